@@ -1,0 +1,67 @@
+# Two commands set everything up on a machine with Python >= 3.11, pip and make:
+#   make paper    the paper's figures, tables and verdicts, in ./paper-out
+#   make test     the tests
+# PYTHON=python3.13 make test   takes another Python.
+
+PYTHON ?= python3
+VENV ?= .venv
+OUT ?= paper-out
+JOBS ?= 2
+BIN = $(VENV)/bin
+READY = $(VENV)/ready
+
+export JAX_PLATFORMS ?= cpu
+
+.PHONY: help paper test test-fast lint types format lock clean
+
+help:
+	@sed -n 's/^## //p' $(MAKEFILE_LIST)
+
+## make paper       reproduce the paper into ./paper-out (OUT=... for another new directory)
+paper: $(READY)
+	$(BIN)/dvi-jax paper --out $(OUT)
+
+## make test        all tests
+test: $(READY)
+	$(BIN)/python -m pytest -n $(JOBS)
+
+## make test-fast   all tests but the slow ones
+test-fast: $(READY)
+	$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
+
+## make lint        style and formatting
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+## make types       static types
+types: $(READY)
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+## make format      put the code into the house format
+format: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+## make lock        renew requirements.lock.txt from pyproject.toml
+lock: $(READY)
+	$(BIN)/uv pip compile pyproject.toml --universal --generate-hashes --upgrade \
+	  --extra ephemeris --extra test --group dev --no-emit-index-url --no-annotate \
+	  --custom-compile-command "make lock" --quiet --output-file requirements.lock.txt
+
+# The environment, made without ensurepip (Debian's python3 has none) from hashed requirements.
+$(READY): requirements.lock.txt pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "dvi_jax needs Python >= 3.11; '$(PYTHON)' is $$($(PYTHON) --version 2>&1)."; \
+	  echo "Name another one: PYTHON=python3.12 make $(MAKECMDGOALS)"; exit 1; }
+	rm -rf $(VENV)
+	$(PYTHON) -m venv --without-pip $(VENV)
+	$(PYTHON) -m pip --python $(BIN)/python install --quiet --disable-pip-version-check \
+	  --require-hashes --requirement requirements.lock.txt
+	$(PYTHON) -m pip --python $(BIN)/python install --quiet --disable-pip-version-check \
+	  --no-deps --no-build-isolation --editable .
+	touch $(READY)
+
+## make clean       remove the environment and what tools left behind
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build dist

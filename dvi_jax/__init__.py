@@ -1,0 +1,29 @@
+"""Differentiable variational integrators for disturbed Hamiltonian systems."""
+
+from ._adjoints import Checkpointed as Checkpointed, Direct as Direct
+from ._discretise import discretise as discretise
+from ._integrate import integrate as integrate
+from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
+from ._solution import Save as Save, Solution as Solution
+from ._system import System as System
+from .engine.newton import Newton as Newton
+from .lattices import Given as Given, Lattice as Lattice, Uniform as Uniform
+from .methods import (
+    Adjoint as Adjoint,
+    Composition as Composition,
+    Method as Method,
+    RungeKutta4 as RungeKutta4,
+    Strang as Strang,
+    TypeII as TypeII,
+    Yoshida as Yoshida,
+)
+from .observe import (
+    Last as Last,
+    MaxDrift as MaxDrift,
+    Mean as Mean,
+    Range as Range,
+    Reduction as Reduction,
+    Trend as Trend,
+)
+
+__version__ = "0.1.0"

@@ -1,0 +1,17 @@
+"""The few names of JAX that have moved between releases, or are not public: all of them, here."""
+
+import jax
+from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+__all__ = ["ClosedJaxpr", "Jaxpr", "Literal", "is_traced", "x64_enabled"]
+
+
+def is_traced(x: object) -> bool:
+    """Whether `x` stands for a value that is not known yet (inside jit, vmap, grad, …)."""
+    return isinstance(x, Tracer)
+
+
+def x64_enabled() -> bool:
+    """Whether this process computes in double precision."""
+    return bool(jax.config.read("jax_enable_x64"))

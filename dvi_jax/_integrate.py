@@ -1,0 +1,304 @@
+"""The front door: one trajectory."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, PyTree
+
+from ._adjoints import AbstractAdjoint, Checkpointed
+from ._compat import is_traced, x64_enabled
+from ._results import RESULTS, IntegrationError
+from ._rollout import (
+    Carry,
+    Plan,
+    Problem,
+    Saved,
+    finish,
+    is_observable,
+    make_plan,
+    run,
+    start,
+)
+from ._solution import Save, Solution
+from ._system import System
+from .engine.newton import Newton
+from .lattices import Lattice, Uniform
+from .methods import Method, TypeII
+from .observe import Reduction
+
+_PIECES = 100
+"""Pieces that a run with progress is cut into."""
+
+
+def integrate(
+    system: System,
+    q0: Any,
+    p0: Any,
+    *,
+    h: Any = None,
+    num_steps: int | None = None,
+    t0: Any = 0.0,
+    epsilon: Any = 0.0,
+    args: PyTree = None,
+    method: Method = TypeII(),
+    lattice: Lattice = Uniform(),
+    save: Save = Save(),
+    observe: PyTree = None,
+    adjoint: AbstractAdjoint = Checkpointed(),
+    newton: Newton = Newton(),
+    throw: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> Solution:
+    r"""One trajectory of a disturbed discrete Hamiltonian system.
+
+    Iterates the map of `method`, by default the paper's (12)–(13),
+
+        q1 = q0 + h ∂H_D/∂p1,    p1 = p0 − h ∂H_D/∂q0 + h ε W(t0, t1, q0, p1).
+
+    **Arguments**
+
+    - `system`: a `System`.
+    - `q0`, `p0`: start, real arrays of one shape (any: ``(n,)``, ``(bodies, 3)``).
+    - `h`: step size [time], not 0; negative runs backwards. `num_steps`: how many; static.
+    - `t0`: time of the start. `epsilon`: strength of the disturbance.
+    - `args`: pytree handed to H_D, W and the observables.
+    - `method`: `TypeII`, `Strang`, `Yoshida`, `Composition`, `Adjoint`, `RungeKutta4`.
+    - `lattice`: `Uniform()`, or `Given(ts)`, which replaces h, num_steps and t0.
+    - `save`: which states are kept, see `Save`.
+    - `observe`: pytree of observables, functions of one step
+      ``(t0, t1, q0, p0, q1, p1, args)`` → array. Alone, one is evaluated on the steps that end at
+      a save point; in `MaxDrift`, `Range`, `Trend`, `Mean`, `Last` it is reduced over every step
+      in constant memory.
+    - `adjoint`: how reverse-mode gradients are computed, see `Direct`, `Checkpointed`.
+    - `newton`: settings of implicit solves, see `Newton`.
+    - `throw`: raise if the trajectory fails; otherwise read ``solution.result``.
+    - `progress`: called as ``progress(steps_done, num_steps)`` about a hundred times during the
+      run, which then goes in pieces (same numbers, bit for bit). Not under jit, vmap or grad.
+
+    h, t0, epsilon, args, q0, p0 and the times of `Given` are traced: they may be batched by
+    `vmap` and differentiated by `grad` and `jvp`. The arithmetic is in the precision of q0, p0.
+
+    **Returns** a `Solution`; time is the first axis of what it saved.
+
+    **Raises** `ValueError` or `TypeError` for input that cannot be meant (shapes, types, values);
+    `IntegrationError` when the trajectory fails and `throw` is True, with the status, the step
+    and the residual (inside jit or vmap an equinox runtime error with the status).
+
+    **Accuracy** order of the method in h. Symplectic methods keep the map's own invariants
+    to round-off and energy to O(h^order) without drift. Gradients are those of the discrete
+    map, by the implicit function theorem through each solve.
+    """
+    if not isinstance(system, System):
+        raise TypeError(
+            f"system must be a dvi.System, got {type(system).__name__}. Wrap the discrete "
+            "Hamiltonian: dvi.System(H_D, force=W)."
+        )
+    for name, value, kind in (
+        ("method", method, Method),
+        ("lattice", lattice, Lattice),
+        ("save", save, Save),
+        ("adjoint", adjoint, AbstractAdjoint),
+        ("newton", newton, Newton),
+    ):
+        if not isinstance(value, kind):
+            hint = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
+            raise TypeError(f"{name} must be a {kind.__name__}, got {value!r}{hint}.")
+
+    q0, p0 = _start_state(q0, p0)
+    t0, h, num_steps = lattice.prepare(t0, h, num_steps)
+    t0 = _scalar("t0", t0, q0.dtype)
+    h = _scalar("h", h, q0.dtype, zero_allowed=False)
+    epsilon = _scalar("epsilon", epsilon, q0.dtype)
+    args = jax.tree.map(_parameter, args)
+    system.check_shapes(t0, q0, p0, epsilon, args)
+    _check_observe(observe, t0, q0, p0, args)
+
+    problem = Problem(system, method, lattice, newton, observe, t0, h, epsilon, args)
+    plan = make_plan(save, num_steps)
+    traced = any(is_traced(x) for x in jax.tree.leaves((problem, q0, p0)))
+    if progress is None:
+        carry, saved = _whole(problem, plan, q0, p0, adjoint)
+    elif traced:
+        raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
+    else:
+        carry, saved = _in_pieces(problem, plan, q0, p0, num_steps, progress)
+
+    solution = _solution(problem, carry, saved, q0, p0, num_steps)
+    return _raise_on_failure(solution, h) if throw else solution
+
+
+@eqx.filter_jit
+def _whole(problem, plan: Plan, q0, p0, adjoint) -> tuple[Carry, Saved]:
+    return run(problem, plan, start(problem, q0, p0), adjoint.loop)
+
+
+@eqx.filter_jit
+def _piece(problem, plan: Plan, carry: Carry, first) -> tuple[Carry, Saved]:
+    return run(problem, plan, carry, lax.scan, first)
+
+
+def _in_pieces(problem, plan, q0, p0, num_steps, progress) -> tuple[Carry, Saved]:
+    """The same scan as `_whole`, cut between save points, with a call after each piece."""
+    blocks = max(1, -(-plan.num_blocks // _PIECES))
+    # The last piece takes what is left of the blocks and the tail: at most one more compilation.
+    carry, first, parts = start(problem, q0, p0), 0, []
+    done = 0
+    while True:
+        count = min(blocks, plan.num_blocks - done)
+        is_last = done + count >= plan.num_blocks
+        piece = Plan(count, plan.block, plan.tail if is_last else 0, plan.save_tail and is_last)
+        carry, saved = _piece(problem, piece, carry, jnp.asarray(first, jnp.int32))
+        jax.block_until_ready(carry)
+        parts.append(saved)
+        done += count
+        first = done * plan.block
+        progress(num_steps if is_last else first, num_steps)
+        if is_last:
+            break
+    return carry, jax.tree.map(lambda *xs: jnp.concatenate(xs), *parts)
+
+
+@eqx.filter_jit
+def _solution(problem, carry: Carry, saved: Saved, q0, p0, num_steps) -> Solution:
+    def from_start(first, rest):
+        return jnp.concatenate([first[None], rest])
+
+    return Solution(
+        ts=from_start(problem.t0, saved.t),
+        qs=from_start(q0, saved.q),
+        ps=from_start(p0, saved.p),
+        hs=saved.h,
+        observed=finish(problem, carry, saved),
+        result=carry.result,
+        stats={
+            "num_steps": num_steps,
+            "newton_iterations": carry.iterations,
+            "max_residual": carry.residual,
+            "failed_step": carry.failed_step,
+            "failed_residual": carry.failed_residual,
+        },
+    )
+
+
+def _raise_on_failure(solution: Solution, h: Array) -> Solution:
+    result = solution.result
+    if result.is_traced():
+        failed = result != RESULTS.successful
+        return result.error_if(solution, failed)
+    if bool(result == RESULTS.successful):
+        return solution
+    step = int(solution.stats["failed_step"])
+    residual = float(solution.stats["failed_residual"])
+    raise IntegrationError(
+        f"the trajectory failed at step {step} of {solution.stats['num_steps']} "
+        f"(h = {float(h):g}; relative residual of the implicit solve {residual:.3g}). "
+        f"{RESULTS[result]} With throw=False the solution up to there is returned "
+        "with its status; here it is the `solution` attribute of this error.",
+        solution,
+    )
+
+
+def _start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
+    q, p = _real_array("q0", q0), _real_array("p0", p0)
+    if q.shape != p.shape:
+        raise ValueError(
+            f"q0 and p0 must have one shape, got q0 {q.shape} and p0 {p.shape}. Each position "
+            "needs its momentum."
+        )
+    dtype = jnp.result_type(q.dtype, p.dtype)
+    return q.astype(dtype), p.astype(dtype)
+
+
+def _real_array(name: str, value: Any) -> Array:
+    if not is_traced(value):
+        try:
+            seen = value if isinstance(value, jax.Array) else np.asarray(value)
+        except Exception as error:  # a list that holds tracers
+            if not any(is_traced(x) for x in jax.tree.leaves(value)):
+                raise TypeError(f"{name} must be a real array, got {value!r} ({error}).") from None
+            return _real_array(name, jnp.stack([jnp.asarray(x) for x in value]))
+        _refuse_double_without_x64(name, seen.dtype)
+        if not (np.issubdtype(seen.dtype, np.integer) or jnp.issubdtype(seen.dtype, jnp.inexact)):
+            raise TypeError(f"{name} must be a real array, got dtype {seen.dtype}.")
+    array = jnp.asarray(value)
+    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise TypeError(
+            f"{name} must be real, got dtype {array.dtype}. Write a complex variable as its real "
+            "and imaginary parts (a canonical pair, up to a factor)."
+        )
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(jnp.result_type(float))
+    if not is_traced(array) and not bool(jnp.all(jnp.isfinite(array))):
+        where = np.argwhere(~np.isfinite(np.asarray(array)))[0].tolist()
+        raise ValueError(
+            f"{name} holds a value that is not finite at index {where}: "
+            f"{np.asarray(array)[tuple(where)]}. Every component of the start must be a number."
+        )
+    return array
+
+
+def _scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
+    if not is_traced(value) and jnp.iscomplexobj(value):
+        raise TypeError(f"{name} must be real, got {value!r}.")
+    try:
+        array = jnp.asarray(value, dtype)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a real number, got {value!r}.") from None
+    if array.shape != ():
+        raise ValueError(
+            f"{name} must be one number, got shape {array.shape}. For several values use "
+            f"jax.vmap over {name}" + (", or lattice=dvi.Given(ts)." if name == "h" else ".")
+        )
+    if not is_traced(array):
+        if not bool(jnp.isfinite(array)):
+            raise ValueError(f"{name} must be finite, got {float(array)}.")
+        if not zero_allowed and float(array) == 0:
+            raise ValueError(
+                f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
+                "or a negative one (backward)."
+            )
+    return array
+
+
+def _parameter(leaf: Any) -> Any:
+    """A leaf of args: floats become arrays, so that a new value needs no new compilation."""
+    if isinstance(leaf, np.ndarray | np.generic):
+        _refuse_double_without_x64("args", leaf.dtype)
+        return jnp.asarray(leaf)
+    return jnp.asarray(leaf) if isinstance(leaf, float) else leaf
+
+
+def _refuse_double_without_x64(name: str, dtype: Any) -> None:
+    if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():
+        raise TypeError(
+            f"{name} is float64, but this process computes in float32. Invariants need double "
+            'precision: put\n    jax.config.update("jax_enable_x64", True)\nbefore the first '
+            f"array is made. If float32 is meant, say so: {name} as jnp.float32."
+        )
+
+
+def _check_observe(observe: PyTree, t0, q0, p0, args) -> None:
+    for leaf in jax.tree.leaves(observe, is_leaf=is_observable):
+        if not is_observable(leaf):
+            raise TypeError(
+                "observe must be a pytree of functions (t0, t1, q0, p0, q1, p1, args) or "
+                f"reductions such as dvi.MaxDrift(function); it holds {leaf!r}."
+            )
+        function = leaf.function if isinstance(leaf, Reduction) else leaf
+        called = getattr(function, "__name__", type(function).__name__)
+        if not callable(function):
+            raise TypeError(
+                f"{type(leaf).__name__} takes a function (t0, t1, q0, p0, q1, p1, args), "
+                f"got {function!r}."
+            )
+        out = eqx.filter_eval_shape(function, t0, t0, q0, p0, q0, p0, args)
+        if not hasattr(out, "shape") and not isinstance(out, int | float):
+            raise TypeError(
+                "an observable (t0, t1, q0, p0, q1, p1, args) must return one array; "
+                f"{called} returned {type(out).__name__}."
+            )

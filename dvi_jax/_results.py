@@ -1,0 +1,47 @@
+"""How a trajectory ended: one status for each, carried beside its numbers."""
+
+import equinox as eqx
+
+
+class RESULTS(eqx.Enumeration):
+    """Status of one trajectory.
+
+    Along a trajectory the first status that is not `successful` stays. Within one step
+    `not_finite` goes before `not_converged`: a solve that met NaN did not merely run
+    out of iterations. Compare with ``sol.result == dvi.RESULTS.successful`` (an array of
+    booleans for a batch); ``dvi.RESULTS[sol.result]`` is the text.
+    """
+
+    successful = ""
+    not_converged = (
+        "Newton's iteration for the implicit step did not converge. Likely causes: (a) h is too "
+        "large for this state, so that the discrete equations have no nearby solution; (b) the "
+        "mixed derivative of H_D or the derivative of W in p1 is not continuous there; (c) the "
+        "tolerance lies below round-off for badly scaled variables. Try a smaller h, or "
+        "newton=dvi.Newton(max_steps=..., rtol=...)."
+    )
+    not_finite = (
+        "The state became NaN or infinite. Likely causes: (a) the start or args already hold a "
+        "value that is not finite; (b) a singularity of H_D was met (two bodies at one place, "
+        "say); (c) h is beyond the stability limit and the orbit escaped."
+    )
+    bad_step_size = (
+        "The step size h is zero or not finite. On a `Given` lattice: two neighbouring times "
+        "are equal or the times change direction."
+    )
+
+
+def first_failure(earlier: RESULTS, later: RESULTS) -> RESULTS:
+    """The status to keep when `later` follows `earlier`: whichever failed first."""
+    return RESULTS.where(earlier == RESULTS.successful, later, earlier)
+
+
+class IntegrationError(RuntimeError):
+    """Raised by `integrate` with ``throw=True`` when a trajectory failed.
+
+    `solution` holds everything up to the failing step, with its status and statistics.
+    """
+
+    def __init__(self, message: str, solution: object = None):
+        super().__init__(message)
+        self.solution = solution

@@ -1,0 +1,217 @@
+"""Many steps: the scan over a lattice, with status, saved states and observables."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from ._results import RESULTS, first_failure
+from ._solution import Save
+from ._system import System
+from ._types import Args, Interval, Scalar, State
+from .engine.newton import Newton
+from .lattices import Lattice
+from .methods import Method
+from .observe import Reduction
+
+Loop = Callable[[Callable, Any, Any], tuple[Any, Any]]
+"""A scan ``(body, carry, xs) -> (carry, ys)``: how gradients flow back through it is its own."""
+
+
+class Problem(eqx.Module):
+    """All that stays the same along a trajectory."""
+
+    system: System
+    method: Method
+    lattice: Lattice
+    newton: Newton
+    observe: PyTree
+    t0: Scalar
+    h: Scalar
+    epsilon: Scalar
+    args: Args
+
+    def observables(self) -> tuple[list[Callable], list[Reduction]]:
+        """The observables that stand alone, and those in a reduction, in tree order."""
+        leaves = jax.tree.leaves(self.observe, is_leaf=is_observable)
+        alone = [f for f in leaves if not isinstance(f, Reduction)]
+        return alone, [f for f in leaves if isinstance(f, Reduction)]
+
+
+class Carry(NamedTuple):
+    """What goes from step to step."""
+
+    q: State
+    p: State
+    result: RESULTS
+    failed_step: Int[Array, ""]
+    failed_residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    residual: Float[Array, ""]
+    reductions: list[Any]
+
+
+class StepTaken(NamedTuple):
+    """One step as an observable sees it."""
+
+    t0: Scalar
+    t1: Scalar
+    q0: State
+    p0: State
+    q1: State
+    p1: State
+
+    def value(self, observable: Callable, args: Args) -> Array:
+        return jnp.asarray(observable(*self, args))
+
+
+class Saved(NamedTuple):
+    """What is kept of a step at a save point."""
+
+    t: Array
+    h: Array
+    q: Array
+    p: Array
+    observed: list[Any]
+
+
+class Plan(NamedTuple):
+    """Steps as blocks of `block` steps with a save after each, then a tail. Static."""
+
+    num_blocks: int
+    block: int
+    tail: int
+    save_tail: bool
+
+
+def is_observable(x: Any) -> bool:
+    return isinstance(x, Reduction) or callable(x)
+
+
+def make_plan(save: Save, num_steps: int) -> Plan:
+    every = save.every
+    if every is None:
+        every = max(num_steps, 1) if save.final else 1
+    num_blocks, tail = divmod(num_steps, every)
+    return Plan(num_blocks, every, tail, save.final and tail > 0)
+
+
+def start(problem: Problem, q0: State, p0: State) -> Carry:
+    """The carry before the first step."""
+    real = jnp.finfo(q0.dtype).dtype
+    finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(p0))
+    result = RESULTS.where(finite, RESULTS.successful, RESULTS.not_finite)
+    usable = problem.lattice.is_usable(problem.t0, problem.h)
+    result = RESULTS.where(usable, result, RESULTS.bad_step_size)
+    interval = problem.lattice.interval(problem.t0, problem.h, jnp.asarray(0, jnp.int32))
+
+    def zero_value(reduction):
+        step = StepTaken(interval.t0, interval.t1, q0, p0, q0, p0)
+        like = eqx.filter_eval_shape(step.value, reduction.function, problem.args)
+        return jnp.zeros(like.shape, jnp.result_type(like.dtype, real))
+
+    _, reductions = problem.observables()
+    good = result == RESULTS.successful
+    return Carry(
+        _or_nan(good, q0),
+        _or_nan(good, p0),
+        result,
+        jnp.where(good, jnp.asarray(-1, jnp.int32), jnp.asarray(0, jnp.int32)),
+        jnp.zeros((), real),
+        jnp.asarray(0, jnp.int32),
+        jnp.zeros((), real),
+        [r.start(zero_value(r)) for r in reductions],
+    )
+
+
+def take_step(problem: Problem, carry: Carry, k: Array) -> tuple[Carry, Interval, StepTaken]:
+    """Step k of the trajectory, its status and its reductions."""
+    interval = problem.lattice.interval(problem.t0, problem.h, k)
+    q1, p1, info = problem.method.step(
+        problem.system,
+        interval,
+        carry.q,
+        carry.p,
+        problem.epsilon,
+        problem.args,
+        problem.newton,
+    )
+    was_good = carry.result == RESULTS.successful
+    result = first_failure(carry.result, info.result)
+    good = result == RESULTS.successful
+    fails_now = was_good & ~good
+    # A state after a failed step is no answer: NaN keeps it from being taken for one.
+    q1, p1 = _or_nan(good, q1), _or_nan(good, p1)
+    taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
+    _, reductions = problem.observables()
+    memories = [
+        r.update(memory, k, interval.t1, taken.value(r.function, problem.args))
+        for r, memory in zip(reductions, carry.reductions, strict=True)
+    ]
+    residual = jax.lax.stop_gradient(info.residual)
+    return (
+        Carry(
+            q1,
+            p1,
+            result,
+            jnp.where(fails_now, k, carry.failed_step),
+            jnp.where(fails_now, residual, carry.failed_residual),
+            carry.iterations + jnp.where(was_good, info.iterations, 0),
+            jnp.where(good, jnp.maximum(carry.residual, residual), carry.residual),
+            memories,
+        ),
+        interval,
+        taken,
+    )
+
+
+def run(
+    problem: Problem, plan: Plan, carry: Carry, loop: Loop, first: int | Array = 0
+) -> tuple[Carry, Saved]:
+    """All steps of `plan` from step number `first`, and what was saved of them."""
+    alone, _ = problem.observables()
+    first = jnp.asarray(first, jnp.int32)
+
+    def body(state, k):
+        carry, _, _ = state
+        return take_step(problem, carry, k), None
+
+    def steps(carry, k, count):
+        """`count` steps from number k, and the last of them as it is saved."""
+        if count == 1:
+            state = take_step(problem, carry, k)
+        else:
+            interval = problem.lattice.interval(problem.t0, problem.h, k)
+            none_yet = StepTaken(*interval[:2], carry.q, carry.p, carry.q, carry.p)
+            numbers = k + jnp.arange(count, dtype=jnp.int32)
+            state, _ = loop(body, (carry, interval, none_yet), numbers)
+        carry, interval, taken = state
+        observed = [taken.value(f, problem.args) for f in alone]
+        return carry, Saved(interval.t1, interval.h, taken.q1, taken.p1, observed)
+
+    starts = first + plan.block * jnp.arange(plan.num_blocks, dtype=jnp.int32)
+    carry, saved = loop(lambda c, k: steps(c, k, plan.block), carry, starts)
+    if plan.tail:
+        carry, last = steps(carry, first + plan.num_blocks * plan.block, plan.tail)
+        if plan.save_tail:
+            saved = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), saved, last)
+    return carry, saved
+
+
+def finish(problem: Problem, carry: Carry, saved: Saved) -> PyTree:
+    """The pytree `observe` with every observable replaced by its values."""
+    _, reductions = problem.observables()
+    reduced = iter(r.finish(memory) for r, memory in zip(reductions, carry.reductions, strict=True))
+    alone = iter(saved.observed)
+    return jax.tree.map(
+        lambda f: next(reduced) if isinstance(f, Reduction) else next(alone),
+        problem.observe,
+        is_leaf=is_observable,
+    )
+
+
+def _or_nan(good, x):
+    return jnp.where(good, x, jnp.full_like(x, jnp.nan))

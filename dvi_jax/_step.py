@@ -1,0 +1,160 @@
+"""One step of the map (12)–(13), its inverse, and its adjoint."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ._results import RESULTS, first_failure
+from ._system import System
+from ._types import Args, Interval, Scalar, State
+from .engine.dependence import depends_on
+from .engine.newton import Newton, RootInfo, find_root
+
+
+class StepInfo(NamedTuple):
+    """Status of a step, Newton iterations spent, largest relative residual left."""
+
+    result: RESULTS
+    iterations: Int[Array, ""]
+    residual: Float[Array, ""]
+
+    def then(self, later: "StepInfo") -> "StepInfo":
+        """This step followed by another: first failure, total work, worst residual."""
+        return StepInfo(
+            first_failure(self.result, later.result),
+            self.iterations + later.iterations,
+            jnp.maximum(self.residual, later.residual),
+        )
+
+
+def momentum_rate(
+    system: System, interval: Interval, q0: State, p1: State, epsilon: Scalar, args: Args
+) -> State:
+    """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
+    t0, t1, _ = interval
+    gradient = jax.grad(system.hamiltonian, argnums=2)(t0, t1, q0, p1, epsilon, args)
+    if system.force is None:
+        return -gradient
+    return -gradient + system.disturbing_force(t0, t1, q0, p1, epsilon, args)
+
+
+def position_rate(
+    system: System, interval: Interval, q0: State, p1: State, epsilon: Scalar, args: Args
+) -> State:
+    """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""
+    t0, t1, _ = interval
+    return jax.grad(system.hamiltonian, argnums=3)(t0, t1, q0, p1, epsilon, args)
+
+
+def step_is_explicit(
+    system: System, interval: Interval, q: State, p: State, epsilon: Scalar, args: Args
+) -> bool:
+    """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""
+
+    def rate(p1):
+        return momentum_rate(system, interval, q, p1, epsilon, args)
+
+    return not depends_on(rate, 0, p)
+
+
+def inverse_is_explicit(
+    system: System, interval: Interval, q: State, p: State, epsilon: Scalar, args: Args
+) -> bool:
+    """Whether q0 does not enter ∂H_D/∂p1, so that the inverse (and the adjoint) needs no solve."""
+
+    def rate(q0):
+        return position_rate(system, interval, q0, p, epsilon, args)
+
+    return not depends_on(rate, 0, q)
+
+
+def step(
+    system: System,
+    interval: Interval,
+    q0: State,
+    p0: State,
+    epsilon: Scalar,
+    args: Args,
+    newton: Newton,
+) -> tuple[State, State, StepInfo]:
+    """The map Φ_h of (12)–(13): (q0, p0) at t0 → (q1, p1) at t1.
+
+    p1 = p0 + h (−∂H_D/∂q0 + εW)(t0, t1, q0, p1)      solved for p1 where p1 enters
+    q1 = q0 + h ∂H_D/∂p1 (t0, t1, q0, p1)
+    """
+
+    def rate(p1):
+        return momentum_rate(system, interval, q0, p1, epsilon, args)
+
+    p1, info = _increment(
+        rate, p0, interval.h, newton, step_is_explicit(system, interval, q0, p0, epsilon, args)
+    )
+    q1 = q0 + interval.h * position_rate(system, interval, q0, p1, epsilon, args)
+    return q1, p1, _judge(info, q1, p1)
+
+
+def inverse_step(
+    system: System,
+    interval: Interval,
+    q1: State,
+    p1: State,
+    epsilon: Scalar,
+    args: Args,
+    newton: Newton,
+) -> tuple[State, State, StepInfo]:
+    """The inverse Φ_h⁻¹ of `step`: (q1, p1) at t1 → (q0, p0) at t0.
+
+    q0 = q1 − h ∂H_D/∂p1 (t0, t1, q0, p1)             solved for q0 where q0 enters
+    p0 = p1 − h (−∂H_D/∂q0 + εW)(t0, t1, q0, p1)
+    """
+
+    def rate(q0):
+        return position_rate(system, interval, q0, p1, epsilon, args)
+
+    q0, info = _increment(
+        rate, q1, -interval.h, newton, inverse_is_explicit(system, interval, q1, p1, epsilon, args)
+    )
+    p0 = p1 - interval.h * momentum_rate(system, interval, q0, p1, epsilon, args)
+    return q0, p0, _judge(info, q0, p0)
+
+
+def adjoint_step(
+    system: System,
+    interval: Interval,
+    q0: State,
+    p0: State,
+    epsilon: Scalar,
+    args: Args,
+    newton: Newton,
+) -> tuple[State, State, StepInfo]:
+    """The adjoint Φ*_h = (Φ_{−h})⁻¹: (q0, p0) at t0 → (q1, p1) at t1.
+
+    It is the inverse of the step that walks the interval backwards; H_D and W are
+    evaluated at (t1, t0, q1, p0).
+    """
+    return inverse_step(system, interval.reversed(), q0, p0, epsilon, args, newton)
+
+
+def _increment(rate, x0, h, newton, explicit) -> tuple[State, RootInfo]:
+    """x1 = x0 + h rate(x1), by one evaluation if `rate` ignores x1, else by Newton's method."""
+    guess = x0 + h * rate(x0)
+    if explicit:
+        real = jnp.finfo(x0.dtype).dtype
+        return guess, RootInfo(jnp.asarray(0, jnp.int32), jnp.zeros((), real), jnp.asarray(True))
+    shape = x0.shape
+    known = x0.ravel()
+
+    def residual(x1):
+        return x1 - known - h * rate(x1.reshape(shape)).ravel()
+
+    x1, info = find_root(residual, guess.ravel(), known, newton)
+    return x1.reshape(shape), info
+
+
+def _judge(info: RootInfo, q: State, p: State) -> StepInfo:
+    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(p))
+    result = RESULTS.where(info.converged, RESULTS.successful, RESULTS.not_converged)
+    result = RESULTS.where(finite, result, RESULTS.not_finite)
+    return StepInfo(result, info.iterations, info.residual)

@@ -1,0 +1,136 @@
+"""What the user writes: a discrete Hamiltonian, a disturbing force, a perturbation."""
+
+import inspect
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
+
+_NAMES = "(t0, t1, q0, p1, args)"
+
+
+class System(eqx.Module):
+    r"""A disturbed discrete Hamiltonian system.
+
+    The discrete Hamiltonian is ``H_D + epsilon * perturbation`` and the disturbing force
+    ``epsilon * force``; the map they define is (12)–(13) of the paper:
+
+        q1 = q0 + h ∂H_D/∂p1,        p1 = p0 − h ∂H_D/∂q0 + h ε W(t0, t1, q0, p1).
+
+    **Arguments**
+
+    - `H_D`: function ``(t0, t1, q0, p1, args)`` → scalar [energy].
+    - `force`: W, function of the same arguments → array like q0 [energy / unit of q]; or None.
+    - `perturbation`: H1_D, function of the same arguments → scalar [energy]; or None.
+      ``epsilon * H1_D`` is added to H_D: a disturbance that derives from a Hamiltonian.
+    - `slow_time`: if True all three functions receive the slow times ``epsilon * t0`` and
+      ``epsilon * t1`` in place of t0 and t1.
+
+    q0 and p1 are arrays of one shape, whichever was given to `integrate`. `args` is
+    any pytree; what of it is an array or a float is differentiable.
+
+    **Raises** `TypeError` when a function is not callable or cannot take the five arguments.
+
+    **Source** H_D: type II generating function S = p1·q0 + h H_D (Marsden & West 2001,
+    *Discrete mechanics and variational integrators*; Leok & Zhang 2011). Disturbance: the
+    paper, (6)–(13).
+    """
+
+    H_D: HamiltonianFn
+    force: ForceFn | None = None
+    perturbation: HamiltonianFn | None = None
+    slow_time: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        _require_five_arguments(self.H_D, "H_D")
+        if self.force is not None:
+            _require_five_arguments(self.force, "force")
+        if self.perturbation is not None:
+            _require_five_arguments(self.perturbation, "perturbation")
+        if not isinstance(self.slow_time, bool):
+            raise TypeError(f"slow_time must be True or False, got {self.slow_time!r}.")
+
+    def hamiltonian(
+        self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
+    ) -> Scalar:
+        """H_D(t0, t1, q0, p1) + ε H1_D(t0, t1, q0, p1): a scalar [energy]."""
+        s0, s1 = self._times(t0, t1, epsilon)
+        H = self.H_D(s0, s1, q0, p1, args)
+        if self.perturbation is not None:
+            H = H + epsilon * self.perturbation(s0, s1, q0, p1, args)
+        return H
+
+    def disturbing_force(
+        self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
+    ) -> State:
+        """ε W(t0, t1, q0, p1): an array like q0 [energy / unit of q]; zero without a force."""
+        if self.force is None:
+            return jnp.zeros_like(q0)
+        s0, s1 = self._times(t0, t1, epsilon)
+        return epsilon * self.force(s0, s1, q0, p1, args)
+
+    def _times(self, t0: Scalar, t1: Scalar, epsilon: Scalar) -> tuple[Scalar, Scalar]:
+        return (epsilon * t0, epsilon * t1) if self.slow_time else (t0, t1)
+
+    def check_shapes(self, t: Scalar, q: State, p: State, epsilon: Scalar, args: Args) -> None:
+        """Refuse functions whose values have the wrong shape or type, by tracing them once."""
+        for name in ("H_D", "perturbation"):
+            function = getattr(self, name)
+            if function is not None:
+                out = _traced_output(function, name, t, q, p, args)
+                if out.shape != () or not jnp.issubdtype(out.dtype, jnp.floating):
+                    raise ValueError(
+                        f"{name}{_NAMES} must return a real scalar (an energy); for q0 of shape "
+                        f"{q.shape} it returned shape {out.shape}, dtype {out.dtype}. "
+                        + (
+                            "Reduce it, e.g. with jnp.sum."
+                            if out.shape
+                            else "Take the real part if that is what is meant."
+                        )
+                    )
+        if self.force is not None:
+            out = _traced_output(self.force, "force", t, q, p, args)
+            if out.shape != q.shape or not jnp.issubdtype(out.dtype, jnp.floating):
+                raise ValueError(
+                    f"force{_NAMES} must return a real array shaped like q0, {q.shape}; it "
+                    f"returned shape {out.shape}, dtype {out.dtype}."
+                )
+
+
+def _traced_output(
+    function: Callable, name: str, t: Scalar, q: State, p: State, args: Args
+) -> jax.ShapeDtypeStruct:
+    out = eqx.filter_eval_shape(function, t, t, q, p, args)
+    if out is None or not hasattr(out, "shape"):
+        if isinstance(out, int | float):
+            return jax.ShapeDtypeStruct((), jnp.result_type(float))
+        raise TypeError(
+            f"{name}{_NAMES} must return one array; it returned "
+            f"{'None (is a return missing?)' if out is None else type(out).__name__}."
+        )
+    return out
+
+
+def _require_five_arguments(function: object, name: str) -> None:
+    if not callable(function):
+        raise TypeError(f"{name} must be a function {_NAMES}, got {function!r}.")
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # builtins without a signature: tracing will tell
+        return
+    try:
+        signature.bind(*range(5))
+    except TypeError as error:
+        called = getattr(function, "__name__", type(function).__name__)
+        raise TypeError(
+            f"{name} must take five positional arguments {_NAMES}; "
+            f"{called}{signature} does not: {error}."
+            + (
+                " A continuous Hamiltonian H(t, q, p, args) goes through dvi.discretise(H) first."
+                if len(signature.parameters) == 4
+                else ""
+            )
+        ) from None

@@ -1,0 +1,38 @@
+"""Names for the arrays and functions that pass between the rooms."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+from jaxtyping import Array, Float, Inexact
+
+Scalar: TypeAlias = Float[Array, ""]
+State: TypeAlias = Inexact[Array, "..."]
+Args: TypeAlias = Any
+
+HamiltonianFn: TypeAlias = Callable[..., Any]
+"""``H_D(t0, t1, q0, p1, args)`` → scalar, units of energy."""
+
+ForceFn: TypeAlias = Callable[..., Any]
+"""``W(t0, t1, q0, p1, args)`` → like q0, units of force."""
+
+
+class Interval(NamedTuple):
+    """One mesh interval: its ends and its length.
+
+    `h` travels beside `t1 - t0` because late in a run the difference of two large times
+    has lost digits that an exact invariant would show.
+    """
+
+    t0: Scalar
+    t1: Scalar
+    h: Scalar
+
+    def reversed(self) -> "Interval":
+        """The same interval walked from its end to its start."""
+        return Interval(self.t1, self.t0, -self.h)
+
+    def part(self, start: float, end: float) -> "Interval":
+        """The piece between the fractions `start` and `end` of this interval."""
+        t0 = self.t0 + start * self.h if start != 0 else self.t0
+        t1 = self.t0 + end * self.h if end != 1 else self.t1
+        return Interval(t0, t1, (end - start) * self.h)

@@ -1,0 +1,120 @@
+"""Newton's method for small systems of equations, with the implicit derivative."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Inexact, Int
+
+from .linear import solve_dense
+
+Vector = Inexact[Array, " n"]
+
+
+class Newton(eqx.Module):
+    """Settings of Newton's method for the implicit part of a step.
+
+    The iteration stops once the correction is at most ``rtol * scale + atol`` in the
+    maximum norm, `scale` being the size of the known and the unknown vector. Convergence
+    being quadratic, the accepted iterate, which includes that last correction, is then
+    accurate to round-off.
+
+    **Arguments**
+
+    - `rtol`: relative tolerance; None means 4096 units of round-off (9e-13 in float64).
+    - `atol`: absolute tolerance [unit of the unknown].
+    - `max_steps`: iterations after which the status becomes `not_converged`.
+
+    **Raises** `ValueError` for tolerances that are negative or both zero, or fewer than one step.
+    """
+
+    rtol: float | None = eqx.field(static=True, default=None)
+    atol: float = eqx.field(static=True, default=0.0)
+    max_steps: int = eqx.field(static=True, default=20)
+
+    def __check_init__(self):
+        if isinstance(self.max_steps, bool) or not isinstance(self.max_steps, int):
+            raise ValueError(f"max_steps must be an integer of at least 1, got {self.max_steps!r}.")
+        if self.max_steps < 1:
+            raise ValueError(f"max_steps must be at least 1, got {self.max_steps}.")
+        for name in ("rtol", "atol"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < float("inf"):
+                raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
+        if self.rtol == 0 and self.atol == 0:
+            raise ValueError("rtol and atol are both zero: no iteration could ever stop.")
+
+
+class RootInfo(NamedTuple):
+    """How a solve went: iterations made, ‖F‖ at the end over the scale, and its verdict."""
+
+    iterations: Int[Array, ""]
+    residual: Float[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class _Iterate(NamedTuple):
+    x: Vector
+    correction: Float[Array, ""]
+    tolerance: Float[Array, ""]
+    iterations: Int[Array, ""]
+
+
+def find_root(
+    function: Callable[[Vector], Vector], guess: Vector, known: Vector, options: Newton
+) -> tuple[Vector, RootInfo]:
+    """Root x of function(x) = 0 near `guess`, and how it was found.
+
+    The derivative of x with respect to anything that `function` closes over is that of the
+    implicit function theorem, dx = −(∂F/∂x)⁻¹ dF, in forward and reverse mode and to any
+    order: the iteration itself is never differentiated. `known` sets the scale for the
+    relative tolerance beside x itself. The Jacobian comes from autodiff.
+    """
+    eps = jnp.finfo(guess.dtype).eps
+    rtol = 4096 * eps if options.rtol is None else options.rtol
+    size = lax.stop_gradient(_norm(known))
+
+    def solve(F, x0):
+        def proceed(state: _Iterate):
+            # `<=` is False for NaN: a correction that is not a number ends the iteration too.
+            open_ = ~(state.correction <= state.tolerance) & jnp.isfinite(state.correction)
+            return (state.iterations == 0) | (open_ & (state.iterations < options.max_steps))
+
+        def improve(state: _Iterate):
+            value, jacobian = _value_and_jacobian(F, state.x)
+            correction = solve_dense(jacobian, value)
+            x = state.x - correction
+            tolerance = rtol * jnp.maximum(size, _norm(x)) + options.atol
+            return _Iterate(x, _norm(correction), tolerance, state.iterations + 1)
+
+        infinity = jnp.full_like(size, jnp.inf)
+        start = _Iterate(x0, infinity, jnp.zeros_like(size), jnp.asarray(0, jnp.int32))
+        end = lax.while_loop(proceed, improve, start)
+        scale = jnp.maximum(size, _norm(end.x))
+        residual = _norm(F(end.x))
+        relative = jnp.where(scale > 0, residual / jnp.where(scale > 0, scale, 1), residual)
+        converged = (end.correction <= end.tolerance) & jnp.isfinite(residual)
+        # custom_root gives its auxiliary output tangents of the same type, so no integers here.
+        return end.x, tuple(
+            jnp.asarray(a, size.dtype) for a in (end.iterations, relative, converged)
+        )
+
+    def tangent_solve(linear, rhs):
+        _, matrix = _value_and_jacobian(linear, jnp.zeros_like(rhs))
+        return solve_dense(matrix, rhs)
+
+    root, aux = lax.custom_root(function, guess, solve, tangent_solve, has_aux=True)
+    iterations, residual, converged = map(lax.stop_gradient, aux)
+    return root, RootInfo(iterations.astype(jnp.int32), residual, converged > 0)
+
+
+def _value_and_jacobian(F: Callable[[Vector], Vector], x: Vector) -> tuple[Vector, Array]:
+    value, push = jax.linearize(F, x)
+    return value, jax.vmap(push, out_axes=1)(jnp.eye(x.shape[0], dtype=x.dtype))
+
+
+def _norm(x: Vector) -> Float[Array, ""]:
+    return jnp.max(jnp.abs(x), initial=0.0)

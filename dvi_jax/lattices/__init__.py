@@ -1,0 +1,5 @@
+"""Where t1 comes from: one file for each lattice, over one abstract base."""
+
+from ._base import Lattice as Lattice
+from ._given import Given as Given
+from ._uniform import Uniform as Uniform

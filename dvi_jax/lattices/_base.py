@@ -1,0 +1,45 @@
+"""What every lattice is: the interval of step k."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Int
+
+from .._types import Interval, Scalar
+
+
+class Lattice(eqx.Module):
+    """Base of all lattices."""
+
+    @abc.abstractmethod
+    def prepare(self, t0: Any, h: Any, num_steps: Any) -> tuple[Any, Any, int]:
+        """(t0, h, num_steps) with defaults filled in, after refusing what does not fit."""
+
+    @abc.abstractmethod
+    def interval(self, t0: Scalar, h: Scalar, k: Int[Array, ""]) -> Interval:
+        """The interval of step k = 0, 1, …"""
+
+    @abc.abstractmethod
+    def is_usable(self, t0: Scalar, h: Scalar) -> Bool[Array, ""]:
+        """Whether every step size is finite, non-zero and of one sign."""
+
+
+def check_num_steps(num_steps: object) -> int:
+    """`num_steps` as an int, after refusing what cannot count steps."""
+    if hasattr(num_steps, "__index__") and not isinstance(num_steps, bool):
+        try:
+            count = num_steps.__index__()  # pyright: ignore[reportAttributeAccessIssue]
+        except Exception:
+            count = None
+        if count is not None:
+            if count < 0:
+                raise ValueError(
+                    f"num_steps must not be negative, got {count}. To go backwards in time give "
+                    "a negative h."
+                )
+            return count
+    raise TypeError(
+        f"num_steps must be a Python integer (it sets array shapes), got {num_steps!r}. Under jit "
+        "mark it static."
+    )

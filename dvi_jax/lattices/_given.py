@@ -1,0 +1,67 @@
+"""Steps between times that the user gives."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._compat import is_traced
+from .._types import Interval
+from ._base import Lattice, check_num_steps
+
+
+class Given(Lattice):
+    """The lattice of the given times t_0, t_1, …, t_N.
+
+    **Arguments**
+
+    - `ts`: times, shape (N+1,), strictly increasing or strictly decreasing; differentiable.
+
+    `integrate` then takes t0, h and num_steps from it, and refuses values that contradict it.
+
+    **Raises** `ValueError` for another shape, fewer than one time, or times that are not
+    finite or not strictly monotonic (a traced `ts` gives the status `bad_step_size` instead).
+    """
+
+    ts: Float[Array, " times"] = eqx.field(converter=jnp.asarray)
+
+    def __check_init__(self):
+        if self.ts.ndim != 1 or self.ts.shape[0] < 1:
+            raise ValueError(
+                f"Given(ts) needs a one-dimensional array of times, got shape {self.ts.shape}."
+            )
+        if not jnp.issubdtype(self.ts.dtype, jnp.floating):
+            raise TypeError(
+                f"Given(ts) needs real floating-point times, got dtype {self.ts.dtype}."
+            )
+        if not is_traced(self.ts):
+            steps = np.diff(np.asarray(self.ts))
+            bad = ~np.isfinite(steps) | (steps * (np.sign(steps[0]) if steps.size else 1) <= 0)
+            if not np.isfinite(np.asarray(self.ts)).all() or bad.any():
+                k = int(np.argmax(bad)) if bad.any() else 0
+                raise ValueError(
+                    "Given(ts) needs finite times in strictly increasing or strictly decreasing "
+                    f"order; the first fault is at ts[{k}:{k + 2}] = "
+                    f"{np.asarray(self.ts)[k : k + 2].tolist()}."
+                )
+
+    def prepare(self, t0, h, num_steps):
+        available = self.ts.shape[0] - 1
+        if h is not None:
+            raise ValueError("h must be left out with the lattice Given(ts): ts sets the steps.")
+        if not is_traced(t0) and not is_traced(self.ts) and t0 != 0.0 and t0 != self.ts[0]:
+            raise ValueError(f"t0={t0} contradicts Given(ts), which starts at {self.ts[0]}.")
+        if num_steps is not None and check_num_steps(num_steps) != available:
+            raise ValueError(
+                f"num_steps={num_steps} contradicts Given(ts), whose {available + 1} times make "
+                f"{available} steps. Leave num_steps out, or cut ts."
+            )
+        return self.ts[0], 1.0, available
+
+    def interval(self, t0, h, k):
+        start, end = self.ts[k], self.ts[k + 1]
+        return Interval(start, end, end - start)
+
+    def is_usable(self, t0, h):
+        steps = jnp.diff(self.ts)
+        return jnp.all(jnp.isfinite(self.ts)) & (jnp.all(steps > 0) | jnp.all(steps < 0))

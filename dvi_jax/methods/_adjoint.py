@@ -1,0 +1,47 @@
+"""The adjoint of another method."""
+
+import equinox as eqx
+
+from ._base import Method
+from ._type_ii import TypeII
+
+
+class Adjoint(Method):
+    r"""The adjoint method Φ*_h = (Φ_{−h})⁻¹ of `method`.
+
+    Same order and symplecticity; the adjoint of a symmetric method is that method. The
+    adjoint of `TypeII` solves for q1 instead of p1, and is explicit when q0 does not enter
+    ∂H_D/∂p1.
+
+    **Source** Hairer, Lubich & Wanner 2006, II.3.
+    """
+
+    method: Method = eqx.field(default_factory=TypeII)
+
+    def __check_init__(self):
+        if not isinstance(self.method, Method):
+            raise TypeError(f"Adjoint takes a method such as dvi.TypeII(), got {self.method!r}.")
+
+    @property
+    def order(self) -> int:
+        return self.method.order
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.method.is_symmetric
+
+    @property
+    def is_symplectic(self) -> bool:
+        return self.method.is_symplectic
+
+    def step(self, system, interval, q0, p0, epsilon, args, newton):
+        return self.method.inverse(system, interval.reversed(), q0, p0, epsilon, args, newton)
+
+    def inverse(self, system, interval, q1, p1, epsilon, args, newton):
+        return self.method.step(system, interval.reversed(), q1, p1, epsilon, args, newton)
+
+    def _needs_no_solve(self, system, interval, q, epsilon, args) -> bool:
+        return self.method._inverse_needs_no_solve(system, interval, q, epsilon, args)
+
+    def _inverse_needs_no_solve(self, system, interval, q, epsilon, args) -> bool:
+        return self.method._needs_no_solve(system, interval, q, epsilon, args)

@@ -1,0 +1,80 @@
+"""What every method is: a step, its inverse where there is one, and what is promised of it."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._step import StepInfo
+from .._system import System
+from .._types import Args, Interval, Scalar, State
+from ..engine.newton import Newton
+
+
+class Method(eqx.Module):
+    """Base of all methods. A final subclass names its order and properties and writes `step`."""
+
+    order: eqx.AbstractVar[int]
+    is_symmetric: eqx.AbstractVar[bool]
+    is_symplectic: eqx.AbstractVar[bool]
+
+    @abc.abstractmethod
+    def step(
+        self,
+        system: System,
+        interval: Interval,
+        q0: State,
+        p0: State,
+        epsilon: Scalar,
+        args: Args,
+        newton: Newton,
+    ) -> tuple[State, State, StepInfo]:
+        """(q0, p0) at interval.t0 → (q1, p1) at interval.t1, with the status of the step."""
+
+    @abc.abstractmethod
+    def inverse(
+        self,
+        system: System,
+        interval: Interval,
+        q1: State,
+        p1: State,
+        epsilon: Scalar,
+        args: Args,
+        newton: Newton,
+    ) -> tuple[State, State, StepInfo]:
+        """(q1, p1) at interval.t1 → (q0, p0) at interval.t0: what `step` came from."""
+
+    @abc.abstractmethod
+    def _needs_no_solve(
+        self, system: System, interval: Interval, q: State, epsilon: Scalar, args: Args
+    ) -> bool: ...
+
+    @abc.abstractmethod
+    def _inverse_needs_no_solve(
+        self, system: System, interval: Interval, q: State, epsilon: Scalar, args: Args
+    ) -> bool: ...
+
+    def is_explicit(self, system: System, q: State | None = None, args: Args = None) -> bool:
+        """Whether a step of this method on `system` needs no solve; read from the jaxpr.
+
+        `q` is an example position (values do not matter, the shape does; two components if
+        left out), `args` example parameters for systems that need some.
+        """
+        if q is None:
+            q = jnp.zeros(2)
+        scalar = jax.ShapeDtypeStruct((), q.dtype)
+        found: list[bool] = []
+
+        def probe(t0, t1, q, epsilon):
+            found.append(self._needs_no_solve(system, Interval(t0, t1, t1), q, epsilon, args))
+            return t0
+
+        try:
+            jax.eval_shape(probe, scalar, scalar, q, scalar)
+        except (TypeError, IndexError, KeyError, ValueError) as error:
+            raise ValueError(
+                f"could not trace the system for q of shape {q.shape} and args={args!r} ({error}). "
+                "Give an example: is_explicit(system, q=jnp.zeros(shape), args=...)."
+            ) from error
+        return found[0]

@@ -1,0 +1,60 @@
+"""The classical Runge–Kutta method, the paper's foil."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from .._results import RESULTS
+from .._step import StepInfo, momentum_rate, position_rate
+from .._types import Interval
+from ._base import Method
+
+
+class RungeKutta4(Method):
+    r"""The classical fourth-order Runge–Kutta method on the continuous equations.
+
+        q̇ = ∂H/∂p,   ṗ = −∂H/∂q + εW     with H(t, q, p) = H_D(t, t, q, p)
+
+    Neither symplectic nor symmetric: the paper's foil (Figures 2 and 4). It has no inverse
+    in closed form, so it cannot be composed with its adjoint.
+
+    **Source** Kutta 1901; Hairer, Nørsett & Wanner 1993, *Solving ODEs I*, table II.1.2.
+    """
+
+    order: ClassVar[int] = 4
+    is_symmetric: ClassVar[bool] = False
+    is_symplectic: ClassVar[bool] = False
+
+    def step(self, system, interval, q0, p0, epsilon, args, newton):
+        del newton
+        t0, t1, h = interval
+        middle = t0 + h / 2
+
+        def field(t, q, p):
+            now = Interval(t, t, jnp.zeros_like(h))
+            return (
+                position_rate(system, now, q, p, epsilon, args),
+                momentum_rate(system, now, q, p, epsilon, args),
+            )
+
+        kq1, kp1 = field(t0, q0, p0)
+        kq2, kp2 = field(middle, q0 + h / 2 * kq1, p0 + h / 2 * kp1)
+        kq3, kp3 = field(middle, q0 + h / 2 * kq2, p0 + h / 2 * kp2)
+        kq4, kp4 = field(t1, q0 + h * kq3, p0 + h * kp3)
+        q1 = q0 + h / 6 * (kq1 + 2 * kq2 + 2 * kq3 + kq4)
+        p1 = p0 + h / 6 * (kp1 + 2 * kp2 + 2 * kp3 + kp4)
+        finite = jnp.all(jnp.isfinite(q1)) & jnp.all(jnp.isfinite(p1))
+        result = RESULTS.where(finite, RESULTS.successful, RESULTS.not_finite)
+        return q1, p1, StepInfo(result, jnp.asarray(0, jnp.int32), jnp.zeros((), q1.dtype))
+
+    def inverse(self, system, interval, q1, p1, epsilon, args, newton):
+        raise TypeError(
+            "RungeKutta4 has no inverse step in closed form, so it has no adjoint and no "
+            "reversible gradient: use a variational method, or adjoint=dvi.Checkpointed()."
+        )
+
+    def _needs_no_solve(self, system, interval, q, epsilon, args):
+        return True
+
+    def _inverse_needs_no_solve(self, system, interval, q, epsilon, args):
+        return False

@@ -1,0 +1,35 @@
+"""The paper's map itself."""
+
+from typing import ClassVar
+
+from .._step import inverse_is_explicit, inverse_step, step, step_is_explicit
+from ._base import Method
+
+
+class TypeII(Method):
+    r"""The type II variational map, equations (12)–(13), of order 1 for the paper's rule.
+
+        q1 = q0 + h ∂H_D/∂p1,    p1 = p0 − h ∂H_D/∂q0 + h ε W(t0, t1, q0, p1)
+
+    It is symplectic for ε = 0 (generating function p1·q0 + h H_D) whatever H_D is, and
+    explicit when p1 enters neither ∂H_D/∂q0 nor W (symplectic Euler for separable H).
+
+    **Source** the paper, (12)–(13); Hairer, Lubich & Wanner 2006, *Geometric Numerical
+    Integration*, VI.5 (generating function of the second kind).
+    """
+
+    order: ClassVar[int] = 1
+    is_symmetric: ClassVar[bool] = False
+    is_symplectic: ClassVar[bool] = True
+
+    def step(self, system, interval, q0, p0, epsilon, args, newton):
+        return step(system, interval, q0, p0, epsilon, args, newton)
+
+    def inverse(self, system, interval, q1, p1, epsilon, args, newton):
+        return inverse_step(system, interval, q1, p1, epsilon, args, newton)
+
+    def _needs_no_solve(self, system, interval, q, epsilon, args):
+        return step_is_explicit(system, interval, q, q, epsilon, args)
+
+    def _inverse_needs_no_solve(self, system, interval, q, epsilon, args):
+        return inverse_is_explicit(system, interval, q, q, epsilon, args)

@@ -1,0 +1,52 @@
+"""The simple harmonic oscillator, disturbed by −εq."""
+
+import jax.numpy as jnp
+
+from .._system import System
+from ._problem import Problem
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = (|p1|² + |q0|²)/2, unit mass and frequency (the paper, before (32))."""
+    return (jnp.sum(p1**2) + jnp.sum(q0**2)) / 2
+
+
+def linear_force(t0, t1, q0, p1, args):
+    """W = −q0: the disturbance F(q) = −εq of the paper's Section 5.1 (its text prints εq)."""
+    return -q0
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """(|p|² + |q|²)/2 at t1: the continuous energy."""
+    return (jnp.sum(p1**2) + jnp.sum(q1**2)) / 2
+
+
+def mixed_energy(t0, t1, q0, p0, q1, p1, args):
+    """(p_k² + q_{k−1}²)/2, the paper's I_0: H_D on the step that ends at t_k."""
+    return hamiltonian(t0, t1, q0, p1, args)
+
+
+def map_invariant(t0, t1, q0, p0, q1, p1, args):
+    """(|p|² + |q|² − h q·p)/2 at t1: what the undisturbed map keeps exactly (h = t1 − t0).
+
+    Our own: the map is linear with matrix M, and MᵀSM = S for S = [[1, −h/2], [−h/2, 1]].
+    """
+    return (jnp.sum(p1**2) + jnp.sum(q1**2) - (t1 - t0) * jnp.sum(q1 * p1)) / 2
+
+
+def oscillator() -> Problem:
+    """The paper's oscillator with its start (0.01, 0.01) and h = 0.1; dimensionless."""
+    return Problem(
+        name="oscillator",
+        system=System(hamiltonian, force=linear_force),
+        q0=[0.01],
+        p0=[0.01],
+        h=0.1,
+        observables={
+            "energy": energy,
+            "mixed_energy": mixed_energy,
+            "map_invariant": map_invariant,
+        },
+        units={"q": "1", "p": "1", "t": "1/ω", "energy": "1"},
+        source="the paper, Section 5.1",
+    )
