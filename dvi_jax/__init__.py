@@ -1,6 +1,10 @@
 """Differentiable variational integrators for disturbed Hamiltonian systems."""
 
-from ._adjoints import Checkpointed as Checkpointed, Direct as Direct
+from ._adjoints import (
+    Checkpointed as Checkpointed,
+    Direct as Direct,
+    Reversible as Reversible,
+)
 from ._discretise import discretise as discretise
 from ._integrate import integrate as integrate
 from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
@@ -24,6 +28,19 @@ from .observe import (
     Range as Range,
     Reduction as Reduction,
     Trend as Trend,
+)
+from .symmetry import (
+    AdiabaticInvariant as AdiabaticInvariant,
+    Generator as Generator,
+    LatticePoint as LatticePoint,
+    conformal_factor as conformal_factor,
+    determining_residual as determining_residual,
+    discrete_equations as discrete_equations,
+    incoming_energy as incoming_energy,
+    lattice_defect as lattice_defect,
+    noether_identity as noether_identity,
+    outgoing_energy as outgoing_energy,
+    prolong as prolong,
 )
 
 __version__ = "0.1.0"

@@ -1,33 +1,66 @@
-"""How gradients flow back through the scan over the steps."""
+"""How gradients flow back through a trajectory."""
 
 import abc
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
+from jaxtyping import Array
+
+from ._results import RESULTS
+from ._rollout import (
+    Carry,
+    Loop,
+    Plan,
+    Problem,
+    Saved,
+    StepTaken,
+    reduce,
+    run,
+    start,
+    with_tail,
+)
+from ._types import State
+
+
+class Outcome(NamedTuple):
+    """A trajectory as it leaves the scan: last carry, saved states, reduced observables."""
+
+    carry: Carry
+    saved: Saved
+    reduced: list[Array]
 
 
 class AbstractAdjoint(eqx.Module):
-    """Base of the ways to differentiate a trajectory. All of them give the same derivative,
-    that of the discrete map, to round-off; they differ in memory and time."""
+    """Base of the ways to differentiate a trajectory.
+
+    All of them give the same derivative, that of the discrete map, to round-off; they
+    differ in memory and time.
+    """
 
     @abc.abstractmethod
-    def loop(self, body: Callable, carry: Any, xs: Any) -> tuple[Any, Any]:
-        """A scan of `body` over `xs`, differentiable in this adjoint's way."""
+    def rollout(self, problem: Problem, plan: Plan, q0: State, p0: State) -> Outcome:
+        """The whole trajectory, differentiable in this adjoint's way."""
+
+
+def _direct_rollout(problem: Problem, plan: Plan, q0: State, p0: State, loop: Loop) -> Outcome:
+    carry, saved, tail = run(problem, plan, start(problem, q0, p0), loop)
+    return Outcome(carry, with_tail(plan, saved, tail), reduce(problem, carry))
 
 
 class Direct(AbstractAdjoint):
     """Forward and reverse mode straight through the scan.
 
-    Reverse mode stores what each step needs: memory grows with num_steps; fastest for short runs.
+    Reverse mode stores what each step needs: memory grows with num_steps; good for short runs.
     """
 
-    def loop(self, body, carry, xs):
-        return lax.scan(body, carry, xs)
+    def rollout(self, problem, plan, q0, p0):
+        return _direct_rollout(problem, plan, q0, p0, lax.scan)
 
 
 class Checkpointed(AbstractAdjoint):
@@ -35,18 +68,26 @@ class Checkpointed(AbstractAdjoint):
 
     - `segments`: pieces that a scan is cut into; None means about √(number of steps).
 
-    Forward mode costs what it costs with `Direct`.
+    Forward mode costs what it costs with `Direct`. Works for every method and any
+    dynamics, chaotic or dissipative.
     """
 
     segments: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if self.segments is not None and (not isinstance(self.segments, int) or self.segments < 1):
+        if self.segments is not None and (
+            isinstance(self.segments, bool)
+            or not isinstance(self.segments, int)
+            or self.segments < 1
+        ):
             raise ValueError(f"segments must be a positive integer, got {self.segments!r}.")
 
-    def loop(self, body, carry, xs):
+    def rollout(self, problem, plan, q0, p0):
+        return _direct_rollout(problem, plan, q0, p0, self._loop)
+
+    def _loop(self, body: Callable, carry: Any, xs: Any) -> tuple[Any, Any]:
         length = len(jax.tree.leaves(xs)[0])
-        segments = self.segments or math.isqrt(length)
+        segments = min(self.segments or math.isqrt(length), max(length, 1))
         size = length // max(segments, 1)
         if size < 2:
             return lax.scan(body, carry, xs)
@@ -63,3 +104,225 @@ class Checkpointed(AbstractAdjoint):
             carry, rest = segment(carry, jax.tree.map(lambda x: x[whole:], xs))
             ys = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), ys, rest)
         return carry, ys
+
+
+class Reversible(AbstractAdjoint):
+    r"""Reverse mode that rebuilds the states by the inverse step instead of storing them.
+
+    Going backwards from λ_{k+1}, the state before the step is Φ_h⁻¹(q_{k+1}, p_{k+1}) and
+
+        λ_k = (∂Φ_h/∂(q_k, p_k))ᵀ λ_{k+1},     dL/dθ += (∂Φ_h/∂θ)ᵀ λ_{k+1}.
+
+    Memory does not grow with num_steps but for one state every `checkpoint_every` steps, from
+    which the rebuilding starts afresh: it amplifies round-off on chaotic or dissipative arcs.
+    Where a rebuilt state misses the stored one by more than `max_defect` (relative to the
+    largest component), or an inverse step has no solution, the gradient is NaN rather than
+    wrong: take fewer steps between checkpoints, or `Checkpointed`.
+
+    Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A
+    method without an inverse (`RungeKutta4`) is differentiated as by `Checkpointed`.
+
+    **Raises** `ValueError` for settings that are not positive.
+
+    **Source** our own combination; reversible backpropagation: Maclaurin, Duvenaud & Adams 2015.
+    """
+
+    checkpoint_every: int = eqx.field(static=True, default=100)
+    max_defect: float = eqx.field(static=True, default=1e-6)
+
+    def __check_init__(self):
+        every = self.checkpoint_every
+        if isinstance(every, bool) or not isinstance(every, int) or every < 1:
+            raise ValueError(f"checkpoint_every must be a positive integer, got {every!r}.")
+        if not self.max_defect > 0:
+            raise ValueError(f"max_defect must be positive, got {self.max_defect!r}.")
+
+    def rollout(self, problem, plan, q0, p0):
+        if not problem.method.is_invertible:
+            return Checkpointed().rollout(problem, plan, q0, p0)
+        theta, fixed = eqx.partition(problem, eqx.is_inexact_array)
+
+        def forward(inputs):
+            theta, q0, p0 = inputs
+            problem = eqx.combine(theta, fixed)
+            carry, saved, tail = run(
+                problem, plan, start(problem, q0, p0), lax.scan, self._inner_loop
+            )
+            smooth = _Smooth(carry.q, carry.p, with_tail(plan, saved, tail), reduce(problem, carry))
+            return smooth, (carry, saved, tail)
+
+        @jax.custom_jvp
+        def trajectory(inputs):
+            return forward(inputs)
+
+        @trajectory.defjvp
+        def _(primals, tangents):
+            # The tangent is L·dx with L the derivative. Written as the solution (u, v) of the
+            # linear system u = dx, v − L u = 0, it may be given a transpose of its own: forward
+            # mode runs L along the scan, reverse mode runs Lᵀ on rebuilt states.
+            (inputs,), (change,) = primals, tangents
+            smooth, trace = trajectory(inputs)
+
+            def push(u):
+                return jax.jvp(lambda x: forward(x)[0], (inputs,), (u,))[1]
+
+            def matvec(uv):
+                u, v = uv
+                return u, jax.tree.map(jnp.subtract, v, push(u))
+
+            def solve(_, b):
+                u, v = b
+                return u, jax.tree.map(jnp.add, v, push(u))
+
+            def transpose_solve(_, b):
+                u, v = b
+                back = _pull_back(self, fixed, plan, inputs, trace, v)
+                return jax.tree.map(jnp.add, u, back), v
+
+            # Every part of the right side must be linear in the tangents, also those that are
+            # zero: an empty sum of the tangents is such a zero.
+            nothing = sum(jnp.sum(x.ravel()[:0]) for x in jax.tree.leaves(change))
+            rhs = jax.tree.map(
+                lambda x: x + nothing, (change, jax.tree.map(jnp.zeros_like, smooth))
+            )
+            _, moved = lax.custom_linear_solve(matvec, rhs, solve, transpose_solve)
+            return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
+
+        smooth, (carry, _, _) = trajectory((theta, q0, p0))
+        return Outcome(carry._replace(q=smooth.q, p=smooth.p), smooth.saved, smooth.reduced)
+
+    def _inner_loop(self, body, state, numbers):
+        """A scan over the steps of a block that keeps the state every `checkpoint_every` steps."""
+        count = len(numbers)
+        segments = (count - 1) // self.checkpoint_every  # the end of the block is kept anyway
+
+        def segment(state, numbers):
+            state, _ = lax.scan(body, state, numbers)
+            return state, (state[0].q, state[0].p)
+
+        whole = segments * self.checkpoint_every
+        state, ends = lax.scan(
+            segment, state, numbers[:whole].reshape(segments, self.checkpoint_every)
+        )
+        state, _ = lax.scan(body, state, numbers[whole:])
+        return state, ends
+
+
+class _Smooth(NamedTuple):
+    """The outputs of a trajectory that have derivatives."""
+
+    q: State
+    p: State
+    saved: Saved
+    reduced: list[Array]
+
+
+def _no_tangent(x):
+    if jnp.issubdtype(x.dtype, jnp.inexact):
+        return jnp.zeros_like(x)
+    return np.zeros(x.shape, jax.dtypes.float0)
+
+
+def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent: _Smooth):
+    """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start."""
+    theta, q_start, p_start = inputs
+    carry, saved, tail = trace
+    problem: Problem = eqx.combine(theta, fixed)
+    _, reductions = problem.observables()
+
+    def local_step(theta, q0, p0, k):
+        problem: Problem = eqx.combine(theta, fixed)
+        alone, reductions = problem.observables()
+        interval = problem.lattice.interval(problem.t0, problem.h, k)
+        q1, p1, _ = problem.method.step(
+            problem.system, interval, q0, p0, problem.epsilon, problem.args, problem.newton
+        )
+        taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
+        values = [taken.value(f, problem.args) for f in alone]
+        reduced = [taken.value(problem.bound(r.function), problem.args) for r in reductions]
+        return Saved(interval.t1, interval.h, q1, p1, values), reduced
+
+    def undo(state, k, is_last, at_save: Saved):
+        """One step back: the state before it, and the cotangents before it."""
+        q1, p1, grad, (cq, cp) = state
+        interval = problem.lattice.interval(problem.t0, problem.h, k)
+        q0, p0, info = problem.method.inverse(
+            problem.system, interval, q1, p1, problem.epsilon, problem.args, problem.newton
+        )
+        (end, values), pull = jax.vjp(lambda *x: local_step(*x, k), theta, q0, p0)
+        seed = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
+        seed = seed._replace(q=seed.q + cq, p=seed.p + cp)
+        seeds = []
+        for r, memory, c, value in zip(
+            reductions, carry.reductions, cotangent.reduced, values, strict=True
+        ):
+            of_t, of_value = r.pull(memory, c, k, end.t, value)
+            seed = seed._replace(t=seed.t + of_t)
+            seeds.append(of_value.astype(value.dtype))
+        of_theta, cq, cp = pull((seed, seeds))
+        ok = info.result == RESULTS.successful
+        cq, cp = _or_nan(ok, cq), _or_nan(ok, cp)
+        return q0, p0, jax.tree.map(jnp.add, grad, of_theta), (cq, cp)
+
+    def undo_steps(known_start, end, numbers, last, at_save, grad, cot):
+        """The steps `numbers` back from the exact state `end`, checked against `known_start`."""
+
+        def body(state, k):
+            return undo(state, k, k == last, at_save), None
+
+        (q, p, grad, cot), _ = lax.scan(body, (*end, grad, cot), numbers, reverse=True)
+        defect = jnp.maximum(_distance(q, known_start[0]), _distance(p, known_start[1]))
+        ok = defect <= settings.max_defect
+        return grad, jax.tree.map(lambda c: _or_nan(ok, c), cot)
+
+    def undo_block(known_start, saved: Saved, k, count, at_save, grad, cot):
+        last = k + count - 1
+        numbers = k + jnp.arange(count, dtype=jnp.int32)
+        end = (saved.q, saved.p)
+        if saved.inner is None or len(saved.inner[0]) == 0:
+            return undo_steps(known_start, end, numbers, last, at_save, grad, cot)
+        inner = saved.inner
+        segments, size = len(inner[0]), settings.checkpoint_every
+        whole = segments * size
+        newest = jax.tree.map(lambda x: x[-1], inner)
+        grad, cot = undo_steps(newest, end, numbers[whole:], last, at_save, grad, cot)
+
+        def segment(state, x):
+            start, end, numbers = x
+            return undo_steps(start, end, numbers, last, at_save, *state), None
+
+        starts = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), known_start, inner)
+        pieces = numbers[:whole].reshape(segments, size)
+        (grad, cot), _ = lax.scan(segment, (grad, cot), (starts, inner, pieces), reverse=True)
+        return grad, cot
+
+    start_state = (q_start, p_start)
+    ends = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start_state, (saved.q, saved.p))
+    grad = jax.tree.map(jnp.zeros_like, theta)
+    cot = (cotangent.q, cotangent.p)
+    rows = cotangent.saved
+    if tail is not None:
+        at_save = jax.tree.map(lambda x: x[-1] if plan.save_tail else jnp.zeros_like(x[0]), rows)
+        newest = jax.tree.map(lambda x: x[-1], ends)
+        k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
+        grad, cot = undo_block(newest, tail, k, plan.tail, at_save, grad, cot)
+
+    def block(state, x):
+        known_start, saved, k, at_save = x
+        return undo_block(known_start, saved, k, plan.block, at_save, *state), None
+
+    starts = jax.tree.map(lambda x: x[:-1], ends)
+    numbers = plan.block * jnp.arange(plan.num_blocks, dtype=jnp.int32)
+    rows = jax.tree.map(lambda x: x[: plan.num_blocks], rows)
+    (grad, cot), _ = lax.scan(block, (grad, cot), (starts, saved, numbers, rows), reverse=True)
+    return grad, *cot
+
+
+def _distance(a, b):
+    """Largest distance of two states, relative to the size of the second."""
+    size = jnp.max(jnp.abs(b), initial=0.0)
+    return jnp.max(jnp.abs(a - b), initial=0.0) / jnp.where(size > 0, size, 1)
+
+
+def _or_nan(good, x):
+    return jnp.where(good, x, jnp.full_like(x, jnp.nan))

@@ -10,19 +10,19 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from ._adjoints import AbstractAdjoint, Checkpointed
+from ._adjoints import AbstractAdjoint, Outcome, Reversible
 from ._compat import is_traced, x64_enabled
 from ._results import RESULTS, IntegrationError
 from ._rollout import (
-    Carry,
     Plan,
     Problem,
-    Saved,
-    finish,
     is_observable,
     make_plan,
+    observed,
+    reduce,
     run,
     start,
+    with_tail,
 )
 from ._solution import Save, Solution
 from ._system import System
@@ -49,7 +49,7 @@ def integrate(
     lattice: Lattice = Uniform(),
     save: Save = Save(),
     observe: PyTree = None,
-    adjoint: AbstractAdjoint = Checkpointed(),
+    adjoint: AbstractAdjoint = Reversible(),
     newton: Newton = Newton(),
     throw: bool = True,
     progress: Callable[[int, int], None] | None = None,
@@ -74,7 +74,7 @@ def integrate(
       ``(t0, t1, q0, p0, q1, p1, args)`` → array. Alone, one is evaluated on the steps that end at
       a save point; in `MaxDrift`, `Range`, `Trend`, `Mean`, `Last` it is reduced over every step
       in constant memory.
-    - `adjoint`: how reverse-mode gradients are computed, see `Direct`, `Checkpointed`.
+    - `adjoint`: how reverse-mode gradients go, see `Reversible`, `Checkpointed`, `Direct`.
     - `newton`: settings of implicit solves, see `Newton`.
     - `throw`: raise if the trajectory fails; otherwise read ``solution.result``.
     - `progress`: called as ``progress(steps_done, num_steps)`` about a hundred times during the
@@ -116,55 +116,61 @@ def integrate(
     epsilon = _scalar("epsilon", epsilon, q0.dtype)
     args = jax.tree.map(_parameter, args)
     system.check_shapes(t0, q0, p0, epsilon, args)
-    _check_observe(observe, t0, q0, p0, args)
-
     problem = Problem(system, method, lattice, newton, observe, t0, h, epsilon, args)
+    _check_observe(problem, q0, p0)
     plan = make_plan(save, num_steps)
     traced = any(is_traced(x) for x in jax.tree.leaves((problem, q0, p0)))
     if progress is None:
-        carry, saved = _whole(problem, plan, q0, p0, adjoint)
+        outcome = _whole(problem, plan, q0, p0, adjoint)
     elif traced:
         raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
     else:
-        carry, saved = _in_pieces(problem, plan, q0, p0, num_steps, progress)
+        outcome = _in_pieces(problem, plan, q0, p0, num_steps, progress)
 
-    solution = _solution(problem, carry, saved, q0, p0, num_steps)
+    solution = _solution(problem, outcome, q0, p0, num_steps)
     return _raise_on_failure(solution, h) if throw else solution
 
 
 @eqx.filter_jit
-def _whole(problem, plan: Plan, q0, p0, adjoint) -> tuple[Carry, Saved]:
-    return run(problem, plan, start(problem, q0, p0), adjoint.loop)
+def _whole(problem: Problem, plan: Plan, q0, p0, adjoint: AbstractAdjoint) -> Outcome:
+    return adjoint.rollout(problem, plan, q0, p0)
 
 
 @eqx.filter_jit
-def _piece(problem, plan: Plan, carry: Carry, first) -> tuple[Carry, Saved]:
-    return run(problem, plan, carry, lax.scan, first)
+def _begin(problem: Problem, q0, p0):
+    return start(problem, q0, p0)
 
 
-def _in_pieces(problem, plan, q0, p0, num_steps, progress) -> tuple[Carry, Saved]:
+@eqx.filter_jit
+def _piece(problem: Problem, plan: Plan, carry, first):
+    carry, saved, tail = run(problem, plan, carry, lax.scan, first=first)
+    return carry, with_tail(plan, saved, tail)
+
+
+def _in_pieces(problem: Problem, plan: Plan, q0, p0, num_steps, progress) -> Outcome:
     """The same scan as `_whole`, cut between save points, with a call after each piece."""
     blocks = max(1, -(-plan.num_blocks // _PIECES))
-    # The last piece takes what is left of the blocks and the tail: at most one more compilation.
-    carry, first, parts = start(problem, q0, p0), 0, []
-    done = 0
+    carry, done, parts = _begin(problem, q0, p0), 0, []
     while True:
         count = min(blocks, plan.num_blocks - done)
         is_last = done + count >= plan.num_blocks
-        piece = Plan(count, plan.block, plan.tail if is_last else 0, plan.save_tail and is_last)
-        carry, saved = _piece(problem, piece, carry, jnp.asarray(first, jnp.int32))
+        tail = (plan.tail, plan.save_tail) if is_last else (0, False)
+        first = jnp.asarray(done * plan.block, jnp.int32)
+        carry, saved = _piece(problem, Plan(count, plan.block, *tail), carry, first)
         jax.block_until_ready(carry)
         parts.append(saved)
         done += count
-        first = done * plan.block
-        progress(num_steps if is_last else first, num_steps)
+        progress(num_steps if is_last else done * plan.block, num_steps)
         if is_last:
             break
-    return carry, jax.tree.map(lambda *xs: jnp.concatenate(xs), *parts)
+    saved = jax.tree.map(lambda *xs: jnp.concatenate(xs), *parts)
+    return Outcome(carry, saved, reduce(problem, carry))
 
 
 @eqx.filter_jit
-def _solution(problem, carry: Carry, saved: Saved, q0, p0, num_steps) -> Solution:
+def _solution(problem: Problem, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
+    carry, saved, reduced = outcome
+
     def from_start(first, rest):
         return jnp.concatenate([first[None], rest])
 
@@ -173,7 +179,7 @@ def _solution(problem, carry: Carry, saved: Saved, q0, p0, num_steps) -> Solutio
         qs=from_start(q0, saved.q),
         ps=from_start(p0, saved.p),
         hs=saved.h,
-        observed=finish(problem, carry, saved),
+        observed=observed(problem.observe, saved, reduced),
         result=carry.result,
         stats={
             "num_steps": num_steps,
@@ -282,8 +288,9 @@ def _refuse_double_without_x64(name: str, dtype: Any) -> None:
         )
 
 
-def _check_observe(observe: PyTree, t0, q0, p0, args) -> None:
-    for leaf in jax.tree.leaves(observe, is_leaf=is_observable):
+def _check_observe(problem: Problem, q0: Array, p0: Array) -> None:
+    """Refuse observables that are not functions of a step with an array for a value."""
+    for leaf in jax.tree.leaves(problem.observe, is_leaf=is_observable):
         if not is_observable(leaf):
             raise TypeError(
                 "observe must be a pytree of functions (t0, t1, q0, p0, q1, p1, args) or "
@@ -296,7 +303,8 @@ def _check_observe(observe: PyTree, t0, q0, p0, args) -> None:
                 f"{type(leaf).__name__} takes a function (t0, t1, q0, p0, q1, p1, args), "
                 f"got {function!r}."
             )
-        out = eqx.filter_eval_shape(function, t0, t0, q0, p0, q0, p0, args)
+        t0 = problem.t0
+        out = eqx.filter_eval_shape(problem.bound(function), t0, t0, q0, p0, q0, p0, problem.args)
         if not hasattr(out, "shape") and not isinstance(out, int | float):
             raise TypeError(
                 "an observable (t0, t1, q0, p0, q1, p1, args) must return one array; "

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from ._results import RESULTS, first_failure
 from ._solution import Save
 from ._system import System
-from ._types import Args, Interval, Scalar, State
+from ._types import Args, Bindable, Interval, Scalar, State
 from .engine.newton import Newton
 from .lattices import Lattice
 from .methods import Method
@@ -37,8 +37,14 @@ class Problem(eqx.Module):
     def observables(self) -> tuple[list[Callable], list[Reduction]]:
         """The observables that stand alone, and those in a reduction, in tree order."""
         leaves = jax.tree.leaves(self.observe, is_leaf=is_observable)
-        alone = [f for f in leaves if not isinstance(f, Reduction)]
+        alone = [self.bound(f) for f in leaves if not isinstance(f, Reduction)]
         return alone, [f for f in leaves if isinstance(f, Reduction)]
+
+    def bound(self, observable: Callable) -> Callable:
+        """The observable, told the system and ε if it asks for them."""
+        if isinstance(observable, Bindable):
+            return observable.bind(self.system, self.epsilon)
+        return observable
 
 
 class Carry(NamedTuple):
@@ -69,13 +75,18 @@ class StepTaken(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """What is kept of a step at a save point."""
+    """What is kept of a step at a save point.
+
+    `inner` is what the scan over the steps since the save point before has returned besides its
+    carry (checkpoints, for a reversible gradient; else None).
+    """
 
     t: Array
     h: Array
     q: Array
     p: Array
     observed: list[Any]
+    inner: Any = None
 
 
 class Plan(NamedTuple):
@@ -110,7 +121,7 @@ def start(problem: Problem, q0: State, p0: State) -> Carry:
 
     def zero_value(reduction):
         step = StepTaken(interval.t0, interval.t1, q0, p0, q0, p0)
-        like = eqx.filter_eval_shape(step.value, reduction.function, problem.args)
+        like = eqx.filter_eval_shape(step.value, problem.bound(reduction.function), problem.args)
         return jnp.zeros(like.shape, jnp.result_type(like.dtype, real))
 
     _, reductions = problem.observables()
@@ -148,7 +159,7 @@ def take_step(problem: Problem, carry: Carry, k: Array) -> tuple[Carry, Interval
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
     _, reductions = problem.observables()
     memories = [
-        r.update(memory, k, interval.t1, taken.value(r.function, problem.args))
+        r.update(memory, k, interval.t1, taken.value(problem.bound(r.function), problem.args))
         for r, memory in zip(reductions, carry.reductions, strict=True)
     ]
     residual = jax.lax.stop_gradient(info.residual)
@@ -169,9 +180,19 @@ def take_step(problem: Problem, carry: Carry, k: Array) -> tuple[Carry, Interval
 
 
 def run(
-    problem: Problem, plan: Plan, carry: Carry, loop: Loop, first: int | Array = 0
-) -> tuple[Carry, Saved]:
-    """All steps of `plan` from step number `first`, and what was saved of them."""
+    problem: Problem,
+    plan: Plan,
+    carry: Carry,
+    loop: Loop,
+    inner_loop: Loop | None = None,
+    first: int | Array = 0,
+) -> tuple[Carry, Saved, Saved | None]:
+    """All steps of `plan` from step number `first`: the carry, what was saved, and the tail.
+
+    `loop` scans over the blocks and `inner_loop` (the same if None) over the steps of one. The
+    tail is the end of the steps after the last block, None where there are none.
+    """
+    inner_loop = loop if inner_loop is None else inner_loop
     alone, _ = problem.observables()
     first = jnp.asarray(first, jnp.int32)
 
@@ -181,34 +202,47 @@ def run(
 
     def steps(carry, k, count):
         """`count` steps from number k, and the last of them as it is saved."""
+        inner = None
         if count == 1:
             state = take_step(problem, carry, k)
         else:
             interval = problem.lattice.interval(problem.t0, problem.h, k)
             none_yet = StepTaken(*interval[:2], carry.q, carry.p, carry.q, carry.p)
             numbers = k + jnp.arange(count, dtype=jnp.int32)
-            state, _ = loop(body, (carry, interval, none_yet), numbers)
+            state, inner = inner_loop(body, (carry, interval, none_yet), numbers)
         carry, interval, taken = state
         observed = [taken.value(f, problem.args) for f in alone]
-        return carry, Saved(interval.t1, interval.h, taken.q1, taken.p1, observed)
+        return carry, Saved(interval.t1, interval.h, taken.q1, taken.p1, observed, inner)
 
     starts = first + plan.block * jnp.arange(plan.num_blocks, dtype=jnp.int32)
     carry, saved = loop(lambda c, k: steps(c, k, plan.block), carry, starts)
-    if plan.tail:
-        carry, last = steps(carry, first + plan.num_blocks * plan.block, plan.tail)
-        if plan.save_tail:
-            saved = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), saved, last)
-    return carry, saved
+    if not plan.tail:
+        return carry, saved, None
+    carry, tail = steps(carry, first + plan.num_blocks * plan.block, plan.tail)
+    return carry, saved, tail
 
 
-def finish(problem: Problem, carry: Carry, saved: Saved) -> PyTree:
-    """The pytree `observe` with every observable replaced by its values."""
+def reduce(problem: Problem, carry: Carry) -> list[Array]:
+    """The reduced values, in tree order."""
     _, reductions = problem.observables()
-    reduced = iter(r.finish(memory) for r, memory in zip(reductions, carry.reductions, strict=True))
-    alone = iter(saved.observed)
+    return [r.finish(memory) for r, memory in zip(reductions, carry.reductions, strict=True)]
+
+
+def with_tail(plan: Plan, saved: Saved, tail: Saved | None) -> Saved:
+    """What was saved, the end of the tail included where it is asked for."""
+    saved = saved._replace(inner=None)
+    if tail is None or not plan.save_tail:
+        return saved
+    tail = tail._replace(inner=None)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), saved, tail)
+
+
+def observed(observe: PyTree, saved: Saved, reduced: list[Array]) -> PyTree:
+    """The pytree `observe` with every observable replaced by its values."""
+    values, alone = iter(reduced), iter(saved.observed)
     return jax.tree.map(
-        lambda f: next(reduced) if isinstance(f, Reduction) else next(alone),
-        problem.observe,
+        lambda f: next(values) if isinstance(f, Reduction) else next(alone),
+        observe,
         is_leaf=is_observable,
     )
 

@@ -57,7 +57,7 @@ class System(eqx.Module):
         self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
     ) -> Scalar:
         """H_D(t0, t1, q0, p1) + ε H1_D(t0, t1, q0, p1): a scalar [energy]."""
-        s0, s1 = self._times(t0, t1, epsilon)
+        s0, s1 = self.times(t0, t1, epsilon)
         H = self.H_D(s0, s1, q0, p1, args)
         if self.perturbation is not None:
             H = H + epsilon * self.perturbation(s0, s1, q0, p1, args)
@@ -69,10 +69,11 @@ class System(eqx.Module):
         """ε W(t0, t1, q0, p1): an array like q0 [energy / unit of q]; zero without a force."""
         if self.force is None:
             return jnp.zeros_like(q0)
-        s0, s1 = self._times(t0, t1, epsilon)
+        s0, s1 = self.times(t0, t1, epsilon)
         return epsilon * self.force(s0, s1, q0, p1, args)
 
-    def _times(self, t0: Scalar, t1: Scalar, epsilon: Scalar) -> tuple[Scalar, Scalar]:
+    def times(self, t0: Scalar, t1: Scalar, epsilon: Scalar) -> tuple[Scalar, Scalar]:
+        """The times that the user's functions receive: slow ones if `slow_time` is set."""
         return (epsilon * t0, epsilon * t1) if self.slow_time else (t0, t1)
 
     def check_shapes(self, t: Scalar, q: State, p: State, epsilon: Scalar, args: Args) -> None:

@@ -1,7 +1,7 @@
 """Names for the arrays and functions that pass between the rooms."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 from jaxtyping import Array, Float, Inexact
 
@@ -36,3 +36,10 @@ class Interval(NamedTuple):
         t0 = self.t0 + start * self.h if start != 0 else self.t0
         t1 = self.t0 + end * self.h if end != 1 else self.t1
         return Interval(t0, t1, (end - start) * self.h)
+
+
+@runtime_checkable
+class Bindable(Protocol):
+    """An observable that has to know the system and ε of the run it watches."""
+
+    def bind(self, system: Any, epsilon: Any) -> Callable[..., Any]: ...

@@ -1,5 +1,7 @@
 """The adjoint of another method."""
 
+from typing import ClassVar
+
 import equinox as eqx
 
 from ._base import Method
@@ -18,9 +20,16 @@ class Adjoint(Method):
 
     method: Method = eqx.field(default_factory=TypeII)
 
+    is_invertible: ClassVar[bool] = True
+
     def __check_init__(self):
         if not isinstance(self.method, Method):
             raise TypeError(f"Adjoint takes a method such as dvi.TypeII(), got {self.method!r}.")
+        if not self.method.is_invertible:
+            raise ValueError(
+                f"{self.method!r} has no inverse step, so it has no adjoint here: take a "
+                "variational method."
+            )
 
     @property
     def order(self) -> int:

@@ -18,6 +18,7 @@ class Method(eqx.Module):
     order: eqx.AbstractVar[int]
     is_symmetric: eqx.AbstractVar[bool]
     is_symplectic: eqx.AbstractVar[bool]
+    is_invertible: eqx.AbstractVar[bool]
 
     @abc.abstractmethod
     def step(

@@ -1,7 +1,9 @@
 """Compositions of the map with its adjoint."""
 
+import abc
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import equinox as eqx
 
@@ -17,7 +19,11 @@ class CompositionMethod(Method):
     The inverse undoes the parts in the opposite order.
     """
 
-    coefficients: eqx.AbstractVar[tuple[float, ...]]
+    is_invertible: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def fractions(self) -> tuple[float, ...]:
+        """c₁, c₂, …: the map takes the odd ones, its adjoint the even ones; they sum to 1."""
 
     def step(self, system, interval, q0, p0, epsilon, args, newton):
         q, p, info = q0, p0, None
@@ -40,9 +46,10 @@ class CompositionMethod(Method):
         return q, p, info
 
     def _parts(self, interval):
+        fractions = self.fractions()
         start, parts = 0.0, []
-        for i, c in enumerate(self.coefficients):
-            end = 1.0 if i + 1 == len(self.coefficients) else start + c
+        for i, c in enumerate(fractions):
+            end = 1.0 if i + 1 == len(fractions) else start + c
             part = interval.part(start, end)
             parts.append(part._replace(h=c * interval.h))
             start = end
@@ -89,6 +96,9 @@ class Composition(CompositionMethod):
                 "the coefficients of a composition must be finite and sum to 1 (consistency); "
                 f"got {c}" + (f", which sum to {math.fsum(c)!r}." if c else ".")
             )
+
+    def fractions(self):
+        return self.coefficients
 
     @property
     def is_symmetric(self) -> bool:

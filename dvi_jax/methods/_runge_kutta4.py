@@ -24,6 +24,7 @@ class RungeKutta4(Method):
     order: ClassVar[int] = 4
     is_symmetric: ClassVar[bool] = False
     is_symplectic: ClassVar[bool] = False
+    is_invertible: ClassVar[bool] = False
 
     def step(self, system, interval, q0, p0, epsilon, args, newton):
         del newton

@@ -17,4 +17,6 @@ class Strang(CompositionMethod):
     order: ClassVar[int] = 2
     is_symmetric: ClassVar[bool] = True
     is_symplectic: ClassVar[bool] = True
-    coefficients: ClassVar[tuple[float, ...]] = (0.5, 0.5)
+
+    def fractions(self):
+        return (0.5, 0.5)

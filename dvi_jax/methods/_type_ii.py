@@ -21,6 +21,7 @@ class TypeII(Method):
     order: ClassVar[int] = 1
     is_symmetric: ClassVar[bool] = False
     is_symplectic: ClassVar[bool] = True
+    is_invertible: ClassVar[bool] = True
 
     def step(self, system, interval, q0, p0, epsilon, args, newton):
         return step(system, interval, q0, p0, epsilon, args, newton)

@@ -30,8 +30,7 @@ class Yoshida(CompositionMethod):
                 "coefficients of your own, dvi.Composition(coefficients, order=...)."
             )
 
-    @property
-    def coefficients(self) -> tuple[float, ...]:
+    def fractions(self):
         outer = 1.0 / (2.0 - 2.0 ** (1.0 / 3.0))
         inner = 1.0 - 2.0 * outer
         return tuple(c / 2 for c in (outer, outer, inner, inner, outer, outer))

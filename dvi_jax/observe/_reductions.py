@@ -33,6 +33,15 @@ class Reduction(eqx.Module):
     def finish(self, memory: Any) -> Array:
         """The reduced value, NaN when there was no step."""
 
+    @abc.abstractmethod
+    def pull(
+        self, memory: Any, cotangent: Array, k: Array, t: Scalar, value: Array
+    ) -> tuple[Array, Array]:
+        """Cotangents of t and of the value at step k, given that of the reduced value.
+
+        `memory` is the final one: a reversible gradient asks for the steps in any order.
+        """
+
 
 class MaxDrift(Reduction):
     """Largest distance from the first value: max_k |f_k − f_1|, elementwise."""
@@ -40,16 +49,30 @@ class MaxDrift(Reduction):
     function: Callable[..., Any]
 
     def start(self, value):
-        return value, jnp.full_like(value, jnp.nan)
+        zero = jnp.zeros_like(value)
+        return value, jnp.full_like(value, jnp.nan), zero, jnp.zeros(value.shape, jnp.int32)
 
     def update(self, memory, k, t, value):
-        first, drift = memory
+        first, drift, sign, at = memory
         first = jnp.where(k == 0, value, first)
-        drift = jnp.where(k == 0, jnp.zeros_like(drift), drift)
-        return first, jnp.maximum(drift, jnp.abs(value - first))
+        distance = jnp.abs(value - first)
+        # Written so that NaN, once seen, stays.
+        larger = (k == 0) | ~(distance <= drift)
+        larger = larger & ~(jnp.isnan(drift) & (k > 0))
+        return (
+            first,
+            jnp.where(larger, distance, drift),
+            jnp.where(larger, jnp.sign(value - first), sign),
+            jnp.where(larger, k, at),
+        )
 
     def finish(self, memory):
         return memory[1]
+
+    def pull(self, memory, cotangent, k, t, value):
+        _, _, sign, at = memory
+        slope = jnp.where(k == at, sign, 0) - jnp.where(k == 0, sign, 0)
+        return jnp.zeros_like(t), cotangent * slope
 
 
 class Range(Reduction):
@@ -58,16 +81,28 @@ class Range(Reduction):
     function: Callable[..., Any]
 
     def start(self, value):
-        return jnp.full_like(value, jnp.nan), jnp.full_like(value, jnp.nan)
+        nan, at = jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
+        return nan, nan, at, at
 
     def update(self, memory, k, t, value):
-        low, high = memory
-        low = jnp.where(k == 0, value, jnp.minimum(low, value))
-        high = jnp.where(k == 0, value, jnp.maximum(high, value))
-        return low, high
+        low, high, at_low, at_high = memory
+        failed = jnp.isnan(low) & (k > 0)
+        lower = ((k == 0) | ~(value >= low)) & ~failed
+        higher = ((k == 0) | ~(value <= high)) & ~failed
+        return (
+            jnp.where(lower, value, low),
+            jnp.where(higher, value, high),
+            jnp.where(lower, k, at_low),
+            jnp.where(higher, k, at_high),
+        )
 
     def finish(self, memory):
         return memory[1] - memory[0]
+
+    def pull(self, memory, cotangent, k, t, value):
+        _, _, at_low, at_high = memory
+        slope = jnp.where(k == at_high, 1.0, 0.0) - jnp.where(k == at_low, 1.0, 0.0)
+        return jnp.zeros_like(t), cotangent * slope
 
 
 class Trend(Reduction):
@@ -75,7 +110,7 @@ class Trend(Reduction):
 
         Σ (t_k − t̄)(f_k − f̄) / Σ (t_k − t̄)²
 
-    Means and moments are updated together (Welford), so long runs do not cancel. NaN for
+    Means and moments are updated together (Welford 1962), so long runs do not cancel. NaN for
     fewer than two steps.
     """
 
@@ -97,6 +132,11 @@ class Trend(Reduction):
         _, _, t_t, t_f = memory
         return t_f / t_t
 
+    def pull(self, memory, cotangent, k, t, value):
+        mean_t, mean_f, t_t, t_f = memory
+        from_t = (value - mean_f - 2 * (t_f / t_t) * (t - mean_t)) / t_t
+        return jnp.sum(cotangent * from_t), cotangent * (t - mean_t) / t_t
+
 
 class Mean(Reduction):
     """Mean over the steps: (1/N) Σ f_k, elementwise."""
@@ -104,14 +144,18 @@ class Mean(Reduction):
     function: Callable[..., Any]
 
     def start(self, value):
-        return jnp.full_like(value, jnp.nan)
+        return jnp.full_like(value, jnp.nan), jnp.asarray(0, jnp.int32)
 
     def update(self, memory, k, t, value):
-        mean = jnp.where(k == 0, jnp.zeros_like(memory), memory)
-        return mean + (value - mean) / jnp.asarray(k + 1, value.dtype)
+        mean, _ = memory
+        mean = jnp.where(k == 0, jnp.zeros_like(mean), mean)
+        return mean + (value - mean) / jnp.asarray(k + 1, value.dtype), k + 1
 
     def finish(self, memory):
-        return memory
+        return memory[0]
+
+    def pull(self, memory, cotangent, k, t, value):
+        return jnp.zeros_like(t), cotangent / jnp.asarray(memory[1], value.dtype)
 
 
 class Last(Reduction):
@@ -120,10 +164,13 @@ class Last(Reduction):
     function: Callable[..., Any]
 
     def start(self, value):
-        return jnp.full_like(value, jnp.nan)
+        return jnp.full_like(value, jnp.nan), jnp.asarray(0, jnp.int32)
 
     def update(self, memory, k, t, value):
-        return value
+        return value, k
 
     def finish(self, memory):
-        return memory
+        return memory[0]
+
+    def pull(self, memory, cotangent, k, t, value):
+        return jnp.zeros_like(t), jnp.where(k == memory[1], cotangent, 0)

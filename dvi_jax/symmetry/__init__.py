@@ -1,0 +1,15 @@
+"""Symmetries of the discrete equations, and the invariants that follow from them."""
+
+from .determining import (
+    conformal_factor as conformal_factor,
+    determining_residual as determining_residual,
+    discrete_equations as discrete_equations,
+)
+from .generators import Generator as Generator, LatticePoint as LatticePoint, prolong as prolong
+from .noether import (
+    AdiabaticInvariant as AdiabaticInvariant,
+    incoming_energy as incoming_energy,
+    lattice_defect as lattice_defect,
+    noether_identity as noether_identity,
+    outgoing_energy as outgoing_energy,
+)

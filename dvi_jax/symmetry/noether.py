@@ -1,0 +1,155 @@
+"""Noether's identity, and the adiabatic invariant it leads to."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._system import System
+from .._types import Args, Scalar, State
+from .generators import Generator, LatticePoint, prolong
+
+Gauge = Callable[..., Any]
+"""``G(t, q, p, args)`` → scalar [action] at a lattice point."""
+
+
+def outgoing_energy(
+    system: System, t0: Any, t1: Any, q0: State, p1: State, epsilon: Any = 0.0, args: Args = None
+) -> Scalar:
+    """E⁺ = H_D − h ∂H_D/∂t0 of the step from t0 to t1 [energy], as it leaves its first point."""
+    value, slope = jax.value_and_grad(system.hamiltonian)(t0, t1, q0, p1, epsilon, args)
+    return value - (t1 - t0) * slope
+
+
+def incoming_energy(
+    system: System, t0: Any, t1: Any, q0: State, p1: State, epsilon: Any = 0.0, args: Args = None
+) -> Scalar:
+    """E⁻ = H_D + h ∂H_D/∂t1 of the step from t0 to t1 [energy], as it reaches its second point."""
+    value, slope = jax.value_and_grad(system.hamiltonian, argnums=1)(t0, t1, q0, p1, epsilon, args)
+    return value + (t1 - t0) * slope
+
+
+def lattice_defect(
+    system: System,
+    points: Sequence[LatticePoint],
+    epsilon: Any = 0.0,
+    args: Args = None,
+) -> Scalar:
+    r"""The residual r of the lattice equation at the middle of three points [power].
+
+        r = (E⁺_k − E⁻_k − εW_k·(q_{k+1} − q_k)) / h_k
+
+    Zero when the lattice obeys (14); on a fixed mesh it is what energy is not conserved by.
+
+    **Source** the paper's (11) and (14) with the signs mended: (14) prints −H_{D,k−1} and
+    differentiates it in t_{k−1}; stationarity in t_k gives the form above.
+    """
+    (t_, q_, _), (t0, q0, p0), (t1, q1, p1) = points
+    work = jnp.sum(system.disturbing_force(t0, t1, q0, p1, epsilon, args) * (q1 - q0))
+    leaving = outgoing_energy(system, t0, t1, q0, p1, epsilon, args)
+    arriving = incoming_energy(system, t_, t0, q_, p0, epsilon, args)
+    return (leaving - arriving - work) / (t1 - t0)
+
+
+def noether_identity(
+    system: System,
+    generators: Sequence[Generator],
+    gauges: Sequence[Gauge | None],
+    order: int,
+    first: LatticePoint,
+    second: LatticePoint,
+    epsilon: Any = 0.0,
+    args: Args = None,
+) -> Scalar:
+    r"""The left side N_m of Noether's identity of order m between two lattice points [energy].
+
+        N_m = pr X_m(S)/h + W·(ξ_{m−1} − Dq ξ0_{m−1}) + D G_m,    S = p1·(q1 − q0) − h H_D
+
+    with D f = (f_{k+1} − f_k)/h and no W term for m = 0. It has to vanish on the solutions of the
+    *disturbed* map for `AdiabaticInvariant` to be one.
+
+    **Arguments** `generators`, `gauges`: the series, order 0 first (a gauge None is zero);
+    `order`: m.
+
+    **Source** the paper, (25) and (28).
+    """
+    first = LatticePoint(*map(jnp.asarray, first))
+    second = LatticePoint(*map(jnp.asarray, second))
+    h = second.t - first.t
+
+    def action(first, second):
+        (t0, q0, _), (t1, q1, p1) = first, second
+        H = system.hamiltonian(t0, t1, q0, p1, epsilon, args)
+        return jnp.sum(p1 * (q1 - q0)) - (t1 - t0) * H
+
+    identity = prolong(generators[order], action, (first, second), args=args) / h
+    if order > 0 and system.force is not None:
+        W = system.force(*system.times(first.t, second.t, epsilon), first.q, second.p, args)
+        xi0, xi, _ = generators[order - 1](first, args)
+        identity = identity + jnp.sum(W * (xi - (second.q - first.q) / h * xi0))
+    gauge = gauges[order]
+    if gauge is not None:
+        identity = identity + (gauge(*second, args) - gauge(*first, args)) / h
+    return identity
+
+
+class AdiabaticInvariant(eqx.Module):
+    r"""The adiabatic invariant of order z that a series of generators and gauges leads to.
+
+        I_z = Σ_{m≤z} ε^m (ξ_m·p_k − ξ0_m E⁻_k + G_m)
+
+    at the end of a step of the map `TypeII`, where E⁻ = H_D + h ∂H_D/∂t1. It is an observable:
+    give it to `integrate` as it is, alone or in a reduction, and it is bound there to the
+    system and ε of the run. To call it elsewhere bind it first:
+    ``invariant.bind(system, epsilon)(t0, t1, q0, p0, q1, p1, args)``. (A composed step has no
+    single H_D: there E⁻ is taken of the whole step and differs from the energy by O(h).)
+
+    - `generators`, `gauges`: one for each order, order 0 first; z is their number less one. A
+      gauge G is a function ``(t, q, p, args)`` → scalar [action], or None for zero.
+
+    Whether it *is* invariant to that order is for `noether_identity` to say.
+
+    **Raises** `ValueError` when there are not as many generators as gauges, or none.
+
+    **Source** the paper, (26) (with its η·p mended to ξ·p) and (29).
+    """
+
+    generators: Sequence[Generator]
+    gauges: Sequence[Gauge | None]
+    system: System | None = None
+    epsilon: Any = None
+
+    def __check_init__(self):
+        if len(self.generators) != len(self.gauges) or not self.gauges:
+            raise ValueError(
+                "an invariant of order z needs z + 1 generators and z + 1 gauges (None for zero); "
+                f"got {len(self.generators)} and {len(self.gauges)}."
+            )
+
+    @property
+    def order(self) -> int:
+        """z, the order up to which the series goes."""
+        return len(self.gauges) - 1
+
+    def bind(self, system: System, epsilon: Any) -> "AdiabaticInvariant":
+        """The same invariant for this system and strength of the disturbance."""
+        return AdiabaticInvariant(self.generators, self.gauges, system, epsilon)
+
+    def __call__(self, t0, t1, q0, p0, q1, p1, args):
+        if self.system is None:
+            raise ValueError(
+                "an AdiabaticInvariant has to know the system and ε: call "
+                "invariant.bind(system, epsilon)(...), or give it to dvi.integrate(observe=...)."
+            )
+        energy = incoming_energy(self.system, t0, t1, q0, p1, self.epsilon, args)
+        end = LatticePoint(t1, q1, p1)
+        total = jnp.zeros((), q1.dtype)
+        for m, (generator, gauge) in enumerate(zip(self.generators, self.gauges, strict=True)):
+            xi0, xi, _ = generator(end, args)
+            term = jnp.sum(xi * p1) - xi0 * energy
+            if gauge is not None:
+                term = term + gauge(*end, args)
+            total = total + self.epsilon**m * term
+        return total
