@@ -2,8 +2,7 @@
 
 import abc
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,6 +19,7 @@ from ._rollout import (
     Problem,
     Saved,
     StepTaken,
+    counted_scan,
     reduce,
     run,
     start,
@@ -60,7 +60,7 @@ class Direct(AbstractAdjoint):
     """
 
     def rollout(self, problem, plan, q0, p0):
-        return _direct_rollout(problem, plan, q0, p0, lax.scan)
+        return _direct_rollout(problem, plan, q0, p0, counted_scan)
 
 
 class Checkpointed(AbstractAdjoint):
@@ -85,23 +85,24 @@ class Checkpointed(AbstractAdjoint):
     def rollout(self, problem, plan, q0, p0):
         return _direct_rollout(problem, plan, q0, p0, self._loop)
 
-    def _loop(self, body: Callable, carry: Any, xs: Any) -> tuple[Any, Any]:
-        length = len(jax.tree.leaves(xs)[0])
-        segments = min(self.segments or math.isqrt(length), max(length, 1))
-        size = length // max(segments, 1)
+    def _loop(self, body, carry, first, stride, count):
+        segments = min(self.segments or math.isqrt(count), count)
+        size = count // max(segments, 1)
         if size < 2:
-            return lax.scan(body, carry, xs)
-
-        @jax.checkpoint
-        def segment(carry, xs):
-            return lax.scan(body, carry, xs)
-
+            return counted_scan(body, carry, first, stride, count)
         whole = size * segments
-        head = jax.tree.map(lambda x: x[:whole].reshape(segments, size, *x.shape[1:]), xs)
-        carry, ys = lax.scan(segment, carry, head)
+
+        def segment(length):
+            @jax.checkpoint
+            def scan(carry, k):
+                return counted_scan(body, carry, k, stride, length)
+
+            return scan
+
+        carry, ys = counted_scan(segment(size), carry, first, stride * size, segments)
         ys = jax.tree.map(lambda y: y.reshape(whole, *y.shape[2:]), ys)
-        if whole < length:
-            carry, rest = segment(carry, jax.tree.map(lambda x: x[whole:], xs))
+        if whole < count:
+            carry, rest = segment(count - whole)(carry, first + stride * whole)
             ys = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), ys, rest)
         return carry, ys
 
@@ -146,7 +147,7 @@ class Reversible(AbstractAdjoint):
             theta, q0, p0 = inputs
             problem = eqx.combine(theta, fixed)
             carry, saved, tail = run(
-                problem, plan, start(problem, q0, p0), lax.scan, self._inner_loop
+                problem, plan, start(problem, q0, p0), counted_scan, self._inner_loop
             )
             smooth = _Smooth(carry.q, carry.p, with_tail(plan, saved, tail), reduce(problem, carry))
             return smooth, (carry, saved, tail)
@@ -191,20 +192,18 @@ class Reversible(AbstractAdjoint):
         smooth, (carry, _, _) = trajectory((theta, q0, p0))
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), smooth.saved, smooth.reduced)
 
-    def _inner_loop(self, body, state, numbers):
+    def _inner_loop(self, body, state, first, stride, count):
         """A scan over the steps of a block that keeps the state every `checkpoint_every` steps."""
-        count = len(numbers)
-        segments = (count - 1) // self.checkpoint_every  # the end of the block is kept anyway
+        size = self.checkpoint_every
+        segments = (count - 1) // size  # the end of the block is kept anyway
 
-        def segment(state, numbers):
-            state, _ = lax.scan(body, state, numbers)
+        def segment(state, k):
+            state, _ = counted_scan(body, state, k, stride, size)
             return state, (state[0].q, state[0].p)
 
-        whole = segments * self.checkpoint_every
-        state, ends = lax.scan(
-            segment, state, numbers[:whole].reshape(segments, self.checkpoint_every)
-        )
-        state, _ = lax.scan(body, state, numbers[whole:])
+        state, ends = counted_scan(segment, state, first, stride * size, segments)
+        whole = segments * size
+        state, _ = counted_scan(body, state, first + stride * whole, stride, count - whole)
         return state, ends
 
 
@@ -261,39 +260,37 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
             seeds.append(of_value.astype(value.dtype))
         of_theta, cq, cp = pull((seed, seeds))
         ok = info.result == RESULTS.successful
-        cq, cp = _or_nan(ok, cq), _or_nan(ok, cp)
-        return q0, p0, jax.tree.map(jnp.add, grad, of_theta), (cq, cp)
+        grad = jax.tree.map(jnp.add, grad, of_theta)
+        return q0, p0, *_all_or_nan(ok, (grad, (cq, cp)))
 
-    def undo_steps(known_start, end, numbers, last, at_save, grad, cot):
-        """The steps `numbers` back from the exact state `end`, checked against `known_start`."""
+    def undo_steps(known_start, end, first, count, last, at_save, grad, cot):
+        """`count` steps back from the exact state `end`, checked against `known_start`."""
 
         def body(state, k):
             return undo(state, k, k == last, at_save), None
 
-        (q, p, grad, cot), _ = lax.scan(body, (*end, grad, cot), numbers, reverse=True)
+        (q, p, grad, cot), _ = counted_scan(body, (*end, grad, cot), first, 1, count, reverse=True)
         defect = jnp.maximum(_distance(q, known_start[0]), _distance(p, known_start[1]))
-        ok = defect <= settings.max_defect
-        return grad, jax.tree.map(lambda c: _or_nan(ok, c), cot)
+        return _all_or_nan(defect <= settings.max_defect, (grad, cot))
 
-    def undo_block(known_start, saved: Saved, k, count, at_save, grad, cot):
-        last = k + count - 1
-        numbers = k + jnp.arange(count, dtype=jnp.int32)
+    def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):
+        last = first + count - 1
         end = (saved.q, saved.p)
-        if saved.inner is None or len(saved.inner[0]) == 0:
-            return undo_steps(known_start, end, numbers, last, at_save, grad, cot)
-        inner = saved.inner
-        segments, size = len(inner[0]), settings.checkpoint_every
-        whole = segments * size
+        segments = 0 if saved.inner is None else len(saved.inner[0])
+        if segments == 0:
+            return undo_steps(known_start, end, first, count, last, at_save, grad, cot)
+        inner, size = saved.inner, settings.checkpoint_every
         newest = jax.tree.map(lambda x: x[-1], inner)
-        grad, cot = undo_steps(newest, end, numbers[whole:], last, at_save, grad, cot)
+        k, rest = first + segments * size, count - segments * size
+        grad, cot = undo_steps(newest, end, k, rest, last, at_save, grad, cot)
 
         def segment(state, x):
-            start, end, numbers = x
-            return undo_steps(start, end, numbers, last, at_save, *state), None
+            k, grad, cot = state
+            start, end = x
+            return (k - size, *undo_steps(start, end, k, size, last, at_save, grad, cot)), None
 
         starts = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), known_start, inner)
-        pieces = numbers[:whole].reshape(segments, size)
-        (grad, cot), _ = lax.scan(segment, (grad, cot), (starts, inner, pieces), reverse=True)
+        (_, grad, cot), _ = lax.scan(segment, (k - size, grad, cot), (starts, inner), reverse=True)
         return grad, cot
 
     start_state = (q_start, p_start)
@@ -308,13 +305,15 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
         grad, cot = undo_block(newest, tail, k, plan.tail, at_save, grad, cot)
 
     def block(state, x):
-        known_start, saved, k, at_save = x
-        return undo_block(known_start, saved, k, plan.block, at_save, *state), None
+        k, grad, cot = state
+        known_start, saved, at_save = x
+        k = k - plan.block
+        return (k, *undo_block(known_start, saved, k, plan.block, at_save, grad, cot)), None
 
     starts = jax.tree.map(lambda x: x[:-1], ends)
-    numbers = plan.block * jnp.arange(plan.num_blocks, dtype=jnp.int32)
     rows = jax.tree.map(lambda x: x[: plan.num_blocks], rows)
-    (grad, cot), _ = lax.scan(block, (grad, cot), (starts, saved, numbers, rows), reverse=True)
+    k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
+    (_, grad, cot), _ = lax.scan(block, (k, grad, cot), (starts, saved, rows), reverse=True)
     return grad, *cot
 
 
@@ -324,5 +323,5 @@ def _distance(a, b):
     return jnp.max(jnp.abs(a - b), initial=0.0) / jnp.where(size > 0, size, 1)
 
 
-def _or_nan(good, x):
-    return jnp.where(good, x, jnp.full_like(x, jnp.nan))
+def _all_or_nan(good, tree):
+    return jax.tree.map(lambda x: jnp.where(good, x, jnp.full_like(x, jnp.nan)), tree)

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, PyTree
 
 from ._adjoints import AbstractAdjoint, Outcome, Reversible
@@ -16,6 +15,7 @@ from ._results import RESULTS, IntegrationError
 from ._rollout import (
     Plan,
     Problem,
+    counted_scan,
     is_observable,
     make_plan,
     observed,
@@ -143,7 +143,7 @@ def _begin(problem: Problem, q0, p0):
 
 @eqx.filter_jit
 def _piece(problem: Problem, plan: Plan, carry, first):
-    carry, saved, tail = run(problem, plan, carry, lax.scan, first=first)
+    carry, saved, tail = run(problem, plan, carry, counted_scan, first=first)
     return carry, with_tail(plan, saved, tail)
 
 
@@ -221,54 +221,57 @@ def _start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
 
 
 def _real_array(name: str, value: Any) -> Array:
-    if not is_traced(value):
-        try:
-            seen = value if isinstance(value, jax.Array) else np.asarray(value)
-        except Exception as error:  # a list that holds tracers
-            if not any(is_traced(x) for x in jax.tree.leaves(value)):
-                raise TypeError(f"{name} must be a real array, got {value!r} ({error}).") from None
-            return _real_array(name, jnp.stack([jnp.asarray(x) for x in value]))
-        _refuse_double_without_x64(name, seen.dtype)
-        if not (np.issubdtype(seen.dtype, np.integer) or jnp.issubdtype(seen.dtype, jnp.inexact)):
-            raise TypeError(f"{name} must be a real array, got dtype {seen.dtype}.")
-    array = jnp.asarray(value)
-    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+    if isinstance(value, list | tuple) and any(is_traced(x) for x in jax.tree.leaves(value)):
+        value = jnp.asarray(value)
+    if is_traced(value):
+        kind = value.dtype
+    else:
+        # In NumPy: under jit, jax.numpy would give tracers even for values that are known.
+        value = _as_numpy(name, value)
+        kind = value.dtype
+        _refuse_double_without_x64(name, kind)
+    if jnp.issubdtype(kind, jnp.complexfloating):
         raise TypeError(
-            f"{name} must be real, got dtype {array.dtype}. Write a complex variable as its real "
-            "and imaginary parts (a canonical pair, up to a factor)."
+            f"{name} must be real, got dtype {kind}. Write a complex variable as its real and "
+            "imaginary parts (a canonical pair, up to a factor)."
         )
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        array = array.astype(jnp.result_type(float))
-    if not is_traced(array) and not bool(jnp.all(jnp.isfinite(array))):
-        where = np.argwhere(~np.isfinite(np.asarray(array)))[0].tolist()
+    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+        raise TypeError(f"{name} must be a real array, got dtype {kind}.")
+    if isinstance(value, np.ndarray) and not np.isfinite(value).all():
+        where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
         raise ValueError(
-            f"{name} holds a value that is not finite at index {where}: "
-            f"{np.asarray(array)[tuple(where)]}. Every component of the start must be a number."
+            f"{name} holds a value that is not finite at index {list(where)}: {value[where]}. "
+            "Every component of the start must be a number."
         )
-    return array
+    array = jnp.asarray(value)
+    return array if jnp.issubdtype(kind, jnp.floating) else array.astype(jnp.result_type(float))
 
 
 def _scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
-    if not is_traced(value) and jnp.iscomplexobj(value):
-        raise TypeError(f"{name} must be real, got {value!r}.")
-    try:
-        array = jnp.asarray(value, dtype)
-    except (TypeError, ValueError):
-        raise TypeError(f"{name} must be a real number, got {value!r}.") from None
-    if array.shape != ():
+    known = None if is_traced(value) else _as_numpy(name, value)
+    kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
+    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+        raise TypeError(f"{name} must be a real number, got {value!r}.")
+    if shape != ():
         raise ValueError(
-            f"{name} must be one number, got shape {array.shape}. For several values use "
+            f"{name} must be one number, got shape {shape}. For several values use "
             f"jax.vmap over {name}" + (", or lattice=dvi.Given(ts)." if name == "h" else ".")
         )
-    if not is_traced(array):
-        if not bool(jnp.isfinite(array)):
-            raise ValueError(f"{name} must be finite, got {float(array)}.")
-        if not zero_allowed and float(array) == 0:
-            raise ValueError(
-                f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
-                "or a negative one (backward)."
-            )
-    return array
+    if known is not None and not np.isfinite(known):
+        raise ValueError(f"{name} must be finite, got {known}.")
+    if known is not None and not zero_allowed and known == 0:
+        raise ValueError(
+            f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
+            "or a negative one (backward)."
+        )
+    return jnp.asarray(value, dtype)
+
+
+def _as_numpy(name: str, value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be made of real numbers, got {value!r} ({error}).") from None
 
 
 def _parameter(leaf: Any) -> Any:

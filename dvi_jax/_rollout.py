@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from ._results import RESULTS, first_failure
@@ -17,8 +18,25 @@ from .lattices import Lattice
 from .methods import Method
 from .observe import Reduction
 
-Loop = Callable[[Callable, Any, Any], tuple[Any, Any]]
-"""A scan ``(body, carry, xs) -> (carry, ys)``: how gradients flow back through it is its own."""
+Loop = Callable[[Callable, Any, Array, int, int], tuple[Any, Any]]
+"""``(body, carry, first, stride, count) -> (carry, ys)``: `body(carry, k)` for k = first, first +
+stride, … `count` times. How gradients flow back through it is its own."""
+
+
+def counted_scan(
+    body: Callable, carry: Any, first: Array, stride: int, count: int, reverse: bool = False
+) -> tuple[Any, Any]:
+    """The plain `Loop`. The number of the step is carried: an array of them would grow."""
+    if reverse:
+        first, stride = first + stride * (count - 1), -stride
+
+    def counted(state, _):
+        k, carry = state
+        carry, y = body(carry, k)
+        return (k + stride, carry), y
+
+    (_, carry), ys = lax.scan(counted, (jnp.asarray(first, jnp.int32), carry), None, count)
+    return carry, ys
 
 
 class Problem(eqx.Module):
@@ -162,7 +180,7 @@ def take_step(problem: Problem, carry: Carry, k: Array) -> tuple[Carry, Interval
         r.update(memory, k, interval.t1, taken.value(problem.bound(r.function), problem.args))
         for r, memory in zip(reductions, carry.reductions, strict=True)
     ]
-    residual = jax.lax.stop_gradient(info.residual)
+    residual = lax.stop_gradient(info.residual)
     return (
         Carry(
             q1,
@@ -208,14 +226,14 @@ def run(
         else:
             interval = problem.lattice.interval(problem.t0, problem.h, k)
             none_yet = StepTaken(*interval[:2], carry.q, carry.p, carry.q, carry.p)
-            numbers = k + jnp.arange(count, dtype=jnp.int32)
-            state, inner = inner_loop(body, (carry, interval, none_yet), numbers)
+            state, inner = inner_loop(body, (carry, interval, none_yet), k, 1, count)
         carry, interval, taken = state
         observed = [taken.value(f, problem.args) for f in alone]
         return carry, Saved(interval.t1, interval.h, taken.q1, taken.p1, observed, inner)
 
-    starts = first + plan.block * jnp.arange(plan.num_blocks, dtype=jnp.int32)
-    carry, saved = loop(lambda c, k: steps(c, k, plan.block), carry, starts)
+    carry, saved = loop(
+        lambda c, k: steps(c, k, plan.block), carry, first, plan.block, plan.num_blocks
+    )
     if not plan.tail:
         return carry, saved, None
     carry, tail = steps(carry, first + plan.num_blocks * plan.block, plan.tail)

@@ -29,6 +29,14 @@ class StepInfo(NamedTuple):
         )
 
 
+def no_step_yet(like: State) -> StepInfo:
+    """The information that `StepInfo.then` starts from."""
+    real = jnp.finfo(like.dtype).dtype
+    zero = jnp.asarray(0, jnp.int32)
+    good = RESULTS.where(jnp.asarray(True), RESULTS.successful, RESULTS.not_finite)
+    return StepInfo(good, zero, jnp.zeros((), real))
+
+
 def momentum_rate(
     system: System, interval: Interval, q0: State, p1: State, epsilon: Scalar, args: Args
 ) -> State:

@@ -84,17 +84,17 @@ def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str) -> Figu
     """Sizes of relative changes of conserved quantities, on one logarithmic axis."""
     figure, axis = plt.subplots()
     for (label, values), colour in zip(series.items(), itertools.cycle(COLOURS), strict=False):
-        values = np.asarray(values)
-        # Zero has no logarithm; round-off of one unit stands for "no change at all".
-        shown = np.maximum(values, np.finfo(float).eps / 16)
-        axis.semilogy(ts, shown, color=colour, linewidth=0.9, label=label)
+        # The start itself, where the change is 0, has no place on this axis.
+        axis.semilogy(ts[1:], np.asarray(values)[1:], color=colour, linewidth=0.9, label=label)
     axis.axhline(np.finfo(float).eps, color="#777777", linewidth=1, linestyle=":")
     axis.annotate(
         "rounding of one operation", (1, np.finfo(float).eps), xycoords=("axes fraction", "data"),
         ha="right", va="bottom", fontsize=8, color="#555555",
     )  # fmt: skip
     axis.set(xlabel=time, ylabel="relative change since the start", title=title)
-    figure.legend(loc="outside lower center", ncols=len(series))
+    legend = figure.legend(loc="outside lower center", ncols=len(series))
+    for line in legend.get_lines():
+        line.set_linewidth(2.5)
     return figure
 
 
@@ -118,7 +118,7 @@ def trajectory(
     if bodies is not None:
         for i, colour in zip(range(bodies.shape[1]), itertools.cycle(COLOURS), strict=False):
             x, y = bodies[:, i, 0], bodies[:, i, 1]
-            axis.plot(x, y, color=colour, linewidth=0.8, alpha=0.85)
+            axis.plot(x, y, color=colour, linewidth=0.8, alpha=0.85, linestyle=DASHES[i % 7])
             axis.plot(x[:1], y[:1], "o", color=colour, markerfacecolor="white", zorder=3)
         axis.plot([], [], "o", color="#444444", markerfacecolor="white", label="start")
         axis.set(xlabel=f"q$_1${unit}", ylabel=f"q$_2${unit}")
@@ -133,7 +133,7 @@ def trajectory(
     else:
         flat = qs.reshape(len(ts), -1)
         for i in range(flat.shape[1]):
-            style = {"color": COLOURS[i % len(COLOURS)], "linestyle": DASHES[i // len(COLOURS) % 7]}
+            style = {"color": COLOURS[i % len(COLOURS)], "linestyle": DASHES[i % 7]}
             axis.plot(ts, flat[:, i], linewidth=1, label=f"q$_{{{i + 1}}}$", **style)
         axis.set(xlabel=time, ylabel=f"q{unit}")
         if flat.shape[1] <= 12:
@@ -184,7 +184,10 @@ def ephemeris_comparison(
       `intercept` [″] of its fitted line.
     """
     years, errors, perihelion = np.asarray(years), np.asarray(errors), np.asarray(perihelion)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10.4, 4.8))
+    figure = plt.figure(figsize=(10.4, 5.2))
+    grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
+    left, right = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
+    below = figure.add_subplot(grid[1, 1], sharex=right)
     for i, name in enumerate(names):
         x, y = _upper_envelope(years, errors[:, i])
         left.semilogy(
@@ -197,18 +200,23 @@ def ephemeris_comparison(
         title="Heliocentric position, integration − DE421",
     )
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
-    right.plot(years, perihelion, ".", color=COLOURS[0], markersize=2, label="osculating orbit")
+    right.plot(years, perihelion, ".", color=COLOURS[0], markersize=2, label="osculating orbits")
+    line = intercept + slope * years / 100
     if np.isfinite(slope):
         right.plot(
-            years, intercept + slope * years / 100, color=COLOURS[1], linewidth=1.5,
+            years, line, color=COLOURS[1], linewidth=1.2, linestyle="--",
             label=f"line: {slope:.2f}″ per century",
         )  # fmt: skip
+        below.plot(years, perihelion - line, color=COLOURS[0], linewidth=0.5)
+        below.axhline(0, color=COLOURS[1], linewidth=1.2, linestyle="--")
     right.set(
-        xlabel="years since the start",
         ylabel="ϖ(DE421) − ϖ(integration) [″]",
-        title="Mercury's perihelion: what Newton's law lacks",
+        title="Mercury's perihelion, DE421 − integration",
     )
-    right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, markerscale=3)
+    right.legend(loc="best", markerscale=3)
+    right.tick_params(labelbottom=False)
+    below.set(xlabel="years since the start", ylabel="minus the line [″]")
+    figure.align_ylabels([right, below])
     return figure
 
 
@@ -216,7 +224,7 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 
 
 def _upper_envelope(x: np.ndarray, y: np.ndarray, pieces: int = 100) -> tuple[Any, Any]:
-    """Largest value in each of about a hundred pieces: an oscillating error as one readable line."""
+    """Largest value in each of about a hundred pieces: a readable line."""
     if len(x) <= 2 * pieces:
         return x[1:], y[1:]
     parts = np.array_split(np.arange(1, len(x)), pieces)

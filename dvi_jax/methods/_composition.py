@@ -2,12 +2,22 @@
 
 import abc
 import math
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
 
-from .._step import adjoint_step, inverse_is_explicit, inverse_step, step, step_is_explicit
+from .._step import (
+    adjoint_step,
+    inverse_is_explicit,
+    inverse_step,
+    no_step_yet,
+    step,
+    step_is_explicit,
+)
 from ._base import Method
 
 
@@ -26,26 +36,45 @@ class CompositionMethod(Method):
         """c₁, c₂, …: the map takes the odd ones, its adjoint the even ones; they sum to 1."""
 
     def step(self, system, interval, q0, p0, epsilon, args, newton):
-        q, p, info = q0, p0, None
-        for i, part in enumerate(self._parts(interval)):
-            advance = step if i % 2 == 0 else adjoint_step
-            q, p, part_info = advance(system, part, q, p, epsilon, args, newton)
-            info = part_info if info is None else info.then(part_info)
-        assert info is not None
-        return q, p, info
+        def pair(state, parts):
+            """The map on the first part, then its adjoint on the second."""
+            q, p, info = state
+            q, p, one = step(system, parts[0], q, p, epsilon, args, newton)
+            q, p, two = adjoint_step(system, parts[1], q, p, epsilon, args, newton)
+            return q, p, info.then(one).then(two)
+
+        def single(state, part):
+            q, p, info = state
+            q, p, one = step(system, part, q, p, epsilon, args, newton)
+            return q, p, info.then(one)
+
+        explicit = self._needs_no_solve(system, interval, q0, epsilon, args)
+        state = (q0, p0, no_step_yet(q0))
+        pairs, rest = self._parts(interval)
+        state = _each(pair, state, pairs, unrolled=explicit)
+        return single(state, rest) if rest is not None else state
 
     def inverse(self, system, interval, q1, p1, epsilon, args, newton):
-        q, p, info = q1, p1, None
-        for i, part in reversed(list(enumerate(self._parts(interval)))):
-            if i % 2 == 0:
-                q, p, part_info = inverse_step(system, part, q, p, epsilon, args, newton)
-            else:
-                q, p, part_info = step(system, part.reversed(), q, p, epsilon, args, newton)
-            info = part_info if info is None else info.then(part_info)
-        assert info is not None
-        return q, p, info
+        def single(state, part):
+            q, p, info = state
+            q, p, one = inverse_step(system, part, q, p, epsilon, args, newton)
+            return q, p, info.then(one)
+
+        def pair(state, parts):
+            q, p, info = state
+            q, p, one = step(system, parts[1].reversed(), q, p, epsilon, args, newton)
+            q, p, two = inverse_step(system, parts[0], q, p, epsilon, args, newton)
+            return q, p, info.then(one).then(two)
+
+        explicit = self._needs_no_solve(system, interval, q1, epsilon, args)
+        state = (q1, p1, no_step_yet(q1))
+        pairs, rest = self._parts(interval)
+        if rest is not None:
+            state = single(state, rest)
+        return _each(pair, state, pairs[::-1], unrolled=explicit)
 
     def _parts(self, interval):
+        """The interval cut into pairs of parts, and the part that is left when they are odd."""
         fractions = self.fractions()
         start, parts = 0.0, []
         for i, c in enumerate(fractions):
@@ -53,7 +82,8 @@ class CompositionMethod(Method):
             part = interval.part(start, end)
             parts.append(part._replace(h=c * interval.h))
             start = end
-        return parts
+        pairs = list(zip(parts[0::2], parts[1::2], strict=False))
+        return pairs, parts[-1] if len(parts) % 2 else None
 
     def _needs_no_solve(self, system, interval, q, epsilon, args) -> bool:
         return step_is_explicit(system, interval, q, q, epsilon, args) and inverse_is_explicit(
@@ -62,6 +92,19 @@ class CompositionMethod(Method):
 
     def _inverse_needs_no_solve(self, system, interval, q, epsilon, args) -> bool:
         return self._needs_no_solve(system, interval, q, epsilon, args)
+
+
+def _each(body: Callable, state: Any, pairs: list, unrolled: bool) -> Any:
+    """`body` on each pair in turn: written out when that lets the arithmetic fuse, else a scan.
+
+    An implicit pair is a loop already, and writing out many of them only costs compile time.
+    """
+    if unrolled or len(pairs) < 2:
+        for parts in pairs:
+            state = body(state, parts)
+        return state
+    stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *pairs)
+    return lax.scan(lambda s, parts: (body(s, parts), None), state, stacked)[0]
 
 
 def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:

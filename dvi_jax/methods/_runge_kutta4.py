@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from .._results import RESULTS
-from .._step import StepInfo, momentum_rate, position_rate
+from .._step import momentum_rate, no_step_yet, position_rate
 from .._types import Interval
 from ._base import Method
 
@@ -46,7 +46,7 @@ class RungeKutta4(Method):
         p1 = p0 + h / 6 * (kp1 + 2 * kp2 + 2 * kp3 + kp4)
         finite = jnp.all(jnp.isfinite(q1)) & jnp.all(jnp.isfinite(p1))
         result = RESULTS.where(finite, RESULTS.successful, RESULTS.not_finite)
-        return q1, p1, StepInfo(result, jnp.asarray(0, jnp.int32), jnp.zeros((), q1.dtype))
+        return q1, p1, no_step_yet(q1)._replace(result=result)
 
     def inverse(self, system, interval, q1, p1, epsilon, args, newton):
         raise TypeError(

@@ -16,6 +16,8 @@ class Problem:
     - `observables`: name → function of one step ``(t0, t1, q0, p0, q1, p1, args)``.
     - `units`: what q, p, t and energy are measured in.
     - `source`: where equations and values come from.
+    - `check`: function ``(q0, p0, args)`` that raises `ValueError` for a start that the system
+      cannot go on from; or None.
     """
 
     name: str
@@ -27,3 +29,4 @@ class Problem:
     observables: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     source: str = ""
+    check: Callable[[Any, Any, Any], None] | None = None

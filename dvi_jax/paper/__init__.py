@@ -1,0 +1,3 @@
+"""The paper, reproduced: its figures redrawn, its claims measured and judged."""
+
+from ._reproduce import reproduce as reproduce

@@ -1,0 +1,211 @@
+"""Measurements on the oscillator: Figures 1 to 3, the crossover, the sweep of (34)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dvi_jax as dvi
+from dvi_jax import systems
+
+from .numbers import crossing
+
+Tick = Callable[[float], None]
+"""Told the part of an experiment that is done, from 0 to 1."""
+
+STEPS = 10_000
+"""Length of the paper's runs in steps."""
+
+EPSILONS = (0.0, 1e-4, 1e-3, 1e-2, 1e-1)
+"""Strengths of the disturbance; the paper does not print its own."""
+
+
+@dataclass(frozen=True)
+class FixedMesh:
+    """The paper's run at its h = 0.1: 10 000 steps for five strengths of the disturbance.
+
+    `epsilons` (E,), `ts` (N,), `mixed` (E, N): (p_k² + q_{k−1}²)/2, `exact` (E, N): what the
+    disturbed map keeps, `rk4` (N,): (p² + q²)/2 along RK4 at ε = 0, `energy`: its start.
+    Dimensionless, like all of the paper.
+    """
+
+    h: float
+    epsilons: np.ndarray
+    ts: np.ndarray
+    mixed: np.ndarray
+    exact: np.ndarray
+    rk4: np.ndarray
+    energy: float
+
+    @property
+    def printed(self) -> np.ndarray:
+        """(34) as printed, (1+ε)(p_k² + q_{k−1}²)/2, shape (E, N)."""
+        return (1 + self.epsilons[:, None]) * self.mixed
+
+
+@dataclass(frozen=True)
+class Crossover:
+    """When RK4's energy error outgrows the band of the variational method's energy.
+
+    `hs` (H,); `bands` (H,): range of (p_k² + q_{k−1}²)/2 over 10 000 steps; `steps` (H,): RK4
+    steps until its error is as large, measured (NaN: not within the run); `predicted` (H,):
+    the same from a loss of h⁶/72 of the energy per step; `loss` and `loss_theory`: that loss at
+    h = 0.1; `run_steps`, `run_errors` (S,): RK4's energy error at h = 0.1.
+    """
+
+    hs: np.ndarray
+    bands: np.ndarray
+    steps: np.ndarray
+    predicted: np.ndarray
+    loss: float
+    loss_theory: float
+    run_steps: np.ndarray
+    run_errors: np.ndarray
+
+
+@dataclass(frozen=True)
+class SmallStep:
+    """(34) as h → 0: order-4 composition, h = 0.01, t = 200.
+
+    `epsilons` (E,); ranges (E,) relative to the undisturbed energy of the start, of (34) as
+    printed and of (p² + (1+ε)q²)/2.
+    """
+
+    h: float
+    epsilons: np.ndarray
+    printed: np.ndarray
+    corrected: np.ndarray
+
+
+def fixed_mesh(tick: Tick) -> FixedMesh:
+    """The oscillator at the paper's h = 0.1, by the variational map and by RK4."""
+    problem = systems.oscillator()
+    h = problem.h
+    epsilons = np.array(EPSILONS)
+
+    def run(epsilon):
+        return dvi.integrate(
+            problem.system,
+            problem.q0,
+            problem.p0,
+            h=h,
+            num_steps=STEPS,
+            epsilon=epsilon,
+            observe=problem.observables["mixed_energy"],
+        )
+
+    variational = jax.vmap(run)(jnp.asarray(epsilons))
+    tick(0.5)
+    rk4 = dvi.integrate(
+        problem.system,
+        problem.q0,
+        problem.p0,
+        h=h,
+        num_steps=STEPS,
+        method=dvi.RungeKutta4(),
+        observe=problem.observables["energy"],
+    )
+    q, p = np.asarray(variational.qs)[..., 0], np.asarray(variational.ps)[..., 0]
+    stiffness = 1 + epsilons[:, None]
+    return FixedMesh(
+        h=h,
+        epsilons=epsilons,
+        ts=np.asarray(variational.ts)[0, 1:],
+        mixed=np.asarray(variational.observed),
+        # The disturbed map is the undisturbed one with stiffness 1 + ε, and so is its invariant.
+        exact=((p**2 + stiffness * q**2 - h * stiffness * q * p) / 2)[:, 1:],
+        rk4=np.asarray(rk4.observed),
+        energy=float(np.sum(np.square(problem.q0) + np.square(problem.p0)) / 2),
+    )
+
+
+def crossover(tick: Tick) -> Crossover:
+    """RK4 run until its energy error has passed the variational band, for several h."""
+    problem = systems.oscillator()
+    energy = problem.observables["energy"]
+    start = float(np.sum(np.square(problem.q0) + np.square(problem.p0)) / 2)
+    hs = np.array([0.1, 0.2, 0.3, 0.4])
+
+    def band(h):
+        return dvi.integrate(
+            problem.system,
+            problem.q0,
+            problem.p0,
+            h=h,
+            num_steps=STEPS,
+            save=dvi.Save(final=True),
+            observe=dvi.Range(problem.observables["mixed_energy"]),
+        ).observed
+
+    def rk4(h, num_steps, every, progress=None):
+        return dvi.integrate(
+            problem.system,
+            problem.q0,
+            problem.p0,
+            h=h,
+            num_steps=num_steps,
+            method=dvi.RungeKutta4(),
+            save=dvi.Save(every=every),
+            observe=energy,
+            progress=progress,
+        ).observed
+
+    bands = np.asarray(jax.vmap(band)(jnp.asarray(hs)))
+    long, every = 7_500_000, 2500
+    run = rk4(hs[0], long, every, lambda done, total: tick(0.9 * done / total))
+    short, often = 300_000, 20
+    others = jax.vmap(lambda h: rk4(h, short, often))(jnp.asarray(hs[1:]))
+
+    def history(values, every):
+        values = np.asarray(values)
+        return every * np.arange(1, len(values) + 1), np.abs(values - start)
+
+    runs = [history(run, every), *(history(values, often) for values in others)]
+    return Crossover(
+        hs=hs,
+        bands=bands,
+        steps=np.array([crossing(n, e, b) for (n, e), b in zip(runs, bands, strict=True)]),
+        # E_N = E_0 (1 − h⁶/72)^N, and the error is E_0 − E_N.
+        predicted=np.log1p(-bands / start) / np.log1p(-(hs**6) / 72),
+        loss=-float(np.expm1(np.log(float(run[-1]) / start) / long)),
+        loss_theory=hs[0] ** 6 / 72,
+        run_steps=runs[0][0],
+        run_errors=runs[0][1],
+    )
+
+
+def small_step(tick: Tick) -> SmallStep:
+    """The drift of (34) and of its corrected form against ε, with the mesh out of the way."""
+    problem = systems.oscillator()
+    h, epsilons = 0.01, np.array([1e-4, 2e-4, 1e-3, 1e-2, 1e-1])
+
+    def printed(t0, t1, q0, p0, q1, p1, args):
+        return (1 + args["epsilon"]) * (jnp.sum(p1**2) + jnp.sum(q1**2)) / 2
+
+    def corrected(t0, t1, q0, p0, q1, p1, args):
+        return (jnp.sum(p1**2) + (1 + args["epsilon"]) * jnp.sum(q1**2)) / 2
+
+    def run(epsilon):
+        return dvi.integrate(
+            problem.system,
+            problem.q0,
+            problem.p0,
+            h=h,
+            num_steps=round(200 / h),
+            epsilon=epsilon,
+            args={"epsilon": epsilon},
+            method=dvi.Yoshida(4),
+            save=dvi.Save(final=True),
+            observe={"printed": dvi.Range(printed), "corrected": dvi.Range(corrected)},
+        ).observed
+
+    ranges = jax.vmap(run)(jnp.asarray(epsilons))
+    start = float(np.sum(np.square(problem.q0) + np.square(problem.p0)) / 2)
+    return SmallStep(
+        h=h,
+        epsilons=epsilons,
+        printed=np.asarray(ranges["printed"]) / start,
+        corrected=np.asarray(ranges["corrected"]) / start,
+    )

@@ -1,0 +1,177 @@
+"""The TOML file of a run: its keys, their types, and nothing else."""
+
+import datetime
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ._errors import InputError, one_of, shown
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key: `read` makes the value or raises `ValueError`, `allowed` says what it takes."""
+
+    read: Callable[[Any], Any]
+    allowed: str
+    default: Any = None
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError
+    return value
+
+
+def _boolean(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError
+    return value
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise ValueError
+    return float(value)
+
+
+def _step_size(value: Any) -> float:
+    if _number(value) == 0:
+        raise ValueError
+    return float(value)
+
+
+def _count(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError
+    return value
+
+
+def _array(value: Any) -> np.ndarray:
+    """Nested arrays of finite numbers, all rows of one length."""
+    if not isinstance(value, list) or not value:
+        raise ValueError
+    for item in value:
+        _array(item) if isinstance(item, list) else _number(item)
+    return np.asarray(value, float)  # ValueError for rows of unequal length
+
+
+def _date(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, str | int | float | datetime.date):
+        raise ValueError
+    return value
+
+
+def _lattice(value: Any) -> Any:
+    if isinstance(value, dict):
+        if set(value) != {"times"}:
+            raise ValueError
+        times = _array(value["times"])
+        steps = np.diff(times) if times.ndim == 1 else np.zeros(1)
+        if not steps.size or not ((steps > 0).all() or (steps < 0).all()):
+            raise ValueError
+        return times
+    if value != "uniform":
+        raise ValueError
+    return value
+
+
+def _parameter(value: Any) -> Any:
+    """A leaf of args, or a table of them. Arrays become float arrays; whole numbers stay whole."""
+    if isinstance(value, dict):
+        return {name: _parameter(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return _array(value)
+    if isinstance(value, bool):
+        return value
+    return value if isinstance(value, int) else _number(value)
+
+
+_ARRAY = "an array of finite numbers, or of such arrays with rows of one length"
+
+KEYS: Mapping[str, Key | Mapping[str, Key]] = {
+    "system": Key(_text, 'the name of a system in the library, or "file.py:name"'),
+    "state": {
+        "q0": Key(_array, _ARRAY),
+        "p0": Key(_array, _ARRAY),
+        "date": Key(_date, 'a day such as "1900-01-01" or a Julian date; for solar_system alone'),
+    },
+    "args": Key(
+        lambda value: _parameter(value) if isinstance(value, dict) else _text(0),
+        "a table of numbers, booleans, arrays of numbers, or tables of these",
+    ),
+    "t0": Key(_number, "a finite number", 0.0),
+    "h": Key(_step_size, "a finite number that is not zero (negative runs backwards)"),
+    "steps": Key(_count, "a positive whole number"),
+    "epsilon": Key(_number, "a finite number", 0.0),
+    "method": Key(_text, 'text such as "TypeII", "Strang" or "Yoshida(4)"', "TypeII"),
+    "lattice": Key(
+        _lattice,
+        '"uniform", or {times = [t0, t1, …]} with at least two times, all increasing or all '
+        "decreasing",
+        "uniform",
+    ),
+    "observables": Key(
+        lambda value: (
+            {name: _text(inner) for name, inner in value.items()}
+            if isinstance(value, dict)
+            else _text(0)
+        ),
+        'a table of texts, such as energy = "energy" or drift = "MaxDrift(energy)"',
+    ),
+    "output": {
+        "dir": Key(_text, "the path of a directory that does not exist yet"),
+        "every": Key(_count, "a positive whole number: steps from one saved state to the next", 1),
+        "plots": Key(_boolean, "true or false", True),
+    },
+}
+"""Every key that a run file may hold."""
+
+
+def read_config(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The values of a run file with defaults filled in, and the file as it was.
+
+    Tables are flattened: ``"state.q0"``, ``"output.dir"``; a key that is absent is None.
+
+    **Raises** `InputError` for a missing or unreadable file, TOML that does not parse, an
+    unknown key and a value of the wrong type.
+    """
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(str(path), "there is no such file", "the path of a TOML file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(str(path), f"cannot be read: {error}", "a TOML file in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(str(path), f"is not TOML: {error}", "https://toml.io") from None
+    values = _read_table(KEYS, raw, "")
+    if values["system"] is None:
+        key = KEYS["system"]
+        assert isinstance(key, Key)
+        raise InputError("system", "the key is missing", key.allowed)
+    return values, raw
+
+
+def _read_table(keys: Mapping[str, Any], table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    for name in table:
+        if name not in keys:
+            raise InputError(prefix + name, "there is no such key", one_of(keys, name))
+    values = {}
+    for name, key in keys.items():
+        full, value = prefix + name, table.get(name)
+        if not isinstance(key, Key):
+            if value is not None and not isinstance(value, dict):
+                raise InputError(full, shown(value), f"a table with the keys {one_of(key)}")
+            values |= _read_table(key, value or {}, full + ".")
+        elif value is None:
+            values[full] = key.default
+        else:
+            try:
+                values[full] = key.read(value)
+            except ValueError:
+                raise InputError(full, shown(value), key.allowed) from None
+    return values

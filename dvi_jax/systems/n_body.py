@@ -1,0 +1,146 @@
+"""Bodies that attract one another by Newton's law."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ._problem import Problem
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    r"""Newtonian N-body Hamiltonian.
+
+        H_D = Σ_i |p1_i|² / (2 m_i) − G Σ_{i<j} m_i m_j / |q0_i − q0_j|
+
+    - `q0`: positions [length], shape (bodies, dim); `p1`: momenta [mass length / time].
+    - `args`: ``{"masses": (bodies,), "G": number}``; G is 1 when left out. With masses given as
+      GM [length³/time²] and G = 1 momenta and energy carry one factor G more, and the orbits
+      are the same.
+
+    Two bodies in one place give −∞ here and NaN in the step, hence the status `not_finite`.
+
+    **Raises** `ValueError` when the shapes of q0 and masses do not agree.
+    """
+    masses = jnp.asarray(args["masses"], q0.dtype)
+    if q0.ndim != 2 or masses.shape != q0.shape[:1]:
+        raise ValueError(
+            "the N-body system needs q0 of shape (bodies, dim) and masses of shape (bodies,); "
+            f"got q0 {q0.shape} and masses {masses.shape}."
+        )
+    kinetic = jnp.sum(jnp.sum(p1**2, axis=-1) / masses) / 2
+    # Every pair twice, and a body with itself at distance 1 but with weight 0: dense arrays
+    # that one kernel can run through, where a list of pairs would gather and scatter.
+    itself = jnp.eye(masses.shape[0], dtype=bool)
+    difference = q0[:, None, :] - q0[None, :, :]
+    distance = jnp.sqrt(jnp.where(itself, 1.0, jnp.sum(difference**2, axis=-1)))
+    weight = jnp.where(itself, 0.0, masses[:, None] * masses[None, :])
+    return kinetic - args.get("G", 1.0) * jnp.sum(weight / distance) / 2
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """Kinetic plus potential energy at t1 [mass length² / time²]."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def linear_momentum(t0, t1, q0, p0, q1, p1, args):
+    """Σ p_i at t1 [mass length / time], shape (dim,)."""
+    return jnp.sum(p1, axis=0)
+
+
+def angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """Σ q_i × p_i at t1 [mass length² / time]: shape (3,), or one number in the plane."""
+    if q1.shape[-1] == 2:
+        return jnp.sum(q1[:, 0] * p1[:, 1] - q1[:, 1] * p1[:, 0])
+    return jnp.sum(jnp.cross(q1, p1), axis=0)
+
+
+OBSERVABLES = {
+    "energy": energy,
+    "linear_momentum": linear_momentum,
+    "angular_momentum": angular_momentum,
+}
+
+
+def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None) -> None:
+    """A start that the N-body Hamiltonian can go on from, or an error that names the bodies.
+
+    Arguments as in `hamiltonian`, with values (not under jit); `names` of the bodies for the
+    message, else their indices.
+
+    **Raises** `ValueError` for shapes that do not agree, a mass that is not positive (its
+    momentum would fix no velocity), and two bodies closer than the rounding of their positions.
+    """
+    q, p = np.asarray(q0, float), np.asarray(p0, float)
+    masses = np.asarray(args["masses"], float)
+    if q.ndim != 2 or q.shape[-1] not in (2, 3) or p.shape != q.shape:
+        raise ValueError(
+            "q0 and p0 of N bodies must both have shape (bodies, 2) or (bodies, 3); got "
+            f"{q.shape} and {p.shape}."
+        )
+    if masses.shape != q.shape[:1]:
+        raise ValueError(
+            f"masses must hold one number for each of the {q.shape[0]} bodies; got shape "
+            f"{masses.shape}."
+        )
+
+    def called(i: int) -> str:
+        return names[i] if names is not None and len(names) == len(masses) else f"body {i}"
+
+    bad = ~(np.isfinite(masses) & (masses > 0))
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ValueError(
+            f"the mass of {called(i)} is {masses[i]}: every mass must be positive and finite. "
+            "For a test particle give a tiny mass, such as 1e-20 of the largest."
+        )
+    separation = np.linalg.norm(q[:, None, :] - q[None, :, :], axis=-1)
+    size = np.linalg.norm(q, axis=-1)
+    rounding = 4 * np.finfo(float).eps * np.maximum(size[:, None], size[None, :])
+    i, j = np.nonzero(np.triu(separation <= rounding, k=1))
+    if i.size:
+        a, b = int(i[0]), int(j[0])
+        raise ValueError(
+            f"{called(a)} and {called(b)} are on top of one another, at {q[a].tolist()}: their "
+            "attraction is infinite. Every two bodies must start apart."
+        )
+
+
+def n_body(
+    masses: Any = None, q0: Any = None, p0: Any = None, h: float = 0.01, G: float = 1.0
+) -> Problem:
+    """N bodies with the given masses and start; the figure eight of three when left out.
+
+    - `masses`: shape (bodies,). `q0`: positions, `p0`: momenta, shape (bodies, 2 or 3).
+    - `h`: a step size that suits the start [time]. `G`: the gravitational constant.
+
+    **Raises** `ValueError` for a start that `check_bodies` refuses, `TypeError` when only some
+    of masses, q0 and p0 are given.
+
+    **Source** figure eight: Chenciner & Montgomery 2000, *Ann. Math.* 152, 881; digits by
+    C. Simó, printed there. Period 6.32591398, unit masses, G = 1.
+    """
+    given = [x is not None for x in (masses, q0, p0)]
+    if any(given) and not all(given):
+        raise TypeError("n_body takes masses, q0 and p0 together, or none of them.")
+    if masses is None or q0 is None or p0 is None:
+        place, speed = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
+        masses = np.ones(3)
+        q0 = np.array([place, -place, np.zeros(2)])
+        p0 = np.array([-speed / 2, -speed / 2, speed])
+    args = {"masses": np.asarray(masses, float), "G": float(G)}
+    check_bodies(q0, p0, args)
+    return Problem(
+        name="n_body",
+        system=System(hamiltonian),
+        q0=np.asarray(q0, float),
+        p0=np.asarray(p0, float),
+        h=h,
+        args=args,
+        observables=OBSERVABLES,
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="Chenciner & Montgomery 2000, Ann. Math. 152, 881 (the figure eight)",
+        check=check_bodies,
+    )

@@ -1,0 +1,187 @@
+"""The Sun and its planets, started from a JPL ephemeris.
+
+Newton's law between ten points of mass; what general relativity, the Sun's oblateness and the
+asteroids add is left out, and is what a comparison with the ephemeris shows.
+"""
+
+import datetime
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._system import System
+from ._problem import Problem
+from .n_body import OBSERVABLES, check_bodies, hamiltonian
+
+BODIES = (
+    "Sun", "Mercury", "Venus", "Earth–Moon", "Mars",
+    "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto",
+)  # fmt: skip
+"""Names, in the order of every array here. Earth–Moon is their barycentre, and so are the
+planets with moons."""
+
+GM = np.array([
+    2.959122082855911e-4, 4.91254957186794e-11, 7.243452332698441e-10, 8.997011408268049e-10,
+    9.54954869562239e-11, 2.82534584085505e-7, 8.459706073308477e-8, 1.29202482579265e-8,
+    1.52435910924974e-8, 2.17844105199052e-12,
+])  # fmt: skip
+"""G times mass [au³/day²], as used in the making of DE421."""
+
+AU_IN_KM = 149597870.6996262
+"""The astronomical unit of DE421 [km]."""
+
+COVERAGE = (2414864.5, 2471184.5)
+"""First and last TDB Julian date of DE421: 1899-07-29 and 2053-10-09."""
+
+_CODES = (10, 1, 2, 3, 4, 5, 6, 7, 8, 9)  # NAIF numbers of BODIES
+_OBLIQUITY = np.deg2rad(84381.448 / 3600)  # of the ecliptic at J2000 (IAU 1976)
+_EXTRA = 'pip install "dvi-jax[ephemeris]"'
+
+
+class EphemerisMissing(ImportError):
+    """The ephemeris or its reader is not installed; the message has the command."""
+
+
+def julian_date(date: str | datetime.date | float) -> float:
+    """TDB Julian date of a calendar day at 0h, or of a number that is one already [day].
+
+    - `date`: ``"1900-01-01"`` (Gregorian), a `datetime.date`, or a Julian date.
+
+    **Raises** `ValueError` for another text, and for dates that DE421 does not cover.
+    """
+    if isinstance(date, str):
+        try:
+            date = datetime.date.fromisoformat(date)
+        except ValueError:
+            raise ValueError(
+                f'date must read like "1900-01-01" (year, month, day), got {date!r}.'
+            ) from None
+    if isinstance(date, datetime.datetime):
+        raise ValueError(f"date must be a day without a time of day, got {date}.")
+    if isinstance(date, datetime.date):
+        jd = date.toordinal() + 1721424.5
+    elif isinstance(date, int | float) and not isinstance(date, bool):
+        jd = float(date)
+    else:
+        raise ValueError(f"date must be a calendar day or a Julian date, got {date!r}.")
+    check_covered(jd)
+    return jd
+
+
+def check_covered(jd: Any) -> None:
+    """Refuse TDB Julian dates outside the ephemeris with a `ValueError`."""
+    first, last = COVERAGE
+    outside = np.atleast_1d(jd)[~((np.atleast_1d(jd) >= first) & (np.atleast_1d(jd) <= last))]
+    if outside.size:
+        raise ValueError(
+            f"the ephemeris DE421 covers 1899-07-29 to 2053-10-09 (Julian dates {first} to "
+            f"{last}); {outside[0]} lies outside."
+        )
+
+
+def ephemeris(jd: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Barycentric positions [au] and velocities [au/day] of `BODIES` by DE421.
+
+    - `jd`: TDB Julian dates [day], shape (times,).
+
+    Returns two arrays of shape (times, bodies, 3) on the axes of the ICRF (equator of J2000);
+    velocities are derivatives of the ephemeris's own Chebyshev polynomials. The file is the one
+    in the package skyfield-data; nothing is fetched.
+
+    **Raises** `EphemerisMissing` without the extra `ephemeris`; `ValueError` for dates outside
+    `COVERAGE`.
+
+    **Source** Folkner, Williams & Boggs 2009, *The planetary and lunar ephemeris DE 421*, IPN
+    Progress Report 42-178.
+    """
+    jd = np.asarray(jd, float)
+    if jd.ndim != 1:
+        raise ValueError(f"jd must be a one-dimensional array of dates, got shape {jd.shape}.")
+    check_covered(jd)
+    kernel = _kernel()
+    states = [kernel[0, code].compute_and_differentiate(jd) for code in _CODES]
+    q, v = (np.stack([np.asarray(state[i]).T for state in states], axis=1) for i in (0, 1))
+    return q / AU_IN_KM, v / AU_IN_KM
+
+
+def to_ecliptic(vectors: Any) -> np.ndarray:
+    """The same vectors on the axes of the ecliptic of J2000 (obliquity 84381.448″)."""
+    x, y, z = np.moveaxis(np.asarray(vectors, float), -1, 0)
+    c, s = np.cos(_OBLIQUITY), np.sin(_OBLIQUITY)
+    return np.stack([x, c * y + s * z, c * z - s * y], axis=-1)
+
+
+def perihelion_longitude(q: Any, v: Any, mu: float) -> np.ndarray:
+    r"""Longitude of perihelion of the osculating orbit, ϖ = Ω + ω [rad].
+
+        L = q × v,    e = v × L / mu − q / |q|,    Ω = atan2(L_x, −L_y),
+        ω = angle from the node (cos Ω, sin Ω, 0) to e about L
+
+    - `q`, `v`: heliocentric position [au] and velocity [au/day] on ecliptic axes, shape
+      (times, 3). `mu`: GM of the Sun plus that of the planet [au³/day²].
+
+    Returns shape (times,), continuous in time (unwrapped).
+
+    **Source** Murray & Dermott 1999, *Solar System Dynamics*, 2.8; e is the
+    Laplace–Runge–Lenz vector over mu.
+    """
+    q, v = np.asarray(q, float), np.asarray(v, float)
+    L = np.cross(q, v)
+    e = np.cross(v, L) / mu - q / np.linalg.norm(q, axis=-1, keepdims=True)
+    node = np.arctan2(L[..., 0], -L[..., 1])
+    to_node = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=-1)
+    normal = L / np.linalg.norm(L, axis=-1, keepdims=True)
+    across = np.sum(np.cross(to_node, e) * normal, axis=-1)
+    return np.unwrap(node + np.arctan2(across, np.sum(to_node * e, axis=-1)))
+
+
+def check_start(q0: Any, p0: Any, args: Any) -> None:
+    """`check_bodies` with the names of the planets."""
+    check_bodies(q0, p0, args, BODIES)
+
+
+def solar_system(date: str | datetime.date | float = "1900-01-01") -> Problem:
+    """The ten bodies on a day, barycentric, on the axes of the ICRF.
+
+    - `date`: the day of the start, as for `julian_date`.
+
+    q [au], t [day] from the start, masses as GM [au³/day²] with G = 1, so that
+    p = GM v [au⁴/day³] and energies are in au⁵/day⁴. The step suits `Yoshida(4)`: h = 1/32 day
+    turns Mercury's perihelion by 0.04″ in a century too much, and that goes with h⁴.
+
+    **Raises** as `ephemeris` and `julian_date`.
+    """
+    q, v = ephemeris([julian_date(date)])
+    return Problem(
+        name="solar_system",
+        system=System(hamiltonian),
+        q0=q[0],
+        p0=GM[:, None] * v[0],
+        h=1 / 32,
+        args={"masses": GM, "G": 1.0},
+        observables=OBSERVABLES,
+        units={"q": "au", "p": "au⁴/day³", "t": "day", "energy": "au⁵/day⁴"},
+        source="JPL ephemeris DE421 (Folkner, Williams & Boggs 2009)",
+        check=check_start,
+    )
+
+
+@cache
+def _kernel() -> Any:
+    try:
+        from jplephem.spk import SPK
+    except ImportError:
+        raise EphemerisMissing(f"reading an ephemeris needs jplephem: {_EXTRA}") from None
+    # Looked up, not imported: on import that package warns of the age of another of its files.
+    package = find_spec("skyfield_data")
+    if package is None or package.origin is None:
+        raise EphemerisMissing(f"the ephemeris DE421 is not installed: {_EXTRA}")
+    path = Path(package.origin).parent / "data" / "de421.bsp"
+    if not path.is_file():
+        raise EphemerisMissing(
+            f"the installed skyfield-data has no de421.bsp; a version that has it: {_EXTRA}"
+        )
+    return SPK.open(path)

@@ -1,0 +1,142 @@
+"""The registries that tests parametrise over, and the oracles they compare with.
+
+A new method or system is tested for order, symplecticity, reversal, gradients, batching and
+tracing by being listed here.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dvi_jax as dvi
+from dvi_jax import systems
+
+
+class ExplicitEuler(dvi.Method):
+    """The negative control: first order, not symplectic, not symmetric."""
+
+    order: int = 1
+    is_symmetric: bool = False
+    is_symplectic: bool = False
+    is_invertible: bool = False
+
+    def step(self, system, interval, q0, p0, epsilon, args, newton):
+        from dvi_jax._step import StepInfo, momentum_rate, position_rate
+
+        q1 = q0 + interval.h * position_rate(system, interval, q0, p0, epsilon, args)
+        p1 = p0 + interval.h * momentum_rate(system, interval, q0, p0, epsilon, args)
+        return q1, p1, StepInfo(dvi.RESULTS.successful, jnp.asarray(0, jnp.int32), jnp.zeros(()))
+
+    def inverse(self, system, interval, q1, p1, epsilon, args, newton):
+        raise TypeError
+
+    def _needs_no_solve(self, system, interval, q, epsilon, args):
+        return True
+
+    def _inverse_needs_no_solve(self, system, interval, q, epsilon, args):
+        return False
+
+
+def non_separable(t0, t1, q0, p1, args):
+    """H = (q² + 1)(p² + 1)/2, each degree of freedom by itself."""
+    return jnp.sum((q0**2 + 1) * (p1**2 + 1)) / 2
+
+
+def double_pendulum(t0, t1, q0, p1, args):
+    """Two unit masses on unit rods, unit gravity; canonical angles and momenta."""
+    difference = q0[0] - q0[1]
+    kinetic = (p1[0] ** 2 + 2 * p1[1] ** 2 - 2 * p1[0] * p1[1] * jnp.cos(difference)) / (
+        2 * (1 + jnp.sin(difference) ** 2)
+    )
+    return kinetic - 2 * jnp.cos(q0[0]) - jnp.cos(q0[1])
+
+
+def pendulum(t0, t1, q0, p1, args):
+    """H = p²/2 − cos q."""
+    return jnp.sum(p1**2) / 2 - jnp.sum(jnp.cos(q0))
+
+
+def damping(t0, t1, q0, p1, args):
+    """W = −(1 + q²) p + cos t: dissipative, driven, implicit."""
+    return -(1 + q0**2) * p1 + jnp.cos(t0)
+
+
+SYSTEMS = {
+    "pendulum": (dvi.System(pendulum, force=damping), [0.4], [0.7]),
+    "kepler": (systems.kepler().system, [0.0, 1.2], [-1.0, -0.6]),
+    "non_separable": (dvi.System(non_separable, force=damping), [0.3], [0.4]),
+    "double_pendulum": (dvi.System(double_pendulum, force=damping), [0.5, -0.3], [0.2, 0.4]),
+}
+ARGS = {"K": 1.0}
+
+METHODS = {
+    "TypeII": dvi.TypeII(),
+    "Adjoint": dvi.Adjoint(),
+    "Strang": dvi.Strang(),
+    "Yoshida4": dvi.Yoshida(4),
+    "Composition": dvi.Composition((0.3, 0.2, 0.2, 0.3), order=2),
+    "RungeKutta4": dvi.RungeKutta4(),
+}
+SYMPLECTIC = {k: m for k, m in METHODS.items() if m.is_symplectic}
+INVERTIBLE = {k: m for k, m in METHODS.items() if m.is_invertible}
+
+ADJOINTS = {
+    "Direct": dvi.Direct(),
+    "Checkpointed": dvi.Checkpointed(),
+    "Reversible": dvi.Reversible(checkpoint_every=5),
+}
+
+
+def flow(system, method, h, num_steps=1, epsilon=0.0, t0=0.0, args=ARGS):
+    """z = (q, p) as one vector → the state after `num_steps` steps, as one vector."""
+
+    def of(z):
+        q, p = jnp.split(z, 2)
+        sol = dvi.integrate(
+            system,
+            q,
+            p,
+            h=h,
+            num_steps=num_steps,
+            t0=t0,
+            epsilon=epsilon,
+            args=args,
+            method=method,
+            save=dvi.Save(final=True),
+        )
+        return jnp.concatenate([sol.qs[-1], sol.ps[-1]])
+
+    return of
+
+
+def state(name):
+    """The start of a registered system as one vector."""
+    _, q, p = SYSTEMS[name]
+    return jnp.asarray([*q, *p])
+
+
+def symplectic_defect(M):
+    """max |MᵀJM − J|."""
+    n = M.shape[0] // 2
+    J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    return np.max(np.abs(M.T @ J @ M - J))
+
+
+def central_difference(f, x, direction, step=1e-5):
+    """(f(x + s d) − f(x − s d))/2s at two steps, extrapolated: error O(s⁴), 1e-10 or so."""
+
+    def at(s):
+        forward = jax.tree.map(lambda a, d: a + s * d, x, direction)
+        backward = jax.tree.map(lambda a, d: a - s * d, x, direction)
+        return (f(forward) - f(backward)) / (2 * s)
+
+    return (4 * at(step) - at(2 * step)) / 3
+
+
+def measured_orders(errors, ratio, floor):
+    """Orders between neighbouring step sizes, round-off plateau (below `floor`) masked out."""
+    errors = np.asarray(errors)
+    keep = errors > floor
+    assert keep.sum() >= 3, f"fewer than three points above round-off: {errors}"
+    errors = errors[keep]
+    return np.log(errors[:-1] / errors[1:]) / np.log(ratio)

@@ -1,0 +1,88 @@
+"""Imports run downward only, and the public names are there."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import dvi_jax as dvi
+
+ROOT = Path(dvi.__file__).parent
+FLOORS = [
+    ["_compat", "_types", "_results"],
+    ["_system", "_discretise", "_solution", "engine"],
+    ["_step"],
+    ["methods", "lattices", "symmetry", "observe"],
+    ["_rollout"],
+    ["_adjoints"],
+    ["_integrate"],
+    ["__init__", "systems", "plot"],
+    ["paper", "run"],
+    ["cli"],
+]
+FLOOR = {room: i for i, rooms in enumerate(FLOORS) for room in rooms}
+DOOR_ONLY = {"paper", "run", "cli"}
+"""Leaves: of the package they use the public door, each other's floors below, and no private room."""
+
+
+def room_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return parts[0]
+
+
+def imported_rooms(path: Path):
+    """(room, name of what is imported) for every import of the package by the file."""
+    package = ("dvi_jax", *path.relative_to(ROOT).with_suffix("").parts[:-1])
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            target = [*base, *(node.module or "").split(".")] if node.module else list(base)
+            if target[:1] != ["dvi_jax"]:
+                continue
+            for alias in node.names:
+                full = [*target, alias.name]
+                yield (full[1] if full[1] in FLOOR else "__init__"), ".".join(full)
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                parts = alias.name.split(".")
+                if parts[0] == "dvi_jax":
+                    yield (parts[1] if len(parts) > 1 else "__init__"), alias.name
+
+
+FILES = sorted(ROOT.rglob("*.py"))
+
+
+def test_every_file_has_a_floor():
+    assert {room_of(f) for f in FILES} <= set(FLOOR)
+    assert len(FILES) > 20
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_run_downward(path):
+    here = room_of(path)
+    for room, name in imported_rooms(path):
+        if room == here:
+            continue
+        assert FLOOR[room] < FLOOR[here], f"{path.name} (floor {FLOOR[here]}) imports {name}"
+        if here in DOOR_ONLY:
+            assert not room.startswith("_") or room == "__init__", f"{path.name} imports {name}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_first_line_says_what_the_file_is(path):
+    docstring = ast.get_docstring(ast.parse(path.read_text()))
+    assert docstring
+    assert docstring.splitlines()[0].endswith(".")
+
+
+def test_door_has_no_logic():
+    tree = ast.parse((ROOT / "__init__.py").read_text())
+    assert all(isinstance(n, ast.ImportFrom | ast.Expr | ast.Assign) for n in tree.body)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["System", "discretise", "integrate", "Save", "Solution", "RESULTS", "Newton", "TypeII", "Adjoint", "Strang", "Yoshida", "Composition", "RungeKutta4", "Uniform", "Given", "MaxDrift", "Range", "Trend", "Mean", "Last", "Reversible", "Checkpointed", "Direct", "Generator", "prolong", "determining_residual", "conformal_factor", "noether_identity", "AdiabaticInvariant", "IntegrationError"],
+)
+def test_public_name_is_documented(name):
+    assert getattr(dvi, name).__doc__

@@ -1,0 +1,144 @@
+"""Small linear solves, Newton, and dependence read from the jaxpr."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from dvi_jax.engine.dependence import depends_on
+from dvi_jax.engine.linear import UNROLLED_UP_TO, solve_dense
+from dvi_jax.engine.newton import Newton, find_root
+
+SOLVE = {n: jax.jit(solve_dense) for n in range(1, 6)}
+
+
+@settings(max_examples=60, deadline=None)
+@given(n=st.integers(1, 5), seed=st.integers(0, 2**31))
+def test_solve_agrees_with_lapack_in_backward_error(n, seed):
+    rng = np.random.default_rng(seed)
+    A, b = rng.normal(size=(n, n)), rng.normal(size=n)
+    x = np.asarray(SOLVE[n](A, b))
+    backward = np.max(np.abs(A @ x - b)) / (np.max(np.abs(A)) * np.max(np.abs(x)) + 1)
+    assert backward < 1e-13
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_solve_pivots(n):
+    A = np.eye(n)[::-1].copy() + 1e-30 * np.eye(n)
+    b = np.arange(1.0, n + 1)
+    np.testing.assert_allclose(SOLVE[n](A, b), b[::-1], rtol=1e-14)
+    assert not np.allclose(_eliminate_without_pivoting(A, b), b[::-1])  # what pivoting saves from
+
+
+def _eliminate_without_pivoting(A, b):
+    A, b = A.copy(), b.copy()
+    n = len(b)
+    with np.errstate(all="ignore"):
+        for c in range(n):
+            for i in range(c + 1, n):
+                f = A[i, c] / A[c, c]
+                A[i] -= f * A[c]
+                b[i] -= f * b[c]
+        x = np.zeros(n)
+        for i in reversed(range(n)):
+            x[i] = (b[i] - A[i, i + 1 :] @ x[i + 1 :]) / A[i, i]
+    return x
+
+
+def test_singular_matrix_gives_no_number():
+    assert not np.isfinite(SOLVE[2](np.ones((2, 2)), np.array([1.0, 2.0]))).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
+def test_batched_newton_calls_lapack_only_above_the_limit(n):
+    def batch(x):
+        def one(x):
+            return find_root(lambda y: y + 0.1 * jnp.sin(y) * jnp.sum(y) - x, x, x, Newton())[0]
+
+        return jnp.sum(jax.vmap(one)(x))
+
+    for f in (batch, jax.grad(batch)):
+        text = str(jax.make_jaxpr(f)(jnp.ones((3, n))))
+        assert ("lu[" in text or "triangular_solve" in text) == (n > UNROLLED_UP_TO)
+
+
+def test_newton_finds_the_root_to_round_off_and_counts():
+    root, info = find_root(lambda x: x**3 - 2, jnp.array([1.5]), jnp.array([2.0]), Newton())
+    assert abs(float(root[0]) - 2 ** (1 / 3)) < 4e-16
+    assert bool(info.converged)
+    assert 3 <= int(info.iterations) <= 7
+    assert float(info.residual) < 1e-15
+
+
+def test_newton_says_when_there_is_no_root():
+    _, info = find_root(lambda x: x**2 + 1, jnp.array([0.3]), jnp.array([1.0]), Newton())
+    assert not bool(info.converged)
+    assert int(info.iterations) == 20
+
+
+def test_newton_stops_at_nan_at_once():
+    _, info = find_root(lambda x: jnp.log(x), jnp.array([-1.0]), jnp.array([1.0]), Newton())
+    assert not bool(info.converged)
+    assert int(info.iterations) == 1
+
+
+def test_a_slow_lane_does_not_change_its_neighbours():
+    def solve(a):
+        x, info = find_root(
+            lambda x: x + a * jnp.sin(3 * x) - 1, jnp.ones(1), jnp.ones(1), Newton()
+        )
+        return x[0], info.iterations
+
+    a = jnp.array([0.0, 0.1, 0.3, 5.0])
+    together = jax.jit(jax.vmap(solve))(a)
+    alone = [jax.jit(solve)(x) for x in a]
+    # One lane and a batch are different programs: equal up to a rounding.
+    np.testing.assert_allclose(together[0][:3], [x for x, _ in alone[:3]], rtol=4e-16)
+    np.testing.assert_array_equal(together[1][:3], [k for _, k in alone[:3]])
+
+
+def test_root_derivatives_are_those_of_the_implicit_function():
+    def root(a):
+        return find_root(lambda x: x**3 - a, jnp.array([1.0]), jnp.array([1.0]), Newton())[0][0]
+
+    a = 2.0
+    np.testing.assert_allclose(jax.grad(root)(a), a ** (-2 / 3) / 3, rtol=1e-14)
+    np.testing.assert_allclose(jax.jacfwd(root)(a), a ** (-2 / 3) / 3, rtol=1e-14)
+    np.testing.assert_allclose(jax.hessian(root)(a), -2 / 9 * a ** (-5 / 3), rtol=1e-13)
+
+
+def test_no_iteration_is_differentiated():
+    def root(a):
+        return find_root(lambda x: x**3 - a, jnp.array([1.0]), jnp.array([1.0]), Newton())[0][0]
+
+    # Reverse mode through a while loop would raise; one loop, the forward solve, is there.
+    assert str(jax.make_jaxpr(jax.grad(root))(2.0)).count(" while[") == 1
+
+
+@pytest.mark.parametrize("bad", [{"rtol": -1.0}, {"rtol": 0.0}, {"max_steps": 0}, {"atol": np.inf}])
+def test_newton_refuses_settings_that_cannot_work(bad):
+    with pytest.raises(ValueError, match="must be|both zero"):
+        Newton(**bad)
+
+
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        (lambda x, y: x, False),
+        (lambda x, y: x + 0 * y, True),  # errs on the safe side
+        (lambda x, y: x * jnp.sign(y), True),  # zero derivative, yet dependent
+        (lambda x, y: jnp.where(y > 0, x, 2 * x), True),
+        (lambda x, y: jax.jit(lambda a, b: (a * 2, b * 3))(x, y)[0], False),
+        (lambda x, y: jax.jit(lambda a, b: (a * 2, b * 3))(x, y)[1], True),
+        (lambda x, y: jax.grad(lambda a: jnp.sum(jnp.cos(a)) + jnp.sum(y**2))(x), False),
+        (lambda x, y: jax.grad(lambda a: jnp.sum(jnp.cos(a) * y**2))(x), True),
+        (lambda x, y: jax.lax.fori_loop(0, 3, lambda i, a: a * x, x), False),
+        (lambda x, y: jax.lax.fori_loop(0, 3, lambda i, a: a * y, x), True),
+        (lambda x, y: jax.lax.cond(y[0] > 0, lambda: x, lambda: 2 * x), True),
+        (lambda x, y: jnp.linalg.norm(x) * x, False),
+    ],
+)
+def test_dependence(function, expected):
+    x = jnp.ones(2)
+    assert depends_on(function, 1, x, x) is expected

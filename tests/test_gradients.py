@@ -1,0 +1,235 @@
+"""Gradients of every kind against central differences, and against each other."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ADJOINTS, ARGS, METHODS, SYSTEMS, central_difference
+from jax.flatten_util import ravel_pytree
+
+import dvi_jax as dvi
+
+
+def product(t0, t1, q0, p0, q1, p1, args):
+    return jnp.sum(q1 * p1) * args["K"] + t1 * q0[0]
+
+
+DOUBLE_PENDULUM = pytest.param("double_pendulum", marks=pytest.mark.slow)
+
+OBSERVE = {
+    "alone": product,
+    "reduced": [
+        dvi.MaxDrift(product),
+        dvi.Range(product),
+        dvi.Trend(product),
+        dvi.Mean(product),
+        dvi.Last(product),
+    ],
+}
+
+
+def loss(x, system, adjoint, method=dvi.TypeII(), save=dvi.Save(every=4, final=True)):
+    """A number that every saved and observed value enters, with weights of its own."""
+    q, p, h, t0, epsilon, K = x
+    sol = dvi.integrate(
+        SYSTEMS[system][0],
+        q,
+        p,
+        h=h,
+        num_steps=17,
+        t0=t0,
+        epsilon=epsilon,
+        args={"K": K},
+        adjoint=adjoint,
+        method=method,
+        save=save,
+        observe=OBSERVE,
+    )
+    weights = jnp.linspace(1.0, 2.0, sol.qs.size).reshape(sol.qs.shape)
+    reduced = sum((i + 1) * r for i, r in enumerate(sol.observed["reduced"]))
+    return (
+        jnp.sum(weights * sol.qs**2)
+        + jnp.sum(sol.ps / weights)
+        + jnp.sum(sol.ts**2)
+        + jnp.sum(sol.hs**3)
+        + jnp.sum(sol.observed["alone"] ** 2)
+        + reduced
+    )
+
+
+def point(system):
+    _, q, p = SYSTEMS[system]
+    return (jnp.asarray(q), jnp.asarray(p), *map(jnp.asarray, (0.05, 0.3, 0.2, 1.1)))
+
+
+@functools.cache
+def gradient(system, adjoint):
+    return jax.jit(jax.grad(lambda x: loss(x, system, ADJOINTS[adjoint])))
+
+
+@pytest.mark.parametrize("system", ["kepler", "non_separable", DOUBLE_PENDULUM])
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_gradient_equals_central_differences(system, adjoint):
+    """In every input at once: along each axis of (q0, p0, h, t0, ε, args)."""
+    x = point(system)
+    value = jax.jit(lambda x: loss(x, system, ADJOINTS["Direct"]))
+    flat, unravel = ravel_pytree(x)
+    g, _ = ravel_pytree(gradient(system, adjoint)(x))
+    for i in range(flat.size):
+        axis = unravel(jnp.zeros_like(flat).at[i].set(1.0))
+        expected = central_difference(value, x, axis)
+        assert abs(float(g[i]) - float(expected)) <= 1e-6 * abs(float(expected)) + 1e-9, i
+
+
+@pytest.mark.parametrize("system", ["kepler", "non_separable", DOUBLE_PENDULUM])
+def test_adjoints_agree_to_round_off(system):
+    x = point(system)
+    direct = jax.tree.leaves(gradient(system, "Direct")(x))
+    for other in ("Checkpointed", "Reversible"):
+        for a, b in zip(jax.tree.leaves(gradient(system, other)(x)), direct, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("save", [dvi.Save(), dvi.Save(every=8), dvi.Save(final=True)])
+def test_reversible_gradient_for_every_way_of_saving(save):
+    x = point("kepler")
+    a = jax.grad(lambda x: loss(x, "kepler", ADJOINTS["Reversible"], save=save))(x)
+    b = jax.grad(lambda x: loss(x, "kepler", ADJOINTS["Direct"], save=save))(x)
+    for u, v in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(u, v, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_gradient_through_every_method(method):
+    """RungeKutta4, which has no inverse, is differentiated by checkpoints under the default."""
+    x = point("pendulum")
+    m = METHODS[method]
+    value = jax.jit(lambda x: loss(x, "pendulum", dvi.Reversible(checkpoint_every=5), m))
+    ones = jax.tree.map(jnp.ones_like, x)
+    expected = central_difference(value, x, ones)
+    backward = sum(float(jnp.sum(g)) for g in jax.tree.leaves(jax.grad(value)(x)))
+    forward = float(jax.jvp(value, (x,), (ones,))[1])
+    assert abs(backward - expected) <= 1e-6 * abs(expected)
+    assert abs(forward - backward) <= 1e-10 * abs(backward)
+
+
+def test_second_derivative_and_batched_gradient():
+    x = point("non_separable")
+
+    def in_epsilon(adjoint):
+        return lambda e: loss((*x[:4], e, x[5]), "non_separable", ADJOINTS[adjoint])
+
+    hessian = jax.jit(jax.hessian(in_epsilon("Reversible")))(0.2)
+    slope = jax.jit(jax.grad(in_epsilon("Direct")))
+    expected = central_difference(slope, jnp.asarray(0.2), jnp.asarray(1.0))
+    assert abs(float(hessian) - float(expected)) < 1e-6 * abs(float(expected))
+    es = jnp.array([0.1, 0.2, 0.3])
+    batch = jax.jit(jax.vmap(jax.grad(in_epsilon("Reversible"))))(es)
+    np.testing.assert_allclose(batch, [slope(e) for e in es], rtol=1e-11)
+
+
+def test_gradient_through_the_times_of_a_given_lattice():
+    s, q, p = SYSTEMS["kepler"]
+
+    def final(ts, adjoint):
+        sol = dvi.integrate(
+            s, q, p, lattice=dvi.Given(ts), args=ARGS, epsilon=0.1, adjoint=ADJOINTS[adjoint]
+        )
+        return jnp.sum(sol.qs[-1])
+
+    ts = jnp.array([0.0, 0.1, 0.25, 0.3, 0.5])
+    g = jax.grad(lambda t: final(t, "Reversible"))(ts)
+    for i in range(5):
+        axis = jnp.zeros(5).at[i].set(1.0)
+        expected = central_difference(lambda t: final(t, "Direct"), ts, axis)
+        assert abs(float(g[i] - expected)) < 1e-8
+
+
+def test_gradient_into_a_module_force():
+    """W as an equinox module: its arrays are differentiable, no args needed."""
+    import equinox as eqx
+
+    net = eqx.nn.MLP(1, 1, 4, 1, key=jax.random.key(0))
+    net = jax.tree.map(lambda x: x.astype(jnp.float64) if eqx.is_array(x) else x, net)
+
+    class Force(eqx.Module):
+        net: eqx.nn.MLP
+
+        def __call__(self, t0, t1, q0, p1, args):
+            return self.net(q0)
+
+    def final(force, adjoint):
+        system = dvi.System(SYSTEMS["pendulum"][0].H_D, force=force)
+        sol = dvi.integrate(
+            system, [0.4], [0.7], h=0.1, num_steps=30, epsilon=0.5, adjoint=ADJOINTS[adjoint]
+        )
+        return jnp.sum(sol.qs[-1])
+
+    a = eqx.filter_grad(final)(Force(net), "Reversible")
+    b = eqx.filter_grad(final)(Force(net), "Direct")
+    for u, v in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(u, v, rtol=1e-10, atol=1e-14)
+    assert max(float(jnp.max(jnp.abs(u))) for u in jax.tree.leaves(a)) > 1e-3
+
+
+def test_a_rebuilt_state_that_misses_gives_nan_not_a_wrong_gradient():
+    """Damped and driven over t = 80: rebuilding amplifies round-off by some e⁴⁰."""
+
+    def damped_and_driven(t0, t1, q, p, args):
+        return jnp.cos(t0) - p
+
+    system = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2, force=damped_and_driven)
+
+    def slope(adjoint):
+        def final(e):
+            sol = dvi.integrate(
+                system,
+                [1.0],
+                [0.0],
+                h=0.1,
+                num_steps=800,
+                epsilon=e,
+                save=dvi.Save(final=True),
+                adjoint=adjoint,
+            )
+            return sol.qs[-1, 0]
+
+        return float(jax.grad(final)(1.0))
+
+    exact = slope(dvi.Direct())
+    np.testing.assert_allclose(slope(dvi.Reversible(checkpoint_every=20)), exact, rtol=1e-9)
+    assert np.isnan(slope(dvi.Reversible(checkpoint_every=1000)))
+
+
+def test_reversible_memory_is_flat_and_direct_is_not():
+    def size(adjoint, n):
+        def final(q):
+            sol = dvi.integrate(
+                SYSTEMS["kepler"][0],
+                q,
+                jnp.array([-1.0, -0.6]),
+                h=0.01,
+                num_steps=n,
+                args=ARGS,
+                save=dvi.Save(final=True),
+                adjoint=adjoint,
+            )
+            return jnp.sum(sol.qs[-1])
+
+        compiled = jax.jit(jax.grad(final)).lower(jnp.array([0.0, 1.2])).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    growth = {n: size(a, 20_000) - size(a, 200) for n, a in ADJOINTS.items()}
+    reversible = size(dvi.Reversible(), 20_000) - size(dvi.Reversible(), 200)
+    assert growth["Direct"] > 20_000 * 8 * 10
+    assert reversible < growth["Direct"] / 100
+
+
+@pytest.mark.parametrize("bad", [0, -1, 1.5])
+def test_adjoints_refuse_bad_settings(bad):
+    with pytest.raises(ValueError, match="positive"):
+        dvi.Reversible(checkpoint_every=bad)
+    with pytest.raises(ValueError, match="positive"):
+        dvi.Checkpointed(segments=bad)

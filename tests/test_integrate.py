@@ -1,0 +1,389 @@
+"""The front door: what is saved and observed, how it fails, and what it refuses."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import METHODS, double_pendulum, non_separable
+
+import dvi_jax as dvi
+
+
+def H(t0, t1, q0, p1, args):
+    return (jnp.sum(p1**2) + jnp.sum(q0**2)) / 2
+
+
+OSCILLATOR = dvi.System(H, force=lambda t0, t1, q0, p1, args: -q0)
+NON_SEPARABLE = dvi.System(non_separable)
+START = ([0.3, 0.1], [0.4, -0.2])
+
+
+def run(**kwargs):
+    return dvi.integrate(OSCILLATOR, *START, **{"h": 0.1, "num_steps": 23, **kwargs})
+
+
+def position(t0, t1, q0, p0, q1, p1, args):
+    return q1
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    return H(t1, t1, q1, p1, args)
+
+
+# --- what is saved ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("save", "kept"),
+    [
+        (dvi.Save(), range(24)),
+        (dvi.Save(every=5), [0, 5, 10, 15, 20]),
+        (dvi.Save(every=5, final=True), [0, 5, 10, 15, 20, 23]),
+        (dvi.Save(every=23, final=True), [0, 23]),
+        (dvi.Save(final=True), [0, 23]),
+        (dvi.Save(every=40), [0]),
+    ],
+)
+def test_save_policies(save, kept):
+    full, sol = run(), run(save=save, observe=position)
+    kept = np.array(kept)
+    np.testing.assert_array_equal(sol.ts, full.ts[kept])
+    np.testing.assert_allclose(sol.qs, full.qs[kept], rtol=1e-14)
+    np.testing.assert_allclose(sol.ps, full.ps[kept], rtol=1e-14)
+    np.testing.assert_array_equal(sol.hs, np.full(len(kept) - 1, 0.1))
+    np.testing.assert_array_equal(sol.observed, sol.qs[1:])
+
+
+def test_no_steps_returns_the_start():
+    sol = run(num_steps=0, t0=2.0, observe={"last": dvi.Last(position), "all": position})
+    np.testing.assert_array_equal(sol.ts, [2.0])
+    np.testing.assert_array_equal(sol.qs, [START[0]])
+    assert sol.observed["all"].shape == (0, 2)
+    assert np.isnan(sol.observed["last"]).all()  # no step: no value, and it says so
+    assert bool(sol.result == dvi.RESULTS.successful)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (3,), (2, 3)])
+def test_states_of_any_shape(shape):
+    q, p = np.full(shape, 0.3), np.full(shape, 0.4)
+    one = dvi.integrate(NON_SEPARABLE, 0.3, 0.4, h=0.1, num_steps=5)
+    sol = dvi.integrate(NON_SEPARABLE, q, p, h=0.1, num_steps=5)
+    assert sol.qs.shape == (6, *shape)
+    expected = np.broadcast_to(np.reshape(one.qs, (6, *(1 for _ in shape))), sol.qs.shape)
+    np.testing.assert_allclose(sol.qs, expected, rtol=1e-14)
+
+
+def test_times_do_not_accumulate_round_off():
+    sol = run(num_steps=10_000, t0=5.0, save=dvi.Save(every=1000))
+    np.testing.assert_array_equal(sol.ts, 5.0 + 0.1 * np.arange(0, 10_001, 1000))
+    assert sum([0.1] * 10_000) != 1000.0  # a running sum would
+
+
+def test_exact_invariant_of_the_map_is_kept_late_in_a_run():
+    """h reaches the step as it is, not as a difference of large times."""
+
+    def invariant(t0, t1, q0, p0, q1, p1, args):
+        return jnp.sum(p1**2 + q1**2 - 0.1 * q1 * p1) / 2
+
+    observe = {"range": dvi.Range(invariant), "mean": dvi.Mean(invariant)}
+    sol = run(num_steps=10_000, t0=1e6, observe=observe, save=dvi.Save(final=True))
+    assert sol.observed["range"] / sol.observed["mean"] < 5e-14
+
+
+# --- lattices --------------------------------------------------------------------------------
+
+
+def test_given_lattice_equals_the_uniform_one_on_its_times():
+    a = run(epsilon=0.1)
+    b = dvi.integrate(OSCILLATOR, *START, lattice=dvi.Given(0.1 * np.arange(24)), epsilon=0.1)
+    np.testing.assert_allclose(a.qs, b.qs, atol=1e-14)
+    np.testing.assert_allclose(b.hs, np.full(23, 0.1), atol=1e-14)
+
+
+def test_given_lattice_with_unequal_steps():
+    ts = np.array([0.0, 0.1, 0.4, 0.45, 1.0])
+    sol = dvi.integrate(OSCILLATOR, *START, lattice=dvi.Given(ts))
+    q, p = np.array(START)
+    for k, h in enumerate(np.diff(ts)):
+        p = p - h * q
+        q = q + h * p
+        np.testing.assert_allclose(sol.qs[k + 1], q, rtol=1e-14)
+    np.testing.assert_array_equal(sol.ts, ts)
+
+
+@pytest.mark.parametrize(
+    ("ts", "match"),
+    [
+        ([0.0, 0.1, 0.1], "strictly"),
+        ([0.0, 0.2, 0.1], "strictly"),
+        ([0.0, np.nan], "finite"),
+        ([[0.0, 1.0]], "one-dimensional"),
+    ],
+)
+def test_given_refuses_times_that_are_no_lattice(ts, match):
+    with pytest.raises(ValueError, match=match):
+        dvi.Given(np.array(ts))
+
+
+def test_given_refuses_contradictions():
+    lattice = dvi.Given(np.arange(4.0))
+    for contradiction in ({"h": 0.1}, {"num_steps": 5}, {"t0": 1.0}):
+        with pytest.raises(ValueError, match="Given"):
+            dvi.integrate(OSCILLATOR, *START, lattice=lattice, **contradiction)
+
+
+# --- observables -----------------------------------------------------------------------------
+
+
+def test_reductions_equal_numpy_on_the_full_record():
+    record = run(observe={"q": position, "E": energy}, epsilon=0.2)
+    E, q, t = record.observed["E"], record.observed["q"], record.ts[1:]
+    observe = {
+        "drift": dvi.MaxDrift(energy),
+        "range": dvi.Range(energy),
+        "trend": dvi.Trend(energy),
+        "mean": [dvi.Mean(energy), dvi.Mean(position)],
+        "last": dvi.Last(position),
+    }
+    sol = run(observe=observe, epsilon=0.2, save=dvi.Save(every=7))
+    np.testing.assert_allclose(sol.observed["drift"], np.max(np.abs(E - E[0])), rtol=1e-13)
+    np.testing.assert_allclose(sol.observed["range"], np.ptp(E), rtol=1e-13)
+    np.testing.assert_allclose(sol.observed["trend"], np.polyfit(t, E, 1)[0], rtol=1e-9)
+    np.testing.assert_allclose(sol.observed["mean"][0], np.mean(E), rtol=1e-13)
+    np.testing.assert_allclose(sol.observed["mean"][1], np.mean(q, axis=0), rtol=1e-12)
+    np.testing.assert_array_equal(sol.observed["last"], q[-1])
+
+
+def test_an_observable_sees_both_ends_of_its_step():
+    def seen(t0, t1, q0, p0, q1, p1, args):
+        return jnp.stack([t0, t1, q0[0], p0[0], q1[0], p1[0], args["a"]])
+
+    sol = run(observe=seen, save=dvi.Save(every=5), args={"a": 3.0})
+    full = run()
+    for row, k in zip(sol.observed, [5, 10, 15, 20], strict=True):
+        expected = [full.ts[k - 1], full.ts[k], full.qs[k - 1, 0], full.ps[k - 1, 0]]
+        np.testing.assert_allclose(row, [*expected, full.qs[k, 0], full.ps[k, 0], 3.0], rtol=1e-13)
+
+
+def test_streamed_reductions_need_no_memory_for_the_steps():
+    def final(n):
+        return lambda q: (
+            dvi.integrate(
+                OSCILLATOR,
+                q,
+                q,
+                h=0.1,
+                num_steps=n,
+                save=dvi.Save(final=True),
+                observe=dvi.Range(energy),
+            ).observed
+        )
+
+    sizes = [
+        jax.jit(final(n)).lower(jnp.ones(2)).compile().memory_analysis().temp_size_in_bytes
+        for n in (100, 100_000)
+    ]
+    assert sizes[1] <= sizes[0] + 1024
+
+
+# --- batches, compilation --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_batch_equals_loop_and_jit_equals_eager(method):
+    def final(e):
+        sol = dvi.integrate(
+            dvi.System(double_pendulum),
+            [0.5, -0.3],
+            [0.2, 0.4],
+            h=0.1,
+            num_steps=20,
+            epsilon=e,
+            method=METHODS[method],
+            save=dvi.Save(every=10),
+        )
+        return sol.qs
+
+    es = jnp.array([0.0, 0.1, 0.2])
+    together = jax.vmap(final)(es)
+    np.testing.assert_allclose(together, jnp.stack([final(e) for e in es]), rtol=1e-12)
+    np.testing.assert_array_equal(jax.jit(final)(es[1]), final(es[1]))
+
+
+def test_one_trace_per_shape():
+    traces = []
+
+    def counted(t0, t1, q0, p1, args):
+        traces.append(1)
+        return H(t0, t1, q0, p1, args)
+
+    system = dvi.System(counted)
+
+    def go(q, h, epsilon, a):
+        seen = len(traces)
+        args = {"a": a}
+        dvi.integrate(system, q, q, h=h, num_steps=5, epsilon=epsilon, args=args)
+        return len(traces) - seen
+
+    first = go(np.ones(2), 0.1, 0.0, 1.0)
+    assert first > 1
+    # What is left is the check of shapes before the compiled program is looked up.
+    assert go(np.zeros(2), 0.2, 0.5, 2.0) <= 1
+    assert go(np.ones(3), 0.1, 0.0, 1.0) > 1
+
+
+def test_progress_reports_and_changes_nothing():
+    calls = []
+    kwargs = {
+        "num_steps": 1037,
+        "save": dvi.Save(every=5, final=True),
+        "observe": [energy, dvi.Trend(energy)],
+        "epsilon": 0.1,
+    }
+    plain = run(**kwargs)
+    reported = run(**kwargs, progress=lambda done, total: calls.append((done, total)))
+    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(reported), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert 10 < len(calls) <= 101
+    assert calls[-1] == (1037, 1037)
+    assert [c[0] for c in calls] == sorted({c[0] for c in calls})
+    with pytest.raises(ValueError, match="leave progress out"):
+        jax.jit(lambda e: run(epsilon=e, progress=print).qs)(0.1)
+
+
+def test_single_precision_works_when_asked_for():
+    q, p = jnp.float32([0.3]), jnp.float32([0.4])
+    sol = dvi.integrate(NON_SEPARABLE, q, p, h=0.01, num_steps=100)
+    reference = dvi.integrate(NON_SEPARABLE, [0.3], [0.4], h=0.01, num_steps=100)
+    assert sol.qs.dtype == sol.ts.dtype == jnp.float32
+    np.testing.assert_allclose(sol.qs, reference.qs, atol=2e-5)
+
+
+# --- failure ---------------------------------------------------------------------------------
+
+
+def test_newton_failure_is_named_with_step_and_residual():
+    with pytest.raises(
+        dvi.IntegrationError, match=r"step 0 of 10 .*residual .*did not converge"
+    ) as e:
+        dvi.integrate(NON_SEPARABLE, [3.0], [4.0], h=10.0, num_steps=10)
+    solution = e.value.solution
+    assert bool(solution.result == dvi.RESULTS.not_converged)
+    assert float(solution.stats["failed_residual"]) > 1e-6
+
+
+def test_failure_later_in_the_run_keeps_what_came_before():
+    """H = p²/2 + √(1/2 − q) ends at q = 1/2: the orbit until then is there, the rest is NaN."""
+    system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.sqrt(0.5 - q)))
+    sol = dvi.integrate(
+        system, [0.0], [1.0], h=0.2, num_steps=9, throw=False, observe=dvi.Range(energy)
+    )
+    assert bool(sol.result == dvi.RESULTS.not_finite)
+    k = int(sol.stats["failed_step"])
+    assert 0 < k < 8
+    assert np.isfinite(sol.qs[: k + 1]).all()
+    assert np.isnan(sol.qs[k + 1 :]).all()
+    assert np.isnan(sol.observed)
+    with pytest.raises(dvi.IntegrationError, match=rf"step {k} of 9 .*NaN or infinite"):
+        dvi.integrate(system, [0.0], [1.0], h=0.2, num_steps=9)
+
+
+def test_a_failed_lane_leaves_its_neighbours_alone():
+    def go(h):
+        return dvi.integrate(NON_SEPARABLE, [3.0], [4.0], h=h, num_steps=10, throw=False)
+
+    hs = jnp.array([0.001, 10.0, 0.002])
+    sols = jax.vmap(go)(hs)
+    good = sols.result == dvi.RESULTS.successful
+    np.testing.assert_array_equal(good, [True, False, True])
+    np.testing.assert_array_equal(sols.stats["failed_step"], [-1, 0, -1])
+    for i in (0, 2):
+        np.testing.assert_allclose(sols.qs[i], go(hs[i]).qs, rtol=1e-14)
+    assert np.isnan(sols.qs[1, 1:]).all()
+    gradients = jax.vmap(jax.grad(lambda h: go(h).qs[-1, 0]))(hs)
+    np.testing.assert_array_equal(np.isfinite(gradients), [True, False, True])
+
+
+def test_a_batch_raises_for_a_bad_lane_when_asked_to_throw():
+    def go(h):
+        return dvi.integrate(NON_SEPARABLE, [3.0], [4.0], h=h, num_steps=10).qs
+
+    with pytest.raises(Exception, match="did not converge"):
+        jax.block_until_ready(jax.vmap(go)(jnp.array([0.001, 10.0])))
+
+
+def test_traced_bad_input_becomes_a_status():
+    def status(q=0.3, h=0.1):
+        return dvi.integrate(OSCILLATOR, [q], [0.1], h=h, num_steps=3, throw=False)
+
+    sols = jax.vmap(lambda h: status(h=h))(jnp.array([0.1, 0.0, jnp.inf]))
+    expected = [True, False, False]
+    np.testing.assert_array_equal(sols.result == dvi.RESULTS.successful, expected)
+    np.testing.assert_array_equal((sols.result == dvi.RESULTS.bad_step_size)[1:], [True, True])
+    sols = jax.vmap(lambda q: status(q=q))(jnp.array([0.3, jnp.nan]))
+    np.testing.assert_array_equal(sols.result == dvi.RESULTS.not_finite, [False, True])
+
+
+# --- what is refused -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        ({"p0": [0.1]}, ValueError, r"one shape, got q0 \(2,\) and p0 \(1,\)"),
+        ({"q0": [np.nan, 1.0]}, ValueError, r"q0.*not finite at index \[0\]"),
+        ({"p0": [1.0, np.inf]}, ValueError, r"p0.*not finite at index \[1\]"),
+        ({"q0": [1j, 1.0]}, TypeError, "real"),
+        ({"q0": ["a", "b"]}, TypeError, "real array"),
+        ({"h": 0.0}, ValueError, "h must not be zero"),
+        ({"h": np.nan}, ValueError, "h must be finite"),
+        ({"h": np.inf}, ValueError, "h must be finite"),
+        ({"h": None}, TypeError, "h is missing"),
+        ({"h": [0.1, 0.2]}, ValueError, r"h must be one number.*vmap"),
+        ({"h": "0.1s"}, TypeError, "h must be a real number"),
+        ({"num_steps": -1}, ValueError, "must not be negative"),
+        ({"num_steps": 2.5}, TypeError, "Python integer"),
+        ({"num_steps": None}, TypeError, "num_steps is missing"),
+        ({"epsilon": np.nan}, ValueError, "epsilon must be finite"),
+        ({"epsilon": 1j}, TypeError, "epsilon must be a real"),
+        ({"method": dvi.TypeII}, TypeError, "parentheses missing"),
+        ({"save": 10}, TypeError, "save must be a Save"),
+        ({"observe": 3.0}, TypeError, "pytree of functions"),
+        ({"observe": dvi.Range(3.0)}, TypeError, "Range takes a function"),
+        ({"observe": lambda *a: None}, TypeError, "must return one array"),
+    ],
+)
+def test_bad_input_is_named(change, error, match):
+    given = {"q0": START[0], "p0": START[1], "h": 0.1, "num_steps": 3, **change}
+    with pytest.raises(error, match=match):
+        dvi.integrate(OSCILLATOR, given.pop("q0"), given.pop("p0"), **given)
+
+
+def test_a_bare_function_is_not_a_system():
+    with pytest.raises(TypeError, match=r"dvi.System\(H_D"):
+        dvi.integrate(H, *START, h=0.1, num_steps=3)
+
+
+@pytest.mark.parametrize("bad", [0, -3, 2.0, True])
+def test_save_refuses_what_does_not_count(bad):
+    with pytest.raises(ValueError, match="positive integer"):
+        dvi.Save(every=bad)
+
+
+def test_double_precision_input_without_x64_is_refused_with_the_line_to_add():
+    code = """
+import numpy as np, jax.numpy as jnp, dvi_jax as dvi
+s = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2)
+for q in (np.ones(1), [1.0]):
+    try:
+        dvi.integrate(s, q, q, h=0.1, num_steps=1)
+        print("accepted")
+    except TypeError as error:
+        print('jax.config.update("jax_enable_x64", True)' in str(error))
+print(dvi.integrate(s, jnp.ones(1), jnp.ones(1), h=0.1, num_steps=1).qs.dtype)
+"""
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["True", "True", "float32"]

@@ -1,0 +1,278 @@
+"""The reproduction of the paper: its numbers, its verdicts, what it writes and refuses to."""
+
+import csv
+import dataclasses
+import io
+import json
+import re
+import time
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from dvi_jax.paper import reproduce
+from dvi_jax.paper.claims import Check, Claim, Verdict, judge
+from dvi_jax.paper.equations import EQUATIONS, resolve
+from dvi_jax.paper.figures import FIGURES
+from dvi_jax.paper.numbers import crossing, max_drift, relative_spread, slope, spread
+from dvi_jax.paper.verdicts import pretty
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """One reproduction for all tests, what it printed (not to a terminal), its CPU seconds."""
+    out = tmp_path_factory.mktemp("paper") / "made" / "here"
+    console = Console(file=io.StringIO(), width=100)
+    began = time.process_time()
+    result = reproduce(out, console=console)
+    return result, console.file.getvalue(), time.process_time() - began
+
+
+@pytest.fixture(scope="module")
+def m(run):
+    return run[0].measurements
+
+
+def verdicts(measurements):
+    return {claim.key: claim.verdict for claim in judge(measurements)}
+
+
+# --- numbers
+
+
+def test_oscillator_energy(m):
+    mixed = m.fixed_mesh.mixed[0]
+    assert spread(mixed) == pytest.approx(9.52e-6, rel=0.01)
+    assert spread(mixed) / np.mean([mixed.min(), mixed.max()]) == pytest.approx(0.1, rel=0.01)
+    assert m.fixed_mesh.energy == pytest.approx(1e-4)
+
+
+def test_what_the_oscillator_keeps(m):
+    assert m.fixed_mesh.exact.shape == (5, 10_000)
+    assert np.all(relative_spread(m.fixed_mesh.exact) < 4e-14)
+    # The same form without h must fail by O(h), or the test above says nothing.
+    assert np.all(relative_spread(m.fixed_mesh.printed) > 0.09)
+
+
+def test_rk4_on_the_oscillator(m):
+    assert m.fixed_mesh.rk4[-1] - m.fixed_mesh.energy == pytest.approx(-1.39e-8, rel=0.01)
+    assert m.crossover.loss == pytest.approx(m.crossover.hs[0] ** 6 / 72, rel=0.01)
+
+
+def test_crossover(m):
+    assert m.crossover.steps[0] == pytest.approx(7.2e6, rel=0.02)
+    np.testing.assert_allclose(m.crossover.steps, m.crossover.predicted, rtol=0.03)
+
+
+def test_orders_of_34(m):
+    assert slope(m.small_step.epsilons, m.small_step.printed) == pytest.approx(1.0, abs=0.03)
+    assert np.max(m.small_step.corrected) < 2e-9
+
+
+def test_kepler_wiggles(m):
+    sweep = m.mesh_sweep
+    at = dict(zip(sweep.hs, sweep.spread_50[:, 0], strict=True))
+    assert at[0.1] == pytest.approx(0.055, rel=0.01)
+    assert at[0.01] == pytest.approx(0.0051, rel=0.01)
+    assert slope(sweep.hs, sweep.spread_50[:, 0]) == pytest.approx(1.0, abs=0.1)
+    assert np.max(sweep.relative_49) < 1e-13
+
+
+def test_orders_of_50(m):
+    small = m.small_step_sweep
+    attracting, repelling = (
+        small.exponent(small.beyond_zero(d)) for d in (small.attracting, small.repelling)
+    )
+    assert attracting == pytest.approx(1.98, abs=0.02)
+    assert repelling == pytest.approx(1.04, abs=0.02)
+    # ξ0 = 1, as (47) has it, gives an invariant that is exact as h → 0.
+    assert np.all(np.abs(small.beyond_zero(small.literal)) < 0.1 * small.literal[0])
+
+
+def test_long_kepler_runs(m):
+    rk4, variational = m.long_runs["RK4"], m.long_runs["variational (order 1)"]
+    assert rk4.error_at(1.0) == pytest.approx(4.6e-3, rel=0.02)
+    assert rk4.error_at(1.0) / rk4.error_at(0.5) == pytest.approx(2, rel=0.02)
+    assert np.max(np.abs(rk4.momentum_errors)) == pytest.approx(3.4e-4, rel=0.02)
+    assert variational.error_at(1.0) == pytest.approx(0.324, rel=0.01)
+    assert np.max(np.abs(variational.momentum_errors)) < 1e-13
+    assert variational.width > 100 * rk4.width
+
+
+def test_variational_mesh_ends(m):
+    assert m.variational_mesh.steps[0] == 77
+    assert m.variational_mesh.times == pytest.approx([31.0, 20.1], abs=0.1)
+
+
+def test_balance_is_exact_where_31_is_not(m):
+    assert np.max(m.identities.balance) < 1e-12
+    assert np.min(m.identities.law_31) > 1e-3
+
+
+# --- verdicts
+
+
+def test_every_verdict_is_as_on_record(run):
+    claims = run[0].claims
+    assert [claim.key for claim in claims if not claim.is_expected] == []
+    assert len({claim.key for claim in claims}) == len(claims)
+    assert {claim.verdict for claim in claims} == set(Verdict)
+
+
+def replaced(m, field, **changes):
+    return dataclasses.replace(m, **{field: dataclasses.replace(getattr(m, field), **changes)})
+
+
+def test_verdicts_follow_the_measurements(m):
+    before = verdicts(m)
+
+    mesh = m.fixed_mesh
+    steady = mesh.mixed[:1, :1] * (1 + 1e-9 * np.sin(mesh.ts))
+    after = verdicts(replaced(m, "fixed_mesh", mixed=np.repeat(steady, len(mesh.mixed), 0)))
+    assert before["energy-fig1"] is Verdict.FAILS
+    assert after["energy-fig1"] is Verdict.HOLDS
+    assert after["exact-oscillator"] is Verdict.MENDED  # 1e-9 is small, and not round-off
+
+    sweep = m.mesh_sweep
+    after = verdicts(replaced(m, "mesh_sweep", relative_49=sweep.relative_49 + 1e-6))
+    assert (before["momentum"], before["invariant-49"]) == (Verdict.HOLDS, Verdict.HOLDS)
+    assert (after["momentum"], after["invariant-49"]) == (Verdict.FAILS, Verdict.FAILS)
+
+    small = m.small_step_sweep
+    swapped = {"attracting": small.repelling, "repelling": small.attracting}
+    after = verdicts(replaced(m, "small_step_sweep", **swapped))
+    assert (before["force-kepler"], after["force-kepler"]) == (Verdict.MENDED, Verdict.HOLDS)
+    assert after["invariant-50"] is Verdict.FAILS
+
+    never = np.full_like(m.crossover.steps, np.nan)
+    after = verdicts(replaced(m, "crossover", steps=never))
+    assert (before["rk4-long"], after["rk4-long"]) == (Verdict.HOLDS, Verdict.FAILS)
+
+
+def test_a_changed_verdict_says_so(m):
+    changed = replaced(m, "mesh_sweep", relative_49=m.mesh_sweep.relative_49 + 1e-6)
+    claim = next(c for c in judge(changed) if c.key == "momentum")
+    assert not claim.is_expected
+    assert "Unexpected" in claim.reason
+
+
+def test_nan_passes_no_check():
+    check = Check("a number", float("nan"))
+    assert not check.passes
+    claim = Claim("k", "w", "s", (check,), (check,), Verdict.FAILS, "why")
+    assert claim.verdict is Verdict.FAILS
+
+
+# --- equations
+
+
+def test_all_fifty_equations_are_mapped_to_code():
+    assert [e.number for e in EQUATIONS] == list(range(1, 51))
+    for equation in EQUATIONS:
+        assert equation.code, equation
+        for name in equation.code:
+            assert resolve(name) is not None, name
+
+
+@pytest.mark.parametrize("name", ["dvi_jax.NoSuchThing", "dvi_jax.no.such", "no_such_package.x"])
+def test_a_name_that_does_not_exist_is_not_resolved(name):
+    with pytest.raises((AttributeError, ModuleNotFoundError)):
+        resolve(name)
+
+
+# --- files
+
+
+def test_what_is_written(run):
+    out = run[0].out
+    document = json.loads((out / "verdicts.json").read_text("utf-8"))
+    assert len(document["claims"]) == len(run[0].claims)
+    assert all(row["checks_as_printed"] and row["why"] for row in document["claims"])
+    markdown = (out / "verdicts.md").read_text("utf-8")
+    assert all(claim.says.replace("|", "\\|") in markdown for claim in run[0].claims)
+    for name in FIGURES:
+        assert (out / "figures" / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    for path in (out / "tables").iterdir():
+        header, *rows = csv.reader(path.open(encoding="utf-8"))
+        assert rows
+        assert all(len(row) == len(header) for row in rows)
+
+
+def test_the_page_needs_nothing_beside_it(run):
+    page = (run[0].out / "verdicts.html").read_text("utf-8")
+    sources = re.findall(r"""(?:src|href)=["']([^"']*)""", page)
+    assert all(source.startswith(("data:image/png;base64,", "#")) for source in sources)
+    assert sum(source.startswith("data:") for source in sources) == len(FIGURES)
+    assert not re.search(r"https?:|url\(|@import|<script|<link", page)
+
+
+def test_what_is_printed_without_a_terminal(run):
+    printed = run[1]
+    assert "\x1b" not in printed
+    assert printed.count("100 %") == 11
+    assert "hold once mended" in printed
+    assert "verdicts.html" in printed
+
+
+def test_it_is_done_within_a_minute(run):
+    # Of CPU time, so that a busy machine does not fail it; the work is mostly on one core.
+    assert run[2] < 60
+
+
+# --- refusals
+
+
+def test_a_folder_that_is_not_empty_is_refused_before_any_work(tmp_path):
+    (tmp_path / "mine.txt").write_text("keep")
+    began = time.perf_counter()
+    with pytest.raises(FileExistsError, match="not empty"):
+        reproduce(tmp_path)
+    assert time.perf_counter() - began < 1
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_force_overwrites_its_own_files_only(run, m, tmp_path, monkeypatch):
+    monkeypatch.setattr("dvi_jax.paper._reproduce.measure", lambda console: m)
+    (tmp_path / "mine.txt").write_text("keep")
+    (tmp_path / "verdicts.md").write_text("old")
+    reproduce(tmp_path, force=True, console=Console(file=io.StringIO()))
+    assert (tmp_path / "mine.txt").read_text() == "keep"
+    assert (tmp_path / "verdicts.md").read_text("utf-8").startswith("# The paper's claims")
+
+
+def test_a_file_is_refused(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("keep")
+    with pytest.raises(NotADirectoryError, match="is a file"):
+        reproduce(path, force=True)
+
+
+# --- the statistics
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1.39e-8, "1.39×10⁻⁸"),
+        (-1.39e-8, "−1.39×10⁻⁸"),
+        (7.2e6, "7.2×10⁶"),
+        (0.055, "0.055"),
+        (0, "0"),
+    ],
+)
+def test_numbers_as_text(value, text):
+    assert pretty(value) == text
+
+
+def test_statistics():
+    values = np.array([[2.0, 5.0, 1.0], [4.0, 4.0, 4.0]])
+    np.testing.assert_array_equal(spread(values), [4, 0])
+    np.testing.assert_array_equal(max_drift(values), [3, 0])
+    np.testing.assert_array_equal(relative_spread(values), [2, 0])
+    x = np.array([1.0, 2.0, 4.0])
+    assert slope(x, 3 * x**1.7) == pytest.approx(1.7)
+    assert np.isnan(slope(x, np.array([1.0, 0.0, 1.0])))
+    assert np.isnan(slope(x, np.array([1.0, np.nan, 1.0])))
+    assert crossing(x, x**2, 10.0) == pytest.approx(3.0)
+    assert np.isnan(crossing(x, x, 5.0))

@@ -1,0 +1,381 @@
+"""Runs from TOML files: what they write, what they refuse, how they fail."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import dvi_jax as dvi
+from dvi_jax import systems
+from dvi_jax.cli import app
+from dvi_jax.run import InputError, run_file
+from dvi_jax.run._config import KEYS
+from dvi_jax.run._setup import parse_method
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+OWN = """
+import jax.numpy as jnp
+import dvi_jax as dvi
+from dvi_jax.systems import Problem
+
+def H_D(t0, t1, q0, p1, args):
+    return args["k"] * jnp.sum(q0**2) / 2 + jnp.sum(p1**2) / 2
+
+system = dvi.System(H_D)
+number = 3
+
+def problem():
+    return Problem("spring", system, q0=[1.0], p0=[0.0], h=0.1, args={"k": 1.0})
+
+def failing():
+    raise RuntimeError("no luck")
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    return H_D(t0, t1, q1, p1, args)
+
+def too_few(t0, t1):
+    return t0
+
+def runaway(t0, t1, q0, p1, args):
+    return jnp.sum(p1**2) / 2 - jnp.sum(q0**4)
+
+explosive = dvi.System(runaway)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "own.py").write_text(OWN, encoding="utf-8")
+    (tmp_path / "broken.py").write_text("x = 1\nimport not_there_at_all\n", encoding="utf-8")
+    (tmp_path / "syntax.py").write_text("def f(:\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def command(*words):
+    return CliRunner().invoke(app, [str(w) for w in words])
+
+
+def write(folder, text, name="run.toml"):
+    (folder / name).write_text(text, encoding="utf-8")
+    return folder / name
+
+
+# What a run writes
+
+
+def test_kepler_example(folder):
+    result = command("run", EXAMPLES / "kepler.toml")
+    assert result.exit_code == 0, result.output
+    out = folder / "results" / "kepler"
+    names = {p.name for p in out.iterdir()}
+    assert names == {"trajectory.npz", "report.json", "trajectory.png", "invariants.png"}
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert report["status"]["result"] == "successful"
+    assert report["config"]["epsilon"] == 0.01
+    assert report["results"]["angular_momentum_drift"]["relative"] < 1e-13
+    assert report["results"]["energy"]["largest_saved_change"] > 0.01  # negative control
+
+    problem = systems.kepler()
+    alone = dvi.integrate(
+        problem.system,
+        problem.q0,
+        problem.p0,
+        h=0.1,
+        num_steps=5000,
+        epsilon=0.01,
+        args=problem.args,
+        save=dvi.Save(every=2, final=True),
+        observe=problem.observables["energy"],
+    )
+    with np.load(out / "trajectory.npz") as saved:
+        np.testing.assert_array_equal(saved["ts"], alone.ts)
+        np.testing.assert_allclose(saved["qs"], alone.qs, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(saved["observed/energy"], alone.observed, rtol=0, atol=1e-9)
+        assert saved["ps"].shape == (2501, 2)
+        assert saved["hs"].shape == (2500,)
+
+
+def test_own_system_example(folder):
+    result = command("run", EXAMPLES / "own_system.toml", "--out", folder / "pendulum")
+    assert result.exit_code == 0, result.output
+    report = json.loads((folder / "pendulum" / "report.json").read_text(encoding="utf-8"))
+    results = report["results"]
+    assert 1e-6 < results["energy_range"]["relative"] < 1e-3  # bounded, and not zero
+    assert report["stats"]["newton_iterations"] > 4000  # it is implicit
+    assert report["stats"]["max_residual"] < 1e-12
+
+
+@pytest.mark.parametrize("system", ["own.py:system", "own.py:problem"])
+def test_systems_from_a_file(folder, system):
+    state = "h = 0.1\n[state]\nq0 = [1.0]\np0 = [0.0]\n[args]\nk = 1.0\n" if "sys" in system else ""
+    text = f'system = "{system}"\nsteps = 20\n{state}[output]\nplots = false\n'
+    report = run_file(write(folder, text))
+    with np.load(report.folder / "trajectory.npz") as saved:
+        q, p = 1.0, 0.0
+        for _ in range(20):
+            p -= 0.1 * q
+            q += 0.1 * p
+        np.testing.assert_allclose(saved["qs"][-1], [q], rtol=1e-14)
+    assert report.files == ["trajectory.npz", "report.json"]
+
+
+def test_given_times_and_parameters(folder):
+    times = [0.0, 0.1, 0.3, 0.35]
+    text = f'system = "kepler"\nlattice = {{times = {times}}}\n[args]\nK = 2.0\n'
+    report = run_file(write(folder, text + "[output]\nplots = false\n"))
+    problem = systems.kepler()
+    alone = dvi.integrate(
+        problem.system, problem.q0, problem.p0, lattice=dvi.Given(times), args={"K": 2.0}
+    )
+    with np.load(report.folder / "trajectory.npz") as saved:
+        np.testing.assert_allclose(saved["qs"], alone.qs, rtol=1e-13)
+        np.testing.assert_array_equal(saved["ts"], times)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("TypeII", dvi.TypeII()),
+        (" Strang() ", dvi.Strang()),
+        ("Yoshida(4)", dvi.Yoshida(4)),
+        ("Yoshida(order=4)", dvi.Yoshida(4)),
+        ("Adjoint(TypeII)", dvi.Adjoint(dvi.TypeII())),
+        ("Adjoint(Adjoint(Strang()))", dvi.Adjoint(dvi.Adjoint(dvi.Strang()))),
+        ("Composition([0.5, 0.5], order=2)", dvi.Composition([0.5, 0.5], order=2)),
+        ("Composition([-1.0, 2.0])", dvi.Composition([-1.0, 2.0])),
+    ],
+)
+def test_methods_are_read(text, expected):
+    assert parse_method(text) == expected
+
+
+def test_nothing_in_a_method_is_run(tmp_path):
+    target = tmp_path / "made"
+    for text in (f"open('{target}', 'w')", f"Yoshida(open('{target}', 'w'))", "Strang().order"):
+        with pytest.raises(InputError):
+            parse_method(text)
+    assert not target.exists()
+
+
+# What is refused: the key, what was seen, what is allowed
+
+KEPLER = 'system = "kepler"\n'
+REFUSED = [
+    ("steps = 5", "system: the key is missing", "file.py:name"),
+    ('system = "keplr"', "system: 'keplr'", "did you mean kepler?"),
+    ("system = 3", "system: 3 (a whole number)", "library"),
+    (KEPLER + "stepps = 5", "stepps: there is no such key", "did you mean steps?"),
+    (KEPLER, "steps: the key is missing", "positive whole number"),
+    (KEPLER + "steps = 1.5", "steps: 1.5 (a number)", "positive whole number"),
+    (KEPLER + "steps = true", "steps: true (a boolean)", "positive whole number"),
+    (KEPLER + "steps = -1", "steps: -1 (a whole number)", "positive whole number"),
+    (KEPLER + "steps = 5\nh = 0.0", "h: 0.0 (a number)", "not zero"),
+    (KEPLER + "steps = 5\nh = inf", "h: inf (a number)", "finite"),
+    (KEPLER + 'steps = 5\nepsilon = "big"', "epsilon: 'big' (text)", "finite number"),
+    (KEPLER + 'steps = 5\nmethod = "Yosida(4)"', "method: 'Yosida'", "did you mean Yoshida?"),
+    (KEPLER + 'steps = 5\nmethod = "Yoshida(5)"', "knows order 4, got 5", "Strang"),
+    (KEPLER + 'steps = 5\nmethod = "3"', "method: '3'", "Strang"),
+    (KEPLER + 'steps = 5\nlattice = "given"', "lattice: 'given' (text)", "uniform"),
+    (KEPLER + "lattice = {times = [0.0, 1.0, 0.5]}", "lattice: ", "all increasing"),
+    (KEPLER + "steps = 5\nlattice = {times = [0.0, 1.0]}", "steps: 5", "lattice.times sets"),
+    (KEPLER + "steps = 5\nstate = 1", "state: 1", "q0, p0, date"),
+    (KEPLER + "steps = 5\n[state]\nq0 = [1, 2, 3]", "state.p0: shape (2,)", "(3,)"),
+    (KEPLER + "steps = 5\n[state]\nq0 = [[1, 2], [3]]", "state.q0: [[1, 2], [3]]", "one length"),
+    (KEPLER + "steps = 5\n[state]\nq0 = [1, nan]", "state.q0: [1, nan]", "finite"),
+    (KEPLER + 'steps = 5\n[state]\ndate = "1950-01-01"', "state.date:", "solar_system"),
+    (KEPLER + "steps = 5\n[args]\nk = 1.0", "args.k: there is no such", "did you mean K?"),
+    (KEPLER + 'steps = 5\n[args]\nK = "one"', "args: {'K': 'one'}", "numbers"),
+    (KEPLER + "steps = 5\n[args]\nK = [1.0, 2.0]", "must return a real scalar", "args that fit"),
+    (KEPLER + 'steps = 5\n[observables]\na = "enrgy"', "observables.a: 'enrgy'", "mean energy?"),
+    (KEPLER + 'steps = 5\n[observables]\na = "Max(energy)"', "observables.a: 'Max(", "MaxDrift"),
+    (KEPLER + 'steps = 5\n[observables]\na = "own.py:number"', "own.py:number' is int", "function"),
+    (KEPLER + 'steps = 5\n[observables]\na = "own.py:too_few"', "too_few", "args that fit"),
+    (KEPLER + "steps = 5\n[output]\nevery = 0", "output.every: 0", "positive whole number"),
+    (KEPLER + "steps = 5\n[output]\nevrey = 1", "output.evrey: there is no", "mean every?"),
+    ('system = "kepler', "is not TOML", "toml.io"),
+    ('system = "nowhere.py:system"', "there is no file", "file.py:name"),
+    ('system = "own.py:sistem"', "own.py has no 'sistem'", "did you mean system?"),
+    ('system = "own.py:number"', "own.py:number' is int", "dvi.System"),
+    ('system = "own.py:failing"', "RuntimeError: no luck (own.py, line 16)", "returns a system"),
+    ('system = "broken.py:system"', "not_there_at_all' (broken.py, line 2)", "imports"),
+    ('system = "syntax.py:system"', "SyntaxError", "imports"),
+    ('system = "own.py:system"\nsteps = 5', "state.q0: the key is missing", "this system has none"),
+    (
+        'system = "own.py:system"\nsteps = 5\n[state]\nq0 = [1]\np0 = [0]',
+        "h: the key is missing",
+        "none of its own",
+    ),
+    (
+        'system = "own.py:system"\nsteps = 5\nh = 0.1\n[state]\nq0 = [1]\np0 = [0]',
+        "(own.py, line 7)",
+        "state and args that fit",
+    ),
+    (
+        'system = "n_body"\nsteps = 5\n[state]\nq0 = [[0, 0], [0, 0], [1, 1]]',
+        "body 0 and body 1 are on top of one another",
+        "start",
+    ),
+    ('system = "n_body"\nsteps = 5\n[args]\nmasses = [1, 0, 1]', "mass of body 1 is 0", "start"),
+]
+
+
+@pytest.mark.parametrize(("text", "seen", "allowed"), REFUSED)
+def test_bad_input(folder, text, seen, allowed):
+    result = command("run", write(folder, text), "--out", "out")
+    assert result.exit_code == 2, result.output
+    assert seen in result.stderr
+    assert "allowed: " in result.stderr
+    assert allowed in result.stderr.partition("allowed: ")[2]
+    assert "Traceback" not in result.output
+    assert isinstance(result.exception, SystemExit)
+    assert not (folder / "out").exists()  # nothing is left behind
+
+
+def test_missing_file(folder):
+    result = command("run", "nowhere.toml")
+    assert result.exit_code == 2
+    assert "nowhere.toml: there is no such file" in result.stderr
+
+
+def test_dates_outside_the_ephemeris(folder):
+    pytest.importorskip("jplephem")
+    for date, steps, said in (
+        ("1850-01-01", 5, "covers 1899-07-29"),
+        ("2053-10-01", 10_000, "the run ends 312.5 days after"),
+    ):
+        path = write(
+            folder, f'system = "solar_system"\nsteps = {steps}\n[state]\ndate = "{date}"\n'
+        )
+        result = command("run", path, "--out", "out")
+        assert result.exit_code == 2
+        assert said in result.stderr
+
+
+def test_results_are_not_overwritten(folder):
+    path = write(folder, KEPLER + "steps = 5\n[output]\nplots = false\n")
+    assert command("run", path, "--out", "out").exit_code == 0
+    (folder / "out" / "notes.txt").write_text("mine", encoding="utf-8")
+    (folder / "out" / "orbits.png").write_text("of another run", encoding="utf-8")
+    before = (folder / "out" / "report.json").read_bytes()
+
+    again = command("run", path, "--out", "out")
+    assert again.exit_code == 2
+    assert "out exists and is not empty" in again.stderr
+    assert "--force" in again.stderr
+    assert (folder / "out" / "report.json").read_bytes() == before
+
+    longer = write(folder, KEPLER + "steps = 6\n[output]\nplots = false\n")
+    assert command("run", longer, "--out", "out", "--force").exit_code == 0
+    assert json.loads((folder / "out" / "report.json").read_bytes())["config"]["steps"] == 6
+    assert (folder / "out" / "notes.txt").read_text(encoding="utf-8") == "mine"
+    assert not (folder / "out" / "orbits.png").exists()  # it would belong to no run
+
+
+def test_a_file_in_the_way(folder):
+    path = write(folder, KEPLER + "steps = 5\n")
+    result = command("run", path, "--out", "own.py")
+    assert result.exit_code == 2
+    assert "own.py is not a directory" in result.stderr
+
+
+# How a trajectory fails
+
+
+def test_a_failed_trajectory_is_written(folder):
+    path = write(
+        folder,
+        'system = "own.py:explosive"\nh = 0.1\nsteps = 60\n[state]\nq0 = [1.0]\np0 = [1.0]\n'
+        '[observables]\nenergy = "own.py:energy"\ndrift = "MaxDrift(own.py:energy)"\n'
+        "[args]\nk = 1.0\n",
+    )
+    result = command("run", path, "--out", "out")
+    assert result.exit_code == 1, result.output
+    assert "failed at step" in result.stderr
+    assert "not_finite" in result.stderr
+    report = json.loads((folder / "out" / "report.json").read_text(encoding="utf-8"))
+    step = report["status"]["failed_step"]
+    assert 0 < step < 60
+    with np.load(folder / "out" / "trajectory.npz") as saved:
+        assert np.isfinite(saved["qs"][: step + 1]).all()
+        assert np.isnan(saved["qs"][step + 1 :]).all()
+    assert report["results"]["drift"]["value"] == "nan"  # not finite, and said so
+    assert (folder / "out" / "trajectory.png").exists()
+
+
+# The command line
+
+
+def test_version_and_help():
+    assert command("--version").output.strip() == f"dvi-jax {dvi.__version__}"
+    shown = command("--help")
+    assert shown.exit_code == 0
+    assert "run" in shown.output
+    assert "paper" in shown.output
+    assert command("walk").exit_code == 2
+
+
+def test_entry_point_without_traceback(folder):
+    path = write(folder, KEPLER + "steps = 0\n")
+    code = "from dvi_jax.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "run", str(path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("bad input: steps: 0")
+    assert "Traceback" not in done.stderr
+
+
+def test_every_key_is_shown_in_an_example():
+    """A key that no example shows is one that nobody finds."""
+    text = "".join(p.read_text(encoding="utf-8") for p in EXAMPLES.glob("*.toml"))
+    for key in KEYS:
+        assert f"{key} = " in text or f"[{key}]" in text, key
+
+
+def test_solar_system_with_too_large_a_step_says_so(folder):
+    pytest.importorskip("jplephem")
+    path = write(
+        folder,
+        'system = "solar_system"\nh = 0.25\nsteps = 5840\nmethod = "Yoshida(4)"\n'
+        "[state]\ndate = 1950-01-01\n[output]\nevery = 20\nplots = false\n",
+    )
+    result = command("run", path, "--out", "out")
+    assert result.exit_code == 0, result.output
+    report = json.loads((folder / "out" / "report.json").read_text(encoding="utf-8"))
+    found = report["solar_system"]["mercury_perihelion"]
+    share = found["integrators_share_arcsec_per_century"]
+    slope = found["ephemeris_minus_integration_arcsec_per_century"]
+    assert share < -100
+    assert slope - share == pytest.approx(43.0, abs=1.0)
+    assert "take a smaller h" in " ".join(result.output.split())
+
+
+@pytest.mark.slow
+def test_solar_system_example(folder):
+    """A century: momenta to 1e-12, Mercury's perihelion short by 43″."""
+    pytest.importorskip("jplephem")
+    shutil.copy(EXAMPLES / "solar_system.toml", folder)
+    result = command("run", "solar_system.toml")
+    assert result.exit_code == 0, result.output
+    assert "ephemeris minus integration: 42.96″ per century" in result.output
+    out = folder / "results" / "solar_system"
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))["solar_system"]
+    assert report["years"] == 100
+    assert all(x < 1e-12 for x in report["largest_relative_change"].values())  # measured 4e-13
+    perihelion = report["mercury_perihelion"]
+    assert perihelion["ephemeris_minus_integration_arcsec_per_century"] == pytest.approx(
+        43.0, abs=0.1
+    )
+    assert perihelion["integrators_share_arcsec_per_century"] == pytest.approx(-0.04, abs=0.005)
+    assert 1e4 < report["position_error"]["Mercury"]["largest_km"] < 4e4  # relativity again
+    assert report["position_error"]["Saturn"]["largest_km"] < 30
+    for name in ("orbits.png", "ephemeris.png", "invariants.png"):
+        assert (out / name).stat().st_size > 10_000

@@ -1,0 +1,300 @@
+"""N bodies, the ephemeris, and the century that tells Newton from Einstein."""
+
+import importlib.util
+import sys
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+from dvi_jax.run._solar import compare
+from dvi_jax.systems import n_body, solar_system
+from dvi_jax.systems.n_body import OBSERVABLES, angular_momentum, check_bodies, hamiltonian
+from dvi_jax.systems.solar_system import (
+    AU_IN_KM,
+    BODIES,
+    GM,
+    EphemerisMissing,
+    ephemeris,
+    julian_date,
+    perihelion_longitude,
+    to_ecliptic,
+)
+
+pytest.importorskip("jplephem")
+if importlib.util.find_spec("skyfield_data") is None:
+    pytest.skip("the ephemeris is not installed", allow_module_level=True)
+
+START = 2415020.5  # 1900-01-01
+TEN_YEARS = 3600.0  # day
+
+
+@pytest.fixture(scope="module")
+def century():
+    return solar_system("1900-01-01")
+
+
+@pytest.fixture(scope="module")
+def run(century):
+    """Ten years with a given step, method and masses; every one is integrated once."""
+    kept = {}
+
+    def runner(h, method=dvi.Yoshida(4), masses=GM):
+        key = (h, type(method), tuple(masses))
+        if key not in kept:
+            velocities = century.p0 / GM[:, None]
+            kept[key] = dvi.integrate(
+                century.system,
+                century.q0,
+                masses[:, None] * velocities,
+                h=h,
+                num_steps=round(TEN_YEARS / h),
+                args={"masses": masses, "G": 1.0},
+                method=method,
+                save=dvi.Save(every=round(5 / h)),
+                observe={name: dvi.MaxDrift(f) for name, f in OBSERVABLES.items()},
+            )
+        return kept[key]
+
+    return runner
+
+
+def beside_ephemeris(solution, masses=GM):
+    jd = START + np.asarray(solution.ts)
+    return compare(jd, np.asarray(solution.qs), np.asarray(solution.ps), masses)
+
+
+# The ephemeris
+
+
+@pytest.mark.parametrize(
+    ("date", "jd"), [("1900-01-01", START), ("2000-01-01", 2451544.5), (2451545.0, 2451545.0)]
+)
+def test_dates(date, jd):
+    assert julian_date(date) == jd
+
+
+@pytest.mark.parametrize(
+    ("date", "said"),
+    [
+        ("1899-07-28", "DE421 covers 1899-07-29 to 2053-10-09"),
+        ("2053-10-10", "DE421 covers"),
+        ("01/01/1900", "must read like"),
+        (True, "calendar day or a Julian date"),
+        (float("nan"), "lies outside"),
+    ],
+)
+def test_dates_that_cannot_be_used(date, said):
+    with pytest.raises(ValueError, match=said):
+        julian_date(date)
+
+
+def test_ephemeris_is_barycentric_in_au_and_days():
+    jd = START + np.linspace(0, 36525, 200)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of the age of a file that is not read
+        q, v = ephemeris(jd)
+    assert q.shape == v.shape == (200, 10, 3)
+    radius = np.linalg.norm(q - q[:, :1], axis=-1)
+    perihelion = [0.307, 0.718, 0.983, 1.381, 4.95, 9.0, 18.2, 29.7, 29.6]
+    aphelion = [0.467, 0.729, 1.017, 1.667, 5.46, 10.1, 20.1, 30.4, 49.4]
+    assert (radius[:, 1:] > np.multiply(perihelion, 0.998)).all()
+    assert (radius[:, 1:] < np.multiply(aphelion, 1.002)).all()
+    # The barycentre rests at the origin but for the asteroids, which are not here.
+    total = np.sum(GM)
+    assert np.abs(np.einsum("i,tij->tj", GM, q) / total).max() < 1e-6
+    assert np.abs(np.einsum("i,tij->tj", GM, v) / total).max() < 1e-9
+
+
+def test_velocity_is_the_derivative_of_position():
+    jd, s = START + 1000.0, 0.05
+    q, _ = ephemeris(jd + s * np.arange(-2, 3))
+    _, v = ephemeris([jd])
+    centred = (q[0] - 8 * q[1] + 8 * q[3] - q[4]) / (12 * s)  # error s⁴ q⁽⁵⁾/30 ~ 1e-13 of v
+    # Julian dates near 2.4e6 are spaced by 5e-10 day: that much of v/s is rounding.
+    np.testing.assert_allclose(centred, v[0], rtol=0, atol=2e-9)
+
+
+def test_earth_stays_on_the_ecliptic():
+    jd = START + np.linspace(0, 3652, 100)
+    q, _ = ephemeris(jd)
+    earth = q[:, BODIES.index("Earth–Moon")] - q[:, 0]
+    assert np.abs(to_ecliptic(earth)[:, 2]).max() < 3e-4  # the ecliptic of 1900 beside J2000's
+    assert np.abs(earth[:, 2]).max() > 0.39  # negative control: on the equator's axes it does not
+
+
+def test_missing_extra_names_the_command(monkeypatch):
+    solar = sys.modules["dvi_jax.systems.solar_system"]
+    monkeypatch.setattr(solar, "find_spec", lambda name: None)
+    solar._kernel.cache_clear()
+    with pytest.raises(EphemerisMissing, match=r'pip install "dvi-jax\[ephemeris\]"'):
+        ephemeris([START])
+    monkeypatch.undo()
+    monkeypatch.setitem(sys.modules, "jplephem.spk", None)
+    with pytest.raises(EphemerisMissing, match=r"jplephem: pip install"):
+        ephemeris([START])
+
+
+def test_perihelion_of_a_known_ellipse():
+    a, e, i, node, omega, mu = 0.4, 0.2, 0.12, 0.8, 0.5, 2.9e-4
+    E = np.linspace(0, 20, 300)  # eccentric anomaly, over several turns
+    x, y = a * (np.cos(E) - e), a * np.sqrt(1 - e**2) * np.sin(E)
+    rate = np.sqrt(mu / a**3) / (1 - e * np.cos(E))
+    vx, vy = -a * np.sin(E) * rate, a * np.sqrt(1 - e**2) * np.cos(E) * rate
+
+    def turn(angle, axis):
+        c, s = np.cos(angle), np.sin(angle)
+        return np.array(
+            [[1, 0, 0], [0, c, -s], [0, s, c]]
+            if axis == "x"
+            else [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+        )
+
+    to_space = turn(node, "z") @ turn(i, "x") @ turn(omega, "z")
+    q = np.stack([x, y, 0 * x], -1) @ to_space.T
+    v = np.stack([vx, vy, 0 * x], -1) @ to_space.T
+    np.testing.assert_allclose(perihelion_longitude(q, v, mu), node + omega, rtol=0, atol=1e-12)
+
+
+# N bodies
+
+
+def test_forces_are_newtons():
+    rng = np.random.default_rng(0)
+    m, q, p = rng.uniform(1, 3, 5), rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
+    args = {"masses": jnp.asarray(m), "G": 2.0}
+    dq, dp = jax.grad(hamiltonian, argnums=(2, 3))(0.0, 0.0, jnp.asarray(q), jnp.asarray(p), args)
+    expected = np.zeros_like(q)
+    for i in range(5):
+        for j in range(5):
+            if i != j:
+                d = q[i] - q[j]
+                expected[i] += 2.0 * m[i] * m[j] * d / np.linalg.norm(d) ** 3
+    np.testing.assert_allclose(dq, expected, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(dp, p / m[:, None], rtol=1e-15)
+
+
+def test_bodies_in_one_place_are_not_finite():
+    q = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    solution = dvi.integrate(
+        dvi.System(hamiltonian),
+        q,
+        np.zeros((3, 2)),
+        h=0.01,
+        num_steps=2,
+        args={"masses": np.ones(3)},
+        throw=False,
+    )
+    assert bool(solution.result == dvi.RESULTS.not_finite)
+    assert int(solution.stats["failed_step"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("masses", "q0", "said"),
+    [
+        ([1, 1, 1], [[0, 0], [1, 0], [1, 0]], "body 1 and body 2 are on top of one another"),
+        ([1, 1, 1], [[0, 0], [1, 0], [1, 1e-17]], "body 1 and body 2 are on top"),
+        ([1, -1, 1], [[0, 0], [1, 0], [2, 0]], "mass of body 1 is -1.0"),
+        ([1, np.nan, 1], [[0, 0], [1, 0], [2, 0]], "mass of body 1 is nan"),
+        ([1, 1], [[0, 0], [1, 0], [2, 0]], "one number for each of the 3 bodies"),
+        ([1, 1, 1], [0, 1, 2], r"\(bodies, 2\) or \(bodies, 3\)"),
+    ],
+)
+def test_starts_that_are_refused(masses, q0, said):
+    with pytest.raises(ValueError, match=said):
+        n_body(masses, q0, np.zeros_like(q0, dtype=float))
+
+
+def test_planets_are_named_when_they_coincide(century):
+    q = century.q0.copy()
+    q[3] = q[2]
+    with pytest.raises(ValueError, match="Venus and Earth–Moon are on top of one another"):
+        century.check(q, century.p0, century.args)
+    check_bodies(century.q0, century.p0, century.args)
+
+
+def test_figure_eight_comes_back():
+    problem, period = n_body(), 6.32591398
+    solution = dvi.integrate(
+        problem.system,
+        problem.q0,
+        problem.p0,
+        h=period / 2000,
+        num_steps=2000,
+        args=problem.args,
+        method=dvi.Yoshida(4),
+        save=dvi.Save(final=True),
+        observe=dvi.MaxDrift(angular_momentum),
+    )
+    np.testing.assert_allclose(solution.qs[-1], problem.q0, rtol=0, atol=2e-7)  # digits as printed
+    assert float(solution.observed) < 1e-14
+
+
+# Ten years beside the ephemeris
+
+
+def test_momenta_are_kept_and_runge_kutta_loses_them(run, century):
+    size = np.linalg.norm(angular_momentum(0, 0, None, None, century.q0, century.p0, None))
+    total = np.linalg.norm(century.p0, axis=-1).sum()
+    drift = run(0.25).observed
+    assert np.linalg.norm(drift["angular_momentum"]) / size < 1e-13  # measured 1e-14
+    assert np.linalg.norm(drift["linear_momentum"]) / total < 1e-13
+    # Negative control. Its own drift is small (order h⁵) and yet far above rounding.
+    foil = run(1.0, dvi.RungeKutta4()).observed
+    same_step = run(1.0).observed
+    lost = np.linalg.norm(foil["angular_momentum"]) / size
+    kept = np.linalg.norm(same_step["angular_momentum"]) / size
+    assert lost > 100 * kept
+
+
+def test_outer_planets_follow_the_ephemeris(run):
+    errors = beside_ephemeris(run(0.25)).errors.max(axis=0)
+    jupiter = BODIES.index("Jupiter")
+    assert errors[jupiter] < 30  # km; measured 25
+    assert (errors[jupiter + 1 :] < 4).all()  # measured 2.5 to 3.1
+    # Negative control: Saturn's mass off by a thousandth.
+    wrong = GM.copy()
+    wrong[BODIES.index("Saturn")] *= 1.001
+    worse = beside_ephemeris(run(0.25, masses=wrong), wrong).errors.max(axis=0)
+    assert worse[jupiter] > 10 * errors[jupiter]
+
+
+def test_mercurys_perihelion_lacks_relativitys_share(run):
+    coarse, fine = (beside_ephemeris(run(h)) for h in (0.25, 0.125))
+    # The integrator turns the perihelion too, with h⁴: 10″ a century at h = 1/8.
+    own = (fine.slope - coarse.slope) / 15
+    assert own == pytest.approx(10.31, abs=0.05)
+    # 42.98″ of relativity and 0.03″ of the Sun's oblateness, which DE421 has and this has not.
+    assert fine.slope + own == pytest.approx(43.0, abs=0.05)
+    assert fine.relativity == pytest.approx(42.98, abs=0.01)
+    assert fine.scatter < 0.06
+    # Negative control: with the other planets gone, their 532″ are missing as well.
+    light = np.where(np.arange(10) == 0, GM, 1e-6 * GM)
+    alone = beside_ephemeris(run(0.125, masses=light), light)
+    assert alone.slope + own > 500
+
+
+def test_agrees_with_an_independent_integrator(run, century):
+    rebound = pytest.importorskip("rebound")
+    other = rebound.Simulation()
+    other.G = 1.0
+    other.integrator = "ias15"
+    velocities = century.p0 / GM[:, None]
+    for m, q, v in zip(GM, century.q0, velocities, strict=True):
+        other.add(m=m, x=q[0], y=q[1], z=q[2], vx=v[0], vy=v[1], vz=v[2])
+    other.integrate(TEN_YEARS, exact_finish_time=1)
+    theirs = np.array([particle.xyz for particle in other.particles])
+    theirs -= theirs[0]
+
+    def apart(h):
+        ours = np.asarray(run(h).qs[-1])
+        return np.linalg.norm(ours - ours[0] - theirs, axis=-1) * AU_IN_KM
+
+    coarse, fine = apart(0.25), apart(0.125)
+    mercury = BODIES.index("Mercury")
+    assert np.log2(coarse[mercury] / fine[mercury]) == pytest.approx(4, abs=0.35)
+    # What is left of the outer planets' distance is the Sun's, which shakes at Mercury's pace.
+    assert (fine[BODIES.index("Jupiter") :] < 0.1).all()  # km
