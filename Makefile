@@ -23,11 +23,11 @@ paper: $(READY)
 
 ## make test        all tests
 test: $(READY)
-	$(BIN)/python -m pytest -n $(JOBS)
+	$(BIN)/python -m pytest -n $(JOBS) -m "slow or not slow"
 
-## make test-fast   all tests but the slow ones
+## make test-fast   the tests that are not marked slow (what plain pytest runs)
 test-fast: $(READY)
-	$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
+	$(BIN)/python -m pytest -n $(JOBS)
 
 ## make lint        style and formatting
 lint: $(READY)

@@ -143,6 +143,7 @@ class Reversible(AbstractAdjoint):
             return Checkpointed().rollout(problem, plan, q0, p0)
         theta, fixed = eqx.partition(problem, eqx.is_inexact_array)
 
+        @jax.jit  # so that its uses below share one trace, and one trace of its derivative
         def forward(inputs):
             theta, q0, p0 = inputs
             problem = eqx.combine(theta, fixed)

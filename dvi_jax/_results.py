@@ -1,6 +1,9 @@
 """How a trajectory ended: one status for each, carried beside its numbers."""
 
+from typing import Any
+
 import equinox as eqx
+import numpy as np
 
 
 class RESULTS(eqx.Enumeration):
@@ -29,6 +32,18 @@ class RESULTS(eqx.Enumeration):
         "The step size h is zero or not finite. On a `Given` lattice: two neighbouring times "
         "are equal or the times change direction."
     )
+
+
+STATUS_NAMES = ("successful", "not_converged", "not_finite", "bad_step_size")
+
+
+def status_name(result: RESULTS) -> Any:
+    """The short name of a status, or an array of names for a batch."""
+    code = np.zeros(np.shape(result == RESULTS.successful), int)
+    for i, name in enumerate(STATUS_NAMES):
+        code = np.where(result == getattr(RESULTS, name), i, code)
+    names = np.array(STATUS_NAMES)[code]
+    return str(names) if names.ndim == 0 else names
 
 
 def first_failure(earlier: RESULTS, later: RESULTS) -> RESULTS:

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ._results import RESULTS
+from ._results import RESULTS, status_name
 from ._types import State
 
 
@@ -55,3 +55,8 @@ class Solution(eqx.Module):
     observed: Any
     result: RESULTS
     stats: dict[str, Any]
+
+    @property
+    def status(self) -> Any:
+        """The name of `result`, such as "successful"; an array of names for a batch."""
+        return status_name(self.result)

@@ -272,6 +272,7 @@ def test_newton_failure_is_named_with_step_and_residual():
         dvi.integrate(NON_SEPARABLE, [3.0], [4.0], h=10.0, num_steps=10)
     solution = e.value.solution
     assert bool(solution.result == dvi.RESULTS.not_converged)
+    assert solution.status == "not_converged"
     assert float(solution.stats["failed_residual"]) > 1e-6
 
 
@@ -299,6 +300,7 @@ def test_a_failed_lane_leaves_its_neighbours_alone():
     sols = jax.vmap(go)(hs)
     good = sols.result == dvi.RESULTS.successful
     np.testing.assert_array_equal(good, [True, False, True])
+    assert list(sols.status) == ["successful", "not_converged", "successful"]
     np.testing.assert_array_equal(sols.stats["failed_step"], [-1, 0, -1])
     for i in (0, 2):
         np.testing.assert_allclose(sols.qs[i], go(hs[i]).qs, rtol=1e-14)
@@ -345,6 +347,7 @@ def test_traced_bad_input_becomes_a_status():
         ({"h": [0.1, 0.2]}, ValueError, r"h must be one number.*vmap"),
         ({"h": "0.1s"}, TypeError, "h must be a real number"),
         ({"num_steps": -1}, ValueError, "must not be negative"),
+        ({"num_steps": 2**31}, ValueError, "in pieces"),
         ({"num_steps": 2.5}, TypeError, "Python integer"),
         ({"num_steps": None}, TypeError, "num_steps is missing"),
         ({"epsilon": np.nan}, ValueError, "epsilon must be finite"),

@@ -32,8 +32,19 @@ def jacobian(system, method, epsilon=0.0):
     return jax.jit(jax.jacfwd(flow(SYSTEMS[system][0], METHODS[method], 0.1, epsilon=epsilon)))
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
-@pytest.mark.parametrize("method", SYMPLECTIC)
+LONG_COMPILE = {("double_pendulum", m) for m in ("Yoshida4", "Composition", "Adjoint")}
+
+
+def pairs(methods, names):
+    """Every (system, method); those that take long to compile are marked slow."""
+    return [
+        pytest.param(s, m, marks=[pytest.mark.slow] if (s, m) in LONG_COMPILE else [])
+        for s in names
+        for m in methods
+    ]
+
+
+@pytest.mark.parametrize(("system", "method"), pairs(SYMPLECTIC, SYSTEMS))
 def test_undisturbed_step_is_symplectic(system, method):
     M = np.asarray(jacobian(system, method)(state(system)))
     assert symplectic_defect(M) <= 1e-12
@@ -70,8 +81,7 @@ def reference(system, epsilon, t_end):
     return z.y[:, -1]
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("system", TWO_SYSTEMS)
+@pytest.mark.parametrize(("system", "method"), pairs(METHODS, TWO_SYSTEMS))
 def test_order_with_a_damped_and_driven_force(system, method):
     """The order is that named, on a non-separable, forced, implicit problem."""
     m, t_end, epsilon = METHODS[method], 1.0, 0.2
@@ -83,8 +93,7 @@ def test_order_with_a_damped_and_driven_force(system, method):
     assert abs(orders[-1] - m.order) < 0.2, orders
 
 
-@pytest.mark.parametrize("method", INVERTIBLE)
-@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize(("system", "method"), pairs(INVERTIBLE, SYSTEMS))
 def test_inverse_undoes_the_step_with_the_force_on(system, method):
     s, q, p = SYSTEMS[system]
     m, newton = METHODS[method], dvi.Newton()
@@ -106,8 +115,7 @@ def test_inverse_undoes_the_step_with_the_force_on(system, method):
     assert np.max(np.abs(q1 - q)) > 1e-3  # it did move
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("system", "method"), pairs(METHODS, SYSTEMS))
 def test_symmetric_methods_reverse_and_others_do_not(system, method):
     m = METHODS[method]
     s = SYSTEMS[system][0]

@@ -1,5 +1,6 @@
 """Small dense linear solves, written out so that a batch of them vectorises."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
@@ -7,6 +8,7 @@ UNROLLED_UP_TO = 4
 """Systems up to this size are eliminated in components; larger ones go to LAPACK."""
 
 
+@jax.jit
 def solve_dense(A: Inexact[Array, "n n"], b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
     """Solution x of A x = b, linear in b and differentiable in both.
 

@@ -25,6 +25,9 @@ class Lattice(eqx.Module):
         """Whether every step size is finite, non-zero and of one sign."""
 
 
+MAX_STEPS = 2**31 - 1
+
+
 def check_num_steps(num_steps: object) -> int:
     """`num_steps` as an int, after refusing what cannot count steps."""
     if hasattr(num_steps, "__index__") and not isinstance(num_steps, bool):
@@ -37,6 +40,11 @@ def check_num_steps(num_steps: object) -> int:
                 raise ValueError(
                     f"num_steps must not be negative, got {count}. To go backwards in time give "
                     "a negative h."
+                )
+            if count >= MAX_STEPS:
+                raise ValueError(
+                    f"num_steps must be below 2³¹ (steps are counted in 32 bits), got {count}. Run "
+                    "in pieces, each from the end of the one before."
                 )
             return count
     raise TypeError(

@@ -232,7 +232,7 @@ def kepler_claims(m: Measurements) -> list[Claim]:
             ),
             (Check("exponent in h of the range", wiggle, 0.8, 1.2),),
             Verdict.MENDED,
-            "It wiggles by some percent, whatever ε is, because the mesh is fixed; the wiggle "
+            "It wiggles by O(h), much the same for every ε, because the mesh is fixed; the wiggle "
             "shrinks in proportion to h.",
             (Check("range at ε = 0", at_01),),
         ),

@@ -26,8 +26,8 @@ def discrete_equations(
 
     Both vanish on a solution. **Source** the paper, (16) and (23).
     """
-    (t0, q0, p0), (t1, q1, p1) = first, second
-    h = t1 - t0
+    (t0, q0, p0), (t1, q1, p1) = _as_points(first, second)
+    h, epsilon = t1 - t0, jnp.asarray(epsilon)
     interval = Interval(t0, t1, h)
     return (
         (q1 - q0) / h - position_rate(system, interval, q0, p1, epsilon, args),
@@ -83,8 +83,7 @@ def conformal_factor(
     def at_sample(first, second):
         return _equations_and_change(system, generators, first, second, epsilon, args)
 
-    first = LatticePoint(*map(jnp.asarray, first))
-    second = LatticePoint(*map(jnp.asarray, second))
+    first, second = _as_points(first, second)
     values, changes = jax.vmap(at_sample)(first, second)
     samples, size = values.shape
     if samples < size:
@@ -103,7 +102,10 @@ def _equations_and_change(system, generators, first, second, epsilon, args):
         F_q, F_p = discrete_equations(system, first, second, epsilon, args)
         return jnp.concatenate([F_q.ravel(), F_p.ravel()])
 
-    first = LatticePoint(*map(jnp.asarray, first))
-    second = LatticePoint(*map(jnp.asarray, second))
+    first, second = _as_points(first, second)
     change = prolong(generators, equations, (first, second), epsilon, args)
     return equations(first, second), change
+
+
+def _as_points(*points: LatticePoint) -> tuple[LatticePoint, ...]:
+    return tuple(LatticePoint(*map(jnp.asarray, point)) for point in points)

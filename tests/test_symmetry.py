@@ -1,0 +1,229 @@
+"""Generators, determining equations, Noether's identity and the balance law."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings, strategies as st
+
+import dvi_jax as dvi
+from dvi_jax import systems
+
+KEPLER = systems.kepler()
+OSCILLATOR = systems.oscillator()
+
+
+def turned(v):
+    return jnp.stack([-v[1], v[0]])
+
+
+ROTATION = dvi.Generator(xi=lambda t, q, p, args: turned(q), eta=lambda t, q, p, args: turned(p))
+TIME = dvi.Generator(xi0=lambda t, q, p, args: 1.0)
+SCALING = dvi.Generator(xi=lambda t, q, p, args: q, eta=lambda t, q, p, args: p)
+
+
+def random_points(seed, n, samples, h=0.1):
+    """Pairs of lattice points that lie on no solution."""
+    rng = np.random.default_rng(seed)
+    draw = lambda: rng.normal(size=(samples, n))  # noqa: E731
+    first = dvi.LatticePoint(np.zeros(samples), draw(), draw())
+    return first, dvi.LatticePoint(np.full(samples, h), draw(), draw())
+
+
+def test_prolongation_is_the_sum_over_points():
+    """(15) and (22) written out for a function of three points."""
+    points = [dvi.LatticePoint(0.1 * k, np.array([1.0 + k]), np.array([2.0 - k])) for k in range(3)]
+
+    def f(a, b, c):
+        return a.t * b.q[0] ** 2 + jnp.sin(c.p[0]) * b.t
+
+    x = dvi.Generator(
+        xi0=lambda t, q, p, args: t + 1,
+        xi=lambda t, q, p, args: 3 * q,
+        eta=lambda t, q, p, args: p**2,
+    )
+    (a, b, c) = points
+    by_hand = (
+        (a.t + 1) * b.q[0] ** 2
+        + (b.t + 1) * np.sin(c.p[0])
+        + 3 * b.q[0] * 2 * a.t * b.q[0]
+        + c.p[0] ** 2 * np.cos(c.p[0]) * b.t
+    )
+    np.testing.assert_allclose(dvi.prolong(x, f, points), by_hand, rtol=1e-14)
+    series = dvi.prolong([x, x], f, points, epsilon=0.5)
+    np.testing.assert_allclose(series, 1.5 * by_hand, rtol=1e-14)
+
+
+def test_generator_of_the_wrong_shape_is_named():
+    bad = dvi.Generator(xi=lambda t, q, p, args: q[:1])
+    with pytest.raises(ValueError, match=r"xi must have shape \(2,\).*shape \(1,\)"):
+        bad(dvi.LatticePoint(0.0, np.ones(2), np.ones(2)))
+    with pytest.raises(TypeError, match="eta must be a function"):
+        dvi.Generator(eta=1.0)
+
+
+def test_conformal_factor_of_the_rotation_is_that_of_the_paper_times_one_plus_epsilon():
+    """(48) for the generator (46): the matrix shown, times (1 + ε)."""
+    first, second = random_points(0, 2, 30)
+    epsilon = 0.25
+    found = dvi.conformal_factor(
+        KEPLER.system, [ROTATION, ROTATION], first, second, epsilon, KEPLER.args
+    )
+    J = np.array([[0.0, -1.0], [1.0, 0.0]])
+    expected = (1 + epsilon) * np.block([[J, np.zeros((2, 2))], [np.zeros((2, 2)), J]])
+    np.testing.assert_allclose(found.factor, expected, atol=1e-12)
+    assert found.residual < 1e-13
+    assert abs(found.condition - 1) < 1e-10
+    one = dvi.determining_residual(
+        KEPLER.system,
+        [ROTATION, ROTATION],
+        *(jax.tree.map(lambda x: x[0], point) for point in (first, second)),
+        factor=expected,
+        epsilon=epsilon,
+        args=KEPLER.args,
+    )
+    np.testing.assert_allclose(one, 0, atol=1e-13)
+
+
+def test_no_factor_exists_for_a_generator_that_is_no_symmetry():
+    first, second = random_points(1, 2, 30)
+    assert (
+        dvi.conformal_factor(KEPLER.system, SCALING, first, second, 0.0, KEPLER.args).residual
+        > 0.01
+    )
+    factor = dvi.conformal_factor(OSCILLATOR.system, SCALING, first, second)
+    np.testing.assert_allclose(factor.factor, np.eye(4), atol=1e-12)  # a linear system scales
+    with pytest.raises(ValueError, match="at least 4"):
+        dvi.conformal_factor(OSCILLATOR.system, SCALING, *random_points(1, 2, 3))
+
+
+def test_invariant_of_the_rotation_is_angular_momentum_at_every_epsilon():
+    """(42) and (49), exact on the map; with η in place of ξ, as (26) prints, it is nothing."""
+    invariant = dvi.AdiabaticInvariant([ROTATION, ROTATION], [None, None])
+    assert invariant.order == 1
+
+    def spread(epsilon):
+        sol = dvi.integrate(
+            KEPLER.system,
+            KEPLER.q0,
+            KEPLER.p0,
+            h=0.1,
+            num_steps=2000,
+            epsilon=epsilon,
+            args=KEPLER.args,
+            observe=[dvi.Range(invariant), dvi.Mean(invariant)],
+            save=dvi.Save(final=True),
+        )
+        return sol.observed
+
+    ranges, means = jax.vmap(spread)(jnp.array([0.0, 1e-2, 0.3]))
+    np.testing.assert_allclose(means, 1.2 * (1 + np.array([0.0, 1e-2, 0.3])), rtol=1e-12)
+    assert np.max(ranges) < 1e-13
+
+
+def test_an_unbound_invariant_says_what_it_needs():
+    invariant = dvi.AdiabaticInvariant([ROTATION], [None])
+    with pytest.raises(ValueError, match="bind"):
+        invariant(0.0, 0.1, *(np.ones(2) for _ in range(4)), None)
+    with pytest.raises(ValueError, match="got 2 and 1"):
+        dvi.AdiabaticInvariant([ROTATION, TIME], [None])
+
+
+# --- the balance law -------------------------------------------------------------------------
+
+
+def anharmonic(t0, t1, q0, p1, args):
+    return jnp.sum((q0**2 + 1) * (p1**2 + 1)) / 2 + jnp.sin(t0) * q0[0] * p1[1] + t1 * q0[1]
+
+
+def friction(t0, t1, q0, p1, args):
+    return -p1 * (1 + q0**2) + jnp.cos(t1)
+
+
+SYSTEM = dvi.System(anharmonic, force=friction)
+
+
+@jax.jit
+def balance(a, ts, q, p, epsilon):
+    """Both sides of the balance law at the middle of three points, and the drift's size.
+
+    D(I_z) = Σ ε^m N_m + ε^{z+1} W·(ξ_z − Dq ξ0_z) − Σ ε^m ξ0_m r, for generators and gauges with
+    random coefficients `a`.
+    """
+
+    def generator(a):
+        return dvi.Generator(
+            xi0=lambda t, q, p, args: a[0] + a[1] * q[0] * p[1] + a[2] * jnp.sin(t),
+            xi=lambda t, q, p, args: a[3] * q + a[4] * p * q[::-1] + a[5] * t,
+            eta=lambda t, q, p, args: a[6] * p**2 + a[7] * q + a[8],
+        )
+
+    def gauge(a):
+        return lambda t, q, p, args: (
+            a[9] * jnp.sum(q * p) + a[10] * t * q[0] + a[11] * jnp.sum(p**3)
+        )
+
+    generators, gauges = [generator(x) for x in a], [gauge(x) for x in a]
+    invariant = dvi.AdiabaticInvariant(generators, gauges).bind(SYSTEM, epsilon)
+    sol = dvi.integrate(
+        SYSTEM,
+        q,
+        p,
+        lattice=dvi.Given(ts),
+        epsilon=epsilon,
+        observe=invariant,
+        throw=False,
+    )
+    points = [dvi.LatticePoint(sol.ts[k], sol.qs[k], sol.ps[k]) for k in range(3)]
+    _, first, second = points
+    h = second.t - first.t
+    drift = (sol.observed[1] - sol.observed[0]) / h
+    r = dvi.lattice_defect(SYSTEM, points, epsilon)
+    W = friction(first.t, second.t, first.q, second.p, None)
+    terms = []
+    for m, x in enumerate(generators):
+        N = dvi.noether_identity(SYSTEM, generators, gauges, m, first, second, epsilon)
+        terms += [epsilon**m * N, -(epsilon**m) * x(first).t * r]
+    xi0, xi, _ = generators[-1](first)
+    work = jnp.sum(W * (xi - (second.q - first.q) / h * xi0))
+    terms.append(epsilon ** len(generators) * work)
+    terms = jnp.stack(terms)
+    size = jnp.max(jnp.abs(terms)) + jnp.max(jnp.abs(sol.observed)) / jnp.abs(h)
+    return drift, jnp.sum(terms), size, jnp.sum(terms[:-1])
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 2**31), z=st.integers(0, 2))
+def test_balance_closes_for_any_generator_gauge_and_mesh(seed, z):
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(z + 1, 12))
+    ts = np.concatenate([[rng.normal()], rng.uniform(0.02, 0.2, 2)]).cumsum()
+    q, p = rng.normal(size=2) / 2, rng.normal(size=2) / 2
+    drift, total, size, _ = balance(a, ts, q, p, rng.uniform(0, 0.5))
+    assume(np.isfinite(size))  # the law speaks of solutions; now and then a random step has none
+    assert abs(drift - total) <= 1e-12 * size
+
+
+def test_balance_does_not_close_without_the_work_of_the_disturbance():
+    rng = np.random.default_rng(3)
+    a, ts = rng.normal(size=(2, 12)), np.array([0.0, 0.1, 0.25])
+    drift, total, size, without = balance(a, ts, np.array([0.3, -0.2]), np.array([0.1, 0.4]), 0.3)
+    assert abs(drift - total) <= 1e-12 * size
+    assert abs(drift - without) > 1e-4 * size
+
+
+def test_lattice_defect_vanishes_with_h_where_the_printed_signs_do_not():
+    """(11) against (14): E⁺ − E⁻ → 0 on a uniform mesh; −H_k − H_{k−1} does not."""
+
+    def defects(h):
+        sol = dvi.integrate(OSCILLATOR.system, [0.7], [0.4], h=h, num_steps=2)
+        points = [dvi.LatticePoint(sol.ts[k], sol.qs[k], sol.ps[k]) for k in range(3)]
+        H = [OSCILLATOR.system.H_D(0.0, 0.0, a.q, b.p, None) for a, b in itertools.pairwise(points)]
+        return h * dvi.lattice_defect(OSCILLATOR.system, points), -H[1] - H[0]
+
+    mended, printed = zip(*(defects(h) for h in (0.1, 0.01, 0.001)), strict=True)
+    assert abs(mended[2]) < 1e-4 * abs(printed[2])
+    assert abs(mended[0] / mended[1]) > 50  # O(h²)
+    assert abs(printed[2]) > 0.5
