@@ -249,7 +249,7 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
         q0, p0, info = problem.method.inverse(
             problem.system, interval, q1, p1, problem.epsilon, problem.args, problem.newton
         )
-        (end, values), pull = jax.vjp(lambda *x: local_step(*x, k), theta, q0, p0)
+        (end, values), pull = jax.vjp(lambda a, q, p: local_step(a, q, p, k), theta, q0, p0)
         seed = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
         seed = seed._replace(q=seed.q + cq, p=seed.p + cp)
         seeds = []

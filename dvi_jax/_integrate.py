@@ -223,7 +223,7 @@ def _start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
 def _real_array(name: str, value: Any) -> Array:
     if isinstance(value, list | tuple) and any(is_traced(x) for x in jax.tree.leaves(value)):
         value = jnp.asarray(value)
-    if is_traced(value):
+    if isinstance(value, jax.Array) and is_traced(value):
         kind = value.dtype
     else:
         # In NumPy: under jit, jax.numpy would give tracers even for values that are known.

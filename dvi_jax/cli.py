@@ -113,6 +113,7 @@ def _complain(what: str, message: str) -> None:
 
 def _print(report: Any) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console(highlight=False)
@@ -120,9 +121,9 @@ def _print(report: Any) -> None:
         console.print(table.title, style="bold", markup=False, soft_wrap=True)
         shown = Table()
         for i, column in enumerate(table.columns):
-            shown.add_column(column, justify="left" if i == 0 else "right", overflow="fold")
+            shown.add_column(escape(column), justify="left" if i == 0 else "right", overflow="fold")
         for row in table.rows:
-            shown.add_row(*row)
+            shown.add_row(*(escape(cell) for cell in row))
         console.print(shown)
     for note in report.notes:
         console.print(note, markup=False, style="bold")

@@ -366,6 +366,7 @@ def test_solar_system_example(folder):
     result = command("run", "solar_system.toml")
     assert result.exit_code == 0, result.output
     assert "ephemeris minus integration: 42.96″ per century" in result.output
+    assert "largest [km]" in result.output  # the unit is not taken for markup
     out = folder / "results" / "solar_system"
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))["solar_system"]
     assert report["years"] == 100

@@ -1,0 +1,30 @@
+"""The README's Python blocks run as printed."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def test_python_blocks_run():
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
+    assert len(blocks) >= 2
+    code = "\n".join(blocks) + "\nprint(slopes.shape, bool(jnp.isfinite(slopes).all()))\n"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert out.returncode == 0, out.stderr
+    first, last = out.stdout.strip().splitlines()
+    assert first.startswith("successful (10001, 2)")
+    drift = float(re.search(r"Array\((.*?),", first)[1])
+    assert drift < 1e-13
+    assert last == "(8,) True"
+
+
+def test_commands_named_exist():
+    text = README.read_text(encoding="utf-8")
+    makefile = (README.parent / "Makefile").read_text(encoding="utf-8")
+    for target in set(re.findall(r"`make ([a-z-]+)", text)) | {"paper", "test"}:
+        assert re.search(rf"^{target}:", makefile, re.M), target
+    for path in re.findall(r"examples/\w+\.\w+", text):
+        assert (README.parent / path).exists(), path
