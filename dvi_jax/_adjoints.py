@@ -197,6 +197,8 @@ class Reversible(AbstractAdjoint):
         """A scan over the steps of a block that keeps the state every `checkpoint_every` steps."""
         size = self.checkpoint_every
         segments = (count - 1) // size  # the end of the block is kept anyway
+        if segments == 0:
+            return counted_scan(body, state, first, stride, count)
 
         def segment(state, k):
             state, _ = counted_scan(body, state, k, stride, size)

@@ -13,5 +13,5 @@ def is_traced(x: object) -> bool:
 
 
 def x64_enabled() -> bool:
-    """Whether this process computes in double precision."""
-    return bool(jax.config.read("jax_enable_x64"))
+    """Whether arrays made now are in double precision (the flag, or a context that sets it)."""
+    return bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._adjoints import AbstractAdjoint, Outcome, Reversible
-from ._compat import is_traced, x64_enabled
+from ._compat import is_traced
+from ._precision import refuse_double_without_x64
 from ._results import RESULTS, IntegrationError
 from ._rollout import (
     Plan,
@@ -30,6 +31,8 @@ from .engine.newton import Newton
 from .lattices import Lattice, Uniform
 from .methods import Method, TypeII
 from .observe import Reduction
+
+_STEP = "(t0, t1, q0, p0, q1, p1, args)"
 
 _PIECES = 100
 """Pieces that a run with progress is cut into."""
@@ -216,6 +219,8 @@ def _start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
             f"q0 and p0 must have one shape, got q0 {q.shape} and p0 {p.shape}. Each position "
             "needs its momentum."
         )
+    if q.size == 0:
+        raise ValueError(f"q0 is empty (shape {q.shape}): there is nothing to integrate.")
     dtype = jnp.result_type(q.dtype, p.dtype)
     return q.astype(dtype), p.astype(dtype)
 
@@ -229,7 +234,7 @@ def _real_array(name: str, value: Any) -> Array:
         # In NumPy: under jit, jax.numpy would give tracers even for values that are known.
         value = _as_numpy(name, value)
         kind = value.dtype
-        _refuse_double_without_x64(name, kind)
+        refuse_double_without_x64(name, kind)
     if jnp.issubdtype(kind, jnp.complexfloating):
         raise TypeError(
             f"{name} must be real, got dtype {kind}. Write a complex variable as its real and "
@@ -277,18 +282,9 @@ def _as_numpy(name: str, value: Any) -> np.ndarray:
 def _parameter(leaf: Any) -> Any:
     """A leaf of args: floats become arrays, so that a new value needs no new compilation."""
     if isinstance(leaf, np.ndarray | np.generic):
-        _refuse_double_without_x64("args", leaf.dtype)
+        refuse_double_without_x64("args", leaf.dtype)
         return jnp.asarray(leaf)
     return jnp.asarray(leaf) if isinstance(leaf, float) else leaf
-
-
-def _refuse_double_without_x64(name: str, dtype: Any) -> None:
-    if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():
-        raise TypeError(
-            f"{name} is float64, but this process computes in float32. Invariants need double "
-            'precision: put\n    jax.config.update("jax_enable_x64", True)\nbefore the first '
-            f"array is made. If float32 is meant, say so: {name} as jnp.float32."
-        )
 
 
 def _check_observe(problem: Problem, q0: Array, p0: Array) -> None:
@@ -296,20 +292,21 @@ def _check_observe(problem: Problem, q0: Array, p0: Array) -> None:
     for leaf in jax.tree.leaves(problem.observe, is_leaf=is_observable):
         if not is_observable(leaf):
             raise TypeError(
-                "observe must be a pytree of functions (t0, t1, q0, p0, q1, p1, args) or "
+                f"observe must be a pytree of functions {_STEP} or "
                 f"reductions such as dvi.MaxDrift(function); it holds {leaf!r}."
             )
         function = leaf.function if isinstance(leaf, Reduction) else leaf
         called = getattr(function, "__name__", type(function).__name__)
         if not callable(function):
-            raise TypeError(
-                f"{type(leaf).__name__} takes a function (t0, t1, q0, p0, q1, p1, args), "
-                f"got {function!r}."
-            )
-        t0 = problem.t0
-        out = eqx.filter_eval_shape(problem.bound(function), t0, t0, q0, p0, q0, p0, problem.args)
+            raise TypeError(f"{type(leaf).__name__} takes a function {_STEP}, got {function!r}.")
+        t0, bound = problem.t0, problem.bound(function)
+        try:
+            out = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, problem.args)
+        except Exception as error:
+            error.add_note(f"(in the observable {called}, called with {_STEP})")
+            raise
         if not hasattr(out, "shape") and not isinstance(out, int | float):
             raise TypeError(
-                "an observable (t0, t1, q0, p0, q1, p1, args) must return one array; "
+                f"an observable {_STEP} must return one array; "
                 f"{called} returned {type(out).__name__}."
             )

@@ -104,7 +104,11 @@ class System(eqx.Module):
 def _traced_output(
     function: Callable, name: str, t: Scalar, q: State, p: State, args: Args
 ) -> jax.ShapeDtypeStruct:
-    out = eqx.filter_eval_shape(function, t, t, q, p, args)
+    try:
+        out = eqx.filter_eval_shape(function, t, t, q, p, args)
+    except Exception as error:
+        error.add_note(f"(in {name}{_NAMES}, called with q0 of shape {q.shape} and args={args!r})")
+        raise
     if out is None or not hasattr(out, "shape"):
         if isinstance(out, int | float):
             return jax.ShapeDtypeStruct((), jnp.result_type(float))

@@ -10,6 +10,7 @@ import dvi_jax as dvi
 ROOT = Path(dvi.__file__).parent
 FLOORS = [
     ["_compat", "_types", "_results"],
+    ["_precision"],
     ["_system", "_discretise", "_solution", "engine"],
     ["_step"],
     ["methods", "lattices", "symmetry", "observe"],

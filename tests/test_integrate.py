@@ -128,6 +128,23 @@ def test_given_refuses_times_that_are_no_lattice(ts, match):
         dvi.Given(np.array(ts))
 
 
+def test_given_takes_whole_numbers_and_refuses_words():
+    sol = dvi.integrate(OSCILLATOR, *START, lattice=dvi.Given([0, 1, 2]))
+    np.testing.assert_array_equal(sol.hs, [1.0, 1.0])
+    with pytest.raises(TypeError, match="real times"):
+        dvi.Given("abc")
+
+
+def test_errors_of_the_users_functions_say_where_they_come_from():
+    system = dvi.System(lambda t0, t1, q0, p1, args: args["mu"] * jnp.sum(p1**2))
+    with pytest.raises(TypeError) as error:
+        dvi.integrate(system, *START, h=0.1, num_steps=1)
+    assert any("in H_D" in note and "args=None" in note for note in error.value.__notes__)
+    with pytest.raises(TypeError) as error:
+        run(observe=lambda t0, t1, q0: q0)
+    assert any("in the observable" in note for note in error.value.__notes__)
+
+
 def test_given_refuses_contradictions():
     lattice = dvi.Given(np.arange(4.0))
     for contradiction in ({"h": 0.1}, {"num_steps": 5}, {"t0": 1.0}):
@@ -340,6 +357,7 @@ def test_traced_bad_input_becomes_a_status():
         ({"p0": [1.0, np.inf]}, ValueError, r"p0.*not finite at index \[1\]"),
         ({"q0": [1j, 1.0]}, TypeError, "real"),
         ({"q0": ["a", "b"]}, TypeError, "real array"),
+        ({"q0": [], "p0": []}, ValueError, "empty"),
         ({"h": 0.0}, ValueError, "h must not be zero"),
         ({"h": np.nan}, ValueError, "h must be finite"),
         ({"h": np.inf}, ValueError, "h must be finite"),
@@ -386,7 +404,11 @@ for q in (np.ones(1), [1.0]):
         print("accepted")
     except TypeError as error:
         print('jax.config.update("jax_enable_x64", True)' in str(error))
+try:
+    dvi.Given(np.array([0.0, 0.1]))
+except TypeError as error:
+    print('jax.config.update("jax_enable_x64", True)' in str(error))
 print(dvi.integrate(s, jnp.ones(1), jnp.ones(1), h=0.1, num_steps=1).qs.dtype)
 """
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.split() == ["True", "True", "float32"]
+    assert out.stdout.split() == ["True", "True", "True", "float32"]

@@ -1,13 +1,27 @@
 """Steps between times that the user gives."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._compat import is_traced
+from .._compat import is_traced, x64_enabled
+from .._precision import refuse_double_without_x64
 from .._types import Interval
 from ._base import Lattice, check_num_steps
+
+
+def _as_times(ts: Any) -> Array:
+    if not is_traced(ts):
+        ts = np.asarray(ts)
+        if np.issubdtype(ts.dtype, np.integer):
+            ts = ts.astype(np.float64 if x64_enabled() else np.float32)
+        refuse_double_without_x64("ts", ts.dtype)
+    if not jnp.issubdtype(ts.dtype, jnp.floating):
+        raise TypeError(f"Given(ts) needs real times, got dtype {ts.dtype}.")
+    return jnp.asarray(ts)
 
 
 class Given(Lattice):
@@ -23,16 +37,12 @@ class Given(Lattice):
     finite or not strictly monotonic (a traced `ts` gives the status `bad_step_size` instead).
     """
 
-    ts: Float[Array, " times"] = eqx.field(converter=jnp.asarray)
+    ts: Float[Array, " times"] = eqx.field(converter=_as_times)
 
     def __check_init__(self):
         if self.ts.ndim != 1 or self.ts.shape[0] < 1:
             raise ValueError(
                 f"Given(ts) needs a one-dimensional array of times, got shape {self.ts.shape}."
-            )
-        if not jnp.issubdtype(self.ts.dtype, jnp.floating):
-            raise TypeError(
-                f"Given(ts) needs real floating-point times, got dtype {self.ts.dtype}."
             )
         if not is_traced(self.ts):
             steps = np.diff(np.asarray(self.ts))

@@ -1,0 +1,17 @@
+"""Double precision is asked for, never switched on behind the user's back."""
+
+from typing import Any
+
+import numpy as np
+
+from ._compat import x64_enabled
+
+
+def refuse_double_without_x64(name: str, dtype: Any) -> None:
+    """Refuse a float64 input called `name` in a process that computes in float32."""
+    if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():
+        raise TypeError(
+            f"{name} is float64, but this process computes in float32. Invariants need double "
+            'precision: put\n    jax.config.update("jax_enable_x64", True)\nbefore the first '
+            f"array is made. If float32 is meant, say so: {name} as jnp.float32."
+        )
