@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -117,8 +117,9 @@ class Reversible(AbstractAdjoint):
     Memory does not grow with num_steps but for one state every `checkpoint_every` steps, from
     which the rebuilding starts afresh: it amplifies round-off on chaotic or dissipative arcs.
     Where a rebuilt state misses the stored one by more than `max_defect` (relative to the
-    largest component), or an inverse step has no solution, the gradient is NaN rather than
-    wrong: take fewer steps between checkpoints, or `Checkpointed`.
+    largest component; None means 1e-6 in float64 and 1e-3 in float32), or an inverse step has
+    no solution, the gradient is NaN rather than wrong: take fewer steps between checkpoints, or
+    `Checkpointed`.
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A
     method without an inverse (`RungeKutta4`) is differentiated as by `Checkpointed`.
@@ -129,13 +130,13 @@ class Reversible(AbstractAdjoint):
     """
 
     checkpoint_every: int = eqx.field(static=True, default=100)
-    max_defect: float = eqx.field(static=True, default=1e-6)
+    max_defect: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         every = self.checkpoint_every
         if isinstance(every, bool) or not isinstance(every, int) or every < 1:
             raise ValueError(f"checkpoint_every must be a positive integer, got {every!r}.")
-        if not self.max_defect > 0:
+        if self.max_defect is not None and not self.max_defect > 0:
             raise ValueError(f"max_defect must be positive, got {self.max_defect!r}.")
 
     def rollout(self, problem, plan, q0, p0):
@@ -190,7 +191,8 @@ class Reversible(AbstractAdjoint):
             _, moved = lax.custom_linear_solve(matvec, rhs, solve, transpose_solve)
             return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
 
-        smooth, (carry, _, _) = trajectory((theta, q0, p0))
+        outputs: Any = trajectory((theta, q0, p0))
+        smooth, (carry, _, _) = outputs
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), smooth.saved, smooth.reduced)
 
     def _inner_loop(self, body, state, first, stride, count):
@@ -274,7 +276,8 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
 
         (q, p, grad, cot), _ = counted_scan(body, (*end, grad, cot), first, 1, count, reverse=True)
         defect = jnp.maximum(_distance(q, known_start[0]), _distance(p, known_start[1]))
-        return _all_or_nan(defect <= settings.max_defect, (grad, cot))
+        allowed = settings.max_defect or (1e-6 if q.dtype.itemsize >= 8 else 1e-3)
+        return _all_or_nan(defect <= allowed, (grad, cot))
 
     def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):
         last = first + count - 1
@@ -302,7 +305,7 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
     cot = (cotangent.q, cotangent.p)
     rows = cotangent.saved
     if tail is not None:
-        at_save = jax.tree.map(lambda x: x[-1] if plan.save_tail else jnp.zeros_like(x[0]), rows)
+        at_save = jax.tree.map(lambda x: _last_row(x, plan.save_tail), rows)
         newest = jax.tree.map(lambda x: x[-1], ends)
         k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
         grad, cot = undo_block(newest, tail, k, plan.tail, at_save, grad, cot)
@@ -318,6 +321,10 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
     k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
     (_, grad, cot), _ = lax.scan(block, (k, grad, cot), (starts, saved, rows), reverse=True)
     return grad, *cot
+
+
+def _last_row(x, is_there: bool):
+    return x[-1] if is_there else jnp.zeros(x.shape[1:], x.dtype)
 
 
 def _distance(a, b):

@@ -2,9 +2,9 @@
 
 import jax
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import Jaxpr, Literal, jaxprs_in_params
 
-__all__ = ["ClosedJaxpr", "Jaxpr", "Literal", "is_traced", "x64_enabled"]
+__all__ = ["Jaxpr", "Literal", "is_traced", "jaxprs_in_params", "x64_enabled"]
 
 
 def is_traced(x: object) -> bool:

@@ -92,7 +92,9 @@ def test_adjoints_agree_to_round_off(system):
             np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.parametrize("save", [dvi.Save(), dvi.Save(every=8), dvi.Save(final=True)])
+@pytest.mark.parametrize(
+    "save", [dvi.Save(), dvi.Save(every=8), dvi.Save(every=40), dvi.Save(final=True)]
+)
 def test_reversible_gradient_for_every_way_of_saving(save):
     x = point("kepler")
     a = jax.grad(lambda x: loss(x, "kepler", ADJOINTS["Reversible"], save=save))(x)
@@ -201,6 +203,19 @@ def test_a_rebuilt_state_that_misses_gives_nan_not_a_wrong_gradient():
     exact = slope(dvi.Direct())
     np.testing.assert_allclose(slope(dvi.Reversible(checkpoint_every=20)), exact, rtol=1e-9)
     assert np.isnan(slope(dvi.Reversible(checkpoint_every=1000)))
+
+
+def test_gradient_in_single_precision():
+    system = SYSTEMS["pendulum"][0]
+
+    def final(q):
+        p = jnp.full_like(q, 0.7)
+        sol = dvi.integrate(system, q, p, h=0.05, num_steps=300, save=dvi.Save(final=True))
+        return sol.qs[-1, 0]
+
+    g = jax.grad(final)(jnp.float32([0.4]))
+    assert g.dtype == jnp.float32
+    np.testing.assert_allclose(g, jax.grad(final)(jnp.array([0.4])), rtol=2e-3)
 
 
 def test_reversible_memory_is_flat_and_direct_is_not():

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 
-from .._compat import ClosedJaxpr, Jaxpr, Literal
+from .._compat import Jaxpr, Literal, jaxprs_in_params
 
 
 def depends_on(function: Callable[..., Any], argnum: int, *args: Any) -> bool:
@@ -46,9 +46,9 @@ def _called_jaxpr(eqn: Any) -> Jaxpr | None:
     """
     if eqn.primitive.name in ("scan", "while", "cond"):
         return None
-    bodies = [v for v in eqn.params.values() if isinstance(v, ClosedJaxpr | Jaxpr)]
+    bodies = list(jaxprs_in_params(eqn.params))
     if len(bodies) != 1:
         return None
-    body = bodies[0].jaxpr if isinstance(bodies[0], ClosedJaxpr) else bodies[0]
+    (body,) = bodies
     same = len(body.invars) == len(eqn.invars) and len(body.outvars) == len(eqn.outvars)
     return body if same else None
