@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -191,8 +191,8 @@ class Reversible(AbstractAdjoint):
             _, moved = lax.custom_linear_solve(matvec, rhs, solve, transpose_solve)
             return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
 
-        outputs: Any = trajectory((theta, q0, p0))
-        smooth, (carry, _, _) = outputs
+        # (pyright takes what a custom_jvp returns for NoReturn)
+        smooth, (carry, _, _) = cast(Any, trajectory)((theta, q0, p0))
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), smooth.saved, smooth.reduced)
 
     def _inner_loop(self, body, state, first, stride, count):
