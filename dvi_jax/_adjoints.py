@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -188,11 +188,11 @@ class Reversible(AbstractAdjoint):
             rhs = jax.tree.map(
                 lambda x: x + nothing, (change, jax.tree.map(jnp.zeros_like, smooth))
             )
-            _, moved = lax.custom_linear_solve(matvec, rhs, solve, transpose_solve)
+            solver: Any = lax.custom_linear_solve  # its annotations differ between versions
+            _, moved = solver(matvec, rhs, solve, transpose_solve)
             return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
 
-        # (pyright takes what a custom_jvp returns for NoReturn)
-        smooth, (carry, _, _) = cast(Any, trajectory)((theta, q0, p0))
+        smooth, (carry, _, _) = trajectory((theta, q0, p0))
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), smooth.saved, smooth.reduced)
 
     def _inner_loop(self, body, state, first, stride, count):
