@@ -16,9 +16,9 @@ from ._rollout import (
     Carry,
     Loop,
     Plan,
-    Problem,
     Saved,
     StepTaken,
+    Task,
     counted_scan,
     reduce,
     run,
@@ -44,13 +44,13 @@ class AbstractAdjoint(eqx.Module):
     """
 
     @abc.abstractmethod
-    def rollout(self, problem: Problem, plan: Plan, q0: State, p0: State) -> Outcome:
+    def rollout(self, task: Task, plan: Plan, q0: State, p0: State) -> Outcome:
         """The whole trajectory, differentiable in this adjoint's way."""
 
 
-def _direct_rollout(problem: Problem, plan: Plan, q0: State, p0: State, loop: Loop) -> Outcome:
-    carry, saved, tail = run(problem, plan, start(problem, q0, p0), loop)
-    return Outcome(carry, with_tail(plan, saved, tail), reduce(problem, carry))
+def _direct_rollout(task: Task, plan: Plan, q0: State, p0: State, loop: Loop) -> Outcome:
+    carry, saved, tail = run(task, plan, start(task, q0, p0), loop)
+    return Outcome(carry, with_tail(plan, saved, tail), reduce(task, carry))
 
 
 class Direct(AbstractAdjoint):
@@ -59,8 +59,8 @@ class Direct(AbstractAdjoint):
     Reverse mode stores what each step needs: memory grows with num_steps; good for short runs.
     """
 
-    def rollout(self, problem, plan, q0, p0):
-        return _direct_rollout(problem, plan, q0, p0, counted_scan)
+    def rollout(self, task, plan, q0, p0):
+        return _direct_rollout(task, plan, q0, p0, counted_scan)
 
 
 class Checkpointed(AbstractAdjoint):
@@ -82,8 +82,8 @@ class Checkpointed(AbstractAdjoint):
         ):
             raise ValueError(f"segments must be a positive integer, got {self.segments!r}.")
 
-    def rollout(self, problem, plan, q0, p0):
-        return _direct_rollout(problem, plan, q0, p0, self._loop)
+    def rollout(self, task, plan, q0, p0):
+        return _direct_rollout(task, plan, q0, p0, self._loop)
 
     def _loop(self, body, carry, first, stride, count):
         segments = min(self.segments or math.isqrt(count), count)
@@ -139,19 +139,19 @@ class Reversible(AbstractAdjoint):
         if self.max_defect is not None and not self.max_defect > 0:
             raise ValueError(f"max_defect must be positive, got {self.max_defect!r}.")
 
-    def rollout(self, problem, plan, q0, p0):
-        if not problem.method.is_invertible:
-            return Checkpointed().rollout(problem, plan, q0, p0)
-        theta, fixed = eqx.partition(problem, eqx.is_inexact_array)
+    def rollout(self, task, plan, q0, p0):
+        if not task.method.is_invertible:
+            return Checkpointed().rollout(task, plan, q0, p0)
+        theta, fixed = eqx.partition(task, eqx.is_inexact_array)
 
         @jax.jit  # so that its uses below share one trace, and one trace of its derivative
         def forward(inputs):
             theta, q0, p0 = inputs
-            problem = eqx.combine(theta, fixed)
+            task = eqx.combine(theta, fixed)
             carry, saved, tail = run(
-                problem, plan, start(problem, q0, p0), counted_scan, self._inner_loop
+                task, plan, start(task, q0, p0), counted_scan, self._inner_loop
             )
-            smooth = _Smooth(carry.q, carry.p, with_tail(plan, saved, tail), reduce(problem, carry))
+            smooth = _Smooth(carry.q, carry.p, with_tail(plan, saved, tail), reduce(task, carry))
             return smooth, (carry, saved, tail)
 
         @jax.custom_jvp
@@ -231,28 +231,24 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
     """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start."""
     theta, q_start, p_start = inputs
     carry, saved, tail = trace
-    problem: Problem = eqx.combine(theta, fixed)
-    _, reductions = problem.observables()
+    task: Task = eqx.combine(theta, fixed)
+    _, reductions = task.observables()
 
     def local_step(theta, q0, p0, k):
-        problem: Problem = eqx.combine(theta, fixed)
-        alone, reductions = problem.observables()
-        interval = problem.lattice.interval(problem.t0, problem.h, k)
-        q1, p1, _ = problem.method.step(
-            problem.system, interval, q0, p0, problem.epsilon, problem.args, problem.newton
-        )
+        task: Task = eqx.combine(theta, fixed)
+        alone, reductions = task.observables()
+        interval = task.interval(k)
+        q1, p1, _ = task.method.step(task.equations, interval, q0, p0)
         taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
-        values = [taken.value(f, problem.args) for f in alone]
-        reduced = [taken.value(problem.bound(r.function), problem.args) for r in reductions]
+        values = [taken.value(f, task.args) for f in alone]
+        reduced = [taken.value(task.bound(r.function), task.args) for r in reductions]
         return Saved(interval.t1, interval.h, q1, p1, values), reduced
 
     def undo(state, k, is_last, at_save: Saved):
         """One step back: the state before it, and the cotangents before it."""
         q1, p1, grad, (cq, cp) = state
-        interval = problem.lattice.interval(problem.t0, problem.h, k)
-        q0, p0, info = problem.method.inverse(
-            problem.system, interval, q1, p1, problem.epsilon, problem.args, problem.newton
-        )
+        interval = task.interval(k)
+        q0, p0, info = task.method.inverse(task.equations, interval, q1, p1)
         (end, values), pull = jax.vjp(lambda a, q, p: local_step(a, q, p, k), theta, q0, p0)
         seed = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
         seed = seed._replace(q=seed.q + cq, p=seed.p + cp)

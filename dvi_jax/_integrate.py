@@ -15,7 +15,7 @@ from ._precision import refuse_double_without_x64
 from ._results import RESULTS, IntegrationError
 from ._rollout import (
     Plan,
-    Problem,
+    Task,
     counted_scan,
     is_observable,
     make_plan,
@@ -26,6 +26,7 @@ from ._rollout import (
     with_tail,
 )
 from ._solution import Save, Solution
+from ._step import Equations
 from ._system import System
 from .engine.newton import Newton
 from .lattices import Lattice, Uniform
@@ -119,47 +120,48 @@ def integrate(
     epsilon = _scalar("epsilon", epsilon, q0.dtype)
     args = jax.tree.map(_parameter, args)
     system.check_shapes(t0, q0, p0, epsilon, args)
-    problem = Problem(system, method, lattice, newton, observe, t0, h, epsilon, args)
-    _check_observe(problem, q0, p0)
+    equations = Equations(system, epsilon, args, newton)
+    task = Task(equations, method, lattice, observe, t0, h)
+    _check_observe(task, q0, p0)
     plan = make_plan(save, num_steps)
-    traced = any(is_traced(x) for x in jax.tree.leaves((problem, q0, p0)))
+    traced = any(is_traced(x) for x in jax.tree.leaves((task, q0, p0)))
     if progress is None:
-        outcome = _whole(problem, plan, q0, p0, adjoint)
+        outcome = _whole(task, plan, q0, p0, adjoint)
     elif traced:
         raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
     else:
-        outcome = _in_pieces(problem, plan, q0, p0, num_steps, progress)
+        outcome = _in_pieces(task, plan, q0, p0, num_steps, progress)
 
-    solution = _solution(problem, outcome, q0, p0, num_steps)
+    solution = _solution(task, outcome, q0, p0, num_steps)
     return _raise_on_failure(solution, h) if throw else solution
 
 
 @eqx.filter_jit
-def _whole(problem: Problem, plan: Plan, q0, p0, adjoint: AbstractAdjoint) -> Outcome:
-    return adjoint.rollout(problem, plan, q0, p0)
+def _whole(task: Task, plan: Plan, q0, p0, adjoint: AbstractAdjoint) -> Outcome:
+    return adjoint.rollout(task, plan, q0, p0)
 
 
 @eqx.filter_jit
-def _begin(problem: Problem, q0, p0):
-    return start(problem, q0, p0)
+def _begin(task: Task, q0, p0):
+    return start(task, q0, p0)
 
 
 @eqx.filter_jit
-def _piece(problem: Problem, plan: Plan, carry, first):
-    carry, saved, tail = run(problem, plan, carry, counted_scan, first=first)
+def _piece(task: Task, plan: Plan, carry, first):
+    carry, saved, tail = run(task, plan, carry, counted_scan, first=first)
     return carry, with_tail(plan, saved, tail)
 
 
-def _in_pieces(problem: Problem, plan: Plan, q0, p0, num_steps, progress) -> Outcome:
+def _in_pieces(task: Task, plan: Plan, q0, p0, num_steps, progress) -> Outcome:
     """The same scan as `_whole`, cut between save points, with a call after each piece."""
     blocks = max(1, -(-plan.num_blocks // _PIECES))
-    carry, done, parts = _begin(problem, q0, p0), 0, []
+    carry, done, parts = _begin(task, q0, p0), 0, []
     while True:
         count = min(blocks, plan.num_blocks - done)
         is_last = done + count >= plan.num_blocks
         tail = (plan.tail, plan.save_tail) if is_last else (0, False)
         first = jnp.asarray(done * plan.block, jnp.int32)
-        carry, saved = _piece(problem, Plan(count, plan.block, *tail), carry, first)
+        carry, saved = _piece(task, Plan(count, plan.block, *tail), carry, first)
         jax.block_until_ready(carry)
         parts.append(saved)
         done += count
@@ -167,22 +169,22 @@ def _in_pieces(problem: Problem, plan: Plan, q0, p0, num_steps, progress) -> Out
         if is_last:
             break
     saved = jax.tree.map(lambda *xs: jnp.concatenate(xs), *parts)
-    return Outcome(carry, saved, reduce(problem, carry))
+    return Outcome(carry, saved, reduce(task, carry))
 
 
 @eqx.filter_jit
-def _solution(problem: Problem, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
+def _solution(task: Task, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
     carry, saved, reduced = outcome
 
     def from_start(first, rest):
         return jnp.concatenate([first[None], rest])
 
     return Solution(
-        ts=from_start(problem.t0, saved.t),
+        ts=from_start(task.t0, saved.t),
         qs=from_start(q0, saved.q),
         ps=from_start(p0, saved.p),
         hs=saved.h,
-        observed=observed(problem.observe, saved, reduced),
+        observed=observed(task.observe, saved, reduced),
         result=carry.result,
         stats={
             "num_steps": num_steps,
@@ -287,9 +289,9 @@ def _parameter(leaf: Any) -> Any:
     return jnp.asarray(leaf) if isinstance(leaf, float) else leaf
 
 
-def _check_observe(problem: Problem, q0: Array, p0: Array) -> None:
+def _check_observe(task: Task, q0: Array, p0: Array) -> None:
     """Refuse observables that are not functions of a step with an array for a value."""
-    for leaf in jax.tree.leaves(problem.observe, is_leaf=is_observable):
+    for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
         if not is_observable(leaf):
             raise TypeError(
                 f"observe must be a pytree of functions {_STEP} or "
@@ -299,9 +301,9 @@ def _check_observe(problem: Problem, q0: Array, p0: Array) -> None:
         called = getattr(function, "__name__", type(function).__name__)
         if not callable(function):
             raise TypeError(f"{type(leaf).__name__} takes a function {_STEP}, got {function!r}.")
-        t0, bound = problem.t0, problem.bound(function)
+        t0, bound = task.t0, task.bound(function)
         try:
-            out = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, problem.args)
+            out = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, task.args)
         except Exception as error:
             error.add_note(f"(in the observable {called}, called with {_STEP})")
             raise

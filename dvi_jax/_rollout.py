@@ -11,9 +11,8 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from ._results import RESULTS, first_failure
 from ._solution import Save
-from ._system import System
+from ._step import Equations
 from ._types import Args, Bindable, Interval, Scalar, State
-from .engine.newton import Newton
 from .lattices import Lattice
 from .methods import Method
 from .observe import Reduction
@@ -39,18 +38,23 @@ def counted_scan(
     return carry, ys
 
 
-class Problem(eqx.Module):
+class Task(eqx.Module):
     """All that stays the same along a trajectory."""
 
-    system: System
+    equations: Equations
     method: Method
     lattice: Lattice
-    newton: Newton
     observe: PyTree
     t0: Scalar
     h: Scalar
-    epsilon: Scalar
-    args: Args
+
+    @property
+    def args(self) -> Args:
+        return self.equations.args
+
+    def interval(self, k: Int[Array, ""]) -> Interval:
+        """The interval of step k."""
+        return self.lattice.interval(self.t0, self.h, k)
 
     def observables(self) -> tuple[list[Callable], list[Reduction]]:
         """The observables that stand alone, and those in a reduction, in tree order."""
@@ -61,7 +65,7 @@ class Problem(eqx.Module):
     def bound(self, observable: Callable) -> Callable:
         """The observable, told the system and ε if it asks for them."""
         if isinstance(observable, Bindable):
-            return observable.bind(self.system, self.epsilon)
+            return observable.bind(self.equations.system, self.equations.epsilon)
         return observable
 
 
@@ -128,21 +132,21 @@ def make_plan(save: Save, num_steps: int) -> Plan:
     return Plan(num_blocks, every, tail, save.final and tail > 0)
 
 
-def start(problem: Problem, q0: State, p0: State) -> Carry:
+def start(task: Task, q0: State, p0: State) -> Carry:
     """The carry before the first step."""
     real = jnp.finfo(q0.dtype).dtype
     finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(p0))
     result = RESULTS.where(finite, RESULTS.successful, RESULTS.not_finite)
-    usable = problem.lattice.is_usable(problem.t0, problem.h)
+    usable = task.lattice.is_usable(task.t0, task.h)
     result = RESULTS.where(usable, result, RESULTS.bad_step_size)
-    interval = problem.lattice.interval(problem.t0, problem.h, jnp.asarray(0, jnp.int32))
+    interval = task.interval(jnp.asarray(0, jnp.int32))
 
     def zero_value(reduction):
         step = StepTaken(interval.t0, interval.t1, q0, p0, q0, p0)
-        like = eqx.filter_eval_shape(step.value, problem.bound(reduction.function), problem.args)
+        like = eqx.filter_eval_shape(step.value, task.bound(reduction.function), task.args)
         return jnp.zeros(like.shape, jnp.result_type(like.dtype, real))
 
-    _, reductions = problem.observables()
+    _, reductions = task.observables()
     good = result == RESULTS.successful
     return Carry(
         _or_nan(good, q0),
@@ -156,18 +160,10 @@ def start(problem: Problem, q0: State, p0: State) -> Carry:
     )
 
 
-def take_step(problem: Problem, carry: Carry, k: Array) -> tuple[Carry, Interval, StepTaken]:
+def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, StepTaken]:
     """Step k of the trajectory, its status and its reductions."""
-    interval = problem.lattice.interval(problem.t0, problem.h, k)
-    q1, p1, info = problem.method.step(
-        problem.system,
-        interval,
-        carry.q,
-        carry.p,
-        problem.epsilon,
-        problem.args,
-        problem.newton,
-    )
+    interval = task.interval(k)
+    q1, p1, info = task.method.step(task.equations, interval, carry.q, carry.p)
     was_good = carry.result == RESULTS.successful
     result = first_failure(carry.result, info.result)
     good = result == RESULTS.successful
@@ -175,9 +171,9 @@ def take_step(problem: Problem, carry: Carry, k: Array) -> tuple[Carry, Interval
     # A state after a failed step is no answer: NaN keeps it from being taken for one.
     q1, p1 = _or_nan(good, q1), _or_nan(good, p1)
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
-    _, reductions = problem.observables()
+    _, reductions = task.observables()
     memories = [
-        r.update(memory, k, interval.t1, taken.value(problem.bound(r.function), problem.args))
+        r.update(memory, k, interval.t1, taken.value(task.bound(r.function), task.args))
         for r, memory in zip(reductions, carry.reductions, strict=True)
     ]
     residual = lax.stop_gradient(info.residual)
@@ -198,7 +194,7 @@ def take_step(problem: Problem, carry: Carry, k: Array) -> tuple[Carry, Interval
 
 
 def run(
-    problem: Problem,
+    task: Task,
     plan: Plan,
     carry: Carry,
     loop: Loop,
@@ -211,24 +207,24 @@ def run(
     tail is the end of the steps after the last block, None where there are none.
     """
     inner_loop = loop if inner_loop is None else inner_loop
-    alone, _ = problem.observables()
+    alone, _ = task.observables()
     first = jnp.asarray(first, jnp.int32)
 
     def body(state, k):
         carry, _, _ = state
-        return take_step(problem, carry, k), None
+        return take_step(task, carry, k), None
 
     def steps(carry, k, count):
         """`count` steps from number k, and the last of them as it is saved."""
         inner = None
         if count == 1:
-            state = take_step(problem, carry, k)
+            state = take_step(task, carry, k)
         else:
-            interval = problem.lattice.interval(problem.t0, problem.h, k)
+            interval = task.interval(k)
             none_yet = StepTaken(*interval[:2], carry.q, carry.p, carry.q, carry.p)
             state, inner = inner_loop(body, (carry, interval, none_yet), k, 1, count)
         carry, interval, taken = state
-        observed = [taken.value(f, problem.args) for f in alone]
+        observed = [taken.value(f, task.args) for f in alone]
         return carry, Saved(interval.t1, interval.h, taken.q1, taken.p1, observed, inner)
 
     carry, saved = loop(
@@ -240,9 +236,9 @@ def run(
     return carry, saved, tail
 
 
-def reduce(problem: Problem, carry: Carry) -> list[Array]:
+def reduce(task: Task, carry: Carry) -> list[Array]:
     """The reduced values, in tree order."""
-    _, reductions = problem.observables()
+    _, reductions = task.observables()
     return [r.finish(memory) for r, memory in zip(reductions, carry.reductions, strict=True)]
 
 

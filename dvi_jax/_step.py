@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -37,112 +38,86 @@ def no_step_yet(like: State) -> StepInfo:
     return StepInfo(good, zero, jnp.zeros((), real))
 
 
-def momentum_rate(
-    system: System, interval: Interval, q0: State, p1: State, epsilon: Scalar, args: Args
-) -> State:
-    """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
-    t0, t1, _ = interval
-    gradient = jax.grad(system.hamiltonian, argnums=2)(t0, t1, q0, p1, epsilon, args)
-    if system.force is None:
-        return -gradient
-    return -gradient + system.disturbing_force(t0, t1, q0, p1, epsilon, args)
+class Equations(eqx.Module):
+    """The discrete equations of a system at one ε and one set of args, ready to be stepped.
 
+    `newton` says how their implicit part is solved.
+    """
 
-def position_rate(
-    system: System, interval: Interval, q0: State, p1: State, epsilon: Scalar, args: Args
-) -> State:
-    """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""
-    t0, t1, _ = interval
-    return jax.grad(system.hamiltonian, argnums=3)(t0, t1, q0, p1, epsilon, args)
+    system: System
+    epsilon: Scalar
+    args: Args = None
+    newton: Newton = Newton()
 
+    def momentum_rate(self, interval: Interval, q0: State, p1: State) -> State:
+        """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
+        at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
+        gradient = jax.grad(self.system.hamiltonian, argnums=2)(*at)
+        if self.system.force is None:
+            return -gradient
+        return -gradient + self.system.disturbing_force(*at)
 
-def step_is_explicit(
-    system: System, interval: Interval, q: State, p: State, epsilon: Scalar, args: Args
-) -> bool:
-    """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""
+    def position_rate(self, interval: Interval, q0: State, p1: State) -> State:
+        """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""
+        at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
+        return jax.grad(self.system.hamiltonian, argnums=3)(*at)
 
-    def rate(p1):
-        return momentum_rate(system, interval, q, p1, epsilon, args)
+    def step_is_explicit(self, interval: Interval, like: State) -> bool:
+        """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""
+        return not depends_on(lambda p1: self.momentum_rate(interval, like, p1), 0, like)
 
-    return not depends_on(rate, 0, p)
-
-
-def inverse_is_explicit(
-    system: System, interval: Interval, q: State, p: State, epsilon: Scalar, args: Args
-) -> bool:
-    """Whether q0 does not enter ∂H_D/∂p1, so that the inverse (and the adjoint) needs no solve."""
-
-    def rate(q0):
-        return position_rate(system, interval, q0, p, epsilon, args)
-
-    return not depends_on(rate, 0, q)
+    def inverse_is_explicit(self, interval: Interval, like: State) -> bool:
+        """Whether q0 does not enter ∂H_D/∂p1, so that inverse and adjoint need no solve."""
+        return not depends_on(lambda q0: self.position_rate(interval, q0, like), 0, like)
 
 
 def step(
-    system: System,
-    interval: Interval,
-    q0: State,
-    p0: State,
-    epsilon: Scalar,
-    args: Args,
-    newton: Newton,
+    equations: Equations, interval: Interval, q0: State, p0: State
 ) -> tuple[State, State, StepInfo]:
     """The map Φ_h of (12)–(13): (q0, p0) at t0 → (q1, p1) at t1.
 
     p1 = p0 + h (−∂H_D/∂q0 + εW)(t0, t1, q0, p1)      solved for p1 where p1 enters
     q1 = q0 + h ∂H_D/∂p1 (t0, t1, q0, p1)
     """
-
-    def rate(p1):
-        return momentum_rate(system, interval, q0, p1, epsilon, args)
-
     p1, info = _increment(
-        rate, p0, interval.h, newton, step_is_explicit(system, interval, q0, p0, epsilon, args)
+        lambda p1: equations.momentum_rate(interval, q0, p1),
+        p0,
+        interval.h,
+        equations.newton,
+        explicit=equations.step_is_explicit(interval, q0),
     )
-    q1 = q0 + interval.h * position_rate(system, interval, q0, p1, epsilon, args)
+    q1 = q0 + interval.h * equations.position_rate(interval, q0, p1)
     return q1, p1, _judge(info, q1, p1)
 
 
 def inverse_step(
-    system: System,
-    interval: Interval,
-    q1: State,
-    p1: State,
-    epsilon: Scalar,
-    args: Args,
-    newton: Newton,
+    equations: Equations, interval: Interval, q1: State, p1: State
 ) -> tuple[State, State, StepInfo]:
     """The inverse Φ_h⁻¹ of `step`: (q1, p1) at t1 → (q0, p0) at t0.
 
     q0 = q1 − h ∂H_D/∂p1 (t0, t1, q0, p1)             solved for q0 where q0 enters
     p0 = p1 − h (−∂H_D/∂q0 + εW)(t0, t1, q0, p1)
     """
-
-    def rate(q0):
-        return position_rate(system, interval, q0, p1, epsilon, args)
-
     q0, info = _increment(
-        rate, q1, -interval.h, newton, inverse_is_explicit(system, interval, q1, p1, epsilon, args)
+        lambda q0: equations.position_rate(interval, q0, p1),
+        q1,
+        -interval.h,
+        equations.newton,
+        explicit=equations.inverse_is_explicit(interval, q1),
     )
-    p0 = p1 - interval.h * momentum_rate(system, interval, q0, p1, epsilon, args)
+    p0 = p1 - interval.h * equations.momentum_rate(interval, q0, p1)
     return q0, p0, _judge(info, q0, p0)
 
 
 def adjoint_step(
-    system: System,
-    interval: Interval,
-    q0: State,
-    p0: State,
-    epsilon: Scalar,
-    args: Args,
-    newton: Newton,
+    equations: Equations, interval: Interval, q0: State, p0: State
 ) -> tuple[State, State, StepInfo]:
     """The adjoint Φ*_h = (Φ_{−h})⁻¹: (q0, p0) at t0 → (q1, p1) at t1.
 
     It is the inverse of the step that walks the interval backwards; H_D and W are
     evaluated at (t1, t0, q1, p0).
     """
-    return inverse_step(system, interval.reversed(), q0, p0, epsilon, args, newton)
+    return inverse_step(equations, interval.reversed(), q0, p0)
 
 
 def _increment(rate, x0, h, newton, explicit) -> tuple[State, RootInfo]:

@@ -20,20 +20,20 @@ class ExplicitEuler(dvi.Method):
     is_symplectic: bool = False
     is_invertible: bool = False
 
-    def step(self, system, interval, q0, p0, epsilon, args, newton):
-        from dvi_jax._step import StepInfo, momentum_rate, position_rate
+    def step(self, equations, interval, q0, p0):
+        from dvi_jax._step import no_step_yet
 
-        q1 = q0 + interval.h * position_rate(system, interval, q0, p0, epsilon, args)
-        p1 = p0 + interval.h * momentum_rate(system, interval, q0, p0, epsilon, args)
-        return q1, p1, StepInfo(dvi.RESULTS.successful, jnp.asarray(0, jnp.int32), jnp.zeros(()))
+        q1 = q0 + interval.h * equations.position_rate(interval, q0, p0)
+        p1 = p0 + interval.h * equations.momentum_rate(interval, q0, p0)
+        return q1, p1, no_step_yet(q0)
 
-    def inverse(self, system, interval, q1, p1, epsilon, args, newton):
+    def inverse(self, equations, interval, q1, p1):
         raise TypeError
 
-    def _needs_no_solve(self, system, interval, q, epsilon, args):
+    def _needs_no_solve(self, equations, interval, q):
         return True
 
-    def _inverse_needs_no_solve(self, system, interval, q, epsilon, args):
+    def _inverse_needs_no_solve(self, equations, interval, q):
         return False
 
 

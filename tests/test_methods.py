@@ -21,7 +21,7 @@ from helpers import (
 from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
-from dvi_jax._step import adjoint_step, inverse_step, step
+from dvi_jax._step import Equations, adjoint_step, inverse_step, step
 from dvi_jax._types import Interval
 
 TWO_SYSTEMS = ["non_separable", "double_pendulum"]
@@ -96,14 +96,14 @@ def test_order_with_a_damped_and_driven_force(system, method):
 @pytest.mark.parametrize(("system", "method"), pairs(INVERTIBLE, SYSTEMS))
 def test_inverse_undoes_the_step_with_the_force_on(system, method):
     s, q, p = SYSTEMS[system]
-    m, newton = METHODS[method], dvi.Newton()
+    m = METHODS[method]
 
     @jax.jit
     def there_and_back(q, p):
         interval = Interval(jnp.asarray(0.2), jnp.asarray(0.3), jnp.asarray(0.1))
-        e = jnp.asarray(0.3)
-        q1, p1, one = m.step(s, interval, q, p, e, ARGS, newton)
-        q0, p0, two = m.inverse(s, interval, q1, p1, e, ARGS, newton)
+        equations = Equations(s, jnp.asarray(0.3), ARGS)
+        q1, p1, one = m.step(equations, interval, q, p)
+        q0, p0, two = m.inverse(equations, interval, q1, p1)
         good = (one.result == dvi.RESULTS.successful) & (two.result == dvi.RESULTS.successful)
         return q1, q0, p0, good
 
@@ -130,13 +130,14 @@ def test_symmetric_methods_reverse_and_others_do_not(system, method):
 
 def test_adjoint_is_the_inverse_of_the_step_backwards():
     s, q, p = SYSTEMS["double_pendulum"]
-    q, p, e, newton = jnp.asarray(q), jnp.asarray(p), jnp.asarray(0.3), dvi.Newton()
+    q, p = jnp.asarray(q), jnp.asarray(p)
+    equations = Equations(s, jnp.asarray(0.3), ARGS)
     interval = Interval(jnp.asarray(0.2), jnp.asarray(0.3), jnp.asarray(0.1))
-    q1, p1, _ = adjoint_step(s, interval, q, p, e, ARGS, newton)
-    q0, p0, _ = step(s, interval.reversed(), q1, p1, e, ARGS, newton)
+    q1, p1, _ = adjoint_step(equations, interval, q, p)
+    q0, p0, _ = step(equations, interval.reversed(), q1, p1)
     np.testing.assert_allclose(q0, q, atol=1e-14)
     np.testing.assert_allclose(p0, p, atol=1e-14)
-    plain, _, _ = step(s, interval, q, p, e, ARGS, newton)
+    plain, _, _ = step(equations, interval, q, p)
     assert np.max(np.abs(plain - q1)) > 1e-3  # and is another map
 
 
@@ -156,11 +157,11 @@ def test_discrete_equations_hold_for_the_step():
 def test_inverse_step_solves_where_the_step_does_not():
     """H = p²(1 + q²)/2 − cos q: explicit in neither direction; H = p²/2 − cos q: in both."""
     separable = dvi.System(lambda t0, t1, q, p, args: jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q)))
-    q, p, newton = jnp.array([0.3]), jnp.array([0.4]), dvi.Newton()
+    q, p = jnp.array([0.3]), jnp.array([0.4])
     interval = Interval(jnp.asarray(0.0), jnp.asarray(0.1), jnp.asarray(0.1))
     for s, solves in ((separable, False), (SYSTEMS["non_separable"][0], True)):
         for f in (step, inverse_step):
-            _, _, info = f(s, interval, q, p, jnp.asarray(0.0), None, newton)
+            _, _, info = f(Equations(s, jnp.asarray(0.0)), interval, q, p)
             assert (int(info.iterations) > 0) == solves
 
 

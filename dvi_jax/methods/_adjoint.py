@@ -43,14 +43,14 @@ class Adjoint(Method):
     def is_symplectic(self) -> bool:
         return self.method.is_symplectic
 
-    def step(self, system, interval, q0, p0, epsilon, args, newton):
-        return self.method.inverse(system, interval.reversed(), q0, p0, epsilon, args, newton)
+    def step(self, equations, interval, q0, p0):
+        return self.method.inverse(equations, interval.reversed(), q0, p0)
 
-    def inverse(self, system, interval, q1, p1, epsilon, args, newton):
-        return self.method.step(system, interval.reversed(), q1, p1, epsilon, args, newton)
+    def inverse(self, equations, interval, q1, p1):
+        return self.method.step(equations, interval.reversed(), q1, p1)
 
-    def _needs_no_solve(self, system, interval, q, epsilon, args) -> bool:
-        return self.method._inverse_needs_no_solve(system, interval, q, epsilon, args)
+    def _needs_no_solve(self, equations, interval, q) -> bool:
+        return self.method._inverse_needs_no_solve(equations, interval, q)
 
-    def _inverse_needs_no_solve(self, system, interval, q, epsilon, args) -> bool:
-        return self.method._needs_no_solve(system, interval, q, epsilon, args)
+    def _inverse_needs_no_solve(self, equations, interval, q) -> bool:
+        return self.method._needs_no_solve(equations, interval, q)

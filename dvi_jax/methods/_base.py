@@ -6,10 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._step import StepInfo
+from .._step import Equations, StepInfo
 from .._system import System
-from .._types import Args, Interval, Scalar, State
-from ..engine.newton import Newton
+from .._types import Args, Interval, State
 
 
 class Method(eqx.Module):
@@ -22,38 +21,22 @@ class Method(eqx.Module):
 
     @abc.abstractmethod
     def step(
-        self,
-        system: System,
-        interval: Interval,
-        q0: State,
-        p0: State,
-        epsilon: Scalar,
-        args: Args,
-        newton: Newton,
+        self, equations: Equations, interval: Interval, q0: State, p0: State
     ) -> tuple[State, State, StepInfo]:
         """(q0, p0) at interval.t0 → (q1, p1) at interval.t1, with the status of the step."""
 
     @abc.abstractmethod
     def inverse(
-        self,
-        system: System,
-        interval: Interval,
-        q1: State,
-        p1: State,
-        epsilon: Scalar,
-        args: Args,
-        newton: Newton,
+        self, equations: Equations, interval: Interval, q1: State, p1: State
     ) -> tuple[State, State, StepInfo]:
         """(q1, p1) at interval.t1 → (q0, p0) at interval.t0: what `step` came from."""
 
     @abc.abstractmethod
-    def _needs_no_solve(
-        self, system: System, interval: Interval, q: State, epsilon: Scalar, args: Args
-    ) -> bool: ...
+    def _needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool: ...
 
     @abc.abstractmethod
     def _inverse_needs_no_solve(
-        self, system: System, interval: Interval, q: State, epsilon: Scalar, args: Args
+        self, equations: Equations, interval: Interval, q: State
     ) -> bool: ...
 
     def is_explicit(self, system: System, q: State | None = None, args: Args = None) -> bool:
@@ -68,7 +51,8 @@ class Method(eqx.Module):
         found: list[bool] = []
 
         def probe(t0, t1, q, epsilon):
-            found.append(self._needs_no_solve(system, Interval(t0, t1, t1), q, epsilon, args))
+            equations = Equations(system, epsilon, args)
+            found.append(self._needs_no_solve(equations, Interval(t0, t1, t1), q))
             return t0
 
         try:

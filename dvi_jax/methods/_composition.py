@@ -12,11 +12,9 @@ from jax import lax
 
 from .._step import (
     adjoint_step,
-    inverse_is_explicit,
     inverse_step,
     no_step_yet,
     step,
-    step_is_explicit,
 )
 from ._base import Method
 
@@ -35,38 +33,38 @@ class CompositionMethod(Method):
     def fractions(self) -> tuple[float, ...]:
         """c₁, c₂, …: the map takes the odd ones, its adjoint the even ones; they sum to 1."""
 
-    def step(self, system, interval, q0, p0, epsilon, args, newton):
+    def step(self, equations, interval, q0, p0):
         def pair(state, parts):
-            """The map on the first part, then its adjoint on the second."""
+            # the map on the first part, then its adjoint on the second
             q, p, info = state
-            q, p, one = step(system, parts[0], q, p, epsilon, args, newton)
-            q, p, two = adjoint_step(system, parts[1], q, p, epsilon, args, newton)
+            q, p, one = step(equations, parts[0], q, p)
+            q, p, two = adjoint_step(equations, parts[1], q, p)
             return q, p, info.then(one).then(two)
 
         def single(state, part):
             q, p, info = state
-            q, p, one = step(system, part, q, p, epsilon, args, newton)
+            q, p, one = step(equations, part, q, p)
             return q, p, info.then(one)
 
-        explicit = self._needs_no_solve(system, interval, q0, epsilon, args)
+        explicit = self._needs_no_solve(equations, interval, q0)
         state = (q0, p0, no_step_yet(q0))
         pairs, rest = self._parts(interval)
         state = _each(pair, state, pairs, unrolled=explicit)
         return single(state, rest) if rest is not None else state
 
-    def inverse(self, system, interval, q1, p1, epsilon, args, newton):
+    def inverse(self, equations, interval, q1, p1):
         def single(state, part):
             q, p, info = state
-            q, p, one = inverse_step(system, part, q, p, epsilon, args, newton)
+            q, p, one = inverse_step(equations, part, q, p)
             return q, p, info.then(one)
 
         def pair(state, parts):
             q, p, info = state
-            q, p, one = step(system, parts[1].reversed(), q, p, epsilon, args, newton)
-            q, p, two = inverse_step(system, parts[0], q, p, epsilon, args, newton)
+            q, p, one = step(equations, parts[1].reversed(), q, p)
+            q, p, two = inverse_step(equations, parts[0], q, p)
             return q, p, info.then(one).then(two)
 
-        explicit = self._needs_no_solve(system, interval, q1, epsilon, args)
+        explicit = self._needs_no_solve(equations, interval, q1)
         state = (q1, p1, no_step_yet(q1))
         pairs, rest = self._parts(interval)
         if rest is not None:
@@ -85,13 +83,12 @@ class CompositionMethod(Method):
         pairs = list(zip(parts[0::2], parts[1::2], strict=False))
         return pairs, parts[-1] if len(parts) % 2 else None
 
-    def _needs_no_solve(self, system, interval, q, epsilon, args) -> bool:
-        return step_is_explicit(system, interval, q, q, epsilon, args) and inverse_is_explicit(
-            system, interval, q, q, epsilon, args
-        )
+    def _needs_no_solve(self, equations, interval, q) -> bool:
+        forwards = equations.step_is_explicit(interval, q)
+        return forwards and equations.inverse_is_explicit(interval, q)
 
-    def _inverse_needs_no_solve(self, system, interval, q, epsilon, args) -> bool:
-        return self._needs_no_solve(system, interval, q, epsilon, args)
+    def _inverse_needs_no_solve(self, equations, interval, q) -> bool:
+        return self._needs_no_solve(equations, interval, q)
 
 
 def _each(body: Callable, state: Any, pairs: list, unrolled: bool) -> Any:

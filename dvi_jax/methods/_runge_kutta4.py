@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from .._results import RESULTS
-from .._step import momentum_rate, no_step_yet, position_rate
+from .._step import no_step_yet
 from .._types import Interval
 from ._base import Method
 
@@ -26,16 +26,15 @@ class RungeKutta4(Method):
     is_symplectic: ClassVar[bool] = False
     is_invertible: ClassVar[bool] = False
 
-    def step(self, system, interval, q0, p0, epsilon, args, newton):
-        del newton
+    def step(self, equations, interval, q0, p0):
         t0, t1, h = interval
         middle = t0 + h / 2
 
         def field(t, q, p):
             now = Interval(t, t, jnp.zeros_like(h))
             return (
-                position_rate(system, now, q, p, epsilon, args),
-                momentum_rate(system, now, q, p, epsilon, args),
+                equations.position_rate(now, q, p),
+                equations.momentum_rate(now, q, p),
             )
 
         kq1, kp1 = field(t0, q0, p0)
@@ -48,14 +47,14 @@ class RungeKutta4(Method):
         result = RESULTS.where(finite, RESULTS.successful, RESULTS.not_finite)
         return q1, p1, no_step_yet(q1)._replace(result=result)
 
-    def inverse(self, system, interval, q1, p1, epsilon, args, newton):
+    def inverse(self, equations, interval, q1, p1):
         raise TypeError(
             "RungeKutta4 has no inverse step in closed form, so it has no adjoint and no "
             "reversible gradient: use a variational method, or adjoint=dvi.Checkpointed()."
         )
 
-    def _needs_no_solve(self, system, interval, q, epsilon, args):
+    def _needs_no_solve(self, equations, interval, q):
         return True
 
-    def _inverse_needs_no_solve(self, system, interval, q, epsilon, args):
+    def _inverse_needs_no_solve(self, equations, interval, q):
         return False

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from .._step import inverse_is_explicit, inverse_step, step, step_is_explicit
+from .._step import inverse_step, step
 from ._base import Method
 
 
@@ -23,14 +23,14 @@ class TypeII(Method):
     is_symplectic: ClassVar[bool] = True
     is_invertible: ClassVar[bool] = True
 
-    def step(self, system, interval, q0, p0, epsilon, args, newton):
-        return step(system, interval, q0, p0, epsilon, args, newton)
+    def step(self, equations, interval, q0, p0):
+        return step(equations, interval, q0, p0)
 
-    def inverse(self, system, interval, q1, p1, epsilon, args, newton):
-        return inverse_step(system, interval, q1, p1, epsilon, args, newton)
+    def inverse(self, equations, interval, q1, p1):
+        return inverse_step(equations, interval, q1, p1)
 
-    def _needs_no_solve(self, system, interval, q, epsilon, args):
-        return step_is_explicit(system, interval, q, q, epsilon, args)
+    def _needs_no_solve(self, equations, interval, q):
+        return equations.step_is_explicit(interval, q)
 
-    def _inverse_needs_no_solve(self, system, interval, q, epsilon, args):
-        return inverse_is_explicit(system, interval, q, q, epsilon, args)
+    def _inverse_needs_no_solve(self, equations, interval, q):
+        return equations.inverse_is_explicit(interval, q)

@@ -28,8 +28,12 @@ _SIGN_NOTE = "+K²/r is a repulsion; the equations after (45) attract. −K²/r 
 EQUATIONS = (
     Equation(1, "q̇ = ∂H/∂p", ("dvi_jax.discretise",)),
     Equation(2, "ṗ = −∂H/∂q", ("dvi_jax.discretise",)),
-    Equation(3, "discrete equation for q, undisturbed", ("dvi_jax._step.position_rate", *_STEP)),
-    Equation(4, "discrete equation for p, undisturbed", ("dvi_jax._step.momentum_rate", *_STEP)),
+    Equation(
+        3, "discrete equation for q, undisturbed", ("dvi_jax._step.Equations.position_rate", *_STEP)
+    ),
+    Equation(
+        4, "discrete equation for p, undisturbed", ("dvi_jax._step.Equations.momentum_rate", *_STEP)
+    ),
     Equation(
         5,
         "lattice (energy) equation, undisturbed",
@@ -43,8 +47,8 @@ EQUATIONS = (
     Equation(9, "the terms of the action at one point", (_LATTICE[0],)),
     Equation(10, "variation of the action", _STEP),
     Equation(11, "variation of the action, in full", (*_STEP, *_LATTICE)),
-    Equation(12, "q1 = q0 + h ∂H_D/∂p1", ("dvi_jax._step.position_rate", *_STEP)),
-    Equation(13, "p1 = p0 − h ∂H_D/∂q0 + h εW", ("dvi_jax._step.momentum_rate", *_STEP)),
+    Equation(12, "q1 = q0 + h ∂H_D/∂p1", ("dvi_jax._step.Equations.position_rate", *_STEP)),
+    Equation(13, "p1 = p0 − h ∂H_D/∂q0 + h εW", ("dvi_jax._step.Equations.momentum_rate", *_STEP)),
     Equation(
         14,
         "lattice (energy) equation, disturbed",

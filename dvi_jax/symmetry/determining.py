@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._step import momentum_rate, position_rate
+from .._step import Equations
 from .._system import System
 from .._types import Args, Interval, Scalar, State
 from .generators import Generator, LatticePoint, prolong
@@ -27,11 +27,12 @@ def discrete_equations(
     Both vanish on a solution. **Source** the paper, (16) and (23).
     """
     (t0, q0, p0), (t1, q1, p1) = _as_points(first, second)
-    h, epsilon = t1 - t0, jnp.asarray(epsilon)
+    h = t1 - t0
     interval = Interval(t0, t1, h)
+    equations = Equations(system, jnp.asarray(epsilon), args)
     return (
-        (q1 - q0) / h - position_rate(system, interval, q0, p1, epsilon, args),
-        (p1 - p0) / h - momentum_rate(system, interval, q0, p1, epsilon, args),
+        (q1 - q0) / h - equations.position_rate(interval, q0, p1),
+        (p1 - p0) / h - equations.momentum_rate(interval, q0, p1),
     )
 
 
