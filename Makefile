@@ -23,11 +23,11 @@ paper: $(READY)
 
 ## make test        all tests
 test: $(READY)
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadgroup -m "slow or not slow"
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "slow or not slow"
 
 ## make test-fast   the tests that are not marked slow (what plain pytest runs)
 test-fast: $(READY)
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadgroup
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 ## make lint        style and formatting
 lint: $(READY)

@@ -32,7 +32,9 @@ def jacobian(system, method, epsilon=0.0):
     return jax.jit(jax.jacfwd(flow(SYSTEMS[system][0], METHODS[method], 0.1, epsilon=epsilon)))
 
 
-LONG_COMPILE = {("double_pendulum", m) for m in ("Yoshida4", "Composition", "Adjoint")}
+LONG_COMPILE = {
+    ("double_pendulum", m) for m in ("Yoshida4", "Composition", "Adjoint", "RungeKutta4")
+}
 
 
 def pairs(methods, names):

@@ -18,8 +18,6 @@ from dvi_jax.paper.figures import FIGURES
 from dvi_jax.paper.numbers import crossing, max_drift, relative_spread, slope, spread
 from dvi_jax.paper.verdicts import pretty
 
-pytestmark = pytest.mark.xdist_group("paper")  # so that the reproduction runs once
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
