@@ -11,6 +11,13 @@ from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._solution import Save as Save, Solution as Solution
 from ._system import System as System
 from .engine.newton import Newton as Newton
+from .invariants import (
+    Discovery as Discovery,
+    DriftOrder as DriftOrder,
+    InvariantSeries as InvariantSeries,
+    discover_invariants as discover_invariants,
+    drift_order as drift_order,
+)
 from .lattices import Given as Given, Lattice as Lattice, Uniform as Uniform
 from .methods import (
     Adjoint as Adjoint,
@@ -31,8 +38,10 @@ from .observe import (
 )
 from .symmetry import (
     AdiabaticInvariant as AdiabaticInvariant,
+    Basis as Basis,
     Generator as Generator,
     LatticePoint as LatticePoint,
+    Polynomials as Polynomials,
     conformal_factor as conformal_factor,
     determining_residual as determining_residual,
     discrete_equations as discrete_equations,

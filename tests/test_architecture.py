@@ -17,6 +17,7 @@ FLOORS = [
     ["_rollout"],
     ["_adjoints"],
     ["_integrate"],
+    ["invariants"],
     ["__init__", "systems", "plot"],
     ["paper", "run"],
     ["cli"],
@@ -86,6 +87,7 @@ System discretise integrate Save Solution RESULTS IntegrationError Newton
 TypeII Adjoint Strang Yoshida Composition RungeKutta4 Uniform Given
 MaxDrift Range Trend Mean Last Reversible Checkpointed Direct
 Generator prolong determining_residual conformal_factor noether_identity AdiabaticInvariant
+Polynomials Basis discover_invariants InvariantSeries drift_order
 """
 
 

@@ -14,10 +14,12 @@ def test_python_blocks_run():
     code = "\n".join(blocks) + "\nprint(slopes.shape, bool(jnp.isfinite(slopes).all()))\n"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert out.returncode == 0, out.stderr
-    first, last = out.stdout.strip().splitlines()
+    first, formula, slope, last = out.stdout.strip().splitlines()
     assert first.startswith("successful (10001, 2)")
     drift = float(re.search(r"Array\((.*?),", first)[1])
     assert drift < 1e-13
+    assert formula.startswith("0.5 q² − 0.05 q p + 0.5 p² + ε (0.251256 q⁴ − 0.0502513 q³ p")
+    assert abs(float(slope) - 2) < 0.05
     assert last == "(8,) True"
 
 

@@ -1,5 +1,11 @@
 """Symmetries of the discrete equations, and the invariants that follow from them."""
 
+from .basis import (
+    AbstractBasis as AbstractBasis,
+    Basis as Basis,
+    BoundBasis as BoundBasis,
+    Polynomials as Polynomials,
+)
 from .determining import (
     conformal_factor as conformal_factor,
     determining_residual as determining_residual,

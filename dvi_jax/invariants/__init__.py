@@ -1,0 +1,8 @@
+"""What is conserved along trajectories, and to what order in ε."""
+
+from .discovery import (
+    Discovery as Discovery,
+    InvariantSeries as InvariantSeries,
+    discover_invariants as discover_invariants,
+)
+from .drift import DriftOrder as DriftOrder, drift_order as drift_order
