@@ -187,3 +187,32 @@ def test_a_step_that_fails_on_a_sample_is_reported():
 def test_drift_order_refuses_what_has_no_logarithm():
     with pytest.raises(ValueError, match="positive"):
         dvi.drift_order(SPRING, H_D, [0.1], [0.1], epsilons=[0.0, 0.1], h=0.1, num_steps=2)
+
+
+def test_henon_heiles_keeps_two_of_four_quadratics():
+    """The isotropic oscillator has four quadratic invariants; at order 2 energy and L are left."""
+    system = dvi.System(
+        H_D, perturbation=lambda t0, t1, q, p, args: q[0] ** 2 * q[1] - q[1] ** 3 / 3
+    )
+    d = dvi.discover_invariants(
+        system, dvi.Polynomials(4), 2, h=0.1, samples=box(2, 400, low=-1, high=1)
+    )
+    quadratic = np.array(d.basis.complexity) == 2
+    above = np.array(d.basis.complexity) > 2
+
+    def quadratics(leading):
+        return len(leading) - np.linalg.matrix_rank(leading[:, above], tol=1e-8)
+
+    assert d.survivors == (13, 4, 2)
+    assert quadratics(d.leading_parts) == 2
+    assert d.gap > 1e10
+    assert d.count == 2
+    assert np.max(d.residuals) < 1e-12
+    momentum, energy = np.asarray(d.coefficients)[:, 0, quadratic]
+    names = np.array(d.basis.names)[quadratic]
+    L = {n: c for n, c in zip(names, momentum, strict=True) if abs(c) > 1e-10}
+    E = {n: c for n, c in zip(names, energy, strict=True) if abs(c) > 1e-10}
+    assert set(L) == {"q1 p2", "q2 p1"}
+    assert L["q1 p2"] == pytest.approx(-L["q2 p1"], abs=1e-10)
+    assert set(E) == {"q1²", "q1 p1", "q2²", "q2 p2", "p1²", "p2²"}
+    assert E["q1 p1"] == pytest.approx(-0.05, abs=1e-10)

@@ -206,15 +206,13 @@ def discover_invariants(
     values, changes = _taylor_changes(system, bound, order, h, t0, args, method, newton, q, p)
     _check_basis(bound, values)
     # Orthonormal on the samples: singular values then measure functions, not their scaling.
-    _, R = np.linalg.qr(values[~held])
-    R = R / np.sqrt(np.sum(~held))
-    scaled = np.linalg.solve(R.T, changes.reshape(-1, bound.size).T).T.reshape(changes.shape)
+    R = _triangle(values[~held]) / np.sqrt(np.sum(~held))
+    scaled = np.linalg.solve(R.T, changes[~held].reshape(-1, bound.size).T).T
+    compressed = _compress(scaled.reshape(-1, order + 1, bound.size))
 
-    null, singular, gap = _null_space(_toeplitz(scaled[~held], order))
-    survivors = []
-    for m in range(order + 1):
-        part, _, _ = _null_space(_toeplitz(scaled[~held], m)) if m < order else (null, 0, 0)
-        survivors.append(_rank(part[: bound.size]))
+    spaces = [_null_space(_toeplitz(compressed, m)) for m in range(order + 1)]
+    null, singular, gap = spaces[-1]
+    survivors = [_rank(space[: bound.size]) for space, _, _ in spaces]
     leading = _orthonormal_range(null[: bound.size])
     chosen = _independent(bound, R, null, q[~held], p[~held])
     coefficients = np.array(chosen).reshape(len(chosen), order + 1, bound.size)
@@ -226,7 +224,9 @@ def discover_invariants(
         singular_values=singular,
         gap=gap,
         residuals=_residuals(coefficients, values[held], changes[held]),
-        obstructions=_obstructions(bound, R, scaled[~held], values[~held], order),
+        obstructions=_obstructions(
+            bound, R, scaled.reshape(-1, order + 1, bound.size), values[~held], spaces
+        ),
         basis=bound,
     )
 
@@ -250,28 +250,9 @@ def _samples(samples: Any) -> tuple[np.ndarray, np.ndarray]:
 def _taylor_changes(system, basis, order, h, t0, args, method, newton, q, p):
     """φ at the samples, (S, B), and A_0 … A_z there, (S, z + 1, B)."""
     t0, h = jnp.asarray(t0, float), jnp.asarray(h, float)
+    equations = Equations(system, jnp.zeros(()), args, newton)
     interval = Interval(t0, t0 + h, h)
-
-    def at_point(q, p):
-        def change(epsilon):
-            equations = Equations(system, epsilon, args, newton)
-            q1, p1, info = method.step(equations, interval, q, p)
-            return basis(q1, p1) - basis(q, p), info.result == RESULTS.successful
-
-        def derivatives(f, count):
-            """f, f', … at ε = 0, by nested forward mode."""
-            orders = [f]
-            for _ in range(count):
-                last = orders[-1]
-                orders.append(lambda e, g=last: jax.jvp(g, (e,), (jnp.ones_like(e),))[1])
-            return [g(jnp.zeros(())) for g in orders]
-
-        terms = derivatives(lambda e: change(e)[0], order)
-        factorials = np.cumprod([1.0, *range(1, order + 1)])
-        terms = jnp.stack([d / f for d, f in zip(terms, factorials, strict=True)])
-        return basis(q, p), terms, change(jnp.zeros(()))[1]
-
-    values, changes, good = jax.jit(jax.vmap(at_point))(q, p)
+    values, changes, good = _at_points(equations, interval, method, basis, order, q, p)
     if not bool(jnp.all(good)):
         i = int(jnp.argmin(good))
         raise ValueError(
@@ -280,6 +261,28 @@ def _taylor_changes(system, basis, order, h, t0, args, method, newton, q, p):
             "smaller h."
         )
     return np.asarray(values), np.asarray(changes)
+
+
+@eqx.filter_jit
+def _at_points(equations, interval, method, basis, order: int, q, p):
+    """Values of the basis, Taylor coefficients of their changes, and the steps' success."""
+
+    def at_point(q, p):
+        def change(epsilon):
+            here = Equations(equations.system, epsilon, equations.args, equations.newton)
+            q1, p1, info = method.step(here, interval, q, p)
+            return basis(q1, p1) - basis(q, p), info.result == RESULTS.successful
+
+        # f, f', … at ε = 0 by nested forward mode
+        orders = [lambda e: change(e)[0]]
+        for _ in range(order):
+            orders.append(lambda e, g=orders[-1]: jax.jvp(g, (e,), (jnp.ones_like(e),))[1])
+        factorials = np.cumprod([1.0, *range(1, order + 1)])
+        zero = jnp.zeros(())
+        terms = jnp.stack([g(zero) / f for g, f in zip(orders, factorials, strict=True)])
+        return basis(q, p), terms, change(zero)[1]
+
+    return jax.vmap(at_point)(q, p)
 
 
 def _check_basis(basis: BoundBasis, values: np.ndarray) -> None:
@@ -303,20 +306,39 @@ def _check_basis(basis: BoundBasis, values: np.ndarray) -> None:
         )
 
 
+def _triangle(matrix: np.ndarray) -> np.ndarray:
+    """R of the QR decomposition."""
+    return np.asarray(np.linalg.qr(matrix, mode="r"))
+
+
+def _compress(changes: np.ndarray) -> np.ndarray:
+    """The same inner products of all columns of A_0 … A_z, with as few rows as can be.
+
+    One orthogonal factor Q for all of them, [A_0 … A_z] = Q R, acts on every row block of the
+    Toeplitz matrix alike and changes neither its singular values nor its null space.
+    """
+    samples, orders, size = changes.shape
+    if samples <= orders * size:
+        return changes / np.sqrt(samples)
+    rows = _triangle(changes.reshape(samples, orders * size))
+    return rows.reshape(-1, orders, size) / np.sqrt(samples)
+
+
 def _toeplitz(changes: np.ndarray, order: int) -> np.ndarray:
-    """[A_0; A_1 A_0; A_2 A_1 A_0; …] on all samples."""
+    """[A_0; A_1 A_0; A_2 A_1 A_0; …] up to A_order."""
     samples, _, size = changes.shape
     blocks = np.zeros((order + 1, samples, order + 1, size))
     for k in range(order + 1):
         for m in range(k + 1):
             blocks[k, :, m] = changes[:, k - m]
-    return blocks.reshape((order + 1) * samples, (order + 1) * size) / np.sqrt(samples)
+    return blocks.reshape((order + 1) * samples, (order + 1) * size)
 
 
 def _null_space(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Null vectors as columns, relative singular values, and the ratio at the cut."""
-    _, triangle = np.linalg.qr(matrix) if matrix.shape[0] > matrix.shape[1] else (None, matrix)
-    singular, V = np.linalg.svd(triangle)[1:]
+    if matrix.shape[0] > matrix.shape[1]:
+        matrix = _triangle(matrix)
+    singular, V = np.linalg.svd(matrix)[1:]
     relative = singular / singular[0] if singular[0] > 0 else np.zeros_like(singular)
     floor = np.finfo(float).eps
     ratios = np.append(relative[:-1], relative[-1]) / np.maximum(np.append(relative[1:], 0), floor)
@@ -385,8 +407,9 @@ def _independent(basis, R, null, q, p) -> list[np.ndarray]:
         else:
             free = np.eye(null.shape[1])
         _, singular, V = np.linalg.svd(null[:size] @ free, full_matrices=False)
-        for j in np.flatnonzero(singular > _RANK):
-            vector = in_user_functions((null @ free @ V[j] / singular[j])[:, None])[:, 0]
+        ways = V[singular > _RANK].T / singular[singular > _RANK]
+        candidates = in_user_functions(null @ free @ ways)
+        for vector in _reduced(candidates, complexity).T:
             d = np.einsum("sbn,b->sn", gradient, vector[:size])
             length = np.linalg.norm(d)
             if length < _RANK:
@@ -423,16 +446,15 @@ def _residuals(coefficients, values, changes) -> np.ndarray:
     return out
 
 
-def _obstructions(basis, R, scaled, values, order) -> tuple[DriftLaw, ...]:
+def _obstructions(basis, R, scaled, values, spaces) -> tuple[DriftLaw, ...]:
     """Why leading parts are lost at order 1: their averaged drift as a function of what is kept.
 
     A_1 c_0 = −A_0 c_1 has no solution; with functions of the order-0 invariants added on the
     right it may: A_1 c_0 + A_0 c_1 = d·φ, d in the null space of A_0. That is the averaged law.
     """
-    if order == 0:
+    if len(spaces) < 2:
         return ()
-    kept, _, _ = _null_space(_toeplitz(scaled, 0))
-    extended, _, _ = _null_space(_toeplitz(scaled[:, :2], 1))
+    kept, extended = spaces[0][0], spaces[1][0]
     size = basis.size
     through = _orthonormal_range(extended[:size])
     if kept.shape[1] == 0 or through.shape[1] == kept.shape[1]:
@@ -456,9 +478,7 @@ def _obstructions(basis, R, scaled, values, order) -> tuple[DriftLaw, ...]:
 
 def _simplest(basis, R, columns: np.ndarray) -> np.ndarray:
     """The same span by columns that use complex functions as little as can be."""
-    pivots, reduced = _echelon(np.linalg.solve(R, columns), np.array(basis.complexity))
-    del pivots
-    return R @ reduced[:, ::-1]
+    return R @ _reduced(np.linalg.solve(R, columns), np.array(basis.complexity))
 
 
 def _echelon(columns: np.ndarray, complexity: np.ndarray) -> tuple[list[int], np.ndarray]:
@@ -480,6 +500,17 @@ def _echelon(columns: np.ndarray, complexity: np.ndarray) -> tuple[list[int], np
         pivots.append(int(row))
         out.append(pivot)
     return pivots, np.stack(out, axis=1) if out else columns[:, :0]
+
+
+def _reduced(columns: np.ndarray, complexity: np.ndarray) -> np.ndarray:
+    """The same span with a reduced echelon in the leading part: each column alone in its pivot.
+
+    `columns` may go on below the leading part; what is done to it is done to all of a column.
+    """
+    pivots, _ = _echelon(columns[: len(complexity)], complexity)
+    pivots = pivots[::-1]  # simplest first
+    at_pivots = columns[pivots]
+    return columns @ np.linalg.inv(at_pivots) if pivots else columns[:, :0]
 
 
 def _reduction(columns: np.ndarray, complexity: np.ndarray, size: int):

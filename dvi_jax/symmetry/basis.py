@@ -173,12 +173,14 @@ class Basis(AbstractBasis):
 
     def for_shape(self, shape):
         del shape
-        functions = self.functions
+        return BoundBasis(_Values(self.functions), self.names, (self.complexity,) * len(self.names))
 
-        def values(q, p):
-            return jnp.stack([jnp.asarray(f(q, p)) for f in functions])
 
-        return BoundBasis(values, self.names, (self.complexity,) * len(self.names))
+class _Values(eqx.Module):
+    functions: tuple[Callable[..., Any], ...]
+
+    def __call__(self, q, p):
+        return jnp.stack([jnp.asarray(f(q, p)) for f in self.functions])
 
 
 def _name(function: Any, i: int) -> str:
@@ -194,11 +196,15 @@ class Sum(AbstractBasis):
 
     def for_shape(self, shape):
         a, b = self.first.for_shape(shape), self.second.for_shape(shape)
+        return BoundBasis(_Both(a, b), a.names + b.names, a.complexity + b.complexity)
 
-        def values(q, p):
-            return jnp.concatenate([a(q, p), b(q, p)])
 
-        return BoundBasis(values, a.names + b.names, a.complexity + b.complexity)
+class _Both(eqx.Module):
+    first: BoundBasis
+    second: BoundBasis
+
+    def __call__(self, q, p):
+        return jnp.concatenate([self.first(q, p), self.second(q, p)])
 
 
 class Product(AbstractBasis):
@@ -209,13 +215,17 @@ class Product(AbstractBasis):
 
     def for_shape(self, shape):
         a, b = self.first.for_shape(shape), self.second.for_shape(shape)
-
-        def values(q, p):
-            return jnp.outer(a(q, p), b(q, p)).ravel()
-
         names = tuple(_product_name(m, n) for m, n in itertools.product(a.names, b.names))
         pairs = itertools.product(a.complexity, b.complexity)
-        return BoundBasis(values, names, tuple(c + d for c, d in pairs))
+        return BoundBasis(_Products(a, b), names, tuple(c + d for c, d in pairs))
+
+
+class _Products(eqx.Module):
+    first: BoundBasis
+    second: BoundBasis
+
+    def __call__(self, q, p):
+        return jnp.outer(self.first(q, p), self.second(q, p)).ravel()
 
 
 def _product_name(a: str, b: str) -> str:
