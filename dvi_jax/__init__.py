@@ -12,11 +12,13 @@ from ._solution import Save as Save, Solution as Solution
 from ._system import System as System
 from .engine.newton import Newton as Newton
 from .invariants import (
+    Balance as Balance,
     Discovery as Discovery,
     DriftOrder as DriftOrder,
     InvariantSeries as InvariantSeries,
     discover_invariants as discover_invariants,
     drift_order as drift_order,
+    noether_balance as noether_balance,
 )
 from .lattices import Given as Given, Lattice as Lattice, Uniform as Uniform
 from .methods import (

@@ -223,6 +223,31 @@ def ephemeris_comparison(
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 
 
+def balance(
+    ts: Any, drift: Any, causes: Mapping[str, Any], time: str = "time t", title: str = ""
+) -> Figure:
+    """The drift of an invariant and its causes (`noether_balance`), and how well they add up.
+
+    - `ts`: start of each step, shape (S,); `drift`: rate of change, shape (S,).
+    - `causes`: label → its share of the rate, shape (S,); drawn on one axis with the drift, and
+      below them what the sum leaves.
+    """
+    figure, (top, bottom) = plt.subplots(
+        2, 1, sharex=True, figsize=(6.4, 4.6), height_ratios=(3, 1)
+    )
+    looks = zip(causes.items(), itertools.cycle(COLOURS[:-1]), DASHES[1:], strict=False)
+    for (label, values), colour, dash in looks:
+        top.plot(ts, values, color=colour, linestyle=dash, label=label)
+    top.plot(ts, drift, color="#000000", linewidth=0.9, label="drift")
+    left = np.asarray(drift) - sum(np.asarray(v) for v in causes.values())
+    bottom.plot(ts, left, color="#000000", linewidth=0.7)
+    top.set(ylabel="rate of change", title=title)
+    bottom.set(xlabel=time, ylabel="drift − sum")
+    figure.legend(loc="outside lower center", ncols=len(causes) + 1)
+    figure.align_ylabels()
+    return figure
+
+
 def _upper_envelope(x: np.ndarray, y: np.ndarray, pieces: int = 100) -> tuple[Any, Any]:
     """Largest value in each of about a hundred pieces: a readable line."""
     if len(x) <= 2 * pieces:

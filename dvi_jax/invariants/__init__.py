@@ -1,5 +1,6 @@
 """What is conserved along trajectories, and to what order in ε."""
 
+from .balance import Balance as Balance, noether_balance as noether_balance
 from .discovery import (
     Discovery as Discovery,
     InvariantSeries as InvariantSeries,
