@@ -52,6 +52,7 @@ from .symmetry import (
     noether_identity as noether_identity,
     outgoing_energy as outgoing_energy,
     prolong as prolong,
+    solve_gauge as solve_gauge,
 )
 
 __version__ = "0.1.0"

@@ -227,3 +227,71 @@ def test_lattice_defect_vanishes_with_h_where_the_printed_signs_do_not():
     assert abs(mended[2]) < 1e-4 * abs(printed[2])
     assert abs(mended[0] / mended[1]) > 50  # O(h²)
     assert abs(printed[2]) > 0.5
+
+
+# --- gauges ----------------------------------------------------------------------------------
+
+
+def square(seed=0, count=120, n=1):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1, 1, (count, n)), rng.uniform(-1, 1, (count, n))
+
+
+def test_gauge_of_the_papers_oscillator_is_found():
+    """ξ0 = 1, ξ = q, η = p at ε = 0: G = −pq, so that I = (p² + q²)/2-like (below (32))."""
+    generator = dvi.Generator(lambda t, q, p, args: 1.0, SCALING.xi, SCALING.eta)
+    found = dvi.solve_gauge(
+        OSCILLATOR.system, [generator], dvi.Polynomials(2), h=0.1, samples=square()
+    )
+    assert str(found.gauges[0]) == "−q p"
+    assert found.residuals[0] < 1e-13
+
+
+def test_no_gauge_makes_34_an_invariant_of_first_order():
+    """(33) with its momentum part: identity 0 closes, identity 1 does not, in any quadratic."""
+    generator = dvi.Generator(lambda t, q, p, args: 1.0, SCALING.xi, SCALING.eta)
+    found = dvi.solve_gauge(
+        OSCILLATOR.system, [generator, generator], dvi.Polynomials(4), h=0.1, samples=square()
+    )
+    assert found.residuals[0] < 1e-12
+    assert found.residuals[1] > 1e-2
+
+
+def test_gauge_of_the_time_shift_closes_up_to_the_step_size():
+    """N_1 = q·Dq + D G_1 with q·Dq = D(q²/2) − (h/2)|Dq|²: G_1 = −q²/2, and O(h) is left."""
+    series = [TIME, dvi.Generator()]
+    left = []
+    for h in (0.1, 0.01):
+        found = dvi.solve_gauge(
+            OSCILLATOR.system, series, dvi.Polynomials(2), h=h, samples=square()
+        )
+        assert found.residuals[0] < 1e-12
+        left.append(found.residuals[1])
+        names = list(found.gauges[1].basis.names)
+        assert found.coefficients[1, names.index("q²")] == pytest.approx(-0.5, abs=0.03)
+    assert left[0] == pytest.approx(10 * left[1], rel=0.2)
+    # Along a run the gauge takes the larger part of the symmetry's defect away.
+    q, p = (x[0] for x in square(seed=5))
+    sol = dvi.integrate(OSCILLATOR.system, q, p, h=0.01, num_steps=300, epsilon=1e-3)
+    defects = [
+        np.max(
+            np.abs(dvi.noether_balance(OSCILLATOR.system, series, g, sol, epsilon=1e-3).symmetry)
+        )
+        for g in (list(found.gauges), [None, None])
+    ]
+    assert defects[0] < 0.05 * defects[1]
+
+
+def test_solve_gauge_refuses_few_or_unequal_samples():
+    with pytest.raises(ValueError, match="too few"):
+        dvi.solve_gauge(
+            OSCILLATOR.system, [TIME], dvi.Polynomials(4), h=0.1, samples=square(count=8)
+        )
+    with pytest.raises(ValueError, match="one shape"):
+        dvi.solve_gauge(
+            OSCILLATOR.system,
+            [TIME],
+            dvi.Polynomials(2),
+            h=0.1,
+            samples=(np.ones((9, 1)), np.ones((9, 2))),
+        )

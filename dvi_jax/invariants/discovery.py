@@ -12,7 +12,9 @@ from .._results import RESULTS
 from .._step import Equations
 from .._system import System
 from .._types import Args, Interval, State
+from ..engine.echelon import reduced, reduction
 from ..engine.newton import Newton
+from ..engine.taylor import taylor_coefficients
 from ..methods import Method, TypeII
 from ..symmetry.basis import AbstractBasis, BoundBasis
 
@@ -273,13 +275,8 @@ def _at_points(equations, interval, method, basis, order: int, q, p):
             q1, p1, info = method.step(here, interval, q, p)
             return basis(q1, p1) - basis(q, p), info.result == RESULTS.successful
 
-        # f, f', … at ε = 0 by nested forward mode
-        orders = [lambda e: change(e)[0]]
-        for _ in range(order):
-            orders.append(lambda e, g=orders[-1]: jax.jvp(g, (e,), (jnp.ones_like(e),))[1])
-        factorials = np.cumprod([1.0, *range(1, order + 1)])
         zero = jnp.zeros(())
-        terms = jnp.stack([g(zero) / f for g, f in zip(orders, factorials, strict=True)])
+        terms = taylor_coefficients(lambda e: change(e)[0], zero, order)
         return basis(q, p), terms, change(zero)[1]
 
     return jax.vmap(at_point)(q, p)
@@ -396,7 +393,7 @@ def _independent(basis, R, null, q, p) -> list[np.ndarray]:
     # Null vectors without a leading part may be added to any invariant: ε times another one.
     _, singular, V = np.linalg.svd(user / max(np.linalg.norm(user, 2), 1e-300))
     shifted = every @ V[np.sum(singular > _RANK) :].T
-    simplify = _reduction(shifted, np.tile(complexity, orders), size)
+    simplify = reduction(shifted, np.tile(complexity, orders), size)
     for level in sorted(set(basis.complexity)):
         above = user[complexity > level]
         # combinations whose leading part uses nothing above this level
@@ -409,7 +406,7 @@ def _independent(basis, R, null, q, p) -> list[np.ndarray]:
         _, singular, V = np.linalg.svd(null[:size] @ free, full_matrices=False)
         ways = V[singular > _RANK].T / singular[singular > _RANK]
         candidates = in_user_functions(null @ free @ ways)
-        for vector in _reduced(candidates, complexity).T:
+        for vector in reduced(candidates, complexity).T:
             d = np.einsum("sbn,b->sn", gradient, vector[:size])
             length = np.linalg.norm(d)
             if length < _RANK:
@@ -478,53 +475,4 @@ def _obstructions(basis, R, scaled, values, spaces) -> tuple[DriftLaw, ...]:
 
 def _simplest(basis, R, columns: np.ndarray) -> np.ndarray:
     """The same span by columns that use complex functions as little as can be."""
-    return R @ _reduced(np.linalg.solve(R, columns), np.array(basis.complexity))
-
-
-def _echelon(columns: np.ndarray, complexity: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """Columns of the same span, each with a pivot row in which those after it are zero.
-
-    Rows are gone through from the most complex function to the simplest.
-    """
-    rows = np.argsort(complexity, kind="stable")[::-1]
-    work, pivots, out = columns.copy(), [], []
-    for row in rows:
-        if work.shape[1] == 0:
-            break
-        j = int(np.argmax(np.abs(work[row])))
-        pivot = work[:, j]
-        if abs(pivot[row]) < _RANK * np.max(np.abs(columns)):
-            continue
-        rest = np.delete(work, j, axis=1)
-        work = rest - np.outer(pivot, rest[row] / pivot[row])
-        pivots.append(int(row))
-        out.append(pivot)
-    return pivots, np.stack(out, axis=1) if out else columns[:, :0]
-
-
-def _reduced(columns: np.ndarray, complexity: np.ndarray) -> np.ndarray:
-    """The same span with a reduced echelon in the leading part: each column alone in its pivot.
-
-    `columns` may go on below the leading part; what is done to it is done to all of a column.
-    """
-    pivots, _ = _echelon(columns[: len(complexity)], complexity)
-    pivots = pivots[::-1]  # simplest first
-    at_pivots = columns[pivots]
-    return columns @ np.linalg.inv(at_pivots) if pivots else columns[:, :0]
-
-
-def _reduction(columns: np.ndarray, complexity: np.ndarray, size: int):
-    """A function that adds multiples of `columns` to a vector until it is as simple as can be.
-
-    The most complex functions go first, those of the lowest order in ε before the others.
-    """
-    order = np.repeat(np.arange(len(complexity) // size), size)
-    pivots, reduced = _echelon(columns, complexity - (1 + np.max(complexity)) * order)
-
-    def simplify(vector: np.ndarray) -> np.ndarray:
-        for row, column in zip(pivots, reduced.T, strict=True):
-            vector = vector - vector[row] / column[row] * column
-            vector[row] = 0.0
-        return vector
-
-    return simplify
+    return R @ reduced(np.linalg.solve(R, columns), np.array(basis.complexity))

@@ -11,6 +11,11 @@ from .determining import (
     determining_residual as determining_residual,
     discrete_equations as discrete_equations,
 )
+from .gauge import (
+    BasisGauge as BasisGauge,
+    GaugeSolution as GaugeSolution,
+    solve_gauge as solve_gauge,
+)
 from .generators import Generator as Generator, LatticePoint as LatticePoint, prolong as prolong
 from .noether import (
     AdiabaticInvariant as AdiabaticInvariant,

@@ -1,0 +1,59 @@
+"""Spans of coefficient vectors in their simplest form."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+_RANK = 1e-7
+"""A pivot smaller than this share of the largest entry is taken for zero."""
+
+
+def echelon(columns: np.ndarray, complexity: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """Columns of the same span, each with a pivot row in which those after it are zero.
+
+    Rows are gone through from the most complex function to the simplest.
+    """
+    rows = np.argsort(complexity, kind="stable")[::-1]
+    work, pivots, out = columns.copy(), [], []
+    for row in rows:
+        if work.shape[1] == 0:
+            break
+        j = int(np.argmax(np.abs(work[row])))
+        pivot = work[:, j]
+        if abs(pivot[row]) < _RANK * np.max(np.abs(columns)):
+            continue
+        rest = np.delete(work, j, axis=1)
+        work = rest - np.outer(pivot, rest[row] / pivot[row])
+        pivots.append(int(row))
+        out.append(pivot)
+    return pivots, np.stack(out, axis=1) if out else columns[:, :0]
+
+
+def reduced(columns: np.ndarray, complexity: np.ndarray) -> np.ndarray:
+    """The same span with a reduced echelon in the leading part: each column alone in its pivot.
+
+    `columns` may go on below the leading part; what is done to it is done to all of a column.
+    """
+    pivots, _ = echelon(columns[: len(complexity)], complexity)
+    pivots = pivots[::-1]  # simplest first
+    at_pivots = columns[pivots]
+    return columns @ np.linalg.inv(at_pivots) if pivots else columns[:, :0]
+
+
+def reduction(
+    columns: np.ndarray, complexity: np.ndarray, size: int
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A function that adds multiples of `columns` to a vector until it is as simple as can be.
+
+    The most complex functions go first, those of the lowest order in ε before the others.
+    """
+    order = np.repeat(np.arange(len(complexity) // size), size)
+    pivots, reduced = echelon(columns, complexity - (1 + np.max(complexity)) * order)
+
+    def simplify(vector: np.ndarray) -> np.ndarray:
+        for row, column in zip(pivots, reduced.T, strict=True):
+            vector = vector - vector[row] / column[row] * column
+            vector[row] = 0.0
+        return vector
+
+    return simplify

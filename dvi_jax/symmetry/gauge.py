@@ -1,0 +1,157 @@
+"""Gauge functions that close Noether's identities, found in a basis."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._results import RESULTS
+from .._step import Equations, step
+from .._system import System
+from .._types import Args, Interval
+from ..engine.echelon import reduction
+from ..engine.newton import Newton
+from ..engine.taylor import taylor_coefficients
+from .basis import AbstractBasis, BoundBasis
+from .generators import Generator, LatticePoint
+from .noether import noether_identity
+
+
+class BasisGauge(eqx.Module):
+    """A gauge G(t, q, p, args) = g·φ(q, p); as a formula: `str`."""
+
+    basis: BoundBasis
+    coefficients: Array
+
+    def __call__(self, t, q, p, args):
+        return self.coefficients @ self.basis(q, p)
+
+    def __str__(self) -> str:
+        return self.basis.formula(self.coefficients)
+
+
+class GaugeSolution(NamedTuple):
+    """What `solve_gauge` found.
+
+    - `gauges`: one for each order, for `AdiabaticInvariant`.
+    - `coefficients`: shape (z + 1, basis size).
+    - `residuals`: shape (z + 1,), on held-out points: what the gauge leaves of the identity at
+      each order in ε, relative to the size of the terms. Round-off: a gauge exists, and the
+      identity closes to that order; of order one: no gauge in this basis closes it.
+    """
+
+    gauges: tuple[BasisGauge, ...]
+    coefficients: np.ndarray
+    residuals: np.ndarray
+
+
+def solve_gauge(
+    system: System,
+    generators: Sequence[Generator],
+    basis: AbstractBasis,
+    *,
+    h: float,
+    samples: tuple[Any, Any],
+    t0: float = 0.0,
+    args: Args = None,
+) -> GaugeSolution:
+    r"""The gauge functions that close Noether's identities on the disturbed map, by least squares.
+
+    With Φ_ε the map (12)–(13), the sum Σ_m ε^m N_m of the identities (28) has to vanish on
+    (q, p) → Φ_ε(q, p) up to O(ε^{z+1}). Powers of ε are collected *after* the map is put in:
+
+        n_k + (1/h) Σ_{m≤k} A_{k−m} g_m = 0    for k = 0 … z
+
+    with n_k the Taylor coefficients of the sum without gauges and A_k those of φ(Φ_ε) − φ.
+    (Taken order by order with the undisturbed map, as (28) is printed, terms are lost: (34)
+    fails by it.)
+
+    **Arguments** `generators`: the series, order 0 first; `basis`: φ(q, p), where the gauges are
+    looked for; `h`, `t0`, `args`: of the step; `samples`: (qs, ps), shapes (S, *q.shape), a
+    quarter of them held out.
+
+    **Raises** `ValueError` for samples of unequal shapes, too few of them, or where the step fails.
+
+    **Source** our own; the identities: the paper, (25) and (28).
+    """
+    q, p = (np.asarray(x, float) for x in samples)
+    if q.shape != p.shape or q.ndim < 1:
+        raise ValueError(
+            f"samples (qs, ps) must have one shape (points, *q.shape), got {q.shape} and {p.shape}."
+        )
+    bound = basis.for_shape(q.shape[1:])
+    held = np.arange(len(q)) % 4 == 3
+    if np.sum(~held) < bound.size:
+        raise ValueError(
+            f"{len(q)} samples are too few for {bound.size} basis functions: give at least "
+            f"{2 * bound.size}."
+        )
+    order = len(generators) - 1
+    h_, t0_ = jnp.asarray(h, float), jnp.asarray(t0, float)
+    equations = Equations(system, jnp.zeros(()), args)
+    interval = Interval(t0_, t0_ + h_, h_)
+    terms, good = _identity_terms(equations, interval, list(generators), bound, q, p)
+    if not bool(jnp.all(good)):
+        raise ValueError(
+            f"the step fails at {int(jnp.sum(~good))} of {len(q)} samples: take samples where the "
+            "map is defined, or a smaller h."
+        )
+    terms = np.asarray(terms)
+    n, changes = terms[:, :, 0], terms[:, :, 1:] / h
+    size = bound.size
+
+    def equations_of(rows, k):
+        """The rows of order k: their matrix on (g_0 … g_z), and the right side."""
+        blocks = np.zeros((int(rows.sum()), order + 1, size))
+        for m in range(k + 1):
+            blocks[:, m] = changes[rows, k - m]
+        return blocks.reshape(len(blocks), -1), -n[rows, k]
+
+    scale = np.tile(np.sqrt(np.mean(changes[:, 0] ** 2, axis=0)), order + 1)
+    scale = 1 / np.where(scale > 0, scale, 1)
+    g, free = np.zeros(len(scale)), np.diag(scale)  # solutions so far: g + free @ anything
+    for k in range(order + 1):  # a lower order first: a higher one uses the freedom it leaves
+        matrix, right = equations_of(~held, k)
+        U, singular, V = np.linalg.svd(matrix @ free)
+        rank = int(np.sum(singular > 1e-9 * max(singular[0], 1e-300)))
+        g = g + free @ V[:rank].T @ ((U[:, :rank].T @ (right - matrix @ g)) / singular[:rank])
+        free = free @ V[rank:].T
+    # What is left free is invariants, which may be added to any gauge: the simplest is taken.
+    g = reduction(free, np.tile(bound.complexity, order + 1), size)(g)
+    left = np.array([m @ g - r for m, r in (equations_of(held, k) for k in range(order + 1))])
+    g = g.reshape(order + 1, size)
+    largest = np.maximum(np.max(np.abs(n)), np.finfo(float).tiny)
+    return GaugeSolution(
+        tuple(BasisGauge(bound, jnp.asarray(c)) for c in g),
+        g,
+        np.max(np.abs(left), axis=1) / largest,
+    )
+
+
+@eqx.filter_jit
+def _identity_terms(equations, interval, generators, basis, q, p):
+    """Taylor coefficients in ε of [Σ ε^m N_m without gauges, φ(Φ_ε) − φ], (S, z + 1, 1 + B)."""
+    nothing = [None] * len(generators)
+
+    def at_point(q, p):
+        def of(epsilon):
+            here = Equations(equations.system, epsilon, equations.args, Newton())
+            q1, p1, info = step(here, interval, q, p)
+            first, second = LatticePoint(interval.t0, q, p), LatticePoint(interval.t1, q1, p1)
+            total = sum(
+                epsilon**m
+                * noether_identity(
+                    here.system, generators, nothing, m, first, second, epsilon, here.args
+                )
+                for m in range(len(generators))
+            )
+            return jnp.append(total, basis(q1, p1) - basis(q, p)), info
+
+        terms = taylor_coefficients(lambda e: of(e)[0], jnp.zeros(()), len(generators) - 1)
+        return terms, of(jnp.zeros(()))[1].result == RESULTS.successful
+
+    return jax.vmap(at_point)(q, p)
