@@ -9,8 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from ._compat import is_traced
 from ._results import RESULTS
 from ._rollout import (
     Carry,
@@ -23,6 +25,7 @@ from ._rollout import (
     reduce,
     run,
     start,
+    take_step,
     with_tail,
 )
 from ._types import State
@@ -116,13 +119,14 @@ class Reversible(AbstractAdjoint):
 
     Memory does not grow with num_steps but for one state every `checkpoint_every` steps, from
     which the rebuilding starts afresh: it amplifies round-off on chaotic or dissipative arcs.
-    Where a rebuilt state misses the stored one by more than `max_defect` (relative to the
-    largest component; None means 1e-6 in float64 and 1e-3 in float32), or an inverse step has
-    no solution, the gradient is NaN rather than wrong: take fewer steps between checkpoints, or
-    `Checkpointed`.
+    Where a rebuilt component misses the stored one by more than `max_defect` of its own size
+    (None means 1e-6 in float64 and 1e-3 in float32; a component below round-off of the largest
+    one is not looked at), or an inverse step has no solution, the gradient is NaN rather than
+    wrong: take fewer steps between checkpoints, or `Checkpointed`.
 
-    Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A
-    method without an inverse (`RungeKutta4`) is differentiated as by `Checkpointed`.
+    Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
+    without an inverse (`RungeKutta4`), and a system or observable that *closes over* a value
+    being differentiated (better: hand it over in args), are differentiated as by `Checkpointed`.
 
     **Raises** `ValueError` for settings that are not positive.
 
@@ -142,6 +146,8 @@ class Reversible(AbstractAdjoint):
     def rollout(self, task, plan, q0, p0):
         if not task.method.is_invertible:
             return Checkpointed().rollout(task, plan, q0, p0)
+        if _closes_over_traced(task, q0, p0):
+            return Checkpointed().rollout(task, plan, q0, p0)
         theta, fixed = eqx.partition(task, eqx.is_inexact_array)
 
         @jax.jit  # so that its uses below share one trace, and one trace of its derivative
@@ -151,8 +157,15 @@ class Reversible(AbstractAdjoint):
             carry, saved, tail = run(
                 task, plan, start(task, q0, p0), counted_scan, self._inner_loop
             )
-            smooth = _Smooth(carry.q, carry.p, with_tail(plan, saved, tail), reduce(task, carry))
-            return smooth, (carry, saved, tail)
+            kept, counts = eqx.partition(with_tail(plan, saved, tail), eqx.is_inexact_array)
+            smooth = _Smooth(carry.q, carry.p, kept, reduce(task, carry))
+            # Every output is made to depend on every input, by an empty sum. Under vmap all of
+            # them are then batched if one input is, as their tangents are.
+            nothing = jnp.sum(ravel_pytree(inputs)[0][:0])
+            return jax.tree.map(
+                lambda x: x + nothing.astype(x.dtype) if eqx.is_inexact_array(x) else x,
+                (smooth, (carry, saved, tail, counts)),
+            )
 
         @jax.custom_jvp
         def trajectory(inputs):
@@ -169,31 +182,33 @@ class Reversible(AbstractAdjoint):
             def push(u):
                 return jax.jvp(lambda x: forward(x)[0], (inputs,), (u,))[1]
 
-            def matvec(uv):
-                u, v = uv
-                return u, jax.tree.map(jnp.subtract, v, push(u))
+            # As one vector: the transposition of a linear solve wants all parts of its right side
+            # to be linear in the tangents, also those that are zero.
+            rhs, unravel = ravel_pytree((change, jax.tree.map(jnp.zeros_like, smooth)))
+
+            def flat(u, v):
+                return ravel_pytree((u, v))[0]
+
+            def matvec(x):
+                u, v = unravel(x)
+                return flat(u, jax.tree.map(jnp.subtract, v, push(u)))
 
             def solve(_, b):
-                u, v = b
-                return u, jax.tree.map(jnp.add, v, push(u))
+                u, v = unravel(b)
+                return flat(u, jax.tree.map(jnp.add, v, push(u)))
 
             def transpose_solve(_, b):
-                u, v = b
+                u, v = unravel(b)
                 back = _pull_back(self, fixed, plan, inputs, trace, v)
-                return jax.tree.map(jnp.add, u, back), v
+                return flat(jax.tree.map(jnp.add, u, back), v)
 
-            # Every part of the right side must be linear in the tangents, also those that are
-            # zero: an empty sum of the tangents is such a zero.
-            nothing = sum(jnp.sum(x.ravel()[:0]) for x in jax.tree.leaves(change))
-            rhs = jax.tree.map(
-                lambda x: x + nothing, (change, jax.tree.map(jnp.zeros_like, smooth))
-            )
             solver: Any = lax.custom_linear_solve  # its annotations differ between versions
-            _, moved = solver(matvec, rhs, solve, transpose_solve)
+            _, moved = unravel(solver(matvec, rhs, solve, transpose_solve))
             return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
 
-        smooth, (carry, _, _) = trajectory((theta, q0, p0))
-        return Outcome(carry._replace(q=smooth.q, p=smooth.p), smooth.saved, smooth.reduced)
+        smooth, (carry, _, _, counts) = trajectory((theta, q0, p0))
+        saved = eqx.combine(smooth.saved, counts)
+        return Outcome(carry._replace(q=smooth.q, p=smooth.p), saved, smooth.reduced)
 
     def _inner_loop(self, body, state, first, stride, count):
         """A scan over the steps of a block that keeps the state every `checkpoint_every` steps."""
@@ -230,7 +245,7 @@ def _no_tangent(x):
 def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent: _Smooth):
     """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start."""
     theta, q_start, p_start = inputs
-    carry, saved, tail = trace
+    carry, saved, tail, _ = trace
     task: Task = eqx.combine(theta, fixed)
     _, reductions = task.observables()
 
@@ -241,8 +256,9 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
         q1, p1, _ = task.method.step(task.equations, interval, q0, p0)
         taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
         values = [taken.value(f, task.args) for f in alone]
-        reduced = [taken.value(task.bound(r.function), task.args) for r in reductions]
-        return Saved(interval.t1, interval.h, q1, p1, values), reduced
+        reduced = [taken.number(task.bound(r.function), task.args) for r in reductions]
+        end = Saved(interval.t1, interval.h, q1, p1, values)
+        return eqx.filter(end, eqx.is_inexact_array), reduced
 
     def undo(state, k, is_last, at_save: Saved):
         """One step back: the state before it, and the cotangents before it."""
@@ -268,12 +284,16 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
         """`count` steps back from the exact state `end`, checked against `known_start`."""
 
         def body(state, k):
-            return undo(state, k, k == last, at_save), None
+            state, sizes = state
+            state = undo(state, k, k == last, at_save)
+            return (state, _largest(sizes, state[:2])), None
 
-        (q, p, grad, cot), _ = counted_scan(body, (*end, grad, cot), first, 1, count, reverse=True)
-        defect = jnp.maximum(_distance(q, known_start[0]), _distance(p, known_start[1]))
+        begin = ((*end, grad, cot), _largest(end, end))
+        ((q, p, grad, cot), sizes), _ = counted_scan(body, begin, first, 1, count, reverse=True)
         allowed = settings.max_defect or (1e-6 if q.dtype.itemsize >= 8 else 1e-3)
-        return _all_or_nan(defect <= allowed, (grad, cot))
+        ok = _is_near(q, known_start[0], sizes[0], allowed)
+        ok = ok & _is_near(p, known_start[1], sizes[1], allowed)
+        return _all_or_nan(ok, (grad, cot))
 
     def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):
         last = first + count - 1
@@ -323,10 +343,31 @@ def _last_row(x, is_there: bool):
     return x[-1] if is_there else jnp.zeros(x.shape[1:], x.dtype)
 
 
-def _distance(a, b):
-    """Largest distance of two states, relative to the size of the second."""
-    size = jnp.max(jnp.abs(b), initial=0.0)
-    return jnp.max(jnp.abs(a - b), initial=0.0) / jnp.where(size > 0, size, 1)
+def _largest(sizes, state):
+    return jax.tree.map(lambda s, x: jnp.maximum(jnp.abs(s), jnp.abs(x)), sizes, state)
+
+
+def _is_near(a, b, size, allowed):
+    """Whether a is b to `allowed` of each component's size, or to round-off of the largest."""
+    round_off = 64 * jnp.finfo(a.dtype).eps * jnp.max(size, initial=0.0)
+    return jnp.all(jnp.abs(a - b) <= allowed * size + round_off)
+
+
+def _closes_over_traced(task: Task, q0: State, p0: State) -> bool:
+    """Whether a function of the task holds a value that is being differentiated or batched.
+
+    Such a value is no input of the trajectory, so that a derivative written for its inputs would
+    miss it.
+    """
+    arrays, rest = eqx.partition(task, eqx.is_array)
+
+    def one_step(arrays, q0, p0):
+        task = eqx.combine(arrays, rest)
+        alone, _ = task.observables()
+        carry, _, taken = take_step(task, start(task, q0, p0), jnp.asarray(0, jnp.int32))
+        return carry, [taken.value(f, task.args) for f in alone]
+
+    return any(is_traced(c) for c in jax.make_jaxpr(one_step)(arrays, q0, p0).consts)
 
 
 def _all_or_nan(good, tree):

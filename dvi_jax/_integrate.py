@@ -1,5 +1,6 @@
 """The front door: one trajectory."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -81,8 +82,9 @@ def integrate(
     - `adjoint`: how reverse-mode gradients go, see `Reversible`, `Checkpointed`, `Direct`.
     - `newton`: settings of implicit solves, see `Newton`.
     - `throw`: raise if the trajectory fails; otherwise read ``solution.result``.
-    - `progress`: called as ``progress(steps_done, num_steps)`` about a hundred times during the
-      run, which then goes in pieces (same numbers, bit for bit). Not under jit, vmap or grad.
+    - `progress`: called as ``progress(steps_done, num_steps)`` at save points, at most about a
+      hundred times during the run, which then goes in pieces (same numbers, bit for bit). Not
+      under jit, vmap or grad.
 
     h, t0, epsilon, args, q0, p0 and the times of `Given` are traced: they may be batched by
     `vmap` and differentiated by `grad` and `jvp`. The arithmetic is in the precision of q0, p0.
@@ -121,6 +123,13 @@ def integrate(
     args = jax.tree.map(_parameter, args)
     system.check_shapes(t0, q0, p0, epsilon, args)
     equations = Equations(system, epsilon, args, newton)
+    is_disturbed = system.force is not None or system.perturbation is not None
+    if not (is_disturbed or system.slow_time or is_traced(epsilon)) and float(epsilon) != 0:
+        warnings.warn(
+            f"epsilon = {float(epsilon):g} has no effect: the system has neither a force nor a "
+            "perturbation.",
+            stacklevel=2,
+        )
     task = Task(equations, method, lattice, observe, t0, h)
     _check_observe(task, q0, p0)
     plan = make_plan(save, num_steps)
@@ -133,7 +142,7 @@ def integrate(
         outcome = _in_pieces(task, plan, q0, p0, num_steps, progress)
 
     solution = _solution(task, outcome, q0, p0, num_steps)
-    return _raise_on_failure(solution, h) if throw else solution
+    return _raise_on_failure(solution, task) if throw else solution
 
 
 @eqx.filter_jit
@@ -196,7 +205,7 @@ def _solution(task: Task, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
     )
 
 
-def _raise_on_failure(solution: Solution, h: Array) -> Solution:
+def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     result = solution.result
     if result.is_traced():
         failed = result != RESULTS.successful
@@ -204,10 +213,12 @@ def _raise_on_failure(solution: Solution, h: Array) -> Solution:
     if bool(result == RESULTS.successful):
         return solution
     step = int(solution.stats["failed_step"])
+    h = float(task.interval(jnp.asarray(step, jnp.int32)).h)
+    solved = int(solution.stats["newton_iterations"]) > 0
     residual = float(solution.stats["failed_residual"])
+    how = f"; relative residual of the implicit solve {residual:.3g}" if solved else ""
     raise IntegrationError(
-        f"the trajectory failed at step {step} of {solution.stats['num_steps']} "
-        f"(h = {float(h):g}; relative residual of the implicit solve {residual:.3g}). "
+        f"the trajectory failed at step {step} of {solution.stats['num_steps']} (h = {h:g}{how}). "
         f"{RESULTS[result]} With throw=False the solution up to there is returned "
         "with its status; here it is the `solution` attribute of this error.",
         solution,
@@ -224,6 +235,8 @@ def _start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
     if q.size == 0:
         raise ValueError(f"q0 is empty (shape {q.shape}): there is nothing to integrate.")
     dtype = jnp.result_type(q.dtype, p.dtype)
+    if jnp.finfo(dtype).bits < 32:
+        raise TypeError(f"q0 and p0 must be float32 or float64, got {dtype}: too few digits.")
     return q.astype(dtype), p.astype(dtype)
 
 
@@ -256,6 +269,8 @@ def _real_array(name: str, value: Any) -> Array:
 
 def _scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
     known = None if is_traced(value) else _as_numpy(name, value)
+    if isinstance(value, np.ndarray | np.generic):
+        refuse_double_without_x64(name, value.dtype)
     kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"{name} must be a real number, got {value!r}.")

@@ -53,8 +53,9 @@ class Task(eqx.Module):
         return self.equations.args
 
     def interval(self, k: Int[Array, ""]) -> Interval:
-        """The interval of step k."""
-        return self.lattice.interval(self.t0, self.h, k)
+        """The interval of step k, in the precision of the state (that of h)."""
+        interval = self.lattice.interval(self.t0, self.h, k)
+        return Interval(*(x.astype(self.h.dtype) for x in interval))
 
     def observables(self) -> tuple[list[Callable], list[Reduction]]:
         """The observables that stand alone, and those in a reduction, in tree order."""
@@ -94,6 +95,11 @@ class StepTaken(NamedTuple):
 
     def value(self, observable: Callable, args: Args) -> Array:
         return jnp.asarray(observable(*self, args))
+
+    def number(self, observable: Callable, args: Args) -> Array:
+        """The value for a reduction: whole numbers and truth values count as real numbers."""
+        value = self.value(observable, args)
+        return value if jnp.issubdtype(value.dtype, jnp.inexact) else value.astype(self.q1.dtype)
 
 
 class Saved(NamedTuple):
@@ -143,8 +149,8 @@ def start(task: Task, q0: State, p0: State) -> Carry:
 
     def zero_value(reduction):
         step = StepTaken(interval.t0, interval.t1, q0, p0, q0, p0)
-        like = eqx.filter_eval_shape(step.value, task.bound(reduction.function), task.args)
-        return jnp.zeros(like.shape, jnp.result_type(like.dtype, real))
+        like = eqx.filter_eval_shape(step.number, task.bound(reduction.function), task.args)
+        return jnp.zeros(like.shape, like.dtype)
 
     _, reductions = task.observables()
     good = result == RESULTS.successful
@@ -173,7 +179,7 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
     _, reductions = task.observables()
     memories = [
-        r.update(memory, k, interval.t1, taken.value(task.bound(r.function), task.args))
+        r.update(memory, k, interval.t1, taken.number(task.bound(r.function), task.args))
         for r, memory in zip(reductions, carry.reductions, strict=True)
     ]
     residual = lax.stop_gradient(info.residual)

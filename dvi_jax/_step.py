@@ -55,7 +55,7 @@ class Equations(eqx.Module):
         gradient = jax.grad(self.system.hamiltonian, argnums=2)(*at)
         if self.system.force is None:
             return -gradient
-        return -gradient + self.system.disturbing_force(*at)
+        return -gradient + self.system.disturbing_force(*at).astype(gradient.dtype)
 
     def position_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""

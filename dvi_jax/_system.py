@@ -61,7 +61,7 @@ class System(eqx.Module):
         H = self.H_D(s0, s1, q0, p1, args)
         if self.perturbation is not None:
             H = H + epsilon * self.perturbation(s0, s1, q0, p1, args)
-        return H
+        return jnp.asarray(H, p1.dtype)
 
     def disturbing_force(
         self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args

@@ -109,7 +109,10 @@ def test_reversible_gradient_for_every_way_of_saving(save):
         np.testing.assert_allclose(u, v, rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method",
+    [pytest.param(m, marks=[pytest.mark.slow] if m == "Composition" else []) for m in METHODS],
+)
 def test_gradient_through_every_method(method):
     """RungeKutta4, which has no inverse, is differentiated by checkpoints under the default."""
     x = point("pendulum")
@@ -124,6 +127,7 @@ def test_gradient_through_every_method(method):
     assert abs(forward - backward) <= 1e-10 * abs(backward)
 
 
+@pytest.mark.slow
 def test_second_derivative_and_batched_gradient():
     x = point("non_separable")
 
@@ -258,3 +262,119 @@ def test_adjoints_refuse_bad_settings(bad):
         dvi.Reversible(checkpoint_every=bad)
     with pytest.raises(ValueError, match="positive"):
         dvi.Checkpointed(segments=bad)
+
+
+# --- where a derivative written by hand could be missed or misapplied -------------------------
+
+
+def closing_over(mu, where, adjoint):
+    """A loss whose parameter is not handed over but closed over, in one of several places."""
+    plain = SYSTEMS["kepler"][0]
+    H, W, H1, observe = plain.H_D, plain.force, None, None
+    if where == "H_D":
+        H = lambda t0, t1, q, p, a: p @ p / 2 - mu / jnp.sqrt(q @ q)  # noqa: E731
+    elif where == "force":
+        W = lambda t0, t1, q, p, a: -mu * q  # noqa: E731
+    elif where == "perturbation":
+        H1 = lambda t0, t1, q, p, a: mu * jnp.sum(q**4)  # noqa: E731
+    elif where == "partial":
+        W = functools.partial(lambda m, t0, t1, q, p, a: -m * q, mu)
+    else:
+        observe = dvi.Mean(lambda t0, t1, q0, p0, q1, p1, a: mu * q1[0])
+    sol = dvi.integrate(
+        dvi.System(H, force=W, perturbation=H1),
+        [0.0, 1.2],
+        [-1.0, -0.6],
+        h=0.1,
+        num_steps=10,
+        epsilon=0.1,
+        args=ARGS,
+        observe=observe,
+        adjoint=adjoint,
+    )
+    return jnp.sum(sol.qs[-1]) + (0.0 if observe is None else sol.observed)
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "H_D",
+        "observable",
+        *(pytest.param(w, marks=pytest.mark.slow) for w in ("force", "perturbation", "partial")),
+    ],
+)
+def test_closed_over_parameters_have_gradients(where):
+    expected = jax.grad(closing_over)(1.0, where, dvi.Direct())
+    assert abs(expected) > 1e-3
+    for gradient in (jax.grad(closing_over), jax.jit(jax.grad(closing_over), static_argnums=1)):
+        got = gradient(1.0, where, dvi.Reversible())
+        np.testing.assert_allclose(got, expected, rtol=1e-11)
+
+
+def shared(mu, adjoint):
+    """A sum over lanes that share a parameter, as in a fit."""
+
+    def lane(q):
+        sol = dvi.integrate(
+            SYSTEMS["kepler"][0],
+            q,
+            [-1.0, -0.6],
+            h=0.05,
+            num_steps=12,
+            args={"K": mu},
+            adjoint=ADJOINTS[adjoint],
+            observe=lambda t0, t1, q0, p0, q1, p1, a: q1[0] > 0,  # no number: no gradient
+        )
+        return sol.qs
+
+    return jnp.sum(jax.vmap(lane)(jnp.array([[0.5, 0.3], [0.0, 1.2]])) ** 2)
+
+
+def test_gradient_of_a_batch_with_a_shared_parameter():
+    expected = jax.grad(shared)(1.0, "Direct")
+    np.testing.assert_allclose(jax.grad(shared)(1.0, "Reversible"), expected, rtol=1e-11)
+    tangent = jax.jvp(lambda m: shared(m, "Reversible"), (1.0,), (1.0,))[1]
+    np.testing.assert_allclose(tangent, expected, rtol=1e-11)
+
+
+@pytest.mark.slow
+def test_second_derivatives_in_every_combination_of_modes():
+    for outer, inner in [
+        (jax.grad, jax.grad),
+        (jax.jacrev, jax.jacfwd),
+        (jax.jacfwd, jax.jacrev),
+        (jax.jacfwd, jax.jacfwd),
+    ]:
+        values = [outer(inner(lambda m, a=a: shared(m, a)))(1.0) for a in ("Direct", "Reversible")]
+        np.testing.assert_allclose(values[1], values[0], rtol=1e-10)
+
+
+def light_and_heavy(ratio):
+    """Two oscillators side by side, masses 1 and `ratio`; the second one damped."""
+
+    def H(t0, t1, q, p, m):
+        return jnp.sum(p**2 / (2 * m)) + jnp.sum(m * q**2) / 2
+
+    system = dvi.System(H, force=lambda t0, t1, q, p, m: -p * jnp.array([0.0, 1.0]))
+    return system, jnp.array([1.0, ratio])
+
+
+def test_defect_is_seen_in_a_component_that_is_small_beside_others():
+    system, m = light_and_heavy(1e-9)
+
+    def final(e, adjoint):
+        sol = dvi.integrate(
+            system,
+            m,
+            m**2,
+            h=0.1,
+            num_steps=100,
+            epsilon=e,
+            args=m,
+            adjoint=adjoint,
+            save=dvi.Save(final=True),
+        )
+        return sol.ps[-1, 1] * 1e18
+
+    assert np.isfinite(jax.grad(final)(5.0, dvi.Direct()))
+    assert np.isnan(jax.grad(final)(5.0, dvi.Reversible()))

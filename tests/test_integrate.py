@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import METHODS, double_pendulum, non_separable
+from helpers import METHODS, SYSTEMS, non_separable
 
 import dvi_jax as dvi
 
@@ -211,9 +211,11 @@ def test_streamed_reductions_need_no_memory_for_the_steps():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_batch_equals_loop_and_jit_equals_eager(method):
+    system = SYSTEMS["double_pendulum"][0]
+
     def final(e):
         sol = dvi.integrate(
-            dvi.System(double_pendulum),
+            system,
             [0.5, -0.3],
             [0.2, 0.4],
             h=0.1,
@@ -227,6 +229,7 @@ def test_batch_equals_loop_and_jit_equals_eager(method):
     es = jnp.array([0.0, 0.1, 0.2])
     together = jax.vmap(final)(es)
     np.testing.assert_allclose(together, jnp.stack([final(e) for e in es]), rtol=1e-12)
+    assert np.max(np.abs(together[0] - together[2])) > 1e-3  # ε does something
     np.testing.assert_array_equal(jax.jit(final)(es[1]), final(es[1]))
 
 
@@ -237,7 +240,7 @@ def test_one_trace_per_shape():
         traces.append(1)
         return H(t0, t1, q0, p1, args)
 
-    system = dvi.System(counted)
+    system = dvi.System(counted, force=lambda t0, t1, q0, p1, args: -q0)
 
     def go(q, h, epsilon, a):
         seen = len(traces)
@@ -412,3 +415,65 @@ print(dvi.integrate(s, jnp.ones(1), jnp.ones(1), h=0.1, num_steps=1).qs.dtype)
 """
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.split() == ["True", "True", "True", "float32"]
+
+
+def test_a_light_body_is_solved_as_well_as_beside_nothing():
+    """Newton's test is made for each component: momenta of 1e-12 beside momenta of 1."""
+
+    def H(t0, t1, q, p, m):
+        return jnp.sum(p**2 / (2 * m)) + jnp.sum(m * q**2) / 2
+
+    def drag(t0, t1, q, p, m):
+        return -p * jnp.abs(p) / m * (m < 1)
+
+    system, m = dvi.System(H, force=drag), np.array([1.0, 1e-12])
+    both = dvi.integrate(system, [1.0, 1.0], m, h=0.1, num_steps=100, epsilon=1.0, args=m)
+    alone = dvi.integrate(system, [1.0], m[1:], h=0.1, num_steps=100, epsilon=1.0, args=m[1:])
+    np.testing.assert_allclose(both.ps[:, 1], alone.ps[:, 0], rtol=1e-12)
+
+
+def test_a_component_of_pure_round_off_does_not_keep_newton_from_converging():
+    """A planar orbit seen from oblique axes: the third momentum is nothing but rounding."""
+    turn = np.linalg.qr(np.array([[1.0, 2.0, 0.3], [0.4, 1.0, 2.0], [2.0, 0.1, 1.0]]))[0]
+
+    def drag(t0, t1, q, p, args):
+        return -p * jnp.sqrt(p @ p)
+
+    system = dvi.System(lambda t0, t1, q, p, a: p @ p / 2 - 1 / jnp.sqrt(q @ q), force=drag)
+    q, p = turn @ [0.0, 1.2, 0.0], turn @ [-1.0, -0.6, 0.0]
+    kwargs = {"h": 0.05, "num_steps": 200, "epsilon": 0.01}
+    flat = dvi.integrate(system, [0.0, 1.2, 0.0], [-1.0, -0.6, 0.0], **kwargs)
+    oblique = dvi.integrate(system, q, p, **kwargs)
+    np.testing.assert_allclose(oblique.qs @ turn, flat.qs, atol=1e-12)
+
+
+def test_state_sets_the_precision_whatever_else_is_double():
+    q = jnp.float32([0.3, 0.1])
+    force = dvi.System(H, force=lambda t0, t1, q0, p1, args: -args["k"] * q0)
+    lattice = dvi.Given(np.linspace(0, 1, 11))
+    sol = dvi.integrate(force, q, q, lattice=lattice, epsilon=0.1, args={"k": np.array(1.0)})
+    assert sol.qs.dtype == sol.ts.dtype == jnp.float32
+    half = q.astype(jnp.float16)
+    with pytest.raises(TypeError, match="float32 or float64"):
+        dvi.integrate(OSCILLATOR, half, half, h=0.1, num_steps=1)
+
+
+def test_counting_observables():
+    def right(t0, t1, q0, p0, q1, p1, args):
+        return q1[0] > 0
+
+    sol = run(observe=[right, dvi.Mean(right), dvi.Last(right)])
+    assert sol.observed[0].dtype == bool
+    np.testing.assert_allclose(sol.observed[1], np.mean(sol.observed[0]), rtol=1e-14)
+    assert sol.observed[2] == sol.observed[0][-1]
+
+
+def test_failure_on_a_given_lattice_names_the_step_size_there():
+    lattice = dvi.Given(np.array([0.0, 0.001, 10.0]))
+    with pytest.raises(dvi.IntegrationError, match=r"step 1 of 2 \(h = 9.999"):
+        dvi.integrate(NON_SEPARABLE, [3.0], [4.0], lattice=lattice)
+
+
+def test_epsilon_without_a_disturbance_is_pointed_out():
+    with pytest.warns(UserWarning, match="no effect"):
+        dvi.integrate(NON_SEPARABLE, [0.1], [0.1], h=0.1, num_steps=1, epsilon=0.5)

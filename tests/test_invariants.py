@@ -189,6 +189,7 @@ def test_drift_order_refuses_what_has_no_logarithm():
         dvi.drift_order(SPRING, H_D, [0.1], [0.1], epsilons=[0.0, 0.1], h=0.1, num_steps=2)
 
 
+@pytest.mark.slow
 def test_henon_heiles_keeps_two_of_four_quadratics():
     """The isotropic oscillator has four quadratic invariants; at order 2 energy and L are left."""
     system = dvi.System(

@@ -380,3 +380,20 @@ def test_solar_system_example(folder):
     assert report["position_error"]["Saturn"]["largest_km"] < 30
     for name in ("orbits.png", "ephemeris.png", "invariants.png"):
         assert (out / name).stat().st_size > 10_000
+
+
+def test_inputs_that_once_broke_through(folder):
+    """A number beyond floats, a method that nests too deep, a file that exits, a flat start."""
+    (folder / "leaves.py").write_text("import sys\nsys.exit(0)\n", encoding="utf-8")
+    base = 'system = "oscillator"\nh = 0.1\nsteps = 2\n'
+    for text, key in [
+        (base + "epsilon = 1" + 400 * "0" + "\n", "epsilon"),
+        (base + f'method = "{3000 * "-"}5"\n', "method"),
+        ('system = "leaves.py:system"\nh = 0.1\nsteps = 2\n', "system"),
+        ('system = "kepler"\nh = 0.1\nsteps = 2\n[state]\nq0 = [1.0]\np0 = [1.0]\n', "state"),
+        ('system = "kepler"\nh = 0.1\nsteps = 2\n[state]\nq0 = [0, 0]\np0 = [1, 0]\n', "state"),
+    ]:
+        (folder / "bad.toml").write_text(text, encoding="utf-8")
+        result = command("run", "bad.toml")
+        assert result.exit_code == 2, text
+        assert key in result.output

@@ -17,10 +17,11 @@ Vector = Inexact[Array, " n"]
 class Newton(eqx.Module):
     """Settings of Newton's method for the implicit part of a step.
 
-    The iteration stops once the correction is at most ``rtol * scale + atol`` in the
-    maximum norm, `scale` being the size of the known and the unknown vector. Convergence
-    being quadratic, the accepted iterate, which includes that last correction, is then
-    accurate to round-off.
+    The iteration stops once the correction of each component is at most ``rtol * scale +
+    atol``, `scale` being the larger of that component's known and unknown value; or, for
+    components that are nothing but round-off of larger ones, once they are as small beside those
+    and shrink no more. Convergence being quadratic, the accepted iterate, which includes that
+    last correction, is then accurate to round-off.
 
     **Arguments**
 
@@ -57,9 +58,12 @@ class RootInfo(NamedTuple):
 
 
 class _Iterate(NamedTuple):
+    """x after some iterations, the largest relative correction of a component, and verdicts."""
+
     x: Vector
-    correction: Float[Array, ""]
-    tolerance: Float[Array, ""]
+    relative: Float[Array, ""]
+    finite: Bool[Array, ""]
+    converged: Bool[Array, ""]
     iterations: Int[Array, ""]
 
 
@@ -73,34 +77,37 @@ def find_root(
     order: the iteration itself is never differentiated. `known` sets the scale for the
     relative tolerance beside x itself. The Jacobian comes from autodiff.
     """
-    eps = jnp.finfo(guess.dtype).eps
-    rtol = 4096 * eps if options.rtol is None else options.rtol
-    size = lax.stop_gradient(_norm(known))
+    rtol = 4096 * jnp.finfo(guess.dtype).eps if options.rtol is None else options.rtol
+    known = lax.stop_gradient(jnp.abs(known))
 
     def solve(F, x0):
         def proceed(state: _Iterate):
-            # `<=` is False for NaN: a correction that is not a number ends the iteration too.
-            open_ = ~(state.correction <= state.tolerance) & jnp.isfinite(state.correction)
-            return (state.iterations == 0) | (open_ & (state.iterations < options.max_steps))
+            return ~state.converged & state.finite & (state.iterations < options.max_steps)
 
         def improve(state: _Iterate):
             value, jacobian = _value_and_jacobian(F, state.x)
             correction = solve_dense(jacobian, value)
             x = state.x - correction
-            tolerance = rtol * jnp.maximum(size, _norm(x)) + options.atol
-            return _Iterate(x, _norm(correction), tolerance, state.iterations + 1)
+            error, scale = jnp.abs(correction), jnp.maximum(known, jnp.abs(x))
+            settled = jnp.all(error <= rtol * scale + options.atol)
+            # A component that is all round-off of the others never settles by its own measure: it
+            # is enough that it is small beside them and shrinks no more.
+            relative = jnp.max(error / jnp.where(scale > 0, scale, 1), initial=0.0)
+            small = _norm(error) <= rtol * _norm(scale) + options.atol
+            stalled = small & (relative >= 0.5 * state.relative)
+            finite = jnp.isfinite(_norm(correction))
+            return _Iterate(x, relative, finite, settled | stalled, state.iterations + 1)
 
-        infinity = jnp.full_like(size, jnp.inf)
-        start = _Iterate(x0, infinity, jnp.zeros_like(size), jnp.asarray(0, jnp.int32))
+        no = jnp.asarray(False)
+        unknown = jnp.full((), jnp.nan, x0.dtype)  # no comparison with it is true
+        start = _Iterate(x0, unknown, ~no, no, jnp.asarray(0, jnp.int32))
         end = lax.while_loop(proceed, improve, start)
-        scale = jnp.maximum(size, _norm(end.x))
+        scale = jnp.maximum(_norm(known), _norm(end.x))
         residual = _norm(F(end.x))
         relative = jnp.where(scale > 0, residual / jnp.where(scale > 0, scale, 1), residual)
-        converged = (end.correction <= end.tolerance) & jnp.isfinite(residual)
+        converged = end.converged & jnp.isfinite(residual)
         # custom_root gives its auxiliary output tangents of the same type, so no integers here.
-        return end.x, tuple(
-            jnp.asarray(a, size.dtype) for a in (end.iterations, relative, converged)
-        )
+        return end.x, tuple(jnp.asarray(a, x0.dtype) for a in (end.iterations, relative, converged))
 
     def tangent_solve(linear, rhs):
         _, matrix = _value_and_jacobian(linear, jnp.zeros_like(rhs))

@@ -57,7 +57,7 @@ class Method(eqx.Module):
 
         try:
             jax.eval_shape(probe, scalar, scalar, q, scalar)
-        except (TypeError, IndexError, KeyError, ValueError) as error:
+        except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
                 f"could not trace the system for q of shape {q.shape} and args={args!r} ({error}). "
                 "Give an example: is_explicit(system, q=jnp.zeros(shape), args=...)."

@@ -34,9 +34,15 @@ def _boolean(value: Any) -> bool:
 
 
 def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number of more than 300 digits
+        raise ValueError from None
+    if not np.isfinite(number):
+        raise ValueError
+    return number
 
 
 def _step_size(value: Any) -> float:

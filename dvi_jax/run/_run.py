@@ -179,12 +179,9 @@ def _write(
 
 
 def _status(solution: dvi.Solution) -> tuple[bool, dict[str, Any]]:
-    result = solution.result
-    names = ("successful", "not_converged", "not_finite", "bad_step_size")
-    name = next((n for n in names if bool(result == getattr(dvi.RESULTS, n))), "failed")
-    return name == "successful", {
-        "result": name,
-        "message": dvi.RESULTS[result],
+    return solution.status == "successful", {
+        "result": solution.status,
+        "message": dvi.RESULTS[solution.result],
         "failed_step": int(solution.stats["failed_step"]),
         "failed_residual": float(solution.stats["failed_residual"]),
         "num_steps": int(solution.stats["num_steps"]),

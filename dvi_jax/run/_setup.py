@@ -129,7 +129,7 @@ class Loader:
         sys.path.insert(0, str(path.parent))  # so that it may import its neighbours
         try:
             spec.loader.exec_module(module)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise InputError(
                 key, f"{text!r} does not import: {said(error, path)}", "a file that imports"
             ) from error
@@ -167,7 +167,7 @@ def _problem(
         if is_factory and not isinstance(made, dvi.System):
             try:
                 made = made()
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise InputError(
                     "system",
                     f"{text!r} failed: {said(error, *loader.modules)}",
@@ -269,7 +269,7 @@ def parse_method(text: str) -> dvi.Method:
     """
     try:
         made = _made(ast.parse(text.strip(), mode="eval").body)
-    except (ValueError, TypeError, SyntaxError) as error:
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
         if isinstance(error, InputError):
             raise
         reason = "it does not read as one" if isinstance(error, SyntaxError) else str(error)

@@ -1,6 +1,7 @@
 """The Kepler problem in the plane, disturbed by −εq."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from .._system import System
 from ._problem import Problem
@@ -31,6 +32,18 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     return q1[0] * p1[1] - q1[1] * p1[0]
 
 
+def check_start(q0, p0, args):
+    """Refuse a start that is not in the plane, or at the centre, with a `ValueError`."""
+    q, p = np.asarray(q0, float), np.asarray(p0, float)
+    if q.shape != (2,) or p.shape != (2,):
+        raise ValueError(
+            f"the Kepler problem here is in the plane: q0 and p0 of shape (2,), got {q.shape} and "
+            f"{p.shape}. For more dimensions or bodies take the system n_body."
+        )
+    if not q.any():
+        raise ValueError("the body is on top of the centre, q0 = [0, 0]: the force is infinite.")
+
+
 def kepler() -> Problem:
     """The paper's Kepler problem with its start and h = 0.1; dimensionless, K = 1."""
     return Problem(
@@ -47,4 +60,5 @@ def kepler() -> Problem:
         },
         units={"q": "1", "p": "1", "t": "1", "energy": "1"},
         source="the paper, Section 5.2",
+        check=check_start,
     )
