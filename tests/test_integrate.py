@@ -79,7 +79,7 @@ def test_states_of_any_shape(shape):
 def test_times_do_not_accumulate_round_off():
     sol = run(num_steps=10_000, t0=5.0, save=dvi.Save(every=1000))
     np.testing.assert_array_equal(sol.ts, 5.0 + 0.1 * np.arange(0, 10_001, 1000))
-    assert sum([0.1] * 10_000) != 1000.0  # a running sum would
+    assert np.cumsum(np.full(10_000, 0.1))[-1] != 1000.0  # a running sum would
 
 
 def test_exact_invariant_of_the_map_is_kept_late_in_a_run():
@@ -230,7 +230,8 @@ def test_batch_equals_loop_and_jit_equals_eager(method):
     together = jax.vmap(final)(es)
     np.testing.assert_allclose(together, jnp.stack([final(e) for e in es]), rtol=1e-12)
     assert np.max(np.abs(together[0] - together[2])) > 1e-3  # ε does something
-    np.testing.assert_array_equal(jax.jit(final)(es[1]), final(es[1]))
+    # Under jit the start is a constant that the compiler may fold: equal up to a rounding.
+    np.testing.assert_allclose(jax.jit(final)(es[1]), final(es[1]), rtol=1e-14, atol=1e-16)
 
 
 def test_one_trace_per_shape():
