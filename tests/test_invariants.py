@@ -217,3 +217,19 @@ def test_henon_heiles_keeps_two_of_four_quadratics():
     assert L["q1 p2"] == pytest.approx(-L["q2 p1"], abs=1e-10)
     assert set(E) == {"q1²", "q1 p1", "q2²", "q2 p2", "p1²", "p2²"}
     assert E["q1 p1"] == pytest.approx(-0.05, abs=1e-10)
+
+
+def test_what_is_no_basis_no_step_or_no_observable_is_refused():
+    samples = box(1, 60)
+    for nothing in (dvi.Polynomials, [lambda q, p: q[0]]):
+        with pytest.raises(TypeError, match="must be a basis"):
+            dvi.discover_invariants(SPRING, nothing, h=0.1, samples=samples)
+    with pytest.raises(ValueError, match="other than zero"):
+        dvi.discover_invariants(SPRING, dvi.Polynomials(2), h=0.0, samples=samples)
+    with pytest.raises(TypeError, match="take one of its"):
+        dvi.drift_order(
+            SPRING, found("cubic", 8, 0), [0.1], [0.1], epsilons=[0.1], h=0.1, num_steps=2
+        )
+    for bad in ([], dvi.Generator()):
+        with pytest.raises(ValueError, match="one Generator for each order"):
+            dvi.solve_gauge(SPRING, bad, dvi.Polynomials(2), h=0.1, samples=samples)

@@ -16,7 +16,7 @@ from ..engine.echelon import reduced, reduction
 from ..engine.newton import Newton
 from ..engine.taylor import taylor_coefficients
 from ..methods import Method, TypeII
-from ..symmetry.basis import AbstractBasis, BoundBasis
+from ..symmetry.basis import AbstractBasis, BoundBasis, bind_basis, check_step_size
 
 _NULL = 1e-9
 """A singular value above this share of the largest one is never taken for zero."""
@@ -188,7 +188,8 @@ def discover_invariants(
     **Returns** a `Discovery`; print it for a report.
 
     **Raises** `ValueError` for too few samples, samples or basis functions that are not
-    finite there, a step that fails there, or a basis that is rank-deficient on them.
+    finite there, a step that fails there, a basis that is rank-deficient on them, or h = 0;
+    `TypeError` for what is no basis.
 
     **Accuracy** round-off of the singular values, times the conditioning of the basis; Taylor
     coefficients by nested forward autodiff, through implicit steps.
@@ -198,7 +199,7 @@ def discover_invariants(
     q, p = _samples(samples)
     if isinstance(order, bool) or not isinstance(order, int) or order < 0:
         raise ValueError(f"order must be an integer of at least 0, got {order!r}.")
-    bound = basis.for_shape(q.shape[1:])
+    bound, h = bind_basis(basis, q.shape[1:]), check_step_size(h)
     held = np.arange(len(q)) % 4 == 3
     if np.sum(~held) < 1.5 * bound.size:
         raise ValueError(

@@ -69,6 +69,11 @@ def drift_order(
     **Raises** `ValueError` for epsilons that are not positive and finite, or an observable that
     is not a scalar.
     """
+    if not callable(invariant):
+        raise TypeError(
+            f"invariant must be one observable, got {type(invariant).__name__}. Of a Discovery "
+            "take one of its `invariants`."
+        )
     epsilons = np.asarray(epsilons, float)
     if (
         epsilons.ndim != 1

@@ -30,6 +30,23 @@ class AbstractBasis(eqx.Module):
         return Product(self, other) if isinstance(other, AbstractBasis) else NotImplemented
 
 
+def bind_basis(basis: Any, shape: tuple[int, ...]) -> "BoundBasis":
+    """`basis.for_shape(shape)`, after refusing what is no basis with a `TypeError`."""
+    if not isinstance(basis, AbstractBasis):
+        raise TypeError(
+            "basis must be a basis such as dvi.Polynomials(4), dvi.Basis([f, g]), or a sum or "
+            f"product of them; got {basis!r}."
+        )
+    return basis.for_shape(shape)
+
+
+def check_step_size(h: Any) -> float:
+    """h as a number, after refusing zero (a step that goes nowhere keeps everything)."""
+    if not np.isfinite(h) or h == 0:
+        raise ValueError(f"h must be a finite step size other than zero, got {h!r}.")
+    return float(h)
+
+
 class BoundBasis(eqx.Module):
     """A basis fixed for states of one shape.
 

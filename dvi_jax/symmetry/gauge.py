@@ -16,7 +16,7 @@ from .._types import Args, Interval
 from ..engine.echelon import reduction
 from ..engine.newton import Newton
 from ..engine.taylor import taylor_coefficients
-from .basis import AbstractBasis, BoundBasis
+from .basis import AbstractBasis, BoundBasis, bind_basis, check_step_size
 from .generators import Generator, LatticePoint
 from .noether import noether_identity
 
@@ -83,7 +83,12 @@ def solve_gauge(
         raise ValueError(
             f"samples (qs, ps) must have one shape (points, *q.shape), got {q.shape} and {p.shape}."
         )
-    bound = basis.for_shape(q.shape[1:])
+    if isinstance(generators, Generator) or len(generators) == 0:
+        raise ValueError(
+            "generators must be a list with one Generator for each order, order 0 first; got "
+            f"{generators!r}."
+        )
+    bound, h = bind_basis(basis, q.shape[1:]), check_step_size(h)
     held = np.arange(len(q)) % 4 == 3
     if np.sum(~held) < bound.size:
         raise ValueError(
