@@ -41,9 +41,12 @@ from .observe import (
 from .symmetry import (
     AdiabaticInvariant as AdiabaticInvariant,
     Basis as Basis,
+    Chebyshev as Chebyshev,
     Generator as Generator,
     LatticePoint as LatticePoint,
     Polynomials as Polynomials,
+    Radial as Radial,
+    Trigonometric as Trigonometric,
     conformal_factor as conformal_factor,
     determining_residual as determining_residual,
     discrete_equations as discrete_equations,

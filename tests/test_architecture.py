@@ -87,7 +87,8 @@ System discretise integrate Save Solution RESULTS IntegrationError Newton
 TypeII Adjoint Strang Yoshida Composition RungeKutta4 Uniform Given
 MaxDrift Range Trend Mean Last Reversible Checkpointed Direct
 Generator prolong determining_residual conformal_factor noether_identity AdiabaticInvariant
-Polynomials Basis discover_invariants InvariantSeries drift_order noether_balance solve_gauge
+Polynomials Basis Chebyshev Radial Trigonometric
+discover_invariants InvariantSeries drift_order noether_balance solve_gauge
 """
 
 

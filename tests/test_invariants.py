@@ -29,32 +29,6 @@ def found(name, degree, order):
     )
 
 
-def test_monomials_are_what_their_names_say():
-    basis = dvi.Polynomials(3, constant=True).for_shape((2,))
-    q, p = np.array([2.0, 3.0]), np.array([5.0, 7.0])
-    values = dict(zip(basis.names, basis(q, p), strict=True))
-    assert basis.size == 35
-    assert values["1"] == 1
-    assert values["q1² p2"] == 2**2 * 7
-    assert values["q1 q2 p1"] == 2 * 3 * 5
-    assert values["p2³"] == 7**3
-    some = dvi.Polynomials(2, variables=["q2", "p1"]).for_shape((2,))
-    assert some.names == ("q2", "p1", "q2²", "q2 p1", "p1²")
-    with pytest.raises(ValueError, match=r"no component 'x'; it has \['q1'"):
-        dvi.Polynomials(2, variables=["x"]).for_shape((2,))
-
-
-def test_bases_add_and_multiply():
-    radius = dvi.Basis({"1/r": lambda q, p: 1 / jnp.sqrt(q @ q)})
-    basis = (dvi.Polynomials(1, constant=True) * radius + dvi.Polynomials(1)).for_shape((2,))
-    assert basis.names[:2] == ("1/r", "q1 1/r")
-    assert basis.size == 9
-    q, p = np.array([3.0, 4.0]), np.array([5.0, 7.0])
-    np.testing.assert_allclose(basis(q, p)[:3], [0.2, 0.6, 0.8])
-    with pytest.raises(ValueError, match="at least one"):
-        dvi.Basis([])
-
-
 def test_undisturbed_map_keeps_its_quadratic_form():
     d = found("cubic", 8, 0)
     assert d.survivors == (4,)  # the form and its powers up to degree 8

@@ -4,12 +4,17 @@ from .basis import (
     AbstractBasis as AbstractBasis,
     Basis as Basis,
     BoundBasis as BoundBasis,
-    Polynomials as Polynomials,
 )
 from .determining import (
     conformal_factor as conformal_factor,
     determining_residual as determining_residual,
     discrete_equations as discrete_equations,
+)
+from .families import (
+    Chebyshev as Chebyshev,
+    Polynomials as Polynomials,
+    Radial as Radial,
+    Trigonometric as Trigonometric,
 )
 from .gauge import (
     BasisGauge as BasisGauge,

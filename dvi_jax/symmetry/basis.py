@@ -1,6 +1,7 @@
 """Bases of functions of a lattice point, in which symmetries and invariants are looked for."""
 
 import abc
+import inspect
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import State
+from .._types import Scalar, State
 
 
 class AbstractBasis(eqx.Module):
-    """A family of functions of (q, p); `for_shape` fixes it for states of one shape.
+    """A family of functions of (q, p, t); `for_shape` fixes it for states of one shape.
+
+    t is the time, or the slow time τ = εt of a system with ``slow_time=True``.
 
     Bases add (both families) and multiply (every product of two members).
     """
@@ -52,20 +55,22 @@ class BoundBasis(eqx.Module):
 
     - `names`: one text for each function; `complexity`: how simple it is (polynomials: the
       degree), by which discovery prefers one representative to another.
-    - ``basis(q, p)``: values, shape (size,).
+    - `uses_time`: whether any of them depends on t.
+    - ``basis(q, p, t)``: values, shape (size,).
     """
 
-    function: Callable[[State, State], Array]
+    function: Callable[[State, State, Scalar], Array]
     names: tuple[str, ...] = eqx.field(static=True)
     complexity: tuple[int, ...] = eqx.field(static=True)
+    uses_time: bool = eqx.field(static=True, default=False)
 
     @property
     def size(self) -> int:
         """Number of functions."""
         return len(self.names)
 
-    def __call__(self, q: State, p: State) -> Float[Array, " size"]:
-        return self.function(q, p)
+    def __call__(self, q: State, p: State, t: Any = 0.0) -> Float[Array, " size"]:
+        return self.function(q, p, jnp.asarray(t, float))
 
     def formula(self, coefficients: Any, digits: int = 6, drop: float = 1e-9) -> str:
         """The combination with these coefficients as text; tiny ones (relative) are left out."""
@@ -87,84 +92,15 @@ class BoundBasis(eqx.Module):
         return text
 
 
-def coordinate_names(shape: tuple[int, ...]) -> tuple[str, ...]:
-    """Names of the components of q, then of p: "q", "p", or "q1", "q2", …, counted from 1."""
-    size = int(np.prod(shape, dtype=int))
-    if size == 1:
-        return ("q", "p")
-    return tuple(f"{v}{i + 1}" for v in "qp" for i in range(size))
-
-
-_RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-class Polynomials(AbstractBasis):
-    """All monomials in the components of q and p of degree 1 to `degree`.
-
-    - `degree`: the largest total degree.
-    - `variables`: which components to use, by name ("q", "p", or "q1", "p2", … counted from 1 in
-      the order of the flattened array); None for all.
-    - `constant`: whether 1 is among them (for products with other bases).
-
-    **Raises** `ValueError` for a degree that is not a positive integer, or names that the state
-    does not have.
-    """
-
-    degree: int = eqx.field(static=True)
-    variables: tuple[str, ...] | None = eqx.field(
-        static=True, default=None, converter=lambda v: None if v is None else tuple(v)
-    )
-    constant: bool = eqx.field(static=True, default=False)
-
-    def __check_init__(self):
-        if isinstance(self.degree, bool) or not isinstance(self.degree, int) or self.degree < 1:
-            raise ValueError(f"degree must be a positive integer, got {self.degree!r}.")
-
-    def for_shape(self, shape):
-        every = coordinate_names(shape)
-        chosen = every if self.variables is None else self.variables
-        unknown = [v for v in chosen if v not in every]
-        if unknown:
-            raise ValueError(f"the state has no component {unknown[0]!r}; it has {list(every)}.")
-        places = tuple(every.index(v) for v in chosen)
-        exponents = [
-            tuple(sorted(c))
-            for d in range(0 if self.constant else 1, self.degree + 1)
-            for c in itertools.combinations_with_replacement(range(len(chosen)), d)
-        ]
-        names = tuple(_monomial([chosen[i] for i in c]) for c in exponents)
-        return BoundBasis(
-            _Monomials(places, tuple(exponents)), names, tuple(len(c) for c in exponents)
-        )
-
-
-def _monomial(factors: Sequence[str]) -> str:
-    counted = [(name, factors.count(name)) for name in dict.fromkeys(factors)]
-    words = [n if k == 1 else n + str(k).translate(_RAISED) for n, k in counted]
-    return " ".join(words) or "1"
-
-
-class _Monomials(eqx.Module):
-    places: tuple[int, ...] = eqx.field(static=True)
-    exponents: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-
-    def __call__(self, q, p):
-        flat = jnp.concatenate([jnp.ravel(q), jnp.ravel(p)])[np.array(self.places)]
-        counts = np.array([[c.count(i) for i in range(len(self.places))] for c in self.exponents])
-        powers = [jnp.ones_like(flat)]
-        for _ in range(int(counts.max())):
-            powers.append(powers[-1] * flat)
-        table = jnp.stack(powers)  # (power, variable)
-        return jnp.prod(table[counts, np.arange(len(self.places))], axis=-1)
-
-
 class Basis(AbstractBasis):
     """Functions of the user's.
 
-    - `functions`: a list of functions ``(q, p)`` → scalar, or a dict with their names as keys.
+    - `functions`: a list of functions ``(q, p)`` or ``(q, p, t)`` → scalar, or a dict with their
+      names as keys.
     - `complexity`: the complexity that they count for (see `BoundBasis`), default 1.
 
-    **Raises** `ValueError` when there is none, `TypeError` for what is not callable.
+    **Raises** `ValueError` when there is none, `TypeError` for what is not callable or takes
+    other arguments.
     """
 
     functions: tuple[Callable[..., Any], ...]
@@ -185,19 +121,35 @@ class Basis(AbstractBasis):
         for name, function in named.items():
             if not callable(function):
                 raise TypeError(f"basis function {name!r} must be callable, got {function!r}.")
+            if not (_takes(function, 2) or _takes(function, 3)):
+                raise TypeError(f"basis function {name!r} must take (q, p) or (q, p, t).")
         self.functions, self.names = tuple(named.values()), tuple(named)
         self.complexity = complexity
 
     def for_shape(self, shape):
         del shape
-        return BoundBasis(_Values(self.functions), self.names, (self.complexity,) * len(self.names))
+        timed = tuple(not _takes(f, 2) for f in self.functions)
+        complexity = (self.complexity,) * len(self.names)
+        return BoundBasis(_Values(self.functions, timed), self.names, complexity, any(timed))
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    try:
+        inspect.signature(function).bind(*range(count))
+    except TypeError:
+        return False
+    except ValueError:  # a builtin without a signature: calling it will tell
+        return count == 2
+    return True
 
 
 class _Values(eqx.Module):
     functions: tuple[Callable[..., Any], ...]
+    timed: tuple[bool, ...] = eqx.field(static=True)
 
-    def __call__(self, q, p):
-        return jnp.stack([jnp.asarray(f(q, p)) for f in self.functions])
+    def __call__(self, q, p, t):
+        pairs = zip(self.functions, self.timed, strict=True)
+        return jnp.stack([jnp.asarray(f(q, p, t) if timed else f(q, p)) for f, timed in pairs])
 
 
 def _name(function: Any, i: int) -> str:
@@ -213,15 +165,17 @@ class Sum(AbstractBasis):
 
     def for_shape(self, shape):
         a, b = self.first.for_shape(shape), self.second.for_shape(shape)
-        return BoundBasis(_Both(a, b), a.names + b.names, a.complexity + b.complexity)
+        return BoundBasis(
+            _Both(a, b), a.names + b.names, a.complexity + b.complexity, a.uses_time or b.uses_time
+        )
 
 
 class _Both(eqx.Module):
     first: BoundBasis
     second: BoundBasis
 
-    def __call__(self, q, p):
-        return jnp.concatenate([self.first(q, p), self.second(q, p)])
+    def __call__(self, q, p, t):
+        return jnp.concatenate([self.first(q, p, t), self.second(q, p, t)])
 
 
 class Product(AbstractBasis):
@@ -234,15 +188,16 @@ class Product(AbstractBasis):
         a, b = self.first.for_shape(shape), self.second.for_shape(shape)
         names = tuple(_product_name(m, n) for m, n in itertools.product(a.names, b.names))
         pairs = itertools.product(a.complexity, b.complexity)
-        return BoundBasis(_Products(a, b), names, tuple(c + d for c, d in pairs))
+        complexity = tuple(c + d for c, d in pairs)
+        return BoundBasis(_Products(a, b), names, complexity, a.uses_time or b.uses_time)
 
 
 class _Products(eqx.Module):
     first: BoundBasis
     second: BoundBasis
 
-    def __call__(self, q, p):
-        return jnp.outer(self.first(q, p), self.second(q, p)).ravel()
+    def __call__(self, q, p, t):
+        return jnp.outer(self.first(q, p, t), self.second(q, p, t)).ravel()
 
 
 def _product_name(a: str, b: str) -> str:

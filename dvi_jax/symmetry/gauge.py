@@ -15,20 +15,22 @@ from .._system import System
 from .._types import Args, Interval
 from ..engine.echelon import reduction
 from ..engine.newton import Newton
+from ..engine.nullspace import toeplitz
 from ..engine.taylor import taylor_coefficients
 from .basis import AbstractBasis, BoundBasis, bind_basis, check_step_size
 from .generators import Generator, LatticePoint
 from .noether import noether_identity
+from .sampling import as_samples, require_enough, require_steps, require_time
 
 
 class BasisGauge(eqx.Module):
-    """A gauge G(t, q, p, args) = g·φ(q, p); as a formula: `str`."""
+    """A gauge G(t, q, p, args) = g·φ(q, p, t); as a formula: `str`."""
 
     basis: BoundBasis
     coefficients: Array
 
     def __call__(self, t, q, p, args):
-        return self.coefficients @ self.basis(q, p)
+        return self.coefficients @ self.basis(q, p, t)
 
     def __str__(self) -> str:
         return self.basis.formula(self.coefficients)
@@ -55,7 +57,7 @@ def solve_gauge(
     basis: AbstractBasis,
     *,
     h: float,
-    samples: tuple[Any, Any],
+    samples: Any,
     t0: float = 0.0,
     args: Args = None,
 ) -> GaugeSolution:
@@ -71,63 +73,43 @@ def solve_gauge(
     fails by it.)
 
     **Arguments** `generators`: the series, order 0 first; `basis`: φ(q, p), where the gauges are
-    looked for; `h`, `t0`, `args`: of the step; `samples`: (qs, ps), shapes (S, *q.shape), a
-    quarter of them held out.
+    looked for; `h`, `t0`, `args`: of the step; `samples`: (qs, ps) at t0, shapes (S, *q.shape),
+    or (qs, ps, ts) with the times of the samples, shape (S,); a quarter of them held out.
 
     **Raises** `ValueError` for samples of unequal shapes, too few of them, or where the step fails.
 
     **Source** our own; the identities: the paper, (25) and (28).
     """
-    q, p = (np.asarray(x, float) for x in samples)
-    if q.shape != p.shape or q.ndim < 1:
-        raise ValueError(
-            f"samples (qs, ps) must have one shape (points, *q.shape), got {q.shape} and {p.shape}."
-        )
+    samples = as_samples(samples, t0)
     if isinstance(generators, Generator) or len(generators) == 0:
         raise ValueError(
             "generators must be a list with one Generator for each order, order 0 first; got "
             f"{generators!r}."
         )
-    bound, h = bind_basis(basis, q.shape[1:]), check_step_size(h)
-    held = np.arange(len(q)) % 4 == 3
-    if np.sum(~held) < bound.size:
-        raise ValueError(
-            f"{len(q)} samples are too few for {bound.size} basis functions: give at least "
-            f"{2 * bound.size}."
-        )
-    order = len(generators) - 1
-    h_, t0_ = jnp.asarray(h, float), jnp.asarray(t0, float)
+    bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
+    require_enough(samples, bound.size)
+    require_time(bound, samples)
+    held, order = samples.held_out, len(generators) - 1
     equations = Equations(system, jnp.zeros(()), args)
-    interval = Interval(t0_, t0_ + h_, h_)
-    terms, good = _identity_terms(equations, interval, list(generators), bound, q, p)
-    if not bool(jnp.all(good)):
-        raise ValueError(
-            f"the step fails at {int(jnp.sum(~good))} of {len(q)} samples: take samples where the "
-            "map is defined, or a smaller h."
-        )
+    terms, good = _identity_terms(equations, h, list(generators), bound, samples)
+    require_steps(good, samples)
     terms = np.asarray(terms)
     n, changes = terms[:, :, 0], terms[:, :, 1:] / h
     size = bound.size
 
-    def equations_of(rows, k):
-        """The rows of order k: their matrix on (g_0 … g_z), and the right side."""
-        blocks = np.zeros((int(rows.sum()), order + 1, size))
-        for m in range(k + 1):
-            blocks[:, m] = changes[rows, k - m]
-        return blocks.reshape(len(blocks), -1), -n[rows, k]
-
+    blocks = toeplitz(changes, order).reshape(order + 1, len(held), -1)
     scale = np.tile(np.sqrt(np.mean(changes[:, 0] ** 2, axis=0)), order + 1)
     scale = 1 / np.where(scale > 0, scale, 1)
     g, free = np.zeros(len(scale)), np.diag(scale)  # solutions so far: g + free @ anything
     for k in range(order + 1):  # a lower order first: a higher one uses the freedom it leaves
-        matrix, right = equations_of(~held, k)
+        matrix, right = blocks[k, ~held], -n[~held, k]
         U, singular, V = np.linalg.svd(matrix @ free)
         rank = int(np.sum(singular > 1e-9 * max(singular[0], 1e-300)))
         g = g + free @ V[:rank].T @ ((U[:, :rank].T @ (right - matrix @ g)) / singular[:rank])
         free = free @ V[rank:].T
     # What is left free is invariants, which may be added to any gauge: the simplest is taken.
     g = reduction(free, np.tile(bound.complexity, order + 1), size)(g)
-    left = np.array([m @ g - r for m, r in (equations_of(held, k) for k in range(order + 1))])
+    left = blocks[:, held] @ g + n[held].T
     g = g.reshape(order + 1, size)
     largest = np.maximum(np.max(np.abs(n)), np.finfo(float).tiny)
     return GaugeSolution(
@@ -138,11 +120,13 @@ def solve_gauge(
 
 
 @eqx.filter_jit
-def _identity_terms(equations, interval, generators, basis, q, p):
+def _identity_terms(equations, h, generators, basis, samples):
     """Taylor coefficients in ε of [Σ ε^m N_m without gauges, φ(Φ_ε) − φ], (S, z + 1, 1 + B)."""
     nothing = [None] * len(generators)
 
-    def at_point(q, p):
+    def at_point(q, p, t):
+        interval = Interval(t, t + h, jnp.asarray(h, float))
+
         def of(epsilon):
             here = Equations(equations.system, epsilon, equations.args, Newton())
             q1, p1, info = step(here, interval, q, p)
@@ -154,9 +138,9 @@ def _identity_terms(equations, interval, generators, basis, q, p):
                 )
                 for m in range(len(generators))
             )
-            return jnp.append(total, basis(q1, p1) - basis(q, p)), info
+            return jnp.append(total, basis(q1, p1, interval.t1) - basis(q, p, interval.t0)), info
 
         terms = taylor_coefficients(lambda e: of(e)[0], jnp.zeros(()), len(generators) - 1)
         return terms, of(jnp.zeros(()))[1].result == RESULTS.successful
 
-    return jax.vmap(at_point)(q, p)
+    return jax.vmap(at_point)(*samples)

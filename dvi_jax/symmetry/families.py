@@ -1,0 +1,249 @@
+"""Families of basis functions: polynomials, Chebyshev, trigonometric, powers of the radius."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .basis import AbstractBasis, BoundBasis
+
+TIME = ("t", "τ")
+"""Names of the time, which is the slow time of a system with ``slow_time=True``."""
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def coordinate_names(shape: tuple[int, ...]) -> tuple[str, ...]:
+    """Names of the components of q, then of p: "q", "p", or "q1", "q2", …, counted from 1."""
+    size = int(np.prod(shape, dtype=int))
+    if size == 1:
+        return ("q", "p")
+    return tuple(f"{v}{i + 1}" for v in "qp" for i in range(size))
+
+
+def _places(variables: Sequence[str], shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Where the named variables stand in (q, p, t) flattened."""
+    every = coordinate_names(shape)
+    unknown = [v for v in variables if v not in every + TIME]
+    if unknown:
+        raise ValueError(
+            f"the state has no component {unknown[0]!r}; it has {list(every)} and the time 't'."
+        )
+    return tuple(len(every) if v in TIME else every.index(v) for v in variables)
+
+
+def _at(places: tuple[int, ...], q: Any, p: Any, t: Any) -> Any:
+    return jnp.concatenate([jnp.ravel(q), jnp.ravel(p), jnp.ravel(t)])[np.array(places)]
+
+
+def _names(values: Any) -> tuple[str, ...] | None:
+    if values is None:
+        return None
+    return (values,) if isinstance(values, str) else tuple(values)
+
+
+def _power(name: str, k: int) -> str:
+    return name if k == 1 else name + str(k).translate(_RAISED)
+
+
+def _positive(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name} must be a positive integer, got {value!r}.")
+
+
+class Polynomials(AbstractBasis):
+    """All monomials in the components of q and p of degree 1 to `degree`.
+
+    - `degree`: the largest total degree.
+    - `variables`: which to use, by name ("q", "p", or "q1", "p2", … counted from 1 in the order
+      of the flattened array; "t" or "τ" for the time); None for all components of q and p.
+    - `constant`: whether 1 is among them (for generators, and for products with other bases).
+
+    **Raises** `ValueError` for a degree that is not a positive integer, or names that the state
+    does not have.
+    """
+
+    degree: int = eqx.field(static=True)
+    variables: tuple[str, ...] | None = eqx.field(static=True, default=None, converter=_names)
+    constant: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        _positive("degree", self.degree)
+
+    def for_shape(self, shape):
+        chosen = coordinate_names(shape) if self.variables is None else self.variables
+        places = _places(chosen, shape)
+        exponents = [
+            tuple(sorted(c))
+            for d in range(0 if self.constant else 1, self.degree + 1)
+            for c in itertools.combinations_with_replacement(range(len(chosen)), d)
+        ]
+        names = tuple(_monomial([chosen[i] for i in c]) for c in exponents)
+        return BoundBasis(
+            _Monomials(places, tuple(exponents)),
+            names,
+            tuple(len(c) for c in exponents),
+            any(v in TIME for v in chosen),
+        )
+
+
+def _monomial(factors: Sequence[str]) -> str:
+    counted = [(name, factors.count(name)) for name in dict.fromkeys(factors)]
+    return " ".join(_power(name, k) for name, k in counted) or "1"
+
+
+class _Monomials(eqx.Module):
+    places: tuple[int, ...] = eqx.field(static=True)
+    exponents: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    def __call__(self, q, p, t):
+        flat = _at(self.places, q, p, t)
+        counts = np.array([[c.count(i) for i in range(len(self.places))] for c in self.exponents])
+        powers = [jnp.ones_like(flat)]
+        for _ in range(int(counts.max())):
+            powers.append(powers[-1] * flat)
+        table = jnp.stack(powers)  # (power, variable)
+        return jnp.prod(table[counts, np.arange(len(self.places))], axis=-1)
+
+
+def _pair(ends: Any) -> Any:
+    """A list as a tuple, which can be hashed."""
+    return tuple(ends) if isinstance(ends, list) else ends
+
+
+class Chebyshev(AbstractBasis):
+    r"""Chebyshev polynomials T_0 … T_{count−1} of one variable, scaled from `domain` to [−1, 1].
+
+        T_k(cos θ) = cos kθ,    cos θ = (2x − a − b)/(b − a)
+
+    - `count`: how many, T_0 = 1 included. `variable`: a name as in `Polynomials`.
+    - `domain`: (a, b), where the samples lie.
+
+    **Raises** `ValueError` for a count that is not a positive integer or an empty domain.
+    """
+
+    count: int = eqx.field(static=True)
+    variable: str = eqx.field(static=True)
+    domain: tuple[float, float] = eqx.field(static=True, converter=_pair, default=(-1.0, 1.0))
+
+    def __check_init__(self):
+        _positive("count", self.count)
+        ends = np.asarray(self.domain, float)
+        if ends.shape != (2,) or not np.isfinite(ends).all() or not ends[0] < ends[1]:
+            raise ValueError(f"domain must be two numbers (a, b), a < b, got {self.domain!r}.")
+
+    def for_shape(self, shape):
+        names = ("1", *(f"T{k}({self.variable})" for k in range(1, self.count)))
+        return BoundBasis(
+            _ChebyshevValues(_places([self.variable], shape), self.count, self.domain),
+            names,
+            tuple(range(self.count)),
+            self.variable in TIME,
+        )
+
+
+class _ChebyshevValues(eqx.Module):
+    places: tuple[int, ...] = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+    domain: tuple[float, float] = eqx.field(static=True)
+
+    def __call__(self, q, p, t):
+        a, b = self.domain
+        x = (2 * _at(self.places, q, p, t)[0] - a - b) / (b - a)
+        values = [jnp.ones_like(x), x]
+        for _ in range(self.count - 2):
+            values.append(2 * x * values[-1] - values[-2])
+        return jnp.stack(values[: self.count])
+
+
+class Trigonometric(AbstractBasis):
+    r"""cos kωx and sin kωx of one variable x, k = 1 … `count`, with ω = 2π/period.
+
+    - `variable`: a name as in `Polynomials`. `period`: default 2π.
+    - `constant`: whether 1 is among them (for products with other bases).
+
+    **Raises** `ValueError` for a count that is not a positive integer or a period that is not
+    positive.
+    """
+
+    count: int = eqx.field(static=True)
+    variable: str = eqx.field(static=True)
+    period: float = eqx.field(static=True, default=2 * np.pi)
+    constant: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        _positive("count", self.count)
+        if not 0 < self.period < np.inf:
+            raise ValueError(f"period must be positive and finite, got {self.period!r}.")
+
+    def for_shape(self, shape):
+        omega = 2 * np.pi / self.period
+        multiples = [f"{omega * k:.6g}" for k in range(1, self.count + 1)]
+        angles = [f"{'' if m == '1' else m}{self.variable}" for m in multiples]
+        names = [f"{f} {angle}" for angle in angles for f in ("cos", "sin")]
+        complexity = [k for k in range(1, self.count + 1) for _ in range(2)]
+        if self.constant:
+            names, complexity = ["1", *names], [0, *complexity]
+        return BoundBasis(
+            _Waves(_places([self.variable], shape), self.count, omega, self.constant),
+            tuple(names),
+            tuple(complexity),
+            self.variable in TIME,
+        )
+
+
+class _Waves(eqx.Module):
+    places: tuple[int, ...] = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+    omega: float = eqx.field(static=True)
+    constant: bool = eqx.field(static=True)
+
+    def __call__(self, q, p, t):
+        x = self.omega * jnp.arange(1, self.count + 1) * _at(self.places, q, p, t)[0]
+        waves = jnp.stack([jnp.cos(x), jnp.sin(x)], axis=1).ravel()
+        return jnp.append(1.0, waves) if self.constant else waves
+
+
+class Radial(AbstractBasis):
+    r"""Powers r^k of the radius r = √(q·q), taken over all components of q, or those named.
+
+    - `powers`: integers k, default (−1,): 1/r. 0 stands for the constant 1.
+    - `variables`: names of the components that r is made of; None for all of q.
+
+    **Raises** `ValueError` for powers that are not integers. At r = 0 negative powers are
+    infinite: keep samples off it.
+    """
+
+    powers: tuple[int, ...] = eqx.field(static=True, converter=tuple, default=(-1,))
+    variables: tuple[str, ...] | None = eqx.field(static=True, default=None, converter=_names)
+
+    def __check_init__(self):
+        if not self.powers or any(
+            isinstance(k, bool) or not isinstance(k, int) for k in self.powers
+        ):
+            raise ValueError(f"powers must be a list of integers, got {self.powers!r}.")
+
+    def for_shape(self, shape):
+        names = coordinate_names(shape)
+        chosen = names[: len(names) // 2] if self.variables is None else self.variables
+        words = ["1" if k == 0 else _power("r", k) if k > 0 else f"1/{_power('r', -k)}"
+                 for k in self.powers]  # fmt: skip
+        return BoundBasis(
+            _RadialValues(_places(chosen, shape), self.powers),
+            tuple(words),
+            tuple(abs(k) for k in self.powers),
+            any(v in TIME for v in chosen),
+        )
+
+
+class _RadialValues(eqx.Module):
+    places: tuple[int, ...] = eqx.field(static=True)
+    powers: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, q, p, t):
+        x = _at(self.places, q, p, t)
+        r = jnp.sqrt(jnp.sum(x**2))
+        return jnp.stack([r**k for k in self.powers])
