@@ -14,10 +14,14 @@ from .engine.newton import Newton as Newton
 from .invariants import (
     Balance as Balance,
     Discovery as Discovery,
+    DriftLaw as DriftLaw,
     DriftOrder as DriftOrder,
+    DriftSurface as DriftSurface,
     InvariantSeries as InvariantSeries,
+    ShadowHamiltonian as ShadowHamiltonian,
     discover_invariants as discover_invariants,
     drift_order as drift_order,
+    drift_surface as drift_surface,
     noether_balance as noether_balance,
 )
 from .lattices import Given as Given, Lattice as Lattice, Uniform as Uniform
@@ -46,16 +50,23 @@ from .symmetry import (
     LatticePoint as LatticePoint,
     Polynomials as Polynomials,
     Radial as Radial,
+    Symmetries as Symmetries,
+    Symmetry as Symmetry,
     Trigonometric as Trigonometric,
     conformal_factor as conformal_factor,
     determining_residual as determining_residual,
     discrete_equations as discrete_equations,
+    find_symmetries as find_symmetries,
     incoming_energy as incoming_energy,
     lattice_defect as lattice_defect,
+    library as _library,
     noether_identity as noether_identity,
     outgoing_energy as outgoing_energy,
     prolong as prolong,
+    random_pairs as random_pairs,
+    solution_pairs as solution_pairs,
     solve_gauge as solve_gauge,
 )
 
+generators = _library
 __version__ = "0.1.0"

@@ -33,8 +33,9 @@ class Interval(NamedTuple):
 
     def part(self, start: float, end: float) -> "Interval":
         """The piece between the fractions `start` and `end` of this interval."""
-        t0 = self.t0 + start * self.h if start != 0 else self.t0
-        t1 = self.t0 + end * self.h if end != 1 else self.t1
+        length = self.t1 - self.t0  # not h where t is a slow time
+        t0 = self.t0 + start * length if start != 0 else self.t0
+        t1 = self.t0 + end * length if end != 1 else self.t1
         return Interval(t0, t1, (end - start) * self.h)
 
 

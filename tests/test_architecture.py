@@ -11,8 +11,9 @@ ROOT = Path(dvi.__file__).parent
 FLOORS = [
     ["_compat", "_types", "_results"],
     ["_precision"],
-    ["_system", "_discretise", "_solution", "engine"],
-    ["_step"],
+    ["_system", "_solution", "engine"],
+    ["_generating"],
+    ["_discretise", "_step"],
     ["methods", "lattices", "symmetry", "observe"],
     ["_rollout"],
     ["_adjoints"],
@@ -87,8 +88,10 @@ System discretise integrate Save Solution RESULTS IntegrationError Newton
 TypeII Adjoint Strang Yoshida Composition RungeKutta4 Uniform Given
 MaxDrift Range Trend Mean Last Reversible Checkpointed Direct
 Generator prolong determining_residual conformal_factor noether_identity AdiabaticInvariant
+generators random_pairs solution_pairs find_symmetries Symmetries Symmetry
 Polynomials Basis Chebyshev Radial Trigonometric
-discover_invariants InvariantSeries drift_order noether_balance solve_gauge
+discover_invariants InvariantSeries ShadowHamiltonian drift_order drift_surface
+noether_balance solve_gauge
 """
 
 

@@ -70,6 +70,19 @@ def test_orders_of_34(m):
     assert np.max(m.small_step.corrected) < 2e-9
 
 
+def test_what_the_tools_find(m):
+    found = m.discoveries
+    assert found.oscillator == "0.5 q² − 0.05 q p + 0.5 p² + ε (0.5 q² − 0.05 q p)"
+    assert found.kepler.replace("−", "") in ("0.5 q1 p2  0.5 q2 p1", "0.5 q1 p2 + 0.5 q2 p1")
+    assert found.gauge_34[0] < 1e-13 < 1e-3 < found.gauge_34[1]
+    assert slope(found.hs, found.gauge_50) == pytest.approx(1.0, abs=0.05)
+    assert found.balance < 1e-12
+    worse = dataclasses.replace(found, oscillator_off=1e-3, kepler_count=2)
+    changed = verdicts(dataclasses.replace(m, discoveries=worse))
+    assert changed["invariant-34"] is Verdict.FAILS
+    assert changed["invariant-49"] is Verdict.FAILS
+
+
 def test_kepler_wiggles(m):
     sweep = m.mesh_sweep
     at = dict(zip(sweep.hs, sweep.spread_50[:, 0], strict=True))
@@ -210,7 +223,7 @@ def test_the_page_needs_nothing_beside_it(run):
 def test_what_is_printed_without_a_terminal(run):
     printed = run[1]
     assert "\x1b" not in printed
-    assert printed.count("100 %") == 11
+    assert printed.count("100 %") == 12
     assert "hold once mended" in printed
     assert "verdicts.html" in printed
 

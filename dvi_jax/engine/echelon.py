@@ -4,51 +4,62 @@ from collections.abc import Callable
 
 import numpy as np
 
-_RANK = 1e-7
-"""A pivot smaller than this share of the largest entry is taken for zero."""
+from .nullspace import RANK
 
 
-def echelon(columns: np.ndarray, complexity: np.ndarray) -> tuple[list[int], np.ndarray]:
+def echelon(
+    columns: np.ndarray, complexity: np.ndarray, above: float = RANK
+) -> tuple[list[int], np.ndarray]:
     """Columns of the same span, each with a pivot row in which those after it are zero.
 
-    Rows are gone through from the most complex function to the simplest.
+    Rows are gone through from the most complex function to the simplest. An entry up to the share
+    `above` of the largest in its column is taken for zero.
     """
     rows = np.argsort(complexity, kind="stable")[::-1]
     work, pivots, out = columns.copy(), [], []
-    for row in rows:
-        if work.shape[1] == 0:
-            break
-        j = int(np.argmax(np.abs(work[row])))
+    nothing = RANK * np.max(np.abs(columns), initial=0.0)
+
+    def eliminate(row: int, j: int) -> None:
+        nonlocal work
         pivot = work[:, j]
-        if abs(pivot[row]) < _RANK * np.max(np.abs(columns)):
-            continue
         rest = np.delete(work, j, axis=1)
         work = rest - np.outer(pivot, rest[row] / pivot[row])
         pivots.append(int(row))
         out.append(pivot)
+
+    for row in rows:
+        if work.shape[1] == 0:
+            break
+        largest = np.maximum(np.max(np.abs(work), axis=0), nothing)
+        j = int(np.argmax(np.abs(work[row]) / largest))
+        if abs(work[row, j]) > above * largest[j]:
+            eliminate(row, j)
+    while work.size and np.max(np.abs(work)) > nothing:  # what is left had no clear pivot
+        row, j = np.unravel_index(np.argmax(np.abs(work)), work.shape)
+        eliminate(int(row), int(j))
     return pivots, np.stack(out, axis=1) if out else columns[:, :0]
 
 
-def reduced(columns: np.ndarray, complexity: np.ndarray) -> np.ndarray:
+def reduced(columns: np.ndarray, complexity: np.ndarray, above: float = RANK) -> np.ndarray:
     """The same span with a reduced echelon in the leading part: each column alone in its pivot.
 
     `columns` may go on below the leading part; what is done to it is done to all of a column.
     """
-    pivots, _ = echelon(columns[: len(complexity)], complexity)
+    pivots, _ = echelon(columns[: len(complexity)], complexity, above)
     pivots = pivots[::-1]  # simplest first
     at_pivots = columns[pivots]
-    return columns @ np.linalg.inv(at_pivots) if pivots else columns[:, :0]
+    return columns @ np.linalg.pinv(at_pivots) if pivots else columns[:, :0]
 
 
 def reduction(
-    columns: np.ndarray, complexity: np.ndarray, size: int
+    columns: np.ndarray, complexity: np.ndarray, size: int, above: float = RANK
 ) -> Callable[[np.ndarray], np.ndarray]:
     """A function that adds multiples of `columns` to a vector until it is as simple as can be.
 
     The most complex functions go first, those of the lowest order in ε before the others.
     """
     order = np.repeat(np.arange(len(complexity) // size), size)
-    pivots, reduced = echelon(columns, complexity - (1 + np.max(complexity)) * order)
+    pivots, reduced = echelon(columns, complexity - (1 + np.max(complexity)) * order, above)
 
     def simplify(vector: np.ndarray) -> np.ndarray:
         for row, column in zip(pivots, reduced.T, strict=True):

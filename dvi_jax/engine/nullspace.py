@@ -71,16 +71,52 @@ def null_space(matrix: np.ndarray, tolerance: float | None = None) -> NullSpace:
     return NullSpace(V.T[:, kept:], relative, float(ratio[kept - 1]) if kept < size else 1.0)
 
 
-def rank(columns: np.ndarray) -> int:
-    """Number of directions of a size above `RANK`."""
+def rank(columns: np.ndarray, above: float = RANK) -> int:
+    """Number of directions of a size above `above`."""
     if columns.size == 0:
         return 0
-    return int(np.sum(np.linalg.svd(columns, compute_uv=False) > RANK))
+    return int(np.sum(np.linalg.svd(columns, compute_uv=False) > above))
 
 
-def orthonormal_range(columns: np.ndarray) -> np.ndarray:
-    """Orthonormal columns of the same span."""
+def orthonormal_range(columns: np.ndarray, above: float = RANK) -> np.ndarray:
+    """Orthonormal columns of the same span, directions up to the size `above` left out."""
     if columns.size == 0:
         return columns[:, :0]
     U, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return U[:, singular > RANK]
+    return U[:, singular > above]
+
+
+class SeriesSpace(NamedTuple):
+    """Vectors (c_0, …, c_m) in the null space of a Toeplitz matrix, sorted by their first block.
+
+    - `leading`: columns, shape ((m + 1) · size, count), whose first blocks c_0 are orthonormal.
+    - `shifts`: orthonormal columns without a first block: what may be added to any of them.
+    - `singular_values`, `gap`: of the Toeplitz matrix, see `NullSpace`.
+    """
+
+    leading: np.ndarray
+    shifts: np.ndarray
+    singular_values: np.ndarray
+    gap: float
+
+
+def series_space(terms: np.ndarray, order: int, tolerance: float | None = None) -> SeriesSpace:
+    """The null space of the Toeplitz matrix of that order, as series.
+
+    A vector with a small first block is no series unless it is null for the size of that block:
+    first blocks are made orthonormal, and judged again.
+    """
+    matrix = toeplitz(terms, order)
+    space = null_space(matrix, tolerance)
+    limit = NULL if tolerance is None else 10 * tolerance
+    size = terms.shape[2]
+    singular, V = np.linalg.svd(space.columns[:size])[1:]
+    large = np.flatnonzero(singular > (RANK if tolerance is None else max(RANK, tolerance)))
+    leading = space.columns @ (V[large].T / singular[large])
+    shifts = space.columns @ np.delete(V, large, axis=0).T
+    if leading.shape[1]:
+        norm = max(np.linalg.norm(matrix, 2), np.finfo(float).tiny)
+        left, W = np.linalg.svd(matrix @ leading / norm)[1:]
+        left = np.append(left, np.zeros(len(W) - len(left)))
+        leading = leading @ W[left <= limit].T
+    return SeriesSpace(leading, shifts, space.singular_values, space.gap)

@@ -1,43 +1,212 @@
 """The order in ε to which something is conserved, measured."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._integrate import integrate
-from .._results import RESULTS
+from .._integrate import _parameter, _scalar, _start_state, integrate
+from .._results import status_name
 from .._solution import Save
 from .._system import System
 from .._types import Args
+from ..engine.newton import Newton
 from ..methods import Method, TypeII
-from ..observe import MaxDrift, Mean
+from ..observe import MaxDrift
+
+_ABOVE_FLOOR = 10
+"""A point counts when its drift is this many times the one that ε has no part in."""
+
+_ENOUGH = 3
+"""Points that a slope needs: two always lie on a line."""
+
+_FLAT = 0.5
+"""Below this slope a run of points at the smallest ε is a plateau."""
+
+_FLAT_SPAN = np.sqrt(10)
+"""Ratio of largest to smallest ε from which on such a run is believed."""
+
+_MEANINGS = {
+    "failed": "too many of the starts failed",
+    "no floor": "the undisturbed run failed, so that nothing can be told from its drift",
+    "round-off": "within ten times of round-off",
+    "mesh": "within ten times of the drift at ε = 0",
+    "flat": "within ten times of a plateau at the smallest ε",
+}
 
 
 class DriftOrder(NamedTuple):
-    """The measured order in ε of a drift.
+    """The measured order in ε of a drift; print it for a report.
 
-    - `epsilons`, `drifts`: shape (E,). `floor`: the drift at ε = 0, by mesh and round-off.
-    - `used`: which points the fit takes: those at least ten times above the floor.
-    - `slope`, `stderr`: d log(drift) / d log(ε) and its standard error; NaN with fewer than
-      two points (slope) or three (stderr).
-    - `successful`: which trajectories did not fail.
+    - `epsilons`, `drifts`: shape (E,); a drift is the largest over the starts that count, NaN
+      where they failed.
+    - `floor`: the drift at ε = 0; `floor_cause`: "round-off", "mesh" (the observable is not kept
+      by the undisturbed map), or "failed" (then it is NaN).
+    - `used`: which points the fit takes, shape (E,). `excluded`: why not the others: "failed",
+      "no floor", "round-off", "mesh", "flat"; "" where used.
+    - `slope`, `stderr`: d log(drift) / d log(ε) by least squares and its standard error; NaN with
+      fewer than three points.
+    - `kept`: the starts that count, shape (S,). `start_drifts`, `statuses`: of every trajectory,
+      shape (E + 1, S), the last row at ε = 0. A status is one of `RESULTS` by name, or
+      "observable_not_finite".
     """
 
     epsilons: np.ndarray
     drifts: np.ndarray
     floor: float
+    floor_cause: str
     used: np.ndarray
+    excluded: np.ndarray
     slope: float
     stderr: float
-    successful: np.ndarray
+    kept: np.ndarray
+    start_drifts: np.ndarray
+    statuses: np.ndarray
 
     @property
     def interval(self) -> tuple[float, float]:
-        """About 95 % confidence: slope ± 2 stderr."""
-        return self.slope - 2 * self.stderr, self.slope + 2 * self.stderr
+        """95 % confidence interval of the slope, by Student's t.
+
+        It knows the scatter about a straight line; the bend that the next order brings at large ε
+        is a bias that it does not know (see `limit`).
+        """
+        return _interval(self.slope, self.stderr, int(self.used.sum()))
+
+    @property
+    def limit(self) -> float:
+        """The slope for ε → 0: s in the fit drift = C ε^s exp(cε), the next order as a factor.
+
+        NaN with fewer than four points used.
+        """
+        if self.used.sum() <= _ENOUGH:
+            return np.nan
+        x, y = self.epsilons[self.used], np.log(self.drifts[self.used])
+        columns = np.stack([np.ones_like(x), np.log(x), x / x.max()], axis=1)
+        return float(np.linalg.lstsq(columns, y)[0][1])
+
+    @property
+    def successful(self) -> np.ndarray:
+        """At which ε no trajectory failed, shape (E,)."""
+        return (self.statuses[:-1] == "successful").all(axis=1)
+
+    @property
+    def slope_of_all(self) -> float:
+        """The slope through all points, plateaus included: near 0 where ε has no part."""
+        good = self.drifts > 0
+        return _line(np.log(self.epsilons[good]), np.log(self.drifts[good]))[0]
+
+    def __str__(self) -> str:
+        points, used = len(self.epsilons), int(self.used.sum())
+        low, high = self.interval
+        if used >= _ENOUGH:
+            lines = [
+                f"drift ∝ ε^{self.slope:.4g}, 95 % interval {low:.4g} … {high:.4g}, by {used} of "
+                f"{points} points"
+            ]
+            if np.isfinite(self.limit):
+                lines[0] += f"; for ε → 0 it tends to ε^{self.limit:.4g}"
+        else:
+            lines = [
+                f"no order: {used} of {points} points can be used, {_ENOUGH} are needed (through "
+                f"all of them the slope is {self.slope_of_all:.2g})"
+            ]
+        lines.append(f"  drift at ε = 0: {self.floor:.2g} ({self.floor_cause})")
+        for reason, meaning in _MEANINGS.items():
+            where = self.epsilons[self.excluded == reason]
+            if len(where):
+                lines.append(f"  excluded: {len(where)} at ε = {_span(where)}, {meaning}")
+        return "\n".join(lines + _starts_left_out(self.kept, self.statuses))
+
+
+class DriftSurface(NamedTuple):
+    """Drifts over ε and h, with their orders; print it for a table.
+
+    - `epsilons`: shape (E,); `hs`: step sizes, shape (H,); `num_steps`: steps at each, (H,).
+    - `orders`: a `DriftOrder` for each h, over the same starts.
+    - `mesh_used`: at which h the drift at ε = 0 is above round-off, shape (H,); `mesh_slope`,
+      `mesh_stderr`: its order in h there, d log(drift) / d log(h); NaN with fewer than three.
+    """
+
+    epsilons: np.ndarray
+    hs: np.ndarray
+    num_steps: np.ndarray
+    orders: tuple[DriftOrder, ...]
+    mesh_used: np.ndarray
+    mesh_slope: float
+    mesh_stderr: float
+
+    @property
+    def drifts(self) -> np.ndarray:
+        """Shape (E, H); NaN where the trajectories failed."""
+        return np.stack([o.drifts for o in self.orders], axis=1)
+
+    @property
+    def floors(self) -> np.ndarray:
+        """The drifts at ε = 0, shape (H,)."""
+        return np.array([o.floor for o in self.orders])
+
+    @property
+    def used(self) -> np.ndarray:
+        """Which points the fits in ε take, shape (E, H)."""
+        return np.stack([o.used for o in self.orders], axis=1)
+
+    @property
+    def excluded(self) -> np.ndarray:
+        """Why not the others, shape (E, H); "" where used."""
+        return np.stack([o.excluded for o in self.orders], axis=1)
+
+    @property
+    def statuses(self) -> np.ndarray:
+        """Of every trajectory, shape (E + 1, H, S), the last row at ε = 0."""
+        return np.stack([o.statuses for o in self.orders], axis=1)
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """The order in ε at each h, shape (H,)."""
+        return np.array([o.slope for o in self.orders])
+
+    @property
+    def intervals(self) -> np.ndarray:
+        """Their 95 % confidence intervals, shape (H, 2)."""
+        return np.array([o.interval for o in self.orders])
+
+    @property
+    def mesh_interval(self) -> tuple[float, float]:
+        """95 % confidence interval of the order in h of the drift at ε = 0."""
+        return _interval(self.mesh_slope, self.mesh_stderr, int(self.mesh_used.sum()))
+
+    def __str__(self) -> str:
+        def row(name, cells):
+            return f"{name:>10}" + "".join(f"{cell:>11}" for cell in cells)
+
+        marks = np.where(self.used, " ", "*")
+        lines = [row("ε \\ h", [f"{h:.3g} " for h in self.hs])]
+        for epsilon, drifts, mark in zip(self.epsilons, self.drifts, marks, strict=True):
+            cells = [f"{d:.2e}{m}" for d, m in zip(drifts, mark, strict=True)]
+            lines.append(row(f"{epsilon:.3g}", cells))
+        lines.append(row("0", [f"{floor:.2e} " for floor in self.floors]))
+        lines.append(row("slope", [f"{slope:.3f} " for slope in self.slopes]))
+        half = (self.intervals[:, 1] - self.intervals[:, 0]) / 2
+        lines.append(row("±", [f"{x:.3f} " for x in half]))
+        for reason, meaning in _MEANINGS.items():
+            count = int(np.sum(self.excluded == reason))
+            if count:
+                lines.append(f"* {count} excluded: {meaning}")
+        count = int(self.mesh_used.sum())
+        if count >= _ENOUGH:
+            low, high = self.mesh_interval
+            lines.append(
+                f"drift at ε = 0 ∝ h^{self.mesh_slope:.4g}, 95 % interval {low:.4g} … {high:.4g}, "
+                f"by {count} of {len(self.hs)} step sizes"
+            )
+        else:
+            lines.append(f"drift at ε = 0: above round-off at {count} of {len(self.hs)} step sizes")
+        kept, statuses = self.orders[0].kept, self.statuses.reshape(-1, len(self.orders[0].kept))
+        return "\n".join(lines + _starts_left_out(kept, statuses))
 
 
 def drift_order(
@@ -49,78 +218,313 @@ def drift_order(
     epsilons: Any,
     h: Any,
     num_steps: int,
+    batched: bool = False,
     t0: float = 0.0,
     args: Args = None,
     method: Method = TypeII(),
+    newton: Newton = Newton(),
 ) -> DriftOrder:
     r"""The exponent of ε in the largest drift of a scalar along trajectories.
 
-        max_k |I_ε(k) − I_ε(1)| ∝ ε^slope      (z + 1 for an invariant of order z)
+        max_starts max_k |I_ε(k) − I_ε(1)| ∝ ε^slope      (z + 1 for an invariant of order z)
 
-    One batched sweep over ε, reduced on the device; the same run at ε = 0 gives the floor.
+    One batched sweep over ε and the starts, reduced on the device: memory does not grow with
+    num_steps. The same runs at ε = 0 give the floor, by the mesh or by round-off. The line is
+    fitted to the points that stand ten times above it, and above a plateau at the smallest ε if
+    there is one; the others are excluded and reported.
+
+    An ε at which more than half of the starts fail is excluded. A start that fails at one of the
+    others is left out at all of them, so that every point is the largest over the same starts.
 
     **Arguments**
 
     - `invariant`: an observable: a function of one step, an `InvariantSeries`, an
       `AdiabaticInvariant`.
-    - `q0`, `p0`, `h`, `num_steps`, `t0`, `args`, `method`: as for `integrate`.
-    - `epsilons`: strengths, shape (E,), positive.
+    - `q0`, `p0`: one start; with ``batched=True`` many, along the first axis: (S, *state).
+    - `epsilons`: strengths, shape (E,), positive, no two the same, in any order.
+    - `h`, `num_steps`, `t0`, `args`, `method`, `newton`: as for `integrate`.
 
-    **Raises** `ValueError` for epsilons that are not positive and finite, or an observable that
-    is not a scalar.
+    **Returns** a `DriftOrder`; its slope is NaN when fewer than three points are left.
+
+    **Raises** `ValueError` for epsilons that are not positive, finite and distinct, starts that
+    are not of one shape, or an observable that is not a scalar.
+
+    **Accuracy** the interval is that of a straight line with independent errors. The next order
+    bends the line at large ε; `DriftOrder.limit` is the slope with that bend taken out.
     """
-    if not callable(invariant):
-        raise TypeError(
-            f"invariant must be one observable, got {type(invariant).__name__}. Of a Discovery "
-            "take one of its `invariants`."
-        )
-    epsilons = np.asarray(epsilons, float)
-    if (
-        epsilons.ndim != 1
-        or len(epsilons) == 0
-        or not (np.isfinite(epsilons) & (epsilons > 0)).all()
-    ):
-        raise ValueError(f"epsilons must be a list of positive numbers, got {epsilons.tolist()}.")
+    _check_observable(invariant)
+    epsilons = _positive("epsilons", epsilons)
+    q0, p0 = _starts(q0, p0, batched)
+    h = float(_scalar("h", h, q0.dtype, zero_allowed=False))
+    settings = _settings(t0, args, method, newton)
+    lanes = _sweep(system, invariant, q0, p0, epsilons, h, num_steps, settings)
+    return _order(epsilons, lanes, _kept(lanes.good))
 
-    def run(epsilon):
+
+def drift_surface(
+    system: System,
+    invariant: Callable[..., Any] | Sequence[Callable[..., Any]],
+    q0: Any,
+    p0: Any,
+    *,
+    epsilons: Any,
+    hs: Any,
+    duration: float,
+    batched: bool = False,
+    t0: float = 0.0,
+    args: Args = None,
+    method: Method = TypeII(),
+    newton: Newton = Newton(),
+) -> DriftSurface:
+    r"""The largest drift of a scalar over ε and h, and its order in each.
+
+        max_starts max_k |I(k) − I(1)|    over t_k − t0 ≤ duration
+
+    At each h one sweep as in `drift_order`, over round(duration / h) steps; the number of steps
+    differs, so every h is compiled by itself. The drift at ε = 0 is the mesh's share: where it is
+    above round-off its order in h is measured.
+
+    An (ε, h) at which more than half of the starts fail is excluded. A start that fails at one of
+    the others is left out at all of them.
+
+    **Arguments**
+
+    - `invariant`: an observable, or a sequence with one for each h (a discovered invariant
+      belongs to the h it was found for).
+    - `q0`, `p0`: one start; with ``batched=True`` many, along the first axis: (S, *state).
+    - `epsilons`: strengths, shape (E,); `hs`: step sizes [time], shape (H,); both positive and
+      increasing.
+    - `duration`: how long each trajectory is [time], at least two of the longest steps.
+    - `t0`, `args`, `method`, `newton`: as for `integrate`.
+
+    **Returns** a `DriftSurface`.
+
+    **Raises** `ValueError` for epsilons or hs that are not positive and increasing, a duration
+    that is too short, starts that are not of one shape, observables that are not one for each
+    step size, or one that is not a scalar.
+    """
+    epsilons = _positive("epsilons", epsilons, increasing=True)
+    hs = _positive("hs", hs, increasing=True)
+    if not np.isfinite(duration) or duration < 2 * hs[-1]:
+        raise ValueError(
+            f"duration must hold at least two of the longest steps, {hs[-1]:g}; got {duration!r}."
+        )
+    given = isinstance(invariant, Sequence)
+    invariants = list(invariant) if given else [invariant] * len(hs)
+    if len(invariants) != len(hs):
+        raise ValueError(
+            f"give one observable for all step sizes or one for each: got {len(invariants)} for "
+            f"{len(hs)} step sizes."
+        )
+    for each in invariants:
+        _check_observable(each)
+    q0, p0 = _starts(q0, p0, batched)
+    num_steps = np.round(duration / hs).astype(int)
+    settings = _settings(t0, args, method, newton)
+    lanes = [
+        _sweep(system, each, q0, p0, epsilons, float(h), int(steps), settings)
+        for each, h, steps in zip(invariants, hs, num_steps, strict=True)
+    ]
+    kept = _kept(np.concatenate([lane.good for lane in lanes]))
+    orders = tuple(_order(epsilons, lane, kept) for lane in lanes)
+    floors = np.array([o.floor for o in orders])
+    by_mesh = np.isfinite(floors) & np.array([o.floor_cause == "mesh" for o in orders])
+    mesh_slope, mesh_stderr = _line(np.log(hs[by_mesh]), np.log(floors[by_mesh]))
+    return DriftSurface(epsilons, hs, num_steps, orders, by_mesh, mesh_slope, mesh_stderr)
+
+
+class _Lanes(NamedTuple):
+    """What a sweep brings back, shape (E + 1, S), the last row at ε = 0.
+
+    `sizes` of the observable; `epsilon`: the relative rounding of one operation.
+    """
+
+    drifts: np.ndarray
+    sizes: np.ndarray
+    statuses: np.ndarray
+    num_steps: int
+    epsilon: float
+
+    @property
+    def good(self) -> np.ndarray:
+        return self.statuses == "successful"
+
+
+def _sweep(system, invariant, q0, p0, epsilons, h, num_steps, settings) -> _Lanes:
+    """Every start at every ε and at 0, as one batch."""
+    shape = len(epsilons) + 1, len(q0)
+    strengths = jnp.repeat(jnp.append(jnp.asarray(epsilons, q0.dtype), 0), shape[1])
+    starts = tuple(jnp.concatenate([x] * shape[0]) for x in (q0, p0))
+    drifts, last, result = _run(system, invariant, strengths, starts, h, num_steps, settings)
+    if drifts.ndim != 1:
+        raise ValueError(
+            f"the invariant must be a scalar, got values of shape {drifts.shape[1:]}: take one "
+            "component."
+        )
+    drifts = np.asarray(drifts, float)
+    # An odd observable may end near zero: its drift says how large it was.
+    sizes = np.abs(np.asarray(last, float)[:, -1]) + drifts
+    statuses = status_name(result)
+    blind = (statuses == "successful") & ~np.isfinite(drifts)
+    statuses = np.where(blind, "observable_not_finite", statuses)
+    return _Lanes(
+        drifts.reshape(shape),
+        sizes.reshape(shape),
+        statuses.reshape(shape),
+        num_steps,
+        float(jnp.finfo(q0.dtype).eps),
+    )
+
+
+@eqx.filter_jit
+def _run(system, invariant, strengths, starts, h, num_steps: int, settings):
+    """Drift, last value and status of every lane; nothing is saved on the way."""
+
+    def lane(epsilon, q0, p0):
         solution = integrate(
             system,
             q0,
             p0,
             h=h,
             num_steps=num_steps,
-            t0=t0,
             epsilon=epsilon,
-            args=args,
-            method=method,
             save=Save(final=True),
-            observe=(MaxDrift(invariant), Mean(invariant)),
+            observe=(MaxDrift(invariant), invariant),
             throw=False,
+            **settings,
         )
-        return solution.observed, solution.result == RESULTS.successful
+        return *solution.observed, solution.result
 
-    (drifts, means), good = jax.jit(jax.vmap(run))(jnp.append(epsilons, 0.0))
-    if drifts.ndim != 1:
-        raise ValueError(
-            f"the invariant must be a scalar, got values of shape {drifts.shape[1:]}: take one "
-            "component."
-        )
-    drifts, good = np.asarray(drifts), np.asarray(good)
-    round_off = 1e-15 * abs(float(means[-1]))
-    floor = max(float(drifts[-1]), round_off)
-    drifts, good = drifts[:-1], good[:-1]
-    used = good & (drifts > 10 * floor)
+    return jax.vmap(lane)(strengths, *starts)
+
+
+def _kept(good: np.ndarray) -> np.ndarray:
+    """The starts that got through wherever most of them did, shape (S,); `good`: (points, S)."""
+    return np.all(good[_passable(good)], axis=0)
+
+
+def _passable(good: np.ndarray) -> np.ndarray:
+    return 2 * good.sum(axis=1) >= good.shape[1]
+
+
+def _order(epsilons: np.ndarray, lanes: _Lanes, kept: np.ndarray) -> DriftOrder:
+    """The fit over the starts that count."""
+    passed = _passable(lanes.good) & kept.any()
+    largest = np.where(passed, lanes.drifts[:, kept].max(axis=1, initial=0), np.nan)
+    drifts, floor = largest[:-1], float(largest[-1])
+    rounding = lanes.sizes[-1, kept].max(initial=0) * lanes.epsilon
+    floor = max(floor, 4 * rounding)
+    # One rounding in each step, and ten thousand for the coefficients of the observable.
+    cause = "round-off" if floor <= (10_000 + lanes.num_steps) * rounding else "mesh"
+    excluded = np.full(len(epsilons), "", dtype="<U9")
+    excluded[~(drifts > _ABOVE_FLOOR * floor)] = cause
+    if not passed[-1]:
+        cause = "failed"
+        excluded[:] = "no floor"
+    excluded[~passed[:-1]] = "failed"
+    candidates = excluded == ""
+    level = _plateau(epsilons[candidates], drifts[candidates])
+    excluded[candidates & ~(drifts > _ABOVE_FLOOR * level)] = "flat"
+    used = excluded == ""
     slope, stderr = _line(np.log(epsilons[used]), np.log(drifts[used]))
-    return DriftOrder(epsilons, drifts, floor, used, slope, stderr, good)
+    return DriftOrder(
+        epsilons, drifts, floor, cause, used, excluded, slope, stderr, kept, lanes.drifts,
+        lanes.statuses,
+    )  # fmt: skip
+
+
+def _plateau(epsilons: np.ndarray, drifts: np.ndarray) -> float:
+    """The level on which the drifts at the smallest ε lie, 0 if they rise from the first on."""
+    order = np.argsort(epsilons)
+    x, y = np.log(epsilons[order]), np.log(drifts[order])
+    for count in range(len(x), _ENOUGH - 1, -1):
+        if x[count - 1] - x[0] < np.log(_FLAT_SPAN):
+            break
+        rises = _line(x[:count], y[:count])[0] >= _FLAT or np.ptp(y[:count]) > np.log(_ABOVE_FLOOR)
+        if not rises:
+            return float(np.exp(np.median(y[:count])))
+    return 0.0
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Least-squares slope and its standard error."""
-    if len(x) < 2:
+    """Least-squares slope and its standard error; NaN for fewer than three points."""
+    if len(x) < _ENOUGH:
         return np.nan, np.nan
     dx = x - x.mean()
     slope = float(dx @ (y - y.mean()) / (dx @ dx))
-    if len(x) < 3:
-        return slope, np.nan
     rest = y - y.mean() - slope * dx
     return slope, float(np.sqrt(rest @ rest / (len(x) - 2) / (dx @ dx)))
+
+
+def _interval(slope: float, stderr: float, points: int) -> tuple[float, float]:
+    if points < _ENOUGH:
+        return np.nan, np.nan
+    half = _student_t(points - 2) * stderr
+    return slope - half, slope + half
+
+
+@functools.cache
+def _student_t(freedom: int) -> float:
+    """The t that |T| stays below with probability 95 %, for T of Student's distribution.
+
+    P(|T| > t) = I_x(ν/2, 1/2) with x = ν/(ν + t²), increasing in x: solved by bisection.
+    """
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        x = (low + high) / 2
+        outside = jax.scipy.special.betainc(freedom / 2, 0.5, x)
+        low, high = (x, high) if outside < 0.05 else (low, x)
+    return float(np.sqrt(freedom * (1 - low) / low))
+
+
+def _check_observable(invariant: Any) -> None:
+    if not callable(invariant):
+        raise TypeError(
+            f"invariant must be one observable, got {type(invariant).__name__}. Of a Discovery "
+            "take one of its `invariants`."
+        )
+
+
+def _positive(name: str, values: Any, increasing: bool = False) -> np.ndarray:
+    values = np.asarray(values, float)
+    if values.ndim != 1 or len(values) == 0 or not (np.isfinite(values) & (values > 0)).all():
+        raise ValueError(f"{name} must be a list of positive numbers, got {values.tolist()}.")
+    if increasing and (np.diff(values) <= 0).any():
+        raise ValueError(f"{name} must increase, got {values.tolist()}.")
+    if len(np.unique(values)) < len(values):
+        raise ValueError(f"{name} must be distinct, got {values.tolist()}.")
+    return values
+
+
+def _starts(q0: Any, p0: Any, batched: bool):
+    """The starts as arrays (S, *state)."""
+    q0, p0 = _start_state(q0, p0)
+    if not batched:
+        return q0[None], p0[None]
+    if q0.ndim == 0:
+        raise ValueError(
+            "with batched=True, q0 and p0 must have a first axis of starts, (S, *state); got "
+            "single numbers."
+        )
+    return q0, p0
+
+
+def _settings(t0, args, method, newton) -> dict[str, Any]:
+    args = jax.tree.map(_parameter, args)
+    return {"t0": t0, "args": args, "method": method, "newton": newton}
+
+
+def _span(values: np.ndarray) -> str:
+    low, high = f"{values.min():.3g}", f"{values.max():.3g}"
+    return low if low == high else f"{low} … {high}"
+
+
+def _starts_left_out(kept: np.ndarray, statuses: np.ndarray) -> list[str]:
+    """Lines about the starts that do not count; `statuses`: shape (points, S)."""
+    lost = np.flatnonzero(~kept)
+    if not len(lost):
+        return []
+    failed = statuses[:, lost]
+    names = ", ".join(np.unique(failed[failed != "successful"]))
+    some = ", ".join(map(str, lost[:8])) + (", …" if len(lost) > 8 else "")
+    return [f"  left out: {len(lost)} of {len(kept)} starts ({names}): number {some}"]

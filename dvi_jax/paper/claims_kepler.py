@@ -4,12 +4,12 @@ import numpy as np
 
 from .experiments import Measurements
 from .numbers import relative_spread, slope
-from .verdicts import Check, Claim, Verdict
+from .verdicts import ROUND_OFF, Check, Claim, Verdict
 
 
 def kepler_claims(m: Measurements) -> list[Claim]:
     """The claims about the Kepler problem."""
-    sweep, small, runs = m.mesh_sweep, m.small_step_sweep, m.long_runs
+    sweep, small, runs, found = m.mesh_sweep, m.small_step_sweep, m.long_runs, m.discoveries
     rk4, variational = runs["RK4"], runs["variational (order 1)"]
 
     def largest(run):
@@ -168,6 +168,9 @@ def kepler_claims(m: Measurements) -> list[Claim]:
                     0,
                     1e-13,
                 ),
+                Check("invariants that discovery finds with 1/r", float(found.kepler_count), 1, 1),
+                Check("held-out residual", found.kepler_residual, 0, ROUND_OFF),
+                Check("kept at ε = 0.5 and −0.3 too (1: yes)", found.kepler_exact, 1),
             ),
             (),
             Verdict.HOLDS,
@@ -177,7 +180,15 @@ def kepler_claims(m: Measurements) -> list[Claim]:
             "gauge-50",
             "(28), (50)",
             "With the gauge −ε|q|²/2 the identity of order 1 holds.",
-            (Check("largest |N_1| at h = 0.1", float(m.identities.kepler_1[0]), 0, 1e-10),),
+            (
+                Check("largest |N_1| at h = 0.1", float(m.identities.kepler_1[0]), 0, 1e-10),
+                Check(
+                    "what the best gauge of degree 4 leaves of it, relative",
+                    float(found.gauge_50[0]),
+                    0,
+                    ROUND_OFF,
+                ),
+            ),
             (
                 Check(
                     "exponent in h of |N_1|",
@@ -187,6 +198,12 @@ def kepler_claims(m: Measurements) -> list[Claim]:
                 ),
                 Check(
                     "rest after −(h/2)|Dq|²", float(np.max(m.identities.kepler_1_rest)), 0, 1e-11
+                ),
+                Check(
+                    "exponent in h of what the best gauge leaves",
+                    slope(found.hs, found.gauge_50),
+                    0.8,
+                    1.2,
                 ),
             ),
             Verdict.MENDED,

@@ -3,13 +3,13 @@
 import numpy as np
 
 from .experiments import Measurements
-from .numbers import max_drift, relative_spread, slope, spread
+from .numbers import max_drift, relative_spread, spread
 from .verdicts import ROUND_OFF, Check, Claim, Verdict
 
 
 def oscillator_claims(m: Measurements) -> list[Claim]:
     """The claims about the oscillator."""
-    mesh, cross, small = m.fixed_mesh, m.crossover, m.small_step
+    mesh, cross, small, found = m.fixed_mesh, m.crossover, m.small_step, m.discoveries
     band = float(spread(mesh.mixed[0]))
     rk4_end = float(mesh.rk4[-1] - mesh.energy)
     rk4_largest = float(np.max(np.abs(mesh.rk4 - mesh.energy)))
@@ -97,6 +97,12 @@ def oscillator_claims(m: Measurements) -> list[Claim]:
                     0,
                     ROUND_OFF,
                 ),
+                Check(
+                    "what the best gauge of degree 4 leaves of it, relative",
+                    float(found.gauge_34[1]),
+                    0,
+                    ROUND_OFF,
+                ),
             ),
             (),
             Verdict.FAILS,
@@ -107,6 +113,7 @@ def oscillator_claims(m: Measurements) -> list[Claim]:
                     "rest after q_k(p_{k+1} − q_k) + εq_k²",
                     m.identities.oscillator_1_rest / m.identities.scale_oscillator,
                 ),
+                Check("what it leaves at order 0", float(found.gauge_34[0])),
             ),
         ),
         Claim(
@@ -115,8 +122,8 @@ def oscillator_claims(m: Measurements) -> list[Claim]:
             "(1+ε)(p_k² + q_{k−1}²)/2 is an adiabatic invariant of first order.",
             (
                 Check(
-                    "exponent in ε of its range as h → 0",
-                    slope(small.epsilons, small.printed),
+                    "exponent in ε of its drift as h → 0",
+                    found.order_34,
                     1.8,
                 ),
             ),
@@ -133,6 +140,14 @@ def oscillator_claims(m: Measurements) -> list[Claim]:
                     0,
                     ROUND_OFF,
                 ),
+                Check(
+                    "distance of the one invariant that discovery finds from it",
+                    found.oscillator_off,
+                    0,
+                    ROUND_OFF,
+                ),
+                Check("its held-out residual", found.oscillator_residual, 0, ROUND_OFF),
+                Check("kept at ε = 0.5 and −0.3 too (1: yes)", found.oscillator_exact, 1),
             ),
             Verdict.MENDED,
             "The disturbance stiffens the spring: (1+ε) belongs before q² only. That form is kept "

@@ -169,6 +169,12 @@ def theory_claims(m: Measurements) -> list[Claim]:
             (Check(f"largest gap for (50), h = {ids.hs[0]:g}", float(ids.law_31[0]), 0, 1e-10),),
             (
                 Check("largest gap of the full balance", float(np.max(ids.balance)), 0, 1e-11),
+                Check(
+                    "the same by noether_balance, every step, relative to the largest cause",
+                    m.discoveries.balance,
+                    0,
+                    ROUND_OFF,
+                ),
                 Check("exponent in h of the gap", slope(ids.hs, ids.law_31), 0.8, 1.2),
             ),
             Verdict.MENDED,

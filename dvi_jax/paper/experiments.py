@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from . import kepler, oscillator, theory
+from . import discoveries, kepler, oscillator, theory
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class Measurements:
     limits: theory.Limits
     symmetries: theory.Symmetries
     identities: theory.Identities
+    discoveries: discoveries.Discoveries
 
 
 EXPERIMENTS = {
@@ -36,6 +37,7 @@ EXPERIMENTS = {
     "limits": ("equations as h → 0", theory.limits),
     "symmetries": ("conformal factors", theory.symmetries),
     "identities": ("Noether identities", theory.identities),
+    "discoveries": ("discovery of invariants", discoveries.discoveries),
 }
 """Field of `Measurements` → what the progress bar calls it, and the function that measures it."""
 

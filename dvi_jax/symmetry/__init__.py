@@ -6,6 +6,7 @@ from .basis import (
     BoundBasis as BoundBasis,
 )
 from .determining import (
+    ConformalFactor as ConformalFactor,
     conformal_factor as conformal_factor,
     determining_residual as determining_residual,
     discrete_equations as discrete_equations,
@@ -28,4 +29,10 @@ from .noether import (
     lattice_defect as lattice_defect,
     noether_identity as noether_identity,
     outgoing_energy as outgoing_energy,
+)
+from .sampling import random_pairs as random_pairs, solution_pairs as solution_pairs
+from .search import (
+    Symmetries as Symmetries,
+    Symmetry as Symmetry,
+    find_symmetries as find_symmetries,
 )

@@ -1,7 +1,7 @@
 """Infinitesimal generators at a lattice point, and their prolongation."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,8 +25,10 @@ class Generator(eqx.Module):
     - `xi`: ξ, function of the same → array like q. `eta`: η → array like p.
 
     None stands for zero. A series in ε, (18)–(20) of the paper, is a list of generators, order
-    0 first.
+    0 first. Generators add, subtract, and multiply with numbers.
     """
+
+    __array_ufunc__: ClassVar[None] = None  # NumPy numbers leave the product to __rmul__
 
     xi0: Callable[..., Any] | None = None
     xi: Callable[..., Any] | None = None
@@ -56,6 +58,43 @@ class Generator(eqx.Module):
                     )
             values.append(value)
         return LatticePoint(*values)
+
+    def __add__(self, other: "Generator") -> "Generator":
+        if not isinstance(other, Generator):
+            return NotImplemented
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ("xi0", "xi", "eta"))
+        return Generator(*(a if b is None else b if a is None else _Total(a, b) for a, b in pairs))
+
+    def __mul__(self, number: Any) -> "Generator":
+        if callable(number) or jnp.shape(number) != ():
+            return NotImplemented
+        functions = (self.xi0, self.xi, self.eta)
+        return Generator(*(None if f is None else _Multiple(f, number) for f in functions))
+
+    def __rmul__(self, number: Any) -> "Generator":
+        return self * number
+
+    def __neg__(self) -> "Generator":
+        return self * -1.0
+
+    def __sub__(self, other: "Generator") -> "Generator":
+        return self + -other if isinstance(other, Generator) else NotImplemented
+
+
+class _Total(eqx.Module):
+    first: Callable[..., Any]
+    second: Callable[..., Any]
+
+    def __call__(self, t, q, p, args):
+        return self.first(t, q, p, args) + self.second(t, q, p, args)
+
+
+class _Multiple(eqx.Module):
+    function: Callable[..., Any]
+    number: Any
+
+    def __call__(self, t, q, p, args):
+        return self.number * self.function(t, q, p, args)
 
 
 def prolong(

@@ -2,9 +2,18 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from .basis import BoundBasis
+from .._results import RESULTS
+from .._step import Equations, step
+from .._system import System
+from .._types import Args, Interval
+from ..engine.newton import Newton
+from .basis import BoundBasis, check_step_size
+from .generators import LatticePoint
 
 
 class Samples(NamedTuple):
@@ -51,8 +60,8 @@ def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None
     needed = int(np.ceil(2 * unknowns / conditions))
     if len(samples.q) < needed:
         raise ValueError(
-            f"{len(samples.q)} samples are too few for {unknowns} basis functions (a quarter is "
-            f"held out): give at least {needed}."
+            f"{len(samples.q)} samples are too few for {unknowns} unknown coefficients (a quarter "
+            f"is held out): give at least {needed}."
         )
 
 
@@ -75,3 +84,86 @@ def require_steps(good: Any, samples: Samples) -> None:
             f"{samples.q[i].tolist()}, p = {samples.p[i].tolist()}: take samples where the map is "
             "defined, or a smaller h."
         )
+
+
+def check_basis(basis: BoundBasis, values: np.ndarray) -> None:
+    """Refuse functions that are not finite on the samples, or dependent; `values`: (S, size)."""
+    bad = ~np.isfinite(values)
+    if bad.any():
+        i, j = np.argwhere(bad)[0]
+        raise ValueError(
+            f"the basis function {basis.names[j]!r} is not finite at {int(bad[:, j].sum())} of "
+            f"{len(values)} samples (first: number {i}): keep the samples off its singularity."
+        )
+    scale = np.linalg.norm(values, axis=0)
+    zero = np.flatnonzero(scale == 0)
+    normal = values / np.where(scale > 0, scale, 1)
+    singular, V = np.linalg.svd(normal, full_matrices=False)[1:]
+    if zero.size or singular[-1] < 1e-13 * singular[0]:
+        members = [basis.names[j] for j in (zero if zero.size else np.argsort(-abs(V[-1]))[:4])]
+        raise ValueError(
+            "the basis is rank-deficient on the samples: a combination of "
+            f"{', '.join(map(repr, members))}{' …' if not zero.size else ''} vanishes on all of "
+            "them. Leave one out, or take samples that fill the domain."
+        )
+
+
+def solution_pairs(
+    system: System,
+    *,
+    h: float,
+    samples: Any,
+    epsilon: Any = 0.0,
+    t0: float = 0.0,
+    args: Args = None,
+    newton: Newton = Newton(),
+) -> tuple[LatticePoint, LatticePoint]:
+    r"""Pairs of lattice points on solutions: each sample, and where one step of the map takes it.
+
+    For `determining_residual` under ``vmap``: it vanishes on them for a symmetry.
+
+    **Arguments** `samples`: (qs, ps) at t0, shapes (S, *q.shape), or (qs, ps, ts) with their
+    times, shape (S,); `h`: step size [time]; `epsilon`, `args`, `newton`: as for `integrate`.
+
+    **Returns** two points with a leading axis of length S. **Raises** `ValueError` for samples
+    of unequal shapes or not finite, h = 0, or a step that fails on them.
+    """
+    samples, h = as_samples(samples, t0), check_step_size(h)
+    equations = Equations(system, jnp.asarray(epsilon, float), args, newton)
+    first, second, good = _stepped(equations, jnp.asarray(h), samples)
+    require_steps(good, samples)
+    return first, second
+
+
+@eqx.filter_jit
+def _stepped(equations, h, samples):
+    def at_point(q, p, t):
+        q1, p1, info = step(equations, Interval(t, t + h, h), q, p)
+        good = info.result == RESULTS.successful
+        return LatticePoint(t, q, p), LatticePoint(t + h, q1, p1), good
+
+    return jax.vmap(at_point)(*map(jnp.asarray, samples))
+
+
+def random_pairs(
+    *, h: float, samples: Any, t0: float = 0.0, seed: int = 0
+) -> tuple[LatticePoint, LatticePoint]:
+    """Pairs of lattice points off the solutions: each sample, and another one at random.
+
+    For `conformal_factor`, whose Λ is asked of all points. The second point is at t + h.
+
+    **Arguments** `samples`: as for `solution_pairs`, at least two; `seed`: of the random order.
+
+    **Returns** two points with a leading axis of length S. **Raises** `ValueError` for samples
+    of unequal shapes, not finite, or fewer than two; h = 0.
+    """
+    samples, h = as_samples(samples, t0), check_step_size(h)
+    count = len(samples.q)
+    if count < 2:
+        raise ValueError("pairs off the solutions need at least two samples, got one.")
+    order = np.random.default_rng(seed).permutation(count)
+    other = np.empty(count, int)
+    other[order] = np.roll(order, 1)  # one cycle: no sample is paired with itself
+    first = LatticePoint(*map(jnp.asarray, (samples.t, samples.q, samples.p)))
+    moved = (samples.t + h, samples.q[other], samples.p[other])
+    return first, LatticePoint(*map(jnp.asarray, moved))

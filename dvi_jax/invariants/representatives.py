@@ -1,0 +1,118 @@
+"""Which series stands for an invariant: independent leading parts, and their corrections."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..engine.echelon import reduced, reduction
+from ..engine.nullspace import SeriesSpace, orthonormal_range
+from ..symmetry.basis import BoundBasis
+from ..symmetry.sampling import Samples
+
+
+class Representatives(NamedTuple):
+    """Series of shape (order + 1, basis size), and whether each is independent of those before."""
+
+    series: list[np.ndarray]
+    independent: list[bool]
+
+
+class Span:
+    """All invariants found, as series in a basis that is orthonormal on the samples.
+
+    `R`: the user's coefficients are R⁻¹ times those of `space`. `blur`: relative size below
+    which coefficients count as none.
+    """
+
+    def __init__(self, basis: BoundBasis, R: np.ndarray, space: SeriesSpace, blur: float):
+        self.basis, self.R, self.space, self.blur = basis, R, space, blur
+        self.size = basis.size
+        self.orders = space.leading.shape[0] // basis.size
+
+    def user(self, columns: np.ndarray) -> np.ndarray:
+        """Coefficients of the user's functions from those of the orthonormal ones."""
+        blocks = columns.reshape(self.orders, self.size, -1)
+        return np.linalg.solve(self.R, blocks).reshape(columns.shape)
+
+    def representatives(self, samples: Samples) -> Representatives:
+        """One series for each leading part, the simplest leading parts first.
+
+        A leading part is independent when its differential is, at generic points, outside the
+        span of the differentials of those before it; otherwise it is a function of them.
+        """
+        if self.space.leading.shape[1] == 0:
+            return Representatives([], [])
+        some = slice(None, None, max(1, len(samples.q) // 40))
+        gradients = np.asarray(_differentials(self.basis, *(x[some] for x in samples)))
+        complexity = np.array(self.basis.complexity)
+        series: list[np.ndarray] = []
+        independent: list[bool] = []
+        taken: list[np.ndarray] = []
+        done = np.zeros((self.size, 0))
+        for level in sorted(set(self.basis.complexity)):
+            candidates = self._up_to(level)
+            for vector in reduced(candidates, complexity, self.blur).T:
+                leading = vector[: self.size]
+                rest = leading - done @ (done.T @ leading)
+                if np.linalg.norm(rest) <= self.blur * np.linalg.norm(leading):
+                    continue  # in the span of those before
+                done = orthonormal_range(np.column_stack([done, rest / np.linalg.norm(rest)]))
+                d = np.einsum("sbn,b->sn", gradients, leading)
+                length = np.linalg.norm(d)
+                if length < self.blur * np.linalg.norm(self.R @ leading):
+                    continue  # a constant
+                grown = self._rank_of([*taken, d / length]) == len(taken) + 1
+                if grown:
+                    taken.append(d / length)
+                series.append(vector.reshape(self.orders, self.size))
+                independent.append(grown)
+        return Representatives(series, independent)
+
+    def _up_to(self, level: int) -> np.ndarray:
+        """Series whose leading part uses no function above this complexity (user's functions)."""
+        user = self.user(self.space.leading)
+        leading = user[: self.size]
+        above = leading[np.array(self.basis.complexity) > level]
+        singular, V = _svd(above / max(np.linalg.norm(leading, 2), 1e-300))
+        singular = np.append(singular, np.zeros(len(V) - len(singular)))
+        return user @ V[singular < self.blur].T
+
+    def _rank_of(self, differentials: list[np.ndarray]) -> int:
+        """The rank of differentials, (points, 2n) each, that most points agree on."""
+        stack = np.stack(differentials, axis=1)
+        rows = stack / np.maximum(np.linalg.norm(stack, axis=-1, keepdims=True), 1e-300)
+        singular = np.linalg.svd(rows, compute_uv=False)
+        return int(np.median(np.sum(singular > max(self.blur, 1e-5), axis=-1)))
+
+    def simplest(self, series: np.ndarray) -> np.ndarray:
+        """The corrections that use complex functions as little as can be."""
+        complexity = np.tile(self.basis.complexity, self.orders)
+        simplify = reduction(self.user(self.space.shifts), complexity, self.size, self.blur)
+        return simplify(series.reshape(-1)).reshape(series.shape)
+
+    def least(self, series: np.ndarray) -> np.ndarray:
+        """The corrections that are smallest on the samples: none along what is kept anyway."""
+        columns = (self.R @ series[..., None])[..., 0].reshape(-1)
+        basis = orthonormal_range(self.space.shifts)
+        columns = columns - basis @ (basis.T @ columns)
+        return self.user(columns[:, None]).reshape(series.shape)
+
+
+def _svd(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Singular values and all right singular vectors as rows."""
+    return np.linalg.svd(matrix)[1:] if matrix.size else (np.zeros(0), np.eye(matrix.shape[1]))
+
+
+@eqx.filter_jit
+def _differentials(basis: BoundBasis, q: Any, p: Any, t: Any) -> Array:
+    """∂φ/∂(q, p) at points, shape (points, size, 2n)."""
+
+    def at_point(q, p, t):
+        slopes = jax.jacfwd(basis, argnums=(0, 1))(q, p, t)
+        return jnp.concatenate([j.reshape(basis.size, -1) for j in slopes], axis=1)
+
+    return jax.vmap(at_point)(q, p, t)

@@ -1,0 +1,211 @@
+"""Generators that everybody needs: shifts, rotations, scalings, boosts, Hamiltonian flows.
+
+They add, subtract, and multiply with numbers: ``rotation(0, 1) + 2 * time_translation()``.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._types import Args, Scalar, State
+from .generators import Generator, LatticePoint
+
+
+def time_translation() -> Generator:
+    """X = ∂/∂t: ξ0 = 1. Conserves the energy, on the variational lattice."""
+    return Generator(xi0=_one)
+
+
+def space_translation(direction: Any) -> Generator:
+    """X = a·∂/∂q: ξ = a, the same for all bodies. Conserves a·Σp.
+
+    - `direction`: a [unit of q], of the shape of q or of its last axes: (dim,) for states of
+      shape (bodies, dim).
+
+    **Raises** `ValueError` for a direction that is zero or not finite, and at the point for one
+    that does not fit q. **Source** Hydon 2014, *Difference Equations by Differential Equation
+    Methods*.
+    """
+    return Generator(xi=_Constant(_direction(direction)))
+
+
+def rotation(i: int = 0, j: int = 1) -> Generator:
+    """The rotation of axis i towards axis j: ξ = e_j q_i − e_i q_j, and η the same of p.
+
+    Axes of the last axis of q: the components of a vector, or of every body's position for
+    states of shape (bodies, dim). Conserves the angular momentum q_i p_j − q_j p_i, summed.
+
+    **Raises** `ValueError` for axes that are equal or negative, and at the point for axes that q
+    does not have. **Source** the paper, (38).
+    """
+    axes = (i, j)
+    if any(isinstance(a, bool) or not isinstance(a, int) or a < 0 for a in axes) or i == j:
+        raise ValueError(f"a rotation needs two different axes i, j ≥ 0, got {i!r} and {j!r}.")
+    return Generator(xi=_Turned(1, i, j), eta=_Turned(2, i, j))
+
+
+def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
+    """X = a t ∂/∂t + b q·∂/∂q + c p·∂/∂p: powers of one factor for t, q and p.
+
+    - `q`, `p`: weights b and c, numbers or arrays of the shape of q. `t`: weight a, a number.
+      (Kepler's third law: q = 1, p = −1/2, t = 3/2.)
+
+    **Raises** `ValueError` for weights that are not finite or all zero, or a `t` that is no
+    number. **Source** Olver 1993, *Applications of Lie Groups to Differential Equations*.
+    """
+    a, b, c = (_finite(name, x) for name, x in (("t", t), ("q", q), ("p", p)))
+    if a.shape != ():
+        raise ValueError(f"the weight of t must be a number, got an array of shape {a.shape}.")
+    if not (a.any() or b.any() or c.any()):
+        raise ValueError("a scaling needs a weight other than zero.")
+    weights = enumerate((a, b, c))
+    return Generator(*(_Scaled(i, jnp.asarray(w)) if w.any() else None for i, w in weights))
+
+
+def boost(direction: Any, mass: Any = 1.0) -> Generator:
+    """Galilei's boost: ξ = t v, η = m v. Conserves v·Σ(t p − m q), with the gauge −m v·q.
+
+    - `direction`: v [unit of q / unit of t], of the shape of q or of its last axes.
+    - `mass`: m [mass]: a number; one for each body, shape (bodies,), for states of shape
+      (bodies, dim); or an array of the shape of q.
+
+    **Raises** `ValueError` for a direction that is zero or not finite, masses that are not
+    positive, and at the point for what does not fit q. **Source** Olver 1993, Chapter 4.
+    """
+    masses = _finite("mass", mass)
+    if not (masses > 0).all():
+        raise ValueError(f"masses must be positive, got {mass!r}.")
+    v = _direction(direction)
+    return Generator(xi=_Boosted(v, None), eta=_Boosted(v, jnp.asarray(masses)))
+
+
+def hamiltonian_flow(function: Callable[..., Any]) -> Generator:
+    """The Hamiltonian vector field of a function K: ξ = ∂K/∂p, η = −∂K/∂q.
+
+    - `function`: K, function ``(t, q, p, args)`` → scalar [action]. With an invariant of the
+      map it is a symmetry of a symplectic map, and K what it conserves (gauge K − ξ·p).
+
+    **Raises** `TypeError` for what is not callable. **Source** Olver 1993, Chapter 6.
+    """
+    if not callable(function):
+        raise TypeError(f"K must be a function (t, q, p, args) → scalar, got {function!r}.")
+    return Generator(xi=_Slope(function, 2, 1.0), eta=_Slope(function, 1, -1.0))
+
+
+def bracket(first: Generator, second: Generator) -> Generator:
+    """The Lie bracket [X, Y] = XY − YX, a symmetry when both are.
+
+        [X, Y]^c = X(Y^c) − Y(X^c)    for each component c of (ξ0, ξ, η)
+
+    **Raises** `TypeError` for what is no `Generator`. **Source** Olver 1993, (1.26).
+    """
+    for generator in (first, second):
+        if not isinstance(generator, Generator):
+            raise TypeError(f"a bracket is of two Generators, got {generator!r}.")
+    return Generator(*(_Bracket(first, second, place) for place in range(3)))
+
+
+def _one(t, q, p, args):
+    return 1.0
+
+
+class _Constant(eqx.Module):
+    value: Array
+
+    def __call__(self, t, q, p, args):
+        return _fitted("direction", self.value, q)
+
+
+class _Turned(eqx.Module):
+    """The vector at `place` of (t, q, p), turned by a right angle in the plane of two axes."""
+
+    place: int = eqx.field(static=True)
+    i: int = eqx.field(static=True)
+    j: int = eqx.field(static=True)
+
+    def __call__(self, t, q, p, args):
+        v = (t, q, p)[self.place]
+        if v.ndim == 0 or v.shape[-1] <= max(self.i, self.j):
+            raise ValueError(
+                f"rotation({self.i}, {self.j}) needs q whose last axis has at least "
+                f"{max(self.i, self.j) + 1} components; q has shape {q.shape}."
+            )
+        turned = jnp.zeros_like(v).at[..., self.i].set(-v[..., self.j])
+        return turned.at[..., self.j].set(v[..., self.i])
+
+
+class _Scaled(eqx.Module):
+    place: int = eqx.field(static=True)
+    weight: Array
+
+    def __call__(self, t, q, p, args):
+        value = (t, q, p)[self.place]
+        return value * _fitted("weight", self.weight, value)
+
+
+class _Boosted(eqx.Module):
+    direction: Array
+    mass: Array | None
+
+    def __call__(self, t, q, p, args):
+        v = _fitted("direction", self.direction, q)
+        if self.mass is None:
+            return t * v
+        mass = self.mass
+        if mass.ndim == 1 and q.ndim == 2 and len(mass) == len(q):
+            mass = mass[:, None]  # one for each body
+        return _fitted("mass", mass, q) * v
+
+
+class _Slope(eqx.Module):
+    function: Callable[..., Any]
+    argnum: int = eqx.field(static=True)
+    sign: float = eqx.field(static=True)
+
+    def __call__(self, t, q, p, args):
+        return self.sign * jax.grad(self.function, argnums=self.argnum)(t, q, p, args)
+
+
+class _Bracket(eqx.Module):
+    first: Generator
+    second: Generator
+    place: int = eqx.field(static=True)
+
+    def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Array:
+        point = LatticePoint(t, q, p)
+
+        def derivative(along, of):
+            component = lambda at: of(at, args)[self.place]  # noqa: E731
+            return jax.jvp(component, (point,), (along(point, args),))[1]
+
+        return derivative(self.first, self.second) - derivative(self.second, self.first)
+
+
+def _finite(name: str, value: Any) -> np.ndarray:
+    array = np.asarray(value, float)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {value!r}.")
+    return array
+
+
+def _direction(value: Any) -> Array:
+    direction = _finite("direction", value)
+    if not direction.any():
+        raise ValueError("the direction must not be zero.")
+    return jnp.asarray(direction)
+
+
+def _fitted(name: str, value: Array, q: State) -> Array:
+    """The value with the shape of q, if that can be."""
+    try:
+        return jnp.broadcast_to(value, q.shape).astype(q.dtype)
+    except ValueError:
+        raise ValueError(
+            f"{name} of shape {value.shape} does not fit q of shape {q.shape}: give that shape or "
+            "the one of its last axes."
+        ) from None

@@ -1,0 +1,575 @@
+"""Discovery of adiabatic invariants on the map that is iterated."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+from dvi_jax import systems
+
+H_D = systems.oscillator().system.H_D
+SPRING = dvi.System(H_D, force=lambda t0, t1, q, p, args: -q)
+CUBIC = dvi.System(H_D, force=lambda t0, t1, q, p, args: -(q**3))
+VAN_DER_POL = dvi.System(H_D, force=lambda t0, t1, q, p, args: (1 - q**2) * p)
+
+
+def box(n, count, seed=0, low=-1.0, high=1.0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(low, high, (count, n)), rng.uniform(low, high, (count, n))
+
+
+@functools.cache
+def found(name, degree, order, representative="least"):
+    system = {"spring": SPRING, "cubic": CUBIC, "van_der_pol": VAN_DER_POL}[name]
+    return dvi.discover_invariants(
+        system,
+        dvi.Polynomials(degree),
+        order,
+        h=0.1,
+        samples=box(1, 300),
+        representative=representative,
+    )
+
+
+def test_undisturbed_map_keeps_its_quadratic_form():
+    d = found("cubic", 8, 0)
+    assert d.survivors == (4,)  # the form and its powers up to degree 8
+    assert d.count == 1  # which are functions of it
+    assert str(d.invariants[0]) == "0.5 q² − 0.05 q p + 0.5 p²"
+    assert np.max(d.residuals) < 1e-12
+    assert d.gap > 1e8
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_cubic_disturbance_has_invariants_of_every_order(order):
+    d = found("cubic", 8, order, "simplest")
+    assert d.survivors == (4, 3, 2)[: order + 1]
+    assert d.count == 1
+    assert np.max(d.residuals) < 1e-12
+    # Leading part as before, and the potential q⁴/4 of the disturbance up to O(h).
+    names = list(d.basis.names)
+    assert d.coefficients[0, 0, names.index("p²")] == pytest.approx(0.5, abs=1e-10)
+    assert d.coefficients[0, 1, names.index("q⁴")] == pytest.approx(0.25, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("order", "slope", "within"),
+    [
+        (0, 1.0, 0.02),
+        (1, 2.0, 0.02),
+        (2, 3.0, 0.03),
+        pytest.param(3, 4.0, 0.4, marks=pytest.mark.slow),
+    ],
+)
+def test_drift_has_the_order_promised(order, slope, within):
+    d = found("cubic", 8, order)
+    assert np.max(d.residuals) < 1e-12
+    measured = dvi.drift_order(
+        CUBIC,
+        d.invariants[0],
+        [0.4],
+        [0.3],
+        epsilons=1e-3 * 2.0 ** np.arange(6),
+        h=0.1,
+        num_steps=20_000,
+    )
+    assert measured.used.sum() >= 3
+    assert abs(measured.slope - slope) < within
+    assert measured.successful.all()
+
+
+def test_the_least_and_the_simplest_corrections_differ_by_what_is_kept():
+    """And the simplest ones, which happen to be nearly exact here, drift far less."""
+    least, simplest = found("cubic", 8, 1), found("cubic", 8, 1, "simplest")
+    np.testing.assert_allclose(least.coefficients[0, 0], simplest.coefficients[0, 0], atol=1e-12)
+    difference = np.asarray(least.coefficients[0, 1] - simplest.coefficients[0, 1])
+    q, p = box(1, 50, seed=7)
+    series = dvi.InvariantSeries(least.basis, jnp.asarray(difference)[None])
+    q1, p1 = q + 0.1 * (p - 0.1 * q), p - 0.1 * q  # the undisturbed map
+    values = jax.vmap(lambda q, p: series.evaluate(q, p, 0.0))
+    np.testing.assert_allclose(values(q1, p1), values(q, p), atol=1e-13)
+    assert np.std(values(q, p)) > 1e-2
+    with pytest.raises(ValueError, match="'least' or 'simplest'"):
+        found("cubic", 8, 0, "best")
+
+
+def test_exact_invariant_of_the_disturbed_spring():
+    """(p² + (1+ε)q² − h(1+ε)qp)/2, ε included and at every order after the first nothing."""
+    d = found("spring", 4, 2)
+    assert str(d.invariants[0]) == "0.5 q² − 0.05 q p + 0.5 p² + ε (0.5 q² − 0.05 q p)"
+    assert d.exact == (True,)
+    assert "exact at every ε tried" in str(d)
+    assert found("cubic", 8, 1).exact == (False,)
+    measured = dvi.drift_order(
+        SPRING, d.invariants[0], [0.4], [0.3], epsilons=[0.01, 0.1, 0.3], h=0.1, num_steps=2000
+    )
+    assert not measured.used.any()  # all on the round-off floor
+    assert np.isnan(measured.slope)
+    assert np.max(measured.drifts) < 1e-14
+
+
+def test_van_der_pol_loses_the_amplitude_and_says_how():
+    """Averaged: D(A) = εh(A − A²/2)-like in A = |z|²/2, so the limit cycle has amplitude 2."""
+    d = found("van_der_pol", 6, 2)
+    assert d.survivors == (3, 0, 0)
+    assert d.count == 0
+    law = d.obstructions[0]
+    assert law.order == 1
+    assert law.leading == "0.5 q² − 0.05 q p + 0.5 p²"
+    assert law.residual < 1e-10
+    names = list(d.basis.names)
+    at = lambda name: law.coefficients[names.index(name)]  # noqa: E731
+    # on a circle of radius r: r²·0.05 − r⁴·0.0125 = 0 at r = 2, up to O(h²)
+    radius = np.sqrt(-at("p²") / at("p⁴"))
+    assert radius == pytest.approx(2.0, abs=0.01)
+    assert "lost at order 1 (dissipation)" in str(d)
+    # as a law of I = (p² + q² − hqp)/2 itself: I is at rest at 2, up to O(h²)
+    assert law.kind == "dissipation"
+    np.testing.assert_allclose(law.powers, [0, 0.1, -0.05], atol=2e-4)
+    np.testing.assert_allclose(law.rest, [2.0], atol=0.01)
+
+
+@pytest.mark.parametrize("start", [0.5, 3.0])
+def test_van_der_pol_settles_where_its_law_is_at_rest(start):
+    """Negative control of the same law: a start elsewhere does not stay."""
+    law = found("van_der_pol", 6, 2).obstructions[0]
+    form = dvi.InvariantSeries(
+        found("van_der_pol", 6, 2).basis, jnp.asarray(law.leading_coefficients)[None]
+    )
+    sol = dvi.integrate(
+        VAN_DER_POL, [start], [0.0], h=0.1, num_steps=20_000, epsilon=0.02, observe={"I": form}
+    )
+    assert sol.observed["I"][-1] == pytest.approx(law.rest[0], rel=0.02)
+    assert abs(sol.observed["I"][0] / law.rest[0] - 1) > 0.5
+
+
+def test_kepler_angular_momentum_is_exact_and_found_alone():
+    k = systems.kepler()
+    rng = np.random.default_rng(1)
+    angle, r = rng.uniform(0, 2 * np.pi, 400), rng.uniform(0.8, 2.0, 400)
+    q = np.stack([r * np.cos(angle), r * np.sin(angle)], 1)
+    samples = (q, rng.uniform(-1, 1, (400, 2)))
+    radius = dvi.Basis({"1/r": lambda q, p: 1 / jnp.sqrt(q @ q)})
+    d = dvi.discover_invariants(
+        k.system, dvi.Polynomials(2) + radius, 1, h=0.1, samples=samples, args=k.args
+    )
+    assert d.count == 1
+    assert str(d.invariants[0]) in ("0.5 q1 p2 − 0.5 q2 p1", "−0.5 q1 p2 + 0.5 q2 p1")
+    value = d.evaluate(np.array([0.0, 1.2]), np.array([-1.0, -0.6]), 0.3)
+    np.testing.assert_allclose(np.abs(value), [0.6], rtol=1e-9)
+
+
+@functools.cache
+def bound_orbits(count=400, seed=0):
+    """Kepler orbits with 0.9 < a < 1.2, e < 0.4, either way round, at any anomaly."""
+    rng = np.random.default_rng(seed)
+    a, e = rng.uniform(0.9, 1.2, count), rng.uniform(0.05, 0.4, count)
+    E, turn = rng.uniform(0, 2 * np.pi, (2, count))
+    b, n = a * np.sqrt(1 - e**2), a**-1.5
+    z = a * (np.cos(E) - e) + 1j * b * np.sin(E)
+    v = (-a * np.sin(E) + 1j * b * np.cos(E)) * n / (1 - e * np.cos(E))
+    z, v = z * np.exp(1j * turn), v * np.exp(1j * turn)
+    way = rng.choice([-1, 1], count)
+    return np.stack([z.real, way * z.imag], 1), np.stack([v.real, way * v.imag], 1)
+
+
+WITH_RADIUS = dvi.Polynomials(3) + (
+    dvi.Polynomials(1, variables=["q1", "q2"], constant=True) * dvi.Radial()
+)
+
+
+@functools.cache
+def kepler_nearly(method, h):
+    k = systems.kepler()
+    return dvi.discover_invariants(
+        k.system,
+        WITH_RADIUS,
+        h=h,
+        samples=bound_orbits(),
+        args=k.args,
+        method=method,
+        tolerance=1e-2,
+    )
+
+
+@pytest.mark.parametrize("method", [dvi.TypeII(), dvi.Strang()])
+def test_energy_and_lrl_vector_are_approximate_with_residuals_of_the_methods_order(method):
+    coarse, fine = kepler_nearly(method, 0.04), kepler_nearly(method, 0.02)
+    for d in (coarse, fine):
+        assert d.survivors == (4,)
+        leading = [
+            str(s.formula(3, 0.03)).split(" + …")[0]
+            for s in (*d.invariants, *d.dependent_invariants)
+        ]
+        assert leading[0] in ("0.5 q1 p2 − 0.5 q2 p1", "−0.5 q1 p2 + 0.5 q2 p1")
+        text = " ".join(leading)
+        assert all(name in text for name in ("p1²", " 1/r", "q1 1/r", "q2 1/r"))
+    # what is zero only up to O(h^r): singular values, and the change in a step times h
+    np.testing.assert_array_less(coarse.singular_values[-1], 1e-14)
+    rate = coarse.singular_values[-4:-1] / fine.singular_values[-4:-1]
+    np.testing.assert_allclose(np.log2(rate), method.order, atol=0.25)
+    residual = np.max(coarse.residuals[1:]) / np.max(fine.residuals[1:])
+    assert np.log2(residual) == pytest.approx(method.order + 1, abs=0.6)
+    assert coarse.residuals[0] < 1e-13
+
+
+def test_without_a_tolerance_only_angular_momentum_is_kept():
+    k = systems.kepler()
+    for h in (0.02, 0.2):
+        d = dvi.discover_invariants(
+            k.system, WITH_RADIUS, 1, h=h, samples=bound_orbits(), args=k.args
+        )
+        assert d.survivors == (1, 1)
+        assert d.exact == (True,)
+        L = np.asarray(d.coefficients[0, 0]) != 0
+        big = np.abs(np.asarray(d.coefficients[0])) > 1e-10
+        assert {n for n, x in zip(d.basis.names, big[0], strict=True) if x} == {"q1 p2", "q2 p1"}
+        assert not big[1].any()
+        assert L.any()
+
+
+def test_lrl_vector_turns_as_perturbation_theory_says():
+    """W = −q: averaged over the ellipse the perihelion moves at −(3/2)√(1 − e²)/n per ε.
+
+    (From H1 = |q|²/2 with mean a²(1 + 3e²/2)/2 and dϖ/dt = √(1−e²)/(n a² e) · (−∂⟨H1⟩/∂e).)
+    The vector is the discovered one.
+    """
+    k = systems.kepler()
+    d = kepler_nearly(dvi.Strang(), 0.02)
+    x, y = (
+        next(s for s in (*d.invariants, *d.dependent_invariants) if name in s.formula(3, 0.03))
+        for name in ("q1 1/r", "q2 1/r")
+    )
+    # scaled to unit coefficient of q/r, pointing to the perihelion: (−) p × L + q/r
+    scale = [
+        -2 * s.coefficients[0, d.basis.names.index(n)] for s, n in ((x, "q1 1/r"), (y, "q2 1/r"))
+    ]
+
+    def angle(t0, t1, q0, p0, q1, p1, args):
+        A = [s.evaluate(q1, p1, 0.0) / c for s, c in ((x, scale[0]), (y, scale[1]))]
+        return jnp.arctan2(A[1], A[0])
+
+    e, h = 0.3, 0.02
+    turn = {}
+    for epsilon in (0.0, 1e-4):
+        sol = dvi.integrate(
+            k.system,
+            [1 - e, 0.0],
+            [0.0, np.sqrt((1 + e) / (1 - e))],
+            h=h,
+            num_steps=60_000,
+            epsilon=epsilon,
+            args=k.args,
+            method=dvi.Strang(),
+            observe={"turn": dvi.Trend(angle)},
+        )
+        turn[epsilon] = float(sol.observed["turn"])
+    measured = (turn[1e-4] - turn[0.0]) / 1e-4
+    assert measured == pytest.approx(-1.5 * np.sqrt(1 - e**2), rel=0.01)
+
+
+OMEGA = dvi.System(
+    lambda t0, t1, q, p, args: (p @ p + (1 + 0.3 * jnp.sin(t0)) ** 2 * (q @ q)) / 2, slow_time=True
+)
+QUADRATICS = dvi.Basis(
+    {"q²": lambda q, p: q[0] ** 2, "q p": lambda q, p: q[0] * p[0], "p²": lambda q, p: p[0] ** 2}
+)
+
+
+@functools.cache
+def slow_oscillator(tolerance=1e-5):
+    tau = np.random.default_rng(5).uniform(0, 2 * np.pi, 600)
+    samples = (*box(1, 600), tau)
+    basis = QUADRATICS * dvi.Chebyshev(24, "τ", domain=(0, 2 * np.pi))
+    return samples, dvi.discover_invariants(
+        OMEGA, basis, 2, h=0.1, samples=samples, tolerance=tolerance
+    )
+
+
+def distance(values, reference):
+    """Relative distance of two functions on the samples, up to a factor."""
+    factor = values @ reference / (values @ values)
+    return np.linalg.norm(factor * values - reference) / np.linalg.norm(reference)
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-5, 1e-4])
+def test_slowly_varying_oscillator_keeps_its_discrete_action_alone(tolerance):
+    (q, p, tau), d = slow_oscillator(tolerance)
+    assert d.survivors[1:] == (1, 1)
+    assert d.survivors[0] > 10
+    assert d.count == 1
+    leading = dvi.InvariantSeries(d.basis, d.coefficients[0, :1], True)
+    values = np.asarray(jax.vmap(lambda q, p, t: leading.evaluate(q, p, 0.0, t))(q, p, tau))
+    q, p, h, w = q[:, 0], p[:, 0], 0.1, 1 + 0.3 * np.sin(tau)
+    twice_energy = p**2 + w**2 * q**2 - h * w**2 * q * p
+    assert distance(values, twice_energy / (w * np.sqrt(1 - h**2 * w**2 / 4))) < 1e-5
+    assert 3e-4 < distance(values, twice_energy / w) < 3e-3
+    assert all(law.kind == "slow time" for law in d.obstructions)
+    assert len(d.obstructions) > 10
+
+
+def test_action_drifts_less_the_higher_its_order():
+    """As an observable of the run: bound to the slow time there.
+
+    Slopes 1 and 2; at order 2 what 24 Chebyshev polynomials leave out of ω(τ) takes over.
+    """
+    _, d = slow_oscillator()
+    drift = {}
+    for order in (0, 1, 2):
+        series = dvi.InvariantSeries(d.basis, d.coefficients[0, : order + 1], True)
+        for epsilon in (0.02, 0.04):
+            sol = dvi.integrate(
+                OMEGA,
+                [0.4],
+                [0.3],
+                h=0.1,
+                num_steps=500,
+                epsilon=epsilon,
+                observe={"J": dvi.MaxDrift(series)},
+            )
+            drift[order, epsilon] = float(sol.observed["J"])
+    slopes = [np.log2(drift[m, 0.04] / drift[m, 0.02]) for m in (0, 1)]
+    np.testing.assert_allclose(slopes, [1, 2], atol=0.1)
+    assert drift[2, 0.02] < drift[1, 0.02] / 3
+
+
+def vector_potential(q):
+    """B = 1 + εx: A = A0 + εA1 + O(ε²)."""
+    return jnp.stack([-q[1], q[0]]) / 2, jnp.stack([-q[0] * q[1], q[0] ** 2]) / 3
+
+
+def magnetic():
+    def H_D(t0, t1, q, p, args):
+        return jnp.sum((p - vector_potential(q)[0]) ** 2) / 2
+
+    def first_order(t0, t1, q, p, args):
+        A0, A1 = vector_potential(q)
+        return -jnp.sum((p - A0) * A1)
+
+    return dvi.System(H_D, perturbation=first_order)
+
+
+def in_span(columns, target):
+    """How far the target (samples,) is outside of the span of the columns (samples, k)."""
+    rest = target - columns @ np.linalg.lstsq(columns, target, rcond=None)[0]
+    return np.linalg.norm(rest) / np.linalg.norm(target)
+
+
+def test_magnetic_moment_survives_order_one_and_the_guiding_centre_drifts():
+    """v²/2 is among what is kept; across grad B the centre moves at v²/2, the textbook drift."""
+    system, h = magnetic(), 0.05
+    samples = box(2, 300)
+    d = dvi.discover_invariants(system, dvi.Polynomials(3), 1, h=h, samples=samples)
+    assert d.survivors == (12, 3)
+    assert np.max(d.residuals) < 1e-12
+    values = np.asarray(jax.vmap(d.basis)(*samples))
+    q, p = samples
+    A0 = np.stack([-q[:, 1], q[:, 0]], 1) / 2
+    v2 = np.sum((p - A0) ** 2, axis=1)
+    kept = values @ d.leading_parts.T
+    assert in_span(kept, v2) < 1e-10  # the implicit map keeps it as it is, at any h
+    assert in_span(kept, p[:, 0] - q[:, 1] / 2) > 0.5
+    law = next(o for o in d.obstructions if o.leading == "−0.25 q2 + 0.5 p1")
+    assert law.kind == "resonance"
+    # that is 0.5 (p1 − q2/2) = −Y/2: dY/dt = −ε v²/2 for B = 1 + εx and charge 1
+    np.testing.assert_allclose(values @ law.coefficients, -h * v2 / 4, rtol=0.01)
+
+
+@pytest.mark.slow
+def test_first_correction_of_the_magnetic_moment():
+    """μ = v²/2 B at the guiding centre: −v·A1 + functions of what order 0 keeps, as h → 0."""
+    samples = box(2, 400)
+    q, p = samples
+    A0, A1 = (np.asarray(a) for a in jax.vmap(vector_potential)(q))
+    H1 = -np.sum((p - A0) * A1, axis=1)
+    off = []
+    for h in (0.02, 0.01):
+        d = dvi.discover_invariants(magnetic(), dvi.Polynomials(4), 2, h=h, samples=samples)
+        assert d.survivors == (21, 5, 1)
+        undisturbed = dvi.discover_invariants(magnetic(), dvi.Polynomials(3), h=h, samples=samples)
+        names = list(d.basis.names)
+        values = np.asarray(jax.vmap(d.basis)(*samples))
+        leading, first = np.asarray(d.coefficients[0, :2])
+        leading, first = (
+            leading / (2 * leading[names.index("p1²")]),
+            first / (2 * leading[names.index("p1²")]),
+        )
+        v2 = np.sum((p - A0) ** 2, axis=1)
+        np.testing.assert_allclose(values @ leading, v2 / 2, atol=1e-9)
+        few = np.asarray(jax.vmap(undisturbed.basis)(*samples))
+        kept = np.column_stack([few @ undisturbed.leading_parts.T, np.ones(len(q))])
+        off.append(in_span(np.column_stack([kept, values @ first]), H1))
+    assert off[1] < 0.02
+    assert off[0] / off[1] == pytest.approx(2.0, abs=0.2)
+
+
+def test_an_invariant_leads_back_to_a_symmetry():
+    """The symplectic gradient satisfies the determining equations where the map is symplectic."""
+    d = found("cubic", 8, 2)
+    series = d.invariants[0]
+    q, p = jnp.array([0.4]), jnp.array([0.3])
+
+    def residual(series, epsilon):
+        p1 = p - 0.1 * (q + epsilon * q**3)
+        q1 = q + 0.1 * p1
+        return np.max(
+            np.abs(
+                dvi.determining_residual(
+                    CUBIC, series.generators, (0.0, q, p), (0.1, q1, p1), epsilon=epsilon
+                )
+            )
+        )
+
+    left = [residual(series, e) for e in (0.02, 0.04)]
+    assert left[1] < 1e-4
+    assert np.log2(left[1] / left[0]) == pytest.approx(3, abs=0.1)
+    wrong = dvi.InvariantSeries(series.basis, series.coefficients.at[1].mul(1.1))
+    assert np.log2(residual(wrong, 0.04) / residual(wrong, 0.02)) == pytest.approx(1, abs=0.2)
+    slow = dvi.InvariantSeries(
+        slow_oscillator()[1].basis, slow_oscillator()[1].coefficients[0], True
+    )
+    with pytest.raises(ValueError, match="slow time"):
+        _ = slow.generators
+
+
+def test_a_discovery_is_saved_and_loaded(tmp_path):
+    for d, basis in (
+        (found("van_der_pol", 6, 2), dvi.Polynomials(6)),
+        (found("cubic", 8, 1), dvi.Polynomials(8)),
+    ):
+        path = tmp_path / "found.npz"
+        d.save(path)
+        back = dvi.Discovery.load(path, basis)
+        assert str(back) == str(d)
+        np.testing.assert_array_equal(back.coefficients, d.coefficients)
+        np.testing.assert_array_equal(
+            back.evaluate(np.array([0.3]), np.array([0.2]), 0.1),
+            d.evaluate(np.array([0.3]), np.array([0.2]), 0.1),
+        )
+    with pytest.raises(ValueError, match="basis of 44 functions"):
+        dvi.Discovery.load(path, dvi.Polynomials(4))
+    path.write_bytes(b"something else")
+    with pytest.raises(ValueError, match="no file that Discovery"):
+        dvi.Discovery.load(path, dvi.Polynomials(4))
+
+
+def test_an_order_that_the_basis_cannot_express_is_told():
+    d = found("cubic", 2, 1)
+    assert d.survivors == (1, 0)
+    assert d.count == 0
+    assert d.obstructions[0].kind == "unexplained"
+    assert "it may be too small" in str(d)
+
+
+def test_functions_of_one_another_are_kept_apart():
+    d = found("cubic", 8, 0)
+    assert len(d.dependent) == 3
+    q, p = box(1, 40)
+    form = jax.vmap(lambda q, p: d.invariants[0].evaluate(q, p, 0.0))(q, p)
+    for k, power in enumerate(d.dependent_invariants, 2):
+        values = np.asarray(jax.vmap(lambda q, p: power.evaluate(q, p, 0.0))(q, p))  # noqa: B023
+        columns = np.stack([np.asarray(form) ** j for j in range(1, k + 1)], 1)
+        assert in_span(columns, values) < 1e-10
+        assert in_span(columns[:, :-1], values) > 1e-3
+    np.testing.assert_array_less(d.dependent_residuals, 1e-12)
+
+
+def test_discovery_goes_through_an_implicit_composed_map():
+    """Strang on H = (q² + 1)(p² + 1)/2 at small h: nothing exact in quadratics, and it says so."""
+    system = dvi.System(lambda t0, t1, q, p, args: jnp.sum((q**2 + 1) * (p**2 + 1)) / 2)
+    d = dvi.discover_invariants(
+        system, dvi.Polynomials(2), h=0.1, samples=box(1, 60), method=dvi.Strang()
+    )
+    assert d.count == 0
+    assert d.singular_values[-1] > 1e-4
+
+
+def test_series_differentiates_batches_and_refuses_to_guess():
+    series = found("cubic", 8, 1).invariants[0]
+    q, p = jnp.array([0.4]), jnp.array([0.3])
+    slope = jax.grad(series.evaluate, argnums=2)(q, p, 0.1)
+    np.testing.assert_allclose(slope, series.coefficients[1] @ series.basis(q, p), rtol=1e-12)
+    with pytest.raises(ValueError, match="know ε"):
+        series(0.0, 0.1, q, p, q, p, None)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"samples": box(1, 12)}, "too few"),
+        ({"samples": (np.ones((50, 1)), np.ones((50, 2)))}, "one shape"),
+        ({"samples": (np.full((50, 1), np.nan), np.ones((50, 1)))}, "not finite"),
+        ({"samples": 100}, "pair"),
+        ({"order": -1}, "at least 0"),
+        ({"tolerance": 2.0}, "between 0 and 1"),
+        ({"basis": dvi.Chebyshev(3, "t")}, "all samples are of one time"),
+        ({"samples": (*box(1, 60), np.zeros(50))}, "times of 60 samples"),
+        ({"basis": dvi.Polynomials(2) + dvi.Polynomials(1)}, "rank-deficient"),
+        ({"basis": dvi.Basis([lambda q, p: 1 / (0 * q[0])])}, "'f1' is not finite"),
+        ({"samples": (np.zeros((50, 1)), np.zeros((50, 1)))}, "rank-deficient"),
+    ],
+)
+def test_bad_input_is_named(change, match):
+    given = {"basis": dvi.Polynomials(3), "order": 0, "samples": box(1, 60), **change}
+    with pytest.raises(ValueError, match=match):
+        dvi.discover_invariants(SPRING, h=0.1, **given)
+
+
+def test_a_step_that_fails_on_a_sample_is_reported():
+    system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - jnp.sum(jnp.sqrt(q)))
+    with pytest.raises(ValueError, match="step fails at"):
+        dvi.discover_invariants(system, dvi.Polynomials(2), h=0.1, samples=box(1, 60))
+
+
+def test_drift_order_refuses_what_has_no_logarithm():
+    with pytest.raises(ValueError, match="positive"):
+        dvi.drift_order(SPRING, H_D, [0.1], [0.1], epsilons=[0.0, 0.1], h=0.1, num_steps=2)
+
+
+@pytest.mark.slow
+def test_henon_heiles_keeps_two_of_four_quadratics():
+    """The isotropic oscillator has four quadratic invariants; at order 2 energy and L are left."""
+    system = dvi.System(
+        H_D, perturbation=lambda t0, t1, q, p, args: q[0] ** 2 * q[1] - q[1] ** 3 / 3
+    )
+    d = dvi.discover_invariants(
+        system, dvi.Polynomials(4), 2, h=0.1, samples=box(2, 400, low=-1, high=1)
+    )
+    quadratic = np.array(d.basis.complexity) == 2
+    above = np.array(d.basis.complexity) > 2
+
+    def quadratics(leading):
+        return len(leading) - np.linalg.matrix_rank(leading[:, above], tol=1e-8)
+
+    assert d.survivors == (13, 4, 2)
+    assert quadratics(d.leading_parts) == 2
+    assert d.gap > 1e10
+    assert d.count == 2
+    assert np.max(d.residuals) < 1e-12
+    momentum, energy = np.asarray(d.coefficients)[:, 0, quadratic]
+    names = np.array(d.basis.names)[quadratic]
+    L = {n: c for n, c in zip(names, momentum, strict=True) if abs(c) > 1e-10}
+    E = {n: c for n, c in zip(names, energy, strict=True) if abs(c) > 1e-10}
+    assert set(L) == {"q1 p2", "q2 p1"}
+    assert L["q1 p2"] == pytest.approx(-L["q2 p1"], abs=1e-10)
+    assert set(E) == {"q1²", "q1 p1", "q2²", "q2 p2", "p1²", "p2²"}
+    assert E["q1 p1"] == pytest.approx(-0.05, abs=1e-10)
+
+
+def test_what_is_no_basis_no_step_or_no_observable_is_refused():
+    samples = box(1, 60)
+    for nothing in (dvi.Polynomials, [lambda q, p: q[0]]):
+        with pytest.raises(TypeError, match="must be a basis"):
+            dvi.discover_invariants(SPRING, nothing, h=0.1, samples=samples)
+    with pytest.raises(ValueError, match="other than zero"):
+        dvi.discover_invariants(SPRING, dvi.Polynomials(2), h=0.0, samples=samples)
+    with pytest.raises(TypeError, match="take one of its"):
+        dvi.drift_order(
+            SPRING, found("cubic", 8, 0), [0.1], [0.1], epsilons=[0.1], h=0.1, num_steps=2
+        )
+    for bad in ([], dvi.Generator()):
+        with pytest.raises(ValueError, match="one Generator for each order"):
+            dvi.solve_gauge(SPRING, bad, dvi.Polynomials(2), h=0.1, samples=samples)

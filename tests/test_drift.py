@@ -1,0 +1,345 @@
+"""Measured orders: slopes, what is excluded and why, failed starts, intervals, surfaces."""
+
+import functools
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from scipy import special
+
+import dvi_jax as dvi
+from dvi_jax import plot, systems
+from dvi_jax.invariants import drift
+
+OSCILLATOR = systems.oscillator()
+CUBIC = dvi.System(OSCILLATOR.system.H_D, force=lambda t0, t1, q, p, args: -(q**3))
+ENERGY = OSCILLATOR.observables["energy"]
+KEPT = OSCILLATOR.observables["map_invariant"]
+"""(p² + q² − h q p)/2: kept exactly for ε = 0, so it drifts as ε."""
+
+EPSILONS = np.geomspace(1e-4, 1e-1, 10)
+STARTS = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 8, 1))
+
+
+def no_invariant(t0, t1, q0, p0, q1, p1, args):
+    """A function that nothing keeps."""
+    return jnp.sin(3 * q1[0] + p1[0] ** 2) + q1[0]
+
+
+def sweep(observable=KEPT, starts=STARTS, **change):
+    given = {"epsilons": EPSILONS, "h": 0.1, "num_steps": 1000, "batched": True, **change}
+    return dvi.drift_order(CUBIC, observable, *starts, **given)
+
+
+@functools.cache
+def usual():
+    return sweep()
+
+
+def synthetic(drifts, floor=1e-15, epsilons=EPSILONS):
+    """The fit to given drifts of one start."""
+    lanes = np.append(drifts, floor)[:, None]
+    good = np.full(lanes.shape, "successful")
+    given = drift._Lanes(lanes, np.ones_like(lanes), good, 1000, 2.0**-52)
+    return drift._order(np.asarray(epsilons), given, np.array([True]))
+
+
+def test_kept_form_of_the_map_drifts_to_first_order():
+    measured = usual()
+    assert measured.used.all()
+    assert measured.slope == pytest.approx(1, abs=0.01)
+    assert measured.limit == pytest.approx(1, abs=1e-3)
+    assert measured.floor_cause == "round-off"
+    assert measured.floor < 1e-14
+    assert (measured.statuses == "successful").all()
+    assert str(measured).startswith("drift ∝ ε^0.99")
+    assert "; for ε → 0 it tends to ε^" in str(measured)
+
+
+@pytest.mark.parametrize("observable", [ENERGY, no_invariant])
+def test_mesh_plateau_is_excluded_and_said(observable):
+    """Negative controls: what the undisturbed map does not keep has no order in ε."""
+    measured = sweep(observable)
+    assert not measured.used.any()
+    assert set(measured.excluded) == {"mesh"}
+    assert np.isnan([measured.slope, measured.stderr, *measured.interval, measured.limit]).all()
+    assert abs(measured.slope_of_all) < 0.05
+    assert "no order: 0 of 10 points" in str(measured)
+    assert "10 at ε = 0.0001 … 0.1, within ten times of the drift at ε = 0" in str(measured)
+
+
+def test_drift_is_the_largest_over_the_starts():
+    measured = usual()
+    assert measured.start_drifts.shape == measured.statuses.shape == (11, 8)
+    np.testing.assert_array_equal(measured.drifts, measured.start_drifts[:-1].max(axis=1))
+    alone = sweep(starts=STARTS[:, 3], batched=False)
+    np.testing.assert_allclose(alone.drifts, measured.start_drifts[:-1, 3], rtol=1e-9)
+    assert alone.kept.shape == (1,)
+
+
+def test_a_start_that_fails_is_reported_and_harms_no_neighbour():
+    starts = STARTS.copy()
+    starts[:, 3] = 50.0
+    measured = sweep(starts=starts)
+    failed = measured.statuses[:-1, 3] != "successful"
+    assert failed[-1]  # blows up at ε = 0.1
+    assert measured.statuses[-1, 3] == "successful"  # but not undisturbed
+    np.testing.assert_array_equal(measured.kept, np.arange(8) != 3)
+    np.testing.assert_array_equal(measured.successful, ~failed)
+    others = measured.kept
+    np.testing.assert_array_equal(measured.start_drifts[:, others], usual().start_drifts[:, others])
+    assert np.isnan(measured.start_drifts[:-1, 3][failed]).all()
+    np.testing.assert_array_equal(measured.drifts, measured.start_drifts[:-1, others].max(axis=1))
+    assert measured.slope == pytest.approx(1, abs=0.01)
+    assert "left out: 1 of 8 starts (not_finite): number 3" in str(measured)
+
+
+def test_an_epsilon_at_which_most_starts_fail_is_excluded():
+    epsilons = np.append(EPSILONS, 1e6)
+    measured = sweep(epsilons=epsilons)
+    assert measured.excluded.tolist() == [""] * 10 + ["failed"]
+    assert np.isnan(measured.drifts[-1])
+    assert measured.kept.all()
+    np.testing.assert_array_equal(measured.drifts[:-1], usual().drifts)
+    assert measured.slope == usual().slope
+    assert "excluded: 1 at ε = 1e+06, too many of the starts failed" in str(measured)
+
+
+def test_nothing_is_concluded_without_an_undisturbed_run():
+    measured = sweep(starts=np.full((2, 1, 1), 0.1), h=3.0)  # beyond the stability limit
+    assert (measured.statuses == "not_finite").all()
+    assert set(measured.excluded) == {"failed"}
+    assert np.isnan(measured.slope)
+    assert np.isnan(measured.floor)
+    assert measured.floor_cause == "failed"
+
+
+def test_an_observable_that_is_not_finite_is_a_failure():
+    starts = STARTS.copy()
+    starts[:, 2] = 0.0  # stays at rest: log 0
+    measured = sweep(lambda *step: jnp.log(KEPT(*step)), starts)
+    assert (measured.statuses[:, 2] == "observable_not_finite").all()
+    assert measured.kept.sum() == 7
+    assert measured.used.sum() >= 9
+    assert "(observable_not_finite): number 2" in str(measured)
+
+
+def test_a_plateau_that_the_undisturbed_run_does_not_show_is_excluded():
+    rng = np.random.default_rng(1)
+    epsilons = np.geomspace(1e-5, 1, 26)
+    noise = 1e-9 * np.exp(0.3 * rng.standard_normal(26))
+    measured = synthetic(noise + 1e-2 * epsilons**2, epsilons=epsilons)
+    flat = measured.excluded == "flat"
+    assert flat.sum() >= 5
+    np.testing.assert_array_equal(flat, np.arange(26) < flat.sum())
+    assert not (set(measured.excluded) - {"", "flat"})
+    low, high = measured.interval
+    assert low - 0.05 < 2 < high + 0.05
+    everything_flat = synthetic(np.full(10, 1e-3))
+    assert set(everything_flat.excluded) == {"flat"}
+    assert everything_flat.slope_of_all == pytest.approx(0, abs=1e-12)
+
+
+def test_saturation_at_large_epsilon_is_no_plateau():
+    epsilons = np.geomspace(1e-4, 10, 20)
+    assert synthetic(epsilons / (1 + 100 * epsilons), epsilons=epsilons).used.all()
+
+
+def test_points_near_round_off_are_excluded():
+    measured = synthetic(EPSILONS**3 + 1e-15)
+    assert measured.floor_cause == "round-off"
+    np.testing.assert_array_equal(measured.used, EPSILONS**3 > 1e-14)
+    assert measured.slope == pytest.approx(3, abs=0.02)
+
+
+@pytest.mark.parametrize("points", [1, 2])
+def test_fewer_than_three_points_give_no_slope(points):
+    measured = synthetic(EPSILONS[:points] * 1e-3, epsilons=EPSILONS[:points])
+    assert measured.used.all()
+    assert np.isnan([measured.slope, *measured.interval]).all()
+    assert f"no order: {points} of {points} points can be used, 3 are needed" in str(measured)
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 5, 30, 62])
+def test_students_t(freedom):
+    expected = special.stdtrit(freedom, 0.975)
+    assert drift._student_t(freedom) == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize("points", [3, 10])
+def test_interval_covers_the_truth_as_often_as_it_says(points):
+    rng = np.random.default_rng(2)
+    epsilons = np.geomspace(1e-3, 1e-1, points)
+    runs = 1000
+    hits = 0
+    for _ in range(runs):
+        noisy = 0.3 * epsilons**2 * np.exp(0.05 * rng.standard_normal(points))
+        low, high = synthetic(noisy, epsilons=epsilons).interval
+        hits += low <= 2 <= high
+    # Four standard deviations of a binomial count; ± 2 stderr would cover 70 % at three points.
+    assert abs(hits / runs - 0.95) < 4 * np.sqrt(0.95 * 0.05 / runs)
+
+
+def test_no_start_that_got_through_everywhere_is_said():
+    good, bad = "successful", "not_finite"
+    lanes = drift._Lanes(
+        drifts=np.array([[1e-3, np.nan], [np.nan, 2e-3], [3e-3, 3e-3], [1e-15, 1e-15]]),
+        sizes=np.ones((4, 2)),
+        statuses=np.array([[good, bad], [bad, good], [good, good], [good, good]]),
+        num_steps=10,
+        epsilon=2.0**-52,
+    )
+    measured = drift._order(EPSILONS[:3], lanes, drift._kept(lanes.good))
+    assert set(measured.excluded) == {"failed"}
+    assert np.isnan(measured.slope)
+    assert "left out: 2 of 2 starts (not_finite): number 0, 1" in str(measured)
+
+
+def test_limit_takes_out_the_bend_of_the_next_order():
+    measured = synthetic(EPSILONS**2 * (1 - 2 * EPSILONS))
+    assert measured.interval[1] < 2  # the straight line does not know
+    assert measured.limit == pytest.approx(2, abs=2e-3)
+
+
+def test_single_precision_has_its_own_floor():
+    measured = sweep(starts=STARTS.astype(np.float32))
+    assert measured.floor_cause == "round-off"
+    assert measured.floor > 1e-8
+    assert measured.slope == pytest.approx(1, abs=0.05)
+
+
+def test_memory_does_not_grow_with_the_steps():
+    def scratch(num_steps):
+        lanes = jnp.ones(64), (jnp.ones((64, 1)), jnp.ones((64, 1)))
+        run = drift._run.lower(CUBIC, KEPT, *lanes, 0.1, num_steps, {"args": None})
+        memory = run.compile().compiled.memory_analysis()
+        return memory.temp_size_in_bytes + memory.output_size_in_bytes
+
+    assert scratch(20_000) == scratch(2_000)
+
+
+@functools.cache
+def energy_surface():
+    return dvi.drift_surface(
+        CUBIC,
+        ENERGY,
+        *STARTS,
+        epsilons=EPSILONS,
+        hs=[0.025, 0.05, 0.1, 0.2],
+        duration=100.0,
+        batched=True,
+    )
+
+
+def test_surface_measures_the_order_of_the_mesh_defect():
+    """The energy of a first-order map errs as h, whatever ε."""
+    surface = energy_surface()
+    assert surface.drifts.shape == (10, 4)
+    assert surface.statuses.shape == (11, 4, 8)
+    assert surface.num_steps.tolist() == [4000, 2000, 1000, 500]
+    assert surface.mesh_used.all()
+    assert surface.mesh_slope == pytest.approx(1, abs=0.1)
+    low, high = surface.mesh_interval
+    assert low < surface.mesh_slope < high
+    assert np.isnan(surface.slopes).all()
+    assert set(surface.excluded.ravel()) == {"mesh"}
+    text = str(surface)
+    assert "40 excluded: within ten times of the drift at ε = 0" in text
+    assert f"drift at ε = 0 ∝ h^{surface.mesh_slope:.4g}" in text
+
+
+@functools.cache
+def kept_surface():
+    """One observable for each h, the last h beyond the stability limit."""
+    return dvi.drift_surface(
+        CUBIC,
+        [KEPT] * 3,
+        *STARTS,
+        epsilons=EPSILONS,
+        hs=[0.05, 0.1, 2.5],
+        duration=100.0,
+        batched=True,
+    )
+
+
+def test_surface_has_an_order_at_each_h_and_none_where_it_failed():
+    surface = kept_surface()
+    np.testing.assert_allclose(surface.slopes[:2], 1, atol=0.01)
+    np.testing.assert_array_equal(surface.drifts[:, 1], usual().drifts)
+    assert (surface.intervals[:2, 0] < surface.slopes[:2]).all()
+    assert np.isnan(surface.slopes[2])
+    assert np.isnan(surface.drifts[:, 2]).all()
+    assert set(surface.excluded[:, 2]) == {"failed"}
+    assert surface.orders[0].kept.all()
+    # Undisturbed, the unstable orbit stays finite, but so large that the form cancels badly.
+    assert surface.mesh_used.tolist() == [False, False, True]
+    assert np.isnan(surface.mesh_slope)
+    assert "above round-off at 1 of 3 step sizes" in str(surface)
+
+
+def test_pictures_show_what_was_excluded():
+    with plot.style():
+        figure = plot.drift_orders({"kept": usual(), "energy": sweep(ENERGY)}, [1, None])
+        labels = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert labels[0].endswith(", promised 1")
+        assert labels[1] == "energy: no order"
+        hollow = [
+            line for line in figure.axes[0].lines
+            if line.get_markerfacecolor() == "white" and len(line.get_xdata()) > 0
+        ]  # fmt: skip
+        assert [len(line.get_xdata()) for line in hollow] == [10]
+        plt.close(figure)
+        for surface in (kept_surface(), energy_surface()):
+            figure = plot.drift_surface(surface, promised=1)
+            excluded = figure.axes[0].lines[0].get_xdata()
+            assert len(excluded) == np.sum(~surface.used & np.isfinite(surface.drifts))
+            figure.canvas.draw()
+            plt.close(figure)
+        with pytest.raises(ValueError, match="1 orders for 2 results"):
+            plot.drift_orders([usual(), usual()], [1])
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"epsilons": [0.0, 0.1, 0.2]}, "positive"),
+        ({"epsilons": [0.1, np.inf]}, "positive"),
+        ({"epsilons": []}, "positive"),
+        ({"epsilons": 0.1}, "positive"),
+        ({"epsilons": [0.1, 0.2, 0.1]}, "distinct"),
+        ({"h": np.float64(0.0)}, "must not be zero"),
+        ({"h": [0.1, 0.2]}, "h must be one number"),
+        ({"starts": (np.ones((3, 1)), np.ones((2, 1)))}, "one shape"),
+        ({"starts": (0.1, 0.1)}, "first axis of starts"),
+        ({"starts": (np.array([[0.1], [np.nan]]), np.ones((2, 1)))}, "not finite at index"),
+        ({"observable": lambda t0, t1, q0, p0, q1, p1, args: q1}, "must be a scalar"),
+    ],
+)
+def test_bad_sweeps_are_refused(change, match):
+    with pytest.raises(ValueError, match=match):
+        sweep(**{"num_steps": 2, **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"hs": [0.2, 0.1]}, "hs must increase"),
+        ({"hs": [0.1, 0.1]}, "hs must increase"),
+        ({"hs": [-0.1, 0.1]}, "hs must be a list of positive"),
+        ({"epsilons": [0.2, 0.1]}, "epsilons must increase"),
+        ({"duration": 0.3}, "two of the longest steps"),
+        ({"duration": np.nan}, "two of the longest steps"),
+        ({"invariant": [KEPT]}, "got 1 for 2 step sizes"),
+    ],
+)
+def test_bad_surfaces_are_refused(change, match):
+    given = {"invariant": KEPT, "epsilons": [0.1, 0.2], "hs": [0.1, 0.2], "duration": 1.0, **change}
+    with pytest.raises(ValueError, match=match):
+        dvi.drift_surface(CUBIC, given.pop("invariant"), *STARTS, batched=True, **given)
+
+
+def test_what_is_no_observable_is_refused():
+    for nothing in (3.0, None):
+        with pytest.raises(TypeError, match="must be one observable"):
+            sweep(nothing)
