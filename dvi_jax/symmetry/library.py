@@ -41,7 +41,7 @@ def rotation(i: int = 0, j: int = 1) -> Generator:
     states of shape (bodies, dim). Conserves the angular momentum q_i p_j − q_j p_i, summed.
 
     **Raises** `ValueError` for axes that are equal or negative, and at the point for axes that q
-    does not have. **Source** the paper, (38).
+    does not have. **Source** the paper, (40).
     """
     axes = (i, j)
     if any(isinstance(a, bool) or not isinstance(a, int) or a < 0 for a in axes) or i == j:
@@ -102,7 +102,7 @@ def bracket(first: Generator, second: Generator) -> Generator:
 
         [X, Y]^c = X(Y^c) − Y(X^c)    for each component c of (ξ0, ξ, η)
 
-    **Raises** `TypeError` for what is no `Generator`. **Source** Olver 1993, (1.26).
+    **Raises** `TypeError` for what is no `Generator`. **Source** Olver 1993, Section 1.3.
     """
     for generator in (first, second):
         if not isinstance(generator, Generator):
