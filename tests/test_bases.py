@@ -60,6 +60,14 @@ def test_radial_functions_are_powers_of_the_radius():
     np.testing.assert_allclose(of_p(q, p), [1.0])
 
 
+def test_formulas_read_well():
+    basis = dvi.Polynomials(1, constant=True).for_shape(())
+    assert basis.names == ("1", "q", "p")
+    assert basis.formula([0.5, 1.0, -2.0]) == "0.5 + q − 2 p"
+    assert basis.formula([-1.0, 0.0, 0.0]) == "−1"
+    assert basis.formula([0.0, 0.0, 0.0]) == "0"
+
+
 def test_functions_of_time_are_told_from_others():
     timed = dvi.Basis({"q t": lambda q, p, t: q * t}).for_shape(())
     plain = dvi.Basis({"q": lambda q, p: q}).for_shape(())

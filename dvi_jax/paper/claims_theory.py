@@ -95,6 +95,14 @@ def theory_claims(m: Measurements) -> list[Claim]:
             (
                 Check("residual of (40)", symmetries.rotation, 0, ROUND_OFF),
                 Check("residual of (41)", symmetries.clocked, 0, ROUND_OFF),
+                Check(
+                    "distance of (40) from what the search for symmetries finds",
+                    m.discoveries.found_rotation,
+                    0,
+                    ROUND_OFF,
+                ),
+                Check("its held-out residual", m.discoveries.found_residual, 0, ROUND_OFF),
+                Check("variational ones found", float(m.discoveries.variational), 2, 2),
             ),
             (),
             Verdict.HOLDS,

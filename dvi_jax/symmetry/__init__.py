@@ -31,8 +31,5 @@ from .noether import (
     outgoing_energy as outgoing_energy,
 )
 from .sampling import random_pairs as random_pairs, solution_pairs as solution_pairs
-from .search import (
-    Symmetries as Symmetries,
-    Symmetry as Symmetry,
-    find_symmetries as find_symmetries,
-)
+from .search import find_symmetries as find_symmetries
+from .symmetries import Symmetries as Symmetries, Symmetry as Symmetry

@@ -87,7 +87,7 @@ class BoundBasis(eqx.Module):
         for value, name in terms:
             sign = "−" if value < 0 else "+"
             size = f"{abs(value):.{digits}g}"
-            term = name if size == "1" else f"{size} {name}"
+            term = size if name == "1" else name if size == "1" else f"{size} {name}"
             text += f" {sign} {term}" if text else (f"−{term}" if value < 0 else term)
         return text
 
