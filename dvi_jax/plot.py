@@ -267,7 +267,7 @@ def drift_orders(
     if not isinstance(results, Mapping):
         results = {f"observable {i}": order for i, order in enumerate(results, 1)}
     slopes = _one_each(promised, len(results))
-    figure, axis = plt.subplots(figsize=(6.4, 4.8))
+    figure, axis = plt.subplots(figsize=(6.4, 4.8), layout="constrained")
     left = min(order.epsilons.min() for order in results.values())
     looks = zip(results.items(), slopes, itertools.cycle(COLOURS), _MARKERS * 9, strict=False)
     for (label, order), slope, colour, marker in looks:
@@ -303,7 +303,9 @@ def drift_surface(
 
     - `promised`: z + 1. Dots mark what is excluded from the fits; bars are 95 % intervals.
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.2), width_ratios=(5, 4))
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(9.6, 4.2), width_ratios=(5, 4), layout="constrained"
+    )
     drifts = np.ma.masked_invalid(surface.drifts)
     norm = LogNorm() if drifts.count() and drifts.min() > 0 else None
     image = left.pcolormesh(

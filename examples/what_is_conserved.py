@@ -1,0 +1,137 @@
+"""What is conserved, to what order in ε, and why the rest drifts: four systems and two pictures.
+
+Run: python examples/what_is_conserved.py [DIRECTORY for the pictures]
+"""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+
+import dvi_jax as dvi
+from dvi_jax import plot
+
+jax.config.update("jax_enable_x64", True)
+mpl.use("Agg")
+
+RNG = np.random.default_rng(0)
+H = 0.1
+
+
+def box(n, count):
+    """Samples (qs, ps) of the domain of interest."""
+    return tuple(RNG.uniform(-1, 1, (2, count, n)))
+
+
+def oscillator(t0, t1, q0, p1, args):
+    """H_D of the harmonic oscillator in any number of dimensions."""
+    return (p1 @ p1 + q0 @ q0) / 2
+
+
+def cubic(out):
+    """A cubic spring: an invariant for every order, and the drift that it promises."""
+    system = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: -(q0**3))
+    orders = {}
+    for z in range(4):
+        found = dvi.discover_invariants(system, dvi.Polynomials(8), z, h=H, samples=box(1, 400))
+        series = found.invariants[0]
+        orders[f"order {z}"] = dvi.drift_order(
+            system,
+            series,
+            [0.4],
+            [0.3],
+            epsilons=np.geomspace(1e-3, 0.2, 8),
+            h=H,
+            num_steps=20_000,
+        )
+        print(f"order {z}: {series.formula(6)}\n  {orders[f'order {z}']}")
+    with plot.style():
+        figure = plot.drift_orders(orders, promised=[1, 2, 3, 4])
+        print(f"written: {plot.save(figure, out / 'drift_orders.png')}")
+
+
+def van_der_pol():
+    """Friction and its opposite: the amplitude is lost at order 1, by the averaged law."""
+    system = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: (1 - q0**2) * p1)
+    print(dvi.discover_invariants(system, dvi.Polynomials(6), 1, h=H, samples=box(1, 400)))
+
+
+def henon_heiles():
+    """Of four quadratic invariants of the isotropic oscillator two survive the second order."""
+
+    def H1(t0, t1, q0, p1, args):
+        return q0[0] ** 2 * q0[1] - q0[1] ** 3 / 3
+
+    system = dvi.System(oscillator, perturbation=H1)
+    print(dvi.discover_invariants(system, dvi.Polynomials(4), 2, h=H, samples=box(2, 400)))
+
+
+def slow_oscillator(out):
+    """ω = 1 + 0.3 sin τ, τ = εt: the map keeps the discrete action, not energy over frequency."""
+
+    def omega(tau):
+        return 1 + 0.3 * jnp.sin(tau)
+
+    def H_D(t0, t1, q0, p1, args):
+        return (p1 @ p1 + omega(t0) ** 2 * (q0 @ q0)) / 2
+
+    system = dvi.System(H_D, slow_time=True)
+    quadratics = dvi.Basis(
+        {
+            "q²": lambda q, p: q[0] ** 2,
+            "q p": lambda q, p: q[0] * p[0],
+            "p²": lambda q, p: p[0] ** 2,
+        }
+    )
+    found = dvi.discover_invariants(
+        system,
+        quadratics * dvi.Chebyshev(24, "τ", domain=(0, 2 * np.pi)),
+        2,
+        h=H,
+        samples=(*box(1, 800), RNG.uniform(0, 2 * np.pi, 800)),
+        tolerance=1e-5,
+    )
+    print(str(found).split("  lost", maxsplit=1)[0])
+    epsilon = 2e-4
+    run = dvi.integrate(
+        system,
+        [0.4],
+        [0.3],
+        h=H,
+        num_steps=int(2 * np.pi / epsilon / H),
+        epsilon=epsilon,
+        save=dvi.Save(every=20),
+        observe=found.invariants[0],
+    )
+    q, p, tau = np.asarray(run.qs)[1:, 0], np.asarray(run.ps)[1:, 0], epsilon * run.ts[1:]
+    w = np.asarray(omega(tau))
+    discrete_energy = (p**2 + w**2 * q**2 - H * w**2 * q * p) / 2
+    curves = {
+        "energy / ω": (p**2 + w**2 * q**2) / 2 / w,
+        "discrete energy / ω": discrete_energy / w,
+        "discrete action": discrete_energy / w / np.sqrt(1 - (H * w) ** 2 / 4),
+        "discovered, order 2": np.asarray(run.observed),
+    }
+    with plot.style():
+        figure, axes = plt.subplots(figsize=(7.5, 4.5))
+        for name, values in curves.items():
+            change = np.maximum(np.abs(values / values[0] - 1), 1e-12)
+            axes.semilogy(tau, change, lw=0.8, label=f"{name}: up to {change.max():.0e}")
+        axes.set(xlabel="slow time τ = εt", ylabel="relative change since the start")
+        axes.set_title(f"A slowly varying oscillator, ε = {epsilon:g}, h = {H:g}")
+        axes.set_ylim(1e-8, 1)
+        figure.legend(loc="outside lower center", ncols=2)
+        print(f"written: {plot.save(figure, out / 'slow_oscillator.png')}")
+
+
+if __name__ == "__main__":
+    directory = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+    directory.mkdir(parents=True, exist_ok=True)
+    cubic(directory)
+    van_der_pol()
+    henon_heiles()
+    slow_oscillator(directory)
