@@ -60,7 +60,7 @@ def test_cubic_disturbance_has_invariants_of_every_order(order):
     [
         (0, 1.0, 0.02),
         (1, 2.0, 0.02),
-        (2, 3.0, 0.03),
+        pytest.param(2, 3.0, 0.03, marks=pytest.mark.slow),
         pytest.param(3, 4.0, 0.4, marks=pytest.mark.slow),
     ],
 )
@@ -146,6 +146,7 @@ def test_van_der_pol_settles_where_its_law_is_at_rest(start):
     assert abs(sol.observed["I"][0] / law.rest[0] - 1) > 0.5
 
 
+@pytest.mark.slow
 def test_kepler_angular_momentum_is_exact_and_found_alone():
     k = systems.kepler()
     rng = np.random.default_rng(1)
@@ -216,6 +217,7 @@ def test_energy_and_lrl_vector_are_approximate_with_residuals_of_the_methods_ord
     assert coarse.residuals[0] < 1e-13
 
 
+@pytest.mark.slow
 def test_without_a_tolerance_only_angular_momentum_is_kept():
     k = systems.kepler()
     for h in (0.02, 0.2):
@@ -295,7 +297,10 @@ def distance(values, reference):
     return np.linalg.norm(factor * values - reference) / np.linalg.norm(reference)
 
 
-@pytest.mark.parametrize("tolerance", [1e-6, 1e-5, 1e-4])
+@pytest.mark.parametrize(
+    "tolerance",
+    [1e-5, *(pytest.param(x, marks=pytest.mark.slow) for x in (1e-6, 1e-4))],
+)
 def test_slowly_varying_oscillator_keeps_its_discrete_action_alone(tolerance):
     (q, p, tau), d = slow_oscillator(tolerance)
     assert d.survivors[1:] == (1, 1)
@@ -358,6 +363,7 @@ def in_span(columns, target):
     return np.linalg.norm(rest) / np.linalg.norm(target)
 
 
+@pytest.mark.slow
 def test_magnetic_moment_survives_order_one_and_the_guiding_centre_drifts():
     """v²/2 is among what is kept; across grad B the centre moves at v²/2, the textbook drift."""
     system, h = magnetic(), 0.05

@@ -111,7 +111,12 @@ def test_reversible_gradient_for_every_way_of_saving(save):
 
 @pytest.mark.parametrize(
     "method",
-    [pytest.param(m, marks=[pytest.mark.slow] if m == "Composition" else []) for m in METHODS],
+    [
+        pytest.param(
+            m, marks=[pytest.mark.slow] if m in ("Composition", "Yoshida4", "RungeKutta4") else []
+        )
+        for m in METHODS
+    ],
 )
 def test_gradient_through_every_method(method):
     """RungeKutta4, which has no inverse, is differentiated by checkpoints under the default."""

@@ -86,6 +86,7 @@ def test_drift_falls_as_a_power_of_h_more_with_each_term():
     assert measured_orders(found[5], 2, 1e-13)[-1] == pytest.approx(2, abs=0.15)
 
 
+@pytest.mark.slow
 def test_two_degrees_of_freedom_and_an_implicit_step():
     hs = 0.08 / 2 ** np.arange(3)
     shadow = dvi.ShadowHamiltonian(2)

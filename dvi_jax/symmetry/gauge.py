@@ -72,6 +72,10 @@ def solve_gauge(
     (Taken order by order with the undisturbed map, as (28) is printed, terms are lost: (34)
     fails by it.)
 
+    On the solutions every generator with ξ0 = 0 has the gauge −ξ·p, whose invariant is 0: where
+    the basis holds it, look at the invariant and not at the residual alone. `find_symmetries`
+    tells such generators from those that lead to an invariant.
+
     **Arguments** `generators`: the series, order 0 first; `basis`: φ(q, p), where the gauges are
     looked for; `h`, `t0`, `args`: of the step; `samples`: (qs, ps) at t0, shapes (S, *q.shape),
     or (qs, ps, ts) with the times of the samples, shape (S,); a quarter of them held out.
