@@ -10,6 +10,7 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax import generators as library, systems
+from dvi_jax.symmetry.sampling import Samples
 
 KEPLER = systems.kepler()
 H_D = systems.oscillator().system.H_D
@@ -431,7 +432,7 @@ def test_held_out_samples_refuse_what_fits_by_chance():
         jnp.where(q > 1, (q - 1) ** 4, 0.0)
     ))  # fmt: skip
     q, p = box(1, 80)
-    q[3::4] += 2.5
+    q[Samples(q, p, np.zeros(80)).held_out] += 2.5
     symmetries = dvi.find_symmetries(hard, LINEAR, h=0.1, samples=(q, p), time=False)
     assert len(symmetries) == 0
     assert symmetries.refused == 2
@@ -501,3 +502,15 @@ def test_what_is_no_basis_is_refused():
         dvi.find_symmetries(OSCILLATOR, 3, h=0.1, samples=box(1))
     with pytest.raises(TypeError, match="basis must be a basis"):
         dvi.find_symmetries(OSCILLATOR, LINEAR, h=0.1, samples=box(1), gauges=3)
+
+
+@pytest.mark.parametrize("strength", [1e-10, pytest.param(1e10, marks=pytest.mark.slow)])
+def test_the_strength_of_the_disturbance_does_not_matter(strength):
+    """Friction, however weak or strong, takes away the same symmetries."""
+    system = dvi.System(H_D, force=lambda t0, t1, q, p, args: -strength * p)
+    symmetries = dvi.find_symmetries(system, LINEAR, 1, h=0.1, samples=box(1), time=False)
+    assert symmetries.survivors == (2, 2)
+    assert not symmetries.variational
+    assert np.max([s.residuals for s in symmetries]) < ROUND_OFF
+    turning = next(str(s) for s in symmetries if "0.05" in str(s))
+    assert f"ε ({strength / 2:.6g} q)" in turning

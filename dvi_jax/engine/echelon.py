@@ -30,9 +30,10 @@ def echelon(
     for row in rows:
         if work.shape[1] == 0:
             break
-        largest = np.maximum(np.max(np.abs(work), axis=0), nothing)
-        j = int(np.argmax(np.abs(work[row]) / largest))
-        if abs(work[row, j]) > above * largest[j]:
+        size = np.max(np.abs(work), axis=0)
+        shares = np.where(size > nothing, np.abs(work[row]) / np.maximum(size, 1e-300), 0.0)
+        j = int(np.argmax(shares))
+        if shares[j] > above:
             eliminate(row, j)
     while work.size and np.max(np.abs(work)) > nothing:  # what is left had no clear pivot
         row, j = np.unravel_index(np.argmax(np.abs(work)), work.shape)

@@ -4,8 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-NULL = 1e-9
+NULL = 1e-11
 """Without a tolerance, a singular value above this share of the largest is never zero."""
+
+HELD_OUT = 10
+"""Held-out samples may leave this many times what fitted ones are allowed to."""
+
+_NOISE = 1e-14
+"""A disturbance that changes a step by less than this share of the step is round-off."""
 
 RANK = 1e-7
 """Relative size below which a direction counts as dependent on others."""
@@ -86,37 +92,106 @@ def orthonormal_range(columns: np.ndarray, above: float = RANK) -> np.ndarray:
     return U[:, singular > above]
 
 
+def epsilon_scale(terms: np.ndarray) -> float:
+    """s such that A_m s^−m, m ≥ 1, are not larger than A_0 and one is as large; 1 if all vanish.
+
+    With ε in units of 1/s a weak and a strong disturbance are one problem.
+    """
+    sizes = np.sqrt(np.mean(terms**2, axis=(0, 2)))
+    orders = np.arange(1, len(sizes))
+    if len(orders) == 0 or sizes[0] == 0:
+        return 1.0
+    scale = float(np.max((sizes[1:] / sizes[0]) ** (1 / orders)))
+    return scale if scale > _NOISE else 1.0
+
+
+def in_units_of(scale: float, terms: np.ndarray, axis: int = 1) -> np.ndarray:
+    """Terms of order m in ε over scale^m: those in ε · scale."""
+    shape = [1] * terms.ndim
+    shape[axis] = terms.shape[axis]
+    return terms / (scale ** np.arange(terms.shape[axis])).reshape(shape)
+
+
 class SeriesSpace(NamedTuple):
     """Vectors (c_0, …, c_m) in the null space of a Toeplitz matrix, sorted by their first block.
 
     - `leading`: columns, shape ((m + 1) · size, count), whose first blocks c_0 are orthonormal.
     - `shifts`: orthonormal columns without a first block: what may be added to any of them.
     - `singular_values`, `gap`: of the Toeplitz matrix, see `NullSpace`.
+    - `refused`: how many more there were that held-out conditions or a lower order refuse.
     """
 
     leading: np.ndarray
     shifts: np.ndarray
     singular_values: np.ndarray
     gap: float
+    refused: int
 
 
-def series_space(terms: np.ndarray, order: int, tolerance: float | None = None) -> SeriesSpace:
-    """The null space of the Toeplitz matrix of that order, as series.
+def series_spaces(
+    fitted: np.ndarray,
+    held_out: np.ndarray,
+    tolerance: float | None = None,
+    trivial: np.ndarray | None = None,
+) -> list[SeriesSpace]:
+    """The null spaces of the Toeplitz matrices of order 0, 1, … as series.
 
     A vector with a small first block is no series unless it is null for the size of that block:
-    first blocks are made orthonormal, and judged again.
+    first blocks are made orthonormal and judged again, by fitted and held-out conditions. Those of
+    an order have to lie among those of the order before.
+
+    - `fitted`, `held_out`: A_0 … A_z, shapes (rows, z + 1, size). `trivial`: a first block that
+      is no series, shape (size,): that of a constant.
     """
-    matrix = toeplitz(terms, order)
-    space = null_space(matrix, tolerance)
-    limit = NULL if tolerance is None else 10 * tolerance
-    size = terms.shape[2]
-    singular, V = np.linalg.svd(space.columns[:size])[1:]
+    size = fitted.shape[2]
+    spaces: list[SeriesSpace] = []
+    for order in range(fitted.shape[1]):
+        matrix = toeplitz(fitted, order)
+        space = null_space(matrix, tolerance)
+        leading, shifts = _by_first_block(space.columns, size, tolerance)
+        found = leading.shape[1]
+        conditions = np.vstack([matrix, toeplitz(held_out, order)])
+        leading = _judged(leading, conditions, np.linalg.norm(matrix, 2), tolerance)
+        refused = found - leading.shape[1]
+        if trivial is not None:
+            leading = leading @ _orthogonal_to(trivial @ leading[:size])
+        if spaces:
+            found = leading.shape[1]
+            leading = _within(leading, spaces[-1].leading[:size], size)
+            refused += found - leading.shape[1]
+        spaces.append(SeriesSpace(leading, shifts, space.singular_values, space.gap, refused))
+    return spaces
+
+
+def _by_first_block(columns, size, tolerance) -> tuple[np.ndarray, np.ndarray]:
+    singular, V = np.linalg.svd(columns[:size])[1:]
     large = np.flatnonzero(singular > (RANK if tolerance is None else max(RANK, tolerance)))
-    leading = space.columns @ (V[large].T / singular[large])
-    shifts = space.columns @ np.delete(V, large, axis=0).T
-    if leading.shape[1]:
-        norm = max(np.linalg.norm(matrix, 2), np.finfo(float).tiny)
-        left, W = np.linalg.svd(matrix @ leading / norm)[1:]
-        left = np.append(left, np.zeros(len(W) - len(left)))
-        leading = leading @ W[left <= limit].T
-    return SeriesSpace(leading, shifts, space.singular_values, space.gap)
+    leading = columns @ (V[large].T / singular[large])
+    return leading, columns @ np.delete(V, large, axis=0).T
+
+
+def _judged(leading, conditions, norm, tolerance) -> np.ndarray:
+    """The combinations that all conditions take for null."""
+    if leading.shape[1] == 0 or norm == 0:
+        return leading
+    limit = HELD_OUT * (NULL if tolerance is None else tolerance)
+    left, V = np.linalg.svd(triangle(conditions @ leading / norm))[1:]
+    left = np.append(left, np.zeros(len(V) - len(left)))
+    return leading @ V[left <= limit].T
+
+
+def _within(leading, before, size) -> np.ndarray:
+    """The combinations whose first blocks lie in the span of orthonormal columns."""
+    if leading.shape[1] == 0 or before.shape[1] == 0:
+        return leading[:, :0]
+    cosines, V = np.linalg.svd(before.T @ leading[:size])[1:]
+    cosines = np.append(cosines, np.zeros(len(V) - len(cosines)))
+    return leading @ V[cosines > 0.9].T
+
+
+def _orthogonal_to(direction) -> np.ndarray:
+    """Orthonormal columns of what is orthogonal to a direction, or all where it is outside."""
+    length = np.linalg.norm(direction)
+    if length < 1e-6:
+        return np.eye(len(direction))
+    return np.linalg.svd((direction / length)[None])[2][1:].T

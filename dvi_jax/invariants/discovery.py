@@ -1,7 +1,6 @@
 """Adiabatic invariants found as a null space on the map that is actually iterated."""
 
-import json
-import os
+import operator
 from typing import Any, Literal
 
 import equinox as eqx
@@ -13,215 +12,47 @@ from jaxtyping import Array
 from .._results import RESULTS
 from .._step import Equations
 from .._system import System
-from .._types import Args, Interval, State
+from .._types import Args, Interval
+from ..engine.dependence import depends_on
 from ..engine.newton import Newton
 from ..engine.nullspace import (
     RANK,
     compress,
-    series_space,
+    epsilon_scale,
+    in_units_of,
+    series_spaces,
     triangle as triangle_of,
 )
 from ..engine.taylor import taylor_coefficients
 from ..methods import Method, TypeII
-from ..symmetry.basis import AbstractBasis, BoundBasis, bind_basis, check_step_size
+from ..symmetry.basis import AbstractBasis, bind_basis, check_step_size
 from ..symmetry.sampling import (
     Samples,
     as_samples,
     check_basis,
+    check_finite,
     require_enough,
     require_steps,
     require_time,
 )
-from .obstructions import DriftLaw, drift_laws
-from .representatives import Span
-from .series import InvariantSeries
+from .found import Discovery
+from .obstructions import drift_laws
+from .representatives import Span, differentials
 
 _EXACT = 1e-12
-"""A series that changes by less in a step at ε of order one is exact, not an expansion."""
+"""A series that changes by less, of what functions change by, at large ε is no expansion."""
 
 _TRIED = (0.5, -0.3)
-"""The ε at which that is tried."""
+"""The ε at which that is tried, in units of that at which the disturbance is as large as H_D."""
 
-_CLEAR = 1e3
-"""A gap in the singular values below this is not clear."""
+_EXACT_STEPS = 100
+"""Steps over which it is tried."""
 
+_LATER = (1.0, 2.7)
+"""Shifts of time at which a map that does not depend on it is the same."""
 
-class Discovery(eqx.Module):
-    """What `discover_invariants` found.
-
-    - `coefficients`: shape (count, order + 1, basis size), of the independent invariants, the
-      simplest first; count may be 0. `dependent`: the same for the others in the span, which
-      are functions of them (on the samples, as far as differentials say).
-    - `exact`: for each independent invariant, whether it is kept at any ε, to round-off.
-    - `leading_parts`: shape (families, basis size): a basis, orthonormal on the samples, of the
-      order-0 parts of *all* invariants in the span.
-    - `survivors`: for m = 0 … order, how many leading parts have an invariant of order m.
-    - `singular_values`: of the whole system, descending, relative to the largest; `gap`: the
-      ratio at which they were cut (large is clear, below 1e3 is not).
-    - `residuals`: shape (count, order + 1), on held-out points: the largest change over one
-      step at each order in ε, relative to the spread of the leading part. `dependent_residuals`
-      likewise.
-    - `obstructions`: a `DriftLaw` for each leading part that is lost at order 1, 2, ….
-    - `basis`: with `names`. `slow_time`: of the system.
-    - `tolerance`: None, or that of approximate invariants.
-
-    On resonant or integrable systems the null space is large; on chaotic ones near-null vectors
-    appear that are none. Held-out residuals and `drift_order` on a long run decide.
-    """
-
-    coefficients: Array
-    dependent: Array
-    exact: tuple[bool, ...] = eqx.field(static=True)
-    leading_parts: np.ndarray
-    survivors: tuple[int, ...] = eqx.field(static=True)
-    singular_values: np.ndarray
-    gap: float = eqx.field(static=True)
-    residuals: np.ndarray
-    dependent_residuals: np.ndarray
-    obstructions: tuple[DriftLaw, ...]
-    basis: BoundBasis
-    shape: tuple[int, ...] = eqx.field(static=True)
-    slow_time: bool = eqx.field(static=True)
-    tolerance: float | None = eqx.field(static=True)
-
-    @property
-    def count(self) -> int:
-        """Number of independent invariants found."""
-        return self.coefficients.shape[0]
-
-    @property
-    def order(self) -> int:
-        """z, the order that was asked for."""
-        return len(self.survivors) - 1
-
-    @property
-    def invariants(self) -> list[InvariantSeries]:
-        """The independent invariants as observables."""
-        return [InvariantSeries(self.basis, c, self.slow_time) for c in self.coefficients]
-
-    @property
-    def dependent_invariants(self) -> list[InvariantSeries]:
-        """Those in the span that are functions of the independent ones."""
-        return [InvariantSeries(self.basis, c, self.slow_time) for c in self.dependent]
-
-    def evaluate(self, q: State, p: State, epsilon: Any, t: Any = 0.0) -> Array:
-        """The values of the independent invariants at a point, shape (count,)."""
-        powers = jnp.asarray(epsilon) ** jnp.arange(self.order + 1)
-        return jnp.einsum("m,kmb,b->k", powers, self.coefficients, self.basis(q, p, t))
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything but the basis functions themselves to a file (NumPy's npz)."""
-        laws = [
-            {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in law._asdict().items()}
-            for law in self.obstructions
-        ]
-        about = {
-            "format": 1,
-            "names": self.basis.names,
-            "exact": self.exact,
-            "survivors": self.survivors,
-            "gap": self.gap,
-            "shape": self.shape,
-            "slow_time": self.slow_time,
-            "tolerance": self.tolerance,
-            "obstructions": laws,
-        }
-        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
-        with open(path, "wb") as file:
-            np.savez(file, about=np.array(json.dumps(about)), **arrays)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str], basis: AbstractBasis) -> "Discovery":
-        """Read what `save` wrote; `basis` is the one that was searched (its names are compared).
-
-        **Raises** `ValueError` for a file of something else, or another basis.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                about = json.loads(str(file["about"]))
-                arrays = {name: file[name] for name in _ARRAYS}
-        except (KeyError, ValueError, EOFError) as error:
-            raise ValueError(f"{os.fspath(path)} is no file that Discovery.save wrote.") from error
-        shape = tuple(about["shape"])
-        bound = bind_basis(basis, shape)
-        if list(bound.names) != about["names"]:
-            raise ValueError(
-                f"{os.fspath(path)} was found in a basis of {len(about['names'])} functions "
-                f"({', '.join(about['names'][:4])} …); the one given has {bound.size} "
-                f"({', '.join(bound.names[:4])} …)."
-            )
-        laws = tuple(_law(law) for law in about["obstructions"])
-        for name in ("coefficients", "dependent"):
-            arrays[name] = jnp.asarray(arrays[name])
-        return cls(
-            exact=tuple(about["exact"]),
-            survivors=tuple(about["survivors"]),
-            gap=about["gap"],
-            obstructions=laws,
-            basis=bound,
-            shape=shape,
-            slow_time=about["slow_time"],
-            tolerance=about["tolerance"],
-            **arrays,
-        )
-
-    def __str__(self) -> str:
-        kind = "independent" if self.tolerance is None else "independent approximate"
-        drop = 1e-9 if self.tolerance is None else np.sqrt(self.tolerance)
-        lines = [
-            f"{self.count} {kind} invariant{'' if self.count == 1 else 's'} of order "
-            f"{self.order} in {self.basis.size} functions; leading parts that survive order 0 … "
-            f"{self.order}: {', '.join(map(str, self.survivors))}; gap {self.gap:.1e}"
-        ]
-        if self.tolerance is not None:
-            lines.append(f"  singular values up to {self.tolerance:g} of the largest count as zero")
-        elif self.survivors[0] and self.gap < _CLEAR:
-            lines.append("  the gap is not clear: let drift_order on a long run decide")
-        for series, residual, exact in zip(
-            self.invariants, self.residuals, self.exact, strict=True
-        ):
-            lines.append(f"  I = {series.formula(_SHOWN, drop)}")
-            told = ", exact at every ε tried" if exact else ""
-            lines.append(f"      held-out residual {np.max(residual):.1e}{told}")
-        if len(self.dependent):
-            lines.append(f"  functions of them, as differentials say: {len(self.dependent)}")
-            for series in self.dependent_invariants[:3]:
-                lines.append(f"      {series.formula(_SHOWN, drop)}")
-        told = [law for law in self.obstructions if law.kind != "unexplained"]
-        lines += [f"  {law}" for law in told[:_LAWS]]
-        if len(told) > _LAWS:
-            lines.append(f"  {len(told) - _LAWS} more lost, each by such a law")
-        lost = self.survivors[0] - self.survivors[-1]
-        if len(told) < lost:
-            lines.append(
-                f"  {lost - len(told)} more lost, by a drift that is no function of what order 0 "
-                "keeps in this basis: it may be too small"
-            )
-        return "\n".join(lines)
-
-
-def _law(values: dict[str, Any]) -> DriftLaw:
-    """A law as `Discovery.save` wrote it."""
-    fields: dict[str, Any] = {
-        k: np.array(v) if isinstance(v, list) else v for k, v in values.items()
-    }
-    return DriftLaw(**fields)
-
-
-_ARRAYS = (
-    "coefficients",
-    "dependent",
-    "leading_parts",
-    "singular_values",
-    "residuals",
-    "dependent_residuals",
-)
-
-_SHOWN = 12
-"""Terms of a formula in a report; ``str`` of a series shows all."""
-
-_LAWS = 4
-"""Drift laws in a report."""
+_ROUND_OFF = 1e-13
+"""Shares below this of the largest are not there."""
 
 
 def discover_invariants(
@@ -281,81 +112,160 @@ def discover_invariants(
     **Source** our own.
     """
     samples = as_samples(samples, t0)
-    _check_options(order, tolerance, representative)
+    order = _check_options(order, tolerance, representative, method)
     bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
     require_enough(samples, bound.size)
     require_time(bound, samples)
+    q, p, t = (jnp.asarray(x[0]) for x in samples)
+    system.check_shapes(t, q, p, jnp.zeros(()), args)
     equations = Equations(system, jnp.zeros(()), args, newton)
-    values, changes, volume, good = _at_points(equations, h, method, bound, order, samples)
-    require_steps(good, samples)
-    values, changes, volume = np.asarray(values), np.asarray(changes), np.asarray(volume)
-    check_basis(bound, values)
-    held = samples.held_out
+    values, changes, volume = _checked_changes(equations, h, method, bound, order, samples)
+    held, fit = samples.held_out, ~samples.held_out
+    condition = check_basis(bound, values[fit])
+    rms = np.sqrt(np.mean(values[fit] ** 2, axis=0))
     # Orthonormal on the samples: singular values then measure functions, not their scaling.
-    R = triangle_of(values[~held]) / np.sqrt(np.sum(~held))
-    scaled = np.linalg.solve(R.T, changes[~held].reshape(-1, bound.size).T).T
-    scaled = scaled.reshape(-1, order + 1, bound.size)
-
+    R = triangle_of(values[fit] / rms) / np.sqrt(np.sum(fit))
+    scaled = np.linalg.solve(R.T, (changes / rms).reshape(-1, bound.size).T).T
+    scaled = scaled.reshape(changes.shape)
+    scale = epsilon_scale(scaled[fit])
+    scaled = in_units_of(scale, scaled)
+    constant = _shares_of_constant(bound, rms, values[fit], _some(samples))
+    spaces = series_spaces(
+        compress(scaled[fit]),
+        compress(scaled[held]),
+        tolerance,
+        None if constant is None else R @ constant,
+    )
     blur = RANK if tolerance is None else max(RANK, np.sqrt(tolerance))
-    compressed = compress(scaled)
-    spaces = [series_space(compressed, m, tolerance) for m in range(order + 1)]
-    span = Span(bound, R, spaces[-1], blur)
-    found = span.representatives(Samples(*(x[~held] for x in samples)))
+    span = Span(bound, rms, R, spaces[-1], blur, constant)
+    found = span.representatives(Samples(*(x[fit] for x in samples)))
+    typical = np.linalg.norm(compress(scaled[fit])[:, 0], 2)
+    typical = typical if typical > 0 else 1.0
+    sizes = rms / scale ** np.arange(order + 1)[:, None]
 
     def chosen(series):
-        simplest = span.simplest(series)
+        """Coefficients of the user's functions, and whether the series is exact."""
         if order == 0:
-            return _normalised(series), False
-        exact = bool(_is_exact(equations, h, method, bound, jnp.asarray(simplest), _some(samples)))
-        use_simplest = exact or representative == "simplest"
-        return _normalised(simplest if use_simplest else span.least(series)), exact
+            return _cleaned(series) / sizes, False
+        simplest = _cleaned(span.simplest(series)) / sizes
+        given, typical_, scale_ = (jnp.asarray(x) for x in (simplest, typical, scale))
+        here = _some(samples)
+        exact = bool(_is_exact(equations, h, method, bound, given, typical_, scale_, here))
+        if exact or representative == "simplest":
+            return simplest, exact
+        return _cleaned(span.least(series)) / sizes, exact
 
     picked = [chosen(series) for series in found.series]
 
     def those(independent):
         flags = [f == independent for f in found.independent]
-        series = [c for (c, _), flag in zip(picked, flags, strict=True) if flag]
+        series = [_normalised(c, rms) for (c, _), f in zip(picked, flags, strict=True) if f]
         exact = tuple(e for (_, e), flag in zip(picked, flags, strict=True) if flag)
         return np.array(series).reshape(len(series), order + 1, bound.size), exact
 
     (coefficients, exact), (dependent, _) = those(True), those(False)
+    judge = values[held], in_units_of(scale, changes[held]) / typical
     return Discovery(
         coefficients=jnp.asarray(coefficients),
         dependent=jnp.asarray(dependent),
         exact=exact,
-        leading_parts=np.linalg.solve(R, spaces[-1].leading[: bound.size]).T,
+        leading_parts=(np.linalg.solve(R, spaces[-1].leading[: bound.size]) / rms[:, None]).T,
         survivors=tuple(space.leading.shape[1] for space in spaces),
         singular_values=spaces[-1].singular_values,
         gap=spaces[-1].gap,
-        residuals=_residuals(coefficients, values[held], changes[held]),
-        dependent_residuals=_residuals(dependent, values[held], changes[held]),
+        refused=spaces[-1].refused,
+        residuals=_residuals(coefficients, scale, *judge),
+        dependent_residuals=_residuals(dependent, scale, *judge),
+        reach=_reach(coefficients, values[fit]),
         obstructions=drift_laws(
             bound,
+            rms,
             R,
-            scaled,
-            values[~held],
+            scaled[fit],
+            values[fit],
             spaces,
-            np.max(np.abs(volume), axis=0),
+            np.max(np.abs(in_units_of(scale, volume)), axis=0),
+            scale,
             system.slow_time,
             blur,
         ),
         basis=bound,
+        sizes=sizes,
+        condition=condition,
+        scale=scale,
+        probe=Samples(*(x[:3] for x in samples)),
         shape=samples.q.shape[1:],
         slow_time=system.slow_time,
         tolerance=tolerance,
     )
 
 
-def _check_options(order: Any, tolerance: Any, representative: Any) -> None:
-    if isinstance(order, bool) or not isinstance(order, int) or order < 0:
+def _check_options(order: Any, tolerance: Any, representative: Any, method: Any) -> int:
+    try:
+        number = -1 if isinstance(order, bool) else operator.index(order)
+    except TypeError:
+        number = -1
+    if number < 0:
         raise ValueError(f"order must be an integer of at least 0, got {order!r}.")
-    if tolerance is not None and not 0 < tolerance < 1:
+    is_number = isinstance(tolerance, float | np.floating)
+    if tolerance is not None and not (is_number and 0 < tolerance < 1):
         raise ValueError(
             "tolerance must be None or a number between 0 and 1 (a share of the largest singular "
             f"value), got {tolerance!r}."
         )
     if representative not in ("least", "simplest"):
         raise ValueError(f"representative must be 'least' or 'simplest', got {representative!r}.")
+    if not isinstance(method, Method):
+        raise TypeError(f"method must be a method such as dvi.TypeII(), got {method!r}.")
+    return number
+
+
+def _checked_changes(equations, h, method, basis, order, samples):
+    """φ, A_0 … A_z and the changes of log phase volume, after refusing what is not finite."""
+    values, changes, volume, good = map(
+        np.asarray, _at_points(equations, h, method, basis, order, samples)
+    )
+    require_steps(good, samples)
+    check_finite(basis, values)
+    bad = ~np.isfinite(changes)
+    if bad.any():
+        i, m, j = np.argwhere(bad)[0]
+        what = "changes by" if m == 0 else f"has in order {m} of ε"
+        raise ValueError(
+            f"what the basis function {basis.names[j]!r} {what} in a step is not finite at "
+            f"{int(bad.any(axis=(1, 2)).sum())} of {len(values)} samples (first: number {i}): H_D, "
+            "the force or the function is singular there or where the step leads. Keep the "
+            "samples off the singularity."
+        )
+    if not np.isfinite(volume).all():
+        raise ValueError(
+            "the derivative of the map is not finite at "
+            f"{int((~np.isfinite(volume)).any(axis=1).sum())} of {len(values)} samples: keep them "
+            "off singularities of H_D and the force."
+        )
+    if np.ptp(samples.t) == 0 and _may_depend_on_time(equations, samples):
+        for shift in _LATER:
+            later = samples._replace(t=samples.t + shift)
+            other = np.asarray(_at_points(equations, h, method, basis, order, later)[1])
+            size = np.max(np.abs(changes), axis=(0, 2)) + np.finfo(float).tiny
+            if not (np.max(np.abs(other - changes), axis=(0, 2)) <= 1e-8 * size).all():
+                raise ValueError(
+                    "the map depends on the time, and all samples are of one time: give "
+                    "samples=(qs, ps, ts)."
+                )
+    return values, changes, volume
+
+
+def _may_depend_on_time(equations, samples) -> bool:
+    """Whether t enters H_D, perturbation or force at all."""
+    q, p, t = (jnp.asarray(x[0]) for x in samples)
+    system, args, one = equations.system, equations.args, jnp.ones(())
+
+    def energies(t):
+        H = system.hamiltonian(t, t, q, p, one, args)
+        return H, system.disturbing_force(t, t, q, p, one, args)
+
+    return depends_on(energies, 0, t)
 
 
 def _map(equations: Equations, h: Any, method: Method, epsilon: Array) -> Any:
@@ -406,21 +316,43 @@ def _at_points(equations, h, method, basis, order: int, samples):
 
 
 @eqx.filter_jit
-def _is_exact(equations, h, method, basis, series, samples):
-    """Whether Σ ε^m c_m·φ is kept over a step at ε that are not small."""
+def _is_exact(equations, h, method, basis, series, typical, scale, samples):
+    """Whether Σ ε^m c_m·φ is kept over many steps at ε that are not small."""
 
     def at(epsilon):
         c = epsilon ** jnp.arange(series.shape[0]) @ series
+        step = _map(equations, h, method, epsilon)
 
         def value(q, p, t):
-            q1, p1, t1, info = _map(equations, h, method, epsilon)(q, p, t)
-            before = c @ basis(q, p, t)
-            return before, c @ basis(q1, p1, t1) - before, info.result == RESULTS.successful
+            def once(_, state):
+                q, p, t, good = state
+                q, p, t, info = step(q, p, t)
+                return q, p, t, good & (info.result == RESULTS.successful)
 
-        before, change, good = jax.vmap(value)(*samples)
-        return jnp.all(good) & (jnp.max(jnp.abs(change)) <= _EXACT * jnp.std(before))
+            good = jnp.asarray(True)
+            q1, p1, t1, good = jax.lax.fori_loop(0, _EXACT_STEPS, once, (q, p, t, good))
+            before, after = basis(q, p, t), basis(q1, p1, t1)
+            rounding = jnp.abs(c) @ (jnp.abs(before) + jnp.abs(after))
+            return c @ before, c @ after - c @ before, rounding, good
 
-    return jnp.all(jax.vmap(at)(jnp.array(_TRIED)))
+        before, change, rounding, good = jax.vmap(value)(*map(jnp.asarray, samples))
+        moved = jnp.minimum(_EXACT_STEPS * typical, 1) * jnp.std(before)
+        allowed = _EXACT * moved + _EXACT_STEPS * jnp.finfo(before.dtype).eps * rounding
+        return jnp.all(good) & jnp.all(jnp.abs(change) <= allowed)
+
+    return jnp.all(jax.vmap(at)(jnp.array(_TRIED) / scale))
+
+
+def _shares_of_constant(basis, rms, values, samples) -> np.ndarray | None:
+    """The combination that is 1 everywhere (and not only on these samples), if there is one."""
+    shares = np.linalg.lstsq(values / rms, np.ones(len(values)), rcond=None)[0]
+    shares = np.where(np.abs(shares) > 1e-9 * np.max(np.abs(shares)), shares, 0.0)
+    if np.max(np.abs(values / rms @ shares - 1)) > 1e-8:
+        return None
+    slopes = np.asarray(differentials(basis, *samples)) / rms[:, None]
+    terms = np.abs(slopes) * np.abs(shares)[:, None]
+    sums = np.einsum("sbn,b->sn", slopes, shares)
+    return shares if np.max(np.abs(sums)) <= 1e-9 * np.max(terms, initial=1.0) else None
 
 
 def _some(samples: Samples) -> Samples:
@@ -429,16 +361,36 @@ def _some(samples: Samples) -> Samples:
     return Samples(*(x[some] for x in samples))
 
 
-def _normalised(series: np.ndarray) -> np.ndarray:
-    """Scaled so that the largest coefficient of the leading part is one half, as of an energy."""
-    return series / (2 * series[0, np.argmax(np.abs(series[0]))])
+def _cleaned(shares: np.ndarray) -> np.ndarray:
+    """The shares without what is round-off of the others."""
+    return np.where(np.abs(shares) > _ROUND_OFF * np.max(np.abs(shares)), shares, 0.0)
 
 
-def _residuals(coefficients, values, changes) -> np.ndarray:
+def _normalised(series: np.ndarray, rms: np.ndarray) -> np.ndarray:
+    """Scaled so that the coefficient with the largest share is one half, as of an energy."""
+    return series / (2 * series[0, np.argmax(np.abs(series[0] * rms))])
+
+
+def _residuals(coefficients, scale, values, changes) -> np.ndarray:
+    """Shape (count, z + 1); `changes` in units of `scale`, relative to what is typical."""
     out = np.zeros(coefficients.shape[:2])
     for i, c in enumerate(coefficients):
-        spread = np.std(values @ c[0])
+        leading = values @ c[0]
+        spread = np.std(leading)
+        size = np.sqrt(np.mean(leading**2))
+        spread = spread if spread > 1e-6 * size else size
         for k in range(c.shape[0]):
-            total = sum(changes[:, k - m] @ c[m] for m in range(k + 1))
+            total = sum(changes[:, k - m] @ (c[m] / scale**m) for m in range(k + 1))
             out[i, k] = np.max(np.abs(total)) / spread
+    return out
+
+
+def _reach(coefficients, values) -> np.ndarray:
+    """The smallest ε at which a correction is as large as the leading part, shape (count,)."""
+    out = np.full(len(coefficients), np.inf)
+    for i, c in enumerate(coefficients):
+        sizes = np.sqrt(np.mean((values @ c.T) ** 2, axis=0))
+        for m in range(1, len(c)):
+            if sizes[m] > 0:
+                out[i] = min(out[i], (sizes[0] / sizes[m]) ** (1 / m))
     return out

@@ -27,10 +27,10 @@ class DriftLaw(NamedTuple):
 
     - `leading`: I as text; `leading_coefficients`, `coefficients`: of I and of the law.
     - `residual`: the share of the drift that the law leaves unexplained.
-    - `kind`: "dissipation" (the map changes phase volume at that order or before), "slow time"
-      (it does not, and the system changes with the slow time), "resonance" (neither, and still
-      the average over the undisturbed motion is not zero), or "unexplained": the drift is no
-      function of what order 0 keeps in this basis, which may be too small.
+    - `kind`: "dissipation" (the disturbance changes phase volume, as fast as I to 1e-4 or more),
+      "slow time" (it does not, and the system changes with the slow time), "resonance" (neither,
+      and still the average over the undisturbed motion is not zero), or "unexplained": the
+      drift is no function of what order 0 keeps in this basis, which may be too small.
     - `powers`: a where the law is Σ_k a_k I^k, k from 0, when it is one; else empty.
     - `rest`: the values I > 0 at which that law vanishes: where the amplitude stands still.
     """
@@ -60,11 +60,13 @@ class DriftLaw(NamedTuple):
 
 def drift_laws(
     basis: BoundBasis,
+    rms: np.ndarray,
     R: np.ndarray,
     terms: np.ndarray,
     values: np.ndarray,
     spaces: Sequence[SeriesSpace],
     volume: np.ndarray,
+    scale: float,
     slow_time: bool,
     blur: float,
 ) -> tuple[DriftLaw, ...]:
@@ -74,50 +76,49 @@ def drift_laws(
     Σ_k A_{m−k} c_k + A_0 c_m = 0, has no solution c_m; with a function of what order 0 keeps on
     the right it may: = φ·K d, K the null space of A_0. That is the averaged law.
 
-    `terms`: A in the orthonormal basis, shape (rows, z + 1, size); `values`: φ there; `spaces`:
-    spaces of order 0, 1, …; `volume`: per order, how much phase volume changes;
-    `slow_time`: of the system.
+    `terms`: A in the orthonormal basis, shape (rows, z + 1, size); `values`: φ there, shape (rows,
+    size); `rms`: their sizes; `R`: see `Span`; `spaces`: of order 0, 1, …; `volume`: per order,
+    how much phase volume changes; `scale`: the unit of ε, in which all this is; `slow_time`: of
+    the system.
     """
     if spaces[0].leading.shape[1] == 0:
         return ()
-    return tuple(
-        law
-        for m in range(1, len(spaces))
-        for law in _lost_at(basis, R, terms, values, spaces, volume, slow_time, blur, m)
-    )
-
-
-def _lost_at(basis, R, terms, values, spaces, volume, slow_time, blur, m):
-    size = basis.size
-    before = np.concatenate([spaces[m - 1].leading, spaces[m - 1].shifts], axis=1)
-    alive, through = spaces[m - 1].leading[:size], orthonormal_range(spaces[m].leading[:size])
-    if alive.shape[1] <= through.shape[1]:
-        return
-    orthonormal = np.linalg.solve(R.T, values.T).T
+    laws = []
+    orthonormal = np.linalg.solve(R.T, (values / rms).T).T
     kept = spaces[0].leading
-    drifts = terms[:, m:0:-1].reshape(len(terms), m * size) @ before
     system = np.concatenate([-terms[:, 0], orthonormal @ kept], axis=1)
-    for c in _lost(basis, R, alive, through, blur):
-        c = c / (2 * c[np.argmax(np.abs(c))])
-        series = np.linalg.lstsq(before[:size], R @ c, rcond=blur)[0]
-        drift = drifts @ series
-        solution = np.linalg.lstsq(system, drift, rcond=1e-10)[0]
-        size_of = max(np.linalg.norm(drift), np.finfo(float).tiny)
-        left = float(np.linalg.norm(system @ solution - drift) / size_of)
-        d = np.linalg.solve(R, kept @ solution[size:])
-        allowed = max(EXPLAINED, blur)
-        powers = _own_powers(values @ c, values @ d) if left < allowed else np.zeros(0)
-        yield DriftLaw(
-            m,
-            shortened(basis, c, _SHOWN),
-            shortened(basis, d, _SHOWN),
-            c,
-            d,
-            left,
-            _kind(left < allowed, volume[: m + 1], slow_time),
-            powers,
-            _zeros(powers, np.max(np.abs(values @ c))),
-        )
+    size, allowed = basis.size, max(EXPLAINED, blur)
+    for m in range(1, len(spaces)):
+        before = np.concatenate([spaces[m - 1].leading, spaces[m - 1].shifts], axis=1)
+        alive, through = spaces[m - 1].leading[:size], spaces[m].leading[:size]
+        drifts = terms[:, m:0:-1].reshape(len(terms), m * size) @ before
+        for shares in _lost(basis, R, alive, orthonormal_range(through), blur):
+            c = shares / rms
+            normal = 1 / (2 * c[np.argmax(np.abs(shares))])
+            shares, c = shares * normal, c * normal
+            series = np.linalg.lstsq(before[:size], R @ shares, rcond=blur)[0]
+            drift = drifts @ series
+            solution = np.linalg.lstsq(system, drift, rcond=1e-10)[0]
+            rate = max(np.linalg.norm(drift), np.finfo(float).tiny)
+            left = float(np.linalg.norm(system @ solution - drift) / rate)
+            law = np.linalg.solve(R, kept @ solution[size:]) / rms * scale**m
+            explained = left < allowed
+            powers = _own_powers(values @ c, values @ law) if explained else np.zeros(0)
+            dissipates = np.max(volume[1 : m + 1]) * np.linalg.norm(values @ c) > 1e-4 * rate
+            laws.append(
+                DriftLaw(
+                    m,
+                    shortened(basis, c, np.abs(shares), _SHOWN, max(1e-9, blur**2)),
+                    shortened(basis, law, np.abs(law * rms), _SHOWN, max(1e-9, blur**2)),
+                    c,
+                    law,
+                    left,
+                    _kind(explained, bool(dissipates), slow_time),
+                    powers,
+                    _zeros(powers, np.max(np.abs(values @ c))),
+                )
+            )
+    return tuple(laws)
 
 
 def _lost(basis, R, alive, through, blur) -> list[np.ndarray]:
@@ -135,10 +136,10 @@ def _lost(basis, R, alive, through, blur) -> list[np.ndarray]:
     return lost
 
 
-def _kind(explained: bool, volume: np.ndarray, slow_time: bool) -> str:
+def _kind(explained: bool, dissipates: bool, slow_time: bool) -> str:
     if not explained:
         return "unexplained"
-    if np.max(volume) > 1e-9:
+    if dissipates:
         return "dissipation"
     return "slow time" if slow_time else "resonance"
 

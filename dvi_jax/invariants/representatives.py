@@ -24,17 +24,19 @@ class Representatives(NamedTuple):
 class Span:
     """All invariants found, as series in a basis that is orthonormal on the samples.
 
-    `R`: the user's coefficients are R⁻¹ times those of `space`. `blur`: relative size below
-    which coefficients count as none.
+    Coefficients are compared as shares: those of functions scaled to one size on the samples,
+    `basis` · 1/`rms`. `R`: shares are R⁻¹ times the coefficients of `space`. `blur`: size
+    below which shares count as none. `constant`: the shares of a constant, None without one.
     """
 
-    def __init__(self, basis: BoundBasis, R: np.ndarray, space: SeriesSpace, blur: float):
-        self.basis, self.R, self.space, self.blur = basis, R, space, blur
+    def __init__(self, basis: BoundBasis, rms, R, space: SeriesSpace, blur: float, constant):
+        self.basis, self.rms, self.R, self.space, self.blur = basis, rms, R, space, blur
+        self.constant = constant
         self.size = basis.size
         self.orders = space.leading.shape[0] // basis.size
 
-    def user(self, columns: np.ndarray) -> np.ndarray:
-        """Coefficients of the user's functions from those of the orthonormal ones."""
+    def shares(self, columns: np.ndarray) -> np.ndarray:
+        """Shares from coefficients of the orthonormal functions."""
         blocks = columns.reshape(self.orders, self.size, -1)
         return np.linalg.solve(self.R, blocks).reshape(columns.shape)
 
@@ -47,7 +49,11 @@ class Span:
         if self.space.leading.shape[1] == 0:
             return Representatives([], [])
         some = slice(None, None, max(1, len(samples.q) // 40))
-        gradients = np.asarray(_differentials(self.basis, *(x[some] for x in samples)))
+        gradients = np.asarray(differentials(self.basis, *(x[some] for x in samples)))
+        # as fast as (q, p) change over the samples, so that their units do not matter
+        spread = np.repeat([_spread(samples.q), _spread(samples.p)], gradients.shape[2] // 2)
+        gradients = gradients * spread / self.rms[:, None]
+        _require_finite(self.basis, gradients)
         complexity = np.array(self.basis.complexity)
         series: list[np.ndarray] = []
         independent: list[bool] = []
@@ -68,18 +74,18 @@ class Span:
                 grown = self._rank_of([*taken, d / length]) == len(taken) + 1
                 if grown:
                     taken.append(d / length)
-                series.append(vector.reshape(self.orders, self.size))
+                series.append(self._without_constants(vector.reshape(self.orders, self.size)))
                 independent.append(grown)
         return Representatives(series, independent)
 
     def _up_to(self, level: int) -> np.ndarray:
-        """Series whose leading part uses no function above this complexity (user's functions)."""
-        user = self.user(self.space.leading)
-        leading = user[: self.size]
+        """Series, as shares, whose leading part uses no function above this complexity."""
+        shares = self.shares(self.space.leading)
+        leading = shares[: self.size]
         above = leading[np.array(self.basis.complexity) > level]
         singular, V = _svd(above / max(np.linalg.norm(leading, 2), 1e-300))
         singular = np.append(singular, np.zeros(len(V) - len(singular)))
-        return user @ V[singular < self.blur].T
+        return shares @ V[singular < self.blur].T
 
     def _rank_of(self, differentials: list[np.ndarray]) -> int:
         """The rank of differentials, (points, 2n) each, that most points agree on."""
@@ -91,7 +97,7 @@ class Span:
     def simplest(self, series: np.ndarray) -> np.ndarray:
         """The corrections that use complex functions as little as can be."""
         complexity = np.tile(self.basis.complexity, self.orders)
-        simplify = reduction(self.user(self.space.shifts), complexity, self.size, self.blur)
+        simplify = reduction(self.shares(self.space.shifts), complexity, self.size, self.blur)
         return simplify(series.reshape(-1)).reshape(series.shape)
 
     def least(self, series: np.ndarray) -> np.ndarray:
@@ -99,7 +105,14 @@ class Span:
         columns = (self.R @ series[..., None])[..., 0].reshape(-1)
         basis = orthonormal_range(self.space.shifts)
         columns = columns - basis @ (basis.T @ columns)
-        return self.user(columns[:, None]).reshape(series.shape)
+        return self._without_constants(self.shares(columns[:, None]).reshape(series.shape))
+
+    def _without_constants(self, series: np.ndarray) -> np.ndarray:
+        """The series less the multiple of the constant at each order that makes it simplest."""
+        if self.constant is None:
+            return series
+        j = np.argmax(np.abs(self.constant))
+        return series - np.outer(series[:, j] / self.constant[j], self.constant)
 
 
 def _svd(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,8 +120,22 @@ def _svd(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.svd(matrix)[1:] if matrix.size else (np.zeros(0), np.eye(matrix.shape[1]))
 
 
+def _require_finite(basis: BoundBasis, gradients: np.ndarray) -> None:
+    bad = ~np.isfinite(gradients).all(axis=(0, 2))
+    if bad.any():
+        raise ValueError(
+            f"the derivatives of the basis function {basis.names[int(np.argmax(bad))]!r} are not "
+            "finite on the samples: keep them off its singularity."
+        )
+
+
+def _spread(values: np.ndarray) -> float:
+    spread = float(np.sqrt(np.mean((values - np.mean(values, axis=0)) ** 2)))
+    return spread if spread > 0 else 1.0
+
+
 @eqx.filter_jit
-def _differentials(basis: BoundBasis, q: Any, p: Any, t: Any) -> Array:
+def differentials(basis: BoundBasis, q: Any, p: Any, t: Any) -> Array:
     """∂φ/∂(q, p) at points, shape (points, size, 2n)."""
 
     def at_point(q, p, t):

@@ -21,6 +21,8 @@ class InvariantSeries(eqx.Module):
 
     - `coefficients`: c, shape (order + 1, basis size). `basis`: φ.
     - `slow_time`: whether φ is a function of the slow time τ = εt in place of t.
+    - `sizes`: shape of `coefficients`: what a coefficient of 1 amounts to where the series was
+      found, by which terms of a formula are left out; None counts all alike.
 
     Give it to `integrate` as it is; there it is bound to the run's ε. As a formula: `str`.
     """
@@ -29,6 +31,7 @@ class InvariantSeries(eqx.Module):
     coefficients: Float[Array, "orders functions"]
     slow_time: bool = eqx.field(static=True, default=False)
     epsilon: Any = None
+    sizes: Any = None
 
     @property
     def order(self) -> int:
@@ -38,7 +41,7 @@ class InvariantSeries(eqx.Module):
     def bind(self, system: System, epsilon: Any) -> "InvariantSeries":
         """The same series at this ε."""
         del system
-        return InvariantSeries(self.basis, self.coefficients, self.slow_time, epsilon)
+        return InvariantSeries(self.basis, self.coefficients, self.slow_time, epsilon, self.sizes)
 
     def evaluate(self, q: State, p: State, epsilon: Any, t: Any = 0.0) -> Scalar:
         """The value at a point, a scalar; t is the slow time τ when `slow_time` is set."""
@@ -73,34 +76,33 @@ class InvariantSeries(eqx.Module):
         return self.formula()
 
     def formula(self, terms: int | None = None, drop: float = 1e-9) -> str:
-        """The series as text, with at most so many terms at each order, all above a share `drop`.
+        """The series as text: at each order at most so many terms, all above a share `drop`.
 
-        How many are left out is said, unless they are below 1e-9 of the largest.
+        How many are left out is said, unless they are round-off.
         """
         c = np.asarray(self.coefficients)
-        largest = float(np.max(np.abs(c)))
-        text = shortened(self.basis, c[0], terms, drop, largest)
-        for m, block in enumerate(c[1:], 1):
-            if np.any(np.abs(block) > 1e-9 * largest):
+        shares = np.abs(c if self.sizes is None else c * np.asarray(self.sizes))
+        text = shortened(self.basis, c[0], shares[0], terms, drop)
+        for m in range(1, len(c)):
+            if np.max(shares[m]) > 1e-9 * np.max(shares):
                 power = "ε" if m == 1 else f"ε{m}".translate(_POWERS)
-                text += f" + {power} ({shortened(self.basis, block, terms, drop, largest)})"
+                text += f" + {power} ({shortened(self.basis, c[m], shares[m], terms, drop)})"
         return text
 
 
 def shortened(
     basis: BoundBasis,
     c: np.ndarray,
+    shares: np.ndarray,
     terms: int | None = None,
     drop: float = 1e-9,
-    largest: float | None = None,
 ) -> str:
-    """The combination as text: at most so many terms, all above the share `drop` of `largest`."""
-    largest = float(np.max(np.abs(c))) if largest is None else largest
-    shown = np.where(np.abs(c) > drop * largest, c, 0.0)
+    """The combination as text: at most so many terms, all above the share `drop` of the largest."""
+    shown = np.where(shares > drop * np.max(shares), c, 0.0)
     if terms is not None:
-        shown[np.argsort(-np.abs(c), kind="stable")[terms:]] = 0.0
-    text = basis.formula(shown)
-    hidden = np.sum(np.abs(c) > 1e-9 * largest) - np.count_nonzero(shown)
+        shown[np.argsort(-shares, kind="stable")[terms:]] = 0.0
+    text = basis.formula(shown, drop=0.0)
+    hidden = np.sum(shares > 1e-9 * np.max(shares)) - np.count_nonzero(shown)
     return f"{text} + … ({hidden} smaller terms)" if hidden else text
 
 

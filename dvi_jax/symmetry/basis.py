@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -70,7 +71,7 @@ class BoundBasis(eqx.Module):
         return len(self.names)
 
     def __call__(self, q: State, p: State, t: Any = 0.0) -> Float[Array, " size"]:
-        return self.function(q, p, jnp.asarray(t, float))
+        return self.function(jnp.asarray(q), jnp.asarray(p), jnp.asarray(t, float))
 
     def formula(self, coefficients: Any, digits: int = 6, drop: float = 1e-9) -> str:
         """The combination with these coefficients as text; tiny ones (relative) are left out."""
@@ -127,8 +128,9 @@ class Basis(AbstractBasis):
         self.complexity = complexity
 
     def for_shape(self, shape):
-        del shape
         timed = tuple(not _takes(f, 2) for f in self.functions)
+        for name, function, with_time in zip(self.names, self.functions, timed, strict=True):
+            _require_real_scalar(name, function, with_time, shape)
         complexity = (self.complexity,) * len(self.names)
         return BoundBasis(_Values(self.functions, timed), self.names, complexity, any(timed))
 
@@ -143,13 +145,32 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
     return True
 
 
+def _require_real_scalar(name, function, timed: bool, shape) -> None:
+    """Refuse a function whose value is no real scalar, by tracing it once."""
+    state, time = (jax.ShapeDtypeStruct(s, jnp.result_type(float)) for s in (shape, ()))
+    try:
+        out = eqx.filter_eval_shape(function, state, state, *([time] if timed else []))
+    except Exception as error:
+        error.add_note(f"(in the basis function {name!r}, called with q of shape {shape})")
+        raise
+    kind, dtype = np.shape(out), getattr(out, "dtype", type(out))
+    real = np.issubdtype(dtype, np.floating) or np.issubdtype(dtype, np.integer)
+    if out is None or kind != () or not real:
+        seen = "None" if out is None else f"shape {kind}, type {np.dtype(dtype).name}"
+        raise ValueError(
+            f"the basis function {name!r} must return a real scalar; for q of shape {shape} it "
+            f"returned {seen}. Take one component, e.g. q[0]."
+        )
+
+
 class _Values(eqx.Module):
     functions: tuple[Callable[..., Any], ...]
     timed: tuple[bool, ...] = eqx.field(static=True)
 
     def __call__(self, q, p, t):
         pairs = zip(self.functions, self.timed, strict=True)
-        return jnp.stack([jnp.asarray(f(q, p, t) if timed else f(q, p)) for f, timed in pairs])
+        values = [f(q, p, t) if timed else f(q, p) for f, timed in pairs]
+        return jnp.stack([jnp.asarray(value, float) for value in values])
 
 
 def _name(function: Any, i: int) -> str:
@@ -165,8 +186,9 @@ class Sum(AbstractBasis):
 
     def for_shape(self, shape):
         a, b = self.first.for_shape(shape), self.second.for_shape(shape)
+        again = tuple(name + "′" if name in a.names else name for name in b.names)
         return BoundBasis(
-            _Both(a, b), a.names + b.names, a.complexity + b.complexity, a.uses_time or b.uses_time
+            _Both(a, b), a.names + again, a.complexity + b.complexity, a.uses_time or b.uses_time
         )
 
 

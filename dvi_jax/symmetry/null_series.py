@@ -7,9 +7,12 @@ import numpy as np
 
 from ..engine.echelon import reduced, reduction
 from ..engine.nullspace import (
+    HELD_OUT,
     NULL,
     RANK,
     compress,
+    epsilon_scale,
+    in_units_of,
     null_space,
     orthonormal_range,
     rank,
@@ -20,9 +23,6 @@ from .families import coordinate_names
 from .gauge import BasisGauge
 from .generators import Generator
 from .symmetries import BasisComponent, Symmetries, Symmetry
-
-_HELD_OUT = 10
-"""Held-out samples may leave this many times what fitted ones are allowed to."""
 
 _TINY = 1e-12
 """Coefficients whose share of a generator is below this are round-off."""
@@ -43,6 +43,7 @@ class Search:
         t = _inverse(np.sqrt(np.mean((raw.clock[fit, 0] * rows) ** 2)))
         used = slice(0 if time else 1, None)
         self.units = np.repeat([t, q, p], [1, n, n])[used]
+        self.size = len(self.units) * basis.size  # unknowns of each order
         values = raw.values[fit, 0, 0]
         self.rms = np.sqrt(np.mean(values**2, axis=0))
         self.R = triangle(values) / np.sqrt(len(values))
@@ -50,12 +51,15 @@ class Search:
 
         determining = raw.determining[..., used, :] * rows[:, None, None]
         identity = raw.identity[..., used, :] * actions[:, None, None]
+        # ε in the unit in which the disturbance is as large as the rest
+        sums = rows_of(self._orthonormal(determining.sum(axis=2))[fit])
+        self.scale = epsilon_scale(sums)
+        determining, identity = (in_units_of(self.scale, x) for x in (determining, identity))
         self.determining, self.identity = determining.sum(axis=2), identity.sum(axis=2)
         self.parts = determining[:, 0], identity[:, 0]  # of each point, at ε = 0
-        self.gauge = raw.gauge * actions[:, None]
+        self.gauge = in_units_of(self.scale, raw.gauge * actions[:, None])
         of_fit = rows_of(self.gauge[fit, 0])
         self.R_gauge = triangle(of_fit) / np.sqrt(len(of_fit))
-        self.size = len(self.units) * basis.size  # unknowns of each order
         self.complexity = np.tile(basis.complexity, len(self.units))
 
     def result(self) -> Symmetries:
@@ -109,7 +113,7 @@ class Search:
         norm = max(np.linalg.norm(conditions, 2), np.finfo(float).tiny)
         singular, V = np.linalg.svd(triangle(conditions @ columns / norm))[1:]
         singular = np.append(singular, np.zeros(len(V) - len(singular)))
-        return columns @ V[singular <= _HELD_OUT * (self.tolerance or NULL)].T
+        return columns @ V[singular <= HELD_OUT * (self.tolerance or NULL)].T
 
     def _variational(self, null: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The series in the null space whose identity closes, and their gauges."""
@@ -204,19 +208,23 @@ class Search:
         else:
             g = self._best_gauge(identity)
         identity = identity + _toeplitz_sums(self.gauge, g)
+        residuals = self._relative(self._sums(self.determining, c), self.parts[0], c)
+        identity_residuals = self._relative(identity, self.parts[1], c)
+        c, g = (in_units_of(1 / self.scale, x, axis=0) for x in (c, g))
         generators = tuple(self._generator(x) for x in c)
         gauges = tuple(BasisGauge(self.gauge_basis, jnp.asarray(x)) for x in g)
         return Symmetry(
             generators=generators,
             is_variational=variational,
             gauges=gauges if variational else None,
-            residuals=self._relative(self._sums(self.determining, c), self.parts[0], c),
-            identity_residuals=self._relative(identity, self.parts[1], c),
+            residuals=residuals,
+            identity_residuals=identity_residuals,
             is_dependent=self._depends(c, before),
             is_symplectic=symplectic and all(g.xi0 is None for g in generators),
             coefficients=c,
             names=self.names,
             basis=self.basis,
+            scale=self.scale,
         )
 
     def _generator(self, c: np.ndarray) -> Generator:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._precision import refuse_double_without_x64
 from .._results import RESULTS
 from .._step import Equations, step
 from .._system import System
@@ -25,12 +26,15 @@ class Samples(NamedTuple):
 
     @property
     def held_out(self) -> np.ndarray:
-        """Which points are not fitted but judge the fit: every fourth."""
-        return np.arange(len(self.q)) % 4 == 3
+        """Which points are not fitted but judge the fit: a quarter, at random, always the same."""
+        held = np.zeros(len(self.q), bool)
+        held[np.random.default_rng(0).permutation(len(held))[: len(held) // 4]] = True
+        return held
 
 
 def as_samples(samples: Any, t0: float = 0.0) -> Samples:
     """(qs, ps) at the time t0, or (qs, ps, ts), after refusing what cannot be sampled points."""
+    refuse_double_without_x64("samples", np.float64)
     if isinstance(samples, Samples):
         return samples
     try:
@@ -86,8 +90,8 @@ def require_steps(good: Any, samples: Samples) -> None:
         )
 
 
-def check_basis(basis: BoundBasis, values: np.ndarray) -> None:
-    """Refuse functions that are not finite on the samples, or dependent; `values`: (S, size)."""
+def check_finite(basis: BoundBasis, values: np.ndarray) -> None:
+    """Refuse functions that are not finite on the samples; `values`: (S, size)."""
     bad = ~np.isfinite(values)
     if bad.any():
         i, j = np.argwhere(bad)[0]
@@ -95,6 +99,14 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> None:
             f"the basis function {basis.names[j]!r} is not finite at {int(bad[:, j].sum())} of "
             f"{len(values)} samples (first: number {i}): keep the samples off its singularity."
         )
+
+
+def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
+    """Refuse functions that are not finite on the samples, or dependent; `values`: (S, size).
+
+    Returns the condition number of the functions, each scaled to one size.
+    """
+    check_finite(basis, values)
     scale = np.linalg.norm(values, axis=0)
     zero = np.flatnonzero(scale == 0)
     normal = values / np.where(scale > 0, scale, 1)
@@ -106,6 +118,7 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> None:
             f"{', '.join(map(repr, members))}{' …' if not zero.size else ''} vanishes on all of "
             "them. Leave one out, or take samples that fill the domain."
         )
+    return float(singular[0] / singular[-1])
 
 
 def solution_pairs(

@@ -95,6 +95,8 @@ def find_symmetries(
     require_enough(samples, components * bound.size, 2 * n)
     require_enough(samples, gauge_basis.size, 1 + 2 * n)
 
+    q, p, t = (jnp.asarray(x[0]) for x in samples)
+    system.check_shapes(t, q, p, jnp.zeros(()), args)
     equations = Equations(system, jnp.zeros(()), args, newton)
     for one in (bound, gauge_basis) if gauges is not None else (bound,):
         check_basis(one, values_at(one, samples))

@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
+from ..engine.nullspace import in_units_of
 from .basis import BoundBasis
 from .gauge import BasisGauge
 from .generators import Generator
@@ -44,6 +45,7 @@ class Symmetry(eqx.Module):
       If it is and yet not variational, a larger gauge basis may close the identity.
     - `coefficients`: shape (z + 1, components, basis size), components ξ0 (if looked for), those
       of ξ, those of η, named in `names`.
+    - `scale`: 1 over the ε at which the disturbance is as large as the rest.
     """
 
     generators: tuple[Generator, ...]
@@ -56,6 +58,7 @@ class Symmetry(eqx.Module):
     coefficients: np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
     basis: BoundBasis
+    scale: float = eqx.field(static=True, default=1.0)
 
     @property
     def order(self) -> int:
@@ -75,8 +78,9 @@ class Symmetry(eqx.Module):
         return AdiabaticInvariant(list(self.generators), list(self.gauges))
 
     def __str__(self) -> str:
-        largest = np.max(np.abs(self.coefficients), initial=0.0)
-        c = np.where(np.abs(self.coefficients) > 1e-9 * largest, self.coefficients, 0.0)
+        shares = np.abs(in_units_of(self.scale, self.coefficients, axis=0))
+        largest = np.max(shares, initial=0.0)
+        c = np.where(shares > 1e-9 * largest, self.coefficients, 0.0)
         parts = [
             f"{name} = {_series(self.basis, c[:, i])}"
             for i, name in enumerate(self.names)
@@ -175,8 +179,11 @@ def _described(symmetry: Symmetry) -> list[str]:
     ]
     if symmetry.gauges is not None:
         gauges = np.stack([np.asarray(g.coefficients) for g in symmetry.gauges])
-        size = max(np.max(np.abs(gauges), initial=0.0), np.max(np.abs(symmetry.coefficients)))
-        gauges = np.where(np.abs(gauges) > 1e-9 * size, gauges, 0.0)
+        shares, others = (
+            np.abs(in_units_of(symmetry.scale, x, axis=0)) for x in (gauges, symmetry.coefficients)
+        )
+        size = max(np.max(shares, initial=0.0), np.max(others))
+        gauges = np.where(shares > 1e-9 * size, gauges, 0.0)
         lines.append(f"      gauge G = {_series(symmetry.gauges[0].basis, gauges)}")
         if symmetry.moves_time:
             lines.append("      ξ0 is not zero: on a fixed mesh its invariant may move by O(h)")
@@ -191,5 +198,6 @@ def _series(basis: BoundBasis, coefficients: np.ndarray) -> str:
     for m, block in enumerate(coefficients):
         power = "ε" if m == 1 else "ε" + str(m).translate(_RAISED)
         if block.any():
-            parts.append(f"{power} ({basis.formula(block)})" if m else basis.formula(block))
+            text = basis.formula(block, drop=0.0)
+            parts.append(f"{power} ({text})" if m else text)
     return " + ".join(parts) or "0"

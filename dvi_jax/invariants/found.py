@@ -1,0 +1,263 @@
+"""What discovery returns: the invariants, what is lost, and a report; saved and loaded."""
+
+import json
+import os
+import zipfile
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._precision import refuse_double_without_x64
+from .._types import State
+from ..symmetry.basis import AbstractBasis, BoundBasis, bind_basis
+from ..symmetry.sampling import Samples
+from .obstructions import DriftLaw
+from .series import InvariantSeries
+
+_CLEAR = 1e3
+"""A gap in the singular values below this is not clear."""
+
+_ILL = 1e8
+"""Condition number of a basis from which on formulas have lost half of their digits."""
+
+
+class Discovery(eqx.Module):
+    """What `discover_invariants` found.
+
+    - `coefficients`: shape (count, order + 1, basis size), of the independent invariants, the
+      simplest first; count may be 0. `dependent`: the same for the others in the span, which
+      are functions of them (on the samples, as far as differentials say).
+    - `exact`: for each independent invariant, whether it is kept at ε that are not small, to
+      round-off over many steps; not tried (False) at order 0.
+    - `leading_parts`: shape (families, basis size): a basis, orthonormal on the samples, of the
+      order-0 parts of *all* invariants in the span.
+    - `survivors`: for m = 0 … order, how many leading parts have an invariant of order m
+      (a constant is none).
+    - `singular_values`: of the whole system, descending, relative to the largest; `gap`: the
+      ratio at which they were cut (large is clear, below 1e3 is not). `refused`: null vectors of
+      the fitted samples that held-out samples, or a lower order, refuse.
+    - `residuals`: shape (count, order + 1), on held-out points: the largest change over one
+      step at each order in ε · `scale`, relative to the spread of the leading part and to what
+      functions of the basis change by in a step. `dependent_residuals` likewise.
+    - `reach`: shape (count,): the ε at which corrections are as large as the leading part; the
+      series is of use far below it. Infinite without corrections.
+    - `obstructions`: a `DriftLaw` for each leading part that is lost at order 1, 2, ….
+    - `basis`: with `names`. `sizes`: shape (order + 1, basis size), what a coefficient of 1
+      amounts to on the samples. `condition`: of the basis there, each function scaled to one size.
+    - `scale`: 1 over the ε at which the disturbance changes a step as much as H_D does.
+    - `slow_time`: of the system. `tolerance`: None, or that of approximate invariants.
+
+    On resonant or integrable systems the null space is large; on chaotic ones near-null vectors
+    appear that are none. Held-out residuals and `drift_order` on a long run decide.
+    """
+
+    coefficients: Array
+    dependent: Array
+    exact: tuple[bool, ...] = eqx.field(static=True)
+    leading_parts: np.ndarray
+    survivors: tuple[int, ...] = eqx.field(static=True)
+    singular_values: np.ndarray
+    gap: float = eqx.field(static=True)
+    refused: int = eqx.field(static=True)
+    residuals: np.ndarray
+    dependent_residuals: np.ndarray
+    reach: np.ndarray
+    obstructions: tuple[DriftLaw, ...]
+    basis: BoundBasis
+    sizes: np.ndarray
+    condition: float = eqx.field(static=True)
+    scale: float = eqx.field(static=True)
+    probe: Samples
+    shape: tuple[int, ...] = eqx.field(static=True)
+    slow_time: bool = eqx.field(static=True)
+    tolerance: float | None = eqx.field(static=True)
+
+    @property
+    def count(self) -> int:
+        """Number of independent invariants found."""
+        return self.coefficients.shape[0]
+
+    @property
+    def order(self) -> int:
+        """z, the order that was asked for."""
+        return len(self.survivors) - 1
+
+    @property
+    def invariants(self) -> list[InvariantSeries]:
+        """The independent invariants as observables."""
+        return self._series(self.coefficients)
+
+    @property
+    def dependent_invariants(self) -> list[InvariantSeries]:
+        """Those in the span that are functions of the independent ones."""
+        return self._series(self.dependent)
+
+    def _series(self, coefficients: Array) -> list[InvariantSeries]:
+        return [
+            InvariantSeries(self.basis, c, self.slow_time, sizes=self.sizes) for c in coefficients
+        ]
+
+    def evaluate(self, q: State, p: State, epsilon: Any, t: Any = 0.0) -> Array:
+        """The values of the independent invariants at a point, shape (count,)."""
+        powers = jnp.asarray(epsilon) ** jnp.arange(self.order + 1)
+        return jnp.einsum("m,kmb,b->k", powers, self.coefficients, self.basis(q, p, t))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything but the basis functions themselves to a file (NumPy's npz)."""
+        laws = [
+            {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in law._asdict().items()}
+            for law in self.obstructions
+        ]
+        about = {
+            "format": _FORMAT,
+            "names": self.basis.names,
+            "exact": self.exact,
+            "survivors": self.survivors,
+            "gap": self.gap,
+            "refused": self.refused,
+            "condition": self.condition,
+            "scale": self.scale,
+            "shape": self.shape,
+            "slow_time": self.slow_time,
+            "tolerance": self.tolerance,
+            "obstructions": laws,
+        }
+        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        arrays |= {f"probe_{name}": x for name, x in self.probe._asdict().items()}
+        arrays["probe_values"] = _probed(self.basis, self.probe)
+        with open(path, "wb") as file:
+            np.savez(file, about=np.array(json.dumps(about)), **arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], basis: AbstractBasis) -> "Discovery":
+        """Read what `save` wrote; `basis` is the one that was searched (its names are compared).
+
+        **Raises** `ValueError` for a file of something else, or another basis.
+        """
+        refuse_double_without_x64("a Discovery", np.float64)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                about = json.loads(str(file["about"]))
+                arrays = {name: file[name] for name in _ARRAYS}
+                probe = Samples(*(file[f"probe_{name}"] for name in Samples._fields))
+                values = file["probe_values"]
+            if about["format"] != _FORMAT:
+                raise KeyError("format")
+        except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{os.fspath(path)} is no file that Discovery.save wrote.") from error
+        shape = tuple(about["shape"])
+        bound = bind_basis(basis, shape)
+        if list(bound.names) != about["names"]:
+            raise ValueError(
+                f"{os.fspath(path)} was found in a basis of {len(about['names'])} functions "
+                f"({', '.join(about['names'][:4])} …); the one given has {bound.size} "
+                f"({', '.join(bound.names[:4])} …)."
+            )
+        differs = ~np.isclose(_probed(bound, probe), values, rtol=1e-9)
+        if differs.any():
+            raise ValueError(
+                f"the basis given has the names of that of {os.fspath(path)} and other values: "
+                f"{bound.names[int(np.argmax(differs.any(axis=0)))]!r} differs."
+            )
+        laws = tuple(_law(law) for law in about["obstructions"])
+        for name in ("coefficients", "dependent"):
+            arrays[name] = jnp.asarray(arrays[name])
+        return cls(
+            exact=tuple(about["exact"]),
+            survivors=tuple(about["survivors"]),
+            gap=about["gap"],
+            refused=about["refused"],
+            condition=about["condition"],
+            scale=about["scale"],
+            obstructions=laws,
+            basis=bound,
+            probe=probe,
+            shape=shape,
+            slow_time=about["slow_time"],
+            tolerance=about["tolerance"],
+            **arrays,
+        )
+
+    def __str__(self) -> str:
+        kind = "independent" if self.tolerance is None else "independent approximate"
+        drop = 1e-9 if self.tolerance is None else np.sqrt(self.tolerance)
+        lines = [
+            f"{self.count} {kind} invariant{'' if self.count == 1 else 's'} of order "
+            f"{self.order} in {self.basis.size} functions; leading parts that survive order 0 … "
+            f"{self.order}: {', '.join(map(str, self.survivors))}; gap {self.gap:.1e}"
+        ]
+        if self.tolerance is not None:
+            lines.append(f"  singular values up to {self.tolerance:g} of the largest count as zero")
+        elif self.survivors[0] and self.gap < _CLEAR:
+            lines.append("  the gap is not clear: let drift_order on a long run decide")
+        if self.refused:
+            lines.append(
+                f"  {self.refused} null vectors of the fitted samples refused: held-out samples or "
+                "a lower order decide (chaos, too few samples, or too large a tolerance)"
+            )
+        if self.condition > _ILL:
+            lines.append(
+                f"  the basis is ill-conditioned on the samples ({self.condition:.0e}): formulas "
+                "are not reliable; shift and scale the coordinates"
+            )
+        for series, residual, exact, reach in zip(
+            self.invariants, self.residuals, self.exact, self.reach, strict=True
+        ):
+            lines.append(f"  I = {series.formula(_SHOWN, drop)}")
+            told = ", exact at every ε tried" if exact else ""
+            if np.isfinite(reach) and not exact:
+                told = f"; corrections are as large as the leading part at ε = {reach:.2g}"
+            lines.append(f"      held-out residual {np.max(residual):.1e}{told}")
+        if len(self.dependent):
+            lines.append(f"  functions of them, as differentials say: {len(self.dependent)}")
+            for series in self.dependent_invariants[:3]:
+                lines.append(f"      {series.formula(_SHOWN, drop)}")
+        told = [law for law in self.obstructions if law.kind != "unexplained"]
+        lines += [f"  {law}" for law in told[:_LAWS]]
+        if len(told) > _LAWS:
+            lines.append(f"  {len(told) - _LAWS} more lost, each by such a law")
+        lost = self.survivors[0] - self.survivors[-1]
+        if len(told) < lost:
+            lines.append(
+                f"  {lost - len(told)} more lost, by a drift that is no function of what order 0 "
+                "keeps in this basis: it may be too small"
+            )
+        return "\n".join(lines)
+
+
+def _law(values: dict[str, Any]) -> DriftLaw:
+    """A law as `Discovery.save` wrote it."""
+    fields: dict[str, Any] = {
+        k: np.array(v) if isinstance(v, list) else v for k, v in values.items()
+    }
+    return DriftLaw(**fields)
+
+
+_ARRAYS = (
+    "coefficients",
+    "dependent",
+    "leading_parts",
+    "singular_values",
+    "residuals",
+    "dependent_residuals",
+    "reach",
+    "sizes",
+)
+
+_FORMAT = 1
+
+
+def _probed(basis: BoundBasis, probe: Samples) -> np.ndarray:
+    """The functions at some points, shape (points, size)."""
+    return np.asarray(jax.vmap(basis)(*map(jnp.asarray, probe)))
+
+
+_SHOWN = 12
+"""Terms of a formula in a report; ``str`` of a series shows all."""
+
+_LAWS = 4
+"""Drift laws in a report."""
