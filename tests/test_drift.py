@@ -306,6 +306,7 @@ def test_pictures_show_what_was_excluded():
         ({"epsilons": [0.0, 0.1, 0.2]}, "positive"),
         ({"epsilons": [0.1, np.inf]}, "positive"),
         ({"epsilons": []}, "positive"),
+        ({"epsilons": "a"}, "positive"),
         ({"epsilons": 0.1}, "positive"),
         ({"epsilons": [0.1, 0.2, 0.1]}, "distinct"),
         ({"h": np.float64(0.0)}, "must not be zero"),

@@ -254,3 +254,10 @@ def test_bad_input_is_refused():
         shadow.terms(0.0, Q, P)
     with pytest.raises(ValueError, match="one shape"):
         shadow.terms(0.0, Q, jnp.zeros(2))
+
+
+def test_doubles_are_refused_where_floats_are_computed():
+    with jax.enable_x64(False), pytest.raises(TypeError, match="jax_enable_x64"):
+        dvi.ShadowHamiltonian(1, dvi.System(pendulum)).evaluate(
+            0.0, np.array([0.1]), np.array([0.2]), 0.1
+        )

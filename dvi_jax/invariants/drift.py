@@ -486,7 +486,11 @@ def _check_observable(invariant: Any) -> None:
 
 
 def _positive(name: str, values: Any, increasing: bool = False) -> np.ndarray:
-    values = np.asarray(values, float)
+    given = values
+    try:
+        values = np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a list of positive numbers, got {given!r}.") from None
     if values.ndim != 1 or len(values) == 0 or not (np.isfinite(values) & (values > 0)).all():
         raise ValueError(f"{name} must be a list of positive numbers, got {values.tolist()}.")
     if increasing and (np.diff(values) <= 0).any():

@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._compat import is_traced
+from .._precision import refuse_double_without_x64
 from .._system import System
 from .._types import Args, Scalar, State
 from ..engine.dependence import depends_on
@@ -53,7 +54,7 @@ class ShadowHamiltonian(eqx.Module):
 
     **Raises** `ValueError` for an order that is not an integer of at least 0, a step size that is
     zero or not finite, q and p of different shapes, or when no system is known; `TypeError`
-    for a system that is none.
+    for a system that is none, or float64 in a process that computes in float32.
 
     **Accuracy** round-off, which grows with the term: relative 1e-13 for H̃_3, 1e-10 for H̃_6.
     Nested forward mode: the time to compile about doubles with each order (at order 4 a second or
@@ -109,6 +110,9 @@ class ShadowHamiltonian(eqx.Module):
         polynomial of degree i in k, its differences Δ^j with j > i vanish.
         """
         system = self._known_system()
+        for name, value in (("q", q), ("p", p)):
+            if not is_traced(value):
+                refuse_double_without_x64(name, getattr(value, "dtype", np.float32))
         q, p = jnp.asarray(q), jnp.asarray(p)
         if q.shape != p.shape:
             raise ValueError(f"q and p must have one shape, got {q.shape} and {p.shape}.")
