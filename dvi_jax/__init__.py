@@ -27,10 +27,14 @@ from .invariants import (
 from .lattices import Given as Given, Lattice as Lattice, Uniform as Uniform
 from .methods import (
     Adjoint as Adjoint,
+    BlanesMoan as BlanesMoan,
     Composition as Composition,
+    KahanLi as KahanLi,
+    McLachlan as McLachlan,
     Method as Method,
     RungeKutta4 as RungeKutta4,
     Strang as Strang,
+    Suzuki as Suzuki,
     TypeII as TypeII,
     Yoshida as Yoshida,
 )

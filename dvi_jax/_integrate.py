@@ -31,7 +31,7 @@ from ._step import Equations
 from ._system import System
 from .engine.newton import Newton
 from .lattices import Lattice, Uniform
-from .methods import Method, TypeII
+from .methods import Method, TypeII, warn_of_dissipation
 from .observe import Reduction
 
 _STEP = "(t0, t1, q0, p0, q1, p1, args)"
@@ -72,7 +72,8 @@ def integrate(
     - `h`: step size [time], not 0; negative runs backwards. `num_steps`: how many; static.
     - `t0`: time of the start. `epsilon`: strength of the disturbance.
     - `args`: pytree handed to H_D, W and the observables.
-    - `method`: `TypeII`, `Strang`, `Yoshida`, `Composition`, `Adjoint`, `RungeKutta4`.
+    - `method`: `TypeII`, `Adjoint`, `Strang`, the compositions `Yoshida`, `Suzuki`, `BlanesMoan`,
+      `McLachlan`, `KahanLi`, `Composition`; `RungeKutta4`.
     - `lattice`: `Uniform()`, or `Given(ts)`, which replaces h, num_steps and t0.
     - `save`: which states are kept, see `Save`.
     - `observe`: pytree of observables, functions of one step
@@ -134,6 +135,9 @@ def integrate(
     _check_observe(task, q0, p0)
     plan = make_plan(save, num_steps)
     traced = any(is_traced(x) for x in jax.tree.leaves((task, q0, p0)))
+    if not traced:
+        first = task.interval(jnp.asarray(0, jnp.int32))
+        warn_of_dissipation(method, equations, first, q0, p0)
     if progress is None:
         outcome = _whole(task, plan, q0, p0, adjoint)
     elif traced:

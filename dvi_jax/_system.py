@@ -52,6 +52,12 @@ class System(eqx.Module):
             _require_five_arguments(self.perturbation, "perturbation")
         if not isinstance(self.slow_time, bool):
             raise TypeError(f"slow_time must be True or False, got {self.slow_time!r}.")
+        functions = (self.H_D, self.perturbation)
+        if self.slow_time and any(getattr(f, "step_is_from_times", False) for f in functions):
+            raise ValueError(
+                "dvi.discretise(H, order) of order 2 and up takes the step from t1 − t0, which is "
+                "not the step in a slow time: use order=1, and compose the map for a higher order."
+            )
 
     def hamiltonian(
         self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args

@@ -85,7 +85,8 @@ def test_door_has_no_logic():
 
 PUBLIC = """
 System discretise integrate Save Solution RESULTS IntegrationError Newton
-TypeII Adjoint Strang Yoshida Composition RungeKutta4 Uniform Given
+TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition RungeKutta4
+Uniform Given
 MaxDrift Range Trend Mean Last Reversible Checkpointed Direct
 Generator prolong determining_residual conformal_factor noether_identity AdiabaticInvariant
 generators random_pairs solution_pairs find_symmetries Symmetries Symmetry

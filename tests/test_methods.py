@@ -1,6 +1,7 @@
 """Order, symplecticity, reversal and inverse of every method, each with a negative control."""
 
 import functools
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -8,13 +9,11 @@ import numpy as np
 import pytest
 from helpers import (
     ARGS,
-    INVERTIBLE,
-    METHODS,
-    SYMPLECTIC,
+    METHODS as REGISTERED,
     SYSTEMS,
     ExplicitEuler,
+    central_difference,
     flow,
-    measured_orders,
     state,
     symplectic_defect,
 )
@@ -23,8 +22,33 @@ from scipy.integrate import solve_ivp
 import dvi_jax as dvi
 from dvi_jax._step import Equations, adjoint_step, inverse_step, step
 from dvi_jax._types import Interval
+from dvi_jax.methods import warn_of_dissipation
+from dvi_jax.methods._composition import CompositionMethod, of_strang
+from dvi_jax.methods._order_conditions import order_defects
 
 TWO_SYSTEMS = ["non_separable", "double_pendulum"]
+
+COMPOSITIONS = {
+    "Yoshida6": dvi.Yoshida(6),
+    "Yoshida8": dvi.Yoshida(8),
+    "Suzuki4": dvi.Suzuki(4),
+    "BlanesMoan4": dvi.BlanesMoan(4),
+    "BlanesMoan6": dvi.BlanesMoan(6),
+    "McLachlan4": dvi.McLachlan(4),
+    "McLachlan6": dvi.McLachlan(6),
+    "McLachlan8": dvi.McLachlan(8),
+    "KahanLi6": dvi.KahanLi(6),
+    "KahanLi8": dvi.KahanLi(8),
+    "StrangOfAdjoint": dvi.Strang(base=dvi.Adjoint()),
+    "TripleOfStrang": dvi.Composition(
+        [1 / (2 - 2 ** (1 / 3)), 1 - 2 / (2 - 2 ** (1 / 3)), 1 / (2 - 2 ** (1 / 3))],
+        order=4,
+        base=dvi.Strang(),
+    ),
+}
+METHODS = {**REGISTERED, **COMPOSITIONS}
+SYMPLECTIC = {k: m for k, m in METHODS.items() if m.is_symplectic}
+INVERTIBLE = {k: m for k, m in METHODS.items() if m.is_invertible}
 
 
 @functools.cache
@@ -37,10 +61,19 @@ LONG_COMPILE = {
 }
 
 
+IN_EVERY_RUN = {("non_separable", "BlanesMoan4"), ("non_separable", "KahanLi8")}
+
+
+def is_long(system, method):
+    if method in COMPOSITIONS:
+        return (system, method) not in IN_EVERY_RUN
+    return (system, method) in LONG_COMPILE
+
+
 def pairs(methods, names):
     """Every (system, method); those that take long to compile are marked slow."""
     return [
-        pytest.param(s, m, marks=[pytest.mark.slow] if (s, m) in LONG_COMPILE else [])
+        pytest.param(s, m, marks=[pytest.mark.slow] if is_long(s, m) else [])
         for s in names
         for m in methods
     ]
@@ -83,16 +116,97 @@ def reference(system, epsilon, t_end):
     return z.y[:, -1]
 
 
+FORCED = 0.2  # strength of the force where orders are measured
+
+
+STEPS_FOR_HIGH_ORDER = {
+    "non_separable": [4, 6, 8, 12, 16, 24],
+    "double_pendulum": [12, 16, 24, 32, 48, 64, 72],
+}
+
+
+@functools.cache
+def forced_step(system, method):
+    """One jitted step (z, t0, h) → z under the damped and driven force, for any number of steps."""
+    s = SYSTEMS[system][0]
+    return jax.jit(lambda z, t0, h: flow(s, method, h, t0=t0, epsilon=FORCED)(z))
+
+
+def measured_order(system, method, t_end=2.0):
+    """The order between the two smallest steps whose errors are above round-off."""
+    number = np.array([16, 32, 64, 128] if method.order <= 4 else STEPS_FOR_HIGH_ORDER[system])
+    exact, advance = reference(system, FORCED, t_end), forced_step(system, method)
+    errors = []
+    for n in number:
+        z = state(system)
+        for k in range(n):
+            z = advance(z, k * t_end / n, t_end / n)
+        errors.append(np.max(np.abs(z - exact)))
+    keep = np.array(errors) > 1e-12
+    assert keep.sum() >= 3, f"fewer than three points above round-off: {errors}"
+    orders = -np.diff(np.log(np.array(errors)[keep])) / np.diff(np.log(number[keep]))
+    return orders[-1]
+
+
 @pytest.mark.parametrize(("system", "method"), pairs(METHODS, TWO_SYSTEMS))
 def test_order_with_a_damped_and_driven_force(system, method):
     """The order is that named, on a non-separable, forced, implicit problem."""
-    m, t_end, epsilon = METHODS[method], 1.0, 0.2
-    f = jax.jit(lambda z, h, n: flow(SYSTEMS[system][0], m, h, n, epsilon)(z), static_argnums=2)
-    steps = [16, 32, 64, 128]
-    exact = reference(system, epsilon, t_end)
-    errors = [np.max(np.abs(f(state(system), t_end / n, n) - exact)) for n in steps]
-    orders = measured_orders(errors, 2, floor=3e-12)
-    assert abs(orders[-1] - m.order) < 0.2, orders
+    m = METHODS[method]
+    assert abs(measured_order(system, m) - m.order) < 0.2
+
+
+def test_a_wrong_digit_costs_the_order():
+    """KahanLi(8) with its third digits changed, symmetric still: order 2."""
+    c = list(dvi.KahanLi(8).fractions())
+    change = 1e-3
+    for i, sign in ((0, 1), (2, -1), (-1, 1), (-3, -1)):
+        c[i] += sign * change
+    wrong = dvi.Composition(c)
+    assert abs(measured_order("non_separable", wrong) - 2) < 0.2
+    with pytest.raises(ValueError, match=r"have order 2, not 8.*order 3.*Claim order=2"):
+        dvi.Composition(c, order=8)
+
+
+def test_conditions_of_order_hold_and_the_next_ones_do_not():
+    for method in METHODS.values():
+        if isinstance(method, CompositionMethod):
+            base = method.base
+            defects = order_defects(
+                method.fractions(), method.order + 1, base.order, base.is_symmetric
+            )
+            assert max(defects[:-1]) < 5e-16, method
+            assert defects[-1] > 1e-9, method
+
+
+def test_conditions_of_order_agree_with_what_is_known():
+    """By hand: Σc = 1 (1), Σ±c² = 0 (2), and of a symmetric base Σc³ = 0 (3)."""
+    c = (0.7, -0.2, 0.5)
+    first, second = order_defects(c, 2)
+    unit = max(1, 1.4**2 / 2)
+    assert first == pytest.approx(0, abs=1e-16)
+    assert second == pytest.approx((0.49 - 0.04 + 0.25) / unit)
+    _, even, third = order_defects(c, 3, 2, True)
+    assert even == pytest.approx(0, abs=1e-16)
+    assert third == pytest.approx(0.343 - 0.008 + 0.125)
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "claimed", "found"),
+    [((0.5, 0.5), 3, 2), ((0.3, 0.7), 2, 1), ((0.3, 0.2, 0.2, 0.3), 4, 2), ((1.0,), 2, 1)],
+)
+def test_an_order_that_coefficients_do_not_have_is_refused(coefficients, claimed, found):
+    assert dvi.Composition(coefficients, order=found).order == found
+    with pytest.raises(ValueError, match=f"have order {found}, not {claimed}"):
+        dvi.Composition(coefficients, order=claimed)
+
+
+def test_printed_digits_are_enough_for_a_claim():
+    """Twelve digits pass, six do not."""
+    good, poor = ([round(x, n) for x in (0.784513610477557, 0.235573213359358)] for n in (12, 6))
+    third = -1.177679984178871
+    assert dvi.Composition(of_strang((*good, third)), order=6).is_symmetric
+    with pytest.raises(ValueError, match="give more digits"):
+        dvi.Composition(of_strang((*poor, third)), order=6)
 
 
 @pytest.mark.parametrize(("system", "method"), pairs(INVERTIBLE, SYSTEMS))
@@ -191,6 +305,65 @@ def test_strang_is_velocity_verlet_when_separable():
     np.testing.assert_allclose(sol.ps[1], [half - h / 2 * np.sin(q1)], rtol=1e-14)
 
 
+def test_strang_of_the_adjoint_is_position_verlet_when_separable():
+    s = dvi.System(lambda t0, t1, q, p, args: jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q)))
+    q, p, h = 0.5, 0.3, 0.1
+    method = dvi.Strang(base=dvi.Adjoint())
+    sol = dvi.integrate(s, [q], [p], h=h, num_steps=1, method=method)
+    middle = q + h / 2 * p
+    p1 = p - h * np.sin(middle)
+    np.testing.assert_allclose(sol.ps[1], [p1], rtol=1e-15)
+    np.testing.assert_allclose(sol.qs[1], [middle + h / 2 * p1], rtol=1e-15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", COMPOSITIONS)
+def test_gradients_of_compositions(method):
+    """Reverse and forward mode against a difference quotient, force on."""
+    s, m = SYSTEMS["non_separable"][0], METHODS[method]
+
+    def value(z, h=0.1):
+        return jnp.sum(flow(s, m, h, num_steps=3, epsilon=0.2)(z) ** 3)
+
+    z, direction = state("non_separable"), jnp.array([0.6, -0.8])
+    reverse = jax.jit(jax.grad(value))(z) @ direction
+    _, forward = jax.jit(lambda z, d: jax.jvp(value, (z,), (d,)))(z, direction)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-11)
+    quotient = central_difference(jax.jit(value), z, direction)
+    np.testing.assert_allclose(reverse, quotient, rtol=1e-8)
+    assert abs(reverse) > 1e-2
+
+
+def test_negative_substeps_are_told():
+    assert not dvi.Strang().has_negative_substeps
+    assert dvi.Yoshida(4).has_negative_substeps
+    assert dvi.Composition((1.0,), base=dvi.Yoshida(4)).has_negative_substeps
+
+
+def test_backwards_against_strong_dissipation_warns():
+    """W = −p, Yoshida(4) goes back by 0.85 h: from εh = 0.3/0.85 on."""
+    system = dvi.System(SYSTEMS["pendulum"][0].H_D, force=lambda t0, t1, q, p, args: -p)
+    undamped = dvi.System(SYSTEMS["pendulum"][0].H_D)
+    q, p, t0, h = jnp.array([0.4]), jnp.array([0.7]), jnp.asarray(0.0), jnp.asarray(0.1)
+
+    def check(method, epsilon, s=system, h=h):
+        equations = Equations(s, jnp.asarray(epsilon))
+        warn_of_dissipation(method, equations, Interval(t0, t0 + h, h), q, p)
+
+    with pytest.warns(UserWarning, match=r"Yoshida goes backwards by 0.85 .*by 0.306 .*Strang"):
+        check(dvi.Yoshida(4), 3.6)
+    with pytest.warns(UserWarning, match="order is worth little"):
+        check(dvi.Adjoint(dvi.Yoshida(4)), 3.6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check(dvi.Yoshida(4), 3.5)
+        check(dvi.Strang(), 50.0)
+        check(dvi.Yoshida(4), 50.0, undamped)
+        check(dvi.Yoshida(4), -50.0)  # the force drives: backwards it damps
+    with pytest.warns(UserWarning, match="goes backwards"):
+        dvi.integrate(system, q, p, h=0.1, num_steps=2, epsilon=3.6, method=dvi.Yoshida(4))
+
+
 @pytest.mark.parametrize("bad", [(), (0.5, 0.6), (np.nan, 1.0)])
 def test_composition_refuses_inconsistent_coefficients(bad):
     with pytest.raises(ValueError, match="sum to 1"):
@@ -198,8 +371,26 @@ def test_composition_refuses_inconsistent_coefficients(bad):
 
 
 def test_orders_that_do_not_exist_are_refused():
+    with pytest.raises(ValueError, match="orders 4, 6 and 8, got 5"):
+        dvi.Yoshida(5)
     with pytest.raises(ValueError, match="order 4, got 6"):
-        dvi.Yoshida(6)
+        dvi.Suzuki(6)
+    with pytest.raises(ValueError, match="orders 4 and 6, got 8"):
+        dvi.BlanesMoan(8)
+    with pytest.raises(ValueError, match="orders 4, 6 and 8, got 2"):
+        dvi.McLachlan(2)
+    with pytest.raises(ValueError, match="orders 6 and 8, got 4"):
+        dvi.KahanLi(4)
+    with pytest.raises(ValueError, match="from 1 to 12"):
+        dvi.Composition((0.5, 0.5), order=13)
+    with pytest.raises(ValueError, match="no inverse step"):
+        dvi.Composition((0.5, 0.5), base=dvi.RungeKutta4())
+    with pytest.raises(TypeError, match="base must be a method"):
+        dvi.Composition((0.5, 0.5), base=dvi.TypeII)
+    with pytest.raises(TypeError, match="base must be a method"):
+        dvi.Yoshida(4, base=4)
+    with pytest.raises(ValueError, match="no inverse step"):
+        dvi.Strang(base=dvi.RungeKutta4())
     with pytest.raises(ValueError, match="no inverse step"):
         dvi.Adjoint(dvi.RungeKutta4())
     with pytest.raises(TypeError, match="takes a method"):

@@ -46,7 +46,7 @@ class ShadowHamiltonian(eqx.Module):
     - A force W has no Hamiltonian and is left out: H̃ then drifts by the work of W. If W = −∂V/∂q0
       with V(t0, t1, q0), the disturbed map is the one of H_D + εV, so give
       ``ShadowHamiltonian(order, System(H_D, perturbation=V))``.
-    - `Strang`, `Yoshida`, `Composition`, `Adjoint` and `RungeKutta4` are other maps, with other
+    - `Adjoint`, `Strang`, all compositions and `RungeKutta4` are other maps, with other
       modified Hamiltonians or none. An observable is not told the method: it is for you to use
       this one with `TypeII` only.
     - On a lattice whose steps differ each step has an H̃ of its own, and none of them is kept.

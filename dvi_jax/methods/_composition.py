@@ -3,73 +3,94 @@
 import abc
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._step import (
-    adjoint_step,
-    inverse_step,
-    no_step_yet,
-    step,
-)
+from .._step import no_step_yet
 from ._base import Method
+from ._order_conditions import order_defects
+from ._type_ii import TypeII
+
+_MOST_UNROLLED = 6
+"""Pairs of an explicit step that are written out; more of them run no faster and compile longer."""
+
+_MOST_CHECKED = 12
+"""Highest order whose conditions are checked: 2^(order − 1) words of that degree."""
+
+_DEFECT = 1e-11
+"""Largest defect of an order condition that passes: coefficients printed to 12 digits do."""
 
 
 class CompositionMethod(Method):
-    """Base of the methods that alternate the map with its adjoint.
+    """Base of the methods that alternate a map with its adjoint.
 
         Ψ_h = … ∘ Φ*_{c₄h} ∘ Φ_{c₃h} ∘ Φ*_{c₂h} ∘ Φ_{c₁h}        (c₁ acts first)
 
-    The inverse undoes the parts in the opposite order.
+    The inverse undoes the parts in the opposite order. Φ is any invertible method, forced and
+    implicit ones too; a part with negative c goes backwards in time.
     """
 
+    base: eqx.AbstractVar[Method]
+
     is_invertible: ClassVar[bool] = True
+
+    if TYPE_CHECKING:  # there the abstract variable would stay an argument of every subclass
+        is_symplectic: ClassVar[bool]
+    else:
+
+        @property
+        def is_symplectic(self):
+            return self.base.is_symplectic
 
     @abc.abstractmethod
     def fractions(self) -> tuple[float, ...]:
         """c₁, c₂, …: the map takes the odd ones, its adjoint the even ones; they sum to 1."""
 
-    def step(self, equations, interval, q0, p0):
-        def pair(state, parts):
-            # the map on the first part, then its adjoint on the second
-            q, p, info = state
-            q, p, one = step(equations, parts[0], q, p)
-            q, p, two = adjoint_step(equations, parts[1], q, p)
-            return q, p, info.then(one).then(two)
+    @property
+    def has_negative_substeps(self) -> bool:
+        """Whether some part goes backwards in time, where a dissipative force makes grow."""
+        inner = isinstance(self.base, CompositionMethod) and self.base.has_negative_substeps
+        return inner or any(c < 0 for c in self.fractions())
 
+    def step(self, equations, interval, q0, p0):
         def single(state, part):
             q, p, info = state
-            q, p, one = step(equations, part, q, p)
+            q, p, one = self.base.step(equations, part, q, p)
             return q, p, info.then(one)
+
+        def pair(state, parts):
+            # the map on the first part, then its adjoint on the second
+            q, p, info = single(state, parts[0])
+            q, p, two = self.base.inverse(equations, parts[1].reversed(), q, p)
+            return q, p, info.then(two)
 
         explicit = self._needs_no_solve(equations, interval, q0)
         state = (q0, p0, no_step_yet(q0))
         pairs, rest = self._parts(interval)
-        state = _each(pair, state, pairs, unrolled=explicit)
+        state = _each(pair, state, pairs, explicit)
         return single(state, rest) if rest is not None else state
 
     def inverse(self, equations, interval, q1, p1):
         def single(state, part):
             q, p, info = state
-            q, p, one = inverse_step(equations, part, q, p)
+            q, p, one = self.base.inverse(equations, part, q, p)
             return q, p, info.then(one)
 
         def pair(state, parts):
             q, p, info = state
-            q, p, one = step(equations, parts[1].reversed(), q, p)
-            q, p, two = inverse_step(equations, parts[0], q, p)
-            return q, p, info.then(one).then(two)
+            q, p, one = self.base.step(equations, parts[1].reversed(), q, p)
+            return single((q, p, info.then(one)), parts[0])
 
         explicit = self._needs_no_solve(equations, interval, q1)
         state = (q1, p1, no_step_yet(q1))
         pairs, rest = self._parts(interval)
         if rest is not None:
             state = single(state, rest)
-        return _each(pair, state, pairs[::-1], unrolled=explicit)
+        return _each(pair, state, pairs[::-1], explicit)
 
     def _parts(self, interval):
         """The interval cut into pairs of parts, and the part that is left when they are odd."""
@@ -84,19 +105,19 @@ class CompositionMethod(Method):
         return pairs, parts[-1] if len(parts) % 2 else None
 
     def _needs_no_solve(self, equations, interval, q) -> bool:
-        forwards = equations.step_is_explicit(interval, q)
-        return forwards and equations.inverse_is_explicit(interval, q)
+        forwards = self.base._needs_no_solve(equations, interval, q)
+        return forwards and self.base._inverse_needs_no_solve(equations, interval, q)
 
     def _inverse_needs_no_solve(self, equations, interval, q) -> bool:
         return self._needs_no_solve(equations, interval, q)
 
 
-def _each(body: Callable, state: Any, pairs: list, unrolled: bool) -> Any:
+def _each(body: Callable, state: Any, pairs: list, explicit: bool) -> Any:
     """`body` on each pair in turn: written out when that lets the arithmetic fuse, else a scan.
 
     An implicit pair is a loop already, and writing out many of them only costs compile time.
     """
-    if unrolled or len(pairs) < 2:
+    if len(pairs) <= (_MOST_UNROLLED if explicit else 1):
         for parts in pairs:
             state = body(state, parts)
         return state
@@ -104,37 +125,90 @@ def _each(body: Callable, state: Any, pairs: list, unrolled: bool) -> Any:
     return lax.scan(lambda s, parts: (body(s, parts), None), state, stacked)[0]
 
 
+def of_strang(outer: Sequence[float]) -> tuple[float, ...]:
+    """The fractions of S_{γ₁h} ∘ … ∘ S_{γ_sh}, s odd and γ symmetric, S = `Strang`.
+
+    `outer` are γ₁, …, up to but not with the middle one, which makes the sum 1. Each S_{γh} is
+    the map and its adjoint, over γh/2 each.
+    """
+    middle = 1.0 - 2.0 * math.fsum(outer)
+    return tuple(c / 2 for c in (*outer, middle, *outer[::-1]) for _ in range(2))
+
+
+def check_base(base: Any) -> None:
+    """Refuse a base that is no method, or that has no inverse to make the adjoint of."""
+    if not isinstance(base, Method):
+        raise TypeError(f"base must be a method such as dvi.TypeII(), got {base!r}.")
+    if not base.is_invertible:
+        raise ValueError(
+            f"{base!r} has no inverse step, so it has no adjoint to be composed with: take a "
+            "variational method."
+        )
+
+
+def check_order(name: str, order: Any, known: Sequence[int]) -> None:
+    """Refuse an order of which there are no coefficients."""
+    if order not in known:
+        *most, last = known
+        which = f"orders {', '.join(map(str, most))} and {last}" if most else f"order {last}"
+        raise ValueError(
+            f"{name} knows {which}, got {order!r}. For order 2 use dvi.Strang(); for "
+            "coefficients of your own, dvi.Composition(coefficients, order=...)."
+        )
+
+
 def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
     return tuple(float(c) for c in values)
 
 
 class Composition(CompositionMethod):
-    r"""A composition of the map with its adjoint, with coefficients of the user's.
+    r"""A composition of a map with its adjoint, with coefficients of the user's.
 
         Ψ_h = … ∘ Φ*_{c₄h} ∘ Φ_{c₃h} ∘ Φ*_{c₂h} ∘ Φ_{c₁h}        (c₁ acts first)
 
     **Arguments**
 
     - `coefficients`: c₁, c₂, … summing to 1; the map at odd places, its adjoint at even ones.
-    - `order`: the order that the coefficients are known to have; it is documentation, and
-      not checked beyond consistency (order 1).
+    - `order`: the order that is claimed for them, at most 12; its conditions are checked, to
+      1e-11 of the terms that cancel.
+    - `base`: Φ, any method with an inverse; `TypeII` when left out. A base of higher order, or a
+      symmetric one, has fewer conditions to meet.
 
-    Symmetric when the coefficients read the same from both ends and their number is even.
+    Symmetric when the coefficients read the same from both ends and either their number is even
+    or the base is symmetric.
 
-    **Raises** `ValueError` when they are empty, not finite, or do not sum to 1 (to 1e-12).
+    **Raises** `ValueError` when the coefficients are empty, not finite, or do not sum to 1 (to
+    1e-12), when they do not have the order claimed (the order that they have is named), and for a
+    base without an inverse; `TypeError` for a base that is no method.
 
-    **Source** Hairer, Lubich & Wanner 2006, II.4 (4.6), V.3.
+    **Source** Hairer, Lubich & Wanner 2006, *Geometric Numerical Integration*, II.4 (4.6), V.3;
+    the conditions: `order_defects`.
     """
 
     coefficients: tuple[float, ...] = eqx.field(static=True, converter=_as_coefficients)
     order: int = eqx.field(static=True, default=1)
+    base: Method = eqx.field(default_factory=TypeII)
 
     def __check_init__(self):
-        c = self.coefficients
+        c, order, base = self.coefficients, self.order, self.base
         if not c or not all(math.isfinite(x) for x in c) or abs(math.fsum(c) - 1) > 1e-12:
             raise ValueError(
                 "the coefficients of a composition must be finite and sum to 1 (consistency); "
                 f"got {c}" + (f", which sum to {math.fsum(c)!r}." if c else ".")
+            )
+        check_base(base)
+        if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= _MOST_CHECKED:
+            raise ValueError(
+                f"order must be an integer from 1 to {_MOST_CHECKED} (the conditions of higher "
+                f"orders are not checked), got {order!r}."
+            )
+        defects = order_defects(c, order, base.order, base.is_symmetric)
+        found = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
+        if found < order:
+            raise ValueError(
+                f"these coefficients have order {found}, not {order}: their defect in the "
+                f"conditions of order {found + 1} is {defects[found]:.1e}, of the terms that "
+                f"cancel there. Claim order={found}, or give more digits."
             )
 
     def fractions(self):
@@ -143,8 +217,4 @@ class Composition(CompositionMethod):
     @property
     def is_symmetric(self) -> bool:
         c = self.coefficients
-        return len(c) % 2 == 0 and c == c[::-1]
-
-    @property
-    def is_symplectic(self) -> bool:
-        return True
+        return c == c[::-1] and (len(c) % 2 == 0 or self.base.is_symmetric)
