@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ..engine.echelon import reduced, reduction
 from ..engine.nullspace import SeriesSpace, orthonormal_range
 from ..symmetry.basis import BoundBasis
-from ..symmetry.sampling import Samples
+from ..symmetry.sampling import Samples, spread
 
 
 class Representatives(NamedTuple):
@@ -51,8 +51,8 @@ class Span:
         some = slice(None, None, max(1, len(samples.q) // 40))
         gradients = np.asarray(differentials(self.basis, *(x[some] for x in samples)))
         # as fast as (q, p) change over the samples, so that their units do not matter
-        spread = np.repeat([_spread(samples.q), _spread(samples.p)], gradients.shape[2] // 2)
-        gradients = gradients * spread / self.rms[:, None]
+        units = np.repeat([spread(samples.q), spread(samples.p)], gradients.shape[2] // 2)
+        gradients = gradients * units / self.rms[:, None]
         _require_finite(self.basis, gradients)
         complexity = np.array(self.basis.complexity)
         series: list[np.ndarray] = []
@@ -127,11 +127,6 @@ def _require_finite(basis: BoundBasis, gradients: np.ndarray) -> None:
             f"the derivatives of the basis function {basis.names[int(np.argmax(bad))]!r} are not "
             "finite on the samples: keep them off its singularity."
         )
-
-
-def _spread(values: np.ndarray) -> float:
-    spread = float(np.sqrt(np.mean((values - np.mean(values, axis=0)) ** 2)))
-    return spread if spread > 0 else 1.0
 
 
 @eqx.filter_jit

@@ -22,6 +22,7 @@ from ..engine.nullspace import (
 from .families import coordinate_names
 from .gauge import BasisGauge
 from .generators import Generator
+from .sampling import spread
 from .symmetries import BasisComponent, Symmetries, Symmetry
 
 _TINY = 1e-12
@@ -38,7 +39,7 @@ class Search:
         self.held, self.tolerance = samples.held_out, tolerance
         self.order = raw.determining.shape[1] - 1
         fit, n = ~self.held, raw.slopes.shape[3] // 2
-        q, p = _spread(samples.q), _spread(samples.p)
+        q, p = spread(samples.q), spread(samples.p)
         rows = h / np.repeat([q, p], n)
         t = _inverse(np.sqrt(np.mean((raw.clock[fit, 0] * rows) ** 2)))
         used = slice(0 if time else 1, None)
@@ -293,11 +294,6 @@ def _component_names(shape: tuple[int, ...]) -> tuple[str, ...]:
     names = coordinate_names(shape)
     half = len(names) // 2
     return ("ξ0", *(f"ξ_{v}" for v in names[:half]), *(f"η_{v}" for v in names[half:]))
-
-
-def _spread(values: np.ndarray) -> float:
-    spread = float(np.sqrt(np.mean((values - np.mean(values, axis=0)) ** 2)))
-    return spread if spread > 0 else 1.0
 
 
 def _inverse(value: Any) -> float:

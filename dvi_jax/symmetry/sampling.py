@@ -32,6 +32,12 @@ class Samples(NamedTuple):
         return held
 
 
+def spread(values: np.ndarray) -> float:
+    """Standard deviation of the components about their means; 1 where nothing varies."""
+    size = float(np.sqrt(np.mean((values - np.mean(values, axis=0)) ** 2)))
+    return size if size > 0 else 1.0
+
+
 def as_samples(samples: Any, t0: float = 0.0) -> Samples:
     """(qs, ps) at the time t0, or (qs, ps, ts), after refusing what cannot be sampled points."""
     refuse_double_without_x64("samples", np.float64)
