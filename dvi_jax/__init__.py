@@ -24,11 +24,17 @@ from .invariants import (
     drift_surface as drift_surface,
     noether_balance as noether_balance,
 )
-from .lattices import Given as Given, Lattice as Lattice, Uniform as Uniform
+from .lattices import (
+    Given as Given,
+    Lattice as Lattice,
+    TimeTransformed as TimeTransformed,
+    Uniform as Uniform,
+)
 from .methods import (
     Adjoint as Adjoint,
     BlanesMoan as BlanesMoan,
     Composition as Composition,
+    GaussLegendre as GaussLegendre,
     KahanLi as KahanLi,
     McLachlan as McLachlan,
     Method as Method,

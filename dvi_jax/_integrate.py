@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 
 from ._adjoints import AbstractAdjoint, Outcome, Reversible
 from ._compat import is_traced
+from ._extended import run_extended
 from ._precision import refuse_double_without_x64
 from ._results import RESULTS, IntegrationError
 from ._rollout import (
@@ -30,7 +31,7 @@ from ._solution import Save, Solution
 from ._step import Equations
 from ._system import System
 from .engine.newton import Newton
-from .lattices import Lattice, Uniform
+from .lattices import Lattice, TimeTransformed, Uniform
 from .methods import Method, TypeII, warn_of_dissipation
 from .observe import Reduction
 
@@ -74,7 +75,8 @@ def integrate(
     - `args`: pytree handed to H_D, W and the observables.
     - `method`: `TypeII`, `Adjoint`, `Strang`, the compositions `Yoshida`, `Suzuki`, `BlanesMoan`,
       `McLachlan`, `KahanLi`, `Composition`; `RungeKutta4`.
-    - `lattice`: `Uniform()`, or `Given(ts)`, which replaces h, num_steps and t0.
+    - `lattice`: `Uniform()`; `Given(ts)`, which replaces h, num_steps and t0; or
+      `TimeTransformed(g)`, whose steps adapt, and h is in its fictitious time.
     - `save`: which states are kept, see `Save`.
     - `observe`: pytree of observables, functions of one step
       ``(t0, t1, q0, p0, q1, p1, args)`` → array. Alone, one is evaluated on the steps that end at
@@ -123,6 +125,12 @@ def integrate(
     epsilon = _scalar("epsilon", epsilon, q0.dtype)
     args = jax.tree.map(_parameter, args)
     system.check_shapes(t0, q0, p0, epsilon, args)
+    if isinstance(lattice, TimeTransformed):
+        return run_extended(
+            integrate, system, lattice, q0, p0, t0, epsilon, args, observe, is_observable, h=h,
+            num_steps=num_steps, method=method, save=save, adjoint=adjoint, newton=newton,
+            throw=throw, progress=progress,
+        )  # fmt: skip
     equations = Equations(system, epsilon, args, newton)
     is_disturbed = system.force is not None or system.perturbation is not None
     if not (is_disturbed or system.slow_time or is_traced(epsilon)) and float(epsilon) != 0:

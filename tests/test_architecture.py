@@ -15,7 +15,7 @@ FLOORS = [
     ["_generating"],
     ["_discretise", "_step"],
     ["methods", "lattices", "symmetry", "observe"],
-    ["_rollout"],
+    ["_rollout", "_extended"],
     ["_adjoints"],
     ["_integrate"],
     ["invariants"],
@@ -85,7 +85,8 @@ def test_door_has_no_logic():
 
 PUBLIC = """
 System discretise integrate Save Solution RESULTS IntegrationError Newton
-TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition RungeKutta4
+TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
+GaussLegendre RungeKutta4
 Uniform Given
 MaxDrift Range Trend Mean Last Reversible Checkpointed Direct
 Generator prolong determining_residual conformal_factor noether_identity AdiabaticInvariant

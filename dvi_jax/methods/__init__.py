@@ -5,6 +5,7 @@ from ._base import Method as Method
 from ._blanes_moan import BlanesMoan as BlanesMoan
 from ._composition import Composition as Composition
 from ._dissipation import warn_of_dissipation as warn_of_dissipation
+from ._gauss_legendre import GaussLegendre as GaussLegendre
 from ._kahan_li import KahanLi as KahanLi
 from ._mclachlan import McLachlan as McLachlan
 from ._runge_kutta4 import RungeKutta4 as RungeKutta4

@@ -1,0 +1,129 @@
+"""A system in extended phase space: time as a position, so that steps may adapt."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ._compat import is_traced
+from ._solution import Solution
+from ._system import System
+from ._types import Args, Bindable, Scalar, State
+from .lattices import TimeTransformed
+from .observe import Reduction, Trend
+
+
+class Extended(eqx.Module):
+    """The transformed problem of `TimeTransformed`.
+
+    Positions are (q, t) and momenta (p, p_t), flattened, shape (n + 1,).
+    """
+
+    system: System
+    speed: Callable[..., Any]
+    epsilon: Scalar
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def start(self, t: Scalar, q: State, p: State, args: Args) -> tuple[Array, Array]:
+        """The extended state, on K = 0."""
+        energy = self.system.hamiltonian(t, t, q, p, self.epsilon, args)
+        return jnp.append(q.ravel(), t), jnp.append(p.ravel(), -energy)
+
+    def parts(self, position: Array, momentum: Array) -> tuple[State, State, Scalar, Scalar]:
+        """(q, p, t, p_t); leading axes stay in front."""
+        lead = position.shape[:-1]
+        q = position[..., :-1].reshape(*lead, *self.shape)
+        p = momentum[..., :-1].reshape(*lead, *self.shape)
+        return q, p, position[..., -1], momentum[..., -1]
+
+    def hamiltonian(self, s0, s1, position, momentum, args):
+        """K = g (H + p_t)."""
+        del s0, s1
+        q, p, t, pt = self.parts(position, momentum)
+        H = self.system.hamiltonian(t, t, q, p, self.epsilon, args)
+        return jnp.asarray(self.speed(t, q, p, args), H.dtype) * (H + pt)
+
+    def force(self, s0, s1, position, momentum, args):
+        """(g εW, −g εW·∂H/∂p)."""
+        del s0, s1
+        q, p, t, _ = self.parts(position, momentum)
+        at = (t, t, q, p, self.epsilon, args)
+        W = self.system.disturbing_force(*at)
+        power = jnp.sum(W * jax.grad(self.system.hamiltonian, argnums=3)(*at))
+        return self.speed(t, q, p, args) * jnp.append(W.ravel(), -power)
+
+    def as_system(self) -> System:
+        """K and its force as a `System`, to be run at ε = 1."""
+        return System(self.hamiltonian, None if self.system.force is None else self.force)
+
+
+class _Seen(eqx.Module):
+    """An observable of the user's on steps of the extended problem."""
+
+    function: Callable[..., Any]
+    extended: Extended
+
+    def __call__(self, s0, s1, position0, momentum0, position1, momentum1, args):
+        q0, p0, t0, _ = self.extended.parts(position0, momentum0)
+        q1, p1, t1, _ = self.extended.parts(position1, momentum1)
+        return self.function(t0, t1, q0, p0, q1, p1, args)
+
+
+def _time_gained(s0, s1, position0, momentum0, position1, momentum1, args):
+    return position1[-1] - position0[-1]
+
+
+def run_extended(
+    integrate: Callable[..., Solution],
+    system: System,
+    lattice: TimeTransformed,
+    q0: State,
+    p0: State,
+    t0: Scalar,
+    epsilon: Scalar,
+    args: Args,
+    observe: Any,
+    is_observable: Callable[[Any], bool],
+    **settings: Any,
+) -> Solution:
+    """`integrate` on the extended problem, told as a solution of the one that was given."""
+    extended = Extended(system, lattice.speed, epsilon, q0.shape)
+    _check_speed(lattice.speed, t0, q0, p0, args)
+
+    def seen(observable):
+        if not is_observable(observable):
+            return observable  # refused by name further on
+        if isinstance(observable, Trend):
+            raise ValueError(
+                "a Trend over a TimeTransformed lattice would be a slope in its fictitious time: "
+                "observe the function alone and fit a line to it over solution.ts."
+            )
+        if isinstance(observable, Reduction):
+            return eqx.tree_at(lambda r: r.function, observable, seen(observable.function))
+        if isinstance(observable, Bindable):
+            observable = observable.bind(system, epsilon)
+        return _Seen(observable, extended)
+
+    solution = integrate(
+        extended.as_system(),
+        *extended.start(t0, q0, p0, args),
+        epsilon=jnp.ones_like(epsilon) if system.force is not None else jnp.zeros_like(epsilon),
+        args=args,
+        observe=(jax.tree.map(seen, observe, is_leaf=is_observable), _time_gained),
+        **settings,
+    )
+    q, p, t, _ = extended.parts(solution.qs, solution.ps)
+    observed, hs = solution.observed
+    return Solution(t, q, p, hs, observed, solution.result, solution.stats)
+
+
+def _check_speed(speed, t0, q0, p0, args) -> None:
+    value = jnp.asarray(speed(t0, q0, p0, args))
+    if value.shape != () or (not is_traced(value) and not float(value) > 0):
+        raise ValueError(
+            "the speed of TimeTransformed must be a positive scalar; at the start it is "
+            f"{value if value.shape == () else f'an array of shape {value.shape}'}."
+        )
