@@ -74,7 +74,7 @@ def integrate(
     - `t0`: time of the start. `epsilon`: strength of the disturbance.
     - `args`: pytree handed to H_D, W and the observables.
     - `method`: `TypeII`, `Adjoint`, `Strang`, the compositions `Yoshida`, `Suzuki`, `BlanesMoan`,
-      `McLachlan`, `KahanLi`, `Composition`; `RungeKutta4`.
+      `McLachlan`, `KahanLi`, `Composition`; `GaussLegendre`; `RungeKutta4`.
     - `lattice`: `Uniform()`; `Given(ts)`, which replaces h, num_steps and t0; or
       `TimeTransformed(g)`, whose steps adapt, and h is in its fictitious time.
     - `save`: which states are kept, see `Save`.

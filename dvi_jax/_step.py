@@ -87,7 +87,7 @@ def step(
         explicit=equations.step_is_explicit(interval, q0),
     )
     q1 = q0 + interval.h * equations.position_rate(interval, q0, p1)
-    return q1, p1, _judge(info, q1, p1)
+    return q1, p1, judge(info, q1, p1)
 
 
 def inverse_step(
@@ -106,7 +106,7 @@ def inverse_step(
         explicit=equations.inverse_is_explicit(interval, q1),
     )
     p0 = p1 - interval.h * equations.momentum_rate(interval, q0, p1)
-    return q0, p0, _judge(info, q0, p0)
+    return q0, p0, judge(info, q0, p0)
 
 
 def adjoint_step(
@@ -136,7 +136,8 @@ def _increment(rate, x0, h, newton, explicit) -> tuple[State, RootInfo]:
     return x1.reshape(shape), info
 
 
-def _judge(info: RootInfo, q: State, p: State) -> StepInfo:
+def judge(info: RootInfo, q: State, p: State) -> StepInfo:
+    """What became of a step: its solve, and whether the state that it led to is finite."""
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(p))
     result = RESULTS.where(info.converged, RESULTS.successful, RESULTS.not_converged)
     result = RESULTS.where(finite, result, RESULTS.not_finite)

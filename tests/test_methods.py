@@ -46,7 +46,8 @@ COMPOSITIONS = {
         base=dvi.Strang(),
     ),
 }
-METHODS = {**REGISTERED, **COMPOSITIONS}
+GAUSS = {f"GaussLegendre{s}": dvi.GaussLegendre(s) for s in (1, 2, 3)}
+METHODS = {**REGISTERED, **COMPOSITIONS, **GAUSS}
 SYMPLECTIC = {k: m for k, m in METHODS.items() if m.is_symplectic}
 INVERTIBLE = {k: m for k, m in METHODS.items() if m.is_invertible}
 
@@ -61,11 +62,15 @@ LONG_COMPILE = {
 }
 
 
-IN_EVERY_RUN = {("non_separable", "BlanesMoan4"), ("non_separable", "KahanLi8")}
+IN_EVERY_RUN = {
+    ("non_separable", "BlanesMoan4"),
+    ("non_separable", "KahanLi8"),
+    ("non_separable", "GaussLegendre2"),
+}
 
 
 def is_long(system, method):
-    if method in COMPOSITIONS:
+    if method in COMPOSITIONS or method in GAUSS:
         return (system, method) not in IN_EVERY_RUN
     return (system, method) in LONG_COMPILE
 

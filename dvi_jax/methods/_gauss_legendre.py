@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial import legendre
 
-from .._step import _judge
+from .._step import judge
 from .._types import Interval
 from ..engine.newton import find_root
 from ._base import Method
@@ -116,7 +116,7 @@ class GaussLegendre(Method):
         guess = advanced(a, all_at_start)
         x, info = find_root(residual, guess.ravel(), all_at_start.ravel(), equations.newton)
         q1, p1 = advanced(b, x.reshape(all_at_start.shape))
-        return q1, p1, _judge(info, q1, p1)
+        return q1, p1, judge(info, q1, p1)
 
     def inverse(self, equations, interval, q1, p1):
         return self.step(equations, interval.reversed(), q1, p1)
