@@ -195,6 +195,7 @@ def test_gradient_into_a_module_force():
     assert max(float(jnp.max(jnp.abs(u))) for u in jax.tree.leaves(a)) > 1e-3
 
 
+@pytest.mark.slow
 def test_a_rebuilt_state_that_misses_gives_nan_not_a_wrong_gradient():
     """Damped and driven over t = 80: rebuilding amplifies round-off by some e⁴⁰."""
 
@@ -237,6 +238,7 @@ def test_gradient_in_single_precision():
     np.testing.assert_allclose(g, jax.grad(final)(jnp.array([0.4])), rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_reversible_memory_is_flat_and_direct_is_not():
     def size(adjoint, n):
         def final(q):

@@ -340,6 +340,7 @@ def test_every_key_is_shown_in_an_example():
         assert f"{key} = " in text or f"[{key}]" in text, key
 
 
+@pytest.mark.slow
 def test_solar_system_with_too_large_a_step_says_so(folder):
     pytest.importorskip("jplephem")
     path = write(

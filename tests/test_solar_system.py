@@ -236,6 +236,7 @@ def test_figure_eight_comes_back():
 # Ten years beside the ephemeris
 
 
+@pytest.mark.slow
 def test_momenta_are_kept_and_runge_kutta_loses_them(run, century):
     size = np.linalg.norm(angular_momentum(0, 0, None, None, century.q0, century.p0, None))
     total = np.linalg.norm(century.p0, axis=-1).sum()
