@@ -12,7 +12,6 @@ FLOORS = [
     ["_compat", "_types", "_results"],
     ["_precision"],
     ["_system", "_solution", "engine"],
-    ["_generating"],
     ["_discretise", "_step"],
     ["methods", "lattices", "symmetry", "observe"],
     ["_rollout", "_extended"],

@@ -669,6 +669,16 @@ def test_what_is_no_basis_no_step_or_no_observable_is_refused():
             dvi.discover_invariants(SPRING, nothing, h=0.1, samples=samples)
     with pytest.raises(ValueError, match="other than zero"):
         dvi.discover_invariants(SPRING, dvi.Polynomials(2), h=0.0, samples=samples)
+    for h in ([0.1, 0.2], "x", None):
+        with pytest.raises(ValueError, match="one finite step size"):
+            dvi.discover_invariants(SPRING, dvi.Polynomials(2), h=h, samples=samples)
+    for search in (dvi.discover_invariants, dvi.find_symmetries):
+        with pytest.raises(TypeError, match="Wrap the discrete"):
+            search(H_D, dvi.Polynomials(2), h=0.1, samples=samples)
+        with pytest.raises(TypeError, match="newton must be"):
+            search(SPRING, dvi.Polynomials(2), h=0.1, samples=samples, newton=5)
+    with pytest.raises(ValueError, match=r"states of shape \(1,\); got q of shape \(2,\)"):
+        found("spring", 4, 2).evaluate([0.1, 0.2], [0.3, 0.4], 0.1)
     with pytest.raises(TypeError, match="must be a method"):
         dvi.discover_invariants(SPRING, dvi.Polynomials(2), h=0.1, samples=samples, method="Strang")
     broadcast = dvi.System(H_D, force=lambda t0, t1, q, p, args: jnp.sum(q))

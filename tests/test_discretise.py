@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from generating import generating_terms
 from helpers import symplectic_defect
 
 import dvi_jax as dvi
-from dvi_jax._generating import generating_terms
 from dvi_jax.engine.taylor import taylor_coefficients
 
 

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from generating import generating_terms
 from helpers import double_pendulum, measured_orders, non_separable, pendulum
 
 import dvi_jax as dvi
-from dvi_jax._generating import generating_terms
 
 Q, P = jnp.array([0.7]), jnp.array([-0.4])
 

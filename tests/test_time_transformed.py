@@ -212,8 +212,9 @@ def test_what_cannot_be_meant_is_refused(speed, observe, says):
             lattice=dvi.TimeTransformed(speed),
             observe=observe,
         )
-    with pytest.raises(TypeError, match="must be a function"):
-        dvi.TimeTransformed(0.5)
+    for wrong in (0.5, lambda t, q, p: 1.0):
+        with pytest.raises(TypeError, match="must be a function"):
+            dvi.TimeTransformed(wrong)
 
 
 def test_observables_are_bound_to_the_system_that_was_given():

@@ -33,6 +33,7 @@ from ..symmetry.sampling import (
     check_finite,
     require_enough,
     require_steps,
+    require_system,
     require_time,
 )
 from .found import Discovery
@@ -92,8 +93,8 @@ def discover_invariants(
       functions in the basis.
     - `tolerance`: for *approximate* invariants: singular values up to that share of the largest
       count as zero. What a method of order r keeps up to O(h^r), such as the energy, has
-      singular values that shrink as h^r; the residual of one step then shrinks as h^{r+1}.
-      None: only what is zero to round-off.
+      singular values and residuals that shrink as h^r.
+      None: only what is below 1e-11.
     - `representative`: an invariant of order z is free by ε times any other. "least" takes the
       corrections that are smallest on the samples (the convention of averaging: no part along
       what order 0 keeps), unless the simplest ones are exact; "simplest" takes those of simple
@@ -102,15 +103,16 @@ def discover_invariants(
     **Returns** a `Discovery`; print it for a report.
 
     **Raises** `ValueError` for too few samples, samples or basis functions that are not
-    finite there, a step that fails there, a basis that is rank-deficient on them, a basis of
-    time on samples of one time, a tolerance that is none, or h = 0; `TypeError` for what is no
-    basis.
+    finite there, a step that fails there, a basis that is rank-deficient on them, a basis or a
+    map of time with samples of one time, a tolerance that is none, or h = 0; `TypeError` for
+    what is no system, basis, method or Newton, and for samples without x64.
 
     **Accuracy** round-off of the singular values, times the conditioning of the basis; Taylor
     coefficients by nested forward autodiff, through implicit steps.
 
     **Source** our own.
     """
+    require_system(system, newton)
     samples = as_samples(samples, t0)
     order = _check_options(order, tolerance, representative, method)
     bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)

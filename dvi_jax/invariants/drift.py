@@ -305,7 +305,8 @@ def drift_surface(
     """
     epsilons = _positive("epsilons", epsilons, increasing=True)
     hs = _positive("hs", hs, increasing=True)
-    if not np.isfinite(duration) or duration < 2 * hs[-1]:
+    is_number = isinstance(duration, int | float | np.number)
+    if not is_number or not np.isfinite(duration) or duration < 2 * hs[-1]:
         raise ValueError(
             f"duration must hold at least two of the longest steps, {hs[-1]:g}; got {duration!r}."
         )

@@ -1,6 +1,7 @@
 """Bases of functions of a lattice point, in which symmetries and invariants are looked for."""
 
 import abc
+import dataclasses
 import inspect
 import itertools
 from collections.abc import Callable, Sequence
@@ -41,14 +42,18 @@ def bind_basis(basis: Any, shape: tuple[int, ...]) -> "BoundBasis":
             "basis must be a basis such as dvi.Polynomials(4), dvi.Basis([f, g]), or a sum or "
             f"product of them; got {basis!r}."
         )
-    return basis.for_shape(shape)
+    return dataclasses.replace(basis.for_shape(shape), shape=shape)
 
 
 def check_step_size(h: Any) -> float:
     """h as a number, after refusing zero (a step that goes nowhere keeps everything)."""
-    if not np.isfinite(h) or h == 0:
-        raise ValueError(f"h must be a finite step size other than zero, got {h!r}.")
-    return float(h)
+    try:
+        number = float(h)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not np.isfinite(number) or number == 0:
+        raise ValueError(f"h must be one finite step size other than zero, got {h!r}.")
+    return number
 
 
 class BoundBasis(eqx.Module):
@@ -57,6 +62,7 @@ class BoundBasis(eqx.Module):
     - `names`: one text for each function; `complexity`: how simple it is (polynomials: the
       degree), by which discovery prefers one representative to another.
     - `uses_time`: whether any of them depends on t.
+    - `shape`: of the states, None where it is not checked.
     - ``basis(q, p, t)``: values, shape (size,).
     """
 
@@ -64,6 +70,7 @@ class BoundBasis(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     complexity: tuple[int, ...] = eqx.field(static=True)
     uses_time: bool = eqx.field(static=True, default=False)
+    shape: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     @property
     def size(self) -> int:
@@ -71,7 +78,13 @@ class BoundBasis(eqx.Module):
         return len(self.names)
 
     def __call__(self, q: State, p: State, t: Any = 0.0) -> Float[Array, " size"]:
-        return self.function(jnp.asarray(q), jnp.asarray(p), jnp.asarray(t, float))
+        q, p = jnp.asarray(q), jnp.asarray(p)
+        if self.shape is not None and not q.shape == p.shape == self.shape:
+            raise ValueError(
+                f"these basis functions are of states of shape {self.shape}; got q of shape "
+                f"{q.shape} and p of shape {p.shape}."
+            )
+        return self.function(q, p, jnp.asarray(t, float))
 
     def formula(self, coefficients: Any, digits: int = 6, drop: float = 1e-9) -> str:
         """The combination with these coefficients as text; tiny ones (relative) are left out."""

@@ -20,7 +20,7 @@ from ..engine.taylor import taylor_coefficients
 from .basis import AbstractBasis, BoundBasis, bind_basis, check_step_size
 from .generators import Generator, LatticePoint
 from .noether import noether_identity
-from .sampling import as_samples, require_enough, require_steps, require_time
+from .sampling import as_samples, require_enough, require_steps, require_system, require_time
 
 
 class BasisGauge(eqx.Module):
@@ -84,6 +84,7 @@ def solve_gauge(
 
     **Source** our own; the identities: the paper, (25) and (28).
     """
+    require_system(system, Newton())
     samples = as_samples(samples, t0)
     if isinstance(generators, Generator) or len(generators) == 0:
         raise ValueError(

@@ -65,6 +65,17 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
     return Samples(q, p, t)
 
 
+def require_system(system: Any, newton: Any) -> None:
+    """Refuse what is no `System` or no `Newton`."""
+    if not isinstance(system, System):
+        raise TypeError(
+            f"system must be a dvi.System, got {type(system).__name__}. Wrap the discrete "
+            "Hamiltonian: dvi.System(H_D, force=W)."
+        )
+    if not isinstance(newton, Newton):
+        raise TypeError(f"newton must be a dvi.Newton(...), got {newton!r}.")
+
+
 def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None:
     """Refuse fewer samples than determine `unknowns`, with `conditions` from each one."""
     needed = int(np.ceil(2 * unknowns / conditions))

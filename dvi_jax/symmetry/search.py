@@ -15,7 +15,15 @@ from .basis import AbstractBasis, Basis, BoundBasis, Product, Sum, bind_basis, c
 from .conditions import Conditions, at_samples, require_finite, require_times, values_at
 from .families import TIME, Polynomials, coordinate_names
 from .null_series import Search, rows_of
-from .sampling import Samples, as_samples, check_basis, require_enough, require_steps, require_time
+from .sampling import (
+    Samples,
+    as_samples,
+    check_basis,
+    require_enough,
+    require_steps,
+    require_system,
+    require_time,
+)
 from .symmetries import Symmetries
 
 
@@ -83,6 +91,7 @@ def find_symmetries(
         raise ValueError(f"order must be an integer of at least 0, got {order!r}.")
     if tolerance is not None and not 0 < tolerance < 1:
         raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance!r}.")
+    require_system(system, newton)
     samples, h = as_samples(samples, t0), check_step_size(h)
     shape = samples.q.shape[1:]
     bound = bind_basis(basis, shape)

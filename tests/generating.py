@@ -1,4 +1,4 @@
-"""The generating function of an exact flow, as a power series in the time."""
+"""The generating function of an exact flow by the Hamilton–Jacobi recursion: a reference."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._types import Args, Scalar, State
-from .engine.taylor import taylor_coefficients
+from dvi_jax._types import Args, Scalar, State
+from dvi_jax.engine.taylor import taylor_coefficients
 
 
 def generating_terms(
