@@ -163,6 +163,18 @@ def slow_oscillator(out):
         tolerance=1e-5,
     )
     print(str(found).split("  lost", maxsplit=1)[0])
+    q, p, tau = (x.ravel() for x in (*box(1, 500), RNG.uniform(0, 2 * np.pi, 500)))
+    leading = np.asarray(
+        jax.vmap(found.basis)(q[:, None], p[:, None], tau) @ found.coefficients[0, 0]
+    )
+    w = np.asarray(omega(tau))
+    energy = (p**2 + w**2 * q**2 - H * w**2 * q * p) / 2
+    for name, J in (
+        ("discrete action", energy / w / np.sqrt(1 - (H * w) ** 2 / 4)),
+        ("discrete energy / ω", energy / w),
+    ):
+        off = leading * (leading @ J) / (leading @ leading) - J
+        print(f"  leading part against {name}: {np.linalg.norm(off) / np.linalg.norm(J):.1e}")
     epsilon = 2e-4
     run = dvi.integrate(
         system,

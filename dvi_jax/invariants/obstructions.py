@@ -168,5 +168,7 @@ def _zeros(powers: np.ndarray, largest: float) -> np.ndarray:
 def _polynomial(powers: np.ndarray) -> str:
     names = ["1", "I", "I²", "I³", "I⁴"]
     present = [(a, n) for a, n in zip(powers, names, strict=False) if a != 0]
-    words = [f"{a:+.6g}{'' if n == '1' else ' ' + n}" for a, n in present]
-    return " ".join(words).removeprefix("+") or "0"
+    words = [
+        f"{'−' if a < 0 else '+'} {abs(a):.6g}{'' if n == '1' else ' ' + n}" for a, n in present
+    ]
+    return " ".join(words).removeprefix("+ ") or "0"
