@@ -6,6 +6,7 @@ from ._adjoints import (
     Reversible as Reversible,
 )
 from ._discretise import discretise as discretise
+from ._energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
 from ._integrate import integrate as integrate
 from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._solution import Save as Save, Solution as Solution
@@ -27,8 +28,10 @@ from .invariants import (
 from .lattices import (
     Given as Given,
     Lattice as Lattice,
+    LatticeCondition as LatticeCondition,
     TimeTransformed as TimeTransformed,
     Uniform as Uniform,
+    Variational as Variational,
 )
 from .methods import (
     Adjoint as Adjoint,
@@ -67,11 +70,9 @@ from .symmetry import (
     determining_residual as determining_residual,
     discrete_equations as discrete_equations,
     find_symmetries as find_symmetries,
-    incoming_energy as incoming_energy,
     lattice_defect as lattice_defect,
     library as _library,
     noether_identity as noether_identity,
-    outgoing_energy as outgoing_energy,
     prolong as prolong,
     random_pairs as random_pairs,
     solution_pairs as solution_pairs,

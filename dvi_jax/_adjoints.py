@@ -125,7 +125,7 @@ class Reversible(AbstractAdjoint):
     wrong: take fewer steps between checkpoints, or `Checkpointed`.
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
-    without an inverse (`RungeKutta4`), and a system or observable that *closes over* a value
+    without an inverse (`RungeKutta4`), a `Variational` lattice, and a system or observable that *closes over* a value
     being differentiated (better: hand it over in args), are differentiated as by `Checkpointed`.
 
     **Raises** `ValueError` for settings that are not positive.
@@ -144,7 +144,7 @@ class Reversible(AbstractAdjoint):
             raise ValueError(f"max_defect must be positive, got {self.max_defect!r}.")
 
     def rollout(self, task, plan, q0, p0):
-        if not task.method.is_invertible:
+        if not task.method.is_invertible or task.lattice.has_memory:
             return Checkpointed().rollout(task, plan, q0, p0)
         if _closes_over_traced(task, q0, p0):
             return Checkpointed().rollout(task, plan, q0, p0)

@@ -31,7 +31,7 @@ from ._solution import Save, Solution
 from ._step import Equations
 from ._system import System
 from .engine.newton import Newton
-from .lattices import Lattice, TimeTransformed, Uniform
+from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation
 from .observe import Reduction
 
@@ -75,8 +75,9 @@ def integrate(
     - `args`: pytree handed to H_D, W and the observables.
     - `method`: `TypeII`, `Adjoint`, `Strang`, the compositions `Yoshida`, `Suzuki`, `BlanesMoan`,
       `McLachlan`, `KahanLi`, `Composition`; `GaussLegendre`; `RungeKutta4`.
-    - `lattice`: `Uniform()`; `Given(ts)`, which replaces h, num_steps and t0; or
-      `TimeTransformed(g)`, whose steps adapt, and h is in its fictitious time.
+    - `lattice`: `Uniform()`; `Given(ts)`, which replaces h, num_steps and t0;
+      `TimeTransformed(g)`, whose steps adapt, and h is in its fictitious time; or
+      `Variational()`, whose steps solve (14), and h is the first of them.
     - `save`: which states are kept, see `Save`.
     - `observe`: pytree of observables, functions of one step
       ``(t0, t1, q0, p0, q1, p1, args)`` → array. Alone, one is evaluated on the steps that end at
@@ -131,6 +132,12 @@ def integrate(
             num_steps=num_steps, method=method, save=save, adjoint=adjoint, newton=newton,
             throw=throw, progress=progress,
         )  # fmt: skip
+    if isinstance(lattice, Variational) and not isinstance(method, TypeII):
+        raise ValueError(
+            f"the lattice Variational() goes with method=dvi.TypeII() only, got {method!r}: (14) is "
+            "the variation of that map's action. For a higher order take an H_D of higher order, "
+            "dvi.discretise(H, order=2)."
+        )
     equations = Equations(system, epsilon, args, newton)
     is_disturbed = system.force is not None or system.perturbation is not None
     if not (is_disturbed or system.slow_time or is_traced(epsilon)) and float(epsilon) != 0:
@@ -213,6 +220,7 @@ def _solution(task: Task, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
             "max_residual": carry.residual,
             "failed_step": carry.failed_step,
             "failed_residual": carry.failed_residual,
+            **task.lattice.report(carry.lattice),
         },
     )
 
@@ -225,12 +233,15 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     if bool(result == RESULTS.successful):
         return solution
     step = int(solution.stats["failed_step"])
-    h = float(task.interval(jnp.asarray(step, jnp.int32)).h)
+    if task.lattice.has_memory:
+        at = f"last h = {float(solution.stats['last_h']):g}"
+    else:
+        at = f"h = {float(task.interval(jnp.asarray(step, jnp.int32)).h):g}"
     solved = int(solution.stats["newton_iterations"]) > 0
     residual = float(solution.stats["failed_residual"])
     how = f"; relative residual of the implicit solve {residual:.3g}" if solved else ""
     raise IntegrationError(
-        f"the trajectory failed at step {step} of {solution.stats['num_steps']} (h = {h:g}{how}). "
+        f"the trajectory failed at step {step} of {solution.stats['num_steps']} ({at}{how}). "
         f"{RESULTS[result]} With throw=False the solution up to there is returned "
         "with its status; here it is the `solution` attribute of this error.",
         solution,

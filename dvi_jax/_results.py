@@ -32,9 +32,16 @@ class RESULTS(eqx.Enumeration):
         "The step size h is zero or not finite. On a `Given` lattice: two neighbouring times "
         "are equal or the times change direction."
     )
+    no_root = (
+        "The lattice equation (14) has no root near the last step: no h keeps the energy balance "
+        "there. It happens near turning points and apsides, for an H_D of first order above all. "
+        "Try a smaller first h, dvi.discretise(H, order=2), a policy, "
+        "lattice=dvi.Variational(on_no_root='hold') or 'minimise', or "
+        "lattice=dvi.TimeTransformed(g), whose steps always exist."
+    )
 
 
-STATUS_NAMES = ("successful", "not_converged", "not_finite", "bad_step_size")
+STATUS_NAMES = ("successful", "not_converged", "not_finite", "bad_step_size", "no_root")
 
 
 def status_name(result: RESULTS) -> Any:

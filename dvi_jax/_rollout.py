@@ -13,7 +13,7 @@ from ._results import RESULTS, first_failure
 from ._solution import Save
 from ._step import Equations
 from ._types import Args, Bindable, Interval, Scalar, State
-from .lattices import Lattice
+from .lattices import Lattice, Place
 from .methods import Method
 from .observe import Reduction
 
@@ -53,8 +53,19 @@ class Task(eqx.Module):
         return self.equations.args
 
     def interval(self, k: Int[Array, ""]) -> Interval:
-        """The interval of step k, in the precision of the state (that of h)."""
-        interval = self.lattice.interval(self.t0, self.h, k)
+        """The interval of step k, in the precision of the state (that of h).
+
+        A lattice with a memory knows only that of the first step: see `next_interval`.
+        """
+        return self._in_precision(self.lattice.interval(self.t0, self.h, k))
+
+    def next_interval(self, carry: "Carry", k: Array) -> tuple[Interval, Any, RESULTS | None]:
+        """The interval of step k, what the lattice remembers after it, and if there is one."""
+        place = Place(self.t0, self.h, k, carry.q, carry.p)
+        interval, memory, result = self.lattice.next(carry.lattice, self.equations, place)
+        return self._in_precision(interval), memory, result
+
+    def _in_precision(self, interval: Interval) -> Interval:
         return Interval(*(x.astype(self.h.dtype) for x in interval))
 
     def observables(self) -> tuple[list[Callable], list[Reduction]]:
@@ -75,6 +86,7 @@ class Carry(NamedTuple):
 
     q: State
     p: State
+    lattice: Any
     result: RESULTS
     failed_step: Int[Array, ""]
     failed_residual: Float[Array, ""]
@@ -157,6 +169,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     return Carry(
         _or_nan(good, q0),
         _or_nan(good, p0),
+        task.lattice.begin(task.t0, task.h),
         result,
         jnp.where(good, jnp.asarray(-1, jnp.int32), jnp.asarray(0, jnp.int32)),
         jnp.zeros((), real),
@@ -168,31 +181,33 @@ def start(task: Task, q0: State, p0: State) -> Carry:
 
 def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, StepTaken]:
     """Step k of the trajectory, its status and its reductions."""
-    interval = task.interval(k)
+    interval, memory, exists = task.next_interval(carry, k)
     q1, p1, info = task.method.step(task.equations, interval, carry.q, carry.p)
     was_good = carry.result == RESULTS.successful
-    result = first_failure(carry.result, info.result)
+    result = carry.result if exists is None else first_failure(carry.result, exists)
+    result = first_failure(result, info.result)
     good = result == RESULTS.successful
     fails_now = was_good & ~good
     # A state after a failed step is no answer: NaN keeps it from being taken for one.
     q1, p1 = _or_nan(good, q1), _or_nan(good, p1)
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
     _, reductions = task.observables()
-    memories = [
-        r.update(memory, k, interval.t1, taken.number(task.bound(r.function), task.args))
-        for r, memory in zip(reductions, carry.reductions, strict=True)
+    reduced = [
+        r.update(so_far, k, interval.t1, taken.number(task.bound(r.function), task.args))
+        for r, so_far in zip(reductions, carry.reductions, strict=True)
     ]
     residual = lax.stop_gradient(info.residual)
     return (
         Carry(
             q1,
             p1,
+            jax.tree.map(lambda new, old: jnp.where(good, new, old), memory, carry.lattice),
             result,
             jnp.where(fails_now, k, carry.failed_step),
             jnp.where(fails_now, residual, carry.failed_residual),
             carry.iterations + jnp.where(was_good, info.iterations, 0),
             jnp.where(good, jnp.maximum(carry.residual, residual), carry.residual),
-            memories,
+            reduced,
         ),
         interval,
         taken,

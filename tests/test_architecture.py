@@ -12,7 +12,7 @@ FLOORS = [
     ["_compat", "_types", "_results"],
     ["_precision"],
     ["_system", "_solution", "engine"],
-    ["_discretise", "_step"],
+    ["_discretise", "_energies", "_step"],
     ["methods", "lattices", "symmetry", "observe"],
     ["_rollout", "_extended"],
     ["_adjoints"],

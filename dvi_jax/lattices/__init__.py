@@ -1,6 +1,7 @@
 """Where t1 comes from: one file for each lattice, over one abstract base."""
 
-from ._base import Lattice as Lattice
+from ._base import Lattice as Lattice, Place as Place
 from ._given import Given as Given
 from ._time_transformed import TimeTransformed as TimeTransformed
 from ._uniform import Uniform as Uniform
+from ._variational import LatticeCondition as LatticeCondition, Variational as Variational

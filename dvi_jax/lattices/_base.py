@@ -1,16 +1,35 @@
 """What every lattice is: the interval of step k."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Int
 
-from .._types import Interval, Scalar
+from .._results import RESULTS
+from .._step import Equations
+from .._types import Interval, Scalar, State
+
+
+class Place(NamedTuple):
+    """Where a trajectory stands before step k: the state, and the step and time it began with."""
+
+    t0: Scalar
+    h: Scalar
+    k: Int[Array, ""]
+    q: State
+    p: State
 
 
 class Lattice(eqx.Module):
-    """Base of all lattices."""
+    """Base of all lattices.
+
+    Most know every interval beforehand, by `interval`. One that finds its steps along the way says
+    ``has_memory = True``: its `next` chooses the interval from the state and from a memory that
+    `begin` makes.
+    """
+
+    has_memory: ClassVar[bool] = False
 
     @abc.abstractmethod
     def prepare(self, t0: Any, h: Any, num_steps: Any) -> tuple[Any, Any, int]:
@@ -18,7 +37,21 @@ class Lattice(eqx.Module):
 
     @abc.abstractmethod
     def interval(self, t0: Scalar, h: Scalar, k: Int[Array, ""]) -> Interval:
-        """The interval of step k = 0, 1, …"""
+        """The interval of step k = 0, 1, … (with a memory: of step 0)."""
+
+    def begin(self, t0: Scalar, h: Scalar) -> Any:
+        """The memory before the first step."""
+        return None
+
+    def next(
+        self, memory: Any, equations: Equations, place: Place
+    ) -> tuple[Interval, Any, RESULTS | None]:
+        """The interval of the next step, the memory after it, and whether it exists (None: yes)."""
+        return self.interval(place.t0, place.h, place.k), memory, None
+
+    def report(self, memory: Any) -> dict[str, Any]:
+        """What there is to say of the lattice at the end, for ``solution.stats``."""
+        return {}
 
     @abc.abstractmethod
     def is_usable(self, t0: Scalar, h: Scalar) -> Bool[Array, ""]:

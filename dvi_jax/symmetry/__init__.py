@@ -25,10 +25,8 @@ from .gauge import (
 from .generators import Generator as Generator, LatticePoint as LatticePoint, prolong as prolong
 from .noether import (
     AdiabaticInvariant as AdiabaticInvariant,
-    incoming_energy as incoming_energy,
     lattice_defect as lattice_defect,
     noether_identity as noether_identity,
-    outgoing_energy as outgoing_energy,
 )
 from .sampling import random_pairs as random_pairs, solution_pairs as solution_pairs
 from .search import find_symmetries as find_symmetries

@@ -7,28 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .._energies import disturbing_work, incoming_energy, outgoing_energy
 from .._system import System
 from .._types import Args, Scalar, State
 from .generators import Generator, LatticePoint, prolong
 
 Gauge = Callable[..., Any]
 """``G(t, q, p, args)`` → scalar [action] at a lattice point."""
-
-
-def outgoing_energy(
-    system: System, t0: Any, t1: Any, q0: State, p1: State, epsilon: Any = 0.0, args: Args = None
-) -> Scalar:
-    """E⁺ = H_D − h ∂H_D/∂t0 of the step from t0 to t1 [energy], as it leaves its first point."""
-    value, slope = jax.value_and_grad(system.hamiltonian)(t0, t1, q0, p1, epsilon, args)
-    return value - (t1 - t0) * slope
-
-
-def incoming_energy(
-    system: System, t0: Any, t1: Any, q0: State, p1: State, epsilon: Any = 0.0, args: Args = None
-) -> Scalar:
-    """E⁻ = H_D + h ∂H_D/∂t1 of the step from t0 to t1 [energy], as it reaches its second point."""
-    value, slope = jax.value_and_grad(system.hamiltonian, argnums=1)(t0, t1, q0, p1, epsilon, args)
-    return value + (t1 - t0) * slope
 
 
 def lattice_defect(
@@ -47,7 +32,7 @@ def lattice_defect(
     differentiates it in t_{k−1}; stationarity in t_k gives the form above.
     """
     (t_, q_, _), (t0, q0, p0), (t1, q1, p1) = points
-    work = jnp.sum(system.disturbing_force(t0, t1, q0, p1, epsilon, args) * (q1 - q0))
+    work = disturbing_work(system, t0, t1, q0, q1, p1, epsilon, args)
     leaving = outgoing_energy(system, t0, t1, q0, p1, epsilon, args)
     arriving = incoming_energy(system, t_, t0, q_, p0, epsilon, args)
     return (leaving - arriving - work) / (t1 - t0)

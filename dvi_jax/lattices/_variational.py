@@ -1,0 +1,309 @@
+"""Steps that the lattice equation (14) chooses."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Int
+
+from .._energies import disturbing_work, incoming_energy, outgoing_energy
+from .._results import RESULTS
+from .._step import Equations, step
+from .._system import System
+from .._types import Args, Interval, Scalar, State
+from ._base import Lattice, check_num_steps
+
+Policy = Literal["stop", "hold", "minimise"]
+
+_CELLS = 16
+"""Cells to each side of the last h that are searched for a change of sign."""
+
+_MOST = 100
+"""Evaluations after which a bracketed search ends where it is."""
+
+_GOLDEN = 0.6180339887498949
+_GOLDEN_STEPS = 40
+"""After so many the interval is 4e-9 of what it was: √ε, all that a minimum can be told to."""
+
+
+class Memory(NamedTuple):
+    """What the lattice equation carries from step to step."""
+
+    t: Scalar  # where the next step begins
+    h: Scalar  # size of the last step
+    energy: Scalar  # E⁻ of the last step [energy]
+    misses: Int[Array, ""]  # steps without a root
+    defect: Scalar  # largest |E⁺ − E⁻ − εW·Δq| so far [energy]
+
+
+class Variational(Lattice):
+    r"""The lattice of the discrete variational principle: the step h solves equation (14), mended,
+
+        E⁺_k − E⁻_k = εW_k·(q_{k+1} − q_k),      E⁺ = H_D − h ∂H_D/∂t0,   E⁻ = H_D + h ∂H_D/∂t1
+
+    together with (12) and (13): stationarity of the discrete action in t_k. Where it holds energy
+    is in exact balance with the discrete work of the disturbance: for an autonomous H_D without a
+    force H_D(q_k, p_{k+1}) is the same number on every step. The first step is the h given to
+    `integrate`; each further one is the root nearest to the step before it, of the same sign and
+    within `reach` and `bounds`.
+
+    **Arguments**
+
+    - `on_no_root`: what to do where no h in reach balances the energy. ``"stop"``: end with the
+      status `no_root`. ``"hold"``: repeat the last h. ``"minimise"``: take the h in reach with the
+      smallest defect. The balance then starts afresh from the energy of that step.
+    - `reach`: how many times larger or smaller than the step before it a step may be.
+    - `bounds`: the smallest and the largest step allowed, as multiples of the first. Roots may pile
+      up at h = 0, where time would stand still, or run away.
+
+    ``solution.stats`` has ``lattice_misses``, the steps that had no root, and ``lattice_defect``,
+    the largest |E⁺ − E⁻ − εW·Δq| [energy] with them. For `TypeII` only, whose equations these are;
+    of higher order through ``dvi.discretise(H, order=r)``. Gradients are those of the equations,
+    by the implicit function theorem; `Reversible` works as `Checkpointed`, because a step cannot
+    be undone without the one before it.
+
+    **Limits** There is no root near turning points and apsides for an H_D of first order, and
+    the higher the order the flatter E⁺ is in h: its condition number (`LatticeCondition`) grows
+    as h^{−order}, and h is uncertain by as many units of round-off. Where E⁺ does not depend on
+    h at all (free motion) the last h is kept. Not symplectic on a fixed lattice: steps depend on
+    the state. `TimeTransformed` adapts without any of this.
+
+    **Raises** `ValueError` for another policy or a reach not above 1.
+
+    **Source** the paper's (5), (11) and (14), whose signs (11) has right; Kane, Marsden & Ortiz
+    1999, *J. Math. Phys.* 40, 3353 (symplectic-energy-momentum integrators, and their failures).
+    """
+
+    on_no_root: Policy = eqx.field(static=True, default="stop")
+    reach: float = eqx.field(static=True, default=10.0)
+    bounds: tuple[float, float] = eqx.field(static=True, default=(1e-3, 1e3))
+
+    has_memory: ClassVar[bool] = True
+
+    def __check_init__(self):
+        if self.on_no_root not in get_args(Policy):
+            raise ValueError(
+                f"on_no_root must be one of {', '.join(map(repr, get_args(Policy)))}, got "
+                f"{self.on_no_root!r}."
+            )
+        if not (isinstance(self.reach, int | float) and 1 < self.reach < float("inf")):
+            raise ValueError(
+                f"reach must be a number above 1 (how many times larger or smaller than the one "
+                f"before a step may be), got {self.reach!r}."
+            )
+        try:
+            smallest, largest = map(float, self.bounds)
+        except (TypeError, ValueError):
+            smallest, largest = 1.0, 0.0
+        if not 0 < smallest <= 1 <= largest < float("inf"):
+            raise ValueError(
+                "bounds must be two positive numbers around 1, the smallest and the largest step "
+                f"as multiples of the first, such as (1e-3, 1e3); got {self.bounds!r}."
+            )
+
+    def prepare(self, t0, h, num_steps):
+        if h is None or num_steps is None:
+            missing = " and ".join(n for n, v in (("h", h), ("num_steps", num_steps)) if v is None)
+            raise TypeError(
+                f"a variational lattice needs h, its first step, and num_steps; {missing} is "
+                "missing."
+            )
+        return t0, h, check_num_steps(num_steps)
+
+    def interval(self, t0, h, k):
+        return Interval(t0, t0 + h, h)
+
+    def is_usable(self, t0, h):
+        return jnp.isfinite(t0) & jnp.isfinite(h) & (h != 0)
+
+    def begin(self, t0, h):
+        zero = jnp.zeros_like(h)
+        return Memory(t0, h, zero, jnp.asarray(0, jnp.int32), zero)
+
+    def next(self, memory, equations, place):
+        def energies(h):
+            return _energies(equations, memory.t, h, place.q, place.p)
+
+        def residual(h):
+            return energies(h).imbalance(memory.energy)
+
+        first = place.k == 0
+        scale = jnp.abs(memory.energy) + energies(memory.h).size
+        candidates = memory.h * self._factors(memory.h / place.h)
+        h, found = self._choose(residual, candidates, lax.stop_gradient(scale))
+        h, found = jnp.where(first, place.h, h), first | found
+        taken = energies(h)
+        defect = jnp.where(first, 0.0, jnp.abs(taken.imbalance(memory.energy)))
+        memory = Memory(
+            memory.t + h,
+            h,
+            taken.arriving,
+            memory.misses + jnp.where(found, 0, 1),
+            jnp.maximum(memory.defect, lax.stop_gradient(defect)),
+        )
+        interval = Interval(memory.t - h, memory.t, h)
+        if self.on_no_root != "stop":
+            return interval, memory, None
+        return interval, memory, RESULTS.where(found, RESULTS.successful, RESULTS.no_root)
+
+    def report(self, memory):
+        return {
+            "last_h": memory.h,
+            "lattice_misses": memory.misses,
+            "lattice_defect": memory.defect,
+        }
+
+    def _factors(self, grown: Scalar) -> Array:
+        """What the last step, `grown` times the first, may be multiplied with: 1 in the middle."""
+        smallest, largest = (jnp.asarray(b, grown.dtype) / grown for b in self.bounds)
+        low = jnp.clip(smallest, 1 / self.reach, 1)
+        high = jnp.clip(largest, 1, self.reach)
+        powers = jnp.linspace(0.0, 1.0, _CELLS + 1, dtype=grown.dtype)
+        factors = jnp.concatenate([(low**powers)[:0:-1], high**powers])
+        return lax.stop_gradient(factors)
+
+    def _choose(self, residual: Callable, hs: Array, scale: Scalar) -> tuple[Scalar, Array]:
+        """Of the candidates `hs`, the last step in the middle, the one nearest to a root by it.
+
+        Returns the root, or what the policy takes, and whether it is one.
+        """
+        last = hs[_CELLS]
+        fixed = lax.stop_gradient(hs)
+        values = lax.stop_gradient(jax.vmap(residual)(fixed))
+        flat = jnp.all(jnp.abs(values) <= 8 * jnp.finfo(hs.dtype).eps * scale)
+
+        # Cell i is [hs[i], hs[i + 1]]; NaN, where (13) has no solution, is no change of sign.
+        changes = (values[:-1] * values[1:] <= 0) & (jnp.diff(fixed) != 0)
+        crossing = fixed[:-1] - values[:-1] * jnp.diff(fixed) / jnp.diff(values)
+        nearest = jnp.argmin(jnp.where(changes, jnp.abs(crossing - fixed[_CELLS]), jnp.inf))
+        has_root = jnp.any(changes) & ~flat
+        bracket = [x[nearest + i] for i in (0, 1) for x in (fixed, values)]
+
+        def root(f, h):
+            return jnp.where(has_root, _bracketed(f, *bracket), h)
+
+        def equation(h):
+            return jnp.where(has_root, residual(h), h - last)
+
+        h = lax.custom_root(equation, fixed[_CELLS], root, _divide)
+        if self.on_no_root == "minimise":
+            wanted = ~flat & ~has_root
+            h = jnp.where(wanted, _least(residual, hs, values, wanted), h)
+        return h, has_root | flat
+
+
+class LatticeCondition(eqx.Module):
+    r"""Observable: the condition number of the lattice equation (14) in h, on the step that it sees.
+
+        κ = (|E⁺| + |E⁻| + |εW·Δq|) / |h ∂(E⁺ − εW·Δq)/∂h|        along (12)–(13) from (q0, p0)
+
+    A relative error δ in the energies moves h by κδ of itself: at κ = 1e13 the sizes of steps that
+    `Variational` chooses have three digits in float64. Infinite where the energy has no slope, at
+    the folds beyond which there is no root.
+    """
+
+    system: System | None = None
+    epsilon: Any = 0.0
+
+    def bind(self, system: System, epsilon: Any) -> "LatticeCondition":
+        """The same for this system and strength of the disturbance."""
+        return LatticeCondition(system, epsilon)
+
+    def __call__(
+        self, t0: Scalar, t1: Scalar, q0: State, p0: State, q1: State, p1: State, args: Args
+    ) -> Scalar:
+        if self.system is None:
+            raise ValueError(
+                "LatticeCondition has to know the system and ε: call "
+                "condition.bind(system, epsilon)(...), or give it to dvi.integrate(observe=...)."
+            )
+        equations = Equations(self.system, self.epsilon, args)
+
+        def balance(h):
+            energies = _energies(equations, t0, h, q0, p0)
+            return energies.imbalance(0.0), energies.size
+
+        h = t1 - t0
+        slope, size = jax.grad(balance, has_aux=True)(h)
+        return size / jnp.abs(h * slope)
+
+
+class _Energies(NamedTuple):
+    """E⁺, E⁻ and εW·Δq of one step, and the size of the terms that they are made of [energy]."""
+
+    leaving: Scalar
+    arriving: Scalar
+    work: Scalar
+    size: Scalar
+
+    def imbalance(self, energy: Scalar) -> Scalar:
+        """E⁺ − E⁻ − εW·Δq with E⁻ = `energy` of the step before."""
+        return self.leaving - energy - self.work
+
+
+def _energies(equations: Equations, t: Scalar, h: Scalar, q: State, p: State) -> _Energies:
+    """Those of the step (12)–(13) of size h from (q, p) at t; NaN where it has no solution."""
+    interval = Interval(t, t + h, h)
+    q1, p1, info = step(equations, interval, q, p)
+    p1 = jnp.where(info.result == RESULTS.successful, p1, jnp.nan)
+    at, more = (equations.system, *interval[:2], q), (p1, equations.epsilon, equations.args)
+    leaving, arriving = outgoing_energy(*at, *more, h), incoming_energy(*at, *more, h)
+    work = disturbing_work(*at, q1, *more)
+    return _Energies(leaving, arriving, work, jnp.abs(leaving) + jnp.abs(arriving) + jnp.abs(work))
+
+
+def _divide(linear: Callable, rhs: Scalar) -> Scalar:
+    return rhs / linear(jnp.ones_like(rhs))
+
+
+def _bracketed(f: Callable, a: Scalar, fa: Scalar, b: Scalar, fb: Scalar) -> Scalar:
+    """The root of f between a and b, to the last digit: false position (Illinois), safeguarded."""
+
+    def proceed(state):
+        a, _, b, fb, n = state
+        return (jnp.abs(b - a) > 2 * jnp.finfo(a.dtype).eps * jnp.abs(b)) & (fb != 0) & (n < _MOST)
+
+    def narrow(state):
+        a, fa, b, fb, n = state
+        secant = b - fb * (b - a) / (fb - fa)
+        # Every third point is the middle one, so that the interval shrinks whatever f does.
+        c = jnp.where(jnp.isfinite(secant) & (n % 3 != 2), secant, (a + b) / 2)
+        fc = f(c)
+        crosses = fc * fb <= 0
+        a, fa = jnp.where(crosses, b, a), jnp.where(crosses, fb, fa / 2)
+        return a, fa, c, fc, n + 1
+
+    end = lax.while_loop(proceed, narrow, (a, fa, b, fb, 0))
+    return end[2]
+
+
+def _least(residual: Callable, hs: Array, values: Array, wanted: Array) -> Scalar:
+    """The h with the smallest |residual| about the best of `hs`; an end of `hs` if that is it."""
+    fixed = lax.stop_gradient(hs)
+    best = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, jnp.abs(values)))
+    inside = wanted & (best > 0) & (best + 1 < hs.size)
+
+    def search(_, h):
+        a, b = fixed[jnp.maximum(best - 1, 0)], fixed[jnp.minimum(best + 1, hs.size - 1)]
+        return jnp.where(inside, _golden_section(lambda h: jnp.abs(residual(h)), a, b), h)
+
+    def stationary(h):
+        return jnp.where(inside, jax.grad(residual)(h), h - hs[best])
+
+    return lax.custom_root(stationary, fixed[best], search, _divide)
+
+
+def _golden_section(f: Callable, a: Scalar, b: Scalar) -> Scalar:
+    """The minimum of f between a and b, to the square root of round-off."""
+
+    def narrow(_, state):
+        a, b = state
+        left, right = b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)
+        keeps_left = f(left) <= f(right)
+        return jnp.where(keeps_left, a, left), jnp.where(keeps_left, right, b)
+
+    a, b = lax.fori_loop(0, _GOLDEN_STEPS, narrow, (a, b))
+    return (a + b) / 2
