@@ -125,8 +125,9 @@ class Reversible(AbstractAdjoint):
     wrong: take fewer steps between checkpoints, or `Checkpointed`.
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
-    without an inverse (`RungeKutta4`), a `Variational` lattice, and a system or observable that *closes over* a value
-    being differentiated (better: hand it over in args), are differentiated as by `Checkpointed`.
+    without an inverse (`RungeKutta4`), a `Variational` lattice, and a system or observable that
+    *closes over* a value being differentiated (better: hand it over in args), are differentiated
+    as by `Checkpointed`.
 
     **Raises** `ValueError` for settings that are not positive.
 

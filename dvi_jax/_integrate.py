@@ -134,9 +134,9 @@ def integrate(
         )  # fmt: skip
     if isinstance(lattice, Variational) and not isinstance(method, TypeII):
         raise ValueError(
-            f"the lattice Variational() goes with method=dvi.TypeII() only, got {method!r}: (14) is "
-            "the variation of that map's action. For a higher order take an H_D of higher order, "
-            "dvi.discretise(H, order=2)."
+            f"the lattice Variational() goes with method=dvi.TypeII() only, got {method!r}: (14) "
+            "is the variation of that map's action. For a higher order take an H_D of higher "
+            "order, dvi.discretise(H, order=2)."
         )
     equations = Equations(system, epsilon, args, newton)
     is_disturbed = system.force is not None or system.perturbation is not None

@@ -192,11 +192,13 @@ class Variational(Lattice):
         if self.on_no_root == "minimise":
             wanted = ~flat & ~has_root
             h = jnp.where(wanted, _least(residual, hs, values, wanted), h)
-        return h, has_root | flat
+        found = has_root | flat
+        lost = jnp.all(jnp.isnan(values)) | (~found & (self.on_no_root == "stop"))
+        return jnp.where(lost, jnp.nan, h), found
 
 
 class LatticeCondition(eqx.Module):
-    r"""Observable: the condition number of the lattice equation (14) in h, on the step that it sees.
+    r"""Observable: the condition number of the lattice equation (14) in h, on the step seen.
 
         κ = (|E⁺| + |E⁻| + |εW·Δq|) / |h ∂(E⁺ − εW·Δq)/∂h|        along (12)–(13) from (q0, p0)
 

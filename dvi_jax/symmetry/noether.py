@@ -4,12 +4,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from .._energies import disturbing_work, incoming_energy, outgoing_energy
 from .._system import System
-from .._types import Args, Scalar, State
+from .._types import Args, Scalar
 from .generators import Generator, LatticePoint, prolong
 
 Gauge = Callable[..., Any]
