@@ -226,7 +226,7 @@ class LatticeCondition(eqx.Module):
 
         def balance(h):
             energies = _energies(equations, t0, h, q0, p0)
-            return energies.imbalance(0.0), energies.size
+            return energies.leaving - energies.work, energies.size
 
         h = t1 - t0
         slope, size = jax.grad(balance, has_aux=True)(h)
