@@ -5,6 +5,12 @@ from ._adjoints import (
     Direct as Direct,
     Reversible as Reversible,
 )
+from ._arithmetic import (
+    Arithmetic as Arithmetic,
+    Compensated as Compensated,
+    FixedPoint as FixedPoint,
+    FloatingPoint as FloatingPoint,
+)
 from ._discretise import discretise as discretise
 from ._energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
 from ._integrate import integrate as integrate

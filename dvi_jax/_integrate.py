@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._adjoints import AbstractAdjoint, Outcome, Reversible
+from ._arithmetic import Arithmetic, FloatingPoint
 from ._compat import is_traced
 from ._extended import run_extended
 from ._precision import refuse_double_without_x64
@@ -30,6 +31,7 @@ from ._rollout import (
 from ._solution import Save, Solution
 from ._step import Equations
 from ._system import System
+from ._types import Interval
 from .engine.newton import Newton
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation
@@ -57,6 +59,7 @@ def integrate(
     observe: PyTree = None,
     adjoint: AbstractAdjoint = Reversible(),
     newton: Newton = Newton(),
+    arithmetic: Arithmetic = FloatingPoint(),
     throw: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Solution:
@@ -85,6 +88,8 @@ def integrate(
       in constant memory.
     - `adjoint`: how reverse-mode gradients go, see `Reversible`, `Checkpointed`, `Direct`.
     - `newton`: settings of implicit solves, see `Newton`.
+    - `arithmetic`: how the state is kept: `FloatingPoint`; for long runs `Compensated`, or
+      `FixedPoint`, whose explicit steps go back bit for bit.
     - `throw`: raise if the trajectory fails; otherwise read ``solution.result``.
     - `progress`: called as ``progress(steps_done, num_steps)`` at save points, at most about a
       hundred times during the run, which then goes in pieces (same numbers, bit for bit). Not
@@ -114,6 +119,7 @@ def integrate(
         ("save", save, Save),
         ("adjoint", adjoint, AbstractAdjoint),
         ("newton", newton, Newton),
+        ("arithmetic", arithmetic, Arithmetic),
     ):
         if not isinstance(value, kind):
             hint = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
@@ -130,7 +136,7 @@ def integrate(
         return run_extended(
             integrate, system, lattice, q0, p0, t0, epsilon, args, observe, is_observable, h=h,
             num_steps=num_steps, method=method, save=save, adjoint=adjoint, newton=newton,
-            throw=throw, progress=progress,
+            arithmetic=arithmetic, throw=throw, progress=progress,
         )  # fmt: skip
     if isinstance(lattice, Variational) and not isinstance(method, TypeII):
         raise ValueError(
@@ -146,7 +152,8 @@ def integrate(
             "perturbation.",
             stacklevel=2,
         )
-    task = Task(equations, method, lattice, observe, t0, h)
+    equations, q0, p0 = arithmetic.prepare(method, equations, Interval(t0, t0 + h, h), q0, p0)
+    task = Task(equations, method, lattice, observe, t0, h, arithmetic)
     _check_observe(task, q0, p0)
     plan = make_plan(save, num_steps)
     traced = any(is_traced(x) for x in jax.tree.leaves((task, q0, p0)))

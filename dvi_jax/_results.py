@@ -39,9 +39,22 @@ class RESULTS(eqx.Enumeration):
         "lattice=dvi.Variational(on_no_root='hold') or 'minimise', or "
         "lattice=dvi.TimeTransformed(g), whose steps always exist."
     )
+    out_of_range = (
+        "The state left the range of dvi.FixedPoint(quantum), 2^53 quanta in float64 and 2^24 in "
+        "float32, beyond which sums are no longer exact. Likely causes: (a) quantum is too small "
+        "for a state of this size; (b) the orbit escaped. Take a larger quantum, or units in which "
+        "the state is smaller."
+    )
 
 
-STATUS_NAMES = ("successful", "not_converged", "not_finite", "bad_step_size", "no_root")
+STATUS_NAMES = (
+    "successful",
+    "not_converged",
+    "not_finite",
+    "bad_step_size",
+    "no_root",
+    "out_of_range",
+)
 
 
 def status_name(result: RESULTS) -> Any:

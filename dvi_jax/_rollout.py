@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
+from ._arithmetic import Arithmetic, FloatingPoint
 from ._results import RESULTS, first_failure
 from ._solution import Save
 from ._step import Equations
@@ -47,6 +48,7 @@ class Task(eqx.Module):
     observe: PyTree
     t0: Scalar
     h: Scalar
+    arithmetic: Arithmetic = FloatingPoint()
 
     @property
     def args(self) -> Args:
@@ -93,6 +95,7 @@ class Carry(NamedTuple):
     iterations: Int[Array, ""]
     residual: Float[Array, ""]
     reductions: list[Any]
+    beside: Any = None  # what the arithmetic remembers
 
 
 class StepTaken(NamedTuple):
@@ -176,13 +179,16 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         jnp.asarray(0, jnp.int32),
         jnp.zeros((), real),
         [r.start(zero_value(r)) for r in reductions],
+        task.arithmetic.start(q0, p0),
     )
 
 
 def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, StepTaken]:
     """Step k of the trajectory, its status and its reductions."""
     interval, memory, exists = task.next_interval(carry, k)
-    q1, p1, info = task.method.step(task.equations, interval, carry.q, carry.p)
+    q1, p1, beside, info = task.arithmetic.step(
+        task.method, task.equations, interval, carry.q, carry.p, carry.beside
+    )
     was_good = carry.result == RESULTS.successful
     result = carry.result if exists is None else first_failure(carry.result, exists)
     result = first_failure(result, info.result)
@@ -208,6 +214,7 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
             carry.iterations + jnp.where(was_good, info.iterations, 0),
             jnp.where(good, jnp.maximum(carry.residual, residual), carry.residual),
             reduced,
+            beside,
         ),
         interval,
         taken,

@@ -1,5 +1,6 @@
 """One step of the map (12)–(13), its inverse, and its adjoint."""
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -41,16 +42,31 @@ def no_step_yet(like: State) -> StepInfo:
 class Equations(eqx.Module):
     """The discrete equations of a system at one ε and one set of args, ready to be stepped.
 
-    `newton` says how their implicit part is solved.
+    `newton` says how their implicit part is solved. Where there is an `origin`, positions and
+    momenta are told relative to it; where there is a `quantum`, an explicit step changes the state
+    by whole multiples of it.
     """
 
     system: System
     epsilon: Scalar
     args: Args = None
     newton: Newton = Newton()
+    origin: tuple[State, State] | None = None
+    quantum: float | None = eqx.field(static=True, default=None)
+
+    def absolute(self, q: State, p: State) -> tuple[State, State]:
+        """(q, p) as the system knows them, the origin included."""
+        if self.origin is None:
+            return q, p
+        return self.origin[0] + q, self.origin[1] + p
+
+    def increment(self, h: Scalar, rate: State) -> State:
+        """h·rate, rounded to a multiple of the quantum where there is one."""
+        return h * rate if self.quantum is None else to_grid(h * rate, self.quantum)
 
     def momentum_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
+        q0, p1 = self.absolute(q0, p1)
         at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
         gradient = jax.grad(self.system.hamiltonian, argnums=2)(*at)
         if self.system.force is None:
@@ -59,6 +75,7 @@ class Equations(eqx.Module):
 
     def position_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""
+        q0, p1 = self.absolute(q0, p1)
         at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
         return jax.grad(self.system.hamiltonian, argnums=3)(*at)
 
@@ -69,6 +86,17 @@ class Equations(eqx.Module):
     def inverse_is_explicit(self, interval: Interval, like: State) -> bool:
         """Whether q0 does not enter ∂H_D/∂p1, so that inverse and adjoint need no solve."""
         return not depends_on(lambda q0: self.position_rate(interval, q0, like), 0, like)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def to_grid(x: State, quantum: float) -> State:
+    """The multiple of `quantum`, a power of two, nearest to x (half to even); its slope is 1."""
+    return jnp.round(x * (1 / quantum)) * quantum
+
+
+@to_grid.defjvp
+def _(quantum, primals, tangents):
+    return to_grid(*primals, quantum), tangents[0]
 
 
 def step(
@@ -83,11 +111,12 @@ def step(
         lambda p1: equations.momentum_rate(interval, q0, p1),
         p0,
         interval.h,
-        equations.newton,
+        equations,
+        known=equations.absolute(q0, p0)[1],
         explicit=equations.step_is_explicit(interval, q0),
     )
-    q1 = q0 + interval.h * equations.position_rate(interval, q0, p1)
-    return q1, p1, judge(info, q1, p1)
+    q1 = q0 + equations.increment(interval.h, equations.position_rate(interval, q0, p1))
+    return q1, p1, judge(info, q1, p1, equations.quantum)
 
 
 def inverse_step(
@@ -102,11 +131,12 @@ def inverse_step(
         lambda q0: equations.position_rate(interval, q0, p1),
         q1,
         -interval.h,
-        equations.newton,
+        equations,
+        known=equations.absolute(q1, p1)[0],
         explicit=equations.inverse_is_explicit(interval, q1),
     )
-    p0 = p1 - interval.h * equations.momentum_rate(interval, q0, p1)
-    return q0, p0, judge(info, q0, p0)
+    p0 = p1 - equations.increment(interval.h, equations.momentum_rate(interval, q0, p1))
+    return q0, p0, judge(info, q0, p0, equations.quantum)
 
 
 def adjoint_step(
@@ -120,25 +150,35 @@ def adjoint_step(
     return inverse_step(equations, interval.reversed(), q0, p0)
 
 
-def _increment(rate, x0, h, newton, explicit) -> tuple[State, RootInfo]:
-    """x1 = x0 + h rate(x1), by one evaluation if `rate` ignores x1, else by Newton's method."""
-    guess = x0 + h * rate(x0)
+def _increment(rate, x0, h, equations, known, explicit) -> tuple[State, RootInfo]:
+    """x1 = x0 + h rate(x1), by one evaluation if `rate` ignores x1, else by Newton's method.
+
+    `known` is x0 with the origin, by which the accuracy of a solve is measured.
+    """
+    guess = x0 + equations.increment(h, rate(x0))
     if explicit:
         real = jnp.finfo(x0.dtype).dtype
         return guess, RootInfo(jnp.asarray(0, jnp.int32), jnp.zeros((), real), jnp.asarray(True))
     shape = x0.shape
-    known = x0.ravel()
+    start = x0.ravel()
 
     def residual(x1):
-        return x1 - known - h * rate(x1.reshape(shape)).ravel()
+        return x1 - start - h * rate(x1.reshape(shape)).ravel()
 
-    x1, info = find_root(residual, guess.ravel(), known, newton)
+    x1, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton)
     return x1.reshape(shape), info
 
 
-def judge(info: RootInfo, q: State, p: State) -> StepInfo:
-    """What became of a step: its solve, and whether the state that it led to is finite."""
+def judge(info: RootInfo, q: State, p: State, quantum: float | None = None) -> StepInfo:
+    """What became of a step: its solve, and whether the state that it led to is finite.
+
+    With a quantum, also whether that state is small enough for sums to be exact.
+    """
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(p))
     result = RESULTS.where(info.converged, RESULTS.successful, RESULTS.not_converged)
+    if quantum is not None:
+        largest = quantum * 2.0 ** (jnp.finfo(q.dtype).nmant + 1)
+        fits = jnp.all(jnp.abs(q) <= largest) & jnp.all(jnp.abs(p) <= largest)
+        result = RESULTS.where(fits, result, RESULTS.out_of_range)
     result = RESULTS.where(finite, result, RESULTS.not_finite)
     return StepInfo(result, info.iterations, info.residual)

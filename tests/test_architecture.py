@@ -14,6 +14,7 @@ FLOORS = [
     ["_system", "_solution", "engine"],
     ["_discretise", "_energies", "_step"],
     ["methods", "lattices", "symmetry", "observe"],
+    ["_arithmetic"],
     ["_rollout", "_extended"],
     ["_adjoints"],
     ["_integrate"],
@@ -86,7 +87,7 @@ PUBLIC = """
 System discretise integrate Save Solution RESULTS IntegrationError Newton
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
 GaussLegendre RungeKutta4
-Uniform Given
+Uniform Given FloatingPoint Compensated FixedPoint
 MaxDrift Range Trend Mean Last Reversible Checkpointed Direct
 Generator prolong determining_residual conformal_factor noether_identity AdiabaticInvariant
 generators random_pairs solution_pairs find_symmetries Symmetries Symmetry

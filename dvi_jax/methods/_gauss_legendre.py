@@ -114,7 +114,8 @@ class GaussLegendre(Method):
             return x - advanced(a, x.reshape(all_at_start.shape)).ravel()
 
         guess = advanced(a, all_at_start)
-        x, info = find_root(residual, guess.ravel(), all_at_start.ravel(), equations.newton)
+        known = jnp.broadcast_to(jnp.stack(equations.absolute(q0, p0)), all_at_start.shape)
+        x, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton)
         q1, p1 = advanced(b, x.reshape(all_at_start.shape))
         return q1, p1, judge(info, q1, p1)
 

@@ -1,0 +1,186 @@
+"""How a state is kept from step to step: rounded, with what rounding loses, or on a grid."""
+
+import abc
+import dataclasses
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+
+from ._step import Equations, StepInfo, to_grid
+from ._types import Interval, State
+from .methods import Adjoint, Method, TypeII
+from .methods._composition import CompositionMethod
+
+
+class Arithmetic(eqx.Module):
+    """Base of the ways to keep a state from step to step."""
+
+    @abc.abstractmethod
+    def prepare(
+        self, method: Method, equations: Equations, interval: Interval, q0: State, p0: State
+    ) -> tuple[Equations, State, State]:
+        """The equations and the start as this arithmetic has them, or an error: once per run."""
+
+    @abc.abstractmethod
+    def start(self, q0: State, p0: State) -> Any:
+        """What is remembered beside the state, before the first step."""
+
+    @abc.abstractmethod
+    def step(
+        self,
+        method: Method,
+        equations: Equations,
+        interval: Interval,
+        q0: State,
+        p0: State,
+        memory: Any,
+    ) -> tuple[State, State, Any, StepInfo]:
+        """One step of `method`: the state, what is remembered beside it, and the status."""
+
+
+class FloatingPoint(Arithmetic):
+    """Plain floating point: each step rounds the state (default).
+
+    The error of an invariant is that of a random walk, √N ε times its size after N steps, ε =
+    2.2e-16 in float64.
+    """
+
+    def prepare(self, method, equations, interval, q0, p0):
+        return equations, q0, p0
+
+    def start(self, q0, p0):
+        return None
+
+    def step(self, method, equations, interval, q0, p0, memory):
+        q1, p1, info = method.step(equations, interval, q0, p0)
+        return q1, p1, memory, info
+
+
+class Compensated(Arithmetic):
+    r"""Compensated summation: what rounding takes from the state is kept and given back.
+
+    The state is q + e, with q = fl(q + e) and e below round-off of q. A step of the method runs in
+    coordinates x relative to q, where no digits of an increment are lost beside a large q,
+
+        x0 = e,   x0 → x1 by the method,   q ← fl(q + x1),   e ← (q_before − q) + x1   exactly,
+
+    and so for p. What is left is the rounding of the rates themselves, h times smaller. Any method,
+    explicit or not, forced or not. What is saved and observed is q without e.
+
+    Derivatives are those of the map: e has none. The rebuilding of `Reversible` leaves e out.
+
+    **Source** Kahan 1965; Møller 1965. The exact sum: Knuth, *The Art of Computer Programming*
+    2, 4.2.2. For symplectic methods: Hairer, Lubich & Wanner 2006, VIII.5.
+    """
+
+    def prepare(self, method, equations, interval, q0, p0):
+        return equations, q0, p0
+
+    def start(self, q0, p0):
+        return jnp.zeros_like(q0), jnp.zeros_like(p0)
+
+    def step(self, method, equations, interval, q0, p0, memory):
+        here = dataclasses.replace(equations, origin=(q0, p0))
+        x, y, info = method.step(here, interval, *memory)
+        q1, lost_q = _exact_sum(q0, x)
+        p1, lost_p = _exact_sum(p0, y)
+        return q1, p1, lax.stop_gradient((lost_q, lost_p)), info
+
+
+class FixedPoint(Arithmetic):
+    r"""Fixed point: the state moves on a grid, and what is explicit goes back bit for bit.
+
+    Positions and momenta are whole multiples of `quantum`, and so is each change of them,
+
+        p1 = p0 + [h (−∂H_D/∂q0 + εW)(t0, t1, q0)],    q1 = q0 + [h ∂H_D/∂p1 (t0, t1, p1)],
+
+    [x] being the multiple nearest to x (half to even, so that [−x] = −[x]). Sums are then exact,
+    and a step and its inverse undo each other without any rounding; so do steps by h and −h of a
+    symmetric method. The map stays symplectic in the sense of a lattice: one to one.
+
+    **Arguments**
+
+    - `quantum`: a power of two [unit of q, and of p], 2.0**-40 for instance. In float64 |q| and |p|
+      must stay below 2⁵³ quanta, in float32 below 2²⁴; the status is else `out_of_range`.
+
+    The start is rounded to the grid. The system must be separable, so that no step needs a solve,
+    and the method made of the map: `TypeII`, `Adjoint`, `Strang` and the compositions.
+
+    Derivatives are those of the map without rounding: [·] has slope 1.
+
+    **Raises** `ValueError` for another `quantum`, method or system.
+
+    **Source** Earn & Tremaine 1992, *Physica D* 56, 1; Levesque & Verlet 1993, *J. Stat. Phys.*
+    72, 519.
+    """
+
+    quantum: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        quantum = self.quantum
+        is_number = isinstance(quantum, int | float) and not isinstance(quantum, bool)
+        if not is_number or not 0 < quantum < math.inf:
+            raise ValueError(
+                f"quantum must be a positive power of two such as 2.0**-40, got {quantum!r}."
+            )
+        mantissa, exponent = math.frexp(quantum)
+        if mantissa != 0.5:
+            raise ValueError(
+                f"quantum must be a power of two, so that multiples of it are exact; got "
+                f"{quantum!r}, which lies between 2.0**{exponent - 1} and 2.0**{exponent}."
+            )
+
+    def prepare(self, method, equations, interval, q0, p0):
+        if not _is_made_of_the_map(method):
+            raise ValueError(
+                f"FixedPoint needs a method that is made of the map (12)–(13) and its adjoint; "
+                f"{method!r} is not. Take dvi.Strang(), dvi.Yoshida(4) or another composition, "
+                "or arithmetic=dvi.Compensated(), which works with every method."
+            )
+        if not (
+            method._needs_no_solve(equations, interval, q0)
+            and method._inverse_needs_no_solve(equations, interval, q0)
+        ):
+            raise ValueError(
+                "FixedPoint needs steps without a solve, forwards and backwards: here p1 enters "
+                "∂H_D/∂q0 or the force, or q0 enters ∂H_D/∂p1. Take a separable H_D = T(p1) + "
+                "V(q0) with a force of q0 and t alone, or arithmetic=dvi.Compensated()."
+            )
+        smallest, largest = jnp.finfo(q0.dtype).tiny, 1 / jnp.finfo(q0.dtype).tiny
+        if not smallest <= self.quantum <= largest:
+            raise ValueError(
+                f"quantum = {self.quantum!r} is no normal number of {q0.dtype}: take one between "
+                f"{smallest:.1e} and {largest:.1e}."
+            )
+        equations = dataclasses.replace(equations, quantum=self.quantum)
+        return equations, _start_on_grid(q0, self.quantum), _start_on_grid(p0, self.quantum)
+
+    def start(self, q0, p0):
+        return None
+
+    def step(self, method, equations, interval, q0, p0, memory):
+        q1, p1, info = method.step(equations, interval, q0, p0)
+        return q1, p1, memory, info
+
+
+def _exact_sum(a: State, b: State) -> tuple[State, State]:
+    """(s, e) with s = fl(a + b) and s + e = a + b exactly, whichever is larger."""
+    s = a + b
+    b_seen = s - a
+    return s, (a - (s - b_seen)) + (b - b_seen)
+
+
+def _start_on_grid(x: State, quantum: float) -> State:
+    x = to_grid(x, quantum)
+    return jnp.where(x == 0, jnp.zeros_like(x), x)  # −0 would come back as +0
+
+
+def _is_made_of_the_map(method: Method) -> bool:
+    if isinstance(method, Adjoint):
+        return _is_made_of_the_map(method.method)
+    if isinstance(method, CompositionMethod):
+        return _is_made_of_the_map(method.base)
+    return isinstance(method, TypeII)
