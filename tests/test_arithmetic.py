@@ -1,0 +1,461 @@
+"""Compensated summation and fixed point: what they keep, what they refuse, and their gradients."""
+
+import functools
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ADJOINTS, ARGS, METHODS as REGISTERED, SYSTEMS, pendulum
+
+import dvi_jax as dvi
+from dvi_jax import systems
+from dvi_jax._arithmetic import _exact_sum
+from dvi_jax._step import Equations, _increment, to_grid
+
+METHODS = {**REGISTERED, "KahanLi6": dvi.KahanLi(6), "GaussLegendre2": dvi.GaussLegendre(2)}
+QUANTUM = 2.0**-46
+FINAL = dvi.Save(final=True)
+
+
+def henon_heiles(t0, t1, q0, p1, args):
+    """Two oscillators, coupled: H = (|p|² + |q|²)/2 + x²y − y³/3."""
+    x, y = q0
+    return jnp.sum(p1**2) / 2 + (x**2 + y**2) / 2 + x**2 * y - y**3 / 3
+
+
+KEPLER, EIGHT = systems.kepler(), systems.n_body()
+ORBITS = {
+    "kepler": (KEPLER.system, [1.0, 0.3], [0.1, 0.9], 0.01, {"K": 1.0}),
+    "figure_eight": (EIGHT.system, EIGHT.q0, EIGHT.p0, 0.01, EIGHT.args),
+    "henon_heiles": (dvi.System(henon_heiles), [0.1, -0.2], [0.3, 0.25], 0.05, None),
+}
+THERE_AND_BACK = {
+    "Strang by −h": (dvi.Strang(), dvi.Strang()),
+    "Yoshida4 by −h": (dvi.Yoshida(4), dvi.Yoshida(4)),
+    "TypeII by its inverse": (dvi.TypeII(), dvi.Adjoint()),
+    "Strang by its inverse": (dvi.Strang(), dvi.Adjoint(dvi.Strang())),
+}
+
+
+def same_bits(a, b):
+    return np.asarray(a).tobytes() == np.asarray(b).tobytes()
+
+
+# Compensated summation
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_sum_is_exact_under_jit(order):
+    """s + e = a + b in rational arithmetic; without e it is not, nor with Dekker's three sums."""
+    rng = np.random.default_rng(0)
+    a = rng.normal(size=200)
+    b = rng.normal(size=200) * 2.0 ** rng.integers(-60, 4, 200)
+    a, b = (a, b)[::order]
+    s, e = map(np.asarray, jax.jit(_exact_sum)(a, b))
+
+    def exact(*parts):
+        return [sum(map(Fraction, x)) for x in zip(*parts, strict=True)]
+
+    wanted = exact(a, b)
+    assert exact(s, e) == wanted
+    assert exact(s) != wanted
+    assert exact(s, (a - s) + b) != wanted
+
+
+def ensemble_error(arithmetic, num_steps, h, starts=32):
+    """Errors of the invariant that the oscillator's map keeps, relative, after `num_steps`."""
+    problem = systems.oscillator()
+    q, p = np.random.default_rng(0).uniform(-1, 1, (2, starts, 1))
+
+    def invariant(t0, t1, q0, p0, q1, p1, args):
+        return jnp.sum(p1**2 + q1**2 - h * q1 * p1) / 2
+
+    @jax.jit
+    @jax.vmap
+    def last(q, p):
+        sol = dvi.integrate(
+            problem.system, q, p, h=h, num_steps=num_steps, arithmetic=arithmetic, save=FINAL,
+            observe=invariant,
+        )  # fmt: skip
+        t = jnp.zeros(())
+        return sol.observed[-1] / invariant(t, t, q, p, q, p, None) - 1
+
+    return np.asarray(last(q, p))
+
+
+def test_compensated_runs_lose_less():
+    plain = ensemble_error(dvi.FloatingPoint(), 100_000, 2.0**-5)
+    compensated = ensemble_error(dvi.Compensated(), 100_000, 2.0**-5)
+    assert np.std(plain) > 1e-14
+    assert np.std(compensated) < np.std(plain) / 8
+
+
+@pytest.mark.slow
+def test_round_off_is_a_random_walk():
+    """√N, for plain sums as well; where h makes roundings repeat they add up (the control)."""
+    number = np.array([30_000, 300_000, 3_000_000])
+
+    def rms(arithmetic, h):
+        errors = [ensemble_error(arithmetic, n, h, starts=64) for n in number]
+        return np.array([np.sqrt(np.mean(e**2)) for e in errors]), errors[-1]
+
+    for arithmetic in (dvi.FloatingPoint(), dvi.Compensated()):
+        growth, last = rms(arithmetic, 2.0**-5)
+        slope = np.polyfit(np.log(number), np.log(growth), 1)[0]
+        assert 0.3 < slope < 0.65
+        assert abs(np.mean(last)) < 4 * np.std(last) / 8
+    _, repeated = rms(dvi.Compensated(), 0.1)
+    assert abs(np.mean(repeated)) > 10 * np.std(repeated) / 8
+
+
+@functools.cache
+def final_state(system, method, arithmetic, num_steps=40):
+    s, q, p = SYSTEMS[system]
+    sol = dvi.integrate(
+        s, q, p, h=0.1, num_steps=num_steps, epsilon=0.2, args=ARGS, method=METHODS[method],
+        arithmetic=arithmetic, save=FINAL,
+    )  # fmt: skip
+    return np.array([sol.qs[-1], sol.ps[-1]]), sol
+
+
+def pairs():
+    fast = {("non_separable", "TypeII"), ("pendulum", "Yoshida4"), ("non_separable", "Adjoint")}
+    fast |= {("kepler", "GaussLegendre2"), ("kepler", "RungeKutta4")}
+    return [
+        pytest.param(s, m, marks=[] if (s, m) in fast else [pytest.mark.slow])
+        for s in ("pendulum", "kepler", "non_separable")
+        for m in METHODS
+    ]
+
+
+@pytest.mark.parametrize(("system", "method"), pairs())
+def test_every_method_is_the_same_in_local_coordinates(system, method):
+    """The same map to round-off, with as many iterations, and a state that is not the same bits."""
+    plain, one = final_state(system, method, dvi.FloatingPoint())
+    compensated, two = final_state(system, method, dvi.Compensated())
+    np.testing.assert_allclose(compensated, plain, rtol=1e-12, atol=1e-13)
+    assert not same_bits(compensated, plain)
+    more = int(two.stats["newton_iterations"]) - int(one.stats["newton_iterations"])
+    assert abs(more) <= 4
+
+
+def test_an_equilibrium_is_solved_for_in_its_own_size():
+    """Increments there are nothing beside the state: measured by themselves they never settle."""
+
+    def resting(t0, t1, q0, p1, args):
+        return jnp.sum(((q0 - 1) ** 2 + 1) * ((p1 - 3) ** 2 + 1)) / 2
+
+    s = dvi.System(resting)
+    for method in (dvi.TypeII(), dvi.Strang(), dvi.GaussLegendre(2)):
+        sol = dvi.integrate(
+            s, [1.0 + 1e-13], [3.0], h=0.1, num_steps=20, method=method,
+            arithmetic=dvi.Compensated(),
+        )  # fmt: skip
+        assert int(sol.stats["newton_iterations"]) <= 20 * 2 * 2
+
+    def iterations(known):
+        equations = Equations(s, jnp.zeros(()), origin=(jnp.ones(1), 3 * jnp.ones(1)))
+        rng = np.random.default_rng(0)
+        noise = 1e-16 * rng.normal(size=64)
+        # A rate with round-off of the size of ulp(1), as one at a state of size 1 has.
+        rate = lambda x: jnp.asarray(1.0) + x - 1.0 - 3e-17 + 0.9 * jnp.sin(1e16 * x) * 1e-16  # noqa: E731
+        _, info = _increment(
+            rate, jnp.asarray(noise[:1]), jnp.asarray(0.1), equations, known, explicit=False
+        )
+        return int(info.iterations), bool(info.converged)
+
+    assert iterations(jnp.ones(1)) <= (2, True)
+    assert iterations(jnp.zeros(1)) > (2, True)
+
+
+def test_memory_goes_along_in_pieces_and_in_batches():
+    """With progress the run is cut in pieces; under vmap lanes are what they are alone."""
+    s, q, p = SYSTEMS["pendulum"]
+
+    def run(q, p, **more):
+        return dvi.integrate(
+            s, q, p, h=0.0625, num_steps=3000, epsilon=0.0, save=dvi.Save(every=10),
+            arithmetic=dvi.Compensated(), **more,
+        )  # fmt: skip
+
+    q, p = jnp.asarray(q), jnp.asarray(p)
+    whole, pieces = run(q, p), run(q, p, progress=lambda done, of: None)
+    assert same_bits(whole.qs, pieces.qs)
+    assert same_bits(whole.ps, pieces.ps)
+    # Begun afresh at each save the memory is lost, and with it the bits.
+    half = run(whole.qs[100], whole.ps[100])
+    assert not same_bits(half.qs[1:201], whole.qs[101:301])
+    batch = jax.vmap(lambda a: run(a * q, a * p).qs)(jnp.array([1.0, 0.5]))
+    np.testing.assert_allclose(batch[0], whole.qs, atol=1e-12)
+    np.testing.assert_allclose(batch[1], run(q / 2, p / 2).qs, atol=1e-12)
+
+
+def test_compensation_works_in_single_precision():
+    """Against double precision: the error of float32 without it is ten times as large."""
+    s = dvi.System(pendulum)
+    q, p = np.array([0.4]), np.array([0.7])
+
+    def last(dtype, arithmetic):
+        return dvi.integrate(
+            s, q.astype(dtype), p.astype(dtype), h=2.0**-6, num_steps=20_000,
+            arithmetic=arithmetic, save=FINAL,
+        ).qs[-1]  # fmt: skip
+
+    q, p = np.float32(q).astype(float), np.float32(p).astype(float)
+    exact = last(np.float64, dvi.FloatingPoint())
+    plain = abs(last(np.float32, dvi.FloatingPoint()) - exact)
+    compensated = abs(last(np.float32, dvi.Compensated()) - exact)
+    assert last(np.float32, dvi.Compensated()).dtype == np.float32
+    assert compensated < plain / 10
+
+
+def test_a_lane_that_fails_leaves_the_others_alone():
+    s = KEPLER.system
+    q = jnp.array([[1.0, 0.0], [0.0, 0.0], [0.9, 0.1]])
+    p = jnp.tile(jnp.array([0.0, 1.0]), (3, 1))
+    for arithmetic in (dvi.Compensated(), dvi.FixedPoint(QUANTUM)):
+        batch = jax.vmap(
+            lambda q, p: dvi.integrate(
+                s, q, p, h=0.01, num_steps=20, args=ARGS, arithmetic=arithmetic, throw=False
+            )
+        )(q, p)
+        assert list(batch.status) == ["successful", "not_finite", "successful"]
+        assert np.isfinite(batch.qs[0]).all()
+        assert np.isfinite(batch.qs[2]).all()
+        assert np.isnan(batch.qs[1, 1:]).all()
+
+
+# Fixed point
+
+
+def there_and_back(orbit, methods, arithmetic, num_steps, batch=None):
+    """(start, end) of a run forth and one back from its end, each a pair (q, p)."""
+    s, q, p, h, args = ORBITS[orbit]
+    q, p = jnp.asarray(q), jnp.asarray(p)
+    forth, back = methods
+
+    def run(q, p, h, method):
+        sol = dvi.integrate(
+            s, q, p, h=h, num_steps=num_steps, args=args, method=method, arithmetic=arithmetic,
+            save=FINAL, throw=False,
+        )  # fmt: skip
+        return (sol.qs[0], sol.ps[0]), (sol.qs[-1], sol.ps[-1])
+
+    if batch is None:
+        one, two = (jax.jit(lambda q, p, h, m=m: run(q, p, h, m)) for m in (forth, back))
+    else:
+        q, p = (x * batch.reshape(-1, *[1] * x.ndim) for x in (q, p))
+        one, two = (
+            jax.jit(jax.vmap(lambda q, p, h, m=m: run(q, p, h, m), (0, 0, None)))
+            for m in (forth, back)
+        )
+    start, far = one(q, p, h)
+    if forth == back:
+        two = one  # the same program
+    _, end = two(*far, -h)
+    assert np.max(np.abs(far[0] - start[0])) > 1e-3  # it did move
+    return start, end
+
+
+def comes_back(*args, **kwargs):
+    start, end = there_and_back(*args, **kwargs)
+    return all(map(same_bits, start, end))
+
+
+ROUTES = [
+    pytest.param(
+        o, r, marks=[] if (o, r[:6]) in {("kepler", "Strang"), ("henon_heiles", "TypeII")}
+        else [pytest.mark.slow],
+    )
+    for o in ORBITS
+    for r in THERE_AND_BACK
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("orbit", "route"), ROUTES)
+def test_fixed_point_comes_back_bit_for_bit(orbit, route):
+    """A million steps forth and as many back; plain and compensated sums do not come back."""
+    num_steps = 1_000_000 if orbit != "kepler" else 50_000
+    methods = THERE_AND_BACK[route]
+    assert comes_back(orbit, methods, dvi.FixedPoint(QUANTUM), num_steps)
+    assert not comes_back(orbit, methods, dvi.FloatingPoint(), 20_000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("route", THERE_AND_BACK)
+def test_a_batch_in_fixed_point_comes_back_bit_for_bit(route):
+    batch = np.linspace(0.8, 1.2, 5)
+    for orbit in ORBITS:
+        methods = THERE_AND_BACK[route]
+        assert comes_back(orbit, methods, dvi.FixedPoint(QUANTUM), 100_000, batch)
+        assert not comes_back(orbit, methods, dvi.Compensated(), 20_000, batch)
+
+
+def test_a_force_of_time_comes_back_where_times_are_exact():
+    """h a power of two, t0 a multiple of it: then t0 + kh forth and back are the same numbers."""
+    s = dvi.System(pendulum, force=lambda t0, t1, q0, p1, args: jnp.cos(t0) + jnp.sin(t1) * q0)
+
+    def back(h, num_steps=4000):
+        def run(q, p, t0, h):
+            sol = dvi.integrate(
+                s, q, p, t0=t0, h=h, num_steps=num_steps, epsilon=0.3, method=dvi.Strang(),
+                save=FINAL, arithmetic=dvi.FixedPoint(QUANTUM),
+            )  # fmt: skip
+            return (sol.qs[0], sol.ps[0]), (sol.qs[-1], sol.ps[-1]), sol.ts[-1]
+
+        start, far, t = run([0.4], [0.7], 0.0, h)
+        _, end, _ = run(*far, t, -h)
+        return all(map(same_bits, start, end))
+
+    assert back(2.0**-5)
+    assert not back(0.03)
+
+
+def test_states_are_multiples_of_the_quantum():
+    s, q, p, h, args = ORBITS["kepler"]
+
+    def leftover(arithmetic):
+        sol = dvi.integrate(s, q, p, h=h, num_steps=50, args=args, arithmetic=arithmetic)
+        z = np.array([sol.qs, sol.ps]) / QUANTUM
+        return np.max(np.abs(z - np.round(z)))
+
+    assert leftover(dvi.FixedPoint(QUANTUM)) == 0
+    assert leftover(dvi.FloatingPoint()) > 0
+
+
+def test_the_start_is_rounded_and_zero_has_no_sign():
+    s = dvi.System(pendulum)
+    sol = dvi.integrate(
+        s, [0.3], [-(2.0**-9)], h=0.125, num_steps=1, arithmetic=dvi.FixedPoint(2.0**-8)
+    )
+    assert sol.qs[0, 0] == 77 / 256  # 76.8 quanta
+    assert same_bits(sol.ps[0], np.zeros(1))  # half a quantum goes to even, to zero
+
+
+def test_rounding_is_odd_and_has_slope_one():
+    x = jnp.array([0.3, 0.5, 1.5, -0.5, 2.49, 1e6 + 0.2])
+    np.testing.assert_array_equal(to_grid(x, 1.0), [0, 0, 2, -0.0, 2, 1e6])
+    np.testing.assert_array_equal(to_grid(-x, 0.25), -to_grid(x, 0.25))
+    np.testing.assert_array_equal(jax.vmap(jax.grad(lambda x: 3 * to_grid(x, 1.0)))(x), 3)
+
+
+def test_leaving_the_range_is_told():
+    """A free particle: q = n after n steps, up to 2⁵³ quanta."""
+    free = dvi.System(lambda t0, t1, q0, p1, args: jnp.sum(p1**2) / 2)
+
+    def run(quantum, dtype=np.float64):
+        return dvi.integrate(
+            free, np.zeros(1, dtype), np.ones(1, dtype), h=1.0, num_steps=20, throw=False,
+            arithmetic=dvi.FixedPoint(quantum),
+        )  # fmt: skip
+
+    assert run(2.0**-48).status == "successful"
+    short = run(2.0**-49)  # up to 16
+    assert short.status == "out_of_range"
+    assert int(short.stats["failed_step"]) == 16
+    assert np.isnan(short.qs[-1]).all()
+    assert short.qs[16, 0] == 16
+    assert run(2.0**-19, np.float32).status == "successful"
+    assert int(run(2.0**-20, np.float32).stats["failed_step"]) == 16
+    with pytest.raises(dvi.IntegrationError, match=r"step 16 of 20.*Take a larger quantum"):
+        dvi.integrate(free, [0.0], [1.0], h=1.0, num_steps=20, arithmetic=dvi.FixedPoint(2.0**-49))
+
+
+@pytest.mark.parametrize("quantum", [0.1, 3.0, 0, -1.0, True, None, float("inf"), float("nan")])
+def test_a_quantum_that_is_no_power_of_two_is_refused(quantum):
+    with pytest.raises(ValueError, match="power of two"):
+        dvi.FixedPoint(quantum)
+
+
+def test_what_fixed_point_cannot_undo_is_refused():
+    separable = dvi.System(pendulum)
+
+    def run(system, method=dvi.TypeII(), **more):
+        q0 = more.pop("q0", [0.3])
+        return dvi.integrate(
+            system, q0, np.ones_like(q0), h=0.1, num_steps=1, method=method,
+            arithmetic=dvi.FixedPoint(more.pop("quantum", QUANTUM)), **more,
+        )  # fmt: skip
+
+    for good in (dvi.TypeII(), dvi.Adjoint(dvi.Yoshida(4)), dvi.Strang(base=dvi.Adjoint())):
+        run(separable, good)
+    for method in (
+        dvi.RungeKutta4(),
+        dvi.GaussLegendre(1),
+        dvi.Yoshida(4, base=dvi.GaussLegendre(1)),
+        dvi.Adjoint(dvi.GaussLegendre(1)),
+    ):
+        with pytest.raises(ValueError, match=r"made of the map.*is not.*dvi\.Compensated"):
+            run(separable, method)
+    damped = dvi.System(pendulum, force=lambda t0, t1, q0, p1, args: -p1)
+    for system in (SYSTEMS["non_separable"][0], damped):
+        for method in (dvi.TypeII(), dvi.Adjoint()):
+            with pytest.raises(ValueError, match=r"without a solve.*separable"):
+                run(system, method, epsilon=0.1)
+    with pytest.raises(ValueError, match="no normal number of float32"):
+        run(separable, q0=np.array([0.3], np.float32), quantum=2.0**-140)
+    with pytest.raises(TypeError, match="arithmetic must be a Arithmetic.*parentheses"):
+        dvi.integrate(separable, [0.3], [1.0], h=0.1, num_steps=1, arithmetic=dvi.Compensated)
+
+
+# Gradients, and other lattices
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_gradients_are_those_of_the_map(adjoint):
+    """As with plain sums: to round-off, and to the quantum in fixed point."""
+
+    def value(arithmetic, system, method, epsilon):
+        def of(x):
+            sol = dvi.integrate(
+                system, x[:1], x[1:2], h=x[2], num_steps=23, epsilon=epsilon * x[3],
+                method=method, adjoint=ADJOINTS[adjoint], arithmetic=arithmetic,
+                save=dvi.Save(every=10, final=True),
+            )  # fmt: skip
+            return jnp.sum(sol.qs**3) + jnp.sum(sol.ps[-1])
+
+        return jax.jit(jax.grad(of))(jnp.array([0.3, 0.4, 0.1, 0.5]))
+
+    implicit = SYSTEMS["non_separable"][0], dvi.Strang(), 0.2
+    plain = value(dvi.FloatingPoint(), *implicit)
+    np.testing.assert_allclose(value(dvi.Compensated(), *implicit), plain, rtol=1e-11)
+    assert np.min(np.abs(plain)) > 1e-3
+    explicit = dvi.System(pendulum, force=lambda t0, t1, q0, p1, args: -(q0**3)), dvi.Yoshida(4), 1
+    plain = value(dvi.FloatingPoint(), *explicit)
+    np.testing.assert_allclose(value(dvi.FixedPoint(QUANTUM), *explicit), plain, rtol=1e-9)
+    coarse = value(dvi.FixedPoint(2.0**-10), *explicit)
+    assert 1e-6 < np.max(np.abs(coarse / plain - 1)) < 0.1
+
+
+def test_forward_mode_agrees_with_reverse_mode():
+    def last(x, arithmetic):
+        sol = dvi.integrate(
+            dvi.System(pendulum), x[:1], x[1:], h=0.1, num_steps=30, arithmetic=arithmetic,
+            method=dvi.Strang(), save=FINAL,
+        )  # fmt: skip
+        return jnp.sum(sol.qs[-1] * sol.ps[-1])
+
+    x = jnp.array([0.3, 0.8])
+    for arithmetic in (dvi.Compensated(), dvi.FixedPoint(QUANTUM)):
+        f = functools.partial(last, arithmetic=arithmetic)
+        np.testing.assert_allclose(jax.jit(jax.jacfwd(f))(x), jax.jit(jax.grad(f))(x), rtol=1e-12)
+
+
+def test_adapted_steps_take_the_arithmetic_along():
+    """On a time-transformed lattice time is summed too; its Hamiltonian is not separable."""
+    lattice = dvi.TimeTransformed(lambda t, q, p, args: jnp.sum(q**2))
+
+    def run(arithmetic):
+        return dvi.integrate(
+            KEPLER.system, [1.0, 0.0], [0.0, 1.1], h=0.02, num_steps=30, args=ARGS,
+            lattice=lattice, method=dvi.TypeII(), arithmetic=arithmetic,
+        )  # fmt: skip
+
+    plain, compensated = run(dvi.FloatingPoint()), run(dvi.Compensated())
+    np.testing.assert_allclose(compensated.qs, plain.qs, atol=1e-12)
+    np.testing.assert_allclose(compensated.ts, plain.ts, atol=1e-12)
+    assert not same_bits(compensated.qs, plain.qs)
+    with pytest.raises(ValueError, match="without a solve"):
+        run(dvi.FixedPoint(QUANTUM))
