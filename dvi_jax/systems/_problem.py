@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from .._system import System
 
 
@@ -30,3 +32,14 @@ class Problem:
     units: Mapping[str, str] = field(default_factory=dict)
     source: str = ""
     check: Callable[[Any, Any, Any], None] | None = None
+
+
+def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], wanted: str) -> None:
+    """Refuse q0 and p0 that are not of one shape for which `fits` holds.
+
+    **Raises** `ValueError` with `wanted`, a sentence that says which shapes there are, and the
+    shapes seen.
+    """
+    q, p = np.shape(q0), np.shape(p0)
+    if q != p or not fits(q):
+        raise ValueError(f"{wanted}; got q0 of shape {q} and p0 of shape {p}.")

@@ -119,17 +119,15 @@ def n_body(
     **Raises** `ValueError` for a start that `check_bodies` refuses, `TypeError` when only some
     of masses, q0 and p0 are given.
 
-    **Source** figure eight: Chenciner & Montgomery 2000, *Ann. Math.* 152, 881; digits by
-    C. Simó, printed there. Period 6.32591398, unit masses, G = 1.
+    **Source** figure eight: see `figure_eight`.
     """
     given = [x is not None for x in (masses, q0, p0)]
     if any(given) and not all(given):
         raise TypeError("n_body takes masses, q0 and p0 together, or none of them.")
     if masses is None or q0 is None or p0 is None:
-        place, speed = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
-        masses = np.ones(3)
-        q0 = np.array([place, -place, np.zeros(2)])
-        p0 = np.array([-speed / 2, -speed / 2, speed])
+        from .figure_eight import MOMENTA, POSITIONS  # which is made by this function
+
+        masses, q0, p0 = np.ones(3), POSITIONS, MOMENTA
     args = {"masses": np.asarray(masses, float), "G": float(G)}
     check_bodies(q0, p0, args)
     return Problem(

@@ -1,0 +1,53 @@
+"""Hénon and Heiles' star in the plane of a galaxy."""
+
+import jax.numpy as jnp
+
+from .._system import System
+from ._problem import Problem, check_shape
+
+ESCAPE_ENERGY = 1 / 6
+"""Energy of the three saddles of the potential: orbits below it that start inside stay there."""
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = |p1|²/2 + |q0|²/2 + x² y − y³/3 with q0 = (x, y)."""
+    x, y = q0
+    return (jnp.sum(p1**2) + jnp.sum(q0**2)) / 2 + x**2 * y - y**3 / 3
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """|p|²/2 + |q|²/2 + x² y − y³/3 at t1: the continuous energy."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not in the plane, with a `ValueError`."""
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (2,),
+        "the Hénon–Heiles system is in the plane: q0 and p0 of shape (2,)",
+    )
+
+
+def henon_heiles() -> Problem:
+    """The Hénon–Heiles system on a regular orbit of energy 1/12; dimensionless.
+
+    Half the energy of escape: most orbits there are regular, and at 1/8 many are chaotic. Start
+    and step are ours.
+
+    **Source** Hénon & Heiles 1964, *Astron. J.* 69, 73.
+    """
+    y, py = 0.1, 0.2
+    px = (2 * (1 / 12) - py**2 - y**2 + 2 * y**3 / 3) ** 0.5  # at x = 0, for energy 1/12
+    return Problem(
+        name="henon_heiles",
+        system=System(hamiltonian),
+        q0=[0.0, y],
+        p0=[px, py],
+        h=0.1,
+        observables={"energy": energy},
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="Hénon & Heiles 1964, Astron. J. 69, 73",
+        check=check_start,
+    )

@@ -1,0 +1,105 @@
+"""A charged particle between two magnetic mirrors."""
+
+import jax.numpy as jnp
+
+from .._system import System
+from ._problem import Problem, check_shape
+
+
+def vector_potential(q, args):
+    r"""A with B = ∇ × A, of an axisymmetric field that grows along its axis.
+
+    A = B0/2 (1 + z²/ℓ²) (−y, x, 0)
+    """
+    x, y, z = q
+    return args["B0"] / 2 * (1 + (z / args["length"]) ** 2) * jnp.stack([-y, x, jnp.zeros_like(z)])
+
+
+def magnetic_field(q, args):
+    r"""B at q: shape (3,).
+
+        B = B0 (−x z/ℓ², −y z/ℓ², 1 + z²/ℓ²)
+
+    Its divergence is zero everywhere; its curl is not, so currents flow where the particle is.
+    """
+    x, y, z = q
+    square = args["length"] ** 2
+    return args["B0"] * jnp.stack([-x * z / square, -y * z / square, 1 + z**2 / square])
+
+
+def kinetic_momentum(q, p, args):
+    """m v = p − e A(q): shape (3,)."""
+    return p - args["charge"] * vector_potential(q, args)
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = |p1 − e A(q0)|²/(2m), with canonical momenta p = mv + eA: not separable."""
+    return jnp.sum(kinetic_momentum(q0, p1, args) ** 2) / (2 * args["mass"])
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """m|v|²/2 at t1: the continuous energy."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def canonical_angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """p_φ = x p_y − y p_x at t1, which turns about the axis keep."""
+    return q1[0] * p1[1] - q1[1] * p1[0]
+
+
+def magnetic_moment(t0, t1, q0, p0, q1, p1, args):
+    """μ = m v⊥²/(2|B|) at t1, B taken at the particle: the adiabatic invariant.
+
+    It wavers in each turn by the order of gyroradius over ℓ, and does not drift.
+    """
+    mv, B = kinetic_momentum(q1, p1, args), magnetic_field(q1, args)
+    strength = jnp.sqrt(jnp.sum(B**2))
+    along = jnp.sum(mv * B) / strength
+    return (jnp.sum(mv**2) - along**2) / (2 * args["mass"] * strength)
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not in space, or a mass or length that is not positive.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (3,),
+        "the magnetic mirror holds one particle in space: q0 and p0 of shape (3,)",
+    )
+    for name in ("mass", "length"):
+        if not args[name] > 0:
+            raise ValueError(f"{name} must be positive, got {args[name]}.")
+
+
+def magnetic_mirror() -> Problem:
+    """A particle that bounces in B = B0 (1 + z²/ℓ²) on the axis; dimensionless.
+
+    e = m = B0 = 1 and ℓ = 20: gyroradius and gyrofrequency 1 at the start, on the middle plane with
+    its guiding centre at (2, 0, 0). With v∥ = 0.8 v⊥ it turns where |B| is 1.64 times that, near
+    z = 0.8 ℓ. Field, start and step are ours.
+
+    - args: `charge` e, `mass` m, `B0`, `length` ℓ.
+
+    **Source** equations and adiabatic invariant: Northrop 1963, *The Adiabatic Motion of Charged
+    Particles*.
+    """
+    x, vy, vz = 3.0, -1.0, 0.8
+    return Problem(
+        name="magnetic_mirror",
+        system=System(hamiltonian),
+        q0=[x, 0.0, 0.0],
+        p0=[0.0, vy + x / 2, vz],  # A = (0, x/2, 0) there
+        h=0.1,
+        args={"charge": 1.0, "mass": 1.0, "B0": 1.0, "length": 20.0},
+        observables={
+            "energy": energy,
+            "canonical_angular_momentum": canonical_angular_momentum,
+            "magnetic_moment": magnetic_moment,
+        },
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="our own choice of field; Northrop 1963, The Adiabatic Motion of Charged Particles",
+        check=check_start,
+    )

@@ -1,0 +1,52 @@
+"""A pendulum disturbed by a Hamiltonian that couples position, momentum and time."""
+
+import jax.numpy as jnp
+
+from .._system import System
+from ._problem import Problem, check_shape
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = p1²/2 − cos q0."""
+    return jnp.sum(p1**2) / 2 - jnp.sum(jnp.cos(q0))
+
+
+def coupling(t0, t1, q0, p1, args):
+    """H1_D = −q0 p1 sin t0, so that H = p²/2 − cos q − ε q p sin t: not separable."""
+    return -jnp.sum(q0 * p1) * jnp.sin(t0)
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """p²/2 − cos q at t1: the energy of the pendulum alone."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not one angle and one momentum, with a `ValueError`."""
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (1,),
+        "the perturbed pendulum is one pendulum: q0 and p0 of shape (1,)",
+    )
+
+
+def perturbed_pendulum() -> Problem:
+    """H = p²/2 − cos q − ε q p sin t, librating; dimensionless. Start and step are ours.
+
+    The disturbance derives from a Hamiltonian, so the map stays symplectic at every ε; it
+    depends on p, so every variational step is implicit.
+
+    **Source** the pendulum: any text; the disturbance is a test problem with all three couplings.
+    """
+    return Problem(
+        name="perturbed_pendulum",
+        system=System(hamiltonian, perturbation=coupling),
+        q0=[0.5],
+        p0=[0.3],
+        h=0.1,
+        observables={"energy": energy},
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="our own choice",
+        check=check_start,
+    )

@@ -1,0 +1,74 @@
+"""Stiff linear springs in a chain with soft ones: the modified Fermi–Pasta–Ulam problem."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ._problem import Problem, check_shape
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    r"""Energy of m stiff springs of frequency ω, joined by soft springs with a fourth power.
+
+        H_D = |p1|²/2 + ω²/2 Σ_i y_i² + Σ_{i=0}^{m} (x_{i+1} − y_{i+1} − x_i − y_i)⁴/4
+
+    q0 = (x, y), shape (2, m): scaled centres x_i of the stiff springs and their scaled lengths
+    y_i, with x = y = 0 at the walls i = 0 and i = m + 1.
+    """
+    x, y = q0
+    soft = jnp.pad(x - y, (0, 1)) - jnp.pad(x + y, (1, 0))
+    return jnp.sum(p1**2) / 2 + args["omega"] ** 2 * jnp.sum(y**2) / 2 + jnp.sum(soft**4) / 4
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """The energy at t1."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def stiff_energies(t0, t1, q0, p0, q1, p1, args):
+    """I_i = (ẏ_i² + ω² y_i²)/2 at t1, shape (m,): they change place on times of order ω."""
+    return (p1[1] ** 2 + (args["omega"] * q1[1]) ** 2) / 2
+
+
+def oscillatory_energy(t0, t1, q0, p0, q1, p1, args):
+    """I = Σ_i I_i at t1: an adiabatic invariant, kept to O(1/ω) over very long times."""
+    return jnp.sum(stiff_energies(t0, t1, q0, p0, q1, p1, args))
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not a pair of rows, with a `ValueError`."""
+    check_shape(
+        q0,
+        p0,
+        lambda shape: len(shape) == 2 and shape[0] == 2 and shape[1] >= 1,
+        "the stiff FPUT chain has centres and lengths of m springs: q0 and p0 of shape (2, m)",
+    )
+
+
+def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
+    """The stiff chain with its energy in the first spring: x_1 = ẋ_1 = ẏ_1 = 1, y_1 = 1/ω.
+
+    **Raises** `ValueError` for fewer than one spring.
+
+    **Source** Galgani, Giorgilli, Martinoli & Vanzini 1992, *Physica D* 59, 334; Hairer, Lubich
+    & Wanner 2006, *Geometric Numerical Integration*, I.5.1 and XIII.2.1, whose start this is.
+    """
+    q0, p0 = np.zeros((2, 2, m))
+    check_start(q0, p0, None)
+    q0[:, 0], p0[:, 0] = (1.0, 1 / omega), (1.0, 1.0)
+    return Problem(
+        name="stiff_fput",
+        system=System(hamiltonian),
+        q0=q0,
+        p0=p0,
+        h=0.5 / omega,
+        args={"omega": float(omega)},
+        observables={
+            "energy": energy,
+            "stiff_energies": stiff_energies,
+            "oscillatory_energy": oscillatory_energy,
+        },
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, I.5.1",
+        check=check_start,
+    )

@@ -1,0 +1,95 @@
+"""The periodic Toda lattice, a chain of particles with as many integrals as it has particles."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ._problem import Problem, check_shape
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = Σ_i p1_i²/2 + Σ_i exp(q0_i − q0_{i+1}), with q_{n+1} = q_1."""
+    return jnp.sum(p1**2) / 2 + jnp.sum(jnp.exp(q0 - jnp.roll(q0, -1)))
+
+
+def lax_matrix(q, p):
+    r"""Flaschka's symmetric matrix L, whose eigenvalues the flow keeps.
+
+        L_ii = b_i,    L_{i,i+1} = L_{i+1,i} = a_i,    L_{1n} = L_{n1} = a_n
+
+        a_i = exp((q_i − q_{i+1})/2)/2,    b_i = −p_i/2
+
+    q, p: shape (n,), n ≥ 3. Returns shape (n, n). tr L = −Σ p_i/2 and tr L² = H/2.
+
+    **Source** Flaschka 1974, *Phys. Rev. B* 9, 1924; Hairer, Lubich & Wanner 2006, X.1.3.
+    """
+    n = q.shape[0]
+    a, after = jnp.exp((q - jnp.roll(q, -1)) / 2) / 2, (np.arange(n) + 1) % n
+    upper = jnp.zeros((n, n), q.dtype).at[np.arange(n), after].set(a)
+    return upper + upper.T - jnp.diag(p) / 2
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """Σ p_i²/2 + Σ exp(q_i − q_{i+1}) at t1: the continuous energy."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def total_momentum(t0, t1, q0, p0, q1, p1, args):
+    """Σ p_i at t1."""
+    return jnp.sum(p1)
+
+
+def lax_traces(t0, t1, q0, p0, q1, p1, args):
+    """tr L^k, k = 1, …, n, at t1: shape (n,). They are in involution."""
+    L = lax_matrix(q1, p1)
+    power, traces = L, [jnp.trace(L)]
+    for _ in range(q1.shape[0] - 1):
+        power = power @ L
+        traces.append(jnp.trace(power))
+    return jnp.stack(traces)
+
+
+def lax_eigenvalues(t0, t1, q0, p0, q1, p1, args):
+    """Eigenvalues of L at t1, ascending: shape (n,)."""
+    return jnp.linalg.eigvalsh(lax_matrix(q1, p1))
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not a row of three particles or more, with a `ValueError`."""
+    check_shape(
+        q0,
+        p0,
+        lambda shape: len(shape) == 1 and shape[0] >= 3,
+        "the periodic Toda lattice needs at least three particles: q0 and p0 of shape (n,), n ≥ 3",
+    )
+
+
+def toda(n: int = 5) -> Problem:
+    """The Toda lattice of n particles at equal distances, in waves of two lengths; dimensionless.
+
+    It moves as a whole at a speed of 0.1. Start and step are ours.
+
+    **Raises** `ValueError` for fewer than three particles.
+
+    **Source** Toda 1967, *J. Phys. Soc. Japan* 22, 431; integrals: Hénon 1974, *Phys. Rev. B* 9,
+    1921, and Flaschka 1974, 1924.
+    """
+    angle = 2 * np.pi * np.arange(n) / n
+    q0, p0 = np.zeros(n), 0.1 + np.cos(angle) + np.sin(2 * angle) / 2
+    check_start(q0, p0, None)
+    return Problem(
+        name="toda",
+        system=System(hamiltonian),
+        q0=q0,
+        p0=p0,
+        h=0.1,
+        observables={
+            "energy": energy,
+            "total_momentum": total_momentum,
+            "lax_traces": lax_traces,
+            "lax_eigenvalues": lax_eigenvalues,
+        },
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="Toda 1967, J. Phys. Soc. Japan 22, 431; Flaschka 1974, Phys. Rev. B 9, 1924",
+        check=check_start,
+    )
