@@ -1,0 +1,570 @@
+"""Work-precision diagrams of the methods: error against evaluations and against time.
+
+Three problems: Kepler's with eccentricity 0.6 and Hénon and Heiles' (both separable: explicit
+steps), and a double pendulum that is damped and driven (not separable, forced: every step
+implicit). The error is that of the state at the end, max(|Δq|/|q|, |Δp|/|p|) in the Euclidean
+norm, against SciPy's DOP853; the difference of two runs of that at different tolerances is the
+floor below which nothing is claimed.
+
+Work is counted as the package does it. One evaluation is one gradient of H_D, both halves, with
+the force W where there is one:
+
+    explicit part of a step       1 (a half for p, a half for q)
+    implicit part of a step       1.5 (guess, residual, other half) and (1 + n w)/2 an iteration
+    Gauss, s stages               3 s (guess, residual, end) and s + 2 s n · s w an iteration
+    RungeKutta4                   4
+
+with n the dimension of q and w = JACOBIAN_WEIGHT what one column of a Jacobian costs at one point,
+in evaluations. Iterations are those that Newton's method reports, not assumed.
+
+Kicks that meet between two parts are counted twice, as they are computed.
+
+Times are those of a jitted run, medians over rounds in one process, after compilation; in each
+round every run is divided by one of `Strang` with REFERENCE_STEPS steps right before it.
+
+Run: python benchmarks/work_precision.py --out DIR
+"""
+
+import argparse
+import csv
+import math
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from PIL import Image
+from scipy.integrate import solve_ivp
+
+import dvi_jax as dvi
+from dvi_jax import systems
+
+jax.config.update("jax_enable_x64", True)
+
+JACOBIAN_WEIGHT = 1.0
+REFERENCE, REFERENCE_STEPS = "Strang", 8192
+SHORTEST = 1e-3
+"""Runs that are shorter are repeated until they are as long [s]."""
+
+PIECE = 8
+"""Steps in a compiled piece: any multiple of it runs without a new compilation."""
+
+METHODS = {
+    "TypeII": dvi.TypeII(),
+    "Adjoint": dvi.Adjoint(),
+    "Strang": dvi.Strang(),
+    "GaussLegendre1": dvi.GaussLegendre(1),
+    "RungeKutta4": dvi.RungeKutta4(),
+    "Yoshida4": dvi.Yoshida(4),
+    "Suzuki4": dvi.Suzuki(4),
+    "BlanesMoan4": dvi.BlanesMoan(4),
+    "McLachlan4": dvi.McLachlan(4),
+    "GaussLegendre2": dvi.GaussLegendre(2),
+    "Yoshida6": dvi.Yoshida(6),
+    "BlanesMoan6": dvi.BlanesMoan(6),
+    "McLachlan6": dvi.McLachlan(6),
+    "KahanLi6": dvi.KahanLi(6),
+    "GaussLegendre3": dvi.GaussLegendre(3),
+    "Yoshida8": dvi.Yoshida(8),
+    "McLachlan8": dvi.McLachlan(8),
+    "KahanLi8": dvi.KahanLi(8),
+    "GaussLegendre4": dvi.GaussLegendre(4),
+}
+"""Every method that is compared. One of a new class needs its cost in `cost`."""
+
+
+class Problem(NamedTuple):
+    """A system, its start and the end of the time over which the error is measured."""
+
+    title: str
+    system: dvi.System
+    q0: Any
+    p0: Any
+    t_end: float
+    epsilon: float = 0.0
+    args: Any = None
+
+
+def double_pendulum(t0, t1, q0, p1, args):
+    """Two unit masses on unit rods, unit gravity: canonical angles and momenta."""
+    difference = q0[0] - q0[1]
+    kinetic = (p1[0] ** 2 + 2 * p1[1] ** 2 - 2 * p1[0] * p1[1] * jnp.cos(difference)) / (
+        2 * (1 + jnp.sin(difference) ** 2)
+    )
+    return kinetic - 2 * jnp.cos(q0[0]) - jnp.cos(q0[1])
+
+
+def damped_and_driven(t0, t1, q0, p1, args):
+    """W = −p1 + (cos t0, 0)."""
+    return -p1 + jnp.stack([jnp.cos(t0), jnp.zeros_like(t0)])
+
+
+def kepler(eccentricity=0.6):
+    """The Kepler problem from perihelion, semi-major axis 1: a little over three revolutions."""
+    problem, e = systems.kepler(), eccentricity
+    start = [1 - e, 0.0], [0.0, ((1 + e) / (1 - e)) ** 0.5]
+    undisturbed = dvi.System(problem.system.H_D)
+    return Problem(f"Kepler, e = {e:g}", undisturbed, *start, 20.0, args=problem.args)
+
+
+def henon_heiles():
+    """The library's orbit of energy 1/12."""
+    problem = systems.henon_heiles()
+    return Problem("Hénon–Heiles, E = 1/12", problem.system, problem.q0, problem.p0, 40.0)
+
+
+def driven_pendulum():
+    """Two pendula that swing by less than a right angle, so that no error is blown up."""
+    system = dvi.System(double_pendulum, force=damped_and_driven)
+    title = "double pendulum, damped and driven"
+    return Problem(title, system, [0.8, -0.4], [0.2, 0.4], 20.0, epsilon=0.2)
+
+
+PROBLEMS = {"kepler": kepler, "henon_heiles": henon_heiles, "double_pendulum": driven_pendulum}
+
+
+# The reference
+
+
+class Reference(NamedTuple):
+    """State at the end, and how well it is known."""
+
+    q: np.ndarray
+    p: np.ndarray
+    floor: float
+
+    def error(self, q, p):
+        """The larger of the relative errors of q and p, Euclidean norms."""
+        pairs = ((self.q, q), (self.p, p))
+        return max(float(np.linalg.norm(b - a) / np.linalg.norm(a)) for a, b in pairs)
+
+
+def reference(problem: Problem) -> Reference:
+    """SciPy's DOP853 on the continuous equations, at two tolerances."""
+    system, args, epsilon = problem.system, problem.args, problem.epsilon
+
+    @jax.jit
+    def field(t, z):
+        q, p = jnp.split(z, 2)
+        of_q, of_p = jax.grad(system.H_D, argnums=(2, 3))(t, t, q, p, args)
+        fall = of_q - system.disturbing_force(t, t, q, p, jnp.asarray(epsilon), args)
+        return jnp.concatenate([of_p, -fall])
+
+    def end(rtol, atol):
+        run = solve_ivp(
+            lambda t, z: np.asarray(field(t, z)),
+            (0.0, problem.t_end),
+            [*problem.q0, *problem.p0],
+            method="DOP853",
+            rtol=rtol,
+            atol=atol,
+        )
+        return np.split(run.y[:, -1], 2)
+
+    best = Reference(*end(2.3e-14, 1e-16), 0.0)  # the smallest rtol that SciPy takes
+    return best._replace(floor=max(best.error(*end(1e-13, 1e-15)), 1e-14))
+
+
+# One method on one problem
+
+
+class Cost(NamedTuple):
+    """Evaluations of a step, evaluations and points of Jacobian columns of a Newton iteration."""
+
+    of_step: float
+    of_iteration: float
+    columns: float
+
+    def evaluations(self, num_steps, iterations):
+        """Of a whole run, Jacobians included."""
+        each = self.of_iteration + JACOBIAN_WEIGHT * self.columns
+        return num_steps * self.of_step + iterations * each
+
+
+def cost(method: dvi.Method, problem: Problem) -> Cost:
+    """What a step of the method does, see the head of this file.
+
+    **Raises** `TypeError` for a method of a class that it does not know.
+    """
+    n, q = len(problem.q0), jnp.asarray(problem.q0)
+    if isinstance(method, dvi.RungeKutta4):
+        return Cost(4, 0, 0)
+    if isinstance(method, dvi.GaussLegendre):
+        s = method.stages
+        return Cost(3 * s, s, 2 * s * n * s)
+    if isinstance(method, dvi.TypeII):
+        parts = (1, 0)
+    elif isinstance(method, dvi.Adjoint) and isinstance(method.method, dvi.TypeII):
+        parts = (0, 1)
+    elif hasattr(method, "fractions") and isinstance(method.base, dvi.TypeII):
+        count = len(method.fractions())
+        parts = (count - count // 2, count // 2)
+    else:
+        raise TypeError(f"what does a step of {method!r} cost? Say so in cost().")
+    directions = (dvi.TypeII(), dvi.Adjoint())
+    explicit = (m.is_explicit(problem.system, q, problem.args) for m in directions)
+    step = sum(k * (1 if e else 1.5) for k, e in zip(parts, explicit, strict=True))
+    return Cost(step, 0.5, n / 2)
+
+
+class Run(NamedTuple):
+    """A compiled run ``(h, pieces) → (q, p, iterations, good)`` over ``PIECE * pieces`` steps."""
+
+    function: Callable[..., Any]
+    problem: Problem
+
+    def __call__(self, num_steps):
+        return self.function(self.problem.t_end / num_steps, num_steps // PIECE)
+
+
+def compiled(method: dvi.Method, problem: Problem) -> Run:
+    """The run, compiled once for all numbers of steps."""
+
+    def run(h, pieces):
+        def piece(k, state):
+            q, p, iterations, good = state
+            sol = dvi.integrate(
+                problem.system,
+                q,
+                p,
+                h=h,
+                num_steps=PIECE,
+                t0=k * PIECE * h,
+                epsilon=problem.epsilon,
+                args=problem.args,
+                method=method,
+                save=dvi.Save(final=True),
+                adjoint=dvi.Direct(),
+                throw=False,
+            )
+            iterations = iterations + sol.stats["newton_iterations"]
+            return sol.qs[-1], sol.ps[-1], iterations, good & (sol.result == dvi.RESULTS.successful)
+
+        start = (jnp.asarray(problem.q0), jnp.asarray(problem.p0), jnp.asarray(0, jnp.int32), True)
+        return jax.lax.fori_loop(0, pieces, piece, start)
+
+    return Run(jax.jit(run).lower(1.0, 1).compile(), problem)
+
+
+class Point(NamedTuple):
+    """One run: its size, its work and its error; `time` in runs of the reference method."""
+
+    problem: str
+    method: str
+    order: int
+    num_steps: int
+    h: float
+    newton_iterations: int
+    evaluations: float
+    error: float
+    time: float = math.nan
+
+
+def sweep(name, method_name, run: Run, truth: Reference, budgets) -> list[Point]:
+    """The method at steps that meet the budgets [evaluations], until the floor is reached."""
+    method, problem = METHODS[method_name], run.problem
+    price, points, iterations = cost(method, problem), [], 3.0
+    solves = price.evaluations(1, 0) != price.evaluations(1, 1)
+    is_implicit = solves and not method.is_explicit(
+        problem.system, jnp.asarray(problem.q0), problem.args
+    )
+    for budget in budgets:
+        if is_implicit:  # from the iterations in a step that the last run took
+            per_step = price.evaluations(1, iterations)
+        else:
+            per_step = price.of_step
+        num_steps = PIECE * max(1, round(budget / per_step / PIECE))
+        if points and num_steps <= points[-1].num_steps:
+            continue
+        q, p, used, good = run(num_steps)
+        if not (bool(good) and np.isfinite(q).all()):
+            continue  # a step that is too large for the solve, or a blow-up: no point
+        iterations = int(used) / num_steps
+        error = truth.error(np.asarray(q), np.asarray(p))
+        work = price.evaluations(num_steps, int(used))
+        h = problem.t_end / num_steps
+        points.append(Point(name, method_name, method.order, num_steps, h, int(used), work, error))
+        if sum(point.error < 3 * truth.floor for point in points) >= 2:
+            break
+    return points
+
+
+def slope(points, floor, of="evaluations"):
+    """The measured order: −d log error/d log `of`, fitted to the last three points that count.
+
+    Those are the points with errors between 30 times the floor and 1e-2; NaN when there are
+    fewer than two. For implicit methods `of` should be "num_steps": iterations in a step grow
+    fewer as steps grow small, which makes the slope in evaluations steeper than the order.
+    """
+    kept = [p for p in points if 30 * floor < p.error < 1e-2][-3:]
+    if len(kept) < 2:
+        return math.nan
+    x, y = (np.log([getattr(p, name) for p in kept]) for name in (of, "error"))
+    return -float(np.polyfit(x, y, 1)[0])
+
+
+def timed(points: list[Point], runs: dict[str, Run], rounds: int) -> list[Point]:
+    """The points with their times, measured in turn, in another order each round."""
+    shuffle = np.random.default_rng(0).permutation
+    ratios: list[list[float]] = [[] for _ in points]
+
+    def seconds(run, num_steps, repeats):
+        begin = time.perf_counter()
+        for _ in range(repeats):
+            jax.block_until_ready(run(num_steps))
+        return (time.perf_counter() - begin) / repeats
+
+    runs_of = [(runs[p.method], p.num_steps) for p in points]
+    repeats = [math.ceil(SHORTEST / seconds(*run, 1)) for run in runs_of]
+    for k in range(rounds):
+        say(f"  timing, round {k + 1} of {rounds}")
+        for i in shuffle(len(points)):
+            unit = seconds(runs[REFERENCE], REFERENCE_STEPS, 1)
+            ratios[i].append(seconds(*runs_of[i], repeats[i]) / unit)
+    return [p._replace(time=statistics.median(r)) for p, r in zip(points, ratios, strict=True)]
+
+
+def measure(name, methods, budgets, rounds) -> tuple[list[Point], Reference]:
+    """All methods on one problem."""
+    problem = PROBLEMS[name]()
+    truth = reference(problem)
+    say(f"{problem.title}: reference known to {truth.floor:.1e}")
+    runs = {}
+    points = []
+    for i, method in enumerate([REFERENCE, *(m for m in methods if m != REFERENCE)]):
+        begin = time.perf_counter()
+        runs[method] = compiled(METHODS[method], problem)
+        found = sweep(name, method, runs[method], truth, budgets)
+        points += found if method in methods else []
+        say(
+            f"  {i + 1:2d}/{len(methods)} {method}: {len(found)} points, slope "
+            f"{slope(found, truth.floor, 'num_steps'):.2f}, {time.perf_counter() - begin:.1f} s"
+        )
+    return (timed(points, runs, rounds) if rounds else points), truth
+
+
+def say(text):
+    """Progress, out of the way of the tables."""
+    print(text, file=sys.stderr, flush=True)
+
+
+# Tables
+
+
+def at_error(points, wanted, of):
+    """`of` where the error crosses `wanted` for good, between points in logarithms; or NaN."""
+    above = [i for i, p in enumerate(points) if p.error > wanted]
+    last = above[-1] if above else -1
+    if last < 0 or last + 1 >= len(points):
+        return math.nan
+    a, b = points[last : last + 2]
+    share = math.log(a.error / wanted) / math.log(a.error / b.error)
+    x, y = (math.log(getattr(p, of)) for p in (a, b))
+    return math.exp(x + share * (y - x))
+
+
+WANTED = (1e-4, 1e-7, 1e-10)
+
+
+def table(points: list[Point], floors: dict[str, float]) -> str:
+    """Markdown: work and time that each method needs for three errors, the least in bold."""
+    lines = []
+    for name in dict.fromkeys(p.problem for p in points):
+        of_method: dict[str, list[Point]] = {}
+        for p in points:
+            if p.problem == name:
+                of_method.setdefault(p.method, []).append(p)
+        heads = [f"{kind} {e:.0e}" for kind in ("evals", "time") for e in WANTED]
+        lines += [f"\n### {PROBLEMS[name]().title} (floor {floors[name]:.0e})\n"]
+        lines += ["| method | order | slope | " + " | ".join(heads) + " |"]
+        lines += ["|---|---|---|" + "---|" * len(heads)]
+        columns = [(of, e) for of in ("evaluations", "time") for e in WANTED]
+        values = {m: [at_error(ps, e, of) for of, e in columns] for m, ps in of_method.items()}
+        best = [
+            min((v[i] for v in values.values() if v[i] > 0), default=math.nan)
+            for i in range(len(columns))
+        ]
+        for m, row in values.items():
+            cells = []
+            for (of, _), x, least in zip(columns, row, best, strict=True):
+                text = (
+                    "–" if math.isnan(x) else (f"{x:,.0f}" if of == "evaluations" else f"{x:.3g}")
+                )
+                cells.append(f"**{text}**" if x == least else text)
+            measured = slope(of_method[m], floors[name], "num_steps")
+            shown = "–" if math.isnan(measured) else f"{measured:.2f}"
+            lines.append(f"| {m} | {METHODS[m].order} | {shown} | " + " | ".join(cells) + " |")
+    return "\n".join(lines).lstrip() + "\n"
+
+
+def write_csv(path: Path, points: list[Point]) -> None:
+    """One row for each point."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(Point._fields)
+        writer.writerows(points)
+
+
+# Pictures
+
+STYLES = {
+    "TypeII": ("#999999", "o"),
+    "Adjoint": ("#CC79A7", "x"),
+    "Strang": ("#000000", "s"),
+    "Yoshida": ("#E69F00", "^"),
+    "Suzuki": ("#CC79A7", "v"),
+    "BlanesMoan": ("#0072B2", "D"),
+    "McLachlan": ("#56B4E9", "P"),
+    "KahanLi": ("#009E73", "*"),
+    "GaussLegendre": ("#D55E00", "o"),
+    "RungeKutta": ("#999999", "X"),
+}
+"""Colour (Okabe & Ito) and marker of each family."""
+
+GROUPS = {"order 1 and 2": (1, 2), "order 4": (4,), "order 6": (6,), "order 8": (8,)}
+
+
+def picture(points: list[Point], truth: Reference) -> plt.Figure:
+    """Error against evaluations (above) and time (below), one column for each order.
+
+    In grey the best of all methods at each work, in every panel the same; dotted the slope of the
+    order; the floor of the reference shaded.
+    """
+    axes_of = {"evaluations": "evaluations of ∇H", "time": f"time / {REFERENCE}({REFERENCE_STEPS})"}
+    has_time = any(not math.isnan(p.time) for p in points)
+    rows = list(axes_of)[: 2 if has_time else 1]
+    figure, axes = plt.subplots(
+        len(rows),
+        len(GROUPS),
+        figsize=(12.5, 3.4 * len(rows) + 0.4),
+        sharey=True,
+        sharex="row",
+        squeeze=False,
+        dpi=110,
+        layout="constrained",
+    )
+    for of, row in zip(rows, axes, strict=True):
+        best = envelope([p for p in points if p.error > truth.floor], of)
+        for (title, orders), ax in zip(GROUPS.items(), row, strict=True):
+            inside = [p for p in points if p.order in orders]
+            ax.loglog(*best, color="0.8", lw=5, solid_capstyle="round", zorder=1)
+            for method in dict.fromkeys(p.method for p in inside):
+                mine = [p for p in inside if p.method == method]
+                colour, marker = STYLES[method.rstrip("0123456789")]
+                ax.loglog(
+                    [getattr(p, of) for p in mine],
+                    [p.error for p in mine],
+                    color=colour,
+                    marker=marker,
+                    ms=4,
+                    lw=1.3,
+                    label=method,
+                )
+            ax.axhspan(1e-16, truth.floor, color="0.92", zorder=-1)
+            if of == "evaluations":
+                ax.set_title(title, fontsize=10, loc="left")
+                for order in orders:
+                    guide(ax, inside, order)
+            ax.set_xlabel(axes_of[of])
+            ax.grid(True, which="major", color="0.93", lw=0.6)
+            ax.set_axisbelow(True)
+            ax.legend(fontsize=7, frameon=False, loc="lower left", handlelength=1.8)
+            ax.spines[["top", "right"]].set_visible(False)
+        row[0].set_ylabel("relative error at the end")
+    axes[0, 0].set_ylim(truth.floor / 8, 1)
+    title = PROBLEMS[points[0].problem]().title
+    figure.suptitle(
+        f"{title}.  Wide grey: the best of all methods. Dotted: slope of the order. "
+        "Shaded: the reference is not known better.",
+        fontsize=10,
+        x=0.01,
+        ha="left",
+    )
+    return figure
+
+
+def envelope(points, of):
+    """The least error that any method has at work up to each point's: two arrays."""
+    ordered = sorted((getattr(p, of), p.error) for p in points)
+    work, error = np.array(ordered).T
+    least = np.minimum.accumulate(error)
+    kept = np.concatenate([[True], np.diff(least) < 0])
+    return work[kept], least[kept]
+
+
+def guide(ax, points, order):
+    """A dotted line of the slope of the order, beside the last points of that order."""
+    mine = [p for p in points if p.order == order and 1e-9 < p.error < 1e-1]
+    if not mine:
+        return
+    right = max(mine, key=lambda p: p.evaluations)
+    x = right.evaluations * np.array([0.25, 1.0]) * 2
+    ax.loglog(x, right.error * (x / right.evaluations / 2) ** -order, ":", color="0.3", lw=1)
+    ax.annotate(
+        f" {order}", (x[1], right.error), fontsize=8, color="0.3", va="center", annotation_clip=True
+    )
+
+
+def save(figure, path: Path) -> None:
+    """As SVG, and as PNG with a palette of 64 colours, a third of the size."""
+    figure.savefig(path.with_suffix(".svg"))
+    figure.canvas.draw()
+    picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
+    picture.quantize(64, dither=Image.Dither.NONE).save(path.with_suffix(".png"), optimize=True)
+
+
+# The command
+
+
+def budgets(least, most, ratio):
+    """Budgets in evaluations, geometric."""
+    count = round(math.log(most / least, ratio)) + 1
+    return np.geomspace(least, most, count)
+
+
+def main(words=None):
+    """Measure, write tables and pictures; returns the points and the floors."""
+    parser = argparse.ArgumentParser(
+        description="Error against evaluations and time, for every method on three problems."
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder for tables and pictures")
+    parser.add_argument("--problem", choices=PROBLEMS, action="append", help="only this (repeat)")
+    parser.add_argument("--method", choices=METHODS, action="append", help="only this (repeat)")
+    parser.add_argument("--rounds", type=int, default=9, help="of timing; 0 for none (default 9)")
+    parser.add_argument(
+        "--quick", action="store_true", help="Hénon–Heiles, fewer steps, one round of timing"
+    )
+    options = parser.parse_args(words)
+    if options.rounds < 0:
+        parser.error(f"--rounds must not be negative, got {options.rounds}.")
+    names = options.problem or (["henon_heiles"] if options.quick else list(PROBLEMS))
+    rounds = min(options.rounds, 1) if options.quick else options.rounds
+    work = budgets(2**8, 2**16, 2**0.5) if options.quick else budgets(2**7, 2**18, 2**0.5)
+    methods = [m for m in METHODS if options.method is None or m in options.method]
+
+    options.out.mkdir(parents=True, exist_ok=True)
+    points: list[Point] = []
+    floors = {}
+    for name in names:
+        found, truth = measure(name, methods, work, rounds)
+        points += found
+        floors[name] = truth.floor
+        figure = picture(found, truth)
+        save(figure, options.out / f"work_precision_{name}")
+        plt.close(figure)
+    write_csv(options.out / "work_precision.csv", points)
+    text = table(points, floors)
+    (options.out / "work_precision.md").write_text(text, encoding="utf-8")
+    print(text)
+    return points, floors
+
+
+if __name__ == "__main__":
+    plt.switch_backend("agg")
+    main()

@@ -1,0 +1,133 @@
+"""The work-precision benchmark: its counts, its reference, and the slopes that it measures."""
+
+import csv
+import importlib.util
+import math
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import dvi_jax as dvi
+
+pytest.importorskip("matplotlib")
+FILE = Path(__file__).parent.parent / "benchmarks" / "work_precision.py"
+
+
+@pytest.fixture(scope="module")
+def bench():
+    spec = importlib.util.spec_from_file_location("work_precision", FILE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.plt.switch_backend("agg")
+    return module
+
+
+@pytest.mark.parametrize(
+    ("problem", "method"),
+    [
+        ("henon_heiles", "Strang"),
+        ("double_pendulum", "TypeII"),
+        *(
+            pytest.param(problem, method, marks=pytest.mark.slow)
+            for problem in ("henon_heiles", "double_pendulum")
+            for method in ("Adjoint", "BlanesMoan4", "KahanLi6", "GaussLegendre2", "RungeKutta4")
+        ),
+    ],
+)
+def test_evaluations_are_counted_as_they_are_made(bench, problem, method):
+    """Against calls of H_D at run time: each is half a gradient. Jacobian columns make none."""
+    problem, calls = bench.PROBLEMS[problem](), []
+
+    def counted(t0, t1, q0, p1, args):
+        jax.debug.callback(lambda _: calls.append(1), q0[0])  # vmapped by what is batched
+        return problem.system.H_D(t0, t1, q0, p1, args)
+
+    watched = problem._replace(system=dvi.System(counted, problem.system.force))
+    price, num_steps = bench.cost(bench.METHODS[method], problem), 16
+    run = bench.compiled(bench.METHODS[method], watched)
+    _, _, iterations, good = run.function(0.1, num_steps // bench.PIECE)
+    jax.effects_barrier()
+    assert bool(good)
+    made = len(calls) / 2
+    assert made == num_steps * price.of_step + int(iterations) * price.of_iteration
+    assert made >= num_steps
+
+
+def test_a_method_of_unknown_cost_is_refused(bench):
+    problem = bench.henon_heiles()
+    with pytest.raises(TypeError, match=r"what does a step of Strang.* cost"):
+        bench.cost(dvi.Strang(base=dvi.Strang()), problem)
+
+
+def test_the_reference_is_as_good_as_its_floor(bench):
+    """Against Kepler's equation, solved to the last digit."""
+    e, t = 0.6, bench.kepler().t_end
+    u = brentq(lambda u: u - e * math.sin(u) - t, t - 1, t + 1, xtol=1e-15, rtol=1e-15)
+    root, r = math.sqrt(1 - e * e), 1 - e * math.cos(u)
+    q = np.array([math.cos(u) - e, root * math.sin(u)])
+    p = np.array([-math.sin(u), root * math.cos(u)]) / r
+    truth = bench.reference(bench.kepler(e))
+    assert 1e-14 <= truth.floor < 2e-12
+    assert truth.error(q, p) < 2 * truth.floor
+    assert truth.error(q * (1 + 1e-11), p) > 4 * truth.floor
+
+
+def swept(bench, method, problem="henon_heiles"):
+    run = bench.compiled(bench.METHODS[method], bench.PROBLEMS[problem]())
+    truth = bench.reference(run.problem)
+    return bench.sweep(problem, method, run, truth, bench.budgets(2**8, 2**15, 2)), truth
+
+
+@pytest.mark.parametrize("method", ["Strang", "BlanesMoan6"])
+def test_slopes_are_the_orders(bench, method):
+    points, truth = swept(bench, method)
+    assert abs(bench.slope(points, truth.floor) - bench.METHODS[method].order) < 0.4
+
+
+def test_a_wrong_digit_costs_the_slope(bench, monkeypatch):
+    """BlanesMoan6 with two third digits changed, symmetric still: order 2."""
+    c = list(bench.METHODS["BlanesMoan6"].fractions())
+    for i, sign in ((0, 1), (2, -1), (-1, 1), (-3, -1)):
+        c[i] += sign * 1e-3
+    monkeypatch.setitem(bench.METHODS, "BlanesMoan6", dvi.Composition(c, order=2))
+    points, truth = swept(bench, "BlanesMoan6")
+    assert abs(bench.slope(points, truth.floor) - 2) < 0.4
+
+
+@pytest.mark.slow
+def test_quick_run(bench, tmp_path, capsys):
+    """Every method has its order; tables and pictures are written, and progress goes apart."""
+    points, floors = bench.main(["--quick", "--out", str(tmp_path)])
+    floor = floors["henon_heiles"]
+    for name, method in bench.METHODS.items():
+        mine = [p for p in points if p.method == name]
+        assert abs(bench.slope(mine, floor, "num_steps") - method.order) < 0.4, name
+        if not any(p.newton_iterations for p in mine):
+            assert abs(bench.slope(mine, floor) - method.order) < 0.4, name
+        assert all(p.time > 0 for p in mine)
+    out, err = capsys.readouterr()
+    assert out.count("| KahanLi8 | 8 |") == 1
+    assert "timing, round 1 of 1" in err
+    with (tmp_path / "work_precision.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(points)
+    assert {row["method"] for row in rows} == set(bench.METHODS)
+    for kind, most in (("png", 200_000), ("svg", 1_000_000)):
+        assert 10_000 < (tmp_path / f"work_precision_henon_heiles.{kind}").stat().st_size < most
+
+
+def test_where_an_error_is_reached(bench):
+    """By hand: error N⁻² crosses 1e-3 at 31.6; never 1e-9; a dip that is left again is none."""
+    points = [
+        bench.Point("p", "m", 2, n, 1 / n, 0, float(n), e)
+        for n, e in ((1, 1.0), (2, 1e-5), (10, 1e-2), (100, 1e-4))
+    ]
+    assert bench.at_error(points, 1e-3, "evaluations") == pytest.approx(10**1.5)
+    assert math.isnan(bench.at_error(points, 1e-9, "evaluations"))
+    assert math.isnan(bench.slope(points, 1e-4))
+    work, error = bench.envelope(points, "evaluations")
+    np.testing.assert_array_equal(work, [1, 2])
+    np.testing.assert_array_equal(error, [1.0, 1e-5])
