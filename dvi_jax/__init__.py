@@ -54,11 +54,14 @@ from .methods import (
     Yoshida as Yoshida,
 )
 from .observe import (
+    Crossings as Crossings,
     Last as Last,
     MaxDrift as MaxDrift,
     Mean as Mean,
     Range as Range,
     Reduction as Reduction,
+    Section as Section,
+    Stop as Stop,
     Trend as Trend,
 )
 from .symmetry import (

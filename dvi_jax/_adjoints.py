@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
 
 from ._compat import is_traced
 from ._results import RESULTS
@@ -36,7 +35,7 @@ class Outcome(NamedTuple):
 
     carry: Carry
     saved: Saved
-    reduced: list[Array]
+    reduced: list[Any]
 
 
 class AbstractAdjoint(eqx.Module):
@@ -125,9 +124,9 @@ class Reversible(AbstractAdjoint):
     wrong: take fewer steps between checkpoints, or `Checkpointed`.
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
-    without an inverse (`RungeKutta4`), a `Variational` lattice, and a system or observable that
-    *closes over* a value being differentiated (better: hand it over in args), are differentiated
-    as by `Checkpointed`.
+    without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop`, and a system
+    or observable that *closes over* a value being differentiated (better: hand it over in args),
+    are differentiated as by `Checkpointed`.
 
     **Raises** `ValueError` for settings that are not positive.
 
@@ -145,7 +144,7 @@ class Reversible(AbstractAdjoint):
             raise ValueError(f"max_defect must be positive, got {self.max_defect!r}.")
 
     def rollout(self, task, plan, q0, p0):
-        if not task.method.is_invertible or task.lattice.has_memory:
+        if not task.method.is_invertible or task.lattice.has_memory or task.stop is not None:
             return Checkpointed().rollout(task, plan, q0, p0)
         if _closes_over_traced(task, q0, p0):
             return Checkpointed().rollout(task, plan, q0, p0)
@@ -234,7 +233,7 @@ class _Smooth(NamedTuple):
     q: State
     p: State
     saved: Saved
-    reduced: list[Array]
+    reduced: list[Any]
 
 
 def _no_tangent(x):

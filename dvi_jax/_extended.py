@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ._compat import is_traced
-from ._solution import Solution
+from ._solution import Save, Solution
 from ._system import System
 from ._types import Args, Bindable, Scalar, State
 from .lattices import TimeTransformed
-from .observe import Reduction, Trend
+from .observe import Crossings, Reduction, Section, Stop, Stopped, Trend
 
 
 class Extended(eqx.Module):
@@ -72,6 +72,21 @@ class _Seen(eqx.Module):
         return self.function(t0, t1, q0, p0, q1, p1, args)
 
 
+class _SeenPoint(eqx.Module):
+    """A function ``(t, q, p, args)`` of the user's at points of the extended problem."""
+
+    function: Callable[..., Any]
+    extended: Extended
+
+    def __call__(self, s, position, momentum, args):
+        q, p, t, _ = self.extended.parts(position, momentum)
+        return self.function(t, q, p, args)
+
+
+def _own_time(t, q, p, args):
+    return t
+
+
 def _time_gained(s0, s1, position0, momentum0, position1, momentum1, args):
     return position1[-1] - position0[-1]
 
@@ -87,6 +102,8 @@ def run_extended(
     args: Args,
     observe: Any,
     is_observable: Callable[[Any], bool],
+    save: Save,
+    stop: Stop | None,
     **settings: Any,
 ) -> Solution:
     """`integrate` on the extended problem, told as a solution of the one that was given."""
@@ -101,23 +118,41 @@ def run_extended(
                 "a Trend over a TimeTransformed lattice would be a slope in its fictitious time: "
                 "observe the function alone and fit a line to it over solution.ts."
             )
+        if isinstance(observable, Section):
+            return eqx.tree_at(lambda s: s.g, observable, _SeenPoint(observable.g, extended))
         if isinstance(observable, Reduction):
             return eqx.tree_at(lambda r: r.function, observable, seen(observable.function))
         if isinstance(observable, Bindable):
             observable = observable.bind(system, epsilon)
         return _Seen(observable, extended)
 
+    def told(crossing):
+        if isinstance(crossing, Crossings):
+            q, p, t, _ = extended.parts(crossing.qs, crossing.ps)
+            return Crossings(t, q, p, crossing.count)
+        if isinstance(crossing, Stopped):
+            q, p, t, _ = extended.parts(crossing.q, crossing.p)
+            return Stopped(t, q, p)
+        return crossing
+
+    if save.ts is not None:
+        save = Save(ts=save.ts, clock=_SeenPoint(save.clock or _own_time, extended))
+    if stop is not None:
+        stop = Stop(_SeenPoint(stop.g, extended))
     solution = integrate(
         extended.as_system(),
         *extended.start(t0, q0, p0, args),
         epsilon=jnp.ones_like(epsilon) if system.force is not None else jnp.zeros_like(epsilon),
         args=args,
         observe=(jax.tree.map(seen, observe, is_leaf=is_observable), _time_gained),
+        save=save,
+        stop=stop,
         **settings,
     )
     q, p, t, _ = extended.parts(solution.qs, solution.ps)
     observed, hs = solution.observed
-    return Solution(t, q, p, hs, observed, solution.result, solution.stats)
+    observed = jax.tree.map(told, observed, is_leaf=lambda x: isinstance(x, Crossings))
+    return Solution(t, q, p, hs, observed, solution.result, solution.stats, told(solution.stop))
 
 
 def _check_speed(speed, t0, q0, p0, args) -> None:

@@ -1,5 +1,6 @@
 """The front door: one trajectory."""
 
+import dataclasses
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -13,11 +14,13 @@ from jaxtyping import Array, PyTree
 from ._adjoints import AbstractAdjoint, Outcome, Reversible
 from ._arithmetic import Arithmetic, FloatingPoint
 from ._compat import is_traced
+from ._dense import Curve, at_times, crossings, stopped
 from ._extended import run_extended
 from ._precision import refuse_double_without_x64
 from ._results import RESULTS, IntegrationError
 from ._rollout import (
     Plan,
+    StepTaken,
     Task,
     counted_scan,
     is_observable,
@@ -35,7 +38,8 @@ from ._types import Interval
 from .engine.newton import Newton
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation
-from .observe import Reduction
+from .observe import Reduction, RequestedTimes, Section, Stop
+from .observe._kept import Start
 
 _STEP = "(t0, t1, q0, p0, q1, p1, args)"
 
@@ -60,6 +64,7 @@ def integrate(
     adjoint: AbstractAdjoint = Reversible(),
     newton: Newton = Newton(),
     arithmetic: Arithmetic = FloatingPoint(),
+    stop: Stop | None = None,
     throw: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Solution:
@@ -85,7 +90,8 @@ def integrate(
     - `observe`: pytree of observables, functions of one step
       ``(t0, t1, q0, p0, q1, p1, args)`` → array. Alone, one is evaluated on the steps that end at
       a save point; in `MaxDrift`, `Range`, `Trend`, `Mean`, `Last` it is reduced over every step
-      in constant memory.
+      in constant memory. A `Section` finds the crossings of a surface.
+    - `stop`: a `Stop`, where the run ends early (a collision, an escape); or None.
     - `adjoint`: how reverse-mode gradients go, see `Reversible`, `Checkpointed`, `Direct`.
     - `newton`: settings of implicit solves, see `Newton`.
     - `arithmetic`: how the state is kept: `FloatingPoint`; for long runs `Compensated`, or
@@ -124,6 +130,8 @@ def integrate(
         if not isinstance(value, kind):
             hint = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
             raise TypeError(f"{name} must be a {kind.__name__}, got {value!r}{hint}.")
+    if not (stop is None or isinstance(stop, Stop)):
+        raise TypeError(f"stop must be a dvi.Stop(g), got {stop!r}.")
 
     q0, p0 = _start_state(q0, p0)
     t0, h, num_steps = lattice.prepare(t0, h, num_steps)
@@ -136,7 +144,7 @@ def integrate(
         return run_extended(
             integrate, system, lattice, q0, p0, t0, epsilon, args, observe, is_observable, h=h,
             num_steps=num_steps, method=method, save=save, adjoint=adjoint, newton=newton,
-            arithmetic=arithmetic, throw=throw, progress=progress,
+            arithmetic=arithmetic, stop=stop, throw=throw, progress=progress,
         )  # fmt: skip
     if isinstance(lattice, Variational) and not isinstance(method, TypeII):
         raise ValueError(
@@ -153,9 +161,14 @@ def integrate(
             stacklevel=2,
         )
     equations, q0, p0 = arithmetic.prepare(method, equations, Interval(t0, t0 + h, h), q0, p0)
-    task = Task(equations, method, lattice, observe, t0, h, arithmetic)
+    task = Task(equations, method, lattice, observe, t0, h, arithmetic, stop)
     _check_observe(task, q0, p0)
     plan = make_plan(save, num_steps)
+    if save.ts is not None:
+        task = eqx.tree_at(
+            lambda task: task.observe, task, _with_times(save, observe, q0.dtype),
+            is_leaf=lambda x: x is None,
+        )  # fmt: skip
     traced = any(is_traced(x) for x in jax.tree.leaves((task, q0, p0)))
     if not traced:
         first = task.interval(jnp.asarray(0, jnp.int32))
@@ -167,7 +180,7 @@ def integrate(
     else:
         outcome = _in_pieces(task, plan, q0, p0, num_steps, progress)
 
-    solution = _solution(task, outcome, q0, p0, num_steps)
+    solution = _solution(task, observe, outcome, q0, p0, num_steps)
     return _raise_on_failure(solution, task) if throw else solution
 
 
@@ -207,20 +220,50 @@ def _in_pieces(task: Task, plan: Plan, q0, p0, num_steps, progress) -> Outcome:
     return Outcome(carry, saved, reduce(task, carry))
 
 
+def _with_times(save: Save, observe: PyTree, dtype: Any) -> tuple[RequestedTimes, PyTree]:
+    """What is observed along the run when states are saved at requested times: no observables that
+    stand alone, which are evaluated at those times afterwards."""
+    assert save.ts is not None
+    kept = jax.tree.map(
+        lambda f: f if isinstance(f, Reduction) else None, observe, is_leaf=is_observable
+    )
+    return RequestedTimes(ts=save.ts.astype(dtype), clock=save.clock), kept
+
+
 @eqx.filter_jit
-def _solution(task: Task, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
+def _solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
+    """What a run has left behind, as its user sees it."""
     carry, saved, reduced = outcome
-
-    def from_start(first, rest):
-        return jnp.concatenate([first[None], rest])
-
+    curve = Curve(task.method, task.equations)
+    first = task.interval(jnp.asarray(0, jnp.int32))
+    safe = Start(first.t0, first.t1, first.t1, q0, p0)
+    _, reductions = task.observables()
+    values: list[Any] = [
+        crossings(curve, r, value, safe) if isinstance(r, Section) else value
+        for r, value in zip(reductions, reduced, strict=True)
+    ]
+    result = carry.result
+    if reductions and isinstance(reductions[0], RequestedTimes):
+        reached, starts, (ts, qs, ps) = at_times(curve, reductions[0], values[0], safe)
+        if reductions[0].clock is None:
+            ts = reductions[0].ts  # also those that were not reached
+        missed = (result == RESULTS.successful) & ~jnp.all(reached)
+        result = RESULTS.where(missed, RESULTS.not_reached, result)
+        values, hs = values[1:], ts - starts.t0
+        steps = StepTaken(starts.t0, ts, starts.q0, starts.p0, qs, ps)
+        own, _ = dataclasses.replace(task, observe=observe).observables()
+        alone = [jax.vmap(lambda step, f=f: step.value(f, task.args))(steps) for f in own]
+    else:
+        ts = jnp.concatenate([task.t0[None], saved.t])
+        qs, ps = jnp.concatenate([q0[None], saved.q]), jnp.concatenate([p0[None], saved.p])
+        hs, alone = saved.h, saved.observed
     return Solution(
-        ts=from_start(task.t0, saved.t),
-        qs=from_start(q0, saved.q),
-        ps=from_start(p0, saved.p),
-        hs=saved.h,
-        observed=observed(task.observe, saved, reduced),
-        result=carry.result,
+        ts=ts,
+        qs=qs,
+        ps=ps,
+        hs=hs,
+        observed=observed(observe, alone, values),
+        result=result,
         stats={
             "num_steps": num_steps,
             "newton_iterations": carry.iterations,
@@ -229,16 +272,21 @@ def _solution(task: Task, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
             "failed_residual": carry.failed_residual,
             **task.lattice.report(carry.lattice),
         },
+        stop=None if task.stop is None else stopped(curve, task.stop, carry.stop, safe),
     )
 
 
 def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     result = solution.result
     if result.is_traced():
-        failed = result != RESULTS.successful
-        return result.error_if(solution, failed)
-    if bool(result == RESULTS.successful):
+        fine = (result == RESULTS.successful) | (result == RESULTS.stopped)
+        return result.error_if(solution, ~fine)
+    if bool((result == RESULTS.successful) | (result == RESULTS.stopped)):
         return solution
+    kept = "With throw=False the solution up to there is returned with its status; here it is the "
+    kept += "`solution` attribute of this error."
+    if bool(result == RESULTS.not_reached):
+        raise IntegrationError(f"{RESULTS[result]} {kept}", solution)
     step = int(solution.stats["failed_step"])
     if task.lattice.has_memory:
         at = f"last h = {float(solution.stats['last_h']):g}"
@@ -249,8 +297,7 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     how = f"; relative residual of the implicit solve {residual:.3g}" if solved else ""
     raise IntegrationError(
         f"the trajectory failed at step {step} of {solution.stats['num_steps']} ({at}{how}). "
-        f"{RESULTS[result]} With throw=False the solution up to there is returned "
-        "with its status; here it is the `solution` attribute of this error.",
+        f"{RESULTS[result]} {kept}",
         solution,
     )
 

@@ -45,6 +45,11 @@ class RESULTS(eqx.Enumeration):
         "for a state of this size; (b) the orbit escaped. Take a larger quantum, or units in which "
         "the state is smaller."
     )
+    stopped = "The condition of dvi.Stop was met: the trajectory ended before its last step."
+    not_reached = (
+        "A time of dvi.Save(ts=...) lies outside of the run: before its start, or after its last "
+        "step. Take more steps, or leave out those times."
+    )
 
 
 STATUS_NAMES = (
@@ -54,6 +59,8 @@ STATUS_NAMES = (
     "bad_step_size",
     "no_root",
     "out_of_range",
+    "stopped",
+    "not_reached",
 )
 
 

@@ -16,7 +16,8 @@ from ._step import Equations
 from ._types import Args, Bindable, Interval, Scalar, State
 from .lattices import Lattice, Place
 from .methods import Method
-from .observe import Reduction
+from .observe import Reduction, Stop
+from .observe._kept import Start, as_row, event
 
 Loop = Callable[[Callable, Any, Array, int, int], tuple[Any, Any]]
 """``(body, carry, first, stride, count) -> (carry, ys)``: `body(carry, k)` for k = first, first +
@@ -49,6 +50,7 @@ class Task(eqx.Module):
     t0: Scalar
     h: Scalar
     arithmetic: Arithmetic = FloatingPoint()
+    stop: Stop | None = None
 
     @property
     def args(self) -> Args:
@@ -96,6 +98,7 @@ class Carry(NamedTuple):
     residual: Float[Array, ""]
     reductions: list[Any]
     beside: Any = None  # what the arithmetic remembers
+    stop: Any = None  # with a `Stop`: the step it ended, as a row
 
 
 class StepTaken(NamedTuple):
@@ -168,18 +171,25 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         return jnp.zeros(like.shape, like.dtype)
 
     _, reductions = task.observables()
+    failed = result != RESULTS.successful
+    stop = None
+    if task.stop is not None:
+        over = ~failed & (event(task.stop.g, task.t0, q0, p0, task.args) >= 0)
+        result = RESULTS.where(over, RESULTS.stopped, result)
+        stop = as_row(over, Start(task.t0, interval.t1, interval.t1, q0, p0))
     good = result == RESULTS.successful
     return Carry(
         _or_nan(good, q0),
         _or_nan(good, p0),
         task.lattice.begin(task.t0, task.h),
         result,
-        jnp.where(good, jnp.asarray(-1, jnp.int32), jnp.asarray(0, jnp.int32)),
+        jnp.where(failed, jnp.asarray(0, jnp.int32), jnp.asarray(-1, jnp.int32)),
         jnp.zeros((), real),
         jnp.asarray(0, jnp.int32),
         jnp.zeros((), real),
         [r.start(zero_value(r)) for r in reductions],
         task.arithmetic.start(q0, p0),
+        stop,
     )
 
 
@@ -192,8 +202,9 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
     was_good = carry.result == RESULTS.successful
     result = carry.result if exists is None else first_failure(carry.result, exists)
     result = first_failure(result, info.result)
+    fails_now = was_good & (result != RESULTS.successful)
+    result, stop = _stop(task, carry, interval, q1, p1, result)
     good = result == RESULTS.successful
-    fails_now = was_good & ~good
     # A state after a failed step is no answer: NaN keeps it from being taken for one.
     q1, p1 = _or_nan(good, q1), _or_nan(good, p1)
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
@@ -202,6 +213,9 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
         r.update(so_far, k, interval.t1, taken.number(task.bound(r.function), task.args))
         for r, so_far in zip(reductions, carry.reductions, strict=True)
     ]
+    if stop is not None:  # what is reduced covers the steps before
+        over = result == RESULTS.stopped
+        reduced = jax.tree.map(lambda a, b: jnp.where(over, b, a), reduced, carry.reductions)
     residual = lax.stop_gradient(info.residual)
     return (
         Carry(
@@ -215,10 +229,23 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
             jnp.where(good, jnp.maximum(carry.residual, residual), carry.residual),
             reduced,
             beside,
+            stop,
         ),
         interval,
         taken,
     )
+
+
+def _stop(
+    task: Task, carry: Carry, interval: Interval, q1: State, p1: State, result: RESULTS
+) -> tuple[RESULTS, Any]:
+    """The status and the step noted, after the step that a `Stop` ends the run with."""
+    if task.stop is None:
+        return result, None
+    met = event(task.stop.g, interval.t1, q1, p1, task.args) >= 0
+    now = (result == RESULTS.successful) & met
+    row = as_row(now, Start(interval.t0, interval.t1, interval.t1, carry.q, carry.p))
+    return RESULTS.where(now, RESULTS.stopped, result), jnp.where(now, row, carry.stop)
 
 
 def run(
@@ -264,7 +291,7 @@ def run(
     return carry, saved, tail
 
 
-def reduce(task: Task, carry: Carry) -> list[Array]:
+def reduce(task: Task, carry: Carry) -> list[Any]:
     """The reduced values, in tree order."""
     _, reductions = task.observables()
     return [r.finish(memory) for r, memory in zip(reductions, carry.reductions, strict=True)]
@@ -279,11 +306,11 @@ def with_tail(plan: Plan, saved: Saved, tail: Saved | None) -> Saved:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), saved, tail)
 
 
-def observed(observe: PyTree, saved: Saved, reduced: list[Array]) -> PyTree:
+def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
     """The pytree `observe` with every observable replaced by its values."""
-    values, alone = iter(reduced), iter(saved.observed)
+    values, lone = iter(reduced), iter(alone)
     return jax.tree.map(
-        lambda f: next(values) if isinstance(f, Reduction) else next(alone),
+        lambda f: next(values) if isinstance(f, Reduction) else next(lone),
         observe,
         is_leaf=is_observable,
     )

@@ -1,12 +1,28 @@
 """What `integrate` returns, and what it is asked to save."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from ._compat import is_traced
+from ._precision import refuse_double_without_x64
 from ._results import RESULTS, status_name
 from ._types import State
+from .engine.signature import accepts
+
+
+def _as_times(ts: Any) -> Any:
+    if ts is None or is_traced(ts):
+        return ts
+    ts = np.asarray(ts)
+    refuse_double_without_x64("ts", ts.dtype)
+    if not (np.issubdtype(ts.dtype, np.floating) or np.issubdtype(ts.dtype, np.integer)):
+        raise TypeError(f"Save(ts=...) needs real times, got dtype {ts.dtype}.")
+    return jnp.asarray(ts, jnp.result_type(float) if ts.dtype.kind == "i" else ts.dtype)
 
 
 class Save(eqx.Module):
@@ -16,18 +32,52 @@ class Save(eqx.Module):
     - ``Save(final=True)``: the state after the last step; together with `every`, also when
       num_steps is no multiple of it.
     - ``Save()``: every state.
+    - ``Save(ts=times)``: the states at these times and no others, in the order in which the run
+      meets them. Between lattice points it is the step of the method to that time, so that its
+      order is the method's. Times outside of the run give NaN and the status `not_reached`.
+      With ``clock=f``, a function ``(t, q, p, args)`` → scalar that grows along the trajectory, an
+      angle for instance, `ts` are values of it.
 
-    **Raises** `ValueError` for an `every` that is not a positive integer.
+    **Raises** `ValueError` for an `every` that is not a positive integer, for `ts` beside another
+    choice, and for times that are not one-dimensional, finite, in ascending or descending order.
     """
 
     every: int | None = eqx.field(static=True, default=None)
     final: bool = eqx.field(static=True, default=False)
+    ts: Float[Array, " times"] | None = eqx.field(default=None, converter=_as_times)
+    clock: Callable[..., Any] | None = None
 
     def __check_init__(self):
         if self.every is not None and (
             isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1
         ):
             raise ValueError(f"Save(every=m) needs a positive integer, got {self.every!r}.")
+        if self.clock is not None and not (callable(self.clock) and accepts(self.clock, 4)):
+            raise TypeError(
+                "the clock of Save(ts=..., clock=...) must be a function (t, q, p, args) → scalar, "
+                f"got {self.clock!r}."
+            )
+        if self.ts is None:
+            if self.clock is not None:
+                raise ValueError("a clock needs times to be saved at: Save(ts=..., clock=...).")
+            return
+        if self.every is not None or self.final:
+            raise ValueError(
+                "Save(ts=...) saves at those times alone: leave out every and final, or add the "
+                "times that they would give."
+            )
+        if self.ts.ndim != 1 or self.ts.shape[0] == 0:
+            raise ValueError(
+                f"Save(ts=...) needs a one-dimensional array of times, got shape {self.ts.shape}."
+            )
+        if not is_traced(self.ts):
+            steps = np.diff(np.asarray(self.ts))
+            ordered = bool((steps >= 0).all() or (steps <= 0).all())
+            if not (ordered and np.isfinite(np.asarray(self.ts)).all()):
+                raise ValueError(
+                    "Save(ts=...) needs finite times in ascending order (descending for h < 0), "
+                    f"got {np.asarray(self.ts)}."
+                )
 
 
 class Solution(eqx.Module):
@@ -36,11 +86,14 @@ class Solution(eqx.Module):
     - `ts`: saved times, shape (S,); ``ts[0]`` is t0.
     - `qs`, `ps`: saved positions and momenta, shape (S, *q0.shape).
     - `hs`: size of the step that ended at each saved time but the first, shape (S − 1,).
+      With ``Save(ts=...)`` the first time is like the others: `hs` and what stands alone in
+      `observed` have shape (S, …), and belong to the part of a step that ends at each time.
     - `observed`: the pytree given as `observe`; an observable alone becomes its values on the
       steps that ended at ``ts[1:]``, shape (S − 1, …); a reduction becomes one value over all
       steps.
     - `result`: the status, one of `RESULTS`. From the failing step on states and observables
       are NaN.
+    - `stop`: where a run with a `Stop` ended, a `Stopped` (t, q, p), NaN if it did not; else None.
     - `stats`: `num_steps`; `newton_iterations` (total); `max_residual` (largest relative residual
       of a solve); `failed_step` (number of the failing step from 0, or −1) and
       `failed_residual` (its relative residual, or 0).
@@ -55,6 +108,7 @@ class Solution(eqx.Module):
     observed: Any
     result: RESULTS
     stats: dict[str, Any]
+    stop: Any = None
 
     @property
     def status(self) -> Any:

@@ -1,9 +1,9 @@
 """Steps that adapt by a transformation of the time."""
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
+from ..engine.signature import accepts
 from ._uniform import Uniform
 
 
@@ -36,18 +36,8 @@ class TimeTransformed(Uniform):
     speed: Callable[..., Any]
 
     def __check_init__(self):
-        if not callable(self.speed) or not _takes_four(self.speed):
+        if not callable(self.speed) or not accepts(self.speed, 4):
             raise TypeError(
                 f"the speed of TimeTransformed must be a function (t, q, p, args) → positive "
                 f"scalar, got {self.speed!r}."
             )
-
-
-def _takes_four(function: Callable[..., Any]) -> bool:
-    try:
-        inspect.signature(function).bind(*range(4))
-    except TypeError:
-        return False
-    except ValueError:  # a builtin without a signature: calling it will tell
-        return True
-    return True

@@ -14,15 +14,13 @@ from .._results import RESULTS
 from .._step import Equations, step
 from .._system import System
 from .._types import Args, Interval, Scalar, State
+from ..engine.bracket import bracketed_root, divide
 from ._base import Lattice, check_num_steps
 
 Policy = Literal["stop", "hold", "minimise"]
 
 _CELLS = 16
 """Cells to each side of the last h that are searched for a change of sign."""
-
-_MOST = 100
-"""Evaluations after which a bracketed search ends where it is."""
 
 _GOLDEN = 0.6180339887498949
 _GOLDEN_STEPS = 40
@@ -180,15 +178,9 @@ class Variational(Lattice):
         crossing = fixed[:-1] - values[:-1] * jnp.diff(fixed) / jnp.diff(values)
         nearest = jnp.argmin(jnp.where(changes, jnp.abs(crossing - fixed[_CELLS]), jnp.inf))
         has_root = jnp.any(changes) & ~flat
-        bracket = [x[nearest + i] for i in (0, 1) for x in (fixed, values)]
-
-        def root(f, h):
-            return jnp.where(has_root, _bracketed(f, *bracket), h)
-
-        def equation(h):
-            return jnp.where(has_root, residual(h), h - last)
-
-        h = lax.custom_root(equation, fixed[_CELLS], root, _divide)
+        left, right = ((fixed[i], values[i]) for i in (nearest, nearest + 1))
+        root = bracketed_root(residual, *left, *right, has_root)
+        h = jnp.where(has_root, root, last)
         if self.on_no_root == "minimise":
             wanted = ~flat & ~has_root
             h = jnp.where(wanted, _least(residual, hs, values, wanted), h)
@@ -257,31 +249,6 @@ def _energies(equations: Equations, t: Scalar, h: Scalar, q: State, p: State) ->
     return _Energies(leaving, arriving, work, jnp.abs(leaving) + jnp.abs(arriving) + jnp.abs(work))
 
 
-def _divide(linear: Callable, rhs: Scalar) -> Scalar:
-    return rhs / linear(jnp.ones_like(rhs))
-
-
-def _bracketed(f: Callable, a: Scalar, fa: Scalar, b: Scalar, fb: Scalar) -> Scalar:
-    """The root of f between a and b, to the last digit: false position (Illinois), safeguarded."""
-
-    def proceed(state):
-        a, _, b, fb, n = state
-        return (jnp.abs(b - a) > 2 * jnp.finfo(a.dtype).eps * jnp.abs(b)) & (fb != 0) & (n < _MOST)
-
-    def narrow(state):
-        a, fa, b, fb, n = state
-        secant = b - fb * (b - a) / (fb - fa)
-        # Every third point is the middle one, so that the interval shrinks whatever f does.
-        c = jnp.where(jnp.isfinite(secant) & (n % 3 != 2), secant, (a + b) / 2)
-        fc = f(c)
-        crosses = fc * fb <= 0
-        a, fa = jnp.where(crosses, b, a), jnp.where(crosses, fb, fa / 2)
-        return a, fa, c, fc, n + 1
-
-    end = lax.while_loop(proceed, narrow, (a, fa, b, fb, 0))
-    return end[2]
-
-
 def _least(residual: Callable, hs: Array, values: Array, wanted: Array) -> Scalar:
     """The h with the smallest |residual| about the best of `hs`; an end of `hs` if that is it."""
     fixed = lax.stop_gradient(hs)
@@ -295,7 +262,7 @@ def _least(residual: Callable, hs: Array, values: Array, wanted: Array) -> Scala
     def stationary(h):
         return jnp.where(inside, jax.grad(residual)(h), h - hs[best])
 
-    return lax.custom_root(stationary, fixed[best], search, _divide)
+    return lax.custom_root(stationary, fixed[best], search, divide)
 
 
 def _golden_section(f: Callable, a: Scalar, b: Scalar) -> Scalar:

@@ -1,5 +1,10 @@
 """What is measured along a trajectory while it runs."""
 
+from ._kept import (
+    Crossings as Crossings,
+    RequestedTimes as RequestedTimes,
+    Section as Section,
+)
 from ._reductions import (
     Last as Last,
     MaxDrift as MaxDrift,
@@ -8,3 +13,4 @@ from ._reductions import (
     Reduction as Reduction,
     Trend as Trend,
 )
+from ._stop import Stop as Stop, Stopped as Stopped

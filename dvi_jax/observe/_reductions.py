@@ -30,12 +30,12 @@ class Reduction(eqx.Module):
         """Memory after step k, which ended at time t with this value."""
 
     @abc.abstractmethod
-    def finish(self, memory: Any) -> Array:
-        """The reduced value, NaN when there was no step."""
+    def finish(self, memory: Any) -> Any:
+        """The reduced value (real arrays), NaN when there was no step."""
 
     @abc.abstractmethod
     def pull(
-        self, memory: Any, cotangent: Array, k: Array, t: Scalar, value: Array
+        self, memory: Any, cotangent: Any, k: Array, t: Scalar, value: Array
     ) -> tuple[Array, Array]:
         """Cotangents of t and of the value at step k, given that of the reduced value.
 

@@ -1,0 +1,113 @@
+"""The trajectory inside of its steps: crossings, requested times, the point where it stopped."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ._step import Equations
+from ._types import Interval, Scalar, State
+from .engine.bracket import bracketed_root
+from .methods import Method
+from .observe import Crossings, Section, Stop, Stopped
+from .observe._kept import RequestedTimes, Start, event, from_rows, lies_in
+
+Point = tuple[Scalar, State, State]
+"""(t, q, p)."""
+
+
+class Curve:
+    """The curve that a method draws inside of a step, Φ_{θh}(q0, p0) for 0 ≤ θ ≤ 1.
+
+    It is of the method's own order, and ends where the step ends.
+    """
+
+    def __init__(self, method: Method, equations: Equations):
+        self.method, self.equations = method, equations
+
+    def point(self, start: Start, theta: Scalar) -> Point:
+        """(t, q, p) at the fraction θ of the step."""
+        h = theta * (start.t1 - start.t0)
+        t = start.t0 + h
+        q, p, _ = self.method.step(self.equations, Interval(start.t0, t, h), start.q0, start.p0)
+        return t, q, p
+
+    def where(self, g: Callable[..., Any], start: Start, exists: Array) -> Point:
+        """The point of the step where g(t, q, p, args) = 0, or its end if nothing `exists`."""
+
+        args = self.equations.args
+
+        def at(theta):
+            return event(g, *self.point(start, theta), args)
+
+        zero, one = jnp.zeros_like(start.t0), jnp.ones_like(start.t0)
+        at_zero = event(g, start.t0, start.q0, start.p0, args)
+        theta = bracketed_root(at, zero, at_zero, one, at(one), exists)
+        return self.point(start, theta)
+
+
+def crossings(curve: Curve, section: Section, kept: tuple[Array, Array], safe: Start) -> Crossings:
+    """The crossings in the steps that a section has kept. `safe` is any step that can be taken."""
+    rows, count = kept
+    exists, starts = _steps(rows, safe)
+    points = jax.vmap(lambda start, exists: curve.where(section.g, start, exists))(starts, exists)
+    ts, qs, ps = _or_nan(exists, points)
+    return Crossings(ts, qs, ps, count.astype(jnp.int32))
+
+
+def at_times(
+    curve: Curve, requested: RequestedTimes, kept: tuple[Array, Array], safe: Start
+) -> tuple[Array, Start, Point]:
+    """For each requested time: if it was reached, the step that it lies in, and the point there."""
+    exists, starts = _steps(kept[0], safe)
+    args = curve.equations.args
+    began = jax.vmap(lambda s: requested.time(s.t0, s.q0, s.p0, args))(starts)
+    at_first = requested.time(safe.t0, safe.q0, safe.p0, args)
+
+    def within(start, time, reached):
+        if requested.clock is not None:
+            return curve.where(lambda *at: requested.time(*at) - time, start, reached)
+        return curve.point(start, (time - start.t0) / (start.t1 - start.t0))
+
+    def one(time):
+        inside = exists & lies_in(time, began, starts.until)
+        reached, is_start = jnp.any(inside), time == at_first
+        start = jax.tree.map(lambda x: x[jnp.argmax(inside)], starts)
+        start = jax.tree.map(lambda a, b: jnp.where(reached, a, b), start, safe)
+        first = (safe.t0, safe.q0, safe.p0)
+        point = jax.tree.map(
+            lambda a, b: jnp.where(is_start, b, a), within(start, time, reached), first
+        )
+        return reached | is_start, start, _or_nan(reached | is_start, point)
+
+    return jax.vmap(one)(requested.ts)
+
+
+def stopped(curve: Curve, stop: Stop, row: Array, safe: Start) -> Stopped:
+    """Where g = 0 in the step that a run stopped in; its start if g ≥ 0 already there."""
+    exists, start = _steps(row, safe)
+    began = (start.t0, start.q0, start.p0)
+    at_start = event(stop.g, *began, curve.equations.args) >= 0
+    point = curve.where(stop.g, start, exists & ~at_start)
+    point = jax.tree.map(lambda a, b: jnp.where(at_start, b, a), point, began)
+    return Stopped(*_or_nan(exists, point))
+
+
+def _steps(rows: Array, safe: Start) -> tuple[Array, Start]:
+    """The steps in the rows, the safe one where a row is empty."""
+    exists, starts = from_rows(rows, safe.q0.shape)
+
+    def filled(x, substitute):
+        return jnp.where(_beside(exists, x), x, substitute)
+
+    return exists, jax.tree.map(filled, starts, safe)
+
+
+def _or_nan(exists: Array, points: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.where(_beside(exists, x), x, jnp.nan), points)
+
+
+def _beside(exists: Array, x: Array) -> Array:
+    return exists.reshape(exists.shape + (1,) * (x.ndim - exists.ndim))

@@ -1,0 +1,60 @@
+"""Roots of one unknown between two points, with the implicit derivative."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+Number = Float[Array, ""]
+Function = Callable[[Number], Number]
+
+_MOST = 100
+"""Evaluations after which a search ends where it is."""
+
+
+def bracketed_root(
+    function: Function, a: Number, at_a: Number, b: Number, at_b: Number, exists: Bool[Array, ""]
+) -> Number:
+    """The root of `function` between a and b, where it has the values `at_a` and `at_b`.
+
+    To the last digit, by false position (Illinois) with a halving every third time. Where
+    `exists` is false the answer is b and has no derivative; `function` should be finite there
+    nevertheless, or a reverse-mode derivative has NaN to multiply by zero.
+
+    The derivative with respect to what `function` closes over is that of the implicit function
+    theorem, to any order.
+    """
+    a, at_a, b, at_b = lax.stop_gradient((a, at_a, b, at_b))
+
+    def equation(x):
+        return jnp.where(exists, function(x), x - b)
+
+    def search(_, x):
+        return jnp.where(exists, _false_position(function, a, at_a, b, at_b, exists), x)
+
+    return lax.custom_root(equation, b, search, divide)
+
+
+def divide(linear: Function, rhs: Number) -> Number:
+    """The solution of linear(x) = rhs for one unknown."""
+    return rhs / linear(jnp.ones_like(rhs))
+
+
+def _false_position(f: Function, a, fa, b, fb, wanted) -> Number:
+    def proceed(state):
+        a, _, b, fb, n = state
+        apart = jnp.abs(b - a) > 2 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(a), jnp.abs(b))
+        return wanted & apart & (fb != 0) & (n < _MOST)
+
+    def narrow(state):
+        a, fa, b, fb, n = state
+        secant = b - fb * (b - a) / (fb - fa)
+        # Every third point is the middle one, so that the interval shrinks whatever f does.
+        c = jnp.where(jnp.isfinite(secant) & (n % 3 != 2), secant, (a + b) / 2)
+        fc = f(c)
+        crosses = fc * fb <= 0
+        a, fa = jnp.where(crosses, b, a), jnp.where(crosses, fb, fa / 2)
+        return a, fa, c, fc, n + 1
+
+    return lax.while_loop(proceed, narrow, (a, fa, b, fb, 0))[2]

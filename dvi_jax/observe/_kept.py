@@ -1,0 +1,180 @@
+"""Steps that are kept along a run, to be looked into afterwards."""
+
+import abc
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._types import Args, Scalar, State
+from ..engine.signature import accepts
+from ._reductions import Reduction
+
+
+class Start(NamedTuple):
+    """Where a step of a run began, and when it ended: at t1, which is `until` by the clock."""
+
+    t0: Scalar
+    t1: Scalar
+    until: Scalar
+    q0: State
+    p0: State
+
+
+class KeptSteps(Reduction):
+    """Base of the reductions that keep some steps: what they began with, in the order of time.
+
+    `function` gives a row, see `as_row`, whose first number is 1 if it is to be kept; the value in
+    the end is the rows kept, NaN where there were fewer than the capacity, and the number of hits.
+    """
+
+    capacity: eqx.AbstractVar[int]
+
+    if TYPE_CHECKING:  # there the abstract variable would stay an argument of every subclass
+        function: ClassVar[Callable[..., Any]]
+    else:
+
+        @property
+        def function(self):
+            return self._row
+
+    @abc.abstractmethod
+    def _row(self, t0, t1, q0, p0, q1, p1, args) -> Array:
+        """The row of one step."""
+
+    def start(self, value):
+        rows = jnp.full((self.capacity, *value.shape), jnp.nan, value.dtype)
+        return rows, jnp.full((self.capacity,), -1, jnp.int32), jnp.asarray(0, jnp.int32)
+
+    def update(self, memory, k, t, value):
+        rows, steps, count = memory
+        hit = value[0] == 1
+        place = jnp.where(hit, count, self.capacity)  # beyond the end: dropped
+        rows = rows.at[place].set(value, mode="drop")
+        return rows, steps.at[place].set(k, mode="drop"), count + jnp.where(hit, 1, 0)
+
+    def finish(self, memory) -> Any:
+        rows, _, count = memory
+        return rows, count.astype(rows.dtype)
+
+    def pull(self, memory, cotangent, k, t, value):
+        _, steps, _ = memory
+        of_rows, _ = cotangent
+        here = (steps == k)[:, None]
+        return jnp.zeros_like(t), jnp.sum(jnp.where(here, of_rows, 0), axis=0)
+
+
+def as_row(hit: Array, start: Start) -> Float[Array, " width"]:
+    """One step as a row of numbers."""
+    parts = (hit.astype(start.q0.dtype), start.t0, start.t1, start.until)
+    return jnp.concatenate([jnp.stack(parts), start.q0.ravel(), start.p0.ravel()])
+
+
+def from_rows(rows: Float[Array, "... width"], shape: tuple[int, ...]) -> tuple[Array, Start]:
+    """Whether there is a step in each row, and the steps, for positions of this shape."""
+    lead = rows.shape[:-1]
+    q0, p0 = (x.reshape(*lead, *shape) for x in jnp.split(rows[..., 4:], 2, axis=-1))
+    return rows[..., 0] == 1, Start(rows[..., 1], rows[..., 2], rows[..., 3], q0, p0)
+
+
+class Crossings(eqx.Module):
+    """The points where a trajectory crossed a section, in the order of time.
+
+    - `ts`, `qs`, `ps`: times and states, shapes (max_crossings,), (max_crossings, *q0.shape); NaN
+      behind the last one.
+    - `count`: how many there were. Above max_crossings, only the first of them are here.
+    """
+
+    ts: Array
+    qs: Array
+    ps: Array
+    count: Array
+
+
+class Section(KeptSteps):
+    r"""Observable: where the trajectory crosses the surface g(t, q, p, args) = 0 (Poincaré 1892).
+
+    A crossing lies in a step when g changes its sign between its ends. It is then solved for, to
+    round-off, on the curve that the method itself draws inside of the step: Φ_{θh}(q0, p0), 0 < θ
+    ≤ 1. Its error is that of the method, whatever its order. The run only notes the steps in
+    question; they are solved together at the end, on the device.
+
+    **Arguments**
+
+    - `g`: function ``(t, q, p, args)`` → scalar. Of an angle take sin or cos, which do not jump.
+    - `direction`: 1 for crossings where g grows, −1 where it falls, 0 for both.
+    - `max_crossings`: room for so many; static.
+
+    The observed value is a `Crossings`. It is differentiable, the times included, and may be
+    batched. Two crossings within one step are not seen: take steps that g does not turn in.
+
+    **Raises** `TypeError` for a g that is no such function, `ValueError` for another direction, a
+    max_crossings below 1, and in `integrate` for a g that is not a scalar.
+    """
+
+    g: Callable[..., Any]
+    direction: int = eqx.field(static=True, default=0)
+    capacity: int = eqx.field(static=True, default=1000)
+
+    def __init__(self, g: Callable[..., Any], direction: int = 0, max_crossings: int = 1000):
+        self.g, self.direction, self.capacity = g, direction, max_crossings
+
+    def __check_init__(self):
+        check_event(self.g, "Section")
+        if self.direction not in (-1, 0, 1):
+            raise ValueError(
+                f"direction must be 1 (g grows), -1 (g falls) or 0 (both), got {self.direction!r}."
+            )
+        n = self.capacity
+        if isinstance(n, bool) or not isinstance(n, int) or n < 1:
+            raise ValueError(f"max_crossings must be a positive integer, got {n!r}.")
+
+    def _row(self, t0, t1, q0, p0, q1, p1, args):
+        before, after = event(self.g, t0, q0, p0, args), event(self.g, t1, q1, p1, args)
+        up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
+        hit = {1: up, -1: down, 0: up | down}[self.direction]
+        return as_row(hit, Start(t0, t1, t1, q0, p0))
+
+
+class RequestedTimes(KeptSteps):
+    """The steps that the times of ``Save(ts=...)`` lie in, by t or by a clock of the user's."""
+
+    ts: Array
+    clock: Callable[..., Any] | None
+
+    @property
+    def capacity(self) -> int:
+        return self.ts.shape[0]
+
+    def time(self, t: Scalar, q: State, p: State, args: Args) -> Scalar:
+        """What the clock shows at a point."""
+        return t if self.clock is None else event(self.clock, t, q, p, args)
+
+    def _row(self, t0, t1, q0, p0, q1, p1, args):
+        start, end = self.time(t0, q0, p0, args), self.time(t1, q1, p1, args)
+        inside = jnp.any(lies_in(self.ts, start, end)) & jnp.all(jnp.isfinite(q1))
+        return as_row(inside, Start(t0, t1, end, q0, p0))
+
+
+def lies_in(t: Array, start: Array, end: Array) -> Array:
+    """Whether t lies in (start, end], or in [end, start) when time runs backwards."""
+    return jnp.where(end >= start, (t > start) & (t <= end), (t < start) & (t >= end))
+
+
+def event(g: Callable[..., Any], t: Scalar, q: State, p: State, args: Args) -> Scalar:
+    """g at a point, refused unless it is a real scalar."""
+    value = jnp.asarray(g(t, q, p, args))
+    if value.shape != () or jnp.issubdtype(value.dtype, jnp.complexfloating):
+        raise ValueError(
+            "g(t, q, p, args) must return a real scalar, whose zeros are meant; it returned shape "
+            f"{value.shape}, dtype {value.dtype}. For several surfaces use several sections."
+        )
+    return value.astype(q.dtype)
+
+
+def check_event(g: Any, of: str) -> None:
+    """Refuse a g that cannot be called as ``g(t, q, p, args)``."""
+    if not callable(g) or not accepts(g, 4):
+        raise TypeError(f"{of} takes a function g(t, q, p, args) → scalar, got {g!r}.")

@@ -1,0 +1,38 @@
+"""Where a trajectory ends before its last step."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array
+
+from ._kept import check_event
+
+
+class Stop(eqx.Module):
+    r"""Ends a trajectory where g(t, q, p, args) reaches zero from below: a collision, an escape.
+
+    ``dvi.Stop(lambda t, q, p, args: 0.1 - jnp.linalg.norm(q))`` for instance ends at |q| = 0.1.
+    The run ends with the first step at whose end g ≥ 0, or before it where g ≥ 0 at the start.
+    Where g = 0 is solved for inside of that step as for `Section`, and told by ``solution.stop``.
+    The status is `stopped`, which is no failure. States after it are NaN, reductions cover the
+    steps before. A g that turns positive and back within one step is not seen.
+
+    **Arguments** `g`: function ``(t, q, p, args)`` → scalar.
+
+    **Raises** `TypeError` for a g that is no such function, and in `integrate` `ValueError` for
+    one that is not a scalar.
+    """
+
+    g: Callable[..., Any]
+
+    def __check_init__(self):
+        check_event(self.g, "Stop")
+
+
+class Stopped(NamedTuple):
+    """Where a trajectory stopped: time and state, NaN if it did not."""
+
+    t: Array
+    q: Array
+    p: Array

@@ -1,0 +1,325 @@
+"""Sections, requested times and stops: the trajectory inside of its steps."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import central_difference, measured_orders
+from scipy.integrate import solve_ivp
+
+import dvi_jax as dvi
+
+E = 0.6
+START = [1 - E, 0.0], [0.0, np.sqrt((1 + E) / (1 - E))]
+KEPLER = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - 1 / jnp.sqrt(q @ q))
+PENDULUM = dvi.System(
+    lambda t0, t1, q, p, args: jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q)),
+    force=lambda t0, t1, q, p, args: -p + jnp.cos(t0),
+)
+
+
+def on_axis(t, q, p, args):
+    return q[1]
+
+
+def radius(t, q, p, args):
+    return jnp.sqrt(q @ q)
+
+
+def too_far(t, q, p, args):
+    return radius(t, q, p, args) - 1.5
+
+
+def momentum(t0, t1, q0, p0, q1, p1, args):
+    return q1[0] * p1[1] - q1[1] * p1[0]
+
+
+def kepler(h=0.02, num_steps=700, **settings):
+    given = {"method": dvi.Strang(), "save": dvi.Save(final=True), **settings}
+    return dvi.integrate(KEPLER, *START, h=h, num_steps=num_steps, **given)
+
+
+@functools.cache
+def exact(end=14.0, g=None, direction=0):
+    """SciPy's DOP853 with its own event location."""
+
+    def rates(t, y):
+        return [*y[2:], *(-y[:2] / np.hypot(*y[:2]) ** 3)]
+
+    def event(t, y):
+        return float(g(t, y[:2], y[2:], None))
+
+    event.direction = direction
+    return solve_ivp(
+        rates, (0, end), [*START[0], *START[1]], "DOP853", rtol=1e-13, atol=1e-13,
+        events=[event] if g else None, dense_output=True,
+    )  # fmt: skip
+
+
+def crossings_of(order, direction, h):
+    method = dvi.Strang() if order == 2 else dvi.Yoshida(order)
+    section = dvi.Section(on_axis, direction, max_crossings=6)
+    return kepler(h, round(14 / h), method=method, observe=section).observed
+
+
+def numpy_axis(t, q, p, args):
+    return q[1]
+
+
+@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.slow)])
+def test_crossings_converge_with_the_order_of_the_method(order):
+    known = exact(14.0, numpy_axis, 1)
+    times, states = known.t_events[0][-2:], known.y_events[0][-2:]
+    errors = []
+    for h in (0.01, 0.005, 0.0025):
+        found = crossings_of(order, 1, h)
+        assert int(found.count) == 2
+        np.testing.assert_allclose(found.qs[:2, 1], 0.0, atol=1e-14)
+        assert np.isnan(np.asarray(found.ts[2:])).all()
+        state = np.concatenate([found.qs[:2], found.ps[:2]], axis=1)
+        errors.append(max(np.abs(found.ts[:2] - times).max(), np.abs(state - states).max()))
+    orders = measured_orders(errors, 2.0, 1e-12)
+    np.testing.assert_allclose(orders, order, atol=0.2)
+
+
+def test_direction_is_chosen():
+    up, down, both = (crossings_of(2, d, 0.01) for d in (1, -1, 0))
+    assert (int(up.count), int(down.count), int(both.count)) == (2, 2, 4)
+    assert np.all(np.asarray(up.ps[:2, 1]) > 0)
+    assert np.all(np.asarray(down.ps[:2, 1]) < 0)
+    together = np.sort(np.concatenate([up.ts[:2], down.ts[:2]]))
+    np.testing.assert_array_equal(together, both.ts[:4])
+
+
+def test_crossings_beyond_the_room_are_counted():
+    sol = kepler(observe=dvi.Section(on_axis, max_crossings=3))
+    assert int(sol.observed.count) == 4
+    assert np.isfinite(np.asarray(sol.observed.ts)).all()
+
+
+def test_a_batch_of_sections():
+    """Hénon and Heiles' surface of section; a lane that fails leaves the others alone."""
+    system = dvi.System(
+        lambda t0, t1, q, p, args: (p @ p + q @ q) / 2 + q[0] ** 2 * q[1] - q[1] ** 3 / 3
+    )
+
+    def run(y):
+        p0 = jnp.stack([jnp.sqrt(2 * (1 / 12 - y**2 / 2 + y**3 / 3)), 0.0])
+        return dvi.integrate(
+            system, jnp.stack([0.0, y]), p0, h=0.05, num_steps=800, throw=False,
+            method=dvi.Strang(), save=dvi.Save(final=True),
+            observe=dvi.Section(lambda t, q, p, args: q[0], 1, max_crossings=10),
+        )  # fmt: skip
+
+    batch = jax.vmap(run)(jnp.asarray([0.1, jnp.nan, -0.2]))
+    assert list(batch.status) == ["successful", "not_finite", "successful"]
+    found = batch.observed
+    assert int(found.count[1]) == 0
+    for i, y in ((0, 0.1), (2, -0.2)):
+        alone = run(jnp.asarray(y)).observed
+        n = int(alone.count)
+        assert n == int(found.count[i]) > 4
+        np.testing.assert_allclose(found.qs[i, :n], alone.qs[:n], atol=1e-11)
+        np.testing.assert_allclose(found.qs[i, :n, 0], 0.0, atol=1e-14)
+
+
+def section_loss(x, adjoint):
+    p, h = x
+    sol = dvi.integrate(
+        KEPLER, START[0], p, h=h, num_steps=150, method=dvi.Strang(), adjoint=adjoint,
+        save=dvi.Save(final=True), observe=dvi.Section(on_axis, max_crossings=4),
+    )  # fmt: skip
+    found = sol.observed
+    return found.ts[0] ** 2 + found.qs[0, 0] * found.ps[0, 1]
+
+
+def test_gradient_of_a_crossing():
+    """Time and state of the crossing, in forward and both ways of reverse mode."""
+    x = (jnp.asarray(START[1]), jnp.asarray(0.03))
+    ones = jax.tree.map(jnp.ones_like, x)
+    value = jax.jit(lambda x: section_loss(x, dvi.Direct()))
+    expected = float(central_difference(value, x, ones))
+    forward = float(jax.jvp(value, (x,), (ones,))[1])
+    assert forward == pytest.approx(expected, rel=1e-6)
+    for adjoint in (dvi.Direct(), dvi.Reversible(checkpoint_every=10)):
+        back = jax.tree.leaves(jax.grad(lambda x, a=adjoint: section_loss(x, a))(x))
+        assert sum(float(jnp.sum(g)) for g in back) == pytest.approx(forward, rel=1e-9)
+
+
+@pytest.mark.parametrize("order", [2, pytest.param(6, marks=pytest.mark.slow)])
+def test_requested_times_have_the_order_of_the_method(order):
+    """Between lattice points too, where a polynomial of low degree would lose it."""
+    ts = np.array([0.0, 1.237, 1.238, 5.55, 9.999])
+    known = exact(14.0).sol(ts).T
+    errors = []
+    for n in (500, 1000, 2000) if order == 2 else (250, 500, 1000):
+        method = dvi.Strang() if order == 2 else dvi.Yoshida(6)
+        sol = kepler(10 / n, n, method=method, save=dvi.Save(ts=ts))
+        assert sol.status == "successful"
+        np.testing.assert_array_equal(sol.ts, ts)
+        errors.append(np.abs(np.concatenate([sol.qs, sol.ps], axis=1) - known).max())
+    np.testing.assert_allclose(measured_orders(errors, 2.0, 1e-12), order, atol=0.3)
+
+
+def test_requested_times_on_the_lattice_are_the_lattices_states():
+    every = kepler(save=dvi.Save(every=100), observe={"L": momentum, "max": dvi.MaxDrift(momentum)})
+    asked = kepler(
+        save=dvi.Save(ts=every.ts), observe={"L": momentum, "max": dvi.MaxDrift(momentum)}
+    )
+    np.testing.assert_allclose(asked.qs, every.qs, atol=1e-12)
+    np.testing.assert_allclose(asked.observed["L"][1:], every.observed["L"], atol=1e-13)
+    np.testing.assert_array_equal(asked.observed["max"], every.observed["max"])
+    np.testing.assert_allclose(asked.hs[1:], every.hs, rtol=1e-9)
+
+
+def test_several_times_in_one_step_and_backwards():
+    ts = np.array([-0.001, -0.002, -0.0021, -0.5])
+    back = kepler(-0.02, 30, save=dvi.Save(ts=ts))
+    ahead = kepler(0.02, 30, save=dvi.Save(ts=-ts))
+    np.testing.assert_allclose(np.asarray(back.qs) * [1, -1], ahead.qs, atol=1e-13)
+    assert np.abs(np.diff(np.asarray(ahead.qs[:, 1]))).min() > 1e-5
+
+
+def test_times_outside_of_the_run():
+    late = kepler(num_steps=50, save=dvi.Save(ts=[0.5, 1.0, 1.01]), throw=False)
+    assert late.status == "not_reached"
+    assert np.isfinite(np.asarray(late.qs[:2])).all()
+    assert np.isnan(np.asarray(late.qs[2])).all()
+    with pytest.raises(dvi.IntegrationError, match=r"lies outside of the run"):
+        kepler(num_steps=50, save=dvi.Save(ts=[-0.5, 1.0]))
+
+
+def test_gradient_in_the_requested_times_is_the_velocity():
+    def at(t, adjoint):
+        return kepler(num_steps=100, save=dvi.Save(ts=t[None]), adjoint=adjoint).qs[0]
+
+    t = jnp.asarray(1.2345)
+    p = kepler(num_steps=100, save=dvi.Save(ts=t[None])).ps[0]
+    for adjoint in (dvi.Direct(), dvi.Reversible()):
+        slope = jax.jacobian(lambda t, a=adjoint: at(t, a))(t)
+        np.testing.assert_allclose(slope, p, rtol=1e-3)  # of the map's curve: order h²
+
+
+def test_a_clock_of_ones_own():
+    """States at given angles of the pendulum that turns over."""
+    system = dvi.System(lambda t0, t1, q, p, args: jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q)))
+    angles = np.linspace(0.1, 30.0, 7)
+    sol = dvi.integrate(
+        system, [0.1], [2.5], h=0.05, num_steps=400, method=dvi.Yoshida(4),
+        save=dvi.Save(ts=angles, clock=lambda t, q, p, args: q[0]),
+    )  # fmt: skip
+    np.testing.assert_allclose(sol.qs[:, 0], angles, atol=1e-13)
+    energy = 2.5**2 / 2 - np.cos(0.1)
+    np.testing.assert_allclose(sol.ps[:, 0] ** 2 / 2 - np.cos(angles), energy, atol=1e-4)
+
+
+def test_escape_ends_a_run():
+    known = exact(14.0, lambda t, q, p, args: np.hypot(*q) - 1.5, 1)
+    sol = kepler(
+        0.005, 1000, method=dvi.Yoshida(4), stop=dvi.Stop(too_far), save=dvi.Save(),
+        observe=dvi.MaxDrift(momentum),
+    )  # fmt: skip
+    assert sol.status == "stopped"
+    assert int(sol.stats["failed_step"]) == -1
+    assert float(sol.stop.t) == pytest.approx(known.t_events[0][0], abs=1e-6)
+    assert float(jnp.linalg.norm(sol.stop.q)) == pytest.approx(1.5, abs=1e-14)
+    before = np.asarray(sol.ts) < float(sol.stop.t)
+    assert np.isfinite(np.asarray(sol.qs)[before]).all()
+    assert np.isnan(np.asarray(sol.qs)[~before]).all()
+    assert 0 < float(sol.observed) < 1e-13  # over the steps before, no NaN
+
+
+def test_stops_of_a_batch_and_their_gradient():
+    def run(p, adjoint=dvi.Reversible()):
+        return dvi.integrate(
+            KEPLER, START[0], jnp.stack([0.0, p]), h=0.02, num_steps=150, method=dvi.Strang(),
+            stop=dvi.Stop(too_far), adjoint=adjoint,
+        )  # fmt: skip
+
+    batch = jax.vmap(run)(jnp.asarray([START[1][1], 1.0]))
+    assert list(batch.status) == ["stopped", "successful"]
+    assert np.isfinite(np.asarray(batch.qs[1])).all()
+    assert np.isnan(np.asarray(batch.stop.t)[1])
+    value = jax.jit(lambda p: run(p).stop.t + run(p).stop.q[0])
+    p = jnp.asarray(START[1][1])
+    expected = central_difference(value, p, jnp.ones(()))
+    assert float(jax.grad(value)(p)) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_a_start_beyond_the_stop():
+    sol = kepler(num_steps=5, stop=dvi.Stop(lambda t, q, p, args: 1 - radius(t, q, p, args)))
+    assert sol.status == "stopped"
+    assert float(sol.stop.t) == 0.0
+    np.testing.assert_array_equal(sol.stop.q, START[0])
+
+
+def test_no_stop_is_told():
+    sol = kepler(num_steps=20, stop=dvi.Stop(lambda t, q, p, args: t - 10.0))
+    assert sol.status == "successful"
+    assert np.isnan(float(sol.stop.t))
+    assert kepler(num_steps=20).stop is None
+
+
+@pytest.mark.slow
+def test_in_a_transformed_time():
+    """The three of them see t, not the fictitious time."""
+    lattice = dvi.TimeTransformed(radius)
+    ts = np.array([0.0, 1.0, 3.3, 7.7])
+    settings = {"lattice": lattice, "method": dvi.Yoshida(6)}
+    sol = kepler(
+        0.05, 200, save=dvi.Save(ts=ts), observe=dvi.Section(on_axis, 1, max_crossings=2),
+        **settings,
+    )  # fmt: skip
+    np.testing.assert_allclose(sol.ts, ts, atol=1e-12)
+    known = exact(14.0, numpy_axis, 1)
+    np.testing.assert_allclose(sol.qs, known.sol(ts)[:2].T, atol=1e-5)
+    np.testing.assert_allclose(sol.observed.ts[0], known.t_events[0][-2], atol=1e-5)
+    end = kepler(0.05, 200, stop=dvi.Stop(too_far), **settings)
+    assert end.status == "stopped"
+    assert float(end.stop.t) == pytest.approx(
+        exact(14.0, lambda t, q, p, args: np.hypot(*q) - 1.5, 1).t_events[0][0], abs=1e-5
+    )
+
+
+def test_implicit_forced_steps_and_progress():
+    def run(**more):
+        return dvi.integrate(
+            PENDULUM, [0.4], [0.7], h=0.05, num_steps=200, epsilon=0.1, method=dvi.Strang(),
+            save=dvi.Save(ts=[0.33, 6.66]), observe=dvi.Section(lambda t, q, p, args: q[0]), **more,
+        )  # fmt: skip
+
+    calls = []
+    sol, told = run(), run(progress=lambda done, of: calls.append(done))
+    assert calls[-1] == 200
+    assert int(sol.observed.count) >= 2
+    np.testing.assert_array_equal(sol.qs, told.qs)
+    np.testing.assert_array_equal(sol.observed.ts, told.observed.ts)
+
+
+def test_what_cannot_be_meant_is_refused():
+    with pytest.raises(TypeError, match=r"Section takes a function g\(t, q, p, args\)"):
+        dvi.Section(lambda q: q)
+    with pytest.raises(TypeError, match=r"Stop takes a function g\(t, q, p, args\)"):
+        dvi.Stop(3.0)
+    with pytest.raises(ValueError, match="direction must be 1"):
+        dvi.Section(on_axis, 2)
+    with pytest.raises(ValueError, match="max_crossings must be a positive integer"):
+        dvi.Section(on_axis, max_crossings=0)
+    with pytest.raises(ValueError, match="must return a real scalar"):
+        kepler(num_steps=3, observe=dvi.Section(lambda t, q, p, args: q))
+    with pytest.raises(ValueError, match="must return a real scalar"):
+        kepler(num_steps=3, stop=dvi.Stop(lambda t, q, p, args: q))
+    with pytest.raises(TypeError, match=r"stop must be a dvi\.Stop"):
+        kepler(num_steps=3, stop=too_far)
+    with pytest.raises(ValueError, match="leave out every and final"):
+        dvi.Save(ts=[0.1], final=True)
+    with pytest.raises(ValueError, match="ascending order"):
+        dvi.Save(ts=[0.1, 0.3, 0.2])
+    with pytest.raises(ValueError, match="one-dimensional"):
+        dvi.Save(ts=0.1)
+    with pytest.raises(ValueError, match="a clock needs times"):
+        dvi.Save(clock=on_axis)
+    with pytest.raises(TypeError, match="the clock of Save"):
+        dvi.Save(ts=[0.1], clock=3)
