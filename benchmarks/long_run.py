@@ -213,7 +213,7 @@ def picture(curves, path):
                 slope = exponent(steps, rms)
                 axis.loglog(steps, rms, dash, color=colour, label=f"{name}, $N^{{{slope:.2f}}}$")
             steps, rms = lines["plain"]
-            guide = rms[-1] * 4 * np.sqrt(steps / steps[-1])
+            guide = rms[-1] * 10 * np.sqrt(steps / steps[-1])
             axis.loglog(steps, guide, color="0.6", linewidth=1, label="$\\sqrt{N}$")
             axis.set_title(title)
             axis.set_xlabel("steps N")

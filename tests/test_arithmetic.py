@@ -13,6 +13,7 @@ import dvi_jax as dvi
 from dvi_jax import systems
 from dvi_jax._arithmetic import _exact_sum
 from dvi_jax._step import Equations, _increment, to_grid
+from dvi_jax._types import Interval
 
 METHODS = {**REGISTERED, "KahanLi6": dvi.KahanLi(6), "GaussLegendre2": dvi.GaussLegendre(2)}
 QUANTUM = 2.0**-46
@@ -32,8 +33,8 @@ ORBITS = {
     "henon_heiles": (dvi.System(henon_heiles), [0.1, -0.2], [0.3, 0.25], 0.05, None),
 }
 THERE_AND_BACK = {
-    "Strang by −h": (dvi.Strang(), dvi.Strang()),
-    "Yoshida4 by −h": (dvi.Yoshida(4), dvi.Yoshida(4)),
+    "Strang by -h": (dvi.Strang(), dvi.Strang()),
+    "Yoshida4 by -h": (dvi.Yoshida(4), dvi.Yoshida(4)),
     "TypeII by its inverse": (dvi.TypeII(), dvi.Adjoint()),
     "Strang by its inverse": (dvi.Strang(), dvi.Adjoint(dvi.Strang())),
 }
@@ -121,8 +122,7 @@ def final_state(system, method, arithmetic, num_steps=40):
 
 
 def pairs():
-    fast = {("non_separable", "TypeII"), ("pendulum", "Yoshida4"), ("non_separable", "Adjoint")}
-    fast |= {("kepler", "GaussLegendre2"), ("kepler", "RungeKutta4")}
+    fast = {("non_separable", "TypeII"), ("pendulum", "Strang"), ("pendulum", "GaussLegendre2")}
     return [
         pytest.param(s, m, marks=[] if (s, m) in fast else [pytest.mark.slow])
         for s in ("pendulum", "kepler", "non_separable")
@@ -142,32 +142,29 @@ def test_every_method_is_the_same_in_local_coordinates(system, method):
 
 
 def test_an_equilibrium_is_solved_for_in_its_own_size():
-    """Increments there are nothing beside the state: measured by themselves they never settle."""
+    """p relaxes to 3, where increments are round-off: by their own size they settle late."""
+    s = dvi.System(pendulum, force=lambda t0, t1, q0, p1, args: jnp.sin(q0) + 3 - p1)
+    sol = dvi.integrate(
+        s, [1.0], [3.0], h=0.1, num_steps=20, epsilon=1.0, arithmetic=dvi.Compensated()
+    )
+    assert int(sol.stats["newton_iterations"]) <= 20 * 2
+    q, p, h = jnp.ones(1), 3 * jnp.ones(1), jnp.asarray(1.0)
+    equations = Equations(s, jnp.ones(()), origin=(q, p))
+    interval = Interval(0 * h, h, h)
 
-    def resting(t0, t1, q0, p1, args):
-        return jnp.sum(((q0 - 1) ** 2 + 1) * ((p1 - 3) ** 2 + 1)) / 2
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(0, None))
+    def solved(start, known):
+        rate = functools.partial(equations.momentum_rate, interval, 0 * q)
+        _, info = _increment(rate, start, h, equations, known, explicit=False)
+        return info.iterations, info.converged
 
-    s = dvi.System(resting)
-    for method in (dvi.TypeII(), dvi.Strang(), dvi.GaussLegendre(2)):
-        sol = dvi.integrate(
-            s, [1.0 + 1e-13], [3.0], h=0.1, num_steps=20, method=method,
-            arithmetic=dvi.Compensated(),
-        )  # fmt: skip
-        assert int(sol.stats["newton_iterations"]) <= 20 * 2 * 2
-
-    def iterations(known):
-        equations = Equations(s, jnp.zeros(()), origin=(jnp.ones(1), 3 * jnp.ones(1)))
-        rng = np.random.default_rng(0)
-        noise = 1e-16 * rng.normal(size=64)
-        # A rate with round-off of the size of ulp(1), as one at a state of size 1 has.
-        rate = lambda x: jnp.asarray(1.0) + x - 1.0 - 3e-17 + 0.9 * jnp.sin(1e16 * x) * 1e-16  # noqa: E731
-        _, info = _increment(
-            rate, jnp.asarray(noise[:1]), jnp.asarray(0.1), equations, known, explicit=False
-        )
-        return int(info.iterations), bool(info.converged)
-
-    assert iterations(jnp.ones(1)) <= (2, True)
-    assert iterations(jnp.zeros(1)) > (2, True)
+    starts = np.linspace(-2e-15, 2e-15, 50)[:, None]
+    iterations, converged = solved(starts, p)
+    assert np.max(iterations) <= 2
+    assert converged.all()
+    iterations, converged = solved(starts, 0 * p)
+    assert np.max(iterations) > 8
 
 
 def test_memory_goes_along_in_pieces_and_in_batches():
@@ -216,11 +213,13 @@ def test_a_lane_that_fails_leaves_the_others_alone():
     q = jnp.array([[1.0, 0.0], [0.0, 0.0], [0.9, 0.1]])
     p = jnp.tile(jnp.array([0.0, 1.0]), (3, 1))
     for arithmetic in (dvi.Compensated(), dvi.FixedPoint(QUANTUM)):
-        batch = jax.vmap(
-            lambda q, p: dvi.integrate(
+
+        def run(q, p, arithmetic=arithmetic):
+            return dvi.integrate(
                 s, q, p, h=0.01, num_steps=20, args=ARGS, arithmetic=arithmetic, throw=False
             )
-        )(q, p)
+
+        batch = jax.jit(jax.vmap(run))(q, p)
         assert list(batch.status) == ["successful", "not_finite", "successful"]
         assert np.isfinite(batch.qs[0]).all()
         assert np.isfinite(batch.qs[2]).all()
@@ -396,39 +395,50 @@ def test_what_fixed_point_cannot_undo_is_refused():
                 run(system, method, epsilon=0.1)
     with pytest.raises(ValueError, match="no normal number of float32"):
         run(separable, q0=np.array([0.3], np.float32), quantum=2.0**-140)
-    with pytest.raises(TypeError, match="arithmetic must be a Arithmetic.*parentheses"):
+    with pytest.raises(TypeError, match=r"arithmetic must be a Arithmetic.*parentheses"):
         dvi.integrate(separable, [0.3], [1.0], h=0.1, num_steps=1, arithmetic=dvi.Compensated)
 
 
 # Gradients, and other lattices
 
 
-@pytest.mark.parametrize("adjoint", ADJOINTS)
+@functools.cache
+def gradient(arithmetic, adjoint, is_implicit):
+    """dL/d(q0, p0, h, ε) of a forced run, explicit or not."""
+    if is_implicit:
+        system, method = SYSTEMS["non_separable"][0], dvi.TypeII()
+    else:
+        system = dvi.System(pendulum, force=lambda t0, t1, q0, p1, args: -(q0**3))
+        method = dvi.Strang()
+
+    def of(x):
+        sol = dvi.integrate(
+            system, x[:1], x[1:2], h=x[2], num_steps=23, epsilon=x[3], method=method,
+            adjoint=ADJOINTS[adjoint], arithmetic=arithmetic, save=dvi.Save(every=10, final=True),
+        )  # fmt: skip
+        return jnp.sum(sol.qs**3) + jnp.sum(sol.ps[-1])
+
+    return np.asarray(jax.jit(jax.grad(of))(jnp.array([0.3, 0.4, 0.1, 0.2])))
+
+
+@pytest.mark.parametrize(
+    "adjoint",
+    [pytest.param(a, marks=[] if a == "Reversible" else [pytest.mark.slow]) for a in ADJOINTS],
+)
 def test_gradients_are_those_of_the_map(adjoint):
-    """As with plain sums: to round-off, and to the quantum in fixed point."""
-
-    def value(arithmetic, system, method, epsilon):
-        def of(x):
-            sol = dvi.integrate(
-                system, x[:1], x[1:2], h=x[2], num_steps=23, epsilon=epsilon * x[3],
-                method=method, adjoint=ADJOINTS[adjoint], arithmetic=arithmetic,
-                save=dvi.Save(every=10, final=True),
-            )  # fmt: skip
-            return jnp.sum(sol.qs**3) + jnp.sum(sol.ps[-1])
-
-        return jax.jit(jax.grad(of))(jnp.array([0.3, 0.4, 0.1, 0.5]))
-
-    implicit = SYSTEMS["non_separable"][0], dvi.Strang(), 0.2
-    plain = value(dvi.FloatingPoint(), *implicit)
-    np.testing.assert_allclose(value(dvi.Compensated(), *implicit), plain, rtol=1e-11)
+    """As with plain sums: to round-off; in fixed point to the quantum, as a coarse one shows."""
+    plain = gradient(dvi.FloatingPoint(), "Direct", True)
     assert np.min(np.abs(plain)) > 1e-3
-    explicit = dvi.System(pendulum, force=lambda t0, t1, q0, p1, args: -(q0**3)), dvi.Yoshida(4), 1
-    plain = value(dvi.FloatingPoint(), *explicit)
-    np.testing.assert_allclose(value(dvi.FixedPoint(QUANTUM), *explicit), plain, rtol=1e-9)
-    coarse = value(dvi.FixedPoint(2.0**-10), *explicit)
-    assert 1e-6 < np.max(np.abs(coarse / plain - 1)) < 0.1
+    np.testing.assert_allclose(gradient(dvi.Compensated(), adjoint, True), plain, rtol=1e-11)
+    plain = gradient(dvi.FloatingPoint(), "Direct", False)
+    fixed = gradient(dvi.FixedPoint(QUANTUM), adjoint, False)
+    np.testing.assert_allclose(fixed, plain, rtol=1e-9)
+    if adjoint == "Reversible":
+        coarse = gradient(dvi.FixedPoint(2.0**-10), adjoint, False)
+        assert 1e-6 < np.max(np.abs(coarse / plain - 1)) < 0.1
 
 
+@pytest.mark.slow
 def test_forward_mode_agrees_with_reverse_mode():
     def last(x, arithmetic):
         sol = dvi.integrate(
@@ -443,6 +453,7 @@ def test_forward_mode_agrees_with_reverse_mode():
         np.testing.assert_allclose(jax.jit(jax.jacfwd(f))(x), jax.jit(jax.grad(f))(x), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_adapted_steps_take_the_arithmetic_along():
     """On a time-transformed lattice time is summed too; its Hamiltonian is not separable."""
     lattice = dvi.TimeTransformed(lambda t, q, p, args: jnp.sum(q**2))
