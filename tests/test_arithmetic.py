@@ -292,6 +292,53 @@ def test_a_batch_in_fixed_point_comes_back_bit_for_bit(route):
         assert not comes_back(orbit, methods, dvi.Compensated(), 20_000, batch)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_random_forces_come_back_whatever_stands_around_them(seed):
+    """Polynomials of many products, which a compiler may join with sums in more than one way.
+
+    Observables that share products with the force stand beside it. The control shows how little it
+    takes: a last bit of a coefficient.
+    """
+    rng = np.random.default_rng(seed)
+    size, terms = 1 + seed % 3, int(rng.integers(4, 9))
+    powers = rng.integers(0, 3, (terms, size))
+
+    def potential(q, factors):
+        total = jnp.sum(q**2) / 2 + jnp.sum(q**2) ** 2 / 10
+        for factor, power in zip(factors, powers, strict=True):
+            total = total + factor * jnp.prod(jnp.stack([q[i] ** k for i, k in enumerate(power)]))
+        return total
+
+    def energy(t0, t1, q0, p0, q1, p1, args):
+        return jnp.sum(p1**2) / 2 + p1[0] ** 4 / 50 + potential(q1, args)
+
+    system = dvi.System(lambda t0, t1, q, p, args: energy(t0, t1, q, p, q, p, args))
+    q, p = rng.normal(size=(2, 5, size)) / 2
+    factors = jnp.asarray(rng.normal(size=terms) / 50)
+
+    def run(q, p, h, factors, method):
+        def one(q, p):
+            sol = dvi.integrate(
+                system, q, p, h=h, num_steps=20_000, args=factors, method=method, save=FINAL,
+                arithmetic=dvi.FixedPoint(2.0**-48), observe=dvi.MaxDrift(energy),
+            )  # fmt: skip
+            return sol.qs[-1], sol.ps[-1]
+
+        return jax.vmap(one)(q, p)
+
+    h = 0.034
+    start = q, p = run(q, p, h, factors, dvi.Strang())  # on the grid
+    for method in (dvi.Strang(), dvi.Yoshida(4)):
+        forth = jax.jit(functools.partial(run, method=method))
+        back = jax.jit(functools.partial(run, method=dvi.Adjoint(method)))
+        far = forth(q, p, h, factors)
+        assert all(map(same_bits, start, forth(*far, -h, factors)))
+        assert all(map(same_bits, start, back(*far, -h, factors)))
+        nearly = factors.at[0].set(jnp.nextafter(factors[0], jnp.inf))
+        assert not any(map(same_bits, start, forth(*far, -h, nearly)))
+
+
 def test_a_force_of_time_comes_back_where_times_are_exact():
     """h a power of two, t0 a multiple of it: then t0 + kh forth and back are the same numbers."""
     s = dvi.System(pendulum, force=lambda t0, t1, q0, p1, args: jnp.cos(t0) + jnp.sin(t1) * q0)
