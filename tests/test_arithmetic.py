@@ -245,7 +245,7 @@ def there_and_back(orbit, methods, arithmetic, num_steps, batch=None):
     if batch is None:
         one, two = (jax.jit(lambda q, p, h, m=m: run(q, p, h, m)) for m in (forth, back))
     else:
-        q, p = (x * batch.reshape(-1, *[1] * x.ndim) for x in (q, p))
+        q, p = (x[None] * batch.reshape(-1, *[1] * x.ndim) for x in (q, p))
         one, two = (
             jax.jit(jax.vmap(lambda q, p, h, m=m: run(q, p, h, m), (0, 0, None)))
             for m in (forth, back)
@@ -265,7 +265,7 @@ def comes_back(*args, **kwargs):
 
 ROUTES = [
     pytest.param(
-        o, r, marks=[] if (o, r[:6]) in {("kepler", "Strang"), ("henon_heiles", "TypeII")}
+        o, r, marks=[] if (o, r[:6]) in {("kepler", "TypeII"), ("henon_heiles", "TypeII")}
         else [pytest.mark.slow],
     )
     for o in ORBITS
@@ -276,16 +276,15 @@ ROUTES = [
 @pytest.mark.parametrize(("orbit", "route"), ROUTES)
 def test_fixed_point_comes_back_bit_for_bit(orbit, route):
     """A million steps forth and as many back; plain and compensated sums do not come back."""
-    num_steps = 1_000_000 if orbit != "kepler" else 50_000
     methods = THERE_AND_BACK[route]
-    assert comes_back(orbit, methods, dvi.FixedPoint(QUANTUM), num_steps)
+    assert comes_back(orbit, methods, dvi.FixedPoint(QUANTUM), 1_000_000)
     assert not comes_back(orbit, methods, dvi.FloatingPoint(), 20_000)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("route", THERE_AND_BACK)
 def test_a_batch_in_fixed_point_comes_back_bit_for_bit(route):
-    batch = np.linspace(0.8, 1.2, 5)
+    batch = np.linspace(0.999, 1.001, 5)
     for orbit in ORBITS:
         methods = THERE_AND_BACK[route]
         assert comes_back(orbit, methods, dvi.FixedPoint(QUANTUM), 100_000, batch)
@@ -298,11 +297,12 @@ def test_random_forces_come_back_whatever_stands_around_them(seed):
     """Polynomials of many products, which a compiler may join with sums in more than one way.
 
     Observables that share products with the force stand beside it. The control shows how little it
-    takes: a last bit of a coefficient.
+    takes: the last bits of the coefficients.
     """
     rng = np.random.default_rng(seed)
     size, terms = 1 + seed % 3, int(rng.integers(4, 9))
     powers = rng.integers(0, 3, (terms, size))
+    powers[:, 0] += 1  # none is constant
 
     def potential(q, factors):
         total = jnp.sum(q**2) / 2 + jnp.sum(q**2) ** 2 / 10
@@ -335,7 +335,7 @@ def test_random_forces_come_back_whatever_stands_around_them(seed):
         far = forth(q, p, h, factors)
         assert all(map(same_bits, start, forth(*far, -h, factors)))
         assert all(map(same_bits, start, back(*far, -h, factors)))
-        nearly = factors.at[0].set(jnp.nextafter(factors[0], jnp.inf))
+        nearly = factors * (1 + 2.0**-50)
         assert not any(map(same_bits, start, forth(*far, -h, nearly)))
 
 
