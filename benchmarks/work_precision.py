@@ -19,8 +19,11 @@ in evaluations. Iterations are those that Newton's method reports, not assumed.
 
 Kicks that meet between two parts are counted twice, as they are computed.
 
-Times are those of a jitted run, medians over rounds in one process, after compilation; in each
-round every run is divided by one of `Strang` with REFERENCE_STEPS steps right before it.
+Times are those of a jitted run in one process, after compilation. Of a run that takes longer than
+SHORT its first part is timed, at the same step size, and scaled by evaluations: a part that fits
+between two interruptions by other work. In each round, and in another order each time, a run is
+the least of LEAST or of as many as fit into TAKEN seconds, divided by the least of the same for
+`Strang` with REFERENCE_STEPS steps, right before it; the median over rounds is shown.
 
 Run: python benchmarks/work_precision.py --out DIR
 """
@@ -49,8 +52,8 @@ jax.config.update("jax_enable_x64", True)
 
 JACOBIAN_WEIGHT = 1.0
 REFERENCE, REFERENCE_STEPS = "Strang", 8192
-SHORTEST = 1e-3
-"""Runs that are shorter are repeated until they are as long [s]."""
+SHORT, TAKEN, LEAST = 5e-4, 5e-3, 7
+"""How long a timed run is, if it can be; how long it is repeated in a round [s], how often."""
 
 PIECE = 8
 """Steps in a compiled piece: any multiple of it runs without a new compilation."""
@@ -222,6 +225,22 @@ class Run(NamedTuple):
     def __call__(self, num_steps):
         return self.function(self.problem.t_end / num_steps, num_steps // PIECE)
 
+    def first_part(self, num_steps):
+        """Pieces of a run of so many steps that take as long as SHORT; all, if they take less."""
+        h, pieces, whole = self.problem.t_end / num_steps, 1, num_steps // PIECE
+        while pieces < whole and self.seconds(h, pieces) < SHORT:
+            pieces = min(2 * pieces, whole)
+        return pieces
+
+    def seconds(self, h, pieces):
+        """The least time that so many pieces take [s]."""
+        taken = []
+        while sum(taken) < TAKEN or len(taken) < LEAST:
+            begin = time.perf_counter()
+            jax.block_until_ready(self.function(h, pieces))
+            taken.append(time.perf_counter() - begin)
+        return min(taken)
+
 
 def compiled(method: dvi.Method, problem: Problem) -> Run:
     """The run, compiled once for all numbers of steps."""
@@ -314,19 +333,27 @@ def timed(points: list[Point], runs: dict[str, Run], rounds: int) -> list[Point]
     shuffle = np.random.default_rng(0).permutation
     ratios: list[list[float]] = [[] for _ in points]
 
-    def seconds(run, num_steps, repeats):
-        begin = time.perf_counter()
-        for _ in range(repeats):
-            jax.block_until_ready(run(num_steps))
-        return (time.perf_counter() - begin) / repeats
+    def whole_run(method, num_steps, evaluations):
+        """How to time it: the run, its step, pieces that are timed, and what to scale them by."""
+        run = runs[method]
+        h, pieces = run.problem.t_end / num_steps, run.first_part(num_steps)
+        iterations = int(run.function(h, pieces)[2])
+        part = cost(METHODS[method], run.problem).evaluations(PIECE * pieces, iterations)
+        return run, h, pieces, evaluations / part
 
-    runs_of = [(runs[p.method], p.num_steps) for p in points]
-    repeats = [math.ceil(SHORTEST / seconds(*run, 1)) for run in runs_of]
+    say("  timing, how much of each run")
+    run = runs[REFERENCE]
+    iterations = int(run(REFERENCE_STEPS)[2])
+    work = cost(METHODS[REFERENCE], run.problem).evaluations(REFERENCE_STEPS, iterations)
+    unit = whole_run(REFERENCE, REFERENCE_STEPS, work)
+    whole_runs = [whole_run(p.method, p.num_steps, p.evaluations) for p in points]
     for k in range(rounds):
         say(f"  timing, round {k + 1} of {rounds}")
         for i in shuffle(len(points)):
-            unit = seconds(runs[REFERENCE], REFERENCE_STEPS, 1)
-            ratios[i].append(seconds(*runs_of[i], repeats[i]) / unit)
+            one, other = (
+                scale * run.seconds(h, pieces) for run, h, pieces, scale in (unit, whole_runs[i])
+            )
+            ratios[i].append(other / one)
     return [p._replace(time=statistics.median(r)) for p, r in zip(points, ratios, strict=True)]
 
 
@@ -474,7 +501,8 @@ def picture(points: list[Point], truth: Reference) -> plt.Figure:
             ax.set_xlabel(axes_of[of])
             ax.grid(True, which="major", color="0.93", lw=0.6)
             ax.set_axisbelow(True)
-            ax.legend(fontsize=7, frameon=False, loc="lower left", handlelength=1.8)
+            if ax in axes[0]:
+                ax.legend(fontsize=7, frameon=False, loc="lower left", handlelength=1.8)
             ax.spines[["top", "right"]].set_visible(False)
         row[0].set_ylabel("relative error at the end")
     axes[0, 0].set_ylim(truth.floor / 8, 1)
@@ -536,7 +564,7 @@ def main(words=None):
     parser.add_argument("--out", type=Path, required=True, help="folder for tables and pictures")
     parser.add_argument("--problem", choices=PROBLEMS, action="append", help="only this (repeat)")
     parser.add_argument("--method", choices=METHODS, action="append", help="only this (repeat)")
-    parser.add_argument("--rounds", type=int, default=9, help="of timing; 0 for none (default 9)")
+    parser.add_argument("--rounds", type=int, default=7, help="of timing; 0 for none (default 7)")
     parser.add_argument(
         "--quick", action="store_true", help="Hénon–Heiles, fewer steps, one round of timing"
     )
