@@ -45,6 +45,7 @@ from .methods import (
     Composition as Composition,
     GaussLegendre as GaussLegendre,
     KahanLi as KahanLi,
+    LobattoIIIAIIIB as LobattoIIIAIIIB,
     McLachlan as McLachlan,
     Method as Method,
     RungeKutta4 as RungeKutta4,

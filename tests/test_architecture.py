@@ -87,8 +87,9 @@ def test_door_has_no_logic():
 PUBLIC = """
 System discretise integrate Save Solution RESULTS IntegrationError Newton
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
-GaussLegendre RungeKutta4
-Uniform Given FloatingPoint Compensated FixedPoint
+GaussLegendre LobattoIIIAIIIB RungeKutta4
+Uniform Given TimeTransformed Variational FloatingPoint Compensated FixedPoint
+Section Stop Crossings LatticeCondition
 MaxDrift Range Trend Mean Last Reversible Checkpointed Direct
 Generator prolong determining_residual conformal_factor noether_identity AdiabaticInvariant
 generators random_pairs solution_pairs find_symmetries Symmetries Symmetry

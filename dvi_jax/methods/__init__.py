@@ -7,6 +7,7 @@ from ._composition import Composition as Composition
 from ._dissipation import warn_of_dissipation as warn_of_dissipation
 from ._gauss_legendre import GaussLegendre as GaussLegendre
 from ._kahan_li import KahanLi as KahanLi
+from ._lobatto_pair import LobattoIIIAIIIB as LobattoIIIAIIIB
 from ._mclachlan import McLachlan as McLachlan
 from ._runge_kutta4 import RungeKutta4 as RungeKutta4
 from ._strang import Strang as Strang

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from .._step import judge
-from .._types import Interval
 from ..engine.newton import find_root
 from ._base import Method
+from ._collocation import check_stages, continuous_rates, integrals
 
 _MOST_STAGES = 8
 """Order 16: up to there the conditions of order are tested."""
@@ -22,21 +22,13 @@ _MOST_STAGES = 8
 def _table(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     r"""Nodes c (s,), weights b (s,) and a (s, s), a_ij = ∫₀^{c_i} ℓ_j, in double precision.
 
-    With x = 2c − 1 the zeros of the Legendre polynomial P_s, and P_{−1} = −1,
-
-        a_ij = b_j Σ_{k<s} P_k(x_j) [P_{k+1}(x_i) − P_{k−1}(x_i)] / 2,
-
-    where no digits cancel; the sum telescopes in b_i a_ij + b_j a_ji = b_i b_j, the condition
-    of symplecticity, which then holds to round-off.
-
-    **Source** Hairer & Wanner 1996, *Solving ODEs II*, IV.5 (the W-transformation).
+    x = 2c − 1 are the zeros of the Legendre polynomial P_s, so that the sum in `integrals`
+    telescopes in b_i a_ij + b_j a_ji = b_i b_j, the condition of symplecticity, which then holds
+    to round-off.
     """
     x, weights = legendre.leggauss(stages)
     b = weights / 2
-    P = legendre.legvander(x, stages)  # (s, s + 1)
-    before = np.concatenate([-np.ones((stages, 1)), P[:, : stages - 1]], axis=1)
-    integrals = (P[:, 1:] - before) / 2
-    return (x + 1) / 2, b, b * (integrals @ P[:, :stages].T)
+    return (x + 1) / 2, b, integrals(x, b, stages)
 
 
 class GaussLegendre(Method):
@@ -81,12 +73,7 @@ class GaussLegendre(Method):
     is_invertible: ClassVar[bool] = True
 
     def __check_init__(self):
-        s = self.stages
-        if isinstance(s, bool) or not isinstance(s, int) or not 1 <= s <= _MOST_STAGES:
-            raise ValueError(
-                f"stages must be an integer from 1 to {_MOST_STAGES} (the order is twice that), "
-                f"got {s!r}."
-            )
+        check_stages(self.stages, 1, _MOST_STAGES, "twice that")
 
     @property
     def order(self) -> int:
@@ -100,10 +87,10 @@ class GaussLegendre(Method):
         z0 = jnp.stack([q0, p0])
         all_at_start = jnp.broadcast_to(z0, (self.stages, *z0.shape))
 
+        position_rate, momentum_rate = continuous_rates(equations, h)
+
         def rates(t, z):
-            now = Interval(t, t, jnp.zeros_like(h))
-            at = (now, z[0], z[1])
-            return jnp.stack([equations.position_rate(*at), equations.momentum_rate(*at)])
+            return jnp.stack([position_rate(t, *z), momentum_rate(t, *z)])
 
         def advanced(weights, stages):
             """z0 + h Σ_j weights_j (q̇, ṗ)_j: shape (2, *q0.shape), with weights' rows in front."""

@@ -30,11 +30,11 @@ class KeptSteps(Reduction):
     the end is the rows kept, NaN where there were fewer than the capacity, and the number of hits.
     """
 
-    capacity: eqx.AbstractVar[int]
-
-    if TYPE_CHECKING:  # there the abstract variable would stay an argument of every subclass
+    if TYPE_CHECKING:  # there abstract variables would stay arguments of every subclass
+        capacity: ClassVar[int]
         function: ClassVar[Callable[..., Any]]
     else:
+        capacity: eqx.AbstractVar[int]
 
         @property
         def function(self):

@@ -1,0 +1,54 @@
+"""What the methods of collocation share: their integrals, the continuous rates, the check of s."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.polynomial import legendre
+
+from .._step import Equations
+from .._types import Interval, Scalar, State
+
+
+def integrals(x: np.ndarray, b: np.ndarray, degree: int) -> np.ndarray:
+    r"""a_ij = ∫₀^{c_i} ℓ_j of the Lagrange polynomials ℓ_j at c = (x + 1)/2, in double precision.
+
+    With P_k the Legendre polynomials and P_{−1} = −1,
+
+        a_ij = b_j Σ_{k<degree} P_k(x_j) [P_{k+1}(x_i) − P_{k−1}(x_i)] / 2,
+
+    where no digits cancel. It is the expansion of ℓ_j in the P_k, each integrated: `degree` is s
+    for the s Gauss nodes; it is s − 1 for the s Lobatto nodes, at which the integral of the last
+    term, a multiple of (1 − x²) P'_{s−1}, is zero.
+
+    **Source** Hairer & Wanner 1996, *Solving ODEs II*, IV.5 (the W-transformation).
+    """
+    P = legendre.legvander(x, degree)  # (s, degree + 1)
+    before = np.concatenate([-np.ones((len(x), 1)), P[:, : degree - 1]], axis=1)
+    return b * ((P[:, 1:] - before) / 2 @ P[:, :degree].T)
+
+
+def continuous_rates(equations: Equations, like: Scalar) -> tuple[Callable, Callable]:
+    """∂H/∂p and −∂H/∂q + εW as functions of (t, q, p), with H(t, q, p) = H_D(t, t, q, p)."""
+
+    def at(t: Scalar) -> Interval:
+        return Interval(t, t, jnp.zeros_like(like))
+
+    def position_rate(t: Scalar, q: State, p: State) -> State:
+        return equations.position_rate(at(t), q, p)
+
+    def momentum_rate(t: Scalar, q: State, p: State) -> State:
+        return equations.momentum_rate(at(t), q, p)
+
+    return position_rate, momentum_rate
+
+
+def check_stages(stages: Any, least: int, most: int, order: str) -> None:
+    """Refuse a number of stages that there is no table of."""
+    whole = isinstance(stages, int) and not isinstance(stages, bool)
+    if not whole or not least <= stages <= most:
+        raise ValueError(
+            f"stages must be an integer from {least} to {most} (the order is {order}), "
+            f"got {stages!r}."
+        )

@@ -1,0 +1,178 @@
+"""The partitioned pair of Lobatto IIIA and IIIB methods."""
+
+import functools
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from numpy.polynomial import legendre
+
+from .._step import judge
+from ..engine.newton import RootInfo, find_root
+from ._base import Method
+from ._collocation import check_stages, continuous_rates, integrals
+
+_MOST_STAGES = 6
+"""Order 10: up to there the conditions of order are tested."""
+
+_SWEEPS = 3
+"""Fixed-point sweeps before Newton's method: they save it about one iteration of three."""
+
+
+class _Table(NamedTuple):
+    c: np.ndarray
+    b: np.ndarray
+    a: np.ndarray
+    a_hat: np.ndarray
+    last: np.ndarray
+
+
+@functools.cache
+def _table(stages: int) -> _Table:
+    r"""Nodes c, weights b, IIIA's a, IIIB's â and the weights of the last P, to round-off.
+
+    x = 2c − 1 are the ends ∓1 and the zeros of P'_{s−1}; b_i = 1/(s(s − 1) P_{s−1}(x_i)²). Then
+    a_ij = ∫₀^{c_i} ℓ_j, whose first row is zero and last row b, and from it, by the condition of
+    symplecticity b_i â_ij + b_j a_ji = b_i b_j,
+
+        â_ij = b_j (1 − a_ji / b_i),
+
+    whose first column is b_1 and last column zero. The P_i lie on a polynomial of degree s − 2, so
+    the last follows from the others: P_s = Σ_{i<s} last_i P_i.
+
+    **Source** Hairer & Wanner 1996, *Solving ODEs II*, IV.5; Hairer, Lubich & Wanner 2006, II.1.4.
+    """
+    top = np.zeros(stages)
+    top[-1] = 1  # P_{s−1}
+    slope = legendre.legder(top)
+    inner = legendre.legroots(slope)
+    inner = inner - legendre.legval(inner, slope) / legendre.legval(inner, legendre.legder(slope))
+    x = np.array([-1.0, *inner, 1.0])
+    x = (x - x[::-1]) / 2  # the nodes are symmetric: so to the last digit
+    b = 1 / (stages * (stages - 1) * legendre.legval(x, top) ** 2)
+    a = integrals(x, b, stages - 1)
+    ratio = integrals(x, np.ones(stages), stages - 1)  # a_ij / b_j
+    known = x[:-1]
+    apart = known[:, None] - known + np.eye(stages - 1)
+    last = np.prod(1 - known + np.diag(known), axis=1) / np.prod(apart, axis=1)
+    return _Table((x + 1) / 2, b, a, b * (1 - ratio.T), last)
+
+
+class LobattoIIIAIIIB(Method):
+    r"""The partitioned Lobatto IIIA–IIIB pair of s stages, of order 2s − 2.
+
+        q̇ = ∂H/∂p,   ṗ = −∂H/∂q + εW     with H(t, q, p) = H_D(t, t, q, p)
+
+        Q_i = q0 + h Σ_j a_ij ∂H/∂p (t_j, Q_j, P_j)               t_j = t0 + c_j h
+        P_i = p0 + h Σ_j â_ij (−∂H/∂q + εW)(t_j, Q_j, P_j)
+        q1 = q0 + h Σ_j b_j ∂H/∂p,    p1 = p0 + h Σ_j b_j (−∂H/∂q + εW)
+
+    The energy, a perturbation and the force are taken on the diagonal t0 = t1, as `GaussLegendre`
+    takes them; c, b and a are the nodes, weights and integrals of Lobatto quadrature (IIIA), and
+    â_ij = b_j (1 − a_ji / b_i) (IIIB). Q_1 = q0 and Q_s = q1. Symmetric; without a force
+    symplectic, and every invariant that is bilinear in q and p, angular momentum for instance, is
+    kept to round-off. Without a force it is the type II variational map (12)–(13) of another
+    discrete Hamiltonian, the value that is stationary in P_i and V_i of
+
+        Σ_i b_i [H(t_i, Q_i, P_i) − (P_i − p1)·V_i],    Q_i = q0 + h Σ_j a_ij V_j,
+
+    the action of curves q of degree s by Lobatto quadrature; for a regular Lagrangian it is the
+    variational integrator of that quadrature of ∫L dt.
+
+    Two stages are the generalised leapfrog, Störmer–Verlet (kick, drift, kick) for a separable H:
+    the map of `Strang` wherever H_D and W take no t1, and `Strang` has the smaller solves. Between
+    the ends the pair does what a composition of high order does, without parts backwards in time.
+
+    Each step solves for the stages at once by Newton's method: (s − 1) n real unknowns for q of n
+    components where q does not enter ∂H/∂p, a force in p and t included, and 2 (s − 1) n where it
+    does; `GaussLegendre(s − 1)`, of the same order, has 2 (s − 1) n in both cases. Two stages of a
+    separable H without a force in p need no solve.
+
+    **Arguments**
+
+    - `stages`: s, from 2 to 6.
+
+    **Raises** `ValueError` for any other number of stages. A solve that fails is told by the
+    status of the step.
+
+    **Accuracy** order 2s − 2 with a force too, which may depend on p and on time. The coefficients
+    hold to round-off.
+
+    **Source** Jay 1996, *SIAM J. Numer. Anal.* 33, 368; Hairer, Lubich & Wanner 2006, *Geometric
+    Numerical Integration*, II.2.2 (order), IV.2.2 (bilinear invariants), VI.4 and VI.6
+    (symplectic, variational).
+    """
+
+    stages: int = eqx.field(static=True, default=2)
+
+    is_symmetric: ClassVar[bool] = True
+    is_symplectic: ClassVar[bool] = True
+    is_invertible: ClassVar[bool] = True
+
+    def __check_init__(self):
+        check_stages(self.stages, 2, _MOST_STAGES, "twice that less two")
+
+    @property
+    def order(self) -> int:
+        return 2 * self.stages - 2
+
+    def step(self, equations, interval, q0, p0):
+        t0, t1, h = interval
+        s, table = self.stages, _table(self.stages)
+        b, a, a_hat, last = (jnp.asarray(part, q0.dtype) for part in table[1:])
+        times = t0 + jnp.asarray(table.c, t0.dtype) * (t1 - t0)
+        velocities, forces = map(jax.vmap, continuous_rates(equations, h))
+        momenta_suffice = equations.inverse_is_explicit(interval, q0)  # q is not in ∂H/∂p
+
+        def positions(Q, P):
+            return q0[None] + h * jnp.tensordot(a, velocities(times, Q, P), 1)
+
+        def momenta(Q, P):
+            known = forces(times[:-1], Q[:-1], P[:-1])  # the last column of â is zero
+            return p0[None] + h * jnp.tensordot(a_hat[:, :-1], known, 1)
+
+        def unknowns(Q, P):
+            """P_1, …, P_{s−1}, and Q_2, …, Q_s unless they follow from the P."""
+            return (P[:-1] if momenta_suffice else jnp.concatenate([P[:-1], Q[1:]])).ravel()
+
+        def at_stages(x):
+            x = x.reshape(-1, *q0.shape)
+            P = jnp.concatenate([x[: s - 1], jnp.tensordot(last, x[: s - 1], 1)[None]])
+            if momenta_suffice:
+                return positions(jnp.broadcast_to(q0, P.shape), P), P
+            return jnp.concatenate([q0[None], x[s - 1 :]]), P
+
+        def residual(x):
+            Q, P = at_stages(x)
+            return x - unknowns(positions(Q, P), momenta(Q, P))
+
+        def sweep(_, known):
+            Q = positions(*known)
+            return Q, momenta(Q, known[1])
+
+        start = tuple(jnp.broadcast_to(z, (s, *z.shape)) for z in (q0, p0))
+        if self._needs_no_solve(equations, interval, q0):  # one sweep finds P_1 = P_2
+            no_residual = jnp.zeros((), jnp.finfo(q0.dtype).dtype)
+            x = unknowns(*sweep(0, start))
+            info = RootInfo(jnp.asarray(0, jnp.int32), no_residual, jnp.asarray(True))
+        else:
+            guess = lax.fori_loop(0, _SWEEPS, sweep, lax.stop_gradient(start))
+            x, info = find_root(residual, unknowns(*guess), unknowns(*start), equations.newton)
+        Q, P = at_stages(x)
+        q1, p1 = Q[-1], p0 + h * jnp.tensordot(b, forces(times, Q, P), 1)
+        return q1, p1, judge(info, q1, p1)
+
+    def inverse(self, equations, interval, q1, p1):
+        return self.step(equations, interval.reversed(), q1, p1)
+
+    def _needs_no_solve(self, equations, interval, q) -> bool:
+        separable = equations.step_is_explicit(interval, q) and equations.inverse_is_explicit(
+            interval, q
+        )
+        return self.stages == 2 and separable
+
+    def _inverse_needs_no_solve(self, equations, interval, q) -> bool:
+        return self._needs_no_solve(equations, interval, q)
