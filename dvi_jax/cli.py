@@ -56,7 +56,7 @@ def run(
     from dvi_jax.run import InputError, run_file
 
     try:
-        with _Bar() as bar:
+        with _Bar("integrating") as bar:
             report = run_file(config, out=out, force=force, progress=bar.show)
     except InputError as error:
         if debug:
@@ -90,6 +90,56 @@ def paper(
         raise typer.Exit(BAD_INPUT) from None
 
 
+@app.command()
+def certify(
+    method: Annotated[
+        list[str] | None, typer.Option(help="A method to certify; may be repeated. All if none.")
+    ] = None,
+    check: Annotated[
+        list[str] | None, typer.Option(help="A check to make; may be repeated. All if none.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Markdown file, or directory, for the certificate.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="One method of each kind only.")] = False,
+) -> None:
+    """Measure what the methods promise: order, structure, long runs, gradients, compilation.
+
+    Each check is also shown to catch a method that is broken on purpose (the controls).
+
+    Exit code 0: all promises kept, all controls caught. 1: not so. 2: bad input.
+    """
+    _double_precision()
+    from dvi_jax.certify import QUICK, certify, page_for
+
+    if quick and method:
+        _complain("bad input", "give --quick or --method, not both.")
+        raise typer.Exit(BAD_INPUT)
+    try:
+        page = None if out is None else page_for(out)
+        with _Bar("certifying") as bar:
+            certificate = certify(QUICK if quick else method or None, check or None, bar.show)
+    except (ValueError, TypeError) as error:
+        _complain("bad input", str(error))
+        raise typer.Exit(BAD_INPUT) from None
+    console = _stdout()
+    _print_tables(console, certificate.tables())
+    for name, tried, measured in certificate.failures:
+        said = f"{name}, {tried}: {measured.verdict}, allowed {measured.allowed}. {measured.detail}"
+        console.print(said, markup=False, soft_wrap=True)
+    console.print(certificate.summary, markup=False, style="bold")
+    if page is not None:
+        try:
+            page.parent.mkdir(parents=True, exist_ok=True)
+            page.write_text(certificate.markdown(), encoding="utf-8")
+        except OSError as error:
+            _complain("failed", f"the certificate cannot be written: {error}")
+            raise typer.Exit(FAILED) from None
+        console.print(f"written to {page}", markup=False, soft_wrap=True)
+    if not certificate.ok:
+        raise typer.Exit(FAILED)
+
+
 def main() -> None:
     """The entry point ``dvi-jax``."""
     app()
@@ -111,13 +161,17 @@ def _complain(what: str, message: str) -> None:
     console.print(Text.assemble((f"{what}: ", "bold red"), message), soft_wrap=True)
 
 
-def _print(report: Any) -> None:
+def _stdout() -> Any:
     from rich.console import Console
+
+    return Console(highlight=False)
+
+
+def _print_tables(console: Any, tables: Any) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    console = Console(highlight=False)
-    for table in report.tables:
+    for table in tables:
         console.print(table.title, style="bold", markup=False, soft_wrap=True)
         shown = Table()
         for i, column in enumerate(table.columns):
@@ -125,6 +179,11 @@ def _print(report: Any) -> None:
         for row in table.rows:
             shown.add_row(*(escape(cell) for cell in row))
         console.print(shown)
+
+
+def _print(report: Any) -> None:
+    console = _stdout()
+    _print_tables(console, report.tables)
     for note in report.notes:
         console.print(note, markup=False, style="bold")
     stats = report.contents["stats"]
@@ -139,6 +198,9 @@ def _print(report: Any) -> None:
 class _Bar:
     """A progress bar on stderr that appears with the first call."""
 
+    def __init__(self, doing: str):
+        self.doing = doing
+
     def __enter__(self) -> "_Bar":
         self.progress = None
         return self
@@ -150,7 +212,7 @@ class _Bar:
         if self.progress is None:
             self.progress = Progress(console=Console(stderr=True), transient=True)
             self.progress.start()
-            self.task = self.progress.add_task("integrating", total=total)
+            self.task = self.progress.add_task(self.doing, total=total)
         self.progress.update(self.task, completed=done)
 
     def __exit__(self, *_: object) -> None:
