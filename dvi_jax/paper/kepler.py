@@ -299,35 +299,24 @@ def repulsion(tick: Tick) -> Repulsion:
 
 
 def variational_mesh(tick: Tick) -> VariationalMesh:
-    """How far the steps that (14) asks for stay real, with this H_D of first order.
-
-    H_D is autonomous, so (14) says H_k = H_{k−1} = E, which with p1 = p0 − h∇V(q0) is the
-    quadratic |∇V|²h²/2 − (p0·∇V)h + |p0|²/2 + V − E = 0; of its roots the one nearest to the
-    last step is taken. Undisturbed; closed form, so that a failure is the equation's own.
-    """
+    """How far the steps that (14) asks for stay real, with this H_D of first order, undisturbed."""
     problem = systems.kepler()
     limit = 5000
     ends = []
     hs = np.array([0.1, 0.01])
     for i, first in enumerate(hs):
-        q, p, t, h, energy = np.array(problem.q0), np.array(problem.p0), 0.0, first, None
-        for k in range(limit):
-            gradient = q / np.linalg.norm(q) ** 3
-            if energy is not None:
-                a, b = gradient @ gradient, p @ gradient
-                c = p @ p / 2 - 1 / np.linalg.norm(q) - energy
-                inside = b * b - 2 * a * c
-                if inside < 0:
-                    ends.append((k, t))
-                    break
-                roots = (b + np.array([-1, 1]) * np.sqrt(inside)) / a
-                h = roots[np.argmin(np.abs(roots - h))]
-            p = p - h * gradient
-            if energy is None:
-                energy = p @ p / 2 - 1 / np.linalg.norm(q)
-            q, t = q + h * p, t + h
-        else:
-            ends.append((np.inf, np.inf))
+        solution = dvi.integrate(
+            problem.system,
+            problem.q0,
+            problem.p0,
+            h=first,
+            num_steps=limit,
+            args=problem.args,
+            lattice=dvi.Variational(),
+            throw=False,
+        )
+        k = int(solution.stats["failed_step"])
+        ends.append((np.inf, np.inf) if k < 0 else (k, float(solution.ts[k])))
         tick((i + 1) / len(hs))
     steps, times = np.array(ends, float).T
     return VariationalMesh(hs, steps, times, limit)
