@@ -93,7 +93,7 @@ class Compensated(Arithmetic):
 
 
 class FixedPoint(Arithmetic):
-    r"""Fixed point: the state moves on a grid, and what is explicit goes back bit for bit.
+    r"""Fixed point: the state moves on a grid, by steps that can be undone bit for bit.
 
     Positions and momenta are whole multiples of `quantum`, and so is each change of them,
 
@@ -103,11 +103,12 @@ class FixedPoint(Arithmetic):
     and a step and its inverse undo each other without any rounding; so do steps by h and −h of a
     symmetric method. The map is one to one on the grid.
 
-    What it takes is that a rate has the same bits whenever it is evaluated at one point. Only the
-    compiler could change that, which may join a product and a sum into one operation or not,
-    depending on what stands around; runs of a million steps have come back on CPUs that do so.
-    Where the force depends on time, the times forth and back must be the same numbers: h a power of
-    two, t0 a multiple of it, and parts of a step likewise (`TypeII`, `Adjoint`, `Strang`).
+    What it takes is that a rate has the same bits whenever it is evaluated at one point. A compiler
+    that joins a product and a sum into one operation (FMA), or not, by what stands around, breaks
+    that for some forces: run back to see, or forbid it, on x86 CPUs by the environment variable
+    XLA_FLAGS=--xla_cpu_max_isa=AVX. Where the force depends on time, the times forth and back must
+    be the same numbers: h a power of two, t0 a multiple of it, and parts of a step likewise
+    (`TypeII`, `Adjoint`, `Strang`).
 
     **Arguments**
 
