@@ -319,14 +319,14 @@ def test_without_joined_products_random_forces_come_back():
 
 @pytest.mark.slow
 @pytest.mark.skipif(joins_products_and_sums(), reason="holds for sure without FMA only")
-def test_random_forces_come_back_bit_for_bit(seed=1):
+def test_random_forces_come_back_bit_for_bit():
     """Polynomials of many products, with observables beside them that share products.
 
     With FMA this one did not come back: the force was compiled in more than one way. The control
     shows how little it takes: the last bits of the coefficients.
     """
-    rng = np.random.default_rng(seed)
-    size, terms = 1 + seed % 3, int(rng.integers(4, 9))
+    rng = np.random.default_rng(1)
+    size, terms = 2, int(rng.integers(4, 9))
     powers = rng.integers(0, 3, (terms, size))
     powers[:, 0] += 1  # none is constant
 
