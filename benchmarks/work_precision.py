@@ -364,13 +364,14 @@ def measure(name, methods, budgets, rounds) -> tuple[list[Point], Reference]:
     say(f"{problem.title}: reference known to {truth.floor:.1e}")
     runs = {}
     points = []
-    for i, method in enumerate([REFERENCE, *(m for m in methods if m != REFERENCE)]):
+    wanted = [REFERENCE, *(m for m in methods if m != REFERENCE)]
+    for i, method in enumerate(wanted):
         begin = time.perf_counter()
         runs[method] = compiled(METHODS[method], problem)
         found = sweep(name, method, runs[method], truth, budgets)
         points += found if method in methods else []
         say(
-            f"  {i + 1:2d}/{len(methods)} {method}: {len(found)} points, slope "
+            f"  {i + 1:2d}/{len(wanted)} {method}: {len(found)} points, slope "
             f"{slope(found, truth.floor, 'num_steps'):.2f}, {time.perf_counter() - begin:.1f} s"
         )
     return (timed(points, runs, rounds) if rounds else points), truth
@@ -501,7 +502,7 @@ def picture(points: list[Point], truth: Reference) -> plt.Figure:
             ax.set_xlabel(axes_of[of])
             ax.grid(True, which="major", color="0.93", lw=0.6)
             ax.set_axisbelow(True)
-            if ax in axes[0]:
+            if ax in axes[0] and inside:
                 ax.legend(fontsize=7, frameon=False, loc="lower left", handlelength=1.8)
             ax.spines[["top", "right"]].set_visible(False)
         row[0].set_ylabel("relative error at the end")
