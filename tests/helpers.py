@@ -1,7 +1,6 @@
-"""The registries that tests parametrise over, and the oracles they compare with.
+"""The systems and methods that tests parametrise over, and the oracles they compare with.
 
-A new method or system is tested for order, symplecticity, reversal, gradients, batching and
-tracing by being listed here.
+All methods are in `dvi_jax.certify.METHODS`: being listed there, a new one is certified and tested.
 """
 
 import jax
@@ -9,32 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax import systems
-
-
-class ExplicitEuler(dvi.Method):
-    """The negative control: first order, not symplectic, not symmetric."""
-
-    order: int = 1
-    is_symmetric: bool = False
-    is_symplectic: bool = False
-    is_invertible: bool = False
-
-    def step(self, equations, interval, q0, p0):
-        from dvi_jax._step import no_step_yet
-
-        q1 = q0 + interval.h * equations.position_rate(interval, q0, p0)
-        p1 = p0 + interval.h * equations.momentum_rate(interval, q0, p0)
-        return q1, p1, no_step_yet(q0)
-
-    def inverse(self, equations, interval, q1, p1):
-        raise TypeError
-
-    def _needs_no_solve(self, equations, interval, q):
-        return True
-
-    def _inverse_needs_no_solve(self, equations, interval, q):
-        return False
+from dvi_jax import certify, systems
 
 
 def non_separable(t0, t1, q0, p1, args):
@@ -69,16 +43,9 @@ SYSTEMS = {
 }
 ARGS = {"K": 1.0}
 
-METHODS = {
-    "TypeII": dvi.TypeII(),
-    "Adjoint": dvi.Adjoint(),
-    "Strang": dvi.Strang(),
-    "Yoshida4": dvi.Yoshida(4),
-    "Composition": dvi.Composition((0.3, 0.2, 0.2, 0.3), order=2),
-    "RungeKutta4": dvi.RungeKutta4(),
-}
-SYMPLECTIC = {k: m for k, m in METHODS.items() if m.is_symplectic}
-INVERTIBLE = {k: m for k, m in METHODS.items() if m.is_invertible}
+IN_EVERY_RUN = ("TypeII", "Adjoint", "Strang", "Yoshida4", "Composition2", "RungeKutta4")
+METHODS = {name: certify.METHODS[name] for name in IN_EVERY_RUN}
+"""Those that run on every system in the quick tests too."""
 
 ADJOINTS = {
     "Direct": dvi.Direct(),

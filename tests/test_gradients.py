@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ADJOINTS, ARGS, METHODS, SYSTEMS, central_difference
+from helpers import ADJOINTS, ARGS, SYSTEMS, central_difference
 from jax.flatten_util import ravel_pytree
 
 import dvi_jax as dvi
@@ -33,7 +33,7 @@ OBSERVE = {
 EVERY_FOURTH = dvi.Save(every=4, final=True)
 
 
-def loss(x, system, adjoint, method=dvi.TypeII(), save=EVERY_FOURTH, observe=True):
+def loss(x, system, adjoint, save=EVERY_FOURTH, observe=True):
     """A number that every saved and observed value enters, with weights of its own."""
     q, p, h, t0, epsilon, K = x
     sol = dvi.integrate(
@@ -46,7 +46,6 @@ def loss(x, system, adjoint, method=dvi.TypeII(), save=EVERY_FOURTH, observe=Tru
         epsilon=epsilon,
         args={"K": K},
         adjoint=adjoint,
-        method=method,
         save=save,
         observe=OBSERVE if observe else None,
     )
@@ -107,29 +106,6 @@ def test_reversible_gradient_for_every_way_of_saving(save):
     b = jax.grad(lambda x: loss(x, "kepler", ADJOINTS["Direct"], save=save))(x)
     for u, v in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_allclose(u, v, rtol=1e-11, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "method",
-    [
-        pytest.param(
-            m, marks=[pytest.mark.slow] if m in ("Composition", "Yoshida4", "RungeKutta4") else []
-        )
-        for m in METHODS
-    ],
-)
-def test_gradient_through_every_method(method):
-    """RungeKutta4, which has no inverse, is differentiated by checkpoints under the default."""
-    x = point("pendulum")
-    m = METHODS[method]
-    adjoint = dvi.Reversible(checkpoint_every=5)
-    value = jax.jit(lambda x: loss(x, "pendulum", adjoint, m, dvi.Save(final=True), observe=False))
-    ones = jax.tree.map(jnp.ones_like, x)
-    expected = central_difference(value, x, ones)
-    backward = sum(float(jnp.sum(g)) for g in jax.tree.leaves(jax.grad(value)(x)))
-    forward = float(jax.jvp(value, (x,), (ones,))[1])
-    assert abs(backward - expected) <= 1e-6 * abs(expected)
-    assert abs(forward - backward) <= 1e-10 * abs(backward)
 
 
 @pytest.mark.slow

@@ -1,0 +1,340 @@
+"""Every method under every check, the methods that are broken on purpose, and the command."""
+
+import functools
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from typer.testing import CliRunner
+
+import dvi_jax as dvi
+from dvi_jax.certify import (
+    CHECKS,
+    CONTROLS,
+    METHODS,
+    QUICK,
+    Candidate,
+    Control,
+    Measured,
+    altered,
+    certificate as certificate_module,
+    certify,
+    orders,
+    page_for,
+    problems,
+)
+from dvi_jax.certify.checks import GROUPS
+from dvi_jax.certify.table import TITLE
+from dvi_jax.cli import app
+
+PAGE = Path(__file__).parent.parent / "docs" / "certificate.md"
+
+
+@functools.cache
+def candidate(name):
+    return Candidate(METHODS[name])
+
+
+IN_EVERY_RUN = {
+    ("KahanLi8", "order"),
+    ("KahanLi8", "forced-order"),
+    ("KahanLi8", "reversal"),
+    ("GaussLegendre2", "forced-order"),
+    ("RungeKutta4", "order"),
+    ("Yoshida4", "energy"),
+    ("Yoshida4", "momentum"),
+    *(("TypeII", check) for check in CHECKS),
+}
+
+
+@pytest.mark.parametrize(
+    ("method", "check"),
+    [
+        pytest.param(m, c, marks=[] if (m, c) in IN_EVERY_RUN else [pytest.mark.slow])
+        for m in METHODS
+        for c in CHECKS
+    ],
+)
+def test_method_keeps_what_it_promises(method, check):
+    measured = CHECKS[check](candidate(method))
+    assert measured.ok, measured
+
+
+def is_quick(control):
+    """Whether the control takes a second, and is not the second of its check."""
+    slow = control.check in ("forced-order", "gradient", "modes")
+    return not slow and control.name not in (
+        "Strang said to be of order 1",
+        "KahanLi8 with third digits changed, said to be of order 8",
+        "explicit Euler in place of TypeII",
+    )
+
+
+@pytest.mark.parametrize(
+    "control",
+    [pytest.param(c, marks=[] if is_quick(c) else [pytest.mark.slow]) for c in CONTROLS],
+    ids=lambda c: f"{c.check}-{c.name}".replace(" ", "-"),
+)
+def test_broken_method_is_caught_by_a_number(control):
+    """Not by an exception: its verdict is FAIL, with something measured."""
+    measured = CHECKS[control.check](Candidate(control.method))
+    assert measured.claimed
+    assert measured.verdict == "FAIL", measured
+
+
+def test_every_check_has_a_control_and_a_place():
+    assert {c.check for c in CONTROLS} == set(CHECKS)
+    assert [name for group in GROUPS.values() for name in group] == list(CHECKS)
+    assert set(QUICK) <= set(METHODS)
+
+
+@pytest.mark.slow
+def test_order_of_the_force_alone_can_be_wrong():
+    """The control of the forced order passes without the force: that check sees what this does."""
+    (control,) = (c for c in CONTROLS if c.check == "forced-order")
+    assert orders.order(Candidate(control.method)).passed
+
+
+@pytest.mark.parametrize("epsilon", [0.0, problems.FORCED])
+def test_reference_agrees_with_scipy(epsilon):
+    gradient = jax.jit(jax.grad(problems.coupled, argnums=(2, 3)))
+
+    def field(t, z):
+        q, p = np.split(z, 2)
+        dq, dp = gradient(t, t, q, p, problems.A)
+        return np.concatenate([dp, -dq + epsilon * problems.damping(t, t, q, p, problems.A)])
+
+    start = np.concatenate(problems.TWO)
+    by_scipy = solve_ivp(field, (0, problems.SPAN), start, "DOP853", rtol=1e-13, atol=1e-14)
+    ours, doubt = problems.reference(epsilon)
+    assert doubt < 1e-14
+    np.testing.assert_allclose(ours.ravel(), by_scipy.y[:, -1], rtol=0, atol=2e-12)
+
+
+# What must not pass
+
+
+def _nan(method, equations, interval, q, p):
+    q, p, info = method.step(equations, interval, q, p)
+    return q * jnp.nan, p, info
+
+
+NAN = altered(dvi.TypeII(), _nan, is_symmetric=True)
+FAST = ("order", "forced-order", "reversal", "adjoint", "energy", "momentum")
+
+
+@pytest.fixture(scope="module")
+def nan_candidate():
+    return Candidate(NAN)
+
+
+@pytest.mark.parametrize(
+    "check",
+    [pytest.param(c, marks=[] if c in FAST else [pytest.mark.slow]) for c in CHECKS],
+)
+def test_nan_never_passes(check, nan_candidate):
+    measured = CHECKS[check](nan_candidate)
+    if check == "traces":  # no number of the state enters
+        assert measured.passed
+    else:
+        assert measured.verdict == "NOT MEASURED"
+        assert not measured.ok
+
+
+def test_too_few_points_above_round_off_are_no_measurement():
+    """The Gauss method of order 16 is there after a few steps."""
+    accurate = Candidate(dvi.GaussLegendre(8))
+    accurate.__dict__["flow"] = problems._most_accurate()
+    measured = orders.order(accurate)
+    assert measured.verdict == "NOT MEASURED"
+    assert re.search(r"^\d points above round-off, at least 6 needed", measured.detail)
+
+
+def test_a_passed_value_is_a_number():
+    with pytest.raises(ValueError, match="cannot have passed"):
+        Measured(np.nan, "≤ 1", True)
+    with pytest.raises(ValueError, match="cannot have passed"):
+        Measured(np.inf, "≤ 1", True)
+
+
+def _broken(method, equations, interval, q, p):
+    raise RuntimeError("no luck\nat all")
+
+
+def test_an_exception_is_a_failure_that_names_itself():
+    measured = CHECKS["reversal"](Candidate(altered(dvi.Strang(), _broken)))
+    assert measured.verdict == "NOT MEASURED"
+    assert measured.detail == "RuntimeError: no luck"
+
+
+def test_what_is_not_promised_is_measured_and_no_failure():
+    foil = candidate("RungeKutta4")
+    measured = CHECKS["reversal"](foil)
+    assert measured.verdict == "not claimed"
+    assert 1e-9 < measured.value < 1e-4
+    assert measured.ok
+    assert not measured.passed
+    assert CHECKS["adjoint"](foil).verdict == "not claimed"
+
+
+# The function
+
+
+CHEAP = ["reversal", "energy"]
+
+
+def test_certify_a_method_of_ones_own():
+    mine = dvi.Composition((0.2, 0.3, 0.3, 0.2), order=2)
+    seen = []
+    found = certify({"mine": mine}, CHEAP, lambda done, total: seen.append((done, total)))
+    assert found.ok
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert found.rows["mine"]["reversal"].value <= 1e-12
+    assert found.summary.splitlines() == [
+        "methods: 1 of 1 keep what they promise",
+        "controls: 2 of 2 caught",
+    ]
+    page = str(found)
+    assert page.startswith(TITLE)
+    assert "| mine | pass " in page
+    assert "RungeKutta4 said to be symplectic" in page
+    assert "max \\|z" not in page  # escaped in tables only
+    assert "symplecticity" not in page.split("## Your own method")[0].split("## What")[0]
+
+
+def test_certify_tells_a_false_promise():
+    liar = altered(dvi.TypeII(), is_symmetric=True)
+    found = certify({"liar": liar, "honest": dvi.TypeII()}, ["reversal"])
+    assert not found.ok
+    ((method, check, measured),) = found.failures
+    assert (method, check) == ("liar", "reversal")
+    assert measured.value > 1e-3
+    assert "| liar | FAIL" in str(found)
+    assert "## Failures" in str(found)
+    assert "| honest | not claimed (" in str(found)
+
+
+def test_a_control_that_passes_is_told(monkeypatch):
+    healthy = (Control("Strang as it is", "reversal", dvi.Strang()),)
+    monkeypatch.setattr(certificate_module, "CONTROLS", healthy)
+    found = certify(["RungeKutta4"], ["reversal"])
+    assert not found.ok
+    assert not found.failures
+    assert [c.name for c in found.missed] == ["Strang as it is"]
+    assert "controls: 0 of 1 caught" in found.summary
+    assert "MISSED" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("methods", "checks", "error", "said"),
+    [
+        (["yoshida4"], None, ValueError, r"no method 'yoshida4' \(did you mean Yoshida4\?\)"),
+        (["Euler"], None, ValueError, "known are TypeII, Adjoint"),
+        (None, ["symmetry"], ValueError, "no check 'symmetry'.*known are order, forced-order"),
+        ([], None, ValueError, "no method was named"),
+        ({}, None, ValueError, "no method was given"),
+        (None, [], ValueError, "no check was named"),
+        ("TypeII", None, TypeError, "must be a list of names"),
+        (dvi.TypeII(), None, TypeError, "give the method a name"),
+        ({"mine": dvi.TypeII}, None, TypeError, "'mine' must be a method such as"),
+        ({"m": altered(dvi.TypeII(), order="2")}, None, TypeError, "order of 'm' must be a num"),
+        ({"m": altered(dvi.TypeII(), order=0)}, None, ValueError, "order of 'm' must be positive"),
+    ],
+)
+def test_bad_input(methods, checks, error, said):
+    with pytest.raises(error, match=said):
+        certify(methods, checks)
+
+
+def test_single_precision_is_refused():
+    with jax.enable_x64(False), pytest.raises(ValueError, match="x64 is off"):
+        certify(["TypeII"], ["reversal"])
+
+
+# The command
+
+
+def command(*words):
+    return CliRunner().invoke(app, ["certify", *map(str, words)], env={"COLUMNS": "150"})
+
+
+def test_command_writes_the_page(tmp_path):
+    page = tmp_path / "sub" / "page.md"
+    result = command("--method", "RungeKutta4", "--check", "reversal", "--out", page)
+    assert result.exit_code == 0, result.output
+    for said in ("not claimed", "caught", "controls: 1 of 1 caught", f"written to {page}"):
+        assert said in result.output.replace("\n", " ")
+    assert page.read_text(encoding="utf-8").startswith(TITLE)
+    assert page_for(page) == page  # a certificate may be replaced by a newer one
+    assert page_for(tmp_path) == page_for(tmp_path / "new").parent.parent / "certificate.md"
+
+
+def test_command_fails_with_a_method(monkeypatch):
+    monkeypatch.setitem(METHODS, "Liar", altered(dvi.TypeII(), is_symmetric=True))
+    result = command("--method", "Liar", "--check", "reversal")
+    assert result.exit_code == 1
+    assert "Liar, reversal: FAIL, allowed ≤ 1e-12" in result.output
+    assert "methods: 0 of 1 keep" in result.output
+
+
+def test_command_refuses_bad_input(tmp_path):
+    other = tmp_path / "README.md"
+    other.write_text("# My notes\n", encoding="utf-8")
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    for words, said in [
+        (("--method", "strang"), "did you mean Strang"),
+        (("--check", "energies"), "did you mean energy"),
+        (("--quick", "--method", "Strang"), "give --quick or --method, not both"),
+        (("--out", other), "exists and is no certificate"),
+        (("--out", tmp_path / "file"), "neither a directory nor a .md file"),
+    ]:
+        result = command(*words)
+        assert result.exit_code == 2, words
+        assert said in result.output.replace("\n", " ")
+    assert other.read_text(encoding="utf-8") == "# My notes\n"
+
+
+@pytest.mark.slow
+def test_quick_command():
+    result = command("--quick", "--check", "order")
+    assert result.exit_code == 0, result.output
+    assert "methods: 5 of 5 keep" in result.output
+    assert "controls: 3 of 3 caught" in result.output
+
+
+# The page in the documentation
+
+
+def test_the_page_is_of_the_methods_and_checks_that_there_are():
+    """Made anew by `dvi-jax certify --out docs/certificate.md` when this fails."""
+    page = PAGE.read_text(encoding="utf-8")
+    head, *sections = re.split(r"^## ", page, flags=re.MULTILINE)
+    assert head.startswith(TITLE)
+    assert f"methods: {len(METHODS)} of {len(METHODS)} keep" in head
+    assert f"controls: {len(CONTROLS)} of {len(CONTROLS)} caught" in head
+    by_title = {section.partition("\n")[0]: section for section in sections}
+    assert "Failures" not in by_title
+    for title, checks in GROUPS.items():
+        columns, _, *rows = [
+            [cell.strip() for cell in line.strip("|").split("|")]
+            for line in by_title[title].splitlines()
+            if line.startswith("|")
+        ]
+        assert [c for c in columns if c in CHECKS] == list(checks)
+        assert [row[0] for row in rows] == list(METHODS)
+        for row in rows:
+            for name, cell in zip(columns, row, strict=True):
+                assert name not in CHECKS or cell.startswith(("pass", "not claimed")), row
+    assert by_title["Controls"].count("| caught |") == len(CONTROLS)
+
+
+@pytest.mark.slow
+def test_the_example_on_the_page_runs():
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    scope = {}
+    exec(code, scope)
+    assert scope["certificate"].ok
