@@ -19,7 +19,12 @@ from dvi_jax._arithmetic import _exact_sum
 from dvi_jax._step import Equations, _increment, to_grid
 from dvi_jax._types import Interval
 
-METHODS = {**REGISTERED, "KahanLi6": dvi.KahanLi(6), "GaussLegendre2": dvi.GaussLegendre(2)}
+METHODS = {
+    **REGISTERED,
+    "KahanLi6": dvi.KahanLi(6),
+    "GaussLegendre2": dvi.GaussLegendre(2),
+    "Lobatto3": dvi.LobattoIIIAIIIB(3),
+}
 QUANTUM = 2.0**-46
 FINAL = dvi.Save(final=True)
 

@@ -160,7 +160,8 @@ class LobattoIIIAIIIB(Method):
             info = RootInfo(jnp.asarray(0, jnp.int32), no_residual, jnp.asarray(True))
         else:
             guess = lax.fori_loop(0, _SWEEPS, sweep, lax.stop_gradient(start))
-            x, info = find_root(residual, unknowns(*guess), unknowns(*start), equations.newton)
+            known = (jnp.broadcast_to(z, (s, *z.shape)) for z in equations.absolute(q0, p0))
+            x, info = find_root(residual, unknowns(*guess), unknowns(*known), equations.newton)
         Q, P = at_stages(x)
         q1, p1 = Q[-1], p0 + h * jnp.tensordot(b, forces(times, Q, P), 1)
         return q1, p1, judge(info, q1, p1)
