@@ -1,5 +1,6 @@
 """The trajectory inside of its steps: crossings, requested times, the point where it stopped."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -25,7 +26,8 @@ class Curve:
     """
 
     def __init__(self, method: Method, equations: Equations):
-        self.method, self.equations = method, equations
+        # On a grid of its own the curve would be a staircase: between lattice points it is smooth.
+        self.method, self.equations = method, dataclasses.replace(equations, quantum=None)
 
     def point(self, start: Start, theta: Scalar) -> Point:
         """(t, q, p) at the fraction θ of the step."""

@@ -29,6 +29,9 @@ METHODS: dict[str, dvi.Method] = {
     "GaussLegendre2": dvi.GaussLegendre(2),
     "GaussLegendre3": dvi.GaussLegendre(3),
     "GaussLegendre4": dvi.GaussLegendre(4),
+    "LobattoIIIAIIIB2": dvi.LobattoIIIAIIIB(2),
+    "LobattoIIIAIIIB3": dvi.LobattoIIIAIIIB(3),
+    "LobattoIIIAIIIB4": dvi.LobattoIIIAIIIB(4),
     "RungeKutta4": dvi.RungeKutta4(),
 }
 """The methods of the package. Another one is one line."""
