@@ -1,5 +1,11 @@
 """Differentiable variational integrators for disturbed Hamiltonian systems."""
 
+from ._adapters import (
+    from_lagrangian as from_lagrangian,
+    from_type_iii as from_type_iii,
+    legendre as legendre,
+    velocity_force as velocity_force,
+)
 from ._adjoints import (
     Checkpointed as Checkpointed,
     Direct as Direct,

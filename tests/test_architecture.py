@@ -13,7 +13,7 @@ FLOORS = [
     ["_precision"],
     ["engine"],
     ["_system", "_solution"],
-    ["_discretise", "_energies", "_step"],
+    ["_discretise", "_adapters", "_energies", "_step"],
     ["methods", "lattices", "symmetry", "observe"],
     ["_arithmetic"],
     ["_rollout", "_extended", "_dense"],
@@ -86,6 +86,7 @@ def test_door_has_no_logic():
 
 PUBLIC = """
 System discretise integrate Save Solution RESULTS IntegrationError Newton
+legendre from_lagrangian from_type_iii velocity_force
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
 GaussLegendre LobattoIIIAIIIB RungeKutta4
 Uniform Given TimeTransformed Variational FloatingPoint Compensated FixedPoint
