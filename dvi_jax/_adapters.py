@@ -14,6 +14,7 @@ from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
 from .engine.dependence import depends_on
 from .engine.linear import solve_dense
 from .engine.newton import Newton, Vector, find_root
+from .engine.signature import accepts
 
 _NEAR = 1e-4
 """Part of the first defect at which the damped search hands over to Newton's method."""
@@ -133,7 +134,7 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
 
     **Source** the paper, (36); Marsden & West 2001, *Acta Numerica* 10, 357, 1.4.
     """
-    discrete, continuous = (_takes(L, count) for count in (5, 4))
+    discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
         raise TypeError(
             "L must be a discrete Lagrangian (t0, t1, q0, v, args) or a continuous one "
@@ -353,17 +354,6 @@ def _require_scalar(value: Any, name: str, shape: tuple[int, ...], what: str) ->
     return value
 
 
-def _takes(function: Any, count: int) -> bool:
-    """Whether a function can be called with `count` positional arguments."""
-    if not callable(function):
-        return False
-    try:
-        inspect.signature(function).bind(*range(count))
-    except (TypeError, ValueError):
-        return False
-    return True
-
-
 def _described(function: Any) -> str:
     try:
         return f"{function.__name__}{inspect.signature(function)}"
@@ -373,5 +363,5 @@ def _described(function: Any) -> str:
 
 def _require(function: Any, name: str, arguments: str) -> None:
     """Refuse what is no function of five arguments."""
-    if not _takes(function, 5):
+    if not (callable(function) and accepts(function, 5)):
         raise TypeError(f"{name} must be a function {arguments}, got {_described(function)}.")
