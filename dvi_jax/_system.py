@@ -55,8 +55,9 @@ class System(eqx.Module):
         functions = (self.H_D, self.perturbation)
         if self.slow_time and any(getattr(f, "step_is_from_times", False) for f in functions):
             raise ValueError(
-                "dvi.discretise(H, order) of order 2 and up takes the step from t1 − t0, which is "
-                "not the step in a slow time: use order=1, and compose the map for a higher order."
+                "dvi.discretise(H, order) of order 2 and up, dvi.from_lagrangian and "
+                "dvi.from_type_iii take the step from t1 − t0, which is not the step in a slow "
+                "time: use order=1, and compose the map for a higher order."
             )
 
     def hamiltonian(
