@@ -12,6 +12,10 @@ the force W where there is one:
     explicit part of a step       1 (a half for p, a half for q)
     implicit part of a step       1.5 (guess, residual, other half) and (1 + n w)/2 an iteration
     Gauss, s stages               3 s (guess, residual, end) and s + 2 s n · s w an iteration
+    Lobatto pair, s stages        4 m + s/2 (guess, residual, end) and m + 2 (s − 1) n · m w an
+                                  iteration, m = s − 1/2
+      where q is not in ∂H/∂p     4 m + s and m + (s − 1) n · m w an iteration
+      two stages without a solve  3.5
     RungeKutta4                   4
 
 with n the dimension of q and w = JACOBIAN_WEIGHT what one column of a Jacobian costs at one point,
@@ -63,21 +67,25 @@ METHODS = {
     "Adjoint": dvi.Adjoint(),
     "Strang": dvi.Strang(),
     "GaussLegendre1": dvi.GaussLegendre(1),
+    "LobattoIIIAIIIB2": dvi.LobattoIIIAIIIB(2),
     "RungeKutta4": dvi.RungeKutta4(),
     "Yoshida4": dvi.Yoshida(4),
     "Suzuki4": dvi.Suzuki(4),
     "BlanesMoan4": dvi.BlanesMoan(4),
     "McLachlan4": dvi.McLachlan(4),
     "GaussLegendre2": dvi.GaussLegendre(2),
+    "LobattoIIIAIIIB3": dvi.LobattoIIIAIIIB(3),
     "Yoshida6": dvi.Yoshida(6),
     "BlanesMoan6": dvi.BlanesMoan(6),
     "McLachlan6": dvi.McLachlan(6),
     "KahanLi6": dvi.KahanLi(6),
     "GaussLegendre3": dvi.GaussLegendre(3),
+    "LobattoIIIAIIIB4": dvi.LobattoIIIAIIIB(4),
     "Yoshida8": dvi.Yoshida(8),
     "McLachlan8": dvi.McLachlan(8),
     "KahanLi8": dvi.KahanLi(8),
     "GaussLegendre4": dvi.GaussLegendre(4),
+    "LobattoIIIAIIIB5": dvi.LobattoIIIAIIIB(5),
 }
 """Every method that is compared. One of a new class needs its cost in `cost`."""
 
@@ -201,6 +209,10 @@ def cost(method: dvi.Method, problem: Problem) -> Cost:
     if isinstance(method, dvi.GaussLegendre):
         s = method.stages
         return Cost(3 * s, s, 2 * s * n * s)
+    directions = (dvi.TypeII(), dvi.Adjoint())
+    explicit = [m.is_explicit(problem.system, q, problem.args) for m in directions]
+    if isinstance(method, dvi.LobattoIIIAIIIB):
+        return lobatto_cost(method.stages, n, *explicit)
     if isinstance(method, dvi.TypeII):
         parts = (1, 0)
     elif isinstance(method, dvi.Adjoint) and isinstance(method.method, dvi.TypeII):
@@ -210,10 +222,18 @@ def cost(method: dvi.Method, problem: Problem) -> Cost:
         parts = (count - count // 2, count // 2)
     else:
         raise TypeError(f"what does a step of {method!r} cost? Say so in cost().")
-    directions = (dvi.TypeII(), dvi.Adjoint())
-    explicit = (m.is_explicit(problem.system, q, problem.args) for m in directions)
     step = sum(k * (1 if e else 1.5) for k, e in zip(parts, explicit, strict=True))
     return Cost(step, 0.5, n / 2)
+
+
+def lobatto_cost(s, n, step_is_explicit, inverse_is_explicit) -> Cost:
+    """Of s stages: whether p enters no rate of p, and q no rate of q (the P_i then suffice)."""
+    if s == 2 and step_is_explicit and inverse_is_explicit:
+        return Cost(3.5, 0, 0)  # halves: one sweep of 2 + 1, 2 for Q, 2 at the end
+    sweep = s - 1 / 2  # s halves for Q, s − 1 for P
+    end = s if inverse_is_explicit else s / 2  # forces; and Q, where it is no unknown
+    unknowns = (1 if inverse_is_explicit else 2) * (s - 1) * n
+    return Cost(4 * sweep + end, sweep, unknowns * sweep)  # three sweeps, one last residual
 
 
 class Run(NamedTuple):
@@ -451,9 +471,10 @@ STYLES = {
     "McLachlan": ("#56B4E9", "P"),
     "KahanLi": ("#009E73", "*"),
     "GaussLegendre": ("#D55E00", "o"),
+    "LobattoIIIAIIIB": ("#6A3D9A", "p"),
     "RungeKutta": ("#999999", "X"),
 }
-"""Colour (Okabe & Ito) and marker of each family."""
+"""Colour (Okabe & Ito, and a violet) and marker of each family."""
 
 GROUPS = {"order 1 and 2": (1, 2), "order 4": (4,), "order 6": (6,), "order 8": (8,)}
 
@@ -492,7 +513,7 @@ def picture(points: list[Point], truth: Reference) -> plt.Figure:
                     marker=marker,
                     ms=4,
                     lw=1.3,
-                    label=method,
+                    label=method.replace("LobattoIIIAIIIB", "Lobatto "),
                 )
             ax.axhspan(1e-16, truth.floor, color="0.92", zorder=-1)
             if of == "evaluations":

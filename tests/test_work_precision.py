@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -25,6 +26,47 @@ def bench():
     return module
 
 
+def counting(system, made):
+    """The system, which appends to `made` at run time for each half of a gradient of H_D.
+
+    The derivatives themselves pass through the host: what the compiler drops is not counted, and
+    no dependence of one half on the other variable is made up.
+    """
+
+    @jax.custom_jvp
+    def seen(x):
+        def note(x):
+            made.append(1)
+            return x
+
+        shape = jax.ShapeDtypeStruct(x.shape, x.dtype)
+        return jax.pure_callback(note, shape, x, vmap_method="sequential")
+
+    seen.defjvp(lambda x, dx: (seen(*x), *dx))  # a column of a Jacobian is none
+
+    @jax.custom_jvp
+    def H_D(t0, t1, q0, p1, args):
+        return system.H_D(t0, t1, q0, p1, args)
+
+    @H_D.defjvp
+    def _(at, changes):
+        of_q, of_p = (seen(jax.grad(system.H_D, argnums=i)(*at)) for i in (2, 3))
+        return H_D(*at), jnp.vdot(of_q, changes[2]) + jnp.vdot(of_p, changes[3])
+
+    return dvi.System(H_D, system.force)
+
+
+def problems(bench):
+    """Separable, neither, and one in which q enters no rate of q but p a rate of p."""
+    separable = bench.henon_heiles()
+    friction = dvi.System(separable.system.H_D, force=lambda t0, t1, q0, p1, args: -p1)
+    return {
+        "henon_heiles": separable,
+        "double_pendulum": bench.driven_pendulum(),
+        "damped": separable._replace(system=friction, epsilon=0.1),
+    }
+
+
 @pytest.mark.parametrize(
     ("problem", "method"),
     [
@@ -33,27 +75,36 @@ def bench():
         *(
             pytest.param(problem, method, marks=pytest.mark.slow)
             for problem in ("henon_heiles", "double_pendulum")
-            for method in ("Adjoint", "BlanesMoan4", "KahanLi6", "GaussLegendre2", "RungeKutta4")
+            for method in (
+                *("Adjoint", "BlanesMoan4", "KahanLi6", "GaussLegendre2", "RungeKutta4"),
+                *("LobattoIIIAIIIB2", "LobattoIIIAIIIB3", "LobattoIIIAIIIB5"),
+            )
         ),
+        pytest.param("damped", "LobattoIIIAIIIB2", marks=pytest.mark.slow),
+        pytest.param("damped", "LobattoIIIAIIIB3", marks=pytest.mark.slow),
     ],
 )
 def test_evaluations_are_counted_as_they_are_made(bench, problem, method):
-    """Against calls of H_D at run time: each is half a gradient. Jacobian columns make none."""
-    problem, calls = bench.PROBLEMS[problem](), []
-
-    def counted(t0, t1, q0, p1, args):
-        jax.debug.callback(lambda _: calls.append(1), q0[0])  # vmapped by what is batched
-        return problem.system.H_D(t0, t1, q0, p1, args)
-
-    watched = problem._replace(system=dvi.System(counted, problem.system.force))
+    """Against derivatives of H_D at run time, each half an evaluation; columns are none."""
+    problem, halves = problems(bench)[problem], []
+    watched = problem._replace(system=counting(problem.system, halves))
     price, num_steps = bench.cost(bench.METHODS[method], problem), 16
     run = bench.compiled(bench.METHODS[method], watched)
-    _, _, iterations, good = run.function(0.1, num_steps // bench.PIECE)
-    jax.effects_barrier()
+    _, _, iterations, good = jax.block_until_ready(run.function(0.1, num_steps // bench.PIECE))
     assert bool(good)
-    made = len(calls) / 2
+    made = len(halves) / 2
     assert made == num_steps * price.of_step + int(iterations) * price.of_iteration
     assert made >= num_steps
+
+
+def test_a_derivative_that_is_not_used_is_not_counted(bench):
+    halves = []
+    H_D = counting(bench.henon_heiles().system, halves).H_D
+    slopes = jax.grad(H_D, argnums=(2, 3))
+    q, p, now = jnp.array([0.1, 0.2]), jnp.array([0.3, 0.1]), 0.0
+    for used, made in ((lambda of: of[0], 1), (lambda of: of, 3)):
+        jax.block_until_ready(jax.jit(lambda q, p, u=used: u(slopes(now, now, q, p, None)))(q, p))
+        assert len(halves) == made
 
 
 def test_a_method_of_unknown_cost_is_refused(bench):
