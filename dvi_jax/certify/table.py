@@ -65,7 +65,13 @@ def tables(
             made.append(Table(title, ["method", *promised, *names], body))
     if controls:
         body = [
-            [c.check, c.name, cell(c.check, x), x.allowed, "MISSED" if x.ok else "caught"]
+            [
+                c.check,
+                c.name,
+                cell(c.check, x),
+                x.allowed,
+                "caught" if x.verdict == "FAIL" else "MISSED",
+            ]
             for c, x in controls
         ]
         columns = ["check", "broken method", "measured", "allowed", "verdict"]
