@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from ._step import Equations
@@ -13,7 +14,7 @@ from ._types import Interval, Scalar, State
 from .engine.bracket import bracketed_root
 from .methods import Method
 from .observe import Crossings, Section, Stop, Stopped
-from .observe._kept import RequestedTimes, Start, event, from_rows, lies_in
+from .observe._kept import RequestedTimes, Start, event, from_rows
 
 Point = tuple[Scalar, State, State]
 """(t, q, p)."""
@@ -66,25 +67,42 @@ def at_times(
     exists, starts = _steps(kept[0], safe)
     args = curve.equations.args
     began = jax.vmap(lambda s: requested.time(s.t0, s.q0, s.p0, args))(starts)
-    at_first = requested.time(safe.t0, safe.q0, safe.p0, args)
+    first = requested.time(safe.t0, safe.q0, safe.p0, args)
+    sense = jnp.where(starts.until[0] >= began[0], 1, -1)  # −1: time runs backwards
+    ends = jnp.where(exists, sense * starts.until, jnp.inf)
+    close = jnp.sqrt(jnp.finfo(safe.q0.dtype).eps)
 
     def within(start, time, reached):
-        if requested.clock is not None:
-            return curve.where(lambda *at: requested.time(*at) - time, start, reached)
-        return curve.point(start, (time - start.t0) / (start.t1 - start.t0))
+        if requested.clock is None:
+            return curve.point(start, (time - start.t0) / (start.t1 - start.t0)), True
+        point = curve.where(lambda *at: requested.time(*at) - time, start, reached)
+        # A clock that jumps, or turns, has passed the value without showing it.
+        missed = jnp.abs(requested.time(*point, args) - time)
+        span = jnp.abs(start.until - requested.time(start.t0, start.q0, start.p0, args))
+        return point, missed <= close * (span + jnp.abs(time))
 
     def one(time):
-        inside = exists & lies_in(time, began, starts.until)
-        reached, is_start = jnp.any(inside), time == at_first
-        start = jax.tree.map(lambda x: x[jnp.argmax(inside)], starts)
-        start = jax.tree.map(lambda a, b: jnp.where(reached, a, b), start, safe)
-        first = (safe.t0, safe.q0, safe.p0)
-        point = jax.tree.map(
-            lambda a, b: jnp.where(is_start, b, a), within(start, time, reached), first
-        )
-        return reached | is_start, start, _or_nan(reached | is_start, point)
+        i = jnp.minimum(jnp.searchsorted(ends, sense * time), ends.size - 1)
+        reached = exists[i] & (sense * began[i] < sense * time) & (sense * time <= ends[i])
+        start = jax.tree.map(lambda x, y: jnp.where(reached, x[i], y), starts, safe)
+        is_start = time == first
+        if requested.clock is None:
+            time = jnp.where(is_start, _just_after(time, start), time)
+        point, shown = within(start, time, reached)
+        known = (safe.t0, safe.q0, safe.p0)
+        if requested.clock is None:  # the start to the bit, with the slope of the curve
+            known = jax.tree.map(lambda a, b: a + lax.stop_gradient(b - a), point, known)
+        point = jax.tree.map(lambda a, b: jnp.where(is_start, b, a), point, known)
+        found = (reached & shown) | is_start
+        return found, start, _or_nan(found, point)
 
     return jax.vmap(one)(requested.ts)
+
+
+def _just_after(time: Scalar, start: Start) -> Scalar:
+    """A time a little inside of the step, moving as `time` does: an H_D may divide by its step."""
+    part = jnp.finfo(start.q0.dtype).eps ** 0.4
+    return time + lax.stop_gradient(part * (start.t1 - start.t0))
 
 
 def stopped(curve: Curve, stop: Stop, row: Array, safe: Start) -> Stopped:

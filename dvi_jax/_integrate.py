@@ -9,10 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, PyTree
 
 from ._adjoints import AbstractAdjoint, Outcome, Reversible
-from ._arithmetic import Arithmetic, FloatingPoint
+from ._arithmetic import Arithmetic, FixedPoint, FloatingPoint
 from ._compat import is_traced
 from ._dense import Curve, at_times, crossings, stopped
 from ._extended import run_extended
@@ -152,6 +153,11 @@ def integrate(
             "is the variation of that map's action. For a higher order take an H_D of higher "
             "order, dvi.discretise(H, order=2)."
         )
+    if isinstance(lattice, Variational) and isinstance(arithmetic, FixedPoint):
+        raise ValueError(
+            "the steps of Variational() are solved for, and a solve cannot be undone bit for bit: "
+            "take arithmetic=dvi.Compensated(), or another lattice."
+        )
     equations = Equations(system, epsilon, args, newton)
     is_disturbed = system.force is not None or system.perturbation is not None
     if not (is_disturbed or system.slow_time or is_traced(epsilon)) and float(epsilon) != 0:
@@ -166,7 +172,7 @@ def integrate(
     plan = make_plan(save, num_steps)
     if save.ts is not None:
         task = eqx.tree_at(
-            lambda task: task.observe, task, _with_times(save, observe, q0.dtype),
+            lambda task: task.observe, task, _with_times(save, task, num_steps),
             is_leaf=lambda x: x is None,
         )  # fmt: skip
     traced = any(is_traced(x) for x in jax.tree.leaves((task, q0, p0)))
@@ -220,14 +226,20 @@ def _in_pieces(task: Task, plan: Plan, q0, p0, num_steps, progress) -> Outcome:
     return Outcome(carry, saved, reduce(task, carry))
 
 
-def _with_times(save: Save, observe: PyTree, dtype: Any) -> tuple[RequestedTimes, PyTree]:
+def _with_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes, PyTree]:
     """What is observed along the run when states are saved at requested times: no observables that
     stand alone, which are evaluated at those times afterwards."""
-    assert save.ts is not None
     kept = jax.tree.map(
-        lambda f: f if isinstance(f, Reduction) else None, observe, is_leaf=is_observable
+        lambda f: f if isinstance(f, Reduction) else None, task.observe, is_leaf=is_observable
     )
-    return RequestedTimes(ts=save.ts.astype(dtype), clock=save.clock), kept
+    ts = jnp.asarray(save.ts, task.t0.dtype)
+    if save.clock is None and not task.lattice.has_memory and num_steps > 0:
+        end = task.interval(jnp.asarray(num_steps - 1, jnp.int32)).t1
+        for known in (task.t0, end):  # N·(T/N) need not be T to the last digit
+            near = jnp.abs(ts - known) <= 16 * jnp.finfo(ts.dtype).eps * jnp.abs(known)
+            ts = jnp.where(near, ts + lax.stop_gradient(known - ts), ts)
+    ordered = jnp.sort(lax.stop_gradient(ts))
+    return RequestedTimes(ts=ts, ordered=ordered, clock=save.clock), kept
 
 
 @eqx.filter_jit
@@ -286,7 +298,14 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     kept = "With throw=False the solution up to there is returned with its status; here it is the "
     kept += "`solution` attribute of this error."
     if bool(result == RESULTS.not_reached):
-        raise IntegrationError(f"{RESULTS[result]} {kept}", solution)
+        missed = np.isnan(np.asarray(solution.qs)).reshape(len(solution.ts), -1).any(1)
+        first = float(solution.ts[missed.argmax()])
+        which = f", the first at t = {first:.17g}" if np.isfinite(first) else ""
+        raise IntegrationError(
+            f"{missed.sum()} of {missed.size} requested states were not reached{which}. "
+            f"{RESULTS[result]} {kept}",
+            solution,
+        )
     step = int(solution.stats["failed_step"])
     if task.lattice.has_memory:
         at = f"last h = {float(solution.stats['last_h']):g}"

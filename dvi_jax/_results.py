@@ -48,7 +48,8 @@ class RESULTS(eqx.Enumeration):
     stopped = "The condition of dvi.Stop was met: the trajectory ended before its last step."
     not_reached = (
         "A time of dvi.Save(ts=...) lies outside of the run: before its start, or after its last "
-        "step. Take more steps, or leave out those times."
+        "step; or a clock does not grow along the trajectory. Take more steps, or leave out those "
+        "times."
     )
 
 

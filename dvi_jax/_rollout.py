@@ -151,7 +151,8 @@ def is_observable(x: Any) -> bool:
 def make_plan(save: Save, num_steps: int) -> Plan:
     every = save.every
     if every is None:
-        every = max(num_steps, 1) if save.final else 1
+        keeps_end_alone = save.final or save.ts is not None
+        every = max(num_steps, 1) if keeps_end_alone else 1
     num_blocks, tail = divmod(num_steps, every)
     return Plan(num_blocks, every, tail, save.final and tail > 0)
 

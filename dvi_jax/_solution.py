@@ -35,6 +35,7 @@ class Save(eqx.Module):
     - ``Save(ts=times)``: the states at these times and no others, in the order in which the run
       meets them. Between lattice points it is the step of the method to that time, so that its
       order is the method's. Times outside of the run give NaN and the status `not_reached`.
+      What the map keeps at step h is kept at lattice points alone, not at the end of such a part.
       With ``clock=f``, a function ``(t, q, p, args)`` → scalar that grows along the trajectory, an
       angle for instance, `ts` are values of it.
 
@@ -87,7 +88,8 @@ class Solution(eqx.Module):
     - `qs`, `ps`: saved positions and momenta, shape (S, *q0.shape).
     - `hs`: size of the step that ended at each saved time but the first, shape (S − 1,).
       With ``Save(ts=...)`` the first time is like the others: `hs` and what stands alone in
-      `observed` have shape (S, …), and belong to the part of a step that ends at each time.
+      `observed` have shape (S, …), and belong to the part of a step that ends at each time (at t0
+      of no length).
     - `observed`: the pytree given as `observe`; an observable alone becomes its values on the
       steps that ended at ``ts[1:]``, shape (S − 1, …); a reduction becomes one value over all
       steps.

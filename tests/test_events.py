@@ -323,3 +323,63 @@ def test_what_cannot_be_meant_is_refused():
         dvi.Save(clock=on_axis)
     with pytest.raises(TypeError, match="the clock of Save"):
         dvi.Save(ts=[0.1], clock=3)
+
+
+def test_slope_at_the_start_and_round_off_at_the_end():
+    system = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2)
+
+    def positions(ts, t0=0.0, **settings):
+        given = {"h": 0.1, "num_steps": 40, "throw": False, **settings}
+        sol = dvi.integrate(system, [1.0], [0.3], t0=t0, save=dvi.Save(ts=ts), **given)
+        return sol.qs[:, 0]
+
+    ts = jnp.asarray([0.0, 0.5, 0.55])
+    for mode in (jax.jacrev, jax.jacfwd):
+        np.testing.assert_allclose(jnp.diag(mode(positions)(ts))[0], 0.3, atol=1e-6)
+        np.testing.assert_allclose(mode(lambda t0: positions(ts, t0))(0.0)[0], -0.3, atol=1e-6)
+    assert float(positions(ts)[0]) == 1.0
+    for n in (49, 98, 103, 107):  # n·(1/n) < 1 for some of them
+        assert np.isfinite(positions(np.linspace(0, 1, 5), h=1 / n, num_steps=n)).all()
+    assert np.isnan(positions(np.array([1.0 + 1e-12]), h=1 / 49, num_steps=49)).all()
+
+
+def test_a_clock_that_jumps_is_told():
+    system = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2)
+    sol = dvi.integrate(
+        system, [np.cos(1.0)], [-np.sin(1.0)], h=0.1, num_steps=100, throw=False,
+        save=dvi.Save(ts=[0.0, 0.5], clock=lambda t, q, p, args: jnp.arctan2(-p[0], q[0])),
+    )  # fmt: skip
+    assert sol.status == "not_reached"
+    assert np.isnan(np.asarray(sol.qs)).all()
+
+
+def test_memory_does_not_grow_with_the_steps():
+    """Neither what a run keeps nor what its gradient does: as with Save(final=True)."""
+
+    def size(save, steps):
+        def loss(q):
+            sol = dvi.integrate(KEPLER, q, START[1], h=0.01, num_steps=steps, save=save)
+            return jnp.sum(sol.qs[-1])
+
+        compiled = jax.jit(jax.grad(loss)).lower(jnp.asarray(START[0])).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    asked, final = size(dvi.Save(ts=[0.5, 0.7]), 10_000), size(dvi.Save(final=True), 10_000)
+    assert asked < final + 20_000
+    assert size(dvi.Save(), 10_000) > 3 * final
+
+
+def test_conditions_in_place_of_functions_are_refused():
+    for g in (lambda t, q, p, args: q[0] > 0.1, lambda t, q, p, args: 1):
+        with pytest.raises(ValueError, match="take the difference"):
+            kepler(num_steps=3, observe=dvi.Section(g))
+        with pytest.raises(ValueError, match="take the difference"):
+            kepler(num_steps=3, stop=dvi.Stop(g))
+    with pytest.raises(ValueError, match=r"the clock \(t, q, p, args\) must return a real scalar"):
+        kepler(num_steps=3, save=dvi.Save(ts=[0.1], clock=lambda t, q, p, args: q))
+
+
+def test_a_balance_needs_lattice_points():
+    sol = kepler(num_steps=4, method=dvi.TypeII(), save=dvi.Save(ts=np.linspace(0.01, 0.07, 5)))
+    with pytest.raises(ValueError, match="saved at times of their own"):
+        dvi.noether_balance(KEPLER, [dvi.generators.time_translation()], [None], sol)

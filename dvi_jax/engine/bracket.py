@@ -53,7 +53,7 @@ def _false_position(f: Function, a, fa, b, fb, wanted) -> Number:
         # Every third point is the middle one, so that the interval shrinks whatever f does.
         c = jnp.where(jnp.isfinite(secant) & (n % 3 != 2), secant, (a + b) / 2)
         fc = f(c)
-        crosses = fc * fb <= 0
+        crosses = jnp.sign(fc) * jnp.sign(fb) <= 0
         a, fa = jnp.where(crosses, b, a), jnp.where(crosses, fb, fa / 2)
         return a, fa, c, fc, n + 1
 

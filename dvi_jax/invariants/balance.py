@@ -76,10 +76,12 @@ def noether_balance(
             f"a balance needs one solution with at least two steps, got ts of shape "
             f"{jnp.shape(solution.ts)}. For a batch use jax.vmap over solutions."
         )
-    if steps != solution.stats["num_steps"]:
+    if steps != solution.stats["num_steps"] or steps != jnp.size(solution.hs):
         raise ValueError(
-            f"a balance needs every state: the solution has {steps} saved of "
-            f"{solution.stats['num_steps']} steps. Integrate with save=dvi.Save()."
+            "a balance needs every lattice point: the solution has "
+            f"{steps + 1} states of {solution.stats['num_steps']} steps"
+            + (", saved at times of their own" if steps != jnp.size(solution.hs) else "")
+            + ". Integrate with save=dvi.Save()."
         )
     return _balance(
         system,

@@ -135,14 +135,14 @@ class Variational(Lattice):
         h, found = jnp.where(first, place.h, h), first | found
         taken = energies(h)
         defect = jnp.where(first, 0.0, jnp.abs(taken.imbalance(memory.energy)))
+        interval = Interval(memory.t, memory.t + h, h)
         memory = Memory(
-            memory.t + h,
+            interval.t1,
             h,
             taken.arriving,
             memory.misses + jnp.where(found, 0, 1),
             jnp.maximum(memory.defect, lax.stop_gradient(defect)),
         )
-        interval = Interval(memory.t - h, memory.t, h)
         if self.on_no_root != "stop":
             return interval, memory, None
         return interval, memory, RESULTS.where(found, RESULTS.successful, RESULTS.no_root)
@@ -174,8 +174,9 @@ class Variational(Lattice):
         flat = jnp.all(jnp.abs(values) <= 8 * jnp.finfo(hs.dtype).eps * scale)
 
         # Cell i is [hs[i], hs[i + 1]]; NaN, where (13) has no solution, is no change of sign.
-        changes = (values[:-1] * values[1:] <= 0) & (jnp.diff(fixed) != 0)
-        crossing = fixed[:-1] - values[:-1] * jnp.diff(fixed) / jnp.diff(values)
+        changes = (jnp.sign(values[:-1]) * jnp.sign(values[1:]) <= 0) & (jnp.diff(fixed) != 0)
+        slopes = jnp.diff(values) / jnp.diff(fixed)
+        crossing = fixed[:-1] - jnp.where(slopes == 0, 0, values[:-1] / slopes)
         nearest = jnp.argmin(jnp.where(changes, jnp.abs(crossing - fixed[_CELLS]), jnp.inf))
         has_root = jnp.any(changes) & ~flat
         left, right = ((fixed[i], values[i]) for i in (nearest, nearest + 1))

@@ -108,7 +108,9 @@ class Section(KeptSteps):
     - `max_crossings`: room for so many; static.
 
     The observed value is a `Crossings`. It is differentiable, the times included, and may be
-    batched. Two crossings within one step are not seen: take steps that g does not turn in.
+    batched. Two crossings within one step are not seen: take steps that g does not turn in. A start
+    on the surface is no crossing; a lattice point on it ends one. A crossing in the step that a
+    `Stop` ends is left out.
 
     **Raises** `TypeError` for a g that is no such function, `ValueError` for another direction, a
     max_crossings below 1, and in `integrate` for a g that is not a scalar.
@@ -139,9 +141,13 @@ class Section(KeptSteps):
 
 
 class RequestedTimes(KeptSteps):
-    """The steps that the times of ``Save(ts=...)`` lie in, by t or by a clock of the user's."""
+    """The steps that the times of ``Save(ts=...)`` lie in, by t or by a clock of the user's.
+
+    `ordered` are the same times in ascending order: a step looks for its own by bisection.
+    """
 
     ts: Array
+    ordered: Array
     clock: Callable[..., Any] | None
 
     @property
@@ -150,26 +156,26 @@ class RequestedTimes(KeptSteps):
 
     def time(self, t: Scalar, q: State, p: State, args: Args) -> Scalar:
         """What the clock shows at a point."""
-        return t if self.clock is None else event(self.clock, t, q, p, args)
+        return t if self.clock is None else event(self.clock, t, q, p, args, "the clock")
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
         start, end = self.time(t0, q0, p0, args), self.time(t1, q1, p1, args)
-        inside = jnp.any(lies_in(self.ts, start, end)) & jnp.all(jnp.isfinite(q1))
-        return as_row(inside, Start(t0, t1, end, q0, p0))
+        passed, inside = (jnp.searchsorted(self.ordered, x, side="right") for x in (start, end))
+        ahead, behind = (jnp.searchsorted(self.ordered, x, side="left") for x in (start, end))
+        hit = jnp.where(end >= start, inside > passed, ahead > behind)  # (start, end], [end, start)
+        return as_row(hit & jnp.all(jnp.isfinite(q1)), Start(t0, t1, end, q0, p0))
 
 
-def lies_in(t: Array, start: Array, end: Array) -> Array:
-    """Whether t lies in (start, end], or in [end, start) when time runs backwards."""
-    return jnp.where(end >= start, (t > start) & (t <= end), (t < start) & (t >= end))
-
-
-def event(g: Callable[..., Any], t: Scalar, q: State, p: State, args: Args) -> Scalar:
-    """g at a point, refused unless it is a real scalar."""
+def event(
+    g: Callable[..., Any], t: Scalar, q: State, p: State, args: Args, name: str = "g"
+) -> Scalar:
+    """g at a point, refused unless it is a real scalar that can pass through a value."""
     value = jnp.asarray(g(t, q, p, args))
-    if value.shape != () or jnp.issubdtype(value.dtype, jnp.complexfloating):
+    if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(
-            "g(t, q, p, args) must return a real scalar, whose zeros are meant; it returned shape "
-            f"{value.shape}, dtype {value.dtype}. For several surfaces use several sections."
+            f"{name} (t, q, p, args) must return a real scalar that passes through zero, or "
+            f"through the values asked for; it returned shape {value.shape}, dtype {value.dtype}. Of a "
+            "condition such as |q| > 2 take the difference, |q| − 2."
         )
     return value.astype(q.dtype)
 

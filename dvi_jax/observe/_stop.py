@@ -16,7 +16,8 @@ class Stop(eqx.Module):
     The run ends with the first step at whose end g ≥ 0, or before it where g ≥ 0 at the start.
     Where g = 0 is solved for inside of that step as for `Section`, and told by ``solution.stop``.
     The status is `stopped`, which is no failure. States after it are NaN, reductions cover the
-    steps before. A g that turns positive and back within one step is not seen.
+    steps before. A g that turns positive and back within one step is not seen. To go on from where
+    a run stopped, take a g that is negative there.
 
     **Arguments** `g`: function ``(t, q, p, args)`` → scalar.
 
