@@ -174,8 +174,8 @@ def event(
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(
             f"{name} (t, q, p, args) must return a real scalar that passes through zero, or "
-            f"through the values asked for; it returned shape {value.shape}, dtype {value.dtype}. Of a "
-            "condition such as |q| > 2 take the difference, |q| − 2."
+            f"through the values asked for; it returned shape {value.shape}, dtype {value.dtype}. "
+            "Of a condition such as |q| > 2 take the difference, |q| − 2."
         )
     return value.astype(q.dtype)
 
