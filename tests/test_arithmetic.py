@@ -176,6 +176,7 @@ def test_an_equilibrium_is_solved_for_in_its_own_size():
     assert np.max(iterations) > 8
 
 
+@pytest.mark.slow
 def test_memory_goes_along_in_pieces_and_in_batches():
     """With progress the run is cut in pieces; under vmap lanes are what they are alone."""
     s, q, p = SYSTEMS["pendulum"]
@@ -501,7 +502,7 @@ def gradient(arithmetic, adjoint, is_implicit):
 
 @pytest.mark.parametrize(
     "adjoint",
-    [pytest.param(a, marks=[] if a == "Reversible" else [pytest.mark.slow]) for a in ADJOINTS],
+    [pytest.param(a, marks=[] if a == "Direct" else [pytest.mark.slow]) for a in ADJOINTS],
 )
 def test_gradients_are_those_of_the_map(adjoint):
     """As with plain sums: to round-off; in fixed point to the quantum, as a coarse one shows."""

@@ -317,6 +317,7 @@ def test_slowly_varying_oscillator_keeps_its_discrete_action_alone(tolerance):
     assert len(d.obstructions) > 10
 
 
+@pytest.mark.slow
 def test_action_drifts_less_the_higher_its_order():
     """As an observable of the run: bound to the slow time there.
 
@@ -413,6 +414,7 @@ def test_first_correction_of_the_magnetic_moment():
     assert off[0] / off[1] == pytest.approx(2.0, abs=0.2)
 
 
+@pytest.mark.slow
 def test_an_invariant_leads_back_to_a_symmetry():
     """The symplectic gradient satisfies the determining equations where the map is symplectic."""
     d = found("cubic", 8, 2)

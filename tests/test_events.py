@@ -99,6 +99,7 @@ def test_crossings_beyond_the_room_are_counted():
     assert np.isfinite(np.asarray(sol.observed.ts)).all()
 
 
+@pytest.mark.slow
 def test_a_batch_of_sections():
     """Hénon and Heiles' surface of section; a lane that fails leaves the others alone."""
     system = dvi.System(
@@ -191,6 +192,7 @@ def test_times_outside_of_the_run():
         kepler(num_steps=50, save=dvi.Save(ts=[-0.5, 1.0]))
 
 
+@pytest.mark.slow
 def test_gradient_in_the_requested_times_is_the_velocity():
     def at(t, adjoint):
         return kepler(num_steps=100, save=dvi.Save(ts=t[None]), adjoint=adjoint).qs[0]
@@ -231,6 +233,7 @@ def test_escape_ends_a_run():
     assert 0 < float(sol.observed) < 1e-13  # over the steps before, no NaN
 
 
+@pytest.mark.slow
 def test_stops_of_a_batch_and_their_gradient():
     def run(p, adjoint=dvi.Reversible()):
         return dvi.integrate(
@@ -283,6 +286,7 @@ def test_in_a_transformed_time():
     )
 
 
+@pytest.mark.slow
 def test_implicit_forced_steps_and_progress():
     def run(**more):
         return dvi.integrate(
@@ -353,6 +357,7 @@ def test_a_clock_that_jumps_is_told():
     assert np.isnan(np.asarray(sol.qs)).all()
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_steps():
     """Neither what a run keeps nor what its gradient does: as with Save(final=True)."""
 

@@ -154,6 +154,7 @@ def drift(system, observable, method, h):
     )
 
 
+@pytest.mark.slow
 def test_energy_of_oscillators_is_kept_to_round_off():
     """Quadratic, of value 2.12; RungeKutta4 loses it."""
 

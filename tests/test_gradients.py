@@ -342,6 +342,7 @@ def light_and_heavy(ratio):
     return system, jnp.array([1.0, ratio])
 
 
+@pytest.mark.slow
 def test_defect_is_seen_in_a_component_that_is_small_beside_others():
     system, m = light_and_heavy(1e-9)
 

@@ -18,6 +18,8 @@ from dvi_jax.paper.figures import FIGURES
 from dvi_jax.paper.numbers import crossing, max_drift, relative_spread, slope, spread
 from dvi_jax.paper.verdicts import pretty
 
+pytestmark = pytest.mark.slow  # all of the paper, once: a minute
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):

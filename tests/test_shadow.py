@@ -185,6 +185,7 @@ def quartic(t0, t1, q0, p1, args):
     return jnp.sum(q0**4) / 4
 
 
+@pytest.mark.slow
 def test_perturbation_takes_part_with_the_epsilon_of_the_run():
     perturbed = dvi.System(oscillator, perturbation=quartic)
     cubic_force = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: -(q0**3))

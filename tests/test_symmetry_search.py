@@ -333,6 +333,7 @@ def test_scaling_is_conformal_with_a_constant_factor():
     assert not scaling.is_symplectic
 
 
+@pytest.mark.slow
 def test_invariants_of_found_symmetries_drift_as_promised():
     quartic = found("quartic").variational[0]
     alone = dvi.AdiabaticInvariant([quartic.generators[0]], [quartic.gauges[0]])

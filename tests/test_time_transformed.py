@@ -76,6 +76,7 @@ def test_eccentric_orbits_need_far_fewer_steps(e, periods, few, many):
     assert worst(energy, few, periods, e=e, speed=None) > 10 * transformed
 
 
+@pytest.mark.slow
 def test_energy_error_has_the_order_of_the_method_and_no_drift():
     coarse, fine = (worst(energy, n, 10) for n in (100, 200))
     assert np.log2(coarse / fine) == pytest.approx(2, abs=0.1)
@@ -96,12 +97,14 @@ def test_the_orbit_converges_to_keplers():
     np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 2, atol=0.1)
 
 
+@pytest.mark.slow
 def test_momentum_stays_exact_under_a_speed_that_is_invariant_too():
     assert worst(momentum, 100, 10) < 1e-12
     tilted = worst(momentum, 100, 10, speed=lambda t, q, p, args: radius(t, q, p, args) + q[0] / 4)
     assert tilted > 1e-4
 
 
+@pytest.mark.slow
 def test_a_constant_speed_is_a_uniform_mesh():
     """Also with a force and an explicit time; the step is then g h."""
     given = {"num_steps": 50, "epsilon": 0.2, "t0": 0.3, "observe": momentum_like}

@@ -153,6 +153,7 @@ def test_free_motion_keeps_its_step():
     np.testing.assert_array_equal(sol.hs, 0.3)
 
 
+@pytest.mark.slow
 def test_implicit_system():
     sol = dvi.integrate(IMPLICIT, [0.3], [0.4], h=0.05, num_steps=10, lattice=dvi.Variational())
     assert int(sol.stats["newton_iterations"]) > 0
@@ -191,6 +192,7 @@ def gradient(adjoint):
     return jax.jit(jax.grad(lambda x: ends(x, dvi.Variational(), adjoint)))(POINT)
 
 
+@pytest.mark.slow
 def test_gradient_equals_central_differences():
     value = jax.jit(lambda x: ends(x, dvi.Variational(), dvi.Direct()))
     ones = jax.tree.map(jnp.ones_like, POINT)
