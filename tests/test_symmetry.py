@@ -211,7 +211,7 @@ def test_balance_tells_the_causes_of_kepler_apart():
     plot.plt.close(figure)
     kwargs = {"h": 0.1, "num_steps": 9, "args": KEPLER.args, "save": dvi.Save(every=3)}
     thin = dvi.integrate(KEPLER.system, KEPLER.q0, KEPLER.p0, **kwargs)
-    with pytest.raises(ValueError, match="every state"):
+    with pytest.raises(ValueError, match="every lattice point"):
         dvi.noether_balance(KEPLER.system, [clocked], [None], thin, args=KEPLER.args)
 
 
