@@ -112,6 +112,7 @@ def test_discretise_takes_the_hamiltonian_of_a_lagrangian():
         assert apart(ours, run(hand, [0.4], [0.7], 50)) < 1e-13
 
 
+@pytest.mark.slow
 def test_one_map_by_each_of_its_generating_functions():
     """(q1, p0) of (12)–(13) satisfy what types I and III say of them, at many points."""
     points = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2, 1))  # beyond, III has none

@@ -149,7 +149,8 @@ def test_gradient_of_a_crossing():
         assert sum(float(jnp.sum(g)) for g in back) == pytest.approx(forward, rel=1e-9)
 
 
-@pytest.mark.parametrize("order", [2, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [2, 6])
 def test_requested_times_have_the_order_of_the_method(order):
     """Between lattice points too, where a polynomial of low degree would lose it."""
     ts = np.array([0.0, 1.237, 1.238, 5.55, 9.999])
@@ -329,6 +330,7 @@ def test_what_cannot_be_meant_is_refused():
         dvi.Save(ts=[0.1], clock=3)
 
 
+@pytest.mark.slow
 def test_slope_at_the_start_and_round_off_at_the_end():
     system = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2)
 

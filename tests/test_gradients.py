@@ -68,8 +68,19 @@ def gradient(system, adjoint):
     return jax.jit(jax.grad(lambda x: loss(x, system, ADJOINTS[adjoint])))
 
 
-@pytest.mark.parametrize("system", ["kepler", "non_separable", DOUBLE_PENDULUM])
-@pytest.mark.parametrize("adjoint", ADJOINTS)
+def is_long(system, adjoint):
+    short = system == "kepler" or (system, adjoint) == ("non_separable", "Reversible")
+    return [] if short else [pytest.mark.slow]
+
+
+@pytest.mark.parametrize(
+    ("system", "adjoint"),
+    [
+        pytest.param(s, a, marks=is_long(s, a))
+        for s in ("kepler", "non_separable", "double_pendulum")
+        for a in ADJOINTS
+    ],
+)
 def test_gradient_equals_central_differences(system, adjoint):
     """In every input at once: along each axis of (q0, p0, h, t0, ε, args)."""
     x = point(system)
@@ -95,7 +106,7 @@ def test_adjoints_agree_to_round_off(system):
     "save",
     [
         dvi.Save(),
-        dvi.Save(final=True),
+        pytest.param(dvi.Save(final=True), marks=pytest.mark.slow),
         pytest.param(dvi.Save(every=8), marks=pytest.mark.slow),
         pytest.param(dvi.Save(every=40), marks=pytest.mark.slow),
     ],
@@ -201,6 +212,7 @@ def test_a_rebuilt_state_that_misses_gives_nan_not_a_wrong_gradient():
     assert np.isnan(slope(dvi.Reversible(checkpoint_every=1000)))
 
 
+@pytest.mark.slow
 def test_gradient_in_single_precision():
     system = SYSTEMS["pendulum"][0]
 

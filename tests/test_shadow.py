@@ -64,6 +64,7 @@ def test_oscillator_has_its_closed_form():
     assert shadow.evaluate(0.0, Q, P, h) == pytest.approx(closed, abs=h**4 / 50)
 
 
+@pytest.mark.slow
 def test_drift_falls_as_a_power_of_h_more_with_each_term():
     hs = 0.2 / 2 ** np.arange(4)
     shadows = [dvi.ShadowHamiltonian(order) for order in range(4)]

@@ -305,7 +305,9 @@ def test_known_symmetries_are_found_and_told_apart(name):
         assert str(symmetries[0]) in str(symmetries)
 
 
-@pytest.mark.parametrize("name", ["kepler", "free", "quartic"])
+@pytest.mark.parametrize(
+    "name", ["kepler", "free", pytest.param("quartic", marks=pytest.mark.slow)]
+)
 def test_found_generators_satisfy_the_equations_at_other_points(name):
     system, samples = {
         "kepler": (KEPLER, ring(40, 9, times=True)),

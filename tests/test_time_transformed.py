@@ -83,6 +83,7 @@ def test_energy_error_has_the_order_of_the_method_and_no_drift():
     assert worst(energy, 100, 40) < 1.2 * coarse
 
 
+@pytest.mark.slow
 def test_the_orbit_converges_to_keplers():
     """Positions at the times that are returned, against Kepler's equation."""
     errors = []
