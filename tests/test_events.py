@@ -68,7 +68,8 @@ def numpy_axis(t, q, p, args):
     return q[1]
 
 
-@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [2, 4])
 def test_crossings_converge_with_the_order_of_the_method(order):
     known = exact(14.0, numpy_axis, 1)
     times, states = known.t_events[0][-2:], known.y_events[0][-2:]
@@ -136,6 +137,7 @@ def section_loss(x, adjoint):
     return found.ts[0] ** 2 + found.qs[0, 0] * found.ps[0, 1]
 
 
+@pytest.mark.slow
 def test_gradient_of_a_crossing():
     """Time and state of the crossing, in forward and both ways of reverse mode."""
     x = (jnp.asarray(START[1]), jnp.asarray(0.03))

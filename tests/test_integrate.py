@@ -211,7 +211,7 @@ def test_streamed_reductions_need_no_memory_for_the_steps():
 
 @pytest.mark.parametrize(
     "method",
-    [m if m in ("TypeII", "Strang") else pytest.param(m, marks=pytest.mark.slow) for m in METHODS],
+    [m if m == "Strang" else pytest.param(m, marks=pytest.mark.slow) for m in METHODS],
 )
 def test_batch_equals_loop_and_jit_equals_eager(method):
     system = SYSTEMS["double_pendulum"][0]

@@ -367,6 +367,7 @@ def largest_drifts(system, invariants, epsilons):
     return np.asarray(jax.vmap(run)(jnp.array(epsilons)))
 
 
+@pytest.mark.slow
 def test_gauge_and_identity_agree_with_noether_identity():
     symmetry = found("quartic").variational[0]
     generators, gauges = list(symmetry.generators), list(symmetry.gauges)
