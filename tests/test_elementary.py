@@ -1,5 +1,6 @@
 """Elementary functions: errors in ulp over the whole range, hand-over, special values, slopes."""
 
+import decimal
 import functools
 import math
 from fractions import Fraction
@@ -9,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import central_difference
+from jax.extend.core import primitives
 from jax.test_util import check_grads
 
 from dvi_jax.engine import elementary
 
 SINES = ("sin", "cos", "tan")
 LIMIT = elementary.LIMIT
+PRECISE = decimal.Context(prec=50)
 # Found by continued fractions of 2^e 2/π: nearest to a multiple of π/2 of all doubles up to 2²⁷,
 # of those from 2²³ on, and (J.-M. Muller, Elementary Functions, 2006, ch. 9) of all.
 NEAREST = (6411027962775774 * 2.0**-47, 7763785107565477 * 2.0**-29, 6381956970095103 * 2.0**797)
@@ -50,24 +53,63 @@ def half_pi(bits=1400) -> Fraction:
     return Fraction(8 * atan_of_inverse(5) - 2 * atan_of_inverse(239), 1 << bits + 20)
 
 
-def exact(name: str, x: float) -> Fraction:
-    """sin, cos or tan to 100 binary digits at least."""
+def _root(x: Fraction) -> Fraction:
+    shift = 2 * ((500 - x.numerator.bit_length() + x.denominator.bit_length()) // 2)
+    return Fraction(math.isqrt(int(x * Fraction(2) ** shift))) / Fraction(2) ** (shift // 2)
+
+
+def _exact_atan(x: Fraction) -> Fraction:
+    """The angle of slope x ≥ 0, halved four times before the series."""
+    if x > 1:
+        return half_pi() - _exact_atan(1 / x)
+    if x < Fraction(1, 2**40):
+        return x - x**3 / 3 + x**5 / 5
+    one = 1 << 200
+    slope = round(x * one)
+    for _ in range(4):
+        slope = slope * one // (one + math.isqrt(one * one + slope * slope))
+    total, power, m = 0, slope, 0
+    while power:
+        total += power // (2 * m + 1) * (-1) ** m
+        power = power * slope // one * slope // one
+        m += 1
+    return Fraction(16 * total, one)
+
+
+def exact(name: str, *xs: float) -> Fraction:
+    """The function of that name to 100 binary digits at least."""
+    x, *more = (Fraction(float(x)) for x in xs)
+    if name in ("sin", "cos"):
+        turns = round(x / half_pi())
+        r = x - turns * half_pi()
+        odd = (turns + (name == "cos")) % 4
+        value = _series(r, 1 - odd % 2, 120 + max(0, -math.frexp(float(r))[1]))
+        return -value if odd >= 2 else value
     if name == "tan":
         return exact("sin", x) / exact("cos", x)
-    x = Fraction(float(x))
-    k = round(x / half_pi())
-    r = x - k * half_pi()
-    odd = (k + (name == "cos")) % 4
-    bits = 120 + max(0, -math.frexp(float(r))[1])
-    value = _series(r, 1 - odd % 2, bits)
-    return -value if odd >= 2 else value
+    if name == "log":
+        return Fraction(*decimal.Decimal(float(x)).ln(PRECISE).as_integer_ratio())
+    if name == "pow":
+        return _root(x ** int(2 * more[0]))
+    if name == "acos":
+        return 2 * _exact_atan(_root((1 - x) / (1 + x))) if x > -1 else 2 * half_pi()
+    if name == "asin":
+        angle = _exact_atan(_root(x * x / (1 - x * x))) if abs(x) < 1 else half_pi()
+    elif name == "atan":
+        angle = _exact_atan(abs(x))
+    elif name == "atan2":
+        angle = _exact_atan(abs(x / more[0])) if more[0] else half_pi()
+        angle = 2 * half_pi() - angle if more[0] < 0 else angle
+    else:
+        raise ValueError(name)
+    return -angle if x < 0 else angle
 
 
-def errors(name: str, xs, values) -> np.ndarray:
+def errors(name: str, *xs_and_values) -> np.ndarray:
     """|value − exact|/ulp at each point."""
     out = []
-    for x, value in zip(np.ravel(xs), np.ravel(values), strict=True):
-        truth = exact(name, x)
+    for *x, value in zip(*map(np.ravel, xs_and_values), strict=True):
+        truth = exact(name, *x)
         out.append(abs(Fraction(float(value)) - truth) / Fraction(math.ulp(float(truth))))
     return np.asarray(out, float)
 
@@ -204,3 +246,173 @@ def test_shapes_and_dtypes(name):
     for x in (jnp.float32(0.7), jnp.float32(1e9), jnp.array([1, 2]), 2, 0.7):
         assert function(x).dtype == library(x).dtype
         np.testing.assert_allclose(function(x), library(x), rtol=4e-16)
+
+
+# --- the others -------------------------------------------------------------------------------
+
+
+def arguments(name):
+    """Arguments over the whole range, dense where one form of the arithmetic ends."""
+    rng = np.random.default_rng(3)
+    signs = rng.choice([-1.0, 1.0], 1200)
+    sizes = 10 ** rng.uniform(-300, 300, 300)
+    if name in ("asin", "acos"):
+        ones = [1.0, -1.0, 0.5, -0.5, np.nextafter(1, 0), np.nextafter(0.5, 1)]
+        small, near_1 = 10 ** rng.uniform(-300, 0, 300), 1 - 10 ** rng.uniform(-16, -1, 300)
+        xs = np.concatenate([rng.uniform(0, 1, 300), rng.uniform(0.45, 0.55, 300), small, near_1])
+        return (np.append(signs * xs, ones),)
+    if name == "atan":
+        xs = np.concatenate([rng.uniform(0, 5, 400), rng.uniform(0.2, 1.3, 500), sizes])
+        return (signs * xs,)
+    if name == "log":
+        near_1 = 1 + 10 ** rng.uniform(-16, -1, 300)
+        return (
+            np.concatenate([rng.uniform(0, 5, 300), rng.uniform(0.65, 1.5, 300), near_1, sizes]),
+        )
+    y, x = rng.uniform(-3, 3, (2, 900))
+    extreme = 10 ** rng.uniform(300, 307.6, (2, 50))
+    y = np.concatenate([y, signs[:300] * sizes, extreme[0], 1 / extreme[0]])
+    x = np.concatenate([x, rng.permutation(sizes), -extreme[1], 1 / extreme[1]])
+    keep = np.abs(np.log(np.abs(y)) - np.log(np.abs(x))) < 700  # y/x is a normal number
+    return y[keep], x[keep]
+
+
+OTHERS = {"asin": 1.6, "acos": 1.2, "atan": 1.4, "atan2": 1.6, "log": 0.8}
+"""Largest error [ulp]. Measured: 1.44, 1.07, 1.27, 1.42, 0.74."""
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_error_of_the_others(name):
+    xs = arguments(name)
+    assert errors(name, *xs, getattr(elementary, name)(*xs)).max() < OTHERS[name]
+
+
+@pytest.mark.parametrize(
+    ("name", "table"), [("asin", "_ASIN"), ("atan", "_ATAN"), ("atan2", "_ATAN"), ("log", "_LOG")]
+)
+def test_oracle_sees_a_missing_coefficient_of_the_others(monkeypatch, name, table):
+    monkeypatch.setattr(elementary, table, getattr(elementary, table)[:-1])
+    xs = [x[::5] for x in arguments(name)]
+    values = getattr(elementary, f"_{name}")(*map(jnp.asarray, xs))
+    assert errors(name, *xs, values).max() > 3
+
+
+@pytest.mark.parametrize("y", [0.5, 1.5, 2.5, 3.5, -0.5, -1.5, -2.5, -3.5])
+def test_error_of_half_integer_powers(y):
+    rng = np.random.default_rng(4)
+    xs = np.concatenate([rng.uniform(0.1, 5, 300), 10 ** rng.uniform(-66, 66, 200)])
+    ys = np.full_like(xs, y)
+    # A rounding each for √, products and 1/·, of half to one ulp each.
+    roundings = 1 + max(0, abs(y) - 0.5) + (y < 0)
+    assert errors("pow", xs, ys, elementary.pow(xs, y)).max() < 0.5 + 0.7 * roundings
+    specials = np.array([0.0, -0.0, np.inf, -np.inf, np.nan, -1.0])
+    np.testing.assert_array_equal(elementary.pow(specials, y), jax.lax.pow(specials, np.full(6, y)))
+    slopes = jax.vmap(jax.grad(lambda x: elementary.pow(x, y)))(xs)
+    np.testing.assert_allclose(slopes, y * xs ** (y - 1), rtol=2e-15)
+
+
+def test_other_powers_are_those_of_the_library():
+    x = jnp.array([0.3, 2.0])
+    for y in (1.3, 4.5, 2, np.array([1.5, 0.5]), jnp.array(1.5)):
+        np.testing.assert_array_equal(elementary.pow(x, y), jnp.power(x, y))
+    assert " pow" not in str(jax.make_jaxpr(lambda x: elementary.pow(x, 1.5))(x))
+    assert " pow" in str(jax.make_jaxpr(elementary.pow)(x, 1.5))
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_special_values_are_those_of_the_library(name):
+    special = np.array([0.0, -0.0, 1.0, -1.0, 2.0, -2.0, 1e300, np.inf, -np.inf, np.nan])
+    xs = (special,)
+    if name == "atan2":
+        xs = tuple(np.ravel(g) for g in np.meshgrid(special, special))
+    ours, expected = getattr(elementary, name)(*xs), getattr(jax.lax, name)(*xs)
+    np.testing.assert_allclose(ours, expected, rtol=4e-16, atol=0)
+    number = ~np.isnan(expected)
+    np.testing.assert_array_equal(np.signbit(ours)[number], np.signbit(expected)[number])
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_symmetry_derivatives_and_dtypes_of_the_others(name):
+    function, library = elementary.VECTORISED[name], getattr(jax.lax, name)
+    xs = [x[:200] for x in arguments(name)]
+    if name in ("asin", "atan", "atan2"):
+        np.testing.assert_array_equal(function(-xs[0], *xs[1:]), -function(*xs))
+    at = (jnp.array([0.3, 0.9]), jnp.array([0.7, -0.2]))[: len(xs)]
+    check_grads(jax.jit(function), at, order=2, modes=["fwd", "rev"], atol=1e-5, rtol=1e-5)
+    for f, g in zip(
+        *(jax.jacfwd(g, tuple(range(len(at))))(*at) for g in (function, library)), strict=True
+    ):
+        np.testing.assert_allclose(f, g, rtol=1e-15, atol=1e-300)
+    single = [x.astype(jnp.float32) for x in at]
+    assert function(*single).dtype == jnp.float32
+    np.testing.assert_array_equal(function(*single), library(*single))
+
+
+# --- where the coefficients come from ---------------------------------------------------------
+
+
+def interpolated(series, length, n):
+    """The polynomial through `series` at n points of [0, length], coefficients in float64.
+
+    The points are the zeros of the Chebyshev polynomial of degree n + 1 in the variable that has
+    its first zero at 0 and the end of its interval at `length`: there g(z) is multiplied by z.
+    """
+    cosines = [math.cos(math.pi * (2 * j + 1) / (2 * n + 2)) for j in range(n + 1)]
+    first = cosines.pop()
+    z = [Fraction(round(2**20 * length * (c - first) / (1 - first)), 2**20) for c in cosines]
+    divided = [series(point) for point in z]
+    for k in range(1, n):
+        for i in range(n - 1, k - 1, -1):
+            divided[i] = (divided[i] - divided[i - 1]) / (z[i] - z[i - k])
+    total = [Fraction(0)] * n
+    for i in range(n - 1, -1, -1):  # Horner's scheme in z − z_i
+        shifted = [Fraction(0), *total[:-1]]
+        total = [s - z[i] * t for s, t in zip(shifted, total, strict=True)]
+        total[0] += divided[i]
+    return tuple(map(float, total))
+
+
+SERIES = {
+    "_SIN": (0.625, lambda k: Fraction((-1) ** k, math.factorial(2 * k + 1)), 1, 18),
+    "_COS": (0.625, lambda k: Fraction((-1) ** k, math.factorial(2 * k)), 2, 18),
+    "_ATAN": (0.0558, lambda k: Fraction((-1) ** k, 2 * k + 1), 1, 40),
+    "_ASIN": (0.25, lambda k: Fraction(math.comb(2 * k, k), 4**k * (2 * k + 1)), 1, 90),
+    "_LOG": (0.02945, lambda k: Fraction(2, 2 * k + 1), 1, 40),
+}
+"""Length of the interval, coefficient of z^k, first and last k: Σ a_k z^(k − first)."""
+
+
+@pytest.mark.parametrize("table", SERIES)
+def test_coefficients_are_interpolated(table):
+    length, coefficient, first, last = SERIES[table]
+
+    def series(z):
+        return sum(coefficient(k) * z ** (k - first) for k in range(first, last))
+
+    mine = getattr(elementary, table)
+    assert interpolated(series, length, len(mine)) == mine
+
+
+def test_parts_of_constants():
+    """Each constant is the sum of its parts, short where products must be exact."""
+
+    def is_short(x, bits):
+        return Fraction(x).numerator.bit_length() <= bits
+
+    parts = elementary._HALF_PI
+    assert abs(sum(map(Fraction, parts)) - half_pi()) < Fraction(1, 2**157)
+    assert all(is_short(p, 53 - 27) for p in parts[:4])
+    assert not is_short(parts[4], 53 - 27)
+    for pair, whole in [
+        (elementary._PI_2, half_pi()),
+        (elementary._ATAN_HALF, _exact_atan(Fraction(1, 2))),
+        (elementary._LOG_2, exact("log", 2)),
+    ]:
+        assert abs(sum(map(Fraction, pair)) - whole) < Fraction(1, 2**93)
+    assert is_short(elementary._LOG_2[0], 53 - 11)
+
+
+def test_table_of_primitives():
+    for name, function in elementary.VECTORISED.items():
+        assert getattr(primitives, f"{name}_p").name == name
+        assert function is getattr(elementary, name)
