@@ -132,8 +132,8 @@ def points(limit=LIMIT, seed=0):
     return xs * rng.choice([-1.0, 1.0], xs.shape)
 
 
-BOUNDS = {"sin": 0.8, "cos": 0.8, "tan": 1.5}
-"""Largest error [ulp]. Measured: 0.76, 0.77, 1.36."""
+BOUNDS = {"sin": 0.9, "cos": 0.9, "tan": 1.6}
+"""Largest error [ulp]. At 4 million points (`benchmarks/elementary.py`): 0.82, 0.85, 1.48."""
 
 
 @pytest.mark.parametrize("name", SINES)
@@ -242,7 +242,9 @@ def test_derivatives(name):
     np.testing.assert_allclose(jax.grad(function)(1e9), jax.grad(library)(1e9), rtol=1e-15)
 
 
-PLAIN = "abs add sub mul div neg floor eq ne lt le gt ge xor select_n copy broadcast_in_dim"
+PLAIN = """
+abs add sub mul div neg floor eq ne lt le gt ge xor select_n convert_element_type broadcast_in_dim
+"""
 """What every backend of a kernel has."""
 
 
@@ -308,8 +310,8 @@ def arguments(name):
     return y[keep], x[keep]
 
 
-OTHERS = {"asin": 1.6, "acos": 1.2, "atan": 1.4, "atan2": 1.6, "log": 0.8}
-"""Largest error [ulp]. Measured: 1.44, 1.07, 1.27, 1.42, 0.74."""
+OTHERS = {"asin": 1.7, "acos": 1.2, "atan": 1.5, "atan2": 1.7, "log": 0.9}
+"""Largest error [ulp]. At 4 million points: 1.60, 1.09, 1.36, 1.56, 0.83."""
 
 
 @pytest.mark.parametrize("name", OTHERS)
@@ -402,7 +404,7 @@ def interpolated(series, length, n):
 SERIES = {
     "_SIN": (0.625, lambda k: Fraction((-1) ** k, math.factorial(2 * k + 1)), 1, 18),
     "_COS": (0.625, lambda k: Fraction((-1) ** k, math.factorial(2 * k)), 2, 18),
-    "_ATAN": (0.0558, lambda k: Fraction((-1) ** k, 2 * k + 1), 1, 40),
+    "_ATAN": (0.09, lambda k: Fraction((-1) ** k, 2 * k + 1), 1, 40),
     "_ASIN": (0.25, lambda k: Fraction(math.comb(2 * k, k), 4**k * (2 * k + 1)), 1, 90),
     "_LOG": (0.02945, lambda k: Fraction(2, 2 * k + 1), 1, 40),
 }

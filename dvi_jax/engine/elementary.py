@@ -4,6 +4,10 @@ XLA calls the library lane by lane for sin, cos and others in float64 on a CPU, 
 is vectorised otherwise. These need adds, multiplications, floor, comparisons and selections only,
 so the loop stays one loop over vectors; sin, cos and tan also go into a Pallas kernel.
 
+Errors are below 0.9 ulp for sin, cos and log, 1.2 for acos, 1.5 for atan, 1.7 for tan, asin and
+atan2, 4 for half-integer powers. As everywhere in XLA on a CPU, numbers below 2⁻¹⁰²² count as 0.
+From some eight lanes on they are faster than the library, not for one lane alone.
+
 Coefficients are those of the polynomial through the function at Chebyshev nodes, pulled so that
 one lies at 0 where the error is multiplied by 0; `tests/test_elementary.py` derives them anew.
 """
@@ -228,14 +232,15 @@ tan = Elementary("tan", _tan, lax.tan, lambda way, y, x: (1 + y * y,), LIMIT)
 # --- atan, atan2, asin, acos ------------------------------------------------------------------
 
 _ATAN = (
-    -0.33333333333333,
-    0.19999999999806065,
-    -0.1428571424709591,
-    0.11111107385222321,
-    -0.09090709678317994,
-    0.07686059801911861,
-    -0.06552090077673682,
-    0.047274565754788445,
+    -0.33333333333333015,
+    0.19999999999857002,
+    -0.14285714263682478,
+    0.11111109443212991,
+    -0.09090837443504039,
+    0.07690440119007526,
+    -0.0663643422706014,
+    0.05582706848868187,
+    -0.035563835426400764,
 )
 _ASIN = (
     0.16666666666666752,
@@ -267,11 +272,11 @@ def _angle(y: Array, x: Array) -> Array:
     """atan(y/x) of 0 ≤ x, y < ∞, not both 0: between 0 and π/2.
 
     In the first octant, n ≤ d,  atan(n/d) = atan c + atan t,  t = (n − c d)/(d + c n), with
-    c = 0, 1/2 or 1, so that |t| ≤ √5 − 2; in the second π/2 − atan(d/n).
+    c = 0, 1/2 or 1, so that |t| ≤ 0.3; in the second π/2 − atan(d/n).
     """
     is_steep = y > x
     n, d = jnp.where(is_steep, x, y), jnp.where(is_steep, y, x)
-    low, high = n < 0.236 * d, n > 0.8345 * d
+    low, high = n < 0.3 * d, n > 0.8345 * d
 
     def of_c(at_0, at_half, at_1):
         return jnp.where(low, at_0, jnp.where(high, at_1, at_half))
