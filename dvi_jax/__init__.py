@@ -24,6 +24,7 @@ from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._solution import Save as Save, Solution as Solution
 from ._system import System as System
 from .engine.newton import Newton as Newton
+from .engine.tiles import Layout as Layout
 from .invariants import (
     Balance as Balance,
     Discovery as Discovery,

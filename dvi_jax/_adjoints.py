@@ -27,7 +27,9 @@ from ._rollout import (
     take_step,
     with_tail,
 )
+from ._segments import can_trust, run_in_segments
 from ._types import State
+from .engine.tiles import Layout, lanewise
 
 
 class Outcome(NamedTuple):
@@ -46,13 +48,33 @@ class AbstractAdjoint(eqx.Module):
     """
 
     @abc.abstractmethod
-    def rollout(self, task: Task, plan: Plan, q0: State, p0: State) -> Outcome:
+    def rollout(
+        self, task: Task, plan: Plan, q0: State, p0: State, layout: Layout = Layout()
+    ) -> Outcome:
         """The whole trajectory, differentiable in this adjoint's way."""
 
 
-def _direct_rollout(task: Task, plan: Plan, q0: State, p0: State, loop: Loop) -> Outcome:
-    carry, saved, tail = run(task, plan, start(task, q0, p0), loop)
-    return Outcome(carry, with_tail(plan, saved, tail), reduce(task, carry))
+def _direct_rollout(
+    task: Task, plan: Plan, q0: State, p0: State, loop: Loop, layout: Layout
+) -> Outcome:
+    arrays, rest = eqx.partition(task, eqx.is_array)
+
+    def outcome(task, ran):
+        carry, saved, tail = ran
+        return Outcome(carry, with_tail(plan, saved, tail), reduce(task, carry))
+
+    def forward(arrays, q0, p0):
+        task = eqx.combine(arrays, rest)
+        return outcome(task, run(task, plan, start(task, q0, p0), loop))
+
+    def on_trust(arrays, q0, p0):
+        task = eqx.combine(arrays, rest)
+        return outcome(task, run_in_segments(task, plan, start(task, q0, p0)))
+
+    return lanewise(
+        on_trust if can_trust(task) else forward, arrays, q0, p0,
+        layout=layout, steps=plan.num_steps, entries=2 * q0.size, plain=forward,
+    )  # fmt: skip
 
 
 class Direct(AbstractAdjoint):
@@ -61,8 +83,8 @@ class Direct(AbstractAdjoint):
     Reverse mode stores what each step needs: memory grows with num_steps; good for short runs.
     """
 
-    def rollout(self, task, plan, q0, p0):
-        return _direct_rollout(task, plan, q0, p0, counted_scan)
+    def rollout(self, task, plan, q0, p0, layout=Layout()):
+        return _direct_rollout(task, plan, q0, p0, counted_scan, layout)
 
 
 class Checkpointed(AbstractAdjoint):
@@ -84,8 +106,8 @@ class Checkpointed(AbstractAdjoint):
         ):
             raise ValueError(f"segments must be a positive integer, got {self.segments!r}.")
 
-    def rollout(self, task, plan, q0, p0):
-        return _direct_rollout(task, plan, q0, p0, self._loop)
+    def rollout(self, task, plan, q0, p0, layout=Layout()):
+        return _direct_rollout(task, plan, q0, p0, self._loop, layout)
 
     def _loop(self, body, carry, first, stride, count):
         segments = min(self.segments or math.isqrt(count), count)
@@ -143,33 +165,39 @@ class Reversible(AbstractAdjoint):
         if self.max_defect is not None and not self.max_defect > 0:
             raise ValueError(f"max_defect must be positive, got {self.max_defect!r}.")
 
-    def rollout(self, task, plan, q0, p0):
+    def rollout(self, task, plan, q0, p0, layout=Layout()):
         if not task.method.is_invertible or task.lattice.has_memory or task.stop is not None:
-            return Checkpointed().rollout(task, plan, q0, p0)
+            return Checkpointed().rollout(task, plan, q0, p0, layout)
         if _closes_over_traced(task, q0, p0):
-            return Checkpointed().rollout(task, plan, q0, p0)
+            return Checkpointed().rollout(task, plan, q0, p0, layout)
         theta, fixed = eqx.partition(task, eqx.is_inexact_array)
+        size, steps = 2 * q0.size, plan.num_steps
 
         @jax.jit  # so that its uses below share one trace, and one trace of its derivative
         def forward(inputs):
             theta, q0, p0 = inputs
             task = eqx.combine(theta, fixed)
-            carry, saved, tail = run(
-                task, plan, start(task, q0, p0), counted_scan, self._inner_loop
+            return finish(
+                task, run(task, plan, start(task, q0, p0), counted_scan, self._inner_loop)
             )
+
+        def on_trust(inputs):
+            theta, q0, p0 = inputs
+            task = eqx.combine(theta, fixed)
+            begin = start(task, q0, p0)
+            return finish(task, run_in_segments(task, plan, begin, self.checkpoint_every))
+
+        def finish(task, ran):
+            carry, saved, tail = ran
             kept, counts = eqx.partition(with_tail(plan, saved, tail), eqx.is_inexact_array)
             smooth = _Smooth(carry.q, carry.p, kept, reduce(task, carry))
-            # Every output is made to depend on every input, by an empty sum. Under vmap all of
-            # them are then batched if one input is, as their tangents are.
-            nothing = jnp.sum(ravel_pytree(inputs)[0][:0])
-            return jax.tree.map(
-                lambda x: x + nothing.astype(x.dtype) if eqx.is_inexact_array(x) else x,
-                (smooth, (carry, saved, tail, counts)),
-            )
+            return smooth, (carry, saved, tail, counts)
+
+        fast = on_trust if can_trust(task) else forward
 
         @jax.custom_jvp
         def trajectory(inputs):
-            return forward(inputs)
+            return lanewise(fast, inputs, layout=layout, steps=steps, entries=size, plain=forward)
 
         @trajectory.defjvp
         def _(primals, tangents):
@@ -179,8 +207,11 @@ class Reversible(AbstractAdjoint):
             (inputs,), (change,) = primals, tangents
             smooth, trace = trajectory(inputs)
 
-            def push(u):
+            def derivative(inputs, u):
                 return jax.jvp(lambda x: forward(x)[0], (inputs,), (u,))[1]
+
+            def push(u):
+                return lanewise(derivative, inputs, u, layout=layout, steps=steps, entries=2 * size)
 
             # As one vector: the transposition of a linear solve wants all parts of its right side
             # to be linear in the tangents, also those that are zero.
@@ -191,7 +222,7 @@ class Reversible(AbstractAdjoint):
 
             def matvec(x):
                 u, v = unravel(x)
-                return flat(u, jax.tree.map(jnp.subtract, v, push(u)))
+                return flat(u, jax.tree.map(jnp.subtract, v, derivative(inputs, u)))
 
             def solve(_, b):
                 u, v = unravel(b)
@@ -199,7 +230,10 @@ class Reversible(AbstractAdjoint):
 
             def transpose_solve(_, b):
                 u, v = unravel(b)
-                back = _pull_back(self, fixed, plan, inputs, trace, v)
+                back = lanewise(
+                    lambda *x: _pull_back(self, fixed, plan, *x), inputs, trace, v,
+                    layout=layout, steps=steps, entries=2 * size,
+                )  # fmt: skip
                 return flat(jax.tree.map(jnp.add, u, back), v)
 
             solver: Any = lax.custom_linear_solve  # its annotations differ between versions

@@ -1,10 +1,28 @@
 """The few names of JAX that have moved between releases, or are not public: all of them, here."""
 
-import jax
-from jax.core import Tracer
-from jax.extend.core import Jaxpr, Literal, jaxprs_in_params
+from collections.abc import Callable, Iterator
+from typing import Any
 
-__all__ = ["Jaxpr", "Literal", "is_traced", "jaxprs_in_params", "x64_enabled"]
+import jax
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
+from jax.interpreters import ad, batching, mlir
+
+__all__ = [
+    "ClosedJaxpr",
+    "Jaxpr",
+    "Literal",
+    "aval",
+    "bind_parameters",
+    "bodies",
+    "identity",
+    "is_traced",
+    "jaxpr_as_fun",
+    "jaxprs_in_params",
+    "primitive",
+    "scan_counts",
+    "x64_enabled",
+]
 
 
 def is_traced(x: object) -> bool:
@@ -15,3 +33,70 @@ def is_traced(x: object) -> bool:
 def x64_enabled() -> bool:
     """Whether arrays made now are in double precision (the flag, or a context that sets it)."""
     return bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def bodies(eqn: Any) -> Iterator[ClosedJaxpr]:
+    """The jaxprs among the parameters of an equation, closed: what it calls."""
+    for value in eqn.params.values():
+        for item in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(item, ClosedJaxpr):
+                yield item
+            elif isinstance(item, Jaxpr):
+                yield ClosedJaxpr(item, ())
+
+
+def aval(variable: Any) -> Any:
+    """Shape and type of a variable of a jaxpr."""
+    return variable.aval
+
+
+def bind_parameters(eqn: Any) -> tuple[list[Any], dict[str, Any]]:
+    """What a primitive is bound with besides its operands: (functions, parameters)."""
+    found = eqn.primitive.get_bind_params(eqn.params)
+    return ([], found) if isinstance(found, dict) else found
+
+
+def scan_counts(params: dict[str, Any]) -> tuple[int, int]:
+    """How many constants and how many parts of a carry a scan has, from its parameters."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(list(consts)), len(list(carry))
+
+
+def primitive(
+    name: str, function: Callable, batched: Callable | None = None, multiple: bool = False
+) -> Primitive:
+    """A primitive of its own name that does what `function` (of arrays and parameters) does.
+
+    `batched(arrays, axes, **params)` → (output, axis or None) is its rule under `vmap`, that of
+    `function` if left out. `multiple` says that it gives a list of arrays. It has no derivative.
+    """
+    new = Primitive(name)
+    new.multiple_results = multiple
+    new.def_impl(function)
+    new.def_abstract_eval(lambda *avals, **params: _abstract(function, avals, params))
+    mlir.register_lowering(new, mlir.lower_fun(function, multiple_results=multiple))
+
+    def as_function(arrays, axes, **params):
+        return jax.vmap(lambda *a: function(*a, **params), axes, 0)(*arrays), 0
+
+    batching.primitive_batchers[new] = batched or as_function
+    return new
+
+
+def identity(name: str, batched: Callable) -> Primitive:
+    """A primitive that does nothing but under `vmap`, for which `batched` is its rule."""
+    new = primitive(name, lambda x: x, batched)
+    ad.deflinear2(new, lambda cotangent, _: [new.bind(cotangent)])
+    return new
+
+
+def _abstract(function: Callable, avals: Any, params: dict[str, Any]) -> Any:
+    shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
+    shape_of = getattr(function, "shape_of", None)
+    if shape_of is not None:
+        out = shape_of(*shapes, **params)
+    else:
+        out = jax.eval_shape(lambda *a: function(*a, **params), *shapes)
+    return jax.tree.map(lambda x: ShapedArray(x.shape, x.dtype), out)

@@ -37,6 +37,7 @@ from ._step import Equations
 from ._system import System
 from ._types import Interval
 from .engine.newton import Newton
+from .engine.tiles import Layout
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation
 from .observe import Reduction, RequestedTimes, Section, Stop
@@ -65,6 +66,7 @@ def integrate(
     adjoint: AbstractAdjoint = Reversible(),
     newton: Newton = Newton(),
     arithmetic: Arithmetic = FloatingPoint(),
+    layout: Layout = Layout(),
     stop: Stop | None = None,
     throw: bool = True,
     progress: Callable[[int, int], None] | None = None,
@@ -92,6 +94,7 @@ def integrate(
       ``(t0, t1, q0, p0, q1, p1, args)`` → array. Alone, one is evaluated on the steps that end at
       a save point; in `MaxDrift`, `Range`, `Trend`, `Mean`, `Last` it is reduced over every step
       in constant memory. A `Section` finds the crossings of a surface.
+    - `layout`: how the arithmetic is laid out, see `Layout`.
     - `stop`: a `Stop`, where the run ends early (a collision, an escape); or None.
     - `adjoint`: how reverse-mode gradients go, see `Reversible`, `Checkpointed`, `Direct`.
     - `newton`: settings of implicit solves, see `Newton`.
@@ -127,6 +130,7 @@ def integrate(
         ("adjoint", adjoint, AbstractAdjoint),
         ("newton", newton, Newton),
         ("arithmetic", arithmetic, Arithmetic),
+        ("layout", layout, Layout),
     ):
         if not isinstance(value, kind):
             hint = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
@@ -145,7 +149,7 @@ def integrate(
         return run_extended(
             integrate, system, lattice, q0, p0, t0, epsilon, args, observe, is_observable, h=h,
             num_steps=num_steps, method=method, save=save, adjoint=adjoint, newton=newton,
-            arithmetic=arithmetic, stop=stop, throw=throw, progress=progress,
+            arithmetic=arithmetic, layout=layout, stop=stop, throw=throw, progress=progress,
         )  # fmt: skip
     if isinstance(lattice, Variational) and not isinstance(method, TypeII):
         raise ValueError(
@@ -180,7 +184,7 @@ def integrate(
         first = task.interval(jnp.asarray(0, jnp.int32))
         warn_of_dissipation(method, equations, first, q0, p0)
     if progress is None:
-        outcome = _whole(task, plan, q0, p0, adjoint)
+        outcome = _whole(task, plan, q0, p0, adjoint, layout)
     elif traced:
         raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
     else:
@@ -191,8 +195,8 @@ def integrate(
 
 
 @eqx.filter_jit
-def _whole(task: Task, plan: Plan, q0, p0, adjoint: AbstractAdjoint) -> Outcome:
-    return adjoint.rollout(task, plan, q0, p0)
+def _whole(task: Task, plan: Plan, q0, p0, adjoint: AbstractAdjoint, layout: Layout) -> Outcome:
+    return adjoint.rollout(task, plan, q0, p0, layout)
 
 
 @eqx.filter_jit

@@ -86,7 +86,11 @@ class Task(eqx.Module):
 
 
 class Carry(NamedTuple):
-    """What goes from step to step."""
+    """What goes from step to step.
+
+    On trust, a step keeps no books: `result`, `failed_step` and `failed_residual` are None, and
+    `residual` is the largest excess of a solve (see `Trusted`), None where nothing is solved.
+    """
 
     q: State
     p: State
@@ -142,6 +146,10 @@ class Plan(NamedTuple):
     block: int
     tail: int
     save_tail: bool
+
+    @property
+    def num_steps(self) -> int:
+        return self.num_blocks * self.block + self.tail
 
 
 def is_observable(x: Any) -> bool:
@@ -200,6 +208,21 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
     q1, p1, beside, info = task.arithmetic.step(
         task.method, task.equations, interval, carry.q, carry.p, carry.beside
     )
+    if carry.result is None:  # on trust
+        taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
+        excess = carry.residual
+        return (
+            carry._replace(
+                q=q1,
+                p=p1,
+                iterations=carry.iterations + info.iterations,
+                residual=None if excess is None else jnp.maximum(excess, info.residual),
+                reductions=_reduced(task, carry, k, taken),
+                beside=beside,
+            ),
+            interval,
+            taken,
+        )
     was_good = carry.result == RESULTS.successful
     result = carry.result if exists is None else first_failure(carry.result, exists)
     result = first_failure(result, info.result)
@@ -209,11 +232,7 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
     # A state after a failed step is no answer: NaN keeps it from being taken for one.
     q1, p1 = _or_nan(good, q1), _or_nan(good, p1)
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
-    _, reductions = task.observables()
-    reduced = [
-        r.update(so_far, k, interval.t1, taken.number(task.bound(r.function), task.args))
-        for r, so_far in zip(reductions, carry.reductions, strict=True)
-    ]
+    reduced = _reduced(task, carry, k, taken)
     if stop is not None:  # what is reduced covers the steps before
         over = result == RESULTS.stopped
         reduced = jax.tree.map(lambda a, b: jnp.where(over, b, a), reduced, carry.reductions)
@@ -235,6 +254,15 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
         interval,
         taken,
     )
+
+
+def _reduced(task: Task, carry: Carry, k: Array, taken: StepTaken) -> list[Any]:
+    """The memories of the reductions after step k."""
+    _, reductions = task.observables()
+    return [
+        r.update(so_far, k, taken.t1, taken.number(task.bound(r.function), task.args))
+        for r, so_far in zip(reductions, carry.reductions, strict=True)
+    ]
 
 
 def _stop(

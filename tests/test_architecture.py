@@ -17,6 +17,7 @@ FLOORS = [
     ["methods", "lattices", "symmetry", "observe"],
     ["_arithmetic"],
     ["_rollout", "_extended", "_dense"],
+    ["_segments"],
     ["_adjoints"],
     ["_integrate"],
     ["invariants"],
@@ -86,7 +87,7 @@ def test_door_has_no_logic():
 
 PUBLIC = """
 System discretise integrate Save Solution RESULTS IntegrationError Newton
-legendre from_lagrangian from_type_iii velocity_force
+legendre from_lagrangian from_type_iii velocity_force Layout
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
 GaussLegendre LobattoIIIAIIIB RungeKutta4
 Uniform Given TimeTransformed Variational FloatingPoint Compensated FixedPoint

@@ -1,51 +1,91 @@
 """Whether an output of a function depends on an input, read from its jaxpr."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 
-from .._compat import Jaxpr, Literal, jaxprs_in_params
+from .._compat import Jaxpr, Literal, jaxprs_in_params, scan_counts
 
 
 def depends_on(function: Callable[..., Any], argnum: int, *args: Any) -> bool:
     """Whether any output of ``function(*args)`` can depend on the values in ``args[argnum]``.
 
     Dependence of values is meant, not a non-zero derivative: sign(p) depends on p. The
-    answer errs on the side of True, through loops and primitives that are not looked into.
+    answer errs on the side of True, through primitives that are not looked into.
     `args` are arrays or shape structs (only shapes and types matter).
     """
     before = len(jax.tree.leaves(args[:argnum]))
     count = len(jax.tree.leaves(args[argnum]))
     closed = jax.make_jaxpr(function)(*args)
-    tainted = [before <= i < before + count for i in range(len(closed.jaxpr.invars))]
-    return any(_propagate(closed.jaxpr, tainted))
+    marked = [before <= i < before + count for i in range(len(closed.jaxpr.invars))]
+    return any(reached_outputs(closed.jaxpr, marked))
 
 
-def _propagate(jaxpr: Jaxpr, tainted_inputs: list[bool]) -> list[bool]:
-    """Which outputs of `jaxpr` are reached from the tainted inputs."""
-    tainted = {v for v, t in zip(jaxpr.invars, tainted_inputs, strict=True) if t}
+def reached_outputs(jaxpr: Jaxpr, reached_inputs: Sequence[bool]) -> list[bool]:
+    """Which outputs of `jaxpr` are reached from the inputs that are marked."""
+    reached = {v for v, r in zip(jaxpr.invars, reached_inputs, strict=True) if r}
 
-    def reached(atom: Any) -> bool:
-        return not isinstance(atom, Literal) and atom in tainted
+    def is_reached(atom: Any) -> bool:
+        return not isinstance(atom, Literal) and atom in reached
 
     for eqn in jaxpr.eqns:
-        inputs = [reached(v) for v in eqn.invars]
+        inputs = [is_reached(v) for v in eqn.invars]
         if any(inputs):
-            inner = _called_jaxpr(eqn)
-            outputs = [True] * len(eqn.outvars) if inner is None else _propagate(inner, inputs)
-            tainted.update(v for v, t in zip(eqn.outvars, outputs, strict=True) if t)
-    return [reached(v) for v in jaxpr.outvars]
+            outputs = reached_by(eqn, inputs)
+            reached.update(v for v, r in zip(eqn.outvars, outputs, strict=True) if r)
+    return [is_reached(v) for v in jaxpr.outvars]
+
+
+def reached_by(eqn: Any, inputs: list[bool]) -> list[bool]:
+    """Which outputs of an equation are reached from the inputs that are marked."""
+    name, params = eqn.primitive.name, eqn.params
+    if name == "scan":
+        consts, count = scan_counts(params)
+        fixed, carry, xs = (
+            inputs[:consts],
+            inputs[consts : consts + count],
+            inputs[consts + count :],
+        )
+
+        def scanned(carry):
+            return reached_outputs(params["jaxpr"].jaxpr, [*fixed, *carry, *xs])
+
+        carry = fixed_point(lambda carry: scanned(carry)[:count], carry)
+        return [*carry, *scanned(carry)[count:]]
+    if name == "while":
+        first, second = params["cond_nconsts"], params["body_nconsts"]
+        of_test, of_body = inputs[:first], inputs[first : first + second]
+
+        def after(carry):
+            (test,) = reached_outputs(params["cond_jaxpr"].jaxpr, [*of_test, *carry])
+            body = reached_outputs(params["body_jaxpr"].jaxpr, [*of_body, *carry])
+            return [test or r for r in body]
+
+        return fixed_point(after, inputs[first + second :])
+    if name == "cond":
+        if inputs[0]:
+            return [True] * len(eqn.outvars)
+        per_branch = [reached_outputs(b.jaxpr, inputs[1:]) for b in params["branches"]]
+        return [any(r) for r in zip(*per_branch, strict=True)]
+    inner = _called_jaxpr(eqn)
+    return [True] * len(eqn.outvars) if inner is None else reached_outputs(inner, inputs)
+
+
+def fixed_point(after: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
+    """The smallest set that holds `marks` and, with each set, what comes `after` it."""
+    while True:
+        more = [a or b for a, b in zip(marks, after(marks), strict=True)]
+        if more == marks:
+            return marks
+        marks = more
 
 
 def _called_jaxpr(eqn: Any) -> Jaxpr | None:
     """The body of a call whose inputs and outputs match the equation's one by one, if it is one.
 
-    (jit, custom_jvp, custom_vjp, checkpoint and their like; a scan or while is not, because
-    what goes round its loop would need a fixed point.)
+    (jit, custom_jvp, custom_vjp, checkpoint and their like.)
     """
-    if eqn.primitive.name in ("scan", "while", "cond"):
-        return None
     bodies = list(jaxprs_in_params(eqn.params))
     if len(bodies) != 1:
         return None

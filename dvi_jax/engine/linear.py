@@ -2,7 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Inexact
+
+from .._compat import primitive
 
 UNROLLED_UP_TO = 4
 """Systems up to this size are eliminated in components; larger ones go to LAPACK."""
@@ -38,3 +41,29 @@ def solve_dense(A: Inexact[Array, "n n"], b: Inexact[Array, " n"]) -> Inexact[Ar
         known = sum((rows[i][j] * x[j] for j in range(i + 1, n)), start=jnp.zeros_like(b[0]))
         x[i] = (rows[i][n] - known) / rows[i][i]
     return jnp.stack(x)
+
+
+def solve_near_identity(A: Inexact[Array, "n n"], b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+    """Solution of A x = b where A needs no pivoting: close to the identity, or trusted to be.
+
+    In component form it is an elimination without exchanges that leaves out what is zero by the
+    structure of A (a band stays a band); elsewhere `solve_dense`. Whoever trusts must look at the
+    result. Linear in b and differentiable in both.
+    """
+    return lax.custom_linear_solve(
+        lambda x: A @ x,
+        b,
+        lambda _, b: _eliminate.bind(A, b),
+        lambda _, b: _eliminate.bind(A.T, b),
+    )
+
+
+_eliminate = primitive("eliminate", solve_dense)
+
+
+def unit_vectors(n: int, dtype) -> Inexact[Array, "n n"]:
+    """The identity matrix, whose zeros are known to be zeros in component form."""
+    return _unit_vectors.bind(n=n, dtype=jnp.dtype(dtype))
+
+
+_unit_vectors = primitive("unit_vectors", lambda *, n, dtype: jnp.eye(n, dtype=dtype))

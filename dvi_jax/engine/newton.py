@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
-from .linear import solve_dense
+from .linear import solve_dense, solve_near_identity, unit_vectors
 
 Vector = Inexact[Array, " n"]
 
@@ -49,6 +49,27 @@ class Newton(eqx.Module):
             raise ValueError("rtol and atol are both zero: no iteration could ever stop.")
 
 
+class Trusted(eqx.Module):
+    """So many iterations of Newton's method, without looking at how they go.
+
+    The verdict comes as a number in place of the residual: how much the last correction of a
+    component exceeds what is allowed. At most zero means that the root is good to round-off: the
+    correction was below √ε of its component, hence, convergence being quadratic, the next would be
+    below round-off; or it was nothing but round-off of larger components. NaN and positive numbers
+    mean that the solve is to be made again with care.
+    """
+
+    newton: Newton
+    iterations: Int[Array, ""]
+
+    def excess(self, correction: Vector, x: Vector, known: Vector) -> Float[Array, ""]:
+        eps = float(jnp.finfo(x.dtype).eps)
+        rtol = max(self.newton.rtol or 0.0, 0.25 * eps**0.5)
+        scale = jnp.maximum(known, jnp.abs(x))
+        floor = 64 * eps * jnp.max(scale, initial=0.0) + self.newton.atol
+        return jnp.max(jnp.abs(correction) - rtol * scale - floor, initial=-jnp.inf)
+
+
 class RootInfo(NamedTuple):
     """How a solve went: iterations made, ‖F‖ at the end over the scale, and its verdict."""
 
@@ -68,7 +89,7 @@ class _Iterate(NamedTuple):
 
 
 def find_root(
-    function: Callable[[Vector], Vector], guess: Vector, known: Vector, options: Newton
+    function: Callable[[Vector], Vector], guess: Vector, known: Vector, options: Newton | Trusted
 ) -> tuple[Vector, RootInfo]:
     """Root x of function(x) = 0 near `guess`, and how it was found.
 
@@ -77,8 +98,10 @@ def find_root(
     order: the iteration itself is never differentiated. `known` sets the scale for the
     relative tolerance beside x itself. The Jacobian comes from autodiff.
     """
-    rtol = 4096 * jnp.finfo(guess.dtype).eps if options.rtol is None else options.rtol
     known = lax.stop_gradient(jnp.abs(known))
+    if isinstance(options, Trusted):
+        return _trusted_root(function, guess, known, options)
+    rtol = 4096 * jnp.finfo(guess.dtype).eps if options.rtol is None else options.rtol
 
     def solve(F, x0):
         def proceed(state: _Iterate):
@@ -118,9 +141,27 @@ def find_root(
     return root, RootInfo(iterations.astype(jnp.int32), residual, converged > 0)
 
 
+def _trusted_root(function, guess: Vector, known: Vector, options: Trusted):
+    def solve(F, x0):
+        def improve(_, state):
+            x, _ = state
+            correction = solve_near_identity(*_value_and_jacobian(F, x)[::-1])
+            return x - correction, correction
+
+        x, correction = lax.fori_loop(0, options.iterations, improve, (x0, x0))
+        return x, options.excess(correction, x, known)
+
+    def tangent_solve(linear, rhs):
+        _, matrix = _value_and_jacobian(linear, jnp.zeros_like(rhs))
+        return solve_near_identity(matrix, rhs)
+
+    root, excess = lax.custom_root(function, guess, solve, tangent_solve, has_aux=True)
+    return root, RootInfo(options.iterations, lax.stop_gradient(excess), jnp.asarray(True))
+
+
 def _value_and_jacobian(F: Callable[[Vector], Vector], x: Vector) -> tuple[Vector, Array]:
     value, push = jax.linearize(F, x)
-    return value, jax.vmap(push, out_axes=1)(jnp.eye(x.shape[0], dtype=x.dtype))
+    return value, jax.vmap(push, out_axes=1)(unit_vectors(x.shape[0], x.dtype))
 
 
 def _norm(x: Vector) -> Float[Array, ""]:

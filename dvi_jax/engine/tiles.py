@@ -1,0 +1,287 @@
+"""A function of one lane on many lanes: in component form, in tiles that stay in cache."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from .._compat import ClosedJaxpr, identity, is_traced, jaxpr_as_fun, primitive
+from .elementary import VECTORISED
+from .lanes import Evaluator, Value, operation_count
+from .lanes._value import as_array, on_lanes, whole
+
+LARGEST = 20_000
+"""A function of more operations than this, loops counted once, is left in arrays."""
+
+SHORTEST = 100_000
+"""What has fewer lanes × steps than this is left in arrays: it is compiled in a third of the time,
+and over in some ten milliseconds."""
+
+FEWEST_FOR_OWN = 8
+"""Lanes from which on elementary functions of our own are faster than the library's."""
+
+TILE_ENTRIES = 2048
+"""Entries of the state of all lanes of a tile: about what a first-level cache holds."""
+
+
+class Layout(eqx.Module):
+    """How the arithmetic of a run is laid out; the numbers are the same to round-off.
+
+    **Arguments**
+
+    - `form`: ``"components"``: every element of an array is a number of its own, and a batch under
+      `vmap` goes in tiles of such numbers, which stay in registers and cache; ``"arrays"``: as the
+      functions were written, batched by `vmap`; ``"auto"``: components, but for short runs (fewer
+      than 100 000 lanes × steps), which they make longer by the time of their compilation, and
+      for functions of very many operations.
+    - `width`: lanes of a tile; None means by the size of the state.
+    - `library`: take sin, cos and their like from the library, as arrays do, also where components
+      go in batches of float64 and arithmetic of our own is several times as fast.
+
+    **Raises** `ValueError` for another form, or a width that is not positive.
+    """
+
+    form: Literal["auto", "components", "arrays"] = eqx.field(static=True, default="auto")
+    width: int | None = eqx.field(static=True, default=None)
+    library: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        if self.form not in ("auto", "components", "arrays"):
+            raise ValueError(f'form must be "auto", "components" or "arrays", got {self.form!r}.')
+        width = self.width
+        if width is not None and (
+            isinstance(width, bool) or not isinstance(width, int) or width < 1
+        ):
+            raise ValueError(f"width must be a positive integer or None, got {width!r}.")
+
+
+def lanewise(
+    function: Callable,
+    *args: Any,
+    layout: Layout,
+    steps: int,
+    entries: int,
+    plain: Callable | None = None,
+) -> Any:
+    """``function(*args)``, for one lane; and how it is to be batched by `vmap`.
+
+    `function` takes and returns pytrees of arrays. It is evaluated in component form, under `vmap`
+    in tiles of lanes, where `layout` says so for `steps` steps of a state with so many `entries`;
+    elsewhere `plain` is called, which gives the same numbers. Derivatives are those of `plain`;
+    it is `function` if left out.
+    """
+    plain = function if plain is None else plain
+    leaves, tree = jax.tree.flatten(args)
+    ordinary = _Traced(plain, leaves, tree)
+    special = ordinary if plain is function else _Traced(function, leaves, tree)
+    program = _Program(ordinary, special, layout, steps, entries)
+    # What is traced outside and closed over is an input like the others.
+    outer = ordinary.outer
+
+    @jax.custom_jvp
+    def call(*operands):
+        return _lanewise.bind(*operands, program=program, lanes=None, on=(False,) * len(operands))
+
+    @call.defjvp
+    def _(primals, tangents):
+        return jax.jvp(lambda *x: _all_alike(ordinary(*x), x), primals, tangents)
+
+    return jax.tree.unflatten(ordinary.out_tree, call(*outer, *leaves))
+
+
+def _all_alike(outputs: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
+    """The outputs, batched under `vmap` as those of the primitive are: all of them, in front.
+
+    JAX takes for granted that a function and its derivative's rule batch their values alike.
+    """
+    parts = [x.ravel()[:0] for x in inputs if eqx.is_inexact_array(x)]
+    nothing = sum((jnp.sum(x) for x in parts), start=jnp.zeros(()))  # it depends on all inputs
+
+    def alike(x):
+        if eqx.is_inexact_array(x):
+            x = x + nothing.astype(x.dtype)
+        else:
+            x = jnp.where(nothing == 0, x, x)
+        return _lanes_in_front.bind(x)
+
+    return [alike(x) for x in outputs]
+
+
+_lanes_in_front = identity(
+    "lanes_in_front",
+    lambda arrays, axes: (_lanes_in_front.bind(jnp.moveaxis(arrays[0], axes[0], 0)), 0),
+)
+
+
+class _Traced:
+    """A function of one lane as a jaxpr, what it closes over as its first operands."""
+
+    def __init__(self, function: Callable, leaves: Sequence[Any], tree: Any):
+        trees: list[Any] = []
+
+        def flat(*leaves):
+            out, out_tree = jax.tree.flatten(function(*jax.tree.unflatten(tree, leaves)))
+            trees.append(out_tree)
+            return out
+
+        self.closed = jax.make_jaxpr(flat)(*leaves)
+        self.out_tree = trees[-1]
+        self.outer = [c for c in self.closed.consts if is_traced(c)]
+
+    def __call__(self, *operands: Any) -> list[Any]:
+        outer = iter(operands[: len(self.outer)])
+        consts = [next(outer) if is_traced(c) else c for c in self.closed.consts]
+        closed = ClosedJaxpr(self.closed.jaxpr, consts)
+        return jaxpr_as_fun(closed)(*operands[len(self.outer) :])
+
+    def in_components(
+        self, operands: Sequence[Any], on: Sequence[bool], lanes: int | None, layout: Layout
+    ) -> list[Value]:
+        """The outputs in component form; the last axis of an operand is the lanes where `on`."""
+        values = [whole(x, o) for x, o in zip(operands, on, strict=True)]
+        outer = iter(values[: len(self.outer)])
+        consts = [next(outer) if is_traced(c) else whole(c, False) for c in self.closed.consts]
+        own = lanes is not None and lanes >= FEWEST_FOR_OWN and not layout.library
+        evaluator = Evaluator(lanes, VECTORISED if own else {})
+        return evaluator.jaxpr(self.closed.jaxpr, consts, values[len(self.outer) :])
+
+
+class _Program:
+    """Two ways to compute the same, and which is taken on how many lanes."""
+
+    def __init__(
+        self, ordinary: _Traced, special: _Traced, layout: Layout, steps: int, entries: int
+    ):
+        self.ordinary, self.special = ordinary, special
+        self.layout, self.steps, self.entries = layout, steps, entries
+
+    def takes_components(self, lanes: int | None) -> bool:
+        if self.layout.form != "auto":
+            return self.layout.form == "components"
+        if len(self.special.outer) != len(self.ordinary.outer):
+            return False
+        if (lanes or 1) * self.steps < SHORTEST:
+            return False
+        return operation_count(self.special.closed.jaxpr) <= LARGEST
+
+    @property
+    def width(self) -> int:
+        if self.layout.width is not None:
+            return self.layout.width
+        best = TILE_ENTRIES / max(self.entries, 1)
+        return min(max(2 ** round(math.log2(best)), 64), 1024)
+
+
+def _run(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
+    """The program on so many lanes: the first axis of operands where `on`, and of all outputs."""
+    if lanes is None:
+        if not program.takes_components(None):
+            return program.ordinary(*operands)
+        return [
+            jnp.asarray(v.array()[0])
+            for v in program.special.in_components(operands, on, None, program.layout)
+        ]
+    if not program.takes_components(lanes):
+        axes = [0 if o else None for o in on]
+        return jax.vmap(program.ordinary, axes, 0)(*operands)
+    return _in_tiles(program, operands, on, lanes)
+
+
+def _shape_of(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
+    front = () if lanes is None else (lanes,)
+    avals = program.ordinary.closed.out_avals
+    return [jax.ShapeDtypeStruct((*front, *a.shape), a.dtype) for a in avals]
+
+
+_run.shape_of = _shape_of  # pyright: ignore[reportFunctionMemberAccess]
+
+
+def _batched(operands, axes, *, program: _Program, lanes: int | None, on: tuple[bool, ...]):
+    """One more axis of lanes: all of them become one."""
+    batched = [axis is not None for axis in axes]
+    moved = [
+        x if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(operands, axes, strict=True)
+    ]
+    (size,) = {x.shape[0] for x, b in zip(moved, batched, strict=True) if b}
+    if lanes is None:
+        outs = _lanewise.bind(*moved, program=program, lanes=size, on=tuple(batched))
+        return outs, [0] * len(outs)
+    merged = [_merge(x, b, o, size, lanes) for x, b, o in zip(moved, batched, on, strict=True)]
+    either = tuple(b or o for b, o in zip(batched, on, strict=True))
+    outs = _lanewise.bind(*merged, program=program, lanes=size * lanes, on=either)
+    outs = [x.reshape(size, lanes, *x.shape[1:]) for x in outs]
+    return outs, [0] * len(outs)
+
+
+_lanewise = primitive("lanewise", _run, _batched, multiple=True)
+
+
+def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> Any:
+    """Two axes of lanes in front as one; one that is missing is filled with copies."""
+    if not (has_outer or has_inner):
+        return x
+    if not has_outer:
+        x = jnp.broadcast_to(x[None], (size, *x.shape))
+    elif not has_inner:
+        x = jnp.broadcast_to(x[:, None], (size, lanes, *x.shape[1:]))
+    return x.reshape(size * lanes, *x.shape[2:])
+
+
+def _in_tiles(program: _Program, operands: Sequence[Any], on: Sequence[bool], lanes: int) -> list:
+    """The outputs on all lanes, tile by tile."""
+    count = -(-lanes // program.width)
+    width = lanes if count == 1 else -(-lanes // (8 * count)) * 8
+    forms: list[_Form] = []
+
+    def cut(x):
+        missing = count * width - lanes
+        if missing:
+            x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (missing, *x.shape[1:]))])
+        return jnp.moveaxis(x.reshape(count, width, *x.shape[1:]), 1, -1)
+
+    def tile(mine):
+        mine = iter(mine)
+        parts = [next(mine) if o else x for x, o in zip(operands, on, strict=True)]
+        values = program.special.in_components(parts, on, width, program.layout)
+        forms[:] = [_Form(v) for v in values]
+        return [form.rows(v, width) for form, v in zip(forms, values, strict=True)]
+
+    mine = [cut(x) for x, o in zip(operands, on, strict=True) if o]
+    if count == 1:
+        rows = jax.tree.map(lambda x: x[None], tile([x[0] for x in mine]))
+    else:
+        rows = lax.map(tile, mine)
+    return [form.joined(r, lanes) for form, r in zip(forms, rows, strict=True)]
+
+
+class _Form:
+    """How a value is put out of a tile: in rows for its entries, or as one array."""
+
+    def __init__(self, value: Value):
+        self.shape, self.dtype = value.shape, value.dtype
+        self.depth = len(value.lead)
+        self.is_split = value.is_split or self.depth > 0
+
+    def rows(self, value: Value, width: int) -> list[jax.Array]:
+        """The arrays of the value, each with the lane axis last."""
+        if not self.is_split:
+            array, has_lanes = value.array()
+            array = jnp.asarray(array)
+            return [array if has_lanes else on_lanes(array, width, array.ndim)]
+        lead = value.lead_entries()
+        entries = value.entries() if lead is None else lead
+        return [on_lanes(as_array(e, self.dtype), width, self.depth) for e in entries.flat]
+
+    def joined(self, rows: Sequence[Any], lanes: int) -> Any:
+        """The array (lanes, *shape) of which each tile has put out rows (tiles, …, width)."""
+        if not rows:
+            return jnp.zeros((lanes, *self.shape), self.dtype)
+        parts = [jnp.moveaxis(x, -1, 1) for x in rows]
+        out = jnp.stack(parts, -1) if self.is_split else parts[0]
+        tiles, width = out.shape[:2]
+        return out.reshape(tiles * width, *self.shape)[:lanes]
