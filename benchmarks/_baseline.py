@@ -1,0 +1,203 @@
+"""The integrators of baseline.c, compiled for this machine and callable on NumPy arrays."""
+
+import ctypes
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+SOURCE = Path(__file__).with_name("baseline.c")
+FLAGS = ["-O3", "-ffast-math", "-shared", "-fPIC"]
+TUNED = [["-march=native"], ["-mcpu=native"], []]
+"""What tells a compiler to use all that this processor has: the first that it understands."""
+
+VECTOR_MATH = [["-DHAVE_LIBMVEC", "-lmvec"], []]
+"""With glibc's vectorised sin and cos where they are; else one lane at a time."""
+
+NEWTON_TOLERANCE = float(np.sqrt(np.finfo(np.float64).eps))
+"""A correction of this relative size was the last one needed, convergence being quadratic."""
+
+
+class NoCompilerError(RuntimeError):
+    """There is no C compiler to be found, or none that can compile baseline.c."""
+
+
+class Run(NamedTuple):
+    """A kernel with its arrays: calling it integrates from the start into the outputs."""
+
+    call: Callable[[], None]
+    outputs: dict[str, np.ndarray]
+
+    def __call__(self) -> dict[str, np.ndarray]:
+        self.call()
+        return self.outputs
+
+
+class Baseline:
+    """baseline.c as a shared library, built at once in a folder that goes with the object.
+
+    **Raises** `NoCompilerError` if neither $CC nor gcc, cc, clang on the PATH compiles it.
+    """
+
+    def __init__(self):
+        self._folder = tempfile.TemporaryDirectory(prefix="dvi_jax_baseline_")
+        target = Path(self._folder.name) / "baseline.so"
+        self.command = _compile(target)
+        self._library = ctypes.CDLL(str(target))
+        self.width = int(self._library.vector_width())
+        self.has_libmvec = bool(self._library.has_libmvec())
+        self._block = int(self._library.block())
+
+    def __str__(self) -> str:
+        sines = "libmvec" if self.has_libmvec else "libm, lane by lane"
+        return f"{' '.join(self.command)}; {self.width} doubles a vector; sin, cos from {sines}"
+
+    def final(self, kernel: str, q0, p0, *, h: float, steps: int, epsilon: float) -> Run:
+        """The explicit run to the state after the last step: outputs q, p."""
+        return self._run(
+            f"{kernel}_final", q0, p0, [_whole(steps), _real(h), _real(epsilon)],
+            lambda n, lanes: {"q": (n, lanes), "p": (n, lanes)},
+        )  # fmt: skip
+
+    def streamed(self, kernel: str, q0, p0, *, h: float, steps: int, epsilon: float) -> Run:
+        """As `final`, and of the energy its largest `drift` and its `slope` against time."""
+        return self._run(
+            f"{kernel}_streamed", q0, p0, [_whole(steps), _real(h), _real(epsilon)],
+            lambda n, lanes: {
+                "q": (n, lanes), "p": (n, lanes), "drift": (lanes,), "slope": (lanes,),
+            },
+        )  # fmt: skip
+
+    def saved(
+        self, kernel: str, q0, p0, *, h: float, steps: int, every: int, epsilon: float
+    ) -> Run:
+        """The start and every m-th state of the explicit run, shape (saves, n, lanes)."""
+        if steps % every:
+            raise ValueError(f"steps must be a multiple of every, got {steps} and {every}.")
+        shape = steps // every + 1
+        return self._run(
+            f"{kernel}_saved", q0, p0, [_whole(steps), _whole(every), _real(h), _real(epsilon)],
+            lambda n, lanes: {"q": (shape, n, lanes), "p": (shape, n, lanes)},
+        )  # fmt: skip
+
+    def implicit(
+        self, kernel: str, q0, p0, *, h: float, steps: int, epsilon: float, iterations: int,
+        monitor: bool = False,
+    ) -> Run:  # fmt: skip
+        """The implicit run to its last state; with `monitor`, the largest last `correction` too."""
+        if iterations < 1:
+            raise ValueError(f"iterations must be at least 1, got {iterations}.")
+        numbers = [_whole(steps), ctypes.c_int(iterations), _real(h), _real(epsilon)]
+        return self._run(
+            kernel, q0, p0, numbers,
+            lambda n, lanes: {
+                "q": (n, lanes), "p": (n, lanes), "correction": (lanes,) if monitor else None,
+            },
+        )  # fmt: skip
+
+    def iterations_needed(
+        self, kernel: str, q0, p0, *, h: float, steps: int, epsilon: float
+    ) -> tuple[int, float]:
+        """The least number of iterations whose last correction is below √ε, and that correction.
+
+        Relative to the largest momentum of the start; the error that is left is its square.
+        """
+        scale = float(np.max(np.abs(p0)))
+        for iterations in range(1, 9):
+            run = self.implicit(
+                kernel, q0, p0, h=h, steps=steps, epsilon=epsilon, iterations=iterations,
+                monitor=True,
+            )  # fmt: skip
+            correction = float(np.max(run()["correction"])) / scale
+            if correction <= NEWTON_TOLERANCE:
+                return iterations, correction
+        raise RuntimeError(
+            f"{kernel}: Newton's method does not converge in 8 iterations at h = {h:g}: "
+            f"the last correction is {correction:.1e}."
+        )
+
+    def _run(self, name: str, q0, p0, numbers: list[Any], shapes) -> Run:
+        """`name` on states (n, lanes), or `name`_one on states (n,)."""
+        q0, p0 = np.asarray(q0, float), np.asarray(p0, float)
+        if q0.shape != p0.shape or q0.ndim not in (1, 2):
+            raise ValueError(f"q0, p0 must be (n, lanes) or (n,), got {q0.shape} and {p0.shape}.")
+        one = q0.ndim == 1
+        n, lanes = (q0.shape[0], 1) if one else q0.shape
+        padded = lanes if one else -(-lanes // self._block) * self._block
+        start = [_aligned(x.reshape(n, lanes), padded) for x in (q0, p0)]
+        outputs = {
+            key: None if shape is None else _empty(shape)
+            for key, shape in shapes(n, padded).items()
+        }
+        function = getattr(self._library, f"{name}_one" if one else name)
+        function.restype = None
+        arguments = [
+            _whole(padded), *numbers,
+            *(ctypes.c_void_p(None if x is None else x.ctypes.data) for x in
+              [*start, *outputs.values()]),
+        ]  # fmt: skip
+
+        def call(kept=(start, outputs)):  # the library has only their addresses
+            function(*arguments)
+
+        shown = {key: x[..., :lanes] for key, x in outputs.items() if x is not None}
+        return Run(call, {key: x[..., 0] for key, x in shown.items()} if one else shown)
+
+
+def _whole(x: int):
+    return ctypes.c_long(x)
+
+
+def _real(x: float):
+    return ctypes.c_double(x)
+
+
+def _empty(shape: tuple[int, ...]) -> np.ndarray:
+    """Zeros, so that their pages are there, from an address that is a multiple of 64."""
+    size = int(np.prod(shape))
+    raw = np.zeros(size + 8)
+    start = (-raw.ctypes.data % 64) // 8
+    return raw[start : start + size].reshape(shape)
+
+
+def _aligned(x: np.ndarray, lanes: int) -> np.ndarray:
+    """x with its last lane repeated up to `lanes` of them."""
+    out = _empty((x.shape[0], lanes))
+    out[:, : x.shape[1]] = x
+    out[:, x.shape[1] :] = x[:, -1:]
+    return out
+
+
+def find_compiler() -> list[str]:
+    """$CC, or the first of gcc, cc, clang on the PATH, as the words of a command."""
+    if os.environ.get("CC"):
+        return shlex.split(os.environ["CC"])
+    for name in ("gcc", "cc", "clang"):
+        if found := shutil.which(name):
+            return [found]
+    raise NoCompilerError(
+        "the baseline is compiled from source, and there is no C compiler: looked for $CC and for "
+        "gcc, cc, clang on the PATH. Install one (apt install gcc), or set CC."
+    )
+
+
+def _compile(target: Path) -> list[str]:
+    compiler, errors = find_compiler(), []
+    for tuned in TUNED:
+        for vector_math in VECTOR_MATH:
+            flags = [*FLAGS, *tuned]
+            command = [*compiler, *flags, str(SOURCE), "-o", str(target), *vector_math, "-lm"]
+            try:
+                done = subprocess.run(command, capture_output=True, text=True, check=False)
+            except OSError as error:
+                raise NoCompilerError(f"{compiler[0]} does not start: {error}.") from error
+            if done.returncode == 0:
+                return [*compiler, *flags]
+            errors.append(f"{shlex.join(command)}\n{done.stderr}")
+    raise NoCompilerError(f"{compiler[0]} does not compile baseline.c:\n{errors[0]}")
