@@ -679,7 +679,7 @@ def picture(report: dict[str, Any], path: Path) -> None:
     ax.set_ylim(len(rows) - 0.4, -0.6)
     ax.set_xlabel("time beside the reference (hand-written C, or the forward pass); less is better")
     ax.margins(x=0.1)
-    ax.legend(loc="lower right", fontsize=8)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
     figure.savefig(path, dpi=150)
     plt.close(figure)
 

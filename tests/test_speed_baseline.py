@@ -1,0 +1,269 @@
+"""The C side of the speed benchmark computes what the package does, and the table adds up."""
+
+import functools
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+
+pytest.importorskip("matplotlib")
+FOLDER = Path(__file__).parent.parent / "benchmarks"
+LANES, STEPS, EVERY = 70, 20, 10
+"""Lanes: more than a block of the C side, and no multiple of it."""
+
+TOLERANCE = 1e-13
+
+
+def module(name):
+    """A file of the benchmarks, which import each other as scripts of one folder do."""
+    sys.path.insert(0, str(FOLDER))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(str(FOLDER))
+
+
+@pytest.fixture(scope="module")
+def baseline():
+    made = module("_baseline")
+    try:
+        made.find_compiler()
+    except made.NoCompilerError as error:
+        pytest.skip(str(error))
+    return made.Baseline()
+
+
+@pytest.fixture(scope="module")
+def speed():
+    speed = module("speed")
+    speed.plt.switch_backend("agg")
+    return speed
+
+
+@functools.cache
+def expected(name):
+    """The package's numbers: saved states (S, n, lanes), and drift and slope of the energy."""
+    w = module("_workloads").WORKLOADS[name]
+    observe = None if w.energy is None else (dvi.MaxDrift(w.energy), dvi.Trend(w.energy))
+
+    @functools.partial(jax.vmap, in_axes=-1, out_axes=-1)
+    def run(q0, p0):
+        sol = dvi.integrate(
+            w.system,
+            q0,
+            p0,
+            h=w.h,
+            num_steps=STEPS,
+            epsilon=module("_workloads").EPSILON,
+            args=w.args,
+            save=dvi.Save(every=EVERY),
+            observe=observe,
+            throw=False,
+        )
+        return sol.qs, sol.ps, sol.observed
+
+    return jax.tree.map(np.asarray, jax.jit(run)(*w.start(LANES)))
+
+
+def settings(name):
+    """The workload, its start, and what the C side is told of the run."""
+    w = module("_workloads").WORKLOADS[name]
+    epsilon = module("_workloads").EPSILON
+    return w, w.start(LANES), {"h": w.h, "steps": STEPS, "epsilon": epsilon}
+
+
+def defect(found, q, p):
+    return max(np.max(np.abs(found["q"] - q)), np.max(np.abs(found["p"] - p)))
+
+
+@pytest.mark.parametrize("name", ["oscillator", "kepler"])
+def test_explicit_kernels_agree_with_the_package(baseline, name):
+    w, start, given = settings(name)
+    qs, ps, (drift, slope) = expected(name)
+    assert defect(baseline.final(w.kernel, *start, **given)(), qs[-1], ps[-1]) < TOLERANCE
+    assert defect(baseline.saved(w.kernel, *start, every=EVERY, **given)(), qs, ps) < TOLERANCE
+    streamed = baseline.streamed(w.kernel, *start, **given)()
+    assert defect(streamed, qs[-1], ps[-1]) < TOLERANCE
+    np.testing.assert_allclose(streamed["drift"], drift, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(streamed["slope"], slope, rtol=0, atol=TOLERANCE)
+    assert np.min(drift) > 1e-4  # there was something to agree on
+    other = given | {"epsilon": 2 * given["epsilon"]}
+    assert defect(baseline.final(w.kernel, *start, **other)(), qs[-1], ps[-1]) > 1e6 * TOLERANCE
+
+
+@pytest.mark.parametrize("name", ["oscillator", "kepler"])
+def test_explicit_kernels_for_one_trajectory(baseline, name):
+    w, start, given = settings(name)
+    qs, ps, (drift, slope) = expected(name)
+    start = [x[:, 3] for x in start]
+    last = qs[-1, :, 3], ps[-1, :, 3]
+    assert defect(baseline.final(w.kernel, *start, **given)(), *last) < TOLERANCE
+    saved = baseline.saved(w.kernel, *start, every=EVERY, **given)()
+    assert defect(saved, qs[..., 3], ps[..., 3]) < TOLERANCE
+    streamed = baseline.streamed(w.kernel, *start, **given)()
+    assert abs(streamed["drift"] - drift[3]) < TOLERANCE
+    assert abs(streamed["slope"] - slope[3]) < TOLERANCE
+
+
+KERNELS = [
+    ("product", "product"),
+    ("pendulum", "pendulum"),
+    ("chain2", "chain2"),
+    pytest.param("chain4", "chain4", marks=pytest.mark.slow),
+    pytest.param("chain10", "chain10_tridiagonal", marks=pytest.mark.slow),
+    pytest.param("chain10", "chain10", marks=pytest.mark.slow),
+    pytest.param("web10", "web10", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("name", "kernel"), KERNELS)
+def test_implicit_kernels_agree_with_the_package(baseline, name, kernel):
+    _, start, given = settings(name)
+    qs, ps, _ = expected(name)
+    iterations, correction = baseline.iterations_needed(kernel, *start, **given)
+    assert correction < 1.5e-8  # √ε, so that what is left is ε
+
+    def run(start, iterations):
+        return baseline.implicit(kernel, *start, iterations=iterations, **given)()
+
+    assert defect(run(start, iterations), qs[-1], ps[-1]) < TOLERANCE
+    assert defect(run(start, iterations + 1), qs[-1], ps[-1]) < TOLERANCE
+    assert defect(run(start, iterations - 1), qs[-1], ps[-1]) > 10 * TOLERANCE
+    one = run([x[:, 3] for x in start], iterations)
+    assert defect(one, qs[-1, :, 3], ps[-1, :, 3]) < TOLERANCE
+
+
+def test_a_larger_step_takes_more_iterations(baseline):
+    _, start, given = settings("product")
+    few, _ = baseline.iterations_needed("product", *start, **given)
+    many, _ = baseline.iterations_needed("product", *start, **(given | {"h": 0.2}))
+    assert few < many
+    with pytest.raises(RuntimeError, match="does not converge"):
+        baseline.iterations_needed("product", *start, **(given | {"h": 4.0}))
+
+
+def test_no_compiler_is_told_in_words(monkeypatch, tmp_path):
+    made = module("_baseline")
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(made.NoCompilerError, match="Install one"):
+        made.find_compiler()
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(made.NoCompilerError, match="does not start"):
+        made.Baseline()
+    monkeypatch.setenv("CC", f"{sys.executable} -c 'raise SystemExit(3)'")
+    with pytest.raises(made.NoCompilerError, match="does not compile"):
+        made.Baseline()
+
+
+# The table
+
+
+def test_the_table_has_every_row_of_the_targets(speed):
+    rows = {row.name: row for row in speed.table()}
+    for start, count in (
+        ("kepler, ", 7), ("oscillator", 3), ("implicit", 6), ("one ", 4), ("gradient", 6),
+        ("forward mode", 2), ("compile", 2),
+    ):  # fmt: skip
+        assert sum(name.startswith(start) for name in rows) == count, start
+    assert rows["kepler, 1024 lanes"].targets == (1.7, 1.3)
+    assert [row.name for row in speed.chosen("one k")] == ["one kepler"]
+    with pytest.raises(SystemExit, match="no row matches"):
+        speed.chosen("no such row")
+
+
+def test_a_ratio_is_one_for_twice_the_same_and_shows_twice_the_work(speed):
+    bench_clock = speed.Clock(rounds=15, budget=20.0)
+    x = jnp.linspace(0.1, 0.9, 4096)
+
+    def work(count):
+        step = jax.jit(lambda x: jax.lax.fori_loop(0, count, lambda _, y: jnp.sin(y + x), x))
+        return lambda: step(x)
+
+    same = speed.ratio(bench_clock.times(work(100), work(100)))
+    thrice = speed.ratio(bench_clock.times(work(300), work(100)))
+    assert 0.6 < float(same) < 1.6
+    assert float(thrice) > 1.5 * float(same)
+
+
+def test_growing_ratios_are_found(speed):
+    before = {"a": {"plain": 2.0}, "b": {"plain": 1.0, "configured": 1.0}, "flat": {"plain": 0.0}}
+    same = {"a": {"plain": 2.1}, "b": {"plain": 1.2, "configured": 0.5}, "flat": {"plain": 1e-4}}
+    assert speed.worse(same, before, 1.3) == []
+    assert speed.worse({"a": {"plain": 2.7}}, before, 1.3) == [("a", "plain", 2.7, 2.0)]
+    assert speed.worse({"a": {"plain": None}}, before, 1.3) == [("a", "plain", None, 2.0)]
+    assert speed.worse({"flat": {"plain": 0.5}}, before, 1.3) == [("flat", "plain", 0.5, 0.0)]
+    assert speed.worse({"a": {"plain": float("nan")}}, before, 1.3)
+    with pytest.raises(ValueError, match="nothing was checked"):
+        speed.worse({"new": {"plain": 1.0}}, before, 1.3)
+
+
+def test_the_check_has_an_exit_status(speed, tmp_path, capsys):
+    file = tmp_path / "ratios.json"
+    file.write_text(json.dumps({"ratios": {"a": {"plain": 1.0}}}))
+
+    def report(value):
+        rows = [
+            {"row": "a", "unit": "×", "value": value},
+            {"row": "seconds", "unit": "s", "value": 9.0},
+        ]
+        return {"columns": {"plain": {"rows": rows}}}
+
+    assert speed.check(report(1.1), file, 1.3) == 0
+    assert speed.check(report(1.5), file, 1.3) == 1
+    assert "was 1" in capsys.readouterr().out
+    file.write_text(json.dumps({"ratios": {"other": {"plain": 1.0}}}))
+    assert speed.check(report(1.1), file, 1.3) == 2
+
+
+def test_a_row_that_raises_is_a_failed_row(speed):
+    def broken(bench):
+        raise ZeroDivisionError("on purpose")
+
+    result = speed.measured(speed.Row("broken", (1.0, 1.0), broken), "plain", None)
+    assert result["status"] == "failed"
+    assert "on purpose" in result["error"]
+    assert "FAILED" in speed.line(result)
+
+
+@pytest.mark.slow
+def test_rows_are_measured_and_reported(baseline, speed, tmp_path):
+    bench = speed.Bench(speed.Clock(rounds=3, budget=1.0), None)
+    rows = []
+    for what in ("final", "invariants", "saved"):
+        measure = functools.partial(
+            speed.explicit_row, name="kepler", lanes=64, steps=20, what=what
+        )
+        rows.append(speed.measured(speed.Row(what, (1e9, 1e9), measure), "plain", bench))
+    measure = functools.partial(speed.implicit_row, name="product", lanes=64, steps=20)
+    rows.append(speed.measured(speed.Row("implicit", (1e-9, None), measure), "plain", bench))
+    for measure in (
+        functools.partial(speed.lanes_first_row, name="kepler", lanes=64, steps=20),
+        functools.partial(speed.one_row, name="product", steps=20),
+        functools.partial(speed.gradient_row, name="kepler", lanes=4, steps=20),
+        functools.partial(speed.forward_mode_row, name="kepler", lanes=4, steps=20),
+        functools.partial(speed.million_row, name="kepler", lanes=(128, 64), steps=20),
+    ):
+        rows.append(speed.measured(speed.Row("any", (None, None), measure), "plain", bench))
+    assert [r["status"] for r in rows] == ["ok"] * 3 + ["missed"] + ["no target"] * 5, rows
+    assert all(r["value"] > 0 for r in rows)
+    assert rows[3]["c_iterations"] == 2
+    report = {"columns": {"plain": {"rows": rows}}}
+    assert "missed" in speed.as_text(report)
+    speed.picture(report, tmp_path / "speed.png")
+    assert (tmp_path / "speed.png").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_memory_is_told_apart(baseline, speed):
+    bench = speed.Bench(speed.Clock(rounds=3, budget=1.0), None)
+    of = functools.partial(speed.memory_row, bench, "kepler", 4, (200, 1000))
+    assert float(of(adjoint=dvi.Direct())) > 1  # stores what every step needs
+    assert float(of(adjoint=dvi.Reversible())) < 0.1
