@@ -500,7 +500,7 @@ def scaling_n(bench: Bench) -> list[dict[str, Any]]:
         f = bench.jit(batched(last_state(w, steps)))
         inputs = jnp.asarray(q0), jnp.asarray(p0)
         first = first_call(functools.partial(f, *inputs))
-        calls = [functools.partial(f, *inputs)]
+        calls: list[Callable[[], Any]] = [functools.partial(f, *inputs)]
         if w.kernel:
             calls.append(
                 bench.baseline.implicit(
@@ -667,10 +667,9 @@ def picture(report: dict[str, Any], path: Path) -> None:
             ax.plot(r["quartiles"], [y, y], color="0.3", lw=1)
             if r["target"] is not None:
                 ax.plot([r["target"]] * 2, [y - height / 2, y + height / 2], color="k", lw=2)
-            ax.annotate(
-                f" {r['value']:.2g}", (r["quartiles"][1], y), va="center", fontsize=7,
-                color="0.2" if r["status"] != "missed" else "C3",
-            )  # fmt: skip
+            right = max(r["quartiles"][1], r["target"] or 0)
+            color = "C3" if r["status"] == "missed" else "0.2"
+            ax.annotate(f" {r['value']:.3g}", (right, y), va="center", fontsize=7, color=color)
     ax.plot([], [], color="k", lw=2, label="target")
     ax.set_xscale("log")
     ax.axvline(1, color="0.6", lw=0.8, zorder=0)

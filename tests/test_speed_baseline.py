@@ -267,3 +267,26 @@ def test_memory_is_told_apart(baseline, speed):
     of = functools.partial(speed.memory_row, bench, "kepler", 4, (200, 1000))
     assert float(of(adjoint=dvi.Direct())) > 1  # stores what every step needs
     assert float(of(adjoint=dvi.Reversible())) < 0.1
+
+
+@pytest.mark.slow
+def test_a_peer_that_computes_something_else_is_not_timed(baseline, speed):
+    pytest.importorskip("scipy")
+    peers, clock = module("peers"), speed.Clock(rounds=3, budget=1.0)
+    (honest,) = (p for p in peers.all_peers() if (p.package, p.task) == ("scipy", "one kepler"))
+
+    def displaced(work):
+        return peers.run_scipy(work._replace(q0=work.q0 * np.array([1.0, 1.01])))
+
+    found, allowed = peers.agreement(honest, baseline)
+    assert found < allowed
+    wrong = peers.compared(honest._replace(prepare=displaced), baseline, clock)
+    assert wrong["status"] == "DISAGREES"
+    assert "value" not in wrong
+
+    def absent(work):
+        raise ImportError("no module named so")
+
+    assert peers.compared(honest._replace(prepare=absent), baseline, clock)["status"] == (
+        "not installed"
+    )
