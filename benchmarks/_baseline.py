@@ -108,7 +108,7 @@ class Baseline:
 
         Relative to the largest momentum of the start; the error that is left is its square.
         """
-        scale = float(np.max(np.abs(p0)))
+        scale, correction = float(np.max(np.abs(p0))), np.inf
         for iterations in range(1, 9):
             run = self.implicit(
                 kernel, q0, p0, h=h, steps=steps, epsilon=epsilon, iterations=iterations,

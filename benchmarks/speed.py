@@ -4,8 +4,9 @@
     python benchmarks/speed.py --scaling --out DIR
 
 A row is a ratio of times, one thread both, pinned to one core. In each round the two sides run
-once, in random order; of the ratios of all rounds the median is shown, and the quartiles. What
-other work on the machine does to a few rounds falls out.
+once, in random order; of the ratios of all rounds the median is shown, and the quartiles. Times
+are processor times of this process, so that waiting for other work on that core does not count;
+where the ratio of wall-clock times differs by more than WALL_DIFFERS it is shown too.
 
 - The C side is baseline.c, compiled here for this machine: arrays with the lanes last, a few
   vectors of lanes in registers over the whole time loop, outputs into memory that is there already.
@@ -64,6 +65,7 @@ FLAGS = (
 """XLA_FLAGS of the column "configured" for a package without `configure_cpu`."""
 
 LEAST_ROUNDS = 3
+WALL_DIFFERS = 1.2
 SAVE_EVERY = 10
 
 
@@ -77,6 +79,13 @@ def first_call(f: Callable[[], Any]) -> float:
     return time.perf_counter() - began
 
 
+class Times(NamedTuple):
+    """Seconds of each call in each round, shape (rounds, calls): of the processor, of the wall."""
+
+    processor: np.ndarray
+    wall: np.ndarray
+
+
 class Clock:
     """Interleaved timing: rounds in random order, within a budget of seconds for a row."""
 
@@ -84,22 +93,24 @@ class Clock:
         self.rounds, self.budget = rounds, budget
         self._random = random.Random(seed)
 
-    def times(self, *calls: Callable[[], Any]) -> np.ndarray:
-        """Seconds of each call in each round, shape (rounds, calls)."""
+    def times(self, *calls: Callable[[], Any]) -> Times:
+        """Each of the calls once in each round, in random order, after one call to warm up."""
         rounds, began = [], time.perf_counter()
         for call in calls:
             jax.block_until_ready(call())
         while len(rounds) < self.rounds:
-            taken = [0.0] * len(calls)
+            taken = np.zeros((2, len(calls)))
             order = list(range(len(calls)))
             self._random.shuffle(order)
             for i in order:
-                taken[i] = first_call(calls[i])
+                start = time.process_time(), time.perf_counter()
+                jax.block_until_ready(calls[i]())
+                taken[:, i] = time.process_time() - start[0], time.perf_counter() - start[1]
             rounds.append(taken)
             spent = time.perf_counter() - began
             if len(rounds) >= LEAST_ROUNDS and spent > self.budget:
                 break
-        return np.array(rounds)
+        return Times(*np.stack(rounds, axis=1))
 
 
 class Measured(NamedTuple):
@@ -112,11 +123,18 @@ class Measured(NamedTuple):
         return float(statistics.median(self.samples))
 
 
-def ratio(times: np.ndarray, **details) -> Measured:
-    """The first call's time over the second's."""
-    seconds = np.median(times, axis=0)
-    details |= {"seconds": seconds[0], "reference_seconds": seconds[1], "rounds": len(times)}
-    return Measured([float(x) for x in times[:, 0] / times[:, 1]], details)
+def ratio(times: Times, work: tuple[float, float] = (1.0, 1.0), **details) -> Measured:
+    """The first call's time over the second's, each by its work."""
+    by_work = [x / np.array(work) for x in times]
+    samples, wall = (x[:, 0] / x[:, 1] for x in by_work)
+    seconds = np.median(times.processor, axis=0)
+    details |= {
+        "seconds": seconds[0],
+        "reference_seconds": seconds[1],
+        "wall_ratio": float(np.median(wall)),
+        "rounds": len(samples),
+    }
+    return Measured([float(x) for x in samples], details)
 
 
 # The package's side
@@ -337,7 +355,7 @@ def million_row(bench: Bench, name: str, lanes: tuple[int, int], steps: int) -> 
     f = bench.jit(batched(last_state(w, steps)))
     starts = [[jnp.asarray(x) for x in w.start(count)] for count in lanes]
     times = bench.clock.times(*(functools.partial(f, *start) for start in starts))
-    return ratio(times / np.array(lanes), lanes=lanes, steps=steps)
+    return ratio(times, work=lanes, lanes=lanes, steps=steps)
 
 
 def first_call_of(bench: Bench, name: str, lanes: int = 1024, steps: int = 3) -> float:
@@ -507,7 +525,8 @@ def scaling_n(bench: Bench) -> list[dict[str, Any]]:
                     w.kernel, q0, p0, h=w.h, steps=steps, epsilon=EPSILON, iterations=2
                 ).call
             )
-        seconds = np.median(bench.clock.times(*calls), axis=0) / (lanes * steps) * 1e9
+        times = bench.clock.times(*calls).processor
+        seconds = np.median(times, axis=0) / (lanes * steps) * 1e9
         point = {"n": n, "nanoseconds": seconds[0], "first_call_seconds": first}
         point["temporary_bytes"] = temporary_bytes(batched(last_state(w, steps)), *inputs)
         points.append(point | ({"c_nanoseconds": seconds[1]} if w.kernel else {}))
@@ -578,8 +597,15 @@ def line(result: dict[str, Any]) -> str:
     target = "–" if result["target"] is None else f"{result['target']:g}"
     return (
         f"{result['row']:34s} {result['value']:8.3g} ({low:.3g} – {high:.3g}) {result['unit']}, "
-        f"target {target}: {result['status']}"
+        f"target {target}: {result['status']}{wall(result)}"
     )
+
+
+def wall(result: dict[str, Any]) -> str:
+    """The ratio of wall-clock times where it is another one."""
+    value, other = result["value"], result.get("wall_ratio", result["value"])
+    differs = max(value, other) > WALL_DIFFERS * min(value, other)
+    return f" (wall {other:.3g})" if differs else ""
 
 
 def column_in_process(column: str, words: list[str]) -> dict[str, Any]:
@@ -639,7 +665,7 @@ def as_text(report: dict[str, Any]) -> str:
             target = "–" if r["target"] is None else f"≤ {r['target']:g}"
             low, high = r["quartiles"]
             value = f"{r['value']:.3g} ({low:.3g}–{high:.3g}) {r['unit']}"
-            cells.append(f"{target:6s} | {value:32s} | {r['status']:9s}")
+            cells.append(f"{target:6s} | {value:32s} | {r['status'] + wall(r):9s}")
         lines.append(" | ".join(cells))
     return "\n".join(lines)
 

@@ -4,6 +4,7 @@ import functools
 import importlib
 import json
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -189,8 +190,27 @@ def test_a_ratio_is_one_for_twice_the_same_and_shows_twice_the_work(speed):
 
     same = speed.ratio(bench_clock.times(work(100), work(100)))
     thrice = speed.ratio(bench_clock.times(work(300), work(100)))
-    assert 0.6 < float(same) < 1.6
+    assert 0.5 < float(same) < 2
     assert float(thrice) > 1.5 * float(same)
+    by_work = speed.ratio(bench_clock.times(work(300), work(100)), work=(3, 1))
+    assert float(by_work) < float(thrice) / 1.5
+
+
+def test_waiting_is_no_work(speed):
+    def spin():
+        began = time.process_time()
+        while time.process_time() - began < 0.005:
+            pass
+
+    def wait():
+        spin()
+        time.sleep(0.05)
+
+    measured = speed.ratio(speed.Clock(5, 10.0).times(wait, spin))
+    assert 0.5 < float(measured) < 2
+    assert measured.details["wall_ratio"] > 2 * float(measured)
+    assert "wall" in speed.wall({"value": float(measured), **measured.details})
+    assert speed.wall({"value": 2.0, "wall_ratio": 2.1}) == ""
 
 
 def test_growing_ratios_are_found(speed):
