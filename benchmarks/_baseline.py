@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 SOURCE = Path(__file__).with_name("baseline.c")
-FLAGS = ["-O3", "-ffast-math", "-shared", "-fPIC"]
+FLAGS = ["-O3", "-ffast-math", "-fPIC"]
 TUNED = [["-march=native"], ["-mcpu=native"], []]
 """What tells a compiler to use all that this processor has: the first that it understands."""
 
-VECTOR_MATH = [["-DHAVE_LIBMVEC", "-lmvec"], []]
+VECTOR_MATH = [["-DHAVE_LIBMVEC", "-lmvec"], ["-UHAVE_LIBMVEC"]]
 """With glibc's vectorised sin and cos where they are; else one lane at a time."""
 
 NEWTON_TOLERANCE = float(np.sqrt(np.finfo(np.float64).eps))
@@ -188,16 +188,27 @@ def find_compiler() -> list[str]:
 
 
 def _compile(target: Path) -> list[str]:
+    """Compiled and linked by two commands: linked with -ffast-math, a library of gcc before 13
+    switches the whole process to rounding subnormal numbers to zero as it is loaded."""
     compiler, errors = find_compiler(), []
+    compiled = str(target.with_suffix(".o"))
     for tuned in TUNED:
-        for vector_math in VECTOR_MATH:
-            flags = [*FLAGS, *tuned]
-            command = [*compiler, *flags, str(SOURCE), "-o", str(target), *vector_math, "-lm"]
-            try:
-                done = subprocess.run(command, capture_output=True, text=True, check=False)
-            except OSError as error:
-                raise NoCompilerError(f"{compiler[0]} does not start: {error}.") from error
-            if done.returncode == 0:
-                return [*compiler, *flags]
-            errors.append(f"{shlex.join(command)}\n{done.stderr}")
+        for define, *libraries in VECTOR_MATH:
+            command = [*compiler, *FLAGS, *tuned]
+            errors.append(_run([*command, define, "-c", str(SOURCE), "-o", compiled]))
+            if not errors[-1]:
+                errors[-1] = _run(
+                    [*compiler, "-shared", compiled, "-o", str(target), *libraries, "-lm"]
+                )
+            if not errors[-1]:
+                return command
     raise NoCompilerError(f"{compiler[0]} does not compile baseline.c:\n{errors[0]}")
+
+
+def _run(command: list[str]) -> str:
+    """What went wrong, with the command; nothing if it went well."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise NoCompilerError(f"{command[0]} does not start: {error}.") from error
+    return f"{shlex.join(command)}\n{done.stderr}" if done.returncode else ""
