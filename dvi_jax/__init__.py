@@ -23,6 +23,7 @@ from ._integrate import integrate as integrate
 from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._solution import Save as Save, Solution as Solution
 from ._system import System as System
+from .engine.cpu import configure_cpu as configure_cpu
 from .engine.newton import Newton as Newton
 from .engine.tiles import Layout as Layout
 from .invariants import (

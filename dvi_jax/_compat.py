@@ -13,6 +13,7 @@ __all__ = [
     "Jaxpr",
     "Literal",
     "aval",
+    "backends_are_initialized",
     "bind_parameters",
     "bodies",
     "identity",
@@ -43,6 +44,13 @@ def bodies(eqn: Any) -> Iterator[ClosedJaxpr]:
                 yield item
             elif isinstance(item, Jaxpr):
                 yield ClosedJaxpr(item, ())
+
+
+def backends_are_initialized() -> bool:
+    """Whether JAX has started, and read its environment variables."""
+    from jax._src import xla_bridge  # no public name tells
+
+    return xla_bridge.backends_are_initialized()
 
 
 def aval(variable: Any) -> Any:

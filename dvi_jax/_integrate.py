@@ -36,6 +36,7 @@ from ._solution import Save, Solution
 from ._step import Equations
 from ._system import System
 from ._types import Interval
+from .engine.cpu import OPTIONS, takes_options
 from .engine.newton import Newton
 from .engine.tiles import Layout
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
@@ -194,9 +195,18 @@ def integrate(
     return _raise_on_failure(solution, task) if throw else solution
 
 
-@eqx.filter_jit
 def _whole(task: Task, plan: Plan, q0, p0, adjoint: AbstractAdjoint, layout: Layout) -> Outcome:
-    return adjoint.rollout(task, plan, q0, p0, layout)
+    arrays = [x for x in jax.tree.leaves((task, q0, p0)) if isinstance(x, jax.Array)]
+    compiled = _rollout_with_options if takes_options(*arrays) else _rollout
+    return compiled(adjoint, task, plan, q0, p0, layout)
+
+
+def _roll_out(adjoint: AbstractAdjoint, *of: Any) -> Outcome:
+    return adjoint.rollout(*of)
+
+
+_rollout = eqx.filter_jit(_roll_out)
+_rollout_with_options = eqx.filter_jit(_roll_out, compiler_options=OPTIONS)
 
 
 @eqx.filter_jit

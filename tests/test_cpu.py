@@ -1,0 +1,79 @@
+"""What XLA is told for the CPU: in time, on request, and nothing behind anybody's back."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import dvi_jax as dvi
+from dvi_jax.engine.cpu import takes_options
+
+
+def run(code, **environment):
+    keep = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**keep, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+CONFIGURE = """
+import os, jax, jax.numpy as jnp, dvi_jax as dvi
+jax.config.update("jax_enable_x64", True)
+dvi.configure_cpu()
+print(os.environ["XLA_FLAGS"])
+system = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2)
+sol = dvi.integrate(system, jnp.ones(1), jnp.ones(1), h=0.1, num_steps=3)
+print(sol.status)
+"""
+
+
+def test_configured_process_runs():
+    done = run(CONFIGURE)
+    flags, status = done.stdout.splitlines()
+    assert status == "successful", done.stderr
+    assert "small_while_loop" in flags
+    assert "vector_width=512" in flags
+
+
+def test_flags_of_the_users_are_left_alone():
+    own = "--xla_cpu_prefer_vector_width=128 --xla_cpu_max_isa=AVX2"
+    flags = run(CONFIGURE, XLA_FLAGS=own).stdout.splitlines()[0]
+    assert flags.startswith(own)
+    assert flags.count("vector_width") == 1
+    assert "small_while_loop" in flags
+
+
+def test_too_late_is_refused_with_what_to_do():
+    jnp.ones(1).block_until_ready()
+    before = os.environ.get("XLA_FLAGS")
+    with pytest.raises(RuntimeError, match="XLA_FLAGS=.*small_while_loop"):
+        dvi.configure_cpu()
+    assert os.environ.get("XLA_FLAGS") == before
+
+
+def test_importing_changes_no_flag():
+    done = run("import os, dvi_jax; print(os.environ.get('XLA_FLAGS'))")
+    assert done.stdout.strip() == "None"
+
+
+def test_options_go_to_the_outermost_compilation_only():
+    x = jnp.ones(2)
+    assert takes_options(x)
+    found = []
+
+    def probe(x):
+        found.append(takes_options(x))
+        return jnp.sum(x)
+
+    jax.vmap(probe)(jnp.ones((2, 2)))
+    jax.jit(probe)(x)
+    jax.grad(probe)(x)
+    jax.vmap(jax.grad(probe))(jnp.ones((2, 2)))
+    assert found == [True, False, False, False]
