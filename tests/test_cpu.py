@@ -53,7 +53,7 @@ def test_flags_of_the_users_are_left_alone():
 def test_too_late_is_refused_with_what_to_do():
     jnp.ones(1).block_until_ready()
     before = os.environ.get("XLA_FLAGS")
-    with pytest.raises(RuntimeError, match="XLA_FLAGS=.*small_while_loop"):
+    with pytest.raises(RuntimeError, match=r"XLA_FLAGS=.*small_while_loop"):
         dvi.configure_cpu()
     assert os.environ.get("XLA_FLAGS") == before
 
