@@ -21,6 +21,7 @@ from ._rollout import (
     StepTaken,
     Task,
     counted_scan,
+    piece_length,
     reduce,
     run,
     start,
@@ -138,7 +139,7 @@ class Reversible(AbstractAdjoint):
 
         λ_k = (∂Φ_h/∂(q_k, p_k))ᵀ λ_{k+1},     dL/dθ += (∂Φ_h/∂θ)ᵀ λ_{k+1}.
 
-    Memory does not grow with num_steps but for one state every `checkpoint_every` steps, from
+    Memory does not grow with num_steps but for one state about every `checkpoint_every` steps, from
     which the rebuilding starts afresh: it amplifies round-off on chaotic or dissipative arcs.
     Where a rebuilt component misses the stored one by more than `max_defect` of its own size
     (None means 1e-6 in float64 and 1e-3 in float32; a component below round-off of the largest
@@ -246,7 +247,7 @@ class Reversible(AbstractAdjoint):
 
     def _inner_loop(self, body, state, first, stride, count):
         """A scan over the steps of a block that keeps the state every `checkpoint_every` steps."""
-        size = self.checkpoint_every
+        size = piece_length(count, self.checkpoint_every)
         segments = (count - 1) // size  # the end of the block is kept anyway
         if segments == 0:
             return counted_scan(body, state, first, stride, count)
@@ -335,7 +336,7 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
         segments = 0 if saved.inner is None else len(saved.inner[0])
         if segments == 0:
             return undo_steps(known_start, end, first, count, last, at_save, grad, cot)
-        inner, size = saved.inner, settings.checkpoint_every
+        inner, size = saved.inner, piece_length(count, settings.checkpoint_every)
         newest = jax.tree.map(lambda x: x[-1], inner)
         k, rest = first + segments * size, count - segments * size
         grad, cot = undo_steps(newest, end, k, rest, last, at_save, grad, cot)

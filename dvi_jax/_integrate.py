@@ -197,8 +197,13 @@ def integrate(
 
 def _whole(task: Task, plan: Plan, q0, p0, adjoint: AbstractAdjoint, layout: Layout) -> Outcome:
     arrays = [x for x in jax.tree.leaves((task, q0, p0)) if isinstance(x, jax.Array)]
-    compiled = _rollout_with_options if takes_options(*arrays) else _rollout
-    return compiled(adjoint, task, plan, q0, p0, layout)
+    if takes_options(*arrays):
+        try:
+            return _rollout_with_options(adjoint, task, plan, q0, p0, layout)
+        except ValueError as error:  # a value of an outer jit or grad is closed over
+            if "compiler_options" not in str(error):
+                raise
+    return _rollout(adjoint, task, plan, q0, p0, layout)
 
 
 def _roll_out(adjoint: AbstractAdjoint, *of: Any) -> Outcome:

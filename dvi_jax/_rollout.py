@@ -165,6 +165,15 @@ def make_plan(save: Save, num_steps: int) -> Plan:
     return Plan(num_blocks, every, tail, save.final and tail > 0)
 
 
+def piece_length(count: int, every: int) -> int:
+    """Into pieces of how many steps `count` of them are cut: about `every`, the last not longer.
+
+    Pieces of one length are taken if there are any near: their loop is known to the compiler.
+    """
+    lengths = range(min(3 * every // 2, count), every // 2, -1)
+    return next((n for n in lengths if count % n == 0), every)
+
+
 def start(task: Task, q0: State, p0: State) -> Carry:
     """The carry before the first step."""
     real = jnp.finfo(q0.dtype).dtype

@@ -25,6 +25,7 @@ from ._rollout import (
     StepTaken,
     Task,
     counted_scan,
+    piece_length,
     run,
     take_step,
 )
@@ -89,10 +90,11 @@ def run_in_segments(
 def _long_block(task: Task, segment, state, first, count: int, every: int):
     """`count` steps in segments, and their end as it is saved."""
     alone, _ = task.observables()
+    every = piece_length(count, every)
     pieces = -(-count // every)
 
     def piece(state, k):
-        length = jnp.minimum(every, first + count - k)
+        length = jnp.minimum(every, first + count - k) if count % every else every
 
         def steps(task, carry):
             def body(i, so_far):
@@ -139,8 +141,7 @@ class _Segment:
         # Where the start was bad the books are kept from the first step on.
         missing = ~done | (~good & (first == 0))
         careful = in_arrays(lambda carry: steps(self.task, carry))
-        nothing = jax.tree.map(jnp.zeros_like, out[1])
-        with_care = lax.cond(on_any_lane(missing), careful, lambda c: (c, nothing), carry)
+        with_care = lax.cond(on_any_lane(missing), careful, lambda c: (c, out[1]), carry)
         after = self._in_the_books(carry, out[0], good), out[1]
         after, other = jax.tree.map(lambda a, b: jnp.where(missing, a, b), with_care, after)
         return (after, iterations), other
@@ -150,14 +151,17 @@ class _Segment:
         newton = equations.newton
         assert isinstance(newton, Newton)
         trusting = dataclasses.replace(equations, newton=Trusted(newton, iterations))
-        bare = carry._replace(
+        return steps(dataclasses.replace(self.task, equations=trusting), self._bare(carry))
+
+    def _bare(self, carry: Carry) -> Carry:
+        """The carry without its books."""
+        return carry._replace(
             result=None,
             failed_step=None,
             failed_residual=None,
             iterations=jnp.asarray(0, jnp.int32),
             residual=jnp.full_like(carry.residual, -jnp.inf) if self.solves else None,
         )
-        return steps(dataclasses.replace(self.task, equations=trusting), bare)
 
     def _solved(self, steps: Callable, carry: Carry, iterations: Array, good: Array):
         """On trust, with as many iterations as a lane has needed so far, or more.
@@ -168,7 +172,8 @@ class _Segment:
         assert isinstance(newton, Newton)
         most = max(min(newton.max_steps, MOST_ITERATIONS), FEWEST_ITERATIONS)
         like = jax.eval_shape(lambda c: self._on_trust(steps, c, iterations), carry)
-        out = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        other = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like[1])
+        out = self._bare(carry), other
 
         def is_open(iterations, done):
             return ~done & (iterations <= most)

@@ -488,7 +488,8 @@ class Evaluator:
         on = [varies or any(x) for x in zip(*per_branch, strict=True)]
         which = index.entries()[()]
         avals = [v.aval for v in eqn.outvars]
-        like = [Value(a.shape, a.dtype, array=np.zeros(a.shape, a.dtype)) for a in avals]
+        bulk = {v.shape for v in operands if v.is_bulk}
+        like = [Value(a.shape, a.dtype, is_bulk=a.shape in bulk) for a in avals]
         pack, unpack = self.packer(like, avals, on)
 
         def run(branch):
@@ -592,8 +593,9 @@ def stays_whole(value: Value) -> bool:
     """Whether a value goes through a loop as one array: it is one, and not small."""
     if value.is_split or value.lead:
         return False
-    most = 8 if value.known() is not None else SPLIT_UP_TO
-    return value.is_bulk or value.size > most
+    if value.is_bulk or value.size > SPLIT_UP_TO:
+        return True
+    return value.is_known and value.size > 8
 
 
 def _cut(values: list[Value], first: int, second: int) -> tuple[list, list, list]:

@@ -61,6 +61,11 @@ class Value:
     def is_split(self) -> bool:
         return self._entries is not None and not self.lead
 
+    @property
+    def is_known(self) -> bool:
+        """Whether it is given by numbers that are known while tracing."""
+        return self._array is not None and self.known() is not None
+
     def known(self) -> np.ndarray | None:
         """The numbers, if all of them are known while tracing."""
         if self._array is not None:
@@ -86,7 +91,7 @@ class Value:
         known = None if self.lead else self.known()
         source = self.array()[0] if known is None else known
         entries = objects([source[i] for i in np.ndindex(self.shape)], self.shape)
-        if not self.lead:
+        if not self.is_bulk:
             self._entries = entries
         return entries
 
