@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from ._compat import is_traced
 from ._results import RESULTS
@@ -292,28 +293,32 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
         taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
         values = [taken.value(f, task.args) for f in alone]
         reduced = [taken.number(task.bound(r.function), task.args) for r in reductions]
-        end = Saved(interval.t1, interval.h, q1, p1, values)
-        return eqx.filter(end, eqx.is_inexact_array), reduced
+        return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), reduced
 
-    def undo(state, k, is_last, at_save: Saved):
+    first_interval = task.interval(jnp.asarray(0, jnp.int32))
+    # What needs no solve fails by becoming NaN, which no check of the state lets pass.
+    may_fail = not task.method._inverse_needs_no_solve(task.equations, first_interval, q_start)
+
+    def undo(state, k, is_last, at_save):
         """One step back: the state before it, and the cotangents before it."""
-        q1, p1, grad, (cq, cp) = state
+        q1, p1, grad, (cq, cp), good = state
         interval = task.interval(k)
         q0, p0, info = task.method.inverse(task.equations, interval, q1, p1)
-        (end, values), pull = jax.vjp(lambda a, q, p: local_step(a, q, p, k), theta, q0, p0)
-        seed = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
-        seed = seed._replace(q=seed.q + cq, p=seed.p + cp)
-        seeds = []
+        ((_, _, t1), _, values), pull = jax.vjp(
+            lambda a, q, p: local_step(a, q, p, k), theta, q0, p0
+        )
+        at_end = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
+        ct, seeds = jnp.zeros_like(t1), []
         for r, memory, c, value in zip(
             reductions, carry.reductions, cotangent.reduced, values, strict=True
         ):
-            of_t, of_value = r.pull(memory, c, k, end.t, value)
-            seed = seed._replace(t=seed.t + of_t)
+            of_t, of_value = r.pull(memory, c, k, t1, value)
+            ct = ct + of_t
             seeds.append(of_value.astype(value.dtype))
-        of_theta, cq, cp = pull((seed, seeds))
-        ok = info.result == RESULTS.successful
-        grad = jax.tree.map(jnp.add, grad, of_theta)
-        return q0, p0, *_all_or_nan(ok, (grad, (cq, cp)))
+        of_theta, cq, cp = pull(((cq, cp, ct), at_end, seeds))
+        if may_fail:
+            good = good & (info.result == RESULTS.successful)
+        return q0, p0, jax.tree.map(jnp.add, grad, of_theta), (cq, cp), good
 
     def undo_steps(known_start, end, first, count, last, at_save, grad, cot):
         """`count` steps back from the exact state `end`, checked against `known_start`."""
@@ -323,16 +328,24 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
             state = undo(state, k, k == last, at_save)
             return (state, _largest(sizes, state[:2])), None
 
-        begin = ((*end, grad, cot), _largest(end, end))
-        ((q, p, grad, cot), sizes), _ = counted_scan(body, begin, first, 1, count, reverse=True)
+        begin = ((*end, grad, cot, jnp.asarray(True) if may_fail else None), _largest(end, end))
+        ((q, p, grad, cot, good), sizes), _ = counted_scan(
+            body, begin, first, 1, count, reverse=True
+        )
         allowed = settings.max_defect or (1e-6 if q.dtype.itemsize >= 8 else 1e-3)
         ok = _is_near(q, known_start[0], sizes[0], allowed)
         ok = ok & _is_near(p, known_start[1], sizes[1], allowed)
+        if may_fail:
+            ok = ok & good
         return _all_or_nan(ok, (grad, cot))
 
     def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):
         last = first + count - 1
         end = (saved.q, saved.p)
+        cot = (cot[0] + at_save.q, cot[1] + at_save.p)
+        _, pull_times = jax.vjp(lambda theta: _end_of(eqx.combine(theta, fixed), last), theta)
+        grad = jax.tree.map(jnp.add, grad, *pull_times((at_save.t, at_save.h)))
+        at_save = at_save.observed
         segments = 0 if saved.inner is None else len(saved.inner[0])
         if segments == 0:
             return undo_steps(known_start, end, first, count, last, at_save, grad, cot)
@@ -372,6 +385,12 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
     k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
     (_, grad, cot), _ = lax.scan(block, (k, grad, cot), (starts, saved, rows), reverse=True)
     return grad, *cot
+
+
+def _end_of(task: Task, k: Array) -> tuple[Array, Array]:
+    """Time and step size at the end of step k."""
+    interval = task.interval(k)
+    return interval.t1, interval.h
 
 
 def _last_row(x, is_there: bool):

@@ -136,7 +136,7 @@ def random_function(program):
     return function
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(program=st.lists(STEPS, min_size=1, max_size=6), n=st.integers(1, 4))
 def test_random_functions(program, n):
     f = random_function(program)
@@ -300,9 +300,7 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "save"),
     [
-        pytest.param(
-            s, w, marks=[] if (s, w) in (("kepler", "both"), ("coupled", "final")) else SLOW
-        )
+        pytest.param(s, w, marks=[] if (s, w) in (("kepler", "both"),) else SLOW)
         for s in SYSTEMS
         for w in SAVES
     ],
@@ -377,7 +375,7 @@ def test_a_lane_that_fails_is_told_and_leaves_the_others_alone():
             np.testing.assert_array_equal(x[others], y[others])
 
 
-@pytest.mark.parametrize("width", [8, 16])
+@pytest.mark.parametrize("width", [16, pytest.param(8, marks=SLOW)])
 def test_tiles_do_not_matter(width):
     """37 lanes in tiles of 8 or 16 (the last one filled up), the bits of one tile."""
     tiles = runner("kepler", dvi.Layout(form="components", width=width), num_steps=20)
@@ -386,6 +384,7 @@ def test_tiles_do_not_matter(width):
     assert_same(tiles(*arguments), one(*arguments), rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_several_axes_of_lanes():
     q, p = starts(6)
     args = jnp.linspace(0, 1, 3)
