@@ -211,7 +211,8 @@ def _roll_out(adjoint: AbstractAdjoint, *of: Any) -> Outcome:
 
 
 _rollout = eqx.filter_jit(_roll_out)
-_rollout_with_options = eqx.filter_jit(_roll_out, compiler_options=OPTIONS)
+_filter_jit: Any = eqx.filter_jit  # its annotations leave out what goes on to jax.jit
+_rollout_with_options = _filter_jit(_roll_out, compiler_options=OPTIONS)
 
 
 @eqx.filter_jit
