@@ -49,28 +49,23 @@ class MaxDrift(Reduction):
     function: Callable[..., Any]
 
     def start(self, value):
-        zero = jnp.zeros_like(value)
-        return value, jnp.full_like(value, jnp.nan), zero, jnp.zeros(value.shape, jnp.int32)
+        return value, jnp.zeros_like(value), jnp.full(value.shape, -1, jnp.int32)
 
     def update(self, memory, k, t, value):
-        first, drift, sign, at = memory
+        first, farthest, at = memory
         first = jnp.where(k == 0, value, first)
-        distance = jnp.abs(value - first)
+        far = value - first
         # Written so that NaN, once seen, stays.
-        larger = (k == 0) | ~(distance <= drift)
-        larger = larger & ~(jnp.isnan(drift) & (k > 0))
-        return (
-            first,
-            jnp.where(larger, distance, drift),
-            jnp.where(larger, jnp.sign(value - first), sign),
-            jnp.where(larger, k, at),
-        )
+        larger = (jnp.abs(far) > jnp.abs(farthest)) | jnp.isnan(far) | (k == 0)
+        return first, jnp.where(larger, far, farthest), jnp.where(larger, k, at)
 
     def finish(self, memory):
-        return memory[1]
+        _, farthest, at = memory
+        return jnp.where(at < 0, jnp.nan, jnp.abs(farthest))
 
     def pull(self, memory, cotangent, k, t, value):
-        _, _, sign, at = memory
+        _, farthest, at = memory
+        sign = jnp.sign(farthest)
         slope = jnp.where(k == at, sign, 0) - jnp.where(k == 0, sign, 0)
         return jnp.zeros_like(t), cotangent * slope
 
@@ -122,10 +117,10 @@ class Trend(Reduction):
 
     def update(self, memory, k, t, value):
         mean_t, mean_f, t_t, t_f = memory
-        count = jnp.asarray(k + 1, value.dtype)
+        weight = 1 / jnp.asarray(k + 1, value.dtype)
         before = t - mean_t
-        mean_t = mean_t + before / count
-        mean_f = mean_f + (value - mean_f) / count
+        mean_t = mean_t + before * weight
+        mean_f = mean_f + (value - mean_f) * weight
         return mean_t, mean_f, t_t + before * (t - mean_t), t_f + before * (value - mean_f)
 
     def finish(self, memory):
@@ -149,7 +144,7 @@ class Mean(Reduction):
     def update(self, memory, k, t, value):
         mean, _ = memory
         mean = jnp.where(k == 0, jnp.zeros_like(mean), mean)
-        return mean + (value - mean) / jnp.asarray(k + 1, value.dtype), k + 1
+        return mean + (value - mean) * (1 / jnp.asarray(k + 1, value.dtype)), k + 1
 
     def finish(self, memory):
         return memory[0]
