@@ -141,9 +141,13 @@ class _Segment:
         # Where the start was bad the books are kept from the first step on.
         missing = ~done | (~good & (first == 0))
         careful = in_arrays(lambda carry: steps(self.task, carry))
-        with_care = lax.cond(on_any_lane(missing), careful, lambda c: (c, out[1]), carry)
-        after = self._in_the_books(carry, out[0], good), out[1]
-        after, other = jax.tree.map(lambda a, b: jnp.where(missing, a, b), with_care, after)
+
+        def mend(trusted):
+            with_care = careful(carry)
+            return jax.tree.map(lambda a, b: jnp.where(missing, a, b), with_care, trusted)
+
+        trusted = self._in_the_books(carry, out[0], good), out[1]
+        after, other = lax.cond(on_any_lane(missing), mend, lambda x: x, trusted)
         return (after, iterations), other
 
     def _on_trust(self, steps: Callable, carry: Carry, iterations: Array):
