@@ -1,6 +1,7 @@
 """How gradients flow back through a trajectory."""
 
 import abc
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from ._arithmetic import FloatingPoint
 from ._compat import is_traced
 from ._results import RESULTS
 from ._rollout import (
@@ -31,7 +33,9 @@ from ._rollout import (
 )
 from ._segments import can_trust, run_in_segments
 from ._types import State
+from .engine.newton import Known
 from .engine.tiles import Layout, lanewise
+from .methods import TypeII
 
 
 class Outcome(NamedTuple):
@@ -285,11 +289,14 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
     task: Task = eqx.combine(theta, fixed)
     _, reductions = task.observables()
 
-    def local_step(theta, q0, p0, k):
+    def local_step(theta, q0, p0, k, p1):
         task: Task = eqx.combine(theta, fixed)
         alone, reductions = task.observables()
-        interval = task.interval(k)
-        q1, p1, _ = task.method.step(task.equations, interval, q0, p0)
+        interval, equations = task.interval(k), task.equations
+        if isinstance(task.method, TypeII) and isinstance(task.arithmetic, FloatingPoint):
+            # What (13) is to be solved for is where we come from.
+            equations = dataclasses.replace(equations, newton=Known(p1.ravel()))
+        q1, p1, _ = task.method.step(equations, interval, q0, p0)
         taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
         values = [taken.value(f, task.args) for f in alone]
         reduced = [taken.number(task.bound(r.function), task.args) for r in reductions]
@@ -305,7 +312,7 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
         interval = task.interval(k)
         q0, p0, info = task.method.inverse(task.equations, interval, q1, p1)
         ((_, _, t1), _, values), pull = jax.vjp(
-            lambda a, q, p: local_step(a, q, p, k), theta, q0, p0
+            lambda a, q, p: local_step(a, q, p, k, p1), theta, q0, p0
         )
         at_end = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
         ct, seeds = jnp.zeros_like(t1), []

@@ -12,7 +12,7 @@ from ._results import RESULTS, first_failure
 from ._system import System
 from ._types import Args, Interval, Scalar, State
 from .engine.dependence import depends_on
-from .engine.newton import Newton, RootInfo, Trusted, find_root
+from .engine.newton import Known, Newton, RootInfo, Trusted, find_root
 
 
 class StepInfo(NamedTuple):
@@ -50,7 +50,7 @@ class Equations(eqx.Module):
     system: System
     epsilon: Scalar
     args: Args = None
-    newton: Newton | Trusted = Newton()
+    newton: Newton | Trusted | Known = Newton()
     origin: tuple[State, State] | None = None
     quantum: float | None = eqx.field(static=True, default=None)
 

@@ -70,6 +70,12 @@ class Trusted(eqx.Module):
         return jnp.max(jnp.abs(correction) - rtol * scale - floor, initial=-jnp.inf)
 
 
+class Known(eqx.Module):
+    """A root that is known already: nothing is solved for but its derivative."""
+
+    root: Vector
+
+
 class RootInfo(NamedTuple):
     """How a solve went: iterations made, ‖F‖ at the end over the scale, and its verdict."""
 
@@ -89,7 +95,10 @@ class _Iterate(NamedTuple):
 
 
 def find_root(
-    function: Callable[[Vector], Vector], guess: Vector, known: Vector, options: Newton | Trusted
+    function: Callable[[Vector], Vector],
+    guess: Vector,
+    known: Vector,
+    options: Newton | Trusted | Known,
 ) -> tuple[Vector, RootInfo]:
     """Root x of function(x) = 0 near `guess`, and how it was found.
 
@@ -101,6 +110,10 @@ def find_root(
     known = lax.stop_gradient(jnp.abs(known))
     if isinstance(options, Trusted):
         return _trusted_root(function, guess, known, options)
+    if isinstance(options, Known):
+        root = lax.custom_root(function, guess, lambda F, x0: options.root, _tangent_solve)
+        zero = jnp.asarray(0, jnp.int32)
+        return root, RootInfo(zero, jnp.zeros((), guess.dtype), jnp.asarray(True))
     rtol = 4096 * jnp.finfo(guess.dtype).eps if options.rtol is None else options.rtol
 
     def solve(F, x0):
@@ -151,12 +164,14 @@ def _trusted_root(function, guess: Vector, known: Vector, options: Trusted):
         x, correction = lax.fori_loop(0, options.iterations, improve, (x0, x0))
         return x, options.excess(correction, x, known)
 
-    def tangent_solve(linear, rhs):
-        _, matrix = _value_and_jacobian(linear, jnp.zeros_like(rhs))
-        return solve_near_identity(matrix, rhs)
-
-    root, excess = lax.custom_root(function, guess, solve, tangent_solve, has_aux=True)
+    root, excess = lax.custom_root(function, guess, solve, _tangent_solve, has_aux=True)
     return root, RootInfo(options.iterations, lax.stop_gradient(excess), jnp.asarray(True))
+
+
+def _tangent_solve(linear: Callable[[Vector], Vector], rhs: Vector) -> Vector:
+    """By the Jacobian at a root that was found without pivoting, or with it."""
+    _, matrix = _value_and_jacobian(linear, jnp.zeros_like(rhs))
+    return solve_near_identity(matrix, rhs)
 
 
 def _value_and_jacobian(F: Callable[[Vector], Vector], x: Vector) -> tuple[Vector, Array]:
