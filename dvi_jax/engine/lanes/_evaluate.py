@@ -454,26 +454,48 @@ class Evaluator:
         pack, unpack = self.packer(carry, [v.aval for v in body.jaxpr.outvars], on)
         (per_lane,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on])
 
-        def goes_on(state):
-            (answer,) = self.closed(test, [*of_test, *unpack(state)])
-            return self.pack(answer, per_lane)[0]
+        def goes_on(state) -> Value:
+            return self.closed(test, [*of_test, *unpack(state)])[0]
 
         def step(state):
             return tuple(pack(self.closed(body, [*of_body, *unpack(state)])))
 
         state = tuple(pack(carry))
-        if not (per_lane and self.lanes):
-            return unpack(list(lax.while_loop(goes_on, step, state)))
+        answer = test.jaxpr.outvars[0].aval
+        if not (answer.shape or (per_lane and self.lanes)):
+            return unpack(
+                list(lax.while_loop(lambda s: self.pack(goes_on(s), False)[0], step, state))
+            )
+
+        # Each lane, and under a `vmap` further in each place on it, stops by itself.
+        first = goes_on(state)
+        keep, restore = self.packer([first], [answer], [per_lane])
 
         def masked(state):
             active, before = state
-            after = tuple(
-                jnp.where(active, a, b) for a, b in zip(step(before), before, strict=True)
-            )
-            return goes_on(after), after
+            masks = self._masks(restore(active)[0], carry, on)
+            after = tuple(map(jnp.where, masks, step(before), before))
+            return tuple(keep([goes_on(after)])), after
 
-        _, end = lax.while_loop(lambda s: jnp.any(s[0]), masked, (goes_on(state), state))
+        def any_active(state):
+            return functools.reduce(jnp.logical_or, map(jnp.any, state[0]))
+
+        _, end = lax.while_loop(any_active, masked, (tuple(keep([first])), state))
         return unpack(list(end))
+
+    def _masks(self, active: Value, carry: Sequence[Value], on: Sequence[bool]) -> list[Any]:
+        """For each array that a carry is packed in, what `active` says of it: its shape is that of
+        the leading axes of all values."""
+        masks = []
+        for value, has_lanes in zip(carry, on, strict=True):
+            rest = value.shape[len(active.shape) :]
+            if stays_whole(value):
+                array, per_lane = active.array()
+                lanes = array.shape[-1:] if per_lane else (1,) * (has_lanes and bool(self.lanes))
+                masks.append(array.reshape(active.shape + (1,) * len(rest) + lanes))
+            else:
+                masks += [e for e in active.entries().flat for _ in np.ndindex(rest)]
+        return masks
 
     def cond(self, eqn: Any, values: list[Value]) -> list[Value]:
         branches = eqn.params["branches"]
