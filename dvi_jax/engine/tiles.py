@@ -24,7 +24,7 @@ and over in some ten milliseconds."""
 FEWEST_FOR_OWN = 8
 """Lanes from which on elementary functions of our own are faster than the library's."""
 
-TILE_ENTRIES = 2048
+TILE_ENTRIES = 1024
 """Entries of the state of all lanes of a tile: about what a first-level cache holds."""
 
 
