@@ -156,8 +156,9 @@ class Reversible(AbstractAdjoint):
     which the rebuilding starts afresh: it amplifies round-off on chaotic or dissipative arcs.
     Where a rebuilt component misses the stored one by more than `max_defect` of its own size
     (None means 1e-6 in float64 and 1e-3 in float32; a component below round-off of the largest
-    one is not looked at), or an inverse step has no solution, the gradient is NaN rather than
-    wrong: take fewer steps between checkpoints, or `Checkpointed`.
+    one is not looked at), or an inverse step has no solution, the lane goes from that checkpoint
+    once more, its states stored: slower, and right for any dynamics. The gradient of a trajectory
+    that has failed is NaN.
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
     without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop`, and a system

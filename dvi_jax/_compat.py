@@ -7,7 +7,7 @@ import jax
 from jax.core import ShapedArray, Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching, mlir, partial_eval
 
 __all__ = [
     "ClosedJaxpr",
@@ -17,13 +17,16 @@ __all__ = [
     "backends_are_initialized",
     "bind_parameters",
     "bodies",
+    "drops_outputs",
     "identity",
     "is_traced",
     "jaxpr_as_fun",
     "jaxprs_in_params",
+    "linear",
     "one_kernel",
     "primitive",
     "scan_counts",
+    "without_outputs",
     "x64_enabled",
 ]
 
@@ -95,11 +98,39 @@ def primitive(
     return new
 
 
+def drops_outputs(primitive: Primitive, without: Callable) -> None:
+    """Have unused outputs of a primitive dropped: `without(params, used)` → its new parameters."""
+
+    def rule(used: list[bool], *more: Any):
+        eqn = more[-1]  # newer releases put something in between
+        if not any(used):
+            return [False] * len(eqn.invars), None
+        outvars = [v for v, u in zip(eqn.outvars, used, strict=True) if u]
+        new = eqn.replace(outvars=outvars, params=without(eqn.params, used))
+        return [True] * len(eqn.invars), new
+
+    partial_eval.dce_rules[primitive] = rule
+
+
+def without_outputs(closed: ClosedJaxpr, used: list[bool]) -> ClosedJaxpr:
+    """The jaxpr that computes only some outputs, of the same inputs."""
+    jaxpr = partial_eval.dce_jaxpr(closed.jaxpr, used, instantiate=True)[0]
+    return ClosedJaxpr(jaxpr, closed.consts)
+
+
 def identity(name: str, batched: Callable) -> Primitive:
     """A primitive that does nothing but under `vmap`, for which `batched` is its rule."""
     new = primitive(name, lambda x: x, batched)
     ad.deflinear2(new, lambda cotangent, _: [new.bind(cotangent)])
     return new
+
+
+def linear(primitive: Primitive, transposed: Callable) -> None:
+    """Have a primitive differentiated as what is linear in all operands.
+
+    `transposed(cotangent, *operands)` → the cotangents of the operands.
+    """
+    ad.deflinear2(primitive, transposed)
 
 
 def _on_cpu(*arrays, closed: ClosedJaxpr):

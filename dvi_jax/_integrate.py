@@ -38,7 +38,7 @@ from ._system import System
 from ._types import Interval
 from .engine.cpu import OPTIONS, takes_options
 from .engine.newton import Newton
-from .engine.tiles import Layout
+from .engine.tiles import Layout, with_first
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation
 from .observe import Reduction, RequestedTimes, Section, Stop
@@ -287,7 +287,7 @@ def _solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: 
         alone = [jax.vmap(lambda step, f=f: step.value(f, task.args))(steps) for f in own]
     else:
         ts = jnp.concatenate([task.t0[None], saved.t])
-        qs, ps = jnp.concatenate([q0[None], saved.q]), jnp.concatenate([p0[None], saved.p])
+        qs, ps = with_first(q0, saved.q), with_first(p0, saved.p)
         hs, alone = saved.h, saved.observed
     return Solution(
         ts=ts,

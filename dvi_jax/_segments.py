@@ -144,11 +144,13 @@ class _Segment:
         missing = ~done | (~good & (first == 0))
         careful = in_arrays(lambda carry: steps(self.task, carry))
 
-        def mend(trusted):
-            return self._where(missing, careful(carry), trusted)
+        def mend(state):
+            return jnp.asarray(False), self._where(missing, careful(carry), state[1])
 
+        # A loop of one turn or none, because a conditional copies what it passes on.
         trusted = self._in_the_books(carry, out[0], good), out[1]
-        after, other = lax.cond(on_any_lane(missing), mend, lambda x: x, trusted)
+        begin = on_any_lane(missing), trusted
+        _, (after, other) = lax.while_loop(lambda state: state[0], mend, begin)
         return (after, iterations), other
 
     def _on_trust(self, steps: Callable, carry: Carry, iterations: Array):

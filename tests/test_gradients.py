@@ -183,7 +183,7 @@ def test_gradient_into_a_module_force():
 
 
 @pytest.mark.slow
-def test_a_rebuilt_state_that_misses_gives_nan_not_a_wrong_gradient():
+def test_where_rebuilt_states_miss_the_steps_are_taken_again():
     """Damped and driven over t = 80: rebuilding amplifies round-off by some e⁴⁰."""
 
     def damped_and_driven(t0, t1, q, p, args):
@@ -209,7 +209,7 @@ def test_a_rebuilt_state_that_misses_gives_nan_not_a_wrong_gradient():
 
     exact = slope(dvi.Direct())
     np.testing.assert_allclose(slope(dvi.Reversible(checkpoint_every=20)), exact, rtol=1e-9)
-    assert np.isnan(slope(dvi.Reversible(checkpoint_every=1000)))
+    np.testing.assert_allclose(slope(dvi.Reversible(checkpoint_every=1000)), exact, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -372,5 +372,9 @@ def test_defect_is_seen_in_a_component_that_is_small_beside_others():
         )
         return sol.ps[-1, 1] * 1e18
 
-    assert np.isfinite(jax.grad(final)(5.0, dvi.Direct()))
-    assert np.isnan(jax.grad(final)(5.0, dvi.Reversible()))
+    exact = jax.grad(final)(5.0, dvi.Direct())
+    assert np.isfinite(exact)
+    np.testing.assert_allclose(jax.grad(final)(5.0, dvi.Reversible()), exact, rtol=1e-9)
+    # It is the look at the defect that does it: without, the rebuilt states are worth nothing.
+    blind = jax.grad(final)(5.0, dvi.Reversible(max_defect=1e300))
+    assert not abs(blind / exact - 1) < 1e-3

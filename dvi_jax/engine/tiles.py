@@ -1,5 +1,6 @@
 """A function of one lane on many lanes: in component form, in tiles that stay in cache."""
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -9,7 +10,16 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._compat import ClosedJaxpr, identity, is_traced, jaxpr_as_fun, primitive
+from .._compat import (
+    ClosedJaxpr,
+    drops_outputs,
+    identity,
+    is_traced,
+    jaxpr_as_fun,
+    linear,
+    primitive,
+    without_outputs,
+)
 from .elementary import VECTORISED
 from .lanes import Evaluator, Value, operation_count
 from .lanes._value import as_array, on_lanes, whole
@@ -138,6 +148,12 @@ class _Traced:
         closed = ClosedJaxpr(self.closed.jaxpr, consts)
         return jaxpr_as_fun(closed)(*operands[len(self.outer) :])
 
+    def giving(self, used: list[bool]) -> "_Traced":
+        """The function that gives some of the outputs only, as a flat list."""
+        fewer = copy.copy(self)
+        fewer.closed = without_outputs(self.closed, used)
+        return fewer
+
     def in_components(
         self, operands: Sequence[Any], on: Sequence[bool], lanes: int | None, layout: Layout
     ) -> list[Value]:
@@ -158,6 +174,12 @@ class _Program:
     ):
         self.ordinary, self.special = ordinary, special
         self.layout, self.steps, self.entries = layout, steps, entries
+
+    def giving(self, used: list[bool]) -> "_Program":
+        """The program that gives some of the outputs only."""
+        ordinary = self.ordinary.giving(used)
+        special = ordinary if self.special is self.ordinary else self.special.giving(used)
+        return _Program(ordinary, special, self.layout, self.steps, self.entries)
 
     def takes_components(self, lanes: int | None) -> bool:
         if self.layout.form != "auto":
@@ -221,6 +243,13 @@ def _batched(operands, axes, *, program: _Program, lanes: int | None, on: tuple[
 _lanewise = primitive("lanewise", _run, _batched, multiple=True)
 
 
+def _without(params: dict[str, Any], used: list[bool]) -> dict[str, Any]:
+    return dict(params, program=params["program"].giving(used))
+
+
+drops_outputs(_lanewise, _without)
+
+
 def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> Any:
     """Two axes of lanes in front as one; one that is missing is filled with copies."""
     if not (has_outer or has_inner):
@@ -259,6 +288,29 @@ def _in_tiles(program: _Program, operands: Sequence[Any], on: Sequence[bool], la
     return [form.joined(r, lanes) for form, r in zip(forms, rows, strict=True)]
 
 
+def with_first(first: jax.Array, rows: jax.Array) -> jax.Array:
+    """`rows` after one more, `first`; under `vmap` with the lanes last, as tiles put them out.
+
+    (The compiler would transpose an array with lanes in front, and back.)
+    """
+    return _with_first.bind(first, rows)
+
+
+def _with_first_batched(arrays, axes):
+    (size,) = {x.shape[a] for x, a in zip(arrays, axes, strict=True) if a is not None}
+    first, rows = (
+        jnp.broadcast_to(x[..., None], (*x.shape, size)) if a is None else jnp.moveaxis(x, a, -1)
+        for x, a in zip(arrays, axes, strict=True)
+    )
+    return _with_first.bind(first, rows), rows.ndim - 1
+
+
+_with_first = primitive(
+    "with_first", lambda first, rows: jnp.concatenate([first[None], rows]), _with_first_batched
+)
+linear(_with_first, lambda cotangent, *_: [cotangent[0], cotangent[1:]])
+
+
 class _Form:
     """How a value is put out of a tile: in rows for its entries, or as one array."""
 
@@ -281,7 +333,7 @@ class _Form:
         """The array (lanes, *shape) of which each tile has put out rows (tiles, …, width)."""
         if not rows:
             return jnp.zeros((lanes, *self.shape), self.dtype)
-        parts = [jnp.moveaxis(x, -1, 1) for x in rows]
-        out = jnp.stack(parts, -1) if self.is_split else parts[0]
-        tiles, width = out.shape[:2]
-        return out.reshape(tiles * width, *self.shape)[:lanes]
+        # Lanes last first, so that a `vmap` which wants them there finds nothing to transpose.
+        parts = [jnp.moveaxis(x, 0, -2) for x in rows]
+        out = jnp.stack(parts, self.depth) if self.is_split else parts[0]
+        return jnp.moveaxis(out.reshape(*self.shape, -1)[..., :lanes], -1, 0)

@@ -131,7 +131,7 @@ class Evaluator:
             (body,) = bodies(eqn)
             return self.closed(body, values)
         numbers = [v.known() for v in values]
-        is_small = all(v.aval.size <= SPLIT_UP_TO for v in eqn.outvars)
+        is_small = all(v.aval.size <= MADE_UP_TO for v in eqn.outvars)
         known = [n for n in numbers if n is not None]
         if values and len(known) == len(values) and is_small and not eqn.effects:
             return [whole(x, False) for x in fold(eqn.primitive, known, eqn.params)]
