@@ -75,7 +75,8 @@ def _direct_rollout(
 
     def on_trust(arrays, q0, p0):
         task = eqx.combine(arrays, rest)
-        return outcome(task, run_in_segments(task, plan, start(task, q0, p0)))
+        begin = start(task, q0, p0)
+        return outcome(task, run_in_segments(task, plan, begin, one_row=layout.in_kernel))
 
     return lanewise(
         on_trust if can_trust(task) else forward, arrays, q0, p0,
@@ -191,7 +192,8 @@ class Reversible(AbstractAdjoint):
             theta, q0, p0 = inputs
             task = eqx.combine(theta, fixed)
             begin = start(task, q0, p0)
-            return finish(task, run_in_segments(task, plan, begin, self.checkpoint_every))
+            every, one_row = self.checkpoint_every, layout.in_kernel
+            return finish(task, run_in_segments(task, plan, begin, every, one_row))
 
         def finish(task, ran):
             carry, saved, tail = ran

@@ -1,12 +1,12 @@
 """The few names of JAX that have moved between releases, or are not public: all of them, here."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching, mlir, partial_eval
 
 __all__ = [
     "ClosedJaxpr",
@@ -20,8 +20,11 @@ __all__ = [
     "is_traced",
     "jaxpr_as_fun",
     "jaxprs_in_params",
+    "lower_on",
     "primitive",
     "scan_counts",
+    "skip_unwanted",
+    "with_outputs",
     "x64_enabled",
 ]
 
@@ -91,6 +94,35 @@ def primitive(
 
     batching.primitive_batchers[new] = batched or as_function
     return new
+
+
+def lower_on(platform: str, primitive: Primitive, function: Callable) -> None:
+    """Have a primitive of several outputs compiled for `platform` as what `function` does."""
+    rule = mlir.lower_fun(function, multiple_results=True)
+    mlir.register_lowering(primitive, rule, platform=platform)
+
+
+def skip_unwanted(primitive: Primitive) -> None:
+    """Tell a primitive which of its outputs are used, in its parameter `wanted`: one truth value
+    for each output that it could give."""
+
+    def rule(used, *rest):  # between them, in later releases: which inputs are used elsewhere
+        eqn = rest[-1]
+        if not any(used):
+            return [False] * len(eqn.invars), None
+        left = iter(used)
+        wanted = tuple(w and next(left) for w in eqn.params["wanted"])
+        outvars = [v for v, u in zip(eqn.outvars, used, strict=True) if u]
+        params = {**eqn.params, "wanted": wanted}
+        return [True] * len(eqn.invars), eqn.replace(outvars=outvars, params=params)
+
+    partial_eval.dce_rules[primitive] = rule
+
+
+def with_outputs(jaxpr: Jaxpr, wanted: Sequence[bool]) -> tuple[Jaxpr, list[bool]]:
+    """What it takes to compute these outputs, and which constants and inputs it has left."""
+    less, consts, inputs = partial_eval.dce_jaxpr_consts(jaxpr, wanted)
+    return less, [*consts, *inputs]
 
 
 def identity(name: str, batched: Callable) -> Primitive:

@@ -90,6 +90,8 @@ MOVES: dict[str, Callable] = {
     "concatenate": lambda *xs, dimension, **_: np.concatenate(xs, axis=dimension),
     "pad": _pad,
     "split": _split,
+    "stack": lambda *xs, axis, **_: np.stack(xs, axis),
+    "unstack": lambda x, *, axis, **_: tuple(np.moveaxis(x, axis, 0)),
 }
 """Where entries go, by NumPy's rules: nothing is computed."""
 

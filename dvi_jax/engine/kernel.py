@@ -1,0 +1,499 @@
+"""A function of one lane on many lanes as one GPU kernel, its loops with the state in registers.
+
+In component form every number of a lane is a variable of its own, and a block of lanes goes through
+all loops of the function within one call of a Pallas kernel (Triton backend): one lane a thread,
+nothing in memory but inputs, outputs and the rows that a loop saves. Rows are written from within
+the loop; what is made of them afterwards (reshaping, joining) is left to XLA. A function that does
+not go into a kernel is found out by looking at its program before anything is compiled.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from .._compat import ClosedJaxpr, Jaxpr, aval, bodies, scan_counts, with_outputs
+from .dependence import fixed_point, reached_outputs
+from .elementary import pow
+from .lanes import Evaluator, Value
+from .lanes._evaluate import _CALLS, IN_ARRAYS, SPLIT_UP_TO, _cut
+from .lanes._rules import apply
+from .lanes._value import as_array, is_array, on_lanes, split, whole
+
+BLOCK = 128
+"""Lanes of a block: four warps, one lane a thread."""
+
+UNROLLED_UP_TO = 8
+"""Scans over so few steps that take rows in, or put rows out inside of a loop, are written out."""
+
+LANES_OF_A_WARP = 32
+
+
+class NotInKernelError(Exception):
+    """The function does not go into a kernel; the message says why."""
+
+
+def run_in_kernel(
+    jaxpr: Jaxpr,
+    arrays: Sequence[Any],
+    has_lanes: Sequence[bool | None],
+    lanes: int,
+    *,
+    wanted: Sequence[bool] | None = None,
+    block: int | None = None,
+    interpret: bool = False,
+) -> list[jax.Array]:
+    """The outputs of `jaxpr` on `lanes` lanes, first axis the lanes, from one kernel.
+
+    `arrays` are its constants and its inputs. Where `has_lanes`, the first axis of an array is that
+    of the lanes; where that is None, the array is known while tracing. `wanted` picks outputs;
+    `block` lanes (rounded up to a power of two) make a block. With `interpret` the kernel is
+    evaluated operation by operation on any device, slowly: for tests.
+
+    **Raises** `NotInKernelError`, before anything is compiled.
+    """
+    wanted = [True] * len(jaxpr.outvars) if wanted is None else wanted
+    jaxpr, used = with_outputs(jaxpr, wanted)
+    inputs = [_Input(x, on) for x, on, u in zip(arrays, has_lanes, used, strict=True) if u]
+    block = _power_of_two(min(block or BLOCK, lanes))
+    count = -(-lanes // block)
+    operands = [x for i in inputs for x in i.operands(count * block - lanes)]
+    program = _Program(jaxpr, inputs, block)
+    written, rows = program.inspect()
+    outputs = _call(program, operands, written, rows, count, interpret)
+    return program.finish(outputs[: len(written)], outputs[len(written) :], lanes)
+
+
+def _power_of_two(n: int) -> int:
+    return 1 << max(n - 1, 0).bit_length()
+
+
+class _Input:
+    """An array as a kernel reads it: an operand for each entry, or one where lanes share it.
+
+    None if it is known.
+    """
+
+    def __init__(self, array: Any, has_lanes: bool | None):
+        self.array, self.has_lanes = array, has_lanes
+        self.shape = array.shape[1:] if has_lanes else array.shape
+        self.dtype = np.dtype(array.dtype)
+        self.size = 0 if has_lanes is None else math.prod(self.shape)
+        if has_lanes is None:
+            return
+        if self.dtype.name not in _KEPT_AS:
+            raise NotInKernelError(f"an input is {self.dtype}.")
+        if self.size > SPLIT_UP_TO:
+            raise NotInKernelError(f"an input has {self.size} entries.")
+
+    def operands(self, missing: int) -> list[jax.Array]:
+        """The arrays handed over, lanes filled up by copies of the last."""
+        if self.size == 0:
+            return []
+        x = jnp.asarray(self.array).astype(_KEPT_AS[self.dtype.name])
+        if not self.has_lanes:
+            return [x.reshape(-1)]
+        if missing:
+            x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (missing, *x.shape[1:]))])
+        columns = x.reshape(x.shape[0], self.size)
+        return [columns[:, i] for i in range(self.size)]
+
+    def shapes(self, block: int) -> list[jax.ShapeDtypeStruct]:
+        """What a block reads of the entries."""
+        shape = (block,) if self.has_lanes else ()
+        return [jax.ShapeDtypeStruct(shape, _KEPT_AS[self.dtype.name])] * self.size
+
+    def value(self, entries: Sequence[Any]) -> Value:
+        """The value in a block, from what it has read."""
+        if self.has_lanes is None:
+            return whole(np.asarray(self.array), False)
+        return split([_restored(e, self.dtype) for e in entries], self.shape, self.dtype)
+
+
+_KEPT_AS = {
+    "float32": np.dtype("float32"),
+    "float64": np.dtype("float64"),
+    "int32": np.dtype("int32"),
+    "int64": np.dtype("int64"),
+    "bool": np.dtype("int32"),
+}
+"""The types of numbers that go into a kernel, and the type by which memory holds them."""
+
+
+def _restored(x: Any, dtype: np.dtype) -> Any:
+    return x != 0 if dtype == np.bool_ else x
+
+
+def _kept(x: jax.Array, block: int) -> jax.Array:
+    """x as it is written: on all lanes, and no truth value."""
+    return on_lanes(x, block).astype(_KEPT_AS[np.dtype(x.dtype).name])
+
+
+# --- in a block -------------------------------------------------------------------------------
+
+
+class _Program:
+    """What a kernel computes, and what is left to do after it."""
+
+    def __init__(self, jaxpr: Jaxpr, inputs: list[_Input], block: int):
+        self.jaxpr, self.inputs, self.block = jaxpr, inputs, block
+        self.afterwards: list[tuple[Any, list[Value], list[_Later]]] = []
+        self.outputs: list[Value] = []
+        self.exported: list[Value] = []
+
+    def inspect(self) -> tuple[list[np.dtype], list[tuple[int, np.dtype]]]:
+        """Types of the entries that the kernel writes; lengths and types of the rows."""
+        shapes = [s for i in self.inputs for s in i.shapes(self.block)]
+        rows = _Rows()
+
+        def dry(*parts):
+            return self.in_block(parts, rows)
+
+        body = jax.make_jaxpr(dry)(*shapes)
+        _inspect(body.jaxpr, self.block)
+        return [a.dtype for a in body.out_avals], rows.kinds
+
+    def in_block(self, parts: Sequence[Any], rows: "_Rows") -> list[jax.Array]:
+        """The entries to be written, of one block; rows are written as they come."""
+        rest = iter(parts)
+        values = [i.value([next(rest) for _ in range(i.size)]) for i in self.inputs]
+        evaluator = _InBlock(self.block, rows)
+        consts = len(self.jaxpr.constvars)
+        outputs = evaluator.jaxpr(self.jaxpr, values[:consts], values[consts:])
+        self.outputs, self.afterwards = outputs, evaluator.afterwards
+        needed = [v for _, inputs, _ in evaluator.afterwards for v in inputs]
+        once = {id(v): v for v in [*outputs, *needed] if not isinstance(v, _Later)}
+        self.exported = list(once.values())
+        return [_kept(e, self.block) for v in self.exported for e in _traced(v)]
+
+    def finish(self, written: Sequence[Any], rows: Sequence[Any], lanes: int) -> list[jax.Array]:
+        """The outputs, of what was written."""
+        outside = Evaluator(written[0].shape[-1] if written else rows[0].shape[-1], {})
+        left, known = iter(written), {}
+        for value in self.exported:
+            entries = [
+                _restored(next(left), value.dtype) if is_array(e) else e
+                for e in value.entries().flat
+            ]
+            known[id(value)] = split(entries, value.shape, value.dtype)
+
+        def read(value: Value) -> Value:
+            if isinstance(value, _Later) and value.rows is not None:
+                parts = [_restored(rows[i], value.dtype) for i in value.rows]
+                entries = split(parts, value.shape[1:], value.dtype).entries()
+                return Value(value.shape, value.dtype, entries=entries, lead=value.shape[:1])
+            return known[id(value)]
+
+        for eqn, inputs, outputs in self.afterwards:
+            results = outside.equation(eqn, [read(v) for v in inputs])
+            known.update(zip(map(id, outputs), results, strict=True))
+        return [_lanes_first(read(v), lanes) for v in self.outputs]
+
+
+def _traced(value: Value) -> list[Any]:
+    return [e for e in value.entries().flat if is_array(e)]
+
+
+def _lanes_first(value: Value, lanes: int) -> jax.Array:
+    array, has_lanes = value.array()
+    array = jnp.asarray(array)
+    if has_lanes:
+        return jnp.moveaxis(array, -1, 0)[:lanes]
+    return jnp.broadcast_to(array[None], (lanes, *array.shape))
+
+
+class _Later(Value):
+    """A value that there is after the kernel only: rows that a loop saves, or made of them."""
+
+    def __init__(self, shape: Sequence[int], dtype: Any, rows: Sequence[int] | None = None):
+        super().__init__(shape, dtype, is_bulk=True)
+        self.rows = rows
+
+    def known(self):
+        return None
+
+    def entries(self):
+        raise NotInKernelError("what a loop saves is used before the end.")
+
+    def array(self):
+        raise NotInKernelError("what a loop saves is used before the end.")
+
+
+class _Rows:
+    """Where rows are written: one array (length, lanes) for each entry. In a dry run there is none,
+    and what it would take is noted."""
+
+    def __init__(self, refs: Sequence[Any] | None = None):
+        self.refs, self.kinds = refs, []
+
+    def reserve(self, length: int, dtypes: Sequence[np.dtype]) -> list[int]:
+        first = len(self.kinds)
+        self.kinds += [(length, dtype) for dtype in dtypes]
+        return list(range(first, len(self.kinds)))
+
+    def write(self, place: int, i: jax.Array, x: jax.Array) -> None:
+        if self.refs is not None:
+            self.refs[place][i, :] = x
+
+
+class _InBlock(Evaluator):
+    """Component form within a kernel: no arrays, rows written as they come."""
+
+    def __init__(self, lanes: int, rows: _Rows):
+        super().__init__(lanes, {"pow": pow})
+        self.rows = rows
+        self.depth = 0
+        self.afterwards: list[tuple[Any, list[Value], list[_Later]]] = []
+
+    def equation(self, eqn: Any, values: list[Value]) -> list[Value]:
+        name = eqn.primitive.name
+        if eqn.params.get("name") == IN_ARRAYS:  # a kernel has no arrays
+            (body,) = bodies(eqn)
+            return self.closed(body, values)
+        if name not in _CALLS and any(isinstance(v, _Later) for v in values):
+            return self._put_off(eqn, values)
+        if name == "scan":
+            return self.scan(eqn, values)
+        if name in ("while", "cond"):
+            return self._inside(lambda: super(_InBlock, self).equation(eqn, values))
+        return super().equation(eqn, values)
+
+    def _put_off(self, eqn: Any, values: list[Value]) -> list[Value]:
+        """An equation that needs rows is evaluated after the kernel."""
+        if self.depth or next(bodies(eqn), None) is not None:
+            raise NotInKernelError("what a loop saves is used in another.")
+        later = [_Later(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
+        self.afterwards.append((eqn, values, later))
+        return list(later)
+
+    def _inside(self, evaluate: Callable) -> Any:
+        self.depth += 1
+        try:
+            return evaluate()
+        finally:
+            self.depth -= 1
+
+    def _batched(self, eqn: Any, values: list[Value]) -> list[Value]:
+        raise NotInKernelError(f"{eqn.primitive.name} is applied to an array.")
+
+    # --- primitives that Triton takes otherwise than XLA -----------------------------------------
+
+    def _operate(self, eqn: Any, entries: list[Any], dtypes: list[Any]) -> Any:
+        own = _OWN.get(eqn.primitive.name)
+        if own is not None and np.issubdtype(dtypes[-1], np.floating):
+            return apply(own, entries, dtypes)
+        return super()._operate(eqn, entries, dtypes)
+
+    def _pairwise(self, operation: Callable, dtype: Any) -> Callable:
+        if np.issubdtype(dtype, np.floating):
+            operation = {lax.max: _maximum, lax.min: _minimum}.get(operation, operation)
+        return super()._pairwise(operation, dtype)
+
+    def on_any(self, x: jax.Array) -> jax.Array:
+        return jnp.max(x.astype(jnp.int32)) > 0 if x.ndim else x
+
+    def select(self, which: jax.Array, cases: Sequence[jax.Array]) -> jax.Array:
+        chosen = cases[-1]
+        for i, case in reversed(list(enumerate(cases[:-1]))):
+            chosen = jnp.where(which == i, case, chosen)
+        return chosen
+
+    # --- loops -----------------------------------------------------------------------------------
+
+    def pack(self, value: Value, has_lanes: bool, as_whole: bool = False) -> list[jax.Array]:
+        if as_whole:
+            raise NotInKernelError(f"a loop carries an array of {value.size} numbers.")
+        return super().pack(value, has_lanes)
+
+    def _split_small(self, values: list[Value]) -> None:
+        for value in values:
+            if value.size <= SPLIT_UP_TO:
+                value.entries()
+
+    def scan(self, eqn: Any, values: list[Value]) -> list[Value]:
+        body: ClosedJaxpr = eqn.params["jaxpr"]
+        length, is_reversed = eqn.params["length"], eqn.params["reverse"]
+        consts, carry, xs = _cut(values, *scan_counts(eqn.params))
+        kept = [v.aval for v in body.jaxpr.outvars[len(carry) :]]
+        is_flat = not any(e.primitive.name in _LOOPS for e in _equations(body.jaxpr, _CALLS))
+        is_short = length <= UNROLLED_UP_TO and is_flat
+        if length <= 1 or (is_short and (xs or (kept and self.depth))):
+            return self._written_out(body, consts, carry, xs, length, is_reversed)
+        if xs:
+            raise NotInKernelError(f"a loop of {length} steps takes rows in.")
+        if kept and self.depth:
+            raise NotInKernelError("a loop inside of another saves rows.")
+        self._split_small([*consts, *carry])
+        on = fixed_point(
+            lambda on: reached_outputs(body.jaxpr, [*map(self.has_lanes, consts), *on])[
+                : len(carry)
+            ],
+            [self.has_lanes(v) for v in carry],
+        )
+        first = len(consts)
+        pack, unpack = self.packer(carry, [v.aval for v in body.jaxpr.invars[first:]], on)
+        places = [self.rows.reserve(length, [a.dtype] * a.size) for a in kept]
+
+        def step(state, _):
+            i, carry = state
+            out = self._inside(lambda: self.closed(body, [*consts, *unpack(carry)]))
+            after, saved = out[: len(on)], out[len(on) :]
+            row = length - 1 - i if is_reversed else i
+            for value, mine in zip(saved, places, strict=True):
+                for place, entry in zip(mine, value.entries().flat, strict=True):
+                    x = as_array(entry, value.dtype)
+                    self.rows.write(place, row, _kept(x, self._lanes()))
+            return (i + 1, tuple(pack(after))), None
+
+        state = (jnp.asarray(0, jnp.int32), tuple(pack(carry)))
+        (_, end), _ = lax.scan(step, state, None, length)
+        later = [
+            _Later((length, *a.shape), a.dtype, mine) for a, mine in zip(kept, places, strict=True)
+        ]
+        return [*unpack(list(end)), *later]
+
+    def _lanes(self) -> int:
+        assert self.lanes is not None
+        return self.lanes
+
+    def _written_out(
+        self, body: ClosedJaxpr, consts, carry, xs, length: int, is_reversed: bool
+    ) -> list[Value]:
+        """A scan of few steps, step by step."""
+        order = range(length)[:: -1 if is_reversed else 1]
+        saved: dict[int, list[Value]] = {}
+        for i in order:
+            mine = [split(x.entries()[i], x.shape[1:], x.dtype) for x in xs]
+            out = self.closed(body, [*consts, *carry, *mine])
+            carry, saved[i] = out[: len(carry)], out[len(carry) :]
+        kept = [v.aval for v in body.jaxpr.outvars[len(carry) :]]
+        rows = [
+            [e for i in range(length) for e in saved[i][k].entries().flat] for k in range(len(kept))
+        ]
+        stacked = [split(r, (length, *a.shape), a.dtype) for r, a in zip(rows, kept, strict=True)]
+        return [*carry, *stacked]
+
+
+def _maximum(a, b):
+    """max(a, b), NaN if one of them is: Triton's would be the other one."""
+    return jnp.where((a > b) | (a != a), a, b)
+
+
+def _minimum(a, b):
+    return jnp.where((a < b) | (a != a), a, b)
+
+
+_OWN: dict[str, Callable] = {
+    "max": _maximum,
+    "min": _minimum,
+    "clamp": lambda low, x, high: _minimum(_maximum(x, low), high),
+}
+
+
+# --- what a kernel may be made of -----------------------------------------------------------------
+
+_FLOATS = """
+abs acos acosh add add_any asin asinh atan atan2 atanh cbrt ceil cos cosh div exp exp2 expm1 floor
+integer_pow is_finite log log1p logistic mul neg pow rsqrt sign sin sinh sqrt square sub tan tanh
+eq ge gt le lt ne
+"""
+_INTEGERS = """
+abs add add_any and clamp div integer_pow max min mul neg not or rem shift_left
+shift_right_arithmetic shift_right_logical sign square sub xor eq ge gt le lt ne
+reduce_max reduce_min
+"""
+_TRUTHS = "and not or xor eq ne"
+_MOVES = ("broadcast_in_dim", "convert_element_type", "select_n")
+
+LOWERED: dict[str, frozenset[str]] = {
+    kind: frozenset((*names.split(), *_MOVES))
+    for kind, names in {"f": _FLOATS, "i": _INTEGERS, "b": _TRUTHS}.items()
+}
+"""Primitives that Triton lowers and that give the numbers XLA gives, by the kind of their first
+operand. Not max and min of real numbers: they lose NaN."""
+
+
+def _inspect(jaxpr: Jaxpr, block: int) -> None:
+    """Raise an error if the program of a block is not made of what goes into a kernel."""
+    for eqn in _equations(jaxpr):
+        name, dtypes = eqn.primitive.name, [aval(v).dtype for v in eqn.invars]
+        kinds = [d.kind for d in dtypes]
+        of = kinds[1] if name == "select_n" and kinds[0] == "b" else kinds[0] if kinds else ""
+        if name not in LOWERED.get(of, ()) or (name == "select_n" and kinds[0] != "b"):
+            raise NotInKernelError(f"{name} of {dtypes[0] if dtypes else 'nothing'}.")
+        for out in eqn.outvars:
+            if aval(out).shape not in ((), (block,)):
+                raise NotInKernelError(f"{name} makes an array of shape {aval(out).shape}.")
+            if aval(out).dtype.name not in _KEPT_AS:
+                raise NotInKernelError(f"{name} makes numbers of type {aval(out).dtype}.")
+
+
+_LOOPS = frozenset({"scan", "while"})
+
+
+def _equations(jaxpr: Jaxpr, entered: frozenset[str] = _CALLS | _LOOPS | {"cond"}) -> Iterator[Any]:
+    """All equations, those inside of what is `entered` in its place."""
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name in entered:
+            for body in bodies(eqn):
+                yield from _equations(body.jaxpr, entered)
+        else:
+            yield eqn
+
+
+# --- the call -------------------------------------------------------------------------------------
+
+
+def _call(
+    program: _Program,
+    operands: Sequence[jax.Array],
+    written: Sequence[np.dtype],
+    rows: Sequence[tuple[int, np.dtype]],
+    count: int,
+    interpret: bool,
+) -> list[jax.Array]:
+    """The arrays (lanes,) and rows (length, lanes) that the kernel writes, block by block."""
+    # Not needed where there is no GPU, and slow to import.
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
+    block, lanes = program.block, count * program.block
+    inputs = [i for i in program.inputs if i.size]
+    on = [i.has_lanes for i in inputs for _ in range(i.size if i.has_lanes else 1)]
+
+    def lanewise(length: int | None = None):
+        if length is None:
+            return pl.BlockSpec((block,), lambda b: (b,))
+        return pl.BlockSpec((length, block), lambda b: (0, b))
+
+    def shared(x):
+        return pl.BlockSpec(x.shape, lambda b: (0,))
+
+    def kernel(*refs):
+        parts = []
+        for ref, o in zip(refs, on, strict=False):
+            parts += [ref[...]] if o else [ref[i] for i in range(ref.shape[0])]
+        outs = refs[len(on) :]
+        entries = program.in_block(parts, _Rows(outs[len(written) :]))
+        for ref, entry in zip(outs, entries, strict=False):
+            ref[...] = entry
+
+    kinds = [(length, _KEPT_AS[np.dtype(dtype).name]) for length, dtype in rows]
+    shapes = [jax.ShapeDtypeStruct((lanes,), dtype) for dtype in written]
+    shapes += [jax.ShapeDtypeStruct((length, lanes), dtype) for length, dtype in kinds]
+    if not shapes:
+        return []
+    return pl.pallas_call(
+        kernel,
+        grid=(count,),
+        in_specs=[lanewise() if o else shared(x) for x, o in zip(operands, on, strict=True)],
+        out_specs=[lanewise()] * len(written) + [lanewise(length) for length, _ in kinds],
+        out_shape=shapes,
+        interpret=interpret,
+        compiler_params=triton.CompilerParams(num_warps=max(block // LANES_OF_A_WARP, 1)),
+        name="lanes",
+    )(*operands)
