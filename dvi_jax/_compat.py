@@ -41,12 +41,24 @@ def x64_enabled() -> bool:
 
 def bodies(eqn: Any) -> Iterator[ClosedJaxpr]:
     """The jaxprs among the parameters of an equation, closed: what it calls."""
+    if "_prim" in eqn.params:  # from jax 0.12 on, custom_root and others
+        yield _expanded(eqn)
     for value in eqn.params.values():
         for item in value if isinstance(value, tuple | list) else (value,):
             if isinstance(item, ClosedJaxpr):
                 yield item
             elif isinstance(item, Jaxpr):
                 yield ClosedJaxpr(item, ())
+
+
+def _expanded(eqn: Any) -> ClosedJaxpr:
+    """What an equation stands for that is itself no operation yet."""
+    which = eqn.params["_prim"]
+
+    def function(*leaves):
+        return jax.tree.leaves(which.expand(*jax.tree.unflatten(which.in_tree, leaves)))
+
+    return jax.make_jaxpr(function)(*(v.aval for v in eqn.invars))
 
 
 def backends_are_initialized() -> bool:

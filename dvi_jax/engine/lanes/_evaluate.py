@@ -595,6 +595,8 @@ _CALLS = frozenset(
         "pjit",
         "closed_call",
         "core_call",
+        "call_hi_primitive",
+        "eval_jaxpr",
         "custom_jvp_call",
         "custom_vjp_call",
         "custom_vjp_call_jaxpr",
