@@ -9,7 +9,7 @@ not go into a kernel is found out by looking at its program before anything is c
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +23,10 @@ from .lanes import Evaluator, Value
 from .lanes._evaluate import _CALLS, IN_ARRAYS, SPLIT_UP_TO, _cut
 from .lanes._rules import apply
 from .lanes._value import as_array, is_array, on_lanes, split, whole
+from .linear import by_elimination, solve_dense
 
 BLOCK = 128
 """Lanes of a block: four warps, one lane a thread."""
-
-UNROLLED_UP_TO = 8
-"""Scans over so few steps that take rows in, or put rows out inside of a loop, are written out."""
 
 LANES_OF_A_WARP = 32
 
@@ -182,11 +180,12 @@ class _Program:
             known[id(value)] = split(entries, value.shape, value.dtype)
 
         def read(value: Value) -> Value:
-            if isinstance(value, _Later) and value.rows is not None:
-                parts = [_restored(rows[i], value.dtype) for i in value.rows]
-                entries = split(parts, value.shape[1:], value.dtype).entries()
-                return Value(value.shape, value.dtype, entries=entries, lead=value.shape[:1])
-            return known[id(value)]
+            if not (isinstance(value, _Later) and value.lead):
+                return known[id(value)]
+            parts = [rows[i].reshape(*value.lead, -1) for i in value.rows]
+            parts = [_restored(x, value.dtype) for x in parts]
+            entries = split(parts, value.shape[len(value.lead) :], value.dtype).entries()
+            return Value(value.shape, value.dtype, entries=entries, lead=value.lead)
 
         for eqn, inputs, outputs in self.afterwards:
             results = outside.equation(eqn, [read(v) for v in inputs])
@@ -207,11 +206,20 @@ def _lanes_first(value: Value, lanes: int) -> jax.Array:
 
 
 class _Later(Value):
-    """A value that there is after the kernel only: rows that a loop saves, or made of them."""
+    """A value that there is after the kernel only: rows that a loop saves, or made of them.
 
-    def __init__(self, shape: Sequence[int], dtype: Any, rows: Sequence[int] | None = None):
-        super().__init__(shape, dtype, is_bulk=True)
-        self.rows = rows
+    `rows` are where those of its entries are written, `lead` the lengths of the loops.
+    """
+
+    def __init__(
+        self,
+        shape: Sequence[int],
+        dtype: Any,
+        rows: Sequence[int] = (),
+        lead: Sequence[int] = (),
+    ):
+        super().__init__(shape, dtype, lead=lead, is_bulk=True)
+        self.rows = tuple(rows)
 
     def known(self):
         return None
@@ -222,6 +230,11 @@ class _Later(Value):
     def array(self):
         raise NotInKernelError("what a loop saves is used before the end.")
 
+    def stacked(self, length: int) -> "_Later":
+        """The rows of all rounds of a loop around the one that saves them."""
+        lead = (length, *self.lead)
+        return _Later((length, *self.shape), self.dtype, self.rows, lead)
+
 
 class _Rows:
     """Where rows are written: one array (length, lanes) for each entry. In a dry run there is none,
@@ -230,14 +243,21 @@ class _Rows:
     def __init__(self, refs: Sequence[Any] | None = None):
         self.refs, self.kinds = refs, []
 
-    def reserve(self, length: int, dtypes: Sequence[np.dtype]) -> list[int]:
+    def reserve(self, length: int, count: int, dtype: np.dtype) -> list[int]:
         first = len(self.kinds)
-        self.kinds += [(length, dtype) for dtype in dtypes]
+        self.kinds += [(length, dtype)] * count
         return list(range(first, len(self.kinds)))
 
     def write(self, place: int, i: jax.Array, x: jax.Array) -> None:
         if self.refs is not None:
             self.refs[place][i, :] = x
+
+
+class _Round(NamedTuple):
+    """A round of a loop that is being evaluated: its number, of how many."""
+
+    number: Any
+    length: int
 
 
 class _InBlock(Evaluator):
@@ -246,7 +266,7 @@ class _InBlock(Evaluator):
     def __init__(self, lanes: int, rows: _Rows):
         super().__init__(lanes, {"pow": pow})
         self.rows = rows
-        self.depth = 0
+        self.rounds: list[_Round | None] = []
         self.afterwards: list[tuple[Any, list[Value], list[_Later]]] = []
 
     def equation(self, eqn: Any, values: list[Value]) -> list[Value]:
@@ -259,23 +279,31 @@ class _InBlock(Evaluator):
         if name == "scan":
             return self.scan(eqn, values)
         if name in ("while", "cond"):
-            return self._inside(lambda: super(_InBlock, self).equation(eqn, values))
+            return self._inside(None, lambda: super(_InBlock, self).equation(eqn, values))
+        if eqn.params.get("name") == solve_dense.__name__ and len(values) == 2:
+            return self._solve(values)
         return super().equation(eqn, values)
+
+    def _solve(self, values: list[Value]) -> list[Value]:
+        """A dense solve of any size without the library."""
+        shapes = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in values]
+        return self.closed(jax.make_jaxpr(by_elimination)(*shapes), values)
 
     def _put_off(self, eqn: Any, values: list[Value]) -> list[Value]:
         """An equation that needs rows is evaluated after the kernel."""
-        if self.depth or next(bodies(eqn), None) is not None:
+        if self.rounds or next(bodies(eqn), None) is not None:
             raise NotInKernelError("what a loop saves is used in another.")
         later = [_Later(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
         self.afterwards.append((eqn, values, later))
         return list(later)
 
-    def _inside(self, evaluate: Callable) -> Any:
-        self.depth += 1
+    def _inside(self, what: "_Round | None", evaluate: Callable) -> Any:
+        """Evaluate in a round of a loop; None stands for one that may be left out."""
+        self.rounds.append(what)
         try:
             return evaluate()
         finally:
-            self.depth -= 1
+            self.rounds.pop()
 
     def _batched(self, eqn: Any, values: list[Value]) -> list[Value]:
         raise NotInKernelError(f"{eqn.primitive.name} is applied to an array.")
@@ -318,64 +346,80 @@ class _InBlock(Evaluator):
         body: ClosedJaxpr = eqn.params["jaxpr"]
         length, is_reversed = eqn.params["length"], eqn.params["reverse"]
         consts, carry, xs = _cut(values, *scan_counts(eqn.params))
-        kept = [v.aval for v in body.jaxpr.outvars[len(carry) :]]
-        is_flat = not any(e.primitive.name in _LOOPS for e in _equations(body.jaxpr, _CALLS))
-        is_short = length <= UNROLLED_UP_TO and is_flat
-        if length <= 1 or (is_short and (xs or (kept and self.depth))):
-            return self._written_out(body, consts, carry, xs, length, is_reversed)
-        if xs:
+        first, last = len(consts), len(consts) + len(carry)
+        slices = [v.aval for v in body.jaxpr.invars[last:]]
+        if any(isinstance(x, _Later) or x.size > SPLIT_UP_TO for x in xs):
             raise NotInKernelError(f"a loop of {length} steps takes rows in.")
-        if kept and self.depth:
-            raise NotInKernelError("a loop inside of another saves rows.")
+        if length == 1:
+            xs = [
+                split(list(x.entries().flat), a.shape, a.dtype)
+                for x, a in zip(xs, slices, strict=True)
+            ]
+            out = self.closed(body, [*consts, *carry, *xs])
+            return [*out[: len(carry)], *(_with_axis(v) for v in out[len(carry) :])]
         self._split_small([*consts, *carry])
         on = fixed_point(
-            lambda on: reached_outputs(body.jaxpr, [*map(self.has_lanes, consts), *on])[
-                : len(carry)
-            ],
+            lambda on: reached_outputs(
+                body.jaxpr, [*map(self.has_lanes, consts), *on, *map(self.has_lanes, xs)]
+            )[: len(carry)],
             [self.has_lanes(v) for v in carry],
         )
-        first = len(consts)
-        pack, unpack = self.packer(carry, [v.aval for v in body.jaxpr.invars[first:]], on)
-        places = [self.rows.reserve(length, [a.dtype] * a.size) for a in kept]
+        pack, unpack = self.packer(carry, [v.aval for v in body.jaxpr.invars[first:last]], on)
+        saved: list[_Later] = []
 
         def step(state, _):
             i, carry = state
-            out = self._inside(lambda: self.closed(body, [*consts, *unpack(carry)]))
-            after, saved = out[: len(on)], out[len(on) :]
             row = length - 1 - i if is_reversed else i
-            for value, mine in zip(saved, places, strict=True):
-                for place, entry in zip(mine, value.entries().flat, strict=True):
-                    x = as_array(entry, value.dtype)
-                    self.rows.write(place, row, _kept(x, self._lanes()))
+
+            def evaluate():
+                mine = [_row(x, row, a) for x, a in zip(xs, slices, strict=True)]
+                out = self.closed(body, [*consts, *unpack(carry), *mine])
+                saved[:] = [self._save(v) for v in out[len(on) :]]
+                return out[: len(on)]
+
+            after = self._inside(_Round(row, length), evaluate)
             return (i + 1, tuple(pack(after))), None
 
         state = (jnp.asarray(0, jnp.int32), tuple(pack(carry)))
         (_, end), _ = lax.scan(step, state, None, length)
-        later = [
-            _Later((length, *a.shape), a.dtype, mine) for a, mine in zip(kept, places, strict=True)
-        ]
-        return [*unpack(list(end)), *later]
+        return [*unpack(list(end)), *(v.stacked(length) for v in saved)]
 
-    def _lanes(self) -> int:
+    def _save(self, value: Value) -> _Later:
+        """Write what a round of a loop saves."""
+        if isinstance(value, _Later):
+            return value
+        if None in self.rounds:
+            raise NotInKernelError("a loop saves rows within a condition or a loop of any length.")
+        rounds = [r for r in self.rounds if r is not None]
+        row: Any = 0
+        for i, length in rounds:
+            row = row * length + i
+        entries = list(value.entries().flat)
+        total = math.prod(r.length for r in rounds)
+        places = self.rows.reserve(total, len(entries), value.dtype)
         assert self.lanes is not None
-        return self.lanes
+        for place, entry in zip(places, entries, strict=True):
+            self.rows.write(place, row, _kept(as_array(entry, value.dtype), self.lanes))
+        return _Later(value.shape, value.dtype, places)
 
-    def _written_out(
-        self, body: ClosedJaxpr, consts, carry, xs, length: int, is_reversed: bool
-    ) -> list[Value]:
-        """A scan of few steps, step by step."""
-        order = range(length)[:: -1 if is_reversed else 1]
-        saved: dict[int, list[Value]] = {}
-        for i in order:
-            mine = [split(x.entries()[i], x.shape[1:], x.dtype) for x in xs]
-            out = self.closed(body, [*consts, *carry, *mine])
-            carry, saved[i] = out[: len(carry)], out[len(carry) :]
-        kept = [v.aval for v in body.jaxpr.outvars[len(carry) :]]
-        rows = [
-            [e for i in range(length) for e in saved[i][k].entries().flat] for k in range(len(kept))
-        ]
-        stacked = [split(r, (length, *a.shape), a.dtype) for r, a in zip(rows, kept, strict=True)]
-        return [*carry, *stacked]
+
+def _row(value: Value, i: jax.Array, aval: Any) -> Value:
+    """The row of that number of a small value."""
+    rows = value.entries().reshape(value.shape[0], -1)
+    entries = []
+    for column in rows.T:
+        entry = as_array(column[-1], value.dtype)
+        for k, other in reversed(list(enumerate(column[:-1]))):
+            entry = jnp.where(i == k, as_array(other, value.dtype), entry)
+        entries.append(entry)
+    return split(entries, aval.shape, aval.dtype)
+
+
+def _with_axis(value: Value) -> Value:
+    """What a scan of one step makes of a value that it saves."""
+    if isinstance(value, _Later):
+        return value.stacked(1)
+    return split(list(value.entries().flat), (1, *value.shape), value.dtype)
 
 
 def _maximum(a, b):
@@ -432,15 +476,12 @@ def _inspect(jaxpr: Jaxpr, block: int) -> None:
                 raise NotInKernelError(f"{name} makes numbers of type {aval(out).dtype}.")
 
 
-_LOOPS = frozenset({"scan", "while"})
-
-
-def _equations(jaxpr: Jaxpr, entered: frozenset[str] = _CALLS | _LOOPS | {"cond"}) -> Iterator[Any]:
-    """All equations, those inside of what is `entered` in its place."""
+def _equations(jaxpr: Jaxpr) -> Iterator[Any]:
+    """All equations, those inside of loops and calls in their place."""
     for eqn in jaxpr.eqns:
-        if eqn.primitive.name in entered:
+        if eqn.primitive.name in _CALLS | {"scan", "while", "cond"}:
             for body in bodies(eqn):
-                yield from _equations(body.jaxpr, entered)
+                yield from _equations(body.jaxpr)
         else:
             yield eqn
 

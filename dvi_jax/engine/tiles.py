@@ -34,7 +34,7 @@ and over in some ten milliseconds."""
 FEWEST_FOR_OWN = 8
 """Lanes from which on elementary functions of our own are faster than the library's."""
 
-LARGEST_KERNEL = 5_000
+LARGEST_KERNEL = 10_000
 """A function of more operations than this goes into no kernel, which has some 250 registers."""
 
 TILE_ENTRIES = 2048
@@ -209,11 +209,14 @@ class _Program:
         """The outputs from one kernel, None where that is not wanted or cannot be."""
         form = self.layout.form
         lanes = options["lanes"]
-        if form not in ("auto", "kernel") or not lanes or not self.takes_components(lanes):
+        if form not in ("auto", "kernel") or not lanes:
+            return None
+        if form == "auto" and not self.takes_components(lanes):
             return None
         try:
-            if operation_count(self.special.closed.jaxpr) > LARGEST_KERNEL:
-                raise NotInKernelError("it has too many operations.")
+            count = operation_count(self.special.closed.jaxpr)
+            if count > LARGEST_KERNEL:
+                raise NotInKernelError(f"it has some {count} operations.")
             return self.special.in_kernel(operands, block=self.layout.width, **options)
         except NotInKernelError as error:
             if form == "kernel":
