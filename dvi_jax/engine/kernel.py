@@ -21,7 +21,7 @@ from .dependence import fixed_point, reached_outputs
 from .elementary import pow
 from .lanes import Evaluator, Value
 from .lanes._evaluate import _CALLS, IN_ARRAYS, SPLIT_UP_TO, _cut
-from .lanes._rules import apply
+from .lanes._rules import apply, fold
 from .lanes._value import as_array, is_array, on_lanes, split, whole
 from .linear import by_elimination, solve_dense
 
@@ -276,6 +276,8 @@ class _InBlock(Evaluator):
             return self.closed(body, values)
         if name not in _CALLS and any(isinstance(v, _Later) for v in values):
             return self._put_off(eqn, values)
+        if name == "iota":
+            return [whole(x, False) for x in fold(eqn.primitive, [], eqn.params)]
         if name == "scan":
             return self.scan(eqn, values)
         if name in ("while", "cond"):
