@@ -500,9 +500,11 @@ def _call(
     interpret: bool,
 ) -> list[jax.Array]:
     """The arrays (lanes,) and rows (length, lanes) that the kernel writes, block by block."""
-    # Not needed where there is no GPU, and slow to import.
-    from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton
+    try:  # slow to import, and announced to go
+        from jax.experimental import pallas as pl
+        from jax.experimental.pallas import triton
+    except ImportError as error:
+        raise NotInKernelError(f"this JAX has no Pallas for Triton ({error}).") from None
 
     block, lanes = program.block, count * program.block
     inputs = [i for i in program.inputs if i.size]
