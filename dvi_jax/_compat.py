@@ -121,7 +121,7 @@ def lower_on(platform: str, primitive: Primitive, function: Callable) -> None:
 _TRITON_CALLS = ("__gpu$xla.gpu.triton", "triton_kernel_call_ffi", "triton_kernel_call")
 
 
-def lowered_for_cuda(function: Callable, *args: Any) -> str:
+def lowered_for_cuda(function: Any, *args: Any) -> str:
     """The program of a jitted function for a GPU (StableHLO). No GPU is needed for that."""
     checks = [export.DisabledSafetyCheck.custom_call(name) for name in _TRITON_CALLS]
     device: Any = AbstractDevice

@@ -23,7 +23,7 @@ from .lanes import Evaluator, Value
 from .lanes._evaluate import _CALLS, IN_ARRAYS, SPLIT_UP_TO, _cut
 from .lanes._rules import apply, fold
 from .lanes._value import as_array, is_array, on_lanes, split, whole
-from .linear import by_elimination, solve_dense
+from .linear import by_elimination
 
 BLOCK = 128
 """Lanes of a block: four warps, one lane a thread."""
@@ -139,7 +139,7 @@ class _Program:
 
     def __init__(self, jaxpr: Jaxpr, inputs: list[_Input], block: int):
         self.jaxpr, self.inputs, self.block = jaxpr, inputs, block
-        self.afterwards: list[tuple[Any, list[Value], list[_Later]]] = []
+        self.afterwards: list[_Afterwards] = []
         self.outputs: list[Value] = []
         self.exported: list[Value] = []
 
@@ -187,8 +187,8 @@ class _Program:
             entries = split(parts, value.shape[len(value.lead) :], value.dtype).entries()
             return Value(value.shape, value.dtype, entries=entries, lead=value.lead)
 
-        for eqn, inputs, outputs in self.afterwards:
-            results = outside.equation(eqn, [read(v) for v in inputs])
+        for operation, inputs, outputs in self.afterwards:
+            results = operation(outside, [read(v) for v in inputs])
             known.update(zip(map(id, outputs), results, strict=True))
         return [_lanes_first(read(v), lanes) for v in self.outputs]
 
@@ -236,6 +236,10 @@ class _Later(Value):
         return _Later((length, *self.shape), self.dtype, self.rows, lead)
 
 
+_Afterwards = tuple[Callable, list[Value], list[_Later]]
+"""(of an evaluator and the inputs) -> outputs; its inputs; its outputs."""
+
+
 class _Rows:
     """Where rows are written: one array (length, lanes) for each entry. In a dry run there is none,
     and what it would take is noted."""
@@ -267,7 +271,7 @@ class _InBlock(Evaluator):
         super().__init__(lanes, {"pow": pow})
         self.rows = rows
         self.rounds: list[_Round | None] = []
-        self.afterwards: list[tuple[Any, list[Value], list[_Later]]] = []
+        self.afterwards: list[_Afterwards] = []
 
     def equation(self, eqn: Any, values: list[Value]) -> list[Value]:
         name = eqn.primitive.name
@@ -282,7 +286,7 @@ class _InBlock(Evaluator):
             return self.scan(eqn, values)
         if name in ("while", "cond"):
             return self._inside(None, lambda: super(_InBlock, self).equation(eqn, values))
-        if eqn.params.get("name") == solve_dense.__name__ and len(values) == 2:
+        if eqn.params.get("name") == "solve_dense" and len(values) == 2:
             return self._solve(values)
         return super().equation(eqn, values)
 
@@ -296,8 +300,19 @@ class _InBlock(Evaluator):
         if self.rounds or next(bodies(eqn), None) is not None:
             raise NotInKernelError("what a loop saves is used in another.")
         later = [_Later(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
-        self.afterwards.append((eqn, values, later))
+        self.afterwards.append((lambda outside, x: outside.equation(eqn, x), values, later))
         return list(later)
+
+    def _with_axis(self, value: Value) -> Value:
+        """What a scan of one step makes of a value that it saves."""
+        shape = (1, *value.shape)
+        if not isinstance(value, _Later):
+            return split(list(value.entries().flat), shape, value.dtype)
+        if value.lead:
+            return value.stacked(1)
+        later = _Later(shape, value.dtype)
+        self.afterwards.append((lambda _, x: [_stacked_alone(x[0])], [value], [later]))
+        return later
 
     def _inside(self, what: "_Round | None", evaluate: Callable) -> Any:
         """Evaluate in a round of a loop; None stands for one that may be left out."""
@@ -358,7 +373,7 @@ class _InBlock(Evaluator):
                 for x, a in zip(xs, slices, strict=True)
             ]
             out = self.closed(body, [*consts, *carry, *xs])
-            return [*out[: len(carry)], *(_with_axis(v) for v in out[len(carry) :])]
+            return [*out[: len(carry)], *(self._with_axis(v) for v in out[len(carry) :])]
         self._split_small([*consts, *carry])
         on = fixed_point(
             lambda on: reached_outputs(
@@ -417,11 +432,9 @@ def _row(value: Value, i: jax.Array, aval: Any) -> Value:
     return split(entries, aval.shape, aval.dtype)
 
 
-def _with_axis(value: Value) -> Value:
-    """What a scan of one step makes of a value that it saves."""
-    if isinstance(value, _Later):
-        return value.stacked(1)
-    return split(list(value.entries().flat), (1, *value.shape), value.dtype)
+def _stacked_alone(value: Value) -> Value:
+    array, has_lanes = value.array()
+    return whole(jnp.asarray(array)[None], has_lanes, is_bulk=True)
 
 
 def _maximum(a, b):
