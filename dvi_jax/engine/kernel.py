@@ -30,6 +30,9 @@ BLOCK = 128
 
 LANES_OF_A_WARP = 32
 
+ROW_UP_TO = 32
+"""Entries of a row of an input, if there is an axis to cut it by."""
+
 
 class NotInKernelError(Exception):
     """The function does not go into a kernel; the message says why."""
@@ -71,45 +74,65 @@ def _power_of_two(n: int) -> int:
 
 
 class _Input:
-    """An array as a kernel reads it: an operand for each entry, or one where lanes share it.
+    """An array as a kernel reads it.
 
-    None if it is known.
+    A small one entry by entry, where lanes share it from one operand. A large one row by row, when
+    a loop comes to it: `lead` are the axes of the rows. None of it if it is known.
     """
 
     def __init__(self, array: Any, has_lanes: bool | None):
         self.array, self.has_lanes = array, has_lanes
-        self.shape = array.shape[1:] if has_lanes else array.shape
+        self.shape = tuple(array.shape[1:] if has_lanes else array.shape)
         self.dtype = np.dtype(array.dtype)
-        self.size = 0 if has_lanes is None else math.prod(self.shape)
-        if has_lanes is None:
-            return
-        if self.dtype.name not in _KEPT_AS:
+        size = 0 if has_lanes is None else math.prod(self.shape)
+        self.lead = _lead(self.shape) if size > SPLIT_UP_TO else ()
+        self.rows = math.prod(self.lead) if self.lead else None
+        self.entries = math.prod(self.shape[len(self.lead) :]) if size else 0
+        if has_lanes is not None and self.dtype.name not in _KEPT_AS:
             raise NotInKernelError(f"an input is {self.dtype}.")
-        if self.size > SPLIT_UP_TO:
-            raise NotInKernelError(f"an input has {self.size} entries.")
+        if self.entries > SPLIT_UP_TO:
+            raise NotInKernelError(f"an input has {size} entries.")
 
     def operands(self, missing: int) -> list[jax.Array]:
-        """The arrays handed over, lanes filled up by copies of the last."""
-        if self.size == 0:
+        """The arrays handed over, lanes last, filled up by copies of the last of them."""
+        if self.entries == 0:
             return []
         x = jnp.asarray(self.array).astype(_KEPT_AS[self.dtype.name])
         if not self.has_lanes:
-            return [x.reshape(-1)]
+            columns = x.reshape(self.rows or 1, self.entries)
+            return [columns.ravel()] if self.rows is None else list(columns.T)
         if missing:
             x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (missing, *x.shape[1:]))])
-        columns = x.reshape(x.shape[0], self.size)
-        return [columns[:, i] for i in range(self.size)]
+        columns = x.reshape(x.shape[0], self.rows or 1, self.entries)
+        columns = [columns[:, :, i].T for i in range(self.entries)]
+        return [c[0] for c in columns] if self.rows is None else columns
 
     def shapes(self, block: int) -> list[jax.ShapeDtypeStruct]:
-        """What a block reads of the entries."""
+        """What a block reads: entries, of one row."""
         shape = (block,) if self.has_lanes else ()
-        return [jax.ShapeDtypeStruct(shape, _KEPT_AS[self.dtype.name])] * self.size
+        return [jax.ShapeDtypeStruct(shape, _KEPT_AS[self.dtype.name])] * self.entries
 
-    def value(self, entries: Sequence[Any]) -> Value:
-        """The value in a block, from what it has read."""
+    def value(self, reads: Sequence[Callable]) -> Value:
+        """The value in a block. `reads` give an entry, in the row of that number."""
         if self.has_lanes is None:
             return whole(np.asarray(self.array), False)
-        return split([_restored(e, self.dtype) for e in entries], self.shape, self.dtype)
+
+        def part(depth: int, i: Any) -> Value:
+            """That which is left of the value behind `depth` axes, in the row of that number."""
+            shape = self.shape[depth:]
+            if depth == len(self.lead):
+                return split([_restored(r(i), self.dtype) for r in reads], shape, self.dtype)
+            return _Stored(shape, self.dtype, lambda k: part(depth + 1, i * shape[0] + k))
+
+        return part(0, 0)
+
+
+def _lead(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The leading axes whose rows are read one by one."""
+    depth = 1
+    while depth < len(shape) - 1 and math.prod(shape[depth:]) > ROW_UP_TO:
+        depth += 1
+    return shape[:depth]
 
 
 _KEPT_AS = {
@@ -149,16 +172,16 @@ class _Program:
         rows = _Rows()
 
         def dry(*parts):
-            return self.in_block(parts, rows)
+            return self.in_block([lambda i, x=x: x for x in parts], rows)
 
         body = jax.make_jaxpr(dry)(*shapes)
         _inspect(body.jaxpr, self.block)
         return [a.dtype for a in body.out_avals], rows.kinds
 
-    def in_block(self, parts: Sequence[Any], rows: "_Rows") -> list[jax.Array]:
+    def in_block(self, reads: Sequence[Callable], rows: "_Rows") -> list[jax.Array]:
         """The entries to be written, of one block; rows are written as they come."""
-        rest = iter(parts)
-        values = [i.value([next(rest) for _ in range(i.size)]) for i in self.inputs]
+        rest = iter(reads)
+        values = [i.value([next(rest) for _ in range(i.entries)]) for i in self.inputs]
         evaluator = _InBlock(self.block, rows)
         consts = len(self.jaxpr.constvars)
         outputs = evaluator.jaxpr(self.jaxpr, values[:consts], values[consts:])
@@ -170,7 +193,7 @@ class _Program:
 
     def finish(self, written: Sequence[Any], rows: Sequence[Any], lanes: int) -> list[jax.Array]:
         """The outputs, of what was written."""
-        outside = Evaluator(written[0].shape[-1] if written else rows[0].shape[-1], {})
+        outside = Evaluator(-(-lanes // self.block) * self.block, {})
         left, known = iter(written), {}
         for value in self.exported:
             entries = [
@@ -203,6 +226,76 @@ def _lanes_first(value: Value, lanes: int) -> jax.Array:
     if has_lanes:
         return jnp.moveaxis(array, -1, 0)[:lanes]
     return jnp.broadcast_to(array[None], (lanes, *array.shape))
+
+
+Row = Callable[[Any], Value]
+"""The part of a value of that number along its first axis: a known one, or one of a loop."""
+
+
+class _Stored(Value):
+    """A large value in memory, read row by row."""
+
+    def __init__(self, shape: Sequence[int], dtype: Any, row: Row):
+        super().__init__(shape, dtype, lead=shape[:1], is_bulk=True)
+        self.row = row
+
+    def known(self):
+        return None
+
+    def entries(self):
+        raise NotInKernelError("a large input is used other than row by row.")
+
+    def array(self):
+        raise NotInKernelError("a large input is used other than row by row.")
+
+
+def _rows_of(value: Value) -> Row:
+    if isinstance(value, _Stored):
+        return value.row
+    if isinstance(value, _Later) or value.size > SPLIT_UP_TO:
+        raise NotInKernelError("a loop takes in rows that another saves, or a large table.")
+    shape = value.shape[1:]
+    columns = value.entries().reshape(value.shape[0], -1).T
+
+    def row(i):
+        if isinstance(i, int):
+            return split([column[i] for column in columns], shape, value.dtype)
+        cases = [[as_array(e, value.dtype) for e in column] for column in columns]
+        return split([_chosen(i, c) for c in cases], shape, value.dtype)
+
+    return row
+
+
+def _chosen(i: jax.Array, cases: Sequence[Any]) -> Any:
+    """The case of that number."""
+    chosen = cases[-1]
+    for k, case in reversed(list(enumerate(cases[:-1]))):
+        chosen = jnp.where(i == k, case, chosen)
+    return chosen
+
+
+def _joined(values: Sequence[Value]) -> Row:
+    """The rows of the one after those of the other."""
+    rows, lengths = [_rows_of(v) for v in values], [v.shape[0] for v in values]
+    starts = np.cumsum([0, *lengths[:-1]]).tolist()
+
+    def row(i):
+        if isinstance(i, int):
+            k = int(np.searchsorted(starts, i, side="right")) - 1
+            return rows[k](i - starts[k])
+        found = [
+            r(jnp.clip(i - a, 0, n - 1)) for r, a, n in zip(rows, starts, lengths, strict=True)
+        ]
+        out = list(found[0].entries().flat)
+        for start, mine in zip(starts[1:], found[1:], strict=True):
+            pairs = zip(out, mine.entries().flat, strict=True)
+            out = [
+                jnp.where(i < start, as_array(a, mine.dtype), as_array(b, mine.dtype))
+                for a, b in pairs
+            ]
+        return split(out, found[0].shape, found[0].dtype)
+
+    return row
 
 
 class _Later(Value):
@@ -280,6 +373,8 @@ class _InBlock(Evaluator):
             return self.closed(body, values)
         if name not in _CALLS and any(isinstance(v, _Later) for v in values):
             return self._put_off(eqn, values)
+        if name in _OF_ROWS and any(isinstance(v, _Stored) for v in values):
+            return self._move_rows(eqn, values)
         if name == "iota":
             return [whole(x, False) for x in fold(eqn.primitive, [], eqn.params)]
         if name == "scan":
@@ -294,6 +389,23 @@ class _InBlock(Evaluator):
         """A dense solve of any size without the library."""
         shapes = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in values]
         return self.closed(jax.make_jaxpr(by_elimination)(*shapes), values)
+
+    def _move_rows(self, eqn: Any, values: list[Value]) -> list[Value]:
+        """Some rows of a large input, or more of them."""
+        name, params, value = eqn.primitive.name, eqn.params, values[0]
+        shape, dtype = eqn.outvars[0].aval.shape, eqn.outvars[0].aval.dtype
+        if name == "concatenate" and params["dimension"] == 0:
+            return [_Stored(shape, dtype, _joined(values))]
+        if name == "slice" and value.shape[1:] == shape[1:] and params["strides"] in (None, (1,)):
+            first, row = params["start_indices"][0], _rows_of(value)
+            return [self._fewer(shape, dtype, lambda i: row(i + first))]
+        raise NotInKernelError("a large input is used other than row by row.")
+
+    def _fewer(self, shape: Sequence[int], dtype: Any, row: Callable) -> Value:
+        first = row(0) if shape[0] == 1 else None
+        if first is None or isinstance(first, _Stored):
+            return _Stored(shape, dtype, row)
+        return split(list(first.entries().flat), shape, dtype)
 
     def _put_off(self, eqn: Any, values: list[Value]) -> list[Value]:
         """An equation that needs rows is evaluated after the kernel."""
@@ -364,21 +476,19 @@ class _InBlock(Evaluator):
         length, is_reversed = eqn.params["length"], eqn.params["reverse"]
         consts, carry, xs = _cut(values, *scan_counts(eqn.params))
         first, last = len(consts), len(consts) + len(carry)
-        slices = [v.aval for v in body.jaxpr.invars[last:]]
-        if any(isinstance(x, _Later) or x.size > SPLIT_UP_TO for x in xs):
-            raise NotInKernelError(f"a loop of {length} steps takes rows in.")
+        rows = [_rows_of(x) for x in xs]
+        if length == 0:
+            kept = [v.aval for v in body.jaxpr.outvars[len(carry) :]]
+            return [*carry, *(split([], (0, *a.shape), a.dtype) for a in kept)]
         if length == 1:
-            xs = [
-                split(list(x.entries().flat), a.shape, a.dtype)
-                for x, a in zip(xs, slices, strict=True)
-            ]
-            out = self.closed(body, [*consts, *carry, *xs])
+            out = self.closed(body, [*consts, *carry, *(r(0) for r in rows)])
             return [*out[: len(carry)], *(self._with_axis(v) for v in out[len(carry) :])]
         self._split_small([*consts, *carry])
+        of_lanes = [isinstance(x, _Stored) or self.has_lanes(x) for x in xs]
         on = fixed_point(
-            lambda on: reached_outputs(
-                body.jaxpr, [*map(self.has_lanes, consts), *on, *map(self.has_lanes, xs)]
-            )[: len(carry)],
+            lambda on: reached_outputs(body.jaxpr, [*map(self.has_lanes, consts), *on, *of_lanes])[
+                : len(carry)
+            ],
             [self.has_lanes(v) for v in carry],
         )
         pack, unpack = self.packer(carry, [v.aval for v in body.jaxpr.invars[first:last]], on)
@@ -389,8 +499,7 @@ class _InBlock(Evaluator):
             row = length - 1 - i if is_reversed else i
 
             def evaluate():
-                mine = [_row(x, row, a) for x, a in zip(xs, slices, strict=True)]
-                out = self.closed(body, [*consts, *unpack(carry), *mine])
+                out = self.closed(body, [*consts, *unpack(carry), *(r(row) for r in rows)])
                 saved[:] = [self._save(v) for v in out[len(on) :]]
                 return out[: len(on)]
 
@@ -420,18 +529,6 @@ class _InBlock(Evaluator):
         return _Later(value.shape, value.dtype, places)
 
 
-def _row(value: Value, i: jax.Array, aval: Any) -> Value:
-    """The row of that number of a small value."""
-    rows = value.entries().reshape(value.shape[0], -1)
-    entries = []
-    for column in rows.T:
-        entry = as_array(column[-1], value.dtype)
-        for k, other in reversed(list(enumerate(column[:-1]))):
-            entry = jnp.where(i == k, as_array(other, value.dtype), entry)
-        entries.append(entry)
-    return split(entries, aval.shape, aval.dtype)
-
-
 def _stacked_alone(value: Value) -> Value:
     array, has_lanes = value.array()
     return whole(jnp.asarray(array)[None], has_lanes, is_bulk=True)
@@ -445,6 +542,8 @@ def _maximum(a, b):
 def _minimum(a, b):
     return jnp.where((a < b) | (a != a), a, b)
 
+
+_OF_ROWS = ("slice", "concatenate")
 
 _OWN: dict[str, Callable] = {
     "max": _maximum,
@@ -520,23 +619,29 @@ def _call(
         raise NotInKernelError(f"this JAX has no Pallas for Triton ({error}).") from None
 
     block, lanes = program.block, count * program.block
-    inputs = [i for i in program.inputs if i.size]
-    on = [i.has_lanes for i in inputs for _ in range(i.size if i.has_lanes else 1)]
+    inputs = [i for i in program.inputs if i.entries]
+    of = [i for i in inputs for _ in range(i.entries if i.has_lanes or i.rows else 1)]
 
     def lanewise(length: int | None = None):
         if length is None:
             return pl.BlockSpec((block,), lambda b: (b,))
         return pl.BlockSpec((length, block), lambda b: (0, b))
 
-    def shared(x):
-        return pl.BlockSpec(x.shape, lambda b: (0,))
+    def spec(x, of):
+        return lanewise(of.rows) if of.has_lanes else pl.BlockSpec(x.shape, lambda b: (0,))
+
+    def reads(ref, of):
+        """What gives an entry, in the row of that number."""
+        if of.rows is None:
+            if of.has_lanes:
+                return [lambda i: ref[...]]
+            return [lambda i, k=k: ref[k] for k in range(of.entries)]
+        return [(lambda i: ref[i, :]) if of.has_lanes else (lambda i: ref[i])]
 
     def kernel(*refs):
-        parts = []
-        for ref, o in zip(refs, on, strict=False):
-            parts += [ref[...]] if o else [ref[i] for i in range(ref.shape[0])]
-        outs = refs[len(on) :]
-        entries = program.in_block(parts, _Rows(outs[len(written) :]))
+        first = [r for ref, o in zip(refs, of, strict=False) for r in reads(ref, o)]
+        outs = refs[len(of) :]
+        entries = program.in_block(first, _Rows(outs[len(written) :]))
         for ref, entry in zip(outs, entries, strict=False):
             ref[...] = entry
 
@@ -548,7 +653,7 @@ def _call(
     return pl.pallas_call(
         kernel,
         grid=(count,),
-        in_specs=[lanewise() if o else shared(x) for x, o in zip(operands, on, strict=True)],
+        in_specs=[spec(x, o) for x, o in zip(operands, of, strict=True)],
         out_specs=[lanewise()] * len(written) + [lanewise(length) for length, _ in kinds],
         out_shape=shapes,
         interpret=interpret,
