@@ -198,24 +198,42 @@ def test_failing_lanes():
     assert all_good.all()
 
 
-@pytest.mark.slow
-def test_derivatives():
-    """Those of the plain path, whatever computes the function."""
+def gradient(form, name, save, **settings):
+    """The gradient of a function of what a batch saves, compiled, and its inputs."""
+    run, *start = batch(name, form, save=save, adjoint=dvi.Reversible(20), **settings)
+    return jax.jit(jax.grad(lambda q, p: jnp.sum(run(q, p)[0] ** 2), (0, 1))), start
 
-    def loss(form):
-        def one(q0, p0):
-            sol = dvi.integrate(
-                SYSTEMS["product"][0], q0, p0, h=0.05, num_steps=12, save=dvi.Save(final=True),
-                throw=False, layout=dvi.Layout(form=form, width=BLOCK),
-            )  # fmt: skip
-            return sol.qs[-1, 0]
 
-        return jax.jit(jax.grad(lambda q, p: jnp.sum(jax.vmap(one)(q, p)), (0, 1)))
-
-    _, q, p = batch("product")
+@pytest.mark.parametrize(
+    ("name", "save", "steps"),
+    [
+        ("product", dvi.Save(every=7, final=True), 4_000),
+        pytest.param("kepler", dvi.Save(final=True), 20_000, marks=pytest.mark.slow),
+        pytest.param("chain", dvi.Save(every=30), 4_000, marks=pytest.mark.slow),
+    ],
+)
+def test_gradients_in_two_kernels(name, save, steps):
+    """One there and one back; the loops beside them are those of a linear map never applied."""
+    back, start = gradient("kernel", name, save, num_steps=steps)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # its way back may be left to XLA
-        same(loss("kernel")(q, p), loss("arrays")(q, p), ulps=256)
+        warnings.simplefilter("error")  # nothing is left to XLA
+        assert calls_and_loops(lowered_for_cuda(back, *start))[0] == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "save", "steps"),
+    [
+        ("product", dvi.Save(every=7, final=True), 160),
+        ("kepler", dvi.Save(final=True), 1_500),
+        ("chain", dvi.Save(every=45), 140),
+    ],
+)
+def test_gradients(name, save, steps):
+    back, start = gradient("kernel", name, save, num_steps=steps)
+    plain, _ = gradient("arrays", name, save, num_steps=steps)
+    for a, b in zip(back(*start), plain(*start), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
 
 
 # --- functions ------------------------------------------------------------------------------------
@@ -308,6 +326,13 @@ FUNCTIONS = {
         x * lax.scan(lambda c, _: (0.9 * c, c), x, None, 9)[1][::-1].sum(0)
     ),
     "a table": lambda x: lax.scan(lambda c, y: (c * y, None), x, jnp.arange(1.0, 18.0) / 9)[0],
+    "no step": lambda x: lax.scan(lambda c, _: (c, c), x, None, 0),
+    "what is known among what is not": lambda x: (
+        -(jnp.stack([x[0], 0.5 + 0 * x[1] ** 0]) ** 2),
+        lax.fori_loop(0, x.shape[0] + 4, lambda i, c: (x[0] + c[0], -2.0, True), (1.0, -2.0, True)),
+        lax.cond(on_any_lane(x[0] > 9), lambda: (1.0, True), lambda: (2.0, False)),
+        lax.while_loop(lambda c: c[0] < 9, lambda c: (c[0] * 2 + 1, 7), (x[0] ** 2, 7)),
+    ),
     "one step": lambda x: lax.scan(lambda c, y: (c * y, c), x, jnp.ones(1)),
     "a loop per lane": lambda x: lax.while_loop(
         lambda c: jnp.sum(c**2) < 10, lambda c: 1.5 * c, x + 2 + x**2
@@ -333,6 +358,26 @@ def test_functions(name):
     check(FUNCTIONS[name], jnp.asarray(np.random.default_rng(0).normal(size=(LANES, 3))))
 
 
+def test_large_inputs_are_read_row_by_row():
+    """By one loop, two, backwards, shifted by a row, with a row in front."""
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(LANES, 6, 4, 9)))
+    y, shared = x.reshape(LANES, 72, 3), jnp.linspace(0, 1, 300).reshape(150, 2)
+
+    def function(x, y, shared):
+        def add(c, row):
+            return 0.9 * c + row, c[0]
+
+        def outer(c, rows):
+            return lax.scan(add, c, rows, reverse=True)
+
+        last, saved = lax.scan(outer, x[-1][2], x)
+        shifted, _ = lax.scan(add, y[3], jnp.concatenate([y[:1], y[:-1]]))
+        sums, _ = lax.scan(add, jnp.zeros(2), shared[1:])
+        return last, saved, shifted, sums
+
+    check(function, x, y, shared, shared=(2,))
+
+
 def test_shared_and_other_inputs():
     x = jnp.asarray(np.random.default_rng(0).normal(size=(LANES, 2)))
     table, which, flag = jnp.arange(3.0), jnp.arange(LANES), x[:, 0] > 0
@@ -354,14 +399,17 @@ REFUSED = {
     "saves rows within": lambda x: lax.cond(
         x[0] > 0, lambda x: lax.scan(lambda c, _: (c / 2, c), x, None, 9)[1].sum(0), jnp.square, x
     ),
-    "takes rows in": lambda x: lax.scan(lambda c, y: (c + y, None), x, jnp.ones((99, 3)))[0],
-    "an input has 200 entries": lambda x: x[0],
+    "a large table": lambda x: lax.scan(lambda c, y: (c + y, None), x, jnp.ones((99, 3)))[0],
+    "a large input is used other than row by row": lambda x: x[0] + x.sum(),
+    "an input has 600 entries": lambda x: x[0, 0],
 }
 
 
 @pytest.mark.parametrize("reason", REFUSED)
 def test_refused_before_it_is_compiled(reason):
-    x = jnp.ones((LANES, 200 if "200" in reason else 3))
+    shapes = {"a large input": (200,), "an input": (3, 200)}
+    shape = next((s for key, s in shapes.items() if reason.startswith(key)), (3,))
+    x = jnp.ones((LANES, *shape))
     lowered, _ = in_kernel(REFUSED[reason], x)
     with pytest.raises(NotInKernelError, match=reason):
         lowered.trace(x)

@@ -8,7 +8,7 @@ not go into a kernel is found out by looking at its program before anything is c
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._compat import ClosedJaxpr, Jaxpr, aval, bodies, scan_counts, with_outputs
+from .._compat import ClosedJaxpr, Jaxpr, Literal, aval, bodies, scan_counts, with_outputs
 from .dependence import fixed_point, reached_outputs
 from .elementary import pow
 from .lanes import Evaluator, Value
 from .lanes._evaluate import _CALLS, IN_ARRAYS, SPLIT_UP_TO, _cut
-from .lanes._rules import apply, fold
-from .lanes._value import as_array, is_array, on_lanes, split, whole
+from .lanes._rules import algebra, apply, fold
+from .lanes._value import as_array, is_array, number, on_lanes, split, whole
 from .linear import by_elimination
 
 BLOCK = 128
@@ -205,10 +205,11 @@ class _Program:
         def read(value: Value) -> Value:
             if not (isinstance(value, _Later) and value.lead):
                 return known[id(value)]
-            parts = [rows[i].reshape(*value.lead, -1) for i in value.rows]
+            parts = [rows[i].reshape(*value.lead, -1)[value.cut] for i in value.rows]
             parts = [_restored(x, value.dtype) for x in parts]
-            entries = split(parts, value.shape[len(value.lead) :], value.dtype).entries()
-            return Value(value.shape, value.dtype, entries=entries, lead=value.lead)
+            depth = len(value.lead)
+            entries = split(parts, value.shape[depth:], value.dtype).entries()
+            return Value(value.shape, value.dtype, entries=entries, lead=value.shape[:depth])
 
         for operation, inputs, outputs in self.afterwards:
             results = operation(outside, [read(v) for v in inputs])
@@ -301,7 +302,8 @@ def _joined(values: Sequence[Value]) -> Row:
 class _Later(Value):
     """A value that there is after the kernel only: rows that a loop saves, or made of them.
 
-    `rows` are where those of its entries are written, `lead` the lengths of the loops.
+    `rows` are where those of its entries are written, `lead` the lengths of the loops, and `cut`
+    what of them it is made of.
     """
 
     def __init__(
@@ -310,9 +312,10 @@ class _Later(Value):
         dtype: Any,
         rows: Sequence[int] = (),
         lead: Sequence[int] = (),
+        cut: Sequence[slice] = (),
     ):
         super().__init__(shape, dtype, lead=lead, is_bulk=True)
-        self.rows = tuple(rows)
+        self.rows, self.cut = tuple(rows), tuple(cut)
 
     def known(self):
         return None
@@ -325,8 +328,15 @@ class _Later(Value):
 
     def stacked(self, length: int) -> "_Later":
         """The rows of all rounds of a loop around the one that saves them."""
-        lead = (length, *self.lead)
-        return _Later((length, *self.shape), self.dtype, self.rows, lead)
+        lead, cut = (length, *self.lead), (slice(None), *self.cut)
+        return _Later((length, *self.shape), self.dtype, self.rows, lead, cut)
+
+    def sliced(self, start: int, stop: int) -> "_Later":
+        """Some of the rows of the last loop."""
+        first, *rest = self.cut
+        before = first.start or 0
+        cut = slice(before + start, before + stop), *rest
+        return _Later((stop - start, *self.shape[1:]), self.dtype, self.rows, self.lead, cut)
 
 
 _Afterwards = tuple[Callable, list[Value], list[_Later]]
@@ -373,8 +383,8 @@ class _InBlock(Evaluator):
             return self.closed(body, values)
         if name not in _CALLS and any(isinstance(v, _Later) for v in values):
             return self._put_off(eqn, values)
-        if name in _OF_ROWS and any(isinstance(v, _Stored) for v in values):
-            return self._move_rows(eqn, values)
+        if name not in _CALLS | {"scan"} and any(isinstance(v, _Stored) for v in values):
+            return [self._of_rows(eqn, values)]
         if name == "iota":
             return [whole(x, False) for x in fold(eqn.primitive, [], eqn.params)]
         if name == "scan":
@@ -390,25 +400,28 @@ class _InBlock(Evaluator):
         shapes = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in values]
         return self.closed(jax.make_jaxpr(by_elimination)(*shapes), values)
 
-    def _move_rows(self, eqn: Any, values: list[Value]) -> list[Value]:
+    def _of_rows(self, eqn: Any, values: list[Value]) -> Value:
         """Some rows of a large input, or more of them."""
         name, params, value = eqn.primitive.name, eqn.params, values[0]
-        shape, dtype = eqn.outvars[0].aval.shape, eqn.outvars[0].aval.dtype
+        out = eqn.outvars[0].aval
         if name == "concatenate" and params["dimension"] == 0:
-            return [_Stored(shape, dtype, _joined(values))]
-        if name == "slice" and value.shape[1:] == shape[1:] and params["strides"] in (None, (1,)):
-            first, row = params["start_indices"][0], _rows_of(value)
-            return [self._fewer(shape, dtype, lambda i: row(i + first))]
+            return _Stored(out.shape, out.dtype, _joined(values))
+        row = _rows_of(value)
+        if name == "slice" and value.shape[1:] == out.shape[1:] and not params["strides"]:
+            first = params["start_indices"][0]
+            if out.shape[0] > 1 or isinstance(row(first), _Stored):
+                return _Stored(out.shape, out.dtype, lambda i: row(i + first))
+            return split(list(row(first).entries().flat), out.shape, out.dtype)
+        if name == "squeeze" and params["dimensions"] == (0,):
+            return row(0)
         raise NotInKernelError("a large input is used other than row by row.")
 
-    def _fewer(self, shape: Sequence[int], dtype: Any, row: Callable) -> Value:
-        first = row(0) if shape[0] == 1 else None
-        if first is None or isinstance(first, _Stored):
-            return _Stored(shape, dtype, row)
-        return split(list(first.entries().flat), shape, dtype)
-
-    def _put_off(self, eqn: Any, values: list[Value]) -> list[Value]:
+    def _put_off(self, eqn: Any, values: list[Any]) -> list[Value]:
         """An equation that needs rows is evaluated after the kernel."""
+        if eqn.primitive.name == "slice" and values[0].lead:
+            (start, *_), (stop, *_) = eqn.params["start_indices"], eqn.params["limit_indices"]
+            if eqn.outvars[0].aval.shape == (stop - start, *values[0].shape[1:]):
+                return [values[0].sliced(start, stop)]
         if self.rounds or next(bodies(eqn), None) is not None:
             raise NotInKernelError("what a loop saves is used in another.")
         later = [_Later(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
@@ -440,6 +453,12 @@ class _InBlock(Evaluator):
     # --- primitives that Triton takes otherwise than XLA -----------------------------------------
 
     def _operate(self, eqn: Any, entries: list[Any], dtypes: list[Any]) -> Any:
+        if not any(map(is_array, entries)):  # what is made of constants alone trips Triton up
+            known = [np.asarray(number(e, d)) for e, d in zip(entries, dtypes, strict=True)]
+            structural = algebra(eqn.primitive.name, entries, eqn.params)
+            return (
+                fold(eqn.primitive, known, eqn.params)[0][()] if structural is None else structural
+            )
         own = _OWN.get(eqn.primitive.name)
         if own is not None and np.issubdtype(dtypes[-1], np.floating):
             return apply(own, entries, dtypes)
@@ -448,7 +467,16 @@ class _InBlock(Evaluator):
     def _pairwise(self, operation: Callable, dtype: Any) -> Callable:
         if np.issubdtype(dtype, np.floating):
             operation = {lax.max: _maximum, lax.min: _minimum}.get(operation, operation)
-        return super()._pairwise(operation, dtype)
+        combined = super()._pairwise(operation, dtype)
+
+        def combine(a: Any, b: Any) -> Any:
+            if is_array(a) or is_array(b):
+                return combined(a, b)
+            with jax.ensure_compile_time_eval():
+                result = combined(a, b)
+                return np.asarray(result)[()] if is_array(result) else result
+
+        return combine
 
     def on_any(self, x: jax.Array) -> jax.Array:
         return jnp.max(x.astype(jnp.int32)) > 0 if x.ndim else x
@@ -464,7 +492,9 @@ class _InBlock(Evaluator):
     def pack(self, value: Value, has_lanes: bool, as_whole: bool = False) -> list[jax.Array]:
         if as_whole:
             raise NotInKernelError(f"a loop carries an array of {value.size} numbers.")
-        return super().pack(value, has_lanes)
+        arrays = super().pack(value, has_lanes)
+        known = [not (has_lanes or is_array(e)) for e in value.entries().flat]
+        return [_computed(x) if k else x for x, k in zip(arrays, known, strict=True)]
 
     def _split_small(self, values: list[Value]) -> None:
         for value in values:
@@ -529,6 +559,11 @@ class _InBlock(Evaluator):
         return _Later(value.shape, value.dtype, places)
 
 
+def _computed(x: jax.Array) -> jax.Array:
+    """A constant as the result of an operation: Triton takes no other from a loop."""
+    return lax.bitwise_or(x, False) if x.dtype == bool else lax.mul(x, jnp.ones_like(x))
+
+
 def _stacked_alone(value: Value) -> Value:
     array, has_lanes = value.array()
     return whole(jnp.asarray(array)[None], has_lanes, is_bulk=True)
@@ -542,8 +577,6 @@ def _maximum(a, b):
 def _minimum(a, b):
     return jnp.where((a < b) | (a != a), a, b)
 
-
-_OF_ROWS = ("slice", "concatenate")
 
 _OWN: dict[str, Callable] = {
     "max": _maximum,
@@ -575,29 +608,30 @@ LOWERED: dict[str, frozenset[str]] = {
 operand. Not max and min of real numbers: they lose NaN."""
 
 
+_OF_CONSTANTS = ("mul", "or", "broadcast_in_dim", "convert_element_type", "select_n")
+
+
 def _inspect(jaxpr: Jaxpr, block: int) -> None:
     """Raise an error if the program of a block is not made of what goes into a kernel."""
-    for eqn in _equations(jaxpr):
+    for eqn in jaxpr.eqns:
         name, dtypes = eqn.primitive.name, [aval(v).dtype for v in eqn.invars]
+        if name in _CALLS | {"scan", "while", "cond"}:
+            for body in bodies(eqn):
+                if name not in _CALLS and any(isinstance(v, Literal) for v in body.jaxpr.outvars):
+                    raise NotInKernelError(f"{name} gives a constant.")
+                _inspect(body.jaxpr, block)
+            continue
         kinds = [d.kind for d in dtypes]
         of = kinds[1] if name == "select_n" and kinds[0] == "b" else kinds[0] if kinds else ""
         if name not in LOWERED.get(of, ()) or (name == "select_n" and kinds[0] != "b"):
             raise NotInKernelError(f"{name} of {dtypes[0] if dtypes else 'nothing'}.")
+        if name not in _OF_CONSTANTS and all(isinstance(v, Literal) for v in eqn.invars):
+            raise NotInKernelError(f"{name} of constants.")
         for out in eqn.outvars:
             if aval(out).shape not in ((), (block,)):
                 raise NotInKernelError(f"{name} makes an array of shape {aval(out).shape}.")
             if aval(out).dtype.name not in _KEPT_AS:
                 raise NotInKernelError(f"{name} makes numbers of type {aval(out).dtype}.")
-
-
-def _equations(jaxpr: Jaxpr) -> Iterator[Any]:
-    """All equations, those inside of loops and calls in their place."""
-    for eqn in jaxpr.eqns:
-        if eqn.primitive.name in _CALLS | {"scan", "while", "cond"}:
-            for body in bodies(eqn):
-                yield from _equations(body.jaxpr)
-        else:
-            yield eqn
 
 
 # --- the call -------------------------------------------------------------------------------------
