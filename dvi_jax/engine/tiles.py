@@ -207,13 +207,14 @@ class _Program:
 
     def from_kernel(self, *operands: Any, **options: Any) -> list[jax.Array] | None:
         """The outputs from one kernel, None where that is not wanted or cannot be."""
-        form = self.layout.form
-        lanes = options["lanes"]
+        form, lanes = self.layout.form, options["lanes"]
         if form not in ("auto", "kernel") or not lanes:
             return None
         if form == "auto" and not self.takes_components(lanes):
             return None
         try:
+            if len(self.special.outer) != len(self.ordinary.outer):
+                raise NotInKernelError("it closes over values that are not known yet.")
             count = operation_count(self.special.closed.jaxpr)
             if count > LARGEST_KERNEL:
                 raise NotInKernelError(f"it has some {count} operations.")
