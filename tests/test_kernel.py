@@ -333,6 +333,9 @@ FUNCTIONS = {
         lax.cond(on_any_lane(x[0] > 9), lambda: (1.0, True), lambda: (2.0, False)),
         lax.while_loop(lambda c: c[0] < 9, lambda c: (c[0] * 2 + 1, 7), (x[0] ** 2, 7)),
     ),
+    "a row of a table": lambda x: lax.fori_loop(
+        0, 5, lambda i, c: c + x[i % 3] * jnp.arange(4.0)[c[0].astype(int)], x
+    ),
     "one step": lambda x: lax.scan(lambda c, y: (c * y, c), x, jnp.ones(1)),
     "a loop per lane": lambda x: lax.while_loop(
         lambda c: jnp.sum(c**2) < 10, lambda c: 1.5 * c, x + 2 + x**2
@@ -358,6 +361,7 @@ def test_functions(name):
     check(FUNCTIONS[name], jnp.asarray(np.random.default_rng(0).normal(size=(LANES, 3))))
 
 
+@pytest.mark.slow
 def test_large_inputs_are_read_row_by_row():
     """By one loop, two, backwards, shifted by a row, with a row in front."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(LANES, 6, 4, 9)))
@@ -373,7 +377,8 @@ def test_large_inputs_are_read_row_by_row():
         last, saved = lax.scan(outer, x[-1][2], x)
         shifted, _ = lax.scan(add, y[3], jnp.concatenate([y[:1], y[:-1]]))
         sums, _ = lax.scan(add, jnp.zeros(2), shared[1:])
-        return last, saved, shifted, sums
+        looked_up = lax.fori_loop(140, 153, lambda i, c: c + shared[i], jnp.zeros(2))
+        return last, saved, shifted, sums, looked_up
 
     check(function, x, y, shared, shared=(2,))
 
@@ -392,7 +397,7 @@ REFUSED = {
     "sort is applied to an array": jnp.sort,
     "float16": lambda x: x.astype(jnp.float16).astype(x.dtype) ** 2,
     "erf": lax.erf,
-    "dynamic_slice is applied to an array": lambda x: lax.dynamic_index_in_dim(x, x[0].astype(int)),
+    "gather is applied to an array": lambda x: x[x.astype(int)],
     "what a loop saves": lambda x: lax.scan(
         lambda c, y: (c + y, None), x, lax.scan(lambda c, _: (c / 2, c), x, None, 9)[1]
     )[0],

@@ -122,7 +122,9 @@ class _Input:
             shape = self.shape[depth:]
             if depth == len(self.lead):
                 return split([_restored(r(i), self.dtype) for r in reads], shape, self.dtype)
-            return _Stored(shape, self.dtype, lambda k: part(depth + 1, i * shape[0] + k))
+            return _Stored(
+                shape, self.dtype, lambda k: part(depth + 1, i * shape[0] + k), bool(self.has_lanes)
+            )
 
         return part(0, 0)
 
@@ -236,9 +238,9 @@ Row = Callable[[Any], Value]
 class _Stored(Value):
     """A large value in memory, read row by row."""
 
-    def __init__(self, shape: Sequence[int], dtype: Any, row: Row):
-        super().__init__(shape, dtype, lead=shape[:1], is_bulk=True)
-        self.row = row
+    def __init__(self, shape: Sequence[int], dtype: Any, row: Row, has_lanes: bool):
+        super().__init__(shape, dtype, lead=shape[:1], is_bulk=True, has_lanes=has_lanes)
+        self.row, self.has_lanes = row, has_lanes
 
     def known(self):
         return None
@@ -383,6 +385,8 @@ class _InBlock(Evaluator):
             return self.closed(body, values)
         if name not in _CALLS and any(isinstance(v, _Later) for v in values):
             return self._put_off(eqn, values)
+        if name == "dynamic_slice" and values[1].known() is None:
+            return [self._looked_up(eqn, values)]
         if name not in _CALLS | {"scan"} and any(isinstance(v, _Stored) for v in values):
             return [self._of_rows(eqn, values)]
         if name == "iota":
@@ -400,17 +404,30 @@ class _InBlock(Evaluator):
         shapes = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in values]
         return self.closed(jax.make_jaxpr(by_elimination)(*shapes), values)
 
+    def _looked_up(self, eqn: Any, values: list[Value]) -> Value:
+        """A row of a table."""
+        table, index = values[:2]
+        if eqn.params["slice_sizes"] != (1, *table.shape[1:]):
+            raise NotInKernelError("a part of an array is taken that is not one row.")
+        i = as_array(index.entries()[()], index.dtype)
+        if isinstance(table, _Stored) and i.ndim:
+            raise NotInKernelError("each lane takes a row of its own of a large input.")
+        row = _rows_of(table)(jnp.clip(i, 0, table.shape[0] - 1))
+        return split(list(row.entries().flat), (1, *table.shape[1:]), table.dtype)
+
     def _of_rows(self, eqn: Any, values: list[Value]) -> Value:
         """Some rows of a large input, or more of them."""
         name, params, value = eqn.primitive.name, eqn.params, values[0]
         out = eqn.outvars[0].aval
         if name == "concatenate" and params["dimension"] == 0:
-            return _Stored(out.shape, out.dtype, _joined(values))
+            on = any(map(self.has_lanes, values))
+            return _Stored(out.shape, out.dtype, _joined(values), on)
         row = _rows_of(value)
         if name == "slice" and value.shape[1:] == out.shape[1:] and not params["strides"]:
             first = params["start_indices"][0]
             if out.shape[0] > 1 or isinstance(row(first), _Stored):
-                return _Stored(out.shape, out.dtype, lambda i: row(i + first))
+                on = self.has_lanes(value)
+                return _Stored(out.shape, out.dtype, lambda i: row(i + first), on)
             return split(list(row(first).entries().flat), out.shape, out.dtype)
         if name == "squeeze" and params["dimensions"] == (0,):
             return row(0)
@@ -498,8 +515,11 @@ class _InBlock(Evaluator):
 
     def _split_small(self, values: list[Value]) -> None:
         for value in values:
-            if value.size <= SPLIT_UP_TO:
+            if value.size <= SPLIT_UP_TO and not isinstance(value, _Stored):
                 value.entries()
+
+    def has_lanes(self, value: Value) -> bool:
+        return value.has_lanes if isinstance(value, _Stored) else super().has_lanes(value)
 
     def scan(self, eqn: Any, values: list[Value]) -> list[Value]:
         body: ClosedJaxpr = eqn.params["jaxpr"]
@@ -514,11 +534,10 @@ class _InBlock(Evaluator):
             out = self.closed(body, [*consts, *carry, *(r(0) for r in rows)])
             return [*out[: len(carry)], *(self._with_axis(v) for v in out[len(carry) :])]
         self._split_small([*consts, *carry])
-        of_lanes = [isinstance(x, _Stored) or self.has_lanes(x) for x in xs]
         on = fixed_point(
-            lambda on: reached_outputs(body.jaxpr, [*map(self.has_lanes, consts), *on, *of_lanes])[
-                : len(carry)
-            ],
+            lambda on: reached_outputs(
+                body.jaxpr, [*map(self.has_lanes, consts), *on, *map(self.has_lanes, xs)]
+            )[: len(carry)],
             [self.has_lanes(v) for v in carry],
         )
         pack, unpack = self.packer(carry, [v.aval for v in body.jaxpr.invars[first:last]], on)
