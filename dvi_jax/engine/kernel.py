@@ -374,6 +374,7 @@ class _InBlock(Evaluator):
 
     def __init__(self, lanes: int, rows: _Rows):
         super().__init__(lanes, {"pow": pow})
+        self.in_kernel = True
         self.rows = rows
         self.rounds: list[_Round | None] = []
         self.afterwards: list[_Afterwards] = []
