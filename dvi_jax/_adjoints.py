@@ -15,7 +15,6 @@ from jaxtyping import Array
 
 from ._arithmetic import FloatingPoint
 from ._compat import is_traced
-from ._results import RESULTS
 from ._rollout import (
     Carry,
     Loop,
@@ -31,11 +30,20 @@ from ._rollout import (
     take_step,
     with_tail,
 )
-from ._segments import can_trust, run_in_segments
+from ._segments import can_trust, largest_divisor, run_in_segments
+from ._step import Equations
 from ._types import State
-from .engine.newton import Known
+from .engine.lanes import in_arrays
+from .engine.newton import Known, Trusted
 from .engine.tiles import Layout, lanewise
+from .engine.together import on_any_lane
 from .methods import TypeII
+
+BACKWARD_ITERATIONS = 3
+"""Of Newton's method in an inverse step, on trust."""
+
+LOOKS = 16
+"""Steps back between two looks at how large the components are."""
 
 
 class Outcome(NamedTuple):
@@ -218,8 +226,14 @@ class Reversible(AbstractAdjoint):
             def derivative(inputs, u):
                 return jax.jvp(lambda x: forward(x)[0], (inputs,), (u,))[1]
 
+            def quick(inputs, u):
+                return jax.jvp(lambda x: fast(x)[0], (inputs,), (u,))[1]
+
             def push(u):
-                return lanewise(derivative, inputs, u, layout=layout, steps=steps, entries=2 * size)
+                return lanewise(
+                    quick, inputs, u,
+                    layout=layout, steps=steps, entries=2 * size, plain=derivative,
+                )  # fmt: skip
 
             # As one vector: the transposition of a linear solve wants all parts of its right side
             # to be linear in the tangents, also those that are zero.
@@ -290,31 +304,36 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
     carry, saved, tail, _ = trace
     task: Task = eqx.combine(theta, fixed)
     _, reductions = task.observables()
+    solves = not (
+        task.method._inverse_needs_no_solve(
+            task.equations, task.interval(jnp.asarray(0, jnp.int32)), q_start
+        )
+    )
+    newton = task.equations.newton
+    on_trust = Trusted(newton, jnp.asarray(BACKWARD_ITERATIONS, jnp.int32))
+
+    def solved_by(task: Task, options) -> Equations:
+        return dataclasses.replace(task.equations, newton=options)
 
     def local_step(theta, q0, p0, k, p1):
         task: Task = eqx.combine(theta, fixed)
         alone, reductions = task.observables()
-        interval, equations = task.interval(k), task.equations
+        interval = task.interval(k)
         if isinstance(task.method, TypeII) and isinstance(task.arithmetic, FloatingPoint):
-            # What (13) is to be solved for is where we come from.
-            equations = dataclasses.replace(equations, newton=Known(p1.ravel()))
-        q1, p1, _ = task.method.step(equations, interval, q0, p0)
+            options = Known(p1.ravel())  # what (13) is to be solved for is where we come from
+        else:
+            options = newton
+        q1, p1, _ = task.method.step(solved_by(task, options), interval, q0, p0)
         taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
         values = [taken.value(f, task.args) for f in alone]
         reduced = [taken.number(task.bound(r.function), task.args) for r in reductions]
         return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), reduced
 
-    first_interval = task.interval(jnp.asarray(0, jnp.int32))
-    # What needs no solve fails by becoming NaN, which no check of the state lets pass.
-    may_fail = not task.method._inverse_needs_no_solve(task.equations, first_interval, q_start)
-
-    def undo(state, k, is_last, at_save):
-        """One step back: the state before it, and the cotangents before it."""
-        q1, p1, grad, (cq, cp), good = state
-        interval = task.interval(k)
-        q0, p0, info = task.method.inverse(task.equations, interval, q1, p1)
+    def pull_through(state, k, before, is_last, at_save):
+        """The cotangents before step k, from the states before and after it."""
+        _, p1, grad, (cq, cp) = state
         ((_, _, t1), _, values), pull = jax.vjp(
-            lambda a, q, p: local_step(a, q, p, k, p1), theta, q0, p0
+            lambda theta, q, p: local_step(theta, q, p, k, p1), theta, *before
         )
         at_end = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
         ct, seeds = jnp.zeros_like(t1), []
@@ -325,28 +344,62 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
             ct = ct + of_t
             seeds.append(of_value.astype(value.dtype))
         of_theta, cq, cp = pull(((cq, cp, ct), at_end, seeds))
-        if may_fail:
-            good = good & (info.result == RESULTS.successful)
-        return q0, p0, jax.tree.map(jnp.add, grad, of_theta), (cq, cp), good
+        return *before, jax.tree.map(jnp.add, grad, of_theta), (cq, cp)
 
     def undo_steps(known_start, end, first, count, last, at_save, grad, cot):
-        """`count` steps back from the exact state `end`, checked against `known_start`."""
+        """`count` steps back from the exact state `end`, checked against `known_start`.
 
-        def body(state, k):
+        By inverse steps on trust; for lanes that then miss the start, through the steps again from
+        there, their states stored.
+        """
+        group = largest_divisor(count, LOOKS)
+
+        def undo(state, k):
+            state, excess = state
+            q, p, info = task.method.inverse(
+                solved_by(task, on_trust), task.interval(k), state[0], state[1]
+            )
+            state = pull_through(state, k, (q, p), k == last, at_save)
+            return (state, jnp.maximum(excess, info.residual) if solves else None), None
+
+        def undo_group(state, k):
             state, sizes = state
-            state = undo(state, k, k == last, at_save)
-            return (state, _largest(sizes, state[:2])), None
+            state, _ = counted_scan(undo, state, k, 1, group, reverse=True)
+            return (state, _largest(sizes, state[0][:2])), None
 
-        begin = ((*end, grad, cot, jnp.asarray(True) if may_fail else None), _largest(end, end))
-        ((q, p, grad, cot, good), sizes), _ = counted_scan(
-            body, begin, first, 1, count, reverse=True
+        worst = jnp.full((), -jnp.inf, end[0].dtype) if solves else None
+        begin = (((*end, grad, cot), worst), _largest(end, end))
+        (((q, p, *out), excess), sizes), _ = counted_scan(
+            undo_group, begin, first, group, count // group, reverse=True
         )
         allowed = settings.max_defect or (1e-6 if q.dtype.itemsize >= 8 else 1e-3)
-        ok = _is_near(q, known_start[0], sizes[0], allowed)
-        ok = ok & _is_near(p, known_start[1], sizes[1], allowed)
-        if may_fail:
-            ok = ok & good
-        return _all_or_nan(ok, (grad, cot))
+        fine = _is_near(q, known_start[0], sizes[0], allowed)
+        fine = fine & _is_near(p, known_start[1], sizes[1], allowed)
+        if solves:
+            fine = fine & (excess <= 0)
+
+        def stored(known_start, end, first, last, at_save, grad, cot):
+            def forward(state, k):
+                q, p, _ = task.method.step(task.equations, task.interval(k), *state)
+                return (q, p), state
+
+            _, states = counted_scan(forward, known_start, first, 1, count)
+
+            def back(state, x):
+                k, state = state
+                return (k - 1, pull_through(state, k, x, k == last, at_save)), None
+
+            start = (first + count - 1, (*end, grad, cot))
+            (_, (_, _, grad, cot)), _ = lax.scan(back, start, states, reverse=True)
+            return grad, cot
+
+        def mend(out):
+            again = in_arrays(stored)(known_start, end, first, last, at_save, grad, cot)
+            return jax.tree.map(lambda a, b: jnp.where(missing, a, b), again, out)
+
+        # Where the trajectory itself has failed there is nothing to mend: NaN, not a number.
+        missing = ~fine & _all_finite(known_start) & _all_finite(end)
+        return lax.cond(on_any_lane(missing), mend, lambda out: out, tuple(out))
 
     def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):
         last = first + count - 1
@@ -433,5 +486,5 @@ def _closes_over_traced(task: Task, q0: State, p0: State) -> bool:
     return any(is_traced(c) for c in jax.make_jaxpr(one_step)(arrays, q0, p0).consts)
 
 
-def _all_or_nan(good, tree):
-    return jax.tree.map(lambda x: jnp.where(good, x, jnp.full_like(x, jnp.nan)), tree)
+def _all_finite(state) -> Array:
+    return jnp.all(jnp.isfinite(state[0])) & jnp.all(jnp.isfinite(state[1]))

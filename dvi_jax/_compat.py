@@ -7,6 +7,7 @@ from typing import Any
 import jax
 from jax import export
 from jax.core import ShapedArray, Tracer
+from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
@@ -25,6 +26,7 @@ __all__ = [
     "jaxprs_in_params",
     "lower_on",
     "lowered_for_cuda",
+    "one_kernel",
     "primitive",
     "scan_counts",
     "skip_unwanted",
@@ -162,6 +164,23 @@ def identity(name: str, batched: Callable) -> Primitive:
     new = primitive(name, lambda x: x, batched)
     ad.deflinear2(new, lambda cotangent, _: [new.bind(cotangent)])
     return new
+
+
+def _on_cpu(*arrays, closed: ClosedJaxpr):
+    # XLA hoists loops over small arrays into a call that it compiles as one function. These marks
+    # on a call of our own have the same effect; one that does not know them ignores them.
+    with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+        return jax.jit(jaxpr_as_fun(closed))(*arrays)
+
+
+def _elsewhere(*arrays, closed: ClosedJaxpr):
+    return jaxpr_as_fun(closed)(*arrays)
+
+
+one_kernel = primitive("one_kernel", _elsewhere, multiple=True)
+"""``one_kernel.bind(*arrays, closed=jaxpr)``: the jaxpr, compiled as one function for the CPU."""
+
+mlir.register_lowering(one_kernel, mlir.lower_fun(_on_cpu, multiple_results=True), platform="cpu")
 
 
 def _abstract(function: Callable, avals: Any, params: dict[str, Any]) -> Any:

@@ -29,6 +29,7 @@ from ._rollout import (
     run,
     take_step,
 )
+from .engine.dependence import fixed_point, reached_outputs
 from .engine.lanes import in_arrays
 from .engine.newton import Newton, Trusted
 from .engine.together import least_over_lanes, on_any_lane
@@ -67,7 +68,7 @@ def run_in_segments(
         )
     else:
         most = 1 if one_row else every // plan.block
-        group = _largest_divisor(plan.num_blocks, max(most, 1))
+        group = largest_divisor(plan.num_blocks, max(most, 1))
 
         def blocks(state, k):
             part = Plan(group, plan.block, 0, False)
@@ -129,6 +130,7 @@ class _Segment:
         self.task = task
         first = task.interval(jnp.asarray(0, jnp.int32))
         self.solves = not task.method._needs_no_solve(task.equations, first, carry.q)
+        self.depends = _depend_on_the_state(task, carry)
 
     def __call__(self, steps: Callable, state: tuple[Carry, Array], first: Array):
         """`steps(task, carry)` → (carry, other), from step number `first`."""
@@ -145,8 +147,7 @@ class _Segment:
         careful = in_arrays(lambda carry: steps(self.task, carry))
 
         def mend(trusted):
-            with_care = careful(carry)
-            return jax.tree.map(lambda a, b: jnp.where(missing, a, b), with_care, trusted)
+            return self._where(missing, careful(carry), trusted)
 
         trusted = self._in_the_books(carry, out[0], good), out[1]
         after, other = lax.cond(on_any_lane(missing), mend, lambda x: x, trusted)
@@ -192,11 +193,27 @@ class _Segment:
             new = self._on_trust(steps, carry, now)
             mine = mine & (iterations == now)
             fine = (mine & _is_fine(new[0])) | (~good & ~done)
-            out = jax.tree.map(lambda a, b: jnp.where(fine, a, b), new, out)
+            out = self._where(fine, new, out)
             return jnp.where(mine & ~fine, iterations + 1, iterations), done | fine, out
 
         state = (jnp.where(good, iterations, FEWEST_ITERATIONS), jnp.asarray(False), out)
         return lax.while_loop(lambda s: on_any_lane(is_open(s[0], s[1])), again, state)
+
+    def _where(self, which: Array, new: tuple[Carry, Saved], old: tuple[Carry, Saved]):
+        """`new` where `which`, else `old`, from the same start; memories that do not depend on the
+        state are alike."""
+
+        def choose(new, old):
+            return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
+
+        leaves, tree = jax.tree.flatten(new[0].reductions)
+        before = jax.tree.leaves(old[0].reductions)
+        leaves = [
+            choose(a, b) if depends else a
+            for a, b, depends in zip(leaves, before, self.depends, strict=True)
+        ]
+        carry = choose(*(x[0]._replace(reductions=None) for x in (new, old)))
+        return carry._replace(reductions=jax.tree.unflatten(tree, leaves)), choose(new[1], old[1])
 
     def _in_the_books(self, carry: Carry, after: Carry, good: Array) -> Carry:
         """The carry after a segment on trust that was found good."""
@@ -213,11 +230,29 @@ class _Segment:
         )
 
 
+def _depend_on_the_state(task: Task, carry: Carry) -> list[bool]:
+    """Which leaves of the reductions' memories do; the others count steps, or times."""
+    found: list[bool] = []
+    interval = task.interval(jnp.asarray(0, jnp.int32))
+    taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, carry.q, carry.p)
+    _, reductions = task.observables()
+    for r, memory in zip(reductions, carry.reductions, strict=True):
+        like = jax.eval_shape(lambda r=r: taken.number(task.bound(r.function), task.args))
+        value = jnp.zeros(like.shape, like.dtype)
+        update = jax.make_jaxpr(r.update)(memory, jnp.asarray(0, jnp.int32), interval.t1, value)
+        count = len(jax.tree.leaves(memory))
+        found += fixed_point(
+            lambda marks, u=update: reached_outputs(u.jaxpr, [*marks, False, False, True]),
+            [False] * count,
+        )
+    return found
+
+
 def _is_fine(after: Carry) -> Array:
     """Whether a segment on trust went well: finite to its end, and every solve good."""
     fine = jnp.all(jnp.isfinite(after.q)) & jnp.all(jnp.isfinite(after.p))
     return fine if after.residual is None else fine & (after.residual <= 0)
 
 
-def _largest_divisor(n: int, most: int) -> int:
+def largest_divisor(n: int, most: int) -> int:
     return next(d for d in range(min(n, most), 0, -1) if n % d == 0) if n else 1

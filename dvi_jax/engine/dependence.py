@@ -22,8 +22,13 @@ def depends_on(function: Callable[..., Any], argnum: int, *args: Any) -> bool:
     return any(reached_outputs(closed.jaxpr, marked))
 
 
-def reached_outputs(jaxpr: Jaxpr, reached_inputs: Sequence[bool]) -> list[bool]:
-    """Which outputs of `jaxpr` are reached from the inputs that are marked."""
+def reached_outputs(
+    jaxpr: Jaxpr, reached_inputs: Sequence[bool], ends: frozenset[str] = frozenset()
+) -> list[bool]:
+    """Which outputs of `jaxpr` are reached from the inputs that are marked.
+
+    Nothing is reached through the primitives named in `ends`.
+    """
     reached = {v for v, r in zip(jaxpr.invars, reached_inputs, strict=True) if r}
 
     def is_reached(atom: Any) -> bool:
@@ -32,14 +37,16 @@ def reached_outputs(jaxpr: Jaxpr, reached_inputs: Sequence[bool]) -> list[bool]:
     for eqn in jaxpr.eqns:
         inputs = [is_reached(v) for v in eqn.invars]
         if any(inputs):
-            outputs = reached_by(eqn, inputs)
+            outputs = reached_by(eqn, inputs, ends)
             reached.update(v for v, r in zip(eqn.outvars, outputs, strict=True) if r)
     return [is_reached(v) for v in jaxpr.outvars]
 
 
-def reached_by(eqn: Any, inputs: list[bool]) -> list[bool]:
+def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset()) -> list[bool]:
     """Which outputs of an equation are reached from the inputs that are marked."""
     name, params = eqn.primitive.name, eqn.params
+    if name in ends:
+        return [False] * len(eqn.outvars)
     if name == "scan":
         consts, count = scan_counts(params)
         fixed, carry, xs = (
@@ -49,7 +56,7 @@ def reached_by(eqn: Any, inputs: list[bool]) -> list[bool]:
         )
 
         def scanned(carry):
-            return reached_outputs(params["jaxpr"].jaxpr, [*fixed, *carry, *xs])
+            return reached_outputs(params["jaxpr"].jaxpr, [*fixed, *carry, *xs], ends)
 
         carry = fixed_point(lambda carry: scanned(carry)[:count], carry)
         return [*carry, *scanned(carry)[count:]]
@@ -58,18 +65,18 @@ def reached_by(eqn: Any, inputs: list[bool]) -> list[bool]:
         of_test, of_body = inputs[:first], inputs[first : first + second]
 
         def after(carry):
-            (test,) = reached_outputs(params["cond_jaxpr"].jaxpr, [*of_test, *carry])
-            body = reached_outputs(params["body_jaxpr"].jaxpr, [*of_body, *carry])
+            (test,) = reached_outputs(params["cond_jaxpr"].jaxpr, [*of_test, *carry], ends)
+            body = reached_outputs(params["body_jaxpr"].jaxpr, [*of_body, *carry], ends)
             return [test or r for r in body]
 
         return fixed_point(after, inputs[first + second :])
     if name == "cond":
         if inputs[0]:
             return [True] * len(eqn.outvars)
-        per_branch = [reached_outputs(b.jaxpr, inputs[1:]) for b in params["branches"]]
+        per_branch = [reached_outputs(b.jaxpr, inputs[1:], ends) for b in params["branches"]]
         return [any(r) for r in zip(*per_branch, strict=True)]
     inner = _called_jaxpr(eqn)
-    return [True] * len(eqn.outvars) if inner is None else reached_outputs(inner, inputs)
+    return [True] * len(eqn.outvars) if inner is None else reached_outputs(inner, inputs, ends)
 
 
 def fixed_point(after: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:

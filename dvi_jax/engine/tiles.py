@@ -37,7 +37,7 @@ FEWEST_FOR_OWN = 8
 LARGEST_KERNEL = 10_000
 """A function of more operations than this goes into no kernel, which has some 250 registers."""
 
-TILE_ENTRIES = 2048
+TILE_ENTRIES = 1024
 """Entries of the state of all lanes of a tile: about what a first-level cache holds."""
 
 

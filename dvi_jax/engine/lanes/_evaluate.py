@@ -9,8 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ..._compat import ClosedJaxpr, Jaxpr, Literal, aval, bind_parameters, bodies, scan_counts
+from ..._compat import (
+    ClosedJaxpr,
+    Jaxpr,
+    Literal,
+    aval,
+    bind_parameters,
+    bodies,
+    one_kernel,
+    scan_counts,
+)
 from ..dependence import fixed_point, reached_by, reached_outputs
+from ..together import AGREED
 from ._rules import (
     CUMULATIVE,
     ELEMENTWISE,
@@ -85,6 +95,7 @@ class Evaluator:
 
     def __init__(self, lanes: int | None, replacements: dict[str, Callable]):
         self.lanes, self.replacements = lanes, replacements
+        self.in_kernel = False
 
     # --- jaxprs ------------------------------------------------------------------------------
 
@@ -110,6 +121,8 @@ class Evaluator:
 
     def equation(self, eqn: Any, values: list[Value]) -> list[Value]:
         name = eqn.primitive.name
+        if name in ("scan", "while") and not self.in_kernel and fits_in_a_kernel(eqn):
+            return self._in_one_kernel(_SPECIAL[name], eqn, values)
         if name in _SPECIAL:
             return _SPECIAL[name](self, eqn, values)
         if eqn.params.get("name") == IN_ARRAYS:
@@ -302,9 +315,36 @@ class Evaluator:
         if not any(flags):
             return [made(x, False) for x in bind(*arrays)]
         axes = [-1 if on else None for on in flags]
-        vary = reached_by(eqn, flags)
+        vary = reached_by(eqn, flags, AGREED)
         outputs = jax.vmap(bind, axes, tuple(-1 if on else None for on in vary))(*arrays)
         return [made(x, on) for x, on in zip(outputs, vary, strict=True)]
+
+    def _in_one_kernel(self, rule: Callable, eqn: Any, values: list[Value]) -> list[Value]:
+        """What `rule` makes of a loop, to be compiled as one function with all that is in it."""
+        self._split_small(values)
+        arrays: list[jax.Array] = []
+        results: list[Value] = []
+
+        def inner(*arrays):
+            into = iter(arrays)
+            inputs = [v.with_arrays(lambda _: next(into)) for v in values]
+            self.in_kernel = True
+            try:
+                results[:] = rule(self, eqn, inputs)
+            finally:
+                self.in_kernel = False
+            outputs: list[jax.Array] = []
+            for value in results:
+                value.with_arrays(outputs.append)
+            return outputs
+
+        for value in values:
+            value.with_arrays(arrays.append)
+        closed = jax.make_jaxpr(inner)(*arrays)
+        if not all(map(_is_written_out, closed.jaxpr.eqns)):
+            return rule(self, eqn, values)
+        outputs = iter(one_kernel.bind(*arrays, closed=closed))
+        return [v.with_arrays(lambda _: next(outputs)) for v in results]
 
     # --- loops -------------------------------------------------------------------------------
 
@@ -379,7 +419,7 @@ class Evaluator:
         first, last = len(consts), len(consts) + len(carry)
         on = fixed_point(
             lambda on: reached_outputs(
-                body.jaxpr, [*map(self.has_lanes, consts), *on, *map(self.has_lanes, xs)]
+                body.jaxpr, [*map(self.has_lanes, consts), *on, *map(self.has_lanes, xs)], AGREED
             )[: len(carry)],
             [self.has_lanes(v) for v in carry],
         )
@@ -454,13 +494,13 @@ class Evaluator:
         lanes_of_body = [self.has_lanes(v) for v in of_body]
 
         def after(on):
-            (goes_on,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on])
-            outs = reached_outputs(body.jaxpr, [*lanes_of_body, *on])
+            (goes_on,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on], AGREED)
+            outs = reached_outputs(body.jaxpr, [*lanes_of_body, *on], AGREED)
             return [goes_on or x for x in outs]
 
         on = fixed_point(after, [self.has_lanes(v) for v in carry])
         pack, unpack = self.packer(carry, [v.aval for v in body.jaxpr.outvars], on)
-        (per_lane,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on])
+        (per_lane,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on], AGREED)
 
         def goes_on(state) -> Value:
             return self.closed(test, [*of_test, *unpack(state)])[0]
@@ -513,7 +553,7 @@ class Evaluator:
             return self.closed(branches[int(np.clip(known, 0, len(branches) - 1))], operands)
         self._split_small(operands)
         flags = [self.has_lanes(v) for v in operands]
-        per_branch = [reached_outputs(b.jaxpr, flags) for b in branches]
+        per_branch = [reached_outputs(b.jaxpr, flags, AGREED) for b in branches]
         varies = self.has_lanes(index)
         on = [varies or any(x) for x in zip(*per_branch, strict=True)]
         which = index.entries()[()]
@@ -619,6 +659,32 @@ _SPECIAL: dict[str, Callable[[Evaluator, Any, list[Value]], list[Value]]] = {
     "least_over_lanes": _least_over_lanes,
     "eliminate": _eliminate,
 }
+
+
+_IN_KERNELS = frozenset(
+    [
+        *(*ELEMENTWISE, *REDUCTIONS, *CUMULATIVE, *MOVES, *LABELLED, *_CALLS, *_SPECIAL),
+        *("argmax", "argmin", "dot_general", "iota", "scatter-add"),
+    ]
+)
+
+
+def fits_in_a_kernel(eqn: Any) -> bool:
+    """Whether all that an equation does is arithmetic that the compiler writes out itself."""
+    if eqn.primitive.name not in _IN_KERNELS or eqn.params.get("name") == IN_ARRAYS:
+        return False
+    return all(fits_in_a_kernel(e) for body in bodies(eqn) for e in body.jaxpr.eqns)
+
+
+def _is_written_out(eqn: Any) -> bool:
+    """Whether the compiler has no library for an equation: what is left in arrays may have one."""
+    name = eqn.primitive.name
+    if name in _WITH_LIBRARIES and aval(eqn.invars[0]).dtype != bool:
+        return False
+    return all(_is_written_out(e) for body in bodies(eqn) for e in body.jaxpr.eqns)
+
+
+_WITH_LIBRARIES = frozenset([*REDUCTIONS, *CUMULATIVE, "argmax", "argmin", "dot_general"])
 
 
 def stays_whole(value: Value) -> bool:

@@ -14,11 +14,12 @@ from jax import lax
 from ._value import ONE, ZERO, Entry, Structural, is_array, number, on_lanes
 
 _NAMES = """
-abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type
-copy copy_p cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow
-is_finite le lgamma log log1p logistic lt max min mul ne neg nextafter not optimization_barrier
-or pow real reduce_precision rem round rsqrt select_n shift_left shift_right_arithmetic
-shift_right_logical sign sin sinh sqrt square stop_gradient sub tan tanh xor
+abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp clz complex conj
+convert_element_type copy copy_p cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge
+gt imag integer_pow is_finite le lgamma log log1p log2 logistic lt max min mul mulhi ne neg
+nextafter not one_minus_square optimization_barrier or population_count pow real
+reduce_precision rem round rsqrt select_n shift_left shift_right_arithmetic shift_right_logical
+sign sin sinh sqrt square stop_gradient sub tan tanh xor
 """
 
 ELEMENTWISE = frozenset(_NAMES.split())
@@ -87,11 +88,12 @@ MOVES: dict[str, Callable] = {
     "transpose": lambda x, *, permutation, **_: np.transpose(x, permutation),
     "rev": lambda x, *, dimensions, **_: np.flip(x, tuple(dimensions)),
     "slice": _slice,
+    "stack": lambda *xs, axis, **_: np.stack(xs, axis),
+    "unstack": lambda x, *, axis, **_: tuple(np.moveaxis(x, axis, 0)),
+    "tile": lambda x, *, reps, **_: np.tile(x, tuple(reps)),
     "concatenate": lambda *xs, dimension, **_: np.concatenate(xs, axis=dimension),
     "pad": _pad,
     "split": _split,
-    "stack": lambda *xs, axis, **_: np.stack(xs, axis),
-    "unstack": lambda x, *, axis, **_: tuple(np.moveaxis(x, axis, 0)),
 }
 """Where entries go, by NumPy's rules: nothing is computed."""
 

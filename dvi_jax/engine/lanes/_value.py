@@ -1,6 +1,6 @@
 """What a variable of a jaxpr holds in component form: one entry for each array element."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -98,6 +98,21 @@ class Value:
     def lead_entries(self) -> np.ndarray | None:
         """The entries with the axes `lead` in front of each, or None if it is in another form."""
         return self._entries if self.lead else None
+
+    def with_arrays(self, function: Callable[[jax.Array], Any]) -> "Value":
+        """The value with `function` of its JAX arrays in their places."""
+
+        def of(x):
+            return function(x) if is_array(x) else x
+
+        value = Value(self.shape, self.dtype, lead=self.lead, is_bulk=self.is_bulk)
+        value.is_tangent, value._has_lanes = self.is_tangent, self._has_lanes
+        if self._entries is None:
+            value._array = of(self._array)
+        else:
+            entries = [of(e) for e in self._entries.flat]
+            value._entries = objects(entries, self._entries.shape)
+        return value
 
     def array(self) -> tuple[Any, bool]:
         """(array, whether its last axis is that of the lanes)."""
