@@ -34,7 +34,7 @@ from ._segments import can_trust, largest_divisor, run_in_segments
 from ._step import Equations
 from ._types import State
 from .engine.lanes import in_arrays
-from .engine.newton import Known, Trusted
+from .engine.newton import Known, Newton, Trusted
 from .engine.tiles import Layout, lanewise
 from .engine.together import on_any_lane
 from .methods import TypeII
@@ -83,7 +83,8 @@ def _direct_rollout(
 
     def on_trust(arrays, q0, p0):
         task = eqx.combine(arrays, rest)
-        return outcome(task, run_in_segments(task, plan, start(task, q0, p0)))
+        begin = start(task, q0, p0)
+        return outcome(task, run_in_segments(task, plan, begin, one_row=layout.in_kernel))
 
     return lanewise(
         on_trust if can_trust(task) else forward, arrays, q0, p0,
@@ -200,7 +201,8 @@ class Reversible(AbstractAdjoint):
             theta, q0, p0 = inputs
             task = eqx.combine(theta, fixed)
             begin = start(task, q0, p0)
-            return finish(task, run_in_segments(task, plan, begin, self.checkpoint_every))
+            every, one_row = self.checkpoint_every, layout.in_kernel
+            return finish(task, run_in_segments(task, plan, begin, every, one_row))
 
         def finish(task, ran):
             carry, saved, tail = ran
@@ -252,8 +254,8 @@ class Reversible(AbstractAdjoint):
             def transpose_solve(_, b):
                 u, v = unravel(b)
                 back = lanewise(
-                    lambda *x: _pull_back(self, fixed, plan, *x), inputs, trace, v,
-                    layout=layout, steps=steps, entries=2 * size,
+                    lambda *x: _pull_back(self, fixed, plan, not layout.in_kernel, *x),
+                    inputs, trace, v, layout=layout, steps=steps, entries=2 * size,
                 )  # fmt: skip
                 return flat(jax.tree.map(jnp.add, u, back), v)
 
@@ -297,8 +299,13 @@ def _no_tangent(x):
     return np.zeros(x.shape, jax.dtypes.float0)
 
 
-def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent: _Smooth):
-    """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start."""
+def _pull_back(
+    settings: Reversible, fixed, plan: Plan, may_store: bool, inputs, trace, cotangent: _Smooth
+):
+    """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start.
+
+    Unless it `may_store` the states of a piece, the gradient is NaN where rebuilding fails.
+    """
     theta, q_start, p_start = inputs
     carry, saved, tail, _ = trace
     task: Task = eqx.combine(theta, fixed)
@@ -309,6 +316,7 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
         )
     )
     newton = task.equations.newton
+    assert isinstance(newton, Newton)
     on_trust = Trusted(newton, jnp.asarray(BACKWARD_ITERATIONS, jnp.int32))
 
     def solved_by(task: Task, options) -> Equations:
@@ -398,6 +406,8 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
 
         # Where the trajectory itself has failed there is nothing to mend: NaN, not a number.
         missing = ~fine & _all_finite(known_start) & _all_finite(end)
+        if not may_store:
+            return jax.tree.map(lambda x: jnp.where(missing, jnp.nan, x), tuple(out))
         return lax.cond(on_any_lane(missing), mend, lambda out: out, tuple(out))
 
     def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):

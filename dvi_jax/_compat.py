@@ -1,13 +1,16 @@
 """The few names of JAX that have moved between releases, or are not public: all of them, here."""
 
-from collections.abc import Callable, Iterator
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
+from jax import export
 from jax.core import ShapedArray, Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
 from jax.interpreters import ad, batching, mlir, partial_eval
+from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 
 __all__ = [
     "ClosedJaxpr",
@@ -23,9 +26,12 @@ __all__ = [
     "jaxpr_as_fun",
     "jaxprs_in_params",
     "linear",
+    "lower_on",
+    "lowered_for_cuda",
     "one_kernel",
     "primitive",
     "scan_counts",
+    "with_outputs",
     "without_outputs",
     "x64_enabled",
 ]
@@ -43,12 +49,24 @@ def x64_enabled() -> bool:
 
 def bodies(eqn: Any) -> Iterator[ClosedJaxpr]:
     """The jaxprs among the parameters of an equation, closed: what it calls."""
+    if "_prim" in eqn.params:  # from jax 0.12 on, custom_root and others
+        yield _expanded(eqn)
     for value in eqn.params.values():
         for item in value if isinstance(value, tuple | list) else (value,):
             if isinstance(item, ClosedJaxpr):
                 yield item
             elif isinstance(item, Jaxpr):
                 yield ClosedJaxpr(item, ())
+
+
+def _expanded(eqn: Any) -> ClosedJaxpr:
+    """What an equation stands for that is itself no operation yet."""
+    which = eqn.params["_prim"]
+
+    def function(*leaves):
+        return jax.tree.leaves(which.expand(*jax.tree.unflatten(which.in_tree, leaves)))
+
+    return jax.make_jaxpr(function)(*(v.aval for v in eqn.invars))
 
 
 def backends_are_initialized() -> bool:
@@ -98,6 +116,28 @@ def primitive(
     return new
 
 
+def lower_on(platform: str, primitive: Primitive, function: Callable) -> None:
+    """Have a primitive of several outputs compiled for `platform` as what `function` does."""
+    rule = mlir.lower_fun(function, multiple_results=True)
+    mlir.register_lowering(primitive, rule, platform=platform)
+
+
+_TRITON_CALLS = ("__gpu$xla.gpu.triton", "triton_kernel_call_ffi", "triton_kernel_call")
+
+
+def lowered_for_cuda(function: Any, *args: Any) -> str:
+    """The program of a jitted function for a GPU (StableHLO). No GPU is needed for that."""
+    checks = [export.DisabledSafetyCheck.custom_call(name) for name in _TRITON_CALLS]
+    device: Any = AbstractDevice
+    which: Any = contextlib.nullcontext()
+    if "platform" in device.__dataclass_fields__:  # from jax 0.12 on: for one of this kind
+        kind = device(device_kind="NVIDIA H200", num_cores=None, platform="gpu")
+        which = use_abstract_mesh(AbstractMesh((), (), abstract_device=kind))
+    with which:
+        done = export.export(function, platforms=["cuda"], disabled_checks=checks)(*args)
+    return str(done.mlir_module())
+
+
 def drops_outputs(primitive: Primitive, without: Callable) -> None:
     """Have unused outputs of a primitive dropped: `without(params, used)` → its new parameters."""
 
@@ -116,6 +156,12 @@ def without_outputs(closed: ClosedJaxpr, used: list[bool]) -> ClosedJaxpr:
     """The jaxpr that computes only some outputs, of the same inputs."""
     jaxpr = partial_eval.dce_jaxpr(closed.jaxpr, used, instantiate=True)[0]
     return ClosedJaxpr(jaxpr, closed.consts)
+
+
+def with_outputs(jaxpr: Jaxpr, wanted: Sequence[bool]) -> tuple[Jaxpr, list[bool]]:
+    """What it takes to compute these outputs, and which constants and inputs it has left."""
+    less, consts, inputs = partial_eval.dce_jaxpr_consts(jaxpr, wanted)
+    return less, [*consts, *inputs]
 
 
 def identity(name: str, batched: Callable) -> Primitive:

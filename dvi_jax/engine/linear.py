@@ -20,9 +20,14 @@ def solve_dense(A: Inexact[Array, "n n"], b: Inexact[Array, " n"]) -> Inexact[Ar
     the batch, where `jnp.linalg.solve` would call LAPACK once a lane. A singular matrix
     gives infinities or NaN, for the caller's status to report.
     """
-    n = b.shape[0]
-    if n > UNROLLED_UP_TO:
+    if b.shape[0] > UNROLLED_UP_TO:
         return jnp.linalg.solve(A, b)
+    return by_elimination(A, b)
+
+
+def by_elimination(A: Inexact[Array, "n n"], b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+    """`solve_dense` without the library for any n, written out."""
+    n = b.shape[0]
     rows = [[A[i, j] for j in range(n)] + [b[i]] for i in range(n)]
     for c in range(n):
         for i in range(c + 1, n):  # bring the larger of rows c and i to place c

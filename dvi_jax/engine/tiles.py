@@ -2,6 +2,7 @@
 
 import copy
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -17,10 +18,12 @@ from .._compat import (
     is_traced,
     jaxpr_as_fun,
     linear,
+    lower_on,
     primitive,
     without_outputs,
 )
-from .elementary import VECTORISED
+from .elementary import VECTORISED, pow
+from .kernel import NotInKernelError, run_in_kernel
 from .lanes import Evaluator, Value, operation_count
 from .lanes._value import as_array, on_lanes, whole
 
@@ -33,6 +36,9 @@ and over in some ten milliseconds."""
 
 FEWEST_FOR_OWN = 8
 """Lanes from which on elementary functions of our own are faster than the library's."""
+
+LARGEST_KERNEL = 10_000
+"""A function of more operations than this goes into no kernel, which has some 250 registers."""
 
 TILE_ENTRIES = 1024
 """Entries of the state of all lanes of a tile: about what a first-level cache holds."""
@@ -47,26 +53,37 @@ class Layout(eqx.Module):
       `vmap` goes in tiles of such numbers, which stay in registers and cache; ``"arrays"``: as the
       functions were written, batched by `vmap`; ``"auto"``: components, but for short runs (fewer
       than 100 000 lanes × steps), which they make longer by the time of their compilation, and
-      for functions of very many operations.
-    - `width`: lanes of a tile; None means by the size of the state.
+      for functions of very many operations; ``"kernel"``: a batch in one kernel of the GPU that
+      runs all steps (see the page on GPUs), which ``"auto"`` takes there too; what does not go into
+      a kernel goes in components, with a warning. On a CPU the kernel is interpreted, for tests.
+    - `width`: lanes of a tile, or of a block of a kernel (the next power of two); None means by the
+      size of the state.
     - `library`: take sin, cos and their like from the library, as arrays do, also where components
       go in batches of float64 and arithmetic of our own is several times as fast.
 
     **Raises** `ValueError` for another form, or a width that is not positive.
     """
 
-    form: Literal["auto", "components", "arrays"] = eqx.field(static=True, default="auto")
+    form: Literal["auto", "components", "arrays", "kernel"] = eqx.field(static=True, default="auto")
     width: int | None = eqx.field(static=True, default=None)
     library: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        if self.form not in ("auto", "components", "arrays"):
-            raise ValueError(f'form must be "auto", "components" or "arrays", got {self.form!r}.')
+        if self.form not in ("auto", "components", "arrays", "kernel"):
+            raise ValueError(
+                f'form must be "auto", "components", "arrays" or "kernel", got {self.form!r}.'
+            )
         width = self.width
         if width is not None and (
             isinstance(width, bool) or not isinstance(width, int) or width < 1
         ):
             raise ValueError(f"width must be a positive integer or None, got {width!r}.")
+
+    @property
+    def in_kernel(self) -> bool:
+        """Whether a batch is to go into a kernel, as far as can be told before it is compiled."""
+        on_gpu = self.form == "auto" and jax.default_backend() == "gpu"
+        return self.form == "kernel" or on_gpu
 
 
 def lanewise(
@@ -94,7 +111,8 @@ def lanewise(
 
     @jax.custom_jvp
     def call(*operands):
-        return _lanewise.bind(*operands, program=program, lanes=None, on=(False,) * len(operands))
+        on = (False,) * len(operands)
+        return _lanewise.bind(*operands, program=program, lanes=None, on=on)
 
     @call.defjvp
     def _(primals, tangents):
@@ -155,15 +173,26 @@ class _Traced:
         return fewer
 
     def in_components(
-        self, operands: Sequence[Any], on: Sequence[bool], lanes: int | None, layout: Layout
+        self, operands: Sequence[Any], on: Sequence[bool], lanes: int | None, own: dict
     ) -> list[Value]:
-        """The outputs in component form; the last axis of an operand is the lanes where `on`."""
+        """The outputs in component form; the last axis of an operand is the lanes where `on`.
+
+        `own` are the elementary functions that are not the library's.
+        """
         values = [whole(x, o) for x, o in zip(operands, on, strict=True)]
         outer = iter(values[: len(self.outer)])
         consts = [next(outer) if is_traced(c) else whole(c, False) for c in self.closed.consts]
-        own = lanes is not None and lanes >= FEWEST_FOR_OWN and not layout.library
-        evaluator = Evaluator(lanes, VECTORISED if own else {})
+        evaluator = Evaluator(lanes, own)
         return evaluator.jaxpr(self.closed.jaxpr, consts, values[len(self.outer) :])
+
+    def in_kernel(
+        self, operands: Sequence[Any], on: Sequence[bool], lanes: int, **options: Any
+    ) -> list[jax.Array]:
+        """The outputs from one kernel; the first axis of an operand is the lanes where `on`."""
+        rest = iter(zip(operands, on, strict=True))
+        consts = [next(rest) if is_traced(c) else (c, None) for c in self.closed.consts]
+        arrays, flags = zip(*consts, *rest, strict=True)
+        return run_in_kernel(self.closed.jaxpr, arrays, flags, lanes, **options)
 
 
 class _Program:
@@ -182,13 +211,32 @@ class _Program:
         return _Program(ordinary, special, self.layout, self.steps, self.entries)
 
     def takes_components(self, lanes: int | None) -> bool:
-        if self.layout.form != "auto":
+        if self.layout.form in ("arrays", "components"):
             return self.layout.form == "components"
         if len(self.special.outer) != len(self.ordinary.outer):
             return False
-        if (lanes or 1) * self.steps < SHORTEST:
+        if (lanes or 1) * self.steps < SHORTEST and self.layout.form == "auto":
             return False
         return operation_count(self.special.closed.jaxpr) <= LARGEST
+
+    def from_kernel(self, *operands: Any, **options: Any) -> list[jax.Array] | None:
+        """The outputs from one kernel, None where that is not wanted or cannot be."""
+        form, lanes = self.layout.form, options["lanes"]
+        if form not in ("auto", "kernel") or not lanes:
+            return None
+        if form == "auto" and not self.takes_components(lanes):
+            return None
+        try:
+            if len(self.special.outer) != len(self.ordinary.outer):
+                raise NotInKernelError("it closes over values that are not known yet.")
+            count = operation_count(self.special.closed.jaxpr)
+            if count > LARGEST_KERNEL:
+                raise NotInKernelError(f"it has some {count} operations.")
+            return self.special.in_kernel(operands, block=self.layout.width, **options)
+        except NotInKernelError as error:
+            if form == "kernel":
+                warnings.warn(f"A part of the run is left to XLA: {error}", stacklevel=2)
+            return None
 
     @property
     def width(self) -> int:
@@ -198,22 +246,42 @@ class _Program:
         return min(max(2 ** round(math.log2(best)), 64), 1024)
 
 
-def _run(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
+def _run(
+    *operands,
+    program: _Program,
+    lanes: int | None,
+    on: tuple[bool, ...],
+    is_gpu: bool = False,
+) -> list[Any]:
     """The program on so many lanes: the first axis of operands where `on`, and of all outputs."""
-    if lanes is None:
-        if not program.takes_components(None):
-            return program.ordinary(*operands)
-        return [
-            jnp.asarray(v.array()[0])
-            for v in program.special.in_components(operands, on, None, program.layout)
-        ]
+    if is_gpu or program.layout.form == "kernel":
+        kept = program.from_kernel(*operands, on=on, lanes=lanes, interpret=not is_gpu)
+        if kept is not None:
+            return kept
     if not program.takes_components(lanes):
-        axes = [0 if o else None for o in on]
-        return jax.vmap(program.ordinary, axes, 0)(*operands)
-    return _in_tiles(program, operands, on, lanes)
+        if lanes is None:
+            outs = program.ordinary(*operands)
+        else:
+            axes = [0 if o else None for o in on]
+            outs = jax.vmap(program.ordinary, axes, 0)(*operands)
+    elif lanes is None:
+        values = program.special.in_components(operands, on, None, {})
+        outs = [jnp.asarray(v.array()[0]) for v in values]
+    else:
+        outs = _in_tiles(program, operands, on, lanes, is_gpu)
+    return outs
 
 
-def _shape_of(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
+def _run_on_gpu(*operands, **params) -> list[Any]:
+    return _run(*operands, is_gpu=True, **params)
+
+
+def _shape_of(
+    *operands,
+    program: _Program,
+    lanes: int | None,
+    on: tuple[bool, ...],
+) -> list[Any]:
     front = () if lanes is None else (lanes,)
     avals = program.ordinary.closed.out_avals
     return [jax.ShapeDtypeStruct((*front, *a.shape), a.dtype) for a in avals]
@@ -222,7 +290,14 @@ def _shape_of(*operands, program: _Program, lanes: int | None, on: tuple[bool, .
 _run.shape_of = _shape_of  # pyright: ignore[reportFunctionMemberAccess]
 
 
-def _batched(operands, axes, *, program: _Program, lanes: int | None, on: tuple[bool, ...]):
+def _batched(
+    operands,
+    axes,
+    *,
+    program: _Program,
+    lanes: int | None,
+    on: tuple[bool, ...],
+):
     """One more axis of lanes: all of them become one."""
     batched = [axis is not None for axis in axes]
     moved = [
@@ -231,16 +306,19 @@ def _batched(operands, axes, *, program: _Program, lanes: int | None, on: tuple[
     ]
     (size,) = {x.shape[0] for x, b in zip(moved, batched, strict=True) if b}
     if lanes is None:
-        outs = _lanewise.bind(*moved, program=program, lanes=size, on=tuple(batched))
+        flags = tuple(batched)
+        outs = _lanewise.bind(*moved, program=program, lanes=size, on=flags)
         return outs, [0] * len(outs)
     merged = [_merge(x, b, o, size, lanes) for x, b, o in zip(moved, batched, on, strict=True)]
     either = tuple(b or o for b, o in zip(batched, on, strict=True))
-    outs = _lanewise.bind(*merged, program=program, lanes=size * lanes, on=either)
+    size_of_all = size * lanes
+    outs = _lanewise.bind(*merged, program=program, lanes=size_of_all, on=either)
     outs = [x.reshape(size, lanes, *x.shape[1:]) for x in outs]
     return outs, [0] * len(outs)
 
 
 _lanewise = primitive("lanewise", _run, _batched, multiple=True)
+lower_on("cuda", _lanewise, _run_on_gpu)
 
 
 def _without(params: dict[str, Any], used: list[bool]) -> dict[str, Any]:
@@ -261,11 +339,16 @@ def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> A
     return x.reshape(size * lanes, *x.shape[2:])
 
 
-def _in_tiles(program: _Program, operands: Sequence[Any], on: Sequence[bool], lanes: int) -> list:
-    """The outputs on all lanes, tile by tile."""
-    count = -(-lanes // program.width)
+def _in_tiles(
+    program: _Program, operands: Sequence[Any], on: Sequence[bool], lanes: int, is_gpu: bool
+) -> list:
+    """The outputs on all lanes, tile by tile; a GPU takes them all at once."""
+    count = 1 if is_gpu else -(-lanes // program.width)
     width = lanes if count == 1 else -(-lanes // (8 * count)) * 8
     forms: list[_Form] = []
+    own = VECTORISED if width >= FEWEST_FOR_OWN and not program.layout.library else {}
+    if is_gpu:  # whose library has sin and its like for all lanes at once
+        own = {"pow": pow}
 
     def cut(x):
         missing = count * width - lanes
@@ -276,7 +359,7 @@ def _in_tiles(program: _Program, operands: Sequence[Any], on: Sequence[bool], la
     def tile(mine):
         mine = iter(mine)
         parts = [next(mine) if o else x for x, o in zip(operands, on, strict=True)]
-        values = program.special.in_components(parts, on, width, program.layout)
+        values = program.special.in_components(parts, on, width, own)
         forms[:] = [_Form(v) for v in values]
         return [form.rows(v, width) for form, v in zip(forms, values, strict=True)]
 

@@ -393,6 +393,14 @@ class Evaluator:
             if not stays_whole(value):
                 value.entries()
 
+    def on_any(self, x: jax.Array) -> jax.Array:
+        """Whether x is true anywhere."""
+        return jnp.any(x)
+
+    def select(self, which: jax.Array, cases: Sequence[jax.Array]) -> jax.Array:
+        """On each lane the case of that number (int32)."""
+        return lax.select_n(which, *cases)
+
     def has_lanes(self, value: Value) -> bool:
         if self.lanes is None:
             return False
@@ -518,7 +526,7 @@ class Evaluator:
             return tuple(keep([goes_on(after)])), after
 
         def any_active(state):
-            return functools.reduce(jnp.logical_or, map(jnp.any, state[0]))
+            return functools.reduce(jnp.logical_or, map(self.on_any, state[0]))
 
         _, end = lax.while_loop(any_active, masked, (tuple(keep([first])), state))
         return unpack(list(end))
@@ -561,7 +569,7 @@ class Evaluator:
             return unpack(list(lax.switch(which, [run(b) for b in branches])))
         which = jnp.clip(which.astype(jnp.int32), 0, len(branches) - 1)
         results = [run(b)() for b in branches]
-        chosen = [lax.select_n(which, *cases) for cases in zip(*results, strict=True)]
+        chosen = [self.select(which, cases) for cases in zip(*results, strict=True)]
         return unpack(chosen)
 
     def linear_solve(self, eqn: Any, values: list[Value]) -> list[Value]:
@@ -627,6 +635,8 @@ _CALLS = frozenset(
         "pjit",
         "closed_call",
         "core_call",
+        "call_hi_primitive",
+        "eval_jaxpr",
         "custom_jvp_call",
         "custom_vjp_call",
         "custom_vjp_call_jaxpr",

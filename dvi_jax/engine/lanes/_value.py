@@ -157,6 +157,8 @@ def on_lanes(x: jax.Array, lanes: int, lead: int = 0) -> jax.Array:
     """x with a lane axis last, if it has none yet."""
     if x.ndim > lead:
         return x
+    if x.ndim == 0:
+        return jnp.broadcast_to(x, (lanes,))
     return jnp.broadcast_to(x[..., None], (*x.shape, lanes))
 
 
