@@ -239,7 +239,7 @@ class Evaluator:
         (out,) = eqn.outvars
         (of_a, of_b), (batch_a, batch_b) = eqn.params["dimension_numbers"]
         dtype = out.aval.dtype
-        if a.dtype != dtype or b.dtype != dtype:
+        if a.dtype != dtype or b.dtype != dtype or dtype == bool:
             return self._batched(eqn, [a, b])[0]
         x, shape_a = _as_stack_of_matrices(a.entries(), batch_a, of_a)
         y, shape_b = _as_stack_of_matrices(b.entries(), batch_b, of_b)
@@ -282,12 +282,13 @@ class Evaluator:
 
     def _scatter_add(self, eqn: Any, values: list[Value], indices: np.ndarray) -> Value:
         operand, _, updates = values
-        zeros, units = np.zeros(operand.shape), np.eye(updates.size)
+        dtype = operand.dtype  # that of the addition which the primitive brings along
+        zeros, units = np.zeros(operand.shape, dtype), np.eye(updates.size, dtype=dtype)
         targets = [
             fold(eqn.primitive, [zeros, indices, unit.reshape(updates.shape)], eqn.params)[0]
             for unit in units
         ]
-        add = self._pairwise(lax.add, operand.dtype)
+        add = self._pairwise(lax.add, dtype)
         totals = list(operand.entries().flat)
         for update, target in zip(updates.entries().flat, targets, strict=True):
             for place in np.flatnonzero(target):

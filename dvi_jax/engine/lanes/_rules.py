@@ -46,8 +46,9 @@ CUMULATIVE: dict[str, Callable] = {
 
 
 def _broadcast_in_dim(x, *, shape, broadcast_dimensions, **_):
+    x = np.transpose(x, np.argsort(broadcast_dimensions))  # they may come in any order
     places = [1] * len(shape)
-    for axis, dimension in enumerate(broadcast_dimensions):
+    for axis, dimension in enumerate(sorted(broadcast_dimensions)):
         places[dimension] = x.shape[axis]
     return np.broadcast_to(x.reshape(places), shape)
 

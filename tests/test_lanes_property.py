@@ -1,0 +1,314 @@
+"""Component form against arrays: every primitive, its variants, and functions made by chance."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from dvi_jax.engine.lanes import evaluate
+
+LANES = 3
+"""As many as the arrays have rows, so that an axis taken for another is no error of shapes."""
+
+
+def by_components(function, args, on):
+    """The outputs of ``function(*args)`` by components, lanes in front where there are any.
+
+    `on` says which arguments have lanes; None means that nothing has, nor is there an axis.
+    """
+    lanes = None if on is None else LANES
+    flags = [False] * len(args) if on is None else on
+    one = [a[0] if o else a for a, o in zip(args, flags, strict=True)]
+    closed = jax.make_jaxpr(function)(*one)
+    tree = jax.tree.structure(jax.eval_shape(function, *one))
+
+    def run(*args):
+        args = [jnp.moveaxis(a, 0, -1) if o else a for a, o in zip(args, flags, strict=True)]
+        outs = []
+        for value in evaluate(closed, args, flags, lanes):
+            array, has_lanes = value.array()
+            array = jnp.asarray(array)
+            if lanes and not has_lanes:
+                array = jnp.broadcast_to(array[..., None], (*value.shape, lanes))
+            outs.append(jnp.moveaxis(array, -1, 0) if lanes else array)
+        return jax.tree.unflatten(tree, outs)
+
+    return jax.jit(run)(*args)
+
+
+def assert_same(found, expected, rtol, what=""):
+    paths = jax.tree_util.tree_flatten_with_path(expected)[0]
+    for (path, b), a in zip(paths, jax.tree.leaves(found), strict=True):
+        where = f"{what}{jax.tree_util.keystr(path)}"
+        assert (a.shape, a.dtype) == (b.shape, b.dtype), where
+        if jnp.issubdtype(b.dtype, jnp.inexact):
+            wide = np.complex128 if jnp.issubdtype(b.dtype, jnp.complexfloating) else np.float64
+            a, b = np.asarray(a).astype(wide), np.asarray(b).astype(wide)
+            np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol, err_msg=where)
+        else:
+            np.testing.assert_array_equal(a, b, err_msg=where)
+
+
+def check(function, *args, rtol=1e-12, patterns=None):
+    """By components on lanes, on one, and where only some arguments have lanes, against vmap."""
+    if patterns is None:
+        patterns = [[True] * len(args), None]
+        if len(args) > 1:
+            patterns += [[i != k for i in range(len(args))] for k in range(len(args))]
+    for on in patterns:
+        mine = [a if on is None or o else a[1] for a, o in zip(args, on or args, strict=True)]
+        if on is None:
+            mine = [a[1] for a in args]
+            expected = jax.jit(function)(*mine)
+        else:
+            axes = [0 if o else None for o in on]
+            expected = jax.jit(jax.vmap(function, axes))(*mine)
+        assert_same(by_components(function, mine, on), expected, rtol, f"{on}: ")
+
+
+def some(*shape, dtype=np.float64, seed=0, low=-3, high=4):
+    """Numbers of any dtype, lanes in front."""
+    rng = np.random.default_rng(seed)
+    if dtype is bool:
+        return jnp.asarray(rng.integers(0, 2, (LANES, *shape)).astype(bool))
+    if np.issubdtype(dtype, np.integer):
+        return jnp.asarray(rng.integers(low, high, (LANES, *shape)).astype(dtype))
+    x = rng.normal(size=(LANES, *shape))
+    if np.issubdtype(dtype, np.complexfloating):
+        x = x + 1j * rng.normal(size=x.shape)
+    return jnp.asarray(x.astype(dtype))
+
+
+NAN, INF = np.nan, np.inf
+ODD = jnp.asarray([[NAN, 1.0, -0.0], [INF, NAN, 0.0], [-INF, -0.0, 2.0]])
+INDEX = np.array([2, 0, 2])
+FAR = np.array([-5, 1, 7])
+
+
+def f64(*shape, seed=0):
+    return some(*shape, seed=seed)
+
+
+ARITHMETIC = {
+    "add, sub, mul, neg, sign": lambda x, y: (x + y, x - y, x * y, -x, jnp.sign(x)),
+    "constants": lambda x, y: (x + 2, 3 - x, x * 2, x * 1, x + 0, 0 * y, 1 * y - 0),
+    "squares": lambda x, y: (lax.square(x), x**2, x**3, x**0),
+    "equality": lambda x, y: (x == y, x != y, x == x),
+    "products": lambda x, y: (jnp.dot(x, y), jnp.outer(x, y), x.sum(), x.prod(), jnp.cumsum(x)),
+    "einsum": lambda x, y: (jnp.einsum("i,j->ij", x, y), jnp.einsum("i,i->", x, y)),
+    "select": lambda x, y: (jnp.where(x == y, x, y), lax.select_n(x[0] == y[0], x, y)),
+    "an integer selects": lambda x, y: lax.select_n(jnp.array([2, 0, 1]), x, y, x + y),
+    "gather": lambda x, y: (x[INDEX], x.at[FAR].get(mode="fill"), x.at[FAR].get(mode="clip")),
+    "gather with a fill": lambda x, y: x.at[FAR].get(mode="fill", fill_value=7),
+    "scatter": lambda x, y: (x.at[INDEX[:2]].set(y[:2]), x.at[FAR].set(y), x.at[0].set(y[1])),
+    "scatter-add": lambda x, y: (
+        x.at[INDEX].add(y), x.at[FAR].add(y), x.at[FAR].add(y, mode="clip"), x.at[1:].add(y[0]),
+    ),
+    "scatter-mul": lambda x, y: (x.at[INDEX].mul(y), x.at[FAR].mul(y)),
+    "pad": lambda x, y: (lax.pad(x, y[0], [(1, 2, 1)]), lax.pad(x, y[1], [(-1, 3, 2)])),
+    "pad and crop": lambda x, y: (lax.pad(x, y[0], [(-2, -1, 3)]), lax.pad(x, y[0], [(2, -4, 1)])),
+    "known slices": lambda x, y: (
+        lax.dynamic_slice(x, (1,), (2,)), lax.dynamic_slice(x, (9,), (2,)),
+        lax.dynamic_slice(x, (-1,), (2,)), lax.dynamic_update_slice(x, y[:2], (9,)),
+    ),
+    "moves": lambda x, y: (
+        jnp.concatenate([x, y]), x[::-1], jnp.stack([x, y], 1).T, jnp.roll(x, 1), jnp.tile(x, 2),
+        jnp.repeat(x, 2), x[:, None] + y[None], lax.rev(x, (0,)), jnp.split(x, [1, 1]),
+    ),
+    "what comes in goes out": lambda x, y: (x, x, y, 2, jnp.arange(3), x[:0], jnp.ones(2, bool)),
+    "zeros of it": lambda x, y: (jnp.zeros_like(x) * y, jnp.zeros_like(x) + y, jnp.ones_like(x) * y),
+}  # fmt: skip
+"""On numbers of every kind."""
+
+ORDERED = {
+    "comparisons": lambda x, y: (x < y, x <= y, x > y, x >= y, jnp.maximum(x, y), jnp.minimum(x, y)),
+    "clamp": lambda x, y: (lax.clamp(y[0], x, y[1] + 5), jnp.clip(x, y, y + 1), jnp.clip(x, -1, 1)),
+    "extrema": lambda x, y: (x.max(), x.min(), lax.cummax(x), lax.cummin(x, reverse=True)),
+    "where they are": lambda x, y: (jnp.argmax(x), jnp.argmin(y), lax.argmax(x, 0, np.int32)),
+    "sort": lambda x, y: (jnp.sort(x), jnp.argsort(-y), lax.sort((x, y), num_keys=1), lax.top_k(x, 2)),
+    "search": lambda x, y: jnp.searchsorted(jnp.sort(x), y),
+    "segments": lambda x, y: jax.ops.segment_sum(x, np.array([1, 0, 1]), num_segments=3),
+    "remainders": lambda x, y: (x % 3, lax.rem(x, jnp.asarray(2, x.dtype)), jnp.floor_divide(x, 2)),
+    "scatter-min, -max": lambda x, y: (x.at[INDEX].min(y), x.at[FAR].max(y)),
+    "to other types": lambda x, y: (
+        x.astype(np.float32), x.astype(np.int32), x.astype(bool), x.astype(np.complex64),
+        x.astype(jnp.bfloat16), x.astype(np.int8).astype(np.int16), x > True,
+    ),
+    "a traced slice": lambda x, y: (
+        lax.dynamic_slice(x, (y[0].astype(int),), (2,)), x[y.astype(int)],
+        lax.dynamic_update_slice(x, y[:2], (y[2].astype(int),)), x.at[y.astype(int)].add(1),
+        x.at[y.astype(int)].get(mode="fill"), lax.dynamic_index_in_dim(x, y[0].astype(int)),
+    ),
+    "an index that does not vary": lambda x, y: x[jnp.argmax(jnp.asarray([1, 3, 2]))] + y,
+    "integer division of what is known": lambda x, y: (
+        x * (jnp.arange(3) // 2).astype(x.dtype) + (jnp.arange(3) % 2).astype(x.dtype)
+    ),
+}  # fmt: skip
+"""On real numbers."""
+
+WHOLE = {
+    "bits": lambda x, y: (
+        x & y, x | y, x ^ y, ~x, x << 2, x >> 1, lax.shift_right_logical(x, jnp.ones_like(x)),
+        lax.population_count(x), lax.clz(x),
+    ),
+    "reduced bits": lambda x, y: (
+        lax.reduce_and(x, (0,)), lax.reduce_or(x, (0,)), lax.reduce_xor(x, (0,)),
+    ),
+    "division": lambda x, y: (lax.div(x, jnp.full_like(x, 2)), x // 2, x % 2, jnp.abs(x), x**2),
+    "mean of integers": lambda x, y: (jnp.mean(x), x / 2, x / y, jnp.sum(x, dtype=np.float32)),
+    "histogram": lambda x, y: jnp.histogram(x, bins=3, range=(0, 3))[0],
+    "bincount": lambda x, y: jnp.bincount(jnp.abs(x), length=4),
+}  # fmt: skip
+"""On integers."""
+
+TRUTH = {
+    "logic": lambda x, y: (x & y, x | y, x ^ y, ~x, jnp.logical_and(x, y[0]), x != y, x == y),
+    "reduced": lambda x, y: (x.any(), x.all(), x.sum(), jnp.cumsum(x), x.mean(), jnp.argmax(x)),
+    "as numbers": lambda x, y: (x * 2, x + 1.5, x.astype(np.float32), -x.astype(int), x * y),
+    "selection": lambda x, y: (jnp.where(x, 1, 0), jnp.where(x, y, x), lax.select(x, y, x), x[::-1]),
+    "scatter": lambda x, y: (x.at[INDEX[:2]].set(y[:2]), x.at[FAR].get(mode="fill"), x[INDEX]),
+    "slices": lambda x, y: (lax.dynamic_update_slice(x, y[:1], (1,)), lax.pad(x, y[0], [(1, 1, 0)])),
+    "products": lambda x, y: (jnp.dot(x, y), jnp.outer(x, y), jnp.nonzero(x, size=3)),
+}  # fmt: skip
+"""On truth values."""
+
+FLOATS = {
+    "trigonometric": lambda x, y: (
+        jnp.sin(x), jnp.cos(x), jnp.tan(x), jnp.arcsin(x / 9), jnp.arccos(x / 9), jnp.arctan(x),
+        jnp.arctan2(x, y),
+    ),
+    "hyperbolic": lambda x, y: (
+        jnp.sinh(x), jnp.cosh(x), jnp.tanh(x), jnp.arcsinh(x), jnp.arccosh(1 + x**2),
+        jnp.arctanh(x / 9),
+    ),
+    "exponential": lambda x, y: (
+        jnp.exp(x), jnp.exp2(x), jnp.expm1(x), jnp.log(x**2), jnp.log1p(x**2), jax.nn.sigmoid(x),
+        jnp.logaddexp(x, y), jax.nn.logsumexp(x), lax.cumlogsumexp(x), jax.nn.softmax(x),
+    ),
+    "powers": lambda x, y: (
+        jnp.abs(x) ** y, x**-2, x**-1, jnp.sqrt(jnp.abs(x)), lax.rsqrt(jnp.abs(x)), jnp.cbrt(x),
+        jnp.abs(x) ** 1.5, 2.0**x, jnp.float_power(jnp.abs(x), 2), lax.pow(x, jnp.array([2, 3, -1])),
+    ),
+    "special": lambda x, y: (
+        lax.erf(x), lax.erfc(x), lax.erf_inv(x / 9), lax.lgamma(x), lax.digamma(x + 5),
+        jnp.i0(x), lax.igamma(1 + x**2, 1 + y**2), jnp.sinc(x),
+    ),
+    "rounding": lambda x, y: (
+        jnp.floor(x), jnp.ceil(x), jnp.round(x), lax.round(2 * x), jnp.trunc(x), jnp.modf(x),
+        lax.reduce_precision(x, 5, 7), lax.nextafter(x, y), jnp.frexp(x), jnp.ldexp(x, 3),
+        jnp.copysign(x, y), jnp.signbit(x), jnp.heaviside(x, y),
+    ),
+    "division": lambda x, y: (x / y, 1 / x, lax.rem(x, y), jnp.mod(x, y), jnp.hypot(x, y), x / 1),
+    "what is finite": lambda x, y: (jnp.isfinite(x), jnp.isnan(x / 0), jnp.nan_to_num(x / 0)),
+    "tables": lambda x, y: (
+        jnp.interp(x, jnp.sort(y), y), jnp.polyval(x, y), jnp.interp(x, np.arange(3.0), y),
+        jnp.interp(x, np.arange(3.0), np.ones(3), left=-1, right=7),
+    ),
+    "linear algebra": lambda x, y: (
+        jnp.linalg.solve(jnp.diag(x) + jnp.outer(y, y), y), jnp.linalg.norm(x), jnp.cross(x, y),
+        jnp.linalg.det(jnp.diag(x) + jnp.outer(y, y)), jnp.linalg.inv(jnp.eye(3) + jnp.outer(x, x)),
+        jnp.linalg.cholesky(jnp.eye(3) + jnp.outer(x, x)), jnp.linalg.slogdet(jnp.outer(x, y) + jnp.eye(3)),
+        jnp.linalg.eigvalsh(jnp.outer(x, x) + jnp.diag(y)), jnp.trace(jnp.outer(x, y)),
+        jax.scipy.linalg.solve_triangular(jnp.triu(jnp.outer(x, y) + 3 * jnp.eye(3)), y),
+    ),
+    "Fourier": lambda x, y: (jnp.fft.fft(x), jnp.fft.irfft(jnp.fft.rfft(x), 3), jnp.convolve(x, y)),
+    "complex": lambda x, y: (
+        lax.complex(x, y), (x + 1j * y) ** 2, jnp.abs(x + 1j * y), jnp.real(jnp.exp(1j * x)),
+        jnp.angle(x + 1j * y), (1j * x).imag, jnp.conj(x + 1j * y),
+    ),
+    "statistics": lambda x, y: (jnp.mean(x), jnp.std(x), jnp.median(x), jnp.var(x), jnp.diff(x)),
+    "bits": lambda x, y: lax.bitcast_convert_type(x, np.int32 if x.dtype == np.float32 else np.int64),
+    "gradient": lambda x, y: jax.grad(lambda x: jnp.sum(jnp.sin(x * y)) / (1 + x @ x))(x),
+    "a Hessian": lambda x, y: jax.hessian(lambda x: jnp.sum(jnp.sin(x * y)) / (1 + x @ x))(x),
+    "a barrier": lambda x, y: lax.optimization_barrier((x, y)),
+    "a barrier for one": lambda x, y: lax.optimization_barrier(x) * y,
+    "stop_gradient": lambda x, y: lax.stop_gradient(x) * y,
+    "custom roots": lambda x, y: lax.custom_root(
+        lambda z: z**3 + z - x[0], x[1], lambda f, z: z - f(z) / 10, lambda g, b: b / g(1.0)
+    ),
+    "custom solves": lambda x, y: lax.custom_linear_solve(
+        lambda z: x**2 * z + z, y, lambda _, b: b / (1 + x**2), symmetric=True
+    ),
+}  # fmt: skip
+"""On floating-point numbers."""
+
+MATRICES = {
+    "products": lambda A, B: (
+        A @ B, jnp.tensordot(A, B, 2), jnp.einsum("ij,kj->ki", A, B), jnp.einsum("ii->i", A),
+        jnp.einsum("ij,ij->i", A, B), jnp.einsum("ij,ji->j", A, B), jnp.kron(A, B),
+        jnp.einsum("ij,jk,kl->il", A, B, A), A @ B[0], A[1] @ B,
+    ),
+    "contractions": lambda A, B: (
+        lax.dot_general(A, B, (((0,), (1,)), ((), ()))), lax.dot_general(A, B, (((), ()), ((0,), (0,)))),
+        lax.dot_general(A, B, (((1,), (1,)), ((0,), (0,)))), lax.dot_general(A, B, (((0,), (1,)), ((1,), (0,)))),
+        lax.dot_general(A, B, (((), ()), ((1, 0), (0, 1)))), lax.dot_general(A, B, (((), ()), ((), ()))),
+        lax.dot_general(A, B, (((0, 1), (1, 0)), ((), ()))),
+    ),
+    "another precision": lambda A, B: (
+        lax.dot_general(A.astype(np.float32), B.astype(np.float32), (((1,), (0,)), ((), ())),
+                        preferred_element_type=np.float64),
+        lax.dot(A.astype(np.int8), B.astype(np.int8), preferred_element_type=np.int32),
+    ),
+    "reductions": lambda A, B: (
+        A.sum((0, 1)), A.sum(1), A.prod(0), A.max(1), A.min(), B.any(0), lax.reduce_sum(A, axes=()),
+        jnp.sum(A, axis=-1, keepdims=True), jnp.argmax(A), jnp.argmin(A, 1), (A > 0).all(1),
+    ),
+    "running": lambda A, B: (
+        jnp.cumsum(A, 0), jnp.cumsum(A, 1), lax.cumprod(A, 1, reverse=True), lax.cummax(A, 0),
+        lax.cumsum(B, 0, reverse=True), lax.cummin(A, 1),
+    ),
+    "places": lambda A, B: (
+        A[0], A[:, 1], A[INDEX], A[INDEX, INDEX[::-1]], A[1:, :2], A.at[1].set(B[0]), A[::-1, ::2],
+        A.at[INDEX[:2], INDEX[1:]].add(B[0, :2]), A.at[:, FAR].add(B), A.at[FAR].get(mode="fill"),
+        A.at[FAR, 0].set(B[:, 0]), A.at[jnp.ix_(INDEX[:2], INDEX[:2])].set(B[:2, 1:]), A[..., None],
+        jnp.take_along_axis(A, INDEX[None], 1), A.ravel()[FAR], jnp.take(A, FAR, axis=1),
+    ),
+    "moves": lambda A, B: (
+        A.T, A.reshape(-1), jnp.swapaxes(A, 0, 1) * 2, jnp.concatenate([A, B], 1), jnp.rot90(A),
+        jnp.stack([A, B], 2), lax.pad(A, B[0, 0], [(1, -1, 1), (-1, 2, 0)]), jnp.flip(A),
+        jnp.triu(A), jnp.diag(A), jnp.diag(A[0]), jnp.vstack([A, B]), jnp.broadcast_to(A, (2, 3, 3)),
+        jnp.squeeze(A[:1]), lax.broadcast_in_dim(A, (3, 2, 3), (2, 0)), jnp.split(A, 3, 1),
+        jnp.array_split(A, 2), lax.transpose(A[None], (2, 0, 1)), jnp.moveaxis(A, 0, 1), A[[1], :],
+    ),
+    "a traced place": lambda A, B: (
+        A[jnp.argmax(B[0])], A[jnp.argmax(B, 0), INDEX], lax.dynamic_slice(A, (jnp.argmax(B), 1), (2, 2)),
+        lax.dynamic_update_slice(A, B[:1], (jnp.argmin(B[1]), -1)), A.at[:, jnp.argmax(B[0])].add(1.0),
+        A.at[jnp.argmax(B, 1)].set(B[1, 1]), A.at[jnp.argmax(B, 1)].max(B),
+    ),
+    "three axes": lambda A, B: (
+        (A[:, None] * B[None]).sum((0, 2)), (A[:, None] * B[None]).max((2, 0)),
+        jnp.cumsum(A[:, None] * B[None], 1), jnp.einsum("ijk,kl->lij", A[:, None] * B[None], A),
+        jnp.transpose(A[:, None] * B[None], (2, 0, 1)),
+    ),
+    "decompositions": lambda A, B: (
+        jnp.linalg.inv(A + 3 * jnp.eye(3)), jnp.linalg.solve(A + 3 * jnp.eye(3), B),
+        jnp.linalg.eigh(A + A.T)[0], jnp.linalg.det(A), jnp.linalg.qr(A)[1], jnp.linalg.svd(A)[1],
+        jax.scipy.linalg.expm(A), jnp.linalg.cholesky(A @ A.T + jnp.eye(3)), jnp.linalg.pinv(A),
+    ),
+    "windows": lambda A, B: (
+        lax.reduce_window(A, 0.0, lax.add, (2, 2), (1, 1), "VALID"), jnp.convolve(A[0], B[0], "same"),
+        lax.conv_general_dilated(A[None, None], B[None, None], (1, 1), "SAME"),
+        lax.associative_scan(jnp.multiply, A), lax.reduce(A, 0.0, lax.add, (1,)),
+    ),
+}  # fmt: skip
+"""On two matrices."""
+
+
+def kinds(cases, *dtypes):
+    return [(cases, dtype) for dtype in dtypes]
+
+
+TABLES = {
+    "arithmetic": kinds(ARITHMETIC, np.float64, np.float32, np.int32, np.complex128),
+    "ordered": kinds(ORDERED, np.float64, np.float32, np.int32),
+    "whole": kinds(WHOLE, np.int32, np.uint8),
+    "truth": kinds(TRUTH, bool),
+    "floats": kinds(FLOATS, np.float64, np.float32),
+}
+
+
+def tolerance(dtype):
+    return 3e-5 if dtype in (np.float32, np.complex64) else 1e-12
