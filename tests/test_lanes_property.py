@@ -312,3 +312,148 @@ TABLES = {
 
 def tolerance(dtype):
     return 3e-5 if dtype in (np.float32, np.complex64) else 1e-12
+
+CONTROL = {
+    "scan": lambda x, y: (
+        lax.scan(lambda c, z: (c * y + z, c[0]), x, y, reverse=True),
+        lax.scan(lambda c, z: (c + z, (c, z)), x, (jnp.arange(6.0)), unroll=4),
+        lax.scan(lambda c, _: (c * y, None), x, None, 2), lax.scan(lambda c, _: (c, c[1]), x, None, 0),
+        lax.scan(lambda c, z: (c, z * 2), None, x), lax.scan(lambda c, z: (c, z[0]), 1, y[:, None]),
+        lax.scan(lambda c, z: (c, c * z), x, jnp.ones((1, 3))),
+    ),
+    "a scan of counters": lambda x, y: lax.scan(
+        lambda c, z: ((c[0] + 1, c[1] + (z > 0), {"v": c[2]["v"] + z * c[0]}), c[0]),
+        (0, jnp.zeros(3, int), {"v": x}), jnp.stack([y, x]),
+    ),
+    "a carry that comes to vary": lambda x, y: lax.scan(
+        lambda c, z: ((c[1], c[2], c[0] + z), c[0]), (0.0, 1.0, 2.0), x
+    ),
+    "a large carry": lambda x, y: lax.scan(
+        lambda c, z: (c.at[0].add(z) + jnp.cumsum(c)[::-1] / 200, c.sum()), jnp.arange(200.0), x
+    ),
+    "large constants": lambda x, y: lax.scan(
+        lambda c, z: (c + jnp.sum(jnp.arange(200.0) * z), z), 0.0, x
+    ),
+    "large and small": lambda x, y: (
+        jnp.sum(jnp.ones((5000,)) * x[0]) + y, jnp.outer(jnp.arange(50.0), x).T @ jnp.ones(50),
+        (jnp.arange(4200.0) * x[1])[INDEX * 2000], jnp.concatenate([x, jnp.ones(129)])[2:5],
+    ),
+    "known arrays as carry and constant": lambda x, y: known_twice(x),
+    "while": lambda x, y: (
+        lax.while_loop(lambda c: c[0] < 40, lambda c: (c[0] * 2 + 1, c[1] + x), (y[0] ** 2, y)),
+        lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] + x), (0, y)),
+        lax.while_loop(lambda c: (c[0] < 3) & (y[0] > 0), lambda c: (c[0] + 1, c[1] + 1), (0, 2)),
+        lax.while_loop(lambda c: jnp.any(c < 0), lambda c: c + 1, x)[::-1],
+    ),
+    "counted loops": lambda x, y: (
+        lax.fori_loop(0, (jnp.abs(x[0]) * 3).astype(int), lambda i, c: c + i * y, x),
+        lax.fori_loop((y[1]).astype(int), 4, lambda i, c: c * 0.5 + i, x),
+        lax.fori_loop(2, 0, lambda i, c: c * 0.5 + i, x),
+        jax.jvp(lambda x: lax.fori_loop(0, 3, lambda i, c: jnp.sin(c) * x[i], x), (x,), (y,)),
+    ),
+    "whiles under vmap": lambda x, y: jax.vmap(
+        lambda a: lax.while_loop(lambda c: c[0] < 4, lambda c: (c[0] + a**2 + 0.3, c[1] * a + y), (a, y))
+    )(x),
+    "whiles under two": lambda x, y: jax.vmap(
+        lambda a: jax.vmap(
+            lambda b: lax.while_loop(
+                lambda c: c[0] < 4, lambda c: (c[0] + b**2 + 0.3, c[1] + a, c[2] + x), (a * b, b, y)
+            )
+        )(jnp.array([0.5, 2.0, 1.0, -1.0]))
+    )(x),
+    "a loop without lanes under one with": lambda x, y: jax.vmap(
+        lambda b: lax.while_loop(lambda c: c[0] < b, lambda c: (c[0] + 1, c[1] * 0.5 + x), (0, y))
+    )(jnp.array([3, 0, 1, 7])),
+    "a loop in a loop": lambda x, y: lax.while_loop(
+        lambda c: c[0] < 5,
+        lambda c: (c[0] + 1 + y[0] ** 2, lax.while_loop(lambda d: jnp.sum(d) < c[0], lambda d: d + 1 + y**2, c[1])),
+        (x[0], x),
+    ),
+    "branches": lambda x, y: (
+        lax.cond(x[0] > 0, lambda a: (a, 1), lambda a: (a * y, 2), x),
+        lax.cond(x[0] > 0, lambda: 1.0, lambda: x[1]), lax.cond(True, lambda: x, lambda: y),
+        lax.switch((3 * y[0]).astype(int), [lambda a: a, lambda a: -a, lambda a: a * y], x),
+        lax.switch(jnp.asarray(7), [lambda a: a, lambda a: -a], x),
+        lax.cond(jnp.sum(jnp.arange(3)) > 2, lambda: x, lambda: y),
+    ),
+    "branches of large arrays": lambda x, y: lax.cond(
+        x[0] > 0, lambda: jnp.arange(300.0) * x[1], lambda: jnp.ones(300)
+    ),
+    "a switch of large arrays": lambda x, y: lax.switch(
+        (y[0] + 1).astype(int),
+        [lambda: jnp.arange(300.0) * x[1], lambda: jnp.ones(300), lambda: jnp.zeros(300)],
+    ),
+    "branches under vmap": lambda x, y: jax.vmap(
+        lambda a: lax.cond(a > 0, lambda: a * y, lambda: y[::-1])
+    )(x),
+    "branches in a scan": lambda x, y: lax.scan(
+        lambda c, k: (lax.switch(k, [lambda: c + x, lambda: c * 2, lambda: y]), c), x, jnp.array([1, 0, 2])
+    ),
+    "a loop in a branch": lambda x, y: lax.cond(
+        x[0] > 0, lambda: lax.while_loop(lambda c: c[0] < 3, lambda c: c + 1 + x**2, y), lambda: x
+    ),
+    "branches in a loop": lambda x, y: lax.while_loop(
+        lambda c: c[0] < 6, lambda c: lax.cond(c[1] > 0, lambda: c + 1, lambda: c + 2 + x**2), y
+    ),
+    "map": lambda x, y: (
+        lax.map(lambda z: z * y, x), lax.map(lambda z: z[0] + y[z[1]], (x, jnp.arange(3))),
+        jax.vmap(jnp.dot, (None, 0))(x, jnp.outer(x, y)), lax.map(jnp.sin, x, batch_size=2),
+        jax.vmap(lambda a, b: a * b, (0, None), 1)(x, y), jax.vmap(lambda a: a, -1)(jnp.outer(x, y)),
+        jax.vmap(jax.vmap(lambda a, b: a - b, (None, 0)), (0, None))(x, y),
+    ),
+    "rules of one's own": lambda x, y: (
+        jax.nn.relu(x), jax.nn.gelu(x), jax.grad(lambda x: jnp.sum(jax.nn.silu(x) * y))(x),
+        half(x), jax.grad(lambda x: jnp.sum(half(x) * y))(x), jax.jvp(third, (x,), (y,)),
+    ),
+    "checkpoint and jit": lambda x, y: (
+        jax.checkpoint(lambda x: jnp.sin(x) * y)(x), jax.jit(lambda x: (x, x[0]))(x),
+        jax.grad(jax.checkpoint(lambda x: jnp.sum(jnp.sin(jnp.sin(x) * y))))(x),
+    ),
+    "gradients of loops": lambda x, y: (
+        jax.grad(lambda x: lax.scan(lambda c, z: (jnp.sin(c) * z, c), y, x)[0].sum())(x),
+        jax.grad(lambda x: jnp.sum(lax.scan(lambda c, z: (c * y, c[0] * z), x, x)[1]))(x),
+        jax.hessian(lambda x: lax.fori_loop(0, 3, lambda i, c: jnp.sin(c * x[i]), y).sum())(x),
+        jax.jacfwd(lambda x: lax.while_loop(lambda c: c[0] < 9, lambda c: c * 1.5 + 1 + x**2, y))(x),
+        jax.grad(lambda x: lax.cond(x[0] > 0, lambda: x @ y, lambda: jnp.sum(x**3)))(x),
+    ),
+    "random numbers": lambda x, y: (
+        jax.random.normal(jax.random.key(3), (3,)) * x, jax.random.uniform(jax.random.PRNGKey(1)) + y,
+    ),
+    "random numbers of a lane": lambda x, y: jax.random.uniform(
+        jax.random.fold_in(jax.random.key(1), (100 * x[0]).astype(np.int32)), (3,)
+    ),
+    "callbacks": lambda x, y: jax.pure_callback(
+        lambda x: np.asarray(x) * 2, jax.ShapeDtypeStruct((3,), x.dtype), x, vmap_method="sequential"
+    ),
+}  # fmt: skip
+"""Loops, branches and calls, on two vectors."""
+
+
+def known_twice(x):
+    """A loop that starts from a known array and closes over it as well."""
+    table = np.arange(12.0).reshape(3, 4)
+
+    def loop(a):
+        return lax.while_loop(
+            lambda c: (c[0].sum() + table[1, 1] < 60) & (c[1] < 5 + a),
+            lambda c: (c[0] + table * a, c[1] + 1.0, c[2] + x),
+            (table, 0.0, x),
+        )
+
+    return loop(x[0]), jax.vmap(loop)(x)
+
+
+@jax.custom_vjp
+def half(x):
+    return x / 2
+
+
+half.defvjp(lambda x: (x / 2, x), lambda x, c: (7 * c * x,))
+
+
+@jax.custom_jvp
+def third(x):
+    return x / 3
+
+
+third.defjvp(lambda x, t: (third(*x), 5 * t[0] * x[0]))

@@ -400,7 +400,7 @@ class Evaluator:
 
     def select(self, which: jax.Array, cases: Sequence[jax.Array]) -> jax.Array:
         """On each lane the case of that number (int32)."""
-        return lax.select_n(which, *cases)
+        return lax.select_n(jnp.broadcast_to(which, cases[0].shape), *cases)
 
     def has_lanes(self, value: Value) -> bool:
         if self.lanes is None:
