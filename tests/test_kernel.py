@@ -18,6 +18,7 @@ from dvi_jax import certify, systems
 from dvi_jax._compat import lowered_for_cuda
 from dvi_jax.engine.kernel import LOWERED, NotInKernelError, run_in_kernel
 from dvi_jax.engine.linear import solve_dense
+from dvi_jax.engine.tiles import lanewise
 from dvi_jax.engine.together import on_any_lane
 
 LANES, BLOCK = 11, 4
