@@ -227,7 +227,7 @@ FLOATS = {
     "a barrier for one": lambda x, y: lax.optimization_barrier(x) * y,
     "stop_gradient": lambda x, y: lax.stop_gradient(x) * y,
     "custom roots": lambda x, y: lax.custom_root(
-        lambda z: z**3 + z - x[0], x[1], lambda f, z: z - f(z) / 10, lambda g, b: b / g(1.0)
+        lambda z: z**3 + z - x[0], x[1], lambda f, z: z - f(z) / 10, lambda g, b: b / g(jnp.ones_like(b))
     ),
     "custom solves": lambda x, y: lax.custom_linear_solve(
         lambda z: x**2 * z + z, y, lambda _, b: b / (1 + x**2), symmetric=True
@@ -419,8 +419,8 @@ CONTROL = {
     "random numbers": lambda x, y: (
         jax.random.normal(jax.random.key(3), (3,)) * x, jax.random.uniform(jax.random.PRNGKey(1)) + y,
     ),
-    "random numbers of a lane": lambda x, y: jax.random.uniform(
-        jax.random.fold_in(jax.random.key(1), (100 * x[0]).astype(np.int32)), (3,)
+    "random numbers of a lane": lambda x, y: random_walk(
+        jax.random.fold_in(jax.random.key(1), (100 * x[0]).astype(np.int32)), x
     ),
     "callbacks": lambda x, y: jax.pure_callback(
         lambda x: np.asarray(x) * 2, jax.ShapeDtypeStruct((3,), x.dtype), x, vmap_method="sequential"
@@ -441,6 +441,20 @@ def known_twice(x):
         )
 
     return loop(x[0]), jax.vmap(loop)(x)
+
+
+def random_walk(key, x):
+    keys = jax.random.split(key, 3)
+    x = x + jax.vmap(jax.random.normal)(keys) + jax.random.uniform(keys[1])
+    key = lax.cond(x[0] > 0, lambda: keys[2], lambda: keys[0])
+
+    def step(state):
+        key, x = state
+        key, now = jax.random.split(key)
+        return key, x + jax.random.uniform(now)
+
+    key, x = lax.while_loop(lambda s: jnp.sum(s[1]) < 9, step, (key, x))
+    return lax.scan(lambda c, k: (c + jax.random.normal(k), jax.random.key_data(k)), x, keys)
 
 
 @jax.custom_vjp

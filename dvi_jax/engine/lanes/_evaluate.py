@@ -32,7 +32,19 @@ from ._rules import (
     fold,
     is_zero,
 )
-from ._value import ONE, ZERO, Entry, Value, as_array, is_array, number, on_lanes, split, whole
+from ._value import (
+    ONE,
+    ZERO,
+    Entry,
+    Value,
+    as_array,
+    is_array,
+    is_opaque,
+    number,
+    on_lanes,
+    split,
+    whole,
+)
 
 IN_ARRAYS = "_in_arrays"
 
@@ -130,6 +142,8 @@ class Evaluator:
         if name in _CALLS:
             (body,) = bodies(eqn)
             return self.closed(body, values)
+        if any(is_opaque(x.dtype) for x in (*values, *(v.aval for v in eqn.outvars))):
+            return self._batched(eqn, values)
         numbers = [v.known() for v in values]
         is_small = all(v.aval.size <= MADE_UP_TO for v in eqn.outvars)
         known = [n for n in numbers if n is not None]

@@ -47,7 +47,8 @@ class Value:
         lead: Sequence[int] = (),
         is_bulk: bool = False,
     ):
-        self.shape, self.dtype = tuple(shape), np.dtype(dtype)
+        self.shape = tuple(shape)
+        self.dtype = dtype if is_opaque(dtype) else np.dtype(dtype)
         self.lead = tuple(lead)
         self.is_bulk = is_bulk or bool(self.lead)
         self.is_tangent = False
@@ -68,6 +69,8 @@ class Value:
 
     def known(self) -> np.ndarray | None:
         """The numbers, if all of them are known while tracing."""
+        if is_opaque(self.dtype):
+            return None
         if self._array is not None:
             is_known = isinstance(self._array, np.ndarray | np.generic) or (
                 not self._has_lanes and not is_traced(self._array) and self.size <= 4096
@@ -137,6 +140,11 @@ class Value:
         joined = jnp.stack(parts, axis=depth) if self._entries.ndim else parts[0]
         lanes_shape = joined.shape[-1:] if has_lanes else ()
         return joined.reshape(self.shape + lanes_shape), has_lanes
+
+
+def is_opaque(dtype: Any) -> bool:
+    """Whether it is a type that NumPy does not have, and no number: keys of random numbers."""
+    return jax.dtypes.issubdtype(dtype, jax.dtypes.extended)
 
 
 def is_array(entry: Entry) -> bool:
