@@ -169,19 +169,26 @@ def apply(operation: Callable, entries: list[Entry], dtypes: list[Any]) -> Entry
 
 def fold(primitive: Any, arrays: list[np.ndarray], params: dict) -> list[np.ndarray]:
     """The outputs of a primitive whose inputs are known, computed while tracing."""
-    if primitive.name in _IN_NUMPY and len({a.shape for a in arrays}) == 1:
-        return [np.asarray(_IN_NUMPY[primitive.name](*arrays))]
+    is_same = len({a.shape for a in arrays}) == 1
+    is_quotient = primitive.name == "div"  # NumPy's integers divide otherwise
+    if primitive.name in _IN_NUMPY and is_same and (not is_quotient or _is_real(arrays[0])):
+        with np.errstate(all="ignore"):
+            return [np.asarray(_IN_NUMPY[primitive.name](*arrays))]
     with jax.ensure_compile_time_eval():
         out = primitive.bind(*map(jnp.asarray, arrays), **params)
     outs = out if primitive.multiple_results else [out]
     return [np.asarray(x) for x in outs]
 
 
+def _is_real(x: np.ndarray) -> bool:
+    return np.issubdtype(x.dtype, np.floating)
+
+
 _IN_NUMPY: dict[str, Callable] = {
     "add": np.add,
     "sub": np.subtract,
     "mul": np.multiply,
-    "div": lambda a, b: a / b if np.issubdtype(a.dtype, np.floating) else lax.div(a, b),
+    "div": np.divide,
     "neg": np.negative,
     "lt": np.less,
     "le": np.less_equal,
