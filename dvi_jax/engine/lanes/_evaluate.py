@@ -531,13 +531,14 @@ class Evaluator:
             )
 
         # Each lane, and under a `vmap` further in each place on it, stops by itself.
+        wholes = [stays_whole(v) for v in carry]  # as packed: a value that is used is taken apart
         first = goes_on(state)
         keep, restore = self.packer([first], [answer], [per_lane])
 
         def masked(state):
             active, before = state
-            masks = self._masks(restore(active)[0], carry, on)
-            after = tuple(map(jnp.where, masks, step(before), before))
+            masks = self._masks(restore(active)[0], carry, wholes, on)
+            after = tuple(jnp.where(*x) for x in zip(masks, step(before), before, strict=True))
             return tuple(keep([goes_on(after)])), after
 
         def any_active(state):
@@ -546,13 +547,15 @@ class Evaluator:
         _, end = lax.while_loop(any_active, masked, (tuple(keep([first])), state))
         return unpack(list(end))
 
-    def _masks(self, active: Value, carry: Sequence[Value], on: Sequence[bool]) -> list[Any]:
+    def _masks(
+        self, active: Value, carry: Sequence[Value], wholes: Sequence[bool], on: Sequence[bool]
+    ) -> list[Any]:
         """For each array that a carry is packed in, what `active` says of it: its shape is that of
         the leading axes of all values."""
         masks = []
-        for value, has_lanes in zip(carry, on, strict=True):
+        for value, as_whole, has_lanes in zip(carry, wholes, on, strict=True):
             rest = value.shape[len(active.shape) :]
-            if stays_whole(value):
+            if as_whole:
                 array, per_lane = active.array()
                 lanes = array.shape[-1:] if per_lane else (1,) * (has_lanes and bool(self.lanes))
                 masks.append(array.reshape(active.shape + (1,) * len(rest) + lanes))
