@@ -1,7 +1,5 @@
 """Component form against arrays: every primitive, its variants, and functions made by chance."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +7,9 @@ import pytest
 from jax import lax
 
 from dvi_jax.engine.lanes import evaluate
+
+OPTIONS = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+"""Much is compiled here, and hardly anything is run."""
 
 LANES = 3
 """As many as the arrays have rows, so that an axis taken for another is no error of shapes."""
@@ -36,7 +37,7 @@ def by_components(function, args, on):
             outs.append(jnp.moveaxis(array, -1, 0) if lanes else array)
         return jax.tree.unflatten(tree, outs)
 
-    return jax.jit(run)(*args)
+    return jax.jit(run, compiler_options=OPTIONS)(*args)
 
 
 def assert_same(found, expected, rtol, what=""):
@@ -62,10 +63,10 @@ def check(function, *args, rtol=1e-12, patterns=None):
         mine = [a if on is None or o else a[1] for a, o in zip(args, on or args, strict=True)]
         if on is None:
             mine = [a[1] for a in args]
-            expected = jax.jit(function)(*mine)
+            expected = jax.jit(function, compiler_options=OPTIONS)(*mine)
         else:
             axes = [0 if o else None for o in on]
-            expected = jax.jit(jax.vmap(function, axes))(*mine)
+            expected = jax.jit(jax.vmap(function, axes), compiler_options=OPTIONS)(*mine)
         assert_same(by_components(function, mine, on), expected, rtol, f"{on}: ")
 
 
@@ -297,6 +298,54 @@ MATRICES = {
 """On two matrices."""
 
 
+KNOWN = {
+    "quotients": lambda x, y: (
+        x * lax.div(of(4, 5, -7), of(2, 2, 2)), x * lax.rem(of(4, 5, -7), of(2, 2, 2)),
+        x * lax.div(of(4, 5, -7) + 0j, of(2, 2, 2) + 0j), x * lax.div(of(1.0, 0.0), of(0.0, 0.0))[0],
+    ),
+    "others": lambda x, y: (
+        x * lax.shift_left(of(4, 5, -7), of(2, 2, 2)), x * lax.integer_pow(of(2.0, 5, -7), -2),
+        x * lax.max(of(1.0, NAN, 2), of(0.0, 1, 3)), x * jnp.logical_not(of(True, False, True)),
+        x * jnp.argmax(of(1, 5, 2)), x * jnp.sort(of(3, 1, 2)), x * (of(1, 2, 3) == of(1, 0, 3)),
+    ),
+    "broadcast in another order": lambda x, y: lax.broadcast_in_dim(
+        jnp.outer(x, of(1.0, 2, 3)), (3, 2, 3), (2, 0)
+    ),
+}  # fmt: skip
+"""With numbers that are known while tracing."""
+
+
+def of(*numbers):
+    return np.array(numbers)
+
+
+STRANGE = {
+    "arithmetic": lambda x, y: (
+        x + y, x - y, x * y, x / y, 0 * x, x * 0.0, x - x, -x, x**2, x**0, x**y, x @ y, x % y,
+        jnp.hypot(x, y), jnp.linalg.norm(x), jnp.sum(x), jnp.prod(x), jnp.cumsum(x), jnp.nansum(x),
+    ),
+    "order": lambda x, y: (
+        jnp.maximum(x, y), jnp.minimum(x, y), x.max(), x.min(), jnp.argmax(x), jnp.argmin(x), x == y,
+        jnp.sort(x), lax.cummax(x), lax.cummin(x), x < y, jnp.clip(x, -1, 1), jnp.clip(y, x, 2),
+        jnp.nanmax(x), lax.top_k(x, 2), x.at[np.array([0, 0])].max(y[:2]), jnp.searchsorted(x, y),
+    ),
+    "selection": lambda x, y: (
+        jnp.where(x > y, x, y), jnp.isnan(x), jnp.isfinite(x), jnp.any(x > y), jnp.nan_to_num(x),
+        lax.cond(x[0] > 0, lambda: x, lambda: y), x.astype(int), x.astype(bool), jnp.sign(x),
+    ),
+    "functions": lambda x, y: (
+        jnp.sqrt(x), jnp.sin(x), jnp.exp(x), jnp.log(x), jnp.arctan2(x, y), jnp.floor(x),
+        jnp.arctan2(x, -jnp.abs(y)), jnp.round(x), jnp.abs(x), jnp.signbit(x), jnp.nextafter(x, y),
+        jnp.arctan2(-x, -jnp.ones(3)), jnp.tanh(x), jnp.arctan(x), jnp.copysign(1.0, x),
+    ),
+    "gradients": lambda x, y: (
+        jax.grad(lambda x: jnp.sum(jnp.where(x > 0, jnp.sqrt(x), y * x)))(x),
+        jax.grad(lambda x: jnp.max(x) + jnp.linalg.norm(y * x))(x),
+    ),
+}  # fmt: skip
+"""With NaN, infinities and both zeros."""
+
+
 def kinds(cases, *dtypes):
     return [(cases, dtype) for dtype in dtypes]
 
@@ -312,6 +361,7 @@ TABLES = {
 
 def tolerance(dtype):
     return 3e-5 if dtype in (np.float32, np.complex64) else 1e-12
+
 
 CONTROL = {
     "scan": lambda x, y: (
@@ -471,3 +521,42 @@ def third(x):
 
 
 third.defjvp(lambda x, t: (third(*x), 5 * t[0] * x[0]))
+
+
+GROUP = 6
+"""Cases that are compiled together."""
+
+
+def groups() -> list:
+    """(name, cases, two arguments, tolerance) for some cases of a table and one dtype at a time."""
+    made = []
+    for name, table in TABLES.items():
+        for cases, dtype in table:
+            low = 0 if np.dtype(dtype).kind == "u" else -3
+            pair = [some(3, dtype=dtype, seed=i, low=low) for i in range(2)]
+            made += in_groups(f"{name}-{np.dtype(dtype).name}", cases, pair, tolerance(dtype))
+    vectors = [f64(3), f64(3, seed=1)]
+    return [
+        *made,
+        *in_groups("matrices", MATRICES, [f64(3, 3), f64(3, 3, seed=1)]),
+        *in_groups("control", CONTROL, vectors),
+        *in_groups("known", KNOWN, vectors),
+        *in_groups("strange", STRANGE, [ODD, ODD[::-1]]),
+    ]
+
+
+def in_groups(name, cases, pair, rtol=1e-12):
+    names = list(cases)
+    for i in range(0, len(names), GROUP):
+        chosen = {n: cases[n] for n in names[i : i + GROUP]}
+        marks = [] if (name, i // GROUP) in QUICK else SLOW
+        yield pytest.param(chosen, pair, rtol, marks=marks, id=f"{name}-{i // GROUP}")
+
+
+SLOW = pytest.mark.slow
+QUICK = (("known", 0), ("arithmetic-float32", 2), ("control", 0))
+
+
+@pytest.mark.parametrize(("cases", "pair", "rtol"), groups())
+def test_primitives(cases, pair, rtol):
+    check(lambda x, y: {name: f(x, y) for name, f in cases.items()}, *pair, rtol=rtol)
