@@ -186,20 +186,22 @@ class Reversible(AbstractAdjoint):
             return Checkpointed().rollout(task, plan, q0, p0, layout)
         if _closes_over_traced(task, q0, p0):
             return Checkpointed().rollout(task, plan, q0, p0, layout)
-        theta, fixed = eqx.partition(task, eqx.is_inexact_array)
+        theta, others = eqx.partition(task, eqx.is_inexact_array)
+        # Whole numbers and truth values may be traced as well: inputs without a derivative.
+        whole, fixed = eqx.partition(others, eqx.is_array)
         size, steps = 2 * q0.size, plan.num_steps
 
         @jax.jit  # so that its uses below share one trace, and one trace of its derivative
-        def forward(inputs):
+        def forward(inputs, whole):
             theta, q0, p0 = inputs
-            task = eqx.combine(theta, fixed)
+            task = eqx.combine(theta, whole, fixed)
             return finish(
                 task, run(task, plan, start(task, q0, p0), counted_scan, self._inner_loop)
             )
 
-        def on_trust(inputs):
+        def on_trust(inputs, whole):
             theta, q0, p0 = inputs
-            task = eqx.combine(theta, fixed)
+            task = eqx.combine(theta, whole, fixed)
             begin = start(task, q0, p0)
             every, one_row = self.checkpoint_every, layout.in_kernel
             return finish(task, run_in_segments(task, plan, begin, every, one_row))
@@ -213,26 +215,28 @@ class Reversible(AbstractAdjoint):
         fast = on_trust if can_trust(task) else forward
 
         @jax.custom_jvp
-        def trajectory(inputs):
-            return lanewise(fast, inputs, layout=layout, steps=steps, entries=size, plain=forward)
+        def trajectory(inputs, whole):
+            return lanewise(
+                fast, inputs, whole, layout=layout, steps=steps, entries=size, plain=forward
+            )
 
         @trajectory.defjvp
         def _(primals, tangents):
             # The tangent is L·dx with L the derivative. Written as the solution (u, v) of the
             # linear system u = dx, v − L u = 0, it may be given a transpose of its own: forward
             # mode runs L along the scan, reverse mode runs Lᵀ on rebuilt states.
-            (inputs,), (change,) = primals, tangents
-            smooth, trace = trajectory(inputs)
+            (inputs, whole), (change, _) = primals, tangents
+            smooth, trace = trajectory(inputs, whole)
 
-            def derivative(inputs, u):
-                return jax.jvp(lambda x: forward(x)[0], (inputs,), (u,))[1]
+            def derivative(inputs, whole, u):
+                return jax.jvp(lambda x: forward(x, whole)[0], (inputs,), (u,))[1]
 
-            def quick(inputs, u):
-                return jax.jvp(lambda x: fast(x)[0], (inputs,), (u,))[1]
+            def quick(inputs, whole, u):
+                return jax.jvp(lambda x: fast(x, whole)[0], (inputs,), (u,))[1]
 
             def push(u):
                 return lanewise(
-                    quick, inputs, u,
+                    quick, inputs, whole, u,
                     layout=layout, steps=steps, entries=2 * size, plain=derivative,
                 )  # fmt: skip
 
@@ -245,7 +249,7 @@ class Reversible(AbstractAdjoint):
 
             def matvec(x):
                 u, v = unravel(x)
-                return flat(u, jax.tree.map(jnp.subtract, v, derivative(inputs, u)))
+                return flat(u, jax.tree.map(jnp.subtract, v, derivative(inputs, whole, u)))
 
             def solve(_, b):
                 u, v = unravel(b)
@@ -254,8 +258,10 @@ class Reversible(AbstractAdjoint):
             def transpose_solve(_, b):
                 u, v = unravel(b)
                 back = lanewise(
-                    lambda *x: _pull_back(self, fixed, plan, not layout.in_kernel, *x),
-                    inputs, trace, v, layout=layout, steps=steps, entries=2 * size,
+                    lambda whole, *x: _pull_back(
+                        self, eqx.combine(whole, fixed), plan, not layout.in_kernel, *x
+                    ),
+                    whole, inputs, trace, v, layout=layout, steps=steps, entries=2 * size,
                 )  # fmt: skip
                 return flat(jax.tree.map(jnp.add, u, back), v)
 
@@ -263,7 +269,7 @@ class Reversible(AbstractAdjoint):
             _, moved = unravel(solver(matvec, rhs, solve, transpose_solve))
             return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
 
-        smooth, (carry, _, _, counts) = trajectory((theta, q0, p0))
+        smooth, (carry, _, _, counts) = trajectory((theta, q0, p0), whole)
         saved = eqx.combine(smooth.saved, counts)
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), saved, smooth.reduced)
 
