@@ -48,22 +48,25 @@ def by_elimination(A: Inexact[Array, "n n"], b: Inexact[Array, " n"]) -> Inexact
     return jnp.stack(x)
 
 
-def solve_near_identity(A: Inexact[Array, "n n"], b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+def solve_near_identity(
+    A: Inexact[Array, "n n"], b: Inexact[Array, " n"], checked: bool = False
+) -> Inexact[Array, " n"]:
     """Solution of A x = b where A needs no pivoting: close to the identity, or trusted to be.
 
     In component form it is an elimination without exchanges that leaves out what is zero by the
     structure of A (a band stays a band); elsewhere `solve_dense`. Whoever trusts must look at the
-    result. Linear in b and differentiable in both.
+    result, or have it `checked`: rows are then exchanged where the remainder A x − b asks for it.
+    Linear in b and differentiable in both.
     """
     return lax.custom_linear_solve(
         lambda x: A @ x,
         b,
-        lambda _, b: _eliminate.bind(A, b),
-        lambda _, b: _eliminate.bind(A.T, b),
+        lambda _, b: _eliminate.bind(A, b, checked=checked),
+        lambda _, b: _eliminate.bind(A.T, b, checked=checked),
     )
 
 
-_eliminate = primitive("eliminate", solve_dense)
+_eliminate = primitive("eliminate", lambda A, b, *, checked: solve_dense(A, b))
 
 
 def unit_vectors(n: int, dtype) -> Inexact[Array, "n n"]:

@@ -171,7 +171,7 @@ def _trusted_root(function, guess: Vector, known: Vector, options: Trusted):
 def _tangent_solve(linear: Callable[[Vector], Vector], rhs: Vector) -> Vector:
     """By the Jacobian at a root that was found without pivoting, or with it."""
     _, matrix = _value_and_jacobian(linear, jnp.zeros_like(rhs))
-    return solve_near_identity(matrix, rhs)
+    return solve_near_identity(matrix, rhs, checked=True)  # nobody looks at a gradient
 
 
 def _value_and_jacobian(F: Callable[[Vector], Vector], x: Vector) -> tuple[Vector, Array]:

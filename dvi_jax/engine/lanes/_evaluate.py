@@ -644,7 +644,37 @@ def _eliminate(evaluator: Evaluator, eqn: Any, values: list[Value]) -> list[Valu
         for j in range(i + 1, n):
             total = subtract(total, multiply(rows[i][j], x[j]))
         x[i] = multiply(total, rows[i][i])
-    return [split(x, (n,), dtype)]
+    solution = split(x, (n,), dtype)
+    return [_mended(evaluator, eqn, values, solution) if eqn.params["checked"] else solution]
+
+
+def _mended(evaluator: Evaluator, eqn: Any, values: list[Value], solution: Value) -> Value:
+    """The solution, with exchanges of rows on lanes where it lost digits without them."""
+    matrix, vector = values
+    dtype = matrix.dtype
+    multiply, subtract = (evaluator._pairwise(f, dtype) for f in (lax.mul, lax.sub))
+    remainder = list(vector.entries())
+    for i, row in enumerate(matrix.entries()):
+        for a, x in zip(row, solution.entries(), strict=True):
+            remainder[i] = subtract(remainder[i], multiply(a, x))
+
+    def size(entries):
+        sizes = [jnp.abs(as_array(e, dtype)) for e in entries if e is not ZERO]
+        return functools.reduce(jnp.maximum, sizes, jnp.zeros((), dtype))
+
+    bound = 256 * jnp.finfo(dtype).eps * size(matrix.entries().flat) * size(solution.entries())
+    is_given = jnp.isfinite(size(matrix.entries().flat)) & jnp.isfinite(size(vector.entries()))
+    lost = is_given & ~(size(remainder) <= bound)
+    on = any(map(evaluator.has_lanes, (*values, solution)))
+    found = evaluator.pack(solution, on)
+
+    def with_exchanges():
+        (other,) = evaluator._batched(eqn, values)
+        return [
+            jnp.where(lost, a, b) for a, b in zip(evaluator.pack(other, on), found, strict=True)
+        ]
+
+    return split(lax.cond(jnp.any(lost), with_exchanges, lambda: found), solution.shape, dtype)
 
 
 _CALLS = frozenset(
