@@ -7,6 +7,7 @@ import pytest
 from jax import lax
 
 from dvi_jax.engine.lanes import evaluate
+from dvi_jax.engine.linear import solve_near_identity
 
 OPTIONS = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 """Much is compiled here, and hardly anything is run."""
@@ -560,3 +561,25 @@ QUICK = (("known", 0), ("arithmetic-float32", 2), ("control", 0))
 @pytest.mark.parametrize(("cases", "pair", "rtol"), groups())
 def test_primitives(cases, pair, rtol):
     check(lambda x, y: {name: f(x, y) for name, f in cases.items()}, *pair, rtol=rtol)
+
+
+@pytest.mark.parametrize("on", [[True, True], [False, True], None])
+@pytest.mark.parametrize("pivot", [0.0, 1e-11, -1e-7])
+def test_a_checked_solve_exchanges_rows_where_it_must(pivot, on):
+    """A pivot next to nothing on one of the lanes: the digits of all, and of a NaN beside it."""
+    A = (jnp.eye(3)[None] + 0.3 * some(3, 3)).at[1, 0, 0].set(pivot)
+    b = some(3, seed=1)
+    mine = (A[1], b) if on == [False, True] else (A, b) if on else (A[1], b[1])
+    expected = np.linalg.solve(np.broadcast_to(mine[0], (*mine[1].shape, 3)), mine[1][..., None])
+
+    def solution(checked):
+        function = lambda A, b: solve_near_identity(A, b, checked)  # noqa: E731
+        return by_components(function, mine, on)
+
+    np.testing.assert_allclose(solution(True), expected[..., 0], rtol=1e-13)
+    assert not np.allclose(solution(False), expected[..., 0], rtol=1e-12, atol=0)
+    if on == [True, True]:
+        mine = (A.at[0, 1, 1].set(NAN), b)
+        found = solution(True)
+        assert np.isnan(found[0]).any()
+        np.testing.assert_allclose(found[1:], expected[1:, :, 0], rtol=1e-13)
