@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
 from jax import lax
 
 from dvi_jax.engine.lanes import evaluate
@@ -583,3 +584,114 @@ def test_a_checked_solve_exchanges_rows_where_it_must(pivot, on):
         found = solution(True)
         assert np.isnan(found[0]).any()
         np.testing.assert_allclose(found[1:], expected[1:, :, 0], rtol=1e-13)
+
+
+# --- functions made by chance ------------------------------------------------------------------
+
+UNARY = (
+    jnp.sin,
+    jnp.tanh,
+    lambda x: x[::-1] * 0.5,
+    lambda x: jnp.cumsum(x) / 3,
+    lambda x: jnp.where(x > 0, x, -x / 2),
+    lambda x: x.at[INDEX[1:]].add(x[:2]),
+    lambda x: jnp.sort(x) - x,
+    lambda x: jnp.pad(x, 1)[:3] + x[jnp.argmax(x)],
+    lambda x: jnp.outer(x, x) @ x,
+    lambda x: jnp.linalg.norm(x) * x,
+    lambda x: jnp.floor(2 * x) / 2 + x.astype(np.float32),
+    lambda x: lax.dynamic_slice(jnp.tile(x, 2), ((3 * jnp.abs(x[0])).astype(int),), (3,)),
+)
+BINARY = (
+    jnp.add,
+    jnp.multiply,
+    jnp.maximum,
+    lambda x, y: x / (1 + y**2),
+    lambda x, y: jnp.where(x > y, x, y[::-1]),
+    lambda x, y: jnp.einsum("i,j->ij", x, y).sum(0) / 3,
+    lambda x, y: jnp.concatenate([x[1:], y[:1]]),
+    lambda x, y: jnp.linalg.solve(4 * jnp.eye(3) + jnp.outer(x, x), y),
+    lambda x, y: lax.select_n((jnp.abs(x * 3).astype(int) % 3), x, y, x + y),
+    lambda x, y: jnp.interp(x, jnp.array([-1.0, 0, 1]), y),
+)
+STEPS = st.tuples(
+    st.sampled_from(
+        ["unary", "binary", "scan", "while", "cond", "switch", "map", "vmap while", "vmap cond", "grad"]
+    ),
+    st.integers(0, 30), st.integers(0, 30), st.integers(0, 30),
+)  # fmt: skip
+PROGRAMS = st.lists(STEPS, min_size=1, max_size=4)
+
+
+def random_function(program):
+    """A function of two vectors: each step takes two of the values so far and makes a third.
+
+    The bodies of its loops and branches are steps themselves. All values stay below one.
+    """
+
+    def function(x, y):
+        values = [jnp.tanh(x), jnp.tanh(y)]
+        for kind, i, j, k in program:
+            a, b = values[i % len(values)], values[j % len(values)]
+            values.append(jnp.tanh(step(kind, k, a, b)))
+        return values[-1] * jnp.sum(values[len(values) // 2])
+
+    return function
+
+
+def step(kind, k, a, b):
+    f, g = UNARY[k % len(UNARY)], BINARY[k % len(BINARY)]
+    if kind == "unary":
+        return f(a)
+    if kind == "binary":
+        return g(a, b)
+    if kind == "scan":
+        c, zs = lax.scan(lambda c, z: (jnp.tanh(g(c, a) + z), c[k % 3]), b, a, reverse=k % 2 == 0)
+        return c + zs
+    if kind == "while":
+        return rises(lambda c: f(c) + b, a, 1 + jnp.abs(b[k % 3]))
+    if kind == "cond":
+        return lax.cond(a[k % 3] > b[0], lambda: f(a), lambda: g(a, b))
+    if kind == "switch":
+        which = (4 * jnp.abs(a[k % 3])).astype(int) - 1
+        return lax.switch(which, [lambda: f(a), lambda: g(b, a), lambda: b])
+    if kind == "map":
+        return lax.map(lambda z: jnp.sum(g(a * z, b)), b)
+    if kind == "vmap while":
+        return jax.vmap(lambda z: jnp.sum(rises(lambda c: g(c, z * b), a, 1 + jnp.abs(z))))(b)
+    if kind == "vmap cond":
+        return jax.vmap(lambda z: lax.cond(z > a[0], lambda: jnp.sum(f(a * z)), lambda: z))(b)
+    return jax.grad(lambda a: jnp.sum(jnp.tanh(g(a, b)) * b))(a)
+
+
+def rises(change, x, most):
+    """A loop whose length depends on the numbers, to be differentiated forwards."""
+
+    def body(state):
+        level, x = state
+        return level + 0.2 + x[0] ** 2, jnp.tanh(change(x))
+
+    return lax.while_loop(lambda state: state[0] < most, body, (x[1] ** 2, x))[1]
+
+
+def with_derivatives(f):
+    def function(x, y):
+        slope, bend = jax.jvp(lambda x: jax.jvp(f, (x, y), (y, x)), (x,), (jnp.ones(3),))
+        return slope, bend, jax.jacfwd(f)(x, y)
+
+    return function
+
+
+@pytest.mark.slow
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(program=PROGRAMS, seed=st.integers(0, 3))
+def test_random_functions(program, seed):
+    check(random_function(program), f64(3, seed=seed), f64(3, seed=seed + 9), rtol=1e-9)
+
+
+@pytest.mark.slow
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(program=PROGRAMS, seed=st.integers(0, 3))
+def test_derivatives_of_random_functions(program, seed):
+    f = with_derivatives(random_function(program))
+    check(f, f64(3, seed=seed), f64(3, seed=seed + 9), rtol=1e-7, patterns=[[True, True], None])
