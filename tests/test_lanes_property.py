@@ -108,212 +108,397 @@ ARITHMETIC = {
     "gather with a fill": lambda x, y: x.at[FAR].get(mode="fill", fill_value=7),
     "scatter": lambda x, y: (x.at[INDEX[:2]].set(y[:2]), x.at[FAR].set(y), x.at[0].set(y[1])),
     "scatter-add": lambda x, y: (
-        x.at[INDEX].add(y), x.at[FAR].add(y), x.at[FAR].add(y, mode="clip"), x.at[1:].add(y[0]),
+        x.at[INDEX].add(y),
+        x.at[FAR].add(y),
+        x.at[FAR].add(y, mode="clip"),
+        x.at[1:].add(y[0]),
     ),
     "scatter-mul": lambda x, y: (x.at[INDEX].mul(y), x.at[FAR].mul(y)),
     "pad": lambda x, y: (lax.pad(x, y[0], [(1, 2, 1)]), lax.pad(x, y[1], [(-1, 3, 2)])),
     "pad and crop": lambda x, y: (lax.pad(x, y[0], [(-2, -1, 3)]), lax.pad(x, y[0], [(2, -4, 1)])),
     "known slices": lambda x, y: (
-        lax.dynamic_slice(x, (1,), (2,)), lax.dynamic_slice(x, (9,), (2,)),
-        lax.dynamic_slice(x, (-1,), (2,)), lax.dynamic_update_slice(x, y[:2], (9,)),
+        lax.dynamic_slice(x, (1,), (2,)),
+        lax.dynamic_slice(x, (9,), (2,)),
+        lax.dynamic_slice(x, (-1,), (2,)),
+        lax.dynamic_update_slice(x, y[:2], (9,)),
     ),
     "moves": lambda x, y: (
-        jnp.concatenate([x, y]), x[::-1], jnp.stack([x, y], 1).T, jnp.roll(x, 1), jnp.tile(x, 2),
-        jnp.repeat(x, 2), x[:, None] + y[None], lax.rev(x, (0,)), jnp.split(x, [1, 1]),
+        jnp.concatenate([x, y]),
+        x[::-1],
+        jnp.stack([x, y], 1).T,
+        jnp.roll(x, 1),
+        jnp.tile(x, 2),
+        jnp.repeat(x, 2),
+        x[:, None] + y[None],
+        lax.rev(x, (0,)),
+        jnp.split(x, [1, 1]),
     ),
     "what comes in goes out": lambda x, y: (x, x, y, 2, jnp.arange(3), x[:0], jnp.ones(2, bool)),
-    "zeros of it": lambda x, y: (jnp.zeros_like(x) * y, jnp.zeros_like(x) + y, jnp.ones_like(x) * y),
-}  # fmt: skip
+    "zeros of it": lambda x, y: (
+        jnp.zeros_like(x) * y,
+        jnp.zeros_like(x) + y,
+        jnp.ones_like(x) * y,
+    ),
+}
 """On numbers of every kind."""
 
 ORDERED = {
-    "comparisons": lambda x, y: (x < y, x <= y, x > y, x >= y, jnp.maximum(x, y), jnp.minimum(x, y)),
+    "comparisons": lambda x, y: (
+        x < y,
+        x <= y,
+        x > y,
+        x >= y,
+        jnp.maximum(x, y),
+        jnp.minimum(x, y),
+    ),
     "clamp": lambda x, y: (lax.clamp(y[0], x, y[1] + 5), jnp.clip(x, y, y + 1), jnp.clip(x, -1, 1)),
     "extrema": lambda x, y: (x.max(), x.min(), lax.cummax(x), lax.cummin(x, reverse=True)),
     "where they are": lambda x, y: (jnp.argmax(x), jnp.argmin(y), lax.argmax(x, 0, np.int32)),
-    "sort": lambda x, y: (jnp.sort(x), jnp.argsort(-y), lax.sort((x, y), num_keys=1), lax.top_k(x, 2)),
+    "sort": lambda x, y: (
+        jnp.sort(x),
+        jnp.argsort(-y),
+        lax.sort((x, y), num_keys=1),
+        lax.top_k(x, 2),
+    ),
     "search": lambda x, y: jnp.searchsorted(jnp.sort(x), y),
     "segments": lambda x, y: jax.ops.segment_sum(x, np.array([1, 0, 1]), num_segments=3),
     "remainders": lambda x, y: (x % 3, lax.rem(x, jnp.asarray(2, x.dtype)), jnp.floor_divide(x, 2)),
     "scatter-min, -max": lambda x, y: (x.at[INDEX].min(y), x.at[FAR].max(y)),
     "to other types": lambda x, y: (
-        x.astype(np.float32), x.astype(np.int32), x.astype(bool), x.astype(np.complex64),
-        x.astype(jnp.bfloat16), x.astype(np.int8).astype(np.int16), x > True,
+        x.astype(np.float32),
+        x.astype(np.int32),
+        x.astype(bool),
+        x.astype(np.complex64),
+        x.astype(jnp.bfloat16),
+        x.astype(np.int8).astype(np.int16),
+        x > True,
     ),
     "a traced slice": lambda x, y: (
-        lax.dynamic_slice(x, (y[0].astype(int),), (2,)), x[y.astype(int)],
-        lax.dynamic_update_slice(x, y[:2], (y[2].astype(int),)), x.at[y.astype(int)].add(1),
-        x.at[y.astype(int)].get(mode="fill"), lax.dynamic_index_in_dim(x, y[0].astype(int)),
+        lax.dynamic_slice(x, (y[0].astype(int),), (2,)),
+        x[y.astype(int)],
+        lax.dynamic_update_slice(x, y[:2], (y[2].astype(int),)),
+        x.at[y.astype(int)].add(1),
+        x.at[y.astype(int)].get(mode="fill"),
+        lax.dynamic_index_in_dim(x, y[0].astype(int)),
     ),
     "an index that does not vary": lambda x, y: x[jnp.argmax(jnp.asarray([1, 3, 2]))] + y,
     "integer division of what is known": lambda x, y: (
         x * (jnp.arange(3) // 2).astype(x.dtype) + (jnp.arange(3) % 2).astype(x.dtype)
     ),
-}  # fmt: skip
+}
 """On real numbers."""
 
 WHOLE = {
     "bits": lambda x, y: (
-        x & y, x | y, x ^ y, ~x, x << 2, x >> 1, lax.shift_right_logical(x, jnp.ones_like(x)),
-        lax.population_count(x), lax.clz(x),
+        x & y,
+        x | y,
+        x ^ y,
+        ~x,
+        x << 2,
+        x >> 1,
+        lax.shift_right_logical(x, jnp.ones_like(x)),
+        lax.population_count(x),
+        lax.clz(x),
     ),
     "reduced bits": lambda x, y: (
-        lax.reduce_and(x, (0,)), lax.reduce_or(x, (0,)), lax.reduce_xor(x, (0,)),
+        lax.reduce_and(x, (0,)),
+        lax.reduce_or(x, (0,)),
+        lax.reduce_xor(x, (0,)),
     ),
     "division": lambda x, y: (lax.div(x, jnp.full_like(x, 2)), x // 2, x % 2, jnp.abs(x), x**2),
     "mean of integers": lambda x, y: (jnp.mean(x), x / 2, x / y, jnp.sum(x, dtype=np.float32)),
     "histogram": lambda x, y: jnp.histogram(x, bins=3, range=(0, 3))[0],
     "bincount": lambda x, y: jnp.bincount(jnp.abs(x), length=4),
-}  # fmt: skip
+}
 """On integers."""
 
 TRUTH = {
     "logic": lambda x, y: (x & y, x | y, x ^ y, ~x, jnp.logical_and(x, y[0]), x != y, x == y),
     "reduced": lambda x, y: (x.any(), x.all(), x.sum(), jnp.cumsum(x), x.mean(), jnp.argmax(x)),
     "as numbers": lambda x, y: (x * 2, x + 1.5, x.astype(np.float32), -x.astype(int), x * y),
-    "selection": lambda x, y: (jnp.where(x, 1, 0), jnp.where(x, y, x), lax.select(x, y, x), x[::-1]),
+    "selection": lambda x, y: (
+        jnp.where(x, 1, 0),
+        jnp.where(x, y, x),
+        lax.select(x, y, x),
+        x[::-1],
+    ),
     "scatter": lambda x, y: (x.at[INDEX[:2]].set(y[:2]), x.at[FAR].get(mode="fill"), x[INDEX]),
-    "slices": lambda x, y: (lax.dynamic_update_slice(x, y[:1], (1,)), lax.pad(x, y[0], [(1, 1, 0)])),
+    "slices": lambda x, y: (
+        lax.dynamic_update_slice(x, y[:1], (1,)),
+        lax.pad(x, y[0], [(1, 1, 0)]),
+    ),
     "products": lambda x, y: (jnp.dot(x, y), jnp.outer(x, y), jnp.nonzero(x, size=3)),
-}  # fmt: skip
+}
 """On truth values."""
 
 FLOATS = {
     "trigonometric": lambda x, y: (
-        jnp.sin(x), jnp.cos(x), jnp.tan(x), jnp.arcsin(x / 9), jnp.arccos(x / 9), jnp.arctan(x),
+        jnp.sin(x),
+        jnp.cos(x),
+        jnp.tan(x),
+        jnp.arcsin(x / 9),
+        jnp.arccos(x / 9),
+        jnp.arctan(x),
         jnp.arctan2(x, y),
     ),
     "hyperbolic": lambda x, y: (
-        jnp.sinh(x), jnp.cosh(x), jnp.tanh(x), jnp.arcsinh(x), jnp.arccosh(1 + x**2),
+        jnp.sinh(x),
+        jnp.cosh(x),
+        jnp.tanh(x),
+        jnp.arcsinh(x),
+        jnp.arccosh(1 + x**2),
         jnp.arctanh(x / 9),
     ),
     "exponential": lambda x, y: (
-        jnp.exp(x), jnp.exp2(x), jnp.expm1(x), jnp.log(x**2), jnp.log1p(x**2), jax.nn.sigmoid(x),
-        jnp.logaddexp(x, y), jax.nn.logsumexp(x), lax.cumlogsumexp(x), jax.nn.softmax(x),
+        jnp.exp(x),
+        jnp.exp2(x),
+        jnp.expm1(x),
+        jnp.log(x**2),
+        jnp.log1p(x**2),
+        jax.nn.sigmoid(x),
+        jnp.logaddexp(x, y),
+        jax.nn.logsumexp(x),
+        lax.cumlogsumexp(x),
+        jax.nn.softmax(x),
     ),
     "powers": lambda x, y: (
-        jnp.abs(x) ** y, x**-2, x**-1, jnp.sqrt(jnp.abs(x)), lax.rsqrt(jnp.abs(x)), jnp.cbrt(x),
-        jnp.abs(x) ** 1.5, 2.0**x, jnp.float_power(jnp.abs(x), 2), lax.pow(x, jnp.array([2, 3, -1])),
+        jnp.abs(x) ** y,
+        x**-2,
+        x**-1,
+        jnp.sqrt(jnp.abs(x)),
+        lax.rsqrt(jnp.abs(x)),
+        jnp.cbrt(x),
+        jnp.abs(x) ** 1.5,
+        2.0**x,
+        jnp.float_power(jnp.abs(x), 2),
+        lax.pow(x, jnp.array([2, 3, -1])),
     ),
     "special": lambda x, y: (
-        lax.erf(x), lax.erfc(x), lax.erf_inv(x / 9), lax.lgamma(x), lax.digamma(x + 5),
-        jnp.i0(x), lax.igamma(1 + x**2, 1 + y**2), jnp.sinc(x),
+        lax.erf(x),
+        lax.erfc(x),
+        lax.erf_inv(x / 9),
+        lax.lgamma(x),
+        lax.digamma(x + 5),
+        jnp.i0(x),
+        lax.igamma(1 + x**2, 1 + y**2),
+        jnp.sinc(x),
     ),
     "rounding": lambda x, y: (
-        jnp.floor(x), jnp.ceil(x), jnp.round(x), lax.round(2 * x), jnp.trunc(x), jnp.modf(x),
-        lax.reduce_precision(x, 5, 7), lax.nextafter(x, y), jnp.frexp(x), jnp.ldexp(x, 3),
-        jnp.copysign(x, y), jnp.signbit(x), jnp.heaviside(x, y),
+        jnp.floor(x),
+        jnp.ceil(x),
+        jnp.round(x),
+        lax.round(2 * x),
+        jnp.trunc(x),
+        jnp.modf(x),
+        lax.reduce_precision(x, 5, 7),
+        lax.nextafter(x, y),
+        jnp.frexp(x),
+        jnp.ldexp(x, 3),
+        jnp.copysign(x, y),
+        jnp.signbit(x),
+        jnp.heaviside(x, y),
     ),
     "division": lambda x, y: (x / y, 1 / x, lax.rem(x, y), jnp.mod(x, y), jnp.hypot(x, y), x / 1),
     "what is finite": lambda x, y: (jnp.isfinite(x), jnp.isnan(x / 0), jnp.nan_to_num(x / 0)),
     "tables": lambda x, y: (
-        jnp.interp(x, jnp.sort(y), y), jnp.polyval(x, y), jnp.interp(x, np.arange(3.0), y),
+        jnp.interp(x, jnp.sort(y), y),
+        jnp.polyval(x, y),
+        jnp.interp(x, np.arange(3.0), y),
         jnp.interp(x, np.arange(3.0), np.ones(3), left=-1, right=7),
     ),
     "linear algebra": lambda x, y: (
-        jnp.linalg.solve(jnp.diag(x) + jnp.outer(y, y), y), jnp.linalg.norm(x), jnp.cross(x, y),
-        jnp.linalg.det(jnp.diag(x) + jnp.outer(y, y)), jnp.linalg.inv(jnp.eye(3) + jnp.outer(x, x)),
-        jnp.linalg.cholesky(jnp.eye(3) + jnp.outer(x, x)), jnp.linalg.slogdet(jnp.outer(x, y) + jnp.eye(3)),
-        jnp.linalg.eigvalsh(jnp.outer(x, x) + jnp.diag(y)), jnp.trace(jnp.outer(x, y)),
+        jnp.linalg.solve(jnp.diag(x) + jnp.outer(y, y), y),
+        jnp.linalg.norm(x),
+        jnp.cross(x, y),
+        jnp.linalg.det(jnp.diag(x) + jnp.outer(y, y)),
+        jnp.linalg.inv(jnp.eye(3) + jnp.outer(x, x)),
+        jnp.linalg.cholesky(jnp.eye(3) + jnp.outer(x, x)),
+        jnp.linalg.slogdet(jnp.outer(x, y) + jnp.eye(3)),
+        jnp.linalg.eigvalsh(jnp.outer(x, x) + jnp.diag(y)),
+        jnp.trace(jnp.outer(x, y)),
         jax.scipy.linalg.solve_triangular(jnp.triu(jnp.outer(x, y) + 3 * jnp.eye(3)), y),
     ),
     "Fourier": lambda x, y: (jnp.fft.fft(x), jnp.fft.irfft(jnp.fft.rfft(x), 3), jnp.convolve(x, y)),
     "complex": lambda x, y: (
-        lax.complex(x, y), (x + 1j * y) ** 2, jnp.abs(x + 1j * y), jnp.real(jnp.exp(1j * x)),
-        jnp.angle(x + 1j * y), (1j * x).imag, jnp.conj(x + 1j * y),
+        lax.complex(x, y),
+        (x + 1j * y) ** 2,
+        jnp.abs(x + 1j * y),
+        jnp.real(jnp.exp(1j * x)),
+        jnp.angle(x + 1j * y),
+        (1j * x).imag,
+        jnp.conj(x + 1j * y),
     ),
     "statistics": lambda x, y: (jnp.mean(x), jnp.std(x), jnp.median(x), jnp.var(x), jnp.diff(x)),
-    "bits": lambda x, y: lax.bitcast_convert_type(x, np.int32 if x.dtype == np.float32 else np.int64),
+    "bits": lambda x, y: lax.bitcast_convert_type(
+        x, np.int32 if x.dtype == np.float32 else np.int64
+    ),
     "gradient": lambda x, y: jax.grad(lambda x: jnp.sum(jnp.sin(x * y)) / (1 + x @ x))(x),
     "a Hessian": lambda x, y: jax.hessian(lambda x: jnp.sum(jnp.sin(x * y)) / (1 + x @ x))(x),
     "a barrier": lambda x, y: lax.optimization_barrier((x, y)),
     "a barrier for one": lambda x, y: lax.optimization_barrier(x) * y,
     "stop_gradient": lambda x, y: lax.stop_gradient(x) * y,
     "custom roots": lambda x, y: lax.custom_root(
-        lambda z: z**3 + z - x[0], x[1], lambda f, z: z - f(z) / 10, lambda g, b: b / g(jnp.ones_like(b))
+        lambda z: z**3 + z - x[0],
+        x[1],
+        lambda f, z: z - f(z) / 10,
+        lambda g, b: b / g(jnp.ones_like(b)),
     ),
     "custom solves": lambda x, y: lax.custom_linear_solve(
         lambda z: x**2 * z + z, y, lambda _, b: b / (1 + x**2), symmetric=True
     ),
-}  # fmt: skip
+}
 """On floating-point numbers."""
 
 MATRICES = {
     "products": lambda A, B: (
-        A @ B, jnp.tensordot(A, B, 2), jnp.einsum("ij,kj->ki", A, B), jnp.einsum("ii->i", A),
-        jnp.einsum("ij,ij->i", A, B), jnp.einsum("ij,ji->j", A, B), jnp.kron(A, B),
-        jnp.einsum("ij,jk,kl->il", A, B, A), A @ B[0], A[1] @ B,
+        A @ B,
+        jnp.tensordot(A, B, 2),
+        jnp.einsum("ij,kj->ki", A, B),
+        jnp.einsum("ii->i", A),
+        jnp.einsum("ij,ij->i", A, B),
+        jnp.einsum("ij,ji->j", A, B),
+        jnp.kron(A, B),
+        jnp.einsum("ij,jk,kl->il", A, B, A),
+        A @ B[0],
+        A[1] @ B,
     ),
     "contractions": lambda A, B: (
-        lax.dot_general(A, B, (((0,), (1,)), ((), ()))), lax.dot_general(A, B, (((), ()), ((0,), (0,)))),
-        lax.dot_general(A, B, (((1,), (1,)), ((0,), (0,)))), lax.dot_general(A, B, (((0,), (1,)), ((1,), (0,)))),
-        lax.dot_general(A, B, (((), ()), ((1, 0), (0, 1)))), lax.dot_general(A, B, (((), ()), ((), ()))),
+        lax.dot_general(A, B, (((0,), (1,)), ((), ()))),
+        lax.dot_general(A, B, (((), ()), ((0,), (0,)))),
+        lax.dot_general(A, B, (((1,), (1,)), ((0,), (0,)))),
+        lax.dot_general(A, B, (((0,), (1,)), ((1,), (0,)))),
+        lax.dot_general(A, B, (((), ()), ((1, 0), (0, 1)))),
+        lax.dot_general(A, B, (((), ()), ((), ()))),
         lax.dot_general(A, B, (((0, 1), (1, 0)), ((), ()))),
     ),
     "another precision": lambda A, B: (
-        lax.dot_general(A.astype(np.float32), B.astype(np.float32), (((1,), (0,)), ((), ())),
-                        preferred_element_type=np.float64),
+        lax.dot_general(
+            A.astype(np.float32),
+            B.astype(np.float32),
+            (((1,), (0,)), ((), ())),
+            preferred_element_type=np.float64,
+        ),
         lax.dot(A.astype(np.int8), B.astype(np.int8), preferred_element_type=np.int32),
     ),
     "reductions": lambda A, B: (
-        A.sum((0, 1)), A.sum(1), A.prod(0), A.max(1), A.min(), B.any(0), lax.reduce_sum(A, axes=()),
-        jnp.sum(A, axis=-1, keepdims=True), jnp.argmax(A), jnp.argmin(A, 1), (A > 0).all(1),
+        A.sum((0, 1)),
+        A.sum(1),
+        A.prod(0),
+        A.max(1),
+        A.min(),
+        B.any(0),
+        lax.reduce_sum(A, axes=()),
+        jnp.sum(A, axis=-1, keepdims=True),
+        jnp.argmax(A),
+        jnp.argmin(A, 1),
+        (A > 0).all(1),
     ),
     "running": lambda A, B: (
-        jnp.cumsum(A, 0), jnp.cumsum(A, 1), lax.cumprod(A, 1, reverse=True), lax.cummax(A, 0),
-        lax.cumsum(B, 0, reverse=True), lax.cummin(A, 1),
+        jnp.cumsum(A, 0),
+        jnp.cumsum(A, 1),
+        lax.cumprod(A, 1, reverse=True),
+        lax.cummax(A, 0),
+        lax.cumsum(B, 0, reverse=True),
+        lax.cummin(A, 1),
     ),
     "places": lambda A, B: (
-        A[0], A[:, 1], A[INDEX], A[INDEX, INDEX[::-1]], A[1:, :2], A.at[1].set(B[0]), A[::-1, ::2],
-        A.at[INDEX[:2], INDEX[1:]].add(B[0, :2]), A.at[:, FAR].add(B), A.at[FAR].get(mode="fill"),
-        A.at[FAR, 0].set(B[:, 0]), A.at[jnp.ix_(INDEX[:2], INDEX[:2])].set(B[:2, 1:]), A[..., None],
-        jnp.take_along_axis(A, INDEX[None], 1), A.ravel()[FAR], jnp.take(A, FAR, axis=1),
+        A[0],
+        A[:, 1],
+        A[INDEX],
+        A[INDEX, INDEX[::-1]],
+        A[1:, :2],
+        A.at[1].set(B[0]),
+        A[::-1, ::2],
+        A.at[INDEX[:2], INDEX[1:]].add(B[0, :2]),
+        A.at[:, FAR].add(B),
+        A.at[FAR].get(mode="fill"),
+        A.at[FAR, 0].set(B[:, 0]),
+        A.at[jnp.ix_(INDEX[:2], INDEX[:2])].set(B[:2, 1:]),
+        A[..., None],
+        jnp.take_along_axis(A, INDEX[None], 1),
+        A.ravel()[FAR],
+        jnp.take(A, FAR, axis=1),
     ),
     "moves": lambda A, B: (
-        A.T, A.reshape(-1), jnp.swapaxes(A, 0, 1) * 2, jnp.concatenate([A, B], 1), jnp.rot90(A),
-        jnp.stack([A, B], 2), lax.pad(A, B[0, 0], [(1, -1, 1), (-1, 2, 0)]), jnp.flip(A),
-        jnp.triu(A), jnp.diag(A), jnp.diag(A[0]), jnp.vstack([A, B]), jnp.broadcast_to(A, (2, 3, 3)),
-        jnp.squeeze(A[:1]), lax.broadcast_in_dim(A, (3, 2, 3), (2, 0)), jnp.split(A, 3, 1),
-        jnp.array_split(A, 2), lax.transpose(A[None], (2, 0, 1)), jnp.moveaxis(A, 0, 1), A[[1], :],
+        A.T,
+        A.reshape(-1),
+        jnp.swapaxes(A, 0, 1) * 2,
+        jnp.concatenate([A, B], 1),
+        jnp.rot90(A),
+        jnp.stack([A, B], 2),
+        lax.pad(A, B[0, 0], [(1, -1, 1), (-1, 2, 0)]),
+        jnp.flip(A),
+        jnp.triu(A),
+        jnp.diag(A),
+        jnp.diag(A[0]),
+        jnp.vstack([A, B]),
+        jnp.broadcast_to(A, (2, 3, 3)),
+        jnp.squeeze(A[:1]),
+        lax.broadcast_in_dim(A, (3, 2, 3), (2, 0)),
+        jnp.split(A, 3, 1),
+        jnp.array_split(A, 2),
+        lax.transpose(A[None], (2, 0, 1)),
+        jnp.moveaxis(A, 0, 1),
+        A[[1], :],
     ),
     "a traced place": lambda A, B: (
-        A[jnp.argmax(B[0])], A[jnp.argmax(B, 0), INDEX], lax.dynamic_slice(A, (jnp.argmax(B), 1), (2, 2)),
-        lax.dynamic_update_slice(A, B[:1], (jnp.argmin(B[1]), -1)), A.at[:, jnp.argmax(B[0])].add(1.0),
-        A.at[jnp.argmax(B, 1)].set(B[1, 1]), A.at[jnp.argmax(B, 1)].max(B),
+        A[jnp.argmax(B[0])],
+        A[jnp.argmax(B, 0), INDEX],
+        lax.dynamic_slice(A, (jnp.argmax(B), 1), (2, 2)),
+        lax.dynamic_update_slice(A, B[:1], (jnp.argmin(B[1]), -1)),
+        A.at[:, jnp.argmax(B[0])].add(1.0),
+        A.at[jnp.argmax(B, 1)].set(B[1, 1]),
+        A.at[jnp.argmax(B, 1)].max(B),
     ),
     "three axes": lambda A, B: (
-        (A[:, None] * B[None]).sum((0, 2)), (A[:, None] * B[None]).max((2, 0)),
-        jnp.cumsum(A[:, None] * B[None], 1), jnp.einsum("ijk,kl->lij", A[:, None] * B[None], A),
+        (A[:, None] * B[None]).sum((0, 2)),
+        (A[:, None] * B[None]).max((2, 0)),
+        jnp.cumsum(A[:, None] * B[None], 1),
+        jnp.einsum("ijk,kl->lij", A[:, None] * B[None], A),
         jnp.transpose(A[:, None] * B[None], (2, 0, 1)),
     ),
     "decompositions": lambda A, B: (
-        jnp.linalg.inv(A + 3 * jnp.eye(3)), jnp.linalg.solve(A + 3 * jnp.eye(3), B),
-        jnp.linalg.eigh(A + A.T)[0], jnp.linalg.det(A), jnp.linalg.qr(A)[1], jnp.linalg.svd(A)[1],
-        jax.scipy.linalg.expm(A), jnp.linalg.cholesky(A @ A.T + jnp.eye(3)), jnp.linalg.pinv(A),
+        jnp.linalg.inv(A + 3 * jnp.eye(3)),
+        jnp.linalg.solve(A + 3 * jnp.eye(3), B),
+        jnp.linalg.eigh(A + A.T)[0],
+        jnp.linalg.det(A),
+        jnp.linalg.qr(A)[1],
+        jnp.linalg.svd(A)[1],
+        jax.scipy.linalg.expm(A),
+        jnp.linalg.cholesky(A @ A.T + jnp.eye(3)),
+        jnp.linalg.pinv(A),
     ),
     "windows": lambda A, B: (
-        lax.reduce_window(A, 0.0, lax.add, (2, 2), (1, 1), "VALID"), jnp.convolve(A[0], B[0], "same"),
+        lax.reduce_window(A, 0.0, lax.add, (2, 2), (1, 1), "VALID"),
+        jnp.convolve(A[0], B[0], "same"),
         lax.conv_general_dilated(A[None, None], B[None, None], (1, 1), "SAME"),
-        lax.associative_scan(jnp.multiply, A), lax.reduce(A, 0.0, lax.add, (1,)),
+        lax.associative_scan(jnp.multiply, A),
+        lax.reduce(A, 0.0, lax.add, (1,)),
     ),
-}  # fmt: skip
+}
 """On two matrices."""
 
 
 KNOWN = {
     "quotients": lambda x, y: (
-        x * lax.div(of(4, 5, -7), of(2, 2, 2)), x * lax.rem(of(4, 5, -7), of(2, 2, 2)),
-        x * lax.div(of(4, 5, -7) + 0j, of(2, 2, 2) + 0j), x * lax.div(of(1.0, 0.0), of(0.0, 0.0))[0],
+        x * lax.div(of(4, 5, -7), of(2, 2, 2)),
+        x * lax.rem(of(4, 5, -7), of(2, 2, 2)),
+        x * lax.div(of(4, 5, -7) + 0j, of(2, 2, 2) + 0j),
+        x * lax.div(of(1.0, 0.0), of(0.0, 0.0))[0],
     ),
     "others": lambda x, y: (
-        x * lax.shift_left(of(4, 5, -7), of(2, 2, 2)), x * lax.integer_pow(of(2.0, 5, -7), -2),
-        x * lax.max(of(1.0, NAN, 2), of(0.0, 1, 3)), x * jnp.logical_not(of(True, False, True)),
-        x * jnp.argmax(of(1, 5, 2)), x * jnp.sort(of(3, 1, 2)), x * (of(1, 2, 3) == of(1, 0, 3)),
+        x * lax.shift_left(of(4, 5, -7), of(2, 2, 2)),
+        x * lax.integer_pow(of(2.0, 5, -7), -2),
+        x * lax.max(of(1.0, NAN, 2), of(0.0, 1, 3)),
+        x * jnp.logical_not(of(True, False, True)),
+        x * jnp.argmax(of(1, 5, 2)),
+        x * jnp.sort(of(3, 1, 2)),
+        x * (of(1, 2, 3) == of(1, 0, 3)),
     ),
     "broadcast in another order": lambda x, y: lax.broadcast_in_dim(
         jnp.outer(x, of(1.0, 2, 3)), (3, 2, 3), (2, 0)
     ),
-}  # fmt: skip
+}
 """With numbers that are known while tracing."""
 
 
@@ -323,28 +508,78 @@ def of(*numbers):
 
 STRANGE = {
     "arithmetic": lambda x, y: (
-        x + y, x - y, x * y, x / y, 0 * x, x * 0.0, x - x, -x, x**2, x**0, x**y, x @ y, x % y,
-        jnp.hypot(x, y), jnp.linalg.norm(x), jnp.sum(x), jnp.prod(x), jnp.cumsum(x), jnp.nansum(x),
+        x + y,
+        x - y,
+        x * y,
+        x / y,
+        0 * x,
+        x * 0.0,
+        x - x,
+        -x,
+        x**2,
+        x**0,
+        x**y,
+        x @ y,
+        x % y,
+        jnp.hypot(x, y),
+        jnp.linalg.norm(x),
+        jnp.sum(x),
+        jnp.prod(x),
+        jnp.cumsum(x),
+        jnp.nansum(x),
     ),
     "order": lambda x, y: (
-        jnp.maximum(x, y), jnp.minimum(x, y), x.max(), x.min(), jnp.argmax(x), jnp.argmin(x), x == y,
-        jnp.sort(x), lax.cummax(x), lax.cummin(x), x < y, jnp.clip(x, -1, 1), jnp.clip(y, x, 2),
-        jnp.nanmax(x), lax.top_k(x, 2), x.at[np.array([0, 0])].max(y[:2]), jnp.searchsorted(x, y),
+        jnp.maximum(x, y),
+        jnp.minimum(x, y),
+        x.max(),
+        x.min(),
+        jnp.argmax(x),
+        jnp.argmin(x),
+        x == y,
+        jnp.sort(x),
+        lax.cummax(x),
+        lax.cummin(x),
+        x < y,
+        jnp.clip(x, -1, 1),
+        jnp.clip(y, x, 2),
+        jnp.nanmax(x),
+        lax.top_k(x, 2),
+        x.at[np.array([0, 0])].max(y[:2]),
+        jnp.searchsorted(x, y),
     ),
     "selection": lambda x, y: (
-        jnp.where(x > y, x, y), jnp.isnan(x), jnp.isfinite(x), jnp.any(x > y), jnp.nan_to_num(x),
-        lax.cond(x[0] > 0, lambda: x, lambda: y), x.astype(int), x.astype(bool), jnp.sign(x),
+        jnp.where(x > y, x, y),
+        jnp.isnan(x),
+        jnp.isfinite(x),
+        jnp.any(x > y),
+        jnp.nan_to_num(x),
+        lax.cond(x[0] > 0, lambda: x, lambda: y),
+        x.astype(int),
+        x.astype(bool),
+        jnp.sign(x),
     ),
     "functions": lambda x, y: (
-        jnp.sqrt(x), jnp.sin(x), jnp.exp(x), jnp.log(x), jnp.arctan2(x, y), jnp.floor(x),
-        jnp.arctan2(x, -jnp.abs(y)), jnp.round(x), jnp.abs(x), jnp.signbit(x), jnp.nextafter(x, y),
-        jnp.arctan2(-x, -jnp.ones(3)), jnp.tanh(x), jnp.arctan(x), jnp.copysign(1.0, x),
+        jnp.sqrt(x),
+        jnp.sin(x),
+        jnp.exp(x),
+        jnp.log(x),
+        jnp.arctan2(x, y),
+        jnp.floor(x),
+        jnp.arctan2(x, -jnp.abs(y)),
+        jnp.round(x),
+        jnp.abs(x),
+        jnp.signbit(x),
+        jnp.nextafter(x, y),
+        jnp.arctan2(-x, -jnp.ones(3)),
+        jnp.tanh(x),
+        jnp.arctan(x),
+        jnp.copysign(1.0, x),
     ),
     "gradients": lambda x, y: (
         jax.grad(lambda x: jnp.sum(jnp.where(x > 0, jnp.sqrt(x), y * x)))(x),
         jax.grad(lambda x: jnp.max(x) + jnp.linalg.norm(y * x))(x),
     ),
-}  # fmt: skip
+}
 """With NaN, infinities and both zeros."""
 
 
@@ -369,13 +604,16 @@ CONTROL = {
     "scan": lambda x, y: (
         lax.scan(lambda c, z: (c * y + z, c[0]), x, y, reverse=True),
         lax.scan(lambda c, z: (c + z, (c, z)), x, (jnp.arange(6.0)), unroll=4),
-        lax.scan(lambda c, _: (c * y, None), x, None, 2), lax.scan(lambda c, _: (c, c[1]), x, None, 0),
-        lax.scan(lambda c, z: (c, z * 2), None, x), lax.scan(lambda c, z: (c, z[0]), 1, y[:, None]),
+        lax.scan(lambda c, _: (c * y, None), x, None, 2),
+        lax.scan(lambda c, _: (c, c[1]), x, None, 0),
+        lax.scan(lambda c, z: (c, z * 2), None, x),
+        lax.scan(lambda c, z: (c, z[0]), 1, y[:, None]),
         lax.scan(lambda c, z: (c, c * z), x, jnp.ones((1, 3))),
     ),
     "a scan of counters": lambda x, y: lax.scan(
         lambda c, z: ((c[0] + 1, c[1] + (z > 0), {"v": c[2]["v"] + z * c[0]}), c[0]),
-        (0, jnp.zeros(3, int), {"v": x}), jnp.stack([y, x]),
+        (0, jnp.zeros(3, int), {"v": x}),
+        jnp.stack([y, x]),
     ),
     "a carry that comes to vary": lambda x, y: lax.scan(
         lambda c, z: ((c[1], c[2], c[0] + z), c[0]), (0.0, 1.0, 2.0), x
@@ -387,8 +625,10 @@ CONTROL = {
         lambda c, z: (c + jnp.sum(jnp.arange(200.0) * z), z), 0.0, x
     ),
     "large and small": lambda x, y: (
-        jnp.sum(jnp.ones((5000,)) * x[0]) + y, jnp.outer(jnp.arange(50.0), x).T @ jnp.ones(50),
-        (jnp.arange(4200.0) * x[1])[INDEX * 2000], jnp.concatenate([x, jnp.ones(129)])[2:5],
+        jnp.sum(jnp.ones((5000,)) * x[0]) + y,
+        jnp.outer(jnp.arange(50.0), x).T @ jnp.ones(50),
+        (jnp.arange(4200.0) * x[1])[INDEX * 2000],
+        jnp.concatenate([x, jnp.ones(129)])[2:5],
     ),
     "known arrays as carry and constant": lambda x, y: known_twice(x),
     "while": lambda x, y: (
@@ -404,7 +644,9 @@ CONTROL = {
         jax.jvp(lambda x: lax.fori_loop(0, 3, lambda i, c: jnp.sin(c) * x[i], x), (x,), (y,)),
     ),
     "whiles under vmap": lambda x, y: jax.vmap(
-        lambda a: lax.while_loop(lambda c: c[0] < 4, lambda c: (c[0] + a**2 + 0.3, c[1] * a + y), (a, y))
+        lambda a: lax.while_loop(
+            lambda c: c[0] < 4, lambda c: (c[0] + a**2 + 0.3, c[1] * a + y), (a, y)
+        )
     )(x),
     "whiles under two": lambda x, y: jax.vmap(
         lambda a: jax.vmap(
@@ -418,12 +660,16 @@ CONTROL = {
     )(jnp.array([3, 0, 1, 7])),
     "a loop in a loop": lambda x, y: lax.while_loop(
         lambda c: c[0] < 5,
-        lambda c: (c[0] + 1 + y[0] ** 2, lax.while_loop(lambda d: jnp.sum(d) < c[0], lambda d: d + 1 + y**2, c[1])),
+        lambda c: (
+            c[0] + 1 + y[0] ** 2,
+            lax.while_loop(lambda d: jnp.sum(d) < c[0], lambda d: d + 1 + y**2, c[1]),
+        ),
         (x[0], x),
     ),
     "branches": lambda x, y: (
         lax.cond(x[0] > 0, lambda a: (a, 1), lambda a: (a * y, 2), x),
-        lax.cond(x[0] > 0, lambda: 1.0, lambda: x[1]), lax.cond(True, lambda: x, lambda: y),
+        lax.cond(x[0] > 0, lambda: 1.0, lambda: x[1]),
+        lax.cond(True, lambda: x, lambda: y),
         lax.switch((3 * y[0]).astype(int), [lambda a: a, lambda a: -a, lambda a: a * y], x),
         lax.switch(jnp.asarray(7), [lambda a: a, lambda a: -a], x),
         lax.cond(jnp.sum(jnp.arange(3)) > 2, lambda: x, lambda: y),
@@ -439,7 +685,9 @@ CONTROL = {
         lambda a: lax.cond(a > 0, lambda: a * y, lambda: y[::-1])
     )(x),
     "branches in a scan": lambda x, y: lax.scan(
-        lambda c, k: (lax.switch(k, [lambda: c + x, lambda: c * 2, lambda: y]), c), x, jnp.array([1, 0, 2])
+        lambda c, k: (lax.switch(k, [lambda: c + x, lambda: c * 2, lambda: y]), c),
+        x,
+        jnp.array([1, 0, 2]),
     ),
     "a loop in a branch": lambda x, y: lax.cond(
         x[0] > 0, lambda: lax.while_loop(lambda c: c[0] < 3, lambda c: c + 1 + x**2, y), lambda: x
@@ -448,36 +696,50 @@ CONTROL = {
         lambda c: c[0] < 6, lambda c: lax.cond(c[1] > 0, lambda: c + 1, lambda: c + 2 + x**2), y
     ),
     "map": lambda x, y: (
-        lax.map(lambda z: z * y, x), lax.map(lambda z: z[0] + y[z[1]], (x, jnp.arange(3))),
-        jax.vmap(jnp.dot, (None, 0))(x, jnp.outer(x, y)), lax.map(jnp.sin, x, batch_size=2),
-        jax.vmap(lambda a, b: a * b, (0, None), 1)(x, y), jax.vmap(lambda a: a, -1)(jnp.outer(x, y)),
+        lax.map(lambda z: z * y, x),
+        lax.map(lambda z: z[0] + y[z[1]], (x, jnp.arange(3))),
+        jax.vmap(jnp.dot, (None, 0))(x, jnp.outer(x, y)),
+        lax.map(jnp.sin, x, batch_size=2),
+        jax.vmap(lambda a, b: a * b, (0, None), 1)(x, y),
+        jax.vmap(lambda a: a, -1)(jnp.outer(x, y)),
         jax.vmap(jax.vmap(lambda a, b: a - b, (None, 0)), (0, None))(x, y),
     ),
     "rules of one's own": lambda x, y: (
-        jax.nn.relu(x), jax.nn.gelu(x), jax.grad(lambda x: jnp.sum(jax.nn.silu(x) * y))(x),
-        half(x), jax.grad(lambda x: jnp.sum(half(x) * y))(x), jax.jvp(third, (x,), (y,)),
+        jax.nn.relu(x),
+        jax.nn.gelu(x),
+        jax.grad(lambda x: jnp.sum(jax.nn.silu(x) * y))(x),
+        half(x),
+        jax.grad(lambda x: jnp.sum(half(x) * y))(x),
+        jax.jvp(third, (x,), (y,)),
     ),
     "checkpoint and jit": lambda x, y: (
-        jax.checkpoint(lambda x: jnp.sin(x) * y)(x), jax.jit(lambda x: (x, x[0]))(x),
+        jax.checkpoint(lambda x: jnp.sin(x) * y)(x),
+        jax.jit(lambda x: (x, x[0]))(x),
         jax.grad(jax.checkpoint(lambda x: jnp.sum(jnp.sin(jnp.sin(x) * y))))(x),
     ),
     "gradients of loops": lambda x, y: (
         jax.grad(lambda x: lax.scan(lambda c, z: (jnp.sin(c) * z, c), y, x)[0].sum())(x),
         jax.grad(lambda x: jnp.sum(lax.scan(lambda c, z: (c * y, c[0] * z), x, x)[1]))(x),
         jax.hessian(lambda x: lax.fori_loop(0, 3, lambda i, c: jnp.sin(c * x[i]), y).sum())(x),
-        jax.jacfwd(lambda x: lax.while_loop(lambda c: c[0] < 9, lambda c: c * 1.5 + 1 + x**2, y))(x),
+        jax.jacfwd(lambda x: lax.while_loop(lambda c: c[0] < 9, lambda c: c * 1.5 + 1 + x**2, y))(
+            x
+        ),
         jax.grad(lambda x: lax.cond(x[0] > 0, lambda: x @ y, lambda: jnp.sum(x**3)))(x),
     ),
     "random numbers": lambda x, y: (
-        jax.random.normal(jax.random.key(3), (3,)) * x, jax.random.uniform(jax.random.PRNGKey(1)) + y,
+        jax.random.normal(jax.random.key(3), (3,)) * x,
+        jax.random.uniform(jax.random.PRNGKey(1)) + y,
     ),
     "random numbers of a lane": lambda x, y: random_walk(
         jax.random.fold_in(jax.random.key(1), (100 * x[0]).astype(np.int32)), x
     ),
     "callbacks": lambda x, y: jax.pure_callback(
-        lambda x: np.asarray(x) * 2, jax.ShapeDtypeStruct((3,), x.dtype), x, vmap_method="sequential"
+        lambda x: np.asarray(x) * 2,
+        jax.ShapeDtypeStruct((3,), x.dtype),
+        x,
+        vmap_method="sequential",
     ),
-}  # fmt: skip
+}
 """Loops, branches and calls, on two vectors."""
 
 
@@ -616,10 +878,23 @@ BINARY = (
 )
 STEPS = st.tuples(
     st.sampled_from(
-        ["unary", "binary", "scan", "while", "cond", "switch", "map", "vmap while", "vmap cond", "grad"]
+        [
+            "unary",
+            "binary",
+            "scan",
+            "while",
+            "cond",
+            "switch",
+            "map",
+            "vmap while",
+            "vmap cond",
+            "grad",
+        ]
     ),
-    st.integers(0, 30), st.integers(0, 30), st.integers(0, 30),
-)  # fmt: skip
+    st.integers(0, 30),
+    st.integers(0, 30),
+    st.integers(0, 30),
+)
 PROGRAMS = st.lists(STEPS, min_size=1, max_size=4)
 
 

@@ -185,7 +185,11 @@ CASES = {
     "no step": {"hamiltonian": coupled, "num_steps": 0, "observe": (REDUCED, seen)},
     "one step": {"hamiltonian": coupled, "num_steps": 1, "observe": REDUCED},
     "segments": {"hamiltonian": coupled, "num_steps": 127, "save": dvi.Save(every=128, final=True)},
-    "long blocks": {"hamiltonian": separable, "num_steps": 307, "save": dvi.Save(every=150, final=True)},
+    "long blocks": {
+        "hamiltonian": separable,
+        "num_steps": 307,
+        "save": dvi.Save(every=150, final=True),
+    },
     "times": {"hamiltonian": separable, "save": "times", "observe": (seen, REDUCED)},
     "a section": {"hamiltonian": separable, "observe": SECTION},
     "a stop": {"hamiltonian": separable, "stop": STOP, "observe": REDUCED},
@@ -193,19 +197,32 @@ CASES = {
     "a matrix": {"hamiltonian": coupled, "shape": (2, 2), "num_steps": 9},
     "compensated": {"hamiltonian": coupled, "arithmetic": dvi.Compensated(), "num_steps": 40},
     "on a grid": {
-        "hamiltonian": separable, "unforced": True, "arithmetic": dvi.FixedPoint(2.0**-40), "num_steps": 9
+        "hamiltonian": separable,
+        "unforced": True,
+        "arithmetic": dvi.FixedPoint(2.0**-40),
+        "num_steps": 9,
     },
     "adapted": {
-        "hamiltonian": kepler, "lattice": dvi.TimeTransformed(lambda t, q, p, a: 1 + q @ q), "num_steps": 20
+        "hamiltonian": kepler,
+        "lattice": dvi.TimeTransformed(lambda t, q, p, a: 1 + q @ q),
+        "num_steps": 20,
     },
     "variational": {
-        "hamiltonian": kepler, "lattice": dvi.Variational(on_no_root="hold"), "num_steps": 20, "rtol": 1e-7
+        "hamiltonian": kepler,
+        "lattice": dvi.Variational(on_no_root="hold"),
+        "num_steps": 20,
+        "rtol": 1e-7,
     },
-    "single precision": {"hamiltonian": coupled, "dtype": np.float32, "observe": REDUCED, "rtol": 1e-3},
+    "single precision": {
+        "hamiltonian": coupled,
+        "dtype": np.float32,
+        "observe": REDUCED,
+        "rtol": 1e-3,
+    },
     "Gauss": {"hamiltonian": coupled, "method": dvi.GaussLegendre(2), "num_steps": 20},
     "Lobatto": {"hamiltonian": coupled, "method": dvi.LobattoIIIAIIIB(3), "num_steps": 20},
     "Kahan-Li": {"hamiltonian": separable, "method": dvi.KahanLi(6), "num_steps": 20},
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow
@@ -235,15 +252,23 @@ GRADIENTS = {
     "given": {"hamiltonian": separable, "lattice": given, "adjoint": REVERSIBLE},
     "compensated": {"hamiltonian": separable, "num_steps": 45, "arithmetic": dvi.Compensated()},
     "times": {"hamiltonian": separable, "num_steps": 45, "save": "times"},
-    "forwards": {"hamiltonian": separable, "num_steps": 45, "mode": "forwards", "method": dvi.Yoshida(4)},
+    "forwards": {
+        "hamiltonian": separable,
+        "num_steps": 45,
+        "mode": "forwards",
+        "method": dvi.Yoshida(4),
+    },
     "twice": {"hamiltonian": separable, "num_steps": 5, "mode": "twice"},
     "checkpointed": {
-        "hamiltonian": separable, "num_steps": 45, "adjoint": dvi.Checkpointed(), "method": dvi.RungeKutta4()
+        "hamiltonian": separable,
+        "num_steps": 45,
+        "adjoint": dvi.Checkpointed(),
+        "method": dvi.RungeKutta4(),
     },
     "direct": {"hamiltonian": coupled, "num_steps": 9, "adjoint": dvi.Direct(), "mode": "twice"},
     "no step": {"hamiltonian": coupled, "num_steps": 0},
     "one step": {"hamiltonian": coupled, "num_steps": 1},
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow

@@ -253,7 +253,7 @@ class Evaluator:
         (out,) = eqn.outvars
         (of_a, of_b), (batch_a, batch_b) = eqn.params["dimension_numbers"]
         dtype = out.aval.dtype
-        if a.dtype != dtype or b.dtype != dtype or dtype == bool:
+        if a.dtype != dtype or b.dtype != dtype or dtype == np.bool_:
             return self._batched(eqn, [a, b])[0]
         x, shape_a = _as_stack_of_matrices(a.entries(), batch_a, of_a)
         y, shape_b = _as_stack_of_matrices(b.entries(), batch_b, of_b)
