@@ -158,7 +158,8 @@ def _trusted_root(function, guess: Vector, known: Vector, options: Trusted):
     def solve(F, x0):
         def improve(_, state):
             x, _ = state
-            correction = solve_near_identity(*_value_and_jacobian(F, x)[::-1])
+            value, jacobian = _value_and_jacobian(F, x)
+            correction = solve_near_identity(jacobian, value)
             return x - correction, correction
 
         x, correction = lax.fori_loop(0, options.iterations, improve, (x0, x0))

@@ -144,7 +144,7 @@ class Value:
 
 def is_opaque(dtype: Any) -> bool:
     """Whether it is a type that NumPy does not have, and no number: keys of random numbers."""
-    return jax.dtypes.issubdtype(dtype, jax.dtypes.extended)
+    return jnp.issubdtype(dtype, jax.dtypes.extended)
 
 
 def is_array(entry: Entry) -> bool:
