@@ -24,7 +24,9 @@ from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._solution import Save as Save, Solution as Solution
 from ._system import System as System
 from .engine.cpu import configure_cpu as configure_cpu
-from .engine.newton import Newton as Newton
+from .engine.newton import Newton as Newton, RootSolver as RootSolver
+from .engine.picard import Picard as Picard, PicardThenNewton as PicardThenNewton
+from .engine.simplified import SimplifiedNewton as SimplifiedNewton
 from .engine.tiles import Layout as Layout
 from .invariants import (
     Balance as Balance,

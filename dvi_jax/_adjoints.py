@@ -34,7 +34,7 @@ from ._segments import can_trust, largest_divisor, run_in_segments
 from ._step import Equations
 from ._types import State
 from .engine.lanes import in_arrays
-from .engine.newton import Known, Newton, Trusted
+from .engine.newton import Known, RootSolver, Trusted
 from .engine.tiles import Layout, lanewise
 from .engine.together import on_any_lane
 from .methods import TypeII
@@ -322,7 +322,7 @@ def _pull_back(
         )
     )
     newton = task.equations.newton
-    assert isinstance(newton, Newton)
+    assert isinstance(newton, RootSolver)
     on_trust = Trusted(newton, jnp.asarray(BACKWARD_ITERATIONS, jnp.int32))
 
     def solved_by(task: Task, options) -> Equations:
@@ -333,7 +333,8 @@ def _pull_back(
         alone, reductions = task.observables()
         interval = task.interval(k)
         if isinstance(task.method, TypeII) and isinstance(task.arithmetic, FloatingPoint):
-            options = Known(p1.ravel())  # what (13) is to be solved for is where we come from
+            # What (13) is to be solved for is where we come from.
+            options = Known(p1.ravel(), newton)
         else:
             options = newton
         q1, p1, _ = task.method.step(solved_by(task, options), interval, q0, p0)

@@ -37,7 +37,8 @@ from ._step import Equations
 from ._system import System
 from ._types import Interval
 from .engine.cpu import OPTIONS, takes_options
-from .engine.newton import Newton
+from .engine.newton import RootSolver
+from .engine.picard import PicardThenNewton
 from .engine.tiles import Layout, with_first
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation
@@ -65,7 +66,7 @@ def integrate(
     save: Save = Save(),
     observe: PyTree = None,
     adjoint: AbstractAdjoint = Reversible(),
-    newton: Newton = Newton(),
+    newton: RootSolver = PicardThenNewton(),
     arithmetic: Arithmetic = FloatingPoint(),
     layout: Layout = Layout(),
     stop: Stop | None = None,
@@ -98,7 +99,8 @@ def integrate(
     - `layout`: how the arithmetic is laid out, see `Layout`.
     - `stop`: a `Stop`, where the run ends early (a collision, an escape); or None.
     - `adjoint`: how reverse-mode gradients go, see `Reversible`, `Checkpointed`, `Direct`.
-    - `newton`: settings of implicit solves, see `Newton`.
+    - `newton`: how implicit steps are solved: `PicardThenNewton`, `Newton`, `SimplifiedNewton`,
+      `Picard`.
     - `arithmetic`: how the state is kept: `FloatingPoint`; for long runs `Compensated`, or
       `FixedPoint`, whose explicit steps go back bit for bit.
     - `throw`: raise if the trajectory fails; otherwise read ``solution.result``.
@@ -129,7 +131,7 @@ def integrate(
         ("lattice", lattice, Lattice),
         ("save", save, Save),
         ("adjoint", adjoint, AbstractAdjoint),
-        ("newton", newton, Newton),
+        ("newton", newton, RootSolver),
         ("arithmetic", arithmetic, Arithmetic),
         ("layout", layout, Layout),
     ):

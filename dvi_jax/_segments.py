@@ -31,7 +31,7 @@ from ._rollout import (
 )
 from .engine.dependence import fixed_point, reached_outputs
 from .engine.lanes import in_arrays
-from .engine.newton import Newton, Trusted
+from .engine.newton import RootSolver, Trusted
 from .engine.together import least_over_lanes, on_any_lane
 
 SEGMENT = 128
@@ -158,7 +158,7 @@ class _Segment:
     def _on_trust(self, steps: Callable, carry: Carry, iterations: Array):
         equations = self.task.equations
         newton = equations.newton
-        assert isinstance(newton, Newton)
+        assert isinstance(newton, RootSolver)
         trusting = dataclasses.replace(equations, newton=Trusted(newton, iterations))
         return steps(dataclasses.replace(self.task, equations=trusting), self._bare(carry))
 
@@ -178,7 +178,7 @@ class _Segment:
         A lane that has failed before goes along once, for the times that it gives.
         """
         newton = self.task.equations.newton
-        assert isinstance(newton, Newton)
+        assert isinstance(newton, RootSolver)
         most = max(min(newton.max_steps, MOST_ITERATIONS), FEWEST_ITERATIONS)
         like = jax.eval_shape(lambda c: self._on_trust(steps, c, iterations), carry)
         other = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like[1])

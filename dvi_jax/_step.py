@@ -12,7 +12,7 @@ from ._results import RESULTS, first_failure
 from ._system import System
 from ._types import Args, Interval, Scalar, State
 from .engine.dependence import depends_on
-from .engine.newton import Known, Newton, RootInfo, Trusted, find_root
+from .engine.newton import Known, Newton, RootInfo, RootSolver, Trusted, find_root
 
 
 class StepInfo(NamedTuple):
@@ -50,7 +50,7 @@ class Equations(eqx.Module):
     system: System
     epsilon: Scalar
     args: Args = None
-    newton: Newton | Trusted | Known = Newton()
+    newton: RootSolver | Trusted | Known = Newton()
     origin: tuple[State, State] | None = None
     quantum: float | None = eqx.field(static=True, default=None)
 
@@ -151,7 +151,7 @@ def adjoint_step(
 
 
 def _increment(rate, x0, h, equations, known, explicit) -> tuple[State, RootInfo]:
-    """x1 = x0 + h rate(x1), by one evaluation if `rate` ignores x1, else by Newton's method.
+    """x1 = x0 + h rate(x1), by one evaluation if `rate` ignores x1, else as a root.
 
     `known` is x0 with the origin, by which the accuracy of a solve is measured.
     """
@@ -165,7 +165,8 @@ def _increment(rate, x0, h, equations, known, explicit) -> tuple[State, RootInfo
     def residual(x1):
         return x1 - start - h * rate(x1.reshape(shape)).ravel()
 
-    x1, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton)
+    represented = jnp.maximum(jnp.abs(x0), jnp.abs(guess)).ravel()
+    x1, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton, represented)
     return x1.reshape(shape), info
 
 

@@ -1,5 +1,6 @@
-"""Newton's method for small systems of equations, with the implicit derivative."""
+"""Roots of small systems of equations: what solvers have in common, and Newton's method."""
 
+import abc
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,10 +13,74 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 from .linear import solve_dense, solve_near_identity, unit_vectors
 
 Vector = Inexact[Array, " n"]
+Function = Callable[[Vector], Vector]
 
 
-class Newton(eqx.Module):
-    """Settings of Newton's method for the implicit part of a step.
+class Scales(NamedTuple):
+    """By what the accuracy of each unknown is measured, beside its own size; not negative.
+
+    `known` is the size of the known value that it starts from, and `start` the size of that value
+    as it is represented: the same but for states that are told relative to an origin.
+    """
+
+    known: Vector
+    start: Vector
+
+
+class Found(NamedTuple):
+    """What a solver gives: x, the iterations made, ‖F(x)‖ over the scale, and its verdict."""
+
+    x: Vector
+    iterations: Int[Array, ""]
+    residual: Float[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class RootSolver(eqx.Module):
+    """Base of the methods for the implicit part of a step, F(x) = 0: what `newton=` takes.
+
+    F has a Jacobian near the identity, the nearer the smaller h is; a guess is at hand. All
+    methods find the root to round-off and have the same derivatives, those of the implicit
+    function, to any order; they differ in what an iteration costs and in how many there are.
+    """
+
+    max_steps: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def solve(self, F: Function, x0: Vector, scales: Scales) -> Found:
+        """The root near x0, with care: as many iterations as it takes, each one looked at."""
+
+    @abc.abstractmethod
+    def solve_on_trust(
+        self, F: Function, x0: Vector, scales: Scales, effort: Int[Array, ""]
+    ) -> tuple[Vector, Float[Array, ""]]:
+        """x after `iterations(effort)`, and the excess by which to judge it: see `Trusted`."""
+
+    @abc.abstractmethod
+    def iterations(self, effort: Int[Array, ""], n: int) -> Int[Array, ""]:
+        """How many iterations on trust go with an effort, from 2 upwards, for n unknowns."""
+
+    @abc.abstractmethod
+    def solve_tangent(self, linear: Function, rhs: Vector, on_trust: bool) -> Vector:
+        """x with linear(x) = rhs, the Jacobian at a root; NaN if it is not found. It may be
+        transposed in `rhs`. `on_trust`: that root is good without pivoting, or was."""
+
+
+def check_settings(rtol: float | None, atol: float, max_steps: int) -> None:
+    """Refuse settings by which no iteration could stop, with a `ValueError`."""
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int):
+        raise ValueError(f"max_steps must be an integer of at least 1, got {max_steps!r}.")
+    if max_steps < 1:
+        raise ValueError(f"max_steps must be at least 1, got {max_steps}.")
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        if value is not None and not 0 <= value < float("inf"):
+            raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
+    if rtol == 0 and atol == 0:
+        raise ValueError("rtol and atol are both zero: no iteration could ever stop.")
+
+
+class Newton(RootSolver):
+    """Newton's method, x ← x − (∂F/∂x)⁻¹ F(x), its Jacobian by autodiff in each iteration.
 
     The iteration stops once the correction of each component is at most ``rtol * scale +
     atol``, `scale` being the larger of that component's known and unknown value; or, for
@@ -37,43 +102,78 @@ class Newton(eqx.Module):
     max_steps: int = eqx.field(static=True, default=20)
 
     def __check_init__(self):
-        if isinstance(self.max_steps, bool) or not isinstance(self.max_steps, int):
-            raise ValueError(f"max_steps must be an integer of at least 1, got {self.max_steps!r}.")
-        if self.max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1, got {self.max_steps}.")
-        for name in ("rtol", "atol"):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value < float("inf"):
-                raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
-        if self.rtol == 0 and self.atol == 0:
-            raise ValueError("rtol and atol are both zero: no iteration could ever stop.")
+        check_settings(self.rtol, self.atol, self.max_steps)
+
+    def solve(self, F, x0, scales):
+        known = scales.known
+        rtol = 4096 * jnp.finfo(x0.dtype).eps if self.rtol is None else self.rtol
+
+        def proceed(state: _Iterate):
+            return ~state.converged & state.finite & (state.iterations < self.max_steps)
+
+        def improve(state: _Iterate):
+            value, jacobian = value_and_jacobian(F, state.x)
+            correction = solve_dense(jacobian, value)
+            x = state.x - correction
+            error, scale = jnp.abs(correction), jnp.maximum(known, jnp.abs(x))
+            settled = jnp.all(error <= rtol * scale + self.atol)
+            # A component that is all round-off of the others never settles by its own measure: it
+            # is enough that it is small beside them and shrinks no more.
+            relative = largest(error / jnp.where(scale > 0, scale, 1))
+            small = largest(error) <= rtol * largest(scale) + self.atol
+            stalled = small & (relative >= 0.5 * state.relative)
+            finite = jnp.isfinite(largest(correction))
+            return _Iterate(x, relative, finite, settled | stalled, state.iterations + 1)
+
+        no = jnp.asarray(False)
+        unknown = jnp.full((), jnp.nan, x0.dtype)  # no comparison with it is true
+        start = _Iterate(x0, unknown, ~no, no, jnp.asarray(0, jnp.int32))
+        end = lax.while_loop(proceed, improve, start)
+        residual = over(largest(F(end.x)), jnp.maximum(largest(known), largest(end.x)))
+        return Found(end.x, end.iterations, residual, end.converged & jnp.isfinite(residual))
+
+    def solve_on_trust(self, F, x0, scales, effort):
+        def improve(_, state):
+            x, _ = state
+            correction = solve_near_identity(*value_and_jacobian(F, x)[::-1])
+            return x - correction, correction
+
+        x, correction = lax.fori_loop(0, effort, improve, (x0, x0))
+        # √ε of a component: convergence being quadratic, the next would be below round-off.
+        eps = float(jnp.finfo(x.dtype).eps)
+        rtol = max(self.rtol or 0.0, 0.25 * eps**0.5)
+        scale = jnp.maximum(scales.known, jnp.abs(x))
+        floor = 64 * eps * jnp.max(scale, initial=0.0) + self.atol
+        return x, jnp.max(jnp.abs(correction) - rtol * scale - floor, initial=-jnp.inf)
+
+    def iterations(self, effort, n):
+        return effort
+
+    def solve_tangent(self, linear, rhs, on_trust):
+        _, matrix = value_and_jacobian(linear, jnp.zeros_like(rhs))
+        if on_trust:
+            return solve_near_identity(matrix, rhs, checked=True)  # nobody looks at a gradient
+        return solve_dense(matrix, rhs)
 
 
 class Trusted(eqx.Module):
-    """So many iterations of Newton's method, without looking at how they go.
+    """So many iterations of a solver, without looking at how they go.
 
-    The verdict comes as a number in place of the residual: how much the last correction of a
-    component exceeds what is allowed. At most zero means that the root is good to round-off: the
-    correction was below √ε of its component, hence, convergence being quadratic, the next would be
-    below round-off; or it was nothing but round-off of larger components. NaN and positive numbers
-    mean that the solve is to be made again with care.
+    How many is told by `effort`, 2, 3, …. The verdict comes as a number in place of the residual:
+    how much the last correction of a component exceeds what is allowed. At most zero means that
+    the root is good to round-off, or that what is left is nothing but round-off of larger
+    components. NaN and positive numbers mean that the solve is to be made again with care.
     """
 
-    newton: Newton
-    iterations: Int[Array, ""]
-
-    def excess(self, correction: Vector, x: Vector, known: Vector) -> Float[Array, ""]:
-        eps = float(jnp.finfo(x.dtype).eps)
-        rtol = max(self.newton.rtol or 0.0, 0.25 * eps**0.5)
-        scale = jnp.maximum(known, jnp.abs(x))
-        floor = 64 * eps * jnp.max(scale, initial=0.0) + self.newton.atol
-        return jnp.max(jnp.abs(correction) - rtol * scale - floor, initial=-jnp.inf)
+    solver: RootSolver
+    effort: Int[Array, ""]
 
 
 class Known(eqx.Module):
-    """A root that is known already: nothing is solved for but its derivative."""
+    """A root that is known already: nothing is solved for but its derivative, as by `solver`."""
 
     root: Vector
+    solver: RootSolver = Newton()
 
 
 class RootInfo(NamedTuple):
@@ -95,90 +195,56 @@ class _Iterate(NamedTuple):
 
 
 def find_root(
-    function: Callable[[Vector], Vector],
+    function: Function,
     guess: Vector,
     known: Vector,
-    options: Newton | Trusted | Known,
+    solver: RootSolver | Trusted | Known,
+    start: Vector | None = None,
 ) -> tuple[Vector, RootInfo]:
     """Root x of function(x) = 0 near `guess`, and how it was found.
 
     The derivative of x with respect to anything that `function` closes over is that of the
     implicit function theorem, dx = −(∂F/∂x)⁻¹ dF, in forward and reverse mode and to any
-    order: the iteration itself is never differentiated. `known` sets the scale for the
-    relative tolerance beside x itself. The Jacobian comes from autodiff.
+    order: the iteration itself is never differentiated. `known` and `start` (`known` if left out)
+    set the scales for the tolerances beside x itself, see `Scales`.
     """
     known = lax.stop_gradient(jnp.abs(known))
-    if isinstance(options, Trusted):
-        return _trusted_root(function, guess, known, options)
-    if isinstance(options, Known):
-        root = lax.custom_root(function, guess, lambda F, x0: options.root, _tangent_solve)
-        zero = jnp.asarray(0, jnp.int32)
-        return root, RootInfo(zero, jnp.zeros((), guess.dtype), jnp.asarray(True))
-    rtol = 4096 * jnp.finfo(guess.dtype).eps if options.rtol is None else options.rtol
+    start = known if start is None else lax.stop_gradient(jnp.abs(start))
+    scales, on_trust = Scales(known, start), isinstance(solver, Trusted | Known)
+    used = solver if isinstance(solver, RootSolver) else solver.solver
 
+    # custom_root gives its auxiliary outputs tangents of the same type, so no integers among them.
     def solve(F, x0):
-        def proceed(state: _Iterate):
-            return ~state.converged & state.finite & (state.iterations < options.max_steps)
+        zero = jnp.zeros((), x0.dtype)
+        if isinstance(solver, Known):
+            return solver.root, (zero, zero, zero + 1)
+        if isinstance(solver, Trusted):
+            x, excess = used.solve_on_trust(F, x0, scales, solver.effort)
+            return x, (zero, excess, zero + 1)
+        x, *how = used.solve(F, x0, scales)
+        return x, tuple(jnp.asarray(a, x0.dtype) for a in how)
 
-        def improve(state: _Iterate):
-            value, jacobian = _value_and_jacobian(F, state.x)
-            correction = solve_dense(jacobian, value)
-            x = state.x - correction
-            error, scale = jnp.abs(correction), jnp.maximum(known, jnp.abs(x))
-            settled = jnp.all(error <= rtol * scale + options.atol)
-            # A component that is all round-off of the others never settles by its own measure: it
-            # is enough that it is small beside them and shrinks no more.
-            relative = jnp.max(error / jnp.where(scale > 0, scale, 1), initial=0.0)
-            small = _norm(error) <= rtol * _norm(scale) + options.atol
-            stalled = small & (relative >= 0.5 * state.relative)
-            finite = jnp.isfinite(_norm(correction))
-            return _Iterate(x, relative, finite, settled | stalled, state.iterations + 1)
+    def solve_tangent(linear, rhs):
+        return used.solve_tangent(linear, rhs, on_trust)
 
-        no = jnp.asarray(False)
-        unknown = jnp.full((), jnp.nan, x0.dtype)  # no comparison with it is true
-        start = _Iterate(x0, unknown, ~no, no, jnp.asarray(0, jnp.int32))
-        end = lax.while_loop(proceed, improve, start)
-        scale = jnp.maximum(_norm(known), _norm(end.x))
-        residual = _norm(F(end.x))
-        relative = jnp.where(scale > 0, residual / jnp.where(scale > 0, scale, 1), residual)
-        converged = end.converged & jnp.isfinite(residual)
-        # custom_root gives its auxiliary output tangents of the same type, so no integers here.
-        return end.x, tuple(jnp.asarray(a, x0.dtype) for a in (end.iterations, relative, converged))
-
-    def tangent_solve(linear, rhs):
-        _, matrix = _value_and_jacobian(linear, jnp.zeros_like(rhs))
-        return solve_dense(matrix, rhs)
-
-    root, aux = lax.custom_root(function, guess, solve, tangent_solve, has_aux=True)
+    root, aux = lax.custom_root(function, guess, solve, solve_tangent, has_aux=True)
     iterations, residual, converged = map(lax.stop_gradient, aux)
+    if isinstance(solver, Trusted):  # whole numbers stay what they are, in a hot loop
+        return root, RootInfo(
+            used.iterations(solver.effort, guess.size), residual, jnp.asarray(True)
+        )
     return root, RootInfo(iterations.astype(jnp.int32), residual, converged > 0)
 
 
-def _trusted_root(function, guess: Vector, known: Vector, options: Trusted):
-    def solve(F, x0):
-        def improve(_, state):
-            x, _ = state
-            value, jacobian = _value_and_jacobian(F, x)
-            correction = solve_near_identity(jacobian, value)
-            return x - correction, correction
-
-        x, correction = lax.fori_loop(0, options.iterations, improve, (x0, x0))
-        return x, options.excess(correction, x, known)
-
-    root, excess = lax.custom_root(function, guess, solve, _tangent_solve, has_aux=True)
-    return root, RootInfo(options.iterations, lax.stop_gradient(excess), jnp.asarray(True))
-
-
-def _tangent_solve(linear: Callable[[Vector], Vector], rhs: Vector) -> Vector:
-    """By the Jacobian at a root that was found without pivoting, or with it."""
-    _, matrix = _value_and_jacobian(linear, jnp.zeros_like(rhs))
-    return solve_near_identity(matrix, rhs, checked=True)  # nobody looks at a gradient
-
-
-def _value_and_jacobian(F: Callable[[Vector], Vector], x: Vector) -> tuple[Vector, Array]:
+def value_and_jacobian(F: Function, x: Vector) -> tuple[Vector, Array]:
     value, push = jax.linearize(F, x)
     return value, jax.vmap(push, out_axes=1)(unit_vectors(x.shape[0], x.dtype))
 
 
-def _norm(x: Vector) -> Float[Array, ""]:
+def largest(x: Vector) -> Float[Array, ""]:
     return jnp.max(jnp.abs(x), initial=0.0)
+
+
+def over(size: Float[Array, ""], scale: Float[Array, ""]) -> Float[Array, ""]:
+    """size / scale, or size itself where there is no scale."""
+    return jnp.where(scale > 0, size / jnp.where(scale > 0, scale, 1), size)

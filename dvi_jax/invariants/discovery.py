@@ -14,7 +14,7 @@ from .._step import Equations
 from .._system import System
 from .._types import Args, Interval
 from ..engine.dependence import depends_on
-from ..engine.newton import Newton
+from ..engine.newton import Newton, RootSolver
 from ..engine.nullspace import (
     RANK,
     compress,
@@ -66,7 +66,7 @@ def discover_invariants(
     t0: float = 0.0,
     args: Args = None,
     method: Method = TypeII(),
-    newton: Newton = Newton(),
+    newton: RootSolver = Newton(),
     tolerance: float | None = None,
     representative: Literal["least", "simplest"] = "least",
 ) -> Discovery:

@@ -14,7 +14,7 @@ from .._results import status_name
 from .._solution import Save
 from .._system import System
 from .._types import Args
-from ..engine.newton import Newton
+from ..engine.newton import Newton, RootSolver
 from ..methods import Method, TypeII
 from ..observe import MaxDrift
 
@@ -222,7 +222,7 @@ def drift_order(
     t0: float = 0.0,
     args: Args = None,
     method: Method = TypeII(),
-    newton: Newton = Newton(),
+    newton: RootSolver = Newton(),
 ) -> DriftOrder:
     r"""The exponent of ε in the largest drift of a scalar along trajectories.
 
@@ -274,7 +274,7 @@ def drift_surface(
     t0: float = 0.0,
     args: Args = None,
     method: Method = TypeII(),
-    newton: Newton = Newton(),
+    newton: RootSolver = Newton(),
 ) -> DriftSurface:
     r"""The largest drift of a scalar over ε and h, and its order in each.
 

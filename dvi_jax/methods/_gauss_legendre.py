@@ -102,7 +102,8 @@ class GaussLegendre(Method):
 
         guess = advanced(a, all_at_start)
         known = jnp.broadcast_to(jnp.stack(equations.absolute(q0, p0)), all_at_start.shape)
-        x, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton)
+        represented = jnp.maximum(jnp.abs(all_at_start), jnp.abs(guess)).ravel()
+        x, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton, represented)
         q1, p1 = advanced(b, x.reshape(all_at_start.shape))
         return q1, p1, judge(info, q1, p1)
 

@@ -161,7 +161,9 @@ class LobattoIIIAIIIB(Method):
         else:
             guess = lax.fori_loop(0, _SWEEPS, sweep, lax.stop_gradient(start))
             known = (jnp.broadcast_to(z, (s, *z.shape)) for z in equations.absolute(q0, p0))
-            x, info = find_root(residual, unknowns(*guess), unknowns(*known), equations.newton)
+            x0 = unknowns(*guess)
+            represented = jnp.maximum(jnp.abs(unknowns(*start)), jnp.abs(x0))
+            x, info = find_root(residual, x0, unknowns(*known), equations.newton, represented)
         Q, P = at_stages(x)
         q1, p1 = Q[-1], p0 + h * jnp.tensordot(b, forces(times, Q, P), 1)
         return q1, p1, judge(info, q1, p1)

@@ -12,7 +12,7 @@ from .._results import RESULTS
 from .._step import Equations, step
 from .._system import System
 from .._types import Args, Interval
-from ..engine.newton import Newton
+from ..engine.newton import Newton, RootSolver
 from .basis import BoundBasis, check_step_size
 from .generators import LatticePoint
 
@@ -66,13 +66,13 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
 
 
 def require_system(system: Any, newton: Any) -> None:
-    """Refuse what is no `System` or no `Newton`."""
+    """Refuse what is no `System` or no `RootSolver`."""
     if not isinstance(system, System):
         raise TypeError(
             f"system must be a dvi.System, got {type(system).__name__}. Wrap the discrete "
             "Hamiltonian: dvi.System(H_D, force=W)."
         )
-    if not isinstance(newton, Newton):
+    if not isinstance(newton, RootSolver):
         raise TypeError(f"newton must be a dvi.Newton(...), got {newton!r}.")
 
 
@@ -146,7 +146,7 @@ def solution_pairs(
     epsilon: Any = 0.0,
     t0: float = 0.0,
     args: Args = None,
-    newton: Newton = Newton(),
+    newton: RootSolver = Newton(),
 ) -> tuple[LatticePoint, LatticePoint]:
     r"""Pairs of lattice points on solutions: each sample, and where one step of the map takes it.
 

@@ -9,7 +9,7 @@ import numpy as np
 from .._step import Equations
 from .._system import System
 from .._types import Args
-from ..engine.newton import Newton
+from ..engine.newton import Newton, RootSolver
 from ..engine.nullspace import triangle
 from .basis import AbstractBasis, Basis, BoundBasis, Product, Sum, bind_basis, check_step_size
 from .conditions import Conditions, at_samples, require_finite, require_times, values_at
@@ -38,7 +38,7 @@ def find_symmetries(
     time: bool = True,
     t0: float = 0.0,
     args: Args = None,
-    newton: Newton = Newton(),
+    newton: RootSolver = Newton(),
     tolerance: float | None = None,
 ) -> Symmetries:
     r"""The symmetries of order z of the disturbed discrete equations that a basis can express.
