@@ -11,33 +11,32 @@ from .newton import Found, Scales, Vector, largest, over
 
 
 class _Verdict(NamedTuple):
-    """Whether an iterate is good, whether the next may be, and the error that is left."""
+    """Of each component: whether it is good, or nothing but round-off; the error that is left."""
 
-    good: Bool[Array, ""]
-    promising: Bool[Array, ""]
-    error: Float[Array, ""]
+    good: Bool[Array, " n"]
+    round_off: Bool[Array, " n"]
+    error: Float[Array, " n"]
 
 
 def _verdict(
-    last: Vector, before: Vector, scale: Vector, rtol: float | None, atol: float, slowest: float
+    last: Vector, before: Vector, scale: Vector, rtol: float | None, atol: float
 ) -> _Verdict:
     """On an iterate, by the sizes of its last correction δ_k and of the one before, δ_{k−1}.
 
     If a component shrinks by θ = δ_k / δ_{k−1} from one correction to the next, those that are
     not made any more add up to δ_k θ/(1 − θ). A component is good once that is below `rtol` of its
-    scale, or the correction itself is; or if it is nothing but round-off, which is small and does
-    not go on shrinking.
+    scale, or the correction itself is, or turns but a last digit; or if it is nothing but
+    round-off, its own or that of larger components, which is small and does not go on shrinking.
     """
     eps = float(jnp.finfo(last.dtype).eps)
     allowed = (eps / 16 if rtol is None else rtol) * scale + atol
     shrinks = last < before
     rest = last * (last / jnp.where(shrinks, before - last, 1))
     error = jnp.minimum(last, jnp.where(shrinks, rest, jnp.inf))
-    settled = (last <= allowed) | (error <= allowed)
-    round_off = (last <= 4 * eps * scale) & (last >= 0.5 * before)
-    of_others = (last <= 64 * eps * scale + 4 * eps * largest(scale)) & (last >= before)
-    slow = (last > slowest * before) & (last > 64 * eps * scale + atol)
-    return _Verdict(jnp.all(settled | round_off | of_others), ~jnp.any(slow), largest(error))
+    settled = (error <= allowed) | (last <= eps * scale)
+    at_rest = (last <= 4 * eps * scale) & (last >= 0.5 * before)
+    round_off = last <= 64 * eps * scale + 4 * eps * largest(scale)
+    return _Verdict(settled | at_rest | (round_off & (last >= before)), round_off, error)
 
 
 def contract(
@@ -51,9 +50,9 @@ def contract(
 ) -> Found:
     """x ← x − correction(x) from x0 until it is good to round-off, or is given up.
 
-    That is after `max_steps`, for a number that is not finite, or once a correction of a component
-    is larger than `slowest` times the one before. Of the residual, near the error where the
-    Jacobian is near the identity, an estimate is given.
+    That is after `max_steps`, for a number that is not finite, or once a correction, each
+    component by its scale, is larger than `slowest` times the one before. Of the residual an
+    estimate is given, the error that is left: the Jacobian is near the identity, or divided by.
     """
 
     def proceed(state):
@@ -61,20 +60,25 @@ def contract(
         return ~found.converged & goes_on & (found.iterations < max_steps)
 
     def improve(state):
-        before, found, _ = state
+        before, was_good, found, _ = state
         step = correction(found.x)
         x, last = found.x - step, jnp.abs(step)
         scale = jnp.maximum(scales.start, jnp.abs(x))
-        good, promising, error = _verdict(last, before, scale, rtol, atol, slowest)
-        goes_on = promising & jnp.isfinite(largest(last))
-        residual = over(error, largest(scale))
-        return last, Found(x, found.iterations + 1, residual, good), goes_on
+        good, round_off, error = _verdict(last, before, scale, rtol, atol)
+        # Round-off of many components goes up and down, each in its own time: once is enough.
+        good = good | (was_good & round_off)
+        safe = jnp.where(scale > 0, scale, 1)
+        is_slow = largest(last / safe) > slowest * largest(before / safe)
+        slow = is_slow & jnp.any(~(good | round_off))
+        goes_on = jnp.isfinite(largest(last)) & ~slow
+        residual = over(largest(error), largest(scale))
+        return last, good, Found(x, found.iterations + 1, residual, jnp.all(good)), goes_on
 
     no = jnp.asarray(False)
     unknown = jnp.full_like(x0, jnp.nan)  # no comparison with it is true
     start = Found(x0, jnp.asarray(0, jnp.int32), unknown[0], no)
-    _, found, _ = lax.while_loop(proceed, improve, (unknown, start, ~no))
-    return found
+    state = (unknown, jnp.zeros(x0.shape, bool), start, ~no)
+    return lax.while_loop(proceed, improve, state)[2]
 
 
 def contract_on_trust(
@@ -95,7 +99,7 @@ def contract_on_trust(
     unknown = jnp.full_like(x0, jnp.nan)
     x, last, before = lax.fori_loop(0, iterations, improve, (x0, unknown, unknown))
     scale = jnp.maximum(scales.start, jnp.abs(x))
-    good = _verdict(last, before, scale, rtol, atol, float("inf")).good
+    good = jnp.all(_verdict(last, before, scale, rtol, atol).good)
     return x, jnp.where(good, -1.0, 1.0).astype(x.dtype)
 
 
