@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .contraction import contract, contract_on_trust, linear_iterations
+from .linear import UNROLLED_UP_TO
 from .newton import Found, Function, Newton, RootSolver, Scales, Vector, check_settings
 from .together import on_any_lane
 
@@ -63,30 +64,30 @@ class PicardThenNewton(RootSolver):
     """The solver by default: Newton's method for few unknowns, for many `Picard` and, where it is
     not fast, Newton's.
 
-    With more than `newton_up_to` unknowns in a solve Picard's iteration goes first, and is given
-    up for a lane as soon as a correction is more than half of the one before. That lane is solved
-    by Newton's method from the start, and only if there is such a lane. Numbers of the others do
-    not change.
+    With more unknowns in a solve Picard's iteration goes first, and is given up for a lane as soon
+    as a correction is more than half of the one before. That lane is solved by Newton's method
+    from the start, and only if there is such a lane. Numbers of the others do not change.
 
     **Arguments**
 
-    - `newton_up_to`: unknowns up to which Newton's method is taken at once. They are the components
-      of q for `TypeII` and what is made of it, times the stages and sides for `GaussLegendre` and
-      `LobattoIIIAIIIB`.
+    - `newton_up_to`: unknowns up to which Newton's method is taken at once: the components of q for
+      `TypeII` and what is made of it, times stages and sides for `GaussLegendre` and
+      `LobattoIIIAIIIB`. None means what was measured to be best: 16 where a batch goes by
+      components, and a Jacobian's zeros cost nothing; 4 in arrays, where more go through LAPACK.
     - `picard`, `newton`: settings of the two.
 
     **Raises** `ValueError` for a number that is negative or no integer, `TypeError` for settings
     of another kind.
     """
 
-    newton_up_to: int = eqx.field(static=True, default=16)
+    newton_up_to: int | None = eqx.field(static=True, default=None)
     picard: Picard = Picard(max_steps=12)
     newton: Newton = Newton()
 
     def __check_init__(self):
         n = self.newton_up_to
-        if isinstance(n, bool) or not isinstance(n, int) or n < 0:
-            raise ValueError(f"newton_up_to must be an integer of at least 0, got {n!r}.")
+        if n is not None and (isinstance(n, bool) or not isinstance(n, int) or n < 0):
+            raise ValueError(f"newton_up_to must be an integer of at least 0 or None, got {n!r}.")
         for name, kind in (("picard", Picard), ("newton", Newton)):
             value = getattr(self, name)
             if not isinstance(value, kind):
@@ -96,8 +97,13 @@ class PicardThenNewton(RootSolver):
     def max_steps(self) -> int:
         return self.newton.max_steps
 
+    def _is_few(self, n: int, on_trust: bool) -> bool:
+        if self.newton_up_to is not None:
+            return n <= self.newton_up_to
+        return n <= (_FEW_IN_COMPONENTS if on_trust else UNROLLED_UP_TO)
+
     def solve(self, F, x0, scales):
-        if x0.size <= self.newton_up_to:
+        if self._is_few(x0.size, on_trust=False):
             return self.newton.solve(F, x0, scales)
         of = self.picard
         first = contract(F, x0, scales, of.rtol, of.atol, of.max_steps, slowest=0.5)
@@ -112,7 +118,7 @@ class PicardThenNewton(RootSolver):
         return lax.cond(on_any_lane(~first.converged), mend, lambda first: first, first)
 
     def solve_on_trust(self, F, x0, scales, effort):
-        if x0.size <= self.newton_up_to:
+        if self._is_few(x0.size, on_trust=True):
             return self.newton.solve_on_trust(F, x0, scales, effort)
         return lax.cond(
             effort <= _LAST_OF_PICARD,
@@ -121,24 +127,27 @@ class PicardThenNewton(RootSolver):
         )
 
     def iterations(self, effort, n):
-        if n <= self.newton_up_to:
+        if self._is_few(n, on_trust=True):
             return self.newton.iterations(effort, n)
         picard, newton = self.picard.iterations(effort, n), self.newton.iterations(_then(effort), n)
         return jnp.where(effort <= _LAST_OF_PICARD, picard, newton)
 
     def solve_tangent(self, linear, rhs, on_trust):
-        if rhs.size <= self.newton_up_to:
+        if self._is_few(rhs.size, on_trust=True):
             return self.newton.solve_tangent(linear, rhs, on_trust)
         return _without_matrix(self, linear, rhs)
 
+
+_FEW_IN_COMPONENTS = 16
+"""Unknowns up to which the elimination of a band is faster than Picard's iteration."""
 
 _LAST_OF_PICARD = 4
 """The effort on trust up to which Picard's iteration is tried."""
 
 
 def _then(effort):
-    """The effort of Newton's method after those of Picard's iteration: 2, 4."""
-    return 2 * (effort - _LAST_OF_PICARD)
+    """The effort of Newton's method after those of Picard's iteration: 3, 4."""
+    return effort - 2
 
 
 def _without_matrix(solver: RootSolver, linear: Function, rhs: Vector) -> Vector:
