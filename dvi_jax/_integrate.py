@@ -137,6 +137,8 @@ def integrate(
     ):
         if not isinstance(value, kind):
             hint = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
+            if kind is RootSolver:
+                hint += "; take dvi.Newton(), dvi.SimplifiedNewton(), dvi.Picard() or leave it out"
             raise TypeError(f"{name} must be a {kind.__name__}, got {value!r}{hint}.")
     if not (stop is None or isinstance(stop, Stop)):
         raise TypeError(f"stop must be a dvi.Stop(g), got {stop!r}.")
