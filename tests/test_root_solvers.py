@@ -1,5 +1,7 @@
 """Root solvers: the roots, derivatives and statuses of Newton's method, by fewer operations."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,8 @@ from helpers import double_pendulum, symplectic_defect
 
 import dvi_jax as dvi
 from dvi_jax import systems
+from dvi_jax._step import Equations, no_step_yet
+from dvi_jax._types import Interval
 from dvi_jax.engine.linear import UNROLLED_UP_TO
 from dvi_jax.engine.newton import Newton, Trusted, find_root
 from dvi_jax.engine.picard import Picard, PicardThenNewton
@@ -35,6 +39,28 @@ def drag(t0, t1, q0, p1, args):
 CHAIN = dvi.System(chain)
 
 
+def march(solver, system, q, p, h, num_steps=1, epsilon=0.0, args=None, method=dvi.TypeII()):
+    """(q, p, StepInfo) after so many steps with care: compiled in a tenth of the time of a run."""
+
+    def steps(q, p, epsilon):
+        equations = Equations(system, epsilon, args, solver)
+
+        def step(k, state):
+            q, p, so_far = state
+            t0 = jnp.asarray(k * h, q.dtype)
+            h_ = jnp.asarray(h, q.dtype)
+            q, p, info = method.step(equations, Interval(t0, t0 + h_, h_), q, p)
+            return q, p, so_far.then(info)
+
+        return jax.lax.fori_loop(0, num_steps, step, (q, p, no_step_yet(q)))
+
+    return jax.jit(steps)(jnp.asarray(q), jnp.asarray(p), epsilon)
+
+
+def is_good(info):
+    return bool(info.result == dvi.RESULTS.successful)
+
+
 def box(n, seed=0, width=0.5):
     return np.random.default_rng(seed).uniform(-width, width, (2, n))
 
@@ -58,39 +84,35 @@ TEN = dvi.System(systems.n_body().system.H_D, force=drag)
 TEN_ARGS = {"masses": GM, "G": 1.0}
 
 
-def ten_bodies(solver, num_steps=100, **kwargs):
-    q, p = planets()
-    kwargs = {"h": 0.5, "epsilon": 1e-6, "args": TEN_ARGS} | kwargs
-    return dvi.integrate(TEN, q, p, num_steps=num_steps, newton=solver, **kwargs)
+def ten_bodies(solver, num_steps=100, epsilon=1e-6):
+    return march(solver, TEN, *planets(), 0.5, num_steps, epsilon, TEN_ARGS)
 
 
-def test_ten_bodies_take_two_iterations_and_no_jacobian():
-    reference = ten_bodies(Newton())
+def test_ten_bodies_take_two_iterations():
+    q1, p1, _ = ten_bodies(Newton(), num_steps=1)
+    q, _, _ = ten_bodies(Newton())
     for solver in (Picard(), PicardThenNewton()):
-        sol = ten_bodies(solver)
-        assert int(sol.stats["newton_iterations"]) <= 2.05 * 100
-        assert float(sol.stats["max_residual"]) < EPS
-        np.testing.assert_allclose(sol.qs[1], reference.qs[1], rtol=4 * EPS, atol=EPS)
-        np.testing.assert_allclose(sol.ps[1], reference.ps[1], rtol=4 * EPS)
-        np.testing.assert_allclose(sol.qs, reference.qs, rtol=1e-12, atol=1e-13)
-
-
-def text_of(solver, differentiated=False):
-    def last(epsilon):
-        at = {"adjoint": dvi.Direct(), "throw": False, "epsilon": epsilon}
-        return jnp.sum(ten_bodies(solver, num_steps=3, **at).qs[-1])
-
-    return str(jax.make_jaxpr(jax.grad(last) if differentiated else last)(1e-6))
+        a, b, _ = ten_bodies(solver, num_steps=1)
+        np.testing.assert_allclose(a, q1, rtol=4 * EPS, atol=EPS)
+        np.testing.assert_allclose(b, p1, rtol=4 * EPS)
+        a, _, info = ten_bodies(solver)
+        np.testing.assert_allclose(a, q, rtol=1e-12, atol=1e-13)
+        assert is_good(info)
+        assert int(info.iterations) <= 2.05 * 100
+        assert float(info.residual) < EPS
 
 
 @pytest.mark.parametrize("differentiated", [False, True])
 def test_picard_forms_no_matrix_of_the_unknowns(differentiated):
-    text = text_of(Picard(), differentiated)
-    assert "lu[" not in text
-    assert "[30,30]" not in text
-    newton = text_of(Newton(), differentiated)  # what is looked for is there
-    assert "lu[" in newton
-    assert "[30,30]" in newton
+    def text(solver):
+        def last(epsilon):
+            return jnp.sum(ten_bodies(solver, num_steps=1, epsilon=epsilon)[0])
+
+        text = str(jax.make_jaxpr(jax.grad(last) if differentiated else last)(1e-6))
+        return "triangular_solve" in text, "[30,30]" in text
+
+    assert text(Picard()) == (False, False)
+    assert text(Newton()) == (True, True)  # what is looked for can be found
 
 
 # --- the same roots --------------------------------------------------------------------------
@@ -98,38 +120,58 @@ def test_picard_forms_no_matrix_of_the_unknowns(differentiated):
 WITH_MANY = {
     "pendulums": (dvi.System(double_pendulum, force=drag), *box(2), 0.05, 0.1),
     "chain 3": (CHAIN, *box(3), 0.05, 0.0),
-    "chain 12": (CHAIN, *box(12), 0.05, 0.0),
     "chain 40": (CHAIN, *box(40), 0.1, 0.0),
 }
+
+
+@functools.cache
+def newtons_step(case):
+    system, q, p, h, epsilon = WITH_MANY[case]
+    return march(Newton(), system, q, p, h, epsilon=epsilon)
+
+
+@functools.cache
+def newtons_energy():
+    return energy_after_many_steps(Newton())
+
+
+def energy_after_many_steps(solver):
+    q, p = box(3, width=0.4)
+    q, p, _ = march(solver, CHAIN, q, p, 0.05, 20_000, method=dvi.Strang())
+    return float(chain(0, 0, q, p, None))
 
 
 @EACH
 @pytest.mark.parametrize("case", list(WITH_MANY))
 def test_one_step_agrees_with_newton_to_a_few_ulp(name, case):
     system, q, p, h, epsilon = WITH_MANY[case]
-
-    def step(solver):
-        return dvi.integrate(system, q, p, h=h, num_steps=1, epsilon=epsilon, newton=solver)
-
-    sol, reference = step(OTHERS[name]), step(Newton())
-    assert int(sol.stats["newton_iterations"]) >= 2
-    scale = np.maximum(np.abs(p), np.abs(reference.ps[-1]))
-    assert np.max(np.abs(sol.ps[-1] - reference.ps[-1]) / scale) <= 4 * EPS
-    np.testing.assert_allclose(sol.qs[-1], reference.qs[-1], rtol=8 * EPS, atol=8 * EPS)
+    q1, p1, info = march(OTHERS[name], system, q, p, h, epsilon=epsilon)
+    q_newton, p_newton, _ = newtons_step(case)
+    assert int(info.iterations) >= 2
+    scale = np.maximum(np.abs(p), np.abs(p_newton))
+    assert np.max(np.abs(p1 - p_newton) / scale) <= 4 * EPS
+    np.testing.assert_allclose(q1, q_newton, rtol=8 * EPS, atol=8 * EPS)
 
 
-@EACH
-def test_all_implicit_methods_agree_with_newton(name):
+SOLVED = {
+    "Adjoint": dvi.Adjoint(),
+    "Strang": dvi.Strang(),
+    "Gauss": dvi.GaussLegendre(1),
+    "Lobatto": dvi.LobattoIIIAIIIB(2),
+}
+
+
+@pytest.mark.parametrize("method", list(SOLVED))
+def test_all_implicit_methods_agree_with_newton(method):
     q, p = box(5)
-    methods = [
-        dvi.Adjoint(), dvi.Strang(), dvi.Yoshida(4), dvi.GaussLegendre(2), dvi.LobattoIIIAIIIB(3)
-    ]  # fmt: skip
-    for method in methods:
-        at = {"h": 0.05, "num_steps": 5, "method": method}
-        sol = dvi.integrate(CHAIN, q, p, newton=OTHERS[name], **at)
-        reference = dvi.integrate(CHAIN, q, p, newton=Newton(), **at)
-        np.testing.assert_allclose(sol.qs, reference.qs, rtol=1e-14, atol=1e-15)
-        np.testing.assert_allclose(sol.ps, reference.ps, rtol=1e-14, atol=1e-15)
+    runs = [
+        march(solver, CHAIN, q, p, 0.05, 5, method=SOLVED[method])
+        for solver in (Newton(), *OTHERS.values())
+    ]
+    for a, b, info in runs[1:]:
+        assert is_good(info)
+        np.testing.assert_allclose(a, runs[0][0], rtol=1e-14, atol=1e-15)
+        np.testing.assert_allclose(b, runs[0][1], rtol=1e-14, atol=1e-15)
 
 
 @EACH
@@ -138,13 +180,11 @@ def test_the_map_stays_symplectic(name):
 
     def flow(epsilon):
         def of(z):
-            sol = dvi.integrate(
-                dvi.System(chain, force=drag), z[:5], z[5:], h=0.1, num_steps=3, epsilon=epsilon,
-                newton=OTHERS[name], throw=False,
-            )  # fmt: skip
-            return jnp.concatenate([sol.qs[-1], sol.ps[-1]])
+            system = dvi.System(chain, force=drag)
+            q, p, _ = march(OTHERS[name], system, z[:5], z[5:], 0.1, 3, epsilon)
+            return jnp.concatenate([q, p])
 
-        return jax.jit(jax.jacfwd(of))(np.concatenate([q, p]))
+        return jax.jacfwd(of)(jnp.concatenate([q, p]))
 
     assert symplectic_defect(flow(0.0)) < 1e-12
     assert symplectic_defect(flow(0.1)) > 1e-3  # a drag is not
@@ -153,20 +193,13 @@ def test_the_map_stays_symplectic(name):
 @EACH
 def test_a_long_run_keeps_energy_as_newton_does(name):
     """What a solve leaves must not add up: a bias of a unit of round-off a step would be seen."""
-    q, p = box(3, width=0.4)
-    at = {"h": 0.05, "num_steps": 20_000, "save": dvi.Save(final=True), "method": dvi.Strang()}
-    sol = dvi.integrate(CHAIN, q, p, newton=OTHERS[name], **at)
-    reference = dvi.integrate(CHAIN, q, p, newton=Newton(), **at)
-
-    def energy(s):
-        return chain(0, 0, s.qs[-1], s.ps[-1], None)
-
-    assert abs(float(energy(sol) - energy(reference))) < 1e-11
+    assert abs(energy_after_many_steps(OTHERS[name]) - newtons_energy()) < 3e-14
 
 
 # --- derivatives -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", [dvi.Direct(), dvi.Reversible(checkpoint_every=5)])
 def test_gradients_are_newtons(adjoint):
     q, p = box(20)
@@ -185,6 +218,23 @@ def test_gradients_are_newtons(adjoint):
     for solver in (*OTHERS.values(), PicardThenNewton()):
         for a, b in zip(gradient(solver), reference, strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-13)
+
+
+def test_the_gradient_of_steps_is_newtons():
+    q, p = box(20)
+
+    def gradient(solver):
+        def loss(z, epsilon):
+            system = dvi.System(chain, force=drag)
+            q1, p1, _ = march(solver, system, z[:20], z[20:], 0.05, 3, epsilon)
+            return jnp.sum(q1**2) + jnp.sum(jnp.sin(p1))
+
+        return jax.grad(loss, (0, 1))(jnp.concatenate([q, p]), 0.1)
+
+    reference = gradient(Newton())
+    for solver in (Picard(), PicardThenNewton()):
+        for a, b in zip(gradient(solver), reference, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
 
 
 @EACH
@@ -216,39 +266,45 @@ def test_a_derivative_that_picard_cannot_find_is_nan():
 # --- when it does not contract ---------------------------------------------------------------
 
 
-def strongly_damped(solver, gamma, **kwargs):
-    """Pendulums with W = −p, h γ = 0.1 γ: a contraction by that factor."""
-    q, p = box(6)
-    system = dvi.System(lambda t0, t1, q, p, a: p @ p / 2 - jnp.sum(jnp.cos(q)), force=drag)
-    return dvi.integrate(
-        system, q, p, h=0.1, num_steps=8, epsilon=gamma, newton=solver, throw=False, **kwargs
-    )
+PENDULUMS = dvi.System(lambda t0, t1, q, p, a: p @ p / 2 - jnp.sum(jnp.cos(q)), force=drag)
+
+
+def strongly_damped(solver, gamma):
+    """Pendulums with W = −p: fixed-point iteration multiplies an error by h γ = 0.1 γ."""
+    return march(solver, PENDULUMS, *box(6), 0.1, 8, gamma)
 
 
 def test_picard_says_when_it_does_not_converge_and_the_default_goes_on_by_newton():
-    reference = strongly_damped(Newton(), 30.0)
-    assert strongly_damped(Picard(), 30.0).status == "not_converged"
-    for solver in (SimplifiedNewton(), PicardThenNewton()):
-        sol = strongly_damped(solver, 30.0)
-        assert sol.status == "successful"
-        np.testing.assert_allclose(sol.qs, reference.qs, rtol=1e-14)
+    q, _, _ = strongly_damped(Newton(), 30.0)
+    assert bool(strongly_damped(Picard(), 30.0)[2].result == dvi.RESULTS.not_converged)
+    assert is_good(strongly_damped(SimplifiedNewton(), 30.0)[2])
+    found, _, info = strongly_damped(PicardThenNewton(), 30.0)
+    assert is_good(info)
+    np.testing.assert_allclose(found, q, rtol=1e-14)
     # Given up after the second correction, not after twelve; then Newton's one or two.
-    assert int(sol.stats["newton_iterations"]) <= 8 * (2 + 2)
+    assert int(info.iterations) <= 8 * (2 + 2)
 
 
 def test_slow_contraction_is_given_up_too():
-    sol = strongly_damped(PicardThenNewton(), 7.0)
-    assert int(sol.stats["newton_iterations"]) <= 8 * (2 + 2)
-    assert int(strongly_damped(Picard(), 7.0).stats["newton_iterations"]) > 8 * 30
+    *_, default = strongly_damped(PicardThenNewton(), 7.0)
+    *_, picard = strongly_damped(Picard(max_steps=200), 7.0)
+    assert is_good(default)
+    assert is_good(picard)
+    assert int(default.iterations) <= 8 * (2 + 2)
+    assert int(picard.iterations) > 8 * 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["arrays", "components"])
 @pytest.mark.parametrize("name", ["picard", "picard_then_newton"])
 def test_a_lane_that_fails_does_not_spoil_its_neighbours(name, form):
     gammas = jnp.array([0.1, 30.0, 1.0, 0.0])
 
     def run(gamma):
-        sol = strongly_damped(OTHERS[name], gamma, layout=dvi.Layout(form=form))
+        sol = dvi.integrate(
+            PENDULUMS, *box(6), h=0.1, num_steps=8, epsilon=gamma, newton=OTHERS[name],
+            layout=dvi.Layout(form=form), throw=False,
+        )  # fmt: skip
         return sol.qs, sol.result == dvi.RESULTS.successful
 
     qs, good = jax.jit(jax.vmap(run))(gammas)
@@ -257,6 +313,23 @@ def test_a_lane_that_fails_does_not_spoil_its_neighbours(name, form):
     np.testing.assert_array_equal(good, [True, name != "picard", True, True])
     np.testing.assert_array_equal(qs[jnp.array([0, 2, 3])], calm[jnp.array([0, 2, 3])])
     assert bool(jnp.all(jnp.isnan(qs[1][1:]))) == (name == "picard")
+
+
+@pytest.mark.parametrize("name", ["picard", "picard_then_newton"])
+def test_a_step_that_fails_leaves_the_bits_of_its_neighbours(name):
+    def run(gamma):
+        q, p = box(6)
+        return march(OTHERS[name], PENDULUMS, q, p, 0.1, 2, gamma)
+
+    def lanes(gammas):
+        q, _, info = jax.vmap(run)(gammas)
+        return q, info.result == dvi.RESULTS.successful
+
+    q, good = lanes(jnp.array([0.1, 30.0, 1.0]))
+    calm, all_good = lanes(jnp.array([0.1, 0.5, 1.0]))
+    assert all(all_good)
+    np.testing.assert_array_equal(good, [True, name != "picard", True])
+    np.testing.assert_array_equal(q[::2], calm[::2])
 
 
 @EACH
@@ -275,12 +348,11 @@ def test_round_off_of_a_component_that_is_nothing_else_is_accepted():
 
     system = dvi.System(lambda t0, t1, q, p, a: p @ p / 2 - 1 / jnp.sqrt(q @ q), force=drag)
     q, p = turn @ [0.0, 1.2, 0.0], turn @ [-1.0, -0.6, 0.0]
-    at = {"h": 0.05, "num_steps": 200, "epsilon": 0.01}
-    reference = dvi.integrate(system, q, p, **at)
+    reference, *_ = march(Newton(), system, q, p, 0.05, 200, 0.01)
     for solver in (Picard(), SimplifiedNewton()):
-        np.testing.assert_allclose(
-            dvi.integrate(system, q, p, newton=solver, **at).qs, reference.qs, atol=1e-12
-        )
+        found, _, info = march(solver, system, q, p, 0.05, 200, 0.01)
+        assert is_good(info)
+        np.testing.assert_allclose(found, reference, atol=1e-12)
 
 
 def test_a_light_slow_component_is_solved_by_its_own_measure():
@@ -291,16 +363,21 @@ def test_a_light_slow_component_is_solved_by_its_own_measure():
 
     m = np.array([1.0, 1e-12])
     system = dvi.System(H, force=lambda t0, t1, q, p, m: -p * (m < 1))
-    at = {"h": 0.1, "num_steps": 20, "epsilon": 6.0, "args": m}
-    reference = dvi.integrate(system, [1.0, 1.0], m, newton=Newton(), **at)
     for solver in (Picard(max_steps=200), MANY):
-        sol = dvi.integrate(system, [1.0, 1.0], m, newton=solver, **at)
-        np.testing.assert_allclose(sol.ps, reference.ps, rtol=1e-13)
+        q, p = jnp.ones(2), m
+        for _ in range(3):
+            _, p_newton, _ = march(Newton(), system, q, p, 0.1, 1, 6.0, m)
+            q, p1, info = march(solver, system, q, p, 0.1, 1, 6.0, m)
+            assert is_good(info)
+            error = np.abs(p1 - p_newton) / np.maximum(np.abs(p), np.abs(p1))
+            p = p1
+            assert np.max(error) < 8 * EPS
 
 
 # --- on trust, and everywhere ----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @EACH
 def test_components_on_trust_agree_with_arrays(name):
     q, p = np.random.default_rng(3).uniform(-0.5, 0.5, (2, 8, 3))
@@ -324,7 +401,7 @@ def test_components_on_trust_agree_with_arrays(name):
 
 def test_trust_is_refused_to_what_has_not_converged():
     def F(x):
-        return x - 1 + 0.5 * jnp.sin(x)
+        return x - 1 + 0.1 * jnp.sin(x)
 
     x0, one = jnp.full(3, 0.5), jnp.ones(3)
     verdicts = []
@@ -340,13 +417,15 @@ def test_trust_is_refused_to_what_has_not_converged():
 
 def test_single_precision():
     q, p = np.float32(box(6))
-    reference = dvi.integrate(CHAIN, *box(6), h=0.05, num_steps=50)
+    reference, *_ = march(Newton(), CHAIN, *box(6), 0.05, 50)
     for solver in OTHERS.values():
-        sol = dvi.integrate(CHAIN, q, p, h=0.05, num_steps=50, newton=solver)
-        assert sol.qs.dtype == jnp.float32
-        np.testing.assert_allclose(sol.qs, reference.qs, atol=2e-5)
+        found, _, info = march(solver, CHAIN, q, p, 0.05, 50)
+        assert is_good(info)
+        assert found.dtype == jnp.float32
+        assert 1e-8 < np.max(np.abs(found - reference)) < 2e-5
 
 
+@pytest.mark.slow
 def test_compensated_arithmetic_keeps_what_it_gains():
     q, p = box(3, width=0.4)
 
@@ -360,7 +439,7 @@ def test_compensated_arithmetic_keeps_what_it_gains():
     exact = run(Newton(), dvi.Compensated())
     for solver in OTHERS.values():
         np.testing.assert_allclose(run(solver, dvi.Compensated()), exact, rtol=0, atol=4 * EPS)
-    assert np.max(np.abs(run(Picard(), dvi.FloatingPoint()) - exact)) > 16 * EPS
+    assert np.max(np.abs(run(Picard(), dvi.FloatingPoint()) - exact)) > 8 * EPS
 
 
 @pytest.mark.parametrize("n", [1, UNROLLED_UP_TO, UNROLLED_UP_TO + 1])
@@ -372,17 +451,13 @@ def test_factors_solve(n):
 # --- the door --------------------------------------------------------------------------------
 
 
-def test_the_default_is_newtons_for_few_unknowns():
-    q, p = box(3)
-    at = {"h": 0.05, "num_steps": 20}
-    default, reference = (
-        dvi.integrate(CHAIN, q, p, **at),
-        dvi.integrate(CHAIN, q, p, newton=Newton(), **at),
-    )
-    np.testing.assert_array_equal(default.qs, reference.qs)
-    many = dvi.integrate(CHAIN, *box(20), **at)
-    newton = dvi.integrate(CHAIN, *box(20), newton=Newton(), **at)
-    assert int(many.stats["newton_iterations"]) > int(newton.stats["newton_iterations"])
+def test_the_default_is_newtons_for_few_unknowns_and_picards_for_many():
+    few = [march(s, CHAIN, *box(3), 0.05, 20) for s in (PicardThenNewton(), Newton())]
+    np.testing.assert_array_equal(few[0][0], few[1][0])
+    many = [march(s, CHAIN, *box(20), 0.05, 20) for s in (PicardThenNewton(), Picard())]
+    assert int(many[0][2].iterations) == int(many[1][2].iterations)
+    sol = dvi.integrate(CHAIN, *box(3), h=0.05, num_steps=20)
+    np.testing.assert_allclose(sol.qs[-1], few[0][0], rtol=1e-14)
 
 
 @pytest.mark.parametrize("kind", [SimplifiedNewton, Picard])
