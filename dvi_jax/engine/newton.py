@@ -135,7 +135,8 @@ class Newton(RootSolver):
     def solve_on_trust(self, F, x0, scales, effort):
         def improve(_, state):
             x, _ = state
-            correction = solve_near_identity(*value_and_jacobian(F, x)[::-1])
+            value, jacobian = value_and_jacobian(F, x)
+            correction = solve_near_identity(jacobian, value)
             return x - correction, correction
 
         x, correction = lax.fori_loop(0, effort, improve, (x0, x0))
