@@ -17,11 +17,12 @@ class RESULTS(eqx.Enumeration):
 
     successful = ""
     not_converged = (
-        "Newton's iteration for the implicit step did not converge. Likely causes: (a) h is too "
+        "The iteration for the implicit step did not converge. Likely causes: (a) h is too "
         "large for this state, so that the discrete equations have no nearby solution; (b) the "
         "mixed derivative of H_D or the derivative of W in p1 is not continuous there; (c) the "
         "tolerance lies below round-off, where large terms cancel to almost nothing. Try a smaller "
-        "h, or newton=dvi.Newton(max_steps=..., rtol=..., atol=...), atol for (c)."
+        "h, or newton=dvi.Newton(max_steps=..., rtol=..., atol=...), atol for (c). dvi.Picard() "
+        "needs h times the derivative of the rate to be less than one; dvi.Newton() does not."
     )
     not_finite = (
         "The state became NaN or infinite. Likely causes: (a) the start or args already hold a "

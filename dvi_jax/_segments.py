@@ -179,7 +179,7 @@ class _Segment:
         """
         newton = self.task.equations.newton
         assert isinstance(newton, RootSolver)
-        most = max(min(newton.max_steps, MOST_ITERATIONS), FEWEST_ITERATIONS)
+        most = max(min(newton.most_effort(), MOST_ITERATIONS), FEWEST_ITERATIONS)
         like = jax.eval_shape(lambda c: self._on_trust(steps, c, iterations), carry)
         other = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like[1])
         out = self._bare(carry), other

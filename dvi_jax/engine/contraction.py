@@ -119,3 +119,8 @@ def linear_iterations(effort: Int[Array, ""]) -> Int[Array, ""]:
     Lanes of one effort run together; those of another take the same steps once more.
     """
     return 1 << (effort - 1)
+
+
+def most_linear_effort(max_steps: int) -> int:
+    """The effort of most iterations, but not more than `max_steps`."""
+    return max_steps.bit_length()

@@ -44,8 +44,6 @@ class RootSolver(eqx.Module):
     function, to any order; they differ in what an iteration costs and in how many there are.
     """
 
-    max_steps: eqx.AbstractVar[int]
-
     @abc.abstractmethod
     def solve(self, F: Function, x0: Vector, scales: Scales) -> Found:
         """The root near x0, with care: as many iterations as it takes, each one looked at."""
@@ -59,6 +57,10 @@ class RootSolver(eqx.Module):
     @abc.abstractmethod
     def iterations(self, effort: Int[Array, ""], n: int) -> Int[Array, ""]:
         """How many iterations on trust go with an effort, from 2 upwards, for n unknowns."""
+
+    @abc.abstractmethod
+    def most_effort(self) -> int:
+        """The effort above which more iterations are made than the settings allow."""
 
     @abc.abstractmethod
     def solve_tangent(self, linear: Function, rhs: Vector, on_trust: bool) -> Vector:
@@ -149,6 +151,9 @@ class Newton(RootSolver):
 
     def iterations(self, effort, n):
         return effort
+
+    def most_effort(self):
+        return self.max_steps
 
     def solve_tangent(self, linear, rhs, on_trust):
         _, matrix = value_and_jacobian(linear, jnp.zeros_like(rhs))

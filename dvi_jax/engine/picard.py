@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 
-from .contraction import contract, contract_on_trust, linear_iterations
+from .contraction import contract, contract_on_trust, linear_iterations, most_linear_effort
 from .linear import UNROLLED_UP_TO
 from .newton import Found, Function, Newton, RootSolver, Scales, Vector, check_settings
 from .together import on_any_lane
@@ -56,6 +56,9 @@ class Picard(RootSolver):
     def iterations(self, effort, n):
         return linear_iterations(effort)
 
+    def most_effort(self):
+        return most_linear_effort(self.max_steps)
+
     def solve_tangent(self, linear, rhs, on_trust):
         return _without_matrix(self, linear, rhs)
 
@@ -93,10 +96,6 @@ class PicardThenNewton(RootSolver):
             if not isinstance(value, kind):
                 raise TypeError(f"{name} must be a dvi.{kind.__name__}(...), got {value!r}.")
 
-    @property
-    def max_steps(self) -> int:
-        return self.newton.max_steps
-
     def _is_few(self, n: int, on_trust: bool) -> bool:
         if self.newton_up_to is not None:
             return n <= self.newton_up_to
@@ -131,6 +130,9 @@ class PicardThenNewton(RootSolver):
             return self.newton.iterations(effort, n)
         picard, newton = self.picard.iterations(effort, n), self.newton.iterations(_then(effort), n)
         return jnp.where(effort <= _LAST_OF_PICARD, picard, newton)
+
+    def most_effort(self):
+        return self.newton.most_effort()
 
     def solve_tangent(self, linear, rhs, on_trust):
         if self._is_few(rhs.size, on_trust=True):

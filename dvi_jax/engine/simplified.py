@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import Array, Inexact
 
-from .contraction import contract, contract_on_trust, linear_iterations
+from .contraction import contract, contract_on_trust, linear_iterations, most_linear_effort
 from .linear import UNROLLED_UP_TO, solve_dense
 from .newton import RootSolver, Vector, check_settings, value_and_jacobian
 
@@ -51,6 +51,9 @@ class SimplifiedNewton(RootSolver):
 
     def iterations(self, effort, n):
         return linear_iterations(effort)
+
+    def most_effort(self):
+        return most_linear_effort(self.max_steps)
 
     def solve_tangent(self, linear, rhs, on_trust):
         _, matrix = value_and_jacobian(linear, jnp.zeros_like(rhs))
