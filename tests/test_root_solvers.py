@@ -16,6 +16,7 @@ from dvi_jax.engine.linear import UNROLLED_UP_TO
 from dvi_jax.engine.newton import Newton, Trusted, find_root
 from dvi_jax.engine.picard import Picard, PicardThenNewton
 from dvi_jax.engine.simplified import SimplifiedNewton, factorised
+from dvi_jax.engine.tiles import lanewise
 
 EPS = np.finfo(float).eps
 MANY = PicardThenNewton(newton_up_to=0)
@@ -323,13 +324,24 @@ def test_a_step_that_fails_leaves_the_bits_of_its_neighbours(name):
 
     def lanes(gammas):
         q, _, info = jax.vmap(run)(gammas)
-        return q, info.result == dvi.RESULTS.successful
+        return q, info.result == dvi.RESULTS.successful, info.iterations
 
-    q, good = lanes(jnp.array([0.1, 30.0, 1.0]))
-    calm, all_good = lanes(jnp.array([0.1, 0.5, 1.0]))
+    q, good, _ = lanes(jnp.array([0.1, 30.0, 1.0]))
+    calm, all_good, _ = lanes(jnp.array([0.1, 0.5, 1.0]))
     assert all(all_good)
     np.testing.assert_array_equal(good, [True, name != "picard", True])
     np.testing.assert_array_equal(q[::2], calm[::2])
+
+
+def test_many_lanes_take_the_iterations_of_one():
+    """No test may rest on the NaN that stands for a first correction: a batch may lose it."""
+    q, p = np.random.default_rng(5).uniform(-0.3, 0.3, (2, 256, 20))
+
+    def run(q, p):
+        return march(PicardThenNewton(), CHAIN, q, p, 0.02, 2)[2].iterations
+
+    together = jax.vmap(run)(q, p)
+    np.testing.assert_array_equal(together[:4], [run(*x) for x in zip(q[:4], p[:4], strict=True)])
 
 
 @EACH
@@ -413,6 +425,59 @@ def test_trust_is_refused_to_what_has_not_converged():
     assert verdicts == sorted(verdicts)
     assert not verdicts[0]
     assert verdicts[-1]
+
+
+WHIRL = jnp.array([[1.0, 1.0], [-1.0, 1.0]])
+
+
+def whirl(t0, t1, q0, p1, args):
+    """W with ∂W/∂p1 = WHIRL: at h ε = 1 the Jacobian is [[0, −1], [1, 0]], which has no pivot."""
+    return WHIRL @ p1
+
+
+def test_elimination_without_pivots_is_found_out_and_care_is_not():
+    x, known = jnp.array([0.3, 0.4]), jnp.array([1.0, 2.0])
+
+    def in_components(solver):
+        def solve(strength):
+            def F(x):
+                return x - known - strength * WHIRL @ x
+
+            root, info = find_root(F, x, jnp.ones(2), solver)
+            return root, info.residual, info.converged
+
+        layout = dvi.Layout(form="components")
+        return jax.jit(lambda s: lanewise(solve, s, layout=layout, steps=1, entries=2))
+
+    trusted = in_components(Trusted(Newton(), jnp.asarray(2)))
+    good = trusted(0.1)
+    assert float(good[1]) <= 0
+    np.testing.assert_allclose((jnp.eye(2) - 0.1 * WHIRL) @ good[0], known, rtol=1e-15)
+    assert not float(trusted(1.0)[1]) <= 0
+    root, _, converged = in_components(Newton())(1.0)
+    assert bool(converged)
+    np.testing.assert_allclose(root, [2.0, -1.0], rtol=1e-15)
+
+
+@pytest.mark.slow
+def test_lanes_that_need_pivots_are_solved_again_with_care():
+    system = dvi.System(lambda t0, t1, q, p, a: (p @ p + q @ q) / 2, force=whirl)
+
+    def run(form):
+        def one(epsilon):
+            sol = dvi.integrate(
+                system, [0.3, 0.1], [0.2, 0.5], h=0.5, num_steps=40, epsilon=epsilon,
+                layout=dvi.Layout(form=form), throw=False, save=dvi.Save(final=True),
+            )  # fmt: skip
+            return sol.qs[-1], sol.result == dvi.RESULTS.successful, sol.stats["max_residual"]
+
+        return jax.jit(jax.vmap(one))(jnp.array([0.02, 2.0, -0.1]))
+
+    (q, good, residual), (q_arrays, _, _) = run("components"), run("arrays")
+    assert all(good)
+    np.testing.assert_allclose(q, q_arrays, rtol=1e-12)
+    on_trust = np.asarray(residual) == 64 * EPS
+    np.testing.assert_array_equal(on_trust, [True, False, True])
 
 
 def test_single_precision():

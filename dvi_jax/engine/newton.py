@@ -124,7 +124,7 @@ class Newton(RootSolver):
             relative = largest(error / jnp.where(scale > 0, scale, 1))
             small = largest(error) <= rtol * largest(scale) + self.atol
             stalled = small & (relative >= 0.5 * state.relative)
-            finite = jnp.isfinite(largest(correction))
+            finite = jnp.all(jnp.isfinite(correction))
             return _Iterate(x, relative, finite, settled | stalled, state.iterations + 1)
 
         no = jnp.asarray(False)
