@@ -140,6 +140,10 @@ def _box(system, n: int, lanes: int, h: float, steps: int, width=0.3) -> Row:
     return Row(system, q, p, h, steps)
 
 
+def _name(of: str, lanes: int) -> str:
+    return f"{of}, {lanes} lane" + "s" * (lanes > 1)
+
+
 def rows() -> dict[str, Row]:
     """All rows by name."""
     of_planets = {
@@ -149,26 +153,26 @@ def rows() -> dict[str, Row]:
     made = {}
     for name, (system, epsilon) in of_planets.items():
         for lanes, steps in ((1, 1000), (64, 200)):
-            made[f"{name}, {lanes} lanes"] = Row(system, *planets(lanes), 0.5, steps, epsilon)
+            made[_name(name, lanes)] = Row(system, *planets(lanes), 0.5, steps, epsilon)
     gauss = dvi.GaussLegendre(2)
     relativity = of_planets["ten bodies, relativity"][0]
-    made["ten bodies, Gauss, 1 lanes"] = Row(relativity, *planets(1), 0.5, 200, 0.0, gauss)
+    made["ten bodies, Gauss, 1 lane"] = Row(relativity, *planets(1), 0.5, 200, 0.0, gauss)
     for n in (2, 4, 10, 20, 30, 100):
-        made[f"chain {n}, 1 lanes"] = _box(dvi.System(chain), n, 1, 0.02, 2000 if n < 100 else 200)
+        made[f"chain {n}, 1 lane"] = _box(dvi.System(chain), n, 1, 0.02, 2000 if n < 100 else 200)
     for n in (2, 4, 10, 20, 30):
         made[f"chain {n}, 256 lanes"] = _box(dvi.System(chain), n, 256, 0.02, 400)
     for n in (10, 20):
-        made[f"full {n}, 1 lanes"] = _box(dvi.System(web), n, 1, 0.02, 2000)
+        made[f"full {n}, 1 lane"] = _box(dvi.System(web), n, 1, 0.02, 2000)
         made[f"full {n}, 256 lanes"] = _box(dvi.System(web), n, 256, 0.02, 400)
     two = systems.n_body()
-    made["figure eight, Gauss, 1 lanes"] = Row(
+    made["figure eight, Gauss, 1 lane"] = Row(
         two.system, two.q0[None], two.p0[None], 0.05, 1000, 0.0, gauss
     )
     pendulums = dvi.System(separate_pendulums, force=strong_drag)
     for n in (2, 20):
         for lanes, steps in ((1, 1000), (256, 400)):
             row = _box(pendulums, n, lanes, 0.1, steps)
-            made[f"control, drag {n}, {lanes} lanes"] = row._replace(epsilon=30.0)
+            made[_name(f"control, drag {n}", lanes)] = row._replace(epsilon=30.0)
     return made
 
 

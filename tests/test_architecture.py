@@ -87,6 +87,7 @@ def test_door_has_no_logic():
 
 PUBLIC = """
 System discretise integrate Save Solution RESULTS IntegrationError Newton
+RootSolver SimplifiedNewton Picard PicardThenNewton
 legendre from_lagrangian from_type_iii velocity_force Layout configure_cpu
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
 GaussLegendre LobattoIIIAIIIB RungeKutta4

@@ -18,8 +18,8 @@ class SimplifiedNewton(RootSolver):
 
     The Jacobian and its factors, the dear parts of Newton's method for many unknowns, are made
     once a step; convergence is linear, with a factor of about the relative change of the Jacobian
-    from the guess to the root, O(h²) for the type II map. It converges where Newton's method from
-    the same guess does, nearly, also where h times the derivative of the rate is larger than one.
+    from the guess to the root, O(h²) for the type II map. Unlike Picard's it may converge where h
+    times the derivative of the rate is larger than one, unless that derivative changes much.
 
     Stops as `Picard` does, by the error that the linear convergence leaves; same arguments. Its
     derivatives are Newton's: the Jacobian at the root.
