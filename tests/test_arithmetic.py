@@ -504,6 +504,7 @@ def gradient(arithmetic, adjoint, is_implicit):
     "adjoint",
     [pytest.param(a, marks=[] if a == "Direct" else [pytest.mark.slow]) for a in ADJOINTS],
 )
+@pytest.mark.slow
 def test_gradients_are_those_of_the_map(adjoint):
     """As with plain sums: to round-off; in fixed point to the quantum, as a coarse one shows."""
     plain = gradient(dvi.FloatingPoint(), "Direct", True)

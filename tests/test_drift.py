@@ -232,6 +232,7 @@ def energy_surface():
     )
 
 
+@pytest.mark.slow
 def test_surface_measures_the_order_of_the_mesh_defect():
     """The energy of a first-order map errs as h, whatever ε."""
     surface = energy_surface()

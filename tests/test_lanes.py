@@ -365,6 +365,7 @@ def test_everything_else_goes_by_components(settings):
     assert_same(*(r(*arguments) for r in runs), rtol=1e-9 if "lattice" in settings else 1e-11)
 
 
+@pytest.mark.slow
 def test_large_steps_take_more_iterations_and_lose_no_digit():
     q, p = starts()
     a, b = (runner("coupled", x, num_steps=30)(q, p, 0.15, 0.5) for x in (COMPONENTS, ARRAYS))
@@ -395,6 +396,7 @@ def test_a_lane_that_fails_is_told_and_leaves_the_others_alone():
 
 
 @pytest.mark.parametrize("width", [16, pytest.param(8, marks=SLOW)])
+@pytest.mark.slow
 def test_tiles_do_not_matter(width):
     """37 lanes in tiles of 8 or 16 (the last one filled up), the bits of one tile."""
     tiles = runner("kepler", dvi.Layout(form="components", width=width), num_steps=20)

@@ -68,6 +68,7 @@ CHOSEN = dvi.System(
 
 @pytest.mark.parametrize("what", ["grad", pytest.param("jvp", marks=SLOW)])
 @pytest.mark.parametrize("lanes_of", [pytest.param("state", marks=SLOW), "which"])
+@pytest.mark.slow
 def test_derivatives_beside_whole_numbers_and_truth_values(what, lanes_of):
     """Integers in args are traced, and vary from lane to lane; they have no derivative."""
     q, p = starts(4, 2)

@@ -89,6 +89,7 @@ def ten_bodies(solver, num_steps=100, epsilon=1e-6):
     return march(solver, TEN, *planets(), 0.5, num_steps, epsilon, TEN_ARGS)
 
 
+@pytest.mark.slow
 def test_ten_bodies_take_two_iterations():
     q1, p1, _ = ten_bodies(Newton(), num_steps=1)
     q, _, _ = ten_bodies(Newton())
@@ -163,6 +164,7 @@ SOLVED = {
 
 
 @pytest.mark.parametrize("method", list(SOLVED))
+@pytest.mark.slow
 def test_all_implicit_methods_agree_with_newton(method):
     q, p = box(5)
     runs = [
@@ -176,6 +178,7 @@ def test_all_implicit_methods_agree_with_newton(method):
 
 
 @EACH
+@pytest.mark.slow
 def test_the_map_stays_symplectic(name):
     q, p = box(5)
 
@@ -221,6 +224,7 @@ def test_gradients_are_newtons(adjoint):
             np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_steps_is_newtons():
     q, p = box(20)
 
@@ -333,6 +337,7 @@ def test_a_step_that_fails_leaves_the_bits_of_its_neighbours(name):
     np.testing.assert_array_equal(q[::2], calm[::2])
 
 
+@pytest.mark.slow
 def test_many_lanes_take_the_iterations_of_one():
     """No test may rest on the NaN that stands for a first correction: a batch may lose it."""
     q, p = np.random.default_rng(5).uniform(-0.3, 0.3, (2, 256, 20))
@@ -367,6 +372,7 @@ def test_round_off_of_a_component_that_is_nothing_else_is_accepted():
         np.testing.assert_allclose(found, reference, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_light_slow_component_is_solved_by_its_own_measure():
     """Two masses, 1 and 1e-12; the light one contracts slowly, which the other must not hide."""
 
@@ -480,6 +486,7 @@ def test_lanes_that_need_pivots_are_solved_again_with_care():
     np.testing.assert_array_equal(on_trust, [True, False, True])
 
 
+@pytest.mark.slow
 def test_single_precision():
     q, p = np.float32(box(6))
     reference, *_ = march(Newton(), CHAIN, *box(6), 0.05, 50)
@@ -516,6 +523,7 @@ def test_factors_solve(n):
 # --- the door --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_default_is_newtons_for_few_unknowns_and_picards_for_many():
     few = [march(s, CHAIN, *box(3), 0.05, 20) for s in (PicardThenNewton(), Newton())]
     np.testing.assert_array_equal(few[0][0], few[1][0])

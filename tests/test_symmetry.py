@@ -182,6 +182,7 @@ def random_case(seed, z):
 
 @settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 2**31), z=st.integers(0, 2))
+@pytest.mark.slow
 def test_balance_closes_for_any_generator_gauge_and_mesh(seed, z):
     b, size = balance(*random_case(seed, z))
     assume(np.isfinite(size))  # the law speaks of solutions; now and then a random step has none
