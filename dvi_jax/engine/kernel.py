@@ -396,10 +396,10 @@ class _InBlock(Evaluator):
         if name in ("while", "cond"):
             return self._inside(None, lambda: super(_InBlock, self).equation(eqn, values))
         if eqn.params.get("name") == "solve_dense" and len(values) == 2:
-            return self._solve(values)
+            return self.with_exchanges(eqn, values)
         return super().equation(eqn, values)
 
-    def _solve(self, values: list[Value]) -> list[Value]:
+    def with_exchanges(self, eqn: Any, values: list[Value]) -> list[Value]:
         """A dense solve of any size without the library."""
         shapes = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in values]
         return self.closed(jax.make_jaxpr(by_elimination)(*shapes), values)

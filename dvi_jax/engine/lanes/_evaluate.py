@@ -590,6 +590,10 @@ class Evaluator:
         chosen = [self.select(which, cases) for cases in zip(*results, strict=True)]
         return unpack(chosen)
 
+    def with_exchanges(self, eqn: Any, values: list[Value]) -> list[Value]:
+        """The solution of a dense system, by elimination that exchanges rows."""
+        return self._batched(eqn, values)
+
     def linear_solve(self, eqn: Any, values: list[Value]) -> list[Value]:
         """custom_linear_solve: what it solves with."""
         lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
@@ -658,23 +662,25 @@ def _mended(evaluator: Evaluator, eqn: Any, values: list[Value], solution: Value
         for a, x in zip(row, solution.entries(), strict=True):
             remainder[i] = subtract(remainder[i], multiply(a, x))
 
-    def size(entries):
-        sizes = [jnp.abs(as_array(e, dtype)) for e in entries if e is not ZERO]
-        return functools.reduce(jnp.maximum, sizes, jnp.zeros((), dtype))
+    def size(entries):  # a sum, which passes on what is not finite
+        return sum((jnp.abs(as_array(e, dtype)) for e in entries if e is not ZERO), start=0.0)
 
-    bound = 256 * jnp.finfo(dtype).eps * size(matrix.entries().flat) * size(solution.entries())
-    is_given = jnp.isfinite(size(matrix.entries().flat)) & jnp.isfinite(size(vector.entries()))
+    of_matrix = size(matrix.entries().flat) / vector.size  # about that of a row
+    bound = 256 * jnp.finfo(dtype).eps * of_matrix * size(solution.entries())
+    is_given = jnp.isfinite(of_matrix) & jnp.isfinite(size(vector.entries()))
     lost = is_given & ~(size(remainder) <= bound)
     on = any(map(evaluator.has_lanes, (*values, solution)))
     found = evaluator.pack(solution, on)
 
     def with_exchanges():
-        (other,) = evaluator._batched(eqn, values)
+        (other,) = evaluator.with_exchanges(eqn, values)
         return [
             jnp.where(lost, a, b) for a, b in zip(evaluator.pack(other, on), found, strict=True)
         ]
 
-    return split(lax.cond(jnp.any(lost), with_exchanges, lambda: found), solution.shape, dtype)
+    return split(
+        lax.cond(evaluator.on_any(lost), with_exchanges, lambda: found), solution.shape, dtype
+    )
 
 
 _CALLS = frozenset(
@@ -727,7 +733,7 @@ def fits_in_a_kernel(eqn: Any) -> bool:
 def _is_written_out(eqn: Any) -> bool:
     """Whether the compiler has no library for an equation: what is left in arrays may have one."""
     name = eqn.primitive.name
-    if name in _WITH_LIBRARIES and aval(eqn.invars[0]).dtype != bool:
+    if name not in _IN_KERNELS or (name in _WITH_LIBRARIES and aval(eqn.invars[0]).dtype != bool):
         return False
     return all(_is_written_out(e) for body in bodies(eqn) for e in body.jaxpr.eqns)
 
