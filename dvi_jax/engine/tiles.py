@@ -419,4 +419,5 @@ class _Form:
         # Lanes last first, so that a `vmap` which wants them there finds nothing to transpose.
         parts = [jnp.moveaxis(x, 0, -2) for x in rows]
         out = jnp.stack(parts, self.depth) if self.is_split else parts[0]
-        return jnp.moveaxis(out.reshape(*self.shape, -1)[..., :lanes], -1, 0)
+        padded = math.prod(out.shape[-2:])
+        return jnp.moveaxis(out.reshape(*self.shape, padded)[..., :lanes], -1, 0)

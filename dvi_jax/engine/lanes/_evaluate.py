@@ -731,14 +731,20 @@ def fits_in_a_kernel(eqn: Any) -> bool:
 
 
 def _is_written_out(eqn: Any) -> bool:
-    """Whether the compiler has no library for an equation: what is left in arrays may have one."""
+    """Whether the compiler writes an equation out in place, and has no library for it; what is
+    left in arrays may have one."""
     name = eqn.primitive.name
-    if name not in _IN_KERNELS or (name in _WITH_LIBRARIES and aval(eqn.invars[0]).dtype != bool):
+    if name not in _IN_KERNELS or name in _NOT_IN_PLACE:
         return False
     return all(_is_written_out(e) for body in bodies(eqn) for e in body.jaxpr.eqns)
 
 
-_WITH_LIBRARIES = frozenset([*REDUCTIONS, *CUMULATIVE, "argmax", "argmin", "dot_general"])
+_NOT_IN_PLACE = frozenset(
+    [
+        *(set(REDUCTIONS) - {"reduce_and", "reduce_or"}),
+        *(*CUMULATIVE, "argmax", "argmin", "dot_general", "scatter", "scatter-add"),
+    ]
+)
 
 
 def stays_whole(value: Value) -> bool:
