@@ -27,7 +27,7 @@ from .kernel import NotInKernelError, run_in_kernel
 from .lanes import Evaluator, Value, operation_count
 from .lanes._value import as_array, on_lanes, whole
 
-LARGEST = 5_000
+LARGEST = 20_000
 """A function of more operations than this, loops counted once, is left in arrays."""
 
 SHORTEST = 100_000

@@ -718,7 +718,8 @@ _SPECIAL: dict[str, Callable[[Evaluator, Any, list[Value]], list[Value]]] = {
 _IN_KERNELS = frozenset(
     [
         *(*ELEMENTWISE, *REDUCTIONS, *CUMULATIVE, *MOVES, *LABELLED, *_CALLS, *_SPECIAL),
-        *("argmax", "argmin", "dot_general", "iota", "scatter-add"),
+        *("argmax", "argmin", "bitcast_convert_type", "dot_general", "iota", "scatter-add"),
+        "optimization_barrier",
     ]
 )
 
