@@ -361,8 +361,9 @@ def test_every_method_goes_by_components(system, method):
 def test_everything_else_goes_by_components(settings):
     system = "coupled" if "lattice" in settings else "kepler"
     arguments = (*starts(), 0.02, 0.5)
-    runs = [runner(system, x, num_steps=40, **settings) for x in (COMPONENTS, ARRAYS)]
-    assert_same(*(r(*arguments) for r in runs), rtol=1e-9 if "lattice" in settings else 1e-11)
+    num_steps = 15 if "lattice" in settings else 40  # its steps amplify round-off
+    runs = [runner(system, x, num_steps=num_steps, **settings) for x in (COMPONENTS, ARRAYS)]
+    assert_same(*(r(*arguments) for r in runs), rtol=1e-11)
 
 
 @pytest.mark.slow
