@@ -428,17 +428,24 @@ def _pull_back(
         if segments == 0:
             return undo_steps(known_start, end, first, count, last, at_save, grad, cot)
         inner, size = saved.inner, piece_length(count, settings.checkpoint_every)
-        newest = jax.tree.map(lambda x: x[-1], inner)
-        k, rest = first + segments * size, count - segments * size
-        grad, cot = undo_steps(newest, end, k, rest, last, at_save, grad, cot)
+        rest = count - segments * size
+        if rest == size:  # the last piece goes with the others: it need not be compiled twice
+            ends = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), inner, end)
+        else:
+            ends, k = inner, first + segments * size
+            newest = jax.tree.map(lambda x: x[-1], inner)
+            grad, cot = undo_steps(newest, end, k, rest, last, at_save, grad, cot)
 
         def segment(state, x):
             k, grad, cot = state
             start, end = x
             return (k - size, *undo_steps(start, end, k, size, last, at_save, grad, cot)), None
 
-        starts = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), known_start, inner)
-        (_, grad, cot), _ = lax.scan(segment, (k - size, grad, cot), (starts, inner), reverse=True)
+        starts = jax.tree.map(
+            lambda a, b: jnp.concatenate([a[None], b])[: len(ends[0])], known_start, inner
+        )
+        k = first + (len(ends[0]) - 1) * size
+        (_, grad, cot), _ = lax.scan(segment, (k, grad, cot), (starts, ends), reverse=True)
         return grad, cot
 
     start_state = (q_start, p_start)

@@ -81,6 +81,11 @@ def _split(x, *, sizes, axis, **_):
     return tuple(np.split(x, np.cumsum(sizes)[:-1], axis))
 
 
+def _unstack(x: np.ndarray, *, axis: int, **_: Any) -> tuple[np.ndarray, ...]:
+    rows = np.moveaxis(x, axis, 0)
+    return tuple(rows[i, ...] for i in range(len(rows)))  # "...": an array, of one entry too
+
+
 MOVES: dict[str, Callable] = {
     "broadcast_in_dim": _broadcast_in_dim,
     "reshape": lambda x, *, new_sizes, **_: x.reshape(new_sizes),
@@ -90,7 +95,7 @@ MOVES: dict[str, Callable] = {
     "rev": lambda x, *, dimensions, **_: np.flip(x, tuple(dimensions)),
     "slice": _slice,
     "stack": lambda *xs, axis, **_: np.stack(xs, axis),
-    "unstack": lambda x, *, axis, **_: tuple(np.moveaxis(x, axis, 0)),
+    "unstack": _unstack,
     "tile": lambda x, *, reps, **_: np.tile(x, tuple(reps)),
     "concatenate": lambda *xs, dimension, **_: np.concatenate(xs, axis=dimension),
     "pad": _pad,
