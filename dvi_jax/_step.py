@@ -68,16 +68,13 @@ class Equations(eqx.Module):
         """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
         q0, p1 = self.absolute(q0, p1)
         at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
-        gradient = jax.grad(self.system.hamiltonian, argnums=2)(*at)
-        if self.system.force is None:
-            return -gradient
-        return -gradient + self.system.disturbing_force(*at).astype(gradient.dtype)
+        return _momentum_rate(self.system, *at)
 
     def position_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""
         q0, p1 = self.absolute(q0, p1)
         at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
-        return jax.grad(self.system.hamiltonian, argnums=3)(*at)
+        return _position_rate(self.system, *at)
 
     def step_is_explicit(self, interval: Interval, like: State) -> bool:
         """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""
@@ -86,6 +83,23 @@ class Equations(eqx.Module):
     def inverse_is_explicit(self, interval: Interval, like: State) -> bool:
         """Whether q0 does not enter ∂H_D/∂p1, so that inverse and adjoint need no solve."""
         return not depends_on(lambda q0: self.position_rate(interval, q0, like), 0, like)
+
+
+# Jitted, so that the many places which a rollout takes them from share one trace of the user's
+# functions, and of their derivatives.
+
+
+@eqx.filter_jit
+def _momentum_rate(system: System, *at) -> State:
+    gradient = jax.grad(system.hamiltonian, argnums=2)(*at)
+    if system.force is None:
+        return -gradient
+    return -gradient + system.disturbing_force(*at).astype(gradient.dtype)
+
+
+@eqx.filter_jit
+def _position_rate(system: System, *at) -> State:
+    return jax.grad(system.hamiltonian, argnums=3)(*at)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))

@@ -60,7 +60,7 @@ def check(function, *args, rtol=1e-12, patterns=None):
     if patterns is None:
         patterns = [[True] * len(args), None]
         if len(args) > 1:
-            patterns += [[i != k for i in range(len(args))] for k in range(len(args))]
+            patterns.append([False, *patterns[0][1:]])
     for on in patterns:
         mine = [a if on is None or o else a[1] for a, o in zip(args, on or args, strict=True)]
         if on is None:
@@ -970,3 +970,18 @@ def test_random_functions(program, seed):
 def test_derivatives_of_random_functions(program, seed):
     f = with_derivatives(random_function(program))
     check(f, f64(3, seed=seed), f64(3, seed=seed + 9), rtol=1e-7, patterns=[[True, True], None])
+
+
+def test_a_loop_that_does_not_read_all_that_it_is_given():
+    """The compiler would end the process over an input of its one function that is not read."""
+
+    def function(x, y):
+        is_positive = jnp.sin(x) > 0
+        state = (jnp.zeros(3, int), jnp.sin(y))
+
+        def body(state):
+            return jnp.where(is_positive, state[0] + 1, 9), state[1]
+
+        return lax.while_loop(lambda state: jnp.any(state[0] < 3), body, state)[0], x * 0
+
+    check(function, f64(3), f64(3, seed=1), patterns=[[True, True]])
