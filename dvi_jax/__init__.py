@@ -9,7 +9,6 @@ from ._adapters import (
 from ._adjoints import (
     Checkpointed as Checkpointed,
     Direct as Direct,
-    Reversible as Reversible,
 )
 from ._arithmetic import (
     Arithmetic as Arithmetic,
@@ -21,6 +20,7 @@ from ._discretise import discretise as discretise
 from ._energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
 from ._integrate import integrate as integrate
 from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
+from ._reversible import Reversible as Reversible
 from ._solution import Save as Save, Solution as Solution
 from ._system import System as System
 from .engine.cpu import configure_cpu as configure_cpu

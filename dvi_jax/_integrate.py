@@ -12,13 +12,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from ._adjoints import AbstractAdjoint, Outcome, Reversible
+from ._adjoints import AbstractAdjoint, Outcome
 from ._arithmetic import Arithmetic, FixedPoint, FloatingPoint
 from ._compat import is_traced
 from ._dense import Curve, at_times, crossings, stopped
 from ._extended import run_extended
 from ._precision import refuse_double_without_x64
 from ._results import RESULTS, IntegrationError
+from ._reversible import Reversible
 from ._rollout import (
     Plan,
     StepTaken,
@@ -192,6 +193,10 @@ def integrate(
         outcome = _whole(task, plan, q0, p0, adjoint, layout)
     elif traced:
         raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
+    elif isinstance(adjoint, Reversible) and adjoint.report_defect:
+        raise ValueError(
+            "report_defect=True cannot be reported with progress: leave one of them out."
+        )
     else:
         outcome = _in_pieces(task, plan, q0, p0, num_steps, progress)
 
@@ -269,7 +274,7 @@ def _with_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes,
 @eqx.filter_jit
 def _solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
     """What a run has left behind, as its user sees it."""
-    carry, saved, reduced = outcome
+    carry, saved, reduced, defect = outcome
     curve = Curve(task.method, task.equations)
     first = task.interval(jnp.asarray(0, jnp.int32))
     safe = Start(first.t0, first.t1, first.t1, q0, p0)
@@ -307,6 +312,7 @@ def _solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: 
             "failed_step": carry.failed_step,
             "failed_residual": carry.failed_residual,
             **task.lattice.report(carry.lattice),
+            **({} if defect is None else {"round_trip_defect": defect}),
         },
         stop=None if task.stop is None else stopped(curve, task.stop, carry.stop, safe),
     )

@@ -19,6 +19,7 @@ FLOORS = [
     ["_rollout", "_extended", "_dense"],
     ["_segments"],
     ["_adjoints"],
+    ["_reversible"],
     ["_integrate"],
     ["invariants"],
     ["__init__", "systems", "plot"],

@@ -106,8 +106,8 @@ _ALL = (
     ),
     Check(
         "traces",
-        "Further traces of H_D when q0, p0, t0, h, ε and args change and the method is made anew. "
-        "None.",
+        "Further traces of the run when q0, p0, t0, h, ε and args change and the method is made "
+        "anew. None.",
         programs.retraces,
         ".0f",
     ),

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import problems
 from .candidate import POINT, Candidate, one_step_of_central, point
 from .measured import Measured, at_most, not_measured
 
@@ -16,7 +15,7 @@ def jit_equals_eager(candidate: Candidate) -> Measured:
     """The largest difference of one step compiled from the same step op by op, relative."""
     compiled, _ = candidate.counted_step
     with jax.disable_jit():
-        eager = one_step_of_central(problems.CENTRAL, candidate.method, 1.0)
+        eager = one_step_of_central(candidate.method, 1.0)
     return at_most(_relative(compiled, eager), SAME)
 
 
@@ -42,10 +41,10 @@ def failed_lane(candidate: Candidate) -> Measured:
 
 
 def retraces(candidate: Candidate) -> Measured:
-    """Traces of H_D when q0, p0, h, ε, args and t0 change and the method is made anew."""
+    """Traces of the run when q0, p0, h, ε, args and t0 change and the method is made anew."""
     _, (first, *further) = candidate.counted_step
     if first < 1:
-        return not_measured("≤ 0", "the method never asks for H_D")
+        return not_measured("≤ 0", "the run was not traced")
     return at_most(float(max(further)), 0.0, detail=f"{first} calls while it is compiled")
 
 

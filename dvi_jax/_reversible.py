@@ -1,0 +1,543 @@
+"""Gradients that flow back along states which are rebuilt, not stored."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from ._adjoints import AbstractAdjoint, Checkpointed, Outcome
+from ._arithmetic import FloatingPoint
+from ._compat import is_traced
+from ._rollout import (
+    Plan,
+    Saved,
+    StepTaken,
+    Task,
+    counted_scan,
+    piece_length,
+    reduce,
+    run,
+    start,
+    take_step,
+    with_tail,
+)
+from ._segments import can_trust, largest_divisor, run_in_segments
+from ._step import Equations
+from ._types import State
+from .engine.lanes import in_arrays
+from .engine.newton import Known, RootSolver, Trusted
+from .engine.tiles import Layout, lanewise
+from .engine.together import on_any_lane
+from .methods import TypeII
+
+BACKWARD_ITERATIONS = 3
+"""Of Newton's method in an inverse step, on trust."""
+
+LOOKS = 16
+"""Steps back between two looks at how large the components are."""
+
+
+class Reversible(AbstractAdjoint):
+    r"""Reverse mode that rebuilds the states by the inverse step instead of storing them.
+
+    Going backwards from λ_{k+1}, the state before the step is Φ_h⁻¹(q_{k+1}, p_{k+1}) and
+
+        λ_k = (∂Φ_h/∂(q_k, p_k))ᵀ λ_{k+1},     dL/dθ += (∂Φ_h/∂θ)ᵀ λ_{k+1}.
+
+    Memory does not grow with num_steps but for one state about every `checkpoint_every` steps, from
+    which the rebuilding starts afresh: it amplifies round-off on chaotic or dissipative arcs.
+    Where a rebuilt component misses the stored one by more than `max_defect` of its own size
+    (None means 1e-6 in float64 and 1e-3 in float32; where that is round-off of the largest
+    component, by more than this), or an inverse step has no solution, the lane goes from that
+    checkpoint once more, its states stored: slower, and right for any dynamics. The gradient of a
+    trajectory that has failed is NaN. With `report_defect` the solution gives the largest of these
+    misses, in ``stats["round_trip_defect"]`` (relative, ∞ where an inverse step has no solution),
+    for as much time as the states take to be rebuilt.
+
+    Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
+    without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop`, and a system
+    or observable that *closes over* a value being differentiated (better: hand it over in args),
+    are differentiated as by `Checkpointed`.
+
+    **Raises** `ValueError` for settings that are not positive, and for `report_defect` where no
+    states are rebuilt.
+
+    **Source** our own combination; reversible backpropagation: Maclaurin, Duvenaud & Adams 2015.
+    """
+
+    checkpoint_every: int = eqx.field(static=True, default=100)
+    max_defect: float | None = eqx.field(static=True, default=None)
+    report_defect: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        every = self.checkpoint_every
+        if isinstance(every, bool) or not isinstance(every, int) or every < 1:
+            raise ValueError(f"checkpoint_every must be a positive integer, got {every!r}.")
+        if self.max_defect is not None and not self.max_defect > 0:
+            raise ValueError(f"max_defect must be positive, got {self.max_defect!r}.")
+        if not isinstance(self.report_defect, bool):
+            raise TypeError(f"report_defect must be True or False, got {self.report_defect!r}.")
+
+    def allowed(self, dtype) -> float:
+        """The largest miss that is let pass."""
+        return self.max_defect or (1e-6 if jnp.dtype(dtype).itemsize >= 8 else 1e-3)
+
+    def rollout(self, task, plan, q0, p0, layout=Layout()):
+        why = _why_not(task, q0, p0)
+        if why:
+            if self.report_defect:
+                raise ValueError(
+                    f"report_defect=True asks how well states are rebuilt, but none are: {why}. "
+                    "Leave it out: gradients go by dvi.Checkpointed() here."
+                )
+            return Checkpointed().rollout(task, plan, q0, p0, layout)
+        theta, others = eqx.partition(task, eqx.is_inexact_array)
+        # Whole numbers and truth values may be traced as well: inputs without a derivative.
+        whole, fixed = eqx.partition(others, eqx.is_array)
+        size, steps = 2 * q0.size, plan.num_steps
+
+        @jax.jit  # so that its uses below share one trace, and one trace of its derivative
+        def forward(inputs, whole):
+            theta, q0, p0 = inputs
+            task = eqx.combine(theta, whole, fixed)
+            return finish(
+                task, run(task, plan, start(task, q0, p0), counted_scan, self._inner_loop)
+            )
+
+        def on_trust(inputs, whole):
+            theta, q0, p0 = inputs
+            task = eqx.combine(theta, whole, fixed)
+            begin = start(task, q0, p0)
+            every, one_row = self.checkpoint_every, layout.in_kernel
+            return finish(task, run_in_segments(task, plan, begin, every, one_row))
+
+        def finish(task, ran):
+            carry, saved, tail = ran
+            kept, counts = eqx.partition(with_tail(plan, saved, tail), eqx.is_inexact_array)
+            smooth = _Smooth(carry.q, carry.p, kept, reduce(task, carry))
+            return smooth, (carry, saved, tail, counts)
+
+        fast = on_trust if can_trust(task) else forward
+
+        @jax.custom_jvp
+        def trajectory(inputs, whole):
+            return lanewise(
+                fast, inputs, whole, layout=layout, steps=steps, entries=size, plain=forward
+            )
+
+        @trajectory.defjvp
+        def _(primals, tangents):
+            # The tangent is L·dx with L the derivative. Written as the solution (u, v) of the
+            # linear system u = dx, v − L u = 0, it may be given a transpose of its own: forward
+            # mode runs L along the scan, reverse mode runs Lᵀ on rebuilt states.
+            (inputs, whole), (change, _) = primals, tangents
+            smooth, trace = trajectory(inputs, whole)
+
+            def derivative(inputs, whole, u):
+                return jax.jvp(lambda x: forward(x, whole)[0], (inputs,), (u,))[1]
+
+            def quick(inputs, whole, u):
+                return jax.jvp(lambda x: fast(x, whole)[0], (inputs,), (u,))[1]
+
+            def push(u):
+                return lanewise(
+                    quick, inputs, whole, u,
+                    layout=layout, steps=steps, entries=2 * size, plain=derivative,
+                )  # fmt: skip
+
+            # As one vector: the transposition of a linear solve wants all parts of its right side
+            # to be linear in the tangents, also those that are zero.
+            rhs, unravel = ravel_pytree((change, jax.tree.map(jnp.zeros_like, smooth)))
+
+            def flat(u, v):
+                return ravel_pytree((u, v))[0]
+
+            def matvec(x):
+                u, v = unravel(x)
+                return flat(u, jax.tree.map(jnp.subtract, v, derivative(inputs, whole, u)))
+
+            def solve(_, b):
+                u, v = unravel(b)
+                return flat(u, jax.tree.map(jnp.add, v, push(u)))
+
+            def transpose_solve(_, b):
+                u, v = unravel(b)
+                back = lanewise(
+                    lambda whole, *x: _pull_back(
+                        self, eqx.combine(whole, fixed), plan, not layout.in_kernel, *x
+                    ),
+                    whole, inputs, trace, v, layout=layout, steps=steps, entries=2 * size,
+                )  # fmt: skip
+                return flat(jax.tree.map(jnp.add, u, back), v)
+
+            solver: Any = lax.custom_linear_solve  # its annotations differ between versions
+            _, moved = unravel(solver(matvec, rhs, solve, transpose_solve))
+            return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
+
+        smooth, (carry, saved, tail, counts) = trajectory((theta, q0, p0), whole)
+        rebuilt = None
+        if self.report_defect:
+
+            def defect(theta, whole, *of):
+                task = eqx.combine(theta, whole, fixed)
+                return _round_trip_defect(self, task, plan, *of)
+
+            rebuilt = lanewise(
+                defect, *lax.stop_gradient((theta, whole, (q0, p0), saved, tail)),
+                layout=layout, steps=steps, entries=size,
+            )  # fmt: skip
+        kept = eqx.combine(smooth.saved, counts)
+        return Outcome(carry._replace(q=smooth.q, p=smooth.p), kept, smooth.reduced, rebuilt)
+
+    def _inner_loop(self, body, state, first, stride, count):
+        """A scan over the steps of a block that keeps the state every `checkpoint_every` steps."""
+        size = piece_length(count, self.checkpoint_every)
+        segments = (count - 1) // size  # the end of the block is kept anyway
+        if segments == 0:
+            return counted_scan(body, state, first, stride, count)
+
+        def segment(state, k):
+            state, _ = counted_scan(body, state, k, stride, size)
+            return state, (state[0].q, state[0].p)
+
+        state, ends = counted_scan(segment, state, first, stride * size, segments)
+        whole = segments * size
+        state, _ = counted_scan(body, state, first + stride * whole, stride, count - whole)
+        return state, ends
+
+
+class _Smooth(NamedTuple):
+    """The outputs of a trajectory that have derivatives."""
+
+    q: State
+    p: State
+    saved: Saved
+    reduced: list[Any]
+
+
+def _no_tangent(x):
+    if jnp.issubdtype(x.dtype, jnp.inexact):
+        return jnp.zeros_like(x)
+    return np.zeros(x.shape, jax.dtypes.float0)
+
+
+class _Pieces(NamedTuple):
+    """Pieces of `size` steps each between two states that are known, in order from step `first`."""
+
+    starts: tuple[State, State]
+    ends: tuple[State, State]
+    first: Array
+    size: int
+
+    def over(self, step: Callable, state: Any, reverse: bool = False) -> Any:
+        """``state = step(state, k, start, end)`` for each piece, from step number k."""
+        count = len(self.starts[0])
+        if count == 1:
+            return step(state, self.first, _row(self.starts, 0), _row(self.ends, 0))
+        k, stride = self.first, self.size
+        if reverse:
+            k, stride = k + (count - 1) * stride, -stride
+
+        def one(carry, x):
+            k, state = carry
+            return (k + stride, step(state, k, *x)), None
+
+        (_, state), _ = lax.scan(one, (k, state), (self.starts, self.ends), reverse=reverse)
+        return state
+
+
+def _row(states: tuple[State, State], i: int) -> tuple[State, State]:
+    return states[0][i], states[1][i]
+
+
+def _pieces(known_start, saved: Saved, first, count: int, every: int) -> list[_Pieces]:
+    """The `count` steps to a save point, cut at the states kept on the way, the last piece with the
+    others where it is as long: what is done to a piece is compiled for each length."""
+    inner = saved.inner
+    kept = 0 if inner is None else len(inner[0])
+    size = piece_length(count, every) if kept else count
+    parts = [known_start[0][None], known_start[1][None]], inner, [saved.q[None], saved.p[None]]
+    known = [jnp.concatenate(x) for x in zip(*(p for p in parts if p is not None), strict=True)]
+    starts, ends = (known[0][:-1], known[1][:-1]), (known[0][1:], known[1][1:])
+    rest = count - kept * size
+    if rest == size:
+        return [_Pieces(starts, ends, first, size)]
+
+    def some(which: slice, first, size):
+        start, end = ((q[which], p[which]) for q, p in (starts, ends))
+        return _Pieces(start, end, first, size)
+
+    return [some(slice(-1), first, size), some(slice(-1, None), first + kept * size, rest)]
+
+
+def _solved_by(task: Task, options) -> Equations:
+    return dataclasses.replace(task.equations, newton=options)
+
+
+def _rebuilt(
+    task: Task,
+    end,
+    first,
+    count: int,
+    known_start,
+    allowed: float,
+    along: Callable | None = None,
+    sums: Any = None,
+):
+    """The states from `end` back over `count` steps, by inverse steps on trust.
+
+    Given are the `sums` that ``along(k, after, before, sums)`` has made of each step on the way, by
+    how much of its size each component misses `known_start`, and whether all solves went well.
+    """
+    newton = task.equations.newton
+    assert isinstance(newton, RootSolver)
+    on_trust = Trusted(newton, jnp.asarray(BACKWARD_ITERATIONS, jnp.int32))
+    equations = _solved_by(task, on_trust)
+    group = largest_divisor(count, LOOKS)
+    solves = not (
+        task.method._inverse_needs_no_solve(
+            task.equations, task.interval(jnp.asarray(0, jnp.int32)), end[0]
+        )
+    )
+
+    def undo(state, k):
+        after, sums, excess = state
+        q, p, info = task.method.inverse(equations, task.interval(k), *after)
+        if along is not None:
+            sums = along(k, after, (q, p), sums)
+        return ((q, p), sums, jnp.maximum(excess, info.residual) if solves else None), None
+
+    def undo_group(state, k):
+        state, sizes = state
+        state, _ = counted_scan(undo, state, k, 1, group, reverse=True)
+        return (state, _largest(sizes, state[0])), None
+
+    worst = jnp.full((), -jnp.inf, end[0].dtype) if solves else None
+    begin = ((end, sums, worst), _largest(end, end))
+    ((state, sums, excess), sizes), _ = counted_scan(
+        undo_group, begin, first, group, count // group, reverse=True
+    )
+    misses = [
+        _miss(a, b, size, allowed).ravel()
+        for a, b, size in zip(state, known_start, sizes, strict=True)
+    ]
+    solved = excess <= 0 if solves else jnp.asarray(True)
+    return sums, jnp.concatenate(misses), solved
+
+
+def _round_trip_defect(
+    settings: Reversible, task: Task, plan: Plan, start_state, saved: Saved, tail
+) -> Array:
+    """The largest miss of a rebuilt state at a checkpoint; ∞ where an inverse step went wrong."""
+    allowed = settings.allowed(start_state[0].dtype)
+
+    def of_piece(size):
+        def of(worst, k, start, end):
+            _, misses, solved = _rebuilt(task, end, k, size, start, allowed)
+            return jnp.maximum(worst, jnp.where(solved, jnp.max(misses, initial=0.0), jnp.inf))
+
+        return of
+
+    def of_block(worst, start, saved, first, count):
+        for pieces in _pieces(start, saved, first, count, settings.checkpoint_every):
+            worst = pieces.over(of_piece(pieces.size), worst)
+        return worst
+
+    def block(carry, saved):
+        k, start, worst = carry
+        worst = of_block(worst, start, saved, k, plan.block)
+        return (k + plan.block, (saved.q, saved.p), worst), None
+
+    begin = (jnp.asarray(0, jnp.int32), start_state, jnp.zeros((), start_state[0].dtype))
+    (k, start, worst), _ = lax.scan(block, begin, saved)
+    return worst if tail is None else of_block(worst, start, tail, k, plan.tail)
+
+
+def _pull_back(
+    settings: Reversible, fixed, plan: Plan, may_store: bool, inputs, trace, cotangent: _Smooth
+):
+    """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start.
+
+    Unless it `may_store` the states of a piece, the gradient is NaN where rebuilding fails.
+    """
+    theta, q_start, p_start = inputs
+    carry, saved, tail, _ = trace
+    task: Task = eqx.combine(theta, fixed)
+    _, reductions = task.observables()
+    newton = task.equations.newton
+    assert isinstance(newton, RootSolver)
+
+    def local_step(theta, q0, p0, k, p1):
+        task: Task = eqx.combine(theta, fixed)
+        alone, reductions = task.observables()
+        interval = task.interval(k)
+        if isinstance(task.method, TypeII) and isinstance(task.arithmetic, FloatingPoint):
+            # What (13) is to be solved for is where we come from.
+            options = Known(p1.ravel(), newton)
+        else:
+            options = newton
+        q1, p1, _ = task.method.step(_solved_by(task, options), interval, q0, p0)
+        taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
+        values = [taken.value(f, task.args) for f in alone]
+        reduced = [taken.number(task.bound(r.function), task.args) for r in reductions]
+        return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), reduced
+
+    def pull_through(k, after, before, sums, is_last, at_save):
+        """The cotangents before step k, from the states before and after it."""
+        p1, (grad, (cq, cp)) = after[1], sums
+        ((_, _, t1), _, values), pull = jax.vjp(
+            lambda theta, q, p: local_step(theta, q, p, k, p1), theta, *before
+        )
+        at_end = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
+        ct, seeds = jnp.zeros_like(t1), []
+        for r, memory, c, value in zip(
+            reductions, carry.reductions, cotangent.reduced, values, strict=True
+        ):
+            of_t, of_value = r.pull(memory, c, k, t1, value)
+            ct = ct + of_t
+            seeds.append(of_value.astype(value.dtype))
+        of_theta, cq, cp = pull(((cq, cp, ct), at_end, seeds))
+        return jax.tree.map(jnp.add, grad, of_theta), (cq, cp)
+
+    def undo_steps(known_start, end, first, count, last, at_save, grad, cot):
+        """`count` steps back from the exact state `end`, checked against `known_start`.
+
+        By inverse steps on trust; for lanes that then miss the start, through the steps again from
+        there, their states stored.
+        """
+
+        def along(k, after, before, sums):
+            return pull_through(k, after, before, sums, k == last, at_save)
+
+        allowed = settings.allowed(end[0].dtype)
+        out, misses, solved = _rebuilt(
+            task, end, first, count, known_start, allowed, along, (grad, cot)
+        )
+        fine = solved & jnp.all(misses <= allowed)
+
+        def stored(known_start, end, first, last, at_save, grad, cot):
+            def forward(state, k):
+                q, p, _ = task.method.step(task.equations, task.interval(k), *state)
+                return (q, p), state
+
+            _, states = counted_scan(forward, known_start, first, 1, count)
+
+            def back(state, before):
+                k, after, sums = state
+                sums = pull_through(k, after, before, sums, k == last, at_save)
+                return (k - 1, before, sums), None
+
+            begin = (first + count - 1, end, (grad, cot))
+            (_, _, sums), _ = lax.scan(back, begin, states, reverse=True)
+            return sums
+
+        def mend(out):
+            again = in_arrays(stored)(known_start, end, first, last, at_save, grad, cot)
+            return jax.tree.map(lambda a, b: jnp.where(missing, a, b), again, out)
+
+        # Where the trajectory itself has failed there is nothing to mend: NaN, not a number.
+        missing = ~fine & _all_finite(known_start) & _all_finite(end)
+        if not may_store:
+            return jax.tree.map(lambda x: jnp.where(missing, jnp.nan, x), tuple(out))
+        return lax.cond(on_any_lane(missing), mend, lambda out: out, tuple(out))
+
+    def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):
+        last = first + count - 1
+        cot = (cot[0] + at_save.q, cot[1] + at_save.p)
+        _, pull_times = jax.vjp(lambda theta: _end_of(eqx.combine(theta, fixed), last), theta)
+        grad = jax.tree.map(jnp.add, grad, *pull_times((at_save.t, at_save.h)))
+        at_save = at_save.observed
+        every = settings.checkpoint_every
+        sums = grad, cot
+        for pieces in reversed(_pieces(known_start, saved, first, count, every)):
+
+            def undo(sums, k, start, end, size=pieces.size):
+                return undo_steps(start, end, k, size, last, at_save, *sums)
+
+            sums = pieces.over(undo, sums, reverse=True)
+        return sums
+
+    start_state = (q_start, p_start)
+    ends = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start_state, (saved.q, saved.p))
+    grad = jax.tree.map(jnp.zeros_like, theta)
+    cot = (cotangent.q, cotangent.p)
+    rows = cotangent.saved
+    if tail is not None:
+        at_save = jax.tree.map(lambda x: _last_row(x, plan.save_tail), rows)
+        newest = jax.tree.map(lambda x: x[-1], ends)
+        k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
+        grad, cot = undo_block(newest, tail, k, plan.tail, at_save, grad, cot)
+
+    def block(state, x):
+        k, grad, cot = state
+        known_start, saved, at_save = x
+        k = k - plan.block
+        return (k, *undo_block(known_start, saved, k, plan.block, at_save, grad, cot)), None
+
+    starts = jax.tree.map(lambda x: x[:-1], ends)
+    rows = jax.tree.map(lambda x: x[: plan.num_blocks], rows)
+    k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
+    (_, grad, cot), _ = lax.scan(block, (k, grad, cot), (starts, saved, rows), reverse=True)
+    return grad, *cot
+
+
+def _end_of(task: Task, k: Array) -> tuple[Array, Array]:
+    """Time and step size at the end of step k."""
+    interval = task.interval(k)
+    return interval.t1, interval.h
+
+
+def _last_row(x, is_there: bool):
+    return x[-1] if is_there else jnp.zeros(x.shape[1:], x.dtype)
+
+
+def _largest(sizes, state):
+    return jax.tree.map(lambda s, x: jnp.maximum(jnp.abs(s), jnp.abs(x)), sizes, state)
+
+
+def _miss(a, b, size, allowed):
+    """By how much of its size each component of a misses b. To the size is added that of which
+    `allowed` is round-off of the largest component."""
+    round_off = 64 * jnp.finfo(a.dtype).eps * jnp.max(size, initial=0.0)
+    return jnp.abs(a - b) / (size + (round_off / allowed + jnp.finfo(a.dtype).tiny))
+
+
+def _why_not(task: Task, q0: State, p0: State) -> str | None:
+    """Why no states of this run can be rebuilt, None if they can."""
+    if not task.method.is_invertible:
+        return f"{type(task.method).__name__} has no inverse step"
+    if task.lattice.has_memory:
+        return f"the steps of {type(task.lattice).__name__} depend on those before"
+    if task.stop is not None:
+        return "a run with a Stop ends in the midst"
+    if _closes_over_traced(task, q0, p0):
+        return "a function of the run closes over a traced value (hand it over in args)"
+    return None
+
+
+def _closes_over_traced(task: Task, q0: State, p0: State) -> bool:
+    """Whether a function of the task holds a value that is being differentiated or batched.
+
+    Such a value is no input of the trajectory, so that a derivative written for its inputs would
+    miss it.
+    """
+    arrays, rest = eqx.partition(task, eqx.is_array)
+
+    def one_step(arrays, q0, p0):
+        task = eqx.combine(arrays, rest)
+        alone, _ = task.observables()
+        carry, _, taken = take_step(task, start(task, q0, p0), jnp.asarray(0, jnp.int32))
+        return carry, [taken.value(f, task.args) for f in alone]
+
+    return any(is_traced(c) for c in jax.make_jaxpr(one_step)(arrays, q0, p0).consts)
+
+
+def _all_finite(state) -> Array:
+    return jnp.all(jnp.isfinite(state[0])) & jnp.all(jnp.isfinite(state[1]))
