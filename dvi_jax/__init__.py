@@ -27,6 +27,7 @@ from .engine.cpu import configure_cpu as configure_cpu
 from .engine.newton import Newton as Newton, RootSolver as RootSolver
 from .engine.picard import Picard as Picard, PicardThenNewton as PicardThenNewton
 from .engine.simplified import SimplifiedNewton as SimplifiedNewton
+from .engine.threads import over_threads as over_threads
 from .engine.tiles import Layout as Layout
 from .invariants import (
     Balance as Balance,
