@@ -1,6 +1,7 @@
 """Gradients that flow back along states which are rebuilt, not stored."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
@@ -129,27 +131,32 @@ class Reversible(AbstractAdjoint):
         @jax.custom_jvp
         def trajectory(inputs, whole):
             return lanewise(
-                fast, inputs, whole, layout=layout, steps=steps, entries=size, plain=forward
+                fast, inputs, whole, layout=layout, steps=steps, entries=2 * size, plain=forward
             )
 
-        @trajectory.defjvp
+        @functools.partial(trajectory.defjvp, symbolic_zeros=True)
         def _(primals, tangents):
             # The tangent is L·dx with L the derivative. Written as the solution (u, v) of the
             # linear system u = dx, v − L u = 0, it may be given a transpose of its own: forward
             # mode runs L along the scan, reverse mode runs Lᵀ on rebuilt states.
             (inputs, whole), (change, _) = primals, tangents
             smooth, trace = trajectory(inputs, whole)
+            # By inputs that do not move nothing is differentiated.
+            moves = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), change)
+            moving, still = eqx.partition(inputs, moves)
+            change = eqx.filter(change, moves)
 
-            def derivative(inputs, whole, u):
-                return jax.jvp(lambda x: forward(x, whole)[0], (inputs,), (u,))[1]
+            def along(function, moving, still, whole, u):
+                def of(moving):
+                    return function(eqx.combine(moving, still), whole)[0]
 
-            def quick(inputs, whole, u):
-                return jax.jvp(lambda x: fast(x, whole)[0], (inputs,), (u,))[1]
+                return jax.jvp(of, (moving,), (u,))[1]
 
             def push(u):
                 return lanewise(
-                    quick, inputs, whole, u,
-                    layout=layout, steps=steps, entries=2 * size, plain=derivative,
+                    functools.partial(along, fast), moving, still, whole, u,
+                    layout=layout, steps=steps, entries=2 * size,
+                    plain=functools.partial(along, forward),
                 )  # fmt: skip
 
             # As one vector: the transposition of a linear solve wants all parts of its right side
@@ -161,19 +168,25 @@ class Reversible(AbstractAdjoint):
 
             def matvec(x):
                 u, v = unravel(x)
-                return flat(u, jax.tree.map(jnp.subtract, v, derivative(inputs, whole, u)))
+                moved = along(forward, moving, still, whole, u)
+                return flat(u, jax.tree.map(jnp.subtract, v, moved))
 
             def solve(_, b):
                 u, v = unravel(b)
                 return flat(u, jax.tree.map(jnp.add, v, push(u)))
 
+            def pull(moving, still, whole, trace, v):
+                theta, q0, p0 = eqx.combine(moving, still)
+                theta, others = eqx.partition(theta, moves[0])
+                rest = eqx.combine(others, whole, fixed)
+                back = _pull_back(self, rest, plan, not layout.in_kernel, (theta, q0, p0), trace, v)
+                return eqx.filter(back, moves)
+
             def transpose_solve(_, b):
                 u, v = unravel(b)
                 back = lanewise(
-                    lambda whole, *x: _pull_back(
-                        self, eqx.combine(whole, fixed), plan, not layout.in_kernel, *x
-                    ),
-                    whole, inputs, trace, v, layout=layout, steps=steps, entries=2 * size,
+                    pull, moving, still, whole, trace, v,
+                    layout=layout, steps=steps, entries=2 * size,
                 )  # fmt: skip
                 return flat(jax.tree.map(jnp.add, u, back), v)
 
@@ -191,7 +204,7 @@ class Reversible(AbstractAdjoint):
 
             rebuilt = lanewise(
                 defect, *lax.stop_gradient((theta, whole, (q0, p0), saved, tail)),
-                layout=layout, steps=steps, entries=size,
+                layout=layout, steps=steps, entries=2 * size,
             )  # fmt: skip
         kept = eqx.combine(smooth.saved, counts)
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), kept, smooth.reduced, rebuilt)

@@ -215,6 +215,21 @@ def test_structural_operations_vanish():
     assert not names & {"pad", "dot_general", "gather", "scatter-add", "reduce_sum"}
 
 
+def reciprocals(x):
+    def body(_, c):
+        return c + 0.5 / x + c**-2
+
+    return 0.5 / x, x**-2, -1 / x, x**-1, x**-3, lax.fori_loop(0, 3, body, x), 4 / x, 3 / x, 1 / x
+
+
+def test_a_reciprocal_is_computed_once():
+    """Where its use is exact or a power; within a loop anew, and none of the loop's outside."""
+    check(reciprocals, numbers(), rtol=4 * np.finfo(float).eps)
+    _, jaxpr = in_components(reciprocals, LANES, numbers())
+    assert primitives(jaxpr, "div") == 2  # 1/x and 3/x
+    assert str(jaxpr).count("= div") == 2 + 2
+
+
 def test_large_arrays_are_not_taken_apart():
     _, jaxpr = in_components(lambda x: jnp.sum(jnp.sin(x) ** 2), LANES, numbers(5000))
     assert len(jaxpr.jaxpr.eqns) < 20

@@ -402,7 +402,7 @@ class _InBlock(Evaluator):
     def with_exchanges(self, eqn: Any, values: list[Value]) -> list[Value]:
         """A dense solve of any size without the library."""
         shapes = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in values]
-        return self.closed(jax.make_jaxpr(by_elimination)(*shapes), values)
+        return self.inside(jax.make_jaxpr(by_elimination)(*shapes), values)
 
     def _looked_up(self, eqn: Any, values: list[Value]) -> Value:
         """A row of a table."""
@@ -548,7 +548,7 @@ class _InBlock(Evaluator):
             row = length - 1 - i if is_reversed else i
 
             def evaluate():
-                out = self.closed(body, [*consts, *unpack(carry), *(r(row) for r in rows)])
+                out = self.inside(body, [*consts, *unpack(carry), *(r(row) for r in rows)])
                 saved[:] = [self._save(v) for v in out[len(on) :]]
                 return out[: len(on)]
 

@@ -108,11 +108,20 @@ class Evaluator:
     def __init__(self, lanes: int | None, replacements: dict[str, Callable]):
         self.lanes, self.replacements = lanes, replacements
         self.in_kernel = False
+        self._reciprocals: dict[int, tuple[Entry, Entry]] = {}
 
     # --- jaxprs ------------------------------------------------------------------------------
 
     def closed(self, closed: ClosedJaxpr, values: Sequence[Value]) -> list[Value]:
         return self.jaxpr(closed.jaxpr, [whole(c, False) for c in closed.consts], values)
+
+    def inside(self, closed: ClosedJaxpr, values: Sequence[Value]) -> list[Value]:
+        """The outputs within a loop or a branch, of which nothing is known outside."""
+        outside, self._reciprocals = self._reciprocals, {}
+        try:
+            return self.closed(closed, values)
+        finally:
+            self._reciprocals = outside
 
     def jaxpr(self, jaxpr: Jaxpr, consts: Sequence[Value], values: Sequence[Value]) -> list[Value]:
         known: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
@@ -191,6 +200,9 @@ class Evaluator:
         result = algebra(name, entries, eqn.params)
         if result is not None:
             return result
+        result = self._by_reciprocal(name, entries, dtypes, eqn.params)
+        if result is not None:
+            return result
         own = self.replacements.get(name)
         if own is not None and np.dtype(dtypes[0]) == np.float64:
             if name == "pow":  # by the exponent, if it is known
@@ -201,6 +213,31 @@ class Evaluator:
                     return apply(lambda x: own(x, exponent), entries[:1], dtypes[:1])
             return apply(own, entries, dtypes)
         return apply(lambda *a: eqn.primitive.bind(*a, **eqn.params), entries, dtypes)
+
+    def _by_reciprocal(
+        self, name: str, entries: list[Entry], dtypes: list[Any], params: dict[str, Any]
+    ) -> Entry | None:
+        """x⁻ⁿ and c/x, with c a power of two, from 1/x, which is computed once.
+
+        Derivatives of 1/|q| ask for both, and a division takes as long as ten products.
+        """
+        x = entries[-1]
+        if not (is_array(x) and np.issubdtype(dtypes[-1], np.floating)):
+            return None
+        if name == "integer_pow":
+            power = -params["y"]
+        else:
+            power = 1 if name == "div" and _is_power_of_two(entries[0]) else 0
+        if power < 1:
+            return None
+        if id(x) not in self._reciprocals:
+            self._reciprocals[id(x)] = x, apply(lax.div, [ONE, x], [dtypes[-1]] * 2)
+        _, reciprocal = self._reciprocals[id(x)]
+        if power > 1:
+            return lax.integer_pow(reciprocal, power)
+        if name == "div":
+            return self._pairwise(lax.mul, dtypes[0])(entries[0], reciprocal)
+        return reciprocal
 
     def _elementwise(self, eqn: Any, values: list[Value]) -> Value:
         (out,) = eqn.outvars
@@ -447,7 +484,7 @@ class Evaluator:
                 self._slice(part, v, aval)
                 for part, v, aval in zip(x, xs_values, slices, strict=True)
             ]
-            out = self.closed(body, [*consts, *unpack(carry), *xs])
+            out = self.inside(body, [*consts, *unpack(carry), *xs])
             after, ys = out[: len(on)], out[len(on) :]
             forms[:] = [(self.has_lanes(y), None if stays_whole(y) else len(y.lead)) for y in ys]
             return tuple(pack(after)), tuple(self._row(y) for y in ys)
@@ -518,10 +555,10 @@ class Evaluator:
         (per_lane,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on], AGREED)
 
         def goes_on(state) -> Value:
-            return self.closed(test, [*of_test, *unpack(state)])[0]
+            return self.inside(test, [*of_test, *unpack(state)])[0]
 
         def step(state):
-            return tuple(pack(self.closed(body, [*of_body, *unpack(state)])))
+            return tuple(pack(self.inside(body, [*of_body, *unpack(state)])))
 
         state = tuple(pack(carry))
         answer = test.jaxpr.outvars[0].aval
@@ -581,7 +618,7 @@ class Evaluator:
         pack, unpack = self.packer(like, avals, on)
 
         def run(branch):
-            return lambda: tuple(pack(self.closed(branch, operands)))
+            return lambda: tuple(pack(self.inside(branch, operands)))
 
         if not varies:
             return unpack(list(lax.switch(which, [run(b) for b in branches])))
@@ -607,6 +644,13 @@ def _unit_vectors(evaluator: Evaluator, eqn: Any, values: list[Value]) -> list[V
     n = eqn.params["n"]
     entries = [ONE if i == j else ZERO for i in range(n) for j in range(n)]
     return [_as_tangent(split(entries, (n, n), eqn.params["dtype"]))]
+
+
+def _is_power_of_two(entry: Entry) -> bool:
+    """Whether a product with the entry is exact."""
+    if is_array(entry) or entry is ZERO:
+        return False
+    return abs(np.frexp(number(entry, np.float64))[0]) == 0.5
 
 
 def _as_tangent(value: Value) -> Value:
