@@ -25,7 +25,7 @@ from .._compat import (
 from .elementary import VECTORISED, pow
 from .kernel import NotInKernelError, run_in_kernel
 from .lanes import Evaluator, Value, operation_count
-from .lanes._value import as_array, on_lanes, whole
+from .lanes._value import on_lanes, whole
 
 LARGEST = 20_000
 """A function of more operations than this, loops counted once, is left in arrays."""
@@ -341,11 +341,10 @@ def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> A
 
 def _in_tiles(
     program: _Program, operands: Sequence[Any], on: Sequence[bool], lanes: int, is_gpu: bool
-) -> list:
+) -> list[jax.Array]:
     """The outputs on all lanes, tile by tile; a GPU takes them all at once."""
     count = 1 if is_gpu else -(-lanes // program.width)
     width = lanes if count == 1 else -(-lanes // (8 * count)) * 8
-    forms: list[_Form] = []
     own = VECTORISED if width >= FEWEST_FOR_OWN and not program.layout.library else {}
     if is_gpu:  # whose library has sin and its like for all lanes at once
         own = {"pow": pow}
@@ -356,19 +355,37 @@ def _in_tiles(
             x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (missing, *x.shape[1:]))])
         return jnp.moveaxis(x.reshape(count, width, *x.shape[1:]), 1, -1)
 
-    def tile(mine):
-        mine = iter(mine)
-        parts = [next(mine) if o else x for x, o in zip(operands, on, strict=True)]
+    def tile(*mine):
+        of = iter(mine)
+        parts = [next(of) if o else x for x, o in zip(operands, on, strict=True)]
         values = program.special.in_components(parts, on, width, own)
-        forms[:] = [_Form(v) for v in values]
-        return [form.rows(v, width) for form, v in zip(forms, values, strict=True)]
+        return [_on_lanes(v, width) for v in values]
 
     mine = [cut(x) for x, o in zip(operands, on, strict=True) if o]
     if count == 1:
-        rows = jax.tree.map(lambda x: x[None], tile([x[0] for x in mine]))
+        outs = tile(*(x[0] for x in mine))
     else:
-        rows = lax.map(tile, mine)
-    return [form.joined(r, lanes) for form, r in zip(forms, rows, strict=True)]
+        traced = jax.make_jaxpr(tile)(*(x[0] for x in mine))
+
+        def step(i, outs):
+            # Into the result as it will be: large arrays are written once.
+            rows = jaxpr_as_fun(traced)(*(x[i] for x in mine))
+            return [
+                lax.dynamic_update_slice_in_dim(out, row, i * width, row.ndim - 1)
+                for out, row in zip(outs, rows, strict=True)
+            ]
+
+        begin = [jnp.zeros((*a.shape[:-1], count * width), a.dtype) for a in traced.out_avals]
+        outs = lax.fori_loop(0, count, step, begin)
+    # Lanes were last: a `vmap` which wants them there finds nothing to transpose.
+    return [jnp.moveaxis(x[..., :lanes], -1, 0) for x in outs]
+
+
+def _on_lanes(value: Value, width: int) -> jax.Array:
+    """A value as one array, the lanes last."""
+    array, has_lanes = value.array()
+    array = jnp.asarray(array)
+    return array if has_lanes else on_lanes(array, width, array.ndim)
 
 
 def with_first(first: jax.Array, rows: jax.Array) -> jax.Array:
@@ -392,32 +409,3 @@ _with_first = primitive(
     "with_first", lambda first, rows: jnp.concatenate([first[None], rows]), _with_first_batched
 )
 linear(_with_first, lambda cotangent, *_: [cotangent[0], cotangent[1:]])
-
-
-class _Form:
-    """How a value is put out of a tile: in rows for its entries, or as one array."""
-
-    def __init__(self, value: Value):
-        self.shape, self.dtype = value.shape, value.dtype
-        self.depth = len(value.lead)
-        self.is_split = value.is_split or self.depth > 0
-
-    def rows(self, value: Value, width: int) -> list[jax.Array]:
-        """The arrays of the value, each with the lane axis last."""
-        if not self.is_split:
-            array, has_lanes = value.array()
-            array = jnp.asarray(array)
-            return [array if has_lanes else on_lanes(array, width, array.ndim)]
-        lead = value.lead_entries()
-        entries = value.entries() if lead is None else lead
-        return [on_lanes(as_array(e, self.dtype), width, self.depth) for e in entries.flat]
-
-    def joined(self, rows: Sequence[Any], lanes: int) -> Any:
-        """The array (lanes, *shape) of which each tile has put out rows (tiles, …, width)."""
-        if not rows:
-            return jnp.zeros((lanes, *self.shape), self.dtype)
-        # Lanes last first, so that a `vmap` which wants them there finds nothing to transpose.
-        parts = [jnp.moveaxis(x, 0, -2) for x in rows]
-        out = jnp.stack(parts, self.depth) if self.is_split else parts[0]
-        padded = math.prod(out.shape[-2:])
-        return jnp.moveaxis(out.reshape(*self.shape, padded)[..., :lanes], -1, 0)
