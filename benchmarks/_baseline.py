@@ -29,10 +29,14 @@ class NoCompilerError(RuntimeError):
 
 
 class Run(NamedTuple):
-    """A kernel with its arrays: calling it integrates from the start into the outputs."""
+    """A kernel with its arrays: calling it integrates from the start into the outputs.
+
+    `timed` is what is to be timed: the same, or into new memory where outputs are large.
+    """
 
     call: Callable[[], None]
     outputs: dict[str, np.ndarray]
+    timed: Callable[[], None]
 
     def __call__(self) -> dict[str, np.ndarray]:
         self.call()
@@ -77,13 +81,16 @@ class Baseline:
     def saved(
         self, kernel: str, q0, p0, *, h: float, steps: int, every: int, epsilon: float
     ) -> Run:
-        """The start and every m-th state of the explicit run, shape (saves, n, lanes)."""
+        """The start and every m-th state of the explicit run, shape (saves, n, lanes).
+
+        Into new memory on each call: what a caller gets to keep.
+        """
         if steps % every:
             raise ValueError(f"steps must be a multiple of every, got {steps} and {every}.")
         shape = steps // every + 1
         return self._run(
             f"{kernel}_saved", q0, p0, [_whole(steps), _whole(every), _real(h), _real(epsilon)],
-            lambda n, lanes: {"q": (shape, n, lanes), "p": (shape, n, lanes)},
+            lambda n, lanes: {"q": (shape, n, lanes), "p": (shape, n, lanes)}, anew=True,
         )  # fmt: skip
 
     def implicit(
@@ -122,8 +129,8 @@ class Baseline:
             f"the last correction is {correction:.1e}."
         )
 
-    def _run(self, name: str, q0, p0, numbers: list[Any], shapes) -> Run:
-        """`name` on states (n, lanes), or `name`_one on states (n,)."""
+    def _run(self, name: str, q0, p0, numbers: list[Any], shapes, anew: bool = False) -> Run:
+        """`name` on states (n, lanes), or `name`_one on states (n,); its outputs made `anew`?"""
         q0, p0 = np.asarray(q0, float), np.asarray(p0, float)
         if q0.shape != p0.shape or q0.ndim not in (1, 2):
             raise ValueError(f"q0, p0 must be (n, lanes) or (n,), got {q0.shape} and {p0.shape}.")
@@ -137,17 +144,24 @@ class Baseline:
         }
         function = getattr(self._library, f"{name}_one" if one else name)
         function.restype = None
-        arguments = [
-            _whole(padded), *numbers,
-            *(ctypes.c_void_p(None if x is None else x.ctypes.data) for x in
-              [*start, *outputs.values()]),
-        ]  # fmt: skip
+        given = [_whole(padded), *numbers, *map(_address, start)]
+        addresses = [_address(x) for x in outputs.values()]
 
         def call(kept=(start, outputs)):  # the library has only their addresses
-            function(*arguments)
+            function(*given, *addresses)
+
+        def call_anew(kept=(start, outputs)):
+            fresh = [None if x is None else np.empty_like(x) for x in outputs.values()]
+            function(*given, *map(_address, fresh))
 
         shown = {key: x[..., :lanes] for key, x in outputs.items() if x is not None}
-        return Run(call, {key: x[..., 0] for key, x in shown.items()} if one else shown)
+        if one:
+            shown = {key: x[..., 0] for key, x in shown.items()}
+        return Run(call, shown, call_anew if anew else call)
+
+
+def _address(x: np.ndarray | None):
+    return ctypes.c_void_p(None if x is None else x.ctypes.data)
 
 
 def _whole(x: int):

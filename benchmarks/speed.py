@@ -9,7 +9,9 @@ are processor times of this process, so that waiting for other work on that core
 where the ratio of wall-clock times differs by more than WALL_DIFFERS it is shown too.
 
 - The C side is baseline.c, compiled here for this machine: arrays with the lanes last, a few
-  vectors of lanes in registers over the whole time loop, outputs into memory that is there already.
+  vectors of lanes in registers over the whole time loop, outputs into memory that is there already;
+  saved states, which a caller keeps, into new memory on each call, as the package's: where pages
+  of memory are dear, as on virtual machines, that is most of the time of both.
   Implicit steps: explicit guess, then the least number of Newton iterations whose last correction
   is below √ε (it is measured, and shown; two at these steps).
 - The package's side is the public one: `jax.jit(jax.vmap(one, in_axes=-1, out_axes=-1))` with `one`
@@ -213,7 +215,7 @@ class Bench:
         f = self.jit(f)
         inputs = [jnp.asarray(x) for x in inputs]
         first = first_call(lambda: f(*inputs))
-        times = self.clock.times(lambda: f(*inputs), c_run.call)
+        times = self.clock.times(lambda: f(*inputs), c_run.timed)
         return ratio(times, first_call_seconds=first, **details)
 
 

@@ -18,6 +18,7 @@ from ._rollout import (
     reduce,
     run,
     start,
+    with_start,
     with_tail,
 )
 from ._segments import can_trust, run_in_segments
@@ -26,8 +27,8 @@ from .engine.tiles import Layout, lanewise
 
 
 class Outcome(NamedTuple):
-    """A trajectory as it leaves the scan: last carry, saved states, reduced observables, and the
-    largest miss of a state that was rebuilt, if it was asked for."""
+    """A trajectory as it leaves the scan: last carry, saved states with the start in front, reduced
+    observables, and the largest miss of a state that was rebuilt, if it was asked for."""
 
     carry: Carry
     saved: Saved
@@ -49,27 +50,36 @@ class AbstractAdjoint(eqx.Module):
         """The whole trajectory, differentiable in this adjoint's way."""
 
 
+def entries_of(task: Task, q0: State, p0: State) -> int:
+    """With how many numbers of a lane a step works: state, a Jacobian, memories of reductions."""
+    carry = jax.eval_shape(lambda: start(task, q0, p0))
+    memories = sum(x.size for x in jax.tree.leaves(carry.reductions))
+    return 2 * q0.size + q0.size**2 + memories
+
+
 def _direct_rollout(
     task: Task, plan: Plan, q0: State, p0: State, loop: Loop, layout: Layout
 ) -> Outcome:
     arrays, rest = eqx.partition(task, eqx.is_array)
 
-    def outcome(task, ran):
+    def outcome(task, ran, *of):
         carry, saved, tail = ran
-        return Outcome(carry, with_tail(plan, saved, tail), reduce(task, carry))
+        kept = with_start(with_tail(plan, saved, tail), *of)
+        return Outcome(carry, kept, reduce(task, carry))
 
     def forward(arrays, q0, p0):
         task = eqx.combine(arrays, rest)
-        return outcome(task, run(task, plan, start(task, q0, p0), loop))
+        return outcome(task, run(task, plan, start(task, q0, p0), loop), q0, p0)
 
     def on_trust(arrays, q0, p0):
         task = eqx.combine(arrays, rest)
         begin = start(task, q0, p0)
-        return outcome(task, run_in_segments(task, plan, begin, one_row=layout.in_kernel))
+        ran = run_in_segments(task, plan, begin, one_row=layout.in_kernel)
+        return outcome(task, ran, q0, p0)
 
     return lanewise(
         on_trust if can_trust(task) else forward, arrays, q0, p0,
-        layout=layout, steps=plan.num_steps, entries=2 * q0.size, plain=forward,
+        layout=layout, steps=plan.num_steps, entries=entries_of(task, q0, p0), plain=forward,
     )  # fmt: skip
 
 

@@ -25,7 +25,6 @@ __all__ = [
     "is_traced",
     "jaxpr_as_fun",
     "jaxprs_in_params",
-    "linear",
     "lower_on",
     "lowered_for_cuda",
     "one_kernel",
@@ -169,14 +168,6 @@ def identity(name: str, batched: Callable) -> Primitive:
     new = primitive(name, lambda x: x, batched)
     ad.deflinear2(new, lambda cotangent, _: [new.bind(cotangent)])
     return new
-
-
-def linear(primitive: Primitive, transposed: Callable) -> None:
-    """Have a primitive differentiated as what is linear in all operands.
-
-    `transposed(cotangent, *operands)` → the cotangents of the operands.
-    """
-    ad.deflinear2(primitive, transposed)
 
 
 def _on_cpu(*arrays, closed: ClosedJaxpr):

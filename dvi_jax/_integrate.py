@@ -31,6 +31,7 @@ from ._rollout import (
     reduce,
     run,
     start,
+    with_start,
     with_tail,
 )
 from ._solution import Save, Solution
@@ -40,7 +41,7 @@ from ._types import Interval
 from .engine.cpu import OPTIONS, takes_options
 from .engine.newton import RootSolver
 from .engine.picard import PicardThenNewton
-from .engine.tiles import Layout, with_first
+from .engine.tiles import Layout
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation
 from .observe import Reduction, RequestedTimes, Section, Stop
@@ -252,7 +253,7 @@ def _in_pieces(task: Task, plan: Plan, q0, p0, num_steps, progress) -> Outcome:
         if is_last:
             break
     saved = jax.tree.map(lambda *xs: jnp.concatenate(xs), *parts)
-    return Outcome(carry, saved, reduce(task, carry))
+    return Outcome(carry, with_start(saved, q0, p0), reduce(task, carry))
 
 
 def _with_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes, PyTree]:
@@ -296,8 +297,7 @@ def _solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: 
         alone = [jax.vmap(lambda step, f=f: step.value(f, task.args))(steps) for f in own]
     else:
         ts = jnp.concatenate([task.t0[None], saved.t])
-        qs, ps = with_first(q0, saved.q), with_first(p0, saved.p)
-        hs, alone = saved.h, saved.observed
+        qs, ps, hs, alone = saved.q, saved.p, saved.h, saved.observed
     return Solution(
         ts=ts,
         qs=qs,

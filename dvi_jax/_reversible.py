@@ -14,7 +14,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ._adjoints import AbstractAdjoint, Checkpointed, Outcome
+from ._adjoints import AbstractAdjoint, Checkpointed, Outcome, entries_of
 from ._arithmetic import FloatingPoint
 from ._compat import is_traced
 from ._rollout import (
@@ -28,6 +28,7 @@ from ._rollout import (
     run,
     start,
     take_step,
+    with_start,
     with_tail,
 )
 from ._segments import can_trust, largest_divisor, run_in_segments
@@ -103,26 +104,27 @@ class Reversible(AbstractAdjoint):
         theta, others = eqx.partition(task, eqx.is_inexact_array)
         # Whole numbers and truth values may be traced as well: inputs without a derivative.
         whole, fixed = eqx.partition(others, eqx.is_array)
-        size, steps = 2 * q0.size, plan.num_steps
+        entries, steps = entries_of(task, q0, p0), plan.num_steps
+        with_tangents = entries + 2 * q0.size
 
         @jax.jit  # so that its uses below share one trace, and one trace of its derivative
         def forward(inputs, whole):
             theta, q0, p0 = inputs
             task = eqx.combine(theta, whole, fixed)
-            return finish(
-                task, run(task, plan, start(task, q0, p0), counted_scan, self._inner_loop)
-            )
+            ran = run(task, plan, start(task, q0, p0), counted_scan, self._inner_loop)
+            return finish(task, ran, q0, p0)
 
         def on_trust(inputs, whole):
             theta, q0, p0 = inputs
             task = eqx.combine(theta, whole, fixed)
             begin = start(task, q0, p0)
             every, one_row = self.checkpoint_every, layout.in_kernel
-            return finish(task, run_in_segments(task, plan, begin, every, one_row))
+            return finish(task, run_in_segments(task, plan, begin, every, one_row), q0, p0)
 
-        def finish(task, ran):
+        def finish(task, ran, *of):
             carry, saved, tail = ran
-            kept, counts = eqx.partition(with_tail(plan, saved, tail), eqx.is_inexact_array)
+            rows = with_start(with_tail(plan, saved, tail), *of)
+            kept, counts = eqx.partition(rows, eqx.is_inexact_array)
             smooth = _Smooth(carry.q, carry.p, kept, reduce(task, carry))
             return smooth, (carry, saved, tail, counts)
 
@@ -131,7 +133,7 @@ class Reversible(AbstractAdjoint):
         @jax.custom_jvp
         def trajectory(inputs, whole):
             return lanewise(
-                fast, inputs, whole, layout=layout, steps=steps, entries=2 * size, plain=forward
+                fast, inputs, whole, layout=layout, steps=steps, entries=entries, plain=forward
             )
 
         @functools.partial(trajectory.defjvp, symbolic_zeros=True)
@@ -155,7 +157,7 @@ class Reversible(AbstractAdjoint):
             def push(u):
                 return lanewise(
                     functools.partial(along, fast), moving, still, whole, u,
-                    layout=layout, steps=steps, entries=2 * size,
+                    layout=layout, steps=steps, entries=with_tangents,
                     plain=functools.partial(along, forward),
                 )  # fmt: skip
 
@@ -186,7 +188,7 @@ class Reversible(AbstractAdjoint):
                 u, v = unravel(b)
                 back = lanewise(
                     pull, moving, still, whole, trace, v,
-                    layout=layout, steps=steps, entries=2 * size,
+                    layout=layout, steps=steps, entries=with_tangents,
                 )  # fmt: skip
                 return flat(jax.tree.map(jnp.add, u, back), v)
 
@@ -204,7 +206,7 @@ class Reversible(AbstractAdjoint):
 
             rebuilt = lanewise(
                 defect, *lax.stop_gradient((theta, whole, (q0, p0), saved, tail)),
-                layout=layout, steps=steps, entries=2 * size,
+                layout=layout, steps=steps, entries=entries,
             )  # fmt: skip
         kept = eqx.combine(smooth.saved, counts)
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), kept, smooth.reduced, rebuilt)
@@ -482,6 +484,7 @@ def _pull_back(
     grad = jax.tree.map(jnp.zeros_like, theta)
     cot = (cotangent.q, cotangent.p)
     rows = cotangent.saved
+    of_start, rows = (rows.q[0], rows.p[0]), rows._replace(q=rows.q[1:], p=rows.p[1:])
     if tail is not None:
         at_save = jax.tree.map(lambda x: _last_row(x, plan.save_tail), rows)
         newest = jax.tree.map(lambda x: x[-1], ends)
@@ -498,7 +501,7 @@ def _pull_back(
     rows = jax.tree.map(lambda x: x[: plan.num_blocks], rows)
     k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
     (_, grad, cot), _ = lax.scan(block, (k, grad, cot), (starts, saved, rows), reverse=True)
-    return grad, *cot
+    return grad, *map(jnp.add, cot, of_start)
 
 
 def _end_of(task: Task, k: Array) -> tuple[Array, Array]:

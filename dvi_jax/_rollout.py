@@ -344,6 +344,12 @@ def with_tail(plan: Plan, saved: Saved, tail: Saved | None) -> Saved:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), saved, tail)
 
 
+def with_start(saved: Saved, q0: State, p0: State) -> Saved:
+    """What was saved, the states from the start on."""
+    q, p = (jnp.concatenate([a[None], b]) for a, b in ((q0, saved.q), (p0, saved.p)))
+    return saved._replace(q=q, p=p)
+
+
 def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
     """The pytree `observe` with every observable replaced by its values."""
     values, lone = iter(reduced), iter(alone)

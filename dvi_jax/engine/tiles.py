@@ -17,7 +17,6 @@ from .._compat import (
     identity,
     is_traced,
     jaxpr_as_fun,
-    linear,
     lower_on,
     primitive,
     without_outputs,
@@ -40,8 +39,8 @@ FEWEST_FOR_OWN = 8
 LARGEST_KERNEL = 10_000
 """A function of more operations than this goes into no kernel, which has some 250 registers."""
 
-TILE_ENTRIES = 1024
-"""Entries of the state of all lanes of a tile: about what a first-level cache holds."""
+TILE_ENTRIES = 4096
+"""Numbers of all lanes of a tile that a step works with: what a first-level cache holds."""
 
 
 class Layout(eqx.Module):
@@ -97,9 +96,9 @@ def lanewise(
     """``function(*args)``, for one lane; and how it is to be batched by `vmap`.
 
     `function` takes and returns pytrees of arrays. It is evaluated in component form, under `vmap`
-    in tiles of lanes, where `layout` says so for `steps` steps of a state with so many `entries`;
-    elsewhere `plain` is called, which gives the same numbers. Derivatives are those of `plain`;
-    it is `function` if left out.
+    in tiles of lanes, where `layout` says so for `steps` steps that work with so many `entries` of
+    a lane; elsewhere `plain` is called, which gives the same numbers. Derivatives are those of
+    `plain`; it is `function` if left out.
     """
     plain = function if plain is None else plain
     leaves, tree = jax.tree.flatten(args)
@@ -386,26 +385,3 @@ def _on_lanes(value: Value, width: int) -> jax.Array:
     array, has_lanes = value.array()
     array = jnp.asarray(array)
     return array if has_lanes else on_lanes(array, width, array.ndim)
-
-
-def with_first(first: jax.Array, rows: jax.Array) -> jax.Array:
-    """`rows` after one more, `first`; under `vmap` with the lanes last, as tiles put them out.
-
-    (The compiler would transpose an array with lanes in front, and back.)
-    """
-    return _with_first.bind(first, rows)
-
-
-def _with_first_batched(arrays, axes):
-    (size,) = {x.shape[a] for x, a in zip(arrays, axes, strict=True) if a is not None}
-    first, rows = (
-        jnp.broadcast_to(x[..., None], (*x.shape, size)) if a is None else jnp.moveaxis(x, a, -1)
-        for x, a in zip(arrays, axes, strict=True)
-    )
-    return _with_first.bind(first, rows), rows.ndim - 1
-
-
-_with_first = primitive(
-    "with_first", lambda first, rows: jnp.concatenate([first[None], rows]), _with_first_batched
-)
-linear(_with_first, lambda cotangent, *_: [cotangent[0], cotangent[1:]])
