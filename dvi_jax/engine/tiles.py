@@ -246,11 +246,7 @@ class _Program:
 
 
 def _run(
-    *operands,
-    program: _Program,
-    lanes: int | None,
-    on: tuple[bool, ...],
-    is_gpu: bool = False,
+    *operands, program: _Program, lanes: int | None, on: tuple[bool, ...], is_gpu: bool = False
 ) -> list[Any]:
     """The program on so many lanes: the first axis of operands where `on`, and of all outputs."""
     if is_gpu or program.layout.form == "kernel":
@@ -275,12 +271,7 @@ def _run_on_gpu(*operands, **params) -> list[Any]:
     return _run(*operands, is_gpu=True, **params)
 
 
-def _shape_of(
-    *operands,
-    program: _Program,
-    lanes: int | None,
-    on: tuple[bool, ...],
-) -> list[Any]:
+def _shape_of(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
     front = () if lanes is None else (lanes,)
     avals = program.ordinary.closed.out_avals
     return [jax.ShapeDtypeStruct((*front, *a.shape), a.dtype) for a in avals]
@@ -289,14 +280,7 @@ def _shape_of(
 _run.shape_of = _shape_of  # pyright: ignore[reportFunctionMemberAccess]
 
 
-def _batched(
-    operands,
-    axes,
-    *,
-    program: _Program,
-    lanes: int | None,
-    on: tuple[bool, ...],
-):
+def _batched(operands, axes, *, program: _Program, lanes: int | None, on: tuple[bool, ...]):
     """One more axis of lanes: all of them become one."""
     batched = [axis is not None for axis in axes]
     moved = [
