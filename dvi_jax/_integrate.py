@@ -433,6 +433,11 @@ def _parameter(leaf: Any) -> Any:
 def _check_observe(task: Task, q0: Array, p0: Array) -> None:
     """Refuse observables that are not functions of a step with an array for a value."""
     for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
+        if isinstance(leaf, type) and issubclass(leaf, Reduction):
+            raise TypeError(
+                f"observe holds the class {leaf.__name__}: give it what it is to reduce, "
+                f"dvi.{leaf.__name__}(function), a function {_STEP}."
+            )
         if not is_observable(leaf):
             raise TypeError(
                 f"observe must be a pytree of functions {_STEP} or "

@@ -1,13 +1,24 @@
 """Iterations that converge linearly, to round-off: when to stop, and when to give up."""
 
+import abc
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .newton import Found, Scales, Vector, largest, over
+from .newton import (
+    Found,
+    Function,
+    RootSolver,
+    Scales,
+    Vector,
+    check_settings,
+    largest,
+    over,
+)
 
 
 class _Verdict(NamedTuple):
@@ -114,14 +125,34 @@ def contract_on_trust(
     return x, jnp.where(good, -1.0, 1.0).astype(x.dtype)
 
 
-def linear_iterations(effort: Int[Array, ""]) -> Int[Array, ""]:
-    """2, 4, 8, 16, 32 iterations for an effort of 2, 3, 4, 5, 6.
+class Contraction(RootSolver):
+    """Base of the root solvers x ← x − correction(x) that converge linearly."""
 
-    Lanes of one effort run together; those of another take the same steps once more.
-    """
-    return 1 << (effort - 1)
+    rtol: float | None = eqx.field(static=True, default=None)
+    atol: float = eqx.field(static=True, default=0.0)
+    max_steps: int = eqx.field(static=True, default=50)
 
+    def __check_init__(self):
+        check_settings(self.rtol, self.atol, self.max_steps)
 
-def most_linear_effort(max_steps: int) -> int:
-    """The effort of most iterations, but not more than `max_steps`."""
-    return max_steps.bit_length()
+    @abc.abstractmethod
+    def correction(self, F: Function, x0: Vector) -> Callable[[Vector], Vector]:
+        """x → its correction, all that depends on the guess x0 alone computed now."""
+
+    def solve(self, F, x0, scales):
+        correction = self.correction(F, x0)
+        return contract(correction, x0, scales, self.rtol, self.atol, self.max_steps)
+
+    def solve_on_trust(self, F, x0, scales, effort):
+        count, correction = self.iterations(effort, x0.size), self.correction(F, x0)
+        return contract_on_trust(correction, x0, scales, self.rtol, self.atol, count)
+
+    def iterations(self, effort, n):
+        """2, 4, 8, 16, 32 for an effort of 2, 3, 4, 5, 6.
+
+        Lanes of one effort run together; those of another take the same steps once more.
+        """
+        return 1 << (effort - 1)
+
+    def most_effort(self):
+        return self.max_steps.bit_length()

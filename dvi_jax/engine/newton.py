@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable
+from numbers import Real
 from typing import NamedTuple
 
 import equinox as eqx
@@ -75,8 +76,8 @@ def check_settings(rtol: float | None, atol: float, max_steps: int) -> None:
     if max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {max_steps}.")
     for name, value in (("rtol", rtol), ("atol", atol)):
-        if value is not None and not 0 <= value < float("inf"):
-            raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
+        if value is not None and not (isinstance(value, Real) and 0 <= value < float("inf")):
+            raise ValueError(f"{name} must be a finite number, not negative, got {value!r}.")
     if rtol == 0 and atol == 0:
         raise ValueError("rtol and atol are both zero: no iteration could ever stop.")
 

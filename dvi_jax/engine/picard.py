@@ -4,13 +4,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 
-from .contraction import contract, contract_on_trust, linear_iterations, most_linear_effort
+from .contraction import Contraction, contract
 from .linear import UNROLLED_UP_TO
-from .newton import Found, Function, Newton, RootSolver, Scales, Vector, check_settings
+from .newton import Found, Function, Newton, RootSolver, Scales, Vector
 from .together import on_any_lane
 
 
-class Picard(RootSolver):
+class Picard(Contraction):
     r"""Fixed-point (Picard) iteration, x ← x − F(x): no Jacobian, no linear solve.
 
     For the type II map that is p1 ← p0 + h (−∂H_D/∂q0 + εW)(t0, t1, q0, p1), one evaluation each.
@@ -39,25 +39,8 @@ class Picard(RootSolver):
     IV.8.
     """
 
-    rtol: float | None = eqx.field(static=True, default=None)
-    atol: float = eqx.field(static=True, default=0.0)
-    max_steps: int = eqx.field(static=True, default=50)
-
-    def __check_init__(self):
-        check_settings(self.rtol, self.atol, self.max_steps)
-
-    def solve(self, F, x0, scales):
-        return contract(F, x0, scales, self.rtol, self.atol, self.max_steps)
-
-    def solve_on_trust(self, F, x0, scales, effort):
-        count = self.iterations(effort, x0.size)
-        return contract_on_trust(F, x0, scales, self.rtol, self.atol, count)
-
-    def iterations(self, effort, n):
-        return linear_iterations(effort)
-
-    def most_effort(self):
-        return most_linear_effort(self.max_steps)
+    def correction(self, F, x0):
+        return F
 
     def solve_tangent(self, linear, rhs, on_trust):
         return _without_matrix(self, linear, rhs)

@@ -2,18 +2,17 @@
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import Array, Inexact
 
-from .contraction import contract, contract_on_trust, linear_iterations, most_linear_effort
+from .contraction import Contraction
 from .linear import UNROLLED_UP_TO, solve_dense
-from .newton import RootSolver, Vector, check_settings, value_and_jacobian
+from .newton import Vector, value_and_jacobian
 
 
-class SimplifiedNewton(RootSolver):
+class SimplifiedNewton(Contraction):
     """Simplified Newton iteration, x ← x − J⁻¹ F(x), J = ∂F/∂x at the guess, factorised once.
 
     The Jacobian and its factors, the dear parts of Newton's method for many unknowns, are made
@@ -35,35 +34,13 @@ class SimplifiedNewton(RootSolver):
     **Source** Hairer & Wanner 1996, *Solving ODEs II*, IV.8.
     """
 
-    rtol: float | None = eqx.field(static=True, default=None)
-    atol: float = eqx.field(static=True, default=0.0)
-    max_steps: int = eqx.field(static=True, default=50)
-
-    def __check_init__(self):
-        check_settings(self.rtol, self.atol, self.max_steps)
-
-    def solve(self, F, x0, scales):
-        return contract(_corrections(F, x0), x0, scales, self.rtol, self.atol, self.max_steps)
-
-    def solve_on_trust(self, F, x0, scales, effort):
-        count = self.iterations(effort, x0.size)
-        return contract_on_trust(_corrections(F, x0), x0, scales, self.rtol, self.atol, count)
-
-    def iterations(self, effort, n):
-        return linear_iterations(effort)
-
-    def most_effort(self):
-        return most_linear_effort(self.max_steps)
+    def correction(self, F, x0):
+        solve = factorised(value_and_jacobian(F, x0)[1])
+        return lambda x: solve(F(x))
 
     def solve_tangent(self, linear, rhs, on_trust):
         _, matrix = value_and_jacobian(linear, jnp.zeros_like(rhs))
         return solve_dense(matrix, rhs)
-
-
-def _corrections(F, x0: Vector) -> Callable[[Vector], Vector]:
-    """x → J⁻¹ F(x) with J at x0."""
-    solve = factorised(value_and_jacobian(F, x0)[1])
-    return lambda x: solve(F(x))
 
 
 def factorised(A: Inexact[Array, "n n"]) -> Callable[[Vector], Vector]:

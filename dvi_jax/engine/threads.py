@@ -90,6 +90,9 @@ def _with_axes(args: tuple, in_axes: Any) -> tuple[list[Any], list[int | None], 
             f"in_axes has {len(each)} entries for {len(args)} arguments: give one for each, or "
             "one number for all."
         )
+    for axis in each:
+        if axis is not None and (isinstance(axis, bool) or not isinstance(axis, int)):
+            raise TypeError(f"an axis of lanes is a whole number or None, got {axis!r}.")
     axes = []
     for argument, axis in zip(args, each, strict=True):
         axes += [axis] * len(jax.tree.leaves(argument))
