@@ -103,12 +103,12 @@ class FixedPoint(Arithmetic):
     and a step and its inverse undo each other without any rounding; so do steps by h and −h of a
     symmetric method. The map is one to one on the grid.
 
-    What it takes is that a rate has the same bits whenever it is evaluated at one point. A compiler
-    that joins a product and a sum into one operation (FMA), or not, by what stands around, breaks
-    that for some forces: run back to see, or forbid it, on x86 CPUs by the environment variable
-    XLA_FLAGS=--xla_cpu_max_isa=AVX. Where the force depends on time, the times forth and back must
-    be the same numbers: h a power of two, t0 a multiple of it, and parts of a step likewise
-    (`TypeII`, `Adjoint`, `Strang`).
+    What it takes is that a rate has the same bits whenever it is evaluated at one point. So each of
+    its operations is rounded by itself: a compiler joins a product and a sum into one operation
+    (FMA), or not, by what stands around. (What is left in arrays, sorting or products of large
+    matrices, is not covered: run back to see.) Where the force depends on time, the times forth and
+    back must be the same numbers: h a power of two, t0 a multiple of it, and parts of a step
+    likewise (`TypeII`, `Adjoint`, `Strang`).
 
     **Arguments**
 

@@ -13,6 +13,7 @@ from ._system import System
 from ._types import Args, Interval, Scalar, State
 from .engine.dependence import depends_on
 from .engine.newton import Known, Newton, RootInfo, RootSolver, Trusted, find_root
+from .engine.rounding import one_by_one
 
 
 class StepInfo(NamedTuple):
@@ -44,7 +45,7 @@ class Equations(eqx.Module):
 
     `newton` says how their implicit part is solved. Where there is an `origin`, positions and
     momenta are told relative to it; where there is a `quantum`, an explicit step changes the state
-    by whole multiples of it.
+    by whole multiples of it, and a rate has the same bits wherever it is evaluated.
     """
 
     system: System
@@ -68,13 +69,17 @@ class Equations(eqx.Module):
         """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
         q0, p1 = self.absolute(q0, p1)
         at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
-        return _momentum_rate(self.system, *at)
+        if self.quantum is None:
+            return _momentum_rate(self.system, *at)
+        return one_by_one(_momentum_rate, q0, self.system, *at)
 
     def position_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""
         q0, p1 = self.absolute(q0, p1)
         at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
-        return _position_rate(self.system, *at)
+        if self.quantum is None:
+            return _position_rate(self.system, *at)
+        return one_by_one(_position_rate, p1, self.system, *at)
 
     def step_is_explicit(self, interval: Interval, like: State) -> bool:
         """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""

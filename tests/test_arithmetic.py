@@ -1,10 +1,6 @@
 """Compensated summation and fixed point: what they keep, what they refuse, and their gradients."""
 
 import functools
-import os
-import platform
-import subprocess
-import sys
 from fractions import Fraction
 
 import jax
@@ -305,35 +301,12 @@ def test_a_batch_in_fixed_point_comes_back_bit_for_bit(route):
         assert not comes_back(orbit, methods, dvi.Compensated(), 20_000, batch)
 
 
-def joins_products_and_sums():
-    """Whether a·b + c is compiled into one operation, rounded once (FMA)."""
-    a, b = np.random.default_rng(0).normal(size=(2, 100))
-    return bool(np.any(jax.jit(lambda a, b, c: a * b + c)(a, b, -(a * b))))
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(
-    platform.machine() not in ("x86_64", "AMD64") or jax.default_backend() != "cpu",
-    reason="the flag is for CPUs of this kind",
-)
-def test_without_joined_products_random_forces_come_back():
-    """The next test, in a process of its own, compiled without FMA."""
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "-m", "slow", __file__]
-    done = subprocess.run(
-        [*command, "-k", "random_forces_come_back_bit"],
-        env={**os.environ, "XLA_FLAGS": "--xla_cpu_max_isa=AVX"}, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
-    assert "1 passed" in done.stdout, done.stdout
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(joins_products_and_sums(), reason="holds for sure without FMA only")
 def test_random_forces_come_back_bit_for_bit():
     """Polynomials of many products, with observables beside them that share products.
 
-    With FMA this one did not come back: the force was compiled in more than one way. The control
-    shows how little it takes: the last bits of the coefficients.
+    With products joined to sums (FMA) this one did not come back: the force was compiled in more
+    than one way. The control shows how little it takes: the last bits of the coefficients.
     """
     rng = np.random.default_rng(1)
     size, terms = 2, int(rng.integers(4, 9))
