@@ -76,7 +76,7 @@ TOO_DEAR = {
     ("damped", "LobattoIIIAIIIB2"),
     ("damped", "LobattoIIIAIIIB3"),
 }
-"""Priced half an evaluation or one a stage and step more than are made (issue 5: to be found out)."""
+"""Priced half an evaluation or one a stage and step more than are made: to be found out."""
 
 COUNTED = [
     ("henon_heiles", "Strang"),
