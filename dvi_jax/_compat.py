@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
-from jax import export
+from jax import export, lax
 from jax.core import ShapedArray, Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
@@ -151,6 +151,43 @@ def drops_outputs(primitive: Primitive, without: Callable) -> None:
     partial_eval.dce_rules[primitive] = rule
 
 
+def _smaller_while(used: list[bool], eqn: Any) -> tuple[list[bool], Any]:
+    """The loop without what it carries for unused outputs alone; JAX has this from 0.12 on."""
+    params = eqn.params
+    test, body = params["cond_jaxpr"], params["body_jaxpr"]
+    of_test, of_body = params["cond_nconsts"], params["body_nconsts"]
+    if eqn.effects:
+        return [True] * len(eqn.invars), eqn
+    if not any(used):
+        return [False] * len(eqn.invars), None
+    _, read = partial_eval.dce_jaxpr(test.jaxpr, [True])
+    live = [a or b for a, b in zip(used, read[of_test:], strict=True)]
+    while True:
+        _, read = partial_eval.dce_jaxpr(body.jaxpr, live)
+        more = [a or b for a, b in zip(live, read[of_body:], strict=True)]
+        if more == live:
+            break
+        live = more
+    less_test, read_by_test = partial_eval.dce_jaxpr(test.jaxpr, [True], [False] * of_test + live)
+    less_body, read_by_body = partial_eval.dce_jaxpr(body.jaxpr, live, [False] * of_body + live)
+    inputs = [*read_by_test[:of_test], *read_by_body[:of_body], *live]
+    new = eqn.replace(
+        invars=[v for v, u in zip(eqn.invars, inputs, strict=True) if u],
+        outvars=[v for v, u in zip(eqn.outvars, live, strict=True) if u],
+        params={
+            "cond_nconsts": sum(read_by_test[:of_test]),
+            "cond_jaxpr": ClosedJaxpr(less_test, test.consts),
+            "body_nconsts": sum(read_by_body[:of_body]),
+            "body_jaxpr": ClosedJaxpr(less_body, body.consts),
+        },
+    )
+    return inputs, new
+
+
+if lax.while_p not in partial_eval.dce_rules:
+    partial_eval.dce_rules[lax.while_p] = _smaller_while
+
+
 def without_outputs(closed: ClosedJaxpr, used: list[bool]) -> ClosedJaxpr:
     """The jaxpr that computes only some outputs, of the same inputs."""
     jaxpr = partial_eval.dce_jaxpr(closed.jaxpr, used, instantiate=True)[0]
@@ -181,8 +218,9 @@ def _on_cpu(*arrays, closed: ClosedJaxpr):
     less, inputs = ClosedJaxpr(jaxpr, kept[:count]), kept[count:]
 
     def function(*inputs):
-        first = [x.ravel()[0].real.astype("float32") for x in inputs if x.size]
-        return jaxpr_as_fun(less)(*inputs), sum(first)
+        with set_xla_metadata(xla_cpu_small_call="false", inlineable="true"):
+            first = [x.ravel()[0].real.astype("float32") for x in inputs if x.size]
+            return jaxpr_as_fun(less)(*inputs), sum(first)
 
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
         outs, _ = jax.jit(function)(*inputs)

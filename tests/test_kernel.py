@@ -125,18 +125,10 @@ def test_one_kernel_and_its_numbers(name):
     same(run(*start), plain(*start), start[0].dtype, ulps)
 
 
-LEFT_TO_XLA = ("GaussLegendre4", "LobattoIIIAIIIB4")
-ONE_OF_EACH = (
-    *("TypeII", "Adjoint", "Strang", "Yoshida4", "RungeKutta4", "GaussLegendre1"),
-    "LobattoIIIAIIIB2",
-)
-"""The other compositions are the same program, but for its numbers."""
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*ONE_OF_EACH, *LEFT_TO_XLA])
+@pytest.mark.parametrize("name", certify.METHODS)
 def test_methods(name):
-    """A method goes into a kernel or is left to XLA, known before it is compiled."""
+    """Every method goes into a kernel or is left to XLA, known before it is compiled."""
     settings = {"method": certify.METHODS[name], "num_steps": 12, "save": dvi.Save(every=4)}
     run, *start = batch("chain", **settings)
     with warnings.catch_warnings(record=True) as seen:
@@ -144,7 +136,7 @@ def test_methods(name):
         calls, loops = calls_and_loops(lowered_for_cuda(run, *start))
     left = [w for w in seen if "left to XLA" in str(w.message)]
     assert (calls, bool(loops), bool(left)) in ((1, False, False), (0, True, True))
-    assert bool(calls) == (name not in LEFT_TO_XLA)
+    assert bool(calls) == (name not in ("GaussLegendre4", "LobattoIIIAIIIB4"))
     if calls:
         plain, *_ = batch("chain", "arrays", **settings)
         same(run(*start), plain(*start), ulps=256)

@@ -1,6 +1,7 @@
 """Component form: the numbers of the arrays, lane by lane, and nothing of the neighbours."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from hypothesis import given, settings, strategies as st
 from jax import lax
 
 import dvi_jax as dvi
+from dvi_jax._compat import jaxpr_as_fun, without_outputs
 from dvi_jax.engine.lanes import evaluate, in_arrays, operation_count
 from dvi_jax.engine.linear import solve_near_identity, unit_vectors
 from dvi_jax.engine.together import least_over_lanes, on_any_lane
@@ -111,6 +113,33 @@ FUNCTIONS = {
     "jit, custom rules, checkpoint": jax.checkpoint(jax.jit(jax.nn.softplus)),
     "two lengths": lambda x: (x[:0], jnp.sum(x[:0]), jnp.ones(200) * x[0]),
     "what does not vary": lambda x: (jnp.arange(3.0), jnp.ones((2, 2)), x),
+}
+
+
+def rows(x, count=4):
+    """What a scan puts out, of shape (count, *x.shape)."""
+    return lax.scan(lambda c, _: (0.9 * c, c), x, None, count)[1]
+
+
+def grown(x):
+    """Half as large again, until it is large."""
+    return lax.while_loop(lambda c: jnp.sum(c**2) < 10, lambda c: 1.5 * c, x)
+
+
+FUNCTIONS |= {
+    "rows carried by a loop": lambda x: grown(rows(x)),
+    "rows of rows carried": lambda x: grown(rows(rows(x)[0])) * lax.map(grown, rows(x)),
+    "rows, each to its own end": lambda x: jax.vmap(grown)(rows(x)),
+    "rows of rows, each to its own end": lambda x: (
+        jax.vmap(jax.vmap(grown))(rows(jnp.outer(x, x))),
+        jax.vmap(jax.vmap(grown))(rows(lax.map(jnp.sin, rows(x)))),
+    ),
+    "rows mixed with others": lambda x: lax.while_loop(
+        lambda c: jnp.sum(c[0] ** 2) < 10, lambda c: (1.5 * c[0], c[1] + 1), (x, rows(x))
+    ),
+    "rows that a loop replaces": lambda x: lax.while_loop(
+        lambda c: jnp.sum(c[0] ** 2) < 10, lambda c: (1.5 * c[0], rows(c[0])[::-1]), (x, rows(x))
+    ),
 }
 
 
@@ -230,9 +259,79 @@ def test_a_reciprocal_is_computed_once():
     assert str(jaxpr).count("= div") == 2 + 2
 
 
+def multiples(x, s):
+    """Several times −x, in products one after the other and in sums, with s the same on all."""
+    pull = -x + s * -x
+    sums = 0.1 * pull, pull + pull, x + 3 * x, pull + 2.0 * x, lax.neg(-x), x @ (2 * x)
+    loop = lax.fori_loop(0, 3, lambda _, c: c + 0.1 * (-x - x), x)
+    return *sums, loop, (2.0 * x) * x, s * (s * x), 1e-200 * (1e200 * (1e200 * (1e-300 * x))), x + x
+
+
+def test_multiples_of_a_number_are_one_product():
+    few_ulp = 4 * np.finfo(float).eps
+    check(multiples, numbers(2), numbers(seed=1), rtol=few_ulp)
+    check(lambda x: multiples(x, 0.7), numbers(2), rtol=few_ulp)
+
+    def step(x, y):  # by a quadratic energy, and a weak force of its kind
+        pull = -x + 1e-4 * -x
+        return y + 0.1 * pull
+
+    _, jaxpr = in_components(step, LANES, numbers(1), numbers(1))
+    used = re.findall(r"^ *[a-z]+:f64\[5\] = (\w+)", str(jaxpr), re.MULTILINE)
+    assert [name for name in used if name in ("mul", "neg", "add")] == ["mul", "add"]
+
+
 def test_large_arrays_are_not_taken_apart():
     _, jaxpr = in_components(lambda x: jnp.sum(jnp.sin(x) ** 2), LANES, numbers(5000))
     assert len(jaxpr.jaxpr.eqns) < 20
+
+
+def test_rows_that_a_loop_carries_are_not_taken_apart():
+    """Their program is as long for 100 rows as for 10, where they had become 100 numbers each."""
+
+    def carried(x, count):
+        begin = jnp.sum(x), rows(x, count)
+        return lax.while_loop(lambda c: c[0] < 9, lambda c: (c[0] * 2, jnp.flip(c[1])), begin)
+
+    for lanes, x in ((LANES, numbers(2)), (None, numbers(2)[0])):
+        few, many = (
+            in_components(functools.partial(carried, count=n), lanes, x)[1] for n in (10, 100)
+        )
+        assert str(few).count("\n") == str(many).count("\n") < 100
+
+
+def test_a_long_loop_over_a_single_number():
+    """The compiler would give its body to threads, which there are none of inside of a function."""
+
+    def body(x, _):
+        for _ in range(6):
+            x = x + 0.1 * (1 + 1e-4 * x) * (1 - 1e-3 * x**2)
+        return x, None
+
+    x = jnp.linspace(0.1, 0.2, 2048)
+    run, _ = in_components(lambda x: lax.scan(body, x, None, 25)[0], 2048, x)
+    np.testing.assert_allclose(jax.jit(run)(x)[0], lax.scan(body, x, None, 25)[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("used", "carried"), [("01000", 2), ("00100", 3), ("10001", 2), ("00010", 2), ("00000", 0)]
+)
+def test_a_loop_carries_what_is_asked_for(used, carried):
+    """Its other outputs are not, unless the test or one of those needs them."""
+
+    def loop(x, y):
+        def body(state):
+            k, a, b, c, d = state
+            return k + 1, a * x, b + a * y, c + 1, jnp.sin(d)
+
+        return lax.while_loop(lambda state: state[0] < 3 + x, body, (0.0, x, y, x, y))
+
+    used = [u == "1" for u in used]
+    less = without_outputs(jax.make_jaxpr(loop)(2.0, 3.0), used)
+    loops = [e for e in less.jaxpr.eqns if e.primitive.name == "while"]
+    assert sum(len(e.outvars) for e in loops) == carried
+    wanted = [v for v, u in zip(loop(2.0, 3.0), used, strict=True) if u]
+    assert jaxpr_as_fun(less)(2.0, 3.0) == wanted
 
 
 def test_operation_count_grows_with_what_is_written():

@@ -60,7 +60,7 @@ def check(function, *args, rtol=1e-12, patterns=None):
     if patterns is None:
         patterns = [[True] * len(args), None]
         if len(args) > 1:
-            patterns.append([False, *patterns[0][1:]])
+            patterns += [[i != k for i in range(len(args))] for k in range(len(args))]
     for on in patterns:
         mine = [a if on is None or o else a[1] for a, o in zip(args, on or args, strict=True)]
         if on is None:

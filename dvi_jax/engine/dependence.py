@@ -1,5 +1,6 @@
 """Whether an output of a function depends on an input, read from its jaxpr."""
 
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -29,6 +30,16 @@ def reached_outputs(
 
     Nothing is reached through the primitives named in `ends`.
     """
+    known, question = _ANSWERS.setdefault(jaxpr, {}), (tuple(reached_inputs), ends)
+    if question not in known:  # loops in loops ask the same many times
+        known[question] = _reached_outputs(jaxpr, *question)
+    return list(known[question])
+
+
+_ANSWERS: weakref.WeakKeyDictionary[Jaxpr, dict] = weakref.WeakKeyDictionary()
+
+
+def _reached_outputs(jaxpr: Jaxpr, reached_inputs: Sequence[bool], ends: frozenset[str]) -> Any:
     reached = {v for v, r in zip(jaxpr.invars, reached_inputs, strict=True) if r}
 
     def is_reached(atom: Any) -> bool:

@@ -49,7 +49,7 @@ class MaxDrift(Reduction):
     function: Callable[..., Any]
 
     def start(self, value):
-        return value, jnp.zeros_like(value), jnp.full(value.shape, -1, jnp.int32)
+        return value, jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
 
     def update(self, memory, k, t, value):
         first, farthest, at = memory
@@ -60,8 +60,7 @@ class MaxDrift(Reduction):
         return first, jnp.where(larger, far, farthest), jnp.where(larger, k, at)
 
     def finish(self, memory):
-        _, farthest, at = memory
-        return jnp.where(at < 0, jnp.nan, jnp.abs(farthest))
+        return jnp.abs(memory[1])
 
     def pull(self, memory, cotangent, k, t, value):
         _, farthest, at = memory

@@ -10,14 +10,12 @@ import numpy as np
 from jax import lax
 
 from ..._compat import ClosedJaxpr, bodies, scan_counts
-from ..dependence import fixed_point, reached_outputs
 from ..elementary import pow
 from ..lanes import Evaluator, Value
 from ..lanes._evaluate import _CALLS, IN_ARRAYS, SPLIT_UP_TO, _cut
 from ..lanes._rules import algebra, apply, fold
 from ..lanes._value import as_array, is_array, number, split, whole
 from ..linear import by_elimination
-from ..together import AGREED
 from ._limits import NotInKernelError
 from ._rows import Afterwards, Later, Round, Rows, Stored, joined, kept, rows_of
 
@@ -160,8 +158,8 @@ class InBlock(Evaluator):
 
     # --- loops -----------------------------------------------------------------------------------
 
-    def pack(self, value: Value, has_lanes: bool, as_whole: bool = False) -> list[jax.Array]:
-        if as_whole:
+    def pack(self, value: Value, has_lanes: bool, depth: int | None = 0) -> list[jax.Array]:
+        if depth != 0:
             raise NotInKernelError(f"a loop carries an array of {value.size} numbers.")
         arrays = super().pack(value, has_lanes)
         known = [not (has_lanes or is_array(e)) for e in value.entries().flat]
@@ -188,12 +186,7 @@ class InBlock(Evaluator):
             out = self.closed(body, [*consts, *carry, *(r(0) for r in rows)])
             return [*out[: len(carry)], *(self._with_axis(v) for v in out[len(carry) :])]
         self._split_small([*consts, *carry])
-        on = fixed_point(
-            lambda on: reached_outputs(
-                body.jaxpr, [*map(self.has_lanes, consts), *on, *map(self.has_lanes, xs)], AGREED
-            )[: len(carry)],
-            [self.has_lanes(v) for v in carry],
-        )
+        on = self.varying(body, consts, carry, xs)
         pack, unpack = self.packer(carry, [v.aval for v in body.jaxpr.invars[first:last]], on)
         saved: list[Later] = []
 

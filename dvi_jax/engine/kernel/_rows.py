@@ -36,7 +36,7 @@ class Stored(Value):
     def known(self):
         return None
 
-    def entries(self):
+    def entries(self, depth=0):
         raise NotInKernelError("a large input is used other than row by row.")
 
     def array(self):
@@ -113,7 +113,7 @@ class Later(Value):
     def known(self):
         return None
 
-    def entries(self):
+    def entries(self, depth=0):
         raise NotInKernelError("what a loop saves is used before the end.")
 
     def array(self):

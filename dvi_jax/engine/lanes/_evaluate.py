@@ -1,6 +1,7 @@
 """A jaxpr evaluated in component form."""
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ from ..._compat import (
 )
 from ..dependence import fixed_point, reached_by, reached_outputs
 from ..together import AGREED
+from ._rewrite import Rewrites
 from ._rules import (
     CUMULATIVE,
     ELEMENTWISE,
@@ -108,7 +110,7 @@ class Evaluator:
     def __init__(self, lanes: int | None, replacements: dict[str, Callable]):
         self.lanes, self.replacements = lanes, replacements
         self.in_kernel = False
-        self._reciprocals: dict[int, tuple[Entry, Entry]] = {}
+        self._rewrite = Rewrites()
 
     # --- jaxprs ------------------------------------------------------------------------------
 
@@ -117,11 +119,11 @@ class Evaluator:
 
     def inside(self, closed: ClosedJaxpr, values: Sequence[Value]) -> list[Value]:
         """The outputs within a loop or a branch, of which nothing is known outside."""
-        outside, self._reciprocals = self._reciprocals, {}
+        outside, self._rewrite = self._rewrite, Rewrites()
         try:
             return self.closed(closed, values)
         finally:
-            self._reciprocals = outside
+            self._rewrite = outside
 
     def jaxpr(self, jaxpr: Jaxpr, consts: Sequence[Value], values: Sequence[Value]) -> list[Value]:
         known: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
@@ -200,7 +202,7 @@ class Evaluator:
         result = algebra(name, entries, eqn.params)
         if result is not None:
             return result
-        result = self._by_reciprocal(name, entries, dtypes, eqn.params)
+        result = self._rewrite(name, entries, dtypes, eqn.params)
         if result is not None:
             return result
         own = self.replacements.get(name)
@@ -213,31 +215,6 @@ class Evaluator:
                     return apply(lambda x: own(x, exponent), entries[:1], dtypes[:1])
             return apply(own, entries, dtypes)
         return apply(lambda *a: eqn.primitive.bind(*a, **eqn.params), entries, dtypes)
-
-    def _by_reciprocal(
-        self, name: str, entries: list[Entry], dtypes: list[Any], params: dict[str, Any]
-    ) -> Entry | None:
-        """x⁻ⁿ and c/x, with c a power of two, from 1/x, which is computed once.
-
-        Derivatives of 1/|q| ask for both, and a division takes as long as ten products.
-        """
-        x = entries[-1]
-        if not (is_array(x) and np.issubdtype(dtypes[-1], np.floating)):
-            return None
-        if name == "integer_pow":
-            power = -params["y"]
-        else:
-            power = 1 if name == "div" and _is_power_of_two(entries[0]) else 0
-        if power < 1:
-            return None
-        if id(x) not in self._reciprocals:
-            self._reciprocals[id(x)] = x, apply(lax.div, [ONE, x], [dtypes[-1]] * 2)
-        _, reciprocal = self._reciprocals[id(x)]
-        if power > 1:
-            return lax.integer_pow(reciprocal, power)
-        if name == "div":
-            return self._pairwise(lax.mul, dtypes[0])(entries[0], reciprocal)
-        return reciprocal
 
     def _elementwise(self, eqn: Any, values: list[Value]) -> Value:
         (out,) = eqn.outvars
@@ -281,8 +258,11 @@ class Evaluator:
         name = {lax.add: "add", lax.mul: "mul", lax.sub: "sub", lax.div: "div"}.get(operation, "")
 
         def combine(a: Entry, b: Entry) -> Entry:
-            result = algebra(name, [a, b], {})
-            return apply(operation, [a, b], [dtype, dtype]) if result is None else result
+            pair, dtypes = [a, b], [dtype, dtype]
+            result = algebra(name, pair, {})
+            if result is None:
+                result = self._rewrite(name, pair, dtypes, {})
+            return apply(operation, pair, dtypes) if result is None else result
 
         return combine
 
@@ -400,14 +380,14 @@ class Evaluator:
 
     # --- loops -------------------------------------------------------------------------------
 
-    def pack(self, value: Value, has_lanes: bool, as_whole: bool = False) -> list[jax.Array]:
-        """The arrays that stand for a value in the carry of a loop."""
-        if as_whole:
+    def pack(self, value: Value, has_lanes: bool, depth: int | None = 0) -> list[jax.Array]:
+        """The arrays that stand for a value in the carry of a loop, see `depth_of`."""
+        if depth is None:
             array, on = value.array()
             array = jnp.asarray(array)
             return [self._with_lanes(array, array.ndim) if has_lanes and not on else array]
-        arrays = [as_array(e, value.dtype) for e in value.entries().flat]
-        return [self._with_lanes(x) for x in arrays] if has_lanes else arrays
+        arrays = [as_array(e, value.dtype) for e in value.entries(depth).flat]
+        return [self._with_lanes(x, depth) for x in arrays] if has_lanes else arrays
 
     def _with_lanes(self, x: jax.Array, lead: int = 0) -> jax.Array:
         return x if self.lanes is None else on_lanes(x, self.lanes, lead)
@@ -416,25 +396,23 @@ class Evaluator:
         self, values: Sequence[Value], avals: Sequence[Any], lanes: Sequence[bool]
     ) -> tuple[Callable, Callable]:
         """(values → flat list of arrays, and back) for a carry that starts with these values."""
-        wholes = [stays_whole(v) for v in values]
-        counts = [1 if w else a.size for w, a in zip(wholes, avals, strict=True)]
+        depths = [depth_of(v) for v in values]
+        counts = [
+            1 if d is None else math.prod(a.shape[d:]) for d, a in zip(depths, avals, strict=True)
+        ]
         ends = np.cumsum(counts)
 
         def pack(values):
             return [
                 x
-                for v, on, as_whole in zip(values, lanes, wholes, strict=True)
-                for x in self.pack(v, on, as_whole)
+                for v, on, depth in zip(values, lanes, depths, strict=True)
+                for x in self.pack(v, on, depth)
             ]
 
         def unpack(arrays):
             return [
-                whole(arrays[end - 1], on and self.lanes is not None, is_bulk=True)
-                if as_whole
-                else split(list(arrays[end - count : end]), a.shape, a.dtype)
-                for a, on, as_whole, count, end in zip(
-                    avals, lanes, wholes, counts, ends, strict=True
-                )
+                unpacked(arrays[end - count : end], a, on and self.lanes is not None, depth)
+                for a, on, depth, count, end in zip(avals, lanes, depths, counts, ends, strict=True)
             ]
 
         return pack, unpack
@@ -442,7 +420,7 @@ class Evaluator:
     def _split_small(self, values: list[Value]) -> None:
         """Take small values apart before a loop, whose body would else do it each time round."""
         for value in values:
-            if not stays_whole(value):
+            if depth_of(value) == 0:
                 value.entries()
 
     def on_any(self, x: jax.Array) -> jax.Array:
@@ -463,18 +441,24 @@ class Evaluator:
             return any(e.ndim > len(value.lead) for e in lead.flat)
         return value.array()[1]
 
+    def varying(
+        self, body: ClosedJaxpr, consts: list[Value], carry: list[Value], xs: list[Value]
+    ) -> list[bool]:
+        """Which values that a scan carries have lanes, in some round of it."""
+        before, after = ([self.has_lanes(v) for v in values] for values in (consts, xs))
+
+        def next_round(on: list[bool]) -> list[bool]:
+            return reached_outputs(body.jaxpr, [*before, *on, *after], AGREED)[: len(on)]
+
+        return fixed_point(next_round, [self.has_lanes(v) for v in carry])
+
     def scan(self, eqn: Any, values: list[Value]) -> list[Value]:
         params = eqn.params
         body: ClosedJaxpr = params["jaxpr"]
         consts, carry, xs = _cut(values, *scan_counts(params))
         self._split_small(consts)
         first, last = len(consts), len(consts) + len(carry)
-        on = fixed_point(
-            lambda on: reached_outputs(
-                body.jaxpr, [*map(self.has_lanes, consts), *on, *map(self.has_lanes, xs)], AGREED
-            )[: len(carry)],
-            [self.has_lanes(v) for v in carry],
-        )
+        on = self.varying(body, consts, carry, xs)
         pack, unpack = self.packer(carry, [v.aval for v in body.jaxpr.invars[first:last]], on)
         slices = [v.aval for v in body.jaxpr.invars[last:]]
         forms: list[tuple[bool, int | None]] = []
@@ -486,8 +470,8 @@ class Evaluator:
             ]
             out = self.inside(body, [*consts, *unpack(carry), *xs])
             after, ys = out[: len(on)], out[len(on) :]
-            forms[:] = [(self.has_lanes(y), None if stays_whole(y) else len(y.lead)) for y in ys]
-            return tuple(pack(after)), tuple(self._row(y) for y in ys)
+            forms[:] = [(self.has_lanes(y), depth_of(y)) for y in ys]
+            return tuple(pack(after)), tuple(tuple(self.pack(y, False, depth_of(y))) for y in ys)
 
         xs_values = xs
         scanned = tuple(self._scanned(v) for v in xs)
@@ -502,22 +486,12 @@ class Evaluator:
         ]
         return [*unpack(list(end)), *outputs]
 
-    def _row(self, value: Value) -> tuple[jax.Array, ...]:
-        """What a step of a scan puts out of a value: its entries."""
-        lead = value.lead_entries()
-        if lead is None:
-            return tuple(self.pack(value, False, stays_whole(value)))
-        return tuple(lead.flat)
-
     def _stacked(
         self, rows: Sequence[Any], aval: Any, length: int, has_lanes: bool, depth: int | None
     ) -> Value:
-        """The value whose entries, each with `depth` axes of a loop in front, were put out."""
-        shape = (length, *aval.shape)
-        if depth is None:
-            return whole(rows[0], has_lanes, is_bulk=True)
-        entries = split(list(rows), aval.shape[depth:], aval.dtype).entries()
-        return Value(shape, aval.dtype, entries=entries, lead=shape[: depth + 1])
+        """The value of which each step put out a row, see `depth_of`."""
+        like = jax.ShapeDtypeStruct((length, *aval.shape), aval.dtype)
+        return unpacked(rows, like, has_lanes, None if depth is None else depth + 1)
 
     def _scanned(self, value: Value) -> Any:
         """The arrays over which a scan goes, their first axis that of the steps."""
@@ -531,11 +505,7 @@ class Evaluator:
         lead = value.lead_entries()
         if lead is None:
             return whole(parts[0], value.array()[1])
-        depth = len(value.lead) - 1
-        entries = split(list(parts), aval.shape[depth:], aval.dtype).entries()
-        if depth == 0:
-            return Value(aval.shape, aval.dtype, entries=entries)
-        return Value(aval.shape, aval.dtype, entries=entries, lead=value.lead[1:])
+        return unpacked(parts, aval, False, len(value.lead) - 1)
 
     def while_loop(self, eqn: Any, values: list[Value]) -> list[Value]:
         params = eqn.params
@@ -568,13 +538,13 @@ class Evaluator:
             )
 
         # Each lane, and under a `vmap` further in each place on it, stops by itself.
-        wholes = [stays_whole(v) for v in carry]  # as packed: a value that is used is taken apart
+        depths = [depth_of(v) for v in carry]  # as packed: a value that is used is taken apart
         first = goes_on(state)
         keep, restore = self.packer([first], [answer], [per_lane])
 
         def masked(state):
             active, before = state
-            masks = self._masks(restore(active)[0], carry, wholes, on)
+            masks = self._masks(restore(active)[0], carry, depths, on)
             after = tuple(jnp.where(*x) for x in zip(masks, step(before), before, strict=True))
             return tuple(keep([goes_on(after)])), after
 
@@ -585,19 +555,24 @@ class Evaluator:
         return unpack(list(end))
 
     def _masks(
-        self, active: Value, carry: Sequence[Value], wholes: Sequence[bool], on: Sequence[bool]
+        self,
+        active: Value,
+        carry: Sequence[Value],
+        depths: Sequence[int | None],
+        on: Sequence[bool],
     ) -> list[Any]:
         """For each array that a carry is packed in, what `active` says of it: its shape is that of
         the leading axes of all values."""
         masks = []
-        for value, as_whole, has_lanes in zip(carry, wholes, on, strict=True):
-            rest = value.shape[len(active.shape) :]
-            if as_whole:
-                array, per_lane = active.array()
-                lanes = array.shape[-1:] if per_lane else (1,) * (has_lanes and bool(self.lanes))
-                masks.append(array.reshape(active.shape + (1,) * len(rest) + lanes))
-            else:
-                masks += [e for e in active.entries().flat for _ in np.ndindex(rest)]
+        for value, depth, has_lanes in zip(carry, depths, on, strict=True):
+            ndim = len(value.shape) if depth is None else depth
+            common = min(ndim, len(active.shape))
+            copies = math.prod(value.shape[max(ndim, len(active.shape)) :])
+            for entry in active.entries(common).flat:
+                mask = jnp.asarray(entry)
+                lanes = mask.shape[common:] or (1,) * (has_lanes and self.lanes is not None)
+                mask = mask.reshape(active.shape[:common] + (1,) * (ndim - common) + lanes)
+                masks += [mask] * copies
         return masks
 
     def cond(self, eqn: Any, values: list[Value]) -> list[Value]:
@@ -644,13 +619,6 @@ def _unit_vectors(evaluator: Evaluator, eqn: Any, values: list[Value]) -> list[V
     n = eqn.params["n"]
     entries = [ONE if i == j else ZERO for i in range(n) for j in range(n)]
     return [_as_tangent(split(entries, (n, n), eqn.params["dtype"]))]
-
-
-def _is_power_of_two(entry: Entry) -> bool:
-    """Whether a product with the entry is exact."""
-    if is_array(entry) or entry is ZERO:
-        return False
-    return abs(np.frexp(number(entry, np.float64))[0]) == 0.5
 
 
 def _as_tangent(value: Value) -> Value:
@@ -792,13 +760,21 @@ _NOT_IN_PLACE = frozenset(
 )
 
 
-def stays_whole(value: Value) -> bool:
-    """Whether a value goes through a loop as one array: it is one, and not small."""
-    if value.is_split or value.lead:
-        return False
-    if value.is_bulk or value.size > SPLIT_UP_TO:
-        return True
-    return value.is_known and value.size > 8
+def depth_of(value: Value) -> int | None:
+    """How a value goes through a loop: as its entries, each with so many axes of `lead` in front;
+    or, told by None, as one array, because it is one and not small."""
+    if value.lead or value.is_split:
+        return len(value.lead)
+    is_small = not value.is_bulk and value.size <= (8 if value.is_known else SPLIT_UP_TO)
+    return 0 if is_small else None
+
+
+def unpacked(arrays: Sequence[Any], aval: Any, has_lanes: bool, depth: int | None) -> Value:
+    """The value of shape and type `aval` that goes through a loop as these arrays."""
+    if depth is None:
+        return whole(arrays[0], has_lanes, is_bulk=True)
+    entries = split(list(arrays), aval.shape[depth:], aval.dtype).entries()
+    return Value(aval.shape, aval.dtype, entries=entries, lead=aval.shape[:depth])
 
 
 def _cut(values: list[Value], first: int, second: int) -> tuple[list, list, list]:

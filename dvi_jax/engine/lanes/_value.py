@@ -86,8 +86,11 @@ class Value:
             numbers[i] = number(entries[i], self.dtype)
         return numbers
 
-    def entries(self) -> np.ndarray:
-        """The entries as an object array of shape `shape`."""
+    def entries(self, depth: int = 0) -> np.ndarray:
+        """The entries as an object array of shape `shape`; less of its first `depth` axes, which
+        each entry then has in front."""
+        if depth:
+            return self._entries_behind(depth)
         if self.is_split:
             assert self._entries is not None
             return self._entries
@@ -97,6 +100,13 @@ class Value:
         if not self.is_bulk:
             self._entries = entries
         return entries
+
+    def _entries_behind(self, depth: int) -> np.ndarray:
+        if depth == len(self.lead):
+            assert self._entries is not None
+            return self._entries
+        source, rest, front = self.array()[0], self.shape[depth:], (slice(None),) * depth
+        return objects([source[front + i] for i in np.ndindex(rest)], rest)
 
     def lead_entries(self) -> np.ndarray | None:
         """The entries with the axes `lead` in front of each, or None if it is in another form."""
