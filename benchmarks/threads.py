@@ -8,62 +8,29 @@ smaller ratio: run it when there is none.
 """
 
 import argparse
-import random
 import statistics
-import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _workloads import EPSILON, WORKLOADS
+from _workloads import WORKLOADS
+from speed import JIT_OPTIONS, Clock, batched, last_state
 
 import dvi_jax as dvi
 
 ROWS = (("kepler", 65536, 2000), ("oscillator", 65536, 10000), ("chain4", 8192, 500))
 
 
-def batch_of(name: str, steps: int):
-    """A jitted batch, lanes last, to its last states and status."""
-    w = WORKLOADS[name]
-
-    def one(q0, p0):
-        sol = dvi.integrate(
-            w.system,
-            q0,
-            p0,
-            h=w.h,
-            num_steps=steps,
-            epsilon=EPSILON,
-            args=w.args,
-            save=dvi.Save(final=True),
-            throw=False,
-        )
-        return sol.qs[-1], sol.ps[-1], sol.result
-
-    options = {"xla_cpu_prefer_vector_width": 512}
-    return jax.jit(jax.vmap(one, in_axes=-1, out_axes=-1), compiler_options=options)
-
-
-def seconds(f, *args) -> float:
-    began = time.perf_counter()
-    jax.block_until_ready(f(*args))
-    return time.perf_counter() - began
-
-
-def measured(name: str, lanes: int, steps: int, threads: int | None, rounds: int) -> list[float]:
+def measured(name: str, lanes: int, steps: int, threads: int | None, rounds: int) -> np.ndarray:
     """Ratios of wall-clock times, one thread over several."""
-    inputs = [jnp.asarray(x) for x in WORKLOADS[name].start(lanes)]
-    one = batch_of(name, steps)
+    w = WORKLOADS[name]
+    inputs = [jnp.asarray(x) for x in w.start(lanes)]
+    one = jax.jit(batched(last_state(w, steps)), compiler_options=JIT_OPTIONS["plain"])
     several = dvi.over_threads(one, threads, in_axes=-1, out_axes=-1)
     for a, b in zip(jax.tree.leaves(one(*inputs)), jax.tree.leaves(several(*inputs)), strict=True):
         np.testing.assert_array_equal(a, b)
-    ratios = []
-    for _ in range(rounds):
-        sides = [one, several]
-        random.shuffle(sides)
-        taken = {f: seconds(f, *inputs) for f in sides}
-        ratios.append(taken[one] / taken[several])
-    return ratios
+    wall = Clock(rounds, float("inf")).times(lambda: one(*inputs), lambda: several(*inputs)).wall
+    return wall[:, 0] / wall[:, 1]
 
 
 def main():

@@ -11,15 +11,17 @@ the force W where there is one:
 
     explicit part of a step       1 (a half for p, a half for q)
     implicit part of a step       1.5 (guess, residual, other half) and (1 + n w)/2 an iteration
-    Gauss, s stages               3 s (guess, residual, end) and s + 2 s n · s w an iteration
+    Gauss, s stages               2 s (guess, end) and s + 2 s n · s w an iteration
     Lobatto pair, s stages        4 m + s/2 (guess, residual, end) and m + 2 (s − 1) n · m w an
                                   iteration, m = s − 1/2
-      where q is not in ∂H/∂p     4 m + s and m + (s − 1) n · m w an iteration
+      where q is not in ∂H/∂p     the same, and m + (s − 1) n · m w an iteration
       two stages without a solve  3.5
     RungeKutta4                   4
 
 with n the dimension of q and w = JACOBIAN_WEIGHT what one column of a Jacobian costs at one point,
-in evaluations. Iterations are those that Newton's method reports, not assumed.
+in evaluations. What the last residual and the end of a step have in common is evaluated once: all
+rates of Gauss, ∂H/∂p of the pair where q is not in it. Iterations are those that Newton's method
+reports, not assumed.
 
 Kicks that meet between two parts are counted twice, as they are computed.
 
@@ -208,7 +210,7 @@ def cost(method: dvi.Method, problem: Problem) -> Cost:
         return Cost(4, 0, 0)
     if isinstance(method, dvi.GaussLegendre):
         s = method.stages
-        return Cost(3 * s, s, 2 * s * n * s)
+        return Cost(2 * s, s, 2 * s * n * s)  # the last residual is that of the end
     directions = (dvi.TypeII(), dvi.Adjoint())
     explicit = [m.is_explicit(problem.system, q, problem.args) for m in directions]
     if isinstance(method, dvi.LobattoIIIAIIIB):
@@ -231,8 +233,8 @@ def lobatto_cost(s, n, step_is_explicit, inverse_is_explicit) -> Cost:
     if s == 2 and step_is_explicit and inverse_is_explicit:
         return Cost(3.5, 0, 0)  # halves: one sweep of 2 + 1, 2 for Q, 2 at the end
     sweep = s - 1 / 2  # s halves for Q, s − 1 for P
-    end = s if inverse_is_explicit else s / 2  # forces; and Q, where it is no unknown
     unknowns = (1 if inverse_is_explicit else 2) * (s - 1) * n
+    end = s / 2  # forces; Q is unknown, or that of the last residual
     return Cost(4 * sweep + end, sweep, unknowns * sweep)  # three sweeps, one last residual
 
 

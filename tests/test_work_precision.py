@@ -68,16 +68,6 @@ def problems(bench):
     }
 
 
-TOO_DEAR = {
-    ("henon_heiles", "GaussLegendre2"),
-    ("henon_heiles", "LobattoIIIAIIIB3"),
-    ("henon_heiles", "LobattoIIIAIIIB5"),
-    ("double_pendulum", "GaussLegendre2"),
-    ("damped", "LobattoIIIAIIIB2"),
-    ("damped", "LobattoIIIAIIIB3"),
-}
-"""Priced half an evaluation or one a stage and step more than are made: to be found out."""
-
 COUNTED = [
     ("henon_heiles", "Strang"),
     ("double_pendulum", "TypeII"),
@@ -94,13 +84,9 @@ COUNTED = [
 ]
 
 
-def marks_of(i, pair):
-    too_dear = pytest.mark.xfail(strict=True, reason="priced too dear by a constant a step")
-    return [pytest.mark.slow] * (i > 1) + [too_dear] * (pair in TOO_DEAR)
-
-
 @pytest.mark.parametrize(
-    ("problem", "method"), [pytest.param(*x, marks=marks_of(i, x)) for i, x in enumerate(COUNTED)]
+    ("problem", "method"),
+    [pytest.param(*pair, marks=[pytest.mark.slow] * (i > 1)) for i, pair in enumerate(COUNTED)],
 )
 def test_evaluations_are_counted_as_they_are_made(bench, problem, method):
     """Against derivatives of H_D at run time, each half an evaluation; columns are none."""
