@@ -76,6 +76,17 @@ from .observe import (
     Stop as Stop,
     Trend as Trend,
 )
+from .sweep import (
+    Axis as Axis,
+    StoreError as StoreError,
+    StoreMismatch as StoreMismatch,
+    SweepInterrupted as SweepInterrupted,
+    SweepProgress as SweepProgress,
+    SweepResult as SweepResult,
+    open_sweep as open_sweep,
+    starts as starts,
+    sweep as sweep,
+)
 from .symmetry import (
     AdiabaticInvariant as AdiabaticInvariant,
     Basis as Basis,

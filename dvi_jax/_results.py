@@ -3,7 +3,9 @@
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 
 class RESULTS(eqx.Enumeration):
@@ -68,11 +70,16 @@ STATUS_NAMES = (
 
 def status_name(result: RESULTS) -> Any:
     """The short name of a status, or an array of names for a batch."""
-    code = np.zeros(np.shape(result == RESULTS.successful), int)
-    for i, name in enumerate(STATUS_NAMES):
-        code = np.where(result == getattr(RESULTS, name), i, code)
-    names = np.array(STATUS_NAMES)[code]
+    names = np.array(STATUS_NAMES)[np.asarray(status_code(result))]
     return str(names) if names.ndim == 0 else names
+
+
+def status_code(result: RESULTS) -> Array:
+    """The place of a status in `STATUS_NAMES`, for each lane of a batch."""
+    code = jnp.zeros(jnp.shape(result == RESULTS.successful), jnp.int32)
+    for i, name in enumerate(STATUS_NAMES):
+        code = jnp.where(result == getattr(RESULTS, name), i, code)
+    return code
 
 
 def first_failure(earlier: RESULTS, later: RESULTS) -> RESULTS:

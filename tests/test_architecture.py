@@ -21,7 +21,7 @@ FLOORS = [
     ["_adjoints"],
     ["_reversible"],
     ["_integrate"],
-    ["invariants"],
+    ["invariants", "sweep"],
     ["__init__", "systems", "plot"],
     ["paper", "run", "certify"],
     ["cli"],
@@ -100,6 +100,7 @@ generators random_pairs solution_pairs find_symmetries Symmetries Symmetry
 Polynomials Basis Chebyshev Radial Trigonometric
 discover_invariants InvariantSeries ShadowHamiltonian drift_order drift_surface
 noether_balance solve_gauge
+sweep Axis starts open_sweep SweepResult SweepProgress SweepInterrupted StoreError StoreMismatch
 """
 
 

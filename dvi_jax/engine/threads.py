@@ -42,7 +42,7 @@ def over_threads(
             f"over_threads takes a function, e.g. jax.jit(jax.vmap(one)), got {function!r}."
         )
     if threads is None:
-        threads = _processors()
+        threads = processors()
     if isinstance(threads, bool) or not isinstance(threads, int):
         raise TypeError(f"threads must be a whole number or None, got {threads!r}.")
     if threads < 1:
@@ -76,7 +76,8 @@ def over_threads(
     return call
 
 
-def _processors() -> int:
+def processors() -> int:
+    """How many processors this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

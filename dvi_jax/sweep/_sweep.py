@@ -1,0 +1,261 @@
+"""The front door for many trajectories."""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._arithmetic import Arithmetic, FloatingPoint
+from .._solution import Save
+from .._system import System
+from ..engine.newton import RootSolver
+from ..engine.picard import PicardThenNewton
+from ..engine.tiles import Layout
+from ..lattices import Given, Lattice, Uniform
+from ..methods import Method, TypeII
+from ..observe import Stop
+from .axes import Axis, as_axis, is_axis, leaves_with_axes, lengths
+from .bar import shown
+from .identity import description, provenance
+from .plan import make_plan
+from .program import Program, Sweep, own_dims, shapes, variables
+from .result import SweepResult
+from .sinks import Memory
+from .starts import Starts
+from .store import Store
+from .workers import SweepProgress, run_here
+
+_SHARE = 0.5
+"""Of the memory of the machine, for results that are kept there."""
+
+_MANY_STARTS = 100_000
+"""Starts up to which they are written into the result."""
+
+
+class SweepInterrupted(KeyboardInterrupt):
+    """Ctrl-C during a sweep: what was finished is in `result`, and in the store if there is one."""
+
+    def __init__(self, message: str, result: SweepResult):
+        super().__init__(message)
+        self.result = result
+
+
+def sweep(
+    system: System,
+    q0: Any = None,
+    p0: Any = None,
+    *,
+    start: Starts | None = None,
+    h: Any = None,
+    num_steps: Any = None,
+    t0: Any = 0.0,
+    epsilon: Any = 0.0,
+    args: Any = None,
+    method: Any = TypeII(),
+    lattice: Lattice = Uniform(),
+    save: Save | None = None,
+    observe: Any = None,
+    newton: RootSolver = PicardThenNewton(),
+    arithmetic: Arithmetic = FloatingPoint(),
+    layout: Layout = Layout(),
+    stop: Stop | None = None,
+    store: str | os.PathLike | None = None,
+    threads: int | None = None,
+    lanes_per_task: int | None = None,
+    progress: bool | Callable[[SweepProgress], None] | None = None,
+) -> SweepResult:
+    """Trajectories over a grid of ε, initial conditions, parameters, steps and methods.
+
+    ``dvi.sweep(system, q0, p0, epsilon=np.geomspace(1e-4, 1e-1, 20), h=0.1, num_steps=10_000,
+    observe={"drift": dvi.MaxDrift(energy)}).to_xarray()`` is a labelled array of 20 drifts.
+
+    The grid is cut into tasks of one shape, which run on all processors or GPUs of this machine.
+    Results do not depend on how many there are, nor on when a run was interrupted: not in one bit.
+
+    **What varies.** Any number in epsilon, h, t0, q0, p0 and args may be an `Axis`; for epsilon, h
+    and t0 a one-dimensional array is one, of that name. Axes of different names make a grid, of one
+    name they go together. `start` generates initial conditions: `Random`, `Halton`, `Normal`,
+    `EnergyShell` in `dvi.starts`. An `Axis` of a list may stand for `method` (or simply the list)
+    and for `num_steps`, e.g. together with h; each value is compiled.
+
+    **Arguments** otherwise as for `integrate`, and
+
+    - `observe`: pytree of observables and reductions. `save`: which states are kept; None: none.
+    - `store`: a directory. Each task is written there when it is done; the same call again goes on
+      where a former one ended, however it ended. Several processes may work on one store. Without
+      one the results stay in memory.
+    - `threads`: of this process; None: one for each processor, or GPU.
+    - `lanes_per_task`: trajectories at a time; None: chosen from the number of steps.
+    - `progress`: True or False for a bar; a function of a `SweepProgress`; None: a bar where
+      somebody looks.
+
+    A trajectory that fails has a status and NaN, and its neighbours are as they were.
+
+    **Returns** a `SweepResult`.
+
+    **Raises** `ValueError` or `TypeError` for input that cannot be meant; `StoreMismatch` for a
+    store of another sweep, with what differs, and `StoreError` for one that cannot be used;
+    `SweepInterrupted`, a `KeyboardInterrupt`, after Ctrl-C, with what was finished.
+    """
+    made = make_sweep(
+        system, q0, p0, start=start, h=h, num_steps=num_steps, t0=t0, epsilon=epsilon, args=args,
+        method=method, lattice=lattice, save=save, observe=observe, newton=newton,
+        arithmetic=arithmetic, layout=layout, stop=stop,
+    )  # fmt: skip
+    program, found = prepare(made, lanes_per_task)
+    coordinates = coordinates_of(made)
+    about: dict[str, Any] = provenance()
+    if beside := [name for name in coordinates if name not in made.dims]:
+        about["coordinates"] = " ".join(beside)  # what a reader by CF looks for
+    config = description(made, program.plan, found)
+    if threads is not None and (
+        isinstance(threads, bool) or not isinstance(threads, int) or threads < 1
+    ):
+        raise ValueError(f"threads must be a positive whole number or None, got {threads!r}.")
+    if store is None:
+        _check_memory(program.plan.lanes * sum(v.bytes for v in found.values()))
+        sink: Any = Memory(program.plan, found)
+        result = SweepResult(sink, coordinates, {**about, "config": json.dumps(config)})
+    else:
+        sink = Store.open_or_make(store, config, found, coordinates, about)
+        result = SweepResult(sink, coordinates, sink.attributes)
+    with shown(progress) as report:
+        if not run_here(program, sink, threads, report):
+            raise SweepInterrupted(_interrupted(result), result)
+    return result
+
+
+def _interrupted(result: SweepResult) -> str:
+    done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
+    if result.path is None:
+        return f"interrupted: {done}; they are the `result` of this exception."
+    return f"interrupted: {done} and kept in {result.path}; the same call goes on from there."
+
+
+def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_steps: Any,
+               **rest: Any) -> Sweep:  # fmt: skip
+    """The sweep that these arguments describe; refuses what cannot be meant."""
+    if not isinstance(system, System):
+        raise TypeError(
+            f"system must be a dvi.System, got {type(system).__name__}. Wrap the discrete "
+            "Hamiltonian: dvi.System(H_D, force=W)."
+        )
+    inputs = {name: as_axis(name, rest.pop(name)) for name in ("epsilon", "h", "t0")}
+    inputs["args"] = rest.pop("args")
+    if start is None:
+        if q0 is None or p0 is None:
+            raise ValueError("give q0 and p0, or start=dvi.starts.Random(...) or another of those.")
+        inputs |= {"q0": q0, "p0": p0}
+    elif q0 is not None or p0 is not None:
+        raise ValueError("give q0 and p0 or a start, not both.")
+    elif not isinstance(start, Starts):
+        raise TypeError(
+            f"start must be one of dvi.starts, such as Random(...), got {start!r}. States of your "
+            'own are q0=dvi.Axis("start", ...), p0=dvi.Axis("start", ...).'
+        )
+    if rest["observe"] is None and rest["save"] is None:
+        raise ValueError(
+            "nothing would be kept: give observe={...}, or save=dvi.Save(final=True) for the last "
+            "states."
+        )
+    method = _static("method", method, Method)
+    num_steps = _static("num_steps", num_steps, int | np.integer)
+    leaves = leaves_with_axes(inputs)
+    in_front = [
+        (x.name, len(x), where)
+        for where, x in (("method", method), ("num_steps", num_steps))
+        if is_axis(x)
+    ]
+    axes = [*in_front, *((leaf.axis.name, len(leaf.axis), leaf.name) for leaf in leaves)]
+    if start is not None:
+        axes.append((start.name, start.count, "start"))
+    dims = lengths(axes)
+    if not dims:
+        raise ValueError(
+            'nothing varies: give an array for epsilon or h, a dvi.Axis("name", values) anywhere, '
+            "or a start. For one trajectory there is dvi.integrate."
+        )
+    if start is not None and start.name in dict.fromkeys(name for name, *_ in axes[:-1]):
+        raise ValueError(f"the name {start.name!r} of the start is that of an axis too.")
+    if isinstance(rest["lattice"], Given) and num_steps is not None:
+        raise ValueError("the times of dvi.Given are the steps: leave num_steps out.")
+    compiled = len({name for name, *_ in in_front})
+    return Sweep(system, inputs, start, method, num_steps, rest, dims, compiled)
+
+
+def _static(name: str, value: Any, kind: Any) -> Any:
+    """One value, or an axis of values that are compiled one by one."""
+    if isinstance(value, Mapping):
+        value = Axis(name, list(value.values()))
+    elif isinstance(value, list | tuple):
+        value = Axis(name, value)
+    for x in value.values if is_axis(value) else ():
+        if isinstance(x, bool) or not isinstance(x, kind):
+            raise TypeError(f"the axis {value.name!r} of {name} holds {x!r}, which is none.")
+    return value
+
+
+def prepare(made: Sweep, lanes_per_task: int | None) -> tuple[Program, dict[str, Any]]:
+    """The program of a sweep, cut into tasks, and the variables of its result."""
+    found = variables(made, shapes(made))
+    plan = make_plan(
+        made.dims, made.compiled, made.most_steps, sum(v.bytes for v in found.values()),
+        lanes_per_task,
+    )  # fmt: skip
+    return Program(made, plan), found
+
+
+def coordinates_of(made: Sweep) -> dict[str, Any]:
+    """name → (dims, values, attributes). Where one argument alone runs along a dimension, its
+    values are the dimension's; else they stand beside it under the argument's name."""
+    found: dict[str, Any] = {}
+    along: dict[str, dict[str, tuple[np.ndarray, str]]] = {dim: {} for dim in made.dims}
+    if is_axis(made.method):
+        names = np.asarray([repr(m) for m in made.method.values])
+        along[made.method.name]["method"] = names, ""
+    if is_axis(made.num_steps):
+        along[made.num_steps.name]["num_steps"] = np.asarray(made.num_steps.values), "steps"
+    for leaf in leaves_with_axes(made.inputs):
+        along[leaf.axis.name][leaf.name] = leaf.axis.values, leaf.axis.units
+    for dim, arguments in along.items():
+        rows = [name for name, (values, _) in arguments.items() if values.ndim == 1]
+        main = dim if dim in rows else rows[0] if len(rows) == 1 else None
+        if main is None and made.dims[dim] <= _MANY_STARTS:
+            found[dim] = ((dim,), np.arange(made.dims[dim]), {})
+        for name, (values, units) in arguments.items():
+            own = own_dims("component" if name in ("q0", "p0") else f"{name}_dim", values.shape[1:])
+            about = {"units": units} if units else {}
+            found[dim if name == main else name] = ((dim, *own), values, about)
+    if made.start is not None and made.start.count <= _MANY_STARTS:
+        states = _starts(made)
+        for name, x in zip(("q0", "p0"), states, strict=False):  # none where they vary
+            found[name] = ((made.start.name, *own_dims("component", x.shape[1:])), x, {})
+    return found
+
+
+def _starts(made: Sweep) -> list[np.ndarray]:
+    """All starts, where they do not depend on what else varies."""
+    start = made.start
+    assert start is not None
+    varies = any(is_axis(x) for x in jax.tree.leaves(
+        (made.inputs["t0"], made.inputs["args"]), is_leaf=is_axis))  # fmt: skip
+    if varies:
+        return []
+    at = jax.jit(jax.vmap(lambda i: start.at(i, made.inputs["t0"], made.inputs["args"])))
+    return [np.asarray(x) for x in at(np.arange(start.count))]
+
+
+def _check_memory(needed: int) -> None:
+    try:
+        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        there = 8 * 2**30
+    if needed > _SHARE * there:
+        raise ValueError(
+            f"the results need {needed / 2**30:.1f} GiB of memory, and this machine has "
+            f"{there / 2**30:.1f} GiB: give store=..., a directory, of which one task at a time is "
+            "in memory."
+        )

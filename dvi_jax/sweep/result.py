@@ -1,0 +1,127 @@
+"""What a sweep returns: labelled arrays, in memory or in a store, with a status for each number."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._results import STATUS_NAMES
+from .plan import Plan
+from .sinks import Memory
+from .store import STATUS, Store, about_variable
+
+
+class SweepResult:
+    """The results of a sweep over a grid.
+
+    - `dims`: name → length of the dimensions.
+    - `path`: of the store, or None.
+    - `num_tasks`, `tasks_done`: pieces of the grid, and how many of them have been computed.
+    - ``result["energy_drift"]``: one variable as a NumPy array, all of it.
+    - `to_xarray()`: the labelled whole.
+
+    What has not been computed is NaN (−1 in whole numbers), with the status −1.
+    """
+
+    def __init__(self, source: Memory | Store, coordinates: Mapping[str, Any], attributes: Any):
+        self._source, self._coordinates = source, dict(coordinates)
+        self.attributes = dict(attributes)
+
+    @property
+    def _plan(self) -> Plan:
+        return self._source.plan
+
+    @property
+    def dims(self) -> dict[str, int]:
+        return dict(self._plan.dims)
+
+    @property
+    def path(self) -> Path | None:
+        return self._source.path if isinstance(self._source, Store) else None
+
+    @property
+    def num_tasks(self) -> int:
+        return self._plan.num_tasks
+
+    @property
+    def tasks_done(self) -> int:
+        return self._plan.num_tasks - len(self._source.todo())
+
+    @property
+    def is_complete(self) -> bool:
+        return self.tasks_done == self.num_tasks
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if isinstance(self._source, Memory):
+            if name not in self._source.arrays:
+                raise KeyError(f"{name!r}: there are {', '.join(self._source.arrays)}.")
+            return self._source.arrays[name]
+        return self.to_xarray()[name].values
+
+    def status_counts(self) -> dict[str, int]:
+        """How many trajectories ended with each status, read task by task."""
+        counts = np.zeros(len(STATUS_NAMES) + 1, int)
+        if isinstance(self._source, Memory):
+            counts += np.bincount(self._source.arrays[STATUS].ravel() + 1, minlength=len(counts))
+        else:
+            for number in self._source.done():
+                record = self._source.record(number)
+                if record is not None:
+                    for name, count in record["statuses"].items():
+                        counts[STATUS_NAMES.index(name) + 1] += count
+            counts[0] = self._plan.lanes - counts[1:].sum()
+        names = ("not_computed", *STATUS_NAMES)
+        return {name: int(n) for name, n in zip(names, counts, strict=True) if n}
+
+    def to_xarray(self) -> Any:
+        """The result as an `xarray.Dataset`: dimensions with their values, units, and where and how
+        it was made in the attributes. Of a store nothing is read before it is asked for; tasks that
+        are not done are masked."""
+        import xarray as xr
+
+        data = {}
+        if isinstance(self._source, Memory):
+            for name, v in self._source.variables.items():
+                dims = (*self.dims, *v.dims)
+                data[name] = (dims, self._source.arrays[name], about_variable(name))
+        else:
+            from .lazy import masked
+
+            for name, v in self._source.variables.items():
+                dims = (*self.dims, *v.dims)
+                data[name] = xr.Variable(dims, masked(self._source, name), about_variable(name))
+        coords = {
+            name: xr.Variable(dims, values, about)
+            for name, (dims, values, about) in self._coordinates.items()
+        }
+        about = {k: v for k, v in self.attributes.items() if k != "coordinates"}
+        return xr.Dataset(data, coords, about)
+
+    def __repr__(self) -> str:
+        grid = " × ".join(f"{name} {n}" for name, n in self.dims.items())
+        done = f"{self.tasks_done} of {self.num_tasks} tasks done"
+        names = ", ".join(self._source.variables)
+        where = f", in {self.path}" if self.path is not None else ""
+        return f"SweepResult({grid}: {names}; {done}{where})"
+
+
+def open_sweep(path: Any) -> SweepResult:
+    """The results in a store, finished or not, while others still write to it or not.
+
+    **Raises** `StoreError` where there is none.
+    """
+    import zarr
+
+    store = Store.open(path)
+    group = zarr.open_group(store.path, mode="r")
+    coordinates = {}
+    for name, array in group.arrays():
+        if name in store.variables:
+            continue
+        coordinates[name] = (
+            getattr(array.metadata, "dimension_names", None),
+            array[:],
+            dict(array.attrs),
+        )
+    return SweepResult(store, coordinates, store.attributes)

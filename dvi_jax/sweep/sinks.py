@@ -1,0 +1,50 @@
+"""Where the results of tasks go: into memory here, into a store in `store`."""
+
+import abc
+import contextlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from .plan import Plan, Task
+from .program import Variable
+
+
+class Sink(abc.ABC):
+    """Takes the results of tasks, and knows which it has."""
+
+    @abc.abstractmethod
+    def todo(self) -> list[int]:
+        """The numbers of the tasks that are not done."""
+
+    @abc.abstractmethod
+    def claimed(self, task: Task) -> contextlib.AbstractContextManager[bool]:
+        """Whether the task is this worker's to do; for as long as the context lasts."""
+
+    @abc.abstractmethod
+    def commit(self, task: Task, results: Mapping[str, np.ndarray], facts: Mapping[str, Any]):
+        """Keep the results of a task; it is done once this returns."""
+
+
+class Memory(Sink):
+    """Arrays of the whole grid, where there is room for them."""
+
+    def __init__(self, plan: Plan, variables: Mapping[str, Variable]):
+        self.plan, self.variables = plan, dict(variables)
+        self.arrays = {
+            name: np.full((*plan.shape, *v.shape), v.fill, v.dtype) for name, v in variables.items()
+        }
+        self._done: set[int] = set()
+
+    def todo(self):
+        return [i for i in range(self.plan.num_tasks) if i not in self._done]
+
+    @contextlib.contextmanager
+    def claimed(self, task) -> Iterator[bool]:
+        yield True
+
+    def commit(self, task, results, facts):
+        for name, x in results.items():
+            self.arrays[name][task.box] = x
+        self._done.add(task.number)

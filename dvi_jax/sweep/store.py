@@ -1,0 +1,440 @@
+"""A sweep on disk: labelled arrays in zarr, and a record of every task that is done.
+
+Each task has one shard in each array. A shard is written under another name, forced to the disk and
+renamed; then the task's record is, which names the shards with their sizes and checksums. A task
+is done when its record is there: whatever dies, at whatever moment, leaves done tasks whole and the
+others to be done again.
+"""
+
+import contextlib
+import json
+import math
+import os
+import shutil
+import threading
+import time
+import uuid
+import warnings
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .identity import FORMAT, differences, digest
+from .plan import Plan, Task
+from .program import Variable
+from .sinks import Sink
+
+try:
+    import fcntl
+except ImportError:  # Windows: processes there do not divide a sweep between them
+    fcntl = None
+
+TASKS, CLAIMS = ".tasks", ".claims"
+_TEMPORARY = ".tmp"
+_CHUNK_BYTES = 2**22
+"""Of an inner chunk of a shard: what is read at least to see one number."""
+
+STATUS = "status"
+"""The variable whose shard is published after the others."""
+
+
+class StoreError(Exception):
+    """A store that cannot be used: the message says why, and what to do."""
+
+
+class StoreMismatch(StoreError, ValueError):
+    """A store that holds another sweep; `differing` names what differs."""
+
+    def __init__(self, message: str, differing: list[str]):
+        super().__init__(message)
+        self.differing = differing
+
+
+class Verification(NamedTuple):
+    """What `verify` found: tasks that are sound, bad ones (number → what is wrong; they are open
+    again), and how many are left to do."""
+
+    sound: int
+    bad: dict[int, str]
+    todo: int
+
+
+class Store(Sink):
+    """The directory of a sweep."""
+
+    def __init__(self, path: Path, attributes: Mapping[str, Any]):
+        self.path = path
+        self.attributes = attributes
+        self.config = json.loads(attributes["config"])
+        self.sha = attributes["config_sha256"]
+        self.plan = Plan(dict(self.config["dims"]), tuple(self.config["chunk"]))
+        self.variables = {
+            name: Variable(dtype, tuple(shape), tuple(dims))
+            for name, (dtype, shape, dims) in self.config["variables"].items()
+        }
+
+    # --- opening ----------------------------------------------------------------------------
+
+    @classmethod
+    def open(cls, path: str | os.PathLike) -> "Store":
+        """The store in a directory.
+
+        **Raises** `StoreError` where there is none, or none that this version can read.
+        """
+        path = Path(path)
+        try:
+            attributes = json.loads((path / "zarr.json").read_text())["attributes"]
+            found = attributes["dvi_jax_sweep"]
+        except FileNotFoundError:
+            raise StoreError(f"{path}: there is no sweep here (no zarr.json).") from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise StoreError(
+                f"{path}: zarr.json cannot be read as that of a sweep ({error!r}). If this was a "
+                "sweep, its results are in the arrays beside it; restore the file from a backup."
+            ) from None
+        if found != FORMAT:
+            raise StoreError(
+                f"{path}: the store has format {found}, this version reads {FORMAT}: use the "
+                f"version that made it ({attributes.get('dvi-jax', 'unknown')})."
+            )
+        if digest(json.loads(attributes["config"])) != attributes["config_sha256"]:
+            raise StoreError(f"{path}: the configuration in zarr.json is damaged or was edited.")
+        return cls(path, attributes)
+
+    @classmethod
+    def open_or_make(
+        cls,
+        path: str | os.PathLike,
+        config: Mapping[str, Any],
+        variables: Mapping[str, Variable],
+        coordinates: Mapping[str, Any],
+        attributes: Mapping[str, Any],
+    ) -> "Store":
+        """The store of this very sweep in a directory, made if there is nothing there.
+
+        **Raises** `StoreMismatch` if it holds another sweep; `StoreError` for a directory that
+        holds something else, or cannot be written.
+        """
+        path = Path(path)
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            if not (path / "zarr.json").exists():
+                raise StoreError(
+                    f"{path}: exists, and is no sweep: give a path that does not exist yet."
+                )
+        else:
+            _make(path, config, variables, coordinates, attributes)
+        store = cls.open(path)
+        if store.sha != digest(config):
+            differing = differences(store.config, config)
+            made = store.attributes
+            raise StoreMismatch(
+                f"{path} holds another sweep. Different are:\n  " + "\n  ".join(differing) + "\n"
+                f"(made {made.get('created')} with dvi-jax {made.get('dvi-jax')}, jax "
+                f"{made.get('jax')}). Give another store, or the arguments of that one.",
+                differing,
+            )
+        if not os.access(path / TASKS, os.W_OK):
+            raise StoreError(
+                f"{path}: cannot be written by this user: results would be lost. Give another "
+                "store, or change its permissions; dvi.open_sweep(path) reads it."
+            )
+        return store
+
+    # --- tasks --------------------------------------------------------------------------------
+
+    def record_path(self, number: int) -> Path:
+        return self.path / TASKS / f"{number // 1000:06d}" / f"{number:09d}.json"
+
+    def record(self, number: int) -> dict[str, Any] | None:
+        """What was committed of a task; None if it is not done or its record is damaged."""
+        try:
+            text = self.record_path(number).read_bytes()
+        except OSError:
+            return None
+        body, _, checksum = text.rstrip(b"\n").rpartition(b"\n")
+        if checksum != f"{zlib.crc32(body):08x}".encode():
+            return None
+        found = json.loads(body)
+        return found if found["config_sha256"] == self.sha else None
+
+    def done(self) -> list[int]:
+        """The numbers of the tasks that are done."""
+        named = sorted(int(f.stem) for f in (self.path / TASKS).glob("??????/?????????.json"))
+        return [i for i in named if self.record(i) is not None]
+
+    def todo(self):
+        done = set(self.done())
+        return [i for i in range(self.plan.num_tasks) if i not in done]
+
+    @contextlib.contextmanager
+    def claimed(self, task) -> Iterator[bool]:
+        with _claim(self.path / CLAIMS, task.number) as mine:
+            yield mine and self.record(task.number) is None
+
+    def shard_path(self, name: str, number: int) -> Path:
+        place = self.plan.place(number)
+        own = (0,) * len(self.variables[name].shape)
+        return self.path.joinpath(name, "c", *(str(k) for k in (*place, *own)))
+
+    def commit(self, task, results, facts):
+        shards = {}
+        for name in sorted(results, key=lambda n: n == STATUS):
+            content = self.shard(name, task, results[name])
+            publish(self.shard_path(name, task.number), content)
+            shards[name] = {"bytes": len(content), "crc32": f"{zlib.crc32(content):08x}"}
+        record = {
+            "task": task.number,
+            "start": task.start,
+            "size": task.size,
+            "shards": shards,
+            "config_sha256": self.sha,
+            **facts,
+        }
+        body = json.dumps(record).encode()
+        publish(self.record_path(task.number), body + f"\n{zlib.crc32(body):08x}\n".encode())
+
+    def shard(self, name: str, task: Task, values: np.ndarray) -> bytes:
+        """The bytes of one shard, made in memory."""
+        import zarr
+        from zarr.storage import MemoryStore
+
+        variable = self.variables[name]
+        files: dict[str, Any] = {}
+        array = zarr.create_array(
+            MemoryStore(files),
+            shape=(*self.plan.chunk, *variable.shape),
+            **_layout(self.plan.chunk, variable),
+        )
+        array[tuple(slice(n) for n in task.size)] = values
+        (content,) = (x for key, x in files.items() if key.startswith("c/"))
+        return content.to_bytes()
+
+    # --- looking after it ---------------------------------------------------------------------
+
+    def verify(self, progress: Any = None) -> Verification:
+        """Read every shard of every task that is done, and compare it with its record. The records
+        of bad ones are taken away, so that the next run does these tasks again."""
+        import zarr
+
+        group = zarr.open_group(self.path, mode="r")
+        bad: dict[int, str] = {}
+        files = sorted((self.path / TASKS).glob("??????/?????????.json"))
+        for n, file in enumerate(files):
+            number = int(file.stem)
+            wrong = self._what_is_wrong(number, group)
+            if wrong:
+                bad[number] = wrong
+                file.unlink()
+            if progress is not None:
+                progress(n + 1, len(files))
+        self._clear_away()
+        sound = len(files) - len(bad)
+        return Verification(sound, bad, self.plan.num_tasks - sound)
+
+    def _what_is_wrong(self, number: int, group: Any) -> str:
+        record = self.record(number)
+        if record is None:
+            return "the record is damaged"
+        task = self.plan.task(number)
+        for name in self.variables:
+            known = record["shards"].get(name)
+            try:
+                content = self.shard_path(name, number).read_bytes()
+            except OSError as error:
+                return f"the shard of {name} cannot be read ({error.strerror})"
+            if known is None or len(content) != known["bytes"]:
+                return f"the shard of {name} has {len(content)} bytes"
+            if f"{zlib.crc32(content):08x}" != known["crc32"]:
+                return f"the shard of {name} has another checksum"
+            try:
+                group[name][task.box]
+            except Exception as error:  # whatever a codec says of bytes that it cannot take
+                return f"the shard of {name} cannot be decoded ({error!r})"
+        return ""
+
+    def _clear_away(self) -> None:
+        """Remove what processes that died had begun to write: files older than any write takes."""
+        before = time.time() - 3600
+        for root, _, names in os.walk(self.path):
+            for name in names:
+                file = Path(root, name)
+                with contextlib.suppress(OSError):
+                    if name.endswith(_TEMPORARY) and file.stat().st_mtime < before:
+                        file.unlink()
+
+
+def publish(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all, on the disk once this returns."""
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{_TEMPORARY}")
+    made = _make_folders(path.parent)
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+    for folder in (path.parent, *made):
+        _sync(folder)
+
+
+def _make_folders(folder: Path) -> list[Path]:
+    """Make a folder and those above it; the folders that have new entries and must be synced."""
+    missing = []
+    while not folder.exists():
+        missing.append(folder)
+        folder = folder.parent
+    for new in reversed(missing):
+        new.mkdir(exist_ok=True)
+    return [new.parent for new in missing]
+
+
+def _sync(folder: Path) -> None:
+    if os.name == "nt":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+# --- claims -------------------------------------------------------------------------------------
+
+_lock = threading.Lock()
+_handles: dict[Path, int] = {}
+_mine: set[tuple[Path, int]] = set()
+
+
+@contextlib.contextmanager
+def _claim(file: Path, number: int) -> Iterator[bool]:
+    """Whether nobody else holds this number. Processes keep one byte of a file locked, which the
+    system lets go when they die; threads of one process see each other in `_mine`."""
+    key = (file.resolve(), number)
+    with _lock:
+        if key in _mine:
+            mine = False
+        elif fcntl is None:
+            mine = True
+        else:
+            # Never closed: a process that closes a file lets go of all its locks on it.
+            if key[0] not in _handles:
+                _handles[key[0]] = os.open(key[0], os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                fcntl.lockf(_handles[key[0]], fcntl.LOCK_EX | fcntl.LOCK_NB, 1, number)
+                mine = True
+            except OSError:
+                mine = False
+        if mine:
+            _mine.add(key)
+    try:
+        yield mine
+    finally:
+        if mine:
+            with _lock:
+                _mine.discard(key)
+                if fcntl is not None:
+                    fcntl.lockf(_handles[key[0]], fcntl.LOCK_UN, 1, number)
+
+
+# --- making -------------------------------------------------------------------------------------
+
+
+def _layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
+    """What zarr is told of an array: a task is a shard, in it chunks of some megabytes."""
+    from zarr import codecs
+
+    shard = (*chunk, *variable.shape)
+    inner = list(shard)
+    size = math.prod(shard) * np.dtype(variable.dtype).itemsize
+    for i, n in enumerate(shard):
+        divisors = (d for d in range(1, n + 1) if n % d == 0)
+        parts = next(d for d in divisors if d == n or size / d <= _CHUNK_BYTES)
+        inner[i] = n // parts
+        size //= parts
+        if size <= _CHUNK_BYTES:
+            break
+    return {
+        "dtype": variable.dtype,
+        "shards": shard,
+        "chunks": tuple(inner),
+        "compressors": [codecs.ZstdCodec(level=1), codecs.Crc32cCodec()],
+        "fill_value": variable.fill,
+        "config": {"write_empty_chunks": True},
+    }
+
+
+def _make(path, config, variables, coordinates, attributes) -> None:
+    """Make a store under another name and rename it: it appears whole or not at all."""
+    import zarr
+    from zarr import codecs
+
+    plan = Plan(dict(config["dims"]), tuple(config["chunk"]))
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{_TEMPORARY}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        group = zarr.create_group(
+            temporary,
+            attributes={
+                "Conventions": "CF-1.11",
+                "dvi_jax_sweep": FORMAT,
+                "config": json.dumps(config),
+                "config_sha256": digest(config),
+                **attributes,
+            },
+        )
+        for name, (dims, values, about) in coordinates.items():
+            group.create_array(
+                name, data=values, chunks=values.shape, dimension_names=dims, attributes=about,
+                compressors=[codecs.ZstdCodec(), codecs.Crc32cCodec()],
+            )  # fmt: skip
+        for name, v in variables.items():
+            group.create_array(
+                name,
+                shape=(*plan.shape, *v.shape),
+                dimension_names=(*plan.dims, *v.dims),
+                attributes=about_variable(name),
+                **_layout(plan.chunk, v),
+            )
+        (temporary / TASKS).mkdir()
+        with warnings.catch_warnings():  # of the format: readers without it list the directory
+            warnings.simplefilter("ignore")
+            zarr.consolidate_metadata(temporary)
+        for root, _, names in os.walk(temporary):
+            for name in names:
+                handle = os.open(Path(root, name), os.O_RDONLY)
+                os.fsync(handle)
+                os.close(handle)
+        try:
+            os.rename(temporary, path)
+        except OSError:  # another process was faster, or the directory holds something
+            if not (path / "zarr.json").exists():
+                raise
+        _sync(path.parent)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be made: {error.strerror or error}.") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def about_variable(name: str) -> dict[str, Any]:
+    """The attributes of a variable."""
+    from .._results import STATUS_NAMES
+
+    if name == STATUS:
+        return {
+            "long_name": "how each trajectory ended",
+            "flag_values": [-1, *range(len(STATUS_NAMES))],
+            "flag_meanings": " ".join(("not_computed", *STATUS_NAMES)),
+        }
+    known = {
+        "failed_step": "number of the failing step from 0, or -1",
+        "residual": "largest relative residual of an implicit solve",
+    }
+    return {"long_name": known[name]} if name in known else {}
