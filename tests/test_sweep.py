@@ -121,6 +121,24 @@ def test_the_same_bits_whatever_the_threads():
     near(results[0]["drift"][999], single(epsilon=0.3).observed["drift"])
 
 
+def test_other_numbers_need_no_other_program():
+    sweep(epsilon=np.linspace(0, 0.1, 7), h=0.1)
+    traced = []
+
+    def watched(t0, t1, q0, p1, args):
+        traced.append(h)
+        return friction(t0, t1, q0, p1, args)
+
+    system = dvi.System(hamiltonian, force=watched)
+    counts = []
+    for h in (0.1, 0.05, 0.02):
+        before = len(traced)
+        dvi.sweep(system, Q, P, epsilon=np.linspace(0, h, 7), h=h, num_steps=4,
+                  args={"k": 1 + h}, observe=OBSERVE)  # fmt: skip
+        counts.append(len(traced) - before)
+    assert counts[1] == counts[2] < counts[0] / 1.5  # shapes and identity alone
+
+
 def test_a_failing_lane_costs_itself_alone():
     eps = np.asarray([0.0, 0.1, 1e200, 0.2])
     with_it, without = sweep(epsilon=eps), sweep(epsilon=[0.0, 0.1, 0.15, 0.2])

@@ -21,11 +21,12 @@ from .axes import Axis, as_axis, is_axis, leaves_with_axes, lengths
 from .bar import shown
 from .identity import description, provenance
 from .plan import make_plan
-from .program import Program, Sweep, own_dims, shapes, variables
+from .program import Program, Sweep, shapes
 from .result import SweepResult
 from .sinks import Memory
 from .starts import Starts
 from .store import Store
+from .variables import own_dims, variables
 from .workers import SweepProgress, run_here
 
 _SHARE = 0.5

@@ -23,7 +23,8 @@ from .._compat import ClosedJaxpr, bodies
 from ..engine.signature import accepts
 from .axes import is_axis, leaves_with_axes
 from .plan import Plan
-from .program import Sweep, Variable, _stacked
+from .program import Sweep, stacked
+from .variables import Variable
 
 FORMAT = 1
 """Of the store: raised when a store of an older one cannot be read any more."""
@@ -72,14 +73,15 @@ def _example(sweep: Sweep) -> tuple[Any, Any, Any]:
         dict(sweep.inputs), is_leaf=is_axis,
     )  # fmt: skip
     if sweep.start is None:
-        q0 = jnp.asarray(_stacked(first["q0"]))
+        q0 = jnp.asarray(stacked(first["q0"]))
     else:
         start, t0, args = sweep.start, first["t0"], first["args"]
         shape = jax.eval_shape(lambda i: start.at(i, t0, args), np.zeros((), np.int32))[0]
         q0 = jnp.ones(shape.shape, shape.dtype)
     if not jnp.issubdtype(q0.dtype, jnp.floating):
         q0 = q0.astype(jnp.result_type(float))
-    return q0, first["args"], first["t0"]
+    args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, first["args"])
+    return q0, args, first["t0"]
 
 
 def digest(description: Mapping[str, Any]) -> str:

@@ -1,11 +1,11 @@
 """The compiled function that computes one task."""
 
-import functools
+import dataclasses
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,35 +15,12 @@ from .._integrate import integrate
 from .._results import status_code
 from .._solution import Save, Solution
 from ..engine.cpu import OPTIONS, takes_options
-from ..observe import Reduction
 from .axes import is_axis, place
 from .plan import Plan, Task
 from .starts import Starts
 
-RESERVED = ("status", "failed_step", "residual", "t", "q", "p", "save", "q0", "p0")
-"""Names in a result that are not the user's to give."""
 
-
-@dataclass(frozen=True)
-class Variable:
-    """One array of a result: dtype and, behind the dimensions of the grid, its own."""
-
-    dtype: str
-    shape: tuple[int, ...] = ()
-    dims: tuple[str, ...] = ()
-
-    @property
-    def bytes(self) -> int:
-        """For one trajectory."""
-        return int(np.dtype(self.dtype).itemsize * np.prod(self.shape, dtype=int))
-
-    @property
-    def fill(self) -> Any:
-        """What stands where nothing has been computed."""
-        return np.nan if np.dtype(self.dtype).kind in "fc" else -1
-
-
-@dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Sweep:
     """All that defines a sweep: what `integrate` takes, with axes in it.
 
@@ -81,36 +58,96 @@ class Sweep:
         return steps
 
 
-def lane(sweep: Sweep, method: Any, num_steps: int | None, values: Any, at: Any) -> dict[str, Any]:
-    """One trajectory: the variables of its result. `at` are its indices, one for each dimension of
-    `sweep.of_grid`: in `values` that of the task, for the starts that of the whole sweep."""
-    inside, index = at
-    where = dict(zip(sweep.of_grid, inside, strict=True))
+class Rows(eqx.Module):
+    """The values of an axis in one task; `name` is that of its dimension."""
 
-    def pick(leaf: Any, value: Any) -> Any:
+    values: Any
+    name: str = eqx.field(static=True)
+
+
+def _is_rows(x: Any) -> bool:
+    return isinstance(x, Rows)
+
+
+class Lanes(eqx.Module):
+    """What the trajectories of a task have in common, as one pytree: `Rows` in the inputs vary.
+
+    - `names`: the dimensions of the task. Its method and number of steps are one each.
+    """
+
+    system: Any
+    inputs: dict[str, Any]
+    start: Starts | None
+    method: Any
+    options: dict[str, Any]
+    num_steps: int | None = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def one(self, inside: tuple[Any, ...], index: tuple[Any, ...]) -> dict[str, Any]:
+        """One trajectory: the variables of its result. For each dimension `inside` is its index in
+        the task, `index` that in the whole sweep."""
+        where = dict(zip(self.names, inside, strict=True))
+        inputs = jax.tree.map(
+            lambda x: x.values[where[x.name]] if _is_rows(x) else x, self.inputs, is_leaf=_is_rows
+        )
+        if self.start is None:
+            q0, p0 = (stacked(inputs.pop(name)) for name in ("q0", "p0"))
+        else:
+            number = index[self.names.index(self.start.name)]
+            q0, p0 = self.start.at(number, inputs["t0"], inputs["args"])
+        save = self.options["save"]
+        options = {**self.options, "save": save or Save(final=True)}
+        solution = integrate(
+            self.system, q0, p0, **inputs, **options,
+            method=self.method, num_steps=self.num_steps, throw=False,
+        )  # fmt: skip
+        return outputs(solution, save is not None)
+
+
+def lanes_of(sweep: Sweep, task_start: tuple[int, ...], values: Any) -> Lanes:
+    """The trajectories of the task that begins there; `values` makes Rows of an axis."""
+
+    def known(leaf: Any) -> Any:
         if not is_axis(leaf):
             return leaf
-        return value[where[leaf.name]] if leaf.name in where else value
+        if leaf.name in sweep.of_grid:
+            return Rows(values(leaf), leaf.name)
+        return leaf.values[task_start[list(sweep.dims).index(leaf.name)]]
 
-    inputs = jax.tree.map(pick, dict(sweep.inputs), values, is_leaf=is_axis)
-    if sweep.start is None:
-        q0, p0 = (_stacked(inputs.pop(name)) for name in ("q0", "p0"))
-    else:
-        q0, p0 = sweep.start.at(index[sweep.of_grid.index(sweep.start.name)], inputs["t0"],
-                                inputs["args"])  # fmt: skip
-    save = sweep.options["save"]
-    solution = integrate(
-        sweep.system, q0, p0, **inputs, **{**sweep.options, "save": save or Save(final=True)},
-        method=method, num_steps=num_steps, throw=False,
-    )  # fmt: skip
-    return outputs(solution, save is not None)
+    return Lanes(
+        sweep.system,
+        jax.tree.map(known, dict(sweep.inputs), is_leaf=is_axis),
+        sweep.start,
+        sweep.value(sweep.method, task_start),
+        dict(sweep.options),
+        sweep.value(sweep.num_steps, task_start),
+        tuple(sweep.of_grid),
+    )
 
 
-def _stacked(state: Any) -> Any:
+def _batch(lanes: Lanes, chunk: tuple[int, ...], begin: Any, last: Any) -> dict[str, Any]:
+    """All lanes of a task, in the order of its box; lanes beyond its end are those at the end."""
+    if not chunk:
+        return jax.tree.map(lambda x: x[None], lanes.one((), ()))
+    count = stride = int(np.prod(chunk, dtype=int))
+    inside = []
+    for c in chunk:
+        stride //= c
+        inside.append((np.arange(count, dtype=np.int32) // stride) % c)
+    index = [jnp.minimum(i + b, e) for i, b, e in zip(inside, begin, last, strict=True)]
+    return jax.vmap(lanes.one)(tuple(inside), tuple(index))
+
+
+_filter_jit: Any = eqx.filter_jit  # its annotations leave out what goes on to jax.jit
+_compiled = _filter_jit(_batch)
+_compiled_with_options = _filter_jit(_batch, compiler_options=OPTIONS)
+
+
+def stacked(state: Any) -> Any:
     """A state given component by component."""
     if not isinstance(state, list | tuple):
         return state
-    return jnp.stack([jnp.asarray(_stacked(x), jnp.result_type(float)) for x in state])
+    return jnp.stack([jnp.asarray(stacked(x), jnp.result_type(float)) for x in state])
 
 
 def outputs(solution: Solution, with_states: bool) -> dict[str, Any]:
@@ -128,34 +165,33 @@ def outputs(solution: Solution, with_states: bool) -> dict[str, Any]:
 
 
 class Program:
-    """Computes tasks of a sweep. The functions are compiled once and for all threads."""
+    """Computes tasks of a sweep; a function is compiled once, by the thread that needs it first."""
 
     def __init__(self, sweep: Sweep, plan: Plan):
         self.sweep, self.plan = sweep, plan
-        self._functions: dict[Any, Any] = {}
+        self._ready: dict[Any, tuple[threading.Lock, list[bool]]] = {}
         self._lock = threading.Lock()
 
     def __call__(self, task: Task, device: Any = None) -> dict[str, np.ndarray]:
         """The variables of a task, each of shape (*task.size, …), computed on a device."""
         sweep, first = self.sweep, self.sweep.compiled
         chunk, size = self.plan.chunk[first:], task.size[first:]
-        names = sweep.of_grid
 
-        def rows(leaf: Any) -> Any:
-            if not is_axis(leaf):
-                return None
-            if leaf.name not in names:
-                return leaf.values[task.start[list(sweep.dims).index(leaf.name)]]
-            k = names.index(leaf.name)
+        def rows(axis: Any) -> Any:
+            k = sweep.of_grid.index(axis.name)
             begin = task.start[first + k]
-            values = np.asarray(leaf.values[begin : begin + size[k]])
+            values = np.asarray(axis.values[begin : begin + size[k]])
             return np.concatenate([values, *[values[-1:]] * (chunk[k] - size[k])])
 
-        values = jax.tree.map(rows, dict(sweep.inputs), is_leaf=is_axis)
+        lanes = lanes_of(sweep, task.start, rows)
+        numbers = jax.tree.map(  # not compiled in: another h needs no other program
+            lambda x: np.asarray(x) if isinstance(x, float | np.generic) else x, lanes.inputs
+        )
+        lanes = dataclasses.replace(lanes, inputs=numbers)
         begin = np.asarray(task.start[first:], np.int64 if x64_enabled() else np.int32)
         last = begin + np.asarray(size, begin.dtype) - 1
         with jax.default_device(device):
-            found = self._call(task, device, values, begin, last)
+            found = self._call((task.start[:first], device), lanes, chunk, begin, last)
         cut = tuple(slice(n) for n in size)
         results = {}
         for name, x in found.items():
@@ -169,24 +205,14 @@ class Program:
         steps = self.sweep.value(self.sweep.num_steps, task.start)
         return self.sweep.most_steps if steps is None else steps
 
-    def _call(self, task: Task, device: Any, *inputs: Any) -> Any:
-        """The outputs of the compiled function; the first thread that needs one compiles it."""
-        sweep = self.sweep
-        which = task.start[: sweep.compiled]
+    def _call(self, which: Any, *inputs: Any) -> Any:
+        function = _compiled_with_options if takes_options() else _compiled
         with self._lock:
-            if which not in self._functions:
-                method = sweep.value(sweep.method, task.start)
-                steps = sweep.value(sweep.num_steps, task.start)
-                one = functools.partial(lane, sweep, method, steps)
-                function = functools.partial(_batch, one, self.plan.chunk[sweep.compiled :])
-                options = OPTIONS if takes_options() else None
-                compiled = jax.jit(function, compiler_options=options)
-                self._functions[which] = compiled, threading.Lock(), set()
-        function, lock, ready = self._functions[which]
-        if device not in ready:
-            with lock:
+            first, ready = self._ready.setdefault(which, (threading.Lock(), []))
+        if not ready:
+            with first:
                 found = jax.block_until_ready(function(*inputs))
-                ready.add(device)
+                ready.append(True)
             return found
         return function(*inputs)
 
@@ -197,15 +223,11 @@ def shapes(sweep: Sweep) -> dict[str, Any]:
     **Raises** `ValueError` where they differ between methods or numbers of steps.
     """
     found: dict[str, Any] = {}
+    zeros = tuple(np.zeros((), np.int32) for _ in sweep.of_grid)
     for which in np.ndindex(*list(sweep.dims.values())[: sweep.compiled]):
         start = (*(int(k) for k in which), *(0 for _ in sweep.of_grid))
-        method, steps = (sweep.value(x, start) for x in (sweep.method, sweep.num_steps))
-        values = jax.tree.map(
-            lambda leaf: _first(leaf, sweep.of_grid), dict(sweep.inputs), is_leaf=is_axis
-        )
-        one = functools.partial(lane, sweep, method, steps)
-        zeros = tuple(np.zeros((), np.int32) for _ in sweep.of_grid)
-        out = jax.eval_shape(one, values, (zeros, zeros))
+        lanes = lanes_of(sweep, start, lambda axis: jnp.asarray(axis.values[:1]))
+        out = jax.eval_shape(lambda a, b, lanes=lanes: lanes.one(a, b), zeros, zeros)
         if found and {k: (v.shape, v.dtype) for k, v in out.items()} != {
             k: (v.shape, v.dtype) for k, v in found.items()
         }:
@@ -216,76 +238,3 @@ def shapes(sweep: Sweep) -> dict[str, Any]:
             )
         found = out
     return found
-
-
-def _first(leaf: Any, of_grid: list[str]) -> Any:
-    if not is_axis(leaf):
-        return None
-    return leaf.values[:1] if leaf.name in of_grid else leaf.values[0]
-
-
-def _batch(one: Any, chunk: tuple[int, ...], values: Any, begin: Any, last: Any) -> dict[str, Any]:
-    """All lanes of a task, in the order of its box; lanes beyond its end are those at the end."""
-    lanes = int(np.prod(chunk, dtype=int))
-    inside, stride = [], lanes
-    for c in chunk:
-        stride //= c
-        inside.append((np.arange(lanes, dtype=np.int32) // stride) % c)
-    index = [jnp.minimum(i + b, e) for i, b, e in zip(inside, begin, last, strict=True)]
-    if not chunk:
-        return jax.tree.map(lambda x: x[None], one(values, ((), ())))
-    return jax.vmap(one, in_axes=(None, 0))(values, (tuple(inside), tuple(index)))
-
-
-def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
-    """The arrays of a result, with names for their own dimensions.
-
-    **Raises** `ValueError` for an observable with a name that is taken, `TypeError` for one that
-    is not real or complex.
-    """
-    given = {
-        place(path) or "observed"
-        for path, _ in jax.tree.leaves_with_path(
-            sweep.options["observe"], is_leaf=lambda x: isinstance(x, Reduction)
-        )
-    }
-    taken = [n for n in given if n.split(".")[0] in RESERVED or n in sweep.dims]
-    if taken:
-        raise ValueError(
-            f"the observable {taken[0]!r} has a name that the result needs for something else "
-            f"({', '.join(dict.fromkeys((*RESERVED, *sweep.dims)))}): give it another."
-        )
-    found = {}
-    alone = _alone(sweep)
-    for name, x in shapes.items():
-        dims: list[str] = []
-        rest = x.shape
-        if name in ("t", "q", "p"):
-            dims, rest = ["save"], rest[1:]
-        elif name in alone:
-            dims, rest = [alone[name]], rest[1:]
-        if name in ("q", "p"):
-            dims += own_dims("component", rest)
-        else:
-            dims += own_dims(f"{name}_dim", rest)
-        dtype = np.dtype(x.dtype)
-        if dtype.kind not in "iufbc":
-            raise TypeError(f"the observable {name!r} has dtype {dtype}: it must be a number.")
-        found[name] = Variable("int8" if dtype.kind == "b" else dtype.name, x.shape, tuple(dims))
-    return found
-
-
-def _alone(sweep: Sweep) -> dict[str, str]:
-    """The observables that stand alone, and the dimension of their rows: steps that end at a save
-    point, one less than states but for ``Save(ts=...)``."""
-    save = sweep.options["save"]
-    rows = "save" if save is not None and save.ts is not None else "saved_step"
-    leaves = jax.tree.leaves_with_path(
-        sweep.options["observe"], is_leaf=lambda x: isinstance(x, Reduction)
-    )
-    return {place(path) or "observed": rows for path, f in leaves if not isinstance(f, Reduction)}
-
-
-def own_dims(name: str, shape: tuple[int, ...]) -> list[str]:
-    """Names for the dimensions of an array that are not those of the grid."""
-    return [name] if len(shape) == 1 else [f"{name}_{i}" for i in range(len(shape))]

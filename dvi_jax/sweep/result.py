@@ -1,6 +1,6 @@
 """What a sweep returns: labelled arrays, in memory or in a store, with a status for each number."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 from .._results import STATUS_NAMES
 from .plan import Plan
 from .sinks import Memory
-from .store import STATUS, Store, about_variable
+from .store import STATUS, Store, StoreError, Verification, about_variable
 
 
 class SweepResult:
@@ -73,6 +73,18 @@ class SweepResult:
             counts[0] = self._plan.lanes - counts[1:].sum()
         names = ("not_computed", *STATUS_NAMES)
         return {name: int(n) for name, n in zip(names, counts, strict=True) if n}
+
+    def verify(self, progress: Callable[[int, int], None] | None = None) -> Verification:
+        """Read all of a store again and compare it with the checksums in its records.
+
+        Tasks that are not sound are open again: the next run computes them anew. `progress` is
+        called as ``progress(tasks_read, tasks)``.
+
+        **Raises** `StoreError` for results that are in memory.
+        """
+        if not isinstance(self._source, Store):
+            raise StoreError("results in memory have no checksums: only a store can be verified.")
+        return self._source.verify(progress)
 
     def to_xarray(self) -> Any:
         """The result as an `xarray.Dataset`: dimensions with their values, units, and where and how

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .plan import Plan, Task
-from .program import Variable
+from .variables import Variable
 
 
 class Sink(abc.ABC):

@@ -24,8 +24,8 @@ import numpy as np
 
 from .identity import FORMAT, differences, digest
 from .plan import Plan, Task
-from .program import Variable
 from .sinks import Sink
+from .variables import Variable
 
 try:
     import fcntl
@@ -180,6 +180,15 @@ class Store(Sink):
         return self.path.joinpath(name, "c", *(str(k) for k in (*place, *own)))
 
     def commit(self, task, results, facts):
+        try:
+            self._commit(task, results, facts)
+        except OSError as error:
+            raise StoreError(
+                f"{self.path}: task {task.number} cannot be written: {error.strerror or error}. "
+                "What was finished before is kept; once there is room, the same call goes on."
+            ) from error
+
+    def _commit(self, task: Task, results: Mapping[str, np.ndarray], facts: Mapping) -> None:
         shards = {}
         for name in sorted(results, key=lambda n: n == STATUS):
             content = self.shard(name, task, results[name])

@@ -1,0 +1,88 @@
+"""The arrays of a result: names, types, shapes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..observe import Reduction
+from .axes import place
+from .program import Sweep
+
+RESERVED = ("status", "failed_step", "residual", "t", "q", "p", "save", "q0", "p0")
+"""Names in a result that are not the user's to give."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One array of a result: dtype and, behind the dimensions of the grid, its own."""
+
+    dtype: str
+    shape: tuple[int, ...] = ()
+    dims: tuple[str, ...] = ()
+
+    @property
+    def bytes(self) -> int:
+        """For one trajectory."""
+        return int(np.dtype(self.dtype).itemsize * np.prod(self.shape, dtype=int))
+
+    @property
+    def fill(self) -> Any:
+        """What stands where nothing has been computed."""
+        return np.nan if np.dtype(self.dtype).kind in "fc" else -1
+
+
+def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
+    """The arrays of a result, with names for their own dimensions.
+
+    **Raises** `ValueError` for an observable with a name that is taken, `TypeError` for one that
+    is not real or complex.
+    """
+    given = {
+        place(path) or "observed"
+        for path, _ in jax.tree.leaves_with_path(
+            sweep.options["observe"], is_leaf=lambda x: isinstance(x, Reduction)
+        )
+    }
+    taken = [n for n in given if n.split(".")[0] in RESERVED or n in sweep.dims]
+    if taken:
+        raise ValueError(
+            f"the observable {taken[0]!r} has a name that the result needs for something else "
+            f"({', '.join(dict.fromkeys((*RESERVED, *sweep.dims)))}): give it another."
+        )
+    found = {}
+    alone = _alone(sweep)
+    for name, x in shapes.items():
+        dims: list[str] = []
+        rest = x.shape
+        if name in ("t", "q", "p"):
+            dims, rest = ["save"], rest[1:]
+        elif name in alone:
+            dims, rest = [alone[name]], rest[1:]
+        if name in ("q", "p"):
+            dims += own_dims("component", rest)
+        else:
+            dims += own_dims(f"{name}_dim", rest)
+        dtype = np.dtype(x.dtype)
+        if dtype.kind not in "iufbc":
+            raise TypeError(f"the observable {name!r} has dtype {dtype}: it must be a number.")
+        found[name] = Variable("int8" if dtype.kind == "b" else dtype.name, x.shape, tuple(dims))
+    return found
+
+
+def _alone(sweep: Sweep) -> dict[str, str]:
+    """The observables that stand alone, and the dimension of their rows: steps that end at a save
+    point, one less than states but for ``Save(ts=...)``."""
+    save = sweep.options["save"]
+    rows = "save" if save is not None and save.ts is not None else "saved_step"
+    leaves = jax.tree.leaves_with_path(
+        sweep.options["observe"], is_leaf=lambda x: isinstance(x, Reduction)
+    )
+    return {place(path) or "observed": rows for path, f in leaves if not isinstance(f, Reduction)}
+
+
+def own_dims(name: str, shape: tuple[int, ...]) -> list[str]:
+    """Names for the dimensions of an array that are not those of the grid."""
+    return [name] if len(shape) == 1 else [f"{name}_{i}" for i in range(len(shape))]

@@ -1,0 +1,301 @@
+"""The store of sweeps: resuming, dying at any moment, damage of every kind."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sweep_child
+import xarray as xr
+from sweep_child import sweep
+
+import dvi_jax as dvi
+from dvi_jax.sweep import store as stores
+from dvi_jax.sweep.store import Store
+
+VARIABLES = ("drift", "end", "t", "q", "p", "status", "failed_step", "residual")
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    return sweep(None)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sweeps") / "whole.zarr"
+    sweep(path)
+    return path
+
+
+@pytest.fixture
+def copy(finished, tmp_path):
+    return Path(shutil.copytree(finished, tmp_path / "copy.zarr"))
+
+
+def same(a, b):
+    for name in VARIABLES:
+        np.testing.assert_array_equal(a[name], b[name])
+
+
+def shard(path, name="drift", task=3):
+    return Store.open(path).shard_path(name, task)
+
+
+def record(path, task=3):
+    return Store.open(path).record_path(task)
+
+
+def test_a_store_has_the_bits_of_memory(undisturbed, finished):
+    found = dvi.open_sweep(finished)
+    assert found.is_complete
+    same(found, undisturbed)
+    assert found.status_counts() == undisturbed.status_counts()
+    assert found.status_counts() == {"successful": 1175, "not_finite": 25}
+    a, b = found.to_xarray(), undisturbed.to_xarray()
+    xr.testing.assert_identical(a.drop_attrs(), b.drop_attrs())
+    for key in ("host", "jax", "created", "git_revision", "config"):
+        assert isinstance(a.attrs[key], str)
+
+
+def test_other_programs_read_it(undisturbed, finished):
+    with xr.open_zarr(finished, chunks=None) as ds:
+        assert ds.drift.dims == ("epsilon", "start")
+        assert ds.sel(start=3).status.attrs["flag_meanings"].startswith("not_computed successful")
+        np.testing.assert_array_equal(ds.drift, undisturbed["drift"])
+        assert "q0" in ds.coords
+
+
+def test_parts_are_read_without_the_rest(finished, monkeypatch):
+    lazy = dvi.open_sweep(finished).to_xarray()
+    asked = []
+    read = Store.record
+    monkeypatch.setattr(Store, "record", lambda self, n: asked.append(n) or read(self, n))
+    whole = sweep(None)["drift"]
+    np.testing.assert_array_equal(lazy.drift[4:8, 3], whole[4:8, 3])
+    assert asked == [1]
+    np.testing.assert_array_equal(lazy.drift[[0, 47], ::-2], whole[[0, 47], ::-2])
+    np.testing.assert_array_equal(lazy.drift[2], whole[2])
+    assert float(lazy.drift[9, 9]) == whole[9, 9]
+    assert lazy.q.isel(epsilon=3, save=1, component=0).shape == (25,)
+
+
+def test_an_unfinished_store_is_masked_and_goes_on(copy, undisturbed):
+    for task in (3, 7):
+        record(copy, task).unlink()  # their shards are still there: cut off before the record
+    found = dvi.open_sweep(copy)
+    assert found.tasks_done == 10
+    assert found.status_counts()["not_computed"] == 200
+    assert np.isnan(found["drift"][12:16]).all()
+    assert (found["status"][28:32] == -1).all()
+    np.testing.assert_array_equal(found["drift"][:12], undisturbed["drift"][:12])
+    before = record(copy, 2).stat().st_mtime_ns
+    same(sweep(copy), undisturbed)
+    assert record(copy, 2).stat().st_mtime_ns == before
+
+
+def test_another_sweep_is_refused_with_what_differs(copy):
+    with pytest.raises(dvi.StoreMismatch, match=r'args.k: "1.0" there, "2.0" now') as caught:
+        sweep(copy, k=2.0)
+    assert [d.split(":")[0] for d in caught.value.differing] == ["args.k"]
+
+
+def test_a_number_within_a_function_is_seen(copy, monkeypatch):
+    def other(t0, t1, q0, p0, q1, p1, args):
+        return 2 * sweep_child.hamiltonian(t0, t1, q1, p1, args)
+
+    monkeypatch.setattr(sweep_child, "energy", other)
+    with pytest.raises(dvi.StoreMismatch, match=r"observe.drift.function: "):
+        sweep(copy)
+
+
+def test_the_identity_is_the_same_in_every_process(tmp_path, finished):
+    code = (
+        "import sweep_child, sys; print(sweep_child.sweep(sys.argv[1]).attributes['config_sha256'])"
+    )
+    for seed in ("1", "2"):
+        found = subprocess.run(
+            [sys.executable, "-c", code, str(finished)], capture_output=True, text=True, check=True,
+            env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(Path(__file__).parent)},
+        )  # fmt: skip
+        assert found.stdout.strip() == Store.open(finished).sha
+
+
+def flip(path: Path, where: int):
+    content = bytearray(path.read_bytes())
+    content[where] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("name", ["drift", "status", "q"])
+def test_every_flipped_bit_is_found_and_repaired(copy, undisturbed, name):
+    file = shard(copy, name)
+    whole = file.read_bytes()
+    for where in {0, len(whole) // 2, len(whole) - 1, random.randrange(len(whole))}:
+        flip(file, where)
+        checked = dvi.open_sweep(copy).verify()
+        assert checked.bad == {3: f"the shard of {name} has another checksum"}
+        assert (checked.sound, checked.todo) == (11, 1)
+        same(sweep(copy), undisturbed)
+        assert file.read_bytes() == whole
+    assert not dvi.open_sweep(copy).verify().bad
+
+
+def test_a_flipped_bit_does_not_pass_for_a_number(copy):
+    """Whoever reads without verifying is told by the codec."""
+    file = shard(copy)
+    flip(file, len(file.read_bytes()) // 3)
+    with pytest.raises(Exception, match=r"(?i)checksum|zstd|decompress|corrupt"):
+        dvi.open_sweep(copy)["drift"]
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "rubbish", "flip"])
+def test_a_damaged_record_is_a_task_to_do(copy, undisturbed, damage):
+    file = record(copy)
+    text = file.read_bytes()
+    if damage == "flip":
+        flip(file, 40)
+    else:
+        file.write_bytes({"cut": text[:50], "empty": b"", "rubbish": b"{}\n0\n"}[damage])
+    assert dvi.open_sweep(copy).tasks_done == 11
+    assert dvi.open_sweep(copy).verify().bad == {3: "the record is damaged"}
+    same(sweep(copy), undisturbed)
+
+
+def test_a_missing_or_short_shard_is_found(copy, undisturbed):
+    shard(copy, "p", 1).unlink()
+    file = shard(copy, "end", 2)
+    file.write_bytes(file.read_bytes()[:-7])
+    bad = dvi.open_sweep(copy).verify().bad
+    assert set(bad) == {1, 2}
+    assert "cannot be read" in bad[1]
+    assert "bytes" in bad[2]
+    same(sweep(copy), undisturbed)
+
+
+def test_a_full_disk_loses_nothing(tmp_path, undisturbed, monkeypatch):
+    path, written = tmp_path / "s.zarr", []
+    write = os.fsync
+
+    def full(handle):
+        written.append(handle)
+        if len(written) > 200:
+            raise OSError(28, "No space left on device")
+        write(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(dvi.StoreError, match=r"No space left on device.*the same call goes on"):
+        sweep(path)
+    monkeypatch.undo()
+    found = dvi.open_sweep(path)
+    assert 0 < found.tasks_done < 12
+    assert not found.verify().bad
+    assert not list(path.rglob("*.tmp"))
+    same(sweep(path), undisturbed)
+
+
+def test_a_directory_that_cannot_be_written(copy, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(dvi.StoreError, match="cannot be written"):
+        sweep(copy)
+    monkeypatch.undo()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(dvi.StoreError, match="cannot be made"):
+        sweep(tmp_path / "file" / "s.zarr")
+
+
+def test_what_is_no_store(tmp_path, copy):
+    with pytest.raises(dvi.StoreError, match="there is no sweep here"):
+        dvi.open_sweep(tmp_path)
+    (tmp_path / "thesis.txt").write_text("all of it")
+    with pytest.raises(dvi.StoreError, match="is no sweep"):
+        sweep(tmp_path)
+    assert (tmp_path / "thesis.txt").read_text() == "all of it"
+    meta = copy / "zarr.json"
+    text = meta.read_text()
+    meta.write_text(text.replace('\\"k\\"', '\\"K\\"', 1))
+    with pytest.raises(dvi.StoreError, match="damaged or was edited"):
+        dvi.open_sweep(copy)
+    meta.write_text(text[:100])
+    with pytest.raises(dvi.StoreError, match="cannot be read as that of a sweep"):
+        sweep(copy)
+
+
+def test_a_store_of_another_format(copy):
+    meta = copy / "zarr.json"
+    content = json.loads(meta.read_text())
+    content["attributes"]["dvi_jax_sweep"] = 99
+    meta.write_text(json.dumps(content))
+    with pytest.raises(dvi.StoreError, match="format 99, this version reads 1"):
+        dvi.open_sweep(copy)
+
+
+def test_claims_exclude_threads_and_end_with_the_context(tmp_path):
+    file = tmp_path / "claims"
+    with stores._claim(file, 3) as first, stores._claim(file, 3) as again, \
+            stores._claim(file, 4) as other:  # fmt: skip
+        assert (first, again, other) == (True, False, True)
+    with stores._claim(file, 3) as later:
+        assert later
+
+
+def child(path, tasks, pause=0.01):
+    script = Path(__file__).with_name("sweep_child.py")
+    return subprocess.Popen([sys.executable, str(script), str(path), str(tasks), str(pause)])
+
+
+def committed(path):
+    lines = [line.split() for line in Path(f"{path}.log").read_text().splitlines()]
+    return Counter(n for n, what in lines if what == "end")
+
+
+def cut_off(path):
+    """Commits that had begun and never ended."""
+    words = [line.split()[1] for line in Path(f"{path}.log").read_text().splitlines()]
+    return words.count("begin") - words.count("end")
+
+
+@pytest.mark.slow
+def test_two_processes_on_one_store(tmp_path):
+    path = tmp_path / "s.zarr"
+    running = [child(path, 30, 0.1), child(path, 30, 0.1)]
+    assert [p.wait(120) for p in running] == [0, 0]
+    assert set(committed(path).values()) == {1}
+    assert len(committed(path)) == 30
+    by = Counter(Store.open(path).record(i)["pid"] for i in range(30))
+    assert len(by) == 2
+    same(dvi.open_sweep(path), sweep(None, 30))
+
+
+@pytest.mark.slow
+def test_killed_forty_times(tmp_path):
+    """SIGKILL at random moments, two processes at a time: all done, once, with the same bits."""
+    path, tasks = tmp_path / "s.zarr", 160
+    rng = random.Random(5)
+    running, kills = [child(path, tasks, 0.15) for _ in range(2)], 0
+    began = time.monotonic()
+    while kills < 40 and time.monotonic() - began < 400:
+        time.sleep(rng.uniform(0.0, 2.0))
+        i = rng.randrange(2)
+        if running[i].poll() is None:
+            running[i].send_signal(signal.SIGKILL)
+            running[i].wait()
+            kills += 1
+        running[i] = child(path, tasks, 0.15)
+    for process in running:
+        assert process.wait(200) == 0
+    found = dvi.open_sweep(path)
+    assert found.is_complete
+    assert not found.verify().bad
+    same(found, sweep(None, tasks))
+    assert kills == 40
+    assert max(committed(path).values()) == 1
+    assert cut_off(path) > 0, "no kill met a task that was being written: nothing was tested"
