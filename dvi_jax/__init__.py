@@ -78,6 +78,7 @@ from .observe import (
 )
 from .sweep import (
     Axis as Axis,
+    ClusterError as ClusterError,
     StoreError as StoreError,
     StoreMismatch as StoreMismatch,
     SweepInterrupted as SweepInterrupted,

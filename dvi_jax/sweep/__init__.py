@@ -3,6 +3,7 @@
 from . import starts as starts
 from ._sweep import SweepInterrupted as SweepInterrupted, sweep as sweep
 from .axes import Axis as Axis
+from .cluster import ClusterError as ClusterError
 from .result import SweepResult as SweepResult, open_sweep as open_sweep
 from .store import StoreError as StoreError, StoreMismatch as StoreMismatch
 from .workers import SweepProgress as SweepProgress

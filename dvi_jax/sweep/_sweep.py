@@ -64,6 +64,7 @@ def sweep(
     layout: Layout = Layout(),
     stop: Stop | None = None,
     store: str | os.PathLike | None = None,
+    client: Any = None,
     threads: int | None = None,
     lanes_per_task: int | None = None,
     progress: bool | Callable[[SweepProgress], None] | None = None,
@@ -88,6 +89,8 @@ def sweep(
     - `store`: a directory. Each task is written there when it is done; the same call again goes on
       where a former one ended, however it ended. Several processes may work on one store. Without
       one the results stay in memory.
+    - `client`: a `distributed.Client`: its workers compute the tasks, and write them where there is
+      a store, which all of them must see under the same path.
     - `threads`: of this process; None: one for each processor, or GPU.
     - `lanes_per_task`: trajectories at a time; None: chosen from the number of steps.
     - `progress`: True or False for a bar; a function of a `SweepProgress`; None: a bar where
@@ -99,6 +102,7 @@ def sweep(
 
     **Raises** `ValueError` or `TypeError` for input that cannot be meant; `StoreMismatch` for a
     store of another sweep, with what differs, and `StoreError` for one that cannot be used;
+    `ClusterError` for a cluster that is lost;
     `SweepInterrupted`, a `KeyboardInterrupt`, after Ctrl-C, with what was finished.
     """
     made = make_sweep(
@@ -112,6 +116,12 @@ def sweep(
     if beside := [name for name in coordinates if name not in made.dims]:
         about["coordinates"] = " ".join(beside)  # what a reader by CF looks for
     config = description(made, program.plan, found)
+    if client is not None and not hasattr(client, "submit"):
+        raise TypeError(f"client must be a distributed.Client, got {client!r}.")
+    if threads is not None and client is not None:
+        raise ValueError(
+            "threads are those of this process: with a client its workers have theirs."
+        )
     if threads is not None and (
         isinstance(threads, bool) or not isinstance(threads, int) or threads < 1
     ):
@@ -124,7 +134,13 @@ def sweep(
         sink = Store.open_or_make(store, config, found, coordinates, about)
         result = SweepResult(sink, coordinates, sink.attributes)
     with shown(progress) as report:
-        if not run_here(program, sink, threads, report):
+        if client is not None:
+            from .cluster import run_on
+
+            is_whole = run_on(client, made, program.plan, sink, report)
+        else:
+            is_whole = run_here(program, sink, threads, report)
+        if not is_whole:
             raise SweepInterrupted(_interrupted(result), result)
     return result
 
