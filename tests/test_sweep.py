@@ -7,7 +7,9 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
+import xarray as xr
 
 import dvi_jax as dvi
 from dvi_jax import starts
@@ -29,6 +31,7 @@ def energy(t0, t1, q0, p0, q1, p1, args):
 
 SYSTEM = dvi.System(hamiltonian, force=friction)
 OBSERVE = {"drift": dvi.MaxDrift(energy), "mean": dvi.Mean(energy)}
+LOW, HIGH = ([-1.0, 0.0], [0.0, 0.5]), ([1.0, 2.0], [0.0, 1.5])
 Q, P = [0.5, -0.2], [0.1, 0.3]
 
 
@@ -95,8 +98,8 @@ def test_methods_and_numbers_of_steps_are_axes():
     methods = [dvi.TypeII(), dvi.Strang()]
     steps = dvi.Axis("h", [10, 20])
     found = sweep(method=methods, num_steps=steps, h=dvi.Axis("h", [0.1, 0.05])).to_xarray()
-    assert found.drift.dims == ("method", "h")
-    assert list(found.method.values) == ["TypeII()", "Strang(base=TypeII())"]
+    assert found.drift.dims == ("integrator", "h")
+    assert list(found.integrator.values) == ["TypeII()", "Strang(base=TypeII())"]
     assert list(found.num_steps.values) == [10, 20]
     for i, method in enumerate(methods):
         for j, (n, h) in enumerate(((10, 0.1), (20, 0.05))):
@@ -180,9 +183,44 @@ def test_ctrl_c_keeps_what_is_finished():
     assert np.isnan(result["drift"][~computed]).all()
 
 
-# --- starts ----------------------------------------------------------------------------------
+# --- export ----------------------------------------------------------------------------------
 
-LOW, HIGH = ([-1.0, 0.0], [0.0, 0.5]), ([1.0, 2.0], [0.0, 1.5])
+
+@pytest.fixture(scope="module", params=["memory", "store"])
+def result(request, tmp_path_factory):
+    where = tmp_path_factory.mktemp("export") / "s.zarr" if request.param == "store" else None
+    return sweep(
+        start=starts.Halton(10, LOW, HIGH), epsilon=[0.0, 0.1, 1e200], lanes_per_task=4,
+        method=[dvi.TypeII(), dvi.Strang()], save=dvi.Save(final=True), store=where,
+    )  # fmt: skip
+
+
+def test_netcdf_is_the_dataset(result, tmp_path):
+    result.to_netcdf(tmp_path / "s.nc")
+    with xr.open_dataset(tmp_path / "s.nc", engine="h5netcdf") as found:
+        wanted = result.to_xarray()
+        xr.testing.assert_equal(found.load(), wanted)
+        assert found.attrs["jax"] == jax.__version__
+        assert found.status.attrs["flag_meanings"] == wanted.status.attrs["flag_meanings"]
+    with pytest.raises(FileExistsError, match="force=True"):
+        result.to_netcdf(tmp_path / "s.nc")
+
+
+def test_parquet_has_a_row_for_each_trajectory(result, tmp_path):
+    result.to_parquet(tmp_path / "s.parquet")
+    table = pd.read_parquet(tmp_path / "s.parquet")
+    assert len(table) == 60
+    assert set(table.status) == {"successful", "not_finite"}
+    one = table[(table.epsilon == 0.1) & (table.start == 7) & (table.integrator == "TypeII()")]
+    found = result.to_xarray().sel(epsilon=0.1, start=7, integrator="TypeII()")
+    near(one.drift, [found.drift])
+    near(one.q_1_0, [found.q[1, 0]])
+    near(one.p0_1, [found.p0[1]])
+    result.to_parquet(tmp_path / "s.parquet", force=True)
+    assert [f.name for f in tmp_path.iterdir()] == ["s.parquet"]
+
+
+# --- starts ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [starts.Random, starts.Halton])

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -80,8 +80,9 @@ def sweep(
     **What varies.** Any number in epsilon, h, t0, q0, p0 and args may be an `Axis`; for epsilon, h
     and t0 a one-dimensional array is one, of that name. Axes of different names make a grid, of one
     name they go together. `start` generates initial conditions: `Random`, `Halton`, `Normal`,
-    `EnergyShell` in `dvi.starts`. An `Axis` of a list may stand for `method` (or simply the list)
-    and for `num_steps`, e.g. together with h; each value is compiled.
+    `EnergyShell` in `dvi.starts`. An `Axis` of a list may stand for `method` (or simply the list;
+    the dimension is then "integrator") and for `num_steps`, e.g. together with h; each value is
+    compiled.
 
     **Arguments** otherwise as for `integrate`, and
 
@@ -205,10 +206,9 @@ def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_st
 
 def _static(name: str, value: Any, kind: Any) -> Any:
     """One value, or an axis of values that are compiled one by one."""
-    if isinstance(value, Mapping):
-        value = Axis(name, list(value.values()))
-    elif isinstance(value, list | tuple):
-        value = Axis(name, value)
+    if isinstance(value, list | tuple):
+        # Not "method", which xarray's sel takes for something else.
+        value = Axis({"method": "integrator"}.get(name, name), value)
     for x in value.values if is_axis(value) else ():
         if isinstance(x, bool) or not isinstance(x, kind):
             raise TypeError(f"the axis {value.name!r} of {name} holds {x!r}, which is none.")

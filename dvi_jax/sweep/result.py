@@ -1,6 +1,6 @@
 """What a sweep returns: labelled arrays, in memory or in a store, with a status for each number."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +110,30 @@ class SweepResult:
         about = {k: v for k, v in self.attributes.items() if k != "coordinates"}
         return xr.Dataset(data, coords, about)
 
+    def to_netcdf(self, path: Any, force: bool = False) -> None:
+        """Write all of it to a NetCDF 4 file, task by task: memory is that of one task.
+
+        Needs the extra `export`. **Raises** `FileExistsError` for a file that is there, unless
+        `force`; `ImportError` without h5netcdf.
+        """
+        from .export import to_netcdf
+
+        to_netcdf(self.to_xarray(), self._boxes(), path, force)
+
+    def to_parquet(self, path: Any, force: bool = False) -> None:
+        """Write a Parquet table, one row a trajectory: the values of its axes, its results, the
+        name of its status. Task by task: each is a row group.
+
+        Needs the extra `export`. **Raises** as `to_netcdf`.
+        """
+        from .export import to_parquet
+
+        to_parquet(self.to_xarray(), self._boxes(), path, force)
+
+    def _boxes(self) -> Iterator[dict[str, slice]]:
+        """The parts of the grid that the tasks are."""
+        return (dict(zip(self.dims, t.box, strict=True)) for t in self._plan.tasks())
+
     def __repr__(self) -> str:
         grid = " × ".join(f"{name} {n}" for name, n in self.dims.items())
         done = f"{self.tasks_done} of {self.num_tasks} tasks done"
@@ -131,9 +155,9 @@ def open_sweep(path: Any) -> SweepResult:
     for name, array in group.arrays():
         if name in store.variables:
             continue
-        coordinates[name] = (
-            getattr(array.metadata, "dimension_names", None),
-            array[:],
-            dict(array.attrs),
-        )
+        values: Any = array[:]
+        if values.dtype.kind == "T":
+            values = values.astype(str)
+        dims = getattr(array.metadata, "dimension_names", None)
+        coordinates[name] = (dims, values, dict(array.attrs))
     return SweepResult(store, coordinates, store.attributes)

@@ -399,6 +399,8 @@ def _make(path, config, variables, coordinates, attributes) -> None:
             },
         )
         for name, (dims, values, about) in coordinates.items():
+            if values.dtype.kind == "U":  # names of methods, of any length
+                values = values.astype(np.dtypes.StringDType())
             group.create_array(
                 name, data=values, chunks=values.shape, dimension_names=dims, attributes=about,
                 compressors=[codecs.ZstdCodec(), codecs.Crc32cCodec()],
