@@ -81,12 +81,14 @@ from .sweep import (
     ClusterError as ClusterError,
     StoreError as StoreError,
     StoreMismatch as StoreMismatch,
+    SweepCost as SweepCost,
     SweepInterrupted as SweepInterrupted,
     SweepProgress as SweepProgress,
     SweepResult as SweepResult,
     open_sweep as open_sweep,
     starts as starts,
     sweep as sweep,
+    sweep_cost as sweep_cost,
 )
 from .symmetry import (
     AdiabaticInvariant as AdiabaticInvariant,

@@ -101,7 +101,7 @@ Polynomials Basis Chebyshev Radial Trigonometric
 discover_invariants InvariantSeries ShadowHamiltonian drift_order drift_surface
 noether_balance solve_gauge
 sweep Axis starts open_sweep SweepResult SweepProgress SweepInterrupted StoreError StoreMismatch
-ClusterError
+ClusterError sweep_cost SweepCost
 """
 
 

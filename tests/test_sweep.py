@@ -13,6 +13,7 @@ import xarray as xr
 
 import dvi_jax as dvi
 from dvi_jax import starts
+from dvi_jax.sweep.cost import span
 from dvi_jax.sweep.plan import Plan, make_plan
 from dvi_jax.sweep.starts import radical_inverse
 
@@ -181,6 +182,37 @@ def test_ctrl_c_keeps_what_is_finished():
     computed = result["status"] == 0
     assert np.isfinite(result["drift"][computed]).all()
     assert np.isnan(result["drift"][~computed]).all()
+
+
+# --- what it takes ---------------------------------------------------------------------------
+
+
+def test_the_cost_of_a_sweep():
+    settings = {"h": 0.1, "num_steps": 50, "args": {"k": 1.0}, "observe": OBSERVE}
+    grid = {"epsilon": np.linspace(0, 0.1, 100), "method": [dvi.TypeII(), dvi.Strang()]}
+    cost = dvi.sweep_cost(SYSTEM, Q, P, **settings, **grid, lanes_per_task=10, store="ignored")
+    whole = sweep(**grid, num_steps=50, lanes_per_task=10)
+    assert (cost.lanes, cost.steps, cost.tasks) == (200, 10_000, whole.num_tasks)
+    arrays = [whole[n] for n in ("drift", "mean", "status", "failed_step", "residual")]
+    assert cost.bytes == sum(x.nbytes for x in arrays)
+    assert 0 < cost.seconds_per_step < 1e-3
+    assert cost.compilation > 0
+    large = cost.scaled(1e9)
+    assert (large.tasks, large.files) == (10**8, 6 * 10**8)
+    assert large.bytes == cost.bytes * 5 * 10**6
+    assert large.seconds(1) > 60 * large.seconds(64) > 0
+    assert "| 1e+12 | 1e+11 |" in cost.table()
+    assert "20 tasks of 10 trajectories" in str(cost)
+    with pytest.raises(ValueError, match="nothing varies"):
+        dvi.sweep_cost(SYSTEM, Q, P, **settings)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(0.004, "0.004 s"), (70, "70 s"), (200, "3.33 min"), (1e4, "2.78 h"), (1e9, "31.7 years")],
+)
+def test_times_in_words(seconds, said):
+    assert span(seconds) == said
 
 
 # --- export ----------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """The front door for many trajectories."""
 
+import inspect
 import json
 import os
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from ..methods import Method, TypeII
 from ..observe import Stop
 from .axes import Axis, as_axis, is_axis, leaves_with_axes, lengths
 from .bar import shown
+from .cost import SweepCost, cost
 from .identity import description, provenance
 from .plan import make_plan
 from .program import Program, Sweep, shapes
@@ -144,6 +146,36 @@ def sweep(
         if not is_whole:
             raise SweepInterrupted(_interrupted(result), result)
     return result
+
+
+def sweep_cost(
+    system: System,
+    q0: Any = None,
+    p0: Any = None,
+    *,
+    lanes_per_task: int | None = None,
+    **settings: Any,
+) -> SweepCost:
+    """What `sweep` would take with these arguments: tasks, bytes, seconds; with tables for larger
+    ones. One task for each method and number of steps is computed for it and timed.
+
+    **Arguments** as for `sweep`; `store`, `client`, `threads` and `progress` are not needed.
+
+    **Returns** a `SweepCost`. **Raises** as `sweep` for input that cannot be meant.
+    """
+    for name in ("store", "client", "threads", "progress"):
+        settings.pop(name, None)
+    made = make_sweep(system, q0, p0, **_DEFAULTS | settings)
+    program, found = prepare(made, lanes_per_task)
+    return cost(made, program.plan, found)
+
+
+_DEFAULTS = {
+    name: parameter.default
+    for name, parameter in inspect.signature(sweep).parameters.items()
+    if name
+    not in ("system", "q0", "p0", "store", "client", "threads", "lanes_per_task", "progress")
+}
 
 
 def _interrupted(result: SweepResult) -> str:

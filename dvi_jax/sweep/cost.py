@@ -1,0 +1,147 @@
+"""What a sweep will take: tasks, bytes and seconds, from one task that is computed."""
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..engine.threads import processors
+from .plan import Plan
+from .program import Program, Sweep
+from .variables import Variable
+
+SECONDS_TO_COMMIT = 0.02
+"""To write a task, at least: files are forced to the disk one after the other. The directory of a
+cluster may take longer."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepCost:
+    """What a sweep takes.
+
+    - `dims`: of the grid. `lanes`: trajectories. `steps`: of all trajectories together.
+    - `tasks`, `lanes_per_task`: pieces that are computed, written and lost together.
+    - `bytes`: of the results, before compression. `files`: of a store.
+    - `seconds_per_step`: of one trajectory, on one core or GPU, measured (the mean over methods).
+    - `compilation`: seconds until the first task was there, less those of computing it.
+    - `seconds_per_task`: of the one measured. `cores`: that this process would use.
+    """
+
+    dims: Mapping[str, int]
+    lanes: int
+    steps: int
+    tasks: int
+    lanes_per_task: int
+    bytes: int
+    files: int
+    variables: int
+    seconds_per_step: float
+    seconds_per_task: float
+    compilation: float
+    cores: int
+
+    def seconds(self, workers: int | None = None) -> float:
+        """Until the last task is done on so many cores (or GPUs), those of this machine if None.
+
+        Tasks go round in turns: ⌈tasks/workers⌉ of them one after the other, and compilation once.
+        """
+        workers = workers or self.cores
+        each = max(self.steps * self.seconds_per_step / self.tasks, SECONDS_TO_COMMIT)
+        return self.compilation + -(-self.tasks // workers) * each
+
+    def scaled(self, lanes: float) -> "SweepCost":
+        """The same with another number of trajectories, in tasks of the same size."""
+        factor = lanes / self.lanes
+        tasks = max(1, -(-int(lanes) // self.lanes_per_task))
+        return dataclasses.replace(
+            self, dims={}, lanes=int(lanes), steps=int(self.steps * factor), tasks=tasks,
+            bytes=int(self.bytes * factor), files=tasks * (self.variables + 1),
+        )  # fmt: skip
+
+    def table(
+        self,
+        lanes: Sequence[float] = (1e6, 1e9, 1e12),
+        workers: Sequence[int] = (1, 64, 4096),
+    ) -> str:
+        """Markdown: time and room for other numbers of trajectories and workers."""
+        each = [self, *(self.scaled(n) for n in lanes)]
+        head = ["trajectories", "tasks", "results", *(f"{n} workers" for n in workers)]
+        rows = [
+            [
+                f"{c.lanes:.3g}",
+                f"{c.tasks:.3g}",
+                size(c.bytes),
+                *(span(c.seconds(n)) for n in workers),
+            ]
+            for c in each
+        ]
+        lines = [head, ["---"] * len(head), *rows]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+    def __str__(self) -> str:
+        grid = " × ".join(f"{name} {n}" for name, n in self.dims.items())
+        return (
+            f"{grid or 'trajectories'}: {self.lanes:.6g} trajectories, {self.steps:.3g} steps\n"
+            f"{self.tasks} tasks of {self.lanes_per_task} trajectories, "
+            f"{span(self.seconds_per_task)} each\n"
+            f"{size(self.bytes)} of results in {self.files} files\n"
+            f"{self.seconds_per_step * 1e9:.3g} ns a step; compilation "
+            f"{span(self.compilation)}; in all {span(self.seconds())} on {self.cores} cores"
+        )
+
+
+def cost(sweep: Sweep, plan: Plan, variables: Mapping[str, Variable]) -> SweepCost:
+    """Compute the first task of each method and number of steps, twice, and extrapolate."""
+    program = Program(sweep, plan)
+    per_value = plan.num_tasks // max(int(np.prod(plan.counts[: sweep.compiled])), 1)
+    firsts, again, steps = [], [], 0
+    for number in range(0, plan.num_tasks, per_value):
+        task = plan.task(number)
+        firsts.append(_seconds(program, task))
+        again.append(min(_seconds(program, task) for _ in range(2)))
+        steps += program.steps(task)
+    lanes = plan.lanes_per_task
+    return SweepCost(
+        dims=dict(plan.dims),
+        lanes=plan.lanes,
+        steps=plan.lanes // len(again) * steps,
+        tasks=plan.num_tasks,
+        lanes_per_task=lanes,
+        bytes=plan.lanes * sum(v.bytes for v in variables.values()),
+        files=plan.num_tasks * (len(variables) + 1),
+        variables=len(variables),
+        seconds_per_step=sum(again) / (lanes * steps),
+        seconds_per_task=sum(again) / len(again),
+        compilation=max(0.0, sum(firsts) - sum(again)),
+        cores=processors(),
+    )
+
+
+def _seconds(program: Program, task: Any) -> float:
+    began = time.perf_counter()
+    program(task)
+    return time.perf_counter() - began
+
+
+def size(number: float) -> str:
+    """A number of bytes in words."""
+    for unit in ("B", "KiB", "MiB", "GiB", "TiB"):
+        if number < 1024:
+            return f"{number:.3g} {unit}"
+        number /= 1024
+    return f"{number:.3g} PiB"
+
+
+def span(seconds: float) -> str:
+    """A time in words."""
+    for unit, length, least in (
+        ("years", 365.25 * 86400, 2),
+        ("days", 86400, 2),
+        ("h", 3600, 1.5),
+        ("min", 60, 1.5),
+    ):
+        if seconds >= least * length:
+            return f"{seconds / length:.3g} {unit}"
+    return f"{seconds:.2g} s"
