@@ -1,0 +1,17 @@
+"""Pictures: one house style, readable in print and by colour-blind eyes."""
+
+from matplotlib import pyplot as plt  # noqa: F401 (plot.plt.close closes a figure)
+
+from .drifts import (
+    balance as balance,
+    drift_orders as drift_orders,
+    drift_surface as drift_surface,
+)
+from .house import COLOURS as COLOURS, DASHES as DASHES, save as save, style as style
+from .runs import (
+    changes as changes,
+    conserved as conserved,
+    ephemeris_comparison as ephemeris_comparison,
+    planet_orbits as planet_orbits,
+    trajectory as trajectory,
+)
