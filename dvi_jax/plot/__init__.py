@@ -15,3 +15,8 @@ from .runs import (
     planet_orbits as planet_orbits,
     trajectory as trajectory,
 )
+from .sweeps import (
+    failure_map as failure_map,
+    slope_map as slope_map,
+    sweep_map as sweep_map,
+)

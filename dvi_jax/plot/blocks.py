@@ -1,0 +1,249 @@
+"""Grids drawn in fewer pixels than they have points: read block by block, reduced on the way."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+BLOCK = 2**21
+"""Numbers of a grid that are in memory at a time, 16 MiB of float64."""
+
+REDUCTIONS = {"max": "largest", "min": "smallest", "mean": "mean", "median": "median"}
+"""How the numbers of one pixel become one → what the result is called."""
+
+
+class Bins(NamedTuple):
+    """Which points of a dimension belong to which pixel.
+
+    - `size`: points n of the dimension. `starts`: where each pixel begins, shape (pixels,).
+    - `order`: the points in the order in which they are drawn, shape (n,); None: as they are.
+    """
+
+    size: int
+    starts: np.ndarray
+    order: np.ndarray | None = None
+
+    @property
+    def ends(self) -> np.ndarray:
+        """Where each pixel begins, and where the last one ends."""
+        return np.append(self.starts, self.size)
+
+    @property
+    def most(self) -> int:
+        """Points of the largest pixel."""
+        return int(np.diff(self.ends).max())
+
+    def points(self, first: int, last: int) -> Any:
+        """The points of the pixels from `first` to before `last`, a slice where they are one."""
+        a, b = (int(x) for x in self.ends[[first, last]])
+        return slice(a, b) if self.order is None else np.sort(self.order[a:b])
+
+    def pixels(self, chosen: Any) -> np.ndarray:
+        """The pixel of each point of a selection."""
+        points = np.arange(self.size)[chosen] if self.order is not None else chosen
+        if isinstance(points, slice):
+            points = np.arange(*points.indices(self.size))
+        if self.order is not None:
+            points = np.argsort(self.order)[points]
+        return np.searchsorted(self.starts, points, side="right") - 1
+
+
+def make_bins(size: int, pixels: int, order: np.ndarray | None = None) -> Bins:
+    """Pixels of equal counts of points as nearly as can be; one point each where there is room."""
+    count = min(size, pixels)
+    return Bins(size, np.arange(count) * size // count, order)
+
+
+class Lines(NamedTuple):
+    """What is made of each line of the grid along `dim`, before the numbers of a pixel meet.
+
+    - `function`: lines of shape (n, ...) → shape (m, ...).
+    - `keeps`: whether `dim` is a dimension of the result, with m points; else m = 1.
+    """
+
+    dim: str
+    function: Callable[[np.ndarray], np.ndarray]
+    keeps: bool
+
+
+class Picture(NamedTuple):
+    """One number for each pixel, and how many points of the grid had none.
+
+    - `values`: one axis for each `Bins`, NaN where no point of a pixel has a number.
+    - `missing`, `points`: points without a number, of how many.
+    """
+
+    values: np.ndarray
+    missing: int
+    points: int
+
+
+def reduced(
+    data: Any, bins: Mapping[str, Bins], reduce: str, lines: Lines | None = None
+) -> Picture:
+    """The numbers of a grid, reduced to pixels.
+
+    - `data`: `xarray.DataArray`, of which one block is read at a time.
+    - `bins`: dimension → its pixels, for each axis of the result in turn; the other dimensions
+      are reduced as a whole.
+    - `reduce`: a key of `REDUCTIONS`; entries that are not finite are left out.
+
+    **Raises** `ValueError` for a median where one pixel alone is more than a block.
+    """
+    shape = tuple(len(b.starts) for b in bins.values())
+    keep = _Median(shape) if reduce == "median" else _Running(shape, reduce)
+    missing = points = 0
+    whole = reduce == "median"
+    for pixels, block in blocks(data, bins, lines, whole):
+        block = np.where(np.isfinite(block), block, np.nan)
+        missing += int(np.isnan(block).sum())
+        points += block.size
+        keep.add(pixels, block)
+    return Picture(keep.result(), missing, points)
+
+
+def counted(data: Any, bins: Mapping[str, Bins], codes: Sequence[int]) -> np.ndarray:
+    """How often each code occurs in each pixel, shape (codes, *pixels); read block by block."""
+    shape = tuple(len(b.starts) for b in bins.values())
+    counts = np.zeros((len(codes), *shape), np.int64)
+    for pixels, block in blocks(data, bins):
+        for i, code in enumerate(codes):
+            here = block == code
+            if here.any():
+                where, sums = _by_pixel(pixels, here.sum(0), np.add)
+                counts[i][where] += sums
+    return counts
+
+
+def blocks(
+    data: Any, bins: Mapping[str, Bins], lines: Lines | None = None, whole: bool = False
+) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+    """(pixels of the points along each binned dimension, block of shape (rest, *points)).
+
+    - `whole`: every pixel lies in one block, as a median needs it.
+    """
+    dims = tuple(bins)
+    for selection in _selections(data, bins, lines, whole):
+        block = np.asarray(data.variable.isel(selection).values)
+        names = list(data.dims)
+        pixels = {d: bins[d].pixels(selection[d]) for d in dims if not _is(lines, d)}
+        if lines is not None:
+            block = lines.function(np.moveaxis(block, names.index(lines.dim), 0))
+            names.remove(lines.dim)
+            names.insert(0, lines.dim)
+            if lines.keeps:
+                pixels[lines.dim] = bins[lines.dim].pixels(slice(None))
+        rest = [i for i, d in enumerate(names) if d not in dims]
+        block = block.transpose(*rest, *(names.index(d) for d in dims))
+        shape = block.shape[len(rest) :]
+        yield [pixels[d] for d in dims], block.reshape(-1, *shape)
+
+
+def _is(lines: Lines | None, dim: str) -> bool:
+    return lines is not None and lines.dim == dim
+
+
+def _selections(
+    data: Any, bins: Mapping[str, Bins], lines: Lines | None, whole: bool
+) -> Iterator[dict[str, Any]]:
+    """What is read at a time: in the order in which the numbers lie, last dimension first."""
+    parts: dict[str, list[Any]] = {}
+    room = BLOCK
+    sizes = dict(zip(data.dims, data.shape, strict=True))
+    together = {d for d in sizes if _is(lines, d) or (whole and d not in bins)}
+    room = max(1, room // math.prod(sizes[d] for d in together))
+    if whole:
+        _check_pixel(sizes, bins, together)
+    for d in reversed(data.dims):
+        if d in together:
+            parts[d] = [slice(0, sizes[d])]
+        elif whole:
+            parts[d], room = _whole_pixels(bins[d], room)
+        else:
+            step = min(sizes[d], max(room, 1))
+            known = (data.encoding.get("preferred_chunks") or {}).get(d)
+            if isinstance(known, int) and known < step < sizes[d]:
+                step -= step % known
+            parts[d] = [slice(i, i + step) for i in range(0, sizes[d], step)]
+            room //= step
+    for chosen in itertools.product(*(parts[d] for d in data.dims)):
+        yield dict(zip(data.dims, chosen, strict=True))
+
+
+def _whole_pixels(bins: Bins, room: int) -> tuple[list[Any], int]:
+    """The points of as many whole pixels as fit, a part at a time, and the room left."""
+    count = len(bins.starts)
+    step = min(count, max(1, room // bins.most))
+    parts = [bins.points(i, min(i + step, count)) for i in range(0, count, step)]
+    return parts, room // (bins.most * step)
+
+
+def _check_pixel(sizes: Mapping[str, int], bins: Mapping[str, Bins], together: set[str]) -> None:
+    needed = math.prod(b.most for d, b in bins.items() if d not in together)
+    needed *= math.prod(sizes[d] for d in together)
+    if needed > BLOCK:
+        raise ValueError(
+            f"a median needs all {needed} numbers of a pixel at a time, and {BLOCK} are read at a "
+            "time: take reduce='mean' or 'max', more pixels, or a part of the data."
+        )
+
+
+class _Running:
+    """Largest, smallest or mean of what has come so far."""
+
+    def __init__(self, shape: tuple[int, ...], reduce: str):
+        self.mean = reduce == "mean"
+        self.combine: Any = {"max": np.fmax, "min": np.fmin, "mean": np.add}[reduce]
+        self.values = np.full(shape, 0.0 if self.mean else np.nan)
+        self.counts = np.zeros(shape, np.int64)
+
+    def add(self, pixels: list[np.ndarray], block: np.ndarray) -> None:
+        if self.mean:
+            there = (~np.isnan(block)).sum(0)
+            where, counts = _by_pixel(pixels, there, np.add)
+            self.counts[where] += counts
+            block = np.nan_to_num(block, copy=False, nan=0.0)
+        where, values = _by_pixel(pixels, self.combine.reduce(block, axis=0), self.combine)
+        self.values[where] = self.combine(self.values[where], values)
+
+    def result(self) -> np.ndarray:
+        if not self.mean:
+            return self.values
+        with np.errstate(invalid="ignore"):
+            return self.values / np.where(self.counts, self.counts, np.nan)
+
+
+class _Median:
+    """Medians of pixels that come whole."""
+
+    def __init__(self, shape: tuple[int, ...]):
+        self.values = np.full(shape, np.nan)
+
+    def add(self, pixels: list[np.ndarray], block: np.ndarray) -> None:
+        each = [[np.flatnonzero(p == k) for k in np.unique(p)] for p in pixels]
+        numbers = [np.unique(p) for p in pixels]
+        for at in np.ndindex(*(len(e) for e in each)):
+            inside = np.ix_(*(e[i] for e, i in zip(each, at, strict=True)))
+            values = block[(slice(None), *inside)]
+            values = values[~np.isnan(values)]
+            if values.size:
+                place = tuple(n[i] for n, i in zip(numbers, at, strict=True))
+                self.values[place] = np.median(values)
+
+    def result(self) -> np.ndarray:
+        return self.values
+
+
+def _by_pixel(pixels: list[np.ndarray], values: np.ndarray, combine: Any) -> tuple[Any, np.ndarray]:
+    """(open mesh of the pixels that are met, values of shape `points` combined to them)."""
+    met = []
+    for axis, numbers in enumerate(pixels):
+        if (np.diff(numbers) < 0).any():
+            order = np.argsort(numbers, kind="stable")
+            values, numbers = np.take(values, order, axis), numbers[order]
+        first = np.flatnonzero(np.diff(numbers, prepend=-1))
+        values = combine.reduceat(values, first, axis=axis)
+        met.append(numbers[first])
+    return np.ix_(*met), values

@@ -1,0 +1,370 @@
+"""Panels of a map: which dimension goes where, axes, colours, legends."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import CenteredNorm, ListedColormap, LogNorm, Normalize
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogFormatterMathtext, LogLocator
+
+from .house import COLOURS
+from .places import Place, dim_of, find_place, label_of, names_of
+
+NO_NUMBER, NOT_COMPUTED, ZERO = "#d0d0d0", "#ffffff", "#000000"
+"""Of cells that have no place on the scale of colours; the first is hatched as well."""
+
+_HATCH = {"facecolor": NO_NUMBER, "edgecolor": "#8c8c8c", "hatch": "/////", "linewidth": 0}
+_MOST_PANELS = 16
+_BOTH_SIGNS = 0.05
+"""Of the larger side: numbers that reach less far on the other side of 0 need no middle."""
+
+_DECADES = 2
+"""Positive numbers that reach over more of them get a logarithmic scale."""
+
+
+class Grid(NamedTuple):
+    """What is drawn: one array for each panel, and the axes that all of them share.
+
+    - `panels`: (title, array) of each. `x`, `y`: axes; no `y` for a line.
+    - `over`: dimensions of which the numbers meet in a pixel.
+    """
+
+    panels: list[tuple[str, Any]]
+    x: Place
+    y: Place | None
+    over: tuple[str, ...]
+
+    @property
+    def places(self) -> list[Place]:
+        """The axes in the order of an array that is drawn: y, x."""
+        return [self.x] if self.y is None else [self.y, self.x]
+
+    @property
+    def bins(self) -> dict[str, Any]:
+        return {place.dim: place.bins for place in self.places}
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(len(place.centres) for place in self.places)
+
+
+def arrange(
+    data: Any,
+    x: str | None,
+    y: str | None,
+    facet: str | None,
+    over: str | Sequence[str],
+    pixels: Any,
+    made: Mapping[str, Any] | None = None,
+) -> Grid:
+    """Who is where: dimensions that are not named become x and y in turn.
+
+    - `made`: name → array that stands for that of the data where its axis is found; None for a
+      dimension that does not appear.
+
+    **Raises** `ValueError` for a dimension that is not there, is named twice, or is one too many.
+    """
+    width, height = _checked_pixels(pixels)
+    made = made or {}
+    if empty := [str(d) for d, n in data.sizes.items() if n == 0]:
+        raise ValueError(f"there is nothing to draw: {', '.join(empty)} has no values.")
+    over = (over,) if isinstance(over, str) else tuple(over)
+    roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in over}}
+    taken: dict[str, str] = {}
+    for role, name in roles.items():
+        if name is None:
+            continue
+        dim = dim_of(data, name)
+        if dim in taken:
+            raise ValueError(f"{role} and {taken[dim]} are both along {dim!r}: name another.")
+        taken[dim] = role
+    gone = [dim_of(data, name) for name, stand_in in made.items() if stand_in is None]
+    free = [str(d) for d in data.dims if d not in taken and d not in gone]
+    single = [d for d in free if data.sizes[d] == 1]
+    free = [d for d in free if d not in single]
+    if x is None:
+        x, y = (free.pop(0), y) if free else (y, None)
+    if y is None and free:
+        y = free.pop(0)
+    if x is None:
+        raise ValueError("there is nothing to draw: no dimension has more than one value.")
+    if free:
+        raise ValueError(_too_many(data, x, y, free))
+    data = data.isel(dict.fromkeys(single, 0))
+    places = {}
+    for name, size in ((x, width), (y, height)):
+        if name is not None:
+            stand_in = made.get(name)
+            places[name] = find_place(data if stand_in is None else stand_in, name, size)
+    over = tuple(dim_of(data, name) for name in over)
+    return Grid(_panels(data, facet), places[x], None if y is None else places[y], over)
+
+
+def _too_many(data: Any, x: str, y: str | None, free: list[str]) -> str:
+    first = free[0]
+    return (
+        f"a map has two dimensions, {x!r} and {y!r} here; {', '.join(map(repr, free))} "
+        f"{'is' if len(free) == 1 else 'are'} left of {names_of(data)}. Select one value, "
+        f"data.isel({first}=0), reduce them, over={first!r}, or draw one map each, facet={first!r}."
+    )
+
+
+def _checked_pixels(pixels: Any) -> tuple[int, int]:
+    try:
+        width, height = (int(n) for n in pixels)
+    except (TypeError, ValueError):
+        width = height = 0
+    if min(width, height) < 1:
+        raise ValueError(f"pixels must be (width, height), two positive numbers, got {pixels!r}.")
+    return width, height
+
+
+def _panels(data: Any, facet: str | None) -> list[tuple[str, Any]]:
+    if facet is None:
+        return [("", data)]
+    dim = dim_of(data, facet)
+    count = data.sizes[dim]
+    if count > _MOST_PANELS:
+        raise ValueError(
+            f"facet {facet!r} has {count} values, and there is room for {_MOST_PANELS} panels: "
+            f"select some, data.isel({dim}=slice(None, None, {-(-count // _MOST_PANELS)}))."
+        )
+    coordinate = data.coords.get(facet)
+    label = label_of(coordinate, facet)
+    name, _, units = label.partition(" [")
+    values = np.arange(count) if coordinate is None else coordinate.values
+    texts = [f"{v:.4g}" if np.issubdtype(type(v), np.number) else str(v) for v in values]
+    tail = f" {units.rstrip(']')}" if units else ""
+    return [(f"{name} = {t}{tail}", data.isel({dim: i})) for i, t in enumerate(texts)]
+
+
+def checked_array(data: Any, what: str) -> Any:
+    """A `DataArray` of numbers, or an error that says how to come by one."""
+    import xarray as xr
+
+    if isinstance(data, xr.Dataset):
+        raise TypeError(
+            f"{what} takes one variable of a Dataset, data[name]: there are "
+            f"{', '.join(map(str, data.data_vars))}."
+        )
+    if not isinstance(data, xr.DataArray):
+        raise TypeError(
+            f'{what} takes an xarray.DataArray, such as result.to_xarray()["drift"], got '
+            f"{type(data).__name__}."
+        )
+    if data.dtype.kind not in "biuf":
+        raise TypeError(f"{what} takes real numbers, got an array of {data.dtype}.")
+    return data
+
+
+# --- axes ---------------------------------------------------------------------------------------
+
+
+def make_axes(grid: Grid, ax: Any) -> list[Any]:
+    """One `Axes` for each panel: `ax`, or those of a new figure."""
+    count = len(grid.panels)
+    if ax is not None:
+        if count > 1:
+            raise ValueError("a facet has a figure of its own: leave out ax, or facet.")
+        return [ax]
+    if count == 1:
+        return [plt.subplots(layout="constrained")[1]]
+    columns = min(count, 3 if count > 4 else 2 if count == 4 else count)
+    rows = -(-count // columns)
+    size = (1.4 + 2.7 * columns, 1.0 + 2.3 * rows)
+    figure, axes = plt.subplots(
+        rows, columns, sharex=True, sharey=True, squeeze=False, figsize=size, layout="constrained"
+    )
+    for i, spare in enumerate(axes.flat):
+        if i >= count:
+            figure.delaxes(spare)
+    return list(axes.flat)[:count]
+
+
+def finish(axes: Sequence[Any], grid: Grid) -> None:
+    """Scales, ticks, labels and titles."""
+    for i, ((title, _), axis) in enumerate(zip(grid.panels, axes, strict=True)):
+        _dress(axis, "x", grid.x)
+        if grid.y is not None:
+            _dress(axis, "y", grid.y)
+        if title:
+            axis.set_title(title)
+        below = axis.get_subplotspec()
+        if len(axes) > 1 and below is not None:
+            columns = below.get_gridspec().ncols
+            axis.tick_params(labelbottom=i + columns >= len(axes))
+            axis.set_xlabel(axis.get_xlabel() if i + columns >= len(axes) else "")
+            axis.set_ylabel(axis.get_ylabel() if i % columns == 0 else "")
+
+
+def _dress(axis: Any, which: str, place: Place) -> None:
+    set_ = {name: getattr(axis, f"set_{which}{name}") for name in ("scale", "lim", "label")}
+    ticks = getattr(axis, f"set_{which}ticks")
+    if place.log:
+        set_["scale"]("log")
+    set_["lim"](*place.edges[[0, -1]])
+    set_["label"](place.label)
+    if place.names is not None:
+        positions, texts = place.names
+        long = which == "x" and sum(map(len, texts)) > 60
+        turn = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if long else {}
+        ticks(positions, texts, **turn)
+    if place.zero is not None:
+        low, high = np.sqrt(place.zero * place.centres[1]), place.edges[-1]
+        major, minor = (
+            [t for t in LogLocator(subs=subs).tick_values(low, high) if low <= t <= high]
+            for subs in ((1.0,), tuple(range(2, 10)))
+        )
+        texts = [LogFormatterMathtext()(t) for t in major]
+        ticks([place.zero, *major], ["0", *texts])
+        ticks(minor, minor=True, labels=[""] * len(minor))
+
+
+# --- colours ------------------------------------------------------------------------------------
+
+
+class Scale(NamedTuple):
+    """The colours of numbers: `log`, and how far the numbers go beyond the scale."""
+
+    norm: Any
+    cmap: str
+    log: bool
+    extend: str
+
+
+def make_scale(values: Sequence[np.ndarray], log: bool | None, limits: Any) -> Scale:
+    """Colours for all panels: logarithmic for positive numbers over decades, with a middle for
+    numbers of both signs.
+
+    **Raises** `ValueError` for a logarithmic scale of negative numbers, and for `limits` that are
+    no interval.
+    """
+    found = np.concatenate([np.ravel(v) for v in values])
+    found = found[np.isfinite(found)]
+    positive = found[found > 0]
+    if log is None:
+        log = positive.size > 0 and bool((found >= 0).all())
+        log = log and bool(positive.max() > 10**_DECADES * positive.min())
+    if log and (found < 0).any():
+        raise ValueError(
+            f"a logarithmic scale has no place for the {np.sum(found < 0)} pixels below 0: leave "
+            "out log=True, or draw abs(data)."
+        )
+    inside = positive if log else found
+    low, high = (inside.min(), inside.max()) if inside.size else (0.1 if log else 0.0, 1.0)
+    if limits is not None:
+        least, most = low, high
+        low, high = _checked_limits(limits, log)
+        below, above = inside.size and least < low, inside.size and most > high
+        extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
+        extend = extend[int(below), int(above)]
+    else:
+        extend = "neither"
+    if log:
+        wide = 1.0 if high > low else 2.0
+        return Scale(LogNorm(low / wide, high * wide), "viridis", True, extend)
+    if limits is None and min(-low, high) > _BOTH_SIGNS * max(-low, high):
+        return Scale(CenteredNorm(0, max(-low, high)), "PuOr_r", False, extend)
+    if high == low:
+        low, high = low - (abs(low) or 1) / 2, high + (abs(high) or 1) / 2
+    return Scale(Normalize(low, high), "viridis", False, extend)
+
+
+def _checked_limits(limits: Any, log: bool) -> tuple[float, float]:
+    try:
+        low, high = (float(v) for v in limits)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if not low < high or (log and low <= 0):
+        wanted = "two rising positive numbers" if log else "two rising numbers"
+        raise ValueError(f"limits must be {wanted}, got {limits!r}.")
+    return low, high
+
+
+def draw_values(axis: Any, grid: Grid, values: np.ndarray, scale: Scale, look: int = 0) -> Any:
+    """A map of numbers, or a line; what has no number is left to the background.
+
+    A line is drawn over marks at the bottom where there is none. Returns what has the colours, or
+    None.
+    """
+    zero = values == 0 if scale.log else np.zeros(values.shape, bool)
+    shown = np.ma.masked_where(zero | ~np.isfinite(values), values)
+    if grid.y is None:
+        mark = "o" if values.size <= 60 else ""
+        axis.plot(grid.x.centres, np.where(shown.mask, np.nan, values), marker=mark,
+                  color=COLOURS[look])  # fmt: skip
+        if scale.log:
+            axis.set_yscale("log")
+        rug(axis, grid.x.centres[zero], "v", ZERO)
+        rug(axis, grid.x.centres[~np.isfinite(values)], "x", "#777777")
+        return None
+    _background(axis)
+    cmap = plt.get_cmap(scale.cmap)
+    mesh = axis.pcolormesh(
+        grid.x.edges, grid.y.edges, shown, norm=scale.norm, cmap=cmap, rasterized=True
+    )
+    if zero.any():
+        draw_flags(axis, grid, zero, ZERO)
+    return mesh
+
+
+def rug(axis: Any, x: np.ndarray, mark: str, colour: str) -> None:
+    """Marks at the bottom of a panel."""
+    if len(x):
+        axis.plot(
+            x, np.full(len(x), 0.025), mark, color=colour, transform=axis.get_xaxis_transform()
+        )
+
+
+def draw_flags(axis: Any, grid: Grid, where: np.ndarray, colour: str) -> None:
+    """Cells of one colour over a map."""
+    if grid.y is not None:
+        axis.pcolormesh(
+            grid.x.edges, grid.y.edges, np.ma.masked_where(~where, np.ones(where.shape)),
+            cmap=ListedColormap([colour]), rasterized=True,
+        )  # fmt: skip
+
+
+def _background(axis: Any) -> None:
+    axis.grid(False)
+    axis.patch.set(**_HATCH)
+
+
+def colour_bar(axes: Sequence[Any], mesh: Any, scale: Scale, label: str) -> None:
+    """One bar for all panels, or the name of the y axis of lines."""
+    if mesh is None:
+        for axis in axes:
+            axis.set_ylabel(label)
+    else:
+        axes[0].figure.colorbar(mesh, ax=list(axes), label=label, extend=scale.extend)
+
+
+def flag(colour: str, label: str) -> Patch:
+    """An entry of a legend."""
+    if colour == NO_NUMBER:
+        return Patch(label=label, **_HATCH)
+    return Patch(facecolor=colour, edgecolor="#8c8c8c", linewidth=0.6, label=label)
+
+
+def legend(axes: Sequence[Any], entries: Sequence[Any], ax: Any) -> None:
+    """Below the panels: of the figure if it is ours, else of the axes."""
+    if not entries:
+        return
+    if ax is None:
+        axes[0].figure.legend(
+            handles=entries, loc="outside lower center", ncols=min(len(entries), 3)
+        )
+    else:
+        ax.legend(
+            handles=entries, loc="upper center", bbox_to_anchor=(0.5, -0.14),
+        )  # fmt: skip
+
+
+def share(count: int, total: int) -> str:
+    """How many of how many."""
+    percent = 100 * count / total
+    text = "< 0.1" if 0 < percent < 0.1 else f"{percent:.3g}"
+    return f"{count} of {total} ({text} %)"

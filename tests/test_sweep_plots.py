@@ -1,0 +1,508 @@
+"""Maps of sweeps: what is drawn, where there is no number, and how little is read at a time."""
+
+import tracemalloc
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.colors import LogNorm, Normalize, to_hex
+from xarray.backends import BackendArray
+from xarray.core import indexing
+
+import dvi_jax as dvi
+from dvi_jax import plot
+from dvi_jax._results import STATUS_NAMES
+from dvi_jax.plot import blocks
+from dvi_jax.sweep import lazy
+
+mpl.use("Agg")
+
+EPS = np.geomspace(1e-4, 1e-1, 7)
+X = np.asarray([0.1, 0.2, 0.4, 0.5, 0.9])
+FLAGS = {
+    "flag_values": [-1, *range(len(STATUS_NAMES))],
+    "flag_meanings": " ".join(("not_computed", *STATUS_NAMES)),
+}
+RNG = np.random.default_rng(1)
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def drift(order=1.0):
+    """ε^order (1 + x), shape (7, 5), with names and units."""
+    values = EPS[:, None] ** order * (1 + X)
+    coords = {"epsilon": EPS, "x": ("x", X, {"units": "kg"})}
+    return xr.DataArray(values, coords, ("epsilon", "x"), "drift", {"units": "J"})
+
+
+def with_status(values=None):
+    """A sweep with one failure of each of two kinds, and a corner that is not computed."""
+    data = drift() if values is None else values
+    status = np.zeros(data.shape, np.int8)
+    status[2, 1], status[3, 1], status[5:, 3:] = 1, 2, -1
+    data = data.where(status == 0)
+    status = xr.DataArray(status, dims=data.dims, attrs=FLAGS)
+    return xr.Dataset({"drift": data, "status": status})
+
+
+def array_of(axis, which=0):
+    return axis.collections[which].get_array()
+
+
+def texts(axis):
+    found = axis.get_legend() or axis.figure.legends[0]
+    return [t.get_text() for t in found.get_texts()]
+
+
+def colour_at(axis, x, y):
+    """The colour that is drawn at a place, as three bytes."""
+    axis.figure.canvas.draw()
+    picture = np.asarray(axis.figure.canvas.buffer_rgba())
+    column, row = axis.transData.transform((x, y))
+    return picture[picture.shape[0] - 1 - round(row), round(column), :3]
+
+
+# --- what is drawn ---------------------------------------------------------------------------
+
+
+def test_the_numbers_and_their_places():
+    axis = plot.sweep_map(drift())
+    np.testing.assert_array_equal(array_of(axis), drift().values.T)
+    assert (axis.get_xscale(), axis.get_yscale()) == ("log", "linear")
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("ε", "x [kg]")
+    assert axis.figure.axes[1].get_ylabel() == "drift [J]"
+    assert isinstance(axis.collections[0].norm, LogNorm)
+    edges = axis.collections[0].get_coordinates()
+    np.testing.assert_allclose(edges[0, 1:-1, 0], np.sqrt(EPS[1:] * EPS[:-1]))
+    np.testing.assert_allclose(edges[:, 0, 1], [0.05, 0.15, 0.3, 0.45, 0.7, 1.1])
+    np.testing.assert_allclose(axis.get_xlim(), edges[0, [0, -1], 0])
+    assert not axis.figure.legends
+
+
+def test_axes_turned_and_numbers_of_one_decade():
+    narrow = drift(0.2)
+    axis = plot.sweep_map(narrow, x="x")
+    np.testing.assert_array_equal(array_of(axis), narrow.values)
+    assert axis.get_ylabel() == "ε"
+    assert type(axis.collections[0].norm) is Normalize
+    assert isinstance(plot.sweep_map(narrow, log=True).collections[0].norm, LogNorm)
+    assert type(plot.sweep_map(drift(), log=False).collections[0].norm) is Normalize
+
+
+def test_numbers_of_both_signs_have_a_middle():
+    norm = plot.sweep_map(drift() - 0.05).collections[0].norm
+    assert norm.vmin == -norm.vmax
+    norm = plot.sweep_map(drift() - 0.05, limits=(-0.01, 0.2)).collections[0].norm
+    assert (norm.vmin, norm.vmax) == (-0.01, 0.2)
+
+
+def test_values_out_of_order_are_put_in_order():
+    mixed = drift().isel(epsilon=[3, 0, 5, 1, 6, 2, 4])
+    np.testing.assert_array_equal(array_of(plot.sweep_map(mixed)), drift().values.T)
+
+
+def test_a_coordinate_beside_the_dimension_is_an_axis():
+    case = drift().rename(epsilon="case").drop_vars("case").assign_coords(epsilon=("case", EPS))
+    axis = plot.sweep_map(case, x="epsilon")
+    np.testing.assert_array_equal(array_of(axis), drift().values.T)
+    assert (axis.get_xscale(), axis.get_xlabel()) == ("log", "ε")
+    axis = plot.sweep_map(case)
+    assert (axis.get_xscale(), axis.get_xlabel()) == ("linear", "case")
+
+
+def test_names_stand_at_their_places():
+    methods = ["TypeII()", "Strang()", "Yoshida()"]
+    data = drift().isel(x=slice(3)).assign_coords(x=methods).rename(x="method")
+    axis = plot.sweep_map(data)
+    assert [t.get_text() for t in axis.get_yticklabels()] == methods
+    np.testing.assert_array_equal(axis.get_yticks(), [0, 1, 2])
+
+
+def test_a_disturbance_of_0_has_a_place_before_the_others():
+    eps = np.asarray([0, *EPS])
+    data = drift().reindex(epsilon=eps, fill_value=1e-9)
+    axis = plot.sweep_map(data)
+    assert axis.get_xscale() == "log"
+    assert axis.get_xticklabels()[0].get_text() == "0"
+    edges = axis.collections[0].get_coordinates()[0, :, 0]
+    assert edges[0] < axis.get_xticks()[0] < edges[1] < EPS[0]
+    assert (axis.get_xticks()[1:] > edges[1]).all()
+    assert (axis.get_xticks(minor=True) > edges[1]).all()
+
+
+def test_exact_zeros_on_a_logarithmic_scale_are_black():
+    data = drift()
+    data[2, 1] = 0
+    axis = plot.sweep_map(data)
+    assert array_of(axis).mask.sum() == 1
+    assert texts(axis) == ["exactly 0"]
+    assert tuple(colour_at(axis, EPS[2], X[1])) == (0, 0, 0)
+    assert colour_at(axis, EPS[3], X[1]).max() > 0
+
+
+def test_one_dimension_is_a_line():
+    data = drift()[:, 2].copy()
+    data[3] = np.nan
+    axis = plot.sweep_map(data)
+    np.testing.assert_array_equal(axis.lines[0].get_xdata(), EPS)
+    np.testing.assert_array_equal(axis.lines[0].get_ydata(), data)
+    np.testing.assert_array_equal(axis.lines[1].get_xdata(), EPS[3:4])
+    assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
+    assert axis.get_ylabel() == "drift [J]"
+    assert texts(axis) == ["no number: 1 of 7 (14.3 %)"]
+
+
+def test_facets_share_their_colours():
+    data = xr.concat([drift(), 100 * drift()], xr.IndexVariable("h", [0.1, 0.05], {"units": "s"}))
+    axes = plot.sweep_map(data, facet="h")
+    assert [a.get_title() for a in axes] == ["step size h = 0.1 s", "step size h = 0.05 s"]
+    for axis, scale in zip(axes, (1, 100), strict=True):
+        np.testing.assert_array_equal(array_of(axis), scale * drift().values.T)
+        assert axis.collections[0].norm.vmin == drift().min()
+        assert axis.collections[0].norm.vmax == 100 * drift().max()
+    assert [a.get_ylabel() for a in axes] == ["x [kg]", ""]
+
+
+def test_a_picture_of_ones_own(tmp_path):
+    with plot.style():
+        figure, axes = plt.subplots(1, 3, layout="constrained", figsize=(9, 3))
+        data = with_status()
+        assert plot.sweep_map(data.drift, ax=axes[0], status=data.status) is axes[0]
+        assert plot.slope_map(data.drift, ax=axes[1]) is axes[1]
+        assert plot.failure_map(data, ax=axes[2]) is axes[2]
+        file = plot.save(figure, tmp_path / "maps.png")
+    assert file.stat().st_size > 10_000
+
+
+# --- where there is no number ------------------------------------------------------------------
+
+
+def test_cells_without_a_number_are_grey_and_counted():
+    data = with_status()
+    axis = plot.sweep_map(data.drift)
+    np.testing.assert_array_equal(array_of(axis).mask, np.isnan(data.drift.values.T))
+    assert texts(axis) == ["no number: 6 of 35 (17.1 %)"]
+    grey = colour_at(axis, EPS[2], X[1])
+    assert np.ptp(grey.astype(int)) == 0
+    assert grey[0] < 220
+    good = colour_at(axis, EPS[2], X[2])
+    assert np.ptp(good.astype(int)) > 20
+
+
+def test_a_status_tells_failed_from_not_computed():
+    data = with_status()
+    axis = plot.sweep_map(data.drift, status=data.status)
+    assert texts(axis) == ["no number: 6 of 35 (17.1 %)", "not computed"]
+    assert tuple(colour_at(axis, EPS[6], X[4])) == (255, 255, 255)
+    assert colour_at(axis, EPS[2], X[1]).max() < 220
+
+
+def test_the_failures_of_a_real_sweep():
+    result = small_sweep()
+    data = result.to_xarray()
+    axis = plot.failure_map(data)
+    np.testing.assert_array_equal(array_of(axis), data.status.values.T)
+    assert texts(axis) == ["successful: 15 of 20 (75 %)", "not finite: 5 of 20 (25 %)"]
+    mesh = axis.collections[0]
+    shown = [to_hex(mesh.cmap(mesh.norm(code))) for code in (0, STATUS_NAMES.index("not_finite"))]
+    assert shown == ["#d9d9d9", plot.COLOURS[1].lower()]
+    bad = colour_at(axis, *(data[n].values[-1] for n in ("epsilon", "k")))
+    np.testing.assert_array_equal(bad, [0xD5, 0x5E, 0x00])
+    fine = plot.failure_map(data.isel(epsilon=slice(3)))
+    assert texts(fine) == ["successful: 15 of 15 (100 %)"]
+
+
+def test_statuses_of_one_dimension_are_a_strip():
+    status = with_status().status.assign_coords(epsilon=EPS)[:, 1]
+    axis = plot.failure_map(status)
+    np.testing.assert_array_equal(array_of(axis), status.values[None])
+
+
+def test_a_single_failure_is_not_hidden_in_its_pixel():
+    status = xr.DataArray(np.zeros((40, 60), np.int8), dims=("a", "b"), attrs=FLAGS)
+    status[7, 11], status[20:24, 30:36], status[21, 33] = 4, 1, 2
+    status[39] = 6  # stopped: no failure
+    status[0] = -1
+    axis = plot.failure_map(status, pixels=(10, 10))
+    shown = array_of(axis).T
+    assert shown[1, 1] == 4
+    assert shown[5, 5] == 1
+    assert (shown > 0).sum() == 2
+    axis = plot.failure_map(status, reduce="fraction", pixels=(10, 10))
+    values = array_of(axis).T
+    np.testing.assert_allclose(values[5, 5], 1.0)
+    np.testing.assert_allclose(values[1, 1], 1 / 24)
+    assert (values > 0).sum() == 2
+    assert texts(axis) == ["not computed: 60 of 2400 (2.5 %)"]
+
+
+# --- slopes ------------------------------------------------------------------------------------
+
+
+def test_fitted_slopes_against_polyfit():
+    noisy = drift(2) * np.exp(0.3 * RNG.normal(size=drift().shape))
+    noisy[1, 2], noisy[4, 2], noisy[2, 0] = np.nan, 0.0, -1.0
+    noisy[1:, 4] = np.nan
+    axis = plot.slope_map(noisy)
+    found = axis.lines[0].get_ydata()
+    for i in range(4):
+        y = noisy.values[:, i]
+        good = y > 0
+        want = np.polyfit(np.log(EPS[good]), np.log(y[good]), 1)[0]
+        np.testing.assert_allclose(found[i], want, rtol=1e-12)
+    assert np.isnan(found[4])
+    assert axis.get_ylabel() == "slope of log drift over log ε"
+    assert texts(axis) == ["no slope: 1 of 5 (20 %)"]
+
+
+def test_local_slopes_stand_between_the_points():
+    data = drift(1) + 1e3 * drift(3)
+    axis = plot.slope_map(data, x="epsilon", y="x")
+    want = np.diff(np.log(data.values), axis=0) / np.diff(np.log(EPS))[:, None]
+    np.testing.assert_allclose(array_of(axis), want.T, rtol=1e-12)
+    assert 1 < want.min() < 2 < want.max() < 3
+    edges = axis.collections[0].get_coordinates()[0, :, 0]
+    np.testing.assert_allclose(edges, EPS)
+    other = plot.slope_map(data, local=True, y="x")
+    np.testing.assert_array_equal(array_of(other), array_of(axis))
+
+
+def test_slopes_leave_out_0_and_what_is_below_the_floor():
+    eps = np.asarray([0, *EPS])
+    data = (drift(2) + 1e-5).reindex(epsilon=eps, fill_value=1e-5)
+    with_floor = plot.slope_map(data, floor=1e-4).lines[0].get_ydata()
+    without = plot.slope_map(data).lines[0].get_ydata()
+    assert np.abs(with_floor - 2).max() < 0.1
+    assert np.abs(without - 2).min() > 0.5
+
+
+def test_slopes_over_two_dimensions_and_starts():
+    orders = np.asarray([1.0, 2.0, 3.0])
+    data = xr.concat([drift(k) for k in orders], xr.IndexVariable("k", [0, 1, 2]))
+    axis = plot.slope_map(data)
+    np.testing.assert_allclose(array_of(axis), np.broadcast_to(orders, (5, 3)))
+    axis = plot.slope_map(data, x="k", over="x", reduce="median")
+    np.testing.assert_allclose(axis.lines[0].get_ydata(), orders)
+
+
+# --- more points than pixels -------------------------------------------------------------------
+
+
+class Counted(BackendArray):
+    """An array that is made where it is asked for, and counts what is asked for at a time."""
+
+    def __init__(self, shape, function):
+        self.shape, self.dtype, self.function = shape, np.dtype(float), function
+        self.largest = self.total = 0
+
+    def __getitem__(self, key):
+        return indexing.explicit_indexing_adapter(
+            key, self.shape, indexing.IndexingSupport.OUTER, self.made
+        )
+
+    def made(self, key):
+        index = [
+            np.arange(n)[k] if isinstance(k, slice) else np.asarray(k)
+            for k, n in zip(key, self.shape, strict=True)
+        ]
+        count = int(np.prod([np.size(i) for i in index]))
+        self.largest, self.total = max(self.largest, count), self.total + count
+        return self.function(*np.ix_(*(np.atleast_1d(i) for i in index))).reshape(
+            [len(i) for i in index if np.ndim(i)]
+        )
+
+
+def lazily(shape, dims, function, coords=None):
+    source = Counted(shape, function)
+    return source, xr.DataArray(
+        xr.Variable(dims, indexing.LazilyIndexedArray(source)), coords, name="drift"
+    )
+
+
+def rough(i, j, k=0):
+    """Numbers over some decades, some of them NaN; the whole as a function of the place."""
+    x = np.sin(12.9898 * i + 78.233 * j + 37.719 * k) * 43758.5453
+    x = 10.0 ** (3 * (x - np.floor(x)))
+    return np.where(np.asarray(i + 3 * j + 5 * k) % 11 == 0, np.nan, x)
+
+
+REDUCED = {"max": np.nanmax, "min": np.nanmin, "mean": np.nanmean, "median": np.nanmedian}
+
+
+@pytest.mark.parametrize("reduce", REDUCED)
+@pytest.mark.parametrize("block", [1000, 3777, 2**21])
+def test_a_reduced_map_is_the_reduction_of_the_whole(monkeypatch, reduce, block):
+    monkeypatch.setattr(blocks, "BLOCK", block)
+    _, data = lazily((60, 5, 41), ("a", "k", "b"), lambda i, k, j: rough(i, j, k))
+    axis = plot.sweep_map(data, over="k", reduce=reduce, pixels=(12, 7))
+    whole = data.values.transpose(2, 0, 1)
+    ends = np.arange(8) * 41 // 7
+    want = [
+        [REDUCED[reduce](whole[ends[y] : ends[y + 1], 5 * x : 5 * x + 5]) for x in range(12)]
+        for y in range(7)
+    ]
+    np.testing.assert_allclose(array_of(axis), want, rtol=1e-13)
+    assert texts(axis) == [f"no number: {np.isnan(whole).sum()} of 12300 (9.1 %)"]
+    other = np.asarray(want) * (1 + 1e-9)
+    assert not np.allclose(array_of(axis), other, rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("reduce", REDUCED)
+def test_reduced_points_out_of_order(monkeypatch, reduce):
+    monkeypatch.setattr(blocks, "BLOCK", 700)
+    values = RNG.permutation(np.linspace(0.0, 1.0, 90))
+    _, data = lazily((90, 40), ("a", "b"), rough, {"a": values})
+    axis = plot.sweep_map(data, reduce=reduce, pixels=(9, 40))
+    whole = data.values[np.argsort(values)].reshape(9, 10, 40)
+    np.testing.assert_allclose(array_of(axis), REDUCED[reduce](whole, axis=1).T, rtol=1e-13)
+
+
+def test_memory_is_one_block_however_large_the_grid(monkeypatch):
+    monkeypatch.setattr(blocks, "BLOCK", 2**18)
+    source, data = lazily((2000, 10_000), ("a", "b"), lambda i, j: (i + 1.0) * (j + 1.0))
+    tracemalloc.start()
+    axis = plot.sweep_map(data, pixels=(50, 40))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert source.total == 2e7
+    assert source.largest <= 2**18
+    assert peak < 12 * 2**18 * 8 < source.total * 8 / 6
+    want = 40 * np.arange(1, 51) * 250 * np.arange(1, 41)[:, None]
+    np.testing.assert_array_equal(array_of(axis), want)
+
+
+def test_a_dimension_without_values_costs_nothing_for_its_length(monkeypatch):
+    """10¹² points: their axis, pixels and selections are made without a list of them."""
+    source, data = lazily((3, 10**12), ("a", "b"), lambda i, j: (i + 1.0) * (j + 1.0))
+    grid = plot.panels.arrange(data, "b", "a", None, (), (400, 300))
+    assert grid.x.edges[-1] == 10**12 - 0.5
+    chosen = slice(10**11, 10**11 + 5)
+    np.testing.assert_array_equal(grid.x.bins.pixels(chosen), [40] * 5)
+    assert source.total == 0
+
+
+def test_what_lies_in_chunks_is_read_in_chunks(monkeypatch):
+    monkeypatch.setattr(blocks, "BLOCK", 1000)
+    _, data = lazily((10, 2500), ("a", "b"), rough)
+    data.encoding["preferred_chunks"] = {"a": 1, "b": 300}
+    parts = [s["b"] for s in blocks._selections(data, {}, None, False)]
+    assert all(p.start % 300 == 0 for p in parts)
+    assert max(p.stop - p.start for p in parts) == 900
+
+
+def test_a_median_that_is_too_large_is_refused(monkeypatch):
+    monkeypatch.setattr(blocks, "BLOCK", 100)
+    _, data = lazily((60, 40), ("a", "b"), rough)
+    with pytest.raises(ValueError, match=r"all 240 numbers of a pixel.*mean"):
+        plot.sweep_map(data, reduce="median", pixels=(10, 1))
+    plot.sweep_map(data, reduce="median", pixels=(10, 40))
+
+
+def test_slopes_of_more_points_than_pixels(monkeypatch):
+    monkeypatch.setattr(blocks, "BLOCK", 70)
+    orders = np.linspace(1, 3, 100)
+    source, data = lazily(
+        (7, 100), ("epsilon", "b"), lambda i, j: EPS[i] ** orders[j], {"epsilon": EPS}
+    )
+    axis = plot.slope_map(data, pixels=(20, 5))
+    np.testing.assert_allclose(axis.lines[0].get_ydata(), orders.reshape(20, 5).mean(1))
+    assert source.largest == 70
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    return 0.5 * p1 @ p1 + 0.5 * args["k"] * q0 @ q0
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def small_sweep(**kw):
+    """4 disturbances, of which the last is too much, × 5 springs."""
+    kw = {"epsilon": [0.01, 0.02, 0.04, 1e80], "num_steps": 5} | kw
+    system = dvi.System(hamiltonian, force=lambda t0, t1, q0, p1, args: -(q0**3))
+    springs = {"k": dvi.Axis("k", [1.0, 1.5, 2.0, 2.5, 3.0])}
+    return dvi.sweep(
+        system, [0.5], [0.1], h=0.1, args=springs, observe={"drift": dvi.MaxDrift(energy)}, **kw
+    )
+
+
+def test_a_store_is_read_in_blocks(tmp_path, monkeypatch):
+    eps = np.linspace(0.001, 0.2, 200)
+    small_sweep(epsilon=eps, store=tmp_path / "s", lanes_per_task=100)
+    whole = dvi.open_sweep(tmp_path / "s")["drift"]
+    read = []
+    get = lazy._Masked._get
+    monkeypatch.setattr(
+        lazy._Masked, "_get", lambda self, key: read.append(get(self, key)) or read[-1]
+    )
+    monkeypatch.setattr(blocks, "BLOCK", 60)
+    data = dvi.open_sweep(tmp_path / "s").to_xarray()
+    axis = plot.sweep_map(data.drift, pixels=(20, 5))
+    np.testing.assert_array_equal(array_of(axis), whole.reshape(20, 10, 5).max(1).T)
+    assert axis.figure.axes[1].get_ylabel() == "largest drift"
+    assert max(r.size for r in read) == 60
+    assert sum(r.size for r in read) == 1000
+    plot.failure_map(data, pixels=(20, 5))
+    plot.slope_map(data.drift, pixels=(20, 5), local=True)
+    assert max(r.size for r in read) == 200  # lines along ε are whole
+
+
+# --- what is refused ---------------------------------------------------------------------------
+
+THREE = xr.DataArray(np.ones((2, 3, 4)), dims=("a", "b", "c"), name="v")
+
+
+@pytest.mark.parametrize(
+    ("draw", "error", "said"),
+    [
+        (lambda: plot.sweep_map(drift(), "y"), ValueError, r"no dimension 'y'.*epsilon \(7\), x"),
+        (lambda: plot.sweep_map(THREE), ValueError, r"'c' is left.*isel\(c=0\).*over='c'.*facet="),
+        (lambda: plot.sweep_map(THREE, "a", "a"), ValueError, "y and x are both along 'a'"),
+        (lambda: plot.sweep_map(THREE, "a", over="a"), ValueError, "both along 'a'"),
+        (lambda: plot.sweep_map(THREE[:, :0]), ValueError, "b has no values"),
+        (lambda: plot.sweep_map(THREE[0, 0, 0]), ValueError, "no dimension has more than one"),
+        (lambda: plot.sweep_map(THREE[0], reduce="sum"), ValueError, "one of 'max', 'min'"),
+        (lambda: plot.sweep_map(THREE[0], pixels=3), ValueError, "pixels must be"),
+        (lambda: plot.sweep_map(THREE[0], limits=(2, 1)), ValueError, "two rising numbers"),
+        (lambda: plot.sweep_map(-THREE[0], log=True), ValueError, "no place for the 12 pixels"),
+        (lambda: plot.sweep_map(np.ones(3)), TypeError, "takes an xarray.DataArray.*ndarray"),
+        (lambda: plot.sweep_map(with_status()), TypeError, "one variable.*drift, status"),
+        (lambda: plot.sweep_map(THREE[0] + 1j), TypeError, "real numbers, got .* complex128"),
+        (
+            lambda: plot.sweep_map(THREE, facet="a", ax=plt.subplots()[1]),
+            ValueError,
+            "leave out ax",
+        ),
+        (
+            lambda: plot.sweep_map(xr.DataArray(np.ones((40, 2, 2))), facet="dim_0"),
+            ValueError,
+            r"40 values.*16 panels.*slice\(None, None, 3\)",
+        ),
+        (
+            lambda: plot.sweep_map(drift(), status=with_status().status.expand_dims(k=2)),
+            ValueError,
+            "select the same of both",
+        ),
+        (lambda: plot.failure_map(drift().to_dataset()), ValueError, "has no status: .*drift"),
+        (lambda: plot.failure_map(drift()), ValueError, "flag_values and flag_meanings"),
+        (lambda: plot.slope_map(drift(), "h"), ValueError, "no dimension 'h'"),
+        (lambda: plot.slope_map(THREE, "a"), ValueError, "'a' has no values to take a slope"),
+        (lambda: plot.slope_map(drift(), facet="epsilon"), ValueError, "nothing of it for a facet"),
+        (lambda: plot.slope_map(drift()[:1]), ValueError, "two or more positive values"),
+        (
+            lambda: plot.slope_map(drift().expand_dims(k=2), x="x", y="k", local=True),
+            ValueError,
+            "name it as x or y",
+        ),
+    ],
+)
+def test_refused(draw, error, said):
+    with pytest.raises(error, match=said):
+        draw()
