@@ -198,7 +198,7 @@ def test_cells_without_a_number_are_grey_and_counted():
 def test_a_status_tells_failed_from_not_computed():
     data = with_status()
     axis = plot.sweep_map(data.drift, status=data.status)
-    assert texts(axis) == ["no number: 6 of 35 (17.1 %)", "not computed"]
+    assert texts(axis) == ["no number: 2 of 35 (5.71 %)", "not computed: 4 of 35 (11.4 %)"]
     assert tuple(colour_at(axis, EPS[6], X[4])) == (255, 255, 255)
     assert colour_at(axis, EPS[2], X[1]).max() < 220
 
@@ -389,11 +389,20 @@ def test_a_dimension_without_values_costs_nothing_for_its_length(monkeypatch):
 
 def test_what_lies_in_chunks_is_read_in_chunks(monkeypatch):
     monkeypatch.setattr(blocks, "BLOCK", 1000)
-    _, data = lazily((10, 2500), ("a", "b"), rough)
-    data.encoding["preferred_chunks"] = {"a": 1, "b": 300}
-    parts = [s["b"] for s in blocks._selections(data, {}, None, False)]
-    assert all(p.start % 300 == 0 for p in parts)
-    assert max(p.stop - p.start for p in parts) == 900
+    source, data = lazily((10, 2500), ("a", "b"), rough)
+    plain = array_of(plot.sweep_map(data, pixels=(5, 50)))
+    source.largest = source.total = 0
+    data.encoding["preferred_chunks"] = {"a": 4, "b": 120}
+    read = list(blocks._selections(data, {}, None, False))
+    for dim, chunk, most in (("a", 4, 4), ("b", 120, 240)):
+        assert {s[dim].start % chunk for s in read} == {0}
+        assert max(s[dim].stop - s[dim].start for s in read) == most
+    np.testing.assert_array_equal(array_of(plot.sweep_map(data, pixels=(5, 50))), plain)
+    assert (source.largest, source.total) == (960, 25_000)
+    data.encoding["preferred_chunks"] = {"a": 4, "b": 500}  # more than a block
+    assert max(s["b"].stop for s in blocks._selections(data, {}, None, False)) == 2500
+    plot.sweep_map(data)
+    assert source.largest <= 1000
 
 
 def test_a_median_that_is_too_large_is_refused(monkeypatch):

@@ -148,26 +148,30 @@ def _is(lines: Lines | None, dim: str) -> bool:
 def _selections(
     data: Any, bins: Mapping[str, Bins], lines: Lines | None, whole: bool
 ) -> Iterator[dict[str, Any]]:
-    """What is read at a time: in the order in which the numbers lie, last dimension first."""
+    """What is read at a time: whole chunks where the array tells its own, last dimension first."""
     parts: dict[str, list[Any]] = {}
-    room = BLOCK
     sizes = dict(zip(data.dims, data.shape, strict=True))
     together = {d for d in sizes if _is(lines, d) or (whole and d not in bins)}
-    room = max(1, room // math.prod(sizes[d] for d in together))
+    room = max(1, BLOCK // math.prod(sizes[d] for d in together))
     if whole:
         _check_pixel(sizes, bins, together)
+    chunk = {d: 1 for d in sizes if d not in together}
+    known = data.encoding.get("preferred_chunks") or {}
+    if all(isinstance(known.get(d), int) for d in chunk):
+        fits = {d: min(known[d], sizes[d]) for d in chunk}
+        chunk = fits if math.prod(fits.values()) <= room else chunk
+    if not whole:
+        room //= math.prod(chunk.values())
     for d in reversed(data.dims):
         if d in together:
             parts[d] = [slice(0, sizes[d])]
         elif whole:
             parts[d], room = _whole_pixels(bins[d], room)
         else:
-            step = min(sizes[d], max(room, 1))
-            known = (data.encoding.get("preferred_chunks") or {}).get(d)
-            if isinstance(known, int) and known < step < sizes[d]:
-                step -= step % known
-            parts[d] = [slice(i, i + step) for i in range(0, sizes[d], step)]
-            room //= step
+            chunks = min(-(-sizes[d] // chunk[d]), max(room, 1))
+            step = chunks * chunk[d]
+            parts[d] = [slice(i, min(i + step, sizes[d])) for i in range(0, sizes[d], step)]
+            room //= chunks
     for chosen in itertools.product(*(parts[d] for d in data.dims)):
         yield dict(zip(data.dims, chosen, strict=True))
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import CenteredNorm, ListedColormap, LogNorm, Normalize
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogFormatterMathtext, LogLocator
 
@@ -17,6 +18,12 @@ NO_NUMBER, NOT_COMPUTED, ZERO = "#d0d0d0", "#ffffff", "#000000"
 """Of cells that have no place on the scale of colours; the first is hatched as well."""
 
 _HATCH = {"facecolor": NO_NUMBER, "edgecolor": "#8c8c8c", "hatch": "/////", "linewidth": 0}
+_MARKS: dict[str, Any] = {
+    NO_NUMBER: {"marker": "x", "color": "#777777", "linestyle": "none"},
+    ZERO: {"marker": "v", "color": ZERO, "linestyle": "none"},
+}
+"""The same along a line."""
+
 _MOST_PANELS = 16
 _BOTH_SIGNS = 0.05
 """Of the larger side: numbers that reach less far on the other side of 0 need no middle."""
@@ -163,15 +170,18 @@ def checked_array(data: Any, what: str) -> Any:
 # --- axes ---------------------------------------------------------------------------------------
 
 
-def make_axes(grid: Grid, ax: Any) -> list[Any]:
-    """One `Axes` for each panel: `ax`, or those of a new figure."""
+def make_axes(grid: Grid, ax: Any, height: float | None = None) -> list[Any]:
+    """One `Axes` for each panel: `ax`, or those of a new figure, of one panel of this height."""
     count = len(grid.panels)
     if ax is not None:
         if count > 1:
             raise ValueError("a facet has a figure of its own: leave out ax, or facet.")
         return [ax]
     if count == 1:
-        return [plt.subplots(layout="constrained")[1]]
+        figure, axis = plt.subplots(layout="constrained")
+        if height is not None:
+            figure.set_figheight(height)
+        return [axis]
     columns = min(count, 3 if count > 4 else 2 if count == 4 else count)
     rows = -(-count // columns)
     size = (1.4 + 2.7 * columns, 1.0 + 2.3 * rows)
@@ -284,7 +294,7 @@ def _checked_limits(limits: Any, log: bool) -> tuple[float, float]:
     return low, high
 
 
-def draw_values(axis: Any, grid: Grid, values: np.ndarray, scale: Scale, look: int = 0) -> Any:
+def draw_values(axis: Any, grid: Grid, values: np.ndarray, scale: Scale) -> Any:
     """A map of numbers, or a line; what has no number is left to the background.
 
     A line is drawn over marks at the bottom where there is none. Returns what has the colours, or
@@ -295,13 +305,14 @@ def draw_values(axis: Any, grid: Grid, values: np.ndarray, scale: Scale, look: i
     if grid.y is None:
         mark = "o" if values.size <= 60 else ""
         axis.plot(grid.x.centres, np.where(shown.mask, np.nan, values), marker=mark,
-                  color=COLOURS[look])  # fmt: skip
+                  color=COLOURS[0])  # fmt: skip
         if scale.log:
             axis.set_yscale("log")
-        rug(axis, grid.x.centres[zero], "v", ZERO)
-        rug(axis, grid.x.centres[~np.isfinite(values)], "x", "#777777")
+        _rug(axis, grid.x.centres[zero], ZERO)
+        _rug(axis, grid.x.centres[~np.isfinite(values)], NO_NUMBER)
         return None
-    _background(axis)
+    frame(axis)
+    axis.patch.set(**_HATCH)
     cmap = plt.get_cmap(scale.cmap)
     mesh = axis.pcolormesh(
         grid.x.edges, grid.y.edges, shown, norm=scale.norm, cmap=cmap, rasterized=True
@@ -311,12 +322,11 @@ def draw_values(axis: Any, grid: Grid, values: np.ndarray, scale: Scale, look: i
     return mesh
 
 
-def rug(axis: Any, x: np.ndarray, mark: str, colour: str) -> None:
+def _rug(axis: Any, x: np.ndarray, kind: str) -> None:
     """Marks at the bottom of a panel."""
     if len(x):
-        axis.plot(
-            x, np.full(len(x), 0.025), mark, color=colour, transform=axis.get_xaxis_transform()
-        )
+        y = np.full(len(x), 0.025)
+        axis.plot(x, y, transform=axis.get_xaxis_transform(), **_MARKS[kind])
 
 
 def draw_flags(axis: Any, grid: Grid, where: np.ndarray, colour: str) -> None:
@@ -328,9 +338,10 @@ def draw_flags(axis: Any, grid: Grid, where: np.ndarray, colour: str) -> None:
         )  # fmt: skip
 
 
-def _background(axis: Any) -> None:
+def frame(axis: Any) -> None:
+    """No grid, and a line all around: white cells belong to the map."""
     axis.grid(False)
-    axis.patch.set(**_HATCH)
+    axis.spines[:].set_visible(True)
 
 
 def colour_bar(axes: Sequence[Any], mesh: Any, scale: Scale, label: str) -> None:
@@ -342,8 +353,10 @@ def colour_bar(axes: Sequence[Any], mesh: Any, scale: Scale, label: str) -> None
         axes[0].figure.colorbar(mesh, ax=list(axes), label=label, extend=scale.extend)
 
 
-def flag(colour: str, label: str) -> Patch:
-    """An entry of a legend."""
+def flag(colour: str, label: str, line: bool = False) -> Any:
+    """An entry of a legend, of a map or of a line."""
+    if line and colour in _MARKS:
+        return Line2D([], [], label=label, **_MARKS[colour])
     if colour == NO_NUMBER:
         return Patch(label=label, **_HATCH)
     return Patch(facecolor=colour, edgecolor="#8c8c8c", linewidth=0.6, label=label)
@@ -355,7 +368,9 @@ def legend(axes: Sequence[Any], entries: Sequence[Any], ax: Any) -> None:
         return
     if ax is None:
         axes[0].figure.legend(
-            handles=entries, loc="outside lower center", ncols=min(len(entries), 3)
+            handles=entries,
+            loc="outside lower center",
+            ncols=min(len(entries), 2 if len(axes) < 3 else 3),
         )
     else:
         ax.legend(

@@ -170,7 +170,7 @@ def failure_map(
         pictures = [_failed_share(c, names) for c in counts]
         label = "share of trajectories that failed"
         return _draw(grid, pictures, label, False, (0, 1), ax, None, "not computed")
-    axes = panels.make_axes(grid, ax)
+    axes = panels.make_axes(grid, ax, 1.9 if grid.y is None else None)
     for axis, count in zip(axes, counts, strict=True):
         _draw_statuses(axis, grid, _shown(count, codes, names), codes, names)
     panels.finish(axes, grid)
@@ -194,7 +194,7 @@ def _draw(
     log: bool | None,
     limits: Any,
     ax: Any,
-    opens: list[np.ndarray] | None,
+    opens: tuple[list[np.ndarray], float] | None,
     what: str,
 ) -> Any:
     """Numbers in their colours, with a bar and a legend of what has none."""
@@ -204,18 +204,22 @@ def _draw(
     for i, (axis, picture) in enumerate(zip(axes, pictures, strict=True)):
         mesh = panels.draw_values(axis, grid, picture.values, scale)
         if opens is not None:
-            panels.draw_flags(axis, grid, opens[i] & np.isnan(picture.values), NOT_COMPUTED)
+            panels.draw_flags(axis, grid, opens[0][i] & np.isnan(picture.values), NOT_COMPUTED)
     panels.finish(axes, grid)
     panels.colour_bar(axes, mesh, scale, label)
-    missing = sum(p.missing for p in pictures)
-    entries = []
-    if missing:
-        there = share(missing, sum(p.points for p in pictures))
-        entries.append(flag(NO_NUMBER, f"{what}: {there}"))
-    if opens is not None and any(o.any() for o in opens):
-        entries.append(flag(NOT_COMPUTED, "not computed"))
+    points = sum(p.points for p in pictures)
+    counts = {NO_NUMBER: sum(p.missing for p in pictures)}
+    if opens is not None:
+        counts[NOT_COMPUTED] = round(opens[1] * points)
+        counts[NO_NUMBER] -= counts[NOT_COMPUTED]
+    names, line = {NO_NUMBER: what, NOT_COMPUTED: "not computed"}, grid.y is None
+    entries = [
+        flag(colour, f"{names[colour]}: {share(count, points)}", line)
+        for colour, count in counts.items()
+        if count > 0
+    ]
     if scale.log and any((p.values == 0).any() for p in pictures):
-        entries.append(flag(ZERO, "exactly 0"))
+        entries.append(flag(ZERO, "exactly 0", line))
     panels.legend(axes, entries, ax)
     return axes[0] if len(grid.panels) == 1 and not grid.panels[0][0] else np.asarray(axes)
 
@@ -312,8 +316,8 @@ def _flags(status: Any) -> tuple[list[int], list[str]]:
     return [code for code, _ in pairs], [name for _, name in pairs]
 
 
-def _open_cells(status: Any, grid: Grid, facet: str | None) -> list[np.ndarray]:
-    """For each panel: pixels of which nothing is computed."""
+def _open_cells(status: Any, grid: Grid, facet: str | None) -> tuple[list[np.ndarray], float]:
+    """(for each panel: pixels of which nothing is computed; share of trajectories that are not)."""
     status = _status_of(status)
     codes, names = _flags(status)
     wanted = [*grid.bins] + ([dim_of(status, facet)] if facet is not None else [])
@@ -323,13 +327,14 @@ def _open_cells(status: Any, grid: Grid, facet: str | None) -> list[np.ndarray]:
             f"the status has the dimensions {names_of(status)}; those of the map are "
             f"{', '.join(wanted)}: select the same of both."
         )
-    found = []
+    found, not_computed, points = [], 0, 0
+    is_open = np.asarray([name == _OPEN for name in names])
     for i in range(len(grid.panels)):
         panel = status if facet is None else status.isel({dim_of(status, facet): i})
         counts = counted(panel, grid.bins, codes)
-        is_open = np.asarray([name == _OPEN for name in names])
         found.append(counts[~is_open].sum(0) == 0)
-    return found
+        not_computed, points = not_computed + counts[is_open].sum(), points + counts.sum()
+    return found, float(not_computed / points)
 
 
 def _shown(counts: np.ndarray, codes: list[int], names: list[str]) -> np.ndarray:
@@ -353,7 +358,7 @@ def _draw_statuses(
     axis: Any, grid: Grid, shown: np.ndarray, codes: list[int], names: list[str]
 ) -> None:
     """Statuses as cells; of one dimension a strip."""
-    axis.grid(False)
+    panels.frame(axis)
     if grid.y is None:
         y, shown = np.asarray([0.0, 1.0]), shown[None]
         axis.set_yticks([])
