@@ -24,6 +24,7 @@ from ._reversible import Reversible as Reversible
 from ._solution import Save as Save, Solution as Solution
 from ._system import System as System
 from .engine.cpu import configure_cpu as configure_cpu
+from .engine.devices import over_devices as over_devices
 from .engine.newton import Newton as Newton, RootSolver as RootSolver
 from .engine.picard import Picard as Picard, PicardThenNewton as PicardThenNewton
 from .engine.simplified import SimplifiedNewton as SimplifiedNewton

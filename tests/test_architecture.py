@@ -89,7 +89,7 @@ def test_door_has_no_logic():
 PUBLIC = """
 System discretise integrate Save Solution RESULTS IntegrationError Newton
 RootSolver SimplifiedNewton Picard PicardThenNewton
-legendre from_lagrangian from_type_iii velocity_force Layout configure_cpu
+legendre from_lagrangian from_type_iii velocity_force Layout configure_cpu over_threads over_devices
 TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
 GaussLegendre LobattoIIIAIIIB RungeKutta4
 Uniform Given TimeTransformed Variational FloatingPoint Compensated FixedPoint

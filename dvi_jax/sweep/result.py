@@ -102,7 +102,11 @@ class SweepResult:
 
             for name, v in self._source.variables.items():
                 dims = (*self.dims, *v.dims)
-                data[name] = xr.Variable(dims, masked(self._source, name), about_variable(name))
+                chunks = dict(zip(dims, (*self._plan.chunk, *v.shape), strict=True))
+                data[name] = xr.Variable(
+                    dims, masked(self._source, name), about_variable(name),
+                    {"preferred_chunks": chunks},
+                )  # fmt: skip
         coords = {
             name: xr.Variable(dims, values, about)
             for name, (dims, values, about) in self._coordinates.items()

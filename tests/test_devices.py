@@ -1,0 +1,102 @@
+"""One array program over devices and hosts."""
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "many_hosts.py"
+
+TWO_DEVICES = """
+import sys
+sys.path.insert(0, {folder!r})
+import jax, jax.numpy as jnp, numpy as np
+import dvi_jax as dvi
+import many_hosts as example
+assert len(jax.devices()) == 2
+observed = jnp.asarray([0.1, 0.2])
+lanes = jnp.arange(4096)
+alone = jax.vmap(example.end, in_axes=(0, None))
+print(jax.jit(lambda e: jnp.abs(
+    dvi.over_devices(alone, in_axes=(0, None))(lanes, e) - alone(lanes, e)).max())(0.01))
+def misfit(e):
+    return jnp.sum((jnp.mean(alone(lanes, e), axis=0) - observed) ** 2)
+for f in (lambda e: example.misfit(e, observed), misfit):
+    print(*jax.jit(jax.value_and_grad(f))(0.01))
+placed = jax.jit(dvi.over_devices(alone, in_axes=(0, None)))(lanes, 0.01)
+print(len(placed.sharding.device_set))
+"""
+
+
+def run(command, **env):
+    return subprocess.run(
+        command, capture_output=True, text=True, check=True, timeout=300,
+        env={**os.environ, "JAX_PLATFORMS": "cpu", **env},
+    )  # fmt: skip
+
+
+def test_two_devices_give_what_one_does():
+    code = TWO_DEVICES.format(folder=str(EXAMPLE.parent))
+    flags = "--xla_force_host_platform_device_count=2"
+    out = run([sys.executable, "-c", code], XLA_FLAGS=flags).stdout.split()
+    difference, value, gradient, alone, gradient_alone, devices = map(float, out)
+    assert difference < 1e-13
+    np.testing.assert_allclose([value, gradient], [alone, gradient_alone], rtol=1e-12)
+    assert devices == 2
+
+
+def test_one_device_and_what_is_refused():
+    x, c = jnp.arange(6.0).reshape(2, 3), jnp.asarray(2.0)
+    doubled = dvi.over_devices(lambda x, c: c * x, in_axes=(-1, None), out_axes=1)
+    np.testing.assert_array_equal(doubled(x, c), 2 * x)
+    with pytest.raises(TypeError, match="takes a function"):
+        dvi.over_devices(3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="at least one device"):
+        dvi.over_devices(jnp.sin, devices=[])
+    with pytest.raises(ValueError, match="in_axes has 1 entries for 2"):
+        dvi.over_devices(jnp.add, in_axes=[0])(x, x)
+    with pytest.raises(ValueError, match=r"shape \(\)"):
+        dvi.over_devices(jnp.add)(x, c)
+    assert jax.device_count() == 1
+
+
+@pytest.mark.slow
+def test_hosts_are_killed_and_the_fit_is_the_same(tmp_path):
+    """Two hosts, one of them killed now and then; the launcher starts them again."""
+    command = [sys.executable, str(EXAMPLE), "--iterations", "30", "--state"]
+    undisturbed = run([*command, str(tmp_path / "a.json"), "--launch", "2"]).stdout
+    launcher = subprocess.Popen(
+        [*command, str(tmp_path / "b.json"), "--launch", "2"], stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )  # fmt: skip
+    rng, kills, lines, pids = random.Random(1), 0, [], []
+    assert launcher.stdout is not None
+    for line in launcher.stdout:
+        lines.append(line)
+        if line.startswith("hosts:"):
+            pids = [int(p) for p in line.split()[1:]]
+        elif '"iteration"' in line and kills < 3 and json.loads(line)["iteration"] >= 5 * kills + 3:
+            time.sleep(rng.uniform(0, 0.02))
+            os.kill(rng.choice(pids), signal.SIGKILL)
+            kills += 1
+    assert launcher.wait(120) == 0
+    assert kills == 3
+    assert sum("a host was lost" in line for line in lines) >= 2
+    last = [re.findall(r"ε = (\S+) on (\d+)", text)[-1] for text in (undisturbed, "".join(lines))]
+    assert last[0] == last[1]
+    assert last[0][1] == "2"
+    assert abs(float(last[0][0]) - 0.02) < 1e-9
+    a, b = (json.loads((tmp_path / f"{n}.json").read_text()) for n in "ab")
+    assert a == b
