@@ -57,12 +57,14 @@ def test_a_grid_has_the_numbers_of_single_runs_and_their_names():
     eps, k = np.linspace(0, 0.2, 4), [1.0, 1.5, 2.0]
     found = sweep(
         epsilon=eps,
+        units={"drift": "J"},
         args={"k": dvi.Axis("k", k, units="N/m")},
         h=[0.1, 0.05],
         save=dvi.Save(final=True),
     ).to_xarray()
     assert dict(found.sizes) == {"epsilon": 4, "h": 2, "k": 3, "save": 2, "component": 2}
     assert found.k.attrs["units"] == "N/m"
+    assert found.drift.attrs["units"] == "J"
     for e in eps:
         for h in (0.1, 0.05):
             one = single(epsilon=e, h=h, args={"k": 1.5})
@@ -358,6 +360,9 @@ def test_tasks_suit_the_work():
         ({"epsilon": [0.1], "threads": 0}, ValueError, "threads must be"),
         ({"epsilon": [0.1], "lanes_per_task": 1.5}, ValueError, "lanes_per_task must be"),
         ({"epsilon": [0.1], "progress": 3}, TypeError, "progress must be"),
+        ({"epsilon": [0.1], "units": {"drft": "J"}}, ValueError, "'drft', which is none"),
+        ({"epsilon": [0.1], "units": "J"}, TypeError, "units must be a table"),
+        ({"epsilon": dvi.Axis("save", [0.1])}, ValueError, "the axis 'save' has a name"),
         ({"method": [dvi.TypeII(), "Strang"]}, TypeError, "'Strang', which is none"),
         ({"epsilon": [0.1], "start": 3}, TypeError, "one of dvi.starts"),
         ({"epsilon": [0.1], "p0": None}, ValueError, "give q0 and p0, or start"),

@@ -3,7 +3,7 @@
 import inspect
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -28,7 +28,7 @@ from .result import SweepResult
 from .sinks import Memory
 from .starts import Starts
 from .store import Store
-from .variables import own_dims, variables
+from .variables import RESERVED, own_dims, variables
 from .workers import SweepProgress, run_here
 
 _SHARE = 0.5
@@ -61,6 +61,7 @@ def sweep(
     lattice: Lattice = Uniform(),
     save: Save | None = None,
     observe: Any = None,
+    units: Mapping[str, str] | None = None,
     newton: RootSolver = PicardThenNewton(),
     arithmetic: Arithmetic = FloatingPoint(),
     layout: Layout = Layout(),
@@ -89,6 +90,7 @@ def sweep(
     **Arguments** otherwise as for `integrate`, and
 
     - `observe`: pytree of observables and reductions. `save`: which states are kept; None: none.
+    - `units`: of observables (and of t, q, p), name → text, for labels.
     - `store`: a directory. Each task is written there when it is done; the same call again goes on
       where a former one ended, however it ended. Several processes may work on one store. Without
       one the results stay in memory.
@@ -118,6 +120,9 @@ def sweep(
     about: dict[str, Any] = provenance()
     if beside := [name for name in coordinates if name not in made.dims]:
         about["coordinates"] = " ".join(beside)  # what a reader by CF looks for
+    if units is not None:
+        _check_units(units, found)
+        about["units"] = json.dumps(dict(units))
     config = description(made, program.plan, found)
     if client is not None and not hasattr(client, "submit"):
         raise TypeError(f"client must be a distributed.Client, got {client!r}.")
@@ -163,19 +168,29 @@ def sweep_cost(
 
     **Returns** a `SweepCost`. **Raises** as `sweep` for input that cannot be meant.
     """
-    for name in ("store", "client", "threads", "progress"):
+    for name in _OF_RUNNING:
         settings.pop(name, None)
     made = make_sweep(system, q0, p0, **_DEFAULTS | settings)
     program, found = prepare(made, lanes_per_task)
     return cost(made, program.plan, found)
 
 
+_OF_RUNNING = ("store", "client", "threads", "progress", "units")
+
 _DEFAULTS = {
     name: parameter.default
     for name, parameter in inspect.signature(sweep).parameters.items()
-    if name
-    not in ("system", "q0", "p0", "store", "client", "threads", "lanes_per_task", "progress")
+    if name not in ("system", "q0", "p0", "lanes_per_task", *_OF_RUNNING)
 }
+
+
+def _check_units(units: Any, found: Mapping[str, Any]) -> None:
+    if not isinstance(units, Mapping) or not all(isinstance(u, str) for u in units.values()):
+        raise TypeError(f'units must be a table such as {{"drift": "J"}}, got {units!r}.')
+    if unknown := [name for name in units if name not in found]:
+        raise ValueError(
+            f"units are given for {unknown[0]!r}, which is none of the results: {', '.join(found)}."
+        )
 
 
 def _interrupted(result: SweepResult) -> str:
@@ -223,6 +238,11 @@ def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_st
     if start is not None:
         axes.append((start.name, start.count, "start"))
     dims = lengths(axes)
+    if taken := [name for name in dims if name in RESERVED]:
+        raise ValueError(
+            f"the axis {taken[0]!r} has a name that the result needs for something else "
+            f"({', '.join(RESERVED)}): give it another."
+        )
     if not dims:
         raise ValueError(
             'nothing varies: give an array for epsilon or h, a dvi.Axis("name", values) anywhere, '

@@ -153,11 +153,16 @@ class Describer:
                 traced = jax.make_jaxpr(lambda d, s=static: f(*eqx.combine(d, s)))(dynamic)
             except Exception:  # not of this kind: what is wrong with it `integrate` will say
                 continue
-            hashed = hashlib.sha256(_ADDRESS.sub("", str(traced.jaxpr)).encode())
+            hashed = hashlib.sha256(_text(traced.jaxpr).encode())
             for constant in _constants(traced):
                 hashed.update(json.dumps(_of_array(np.asarray(constant))).encode())
             return f"computes {hashed.hexdigest()[:16]}"
         return f"code {hashlib.sha256(_code(f)).hexdigest()[:16]}"
+
+
+def _text(jaxpr: Any) -> str:
+    """A jaxpr in words that are the same everywhere: no colours, no addresses."""
+    return _ADDRESS.sub("", jaxpr.pretty_print(use_color=False))
 
 
 def _constants(closed: ClosedJaxpr) -> Iterator[Any]:

@@ -92,11 +92,11 @@ class SweepResult:
         are not done are masked."""
         import xarray as xr
 
-        data = {}
+        data, units = {}, self.attributes.get("units", "{}")
         if isinstance(self._source, Memory):
             for name, v in self._source.variables.items():
                 dims = (*self.dims, *v.dims)
-                data[name] = (dims, self._source.arrays[name], about_variable(name))
+                data[name] = (dims, self._source.arrays[name], about_variable(name, units))
         else:
             from .lazy import masked
 
@@ -104,7 +104,7 @@ class SweepResult:
                 dims = (*self.dims, *v.dims)
                 chunks = dict(zip(dims, (*self._plan.chunk, *v.shape), strict=True))
                 data[name] = xr.Variable(
-                    dims, masked(self._source, name), about_variable(name),
+                    dims, masked(self._source, name), about_variable(name, units),
                     {"preferred_chunks": chunks},
                 )  # fmt: skip
         coords = {

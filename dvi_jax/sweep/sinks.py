@@ -19,6 +19,10 @@ class Sink(abc.ABC):
         """The numbers of the tasks that are not done."""
 
     @abc.abstractmethod
+    def is_done(self, number: int) -> bool:
+        """Whether one task is done, by whomever."""
+
+    @abc.abstractmethod
     def claimed(self, task: Task) -> contextlib.AbstractContextManager[bool]:
         """Whether the task is this worker's to do; for as long as the context lasts."""
 
@@ -39,6 +43,9 @@ class Memory(Sink):
 
     def todo(self):
         return [i for i in range(self.plan.num_tasks) if i not in self._done]
+
+    def is_done(self, number):
+        return number in self._done
 
     @contextlib.contextmanager
     def claimed(self, task) -> Iterator[bool]:

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._results import STATUS_NAMES
 from .identity import FORMAT, differences, digest
 from .plan import Plan, Task
 from .sinks import Sink
@@ -169,10 +170,13 @@ class Store(Sink):
         done = set(self.done())
         return [i for i in range(self.plan.num_tasks) if i not in done]
 
+    def is_done(self, number):
+        return self.record(number) is not None
+
     @contextlib.contextmanager
     def claimed(self, task) -> Iterator[bool]:
         with _claim(self.path / CLAIMS, task.number) as mine:
-            yield mine and self.record(task.number) is None
+            yield mine and not self.is_done(task.number)
 
     def shard_path(self, name: str, number: int) -> Path:
         place = self.plan.place(number)
@@ -410,7 +414,7 @@ def _make(path, config, variables, coordinates, attributes) -> None:
                 name,
                 shape=(*plan.shape, *v.shape),
                 dimension_names=(*plan.dims, *v.dims),
-                attributes=about_variable(name),
+                attributes=about_variable(name, attributes.get("units", "{}")),
                 **_layout(plan.chunk, v),
             )
         (temporary / TASKS).mkdir()
@@ -434,10 +438,8 @@ def _make(path, config, variables, coordinates, attributes) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def about_variable(name: str) -> dict[str, Any]:
-    """The attributes of a variable."""
-    from .._results import STATUS_NAMES
-
+def about_variable(name: str, units: str) -> dict[str, Any]:
+    """The attributes of a variable; `units` are those of all that have some, as JSON."""
     if name == STATUS:
         return {
             "long_name": "how each trajectory ended",
@@ -448,4 +450,6 @@ def about_variable(name: str) -> dict[str, Any]:
         "failed_step": "number of the failing step from 0, or -1",
         "residual": "largest relative residual of an implicit solve",
     }
-    return {"long_name": known[name]} if name in known else {}
+    found = {"long_name": known[name]} if name in known else {}
+    known_units = json.loads(units)
+    return {**found, "units": known_units[name]} if name in known_units else found

@@ -187,10 +187,9 @@ def _next(queue: deque, theirs: deque, stop: threading.Event) -> Iterator[int]:
 
 def _look_again(queue: deque, theirs: deque, sink: Sink, counter: Counter, program: Program):
     """Take up again what other processes had claimed, if it is not done."""
-    open_still = set(sink.todo())
     for _ in range(len(theirs)):
         number = theirs.popleft()
-        if number in open_still:
-            queue.append(number)
-        else:
+        if sink.is_done(number):
             counter.add(program.plan.task(number), {})
+        else:
+            queue.append(number)
