@@ -1,4 +1,4 @@
-"""The TOML file of a run: its keys, their types, and nothing else."""
+"""The TOML file of a run: its keys, their types, and nothing else; and how such files are read."""
 
 import datetime
 import tomllib
@@ -21,48 +21,48 @@ class Key:
     default: Any = None
 
 
-def _text(value: Any) -> str:
+def text(value: Any) -> str:
     if not isinstance(value, str) or not value.strip():
         raise ValueError
     return value
 
 
-def _boolean(value: Any) -> bool:
+def boolean(value: Any) -> bool:
     if not isinstance(value, bool):
         raise ValueError
     return value
 
 
-def _number(value: Any) -> float:
+def number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError
     try:
-        number = float(value)
+        found = float(value)
     except OverflowError:  # a whole number of more than 300 digits
         raise ValueError from None
-    if not np.isfinite(number):
+    if not np.isfinite(found):
         raise ValueError
-    return number
+    return found
 
 
-def _step_size(value: Any) -> float:
-    if _number(value) == 0:
+def step_size(value: Any) -> float:
+    if number(value) == 0:
         raise ValueError
     return float(value)
 
 
-def _count(value: Any) -> int:
+def count(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise ValueError
     return value
 
 
-def _array(value: Any) -> np.ndarray:
+def array(value: Any) -> np.ndarray:
     """Nested arrays of finite numbers, all rows of one length."""
     if not isinstance(value, list) or not value:
         raise ValueError
     for item in value:
-        _array(item) if isinstance(item, list) else _number(item)
+        array(item) if isinstance(item, list) else number(item)
     return np.asarray(value, float)  # ValueError for rows of unequal length
 
 
@@ -76,7 +76,7 @@ def _lattice(value: Any) -> Any:
     if isinstance(value, dict):
         if set(value) != {"times"}:
             raise ValueError
-        times = _array(value["times"])
+        times = array(value["times"])
         steps = np.diff(times) if times.ndim == 1 else np.zeros(1)
         if not steps.size or not ((steps > 0).all() or (steps < 0).all()):
             raise ValueError
@@ -86,35 +86,38 @@ def _lattice(value: Any) -> Any:
     return value
 
 
-def _parameter(value: Any) -> Any:
+def parameter(value: Any) -> Any:
     """A leaf of args, or a table of them. Arrays become float arrays; whole numbers stay whole."""
     if isinstance(value, dict):
-        return {name: _parameter(inner) for name, inner in value.items()}
+        return {name: parameter(inner) for name, inner in value.items()}
     if isinstance(value, list):
-        return _array(value)
+        return array(value)
     if isinstance(value, bool):
         return value
-    return value if isinstance(value, int) else _number(value)
+    return value if isinstance(value, int) else number(value)
 
 
-_ARRAY = "an array of finite numbers, or of such arrays with rows of one length"
+ARRAY = "an array of finite numbers, or of such arrays with rows of one length"
 
-KEYS: Mapping[str, Key | Mapping[str, Key]] = {
-    "system": Key(_text, 'the name of a system in the library, or "file.py:name"'),
+Keys = Mapping[str, Key | Mapping[str, Key]]
+"""The keys of a kind of file: name → key, or a table of keys."""
+
+KEYS: Keys = {
+    "system": Key(text, 'the name of a system in the library, or "file.py:name"'),
     "state": {
-        "q0": Key(_array, _ARRAY),
-        "p0": Key(_array, _ARRAY),
+        "q0": Key(array, ARRAY),
+        "p0": Key(array, ARRAY),
         "date": Key(_date, 'a day such as "1900-01-01" or a Julian date; for solar_system alone'),
     },
     "args": Key(
-        lambda value: _parameter(value) if isinstance(value, dict) else _text(0),
+        lambda value: parameter(value) if isinstance(value, dict) else text(0),
         "a table of numbers, booleans, arrays of numbers, or tables of these",
     ),
-    "t0": Key(_number, "a finite number", 0.0),
-    "h": Key(_step_size, "a finite number that is not zero (negative runs backwards)"),
-    "steps": Key(_count, "a positive whole number"),
-    "epsilon": Key(_number, "a finite number", 0.0),
-    "method": Key(_text, 'text such as "TypeII", "Strang" or "Yoshida(4)"', "TypeII"),
+    "t0": Key(number, "a finite number", 0.0),
+    "h": Key(step_size, "a finite number that is not zero (negative runs backwards)"),
+    "steps": Key(count, "a positive whole number"),
+    "epsilon": Key(number, "a finite number", 0.0),
+    "method": Key(text, 'text such as "TypeII", "Strang" or "Yoshida(4)"', "TypeII"),
     "lattice": Key(
         _lattice,
         '"uniform", or {times = [t0, t1, …]} with at least two times, all increasing or all '
@@ -123,23 +126,23 @@ KEYS: Mapping[str, Key | Mapping[str, Key]] = {
     ),
     "observables": Key(
         lambda value: (
-            {name: _text(inner) for name, inner in value.items()}
+            {name: text(inner) for name, inner in value.items()}
             if isinstance(value, dict)
-            else _text(0)
+            else text(0)
         ),
         'a table of texts, such as energy = "energy" or drift = "MaxDrift(energy)"',
     ),
     "output": {
-        "dir": Key(_text, "the path of a directory that does not exist yet"),
-        "every": Key(_count, "a positive whole number: steps from one saved state to the next", 1),
-        "plots": Key(_boolean, "true or false", True),
+        "dir": Key(text, "the path of a directory that does not exist yet"),
+        "every": Key(count, "a positive whole number: steps from one saved state to the next", 1),
+        "plots": Key(boolean, "true or false", True),
     },
 }
 """Every key that a run file may hold."""
 
 
-def read_config(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The values of a run file with defaults filled in, and the file as it was.
+def read_config(path: Path, keys: Keys) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The values of a file of these keys with defaults filled in, and the file as it was.
 
     Tables are flattened: ``"state.q0"``, ``"output.dir"``; a key that is absent is None.
 
@@ -154,9 +157,9 @@ def read_config(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise InputError(str(path), f"cannot be read: {error}", "a TOML file in UTF-8") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(str(path), f"is not TOML: {error}", "https://toml.io") from None
-    values = _read_table(KEYS, raw, "")
+    values = _read_table(keys, raw, "")
     if values["system"] is None:
-        key = KEYS["system"]
+        key = keys["system"]
         assert isinstance(key, Key)
         raise InputError("system", "the key is missing", key.allowed)
     return values, raw
@@ -178,6 +181,8 @@ def _read_table(keys: Mapping[str, Any], table: Mapping[str, Any], prefix: str) 
         else:
             try:
                 values[full] = key.read(value)
+            except InputError:  # it knows better what is wrong
+                raise
             except ValueError:
                 raise InputError(full, shown(value), key.allowed) from None
     return values

@@ -15,7 +15,7 @@ import dvi_jax as dvi
 
 from .. import plot
 from ..systems.n_body import OBSERVABLES
-from ._config import read_config
+from ._config import KEYS, read_config
 from ._errors import InputError
 from ._pictures import draw, draw_solar_system
 from ._report import Report, plain, solar_contents, solar_tables, watched_table
@@ -50,7 +50,7 @@ def run_file(
     **Raises** `InputError` for input that cannot be meant; nothing is written then.
     """
     path = Path(path)
-    values, raw = read_config(path)
+    values, raw = read_config(path, KEYS)
     folder = Path(out if out is not None else values["output.dir"] or f"results/{path.stem}")
     made = _reserve(folder, "--out" if out is not None else "output.dir", force)
     try:

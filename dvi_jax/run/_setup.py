@@ -49,22 +49,11 @@ def make_setup(values: dict[str, Any], folder: Path) -> Setup:
     **Raises** `InputError`.
     """
     loader = Loader(folder)
-    problem, system, jd = _problem(values, loader)
-    args = _arguments(values["args"], problem)
-    q0, p0 = (_state(values, name, getattr(problem, name, None)) for name in ("q0", "p0"))
-    if q0.shape != p0.shape:
-        raise InputError(
-            "state.p0", f"shape {p0.shape}", f"the shape of q0, {q0.shape}: a momentum for each q"
-        )
-    if problem is not None and problem.check is not None:
-        try:
-            problem.check(q0, p0, args)
-        except ValueError as error:
-            raise InputError(
-                "state", str(error), "a start that the system can go on from"
-            ) from None
-
-    lattice, h, steps = _lattice(values, problem)
+    problem, system, jd = find_problem(values, loader)
+    args = arguments_of(values["args"], problem)
+    q0, p0 = (state_of(values, name, getattr(problem, name, None)) for name in ("q0", "p0"))
+    check_start(problem, q0, p0, args)
+    lattice, h, steps = lattice_of(values, problem)
     setup = Setup(
         name=problem.name if problem is not None else values["system"],
         system=system,
@@ -78,7 +67,7 @@ def make_setup(values: dict[str, Any], folder: Path) -> Setup:
         method=parse_method(values["method"]),
         lattice=lattice,
         every=values["output.every"],
-        observables=_observables(values["observables"], problem, loader),
+        observables=observables_of(values["observables"], problem, loader),
         units=dict(problem.units) if problem is not None else {},
         jd=jd,
         files=tuple(loader.modules),
@@ -148,7 +137,7 @@ def said(error: BaseException, *files: Path) -> str:
     return f"{type(error).__name__}: {error}{where}"
 
 
-def _problem(
+def find_problem(
     values: dict[str, Any], loader: Loader
 ) -> tuple[systems.Problem | None, dvi.System, float | None]:
     """The library's record if there is one, the system, the Julian date of the start."""
@@ -210,7 +199,8 @@ def _takes_arguments(function: Any) -> bool:
 # Its start and parameters
 
 
-def _state(values: dict[str, Any], name: str, default: Any) -> np.ndarray:
+def state_of(values: dict[str, Any], name: str, default: Any) -> Any:
+    """What the file gives as q0 or p0, or else the system's own."""
     given = values[f"state.{name}"]
     if given is None:
         if default is None:
@@ -221,7 +211,25 @@ def _state(values: dict[str, Any], name: str, default: Any) -> np.ndarray:
     return given
 
 
-def _arguments(given: dict[str, Any] | None, problem: systems.Problem | None) -> Any:
+def check_start(problem: systems.Problem | None, q0: Any, p0: Any, args: Any) -> None:
+    """Refuse a start that the system cannot go on from."""
+    if np.shape(q0) != np.shape(p0):
+        raise InputError(
+            "state.p0",
+            f"shape {np.shape(p0)}",
+            f"the shape of q0, {np.shape(q0)}: a momentum for each q",
+        )
+    if problem is not None and problem.check is not None:
+        try:
+            problem.check(q0, p0, args)
+        except ValueError as error:
+            raise InputError(
+                "state", str(error), "a start that the system can go on from"
+            ) from None
+
+
+def arguments_of(given: dict[str, Any] | None, problem: systems.Problem | None) -> Any:
+    """The parameters of the system with those of the file in their place."""
     known = problem.args if problem is not None else None
     if given is None:
         return known
@@ -234,15 +242,20 @@ def _arguments(given: dict[str, Any] | None, problem: systems.Problem | None) ->
     for name in given:
         if name not in known:
             raise InputError(f"args.{name}", "there is no such parameter", one_of(known, name))
+        if isinstance(given[name], dict) and not isinstance(known[name], dict):
+            raise InputError(
+                f"args.{name}", shown(given[name]), "a number or an array; in a sweep also an axis"
+            )
     return {**known, **given}
 
 
 # How it is integrated
 
 
-def _lattice(
+def lattice_of(
     values: dict[str, Any], problem: systems.Problem | None
-) -> tuple[dvi.Lattice, float | None, int | None]:
+) -> tuple[dvi.Lattice, Any, Any]:
+    """The lattice, h and the number of steps, as `integrate` takes them."""
     times = values["lattice"]
     if isinstance(times, np.ndarray):
         for name in ("h", "steps"):
@@ -310,9 +323,10 @@ def _made(node: ast.expr) -> Any:
 # What is watched
 
 
-def _observables(
+def observables_of(
     given: dict[str, str] | None, problem: systems.Problem | None, loader: Loader
 ) -> dict[str, Any]:
+    """What is watched, by name; all that the system knows and their drifts if nothing is said."""
     known = dict(problem.observables) if problem is not None else {}
     if given is None:
         drifts = {f"{name}_drift": dvi.MaxDrift(f) for name, f in known.items()}
