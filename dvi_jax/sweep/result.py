@@ -74,6 +74,16 @@ class SweepResult:
         names = ("not_computed", *STATUS_NAMES)
         return {name: int(n) for name, n in zip(names, counts, strict=True) if n}
 
+    def records(self) -> Iterator[dict[str, Any]]:
+        """What a store has on record of each task that is done: `task`, `start` and `size` of its
+        box, `statuses`, `seconds` that it took and when it was `finished`, `host`, `pid`, `device`.
+        """
+        if isinstance(self._source, Store):
+            for number in self._source.done():
+                record = self._source.record(number)
+                if record is not None:
+                    yield record
+
     def verify(self, progress: Callable[[int, int], None] | None = None) -> Verification:
         """Read all of a store again and compare it with the checksums in its records.
 
