@@ -1,9 +1,11 @@
 """The command line."""
 
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 app = typer.Typer(
     name="dvi-jax",
@@ -15,7 +17,29 @@ app = typer.Typer(
 
 BAD_INPUT = 2
 FAILED = 1
+INTERRUPTED = 130
+AGAIN = "On the command line: the same with --resume goes on from what is done."
 
+
+class _RunFirst(TyperGroup):
+    """Commands of which `run` is meant where none is named."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in (*self.commands, "--help"):
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
+
+
+sweeps = typer.Typer(
+    cls=_RunFirst,
+    no_args_is_help=True,
+    subcommand_metavar="CONFIG | status STORE | verify STORE",
+    help="Many trajectories: run the sweep of a TOML file, look at its store, verify it.",
+)
+app.add_typer(sweeps, name="sweep")
+
+Debug = Annotated[bool, typer.Option("--debug", help="Show the whole traceback of an error.")]
+StorePath = Annotated[Path, typer.Argument(metavar="STORE", help="Directory of a sweep.")]
 Force = Annotated[
     bool, typer.Option("--force", help="Write into a directory that has results already.")
 ]
@@ -46,7 +70,7 @@ def run(
         Path | None, typer.Option(help="Directory for the results, instead of output.dir.")
     ] = None,
     force: Force = False,
-    debug: Annotated[bool, typer.Option(help="Show the whole traceback of an error.")] = False,
+    debug: Debug = False,
 ) -> None:
     """Integrate what a TOML file describes; write the trajectory, a report and pictures.
 
@@ -71,6 +95,104 @@ def run(
     _print(report)
     if not report.ok:
         _complain("failed", report.message)
+        raise typer.Exit(FAILED)
+
+
+@sweeps.command("run")
+def sweep_run(
+    config: Annotated[Path, typer.Argument(help="TOML file that describes the sweep.")],
+    store: Annotated[
+        Path | None, typer.Option(help="Directory for the results, instead of output.store.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a store that exists, if it does.")
+    ] = False,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="Threads; one for each processor or GPU if not given.")
+    ] = None,
+    debug: Debug = False,
+) -> None:
+    """Do the sweep that a TOML file describes; this is what CONFIG alone means.
+
+    Each task is in the store once it is done. Whatever ends the sweep, --resume goes on from there.
+
+    Exit code 0: done; trajectories that fail are results, and are counted in a table. 1: failed,
+    such as by a full disk. 2: bad input, or a store of another sweep. 130: Ctrl-C.
+    """
+    _double_precision()
+    from dvi_jax import StoreError, StoreMismatch
+    from dvi_jax.run import InputError, sweep_file
+
+    try:
+        report = sweep_file(config, store, resume, threads)
+    except KeyboardInterrupt as error:
+        _complain("interrupted", f"{error or 'before anything was done'}\n{AGAIN}")
+        raise typer.Exit(INTERRUPTED) from None
+    except (InputError, StoreMismatch) as error:
+        if debug:
+            raise
+        _complain("bad input", str(error))
+        raise typer.Exit(BAD_INPUT) from None
+    except (StoreError, OSError) as error:
+        if debug:
+            raise
+        _complain("failed", f"{error}\n{AGAIN}")
+        raise typer.Exit(FAILED) from None
+    _print_sweep(report)
+
+
+@sweeps.command("status")
+def sweep_status(
+    store: StorePath,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON, for programs.")] = False,
+    debug: Debug = False,
+) -> None:
+    """How far a sweep is: tasks, trajectories, rate, size, and what it was made with.
+
+    It may be running meanwhile. Exit code 0: done. 2: there is no store.
+    """
+    from dvi_jax.run import InputError, sweep_status
+
+    try:
+        report = sweep_status(store)
+    except InputError as error:
+        if debug:
+            raise
+        _complain("bad input", str(error))
+        raise typer.Exit(BAD_INPUT) from None
+    if as_json:
+        typer.echo(json.dumps(report.contents, indent=2, ensure_ascii=False, allow_nan=False))
+    else:
+        _print_sweep(report)
+
+
+@sweeps.command("verify")
+def sweep_verify(store: StorePath, debug: Debug = False) -> None:
+    """Read everything in a store again: checksums, and that it can be decoded.
+
+    Tasks that are bad are open again, and the sweep with --resume does them anew: in the same bits.
+
+    Exit code 0: all is sound. 1: something was bad, or cannot be read. 2: there is no store.
+    """
+    from dvi_jax.run import InputError, verify_store
+
+    try:
+        with _Bar("verifying") as bar:
+            report = verify_store(store, bar.show)
+    except InputError as error:
+        if debug:
+            raise
+        _complain("bad input", str(error))
+        raise typer.Exit(BAD_INPUT) from None
+    except OSError as error:
+        if debug:
+            raise
+        _complain("failed", f"the bad tasks cannot be opened again: {error}")
+        raise typer.Exit(FAILED) from None
+    _print_sweep(report)
+    if report.contents["bad"]:
+        _complain("failed", "bad tasks were found; they are open again. To repair the store, do "
+                  "the sweep again with --resume.")  # fmt: skip
         raise typer.Exit(FAILED)
 
 
@@ -179,6 +301,12 @@ def _print_tables(console: Any, tables: Any) -> None:
         for row in table.rows:
             shown.add_row(*(escape(cell) for cell in row))
         console.print(shown)
+
+
+def _print_sweep(report: Any) -> None:
+    console = _stdout()
+    _print_tables(console, report.tables)
+    console.print(report.summary, markup=False, soft_wrap=True)
 
 
 def _print(report: Any) -> None:

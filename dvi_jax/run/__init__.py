@@ -1,4 +1,9 @@
-"""A run from a TOML file: what is in it, the integration, the report."""
+"""Runs and sweeps from TOML files: what is in them, the integration, the report."""
 
 from ._errors import InputError as InputError
 from ._run import run_file as run_file
+from ._sweep import (
+    sweep_file as sweep_file,
+    sweep_status as sweep_status,
+    verify_store as verify_store,
+)

@@ -1,0 +1,443 @@
+"""Sweeps from TOML files: axes, stores that go on, what is refused, Ctrl-C."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import dvi_jax as dvi
+from dvi_jax.cli import app
+from dvi_jax.run import InputError, sweep_file, sweep_status
+from dvi_jax.run._config import read_config
+from dvi_jax.run._setup import Loader
+from dvi_jax.run._sweep_config import SWEEP_KEYS
+from dvi_jax.run._sweep_setup import make_sweep_setup
+from dvi_jax.sweep import store
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "sweep.toml"
+
+OWN = """
+import jax.numpy as jnp
+import dvi_jax as dvi
+
+def H_D(t0, t1, q0, p1, args):
+    return args["k"] * jnp.sum(q0**2) / 2 + jnp.sum(p1**2) / 2
+
+system = dvi.System(H_D, force=lambda t0, t1, q0, p1, args: -p1)
+
+def H(t, q, p, args):
+    return H_D(t, t, q, p, args)
+
+def failing(t, q, p, args):
+    return q.nothing
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    return H_D(t0, t1, q1, p1, args)
+
+def both(t0, t1, q0, p0, q1, p1, args):
+    return jnp.concatenate([q1, p1])
+"""
+
+SMALL = """
+system = "own.py:system"
+h = 0.1
+steps = 30
+epsilon = {linspace = [0.0, 0.2, 12]}
+[state]
+q0 = [0.5]
+p0 = [0.1]
+[args]
+k = 1.0
+[observables]
+energy = "own.py:energy"
+drift = "MaxDrift(own.py:energy)"
+[output]
+store = "out.zarr"
+lanes_per_task = 4
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "own.py").write_text(OWN, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def command(*words):
+    return CliRunner().invoke(app, ["sweep", *(str(w) for w in words)])
+
+
+def write(folder, text, name="sweep.toml"):
+    (folder / name).write_text(text, encoding="utf-8")
+    return folder / name
+
+
+def arguments(folder, text):
+    path = write(folder, text)
+    return make_sweep_setup(read_config(path, SWEEP_KEYS)[0], folder).arguments
+
+
+def contents(path):
+    """Every number in a store, by name."""
+    data = dvi.open_sweep(path).to_xarray()
+    return {name: data[name].values for name in data.data_vars}
+
+
+def assert_same(a, b):
+    assert a.keys() == b.keys()
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name])
+
+
+# What a file means
+
+
+def test_the_same_sweep_in_python(folder):
+    """A store goes on for the very same sweep alone: axes, methods, functions, to the last bit."""
+    text = """
+        system = "own.py:system"
+        h = {values = [0.1, 0.05], axis = "size"}
+        steps = {linspace = [10, 20, 2], axis = "size"}
+        epsilon = {geomspace = [1e-4, 1e-1, 3]}
+        method = {values = ["TypeII", "Strang"], axis = "size"}
+        save = "final"
+        [state]
+        q0 = [{linspace = [-0.2, 0.2, 3], axis = "x", units = "m"}, 1.2]
+        p0 = [0.1, 0.2]
+        [args]
+        k = {values = [1.0, 1.1]}
+        [observables]
+        last = "own.py:energy"
+        drift = "MaxDrift(own.py:energy)"
+    """
+    report = sweep_file(write(folder, text), store="here.zarr")
+    assert report.contents["trajectories"] == {"successful": 36}
+    own = Loader(folder)
+    system, energy = own.load("", "own.py:system"), own.load("", "own.py:energy")
+    again = dvi.sweep(
+        system,
+        [dvi.Axis("x", np.linspace(-0.2, 0.2, 3)), 1.2],
+        np.asarray([0.1, 0.2]),
+        h=dvi.Axis("size", [0.1, 0.05]),
+        num_steps=dvi.Axis("size", [10, 20]),
+        epsilon=np.geomspace(1e-4, 1e-1, 3),
+        args={"k": dvi.Axis("k", [1.0, 1.1])},
+        method=dvi.Axis("size", [dvi.TypeII(), dvi.Strang()]),
+        save=dvi.Save(final=True),
+        observe={"last": dvi.Last(energy), "drift": dvi.MaxDrift(energy)},
+        store="here.zarr",
+        progress=lambda p: pytest.fail("work was left") if p.tasks_done < p.num_tasks else None,
+    )
+    found = again.to_xarray()
+    assert found.drift.dims == ("size", "epsilon", "k", "x")
+    assert dvi.open_sweep("here.zarr").to_xarray().x.attrs["units"] == "m"
+    assert report.contents["observed"]["drift"]["max"] == found.drift.values.max()
+    one = dvi.integrate(
+        system, jnp.asarray([0.2, 1.2]), jnp.asarray([0.1, 0.2]), h=0.05, num_steps=20,
+        epsilon=0.1, args={"k": 1.1}, method=dvi.Strang(), observe=dvi.MaxDrift(energy),
+    )  # fmt: skip
+    np.testing.assert_allclose(found.drift[1, 2, 1, 2], one.observed, rtol=1e-12)
+
+
+def test_axes_in_arrays(folder):
+    text = """
+        system = "n_body"
+        steps = 3
+        [args]
+        masses = [1.0, {values = [0.1, 0.2], axis = "m"}, 2.0]
+    """
+    axis = arguments(folder, text)["args"]["masses"]
+    assert axis.name == "m"
+    np.testing.assert_array_equal(axis.values, [[1.0, 0.1, 2.0], [1.0, 0.2, 2.0]])
+    method = arguments(folder, 'method = ["TypeII", "Yoshida(4)"]' + SMALL)["method"]
+    assert (method.name, method.values) == ("method", [dvi.TypeII(), dvi.Yoshida(4)])
+    states = SMALL.replace("q0 = [0.5]", 'q0 = {values = [[0.5], [0.6]], axis = "start"}')
+    q0 = arguments(folder, states)["q0"]
+    np.testing.assert_array_equal(q0.values, [[0.5], [0.6]])
+
+
+STARTS = {
+    "halton": ("low = {q = [0], p = [0]}\nhigh = {q = [1], p = [2]}\nseed = 3", dvi.starts.Halton),
+    "random": ('low = {q = [0], p = [0]}\nhigh = {q = [1], p = [2]}\nname = "s"',
+               dvi.starts.Random),
+    "normal": ("q0 = [0.5]\np0 = [0]\nsigma = {q = 0.1, p = [0.2]}", dvi.starts.Normal),
+    "energy_shell": ('energy = 1.0\nlow = [-1]\nhigh = [1]\nH = "own.py:H"',
+                     dvi.starts.EnergyShell),
+}  # fmt: skip
+
+
+def with_start(start):
+    head, _, tail = SMALL.partition("[state]")
+    return head + "[start]\n" + start + "\n[args]" + tail.partition("[args]")[2]
+
+
+@pytest.mark.parametrize("kind", STARTS)
+def test_starts(folder, kind):
+    keys, made = STARTS[kind]
+    start = arguments(folder, with_start(f'kind = "{kind}"\ncount = 20\n{keys}'))["start"]
+    assert isinstance(start, made)
+    assert start.count == 20
+    assert (start.seed, start.name) == (3 if kind == "halton" else 0, "s" if made is
+                                        dvi.starts.Random else "start")  # fmt: skip
+    q, p = start.at(np.int32(4), 0.0, {"k": 1.0})
+    assert q.shape == p.shape == (1,)
+
+
+def test_the_example_and_every_key_in_it(folder):
+    result = command(EXAMPLE)
+    assert result.exit_code == 0, result.output
+    assert "3072 trajectories in" in result.output
+    found = dvi.open_sweep("results/sweep.zarr").to_xarray()
+    assert found.energy_drift.dims == ("epsilon", "start")
+    assert found.angular_momentum_drift.max() < 1e-12
+    assert found.energy_drift.min() > 1e-3  # negative control
+    text = EXAMPLE.read_text(encoding="utf-8")
+    for key in SWEEP_KEYS:
+        shown_elsewhere = key in ("state", "t0", "lattice")  # of runs, in kepler.toml
+        assert shown_elsewhere or f"{key} = " in text or f"[{key}]" in text, key
+
+
+def test_what_is_not_a_number_alone(folder):
+    text = SMALL.replace('"own.py:energy"\n', '"own.py:both"\n', 1) + "\n"
+    report = sweep_file(write(folder, text), threads=1)
+    energy = contents("out.zarr")["energy"]
+    assert energy.shape == (12, 2)
+    assert report.contents["observed"]["energy"]["max"] == energy.max()
+
+
+# Stores
+
+
+def test_a_store_goes_on_with_resume_alone(folder):
+    path = write(folder, SMALL)
+    first = command(path)
+    assert first.exit_code == 0, first.output
+    assert "median" in first.output
+    before = contents("out.zarr")
+    again = command(path)
+    assert again.exit_code == 2
+    assert "3 of 3 tasks are done" in again.stderr
+    assert "--resume" in again.stderr
+    assert_same(contents("out.zarr"), before)
+
+    dvi.open_sweep("out.zarr")._source.record_path(1).unlink()
+    status = json.loads(command("status", "out.zarr", "--json").stdout)
+    assert status["tasks"] == {"done": 2, "left": 1, "all": 3}
+    assert status["trajectories"] == {"not_computed": 4, "successful": 8}
+    assert status["steps_per_second"] == pytest.approx(30 * status["trajectories_per_second"])
+    resumed = command("run", path, "--resume", "--threads", 1)
+    assert resumed.exit_code == 0, resumed.output
+    assert_same(contents("out.zarr"), before)
+    shown = command("status", "out.zarr")
+    assert "3 of 3 tasks done" in shown.stdout
+    assert "dvi-jax" in shown.stdout
+    assert "nothing was left to do" in command(path, "--resume").output
+
+    assert command(path, "--store", "other.zarr", "--resume").exit_code == 0
+    assert_same(contents("other.zarr"), before)
+
+
+def test_another_sweep_is_not_mixed_in(folder):
+    path = write(folder, SMALL)
+    sweep_file(path)
+    before = contents("out.zarr")
+    write(folder, SMALL.replace("h = 0.1", "h = 0.2").replace("k = 1.0", "k = 1.5"))
+    result = command(path, "--resume")
+    assert result.exit_code == 2
+    for said in ("holds another sweep", "args.k: ", "h: "):
+        assert said in result.stderr
+    assert "epsilon: " not in result.stderr
+    assert_same(contents("out.zarr"), before)
+
+
+def test_a_place_that_is_no_store(folder):
+    path = write(folder, SMALL)
+    for place in (folder, "own.py"):
+        result = command(path, "--resume", "--store", place)
+        assert result.exit_code == 2
+        assert "is no store of a sweep" in result.stderr
+    for word in ("status", "verify"):
+        result = command(word, "nowhere.zarr")
+        assert result.exit_code == 2
+        assert "there is no sweep here" in result.stderr
+
+
+def test_a_flipped_byte_is_found_and_repaired(folder):
+    path = write(folder, SMALL)
+    sweep_file(path)
+    before = contents("out.zarr")
+    assert command("verify", "out.zarr").exit_code == 0
+    shard = folder / "out.zarr" / "drift" / "c" / "1"
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    result = command("verify", "out.zarr")
+    assert result.exit_code == 1, result.output
+    assert "the shard of drift has another checksum" in result.stdout
+    assert "2 tasks are sound, 1 bad" in result.stdout
+    assert "--resume" in result.stderr
+    assert sweep_status("out.zarr").contents["tasks"]["left"] == 1
+    assert command(path, "--resume").exit_code == 0
+    assert command("verify", "out.zarr").exit_code == 0
+    assert_same(contents("out.zarr"), before)
+
+
+def test_failed_trajectories_are_results(folder):
+    path = write(folder, SMALL.replace("{linspace = [0.0, 0.2, 12]}", "{values = [0.1, 1e200]}"))
+    result = command(path)
+    assert result.exit_code == 0, result.output
+    assert "not_finite" in result.output
+    assert "50 %" in result.output
+
+
+def test_a_disk_that_fails(folder, monkeypatch):
+    path = write(folder, SMALL)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "publish", full)
+        result = command(path)
+    assert result.exit_code == 1
+    assert "No space left on device" in result.stderr
+    assert "--resume" in result.stderr
+    assert command(path, "--resume").exit_code == 0
+
+
+def test_ctrl_c_leaves_a_store_to_go_on_with(folder):
+    text = SMALL.replace("0.2, 12]", "0.2, 24]").replace("steps = 30", "steps = 200_000")
+    path = write(folder, text.replace("lanes_per_task = 4", "lanes_per_task = 1"))
+    code = "from dvi_jax.cli import main; main()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "sweep", str(path), "--threads", "1"],
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    until = time.monotonic() + 60
+    while not list(folder.glob("out.zarr/.tasks/*/*.json")) and time.monotonic() < until:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert "interrupted: " in said
+    assert "--resume" in said
+    assert "Traceback" not in said
+    tasks = sweep_status("out.zarr").contents["tasks"]
+    assert 1 <= tasks["done"] < 24, tasks
+    sweep_file(path, resume=True)
+    sweep_file(path, store="whole.zarr")
+    assert_same(contents("out.zarr"), contents("whole.zarr"))
+
+
+# What is refused: the key, what was seen, what is allowed
+
+KEPLER = 'system = "kepler"\nsteps = 5\n'
+EPS = KEPLER + "epsilon = {values = [0.1]}\n"
+HALTON = KEPLER + '[start]\nkind = "halton"\ncount = 3\n'
+BOX = "low = {q = [0, 1], p = [0, 0]}\nhigh = {q = [1, 2], p = [1, 1]}\n"
+REFUSED = [
+    (KEPLER, "epsilon: nothing varies", "[start]"),
+    (EPS + "lattices = 3", "lattices: there is no such key", "did you mean lattice?"),
+    (EPS + "[output]\nstor = 'a'", "output.stor: there is no such key", "did you mean store?"),
+    (KEPLER + "epsilon = [0.1, 0.2]", "epsilon: [0.1, 0.2] (an array)", "{values = […]}"),
+    (KEPLER + "epsilon = {lin = 3}", "epsilon: {'lin': 3} (a table)", "{linspace = [a, b, n]}"),
+    (
+        KEPLER + "epsilon = {linspace = [0, 1, 2], unit = 'm'}",
+        "epsilon.unit: there is no such key",
+        "did you mean units?",
+    ),
+    (
+        KEPLER + "epsilon = {linspace = [0, 1, 2], values = [1]}",
+        "epsilon: {'linspace'",
+        "one of {linspace",
+    ),
+    (KEPLER + "epsilon = {linspace = [0, 1]}", "epsilon.linspace: [0, 1]", "how many]"),
+    (KEPLER + "epsilon = {linspace = [0, 1, 2.5]}", "epsilon.linspace: [0, 1, 2.5]", "whole"),
+    (KEPLER + "epsilon = {geomspace = [0, 1, 3]}", "epsilon.geomspace: [0, 1, 3]", "above zero"),
+    (KEPLER + "epsilon = {values = []}", "epsilon.values: [] (an array)", "at least one"),
+    (KEPLER + "epsilon = {values = [0.1, nan]}", "epsilon.values[1]: nan", "no axis"),
+    (KEPLER + "epsilon = {values = [1], axis = 'a b'}", "epsilon.axis: 'a b'", "a name"),
+    (KEPLER + "epsilon = {values = [1], axis = 'status'}", "epsilon.axis: 'status'", "none of"),
+    (KEPLER + "epsilon = {values = [1], units = 3}", "epsilon.units: 3", "text"),
+    (KEPLER + "h = {linspace = [-1, 1, 3]}", "h.linspace[1]: 0.0", "no axis"),
+    ('system = "kepler"\nsteps = {values = [1, 2.5]}', "steps.values[1]: 2.5", "no axis"),
+    (
+        KEPLER + "[state]\nq0 = [{values = [1.0]}, 0.0]",
+        "state.q0[0].axis: the key is missing",
+        'axis = "x"',
+    ),
+    (KEPLER + "[state]\nq0 = [{values = [1.0], axis = 'x'}]", "state.p0: shape (2,)", "(1,)"),
+    (
+        KEPLER + "[state]\nq0 = {values = [[0, 0], [0, 0]], axis = 'x'}",
+        "state: the body is on top of the centre",
+        "start",
+    ),
+    (KEPLER + "[args]\nK = {linspce = [1, 2, 3]}", "args.K: {'linspce'", "in a sweep also an axis"),
+    (KEPLER + "[args]\nk = {values = [1]}", "args.k: there is no such", "did you mean K?"),
+    (KEPLER + "[args]\nK = {values = [1, [2]]}", "args.K.values: [1, [2]]", "one shape"),
+    (
+        KEPLER + "[args]\nK = [{values = [1], axis = 'a'}, {values = [1], axis = 'b'}]",
+        "args.K: axes Axis('a', 1 values), Axis('b', 1 values) in one array",
+        "one name",
+    ),
+    (KEPLER + "method = ['TypeII', 'Strng']", "method: 'Strng'", "did you mean Strang?"),
+    (KEPLER + "method = [3]", "method.values[0]: 3", "no axis"),
+    (EPS + "save = 'all'", "save: 'all' (text)", "{every = n}"),
+    (EPS + "save = {every = 0}", "save: {'every': 0}", "positive"),
+    (EPS + "[observables]", "observables: nothing would be kept", 'save = "final"'),
+    (EPS + "[observables]\nepsilon = 'energy'", "'epsilon' has a name that", "fit one another"),
+    (
+        KEPLER + "epsilon = {values = [1, 2], axis = 'a'}\nh = {values = [1], axis = 'a'}",
+        "has 2 values in epsilon and 1 in h",
+        "axes",
+    ),
+    (HALTON, "start.low: the key is missing", "{q = […], p = […]}"),
+    (HALTON.replace("halton", "haltn"), "start.kind: 'haltn'", "did you mean halton?"),
+    (KEPLER + "[start]\ncount = 3", "start.kind: the key is missing", "normal"),
+    (HALTON + BOX + "sigma = {q = 1, p = 1}", "start.sigma: kind = halton has no", "seed"),
+    (HALTON + BOX.replace("low = {q", "low = {x"), "start.low: {'p'", "{q = […], p = […]}"),
+    (HALTON + "low = [0, 0]\nhigh = [1, 1]", "start.low: array", "{q = […], p = […]}"),
+    (HALTON + BOX.replace("high", "High"), "start.High: there is no such key", "mean high?"),
+    (HALTON + BOX.replace("[1, 1]", "[-1, 1]"), "start: low of Halton must not lie", "halton"),
+    (HALTON + BOX + "name = 'save'", "start.name: 'save'", "none of"),
+    (HALTON + BOX + "[state]\nq0 = [0, 1]", "state.q0: given beside [start]", "[start]"),
+    (
+        HALTON + "low = {q = [0], p = [0]}\nhigh = {q = [1], p = [1]}",
+        "state: the Kepler problem here is in the plane",
+        "start",
+    ),
+    (
+        KEPLER + "[start]\nkind = 'energy_shell'\ncount = 2\nenergy = -1\nlow = [0, 1]\n"
+        "high = [1, 2]\nH = 'own.py:failing'",
+        "(own.py, line 14)",
+        "H (t, q, p, args)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("text", "seen", "allowed"), REFUSED)
+def test_bad_input(folder, text, seen, allowed):
+    result = command(write(folder, text), "--store", "out")
+    assert result.exit_code == 2, result.output
+    assert seen in result.stderr
+    assert allowed in result.stderr.partition("allowed: ")[2]
+    assert isinstance(result.exception, SystemExit)
+    assert not (folder / "out").exists()  # nothing is left behind
+
+
+def test_the_command_line_itself(folder):
+    assert "status" in command("--help").output
+    assert command().exit_code == 2
+    assert command(write(folder, SMALL), "--threads", 0).exit_code == 2
+    assert command("--stor", "x").exit_code == 2
+    assert command("nowhere.toml").exit_code == 2
+    with pytest.raises(InputError, match="there is no such file"):
+        CliRunner().invoke(app, ["sweep", "x.toml", "--debug"], catch_exceptions=False)
