@@ -120,13 +120,18 @@ def sweep_run(
     such as by a full disk. 2: bad input, or a store of another sweep. 130: Ctrl-C.
     """
     _double_precision()
+    import jax
+
+    # A store knows its sweep by how JAX prints it: in a terminal as in a batch job.
+    jax.config.update("jax_pprint_use_color", False)
     from dvi_jax import StoreError, StoreMismatch
     from dvi_jax.run import InputError, sweep_file
 
     try:
         report = sweep_file(config, store, resume, threads)
     except KeyboardInterrupt as error:
-        _complain("interrupted", f"{error or 'before anything was done'}\n{AGAIN}")
+        what = str(error).removeprefix("interrupted: ") or "before anything was done"
+        _complain("interrupted", f"{what}\n{AGAIN}")
         raise typer.Exit(INTERRUPTED) from None
     except (InputError, StoreMismatch) as error:
         if debug:
@@ -136,7 +141,7 @@ def sweep_run(
     except (StoreError, OSError) as error:
         if debug:
             raise
-        _complain("failed", f"{error}\n{AGAIN}")
+        _complain("failed", f"the results cannot be written: {error}\n{AGAIN}")
         raise typer.Exit(FAILED) from None
     _print_sweep(report)
 

@@ -7,9 +7,11 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax._src import pretty_printer
 from typer.testing import CliRunner
 
 import dvi_jax as dvi
@@ -205,9 +207,11 @@ def test_the_example_and_every_key_in_it(folder):
         assert shown_elsewhere or f"{key} = " in text or f"[{key}]" in text, key
 
 
-def test_what_is_not_a_number_alone(folder):
+def test_observables_of_several_numbers_on_given_times(folder):
     text = SMALL.replace('"own.py:energy"\n', '"own.py:both"\n', 1) + "\n"
+    text = text.replace("h = 0.1\nsteps = 30", "lattice = {times = [0.0, 0.1, 0.3]}")
     report = sweep_file(write(folder, text), threads=1)
+    assert "trajectories/s; " in sweep_status("out.zarr").summary  # steps are not said
     energy = contents("out.zarr")["energy"]
     assert energy.shape == (12, 2)
     assert report.contents["observed"]["energy"]["max"] == energy.max()
@@ -256,6 +260,16 @@ def test_another_sweep_is_not_mixed_in(folder):
         assert said in result.stderr
     assert "epsilon: " not in result.stderr
     assert_same(contents("out.zarr"), before)
+
+
+def test_a_batch_job_goes_on_in_a_terminal(folder, monkeypatch):
+    """Where JAX sees a terminal it prints in colours; the sweep is the same."""
+    path = write(folder, SMALL)
+    sweep_file(path)
+    monkeypatch.setattr(pretty_printer, "CAN_USE_COLOR", True)
+    jax.config.update("jax_pprint_use_color", True)
+    result = command(path, "--resume")
+    assert result.exit_code == 0, result.stderr
 
 
 def test_a_place_that_is_no_store(folder):
@@ -308,7 +322,7 @@ def test_a_disk_that_fails(folder, monkeypatch):
         patched.setattr(store, "publish", full)
         result = command(path)
     assert result.exit_code == 1
-    assert "No space left on device" in result.stderr
+    assert "cannot be written: [Errno 28] No space left on device" in result.stderr
     assert "--resume" in result.stderr
     assert command(path, "--resume").exit_code == 0
 
@@ -327,7 +341,8 @@ def test_ctrl_c_leaves_a_store_to_go_on_with(folder):
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
     assert process.returncode == 130, said
-    assert "interrupted: " in said
+    assert said.startswith("interrupted: ")
+    assert "tasks are done and kept in out.zarr" in said
     assert "--resume" in said
     assert "Traceback" not in said
     tasks = sweep_status("out.zarr").contents["tasks"]

@@ -197,7 +197,7 @@ def sweep_status(store: str | Path) -> SweepReport:
         "trajectories": ({"not_computed": left} if left else {}) | dict(statuses),
         "seconds": seconds,
         "trajectories_per_second": rate,
-        "steps_per_second": work / seconds if seconds else 0.0,
+        "steps_per_second": None if math.isnan(work) else work / seconds if seconds else 0.0,
         "seconds_left": left / rate if rate else None,
         "bytes": _bytes(Path(store)),
         "provenance": {k: v for k, v in result.attributes.items() if k not in _NOT_OURS},
@@ -213,11 +213,12 @@ def sweep_status(store: str | Path) -> SweepReport:
 def _status_summary(contents: dict[str, Any]) -> str:
     tasks, left = contents["tasks"], contents["seconds_left"]
     grid = " × ".join(f"{name} {n}" for name, n in contents["dims"].items())
+    speed = contents["steps_per_second"]
     rest = f", {tasks['left']} left" + (f" (about {left:.3g} s)" if left else "")
     return (
         f"{contents['store']}: {grid}; {tasks['done']} of {tasks['all']} tasks done"
         f"{rest if tasks['left'] else ''}; {contents['trajectories_per_second']:.3g} "
-        f"trajectories/s, {contents['steps_per_second']:.3g} steps/s; "
+        f"trajectories/s{'' if speed is None else f', {speed:.3g} steps/s'}; "
         f"{contents['bytes'] / 1e6:.3g} MB"
     )
 
