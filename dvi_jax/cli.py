@@ -110,6 +110,9 @@ def sweep_run(
     threads: Annotated[
         int | None, typer.Option(min=1, help="Threads; one for each processor or GPU if not given.")
     ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say what it would take: tasks, bytes, seconds.")
+    ] = False,
     debug: Debug = False,
 ) -> None:
     """Do the sweep that a TOML file describes; this is what CONFIG alone means.
@@ -120,14 +123,13 @@ def sweep_run(
     such as by a full disk. 2: bad input, or a store of another sweep. 130: Ctrl-C.
     """
     _double_precision()
-    import jax
-
-    # A store knows its sweep by how JAX prints it: in a terminal as in a batch job.
-    jax.config.update("jax_pprint_use_color", False)
     from dvi_jax import StoreError, StoreMismatch
-    from dvi_jax.run import InputError, sweep_file
+    from dvi_jax.run import InputError, sweep_cost, sweep_file
 
     try:
+        if dry_run:
+            typer.echo(sweep_cost(config))
+            return
         report = sweep_file(config, store, resume, threads)
     except KeyboardInterrupt as error:
         what = str(error).removeprefix("interrupted: ") or "before anything was done"

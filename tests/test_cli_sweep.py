@@ -271,9 +271,24 @@ def test_another_sweep_is_not_mixed_in(folder, small):
 def test_a_batch_job_goes_on_in_a_terminal(small, monkeypatch):
     """Where JAX sees a terminal it prints in colours; the sweep is the same."""
     monkeypatch.setattr(pretty_printer, "CAN_USE_COLOR", True)
+    before = jax.config.jax_pprint_use_color
     jax.config.update("jax_pprint_use_color", True)
-    result = command(small, "--resume")
+    try:
+        result = command(small, "--resume")
+    finally:
+        jax.config.update("jax_pprint_use_color", before)
     assert result.exit_code == 0, result.stderr
+
+
+def test_a_dry_run_says_what_it_takes_and_writes_nothing(folder):
+    path = write(folder, SMALL)
+    result = command(path, "--dry-run")
+    assert result.exit_code == 0, result.stderr
+    assert "3 tasks of 4 trajectories" in result.stdout
+    assert "| 1e+12 | 2.5e+11 |" in result.stdout
+    assert not (folder / "out.zarr").exists()
+    result = command(write(folder, SMALL.replace("h = 0.1", "h = 0.0")), "--dry-run")
+    assert result.exit_code == 2
 
 
 def test_a_place_that_is_no_store(folder):
@@ -324,7 +339,7 @@ def test_a_disk_that_fails(folder, monkeypatch):
         patched.setattr(store, "publish", full)
         result = command(path)
     assert result.exit_code == 1
-    assert "cannot be written: [Errno 28] No space left on device" in result.stderr
+    assert "cannot be written: No space left on device" in result.stderr
     assert "--resume" in result.stderr
     assert sweep_status("out.zarr").contents["tasks"]["left"] == 3
 

@@ -229,6 +229,12 @@ def result(request, tmp_path_factory):
     )  # fmt: skip
 
 
+def test_a_store_opened_again_is_the_same(result):
+    if result.path is not None:
+        again = dvi.open_sweep(result.path)
+        xr.testing.assert_identical(again.to_xarray(), result.to_xarray())
+
+
 def test_netcdf_is_the_dataset(result, tmp_path):
     result.to_netcdf(tmp_path / "s.nc")
     with xr.open_dataset(tmp_path / "s.nc", engine="h5netcdf") as found:

@@ -3,6 +3,7 @@
 from ._errors import InputError as InputError
 from ._run import run_file as run_file
 from ._sweep import (
+    sweep_cost as sweep_cost,
     sweep_file as sweep_file,
     sweep_status as sweep_status,
     verify_store as verify_store,

@@ -14,13 +14,13 @@ import numpy as np
 import dvi_jax as dvi
 
 from ..sweep.bar import shown as shown_bar
-from ..sweep.program import RESERVED
+from ..sweep.variables import RESERVED
 from ._config import read_config
 from ._errors import InputError
 from ._report import Table, plain
 from ._setup import said
 from ._sweep_config import SWEEP_KEYS
-from ._sweep_setup import make_sweep_setup
+from ._sweep_setup import SweepSetup, make_sweep_setup
 
 _MOST = 10_000_000
 """Numbers up to which results are read again for the table at the end."""
@@ -77,12 +77,32 @@ def sweep_file(
         except Exception as error:
             if last:  # the work had begun: it is not the input
                 raise
-            raise InputError(
-                str(path),
-                f"{setup.name} cannot be swept: {said(error, *setup.files)}",
-                "axes, functions, state and args that fit one another",
-            ) from error
+            raise _unfit(path, setup, error) from error
     return _finished(result, last[0])
+
+
+def sweep_cost(path: str | Path) -> str:
+    """What the sweep of a TOML file would take, and larger ones: text with a table. One task is
+    computed and timed for it, and nothing is written.
+
+    **Raises** `InputError` for input that cannot be meant.
+    """
+    path = Path(path)
+    values, _ = read_config(path, SWEEP_KEYS)
+    setup = make_sweep_setup(values, path.parent)
+    try:
+        cost = dvi.sweep_cost(**setup.arguments)
+    except Exception as error:
+        raise _unfit(path, setup, error) from error
+    return f"{cost}\n\n{cost.table()}"
+
+
+def _unfit(path: Path, setup: SweepSetup, error: Exception) -> InputError:
+    return InputError(
+        str(path),
+        f"{setup.name} cannot be swept: {said(error, *setup.files)}",
+        "axes, functions, state and args that fit one another",
+    )
 
 
 def _default(path: Path) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from ..sweep.program import RESERVED
+from ..sweep.variables import RESERVED
 from ._config import ARRAY, KEYS, Key, Keys, array, count, number, parameter, step_size, text
 from ._errors import InputError, one_of, shown
 

@@ -171,7 +171,7 @@ def open_sweep(path: Any) -> SweepResult:
             continue
         values: Any = array[:]
         if values.dtype.kind == "T":
-            values = values.astype(str)
+            values = np.asarray(values.tolist())
         dims = getattr(array.metadata, "dimension_names", None)
         coordinates[name] = (dims, values, dict(array.attrs))
     return SweepResult(store, coordinates, store.attributes)
