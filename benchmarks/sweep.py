@@ -1,7 +1,8 @@
 """What a sweep costs beside the bare kernel, in time and in memory, and how Dask workers scale.
 
     python benchmarks/sweep.py rate [--lanes 1000000] [--steps 10000] [--rounds 3]
-    python benchmarks/sweep.py dask [--tasks 64]
+    python benchmarks/sweep.py dask [--tasks 128]
+    python benchmarks/sweep.py cost
 
 rate: trajectories of the disturbed Kepler problem with three streamed invariants, written to a
 store, on all cores; beside it the bare kernel, the same reductions of the same states without
@@ -9,8 +10,11 @@ sweep, store or starts: `dvi.over_threads(jax.jit(jax.vmap(one)))` on 2¹⁷ of 
 time scaled to their number. Both once in each round, in random order, in one process; the sweep
 compiles in a round before. The largest memory is that of the process, over all rounds.
 
-dask: the same sweep on one worker of one thread and on two, each a process of its own, started and
-warmed up before; seconds from the call to the last commit.
+cost: what `dvi.sweep_cost` says of that sweep and of larger ones.
+
+dask: the same sweep, in tasks of the size that `sweep` chooses, on one worker of one thread and on
+two, each a process of its own, started before; seconds from the call to the last commit, the
+compilation in each worker included.
 """
 
 import argparse
@@ -51,18 +55,20 @@ OBSERVE = {
 }
 
 
+def arguments(lanes: int, steps: int) -> dict:
+    return {
+        "system": KEPLER.system,
+        "start": dvi.starts.Halton(lanes, LOW, HIGH),
+        "epsilon": dvi.Axis("epsilon", [EPSILON]),
+        "args": KEPLER.args,
+        "h": H,
+        "num_steps": steps,
+        "observe": OBSERVE,
+    }
+
+
 def sweep(lanes: int, steps: int, store: str, **kw):
-    return dvi.sweep(
-        KEPLER.system,
-        start=dvi.starts.Halton(lanes, LOW, HIGH),
-        epsilon=dvi.Axis("epsilon", [EPSILON]),
-        args=KEPLER.args,
-        h=H,
-        num_steps=steps,
-        observe=OBSERVE,
-        store=store,
-        **kw,
-    )
+    return dvi.sweep(**arguments(lanes, steps), store=store, **kw)
 
 
 def bare(steps: int):
@@ -120,13 +126,16 @@ def rate(lanes: int, steps: int, rounds: int) -> None:
 def dask(tasks: int) -> None:
     from distributed import Client, LocalCluster
 
-    lanes, steps = 8192, 10_000
+    lanes, steps = 16384, 10_000
     taken = {}
     with tempfile.TemporaryDirectory() as folder:
         for workers in (1, 2, 1, 2):
             with (
                 LocalCluster(
-                    workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    host="127.0.0.1",
+                    dashboard_address=None,
                 ) as cluster,
                 Client(cluster) as client,
             ):
@@ -144,16 +153,19 @@ def dask(tasks: int) -> None:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("rate", "dask"))
+    parser.add_argument("what", choices=("rate", "dask", "cost"))
     parser.add_argument("--lanes", type=int, default=1_000_000)
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--tasks", type=int, default=64)
+    parser.add_argument("--tasks", type=int, default=128)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, NumPy {np.__version__}")
     if options.what == "rate":
         rate(options.lanes, options.steps, options.rounds)
+    elif options.what == "cost":
+        found = dvi.sweep_cost(**arguments(options.lanes, options.steps))
+        print(found, found.table(), sep="\n\n")
     else:
         dask(options.tasks)
 

@@ -23,6 +23,17 @@ def test_python_blocks_run():
     assert last == "(8,) True"
 
 
+def test_the_page_on_sweeps_runs(tmp_path):
+    page = (README.parent / "docs" / "sweeps.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    code = "import matplotlib; matplotlib.use('Agg')\n" + block + "\nprint(result.status_counts())"
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert out.returncode == 0, out.stderr
+    assert out.stdout.strip() == "{'successful': 12000}"
+
+
 def test_commands_named_exist():
     text = README.read_text(encoding="utf-8")
     makefile = (README.parent / "Makefile").read_text(encoding="utf-8")

@@ -266,7 +266,7 @@ def cut_off(path):
 @pytest.mark.slow
 def test_two_processes_on_one_store(tmp_path):
     path = tmp_path / "s.zarr"
-    running = [child(path, 30, 0.1), child(path, 30, 0.1)]
+    running = [child(path, 30, 0.5), child(path, 30, 0.5)]
     assert [p.wait(120) for p in running] == [0, 0]
     assert set(committed(path).values()) == {1}
     assert len(committed(path)) == 30

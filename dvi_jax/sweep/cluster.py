@@ -5,6 +5,7 @@ were being computed: what is in the store stays, and is never computed again.
 """
 
 import hashlib
+import os
 import pickle
 import threading
 import uuid
@@ -14,7 +15,7 @@ from typing import Any
 
 import jax
 
-from .._compat import x64_enabled
+from .._compat import backends_are_initialized, x64_enabled
 from .plan import Plan
 from .program import Program, Sweep
 from .sinks import Sink
@@ -114,8 +115,30 @@ class _Job:
     """What a worker keeps of a sweep between tasks."""
 
     def __init__(self, pickled: bytes):
+        _start_jax()
         self.sweep, self.plan, self.path, self.sha, self.x64 = pickle.loads(pickled)
         self.program = Program(self.sweep, self.plan)
+
+
+def _start_jax() -> None:
+    """Start JAX in a worker with as many threads as the worker has.
+
+    XLA's threads look for work without pause. Those of a worker that was given one core would do so
+    on the cores of its neighbours; how many there are XLA reads from NPROC, once.
+    """
+    if backends_are_initialized() or "NPROC" in os.environ:
+        return
+    from distributed import get_worker
+
+    try:
+        threads = get_worker().state.nthreads
+    except ValueError:  # not in a worker
+        return
+    os.environ["NPROC"] = str(threads)
+    try:
+        jax.local_devices()
+    finally:
+        del os.environ["NPROC"]
 
 
 _lock = threading.Lock()

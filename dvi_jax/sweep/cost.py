@@ -66,8 +66,9 @@ class SweepCost:
         workers: Sequence[int] = (1, 64, 4096),
     ) -> str:
         """Markdown: time and room for other numbers of trajectories and workers."""
-        each = [self, *(self.scaled(n) for n in lanes)]
-        head = ["trajectories", "tasks", "results", *(f"{n} workers" for n in workers)]
+        each = [self, *(self.scaled(n) for n in lanes if n != self.lanes)]
+        cores = ("1 worker" if n == 1 else f"{n} workers" for n in workers)
+        head = ["trajectories", "tasks", "results", *cores]
         rows = [
             [
                 f"{c.lanes:.3g}",
