@@ -1,5 +1,6 @@
 """Sweeps: the numbers of single runs, axes, starts, failures, what is refused."""
 
+import contextlib
 import signal
 import threading
 import time
@@ -13,8 +14,10 @@ import xarray as xr
 
 import dvi_jax as dvi
 from dvi_jax import starts
+from dvi_jax.sweep import _sweep
 from dvi_jax.sweep.cost import span
 from dvi_jax.sweep.plan import Plan, make_plan
+from dvi_jax.sweep.sinks import Memory
 from dvi_jax.sweep.starts import radical_inverse
 
 
@@ -125,6 +128,45 @@ def test_the_same_bits_whatever_the_threads():
         for name in ("drift", "mean", "status"):
             np.testing.assert_array_equal(results[0][name], other[name])
     near(results[0]["drift"][999], single(epsilon=0.3).observed["drift"])
+
+
+def test_threads_compute_in_the_precision_of_the_caller():
+    """jax.enable_x64 as a context holds in its own thread alone."""
+    with jax.enable_x64(False):
+        assert jnp.zeros(()).dtype == jnp.float32
+        q, p = (jnp.asarray(x, jnp.float32) for x in (Q, P))
+        single = sweep(epsilon=np.linspace(0, 0.1, 9, dtype=np.float32), q0=q, p0=p)
+    assert single["drift"].dtype == np.float32
+    double = sweep(epsilon=np.linspace(0, 0.1, 9))
+    assert 0 < np.abs(single["drift"] - double["drift"]).max() < 1e-5
+
+
+class Busy(Memory):
+    """A sink of which every third task is another's when it is first asked for."""
+
+    def __init__(self, plan, variables):
+        super().__init__(plan, variables)
+        self.asked: list[int] = []
+
+    @contextlib.contextmanager
+    def claimed(self, task):
+        first = task.number not in self.asked
+        self.asked.append(task.number)
+        if first and task.number == 6:  # which it finishes
+            self.arrays["status"][task.box], self._done = 0, {*self._done, 6}
+        yield not (first and task.number % 3 == 0)
+
+
+def test_what_others_leave_undone_is_done(monkeypatch):
+    monkeypatch.setattr(_sweep, "Memory", Busy)
+    seen = []
+    found = sweep(epsilon=np.linspace(0, 0.1, 100), lanes_per_task=10, progress=seen.append)
+    assert found.is_complete
+    assert seen[-1].tasks_done == 10
+    computed = np.isfinite(found["drift"])
+    assert computed[:60].all()
+    assert not computed[60:70].any()
+    assert computed[70:].all()
 
 
 def test_other_numbers_need_no_other_program():

@@ -263,6 +263,18 @@ def cut_off(path):
     return words.count("begin") - words.count("end")
 
 
+def test_two_devices_give_the_bits_of_one(tmp_path, undisturbed):
+    code = "import sweep_child, sys, jax; sweep_child.sweep(sys.argv[1]); print(jax.device_count())"
+    flags = "--xla_force_host_platform_device_count=2"
+    out = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "s.zarr")], capture_output=True, text=True,
+        check=True,
+        env={**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": str(Path(__file__).parent)},
+    )  # fmt: skip
+    assert out.stdout.strip() == "2"
+    same(dvi.open_sweep(tmp_path / "s.zarr"), undisturbed)
+
+
 @pytest.mark.slow
 def test_two_processes_on_one_store(tmp_path):
     path = tmp_path / "s.zarr"

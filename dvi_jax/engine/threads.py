@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .._compat import is_traced
+from .._compat import is_traced, x64_enabled
 
 
 def over_threads(
@@ -52,7 +52,7 @@ def over_threads(
 
     def call(*args: Any) -> Any:
         leaves, axes, tree = _with_axes(args, in_axes)
-        lanes = _lanes(leaves, axes)
+        lanes, x64 = _lanes(leaves, axes), x64_enabled()
         size = math.ceil(lanes / min(count, lanes))
         starts = range(0, lanes, size)
 
@@ -61,7 +61,8 @@ def over_threads(
                 x if a is None else _cut(x, a, start, size)
                 for x, a in zip(leaves, axes, strict=True)
             ]
-            return jax.block_until_ready(function(*jax.tree.unflatten(tree, mine)))
+            with jax.enable_x64(x64):  # a context of the caller's, which threads do not inherit
+                return jax.block_until_ready(function(*jax.tree.unflatten(tree, mine)))
 
         like = (tree, size, tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves))
         # What has not been compiled yet is compiled by one of the threads.

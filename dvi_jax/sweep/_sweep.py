@@ -21,7 +21,7 @@ from ..observe import Stop
 from .axes import Axis, as_axis, is_axis, leaves_with_axes, lengths
 from .bar import shown
 from .cost import SweepCost, cost
-from .identity import description, provenance
+from .identity import description, digest, provenance
 from .plan import make_plan
 from .program import Program, Sweep, shapes
 from .result import SweepResult
@@ -137,7 +137,11 @@ def sweep(
     if store is None:
         _check_memory(program.plan.lanes * sum(v.bytes for v in found.values()))
         sink: Any = Memory(program.plan, found)
-        result = SweepResult(sink, coordinates, {**about, "config": json.dumps(config)})
+        result = SweepResult(
+            sink,
+            coordinates,
+            {**about, "config": json.dumps(config), "config_sha256": digest(config)},
+        )
     else:
         sink = Store.open_or_make(store, config, found, coordinates, about)
         result = SweepResult(sink, coordinates, sink.attributes)

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._compat import x64_enabled
 from .._results import STATUS_NAMES
 from ..engine.threads import processors
 from .plan import Task
@@ -107,6 +108,45 @@ def compute(
     return results, facts
 
 
+class Queue:
+    """The tasks to do, and those that another process works on and may leave undone."""
+
+    def __init__(self, todo: list[int], sink: Sink, done_elsewhere: Callable[[int], None]):
+        self.sink, self.done_elsewhere = sink, done_elsewhere
+        self.stop = threading.Event()
+        self._mine, self._theirs = deque(todo), deque()
+        self._lock = threading.Lock()
+
+    def put_off(self, number: int) -> None:
+        """Another process has claimed it."""
+        with self._lock:
+            self._theirs.append(number)
+
+    def __iter__(self) -> Iterator[int]:
+        """Numbers of tasks until all are done or it is stopped; several threads may ask."""
+        while not self.stop.is_set():
+            with self._lock:
+                if self._mine:
+                    number = self._mine.popleft()
+                elif not self._theirs:
+                    return
+                else:
+                    number = None
+            if number is not None:
+                yield number
+            elif not self.stop.wait(_PATIENCE):
+                self._look_again()
+
+    def _look_again(self) -> None:
+        with self._lock:
+            for _ in range(len(self._theirs)):
+                number = self._theirs.popleft()
+                if self.sink.is_done(number):
+                    self.done_elsewhere(number)
+                else:
+                    self._mine.append(number)
+
+
 def run_here(
     program: Program,
     sink: Sink,
@@ -120,8 +160,8 @@ def run_here(
     """
     todo = sink.todo()
     counter = Counter(program, todo, report)
-    queue, theirs, stop = deque(todo), deque(), threading.Event()
-    devices = jax.local_devices()
+    queue = Queue(todo, sink, lambda number: counter.add(program.plan.task(number), {}))
+    devices, x64 = jax.local_devices(), x64_enabled()
     count = threads or (processors() if devices[0].platform == "cpu" else len(devices))
     room = threading.Semaphore(_BEHIND * count)
     writer = ThreadPoolExecutor(2, "write")
@@ -133,63 +173,43 @@ def run_here(
                 sink.commit(task, results, facts)
             counter.add(task, facts["statuses"])
         except BaseException:
-            stop.set()
+            queue.stop.set()
             raise
         finally:
             room.release()
 
     def work(device: Any) -> None:
         try:
-            for number in _next(queue, theirs, stop):
-                task = program.plan.task(number)
-                with contextlib.ExitStack() as claim:
-                    if not claim.enter_context(sink.claimed(task)):
-                        theirs.append(number)
-                        continue
-                    results, facts = compute(program, task, device)
-                    room.acquire()
-                    passed_on = claim.pop_all()
-                written.append(writer.submit(keep, task, results, facts, passed_on))
+            with jax.enable_x64(x64):  # a context of the caller's, which threads do not inherit
+                for number in queue:
+                    task = program.plan.task(number)
+                    with contextlib.ExitStack() as claim:
+                        if not claim.enter_context(sink.claimed(task)):
+                            queue.put_off(number)
+                            continue
+                        results, facts = compute(program, task, device)
+                        room.acquire()
+                        passed_on = claim.pop_all()
+                    written.append(writer.submit(keep, task, results, facts, passed_on))
         except BaseException:
-            stop.set()
+            queue.stop.set()
             raise
 
     interrupted = False
-    with ThreadPoolExecutor(count, "sweep") as pool:
+    with writer, ThreadPoolExecutor(count, "sweep") as pool:
         running = [pool.submit(work, devices[i % len(devices)]) for i in range(count)]
-        while True:
-            try:
-                if not wait(running, timeout=_PATIENCE).not_done:
-                    break
-            except KeyboardInterrupt:
-                if interrupted:
-                    raise
-                interrupted = True
-                stop.set()
-            if not stop.is_set() and theirs and not queue:
-                _look_again(queue, theirs, sink, counter, program)
-    writer.shutdown()
+        try:
+            while True:
+                try:
+                    if not wait(running, timeout=_PATIENCE).not_done:
+                        break
+                except KeyboardInterrupt:
+                    if interrupted:
+                        raise
+                    interrupted = True
+                    queue.stop.set()
+        finally:
+            queue.stop.set()  # whatever is raised here must not wait for all of the sweep
     for future in (*running, *written):
         future.result()
     return not interrupted
-
-
-def _next(queue: deque, theirs: deque, stop: threading.Event) -> Iterator[int]:
-    """Numbers of tasks, until there are none, nor any that another process may leave undone."""
-    while not stop.is_set():
-        try:
-            yield queue.popleft()
-        except IndexError:
-            if not theirs:
-                return
-            time.sleep(_PATIENCE)
-
-
-def _look_again(queue: deque, theirs: deque, sink: Sink, counter: Counter, program: Program):
-    """Take up again what other processes had claimed, if it is not done."""
-    for _ in range(len(theirs)):
-        number = theirs.popleft()
-        if sink.is_done(number):
-            counter.add(program.plan.task(number), {})
-        else:
-            queue.append(number)
