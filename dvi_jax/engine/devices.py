@@ -40,6 +40,8 @@ def over_devices(
     chosen = np.asarray(jax.devices() if devices is None else list(devices))
     if chosen.size == 0:
         raise ValueError("over_devices needs at least one device.")
+    if isinstance(out_axes, bool) or not isinstance(out_axes, int) or out_axes < 0:
+        raise ValueError(f"out_axes must be a whole number from 0 up, got {out_axes!r}.")
     mesh = jax.sharding.Mesh(chosen, (LANES,), axis_types=(AxisType.Auto,))
 
     def call(*args: Any) -> Any:
@@ -49,6 +51,8 @@ def over_devices(
                 f"in_axes has {len(each)} entries for {len(args)} arguments: give one for each, or "
                 "one number for all."
             )
+        if wrong := [a for a in each if not (a is None or isinstance(a, int))]:
+            raise TypeError(f"an axis of lanes is a whole number or None, got {wrong[0]!r}.")
         specs = tuple(
             jax.tree.map(lambda x, axis=axis: _spec(x, axis, chosen.size), argument)
             for argument, axis in zip(args, each, strict=True)

@@ -120,6 +120,15 @@ def lanewise(
     return jax.tree.unflatten(ordinary.out_tree, call(*outer, *leaves))
 
 
+def functions_in(eqn: Any) -> list[ClosedJaxpr]:
+    """The jaxprs of what `lanewise` was given, if an equation of a jaxpr is its call: they are not
+    among those that the equation shows."""
+    program = eqn.params.get("program")
+    if not isinstance(program, _Program):
+        return []
+    return [program.ordinary.closed, program.special.closed]
+
+
 def _all_alike(outputs: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
     """The outputs, batched under `vmap` as those of the primitive are: all of them, in front.
 

@@ -155,7 +155,7 @@ def _observed(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
     nothing to say, or too much to read."""
     data = result.to_xarray()
     names = [str(n) for n in data.data_vars if str(n).split(".")[0] not in RESERVED]
-    if sum(data[name].size for name in names) > _MOST:
+    if not names or sum(data[name].size for name in names) > _MOST:
         return {}
     good = result["status"] == 0
     found = {}

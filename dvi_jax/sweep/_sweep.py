@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from .._arithmetic import Arithmetic, FloatingPoint
+from .._compat import x64_enabled
 from .._solution import Save
 from .._system import System
 from ..engine.newton import RootSolver
@@ -23,12 +24,12 @@ from .bar import shown
 from .cost import SweepCost, cost
 from .identity import description, digest, provenance
 from .plan import make_plan
-from .program import Program, Sweep, shapes
+from .program import Program, Sweep, traced
 from .result import SweepResult
 from .sinks import Memory
 from .starts import Starts
 from .store import Store
-from .variables import RESERVED, own_dims, variables
+from .variables import RESERVED, check_names, own_dims, variables
 from .workers import SweepProgress, run_here
 
 _SHARE = 0.5
@@ -90,7 +91,8 @@ def sweep(
     **Arguments** otherwise as for `integrate`, and
 
     - `observe`: pytree of observables and reductions. `save`: which states are kept; None: none.
-    - `units`: of observables (and of t, q, p), name → text, for labels.
+    - `units`: of observables (and of t, q, p), name → text, for labels; those of a store are given
+      when it is made.
     - `store`: a directory. Each task is written there when it is done; the same call again goes on
       where a former one ended, however it ended. Several processes may work on one store. Without
       one the results stay in memory.
@@ -115,15 +117,16 @@ def sweep(
         method=method, lattice=lattice, save=save, observe=observe, newton=newton,
         arithmetic=arithmetic, layout=layout, stop=stop,
     )  # fmt: skip
-    program, found = prepare(made, lanes_per_task)
+    program, found, programs = prepare(made, lanes_per_task)
     coordinates = coordinates_of(made)
+    check_names(made.dims, found, coordinates)
     about: dict[str, Any] = provenance()
     if beside := [name for name in coordinates if name not in made.dims]:
         about["coordinates"] = " ".join(beside)  # what a reader by CF looks for
     if units is not None:
         _check_units(units, found)
         about["units"] = json.dumps(dict(units))
-    config = description(made, program.plan, found)
+    config = description(made, program.plan, found, programs)
     if client is not None and not hasattr(client, "submit"):
         raise TypeError(f"client must be a distributed.Client, got {client!r}.")
     if threads is not None and client is not None:
@@ -175,7 +178,7 @@ def sweep_cost(
     for name in _OF_RUNNING:
         settings.pop(name, None)
     made = make_sweep(system, q0, p0, **_DEFAULTS | settings)
-    program, found = prepare(made, lanes_per_task)
+    program, found, _ = prepare(made, lanes_per_task)
     return cost(made, program.plan, found)
 
 
@@ -212,7 +215,7 @@ def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_st
             f"system must be a dvi.System, got {type(system).__name__}. Wrap the discrete "
             "Hamiltonian: dvi.System(H_D, force=W)."
         )
-    inputs = {name: as_axis(name, rest.pop(name)) for name in ("epsilon", "h", "t0")}
+    inputs = {name: as_axis(name, _number(rest.pop(name))) for name in ("epsilon", "h", "t0")}
     inputs["args"] = rest.pop("args")
     if start is None:
         if q0 is None or p0 is None:
@@ -254,10 +257,27 @@ def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_st
         )
     if start is not None and start.name in dict.fromkeys(name for name, *_ in axes[:-1]):
         raise ValueError(f"the name {start.name!r} of the start is that of an axis too.")
-    if isinstance(rest["lattice"], Given) and num_steps is not None:
-        raise ValueError("the times of dvi.Given are the steps: leave num_steps out.")
+    if start is not None:
+        Axis(start.name, [0])  # refuses what is no name
+    if isinstance(rest["lattice"], Given):
+        if num_steps is not None:
+            raise ValueError("the times of dvi.Given are the steps: leave num_steps out.")
+        if any(is_axis(inputs[name]) for name in ("h", "t0")):
+            raise ValueError("the times of dvi.Given replace h and t0: there is no axis of them.")
+    elif any(n < 1 for n in (num_steps.values if is_axis(num_steps) else [num_steps or 0])):
+        raise ValueError(f"num_steps must be at least 1, got {num_steps!r}.")
+    if not x64_enabled() and max(dims.values()) >= 2**31:
+        raise ValueError(
+            "more than 2³¹ values along one axis are counted with 64 bits: put\n"
+            '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
+        )
     compiled = len({name for name, *_ in in_front})
     return Sweep(system, inputs, start, method, num_steps, rest, dims, compiled)
+
+
+def _number(value: Any) -> Any:
+    """A whole number of Python's as the number that it is."""
+    return float(value) if type(value) is int else value
 
 
 def _static(name: str, value: Any, kind: Any) -> Any:
@@ -271,14 +291,15 @@ def _static(name: str, value: Any, kind: Any) -> Any:
     return value
 
 
-def prepare(made: Sweep, lanes_per_task: int | None) -> tuple[Program, dict[str, Any]]:
-    """The program of a sweep, cut into tasks, and the variables of its result."""
-    found = variables(made, shapes(made))
+def prepare(made: Sweep, lanes_per_task: int | None) -> tuple[Program, dict[str, Any], list[Any]]:
+    """The program of a sweep, cut into tasks, the variables of its result, and the jaxprs."""
+    shapes, programs = traced(made)
+    found = variables(made, shapes)
     plan = make_plan(
         made.dims, made.compiled, made.most_steps, sum(v.bytes for v in found.values()),
         lanes_per_task,
     )  # fmt: skip
-    return Program(made, plan), found
+    return Program(made, plan), found, programs
 
 
 def coordinates_of(made: Sweep) -> dict[str, Any]:

@@ -1,11 +1,12 @@
 """What a sweep varies: named axes, and how they lie in its arguments."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .._precision import refuse_double_without_x64
@@ -49,7 +50,11 @@ class Axis:
                     f"the axis {name!r} needs a sequence of values, got {values!r}."
                 ) from None
             if values and not any(_is_object(v) for v in values):
-                values = np.asarray(values)
+                array = np.asarray(values)
+                # Numbers of Python's have the precision of the process, as in JAX.
+                if array.dtype.kind == "f" and all(type(x) in (int, float) for x in _flat(values)):
+                    array = array.astype(jnp.result_type(float))
+                values = array
         if isinstance(values, np.ndarray):
             values = _checked(name, values)
         if len(values) == 0:
@@ -63,6 +68,14 @@ class Axis:
 
     def __repr__(self) -> str:
         return f"Axis({self.name!r}, {len(self)} values)"
+
+
+def _flat(values: list[Any]) -> Iterator[Any]:
+    for x in values:
+        if isinstance(x, list | tuple):
+            yield from _flat(list(x))
+        else:
+            yield x
 
 
 def _is_object(value: Any) -> bool:

@@ -4,6 +4,7 @@ A worker that dies, a task that runs twice, a scheduler that is lost cost at mos
 were being computed: what is in the store stays, and is never computed again.
 """
 
+import contextlib
 import hashlib
 import os
 import pickle
@@ -24,6 +25,9 @@ from .workers import Counter, SweepProgress, compute
 
 _AHEAD = 4
 """Tasks for each thread of the cluster that are handed out at a time."""
+
+_LARGE = 2**20
+"""Bytes of a sweep, pickled, above which they are not sent with each task."""
 
 _LIVES = 10
 """Times that a task may be lost with its worker before it is held to be the cause."""
@@ -56,8 +60,13 @@ def run_on(
     job = cloudpickle.dumps((sweep, plan, *where, x64_enabled()))
     lost: dict[int, int] = {}
     numbers: dict[Any, int] = {}
+    waiting: dict[Any, Any] = {}
     attempts, run = 0, uuid.uuid4().hex[:12]
     done = as_completed()
+
+    payload = job
+    if len(job) > _LARGE:  # an axis of many values: once to each worker, not with each task
+        payload = client.scatter(job, broadcast=True, hash=False)
 
     def hand_out() -> None:
         nonlocal attempts
@@ -66,9 +75,10 @@ def run_on(
             number = todo.popleft()
             attempts += 1
             future = client.submit(
-                _task, job, number, pure=False, key=f"dvi-task-{run}-{number}-{attempts}"
+                _task, payload, number, pure=False, key=f"dvi-task-{run}-{number}-{attempts}"
             )
             numbers[future.key] = number
+            waiting[future.key] = future
             done.add(future)
 
     try:
@@ -76,6 +86,7 @@ def run_on(
         while numbers:
             future = next(done)
             number = numbers.pop(future.key)
+            del waiting[future.key]
             if future.status == "finished":
                 results, statuses = future.result()
                 task = plan.task(number)
@@ -87,11 +98,23 @@ def run_on(
                 todo.append(number)
             hand_out()
     except KeyboardInterrupt:
-        client.cancel([*done.futures])
         return False
+    except _OfTaskError as error:
+        raise error.error from None
     except (OSError, TimeoutError) as error:
         raise ClusterError(f"the cluster is lost ({error!r}). {ClusterError.__doc__}") from error
+    finally:
+        with contextlib.suppress(OSError, TimeoutError):
+            client.cancel([*waiting.values()])
     return True
+
+
+class _OfTaskError(Exception):
+    """What a task raised, told apart from what the cluster raises."""
+
+    def __init__(self, error: BaseException):
+        super().__init__(str(error))
+        self.error = error
 
 
 def _look_at(future: Any, number: int, lost: dict[int, int]) -> None:
@@ -109,6 +132,8 @@ def _look_at(future: Any, number: int, lost: dict[int, int]) -> None:
             ) from error
     except CancelledError as error:
         raise OSError(f"task {number} was cancelled") from error
+    except Exception as error:
+        raise _OfTaskError(error) from error
 
 
 class _Job:

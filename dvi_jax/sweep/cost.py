@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.threads import processors
 from .plan import Plan
 from .program import Program, Sweep
 from .variables import Variable
+from .workers import default_threads
 
 SECONDS_TO_COMMIT = 0.02
 """To write a task, at least: files are forced to the disk one after the other. The directory of a
@@ -116,7 +116,7 @@ def cost(sweep: Sweep, plan: Plan, variables: Mapping[str, Variable]) -> SweepCo
         seconds_per_step=sum(again) / (lanes * steps),
         seconds_per_task=sum(again) / len(again),
         compilation=max(0.0, sum(firsts) - sum(again)),
-        cores=processors(),
+        cores=default_threads(),
     )
 
 

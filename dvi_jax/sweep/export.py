@@ -107,7 +107,13 @@ def _columns(part: Any, grid: list[str]) -> dict[str, np.ndarray]:
         names = [name] if not own else [
             "_".join((name, *map(str, k))) for k in np.ndindex(*(part.sizes[d] for d in own))
         ]  # fmt: skip
-        columns.update(zip(names, values.T, strict=True))
+        for column, entries in zip(names, values.T, strict=True):
+            parts = {column: entries}
+            if np.iscomplexobj(entries):
+                parts = {f"{column}_re": np.real(entries), f"{column}_im": np.imag(entries)}
+            if taken := [c for c in parts if c in columns]:
+                raise ValueError(f"two results give the column {taken[0]!r}: rename one of them.")
+            columns.update(parts)
 
     for name in (*part.coords, *part.data_vars):
         add(name, part[name].variable)

@@ -10,7 +10,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -19,8 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._compat import ClosedJaxpr, bodies
+from .._compat import ClosedJaxpr, bodies, is_traced
 from ..engine.signature import accepts
+from ..engine.tiles import functions_in
 from .axes import is_axis, leaves_with_axes
 from .plan import Plan
 from .program import Sweep, stacked
@@ -28,6 +29,8 @@ from .variables import Variable
 
 FORMAT = 1
 """Of the store: raised when a store of an older one cannot be read any more."""
+
+PROGRAM = "program"
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
@@ -41,11 +44,18 @@ _SIGNATURES = {
 """Arguments of the functions that users write, by how many they are."""
 
 
-def description(sweep: Sweep, plan: Plan, variables: Mapping[str, Variable]) -> dict[str, Any]:
-    """Everything that the numbers depend on, as JSON: one entry for each argument.
+def description(
+    sweep: Sweep,
+    plan: Plan,
+    variables: Mapping[str, Variable],
+    programs: Sequence[ClosedJaxpr],
+) -> dict[str, Any]:
+    """Everything that the numbers depend on, as JSON: one entry for each argument, so that it can
+    be said which differs, and `program`, which sees all that any function does.
 
     Functions stand there as the hash of what they compute (their jaxpr, with its constants), so
-    that renaming a variable changes nothing and changing a number in them does.
+    that renaming a variable changes nothing and changing a number in them does. What a callback to
+    Python computes is not seen.
     """
     q0, args, t0 = _example(sweep)
     known = Describer(jnp.asarray(t0, q0.dtype), q0, args)
@@ -59,6 +69,7 @@ def description(sweep: Sweep, plan: Plan, variables: Mapping[str, Variable]) -> 
         "num_steps": known(sweep.num_steps),
         **{name: known(value) for name, value in sweep.options.items()},
         "precision": str(q0.dtype),
+        PROGRAM: [_hash(program) for program in programs],
         "dims": dict(plan.dims),
         "axes": axes,
         "chunk": list(plan.chunk),
@@ -92,10 +103,13 @@ def digest(description: Mapping[str, Any]) -> str:
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """The entries in which two descriptions differ, with both values."""
     a, b = _flat(old), _flat(new)
+    keys = [key for key in sorted({*a, *b}) if a.get(key) != b.get(key)]
+    if keys == [PROGRAM]:
+        return [f"{PROGRAM}: a function, or a part of the packages, computes something else"]
     return [
         f"{key}: {_short(a.get(key))} there, {_short(b.get(key))} now"
-        for key in sorted({*a, *b})
-        if a.get(key) != b.get(key)
+        for key in keys
+        if key != PROGRAM
     ]
 
 
@@ -122,8 +136,10 @@ class Describer:
     args: Any
 
     def __call__(self, x: Any) -> Any:
-        if x is None or isinstance(x, bool | int | float | str):
-            return x if not isinstance(x, float) else repr(x)
+        if isinstance(x, float):
+            return repr(float(x))
+        if x is None or isinstance(x, bool | int | str):
+            return x
         if is_axis(x):
             values = x.values if isinstance(x.values, np.ndarray) else list(x.values)
             return {"axis": x.name, "values": self(values)}
@@ -135,7 +151,8 @@ class Describer:
             return [self(v) for v in x]
         if dataclasses.is_dataclass(x) and not isinstance(x, type):
             fields = {f.name: self(getattr(x, f.name, None)) for f in dataclasses.fields(x)}
-            return {"is": type(x).__qualname__, **fields}
+            code = {"function": self.function(x)} if callable(x) else {}
+            return {"is": type(x).__qualname__, **fields, **code}
         if isinstance(x, type):
             return x.__qualname__
         if callable(x):
@@ -144,7 +161,9 @@ class Describer:
 
     def function(self, f: Callable[..., Any]) -> str:
         """The hash of what a function computes, or of its code where it cannot be traced alone."""
-        for count, arguments in _SIGNATURES.items():
+        first = [n for n in _SIGNATURES if n == _required(f)]
+        for count in (*first, *(n for n in _SIGNATURES if n not in first)):
+            arguments = _SIGNATURES[count]
             if not accepts(f, count):
                 continue
             try:
@@ -153,11 +172,28 @@ class Describer:
                 traced = jax.make_jaxpr(lambda d, s=static: f(*eqx.combine(d, s)))(dynamic)
             except Exception:  # not of this kind: what is wrong with it `integrate` will say
                 continue
-            hashed = hashlib.sha256(_text(traced.jaxpr).encode())
-            for constant in _constants(traced):
-                hashed.update(json.dumps(_of_array(np.asarray(constant))).encode())
-            return f"computes {hashed.hexdigest()[:16]}"
+            return f"computes {_hash(traced)}"
         return f"code {hashlib.sha256(_code(f)).hexdigest()[:16]}"
+
+
+def _required(f: Callable[..., Any]) -> int:
+    """How many arguments have no default; others are a way to give a function its constants."""
+    try:
+        parameters = inspect.signature(f).parameters.values()
+    except (TypeError, ValueError):
+        return -1
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in positional and p.default is p.empty for p in parameters)
+
+
+def _hash(closed: ClosedJaxpr) -> str:
+    hashed = hashlib.sha256()
+    for part in _parts(closed):
+        hashed.update(_text(part.jaxpr).encode())
+        for constant in part.consts:
+            if not is_traced(constant):
+                hashed.update(json.dumps(_of_array(np.asarray(constant))).encode())
+    return hashed.hexdigest()[:16]
 
 
 def _text(jaxpr: Any) -> str:
@@ -165,12 +201,12 @@ def _text(jaxpr: Any) -> str:
     return _ADDRESS.sub("", jaxpr.pretty_print(use_color=False))
 
 
-def _constants(closed: ClosedJaxpr) -> Iterator[Any]:
-    """The arrays that a jaxpr holds, also those inside of loops and calls."""
-    yield from closed.consts
+def _parts(closed: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
+    """A jaxpr, and those inside of its loops and calls, with the constants that they hold."""
+    yield closed
     for eqn in closed.jaxpr.eqns:
-        for body in bodies(eqn):
-            yield from _constants(body)
+        for body in (*bodies(eqn), *functions_in(eqn)):
+            yield from _parts(body)
 
 
 def _of_array(x: np.ndarray) -> Any:

@@ -131,6 +131,8 @@ def make_plan(
     for n in reversed(list(dims.values())[compiled:]):
         boxes = -(-n // min(n, max(room, 1)))
         size = -(-n // boxes)  # boxes as equal as can be
+        if boxes > 1 and size > 64:
+            size = min(-(-size // 64) * 64, n, room)  # of whole vectors
         chunk.append(size)
         room = room // size if boxes == 1 else 1
     return Plan(dict(dims), (*(1 for _ in range(compiled)), *reversed(chunk)))

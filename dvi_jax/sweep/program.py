@@ -1,6 +1,7 @@
 """The compiled function that computes one task."""
 
 import dataclasses
+import functools
 import threading
 from collections.abc import Mapping
 from typing import Any
@@ -10,11 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._compat import x64_enabled
+from .._compat import ClosedJaxpr, x64_enabled
 from .._integrate import integrate
 from .._results import status_code
 from .._solution import Save, Solution
 from ..engine.cpu import OPTIONS, takes_options
+from ..lattices import Given
 from .axes import is_axis, place
 from .plan import Plan, Task
 from .starts import Starts
@@ -94,7 +96,9 @@ class Lanes(eqx.Module):
             q0, p0 = (stacked(inputs.pop(name)) for name in ("q0", "p0"))
         else:
             number = index[self.names.index(self.start.name)]
-            q0, p0 = self.start.at(number, inputs["t0"], inputs["args"])
+            lattice = self.options["lattice"]
+            t0 = lattice.ts[0] if isinstance(lattice, Given) else inputs["t0"]
+            q0, p0 = self.start.at(number, t0, inputs["args"])
         save = self.options["save"]
         options = {**self.options, "save": save or Save(final=True)}
         solution = integrate(
@@ -217,17 +221,21 @@ class Program:
         return function(*inputs)
 
 
-def shapes(sweep: Sweep) -> dict[str, Any]:
-    """Shape and dtype of the variables of one trajectory, traced, not computed.
+def traced(sweep: Sweep) -> tuple[dict[str, Any], list[ClosedJaxpr]]:
+    """Shape and dtype of the variables of one trajectory, traced, not computed; and the programs
+    of one, for each method and number of steps.
 
     **Raises** `ValueError` where they differ between methods or numbers of steps.
     """
     found: dict[str, Any] = {}
+    programs = []
     zeros = tuple(np.zeros((), np.int32) for _ in sweep.of_grid)
     for which in np.ndindex(*list(sweep.dims.values())[: sweep.compiled]):
         start = (*(int(k) for k in which), *(0 for _ in sweep.of_grid))
         lanes = lanes_of(sweep, start, lambda axis: jnp.asarray(axis.values[:1]))
-        out = jax.eval_shape(lambda a, b, lanes=lanes: lanes.one(a, b), zeros, zeros)
+        one = functools.partial(_one, lanes)
+        program, out = jax.make_jaxpr(one, return_shape=True)(zeros, zeros)
+        programs.append(program)
         if found and {k: (v.shape, v.dtype) for k, v in out.items()} != {
             k: (v.shape, v.dtype) for k, v in found.items()
         }:
@@ -237,4 +245,8 @@ def shapes(sweep: Sweep) -> dict[str, Any]:
                 "times, Save(ts=...)."
             )
         found = out
-    return found
+    return found, programs
+
+
+def _one(lanes: Lanes, inside: Any, index: Any) -> dict[str, Any]:
+    return lanes.one(inside, index)

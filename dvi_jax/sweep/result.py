@@ -53,9 +53,12 @@ class SweepResult:
         return self.tasks_done == self.num_tasks
 
     def __getitem__(self, name: str) -> np.ndarray:
+        names = (*self._source.variables, *self._coordinates)
+        if name not in names:
+            raise KeyError(f"{name!r}: there are {', '.join(names)}.")
+        if name in self._coordinates:
+            return self._coordinates[name][1]
         if isinstance(self._source, Memory):
-            if name not in self._source.arrays:
-                raise KeyError(f"{name!r}: there are {', '.join(self._source.arrays)}.")
             return self._source.arrays[name]
         return self.to_xarray()[name].values
 

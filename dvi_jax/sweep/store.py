@@ -7,6 +7,7 @@ others to be done again.
 """
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -85,7 +86,7 @@ class Store(Sink):
 
         **Raises** `StoreError` where there is none, or none that this version can read.
         """
-        path = Path(path)
+        path = Path(path).resolve()
         try:
             attributes = json.loads((path / "zarr.json").read_text())["attributes"]
             found = attributes["dvi_jax_sweep"]
@@ -96,6 +97,11 @@ class Store(Sink):
                 f"{path}: zarr.json cannot be read as that of a sweep ({error!r}). If this was a "
                 "sweep, its results are in the arrays beside it; restore the file from a backup."
             ) from None
+        if not (path / TASKS).is_dir():
+            raise StoreError(
+                f"{path}: the directory {TASKS}, with the records of tasks, is missing: was the "
+                "store copied without the names that begin with a point?"
+            )
         if found != FORMAT:
             raise StoreError(
                 f"{path}: the store has format {found}, this version reads {FORMAT}: use the "
@@ -119,7 +125,7 @@ class Store(Sink):
         **Raises** `StoreMismatch` if it holds another sweep; `StoreError` for a directory that
         holds something else, or cannot be written.
         """
-        path = Path(path)
+        path = Path(path).resolve()
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             if not (path / "zarr.json").exists():
                 raise StoreError(
@@ -163,7 +169,7 @@ class Store(Sink):
 
     def done(self) -> list[int]:
         """The numbers of the tasks that are done."""
-        named = sorted(int(f.stem) for f in (self.path / TASKS).glob("??????/?????????.json"))
+        named = sorted(int(f.stem) for f in (self.path / TASKS).glob("*/*.json"))
         return [i for i in named if self.record(i) is not None]
 
     def todo(self):
@@ -234,7 +240,7 @@ class Store(Sink):
 
         group = zarr.open_group(self.path, mode="r")
         bad: dict[int, str] = {}
-        files = sorted((self.path / TASKS).glob("??????/?????????.json"))
+        files = sorted((self.path / TASKS).glob("*/*.json"))
         for n, file in enumerate(files):
             number = int(file.stem)
             wrong = self._what_is_wrong(number, group)
@@ -325,6 +331,30 @@ _handles: dict[Path, int] = {}
 _mine: set[tuple[Path, int]] = set()
 
 
+def _lock_byte(file: Path, number: int) -> bool:
+    """Whether this process could lock a byte. True, with a warning, where the file system has no
+    locks: tasks may then be done twice, in the same bits."""
+    if fcntl is None:
+        return True
+    # Never closed: a process that closes a file lets go of all its locks on it.
+    if file not in _handles:
+        try:
+            _handles[file] = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise StoreError(f"{file}: cannot be opened ({error.strerror or error}).") from error
+    try:
+        fcntl.lockf(_handles[file], fcntl.LOCK_EX | fcntl.LOCK_NB, 1, number)
+    except OSError as error:
+        if error.errno in (errno.EACCES, errno.EAGAIN):  # it is another's
+            return False
+        warnings.warn(
+            f"{file.parent}: tasks cannot be claimed here ({error.strerror or error}): several "
+            "processes on this store may do the same tasks.",
+            stacklevel=2,
+        )
+    return True
+
+
 @contextlib.contextmanager
 def _claim(file: Path, number: int) -> Iterator[bool]:
     """Whether nobody else holds this number. Processes keep one byte of a file locked, which the
@@ -333,17 +363,8 @@ def _claim(file: Path, number: int) -> Iterator[bool]:
     with _lock:
         if key in _mine:
             mine = False
-        elif fcntl is None:
-            mine = True
         else:
-            # Never closed: a process that closes a file lets go of all its locks on it.
-            if key[0] not in _handles:
-                _handles[key[0]] = os.open(key[0], os.O_RDWR | os.O_CREAT, 0o666)
-            try:
-                fcntl.lockf(_handles[key[0]], fcntl.LOCK_EX | fcntl.LOCK_NB, 1, number)
-                mine = True
-            except OSError:
-                mine = False
+            mine = _lock_byte(key[0], number)
         if mine:
             _mine.add(key)
     try:
@@ -352,8 +373,9 @@ def _claim(file: Path, number: int) -> Iterator[bool]:
         if mine:
             with _lock:
                 _mine.discard(key)
-                if fcntl is not None:
-                    fcntl.lockf(_handles[key[0]], fcntl.LOCK_UN, 1, number)
+                if fcntl is not None and key[0] in _handles:
+                    with contextlib.suppress(OSError):
+                        fcntl.lockf(_handles[key[0]], fcntl.LOCK_UN, 1, number)
 
 
 # --- making -------------------------------------------------------------------------------------
@@ -369,6 +391,8 @@ def _layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
     for i, n in enumerate(shard):
         divisors = (d for d in range(1, n + 1) if n % d == 0)
         parts = next(d for d in divisors if d == n or size / d <= _CHUNK_BYTES)
+        if size / parts < _CHUNK_BYTES / 16 and i + 1 < len(shard):
+            continue  # a prime, say: crumbs would take long to write
         inner[i] = n // parts
         size //= parts
         if size <= _CHUNK_BYTES:

@@ -1,5 +1,6 @@
 """The arrays of a result: names, types, shapes."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,8 @@ import numpy as np
 from ..observe import Reduction
 from .axes import place
 from .program import Sweep
+
+_NAME = re.compile(r"[\w +-]+(\.[\w +-]+)*")
 
 RESERVED = ("status", "failed_step", "residual", "t", "q", "p", "save", "q0", "p0")
 """Names in a result that are not the user's to give."""
@@ -31,7 +34,10 @@ class Variable:
     @property
     def fill(self) -> Any:
         """What stands where nothing has been computed."""
-        return np.nan if np.dtype(self.dtype).kind in "fc" else -1
+        dtype = np.dtype(self.dtype)
+        if dtype.kind == "u":
+            return int(np.iinfo(dtype).max)
+        return np.nan if dtype.kind in "fc" else -1
 
 
 def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
@@ -40,12 +46,19 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     **Raises** `ValueError` for an observable with a name that is taken, `TypeError` for one that
     is not real or complex.
     """
-    given = {
+    given = [
         place(path) or "observed"
         for path, _ in jax.tree.leaves_with_path(
             sweep.options["observe"], is_leaf=lambda x: isinstance(x, Reduction)
         )
-    }
+    ]
+    if twice := [n for n in given if given.count(n) > 1]:
+        raise ValueError(f"two observables have the name {twice[0]!r}: give one of them another.")
+    if bad := [n for n in given if not _NAME.fullmatch(n)]:
+        raise ValueError(
+            f"the observable {bad[0]!r}: names are letters, digits, spaces and _ - + with points "
+            "between them, for they become names in files."
+        )
     taken = [n for n in given if n.split(".")[0] in RESERVED or n in sweep.dims]
     if taken:
         raise ValueError(
@@ -70,6 +83,23 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
             raise TypeError(f"the observable {name!r} has dtype {dtype}: it must be a number.")
         found[name] = Variable("int8" if dtype.kind == "b" else dtype.name, x.shape, tuple(dims))
     return found
+
+
+def check_names(
+    dims: Mapping[str, int], variables: Mapping[str, Variable], coordinates: Mapping[str, Any]
+) -> None:
+    """Refuse names that would mean two things in one result."""
+    own = {d for v in variables.values() for d in v.dims}
+    own |= {d for of, *_ in coordinates.values() for d in of if d not in dims}
+    if taken := [name for name in dims if name in own]:
+        raise ValueError(
+            f"the axis {taken[0]!r} has the name of a dimension of the results: give it another."
+        )
+    if taken := [name for name in variables if name in coordinates or name in own]:
+        raise ValueError(
+            f"the observable {taken[0]!r} has the name of what varies in the sweep: give it "
+            "another."
+        )
 
 
 def _alone(sweep: Sweep) -> dict[str, str]:

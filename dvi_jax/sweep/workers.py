@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from math import nan
 from typing import Any
@@ -108,6 +108,12 @@ def compute(
     return results, facts
 
 
+def default_threads() -> int:
+    """One for each processor, or each GPU."""
+    devices = jax.local_devices()
+    return processors() if devices[0].platform == "cpu" else len(devices)
+
+
 class Queue:
     """The tasks to do, and those that another process works on and may leave undone."""
 
@@ -138,13 +144,13 @@ class Queue:
                 self._look_again()
 
     def _look_again(self) -> None:
+        done = []
         with self._lock:
             for _ in range(len(self._theirs)):
                 number = self._theirs.popleft()
-                if self.sink.is_done(number):
-                    self.done_elsewhere(number)
-                else:
-                    self._mine.append(number)
+                (done if self.sink.is_done(number) else self._mine).append(number)
+        for number in done:
+            self.done_elsewhere(number)
 
 
 def run_here(
@@ -162,19 +168,19 @@ def run_here(
     counter = Counter(program, todo, report)
     queue = Queue(todo, sink, lambda number: counter.add(program.plan.task(number), {}))
     devices, x64 = jax.local_devices(), x64_enabled()
-    count = threads or (processors() if devices[0].platform == "cpu" else len(devices))
+    count = threads or default_threads()
     room = threading.Semaphore(_BEHIND * count)
     writer = ThreadPoolExecutor(2, "write")
-    written: list[Future] = []
+    errors: list[BaseException] = []
 
     def keep(task: Task, results: Any, facts: Any, claim: contextlib.ExitStack) -> None:
         try:
             with claim:
                 sink.commit(task, results, facts)
             counter.add(task, facts["statuses"])
-        except BaseException:
+        except BaseException as error:
             queue.stop.set()
-            raise
+            errors.append(error)
         finally:
             room.release()
 
@@ -190,10 +196,10 @@ def run_here(
                         results, facts = compute(program, task, device)
                         room.acquire()
                         passed_on = claim.pop_all()
-                    written.append(writer.submit(keep, task, results, facts, passed_on))
-        except BaseException:
+                    writer.submit(keep, task, results, facts, passed_on)
+        except BaseException as error:
             queue.stop.set()
-            raise
+            errors.append(error)
 
     interrupted = False
     with writer, ThreadPoolExecutor(count, "sweep") as pool:
@@ -210,6 +216,6 @@ def run_here(
                     queue.stop.set()
         finally:
             queue.stop.set()  # whatever is raised here must not wait for all of the sweep
-    for future in (*running, *written):
-        future.result()
+    if errors:
+        raise errors[0]
     return not interrupted

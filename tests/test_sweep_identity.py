@@ -1,0 +1,260 @@
+"""What a store knows of its sweep: every difference that changes numbers, and no other."""
+
+import errno
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+from dvi_jax.sweep import store as stores
+from dvi_jax.sweep._sweep import _DEFAULTS, make_sweep, prepare
+from dvi_jax.sweep.identity import description, differences, digest
+
+Q = np.asarray([0.5])
+
+
+def oscillator(k=1.0):
+    return dvi.System(lambda t0, t1, q0, p1, a: jnp.sum(p1**2) / 2 + k * jnp.sum(q0**2) / 2)
+
+
+def identity(system=None, q0=Q, p0=Q, **kw):
+    kw = {"h": 0.1, "num_steps": 5, "t0": [0.0, 1.0], "save": dvi.Save(final=True)} | kw
+    made = make_sweep(system or oscillator(), q0, p0, **_DEFAULTS | kw)
+    program, found, programs = prepare(made, None)
+    return description(made, program.plan, found, programs)
+
+
+class Spring(eqx.Module):
+    """Functions as an object, of which the code differs."""
+
+    k: float
+    power: int = eqx.field(static=True, default=2)
+
+    def __call__(self, t0, t1, q0, p1, args):
+        return jnp.sum(p1**2) / 2 + self.k * jnp.sum(q0**self.power) / 2
+
+
+def spring_in_closure(c):
+    class Inside(eqx.Module):
+        k: float
+
+        def __call__(self, t0, t1, q0, p1, args):
+            return jnp.sum(p1**2) / 2 + c * self.k * jnp.sum(q0**2) / 2
+
+    return dvi.System(Inside(1.0))
+
+
+class Constant(dvi.starts.Starts):
+    """Starts of a user's own."""
+
+    value: float
+    count: int = 4
+    name: str = "start"
+
+    def at(self, index, t0, args):
+        return jnp.ones(1) * SCALE["of starts"] + index, jnp.ones(1)
+
+
+SCALE = {"of starts": 1.0}
+
+
+@jax.tree_util.register_pytree_node_class
+class Parameters:
+    """args that are no dictionary."""
+
+    def __init__(self, k):
+        self.k = k
+
+    def tree_flatten(self):
+        return (self.k,), None
+
+    @classmethod
+    def tree_unflatten(cls, _, leaves):
+        return cls(*leaves)
+
+
+def with_own_derivative(c):
+    @jax.custom_jvp
+    def potential(q):
+        return jnp.sum(q**2)
+
+    potential.defjvp(lambda x, t: (potential(x[0]), c * jnp.sum(2 * x[0] * t[0])))
+    return dvi.System(lambda t0, t1, q0, p1, a: jnp.sum(p1**2) / 2 + potential(q0))
+
+
+def last(c):
+    class Last(dvi.Last):
+        def finish(self, memory):
+            return c * memory[0]
+
+    return Last(lambda t0, t1, q0, p0, q1, p1, args: q1[0])
+
+
+def position(t0, t1, q0, p0, q1, p1, args):
+    return q1[0]
+
+
+def stop_at(k):
+    return dvi.Stop(lambda t, q, p, a, k=k: jnp.sum(q) - k)
+
+
+OF_ARGS = dvi.System(lambda t0, t1, q0, p1, a: (p1 @ p1 + a.k * q0 @ q0) / 2)
+TABLE = [np.arange(20.0), np.arange(20.0)]
+TABLE[1][17] += 1e-9
+
+DIFFERENT = {
+    "a constant in a closure": [{"system": oscillator(k)} for k in (1.0, 1.0 + 1e-15)],
+    "a field of a module": [{"system": dvi.System(Spring(k))} for k in (1.0, 2.0)],
+    "a static field of a module": [{"system": dvi.System(Spring(1.0, n))} for n in (2, 4)],
+    "the code of a module": [{"system": spring_in_closure(c)} for c in (1.0, 5.0)],
+    "a bound method": [{"system": dvi.System(Spring(k).__call__)} for k in (1.0, 2.0)],
+    "a rule of differentiation": [{"system": with_own_derivative(c)} for c in (1.0, 2.0)],
+    "args of a class": [{"system": OF_ARGS, "args": Parameters(k)} for k in (1.0, 5.0)],
+    "a reduction of one's own": [{"observe": last(c)} for c in (1.0, 2.0)],
+    "a default of a stop": [{"args": 1.0, "stop": stop_at(k)} for k in (1.2, 1.35)],
+    "a lattice's function": [
+        {"lattice": dvi.TimeTransformed(lambda t, q, p, a, c=c: c + q @ q)} for c in (1.0, 2.0)
+    ],
+    "one number of an axis": [{"epsilon": dvi.Axis("e", x), "t0": 0.0} for x in TABLE],
+    "the start": [{"q0": Q}, {"q0": Q * 2}],
+    "the tolerance": [{"newton": dvi.Newton(rtol=r)} for r in (1e-12, 1e-13)],
+    "the method": [{"method": dvi.Yoshida(4)}, {"method": dvi.Suzuki(4)}],
+    "a box of starts": [
+        {"q0": None, "p0": None, "start": dvi.starts.Random(4, ([0.0], [0.0]), ([b], [1.0]))}
+        for b in (1.0, 1.5)
+    ],
+}
+
+
+@pytest.mark.filterwarnings("ignore:epsilon = ")
+@pytest.mark.parametrize("what", DIFFERENT)
+def test_a_difference_is_seen(what):
+    a, b = (identity(**kw) for kw in DIFFERENT[what])
+    assert digest(a) != digest(b)
+    assert differences(a, b)
+    again = identity(**DIFFERENT[what][0])
+    assert digest(again) == digest(a)
+
+
+def test_the_code_of_starts_is_seen(monkeypatch):
+    kw = {"q0": None, "p0": None, "start": Constant(1.0)}
+    before = identity(**kw)
+    monkeypatch.setitem(SCALE, "of starts", 2.0)
+    assert differences(before, identity(**kw)) == [
+        "program: a function, or a part of the packages, computes something else"
+    ]
+
+
+SAME = {
+    "another function that does the same": [{"system": oscillator()}, {"system": oscillator()}],
+    "numbers of NumPy's": [{"h": 0.1, "epsilon": 0}, {"h": np.float64(0.1), "epsilon": 0.0}],
+    "a tuple": [{"observe": {"x": position}}, {"observe": {"x": lambda *a: a[4][0]}}],
+}
+
+
+@pytest.mark.parametrize("what", SAME)
+def test_what_is_the_same_is_the_same(what):
+    a, b = (identity(**kw) for kw in SAME[what])
+    assert differences(a, b) == []
+
+
+# --- names, and what cannot be meant -------------------------------------------------------------
+
+
+def observed(**observe):
+    return {"observe": observe}
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (observed(**{"a.b": position, "a": {"b": position}}), "two observables have the name"),
+        (observed(**{"a/b": position}), "names are letters"),
+        (observed(**{"../x": position}), "names are letters"),
+        ({"t0": dvi.Axis("component", [0.0, 1.0])}, "name of a dimension of the results"),
+        (
+            {"t0": 0.0, "h": dvi.Axis("step", [0.1, 0.05]), "num_steps": dvi.Axis("step", [4, 8]),
+             **observed(h=dvi.Last(position))},
+            "has the name of what varies",
+        ),
+        ({"num_steps": 0}, "at least 1"),
+        ({"lattice": dvi.Given([0.0, 0.1]), "h": None, "num_steps": None}, "replace h and t0"),
+        ({"q0": None, "p0": None, "start": Constant(1.0, name="a/b")}, "identifier"),
+    ],
+)  # fmt: skip
+def test_refused(settings, said):
+    kw = {"h": 0.1, "num_steps": 5, "t0": [0.0, 1.0], "save": dvi.Save(final=True)} | settings
+    with pytest.raises(ValueError, match=said):
+        dvi.sweep(oscillator(), kw.pop("q0", Q), kw.pop("p0", Q), **kw)
+
+
+def test_whole_numbers_without_a_sign(tmp_path):
+    observe = {"count": lambda *a: jnp.uint8(3), "x": dvi.Last(position)}
+    found = dvi.sweep(oscillator(), Q, Q, h=0.1, num_steps=2, t0=[0.0, 1.0], observe=observe,
+                      store=tmp_path / "s.zarr")  # fmt: skip
+    assert found["count"].dtype == np.uint8
+    assert (found["count"] == 3).all()
+    np.testing.assert_array_equal(found["t0"], [0.0, 1.0])
+    with pytest.raises(KeyError, match="there are"):
+        found["cuont"]
+
+
+def test_starts_know_the_time_of_a_given_lattice():
+    def H(t, q, p, args):
+        return p @ p / 2 + 0.1 * t
+
+    start = dvi.starts.EnergyShell(3, H, 1.0, [-1.0], [1.0])
+    found = dvi.sweep(oscillator(), start=start, lattice=dvi.Given(np.linspace(5.0, 6.0, 3)),
+                      save=dvi.Save(final=True))  # fmt: skip
+    np.testing.assert_allclose(found["p"][:, 0, 0] ** 2 / 2 + 0.5, 1.0, rtol=1e-14)
+
+
+def test_float32_takes_lists_of_numbers():
+    with jax.enable_x64(False):
+        q = jnp.asarray([0.5], jnp.float32)
+        found = dvi.sweep(oscillator(), q, q, h=[0.1, 0.05], num_steps=4, save=dvi.Save(final=True))
+        assert found["q"].dtype == np.float32
+        with pytest.raises(TypeError, match="float64"):
+            dvi.sweep(oscillator(), q, q, h=np.asarray([0.1, 0.05]), num_steps=4,
+                      save=dvi.Save(final=True))  # fmt: skip
+
+
+# --- file systems ---------------------------------------------------------------------------------
+
+
+def small(path):
+    return dvi.sweep(oscillator(), Q, Q, h=0.1, num_steps=3, t0=[0.0, 1.0, 2.0], lanes_per_task=1,
+                     save=dvi.Save(final=True), store=path)  # fmt: skip
+
+
+def test_a_file_system_without_locks(tmp_path, monkeypatch):
+    def lockf(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(stores.fcntl, "lockf", lockf)
+    with pytest.warns(UserWarning, match="tasks cannot be claimed here"):
+        assert small(tmp_path / "s.zarr").is_complete
+
+
+def test_places(tmp_path, monkeypatch):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "there")
+    found = small(tmp_path / "link")
+    monkeypatch.chdir(tmp_path)
+    relative = dvi.open_sweep("there")
+    monkeypatch.chdir("/")
+    np.testing.assert_array_equal(relative["q"], found["q"])
+    (tmp_path / "there" / ".tasks").rename(tmp_path / "elsewhere")
+    with pytest.raises(dvi.StoreError, match="names that begin with a point"):
+        dvi.open_sweep(tmp_path / "there")
+
+
+def test_sizes_without_divisors_are_not_crumbled():
+    variable = stores.Variable("float64", (30,), ("x",))
+    inner = stores._layout((32749,), variable)["chunks"]
+    assert np.prod(inner) * 8 > stores._CHUNK_BYTES / 16
+    inner = stores._layout((2**15, 4), variable)["chunks"]
+    assert np.prod(inner) * 8 <= stores._CHUNK_BYTES
