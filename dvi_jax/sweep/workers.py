@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import threading
 import time
 from collections import deque
@@ -201,21 +202,46 @@ def run_here(
             queue.stop.set()
             errors.append(error)
 
-    interrupted = False
-    with writer, ThreadPoolExecutor(count, "sweep") as pool:
+    interrupted = threading.Event()
+    with (
+        _instead_of_interrupt(interrupted, queue.stop),
+        writer,
+        ThreadPoolExecutor(count, "sweep") as pool,
+    ):
         running = [pool.submit(work, devices[i % len(devices)]) for i in range(count)]
         try:
             while True:
                 try:
                     if not wait(running, timeout=_PATIENCE).not_done:
                         break
-                except KeyboardInterrupt:
-                    if interrupted:
+                except KeyboardInterrupt:  # another handler than Python's raised it
+                    if interrupted.is_set():
                         raise
-                    interrupted = True
+                    interrupted.set()
                     queue.stop.set()
         finally:
             queue.stop.set()  # whatever is raised here must not wait for all of the sweep
     if errors:
         raise errors[0]
-    return not interrupted
+    return not interrupted.is_set()
+
+
+@contextlib.contextmanager
+def _instead_of_interrupt(*events: threading.Event) -> Iterator[None]:
+    """Have the first Ctrl-C set these events. The exception that Python raises instead can meet any
+    line, and is lost in some, such as a callback of the garbage collector."""
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def handle(number: int, frame: Any) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for event in events:
+            event.set()
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
