@@ -257,10 +257,19 @@ def committed(path):
     return Counter(n for n, what in lines if what == "end")
 
 
+def words(path):
+    log = Path(f"{path}.log")
+    return [line.split()[1] for line in log.read_text().splitlines()] if log.exists() else []
+
+
+def begun(path):
+    """Commits that have begun."""
+    return words(path).count("begin")
+
+
 def cut_off(path):
     """Commits that had begun and never ended."""
-    words = [line.split()[1] for line in Path(f"{path}.log").read_text().splitlines()]
-    return words.count("begin") - words.count("end")
+    return words(path).count("begin") - words(path).count("end")
 
 
 def test_two_devices_give_the_bits_of_one(tmp_path, undisturbed):
@@ -292,16 +301,19 @@ def test_killed_forty_times(tmp_path):
     """SIGKILL at random moments, two processes at a time: all done, once, with the same bits."""
     path, tasks = tmp_path / "s.zarr", 160
     rng = random.Random(5)
-    running, kills = [child(path, tasks, 0.15) for _ in range(2)], 0
-    began = time.monotonic()
-    while kills < 40 and time.monotonic() - began < 400:
-        time.sleep(rng.uniform(0.0, 2.0))
+    running, kills, seen = [child(path, tasks, 0.6) for _ in range(2)], 0, 0
+    until = time.monotonic() + 450
+    while kills < 40 and time.monotonic() < until:
+        while begun(path) == seen and time.monotonic() < until:  # somebody is at work
+            time.sleep(0.05)
+        seen = begun(path)
+        time.sleep(rng.uniform(0.0, 0.6))
         i = rng.randrange(2)
         if running[i].poll() is None:
             running[i].send_signal(signal.SIGKILL)
             running[i].wait()
             kills += 1
-        running[i] = child(path, tasks, 0.15)
+        running[i] = child(path, tasks, 0.6)
     for process in running:
         assert process.wait(200) == 0
     found = dvi.open_sweep(path)

@@ -34,6 +34,8 @@ PROGRAM = "program"
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+
 _SIGNATURES = {
     5: lambda t, x, args: (t, t, x, x, args),
     7: lambda t, x, args: (t, t, x, x, x, x, args),
@@ -198,7 +200,7 @@ def _hash(closed: ClosedJaxpr) -> str:
 
 def _text(jaxpr: Any) -> str:
     """A jaxpr in words that are the same everywhere: no colours, no addresses."""
-    return _ADDRESS.sub("", jaxpr.pretty_print(use_color=False))
+    return _COLOUR.sub("", _ADDRESS.sub("", str(jaxpr)))
 
 
 def _parts(closed: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
