@@ -345,6 +345,7 @@ def test_a_disk_that_fails(folder, monkeypatch):
     assert sweep_status("out.zarr").contents["tasks"]["left"] == 3
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_store_to_go_on_with(folder):
     text = SMALL.replace("0.2, 12]", "0.2, 24]").replace("steps = 30", "steps = 400_000")
     path = write(folder, text.replace("lanes_per_task = 4", "lanes_per_task = 1"))

@@ -47,6 +47,7 @@ def run(command, **env):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_two_devices_give_what_one_does():
     code = TWO_DEVICES.format(folder=str(EXAMPLE.parent))
     flags = "--xla_force_host_platform_device_count=2"

@@ -117,6 +117,7 @@ def test_a_number_within_a_function_is_seen(copy, monkeypatch):
         sweep(copy)
 
 
+@pytest.mark.slow
 def test_the_identity_is_the_same_in_every_process(tmp_path, finished):
     code = (
         "import sweep_child, sys; print(sweep_child.sweep(sys.argv[1]).attributes['config_sha256'])"
@@ -135,7 +136,10 @@ def flip(path: Path, where: int):
     path.write_bytes(content)
 
 
-@pytest.mark.parametrize("name", ["drift", "status", "q"])
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("status", "q")]
+
+
+@pytest.mark.parametrize("name", ["drift", *SLOW])
 def test_every_flipped_bit_is_found_and_repaired(copy, undisturbed, name):
     file = shard(copy, name)
     whole = file.read_bytes()
@@ -272,6 +276,7 @@ def cut_off(path):
     return words(path).count("begin") - words(path).count("end")
 
 
+@pytest.mark.slow
 def test_two_devices_give_the_bits_of_one(tmp_path, undisturbed):
     code = "import sweep_child, sys, jax; sweep_child.sweep(sys.argv[1]); print(jax.device_count())"
     flags = "--xla_force_host_platform_device_count=2"
