@@ -82,8 +82,8 @@ def _key(seed: int, index: Array) -> Array:
     return jax.random.fold_in(key, index >> 31)
 
 
-class Random(Starts):
-    """Starts drawn uniformly from a box, independently.
+class InBox(Starts):
+    """Base of starts in a box: points of the unit cube, stretched.
 
     - `count`: how many. `low`, `high`: corners of the box, pairs (q, p).
     - `seed`: start i of a seed is always the same, whatever the count.
@@ -98,14 +98,54 @@ class Random(Starts):
     name: str = eqx.field(static=True)
 
     def __init__(self, count: int, low: Any, high: Any, seed: int = 0, name: str = "start"):
-        a, b, self.shape = _box(low, high, "Random")
+        of = type(self).__name__
+        a, b, self.shape = _box(low, high, of)
         self.low, self.high = tuple(a.tolist()), tuple(b.tolist())
-        self.count, self.seed, self.name = _count(count, "Random"), _seed(seed, "Random"), name
+        self.count, self.seed, self.name = _count(count, of), _seed(seed, of), name
+
+    @abc.abstractmethod
+    def in_unit_cube(self, index: Array, like: Array) -> Array:
+        """Point number `index`, an array like this one of numbers from 0 to 1."""
 
     def at(self, index, t0, args):
         low, high = jnp.asarray(self.low), jnp.asarray(self.high)
-        u = jax.random.uniform(_key(self.seed, index), low.shape, low.dtype)
-        return _state(low + (high - low) * u, self.shape)
+        return _state(low + (high - low) * self.in_unit_cube(index, low), self.shape)
+
+
+class Random(InBox):
+    """Starts drawn uniformly from a box, independently.
+
+    - `count`: how many. `low`, `high`: corners of the box, pairs (q, p).
+    - `seed`: start i of a seed is always the same, whatever the count.
+    - `name`: of the dimension in the result.
+    """
+
+    def in_unit_cube(self, index, like):
+        return jax.random.uniform(_key(self.seed, index), like.shape, like.dtype)
+
+
+class Halton(InBox):
+    """Starts that fill a box evenly: Halton's sequence in the first primes, shifted at random.
+
+    The error of a mean over them falls nearly as 1/count in few dimensions, where that of `Random`
+    falls as 1/√count. The shift (modulo one) depends on `seed`, and makes the mean unbiased.
+
+    - `count`: how many. `low`, `high`: corners of the box, pairs (q, p). A component whose ends are
+      the same takes no prime.
+    - `seed`, `name`: as for `Random`.
+
+    **Source** Halton 1960, Numer. Math. 2, 84; the shift: Cranley & Patterson 1976, SIAM J. Numer.
+    Anal. 13, 904.
+    """
+
+    def in_unit_cube(self, index, like):
+        moves = [i for i, (a, b) in enumerate(zip(self.low, self.high, strict=True)) if a != b]
+        shift = np.random.default_rng(self.seed).random(len(moves))
+        u = jnp.zeros_like(like)
+        for i, base, s in zip(moves, _primes(len(moves)), shift, strict=True):
+            x = radical_inverse(index + 1, base, self.count + 1, like.dtype) + s
+            u = u.at[i].set(jnp.where(x >= 1, x - 1, x))
+        return u
 
 
 class Normal(Starts):
@@ -141,43 +181,6 @@ class Normal(Starts):
         middle, sigma = jnp.asarray(self.middle), jnp.asarray(self.sigma)
         z = jax.random.normal(_key(self.seed, index), middle.shape, middle.dtype)
         return _state(middle + sigma * z, self.shape)
-
-
-class Halton(Starts):
-    """Starts that fill a box evenly: Halton's sequence in the first primes, shifted at random.
-
-    The error of a mean over them falls nearly as 1/count in few dimensions, where that of `Random`
-    falls as 1/√count. The shift (modulo one) depends on `seed`, and makes the mean unbiased.
-
-    - `count`: how many. `low`, `high`: corners of the box, pairs (q, p). A component whose ends are
-      the same takes no prime.
-    - `seed`, `name`: as for `Random`.
-
-    **Source** Halton 1960, Numer. Math. 2, 84; the shift: Cranley & Patterson 1976, SIAM J. Numer.
-    Anal. 13, 904.
-    """
-
-    count: int = eqx.field(static=True)
-    low: tuple[float, ...] = eqx.field(static=True)
-    high: tuple[float, ...] = eqx.field(static=True)
-    shape: tuple[int, ...] = eqx.field(static=True)
-    seed: int = eqx.field(static=True)
-    name: str = eqx.field(static=True)
-
-    def __init__(self, count: int, low: Any, high: Any, seed: int = 0, name: str = "start"):
-        a, b, self.shape = _box(low, high, "Halton")
-        self.low, self.high = tuple(a.tolist()), tuple(b.tolist())
-        self.count, self.seed, self.name = _count(count, "Halton"), _seed(seed, "Halton"), name
-
-    def at(self, index, t0, args):
-        low, high = jnp.asarray(self.low), jnp.asarray(self.high)
-        moves = [i for i, (a, b) in enumerate(zip(self.low, self.high, strict=True)) if a != b]
-        shift = np.random.default_rng(self.seed).random(len(moves))
-        u = jnp.zeros_like(low)
-        for i, base, s in zip(moves, _primes(len(moves)), shift, strict=True):
-            x = radical_inverse(index + 1, base, self.count + 1, low.dtype) + s
-            u = u.at[i].set(jnp.where(x >= 1, x - 1, x))
-        return _state(low + (high - low) * u, self.shape)
 
 
 def radical_inverse(index: Array, base: int, largest: int, dtype: Any) -> Array:
