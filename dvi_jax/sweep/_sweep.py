@@ -127,6 +127,8 @@ def sweep(
         _check_units(units, found)
         about["units"] = json.dumps(dict(units))
     config = description(made, program.plan, found, programs)
+    if not (store is None or isinstance(store, str | os.PathLike)):
+        raise TypeError(f"store must be the path of a directory or None, got {store!r}.")
     if client is not None and not hasattr(client, "submit"):
         raise TypeError(f"client must be a distributed.Client, got {client!r}.")
     if threads is not None and client is not None:
@@ -264,7 +266,9 @@ def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_st
             raise ValueError("the times of dvi.Given are the steps: leave num_steps out.")
         if any(is_axis(inputs[name]) for name in ("h", "t0")):
             raise ValueError("the times of dvi.Given replace h and t0: there is no axis of them.")
-    elif any(n < 1 for n in (num_steps.values if is_axis(num_steps) else [num_steps or 0])):
+    elif num_steps is None:
+        raise ValueError("num_steps is missing: how many steps each trajectory takes.")
+    elif any(n < 1 for n in (num_steps.values if is_axis(num_steps) else [num_steps])):
         raise ValueError(f"num_steps must be at least 1, got {num_steps!r}.")
     if not x64_enabled() and max(dims.values()) >= 2**31:
         raise ValueError(

@@ -107,9 +107,15 @@ def is_axis(x: Any) -> bool:
 
 def as_axis(name: str, value: Any) -> Any:
     """A number argument: a one-dimensional array of it is an axis of the argument's name."""
-    if isinstance(value, list | tuple | np.ndarray | jax.Array) and np.ndim(value) == 1:
-        return Axis(name, value)
-    return value
+    if not isinstance(value, list | tuple | np.ndarray | jax.Array) or np.ndim(value) == 0:
+        return value
+    if np.ndim(value) > 1:
+        raise ValueError(
+            f"{name} must be a number or a one-dimensional array of them, got shape "
+            f"{np.shape(value)}: for a grid give the axes one by one, for pairs that go together "
+            'dvi.Axis("name", values) of one name.'
+        )
+    return Axis(name, value)
 
 
 def leaves_with_axes(arguments: Mapping[str, Any]) -> list[Leaf]:
