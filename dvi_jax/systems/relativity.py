@@ -1,0 +1,193 @@
+"""The Sun's relativity and oblateness: what the solar system has beyond Newton's points of mass.
+
+Body 0 is the Sun in all of these, and r_i = q_i − q_0. Each adds to the Newtonian `n_body`:
+
+    dvi.System(hamiltonian, force=post_newtonian_force)
+    dvi.System(hamiltonian, perturbation=post_newtonian_hamiltonian)
+    dvi.System(hamiltonian_with_oblateness, force=post_newtonian_force)
+
+with ``epsilon=1`` in `integrate`, whose default, 0, switches relativity off.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .n_body import hamiltonian
+from .solar_system import AU_IN_KM
+
+SPEED_OF_LIGHT = 299792.458 * 86400 / AU_IN_KM
+"""c [au/day], in the astronomical unit of DE421."""
+
+SUN_RADIUS = 696000 / AU_IN_KM
+"""Equatorial radius of the Sun [au], to which `SUN_J2` refers: 696000 km, as in the ephemerides."""
+
+SUN_J2 = 2e-7
+"""Quadrupole moment of the Sun, the value of DE421; helioseismology gives 2.2e-7."""
+
+SUN_POLE = np.array([
+    np.cos(np.deg2rad(63.87)) * np.cos(np.deg2rad(286.13)),
+    np.cos(np.deg2rad(63.87)) * np.sin(np.deg2rad(286.13)),
+    np.sin(np.deg2rad(63.87)),
+])  # fmt: skip
+"""North pole of the Sun's rotation on the axes of the ICRF: RA 286.13°, dec 63.87° (IAU WGCCRE;
+Archinal et al. 2018). A unit vector."""
+
+
+def post_newtonian_force(t0, t1, q0, p1, args):
+    r"""Force of the Sun's general relativity on every other body, W of a `System`.
+
+        W_i = m_i GM / (c² r³) [(4 GM/r − v²) r + 4 (r·v) v],    W_0 = 0
+        r = q0_i − q0_0,    v = p1_i/m_i − p1_0/m_0,    GM = G m_0
+
+    - `q0`: positions [length], shape (bodies, dim); `p1`: momenta [mass length / time], which
+      are m times velocity.
+    - `args`: as for `n_body.hamiltonian`, and ``"c"`` [length/time], else `SPEED_OF_LIGHT`.
+
+    Returns shape (bodies, dim) [mass length / time²]. With ``epsilon=1`` it is relativity, with
+    another it is that at c/√ε. Differentiable in all it is given.
+
+    Neglected: the recoil of the Sun, of order m_i/M of the rest (so total momentum is not kept),
+    the other bodies' own relativity, of the same order, and O(1/c⁴).
+
+    **Raises** `ValueError` when the shapes of q0 and masses do not agree.
+
+    **Source** the Schwarzschild term in harmonic coordinates, those of the ephemerides: IERS
+    Conventions 2010, (10.12) with β = γ = 1; Anderson et al. 1975, *Astrophys. J.* 200, 221.
+    """
+    masses, mu = _masses(q0, args)
+    r, v = _from_sun(q0), _from_sun(p1 / masses[:, None])
+    distance, rv = _length(r), jnp.sum(r * v, axis=-1, keepdims=True)
+    v2 = jnp.sum(v**2, axis=-1, keepdims=True)
+    a = mu / (_c2(args) * distance**3) * ((4 * mu / distance - v2) * r + 4 * rv * v)
+    return jnp.concatenate([jnp.zeros_like(q0[:1]), masses[1:, None] * a])
+
+
+def post_newtonian_hamiltonian(t0, t1, q0, p1, args):
+    r"""The Sun's general relativity as a Hamiltonian, H1_D of a `System`.
+
+        H1 = −Σ_{i>0} (m_i/c²) [v⁴/8 + 3 GM v²/(2r) − GM²/(2r²)]
+        r = |q0_i − q0_0|,    v = p1_i/m_i − p1_0/m_0,    GM = G m_0
+
+    Arguments and `args` as for `post_newtonian_force`, of which it is the conservative version;
+    a scalar [mass length² / time²]. It depends on differences alone, so total momentum is kept,
+    the Sun recoils, and the map is symplectic. It is not separable: every step is implicit.
+
+    The canonical momentum is not m times velocity but p/m = V (1 + V²/(2c²) + 3GM/(c² r)) + …:
+    start from `momenta_from_velocities`, read with `velocities_from_momenta`. With p = m V the
+    orbit is another, by 9e-8 of the velocity for Mercury.
+
+    The acceleration is that of `post_newtonian_force` up to O(1/c⁴) and m_i/M of it.
+
+    **Raises** `ValueError` when the shapes of q0 and masses do not agree.
+
+    **Source** the Lagrangian of a test particle about a mass in harmonic coordinates,
+    L = V²/2 + GM/r + [V⁴/8 + 3 GM V²/(2r) − GM²/(2r²)]/c² (Landau & Lifshitz, *The Classical Theory
+    of Fields*, §106): to first order H1 is minus what 1/c² adds to L.
+    """
+    masses, mu = _masses(q0, args)
+    r, v = _length(_from_sun(q0)), _from_sun(p1 / masses[:, None])
+    v2 = jnp.sum(v**2, axis=-1, keepdims=True)
+    added = v2**2 / 8 + 1.5 * mu * v2 / r - mu**2 / (2 * r**2)
+    return -jnp.sum(masses[1:, None] * added) / _c2(args)
+
+
+def momenta_from_velocities(q: Any, v: Any, args: Any):
+    r"""Canonical momenta of `hamiltonian` + `post_newtonian_hamiltonian` [mass length / time].
+
+        p_i = m_i (v_i + w_i),    p_0 = m_0 v_0 − Σ m_i w_i
+        w_i = (u²/(2c²) + 3 GM/(c² r)) u,    u = v_i − v_0,    r = |q_i − q_0|
+
+    - `q`: positions [length], `v`: velocities [length/time] in the frame of q, shape
+      (bodies, dim). `args` as for `post_newtonian_force`; with another epsilon than 1, c/√ε.
+
+    Total momentum is Σ m v. Right up to O(1/c⁴), as the Hamiltonian is.
+    """
+    q, v = jnp.asarray(q), jnp.asarray(v)
+    masses, _ = _masses(q, args)
+    return masses[:, None] * v + _added_momenta(q, v, args)
+
+
+def velocities_from_momenta(q: Any, p: Any, args: Any):
+    r"""Velocities ∂H/∂p of `hamiltonian` + `post_newtonian_hamiltonian` [length/time].
+
+    The inverse of `momenta_from_velocities` up to O(1/c⁴), and exact for this Hamiltonian:
+    v_i = p_i/m_i − w_i, v_0 = p_0/m_0 + Σ m_i w_i / m_0 with u = p_i/m_i − p_0/m_0 in w_i.
+    """
+    q, p = jnp.asarray(q), jnp.asarray(p)
+    masses, _ = _masses(q, args)
+    rest = p / masses[:, None]
+    return rest - _added_momenta(q, rest, args) / masses[:, None]
+
+
+def oblateness(q, args):
+    r"""Potential energy of the bodies in the quadrupole of the Sun [mass length² / time²].
+
+        U = Σ_{i>0} G M m_i J2 R² / (2 r³) (3 (r·n)²/r² − 1),    r = q_i − q_0
+
+    An oblate Sun (J2 > 0) attracts more in the plane of its equator, where U < 0. Perihelia in
+    that plane advance, nodes upon it go back.
+
+    - `q`: positions [length], shape (bodies, dim).
+    - `args`: as for `n_body.hamiltonian`, and ``"J2"``; if need be the equatorial radius ``"R"``
+      [length], else `SUN_RADIUS`, and the direction of the pole ``"pole"``, shape (dim,), of any
+      length, else `SUN_POLE`, which is on ICRF axes.
+
+    Differentiable in J2 and the rest. Total momentum is kept; the Sun's axis stands still, so that
+    of angular momentum only the part along the pole is kept.
+
+    **Raises** `ValueError` when the shapes of q and masses, or of q and the pole, do not agree.
+
+    **Source** potential −(GM/r) [1 − J2 (R/r)² P₂(sin φ)], sin φ = r·n/r: Murray & Dermott 1999,
+    *Solar System Dynamics*, 6.11.
+    """
+    masses, mu = _masses(q, args)
+    pole = jnp.asarray(args.get("pole", SUN_POLE), q.dtype)
+    if pole.shape != q.shape[1:]:
+        raise ValueError(
+            "the Sun's oblateness needs a pole with as many components as a position; got q "
+            f"{q.shape} and pole {pole.shape}."
+        )
+    r = _from_sun(q)
+    r2 = jnp.sum(r**2, axis=-1)
+    along = jnp.sum(r * pole[None, :], axis=-1) ** 2 / (r2 * jnp.sum(pole**2))
+    size = mu * args["J2"] * args.get("R", SUN_RADIUS) ** 2
+    return size / 2 * jnp.sum(masses[1:] * (3 * along - 1) / r2**1.5)
+
+
+def hamiltonian_with_oblateness(t0, t1, q0, p1, args):
+    """`n_body.hamiltonian` + `oblateness` of q0, separable; args and errors as for these."""
+    return hamiltonian(t0, t1, q0, p1, args) + oblateness(q0, args)
+
+
+def _masses(q, args):
+    """Masses as an array, and GM of the Sun; the check is that of `n_body.hamiltonian`."""
+    masses = jnp.asarray(args["masses"], q.dtype)
+    if q.ndim != 2 or masses.shape != q.shape[:1]:
+        raise ValueError(
+            "the N-body system needs q0 of shape (bodies, dim) and masses of shape (bodies,); "
+            f"got q0 {q.shape} and masses {masses.shape}."
+        )
+    return masses, args.get("G", 1.0) * masses[0]
+
+
+def _c2(args):
+    return args.get("c", SPEED_OF_LIGHT) ** 2
+
+
+def _from_sun(x):
+    return x[1:] - x[:1]
+
+
+def _length(r):
+    return jnp.sqrt(jnp.sum(r**2, axis=-1, keepdims=True))
+
+
+def _added_momenta(q, v, args):
+    """What 1/c² adds to m v: m_i w_i, and −Σ m_i w_i for the Sun."""
+    masses, mu = _masses(q, args)
+    u = _from_sun(v)
+    w = (_length(u) ** 2 / 2 + 3 * mu / _length(_from_sun(q))) / _c2(args) * u
+    added = masses[1:, None] * w
+    return jnp.concatenate([-jnp.sum(added, axis=0, keepdims=True), added])
