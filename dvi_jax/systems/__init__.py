@@ -9,6 +9,7 @@ from .magnetic_mirror import magnetic_mirror as magnetic_mirror
 from .n_body import n_body as n_body
 from .oscillator import oscillator as oscillator
 from .perturbed_pendulum import perturbed_pendulum as perturbed_pendulum
+from .polar_motion import polar_motion as polar_motion
 from .solar_system import solar_system as solar_system
 from .stiff_fput import stiff_fput as stiff_fput
 from .toda import toda as toda
@@ -25,5 +26,6 @@ LIBRARY = {
     "stiff_fput": stiff_fput,
     "perturbed_pendulum": perturbed_pendulum,
     "magnetic_mirror": magnetic_mirror,
+    "polar_motion": polar_motion,
 }
 """Name → function that makes the `Problem`."""

@@ -1,0 +1,313 @@
+"""The pole as measured, and the wobble's equations against closed forms and by hand."""
+
+import datetime
+import importlib.util
+import sys
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dvi_jax as dvi
+from dvi_jax.systems import polar_motion
+from dvi_jax.systems.polar_motion import (
+    REFERENCE,
+    YEAR,
+    annual,
+    exact,
+    forced_pole,
+    mean_pole,
+    rates,
+    read_polar_motion,
+)
+from dvi_jax.systems.solar_system import EphemerisMissing
+
+PROBLEM = polar_motion()
+ARGS = PROBLEM.args
+QUIET = ARGS | {name: np.zeros(2) for name in ("prograde", "retrograde", "mean", "drift")}
+LOSSY = QUIET | {"inverse_Q": 0.1}
+START = -8766.0  # 1976-01-01
+MAS = 1e-3
+
+
+@pytest.fixture(scope="module")
+def measured():
+    if importlib.util.find_spec("skyfield_data") is None:
+        pytest.skip("the measured polar motion is not installed")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of the age of the files
+        return read_polar_motion()
+
+
+def run(args, h, num_steps, method=dvi.Yoshida(4), epsilon=1.0, q0=(0.1,), p0=(0.2,), **more):
+    return dvi.integrate(
+        PROBLEM.system,
+        jnp.array(q0),
+        jnp.array(p0),
+        h=h,
+        num_steps=num_steps,
+        t0=START,
+        epsilon=epsilon,
+        args=args,
+        method=method,
+        **more,
+    )
+
+
+def distance(solution, args, q0=0.1, p0=0.2):
+    x, y = exact(solution.ts, START, q0, p0, args)
+    return np.max(np.hypot(solution.qs[:, 0] - x, solution.ps[:, 0] - y))
+
+
+def by_hand(t, state, args, of_x=1.0, of_y=1.0):
+    """Liouville's equation in its real parts; `of_x` and `of_y` scale what each one loses."""
+    sigma = 2 * np.pi / args["period"]
+    gamma = sigma * args["inverse_Q"] / 2
+    turn = np.exp(2j * np.pi * t / 365.25)
+    a, b = (complex(*args[name]) for name in ("prograde", "retrograde"))
+    drive = a * turn + b / turn
+    u = state[0] - args["mean"][0] - args["drift"][0] * t / 365.25 - drive.real
+    v = state[1] - args["mean"][1] - args["drift"][1] * t / 365.25 + drive.imag
+    return [sigma * v - of_x * gamma * u, -sigma * u - of_y * gamma * v]
+
+
+def solved(args, t1, **scales):
+    kept = solve_ivp(
+        lambda t, s: by_hand(t, s, args, **scales),
+        (START, t1),
+        [0.1, 0.2],
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-14,
+    )
+    return kept.y[:, -1]
+
+
+# What was measured
+
+C04 = [  # date, x, y, tolerance [arcsec], from IERS EOP 20 C04, another centre's own combination
+    ("1977-01-01", -0.072400, 0.083200, 20 * MAS),
+    ("1984-01-01", -0.133010, 0.091197, 2 * MAS),
+    ("2000-01-01", 0.043261, 0.377991, 0.3 * MAS),
+    ("2010-01-01", 0.098670, 0.192840, 0.1 * MAS),
+    ("2016-01-01", 0.051172, 0.256788, 0.1 * MAS),
+]
+
+
+@pytest.mark.parametrize(("date", "x", "y", "tolerance"), C04)
+def test_poles_are_those_of_another_centre(measured, date, x, y, tolerance):
+    day = datetime.date.fromisoformat(date) - datetime.date(1858, 11, 17)  # where MJD counts from
+    (i,) = np.flatnonzero(measured.mjd == day.days)
+    assert abs(measured.x[i] - x) < tolerance
+    assert abs(measured.y[i] - y) < tolerance
+    error = np.hypot(measured.x_error[i], measured.y_error[i])
+    assert np.hypot(measured.x[i] - x, measured.y[i] - y) < 3 * error
+    assert abs(measured.x[i] - y) > tolerance  # negative control: the columns are not swapped
+
+
+def test_every_day_is_there_once_with_an_error(measured):
+    assert measured.mjd[0] == 41684.0  # 1973-01-02
+    np.testing.assert_array_equal(np.diff(measured.mjd), 1.0)
+    assert all(column.shape == measured.mjd.shape for column in measured)
+    assert measured.mjd.size > 15000
+    for error in (measured.x_error, measured.y_error):
+        assert (error > 0).all()
+        early, late = (np.median(error[abs(measured.mjd - m) < 180]) for m in (41864, 51544))
+        assert early > 100 * late
+    assert np.abs(measured.x).max() < 0.35  # the pole stays within twenty metres of its mean
+    assert -0.05 < measured.y.min() < measured.y.max() < 0.65
+
+
+LINE = "24 1 1 60310.00 {}  0.136621 0.000009  0.202010 0.000009  I-0.0087688 0.0000053"
+
+
+def test_predictions_and_empty_lines_are_left_out(tmp_path):
+    path = tmp_path / "finals.all"
+    path.write_text("\n".join([LINE.format("I"), LINE.format("P"), LINE[:16] + " " * 60, ""]))
+    read = read_polar_motion(path)
+    np.testing.assert_array_equal(np.stack(read).T, [[60310.0, 0.136621, 0.20201, 9e-6, 9e-6]])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "no measured pole"),
+        (LINE.format("P"), "no measured pole"),
+        (LINE.format("I")[:30], "line 1 of finals.all is not in the format"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, text, said):
+    path = tmp_path / "finals.all"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=said):
+        read_polar_motion(path)
+
+
+def test_missing_extra_names_the_command(monkeypatch):
+    module = sys.modules["dvi_jax.systems.polar_motion"]  # its name is the function's as well
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    with pytest.raises(EphemerisMissing, match=r'pip install "dvi-jax\[ephemeris\]"'):
+        read_polar_motion()
+
+
+def test_the_wobble_turns_as_the_sign_of_y_says(measured):
+    """Prograde, from Greenwich to 90° east: in x − i y against the clock, once in 433 days."""
+    t, z = measured.mjd - REFERENCE, measured.x - 1j * measured.y
+    early = (t > -10 * YEAR) & (t < 0)
+    z = z[early] - np.mean(z[early])
+    at_chandler = np.abs([np.mean(z * np.exp(s * 2j * np.pi * t[early] / 433)) for s in (-1, 1)])
+    assert at_chandler[0] > 0.12  # arcsec
+    assert at_chandler[0] > 10 * at_chandler[1]
+
+
+# The free wobble
+
+
+def test_undisturbed_pole_goes_round_a_circle():
+    solution = run(QUIET, 1.0, 433, epsilon=0.0)
+    radius = np.hypot(solution.qs[:, 0], solution.ps[:, 0])
+    np.testing.assert_allclose(radius, radius[0], rtol=1e-7)
+    np.testing.assert_allclose(solution.qs[-1], 0.1, atol=1e-7)
+    np.testing.assert_allclose(solution.ps[-1], 0.2, atol=1e-7)
+    ellipse = run(QUIET, 1.0, 433, dvi.TypeII(), epsilon=0.0)  # negative control: order 1
+    assert np.ptp(np.hypot(ellipse.qs[:, 0], ellipse.ps[:, 0])) > 0.005 * radius[0]
+
+
+def test_damping_is_that_of_q():
+    cycles = 3
+    solution = run(LOSSY, 1.0, 433 * cycles, save=dvi.Save(every=433))
+    radius = np.hypot(solution.qs[:, 0], solution.ps[:, 0])
+    expected = radius[0] * np.exp(-np.pi * 0.1 * np.arange(cycles + 1))  # e^{−π/Q} in each turn
+    np.testing.assert_allclose(radius, expected, rtol=1e-8)
+    assert abs(radius[-1] / radius[0] - 1) > 0.5  # negative control: it is not the circle
+
+
+def test_damping_is_the_same_in_every_direction():
+    """The spiral is exact, not an average over a turn, as with a force −2γp alone."""
+    end = START + 100.0
+    x, y = exact(end, START, 0.1, 0.2, LOSSY)
+    np.testing.assert_allclose(solved(LOSSY, end), [x, y], atol=1e-11)
+    one_sided = solved(LOSSY, end, of_x=0.0, of_y=2.0)
+    assert np.hypot(*(one_sided - np.array([x, y]))) > 0.03 * np.hypot(x, y)
+    assert distance(run(LOSSY, 1.0, 100), LOSSY) < 1e-9
+
+
+def test_half_the_disturbance_is_half_the_damping():
+    whole, half = (run(LOSSY, 1.0, 433, epsilon=e) for e in (1.0, 0.5))
+    ratio = [np.log(np.hypot(s.qs[-1, 0], s.ps[-1, 0]) / np.hypot(0.1, 0.2)) for s in (whole, half)]
+    np.testing.assert_allclose(ratio, [-np.pi * 0.1, -np.pi * 0.05], rtol=1e-8)
+
+
+# The driven wobble
+
+
+@pytest.mark.parametrize("name", ["prograde", "retrograde", "drift"])
+def test_closed_form_solves_the_equation(name):
+    args = LOSSY | {name: np.array([0.03, -0.01])}
+    end = START + 700.0
+    np.testing.assert_allclose(solved(args, end), exact(end, START, 0.1, 0.2, args), atol=1e-11)
+    other = args | {name: np.array([0.03, 0.01])}  # negative control
+    assert np.max(np.abs(solved(other, end) - exact(end, START, 0.1, 0.2, args))) > 1e-4
+
+
+def test_response_is_the_resonance():
+    sigma, omega = 2 * np.pi / 433.0, 2 * np.pi / YEAR
+    lossless = QUIET | {"inverse_Q": 0.0}
+    t = np.linspace(0, 2 * YEAR, 50)
+    for name, gain in (
+        ("prograde", sigma / (sigma - omega)),
+        ("retrograde", sigma / (sigma + omega)),
+    ):
+        args = lossless | {name: np.array([0.01, 0.02])}
+        np.testing.assert_allclose(forced_pole(t, args), gain * np.stack(annual(t, args)))
+    assert sigma / (sigma - omega) == pytest.approx(-5.39, abs=0.01)
+
+
+def test_a_pole_on_the_forced_path_stays_there():
+    q0, p0 = (float(c) for c in forced_pole(START, ARGS))
+    solution = run(ARGS, 5.0, 584, q0=(q0,), p0=(p0,), observe=PROBLEM.observables)
+    x, y = forced_pole(solution.ts, ARGS)
+    assert np.max(np.hypot(solution.qs[:, 0] - x, solution.ps[:, 0] - y)) < 0.01 * MAS
+    assert np.max(solution.observed["free_amplitude"]) < 0.01 * MAS
+    away = solution.observed["amplitude"]  # from the mean pole: the driven ellipse
+    assert np.max(away) > 0.08
+    assert np.max(away) - np.min(away) > 0.005
+    detuned = ARGS | {"period": 440.0}  # negative control
+    x, y = forced_pole(solution.ts, detuned)
+    assert np.max(np.hypot(solution.qs[:, 0] - x, solution.ps[:, 0] - y)) > 1 * MAS
+
+
+def test_free_amplitude_decays_about_the_forced_path():
+    solution = run(ARGS, 5.0, 584, observe=PROBLEM.observables)
+    _, gamma = rates(ARGS)
+    free = solution.observed["free_amplitude"]
+    ts = solution.ts[-len(free) :]
+    np.testing.assert_allclose(free, free[0] * np.exp(-gamma * (ts - ts[0])), rtol=2e-4)
+
+
+def test_mean_pole_moves_by_its_drift_in_a_year():
+    assert mean_pole(0.0, ARGS) == (0.0550, 0.3205)
+    np.testing.assert_allclose(
+        mean_pole(10 * YEAR, ARGS), [0.0550 + 0.01677, 0.3205 + 0.0346], rtol=1e-14
+    )
+
+
+# The map
+
+
+@pytest.mark.parametrize(
+    ("method", "order"), [(dvi.TypeII(), 1), (dvi.Strang(), 2), (dvi.Yoshida(4), 4)]
+)
+def test_order(method, order):
+    errors = [distance(run(ARGS, 800.0 / n, n, method), ARGS) for n in (40, 80, 160)]
+    slopes = np.log2(np.divide(errors[:-1], errors[1:]))
+    np.testing.assert_allclose(slopes, order, atol=0.35)
+
+
+def test_eight_years_are_exact_enough_to_fit():
+    assert distance(run(ARGS, 5.0, 584), ARGS) < 0.02 * MAS
+    strang = run(ARGS, 1.0, 2920, dvi.Strang())
+    shorter = ARGS | {"period": ARGS["period"] - 0.0038}  # (σh)²/24 of it, as the docstring says
+    assert distance(strang, shorter) < 0.01 * MAS < 0.03 * MAS < distance(strang, ARGS)
+
+
+def test_derivatives_by_the_parameters():
+    """Forward and reverse through a run of two years, beside those of the closed form."""
+
+    def integrated(args):
+        solution = run(args, 1.0, 730, dvi.Strang(), save=dvi.Save(every=365))
+        return jnp.concatenate([solution.qs[1:, 0], solution.ps[1:, 0]])
+
+    def closed(args):
+        ts = START + 365.0 * jnp.array([1.0, 2.0])
+        return jnp.concatenate(exact(ts, START, 0.1, 0.2, args))
+
+    args = jax.tree.map(lambda x: jnp.asarray(x, float), ARGS)
+    wanted, got = jax.jacfwd(closed)(args), jax.jacfwd(integrated)(args)
+    back = jax.jit(jax.grad(lambda args: jnp.sum(integrated(args) * jnp.arange(1.0, 5.0))))(args)
+    for name in ARGS:
+        size = float(jnp.max(jnp.abs(wanted[name])))
+        assert size > 0
+        # Strang: ((σ + ω)h)²/12 = 8e-5 in what drives, and 9e-5 in the phase after two years
+        np.testing.assert_allclose(got[name], wanted[name], rtol=0, atol=5e-4 * size)
+        along = jnp.tensordot(jnp.arange(1.0, 5.0), wanted[name], 1)
+        np.testing.assert_allclose(back[name], along, rtol=0, atol=5e-3 * size)
+
+
+# The start
+
+
+def test_start_is_the_measured_one(measured):
+    (i,) = np.flatnonzero(measured.mjd == REFERENCE)
+    assert (PROBLEM.q0, PROBLEM.p0) == ([measured.x[i]], [measured.y[i]])
+    PROBLEM.check(PROBLEM.q0, PROBLEM.p0, ARGS)
+
+
+def test_other_starts_are_refused():
+    with pytest.raises(ValueError, match="the pole is one point"):
+        PROBLEM.check([0.1, 0.2], [0.1, 0.2], ARGS)
+    with pytest.raises(ValueError, match=r"period must be positive, got -433\.0"):
+        PROBLEM.check(PROBLEM.q0, PROBLEM.p0, ARGS | {"period": -433.0})
