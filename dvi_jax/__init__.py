@@ -30,6 +30,23 @@ from .engine.picard import Picard as Picard, PicardThenNewton as PicardThenNewto
 from .engine.simplified import SimplifiedNewton as SimplifiedNewton
 from .engine.threads import over_threads as over_threads
 from .engine.tiles import Layout as Layout
+from .fit import (
+    FIT_RESULTS as FIT_RESULTS,
+    Bounds as Bounds,
+    Cauchy as Cauchy,
+    FitError as FitError,
+    FitProgress as FitProgress,
+    FitResult as FitResult,
+    LeastSquares as LeastSquares,
+    Likelihood as Likelihood,
+    Model as Model,
+    MultipleShooting as MultipleShooting,
+    Observations as Observations,
+    Prior as Prior,
+    SingleShooting as SingleShooting,
+    SoftL1 as SoftL1,
+    fit as fit,
+)
 from .invariants import (
     Balance as Balance,
     Discovery as Discovery,

@@ -21,7 +21,7 @@ FLOORS = [
     ["_adjoints"],
     ["_reversible"],
     ["_integrate"],
-    ["invariants", "sweep"],
+    ["invariants", "sweep", "fit"],
     ["__init__", "systems", "plot"],
     ["paper", "run", "certify"],
     ["cli"],
@@ -102,6 +102,8 @@ discover_invariants InvariantSeries ShadowHamiltonian drift_order drift_surface
 noether_balance solve_gauge
 sweep Axis starts open_sweep SweepResult SweepProgress SweepInterrupted StoreError StoreMismatch
 ClusterError sweep_cost SweepCost
+fit Model Observations Bounds Prior LeastSquares SoftL1 Cauchy Likelihood
+SingleShooting MultipleShooting FitResult FitProgress FIT_RESULTS FitError
 """
 
 

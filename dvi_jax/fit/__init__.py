@@ -1,0 +1,16 @@
+"""Disturbances from data: parameters of a model that observed trajectories determine."""
+
+from ._fit import fit as fit
+from .losses import (
+    Cauchy as Cauchy,
+    LeastSquares as LeastSquares,
+    Likelihood as Likelihood,
+    SoftL1 as SoftL1,
+)
+from .model import Model as Model
+from .observations import Observations as Observations
+from .parameters import Bounds as Bounds, Prior as Prior
+from .progress import FitProgress as FitProgress
+from .result import FitResult as FitResult
+from .results import FIT_RESULTS as FIT_RESULTS, FitError as FitError
+from .shooting import MultipleShooting as MultipleShooting, SingleShooting as SingleShooting

@@ -1,0 +1,56 @@
+"""How much of the arcs a stage of a fit looks at."""
+
+import numpy as np
+
+from .model import Group
+from .problem import Problem
+
+_OFF = 0.5
+"""Misfit, relative to the scatter of the data, up to which a fit of everything is trusted to find
+the nearest minimum: half of it is a sixth of a period's phase."""
+
+
+def full_horizon(problem: Problem) -> float:
+    """The longest time between the start of an arc and one of its observations."""
+    return max(float(_since(group).max()) for group in problem.groups)
+
+
+def suitable_horizon(problem: Problem, rows: list[np.ndarray], at_least: float = 0.0) -> float:
+    """The longest of full, full/2, full/4, … over which the misfit is small beside the scatter of
+    the data; the shortest that has enough of them for the parameters where none is.
+
+    - `rows`: whitened residuals (A, N, K) of each group. `at_least`: a horizon to go beyond.
+
+    Infinite stands for everything.
+    """
+    full, shortest = full_horizon(problem), np.inf
+    scatter = np.concatenate([_scatter(g)[g.seen] for g in problem.groups])
+    allowed = _OFF * np.sqrt(np.mean(scatter**2))
+    since = np.concatenate([np.broadcast_to(_since(g)[..., None], g.seen.shape)[g.seen]
+                            for g in problem.groups])  # fmt: skip
+    misfit = np.concatenate([np.asarray(r)[g.seen]
+                             for r, g in zip(rows, problem.groups, strict=True)])  # fmt: skip
+    horizon = full
+    while horizon > at_least:
+        inside = since <= horizon * (1 + 1e-12)
+        if inside.sum() < 2 * problem.size:
+            break
+        if np.isfinite(misfit[inside]).all() and np.sqrt(np.mean(misfit[inside] ** 2)) <= allowed:
+            return np.inf if horizon == full else horizon
+        shortest = horizon
+        horizon /= 2
+    return np.inf if shortest >= full else shortest
+
+
+def _since(group: Group) -> np.ndarray:
+    return np.abs(group.ts - group.t0[:, None])
+
+
+def _scatter(group: Group) -> np.ndarray:
+    """Observed values minus their mean over the arc, in standard errors, (A, N, K)."""
+    count = np.maximum(group.seen.sum(axis=1, keepdims=True), 1)
+    mean = np.where(group.seen, group.values, 0).sum(axis=1, keepdims=True) / count
+    off = np.where(group.seen, group.values - mean, 0.0)
+    if group.whiten.ndim == 3:
+        return off * group.whiten
+    return np.einsum("anij,anj->ani", group.whiten, off)

@@ -1,0 +1,312 @@
+"""The model of an arc: from parameters to what `integrate` is to do, and to predictions."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._compat import is_traced
+from .._integrate import integrate
+from .._results import RESULTS
+from .._solution import Save
+from .._system import System
+from ..engine.signature import accepts
+from ..lattices import Uniform
+from .observations import Observations
+
+_MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
+_OWN = ("num_steps", "save", "observe", "throw", "progress", "stop", "t0")
+"""What `fit` sets itself."""
+
+
+class Model:
+    """A system with what is known of it; parameters replace or add the rest.
+
+    - `system`: a `System`. `h`: the step size [time]. `q0`, `p0`, `epsilon`, `args`: as in
+      `integrate`; what is among the parameters may be left out here. When `data` is a list of
+      arcs, q0 and p0 have one row for each arc, here and among the parameters.
+    - `options`: further arguments of `integrate`: `method`, `lattice`, `newton`, `adjoint`,
+      `arithmetic`, `layout`; for a lattice that is not uniform also `num_steps`.
+
+    Parameters are a dict with keys among ``"q0"``, ``"p0"``, ``"epsilon"``, ``"args"``; when args
+    are dicts, the entries of the parameters' are put into those given here. For any other
+    dependence write the model as a function of the parameters, ``(params)`` or ``(params, arc)``
+    with the number of the arc, that returns the arguments of `integrate` as a dict.
+
+    **Raises** `TypeError` for arguments and parameters that have no such name.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        *,
+        h: float,
+        q0: Any = None,
+        p0: Any = None,
+        epsilon: Any = 0.0,
+        args: PyTree = None,
+        **options: Any,
+    ):
+        if not isinstance(system, System):
+            raise TypeError(f"system must be a dvi.System, got {system!r}.")
+        known = ("method", "lattice", "newton", "adjoint", "arithmetic", "layout", "num_steps")
+        for name in options:
+            if name not in known:
+                raise TypeError(
+                    f"dvi.Model takes no {name!r}: options are {', '.join(known)}; what is saved "
+                    "and observed follows from the data."
+                )
+        self.fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
+        self.rest = {"system": system, "h": h, **options}
+
+    def __call__(self, params: Mapping[str, Any], arc: Any = None) -> dict[str, Any]:
+        """The arguments of `integrate` for an arc (None: there is one, without rows)."""
+        if not isinstance(params, Mapping):
+            raise TypeError(
+                "the parameters of a dvi.Model are a dict with keys among "
+                f"{', '.join(_MAY_BE_FITTED)}, got {type(params).__name__}. For any other pytree "
+                "write the model as a function (params) that returns the arguments of integrate."
+            )
+        found = dict(self.fixed)
+        for name, value in params.items():
+            if name not in _MAY_BE_FITTED:
+                raise TypeError(
+                    f"{name!r} is no parameter of a dvi.Model: they are "
+                    f"{', '.join(_MAY_BE_FITTED)}. A parameter of the system goes under args: "
+                    f'{{"args": {{{name!r}: ...}}}}.'
+                )
+            old = found[name]
+            both = isinstance(old, Mapping) and isinstance(value, Mapping)
+            found[name] = {**old, **value} if both else value
+        for name in ("q0", "p0"):
+            if found[name] is None:
+                raise TypeError(f"{name} is neither in dvi.Model(..., {name}=...) nor a parameter.")
+            if arc is not None:
+                found[name] = jnp.asarray(found[name])[arc]
+        return {**self.rest, **found}
+
+
+@dataclass(frozen=True)
+class Group:
+    """Arcs that are computed together: same observable, about the same number of steps.
+
+    Arrays have the arcs in front and are padded to one number of observations N of K components:
+    `arcs` (A,), `t0` (A,), `ts` (A, N), `values` and `seen` (A, N, K), `whiten` (A, N, K) or
+    (A, N, K, K). Padding is not seen, and has the time of the last observation. `block` and
+    `pick` are how observations are found on the lattice, see `predict`.
+    """
+
+    arcs: np.ndarray
+    t0: np.ndarray
+    ts: np.ndarray
+    values: np.ndarray
+    seen: np.ndarray
+    whiten: np.ndarray
+    observe: Callable[..., Any]
+    num_steps: int
+    block: int
+    pick: np.ndarray | None
+
+
+def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: bool) -> dict:
+    """What the model says `integrate` shall do for an arc, checked.
+
+    **Raises** `TypeError` or `ValueError` for a model that returns something else.
+    """
+    if isinstance(model, Model):
+        found = model(params, arc if many else None)
+    else:
+        found = model(params, arc) if accepts(model, 2) else model(params)
+    if not isinstance(found, Mapping):
+        raise TypeError(
+            "the model must return the arguments of dvi.integrate as a dict, such as "
+            'dict(system=..., q0=..., p0=..., h=..., epsilon=params["epsilon"]), got '
+            f"{type(found).__name__}."
+        )
+    found = dict(found)
+    for name in ("system", "q0", "p0", "h"):
+        if found.get(name) is None:
+            raise ValueError(f"the model's arguments of dvi.integrate lack {name!r}.")
+    for name in _OWN:
+        if name in found and not (name == "num_steps" and not _uniform(found)):
+            raise ValueError(
+                f"the model must not set {name!r}: it follows from the data"
+                + (" (Observations(..., t0=...))." if name == "t0" else ".")
+            )
+    if is_traced(found["h"]):
+        raise ValueError("the step size h of the model must be a number, not a parameter.")
+    return found
+
+
+def _uniform(spec: Mapping[str, Any]) -> bool:
+    return isinstance(spec.get("lattice", Uniform()), Uniform)
+
+
+def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[Group]:
+    """Arcs put together where one compiled program can serve them.
+
+    **Raises** `ValueError` for step sizes that cannot suit the data.
+    """
+    kinds: dict[Any, list[int]] = {}
+    for i, (arc, spec) in enumerate(zip(arcs, specs, strict=True)):
+        steps = _steps(i, arc, spec)
+        full = arc.covariance is not None
+        key = (arc.function, arc.values.shape[1:], full, math.ceil(math.log2(steps)), spec["h"])
+        kinds.setdefault(key, []).append(i)
+    return [
+        make_group(
+            those,
+            [arcs[i] for i in those],
+            specs[those[0]],
+            max(_steps(i, arcs[i], specs[i]) for i in those),
+        )
+        for those in kinds.values()
+    ]
+
+
+def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
+    """How many steps reach the last observation."""
+    h = float(spec["h"])
+    if not np.isfinite(h) or h == 0:
+        raise ValueError(f"the step size h of the model must be finite and not zero, got {h}.")
+    if not _uniform(spec):
+        if not isinstance(spec.get("num_steps"), int):
+            raise ValueError(
+                f"on the lattice {spec['lattice']!r} the model has to say how many steps reach "
+                "the last observation: num_steps."
+            )
+        return spec["num_steps"]
+    span = arc.ts[-1] - arc.t0
+    if span * h < 0:
+        raise ValueError(
+            f"arc {i}: the observations go from t0 = {arc.t0:g} to {arc.ts[-1]:g}, but h = {h:g} "
+            "goes the other way. Give h the sign of the data's direction."
+        )
+    steps = span / h
+    if steps > 2e9:
+        raise ValueError(
+            f"arc {i}: {steps:.3g} steps of h = {h:g} would be needed for a span of {span:g}. Are "
+            "the times of the data in the units of h?"
+        )
+    if 0 < steps < 0.5:
+        raise ValueError(
+            f"arc {i}: the whole span of the observations, {span:g}, is shorter than half a step, "
+            f"h = {h:g}. Are the times of the data in the units of h?"
+        )
+    return max(1, math.ceil(steps - 1e-9))
+
+
+def make_group(
+    numbers: list[int], arcs: list[Any], spec: Mapping[str, Any], num_steps: int
+) -> Group:
+    """One group of arcs (`Observations` or parts of them) that take `num_steps` steps each."""
+    rows = max(len(arc.ts) for arc in arcs)
+
+    def padded(x, fill=0.0):
+        width = [(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1)
+        return np.pad(x, width, mode="constant", constant_values=fill)
+
+    ts = np.stack([np.pad(arc.ts, (0, rows - len(arc.ts)), mode="edge") for arc in arcs])
+    flat = [arc.values.reshape(len(arc.ts), -1) for arc in arcs]
+    t0 = np.array([arc.t0 for arc in arcs])
+    block, pick = 0, None
+    if _uniform(spec):
+        block, pick = _blocks((ts - t0[:, None]) / float(spec["h"]), num_steps)
+    return Group(
+        arcs=np.array(numbers),
+        t0=t0,
+        ts=ts,
+        values=np.stack([padded(np.nan_to_num(x)) for x in flat]),
+        seen=np.stack([padded(~np.isnan(x), False) for x in flat]),
+        whiten=np.stack([padded(arc.whitening()) for arc in arcs]),
+        observe=arcs[0].function,
+        num_steps=num_steps,
+        block=block,
+        pick=pick,
+    )
+
+
+def _blocks(places: np.ndarray, num_steps: int) -> tuple[int, np.ndarray | None]:
+    """How often states are saved, and which saved state is which observation; None for the latter
+    where observations lie between lattice points, or too irregularly upon them.
+
+    `places` are times in steps from the start, shape (A, N).
+    """
+    count = places.shape[1]
+    whole = np.rint(places)
+    if (np.abs(places - whole) <= 1e-9 * np.maximum(1, np.abs(places))).all():
+        block = max(1, int(np.gcd.reduce(whole.astype(np.int64), axis=None)))
+        if num_steps / block <= max(64, 16 * count):
+            return min(block, num_steps), (whole / block).astype(np.int64)
+    return max(1, num_steps // (4 * count)), None
+
+
+def predict(
+    spec: dict[str, Any], t0: Array, ts: Array, pick: Array | None, group: Group
+) -> tuple[Array, tuple[Array, Array], RESULTS]:
+    """What the model says is observed along one arc, shape (N, K), its last state and its status.
+
+    On a uniform lattice states are saved every `block` steps. Observations upon them are picked
+    out; others are reached from the saved state before by `block` equal steps of their own, none
+    longer than h. So an observation is that of the method to its order, each step runs in the
+    quick loop, and memory grows with the number of observations, not of steps.
+    """
+    spec = {**spec, "t0": t0, "throw": False}
+    if group.block == 0:
+        sol = integrate(**spec, save=Save(ts=ts))
+        last = sol.qs[-1], sol.ps[-1]
+        return _observed(group, spec, ts, sol.qs, sol.ps), last, sol.result
+    spec["num_steps"] = group.num_steps
+    sol = integrate(**spec, save=Save(every=group.block, final=True))
+    last = sol.qs[-1], sol.ps[-1]
+    if pick is not None:
+        qs, ps = sol.qs[pick], sol.ps[pick]
+        return _observed(group, spec, ts, qs, ps), last, sol.result
+    stride = group.block * float(spec["h"])
+    before = jnp.ceil((ts - t0) / stride - 1e-9).astype(int) - 1
+    before = jnp.clip(before, 0, group.num_steps // group.block)
+    at = sol.ts[before]
+    none = ts == t0  # no step leads there
+    h = jnp.where(none, stride, ts - at) / group.block
+
+    def reach(t, q, p, h):
+        own = {**spec, "t0": t, "q0": q, "p0": p, "h": h, "num_steps": group.block}
+        end = integrate(**own, save=Save(final=True))
+        return end.qs[-1], end.ps[-1]
+
+    qs, ps = jax.vmap(reach)(at, sol.qs[before], sol.ps[before], h)
+    wide = none.reshape(-1, *[1] * (qs.ndim - 1))
+    qs, ps = jnp.where(wide, sol.qs[0], qs), jnp.where(wide, sol.ps[0], ps)
+    return _observed(group, spec, ts, qs, ps), last, sol.result
+
+
+def _observed(group: Group, spec: Mapping[str, Any], ts: Array, qs: Array, ps: Array) -> Array:
+    args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, spec.get("args"))
+    found = jax.vmap(lambda t, q, p: group.observe(t, q, p, args))(ts, qs, ps)
+    return jnp.reshape(found, (len(ts), -1))
+
+
+def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> None:
+    """Refuse an observable that does not give one value of the shape of the data.
+
+    **Raises** `ValueError` with both shapes; errors of the function itself with a note.
+    """
+    q, p = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
+    try:
+        out = eqx.filter_eval_shape(arc.function, jnp.asarray(arc.t0), q, p, spec.get("args"))
+    except Exception as error:
+        error.add_note(f"(in the observe of arc {i}, called with (t, q, p, args))")
+        raise
+    shape = getattr(out, "shape", None)
+    if shape != arc.values.shape[1:]:
+        name = arc.observe if isinstance(arc.observe, str) else "observe"
+        raise ValueError(
+            f"arc {i}: values has shape {arc.values.shape}, so one observation has "
+            f"{arc.values.shape[1:]}, but {name} returns {shape} for a state of shape {q.shape}."
+        )

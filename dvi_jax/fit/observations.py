@@ -1,0 +1,259 @@
+"""What was observed: times, values, errors; checked, and laid out for the device."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..engine.signature import accepts
+
+
+def _positions(t, q, p, args):
+    return q
+
+
+def _momenta(t, q, p, args):
+    return p
+
+
+def _state(t, q, p, args):
+    return jnp.concatenate([jnp.ravel(q), jnp.ravel(p)])
+
+
+NAMED = {"positions": _positions, "momenta": _momenta, "state": _state}
+"""Observables of a state that have a name."""
+
+
+def accepts_four(function: Any) -> bool:
+    """Whether it can be called with (t, q, p, args)."""
+    return callable(function) and accepts(function, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    r"""Observed values along one arc of a trajectory.
+
+    - `ts`: times, shape (N,), in the direction of the run, no two alike.
+    - `values`: what was observed at them, shape (N, ...); NaN where a component is missing.
+    - `observe`: what is observed of a state: ``"positions"`` (q, the default), ``"momenta"`` (p),
+      ``"state"`` (both in one vector), or a function ``(t, q, p, args)`` that returns an array of
+      the shape of one value: a range, an angle, one body of many.
+    - `sigma`: standard errors: one number, or an array that broadcasts to `values`. Left out,
+      all values have the same error and its size is found from the residuals.
+    - `covariance`: instead of sigma, covariances of the K components of one observation in the
+      order of ``ravel``: shape (K, K) for all, or (N, K, K).
+    - `t0`: time of the arc's start, where the model's q0 and p0 belong; ``ts[0]`` if left out.
+
+    Observations of several kinds along the same arc are one `observe` that returns them all, at
+    the union of their times, with NaN for what was not seen.
+
+    **Raises** `ValueError` or `TypeError` for what cannot be meant: times that are not finite,
+    not in order or twice the same, before t0; values of another shape, infinite, or all missing;
+    errors that are zero, negative or NaN; a covariance that is not positive definite.
+    """
+
+    ts: Any
+    values: Any
+    observe: str | Callable[..., Any] = "positions"
+    sigma: Any = None
+    covariance: Any = None
+    t0: float | None = None
+
+    def __post_init__(self):
+        ts = _real("ts", self.ts)
+        values = _real("values", self.values)
+        known = (
+            self.observe in NAMED if isinstance(self.observe, str) else accepts_four(self.observe)
+        )
+        if not known:
+            raise TypeError(
+                'observe must be "positions", "momenta", "state" or a function (t, q, p, args) of '
+                f"a state, got {self.observe!r}."
+            )
+        if ts.ndim != 1 or ts.size == 0:
+            raise ValueError(f"ts must be a one-dimensional array of times, got shape {ts.shape}.")
+        if values.shape[:1] != ts.shape:
+            raise ValueError(
+                f"values must have one row for each time: ts has shape {ts.shape}, values has "
+                f"{values.shape}."
+            )
+        _check_times(ts)
+        if np.isinf(values).any():
+            where = np.argwhere(np.isinf(values))[0].tolist()
+            raise ValueError(
+                f"values is infinite at index {where}. A missing component is given as NaN."
+            )
+        if np.isnan(values).all():
+            raise ValueError("all values are NaN, which stands for missing: nothing was observed.")
+        t0 = float(ts[0]) if self.t0 is None else _number("t0", self.t0)
+        direction = ts[-1] - t0
+        early = (ts - t0) * (1 if direction >= 0 else -1) < 0
+        if early.any():
+            raise ValueError(
+                f"the time {ts[early][0]:.17g} lies before t0 = {t0:.17g}, the start of the arc. "
+                "Move t0, or give the observations before it as an arc of their own that runs "
+                "backwards (h < 0, times in descending order)."
+            )
+        if self.sigma is not None and self.covariance is not None:
+            raise ValueError("give sigma or covariance, not both.")
+        for name, value in (("ts", ts), ("values", values), ("t0", t0)):
+            object.__setattr__(self, name, value)
+        if self.sigma is not None:
+            object.__setattr__(self, "sigma", _sigma(self.sigma, values))
+        if self.covariance is not None:
+            covariance = _real("covariance", self.covariance)
+            object.__setattr__(self, "covariance", _check_covariance(covariance, values))
+
+    @property
+    def function(self) -> Callable[..., Any]:
+        """`observe` as a function (t, q, p, args)."""
+        return NAMED[self.observe] if isinstance(self.observe, str) else self.observe
+
+    @property
+    def components(self) -> int:
+        """How many numbers one observation has."""
+        return int(np.prod(self.values.shape[1:], dtype=int))
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether sigma or covariance was given."""
+        return self.sigma is not None or self.covariance is not None
+
+    def whitening(self) -> np.ndarray:
+        """What residuals are multiplied by to be independent with unit variance.
+
+        Shape (N, K), or (N, K, K) for covariances: with those of what was seen, C = L Lᵀ, it
+        is L⁻¹; rows and columns of what is missing are zero.
+        """
+        flat = self.values.reshape(len(self.ts), -1)
+        seen = ~np.isnan(flat)
+        if self.covariance is None:
+            sigma = 1.0 if self.sigma is None else self.sigma.reshape(flat.shape)
+            return np.where(seen, 1 / np.where(seen, sigma, 1.0), 0.0)
+        k = flat.shape[1]
+        found = np.zeros((len(flat), k, k))
+        for i, (C, good) in enumerate(zip(self.covariance, seen, strict=True)):
+            if good.any():
+                L = np.linalg.cholesky(C[np.ix_(good, good)])
+                found[i][np.ix_(good, good)] = np.linalg.solve(L, np.eye(len(L)))
+        return found
+
+
+def as_arcs(data: Any) -> tuple[list[Observations], bool]:
+    """The arcs, and whether they were given as a list.
+
+    **Raises** `TypeError` for anything but `Observations`, `ValueError` for an empty list and when
+    some arcs have errors and some have none.
+    """
+    if isinstance(data, Observations):
+        return [data], False
+    if not isinstance(data, list | tuple):
+        raise TypeError(
+            f"data must be a dvi.Observations or a list of them, one for each arc, got {data!r}."
+        )
+    if not data:
+        raise ValueError("data is an empty list: there is nothing to fit.")
+    for i, arc in enumerate(data):
+        if not isinstance(arc, Observations):
+            raise TypeError(f"data[{i}] must be a dvi.Observations, got {arc!r}.")
+    if len({arc.has_errors for arc in data}) > 1:
+        without = next(i for i, arc in enumerate(data) if not arc.has_errors)
+        raise ValueError(
+            f"data[{without}] has neither sigma nor covariance while other arcs have: their "
+            "weights would be arbitrary. Give errors for all arcs, or for none."
+        )
+    return list(data), True
+
+
+def _real(name: str, value: Any) -> np.ndarray:
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be an array of real numbers ({error}).") from None
+    if not (np.issubdtype(found.dtype, np.floating) or np.issubdtype(found.dtype, np.integer)):
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {found.dtype}.")
+    return found.astype(float)
+
+
+def _number(name: str, value: Any) -> float:
+    found = _real(name, value)
+    if found.shape != () or not np.isfinite(found):
+        raise ValueError(f"{name} must be one finite number, got {value!r}.")
+    return float(found)
+
+
+def _check_times(ts: np.ndarray) -> None:
+    if not np.isfinite(ts).all():
+        i = int(np.argmin(np.isfinite(ts)))
+        raise ValueError(
+            f"ts[{i}] is {ts[i]}: every observation needs its time. Leave out those without one."
+        )
+    steps = np.diff(ts)
+    if (steps == 0).any():
+        i = int(np.argmax(steps == 0))
+        raise ValueError(
+            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]:.17g}. Several observations at "
+            "one time are one observation with more components (an observe that returns them "
+            "all), or their mean with its smaller sigma."
+        )
+    if not ((steps > 0).all() or (steps < 0).all()):
+        up = (steps > 0).sum() >= (steps < 0).sum()
+        i = int(np.argmax(steps < 0 if up else steps > 0))
+        raise ValueError(
+            f"ts is not in order: ts[{i}] = {ts[i]:.17g} is followed by ts[{i + 1}] = "
+            f"{ts[i + 1]:.17g}. Sort times and values together: order = np.argsort(ts); "
+            "ts[order], values[order]."
+        )
+
+
+def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
+    sigma = _real("sigma", sigma)
+    try:
+        full = np.broadcast_to(sigma, values.shape)
+    except ValueError:
+        raise ValueError(
+            f"sigma of shape {sigma.shape} does not broadcast to values of shape {values.shape}. "
+            "For one error at each time give shape (N, 1, ...)."
+        ) from None
+    bad = ~(np.isfinite(full) & (full > 0)) & ~np.isnan(values)
+    if bad.any():
+        i = np.argwhere(bad)[0].tolist()
+        raise ValueError(
+            f"sigma is {full[tuple(i)]} for the value at index {i}: standard errors must be "
+            "positive and finite. A value that is not to count is given as NaN; one that is known "
+            "exactly belongs into the model."
+        )
+    return np.array(full)
+
+
+def _check_covariance(C: np.ndarray, values: np.ndarray) -> np.ndarray:
+    n, k = len(values), int(np.prod(values.shape[1:], dtype=int))
+    if C.shape not in ((k, k), (n, k, k)):
+        raise ValueError(
+            f"covariance must have shape {(k, k)} or {(n, k, k)} for values of shape "
+            f"{values.shape}, got {C.shape}."
+        )
+    full = np.broadcast_to(C, (n, k, k))
+    scale = np.sqrt(np.abs(np.einsum("nii->ni", full)))
+    skew = np.abs(full - full.swapaxes(1, 2)).max(axis=(1, 2))
+    asymmetric = skew > 1e-10 * (scale.max(axis=1) ** 2 + np.finfo(float).tiny)
+    if asymmetric.any() or not np.isfinite(full).all():
+        i = int(np.argmax(asymmetric | ~np.isfinite(full).all(axis=(1, 2))))
+        raise ValueError(
+            f"the covariance of observation {i} is not symmetric and finite: {full[i]}"
+        )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        unit = full / (scale[:, :, None] * scale[:, None, :])
+    good = np.isfinite(unit).all(axis=(1, 2))
+    smallest = np.linalg.eigvalsh(np.where(good[:, None, None], unit, np.eye(k)))[:, 0]
+    bad = ~good | (smallest <= 1e-14) | (np.einsum("nii->ni", full) <= 0).any(axis=1)
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ValueError(
+            f"the covariance of observation {i} is not positive definite (smallest eigenvalue of "
+            f"its correlations {smallest[i]:.3g}): {full[i].tolist()}. A combination that is known "
+            "exactly belongs into the model; an error of zero cannot be weighed."
+        )
+    return np.array(full)

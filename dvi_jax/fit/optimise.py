@@ -1,0 +1,291 @@
+"""One stage of a fit: an optimiser driven step by step, so that it can be watched and resumed."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array
+
+from .results import FIT_RESULTS
+
+_STIFFNESS = 30.0
+"""Length of the columns of the scaled Jacobian. Optimistix damps with 1 to begin with, so that
+this is Marquardt's 1e-3 of the squared columns."""
+
+_FLAT = 1e-3
+"""Standard errors that the gradient is worth, below which a loss that no longer falls is a minimum,
+known to its rounding."""
+
+
+@dataclass
+class Record:
+    """One step of an optimiser: of which `stage`, the `loss` (½ Σ r², or the scalar) of the
+    accepted point `x`, the `step` to the next trial in standard errors, whether it was accepted."""
+
+    stage: int
+    horizon: float
+    loss: float
+    step: float
+    accepted: bool
+    x: np.ndarray
+
+
+@dataclass
+class Position:
+    """Where a stage stands: all that is needed to go on with the same bits."""
+
+    stage: int
+    horizon: float
+    done: int
+    base: np.ndarray
+    scale: np.ndarray
+    z: np.ndarray
+    leaves: list[np.ndarray] = field(default_factory=list)
+    extra: list[np.ndarray] = field(default_factory=list)
+
+
+class _Known(eqx.Module):
+    """Inputs of a compiled step of the scalar loss: where z is counted from and in what."""
+
+    base: Array
+    scale: Array
+    horizon: Array
+    extra: Any = None
+
+
+class Evaluation(NamedTuple):
+    """Residual vector (R,), its derivative (R, n), and what else was found on the way."""
+
+    residual: Array
+    jacobian: Array
+    aux: Any = None
+
+
+@eqx.filter_custom_jvp
+def _residual(z, known):
+    return known[0]
+
+
+@_residual.def_jvp
+def _(primals, tangents):
+    residual, jacobian = primals[1]
+    return residual, jacobian @ tangents[0]
+
+
+def _function(z, known):
+    """The residual of optimistix where it asks for it: known there, with its derivative."""
+    return _residual(z, known), None
+
+
+class LeastSquaresStage:
+    """Gauss–Newton with damping on the residual vector, in scaled variables.
+
+        u = base + scale z,    the columns of dr/dz have one length at z = 0
+
+    A solver of optimistix asks for the residual once a step, at a point that its state tells
+    beforehand. So the one large program, that of residual and Jacobian, is called here, and the
+    solver's step is a small one.
+
+    - `evaluate`: function ``(u, horizon, extra)`` → `Evaluation`, compiled here.
+    - `solver`: one of optimistix's Gauss–Newton family.
+    """
+
+    def __init__(self, evaluate: Callable[..., Evaluation], solver: Any):
+        self.evaluate = eqx.filter_jit(evaluate)
+        self._solver = solver
+        self._step = eqx.filter_jit(
+            lambda z, known, state: solver.step(_function, z, known, {}, state, frozenset())
+        )
+
+    def _begin(self, z: Array, known: tuple[Array, Array]) -> Any:
+        shape = jax.ShapeDtypeStruct(known[0].shape, known[0].dtype)
+        return self._solver.init(_function, z, known, {}, shape, None, frozenset())
+
+    def at(self, u: np.ndarray, horizon: float = np.inf, extra: Any = None) -> Evaluation:
+        """Residual, Jacobian and the rest at u."""
+        return self.evaluate(jnp.asarray(u), jnp.asarray(horizon), extra)
+
+    def run(
+        self,
+        u: np.ndarray,
+        horizon: float,
+        *,
+        stage: int,
+        max_steps: int,
+        tolerance: float,
+        degrees: int,
+        first: Evaluation | None = None,
+        extra: Any = None,
+        resume: Position | None = None,
+        watch: Callable[[Record, Position], None],
+    ) -> tuple[np.ndarray, Evaluation, FIT_RESULTS]:
+        """u at the minimum, what was found there, and the status.
+
+        - `first`: what is known at u already; `degrees` of freedom; `extra` for `evaluate`.
+
+        Ends when the step to the next trial moves what is predicted by less than `tolerance`
+        standard errors, the size of which is found from the residuals.
+        """
+        if resume is None:
+            best = self.at(u, horizon, extra) if first is None else first
+            if not (np.isfinite(best.residual).all() and np.isfinite(best.jacobian).all()):
+                return u, best, FIT_RESULTS.not_finite
+            length = np.linalg.norm(np.asarray(best.jacobian), axis=0)
+            scale = np.where(length > 0, _STIFFNESS / np.where(length > 0, length, 1.0), 1.0)
+            base, z, done = np.asarray(u), jnp.zeros(len(u)), 0
+            state = self._begin(z, (best.residual, best.jacobian))
+            trial = best
+        else:
+            base, scale, done = resume.base, resume.scale, resume.done
+            z = jnp.asarray(resume.z)
+            best = self.at(base + scale * np.asarray(z), horizon, extra)
+            state = _with_leaves(self._begin(z, (best.residual, best.jacobian)), resume.leaves)
+            trial = None
+        status, rejected = FIT_RESULTS.max_steps_reached, 0
+        while done < max_steps:
+            if trial is None:
+                trial = self.at(base + scale * np.asarray(state.y_eval), horizon, extra)
+            z, state, _ = self._step(z, (trial.residual, trial.jacobian * scale), state)
+            done += 1
+            accepted = int(state.num_steps_since_acceptance) == 0
+            best, rejected = (trial, 0) if accepted else (best, rejected + 1)
+            trial = None
+            residual = np.asarray(best.residual)
+            loss = float(residual @ residual) / 2
+            spread = np.sqrt(2 * loss / max(degrees, 1))
+            moved = _STIFFNESS * float(np.linalg.norm(state.y_eval - z))
+            u = base + scale * np.asarray(z)
+            position = Position(
+                stage, horizon, done, base, scale, np.asarray(z), _leaves(state), _leaves(extra)
+            )
+            in_sigma = moved / spread if spread else 0.0
+            watch(Record(stage, horizon, loss, in_sigma, accepted, u), position)
+            floor = 1e-13 * _STIFFNESS * float(np.linalg.norm(u / scale))
+            if not np.isfinite(moved):
+                status = FIT_RESULTS.stalled
+                break
+            if (moved <= tolerance * spread and rejected < 3) or moved <= floor:
+                status = FIT_RESULTS.converged
+                break
+            if rejected >= 3 and (rejected >= 12 or moved <= tolerance * spread):
+                gradient = (np.asarray(best.jacobian) * scale).T @ residual
+                flat = np.abs(gradient).max() <= _FLAT * _STIFFNESS * spread
+                status = FIT_RESULTS.converged if flat else FIT_RESULTS.stalled
+                break
+        return u, best, status
+
+
+class ScalarStage:
+    """A minimiser of optimistix, or one of optax, on the scalar loss, in u = base + scale z.
+
+    - `value`: function ``(u, horizon, choice)`` → the loss.
+    """
+
+    def __init__(self, value: Callable[..., Array], solver: Any):
+        self.solver = solver
+        self.value = eqx.filter_jit(value)
+
+        @eqx.filter_custom_jvp
+        def function(z, known):
+            return value(known.base + known.scale * z, known.horizon, known.extra)
+
+        @function.def_jvp
+        def _(primals, tangents):
+            # By reverse mode, whatever the solver takes: memory flat in the number of steps.
+            z, known = primals
+            loss, slope = jax.value_and_grad(
+                lambda z: value(known.base + known.scale * z, known.horizon, known.extra)
+            )(z)
+            return loss, slope @ tangents[0]
+
+        self._function = lambda z, known: (function(z, known), None)
+        self._step = eqx.filter_jit(
+            lambda z, known, state: self.solver.step(
+                self._function, z, known, {}, state, frozenset()
+            )
+        )
+
+    def run(
+        self,
+        u: np.ndarray,
+        horizon: float,
+        *,
+        stage: int,
+        max_steps: int,
+        tolerance: float,
+        scale: np.ndarray,
+        choose: Callable[[int], Any] | None = None,
+        resume: Position | None = None,
+        watch: Callable[[Record, Position], None],
+    ) -> tuple[np.ndarray, FIT_RESULTS]:
+        """u at the end, and the status.
+
+        With `choose`, a function of the number of the step → arcs, it ends after `max_steps`;
+        else when the loss of a step changed by less than tolerance² (in −log likelihood), three
+        times running.
+        """
+        base = jnp.asarray(u if resume is None else resume.base)
+        size = jnp.asarray(scale if resume is None else resume.scale)
+        z = jnp.zeros(len(u)) if resume is None else jnp.asarray(resume.z)
+        done = 0 if resume is None else resume.done
+
+        def known(step):
+            extra = None if choose is None else choose(step)
+            return _Known(base, size, jnp.asarray(horizon), extra)
+
+        struct = jax.ShapeDtypeStruct((), jnp.result_type(float))
+        state = self.solver.init(
+            self._function, jnp.zeros(len(u)), known(0), {}, struct, None, frozenset()
+        )
+        if resume is not None:
+            state = _with_leaves(state, resume.leaves)
+        is_optax = isinstance(self.solver, optx.OptaxMinimiser)
+        last, still = np.inf, 0
+        status = FIT_RESULTS.steps_done if is_optax else FIT_RESULTS.max_steps_reached
+        while done < max_steps:
+            old = z
+            z, state, _ = self._step(z, known(done), state)
+            done += 1
+            loss = float(state.f if is_optax else state.f_info.f)
+            if not np.isfinite(loss) and done == 1:
+                return u, FIT_RESULTS.not_finite
+            x = np.asarray(base + size * z)
+            position = Position(
+                stage, horizon, done, np.asarray(base), np.asarray(size), np.asarray(z),
+                _leaves(state),
+            )  # fmt: skip
+            moved = float(np.linalg.norm(z - old))
+            watch(Record(stage, horizon, loss, moved, bool(moved > 0), x), position)
+            if not np.isfinite(x).all():
+                return np.asarray(base + size * old), FIT_RESULTS.not_finite
+            if choose is None and not is_optax:
+                still = still + 1 if abs(last - loss) <= tolerance**2 else 0
+                last = loss
+                ended, _ = self.solver.terminate(
+                    self._function, z, known(done), {}, state, frozenset()
+                )
+                if bool(ended) or still >= 3:
+                    status = FIT_RESULTS.converged
+                    break
+        return np.asarray(base + size * z), status
+
+
+def _leaves(state: Any) -> list[np.ndarray]:
+    """The numbers in it."""
+    return [np.asarray(x) for x in jax.tree.leaves(eqx.filter(state, eqx.is_array))]
+
+
+def _with_leaves(state: Any, leaves: list[np.ndarray]) -> Any:
+    """The same state with other numbers."""
+    arrays, rest = eqx.partition(state, eqx.is_array)
+    old, tree = jax.tree.flatten(arrays)
+    shapes = [np.shape(x) for x in old]
+    if shapes != [np.shape(x) for x in leaves]:
+        raise ValueError("the checkpoint is of another fit: its optimiser has another state.")
+    new = [jnp.asarray(x, o.dtype) for x, o in zip(leaves, old, strict=True)]
+    return eqx.combine(jax.tree.unflatten(tree, new), rest)

@@ -1,0 +1,254 @@
+"""A fit as functions of one vector: predictions, residuals, Jacobian, a scalar to minimise."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._results import RESULTS, status_name
+from .losses import LeastSquares, Likelihood, Loss
+from .model import Group, check_observable, make_groups, predict, specification
+from .observations import Observations
+from .optimise import Evaluation
+from .parameters import Space
+
+_UNITS = 1e3
+"""By which factor data and model may differ in size before it must be a matter of units."""
+
+
+class Problem:
+    """What is to be fitted, in free variables u.
+
+    - `space`: the parameters. `arcs`: the data. `groups`: them as arrays.
+    - `size`: how many free variables there are. `count`: how many values were observed.
+    """
+
+    def __init__(
+        self,
+        model: Callable[..., Any],
+        arcs: list[Observations],
+        many: bool,
+        params: PyTree,
+        *,
+        bounds: PyTree = None,
+        priors: PyTree = None,
+        loss: Loss | Likelihood = LeastSquares(),
+    ):
+        if not callable(model):
+            raise TypeError(
+                "model must be a dvi.Model or a function of the parameters that returns the "
+                f"arguments of dvi.integrate, got {model!r}."
+            )
+        if not isinstance(loss, Loss | Likelihood):
+            raise TypeError(
+                f"loss must be a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or "
+                f"dvi.Likelihood(f), got {loss!r}."
+            )
+        self.model, self.arcs, self.many, self.loss = model, arcs, many, loss
+        self.space = Space(params, bounds, priors)
+        self.size = self.space.size
+        self.has_errors = arcs[0].has_errors
+        if not self.has_errors:
+            for what, there in (
+                ("priors", self.space.count_of_priors > 0),
+                ("a robust loss", not isinstance(loss, LeastSquares | Likelihood)),
+            ):
+                if there:
+                    raise ValueError(
+                        f"{what} can only be weighed against data with errors: give sigma or "
+                        "covariance with the observations."
+                    )
+        self.specs = [self.specification(params, i) for i in range(len(arcs))]
+        for i, arc in enumerate(arcs):
+            check_observable(i, arc, self.specs[i])
+        self.groups = make_groups(arcs, self.specs)
+        self.count = int(sum(group.seen.sum() for group in self.groups))
+
+    def specification(self, params: PyTree, arc: Any) -> dict[str, Any]:
+        """The arguments of `integrate` for an arc."""
+        return specification(self.model, params, arc, self.many)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Observed values and priors minus parameters."""
+        return self.count + self.space.count_of_priors - self.size
+
+    def check_count(self) -> None:
+        """**Raises** `ValueError` for fewer observed values than parameters."""
+        if self.degrees_of_freedom < 0:
+            raise ValueError(
+                f"{self.size} parameters cannot follow from {self.count} observed values"
+                + (f" and {n} priors" if (n := self.space.count_of_priors) else "")
+                + ". Fit fewer parameters, give priors, or more observations."
+            )
+
+    # ---- the model
+
+    def predict(self, params: PyTree, group: Group, arcs: Any = None) -> tuple[Array, RESULTS]:
+        """Predictions (A, N, K) and a status for each arc of a group (or for some of them)."""
+        which = np.arange(len(group.arcs)) if arcs is None else arcs
+
+        def one(arc, t0, ts, pick):
+            found, _, result = predict(self.specification(params, arc), t0, ts, pick, group)
+            return found, result
+
+        pick = None if group.pick is None else jnp.asarray(group.pick)[which]
+        return jax.vmap(one, in_axes=(0, 0, 0, None if pick is None else 0))(
+            jnp.asarray(group.arcs)[which], jnp.asarray(group.t0)[which],
+            jnp.asarray(group.ts)[which], pick,
+        )  # fmt: skip
+
+    def whitened(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
+        """Residuals predicted − observed in standard errors, (A, N, K) for each group, zero for
+        what is missing or later than `horizon` after the start; and predictions with statuses."""
+        params = self.space.to_params(self.space.to_x(u))
+        rows, known = [], []
+        for group in self.groups:
+            found, result = self.predict(params, group)
+            rows.append(_whiten(group, found, _within(group, horizon)))
+            known.append((found, result))
+        return rows, known
+
+    def residuals(self, u: Array, horizon: Any = np.inf) -> Array:
+        """The vector whose half square is the loss, priors last."""
+        return self.root_rows(u, self.whitened(u, horizon)[0])
+
+    def root_rows(self, u: Array, rows: list[Array]) -> Array:
+        """The same from whitened residuals."""
+        return jnp.concatenate([self.root(r).ravel() for r in rows] + [self.prior_rows(u)])
+
+    def root(self, r: Array) -> Array:
+        """What is squared of whitened residuals; for a likelihood they themselves."""
+        return self.loss.root(r) if isinstance(self.loss, Loss) else r
+
+    def prior_rows(self, u: Array) -> Array:
+        """Parameters minus their prior means in prior standard errors, 0 without a prior."""
+        return (self.space.to_x(u) - self.space.prior_mean) * self.space.prior_weight
+
+    def by_arc(self, rows: list[Any], known: list[Any]) -> tuple[list, list, list[str]]:
+        """For each arc predictions (N, ...), whitened residuals (N, K), and the status."""
+        predicted, whitened, names = {}, {}, {}
+        for group, r, (values, result) in zip(self.groups, rows, known, strict=True):
+            status = np.atleast_1d(status_name(result))
+            for a, i in enumerate(group.arcs):
+                arc, n = self.arcs[i], len(self.arcs[i].ts)
+                predicted[i] = np.asarray(values[a, :n]).reshape(arc.values.shape)
+                whitened[i] = np.where(group.seen[a, :n], np.asarray(r[a, :n]), np.nan)
+                names[i] = str(status[a])
+        each = range(len(self.arcs))
+        return [predicted[i] for i in each], [whitened[i] for i in each], [names[i] for i in each]
+
+    def rows_within(self, horizon: float) -> np.ndarray:
+        """Which entries of the residual vector lie within a horizon; priors do."""
+        inside = [np.asarray(_within(g, horizon)).ravel() for g in self.groups]
+        return np.concatenate([*inside, np.ones(self.size, bool)])
+
+    def evaluate(self, u: Array, horizon: Any = np.inf, extra: Any = None) -> Evaluation:
+        """Residual vector and Jacobian, by forward mode: memory does not grow with the number of
+        steps; and for each group predictions and statuses."""
+        del extra
+
+        def twice(u):
+            rows, known = self.whitened(u, horizon)
+            r = self.root_rows(u, rows)
+            return r, (r, rows, known)
+
+        J, (r, rows, known) = jax.jacfwd(twice, has_aux=True)(u)
+        return Evaluation(r, J, (rows, known))
+
+    def scalar(self, u: Array, horizon: Any = np.inf, choice: Any = None) -> Array:
+        """The loss: ½ Σ ρ(r²), or −log likelihood; −log prior is added.
+
+        With `choice`, for each group indices of arcs, those alone, weighed to stand for all.
+        """
+        x = self.space.to_x(u)
+        params = self.space.to_params(x)
+        total = jnp.sum(((x - self.space.prior_mean) * self.space.prior_weight) ** 2) / 2
+        for i, group in enumerate(self.groups):
+            which = None if choice is None else choice[i]
+            found, _ = self.predict(params, group, which)
+            part = group if which is None else _Part(group, which)
+            keep = _within(part, horizon)
+            weight = 1.0 if which is None else len(group.arcs) / len(which)
+            if isinstance(self.loss, Likelihood):
+                total = total + weight * self._likelihood(part, found, keep, params)
+            else:
+                total = (
+                    total + weight * jnp.sum(self.loss.root(_whiten(part, found, keep)) ** 2) / 2
+                )
+        return total
+
+    def _likelihood(self, group: Any, found: Array, keep: Array, params: PyTree) -> Array:
+        assert isinstance(self.loss, Likelihood)
+        if group.whiten.ndim == 4:
+            raise ValueError("dvi.Likelihood takes sigma, not covariance, with the observations.")
+        weight = jnp.where(keep, jnp.asarray(group.whiten), 1.0)
+        safe = jnp.where(keep, found, jnp.asarray(group.values))
+        each = jax.vmap(self.loss.negative_log_density, in_axes=(0, 0, 0, None))(
+            safe, jnp.asarray(group.values), 1 / weight, params
+        )
+        if jnp.shape(each) != jnp.shape(found):
+            raise ValueError(
+                "the function of dvi.Likelihood must return one number for each value, shape "
+                f"{found.shape[1:]} for an arc, got {jnp.shape(each)[1:]}."
+            )
+        return jnp.sum(jnp.where(keep, each, 0.0))
+
+    # ---- what stands before a fit
+
+    def check_start(self, known: list[Any], check_units: bool = True) -> None:
+        """Refuse a start at which the model fails from the first observation on, or whose
+        predictions are of another size than the data.
+
+        - `known`: predictions and statuses of each group.
+        """
+        for group, (found, result) in zip(self.groups, known, strict=True):
+            found = np.asarray(found)
+            names = np.atleast_1d(status_name(result))
+            for a, arc in enumerate(group.arcs):
+                first = group.seen[a].any(axis=1).argmax()
+                if not np.isfinite(found[a, first][group.seen[a, first]]).all():
+                    raise ValueError(
+                        f"at the starting parameters the model gives no number for the first "
+                        f"observation of arc {arc} (t = {group.ts[a, first]:g}; status "
+                        f"{names[a]!r}). Start from other parameters or take a smaller h."
+                    )
+        if check_units:
+            self._check_units([np.asarray(found) for found, _ in known])
+
+    def _check_units(self, found: list[np.ndarray]) -> None:
+        seen = np.concatenate([g.values[g.seen] for g in self.groups])
+        model = np.concatenate([f[g.seen] for f, g in zip(found, self.groups, strict=True)])
+        model = model[np.isfinite(model)]
+        data, own = np.abs(seen).max(), np.abs(model).max() if model.size else 0.0
+        if data == 0 or own == 0 or 1 / _UNITS < data / own < _UNITS:
+            return
+        raise ValueError(
+            f"the observed values are up to {data:.3g}, those of the model at the starting "
+            f"parameters up to {own:.3g}: a factor of {data / own:.3g}. Are they in the same "
+            "units? If it is meant, say check_units=False."
+        )
+
+
+class _Part:
+    """Some arcs of a group."""
+
+    def __init__(self, group: Group, which: Any):
+        for name in ("t0", "ts", "values", "seen", "whiten"):
+            setattr(self, name, jnp.asarray(getattr(group, name))[which])
+
+
+def _within(group: Any, horizon: Any) -> Array:
+    """What was observed within the horizon, shape (A, N, K)."""
+    since = jnp.abs(jnp.asarray(group.ts) - jnp.asarray(group.t0)[:, None])
+    return jnp.asarray(group.seen) & (since <= horizon)[..., None]
+
+
+def _whiten(group: Any, found: Array, keep: Array) -> Array:
+    # First where, then subtract: a trajectory that fails after the horizon leaves no NaN behind.
+    off = jnp.where(keep, found - jnp.asarray(group.values), 0.0)
+    whiten = jnp.asarray(group.whiten)
+    return off * whiten if whiten.ndim == 3 else jnp.einsum("anij,anj->ani", whiten, off)

@@ -1,0 +1,268 @@
+"""What a fit found: parameters, how well they are known, what is left over."""
+
+import json
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from .results import FIT_RESULTS, NAMES, name_of
+from .uncertainty import correlations
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    r"""Parameters fitted to observations.
+
+    - `params`: the pytree that was given, with fitted numbers; `x` those n numbers as one vector,
+      `names` what they are called.
+    - `covariance`: of x, shape (n, n), by Gauss–Newton, s² (JᵀJ)⁻¹; for `dvi.Likelihood` the
+      inverse of the Hessian. Infinite for what the data do not determine. s² is 1 when the data
+      have errors, else their variance found from the residuals.
+    - `history`: arrays with one entry for each step of the optimiser: `stage`, `horizon`,
+      `loss`, `step`, `accepted`, and `x`, shape (steps, n).
+    - `result`: how it ended, one of `FIT_RESULTS`; `status` its name.
+    - `ts`, `observed`, `predicted`: lists with an array for each arc, (N,) and (N, ...).
+    - `whitened`: residuals in standard errors, (N, K) for each arc, NaN for what is missing.
+    - `loss`: ½ Σ ρ(r²) + priors; `degrees_of_freedom`; `num_observed`: how many values.
+    - `undetermined`: directions of the parameters that the data say nothing of, in words.
+    - `singular_values`: of the Jacobian with columns of unit length, largest first.
+    - `curvature`: the exact second derivative of the loss along each principal direction over
+      that of Gauss–Newton: near 1 where the errors can be trusted. None if it was not asked for.
+    - `at_bounds`: names of the parameters that ended at a bound.
+    - `trajectories`: status of each arc's trajectory.
+    """
+
+    params: PyTree
+    x: np.ndarray
+    names: list[str]
+    covariance: np.ndarray
+    history: dict[str, np.ndarray]
+    result: FIT_RESULTS
+    ts: list[np.ndarray]
+    observed: list[np.ndarray]
+    predicted: list[np.ndarray]
+    whitened: list[np.ndarray]
+    loss: float
+    degrees_of_freedom: int
+    num_observed: int
+    has_errors: bool
+    undetermined: list[str] = field(default_factory=list)
+    singular_values: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    curvature: np.ndarray | None = None
+    at_bounds: list[str] = field(default_factory=list)
+    trajectories: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+    @property
+    def status(self) -> str:
+        """The name of `result`."""
+        return name_of(self.result)
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard errors of x, shape (n,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlations(self) -> np.ndarray:
+        """Correlations of x, shape (n, n); NaN where a variance is not finite."""
+        return correlations(self.covariance)
+
+    @property
+    def residuals(self) -> list[np.ndarray]:
+        """Observed minus predicted, in the units of the data, one array for each arc."""
+        return [o - p for o, p in zip(self.observed, self.predicted, strict=True)]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals, in the units of the data."""
+        return float(np.sqrt(np.nanmean(np.concatenate([r.ravel() for r in self.residuals]) ** 2)))
+
+    @property
+    def chi2(self) -> float:
+        """Σ of the squared whitened residuals."""
+        return float(sum(np.nansum(r**2) for r in self.whitened))
+
+    @property
+    def reduced_chi2(self) -> float:
+        """`chi2` over the degrees of freedom: about 1 for a right model and right errors."""
+        return self.chi2 / self.degrees_of_freedom if self.degrees_of_freedom else np.nan
+
+    def statistics(self) -> dict[str, float]:
+        """Of the whitened residuals: `rms`, `mean`, `largest`, `skewness`, `excess` kurtosis, and
+        `lag_one`, the correlation of neighbours in time, which is about 0 for a right model."""
+        r = np.concatenate([w[np.isfinite(w)] for w in self.whitened])
+        mean, spread = r.mean(), r.std()
+        safe = spread if spread > 0 else 1.0
+        pairs = [(w[:-1], w[1:]) for w in self.whitened]
+        a, b = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in (0, 1))
+        both = np.isfinite(a) & np.isfinite(b)
+        total = (r**2).mean()
+        return {
+            "rms": float(np.sqrt(total)),
+            "mean": float(mean),
+            "largest": float(np.abs(r).max()),
+            "skewness": float((((r - mean) / safe) ** 3).mean()),
+            "excess": float((((r - mean) / safe) ** 4).mean() - 3),
+            "lag_one": float((a[both] * b[both]).mean() / total) if both.any() and total else 0.0,
+        }
+
+    def __str__(self) -> str:
+        sigma, width = self.sigma, max(len(n) for n in self.names[:40])
+        lines = [f"{self.status} after {len(self.history['loss'])} steps, {self.seconds:.1f} s"]
+        for name, x, s in list(zip(self.names, self.x, sigma, strict=True))[:40]:
+            lines.append(f"  {name:{width}}  {with_error(x, s)}")
+        if len(self.names) > 40:
+            lines.append(f"  … and {len(self.names) - 40} more")
+        errors = f"reduced chi² {self.reduced_chi2:.4g}, " if self.has_errors else ""
+        lines.append(
+            f"{errors}rms {self.rms:.4g}, {self.num_observed} values, "
+            f"{self.degrees_of_freedom} degrees of freedom"
+        )
+        lines += [f"not determined: {words}" for words in self.undetermined]
+        if self.at_bounds:
+            lines.append(f"at their bounds: {', '.join(self.at_bounds)}")
+        if self.result != FIT_RESULTS.converged and str(FIT_RESULTS[self.result]):
+            lines.append(str(FIT_RESULTS[self.result]))
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything but functions into one file (.npz), atomically."""
+        about: dict[str, Any] = {
+            "format": _FORMAT, "names": self.names, "result": self.status, "loss": self.loss,
+            "degrees_of_freedom": self.degrees_of_freedom, "num_observed": self.num_observed,
+            "has_errors": self.has_errors, "undetermined": self.undetermined,
+            "at_bounds": self.at_bounds, "trajectories": self.trajectories,
+            "seconds": self.seconds, "arcs": len(self.ts), "shape": _shape_of(self.params),
+        }  # fmt: skip
+        arrays = {"x": self.x, "covariance": self.covariance, "values": self.singular_values}
+        arrays |= {f"history.{name}": value for name, value in self.history.items()}
+        for name in ("ts", "observed", "predicted", "whitened"):
+            arrays |= {f"{name}.{i}": a for i, a in enumerate(getattr(self, name))}
+        if self.curvature is not None:
+            arrays["curvature"] = self.curvature
+        write_npz(path, about, arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], params: PyTree = None) -> "FitResult":
+        """Read what `save` wrote.
+
+        - `params`: a pytree like the fitted one; needed only if it is not made of dicts, lists and
+          numbers (a network, whose functions are not in the file).
+
+        **Raises** `FileNotFoundError`, and `ValueError` for a file that is no fit or of another
+        format, or params of other names.
+        """
+        about, arrays = read_npz(path, "fit")
+        if params is None:
+            if about["shape"] is None:
+                raise ValueError(
+                    "these parameters hold more than numbers: FitResult.load(path, params) with a "
+                    "pytree like the fitted one."
+                )
+            like = jax.tree.map(np.array, about["shape"], is_leaf=lambda x: isinstance(x, list))
+        else:
+            like = params
+        from .parameters import Space
+
+        space = Space(like)
+        if space.names != about["names"]:
+            raise ValueError(
+                f"the fit in {path} has the parameters {about['names'][:5]}…, not "
+                f"{space.names[:5]}…."
+            )
+        many = range(about["arcs"])
+        history = {k[8:]: v for k, v in arrays.items() if k.startswith("history.")}
+        lists = {
+            name: [arrays[f"{name}.{i}"] for i in many]
+            for name in ("ts", "observed", "predicted", "whitened")
+        }
+        return cls(
+            params=space.to_params(jnp.asarray(arrays["x"])),
+            x=arrays["x"], names=about["names"], covariance=arrays["covariance"],
+            history=history, result=getattr(FIT_RESULTS, _known(about["result"])), **lists,
+            loss=about["loss"], degrees_of_freedom=about["degrees_of_freedom"],
+            num_observed=about["num_observed"], has_errors=about["has_errors"],
+            undetermined=about["undetermined"], singular_values=arrays["values"],
+            curvature=arrays.get("curvature"), at_bounds=about["at_bounds"],
+            trajectories=about["trajectories"], seconds=about["seconds"],
+        )  # fmt: skip
+
+
+def _known(name: str) -> str:
+    if name not in NAMES:
+        raise ValueError(f"the file has the unknown status {name!r}: it is of a newer version.")
+    return name
+
+
+def with_error(x: float, sigma: float) -> str:
+    """``1.00063 ± 0.00002``, with two digits of the error."""
+    if not np.isfinite(sigma) or sigma <= 0:
+        return f"{x:.8g} ± {sigma:.2g}"
+    digits = 1 - int(np.floor(np.log10(sigma)))
+    size = np.floor(np.log10(abs(x))) if x else 0
+    if -4 <= size <= 6 and 0 <= digits <= 12:
+        return f"{x:.{digits}f} ± {sigma:.{digits}f}"
+    return f"{x:.{max(int(size) + digits, 1)}e} ± {sigma:.1e}"
+
+
+def _shape_of(params: PyTree) -> Any:
+    """The pytree as JSON with lists in place of arrays, or None for one that is more than that."""
+    leaves = jax.tree.leaves(params)
+    plain = all(eqx.is_array_like(x) for x in leaves) and _is_plain(params)
+    return jax.tree.map(lambda x: np.asarray(x).tolist(), params) if plain and leaves else None
+
+
+def _is_plain(node: Any) -> bool:
+    """Whether it is arrays and numbers on dicts with names: lists would not be told from arrays."""
+    if isinstance(node, dict):
+        return all(isinstance(k, str) and _is_plain(v) for k, v in node.items())
+    return isinstance(node, np.ndarray | np.generic | jax.Array | float | int)
+
+
+def write_npz(path: str | os.PathLike[str], about: dict[str, Any], arrays: dict[str, Any]) -> None:
+    """One .npz file with a JSON header, written under another name first."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"there is no directory {path.parent} to write {path.name} into.")
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, about=np.array(json.dumps(about)), **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def read_npz(path: str | os.PathLike[str], what: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Header and arrays of such a file.
+
+    **Raises** `FileNotFoundError`, `ValueError` for another file or format.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no {what} at {path}.")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        about = json.loads(str(arrays.pop("about")))
+    except Exception as error:
+        raise ValueError(f"{path} is no {what} of this package, or is damaged ({error}).") from None
+    if about.get("format") != _FORMAT:
+        raise ValueError(f"{path} has the format {about.get('format')!r}; this reads {_FORMAT}.")
+    return about, arrays

@@ -1,0 +1,82 @@
+"""How well parameters are known: covariance, correlations, what the data do not determine."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_RANK = 1e-9
+"""Singular value of the scaled Jacobian, relative to the largest, below which a direction counts
+as not determined: derivatives are known to some 1e-12."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Covariance of the free variables, and the directions behind it.
+
+    - `covariance`: (n, n); infinite for what is not determined.
+    - `directions`: principal directions of the scaled Jacobian, best known first, as columns in
+      u; `singular_values`: theirs.
+    - `undetermined`: those columns of `directions` that the data say nothing of, in scaled
+      variables with unit length, shape (n, count).
+    """
+
+    covariance: np.ndarray
+    directions: np.ndarray
+    singular_values: np.ndarray
+    undetermined: np.ndarray
+
+
+def uncertainty(J: np.ndarray, variance: float, kept: np.ndarray | None = None) -> Uncertainty:
+    r"""Gauss–Newton covariance s² (JᵀJ)⁻¹ by singular values of J with columns of unit length.
+
+    - `J`: derivative of the whitened residuals, (R, n). `variance`: s², 1 for known errors.
+    - `kept`: basis of the directions that constraints leave free, (n, m), or None for all.
+
+    A parameter that shares in a direction that is not determined has infinite variance.
+    """
+    n = J.shape[1]
+    Z = np.eye(n) if kept is None else kept
+    length = np.linalg.norm(J, axis=0)
+    scale = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 1.0)
+    if kept is not None:  # the same space, orthonormal in scaled variables
+        Z = np.linalg.qr(Z / scale[:, None])[0]
+    # QR first: the singular values of a small triangle.
+    R = np.linalg.qr((J * scale) @ Z, mode="r")
+    _, values, Vt = np.linalg.svd(R, full_matrices=True)
+    values = np.concatenate([values, np.zeros(Z.shape[1] - len(values))])
+    V = Z @ Vt.T
+    good = values > _RANK * max(values.max(initial=0.0), np.finfo(float).tiny)
+    known = V[:, good] / values[good]
+    covariance = variance * (known @ known.T) * np.outer(scale, scale)
+    lost = V[:, ~good]
+    share = (np.abs(lost) > 1e-6).any(axis=1)
+    covariance[np.ix_(share, np.ones(n, bool))] = np.nan
+    covariance[np.ix_(np.ones(n, bool), share)] = np.nan
+    covariance[share, share] = np.inf
+    return Uncertainty(covariance, V * scale[:, None], values, lost)
+
+
+def correlations(covariance: np.ndarray) -> np.ndarray:
+    """Correlation matrix of a covariance, NaN where a variance is not finite."""
+    sigma = np.sqrt(np.diag(covariance))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found = covariance / np.outer(sigma, sigma)
+    found[~np.isfinite(found)] = np.nan
+    return found
+
+
+def in_words(direction: np.ndarray, names: list[str], most: int = 4) -> str:
+    """A direction as a sum of names, largest first: ``0.71 q0[0] − 0.71 mu``."""
+    order = np.argsort(-np.abs(direction))
+    order = [i for i in order[:most] if abs(direction[i]) > 0.05]
+    sign = 1 if direction[order[0]] >= 0 else -1
+    parts = [f"{sign * direction[i]:+.2f} {names[i]}" for i in order]
+    more = " + …" if (np.abs(direction) > 0.05).sum() > most else ""
+    return " ".join(parts).lstrip("+").replace("-", "−") + more
+
+
+def null_space(C: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of the directions d with C d = 0, shape (n, n − rank)."""
+    _, s, Vt = np.linalg.svd(C, full_matrices=True)
+    rank = int((s > 1e-12 * s.max(initial=0.0)).sum())
+    return Vt[rank:].T
