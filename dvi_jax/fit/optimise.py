@@ -145,6 +145,7 @@ class LeastSquaresStage:
             z = jnp.asarray(resume.z)
             best = self.at(base + scale * np.asarray(z), horizon, extra)
             state = _with_leaves(self._begin(z, (best.residual, best.jacobian)), resume.leaves)
+            _check_same(best.residual, state.f_info.residual)
             trial = None
         status, rejected = FIT_RESULTS.max_steps_reached, 0
         while done < max_steps:
@@ -273,6 +274,15 @@ class ScalarStage:
                     status = FIT_RESULTS.converged
                     break
         return np.asarray(base + size * z), status
+
+
+def _check_same(now: Array, then: Array) -> None:
+    """Refuse a checkpoint whose residuals are not those of this model."""
+    if not np.allclose(now, then, rtol=1e-6, atol=1e-6 * float(np.abs(then).max(initial=0.0))):
+        raise ValueError(
+            "the checkpoint is of another model: at its parameters this one predicts other values. "
+            "Give another file, or remove it to begin anew."
+        )
 
 
 def _leaves(state: Any) -> list[np.ndarray]:
