@@ -23,6 +23,10 @@ from .run import Run, identity
 from .shooting import MultipleShooting, Segments, SingleShooting
 from .stages import MANY, by_gradient, in_segments, least_squares
 
+_LEVENBERG_MARQUARDT = optx.LevenbergMarquardt(rtol=1e-14, atol=1e-300)
+_BFGS = optx.BFGS(rtol=1e-10, atol=1e-10)
+# One object each, so that all fits share what is compiled for it. How they end is decided here.
+
 
 def fit(
     model: Callable[..., Any],
@@ -111,7 +115,7 @@ def fit(
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError("multiple shooting goes with least squares and their solvers alone.")
     wanted = _horizons(horizons)
-    u = problem.space.to_u(problem.space.start)
+    u = problem.space.to_u(problem.start)
     name = identity(problem, u, solver, shooting, wanted, batch, seed, tolerance, max_steps)
     with shown(progress) as show:
         run = Run(problem, max_steps, tolerance, show, began, checkpoint, name)
@@ -141,9 +145,9 @@ def _solver(optimiser: Any, problem: Problem) -> Any:
         if problem.size > MANY:
             optimiser = optax.adam(optax.warmup_cosine_decay_schedule(1e-5, 3e-3, 100, 2000, 1e-5))
         elif residuals:
-            return optx.LevenbergMarquardt(rtol=1e-14, atol=1e-300)
+            return _LEVENBERG_MARQUARDT
         else:
-            return optx.BFGS(rtol=1e-10, atol=1e-10)
+            return _BFGS
     if isinstance(optimiser, optax.GradientTransformation):
         return optx.OptaxMinimiser(optimiser, rtol=0.0, atol=0.0)
     if isinstance(optimiser, optx.AbstractGaussNewton):

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -25,7 +24,7 @@ _OWN = ("num_steps", "save", "observe", "throw", "progress", "stop", "t0")
 """What `fit` sets itself."""
 
 
-class Model:
+class Model(eqx.Module):
     """A system with what is known of it; parameters replace or add the rest.
 
     - `system`: a `System`. `h`: the step size [time]. `q0`, `p0`, `epsilon`, `args`: as in
@@ -41,6 +40,9 @@ class Model:
 
     **Raises** `TypeError` for arguments and parameters that have no such name.
     """
+
+    fixed: dict[str, Any]
+    rest: dict[str, Any]
 
     def __init__(
         self,
@@ -62,8 +64,10 @@ class Model:
                     f"dvi.Model takes no {name!r}: options are {', '.join(known)}; what is saved "
                     "and observed follows from the data."
                 )
-        self.fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
-        self.rest = {"system": system, "h": h, **options}
+        fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
+        # Arrays, so that another value needs no other compilation.
+        self.fixed = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, float) else x, fixed)
+        self.rest = {"system": system, "h": float(h), **options}
 
     def __call__(self, params: Mapping[str, Any], arc: Any = None) -> dict[str, Any]:
         """The arguments of `integrate` for an arc (None: there is one, without rows)."""
@@ -92,8 +96,7 @@ class Model:
         return {**self.rest, **found}
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(eqx.Module):
     """Arcs that are computed together: same observable, about the same number of steps.
 
     Arrays have the arcs in front and are padded to one number of observations N of K components:
@@ -108,10 +111,10 @@ class Group:
     values: np.ndarray
     seen: np.ndarray
     whiten: np.ndarray
-    observe: Callable[..., Any]
-    num_steps: int
-    block: int
     pick: np.ndarray | None
+    observe: Callable[..., Any] = eqx.field(static=True)
+    num_steps: int = eqx.field(static=True)
+    block: int = eqx.field(static=True)
 
 
 def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: bool) -> dict:

@@ -1,5 +1,6 @@
 """One stage of a fit: an optimiser driven step by step, so that it can be watched and resumed."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -82,6 +83,20 @@ def _function(z, known):
     return _residual(z, known), None
 
 
+@functools.lru_cache(maxsize=64)
+def _begin(solver: Any, rows: int, size: int) -> Any:
+    """The state of a solver before its first step; one object, so that a step is compiled once."""
+    z, known = jnp.zeros(size), (jnp.zeros(rows), jnp.zeros((rows, size)))
+    shape = jax.ShapeDtypeStruct((rows,), known[0].dtype)
+    return solver.init(_function, z, known, {}, shape, None, frozenset())
+
+
+@eqx.filter_jit
+def _advance(solver: Any, z: Array, known: tuple[Array, Array], state: Any) -> tuple[Array, Any]:
+    z, state, _ = solver.step(_function, z, known, {}, state, frozenset())
+    return z, state
+
+
 class LeastSquaresStage:
     """Gauss–Newton with damping on the residual vector, in scaled variables.
 
@@ -91,20 +106,12 @@ class LeastSquaresStage:
     beforehand. So the one large program, that of residual and Jacobian, is called here, and the
     solver's step is a small one.
 
-    - `evaluate`: function ``(u, horizon, extra)`` → `Evaluation`, compiled here.
+    - `evaluate`: compiled function ``(u, horizon, extra)`` → `Evaluation`.
     - `solver`: one of optimistix's Gauss–Newton family.
     """
 
     def __init__(self, evaluate: Callable[..., Evaluation], solver: Any):
-        self.evaluate = eqx.filter_jit(evaluate)
-        self._solver = solver
-        self._step = eqx.filter_jit(
-            lambda z, known, state: solver.step(_function, z, known, {}, state, frozenset())
-        )
-
-    def _begin(self, z: Array, known: tuple[Array, Array]) -> Any:
-        shape = jax.ShapeDtypeStruct(known[0].shape, known[0].dtype)
-        return self._solver.init(_function, z, known, {}, shape, None, frozenset())
+        self.evaluate, self._solver = evaluate, solver
 
     def at(self, u: np.ndarray, horizon: float = np.inf, extra: Any = None) -> Evaluation:
         """Residual, Jacobian and the rest at u."""
@@ -138,20 +145,21 @@ class LeastSquaresStage:
             length = np.linalg.norm(np.asarray(best.jacobian), axis=0)
             scale = np.where(length > 0, _STIFFNESS / np.where(length > 0, length, 1.0), 1.0)
             base, z, done = np.asarray(u), jnp.zeros(len(u)), 0
-            state = self._begin(z, (best.residual, best.jacobian))
+            state = _begin(self._solver, *best.jacobian.shape)
             trial = best
         else:
             base, scale, done = resume.base, resume.scale, resume.done
             z = jnp.asarray(resume.z)
             best = self.at(base + scale * np.asarray(z), horizon, extra)
-            state = _with_leaves(self._begin(z, (best.residual, best.jacobian)), resume.leaves)
+            state = _with_leaves(_begin(self._solver, *best.jacobian.shape), resume.leaves)
             _check_same(best.residual, state.f_info.residual)
             trial = None
         status, rejected = FIT_RESULTS.max_steps_reached, 0
         while done < max_steps:
             if trial is None:
                 trial = self.at(base + scale * np.asarray(state.y_eval), horizon, extra)
-            z, state, _ = self._step(z, (trial.residual, trial.jacobian * scale), state)
+            known = trial.residual, trial.jacobian * scale
+            z, state = _advance(self._solver, z, known, state)
             done += 1
             accepted = int(state.num_steps_since_acceptance) == 0
             best, rejected = (trial, 0) if accepted else (best, rejected + 1)
@@ -181,35 +189,44 @@ class LeastSquaresStage:
         return u, best, status
 
 
+def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
+    """The scalar loss over `per` as optimistix wants it, a function of z and where it is counted
+    from; its derivative by reverse mode, whatever the solver takes: memory flat in the number of
+    steps."""
+
+    def value(z, known):
+        return core.scalar(known.base + known.scale * z, known.horizon, known.extra) / per
+
+    @eqx.filter_custom_jvp
+    def function(z, known):
+        return value(z, known)
+
+    @function.def_jvp
+    def _(primals, tangents):
+        loss, slope = jax.value_and_grad(value)(*primals)
+        return loss, slope @ tangents[0]
+
+    return lambda z, known: (function(z, known), None)
+
+
+@eqx.filter_jit
+def _descend(
+    solver: Any, core: Any, per: float, z: Array, known: _Known, state: Any
+) -> tuple[Array, Any, Array]:
+    function = _scalar_function(core, per)
+    new, state, _ = solver.step(function, z, known, {}, state, frozenset())
+    ended, _ = solver.terminate(function, new, known, {}, state, frozenset())
+    return new, state, ended
+
+
 class ScalarStage:
     """A minimiser of optimistix, or one of optax, on the scalar loss, in u = base + scale z.
 
-    - `value`: function ``(u, horizon, choice)`` → the loss.
+    - `core`: has ``scalar(u, horizon, choice)``, the loss. `per`: what it is divided by.
     """
 
-    def __init__(self, value: Callable[..., Array], solver: Any):
-        self.solver = solver
-        self.value = eqx.filter_jit(value)
-
-        @eqx.filter_custom_jvp
-        def function(z, known):
-            return value(known.base + known.scale * z, known.horizon, known.extra)
-
-        @function.def_jvp
-        def _(primals, tangents):
-            # By reverse mode, whatever the solver takes: memory flat in the number of steps.
-            z, known = primals
-            loss, slope = jax.value_and_grad(
-                lambda z: value(known.base + known.scale * z, known.horizon, known.extra)
-            )(z)
-            return loss, slope @ tangents[0]
-
-        self._function = lambda z, known: (function(z, known), None)
-        self._step = eqx.filter_jit(
-            lambda z, known, state: self.solver.step(
-                self._function, z, known, {}, state, frozenset()
-            )
-        )
+    def __init__(self, core: Any, per: float, solver: Any):
+        self.core, self.per, self.solver = core, per, solver
 
     def run(
         self,
@@ -240,9 +257,9 @@ class ScalarStage:
             return _Known(base, size, jnp.asarray(horizon), extra)
 
         struct = jax.ShapeDtypeStruct((), jnp.result_type(float))
-        state = self.solver.init(
-            self._function, jnp.zeros(len(u)), known(0), {}, struct, None, frozenset()
-        )
+        function = _scalar_function(self.core, self.per)
+        zero = jnp.zeros(len(u))
+        state = self.solver.init(function, zero, known(0), {}, struct, None, frozenset())
         if resume is not None:
             state = _with_leaves(state, resume.leaves)
         is_optax = isinstance(self.solver, optx.OptaxMinimiser)
@@ -250,7 +267,7 @@ class ScalarStage:
         status = FIT_RESULTS.steps_done if is_optax else FIT_RESULTS.max_steps_reached
         while done < max_steps:
             old = z
-            z, state, _ = self._step(z, known(done), state)
+            z, state, ended = _descend(self.solver, self.core, self.per, z, known(done), state)
             done += 1
             loss = float(state.f if is_optax else state.f_info.f)
             if not np.isfinite(loss) and done == 1:
@@ -267,9 +284,6 @@ class ScalarStage:
             if choose is None and not is_optax:
                 still = still + 1 if abs(last - loss) <= tolerance**2 else 0
                 last = loss
-                ended, _ = self.solver.terminate(
-                    self._function, z, known(done), {}, state, frozenset()
-                )
                 if bool(ended) or still >= 3:
                     status = FIT_RESULTS.converged
                     break

@@ -2,8 +2,6 @@
 
 import time
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -22,11 +20,11 @@ def result_of(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
     """Errors and residuals at a minimum, as the user sees them."""
     problem, u, n = run.problem, minimum.u, run.problem.size
     space, has_residuals = problem.space, isinstance(problem.loss, Loss)
-    aux = minimum.aux or eqx.filter_jit(problem.whitened)(jnp.asarray(u))
+    aux = minimum.aux or problem.whitened(u)
     predicted, whitened, trajectories = problem.by_arc(*aux)
     x = np.asarray(space.to_x(jnp.asarray(u)))
     if has_residuals:
-        loss = float(np.sum(np.asarray(problem.root_rows(jnp.asarray(u), aux[0])) ** 2) / 2)
+        loss = float(np.sum(np.asarray(problem.core.root_rows(jnp.asarray(u), aux[0])) ** 2) / 2)
     else:
         loss = float(run.records[-1].loss) if run.records else np.nan
     degrees = problem.degrees_of_freedom
@@ -39,11 +37,11 @@ def result_of(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
         about = uncertainty(J, variance, minimum.free)
         slope, values = space.slope(u), about.singular_values
         covariance = about.covariance[:n, :n] * np.outer(slope, slope)
-        words = [in_words(d[:n], space.names) for d in about.undetermined.T if np.any(d[:n])]
+        words = [in_words(d[:n], list(space.names)) for d in about.undetermined.T if np.any(d[:n])]
         if check_curvature and minimum.free is None and has_residuals and n <= _FEW:
-            curvature = curvature_ratio(problem, u, J, about)
+            curvature = _curvature_ratio(problem, u, J, about)
     return FitResult(
-        params=space.to_params(jnp.asarray(x)), x=x, names=space.names, covariance=covariance,
+        params=space.to_params(jnp.asarray(x)), x=x, names=list(space.names), covariance=covariance,
         history=run.history(), result=minimum.status, ts=[a.ts for a in problem.arcs],
         observed=[a.values for a in problem.arcs], predicted=predicted, whitened=whitened,
         loss=loss, degrees_of_freedom=degrees, num_observed=problem.count,
@@ -53,23 +51,8 @@ def result_of(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
     )  # fmt: skip
 
 
-def curvature_ratio(
-    problem: Problem, u: np.ndarray, J: np.ndarray, about: Uncertainty
-) -> np.ndarray:
+def _curvature_ratio(problem: Problem, u: np.ndarray, J: np.ndarray, about: Uncertainty):
     """Exact second derivative of the loss along each principal direction over Gauss–Newton's."""
     D = about.directions[:, : about.directions.shape[1] - about.undetermined.shape[1]]
-    if D.shape[1] == 0:
-        return np.zeros(0)
-
-    def second(u, d):
-        def loss(t):
-            r = problem.residuals(u + t * d)
-            return r @ r / 2
-
-        def slope(t):
-            return jax.jvp(loss, (t,), (1.0,))[1]
-
-        return jax.jvp(slope, (0.0,), (1.0,))[1]
-
-    exact = jax.jit(jax.vmap(second, in_axes=(None, 0)))(jnp.asarray(u), jnp.asarray(D.T))
-    return np.asarray(exact) / np.sum((J @ D) ** 2, axis=0)
+    exact = np.asarray(problem.curvature(u, D.T)) if D.shape[1] else np.zeros(0)
+    return exact / np.sum((J @ D) ** 2, axis=0)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,79 +14,29 @@ from .losses import LeastSquares, Likelihood, Loss
 from .model import Group, check_observable, make_groups, predict, specification
 from .observations import Observations
 from .optimise import Evaluation
-from .parameters import Space
+from .parameters import Space, make_space
 
 _UNITS = 1e3
 """By which factor data and model may differ in size before it must be a matter of units."""
 
 
-class Problem:
-    """What is to be fitted, in free variables u.
+class Core(eqx.Module):
+    """The functions of a fit, with their data as arrays: what is compiled, and compiled once for
+    all fits of one model with data of one shape.
 
-    - `space`: the parameters. `arcs`: the data. `groups`: them as arrays.
-    - `size`: how many free variables there are. `count`: how many values were observed.
+    - `model`, `loss`: as given. `groups`: the data. `space`: the parameters. `many`: whether arcs
+      were given as a list.
     """
 
-    def __init__(
-        self,
-        model: Callable[..., Any],
-        arcs: list[Observations],
-        many: bool,
-        params: PyTree,
-        *,
-        bounds: PyTree = None,
-        priors: PyTree = None,
-        loss: Loss | Likelihood = LeastSquares(),
-    ):
-        if not callable(model):
-            raise TypeError(
-                "model must be a dvi.Model or a function of the parameters that returns the "
-                f"arguments of dvi.integrate, got {model!r}."
-            )
-        if not isinstance(loss, Loss | Likelihood):
-            raise TypeError(
-                f"loss must be a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or "
-                f"dvi.Likelihood(f), got {loss!r}."
-            )
-        self.model, self.arcs, self.many, self.loss = model, arcs, many, loss
-        self.space = Space(params, bounds, priors)
-        self.size = self.space.size
-        self.has_errors = arcs[0].has_errors
-        if not self.has_errors:
-            for what, there in (
-                ("priors", self.space.count_of_priors > 0),
-                ("a robust loss", not isinstance(loss, LeastSquares | Likelihood)),
-            ):
-                if there:
-                    raise ValueError(
-                        f"{what} can only be weighed against data with errors: give sigma or "
-                        "covariance with the observations."
-                    )
-        self.specs = [self.specification(params, i) for i in range(len(arcs))]
-        for i, arc in enumerate(arcs):
-            check_observable(i, arc, self.specs[i])
-        self.groups = make_groups(arcs, self.specs)
-        self.count = int(sum(group.seen.sum() for group in self.groups))
+    model: Any
+    groups: tuple[Group, ...]
+    space: Space
+    loss: Any
+    many: bool = eqx.field(static=True)
 
     def specification(self, params: PyTree, arc: Any) -> dict[str, Any]:
         """The arguments of `integrate` for an arc."""
         return specification(self.model, params, arc, self.many)
-
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Observed values and priors minus parameters."""
-        return self.count + self.space.count_of_priors - self.size
-
-    def check_count(self) -> None:
-        """**Raises** `ValueError` for fewer observed values than parameters."""
-        if self.degrees_of_freedom < 0:
-            raise ValueError(
-                f"{self.size} parameters cannot follow from {self.count} observed values"
-                + (f" and {n} priors" if (n := self.space.count_of_priors) else "")
-                + ". Fit fewer parameters, give priors, or more observations."
-            )
-
-    # ---- the model
 
     def predict(self, params: PyTree, group: Group, arcs: Any = None) -> tuple[Array, RESULTS]:
         """Predictions (A, N, K) and a status for each arc of a group (or for some of them)."""
@@ -127,24 +78,6 @@ class Problem:
     def prior_rows(self, u: Array) -> Array:
         """Parameters minus their prior means in prior standard errors, 0 without a prior."""
         return (self.space.to_x(u) - self.space.prior_mean) * self.space.prior_weight
-
-    def by_arc(self, rows: list[Any], known: list[Any]) -> tuple[list, list, list[str]]:
-        """For each arc predictions (N, ...), whitened residuals (N, K), and the status."""
-        predicted, whitened, names = {}, {}, {}
-        for group, r, (values, result) in zip(self.groups, rows, known, strict=True):
-            status = np.atleast_1d(status_name(result))
-            for a, i in enumerate(group.arcs):
-                arc, n = self.arcs[i], len(self.arcs[i].ts)
-                predicted[i] = np.asarray(values[a, :n]).reshape(arc.values.shape)
-                whitened[i] = np.where(group.seen[a, :n], np.asarray(r[a, :n]), np.nan)
-                names[i] = str(status[a])
-        each = range(len(self.arcs))
-        return [predicted[i] for i in each], [whitened[i] for i in each], [names[i] for i in each]
-
-    def rows_within(self, horizon: float) -> np.ndarray:
-        """Which entries of the residual vector lie within a horizon; priors do."""
-        inside = [np.asarray(_within(g, horizon)).ravel() for g in self.groups]
-        return np.concatenate([*inside, np.ones(self.size, bool)])
 
     def evaluate(self, u: Array, horizon: Any = np.inf, extra: Any = None) -> Evaluation:
         """Residual vector and Jacobian, by forward mode: memory does not grow with the number of
@@ -197,6 +130,112 @@ class Problem:
             )
         return jnp.sum(jnp.where(keep, each, 0.0))
 
+
+class Problem:
+    """What is to be fitted, in free variables u.
+
+    - `core`: its functions. `space`: the parameters, `start` their x. `arcs`: the data, `groups`
+      them as arrays.
+    - `size`: how many free variables there are. `count`: how many values were observed.
+    """
+
+    def __init__(
+        self,
+        model: Callable[..., Any],
+        arcs: list[Observations],
+        many: bool,
+        params: PyTree,
+        *,
+        bounds: PyTree = None,
+        priors: PyTree = None,
+        loss: Loss | Likelihood = LeastSquares(),
+    ):
+        if not callable(model):
+            raise TypeError(
+                "model must be a dvi.Model or a function of the parameters that returns the "
+                f"arguments of dvi.integrate, got {model!r}."
+            )
+        if not isinstance(loss, Loss | Likelihood):
+            raise TypeError(
+                f"loss must be a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or "
+                f"dvi.Likelihood(f), got {loss!r}."
+            )
+        self.arcs, self.loss = arcs, loss
+        self.space, self.start = make_space(params, bounds, priors)
+        self.size = self.space.size
+        self.has_errors = arcs[0].has_errors
+        if not self.has_errors:
+            for what, there in (
+                ("priors", self.space.count_of_priors > 0),
+                ("a robust loss", not isinstance(loss, LeastSquares | Likelihood)),
+            ):
+                if there:
+                    raise ValueError(
+                        f"{what} can only be weighed against data with errors: give sigma or "
+                        "covariance with the observations."
+                    )
+        self.specs = [specification(model, params, i, many) for i in range(len(arcs))]
+        for i, arc in enumerate(arcs):
+            check_observable(i, arc, self.specs[i])
+        self.groups = make_groups(arcs, self.specs)
+        self.core = Core(model, tuple(self.groups), self.space, loss, many)
+        self.count = int(sum(group.seen.sum() for group in self.groups))
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Observed values and priors minus parameters."""
+        return self.count + self.space.count_of_priors - self.size
+
+    def check_count(self) -> None:
+        """**Raises** `ValueError` for fewer observed values than parameters."""
+        if self.degrees_of_freedom < 0:
+            raise ValueError(
+                f"{self.size} parameters cannot follow from {self.count} observed values"
+                + (f" and {n} priors" if (n := self.space.count_of_priors) else "")
+                + ". Fit fewer parameters, give priors, or more observations."
+            )
+
+    # ---- functions of u, compiled
+
+    def evaluate(self, u: Any, horizon: Any = np.inf, extra: Any = None) -> Evaluation:
+        """`Core.evaluate`."""
+        return _evaluate(self.core, jnp.asarray(u), jnp.asarray(horizon, float), extra)
+
+    def whitened(self, u: Any, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
+        """`Core.whitened`."""
+        return _whitened(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
+
+    def residuals(self, u: Any, horizon: Any = np.inf) -> Array:
+        """`Core.residuals`."""
+        rows, _ = self.whitened(u, horizon)
+        return self.core.root_rows(jnp.asarray(u), rows)
+
+    def hessian(self, u: Any) -> Array:
+        """Exact second derivatives of the loss, (n, n), forward over reverse."""
+        return _hessian(self.core, jnp.asarray(u))
+
+    def curvature(self, u: Any, directions: Any) -> Array:
+        """Exact second derivatives of the loss along directions, the rows of an array."""
+        return _curvature(self.core, jnp.asarray(u), jnp.asarray(directions))
+
+    def by_arc(self, rows: list[Any], known: list[Any]) -> tuple[list, list, list[str]]:
+        """For each arc predictions (N, ...), whitened residuals (N, K), and the status."""
+        predicted, whitened, names = {}, {}, {}
+        for group, r, (values, result) in zip(self.groups, rows, known, strict=True):
+            status = np.atleast_1d(status_name(result))
+            for a, i in enumerate(group.arcs):
+                arc, n = self.arcs[i], len(self.arcs[i].ts)
+                predicted[i] = np.asarray(values[a, :n]).reshape(arc.values.shape)
+                whitened[i] = np.where(group.seen[a, :n], np.asarray(r[a, :n]), np.nan)
+                names[i] = str(status[a])
+        each = range(len(self.arcs))
+        return [predicted[i] for i in each], [whitened[i] for i in each], [names[i] for i in each]
+
+    def rows_within(self, horizon: float) -> np.ndarray:
+        """Which entries of the residual vector lie within a horizon; priors do."""
+        inside = [np.asarray(_within(g, horizon)).ravel() for g in self.groups]
+        return np.concatenate([*inside, np.ones(self.size, bool)])
+
     # ---- what stands before a fit
 
     def check_start(self, known: list[Any], check_units: bool = True) -> None:
@@ -231,6 +270,36 @@ class Problem:
             f"parameters up to {own:.3g}: a factor of {data / own:.3g}. Are they in the same "
             "units? If it is meant, say check_units=False."
         )
+
+
+@eqx.filter_jit
+def _evaluate(core: Core, u: Array, horizon: Array, extra: Any) -> Evaluation:
+    return core.evaluate(u, horizon, extra)
+
+
+@eqx.filter_jit
+def _whitened(core: Core, u: Array, horizon: Array) -> tuple[list[Array], list[Any]]:
+    return core.whitened(u, horizon)
+
+
+@eqx.filter_jit
+def _hessian(core: Core, u: Array) -> Array:
+    return jax.jacfwd(jax.grad(core.scalar))(u)
+
+
+@eqx.filter_jit
+def _curvature(core: Core, u: Array, directions: Array) -> Array:
+    def second(d):
+        def loss(t):
+            r = core.residuals(u + t * d)
+            return r @ r / 2
+
+        def slope(t):
+            return jax.jvp(loss, (t,), (1.0,))[1]
+
+        return jax.jvp(slope, (0.0,), (1.0,))[1]
+
+    return jax.vmap(second)(directions)
 
 
 class _Part:

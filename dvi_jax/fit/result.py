@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from .parameters import make_space
 from .results import FIT_RESULTS, NAMES, name_of
 from .uncertainty import correlations
 
@@ -175,10 +176,8 @@ class FitResult:
             like = jax.tree.map(np.array, about["shape"], is_leaf=lambda x: isinstance(x, list))
         else:
             like = params
-        from .parameters import Space
-
-        space = Space(like)
-        if space.names != about["names"]:
+        space, _ = make_space(like)
+        if list(space.names) != about["names"]:
             raise ValueError(
                 f"the fit in {path} has the parameters {about['names'][:5]}…, not "
                 f"{space.names[:5]}…."

@@ -63,7 +63,7 @@ class Run:
             self._show(
                 FitProgress(
                     len(self.records), self.max_steps, record.stage, record.horizon, record.loss,
-                    x, self.problem.space.names, time.monotonic() - self.began,
+                    x, list(self.problem.space.names), time.monotonic() - self.began,
                 )
             )  # fmt: skip
 

@@ -136,7 +136,7 @@ class Segments:
     def _guess(self, i: int, u: np.ndarray) -> np.ndarray:
         guess, arc = self.shooting.guess, self.problem.arcs[i]
         params = self.problem.space.to_params(self.problem.space.to_x(jnp.asarray(u)))
-        spec = self.problem.specification(params, i)
+        spec = self.problem.core.specification(params, i)
         times = self.cuts[i]
         if guess is None:
             named = arc.observe in ("positions", "state")
@@ -170,13 +170,13 @@ class Segments:
         """Whitened residuals (N K,) and the end state (2 half,) of one segment."""
         problem = self.problem
         params = problem.space.to_params(problem.space.to_x(u))
-        spec = problem.specification(params, arc)
+        spec = problem.core.specification(params, arc)
         q = jnp.where(first, spec["q0"], node[: self.half].reshape(self.shape))
         p = jnp.where(first, spec["p0"], node[self.half :].reshape(self.shape))
         found, (q1, p1), _ = predict({**spec, "q0": q, "p0": p}, t0, ts, pick, self.group)
         off = jnp.where(seen, found - values, 0.0)
         r = off * whiten if whiten.ndim == 2 else jnp.einsum("nij,nj->ni", whiten, off)
-        return problem.root(r).ravel(), jnp.concatenate([q1.ravel(), p1.ravel()]) / self.orbit
+        return problem.core.root(r).ravel(), jnp.concatenate([q1.ravel(), p1.ravel()]) / self.orbit
 
     def _all(self, w: Array):
         """Residuals and ends of all segments, and their derivatives in (u, own start)."""
@@ -211,7 +211,7 @@ class Segments:
         count, rows = r.shape
         inner = np.flatnonzero(self.next_of >= 0)
         gaps = self._gaps(w, ends)
-        prior, prior_slope = self.problem.prior_rows, jax.jacfwd(self.problem.prior_rows)
+        prior, prior_slope = self.problem.core.prior_rows, jax.jacfwd(self.problem.core.prior_rows)
         residual = jnp.concatenate(
             [
                 r.ravel(),

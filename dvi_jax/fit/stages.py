@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -95,16 +94,12 @@ def by_gradient(run: Run, u: np.ndarray, solver: Any, wanted, batch, seed: int, 
     problem = run.problem
     is_optax = isinstance(solver, optx.OptaxMinimiser)
 
-    def value(u, horizon, choice):
-        # Per value, so that a learning rate means the same for any amount of data.
-        return problem.scalar(u, horizon, choice) / (problem.count if is_optax else 1)
-
-    stage = ScalarStage(value, solver)
-    look = eqx.filter_jit(problem.whitened)
+    # Per value, so that a learning rate means the same for any amount of data.
+    stage = ScalarStage(problem.core, float(problem.count) if is_optax else 1.0, solver)
     choose = None if batch is None else _draw(problem, batch, seed)
     resume = run.take_resume()
     if resume is None:
-        rows, known = look(jnp.asarray(u))
+        rows, known = problem.whitened(u)
         problem.check_start(known, units)
         number, horizon = 0, _next(problem, wanted, 0, rows, 0.0)
         scale = np.ones(problem.size) if is_optax else _lengths(problem, u)
@@ -120,7 +115,7 @@ def by_gradient(run: Run, u: np.ndarray, solver: Any, wanted, batch, seed: int, 
             resume=resume, watch=run.watch,
         )  # fmt: skip
         resume = None
-        rows, known = look(jnp.asarray(u))
+        rows, known = problem.whitened(u)
         if is_last or status == FIT_RESULTS.not_finite or run.left <= 0:
             break
         number += 1
@@ -131,7 +126,7 @@ def by_gradient(run: Run, u: np.ndarray, solver: Any, wanted, batch, seed: int, 
         return Minimum(u, status, _root_of_hessian(problem, u), None, (rows, known))
     return (
         u,
-        (eqx.filter_jit(problem.evaluate)(jnp.asarray(u)).jacobian, None),
+        (problem.evaluate(u).jacobian, None),
         status,
         (rows, known),
     )
@@ -139,7 +134,7 @@ def by_gradient(run: Run, u: np.ndarray, solver: Any, wanted, batch, seed: int, 
 
 def _lengths(problem: Problem, u: np.ndarray) -> np.ndarray:
     """Scales of u in which the residuals change alike."""
-    J = np.asarray(eqx.filter_jit(problem.evaluate)(jnp.asarray(u)).jacobian)
+    J = np.asarray(problem.evaluate(u).jacobian)
     length = np.linalg.norm(np.where(np.isfinite(J), J, 0.0), axis=0)
     return np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 1.0)
 
@@ -159,8 +154,7 @@ def _draw(problem: Problem, batch: int, seed: int) -> Callable[[int], Any]:
 
 def _root_of_hessian(problem: Problem, u: np.ndarray) -> np.ndarray:
     """A matrix whose square JᵀJ is the exact Hessian of the loss, NaN if it is not positive."""
-    gradient = jax.grad(problem.scalar)
-    H = np.asarray(jax.jit(jax.jacfwd(gradient))(jnp.asarray(u)))
+    H = np.asarray(problem.hessian(u))
     values, vectors = np.linalg.eigh((H + H.T) / 2)
     return np.sqrt(np.where(values > 0, values, np.nan))[:, None] * vectors.T
 
@@ -168,7 +162,7 @@ def _root_of_hessian(problem: Problem, u: np.ndarray) -> np.ndarray:
 def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any):
     """Multiple shooting: Levenberg–Marquardt inside of an augmented Lagrangian."""
     problem, n, gaps = run.problem, run.problem.size, segments.num_gaps
-    stage = LeastSquaresStage(segments.evaluate, solver)
+    stage = LeastSquaresStage(eqx.filter_jit(segments.evaluate), solver)
     resume = run.take_resume()
     w, found = segments.begin(u), None
     if resume is None:
