@@ -34,6 +34,17 @@ def test_the_page_on_sweeps_runs(tmp_path):
     assert out.stdout.strip() == "{'successful': 12000}"
 
 
+def test_the_page_on_fitting_runs():
+    page = (README.parent / "docs" / "fitting.md").read_text(encoding="utf-8")
+    block = re.findall(r"```python\n(.*?)```", page, re.S)[0]
+    code = block + "\nprint(found.status, abs(float(found.params['epsilon']) - 0.02))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert out.returncode == 0, out.stderr
+    status, off = out.stdout.strip().splitlines()[-1].split()
+    assert status == "converged"
+    assert float(off) < 2e-3
+
+
 def test_commands_named_exist():
     text = README.read_text(encoding="utf-8")
     makefile = (README.parent / "Makefile").read_text(encoding="utf-8")

@@ -19,6 +19,9 @@ from ..engine.signature import accepts
 from ..lattices import Uniform
 from .observations import Observations
 
+_WASTE = 2_000_000
+"""Steps beyond the ends of shorter arcs that are taken rather than compiling another program."""
+
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
 _OWN = ("num_steps", "save", "observe", "throw", "progress", "stop", "t0")
 """What `fit` sets itself."""
@@ -157,17 +160,19 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
     **Raises** `ValueError` for step sizes that cannot suit the data.
     """
     kinds: dict[Any, list[int]] = {}
+    steps = [_steps(i, arc, spec) for i, (arc, spec) in enumerate(zip(arcs, specs, strict=True))]
+    # A program each takes seconds to compile; some millions of steps too many do not.
+    apart = len(arcs) * max(steps) - sum(steps) > _WASTE
     for i, (arc, spec) in enumerate(zip(arcs, specs, strict=True)):
-        steps = _steps(i, arc, spec)
-        full = arc.covariance is not None
-        key = (arc.function, arc.values.shape[1:], full, math.ceil(math.log2(steps)), spec["h"])
+        size = math.ceil(math.log2(steps[i])) if apart else 0
+        key = (arc.function, arc.values.shape[1:], arc.covariance is not None, size, spec["h"])
         kinds.setdefault(key, []).append(i)
     return [
         make_group(
             those,
             [arcs[i] for i in those],
             specs[those[0]],
-            max(_steps(i, arcs[i], specs[i]) for i in those),
+            max(steps[i] for i in those),
         )
         for those in kinds.values()
     ]

@@ -158,7 +158,7 @@ class LeastSquaresStage:
         while done < max_steps:
             if trial is None:
                 trial = self.at(base + scale * np.asarray(state.y_eval), horizon, extra)
-            known = trial.residual, trial.jacobian * scale
+            known = trial.residual, trial.jacobian * scale[None]
             z, state = _advance(self._solver, z, known, state)
             done += 1
             accepted = int(state.num_steps_since_acceptance) == 0

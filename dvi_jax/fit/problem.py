@@ -174,7 +174,8 @@ class Problem:
                         f"{what} can only be weighed against data with errors: give sigma or "
                         "covariance with the observations."
                     )
-        self.specs = [specification(model, params, i, many) for i in range(len(arcs))]
+        arrays = self.space.to_params(jnp.asarray(self.start))
+        self.specs = [specification(model, arrays, i, many) for i in range(len(arcs))]
         for i, arc in enumerate(arcs):
             check_observable(i, arc, self.specs[i])
         self.groups = make_groups(arcs, self.specs)

@@ -200,7 +200,7 @@ class Segments:
     def _gaps(self, w: Array, ends: Array) -> Array:
         nodes = w[self.n :].reshape(self.num_nodes, 2 * self.half)
         inner = self.next_of >= 0
-        return ends[inner] - nodes[self.next_of[inner]] / self.orbit
+        return ends[inner] - nodes[self.next_of[inner]] / self.orbit[None]
 
     def evaluate(self, w: Array, horizon: Any, extra: tuple[Array, Array]) -> Evaluation:
         """The residual vector, its derivative put together from those of the segments, and c."""
@@ -234,7 +234,7 @@ class Segments:
             root * Je[inner[has]][..., n:]
         )
         to = n + self.next_of[inner][:, None] * width + np.arange(width)
-        return Evaluation(residual, J.at[row, to].set(-root / self.orbit), gaps.ravel())
+        return Evaluation(residual, J.at[row, to].set(-root / self.orbit[None]), gaps.ravel())
 
 
 def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.ndarray:

@@ -1,0 +1,193 @@
+"""What `dvi.fit` refuses, and what it says."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+
+
+def H(t0, t1, q0, p1, args):
+    return jnp.sum(p1**2) / 2 + args["k"] * jnp.sum(q0**2) / 2
+
+
+def W(t0, t1, q0, p1, args):
+    return -p1
+
+
+SYSTEM = dvi.System(H, force=W)
+TS = np.arange(1, 21) * 0.5
+VALUES = np.cos(TS)[:, None]
+MODEL = dvi.Model(SYSTEM, h=0.1, q0=[1.0], p0=[0.0], args={"k": 1.0})
+DATA = dvi.Observations(TS, VALUES, sigma=0.1, t0=0.0)
+PARAMS = {"epsilon": 0.0}
+
+
+def swapped(x, i, j):
+    x = np.array(x)
+    x[[i, j]] = x[[j, i]]
+    return x
+
+
+def put(x, i, value):
+    x = np.array(x, float)
+    x[i] = value
+    return x
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "says"),
+    [
+        ({"ts": put(TS, 3, np.nan)}, ValueError, r"ts\[3\] is nan"),
+        ({"ts": put(TS, 3, np.inf)}, ValueError, r"ts\[3\] is inf"),
+        ({"ts": swapped(TS, 4, 5)}, ValueError, r"not in order: ts\[4\].*argsort"),
+        ({"ts": put(TS, 4, TS[3])}, ValueError, r"ts\[3\] and ts\[4\] are the same time"),
+        ({"t0": 0.75}, ValueError, "lies before t0 = 0.75"),
+        ({"t0": np.nan}, ValueError, "t0 must be one finite number"),
+        ({"ts": TS[:5]}, ValueError, r"one row for each time: ts has shape \(5,\)"),
+        ({"ts": TS[:, None]}, ValueError, "one-dimensional array of times"),
+        ({"ts": np.zeros(0), "values": np.zeros((0, 1))}, ValueError, "one-dimensional"),
+        ({"values": put(VALUES, (2, 0), np.inf)}, ValueError, r"infinite at index \[2, 0\]"),
+        ({"values": VALUES * np.nan}, ValueError, "nothing was observed"),
+        ({"values": VALUES * 1j}, TypeError, "real numbers, got dtype complex"),
+        ({"values": [["a"]] * 20}, TypeError, "real numbers"),
+        ({"sigma": 0.0}, ValueError, "sigma is 0.0 .* positive"),
+        ({"sigma": -1.0}, ValueError, "positive"),
+        ({"sigma": np.nan}, ValueError, "sigma is nan"),
+        ({"sigma": np.ones((20, 2))}, ValueError, "does not broadcast"),
+        ({"sigma": None, "covariance": np.zeros((1, 1))}, ValueError, "not positive definite"),
+        ({"sigma": None, "covariance": -np.eye(1)}, ValueError, "not positive definite"),
+        ({"sigma": None, "covariance": np.eye(2)}, ValueError, r"shape \(1, 1\) or \(20, 1, 1\)"),
+        ({"covariance": np.eye(1)}, ValueError, "sigma or covariance, not both"),
+        ({"observe": "velocities"}, TypeError, '"positions", "momenta", "state"'),
+        ({"observe": lambda q: q}, TypeError, r"\(t, q, p, args\)"),
+    ],
+)
+def test_observations_are_checked(wrong, error, says):
+    with pytest.raises(error, match=says):
+        dvi.Observations(**{"ts": TS, "values": VALUES, "sigma": 0.1, "t0": 0.0, **wrong})
+
+
+def test_a_covariance_of_correlation_one_is_refused():
+    values = np.stack([np.cos(TS), np.sin(TS)], 1)
+    C = np.array([[1.0, 1.0], [1.0, 1.0]])
+    with pytest.raises(ValueError, match="known exactly"):
+        dvi.Observations(TS, values, covariance=C)
+    full = np.tile(np.eye(2), (20, 1, 1))
+    full[7, 0, 1] = 0.5
+    with pytest.raises(ValueError, match="observation 7 is not symmetric"):
+        dvi.Observations(TS, values, covariance=full)
+
+
+def fit(model=MODEL, data=DATA, params=PARAMS, **options):
+    return dvi.fit(model, data, params, **options)
+
+
+def fails_at_start(params):
+    k = jnp.sqrt(params["epsilon"] - 1)
+    return {"system": SYSTEM, "q0": [1.0], "p0": [0.0], "h": 0.1, "args": {"k": k}}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "says"),
+    [
+        ({"model": 3}, TypeError, "model must be a dvi.Model"),
+        ({"model": lambda params: 3}, TypeError, "must return the arguments of dvi.integrate"),
+        ({"model": lambda params: {"system": SYSTEM}}, ValueError, "lack 'q0'"),
+        ({"model": lambda p: {**MODEL(p), "num_steps": 3}}, ValueError, "must not set 'num_steps'"),
+        ({"model": lambda p: {**MODEL(p), "t0": 0.0}}, ValueError, r"Observations\(\.\.\., t0"),
+        ({"model": lambda p: {**MODEL(p), "h": 0.0}}, ValueError, "finite and not zero"),
+        ({"model": lambda p: {**MODEL(p), "h": -0.1}}, ValueError, "goes the other way"),
+        ({"model": lambda p: {**MODEL(p), "h": 1e-12}}, ValueError, "Are the times"),
+        ({"model": lambda p: {**MODEL(p), "h": 1e3}}, ValueError, "Are the times"),
+        ({"model": lambda p: {**MODEL(p), "h": p["epsilon"] + 0.1}}, ValueError, "not a parameter"),
+        ({"data": (TS, VALUES)}, TypeError, "dvi.Observations"),
+        ({"data": []}, ValueError, "empty"),
+        (
+            {"data": [DATA, dvi.Observations(TS, VALUES, t0=0.0)]},
+            ValueError,
+            r"data\[1\] has neither sigma",
+        ),
+        ({"data": dvi.Observations(TS, VALUES[:, 0], sigma=1.0)}, ValueError, r"returns \(1,\)"),
+        ({"data": dvi.Observations(TS, 1e6 * VALUES, sigma=1.0)}, ValueError, "same units"),
+        ({"data": dvi.Observations(TS, 1e-6 * VALUES, sigma=1.0)}, ValueError, "same units"),
+        (
+            {"data": dvi.Observations(TS, VALUES, t0=0.0), "loss": dvi.Cauchy()},
+            ValueError,
+            "robust",
+        ),
+        (
+            {"data": dvi.Observations(TS, VALUES, t0=0.0), "priors": {"epsilon": dvi.Prior(0, 1)}},
+            ValueError,
+            "priors can only be weighed",
+        ),
+        ({"params": {}}, ValueError, "no number that could be fitted"),
+        ({"params": 0.1}, TypeError, "a dict with keys among"),
+        ({"params": {"k": 1.0}}, TypeError, "{\"args\": {'k': ...}}"),
+        ({"params": {"epsilon": np.nan}}, ValueError, "epsilon starts at nan"),
+        ({"params": {"args": {"k": np.ones(40)}}}, ValueError, "scalar|parameters cannot follow"),
+        ({"bounds": {"epsilon": dvi.Bounds(1, 0)}}, ValueError, "lower one must be less"),
+        ({"bounds": {"epsilon": dvi.Bounds(0.5, 1)}}, ValueError, "not between"),
+        ({"bounds": {"eps": dvi.Bounds(0.5, 1)}}, ValueError, "given for 'eps'"),
+        ({"bounds": {"epsilon": (0, 1)}}, TypeError, r"dvi.Bounds\(...\)"),
+        ({"priors": {"epsilon": dvi.Prior(0.0, 0.0)}}, ValueError, "positive sigma"),
+        ({"loss": "huber"}, TypeError, "dvi.SoftL1"),
+        ({"shooting": "multiple"}, TypeError, "MultipleShooting"),
+        ({"shooting": dvi.MultipleShooting(300)}, ValueError, "fewer segments"),
+        ({"optimiser": "adam"}, TypeError, "optimistix"),
+        ({"batch": 3}, ValueError, "stochastic"),
+        ({"max_steps": 0}, ValueError, "max_steps"),
+        ({"tolerance": 0.0}, ValueError, "tolerance"),
+        ({"horizons": [2.0, 1.0]}, ValueError, "growing"),
+        ({"horizons": "all"}, ValueError, "auto"),
+        ({"progress": 3}, TypeError, "progress"),
+        ({"model": fails_at_start}, ValueError, "starting parameters the model gives no number"),
+    ],
+)
+def test_fit_refuses(wrong, error, says):
+    with pytest.raises(error, match=says):
+        fit(**wrong)
+
+
+def test_fewer_values_than_parameters():
+    few = dvi.Observations(TS[:1], VALUES[:1], sigma=0.1, t0=0.0)
+    params = {"epsilon": 0.0, "args": {"k": 1.0}}
+    with pytest.raises(ValueError, match="2 parameters cannot follow from 1 observed values"):
+        fit(data=few, params=params)
+    priors = {"epsilon": dvi.Prior(0.0, 0.1)}
+    assert fit(data=few, params=params, priors=priors).degrees_of_freedom == 0
+
+
+def test_a_wrong_unit_can_be_meant():
+    found = fit(
+        data=dvi.Observations(TS, 1e4 * VALUES, sigma=1.0, t0=0.0), check_units=False, throw=False
+    )
+    assert found.status in ("converged", "stalled", "max_steps_reached")
+
+
+def test_single_precision_is_refused():
+    with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
+        fit()
+
+
+def test_missing_values_do_not_count():
+    holes = VALUES.copy()
+    holes[::3] = np.nan
+    found = fit(data=dvi.Observations(TS, holes, sigma=0.1, t0=0.0))
+    left = ~np.isnan(holes[:, 0])
+    same = fit(data=dvi.Observations(TS[left], holes[left], sigma=0.1, t0=0.0))
+    assert found.num_observed == left.sum()
+    np.testing.assert_allclose(found.x, same.x, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, same.covariance, rtol=1e-6)
+    assert np.isnan(found.whitened[0][::3]).all()
+    assert np.isnan(found.residuals[0][::3]).all()
+
+
+def test_a_missing_component_leaves_the_others_their_covariance():
+    C = np.array([[2.0, 0.9], [0.9, 1.0]])
+    values = np.stack([np.cos(TS), np.sin(TS)], 1)
+    values[4, 0] = np.nan
+    weights = dvi.Observations(TS, values, covariance=C).whitening()
+    np.testing.assert_allclose(weights[0].T @ weights[0], np.linalg.inv(C), rtol=1e-12)
+    np.testing.assert_allclose(weights[4], [[0, 0], [0, 1.0]], rtol=1e-12)
