@@ -42,10 +42,13 @@ from .fit import (
     Model as Model,
     MultipleShooting as MultipleShooting,
     Observations as Observations,
+    Posterior as Posterior,
     Prior as Prior,
+    Samples as Samples,
     SingleShooting as SingleShooting,
     SoftL1 as SoftL1,
     fit as fit,
+    sample as sample,
 )
 from .invariants import (
     Balance as Balance,

@@ -104,6 +104,7 @@ sweep Axis starts open_sweep SweepResult SweepProgress SweepInterrupted StoreErr
 ClusterError sweep_cost SweepCost
 fit Model Observations Bounds Prior LeastSquares SoftL1 Cauchy Likelihood
 SingleShooting MultipleShooting FitResult FitProgress FIT_RESULTS FitError
+Posterior Samples sample
 """
 
 

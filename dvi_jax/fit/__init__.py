@@ -1,6 +1,7 @@
 """Disturbances from data: parameters of a model that observed trajectories determine."""
 
 from ._fit import fit as fit
+from .bayes import Posterior as Posterior, Samples as Samples, sample as sample
 from .losses import (
     Cauchy as Cauchy,
     LeastSquares as LeastSquares,

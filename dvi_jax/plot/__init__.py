@@ -7,6 +7,12 @@ from .drifts import (
     drift_orders as drift_orders,
     drift_surface as drift_surface,
 )
+from .fits import (
+    fit_against_data as fit_against_data,
+    fit_corner as fit_corner,
+    fit_residuals as fit_residuals,
+    learning_curve as learning_curve,
+)
 from .house import COLOURS as COLOURS, DASHES as DASHES, save as save, style as style
 from .runs import (
     changes as changes,

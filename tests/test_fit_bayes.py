@@ -1,0 +1,427 @@
+"""Posteriors and draws from them: densities, slopes, bounds, agreement with the fit."""
+
+import builtins
+import contextlib
+import sys
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+import dvi_jax as dvi
+from dvi_jax.fit import bayes
+
+N, H = 12, 0.1
+
+
+@pytest.fixture(autouse=True)
+def ranks():
+    # The optimiser of dvi.fit scales the columns of a Jacobian by a vector.
+    with jax.numpy_rank_promotion("allow"):
+        yield
+
+
+def free(t0, t1, q0, p1, args):
+    return p1 @ p1 / 2
+
+
+def kepler(t0, t1, q0, p1, args):
+    return p1 @ p1 / 2 - args["mu"] / jnp.linalg.norm(q0)
+
+
+def cubic(t0, t1, q0, p1, args):
+    return (p1 @ p1 + args["k"] * q0 @ q0) / 2
+
+
+def pull(t0, t1, q0, p1, args):
+    return -(q0**3)
+
+
+LINE = dvi.Model(dvi.System(free), h=H)
+PAIR = {"q0": np.array([0.1]), "p0": np.array([0.9])}
+
+
+def on_a_line(sigma=0.05, count=N, seed=0):
+    """Noisy places of q = 0.1 + 0.9 t, of which the map of a free particle is exact."""
+    ts = H * np.arange(count)
+    noise = (sigma or 0.05) * np.random.default_rng(seed).normal(size=(count, 1))
+    return dvi.Observations(ts, 0.1 + 0.9 * ts[:, None] + noise, sigma=sigma)
+
+
+def line_by_hand(data, sigma):
+    """Mean and covariance of (p0, q0), as the straight line's normal equations have them."""
+    A = np.stack([data.ts, np.ones(len(data.ts))], axis=1) / sigma
+    C = np.linalg.inv(A.T @ A)
+    return C @ A.T @ data.values[:, 0] / sigma, C
+
+
+OSCILLATOR = dvi.Model(dvi.System(cubic, force=pull), h=H, p0=jnp.array([0.3]))
+NEAR = {"epsilon": 0.03, "q0": np.array([0.8]), "args": {"k": 1.1}}
+LIMITS = {"epsilon": dvi.Bounds(0.0, 0.2), "args": {"k": dvi.Bounds(lower=0.5)}}
+
+
+def swinging(sigma=0.01, steps=40, seed=0):
+    sol = dvi.integrate(
+        OSCILLATOR.rest["system"], [0.8], [0.3], h=H, num_steps=steps, epsilon=0.05,
+        args={"k": 1.0}, save=dvi.Save(every=4),
+    )  # fmt: skip
+    noise = 0.01 * np.random.default_rng(seed).normal(size=sol.qs.shape)
+    return dvi.Observations(sol.ts, np.asarray(sol.qs) + noise, sigma=sigma)
+
+
+# --- the density ---------------------------------------------------------------------------------
+
+
+def student(predicted, observed, sigma, params):
+    return 2.5 * jnp.log1p(((predicted - observed) / sigma) ** 2 / 4)
+
+
+@pytest.mark.parametrize(
+    ("loss", "sigma"),
+    [
+        (dvi.LeastSquares(), 0.01),
+        (dvi.LeastSquares(), None),
+        (dvi.Cauchy(), 0.01),
+        (dvi.Likelihood(student), 0.01),
+    ],
+    ids=["least squares", "unknown errors", "Cauchy", "likelihood"],
+)
+def test_slopes_against_differences(loss, sigma):
+    data = swinging(sigma)
+    about = {"bounds": LIMITS, "loss": loss, "priors": {"args": {"k": dvi.Prior(1.0, 0.02)}}}
+    posterior = dvi.Posterior(OSCILLATOR, data, NEAR, **about)
+    forward = dvi.Posterior(OSCILLATOR, data, NEAR, gradient="forward", **about)
+    u = jnp.asarray(posterior.start)
+    slope = np.asarray(jax.grad(posterior.potential)(u))
+    # Central differences of order six: their own error is some h⁶, round-off some 1e-16 U/h.
+    h, at, weights = 2e-4, np.array([-3, -2, -1, 1, 2, 3]), np.array([-1, 9, -45, 45, -9, 1]) / 60
+    moved = u + h * at[:, None, None] * jnp.eye(3)
+    values = np.asarray(jax.vmap(jax.vmap(posterior.potential))(moved))
+    by_differences = weights @ values / h
+    np.testing.assert_allclose(slope, by_differences, rtol=1e-8)
+    np.testing.assert_allclose(jax.grad(forward.potential)(u), slope, rtol=1e-9)
+    assert not np.allclose(slope * (1 + 3e-8), by_differences, rtol=1e-8, atol=0)
+
+
+def test_second_derivatives_and_both_modes():
+    posterior = dvi.Posterior(OSCILLATOR, swinging(), NEAR, gradient="forward")
+    u, d = jnp.asarray(posterior.start), jnp.array([1.0, -2.0, 0.5])
+    slope = jax.grad(posterior.potential)
+    np.testing.assert_allclose(
+        jax.jvp(posterior.potential, (u,), (d,))[1], slope(u) @ d, rtol=1e-12
+    )
+    h = 1e-5
+    by_differences = (slope(u + h * d) - slope(u - h * d)) / (2 * h)
+    np.testing.assert_allclose(jax.jvp(slope, (u,), (d,))[1], by_differences, rtol=1e-6)
+
+
+def test_priors_and_bounds_are_meant_in_x():
+    """∫ exp(−U(u)) du over a part of u is the mass of the density of x there."""
+    limits = {"p0": dvi.Bounds(0.8, 1.0), "q0": dvi.Bounds(lower=0.05)}
+    priors = {"q0": dvi.Prior(0.12, 0.02)}
+    data = on_a_line()
+    posterior = dvi.Posterior(LINE, data, PAIR, bounds=limits, priors=priors)
+    (p, q), C = line_by_hand(data, 0.05)
+
+    def density(x):  # of (p0, q0)
+        off = x - np.array([p, q])
+        normal = np.exp(-np.einsum("...i,ij,...j", off, np.linalg.inv(C), off) / 2)
+        return normal * np.exp(-(((x[..., 1] - 0.12) / 0.02) ** 2) / 2)
+
+    u = np.linspace(-6, 1.5, 7)[:, None] * [1.0, 0.6] + [0.0, -2.0]
+    x = np.asarray(jax.vmap(posterior.to_x)(jnp.asarray(u)))
+    stretch = np.prod([np.diag(jax.jacfwd(posterior.to_x)(jnp.asarray(v))) for v in u], axis=1)
+    values = np.asarray(jax.vmap(posterior.potential)(jnp.asarray(u)))
+    found, want = np.exp(-values), density(x) * stretch
+    np.testing.assert_allclose(found / found[0], want / want[0], rtol=1e-7)
+    assert not np.allclose(found / found[0], density(x) / density(x)[0], rtol=0.1)
+    assert posterior.names == ["p0[0]", "q0[0]"]
+    params = posterior.to_params(jnp.asarray(u[0]))
+    np.testing.assert_allclose(np.concatenate([params["p0"], params["q0"]]), x[0])
+
+
+def test_unknown_errors_are_integrated_out():
+    """A straight line with errors of unknown size: Student's distribution, N − 2 degrees."""
+    data = on_a_line(sigma=None, count=8)
+    posterior = dvi.Posterior(LINE, data, PAIR)
+    centre, C = line_by_hand(data, 1.0)
+    residual = data.values[:, 0] - centre[1] - centre[0] * data.ts
+    square = residual @ residual
+    off = np.random.default_rng(1).normal(size=(20, 2)) * 0.1
+    u = jnp.asarray(centre + off)
+    found = np.asarray(jax.vmap(posterior.potential)(u))
+    nu = 6
+    distance = np.einsum("ni,ij,nj->n", off, np.linalg.inv(C), off) / (square / nu)
+    want = (nu + 2) / 2 * np.log1p(distance / nu)
+    np.testing.assert_allclose(found - found[0], want - want[0], rtol=1e-8, atol=1e-9)
+    plug_in = distance / 2  # the size taken for known, at its estimate
+    assert np.abs(found - found[0] - plug_in + plug_in[0]).max() > 0.1
+
+
+def test_a_failing_trajectory_has_density_0_and_no_nan():
+    def explosive(t0, t1, q0, p1, args):
+        return p1 @ p1 / 2 - jnp.sum(jnp.exp(args["b"] * q0))
+
+    ts = H * np.arange(30)
+    data = dvi.Observations(ts, np.ones((30, 1)), sigma=0.1)
+    model = dvi.Model(dvi.System(explosive), h=H, q0=jnp.ones(1), p0=jnp.ones(1))
+    for gradient in ("reverse", "forward"):
+        posterior = dvi.Posterior(model, data, {"args": {"b": 0.01}}, gradient=gradient)
+        value, slope = jax.vmap(jax.value_and_grad(posterior.potential))(jnp.array([[0.01], [9.0]]))
+        assert np.isfinite(value[0])
+        assert value[1] == np.inf
+        assert slope[0] != 0
+        assert slope[1] == 0
+        assert posterior.log_density(jnp.array([9.0])) == -np.inf
+    with pytest.raises(ValueError, match=r"density is 0 at the start \(args.b = 9\)"):
+        posterior.laplace([9.0])
+
+
+def test_the_mode_and_its_covariance():
+    data = on_a_line()
+    posterior = dvi.Posterior(LINE, data, {"q0": np.array([3.0]), "p0": np.array([-2.0])})
+    mode, root = posterior.laplace()
+    centre, C = line_by_hand(data, 0.05)
+    np.testing.assert_allclose(mode, centre, atol=3e-4 * np.sqrt(C[1, 1]))
+    np.testing.assert_allclose(root @ root.T, C, rtol=1e-6)
+    student_t = dvi.Posterior(LINE, data, PAIR, loss=dvi.Likelihood(student))
+    mode, root = student_t.laplace()
+    assert np.abs(jax.grad(student_t.potential)(jnp.asarray(mode)) @ root).max() < 1e-2
+
+
+# --- draws ---------------------------------------------------------------------------------------
+
+
+def test_draws_of_a_linear_problem_have_the_mean_and_sigma_of_the_fit(monkeypatch):
+    data = on_a_line()
+    fit = dvi.fit(LINE, data, PAIR)
+    asked = []
+    monkeypatch.setattr(bayes, "fit", lambda *args, **options: asked.append(options) or fit)
+    found = dvi.sample(LINE, data, PAIR, num_samples=1000, num_warmup=200, chains=2)
+    assert asked[0]["throw"] is False
+    assert found.status == "mixed"
+    assert found.warnings == []
+    assert found.divergences == 0
+    ess = np.array([found.ess[n] for n in fit.names])
+    assert (ess > 500).all()
+    np.testing.assert_array_less(np.abs(found.mean - fit.x), 4 * fit.sigma / np.sqrt(ess))
+    ess_of_square = ess / 2
+    np.testing.assert_array_less(
+        np.abs(found.sigma / fit.sigma - 1), 4 / np.sqrt(2 * ess_of_square)
+    )
+    assert abs(found.correlations[0, 1] - fit.correlations[0, 1]) < 0.03
+    # What they hold, and how it is laid out.
+    assert found.x.shape == (2, 1000, 2)
+    np.testing.assert_array_equal(found.samples["q0[0]"], found.params["q0"][..., 0])
+    assert list(found.r_hat) == fit.names
+    assert "q0[0]" in str(found)
+    tree = found.to_xarray()
+    assert tree["posterior"]["p0[0]"].dims == ("chain", "draw")
+    np.testing.assert_array_equal(tree["sample_stats"]["lp"], -found.potential)
+    look = jax.vmap(dvi.Posterior(LINE, data, PAIR).potential)
+    np.testing.assert_allclose(look(jnp.asarray(found.x[1, :5])), found.potential[1, :5])
+
+
+NEAR_0 = dvi.Model(dvi.System(free), h=H, p0=jnp.zeros(1))
+EDGE = {"q0": dvi.Bounds(0.0, 1.0)}
+
+
+def truncated():
+    """Data whose mean lies 0.5 of its error below the lower bound 0, and (mean, sd) of q0 by
+    quadrature: ∫ x f dx / ∫ f dx."""
+    sigma, count = 0.2, 4
+    data = dvi.Observations(
+        H * np.arange(count), np.array([[-0.2], [0.0], [-0.05], [0.05]]), sigma=sigma
+    )
+    error = sigma / np.sqrt(count)
+    x = np.linspace(0, 1, 200_001)
+    f = np.exp(-(((x + 0.05) / error) ** 2) / 2)
+    mean = (x * f).sum() / f.sum()
+    return data, mean, np.sqrt(((x - mean) ** 2 * f).sum() / f.sum())
+
+
+@pytest.mark.parametrize("is_right", [True, False], ids=["right", "log-Jacobian left out"])
+def test_a_parameter_at_its_bound_has_the_truncated_distribution(monkeypatch, is_right):
+    data, mean, sigma = truncated()
+    expected = contextlib.nullcontext()
+    if not is_right:  # a density of u that is flat towards the bound, where no chain finds an end
+        monkeypatch.setattr(bayes, "log_slope", lambda space, u: jnp.zeros_like(u))
+        expected = pytest.warns(UserWarning, match="the chains do not agree")
+    with expected:
+        found = dvi.sample(
+            NEAR_0, data, {"q0": np.array([0.1])}, bounds=EDGE, num_warmup=300, chains=2, seed=3,
+            num_samples=1500 if is_right else 300, max_tree_depth=10 if is_right else 6,
+            start={"q0": np.array([0.1])},
+        )  # fmt: skip
+    off = abs(found.mean[0] - mean) / (sigma / np.sqrt(found.ess["q0[0]"]))
+    wider = abs(found.sigma[0] / sigma - 1)
+    if is_right:
+        assert found.x.min() > 0
+        assert found.divergences == 0
+        assert off < 4
+        assert wider < 0.1
+    else:
+        assert found.status == "not_mixed"
+        assert not off < 8
+        assert wider > 0.5
+
+
+def test_epsilon_of_a_disturbed_orbit_is_recovered():
+    model = dvi.Model(
+        dvi.System(kepler, force=lambda t0, t1, q0, p1, args: -q0), h=0.05,
+        p0=jnp.array([-1.0, -0.1]), args={"mu": 1.0},
+    )  # fmt: skip
+    truth = {"epsilon": 0.02, "q0": np.array([0.0, 1.0])}
+    sol = dvi.integrate(**model(truth), num_steps=400, save=dvi.Save(every=20))
+    noise = 0.01 * np.random.default_rng(1).normal(size=sol.qs.shape)
+    data = dvi.Observations(sol.ts, np.asarray(sol.qs) + noise, sigma=0.01)
+    start = {"epsilon": 0.0, "q0": np.array([0.01, 1.01])}
+    found = dvi.sample(
+        model, data, start, start=start, num_samples=500, num_warmup=200, chains=2, seed=1
+    )
+    assert found.status == "mixed"
+    i = found.names.index("epsilon")
+    assert abs(found.mean[i] - 0.02) < 3 * found.sigma[i]
+    assert abs(found.mean[i]) > 10 * found.sigma[i]  # no disturbance is out of the question
+    assert found.params["q0"].shape == (2, 500, 2)
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth_as_often_as_they_say():
+    inside = []
+    for seed in range(40):
+        data = swinging(seed=seed)
+        found = dvi.sample(
+            OSCILLATOR, data, NEAR, bounds=LIMITS, num_samples=300, num_warmup=150, chains=2,
+            seed=seed,
+        )  # fmt: skip
+        for name, truth in (("epsilon", 0.05), ("q0[0]", 0.8), ("args.k", 1.0)):
+            low, high = found.quantiles((0.25, 0.75))[name]
+            inside.append(low < truth < high)
+    # 120 half chances, three by three dependent: sd at most sqrt(3 · 120) / 2.
+    assert abs(np.sum(inside) - 60) < 3 * np.sqrt(3 * 120) / 2
+
+
+def fake(x, diverging=0, steps=3):
+    """`Samples` of draws x (chains, draws) of one parameter, as `sample` collects them."""
+    posterior = types.SimpleNamespace(
+        names=["a"], _space=dvi.Posterior(NEAR_0, truncated()[0], {"q0": 0.1 * np.ones(1)})._space
+    )
+    lost = np.zeros(x.shape, bool)
+    lost.flat[:diverging] = True
+    about = {
+        "potential_energy": x**2 / 2, "diverging": lost, "num_steps": np.full(x.shape, steps),
+        "mean_accept_prob": np.full(x.shape, 0.8),
+    }  # fmt: skip
+    return bayes._collect(bayes._numpyro(), posterior, x[..., None], about, [], 1023)
+
+
+def test_doubts_are_said():
+    good = np.random.default_rng(0).normal(size=(4, 500))
+    assert fake(good).status == "mixed"
+    assert fake(good).warnings == []
+    apart = fake(good + np.arange(4)[:, None])
+    assert apart.status == "not_mixed"
+    assert "the chains do not agree" in apart.warnings[0]
+    assert "a 1." in apart.warnings[0] or "a 2." in apart.warnings[0]
+    stuck = fake(np.ones((4, 500)))
+    assert stuck.status == "not_mixed"
+    assert np.isnan(stuck.r_hat["a"])
+    lost = fake(good, diverging=3)
+    assert (lost.status, lost.divergences) == ("diverging", 3)
+    assert "3 of 2000 draws diverged" in lost.warnings[0]
+    assert "diverged" in str(lost)
+    assert "100 % of the paths were cut short" in fake(good, steps=1023).warnings[0]
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+
+def test_arviz_old_new_and_none(monkeypatch):
+    found = fake(np.random.default_rng(0).normal(size=(2, 50)))
+    new = types.SimpleNamespace(__version__="1.0.0")
+    old = types.SimpleNamespace(__version__="0.22.0", InferenceData=lambda **groups: groups)
+    monkeypatch.setitem(sys.modules, "arviz", new)
+    assert isinstance(found.to_arviz(), xr.DataTree)
+    monkeypatch.setitem(sys.modules, "arviz", old)
+    assert set(found.to_arviz()) == {"posterior", "sample_stats"}
+    monkeypatch.setitem(sys.modules, "arviz", None)
+    with pytest.raises(ImportError, match="pip install arviz"):
+        found.to_arviz()
+
+
+def test_without_numpyro_the_extra_is_named(monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.startswith("numpyro"):
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=r"dvi-jax\[bayes\]"):
+        dvi.sample(LINE, on_a_line(), PAIR)
+    assert np.isfinite(dvi.Posterior(LINE, on_a_line(), PAIR).potential(jnp.ones(2)))
+
+
+ONE = dvi.Observations([0.0], np.zeros((1, 1)), sigma=0.1)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "said"),
+    [
+        (lambda: dvi.Posterior(LINE, ONE, PAIR), ValueError, "2 parameters .* from 1 observed"),
+        (
+            lambda: dvi.Posterior(LINE, on_a_line(None, 2), PAIR),
+            ValueError,
+            "and the size of the errors, cannot follow from 2",
+        ),
+        (lambda: dvi.Posterior(LINE, ONE, PAIR, gradient="both"), ValueError, '"reverse" or'),
+        (lambda: dvi.Posterior(LINE, np.ones(3), PAIR), TypeError, "dvi.Observations"),
+        (
+            lambda: dvi.Posterior(LINE, on_a_line(None), PAIR, loss=dvi.SoftL1()),
+            ValueError,
+            "a robust loss can only be weighed against data with errors",
+        ),
+        (
+            lambda: dvi.sample(LINE, on_a_line(), PAIR, num_samples=2),
+            ValueError,
+            "num_samples must be an integer, at least 4, got 2",
+        ),
+        (lambda: dvi.sample(LINE, on_a_line(), PAIR, chains=0), ValueError, "chains must be"),
+        (
+            lambda: dvi.sample(LINE, on_a_line(), PAIR, target_accept=1.0),
+            ValueError,
+            "target_accept must lie between 0 and 1",
+        ),
+        (lambda: dvi.sample(LINE, on_a_line(), PAIR, progress=3), TypeError, "progress must be"),
+        (
+            lambda: dvi.sample(LINE, on_a_line(), PAIR, start={"q0": np.zeros(1)}),
+            ValueError,
+            r"start has the parameters q0\[0\], those to be sampled are p0\[0\], q0\[0\]",
+        ),
+        (
+            lambda: dvi.sample(
+                LINE, on_a_line(), PAIR, bounds={"q0": dvi.Bounds(0, 1)},
+                start={"q0": np.ones(1) * 2, "p0": np.ones(1)},
+            ),
+            ValueError,
+            "not between its bounds",
+        ),
+        (
+            lambda: dvi.sample(
+                dvi.Model(dvi.System(free), h=H, q0=jnp.zeros(1)), on_a_line(),
+                {"p0": np.ones(1), "args": {"unused": 1.0}}, start={"p0": np.ones(1),
+                                                                    "args": {"unused": 1.0}},
+            ),
+            ValueError,
+            "neither the data nor priors determine 1.00 args.unused",
+        ),
+    ],
+)  # fmt: skip
+def test_refused(call, error, said):
+    with pytest.raises(error, match=said):
+        call()

@@ -1,0 +1,355 @@
+"""Pictures of fits: what is drawn, where, in which units, and what is refused."""
+
+import types
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.patches import Ellipse
+
+import dvi_jax as dvi
+from dvi_jax import plot
+
+mpl.use("Agg")
+
+NAMES = ["args.mu", "epsilon", "q0[0]"]
+X = np.array([1.000632, -0.02, 3.2e-4])
+SIGMA = np.array([2e-5, 4e-3, 5e-4])
+RHO = np.array([[1.0, 0.6, 0.0], [0.6, 1.0, -0.9996], [0.0, -0.9996, 1.0]])
+RHO = np.where(np.eye(3, dtype=bool), 1.0, np.clip(RHO, -0.8, 0.8))
+C = RHO * np.outer(SIGMA, SIGMA)
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def made(arcs=1, sigma=0.1, n=60, components=2, **changes):
+    """A `FitResult` of normal residuals, with two stages and a rejected step."""
+    rng = np.random.default_rng(0)
+    ts = [np.linspace(0, 10, n) + i for i in range(arcs)]
+    predicted = [np.stack([np.sin(t + k) for k in range(components)], 1) for t in ts]
+    whitened = [rng.normal(size=p.shape) for p in predicted]
+    whitened[0][3, 0] = np.nan
+    observed = [p - (sigma or 0.1) * w for p, w in zip(predicted, whitened, strict=True)]
+    history = {
+        "stage": np.array([0, 0, 1, 1, 1]), "horizon": np.array([5.0, 5.0, *[np.inf] * 3]),
+        "loss": np.array([1e3, 40.0, 90.0, 90.0, 61.0]), "step": np.ones(5),
+        "accepted": np.array([True, True, True, False, True]), "x": np.tile(X, (5, 1)),
+    }  # fmt: skip
+    about = {
+        "params": dict(zip(NAMES, X, strict=True)), "x": X, "names": NAMES, "covariance": C,
+        "history": history, "result": dvi.FIT_RESULTS.converged, "ts": ts, "observed": observed,
+        "predicted": predicted, "loss": 61.0, "degrees_of_freedom": 2 * n - 3,
+        "whitened": whitened if sigma else [0.1 * w for w in whitened], "num_observed": 2 * n,
+        "has_errors": sigma is not None,
+    }  # fmt: skip
+    return dvi.FitResult(**{**about, **changes})
+
+
+def points(axis):
+    """What is drawn as dots, one array (N, 2) each."""
+    return [np.asarray(line.get_xydata()) for line in axis.lines if line.get_marker() != "None"]
+
+
+def texts(axis):
+    return [t.get_text() for t in axis.get_legend().get_texts()]
+
+
+# --- residuals -----------------------------------------------------------------------------------
+
+
+def test_residuals_stand_at_their_times_beside_their_distribution():
+    fit = made()
+    axes = plot.fit_residuals(fit)
+    assert axes.shape == (2,)
+    for k, drawn in enumerate(points(axes[0])[:2]):
+        np.testing.assert_array_equal(drawn, np.stack([fit.ts[0], fit.whitened[0][:, k]], 1))
+    levels = {line.get_ydata()[0] for line in axes[0].lines if line.get_marker() == "None"}
+    assert levels == {0, 1, -1, 3, -3}
+    counted = sum(patch.get_width() for patch in axes[1].patches)
+    assert counted == 119  # one is missing
+    curve = next(line for line in axes[1].lines if len(line.get_xdata()) == 200)
+    area = np.trapezoid(curve.get_xdata(), curve.get_ydata())
+    assert area == pytest.approx(119 * axes[1].patches[0].get_height(), rel=1e-3)
+    assert axes[0].get_ylim() == axes[1].get_ylim()
+    assert axes[0].get_ylabel() == "predicted − observed\n[standard errors]"
+    assert texts(axes[0]) == ["component 0", "component 1"]
+
+
+def test_residuals_of_unknown_errors_are_in_the_error_that_was_found():
+    fit = made(sigma=None)
+    axes = plot.fit_residuals(fit, component=1)
+    (drawn,) = points(axes[0])
+    s = np.sqrt(fit.reduced_chi2)
+    np.testing.assert_allclose(drawn[:, 1], fit.whitened[0][:, 1] / s)
+    assert 0.8 < np.std(drawn[:, 1]) < 1.2
+    assert f"s = {s:.3g}" in axes[0].get_ylabel()
+
+
+def test_an_outlier_stays_in_the_picture():
+    fit = made()
+    fit.whitened[0][7, 1] = -12.0
+    axes = plot.fit_residuals(fit)
+    assert axes[0].get_ylim()[0] < -12
+    assert sum(patch.get_width() for patch in axes[1].patches) == 119
+
+
+def test_arcs_have_panels_until_there_are_many():
+    assert [a.get_title(loc="left") or a.get_title() for a in plot.fit_residuals(made(3))[:3]] == [
+        "arc 0", "arc 1", "arc 2"
+    ]  # fmt: skip
+    axes = plot.fit_residuals(made(9))
+    assert len(axes) == 2
+    assert len(points(axes[0])) == 18
+    axes = plot.fit_residuals(made(9), arcs=[8])
+    np.testing.assert_array_equal(points(axes[0])[0][:, 0], np.linspace(0, 10, 60) + 8)
+    mine = plt.subplots(1, 2)[1]
+    assert list(plot.fit_residuals(made(), axes=mine)) == list(mine)
+
+
+def test_the_sign_that_the_label_says_is_that_of_a_real_fit():
+    model = dvi.Model(dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2), h=0.1, p0=jnp.ones(1))
+    data = dvi.Observations([0.0, 0.1, 0.2], np.array([[0.0], [0.1], [0.8]]), sigma=0.1)
+    with jax.numpy_rank_promotion("allow"):  # the optimiser scales columns
+        fit = dvi.fit(model, data, {"q0": np.zeros(1)})
+    last = points(plot.fit_residuals(fit)[0])[0][-1, 1]
+    np.testing.assert_allclose(last, (fit.predicted[0] - fit.observed[0])[-1, 0] / 0.1)
+    assert last < -3
+
+
+# --- covariance ----------------------------------------------------------------------------------
+
+
+def edge(ellipse):
+    """Points of an ellipse."""
+    t = np.linspace(0, 2 * np.pi, 100)
+    half = np.array([ellipse.width, ellipse.height]) / 2
+    a = np.radians(ellipse.angle)
+    turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    return (half * np.stack([np.cos(t), np.sin(t)], 1)) @ turn.T + np.array(ellipse.center)
+
+
+def test_ellipses_are_those_of_the_covariance():
+    axes = plot.fit_corner(made())
+    # Units of the axes, read from their labels.
+    assert axes[2, 0].get_xlabel() == "args.mu − 1.000632\n[$10^{-5}$]"
+    assert axes[2, 1].get_xlabel() == "epsilon"
+    assert axes[2, 2].get_xlabel() == "q0[0]\n[$10^{-3}$]"
+    scale = np.array([1e-5, 1.0, 1e-3])
+    for i, j in ((1, 0), (2, 0), (2, 1)):
+        pair = C[np.ix_([j, i], [j, i])]
+        found = [p for p in axes[i, j].patches if isinstance(p, Ellipse)]
+        for size, ellipse in zip((1, 2), found, strict=True):
+            off = (edge(ellipse) - np.array(ellipse.center)) * scale[[j, i]]
+            distance = np.einsum("ni,ij,nj->n", off, np.linalg.inv(pair), off)
+            np.testing.assert_allclose(distance, size**2, rtol=1e-6)
+            np.testing.assert_allclose(np.ptp(off, axis=0) / 2, size * SIGMA[[j, i]], rtol=2e-3)
+    centre = np.array(axes[2, 1].patches[0].center)
+    np.testing.assert_allclose(centre * scale[[1, 2]], X[[1, 2]])
+    assert axes[0, 1].texts[0].get_text() == "+0.60"
+    assert axes[1, 2].texts[0].get_text() == "−0.80"
+    assert axes[0, 2].texts[0].get_text() == "0.00"
+    titles = [axes[i, i].get_title() for i in range(3)]
+    assert titles[0] == "args.mu\n1.000632 ± 0.000020"
+    assert titles[1] == "epsilon\n−0.0200 ± 0.0040"
+
+
+def test_marginals_are_normal_densities():
+    axes = plot.fit_corner(made())
+    for i, scale in enumerate((1e-5, 1.0, 1e-3)):
+        x, y = axes[i, i].lines[0].get_data()
+        assert np.trapezoid(y, x) == pytest.approx(1, abs=3e-3)
+        assert y.max() == pytest.approx(scale / (SIGMA[i] * np.sqrt(2 * np.pi)), rel=1e-3)
+
+
+def test_parameters_are_chosen_and_ordered():
+    axes = plot.fit_corner(made(), ["epsilon", "args.mu"])
+    assert axes.shape == (2, 2)
+    assert axes[1, 0].get_xlabel() == "epsilon"
+    assert plot.fit_corner(made(), "epsilon").shape == (1, 1)
+    mine = plt.subplots(2, 2)[1]
+    assert plot.fit_corner(made(), NAMES[:2], axes=mine)[1, 0] is mine[1, 0]
+    strong = C.copy()
+    strong[0, 1] = strong[1, 0] = -0.9996 * SIGMA[0] * SIGMA[1]
+    axes = plot.fit_corner(made(covariance=strong), NAMES[:2])
+    assert axes[0, 1].texts[0].get_text() == "−0.9996"
+
+
+def test_draws_lie_under_the_ellipses():
+    draws = np.random.default_rng(0).multivariate_normal(X, C, 2000).reshape(4, 500, 3)
+    samples = {name: draws[..., i] for i, name in enumerate(NAMES)}
+    axes = plot.fit_corner(made(), samples=samples)
+    (cloud,) = [p for p in points(axes[2, 1]) if len(p) == 2000]
+    np.testing.assert_allclose(cloud * [1.0, 1e-3], draws.reshape(-1, 3)[:, [1, 2]])
+    bars = sum(p.get_height() * p.get_width() for p in axes[0, 0].patches)
+    assert bars == pytest.approx(1)
+    own = types.SimpleNamespace(
+        names=NAMES, x=draws, mean=draws.mean((0, 1)), samples=samples,
+        covariance=np.cov(draws.reshape(-1, 3).T),
+    )  # fmt: skip
+    assert plot.fit_corner(own, samples=own).shape == (3, 3)
+
+
+def test_what_is_not_determined_is_named():
+    lost = C.copy()
+    lost[1, :] = lost[:, 1] = np.nan
+    lost[1, 1] = np.inf
+    fit = made(covariance=lost)
+    with pytest.raises(ValueError, match=r"do not determine epsilon.*'args.mu', 'q0\[0\]'"):
+        plot.fit_corner(fit)
+    assert plot.fit_corner(fit, ["args.mu", "q0[0]"]).shape == (2, 2)
+
+
+# --- data, history -------------------------------------------------------------------------------
+
+
+def bars(axis):
+    """Half lengths of the error bars of each set of data, without those that have none."""
+    return [
+        [np.ptp(s[:, 1]) / 2 for s in c[2][0].get_segments() if len(s)]
+        for c in axis.containers
+        if c[2]
+    ]
+
+
+def test_data_with_their_errors_beside_the_prediction():
+    fit = made()
+    axis = plot.fit_against_data(fit, component=1)
+    np.testing.assert_allclose(bars(axis)[0], 0.1)
+    lines = [line.get_xydata() for line in axis.lines]
+    np.testing.assert_array_equal(lines[0], np.stack([fit.ts[0], fit.predicted[0][:, 1]], 1))
+    np.testing.assert_array_equal(lines[1], np.stack([fit.ts[0], fit.observed[0][:, 1]], 1))
+    assert texts(axis) == ["component 1: fit", "component 1: observed"]
+    both = plot.fit_against_data(fit)
+    shown = [to_hex(line.get_color()).upper() for line in both.lines[::2]]
+    assert shown == list(plot.COLOURS[:2])
+
+
+def test_errors_come_from_the_data_where_residuals_do_not_tell_them():
+    fit = made()
+    mixed = [w @ np.array([[1.0, 0.4], [0.0, 0.8]]) for w in fit.whitened]
+    fit = made(whitened=mixed)
+    assert bars(plot.fit_against_data(fit, component=1)) == []
+    cov = np.array([[0.01, 0.0], [0.0, 0.04]])
+    data = dvi.Observations(fit.ts[0], fit.observed[0], covariance=cov)
+    np.testing.assert_allclose(bars(plot.fit_against_data(fit, component=1, data=data))[0], 0.2)
+    data = dvi.Observations(fit.ts[0], fit.observed[0], sigma=np.linspace(0.1, 0.2, 60)[:, None])
+    found = bars(plot.fit_against_data(fit, component=0, data=[data]))[0]
+    want = np.delete(np.linspace(0.1, 0.2, 60), 3)
+    np.testing.assert_allclose([b for b in found if np.isfinite(b)], want, atol=1e-12)
+    fit = made(sigma=None)
+    found = bars(plot.fit_against_data(fit, component=1))[0]
+    np.testing.assert_allclose(found, np.sqrt(fit.reduced_chi2))
+    one = made(components=1)
+    np.testing.assert_allclose(np.array(bars(plot.fit_against_data(one))[0])[4:], 0.1)
+
+
+def test_a_finer_curve_stands_in_for_the_lines():
+    fit = made(components=1)
+    t = np.linspace(0, 10, 500)
+    axis = plot.fit_against_data(fit, curve=(t, np.sin(t)))
+    np.testing.assert_array_equal(axis.lines[0].get_ydata(), np.sin(t))
+
+
+def test_losses_by_stage_with_rejected_steps():
+    axis = plot.learning_curve(made())
+    first, second = axis.lines[0], axis.lines[1]
+    np.testing.assert_array_equal(first.get_xydata(), [[1, 1e3], [2, 40]])
+    np.testing.assert_array_equal(second.get_xdata(), [3, 4, 5])
+    assert first.get_color() != second.get_color()
+    (cross,) = [line for line in axis.lines if line.get_marker() == "x"]
+    np.testing.assert_array_equal(cross.get_xydata(), [[4, 90]])
+    assert texts(axis) == ["stage 1: up to 5 after the start", "stage 2: all data", "step rejected"]
+    assert axis.get_yscale() == "log"
+    fit = made()
+    fit.history["loss"][4] = -3.0
+    fit.history["accepted"][:] = True
+    axis = plot.learning_curve(fit)
+    assert axis.get_yscale() == "linear"
+    assert "step rejected" not in texts(axis)
+
+
+def test_pictures_of_ones_own(tmp_path):
+    with plot.style():
+        figure, axes = plt.subplots(1, 2, layout="constrained")
+        assert plot.learning_curve(made(), ax=axes[0]) is axes[0]
+        assert plot.fit_against_data(made(2), arc=1, ax=axes[1]) is axes[1]
+        assert axes[1].get_title(loc="left") == "arc 1"
+        assert plot.save(figure, tmp_path / "fit.png").stat().st_size > 10_000
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+BARE = types.SimpleNamespace(x=X)
+NONE = np.full((3, 3), np.nan)
+MANY = made(names=[f"a{i}" for i in range(13)], x=np.ones(13), covariance=np.eye(13))
+
+
+@pytest.mark.parametrize(
+    ("draw", "error", "said"),
+    [
+        (lambda: plot.fit_residuals(BARE), TypeError, "fit_residuals takes a FitResult.*whitened"),
+        (lambda: plot.fit_residuals(made(), arcs=1), ValueError, "no arc 1: .* 0 to 0"),
+        (lambda: plot.fit_residuals(made(), component="q"), ValueError, "no component 'q'"),
+        (lambda: plot.fit_residuals(made(), arcs=[]), ValueError, "at least one arc"),
+        (
+            lambda: plot.fit_residuals(made(), axes=plt.subplots(1, 3)[1]),
+            ValueError,
+            "axes must be 2, one for each panel.*got 3",
+        ),
+        (lambda: plot.fit_corner(BARE), TypeError, "fit_corner takes .* names, covariance"),
+        (lambda: plot.fit_corner(made(covariance=NONE)), ValueError, "no covariance to draw"),
+        (
+            lambda: plot.fit_corner(made(), ["mu"]),
+            ValueError,
+            "no parameter is called 'mu': there are args.mu, eps",
+        ),
+        (lambda: plot.fit_corner(made(), ["epsilon"] * 2), ValueError, "different names"),
+        (lambda: plot.fit_corner(made(), []), ValueError, "one or more"),
+        (lambda: plot.fit_corner(MANY), ValueError, r"13 parameters are too many.*params=\['a0'"),
+        (
+            lambda: plot.fit_corner(made(), samples={"mu": X}),
+            ValueError,
+            "samples has no 'args.mu'",
+        ),
+        (lambda: plot.fit_corner(made(), samples=3), TypeError, "a dvi.Samples or a dict"),
+        (
+            lambda: plot.fit_corner(made(), axes=plt.subplots(2, 2)[1]),
+            ValueError,
+            r"shape \(3, 3\) for 3 parameters",
+        ),
+        (lambda: plot.fit_against_data(BARE), TypeError, "fit_against_data takes"),
+        (lambda: plot.fit_against_data(made(), arc=2), ValueError, "no arc 2"),
+        (lambda: plot.fit_against_data(made(), component=-1), ValueError, "no component -1"),
+        (
+            lambda: plot.fit_against_data(made(), data=np.ones(3)),
+            ValueError,
+            "with sigma or covariance, got ndarray",
+        ),
+        (
+            lambda: plot.fit_against_data(
+                made(), data=dvi.Observations([0.0], np.ones((1, 2)), sigma=1.0)
+            ),
+            ValueError,
+            r"shape \(1, 2\), arc 0 of the fit has \(60, 2\)",
+        ),
+        (lambda: plot.fit_against_data(made(), curve=(X, X)), ValueError, "with 2 components"),
+        (lambda: plot.fit_against_data(made(components=9)), ValueError, "9 components are too"),
+        (lambda: plot.learning_curve(BARE), TypeError, "learning_curve takes"),
+        (
+            lambda: plot.learning_curve(made(history=dict.fromkeys(made().history, X[:0]))),
+            ValueError,
+            "took no step",
+        ),
+    ],
+)
+def test_refused(draw, error, said):
+    with pytest.raises(error, match=said):
+        draw()
