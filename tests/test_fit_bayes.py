@@ -17,13 +17,6 @@ from dvi_jax.fit import bayes
 N, H = 12, 0.1
 
 
-@pytest.fixture(autouse=True)
-def ranks():
-    # The optimiser of dvi.fit scales the columns of a Jacobian by a vector.
-    with jax.numpy_rank_promotion("allow"):
-        yield
-
-
 def free(t0, t1, q0, p1, args):
     return p1 @ p1 / 2
 

@@ -1,7 +1,7 @@
 """Disturbances from data: parameters of a model that observed trajectories determine."""
 
 from ._fit import fit as fit
-from .bayes import Posterior as Posterior, Samples as Samples, sample as sample
+from .bayes import Samples as Samples, sample as sample
 from .losses import (
     Cauchy as Cauchy,
     LeastSquares as LeastSquares,
@@ -11,6 +11,7 @@ from .losses import (
 from .model import Model as Model
 from .observations import Observations as Observations
 from .parameters import Bounds as Bounds, Prior as Prior
+from .posterior import Posterior as Posterior
 from .progress import FitProgress as FitProgress
 from .result import FitResult as FitResult
 from .results import FIT_RESULTS as FIT_RESULTS, FitError as FitError

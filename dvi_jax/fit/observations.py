@@ -121,6 +121,13 @@ class Observations:
         """Whether sigma or covariance was given."""
         return self.sigma is not None or self.covariance is not None
 
+    @property
+    def errors(self) -> np.ndarray:
+        """Standard error of each value, of the shape of `values`; NaN where none was given."""
+        if self.covariance is not None:
+            return np.sqrt(np.einsum("nii->ni", self.covariance)).reshape(self.values.shape)
+        return np.full(self.values.shape, np.nan) if self.sigma is None else self.sigma
+
     def whitening(self) -> np.ndarray:
         """What residuals are multiplied by to be independent with unit variance.
 

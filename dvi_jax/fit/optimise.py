@@ -18,6 +18,9 @@ _STIFFNESS = 30.0
 """Length of the columns of the scaled Jacobian. Optimistix damps with 1 to begin with, so that
 this is Marquardt's 1e-3 of the squared columns."""
 
+_HOPELESS = 12
+"""Rejected steps in a row after which no step is expected to help."""
+
 _FLAT = 1e-3
 """Standard errors that the gradient is worth, below which a loss that no longer falls is a minimum,
 known to its rounding."""
@@ -136,7 +139,8 @@ class LeastSquaresStage:
         - `first`: what is known at u already; `degrees` of freedom; `extra` for `evaluate`.
 
         Ends when the step to the next trial moves what is predicted by less than `tolerance`
-        standard errors, the size of which is found from the residuals.
+        standard errors, the size of which is found from the residuals; or when three steps in a
+        row make Σ r² smaller by less than its square.
         """
         if resume is None:
             best = self.at(u, horizon, extra) if first is None else first
@@ -154,7 +158,7 @@ class LeastSquaresStage:
             state = _with_leaves(_begin(self._solver, *best.jacobian.shape), resume.leaves)
             _check_same(best.residual, state.f_info.residual)
             trial = None
-        status, rejected = FIT_RESULTS.max_steps_reached, 0
+        status, rejected, last, still = FIT_RESULTS.max_steps_reached, 0, np.inf, 0
         while done < max_steps:
             if trial is None:
                 trial = self.at(base + scale * np.asarray(state.y_eval), horizon, extra)
@@ -178,10 +182,13 @@ class LeastSquaresStage:
             if not np.isfinite(moved):
                 status = FIT_RESULTS.stalled
                 break
-            if (moved <= tolerance * spread and rejected < 3) or moved <= floor:
+            if accepted:  # at a bound the free variable goes on for ever, and nothing changes
+                still = still + 1 if last - loss <= (tolerance * spread) ** 2 else 0
+                last = loss
+            if (moved <= tolerance * spread and rejected < 3) or moved <= floor or still >= 3:
                 status = FIT_RESULTS.converged
                 break
-            if rejected >= 3 and (rejected >= 12 or moved <= tolerance * spread):
+            if rejected >= 3 and (rejected >= _HOPELESS or moved <= tolerance * spread):
                 gradient = (np.asarray(best.jacobian) * scale).T @ residual
                 flat = np.abs(gradient).max() <= _FLAT * _STIFFNESS * spread
                 status = FIT_RESULTS.converged if flat else FIT_RESULTS.stalled
@@ -263,7 +270,7 @@ class ScalarStage:
         if resume is not None:
             state = _with_leaves(state, resume.leaves)
         is_optax = isinstance(self.solver, optx.OptaxMinimiser)
-        last, still = np.inf, 0
+        last, still, rejected = np.inf, 0, 0
         status = FIT_RESULTS.steps_done if is_optax else FIT_RESULTS.max_steps_reached
         while done < max_steps:
             old = z
@@ -282,8 +289,13 @@ class ScalarStage:
             if not np.isfinite(x).all():
                 return np.asarray(base + size * old), FIT_RESULTS.not_finite
             if choose is None and not is_optax:
-                still = still + 1 if abs(last - loss) <= tolerance**2 else 0
-                last = loss
+                rejected = 0 if moved > 0 else rejected + 1
+                if moved > 0:
+                    still = still + 1 if abs(last - loss) <= tolerance**2 else 0
+                    last = loss
+                if rejected >= _HOPELESS:
+                    status = FIT_RESULTS.stalled
+                    break
                 if bool(ended) or still >= 3:
                     status = FIT_RESULTS.converged
                     break

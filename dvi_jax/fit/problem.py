@@ -220,14 +220,15 @@ class Problem:
         return _curvature(self.core, jnp.asarray(u), jnp.asarray(directions))
 
     def by_arc(self, rows: list[Any], known: list[Any]) -> tuple[list, list, list[str]]:
-        """For each arc predictions (N, ...), whitened residuals (N, K), and the status."""
+        """For each arc predictions (N, ...), observed minus predicted in standard errors (N, K),
+        and the status."""
         predicted, whitened, names = {}, {}, {}
         for group, r, (values, result) in zip(self.groups, rows, known, strict=True):
             status = np.atleast_1d(status_name(result))
             for a, i in enumerate(group.arcs):
                 arc, n = self.arcs[i], len(self.arcs[i].ts)
                 predicted[i] = np.asarray(values[a, :n]).reshape(arc.values.shape)
-                whitened[i] = np.where(group.seen[a, :n], np.asarray(r[a, :n]), np.nan)
+                whitened[i] = np.where(group.seen[a, :n], -np.asarray(r[a, :n]), np.nan)
                 names[i] = str(status[a])
         each = range(len(self.arcs))
         return [predicted[i] for i in each], [whitened[i] for i in each], [names[i] for i in each]

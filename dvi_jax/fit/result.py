@@ -33,7 +33,9 @@ class FitResult:
       `loss`, `step`, `accepted`, and `x`, shape (steps, n).
     - `result`: how it ended, one of `FIT_RESULTS`; `status` its name.
     - `ts`, `observed`, `predicted`: lists with an array for each arc, (N,) and (N, ...).
-    - `whitened`: residuals in standard errors, (N, K) for each arc, NaN for what is missing.
+    - `errors`: standard errors of the data, (N, ...) for each arc, NaN where none were given.
+    - `whitened`: observed minus predicted in standard errors, (N, K) for each arc, independent of
+      one another where covariances were given; NaN for what is missing.
     - `loss`: ½ Σ ρ(r²) + priors; `degrees_of_freedom`; `num_observed`: how many values.
     - `undetermined`: directions of the parameters that the data say nothing of, in words.
     - `singular_values`: of the Jacobian with columns of unit length, largest first.
@@ -53,6 +55,7 @@ class FitResult:
     observed: list[np.ndarray]
     predicted: list[np.ndarray]
     whitened: list[np.ndarray]
+    errors: list[np.ndarray]
     loss: float
     degrees_of_freedom: int
     num_observed: int
@@ -150,7 +153,7 @@ class FitResult:
         }  # fmt: skip
         arrays = {"x": self.x, "covariance": self.covariance, "values": self.singular_values}
         arrays |= {f"history.{name}": value for name, value in self.history.items()}
-        for name in ("ts", "observed", "predicted", "whitened"):
+        for name in ("ts", "observed", "predicted", "whitened", "errors"):
             arrays |= {f"{name}.{i}": a for i, a in enumerate(getattr(self, name))}
         if self.curvature is not None:
             arrays["curvature"] = self.curvature
@@ -186,7 +189,7 @@ class FitResult:
         history = {k[8:]: v for k, v in arrays.items() if k.startswith("history.")}
         lists = {
             name: [arrays[f"{name}.{i}"] for i in many]
-            for name in ("ts", "observed", "predicted", "whitened")
+            for name in ("ts", "observed", "predicted", "whitened", "errors")
         }
         return cls(
             params=space.to_params(jnp.asarray(arrays["x"])),

@@ -171,8 +171,8 @@ class Segments:
         problem = self.problem
         params = problem.space.to_params(problem.space.to_x(u))
         spec = problem.core.specification(params, arc)
-        q = jnp.where(first, spec["q0"], node[: self.half].reshape(self.shape))
-        p = jnp.where(first, spec["p0"], node[self.half :].reshape(self.shape))
+        q = jnp.where(first, jnp.asarray(spec["q0"], float), node[: self.half].reshape(self.shape))
+        p = jnp.where(first, jnp.asarray(spec["p0"], float), node[self.half :].reshape(self.shape))
         found, (q1, p1), _ = predict({**spec, "q0": q, "p0": p}, t0, ts, pick, self.group)
         off = jnp.where(seen, found - values, 0.0)
         r = off * whiten if whiten.ndim == 2 else jnp.einsum("nij,nj->ni", whiten, off)

@@ -41,7 +41,7 @@ class Minimum(NamedTuple):
     aux: Any = None
 
 
-def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units: bool):
+def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units: bool) -> Minimum:
     """Stages of growing horizon; u, the Jacobian of the last, and how it ended."""
     problem = run.problem
     stage = LeastSquaresStage(problem.evaluate, solver)
@@ -120,16 +120,12 @@ def by_gradient(run: Run, u: np.ndarray, solver: Any, wanted, batch, seed: int, 
             break
         number += 1
         horizon = _next(problem, wanted, number, rows, 2 * horizon * (1 - 1e-9))
+    aux = rows, known
     if problem.size > MANY or status == FIT_RESULTS.not_finite:
-        return Minimum(u, status, aux=(rows, known))
+        return Minimum(u, status, aux=aux)
     if isinstance(problem.loss, Likelihood):
-        return Minimum(u, status, _root_of_hessian(problem, u), None, (rows, known))
-    return (
-        u,
-        (problem.evaluate(u).jacobian, None),
-        status,
-        (rows, known),
-    )
+        return Minimum(u, status, _root_of_hessian(problem, u), aux=aux)
+    return Minimum(u, status, problem.evaluate(u).jacobian, aux=aux)
 
 
 def _lengths(problem: Problem, u: np.ndarray) -> np.ndarray:
@@ -159,7 +155,7 @@ def _root_of_hessian(problem: Problem, u: np.ndarray) -> np.ndarray:
     return np.sqrt(np.where(values > 0, values, np.nan))[:, None] * vectors.T
 
 
-def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any):
+def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any) -> Minimum:
     """Multiple shooting: Levenberg–Marquardt inside of an augmented Lagrangian."""
     problem, n, gaps = run.problem, run.problem.size, segments.num_gaps
     stage = LeastSquaresStage(eqx.filter_jit(segments.evaluate), solver)

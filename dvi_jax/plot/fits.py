@@ -34,7 +34,7 @@ def fit_residuals(
 ) -> np.ndarray:
     """Residuals in standard errors against time, and their distribution beside a normal one.
 
-    - `fit`: a `FitResult`. Its whitened residuals, predicted − observed, are drawn as they are; for
+    - `fit`: a `FitResult`. Its whitened residuals, observed − predicted, are drawn as they are; for
       data without errors they are divided by s, the error that was found.
     - `arcs`: numbers of those that are drawn; None: all. Up to six have a panel each, more share
       one. `component`: of the flattened values of one observation; None: all.
@@ -65,7 +65,7 @@ def fit_residuals(
     furthest = 1.08 * max(3.5, np.abs(every).max(initial=0.0))
     _draw_distribution(axes[-1], every, furthest)
     unit = "standard errors" if fit.has_errors else f"s = {size:.3g}"
-    label = f"predicted − observed\n[{unit}]"
+    label = f"observed − predicted\n[{unit}]"
     for axis in axes[:-1]:
         axis.set_ylim(-furthest, furthest)
         if furthest < 5:
@@ -385,18 +385,15 @@ def fit_against_data(
     fit: Any,
     arc: int = 0,
     component: int | Sequence[int] | None = None,
-    data: Any = None,
     curve: tuple[Any, Any] | None = None,
     ax: Any = None,
 ) -> Any:
     """What was observed along one arc, with its errors, and what the fit predicts.
 
+    Data without errors have bars of the error that was found.
+
     - `fit`: a `FitResult`. `arc`: its number. `component`: of the flattened values of one
       observation, one or several; None: all, up to seven.
-    - `data`: the `Observations` that were fitted (or the list of them): error bars by their sigma
-      or covariance. None: by the residuals, which tell the errors of one component, and of several
-      where they are the same at all times; others are drawn without bars. Data without errors have
-      bars of the error that was found.
     - `curve`: (times, values) of the model on a finer grid, (T,) and (T, ...), in place of the
       straight lines between its predictions.
     - `ax`: where to draw; None: a new figure.
@@ -404,9 +401,9 @@ def fit_against_data(
     **Returns** the `Axes`.
 
     **Raises** `TypeError` for what is no fit; `ValueError` for an arc or a component that is not
-    there, data or a curve of another shape.
+    there, or a curve of another shape.
     """
-    _check_fit(fit, "fit_against_data", "ts", "observed", "predicted", "whitened")
+    _check_fit(fit, "fit_against_data", "ts", "observed", "predicted", "errors")
     (arc,) = _chosen(arc, len(fit.ts), "arc")
     ts = np.asarray(fit.ts[arc])
     seen, model = (np.asarray(x[arc]).reshape(len(ts), -1) for x in (fit.observed, fit.predicted))
@@ -417,7 +414,9 @@ def fit_against_data(
             f"component={kept[:3]}, say."
         )
     fine = (ts, model) if curve is None else _curve(curve, seen.shape[1])
-    errors = _errors(fit, arc, seen, model, data)
+    found = math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
+    errors = np.asarray(fit.errors[arc]).reshape(seen.shape) if fit.has_errors else found
+    errors = np.broadcast_to(errors, seen.shape)
     if ax is None:
         ax = plt.subplots(figsize=(7.0, 4.0), layout="constrained")[1]
     order = np.argsort(fine[0])
@@ -428,7 +427,7 @@ def fit_against_data(
                 label=f"{name}fit")  # fmt: skip
         bars = errors[:, k]
         ax.errorbar(
-            ts, seen[:, k], yerr=bars if np.isfinite(bars).any() else None, color=colour,
+            ts, seen[:, k], yerr=bars, color=colour,
             fmt=MARKERS[k % len(MARKERS)], markersize=4 if len(ts) < 200 else 2, capsize=0,
             elinewidth=0.9, markerfacecolor="white", label=f"{name}observed",
         )  # fmt: skip
@@ -446,50 +445,6 @@ def _curve(curve: Any, components: int) -> tuple[np.ndarray, np.ndarray]:
             f"components, got {ts.shape} and {values.shape}."
         )
     return ts, values.reshape(len(ts), -1)
-
-
-def _errors(fit: Any, arc: int, seen: np.ndarray, model: np.ndarray, data: Any) -> np.ndarray:
-    """Standard errors of the values of an arc (N, K), NaN where they are not known."""
-    if not fit.has_errors:
-        found = math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
-        return np.full(seen.shape, found)
-    if data is not None:
-        return _given_errors(data, arc, seen.shape)
-    r, w = np.abs(seen - model), np.abs(np.asarray(fit.whitened[arc]))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        found = np.where(w > 0, r / w, np.nan)
-    if seen.shape[1] == 1:
-        return found
-    # By covariances each residual is a mixture of all: only a sigma leaves one ratio throughout.
-    for k in range(seen.shape[1]):
-        ratio = found[:, k][np.isfinite(found[:, k])]
-        if ratio.size < 2 or np.ptp(ratio) > 1e-6 * ratio.max():
-            found[:, k] = np.nan
-    return found
-
-
-def _given_errors(data: Any, arc: int, shape: tuple[int, ...]) -> np.ndarray:
-    one = data[arc] if isinstance(data, list | tuple) else data
-    sigma, covariance = getattr(one, "sigma", None), getattr(one, "covariance", None)
-    if sigma is None and covariance is None:
-        raise ValueError(
-            "data must be the dvi.Observations that were fitted, with sigma or covariance, got "
-            f"{type(one).__name__}."
-        )
-    if sigma is not None:
-        found = np.asarray(sigma, float)
-        if found.size == 1:
-            return np.full(shape, found.item())
-        found = found.reshape(len(found), -1)
-    else:
-        found = np.sqrt(np.diagonal(np.asarray(covariance), axis1=-2, axis2=-1))
-        found = np.broadcast_to(found, (shape[0], found.shape[-1]))
-    if found.shape != shape:
-        raise ValueError(
-            f"the errors of data have shape {found.shape}, arc {arc} of the fit has {shape}: "
-            "give the Observations that were fitted, all arcs in one list."
-        )
-    return found
 
 
 # --- how it went --------------------------------------------------------------------------------
