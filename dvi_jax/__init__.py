@@ -37,10 +37,13 @@ from .fit import (
     FitError as FitError,
     FitProgress as FitProgress,
     FitResult as FitResult,
+    ForceLibrary as ForceLibrary,
+    Identification as Identification,
     LeastSquares as LeastSquares,
     Likelihood as Likelihood,
     Model as Model,
     MultipleShooting as MultipleShooting,
+    NetworkForce as NetworkForce,
     Observations as Observations,
     Posterior as Posterior,
     Prior as Prior,
@@ -48,6 +51,7 @@ from .fit import (
     SingleShooting as SingleShooting,
     SoftL1 as SoftL1,
     fit as fit,
+    identify as identify,
     sample as sample,
 )
 from .invariants import (

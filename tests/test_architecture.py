@@ -105,6 +105,7 @@ ClusterError sweep_cost SweepCost
 fit Model Observations Bounds Prior LeastSquares SoftL1 Cauchy Likelihood
 SingleShooting MultipleShooting FitResult FitProgress FIT_RESULTS FitError
 Posterior Samples sample
+ForceLibrary identify Identification NetworkForce
 """
 
 

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 import dvi_jax as dvi
-from dvi_jax.fit import bayes
+from dvi_jax.fit import bayes, posterior as posterior_room
 
 N, H = 12, 0.1
 
@@ -91,7 +91,7 @@ def test_slopes_against_differences(loss, sigma):
     slope = np.asarray(jax.grad(posterior.potential)(u))
     # Central differences of order six: their own error is some h⁶, round-off some 1e-16 U/h.
     h, at, weights = 2e-4, np.array([-3, -2, -1, 1, 2, 3]), np.array([-1, 9, -45, 45, -9, 1]) / 60
-    moved = u + h * at[:, None, None] * jnp.eye(3)
+    moved = u[None, None] + h * at[:, None, None] * np.eye(3)[None]
     values = np.asarray(jax.vmap(jax.vmap(posterior.potential))(moved))
     by_differences = weights @ values / h
     np.testing.assert_allclose(slope, by_differences, rtol=1e-8)
@@ -241,7 +241,7 @@ def test_a_parameter_at_its_bound_has_the_truncated_distribution(monkeypatch, is
     data, mean, sigma = truncated()
     expected = contextlib.nullcontext()
     if not is_right:  # a density of u that is flat towards the bound, where no chain finds an end
-        monkeypatch.setattr(bayes, "log_slope", lambda space, u: jnp.zeros_like(u))
+        monkeypatch.setattr(posterior_room, "log_slope", lambda space, u: jnp.zeros_like(u))
         expected = pytest.warns(UserWarning, match="the chains do not agree")
     with expected:
         found = dvi.sample(
@@ -307,9 +307,8 @@ def test_errors_of_unknown_size_with_bounds_and_a_prior_from_a_fit_of_its_own():
 
 def fake(x, diverging=0, steps=3):
     """`Samples` of draws x (chains, draws) of one parameter, as `sample` collects them."""
-    posterior = types.SimpleNamespace(
-        names=["a"], _space=dvi.Posterior(NEAR_0, truncated()[0], {"q0": 0.1 * np.ones(1)})._space
-    )
+    posterior = dvi.Posterior(NEAR_0, truncated()[0], {"q0": 0.1 * np.ones(1)})
+    posterior.names = ["a"]
     lost = np.zeros(x.shape, bool)
     lost.flat[:diverging] = True
     about = {

@@ -79,7 +79,7 @@ def test_residuals_stand_at_their_times_beside_their_distribution():
     area = np.trapezoid(curve.get_xdata(), curve.get_ydata())
     assert area == pytest.approx(119 * axes[1].patches[0].get_height(), rel=1e-3)
     assert axes[0].get_ylim() == axes[1].get_ylim()
-    assert axes[0].get_ylabel() == "predicted − observed\n[standard errors]"
+    assert axes[0].get_ylabel() == "observed − predicted\n[standard errors]"
     assert texts(axes[0]) == ["component 0", "component 1"]
 
 

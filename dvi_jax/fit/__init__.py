@@ -2,6 +2,12 @@
 
 from ._fit import fit as fit
 from .bayes import Samples as Samples, sample as sample
+from .library import (
+    ForceLibrary as ForceLibrary,
+    Identification as Identification,
+    Removal as Removal,
+    identify as identify,
+)
 from .losses import (
     Cauchy as Cauchy,
     LeastSquares as LeastSquares,
@@ -9,6 +15,7 @@ from .losses import (
     SoftL1 as SoftL1,
 )
 from .model import Model as Model
+from .network import NetworkForce as NetworkForce
 from .observations import Observations as Observations
 from .parameters import Bounds as Bounds, Prior as Prior
 from .posterior import Posterior as Posterior

@@ -14,6 +14,7 @@ from jaxtyping import PyTree
 from .._compat import x64_enabled
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Observations, as_arcs
+from .optimise import BFGS, LEVENBERG_MARQUARDT
 from .outcome import result_of
 from .problem import Problem
 from .progress import FitProgress, shown
@@ -22,10 +23,6 @@ from .results import FIT_RESULTS, FitError
 from .run import Run, identity
 from .shooting import MultipleShooting, Segments, SingleShooting
 from .stages import MANY, by_gradient, in_segments, least_squares
-
-_LEVENBERG_MARQUARDT = optx.LevenbergMarquardt(rtol=1e-14, atol=1e-300)
-_BFGS = optx.BFGS(rtol=1e-10, atol=1e-10)
-# One object each, so that all fits share what is compiled for it. How they end is decided here.
 
 
 def fit(
@@ -145,9 +142,9 @@ def _solver(optimiser: Any, problem: Problem) -> Any:
         if problem.size > MANY:
             optimiser = optax.adam(optax.warmup_cosine_decay_schedule(1e-5, 3e-3, 100, 2000, 1e-5))
         elif residuals:
-            return _LEVENBERG_MARQUARDT
+            return LEVENBERG_MARQUARDT
         else:
-            return _BFGS
+            return BFGS
     if isinstance(optimiser, optax.GradientTransformation):
         return optx.OptaxMinimiser(optimiser, rtol=0.0, atol=0.0)
     if isinstance(optimiser, optx.AbstractGaussNewton):

@@ -5,6 +5,9 @@ import numpy as np
 from .model import Group
 from .problem import Problem
 
+_FURTHER = 1.02
+"""By how much a horizon grows at least where trajectories that fail do not let it double."""
+
 _OFF = 0.5
 """Misfit, relative to the scatter of the data, up to which a fit of everything is trusted to find
 the nearest minimum: half of it is a sixth of a period's phase."""
@@ -17,7 +20,8 @@ def full_horizon(problem: Problem) -> float:
 
 def suitable_horizon(problem: Problem, rows: list[np.ndarray], at_least: float = 0.0) -> float:
     """The longest of full, full/2, full/4, … over which the misfit is small beside the scatter of
-    the data; the shortest that has enough of them for the parameters where none is.
+    the data; the shortest that has enough of them for the parameters where none is, but not beyond
+    the first prediction that is not finite.
 
     - `rows`: whitened residuals (A, N, K) of each group. `at_least`: a horizon to go beyond.
 
@@ -30,15 +34,19 @@ def suitable_horizon(problem: Problem, rows: list[np.ndarray], at_least: float =
                             for g in problem.groups])  # fmt: skip
     misfit = np.concatenate([np.asarray(r)[g.seen]
                              for r, g in zip(rows, problem.groups, strict=True)])  # fmt: skip
+    enough = 2 * max(problem.size - problem.space.count_of_priors, 1)
     horizon = full
     while horizon > at_least:
         inside = since <= horizon * (1 + 1e-12)
-        if inside.sum() < 2 * problem.size:
+        if inside.sum() < enough:
             break
         if np.isfinite(misfit[inside]).all() and np.sqrt(np.mean(misfit[inside] ** 2)) <= allowed:
             return np.inf if horizon == full else horizon
         shortest = horizon
         horizon /= 2
+    lost = since[~np.isfinite(misfit)].min(initial=np.inf)
+    if shortest >= lost > _FURTHER * at_least / 2:
+        return lost * (1 - 1e-9)
     return np.inf if shortest >= full else shortest
 
 

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._compat import is_traced
 from .._integrate import integrate
 from .._results import RESULTS
 from .._solution import Save
@@ -145,8 +144,11 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: boo
                 f"the model must not set {name!r}: it follows from the data"
                 + (" (Observations(..., t0=...))." if name == "t0" else ".")
             )
-    if is_traced(found["h"]):
-        raise ValueError("the step size h of the model must be a number, not a parameter.")
+    if isinstance(found["h"], jax.Array):
+        raise ValueError(
+            "the step size h of the model must be a number such as 0.1, not a parameter nor a JAX "
+            "array: how many steps reach the data follows from it."
+        )
     return found
 
 

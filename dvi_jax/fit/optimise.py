@@ -18,6 +18,10 @@ _STIFFNESS = 30.0
 """Length of the columns of the scaled Jacobian. Optimistix damps with 1 to begin with, so that
 this is Marquardt's 1e-3 of the squared columns."""
 
+LEVENBERG_MARQUARDT = optx.LevenbergMarquardt(rtol=1e-14, atol=1e-300)
+BFGS = optx.BFGS(rtol=1e-10, atol=1e-10)
+# One object each, so that all fits share what is compiled for it. How they end is decided below.
+
 _HOPELESS = 12
 """Rejected steps in a row after which no step is expected to help."""
 

@@ -1,0 +1,177 @@
+"""Unknown forces as networks that are made of a potential and of damping."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._types import Args, Scalar, State
+
+
+def _momentum(q: Any, p: Any) -> Any:
+    return p
+
+
+class NetworkForce(eqx.Module):
+    r"""A force from networks: one of a potential, one of damping.
+
+        W(q, p) = −∇φ(q) − D(q, p) v,     D = L Lᵀ ≥ 0
+
+    so that the second part never does positive work: −vᵀ D v ≤ 0, whatever the parameters are.
+
+    - `n`: q and p have shape (n,). `key`: of `jax.random`, for the initial weights.
+    - `width`, `depth`: neurons of a hidden layer, and how many there are of them, in each network.
+    - `conservative`, `dissipative`: which of the parts there are.
+    - `damping_of`: ``"q"``, or ``"qp"`` for a D that depends on both.
+    - `activation`: a smooth function; the force has its derivative, so that softplus, the default,
+      makes it a network of sigmoids.
+    - `velocity`: function ``(q, p)`` → v, shape (n,): the q̇ = ∂H/∂p with which the power is to be
+      negative. None takes v = p, that of masses 1 and all others up to a positive factor.
+    - `scale_q`, `scale_p`: sizes of q and p: networks receive q / scale_q and p / scale_p.
+    - `initial`: by what the last layers are made smaller to begin with, so that the force is small.
+      Far smaller ones leave the layers before them without effect, which least squares take ill.
+
+    The module is a force, ``dvi.System(H_D, force=network)``, and its own parameters:
+
+        model = lambda network: dict(system=dvi.System(H_D, force=network), q0=..., p0=...,
+                                     h=0.1, epsilon=1.0)
+        fit = dvi.fit(model, data, dvi.NetworkForce(2, key=jax.random.key(0)))
+
+    and then ``fit.params`` is a `NetworkForce`. Up to 400 parameters are fitted by
+    Levenberg–Marquardt, which is far better here than gradient steps: take small networks. `size`
+    counts them. Through the data alone weights are not determined, which is reported as such;
+    the force is.
+
+    **Raises** `ValueError` or `TypeError` for what cannot be meant; `ValueError`, when called, for
+    q of another shape.
+
+    **Source** Our own; potentials by networks, Greydanus, Dzamba & Yosinski 2019; D = L Lᵀ,
+    Zhong, Dey & Chakraborty 2020, *Dissipative SymODEN*.
+    """
+
+    potential_net: eqx.nn.MLP | None
+    damping_net: eqx.nn.MLP | None
+    n: int = eqx.field(static=True)
+    damping_of: str = eqx.field(static=True)
+    scale_q: float = eqx.field(static=True)
+    scale_p: float = eqx.field(static=True)
+    velocity: Callable[..., Any] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        n: int,
+        *,
+        key: Array,
+        width: int = 8,
+        depth: int = 2,
+        conservative: bool = True,
+        dissipative: bool = True,
+        damping_of: str = "q",
+        activation: Callable[..., Any] = jax.nn.softplus,
+        velocity: Callable[..., Any] | None = None,
+        scale_q: float = 1.0,
+        scale_p: float = 1.0,
+        initial: float = 0.3,
+    ):
+        for name, value in (("n", n), ("width", width), ("depth", depth)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a positive integer, got {value!r}.")
+        for name, value in (("scale_q", scale_q), ("scale_p", scale_p), ("initial", initial)):
+            if not (isinstance(value, int | float) and 0 < value < np.inf):
+                raise ValueError(f"{name} must be a positive number, got {value!r}.")
+        if damping_of not in ("q", "qp"):
+            raise ValueError(f'damping_of must be "q" or "qp", got {damping_of!r}.')
+        if not (conservative or dissipative):
+            raise ValueError("conservative and dissipative are both False: no force is left.")
+        for name, value in (("activation", activation), ("velocity", velocity or _momentum)):
+            if not callable(value):
+                raise TypeError(f"{name} must be a function, got {value!r}.")
+        self.n, self.damping_of = n, damping_of
+        self.scale_q, self.scale_p = float(scale_q), float(scale_p)
+        self.velocity = _momentum if velocity is None else velocity
+        one, two = jax.random.split(key)
+        self.potential_net = self.damping_net = None
+        if conservative:
+            # A constant of φ is no force: a bias there would be a parameter without effect.
+            net = eqx.nn.MLP(n, 1, width, depth, activation, use_final_bias=False, key=one)
+            self.potential_net = _last_layer(net, initial)
+        if dissipative:
+            inputs = n if damping_of == "q" else 2 * n
+            net = eqx.nn.MLP(inputs, n * (n + 1) // 2, width, depth, activation, key=two)
+            # D is quadratic in L and has no slope at L = 0: it begins at initial² on the diagonal.
+            net = _last_layer(net, initial)
+            start = jnp.asarray(initial * np.eye(n)[np.tril_indices(n)])
+            self.damping_net = eqx.tree_at(lambda m: m.layers[-1].bias, net, start)
+
+    def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> State:
+        """W(q0, p1): shape (n,), [energy / unit of q]. Times and args have no part in it."""
+        del t0, t1, args
+        return self.conservative(q0) + self.dissipation(q0, p1)
+
+    def potential(self, q: State) -> Scalar:
+        """φ(q) − φ(0), a scalar [energy]; zero without this part."""
+        q = self._checked(q)
+        return self._phi(q) - self._phi(jnp.zeros_like(q))
+
+    def conservative(self, q: State) -> State:
+        """−∇φ(q), shape (n,)."""
+        return -jax.grad(self._phi)(self._checked(q))
+
+    def damping(self, q: State, p: State) -> Array:
+        """D = L Lᵀ, symmetric and positive semidefinite, shape (n, n)."""
+        q = self._checked(q)
+        if self.damping_net is None:
+            return jnp.zeros((self.n, self.n))
+        L = self._factor(q, self._checked(p))
+        return L @ L.T
+
+    def dissipation(self, q: State, p: State) -> State:
+        """−D v, shape (n,)."""
+        q, p = self._checked(q), self._checked(p)
+        if self.damping_net is None:
+            return jnp.zeros_like(q)
+        L = self._factor(q, p)
+        return -L @ (L.T @ self.velocity(q, p))
+
+    def power(self, q: State, p: State) -> Scalar:
+        """−vᵀ D v ≤ 0 [energy / time]: what the second part takes out."""
+        return jnp.dot(self.velocity(q, p), self.dissipation(q, p))
+
+    @property
+    def size(self) -> int:
+        """How many parameters there are."""
+        return sum(x.size for x in jax.tree.leaves(eqx.filter(self, eqx.is_inexact_array)))
+
+    def _phi(self, q: Array) -> Array:
+        if self.potential_net is None:
+            return jnp.zeros((), q.dtype)
+        return self.potential_net(q / self.scale_q)[0]
+
+    def _factor(self, q: Array, p: Array) -> Array:
+        """L, lower triangular."""
+        assert self.damping_net is not None
+        x = q / self.scale_q
+        if self.damping_of == "qp":
+            x = jnp.concatenate([x, p / self.scale_p])
+        found = self.damping_net(x)
+        place = np.zeros((self.n, self.n), int)
+        place[np.tril_indices(self.n)] = np.arange(len(found))
+        return jnp.where(np.tri(self.n, dtype=bool), found[place], 0.0)
+
+    def _checked(self, x: Any) -> Array:
+        x = jnp.asarray(x)
+        if x.shape != (self.n,):
+            raise ValueError(
+                f"this NetworkForce is made for q and p of shape ({self.n},), got {x.shape}: "
+                "dvi.NetworkForce(n, ...)."
+            )
+        return x
+
+
+def _last_layer(net: eqx.nn.MLP, size: float) -> eqx.nn.MLP:
+    """The same network with a small last layer."""
+    return eqx.tree_at(lambda m: m.layers[-1].weight, net, replace_fn=lambda w: size * w)

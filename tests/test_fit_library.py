@@ -1,0 +1,283 @@
+"""Unknown forces out of candidates: exactly the planted terms, and none where there are none."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+
+H = 0.1
+
+
+def H_D(t0, t1, q0, p1, args):
+    return (p1 @ p1 + q0 @ q0) / 2
+
+
+FREE = dvi.System(H_D)
+ONE = dvi.ForceLibrary.monomials(5, 1)
+TWO = dvi.ForceLibrary.monomials(3, 2, "q") + dvi.ForceLibrary(
+    {
+        "friction": lambda t0, t1, q, p, args: -p,
+        "magnetic": lambda t0, t1, q, p, args: jnp.stack([p[1], -p[0]]),
+    }
+)
+DAMPED = {"p": -0.05, "q³": -0.3}
+# The force of the potential q1²q2 − q2³/3 (Hénon and Heiles 1964), and friction.
+COUPLED = {"q1 q2 e1": -2.0, "q1² e2": -1.0, "q2² e2": 1.0, "friction": 0.02}
+CASES = {
+    "damped": (ONE, DAMPED, [1.5], [0.0], 300, 1.0),
+    "coupled": (TWO, COUPLED, [0.9, 0.7], [0.3, -0.8], 300, 0.3),
+}
+
+
+def observed(system, q0, p0, steps, seed, noise=0.01, epsilon=1.0, known=True):
+    """The state at each step, with 1 % of its spread as noise."""
+    epsilon = epsilon if system.force is not None else 0.0
+    sol = dvi.integrate(system, q0, p0, h=H, num_steps=steps, epsilon=epsilon)
+    values = np.concatenate([np.asarray(sol.qs), np.asarray(sol.ps)], axis=1)
+    sigma = noise * values.std()
+    values = values + sigma * np.random.default_rng(seed).normal(size=values.shape)
+    return dvi.Observations(
+        np.asarray(sol.ts), values, observe="state", sigma=sigma if known else None
+    )
+
+
+MODELS = {name: dvi.Model(FREE, h=H, epsilon=epsilon) for name, (*_, epsilon) in CASES.items()}
+
+
+@functools.cache
+def found(name, seed):
+    library, planted, q0, p0, steps, epsilon = CASES[name]
+    truth = dvi.System(H_D, force=library.with_coefficients(planted))
+    data = observed(truth, q0, p0, steps, seed, epsilon=epsilon)
+    off = np.random.default_rng(seed).normal(scale=0.03, size=(2, len(q0)))
+    starts = {"q0": jnp.array(q0) + off[0], "p0": jnp.array(p0) + off[1]}
+    return dvi.identify(MODELS[name], data, library, starts)
+
+
+def is_exact(name, seed):
+    planted, it = CASES[name][1], found(name, seed)
+    assert set(it.terms) == set(planted)
+    truth = np.array([planted[term] for term in it.terms])
+    assert np.max(np.abs(it.coefficients - truth) / it.sigma) < 4
+    assert np.max(it.sigma / np.abs(truth)) < 0.1
+    assert it.is_unique
+    assert it.undetermined == []
+    assert it.fit.status == "converged"
+    return it
+
+
+def test_finds_exactly_the_damped_cubic_among_twenty():
+    it = is_exact("damped", 0)
+    assert len(ONE) == 20
+    assert len(it.path) == 20  # each removal, and the one too many
+    assert it.path[-1].criterion > it.path[-2].criterion + 1000
+    assert "2 of 20 candidates" in str(it)
+    assert "\n  q³  -0." in str(it)
+
+
+def test_the_identified_system_is_ready_for_discovery():
+    """Friction forbids what the cubic alone has: an invariant of first order."""
+    samples = np.random.default_rng(0).uniform(-1, 1, (2, 120, 1))
+    it = found("damped", 0)
+    d = dvi.discover_invariants(it.system, dvi.Polynomials(4), 1, h=H, samples=samples)
+    assert d.count == 0
+    assert d.obstructions[0].kind == "dissipation"
+    cubic = ONE.only(["q³"]).with_coefficients(it.coefficients[list(it.terms).index("q³")][None])
+    system = dvi.System(H_D, force=cubic)
+    d = dvi.discover_invariants(
+        system, dvi.Polynomials(4), 1, h=H, samples=samples, representative="simplest"
+    )
+    assert d.count == 1
+    names = list(d.basis.names)
+    assert d.coefficients[0, 1, names.index("q⁴")] == pytest.approx(0.3 / 4, abs=2e-3)
+
+
+def test_finds_exactly_the_coupling_of_two_degrees_of_freedom_among_twenty():
+    assert len(TWO) == 20
+    is_exact("coupled", 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 6))
+@pytest.mark.parametrize("name", CASES)
+def test_finds_exactly_the_planted_terms_for_every_noise(name, seed):
+    is_exact(name, seed)
+
+
+RESTING = dvi.Model(FREE, h=H, q0=[1.0], p0=[0.2])
+
+
+def nothing(seed, known=True):
+    data = observed(FREE, [1.0], [0.2], 150, seed, noise=0.1, known=known)
+    return dvi.identify(RESTING, data, ONE)
+
+
+def test_noise_on_an_undisturbed_system_gives_no_term():
+    it = nothing(0)
+    assert it.terms == ()
+    assert it.coefficients.shape == (0,)
+    assert it.fit is None
+    assert it.system.force is None
+    assert "no force is seen" in str(it)
+    assert len(it.path) == 21
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 6))
+@pytest.mark.parametrize("known", [True, False])
+def test_noise_gives_no_term_whether_or_not_its_size_is_known(seed, known):
+    assert nothing(seed, known).terms == ()
+
+
+SMALL = dvi.ForceLibrary(
+    {
+        "spring": lambda t0, t1, q, p, args: -q,
+        "double spring": lambda t0, t1, q, p, args: -2 * q,
+        "friction": lambda t0, t1, q, p, args: -p,
+        "cubic": lambda t0, t1, q, p, args: -(q**3),
+    }
+)
+
+
+def test_candidates_that_are_the_same_are_reported():
+    truth = dvi.System(H_D, force=SMALL.with_coefficients({"spring": 0.2, "cubic": 0.1}))
+    data = observed(truth, [1.2], [0.0], 150, 0, known=False)
+    it = dvi.identify(dvi.Model(FREE, h=H, q0=[1.2], p0=[0.0]), data, SMALL)
+    springs = {"spring", "double spring"}
+    assert len(it.terms) == 2
+    assert "cubic" in it.terms
+    (chosen,) = springs & set(it.terms)
+    assert set(it.alternatives) == {chosen}
+    ((other, rise),) = it.alternatives[chosen]
+    assert {chosen, other} == springs
+    assert abs(rise) < 1e-6
+    assert not it.is_unique
+    assert len(it.undetermined) == 1
+    assert all(name in it.undetermined[0] for name in springs)
+    assert f"not unique: in place of {chosen} the data allow {other}" in str(it)
+
+
+def test_exact_data_of_an_undisturbed_system_give_no_term():
+    """Rounding is no force."""
+    data = observed(FREE, [1.0], [0.2], 100, 0, noise=0.0, known=False)
+    it = dvi.identify(dvi.Model(FREE, h=H, q0=[1.0], p0=[0.2]), data, SMALL.only(["cubic"]))
+    assert it.terms == ()
+
+
+def test_a_known_force_and_parameters_are_kept_beside_the_library():
+    """A model as a function: a mass to be fitted, a known spring, ε and args of its own."""
+    spring = lambda t0, t1, q, p, args: -args["k"] * q  # noqa: E731
+    moving = lambda t0, t1, q, p, args: p @ p / (2 * args["m"])  # noqa: E731
+    library = SMALL.only(["friction", "cubic"])
+
+    def both(t0, t1, q, p, args):
+        return spring(t0, t1, q, p, args) - 0.4 * q**3
+
+    truth = dvi.System(moving, force=both)
+    sol = dvi.integrate(
+        truth, [1.2], [0.0], h=H, num_steps=150, epsilon=0.5, args={"k": 2.0, "m": 1.3}
+    )
+    noise = 0.01 * np.random.default_rng(0).normal(size=sol.qs.shape)
+    data = dvi.Observations(np.asarray(sol.ts), np.asarray(sol.qs) + noise, sigma=0.01)
+
+    def model(params):
+        return {
+            "system": dvi.System(moving, force=spring), "q0": [1.2], "p0": [0.0], "h": H,
+            "epsilon": 0.5,
+            "args": {"k": 2.0, "m": params["m"]},
+        }  # fmt: skip
+
+    it = dvi.identify(model, data, library, {"m": 1.2})
+    assert it.terms == ("cubic",)
+    assert it.coefficients[0] == pytest.approx(0.4, abs=4 * it.sigma[0])
+    assert it.fit.params["m"] == pytest.approx(1.3, abs=0.02)
+    assert it.epsilon == 0.5
+    q, p = jnp.array([0.7]), jnp.array([0.1])
+    np.testing.assert_allclose(
+        it.system.disturbing_force(0.0, H, q, p, 0.5, {"k": 2.0}),
+        0.5 * (-2.0 * q - it.coefficients[0] * q**3), rtol=1e-12,
+    )  # fmt: skip
+
+
+def test_a_library_is_the_sum_of_its_candidates():
+    q, p = jnp.array([0.7, -0.4]), jnp.array([0.2, 0.5])
+    c = {"q1 q2 e1": 2.0, "p2² e2": -3.0}
+    library = dvi.ForceLibrary.monomials(2, 2)
+    assert len(library) == 28
+    assert len(dvi.ForceLibrary.monomials(2, 2, constant=True)) == 30
+    assert dvi.ForceLibrary.monomials(3, 1, "p").names == ("p", "p²", "p³")
+    bound = library.with_coefficients(c)
+    expected = [2.0 * 0.7 * -0.4, -3.0 * 0.25]
+    np.testing.assert_allclose(bound(0.0, H, q, p, None), expected, rtol=1e-14)
+    args = {"coefficients": bound.coefficients}
+    np.testing.assert_allclose(library(0.0, H, q, p, args), expected, rtol=1e-14)
+    np.testing.assert_allclose(bound.only(c)(0.0, H, q, p, None), expected, rtol=1e-14)
+    slope = jax.jacobian(lambda c: library(0.0, H, q, p, {"coefficients": c}))(bound.coefficients)
+    np.testing.assert_allclose(slope @ bound.coefficients, expected, rtol=1e-14)
+    assert TWO.names[-2:] == ("friction", "magnetic")
+
+
+Q, P = jnp.array([0.7]), jnp.array([0.1])
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "match"),
+    [
+        (lambda: dvi.ForceLibrary([Q]), TypeError, "takes a dict"),
+        (lambda: dvi.ForceLibrary({}), ValueError, "at least one"),
+        (lambda: dvi.ForceLibrary({1: H_D}), TypeError, "must be a string"),
+        (lambda: dvi.ForceLibrary({"f": lambda q: q}), TypeError, "'f' must be a function"),
+        (lambda: dvi.ForceLibrary({"f": H_D}, [1.0, 2.0]), ValueError, r"shape \(1,\)"),
+        (lambda: ONE.only(["x"]), ValueError, "no candidate 'x'"),
+        (lambda: ONE.with_coefficients({"x": 1.0}), ValueError, "no candidate 'x'"),
+        (lambda: ONE + ONE, ValueError, "both libraries"),
+        (lambda: ONE(0.0, H, Q, P, None), ValueError, r"args\[.coefficients.\]"),
+        (lambda: ONE(0.0, H, Q, P, {"coefficients": Q}), ValueError, r"shape \(20,\)"),
+        (lambda: TWO(0.0, H, Q, P, {"coefficients": jnp.ones(20)}), ValueError, r"shape \(2,\)"),
+        (
+            lambda: dvi.ForceLibrary({"f": lambda *a: 1.0}, [1.0])(0.0, H, Q, P, None),
+            ValueError,
+            "'f' must return an array shaped like q0",
+        ),
+        (lambda: dvi.ForceLibrary.monomials(0, 1), ValueError, "degree must be"),
+        (lambda: dvi.ForceLibrary.monomials(1, 1.0), ValueError, "n must be"),
+        (lambda: dvi.ForceLibrary.monomials(1, 1, "pq"), ValueError, "variables"),
+    ],
+)
+def test_a_library_refuses_what_cannot_be_meant(make, error, match):
+    with pytest.raises(error, match=match):
+        make()
+
+
+MODEL = dvi.Model(FREE, h=H, q0=[1.0], p0=[0.0])
+FORCED = dvi.System(H_D, force=lambda t0, t1, q, p, args: -q)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        ({"library": {"q": H_D}}, TypeError, "must be a dvi.ForceLibrary"),
+        ({"library": SMALL.with_coefficients({})}, ValueError, "has coefficients already"),
+        ({"params": {"coefficients": 0.0}}, ValueError, "follow from the library"),
+        ({"params": [1.0]}, TypeError, "must be a dict"),
+        ({"params": {"epsilon": 0.1}}, ValueError, "only their product"),
+        ({"penalty": 0.0}, ValueError, "penalty must be positive|positive number"),
+        ({"loss": dvi.Likelihood(lambda *a: 0.0)}, TypeError, "by residuals"),
+        ({"model": 3}, TypeError, "model must be"),
+        ({"model": dvi.Model(FORCED, h=H, q0=[1.0], p0=[0.0])}, ValueError, "epsilon = 0"),
+        (
+            {"model": dvi.Model(FREE, h=H, q0=[1.0], p0=[0.0], args=2.0)},
+            TypeError,
+            "args of the model",
+        ),
+    ],
+)
+def test_identify_refuses_what_cannot_be_meant(change, error, match):
+    data = dvi.Observations([0.0, 0.1, 0.2], [[1.0], [0.9], [0.8]], sigma=0.1)
+    given = {"model": MODEL, "data": data, "library": SMALL, "params": None, **change}
+    with pytest.raises(error, match=match):
+        dvi.identify(**given)
