@@ -111,12 +111,11 @@ def fitted(name, model, data, params):
         model,
         data,
         params,
-        # Nearly linear in the parameters: three steps without damping, then only the last digit of
-        # the start changes, which is half a metre of Mercury in a century and as much as a step.
+        # Nearly linear in the parameters: steps without damping, until only the last digit of the
+        # start changes, which is half a metre of Mercury in a century.
         optimiser=optx.Dogleg(rtol=1e-14, atol=1e-300),
         tolerance=0.9,
-        max_steps=3,
-        throw=False,
+        max_steps=8,
         check_curvature=False,
     )
     known = "epsilon" in params

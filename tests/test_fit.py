@@ -312,8 +312,13 @@ def test_horizons_lead_where_everything_at_once_misleads():
 
 @pytest.mark.parametrize(
     "optimiser",
-    [optx.Dogleg(rtol=1e-12, atol=1e-12), optx.BFGS(rtol=1e-9, atol=1e-9), optax.adam(0.01)],
-    ids=["dogleg", "bfgs", "adam"],
+    [
+        optx.Dogleg(rtol=1e-12, atol=1e-12),
+        optx.GaussNewton(rtol=1e-12, atol=1e-12),
+        optx.BFGS(rtol=1e-9, atol=1e-9),
+        optax.adam(0.01),
+    ],
+    ids=["dogleg", "gauss-newton", "bfgs", "adam"],
 )
 def test_other_optimisers_find_the_same(regular, optimiser):
     data, found = regular

@@ -90,12 +90,21 @@ def _function(z, known):
     return _residual(z, known), None
 
 
-@functools.lru_cache(maxsize=64)
 def _begin(solver: Any, rows: int, size: int) -> Any:
     """The state of a solver before its first step; one object, so that a step is compiled once."""
+    try:
+        return _kept(solver, rows, size)
+    except TypeError:  # a solver that holds arrays has no hash
+        return _state(solver, rows, size)
+
+
+def _state(solver: Any, rows: int, size: int) -> Any:
     z, known = jnp.zeros(size), (jnp.zeros(rows), jnp.zeros((rows, size)))
     shape = jax.ShapeDtypeStruct((rows,), known[0].dtype)
     return solver.init(_function, z, known, {}, shape, None, frozenset())
+
+
+_kept = functools.lru_cache(maxsize=64)(_state)
 
 
 @eqx.filter_jit
@@ -175,7 +184,7 @@ class LeastSquaresStage:
             residual = np.asarray(best.residual)
             loss = float(residual @ residual) / 2
             spread = np.sqrt(2 * loss / max(degrees, 1))
-            moved = _STIFFNESS * float(np.linalg.norm(state.y_eval - z))
+            moved = float(np.linalg.norm(np.asarray(best.jacobian) @ (scale * (state.y_eval - z))))
             u = base + scale * np.asarray(z)
             position = Position(
                 stage, horizon, done, base, scale, np.asarray(z), _leaves(state), _leaves(extra)
