@@ -117,6 +117,7 @@ def test_jacobian_against_differences(ts):
     assert np.abs(wrong - J).max() > 1e-8 * np.abs(J).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ts", [REGULAR, IRREGULAR], ids=["regular", "irregular"])
 def test_adjoints_agree(ts):
     """Reverse mode by each adjoint against the Jacobian by forward mode."""
@@ -231,6 +232,7 @@ def test_robust_losses_are_what_they_say(loss):
     assert abs(float(slope[0]) - 1) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_likelihood_with_an_unknown_noise_level():
     """Normal errors of fitted size: the maximum and its Hessian are known in closed form."""
 
@@ -332,6 +334,7 @@ def test_other_optimisers_find_the_same(regular, optimiser):
     assert np.abs((other.x - found.x) / found.sigma).max() < close
 
 
+@pytest.mark.slow
 def test_batches_draw_arcs():
     arcs = [
         dvi.Observations(REGULAR, noisy(REGULAR, 20 + i, q0=[q]), sigma=NOISE, t0=0.0)
@@ -374,7 +377,14 @@ class Interrupted(Exception):
     pass
 
 
-@pytest.mark.parametrize("kind", ["least squares", "adam", "segments"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "least squares",
+        pytest.param("adam", marks=pytest.mark.slow),
+        pytest.param("segments", marks=pytest.mark.slow),
+    ],
+)
 def test_resumed_with_the_same_bits(kind, tmp_path, monkeypatch):
     monkeypatch.setattr(run, "_EVERY", 0.0)
     data = dvi.Observations(REGULAR, noisy(REGULAR, 11), sigma=NOISE, t0=0.0)
@@ -480,6 +490,7 @@ def test_multiple_shooting_agrees_with_single(regular):
     assert apart.trajectories == ["successful"]
 
 
+@pytest.mark.slow
 def test_multiple_shooting_where_single_is_lost():
     """A chaotic orbit over some twenty of its e-folding times, from a poor start."""
 
