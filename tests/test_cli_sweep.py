@@ -349,7 +349,9 @@ def test_a_disk_that_fails(folder, monkeypatch):
 def test_ctrl_c_leaves_a_store_to_go_on_with(folder):
     text = SMALL.replace("0.2, 12]", "0.2, 24]").replace("steps = 30", "steps = 400_000")
     path = write(folder, text.replace("lanes_per_task = 4", "lanes_per_task = 1"))
-    code = "from dvi_jax.cli import main; main()"
+    # Started in the background, tests and their children have Ctrl-C ignored: here it raises.
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    code += "from dvi_jax.cli import main; main()"
     process = subprocess.Popen(
         [sys.executable, "-c", code, "sweep", str(path), "--threads", "1"],
         stderr=subprocess.PIPE, text=True,

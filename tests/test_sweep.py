@@ -207,6 +207,15 @@ def test_progress_counts_everything():
     assert seen[-1].rate > 0
 
 
+@pytest.fixture
+def ctrl_c():
+    """Ctrl-C raises, also where tests were started in the background, with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_keeps_what_is_finished():
     seen = []
 
