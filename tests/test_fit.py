@@ -1,5 +1,6 @@
 """Fits: what they find, what they say of its errors, how they go on."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -397,7 +398,7 @@ def test_resumed_with_the_same_bits(kind, tmp_path, monkeypatch):
     whole = dvi.fit(MODEL, data, start, **options)
     file, steps = tmp_path / "fit.npz", len(whole.history["loss"])
     assert steps > 6
-    for stop in (2, steps // 2, steps - 1):
+    for stop in range(1, steps + 1):  # the last of each stage among them
 
         def interrupt(p, stop=stop):
             if p.step == stop:
@@ -431,10 +432,176 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path, monkeypatch):
     def stiffer(t0, t1, q0, p1, args):
         return H(t0, t1, q0, p1, args) + jnp.sum(q0**4)
 
-    model = dvi.Model(dvi.System(stiffer, force=W), h=H_STEP, p0=[0.0], method=STRANG)
+    system = dvi.System(stiffer, force=W)
+    model = dvi.Model(system, h=H_STEP, p0=[0.0], args={"k": 1.0}, method=STRANG)
     with pytest.raises(ValueError, match="is of another model"):
         dvi.fit(model, data, START, checkpoint=file)
     assert file.exists()
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "_EVERY", 0.0)
+    data = dvi.Observations(REGULAR, noisy(REGULAR, 11), sigma=NOISE, t0=0.0)
+    file = tmp_path / "fit.npz"
+
+    def interrupt(p):
+        raise Interrupted
+
+    with pytest.raises(Interrupted):
+        dvi.fit(MODEL, data, START, checkpoint=file, progress=interrupt)
+    moved = dvi.Model(SYSTEM, h=H_STEP, p0=[0.5], args={"k": 1.0}, method=STRANG)
+    prior = {"epsilon": dvi.Prior(0.5, 1e-3)}
+    for model, options in (
+        (MODEL, {"loss": dvi.Cauchy()}), (MODEL, {"priors": prior}), (moved, {}),
+        (MODEL, {"tolerance": 1e-3}),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="is of another fit"):
+            dvi.fit(model, data, START, checkpoint=file, **options)
+    with pytest.raises(FileNotFoundError, match="no directory"):
+        dvi.fit(MODEL, data, START, checkpoint=tmp_path / "nowhere" / "fit.npz")
+
+
+def test_more_steps_go_on_from_the_checkpoint(regular, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "_EVERY", 0.0)
+    data, found = regular
+    file = tmp_path / "fit.npz"
+    with pytest.raises(dvi.FitError):
+        dvi.fit(MODEL, data, START, max_steps=3, checkpoint=file)
+    assert file.exists()
+    more = dvi.fit(MODEL, data, START, checkpoint=file)
+    assert not file.exists()
+    np.testing.assert_array_equal(more.history["x"], found.history["x"])
+
+
+# --- statuses and errors that must not lie: each of these once said otherwise --------------------
+
+
+def test_nearly_collinear_parameters_are_followed_to_the_minimum():
+    small = 1e-5
+
+    def model(params):
+        q0 = (params["a"] + params["b"])[None]
+        return MODEL({"q0": q0, "epsilon": 0.02, "args": {"k": 1.3}}) | {
+            "p0": small * params["b"][None]
+        }  # fmt: skip
+
+    y = np.asarray(states_at(REGULAR, p0=[small]).qs)
+    y = y + small * NOISE * np.random.default_rng(0).normal(size=y.shape)
+    data = dvi.Observations(REGULAR, y, sigma=small * NOISE, t0=0.0)
+    found = dvi.fit(model, data, {"a": 0.9, "b": -0.5}, check_curvature=False)
+    assert found.status == "converged"
+    assert np.abs((found.x - [0.0, 1.0]) / found.sigma).max() < 4
+
+
+@pytest.mark.parametrize("bounds", [dvi.Bounds(0.0), dvi.Bounds(0.0, 1.0)], ids=["one", "two"])
+def test_a_start_next_to_a_bound(bounds, regular):
+    data, found = regular
+    near = dvi.fit(MODEL, data, {**START, "epsilon": 1e-6}, bounds={"epsilon": bounds})
+    assert np.abs((near.x - found.x) / found.sigma).max() < 0.01
+    assert near.at_bounds == []
+
+
+def test_a_small_parameter_is_not_at_its_bound():
+    data = dvi.Observations(REGULAR, np.asarray(states_at(REGULAR).qs), sigma=1e-7, t0=0.0)
+
+    def model(params):
+        return MODEL({"q0": [1.0], "epsilon": 1e4 * params["small"], "args": {"k": 1.3}})
+
+    found = dvi.fit(model, data, {"small": 1e-6}, bounds={"small": dvi.Bounds(0.0)})
+    np.testing.assert_allclose(found.x, 2e-6, rtol=1e-4)
+    assert found.at_bounds == []
+
+
+def test_a_piece_that_converged_is_not_the_whole():
+    data = dvi.Observations(REGULAR, noisy(REGULAR, 10), sigma=NOISE, t0=0.0)
+    start = {**START, "args": {"k": 0.7}}
+    for steps in range(4, 9):
+        cut = dvi.fit(
+            MODEL, data, start, horizons=[2.0, 8.0], max_steps=steps, throw=False,
+            check_curvature=False,
+        )  # fmt: skip
+        whole = cut.history["horizon"][-1] == np.inf
+        assert whole or cut.status == "max_steps_reached"
+        assert cut.sigma[0] < 2e-3  # of all the data
+
+
+def test_undetermined_parameters_take_no_degree_of_freedom():
+    few = dvi.Observations(REGULAR[:6], noisy(REGULAR, 14)[:6], t0=0.0)
+
+    def model(params):
+        return MODEL({"q0": [1.0], "epsilon": params["e"], "args": {"k": params["k"]}})
+
+    plain = dvi.fit(model, few, {"e": 0.0, "k": 1.3}, check_curvature=False)
+    idle = dvi.fit(model, few, {"e": 0.0, "k": 1.3, "z": np.zeros(3)}, check_curvature=False)
+    assert len(idle.undetermined) == 3
+    assert idle.degrees_of_freedom == plain.degrees_of_freedom == 4
+    np.testing.assert_allclose(idle.sigma[:2], plain.sigma, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_likelihood_of_small_noise_with_an_idle_parameter_and_a_prior():
+    def density(predicted, observed, sigma, params):
+        return ((predicted - observed) / NOISE) ** 2 / 2
+
+    def model(params):
+        return MODEL({"q0": [1.0], "epsilon": params["e"], "args": {"k": params["k"]}})
+
+    y = noisy(REGULAR, 8)
+    start = {"e": 0.01, "k": 1.29, "idle": 0.0}
+    found = dvi.fit(
+        model, dvi.Observations(REGULAR, y, t0=0.0), start, loss=dvi.Likelihood(density),
+        priors={"k": dvi.Prior(1.3, 1e-4)},
+    )  # fmt: skip
+    data = dvi.Observations(REGULAR, y, sigma=NOISE, t0=0.0)
+    least = dvi.fit(model, data, start, priors={"k": dvi.Prior(1.3, 1e-4)})
+    np.testing.assert_allclose(found.x[[0, 2]], least.x[[0, 2]], atol=1e-5)
+    np.testing.assert_allclose(found.sigma[[0, 2]], least.sigma[[0, 2]], rtol=1e-2)
+    assert found.names[1] == "idle"
+    assert np.isinf(found.sigma[1])
+    np.testing.assert_allclose(found.loss, least.loss, rtol=1e-6)
+
+
+def test_rows_for_arcs_are_counted():
+    data = dvi.Observations(REGULAR, noisy(REGULAR, 1), sigma=NOISE, t0=0.0)
+    for rows in (2, 4):
+        model = dvi.Model(SYSTEM, h=H_STEP, q0=np.ones((rows, 1)), p0=np.zeros((3, 1)))
+        with pytest.raises(ValueError, match=r"list of .*arcs.*row"):
+            dvi.fit(model, [data] * 3, {"epsilon": 0.0, "args": {"k": 1.3}})
+
+
+def test_what_is_masked_is_missing():
+    y = noisy(REGULAR, 1)
+    masked = np.ma.masked_array(y, np.arange(60)[:, None] == 5)
+    values = dvi.Observations(REGULAR, masked).values
+    assert np.isnan(values[5, 0])
+    assert np.isfinite(np.delete(values, 5)).all()
+
+
+class Drag(eqx.Module):
+    """A force with a size that is no parameter."""
+
+    size: int
+    weight: jax.Array
+
+    def __call__(self, t0, t1, q0, p1, args):
+        return sum(-self.weight * p1 for _ in range(self.size))
+
+
+def with_drag(force):
+    return {
+        "system": dvi.System(H, force=force), "q0": [1.0], "p0": [0.0], "h": H_STEP,
+        "epsilon": 1.0, "args": {"k": 1.3}, "method": STRANG,
+    }  # fmt: skip
+
+
+def test_sizes_in_a_module_are_not_fitted():
+    data = dvi.Observations(REGULAR, noisy(REGULAR, 1), sigma=NOISE, t0=0.0)
+    found = dvi.fit(
+        with_drag, data, Drag(2, jnp.array(0.0)), bounds=Drag(None, dvi.Bounds(-1.0, 1.0)),
+        check_curvature=False,
+    )  # fmt: skip
+    assert found.names == ["weight"]
+    np.testing.assert_allclose(found.x, 0.01, atol=1e-3)
 
 
 def test_progress_is_reported(regular):
@@ -519,6 +686,13 @@ def test_multiple_shooting_where_single_is_lost():
     only = dvi.Observations(ts, y[:, :2], sigma=1e-3, t0=0.0)
     from_positions = dvi.fit(model, only, start, shooting=dvi.MultipleShooting(25))
     assert np.abs((from_positions.x - truth) / from_positions.sigma).max() < 3.5
+
+
+def test_multiple_shooting_from_the_models_own_trajectory(regular):
+    """Segments that meet from the first step on must not hold the parameters fast."""
+    data, found = regular
+    apart = dvi.fit(MODEL, data, START, shooting=dvi.MultipleShooting(6, guess="model"))
+    assert np.abs((apart.x - found.x) / found.sigma).max() < 1e-2
 
 
 def test_a_guess_may_be_given_or_refused(regular):

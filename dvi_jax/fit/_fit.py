@@ -24,6 +24,13 @@ from .run import Run, identity
 from .shooting import MultipleShooting, Segments, SingleShooting
 from .stages import MANY, by_gradient, in_segments, least_squares
 
+_MINIMISERS = (
+    optx.OptaxMinimiser
+    | optx.AbstractQuasiNewton
+    | optx.AbstractLBFGS
+    | optx.AbstractGradientDescent
+)
+
 
 def fit(
     model: Callable[..., Any],
@@ -57,7 +64,7 @@ def fit(
     - `model`: a `Model`, or a function ``(params)`` or ``(params, arc)`` that returns the
       arguments of `integrate` as a dict: system, q0, p0, h, epsilon, args, method, ….
     - `data`: `Observations`, or a list of them, one for each arc.
-    - `params`: a pytree with starting values: floats and floating-point arrays are fitted, what
+    - `params`: a pytree with starting values: numbers and floating-point arrays are fitted, what
       else it holds stays as it is. For a `Model` a dict with keys among q0, p0, epsilon, args.
     - `bounds`, `priors`: like params, with `Bounds` and `Prior` in place of numbers; entries
       without one may be left out.
@@ -76,7 +83,8 @@ def fit(
     - `check_curvature`: compare the Gauss–Newton errors with exact second derivatives (for up to
       50 parameters).
     - `checkpoint`: a file that is written every few seconds. The same call goes on from it, with
-      the same bits as without the interruption; it is removed when the fit is done.
+      the same bits as without the interruption, also with more `max_steps`; it is removed when
+      the fit has converged.
     - `progress`: True shows a bar, False none, None where there is a terminal; or a function of a
       `FitProgress`.
     - `throw`: raise `FitError` when the fit does not converge; it holds what was found. Otherwise
@@ -101,7 +109,8 @@ def fit(
         raise TypeError(
             f"shooting must be a dvi.SingleShooting() or a dvi.MultipleShooting(n): {shooting!r}."
         )
-    solver = _solver(optimiser, problem)
+    steps = 2000 if max_steps is None else max_steps
+    solver = _solver(optimiser, problem, steps if isinstance(steps, int) else 2000)
     is_optax = isinstance(solver, optx.OptaxMinimiser)
     is_vector = isinstance(solver, optx.AbstractGaussNewton)
     if not is_optax:
@@ -113,7 +122,7 @@ def fit(
         raise ValueError("multiple shooting goes with least squares and their solvers alone.")
     wanted = _horizons(horizons)
     u = problem.space.to_u(problem.start)
-    name = identity(problem, u, solver, shooting, wanted, batch, seed, tolerance, max_steps)
+    name = identity(problem, u, solver, shooting, wanted, batch, seed, tolerance)
     with shown(progress) as show:
         run = Run(problem, max_steps, tolerance, show, began, checkpoint, name)
         if isinstance(shooting, MultipleShooting):
@@ -123,9 +132,10 @@ def fit(
         else:
             found = by_gradient(run, u, solver, wanted, batch, seed, check_units)
     found, status = result_of(run, found, check_curvature), found.status
-    if checkpoint is not None:
+    fine = bool((status == FIT_RESULTS.converged) | (status == FIT_RESULTS.steps_done))
+    if checkpoint is not None and fine:
         Path(checkpoint).unlink(missing_ok=True)
-    if not throw or bool((status == FIT_RESULTS.converged) | (status == FIT_RESULTS.steps_done)):
+    if fine or not throw:
         return found
     raise FitError(
         f"the fit did not converge ({found.status} after {len(run.records)} steps, loss "
@@ -135,12 +145,13 @@ def fit(
     )
 
 
-def _solver(optimiser: Any, problem: Problem) -> Any:
+def _solver(optimiser: Any, problem: Problem, steps: int) -> Any:
     """The optimistix solver that is meant."""
     residuals = isinstance(problem.loss, Loss)
     if optimiser is None:
         if problem.size > MANY:
-            optimiser = optax.adam(optax.warmup_cosine_decay_schedule(1e-5, 3e-3, 100, 2000, 1e-5))
+            rate = optax.warmup_cosine_decay_schedule(1e-5, 3e-3, max(steps // 20, 1), steps, 1e-5)
+            optimiser = optax.adam(rate)
         elif residuals:
             return LEVENBERG_MARQUARDT
         else:
@@ -154,7 +165,7 @@ def _solver(optimiser: Any, problem: Problem) -> Any:
                 "optimistix.BFGS(rtol=1e-10, atol=1e-10), or leave optimiser out."
             )
         return optimiser
-    if isinstance(optimiser, optx.AbstractMinimiser):
+    if isinstance(optimiser, _MINIMISERS):
         return optimiser
     raise TypeError(
         "optimiser must be None, a least-squares solver or minimiser of optimistix, or a gradient "

@@ -26,8 +26,8 @@ from .uncertainty import Uncertainty, in_words, uncertainty
 _REFIT = 30
 """Steps of a refit, which begins next to its minimum."""
 
-_PRECISE = 1e-2
-"""Standard errors to which a refit is taken: 1e-4 in chi²."""
+_PRECISE = 1e-4
+"""Standard errors to which a refit is taken: 1e-8 in chi²."""
 
 _BEYOND = 3.0
 """Penalties by which the criterion may exceed the best before terms are no longer removed."""

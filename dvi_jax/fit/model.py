@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._compat import is_traced
 from .._integrate import integrate
 from .._results import RESULTS
 from .._solution import Save
@@ -38,7 +39,9 @@ class Model(eqx.Module):
     Parameters are a dict with keys among ``"q0"``, ``"p0"``, ``"epsilon"``, ``"args"``; when args
     are dicts, the entries of the parameters' are put into those given here. For any other
     dependence write the model as a function of the parameters, ``(params)`` or ``(params, arc)``
-    with the number of the arc, that returns the arguments of `integrate` as a dict.
+    with the number of the arc, that returns the arguments of `integrate` as a dict. All arcs go
+    through one program, so that the number is traced: index JAX arrays with it,
+    ``jnp.asarray(q0s)[arc]``.
 
     **Raises** `TypeError` for arguments and parameters that have no such name.
     """
@@ -94,8 +97,27 @@ class Model(eqx.Module):
             if found[name] is None:
                 raise TypeError(f"{name} is neither in dvi.Model(..., {name}=...) nor a parameter.")
             if arc is not None:
-                found[name] = jnp.asarray(found[name])[arc]
+                found[name] = _row(name, found[name], arc)
         return {**self.rest, **found}
+
+    def check_rows(self, params: Mapping[str, Any], arcs: int) -> None:
+        """Refuse q0 and p0 with more rows than there are arcs."""
+        for name in ("q0", "p0"):
+            shape = np.shape(params.get(name, self.fixed[name]))
+            if shape[0] != arcs:
+                raise ValueError(
+                    f"{name} has shape {shape}, but data is a list of {arcs} arcs: it needs a row "
+                    "for each."
+                )
+
+
+def _row(name: str, rows: Any, arc: Any) -> Array:
+    rows = jnp.asarray(rows)
+    if rows.ndim == 0 or (not is_traced(arc) and arc >= len(rows)):
+        raise ValueError(
+            f"{name} has shape {rows.shape}: data is a list of arcs, so it needs a row for each."
+        )
+    return rows[arc]
 
 
 class Group(eqx.Module):
@@ -163,6 +185,12 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
     """
     kinds: dict[Any, list[int]] = {}
     steps = [_steps(i, arc, spec) for i, (arc, spec) in enumerate(zip(arcs, specs, strict=True))]
+    spans = [abs((arc.ts[-1] - arc.t0) / spec["h"]) for arc, spec in zip(arcs, specs, strict=True)]
+    if _uniform(specs[0]) and 0 < max(spans) < 0.5:
+        raise ValueError(
+            f"all observations lie within {max(spans):.3g} steps of h = {specs[0]['h']:g}, less "
+            "than half of one. Are the times of the data in the units of h?"
+        )
     # A program each takes seconds to compile; some millions of steps too many do not.
     apart = len(arcs) * max(steps) - sum(steps) > _WASTE
     for i, (arc, spec) in enumerate(zip(arcs, specs, strict=True)):
@@ -203,11 +231,6 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
         raise ValueError(
             f"arc {i}: {steps:.3g} steps of h = {h:g} would be needed for a span of {span:g}. Are "
             "the times of the data in the units of h?"
-        )
-    if 0 < steps < 0.5:
-        raise ValueError(
-            f"arc {i}: the whole span of the observations, {span:g}, is shorter than half a step, "
-            f"h = {h:g}. Are the times of the data in the units of h?"
         )
     return max(1, math.ceil(steps - 1e-9))
 

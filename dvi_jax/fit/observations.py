@@ -63,7 +63,10 @@ class Observations:
 
     def __post_init__(self):
         ts = _real("ts", self.ts)
-        values = _real("values", self.values)
+        values = self.values
+        if isinstance(values, np.ma.MaskedArray):  # what is masked is missing
+            values = np.ma.filled(values.astype(float), np.nan)
+        values = _real("values", values)
         known = (
             self.observe in NAMED if isinstance(self.observe, str) else accepts_four(self.observe)
         )

@@ -25,9 +25,12 @@ BFGS = optx.BFGS(rtol=1e-10, atol=1e-10)
 _HOPELESS = 12
 """Rejected steps in a row after which no step is expected to help."""
 
+_HOPELESS_LINE = 40
+"""The same for a line search that halves: it has no scale to begin with."""
+
 _FLAT = 1e-3
-"""Standard errors that the gradient is worth, below which a loss that no longer falls is a minimum,
-known to its rounding."""
+"""Standard errors that an undamped step is worth, below which a loss that no longer falls is a
+minimum, known to its rounding."""
 
 
 @dataclass
@@ -45,7 +48,8 @@ class Record:
 
 @dataclass
 class Position:
-    """Where a stage stands: all that is needed to go on with the same bits."""
+    """Where a stage stands: all that is needed to go on with the same bits. `memory` is of how the
+    last steps went; `status` is that of a stage that has ended, else empty."""
 
     stage: int
     horizon: float
@@ -55,6 +59,8 @@ class Position:
     z: np.ndarray
     leaves: list[np.ndarray] = field(default_factory=list)
     extra: list[np.ndarray] = field(default_factory=list)
+    memory: tuple[float, ...] = ()
+    status: str = ""
 
 
 class _Known(eqx.Module):
@@ -167,12 +173,14 @@ class LeastSquaresStage:
         else:
             base, scale, done = resume.base, resume.scale, resume.done
             z = jnp.asarray(resume.z)
+            u = base + scale * resume.z
             best = self.at(base + scale * np.asarray(z), horizon, extra)
             state = _with_leaves(_begin(self._solver, *best.jacobian.shape), resume.leaves)
             _check_same(best.residual, state.f_info.residual)
             trial = None
-        status, rejected, last, still = FIT_RESULTS.max_steps_reached, 0, np.inf, 0
-        while done < max_steps:
+        rejected, last, still = (0, np.inf, 0) if resume is None else resume.memory
+        status = "" if resume is None else resume.status
+        while not status and done < max_steps:
             if trial is None:
                 trial = self.at(base + scale * np.asarray(state.y_eval), horizon, extra)
             known = trial.residual, trial.jacobian * scale[None]
@@ -186,27 +194,27 @@ class LeastSquaresStage:
             spread = np.sqrt(2 * loss / max(degrees, 1))
             moved = float(np.linalg.norm(np.asarray(best.jacobian) @ (scale * (state.y_eval - z))))
             u = base + scale * np.asarray(z)
-            position = Position(
-                stage, horizon, done, base, scale, np.asarray(z), _leaves(state), _leaves(extra)
-            )
-            in_sigma = moved / spread if spread else 0.0
-            watch(Record(stage, horizon, loss, in_sigma, accepted, u), position)
             floor = 1e-13 * _STIFFNESS * float(np.linalg.norm(u / scale))
-            if not np.isfinite(moved):
-                status = FIT_RESULTS.stalled
-                break
+            least = max(tolerance * spread, floor)
             if accepted:  # at a bound the free variable goes on for ever, and nothing changes
                 still = still + 1 if last - loss <= (tolerance * spread) ** 2 else 0
                 last = loss
-            if (moved <= tolerance * spread and rejected < 3) or moved <= floor or still >= 3:
-                status = FIT_RESULTS.converged
-                break
-            if rejected >= 3 and (rejected >= _HOPELESS or moved <= tolerance * spread):
-                gradient = (np.asarray(best.jacobian) * scale).T @ residual
-                flat = np.abs(gradient).max() <= _FLAT * _STIFFNESS * spread
-                status = FIT_RESULTS.converged if flat else FIT_RESULTS.stalled
-                break
-        return u, best, status
+            ended = still >= 3 or (moved <= least and rejected < 3)
+            if not np.isfinite(moved):
+                status = "stalled"
+            elif ended and _undamped(best, scale) <= least:
+                # A damped step is small for its damping as well.
+                status = "converged"
+            elif rejected >= _HOPELESS or (rejected >= 3 and moved <= least):
+                flat = _undamped(best, scale) <= max(_FLAT * spread, least)
+                status = "converged" if flat else "stalled"
+            position = Position(
+                stage, horizon, done, base, scale, np.asarray(z), _leaves(state), _leaves(extra),
+                (rejected, last, still), status,
+            )  # fmt: skip
+            in_sigma = moved / spread if spread else 0.0
+            watch(Record(stage, horizon, loss, in_sigma, accepted, u), position)
+        return u, best, getattr(FIT_RESULTS, status or "max_steps_reached")
 
 
 def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
@@ -280,25 +288,21 @@ class ScalarStage:
         function = _scalar_function(self.core, self.per)
         zero = jnp.zeros(len(u))
         state = self.solver.init(function, zero, known(0), {}, struct, None, frozenset())
+        if not (hasattr(state, "f") or hasattr(state, "f_info")):
+            raise TypeError(f"{type(self.solver).__name__} does not tell the loss of its steps.")
         if resume is not None:
             state = _with_leaves(state, resume.leaves)
         is_optax = isinstance(self.solver, optx.OptaxMinimiser)
-        last, still, rejected = np.inf, 0, 0
-        status = FIT_RESULTS.steps_done if is_optax else FIT_RESULTS.max_steps_reached
-        while done < max_steps:
+        last, still, rejected = (np.inf, 0, 0) if resume is None else resume.memory
+        status = "" if resume is None else resume.status
+        while not status and done < max_steps:
             old = z
             z, state, ended = _descend(self.solver, self.core, self.per, z, known(done), state)
             done += 1
             loss = float(state.f if is_optax else state.f_info.f)
             if not np.isfinite(loss) and done == 1:
                 return u, FIT_RESULTS.not_finite
-            x = np.asarray(base + size * z)
-            position = Position(
-                stage, horizon, done, np.asarray(base), np.asarray(size), np.asarray(z),
-                _leaves(state),
-            )  # fmt: skip
-            moved = float(np.linalg.norm(z - old))
-            watch(Record(stage, horizon, loss, moved, bool(moved > 0), x), position)
+            x, moved = np.asarray(base + size * z), float(np.linalg.norm(z - old))
             if not np.isfinite(x).all():
                 return np.asarray(base + size * old), FIT_RESULTS.not_finite
             if choose is None and not is_optax:
@@ -306,13 +310,29 @@ class ScalarStage:
                 if moved > 0:
                     still = still + 1 if abs(last - loss) <= tolerance**2 else 0
                     last = loss
-                if rejected >= _HOPELESS:
-                    status = FIT_RESULTS.stalled
-                    break
                 if bool(ended) or still >= 3:
-                    status = FIT_RESULTS.converged
-                    break
-        return np.asarray(base + size * z), status
+                    status = "converged"
+                elif rejected >= _HOPELESS_LINE:
+                    status = "stalled"
+            position = Position(
+                stage, horizon, done, np.asarray(base), np.asarray(size), np.asarray(z),
+                _leaves(state), [], (last, still, rejected), status,
+            )  # fmt: skip
+            watch(Record(stage, horizon, loss * self.per, moved, bool(moved > 0), x), position)
+        usual = "steps_done" if is_optax else "max_steps_reached"
+        return np.asarray(base + size * z), getattr(FIT_RESULTS, status or usual)
+
+
+def _undamped(at: Evaluation, scale: np.ndarray) -> float:
+    """What the undamped step would move what is predicted by, in standard errors; parameters that
+    have all but lost their effect (at a bound) left out."""
+    J = np.asarray(at.jacobian) * scale
+    length = np.linalg.norm(J, axis=0)
+    J = J[:, length > 1e-3 * _STIFFNESS]
+    if not J.shape[1]:
+        return 0.0
+    U, s, _ = np.linalg.svd(J / np.linalg.norm(J, axis=0), full_matrices=False)
+    return float(np.linalg.norm(U[:, s > 1e-7 * s[0]].T @ np.asarray(at.residual)))
 
 
 def _check_same(now: Array, then: Array) -> None:

@@ -26,17 +26,19 @@ def result_of(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
     if has_residuals:
         loss = float(np.sum(np.asarray(problem.core.root_rows(jnp.asarray(u), aux[0])) ** 2) / 2)
     else:
-        loss = float(run.records[-1].loss) if run.records else np.nan
+        loss = float(problem.core.scalar(jnp.asarray(u)))
     degrees = problem.degrees_of_freedom
+    off = np.asarray(problem.core.prior_rows(jnp.asarray(u)))
     variance = 1.0
-    if has_residuals and not problem.has_errors:
-        variance = 2 * loss / degrees if degrees > 0 else np.nan
     covariance, curvature, words, values = np.full((n, n), np.nan), None, [], np.zeros(0)
     if minimum.jacobian is not None and np.isfinite(minimum.jacobian).all():
         J = np.asarray(minimum.jacobian)
-        about = uncertainty(J, variance, minimum.free)
+        about = uncertainty(J, 1.0, minimum.free)
+        degrees += about.undetermined.shape[1]  # what is not determined takes no degree
+        if has_residuals and not problem.has_errors:
+            variance = 2 * loss / degrees if degrees > 0 else np.nan
         slope, values = space.slope(u), about.singular_values
-        covariance = about.covariance[:n, :n] * np.outer(slope, slope)
+        covariance = variance * about.covariance[:n, :n] * np.outer(slope, slope)
         words = [in_words(d[:n], list(space.names)) for d in about.undetermined.T if np.any(d[:n])]
         if check_curvature and minimum.free is None and has_residuals and n <= _FEW:
             curvature = _curvature_ratio(problem, u, J, about)
@@ -45,10 +47,10 @@ def result_of(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
         history=run.history(), result=minimum.status, ts=[a.ts for a in problem.arcs],
         observed=[a.values for a in problem.arcs], predicted=predicted, whitened=whitened,
         errors=[a.errors for a in problem.arcs], loss=loss, degrees_of_freedom=degrees,
-        num_observed=problem.count,
+        num_observed=problem.count, prior_chi2=float(np.sum(off**2)),
         has_errors=problem.has_errors, undetermined=words, singular_values=values,
-        curvature=curvature, at_bounds=space.at_bounds(x), trajectories=trajectories,
-        seconds=time.monotonic() - run.began,
+        curvature=curvature, at_bounds=space.at_bounds(x, np.sqrt(np.diag(covariance))),
+        trajectories=trajectories, seconds=time.monotonic() - run.began,
     )  # fmt: skip
 
 

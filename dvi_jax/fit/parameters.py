@@ -1,5 +1,6 @@
 """Parameters as one vector: their names, bounds and priors."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -37,15 +38,18 @@ class Prior:
     sigma: Any
 
 
-def _is_number(x: Any) -> bool:
-    return eqx.is_inexact_array_like(x) or (isinstance(x, int) and not isinstance(x, bool))
+def _is_number(path: Any, x: Any) -> bool:
+    """Whether a leaf is fitted: a whole number is unless it is a field of an object, a size."""
+    if isinstance(x, int) and not isinstance(x, bool):
+        return not any(isinstance(key, jax.tree_util.GetAttrKey) for key in path)
+    return bool(eqx.is_inexact_array_like(x))
 
 
 class Space(eqx.Module):
     """The parameters of a fit as a vector x of all their numbers, and as a free vector u.
 
     Numbers and floating-point arrays are fitted; what else the pytree holds (functions, arrays of
-    integers) stays as it is. x obeys the bounds, u has none.
+    integers, whole numbers in objects) stays as it is. x obeys the bounds, u has none.
 
     - `names`: one for each number, such as ``q0[1]``. `lower`, `upper`: bounds of x, infinite
       where there are none. `prior_mean`, `prior_weight`: of x; the weight is 1/sigma, 0 without a
@@ -109,11 +113,10 @@ class Space(eqx.Module):
         u = jnp.asarray(u)
         return np.asarray(jax.jvp(self.to_x, (u,), (jnp.ones_like(u),))[1])
 
-    def at_bounds(self, x: np.ndarray) -> list[str]:
-        """Names of the numbers that lie at a bound, to 1e-5 of the distance between both or 1."""
-        lower, upper = np.asarray(self.lower), np.asarray(self.upper)
-        width = np.where(np.isfinite(upper - lower), upper - lower, 1.0)
-        near = np.minimum(x - lower, upper - x) < 1e-5 * width
+    def at_bounds(self, x: np.ndarray, sigma: np.ndarray) -> list[str]:
+        """Names of the numbers that lie within a tenth of their standard error from a bound."""
+        off = np.minimum(x - np.asarray(self.lower), np.asarray(self.upper) - x)
+        near = np.isfinite(off) & ~(off > 0.1 * np.nan_to_num(sigma, nan=np.inf))
         return [name for name, is_near in zip(self.names, near, strict=True) if is_near]
 
 
@@ -125,7 +128,7 @@ def make_space(
     **Raises** `TypeError` or `ValueError` for a pytree without numbers, values that are not finite,
     starts outside of bounds, and bounds or priors that do not fit the pytree.
     """
-    numbers, rest = eqx.partition(params, _is_number)
+    numbers, rest = eqx.partition(params, jax.tree_util.tree_map_with_path(_is_number, params))
     paths, tree = jax.tree_util.tree_flatten_with_path(numbers)
     if not paths:
         raise ValueError(
@@ -140,6 +143,9 @@ def make_space(
         places = ("" if not shape else f"[{', '.join(map(str, i))}]" for i in np.ndindex(shape))
         names += [name + place for place in places]
         shapes.append(shape)
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"two parameters are called {twice}: give their keys other names.")
     start = np.concatenate([np.ravel(np.asarray(leaf, float)) for _, leaf in paths])
     if not np.isfinite(start).all():
         i = int(np.argmin(np.isfinite(start)))
@@ -191,9 +197,15 @@ class _Limits:
                         )
                     down(value, below[key], f"{path}.{key}" if path else str(key))
                 return
-            if isinstance(given, list | tuple) and isinstance(below, list | tuple):
-                for i, value in enumerate(given):
-                    down(value, below[i], f"{path}[{i}]")
+            if dataclasses.is_dataclass(given) and type(given) is type(below):
+                for part in dataclasses.fields(given):
+                    name = f"{path}.{part.name}" if path else part.name
+                    down(getattr(given, part.name), getattr(below, part.name), name)
+                return
+            pairs = _pairs(given, below)
+            if pairs:
+                for i, (value, under) in enumerate(pairs):
+                    down(value, under, f"{path}[{i}]")
                 return
             raise TypeError(
                 f"{called} must be made like the parameters, with dvi.{kind.__name__}(...) or None "
@@ -234,6 +246,12 @@ class _Limits:
                 f"the parameter {self.names[i]} starts at {start[i]}, which is not between "
                 f"its bounds {self.lower[i]} and {self.upper[i]}."
             )
+
+
+def _pairs(a: Any, b: Any) -> list[tuple[Any, Any]]:
+    """Entries of two lists or tuples of one length; none of anything else."""
+    lists = isinstance(a, list | tuple) and isinstance(b, list | tuple)
+    return list(zip(a, b, strict=True)) if lists and len(a) == len(b) else []
 
 
 def _spread(value: Any, where: np.ndarray, shape: tuple[int, ...], called: str) -> np.ndarray:

@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 
 from .._results import RESULTS, status_name
 from .losses import LeastSquares, Likelihood, Loss
-from .model import Group, check_observable, make_groups, predict, specification
+from .model import Group, Model, check_observable, make_groups, predict, specification
 from .observations import Observations
 from .optimise import Evaluation
 from .parameters import Space, make_space
@@ -164,10 +164,10 @@ class Problem:
         self.space, self.start = make_space(params, bounds, priors)
         self.size = self.space.size
         self.has_errors = arcs[0].has_errors
-        if not self.has_errors:
+        if not self.has_errors and not isinstance(loss, Likelihood):
             for what, there in (
                 ("priors", self.space.count_of_priors > 0),
-                ("a robust loss", not isinstance(loss, LeastSquares | Likelihood)),
+                ("a robust loss", not isinstance(loss, LeastSquares)),
             ):
                 if there:
                     raise ValueError(
@@ -175,6 +175,9 @@ class Problem:
                         "covariance with the observations."
                     )
         arrays = self.space.to_params(jnp.asarray(self.start))
+        if many and isinstance(model, Model):
+            specification(model, arrays, 0, many)  # which says what is missing
+            model.check_rows(arrays, len(arcs))
         self.specs = [specification(model, arrays, i, many) for i in range(len(arcs))]
         for i, arc in enumerate(arcs):
             check_observable(i, arc, self.specs[i])

@@ -27,8 +27,9 @@ class FitResult:
     - `params`: the pytree that was given, with fitted numbers; `x` those n numbers as one vector,
       `names` what they are called.
     - `covariance`: of x, shape (n, n), by Gauss–Newton, s² (JᵀJ)⁻¹; for `dvi.Likelihood` the
-      inverse of the Hessian. Infinite for what the data do not determine. s² is 1 when the data
-      have errors, else their variance found from the residuals.
+      inverse of the Hessian. For robust losses J is that of √ρ, which is within some tens of a
+      percent of the scatter. Infinite for what the data do not determine, NaN for more than 400
+      parameters. s² is 1 when the data have errors, else their variance found from the residuals.
     - `history`: arrays with one entry for each step of the optimiser: `stage`, `horizon`,
       `loss`, `step`, `accepted`, and `x`, shape (steps, n).
     - `result`: how it ended, one of `FIT_RESULTS`; `status` its name.
@@ -36,7 +37,9 @@ class FitResult:
     - `errors`: standard errors of the data, (N, ...) for each arc, NaN where none were given.
     - `whitened`: observed minus predicted in standard errors, (N, K) for each arc, independent of
       one another where covariances were given; NaN for what is missing.
-    - `loss`: ½ Σ ρ(r²) + priors; `degrees_of_freedom`; `num_observed`: how many values.
+    - `loss`: ½ Σ ρ(r²) + priors; `num_observed`: how many values; `degrees_of_freedom`: values and
+      priors minus parameters, those that are not determined left out.
+    - `prior_chi2`: Σ ((x − mean)/sigma)² of the priors.
     - `undetermined`: directions of the parameters that the data say nothing of, in words.
     - `singular_values`: of the Jacobian with columns of unit length, largest first.
     - `curvature`: the exact second derivative of the loss along each principal direction over
@@ -65,6 +68,7 @@ class FitResult:
     curvature: np.ndarray | None = None
     at_bounds: list[str] = field(default_factory=list)
     trajectories: list[str] = field(default_factory=list)
+    prior_chi2: float = 0.0
     seconds: float = 0.0
 
     @property
@@ -99,8 +103,10 @@ class FitResult:
 
     @property
     def reduced_chi2(self) -> float:
-        """`chi2` over the degrees of freedom: about 1 for a right model and right errors."""
-        return self.chi2 / self.degrees_of_freedom if self.degrees_of_freedom else np.nan
+        """`chi2` and `prior_chi2` over the degrees of freedom: about 1 where model, errors and
+        priors are right."""
+        total = self.chi2 + self.prior_chi2
+        return total / self.degrees_of_freedom if self.degrees_of_freedom else np.nan
 
     def statistics(self) -> dict[str, float]:
         """Of the whitened residuals: `rms`, `mean`, `largest`, `skewness`, `excess` kurtosis, and
@@ -126,6 +132,8 @@ class FitResult:
         lines = [f"{self.status} after {len(self.history['loss'])} steps, {self.seconds:.1f} s"]
         for name, x, s in list(zip(self.names, self.x, sigma, strict=True))[:40]:
             lines.append(f"  {name:{width}}  {with_error(x, s)}")
+        if np.isnan(self.covariance).all():
+            lines.append("  no errors: more than 400 parameters, or a derivative is not finite")
         if len(self.names) > 40:
             lines.append(f"  … and {len(self.names) - 40} more")
         errors = f"reduced chi² {self.reduced_chi2:.4g}, " if self.has_errors else ""
@@ -149,7 +157,8 @@ class FitResult:
             "degrees_of_freedom": self.degrees_of_freedom, "num_observed": self.num_observed,
             "has_errors": self.has_errors, "undetermined": self.undetermined,
             "at_bounds": self.at_bounds, "trajectories": self.trajectories,
-            "seconds": self.seconds, "arcs": len(self.ts), "shape": _shape_of(self.params),
+            "seconds": self.seconds, "prior_chi2": self.prior_chi2,
+            "arcs": len(self.ts), "shape": _shape_of(self.params),
         }  # fmt: skip
         arrays = {"x": self.x, "covariance": self.covariance, "values": self.singular_values}
         arrays |= {f"history.{name}": value for name, value in self.history.items()}
@@ -200,6 +209,7 @@ class FitResult:
             undetermined=about["undetermined"], singular_values=arrays["values"],
             curvature=arrays.get("curvature"), at_bounds=about["at_bounds"],
             trajectories=about["trajectories"], seconds=about["seconds"],
+            prior_chi2=about["prior_chi2"],
         )  # fmt: skip
 
 

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -38,6 +40,8 @@ class Run:
         self.records: list[Record] = []
         self.resume: Position | None = None
         self._saved = time.monotonic()
+        if checkpoint is not None and not Path(checkpoint).parent.is_dir():
+            raise FileNotFoundError(f"there is no directory for the checkpoint {checkpoint}.")
         if checkpoint is not None and Path(checkpoint).exists():
             self.resume, self.records = _read_checkpoint(checkpoint, identity)
 
@@ -76,9 +80,12 @@ class Run:
 
 def identity(problem: Problem, u: np.ndarray, *of: Any) -> str:
     """What a checkpoint is known by: data, names, start and settings."""
-    settings = re.sub(r" at 0x[0-9a-f]+", "", repr((problem.space.names, *of)))
+    settings = re.sub(r" at 0x[0-9a-f]+", "", repr((problem.space.names, problem.loss, *of)))
     digest = hashlib.sha256(settings.encode())
     digest.update(np.ascontiguousarray(u).tobytes())
+    known = eqx.filter((problem.space, problem.core.model), eqx.is_array_like)
+    for leaf in jax.tree.leaves(known):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
     for group in problem.groups:
         for array in (group.ts, group.values, group.seen, group.whiten, group.t0):
             digest.update(np.ascontiguousarray(array).tobytes())
@@ -94,7 +101,8 @@ def _write_checkpoint(path: Any, identity: str, at: Position, records: list[Reco
         arrays[f"record.{name}"] = np.array([getattr(r, name) for r in records])
     about = {
         "format": 1, "identity": identity, "stage": at.stage, "horizon": at.horizon,
-        "done": at.done, "leaves": len(at.leaves), "extra": len(at.extra),
+        "done": at.done, "memory": list(at.memory), "status": at.status,
+        "leaves": len(at.leaves), "extra": len(at.extra),
     }  # fmt: skip
     write_npz(path, about, arrays)
 
@@ -110,6 +118,7 @@ def _read_checkpoint(path: Any, identity: str) -> tuple[Position, list[Record]]:
         about["stage"], about["horizon"], about["done"], arrays["base"], arrays["scale"],
         arrays["z"], [arrays[f"leaf.{i}"] for i in range(about["leaves"])],
         [arrays[f"extra.{i}"] for i in range(about["extra"])],
+        tuple(about["memory"]), about["status"],
     )  # fmt: skip
     columns = [arrays[f"record.{n}"] for n in ("stage", "horizon", "loss", "step", "accepted", "x")]
     records = [

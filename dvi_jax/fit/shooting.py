@@ -52,6 +52,8 @@ class MultipleShooting:
             raise TypeError(f"segments must be an integer, got {self.segments!r}.")
         if self.segments < 2:
             raise ValueError(f"segments must be at least 2, got {self.segments}.")
+        if not 0 < self.tolerance < 1:
+            raise ValueError(f"tolerance must lie between 0 and 1, got {self.tolerance!r}.")
         if not (self.guess in (None, "data", "model") or callable(self.guess)):
             raise TypeError(
                 f'guess must be "data", "model", a function t → (q, p) or None, got {self.guess!r}.'

@@ -63,10 +63,12 @@ def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units
             first=None if whole is None else _up_to(problem, whole, horizon),
         )  # fmt: skip
         resume = None
-        if is_last or status == FIT_RESULTS.not_finite or run.left <= 0:
+        if is_last or status == FIT_RESULTS.not_finite:
             return Minimum(u, status, found.jacobian, None, found.aux if is_last else None)
         number += 1
         whole = stage.at(u)
+        if run.left <= 0:  # a piece may have converged, the whole has not
+            return Minimum(u, FIT_RESULTS.max_steps_reached, whole.jacobian, None, whole.aux)
         horizon = _next(problem, wanted, number, whole.aux[0], 2 * horizon * (1 - 1e-9))
 
 
@@ -116,7 +118,10 @@ def by_gradient(run: Run, u: np.ndarray, solver: Any, wanted, batch, seed: int, 
         )  # fmt: skip
         resume = None
         rows, known = problem.whitened(u)
-        if is_last or status == FIT_RESULTS.not_finite or run.left <= 0:
+        if is_last or status == FIT_RESULTS.not_finite:
+            break
+        if run.left <= 0:
+            status = FIT_RESULTS.steps_done if is_optax else FIT_RESULTS.max_steps_reached
             break
         number += 1
         horizon = _next(problem, wanted, number, rows, 2 * horizon * (1 - 1e-9))
@@ -151,8 +156,11 @@ def _draw(problem: Problem, batch: int, seed: int) -> Callable[[int], Any]:
 def _root_of_hessian(problem: Problem, u: np.ndarray) -> np.ndarray:
     """A matrix whose square JᵀJ is the exact Hessian of the loss, NaN if it is not positive."""
     H = np.asarray(problem.hessian(u))
-    values, vectors = np.linalg.eigh((H + H.T) / 2)
-    return np.sqrt(np.where(values > 0, values, np.nan))[:, None] * vectors.T
+    length = np.sqrt(np.abs(np.diag(H)))
+    scale = np.where(length > 0, length, 1.0)
+    values, vectors = np.linalg.eigh((H + H.T) / 2 / np.outer(scale, scale))
+    values = np.where(np.abs(values) <= 1e-12 * np.abs(values).max(initial=0.0), 0.0, values)
+    return np.sqrt(np.where(values >= 0, values, np.nan))[:, None] * vectors.T * scale
 
 
 def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any) -> Minimum:
@@ -166,7 +174,7 @@ def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any) -> Min
         r, _, c = stage.at(w, np.inf, (jnp.asarray(root), jnp.asarray(multipliers)))
         # Continuity weighs as much as the data to begin with.
         misfit, size = float(np.linalg.norm(r[: len(r) - gaps])), float(np.linalg.norm(c))
-        root = max(misfit / max(size, 1e-12), np.sqrt(len(r)))
+        root = max(misfit / max(size, 1e-2), np.sqrt(len(r)))
     else:
         number, (root, multipliers) = resume.stage, (float(resume.extra[0]), resume.extra[1])
     while True:

@@ -68,10 +68,11 @@ def correlations(covariance: np.ndarray) -> np.ndarray:
 def in_words(direction: np.ndarray, names: list[str], most: int = 4) -> str:
     """A direction as a sum of names, largest first: ``0.71 q0[0] − 0.71 mu``."""
     order = np.argsort(-np.abs(direction))
-    order = [i for i in order[:most] if abs(direction[i]) > 0.05]
+    least = 0.05 * np.abs(direction).max()
+    order = [i for i in order[:most] if abs(direction[i]) > least]
     sign = 1 if direction[order[0]] >= 0 else -1
     parts = [f"{sign * direction[i]:+.2f} {names[i]}" for i in order]
-    more = " + …" if (np.abs(direction) > 0.05).sum() > most else ""
+    more = " + …" if (np.abs(direction) > least).sum() > most else ""
     return " ".join(parts).lstrip("+").replace("-", "−") + more
 
 
