@@ -407,14 +407,17 @@ class _Search:
             removed = self.library.names[i]
 
     def _refit(self, u: np.ndarray, keep: np.ndarray):
-        """From where the rest stands; from no force at all if there is no way from there."""
+        """From where the rest stands; from no force at all if that leads nowhere."""
         u = np.where(keep, u, 0.0)
         if not keep.any():
             return u, self.stage.at(u, np.inf, jnp.asarray(keep)), FIT_RESULTS.converged
         outcome = self._minimum(u, keep)
-        if bool(outcome[2] == FIT_RESULTS.not_finite):
-            zero = u.copy()
-            zero[self.where] = 0.0
+        zero = u.copy()
+        zero[self.where] = 0.0
+        bare = np.asarray(self.stage.at(zero, np.inf, jnp.asarray(keep)).residual)
+        r = np.asarray(outcome[1].residual)
+        # A refit that ran away, to where no force at all is better, begins anew from there.
+        if np.isfinite(bare).all() and not r @ r <= bare @ bare:
             outcome = self._minimum(zero, keep)
         return outcome
 
