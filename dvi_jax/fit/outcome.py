@@ -38,7 +38,8 @@ def result_of(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
         if has_residuals and not problem.has_errors:
             variance = 2 * loss / degrees if degrees > 0 else np.nan
         slope, values = space.slope(u), about.singular_values
-        covariance = variance * about.covariance[:n, :n] * np.outer(slope, slope)
+        with np.errstate(invalid="ignore"):  # infinite variance, of a parameter without effect
+            covariance = variance * about.covariance[:n, :n] * np.outer(slope, slope)
         words = [in_words(d[:n], list(space.names)) for d in about.undetermined.T if np.any(d[:n])]
         if check_curvature and minimum.free is None and has_residuals and n <= _FEW:
             curvature = _curvature_ratio(problem, u, J, about)
