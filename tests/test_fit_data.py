@@ -133,6 +133,8 @@ def fails_at_start(params):
         ({"bounds": {"epsilon": (0, 1)}}, TypeError, r"dvi.Bounds\(...\)"),
         ({"priors": {"epsilon": dvi.Prior(0.0, 0.0)}}, ValueError, "positive sigma"),
         ({"loss": "huber"}, TypeError, "dvi.SoftL1"),
+        ({"bounds": {"epsilon": dvi.Bounds("a", 1)}}, TypeError, "lower of epsilon must be"),
+        ({"checkpoint": "."}, IsADirectoryError, "is a directory"),
         ({"shooting": "multiple"}, TypeError, "MultipleShooting"),
         ({"shooting": dvi.MultipleShooting(300)}, ValueError, "fewer segments"),
         ({"optimiser": "adam"}, TypeError, "optimistix"),
@@ -148,6 +150,12 @@ def fails_at_start(params):
 def test_fit_refuses(wrong, error, says):
     with pytest.raises(error, match=says):
         fit(**wrong)
+
+
+@pytest.mark.parametrize("loss", [dvi.SoftL1, dvi.Cauchy])
+def test_a_robust_loss_has_a_positive_scale(loss):
+    with pytest.raises(ValueError, match="positive number of standard errors"):
+        loss(-1.0)
 
 
 def test_fewer_values_than_parameters():

@@ -27,10 +27,21 @@ class LeastSquares(Loss):
         return r
 
 
+def _check_scale(scale: Any) -> None:
+    if not (isinstance(scale, int | float) and scale > 0):
+        raise ValueError(
+            f"the scale of a robust loss must be a positive number of standard errors, "
+            f"got {scale!r}."
+        )
+
+
 class SoftL1(Loss):
     """ρ(s) = 2 k² (√(1 + s/k²) − 1): like s up to k standard errors, then like 2 k √s."""
 
     scale: float = 1.5
+
+    def __check_init__(self):
+        _check_scale(self.scale)
 
     def root(self, r):
         s = (r / self.scale) ** 2
@@ -41,6 +52,9 @@ class Cauchy(Loss):
     """ρ(s) = k² log(1 + s/k²): errors with the tails of Cauchy's distribution."""
 
     scale: float = 2.4
+
+    def __check_init__(self):
+        _check_scale(self.scale)
 
     def root(self, r):
         s = (r / self.scale) ** 2

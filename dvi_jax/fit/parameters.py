@@ -255,7 +255,10 @@ def _pairs(a: Any, b: Any) -> list[tuple[Any, Any]]:
 
 
 def _spread(value: Any, where: np.ndarray, shape: tuple[int, ...], called: str) -> np.ndarray:
-    value = np.asarray(value, float)
+    try:
+        value = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise TypeError(f"{called} must be a number or an array, got {value!r}.") from None
     if value.ndim == 0:
         return np.full(len(where), float(value))
     if value.shape != shape:

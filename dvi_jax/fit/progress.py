@@ -1,10 +1,8 @@
 """What a fit shows while it runs."""
 
 import contextlib
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -65,13 +63,3 @@ def shown(
             )
 
         yield show
-
-
-class Clock:
-    """Seconds since it was made."""
-
-    def __init__(self):
-        self._start: Any = time.monotonic()
-
-    def __call__(self) -> float:
-        return time.monotonic() - self._start

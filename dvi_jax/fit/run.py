@@ -42,6 +42,8 @@ class Run:
         self._saved = time.monotonic()
         if checkpoint is not None and not Path(checkpoint).parent.is_dir():
             raise FileNotFoundError(f"there is no directory for the checkpoint {checkpoint}.")
+        if checkpoint is not None and Path(checkpoint).is_dir():
+            raise IsADirectoryError(f"checkpoint must be a file, {checkpoint} is a directory.")
         if checkpoint is not None and Path(checkpoint).exists():
             self.resume, self.records = _read_checkpoint(checkpoint, identity)
 
