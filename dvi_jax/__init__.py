@@ -91,14 +91,21 @@ from .methods import (
     Yoshida as Yoshida,
 )
 from .observe import (
+    GALI as GALI,
+    MEGNO as MEGNO,
+    SALI as SALI,
     Crossings as Crossings,
+    Deviations as Deviations,
     Last as Last,
+    LyapunovSpectrum as LyapunovSpectrum,
     MaxDrift as MaxDrift,
     Mean as Mean,
     Range as Range,
     Reduction as Reduction,
+    Running as Running,
     Section as Section,
     Stop as Stop,
+    TangentMap as TangentMap,
     Trend as Trend,
 )
 from .sweep import (

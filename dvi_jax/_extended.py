@@ -13,7 +13,7 @@ from ._solution import Save, Solution
 from ._system import System
 from ._types import Args, Bindable, Scalar, State
 from .lattices import TimeTransformed
-from .observe import Crossings, Reduction, Section, Stop, Stopped, Trend
+from .observe import Crossings, Deviations, Reduction, Running, Section, Stop, Stopped, Trend
 
 
 class Extended(eqx.Module):
@@ -113,10 +113,18 @@ def run_extended(
     def seen(observable):
         if not is_observable(observable):
             return observable  # refused by name further on
+        if isinstance(observable, Running):
+            return Running(seen(observable.reduction))
         if isinstance(observable, Trend):
             raise ValueError(
                 "a Trend over a TimeTransformed lattice would be a slope in its fictitious time: "
                 "observe the function alone and fit a line to it over solution.ts."
+            )
+        if isinstance(observable, Deviations):
+            raise ValueError(
+                f"{type(observable).__name__} needs steps whose size does not depend on the state, "
+                "and those of a TimeTransformed lattice do: take lattice=dvi.Uniform() or "
+                "dvi.Given(ts)."
             )
         if isinstance(observable, Section):
             return eqx.tree_at(lambda s: s.g, observable, _SeenPoint(observable.g, extended))

@@ -44,7 +44,7 @@ from .engine.picard import PicardThenNewton
 from .engine.tiles import Layout
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation
-from .observe import Reduction, RequestedTimes, Section, Stop
+from .observe import Deviations, Reduction, RequestedTimes, Running, Section, Stop
 from .observe._kept import Start
 
 _STEP = "(t0, t1, q0, p0, q1, p1, args)"
@@ -259,6 +259,11 @@ def _in_pieces(task: Task, plan: Plan, q0, p0, num_steps, progress) -> Outcome:
 def _with_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes, PyTree]:
     """What is observed along the run when states are saved at requested times: no observables that
     stand alone, which are evaluated at those times afterwards."""
+    if task.has_running_values:
+        raise ValueError(
+            "Running tells a reduction at lattice points, and Save(ts=...) asks for other times: "
+            "take save=dvi.Save(every=m)."
+        )
     kept = jax.tree.map(
         lambda f: f if isinstance(f, Reduction) else None, task.observe, is_leaf=is_observable
     )
@@ -430,6 +435,17 @@ def _parameter(leaf: Any) -> Any:
     return jnp.asarray(leaf) if isinstance(leaf, float) else leaf
 
 
+def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> None:
+    """Refuse deviation vectors along steps whose derivative is not that of the method alone."""
+    name = type(leaf).__name__
+    if task.lattice.has_memory:
+        raise ValueError(
+            f"{name} needs steps whose size does not depend on the state, and those of "
+            f"{task.lattice!r} do: take lattice=dvi.Uniform() or dvi.Given(ts)."
+        )
+    eqx.filter_eval_shape(leaf.start, jnp.zeros(2 * q0.size, q0.dtype))  # counts and units
+
+
 def _check_observe(task: Task, q0: Array, p0: Array) -> None:
     """Refuse observables that are not functions of a step with an array for a value."""
     for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
@@ -443,6 +459,11 @@ def _check_observe(task: Task, q0: Array, p0: Array) -> None:
                 f"observe must be a pytree of functions {_STEP} or "
                 f"reductions such as dvi.MaxDrift(function); it holds {leaf!r}."
             )
+        if isinstance(leaf, Running):
+            leaf = leaf.reduction
+        if isinstance(leaf, Deviations):
+            _check_deviations(leaf, task, q0, p0)
+            continue
         function = leaf.function if isinstance(leaf, Reduction) else leaf
         called = getattr(function, "__name__", type(function).__name__)
         if not callable(function):

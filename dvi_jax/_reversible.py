@@ -65,9 +65,10 @@ class Reversible(AbstractAdjoint):
     for as much time as the states take to be rebuilt.
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
-    without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop`, and a system
-    or observable that *closes over* a value being differentiated (better: hand it over in args),
-    are differentiated as by `Checkpointed`.
+    without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop`, with deviation
+    vectors (`LyapunovSpectrum` and its like) or with `Running` values, and a system or observable
+    that *closes over* a value being differentiated (better: hand it over in args), are
+    differentiated as by `Checkpointed`.
 
     **Raises** `ValueError` for settings that are not positive, and for `report_defect` where no
     states are rebuilt.
@@ -533,6 +534,10 @@ def _why_not(task: Task, q0: State, p0: State) -> str | None:
         return f"the steps of {type(task.lattice).__name__} depend on those before"
     if task.stop is not None:
         return "a run with a Stop ends in the midst"
+    if task.has_deviations:
+        return "deviation vectors cannot be followed backwards"
+    if task.has_running_values:
+        return "running values of reductions are not rebuilt"
     if _closes_over_traced(task, q0, p0):
         return "a function of the run closes over a traced value (hand it over in args)"
     return None

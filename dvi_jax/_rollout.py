@@ -16,7 +16,7 @@ from ._step import Equations
 from ._types import Args, Bindable, Interval, Scalar, State
 from .lattices import Lattice, Place
 from .methods import Method
-from .observe import Reduction, Stop
+from .observe import Deviations, Pushed, Reduction, Running, Stop
 from .observe._kept import Start, as_row, event
 
 Loop = Callable[[Callable, Any, Array, int, int], tuple[Any, Any]]
@@ -73,10 +73,40 @@ class Task(eqx.Module):
         return Interval(*(x.astype(self.h.dtype) for x in interval))
 
     def observables(self) -> tuple[list[Callable], list[Reduction]]:
-        """The observables that stand alone, and those in a reduction, in tree order."""
-        leaves = jax.tree.leaves(self.observe, is_leaf=is_observable)
-        alone = [self.bound(f) for f in leaves if not isinstance(f, Reduction)]
-        return alone, [f for f in leaves if isinstance(f, Reduction)]
+        """The functions that stand alone, and the reductions, in tree order."""
+        alone = [self.bound(f) for f in self._leaves() if not isinstance(f, Reduction | Running)]
+        found = [f.reduction if isinstance(f, Running) else f for f in self._leaves()]
+        return alone, [f for f in found if isinstance(f, Reduction)]
+
+    def at_save(self, carry: "Carry", taken: "StepTaken | None") -> list[Any]:
+        """What is observed at a save point, after the step taken (None where nobody asks for it):
+        values of functions that stand alone and running values of reductions, in tree order."""
+        memories, values = iter(carry.reductions), []
+        for f in self._leaves():
+            if isinstance(f, Running):
+                value = f.reduction.finish(next(memories))
+                if carry.result is not None:
+                    value = _or_nan(carry.result == RESULTS.successful, value)
+                values.append(value)
+            elif isinstance(f, Reduction):
+                next(memories)
+            else:
+                assert taken is not None
+                values.append(taken.value(self.bound(f), self.args))
+        return values
+
+    def _leaves(self) -> list[Any]:
+        return jax.tree.leaves(self.observe, is_leaf=is_observable)
+
+    @property
+    def has_running_values(self) -> bool:
+        """Whether a reduction is told at every save point."""
+        return any(isinstance(f, Running) for f in self._leaves())
+
+    @property
+    def has_deviations(self) -> bool:
+        """Whether a reduction follows deviation vectors, for which steps are differentiated."""
+        return any(isinstance(r, Deviations) for r in self.observables()[1])
 
     def bound(self, observable: Callable) -> Callable:
         """The observable, told the system and ε if it asks for them."""
@@ -153,7 +183,7 @@ class Plan(NamedTuple):
 
 
 def is_observable(x: Any) -> bool:
-    return isinstance(x, Reduction) or callable(x)
+    return isinstance(x, Reduction | Running) or callable(x)
 
 
 def make_plan(save: Save, num_steps: int) -> Plan:
@@ -214,9 +244,17 @@ def start(task: Task, q0: State, p0: State) -> Carry:
 def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, StepTaken]:
     """Step k of the trajectory, its status and its reductions."""
     interval, memory, exists = task.next_interval(carry, k)
-    q1, p1, beside, info = task.arithmetic.step(
-        task.method, task.equations, interval, carry.q, carry.p, carry.beside
-    )
+
+    def advance(q, p):
+        q1, p1, *rest = task.arithmetic.step(
+            task.method, task.equations, interval, q, p, carry.beside
+        )
+        return (q1, p1), rest
+
+    if task.has_deviations:
+        (q1, p1), push, (beside, info) = jax.linearize(advance, carry.q, carry.p, has_aux=True)
+    else:
+        ((q1, p1), (beside, info)), push = advance(carry.q, carry.p), None
     if carry.result is None:  # on trust
         taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
         excess = carry.residual
@@ -226,7 +264,7 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
                 p=p1,
                 iterations=carry.iterations + info.iterations,
                 residual=None if excess is None else jnp.maximum(excess, info.residual),
-                reductions=_reduced(task, carry, k, taken),
+                reductions=_reduced(task, carry, k, taken, push, interval.h),
                 beside=beside,
             ),
             interval,
@@ -241,7 +279,7 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
     # A state after a failed step is no answer: NaN keeps it from being taken for one.
     q1, p1 = _or_nan(good, q1), _or_nan(good, p1)
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
-    reduced = _reduced(task, carry, k, taken)
+    reduced = _reduced(task, carry, k, taken, push, interval.h)
     if stop is not None:  # what is reduced covers the steps before
         over = result == RESULTS.stopped
         reduced = jax.tree.map(lambda a, b: jnp.where(over, b, a), reduced, carry.reductions)
@@ -265,13 +303,33 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
     )
 
 
-def _reduced(task: Task, carry: Carry, k: Array, taken: StepTaken) -> list[Any]:
-    """The memories of the reductions after step k."""
+def _reduced(
+    task: Task, carry: Carry, k: Array, taken: StepTaken, push: Callable | None, h: Scalar
+) -> list[Any]:
+    """The memories of the reductions after step k, whose derivative is `push`."""
     _, reductions = task.observables()
+
+    def value(r: Reduction, memory: Any) -> Any:
+        if isinstance(r, Deviations):
+            assert push is not None
+            return _pushed(push, r.vectors(memory), taken, h)
+        return taken.number(task.bound(r.function), task.args)
+
     return [
-        r.update(so_far, k, taken.t1, taken.number(task.bound(r.function), task.args))
+        r.update(so_far, k, taken.t1, value(r, so_far))
         for r, so_far in zip(reductions, carry.reductions, strict=True)
     ]
+
+
+def _pushed(push: Callable, vectors: Array, taken: StepTaken, h: Scalar) -> Pushed:
+    """Deviation vectors (δq, δp), one in each row, after the step; NaN if it has failed."""
+
+    def of(vector):
+        dq, dp = (x.reshape(taken.q0.shape) for x in jnp.split(vector, 2))
+        return jnp.concatenate([x.ravel() for x in push(dq, dp)])
+
+    good = jnp.all(jnp.isfinite(taken.q1)) & jnp.all(jnp.isfinite(taken.p1))
+    return Pushed(_or_nan(good, jax.vmap(of)(vectors)), h)
 
 
 def _stop(
@@ -300,7 +358,6 @@ def run(
     tail is the end of the steps after the last block, None where there are none.
     """
     inner_loop = loop if inner_loop is None else inner_loop
-    alone, _ = task.observables()
     first = jnp.asarray(first, jnp.int32)
 
     def body(state, k):
@@ -317,7 +374,7 @@ def run(
             none_yet = StepTaken(*interval[:2], carry.q, carry.p, carry.q, carry.p)
             state, inner = inner_loop(body, (carry, interval, none_yet), k, 1, count)
         carry, interval, taken = state
-        observed = [taken.value(f, task.args) for f in alone]
+        observed = task.at_save(carry, taken)
         return carry, Saved(interval.t1, interval.h, taken.q1, taken.p1, observed, inner)
 
     carry, saved = loop(
@@ -353,12 +410,16 @@ def with_start(saved: Saved, q0: State, p0: State) -> Saved:
 def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
     """The pytree `observe` with every observable replaced by its values."""
     values, lone = iter(reduced), iter(alone)
-    return jax.tree.map(
-        lambda f: next(values) if isinstance(f, Reduction) else next(lone),
-        observe,
-        is_leaf=is_observable,
-    )
+
+    def value(f):
+        if isinstance(f, Reduction):
+            return next(values)
+        if isinstance(f, Running):  # its last value is the last of its rows
+            next(values)
+        return next(lone)
+
+    return jax.tree.map(value, observe, is_leaf=is_observable)
 
 
 def _or_nan(good, x):
-    return jnp.where(good, x, jnp.full_like(x, jnp.nan))
+    return jax.tree.map(lambda x: jnp.where(good, x, jnp.full_like(x, jnp.nan)), x)

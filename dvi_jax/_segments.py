@@ -33,6 +33,7 @@ from .engine.dependence import fixed_point, reached_outputs
 from .engine.lanes import in_arrays
 from .engine.newton import RootSolver, Trusted
 from .engine.together import least_over_lanes, on_any_lane
+from .observe import Deviations, Pushed, Reduction
 
 SEGMENT = 128
 """Steps between two looks, where nothing else says how many."""
@@ -114,11 +115,11 @@ def _long_block(task: Task, segment, state, first, count: int, every: int):
     state, (before, ends) = counted_scan(piece, state, first, every, pieces)
     carry, _ = state
     interval = task.interval(first + (count - 1))
-    observed = []
+    taken = None
     if alone:
         q0, p0 = (x[-1] for x in before)
         taken = StepTaken(interval.t0, interval.t1, q0, p0, carry.q, carry.p)
-        observed = [taken.value(f, task.args) for f in alone]
+    observed = task.at_save(carry, taken)
     inner = jax.tree.map(lambda x: x[:-1], ends) if pieces > 1 else None
     return state, Saved(interval.t1, interval.h, carry.q, carry.p, observed, inner)
 
@@ -239,15 +240,24 @@ def _depend_on_the_state(task: Task, carry: Carry) -> list[bool]:
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, carry.q, carry.p)
     _, reductions = task.observables()
     for r, memory in zip(reductions, carry.reductions, strict=True):
-        like = jax.eval_shape(lambda r=r: taken.number(task.bound(r.function), task.args))
-        value = jnp.zeros(like.shape, like.dtype)
+        value = _like_a_value(task, r, memory, taken, interval.h)
         update = jax.make_jaxpr(r.update)(memory, jnp.asarray(0, jnp.int32), interval.t1, value)
-        count = len(jax.tree.leaves(memory))
+        count, parts = (len(jax.tree.leaves(x)) for x in (memory, value))
         found += fixed_point(
-            lambda marks, u=update: reached_outputs(u.jaxpr, [*marks, False, False, True]),
+            lambda marks, u=update, n=parts: reached_outputs(
+                u.jaxpr, [*marks, False, False, *[True] * n]
+            ),
             [False] * count,
         )
     return found
+
+
+def _like_a_value(task: Task, r: Reduction, memory, taken: StepTaken, h: Array):
+    """What a reduction is given after a step, as zeros."""
+    if isinstance(r, Deviations):
+        return Pushed(jnp.zeros_like(r.vectors(memory)), h)
+    like = jax.eval_shape(lambda: taken.number(task.bound(r.function), task.args))
+    return jnp.zeros(like.shape, like.dtype)
 
 
 def _is_fine(after: Carry) -> Array:

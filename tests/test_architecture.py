@@ -22,6 +22,7 @@ FLOORS = [
     ["_reversible"],
     ["_integrate"],
     ["invariants", "sweep", "fit"],
+    ["dynamics"],
     ["__init__", "systems", "plot"],
     ["paper", "run", "certify"],
     ["cli"],
@@ -94,6 +95,7 @@ TypeII Adjoint Strang Yoshida Suzuki BlanesMoan McLachlan KahanLi Composition
 GaussLegendre LobattoIIIAIIIB RungeKutta4
 Uniform Given TimeTransformed Variational FloatingPoint Compensated FixedPoint
 Section Stop Crossings LatticeCondition
+Deviations TangentMap LyapunovSpectrum MEGNO GALI SALI Running
 MaxDrift Range Trend Mean Last Reversible Checkpointed Direct
 Generator prolong determining_residual conformal_factor noether_identity AdiabaticInvariant
 generators random_pairs solution_pairs find_symmetries Symmetries Symmetry

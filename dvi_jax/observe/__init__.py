@@ -1,5 +1,14 @@
 """What is measured along a trajectory while it runs."""
 
+from ._deviations import (
+    GALI as GALI,
+    MEGNO as MEGNO,
+    SALI as SALI,
+    Deviations as Deviations,
+    LyapunovSpectrum as LyapunovSpectrum,
+    Pushed as Pushed,
+    TangentMap as TangentMap,
+)
 from ._kept import (
     Crossings as Crossings,
     RequestedTimes as RequestedTimes,
@@ -11,6 +20,7 @@ from ._reductions import (
     Mean as Mean,
     Range as Range,
     Reduction as Reduction,
+    Running as Running,
     Trend as Trend,
 )
 from ._stop import Stop as Stop, Stopped as Stopped

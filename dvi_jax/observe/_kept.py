@@ -26,15 +26,20 @@ class Start(NamedTuple):
 class KeptSteps(Reduction):
     """Base of the reductions that keep some steps: what they began with, in the order of time.
 
-    `function` gives a row, see `as_row`, whose first number is 1 if it is to be kept; the value in
-    the end is the rows kept, NaN where there were fewer than the capacity, and the number of hits.
+    `function` gives a row, see `as_row`, whose first number is 1 if it is to be kept, unless it is
+    among the first `skip` of them; the value in the end is the rows kept, NaN where there were
+    fewer than the capacity, and the number of hits after those skipped.
     """
+
+    has_running_value: ClassVar[bool] = False
 
     if TYPE_CHECKING:  # there abstract variables would stay arguments of every subclass
         capacity: ClassVar[int]
+        skip: ClassVar[int]
         function: ClassVar[Callable[..., Any]]
     else:
         capacity: eqx.AbstractVar[int]
+        skip: eqx.AbstractVar[int]
 
         @property
         def function(self):
@@ -46,18 +51,18 @@ class KeptSteps(Reduction):
 
     def start(self, value):
         rows = jnp.full((self.capacity, *value.shape), jnp.nan, value.dtype)
-        return rows, jnp.full((self.capacity,), -1, jnp.int32), jnp.asarray(0, jnp.int32)
+        return rows, jnp.full((self.capacity,), -1, jnp.int32), jnp.asarray(-self.skip, jnp.int32)
 
     def update(self, memory, k, t, value):
         rows, steps, count = memory
         hit = value[0] == 1
-        place = jnp.where(hit, count, self.capacity)  # beyond the end: dropped
+        place = jnp.where(hit & (count >= 0), count, self.capacity)  # beyond the end: dropped
         rows = rows.at[place].set(value, mode="drop")
         return rows, steps.at[place].set(k, mode="drop"), count + jnp.where(hit, 1, 0)
 
     def finish(self, memory) -> Any:
         rows, _, count = memory
-        return rows, count.astype(rows.dtype)
+        return rows, jnp.maximum(count, 0).astype(rows.dtype)
 
     def pull(self, memory, cotangent, k, t, value):
         _, steps, _ = memory
@@ -84,7 +89,8 @@ class Crossings(eqx.Module):
 
     - `ts`, `qs`, `ps`: times and states, shapes (max_crossings,), (max_crossings, *q0.shape); NaN
       behind the last one.
-    - `count`: how many there were. Above max_crossings, only the first of them are here.
+    - `count`: how many there were after the `skip` first ones. Above max_crossings, only the first
+      of these are here.
     """
 
     ts: Array
@@ -106,6 +112,7 @@ class Section(KeptSteps):
     - `g`: function ``(t, q, p, args)`` → scalar. Of an angle take sin or cos, which do not jump.
     - `direction`: 1 for crossings where g grows, −1 where it falls, 0 for both.
     - `max_crossings`: room for so many; static.
+    - `skip`: crossings at the beginning that are passed over (a transient); static.
 
     The observed value is a `Crossings`. It is differentiable, the times included, and may be
     batched. Two crossings within one step are not seen: take steps that g does not turn in. A start
@@ -119,9 +126,12 @@ class Section(KeptSteps):
     g: Callable[..., Any]
     direction: int = eqx.field(static=True, default=0)
     capacity: int = eqx.field(static=True, default=1000)
+    skip: int = eqx.field(static=True, default=0)
 
-    def __init__(self, g: Callable[..., Any], direction: int = 0, max_crossings: int = 1000):
-        self.g, self.direction, self.capacity = g, direction, max_crossings
+    def __init__(
+        self, g: Callable[..., Any], direction: int = 0, max_crossings: int = 1000, skip: int = 0
+    ):
+        self.g, self.direction, self.capacity, self.skip = g, direction, max_crossings, skip
 
     def __check_init__(self):
         check_event(self.g, "Section")
@@ -132,6 +142,8 @@ class Section(KeptSteps):
         n = self.capacity
         if isinstance(n, bool) or not isinstance(n, int) or n < 1:
             raise ValueError(f"max_crossings must be a positive integer, got {n!r}.")
+        if isinstance(self.skip, bool) or not isinstance(self.skip, int) or self.skip < 0:
+            raise ValueError(f"skip must be a whole number of crossings, got {self.skip!r}.")
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
         before, after = event(self.g, t0, q0, p0, args), event(self.g, t1, q1, p1, args)
@@ -149,6 +161,7 @@ class RequestedTimes(KeptSteps):
     ts: Array
     ordered: Array
     clock: Callable[..., Any] | None
+    skip: ClassVar[int] = 0
 
     @property
     def capacity(self) -> int:

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ class Reduction(eqx.Module):
     """
 
     function: eqx.AbstractVar[Callable[..., Any]]
+    has_running_value: ClassVar[bool] = True
 
     @abc.abstractmethod
     def start(self, value: Array) -> Any:
@@ -168,3 +169,24 @@ class Last(Reduction):
 
     def pull(self, memory, cotangent, k, t, value):
         return jnp.zeros_like(t), jnp.where(k == memory[1], cotangent, 0)
+
+
+class Running(eqx.Module):
+    """The value of a reduction at every save point: over the steps from the start up to there.
+
+    ``dvi.Running(dvi.MEGNO())`` with ``save=dvi.Save(every=m)`` shows how an indicator settles;
+    the values have shape (S − 1, …), like those of an observable that stands alone.
+
+    **Arguments** `reduction`: any but a `Section`, whose rows are what they are.
+
+    **Raises** `TypeError` for what is no such reduction.
+    """
+
+    reduction: Reduction
+
+    def __check_init__(self):
+        if not (isinstance(self.reduction, Reduction) and self.reduction.has_running_value):
+            raise TypeError(
+                "Running takes a reduction with a value at any time, such as dvi.MEGNO() or "
+                f"dvi.Mean(f), got {self.reduction!r}."
+            )

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._rollout import is_observable
 from ..observe import Reduction
 from .axes import place
 from .program import Sweep
@@ -48,9 +49,7 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     """
     given = [
         place(path) or "observed"
-        for path, _ in jax.tree.leaves_with_path(
-            sweep.options["observe"], is_leaf=lambda x: isinstance(x, Reduction)
-        )
+        for path, _ in jax.tree.leaves_with_path(sweep.options["observe"], is_leaf=is_observable)
     ]
     if twice := [n for n in given if given.count(n) > 1]:
         raise ValueError(f"two observables have the name {twice[0]!r}: give one of them another.")
@@ -107,9 +106,7 @@ def _alone(sweep: Sweep) -> dict[str, str]:
     point, one less than states but for ``Save(ts=...)``."""
     save = sweep.options["save"]
     rows = "save" if save is not None and save.ts is not None else "saved_step"
-    leaves = jax.tree.leaves_with_path(
-        sweep.options["observe"], is_leaf=lambda x: isinstance(x, Reduction)
-    )
+    leaves = jax.tree.leaves_with_path(sweep.options["observe"], is_leaf=is_observable)
     return {place(path) or "observed": rows for path, f in leaves if not isinstance(f, Reduction)}
 
 

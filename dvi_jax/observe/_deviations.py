@@ -1,0 +1,343 @@
+"""Deviation vectors: what the derivative of the steps does to small displacements of the start."""
+
+import abc
+import math
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._types import Scalar
+from ._reductions import Reduction
+
+
+class Pushed(NamedTuple):
+    """Deviation vectors after a step, w1 = M w0 with M = ∂(q1, p1)/∂(q0, p0).
+
+    - `vectors`: shape (count, 2N), each one (δq, δp) raveled, N components of q.
+    - `h`: the length of the step.
+    """
+
+    vectors: Array
+    h: Scalar
+
+
+class Deviations(Reduction):
+    """Base of the reductions that follow deviation vectors along a trajectory.
+
+    Before each step `vectors` tells which ones there are; the step's derivative is applied to them,
+    the disturbance included, and `update` is given what they have become as a `Pushed` in place of
+    a value. The derivative is that of the discrete map: exact, by autodiff, through implicit
+    solves as well.
+    """
+
+    if TYPE_CHECKING:  # what a reduction of a function has; here it is the state itself
+        function: ClassVar[Any]
+    else:
+
+        @property
+        def function(self):
+            return _state
+
+    @abc.abstractmethod
+    def vectors(self, memory: Any) -> Array:
+        """The vectors that the next step is to push, shape (count, 2N)."""
+
+    @abc.abstractmethod
+    def update(self, memory: Any, k: Array, t: Scalar, value: Any) -> Any:
+        """Memory after step k, which ended at time t; `value` is a `Pushed`."""
+
+    def pull(self, memory, cotangent, k, t, value):
+        raise NotImplementedError("deviation vectors are differentiated through the steps")
+
+
+def _state(t0, t1, q0, p0, q1, p1, args):
+    return jnp.concatenate([q1.ravel(), p1.ravel()])
+
+
+class TangentMap(Deviations):
+    r"""Observable: the derivative of the whole run, ∂(q_K, p_K)/∂(q_0, p_0), shape (2N, 2N).
+
+    The product M_K ⋯ M_1 of the steps' derivatives, in coordinates (q, p) raveled. Without a
+    dissipative force it is symplectic, MᵀJM = J. Over a closed orbit it is the monodromy matrix,
+    whose eigenvalues are the Floquet multipliers. On chaotic orbits its columns fall together once
+    e^(λt) nears 1e16, and it overflows in the end: take `LyapunovSpectrum` there.
+    """
+
+    def start(self, value):
+        return jnp.eye(value.shape[0], dtype=value.dtype)
+
+    def vectors(self, memory):
+        return memory
+
+    def update(self, memory, k, t, value):
+        return value.vectors
+
+    def finish(self, memory):
+        return memory.T
+
+
+class LyapunovSpectrum(Deviations):
+    r"""Observable: the Lyapunov exponents λ_1 ≥ λ_2 ≥ … [1/time], shape (count,).
+
+        λ_i = (1/t) Σ_k ln R_ii^(k),        M_k Q_{k−1} = Q_k R^(k)
+
+    An orthonormal frame Q is carried by the derivative of each step and made orthonormal again by
+    the Gram–Schmidt process. On a Hamiltonian system they come in pairs ±λ, zero for each integral
+    in involution; a linear damping −εp gives pairs that sum to −ε. An exponent that is zero is seen
+    as about (ln t)/t.
+
+    **Arguments**
+
+    - `count`: how many; None: all 2N of them. The work grows with it.
+    - `seed`: of the first frame, which is random.
+    - `scale`: (of q, of p): units in which deviations are measured, numbers or arrays like q. In
+      the limit they do not matter.
+
+    **Source** Benettin, Galgani, Giorgilli & Strelcyn 1980, *Meccanica* 15, 9 and 21; Shimada &
+    Nagashima 1979.
+    """
+
+    count: int | None = eqx.field(static=True, default=None)
+    seed: int = eqx.field(static=True, default=0)
+    scale: Any = (1.0, 1.0)
+
+    def __check_init__(self):
+        _check_count(self, self.count, 1)
+        _check_frame(self)
+
+    def start(self, value):
+        frame = _first_frame(self, value, self.count)
+        return frame, jnp.zeros(frame.shape[0], value.dtype), jnp.zeros((), value.dtype)
+
+    def vectors(self, memory):
+        return _in_units(self, memory[0])
+
+    def update(self, memory, k, t, value):
+        _, sums, time = memory
+        frame, R = _gram_schmidt(_measured(self, value.vectors))
+        return frame, sums + jnp.stack([jnp.log(row[i]) for i, row in enumerate(R)]), time + value.h
+
+    def finish(self, memory):
+        _, sums, time = memory
+        return sums / time
+
+
+class MEGNO(Deviations):
+    r"""Observable: the mean exponential growth of nearby orbits ⟨Y⟩, a number.
+
+        Y(t) = (2/t) ∫ (|ẇ|/|w|) s ds,        ⟨Y⟩(t) = (1/t) ∫ Y ds
+
+    of one deviation vector w. It tends to 2 on quasi-periodic orbits (to 0 next to a stable
+    periodic one), and to λt/2 on chaotic ones, λ the largest Lyapunov exponent. A dissipative force
+    that makes w shrink makes it negative. The integrals are sums over the steps.
+
+    **Arguments** `seed` of the first vector, which is random; `scale` as for `LyapunovSpectrum`.
+
+    **Source** Cincotta & Simó 2000, *A&AS* 147, 205; for maps Cincotta, Giordano & Simó 2003,
+    *Physica D* 182, 151.
+    """
+
+    seed: int = eqx.field(static=True, default=0)
+    scale: Any = (1.0, 1.0)
+
+    def __check_init__(self):
+        _check_frame(self)
+
+    def start(self, value):
+        zero = jnp.zeros((), value.dtype)
+        return _first_frame(self, value, 1), zero, zero, zero
+
+    def vectors(self, memory):
+        return _in_units(self, memory[0])
+
+    def update(self, memory, k, t, value):
+        _, weighted, area, time = memory
+        vector = _measured(self, value.vectors)
+        size = jnp.sqrt(jnp.sum(vector**2))
+        before = jnp.where(time == 0, 0, weighted / jnp.where(time == 0, 1, time))
+        weighted = weighted + 2 * jnp.log(size) * (time + value.h / 2)
+        time = time + value.h
+        return vector / size, weighted, area + value.h * (before + weighted / time) / 2, time
+
+    def finish(self, memory):
+        _, _, area, time = memory
+        return area / time
+
+
+class GALI(Deviations):
+    r"""Observable: the generalised alignment indices GALI_2, …, GALI_k, shape (k − 1,).
+
+        GALI_j = |ŵ_1 ∧ … ∧ ŵ_j|
+
+    the volume spanned by the first j of k deviation vectors, each of length one. On a chaotic orbit
+    GALI_j falls as exp(−Σ_{i≤j} (λ_1 − λ_i) t); on a torus of n dimensions it stays near a constant
+    for j ≤ n and falls by powers of t above. The vectors are followed as an orthonormal frame and a
+    triangular matrix, so that no digits are lost, down to the smallest number (1e-308), below which
+    stands 0; with ``log10=True`` the logarithm is told, which has no such end.
+
+    **Arguments** `k`: vectors, 2 ≤ k ≤ 2N; `seed` of the first ones, which are random and at right
+    angles; `scale` as for `LyapunovSpectrum`.
+
+    **Source** Skokos, Bountis & Antonopoulos 2007, *Physica D* 231, 30. The triangular matrix: our
+    own.
+    """
+
+    k: int = eqx.field(static=True, default=2)
+    seed: int = eqx.field(static=True, default=0)
+    scale: Any = (1.0, 1.0)
+    log10: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        _check_count(self, self.k, 2)
+        _check_frame(self)
+
+    def start(self, value):
+        frame = _first_frame(self, value, self.k)
+        return frame, jnp.eye(self.k, dtype=value.dtype), jnp.zeros(self.k, value.dtype)
+
+    def vectors(self, memory):
+        return _in_units(self, memory[0])
+
+    def update(self, memory, k, t, value):
+        # The unit vectors are Q·(columns of C). Their part off the first j − 1 directions is
+        # C_jj = exp(logs_j), which soon is nothing beside the others but must not be lost.
+        _, columns, logs = memory
+        frame, R = _gram_schmidt(_measured(self, value.vectors))
+        R = jnp.stack([jnp.stack(row) for row in R])
+        columns = jnp.sum(R[:, :, None] * columns[None, :, :], axis=1)
+        sizes = jnp.sqrt(jnp.sum(columns**2, axis=0))
+        on_diagonal = jnp.stack([R[i, i] for i in range(self.k)])
+        return frame, columns / sizes[None, :], logs + jnp.log(on_diagonal) - jnp.log(sizes)
+
+    def finish(self, memory):
+        logs = jnp.cumsum(memory[2])[1:]
+        return logs / math.log(10) if self.log10 else jnp.exp(logs)
+
+
+class SALI(Deviations):
+    r"""Observable: the smaller alignment index, a number.
+
+        SALI = min(|ŵ_1 + ŵ_2|, |ŵ_1 − ŵ_2|)
+
+    of two deviation vectors: from √2 it falls as exp(−(λ_1 − λ_2) t) on a chaotic orbit, and stays
+    near a constant on a regular one of two or more degrees of freedom (on a closed curve it falls
+    as 1/t², a map's as well). It is followed as `GALI` is, down to 1e-308.
+
+    **Arguments** as for `GALI`.
+
+    **Source** Skokos 2001, *J. Phys. A* 34, 10029.
+    """
+
+    seed: int = eqx.field(static=True, default=0)
+    scale: Any = (1.0, 1.0)
+    log10: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        _check_frame(self)
+
+    @property
+    def _pair(self) -> GALI:
+        return GALI(2, self.seed, self.scale, log10=True)
+
+    def start(self, value):
+        return self._pair.start(value)
+
+    def vectors(self, memory):
+        return self._pair.vectors(memory)
+
+    def update(self, memory, k, t, value):
+        return self._pair.update(memory, k, t, value)
+
+    def finish(self, memory):
+        # |ŵ_1 ∧ ŵ_2| = sin θ, and |ŵ_1 − ŵ_2| = 2 sin(θ/2) = sin θ √(2/(1 + |cos θ|)).
+        log_sine = self._pair.finish(memory)[0]
+        cosine = jnp.sqrt(jnp.maximum(1 - jnp.exp(2 * math.log(10) * log_sine), 0))
+        found = log_sine + jnp.log10(2 / (1 + cosine)) / 2
+        return found if self.log10 else jnp.exp(math.log(10) * found)
+
+
+def _gram_schmidt(vectors: Array) -> tuple[Array, list[list[Array]]]:
+    """(Q, R) with ``vectors[j] = Σ_i R[i][j] Q[i]``, Q orthonormal, R upper triangular, R_jj > 0.
+
+    By the modified process. The vectors come from an orthonormal frame by one step and are far from
+    dependent.
+    """
+    count = vectors.shape[0]
+    zero = jnp.zeros((), vectors.dtype)
+    R = [[zero] * count for _ in range(count)]
+    frame: list[Array] = []
+    for j in range(count):
+        v = vectors[j]
+        for i, u in enumerate(frame):
+            R[i][j] = jnp.sum(u * v)
+            v = v - R[i][j] * u
+        R[j][j] = jnp.sqrt(jnp.sum(v**2))
+        frame.append(v / R[j][j])
+    return jnp.stack(frame), R
+
+
+def _first_frame(of: Any, value: Array, count: int | None) -> Array:
+    """Orthonormal vectors, the same for every trajectory, shape (count, 2N)."""
+    size = value.shape[0]
+    if count is not None and count > size:
+        raise ValueError(
+            f"{type(of).__name__} is to follow {count} deviation vectors, but a state of {size} "
+            f"components has only {size} directions: ask for at most {size}."
+        )
+    random = np.random.default_rng(of.seed).standard_normal((size, size))
+    frame = np.linalg.qr(random)[0][: size if count is None else count]
+    return jnp.asarray(frame, value.dtype)
+
+
+def _units(of: Any, like: Array) -> Array:
+    """The unit of each component of (q, p)."""
+    size = like.shape[-1] // 2
+    parts = []
+    for which, unit in zip("qp", of.scale, strict=True):
+        unit = jnp.asarray(unit, like.dtype).ravel()
+        if unit.size not in (1, size):
+            raise ValueError(
+                f"the scale of {which} in {type(of).__name__} must be a number or an array of "
+                f"{size} numbers, like {which}; got {unit.size}."
+            )
+        parts.append(jnp.broadcast_to(unit, (size,)))
+    return jnp.concatenate(parts)
+
+
+def _has_units(of: Any) -> bool:
+    return not all(isinstance(unit, float) and unit == 1.0 for unit in of.scale)
+
+
+def _in_units(of: Any, vectors: Array) -> Array:
+    """Measured vectors in the units of the state."""
+    return vectors * _units(of, vectors)[None, :] if _has_units(of) else vectors
+
+
+def _measured(of: Any, vectors: Array) -> Array:
+    """Vectors of the state as they are measured."""
+    return vectors / _units(of, vectors)[None, :] if _has_units(of) else vectors
+
+
+def _check_count(of: Any, count: Any, least: int) -> None:
+    if count is None and least == 1:
+        return
+    if isinstance(count, bool) or not isinstance(count, int) or count < least:
+        raise ValueError(
+            f"{type(of).__name__} needs a whole number of at least {least} deviation "
+            f"vector{'s' if least > 1 else ''}, got {count!r}."
+        )
+
+
+def _check_frame(of: Any) -> None:
+    seed = of.seed
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ValueError(
+            f"seed of {type(of).__name__} must be a whole number from 0 on, got {seed!r}."
+        )
+    if not isinstance(of.scale, tuple | list) or len(of.scale) != 2:
+        raise TypeError(
+            f"scale of {type(of).__name__} must be a pair (unit of q, unit of p), got {of.scale!r}."
+        )

@@ -1,0 +1,563 @@
+"""Deviation vectors: the tangent map, Lyapunov spectra, MEGNO, SALI and GALI."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ARGS, SYSTEMS, central_difference, flow, state, symplectic_defect
+from scipy.integrate import solve_ivp
+
+import dvi_jax as dvi
+from dvi_jax import systems
+
+HENON = systems.henon_heiles()
+REGULAR = (HENON.q0, HENON.p0)
+CHAOTIC = ([0.0, -0.25], [0.42, 0.0])
+"""Skokos, Bountis & Antonopoulos 2007: a chaotic orbit of energy 0.125, λ_1 = 0.047."""
+
+
+def run(system, q0, p0, observe, **options):
+    settings = {"h": 0.05, "method": dvi.Strang(), "save": dvi.Save(final=True)}
+    return dvi.integrate(system, q0, p0, observe=observe, **(settings | options))
+
+
+@functools.cache
+def observed(start, num_steps, every=None):
+    """All indicators along an orbit of Hénon and Heiles."""
+    kinds = {
+        "lyapunov": dvi.LyapunovSpectrum(),
+        "megno": dvi.MEGNO(),
+        "sali": dvi.SALI(log10=True),
+        "gali": dvi.GALI(4, log10=True),
+    }
+    if every is not None:
+        kinds = {name: dvi.Running(kind) for name, kind in kinds.items()}
+    save = dvi.Save(final=True) if every is None else dvi.Save(every=every)
+    of = {"regular": REGULAR, "chaotic": CHAOTIC}[start]
+    found = run(HENON.system, *of, kinds, num_steps=num_steps, save=save).observed
+    return {name: np.asarray(value) for name, value in found.items()}
+
+
+# The tangent map
+
+KINDS = {
+    "TypeII": dvi.TypeII(),
+    "Adjoint": dvi.Adjoint(),
+    "Strang": dvi.Strang(),
+    "Yoshida4": dvi.Yoshida(4),
+    "GaussLegendre2": dvi.GaussLegendre(2),
+}
+
+
+def tangent(name, method, epsilon, num_steps=5, **options):
+    system, q, p = SYSTEMS[name]
+    return np.asarray(
+        run(
+            system, q, p, dvi.TangentMap(), h=0.1, num_steps=num_steps, epsilon=epsilon,
+            args=ARGS, method=method, **options,
+        ).observed
+    )  # fmt: skip
+
+
+def cases(quick, names):
+    """Methods on systems, all but the quick ones marked slow."""
+    return [
+        pytest.param(n, m, marks=[] if (n, m) in quick else [pytest.mark.slow])
+        for n in names
+        for m in KINDS
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    cases([("double_pendulum", "TypeII"), ("kepler", "Strang")], ["kepler", "double_pendulum"]),
+)
+def test_tangent_map_is_the_derivative_of_the_run(name, method):
+    """Against differences of runs, with a force; without the force it is another one."""
+    of = flow(SYSTEMS[name][0], KINDS[method], 0.1, num_steps=5, epsilon=0.3)
+    z = state(name)
+    by_differences = np.stack(
+        [central_difference(of, z, e) for e in np.eye(len(z))], axis=1
+    )  # step 1e-5, extrapolated: 1e-10 or so
+    found = tangent(name, KINDS[method], 0.3)
+    assert np.max(np.abs(found - by_differences)) < 1e-9
+    assert np.max(np.abs(found - tangent(name, KINDS[method], 0.0))) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    cases(
+        [("double_pendulum", "TypeII"), ("non_separable", "Strang")],
+        ["double_pendulum", "non_separable"],
+    ),
+)
+def test_tangent_map_is_symplectic(name, method):
+    assert symplectic_defect(tangent(name, KINDS[method], 0.0, num_steps=1)) < 1e-13
+    assert symplectic_defect(tangent(name, KINDS[method], 0.0, num_steps=20)) < 1e-12
+    assert symplectic_defect(tangent(name, KINDS[method], 0.3, num_steps=1)) > 1e-3  # damped
+
+
+def test_tangent_map_of_a_perturbation_is_symplectic():
+    """A disturbance that derives from a Hamiltonian; Runge–Kutta 4 as the control."""
+    problem = systems.perturbed_pendulum()
+    for method, fine in ((dvi.TypeII(), True), (dvi.RungeKutta4(), False)):
+        M = run(
+            problem.system, problem.q0, problem.p0, dvi.TangentMap(), h=0.3, num_steps=1,
+            epsilon=0.3, method=method,
+        ).observed  # fmt: skip
+        defect = symplectic_defect(np.asarray(M))
+        assert defect < 1e-13 if fine else defect > 1e-7
+
+
+def test_tangent_map_on_other_lattices_and_arithmetic():
+    plain = tangent("non_separable", dvi.Strang(), 0.3)
+    by_sum = tangent("non_separable", dvi.Strang(), 0.3, arithmetic=dvi.Compensated())
+    assert np.max(np.abs(plain - by_sum)) < 1e-13
+    system, q, p = SYSTEMS["non_separable"]
+    given = dvi.integrate(
+        system, q, p, lattice=dvi.Given(np.arange(6) * 0.1), epsilon=0.3, args=ARGS,
+        method=dvi.Strang(), observe=dvi.TangentMap(),
+    ).observed  # fmt: skip
+    assert np.max(np.abs(plain - given)) < 1e-13
+
+
+def test_bodies_in_space():
+    """A state of shape (3, 2): the order of the components is that of ravel."""
+    eight = systems.figure_eight()
+    M = run(eight.system, eight.q0, eight.p0, dvi.TangentMap(), h=0.01, num_steps=10,
+            args=eight.args).observed  # fmt: skip
+    assert M.shape == (12, 12)
+    assert symplectic_defect(np.asarray(M)) < 1e-13
+    # All bodies moved alike stay so: a translation is carried to itself.
+    shift = np.concatenate([np.tile([1.0, 0.0], 3), np.zeros(6)])
+    assert np.max(np.abs(M @ shift - shift)) < 1e-13
+
+
+# Lyapunov exponents
+
+
+def linear(t0, t1, q0, p1, args):
+    return jnp.sum(p1**2) / 2 + jnp.sum(jnp.array([1.0, 2.3]) * q0**2) / 2
+
+
+def damping(t0, t1, q0, p1, args):
+    return -p1
+
+
+def test_lyapunov_exponents_of_a_damped_linear_system():
+    """Those of its map: logarithms of the eigenvalues' sizes; their sum is that of its volume."""
+    system = dvi.System(linear, force=damping)
+    options = {"h": 0.1, "epsilon": 0.2, "num_steps": 3000}
+    found = run(system, [1.0, 0.3], [0.0, 0.2], dvi.LyapunovSpectrum(), **options).observed
+    M = run(
+        system, [1.0, 0.3], [0.0, 0.2], dvi.TangentMap(), **(options | {"num_steps": 1})
+    ).observed
+    exact = np.sort(np.log(np.abs(np.linalg.eigvals(M))) / 0.1)[::-1]
+    assert np.max(np.abs(found - exact)) < 2e-3  # O(1/t), t = 300
+    assert abs(np.sum(found) - np.log(np.linalg.det(M)) / 0.1) < 1e-13
+    assert abs(np.sum(exact) + 2 * 0.2) < 1e-3  # −ε for each degree of freedom, and O(h²)
+
+
+def by_scipy(start, first, t):
+    """ln |w(t)| and ⟨Y⟩(t) of Hénon and Heiles' flow, variational equations by hand."""
+
+    def field(t, z):
+        x, y, px, py, dx, dy, dpx, dpy, _, _ = z
+        size = dx * dx + dy * dy + dpx * dpx + dpy * dpy
+        fx, fy = -(1 + 2 * y) * dx - 2 * x * dy, -2 * x * dx - (1 - 2 * y) * dy
+        growth = (dx * dpx + dy * dpy + dpx * fx + dpy * fy) / size
+        Y = 2 * z[8] / t if t > 0 else 0.0
+        return [px, py, -x - 2 * x * y, -y - x * x + y * y, dpx, dpy, fx, fy, growth * t, Y]
+
+    z = np.concatenate([*start, first, [0.0, 0.0]])
+    end = solve_ivp(field, (0, t), z, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    return np.log(np.linalg.norm(end[4:8])), end[9] / t
+
+
+@pytest.mark.parametrize("start", [REGULAR, CHAOTIC], ids=["regular", "chaotic"])
+def test_growth_and_megno_are_those_of_the_variational_equations(start):
+    """SciPy on equations by hand, the same first vector: the same logarithm and ⟨Y⟩."""
+    first = np.asarray(dvi.MEGNO().start(jnp.zeros(4))[0][0])
+    errors = []
+    for num_steps in (500, 1000):
+        found = run(
+            HENON.system, *start, (dvi.LyapunovSpectrum(1), dvi.MEGNO()), h=50 / num_steps,
+            num_steps=num_steps, method=dvi.GaussLegendre(3),
+        ).observed  # fmt: skip
+        growth, megno = by_scipy(start, first, 50.0)
+        assert abs(found[0][0] * 50 - growth) < 1e-8
+        errors.append(abs(found[1] - megno))
+    assert errors[1] < 1e-3
+    assert 1.7 < np.log2(errors[0] / errors[1]) < 2.3  # its integrals are midpoint sums
+
+
+def test_the_first_exponents_do_not_depend_on_how_many_are_asked_for():
+    few = run(HENON.system, *CHAOTIC, dvi.LyapunovSpectrum(2), num_steps=2000).observed
+    assert np.max(np.abs(few - observed("chaotic", 2000)["lyapunov"][:2])) < 1e-12
+
+
+@functools.cache
+def chaotic_sea(num_steps, orbits=16):
+    """Spectra of orbits in one chaotic sea, on the energy of `CHAOTIC`."""
+    energy = 0.42**2 / 2 + 0.25**2 / 2 + 0.25**3 / 3
+    y = np.linspace(-0.265, -0.2, orbits)
+    px = np.sqrt(2 * energy - y**2 + 2 * y**3 / 3)
+    q, p = np.stack([0 * y, y], 1), np.stack([px, 0 * y], 1)
+    spectrum = jax.vmap(
+        lambda q, p: run(HENON.system, q, p, dvi.LyapunovSpectrum(), num_steps=num_steps).observed
+    )
+    return np.asarray(spectrum(q, p))
+
+
+def test_lyapunov_spectrum_of_henon_and_heiles():
+    """Pairs ±λ, two zeros; the mean over the sea is what is published for the orbit."""
+    spectra = chaotic_sea(400_000)  # t = 20 000
+    mean = spectra.mean(0)
+    assert np.max(np.abs(mean - [0.047, 0, 0, -0.047])) < 0.004
+    assert np.max(np.abs(spectra + spectra[:, ::-1])) < 2e-3
+    regular = observed("regular", 400_000)["lyapunov"]
+    assert np.max(np.abs(regular)) < 6e-4  # ln t / t
+
+
+@pytest.mark.slow
+def test_lyapunov_spectrum_at_the_published_start():
+    """t = 10⁶; the spread of ten such runs is 0.002."""
+    found = run(HENON.system, *CHAOTIC, dvi.LyapunovSpectrum(), num_steps=20_000_000).observed
+    assert np.max(np.abs(found - jnp.array([0.047, 0, 0, -0.047]))) < 0.003
+
+
+# MEGNO
+
+
+def test_megno_tells_order_from_chaos():
+    regular, chaotic = (observed(s, 400_000, every=40_000) for s in ("regular", "chaotic"))
+    away = np.abs(regular["megno"] - 2)
+    assert np.all(np.diff(away) < 0)
+    assert away[-1] < 0.01
+    t = 0.05 * 40_000 * np.arange(1, 11)
+    slope = np.polyfit(t, chaotic["megno"], 1)[0]
+    assert 0.03 / 2 < slope < 0.07 / 2
+    assert np.all(np.diff(chaotic["megno"]) > 0)
+
+
+def drive(t0, t1, q0, p1, args):
+    """A force that depends on time alone."""
+    return jnp.cos(args["frequency"] * t0) * jnp.ones_like(q0)
+
+
+def pendulum(t0, t1, q0, p1, args):
+    return jnp.sum(p1**2) / 2 - jnp.sum(jnp.cos(q0))
+
+
+def test_megno_with_a_disturbing_force():
+    """A pendulum near its separatrix, driven: torus at small ε, chaos at larger ones."""
+    system, args = dvi.System(pendulum, force=drive), {"frequency": 1.1}
+    of = jax.vmap(
+        lambda epsilon, p: (
+            run(
+                system,
+                jnp.zeros(1),
+                p[None],
+                (dvi.MEGNO(), dvi.LyapunovSpectrum()),
+                epsilon=epsilon,
+                args=args,
+                num_steps=100_000,
+            ).observed
+        )
+    )
+    megno, spectrum = of(jnp.array([0.0, 0.01, 0.5]), jnp.array([1.0, 1.0, 1.9]))
+    assert np.max(np.abs(megno[:2] - 2)) < 0.03
+    assert megno[2] > 50
+    assert spectrum[2, 0] > 0.05
+    assert abs(spectrum[2].sum()) < 1e-12  # a force without p keeps the volume
+
+
+def test_megno_of_three_bodies_is_that_of_rebound():
+    """A planet beside Jupiter: 2 where it is stable, for both, and large where it is not."""
+    rebound = pytest.importorskip("rebound")
+
+    def of(a):
+        sim = rebound.Simulation()
+        sim.add(m=1.0)
+        sim.add(m=1e-3, a=1.0, e=0.05)
+        sim.add(m=1e-3, a=a, e=0.05, f=2.0)
+        sim.move_to_com()
+        q, v = (np.array([[*getattr(b, x)] for b in sim.particles]) for x in ("xyz", "vxyz"))
+        m = np.array([b.m for b in sim.particles])
+        sim.integrator, sim.dt = "whfast", 0.05
+        sim.init_megno(seed=1)
+        sim.integrate(5000.0)
+        problem = systems.n_body(m, q, m[:, None] * v)
+        ours = run(
+            problem.system, q, m[:, None] * v, dvi.MEGNO(scale=(1.0, m[:, None] * np.ones(3))),
+            h=0.05, num_steps=100_000, args=problem.args, method=dvi.Yoshida(4),
+        ).observed  # fmt: skip
+        return sim.megno(), float(ours)
+
+    theirs, ours = of(1.9)
+    assert abs(theirs - 2) < 0.1
+    assert abs(ours - 2) < 0.1
+    theirs, ours = of(1.3)
+    assert min(theirs, ours) > 20
+
+
+# GALI and SALI
+
+
+def brute_force(start, num_steps):
+    """GALI_2, 3, 4 and SALI from the product of all tangent maps, by singular values."""
+    M = np.asarray(run(HENON.system, *start, dvi.TangentMap(), num_steps=num_steps).observed)
+    w = np.asarray(dvi.GALI(4).start(jnp.zeros(4))[0]) @ M.T
+    w /= np.linalg.norm(w, axis=1, keepdims=True)
+    volumes = [np.prod(np.linalg.svd(w[:k], compute_uv=False)) for k in (2, 3, 4)]
+    return volumes, min(np.linalg.norm(w[0] + w[1]), np.linalg.norm(w[0] - w[1]))
+
+
+@pytest.mark.parametrize("start", ["regular", "chaotic"])
+def test_gali_and_sali_are_volumes_of_unit_vectors(start):
+    for num_steps in (1, 100, 1000):
+        found = observed(start, num_steps)
+        volumes, sali = brute_force({"regular": REGULAR, "chaotic": CHAOTIC}[start], num_steps)
+        assert np.max(np.abs(10 ** found["gali"] / volumes - 1)) < 1e-9
+        assert abs(10 ** found["sali"] / sali - 1) < 1e-9
+    plain = run(HENON.system, *REGULAR, (dvi.GALI(2), dvi.SALI()), num_steps=100).observed
+    assert abs(np.log10(plain[0][0]) - observed("regular", 100)["gali"][0]) < 1e-12
+    assert abs(np.log10(plain[1]) - observed("regular", 100)["sali"]) < 1e-12
+
+
+def test_gali_of_chaos_falls_as_its_exponents_say():
+    """ln GALI_k(t) = −Σ (λ_1 − λ_i) t, far beyond round-off."""
+    num_steps = 100_000
+    found, t = observed("chaotic", num_steps), 0.05 * num_steps
+    spectrum = found["lyapunov"]
+    for k in (2, 3, 4):
+        law = -np.sum(spectrum[0] - spectrum[:k]) * t / np.log(10)
+        assert law < -90
+        assert abs(found["gali"][k - 2] - law) < 0.02 * abs(law) + 2
+    assert abs(found["sali"] - found["gali"][0]) < 1e-9  # of a small angle
+
+
+def test_gali_of_a_torus_of_two_dimensions_falls_by_powers():
+    """GALI_2 stays, GALI_3 ~ t⁻², GALI_4 ~ t⁻⁴."""
+    found = observed("regular", 400_000, every=40_000)["gali"]
+    log_t = np.log10(np.arange(1, 11))
+    slopes = np.polyfit(log_t, found, 1)[0]
+    assert np.max(np.abs(slopes - [0, -2, -4])) < 0.25
+
+
+def test_what_is_too_small_for_a_number_is_zero_and_its_logarithm_is_told():
+    found = run(
+        HENON.system, *CHAOTIC, (dvi.GALI(4), dvi.GALI(4, log10=True)), num_steps=200_000
+    ).observed
+    assert found[0][-1] == 0
+    assert found[1][-1] < -400
+
+
+# What they have in common
+
+
+def test_units_do_not_matter_in_the_limit():
+    scaled = run(
+        HENON.system, *REGULAR, dvi.MEGNO(scale=(10.0, np.array([1.0, 3.0]))), num_steps=400_000
+    ).observed
+    plain = observed("regular", 400_000)["megno"]
+    assert abs(scaled - plain) > 1e-6
+    assert abs(scaled - 2) < 0.01
+
+
+def test_running_values_are_those_of_shorter_runs():
+    along = observed("chaotic", 2000, every=500)
+    for i, n in enumerate((500, 1000, 1500, 2000)):
+        for name, value in observed("chaotic", n).items():
+            assert np.max(np.abs(along[name][i] - value)) < 1e-7, name
+
+
+def test_running_values_beside_others():
+    energy = HENON.observables["energy"]
+    mean_energy = dvi.Mean(energy)
+    sol = run(
+        HENON.system, *REGULAR,
+        [dvi.Running(mean_energy), energy, mean_energy, dvi.Running(dvi.MaxDrift(energy))],
+        num_steps=1000, save=dvi.Save(every=100),
+    )  # fmt: skip
+    mean, alone, last, drift = sol.observed
+    assert mean.shape == alone.shape == drift.shape == (10,)
+    assert mean[-1] == last
+    assert mean[0] != last
+    assert np.all(np.diff(drift) >= 0)
+    assert np.array_equal(alone, run(
+        HENON.system, *REGULAR, energy, num_steps=1000, save=dvi.Save(every=100)
+    ).observed)  # fmt: skip
+
+
+def test_running_values_with_progress_and_in_few_steps():
+    """Cut into pieces, or saved once in a long block: the same numbers."""
+    options = {"num_steps": 600, "save": dvi.Save(every=300)}
+    whole = run(HENON.system, *CHAOTIC, dvi.Running(dvi.MEGNO()), **options).observed
+    seen = []
+    pieces = run(
+        HENON.system, *CHAOTIC, dvi.Running(dvi.MEGNO()), **options,
+        progress=lambda done, of: seen.append(done),
+    ).observed  # fmt: skip
+    assert seen
+    assert np.max(np.abs(whole - pieces)) < 1e-12
+
+
+def test_batches_and_layouts():
+    q, p = (np.array([a, b]) for a, b in zip(REGULAR, CHAOTIC, strict=True))
+    kinds = (dvi.MEGNO(), dvi.LyapunovSpectrum(), dvi.GALI(3, log10=True))
+    found = {
+        form: jax.vmap(
+            lambda q, p, form=form: (
+                run(HENON.system, q, p, kinds, num_steps=500, layout=dvi.Layout(form)).observed
+            )
+        )(q, p)
+        for form in ("arrays", "components")
+    }
+    for i, start in enumerate((REGULAR, CHAOTIC)):
+        alone = run(HENON.system, *start, kinds, num_steps=500).observed
+        for form in found.values():
+            for a, b in zip(alone, form, strict=True):
+                assert np.max(np.abs(a - b[i])) < 1e-8
+
+
+def test_an_orbit_that_escapes_has_a_status_and_no_number():
+    q, p = (
+        np.array([[0.0, 0.1], [0.0, 1.5], [0.0, 0.1]]),
+        np.array([[0.3, 0.2], [0.0, 1.0]] * 2)[:3],
+    )
+    kinds = {"megno": dvi.MEGNO(), "gali": dvi.GALI(2), "along": dvi.Running(dvi.MEGNO())}
+
+    def of(q, p):
+        return run(
+            HENON.system, q, p, kinds, num_steps=2000, save=dvi.Save(every=200), throw=False
+        )  # fmt: skip
+
+    sol = jax.vmap(of)(q, p)
+    assert list(sol.status) == ["successful", "not_finite", "successful"]
+    found = {name: np.asarray(value) for name, value in sol.observed.items()}
+    for value in found.values():
+        assert np.isnan(value[1]).any()
+        assert np.isfinite(value[[0, 2]]).all()
+    assert np.array_equal(found["megno"][0], found["megno"][2])
+    # With a Stop the value is that of the steps before, and the status says why it ends.
+    stopped = run(
+        HENON.system, q[1], p[1], kinds, num_steps=2000, save=dvi.Save(every=10), throw=False,
+        stop=dvi.Stop(lambda t, q, p, args: jnp.sum(q**2) - 9),
+    )  # fmt: skip
+    assert stopped.status == "stopped"
+    assert np.isfinite(stopped.observed["megno"])
+    assert np.isnan(stopped.observed["along"][-1])
+
+
+def test_a_failure_in_the_very_last_step_leaves_no_number():
+    """The step of a Kepler orbit into the centre is the last one."""
+
+    def bad(t0, t1, q0, p1, args):
+        return jnp.sum(p1**2) / 2 + jnp.sum(jnp.where(t0 > 0.85, jnp.nan, 0.5) * q0**2)
+
+    sol = run(
+        dvi.System(bad), [1.0], [0.0], (dvi.MEGNO(), dvi.LyapunovSpectrum()), h=0.1, num_steps=10,
+        method=dvi.TypeII(), throw=False,
+    )  # fmt: skip
+    assert sol.status == "not_finite"
+    assert int(sol.stats["failed_step"]) == 9
+    assert np.isnan(sol.observed[0])
+    assert np.isnan(sol.observed[1]).all()
+
+
+def test_gradients_of_an_indicator():
+    """d⟨Y⟩/dε by reverse and forward mode against differences."""
+    system = dvi.System(pendulum, force=drive)
+
+    def megno(epsilon, adjoint=dvi.Reversible()):
+        return run(
+            system, [0.3], [0.5], dvi.MEGNO(), epsilon=epsilon, args={"frequency": 1.1},
+            num_steps=200, adjoint=adjoint,
+        ).observed  # fmt: skip
+
+    by_differences = central_difference(megno, 0.1, 1.0)
+    for adjoint in (dvi.Reversible(), dvi.Direct()):
+        assert abs(jax.grad(megno)(0.1, adjoint) / by_differences - 1) < 1e-7
+    assert abs(jax.jvp(megno, (0.1,), (1.0,))[1] / by_differences - 1) < 1e-7
+    assert abs(by_differences) > 1e-3
+
+
+def test_memory_does_not_grow_with_the_steps():
+    kinds = (dvi.MEGNO(), dvi.LyapunovSpectrum(), dvi.GALI(4))
+
+    def size(num_steps):
+        def of(q, p):
+            return run(HENON.system, q, p, kinds, num_steps=num_steps).observed
+
+        q, p = np.tile(REGULAR[0], (8, 1)), np.tile(REGULAR[1], (8, 1))
+        memory = jax.jit(jax.vmap(of)).lower(q, p).compile().memory_analysis()
+        return memory.temp_size_in_bytes + memory.output_size_in_bytes
+
+    assert size(128_000) < 1.1 * size(12_800) + 10_000
+    energy = HENON.observables["energy"]
+    along = jax.jit(
+        lambda q, p: run(HENON.system, q, p, energy, num_steps=128_000, save=dvi.Save()).observed
+    )
+    stored = along.lower(*map(jnp.asarray, REGULAR)).compile().memory_analysis()
+    assert stored.output_size_in_bytes > 1_000_000  # what is saved at every step does grow
+
+
+def test_indicators_under_sweep():
+    """Orbits and ε in a grid, with a status beside each number; the same as one by one."""
+    system = dvi.System(HENON.system.H_D, force=lambda t0, t1, q0, p1, args: -p1)
+    result = dvi.sweep(
+        system, HENON.q0, [HENON.p0[0], dvi.Axis("py", np.array([0.0, 0.2, 3.0]))],
+        epsilon=np.array([0.0, 1e-3]), h=0.05, num_steps=1000, method=dvi.Strang(),
+        observe={"megno": dvi.MEGNO(), "lyapunov": dvi.LyapunovSpectrum(2)},
+    ).to_xarray()  # fmt: skip
+    assert result.megno.dims == ("epsilon", "py")
+    assert result.lyapunov.shape == (2, 3, 2)
+    assert list(result.status.values[0]) == [0, 0, 2]  # the last one has energy to escape
+    assert np.isnan(result.megno.values[:, 2]).all()
+    alone = run(system, HENON.q0, [HENON.p0[0], 0.2], dvi.MEGNO(), epsilon=1e-3, num_steps=1000)
+    assert abs(result.megno.values[1, 1] - alone.observed) < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: dvi.LyapunovSpectrum(0), ValueError, "at least 1 deviation vector, got 0"),
+        (lambda: dvi.GALI(1), ValueError, "at least 2 deviation vectors, got 1"),
+        (lambda: dvi.GALI(2.0), ValueError, "got 2.0"),
+        (lambda: dvi.MEGNO(seed=-1), ValueError, "seed of MEGNO .* got -1"),
+        (lambda: dvi.SALI(scale=1.0), TypeError, "scale of SALI must be a pair"),
+        (lambda: dvi.Running(HENON.observables["energy"]), TypeError, "Running takes a reduction"),
+        (lambda: dvi.Running(dvi.Section(lambda t, q, p, a: q[0])), TypeError, "any time"),
+    ],
+)
+def test_indicators_that_cannot_be_meant(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("observe", "options", "message"),
+    [
+        (dvi.GALI(5), {}, "5 deviation vectors, .* only 4 directions: ask for at most 4"),
+        (dvi.MEGNO(scale=(np.ones(3), 1.0)), {}, "scale of q .* 2 numbers, like q; got 3"),
+        (
+            dvi.MEGNO(),
+            {"lattice": dvi.TimeTransformed(lambda t, q, p, a: 1.0)},
+            "MEGNO needs steps",
+        ),
+        (dvi.Running(dvi.MEGNO()), {"save": dvi.Save(ts=[0.1])}, r"Running .*=dvi.Save\(every=m\)"),
+        (dvi.MEGNO, {}, "holds the class MEGNO"),
+    ],
+)
+def test_runs_that_cannot_be_meant(observe, options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        run(HENON.system, *REGULAR, observe, num_steps=10, **options)
+
+
+def test_deviations_on_a_lattice_that_is_solved_for_are_refused():
+    with pytest.raises(ValueError, match="whose size does not depend on the state"):
+        run(HENON.system, *REGULAR, dvi.SALI(), num_steps=10, method=dvi.TypeII(),
+            lattice=dvi.Variational())  # fmt: skip
