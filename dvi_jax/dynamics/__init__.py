@@ -1,0 +1,15 @@
+"""Tools of a dynamicist: what trajectories say of the motion."""
+
+from .actions import (
+    Actions as Actions,
+    FundamentalFrequencies as FundamentalFrequencies,
+    actions as actions,
+    fundamental_frequencies as fundamental_frequencies,
+)
+from .frequencies import (
+    Frequencies as Frequencies,
+    FrequencyDiffusion as FrequencyDiffusion,
+    frequencies as frequencies,
+    frequency_diffusion as frequency_diffusion,
+)
+from .results import FREQUENCY_RESULTS as FREQUENCY_RESULTS, FrequencyError as FrequencyError
