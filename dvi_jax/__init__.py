@@ -23,6 +23,27 @@ from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._reversible import Reversible as Reversible
 from ._solution import Save as Save, Solution as Solution
 from ._system import System as System
+from .dynamics import (
+    FREQUENCY_RESULTS as FREQUENCY_RESULTS,
+    SECTION_RESULTS as SECTION_RESULTS,
+    Actions as Actions,
+    Frequencies as Frequencies,
+    FrequencyDiffusion as FrequencyDiffusion,
+    FrequencyError as FrequencyError,
+    FundamentalFrequencies as FundamentalFrequencies,
+    PoincareSection as PoincareSection,
+    Return as Return,
+    ReturnMap as ReturnMap,
+    SectionError as SectionError,
+    actions as actions,
+    bifurcation as bifurcation,
+    frequencies as frequencies,
+    frequency_diffusion as frequency_diffusion,
+    fundamental_frequencies as fundamental_frequencies,
+    poincare_section as poincare_section,
+    stroboscope as stroboscope,
+    tangent_map as tangent_map,
+)
 from .engine.cpu import configure_cpu as configure_cpu
 from .engine.devices import over_devices as over_devices
 from .engine.newton import Newton as Newton, RootSolver as RootSolver

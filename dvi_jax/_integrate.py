@@ -145,12 +145,12 @@ def integrate(
     if not (stop is None or isinstance(stop, Stop)):
         raise TypeError(f"stop must be a dvi.Stop(g), got {stop!r}.")
 
-    q0, p0 = _start_state(q0, p0)
+    q0, p0 = start_state(q0, p0)
     t0, h, num_steps = lattice.prepare(t0, h, num_steps)
-    t0 = _scalar("t0", t0, q0.dtype)
-    h = _scalar("h", h, q0.dtype, zero_allowed=False)
-    epsilon = _scalar("epsilon", epsilon, q0.dtype)
-    args = jax.tree.map(_parameter, args)
+    t0 = as_scalar("t0", t0, q0.dtype)
+    h = as_scalar("h", h, q0.dtype, zero_allowed=False)
+    epsilon = as_scalar("epsilon", epsilon, q0.dtype)
+    args = jax.tree.map(as_parameter, args)
     system.check_shapes(t0, q0, p0, epsilon, args)
     if isinstance(lattice, TimeTransformed):
         return run_extended(
@@ -356,7 +356,8 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     )
 
 
-def _start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
+def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
+    """A start as real arrays of one shape and precision, or an error that says what is wrong."""
     q, p = _real_array("q0", q0), _real_array("p0", p0)
     if q.shape != p.shape:
         raise ValueError(
@@ -398,7 +399,8 @@ def _real_array(name: str, value: Any) -> Array:
     return array if jnp.issubdtype(kind, jnp.floating) else array.astype(jnp.result_type(float))
 
 
-def _scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
+def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
+    """A number of this precision, or an error that names it."""
     known = None if is_traced(value) else _as_numpy(name, value)
     if isinstance(value, np.ndarray | np.generic):
         refuse_double_without_x64(name, value.dtype)
@@ -427,7 +429,7 @@ def _as_numpy(name: str, value: Any) -> np.ndarray:
         raise TypeError(f"{name} must be made of real numbers, got {value!r} ({error}).") from None
 
 
-def _parameter(leaf: Any) -> Any:
+def as_parameter(leaf: Any) -> Any:
     """A leaf of args: floats become arrays, so that a new value needs no new compilation."""
     if isinstance(leaf, np.ndarray | np.generic):
         refuse_double_without_x64("args", leaf.dtype)

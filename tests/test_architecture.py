@@ -107,6 +107,10 @@ ClusterError sweep_cost SweepCost
 fit Model Observations Bounds Prior LeastSquares SoftL1 Cauchy Likelihood
 SingleShooting MultipleShooting FitResult FitProgress FIT_RESULTS FitError
 Posterior Samples sample
+tangent_map poincare_section PoincareSection SECTION_RESULTS SectionError ReturnMap Return
+bifurcation stroboscope frequencies Frequencies FREQUENCY_RESULTS FrequencyError
+fundamental_frequencies FundamentalFrequencies frequency_diffusion FrequencyDiffusion
+actions Actions
 ForceLibrary identify Identification NetworkForce
 """
 

@@ -13,3 +13,13 @@ from .frequencies import (
     frequency_diffusion as frequency_diffusion,
 )
 from .results import FREQUENCY_RESULTS as FREQUENCY_RESULTS, FrequencyError as FrequencyError
+from .section_results import SECTION_RESULTS as SECTION_RESULTS, SectionError as SectionError
+from .sections import (
+    PoincareSection as PoincareSection,
+    Return as Return,
+    ReturnMap as ReturnMap,
+    bifurcation as bifurcation,
+    poincare_section as poincare_section,
+    stroboscope as stroboscope,
+)
+from .tangent import tangent_map as tangent_map

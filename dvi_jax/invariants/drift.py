@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._integrate import _parameter, _scalar, _start_state, integrate
+from .._integrate import as_parameter, as_scalar, integrate, start_state
 from .._results import status_name
 from .._solution import Save
 from .._system import System
@@ -255,7 +255,7 @@ def drift_order(
     _check_observable(invariant)
     epsilons = _positive("epsilons", epsilons)
     q0, p0 = _starts(q0, p0, batched)
-    h = float(_scalar("h", h, q0.dtype, zero_allowed=False))
+    h = float(as_scalar("h", h, q0.dtype, zero_allowed=False))
     settings = _settings(t0, args, method, newton)
     lanes = _sweep(system, invariant, q0, p0, epsilons, h, num_steps, settings)
     return _order(epsilons, lanes, _kept(lanes.good))
@@ -503,7 +503,7 @@ def _positive(name: str, values: Any, increasing: bool = False) -> np.ndarray:
 
 def _starts(q0: Any, p0: Any, batched: bool):
     """The starts as arrays (S, *state)."""
-    q0, p0 = _start_state(q0, p0)
+    q0, p0 = start_state(q0, p0)
     if not batched:
         return q0[None], p0[None]
     if q0.ndim == 0:
@@ -515,7 +515,7 @@ def _starts(q0: Any, p0: Any, batched: bool):
 
 
 def _settings(t0, args, method, newton) -> dict[str, Any]:
-    args = jax.tree.map(_parameter, args)
+    args = jax.tree.map(as_parameter, args)
     return {"t0": t0, "args": args, "method": method, "newton": newton}
 
 

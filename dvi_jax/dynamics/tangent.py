@@ -1,0 +1,47 @@
+"""The derivative of the flow of the map along an orbit."""
+
+from typing import Any
+
+from jaxtyping import Array, PyTree
+
+from .._arithmetic import Arithmetic, FloatingPoint
+from .._integrate import integrate
+from .._solution import Save
+from .._system import System
+from ..engine.newton import RootSolver
+from ..engine.picard import PicardThenNewton
+from ..lattices import Lattice, Uniform
+from ..methods import Method, TypeII
+from ..observe import TangentMap
+
+
+def tangent_map(
+    system: System,
+    q0: Any,
+    p0: Any,
+    *,
+    h: Any = None,
+    num_steps: int | None = 1,
+    t0: Any = 0.0,
+    epsilon: Any = 0.0,
+    args: PyTree = None,
+    method: Method = TypeII(),
+    lattice: Lattice = Uniform(),
+    newton: RootSolver = PicardThenNewton(),
+    arithmetic: Arithmetic = FloatingPoint(),
+    throw: bool = True,
+) -> Array:
+    """M = ∂(q_K, p_K)/∂(q_0, p_0) of K steps, shape (2N, 2N), by the chain rule along the orbit.
+
+    The disturbance is included; with ε = 0, or a disturbance that derives from a Hamiltonian,
+    MᵀJM = J. Rows and columns are (q, p) raveled. Over a period of a closed orbit its eigenvalues
+    are the Floquet multipliers.
+
+    **Arguments** as for `integrate`. **Raises** as `integrate` does; with ``throw=False`` M of a
+    run that failed is NaN.
+    """
+    return integrate(
+        system, q0, p0, h=h, num_steps=num_steps, t0=t0, epsilon=epsilon, args=args, method=method,
+        lattice=lattice, newton=newton, arithmetic=arithmetic, observe=TangentMap(),
+        save=Save(final=True), throw=throw,
+    ).observed  # fmt: skip
