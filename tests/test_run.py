@@ -398,3 +398,27 @@ def test_inputs_that_once_broke_through(folder):
         result = command("run", "bad.toml")
         assert result.exit_code == 2, text
         assert key in result.output
+
+
+def test_indicators_of_chaos(folder):
+    """Written as in Python; they follow no observable."""
+    base = 'system = "henon_heiles"\nh = 0.05\nsteps = 2000\nmethod = "Strang"\n[observables]\n'
+    (folder / "chaos.toml").write_text(
+        base + 'megno = "MEGNO()"\nl = "LyapunovSpectrum(2, seed=3)"\ng = "GALI(3, log10=True)"\n',
+        encoding="utf-8",
+    )
+    result = command("run", "chaos.toml", "--out", "chaos")
+    assert result.exit_code == 0, result.output
+    report = json.loads((folder / "chaos" / "report.json").read_text(encoding="utf-8"))
+    problem = systems.henon_heiles()
+    direct = dvi.integrate(
+        problem.system, problem.q0, problem.p0, h=0.05, num_steps=2000, method=dvi.Strang(),
+        observe=dvi.LyapunovSpectrum(2, seed=3), save=dvi.Save(final=True),
+    ).observed  # fmt: skip
+    assert np.allclose(report["results"]["l"]["value"], direct, rtol=0, atol=1e-12)
+    assert 0 < report["results"]["megno"]["value"] < 3
+    for text in ("MEGNO(energy)", "GALI(1)", "GALI(", "MEGNOO()"):
+        (folder / "bad.toml").write_text(base + f'x = "{text}"\n', encoding="utf-8")
+        result = command("run", "bad.toml", "--out", "bad")
+        assert result.exit_code == 2, text
+        assert "observables.x" in result.output

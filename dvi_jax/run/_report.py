@@ -46,7 +46,7 @@ def watched_table(watched: dict[str, Watched]) -> Table:
         s = w.summary()
         if w.reduction:
             relative = f"{s['relative']:.2e}" if "relative" in s and w.is_relative else ""
-            rows.append([name, w.reduction, "", _number(s["value"]), relative])
+            rows.append([name, w.reduction, "", _few_numbers(s["value"]), relative])
         else:
             rows.append(
                 [
@@ -69,6 +69,13 @@ def _number(value: Any) -> str:
     if value.ndim == 0:
         return f"{float(value):.8g}"
     return f"|…| = {np.linalg.norm(value):.3g}"
+
+
+def _few_numbers(value: Any) -> str:
+    value = np.asarray(value)
+    if value.ndim == 1 and value.size <= 4:
+        return ", ".join(f"{x:.3g}" for x in value)
+    return _number(value)
 
 
 def solar_contents(c: Comparison, always: dict[str, Watched], share: float) -> dict[str, Any]:

@@ -338,17 +338,16 @@ def observables_of(
 
 
 def _observable(key: str, text: str, known: dict[str, Callable], loader: Loader) -> Any:
-    reductions = {
-        name: thing
-        for name, thing in vars(dvi).items()
-        if isinstance(thing, type)
-        and issubclass(thing, dvi.Reduction)
-        and thing is not dvi.Reduction
-    }
+    indicators = _named(dvi.Deviations)
+    reductions = {n: r for n, r in _named(dvi.Reduction).items() if n not in indicators}
+    del reductions["Deviations"]
     inner, wrap = text.strip(), None
     if found := re.fullmatch(r"(\w+)\((.*)\)", inner):
+        if found[1] in indicators:
+            return _indicator(key, inner, indicators[found[1]])
         if found[1] not in reductions:
-            raise InputError(key, f"{text!r}", f"a reduction: {one_of(reductions, found[1])}")
+            known_ones = [*reductions, *indicators]
+            raise InputError(key, f"{text!r}", f"a reduction: {one_of(known_ones, found[1])}")
         wrap, inner = reductions[found[1]], found[2].strip()
     if ":" in inner:
         function = loader.load(key, inner)
@@ -366,6 +365,28 @@ def _observable(key: str, text: str, known: dict[str, Callable], loader: Loader)
             f'{one_of(known, inner)}; or "file.py:name"; alone or in {", ".join(reductions)}',
         )
     return wrap(function) if wrap is not None else function
+
+
+def _named(base: type) -> dict[str, Any]:
+    """The public classes that are kinds of `base`, by name."""
+    return {
+        name: thing
+        for name, thing in vars(dvi).items()
+        if isinstance(thing, type) and issubclass(thing, base) and thing is not base
+    }
+
+
+def _indicator(key: str, text: str, kind: type) -> Any:
+    """An indicator of chaos as it is written in Python, such as ``GALI(4, log10=True)``."""
+    try:
+        call: Any = ast.parse(text, mode="eval").body
+        options = {k.arg: ast.literal_eval(k.value) for k in call.keywords}
+        return kind(*(ast.literal_eval(a) for a in call.args), **options)
+    except (SyntaxError, TypeError, ValueError) as error:
+        why = "" if "malformed" in str(error) else f" ({error})"
+        raise InputError(
+            key, f"{text!r}{why}", "numbers alone, as in LyapunovSpectrum(2) or MEGNO()"
+        ) from None
 
 
 # Dates
