@@ -45,6 +45,21 @@ def test_the_page_on_fitting_runs():
     assert float(off) < 2e-3
 
 
+def test_the_page_on_chaos_runs():
+    page = (README.parent / "docs" / "chaos.md").read_text(encoding="utf-8")
+    code = "\n".join(re.findall(r"```python\n(.*?)```", page, re.S))
+    code += "\nprint(sorted({int(n) for n in np.bincount(megno.status.values.ravel())}))"
+    code = code.replace("found = dvi.sweep(", "megno = dvi.sweep(").replace(
+        '"megno": dvi.MEGNO()},\n)\n', '"megno": dvi.MEGNO()},\n).to_xarray()\n'
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert out.returncode == 0, out.stderr
+    first, points, statuses = out.stdout.strip().splitlines()
+    assert 1.9 < float(first.split()[0]) < 2
+    assert points == "[1, 2, 4, 5, 2]"
+    assert len(statuses.split(",")) > 1  # some of the grid escape
+
+
 def test_commands_named_exist():
     text = README.read_text(encoding="utf-8")
     makefile = (README.parent / "Makefile").read_text(encoding="utf-8")
