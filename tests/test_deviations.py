@@ -219,6 +219,20 @@ def test_lyapunov_spectrum_of_henon_and_heiles():
     assert np.max(np.abs(regular)) < 6e-4  # ln t / t
 
 
+def test_backwards_the_exponents_change_their_signs():
+    """Of a damped system: what shrank grows, and ⟨Y⟩ with it."""
+    system = dvi.System(linear, force=damping)
+    kinds = (dvi.LyapunovSpectrum(), dvi.MEGNO())
+    (ahead, y), (back, x) = (
+        run(system, [1.0, 0.3], [0.0, 0.2], kinds, h=h, epsilon=0.2, num_steps=1000).observed
+        for h in (0.1, -0.1)
+    )
+    assert np.max(np.abs(ahead + back[::-1])) < 5e-3
+    assert np.all(np.asarray(back) > 0.09)
+    assert y < -1
+    assert x > 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("energy", "exponent"), [(0.125, 0.0455), (0.1275, 0.052)])
 def test_lyapunov_spectrum_over_long_times(energy, exponent):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from .._types import Scalar
@@ -82,12 +83,12 @@ class TangentMap(Deviations):
 class LyapunovSpectrum(Deviations):
     r"""Observable: the Lyapunov exponents λ_1 ≥ λ_2 ≥ … [1/time], shape (count,).
 
-        λ_i = (1/t) Σ_k ln R_ii^(k),        M_k Q_{k−1} = Q_k R^(k)
+        λ_i = (1/|t|) Σ_k ln R_ii^(k),        M_k Q_{k−1} = Q_k R^(k)
 
     An orthonormal frame Q is carried by the derivative of each step and made orthonormal again by
     the Gram–Schmidt process. On a Hamiltonian system they come in pairs ±λ, zero for each integral
     in involution; a linear damping −εp gives pairs that sum to −ε. An exponent that is zero is seen
-    as about (ln t)/t.
+    as about (ln t)/t. A run with h < 0 gives the exponents of the motion backwards.
 
     **Arguments**
 
@@ -122,7 +123,7 @@ class LyapunovSpectrum(Deviations):
 
     def finish(self, memory):
         _, sums, time = memory
-        return sums / time
+        return sums / jnp.abs(time)
 
 
 class MEGNO(Deviations):
@@ -148,22 +149,22 @@ class MEGNO(Deviations):
 
     def start(self, value):
         zero = jnp.zeros((), value.dtype)
-        return _first_frame(self, value, 1), zero, zero, zero
+        return _first_frame(self, value, 1), zero, zero, zero, zero
 
     def vectors(self, memory):
         return _in_units(self, memory[0])
 
     def update(self, memory, k, t, value):
-        _, weighted, area, time = memory
+        _, weighted, before, area, time = memory
         vector = _measured(self, value.vectors)
-        size = jnp.sqrt(jnp.sum(vector**2))
-        before = jnp.where(time == 0, 0, weighted / jnp.where(time == 0, 1, time))
-        weighted = weighted + 2 * jnp.log(size) * (time + value.h / 2)
+        square = jnp.sum(vector**2)
+        weighted = weighted + jnp.log(square) * (time + value.h / 2)
         time = time + value.h
-        return vector / size, weighted, area + value.h * (before + weighted / time) / 2, time
+        now = weighted / time
+        return vector * lax.rsqrt(square), weighted, now, area + value.h * (before + now) / 2, time
 
     def finish(self, memory):
-        _, _, area, time = memory
+        *_, area, time = memory
         return area / time
 
 
@@ -208,9 +209,9 @@ class GALI(Deviations):
         frame, R = _gram_schmidt(_measured(self, value.vectors))
         R = jnp.stack([jnp.stack(row) for row in R])
         columns = jnp.sum(R[:, :, None] * columns[None, :, :], axis=1)
-        sizes = jnp.sqrt(jnp.sum(columns**2, axis=0))
+        shrink = lax.rsqrt(jnp.sum(columns**2, axis=0))
         on_diagonal = jnp.stack([R[i, i] for i in range(self.k)])
-        return frame, columns / sizes[None, :], logs + jnp.log(on_diagonal) - jnp.log(sizes)
+        return frame, columns * shrink[None, :], logs + jnp.log(on_diagonal * shrink)
 
     def finish(self, memory):
         logs = jnp.cumsum(memory[2])[1:]
@@ -274,8 +275,10 @@ def _gram_schmidt(vectors: Array) -> tuple[Array, list[list[Array]]]:
         for i, u in enumerate(frame):
             R[i][j] = jnp.sum(u * v)
             v = v - R[i][j] * u
-        R[j][j] = jnp.sqrt(jnp.sum(v**2))
-        frame.append(v / R[j][j])
+        square = jnp.sum(v**2)
+        shrink = lax.rsqrt(square)
+        R[j][j] = square * shrink
+        frame.append(v * shrink)
     return jnp.stack(frame), R
 
 
