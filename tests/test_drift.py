@@ -281,22 +281,22 @@ def test_surface_has_an_order_at_each_h_and_none_where_it_failed():
 
 def test_pictures_show_what_was_excluded():
     with plot.style():
-        figure = plot.drift_orders({"kept": usual(), "energy": sweep(ENERGY)}, [1, None])
-        labels = [text.get_text() for text in figure.legends[0].get_texts()]
+        axis = plot.drift_orders({"kept": usual(), "energy": sweep(ENERGY)}, [1, None])
+        labels = [text.get_text() for text in axis.figure.legends[0].get_texts()]
         assert labels[0].endswith(", promised 1")
         assert labels[1] == "energy: no order"
         hollow = [
-            line for line in figure.axes[0].lines
+            line for line in axis.lines
             if line.get_markerfacecolor() == "white" and len(line.get_xdata()) > 0
         ]  # fmt: skip
         assert [len(line.get_xdata()) for line in hollow] == [10]
-        plt.close(figure)
+        plt.close(axis.figure)
         for surface in (kept_surface(), energy_surface()):
-            figure = plot.drift_surface(surface, promised=1)
-            excluded = figure.axes[0].lines[0].get_xdata()
+            axes = plot.drift_surface(surface, promised=1)
+            excluded = axes[0].lines[0].get_xdata()
             assert len(excluded) == np.sum(~surface.used & np.isfinite(surface.drifts))
-            figure.canvas.draw()
-            plt.close(figure)
+            axes[0].figure.canvas.draw()
+            plt.close(axes[0].figure)
         with pytest.raises(ValueError, match="1 orders for 2 results"):
             plot.drift_orders([usual(), usual()], [1])
 

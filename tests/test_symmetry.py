@@ -206,10 +206,10 @@ def test_balance_tells_the_causes_of_kepler_apart():
     assert np.max(np.abs(b.work)) == 0
     np.testing.assert_allclose(b.drift, b.lattice, atol=1e-13)
     assert np.max(np.abs(b.lattice)) > 1e-2
-    figure = plot.balance(b.ts, b.drift, {"symmetry": b.symmetry, "lattice": b.lattice})
-    residual = figure.axes[1].lines[0].get_ydata()
+    axes = plot.balance(b.ts, b.drift, {"symmetry": b.symmetry, "lattice": b.lattice})
+    residual = axes[1].lines[0].get_ydata()
     np.testing.assert_allclose(residual, b.defect, atol=1e-15)
-    plot.plt.close(figure)
+    plot.plt.close(axes[0].figure)
     kwargs = {"h": 0.1, "num_steps": 9, "args": KEPLER.args, "save": dvi.Save(every=3)}
     thin = dvi.integrate(KEPLER.system, KEPLER.q0, KEPLER.p0, **kwargs)
     with pytest.raises(ValueError, match="every lattice point"):

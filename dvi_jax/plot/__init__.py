@@ -1,4 +1,8 @@
-"""Pictures: one house style, readable in print and by colour-blind eyes."""
+"""Pictures: one house style, readable in print and by colour-blind eyes.
+
+Every function returns the `Axes` it drew on, one or an array of them, and draws on those that it is
+given as `ax`. `save` writes them, and `animate` writes a film.
+"""
 
 from matplotlib import pyplot as plt  # noqa: F401 (plot.plt.close closes a figure)
 
@@ -7,6 +11,7 @@ from .drifts import (
     drift_orders as drift_orders,
     drift_surface as drift_surface,
 )
+from .films import animate as animate
 from .fits import (
     fit_against_data as fit_against_data,
     fit_corner as fit_corner,
@@ -14,13 +19,20 @@ from .fits import (
     learning_curve as learning_curve,
 )
 from .house import COLOURS as COLOURS, DASHES as DASHES, save as save, style as style
-from .runs import (
+from .orbits import orbit as orbit, phase_portrait as phase_portrait, trajectory as trajectory
+from .precision import work_precision as work_precision
+from .sections import bifurcation as bifurcation, section as section
+from .series import (
     changes as changes,
     conserved as conserved,
+    indicator as indicator,
+    invariants as invariants,
+)
+from .solar import (
     ephemeris_comparison as ephemeris_comparison,
     planet_orbits as planet_orbits,
-    trajectory as trajectory,
 )
+from .spectra import frequency_map as frequency_map, spectrum as spectrum
 from .sweeps import (
     failure_map as failure_map,
     slope_map as slope_map,

@@ -4,57 +4,115 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 
 from ..invariants import DriftOrder, DriftSurface
-from .house import COLOURS, DASHES, MARKERS, cell_edges
+from .house import COLOURS, MARKERS, canvas, cell_edges, in_style, legend, named, stack
 
 
+@in_style
 def balance(
-    ts: Any, drift: Any, causes: Mapping[str, Any], time: str = "time t", title: str = ""
-) -> Figure:
-    """The drift of an invariant and its causes (`noether_balance`), and how well they add up.
+    ts: Any,
+    drift: Any = None,
+    causes: Mapping[str, Any] | None = None,
+    time: str = "time t",
+    title: str = "",
+    cumulative: bool = False,
+    unit: str = "",
+    ax: Any = None,
+) -> Any:
+    """The drift of an invariant as a stack of its causes, and how well they add up.
 
-    - `ts`: start of each step, shape (S,); `drift`: rate of change, shape (S,).
-    - `causes`: label → its share of the rate, shape (S,); drawn on one axis with the drift, and
-      below them what the sum leaves.
+    - `ts`: a `dvi.Balance`, as `dvi.noether_balance` returns it; or start of each step, shape (S,),
+      with `drift`: rate of change, shape (S,), and `causes`: label → its share of the rate, shape
+      (S,).
+    - `cumulative`: what has come together since the start, ∫ rate dt (each rate over its step), in
+      place of rates.
+    - `unit`: of the rates, of what has come together with `cumulative`. `ax`: two `Axes`.
+
+    Areas stand upon one another: what raises the invariant upward from 0, what lowers it downward.
+    The line is the drift; below is what it differs from the sum of the causes by.
+
+    **Returns** the `Axes` of the stack and of what is left, shape (2,).
+
+    **Raises** `TypeError` without drift or causes, `ValueError` for shapes that do not fit.
     """
-    figure, (top, bottom) = plt.subplots(
-        2, 1, sharex=True, figsize=(6.4, 4.6), height_ratios=(3, 1)
-    )
-    looks = zip(causes.items(), itertools.cycle(COLOURS[:-1]), DASHES[1:], strict=False)
-    for (label, values), colour, dash in looks:
-        top.plot(ts, values, color=colour, linestyle=dash, label=label)
-    top.plot(ts, drift, color="#000000", linewidth=0.9, label="drift")
-    left = np.asarray(drift) - sum(np.asarray(v) for v in causes.values())
-    bottom.plot(ts, left, color="#000000", linewidth=0.7)
-    top.set(ylabel="rate of change", title=title)
+    t, rate, shares = _of_balance(ts, drift, causes)
+    if cumulative:
+        steps = np.diff(t, append=2 * t[-1] - t[-2] if len(t) > 1 else t[-1] + 1)
+        rate = np.cumsum(rate * steps)
+        shares = {name: np.cumsum(v * steps) for name, v in shares.items()}
+    (top, bottom), new = stack(
+        ax, 2, "the stack and what is left", (6.4, 4.6), sharex=True,
+        gridspec_kw={"height_ratios": (3, 1)},
+    )  # fmt: skip
+    up = down = np.zeros(len(t))
+    # Hatches, too, tell areas apart where there are no colours.
+    looks = zip(itertools.cycle(COLOURS[:-1]), itertools.cycle(_HATCHES))
+    for (label, values), (colour, hatch) in zip(shares.items(), looks, strict=False):
+        look = {"facecolor": colour, "hatch": hatch, "edgecolor": "#ffffff", "linewidth": 0}
+        higher, lower = up + np.maximum(values, 0), down + np.minimum(values, 0)
+        top.fill_between(t, up, higher, label=label, **look)
+        top.fill_between(t, lower, down, **look)
+        up, down = higher, lower
+    top.plot(t, rate, color="#000000", linewidth=0.9, label="drift")
+    left = rate - sum(shares.values(), np.zeros(len(t)))
+    bottom.plot(t, left, color="#000000", linewidth=0.7)
+    top.axhline(0, color="#000000", linewidth=0.5)
+    what = "change" if cumulative else "rate of change"
+    top.set(ylabel=named(what, unit), title=title)
     bottom.set(xlabel=time, ylabel="drift − sum")
-    figure.legend(loc="outside lower center", ncols=len(causes) + 1)
-    figure.align_ylabels()
-    return figure
+    legend(top, new)
+    top.figure.align_ylabels([top, bottom])
+    return np.asarray([top, bottom])
 
 
+_HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++++")
+_CAUSES = ("symmetry", "work", "lattice")
+
+
+def _of_balance(
+    ts: Any, drift: Any, causes: Mapping[str, Any] | None
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """(times, rate, label → share), checked."""
+    if all(hasattr(ts, name) for name in ("ts", "drift", *_CAUSES)):
+        causes = {name: getattr(ts, name) for name in _CAUSES} if causes is None else causes
+        ts, drift = ts.ts, ts.drift if drift is None else drift
+    if drift is None or not causes:
+        raise TypeError(
+            "balance takes what dvi.noether_balance returns, or times, the drift and its causes."
+        )
+    t, rate = np.asarray(ts, float), np.asarray(drift, float)
+    shares = {name: np.asarray(v, float) for name, v in causes.items()}
+    shapes = {"ts": t.shape, "drift": rate.shape, **{n: v.shape for n, v in shares.items()}}
+    if t.ndim != 1 or not len(t) or len(set(shapes.values())) > 1:
+        raise ValueError(f"balance takes one number of each kind a step, shape (S,), got {shapes}.")
+    return t, rate, shares
+
+
+@in_style
 def drift_orders(
     results: Mapping[str, DriftOrder] | Sequence[DriftOrder],
     promised: Sequence[float | None] | float | None = None,
     title: str = "Largest drift against the disturbance",
-) -> Figure:
+    ax: Any = None,
+) -> Any:
     """Drifts over ε (`drift_order`) beside the orders that were promised.
 
     - `results`: label → measured order, or a sequence of them.
     - `promised`: z + 1 for each result in turn (None: no promise), or one for all; a grey line
       of that slope goes through the first point of the fit.
 
-    Hollow points are excluded from the fit; bars at the left end mark the drift at ε = 0.
+    Hollow points are excluded from the fit; bars at the left end mark the drift at ε = 0. `ax`:
+    where to draw.
+
+    **Returns** the `Axes`.
     """
     if not isinstance(results, Mapping):
         results = {f"observable {i}": order for i, order in enumerate(results, 1)}
     slopes = _one_each(promised, len(results))
-    figure, axis = plt.subplots(figsize=(6.4, 4.8), layout="constrained")
+    axis, new = canvas(ax, (6.4, 4.8))
     left = min(order.epsilons.min() for order in results.values())
     looks = zip(results.items(), slopes, itertools.cycle(COLOURS), MARKERS * 9, strict=False)
     for (label, order), slope, colour, marker in looks:
@@ -77,29 +135,35 @@ def drift_orders(
     axis.plot([], [], "o", color="#444444", markerfacecolor="white", label="excluded from the fit")
     axis.plot([], [], "_", color="#444444", markersize=12, markeredgewidth=2, label="at ε = 0")
     axis.set(xlabel="ε", ylabel="largest drift", title=title)
-    figure.legend(loc="outside lower center", ncols=2)
-    return figure
+    legend(axis, new)
+    return axis
 
 
+@in_style
 def drift_surface(
     surface: DriftSurface,
     promised: float | None = None,
     title: str = "Largest drift over ε and h",
-) -> Figure:
+    ax: Any = None,
+) -> Any:
     """Drifts over ε and h (`drift_surface`), and their orders in ε at each h.
 
     - `promised`: z + 1. Dots mark what is excluded from the fits; bars are 95 % intervals.
+    - `ax`: two `Axes`, of the drifts and of their orders.
+
+    **Returns** the `Axes`, shape (2,).
     """
-    figure, (left, right) = plt.subplots(
-        1, 2, figsize=(9.6, 4.2), width_ratios=(5, 4), layout="constrained"
-    )
+    (left, right), _ = stack(
+        ax, 2, "the drifts and their orders", (9.6, 4.2), ncols=2,
+        gridspec_kw={"width_ratios": (5, 4)},
+    )  # fmt: skip
     drifts = np.ma.masked_invalid(surface.drifts)
     norm = LogNorm() if drifts.count() and drifts.min() > 0 else None
     image = left.pcolormesh(
         cell_edges(surface.epsilons), cell_edges(surface.hs), drifts.T, norm=norm, cmap="cividis",
         rasterized=True,
     )  # fmt: skip
-    figure.colorbar(image, ax=left, label="largest drift")
+    left.figure.colorbar(image, ax=left, label="largest drift")
     left.grid(False)
     left.set_facecolor("#d0d0d0")
     i, j = np.nonzero(~surface.used & np.isfinite(surface.drifts))
@@ -132,7 +196,7 @@ def drift_surface(
     right.set(xscale="log", xlabel="step size h", ylabel="order in ε", title="Order in ε")
     right.set_xlim(*cell_edges(surface.hs)[[0, -1]])
     right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, columnspacing=1)
-    return figure
+    return np.asarray([left, right])
 
 
 def _slope_text(order: DriftOrder) -> str:

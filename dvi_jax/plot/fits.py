@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.patches import Ellipse
 
-from .house import COLOURS, MARKERS
+from .house import COLOURS, MARKERS, in_style
 
 _PANELS = 6
 """Arcs up to which each has a panel of its own."""
@@ -26,6 +26,7 @@ _LINES = ((1, "--"), (3, ":"))
 # --- residuals ----------------------------------------------------------------------------------
 
 
+@in_style
 def fit_residuals(
     fit: Any,
     arcs: int | Sequence[int] | None = None,
@@ -159,6 +160,7 @@ class _Scale(NamedTuple):
         return (x - self.zero) / self.unit
 
 
+@in_style
 def fit_corner(
     fit: Any,
     params: Sequence[str] | None = None,
@@ -381,6 +383,7 @@ def _with_error(x: float, sigma: float) -> str:
 # --- data and model -----------------------------------------------------------------------------
 
 
+@in_style
 def fit_against_data(
     fit: Any,
     arc: int = 0,
@@ -450,6 +453,7 @@ def _curve(curve: Any, components: int) -> tuple[np.ndarray, np.ndarray]:
 # --- how it went --------------------------------------------------------------------------------
 
 
+@in_style
 def learning_curve(fit: Any, ax: Any = None) -> Any:
     """The loss after each step of a fit, its stages in colours, rejected steps crossed.
 

@@ -13,7 +13,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from . import panels
 from .blocks import REDUCTIONS, Lines, Picture, counted, reduced
-from .house import COLOURS
+from .house import COLOURS, in_style
 from .panels import NO_NUMBER, NOT_COMPUTED, ZERO, Grid, flag, share
 from .places import dim_of, label_of, names_of
 
@@ -36,6 +36,7 @@ _STATUS_COLOURS = {
 """One colour for each status in all pictures, so that they can be compared."""
 
 
+@in_style
 def sweep_map(
     data: Any,
     x: str | None = None,
@@ -81,6 +82,7 @@ def sweep_map(
     return _draw(grid, pictures, label, log, limits, ax, opens, "no number")
 
 
+@in_style
 def slope_map(
     data: Any,
     along: str = "epsilon",
@@ -137,6 +139,7 @@ def slope_map(
     return _draw(grid, pictures, label, False, limits, ax, None, "no slope")
 
 
+@in_style
 def failure_map(
     data: Any,
     x: str | None = None,

@@ -15,19 +15,19 @@ from ._watched import Watched
 def draw(
     setup: Setup, ts: np.ndarray, qs: np.ndarray, ps: np.ndarray, watched: dict[str, Watched]
 ) -> dict[str, Any]:
-    """File name → figure: the trajectory, and how what was watched changes along it."""
+    """File name → axes: the trajectory, and how what was watched changes along it."""
     time = _label("t", setup.units.get("t"))
     position, momentum = setup.units.get("q"), setup.units.get("p")
     title = setup.name.replace("_", " ")
-    figures = {"trajectory.png": plot.trajectory(ts, qs, ps, time, position, momentum, title)}
+    drawn = {"trajectory.png": plot.trajectory(ts, qs, ps, time, position, momentum, title)}
     series = {_change_label(name, w): w.change() for name, w in watched.items() if not w.reduction}
     if series:
-        figures["invariants.png"] = plot.changes(ts, series, time, f"{title}: what was watched")
-    return figures
+        drawn["invariants.png"] = plot.changes(ts, series, time, f"{title}: what was watched")
+    return drawn
 
 
 def draw_solar_system(setup: Setup, c: Comparison, always: dict[str, Watched]) -> dict[str, Any]:
-    """File name → figure: orbits, the comparison with the ephemeris, conserved quantities."""
+    """File name → axes: orbits, the comparison with the ephemeris, conserved quantities."""
     series = {name.replace("_", " "): np.abs(always[name].change()) for name in OBSERVABLES}
     title = f"Ten bodies with {type(setup.method).__name__}"
     if setup.h is not None:

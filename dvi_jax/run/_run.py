@@ -169,11 +169,11 @@ def _write(
     if values["output.plots"]:
         with plot.style():
             if comparison is None:
-                figures = draw(setup, ts, qs, ps, watched)
+                pictures = draw(setup, ts, qs, ps, watched)
             else:
-                figures = draw_solar_system(setup, comparison, always)
-            for name, figure in figures.items():
-                plot.save(figure, folder / name)
+                pictures = draw_solar_system(setup, comparison, always)
+            for name, axes in pictures.items():
+                plot.save(axes, folder / name)
                 report.files.append(name)
     return report
 

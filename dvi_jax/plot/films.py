@@ -1,0 +1,368 @@
+"""Films of orbits: GIF by Pillow, which comes with matplotlib, MP4 by ffmpeg, if it is there."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from . import series
+from .house import in_style, named
+from .orbits import View, label_view, phase_portrait, view_of
+from .states import CROSS, Lane, Looks, lanes_of, looks_of, one_shape, subscript
+
+_SUFFIXES = (".gif", ".mp4")
+_FASTEST_GIF = 50
+"""Frames a second: viewers slow down a GIF with shorter delays than 2/100 s."""
+
+_MOST_BYTES = 2**28
+"""Of the frames of a GIF, a byte for each pixel, all in memory until they are written."""
+
+_TAIL = 300
+"""Segments of a tail at most."""
+
+_GHOSTS = 12
+"""Orbits up to which each is drawn as a whole, pale, behind what moves."""
+
+
+class _Track(NamedTuple):
+    """What moves: coordinates of shape (S,) each, its orbit and its colour."""
+
+    lane: int
+    coordinates: list[np.ndarray]
+    colour: Any
+    name: str
+
+
+@in_style
+def animate(
+    orbits: Any,
+    path: str | Path,
+    coordinates: tuple[int, ...] | None = None,
+    bodies: Sequence[int] | None = None,
+    centre: Any = None,
+    beside: str | None = None,
+    values: Mapping[str, Any] | None = None,
+    change: str = "relative",
+    log: bool = False,
+    dof: Any = None,
+    seconds: float = 8.0,
+    fps: float = 25.0,
+    tail: float = 0.2,
+    names: Sequence[str] | None = None,
+    labels: Sequence[str] | None = None,
+    units: Mapping[str, str] | None = None,
+    title: str = "",
+    size: tuple[float, float] | None = None,
+    dpi: float = 100.0,
+    progress: Callable[[int, int], Any] | None = None,
+) -> Path:
+    """A film of orbits with a fading tail, evenly in time; of one degree of freedom in (q, p).
+
+    - `orbits`, `coordinates`, `bodies`, `centre`, `names`, `labels`, `units`, `title`: as for
+      `orbit`; `units` of "t" as well, beside the time that is shown.
+    - `path`: ends in ``.gif``, or in ``.mp4`` if ffmpeg is installed. Its folder must exist.
+    - `beside`: "phase_portrait", of `dof`, or "invariants", of `values`, `change` and `log`: a
+      second picture, as the functions of these names draw it, in which the moment is marked.
+    - `seconds`: how long the film is; `fps`: frames a second, of a GIF at most 50. A run with fewer
+      saved states than frames has as many frames as states, which last longer.
+    - `tail`: its length, as a share of the run.
+    - `size`: inches; `dpi`: pixels an inch. `progress`: called with the numbers of frames done and
+      of all, after each.
+
+    A cross stays where an orbit ended too early. A file of that name is replaced once the film is
+    whole.
+
+    **Returns** the path.
+
+    **Raises** `ValueError` for another suffix, numbers that are no length or rate, a GIF of more
+    than 2²⁸ pixels, and as `orbit` does; `RuntimeError` for an MP4 without ffmpeg.
+    """
+    path = Path(path)
+    _check_film(path, seconds, fps, tail, beside)
+    lanes = lanes_of(orbits, "animate", labels, momenta=False)
+    tracks, view, looks = _tracks(lanes, coordinates, bodies, centre, names)
+    times = _moments(lanes, seconds * fps)
+    width, height = size or ((9.6, 4.6) if beside else (5.0, 4.8))
+    pixels = round(width * dpi) * round(height * dpi)
+    if path.suffix.lower() == ".gif" and pixels * len(times) > _MOST_BYTES:
+        raise ValueError(
+            f"a GIF of {len(times)} frames of {pixels} pixels is too large to be held, and to be "
+            "shown anywhere: take fewer seconds, a lower fps, a smaller size or dpi, or .mp4."
+        )
+    figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    space = view is not None and len(view.coordinates) == 3
+    grid = figure.add_gridspec(1, 2 if beside else 1)
+    axis = figure.add_subplot(grid[0], projection="3d" if space else None)
+    scene = _Scene(axis, tracks, lanes, times, tail, (units or {}).get("t"))
+    scene.prepare(view, looks, units or {}, title)
+    if beside == "phase_portrait":
+        scene.mark_phase(figure.add_subplot(grid[1]), orbits, dof, units)
+    elif beside == "invariants":
+        scene.mark_invariants(figure, grid[1], orbits, values, change, log, units)
+    scene.show(len(times) - 1)
+    canvas.draw()  # the layout of the fullest frame is that of all
+    figure.set_layout_engine("none")
+    part = path.with_name(f".{path.stem}.part{path.suffix.lower()}")
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    try:
+        write(part, scene, canvas, seconds, progress or (lambda done, total: None))
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def _check_film(path: Path, seconds: float, fps: float, tail: float, beside: Any) -> None:
+    suffix = path.suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise ValueError(f"a film is a .gif or an .mp4, got {path.name!r}.")
+    if not path.parent.is_dir():
+        raise ValueError(f"the folder of the film is not there: {path.parent}.")
+    for name, value, good in (
+        ("seconds", seconds, 0 < seconds < math.inf),
+        ("fps", fps, 0 < fps < math.inf),
+        ("tail", tail, 0 <= tail <= 1),
+    ):
+        if not good:
+            wanted = "a share from 0 to 1" if name == "tail" else "a positive number"
+            raise ValueError(f"{name} must be {wanted}, got {value!r}.")
+    if suffix == ".gif" and fps > _FASTEST_GIF:
+        raise ValueError(f"a GIF shows at most {_FASTEST_GIF} frames a second, got fps={fps:g}.")
+    if beside not in (None, "phase_portrait", "invariants"):
+        raise ValueError(f'beside must be "phase_portrait" or "invariants", got {beside!r}.')
+    if suffix == ".mp4":
+        from matplotlib.animation import writers
+
+        if not writers.is_available("ffmpeg"):
+            raise RuntimeError(
+                "an .mp4 is written by ffmpeg, which is not found: install it (apt install ffmpeg, "
+                'brew install ffmpeg, conda install ffmpeg), name it by matplotlib.rcParams["'
+                'animation.ffmpeg_path"], or write a .gif, which needs nothing more.'
+            )
+
+
+def _tracks(
+    lanes: Sequence[Lane], coordinates: Any, bodies: Any, centre: Any, names: Any
+) -> tuple[list[_Track], View | None, Looks]:
+    shape = one_shape(lanes, "animate")
+    if math.prod(shape) == 1 and coordinates is None:
+        looks, tracks = looks_of(len(lanes)), []
+        for i, lane in enumerate(lanes):
+            if lane.ps is None:
+                raise TypeError("a film of one degree of freedom needs momenta: (ts, qs, ps).")
+            pair = [lane.qs.reshape(-1), lane.ps.reshape(-1)]
+            tracks.append(_Track(i, pair, looks.colours[i], lane.label))
+        return tracks, None, looks
+    view = view_of(shape, coordinates, bodies, centre, names)
+    several = len(lanes) > 1
+    looks = looks_of(len(lanes) if several else len(view.bodies))
+    return [
+        _Track(i, view.of(lane.qs, k), looks.colours[i if several else k],
+               (lane.label if k == 0 else "") if several else view.names[k])
+        for i, lane in enumerate(lanes) for k in range(len(view.bodies))
+    ], view, looks  # fmt: skip
+
+
+def _moments(lanes: Sequence[Lane], frames: float) -> np.ndarray:
+    """Times of the frames, evenly from the first to the last that there is."""
+    known = [lane.ts[lane.there] for lane in lanes if lane.there.any()]
+    if not known:
+        raise ValueError("animate: no orbit has a state that is finite.")
+    count = max(2, min(round(frames), max(len(t) for t in known)))
+    ends = np.array([[t[0], t[-1]] for t in known])
+    forward = (ends[:, 1] >= ends[:, 0]).all()
+    first = ends.min() if forward else ends.max()
+    last = ends.max() if forward else ends.min()
+    return np.linspace(first, last, count)
+
+
+class _Scene:
+    """The figure of a film, and what moves in it."""
+
+    def __init__(
+        self, axis: Any, tracks: list[_Track], lanes: list[Lane], times: np.ndarray, tail: float,
+        unit: str | None,
+    ):  # fmt: skip
+        self.axis, self.tracks, self.lanes, self.times, self.unit = axis, tracks, lanes, times, unit
+        self.space = axis.name == "3d"
+        self.length = tail * abs(times[-1] - times[0])
+        self.sign = 1.0 if times[-1] >= times[0] else -1.0
+        step = abs(times[-1] - times[0]) / len(times)
+        self.digits = int(np.clip(np.ceil(-np.log10(step)), 0, 12)) if step > 0 else 0
+        # Each orbit as far as it goes: behind that there is nothing to be found.
+        self.last = [lane.ended for lane in lanes]
+        self.clock = [
+            self.sign * lane.ts[: n + 1] for lane, n in zip(lanes, self.last, strict=True)
+        ]
+        longest = max(len(c) for c in self.clock)
+        self.stride = max(1, math.ceil(tail * longest / _TAIL))
+        self.heads: list[Any] = []
+        self.tails: list[Any] = []
+        self.crosses: list[Any] = []
+        self.moving: list[Callable[[int, float], None]] = []
+
+    def prepare(
+        self, view: View | None, looks: Looks, units: Mapping[str, str], title: str
+    ) -> None:
+        """What stands still, and one head and one tail for each track."""
+        from matplotlib.collections import LineCollection
+        from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+        axis, ghosts = self.axis, len(self.tracks) <= _GHOSTS
+        for track in self.tracks:
+            axis.plot(*track.coordinates, color="#cccccc", linewidth=0.6,
+                      alpha=1.0 if ghosts else 0.0, zorder=0.8)  # fmt: skip
+            # Autoscaling has been done by the whole orbit: a tail of one point adds nothing.
+            none = np.zeros((0, 2, 3 if self.space else 2))
+            if self.space:
+                self.tails.append(axis.add_collection3d(Line3DCollection(list(none))))
+            else:
+                self.tails.append(axis.add_collection(LineCollection(list(none)), autolim=False))
+            self.tails[-1].set_linewidth(1.6)
+            start = [[float(x[0])] for x in track.coordinates]
+            self.heads += axis.plot(*start, marker="o", color=track.colour, linestyle="none",
+                                    markersize=6, markeredgecolor="black", markeredgewidth=0.6,
+                                    label=track.name or None, zorder=4)  # fmt: skip
+            self.crosses += axis.plot(*start, linestyle="none", zorder=5, **CROSS)
+        if view is None:
+            axis.set_xlabel(named(subscript("q", (0,), (1,)), units.get("q")))
+            axis.set_ylabel(named(subscript("p", (0,), (1,)), units.get("p")))
+        else:
+            if view.mark is not None:
+                axis.plot(*([x] for x in view.mark), marker="*", color="#E69F00", markersize=11,
+                          markeredgecolor="black", linestyle="none", zorder=3)  # fmt: skip
+            label_view(axis, view, units)
+        if any(track.name for track in self.tracks):
+            axis.figure.legend(loc="outside lower center", ncols=4)
+        axis.set_title(title)
+
+    def mark_phase(self, axis: Any, orbits: Any, dof: Any, units: Any) -> None:
+        """A phase portrait with a dot at the moment."""
+        shape = self.lanes[0].shape
+        dof = (0,) * len(shape) if dof is None else dof
+        phase_portrait(orbits, dof=dof, units=units, ax=axis)
+        place = (dof,) if isinstance(dof, int) else tuple(dof)
+        looks = looks_of(len(self.lanes))
+        dots = [
+            axis.plot([], [], "o", color=c, markeredgecolor="black", markeredgewidth=0.6,
+                      markersize=6, zorder=5)[0]
+            for c in looks.colours
+        ]  # fmt: skip
+
+        def move(lane: int, t: float) -> None:
+            k, one = self._now(lane, t), self.lanes[lane]
+            assert one.ps is not None
+            q, p = ([one.qs[(k, *place)]], [one.ps[(k, *place)]]) if k >= 0 else ([], [])
+            dots[lane].set_data(q, p)
+
+        self.moving.append(move)
+
+    def mark_invariants(
+        self, figure: Any, cell: Any, orbits: Any, values: Any, change: str, log: bool, units: Any
+    ) -> None:
+        """Quantities along time with a line at the moment."""
+        count = series.panels_of(orbits, values, log)
+        inner = cell.subgridspec(count, 1)
+        axes: list[Any] = []
+        for i in range(count):
+            axes.append(figure.add_subplot(inner[i], sharex=axes[0] if axes else None))
+        series.invariants(orbits, values, change=change, log=log, units=units, ax=axes)
+        lines = [axis.axvline(self.times[0], color="#000000", linewidth=1) for axis in axes]
+
+        def move(lane: int, t: float) -> None:
+            for line in lines:
+                line.set_xdata([t, t])
+
+        self.moving.append(move)
+
+    def _now(self, lane: int, t: float) -> int:
+        """Number of the state that an orbit shows at a time, −1 for none."""
+        return int(np.searchsorted(self.clock[lane], self.sign * t, side="right")) - 1
+
+    def show(self, frame: int) -> None:
+        """Move everything to a frame."""
+        t = float(self.times[frame])
+        for i, track in enumerate(self.tracks):
+            self._show_track(i, track, t)
+        for move in self.moving:
+            for lane in range(len(self.lanes)):
+                move(lane, t)
+        text = f"t = {t:.{self.digits}f}"
+        self.axis.set_title(
+            text if self.unit in (None, "", "1") else f"{text} {self.unit}", loc="right",
+            fontweight="normal",
+        )  # fmt: skip
+
+    def _show_track(self, i: int, track: _Track, t: float) -> None:
+        now, last = self._now(track.lane, t), self.last[track.lane]
+        clock = self.clock[track.lane]
+        first = int(np.searchsorted(clock, self.sign * t - self.length)) if len(clock) else 0
+        # The same states in every frame, so that a tail of few does not flicker.
+        places = np.arange(first, now + 1)
+        places = places[(places % self.stride == 0) | (places == now)]
+        points = np.stack([x[places] for x in track.coordinates], 1)
+        segments = np.stack([points[:-1], points[1:]], 1) if len(points) > 1 else points[:0, None]
+        fade = np.linspace(0, 1, len(segments) + 1)[1:]
+        colours = np.column_stack([np.tile(to_rgb(track.colour), (len(segments), 1)), fade])
+        self.tails[i].set_segments(list(segments))
+        self.tails[i].set_color(colours)
+        over = bool(self.lanes[track.lane].trouble) and now >= last
+        alive = [] if now < 0 or over else [now]
+        _put(self.heads[i], [x[alive] for x in track.coordinates])
+        _put(self.crosses[i], [x[[last]] if over and last >= 0 else [] for x in track.coordinates])
+
+
+def _put(line: Any, coordinates: Sequence[Any]) -> None:
+    (line.set_data if len(coordinates) == 2 else line.set_data_3d)(*coordinates)
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+def _write_gif(path: Path, scene: _Scene, canvas: Any, seconds: float, progress: Any) -> None:
+    from PIL import Image
+
+    def drawn() -> Any:
+        canvas.draw()
+        return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+    count = len(scene.times)
+    # One palette for all, or colours would flicker: from frames that have what there is.
+    few = np.unique(np.linspace(0, count - 1, 4).astype(int))
+    samples = []
+    for frame in few:
+        scene.show(frame)
+        samples.append(np.asarray(drawn()))
+    palette = Image.fromarray(np.concatenate(samples)).quantize(256, dither=Image.Dither.NONE)
+
+    def frames() -> Iterator[Any]:
+        for frame in range(count):
+            scene.show(frame)
+            yield drawn().quantize(palette=palette, dither=Image.Dither.NONE)
+            progress(frame + 1, count)
+
+    # Delays are whole hundredths of a second: together they are what was asked for.
+    ends = np.round(100 * seconds * np.arange(count + 1) / count)
+    delays = [int(10 * d) for d in np.diff(ends)]
+    images = frames()
+    next(images).save(
+        path, format="GIF", save_all=True, append_images=images, duration=delays, loop=0
+    )
+
+
+def _write_mp4(path: Path, scene: _Scene, canvas: Any, seconds: float, progress: Any) -> None:
+    from matplotlib.animation import FFMpegWriter
+
+    count, figure = len(scene.times), canvas.figure
+    writer = FFMpegWriter(fps=count / seconds)  # type: ignore[arg-type]
+    with writer.saving(figure, str(path), figure.dpi):
+        for frame in range(count):
+            scene.show(frame)
+            writer.grab_frame()
+            progress(frame + 1, count)

@@ -1,0 +1,122 @@
+"""Pictures of what accuracy costs."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from .house import COLOURS, DASHES, MARKERS, PALE, canvas, in_style, legend
+
+_PLATEAU = 10.0
+"""Times the least error, below which an error is taken for round-off, not for the method's."""
+
+
+@in_style
+def work_precision(
+    results: Mapping[str, tuple[Any, Any]],
+    cost: str = "cost",
+    error: str = "error",
+    slopes: bool = True,
+    front: bool = True,
+    title: str = "",
+    ax: Any = None,
+) -> Any:
+    """Error against cost, a line for each method, both axes logarithmic.
+
+    - `results`: name of the method → (costs, errors), shape (runs,) each, in any order.
+    - `cost`, `error`: labels, with units.
+    - `slopes`: tell the slope of each line, d log(error)/d log(cost), in the legend: the median
+      of those between neighbours whose errors are both above ten times the line's least one, the
+      plateau of round-off; lines without such neighbours have none.
+    - `front`: a pale band under the runs than which no other is both cheaper and as exact.
+    - `ax`: where to draw.
+
+    A run whose error is not finite stands as a cross at the top, one whose error is exactly 0 as a
+    triangle at the bottom, and the legend counts them.
+
+    **Returns** the `Axes`.
+
+    **Raises** `ValueError` for no methods, for shapes that do not fit and for costs that are not
+    positive.
+    """
+    if not results:
+        raise ValueError("work_precision was given no method.")
+    axis, new = canvas(ax, (6.4, 4.8))
+    runs = {name: _checked(name, pair) for name, pair in results.items()}
+    out, nought = 0, 0
+    for i, (name, (costs, errors)) in enumerate(runs.items()):
+        colour = COLOURS[i % len(COLOURS)]
+        # The same marker comes back with another colour: 9 and 7 have no common factor.
+        marker, dash = MARKERS[i % len(MARKERS)], DASHES[i // len(COLOURS) % len(DASHES)]
+        good = np.isfinite(errors) & (errors > 0)
+        slope = _slope(costs[good], errors[good]) if slopes else None
+        text = name if not slopes else f"{name}: " + (
+            f"slope {slope:.1f}" if slope is not None else "no slope"
+        )  # fmt: skip
+        axis.loglog(
+            costs[good], errors[good], color=colour, marker=marker, linestyle=dash,
+            linewidth=1.2, label=text,
+        )  # fmt: skip
+        edge = {"transform": axis.get_xaxis_transform(), "color": colour, "linestyle": "none"}
+        lost, exact = ~np.isfinite(errors), errors == 0
+        if lost.any():
+            axis.plot(costs[lost], np.full(lost.sum(), 0.985), "x", markersize=6, **edge)
+        if exact.any():
+            axis.plot(costs[exact], np.full(exact.sum(), 0.015), "v", markersize=5, **edge)
+        out, nought = out + int(lost.sum()), nought + int(exact.sum())
+    axis.set(xscale="log", yscale="log", xlabel=cost, ylabel=error, title=title)
+    handles = axis.get_legend_handles_labels()[0]
+    if front:
+        line = _front(list(runs.values()))
+        if len(line):
+            (band,) = axis.plot(*line.T, color="#dcdcdc", linewidth=9, zorder=0.5, label="front",
+                                solid_capstyle="round", solid_joinstyle="round")  # fmt: skip
+            handles.append(Line2D([], [], color=band.get_color(), linewidth=7, label="front"))
+    total = sum(len(c) for c, _ in runs.values())
+    if out:
+        handles.append(Line2D([], [], color=PALE, marker="x", linestyle="none",
+                              label=f"{out} of {total} runs failed"))  # fmt: skip
+    if nought:
+        handles.append(Line2D([], [], color=PALE, marker="v", linestyle="none",
+                              label=f"{nought} of {total} runs without error"))  # fmt: skip
+    legend(axis, new, handles)
+    return axis
+
+
+def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(costs, sizes of errors), in the order of cost."""
+    try:
+        costs, errors = (np.asarray(x, float) for x in pair)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name!r} must be (costs, errors), two arrays, got {pair!r}.") from None
+    if costs.ndim != 1 or costs.shape != errors.shape or not len(costs):
+        raise ValueError(
+            f"{name!r} must have costs and errors of one shape (runs,), got {costs.shape} and "
+            f"{errors.shape}."
+        )
+    if not (np.isfinite(costs) & (costs > 0)).all():
+        raise ValueError(f"the costs of {name!r} must be positive: got {costs}.")
+    order = np.argsort(costs, kind="stable")
+    return costs[order], np.abs(errors[order])
+
+
+def _slope(costs: np.ndarray, errors: np.ndarray) -> float | None:
+    if len(costs) < 2:
+        return None
+    above = errors > _PLATEAU * errors.min()
+    both = above[1:] & above[:-1] & (costs[1:] > costs[:-1])
+    if not both.any():
+        return None
+    steps = np.diff(np.log(errors))[both] / np.diff(np.log(costs))[both]
+    return float(np.median(steps))
+
+
+def _front(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Runs that nothing beats in both, shape (count, 2), in the order of cost."""
+    points = np.concatenate([np.stack(pair, 1) for pair in runs])
+    points = points[np.isfinite(points[:, 1]) & (points[:, 1] > 0)]
+    points = points[np.lexsort((points[:, 1], points[:, 0]))]
+    least = np.minimum.accumulate(points[:, 1]) if len(points) else points[:, 1]
+    better = np.concatenate([[True], points[1:, 1] < least[:-1]]) if len(points) else []
+    return points[np.asarray(better, bool)]

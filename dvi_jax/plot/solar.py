@@ -1,0 +1,112 @@
+"""Pictures of the solar system beside an ephemeris."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from .house import COLOURS, MARKERS, given, in_style, stack
+
+
+@in_style
+def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
+    """Heliocentric orbits on the ecliptic [au], the inner four beside the rest.
+
+    - `positions`: shape (times, planets, 3); `names` of the planets. `ax`: two `Axes`.
+
+    **Returns** the `Axes`, shape (2,).
+    """
+    positions = np.asarray(positions)
+    if positions.ndim != 3 or positions.shape[1:] != (len(names), 3):
+        raise ValueError(
+            f"planet_orbits takes positions of shape (times, {len(names)}, 3), one for each name, "
+            f"got {positions.shape}."
+        )
+    axes, new = stack(ax, 2, "inner and outer planets", (9.6, 5.4), ncols=2)
+    groups = (range(min(4, len(names))), range(min(4, len(names)), len(names)))
+    for axis, group, title in zip(axes, groups, ("Inner planets", "Outer planets"), strict=True):
+        for i in group:
+            x, y = positions[:, i, 0], positions[:, i, 1]
+            colour = COLOURS[(i - group[0]) % len(COLOURS)]
+            axis.plot(x, y, ".", markersize=1, color=colour, alpha=0.35, rasterized=True)
+            axis.plot(
+                x[:1], y[:1], MARKERS[i - group[0]], color=colour, markersize=7,
+                markeredgecolor="black", markeredgewidth=0.7, label=names[i], linestyle="none",
+            )  # fmt: skip
+        axis.plot(0, 0, "*", color="#E69F00", markersize=11, markeredgecolor="black")
+        axis.set(xlabel="x [au]", ylabel="y [au]", title=title)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, handletextpad=0.2)
+    if new:
+        axes[0].figure.suptitle(
+            "Heliocentric orbits on the ecliptic of J2000; marks: places at the start", fontsize=10
+        )
+    return np.asarray(axes)
+
+
+@in_style
+def ephemeris_comparison(
+    years: Any,
+    errors: Any,
+    names: Sequence[str],
+    perihelion: Any,
+    slope: float,
+    intercept: float,
+    ax: Any = None,
+) -> Any:
+    """Position errors of the planets, and Mercury's perihelion, beside an ephemeris.
+
+    - `years`: since the start, shape (T,). `errors`: [km], shape (T, planets).
+    - `perihelion`: ephemeris minus integration [″], shape (T,); `slope` [″/century] and
+      `intercept` [″] of its fitted line.
+    - `ax`: three `Axes`: of the errors, of the perihelion, of what the line leaves.
+
+    **Returns** the `Axes`, shape (3,).
+    """
+    years, errors, perihelion = np.asarray(years), np.asarray(errors), np.asarray(perihelion)
+    if ax is None:
+        figure = plt.figure(figsize=(10.4, 5.2), layout="constrained")
+        grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
+        left, right = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
+        below = figure.add_subplot(grid[1, 1], sharex=right)
+    else:
+        left, right, below = given(ax, 3, "for the errors, the perihelion and what its line leaves")
+    for i, name in enumerate(names):
+        x, y = _upper_envelope(years, errors[:, i])
+        left.semilogy(
+            x, y, color=COLOURS[i % len(COLOURS)], linewidth=1.3, marker=MARKERS[i],
+            markevery=(i * 2 % 12, 12), label=name, linestyle="-" if i < len(COLOURS) else "--",
+        )  # fmt: skip
+    left.set(
+        xlabel="years since the start",
+        ylabel="distance from the ephemeris [km]",
+        title="Heliocentric position, integration − DE421",
+    )
+    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
+    right.plot(years, perihelion, ".", color=COLOURS[0], markersize=2, label="osculating orbits")
+    line = intercept + slope * years / 100
+    if np.isfinite(slope):
+        right.plot(
+            years, line, color=COLOURS[1], linewidth=1.2, linestyle="--",
+            label=f"line: {slope:.2f}″ per century",
+        )  # fmt: skip
+        below.plot(years, perihelion - line, color=COLOURS[0], linewidth=0.5)
+        below.axhline(0, color=COLOURS[1], linewidth=1.2, linestyle="--")
+    right.set(
+        ylabel="ϖ(DE421) − ϖ(integration) [″]",
+        title="Mercury's perihelion, DE421 − integration",
+    )
+    right.legend(loc="best", markerscale=3)
+    right.tick_params(labelbottom=False)
+    below.set(xlabel="years since the start", ylabel="minus the line [″]")
+    left.figure.align_ylabels([right, below])
+    return np.asarray([left, right, below])
+
+
+def _upper_envelope(x: np.ndarray, y: np.ndarray, pieces: int = 100) -> tuple[Any, Any]:
+    """Largest value in each of about a hundred pieces: a readable line."""
+    if len(x) <= 2 * pieces:
+        return x[1:], y[1:]
+    parts = np.array_split(np.arange(1, len(x)), pieces)
+    return np.array([x[part[-1]] for part in parts]), np.array([y[part].max() for part in parts])
