@@ -218,14 +218,13 @@ class _Scene:
         for track in self.tracks:
             axis.plot(*track.coordinates, color="#cccccc", linewidth=0.6,
                       alpha=1.0 if ghosts else 0.0, zorder=0.8)  # fmt: skip
-            # Autoscaling has been done by the whole orbit: a tail of one point adds nothing.
-            none = np.zeros((0, 2, 3 if self.space else 2))
-            if self.space:
-                self.tails.append(axis.add_collection3d(Line3DCollection(list(none))))
-            else:
-                self.tails.append(axis.add_collection(LineCollection(list(none)), autolim=False))
-            self.tails[-1].set_linewidth(1.6)
             start = [[float(x[0])] for x in track.coordinates]
+            nothing = [np.tile(np.ravel(start), (2, 1))]
+            if self.space:
+                self.tails.append(axis.add_collection3d(Line3DCollection(nothing)))
+            else:
+                self.tails.append(axis.add_collection(LineCollection(nothing), autolim=False))
+            self.tails[-1].set_linewidth(1.6)
             self.heads += axis.plot(*start, marker="o", color=track.colour, linestyle="none",
                                     markersize=6, markeredgecolor="black", markeredgewidth=0.6,
                                     label=track.name or None, zorder=4)  # fmt: skip
@@ -307,7 +306,9 @@ class _Scene:
         places = np.arange(first, now + 1)
         places = places[(places % self.stride == 0) | (places == now)]
         points = np.stack([x[places] for x in track.coordinates], 1)
-        segments = np.stack([points[:-1], points[1:]], 1) if len(points) > 1 else points[:0, None]
+        if len(points) < 2:  # a tail of no length: matplotlib has no room for one of no points
+            points = np.full((2, len(track.coordinates)), np.nan)
+        segments = np.stack([points[:-1], points[1:]], 1)
         fade = np.linspace(0, 1, len(segments) + 1)[1:]
         colours = np.column_stack([np.tile(to_rgb(track.colour), (len(segments), 1)), fade])
         self.tails[i].set_segments(list(segments))
@@ -340,6 +341,10 @@ def _write_gif(path: Path, scene: _Scene, canvas: Any, seconds: float, progress:
         scene.show(frame)
         samples.append(np.asarray(drawn()))
     palette = Image.fromarray(np.concatenate(samples)).quantize(256, dither=Image.Dither.NONE)
+    colours = np.asarray(palette.getpalette()).reshape(-1, 3)
+    colours[np.argmax(colours.sum(1))] = 255  # paper stays white
+    palette.putpalette(colours.ravel().tolist())
+    palette.load()
 
     def frames() -> Iterator[Any]:
         for frame in range(count):

@@ -12,6 +12,8 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from cycler import cycler
+from matplotlib import colormaps
+from matplotlib.colors import ListedColormap
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -22,6 +24,9 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 DASHES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)))
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+
+SHADES = ListedColormap(colormaps["viridis"](np.linspace(0, 0.88, 256)), "shades")
+"""Of numbers on white paper: viridis without the yellow that would not be seen there."""
 
 GREY, PALE = "#777777", "#b8b8b8"
 """Of what is no datum: lines to compare with; what has no value."""
@@ -178,12 +183,19 @@ def legend(axis: Any, new: bool, handles: Sequence[Any] | None = None) -> Any:
     if not new:
         return axis.legend(handles=handles, fontsize=8)
     figure = _root(axis)
-    # About 0.075 inch a letter; the handle and the space between columns take another five.
+    if axis.name == "3d":  # whose names of axes would be in the way below
+        return figure.legend(handles=handles, loc="upper right")
+    # About 0.066 inch a letter; the handle and the space between columns take another five.
     longest = max(len(str(h.get_label())) for h in handles)
-    fits = int(figure.get_figwidth() / 0.075 // (longest + 6))
+    fits = int(figure.get_figwidth() / 0.066 // (longest + 6))
     return figure.legend(
         handles=handles, loc="outside lower center", ncols=max(1, min(fits, len(handles)))
     )
+
+
+def signed(value: float, form: str = "g") -> str:
+    """A number with a minus of the length of a plus."""
+    return f"{value:{form}}".replace("-", "−")
 
 
 def named(name: str, unit: str | None) -> str:

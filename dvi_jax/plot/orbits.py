@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from .house import COLOURS, DASHES, canvas, in_style, legend, named, path, stack
 from .states import (
@@ -27,6 +28,9 @@ from .states import (
 
 _PANELS = 6
 """Degrees of freedom up to which each has a panel unasked."""
+
+_NARROW = 0.45
+"""Of the longest side of a box in space: others are at least so long."""
 
 _MESH = 161
 """Points of a side of the mesh on which a Hamiltonian is drawn."""
@@ -90,6 +94,9 @@ def phase_portrait(
         axis.set_ylabel(named(subscript("p", place, shape), units.get("p")))
         if period is not None:
             axis.set_xlim(-period / 2, period / 2)
+            if math.isclose(period, 2 * math.pi):
+                quarters = np.arange(-2, 3)
+                axis.set_xticks(quarters * math.pi / 2, ["−π", "−π/2", "0", "π/2", "π"])
         if hamiltonian is not None:
             _level_lines(axis, hamiltonian, lanes[0], place, levels)
     axes[0].set_title(title)
@@ -327,9 +334,25 @@ def label_view(axis: Any, view: View, units: Mapping[str, str]) -> None:
             name += f" − {name}$_{{{view.about + 1}}}$"
         getattr(axis, f"set_{which}label")(named(name, units.get("q")))
     if len(view.coordinates) == 3:
-        axis.set_aspect("equal", adjustable="box")
+        sides = _widen(axis)
+        # One scale for all; smaller than the figure, in which there is no room for labels else.
+        axis.set_box_aspect(sides, zoom=0.84)
+        axis.zaxis.labelpad = 9
     else:
         axis.set_aspect("equal", adjustable="datalim")
+
+
+def _widen(axis: Any) -> list[float]:
+    """Room about an orbit that is much narrower than long, for numbers; the sides of the box."""
+    sides = {which: np.ptp(getattr(axis, f"get_{which}lim")()) for which in "xyz"}
+    longest = max(sides.values())
+    for which, side in sides.items():
+        wanted = max(side, _NARROW * longest)
+        middle = np.mean(getattr(axis, f"get_{which}lim")())
+        getattr(axis, f"set_{which}lim")(middle - wanted / 2, middle + wanted / 2)
+        bins = int(np.clip(round(6 * wanted / longest), 3, 6))
+        getattr(axis, f"{which}axis").set_major_locator(MaxNLocator(bins))
+    return [max(float(side), _NARROW * float(longest)) for side in sides.values()]
 
 
 # --- what a run shows ---------------------------------------------------------------------------

@@ -6,10 +6,13 @@ from typing import Any
 import numpy as np
 from matplotlib.lines import Line2D
 
-from .house import COLOURS, DASHES, MARKERS, PALE, canvas, in_style, legend
+from .house import COLOURS, DASHES, MARKERS, PALE, canvas, in_style, legend, signed
 
 _PLATEAU = 10.0
 """Times the least error, below which an error is taken for round-off, not for the method's."""
+
+_LAST = 3
+"""Runs that a slope is taken from: those before have steps too long for it."""
 
 
 @in_style
@@ -26,9 +29,9 @@ def work_precision(
 
     - `results`: name of the method → (costs, errors), shape (runs,) each, in any order.
     - `cost`, `error`: labels, with units.
-    - `slopes`: tell the slope of each line, d log(error)/d log(cost), in the legend: the median
-      of those between neighbours whose errors are both above ten times the line's least one, the
-      plateau of round-off; lines without such neighbours have none.
+    - `slopes`: tell the slope of each line, d log(error)/d log(cost), in the legend: the
+      least-squares slope of the last three runs whose errors are above ten times the line's least
+      one, where round-off begins; of two if there are no more.
     - `front`: a pale band under the runs than which no other is both cheaper and as exact.
     - `ax`: where to draw.
 
@@ -52,7 +55,7 @@ def work_precision(
         good = np.isfinite(errors) & (errors > 0)
         slope = _slope(costs[good], errors[good]) if slopes else None
         text = name if not slopes else f"{name}: " + (
-            f"slope {slope:.1f}" if slope is not None else "no slope"
+            f"slope {signed(slope, '.1f')}" if slope is not None else "no slope"
         )  # fmt: skip
         axis.loglog(
             costs[good], errors[good], color=colour, marker=marker, linestyle=dash,
@@ -102,14 +105,13 @@ def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _slope(costs: np.ndarray, errors: np.ndarray) -> float | None:
-    if len(costs) < 2:
+    if not len(costs):
         return None
-    above = errors > _PLATEAU * errors.min()
-    both = above[1:] & above[:-1] & (costs[1:] > costs[:-1])
-    if not both.any():
+    above = np.flatnonzero(errors > _PLATEAU * errors.min())[-_LAST:]
+    x, y = np.log(costs[above]), np.log(errors[above])
+    if len(above) < 2 or x[0] == x[-1]:
         return None
-    steps = np.diff(np.log(errors))[both] / np.diff(np.log(costs))[both]
-    return float(np.median(steps))
+    return float(np.polyfit(x, y, 1)[0])
 
 
 def _front(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:

@@ -115,7 +115,7 @@ def _rgba(colour: Any) -> tuple[float, ...]:
 
 def _dots(count: int, size: float | None) -> dict[str, Any]:
     """How so many points look: smaller the more there are."""
-    across = size if size is not None else float(np.clip(60 / math.sqrt(count), 0.35, 2.5))
+    across = size if size is not None else float(np.clip(150 / math.sqrt(count), 0.5, 2.5))
     return {"s": across**2, "linewidths": 0, "rasterized": count > _MANY}
 
 

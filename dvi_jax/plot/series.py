@@ -1,17 +1,21 @@
 """Pictures of numbers along time: what is conserved, what was watched, indicators of chaos."""
 
 import itertools
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.lines import Line2D
 
-from .house import COLOURS, DASHES, GREY, canvas, envelope, in_style, legend, named, stack
+from .house import COLOURS, DASHES, GREY, canvas, envelope, in_style, legend, named, signed, stack
 from .states import CROSS, Looks, cross, each_state, lanes_of, looks_of, troubles
 
 _CHANGES = ("relative", "absolute", "value")
 _PANELS = 12
+
+_NEAR_ROUNDING = 1e-12
+"""Relative changes below it are compared with the rounding of one operation."""
 
 
 class _Series(NamedTuple):
@@ -87,10 +91,11 @@ def invariants(
             # The first number is the one that others are compared with: no wonder it is 0.
             zeros += int(np.sum(v[1:] == 0)) if log else 0
             _draw(axis, t, v, looks, look, log, name if i == 0 or together else "")
-        axis.set_ylabel(_name_of_axis("" if together else one.name, change, log, one.size, units))
+        name = _name_of_axis("" if together else one.name, change, log, one.size, units)
+        axis.set_ylabel(name, fontsize=9 if count > 1 else None)
         if log:
             axis.set_yscale("log")
-            if change == "relative":
+            if change == "relative" and axis.get_ylim()[0] < _NEAR_ROUNDING:
                 _rounding(axis)
     axes[0].set_title(title)
     axes[-1].set_xlabel(named("time t", units.get("t")))
@@ -226,7 +231,7 @@ def _name_of_axis(name: str, change: str, log: bool, vector: bool, units: Mappin
     unit = units.get(name) if change != "relative" else None
     name = name.replace("_", " ")
     if kind and name:
-        return f"{name}\n{named(kind, unit)}"
+        return f"{textwrap.fill(name, 20)}\n{named(kind, unit)}"
     return named(name or kind, unit)
 
 
@@ -425,4 +430,4 @@ def _guide(axis: Any, lines: Sequence[tuple[np.ndarray, np.ndarray]], slope: flo
         value, first = max(starts)
         x = np.array([first, max(ends)])
         axis.plot(x, value * (x / first) ** slope, color=GREY, linewidth=1, linestyle="--",
-                  label=f"slope {slope:g}")  # fmt: skip
+                  label=f"slope {signed(slope)}")  # fmt: skip

@@ -8,7 +8,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from .house import COLOURS, DASHES, GREY, MARKERS, canvas, in_style, legend, named
+from .house import COLOURS, DASHES, GREY, MARKERS, SHADES, canvas, in_style, legend, named, signed
 from .states import looks_of
 
 _NO_VALUE: dict[str, Any] = {
@@ -156,7 +156,7 @@ def _draw_plane(
     axis.grid(False)
     axis.patch.set(**_NO_VALUE)
     mesh = axis.pcolormesh(_cells(x), _cells(y), np.ma.masked_invalid(D.T), norm=norm,
-                           cmap="viridis", rasterized=True)  # fmt: skip
+                           cmap=SHADES, rasterized=True)  # fmt: skip
     axis.figure.colorbar(mesh, ax=axis, label=label, extend=extend)
     lost = int(np.sum(~np.isfinite(D)))
     if lost:
@@ -183,7 +183,7 @@ def _draw_points(
     else:
         known = there & np.isfinite(D)
         norm, extend = _norm(D[there], limits)
-        drawn = axis.scatter(x[known], y[known], c=D[known], norm=norm, cmap="viridis", **look)
+        drawn = axis.scatter(x[known], y[known], c=D[known], norm=norm, cmap=SHADES, **look)
         axis.figure.colorbar(drawn, ax=axis, label=label, extend=extend)
         grey = there & ~np.isfinite(D)
         if grey.any():
@@ -218,6 +218,6 @@ def _name_resonance(axis: Any, k: tuple[int, int], limits: Any) -> None:
         place, how = (right, at_right), {"ha": "left", "va": "center"}
     else:
         return
-    axis.annotate(f"({a}, {b})".replace("-", "−"), place, fontsize=8, color="#555555",
+    axis.annotate(f"({signed(a)}, {signed(b)})", place, fontsize=8, color="#555555",
                   xytext=(0, 2), textcoords="offset points", annotation_clip=False,
                   **how)  # fmt: skip

@@ -6,13 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 
-from .house import COLOURS, DASHES, PALE, named
+from .house import COLOURS, DASHES, PALE, SHADES, named
 
 _GOOD = ("", "successful", "stopped")
 
@@ -236,7 +235,7 @@ def looks_of(
     if values is None:
         if count <= len(COLOURS):
             return Looks(list(COLOURS[:count]), list(DASHES[:count]), None)
-        shades = plt.get_cmap("viridis")(np.linspace(0, 0.92, count))
+        shades = SHADES(np.linspace(0, 1, count))
         return Looks([tuple(c) for c in shades], ["-"] * count, None)
     values = np.ravel(np.asarray(values, float))
     if len(values) != count:
@@ -249,7 +248,7 @@ def looks_of(
         low, high = float(values[known].min()), float(values[known].max())
     if high <= low:
         low, high = low - 0.5, high + 0.5
-    scale = ScalarMappable(Normalize(low, high), plt.get_cmap("viridis"))
+    scale = ScalarMappable(Normalize(low, high), SHADES)
     shades = [tuple(scale.to_rgba(v)) if k else PALE for v, k in zip(values, known, strict=True)]
     return Looks(shades, ["-"] * count, scale, int(np.sum(~known)))
 
