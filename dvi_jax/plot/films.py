@@ -342,7 +342,7 @@ def _write_gif(path: Path, scene: _Scene, canvas: Any, seconds: float, progress:
         samples.append(np.asarray(drawn()))
     palette = Image.fromarray(np.concatenate(samples)).quantize(256, dither=Image.Dither.NONE)
     colours = np.asarray(palette.getpalette()).reshape(-1, 3)
-    colours[np.argmax(colours.sum(1))] = 255  # paper stays white
+    colours[colours.min(1) >= 248] = 255  # paper stays white
     palette.putpalette(colours.ravel().tolist())
     palette.load()
 

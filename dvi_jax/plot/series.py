@@ -19,12 +19,16 @@ _NEAR_ROUNDING = 1e-12
 
 
 class _Series(NamedTuple):
-    """One quantity along every orbit: times and numbers, shape (S,) each; what they are of."""
+    """One quantity along every orbit: times and numbers, shape (S,) each.
+
+    `size`: whether the numbers are lengths of vectors. `nought`: orbits without a relative change.
+    """
 
     name: str
     ts: list[np.ndarray]
     values: list[np.ndarray]
     size: bool
+    nought: int
 
 
 @in_style
@@ -62,7 +66,8 @@ def invariants(
     **Returns** the `Axes`, an array of them for several panels.
 
     **Raises** `TypeError` for what has no times or no numbers; `ValueError` for shapes that do not
-    fit, and for relative changes of what starts at 0.
+    fit, and for relative changes of what always starts at 0 (an orbit of a batch is left out, and
+    named in the legend).
     """
     if change not in _CHANGES:
         raise ValueError(f"change must be one of {', '.join(_CHANGES)}, got {change!r}.")
@@ -106,6 +111,10 @@ def invariants(
     handles = axes[0].get_legend_handles_labels()[0] + looks.entries()
     if zeros:
         handles.append(Line2D([], [], linestyle="none", label=f"{zeros} values exactly 0"))
+    for one in series:
+        if one.nought:
+            text = f"{one.name}: {one.nought} of {len(ts)} orbits start at 0"
+            handles.append(Line2D([], [], linestyle="none", label=text))
     handles += [cross(text) for text in troubles(lanes)]
     legend(axes[0], new, handles)
     return axes[0] if count == 1 else np.asarray(axes)
@@ -198,16 +207,16 @@ def _changed(
         else:
             v = v[:, 0]
         if change == "relative":
-            nought += size == 0
-            v = v / size if size else v
+            nought += int(size == 0)
+            v = v / size if size else np.full(len(v), np.nan)
         times.append(t[len(t) - len(v) :])
         found.append(np.abs(v) if log else v)
-    if nought:
+    if nought and nought == len(ts):
         raise ValueError(
-            f"{name!r} starts at 0 in {nought} of {len(ts)} orbits, so that no change is relative "
-            "to it: take change='absolute'."
+            f"every orbit starts at 0 of {name!r}, so that no change is relative to it: take "
+            "change='absolute'."
         )
-    return _Series(name, times, found, vector)
+    return _Series(name, times, found, vector, nought)
 
 
 def _draw(
