@@ -1,5 +1,6 @@
 """Pictures of orbits, sections, spectra and costs: what is drawn, where, and what is refused."""
 
+import inspect
 import itertools
 import types
 
@@ -208,6 +209,16 @@ def test_every_picture_draws_on_the_axes_it_is_given_and_returns_them(single):
             draw(3)
         assert isinstance(draw(None), plt.Axes), name
         plt.close("all")
+
+
+def test_every_public_picture_takes_axes():
+    public = {
+        name: f for name, f in vars(plot).items()
+        if inspect.isfunction(f) and name not in ("save", "style", "animate")
+    }  # fmt: skip
+    assert len(public) == 24
+    for name, function in public.items():
+        assert {"ax", "axes"} & set(inspect.signature(function).parameters), name
 
 
 def test_pictures_of_several_panels_take_as_many_axes():
@@ -461,6 +472,22 @@ def test_functions_of_the_state_begin_with_the_start(batch):
     value = plot.invariants(good, {"r": lambda q, p: jnp.linalg.norm(q)}, change="value")
     assert lines(value)[0][1][0] == pytest.approx(1.2)
     assert value.get_ylabel() == "r"
+
+
+def test_solutions_of_several_runs_share_a_panel_for_what_all_of_them_watched(single, batch):
+    short = types.SimpleNamespace(
+        ts=single.ts[:21], qs=single.qs[:21], observed={"energy": single.observed["energy"][:20]}
+    )
+    good = jax.tree.map(lambda x: x[:2], batch)
+    axis = plot.invariants([good, short], labels=["a", "b", "c"])
+    assert axis.get_ylabel() == "energy\nrelative change"
+    assert [len(xy[0]) for xy in lines(axis)] == [60, 60, 20]
+    np.testing.assert_array_equal(lines(axis)[0][1][:20], lines(axis)[2][1])
+    assert legend(axis) == ["a", "b", "c"]
+    mine = {"E": [np.ones(61), np.ones(61), np.r_[1, 2 * np.ones(20)]]}
+    assert lines(plot.invariants([good, short], mine))[2][1].max() == 1
+    with pytest.raises(ValueError, match="one array for each"):
+        plot.invariants([good, short], {"E": np.ones(61)})
 
 
 def test_vectors_change_by_the_length_of_their_difference():

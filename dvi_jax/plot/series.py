@@ -151,22 +151,41 @@ def _watched(
 ) -> dict[str, list[np.ndarray]]:
     """Name → the numbers of every orbit, one array each."""
     if values is None:
-        values = getattr(orbits, "observed", None)
-        if not isinstance(values, Mapping):
-            raise TypeError(
-                "invariants draws the dictionary of observables that stand alone, "
-                "integrate(..., observe={'energy': f}), or values={'energy': numbers or a function "
-                "(q, p)}: there is neither."
-            )
-        lead, n = np.shape(orbits.ts)[:-1], np.shape(orbits.ts)[-1]
-        axes = len(lead) + 1
-        values = {
-            name: v for name, v in values.items()
-            if hasattr(v, "shape") and np.shape(v)[:axes] in ((*lead, n), (*lead, n - 1))
-        }  # fmt: skip
+        several = orbits if isinstance(orbits, list) else [orbits]
+        found = [_alone(one) for one in several]
+        common = [name for name in found[0] if all(name in one for one in found)]
+        if not isinstance(orbits, list):
+            values = found[0]
+        else:  # each may be a batch: its orbits one after another
+            values = {
+                name: [
+                    v
+                    for one, all_ in zip(several, found, strict=True)
+                    for v in _of_every_orbit(name, all_[name], one, ())
+                ]
+                for name in common
+            }
     if not values:
         raise ValueError("there is nothing to draw: nothing was watched that has a value per step.")
     return {name: _of_every_orbit(name, v, orbits, lanes) for name, v in values.items()}
+
+
+def _alone(one: Any) -> dict[str, Any]:
+    """What a solution observed that has a value per step."""
+    observed = getattr(one, "observed", None)
+    if not isinstance(observed, Mapping):
+        raise TypeError(
+            "invariants draws the dictionary of observables that stand alone, "
+            "integrate(..., observe={'energy': f}), or values={'energy': numbers or a function "
+            "(q, p)}: there is neither."
+        )
+    lead, n = np.shape(one.ts)[:-1], np.shape(one.ts)[-1]
+    shapes = (*lead, n), (*lead, n - 1)
+    return {
+        name: v
+        for name, v in observed.items()
+        if hasattr(v, "shape") and np.shape(v)[: len(lead) + 1] in shapes
+    }
 
 
 def _of_every_orbit(name: str, v: Any, orbits: Any, lanes: Sequence[Any]) -> list[np.ndarray]:
