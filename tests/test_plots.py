@@ -2,7 +2,9 @@
 
 import inspect
 import itertools
+import re
 import types
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -927,3 +929,14 @@ def test_an_mp4_is_written_where_there_is_ffmpeg(tmp_path):
     start = path.read_bytes()[:12]
     assert start[4:8] == b"ftyp"
     assert path.stat().st_size > 2000
+
+
+@pytest.mark.slow
+def test_the_documentation_runs_as_printed(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[1] / "docs" / "plots.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    monkeypatch.chdir(tmp_path)
+    exec(block, {})
+    sizes = {file.name: file.stat().st_size for file in tmp_path.iterdir()}
+    assert set(sizes) == {"orbits.png", "invariants.png", "orbits.gif"}
+    assert min(sizes.values()) > 20_000

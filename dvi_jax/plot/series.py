@@ -269,7 +269,8 @@ def _rounding(axis: Any) -> None:
     axis.axhline(eps, color=GREY, linewidth=1, linestyle=":")
     axis.annotate(
         "rounding of one operation", (1, eps), xycoords=("axes fraction", "data"),
-        ha="right", va="bottom", fontsize=8, color="#555555",
+        ha="right", va="bottom", fontsize=8, color="#555555", zorder=4,
+        bbox={"facecolor": "#ffffff", "edgecolor": "none", "alpha": 0.75, "pad": 0.5},
     )  # fmt: skip
 
 
