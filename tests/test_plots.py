@@ -728,6 +728,10 @@ def test_work_precision_measures_slopes_and_finds_the_front():
     assert legend(axis) == ["two: slope −2.0", "four: slope −4.0", "front"]
     front = lines(axis)[2]
     np.testing.assert_array_equal(front, [cost, [1e-2, 1e-4, 1e-8, 1e-12, 1e-14]])
+    flat = {"late": (cost, [1e-3, 1e-5, 1e-7, 1.1e-7, 1.3e-7]), "first": (cost, 1 / cost)}
+    assert legend(plot.work_precision(flat))[:2] == ["late: slope −2.0", "first: slope −1.0"]
+    early = {"early": (cost, [1.0, 9.0, 1.0, 1e-3, 1e-6])}  # steps that are too long at first
+    assert legend(plot.work_precision(early))[0] == "early: slope −3.0"
     looks = {(line.get_marker(), line.get_color()) for line in axis.lines[:2]}
     assert looks == {("o", plot.COLOURS[0]), ("s", plot.COLOURS[1])}
     assert "front" not in legend(plot.work_precision(errors_of("a"), front=False))

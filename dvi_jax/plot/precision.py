@@ -8,8 +8,8 @@ from matplotlib.lines import Line2D
 
 from .house import COLOURS, DASHES, MARKERS, PALE, canvas, in_style, legend, signed
 
-_PLATEAU = 10.0
-"""Times the least error, below which an error is taken for round-off, not for the method's."""
+_FLATTER = 0.6
+"""Of the slope before: a line that falls less steeply than that has reached round-off."""
 
 _LAST = 3
 """Runs that a slope is taken from: those before have steps too long for it."""
@@ -30,8 +30,8 @@ def work_precision(
     - `results`: name of the method → (costs, errors), shape (runs,) each, in any order.
     - `cost`, `error`: labels, with units.
     - `slopes`: tell the slope of each line, d log(error)/d log(cost), in the legend: the
-      least-squares slope of the last three runs whose errors are above ten times the line's least
-      one, where round-off begins; of two if there are no more.
+      least-squares slope of its last three runs before round-off. Round-off begins where the error
+      no longer falls, or falls by less than 0.6 of the slope before.
     - `front`: a pale band under the runs than which no other is both cheaper and as exact.
     - `ax`: where to draw.
 
@@ -105,13 +105,13 @@ def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _slope(costs: np.ndarray, errors: np.ndarray) -> float | None:
-    if not len(costs):
-        return None
-    above = np.flatnonzero(errors > _PLATEAU * errors.min())[-_LAST:]
-    x, y = np.log(costs[above]), np.log(errors[above])
-    if len(above) < 2 or x[0] == x[-1]:
-        return None
-    return float(np.polyfit(x, y, 1)[0])
+    costs, first = np.unique(costs, return_index=True)
+    x, y = np.log(costs), np.log(errors[first])
+    local, n = np.diff(y) / np.diff(x), len(x)
+    while n > 1 and (local[n - 2] >= 0 or (n > 2 and local[n - 2] > _FLATTER * local[n - 3])):
+        n -= 1
+    part = slice(max(0, n - _LAST), n)
+    return float(np.polyfit(x[part], y[part], 1)[0]) if n > 1 else None
 
 
 def _front(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
