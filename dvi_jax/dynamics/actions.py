@@ -11,9 +11,10 @@ import numpy as np
 from .._compat import is_traced
 from .._solution import Solution
 from .frequencies import Frequencies, Raw, analyse, check_count, settings_of, signals_of
+from .lines import EPS
 from .results import (
+    CODE,
     FREQUENCY_RESULTS,
-    NAMES,
     WITHOUT_NUMBERS,
     code_of,
     name_of,
@@ -29,10 +30,6 @@ _ORDERS = {1: 64, 2: 20, 3: 12, 4: 8, 5: 6}
 
 _SUBSETS = 300
 """Choices of lines that are tried as a basis."""
-
-_EPS = float(np.finfo(np.float64).eps)
-
-_CODE = {name: i for i, name in enumerate(NAMES)}
 
 
 class FundamentalFrequencies(eqx.Module):
@@ -240,11 +237,11 @@ def actions(
             continue
         used = power[i] * torus.matched
         lost = power[i] - used + in_doubt[i]
-        total = (power[i] + in_doubt[i]).sum(axis=1) / np.maximum(1 - left[i], _EPS)
+        total = (power[i] + in_doubt[i]).sum(axis=1) / np.maximum(1 - left[i], EPS)
         rest = left[i] * total + lost.sum(axis=1)
         residual[i] = np.sqrt(np.max(rest / np.where(total > 0, total, 1.0)))
-        if codes[i] in (0, _CODE["not_quasi_periodic"]):
-            codes[i] = 0 if residual[i] <= leftover else _CODE["not_quasi_periodic"]
+        if codes[i] in (0, CODE["not_quasi_periodic"]):
+            codes[i] = 0 if residual[i] <= leftover else CODE["not_quasi_periodic"]
         if codes[i] == 0:
             k = torus.combinations
             J[i] = np.einsum("jk,jka->a", used, k) / 2
@@ -315,17 +312,17 @@ def _tori(
     )  # fmt: skip
     tori, codes = [], []
     for nu, a, status, width in rows:
-        silent = status == _CODE["no_signal"]
+        silent = status == CODE["no_signal"]
         hard = (status > 0) & (status <= len(WITHOUT_NUMBERS)) & ~silent
         if hard.any() or silent.all():
             tori.append(_nothing(n, count, search.num))
-            codes.append(status[hard][0] if hard.any() else _CODE["no_signal"])
+            codes.append(status[hard][0] if hard.any() else CODE["no_signal"])
             continue
         tolerance = _SHARE * width.max() if search.tolerance is None else search.tolerance
         torus, problem = _torus(nu, np.abs(a), width.max(), tolerance, search)
         doubt = status[(status != 0) & ~silent]
         tori.append(torus)
-        codes.append(doubt[0] if soft and len(doubt) else _CODE[problem])
+        codes.append(doubt[0] if soft and len(doubt) else CODE[problem])
     return tori, np.array(codes)
 
 
@@ -412,7 +409,7 @@ def _fitted(basis, lines, weight, tolerance, order):
     """Least squares of the basis over the lines that are its combinations, twice."""
     lattice = combinations_up_to(len(basis), order)
     for _ in range(2):
-        k, misfit, matched = _match(basis, lines, tolerance, lattice)
+        k, _, matched = _match(basis, lines, tolerance, lattice)
         rows = (k * weight[:, None])[matched]
         if len(basis) and np.linalg.matrix_rank(rows) == len(basis):
             basis = np.linalg.lstsq(rows, (lines * weight)[matched], rcond=None)[0]

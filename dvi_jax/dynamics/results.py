@@ -70,6 +70,9 @@ NAMES = (
     "unresolved", "not_converged", "not_quasi_periodic", "resonant",
 )  # fmt: skip
 
+CODE = {name: i for i, name in enumerate(NAMES)}
+"""The place of a status in `NAMES`."""
+
 WITHOUT_NUMBERS = NAMES[1:6]
 """Statuses that leave no line."""
 

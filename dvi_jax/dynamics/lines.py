@@ -1,0 +1,308 @@
+"""The lines of one signal: maxima of its windowed transform, and least squares of all of them."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from .results import CODE
+
+EPS = float(np.finfo(np.float64).eps)
+
+_ASCENT, _EACH, _LAST = 4, 3, 4
+"""Newton steps to the maximum of an amplitude; Gauss–Newton steps after each line, and rounds of
+them after the last. Both double the digits, from some hundredths of the resolution on."""
+
+_FLOOR = 256 * EPS
+"""A line below this share of the largest value of the signal is round-off of its samples."""
+
+_ECHO = 1e-9
+"""A line within the resolution of one stronger by this ratio is what round-off left of that."""
+
+_SETTLED = 1e-2
+"""Last correction to a frequency, over the resolution, up to which it is taken as found."""
+
+
+class Settings(NamedTuple):
+    """What is static of an analysis."""
+
+    lines: int
+    window: int
+    refine: bool
+
+
+class Lines(NamedTuple):
+    """The lines of one signal in the variable s = ω T/2, amplitudes at the centre."""
+
+    s: Array
+    amplitudes: Array
+    sure: Array
+    constant: Array
+    residual: Array
+    code: Array
+
+
+class _Grid(NamedTuple):
+    """The samples in blocks, so that e^{isy} = e^{is·rows} e^{is·columns} takes 2√N exponentials.
+
+    y = `rows` + `columns` goes from −1 to 1 over the window; `weights` are χ/N, 0 beyond the end.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    weights: np.ndarray
+    window: int
+    N: int
+
+
+def _grid(N: int, window: int) -> _Grid:
+    B = 1 << (max(N - 1, 1).bit_length() + 1) // 2
+    A = -(-N // B)
+    y = (2 * np.arange(N) + 1 - N) / N
+    k = np.arange(-window, window + 1)
+    weights = np.cos(np.pi * np.outer(y, k)) @ _hann(window)
+    padded = np.concatenate([weights / N, np.zeros(A * B - N)]).reshape(A, B)
+    rows = (2 * B * np.arange(A) + B - N) / N
+    columns = (2 * np.arange(B) + 1 - B) / N
+    return _Grid(rows, columns, padded, window, N)
+
+
+def _hann(window: int) -> np.ndarray:
+    """Fourier coefficients of (1 + cos πu)^window over their mean, from −window to window."""
+    coefficients = np.array([1.0])
+    for _ in range(2 * window):
+        coefficients = np.convolve(coefficients, [1.0, 1.0])
+    return coefficients / coefficients[window]
+
+
+def _moments(grid: _Grid, weighted: Array, s: Array) -> Array:
+    """Σ χ z y^m e^{−isy} / N for m = 0, 1, 2: s (K,) to (3, K); `weighted` is χz/N."""
+    a, b = grid.rows, grid.columns
+    inner = jnp.exp(-1j * b[:, None] * s[None, :])
+    powers = jnp.concatenate([inner, b[:, None] * inner, b[:, None] ** 2 * inner], axis=1)
+    sums = (weighted @ powers).reshape(a.shape[0], 3, s.shape[0])
+    outer = jnp.exp(-1j * a[:, None] * s[None, :])[:, None, :]
+    x = a[:, None]
+    m0, m1, m2 = (sums * outer).transpose(1, 0, 2)
+    return jnp.stack([
+        jnp.sum(m0, axis=0),
+        jnp.sum(x * m0 + m1, axis=0),
+        jnp.sum(x**2 * m0 + 2 * x * m1 + m2, axis=0),
+    ])  # fmt: skip
+
+
+def _synthesis(grid: _Grid, s: Array, amplitudes: Array) -> Array:
+    """Σ_k A_k e^{is_k y} on the grid."""
+    outer = jnp.exp(1j * grid.rows[:, None] * s[None, :]) * amplitudes[None, :]
+    return outer @ jnp.exp(1j * s[:, None] * grid.columns[None, :])
+
+
+def _kernel(grid: _Grid, d: Array) -> tuple[Array, Array, Array]:
+    r"""The window's transform W(d) = Σ χ e^{idy} / N with its first and second derivatives.
+
+    W(d) = Σ_k a_k D(d + kπ), D(x) = sin x / (N sin(x/N)) = S(x) / S(x/N), S(x) = sin x / x.
+    """
+    N, k = grid.N, np.arange(-grid.window, grid.window + 1) * np.pi
+    shape = (k.shape[0],) + (1,) * d.ndim
+    x = d[None] + k.reshape(shape)
+    turns = jnp.round(x / (N * np.pi))  # D(x + Nπ) = ±D(x), and S(x/N) has its zero there
+    sign = jnp.where((N % 2 == 0) & (turns % 2 != 0), -1.0, 1.0)
+    x = x - N * np.pi * turns
+    (S, R), (S1, R1), (S2, R2) = _sinc(jnp.stack([x, x / N]))
+    E, E1 = 1 / R, -R1 / R**2 / N
+    E2 = (2 * R1**2 / R**3 - R2 / R**2) / N**2
+    D = jnp.stack([S * E, S1 * E + S * E1, S2 * E + 2 * S1 * E1 + S * E2])
+    W = jnp.sum((sign * _hann(grid.window).reshape(shape))[None] * D, axis=1)
+    return W[0], W[1], W[2]
+
+
+def _sinc(x: Array) -> tuple[Array, Array, Array]:
+    """Of sin x / x the value and two derivatives, by their series where they cancel."""
+    near = jnp.abs(x) < 1.0
+    far = jnp.where(near, 1.0, x)
+    S = jnp.sin(far) / far
+    S1 = (jnp.cos(far) - S) / far
+    S2 = -S - 2 * S1 / far
+    z = jnp.where(near, x, 0.0) ** 2
+    terms = [1.0]
+    for j in range(1, 10):
+        terms.append(-terms[-1] / ((2 * j) * (2 * j + 1)))
+    series = jnp.polyval(jnp.array(terms[::-1]), z)
+    first = jnp.polyval(jnp.array([2 * j * c for j, c in enumerate(terms)][:0:-1]), z)
+    second = jnp.polyval(
+        jnp.array([2 * j * (2 * j - 1) * c for j, c in enumerate(terms)][:0:-1]), z
+    )
+    return (
+        jnp.where(near, series, S),
+        jnp.where(near, first * jnp.where(near, x, 0.0), S1),
+        jnp.where(near, second, S2),
+    )
+
+
+def lines_of(z: Array, settings: Settings) -> Lines:
+    """The lines of one signal.
+
+    Slot 0 is the constant; a line of a real signal has a second slot, of −ω.
+    """
+    is_real, count, N = not jnp.iscomplexobj(z), settings.lines, z.shape[-1]
+    grid, mirrored = _grid(N, settings.window), 2 if is_real else 1
+    finite = jnp.all(jnp.isfinite(z))
+    z = jnp.where(finite, z, 0.0).astype(complex)
+    largest = jnp.max(jnp.abs(z))
+    z = z / jnp.where(largest > 0, largest, 1.0)  # so that squares neither over- nor underflow
+    pad = grid.weights.size - N
+    blocks = jnp.pad(z, (0, pad)).reshape(grid.weights.shape)
+
+    slots = 1 + count * mirrored
+    s, A = jnp.zeros(slots), jnp.zeros(slots, complex).at[0].set(jnp.sum(grid.weights * blocks))
+    there = jnp.zeros(slots, bool).at[0].set(True)
+    spread = jnp.sum(grid.weights * jnp.abs(blocks - A[0]) ** 2)
+
+    def advance(i, state):
+        s, A, there = state
+        r = blocks - _synthesis(grid, s, A)
+        new, size = _strongest(grid, r, is_real)
+        real = (i < count) & _is_line(grid, r, new, size, s, A, there)
+        new, size = jnp.where(real, new, 0.0), jnp.where(real, size, 0.0)
+        fresh = 1 + mirrored * i + np.arange(mirrored)
+        s = s.at[fresh].set(jnp.stack([new, -new])[:mirrored], mode="drop")
+        A = A.at[fresh].set(jnp.stack([size, jnp.conj(size)])[:mirrored], mode="drop")
+        there = there.at[fresh].set(real, mode="drop")
+        s, A = _fitted(grid, blocks, s, A, there, settings.refine)
+        keep = ~there | (jnp.abs(A) > _least(s, s, A, there))
+        keep = jnp.repeat(keep[1::mirrored], mirrored)
+        keep = jnp.concatenate([np.ones(1, bool), keep])  # a pair goes together
+        return jnp.where(keep, s, 0.0), jnp.where(keep, A, 0.0), there & keep
+
+    rounds = count + (_LAST if settings.refine else 0)
+    s, A, there = lax.fori_loop(0, rounds, advance, (s, A, there))
+    moved = jnp.zeros(slots)
+    if settings.refine:
+        rest = blocks - _synthesis(grid, s, A)
+        moved = _correction(grid, s, A, rest, there, True, 0.0)[1]
+
+    rest = blocks - _synthesis(grid, s, A)
+    residual = jnp.sqrt(
+        jnp.sum(grid.weights * jnp.abs(rest) ** 2) / jnp.where(spread > 0, spread, 1.0)
+    )
+    constant = A[0] * largest
+    s, A, there, moved = (x[1::mirrored] for x in (s, A, there, moved))
+    order = jnp.argsort(jnp.where(there, -jnp.abs(A), jnp.inf))
+    s, A, there, moved = s[order], A[order] * largest, there[order], moved[order]
+    unsettled = there & ~(jnp.abs(moved) <= _SETTLED * np.pi)
+    both = there[:, None] & there[None, :] & ~np.eye(count, dtype=bool)
+    near = both & (jnp.abs(s[:, None] - s[None, :]) < np.pi)
+    if is_real:
+        s = jnp.where(there, s, 1.0)
+    unresolved = jnp.any(near, axis=1) | (there & (jnp.abs(s) < (np.pi / 2 if is_real else np.pi)))
+    code = jnp.asarray(0)
+    for name, applies in (
+        ("not_converged", jnp.any(unsettled)),
+        ("unresolved", jnp.any(unresolved)),
+        ("aliased", jnp.abs(s[0]) > 0.9 * N * np.pi / 2),
+        ("window_too_short", ~(jnp.abs(s[0]) > (settings.window + 1) * np.pi)),
+        ("no_signal", ~there[0] | ~(spread > (64 * EPS) ** 2)),
+        ("not_finite", ~finite),
+    ):
+        code = jnp.where(applies, CODE[name], code)
+    sure = there & ~unsettled & ~unresolved
+    return Lines(s, A, sure, constant, residual, code)
+
+
+def _strongest(grid: _Grid, r: Array, is_real: bool) -> tuple[Array, Array]:
+    """Place and amplitude of the largest maximum of |⟨r, e^{isy}⟩|."""
+    N, p = grid.N, grid.window
+    weighted = grid.weights * r
+    size = jnp.abs(jnp.fft.fft(weighted.reshape(-1)[:N]))
+    if is_real:
+        size = jnp.where(np.arange(N) <= N // 2, size, 0.0)
+    m = jnp.argmax(size)
+    before, at, after = size[m - 1], size[m], size[(m + 1) % N]
+    ratio = jnp.maximum(before, after) / jnp.where(at > 0, at, 1.0)
+    offset = ((p + 1) * ratio - p) / (1 + ratio)  # exact for one line and many samples
+    offset = jnp.where(after > before, offset, -offset)
+    m = jnp.where(m >= (N + 1) // 2, m - N, m)
+    s = np.pi * (m + jnp.clip(offset, -0.6, 0.6))
+
+    def climb(_, s):
+        m0, m1, m2 = _moments(grid, weighted, s[None])[:, 0]
+        slope = 2 * jnp.imag(jnp.conj(m0) * m1)
+        bend = 2 * (jnp.abs(m1) ** 2 - jnp.real(jnp.conj(m0) * m2))
+        step = jnp.where(bend < 0, -slope / jnp.where(bend < 0, bend, 1.0), 0.0)
+        return s + jnp.clip(step, -np.pi / 2, np.pi / 2)
+
+    s = lax.fori_loop(0, _ASCENT, climb, s)
+    return s, _moments(grid, weighted, s[None])[0, 0]
+
+
+def _is_line(grid: _Grid, r: Array, new: Array, size: Array, s: Array, A: Array, there: Array):
+    """Whether a maximum stands above white noise and above round-off.
+
+    Of N values of noise the largest |⟨r, e^{isy}⟩|² is about ln N times its mean, which is the
+    variance of r times mean(χ²)/N.
+    """
+    variance = jnp.sum(grid.weights * jnp.abs(r) ** 2)
+    noise = 2 * np.log(grid.N) * np.sum(grid.weights**2) * variance
+    return (jnp.abs(size) ** 2 > noise) & (jnp.abs(size) > _least(new[None], s, A, there)[0])
+
+
+def _least(at: Array, s: Array, A: Array, there: Array) -> Array:
+    """What a line at `at` must have to be more than round-off of the lines beside it.
+
+    One that was fitted before its neighbour had settled ends below this, and is taken out.
+    """
+    beside = there[None, :] & (jnp.abs(s[None, :] - at[:, None]) < np.pi)
+    stronger = jnp.where(beside, jnp.abs(A)[None, :], 0.0)
+    return jnp.maximum(_ECHO * jnp.max(stronger, axis=1), _FLOOR)
+
+
+def _correction(grid, s, A, rest, there, with_frequencies: bool, damping):
+    r"""The Gauss–Newton step on Σ χ |z − Σ_k A_k e^{is_k y}|² in all A_k and s_k.
+
+    With e_k = e^{is_k y} A_k/|A_k| the model changes by e_k a + i e_k b + i y e_k g, real a, b, g;
+    then A_k changes by (a + ib) A_k/|A_k| and s_k by g/|A_k|. Scalar products of these columns
+    are the window's transform and its derivatives: no sum over samples. The damping is of g alone:
+    without frequencies the problem is linear.
+    """
+    free = there.at[0].set(False) & with_frequencies
+    mask = jnp.concatenate([there, there, free])
+    length = jnp.abs(A)
+    unit = jnp.where(length > 0, A / jnp.where(length > 0, length, 1.0), 1.0)
+    m = jnp.conj(unit)[None, :] * _moments(grid, grid.weights * rest, s)
+    W, W1, W2 = _kernel(grid, s[None, :] - s[:, None])
+    turn = jnp.conj(unit)[:, None] * unit[None, :]
+    G0, G1, G2 = turn * W, turn * (-1j * W1), turn * (-W2)
+    M = jnp.block([
+        [G0.real, -G0.imag, -G1.imag],
+        [G0.imag, G0.real, G1.real],
+        [G1.imag, G1.real, G2.real],
+    ])  # fmt: skip
+    K = s.shape[0]
+    ridge = 1e-14 + jnp.concatenate([jnp.zeros(2 * K), jnp.broadcast_to(damping, (K,))])
+    M = jnp.where(mask[:, None] & mask[None, :], M, 0.0) + jnp.diag(jnp.where(mask, ridge, 1.0))
+    rhs = jnp.where(mask, jnp.concatenate([m[0].real, m[0].imag, m[1].imag]), 0.0)
+    a, b, g = jnp.linalg.solve(M, rhs).reshape(3, K)
+    return unit * (a + 1j * b), g / jnp.where(length > 0, length, 1.0)
+
+
+def _fitted(grid, blocks, s, A, there, with_frequencies: bool) -> tuple[Array, Array]:
+    """A few steps of least squares, more and more damped where one does not make the rest less."""
+
+    def of(s, A):
+        rest = blocks - _synthesis(grid, s, A)
+        return rest, jnp.sum(grid.weights * jnp.abs(rest) ** 2)
+
+    def step(_, now):
+        s, A, rest, cost, damping = now
+        change, moved = _correction(grid, s, A, rest, there, with_frequencies, damping)
+        s, A = s + jnp.clip(moved, -np.pi / 4, np.pi / 4), A + change
+        new = (s, A, *of(s, A), jnp.zeros(()))
+        better = new[3] <= cost * (1 + 1e-9) + EPS**2
+        old = (*now[:4], jnp.maximum(10 * damping, 1e-2))
+        return tuple(jnp.where(better, x, y) for x, y in zip(new, old, strict=True))
+
+    begin = (s, A, *of(s, A), jnp.zeros(()))
+    s, A, *_ = lax.fori_loop(0, _EACH if with_frequencies else 1, step, begin)
+    return s, A
