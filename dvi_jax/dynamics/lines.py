@@ -21,6 +21,9 @@ _FLOOR = 256 * EPS
 _ECHO = 1e-9
 """A line within the resolution of one stronger by this ratio is what round-off left of that."""
 
+_RIDGE = 1e-13
+"""Added to a diagonal of ones: lines that fall together leave no room for a negative pivot."""
+
 _SETTLED = 1e-2
 """Last correction to a frequency, over the resolution, up to which it is taken as found."""
 
@@ -261,30 +264,50 @@ def _least(at: Array, s: Array, A: Array, there: Array) -> Array:
 def _correction(grid, s, A, rest, there, with_frequencies: bool, damping):
     r"""The Gauss–Newton step on Σ χ |z − Σ_k A_k e^{is_k y}|² in all A_k and s_k.
 
-    With e_k = e^{is_k y} A_k/|A_k| the model changes by e_k a + i e_k b + i y e_k g, real a, b, g;
-    then A_k changes by (a + ib) A_k/|A_k| and s_k by g/|A_k|. Scalar products of these columns
-    are the window's transform and its derivatives: no sum over samples. The damping is of g alone:
-    without frequencies the problem is linear.
+    With e_k = e^{is_k y} A_k/|A_k| the model changes by c_k e_k + i g_k y e_k, complex c, real g;
+    then A_k changes by c_k A_k/|A_k| and s_k by g_k/|A_k|. With G_m = ⟨e_k, y^m e_j⟩, which are the
+    window's transform and its derivatives, and r_m = ⟨rest, y^m e_j⟩, the normal equations
+
+        G_0 c + i G_1 g = r_0,      Im(G_1 c) + Re(G_2) g = Im r_1
+
+    are solved for g first. The damping is of g alone: without frequencies the problem is linear.
     """
-    free = there.at[0].set(False) & with_frequencies
-    mask = jnp.concatenate([there, there, free])
-    length = jnp.abs(A)
+    length, K = jnp.abs(A), s.shape[0]
     unit = jnp.where(length > 0, A / jnp.where(length > 0, length, 1.0), 1.0)
-    m = jnp.conj(unit)[None, :] * _moments(grid, grid.weights * rest, s)
+    both = there[:, None] & there[None, :]
+    r = jnp.where(
+        there[None, :], jnp.conj(unit)[None, :] * _moments(grid, grid.weights * rest, s), 0.0
+    )
     W, W1, W2 = _kernel(grid, s[None, :] - s[:, None])
-    turn = jnp.conj(unit)[:, None] * unit[None, :]
-    G0, G1, G2 = turn * W, turn * (-1j * W1), turn * (-W2)
-    M = jnp.block([
-        [G0.real, -G0.imag, -G1.imag],
-        [G0.imag, G0.real, G1.real],
-        [G1.imag, G1.real, G2.real],
-    ])  # fmt: skip
-    K = s.shape[0]
-    ridge = 1e-14 + jnp.concatenate([jnp.zeros(2 * K), jnp.broadcast_to(damping, (K,))])
-    M = jnp.where(mask[:, None] & mask[None, :], M, 0.0) + jnp.diag(jnp.where(mask, ridge, 1.0))
-    rhs = jnp.where(mask, jnp.concatenate([m[0].real, m[0].imag, m[1].imag]), 0.0)
-    a, b, g = jnp.linalg.solve(M, rhs).reshape(3, K)
-    return unit * (a + 1j * b), g / jnp.where(length > 0, length, 1.0)
+    turn = jnp.where(both, jnp.conj(unit)[:, None] * unit[None, :], 0.0)
+    G0 = turn * W + jnp.diag(jnp.where(there, _RIDGE, 1.0))
+    if not with_frequencies:
+        return unit * _solved(G0, r[0][:, None])[:, 0], jnp.zeros(K)
+    G1, G2 = turn * (-1j * W1), turn * (-W2)
+    solved = _solved(G0, jnp.concatenate([G1, r[0][:, None]], axis=1))
+    against = G1 @ solved
+    free = there.at[0].set(False)  # the constant stays one
+    S = jnp.where(free[:, None] & free[None, :], jnp.real(G2 - against[:, :K]), 0.0)
+    S = S + jnp.diag(jnp.where(free, _RIDGE + damping, 1.0))
+    rhs = jnp.where(free, jnp.imag(r[1] - against[:, K]), 0.0)
+    g = _solved(S, rhs[:, None])[:, 0]
+    c = solved[:, K] - 1j * (solved[:, :K] @ g.astype(complex))
+    return unit * c, g / jnp.where(length > 0, length, 1.0)
+
+
+def _solved(M: Array, B: Array) -> Array:
+    """M⁻¹ B of a positive definite M, by elimination without pivots.
+
+    A batch of small systems goes through together. LAPACK takes them one by one, each with the
+    threads that it finds: a hundred times slower where these have to wait for one another.
+    """
+    K = M.shape[0]
+
+    def eliminate(i, T):
+        row = T[i] / T[i, i]
+        return (T - T[:, i][:, None] * row[None, :]).at[i].set(row)
+
+    return lax.fori_loop(0, K, eliminate, jnp.concatenate([M, B], axis=1))[:, K:]
 
 
 def _fitted(grid, blocks, s, A, there, with_frequencies: bool) -> tuple[Array, Array]:
@@ -304,5 +327,5 @@ def _fitted(grid, blocks, s, A, there, with_frequencies: bool) -> tuple[Array, A
         return tuple(jnp.where(better, x, y) for x, y in zip(new, old, strict=True))
 
     begin = (s, A, *of(s, A), jnp.zeros(()))
-    s, A, *_ = lax.fori_loop(0, _EACH if with_frequencies else 1, step, begin)
+    s, A, *_ = lax.fori_loop(0, _EACH, step, begin)
     return s, A
