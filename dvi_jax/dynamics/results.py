@@ -27,8 +27,9 @@ class FREQUENCY_RESULTS(eqx.Enumeration):
         "dvi.Save(every=m) on the lattice dvi.Uniform()."
     )
     no_signal = (
-        "The signal is constant to round-off: it has no frequency. Likely causes: (a) the start is "
-        "an equilibrium; (b) this degree of freedom is not excited."
+        "The signal has no line: it is constant to round-off, or noise. Likely causes: (a) the "
+        "start is an equilibrium; (b) this degree of freedom is not excited; (c) too few samples "
+        "for lines in so much noise."
     )
     window_too_short = (
         "The leading line has fewer periods within the window than its main lobe needs, window + "

@@ -1,0 +1,315 @@
+"""Frequency analysis: planted tori, orders in the window, statuses, an outside reference."""
+
+import functools
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+import dvi_jax as dvi
+from dvi_jax import dynamics, systems
+from dvi_jax.dynamics import FREQUENCY_RESULTS, FrequencyError, frequencies, frequency_diffusion
+
+N, COUNT = 2048, 5
+TS = 3.0 + 0.5 * np.arange(N)
+BIN = 2 * np.pi / (N * 0.5)
+OMEGA = np.array([1.0, -0.61803398875, 2.3456, 0.0703])
+AMPLITUDES = np.array([1.0, 0.3j, 0.1 + 0.05j, 1e-3])
+
+
+def torus(ts=TS, omega=OMEGA, amplitudes=AMPLITUDES):
+    return np.exp(1j * np.outer(ts, omega)) @ amplitudes
+
+
+def pair(bins, ratio):
+    """Two lines at a distance in units of the resolution, and a third."""
+    return torus(omega=[1, 1 + bins * BIN, -0.7], amplitudes=[1, ratio * np.exp(0.7j), 0.2])
+
+
+SIGNALS = {
+    "successful": 0.2 + 0.1j + torus(),
+    "not_finite": np.where(np.arange(N) == 700, np.nan, torus()),
+    "no_signal": np.full(N, 0.3 + 0.1j),
+    "window_too_short": np.exp(2.5j * BIN * TS) + 1e-3 * np.exp(1j * TS),
+    "aliased": np.exp(0.95j * np.pi / 0.5 * TS),
+    "unresolved": pair(0.6, 0.5),
+    "not_converged": np.exp(1j * (TS + 1e-3 * TS**2)),
+    "zero": np.zeros(N, complex),
+    "drift": TS + 0j,
+    "noise": np.random.default_rng(3).standard_normal(N) + 0j,
+    "noisy": torus() + 0.1 * np.random.default_rng(4).standard_normal((2, N)).T @ [1, 1j],
+    "small": 1e-200 * torus(),
+    **{f"pair {bins:g}": pair(bins, ratio) for bins, ratio in ((1.2, 1), (1.5, 0.01), (2, 0.5))},
+    **{f"near {bins:g}": pair(bins, 1) for bins in (0.2, 0.4, 0.8)},
+}
+NAMES = list(SIGNALS)
+
+
+@functools.cache
+def analysed():
+    """All of them in one batch."""
+    return frequencies(TS, np.stack(list(SIGNALS.values())), count=COUNT, throw=False)
+
+
+def of(name):
+    return jax.tree.map(lambda x: x[NAMES.index(name)], analysed())
+
+
+@functools.cache
+def compiled():
+    return jax.jit(lambda ts, z: frequencies(ts, z, count=COUNT, throw=False))
+
+
+@pytest.mark.parametrize("name", ["successful", "small"])
+def test_lines_of_a_torus_are_found_to_round_off(name):
+    found, size = of(name), 1e-200 if name == "small" else 1.0
+    assert found.status == "successful"
+    np.testing.assert_allclose(found.frequencies[:4], OMEGA, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found.amplitudes[:4] / size, AMPLITUDES, rtol=0, atol=1e-12)
+    assert np.isnan(found.frequencies[4])  # there is no fifth
+    assert np.isnan(found.amplitudes[4])
+    assert found.residual < 1e-13
+    assert found.resolution == pytest.approx(BIN)
+    if name == "successful":
+        assert abs(found.constant - (0.2 + 0.1j)) < 1e-14
+        np.testing.assert_allclose(found.evaluate(TS), SIGNALS[name], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", dynamics.results.NAMES[1:8])
+def test_what_has_no_frequency_has_a_status(name):
+    if name == "irregular_times":  # outside of jit it is refused at once
+        ts = TS + 1e-3 * np.sin(TS)
+        found = compiled()(ts, torus())
+    else:
+        found = of(name)
+    assert found.status == name
+    assert len(FREQUENCY_RESULTS[getattr(FREQUENCY_RESULTS, name)]) > 80
+    if name in ("unresolved", "not_converged"):
+        assert np.isnan(found.frequencies[:2]).any()
+    else:
+        assert np.isnan(found.frequencies).all()
+        assert np.isnan(found.amplitudes).all()
+        assert np.isnan(found.residual)
+
+
+@pytest.mark.parametrize(
+    ("name", "status"),
+    [("zero", "no_signal"), ("noise", "no_signal"), ("drift", "window_too_short")],
+)
+def test_no_number_is_made_of_nothing(name, status):
+    assert of(name).status == status
+    assert np.isnan(of(name).frequencies).all()
+
+
+def test_a_batch_keeps_its_good_signals_and_the_error_what_was_found():
+    z = np.stack([torus(), np.full(N, np.nan), np.zeros(N)])
+    with pytest.raises(FrequencyError, match=r"2 of 3 signals.*number \(1,\): not_finite") as info:
+        frequencies(TS, z, count=COUNT)
+    assert list(info.value.found.status) == ["successful", "not_finite", "no_signal"]
+    np.testing.assert_allclose(info.value.found.frequencies[0, :4], OMEGA, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("pair")])
+def test_near_lines_do_not_bias_one_another(name):
+    bins = float(name.split()[1])
+    found = of(name)
+    assert found.status == "successful"
+    lines = np.sort(found.frequencies[:3])
+    np.testing.assert_allclose(lines, [-0.7, 1, 1 + bins * BIN], rtol=0, atol=1e-12)
+
+
+def test_without_joint_refinement_they_do():
+    z = np.stack([SIGNALS["pair 2"], SIGNALS["pair 1.5"]])
+    found = frequencies(TS, z, count=3, refine=False, throw=False)
+    first = np.asarray(found.frequencies)[0, 0]
+    assert np.isnan(first) or abs(first - 1) > 1e-5
+    assert found.residual[0] > 1e-5
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("near")])
+def test_lines_closer_than_the_resolution_are_never_given(name):
+    found = of(name)
+    assert found.status == "unresolved"
+    given = np.asarray(found.frequencies)
+    np.testing.assert_allclose(given[np.isfinite(given)], [-0.7], atol=1e-4)
+
+
+def test_noise_is_left_over():
+    found = of("noisy")
+    assert found.status == "successful"
+    # Cramér and Rao: the variance of ω is 6 σ²/(A² h² N³); Hann's windows lose a factor of a few.
+    sigma = np.sqrt(6 * 0.02 / 2 / (0.25 * N**3))
+    error = np.abs(found.frequencies[:3] - OMEGA[:3]) * np.abs(AMPLITUDES[:3])
+    assert (error < 8 * sigma).all()
+    assert np.isnan(found.frequencies[3:]).all()  # the line of 1e-3 is below the noise
+    total = np.sqrt(np.sum(np.abs(AMPLITUDES) ** 2) + 0.02)
+    assert found.residual == pytest.approx(np.sqrt(0.02) / total, rel=0.1)
+
+
+@pytest.mark.parametrize("window", [0, 1, 2])
+def test_the_bias_of_a_line_not_fitted_falls_with_the_window(window):
+    """|δω| ∝ T^−(2·window + 2): Laskar 1999."""
+    spans = np.repeat([1.0, 2.0, 4.0], 8)  # the spacing grows and the number of samples stays
+    starts = np.tile(np.linspace(0, 7, 8), 3)
+    ts = starts[:, None] + 0.125 * spans[:, None] * np.arange(1024)
+    z = np.stack([torus(t, OMEGA[:3], AMPLITUDES[:3]) for t in ts])
+    found = frequencies(ts, z, count=1, window=window)
+    errors = np.abs(found.frequencies[:, 0] - 1).reshape(3, 8).max(axis=1)
+    order = np.log2(errors[0] / errors[2]) / 2
+    assert order == pytest.approx(2 * window + 2, abs=0.5)
+    if window == 0:
+        assert errors[-1] > 1e-7  # the control: a bare Fourier transform misses 1e-9
+    if window == 2:
+        assert errors[-1] < 1e-11
+
+
+def test_a_real_signal_has_lines_of_positive_frequency():
+    x = 0.7 + np.cos(TS + 0.3) + 0.2 * np.sin(2.2 * TS)
+    found = frequencies(TS, x, count=3)
+    np.testing.assert_allclose(found.frequencies[:2], [1, 2.2], rtol=0, atol=1e-13)
+    expected = [np.exp(0.3j), -0.2j]
+    np.testing.assert_allclose(found.amplitudes[:2], expected, rtol=0, atol=1e-12)
+    assert found.constant == pytest.approx(0.7, abs=1e-13)
+    np.testing.assert_allclose(found.evaluate(TS), x, rtol=0, atol=1e-12)
+
+
+def test_against_the_frequency_analysis_of_rebound():
+    rebound = pytest.importorskip("rebound")
+    if not hasattr(rebound, "frequency_analysis"):
+        pytest.skip("this rebound has no frequency_analysis")
+    z, reach = torus(), np.pi * 0.99
+    data = np.stack([z.real, z.imag], axis=1).ravel()
+    omega, size, _ = rebound.frequency_analysis(
+        data, type="fmft2", nfreq=4, minfreq=-reach, maxfreq=reach
+    )
+    found = frequencies(TS, z, count=COUNT)
+    ours = np.asarray(found.frequencies[:4])
+    np.testing.assert_allclose(omega / 0.5, ours, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(size, np.abs(found.amplitudes[:4]), rtol=0, atol=1e-8)
+    assert np.abs(ours - OMEGA).max() < 1e-3 * np.abs(omega / 0.5 - OMEGA).max()
+
+
+def test_jit_and_vmap_change_nothing():
+    z = np.stack([SIGNALS[name] for name in ("successful", "noisy", "pair 2")])
+    eager = frequencies(TS, z, count=COUNT)
+    single = [frequencies(TS, row, count=COUNT) for row in z]
+    mapped = jax.vmap(lambda row: frequencies(TS, row, count=COUNT))(z)
+    jitted = compiled()(TS, jnp.asarray(z[0]))
+    for other in (mapped.frequencies, np.stack([s.frequencies for s in single])):
+        np.testing.assert_allclose(other, eager.frequencies, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(jitted.frequencies, eager.frequencies[0], rtol=0, atol=1e-13)
+    assert list(mapped.status) == ["successful"] * 3
+
+
+def test_under_jit_a_failure_is_an_error_too():
+    strict = jax.jit(lambda z: frequencies(TS, z, count=COUNT).frequencies)
+    np.testing.assert_allclose(strict(torus())[:4], OMEGA, rtol=0, atol=1e-13)
+    with pytest.raises(Exception, match="constant to round-off"):
+        jax.block_until_ready(strict(np.zeros(N, complex)))
+
+
+def test_a_frequency_can_be_differentiated():
+    ts = 0.5 * np.arange(256)
+
+    def leading(a):
+        z = jnp.exp(1j * a * ts) + 0.3 * jnp.exp(2j * a**2 * ts)
+        return frequencies(ts, z, count=2).frequencies
+
+    expected = [1.0, 4 * 1.1]
+    np.testing.assert_allclose(jax.jacfwd(leading)(1.1), expected, rtol=1e-9)
+    np.testing.assert_allclose(jax.jacrev(leading)(1.1), expected, rtol=1e-9)
+
+
+def pendulum(t0, t1, q, p, args):
+    return jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q))
+
+
+@functools.cache
+def swing():
+    return dvi.integrate(
+        dvi.System(pendulum), [2.0], [0.0], h=0.05, num_steps=8188, method=dvi.KahanLi(8),
+        save=dvi.Save(every=4),
+    )  # fmt: skip
+
+
+def test_pendulum_swings_at_the_frequency_of_the_elliptic_integral():
+    """π/(2K(k)), k = sin(q0/2); q − i p turns forward."""
+    omega = np.pi / (2 * special.ellipk(np.sin(1.0) ** 2))
+    found = frequencies(swing(), count=COUNT)
+    assert found.frequencies.shape == (1, COUNT)
+    assert found.frequencies[0, 0] == pytest.approx(omega, rel=1e-11)
+    odd = np.array([1, -1, 3, -3, 5])
+    np.testing.assert_allclose(found.frequencies[0] / omega, odd, rtol=1e-7)
+    assert frequency_diffusion(swing()).rate[0] < -10
+    coarse = dvi.integrate(dvi.System(pendulum), [2.0], [0.0], h=0.2, num_steps=N - 1)
+    wrong = frequencies(coarse, count=COUNT).frequencies[0, 0]
+    assert abs(wrong - omega) > 1e-4 * omega  # the control: the map's own frequency, order 1
+
+
+def test_diffusion_tells_chaos_from_order():
+    problem = systems.henon_heiles()
+
+    def start(y, py, E):
+        return [0.0, y], [np.sqrt(2 * E - py**2 - y**2 + 2 * y**3 / 3), py]
+
+    starts = [start(0.1, 0.2, 1 / 12), start(0.3, 0.0, 1 / 8), start(-0.1, 0.0, 0.165),
+              start(0.0, 0.1, 0.165)]  # fmt: skip
+    q, p = jnp.asarray(starts).transpose(1, 0, 2)
+    sols = jax.vmap(
+        lambda q, p: dvi.integrate(
+            problem.system, q, p, h=0.1, num_steps=10 * N, method=dvi.KahanLi(6),
+            save=dvi.Save(every=5),
+        )
+    )(q, p)  # fmt: skip
+    moved = frequency_diffusion(sols, throw=False)
+    assert moved.rate.shape == (4, 2)
+    assert (moved.status == "successful").all()
+    assert (moved.rate[:2] < -7).all()
+    assert (moved.rate[2:] > -3).all()
+
+
+def test_diffusion_of_what_failed_is_no_number():
+    z = np.stack([torus(), np.where(np.arange(N) > 1500, np.nan, torus())])
+    moved = frequency_diffusion(TS, z, throw=False)
+    assert list(moved.status) == ["successful", "not_finite"]
+    assert moved.rate[0] < -11
+    assert np.isnan([moved.rate[1], moved.first[1], moved.second[1]]).all()
+    with pytest.raises(FrequencyError, match="not_finite"):
+        frequency_diffusion(TS, z)
+
+
+IRREGULAR = TS + 1e-3 * np.sin(TS)
+
+
+@pytest.mark.parametrize(
+    ("give", "error", "words"),
+    [
+        (lambda: frequencies(IRREGULAR, torus()), ValueError, "not uniform.*dvi.Uniform"),
+        (lambda: frequencies(TS * 0, torus()), ValueError, "not uniform"),
+        (lambda: frequencies(TS[:20], torus()[:20]), ValueError, "at least 32 samples, got 20"),
+        (lambda: frequencies(TS[:-1], torus()), ValueError, "one length along their last axis"),
+        (lambda: frequencies(TS, torus()[:, None]), ValueError, "signal.T"),
+        (lambda: frequencies(np.stack([TS] * 3), torus()), ValueError, "do not go with"),
+        (lambda: frequencies(TS), ValueError, "needs a signal"),
+        (lambda: frequencies(torus(), TS), TypeError, "takes the times first"),
+        (lambda: frequencies(TS, ["a"] * N), TypeError, "array of numbers"),
+        (lambda: frequencies(TS, torus(), count=0), ValueError, "positive integer, got 0"),
+        (lambda: frequencies(TS, torus(), count=2.0), ValueError, "positive integer, got 2.0"),
+        (lambda: frequencies(TS[:64], torus()[:64], count=22), ValueError, "66 unknowns"),
+        (lambda: frequencies(TS, torus(), window=6), ValueError, "from 0 to 5, got 6"),
+        (lambda: frequencies(swing(), torus()), ValueError, "brings its own signal"),
+        (lambda: frequency_diffusion(TS[:60], torus()[:60]), ValueError, "at least 64"),
+    ],
+)
+def test_bad_input_is_refused_in_words(give, error, words):
+    with pytest.raises(error, match=words):
+        give()
+
+
+def test_single_precision_alone_is_refused(monkeypatch):
+    monkeypatch.setattr(sys.modules["dvi_jax.dynamics.frequencies"], "x64_enabled", lambda: False)
+    with pytest.raises(TypeError, match="jax_enable_x64"):
+        frequencies(TS.astype(np.float32), torus().astype(np.complex64))
