@@ -44,21 +44,6 @@ def pendulum(out):
     return plot.save(axis, out / "phase_portrait.png")
 
 
-def henon_heiles_orbits(count, num_steps, energy, h=0.1, **more):
-    """Orbits of one energy that start on x = 0, at rest in y, and their solutions."""
-    problem = systems.henon_heiles()
-    y = jnp.linspace(-0.3, 0.6, count)
-    px = jnp.sqrt(2 * energy - y**2 + 2 * y**3 / 3)
-
-    def run(y, px):
-        q, p = jnp.stack([0 * y, y]), jnp.stack([px, 0 * y])
-        return dvi.integrate(
-            problem.system, q, p, h=h, num_steps=num_steps, method=dvi.Yoshida(4), **more
-        )
-
-    return y, run, jax.vmap(run)(y, px), px
-
-
 def two_degrees(out):
     """One regular orbit in the two planes (q, p) and in the plane of positions."""
     problem = systems.henon_heiles()
@@ -193,46 +178,43 @@ def drift_orders(out):
 # --- chaos --------------------------------------------------------------------------------------
 
 
-def growth(run, y, px):
-    """Times and the size of a tangent vector along every orbit, from the derivative of the run."""
-
-    def states(q, p):
-        sol = run(q, p)
-        return sol.qs, sol.ps, sol.ts
-
-    def one(y, px):
-        # Along y at rest: p_x keeps the energy, to first order.
-        (_, _, ts), (dq, dp, _) = jax.jvp(states, (y, px), (1.0, -(y - y**2) / px))
-        return ts, jnp.sqrt(jnp.sum(dq**2, -1) + jnp.sum(dp**2, -1))
-
-    return jax.vmap(one)(y, px)
-
-
 def chaos(out):
-    """A section coloured by the exponent of each orbit, and the indicators along time."""
-    crossing = dvi.Section(lambda t, q, p, args: q[0], direction=1, max_crossings=400)
-    y, run, sol, px = henon_heiles_orbits(
-        48, 20_000, 1 / 8, save=dvi.Save(every=20), observe={"section": crossing},
-        adjoint=dvi.Direct(),
+    """A section coloured by the MEGNO of each orbit, and indicators along time."""
+    problem, energy, count = systems.henon_heiles(), 1 / 8, 48
+    y = np.linspace(-0.3, 0.6, count)
+    q = np.stack([0 * y, y], 1)
+    p = np.stack([np.sqrt(2 * energy - y**2 + 2 * y**3 / 3), 0 * y], 1)
+    settings = {"h": 0.1, "method": dvi.Yoshida(4)}
+    crossed = dvi.poincare_section(
+        problem.system, q, p, lambda t, q, p, args: q[0], num_steps=30_000, crossings=400,
+        **settings,
     )  # fmt: skip
-    ts, size = growth(run, y, px)
-    t, size = np.asarray(ts)[:, 1:], np.asarray(size)
-    exponents = np.log(size[:, 1:] / size[:, :1]) / t
-    rates = np.diff(np.log(size), axis=1)
-    megno = 2 * np.cumsum(rates * t, 1) / t
-    megno = np.cumsum(megno, 1) / np.arange(1, megno.shape[1] + 1)
+    watched = {
+        "lyapunov": dvi.Running(dvi.LyapunovSpectrum(1)), "megno": dvi.Running(dvi.MEGNO()),
+        "gali": dvi.Running(dvi.GALI(3)),
+    }  # fmt: skip
+
+    def run(q, p):
+        return dvi.integrate(
+            problem.system, q, p, num_steps=20_000, save=dvi.Save(every=20), observe=watched,
+            **settings,
+        )  # fmt: skip
+
+    sol = jax.vmap(run)(jnp.asarray(q), jnp.asarray(p))
+    found = {name: np.asarray(x) for name, x in sol.observed.items()}
     axis = plot.section(
-        sol, colour=np.log10(exponents[:, -1]), colour_label="log$_{10}$ Lyapunov exponent",
+        crossed, colour=np.log10(found["megno"][:, -1]), colour_label="log$_{10}$ MEGNO",
         title="Hénon and Heiles, energy 1/8",
     )  # fmt: skip
     yield plot.save(axis, out / "section.png")
-    few = [4, 20, 32, 44]
+    few, t = [4, 20, 32, 44], np.asarray(sol.ts)[0, 1:]
     with plot.style():
-        figure, axes = plt.subplots(1, 2, figsize=(10.6, 4.2))
-        names = [f"y$_0$ = {v:.2f}".replace("-", "−") for v in np.asarray(y)[few]]
-        plot.indicator(t[few], exponents[few], "lyapunov", labels=names, ax=axes[0])
-        plot.indicator(t[few], megno[few], "megno", labels=names, ax=axes[1])
+        figure, axes = plt.subplots(1, 3, figsize=(14.0, 4.2))
+        names = [f"y$_0$ = {v:.2f}".replace("-", "−") for v in y[few]]
+        plot.indicator(t, found["lyapunov"][few, :, 0], "lyapunov", labels=names, ax=axes[0])
+        plot.indicator(t, found["megno"][few], "megno", labels=names, ax=axes[1])
         axes[1].set_ylim(0, 12)
+        plot.indicator(t, found["gali"][few, :, 1], "gali", labels=names, ax=axes[2])
         yield plot.save(figure, out / "indicators.png")
 
 
@@ -240,20 +222,15 @@ def duffing(out):
     """What a damped spring does once a period of the force that drives it, over its size."""
     system = dvi.System(
         lambda t0, t1, q0, p1, args: jnp.sum(p1**2) / 2 - jnp.sum(q0**2) / 2 + jnp.sum(q0**4) / 4,
-        force=lambda t0, t1, q0, p1, args: -0.3 * p1 + args * jnp.cos(1.2 * t0),
+        force=lambda t0, t1, q0, p1, args: -0.3 * p1 + args["gamma"] * jnp.cos(1.2 * t0),
     )
-    gamma = jnp.linspace(0.2, 0.65, 450)
-
-    def run(size):
-        return dvi.integrate(
-            system, [1.0], [0.0], h=2 * np.pi / 1.2 / 60, num_steps=60 * 150, epsilon=1.0,
-            args=size, save=dvi.Save(final=True), method=dvi.Strang(),
-            observe=dvi.Section(lambda t, q, p, args: jnp.sin(1.2 * (t + 0.01)), 1, 150),
-        )  # fmt: skip
-
-    sol = jax.vmap(run)(gamma)
+    gamma, period = np.linspace(0.2, 0.65, 450), 2 * np.pi / 1.2
+    found = dvi.bifurcation(
+        system, [1.0], [0.0], dvi.stroboscope(period), h=period / 60, num_steps=60 * 152,
+        epsilon=1.0, args={"gamma": dvi.Axis("gamma", gamma)}, skip=90, crossings=60,
+    )  # fmt: skip
     axis = plot.bifurcation(
-        gamma, sol.observed, skip=90, name="size of the driving force", title="Duffing's oscillator"
+        gamma, found, name="size of the driving force", title="Duffing's oscillator"
     )
     return plot.save(axis, out / "bifurcation.png")
 
@@ -261,51 +238,35 @@ def duffing(out):
 # --- frequencies --------------------------------------------------------------------------------
 
 
-def lines(signal, step, count):
-    """The strongest lines of a signal: peaks of its spectrum within a Hann window, refined."""
-    n = signal.shape[-1]
-    window = np.hanning(n) * 2
-    found = []
-    k = np.arange(n)
-    for _ in range(count):
-        power = np.abs(np.fft.fft(signal * window)) / n
-        at = int(np.argmax(power))
-        left, mid, right = np.log(power[[at - 1, at, (at + 1) % n]])
-        w = 2 * np.pi * (at + (left - right) / (2 * (left - 2 * mid + right))) / n
-        wave = np.exp(1j * (w if w < np.pi else w - 2 * np.pi) * k)
-        a = np.vdot(wave, signal * window) / n
-        signal = signal - a * wave
-        found.append(((w if w < np.pi else w - 2 * np.pi) / step, a))
-    return np.array([f for f, _ in found]), np.array([a for _, a in found])
-
-
 def frequencies(out):
     """Lines of a regular orbit, and the frequencies of many as they change."""
-    problem = systems.henon_heiles()
+    problem, energy = systems.henon_heiles(), 1 / 8
+    settings = {"h": 0.1, "method": dvi.Yoshida(4)}
     sol = dvi.integrate(
-        problem.system, problem.q0, problem.p0, h=0.1, num_steps=16_384, method=dvi.Yoshida(4),
-        save=dvi.Save(every=4),
+        problem.system, problem.q0, problem.p0, num_steps=16_384, save=dvi.Save(every=4),
+        **settings,
     )  # fmt: skip
-    z = np.asarray(sol.qs - 1j * sol.ps)
-    pairs = [lines(z[:, i], 0.4, 7) for i in range(2)]
+    found = dvi.frequencies(sol, count=7)
     with plot.style():
         figure, axes = plt.subplots(1, 2, figsize=(10.8, 4.2), width_ratios=(5, 4))
         plot.spectrum(
-            np.stack([w for w, _ in pairs]), np.stack([a for _, a in pairs]), labels=["x", "y"],
-            title="Lines of an orbit of Hénon and Heiles", ax=axes[0],
-        )  # fmt: skip
-        _, _, many, _ = henon_heiles_orbits(120, 16_384, 1 / 8, save=dvi.Save(every=8))
-        z = np.asarray(many.qs - 1j * many.ps)
-        half = z.shape[1] // 2
-        w = np.array(
-            [[[lines(z[b, s, i], 0.8, 1)[0][0] for i in range(2)]
-              for s in (slice(0, half), slice(half, 2 * half))] for b in range(len(z))]
-        )  # fmt: skip
-        moved = np.log10(np.abs(w[:, 1] / w[:, 0] - 1).max(-1) + 1e-16)
+            found, labels=["x", "y"], title="Lines of an orbit of Hénon and Heiles", ax=axes[0]
+        )
+        y = jnp.linspace(-0.3, 0.6, 120)
+        px = jnp.sqrt(2 * energy - y**2 + 2 * y**3 / 3)
+
+        def run(y, px):
+            q, p = jnp.stack([0 * y, y]), jnp.stack([px, 0 * y])
+            return dvi.integrate(
+                problem.system, q, p, num_steps=16_384, save=dvi.Save(every=8), **settings
+            )
+
+        many = dvi.frequency_diffusion(jax.vmap(run)(y, px), throw=False)
+        w = np.abs(np.asarray(many.first))
+        moved = np.max(np.asarray(many.rate), axis=-1)
         plot.frequency_map(
-            np.abs(w[:, 0, 0]), np.abs(w[:, 0, 1]), moved, resonances=[(1, -1)],
-            title="Energy 1/8", ax=axes[1],
-        )  # fmt: skip
+            w[:, 0], w[:, 1], moved, resonances=[(1, -1)], title="Energy 1/8", ax=axes[1]
+        )
         return plot.save(figure, out / "frequencies.png")
 
 

@@ -115,6 +115,21 @@ def test_crossings_that_are_skipped():
     assert np.array_equal(later.count, whole.count - 30)
 
 
+def test_a_section_and_a_bifurcation_are_drawn():
+    """As many points as there are crossings; that there were more than asked for is no news."""
+    plot = pytest.importorskip("dvi_jax.plot")
+    found = portrait(8, 50, 8000)
+    axis = plot.section(found)
+    drawn = sum(len(c.get_offsets()) for c in axis.collections)
+    assert drawn == 8 * 50
+    texts = [t.get_text() for of in (axis.get_legend(), *axis.figure.legends) if of
+             for t in of.get_texts()]  # fmt: skip
+    assert not any("more often" in t for t in texts)
+    axis = plot.bifurcation(np.arange(8.0), found)
+    assert sum(len(c.get_offsets()) for c in axis.collections) == 8 * 50
+    plot.plt.close("all")
+
+
 # Statuses
 
 

@@ -52,7 +52,8 @@ def section(
 ) -> Any:
     """Where orbits crossed a surface (Poincaré 1892), a point for each crossing.
 
-    - `crossings`: a `dvi.Crossings` of one orbit or of a batch, or a `Solution` that observed one.
+    - `crossings`: a `dvi.PoincareSection`, a `dvi.Crossings` of one orbit or of a batch, or a
+      `Solution` that observed one.
     - `x`, `y`: what is drawn: "q[0]", "p[-1]", of bodies "q[0, 2]"; or a function ``(q, p)`` →
       number of one state, e.g. of an angle that is to be folded.
     - `colour`: a number for each orbit, such as its MEGNO, told by a bar with `colour_label` from
@@ -136,7 +137,10 @@ def _points_of(crossings: Any, what: str) -> _Points:
     if qs.ndim == ts.ndim:
         qs, ps = qs[..., None], ps[..., None]
     shape = (math.prod(ts.shape[:-1]), *qs.shape[ts.ndim - 1 :])
-    return _Points(qs.reshape(shape), ps.reshape(shape), np.ravel(np.asarray(one.count)))
+    counts = np.ravel(np.asarray(one.count))
+    if hasattr(one, "status"):  # a PoincareSection: just so many were asked for
+        counts = np.minimum(counts, ts.shape[-1])
+    return _Points(qs.reshape(shape), ps.reshape(shape), counts)
 
 
 def _crossings_in(tree: Any) -> list[Any]:
