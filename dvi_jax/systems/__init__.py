@@ -1,22 +1,55 @@
-"""Systems that are ready to run: equations, parameters with units, a start, what is known."""
+"""Systems that are ready to run: equations, parameters with units, a start, what is known.
 
-from ._problem import Problem as Problem
+Each is a function without obligatory arguments that returns a `Problem`, and a line in `LIBRARY`,
+by which run files name it and `tests/test_library.py` tests it.
+"""
+
+from ._problem import Adiabatic as Adiabatic, InSlowTime as InSlowTime, Problem as Problem
+from .dipole_field import dipole_field as dipole_field
+from .double_pendulum import double_pendulum as double_pendulum
+from .duffing import duffing as duffing
 from .figure_eight import figure_eight as figure_eight
 from .fput import fput as fput
 from .henon_heiles import henon_heiles as henon_heiles
+from .hill import hill as hill
 from .kepler import kepler as kepler
+from .lorentz_pendulum import lorentz_pendulum as lorentz_pendulum
+from .lotka_volterra import lotka_volterra as lotka_volterra
 from .magnetic_mirror import magnetic_mirror as magnetic_mirror
 from .n_body import n_body as n_body
+from .nls_lattice import nls_lattice as nls_lattice
+from .oblate_kepler import oblate_kepler as oblate_kepler
 from .oscillator import oscillator as oscillator
+from .pendulum import pendulum as pendulum
 from .perturbed_pendulum import perturbed_pendulum as perturbed_pendulum
 from .polar_motion import polar_motion as polar_motion
+from .relativistic_kepler import relativistic_kepler as relativistic_kepler
+from .restricted_three_body import restricted_three_body as restricted_three_body
+from .rigid_body import rigid_body as rigid_body
+from .slow_oscillator import slow_oscillator as slow_oscillator
 from .solar_system import solar_system as solar_system
+from .spinning_top import spinning_top as spinning_top
 from .stiff_fput import stiff_fput as stiff_fput
 from .toda import toda as toda
+from .two_centres import two_centres as two_centres
+from .uniform_field import uniform_field as uniform_field
+from .van_der_pol import van_der_pol as van_der_pol
 
 LIBRARY = {
     "oscillator": oscillator,
+    "duffing": duffing,
+    "van_der_pol": van_der_pol,
+    "slow_oscillator": slow_oscillator,
+    "pendulum": pendulum,
+    "perturbed_pendulum": perturbed_pendulum,
+    "lorentz_pendulum": lorentz_pendulum,
+    "double_pendulum": double_pendulum,
     "kepler": kepler,
+    "relativistic_kepler": relativistic_kepler,
+    "oblate_kepler": oblate_kepler,
+    "two_centres": two_centres,
+    "restricted_three_body": restricted_three_body,
+    "hill": hill,
     "n_body": n_body,
     "figure_eight": figure_eight,
     "solar_system": solar_system,
@@ -24,8 +57,13 @@ LIBRARY = {
     "toda": toda,
     "fput": fput,
     "stiff_fput": stiff_fput,
-    "perturbed_pendulum": perturbed_pendulum,
+    "nls_lattice": nls_lattice,
+    "uniform_field": uniform_field,
     "magnetic_mirror": magnetic_mirror,
+    "dipole_field": dipole_field,
+    "rigid_body": rigid_body,
+    "spinning_top": spinning_top,
     "polar_motion": polar_motion,
+    "lotka_volterra": lotka_volterra,
 }
 """Name → function that makes the `Problem`."""

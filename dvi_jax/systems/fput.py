@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
+from ..symmetry.library import time_translation
 from ._problem import Problem, check_shape
 
 
@@ -80,4 +81,10 @@ def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
         units={"q": "1", "p": "1", "t": "1", "energy": "1"},
         source="Fermi, Pasta & Ulam 1955, Los Alamos report LA-1940",
         check=check_start,
+        parameters={
+            "alpha": "quadratic part of a spring's force [1]",
+            "beta": "cubic part of a spring's force [1]",
+        },
+        invariants=("energy",),
+        symmetries={"time": time_translation()},
     )

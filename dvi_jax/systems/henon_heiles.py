@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from .._system import System
+from ..symmetry.library import time_translation
 from ._problem import Problem, check_shape
 
 ESCAPE_ENERGY = 1 / 6
@@ -50,4 +51,6 @@ def henon_heiles() -> Problem:
         units={"q": "1", "p": "1", "t": "1", "energy": "1"},
         source="Hénon & Heiles 1964, Astron. J. 69, 73",
         check=check_start,
+        invariants=("energy",),
+        symmetries={"time": time_translation()},
     )

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ._problem import Problem
+from ..symmetry.library import rotation, scaling, time_translation
+from ._problem import Problem, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -30,6 +31,42 @@ def mixed_energy(t0, t1, q0, p0, q1, p1, args):
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     """L = q_x p_y − q_y p_x at t1, the paper's (42)."""
     return q1[0] * p1[1] - q1[1] * p1[0]
+
+
+@over_times
+def exact(t, q0, p0, args):
+    r"""The body at times t of one on an ellipse that is at (q0, p0) at t = 0, ε = 0.
+
+        q = f q0 + g p0,    f = 1 − a (1 − cos x)/r0,  g = t − (x − sin x)/n,    n = K/a^(3/2)
+
+    with x the growth of the eccentric anomaly, n t = x − e cos E0 sin x + e sin E0 (1 − cos x),
+    solved by Newton's method.
+
+    - `t`: times, any shape. `q0`, `p0`: shape (2,). Returns q, p of shape t.shape + (2,).
+
+    NaN for a body that escapes, of energy ≥ 0. **Source** Danby 1988, *Fundamentals of Celestial
+    Mechanics*, 6.7.
+    """
+    mu, r0 = args["K"] ** 2, jnp.sqrt(jnp.sum(q0**2))
+    inverse = 2 / r0 - jnp.sum(p0**2) / mu
+    a = jnp.where(inverse > 0, 1 / inverse, jnp.nan)
+    n = jnp.sqrt(mu / a**3)
+    # e cos E0 and e sin E0
+    ec, es = 1 - r0 / a, jnp.sum(q0 * p0) / jnp.sqrt(mu * a)
+    whole = jnp.round(n * t / (2 * jnp.pi))
+    mean = n * t - 2 * jnp.pi * whole
+    E0, e = jnp.arctan2(es, ec), jnp.sqrt(ec**2 + es**2)
+    M = mean + E0 - es
+    M = M - 2 * jnp.pi * jnp.round(M / (2 * jnp.pi))
+    E = M + 0.85 * e * jnp.sign(jnp.sin(M))  # from here Newton's method never fails
+    for _ in range(12):
+        E = E - (E - e * jnp.sin(E) - M) / (1 - e * jnp.cos(E))
+    x = E - E0
+    x = x - 2 * jnp.pi * jnp.round((x - mean) / (2 * jnp.pi))
+    r = a * (1 - e * jnp.cos(E))
+    f, g = 1 - a / r0 * (1 - jnp.cos(x)), (mean - x + jnp.sin(x)) / n
+    f_rate, g_rate = -jnp.sqrt(mu * a) / (r * r0) * jnp.sin(x), 1 - a / r * (1 - jnp.cos(x))
+    return f * q0 + g * p0, f_rate * q0 + g_rate * p0
 
 
 def check_start(q0, p0, args):
@@ -61,4 +98,14 @@ def kepler() -> Problem:
         units={"q": "1", "p": "1", "t": "1", "energy": "1"},
         source="the paper, Section 5.2",
         check=check_start,
+        parameters={
+            "K": "root of the strength of attraction, K² = GM [length^(3/2)/time]",
+        },
+        invariants=("energy", "angular_momentum"),
+        symmetries={
+            "time": time_translation(),
+            "rotation": rotation(),
+            "scaling": scaling(q=1.0, p=-0.5, t=1.5),
+        },
+        exact=exact,
     )

@@ -3,7 +3,9 @@
 import jax.numpy as jnp
 
 from .._system import System
-from ._problem import Problem, check_shape
+from ..symmetry.library import rotation, time_translation
+from . import _guiding_centre as guiding_centre
+from ._problem import Adiabatic, Problem, check_shape
 
 
 def vector_potential(q, args):
@@ -58,6 +60,27 @@ def magnetic_moment(t0, t1, q0, p0, q1, p1, args):
     return (jnp.sum(mv**2) - along**2) / (2 * args["mass"] * strength)
 
 
+def corrected_moment(t0, t1, q0, p0, q1, p1, args):
+    """μ + μ1 at t1, which wavers by the second order in gyroradius over ℓ: `_guiding_centre`."""
+    return magnetic_moment(t0, t1, q0, p0, q1, p1, args) + guiding_centre.first_correction(
+        q1, kinetic_momentum(q1, p1, args), lambda q: magnetic_field(q, args), args
+    )
+
+
+def bounce_action(t0, t1, q0, p0, q1, p1, args):
+    r"""The longitudinal invariant at t1, the second adiabatic one [action].
+
+        J = ∮ p∥ ds = 2 ∫ √(2m (E − μ B)) dz = 2π m ℓ (E − μ B0)/√(2m μ B0)
+
+    from mirror point to mirror point and back, with B on the axis and μ the `corrected_moment`.
+    Right up to (distance from the axis/ℓ)². **Source** Northrop 1963, 3.
+    """
+    m, B0 = args["mass"], args["B0"]
+    mu = corrected_moment(t0, t1, q0, p0, q1, p1, args)
+    free = energy(t0, t1, q0, p0, q1, p1, args) - mu * B0
+    return 2 * jnp.pi * m * args["length"] * free / jnp.sqrt(2 * m * mu * B0)
+
+
 def check_start(q0, p0, args):
     """Refuse a start that is not in space, or a mass or length that is not positive.
 
@@ -74,12 +97,14 @@ def check_start(q0, p0, args):
             raise ValueError(f"{name} must be positive, got {args[name]}.")
 
 
-def magnetic_mirror() -> Problem:
+def magnetic_mirror(length: float = 20.0) -> Problem:
     """A particle that bounces in B = B0 (1 + z²/ℓ²) on the axis; dimensionless.
 
-    e = m = B0 = 1 and ℓ = 20: gyroradius and gyrofrequency 1 at the start, on the middle plane with
-    its guiding centre at (2, 0, 0). With v∥ = 0.8 v⊥ it turns where |B| is 1.64 times that, near
+    e = m = B0 = 1: gyroradius and gyrofrequency 1 at the start, on the middle plane with its
+    guiding centre at (2, 0, 0). With v∥ = 0.8 v⊥ it turns where |B| is 1.64 times that, near
     z = 0.8 ℓ. Field, start and step are ours.
+
+    - `length`: ℓ, over the gyroradius.
 
     - args: `charge` e, `mass` m, `B0`, `length` ℓ.
 
@@ -93,13 +118,33 @@ def magnetic_mirror() -> Problem:
         q0=[x, 0.0, 0.0],
         p0=[0.0, vy + x / 2, vz],  # A = (0, x/2, 0) there
         h=0.1,
-        args={"charge": 1.0, "mass": 1.0, "B0": 1.0, "length": 20.0},
+        args={"charge": 1.0, "mass": 1.0, "B0": 1.0, "length": float(length)},
         observables={
             "energy": energy,
             "canonical_angular_momentum": canonical_angular_momentum,
             "magnetic_moment": magnetic_moment,
+            "corrected_moment": corrected_moment,
+            "bounce_action": bounce_action,
         },
         units={"q": "1", "p": "1", "t": "1", "energy": "1"},
         source="our own choice of field; Northrop 1963, The Adiabatic Motion of Charged Particles",
         check=check_start,
+        parameters={
+            "charge": "e [charge]",
+            "mass": "m [mass]",
+            "B0": "field in the middle [mass/(charge time)]",
+            "length": "ℓ, over which it doubles along the axis [length]",
+        },
+        invariants=("energy", "canonical_angular_momentum"),
+        adiabatic={
+            name: Adiabatic(
+                "gyroradius over ℓ", power, smaller=lambda factor: magnetic_mirror(length / factor)
+            )
+            for name, power in (
+                ("magnetic_moment", 1),
+                ("corrected_moment", 2),
+                ("bounce_action", 1),
+            )
+        },
+        symmetries={"time": time_translation(), "rotation": rotation(0, 1)},
     )

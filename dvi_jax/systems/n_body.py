@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
+from ..symmetry.generators import Generator
+from ..symmetry.library import rotation, scaling, space_translation, time_translation
 from ._problem import Problem
 
 
@@ -108,6 +110,34 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
         )
 
 
+PARAMETERS = {"masses": "of the bodies [mass]", "G": "gravity [length³/(mass time²)]"}
+INVARIANTS = ("energy", "linear_momentum", "angular_momentum")
+
+
+def symmetries(dim: int) -> dict[str, Generator]:
+    """Those of Newton and Galilei in `dim` dimensions, and the scaling of Kepler's third law."""
+    axes = "xyz"[:dim]
+    found = {"time": time_translation(), "scaling": scaling(q=1.0, p=-0.5, t=1.5)}
+    for i, x in enumerate(axes):
+        found[f"translation_{x}"] = space_translation(np.eye(dim)[i])
+        found[f"boost_{x}"] = _boost(np.eye(dim)[i])
+        for j in range(i + 1, dim):
+            found[f"rotation_{x}{axes[j]}"] = rotation(i, j)
+    return found
+
+
+def _boost(direction):
+    """`library.boost` for the masses of args: ξ = t v, η_i = m_i v."""
+
+    def shift(t, q, p, args):
+        return t * jnp.broadcast_to(jnp.asarray(direction, q.dtype), q.shape)
+
+    def push(t, q, p, args):
+        return jnp.asarray(args["masses"], p.dtype)[:, None] * jnp.asarray(direction, p.dtype)[None]
+
+    return Generator(xi=shift, eta=push)
+
+
 def n_body(
     masses: Any = None, q0: Any = None, p0: Any = None, h: float = 0.01, G: float = 1.0
 ) -> Problem:
@@ -141,4 +171,7 @@ def n_body(
         units={"q": "1", "p": "1", "t": "1", "energy": "1"},
         source="Chenciner & Montgomery 2000, Ann. Math. 152, 881 (the figure eight)",
         check=check_bodies,
+        parameters=PARAMETERS,
+        invariants=INVARIANTS,
+        symmetries=symmetries(np.shape(q0)[-1]),
     )

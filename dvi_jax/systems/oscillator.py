@@ -3,7 +3,12 @@
 import jax.numpy as jnp
 
 from .._system import System
-from ._problem import Problem
+from ..symmetry.generators import Generator
+from ..symmetry.library import scaling, time_translation
+from ._problem import Problem, check_shape, over_times
+
+PHASE = Generator(xi=lambda t, q, p, args: p, eta=lambda t, q, p, args: -q)
+"""The turn of the phase plane, ξ = p, η = −q: the flow of the oscillator itself."""
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -34,6 +39,21 @@ def map_invariant(t0, t1, q0, p0, q1, p1, args):
     return (jnp.sum(p1**2) + jnp.sum(q1**2) - (t1 - t0) * jnp.sum(q1 * p1)) / 2
 
 
+@over_times
+def exact(t, q0, p0, args):
+    """The state at times t at ε = 0: (q, p) turned clockwise by t.
+
+    - `t`: times, any shape. `q0`, `p0`: any one shape. Returns q, p of shape t.shape + q0.shape.
+    """
+    c, s = jnp.cos(t), jnp.sin(t)
+    return q0 * c + p0 * s, p0 * c - q0 * s
+
+
+def check_start(q0, p0, args):
+    """Refuse q0 and p0 of different shapes, with a `ValueError`."""
+    check_shape(q0, p0, lambda shape: True, "the oscillator takes q0 and p0 of one shape, any")
+
+
 def oscillator() -> Problem:
     """The paper's oscillator with its start (0.01, 0.01) and h = 0.1; dimensionless."""
     return Problem(
@@ -49,4 +69,9 @@ def oscillator() -> Problem:
         },
         units={"q": "1", "p": "1", "t": "1/ω", "energy": "1"},
         source="the paper, Section 5.1",
+        check=check_start,
+        invariants=("energy",),
+        symmetries={"time": time_translation(), "scaling": scaling()},
+        flow_symmetries={"phase": PHASE},
+        exact=exact,
     )

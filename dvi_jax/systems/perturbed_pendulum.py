@@ -3,7 +3,9 @@
 import jax.numpy as jnp
 
 from .._system import System
+from ..symmetry.library import time_translation
 from ._problem import Problem, check_shape
+from .pendulum import exact as of_pendulum
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -19,6 +21,11 @@ def coupling(t0, t1, q0, p1, args):
 def energy(t0, t1, q0, p0, q1, p1, args):
     """p²/2 − cos q at t1: the energy of the pendulum alone."""
     return hamiltonian(t0, t1, q1, p1, args)
+
+
+def exact(t, q0, p0, args):
+    """The pendulum alone at times t, ε = 0: see `pendulum.exact`."""
+    return of_pendulum(t, q0, p0, {"omega": 1.0})
 
 
 def check_start(q0, p0, args):
@@ -49,4 +56,7 @@ def perturbed_pendulum() -> Problem:
         units={"q": "1", "p": "1", "t": "1", "energy": "1"},
         source="our own choice",
         check=check_start,
+        invariants=("energy",),
+        symmetries={"time": time_translation()},
+        exact=exact,
     )

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ._problem import Problem, check_shape
+from ._problem import Problem, check_shape, over_times
 from .solar_system import EphemerisMissing
 
 REFERENCE = 51544.0
@@ -172,7 +172,7 @@ def exact(t: Any, t0: Any, q0: Any, p0: Any, args: Any) -> tuple[Any, Any]:
 
 
 def amplitude(t0, t1, q0, p0, q1, p1, args):
-    """√(u² + v²) at t1, the distance from the mean pole [arcsec]: what is kept at ε = 0."""
+    """√(u² + v²) at t1, the distance from the mean pole [arcsec]: kept at ε = 0 without drift."""
     x, y = mean_pole(t1, args)
     return jnp.sqrt(jnp.sum((q1 - x) ** 2 + (p1 - y) ** 2))
 
@@ -239,7 +239,23 @@ def polar_motion() -> Problem:
         units={"q": "arcsec", "p": "arcsec", "t": "day", "energy": "arcsec²/day"},
         source="Wilson & Vicente 1990; Nastula & Gross 2015; IERS Conventions 2010; finals2000A",
         check=check_start,
+        parameters={
+            "period": "of the free wobble [day]",
+            "inverse_Q": "1/Q, of either sign [1]",
+            "prograde": "what drives the annual wobble, (real, imaginary) [arcsec]",
+            "retrograde": "the same, turning the other way [arcsec]",
+            "mean": "mean pole (x, y) at t = 0 [arcsec]",
+            "drift": "of the mean pole (x, y) in a year [arcsec/365.25 day]",
+        },
+        exact=_exact_from_zero,
+        exact_epsilon=1.0,
     )
+
+
+@over_times
+def _exact_from_zero(t: Any, q0: Any, p0: Any, args: Any) -> tuple[Any, Any]:
+    """`exact` as a `Problem` has it: of one start at t0 = 0."""
+    return exact(t, 0.0, q0, p0, args)
 
 
 def _installed() -> Path:

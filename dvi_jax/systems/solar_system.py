@@ -14,7 +14,7 @@ import numpy as np
 
 from .._system import System
 from ._problem import Problem
-from .n_body import OBSERVABLES, check_bodies, hamiltonian
+from .n_body import INVARIANTS, OBSERVABLES, check_bodies, hamiltonian, symmetries
 
 BODIES = (
     "Sun", "Mercury", "Venus", "Earth–Moon", "Mars",
@@ -166,6 +166,9 @@ def solar_system(date: str | datetime.date | float = "1900-01-01") -> Problem:
         units={"q": "au", "p": "au⁴/day³", "t": "day", "energy": "au⁵/day⁴"},
         source="JPL ephemeris DE421 (Folkner, Williams & Boggs 2009)",
         check=check_start,
+        parameters={"masses": "G times mass of the bodies [au³/day²]", "G": "1, it is in GM [1]"},
+        invariants=INVARIANTS,
+        symmetries=symmetries(3),
     )
 
 

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ._problem import Problem, check_shape
+from ..symmetry.library import time_translation
+from ._problem import Adiabatic, Problem, check_shape
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -71,4 +72,12 @@ def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
         units={"q": "1", "p": "1", "t": "1", "energy": "1"},
         source="Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, I.5.1",
         check=check_start,
+        parameters={"omega": "frequency of the stiff springs [1/time]"},
+        invariants=("energy",),
+        adiabatic={
+            "oscillatory_energy": Adiabatic(
+                "1/ω", 1, smaller=lambda factor: stiff_fput(m, omega / factor)
+            )
+        },
+        symmetries={"time": time_translation()},
     )

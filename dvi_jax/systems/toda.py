@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
+from ..symmetry.library import space_translation, time_translation
 from ._problem import Problem, check_shape
 
 
@@ -92,4 +93,6 @@ def toda(n: int = 5) -> Problem:
         units={"q": "1", "p": "1", "t": "1", "energy": "1"},
         source="Toda 1967, J. Phys. Soc. Japan 22, 431; Flaschka 1974, Phys. Rev. B 9, 1924",
         check=check_start,
+        invariants=("energy", "total_momentum", "lax_traces", "lax_eigenvalues"),
+        symmetries={"time": time_translation(), "translation": space_translation(np.ones(n))},
     )

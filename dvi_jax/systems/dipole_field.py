@@ -1,0 +1,171 @@
+"""Störmer's problem: a charged particle in the field of a magnetic dipole."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import rotation, time_translation
+from . import _guiding_centre as guiding_centre
+from ._problem import Adiabatic, Problem, check_positive, check_shape
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+_HALVINGS = 54
+"""Of the interval that holds the latitude of the mirror point: to the last digits."""
+
+
+def vector_potential(q, args):
+    """A = −B0 R³ (−y, x, 0)/r³, of a dipole along −z, as the Earth's."""
+    x, y, z = q
+    cube = jnp.sum(q**2) ** 1.5
+    return -args["B0"] * args["radius"] ** 3 / cube * jnp.stack([-y, x, jnp.zeros_like(z)])
+
+
+def magnetic_field(q, args):
+    """B = B0 R³ (q r² ∂z/∂q − 3 z q)/r⁵ = B0 R³ (−3xz, −3yz, r² − 3z²)/r⁵: B0 ẑ at r = R, z = 0."""
+    r2 = jnp.sum(q**2)
+    axis = jnp.stack([jnp.zeros_like(r2), jnp.zeros_like(r2), r2])
+    return args["B0"] * args["radius"] ** 3 / r2**2.5 * (axis - 3 * q[2] * q)
+
+
+def kinetic_momentum(q, p, args):
+    """m v = p − e A(q): shape (3,)."""
+    return p - args["charge"] * vector_potential(q, args)
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = |p1 − e A(q0)|²/(2m), with canonical momenta p = mv + eA: not separable."""
+    return jnp.sum(kinetic_momentum(q0, p1, args) ** 2) / (2 * args["mass"])
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """m|v|²/2 at t1: the continuous energy."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def stoermer_integral(t0, t1, q0, p0, q1, p1, args):
+    """p_φ = x p_y − y p_x at t1: Störmer's integral, which turns about the axis keep."""
+    return q1[0] * p1[1] - q1[1] * p1[0]
+
+
+def magnetic_moment(t0, t1, q0, p0, q1, p1, args):
+    """μ0 = m v⊥²/(2|B|) at t1, B taken at the particle: the first adiabatic invariant."""
+    return guiding_centre.magnetic_moment(
+        q1, kinetic_momentum(q1, p1, args), lambda q: magnetic_field(q, args), args
+    )
+
+
+def corrected_moment(t0, t1, q0, p0, q1, p1, args):
+    """μ0 + μ1 at t1, which wavers by the second order in gyroradius over R: `_guiding_centre`."""
+    return magnetic_moment(t0, t1, q0, p0, q1, p1, args) + guiding_centre.first_correction(
+        q1, kinetic_momentum(q1, p1, args), lambda q: magnetic_field(q, args), args
+    )
+
+
+def bounce_action(t0, t1, q0, p0, q1, p1, args):
+    r"""The longitudinal invariant at t1, the second adiabatic one [action].
+
+        J = ∮ p∥ ds = 2 ∫ √(2m (E − μB)) ds,    from mirror point to mirror point and back
+
+    along the field line r = L cos² λ of the guiding centre q − b × v/Ω, with
+    B = B0 (R/L)³ √(1 + 3 sin² λ)/cos⁶ λ, ds = L cos λ √(1 + 3 sin² λ) dλ and μ the
+    `corrected_moment`. Zero where the particle mirrors at the equator. Not differentiable.
+
+    **Source** Northrop 1963, *The Adiabatic Motion of Charged Particles*, 3.
+    """
+    m, mv = args["mass"], kinetic_momentum(q1, p1, args)
+    E = jnp.sum(mv**2) / (2 * m)
+    mu = corrected_moment(t0, t1, q0, p0, q1, p1, args)
+    B = magnetic_field(q1, args)
+    centre = q1 - jnp.cross(B, mv) / (args["charge"] * jnp.sum(B**2))
+    L = jnp.sum(centre**2) ** 1.5 / jnp.sum(centre[:2] ** 2)
+    ratio = E / (mu * args["B0"] * (args["radius"] / L) ** 3)
+
+    def strength(latitude):
+        """|B| over that at the equator of the line."""
+        return jnp.sqrt(1 + 3 * jnp.sin(latitude) ** 2) / jnp.cos(latitude) ** 6
+
+    def halve(_, ends):
+        low, high = ends
+        middle = (low + high) / 2
+        inside = strength(middle) < ratio
+        return jnp.where(inside, middle, low), jnp.where(inside, high, middle)
+
+    ends = (jnp.zeros_like(ratio), jnp.full_like(ratio, jnp.pi / 2))
+    mirror, _ = jax.lax.fori_loop(0, _HALVINGS, halve, ends)
+    # λ = λ_m sin θ takes the root at the mirror point away
+    nodes, weights = (jnp.asarray(x, q1.dtype) for x in (_NODES, _WEIGHTS))
+    theta = jnp.pi / 2 * nodes
+    latitude = mirror * jnp.sin(theta)
+    along = jnp.sqrt(jnp.maximum(2 * m * E * (1 - strength(latitude) / ratio), 0.0))
+    length = L * jnp.cos(latitude) * jnp.sqrt(1 + 3 * jnp.sin(latitude) ** 2)
+    return 2 * jnp.sum(jnp.pi / 2 * weights * along * length * mirror * jnp.cos(theta))
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not in space, or at the dipole, or parameters that are not positive.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (3,),
+        "the dipole field holds one particle in space: q0 and p0 of shape (3,)",
+    )
+    check_positive(args, "mass", "radius")
+    if not np.asarray(q0, float).any():
+        raise ValueError("the particle is on top of the dipole, q0 = [0, 0, 0].")
+
+
+def dipole_field(radius: float = 50.0) -> Problem:
+    """A trapped particle that gyrates, bounces between north and south, and drifts round.
+
+    Dimensionless: e = m = B0 = 1, so that gyrofrequency and gyroradius at the start are 1; it
+    starts at the equator at r ≈ R with its velocity at 45° to the field.
+
+    - `radius`: R, over the gyroradius; the equations in units of Störmer's length depend on it by
+      the start alone.
+
+    **Source** Störmer 1907, *Arch. Sci. Phys. Nat.* 24, 5; Northrop 1963, *The Adiabatic Motion of
+    Charged Particles*; field, start and step are ours.
+    """
+    args = {"charge": 1.0, "mass": 1.0, "B0": 1.0, "radius": float(radius)}
+    q0, v0 = np.array([float(radius), 0.0, 0.0]), np.array([0.6, -0.8, 1.0])
+    A = np.array([0.0, -args["B0"] * args["radius"], 0.0])  # `vector_potential` there
+    return Problem(
+        name="dipole_field",
+        system=System(hamiltonian),
+        q0=q0,
+        p0=args["mass"] * v0 + args["charge"] * A,
+        h=0.1,
+        args=args,
+        observables={
+            "energy": energy,
+            "stoermer_integral": stoermer_integral,
+            "magnetic_moment": magnetic_moment,
+            "corrected_moment": corrected_moment,
+            "bounce_action": bounce_action,
+        },
+        units={"q": "1", "p": "1", "t": "1/gyrofrequency", "energy": "1"},
+        source="Störmer 1907, Arch. Sci. Phys. Nat. 24, 5; Northrop 1963",
+        check=check_start,
+        parameters={
+            "charge": "e [charge]",
+            "mass": "m [mass]",
+            "B0": "field at r = radius on the equator [mass/(charge time)]",
+            "radius": "R, where the field is B0 [length]",
+        },
+        invariants=("energy", "stoermer_integral"),
+        adiabatic={
+            name: Adiabatic(
+                "gyroradius over R", power, smaller=lambda factor: dipole_field(radius / factor)
+            )
+            for name, power in (
+                ("magnetic_moment", 1),
+                ("corrected_moment", 2),
+                ("bounce_action", 1),
+            )
+        },
+        symmetries={"time": time_translation(), "rotation": rotation(0, 1)},
+    )

@@ -1,0 +1,77 @@
+"""Two pendulums, one hung from the other."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import time_translation
+from ._problem import Problem, check_positive, check_shape
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    r"""Energy in canonical angles and momenta; not separable.
+
+        H_D = [m2 l2² P1² + (m1 + m2) l1² P2² − 2 m2 l1 l2 P1 P2 cos Δ]
+              / [2 m2 l1² l2² (m1 + m2 sin² Δ)] − (m1 + m2) g l1 cos q1 − m2 g l2 cos q2
+
+    with (P1, P2) = p1, (q1, q2) = q0, both from the downward vertical, and Δ = q1 − q2.
+    """
+    m1, m2, l1, l2, g = (args[name] for name in ("m1", "m2", "l1", "l2", "g"))
+    (a, b), (A, B) = q0, p1
+    c, s = jnp.cos(a - b), jnp.sin(a - b)
+    top = m2 * (l2 * A) ** 2 + (m1 + m2) * (l1 * B) ** 2 - 2 * m2 * l1 * l2 * A * B * c
+    kinetic = top / (2 * m2 * (l1 * l2) ** 2 * (m1 + m2 * s**2))
+    return kinetic - (m1 + m2) * g * l1 * jnp.cos(a) - m2 * g * l2 * jnp.cos(b)
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """The energy at t1."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """P1 + P2 at t1: the angular momentum about the hinge, kept where g = 0 only."""
+    return jnp.sum(p1)
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not two angles, or masses and lengths that are not positive.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (2,),
+        "the double pendulum is two angles: q0 and p0 of shape (2,)",
+    )
+    check_positive(args, "m1", "m2", "l1", "l2")
+
+
+def double_pendulum() -> Problem:
+    """Two bobs of 1 kg on rods of 1 m, let go at 90° and 60° from the vertical: chaotic.
+
+    **Source** Landau & Lifshitz 1976, *Mechanics*, §5, Problem 1; the Legendre transform and the
+    start are ours.
+    """
+    return Problem(
+        name="double_pendulum",
+        system=System(hamiltonian),
+        q0=np.array([np.pi / 2, np.pi / 3]),
+        p0=np.zeros(2),
+        h=0.005,
+        args={"m1": 1.0, "m2": 1.0, "l1": 1.0, "l2": 1.0, "g": 9.81},
+        observables={"energy": energy, "angular_momentum": angular_momentum},
+        units={"q": "rad", "p": "kg m²/s", "t": "s", "energy": "J"},
+        source="Landau & Lifshitz 1976, Mechanics, §5, Problem 1",
+        check=check_start,
+        parameters={
+            "m1": "mass of the upper bob [kg]",
+            "m2": "mass of the lower bob [kg]",
+            "l1": "length of the upper rod [m]",
+            "l2": "length of the lower rod [m]",
+            "g": "gravity [m/s²]",
+        },
+        invariants=("energy",),
+        symmetries={"time": time_translation()},
+    )

@@ -1,0 +1,107 @@
+"""Duffing's oscillator: a spring with a cubic term, disturbed by friction and a periodic drive."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import time_translation
+from ._elliptic import first_kind, jacobi
+from ._problem import Problem, check_positive, check_shape, over_times
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = p1²/2 + α q0²/2 + β q0⁴/4."""
+    return jnp.sum(p1**2 / 2 + args["alpha"] * q0**2 / 2 + args["beta"] * q0**4 / 4)
+
+
+def friction_and_drive(t0, t1, q0, p1, args):
+    """W = −δ p1 + γ cos(ω t0)."""
+    return -args["delta"] * p1 + args["gamma"] * jnp.cos(args["omega"] * t0)
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """p²/2 + α q²/2 + β q⁴/4 at t1: the continuous energy."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+@over_times
+def exact(t, q0, p0, args):
+    r"""The state at times t of an oscillator at (q0, p0) at t = 0, without disturbance, β > 0.
+
+        E > 0:  q = A cn(λt + u | m),  λ² = α + βA²,  m = βA²/(2λ²)      (over the hill, if any)
+        E < 0:  q = ±A dn(λt + u | m),  λ² = βA²/2,    m = 2 + 2α/(βA²)   (in one of two wells)
+
+    with A the largest distance, A² = (−α + √(α² + 4βE))/β, and p = dq/dt.
+
+    - `t`: times, any shape. `q0`, `p0`: shape (1,). Returns q, p of shape t.shape + (1,).
+
+    At E = 0 with α < 0, on the separatrix, and at rest at the origin it is NaN.
+    **Source** Kovacic & Brennan (eds.) 2011, *The Duffing Equation*, Chapter 4.
+    """
+    alpha, beta = args["alpha"], args["beta"]
+    E = hamiltonian(0.0, 0.0, q0, p0, args)
+    E = jnp.where(E == 0, jnp.nan, E)
+    over, root = E > 0, jnp.sqrt(alpha**2 + 4 * beta * E)
+    # 4E/(α + root) is (root − α)/β without its cancellation, for α > 0
+    square = jnp.where(alpha > 0, 4 * E / (alpha + root), (root - alpha) / beta)
+    A = jnp.sqrt(square)
+    rate = jnp.sqrt(jnp.where(over, root, beta * square / 2))
+    m = jnp.where(over, beta * square / (2 * root), 2 + 2 * alpha / (beta * square))
+    # cn = q/A and sn dn = −p/(Aλ)
+    c = q0 / A
+    cn_phase = jnp.arctan2(-p0 / (A * rate * jnp.sqrt(1 - m + m * c**2)), c)
+    # dn = |q|/A and sn cn = ∓p/(Aλm), whose sine and cosine of twice the phase
+    sign, s2 = jnp.where(q0 < 0, -1.0, 1.0), (1 - c**2) / m
+    dn_phase = jnp.arctan2(-2 * sign * p0 / (A * rate * m), 1 - 2 * s2) / 2
+    u = first_kind(jnp.where(over, cn_phase, dn_phase), m)
+    sn, cn, dn, _ = jacobi(rate * t + u, m)
+    q = A * jnp.where(over, cn, sign * dn)
+    p = -A * rate * jnp.where(over, sn * dn, sign * m * sn * cn)
+    return q, p
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not one q and one p, or a β that lets it run away.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (1,),
+        "Duffing's oscillator has one degree of freedom: q0 and p0 of shape (1,)",
+    )
+    check_positive(args, "beta")
+
+
+def duffing() -> Problem:
+    """H = p²/2 + αq²/2 + βq⁴/4 with the force ε(−δp + γ cos ωt), in the left of two wells.
+
+    Dimensionless. α = −1, β = 1, δ = 0.3, ω = 1.2: with ε = 1 and γ = 0.5 the motion is chaotic,
+    with γ = 0.2 it stays in a well. Without disturbance it swings within one well.
+
+    **Source** Guckenheimer & Holmes 1983, *Nonlinear Oscillations*, 2.2; Kovacic & Brennan 2011,
+    *The Duffing Equation*.
+    """
+    return Problem(
+        name="duffing",
+        system=System(hamiltonian, force=friction_and_drive),
+        q0=np.array([-1.2]),
+        p0=np.array([0.2]),
+        h=0.1,
+        args={"alpha": -1.0, "beta": 1.0, "delta": 0.3, "gamma": 0.5, "omega": 1.2},
+        observables={"energy": energy},
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="Guckenheimer & Holmes 1983, Nonlinear Oscillations, 2.2",
+        check=check_start,
+        parameters={
+            "alpha": "linear part of the spring, negative for two wells [1/time²]",
+            "beta": "cubic part of the spring, positive [1/(length² time²)]",
+            "delta": "friction at ε = 1 [1/time]",
+            "gamma": "amplitude of the drive at ε = 1 [length/time²]",
+            "omega": "frequency of the drive [1/time]",
+        },
+        invariants=("energy",),
+        symmetries={"time": time_translation()},
+        exact=exact,
+    )

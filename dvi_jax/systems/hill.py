@@ -1,0 +1,88 @@
+"""Hill's lunar problem: a satellite near a small body that goes about a large one far away."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import time_translation
+from ._problem import Problem, check_shape
+from .restricted_three_body import velocity
+
+LAGRANGE_DISTANCE = 3 ** (-1 / 3)
+"""L1 and L2 lie at x = ∓ this, on the line to the large body."""
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    r"""Energy in the frame that turns about z with the small body; not separable.
+
+        H_D = |p1|²/2 − (x p_y − y p_x) − x² + y²/2 + z²/2 − 1/|q0|,    q0 = (x, y, z)
+
+    x away from the large body, y along the orbit; p = v + ẑ × q.
+    """
+    x, y, z = q0
+    tide = -(x**2) + (y**2 + z**2) / 2
+    r = jnp.sqrt(jnp.sum(q0**2))
+    return jnp.sum(p1**2) / 2 - (x * p1[1] - y * p1[0]) + tide - 1 / r
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """H at t1, minus one half of `jacobi_constant`."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def jacobi_constant(t0, t1, q0, p0, q1, p1, args):
+    """Γ = 3x² − z² + 2/r − |v|² at t1; below 3^(4/3) there is a way out past L1 and L2."""
+    v, r = velocity(q1, p1), jnp.sqrt(jnp.sum(q1**2))
+    return 3 * q1[0] ** 2 - q1[2] ** 2 + 2 / r - jnp.sum(v**2)
+
+
+def angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """x p_y − y p_x at t1, about the small body; the tide does not keep it."""
+    return q1[0] * p1[1] - q1[1] * p1[0]
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not in space, or on the small body, with a `ValueError`."""
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (3,),
+        "Hill's problem has one body in space: q0 and p0 of shape (3,)",
+    )
+    if not np.asarray(q0, float).any():
+        raise ValueError("the satellite is on top of the small body, q0 = [0, 0, 0].")
+
+
+def hill() -> Problem:
+    r"""A satellite that goes about the small body at a third of the distance of L2, inclined.
+
+    Unit of length: (m/M)^(1/3) times the distance of the two bodies of masses M ≫ m; of time: their
+    period over 2π. The limit μ → 0 of `restricted_three_body` with lengths over μ^(1/3). Start and
+    step are ours.
+
+    **Source** Hill 1878, *Am. J. Math.* 1, 5; Szebehely 1967, *Theory of Orbits*, 10.4; scaled as
+    in Hénon 1969, *Astron. Astrophys.* 1, 223.
+    """
+    x, speed = 0.23, 0.23**-0.5
+    return Problem(
+        name="hill",
+        system=System(hamiltonian),
+        q0=np.array([x, 0.0, 0.0]),
+        p0=np.array([0.0, 0.95 * speed + x, 0.3 * speed]),
+        h=0.005,
+        observables={
+            "energy": energy,
+            "jacobi_constant": jacobi_constant,
+            "angular_momentum": angular_momentum,
+        },
+        units={
+            "q": "(m/M)^(1/3) distances of the bodies",
+            "p": "1",
+            "t": "period/2π",
+            "energy": "1",
+        },
+        source="Hill 1878, Am. J. Math. 1, 5; Hénon 1969, Astron. Astrophys. 1, 223",
+        check=check_start,
+        invariants=("energy", "jacobi_constant"),
+        symmetries={"time": time_translation()},
+    )

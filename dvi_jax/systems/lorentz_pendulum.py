@@ -1,0 +1,109 @@
+"""A pendulum whose string is slowly drawn in and let out: Lorentz's question at Solvay, 1911."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ._elliptic import complete
+from ._problem import Adiabatic, InSlowTime, Problem, check_positive, check_shape
+from .pendulum import exact as of_pendulum
+
+
+def length(tau, args):
+    """l(τ) = l0 (1 + d sin τ), |d| < 1, of the slow time τ = εt."""
+    return args["length"] * (1 + args["depth"] * jnp.sin(tau))
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = p1²/(2 m l²) − m g l cos q0 with l = l(τ0); the times are slow ones, τ = εt.
+
+    The radial motion of the bob, m l̇²/2, depends on time alone and is left out.
+    """
+    m, g, string = args["mass"], args["g"], length(t0, args)
+    return jnp.sum(p1**2) / (2 * m * string**2) - m * g * string * jnp.sum(jnp.cos(q0))
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """p²/(2 m l²) − m g l cos q with l = l(τ1) at the end of the step; t1 is the slow time τ1."""
+    return hamiltonian(t1, t1, q1, p1, args)
+
+
+def action(t0, t1, q0, p0, q1, p1, args):
+    r"""The adiabatic invariant at the end of the step, of a swing of any size (m < 1).
+
+        J = ∮ p dq/2π = (8/π) M l √(gl) (E(m) − (1 − m) K(m)),
+        m = sin²(q/2) + p²/(4 M² g l³)
+
+    with M the mass and l = l(τ1). For small swings J = (E + M g l)/√(g/l), Lorentz's and
+    Einstein's E/ν.
+    """
+    mass, g, string = args["mass"], args["g"], length(t1, args)
+    m = jnp.sum(jnp.sin(q1 / 2) ** 2 + p1**2 / (4 * mass**2 * g * string**3))
+    K, E = complete(m)
+    return 8 / jnp.pi * mass * string * jnp.sqrt(g * string) * (E - (1 - m) * K)
+
+
+def small_swing_action(t0, t1, q0, p0, q1, p1, args):
+    """(E + M g l)/√(g/l) at the end of the step: adiabatic only for swings that are small."""
+    string = length(t1, args)
+    above = energy(t0, t1, q0, p0, q1, p1, args) + args["mass"] * args["g"] * string
+    return above * jnp.sqrt(string / args["g"])
+
+
+def exact(t, q0, p0, args):
+    """The state at times t at ε = 0, where l = l0 for ever: see `pendulum.exact`."""
+    m, g, string = args["mass"], args["g"], args["length"]
+    inertia = m * string**2
+    q, rate = of_pendulum(t, q0, jnp.asarray(p0) / inertia, {"omega": jnp.sqrt(g / string)})
+    return q, inertia * rate
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not one angle and one momentum, or a string without length.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (1,),
+        "Lorentz's pendulum is one angle: q0 and p0 of shape (1,)",
+    )
+    check_positive(args, "mass", "g", "length")
+    if not abs(args["depth"]) < 1:
+        raise ValueError(f"depth must be between -1 and 1, got {args['depth']}.")
+
+
+def lorentz_pendulum() -> Problem:
+    """The pendulum of one metre and one kilogram, l = l0 (1 + 0.3 sin εt), swinging to 1 rad.
+
+    ε [1/s] is the rate of the change over d. Start and step are ours.
+
+    **Source** Solvay congress 1911 (Langevin & de Broglie 1912, *La théorie du rayonnement et les
+    quanta*, p. 450); action: Landau & Lifshitz 1976, *Mechanics*, §49.
+    """
+    return Problem(
+        name="lorentz_pendulum",
+        system=System(hamiltonian, slow_time=True),
+        q0=np.array([1.0]),
+        p0=np.array([0.0]),
+        h=0.02,
+        args={"mass": 1.0, "g": 9.81, "length": 1.0, "depth": 0.3},
+        observables={
+            "energy": InSlowTime(energy),
+            "action": InSlowTime(action),
+            "small_swing_action": InSlowTime(small_swing_action),
+        },
+        units={"q": "rad", "p": "kg m²/s", "t": "s", "energy": "J"},
+        source="Langevin & de Broglie 1912, La théorie du rayonnement et les quanta, p. 450",
+        check=check_start,
+        parameters={
+            "mass": "of the bob [kg]",
+            "g": "gravity [m/s²]",
+            "length": "mean length of the string [m]",
+            "depth": "relative change of the length [1]",
+        },
+        invariants=("energy", "action", "small_swing_action"),
+        adiabatic={"action": Adiabatic("rate of the change over the frequency", 1)},
+        exact=exact,
+    )

@@ -1,0 +1,101 @@
+r"""Prey and predators of Lotka and Volterra, canonical in the logarithms of their numbers.
+
+    dx/dt = x (α − β y),    dy/dt = y (δ x − γ)
+
+In x and y the structure is that of the bracket {x, y} = xy. With q = ln x and p = ln y it is the
+canonical one, and every map here keeps the numbers positive.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import time_translation
+from ._problem import Problem, check_positive, check_shape
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = α p1 − β exp p1 + γ q0 − δ exp q0; separable."""
+    alpha, beta, gamma, delta = (args[name] for name in ("alpha", "beta", "gamma", "delta"))
+    return jnp.sum(alpha * p1 - beta * jnp.exp(p1) + gamma * q0 - delta * jnp.exp(q0))
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """α ln y − β y + γ ln x − δ x at t1: Volterra's constant."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def populations(t0, t1, q0, p0, q1, p1, args):
+    """Numbers (x, y) of prey and predators at t1, shape (2,) + q.shape."""
+    return jnp.stack(to_populations(q1, p1))
+
+
+def to_populations(q, p):
+    """Numbers x = exp q of prey and y = exp p of predators; any shapes."""
+    return jnp.exp(jnp.asarray(q)), jnp.exp(jnp.asarray(p))
+
+
+def from_populations(x, y):
+    """q = ln x and p = ln y of numbers of prey and predators, NumPy; any shapes.
+
+    **Raises** `ValueError` for numbers that are not positive: none are left, and none come.
+    """
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    for name, number in (("prey", x), ("predators", y)):
+        if not (number > 0).all():
+            raise ValueError(f"the number of {name} must be positive, got {number}.")
+    return np.log(x), np.log(y)
+
+
+def equilibrium(args):
+    """Numbers (γ/δ, α/β) at which nothing changes; small swings about it have the period
+    2π/√(αγ).
+    """
+    return args["gamma"] / args["delta"], args["alpha"] / args["beta"]
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not one of each, or rates that are not positive.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (1,),
+        "prey and predators are one logarithm each: q0 and p0 of shape (1,)",
+    )
+    check_positive(args, "alpha", "beta", "gamma", "delta")
+
+
+def lotka_volterra() -> Problem:
+    """Hares and lynxes of the Hudson's Bay Company, in thousands and years.
+
+    Rates 0.55, 0.028, 0.84, 0.026 and the start (33.9, 5.9) are means of a published fit to the
+    pelts of 1900–1920; one cycle takes about eleven years.
+
+    **Source** Lotka 1925, *Elements of Physical Biology*; Volterra 1926, *Mem. Acad. Lincei Roma*
+    2, 31; rates: Carpenter 2018, *Predator–Prey Population Dynamics: the Lotka–Volterra model in
+    Stan*; canonical form: Hairer, Lubich & Wanner 2006, I.1.1 and VII.2.
+    """
+    q0, p0 = from_populations([33.9], [5.9])
+    return Problem(
+        name="lotka_volterra",
+        system=System(hamiltonian),
+        q0=q0,
+        p0=p0,
+        h=0.05,
+        args={"alpha": 0.55, "beta": 0.028, "gamma": 0.84, "delta": 0.026},
+        observables={"energy": energy, "populations": populations},
+        units={"q": "ln(thousands)", "p": "ln(thousands)", "t": "year", "energy": "1/year"},
+        source="Volterra 1926, Mem. Acad. Lincei Roma 2, 31; Hairer, Lubich & Wanner 2006, I.1.1",
+        check=check_start,
+        parameters={
+            "alpha": "growth of prey [1/year]",
+            "beta": "prey eaten, for each predator [1/(year thousand)]",
+            "gamma": "death of predators [1/year]",
+            "delta": "growth of predators, for each prey [1/(year thousand)]",
+        },
+        invariants=("energy",),
+        symmetries={"time": time_translation()},
+    )

@@ -1,0 +1,98 @@
+r"""The discrete nonlinear Schrödinger equation on a ring of sites.
+
+    i dψ_n/dt = −κ (ψ_{n+1} − 2ψ_n + ψ_{n−1}) − γ |ψ_n|² ψ_n,    ψ = (q + i p)/√2
+
+q and p, real and imaginary part, are canonical. (The integrable lattice of Ablowitz and Ladik is so
+in a bracket of its own only, and is not here.)
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import time_translation
+from ._problem import Problem, check_shape
+from .oscillator import PHASE
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    r"""Energy Σ κ|ψ_{n+1} − ψ_n|² − γ|ψ_n|⁴/2 in real and imaginary parts; not separable.
+
+    H_D = Σ_n κ/2 [(q_{n+1} − q_n)² + (p_{n+1} − p_n)²] − γ/8 (q_n² + p_n²)²
+    """
+    steps = (q0 - jnp.roll(q0, -1)) ** 2 + (p1 - jnp.roll(p1, -1)) ** 2
+    return jnp.sum(args["kappa"] / 2 * steps - args["gamma"] / 8 * (q0**2 + p1**2) ** 2)
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """The energy at t1."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def norm(t0, t1, q0, p0, q1, p1, args):
+    """Σ|ψ_n|² = Σ (q² + p²)/2 at t1: the number of particles, which turns of phase keep."""
+    return jnp.sum(q1**2 + p1**2) / 2
+
+
+def densities(t0, t1, q0, p0, q1, p1, args):
+    """|ψ_n|² at t1, shape (n,): how they spread."""
+    return (q1**2 + p1**2) / 2
+
+
+def plane_wave(t, n, mode, amplitude, args):
+    r"""ψ_j = a exp(i(kj − ωt)) of the mode-th wave on n sites as (q, p), an exact solution.
+
+        k = 2π mode/n,    ω = 4κ sin²(k/2) − γ a²
+
+    - `t`: times, any shape. Returns q, p of shape t.shape + (n,). With κγ > 0 and a large enough
+      it is unstable. **Source** Kevrekidis 2009, *The Discrete Nonlinear Schrödinger Equation*.
+    """
+    k = 2 * np.pi * mode / n
+    omega = 4 * args["kappa"] * np.sin(k / 2) ** 2 - args["gamma"] * amplitude**2
+    angle = k * np.arange(n) - omega * jnp.asarray(t)[..., None] * np.ones(n)
+    return np.sqrt(2) * amplitude * jnp.cos(angle), np.sqrt(2) * amplitude * jnp.sin(angle)
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not a ring of three sites or more, with a `ValueError`."""
+    check_shape(
+        q0,
+        p0,
+        lambda shape: len(shape) == 1 and shape[0] >= 3,
+        "the lattice is a ring of at least three sites: q0 and p0 of shape (n,), n ≥ 3",
+    )
+
+
+def nls_lattice(n: int = 8) -> Problem:
+    """A hump on a ring of n sites that attracts itself, and moves; dimensionless.
+
+    κ = γ = 1. Start and step are ours.
+
+    **Raises** `ValueError` for fewer than three sites.
+
+    **Source** Kevrekidis 2009, *The Discrete Nonlinear Schrödinger Equation*; Hairer, Lubich &
+    Wanner 2006, *Geometric Numerical Integration*, VII.4.
+    """
+    site = np.arange(n) - n / 2
+    size, phase = 1 / np.cosh(site / 1.5), 0.5 * site
+    q0, p0 = size * np.cos(phase), size * np.sin(phase)
+    check_start(q0, p0, None)
+    return Problem(
+        name="nls_lattice",
+        system=System(hamiltonian),
+        q0=q0,
+        p0=p0,
+        h=0.02,
+        args={"kappa": 1.0, "gamma": 1.0},
+        observables={"energy": energy, "norm": norm, "densities": densities},
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="Kevrekidis 2009, The Discrete Nonlinear Schrödinger Equation",
+        check=check_start,
+        parameters={
+            "kappa": "coupling of neighbours [1/time]",
+            "gamma": "attraction on a site, negative for repulsion [1/time]",
+        },
+        invariants=("energy", "norm"),
+        symmetries={"time": time_translation()},
+        flow_symmetries={"phase": PHASE},
+    )

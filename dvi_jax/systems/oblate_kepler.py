@@ -1,0 +1,129 @@
+"""A satellite of an oblate planet: the Kepler problem in space with J2."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import rotation, time_translation
+from ._problem import Problem, check_positive, check_shape
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    r"""Energy for unit mass; the planet's axis is z.
+
+    H_D = |p1|²/2 − μ/r + μ J2 R²/(2 r³) (3 z²/r² − 1),    q0 = (x, y, z), r = |q0|
+    """
+    r2 = jnp.sum(q0**2)
+    r = jnp.sqrt(r2)
+    bulge = args["J2"] * args["R"] ** 2 / (2 * r2) * (3 * q0[2] ** 2 / r2 - 1)
+    return jnp.sum(p1**2) / 2 - args["mu"] / r * (1 - bulge)
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """The energy at t1."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def axial_angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """L_z = x p_y − y p_x at t1, which turns about the planet's axis keep."""
+    return q1[0] * p1[1] - q1[1] * p1[0]
+
+
+def angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """q × p at t1, shape (3,): it goes round the axis, and is not kept."""
+    return jnp.cross(q1, p1)
+
+
+def elements(q, p, mu):
+    r"""Osculating semi-major axis, eccentricity, inclination, node and argument of perigee.
+
+        L = q × p,    e = p × L/μ − q/r,    cos i = L_z/|L|,    Ω = atan2(L_x, −L_y),
+        ω = angle from the node (cos Ω, sin Ω, 0) to e about L
+
+    q [length], p [length/time]: shape (3,). Returns shape (5,), angles [rad] between −π and π;
+    the node means nothing at i = 0, nor ω at e = 0.
+
+    **Source** Murray & Dermott 1999, *Solar System Dynamics*, 2.8.
+    """
+    r, L = jnp.sqrt(jnp.sum(q**2)), jnp.cross(q, p)
+    size = jnp.sqrt(jnp.sum(L**2))
+    e = jnp.cross(p, L) / mu - q / r
+    a = 1 / (2 / r - jnp.sum(p**2) / mu)
+    node = jnp.arctan2(L[0], -L[1])
+    to_node = jnp.stack([jnp.cos(node), jnp.sin(node), jnp.zeros_like(node)])
+    perigee = jnp.arctan2(jnp.sum(jnp.cross(to_node, e) * L) / size, jnp.sum(to_node * e))
+    return jnp.stack([a, jnp.sqrt(jnp.sum(e**2)), jnp.arccos(L[2] / size), node, perigee])
+
+
+def osculating_elements(t0, t1, q0, p0, q1, p1, args):
+    """`elements` at t1: (a, e, i, Ω, ω), shape (5,)."""
+    return elements(q1, p1, args["mu"])
+
+
+def secular_rates(a, e, i, args):
+    r"""Mean rates of node and perigee to first order in J2 [rad/time].
+
+        dΩ/dt = −(3/2) n J2 (R/P)² cos i,    dω/dt = (3/4) n J2 (R/P)² (5 cos² i − 1),
+        n = √(μ/a³),    P = a (1 − e²)
+
+    a, e, i are mean elements; osculating ones differ by O(J2), the rates then by O(J2²).
+
+    **Source** Kozai 1959, *Astron. J.* 64, 367.
+    """
+    n = jnp.sqrt(args["mu"] / a**3)
+    size = n * args["J2"] * (args["R"] / (a * (1 - e**2))) ** 2
+    return -1.5 * size * jnp.cos(i), 0.75 * size * (5 * jnp.cos(i) ** 2 - 1)
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not in space, or inside the planet.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (3,),
+        "the satellite is one point in space: q0 and p0 of shape (3,)",
+    )
+    check_positive(args, "mu", "R")
+    r = float(np.linalg.norm(np.asarray(q0, float)))
+    if r < args["R"]:
+        raise ValueError(f"the satellite starts at r = {r}, inside the planet of R = {args['R']}.")
+
+
+def oblate_kepler() -> Problem:
+    """A satellite of the Earth of a = 8000 km, e = 0.1 and i = 50°, at perigee on the node.
+
+    km, s and unit mass: p is the velocity. Node and perigee move by `secular_rates`, −4.3° and
+    +4.6° a day for the first and the second. Start and step are ours.
+
+    **Source** Kozai 1959, *Astron. J.* 64, 367; μ, R and J2: EGM96 (Lemoine et al. 1998,
+    NASA/TP-1998-206861).
+    """
+    mu, a, e, i = 398600.4415, 8000.0, 0.1, np.deg2rad(50)
+    speed = np.sqrt(mu / a * (1 + e) / (1 - e))
+    return Problem(
+        name="oblate_kepler",
+        system=System(hamiltonian),
+        q0=np.array([a * (1 - e), 0.0, 0.0]),
+        p0=speed * np.array([0.0, np.cos(i), np.sin(i)]),
+        h=10.0,
+        args={"mu": mu, "R": 6378.1363, "J2": 1.0826267e-3},
+        observables={
+            "energy": energy,
+            "axial_angular_momentum": axial_angular_momentum,
+            "angular_momentum": angular_momentum,
+            "osculating_elements": osculating_elements,
+        },
+        units={"q": "km", "p": "km/s", "t": "s", "energy": "km²/s²"},
+        source="Kozai 1959, Astron. J. 64, 367; EGM96",
+        check=check_start,
+        parameters={
+            "mu": "G times the mass of the planet [km³/s²]",
+            "R": "equatorial radius of the planet [km]",
+            "J2": "quadrupole of the planet [1]",
+        },
+        invariants=("energy", "axial_angular_momentum"),
+        symmetries={"time": time_translation(), "rotation": rotation(0, 1)},
+    )

@@ -1,0 +1,116 @@
+"""The plane pendulum, solved by Jacobi's elliptic functions, disturbed by friction."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import time_translation
+from ._elliptic import complete, first_kind, jacobi
+from ._problem import Problem, check_positive, check_shape, over_times
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = p1²/2 − ω² cos q0, for unit mass and length."""
+    return jnp.sum(p1**2) / 2 - args["omega"] ** 2 * jnp.sum(jnp.cos(q0))
+
+
+def friction(t0, t1, q0, p1, args):
+    """W = −p1: a friction εp."""
+    return -p1
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """p²/2 − ω² cos q at t1: the continuous energy."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def modulus(q, p, args):
+    """m = (E + ω²)/(2ω²) = sin²(q/2) + p²/(4ω²): below 1 it swings, above 1 it turns over."""
+    return jnp.sum(jnp.sin(q / 2) ** 2 + (p / (2 * args["omega"])) ** 2)
+
+
+def action(t0, t1, q0, p0, q1, p1, args):
+    """J = ∮ p dq/2π = (8ω/π) (E(m) − (1 − m) K(m)) at t1, m < 1; NaN where it turns over.
+
+    E/ω to first order in m, dE/dJ the frequency πω/(2K(m)).
+    """
+    m = modulus(q1, p1, args)
+    K, E = complete(m)
+    return 8 * args["omega"] / jnp.pi * (E - (1 - m) * K)
+
+
+def period(q, p, args):
+    """4K(m)/ω of a swing, 2K(1/m)/(√m ω) of a full turn: the time after which it repeats."""
+    m = modulus(q, p, args)
+    swings = m < 1
+    swing, turn = complete(jnp.where(swings, m, 0.5))[0], complete(jnp.where(swings, 0.5, 1 / m))[0]
+    return jnp.where(swings, 4 * swing, 2 * turn / jnp.sqrt(m)) / args["omega"]
+
+
+@over_times
+def exact(t, q0, p0, args):
+    r"""The pendulum at times t of one that is at (q0, p0) at t = 0, without friction.
+
+        m < 1:  sin(q/2) = √m sn(ωt + u | m),    p = 2ω√m cn(ωt + u | m)
+        m > 1:  q = ±2 am(√m ωt + u | 1/m),      p = ±2ω√m dn(√m ωt + u | 1/m)
+
+    - `t`: times, any shape. `q0` [rad], `p0` [rad/time]: shape (1,).
+
+    Returns q, p of shape t.shape + (1,). Angles are not taken modulo 2π. At m = 1, on the
+    separatrix, it is NaN. **Source** Whittaker 1937, *Analytical Dynamics*, §44.
+    """
+    w, m = args["omega"], modulus(q0, p0, args)
+    m = jnp.where(m == 1, jnp.nan, m)
+    swings = m < 1
+    turns = 2 * jnp.pi * jnp.round(q0 / (2 * jnp.pi))
+    # where it swings; the other branch is given a modulus that it can live with
+    k = jnp.sqrt(jnp.where(swings, m, 0.5))
+    phase = first_kind(jnp.arctan2(jnp.sin((q0 - turns) / 2), p0 / (2 * w)), k**2)
+    sn, cn, _, _ = jacobi(w * t + phase, k**2)
+    q_swing, p_swing = turns + 2 * jnp.arctan2(k * sn, jnp.sqrt(1 - (k * sn) ** 2)), 2 * w * k * cn
+    # where it turns over
+    inverse, sign = jnp.where(swings, 0.5, 1 / m), jnp.where(p0 < 0, -1.0, 1.0)
+    root = jnp.sqrt(jnp.where(swings, 1.0, m))
+    _, _, dn, am = jacobi(root * w * t + first_kind(sign * q0 / 2, inverse), inverse)
+    q, p = (
+        jnp.where(swings, q_swing, 2 * sign * am),
+        jnp.where(swings, p_swing, 2 * sign * w * root * dn),
+    )
+    return q + 0 * m, p + 0 * m
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not one angle and one momentum, or a frequency that is not positive.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0, p0, lambda shape: shape == (1,), "the pendulum is one angle: q0 and p0 of shape (1,)"
+    )
+    check_positive(args, "omega")
+
+
+def pendulum() -> Problem:
+    """H = p²/2 − ω² cos q with the friction −εp, swinging to 2.1 rad; dimensionless.
+
+    ω = 1, mass and length 1; q is measured from the lowest point. Start and step are ours.
+
+    **Source** Whittaker 1937, *A Treatise on the Analytical Dynamics of Particles and Rigid
+    Bodies*, §44.
+    """
+    return Problem(
+        name="pendulum",
+        system=System(hamiltonian, force=friction),
+        q0=np.array([1.5]),
+        p0=np.array([1.0]),
+        h=0.1,
+        args={"omega": 1.0},
+        observables={"energy": energy, "action": action},
+        units={"q": "rad", "p": "1", "t": "1", "energy": "1"},
+        source="Whittaker 1937, Analytical Dynamics, §44",
+        check=check_start,
+        parameters={"omega": "frequency of small swings [1/time]"},
+        invariants=("energy", "action"),
+        symmetries={"time": time_translation()},
+        exact=exact,
+    )

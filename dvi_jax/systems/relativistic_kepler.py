@@ -1,0 +1,111 @@
+"""The Kepler problem with the kinetic energy of special relativity, whose ellipse turns."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import rotation, time_translation
+from ._problem import Problem, check_positive, check_shape
+from .kepler import angular_momentum
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = √(c⁴ + c²|p1|²) − c² − K²/|q0|, unit mass; separable."""
+    square = jnp.sum(p1**2)
+    # √(…) − c² without its cancellation
+    kinetic = square / (1 + jnp.sqrt(1 + square / args["c"] ** 2))
+    return kinetic - args["K"] ** 2 / jnp.sqrt(jnp.sum(q0**2))
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """√(c⁴ + c²|p|²) − c² − K²/|q| at t1: the continuous energy without that at rest."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def precession(q, p, args):
+    r"""Angle by which the perihelion advances from one to the next, exact [rad].
+
+        Δ = 2π (1/Γ − 1),    Γ² = 1 − K⁴/(c² L²),    L = q × p
+
+    For the orbit 1/r = C (1 + e cos Γ(θ − θ0)). To first order in 1/c² it is πK⁴/(c²L²), a sixth
+    of what general relativity gives. NaN where K² > c L: the orbit then falls into the centre.
+
+    **Source** Sommerfeld 1916, *Ann. Phys.* 356, 1; Landau & Lifshitz, *The Classical Theory of
+    Fields*, §39.
+    """
+    L = q[0] * p[1] - q[1] * p[0]
+    return 2 * jnp.pi * (1 / jnp.sqrt(1 - args["K"] ** 4 / (args["c"] * L) ** 2) - 1)
+
+
+def runge_lenz_angle(t0, t1, q0, p0, q1, p1, args):
+    r"""Direction of the perihelion at t1 [rad], between −π and π, which advances steadily.
+
+        The orbit has dr/dθ and 1/r with e cos ψ = 1/(Cr) − 1 and e sin ψ = p_r/(LΓC),
+        ψ = Γ(θ − θ0),  C = K² (E + c²)/(c² L² Γ²);  the perihelion passed last, or the one to
+        come, whichever is nearer, lies at θ0 = θ − ψ/Γ, |ψ| ≤ π
+
+    It is constant but for a jump by `precession` at each aphelion.
+    """
+    r = jnp.sqrt(jnp.sum(q1**2))
+    L = angular_momentum(t0, t1, q0, p0, q1, p1, args)
+    turn = jnp.sqrt(1 - args["K"] ** 4 / (args["c"] * L) ** 2)
+    E = energy(t0, t1, q0, p0, q1, p1, args)
+    C = args["K"] ** 2 * (1 + E / args["c"] ** 2) / (L * turn) ** 2
+    psi = jnp.arctan2(jnp.sum(q1 * p1) / (r * L * turn * C), 1 / (C * r) - 1)
+    angle = jnp.arctan2(q1[1], q1[0]) - psi / turn
+    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not in the plane, or at the centre, or that falls into it.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (2,),
+        "the relativistic Kepler problem is in the plane: q0 and p0 of shape (2,)",
+    )
+    check_positive(args, "K", "c")
+    q, p = np.asarray(q0, float), np.asarray(p0, float)
+    if not q.any():
+        raise ValueError("the body is on top of the centre, q0 = [0, 0]: the force is infinite.")
+    L = q[0] * p[1] - q[1] * p[0]
+    if abs(L) * args["c"] <= args["K"] ** 2:
+        raise ValueError(
+            f"the angular momentum {L} is at most K²/c = {args['K'] ** 2 / args['c']} in size: the "
+            "orbit falls into the centre. Give it more, or a larger c."
+        )
+
+
+def relativistic_kepler() -> Problem:
+    """The start at perihelion of an ellipse of e ≈ 0.4 with K = 1, c = 10; dimensionless.
+
+    It turns by 1.3° from perihelion to perihelion. Start and step are ours. General relativity:
+    `relativity`, with `n_body`.
+
+    **Source** Sommerfeld 1916, *Ann. Phys.* 356, 1.
+    """
+    return Problem(
+        name="relativistic_kepler",
+        system=System(hamiltonian),
+        q0=np.array([0.6, 0.0]),
+        p0=np.array([0.0, 1.5]),
+        h=0.02,
+        args={"K": 1.0, "c": 10.0},
+        observables={
+            "energy": energy,
+            "angular_momentum": angular_momentum,
+            "runge_lenz_angle": runge_lenz_angle,
+        },
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="Sommerfeld 1916, Ann. Phys. 356, 1",
+        check=check_start,
+        parameters={
+            "K": "root of the strength of attraction, K² = GM [length^(3/2)/time]",
+            "c": "speed of light [length/time]",
+        },
+        invariants=("energy", "angular_momentum"),
+        symmetries={"time": time_translation(), "rotation": rotation()},
+    )

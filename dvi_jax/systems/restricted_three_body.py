@@ -1,0 +1,142 @@
+"""The circular restricted problem of three bodies, in the frame that turns with two of them."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import time_translation
+from ._problem import Problem, check_shape
+
+EARTH_MOON = 0.012150585
+"""Mass of the Moon over that of Earth and Moon (JPL DE405: Earth/Moon = 81.30056)."""
+
+
+def potential(q, mu):
+    """−(1 − μ)/r1 − μ/r2 with the large body at (−μ, 0, 0), the small one at (1 − μ, 0, 0)."""
+    x, y, z = q
+    across = y**2 + z**2
+    r1, r2 = jnp.sqrt((x + mu) ** 2 + across), jnp.sqrt((x - 1 + mu) ** 2 + across)
+    return -(1 - mu) / r1 - mu / r2
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    r"""Energy in the frame that turns about z once in 2π; not separable.
+
+        H_D = |p1|²/2 − (x p_y − y p_x) − (1 − μ)/r1 − μ/r2,    q0 = (x, y, z)
+
+    with momenta p = v + ẑ × q, the velocity in a frame that does not turn.
+    """
+    x, y, _ = q0
+    return jnp.sum(p1**2) / 2 - (x * p1[1] - y * p1[0]) + potential(q0, args["mu"])
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """H at t1, minus one half of `jacobi_constant`."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def jacobi_constant(t0, t1, q0, p0, q1, p1, args):
+    """C = x² + y² + 2(1 − μ)/r1 + 2μ/r2 − |v|² at t1, without the μ(1 − μ) that some add."""
+    v = velocity(q1, p1)
+    return q1[0] ** 2 + q1[1] ** 2 - 2 * potential(q1, args["mu"]) - jnp.sum(v**2)
+
+
+def angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """x p_y − y p_x at t1, of the third body in a frame that does not turn; it is not kept."""
+    return q1[0] * p1[1] - q1[1] * p1[0]
+
+
+def velocity(q, p):
+    """v = p − ẑ × q in the turning frame."""
+    return p + jnp.stack([q[1], -q[0], jnp.zeros_like(q[2])])
+
+
+def momentum(q, v):
+    """p = v + ẑ × q of a velocity in the turning frame."""
+    return v - jnp.stack([q[1], -q[0], jnp.zeros_like(q[2])])
+
+
+def lagrange_points(mu):
+    r"""L1, …, L5, where a body may rest in the turning frame: shape (5, 3), NumPy.
+
+    L1, L2, L3 on the line of the bodies: between them, beyond the small one, beyond the large one;
+    L4 ahead of the small body by 60°, L5 behind. The three are roots of
+
+        x − (1 − μ)(x + μ)/|x + μ|³ − μ (x − 1 + μ)/|x − 1 + μ|³ = 0
+
+    by bisection to the last digits. **Raises** `ValueError` for μ outside 0 < μ ≤ 1/2.
+    **Source** Szebehely 1967, *Theory of Orbits*, 4.
+    """
+    mu = float(mu)
+    _check_mu(mu)
+
+    def pull(x):
+        a, b = x + mu, x - 1 + mu
+        return x - (1 - mu) * a / abs(a) ** 3 - mu * b / abs(b) ** 3
+
+    small, large, line = 1 - mu, -mu, []
+    for low, high in ((large, small), (small, 2.0), (-2.0, large)):
+        # pull grows from −∞ to ∞ between a body and the next, or infinity
+        while True:
+            x = (low + high) / 2
+            if x in (low, high):
+                break
+            low, high = (x, high) if pull(x) < 0 else (low, x)
+        line.append([x, 0.0, 0.0])
+    side = 3**0.5 / 2
+    return np.array([*line, [0.5 - mu, side, 0.0], [0.5 - mu, -side, 0.0]])
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not in space, or on a body, or a μ that is none.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (3,),
+        "the restricted problem has one body in space: q0 and p0 of shape (3,)",
+    )
+    mu, q = float(args["mu"]), np.asarray(q0, float)
+    _check_mu(mu)
+    for x in (-mu, 1 - mu):
+        if not (q - [x, 0.0, 0.0]).any():
+            raise ValueError(f"the start is on top of the body at [{x}, 0, 0].")
+
+
+def _check_mu(mu):
+    if not 0 < mu <= 0.5:
+        raise ValueError(
+            f"mu is the share of the smaller body in the mass of both, 0 < mu ≤ 1/2; got {mu}."
+        )
+
+
+def restricted_three_body() -> Problem:
+    """A body near L4 of Earth and Moon, about which it goes to and fro, in and out of the plane.
+
+    Unit of length: the distance of the two bodies; of time: their period over 2π. Start and step
+    are ours.
+
+    **Source** Szebehely 1967, *Theory of Orbits*, 1 and 4.
+    """
+    q0 = lagrange_points(EARTH_MOON)[3] + [0.01, 0.0, 0.02]
+    return Problem(
+        name="restricted_three_body",
+        system=System(hamiltonian),
+        q0=q0,
+        p0=np.array([-q0[1], q0[0], 0.0]),  # at rest in the turning frame
+        h=0.02,
+        args={"mu": EARTH_MOON},
+        observables={
+            "energy": energy,
+            "jacobi_constant": jacobi_constant,
+            "angular_momentum": angular_momentum,
+        },
+        units={"q": "distance of the bodies", "p": "1", "t": "period/2π", "energy": "1"},
+        source="Szebehely 1967, Theory of Orbits, 1 and 4",
+        check=check_start,
+        parameters={"mu": "share of the small body in the mass of both, at most 1/2 [1]"},
+        invariants=("energy", "jacobi_constant"),
+        symmetries={"time": time_translation()},
+    )

@@ -1,0 +1,192 @@
+r"""A free rigid body in the canonical variables of Serret and Andoyer.
+
+    q = (l, g, k),    p = (L, G, K)
+
+G is the size of the angular momentum, K its part along the fixed z axis, L that along the third
+principal axis of the body; k is the longitude of the angular momentum, g the angle from the fixed
+plane to that of the body on the plane across the angular momentum, l the body's angle about its
+third axis. On the principal axes the angular momentum is
+
+    M = (√(G² − L²) sin l, √(G² − L²) cos l, L).
+
+They are free of the singularity of Euler's angles where the body's axis is vertical, and have their
+own where L = ±G (and k loses its meaning at K = ±G).
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.generators import Generator
+from ..symmetry.library import scaling, space_translation, time_translation
+from ._elliptic import first_kind, jacobi
+from ._problem import Problem, check_positive, check_shape, over_times
+from ._quadrature import integral_from_zero
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    r"""Energy of rotation; not separable.
+
+    H_D = (G² − L²)/2 (sin² l/I1 + cos² l/I2) + L²/(2 I3),    l of q0, L and G of p1
+    """
+    I1, I2, I3 = args["I1"], args["I2"], args["I3"]
+    s, c = jnp.sin(q0[0]), jnp.cos(q0[0])
+    return (p1[1] ** 2 - p1[0] ** 2) / 2 * (s**2 / I1 + c**2 / I2) + p1[0] ** 2 / (2 * I3)
+
+
+def body_momentum(q, p):
+    """Angular momentum on the principal axes of the body: shape (3,)."""
+    across = jnp.sqrt(p[1] ** 2 - p[0] ** 2)
+    return jnp.stack([across * jnp.sin(q[0]), across * jnp.cos(q[0]), p[0]])
+
+
+def orientation(q, p):
+    r"""The rotation matrix from axes of the body to fixed ones, shape (3, 3).
+
+    R = R_z(k) R_x(J) R_z(g) R_x(σ) R_z(l),    cos J = K/G,  cos σ = L/G
+    """
+    (body, spin, node), (L, G, K) = q, p
+
+    def about_z(c, s):
+        one, zero = jnp.ones_like(c), jnp.zeros_like(c)
+        return jnp.stack(
+            [jnp.stack([c, -s, zero]), jnp.stack([s, c, zero]), jnp.stack([zero, zero, one])]
+        )
+
+    def about_x(c):
+        s, one, zero = jnp.sqrt(1 - c**2), jnp.ones_like(c), jnp.zeros_like(c)
+        return jnp.stack(
+            [jnp.stack([one, zero, zero]), jnp.stack([zero, c, -s]), jnp.stack([zero, s, c])]
+        )
+
+    turns = [about_z(jnp.cos(a), jnp.sin(a)) for a in (node, spin, body)]
+    return turns[0] @ about_x(K / G) @ turns[1] @ about_x(L / G) @ turns[2]
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """The energy of rotation at t1."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """Angular momentum on fixed axes at t1, shape (3,): R M, kept exactly with G, K and k."""
+    return orientation(q1, p1) @ body_momentum(q1, p1)
+
+
+def body_angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """Angular momentum on the body's axes at t1, shape (3,), which goes round in it."""
+    return body_momentum(q1, p1)
+
+
+@over_times
+def exact(t, q0, p0, args):
+    r"""The body at times t of one that is at (q0, p0) at t = 0, for I1 < I2 < I3.
+
+        M = (a cn, b sn, c dn)(λt + u | m)    where G² > 2 E I2, else with 1 and 3 in turn
+        g = g0 + ∫ G (sin² l/I1 + cos² l/I2) dt,    l = atan2(M1, M2), without jumps
+
+    - `t`: times, any shape. `q0`, `p0`: shape (3,). Returns q, p of shape t.shape + (3,).
+
+    g and the turns of l are integrated numerically, to round-off for some 60 periods. NaN on the
+    separatrix, G² = 2 E I2, and for moments in another order.
+    **Source** Landau & Lifshitz 1976, *Mechanics*, §37.
+    """
+    I = jnp.stack([jnp.asarray(args[name], p0.dtype) for name in ("I1", "I2", "I3")])  # noqa: E741
+    G2, E2 = p0[1] ** 2, 2 * hamiltonian(0.0, 0.0, q0, p0, args)
+    M0 = body_momentum(q0, p0)
+    about_third = E2 * I[1] < G2
+    # Where it goes about the first axis, first and third change places.
+    order = jnp.where(about_third, jnp.arange(3), jnp.arange(3)[::-1])
+    first, middle, last = I[order]
+    M0 = M0[order]
+    sign = jnp.where(M0[2] < 0, -1.0, 1.0)
+    low, high = (E2 * last - G2) / (last - first), (G2 - E2 * first) / (last - first)
+    wide = (E2 * last - G2) / (last - middle)
+    a, b, c = jnp.sqrt(first * low), jnp.sqrt(middle * wide), sign * jnp.sqrt(last * high)
+    rate = jnp.sqrt((last - middle) * (G2 - E2 * first) / (first * middle * last))
+    m = (middle - first) * (E2 * last - G2) / ((last - middle) * (G2 - E2 * first))
+    m = jnp.where(m < 1, m, jnp.nan)
+    start = first_kind(jnp.arctan2(M0[1] / b, sign * M0[0] / a), m)
+
+    def body(s):
+        sn, cn, dn, _ = jacobi(rate * s + start, m)
+        one, two, three = sign * a * cn, b * sn, c * dn
+        return jnp.where(about_third, one, three), two, jnp.where(about_third, three, one)
+
+    def spread(s):
+        """sin² l/I1 + cos² l/I2."""
+        M1, M2, _ = body(s)
+        return (M1**2 / I[0] + M2**2 / I[1]) / (M1**2 + M2**2)
+
+    M1, M2, M3 = body(t)
+    roughly = q0[0] + integral_from_zero(lambda s: body(s)[2] * (1 / I[2] - spread(s)), t)
+    angle = jnp.arctan2(M1, M2)
+    angle = angle + 2 * jnp.pi * jnp.round((roughly - angle) / (2 * jnp.pi))
+    g = q0[1] + p0[1] * integral_from_zero(spread, t)
+    return jnp.stack([angle, g, q0[2]]), jnp.stack([M3, p0[1], p0[2]])
+
+
+def check_start(q0, p0, args):
+    """Refuse a start of another shape, momenta beyond G, or moments that no body has.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (3,),
+        "the rigid body has angles (l, g, k) and momenta (L, G, K): q0 and p0 of shape (3,)",
+    )
+    check_positive(args, "I1", "I2", "I3")
+    moments = [args["I1"], args["I2"], args["I3"]]
+    if 2 * max(moments) > sum(moments):
+        raise ValueError(f"each moment of inertia is at most the sum of the others, got {moments}.")
+    L, G, K = np.asarray(p0, float)
+    if not (abs(L) < G and abs(K) <= G):
+        raise ValueError(
+            f"the parts L and K of the angular momentum must be smaller than its size G, got "
+            f"L = {L}, G = {G}, K = {K}; at L = ±G the angles are singular."
+        )
+
+
+def rigid_body() -> Problem:
+    """A body of moments 1, 2 and 2.5 that starts near its middle axis, and so turns over.
+
+    Dimensionless. Start and step are ours.
+
+    **Source** variables: Andoyer 1923, *Cours de mécanique céleste*, I; Deprit 1967, *Am. J. Phys.*
+    35, 424; motion: Landau & Lifshitz 1976, *Mechanics*, §37.
+    """
+    return Problem(
+        name="rigid_body",
+        system=System(hamiltonian),
+        q0=np.array([0.1, 0.0, 0.4]),
+        p0=np.array([0.1, 1.0, 0.6]),
+        h=0.05,
+        args={"I1": 1.0, "I2": 2.0, "I3": 2.5},
+        observables={
+            "energy": energy,
+            "angular_momentum": angular_momentum,
+            "body_angular_momentum": body_angular_momentum,
+        },
+        units={"q": "rad", "p": "1", "t": "1", "energy": "1"},
+        source="Deprit 1967, Am. J. Phys. 35, 424; Landau & Lifshitz 1976, Mechanics, §37",
+        check=check_start,
+        parameters={
+            f"I{i}": f"moment of inertia about principal axis {i} [mass length²]" for i in (1, 2, 3)
+        },
+        invariants=("energy", "angular_momentum"),
+        symmetries={
+            "time": time_translation(),
+            "turn_about_angular_momentum": space_translation([0.0, 1.0, 0.0]),
+            "turn_about_z": space_translation([0.0, 0.0, 1.0]),
+            "scaling": scaling(q=0.0, p=1.0, t=-1.0),
+            "tilt": Generator(eta=_tilt),
+        },
+        exact=exact,
+    )
+
+
+def _tilt(t, q, p, args):
+    """η = ∂/∂K: the energy does not know where the angular momentum points."""
+    return jnp.zeros_like(p).at[2].set(1.0)

@@ -1,0 +1,77 @@
+"""An oscillator whose frequency changes slowly."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import scaling
+from ._problem import Adiabatic, InSlowTime, Problem, check_shape
+from .oscillator import exact as of_oscillator
+
+
+def frequency(tau, args):
+    """ω(τ) = 1 + d sin τ, |d| < 1, of the slow time τ = εt."""
+    return 1 + args["depth"] * jnp.sin(tau)
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = (p1² + ω(τ0)² q0²)/2; the times are slow ones, τ = εt."""
+    return (jnp.sum(p1**2) + frequency(t0, args) ** 2 * jnp.sum(q0**2)) / 2
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """(p² + ω(τ1)² q²)/2 at the end of the step; t1 is the slow time τ1."""
+    return hamiltonian(t1, t1, q1, p1, args)
+
+
+def action(t0, t1, q0, p0, q1, p1, args):
+    """J = E/ω at the end of the step: the adiabatic invariant; t1 is the slow time τ1."""
+    return energy(t0, t1, q0, p0, q1, p1, args) / frequency(t1, args)
+
+
+def exact(t, q0, p0, args):
+    """The state at times t at ε = 0, where ω = 1 for ever; t.shape + q0.shape."""
+    return of_oscillator(t, q0, p0, args)
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not one q and one p, or a frequency that changes its sign.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (1,),
+        "the slow oscillator has one degree of freedom: q0 and p0 of shape (1,)",
+    )
+    if not abs(args["depth"]) < 1:
+        raise ValueError(f"depth must be between -1 and 1, got {args['depth']}.")
+
+
+def slow_oscillator() -> Problem:
+    """H = (p² + ω(εt)² q²)/2, ω = 1 + 0.3 sin εt: its energy goes with ω, E/ω wavers by O(ε).
+
+    Dimensionless. A step map keeps its own action instead, which differs by O(h): see "What is
+    conserved". Start and step are ours.
+
+    **Source** Ehrenfest 1916, *Ann. Phys.* 356, 327; Arnold 1989, *Mathematical Methods of
+    Classical Mechanics*, §52.
+    """
+    return Problem(
+        name="slow_oscillator",
+        system=System(hamiltonian, slow_time=True),
+        q0=np.array([0.4]),
+        p0=np.array([0.3]),
+        h=0.1,
+        args={"depth": 0.3},
+        observables={"energy": InSlowTime(energy), "action": InSlowTime(action)},
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="Ehrenfest 1916, Ann. Phys. 356, 327; Arnold 1989, §52",
+        check=check_start,
+        parameters={"depth": "relative change of the frequency [1]"},
+        invariants=("energy", "action"),
+        adiabatic={"action": Adiabatic("rate of the change over the frequency", 1)},
+        symmetries={"scaling": scaling()},
+        exact=exact,
+    )

@@ -1,0 +1,99 @@
+"""Euler's problem: a body attracted by two centres that stand still, in space."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.library import rotation, time_translation
+from ._problem import Problem, check_positive, check_shape
+
+
+def distances(q, args):
+    """r1 and r2, from the centres at z = +d and z = −d."""
+    x, y, z = q
+    d, across = args["d"], x**2 + y**2
+    return jnp.sqrt(across + (z - d) ** 2), jnp.sqrt(across + (z + d) ** 2)
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = |p1|²/2 − μ1/r1 − μ2/r2, unit mass; centres at (0, 0, ±d)."""
+    r1, r2 = distances(q0, args)
+    return jnp.sum(p1**2) / 2 - args["mu1"] / r1 - args["mu2"] / r2
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """The energy at t1."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def axial_angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """L_z = x p_y − y p_x at t1, about the line through the centres."""
+    return q1[0] * p1[1] - q1[1] * p1[0]
+
+
+def euler_integral(t0, t1, q0, p0, q1, p1, args):
+    r"""Euler's third integral at t1.
+
+        G = L1·L2 + 2d (μ2 cos θ2 − μ1 cos θ1),    L_i = (q − c_i) × p,  cos θ_i = (z ∓ d)/r_i
+
+    L1·L2 = |L|² − d² (p_x² + p_y²). At d = 0 it is |L|². **Source** Erikson & Hill 1949, *Phys.
+    Rev.* 75, 29; its sign checked by the Poisson bracket with H.
+    """
+    r1, r2 = distances(q1, args)
+    d, z = args["d"], q1[2]
+    momenta = jnp.sum(jnp.cross(q1, p1) ** 2) - d**2 * jnp.sum(p1[:2] ** 2)
+    return momenta + 2 * d * (args["mu2"] * (z + d) / r2 - args["mu1"] * (z - d) / r1)
+
+
+def angular_momentum_squared(t0, t1, q0, p0, q1, p1, args):
+    """|q × p|² at t1, which one centre would keep and two do not."""
+    return jnp.sum(jnp.cross(q1, p1) ** 2)
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not in space, or on a centre, with a `ValueError`."""
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (3,),
+        "the problem of two centres is in space: q0 and p0 of shape (3,)",
+    )
+    check_positive(args, "d")
+    q = np.asarray(q0, float)
+    for z in (args["d"], -args["d"]):
+        if not (q - [0.0, 0.0, z]).any():
+            raise ValueError(
+                f"the body is on top of the centre at [0, 0, {z}]: the force is infinite."
+            )
+
+
+def two_centres() -> Problem:
+    """An orbit about both of two unequal centres; dimensionless. Start and step are ours.
+
+    **Source** Euler 1760; Whittaker 1937, *Analytical Dynamics*, §53; Erikson & Hill 1949, *Phys.
+    Rev.* 75, 29.
+    """
+    return Problem(
+        name="two_centres",
+        system=System(hamiltonian),
+        q0=np.array([2.0, 0.0, 0.5]),
+        p0=np.array([0.1, 0.6, 0.5]),
+        h=0.02,
+        args={"mu1": 1.0, "mu2": 0.6, "d": 0.5},
+        observables={
+            "energy": energy,
+            "axial_angular_momentum": axial_angular_momentum,
+            "euler_integral": euler_integral,
+            "angular_momentum_squared": angular_momentum_squared,
+        },
+        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        source="Whittaker 1937, Analytical Dynamics, §53; Erikson & Hill 1949, Phys. Rev. 75, 29",
+        check=check_start,
+        parameters={
+            "mu1": "strength of the centre at z = d [length³/time²]",
+            "mu2": "strength of the centre at z = −d [length³/time²]",
+            "d": "half the distance of the centres [length]",
+        },
+        invariants=("energy", "axial_angular_momentum", "euler_integral"),
+        symmetries={"time": time_translation(), "rotation": rotation(0, 1)},
+    )

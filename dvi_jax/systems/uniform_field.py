@@ -1,0 +1,148 @@
+"""A charged particle in uniform magnetic and electric fields."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._system import System
+from ..symmetry.generators import Generator
+from ..symmetry.library import time_translation
+from ._problem import Problem, check_positive, check_shape, over_times
+
+
+def vector_potential(q, args):
+    """A = B/2 (−y, x, 0), of B along z."""
+    return args["B"] / 2 * jnp.stack([-q[1], q[0], jnp.zeros_like(q[2])])
+
+
+def kinetic_momentum(q, p, args):
+    """m v = p − e A(q): shape (3,)."""
+    return p - args["charge"] * vector_potential(q, args)
+
+
+def hamiltonian(t0, t1, q0, p1, args):
+    """H_D = |p1 − e A(q0)|²/(2m) − e E·q0, with canonical momenta p = mv + eA: not separable."""
+    kinetic = jnp.sum(kinetic_momentum(q0, p1, args) ** 2) / (2 * args["mass"])
+    return kinetic - args["charge"] * jnp.sum(jnp.asarray(args["E"], q0.dtype) * q0)
+
+
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """m|v|²/2 − e E·q at t1."""
+    return hamiltonian(t0, t1, q1, p1, args)
+
+
+def drift(args):
+    """E × B/B², the velocity of the guiding centre across B: shape (3,)."""
+    E = jnp.asarray(args["E"])
+    return jnp.stack([E[1], -E[0], jnp.zeros_like(E[0])]) / args["B"]
+
+
+def magnetic_moment(t0, t1, q0, p0, q1, p1, args):
+    """m |v⊥ − E × B/B²|²/(2B) at t1: here exactly kept."""
+    turning = kinetic_momentum(q1, p1, args) / args["mass"] - drift(args).astype(q1.dtype)
+    return args["mass"] * jnp.sum(turning[:2] ** 2) / (2 * args["B"])
+
+
+def kinetic_energy(t0, t1, q0, p0, q1, p1, args):
+    """m|v|²/2 at t1, which the electric field changes."""
+    return jnp.sum(kinetic_momentum(q1, p1, args) ** 2) / (2 * args["mass"])
+
+
+def pseudomomentum(t0, t1, q0, p0, q1, p1, args):
+    """K = p + e B × q/2 − e E t1 at t1, shape (3,): what the magnetic translations keep."""
+    half = args["charge"] * args["B"] / 2
+    turned = jnp.stack([-q1[1], q1[0], jnp.zeros_like(q1[2])])
+    return p1 + half * turned - args["charge"] * jnp.asarray(args["E"], q1.dtype) * t1
+
+
+def _translation(axis):
+    """ξ = a, η = e B × a/2: a shift in space, and of A what it takes."""
+    a = np.eye(3)[axis]
+
+    def push(t, q, p, args):
+        return args["charge"] * args["B"] / 2 * jnp.asarray([-a[1], a[0], 0.0], p.dtype)
+
+    return Generator(xi=lambda t, q, p, args: jnp.asarray(a, q.dtype), eta=push)
+
+
+@over_times
+def exact(t, q0, p0, args):
+    r"""The particle at times t of one that is at (q0, p0) at t = 0, with w = v⊥ − E × B/B²:
+
+        w(t) = w cos Ωt + (w × ẑ) sin Ωt,    z = z0 + v_z t + e E_z t²/(2m),    Ω = eB/m
+        q⊥ = q⊥0 + (E × B/B²) t + [w sin Ωt + (w × ẑ)(1 − cos Ωt)]/Ω
+
+    - `t`: times, any shape. `q0`, `p0`: shape (3,). Returns q, p of shape t.shape + (3,).
+
+    **Source** Jackson 1999, *Classical Electrodynamics*, 12.2–12.3.
+    """
+    m, turn = args["mass"], args["charge"] * args["B"] / args["mass"]
+    push = args["charge"] * jnp.asarray(args["E"])[2] / m
+    across = drift(args)
+    v = kinetic_momentum(q0, p0, args) / m
+    w, c, s = v - across, jnp.cos(turn * t), jnp.sin(turn * t)
+    x = q0[0] + across[0] * t + (w[0] * s + w[1] * (1 - c)) / turn
+    y = q0[1] + across[1] * t + (w[1] * s - w[0] * (1 - c)) / turn
+    z = q0[2] + v[2] * t + push * t**2 / 2
+    vx = across[0] + w[0] * c + w[1] * s
+    vy = across[1] + w[1] * c - w[0] * s
+    half = args["charge"] * args["B"] / 2
+    p = jnp.stack([m * vx - half * y, m * vy + half * x, m * (v[2] + push * t)])
+    return jnp.stack([x, y, z]), p
+
+
+def check_start(q0, p0, args):
+    """Refuse a start that is not in space, fields that are none, or a mass that is not positive.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (3,),
+        "the field holds one particle in space: q0 and p0 of shape (3,)",
+    )
+    check_positive(args, "mass")
+    if np.shape(args["E"]) != (3,):
+        raise ValueError(f"E must have shape (3,), got {np.shape(args['E'])}.")
+    for name in ("charge", "B"):
+        if args[name] == 0:
+            raise ValueError(f"{name} is 0: the particle does not gyrate. Take another system.")
+
+
+def uniform_field() -> Problem:
+    """A particle that gyrates about B = ẑ and drifts across it and E = 0.1 x̂; dimensionless.
+
+    e = m = B = 1: gyrofrequency 1. Start and step are ours.
+
+    **Source** Jackson 1999, *Classical Electrodynamics*, 12.2–12.3; pseudomomentum: Johnson &
+    Lippmann 1949, *Phys. Rev.* 76, 828.
+    """
+    return Problem(
+        name="uniform_field",
+        system=System(hamiltonian),
+        q0=np.array([1.0, 0.0, 0.0]),
+        p0=np.array([0.0, -0.5, 0.2]),
+        h=0.1,
+        args={"charge": 1.0, "mass": 1.0, "B": 1.0, "E": np.array([0.1, 0.0, 0.0])},
+        observables={
+            "energy": energy,
+            "magnetic_moment": magnetic_moment,
+            "pseudomomentum": pseudomomentum,
+            "kinetic_energy": kinetic_energy,
+        },
+        units={"q": "1", "p": "1", "t": "1/gyrofrequency", "energy": "1"},
+        source="Jackson 1999, Classical Electrodynamics, 12.2–12.3",
+        check=check_start,
+        parameters={
+            "charge": "e [charge]",
+            "mass": "m [mass]",
+            "B": "magnetic field along z [mass/(charge time)]",
+            "E": "electric field [mass length/(charge time²)]",
+        },
+        invariants=("energy", "magnetic_moment", "pseudomomentum"),
+        symmetries={
+            "time": time_translation(),
+            **{f"magnetic_translation_{x}": _translation(i) for i, x in enumerate("xyz")},
+        },
+        exact=exact,
+    )
