@@ -1,4 +1,4 @@
-r"""The magnetic moment of a charge that gyrates fast, and its first correction.
+r"""The adiabatic invariants of a charge that gyrates fast: moment, first correction, bounces.
 
 The units are those of e, m and B: gyrofrequency Ω = eB/m. With b = B/|B|, v∥ = v·b, v⊥ = v − v∥ b
 and the position on the gyration ρ = b × v⊥/Ω, the moment μ0 = m v⊥²/(2|B|) changes as
@@ -24,6 +24,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+_HALVINGS = 54
+"""Of the interval that holds the mirror point: to the last digits."""
 
 
 def parts(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> tuple[Any, Any, Any, Any]:
@@ -65,3 +70,39 @@ def first_correction(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) ->
         + m * along**2 * jnp.sum(rho * curvature) / strength
         - m * along * shear / (4 * strength * gyration)
     )
+
+
+def centre(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> Any:
+    """The guiding centre q − ρ, shape (3,)."""
+    B = field(q)
+    return q - jnp.cross(B, mv) / (args["charge"] * jnp.sum(B**2))
+
+
+def bounce_action(
+    strength: Callable[[Any], Any], arc: Callable[[Any], Any], far: Any, E: Any, mu: Any, m: Any
+) -> Any:
+    r"""J = ∮ p∥ ds = 4 ∫_0^{s_m} √(2m (E − μB)) ds along a line that is alike on both sides.
+
+    - `strength`: |B| as a function of a coordinate x along the line, growing from its middle,
+      x = 0; `arc`: ds/dx. Of any shape. `far`: an x beyond the mirror point, μB = E.
+    - `E`: energy, `mu`: moment, `m`: mass.
+
+    To about 1e-12 of itself; zero where μB > E at the middle. Not differentiable.
+    **Source** Northrop 1963, *The Adiabatic Motion of Charged Particles*, 3.
+    """
+    limit = E / mu
+
+    def halve(_, ends):
+        low, high = ends
+        middle = (low + high) / 2
+        inside = strength(middle) < limit
+        return jnp.where(inside, middle, low), jnp.where(inside, high, middle)
+
+    ends = (jnp.zeros_like(limit), far * jnp.ones_like(limit))
+    mirror, _ = jax.lax.fori_loop(0, _HALVINGS, halve, ends)
+    # x = x_m sin θ takes the root at the mirror point away
+    theta = jnp.asarray(np.pi / 4 * (1 + _NODES), limit.dtype)
+    weights = jnp.asarray(np.pi / 4 * _WEIGHTS, limit.dtype)
+    x = mirror * jnp.sin(theta)
+    along = jnp.sqrt(jnp.maximum(2 * m * (E - mu * strength(x)), 0.0))
+    return 4 * jnp.sum(weights * along * arc(x) * mirror * jnp.cos(theta))

@@ -1,6 +1,5 @@
 """Störmer's problem: a charged particle in the field of a magnetic dipole."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -8,10 +7,6 @@ from .._system import System
 from ..symmetry.library import rotation, time_translation
 from . import _guiding_centre as guiding_centre
 from ._problem import Adiabatic, Problem, check_positive, check_shape
-
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-_HALVINGS = 54
-"""Of the interval that holds the latitude of the mirror point: to the last digits."""
 
 
 def vector_potential(q, args):
@@ -74,32 +69,19 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
     **Source** Northrop 1963, *The Adiabatic Motion of Charged Particles*, 3.
     """
     m, mv = args["mass"], kinetic_momentum(q1, p1, args)
-    E = jnp.sum(mv**2) / (2 * m)
-    mu = corrected_moment(t0, t1, q0, p0, q1, p1, args)
-    B = magnetic_field(q1, args)
-    centre = q1 - jnp.cross(B, mv) / (args["charge"] * jnp.sum(B**2))
+    centre = guiding_centre.centre(q1, mv, lambda q: magnetic_field(q, args), args)
     L = jnp.sum(centre**2) ** 1.5 / jnp.sum(centre[:2] ** 2)
-    ratio = E / (mu * args["B0"] * (args["radius"] / L) ** 3)
+    at_equator = args["B0"] * (args["radius"] / L) ** 3
 
     def strength(latitude):
-        """|B| over that at the equator of the line."""
-        return jnp.sqrt(1 + 3 * jnp.sin(latitude) ** 2) / jnp.cos(latitude) ** 6
+        return at_equator * jnp.sqrt(1 + 3 * jnp.sin(latitude) ** 2) / jnp.cos(latitude) ** 6
 
-    def halve(_, ends):
-        low, high = ends
-        middle = (low + high) / 2
-        inside = strength(middle) < ratio
-        return jnp.where(inside, middle, low), jnp.where(inside, high, middle)
+    def arc(latitude):
+        return L * jnp.cos(latitude) * jnp.sqrt(1 + 3 * jnp.sin(latitude) ** 2)
 
-    ends = (jnp.zeros_like(ratio), jnp.full_like(ratio, jnp.pi / 2))
-    mirror, _ = jax.lax.fori_loop(0, _HALVINGS, halve, ends)
-    # λ = λ_m sin θ takes the root at the mirror point away
-    nodes, weights = (jnp.asarray(x, q1.dtype) for x in (_NODES, _WEIGHTS))
-    theta = jnp.pi / 2 * nodes
-    latitude = mirror * jnp.sin(theta)
-    along = jnp.sqrt(jnp.maximum(2 * m * E * (1 - strength(latitude) / ratio), 0.0))
-    length = L * jnp.cos(latitude) * jnp.sqrt(1 + 3 * jnp.sin(latitude) ** 2)
-    return 2 * jnp.sum(jnp.pi / 2 * weights * along * length * mirror * jnp.cos(theta))
+    E = jnp.sum(mv**2) / (2 * m)
+    mu = corrected_moment(t0, t1, q0, p0, q1, p1, args)
+    return guiding_centre.bounce_action(strength, arc, jnp.pi / 2, E, mu, m)
 
 
 def check_start(q0, p0, args):
@@ -164,7 +146,7 @@ def dipole_field(radius: float = 50.0) -> Problem:
             for name, power in (
                 ("magnetic_moment", 1),
                 ("corrected_moment", 2),
-                ("bounce_action", 1),
+                ("bounce_action", 2),
             )
         },
         symmetries={"time": time_translation(), "rotation": rotation(0, 1)},

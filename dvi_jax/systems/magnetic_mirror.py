@@ -70,15 +70,26 @@ def corrected_moment(t0, t1, q0, p0, q1, p1, args):
 def bounce_action(t0, t1, q0, p0, q1, p1, args):
     r"""The longitudinal invariant at t1, the second adiabatic one [action].
 
-        J = ∮ p∥ ds = 2 ∫ √(2m (E − μ B)) dz = 2π m ℓ (E − μ B0)/√(2m μ B0)
+        J = ∮ p∥ ds = 4 ∫ √(2m (E − μ|B|)) ds,    from the middle to the mirror point
 
-    from mirror point to mirror point and back, with B on the axis and μ the `corrected_moment`.
-    Right up to (distance from the axis/ℓ)². **Source** Northrop 1963, 3.
+    along the field line of the guiding centre, (x² + y²)(1 + z²/ℓ²) = a², with μ the
+    `corrected_moment`. Near the axis 2πmℓ (E − μB0)/√(2mμB0). Zero where the particle mirrors in
+    the middle. Not differentiable. **Source** Northrop 1963, 3.
     """
-    m, B0 = args["mass"], args["B0"]
+    m, mv, length = args["mass"], kinetic_momentum(q1, p1, args), args["length"]
+    x, y, z = guiding_centre.centre(q1, mv, lambda q: magnetic_field(q, args), args)
+    a = (x**2 + y**2) * (1 + (z / length) ** 2) / length**2
+    E = energy(t0, t1, q0, p0, q1, p1, args)
     mu = corrected_moment(t0, t1, q0, p0, q1, p1, args)
-    free = energy(t0, t1, q0, p0, q1, p1, args) - mu * B0
-    return 2 * jnp.pi * m * args["length"] * free / jnp.sqrt(2 * m * mu * B0)
+
+    def strength(u):  # of u = z/ℓ
+        return args["B0"] * jnp.sqrt((1 + u**2) ** 2 + a * u**2 / (1 + u**2))
+
+    def arc(u):
+        return length * jnp.sqrt(1 + a * u**2 / (1 + u**2) ** 3)
+
+    far = jnp.sqrt(jnp.maximum(E / (mu * args["B0"]) - 1, 0.0))  # where it turns on the axis
+    return guiding_centre.bounce_action(strength, arc, far, E, mu, m)
 
 
 def check_start(q0, p0, args):
@@ -97,21 +108,21 @@ def check_start(q0, p0, args):
             raise ValueError(f"{name} must be positive, got {args[name]}.")
 
 
-def magnetic_mirror(length: float = 20.0) -> Problem:
+def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
     """A particle that bounces in B = B0 (1 + z²/ℓ²) on the axis; dimensionless.
 
     e = m = B0 = 1: gyroradius and gyrofrequency 1 at the start, on the middle plane with its
-    guiding centre at (2, 0, 0). With v∥ = 0.8 v⊥ it turns where |B| is 1.64 times that, near
-    z = 0.8 ℓ. Field, start and step are ours.
+    guiding centre at (`distance`, 0, 0). With v∥ = 0.8 v⊥ it turns where |B| is 1.64 times that,
+    near z = 0.8 ℓ. Field, start and step are ours.
 
-    - `length`: ℓ, over the gyroradius.
+    - `length`: ℓ, and `distance` from the axis, both over the gyroradius.
 
     - args: `charge` e, `mass` m, `B0`, `length` ℓ.
 
     **Source** equations and adiabatic invariant: Northrop 1963, *The Adiabatic Motion of Charged
     Particles*.
     """
-    x, vy, vz = 3.0, -1.0, 0.8
+    x, vy, vz = distance + 1, -1.0, 0.8
     return Problem(
         name="magnetic_mirror",
         system=System(hamiltonian),
@@ -138,12 +149,14 @@ def magnetic_mirror(length: float = 20.0) -> Problem:
         invariants=("energy", "canonical_angular_momentum"),
         adiabatic={
             name: Adiabatic(
-                "gyroradius over ℓ", power, smaller=lambda factor: magnetic_mirror(length / factor)
+                "gyroradius over ℓ",
+                power,
+                smaller=lambda factor: magnetic_mirror(length / factor, distance / factor),
             )
             for name, power in (
                 ("magnetic_moment", 1),
                 ("corrected_moment", 2),
-                ("bounce_action", 1),
+                ("bounce_action", 2),
             )
         },
         symmetries={"time": time_translation(), "rotation": rotation(0, 1)},

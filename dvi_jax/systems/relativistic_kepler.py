@@ -37,7 +37,7 @@ def precession(q, p, args):
     return 2 * jnp.pi * (1 / jnp.sqrt(1 - args["K"] ** 4 / (args["c"] * L) ** 2) - 1)
 
 
-def runge_lenz_angle(t0, t1, q0, p0, q1, p1, args):
+def perihelion_angle(t0, t1, q0, p0, q1, p1, args):
     r"""Direction of the perihelion at t1 [rad], between −π and π, which advances steadily.
 
         The orbit has dr/dθ and 1/r with e cos ψ = 1/(Cr) − 1 and e sin ψ = p_r/(LΓC),
@@ -82,7 +82,7 @@ def check_start(q0, p0, args):
 def relativistic_kepler() -> Problem:
     """The start at perihelion of an ellipse of e ≈ 0.4 with K = 1, c = 10; dimensionless.
 
-    It turns by 1.3° from perihelion to perihelion. Start and step are ours. General relativity:
+    It turns by 2.2° from perihelion to perihelion. Start and step are ours. General relativity:
     `relativity`, with `n_body`.
 
     **Source** Sommerfeld 1916, *Ann. Phys.* 356, 1.
@@ -97,7 +97,7 @@ def relativistic_kepler() -> Problem:
         observables={
             "energy": energy,
             "angular_momentum": angular_momentum,
-            "runge_lenz_angle": runge_lenz_angle,
+            "perihelion_angle": perihelion_angle,
         },
         units={"q": "1", "p": "1", "t": "1", "energy": "1"},
         source="Sommerfeld 1916, Ann. Phys. 356, 1",
