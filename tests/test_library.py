@@ -21,7 +21,15 @@ import dvi_jax as dvi
 from dvi_jax import systems
 from dvi_jax.run import run_file
 from dvi_jax.systems._elliptic import complete, first_kind, jacobi
+from dvi_jax.systems.hill import LAGRANGE_DISTANCE
+from dvi_jax.systems.lotka_volterra import equilibrium, from_populations, to_populations
+from dvi_jax.systems.magnetic_mirror import magnetic_field
+from dvi_jax.systems.nls_lattice import plane_wave
+from dvi_jax.systems.oblate_kepler import elements, secular_rates
+from dvi_jax.systems.relativistic_kepler import precession
 from dvi_jax.systems.solar_system import EphemerisMissing
+from dvi_jax.systems.spinning_top import steady_precession
+from dvi_jax.systems.van_der_pol import averaged_amplitude
 
 NAMES = list(systems.LIBRARY)
 QUICK = ("duffing", "kepler", "nls_lattice")
@@ -500,3 +508,422 @@ def test_a_run_file_names_it(name, tmp_path):
     report = json.loads((run_file(path).folder / "report.json").read_text(encoding="utf-8"))
     assert report["status"]["result"] == "successful"
     assert set(report["results"]) >= set(made.observables)
+
+
+# Elliptic functions, and exact solutions in every regime
+
+
+def test_elliptic_integrals_and_functions_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    m = np.r_[0.0, rng.uniform(0, 1, 60), 1 - 1e-6]
+    u, phi = rng.uniform(-20, 20, (2, m.size))
+    np.testing.assert_allclose(complete(m), [ellipk(m), ellipe(m)], rtol=2e-15)
+    np.testing.assert_allclose(first_kind(phi, m), ellipkinc(phi, m), rtol=3e-15)
+    np.testing.assert_allclose(jacobi(u, m), ellipj(u, m), rtol=0, atol=5e-14)
+    assert np.max(np.abs(jacobi(u, m**1.001)[0] - ellipj(u, m)[0])) > 1e-4
+    assert float(jax.grad(lambda m: complete(m)[0])(0.0)) == pytest.approx(np.pi / 8)  # K′(0)
+
+
+REGIMES = {
+    "pendulum": [
+        ([1.5], [1.0]),
+        ([-1.5], [-0.3]),
+        ([0.0], [1.99]),
+        ([7.0], [0.4]),  # a turn away from the lowest point
+        ([0.5], [2.5]),  # over the top, both ways round
+        ([-2.0], [-3.0]),
+    ],
+    "duffing": [
+        ([-1.2], [0.2]),
+        ([0.7], [-0.3]),
+        ([1.2], [0.0]),
+        ([0.3], [1.0]),  # over the hill
+        ([-1.6], [-0.9]),
+    ],
+    "kepler": [
+        ([0.0, 1.2], [-1.0, -0.6]),
+        ([1.0, 0.0], [0.0, 1.0]),  # a circle
+        ([0.1, 0.0], [0.0, -4.3]),  # perihelion of e = 0.85, backwards
+    ],
+    "rigid_body": [
+        ([0.1, 0.0, 0.4], [0.1, 1.0, 0.6]),
+        ([0.4, 0.2, 0.0], [0.9, 1.0, 0.6]),  # about the third axis
+        ([0.4, 0.2, 0.0], [-0.9, 1.0, -0.6]),
+        ([1.4, -2.0, 0.0], [-0.1, 1.0, 0.6]),  # about the first
+        ([-1.4, -2.0, 0.0], [0.2, 1.0, 0.6]),
+    ],
+    "spinning_top": [
+        ([0.0, 0.6, 0.0], [2.4, 0.1, 2.5]),
+        ([1.0, 1.9, -3.0], [0.4, -0.7, -2.0]),  # it hangs
+        ([0.0, 0.9, 0.0], [1.8, 0.0, 1.5]),  # at a turning point
+    ],
+}
+
+
+@pytest.mark.parametrize("name", REGIMES)
+def test_exact_solutions_solve_the_equations_in_every_regime(name):
+    """They start where they should, and their derivative in time is that of the equations."""
+    made, rates = problem(name), functions(name)
+    ts = jnp.linspace(-7.0, 30.0, 11)
+
+    @jax.jit
+    @jax.vmap
+    def seen(q0, p0):
+        def at(t):
+            return made.exact(t, q0, p0, made.args)
+
+        states, slopes = jax.vmap(lambda t: jax.jvp(at, (t,), (jnp.ones_like(t),)))(ts)
+        return at(jnp.zeros(())), states, slopes
+
+    starts = [jnp.asarray(x) for x in zip(*REGIMES[name], strict=True)]
+    first, states, slopes = seen(*starts)
+    np.testing.assert_allclose(np.stack(first), np.stack(starts), rtol=0, atol=5e-14)
+    wanted = jax.vmap(jax.vmap(lambda q, p: rates(0.0, q, p, 0.0, made.args)))(*states)
+    for a, b in zip(slopes, wanted, strict=True):
+        assert np.max(np.abs(a - b)) < 5e-12 * np.max(np.abs(b))
+    bent = jax.vmap(jax.vmap(lambda q, p: rates(0.0, q * 1.0001, p, 0.0, made.args)))(*states)
+    assert max(np.max(np.abs(a - b)) for a, b in zip(slopes, bent, strict=True)) > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "q0", "p0"),
+    [
+        ("pendulum", [0.0], [2.0]),  # m = 1
+        ("duffing", [0.0], [0.0]),  # E = 0
+        ("kepler", [1.0, 0.0], [0.0, 1.5]),  # it escapes
+    ],
+)
+def test_an_exact_solution_that_does_not_hold_is_not_a_number(name, q0, p0):
+    made = problem(name)
+    q, p = made.exact(1.0, jnp.array(q0), jnp.array(p0), made.args)
+    assert np.all(np.isnan(q))
+    assert np.all(np.isnan(p))
+
+
+# Adiabatic invariants
+
+
+def wavers(problems, epsilons, keys, h, num_steps):
+    """Range over mean of observables, for one problem and ε after another: key → shape (lanes,)."""
+    base = problems[0]
+    lanes = [(made.q0, made.p0, made.args) for made in problems]
+    q0, p0, args = jax.tree.map(lambda *x: jnp.asarray(np.stack(x), float), *lanes)
+
+    @jax.jit
+    @jax.vmap
+    def run(q0, p0, args, epsilon):
+        # Runge's method: explicit for every system, and at these steps good to 1e-5 over the run.
+        sol = dvi.integrate(
+            base.system,
+            q0,
+            p0,
+            h=h,
+            num_steps=num_steps,
+            args=args,
+            epsilon=epsilon,
+            method=dvi.RungeKutta4(),
+            save=dvi.Save(final=True),
+            observe={
+                key: (dvi.Range(base.observables[key]), dvi.Mean(base.observables[key]))
+                for key in keys
+            },
+        )
+        return {key: spread / mean for key, (spread, mean) in sol.observed.items()}
+
+    return {key: np.asarray(x) for key, x in run(q0, p0, args, jnp.asarray(epsilons)).items()}
+
+
+FACTORS = np.array([1.0, 0.5, 0.25])
+
+
+@pytest.mark.parametrize(
+    ("made", "h", "time"),
+    [
+        pytest.param(systems.magnetic_mirror(40.0, 20.0), 0.025, 1200.0, marks=pytest.mark.slow),
+        pytest.param(systems.dipole_field(100.0), 0.025, 1600.0, marks=pytest.mark.slow),
+        pytest.param(systems.stiff_fput(omega=50.0), 0.0005, 50.0, marks=pytest.mark.slow),
+    ],
+    ids=lambda x: getattr(x, "name", ""),
+)
+def test_adiabatic_invariants_waver_by_the_declared_power(made, h, time):
+    """What is small halved twice: wavers fall to 2^−power each time."""
+    key = next(iter(made.adiabatic))
+    problems = [made.adiabatic[key].smaller(f) for f in FACTORS]
+    found = wavers(problems, np.zeros(3), list(made.adiabatic), h, round(time / h))
+    for key, fact in made.adiabatic.items():
+        powers = np.log2(found[key][:-1] / found[key][1:])
+        assert np.max(np.abs(powers - fact.power)) < 0.15, (key, powers)
+
+
+@pytest.mark.parametrize(
+    ("name", "epsilon", "h"),
+    [
+        ("slow_oscillator", 0.02, 0.05),
+        pytest.param("lorentz_pendulum", 0.1, 0.02, marks=pytest.mark.slow),
+    ],
+)
+def test_slow_actions_waver_by_epsilon(name, epsilon, h):
+    """E/ω, and the action of a large swing, over a whole cycle of the change; E goes with ω."""
+    made, epsilons = problem(name), epsilon * FACTORS
+    num_steps = round(2 * np.pi / epsilons[-1] / h)
+    found = wavers([made] * 3, epsilons, list(made.observables), h, num_steps)
+    powers = np.log2(found["action"][:-1] / found["action"][1:])
+    assert np.max(np.abs(powers - made.adiabatic["action"].power)) < 0.1
+    assert np.all(np.abs(found["energy"]) > 0.5)
+    if name == "lorentz_pendulum":  # and E/ν of a swing of 1 rad is not adiabatic
+        assert np.all(found["small_swing_action"] > 0.03)
+
+
+@functools.cache
+def gyrating():
+    """A particle off the axis of a mirror that stays near the middle: t, |B|, μ and μ + μ1."""
+    made = systems.magnetic_mirror(40.0, 20.0)
+    p0 = made.p0 * np.array([1.0, 1.0, 0.375])  # v∥ = 0.3
+    sol = dvi.integrate(
+        made.system,
+        made.q0,
+        p0,
+        h=0.05,
+        num_steps=5024,  # 40 turns at |B| = 1
+        args=made.args,
+        method=dvi.RungeKutta4(),
+        observe={
+            "moment": made.observables["magnetic_moment"],
+            "corrected": made.observables["corrected_moment"],
+            "field": lambda t0, t1, q0, p0, q1, p1, args: jnp.linalg.norm(magnetic_field(q1, args)),
+        },
+    )
+    return np.asarray(sol.ts)[1:], {key: np.asarray(x) for key, x in sol.observed.items()}
+
+
+def test_the_moment_oscillates_at_the_gyration():
+    """Its spectrum has its peak at eB/(2πm); the correction takes nearly all of it away."""
+    ts, seen = gyrating()
+    window = np.hanning(ts.size)
+    frequency = np.fft.rfftfreq(ts.size, ts[1] - ts[0])
+    power = {
+        key: np.abs(np.fft.rfft((seen[key] - seen[key].mean()) * window))
+        for key in ("moment", "corrected")
+    }
+    gyration = seen["field"].mean() / (2 * np.pi)
+    assert abs(frequency[np.argmax(power["moment"])] / gyration - 1) < 0.04
+    near = np.abs(frequency / gyration - 1) < 0.2
+    assert np.max(power["moment"][near]) > 5 * np.max(power["moment"][frequency < 0.5 * gyration])
+    assert np.max(power["corrected"][near]) < 0.1 * np.max(power["moment"][near])
+
+
+@pytest.mark.slow
+def test_the_moment_does_not_drift():
+    """3000 gyrations: the trend over them is far below the waver; Runge–Kutta loses its mean."""
+    made = systems.magnetic_mirror(40.0, 20.0)
+    moment = made.observables["magnetic_moment"]
+    corrected = made.observables["corrected_moment"]
+    h, num_steps = 0.2, round(2 * np.pi * 3000 / 0.2)
+    lost = {}
+    for method in (dvi.GaussLegendre(2), dvi.RungeKutta4()):
+        sol = dvi.integrate(
+            made.system,
+            made.q0,
+            made.p0,
+            h=h,
+            num_steps=num_steps,
+            args=made.args,
+            method=method,
+            save=dvi.Save(final=True),
+            observe={
+                "trends": (dvi.Trend(moment), dvi.Trend(corrected)),
+                "ranges": (dvi.Range(moment), dvi.Range(corrected)),
+            },
+        )
+        seen = jax.tree.map(float, sol.observed)
+        changes = np.abs(seen["trends"]) * h * num_steps
+        lost[type(method).__name__] = changes / np.array(seen["ranges"])
+        if isinstance(method, dvi.GaussLegendre):
+            assert seen["ranges"][1] < 0.2 * seen["ranges"][0]
+    assert np.all(lost["GaussLegendre"] < [0.02, 0.1])
+    assert np.all(lost["RungeKutta4"] > 0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("made", "time"),
+    [(systems.magnetic_mirror(80.0, 40.0), 1200), (systems.dipole_field(200), 900)],
+)
+def test_the_bounce_action_is_what_a_bounce_adds_up_to(made, time):
+    """∮ m v∥² dt along the trajectory, from one upward crossing of the middle to the next."""
+    sol = dvi.integrate(
+        made.system,
+        made.q0,
+        made.p0,
+        h=0.05,
+        num_steps=time * 20,
+        args=made.args,
+        method=dvi.RungeKutta4(),
+        observe=made.observables["bounce_action"],
+    )
+    module = __import__(f"dvi_jax.systems.{made.name}", fromlist=["magnetic_field"])
+
+    def along(q, p):
+        B, mv = module.magnetic_field(q, made.args), module.kinetic_momentum(q, p, made.args)
+        return jnp.sum(B * mv) ** 2 / jnp.sum(B**2) / made.args["mass"]
+
+    rate = np.asarray(jax.jit(jax.vmap(along))(sol.qs, sol.ps))
+    z = np.asarray(sol.qs)[:, 2]
+    up = np.flatnonzero((z[:-1] <= 0) & (z[1:] > 0))
+    assert len(up) >= 2
+    added = np.sum(rate[up[0] : up[1]]) * 0.05
+    formula = np.mean(sol.observed)
+    assert abs(added / formula - 1) < 5e-3
+    assert abs(added / formula - 1) < 0.2 * abs(2 / 3 - 1)  # a third less would be seen
+
+
+# References of single systems
+
+
+def test_the_relativistic_perihelion_advances_by_the_closed_form():
+    made = problem("relativistic_kepler")
+    sol = dvi.integrate(
+        made.system,
+        made.q0,
+        made.p0,
+        h=0.02,
+        num_steps=1500,
+        args=made.args,
+        method=dvi.BlanesMoan(6),
+        observe=made.observables["perihelion_angle"],
+    )
+    angle = np.asarray(sol.observed)
+    jumps = np.diff(angle)[np.abs(np.diff(angle)) > 1e-3]
+    wanted = float(precession(jnp.asarray(made.q0), jnp.asarray(made.p0), made.args))
+    assert len(jumps) >= 4
+    np.testing.assert_allclose(jumps, wanted, rtol=1e-7)
+    first_order = np.pi / (10 * 0.9) ** 2
+    assert abs(wanted / first_order - 1) == pytest.approx(0.75 / 90**2 * 100, rel=0.3)
+
+
+@pytest.mark.slow
+def test_node_and_perigee_move_at_the_secular_rates():
+    """Two days of a satellite: to first order in J2, hence to about a per cent."""
+    made = problem("oblate_kepler")
+    osculating = made.observables["osculating_elements"]
+
+    @jax.jit
+    @jax.vmap
+    def run(J2):
+        return dvi.integrate(
+            made.system,
+            made.q0,
+            made.p0,
+            h=20.0,
+            num_steps=8640,
+            args={**made.args, "J2": J2},
+            method=dvi.BlanesMoan(4),
+            save=dvi.Save(final=True),
+            observe=(dvi.Trend(osculating), dvi.Mean(osculating)),
+        ).observed
+
+    trends, means = (np.asarray(x) for x in run(jnp.array([made.args["J2"], 0.0])))
+    node, perigee = secular_rates(*means[0, :3], made.args)
+    assert abs(trends[0, 3] / node - 1) < 0.01
+    assert abs(trends[0, 4] / perigee - 1) < 0.03
+    assert np.max(np.abs(trends[1, 3:])) < 1e-3 * abs(node)  # a sphere
+    e = elements(jnp.asarray(made.q0), jnp.asarray(made.p0), made.args["mu"])
+    np.testing.assert_allclose(e, [8000, 0.1, np.deg2rad(50), 0, 0], rtol=1e-12, atol=1e-12)
+
+
+def test_lagrange_points_are_at_rest():
+    from dvi_jax.systems.restricted_three_body import EARTH_MOON, lagrange_points, momentum
+
+    rates = functions("restricted_three_body")
+    for mu in (EARTH_MOON, 0.3, 1e-9):
+        points = lagrange_points(mu)
+        for q in points:
+            p = np.asarray(momentum(jnp.asarray(q), jnp.zeros(3)))
+            for x in rates(0.0, q, p, 0.0, {"mu": mu}):
+                wanted = np.array([0.0, 0.0, 0.0])
+                np.testing.assert_allclose(x, wanted, atol=3e-13 if mu > 1e-6 else 1e-9)
+        off = rates(0.0, points[0] + [1e-3, 0, 0], p, 0.0, {"mu": mu})
+        assert np.max(np.abs(off)) > 1e-4
+    assert points[1][0] - (1 - mu) == pytest.approx(LAGRANGE_DISTANCE * mu ** (1 / 3), rel=1e-3)
+    x = np.array([LAGRANGE_DISTANCE, 0.0, 0.0])
+    for rate in functions("hill")(0.0, x, np.array([0.0, x[0], 0.0]), 0.0, None):
+        np.testing.assert_allclose(rate, 0, atol=1e-15)
+    with pytest.raises(ValueError, match="0 < mu"):
+        lagrange_points(0.6)
+
+
+def test_hill_is_the_limit_of_the_restricted_problem():
+    """Lengths over μ^(1/3) about the small body: the equations agree up to O(μ^(1/3))."""
+    _, q, p, _ = nearby("hill", 1)
+    wanted, off = np.concatenate(functions("hill")(0.0, q, p, 0.0, None)), []
+    for mu in (1e-6, 1e-9):
+        unit, body = mu ** (1 / 3), np.array([1 - mu, 0.0, 0.0])
+        of_body = np.array([0.0, 1 - mu, 0.0])
+        rate, push = functions("restricted_three_body")(
+            0.0, body + unit * q, of_body + unit * p, 0.0, {"mu": mu}
+        )
+        # the body itself turns: its own velocity is zero here, its momentum falls as −(1 − μ) x̂
+        found = np.concatenate([rate, push + (1 - mu) * np.array([1.0, 0.0, 0.0])]) / unit
+        off.append(np.max(np.abs(found - wanted)))
+    assert off[0] < 0.1 * np.max(np.abs(wanted))
+    assert off[1] / off[0] == pytest.approx(0.1, rel=0.1)
+
+
+def test_populations_go_to_logarithms_and_back():
+    numbers = np.array([[3.0, 40.0], [7.0, 0.1]])
+    np.testing.assert_allclose(to_populations(*from_populations(*numbers)), numbers, rtol=1e-14)
+    with pytest.raises(ValueError, match=r"number of predators must be positive, got 0\.0"):
+        from_populations(1.0, 0.0)
+    args = problem("lotka_volterra").args
+    at = from_populations(*([x] for x in equilibrium(args)))
+    for rate in functions("lotka_volterra")(0.0, *at, 0.0, args):
+        np.testing.assert_allclose(rate, 0, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_van_der_pol_ends_on_its_cycle():
+    """The amplitude by averaging, to O(ε): from inside and from outside."""
+    made = problem("van_der_pol")
+    for start_at in (0.5, 3.0):
+        off = {}
+        for epsilon in (0.02, 0.01):
+            sol = dvi.integrate(
+                made.system,
+                [start_at],
+                [0.0],
+                h=0.05,
+                num_steps=round(10 / epsilon / 0.05),
+                epsilon=epsilon,
+                method=dvi.GaussLegendre(2),
+                observe=made.observables["amplitude"],
+            )
+            law = averaged_amplitude(sol.ts[1:], epsilon, start_at)
+            off[epsilon] = float(jnp.max(jnp.abs(sol.observed - law)))
+            assert abs(float(sol.observed[-1]) - 2) < 0.05
+        assert off[0.02] < 0.1
+        assert 0.35 < off[0.01] / off[0.02] < 0.65
+
+
+def test_a_top_precesses_steadily_where_it_should():
+    """θ rests with the p_φ of either rate, and falls with another."""
+    args, theta, p_psi = problem("spinning_top").args, 0.6, 2.5
+    for rate in np.asarray(steady_precession(theta, p_psi, args)):
+        p_phi = args["A"] * np.sin(theta) ** 2 * rate + p_psi * np.cos(theta)
+        state = np.array([0.0, theta, 0.0]), np.array([p_phi, 0.0, p_psi])
+        (turn, fall, _), (_, push, _) = functions("spinning_top")(0.0, *state, 0.0, args)
+        assert float(turn) == pytest.approx(rate, rel=1e-13)
+        assert abs(float(fall)) + abs(float(push)) < 1e-13
+        state[1][0] += 0.1
+        assert abs(float(functions("spinning_top")(0.0, *state, 0.0, args)[1][1])) > 0.01
+    assert np.all(np.isnan(steady_precession(theta, 0.5, args)))  # too slow
+
+
+def test_plane_waves_solve_the_schroedinger_lattice():
+    args = {"kappa": 0.7, "gamma": 1.3}
+    for mode in (0, 2):
+        states, slopes = jax.jvp(
+            lambda t: plane_wave(t, 6, mode, 0.8, args), (jnp.array(1.7),), (jnp.array(1.0),)
+        )
+        for a, b in zip(slopes, functions("nls_lattice")(0.0, *states, 0.0, args), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-14)
+            assert np.max(np.abs(b)) > 0.1
