@@ -179,7 +179,7 @@ def test_declared_invariants_are_kept_by_the_flow(name):
     for key in made.invariants:
         x, y, z = (np.asarray(v[key]) for v in (values, sheared, far))
         scale = np.max(np.abs(x)) + np.max(np.abs(z))
-        if np.max(np.abs(x)) < 1e-9:  # a sum that is zero: the size of its terms
+        if np.max(np.abs(x)) < 1e-6 * energy_size(name):  # a sum that is zero: size of its terms
             scale += energy_size(name)
         drift, control = (np.max(np.abs(v - v[0])) / scale for v in (x, y))
         assert drift < 1e-11, key
@@ -496,12 +496,25 @@ def test_an_observable_in_slow_time_asks_for_epsilon():
     assert float(action.bind(None, 0.5)(*at)) == pytest.approx((1 + w**2) / 2 / w, rel=1e-14)
 
 
+IN_RUN_FILES = [
+    pytest.param(
+        name,
+        marks=pytest.mark.xfail(
+            strict=True,
+            raises=ValueError,
+            reason="a run reads the start of an observable before it has told it ε",
+        ),
+    )
+    if name in ("slow_oscillator", "lorentz_pendulum")
+    else name
+    for name in NAMES
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [n for n in NAMES if n != "slow_oscillator"])
+@pytest.mark.parametrize("name", IN_RUN_FILES)
 def test_a_run_file_names_it(name, tmp_path):
     made = problem(name)
-    if any(isinstance(f, systems.InSlowTime) for f in made.observables.values()):
-        pytest.xfail("a run reads the start of an observable before it has told it ε")
     path = tmp_path / "run.toml"
     text = f'system = "{name}"\nsteps = 5\n[output]\nplots = false\n'
     path.write_text(text + f'dir = "{(tmp_path / "out").as_posix()}"\n', encoding="utf-8")
@@ -706,7 +719,10 @@ def test_the_moment_oscillates_at_the_gyration():
         for key in ("moment", "corrected")
     }
     gyration = seen["field"].mean() / (2 * np.pi)
-    assert abs(frequency[np.argmax(power["moment"])] / gyration - 1) < 0.04
+    least, most = (x / (2 * np.pi) for x in (seen["field"].min(), seen["field"].max()))
+    peak = frequency[np.argmax(power["moment"])]
+    assert least - frequency[1] < peak < most + frequency[1]
+    assert most / least < 1.1
     near = np.abs(frequency / gyration - 1) < 0.2
     assert np.max(power["moment"][near]) > 5 * np.max(power["moment"][frequency < 0.5 * gyration])
     assert np.max(power["corrected"][near]) < 0.1 * np.max(power["moment"][near])
@@ -747,7 +763,7 @@ def test_the_moment_does_not_drift():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("made", "time"),
-    [(systems.magnetic_mirror(80.0, 40.0), 1200), (systems.dipole_field(200), 900)],
+    [(systems.magnetic_mirror(80.0, 40.0), 1200), (systems.dipole_field(200.0), 900)],
 )
 def test_the_bounce_action_is_what_a_bounce_adds_up_to(made, time):
     """∮ m v∥² dt along the trajectory, from one upward crossing of the middle to the next."""
@@ -862,8 +878,7 @@ def test_hill_is_the_limit_of_the_restricted_problem():
         rate, push = functions("restricted_three_body")(
             0.0, body + unit * q, of_body + unit * p, 0.0, {"mu": mu}
         )
-        # the body itself turns: its own velocity is zero here, its momentum falls as −(1 − μ) x̂
-        found = np.concatenate([rate, push + (1 - mu) * np.array([1.0, 0.0, 0.0])]) / unit
+        found = np.concatenate([rate, push]) / unit  # the body itself rests in this frame
         off.append(np.max(np.abs(found - wanted)))
     assert off[0] < 0.1 * np.max(np.abs(wanted))
     assert off[1] / off[0] == pytest.approx(0.1, rel=0.1)
@@ -921,9 +936,8 @@ def test_a_top_precesses_steadily_where_it_should():
 def test_plane_waves_solve_the_schroedinger_lattice():
     args = {"kappa": 0.7, "gamma": 1.3}
     for mode in (0, 2):
-        states, slopes = jax.jvp(
-            lambda t: plane_wave(t, 6, mode, 0.8, args), (jnp.array(1.7),), (jnp.array(1.0),)
-        )
+        wave = functools.partial(plane_wave, n=6, mode=mode, amplitude=0.8, args=args)
+        states, slopes = jax.jvp(wave, (jnp.array(1.7),), (jnp.array(1.0),))
         for a, b in zip(slopes, functions("nls_lattice")(0.0, *states, 0.0, args), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-14)
             assert np.max(np.abs(b)) > 0.1
