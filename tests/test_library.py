@@ -350,7 +350,9 @@ SYMMETRIC = [
 ]
 
 
-@pytest.mark.parametrize("name", SYMMETRIC)
+@pytest.mark.parametrize(
+    "name", [n for n in MOST if (n if isinstance(n, str) else n.values[0]) in SYMMETRIC]
+)
 def test_declared_symmetries_solve_the_determining_equations(name):
     made, of = problem(name), residuals(name)
     t, q, p, _ = nearby(name, 5)
