@@ -125,7 +125,7 @@ def relativistic(t, q, K, c, **_):
 
 
 def oblate(q, args):
-    """Acceleration as printed in textbooks (Vallado 2013, 8.6)."""
+    """Acceleration as printed in textbooks (Vallado 2013, *Fundamentals of Astrodynamics*)."""
     r = np.linalg.norm(q)
     size, tilt = 1.5 * args["J2"] * (args["R"] / r) ** 2, 5 * (q[2] / r) ** 2
     return -args["mu"] / r**3 * q * (1 - size * (tilt - np.array([1.0, 1.0, 3.0])))

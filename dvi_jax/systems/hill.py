@@ -60,7 +60,7 @@ def hill() -> Problem:
     period over 2π. The limit μ → 0 of `restricted_three_body` with lengths over μ^(1/3). Start and
     step are ours.
 
-    **Source** Hill 1878, *Am. J. Math.* 1, 5; Szebehely 1967, *Theory of Orbits*, 10.4; scaled as
+    **Source** Hill 1878, *Am. J. Math.* 1, 5; Szebehely 1967, *Theory of Orbits*, 10; scaled as
     in Hénon 1969, *Astron. Astrophys.* 1, 223.
     """
     x, speed = 0.23, 0.23**-0.5

@@ -45,7 +45,7 @@ def exact(t, q0, p0, args):
     - `t`: times, any shape. `q0`, `p0`: shape (2,). Returns q, p of shape t.shape + (2,).
 
     NaN for a body that escapes, of energy ≥ 0. **Source** Danby 1988, *Fundamentals of Celestial
-    Mechanics*, 6.7.
+    Mechanics*, 6.
     """
     mu, r0 = args["K"] ** 2, jnp.sqrt(jnp.sum(q0**2))
     inverse = 2 / r0 - jnp.sum(p0**2) / mu

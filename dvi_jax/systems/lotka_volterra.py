@@ -71,12 +71,12 @@ def check_start(q0, p0, args):
 def lotka_volterra() -> Problem:
     """Hares and lynxes of the Hudson's Bay Company, in thousands and years.
 
-    Rates 0.55, 0.028, 0.84, 0.026 and the start (33.9, 5.9) are means of a published fit to the
-    pelts of 1900–1920; one cycle takes about eleven years.
+    Rates and the start of 33.9 and 5.9 thousand are ours, of the size that fits to the pelts of
+    1900–1920 give (as Carpenter 2018, *Predator–Prey Population Dynamics: the Lotka–Volterra model
+    in Stan*); one cycle takes 9.9 years.
 
     **Source** Lotka 1925, *Elements of Physical Biology*; Volterra 1926, *Mem. Acad. Lincei Roma*
-    2, 31; rates: Carpenter 2018, *Predator–Prey Population Dynamics: the Lotka–Volterra model in
-    Stan*; canonical form: Hairer, Lubich & Wanner 2006, I.1.1 and VII.2.
+    2, 31; canonical form: Hairer, Lubich & Wanner 2006, I.1.1 and VII.2.
     """
     q0, p0 = from_populations([33.9], [5.9])
     return Problem(

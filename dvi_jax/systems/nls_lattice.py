@@ -70,8 +70,7 @@ def nls_lattice(n: int = 8) -> Problem:
 
     **Raises** `ValueError` for fewer than three sites.
 
-    **Source** Kevrekidis 2009, *The Discrete Nonlinear Schrödinger Equation*; Hairer, Lubich &
-    Wanner 2006, *Geometric Numerical Integration*, VII.4.
+    **Source** Kevrekidis 2009, *The Discrete Nonlinear Schrödinger Equation*.
     """
     site = np.arange(n) - n / 2
     size, phase = 1 / np.cosh(site / 1.5), 0.5 * site

@@ -95,8 +95,8 @@ def check_start(q0, p0, args):
 def oblate_kepler() -> Problem:
     """A satellite of the Earth of a = 8000 km, e = 0.1 and i = 50°, at perigee on the node.
 
-    km, s and unit mass: p is the velocity. Node and perigee move by `secular_rates`, −4.3° and
-    +4.6° a day for the first and the second. Start and step are ours.
+    km, s and unit mass: p is the velocity. Node and perigee move by `secular_rates`, −3.0° and
+    +2.5° a day. Start and step are ours.
 
     **Source** Kozai 1959, *Astron. J.* 64, 367; μ, R and J2: EGM96 (Lemoine et al. 1998,
     NASA/TP-1998-206861).

@@ -91,7 +91,7 @@ def check_start(q0, p0, args):
 
 
 def pendulum() -> Problem:
-    """H = p²/2 − ω² cos q with the friction −εp, swinging to 2.1 rad; dimensionless.
+    """H = p²/2 − ω² cos q with the friction −εp, swinging to 2.0 rad; dimensionless.
 
     ω = 1, mass and length 1; q is measured from the lowest point. Start and step are ours.
 

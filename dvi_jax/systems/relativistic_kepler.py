@@ -80,7 +80,7 @@ def check_start(q0, p0, args):
 
 
 def relativistic_kepler() -> Problem:
-    """The start at perihelion of an ellipse of e ≈ 0.4 with K = 1, c = 10; dimensionless.
+    """The start at perihelion of an ellipse of e ≈ 0.35 with K = 1, c = 10; dimensionless.
 
     It turns by 2.2° from perihelion to perihelion. Start and step are ours. General relativity:
     `relativity`, with `n_body`.

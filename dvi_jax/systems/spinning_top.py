@@ -50,7 +50,7 @@ def steady_precession(theta, p_psi, args):
         A cos θ Ω² − p_ψ Ω + w = 0,    p_φ = A sin² θ Ω + p_ψ cos θ
 
     NaN where p_ψ² < 4 A w cos θ: too slow a top has none. At θ = π/2 the fast one is infinite.
-    **Source** Goldstein, Poole & Safko 2002, *Classical Mechanics*, (5.76).
+    **Source** Goldstein, Poole & Safko 2002, *Classical Mechanics*, 5.7.
     """
     lift = args["A"] * jnp.cos(theta)
     root = jnp.sqrt(p_psi**2 - 4 * lift * args["w"])
