@@ -88,7 +88,8 @@ def test_what_has_no_frequency_has_a_status(name):
     assert found.status == name
     assert len(FREQUENCY_RESULTS[getattr(FREQUENCY_RESULTS, name)]) > 80
     if name in ("unresolved", "not_converged"):
-        assert np.isnan(found.frequencies[:2]).any()
+        lost = np.isnan(found.frequencies) & np.isnan(found.amplitudes)
+        assert 0 < lost.sum() < COUNT + (name == "not_converged")
     else:
         assert np.isnan(found.frequencies).all()
         assert np.isnan(found.amplitudes).all()
@@ -149,7 +150,7 @@ def test_noise_is_left_over():
     assert found.residual == pytest.approx(np.sqrt(0.02) / total, rel=0.1)
 
 
-@pytest.mark.parametrize("window", [0, 1, 2])
+@pytest.mark.parametrize("window", [0, pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_bias_of_a_line_not_fitted_falls_with_the_window(window):
     """|δω| ∝ T^−(2·window + 2): Laskar 1999."""
     spans = np.repeat([1.0, 2.0, 4.0], 8)  # the spacing grows and the number of samples stays
@@ -204,6 +205,7 @@ def test_jit_and_vmap_change_nothing():
     assert list(mapped.status) == ["successful"] * 3
 
 
+@pytest.mark.slow
 def test_under_jit_a_failure_is_an_error_too():
     strict = jax.jit(lambda z: frequencies(TS, z, count=COUNT).frequencies)
     np.testing.assert_allclose(strict(torus())[:4], OMEGA, rtol=0, atol=1e-13)
@@ -211,6 +213,7 @@ def test_under_jit_a_failure_is_an_error_too():
         jax.block_until_ready(strict(np.zeros(N, complex)))
 
 
+@pytest.mark.slow
 def test_a_frequency_can_be_differentiated():
     ts = 0.5 * np.arange(256)
 
@@ -243,42 +246,44 @@ def test_pendulum_swings_at_the_frequency_of_the_elliptic_integral():
     assert found.frequencies[0, 0] == pytest.approx(omega, rel=1e-11)
     odd = np.array([1, -1, 3, -3, 5])
     np.testing.assert_allclose(found.frequencies[0] / omega, odd, rtol=1e-7)
-    assert frequency_diffusion(swing()).rate[0] < -10
     coarse = dvi.integrate(dvi.System(pendulum), [2.0], [0.0], h=0.2, num_steps=N - 1)
     wrong = frequencies(coarse, count=COUNT).frequencies[0, 0]
     assert abs(wrong - omega) > 1e-4 * omega  # the control: the map's own frequency, order 1
 
 
-def test_diffusion_tells_chaos_from_order():
+@functools.cache
+def stars():
+    """Diffusion of five orbits of Hénon and Heiles: two regular, two chaotic, one that failed."""
     problem = systems.henon_heiles()
 
     def start(y, py, E):
         return [0.0, y], [np.sqrt(2 * E - py**2 - y**2 + 2 * y**3 / 3), py]
 
     starts = [start(0.1, 0.2, 1 / 12), start(0.3, 0.0, 1 / 8), start(-0.1, 0.0, 0.165),
-              start(0.0, 0.1, 0.165)]  # fmt: skip
+              start(0.0, 0.1, 0.165), ([0.0, np.nan], [0.1, 0.1])]  # fmt: skip
     q, p = jnp.asarray(starts).transpose(1, 0, 2)
-    sols = jax.vmap(
+    return jax.vmap(
         lambda q, p: dvi.integrate(
             problem.system, q, p, h=0.1, num_steps=10 * N, method=dvi.KahanLi(6),
-            save=dvi.Save(every=5),
+            save=dvi.Save(every=5), throw=False,
         )
     )(q, p)  # fmt: skip
-    moved = frequency_diffusion(sols, throw=False)
-    assert moved.rate.shape == (4, 2)
-    assert (moved.status == "successful").all()
+
+
+def test_diffusion_tells_chaos_from_order():
+    moved = frequency_diffusion(stars(), throw=False)
+    assert moved.rate.shape == (5, 2)
+    assert (moved.status[:4] == "successful").all()
     assert (moved.rate[:2] < -7).all()
-    assert (moved.rate[2:] > -3).all()
+    assert (moved.rate[2:4] > -3).all()
 
 
 def test_diffusion_of_what_failed_is_no_number():
-    z = np.stack([torus(), np.where(np.arange(N) > 1500, np.nan, torus())])
-    moved = frequency_diffusion(TS, z, throw=False)
-    assert list(moved.status) == ["successful", "not_finite"]
-    assert moved.rate[0] < -11
-    assert np.isnan([moved.rate[1], moved.first[1], moved.second[1]]).all()
-    with pytest.raises(FrequencyError, match="not_finite"):
-        frequency_diffusion(TS, z)
+    moved = frequency_diffusion(stars(), throw=False)
+    assert (moved.status[4] == "not_finite").all()
+    assert np.isnan([moved.rate[4], moved.first[4], moved.second[4]]).all()
+    with pytest.raises(FrequencyError, match=r"2 of 10 signals.*\(4, 0\): not_finite"):
+        frequency_diffusion(stars())
 
 
 IRREGULAR = TS + 1e-3 * np.sin(TS)

@@ -164,29 +164,23 @@ def lines_of(z: Array, settings: Settings) -> Lines:
     spread = jnp.sum(grid.weights * jnp.abs(blocks - A[0]) ** 2)
 
     def advance(i, state):
-        s, A, there = state
-        r = blocks - _synthesis(grid, s, A)
+        s, A, there, r, _ = state
         new, size = _strongest(grid, r, is_real)
         real = (i < count) & _is_line(grid, r, new, size, s, A, there)
         new, size = jnp.where(real, new, 0.0), jnp.where(real, size, 0.0)
-        fresh = 1 + mirrored * i + np.arange(mirrored)
+        fresh = 1 + mirrored * i + np.arange(mirrored)  # after the last line beyond the end
         s = s.at[fresh].set(jnp.stack([new, -new])[:mirrored], mode="drop")
         A = A.at[fresh].set(jnp.stack([size, jnp.conj(size)])[:mirrored], mode="drop")
         there = there.at[fresh].set(real, mode="drop")
-        s, A = _fitted(grid, blocks, s, A, there, settings.refine)
+        s, A, r, moved = _fitted(grid, blocks, s, A, there, settings.refine)
         keep = ~there | (jnp.abs(A) > _least(s, s, A, there))
-        keep = jnp.repeat(keep[1::mirrored], mirrored)
-        keep = jnp.concatenate([np.ones(1, bool), keep])  # a pair goes together
-        return jnp.where(keep, s, 0.0), jnp.where(keep, A, 0.0), there & keep
+        keep = jnp.repeat(keep[1::mirrored], mirrored)  # a pair goes together
+        keep = jnp.concatenate([np.ones(1, bool), keep])
+        return jnp.where(keep, s, 0.0), jnp.where(keep, A, 0.0), there & keep, r, moved
 
     rounds = count + (_LAST if settings.refine else 0)
-    s, A, there = lax.fori_loop(0, rounds, advance, (s, A, there))
-    moved = jnp.zeros(slots)
-    if settings.refine:
-        rest = blocks - _synthesis(grid, s, A)
-        moved = _correction(grid, s, A, rest, there, True, 0.0)[1]
-
-    rest = blocks - _synthesis(grid, s, A)
+    begin = (s, A, there, blocks - A[0], jnp.zeros(slots))
+    s, A, there, rest, moved = lax.fori_loop(0, rounds, advance, begin)
     residual = jnp.sqrt(
         jnp.sum(grid.weights * jnp.abs(rest) ** 2) / jnp.where(spread > 0, spread, 1.0)
     )
@@ -197,9 +191,7 @@ def lines_of(z: Array, settings: Settings) -> Lines:
     unsettled = there & ~(jnp.abs(moved) <= _SETTLED * np.pi)
     both = there[:, None] & there[None, :] & ~np.eye(count, dtype=bool)
     near = both & (jnp.abs(s[:, None] - s[None, :]) < np.pi)
-    if is_real:
-        s = jnp.where(there, s, 1.0)
-    unresolved = jnp.any(near, axis=1) | (there & (jnp.abs(s) < (np.pi / 2 if is_real else np.pi)))
+    unresolved = jnp.any(near, axis=1) | (there & (jnp.abs(s) < np.pi))  # from the constant
     code = jnp.asarray(0)
     for name, applies in (
         ("not_converged", jnp.any(unsettled)),
@@ -229,15 +221,16 @@ def _strongest(grid: _Grid, r: Array, is_real: bool) -> tuple[Array, Array]:
     m = jnp.where(m >= (N + 1) // 2, m - N, m)
     s = np.pi * (m + jnp.clip(offset, -0.6, 0.6))
 
-    def climb(_, s):
+    def climb(_, state):
+        s = state[0]
         m0, m1, m2 = _moments(grid, weighted, s[None])[:, 0]
         slope = 2 * jnp.imag(jnp.conj(m0) * m1)
         bend = 2 * (jnp.abs(m1) ** 2 - jnp.real(jnp.conj(m0) * m2))
         step = jnp.where(bend < 0, -slope / jnp.where(bend < 0, bend, 1.0), 0.0)
-        return s + jnp.clip(step, -np.pi / 2, np.pi / 2)
+        return s + jnp.clip(step, -np.pi / 2, np.pi / 2), s, m0
 
-    s = lax.fori_loop(0, _ASCENT, climb, s)
-    return s, _moments(grid, weighted, s[None])[0, 0]
+    _, s, amplitude = lax.fori_loop(0, _ASCENT + 1, climb, (s, s, jnp.zeros((), complex)))
+    return s, amplitude
 
 
 def _is_line(grid: _Grid, r: Array, new: Array, size: Array, s: Array, A: Array, there: Array):
@@ -310,22 +303,27 @@ def _solved(M: Array, B: Array) -> Array:
     return lax.fori_loop(0, K, eliminate, jnp.concatenate([M, B], axis=1))[:, K:]
 
 
-def _fitted(grid, blocks, s, A, there, with_frequencies: bool) -> tuple[Array, Array]:
-    """A few steps of least squares, more and more damped where one does not make the rest less."""
+def _fitted(grid, blocks, s, A, there, with_frequencies: bool):
+    """A few steps of least squares, more and more damped where one does not make the rest less.
+
+    Returns s, A, what they leave over, and the last undamped step in s.
+    """
 
     def of(s, A):
         rest = blocks - _synthesis(grid, s, A)
         return rest, jnp.sum(grid.weights * jnp.abs(rest) ** 2)
 
     def step(_, now):
-        s, A, rest, cost, damping = now
+        *place, damping, last = now
+        s, A, rest, cost = place
         change, moved = _correction(grid, s, A, rest, there, with_frequencies, damping)
         s, A = s + jnp.clip(moved, -np.pi / 4, np.pi / 4), A + change
         new = (s, A, *of(s, A), jnp.zeros(()))
         better = new[3] <= cost * (1 + 1e-9) + EPS**2
-        old = (*now[:4], jnp.maximum(10 * damping, 1e-2))
-        return tuple(jnp.where(better, x, y) for x, y in zip(new, old, strict=True))
+        old = (*place, jnp.maximum(10 * damping, 1e-2))
+        last = jnp.where(damping == 0, moved, last)
+        return *(jnp.where(better, x, y) for x, y in zip(new, old, strict=True)), last
 
-    begin = (s, A, *of(s, A), jnp.zeros(()))
-    s, A, *_ = lax.fori_loop(0, _EACH, step, begin)
-    return s, A
+    begin = (s, A, *of(s, A), jnp.zeros(()), jnp.zeros_like(s))
+    s, A, rest, _, _, last = lax.fori_loop(0, _EACH, step, begin)
+    return s, A, rest, last
