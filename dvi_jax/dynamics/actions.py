@@ -216,7 +216,7 @@ def actions(
     if signal.ndim == 1:
         signal = signal[None]
     check_count(settings, signal)
-    if not (np.isscalar(leftover) and np.isfinite(leftover) and leftover > 0):
+    if isinstance(leftover, bool) or not isinstance(leftover, int | float) or not leftover > 0:
         raise ValueError(f"leftover must be a positive number, got {leftover!r}.")
     search = _search(signal.shape[-2], num, guess, order, None, 1e-3)
     lines, raw = analyse(ts, signal, settings)
@@ -358,9 +358,11 @@ def _torus(nu, size, resolution, tolerance, search: _Search) -> tuple[_Torus, st
     power = np.where(there, size, 0.0) ** 2
     ours = matched.reshape(n, count) & there
     total = np.where(power.sum(axis=1) > 0, power.sum(axis=1), 1.0)
+    combinations = np.zeros((len(k), search.num), int)
+    combinations[:, : len(best)] = np.where(matched[:, None], k, 0)
     torus = _Torus(
-        np.pad(best, (0, pad), constant_values=np.nan),
-        np.pad(np.where(matched[:, None], k, 0), ((0, 0), (0, pad))).reshape(n, count, search.num),
+        np.append(best, np.full(pad, np.nan)),
+        combinations.reshape(n, count, search.num),
         np.where(there, misfit.reshape(n, count), np.nan),
         ours,
         float(np.max(np.sum(power * ~ours, axis=1) / total)),

@@ -209,7 +209,7 @@ def lines_of(z: Array, settings: Settings) -> Lines:
 def _strongest(grid: _Grid, r: Array, is_real: bool) -> tuple[Array, Array]:
     """Place and amplitude of the largest maximum of |⟨r, e^{isy}⟩|."""
     N, p = grid.N, grid.window
-    weighted = grid.weights * r
+    weighted = jnp.asarray(grid.weights * r)
     size = jnp.abs(jnp.fft.fft(weighted.reshape(-1)[:N]))
     if is_real:
         size = jnp.where(np.arange(N) <= N // 2, size, 0.0)
