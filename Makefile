@@ -23,7 +23,7 @@ paper: $(READY)
 
 ## make test        all tests
 test: $(READY)
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "slow or not slow"
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "slow or not slow" --durations=40
 
 ## make test-fast   the tests that are not marked slow (what plain pytest runs)
 test-fast: $(READY)

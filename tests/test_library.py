@@ -499,23 +499,8 @@ def test_an_observable_in_slow_time_asks_for_epsilon():
     assert float(action.bind(None, 0.5)(*at)) == pytest.approx((1 + w**2) / 2 / w, rel=1e-14)
 
 
-IN_RUN_FILES = [
-    pytest.param(
-        name,
-        marks=pytest.mark.xfail(
-            strict=True,
-            raises=ValueError,
-            reason="a run reads the start of an observable before it has told it ε",
-        ),
-    )
-    if name in ("slow_oscillator", "lorentz_pendulum")
-    else name
-    for name in NAMES
-]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", IN_RUN_FILES)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_run_file_names_it(name, tmp_path):
     made = problem(name)
     path = tmp_path / "run.toml"

@@ -69,7 +69,9 @@ def watch(
     watched = {}
     for name, observable in observables.items():
         alone = not isinstance(observable, dvi.Reduction)
-        function = observable if alone else observable.function
+        function: Any = observable if alone else observable.function
+        if hasattr(function, "bind"):  # it has to know the system and ε of the run
+            function = function.bind(setup.system, setup.epsilon)
         # A step that goes nowhere stands for the start.
         start = np.asarray(function(t0, t0, q0, p0, q0, p0, setup.args))
         scale = float(np.linalg.norm(start))
