@@ -204,6 +204,30 @@ def sweep_verify(store: StorePath, debug: Debug = False) -> None:
 
 
 @app.command()
+def systems(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="A system of the library.")
+    ] = None,
+) -> None:
+    """List the library of systems, or tell what is known of one.
+
+    Exit code 0: done. 2: there is no such system.
+    """
+    _double_precision()
+    from dvi_jax.run import InputError, library_tables
+
+    try:
+        heading, tables = library_tables(name)
+    except InputError as error:
+        _complain("bad input", str(error))
+        raise typer.Exit(BAD_INPUT) from None
+    console = _stdout()
+    if heading:
+        console.print(heading, markup=False, soft_wrap=True)
+    _print_tables(console, tables, words=True)
+
+
+@app.command()
 def paper(
     out: Annotated[Path, typer.Option(help="Directory for figures and numbers.")],
     force: Force = False,
@@ -296,7 +320,8 @@ def _stdout() -> Any:
     return Console(highlight=False)
 
 
-def _print_tables(console: Any, tables: Any) -> None:
+def _print_tables(console: Any, tables: Any, words: bool = False) -> None:
+    """Tables, their columns but the first to the right, where numbers stand; `words`: all left."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -304,7 +329,8 @@ def _print_tables(console: Any, tables: Any) -> None:
         console.print(table.title, style="bold", markup=False, soft_wrap=True)
         shown = Table()
         for i, column in enumerate(table.columns):
-            shown.add_column(escape(column), justify="left" if i == 0 else "right", overflow="fold")
+            side = "left" if words or i == 0 else "right"
+            shown.add_column(escape(column), justify=side, overflow="fold")
         for row in table.rows:
             shown.add_row(*(escape(cell) for cell in row))
         console.print(shown)

@@ -422,3 +422,17 @@ def test_indicators_of_chaos(folder):
         result = command("run", "bad.toml", "--out", "bad")
         assert result.exit_code == 2, text
         assert "observables.x" in result.output
+
+
+def test_systems_are_listed_and_told_of():
+    result = command("systems")
+    assert result.exit_code == 0, result.output
+    for name in systems.LIBRARY:
+        assert name in result.output
+    result = command("systems", "magnetic_mirror")
+    assert result.exit_code == 0, result.output
+    for word in ("corrected_moment", "to power 2", "rotation", "length", "[charge]", "H_D ="):
+        assert word in result.output
+    result = command("systems", "magnetic_miror")
+    assert result.exit_code == 2
+    assert "did you mean magnetic_mirror?" in result.output
