@@ -176,7 +176,7 @@ def test_an_action_is_kept_where_the_change_is_slow():
 @pytest.mark.slow
 def test_a_chain_of_toda_has_one_frequency_less_than_particles():
     p0 = 2 * np.random.default_rng(0).standard_normal(4)
-    sol = run(systems.toda(4).system.H_D, np.zeros(4), p0 - p0.mean(), 0.1, 4, samples=4096)
+    sol = run(systems.toda(4).system.H_D, np.zeros(4), p0 - p0.mean(), 0.1, 4, samples=8192)
     lines = frequencies(sol.ts, sol.ps.T, count=16)
     three = fundamental_frequencies(lines, num=3, throw=False)
     two = fundamental_frequencies(lines, num=2, throw=False)

@@ -56,8 +56,8 @@ class FREQUENCY_RESULTS(eqx.Enumeration):
         "The signal is no sum of lines at integer combinations of so few frequencies. Likely "
         "causes: (a) the motion is chaotic: see dvi.frequency_diffusion; (b) too few lines: take a "
         "larger count; (c) combinations of high order: take a larger order; (d) the motion changes "
-        "slowly: take a shorter window; (e) the window is too short for the weaker lines; (f) some "
-        "lines above the Nyquist frequency fold back to where no combination is: save more often."
+        "slowly: take a shorter window; (e) the window is too short for the weaker lines; (f) "
+        "lines above the Nyquist frequency fold back to where none should be: save more often."
     )
     resonant = (
         "The lines have fewer independent frequencies than were asked for: an integer combination "
