@@ -54,10 +54,9 @@ def magnetic_moment(t0, t1, q0, p0, q1, p1, args):
 
     It wavers in each turn by the order of gyroradius over ℓ, and does not drift.
     """
-    mv, B = kinetic_momentum(q1, p1, args), magnetic_field(q1, args)
-    strength = jnp.sqrt(jnp.sum(B**2))
-    along = jnp.sum(mv * B) / strength
-    return (jnp.sum(mv**2) - along**2) / (2 * args["mass"] * strength)
+    return guiding_centre.magnetic_moment(
+        q1, kinetic_momentum(q1, p1, args), lambda q: magnetic_field(q, args), args
+    )
 
 
 def corrected_moment(t0, t1, q0, p0, q1, p1, args):
