@@ -451,6 +451,11 @@ def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> Non
 def _check_observe(task: Task, q0: Array, p0: Array) -> None:
     """Refuse observables that are not functions of a step with an array for a value."""
     for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
+        if isinstance(leaf, type) and issubclass(leaf, Deviations | Running):
+            raise TypeError(
+                f"observe holds the class {leaf.__name__}: give it what it takes, as in "
+                "dvi.MEGNO() or dvi.Running(dvi.MEGNO())."
+            )
         if isinstance(leaf, type) and issubclass(leaf, Reduction):
             raise TypeError(
                 f"observe holds the class {leaf.__name__}: give it what it is to reduce, "

@@ -111,6 +111,23 @@ def test_tangent_map_of_a_perturbation_is_symplectic():
         assert defect < 1e-13 if fine else defect > 1e-7
 
 
+def test_tangent_map_by_its_own_door():
+    """One step if nothing is said; all of those of a lattice of given times."""
+    system, q, p = SYSTEMS["kepler"]
+    options = {"epsilon": 0.3, "args": ARGS, "method": dvi.Strang()}
+    one = dvi.tangent_map(system, q, p, h=0.1, **options)
+    assert np.max(np.abs(one - tangent("kepler", dvi.Strang(), 0.3, num_steps=1))) < 1e-15
+    given = dvi.tangent_map(system, q, p, lattice=dvi.Given(np.arange(6) * 0.1), **options)
+    assert np.max(np.abs(given - tangent("kepler", dvi.Strang(), 0.3, num_steps=5))) < 1e-13
+    bad = dvi.tangent_map(system, [0.0, 0.0], p, h=0.1, throw=False, **options)
+    assert np.isnan(bad).all()
+
+
+def test_a_whole_number_of_numpy():
+    found = run(HENON.system, *REGULAR, dvi.LyapunovSpectrum(np.int64(2)), num_steps=10).observed
+    assert found.shape == (2,)
+
+
 def test_tangent_map_on_other_lattices_and_arithmetic():
     plain = tangent("non_separable", dvi.Strang(), 0.3)
     by_sum = tangent("non_separable", dvi.Strang(), 0.3, arithmetic=dvi.Compensated())
@@ -230,6 +247,21 @@ def test_lyapunov_spectrum_over_long_times(energy, exponent):
     """
     spectra = neighbours(energy, 4_000_000, 16, 1e-6)
     assert np.max(np.abs(spectra.mean(0) - [exponent, 0, 0, -exponent])) < 0.003
+
+
+def test_indicators_in_single_precision():
+    """A running sum of 10⁶ steps is off by per cents in float32; these are not."""
+    spring = dvi.System(
+        lambda t0, t1, q0, p1, args: jnp.sum(p1**2 + q0**2) / 2,
+        force=lambda t0, t1, q0, p1, args: -p1,
+    )
+    kinds = (dvi.LyapunovSpectrum(), dvi.MEGNO())
+    start = np.array([1.0], np.float32), np.array([0.0], np.float32)
+    spectrum, megno = run(spring, *start, kinds, epsilon=0.02, num_steps=1_000_000).observed
+    assert spectrum.dtype == jnp.float32
+    assert np.max(np.abs(spectrum / -0.01 - 1)) < 2e-4
+    assert abs(megno / (-0.02 * 50_000 / 4) - 1) < 2e-4
+    assert abs(float(np.cumsum(np.full(1_000_000, 0.05, np.float32))[-1]) / 50_000 - 1) > 5e-3
 
 
 def test_backwards_the_exponents_change_their_signs():
@@ -547,6 +579,10 @@ def test_indicators_under_sweep():
         (lambda: dvi.GALI(2.0), ValueError, "got 2.0"),
         (lambda: dvi.MEGNO(seed=-1), ValueError, "seed of MEGNO .* got -1"),
         (lambda: dvi.SALI(scale=1.0), TypeError, "scale of SALI must be a pair"),
+        (lambda: dvi.MEGNO(scale=(0.0, 1.0)), ValueError, "scale of q in MEGNO .* positive .* 0.0"),
+        (lambda: dvi.MEGNO(scale=(1.0, np.nan)), ValueError, "scale of p in MEGNO .* nan"),
+        (lambda: dvi.GALI(2, scale=("a", 1.0)), ValueError, "scale of q in GALI .* 'a'"),
+        (lambda: dvi.SALI(scale=(1j, 1.0)), ValueError, "scale of q in SALI .* 1j"),
         (lambda: dvi.Running(HENON.observables["energy"]), TypeError, "Running takes a reduction"),
         (lambda: dvi.Running(dvi.Section(lambda t, q, p, a: q[0])), TypeError, "any time"),
     ],
@@ -567,7 +603,8 @@ def test_indicators_that_cannot_be_meant(make, error, message):
             "MEGNO needs steps",
         ),
         (dvi.Running(dvi.MEGNO()), {"save": dvi.Save(ts=[0.1])}, r"Running .*=dvi.Save\(every=m\)"),
-        (dvi.MEGNO, {}, "holds the class MEGNO"),
+        (dvi.MEGNO, {}, r"holds the class MEGNO: .* dvi.MEGNO\(\)"),
+        (dvi.Running, {}, r"holds the class Running: .* dvi.Running\(dvi.MEGNO\(\)\)"),
     ],
 )
 def test_runs_that_cannot_be_meant(observe, options, message):

@@ -417,11 +417,14 @@ def test_indicators_of_chaos(folder):
     ).observed  # fmt: skip
     assert np.allclose(report["results"]["l"]["value"], direct, rtol=0, atol=1e-12)
     assert 0 < report["results"]["megno"]["value"] < 3
-    for text in ("MEGNO(energy)", "GALI(1)", "GALI(", "MEGNOO()"):
+    for text in (
+        "MEGNO(energy)", "GALI(1)", "GALI(", "MEGNOO()", "MEGNO() + SALI()", "MEGNO()(3)", "MEGNO",
+    ):  # fmt: skip
         (folder / "bad.toml").write_text(base + f'x = "{text}"\n', encoding="utf-8")
         result = command("run", "bad.toml", "--out", "bad")
         assert result.exit_code == 2, text
         assert "observables.x" in result.output
+    assert "MEGNO()" in result.output  # which parentheses were left out of
 
 
 def test_systems_are_listed_and_told_of():

@@ -130,6 +130,65 @@ def test_a_section_and_a_bifurcation_are_drawn():
     plot.plt.close("all")
 
 
+def circle(t, q, p, args):
+    """|q|² = 0.05: no plane, and rounding decides on which side of it a point lies."""
+    return jnp.sum(q**2) - 0.05
+
+
+def test_points_of_a_section_as_starts():
+    """They are no crossings, whatever side of the surface rounding has left them on."""
+    settings = {"h": 0.01, "num_steps": 3000, "crossings": 4}
+    q, p = starts(1)
+    first = dvi.poincare_section(HENON.system, q, p, circle, h=0.01, num_steps=9000, crossings=10)
+    again = dvi.poincare_section(HENON.system, first.qs[0], first.ps[0], circle, **settings)
+    assert np.min(again.ts[:, 0]) > 0.1
+    assert np.max(np.abs(again.ts[:-1, 0] - np.diff(first.ts[0]))) < 1e-3
+    sides = np.asarray(jax.vmap(lambda q: circle(0.0, q, q, None))(first.qs[0]))
+    assert np.any(sides < 0) or np.any(sides > 0)
+
+
+def test_a_section_does_not_depend_on_the_sense_of_the_run():
+    """Backwards from where a run has come to, its own crossings, in reverse."""
+    settings = {"h": 0.05, "num_steps": 1200, "crossings": 6}
+    q, p = starts(1)
+    there = dvi.poincare_section(HENON.system, q, p, plane, **settings)
+    end = dvi.integrate(
+        HENON.system, q[0], p[0], h=0.05, num_steps=850, method=dvi.Strang(),
+        save=dvi.Save(final=True),
+    )  # fmt: skip
+    passed = int(np.sum(there.ts[0] < end.ts[-1]))
+    back = dvi.poincare_section(
+        HENON.system, end.qs[-1:], end.ps[-1:], plane, h=-0.05, num_steps=850, t0=end.ts[-1],
+        crossings=passed,
+    )  # fmt: skip
+    assert passed > 3
+    assert np.min(back.ps[..., 0]) > 0  # upwards in x, with time
+    assert np.max(np.abs(back.qs[0, ::-1] - there.qs[0, :passed])) < 1e-4
+    spring = systems.oscillator().system
+    for h in (0.01, -0.01):
+        flashes = dvi.poincare_section(
+            spring, np.ones((1, 1)), np.zeros((1, 1)), dvi.stroboscope(1.0, 0.3), h=h,
+            num_steps=500, crossings=4,
+        ).ts[0]  # fmt: skip
+        assert np.max(np.abs(flashes - 0.3 - np.round(flashes - 0.3))) < 1e-9
+
+
+def test_epsilon_that_is_traced():
+    epsilon = jnp.array([0.0, 0.3])
+    options = {"h": 0.05, "num_steps": 500, "crossings": 2, "throw": False}
+    spring = systems.oscillator().system
+    q, p = np.ones((2, 1)), np.zeros((2, 1))
+
+    def of(epsilon):
+        return dvi.poincare_section(spring, q, p, plane, epsilon=epsilon, **options).ts
+
+    assert np.max(np.abs(jax.jit(of)(epsilon) - of(epsilon))) < 1e-12
+    slope = jax.jacfwd(of)(epsilon)
+    exact = -np.pi / (1 + epsilon) ** 1.5 * 0.75  # of the first upward crossing, t = 3π/2ω
+    assert np.max(np.abs(np.einsum("iki->ik", slope)[:, 0] - exact)) < 1e-2
+    assert np.max(np.abs(slope[0, :, 1])) == 0
+
+
 # Statuses
 
 
@@ -195,6 +254,10 @@ def test_an_orbit_that_escapes():
         (lambda q, p: dvi.bifurcation(
             HENON.system, q[0], p[0], plane, epsilon=0.1, h=0.1, num_steps=9),
          "needs something that varies"),
+        (lambda q, p: dvi.poincare_section(
+            HENON.system, q, p, plane, h=0.1, num_steps=9, crossings=0),
+         "crossings must be a positive whole number, got 0"),
+        (lambda q, p: dvi.stroboscope(1.0, np.nan), "phase of a stroboscope must be a time"),
         (lambda q, p: dvi.stroboscope(0.0), "period of a stroboscope must be a positive"),
         (lambda q, p: dvi.ReturnMap(HENON.system, plane, h=0.1, num_steps=9, returns=0),
          "returns must be a positive whole number"),
@@ -265,6 +328,24 @@ def test_a_periodic_orbit_by_newton():
     assert np.max(np.abs(M.T @ J @ M - J)) < 1e-12
     # Twice 1, along the flow and across the shells, beside the multipliers.
     assert abs(np.trace(M) - 2 - np.sum(multipliers).real) < 1e-4
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_returns_to_a_surface_that_is_no_plane(dtype):
+    """None of them is the start itself, in either precision."""
+    back = dvi.ReturnMap(
+        HENON.system, lambda t, q, p, args: p[1] + q[0] / 3 - 0.01, h=dtype(0.01), num_steps=1500
+    )
+
+    def one(state, _):
+        found = back(*state)
+        return (found.q, found.p), found.t
+
+    start = jnp.array([0.0, 0.1], dtype), jnp.array([0.3, 0.2], dtype)
+    _, times = jax.lax.scan(one, start, None, 12)
+    assert times.dtype == dtype
+    assert np.min(times) > 3
+    assert np.max(times) < 9
 
 
 def test_a_map_that_does_not_return():

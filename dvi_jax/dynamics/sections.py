@@ -26,9 +26,6 @@ from ..observe import Section, Stop
 from ..sweep import Axis
 from .section_results import SECTION_RESULTS, SectionError, judge, name_of
 
-_JUST_LEFT = 1e-6
-"""Of a step: a crossing that soon after a start on the section is the start itself."""
-
 
 class PoincareSection(eqx.Module):
     """Where orbits crossed a section.
@@ -174,7 +171,7 @@ def poincare_section(
             "single start as q0[None], p0[None]."
         )
     settings = _Settings(
-        system, Section(g, direction, crossings, skip), method, newton, arithmetic, layout, stop,
+        system, _section(g, direction, crossings, skip), method, newton, arithmetic, layout, stop,
         _positive("num_steps", num_steps),
     )  # fmt: skip
     epsilon, args, varied = _varied(epsilon, args)
@@ -231,7 +228,7 @@ def bifurcation(
     """
     q, p = start_state(q0, p0)
     settings = _Settings(
-        system, Section(g, direction, crossings, skip), method, newton, arithmetic, layout, stop,
+        system, _section(g, direction, crossings, skip), method, newton, arithmetic, layout, stop,
         _positive("num_steps", num_steps),
     )  # fmt: skip
     epsilon, args, varied = _varied(epsilon, args)
@@ -256,14 +253,16 @@ def bifurcation(
 
 
 def stroboscope(period: float, phase: float = 0.0) -> Callable[..., Any]:
-    """The surface t = phase + k·period, for a section of a driven system.
+    """The surface t = phase + k·period, for a section of a driven system with direction 1.
 
-    g = sin(2π(t − phase)/period), which grows there.
+    g = sin(2π(t − phase)/period), which grows with time there.
 
-    **Raises** `ValueError` for a period that is not positive.
+    **Raises** `ValueError` for a period that is not positive, or a phase that is not finite.
     """
     if not (math.isfinite(period) and period > 0):
         raise ValueError(f"the period of a stroboscope must be a positive time, got {period!r}.")
+    if not math.isfinite(phase):
+        raise ValueError(f"the phase of a stroboscope must be a time, got {phase!r}.")
 
     def g(t, q, p, args):
         return jnp.sin(2 * math.pi * ((t - phase) / period))
@@ -317,18 +316,19 @@ class ReturnMap(eqx.Module):
     def __call__(
         self, q: Any, p: Any, t0: Any = 0.0, epsilon: Any = 0.0, args: Args = None
     ) -> Return:
-        section = Section(self.g, self.direction, self.returns + 1)
+        section = Section(self.g, self.direction, self.returns)
         settings = _Settings(
             self.system, section, self.method, self.newton, FloatingPoint(), Layout(), None,
             self.num_steps,
         )  # fmt: skip
         sol = settings.run(q, p, self.h, t0, epsilon, args)
         crossed: Any = sol.observed
-        # Rounding leaves a start on the section a little before it.
-        is_start = jnp.abs(crossed.ts[0] - t0) < _JUST_LEFT * jnp.abs(self.h)
-        which = self.returns - 1 + jnp.where(is_start, 1, 0)
-        result = judge(crossed.count - jnp.where(is_start, 1, 0), self.returns, sol.result)
-        return Return(crossed.ts[which], crossed.qs[which], crossed.ps[which], result)
+        result = judge(crossed.count, self.returns, sol.result)
+        return Return(crossed.ts[-1], crossed.qs[-1], crossed.ps[-1], result)
+
+
+def _section(g: Any, direction: int, crossings: Any, skip: int) -> Section:
+    return Section(g, direction, _positive("crossings", crossings), skip)
 
 
 def _positive(name: str, value: Any) -> int:
@@ -356,7 +356,11 @@ def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
     def is_axis(x):
         return isinstance(x, Axis)
 
-    epsilon = epsilon if is_traced(epsilon) else known("epsilon", epsilon)
+    if not is_traced(epsilon):
+        epsilon = known("epsilon", epsilon)
+    elif jnp.ndim(epsilon) == 1:
+        found["epsilon"] = epsilon.shape[0]
+        epsilon = _Varied(epsilon)
     args = jax.tree.map(
         lambda x: known(x.name, x) if is_axis(x) else as_parameter(x), args, is_leaf=is_axis
     )

@@ -10,7 +10,7 @@ from .._solution import Save
 from .._system import System
 from ..engine.newton import RootSolver
 from ..engine.picard import PicardThenNewton
-from ..lattices import Lattice, Uniform
+from ..lattices import Given, Lattice, Uniform
 from ..methods import Method, TypeII
 from ..observe import TangentMap
 
@@ -21,7 +21,7 @@ def tangent_map(
     p0: Any,
     *,
     h: Any = None,
-    num_steps: int | None = 1,
+    num_steps: int | None = None,
     t0: Any = 0.0,
     epsilon: Any = 0.0,
     args: PyTree = None,
@@ -37,9 +37,12 @@ def tangent_map(
     MᵀJM = J. Rows and columns are (q, p) raveled. Over a period of a closed orbit its eigenvalues
     are the Floquet multipliers.
 
-    **Arguments** as for `integrate`. **Raises** as `integrate` does; with ``throw=False`` M of a
+    **Arguments** as for `integrate`; num_steps is 1 if left out, or that of a lattice `Given`.
+    **Raises** as `integrate` does; with ``throw=False`` M of a
     run that failed is NaN.
     """
+    if num_steps is None and not isinstance(lattice, Given):
+        num_steps = 1
     return integrate(
         system, q0, p0, h=h, num_steps=num_steps, t0=t0, epsilon=epsilon, args=args, method=method,
         lattice=lattice, newton=newton, arithmetic=arithmetic, observe=TangentMap(),

@@ -5,11 +5,13 @@ import math
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .._compat import is_traced
 from .._types import Scalar
 from ._reductions import Reduction
 
@@ -54,17 +56,40 @@ class Deviations(Reduction):
         raise NotImplementedError("deviation vectors are differentiated through the steps")
 
 
+class _Sum(NamedTuple):
+    """A sum of many small terms, with what rounding has taken from it (Kahan 1965): in float32 a
+    running time would be off by per cents after a million steps."""
+
+    value: Array
+    excess: Array
+
+    def plus(self, x: Array) -> "_Sum":
+        term = x - self.excess
+        value = self.value + term
+        return _Sum(value, (value - self.value) - term)
+
+
+def _no_sum(shape: tuple[int, ...], dtype: Any) -> _Sum:
+    return _Sum(jnp.zeros(shape, dtype), jnp.zeros(shape, dtype))
+
+
 def _state(t0, t1, q0, p0, q1, p1, args):
     return jnp.concatenate([q1.ravel(), p1.ravel()])
+
+
+def _whole(value: Any) -> Any:
+    """A whole number of NumPy's as one of Python's; anything else as it is."""
+    return int(value) if isinstance(value, np.integer) else value
 
 
 class TangentMap(Deviations):
     r"""Observable: the derivative of the whole run, ∂(q_K, p_K)/∂(q_0, p_0), shape (2N, 2N).
 
-    The product M_K ⋯ M_1 of the steps' derivatives, in coordinates (q, p) raveled. Without a
-    dissipative force it is symplectic, MᵀJM = J. Over a closed orbit it is the monodromy matrix,
-    whose eigenvalues are the Floquet multipliers. On chaotic orbits its columns fall together once
-    e^(λt) nears 1e16, and it overflows in the end: take `LyapunovSpectrum` there.
+    The product M_K ⋯ M_1 of the steps' derivatives, in coordinates (q, p) raveled; of no steps the
+    identity. With a symplectic method and ε = 0, or a disturbance that derives from a Hamiltonian,
+    MᵀJM = J. Over a closed orbit it is the monodromy matrix, whose eigenvalues are the Floquet
+    multipliers. On chaotic orbits its columns fall together once e^(λt) nears 1e16, and it
+    overflows in the end: take `LyapunovSpectrum` there.
     """
 
     def start(self, value):
@@ -81,14 +106,15 @@ class TangentMap(Deviations):
 
 
 class LyapunovSpectrum(Deviations):
-    r"""Observable: the Lyapunov exponents λ_1 ≥ λ_2 ≥ … [1/time], shape (count,).
+    r"""Observable: the Lyapunov exponents λ_1, λ_2, … [1/time], shape (count,).
 
         λ_i = (1/|t|) Σ_k ln R_ii^(k),        M_k Q_{k−1} = Q_k R^(k)
 
     An orthonormal frame Q is carried by the derivative of each step and made orthonormal again by
-    the Gram–Schmidt process. On a Hamiltonian system they come in pairs ±λ, zero for each integral
-    in involution; a linear damping −εp gives pairs that sum to −ε. An exponent that is zero is seen
-    as about (ln t)/t. A run with h < 0 gives the exponents of the motion backwards.
+    the Gram–Schmidt process. In the limit λ_1 ≥ λ_2 ≥ …; near ones may change places before. On a
+    Hamiltonian system they come in pairs ±λ, a pair of zeros for each integral in involution; a
+    linear damping −εp gives pairs that sum to −ε. An exponent that is zero is seen as about
+    (ln t)/t. A run with h < 0 gives the exponents of the motion backwards.
 
     **Arguments**
 
@@ -101,7 +127,7 @@ class LyapunovSpectrum(Deviations):
     Nagashima 1979.
     """
 
-    count: int | None = eqx.field(static=True, default=None)
+    count: int | None = eqx.field(static=True, default=None, converter=_whole)
     seed: int = eqx.field(static=True, default=0)
     scale: Any = (1.0, 1.0)
 
@@ -111,7 +137,7 @@ class LyapunovSpectrum(Deviations):
 
     def start(self, value):
         frame = _first_frame(self, value, self.count)
-        return frame, jnp.zeros(frame.shape[0], value.dtype), jnp.zeros((), value.dtype)
+        return frame, _no_sum(frame.shape[:1], value.dtype), _no_sum((), value.dtype)
 
     def vectors(self, memory):
         return _in_units(self, memory[0])
@@ -119,11 +145,11 @@ class LyapunovSpectrum(Deviations):
     def update(self, memory, k, t, value):
         _, sums, time = memory
         frame, R = _gram_schmidt(_measured(self, value.vectors))
-        return frame, sums + jnp.stack([jnp.log(row[i]) for i, row in enumerate(R)]), time + value.h
+        return frame, sums.plus(jnp.log(_diagonal(R))), time.plus(value.h)
 
     def finish(self, memory):
         _, sums, time = memory
-        return sums / jnp.abs(time)
+        return sums.value / jnp.abs(time.value)
 
 
 class MEGNO(Deviations):
@@ -131,9 +157,10 @@ class MEGNO(Deviations):
 
         Y(t) = (2/t) ∫ (|ẇ|/|w|) s ds,        ⟨Y⟩(t) = (1/t) ∫ Y ds
 
-    of one deviation vector w. It tends to 2 on quasi-periodic orbits (to 0 next to a stable
-    periodic one), and to λt/2 on chaotic ones, λ the largest Lyapunov exponent. A dissipative force
-    that makes w shrink makes it negative. The integrals are sums over the steps.
+    of one deviation vector w. It tends to 2 on quasi-periodic and on stable periodic orbits, whose
+    neighbours go by other frequencies (to 0 where all have the same one, as in a linear system),
+    and to λt/2 on chaotic ones, λ the largest Lyapunov exponent. A dissipative force that makes w
+    shrink makes it negative. The integrals are sums over the steps, of order 2 in h.
 
     **Arguments** `seed` of the first vector, which is random; `scale` as for `LyapunovSpectrum`.
 
@@ -149,7 +176,8 @@ class MEGNO(Deviations):
 
     def start(self, value):
         zero = jnp.zeros((), value.dtype)
-        return _first_frame(self, value, 1), zero, zero, zero, zero
+        weighted, area, time = (_no_sum((), value.dtype) for _ in range(3))
+        return _first_frame(self, value, 1), weighted, zero, area, time
 
     def vectors(self, memory):
         return _in_units(self, memory[0])
@@ -158,14 +186,15 @@ class MEGNO(Deviations):
         _, weighted, before, area, time = memory
         vector = _measured(self, value.vectors)
         square = jnp.sum(vector**2)
-        weighted = weighted + jnp.log(square) * (time + value.h / 2)
-        time = time + value.h
-        now = weighted / time
-        return vector * lax.rsqrt(square), weighted, now, area + value.h * (before + now) / 2, time
+        weighted = weighted.plus(jnp.log(square) * (time.value + value.h / 2))
+        time = time.plus(value.h)
+        now = weighted.value / time.value
+        area = area.plus(value.h * (before + now) / 2)
+        return vector * lax.rsqrt(square), weighted, now, area, time
 
     def finish(self, memory):
         *_, area, time = memory
-        return area / time
+        return area.value / time.value
 
 
 class GALI(Deviations):
@@ -186,7 +215,7 @@ class GALI(Deviations):
     own.
     """
 
-    k: int = eqx.field(static=True, default=2)
+    k: int = eqx.field(static=True, default=2, converter=_whole)
     seed: int = eqx.field(static=True, default=0)
     scale: Any = (1.0, 1.0)
     log10: bool = eqx.field(static=True, default=False)
@@ -197,7 +226,7 @@ class GALI(Deviations):
 
     def start(self, value):
         frame = _first_frame(self, value, self.k)
-        return frame, jnp.eye(self.k, dtype=value.dtype), jnp.zeros(self.k, value.dtype)
+        return frame, jnp.eye(self.k, dtype=value.dtype), _no_sum((self.k,), value.dtype)
 
     def vectors(self, memory):
         return _in_units(self, memory[0])
@@ -207,14 +236,12 @@ class GALI(Deviations):
         # C_jj = exp(logs_j), which soon is nothing beside the others but must not be lost.
         _, columns, logs = memory
         frame, R = _gram_schmidt(_measured(self, value.vectors))
-        R = jnp.stack([jnp.stack(row) for row in R])
         columns = jnp.sum(R[:, :, None] * columns[None, :, :], axis=1)
         shrink = lax.rsqrt(jnp.sum(columns**2, axis=0))
-        on_diagonal = jnp.stack([R[i, i] for i in range(self.k)])
-        return frame, columns * shrink[None, :], logs + jnp.log(on_diagonal * shrink)
+        return frame, columns * shrink[None, :], logs.plus(jnp.log(_diagonal(R) * shrink))
 
     def finish(self, memory):
-        logs = jnp.cumsum(memory[2])[1:]
+        logs = jnp.cumsum(memory[2].value)[1:]
         return logs / math.log(10) if self.log10 else jnp.exp(logs)
 
 
@@ -260,26 +287,28 @@ class SALI(Deviations):
         return found if self.log10 else jnp.exp(math.log(10) * found)
 
 
-def _gram_schmidt(vectors: Array) -> tuple[Array, list[list[Array]]]:
-    """(Q, R) with ``vectors[j] = Σ_i R[i][j] Q[i]``, Q orthonormal, R upper triangular, R_jj > 0.
+def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
+    """(Q, R) with ``vectors[j] = Σ_i R[i, j] Q[i]``, Q orthonormal, R upper triangular, R_jj > 0.
 
-    By the modified process. The vectors come from an orthonormal frame by one step and are far from
-    dependent.
+    By the modified process, row by row. The vectors come from an orthonormal frame by one step and
+    are far from dependent.
     """
     count = vectors.shape[0]
-    zero = jnp.zeros((), vectors.dtype)
-    R = [[zero] * count for _ in range(count)]
-    frame: list[Array] = []
-    for j in range(count):
-        v = vectors[j]
-        for i, u in enumerate(frame):
-            R[i][j] = jnp.sum(u * v)
-            v = v - R[i][j] * u
+    frame, rows = [], []
+    for i in range(count):
+        v = vectors[0]
         square = jnp.sum(v**2)
         shrink = lax.rsqrt(square)
-        R[j][j] = square * shrink
-        frame.append(v * shrink)
-    return jnp.stack(frame), R
+        unit = v * shrink
+        along = jnp.sum(vectors[1:] * unit[None, :], axis=1)
+        rows.append(jnp.concatenate([jnp.zeros(i, v.dtype), (square * shrink)[None], along]))
+        frame.append(unit)
+        vectors = vectors[1:] - along[:, None] * unit[None, :]
+    return jnp.stack(frame), jnp.stack(rows)
+
+
+def _diagonal(R: Array) -> Array:
+    return jnp.stack([R[i, i] for i in range(R.shape[0])])
 
 
 def _first_frame(of: Any, value: Array, count: int | None) -> Array:
@@ -344,3 +373,15 @@ def _check_frame(of: Any) -> None:
         raise TypeError(
             f"scale of {type(of).__name__} must be a pair (unit of q, unit of p), got {of.scale!r}."
         )
+    for which, unit in zip("qp", of.scale, strict=True):
+        if any(is_traced(x) for x in jax.tree.leaves(unit)):
+            continue
+        try:
+            good = np.all(np.isfinite(unit) & (np.real_if_close(unit) > 0)) and np.isrealobj(unit)
+        except TypeError:
+            good = False
+        if not good:
+            raise ValueError(
+                f"the scale of {which} in {type(of).__name__} must be a positive number, or an "
+                f"array of them like {which}; got {unit!r}."
+            )

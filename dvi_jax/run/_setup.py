@@ -362,7 +362,8 @@ def _observable(key: str, text: str, known: dict[str, Callable], loader: Loader)
         raise InputError(
             key,
             f"{inner!r}",
-            f'{one_of(known, inner)}; or "file.py:name"; alone or in {", ".join(reductions)}',
+            f'{one_of(known, inner)}; or "file.py:name"; alone or in {", ".join(reductions)}; '
+            f"or {', '.join(f'{name}()' for name in indicators)}",
         )
     return wrap(function) if wrap is not None else function
 
@@ -380,7 +381,9 @@ def _indicator(key: str, text: str, kind: type) -> Any:
     """An indicator of chaos as it is written in Python, such as ``GALI(4, log10=True)``."""
     try:
         call: Any = ast.parse(text, mode="eval").body
-        options = {k.arg: ast.literal_eval(k.value) for k in call.keywords}
+        if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name)):
+            raise ValueError("more than one call")
+        options: Any = {k.arg: ast.literal_eval(k.value) for k in call.keywords}
         return kind(*(ast.literal_eval(a) for a in call.args), **options)
     except (SyntaxError, TypeError, ValueError) as error:
         why = "" if "malformed" in str(error) else f" ({error})"
