@@ -249,6 +249,26 @@ def test_lyapunov_spectrum_over_long_times(energy, exponent):
     assert np.max(np.abs(spectra.mean(0) - [exponent, 0, 0, -exponent])) < 0.003
 
 
+def test_many_deviation_vectors():
+    """All 28 of a chain of 14: the first 12 as alone, the volume kept, and gradients."""
+    chain = systems.fput(14, beta=0.3)
+
+    def spectrum(count, size=1.0):
+        return run(
+            chain.system, size * jnp.asarray(chain.q0), chain.p0, dvi.LyapunovSpectrum(count),
+            h=0.1, num_steps=300, args=chain.args, adjoint=dvi.Direct(),
+        ).observed  # fmt: skip
+
+    whole = spectrum(28)
+    assert np.max(np.abs(whole[:12] - spectrum(12))) < 1e-11
+    assert abs(np.sum(whole)) < 1e-12
+    assert np.max(np.abs(whole)) > 5e-3
+    slope = jax.jvp(lambda size: spectrum(28, size), (1.0,), (1.0,))[1]
+    by_differences = central_difference(lambda size: spectrum(28, size), 1.0, 1.0)
+    assert np.max(np.abs(slope - by_differences)) < 1e-7
+    assert np.max(np.abs(slope)) > 1e-3
+
+
 def test_indicators_in_single_precision():
     """A running sum of 10⁶ steps is off by per cents in float32; these are not."""
     spring = dvi.System(

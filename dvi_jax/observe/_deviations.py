@@ -15,6 +15,9 @@ from .._compat import is_traced
 from .._types import Scalar
 from ._reductions import Reduction
 
+_FEW = 12
+"""Vectors up to which the Gram–Schmidt process is written out."""
+
 
 class Pushed(NamedTuple):
     """Deviation vectors after a step, w1 = M w0 with M = ∂(q1, p1)/∂(q0, p0).
@@ -294,6 +297,8 @@ def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
     are far from dependent.
     """
     count = vectors.shape[0]
+    if count > _FEW:
+        return _gram_schmidt_in_a_loop(vectors)
     frame, rows = [], []
     for i in range(count):
         v = vectors[0]
@@ -307,8 +312,27 @@ def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
     return jnp.stack(frame), jnp.stack(rows)
 
 
+def _gram_schmidt_in_a_loop(vectors: Array) -> tuple[Array, Array]:
+    """The same for many vectors: one program whatever their number."""
+    count = vectors.shape[0]
+    place = jnp.arange(count)
+
+    def row(i, state):
+        V, R = state
+        square = jnp.sum(V[i] ** 2)
+        shrink = lax.rsqrt(square)
+        unit = V[i] * shrink
+        along = jnp.where(place > i, V @ unit, 0)
+        V = (V - along[:, None] * unit[None, :]).at[i].set(unit)
+        return V, R.at[i].set(along.at[i].set(square * shrink))
+
+    return lax.fori_loop(0, count, row, (vectors, jnp.zeros((count, count), vectors.dtype)))
+
+
 def _diagonal(R: Array) -> Array:
-    return jnp.stack([R[i, i] for i in range(R.shape[0])])
+    return (
+        jnp.stack([R[i, i] for i in range(R.shape[0])]) if R.shape[0] <= _FEW else jnp.diagonal(R)
+    )
 
 
 def _first_frame(of: Any, value: Array, count: int | None) -> Array:
