@@ -324,12 +324,13 @@ def spinning_top(t, q, A, C, w, **_):
 
 
 def polar_motion(t, q, p, args, epsilon):
-    """dm/dt = iσ_c (m − χ) of m = x − iy: Liouville's equation, at ε = 1."""
-    assert epsilon == 1
-    sigma = 2 * np.pi / args["period"] * (1 + 0.5j * args["inverse_Q"])
+    """dm/dt = iσ_c (m − χ) of m = x − iy: Liouville's equation; at ε = 0 without loss and drive."""
+    assert epsilon in (0, 1)
+    sigma = 2 * np.pi / args["period"] * (1 + 0.5j * args["inverse_Q"] * epsilon)
     turn = np.exp(2j * np.pi * t / 365.25)
     x, y = args["mean"] + args["drift"] * t / 365.25
-    chi = x - 1j * y + complex(*args["prograde"]) * turn + complex(*args["retrograde"]) / turn
+    driven = complex(*args["prograde"]) * turn + complex(*args["retrograde"]) / turn
+    chi = x - 1j * y + epsilon * driven
     rate = 1j * sigma * (q - 1j * p - chi)
     return rate.real, -rate.imag
 
@@ -383,5 +384,5 @@ DERIVATIONS = {
     "polar_motion": polar_motion,
     "lotka_volterra": lotka_volterra,
 }
-EPSILON = {"polar_motion": 1.0}
-"""Where a derivation holds at one ε only; 0.3 elsewhere."""
+EPSILON = {"polar_motion": (0.0, 1.0)}
+"""Where a derivation holds at some ε only; 0.3 elsewhere."""

@@ -5,6 +5,7 @@ its `Problem` says of it. Its equations need a line in `derivations.py`.
 """
 
 import functools
+import itertools
 import json
 import math
 import re
@@ -16,21 +17,22 @@ import numpy as np
 import pytest
 from derivations import DERIVATIONS, EPSILON
 from scipy.integrate import solve_ivp
-from scipy.special import ellipe, ellipj, ellipk, ellipkinc
+from scipy.special import ellipe, ellipj, ellipk, ellipkinc, elliprf, elliprj
 
 import dvi_jax as dvi
 from dvi_jax import systems
 from dvi_jax.run import run_file
-from dvi_jax.systems._elliptic import complete, first_kind, jacobi
+from dvi_jax.systems._elliptic import complete, first_kind, jacobi, swing, third_kind
 from dvi_jax.systems.hill import LAGRANGE_DISTANCE
 from dvi_jax.systems.lotka_volterra import equilibrium, from_populations, to_populations
 from dvi_jax.systems.magnetic_mirror import magnetic_field
 from dvi_jax.systems.nls_lattice import plane_wave
 from dvi_jax.systems.oblate_kepler import elements, secular_rates
+from dvi_jax.systems.pendulum import action, period
 from dvi_jax.systems.relativistic_kepler import precession
-from dvi_jax.systems.solar_system import EphemerisMissing
+from dvi_jax.systems.solar_system import EphemerisMissing, julian_date
 from dvi_jax.systems.spinning_top import steady_precession
-from dvi_jax.systems.van_der_pol import averaged_amplitude
+from dvi_jax.systems.van_der_pol import amplitude, averaged_amplitude
 
 NAMES = list(systems.LIBRARY)
 QUICK = ("duffing", "kepler")
@@ -97,8 +99,8 @@ def test_every_system_has_a_derivation():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_equations_are_those_of_an_independent_derivation(name):
-    epsilon, rates = EPSILON.get(name, 0.3), functions(name)
-    for seed in range(3):
+    epsilons, rates = EPSILON.get(name, (0.3,)), functions(name)
+    for seed, epsilon in itertools.product(range(3), epsilons):
         t, q, p, args = nearby(name, seed)
         ours = rates(t, q, p, epsilon, args)
         theirs = DERIVATIONS[name](t, q, p, args, epsilon)
@@ -419,7 +421,10 @@ def test_parameters_have_meanings_and_units(name):
     assert set(made.parameters) == known, f"parameters without meaning: {known}"
     for key, meaning in made.parameters.items():
         assert re.fullmatch(r".*\S \[.+\]", meaning), f"{key}: {meaning!r} has no unit"
-    assert all(callable(f) and f.__class__.__doc__ for f in made.observables.values())
+    for key, f in made.observables.items():
+        told = f.function if isinstance(f, systems.InSlowTime) else f
+        assert callable(f)
+        assert told.__doc__, f"the observable {key} does not say what it is"
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -453,12 +458,74 @@ def test_starts_of_another_shape_are_refused(name):
         ("dipole_field", {"radius": -1.0}, "radius must be positive"),
         ("rigid_body", {"I3": 4.0}, "at most the sum of the others"),
         ("spinning_top", {"A": math.inf}, "A must be positive and finite, got inf"),
+        ("kepler", {"K": 0.0}, "K must be positive and finite, got 0.0"),
+        ("magnetic_mirror", {"charge": 0.0}, "charge is 0: the particle does not gyrate"),
+        ("magnetic_mirror", {"B0": 0.0}, "B0 is 0: the particle does not gyrate"),
+        ("magnetic_mirror", {"mass": math.inf}, "mass must be positive and finite, got inf"),
+        ("magnetic_mirror", {"length": math.inf}, "length must be positive and finite, got inf"),
+        ("dipole_field", {"B0": 0.0}, "B0 is 0: the particle does not gyrate"),
+        ("polar_motion", {"mean": [0.1]}, r"mean must have shape \(2,\), got \(1,\)"),
+        ("polar_motion", {"drift": [0.1]}, r"drift must have shape \(2,\), got \(1,\)"),
+        ("polar_motion", {"prograde": 0.1}, r"prograde must have shape \(2,\), got \(\)"),
+        ("polar_motion", {"retrograde": [0.1, math.nan]}, "retrograde must be finite"),
+        ("polar_motion", {"period": math.inf}, "period must be positive and finite, got inf"),
+        ("stiff_fput", {"omega": 0.0}, "omega must be positive and finite, got 0.0"),
     ],
 )
 def test_parameters_that_cannot_be_are_refused(name, change, said):
     made = problem(name)
     with pytest.raises(ValueError, match=said):
         made.check(made.q0, made.p0, {**made.args, **change})
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_parameter_must_be_there_and_be_a_number(name):
+    """By its name: where it is missing, not a number, of another shape, or None."""
+    made = problem(name)
+    for key, value in (made.args or {}).items():
+        rest = {k: v for k, v in made.args.items() if k != key}
+        if key != "G":  # which is 1 when it is left out
+            with pytest.raises(
+                ValueError, match=f"parameter {key} is missing: args must be a dict"
+            ):
+                made.check(made.q0, made.p0, rest)
+            with pytest.raises(ValueError, match=r"is missing: args must be a dict.*got None"):
+                made.check(made.q0, made.p0, None)
+        wrong = [np.nan * np.asarray(value, float), np.ones((2, 2))]
+        for bad in wrong if np.ndim(value) else [*wrong, None, "1", True]:
+            with pytest.raises(
+                ValueError, match="mass of" if key == "masses" and bad is wrong[0] else key
+            ):
+                made.check(made.q0, made.p0, {**made.args, key: bad})
+        made.check(made.q0, made.p0, {**rest, key: np.asarray(value)})  # an array of no axes is one
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: systems.stiff_fput(omega=0.0), "omega must be positive and finite, got 0.0"),
+        (lambda: systems.stiff_fput(-1), "m springs: m must be a whole number ≥ 1, got -1"),
+        (lambda: systems.fput(-1), "row of particles.*n must be a whole number ≥ 1, got -1"),
+        (lambda: systems.fput(alpha=math.nan), "alpha must be finite, got nan"),
+        (
+            lambda: systems.toda(-1),
+            "at least three particles: n must be a whole number ≥ 3, got -1",
+        ),
+        (lambda: systems.nls_lattice(2.5), "ring of at least three sites.*got 2.5"),
+        (lambda: systems.n_body(np.ones(2), np.eye(2), np.eye(2), G=math.nan), "G must be finite"),
+    ],
+)
+def test_systems_that_cannot_be_made_say_why(make, said):
+    with pytest.raises(ValueError, match=said):
+        make()
+
+
+def test_julian_dates_may_be_numbers_of_numpy():
+    day = float(julian_date("2000-01-01"))
+    assert julian_date(np.int64(2451545)) == day + 0.5
+    assert julian_date(np.float32(2451545)) == day + 0.5
+    with pytest.raises(ValueError, match="calendar day or a Julian date, got True"):
+        julian_date(True)
 
 
 @pytest.mark.parametrize(
@@ -523,6 +590,48 @@ def test_elliptic_integrals_and_functions_are_those_of_scipy():
     np.testing.assert_allclose(jax.jit(first_kind)(phi, m), ellipkinc(phi, m), rtol=3e-15)
     np.testing.assert_allclose(ours(u, m), ellipj(u, m), rtol=0, atol=5e-14)
     assert np.max(np.abs(ours(u, m**1.001)[0] - ellipj(u, m)[0])) > 1e-4
+    np.testing.assert_allclose(swing(m), ellipe(m) - (1 - m) * ellipk(m), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(swing(1e-12) / 1e-12, np.pi / 4, rtol=1e-12)
+
+
+def test_integrals_of_the_third_kind_are_those_of_scipy():
+    """Of either sign of n, to 1 − n = 1e-12 and n = −1e8; beside another n."""
+    rng = np.random.default_rng(1)
+    m, phi = rng.uniform(0, 1, 100), rng.uniform(-20, 20, 100)
+    complement = np.r_[
+        1 + 10 ** rng.uniform(-3, 8, 50), (1 - m[50:]) * 10 ** rng.uniform(-12, 0, 50)
+    ]
+
+    def by_scipy(s, c):
+        x, y = c**2, c**2 + (1 - m) * s**2
+        more = elliprj(x, y, 1.0, c**2 + complement * s**2)
+        return s * elliprf(x, y, 1.0) + (1 - complement) / 3 * s**3 * more
+
+    turns = np.round(phi / np.pi)
+    rest = phi - np.pi * turns
+    wanted = 2 * turns * by_scipy(1.0, 0.0) + by_scipy(np.sin(rest), np.cos(rest))
+    found = jax.jit(third_kind)(phi, complement, m)
+    assert np.max(np.abs(found - wanted) / (np.abs(phi) + np.abs(wanted))) < 4e-15
+    other = third_kind(phi, complement * (1 + 1e-9), m)
+    assert np.max(np.abs(other - wanted) / np.abs(wanted)) > 1e-10
+
+
+def test_complete_integrals_at_the_end_of_their_range():
+    np.testing.assert_array_equal(complete(jnp.array([1.0, 1.1])), [[np.inf, np.nan], [1, np.nan]])
+    np.testing.assert_array_equal(swing(jnp.array([1.0, 1.1])), [1, np.nan])
+    K, E = complete(1 - 1e-12)
+    np.testing.assert_allclose([K, E], [ellipk(1 - 1e-12), ellipe(1 - 1e-12)], rtol=1e-14)
+
+
+def test_the_pendulum_takes_for_ever_on_its_separatrix():
+    args, q = problem("pendulum").args, jnp.zeros(1)
+    assert float(period(q, jnp.array([2.0]), args)) == math.inf
+    for p in (2 - 1e-6, 2 + 1e-6):  # beside it T = 2 (or 4) ln(4/√|1 − m|) is some tens
+        turn = (4 if p < 2 else 2) * np.log(4 / np.sqrt(1e-6))
+        assert float(period(q, jnp.array([p]), args)) == pytest.approx(turn, rel=1e-5)
+    of = functools.partial(action, 0.0, 0.0, q, q, q, args=args)
+    assert float(of(p1=jnp.array([2.0]))) == pytest.approx(8 / np.pi, rel=1e-15)
+    assert np.isnan(of(p1=jnp.array([2.01])))
 
 
 REGIMES = {
@@ -595,6 +704,9 @@ def test_exact_solutions_solve_the_equations_in_every_regime(name):
         ("pendulum", [0.0], [2.0]),  # m = 1
         ("duffing", [0.0], [0.0]),  # E = 0
         ("kepler", [1.0, 0.0], [0.0, 1.5]),  # it escapes
+        ("spinning_top", [0.0, 0.6, 0.0], [2.5, 0.1, 2.5]),  # through the vertical, upright
+        ("spinning_top", [0.0, 2.6, 0.0], [-0.5, 0.1, 0.5]),  # and hanging
+        ("rigid_body", [0.0, 0.0, 0.0], [0.0, 1.0, 0.6]),  # about the middle axis
     ],
 )
 def test_an_exact_solution_that_does_not_hold_is_not_a_number(name, q0, p0):
@@ -604,7 +716,128 @@ def test_an_exact_solution_that_does_not_hold_is_not_a_number(name, q0, p0):
     assert np.all(np.isnan(p))
 
 
+LONG = [  # name, q0, p0, time, largest difference from DOP853, whose own error it is
+    pytest.param(  # 108 nutations
+        *("spinning_top", [0.0, 0.6, 0.0], [2.4, 0.1, 2.5], 400.0, 1e-8), marks=pytest.mark.slow
+    ),
+    ("spinning_top", [0.0, 0.6, 0.0], [2.4, 0.1, 2.5], 200.0, 1e-8),
+    ("spinning_top", [0.0, 0.6, 0.0], [2.49, 0.1, 2.5], 20.0, 1e-9),  # cos θ to 0.9998
+    ("spinning_top", [0.0, 0.6, 0.0], [2.499, 0.1, 2.5], 20.0, 1e-8),  # to 1 − 2e-6
+    ("spinning_top", [0.0, 2.5, 0.0], [0.0, 0.5, 0.01], 20.0, 1e-9),  # it hangs
+    pytest.param(  # 170 turns over
+        *("rigid_body", [0.1, 0.0, 0.4], [0.1, 1.0, 0.6], 2000.0, 1e-7), marks=pytest.mark.slow
+    ),
+    ("rigid_body", [0.1, 0.0, 0.4], [0.1, 1.0, 0.6], 800.0, 1e-8),
+    ("rigid_body", [1.4, -2.0, 0.0], [-0.1, 1.0, 0.6], 300.0, 1e-9),
+]
+
+
+@pytest.mark.parametrize(("name", "q0", "p0", "time", "most"), LONG)
+def test_exact_solutions_hold_at_long_times_and_near_singularities(name, q0, p0, time, most):
+    """Where a quadrature of few nodes in all of the time had lost φ, ψ and g."""
+    made, rates = problem(name), functions(name)
+
+    def field(t, z):
+        return np.concatenate(rates(t, z[:3], z[3:], 0.0, made.args))
+
+    ts = time * np.array([0.11, 0.5, 1.0])
+    run = solve_ivp(field, (0, time), [*q0, *p0], "DOP853", ts, rtol=1e-13, atol=1e-14)
+    exact = jax.jit(made.exact)
+    found = np.concatenate(exact(ts, jnp.array(q0), jnp.array(p0), made.args), axis=1)
+    assert np.max(np.abs(found - run.y.T)) < most
+    late = np.concatenate(exact(ts * (1 + 1e-6), jnp.array(q0), jnp.array(p0), made.args), axis=1)
+    assert np.max(np.abs(late - run.y.T)) > 10 * most
+
+
+def test_duffing_swings_harmonically_at_the_bottom_of_a_well():
+    """q = −1 − δ cos √2 t + O(δ²) from a distance δ, and rest at the bottom itself."""
+    made, ts = problem("duffing"), np.array([0.0, 1.0, 2.0, 5.0])
+    w = np.sqrt(2)
+    for size in (1e-5, 1e-7, 1e-8, 1e-9, 0.0):
+        q, p = made.exact(ts, [-1.0 - size], [0.0], made.args)
+        off = np.hypot(q[:, 0] + 1 + size * np.cos(w * ts), p[:, 0] - size * w * np.sin(w * ts))
+        assert np.max(off) < 20 * size**2 + 1e-15
+    softer = np.max(np.abs(p[:, 0] - 1e-9 * np.sin(ts)))  # which a wrong frequency would not be
+    assert softer > 1e-10
+
+
+def test_the_pendulum_carries_gradients_at_rest():
+    """Forward and reverse: those of the linear oscillator. So do action, integrals, amplitude."""
+    at_rest, made, t = jnp.zeros(1), problem("pendulum"), 1.7
+    for jacobian in (jax.jacrev, jax.jacfwd):
+        of = jax.jit(jacobian(lambda q, p: made.exact(t, q, p, made.args), (0, 1)))
+        wanted = [[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]]
+        np.testing.assert_allclose(np.reshape(of(at_rest, at_rest), (2, 2)), wanted, rtol=1e-14)
+
+    def swung(q, p):
+        return action(0.0, 0.0, q, p, q, p, made.args)
+
+    assert jax.jit(jax.grad(swung))(at_rest, at_rest)[0] == 0
+    slope = jax.jit(jax.grad(swung))(jnp.array([1e-3]), at_rest)  # J = q²/2 + …
+    assert float(slope[0]) == pytest.approx(1e-3, rel=1e-6)
+    slopes = [jax.jit(jax.grad(lambda m, i=i: complete(m)[i]))(0.0) for i in (0, 1)]
+    np.testing.assert_allclose(slopes, [np.pi / 8, -np.pi / 8], rtol=1e-14)
+    of_amplitude = jax.grad(lambda q, p: amplitude(0, 0, q, p, q, p, None))
+    assert of_amplitude(at_rest, at_rest)[0] == 0
+    assert float(of_amplitude(jnp.ones(1), 2 * jnp.ones(1))[0]) == pytest.approx(5**-0.5)
+
+
+def test_kepler_carries_gradients_on_a_circle():
+    """Beside central differences of the fourth order; and it is symplectic."""
+    made, circle = problem("kepler"), jnp.array([1.0, 0.0, 0.0, 1.0])
+
+    @jax.jit
+    def end(z):
+        return jnp.concatenate(made.exact(1.7, z[:2], z[2:], made.args))
+
+    found = np.asarray(jax.jit(jax.jacrev(end))(circle))
+
+    def central(h):
+        return np.stack([(end(circle + d) - end(circle - d)) / (2 * h) for d in h * np.eye(4)], 1)
+
+    wanted = (4 * central(5e-4) - central(1e-3)) / 3
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=2e-9)
+    flip = np.kron([[0, 1], [-1, 0]], np.eye(2))
+    np.testing.assert_allclose(found.T @ flip @ found, flip, rtol=0, atol=1e-13)
+    assert np.max(np.abs(found[:2, :2] - np.eye(2))) > 1
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_exact_solutions_keep_the_dtype_and_refuse_other_shapes(name):
+    made, ts = problem(name), np.array([[1.0, 2.0]])
+    for dtype in (jnp.float32, jnp.float64):
+        q0, p0 = (jnp.asarray(x, dtype) for x in start(name))
+        for x in jax.eval_shape(made.exact, ts, q0, p0, made.args):
+            assert x.dtype == dtype
+            assert x.shape == (1, 2, *q0.shape)
+    many = jnp.stack([q0] * 3)
+    if name not in ("oscillator", "van_der_pol", "slow_oscillator"):  # of any number of dimensions
+        with pytest.raises(ValueError, match=r"one start.*jax\.vmap.*got q0 of shape \(3, "):
+            made.exact(1.0, many, many, made.args)
+    with pytest.raises(ValueError, match="shape"):
+        made.exact(1.0, many, q0, made.args)
+    lanes = jax.vmap(made.exact, (None, 0, 0, None))
+    for x in jax.eval_shape(lanes, ts, many, jnp.stack([p0] * 3), made.args):
+        assert x.shape == (3, 1, 2, *q0.shape)
+
+
 # Adiabatic invariants
+
+
+@pytest.mark.parametrize("name", ["magnetic_mirror", "dipole_field"])
+def test_the_bounce_action_does_not_ask_where_the_field_points(name):
+    """Charge and field turned round leave the motion as it is, and J with it."""
+    made = problem(name)
+    of = jax.jit(made.observables["bounce_action"])
+    q, p = start(name)
+    state = (0.0, 0.0, q, p, q, p)
+    wanted = float(of(*state, made.args))
+    turned = {**made.args, "B0": -made.args["B0"], "charge": -made.args["charge"]}
+    assert float(of(*state, turned)) == pytest.approx(wanted, rel=1e-12)
+    weaker = {**turned, "B0": 0.9 * turned["B0"], "charge": turned["charge"] / 0.9}  # the same eB
+    assert float(of(*state, weaker)) == pytest.approx(wanted, rel=1e-12)
+    faster = p + 0.1 * np.array([0.0, 0.0, p[2]])
+    assert float(of(0.0, 0.0, q, faster, q, faster, turned)) > 1.1 * wanted > 1.0
 
 
 def wavers(problems, epsilons, keys, h, num_steps):
@@ -804,6 +1037,17 @@ def test_the_relativistic_perihelion_advances_by_the_closed_form():
     wanted = float(precession(jnp.asarray(made.q0), jnp.asarray(made.p0), made.args))
     assert len(jumps) >= 4
     np.testing.assert_allclose(jumps, wanted, rtol=1e-7)
+    # a mirror image goes round, and its perihelion with it, the other way
+    mirror = jnp.array([1.0, -1.0])
+    of = jax.jit(
+        jax.vmap(
+            lambda q, p: made.observables["perihelion_angle"](
+                0.0, 0.0, q, p, q * mirror, p * mirror, made.args
+            )
+        )
+    )
+    other = np.diff(np.asarray(of(sol.qs[1:], sol.ps[1:])))
+    np.testing.assert_allclose(other[np.abs(other) > 1e-3], -wanted, rtol=1e-7)
     first_order = np.pi / (10 * 0.9) ** 2
     assert abs(wanted / first_order - 1) == pytest.approx(0.75 / 90**2 * 100, rel=0.3)
 

@@ -176,6 +176,23 @@ def test_undisturbed_pole_goes_round_a_circle():
     assert np.ptp(np.hypot(ellipse.qs[:, 0], ellipse.ps[:, 0])) > 0.005 * radius[0]
 
 
+def test_undisturbed_pole_keeps_its_distance_from_the_mean_one():
+    """Also where the mean pole is off the origin; not where it drifts, or at ε = 1."""
+    still = ARGS | {"drift": np.zeros(2)}
+    spread = {}
+    for name, args, epsilon in (
+        ("still", still, 0.0),
+        ("drifting", ARGS, 0.0),
+        ("disturbed", still, 1.0),
+    ):
+        seen = run(args, 2.5, 400, epsilon=epsilon, observe=PROBLEM.observables["amplitude"])
+        amplitudes = np.asarray(seen.observed)
+        spread[name] = np.ptp(amplitudes) / amplitudes[0]
+    assert spread["still"] < 1e-6
+    assert spread["drifting"] > 1e-3
+    assert spread["disturbed"] > 0.1
+
+
 def test_damping_is_that_of_q():
     cycles = 3
     solution = run(LOSSY, 1.0, 433 * cycles, save=dvi.Save(every=433))
@@ -309,5 +326,5 @@ def test_start_is_the_measured_one(measured):
 def test_other_starts_are_refused():
     with pytest.raises(ValueError, match="the pole is one point"):
         PROBLEM.check([0.1, 0.2], [0.1, 0.2], ARGS)
-    with pytest.raises(ValueError, match=r"period must be positive, got -433\.0"):
+    with pytest.raises(ValueError, match=r"period must be positive and finite, got -433\.0"):
         PROBLEM.check(PROBLEM.q0, PROBLEM.p0, ARGS | {"period": -433.0})

@@ -564,7 +564,7 @@ def test_starts_of_another_shape_are_refused(name, shape, said):
 def test_parameters_that_cannot_be_are_refused():
     mirror = systems.magnetic_mirror()
     for key in ("mass", "length"):
-        with pytest.raises(ValueError, match=f"{key} must be positive, got -1.0"):
+        with pytest.raises(ValueError, match=f"{key} must be positive and finite, got -1.0"):
             mirror.check(mirror.q0, mirror.p0, mirror.args | {key: -1.0})
     with pytest.raises(ValueError, match="at least three particles"):
         systems.toda(2)

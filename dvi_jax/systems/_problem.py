@@ -4,6 +4,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Any
 
 import equinox as eqx
@@ -121,21 +122,38 @@ class InSlowTime(eqx.Module):
         return self.function(self.epsilon * t0, self.epsilon * t1, q0, p0, q1, p1, args)
 
 
-def over_times(at_time: Callable[..., tuple[Any, Any]]) -> Callable[..., tuple[Any, Any]]:
-    """The solution at one time as a function of times of any shape.
+def over_times(
+    shape: tuple[int, ...] | None = None,
+) -> Callable[[Callable[..., tuple[Any, Any]]], Callable[..., tuple[Any, Any]]]:
+    """A decorator that makes the solution at one time a function of times of any shape.
 
-    - `at_time`: ``(t, q0, p0, args)`` → (q, p), shaped like q0, for a number t.
+    - `shape`: of q0 and of p0; None where any will do, if only they have the same.
 
-    Returns a function of the same arguments, whose results have the shape t.shape + q0.shape.
+    It takes ``(t, q0, p0, args)`` → (q, p), shaped like q0, for a number t, and gives a function of
+    the same arguments, whose results have the shape t.shape + q0.shape and the dtype of the start.
+    That **raises** `ValueError` for a start of another shape.
     """
+    wanted = "q0 and p0 of one shape" if shape is None else f"q0 and p0 of shape {shape}"
 
-    @functools.wraps(at_time)
-    def exact(t, q0, p0, args):
-        t, q0, p0 = jnp.asarray(t), jnp.asarray(q0), jnp.asarray(p0)
-        q, p = jax.vmap(lambda s: at_time(s, q0, p0, args))(t.ravel())
-        return q.reshape(t.shape + q0.shape), p.reshape(t.shape + p0.shape)
+    def decorate(at_time):
+        @functools.wraps(at_time)
+        def exact(t, q0, p0, args):
+            t, q0, p0 = jnp.asarray(t), jnp.asarray(q0), jnp.asarray(p0)
+            check_shape(
+                q0,
+                p0,
+                lambda seen: shape is None or seen == shape,
+                f"an exact solution is that of one start, with {wanted} (for many starts: "
+                "jax.vmap(exact, (None, 0, 0, None)))",
+            )
+            dtype = jnp.result_type(q0, p0, float)
+            q0, p0 = q0.astype(dtype), p0.astype(dtype)
+            q, p = jax.vmap(lambda s: at_time(s, q0, p0, args))(t.ravel())
+            return tuple(x.astype(dtype).reshape(t.shape + q0.shape) for x in (q, p))
 
-    return exact
+        return exact
+
+    return decorate
 
 
 def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], wanted: str) -> None:
@@ -149,11 +167,96 @@ def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], wante
         raise ValueError(f"{wanted}; got q0 of shape {q} and p0 of shape {p}.")
 
 
+def number(args: Any, name: str) -> float:
+    """The parameter of this name.
+
+    **Raises** `ValueError` where it is missing, or anything but one real number.
+    """
+    value = parameter(args, name)
+    try:
+        seen = np.asarray(value)
+    except ValueError:  # a ragged list
+        seen = np.asarray(None)
+    if seen.shape != () or seen.dtype.kind not in "iuf":
+        what = f"an array of shape {seen.shape}" if seen.shape else repr(value)
+        raise ValueError(f"{name} must be one real number, got {what}.")
+    return float(seen)
+
+
+def parameter(args: Any, name: str) -> Any:
+    """The parameter of this name, whatever it is.
+
+    **Raises** `ValueError` where it is missing, with those that are there.
+    """
+    if not isinstance(args, Mapping) or name not in args:
+        there = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
+        raise ValueError(
+            f"the parameter {name} is missing: args must be a dict that has {name!r}; "
+            f"got {f'one with {there}' if there else repr(args)}."
+        )
+    return args[name]
+
+
+def check_finite(args: Any, *names: str) -> None:
+    """Refuse parameters of these names that are not finite numbers.
+
+    **Raises** `ValueError` with the name and the value.
+    """
+    for name in names:
+        if not math.isfinite(value := number(args, name)):
+            raise ValueError(f"{name} must be finite, got {value}.")
+
+
 def check_positive(args: Any, *names: str) -> None:
     """Refuse parameters of these names that are not positive and finite numbers.
 
     **Raises** `ValueError` with the name and the value.
     """
     for name in names:
-        if not (args[name] > 0 and math.isfinite(args[name])):
-            raise ValueError(f"{name} must be positive and finite, got {args[name]}.")
+        if not ((value := number(args, name)) > 0 and math.isfinite(value)):
+            raise ValueError(f"{name} must be positive and finite, got {value}.")
+
+
+def check_nonzero(args: Any, without: str, *names: str) -> None:
+    """Refuse parameters of these names that are zero or not finite.
+
+    - `without`: what there is none of at zero, a sentence.
+
+    **Raises** `ValueError` with the name, the value and that sentence.
+    """
+    check_finite(args, *names)
+    for name in names:
+        if number(args, name) == 0:
+            raise ValueError(f"{name} is 0: {without}")
+
+
+def check_vector(args: Any, size: int, *names: str) -> None:
+    """Refuse parameters of these names that are not `size` finite numbers.
+
+    **Raises** `ValueError` with the name and the shape or the value.
+    """
+    for name in names:
+        given = parameter(args, name)
+        try:
+            value = np.asarray(given, float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name} must be {size} numbers: {error}") from None
+        if value.shape != (size,):
+            raise ValueError(f"{name} must have shape ({size},), got {value.shape}.")
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} must be finite, got {value}.")
+
+
+def check_count(name: str, count: Any, least: int, wanted: str) -> None:
+    """Refuse a number of things that is not whole, or below `least`.
+
+    **Raises** `ValueError` with `wanted`, a sentence that says what there has to be, and the count.
+    """
+    if isinstance(count, bool) or not isinstance(count, Integral) or count < least:
+        raise ValueError(f"{wanted}: {name} must be a whole number ≥ {least}, got {count!r}.")
+
+
+def distance(square: Any) -> Any:
+    """√ of a sum of squares; its derivative at zero, where there is none, is put down as zero."""
+    away = square > 0
+    return jnp.where(away, jnp.sqrt(jnp.where(away, square, 1.0)), 0.0 * square)

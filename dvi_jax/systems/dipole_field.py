@@ -6,7 +6,7 @@ import numpy as np
 from .._system import System
 from ..symmetry.library import rotation, time_translation
 from . import _guiding_centre as guiding_centre
-from ._problem import Adiabatic, Problem, check_positive, check_shape
+from ._problem import Adiabatic, Problem, check_nonzero, check_positive, check_shape
 
 
 def vector_potential(q, args):
@@ -63,7 +63,7 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
         J = ∮ p∥ ds = 2 ∫ √(2m (E − μB)) ds,    from mirror point to mirror point and back
 
     along the field line r = L cos² λ of the guiding centre q − b × v/Ω, with
-    B = B0 (R/L)³ √(1 + 3 sin² λ)/cos⁶ λ, ds = L cos λ √(1 + 3 sin² λ) dλ and μ the
+    B = |B0| (R/L)³ √(1 + 3 sin² λ)/cos⁶ λ, ds = L cos λ √(1 + 3 sin² λ) dλ and μ the
     `corrected_moment`. Zero where the particle mirrors at the equator. Not differentiable.
 
     **Source** Northrop 1963, *The Adiabatic Motion of Charged Particles*, 3.
@@ -71,7 +71,7 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
     m, mv = args["mass"], kinetic_momentum(q1, p1, args)
     centre = guiding_centre.centre(q1, mv, lambda q: magnetic_field(q, args), args)
     L = jnp.sum(centre**2) ** 1.5 / jnp.sum(centre[:2] ** 2)
-    at_equator = args["B0"] * (args["radius"] / L) ** 3
+    at_equator = jnp.abs(args["B0"]) * (args["radius"] / L) ** 3
 
     def strength(latitude):
         return at_equator * jnp.sqrt(1 + 3 * jnp.sin(latitude) ** 2) / jnp.cos(latitude) ** 6
@@ -85,7 +85,7 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
 
 
 def check_start(q0, p0, args):
-    """Refuse a start that is not in space, or at the dipole, or parameters that are not positive.
+    """Refuse a start that is not in space, or at the dipole, no field, or a mass ≤ 0.
 
     **Raises** `ValueError`.
     """
@@ -96,6 +96,7 @@ def check_start(q0, p0, args):
         "the dipole field holds one particle in space: q0 and p0 of shape (3,)",
     )
     check_positive(args, "mass", "radius")
+    check_nonzero(args, "the particle does not gyrate. Take another system.", "charge", "B0")
     if not np.asarray(q0, float).any():
         raise ValueError("the particle is on top of the dipole, q0 = [0, 0, 0].")
 

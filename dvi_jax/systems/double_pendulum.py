@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import time_translation
-from ._problem import Problem, check_positive, check_shape
+from ._problem import Problem, check_finite, check_positive, check_shape
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -46,6 +46,7 @@ def check_start(q0, p0, args):
         "the double pendulum is two angles: q0 and p0 of shape (2,)",
     )
     check_positive(args, "m1", "m2", "l1", "l2")
+    check_finite(args, "g")
 
 
 def double_pendulum() -> Problem:

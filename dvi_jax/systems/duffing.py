@@ -6,7 +6,7 @@ import numpy as np
 from .._system import System
 from ..symmetry.library import time_translation
 from ._elliptic import first_kind, jacobi
-from ._problem import Problem, check_positive, check_shape, over_times
+from ._problem import Problem, check_finite, check_positive, check_shape, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -24,35 +24,38 @@ def energy(t0, t1, q0, p0, q1, p1, args):
     return hamiltonian(t0, t1, q1, p1, args)
 
 
-@over_times
+@over_times((1,))
 def exact(t, q0, p0, args):
     r"""The state at times t of an oscillator at (q0, p0) at t = 0, without disturbance, β > 0.
 
         E > 0:  q = A cn(λt + u | m),  λ² = α + βA²,  m = βA²/(2λ²)      (over the hill, if any)
         E < 0:  q = ±A dn(λt + u | m),  λ² = βA²/2,    m = 2 + 2α/(βA²)   (in one of two wells)
 
-    with A the largest distance, A² = (−α + √(α² + 4βE))/β, and p = dq/dt.
+    with A the largest distance, A² = (−α + s)/β, s² = α² + 4βE = (α + βq²)² + 2βp², and p = dq/dt.
 
     - `t`: times, any shape. `q0`, `p0`: shape (1,). Returns q, p of shape t.shape + (1,).
 
-    At E = 0 with α < 0, on the separatrix, and at rest at the origin it is NaN.
+    At E = 0 with α < 0, on the separatrix, and at rest at the origin it is NaN. It carries
+    gradients elsewhere, but for the very bottom of a well, where s = 0 has a cusp: NaN.
     **Source** Kovacic & Brennan (eds.) 2011, *The Duffing Equation*, Chapter 4.
     """
     alpha, beta = args["alpha"], args["beta"]
     E = hamiltonian(0.0, 0.0, q0, p0, args)
     E = jnp.where(E == 0, jnp.nan, E)
-    over, root = E > 0, jnp.sqrt(alpha**2 + 4 * beta * E)
+    # s² as a sum of squares: α² + 4βE loses its digits near the bottom of a well
+    slope = alpha + beta * q0**2
+    over, root = E > 0, jnp.sqrt(slope**2 + 2 * beta * p0**2) + 0 * E
     # 4E/(α + root) is (root − α)/β without its cancellation, for α > 0
     square = jnp.where(alpha > 0, 4 * E / (alpha + root), (root - alpha) / beta)
     A = jnp.sqrt(square)
     rate = jnp.sqrt(jnp.where(over, root, beta * square / 2))
-    m = jnp.where(over, beta * square / (2 * root), 2 + 2 * alpha / (beta * square))
+    m = jnp.where(over, beta * square / (2 * root), 2 * root / (beta * square))
     # cn = q/A and sn dn = −p/(Aλ)
     c = q0 / A
     cn_phase = jnp.arctan2(-p0 / (A * rate * jnp.sqrt(1 - m + m * c**2)), c)
-    # dn = |q|/A and sn cn = ∓p/(Aλm), whose sine and cosine of twice the phase
-    sign, s2 = jnp.where(q0 < 0, -1.0, 1.0), (1 - c**2) / m
-    dn_phase = jnp.arctan2(-2 * sign * p0 / (A * rate * m), 1 - 2 * s2) / 2
+    # dn = |q|/A and sn cn = ∓p/(Aλm), whose sine and cosine of twice the phase, times s
+    sign = jnp.where(q0 < 0, -1.0, 1.0)
+    dn_phase = jnp.arctan2(-sign * p0 * jnp.sqrt(2 * beta), slope) / 2
     u = first_kind(jnp.where(over, cn_phase, dn_phase), m)
     sn, cn, dn, _ = jacobi(rate * t + u, m)
     q = A * jnp.where(over, cn, sign * dn)
@@ -72,6 +75,7 @@ def check_start(q0, p0, args):
         "Duffing's oscillator has one degree of freedom: q0 and p0 of shape (1,)",
     )
     check_positive(args, "beta")
+    check_finite(args, "alpha", "delta", "gamma", "omega")
 
 
 def duffing() -> Problem:

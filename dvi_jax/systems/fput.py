@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import time_translation
-from ._problem import Problem, check_shape
+from ._problem import Problem, check_count, check_finite, check_shape
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -46,13 +46,17 @@ def mode_energies(t0, t1, q0, p0, q1, p1, args):
 
 
 def check_start(q0, p0, args):
-    """Refuse a start that is not a row of particles, with a `ValueError`."""
+    """Refuse a start that is not a row of particles, or α or β that is not finite.
+
+    **Raises** `ValueError`.
+    """
     check_shape(
         q0,
         p0,
         lambda shape: len(shape) == 1 and shape[0] >= 1,
         "the FPUT chain is a row of particles between two walls: q0 and p0 of shape (n,)",
     )
+    check_finite(args, "alpha", "beta")
 
 
 def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
@@ -63,13 +67,15 @@ def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
     t ≈ 10 000. With a cubic term the energy has no lower bound: waves that are too strong break
     the chain.
 
-    **Raises** `ValueError` for fewer than one particle.
+    **Raises** `ValueError` for fewer than one particle, and for α or β that is not finite.
 
     **Source** Fermi, Pasta & Ulam (and Tsingou) 1955, *Studies of nonlinear problems I*, Los
     Alamos report LA-1940.
     """
+    check_count("n", n, 1, "the FPUT chain is a row of particles between two walls")
+    springs = {"alpha": alpha, "beta": beta}
+    check_finite(springs, *springs)
     q0 = np.sin(np.pi * np.arange(1, n + 1) / (n + 1))
-    check_start(q0, q0, None)
     return Problem(
         name="fput",
         system=System(hamiltonian),

@@ -2,10 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from .._system import System
 from ..symmetry.library import rotation, scaling, time_translation
-from ._problem import Problem, over_times
+from ._problem import Problem, check_positive, check_shape, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -33,7 +34,7 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     return q1[0] * p1[1] - q1[1] * p1[0]
 
 
-@over_times
+@over_times((2,))
 def exact(t, q0, p0, args):
     r"""The body at times t of one on an ellipse that is at (q0, p0) at t = 0, ε = 0.
 
@@ -44,7 +45,8 @@ def exact(t, q0, p0, args):
 
     - `t`: times, any shape. `q0`, `p0`: shape (2,). Returns q, p of shape t.shape + (2,).
 
-    NaN for a body that escapes, of energy ≥ 0. **Source** Danby 1988, *Fundamentals of Celestial
+    NaN for a body that escapes, of energy ≥ 0. Elsewhere, on a circle too, it carries gradients in
+    t, q0, p0 and K. **Source** Danby 1988, *Fundamentals of Celestial
     Mechanics*, 6.
     """
     mu, r0 = args["K"] ** 2, jnp.sqrt(jnp.sum(q0**2))
@@ -55,29 +57,39 @@ def exact(t, q0, p0, args):
     ec, es = 1 - r0 / a, jnp.sum(q0 * p0) / jnp.sqrt(mu * a)
     whole = jnp.round(n * t / (2 * jnp.pi))
     mean = n * t - 2 * jnp.pi * whole
-    E0, e = jnp.arctan2(es, ec), jnp.sqrt(ec**2 + es**2)
-    M = mean + E0 - es
-    M = M - 2 * jnp.pi * jnp.round(M / (2 * jnp.pi))
-    E = M + 0.85 * e * jnp.sign(jnp.sin(M))  # from here Newton's method never fails
+    # Only the first guess goes by E0 and e themselves, which mean nothing on a circle.
+    x = lax.stop_gradient(_first_guess(mean, ec, es))
     for _ in range(12):
-        E = E - (E - e * jnp.sin(E) - M) / (1 - e * jnp.cos(E))
-    x = E - E0
-    x = x - 2 * jnp.pi * jnp.round((x - mean) / (2 * jnp.pi))
-    r = a * (1 - e * jnp.cos(E))
+        past = x - ec * jnp.sin(x) + es * (1 - jnp.cos(x)) - mean
+        x = x - past / (1 - ec * jnp.cos(x) + es * jnp.sin(x))
+    r = a * (1 - ec * jnp.cos(x) + es * jnp.sin(x))
     f, g = 1 - a / r0 * (1 - jnp.cos(x)), (mean - x + jnp.sin(x)) / n
     f_rate, g_rate = -jnp.sqrt(mu * a) / (r * r0) * jnp.sin(x), 1 - a / r * (1 - jnp.cos(x))
     return f * q0 + g * p0, f_rate * q0 + g_rate * p0
 
 
+def _first_guess(mean, ec, es):
+    """Growth of the eccentric anomaly from which Newton's method never fails."""
+    E0, e = jnp.arctan2(es, ec), jnp.sqrt(ec**2 + es**2)
+    M = mean + E0 - es
+    # on the side of M where the equation is convex towards its root
+    return M + 0.85 * e * jnp.sign(jnp.sin(M)) - E0
+
+
 def check_start(q0, p0, args):
-    """Refuse a start that is not in the plane, or at the centre, with a `ValueError`."""
-    q, p = np.asarray(q0, float), np.asarray(p0, float)
-    if q.shape != (2,) or p.shape != (2,):
-        raise ValueError(
-            f"the Kepler problem here is in the plane: q0 and p0 of shape (2,), got {q.shape} and "
-            f"{p.shape}. For more dimensions or bodies take the system n_body."
-        )
-    if not q.any():
+    """Refuse a start that is not in the plane, or at the centre, or a K that is not positive.
+
+    **Raises** `ValueError`.
+    """
+    check_shape(
+        q0,
+        p0,
+        lambda shape: shape == (2,),
+        "the Kepler problem here is in the plane (for more dimensions or bodies take the system "
+        "n_body): q0 and p0 of shape (2,)",
+    )
+    check_positive(args, "K")
+    if not np.asarray(q0, float).any():
         raise ValueError("the body is on top of the centre, q0 = [0, 0]: the force is infinite.")
 
 

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ._elliptic import complete
-from ._problem import Adiabatic, InSlowTime, Problem, check_positive, check_shape
+from ._elliptic import swing
+from ._problem import Adiabatic, InSlowTime, Problem, check_positive, check_shape, number
 from .pendulum import exact as of_pendulum
 
 
@@ -39,8 +39,7 @@ def action(t0, t1, q0, p0, q1, p1, args):
     """
     mass, g, string = args["mass"], args["g"], length(t1, args)
     m = jnp.sum(jnp.sin(q1 / 2) ** 2 + p1**2 / (4 * mass**2 * g * string**3))
-    K, E = complete(m)
-    return 8 / jnp.pi * mass * string * jnp.sqrt(g * string) * (E - (1 - m) * K)
+    return 8 / jnp.pi * mass * string * jnp.sqrt(g * string) * swing(m)
 
 
 def small_swing_action(t0, t1, q0, p0, q1, p1, args):
@@ -70,8 +69,8 @@ def check_start(q0, p0, args):
         "Lorentz's pendulum is one angle: q0 and p0 of shape (1,)",
     )
     check_positive(args, "mass", "g", "length")
-    if not abs(args["depth"]) < 1:
-        raise ValueError(f"depth must be between -1 and 1, got {args['depth']}.")
+    if not abs(depth := number(args, "depth")) < 1:
+        raise ValueError(f"depth must be between -1 and 1, got {depth}.")
 
 
 def lorentz_pendulum() -> Problem:

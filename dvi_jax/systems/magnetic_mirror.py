@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from .._system import System
 from ..symmetry.library import rotation, time_translation
 from . import _guiding_centre as guiding_centre
-from ._problem import Adiabatic, Problem, check_shape
+from ._problem import Adiabatic, Problem, check_nonzero, check_positive, check_shape
 
 
 def vector_potential(q, args):
@@ -72,27 +72,28 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
         J = ∮ p∥ ds = 4 ∫ √(2m (E − μ|B|)) ds,    from the middle to the mirror point
 
     along the field line of the guiding centre, (x² + y²)(1 + z²/ℓ²) = a², with μ the
-    `corrected_moment`. Near the axis 2πmℓ (E − μB0)/√(2mμB0). Zero where the particle mirrors in
-    the middle. Not differentiable. **Source** Northrop 1963, 3.
+    `corrected_moment`. Near the axis 2πmℓ (E − μ|B0|)/√(2mμ|B0|). Zero where the particle mirrors
+    in the middle. Not differentiable. **Source** Northrop 1963, 3.
     """
     m, mv, length = args["mass"], kinetic_momentum(q1, p1, args), args["length"]
     x, y, z = guiding_centre.centre(q1, mv, lambda q: magnetic_field(q, args), args)
     a = (x**2 + y**2) * (1 + (z / length) ** 2) / length**2
     E = energy(t0, t1, q0, p0, q1, p1, args)
     mu = corrected_moment(t0, t1, q0, p0, q1, p1, args)
+    in_middle = jnp.abs(args["B0"])  # of either sign
 
     def strength(u):  # of u = z/ℓ
-        return args["B0"] * jnp.sqrt((1 + u**2) ** 2 + a * u**2 / (1 + u**2))
+        return in_middle * jnp.sqrt((1 + u**2) ** 2 + a * u**2 / (1 + u**2))
 
     def arc(u):
         return length * jnp.sqrt(1 + a * u**2 / (1 + u**2) ** 3)
 
-    far = jnp.sqrt(jnp.maximum(E / (mu * args["B0"]) - 1, 0.0))  # where it turns on the axis
+    far = jnp.sqrt(jnp.maximum(E / (mu * in_middle) - 1, 0.0))  # where it turns on the axis
     return guiding_centre.bounce_action(strength, arc, far, E, mu, m)
 
 
 def check_start(q0, p0, args):
-    """Refuse a start that is not in space, or a mass or length that is not positive.
+    """Refuse a start that is not in space, no field, or a mass or length that is not positive.
 
     **Raises** `ValueError`.
     """
@@ -102,9 +103,8 @@ def check_start(q0, p0, args):
         lambda shape: shape == (3,),
         "the magnetic mirror holds one particle in space: q0 and p0 of shape (3,)",
     )
-    for name in ("mass", "length"):
-        if not args[name] > 0:
-            raise ValueError(f"{name} must be positive, got {args[name]}.")
+    check_positive(args, "mass", "length")
+    check_nonzero(args, "the particle does not gyrate. Take another system.", "charge", "B0")
 
 
 def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:

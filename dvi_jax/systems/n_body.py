@@ -9,7 +9,7 @@ import numpy as np
 from .._system import System
 from ..symmetry.generators import Generator
 from ..symmetry.library import rotation, scaling, space_translation, time_translation
-from ._problem import Problem
+from ._problem import Problem, check_finite, number, parameter
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -73,10 +73,13 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     message, else their indices.
 
     **Raises** `ValueError` for shapes that do not agree, a mass that is not positive (its
-    momentum would fix no velocity), and two bodies closer than the rounding of their positions.
+    momentum would fix no velocity), a G that is not finite, and two bodies closer than the rounding
+    of their positions.
     """
     q, p = np.asarray(q0, float), np.asarray(p0, float)
-    masses = np.asarray(args["masses"], float)
+    masses = np.asarray(parameter(args, "masses"), float)
+    if "G" in args:
+        check_finite(args, "G")
     if q.ndim != 2 or q.shape[-1] not in (2, 3) or p.shape != q.shape:
         raise ValueError(
             "q0 and p0 of N bodies must both have shape (bodies, 2) or (bodies, 3); got "
@@ -158,7 +161,7 @@ def n_body(
         from .figure_eight import MOMENTA, POSITIONS  # which is made by this function
 
         masses, q0, p0 = np.ones(3), POSITIONS, MOMENTA
-    args = {"masses": np.asarray(masses, float), "G": float(G)}
+    args = {"masses": np.asarray(masses, float), "G": number({"G": G}, "G")}
     check_bodies(q0, p0, args)
     return Problem(
         name="n_body",

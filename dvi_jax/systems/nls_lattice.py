@@ -11,7 +11,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import time_translation
-from ._problem import Problem, check_shape
+from ._problem import Problem, check_count, check_finite, check_shape
 from .oscillator import PHASE
 
 
@@ -54,13 +54,17 @@ def plane_wave(t, n, mode, amplitude, args):
 
 
 def check_start(q0, p0, args):
-    """Refuse a start that is not a ring of three sites or more, with a `ValueError`."""
+    """Refuse a start that is not a ring of three sites or more, or κ or γ that is not finite.
+
+    **Raises** `ValueError`.
+    """
     check_shape(
         q0,
         p0,
         lambda shape: len(shape) == 1 and shape[0] >= 3,
         "the lattice is a ring of at least three sites: q0 and p0 of shape (n,), n ≥ 3",
     )
+    check_finite(args, "kappa", "gamma")
 
 
 def nls_lattice(n: int = 8) -> Problem:
@@ -72,10 +76,10 @@ def nls_lattice(n: int = 8) -> Problem:
 
     **Source** Kevrekidis 2009, *The Discrete Nonlinear Schrödinger Equation*.
     """
+    check_count("n", n, 3, "the lattice is a ring of at least three sites")
     site = np.arange(n) - n / 2
     size, phase = 1 / np.cosh(site / 1.5), 0.5 * site
     q0, p0 = size * np.cos(phase), size * np.sin(phase)
-    check_start(q0, p0, None)
     return Problem(
         name="nls_lattice",
         system=System(hamiltonian),

@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import rotation, time_translation
-from ._problem import Problem, check_positive, check_shape
+from ._problem import Problem, check_finite, check_positive, check_shape
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -87,6 +87,7 @@ def check_start(q0, p0, args):
         "the satellite is one point in space: q0 and p0 of shape (3,)",
     )
     check_positive(args, "mu", "R")
+    check_finite(args, "J2")
     r = float(np.linalg.norm(np.asarray(q0, float)))
     if r < args["R"]:
         raise ValueError(f"the satellite starts at r = {r}, inside the planet of R = {args['R']}.")

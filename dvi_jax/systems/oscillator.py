@@ -39,7 +39,7 @@ def map_invariant(t0, t1, q0, p0, q1, p1, args):
     return (jnp.sum(p1**2) + jnp.sum(q1**2) - (t1 - t0) * jnp.sum(q1 * p1)) / 2
 
 
-@over_times
+@over_times()
 def exact(t, q0, p0, args):
     """The state at times t at ε = 0: (q, p) turned clockwise by t.
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import time_translation
-from ._elliptic import complete, first_kind, jacobi
+from ._elliptic import complete, first_kind, jacobi, swing
 from ._problem import Problem, check_positive, check_shape, over_times
 
 
@@ -30,24 +30,26 @@ def modulus(q, p, args):
 
 
 def action(t0, t1, q0, p0, q1, p1, args):
-    """J = ∮ p dq/2π = (8ω/π) (E(m) − (1 − m) K(m)) at t1, m < 1; NaN where it turns over.
+    """J = ∮ p dq/2π = (8ω/π) (E(m) − (1 − m) K(m)) at t1, m ≤ 1; NaN where it turns over.
 
     E/ω to first order in m, dE/dJ the frequency πω/(2K(m)).
     """
-    m = modulus(q1, p1, args)
-    K, E = complete(m)
-    return 8 * args["omega"] / jnp.pi * (E - (1 - m) * K)
+    return 8 * args["omega"] / jnp.pi * swing(modulus(q1, p1, args))
 
 
 def period(q, p, args):
-    """4K(m)/ω of a swing, 2K(1/m)/(√m ω) of a full turn: the time after which it repeats."""
+    """4K(m)/ω of a swing, 2K(1/m)/(√m ω) of a full turn: the time after which it repeats.
+
+    Infinite on the separatrix, m = 1.
+    """
     m = modulus(q, p, args)
     swings = m < 1
-    swing, turn = complete(jnp.where(swings, m, 0.5))[0], complete(jnp.where(swings, 0.5, 1 / m))[0]
-    return jnp.where(swings, 4 * swing, 2 * turn / jnp.sqrt(m)) / args["omega"]
+    k, over = jnp.where(swings, m, 0.5), jnp.where(swings, 2.0, m)
+    to_and_fro, turn = complete(k)[0], complete(1 / over)[0]
+    return jnp.where(swings, 4 * to_and_fro, 2 * turn / jnp.sqrt(over)) / args["omega"]
 
 
-@over_times
+@over_times((1,))
 def exact(t, q0, p0, args):
     r"""The pendulum at times t of one that is at (q0, p0) at t = 0, without friction.
 
@@ -57,21 +59,25 @@ def exact(t, q0, p0, args):
     - `t`: times, any shape. `q0` [rad], `p0` [rad/time]: shape (1,).
 
     Returns q, p of shape t.shape + (1,). Angles are not taken modulo 2π. At m = 1, on the
-    separatrix, it is NaN. **Source** Whittaker 1937, *Analytical Dynamics*, §44.
+    separatrix, it is NaN; elsewhere, at rest too, it carries gradients in t, q0, p0 and ω.
+    **Source** Whittaker 1937, *Analytical Dynamics*, §44.
     """
     w, m = args["omega"], modulus(q0, p0, args)
     m = jnp.where(m == 1, jnp.nan, m)
     swings = m < 1
     turns = 2 * jnp.pi * jnp.round(q0 / (2 * jnp.pi))
-    # where it swings; the other branch is given a modulus that it can live with
-    k = jnp.sqrt(jnp.where(swings, m, 0.5))
-    phase = first_kind(jnp.arctan2(jnp.sin((q0 - turns) / 2), p0 / (2 * w)), k**2)
-    sn, cn, _, _ = jacobi(w * t + phase, k**2)
-    q_swing, p_swing = turns + 2 * jnp.arctan2(k * sn, jnp.sqrt(1 - (k * sn) ** 2)), 2 * w * k * cn
-    # where it turns over
-    inverse, sign = jnp.where(swings, 0.5, 1 / m), jnp.where(p0 < 0, -1.0, 1.0)
-    root = jnp.sqrt(jnp.where(swings, 1.0, m))
-    _, _, dn, am = jacobi(root * w * t + first_kind(sign * q0 / 2, inverse), inverse)
+    # where it swings, sn, cn and dn of ωt + u by their sums: √m sn u, √m cn u and dn u are these,
+    # and neither √m nor u, which have a corner at rest, is needed
+    k, half = jnp.where(swings, m, 0.5), (q0 - turns) / 2
+    S, P, D = jnp.sin(half), p0 / (2 * w), jnp.cos(half)
+    sn, cn, dn, _ = jacobi(w * t, k)
+    sine, cosine = S * cn * dn + sn * P * D, dn * D - sn * cn * S * P
+    q_swing = turns + 2 * jnp.arctan2(sine, cosine)
+    p_swing = 2 * w * (cn * P - sn * dn * S * D) / (cn**2 + (sn * D) ** 2)
+    # where it turns over; either branch is given a modulus that it can live with
+    over, sign = jnp.where(swings, 2.0, m), jnp.where(p0 < 0, -1.0, 1.0)
+    root = jnp.sqrt(over)
+    _, _, dn, am = jacobi(root * w * t + first_kind(sign * q0 / 2, 1 / over), 1 / over)
     q, p = (
         jnp.where(swings, q_swing, 2 * sign * am),
         jnp.where(swings, p_swing, 2 * sign * w * root * dn),

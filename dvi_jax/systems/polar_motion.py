@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ._problem import Problem, check_shape, over_times
+from ._problem import Problem, check_finite, check_positive, check_shape, check_vector, over_times
 from .solar_system import EphemerisMissing
 
 REFERENCE = 51544.0
@@ -184,15 +184,19 @@ def free_amplitude(t0, t1, q0, p0, q1, p1, args):
 
 
 def check_start(q0: Any, p0: Any, args: Any) -> None:
-    """Refuse a start that is not one pole, or a period that is not positive."""
+    """Refuse a start that is not one pole, or parameters that are none: period ≤ 0, no pair.
+
+    **Raises** `ValueError`.
+    """
     check_shape(
         q0,
         p0,
         lambda shape: shape == (1,),
         "the pole is one point: q0 (its x) and p0 (its y) of shape (1,)",
     )
-    if not args["period"] > 0:
-        raise ValueError(f"period must be positive, got {args['period']}.")
+    check_positive(args, "period")
+    check_finite(args, "inverse_Q")
+    check_vector(args, 2, "prograde", "retrograde", "mean", "drift")
 
 
 def polar_motion() -> Problem:
@@ -252,7 +256,7 @@ def polar_motion() -> Problem:
     )
 
 
-@over_times
+@over_times((1,))
 def _exact_from_zero(t: Any, q0: Any, p0: Any, args: Any) -> tuple[Any, Any]:
     """`exact` as a `Problem` has it: of one start at t0 = 0."""
     return exact(t, 0.0, q0, p0, args)

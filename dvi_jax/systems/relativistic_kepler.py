@@ -23,7 +23,8 @@ def energy(t0, t1, q0, p0, q1, p1, args):
 
 
 def precession(q, p, args):
-    r"""Angle by which the perihelion advances from one to the next, exact [rad].
+    r"""Angle by which the perihelion advances from one to the next, exact [rad], positive in the
+    sense of the motion, whichever that is.
 
         Δ = 2π (1/Γ − 1),    Γ² = 1 − K⁴/(c² L²),    L = q × p
 
@@ -44,7 +45,8 @@ def perihelion_angle(t0, t1, q0, p0, q1, p1, args):
         ψ = Γ(θ − θ0),  C = K² (E + c²)/(c² L² Γ²);  the perihelion passed last, or the one to
         come, whichever is nearer, lies at θ0 = θ − ψ/Γ, |ψ| ≤ π
 
-    It is constant but for a jump by `precession` at each aphelion.
+    It is constant but for a jump at each aphelion in the sense of the motion: by `precession` where
+    L > 0, by minus as much where L < 0.
     """
     r = jnp.sqrt(jnp.sum(q1**2))
     L = angular_momentum(t0, t1, q0, p0, q1, p1, args)

@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import time_translation
-from ._problem import Problem, check_shape
+from ._problem import Problem, check_shape, number
 
 EARTH_MOON = 0.012150585
 """Mass of the Moon over that of Earth and Moon (JPL DE405: Earth/Moon = 81.30056)."""
@@ -98,7 +98,7 @@ def check_start(q0, p0, args):
         lambda shape: shape == (3,),
         "the restricted problem has one body in space: q0 and p0 of shape (3,)",
     )
-    mu, q = float(args["mu"]), np.asarray(q0, float)
+    mu, q = number(args, "mu"), np.asarray(q0, float)
     _check_mu(mu)
     for x in (-mu, 1 - mu):
         if not (q - [x, 0.0, 0.0]).any():

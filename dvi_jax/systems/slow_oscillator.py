@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import scaling
-from ._problem import Adiabatic, InSlowTime, Problem, check_shape
+from ._problem import Adiabatic, InSlowTime, Problem, check_shape, number
 from .oscillator import exact as of_oscillator
 
 
@@ -45,8 +45,8 @@ def check_start(q0, p0, args):
         lambda shape: shape == (1,),
         "the slow oscillator has one degree of freedom: q0 and p0 of shape (1,)",
     )
-    if not abs(args["depth"]) < 1:
-        raise ValueError(f"depth must be between -1 and 1, got {args['depth']}.")
+    if not abs(depth := number(args, "depth")) < 1:
+        raise ValueError(f"depth must be between -1 and 1, got {depth}.")
 
 
 def slow_oscillator() -> Problem:

@@ -7,6 +7,7 @@ asteroids add is left out, and is what a comparison with the ephemeris shows.
 import datetime
 from functools import cache
 from importlib.util import find_spec
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def julian_date(date: str | datetime.date | float) -> float:
         raise ValueError(f"date must be a day without a time of day, got {date}.")
     if isinstance(date, datetime.date):
         jd = date.toordinal() + 1721424.5
-    elif isinstance(date, int | float) and not isinstance(date, bool):
+    elif isinstance(date, Real) and not isinstance(date, bool):
         jd = float(date)
     else:
         raise ValueError(f"date must be a calendar day or a Julian date, got {date!r}.")

@@ -5,9 +5,8 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import space_translation, time_translation
-from ._elliptic import first_kind, jacobi
+from ._elliptic import first_kind, jacobi, third_kind
 from ._problem import Problem, check_positive, check_shape, over_times
-from ._quadrature import integral_from_zero
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -60,9 +59,12 @@ def steady_precession(theta, p_psi, args):
 
 
 def _turning_points(E, p_phi, p_psi, args):
-    r"""Roots u1 < u2 ≤ 1 ≤ u3 of (2/A)(E − wu)(1 − u²) − (p_φ − p_ψ u)²/A², shape (3,).
+    r"""Roots u1 < u2 ≤ 1 ≤ u3 of (2/A)(E − wu)(1 − u²) − (p_φ − p_ψ u)²/A², as these three:
 
-    By the trigonometric formula for three real roots, and three of Newton's steps each.
+        1 + u1,    1 − u2,    1 + u3
+
+    By the trigonometric formula for three real roots, and Newton's steps in what is returned, so
+    that the first two have all their digits where the axis comes close to the vertical.
     """
     A, w = args["A"], args["w"]
     c3, c2 = 2 * w / A, -2 * E / A - (p_psi / A) ** 2
@@ -70,54 +72,81 @@ def _turning_points(E, p_phi, p_psi, args):
     a, b, c = c2 / c3, c1 / c3, c0 / c3
     Q, R = (a**2 - 3 * b) / 9, (2 * a**3 - 9 * a * b + 27 * c) / 54
     angle = jnp.arccos(jnp.clip(R / jnp.sqrt(Q**3), -1, 1))
-    turns = jnp.asarray([0.0, -2.0, 2.0]) * jnp.pi  # ascending for 0 ≤ angle ≤ π
-    u = -2 * jnp.sqrt(Q) * jnp.cos((angle + turns) / 3) - a / 3
-    for _ in range(3):
-        u = u - (((u + a) * u + b) * u + c) / ((3 * u + 2 * a) * u + b)
-    return u
+
+    def root(turns):  # ascending for 0 ≤ angle ≤ π and turns 0, −2, 2
+        return -2 * jnp.sqrt(Q) * jnp.cos((angle + turns * jnp.pi) / 3) - a / 3
+
+    def polished(x, sign):
+        """A root x = 1 + sign u: the same cubic in x, times A²."""
+        P, free = p_phi + sign * p_psi, E + sign * w
+        cubic = (
+            2 * sign * A * w,
+            -4 * sign * A * w - 2 * A * free - p_psi**2,
+            4 * A * free + 2 * sign * P * p_psi,
+            -(P**2),
+        )
+        for _ in range(4):
+            value, slope = cubic[0], 0.0
+            for coefficient in cubic[1:]:
+                value, slope = value * x + coefficient, slope * x + value
+            x = x - value / slope
+        return x
+
+    return polished(1 + root(0), 1), polished(1 - root(-2), -1), polished(1 + root(2), 1)
 
 
-@over_times
+@over_times((3,))
 def exact(t, q0, p0, args):
     r"""The top at times t of one that is at (q0, p0) at t = 0.
 
-        cos θ = u1 + (u2 − u1) sn²(κt + δ | m),    κ² = w (u3 − u1)/(2A),  m = (u2 − u1)/(u3 − u1)
-        dφ/dt = (p_φ − p_ψ cos θ)/(A sin² θ),      dψ/dt = p_ψ/C − cos θ dφ/dt
+        cos θ = u1 + (u2 − u1) sn² x,   x = κt + δ,  κ² = w (u3 − u1)/(2A),  m = (u2 − u1)/(u3 − u1)
+        A dφ/dt = P₊ + P₋,    A dψ/dt = (A/C − 1) p_ψ + P₊ − P₋,    2 P± = (p_φ ± p_ψ)/(1 ± cos θ)
 
     with u_i the roots of (du/dt)² = (2/A)(E′ − wu)(1 − u²) − (p_φ − p_ψ u)²/A², E′ = E − p_ψ²/(2C).
-    φ and ψ are integrated numerically, to round-off for some 60 nutations.
+    φ and ψ are integrals of the third kind, of n = (u1 − u2)/(1 + u1) and (u2 − u1)/(1 − u1).
 
     - `t`: times, any shape. `q0`, `p0`: shape (3,). Returns q, p of shape t.shape + (3,).
 
-    NaN where two roots are one: a steady precession (see `steady_precession`) or a sleeping top.
+    To about 1e-15 of the phases passed and, where the nutation is small, 1e-16/(u2 − u1) besides:
+    u1 and u2 are known no better. NaN where two roots are one, a steady precession (see
+    `steady_precession`) or a sleeping top, and where the axis goes through the vertical, with
+    p_φ = p_ψ and E′ ≥ w above or p_φ = −p_ψ below: Euler's angles jump there.
     **Source** Whittaker 1937, *Analytical Dynamics*, §71.
     """
-    A, C, w = args["A"], args["C"], args["w"]
+    A, C, w = (jnp.asarray(args[name], p0.dtype) for name in ("A", "C", "w"))
     p_phi, p_psi = p0[0], p0[2]
-    E = hamiltonian(0.0, 0.0, q0, p0, args) - p_psi**2 / (2 * C)
-    u1, u2, u3 = _turning_points(E, p_phi, p_psi, args)
-    rate, m = jnp.sqrt(w * (u3 - u1) / (2 * A)), (u2 - u1) / (u3 - u1)
+    above, below = p_phi - p_psi, p_phi + p_psi  # what is left at θ = 0 and π
+    s2, c2 = jnp.sin(q0[1] / 2) ** 2, jnp.cos(q0[1] / 2) ** 2
+    leaning = (above + 2 * p_psi * s2) ** 2 / (8 * A * s2 * c2)
+    E = p0[1] ** 2 / (2 * A) + leaning + w * (c2 - s2)
+    x1, v2, x3 = _turning_points(E, p_phi, p_psi, {"A": A, "w": w})  # 1 + u1, 1 − u2, 1 + u3
+    x2, v1, spread = 2 - v2, 2 - x1, 2 - x1 - v2
+    through = ((above == 0) & (w <= E)) | (below == 0)
+    spread = jnp.where((spread > 0) & ~through, spread, jnp.nan)
+    rate, m = jnp.sqrt(w * (x3 - x1) / (2 * A)), spread / (x3 - x1)
     # sn² and sn cn of the start give sine and cosine of twice the phase
-    square = (jnp.cos(q0[1]) - u1) / (u2 - u1)
+    sn2, cn2 = (2 * c2 - x1) / spread, (2 * s2 - v2) / spread
     climb = -jnp.sin(q0[1]) * p0[1] / A
-    dn = jnp.sqrt(1 - m * square)
-    double = jnp.arctan2(climb / ((u2 - u1) * rate * dn), 1 - 2 * square)
-    start = first_kind(double / 2, m)
+    dn = jnp.sqrt(cn2 + (1 - m) * sn2)
+    start = first_kind(jnp.arctan2(climb / (spread * rate * dn), cn2 - sn2) / 2, m)
+    sn, cn, dn, end = jacobi(rate * t + start, m)
+    begin = jacobi(start, m)[3]
 
-    def height_and_climb(s):
-        sn, cn, dn, _ = jacobi(rate * s + start, m)
-        return u1 + (u2 - u1) * sn**2, 2 * (u2 - u1) * rate * sn * cn * dn
+    def turned(P, base, complement):
+        """∫ P/2A over 1 ± u, which is base (1 − n sn²)."""
+        passed = third_kind(end, complement, m) - third_kind(begin, complement, m)
+        return P / (2 * A * base * rate) * passed
 
-    def precession(s):
-        u, _ = height_and_climb(s)
-        return (p_phi - p_psi * u) / (A * (1 - u**2))
-
-    u, climb = height_and_climb(t)
-    phi = q0[0] + integral_from_zero(precession, t)
-    spin = integral_from_zero(lambda s: height_and_climb(s)[0] * precession(s), t)
-    psi = q0[2] + p_psi / C * t - spin
-    p_theta = -A * climb / jnp.sqrt(1 - u**2)
-    return jnp.stack([phi, jnp.arccos(u), psi]), jnp.stack([p_phi, p_theta, p_psi])
+    up, down = turned(above, v1, v2 / v1), turned(below, x1, x2 / x1)
+    phi = q0[0] + down + up
+    psi = q0[2] + (1 / C - 1 / A) * p_psi * t + down - up
+    # 1 − u and 1 + u, each without cancellation
+    from_top, from_bottom = v2 + spread * cn**2, x1 + spread * sn**2
+    theta = 2 * jnp.arctan2(jnp.sqrt(from_top), jnp.sqrt(from_bottom))
+    climb = 2 * spread * rate * sn * cn * dn
+    p_theta = -A * climb / jnp.sqrt(from_top * from_bottom)
+    q, p = jnp.stack([phi, theta, psi]), jnp.stack([p_phi, p_theta, p_psi])
+    return q + 0 * m, p + 0 * m  # all of it or nothing
 
 
 def check_start(q0, p0, args):

@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import time_translation
-from ._problem import Adiabatic, Problem, check_shape
+from ._problem import Adiabatic, Problem, check_count, check_positive, check_shape
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -37,25 +37,30 @@ def oscillatory_energy(t0, t1, q0, p0, q1, p1, args):
 
 
 def check_start(q0, p0, args):
-    """Refuse a start that is not a pair of rows, with a `ValueError`."""
+    """Refuse a start that is not a pair of rows, or an ω that is not positive.
+
+    **Raises** `ValueError`.
+    """
     check_shape(
         q0,
         p0,
         lambda shape: len(shape) == 2 and shape[0] == 2 and shape[1] >= 1,
         "the stiff FPUT chain has centres and lengths of m springs: q0 and p0 of shape (2, m)",
     )
+    check_positive(args, "omega")
 
 
 def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
     """The stiff chain with its energy in the first spring: x_1 = ẋ_1 = ẏ_1 = 1, y_1 = 1/ω.
 
-    **Raises** `ValueError` for fewer than one spring.
+    **Raises** `ValueError` for fewer than one spring, and for an ω that is not positive.
 
     **Source** Galgani, Giorgilli, Martinoli & Vanzini 1992, *Physica D* 59, 334; Hairer, Lubich
     & Wanner 2006, *Geometric Numerical Integration*, I.5.1 and XIII.2.1, whose start this is.
     """
+    check_count("m", m, 1, "the stiff FPUT chain has centres and lengths of m springs")
+    check_positive({"omega": omega}, "omega")
     q0, p0 = np.zeros((2, 2, m))
-    check_start(q0, p0, None)
     q0[:, 0], p0[:, 0] = (1.0, 1 / omega), (1.0, 1.0)
     return Problem(
         name="stiff_fput",

@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import space_translation, time_translation
-from ._problem import Problem, check_shape
+from ._problem import Problem, check_count, check_shape
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -75,9 +75,9 @@ def toda(n: int = 5) -> Problem:
     **Source** Toda 1967, *J. Phys. Soc. Japan* 22, 431; integrals: Hénon 1974, *Phys. Rev. B* 9,
     1921, and Flaschka 1974, 1924.
     """
+    check_count("n", n, 3, "the periodic Toda lattice needs at least three particles")
     angle = 2 * np.pi * np.arange(n) / n
     q0, p0 = np.zeros(n), 0.1 + np.cos(angle) + np.sin(2 * angle) / 2
-    check_start(q0, p0, None)
     return Problem(
         name="toda",
         system=System(hamiltonian),

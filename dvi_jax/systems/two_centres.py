@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import rotation, time_translation
-from ._problem import Problem, check_positive, check_shape
+from ._problem import Problem, check_finite, check_positive, check_shape
 
 
 def distances(q, args):
@@ -59,6 +59,7 @@ def check_start(q0, p0, args):
         "the problem of two centres is in space: q0 and p0 of shape (3,)",
     )
     check_positive(args, "d")
+    check_finite(args, "mu1", "mu2")
     q = np.asarray(q0, float)
     for z in (args["d"], -args["d"]):
         if not (q - [0.0, 0.0, z]).any():

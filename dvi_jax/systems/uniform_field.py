@@ -6,7 +6,7 @@ import numpy as np
 from .._system import System
 from ..symmetry.generators import Generator
 from ..symmetry.library import time_translation
-from ._problem import Problem, check_positive, check_shape, over_times
+from ._problem import Problem, check_nonzero, check_positive, check_shape, check_vector, over_times
 
 
 def vector_potential(q, args):
@@ -64,7 +64,7 @@ def _translation(axis):
     return Generator(xi=lambda t, q, p, args: jnp.asarray(a, q.dtype), eta=push)
 
 
-@over_times
+@over_times((3,))
 def exact(t, q0, p0, args):
     r"""The particle at times t of one that is at (q0, p0) at t = 0, with w = v⊥ − E × B/B²:
 
@@ -102,11 +102,8 @@ def check_start(q0, p0, args):
         "the field holds one particle in space: q0 and p0 of shape (3,)",
     )
     check_positive(args, "mass")
-    if np.shape(args["E"]) != (3,):
-        raise ValueError(f"E must have shape (3,), got {np.shape(args['E'])}.")
-    for name in ("charge", "B"):
-        if args[name] == 0:
-            raise ValueError(f"{name} is 0: the particle does not gyrate. Take another system.")
+    check_vector(args, 3, "E")
+    check_nonzero(args, "the particle does not gyrate. Take another system.", "charge", "B")
 
 
 def uniform_field() -> Problem:

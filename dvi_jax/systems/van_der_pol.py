@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..symmetry.library import scaling, time_translation
-from ._problem import Problem, check_shape
+from ._problem import Problem, check_shape, distance
 from .oscillator import PHASE, energy, exact, hamiltonian
 
 
@@ -15,8 +15,11 @@ def feedback(t0, t1, q0, p1, args):
 
 
 def amplitude(t0, t1, q0, p0, q1, p1, args):
-    """√(q² + p²) at t1: kept at ε = 0, and nearing 2 for small ε > 0."""
-    return jnp.sqrt(jnp.sum(q1**2) + jnp.sum(p1**2))
+    """√(q² + p²) at t1: kept at ε = 0, and nearing 2 for small ε > 0.
+
+    Its gradient at the origin, a corner, is put down as zero.
+    """
+    return distance(jnp.sum(q1**2) + jnp.sum(p1**2))
 
 
 def averaged_amplitude(t, epsilon, start):
