@@ -1,11 +1,13 @@
 """Measured orders: slopes, what is excluded and why, failed starts, intervals, surfaces."""
 
 import functools
+import types
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.colors import LogNorm
 from scipy import special
 
 import dvi_jax as dvi
@@ -299,6 +301,47 @@ def test_pictures_show_what_was_excluded():
             plt.close(axes[0].figure)
         with pytest.raises(ValueError, match="1 orders for 2 results"):
             plot.drift_orders([usual(), usual()], [1])
+
+
+def test_a_surface_shows_zeros_failures_and_limits():
+    """Of 3 × 4 drifts one exactly 0, and one failed or none; limits far from the slopes."""
+    eps = np.array([0.1, 0.2, 0.4, 0.8])
+
+    def order(drifts, limit):
+        there = np.isfinite(drifts) & (drifts > 0)
+        return types.SimpleNamespace(drifts=drifts, limit=limit, used=there, slope=1.0,
+                                     interval=(0.99, 1.01), floor=1e-9)  # fmt: skip
+
+    def surface(odd):
+        orders = [order(eps * k, 1.0) for k in (1.0, 10.0, 100.0)]
+        orders[1] = order(np.array([0.0, odd, 4.0, 8.0]), 1.7)
+        stack = {"drifts": np.stack([o.drifts for o in orders], 1),
+                 "used": np.stack([o.used for o in orders], 1)}  # fmt: skip
+        return types.SimpleNamespace(
+            epsilons=eps, hs=np.array([0.05, 0.1, 0.2]), orders=orders, slopes=np.ones(3),
+            intervals=np.array([[0.99, 1.01]] * 3), **stack,
+        )  # fmt: skip
+
+    left, right = plot.drift_surface(surface(np.nan), promised=1)
+    mesh, black = left.collections
+    assert isinstance(mesh.norm, LogNorm)
+    assert (mesh.norm.vmin, mesh.norm.vmax) == (0.1, 80.0)
+    assert (~black.get_array().mask).sum() == 1
+    low, high = right.get_ylim()
+    assert low < 1 < 1.7 < high
+    texts = [text.get_text() for text in left.figure.legends[0].get_texts()]
+    assert "1 of 12 exactly 0" in texts
+    assert "1 of 12 failed" in texts
+    assert left.patch.get_hatch()  # no colour of the scale
+    whole = plot.drift_surface(surface(2.0))[0].figure.legends[0].get_texts()
+    assert not any("failed" in text.get_text() for text in whole)
+    mine = plt.subplots(1, 2, layout="constrained", figsize=(10, 4))[1]
+    plot.drift_surface(surface(np.nan), promised=1, ax=mine)
+    mine[0].figure.canvas.draw()
+    for axis in mine:
+        inside, box = axis.get_legend().get_window_extent(), axis.get_window_extent()
+        assert box.y0 <= inside.y0 < inside.y1 <= box.y1
+    plt.close("all")
 
 
 @pytest.mark.parametrize(

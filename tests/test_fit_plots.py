@@ -59,7 +59,8 @@ def points(axis):
 
 
 def texts(axis):
-    return [t.get_text() for t in axis.get_legend().get_texts()]
+    found = axis.get_legend() or axis.figure.legends[0]
+    return [t.get_text() for t in found.get_texts()]
 
 
 # --- residuals -----------------------------------------------------------------------------------
@@ -264,6 +265,34 @@ def test_losses_by_stage_with_rejected_steps():
     axis = plot.learning_curve(fit)
     assert axis.get_yscale() == "linear"
     assert "step rejected" not in texts(axis)
+
+
+def test_losses_and_residuals_that_are_no_numbers_are_counted():
+    fit = made()
+    fit.history["loss"][3] = np.inf
+    axis = plot.learning_curve(fit)
+    (top,) = [x for x in axis.lines if x.get_marker() == "x" and len(x.get_xdata())]
+    np.testing.assert_array_equal(top.get_xydata(), [[4, 0.985]])
+    assert top.get_transform() == axis.get_xaxis_transform()
+    assert texts(axis)[-1] == "1 of 5 losses are no numbers (at the top)"
+    assert not any("no numbers" in text for text in texts(plot.learning_curve(made())))
+    assert plot.fit_residuals(made())[-1].get_xlabel() == "count\n1 of 120\nno number"
+    whole = made()
+    whole.whitened[0][3, 0] = 0.5
+    assert plot.fit_residuals(whole)[-1].get_xlabel() == "count"
+
+
+def test_legends_stay_within_the_axes_that_are_given():
+    for draw in (
+        lambda ax: plot.fit_against_data(made(), ax=ax),
+        lambda ax: plot.learning_curve(made(), ax=ax),
+        lambda ax: plot.fit_residuals(made(), axes=[ax, plt.figure().subplots()])[0],
+    ):
+        axis = draw(plt.subplots(layout="constrained", figsize=(6, 4))[1])
+        axis.figure.canvas.draw()
+        inside, box = axis.get_legend().get_window_extent(), axis.get_window_extent()
+        assert box.x0 <= inside.x0 < inside.x1 <= box.x1
+        assert box.y0 <= inside.y0 < inside.y1 <= box.y1
 
 
 def test_pictures_of_ones_own(tmp_path):

@@ -13,6 +13,7 @@ import matplotlib.animation
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.colors import to_hex, to_rgb
 from PIL import Image
 
@@ -213,14 +214,61 @@ def test_every_picture_draws_on_the_axes_it_is_given_and_returns_them(single):
         plt.close("all")
 
 
-def test_every_public_picture_takes_axes():
-    public = {
-        name: f for name, f in vars(plot).items()
+def public_pictures():
+    """Names of the functions that draw on axes."""
+    return {
+        name for name, f in vars(plot).items()
         if inspect.isfunction(f) and name not in ("save", "style", "animate")
     }  # fmt: skip
-    assert len(public) == 24
-    for name, function in public.items():
-        assert {"ax", "axes"} & set(inspect.signature(function).parameters), name
+
+
+def test_every_public_picture_takes_axes():
+    assert len(public_pictures()) == 24
+    for name in public_pictures():
+        assert {"ax", "axes"} & set(inspect.signature(getattr(plot, name)).parameters), name
+
+
+def test_every_public_picture_refuses_what_are_no_axes(single):
+    """A `TypeError` before anything is drawn, from all of them."""
+    t = np.arange(1.0, 6.0)
+    data = xr.DataArray(t, dims="x", coords={"x": t}, name="drift", attrs={
+        "flag_values": [0, 1, 2, 3, 4, 5], "flag_meanings": "successful a b c d e"
+    })  # fmt: skip
+    fit = types.SimpleNamespace(
+        whitened=[t[:, None]], ts=[t], chi2=1.0, degrees_of_freedom=3, has_errors=True,
+        observed=[t], predicted=[t], errors=[t], names=["a"], x=[1.0], covariance=[[1.0]],
+        history={"stage": 0 * t, "loss": t, "accepted": t > 0, "horizon": t},
+    )  # fmt: skip
+    order = types.SimpleNamespace(limit=1.0)
+    surface = types.SimpleNamespace(
+        epsilons=t, hs=t, drifts=np.ones((5, 5)), used=np.ones((5, 5), bool), slopes=t,
+        intervals=np.stack([t, t], 1), orders=[order] * 5,
+    )  # fmt: skip
+    pictures = single_pictures(single) | {
+        "balance": lambda ax: plot.balance(t, t, {"a": t}, ax=ax),
+        "changes": lambda ax: plot.changes(t, {"a": t}, "t", "", ax=ax),
+        "drift_surface": lambda ax: plot.drift_surface(surface, ax=ax),
+        "sweep_map": lambda ax: plot.sweep_map(data, ax=ax),
+        "slope_map": lambda ax: plot.slope_map(data, "x", x="x", ax=ax),
+        "failure_map": lambda ax: plot.failure_map(data.astype(int), ax=ax),
+        "fit_residuals": lambda ax: plot.fit_residuals(fit, axes=ax),
+        "fit_corner": lambda ax: plot.fit_corner(fit, axes=ax),
+        "fit_against_data": lambda ax: plot.fit_against_data(fit, ax=ax),
+        "learning_curve": lambda ax: plot.learning_curve(fit, ax=ax),
+        "planet_orbits": lambda ax: plot.planet_orbits(np.ones((4, 5, 3)), list("abcde"), ax=ax),
+        "ephemeris_comparison": lambda ax: plot.ephemeris_comparison(
+            t, np.ones((5, 1)), ["a"], t, 1.0, 0.0, ax=ax
+        ),
+    }
+    assert set(pictures) == public_pictures()
+    for name, draw in pictures.items():
+        before = plt.get_fignums()
+        for nothing in (3, "axes", [3]):
+            with pytest.raises(TypeError, match="must be the matplotlib Axes"):
+                draw(nothing)
+        assert plt.get_fignums() == before, name
+        draw(None)  # what it is given else is right
+        plt.close("all")
 
 
 def test_pictures_of_several_panels_take_as_many_axes():
@@ -330,7 +378,8 @@ def test_level_lines_are_those_of_the_hamiltonian_at_the_first_start():
 
     axis = plot.phase_portrait(arrays(n=2), dof=0, hamiltonian=H, levels=[0.7, 0.9])
     (contours,) = axis.collections
-    assert not contours.get_label().startswith("never")
+    np.testing.assert_array_equal(contours.levels, [0.7, 0.9])
+    assert contours.get_zorder() < min(line.get_zorder() for line in axis.lines)
     for level, path in zip([0.7, 0.9], contours.get_paths(), strict=True):
         radii = np.hypot(*path.vertices.T)
         # The other degree of freedom is at (1, 0), its energy ½.
@@ -564,7 +613,7 @@ def test_the_balance_is_a_stack_whose_ends_add_up_to_the_drift():
     assert len({c.get_hatch() for c in top.collections}) == 3
     assert top.get_ylabel() == "rate of change [J/s]"
     whole, _ = plot.balance(t, drift, causes, cumulative=True)
-    np.testing.assert_allclose(whole.lines[0].get_ydata()[-1], drift.sum() / 40)
+    np.testing.assert_allclose(whole.lines[0].get_ydata()[-1], drift[:-1].sum() / 40)
     found = types.SimpleNamespace(
         ts=t, drift=drift, symmetry=causes["a"], work=causes["b"], lattice=causes["c"]
     )
@@ -574,6 +623,69 @@ def test_the_balance_is_a_stack_whose_ends_add_up_to_the_drift():
         plot.balance(t, drift, {"a": np.ones(3)})
     with pytest.raises(TypeError, match="noether_balance"):
         plot.balance(t, drift)
+
+
+def test_what_has_come_together_begins_at_0_and_knows_uneven_steps():
+    """A rate that is the slope of t² over each step brings t² itself, whatever the mesh."""
+    one = plot.balance(np.arange(5.0), np.ones(5), {"a": np.ones(5)}, cumulative=True)[0]
+    np.testing.assert_array_equal(one.lines[0].get_ydata(), np.arange(5.0))
+    t = np.array([0.0, 0.1, 0.4, 1.0, 1.1, 3.0])
+    rate = np.append(np.diff(t**2) / np.diff(t), 1e9)  # of a last step without an end
+    top, bottom = plot.balance(t, rate, {"a": rate}, cumulative=True)
+    np.testing.assert_allclose(top.lines[0].get_ydata(), t**2, atol=1e-15)
+    np.testing.assert_array_equal(bottom.lines[0].get_ydata(), 0)
+    upper = top.collections[0].get_paths()[0].vertices
+    np.testing.assert_allclose(upper[:, 1].max(), 9)
+
+
+def test_indicators_of_runs_backward_stand_at_the_time_since_the_start():
+    t = -np.geomspace(1, 1e3, 40)
+    axis = plot.indicator(np.r_[0, t], 3 / np.abs(t), "lyapunov")
+    np.testing.assert_allclose(lines(axis)[0], [-t, -3 / t])
+    assert legend(axis) == ["slope −1"]
+    assert axis.get_xlabel() == "time since the start |t − t$_0$|"
+    megno = plot.indicator(t, 2 + 0 * t, "megno")
+    np.testing.assert_array_equal(lines(megno)[0], [-t, 2 + 0 * t])
+    megno.figure.canvas.draw()
+    later = plot.indicator(np.r_[5, 5 + t], 2 + 0 * t, "megno")
+    np.testing.assert_allclose(lines(later)[0][0], -t)
+    given = plot.indicator(5 + t, 2 + 0 * t, "megno", t0=5.0)
+    np.testing.assert_allclose(lines(given)[0][0], -t)
+    assert plot.indicator(-t, 2 + 0 * t, "megno").get_xlabel() == "time t"
+
+
+def test_indicators_count_what_has_no_place_each_by_its_reason():
+    t = np.arange(6.0)
+    axis = plot.indicator(t, np.array([1.0, 2, np.nan, 0, -1, 3]), "lyapunov")
+    assert legend(axis)[-3:] == [
+        "1 values are no numbers",
+        "1 values at the start, t = t$_0$",
+        "2 values are not positive",
+    ]
+    linear = plot.indicator(t, np.array([1.0, 2, np.nan, 0, -1, 3]))
+    assert legend(linear) == ["1 values are no numbers"]
+
+
+def test_what_has_no_place_on_a_logarithmic_axis_is_counted():
+    t = np.arange(9.0)
+    part = np.where(t > 5, np.nan, 1e-9)
+    axis = plot.conserved(t, {"a": 0 * t, "b": part, "c": 0 * t + 1e-8}, "t", "")
+    assert legend(axis) == [
+        "a", "b", "c", "a: 8 of 8 are exactly 0", "b: 3 of 8 are no numbers"
+    ]  # fmt: skip
+    axes = plot.changes(t, {"a": np.nan * t, "b": part, "c": t}, "t", "")
+    said = [[text.get_text() for text in axis.texts] for axis in axes]
+    assert said == [["9 of 9 are no numbers"], ["3 of 9 are no numbers"], []]
+    order = types.SimpleNamespace(
+        epsilons=np.array([0.1, 0.2, 0.4, 0.8]), drifts=np.array([0.0, 0.1, np.nan, 0.3]),
+        used=np.array([False, True, False, True]), slope=1.0, interval=(0.9, 1.1), floor=0.0,
+    )  # fmt: skip
+    axis = plot.drift_orders({"a": order})
+    marks = {x.get_marker(): list(x.get_xdata()) for x in axis.lines if x.get_marker() in "xv"}
+    assert marks == {"x": [0.4], "v": [0.1, pytest.approx(0.07)]}
+    assert legend(axis)[-2:] == ["1 of 5 drifts failed", "2 of 5 drifts are exactly 0"]
+    order.drifts, order.floor = np.array([0.05, 0.1, 0.2, 0.3]), 1e-3
+    assert not any("drifts" in text for text in legend(plot.drift_orders({"a": order})))
 
 
 def test_indicators_stand_beside_what_regular_motion_shows():
@@ -636,6 +748,67 @@ def test_a_section_tells_what_is_not_there():
     assert [text.get_text() for text in empty.texts] == ["no orbit crossed the section"]
     assert not list(empty.collections)
     assert not list(plot.section(made).texts)
+
+
+def statuses(made, *names):
+    """The same as a `PoincareSection` whose orbits came through so."""
+    made.status = np.asarray(names)
+    return made
+
+
+def test_a_section_names_how_orbits_ended_and_failed_ones_do_not_set_its_limits():
+    made = statuses(crossings([5, 2, 0, 4, 3]), "successful", "too_few_crossings", "never_crossed",
+                    "stopped", "failed")  # fmt: skip
+    calm = plot.section(made).axis()
+    made.qs[4, 2], made.ps[4, 2] = 1e9, 1e12
+    for kwargs in ({}, {"colour": np.arange(5.0)}):
+        axis = plot.section(made, **kwargs)
+        assert legend(axis) == [
+            "1 of 5 orbits crossed less often than the 5 times asked for",
+            "1 of 5 orbits stopped",
+            "1 of 5 orbits failed",
+            "1 of 5 orbits did not cross",
+            "1 of 3 crossings of failed orbits lie outside the picture",
+        ]
+        assert np.abs(axis.axis()).max() < 10
+        assert sum(len(c.get_offsets()) for c in axis.collections) == 14  # drawn all the same
+        made.status[4] = "successful"
+        assert np.abs(plot.section(made, **kwargs).axis()).max() > 1e12
+        made.status[4] = "failed"
+    assert np.abs(calm).max() < 10
+    alone = plot.section(statuses(crossings([3]), "failed"))
+    assert legend(alone) == ["1 of 1 orbits failed"]
+    assert len(alone.collections[0].get_offsets()) == 3
+
+
+def test_a_bifurcation_names_how_runs_ended():
+    made = statuses(crossings([5, 3, 4], n=1), "successful", "failed", "too_few_crossings")
+    made.qs[1, 2] = -1e9
+    axis = plot.bifurcation([1.0, 2.0, 3.0], made, y="q")
+    assert legend(axis) == [
+        "1 of 3 orbits crossed less often than the 5 times asked for",
+        "1 of 3 orbits failed",
+        "1 of 3 crossings of failed orbits lie outside the picture",
+    ]
+    assert axis.get_ylim()[0] > -10
+    made.status[1] = "successful"
+    assert plot.bifurcation([1.0, 2.0, 3.0], made, y="q").get_ylim()[0] < -1e8
+
+
+def test_a_section_of_runs_that_failed_says_why(batch):
+    assert "1 of 3 orbits failed: not finite" in legend(plot.section(batch))
+    kepler = systems.kepler()
+    q = jnp.array([[1.2, 0.0], [0.0, 0.0]])
+    found = dvi.poincare_section(
+        kepler.system, q, jnp.broadcast_to(jnp.asarray(kepler.p0), (2, 2)),
+        lambda t, q, p, args: q[0], h=0.1, num_steps=100, crossings=40, args=kepler.args,
+        throw=False,
+    )  # fmt: skip
+    assert list(found.status) == ["too_few_crossings", "failed"]
+    assert legend(plot.section(found)) == [
+        "1 of 2 orbits crossed less often than the 40 times asked for",
+        "1 of 2 orbits failed: not finite",
+    ]
 
 
 def test_sections_are_coloured_by_orbit_or_by_value():
@@ -813,6 +986,32 @@ def test_a_plane_of_starts_is_coloured_by_diffusion():
     assert legend(axis) == ["1 of 12 starts without a value"]
     with pytest.raises(ValueError, match="must rise"):
         plot.frequency_map(x[::-1], y, D)
+    plain = plot.frequency_map(x, y, D)
+    assert (plain.get_xlabel(), plain.get_ylabel()) == ("x", "y")
+    with pytest.raises(ValueError, match=r"line among frequencies.*x and y of shape \(4, 3\)"):
+        plot.frequency_map(x, y, D, resonances=[(1, -1)])
+    X, Y = np.meshgrid(x, y, indexing="ij")
+    assert plot.frequency_map(X, Y, D, resonances=[(1, -1)]).get_xlabel() == "ω$_1$"
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "k", "edge"),
+    [
+        ((1, 3), (0.5, 2), (1, -1), "top"),
+        ((1, 2), (0.5, 3), (1, -1), "right"),
+        ((-2, 0), (1, 3), (1, 1), "left"),  # and at the bottom
+    ],
+)
+def test_a_resonance_has_its_name_where_its_line_leaves_the_picture(x, y, k, edge):
+    axis = plot.frequency_map(np.asarray(x), np.asarray(y), resonances=[k])
+    (name,) = axis.texts
+    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    at_x, at_y = name.xy
+    assert k[0] * at_x + k[1] * at_y == pytest.approx(0, abs=1e-12)
+    found, wanted = {"top": (at_y, high), "right": (at_x, right), "left": (at_x, left)}[edge]
+    assert found == pytest.approx(wanted)
+    assert left <= at_x <= right
+    assert low <= at_y <= high
 
 
 # --- films --------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import dvi_jax as dvi
 from dvi_jax import plot
 from dvi_jax._results import STATUS_NAMES
 from dvi_jax.plot import blocks
+from dvi_jax.plot.house import SHADES
 from dvi_jax.sweep import lazy
 
 mpl.use("Agg")
@@ -182,6 +183,24 @@ def test_a_picture_of_ones_own(tmp_path):
 
 
 # --- where there is no number ------------------------------------------------------------------
+
+
+def test_legends_stay_within_the_axes_that_are_given():
+    data = with_status()
+    for draw in (plot.sweep_map, lambda x, ax: plot.failure_map(data, ax=ax)):
+        axis = draw(data.drift, ax=plt.subplots(layout="constrained")[1])
+        axis.figure.canvas.draw()
+        inside, box = axis.get_legend().get_window_extent(), axis.get_window_extent()
+        assert box.x0 <= inside.x0 < inside.x1 <= box.x1
+        assert box.y0 <= inside.y0 < inside.y1 <= box.y1
+
+
+def test_maps_have_the_colours_that_are_measured():
+    data = with_status()
+    for axis in (plot.sweep_map(data.drift), plot.slope_map(data.drift, x="epsilon", y="x"),
+                 plot.failure_map(data, reduce="fraction")):  # fmt: skip
+        top = to_hex(axis.collections[0].cmap(1.0))
+        assert top == to_hex(SHADES(1.0)) != to_hex(plt.get_cmap("viridis")(1.0))
 
 
 def test_cells_without_a_number_are_grey_and_counted():

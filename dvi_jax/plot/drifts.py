@@ -5,10 +5,25 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import LogNorm
+from matplotlib.colors import ListedColormap, LogNorm
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from ..invariants import DriftOrder, DriftSurface
-from .house import COLOURS, MARKERS, canvas, cell_edges, in_style, legend, named, stack
+from .house import (
+    COLOURS,
+    HATCH,
+    MARKERS,
+    PALE,
+    SHADES,
+    ZERO,
+    canvas,
+    cell_edges,
+    in_style,
+    legend,
+    named,
+    stack,
+)
 
 
 @in_style
@@ -27,8 +42,9 @@ def balance(
     - `ts`: a `dvi.Balance`, as `dvi.noether_balance` returns it; or start of each step, shape (S,),
       with `drift`: rate of change, shape (S,), and `causes`: label → its share of the rate, shape
       (S,).
-    - `cumulative`: what has come together since the start, ∫ rate dt (each rate over its step), in
-      place of rates.
+    - `cumulative`: what has come together since the first of `ts`, Σ rate · step, in place of
+      rates: 0 there, and at each later time what the steps before it brought. The last rate has no
+      part in it, as nothing says when its step ends.
     - `unit`: of the rates, of what has come together with `cumulative`. `ax`: two `Axes`.
 
     Areas stand upon one another: what raises the invariant upward from 0, what lowers it downward.
@@ -40,9 +56,7 @@ def balance(
     """
     t, rate, shares = _of_balance(ts, drift, causes)
     if cumulative:
-        steps = np.diff(t, append=2 * t[-1] - t[-2] if len(t) > 1 else t[-1] + 1)
-        rate = np.cumsum(rate * steps)
-        shares = {name: np.cumsum(v * steps) for name, v in shares.items()}
+        rate, shares = _summed(t, rate), {name: _summed(t, v) for name, v in shares.items()}
     (top, bottom), new = stack(
         ax, 2, "the stack and what is left", (6.4, 4.6), sharex=True,
         gridspec_kw={"height_ratios": (3, 1)},
@@ -66,6 +80,11 @@ def balance(
     legend(top, new)
     top.figure.align_ylabels([top, bottom])
     return np.asarray([top, bottom])
+
+
+def _summed(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Σ rate · step over the steps before each time."""
+    return np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(t))])
 
 
 _HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++++")
@@ -104,8 +123,9 @@ def drift_orders(
     - `promised`: z + 1 for each result in turn (None: no promise), or one for all; a grey line
       of that slope goes through the first point of the fit.
 
-    Hollow points are excluded from the fit; bars at the left end mark the drift at ε = 0. `ax`:
-    where to draw.
+    Hollow points are excluded from the fit; bars at the left end mark the drift at ε = 0. Drifts
+    that failed stand as crosses at the top, those exactly 0 as triangles at the bottom, and the
+    legend counts them. `ax`: where to draw.
 
     **Returns** the `Axes`.
     """
@@ -115,16 +135,28 @@ def drift_orders(
     axis, new = canvas(ax, (6.4, 4.8))
     left = min(order.epsilons.min() for order in results.values())
     looks = zip(results.items(), slopes, itertools.cycle(COLOURS), MARKERS * 9, strict=False)
+    failed = nought = total = 0
     for (label, order), slope, colour, marker in looks:
-        x, y, used = order.epsilons, order.drifts, order.used
+        x, y, used = order.epsilons, np.asarray(order.drifts), order.used
+        there = np.isfinite(y) & (y > 0)
         text = _slope_text(order)
         if slope is not None:
             text += f", promised {slope:g}"
         axis.loglog(x[used], y[used], marker, color=colour)
-        axis.loglog(x[~used], y[~used], marker, color=colour, markerfacecolor="white")
+        out = there & ~used
+        axis.loglog(x[out], y[out], marker, color=colour, markerfacecolor="white")
         face = colour if used.any() else "white"
         axis.plot([], [], marker, color=colour, markerfacecolor=face, label=f"{label}: {text}")
-        axis.plot(left * 0.7, order.floor, "_", color=colour, markersize=12, markeredgewidth=2)
+        if np.isfinite(order.floor) and order.floor > 0:
+            axis.plot(left * 0.7, order.floor, "_", color=colour, markersize=12, markeredgewidth=2)
+        # Without a place on this axis: with that at ε = 0, where the bar would stand.
+        xs, ys = np.append(x, left * 0.7), np.append(y, order.floor)
+        edge = {"transform": axis.get_xaxis_transform(), "color": colour, "linestyle": "none"}
+        for here, at, mark in ((~np.isfinite(ys), 0.985, "x"), (ys == 0, 0.015, "v")):
+            if here.any():
+                axis.plot(xs[here], np.full(here.sum(), at), mark, markersize=6, **edge)
+        failed, nought = failed + int(np.sum(~np.isfinite(ys))), nought + int(np.sum(ys == 0))
+        total += len(ys)
         if slope is not None and used.any():
             first = np.argmin(np.where(used, x, np.inf))
             ends = np.array([x[first], x.max()])
@@ -134,8 +166,13 @@ def drift_orders(
         axis.plot([], [], color="#888888", linewidth=1, linestyle="--", label="slope promised")
     axis.plot([], [], "o", color="#444444", markerfacecolor="white", label="excluded from the fit")
     axis.plot([], [], "_", color="#444444", markersize=12, markeredgewidth=2, label="at ε = 0")
-    axis.set(xlabel="ε", ylabel="largest drift", title=title)
-    legend(axis, new)
+    axis.set(xscale="log", yscale="log", xlabel="ε", ylabel="largest drift", title=title)
+    handles = axis.get_legend_handles_labels()[0]
+    for count, mark, what in ((failed, "x", "failed"), (nought, "v", "are exactly 0")):
+        if count:
+            handles.append(Line2D([], [], color=PALE, marker=mark, linestyle="none",
+                                  label=f"{count} of {total} drifts {what}"))  # fmt: skip
+    legend(axis, new, handles)
     return axis
 
 
@@ -149,30 +186,39 @@ def drift_surface(
     """Drifts over ε and h (`drift_surface`), and their orders in ε at each h.
 
     - `promised`: z + 1. Dots mark what is excluded from the fits; bars are 95 % intervals.
+
+    A drift exactly 0 has no place on a logarithmic scale: it is black. One that failed is hatched;
+    the legend counts both.
+
     - `ax`: two `Axes`, of the drifts and of their orders.
 
     **Returns** the `Axes`, shape (2,).
     """
-    (left, right), _ = stack(
+    (left, right), new = stack(
         ax, 2, "the drifts and their orders", (9.6, 4.2), ncols=2,
         gridspec_kw={"width_ratios": (5, 4)},
     )  # fmt: skip
-    drifts = np.ma.masked_invalid(surface.drifts)
-    norm = LogNorm() if drifts.count() and drifts.min() > 0 else None
-    image = left.pcolormesh(
-        cell_edges(surface.epsilons), cell_edges(surface.hs), drifts.T, norm=norm, cmap="cividis",
-        rasterized=True,
-    )  # fmt: skip
+    drifts = np.asarray(surface.drifts)
+    nought, failed = drifts == 0, ~np.isfinite(drifts)
+    shown = np.ma.masked_where(nought | failed, drifts)
+    edges = cell_edges(surface.epsilons, log=True), cell_edges(surface.hs, log=True)
+    norm = LogNorm() if shown.count() else None
+    image = left.pcolormesh(*edges, shown.T, norm=norm, cmap=SHADES, rasterized=True)
     left.figure.colorbar(image, ax=left, label="largest drift")
     left.grid(False)
-    left.set_facecolor("#d0d0d0")
-    i, j = np.nonzero(~surface.used & np.isfinite(surface.drifts))
+    left.patch.set(**HATCH)
+    i, j = np.nonzero(~surface.used & ~failed)
     left.plot(
         surface.epsilons[i], surface.hs[j], "o", color="black", markerfacecolor="white",
-        markersize=4, markeredgewidth=0.8, label="excluded from the fit",
+        markersize=4, markeredgewidth=0.8, linestyle="none", label="excluded from the fit",
     )  # fmt: skip
-    left.plot([], [], "s", color="#d0d0d0", markersize=8, label="failed")
-    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    handles = left.get_legend_handles_labels()[0] if len(i) else []
+    if nought.any():
+        black = np.ma.masked_where(~nought, np.ones(drifts.shape))
+        left.pcolormesh(*edges, black.T, cmap=ListedColormap([ZERO]), rasterized=True)
+        handles.append(Patch(color=ZERO, label=f"{nought.sum()} of {drifts.size} exactly 0"))
+    if failed.any():
+        handles.append(Patch(label=f"{failed.sum()} of {drifts.size} failed", **HATCH))
     left.set(xscale="log", yscale="log", xlabel="ε", ylabel="step size h", title=title)
     measured = np.isfinite(surface.slopes)
     h, slopes = surface.hs[measured], surface.slopes[measured]
@@ -187,15 +233,24 @@ def drift_surface(
     )
     if promised is not None:
         right.axhline(promised, color="#888888", linewidth=1, linestyle="--", label="promised")
-        right.set_ylim(min([promised - 0.1, *(low - 0.05)]), max([promised + 0.1, *(high + 0.05)]))
+        known = limits[np.isfinite(limits)]
+        right.set_ylim(
+            min([promised - 0.1, *(low - 0.05), *(known - 0.05)]),
+            max([promised + 0.1, *(high + 0.05), *(known + 0.05)]),
+        )
     for value in surface.hs[~measured]:
         right.annotate(
             "no order", (value, 0.02), xycoords=("data", "axes fraction"), rotation=90,
             ha="center", va="bottom", fontsize=8, color="#555555",
         )  # fmt: skip
     right.set(xscale="log", xlabel="step size h", ylabel="order in ε", title="Order in ε")
-    right.set_xlim(*cell_edges(surface.hs)[[0, -1]])
-    right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, columnspacing=1)
+    right.set_xlim(*edges[1][[0, -1]])
+    orders = right.get_legend_handles_labels()[0]
+    if new:
+        legend(left, new, handles + orders)
+    else:
+        legend(left, new, handles)
+        legend(right, new, orders)
     return np.asarray([left, right])
 
 

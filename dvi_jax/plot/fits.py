@@ -10,15 +10,13 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.patches import Ellipse
 
-from .house import COLOURS, MARKERS, in_style
+from .house import COLOURS, GREY, MARKERS, canvas, given, in_style, legend
 
 _PANELS = 6
 """Arcs up to which each has a panel of its own."""
 
 _PARAMETERS = 12
 """Parameters up to which a corner plot is drawn unasked."""
-
-_GREY = "#777777"
 
 _LINES = ((1, "--"), (3, ":"))
 """Standard errors that are marked, and how."""
@@ -41,7 +39,8 @@ def fit_residuals(
       one. `component`: of the flattened values of one observation; None: all.
     - `axes`: where to draw: one `Axes` for each panel and one for the distribution.
 
-    Dashed lines stand at ±1, dotted ones at ±3 standard errors.
+    Dashed lines stand at ±1, dotted ones at ±3 standard errors. Residuals that are no numbers, such
+    as those of values that were not observed, are counted below the distribution.
 
     **Returns** the `Axes` of the panels and, last, of the distribution, shape (panels + 1,).
 
@@ -54,6 +53,7 @@ def fit_residuals(
     rows = {i: np.asarray(fit.whitened[i]) / (size or 1.0) for i in numbers}
     kept = _chosen(component, max(r.shape[1] for r in rows.values()), "component")
     panels = [[i] for i in numbers] if len(numbers) <= _PANELS else [numbers]
+    new = axes is None
     axes = _residual_axes(axes, len(panels))
     for axis, those in zip(axes, panels, strict=False):
         for i in those:
@@ -62,9 +62,12 @@ def fit_residuals(
             axis.set_title(f"arc {those[0]}", fontsize=9.5)
         _lines(axis)
     every = np.concatenate([_only(r, kept).ravel() for r in rows.values()])
+    total = every.size
     every = every[np.isfinite(every)]
     furthest = 1.08 * max(3.5, np.abs(every).max(initial=0.0))
     _draw_distribution(axes[-1], every, furthest)
+    if lost := total - every.size:
+        axes[-1].set_xlabel(f"count\n{lost} of {total}\nno number")
     unit = "standard errors" if fit.has_errors else f"s = {size:.3g}"
     label = f"observed − predicted\n[{unit}]"
     for axis in axes[:-1]:
@@ -73,14 +76,14 @@ def fit_residuals(
             axis.set_yticks([-3, -1, 1, 3])
     axes[(len(panels) - 1) // 2].set_ylabel(label)
     axes[len(panels) - 1].set_xlabel("time t")
-    _legend_of_components(axes[0], kept, any(len(p) > 1 for p in panels))
+    _legend_of_components(axes[0], kept, any(len(p) > 1 for p in panels), new)
     return np.asarray(axes)
 
 
 def _residual_axes(axes: Sequence[Any] | None, count: int) -> list[Any]:
     """`axes` or those of a new figure, the panels shared in time and size."""
     if axes is not None:
-        return _given(axes, count + 1, "one for each panel and one for the distribution")
+        return given(axes, count + 1, "one for each panel and one for the distribution")
     figure = plt.figure(figsize=(7.4, 2.6 + 0.9 * (count - 1) + 0.6), layout="constrained")
     grid = figure.add_gridspec(count, 2, width_ratios=(5, 1))
     first = figure.add_subplot(grid[0, 0])
@@ -104,10 +107,10 @@ def _draw_residuals(axis: Any, ts: Any, r: np.ndarray, kept: list[int], arc: int
 
 
 def _lines(axis: Any) -> None:
-    axis.axhline(0, color=_GREY, linewidth=0.8)
+    axis.axhline(0, color=GREY, linewidth=0.8)
     for at, dash in _LINES:
         for sign in (-1, 1):
-            axis.axhline(sign * at, color=_GREY, linewidth=0.8, linestyle=dash)
+            axis.axhline(sign * at, color=GREY, linewidth=0.8, linestyle=dash)
 
 
 def _draw_distribution(axis: Any, r: np.ndarray, furthest: float) -> None:
@@ -125,7 +128,7 @@ def _draw_distribution(axis: Any, r: np.ndarray, furthest: float) -> None:
     axis.set_xlabel("count")
 
 
-def _legend_of_components(axis: Any, kept: list[int], shared: bool) -> None:
+def _legend_of_components(axis: Any, kept: list[int], shared: bool, new: bool) -> None:
     if shared or not 1 < len(kept) <= len(COLOURS):
         return
     handles = [
@@ -133,6 +136,9 @@ def _legend_of_components(axis: Any, kept: list[int], shared: bool) -> None:
                   markeredgewidth=0, label=f"component {k}")[0]
         for k in kept
     ]  # fmt: skip
+    if not new:
+        legend(axis, new, handles)
+        return
     axis.legend(
         handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(len(kept), 4),
         handletextpad=0.1, borderaxespad=0.1, columnspacing=1.0,
@@ -282,6 +288,8 @@ def _scale(name: str, value: float, sigma: float) -> _Scale:
 def _corner_axes(axes: Any, n: int) -> np.ndarray:
     if axes is not None:
         found = np.asarray(axes, object)
+        for axis in found.flat:
+            canvas(axis)
         if found.shape != (n, n):
             raise ValueError(
                 f"axes must have shape {(n, n)} for {n} parameters, not {found.shape}."
@@ -302,7 +310,7 @@ def _draw_marginal(axis: Any, scale: _Scale, draws: np.ndarray | None) -> None:
     density = np.exp(-(((x - centre) / sigma) ** 2) / 2) / (sigma * np.sqrt(2 * np.pi))
     axis.plot(x, density, color=COLOURS[0])
     for sign in (-1, 1):
-        axis.axvline(centre + sign * sigma, color=_GREY, linewidth=0.8, linestyle="--")
+        axis.axvline(centre + sign * sigma, color=GREY, linewidth=0.8, linestyle="--")
     axis.set_ylim(bottom=0)
 
 
@@ -420,8 +428,7 @@ def fit_against_data(
     found = math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
     errors = np.asarray(fit.errors[arc]).reshape(seen.shape) if fit.has_errors else found
     errors = np.broadcast_to(errors, seen.shape)
-    if ax is None:
-        ax = plt.subplots(figsize=(7.0, 4.0), layout="constrained")[1]
+    ax, new = canvas(ax, (7.0, 4.0))
     order = np.argsort(fine[0])
     for k in kept:
         colour = COLOURS[k % len(COLOURS)]
@@ -436,7 +443,7 @@ def fit_against_data(
         )  # fmt: skip
     title = f"arc {arc}" if len(fit.ts) > 1 else ""
     ax.set(xlabel="time t", ylabel="observed value", title=title)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    legend(ax, new)
     return ax
 
 
@@ -460,7 +467,8 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
     - `fit`: a `FitResult`, with its `history`. `ax`: where to draw; None: a new figure.
 
     A stage looks at what was observed up to its horizon; losses of different stages are not of the
-    same data. The axis is logarithmic unless a loss is not positive.
+    same data. The axis is logarithmic unless a loss is not positive. A loss that is no number has a
+    cross at the top, and the legend counts them.
 
     **Returns** the `Axes`.
 
@@ -472,8 +480,7 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
     )
     if loss.size == 0:
         raise ValueError("the fit took no step: there is no history to draw.")
-    if ax is None:
-        ax = plt.subplots(layout="constrained")[1]
+    ax, new = canvas(ax)
     steps = np.arange(1, len(loss) + 1)
     accepted = accepted.astype(bool)
     looks = zip(np.unique(stage), itertools.cycle(COLOURS[:-1]), itertools.cycle(MARKERS))
@@ -488,17 +495,22 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
             label=f"stage {int(number) + 1}: {what}",
         )  # fmt: skip
         if number > stage[0]:
-            ax.axvline(steps[here][0] - 0.5, color=_GREY, linewidth=0.8, linestyle=":")
+            ax.axvline(steps[here][0] - 0.5, color=GREY, linewidth=0.8, linestyle=":")
+    rejected = {"color": "#000000", "markersize": 6, "markeredgewidth": 1.3, "linestyle": "none"}
+    finite = np.isfinite(loss)
     if not accepted.all():
+        here = ~accepted & finite
+        ax.plot(steps[here], loss[here], "x", label="step rejected", zorder=4, **rejected)
+    if not finite.all():
+        where = {"transform": ax.get_xaxis_transform(), "zorder": 4, **rejected}
         ax.plot(
-            steps[~accepted], loss[~accepted], "x", color="#000000", markersize=6,
-            markeredgewidth=1.3, label="step rejected", zorder=4,
+            steps[~finite], np.full(np.sum(~finite), 0.985), "x", markerfacecolor="none",
+            label=f"{np.sum(~finite)} of {len(loss)} losses are no numbers (at the top)", **where,
         )  # fmt: skip
-    positive = loss[np.isfinite(loss)]
-    ax.set_yscale("log" if positive.size and positive.min() > 0 else "linear")
+    ax.set_yscale("log" if finite.any() and loss[finite].min() > 0 else "linear")
     ax.set(xlabel="step", ylabel="loss")
     ax.xaxis.get_major_locator().set_params(integer=True)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    legend(ax, new)
     return ax
 
 
@@ -518,21 +530,14 @@ def _chosen(which: Any, count: int, called: str) -> list[int]:
     """Numbers below `count`: all for None."""
     if which is None:
         return list(range(count))
-    given = [which] if np.ndim(which) == 0 else list(which)
-    for i in given:
+    chosen = [which] if np.ndim(which) == 0 else list(which)
+    for i in chosen:
         is_whole = isinstance(i, int | np.integer) and not isinstance(i, bool)
         if not is_whole or not 0 <= i < count:
             raise ValueError(f"there is no {called} {i!r}: they are numbered 0 to {count - 1}.")
-    if not given:
+    if not chosen:
         raise ValueError(f"choose at least one {called}.")
-    return [int(i) for i in given]
-
-
-def _given(axes: Sequence[Any], count: int, what: str) -> list[Any]:
-    found = list(np.ravel(np.asarray(axes, object)))
-    if len(found) != count:
-        raise ValueError(f"axes must be {count}, {what}, got {len(found)}.")
-    return found
+    return [int(i) for i in chosen]
 
 
 def _only(r: np.ndarray, kept: list[int]) -> np.ndarray:

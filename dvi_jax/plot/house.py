@@ -14,6 +14,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib import colormaps
 from matplotlib.colors import ListedColormap
+from matplotlib.lines import Line2D
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -30,6 +31,14 @@ SHADES = ListedColormap(colormaps["viridis"](np.linspace(0, 0.88, 256)), "shades
 
 GREY, PALE = "#777777", "#b8b8b8"
 """Of what is no datum: lines to compare with; what has no value."""
+
+NO_NUMBER, ZERO = "#d0d0d0", "#000000"
+"""Of cells that have no place on the scale of colours; the first is hatched as well."""
+
+HATCH: dict[str, Any] = {
+    "facecolor": NO_NUMBER, "edgecolor": "#8c8c8c", "hatch": "/////", "linewidth": 0
+}  # fmt: skip
+"""Of cells without a number."""
 
 _STYLE: Any = {
     "figure.figsize": (6.4, 4.0),
@@ -168,20 +177,24 @@ def stack(
 
 def given(axes: Any, count: int, what: str) -> list[Any]:
     """The axes as a list, refused unless there are `count`."""
-    found = list(np.ravel(np.asarray(axes, object)))
+    found = [canvas(axis)[0] for axis in np.ravel(np.asarray(axes, object))]
     if len(found) != count:
         raise ValueError(f"axes must be {count}, {what}, got {len(found)}.")
-    return [canvas(axis)[0] for axis in found]
+    return found
 
 
 def legend(axis: Any, new: bool, handles: Sequence[Any] | None = None) -> Any:
-    """A legend below a new figure in as many columns as fit, or within axes that were given."""
+    """A legend below a new figure in as many columns as fit, or within axes that were given.
+
+    Below given axes it would lie upon their names, or upon the axes beneath.
+    """
     if handles is None:
         handles = axis.get_legend_handles_labels()[0]
     if not handles:
         return None
     if not new:
-        return axis.legend(handles=handles, fontsize=8)
+        paper = {"frameon": True, "framealpha": 0.85, "edgecolor": "none"}
+        return axis.legend(handles=handles, fontsize=8, **paper)
     figure = _root(axis)
     if axis.name == "3d":  # whose names of axes would be in the way below
         return figure.legend(handles=handles, loc="upper right")
@@ -191,6 +204,11 @@ def legend(axis: Any, new: bool, handles: Sequence[Any] | None = None) -> Any:
     return figure.legend(
         handles=handles, loc="outside lower center", ncols=max(1, min(fits, len(handles)))
     )
+
+
+def note(text: str) -> Any:
+    """A line of a legend that is words alone."""
+    return Line2D([], [], linestyle="none", label=text)
 
 
 def signed(value: float, form: str = "g") -> str:
@@ -243,9 +261,13 @@ def envelope(x: np.ndarray, y: np.ndarray, most: int = 8000) -> tuple[np.ndarray
     return x[chosen], y[chosen]
 
 
-def cell_edges(centres: np.ndarray) -> np.ndarray:
-    """Edges of cells about `centres`, half way between them on a logarithmic axis."""
-    x = np.log(centres)
-    middle = (x[1:] + x[:-1]) / 2
-    first, last = (x[0] - middle[0], middle[-1] - x[-1]) if len(x) > 1 else (-0.3, -0.3)
-    return np.exp(np.concatenate([[x[0] + first], middle, [x[-1] - last]]))
+def cell_edges(centres: np.ndarray, log: bool = False) -> np.ndarray:
+    """Edges of cells about rising points, half way between them on the axis."""
+    if log and len(centres) > 1:
+        return np.exp(cell_edges(np.log(centres)))
+    if len(centres) == 1:
+        half = 0.5 * abs(centres[0]) or 0.5
+        return np.asarray([centres[0] - half, centres[0] + half])
+    middle = (centres[1:] + centres[:-1]) / 2
+    first, last = 2 * centres[0] - middle[0], 2 * centres[-1] - middle[-1]
+    return np.concatenate([[first], middle, [last]])

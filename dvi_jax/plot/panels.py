@@ -11,13 +11,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogFormatterMathtext, LogLocator
 
-from .house import COLOURS
+from .house import COLOURS, HATCH, NO_NUMBER, SHADES, ZERO, canvas
 from .places import Place, dim_of, find_place, label_of, names_of
 
-NO_NUMBER, NOT_COMPUTED, ZERO = "#d0d0d0", "#ffffff", "#000000"
-"""Of cells that have no place on the scale of colours; the first is hatched as well."""
+NOT_COMPUTED = "#ffffff"
+"""Of cells that are not computed; `NO_NUMBER` and `ZERO` are those of other pictures, too."""
 
-_HATCH = {"facecolor": NO_NUMBER, "edgecolor": "#8c8c8c", "hatch": "/////", "linewidth": 0}
 _MARKS: dict[str, Any] = {
     NO_NUMBER: {"marker": "x", "color": "#777777", "linestyle": "none"},
     ZERO: {"marker": "v", "color": ZERO, "linestyle": "none"},
@@ -176,7 +175,7 @@ def make_axes(grid: Grid, ax: Any, height: float | None = None) -> list[Any]:
     if ax is not None:
         if count > 1:
             raise ValueError("a facet has a figure of its own: leave out ax, or facet.")
-        return [ax]
+        return [canvas(ax)[0]]
     if count == 1:
         figure, axis = plt.subplots(layout="constrained")
         if height is not None:
@@ -240,7 +239,7 @@ class Scale(NamedTuple):
     """The colours of numbers: `log`, and how far the numbers go beyond the scale."""
 
     norm: Any
-    cmap: str
+    cmap: Any
     log: bool
     extend: str
 
@@ -275,12 +274,12 @@ def make_scale(values: Sequence[np.ndarray], log: bool | None, limits: Any) -> S
         extend = "neither"
     if log:
         wide = 1.0 if high > low else 2.0
-        return Scale(LogNorm(low / wide, high * wide), "viridis", True, extend)
+        return Scale(LogNorm(low / wide, high * wide), SHADES, True, extend)
     if limits is None and min(-low, high) > _BOTH_SIGNS * max(-low, high):
         return Scale(CenteredNorm(0, max(-low, high)), "PuOr_r", False, extend)
     if high == low:
         low, high = low - (abs(low) or 1) / 2, high + (abs(high) or 1) / 2
-    return Scale(Normalize(low, high), "viridis", False, extend)
+    return Scale(Normalize(low, high), SHADES, False, extend)
 
 
 def _checked_limits(limits: Any, log: bool) -> tuple[float, float]:
@@ -312,7 +311,7 @@ def draw_values(axis: Any, grid: Grid, values: np.ndarray, scale: Scale) -> Any:
         _rug(axis, grid.x.centres[~np.isfinite(values)], NO_NUMBER)
         return None
     frame(axis)
-    axis.patch.set(**_HATCH)
+    axis.patch.set(**HATCH)
     cmap = plt.get_cmap(scale.cmap)
     mesh = axis.pcolormesh(
         grid.x.edges, grid.y.edges, shown, norm=scale.norm, cmap=cmap, rasterized=True
@@ -358,24 +357,8 @@ def flag(colour: str, label: str, line: bool = False) -> Any:
     if line and colour in _MARKS:
         return Line2D([], [], label=label, **_MARKS[colour])
     if colour == NO_NUMBER:
-        return Patch(label=label, **_HATCH)
+        return Patch(label=label, **HATCH)
     return Patch(facecolor=colour, edgecolor="#8c8c8c", linewidth=0.6, label=label)
-
-
-def legend(axes: Sequence[Any], entries: Sequence[Any], ax: Any) -> None:
-    """Below the panels: of the figure if it is ours, else of the axes."""
-    if not entries:
-        return
-    if ax is None:
-        axes[0].figure.legend(
-            handles=entries,
-            loc="outside lower center",
-            ncols=min(len(entries), 2 if len(axes) < 3 else 3),
-        )
-    else:
-        ax.legend(
-            handles=entries, loc="upper center", bbox_to_anchor=(0.5, -0.14),
-        )  # fmt: skip
 
 
 def share(count: int, total: int) -> str:

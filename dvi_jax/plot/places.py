@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .blocks import Bins, make_bins
+from .house import cell_edges
 
 _GREEK = {"epsilon": "ε", "h": "step size h", "start": "number of the start", "t0": "t$_0$"}
 _MOST_NAMES = 12
@@ -57,7 +58,7 @@ def find_place(data: Any, name: str, pixels: int) -> Place:
     if not log and size > 3 and x[0] == 0 and is_log(x[1:]):
         log, zero = True, float(x[1] ** 2 / x[2])
         x = np.asarray([zero, *x[1:]])
-    edges = _edges(x, log)
+    edges = cell_edges(x, log)
     centres = x
     if len(bins.starts) < size:
         last = bins.ends[1:] - 1
@@ -115,17 +116,6 @@ def _has_places(values: np.ndarray) -> bool:
 def _counted(dim: str, label: str, bins: Bins) -> Place:
     edges = bins.ends - 0.5
     return Place(dim, label, bins, edges, (edges[1:] + edges[:-1]) / 2)
-
-
-def _edges(x: np.ndarray, log: bool) -> np.ndarray:
-    """Edges of cells about rising points, half way between them on the axis."""
-    if log:
-        return np.exp(_edges(np.log(x), False))
-    middle = (x[1:] + x[:-1]) / 2
-    if len(x) == 1:
-        half = 0.5 * abs(x[0]) or 0.5
-        return np.asarray([x[0] - half, x[0] + half])
-    return np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
 
 
 def _short(value: Any) -> str:

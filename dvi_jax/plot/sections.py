@@ -1,25 +1,36 @@
 """Pictures of Poincaré sections: points of many orbits, and how they change with ε."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.lines import Line2D
 
-from .house import COLOURS, canvas, in_style, legend
+from .._results import status_name
+from .house import COLOURS, canvas, in_style, legend, note
 from .states import component, looks_of
 
 _MANY = 3000
 """Points from which a picture has pixels of them in a file of vectors."""
 
 
+_GOOD = ("", "successful", "stopped", "never_crossed", "too_few_crossings")
+"""Statuses of orbits whose states can be trusted: all but "failed"."""
+
+
 class _Points(NamedTuple):
-    """Crossings of every orbit: shape (orbits, room, *shape), NaN behind the last; how many."""
+    """Crossings of every orbit: shape (orbits, room, *shape), NaN behind the last; how many.
+
+    - `statuses`: how each orbit came through the section, "" where that is not known. `reasons`:
+      of its trajectory, as far as that is known.
+    """
 
     qs: np.ndarray
     ps: np.ndarray
     counts: np.ndarray
+    statuses: np.ndarray
+    reasons: np.ndarray
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -29,6 +40,11 @@ class _Points(NamedTuple):
     def there(self) -> np.ndarray:
         """Which rows are crossings, shape (orbits, room)."""
         return np.asarray(np.isfinite(self.qs).reshape(*self.qs.shape[:2], -1).all(-1))
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Which orbits failed, shape (orbits,)."""
+        return np.isin(self.statuses, _GOOD, invert=True)
 
     def along(self, function: Any) -> np.ndarray:
         """A coordinate of every row, shape (orbits, room)."""
@@ -63,8 +79,11 @@ def section(
     - `ax`: where to draw.
 
     10⁶ points and more are one collection, drawn as pixels. The legend tells of orbits that
-    crossed more often than there was room for, and of those that never did; where there is no
-    crossing at all, the axes say so.
+    crossed more often than there was room for, less often than was asked for, or never, and of
+    those that were stopped or failed; where there is no crossing at all, the axes say so.
+
+    An orbit that failed may have gone far astray before: the others alone set the limits of the
+    axes, and the legend counts crossings of failed ones beyond them.
 
     **Returns** the `Axes`.
 
@@ -82,25 +101,33 @@ def section(
     axis, new = canvas(ax, (5.8, 4.8))
     axis.set(xlabel=x_label, ylabel=y_label, title=title)
     handles: list[Any] = []
+    far = np.zeros(0, bool)
     if not there.any():
         _say_empty(axis)
     else:
         xs, ys = points.along(get_x), points.along(get_y)
         look = _dots(int(there.sum()), size)
+        failed = _leaves_limits(points)
         if colour is None and count <= len(COLOURS):
             for i in range(count):
                 name = None if labels is None else str(labels[i])
-                axis.scatter(xs[i][there[i]], ys[i][there[i]], color=looks.colours[i], label=name,
-                             **look)  # fmt: skip
+                with _limits_kept(axis, bool(failed[i])):
+                    axis.scatter(xs[i][there[i]], ys[i][there[i]], color=looks.colours[i],
+                                 label=name, **look)  # fmt: skip
         else:
             # Orbits of neighbouring starts lie beside one another: neighbouring colours there.
             shades = np.asarray([_rgba(c) for c in looks.colours])
-            each = np.repeat(np.arange(count), there.sum(1))
-            axis.scatter(xs[there], ys[there], c=shades[each], **look)
+            for astray in (False, True):
+                rows = there & (failed == astray)[:, None]
+                each = np.repeat(np.arange(count), rows.sum(1))
+                if len(each):
+                    with _limits_kept(axis, astray):
+                        axis.scatter(xs[rows], ys[rows], c=shades[each], **look)
         handles = axis.get_legend_handles_labels()[0]
+        far = _beyond(axis, xs, ys)[there & failed[:, None]]
     if looks.scale is not None:
         axis.figure.colorbar(looks.scale, ax=axis, label=colour_label)
-    handles += looks.entries() + _notes(points)
+    handles += looks.entries() + _notes(points) + _far(far)
     found = legend(axis, new, handles)
     for handle in found.legend_handles if found else ():
         if hasattr(handle, "set_sizes"):
@@ -112,6 +139,35 @@ def _rgba(colour: Any) -> tuple[float, ...]:
     from matplotlib.colors import to_rgba
 
     return to_rgba(colour)
+
+
+def _leaves_limits(points: _Points) -> np.ndarray:
+    """Which orbits do not set the limits of the axes: failed ones, unless there are no others."""
+    others = points.there.any(1) & ~points.failed
+    return points.failed & others.any()
+
+
+@contextmanager
+def _limits_kept(axis: Any, kept: bool) -> Iterator[None]:
+    """The limits of the data stay as they are, whatever is drawn inside."""
+    before = axis.dataLim.get_points().copy()
+    yield
+    if kept:
+        axis.dataLim.set_points(before)
+        axis.autoscale_view()
+
+
+def _beyond(axis: Any, xs: np.ndarray, ys: np.ndarray) -> np.ndarray:
+    """Which points lie outside the picture."""
+    (left, right), (low, high) = sorted(axis.get_xlim()), sorted(axis.get_ylim())
+    return ~((xs >= left) & (xs <= right) & (ys >= low) & (ys <= high))
+
+
+def _far(beyond: np.ndarray) -> list[Any]:
+    """What a legend says of crossings of failed orbits that are outside the picture."""
+    count = int(beyond.sum())
+    text = f"{count} of {len(beyond)} crossings of failed orbits lie outside the picture"
+    return [note(text)] if count else []
 
 
 def _dots(count: int, size: float | None) -> dict[str, Any]:
@@ -127,7 +183,7 @@ def _points_of(crossings: Any, what: str) -> _Points:
             f"{what} takes the Crossings of a dvi.Section, solution.observed, "
             + (f"and there are {len(found)}: name one." if found else f"got {crossings!r:.60}.")
         )
-    (one,) = found
+    ((one, status),) = found
     qs, ps, ts = (np.asarray(v) for v in (one.qs, one.ps, one.ts))
     if ts.ndim == 0 or qs.shape[: ts.ndim] != ts.shape or qs.shape != ps.shape:
         raise ValueError(
@@ -138,19 +194,28 @@ def _points_of(crossings: Any, what: str) -> _Points:
         qs, ps = qs[..., None], ps[..., None]
     shape = (math.prod(ts.shape[:-1]), *qs.shape[ts.ndim - 1 :])
     counts = np.ravel(np.asarray(one.count))
+    reasons: Any = status
     if hasattr(one, "status"):  # a PoincareSection: just so many were asked for
         counts = np.minimum(counts, ts.shape[-1])
-    return _Points(qs.reshape(shape), ps.reshape(shape), counts)
+        status = one.status
+        reasons = status_name(one.run) if hasattr(one, "run") else ""
+    statuses, reasons = (
+        np.broadcast_to(np.asarray(x, object), ts.shape[:-1]).ravel().astype(str)
+        for x in (status, reasons)
+    )
+    return _Points(qs.reshape(shape), ps.reshape(shape), counts, statuses, reasons)
 
 
-def _crossings_in(tree: Any) -> list[Any]:
-    """Every `Crossings`, told by its fields, of a solution, its observables or a part of them."""
+def _crossings_in(tree: Any, status: Any = "") -> list[tuple[Any, Any]]:
+    """Every `Crossings`, told by its fields, of a solution, its observables or a part of them; with
+    the status of the solution."""
     if all(hasattr(tree, name) for name in ("ts", "qs", "ps")):
-        return [tree] if _is_count(tree) else _crossings_in(getattr(tree, "observed", None))
-    if isinstance(tree, Mapping):
-        return [c for v in tree.values() for c in _crossings_in(v)]
-    if isinstance(tree, list | tuple):
-        return [c for v in tree for c in _crossings_in(v)]
+        if _is_count(tree):
+            return [(tree, status)]
+        return _crossings_in(getattr(tree, "observed", None), getattr(tree, "status", ""))
+    parts = tree.values() if isinstance(tree, Mapping) else tree
+    if isinstance(tree, Mapping | list | tuple):
+        return [c for v in parts for c in _crossings_in(v, status)]
     return []
 
 
@@ -159,18 +224,28 @@ def _is_count(tree: Any) -> bool:
 
 
 def _notes(points: _Points) -> list[Any]:
-    """What a legend says of orbits with more crossings than room, and with none."""
-    total, room = len(points.counts), points.qs.shape[1]
-    over, none = int(np.sum(points.counts > room)), int(np.sum(points.counts == 0))
-    unknown = int(np.sum(~np.isfinite(points.counts)))
+    """What a legend says of orbits with more crossings than room, fewer than asked for, or none."""
+    total, room, failed = len(points.counts), points.qs.shape[1], points.failed
+    over = int(np.sum(points.counts > room))
+    none = int(np.sum((points.counts == 0) & ~failed & (points.statuses != "stopped")))
+    unknown = int(np.sum(~np.isfinite(points.counts) & ~failed))
+    few, stopped = (int(np.sum(points.statuses == s)) for s in ("too_few_crossings", "stopped"))
     texts = []
+    if few:
+        texts.append(f"{few} of {total} orbits crossed less often than the {room} times asked for")
+    if stopped:
+        texts.append(f"{stopped} of {total} orbits stopped")
+    reasons = np.where(np.isin(points.reasons, _GOOD), "", points.reasons)[failed].tolist()
+    for reason in dict.fromkeys(reasons):
+        why = f": {reason.replace('_', ' ')}" if reason else ""
+        texts.append(f"{reasons.count(reason)} of {total} orbits failed{why}")
     if over:
         texts.append(f"{over} of {total} orbits crossed more often than the {room} times kept")
     if none and none < total:
         texts.append(f"{none} of {total} orbits did not cross")
     if unknown:
         texts.append(f"{unknown} of {total} orbits have no count of crossings")
-    return [Line2D([], [], linestyle="none", label=text) for text in texts]
+    return [note(text) for text in texts]
 
 
 def _say_empty(axis: Any) -> None:
@@ -203,6 +278,9 @@ def bifurcation(
     - `log`: a logarithmic axis of the parameter. `size`: of a point, in points across; `units`: of
       "q" and "p". `ax`: where to draw.
 
+    The legend tells how orbits ended, and crossings of failed ones do not set the limits, as in
+    `section`.
+
     **Returns** the `Axes`.
 
     **Raises** `ValueError` for shapes that do not fit, and for a parameter without a place on a
@@ -211,14 +289,14 @@ def bifurcation(
     parameter = np.asarray(parameter, float)
     numbers = np.asarray(crossings) if _is_numeric(crossings) else None
     if numbers is not None:
-        values = numbers.astype(float)
+        values, failed = numbers.astype(float), np.zeros(len(numbers), bool)
         label = "" if y == "q[-1]" else y if isinstance(y, str) else ""
         notes: list[Any] = []
     else:
         points = _points_of(crossings, "bifurcation")
         get, label = component(y, points.shape, units or {}, "bifurcation")
         values = np.where(points.there, points.along(get), np.nan)
-        notes = _notes(points)
+        notes, failed = _notes(points), _leaves_limits(points)
     if parameter.ndim != 1 or values.ndim != 2 or len(values) != len(parameter):
         raise ValueError(
             f"bifurcation takes a parameter of shape (runs,) and crossings of as many runs, got "
@@ -234,15 +312,22 @@ def bifurcation(
     axis, new = canvas(ax, (6.8, 4.4))
     axis.set(xlabel=name, ylabel=label, title=title)
     if there.any():
-        axis.scatter(x[there], values[there], color="#000000", **_dots(int(there.sum()), size))
+        look = _dots(int(there.sum()), size)
+        failed = failed & (there.any(1) & ~failed).any()  # those left after the first
+        for astray in (False, True):
+            rows = there & (failed == astray)[:, None]
+            if rows.any():
+                with _limits_kept(axis, astray):
+                    axis.scatter(x[rows], values[rows], color="#000000", **look)
         if log:
             axis.set_xscale("log")
+        notes += _far(_beyond(axis, x, values)[there & failed[:, None]])
         silent = int(np.sum(~there.any(1)))
         if silent:
             text = f"{silent} of {len(values)} runs have no crossing"
             text += f" after the first {skip}" if skip else ""
             notes = [n for n in notes if "did not cross" not in n.get_label()]
-            notes.append(Line2D([], [], linestyle="none", label=text))
+            notes.append(note(text))
             axis.plot(
                 parameter[~there.any(1)], np.full(silent, 0.015), "|", color="#777777",
                 markersize=6, transform=axis.get_xaxis_transform(),

@@ -6,9 +6,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.lines import Line2D
 
-from .house import COLOURS, DASHES, GREY, canvas, envelope, in_style, legend, named, signed, stack
+from .house import (
+    COLOURS,
+    DASHES,
+    GREY,
+    canvas,
+    envelope,
+    in_style,
+    legend,
+    named,
+    note,
+    signed,
+    stack,
+)
 from .states import CROSS, Looks, cross, each_state, lanes_of, looks_of, troubles
 
 _CHANGES = ("relative", "absolute", "value")
@@ -110,11 +121,11 @@ def invariants(
         axes[0].figure.colorbar(looks.scale, ax=list(axes), label=colour_label)
     handles = axes[0].get_legend_handles_labels()[0] + looks.entries()
     if zeros:
-        handles.append(Line2D([], [], linestyle="none", label=f"{zeros} values exactly 0"))
+        handles.append(note(f"{zeros} values exactly 0"))
     for one in series:
         if one.nought:
             text = f"{one.name}: {one.nought} of {len(ts)} orbits start at 0"
-            handles.append(Line2D([], [], linestyle="none", label=text))
+            handles.append(note(text))
     handles += [cross(text) for text in troubles(lanes)]
     legend(axes[0], new, handles)
     return axes[0] if count == 1 else np.asarray(axes)
@@ -281,6 +292,8 @@ def changes(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any =
     - `ts`: times, shape (S,). `series`: label → changes, shape (S,). `time`: label of the axis.
     - `ax`: where to draw, one `Axes` for each quantity.
 
+    A panel says how many of its changes are no numbers.
+
     **Returns** the `Axes`, shape (quantities,).
     """
     size = (6.4, 1.2 + 1.35 * len(series))
@@ -288,8 +301,12 @@ def changes(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any =
     for axis, (label, values), colour in zip(
         axes, series.items(), itertools.cycle(COLOURS), strict=False
     ):
-        axis.plot(*envelope(*_pair(ts, values, label)), color=colour, linewidth=1.1)
+        t, v = _pair(ts, values, label)
+        axis.plot(*envelope(t, v), color=colour, linewidth=1.1)
         axis.set_ylabel(label, fontsize=9)
+        if lost := int(np.sum(~np.isfinite(v))):
+            axis.text(0.99, 0.95, f"{lost} of {len(v)} are no numbers", ha="right", va="top",
+                      transform=axis.transAxes, fontsize=8, color="#555555")  # fmt: skip
     axes[0].set_title(title)
     axes[-1].set_xlabel(time)
     axes[0].figure.align_ylabels(axes)
@@ -302,17 +319,26 @@ def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any
 
     - `ts`: times, shape (S,). `series`: label → sizes, shape (S,). `ax`: where to draw.
 
+    What has no place on this axis is counted in the legend: exact zeros, and what is no number.
+
     **Returns** the `Axes`.
     """
     axis, new = canvas(ax)
+    notes: list[Any] = []
     looks = zip(itertools.cycle(COLOURS), itertools.cycle(DASHES))
     for (label, values), (colour, dash) in zip(series.items(), looks, strict=False):
         # The start itself, where the change is 0, has no place on this axis.
         t, v = (x[1:] for x in _pair(ts, values, label))
-        axis.semilogy(*envelope(t, v), color=colour, linestyle=dash, linewidth=0.9, label=label)
+        shown = np.where(np.isfinite(v) & (v > 0), v, np.nan)
+        axis.semilogy(*envelope(t, shown), color=colour, linestyle=dash, linewidth=0.9, label=label)
+        lost = {"exactly 0": v == 0, "no numbers": ~np.isfinite(v), "below 0": v < 0}
+        notes += [
+            note(f"{label}: {here.sum()} of {len(v)} are {what}")
+            for what, here in lost.items() if here.any()
+        ]  # fmt: skip
     _rounding(axis)
     axis.set(xlabel=time, ylabel="relative change since the start", title=title)
-    found = legend(axis, new)
+    found = legend(axis, new, axis.get_legend_handles_labels()[0] + notes)
     for line in found.get_lines() if found else ():
         line.set_linewidth(2.0)
     return axis
@@ -361,6 +387,7 @@ def indicator(
     units: Mapping[str, str] | None = None,
     title: str = "",
     ax: Any = None,
+    t0: float | None = None,
 ) -> Any:
     """An indicator of chaos against time, beside what it shows of regular motion.
 
@@ -375,8 +402,11 @@ def indicator(
       the kind.
     - `labels`, `colour`, `colour_label`: of the lines, as for `phase_portrait`. `units`: of "t" and
       "value". `ax`: where to draw.
+    - `t0`: time of the start; None: the first of `ts` if the values are those at ends of steps,
+      else 0. A logarithmic axis shows |t − t0|, so that runs backward have their place.
 
-    Logarithmic axes have no place for numbers that are not positive: the legend counts them.
+    The legend counts values that are no numbers, and, on logarithmic axes, those that are not
+    positive and those at the start itself.
 
     **Returns** the `Axes`.
 
@@ -387,17 +417,23 @@ def indicator(
     about, units = _KINDS.get(kind or "", _Kind("indicator", False, False)), units or {}
     if slope is not None:
         about = about._replace(xlog=True, ylog=True, slope=slope)
-    lines, names = _lines_of(ts, values)
+    found, names = _lines_of(ts, values)
+    found = [(t, v, start if t0 is None else float(t0)) for t, v, start in found]
+    lines = [(np.abs(t - start) if about.xlog else t, v) for t, v, start in found]
+    shifted = about.xlog and any(start != 0 or (t < 0).any() for t, _, start in found)
     names = names if labels is None else list(labels)
     if len(names) not in (0, len(lines)):
         raise ValueError(f"labels has {len(names)} names for {len(lines)} lines.")
     looks = looks_of(len(lines), colour)
     axis, new = canvas(ax)
-    out = 0
+    lost, at_start, low = 0, 0, 0
     for i, (t, v) in enumerate(lines):
-        placeable = np.isfinite(v) & ((t > 0) | (not about.xlog)) & ((v > 0) | (not about.ylog))
-        # A start at t = 0 is no number that is missing.
-        out += int(np.sum(~placeable & ~((t == 0) & about.xlog)))
+        there = np.isfinite(v) & np.isfinite(t)
+        early = there & (t == 0) & about.xlog
+        under = there & ~early & (v <= 0) & about.ylog
+        placeable = there & ~early & ~under
+        lost, at_start = lost + int(np.sum(~there)), at_start + int(np.sum(early))
+        low += int(np.sum(under))
         axis.plot(*envelope(t, np.where(placeable, v, np.nan)), color=looks.colours[i],
                   linestyle=looks.dashes[i], linewidth=1.2,
                   label=str(names[i]) if names else None)  # fmt: skip
@@ -407,20 +443,25 @@ def indicator(
                      label=f"regular: {about.level:g}")  # fmt: skip
     if about.slope is not None:
         _guide(axis, lines, about.slope)
-    axis.set(xlabel=named("time t", units.get("t")), ylabel=named(about.label, units.get("value")))
+    time = "time since the start |t − t$_0$|" if shifted else "time t"
+    axis.set(xlabel=named(time, units.get("t")), ylabel=named(about.label, units.get("value")))
     axis.set_title(title)
     if looks.scale is not None:
         axis.figure.colorbar(looks.scale, ax=axis, label=colour_label)
     handles = axis.get_legend_handles_labels()[0] + looks.entries()
-    if out:
-        text = f"{out} values are not positive" if about.ylog else f"{out} values are no numbers"
-        handles.append(Line2D([], [], linestyle="none", label=text))
+    counts = {
+        "are no numbers": lost, "at the start, t = t$_0$": at_start, "are not positive": low
+    }  # fmt: skip
+    handles += [note(f"{n} values {text}") for text, n in counts.items() if n]
     legend(axis, new, handles)
     return axis
 
 
-def _lines_of(ts: Any, values: Any) -> tuple[list[tuple[np.ndarray, np.ndarray]], list[str]]:
-    """(times, numbers) of every line, and their names if they have any."""
+def _lines_of(ts: Any, values: Any) -> tuple[list[tuple[np.ndarray, np.ndarray, float]], list[str]]:
+    """(times, numbers, start) of every line, and their names if they have any.
+
+    The start is the time before the values where `ts` have one more than there are values, else 0.
+    """
     if isinstance(values, Mapping):
         lines, names = [], []
         for name, v in values.items():
@@ -437,14 +478,16 @@ def _lines_of(ts: Any, values: Any) -> tuple[list[tuple[np.ndarray, np.ndarray]]
             f"an indicator has one number for each time or step, shape (..., {n}) or (..., "
             f"{n - 1}): got ts of shape {t.shape} and values of shape {v.shape}."
         )
+    start = t[..., 0] if n > v.shape[-1] else np.zeros(t.shape[:-1])
     t = t[..., n - v.shape[-1] :]
     if t.ndim > 1 and t.shape[:-1] != v.shape[: t.ndim - 1]:
         raise ValueError(f"ts of shape {t.shape} do not go with values of shape {v.shape}.")
     if t.ndim > 1:
+        start = start.reshape(*start.shape, *(1,) * (v.ndim - t.ndim))
         t = t.reshape(*t.shape[:-1], *(1,) * (v.ndim - t.ndim), t.shape[-1])
-    t = np.broadcast_to(t, v.shape)
-    flat = zip(t.reshape(-1, t.shape[-1]), v.reshape(-1, v.shape[-1]), strict=True)
-    return list(flat), []
+    t, start = np.broadcast_to(t, v.shape), np.broadcast_to(start, v.shape[:-1])
+    rows = (t.reshape(-1, t.shape[-1]), v.reshape(-1, v.shape[-1]), start.ravel().tolist())
+    return list(zip(*rows, strict=True)), []
 
 
 def _guide(axis: Any, lines: Sequence[tuple[np.ndarray, np.ndarray]], slope: float) -> None:

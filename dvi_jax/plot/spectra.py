@@ -5,15 +5,24 @@ from typing import Any
 
 import numpy as np
 from matplotlib.colors import ListedColormap, Normalize
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from .house import COLOURS, DASHES, GREY, MARKERS, SHADES, canvas, in_style, legend, named, signed
+from .house import (
+    COLOURS,
+    DASHES,
+    GREY,
+    HATCH,
+    MARKERS,
+    SHADES,
+    canvas,
+    cell_edges,
+    in_style,
+    legend,
+    named,
+    note,
+    signed,
+)
 from .states import looks_of
-
-_NO_VALUE: dict[str, Any] = {
-    "facecolor": "#d0d0d0", "edgecolor": "#8c8c8c", "hatch": "/////", "linewidth": 0
-}  # fmt: skip
 
 
 @in_style
@@ -75,7 +84,7 @@ def spectrum(
     handles = axis.get_legend_handles_labels()[0]
     if not there.all():
         text = f"{np.sum(~there)} of {there.size} lines have no frequency or amplitude"
-        handles.append(Line2D([], [], linestyle="none", label=text))
+        handles.append(note(text))
     legend(axis, new, handles)
     return axis
 
@@ -98,13 +107,15 @@ def frequency_map(
       of shape (len(x), len(y)), the coordinates of a grid of starts, drawn as cells.
     - `diffusion`: log₁₀ of the relative change of a frequency from one window to the next (Laskar
       1993), as colours; low is regular. NaN is hatched or grey, and counted in the legend.
-    - `resonances`: (k₁, k₂) of lines k₁x + k₂y = 0.
+    - `resonances`: (k₁, k₂) of lines k₁x + k₂y = 0, of frequencies against each other.
     - `limits`: (low, high) of the colours; None: from the 2nd to the 98th percentile.
-    - `names`: labels of x and y. `ax`: where to draw.
+    - `names`: labels of x and y; None: ω₁ and ω₂, of a plane of starts x and y. `ax`: where to
+      draw.
 
     **Returns** the `Axes`.
 
-    **Raises** `ValueError` for shapes that do not fit and for a resonance (0, 0).
+    **Raises** `ValueError` for shapes that do not fit, for a resonance (0, 0), and for resonances
+    over a plane of starts, whose coordinates are no frequencies.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     D = None if diffusion is None else np.asarray(diffusion, float)
@@ -117,6 +128,12 @@ def frequency_map(
             "frequency_map takes x, y and diffusion of one shape, or diffusion of shape (len(x), "
             f"len(y)): got x of shape {x.shape}, y of shape {y.shape}{shape}."
         )
+    if on_grid and len(resonances):
+        raise ValueError(
+            "a resonance is a line among frequencies, and x and y are coordinates of starts here: "
+            "leave out resonances, or give the frequencies of each start, x and y of shape "
+            f"{(len(x), len(y))}."
+        )
     axis, new = canvas(ax, (6.0, 4.8))
     handles: list[Any] = []
     if on_grid:
@@ -125,8 +142,8 @@ def frequency_map(
     else:
         _draw_points(axis, x, y, D, limits, diffusion_label, handles)
     _draw_resonances(axis, resonances)
-    axis.set_xlabel((names or ("ω$_1$", "ω$_2$"))[0])
-    axis.set_ylabel((names or ("ω$_1$", "ω$_2$"))[1])
+    names = names or (("x", "y") if on_grid else ("ω$_1$", "ω$_2$"))
+    axis.set(xlabel=names[0], ylabel=names[1])
     axis.set_title(title)
     legend(axis, new, axis.get_legend_handles_labels()[0] + handles)
     return axis
@@ -154,20 +171,13 @@ def _draw_plane(
             raise ValueError(f"the coordinates {name} of a grid of starts must rise.")
     norm, extend = _norm(D, limits)
     axis.grid(False)
-    axis.patch.set(**_NO_VALUE)
-    mesh = axis.pcolormesh(_cells(x), _cells(y), np.ma.masked_invalid(D.T), norm=norm,
+    axis.patch.set(**HATCH)
+    mesh = axis.pcolormesh(cell_edges(x), cell_edges(y), np.ma.masked_invalid(D.T), norm=norm,
                            cmap=SHADES, rasterized=True)  # fmt: skip
     axis.figure.colorbar(mesh, ax=axis, label=label, extend=extend)
     lost = int(np.sum(~np.isfinite(D)))
     if lost:
-        handles.append(Patch(label=f"{lost} of {D.size} starts without a value", **_NO_VALUE))
-
-
-def _cells(x: np.ndarray) -> np.ndarray:
-    if len(x) == 1:
-        return np.array([x[0] - 0.5, x[0] + 0.5])
-    middle = (x[1:] + x[:-1]) / 2
-    return np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
+        handles.append(Patch(label=f"{lost} of {D.size} starts without a value", **HATCH))
 
 
 def _draw_points(
@@ -192,7 +202,7 @@ def _draw_points(
     lost = int(np.sum(~there))
     if lost:
         text = f"{lost} of {there.size} orbits have no frequencies"
-        handles.append(Line2D([], [], linestyle="none", label=text))
+        handles.append(note(text))
 
 
 def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, int]]) -> None:
@@ -208,16 +218,25 @@ def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, int]]) -> None:
 
 
 def _name_resonance(axis: Any, k: tuple[int, int], limits: Any) -> None:
-    """Its numbers where the line leaves the picture at the top or at the right."""
+    """Its numbers where the line leaves the picture: at the top or at the right, else inside of the
+    left, without which are numbers of the axis. It leaves at two edges, so that is all."""
     (left, right), (low, high) = limits
     a, b = k
-    at_top, at_right = (-b * high / a if a else None), (-a * right / b if b else None)
-    if at_top is not None and left <= at_top <= right:
-        place, how = (at_top, high), {"ha": "center", "va": "bottom"}
-    elif at_right is not None and low <= at_right <= high:
-        place, how = (right, at_right), {"ha": "left", "va": "center"}
+
+    def crossed(level: float, slope: tuple[int, int], within: tuple[float, float]) -> float | None:
+        at = -slope[1] * level / slope[0] if slope[0] else None
+        return at if at is not None and min(within) <= at <= max(within) else None
+
+    top = crossed(high, (a, b), (left, right))
+    at_right, at_left = (crossed(x, (b, a), (low, high)) for x in (right, left))
+    if top is not None:
+        place, how, off = (top, high), {"ha": "center", "va": "bottom"}, (0, 2)
+    elif at_right is not None:
+        place, how, off = (right, at_right), {"ha": "left", "va": "center"}, (2, 0)
+    elif at_left is not None:
+        place, how, off = (left, at_left), {"ha": "left", "va": "center"}, (3, 0)
     else:
         return
     axis.annotate(f"({signed(a)}, {signed(b)})", place, fontsize=8, color="#555555",
-                  xytext=(0, 2), textcoords="offset points", annotation_clip=False,
+                  xytext=off, textcoords="offset points", annotation_clip=False,
                   **how)  # fmt: skip

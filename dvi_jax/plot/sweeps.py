@@ -13,8 +13,8 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from . import panels
 from .blocks import REDUCTIONS, Lines, Picture, counted, reduced
-from .house import COLOURS, in_style
-from .panels import NO_NUMBER, NOT_COMPUTED, ZERO, Grid, flag, share
+from .house import COLOURS, NO_NUMBER, ZERO, in_style, legend
+from .panels import NOT_COMPUTED, Grid, flag, share
 from .places import dim_of, label_of, names_of
 
 PIXELS = (480, 320)
@@ -183,7 +183,7 @@ def failure_map(
         for i, (name, n) in enumerate(zip(names, total, strict=True))
         if n
     ]
-    panels.legend(axes, entries, ax)
+    legend(axes[0], ax is None, entries)
     return axes[0] if facet is None else np.asarray(axes)
 
 
@@ -223,7 +223,7 @@ def _draw(
     ]
     if scale.log and any((p.values == 0).any() for p in pictures):
         entries.append(flag(ZERO, "exactly 0", line))
-    panels.legend(axes, entries, ax)
+    legend(axes[0], ax is None, entries)
     return axes[0] if len(grid.panels) == 1 and not grid.panels[0][0] else np.asarray(axes)
 
 
