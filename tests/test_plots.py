@@ -19,6 +19,7 @@ from PIL import Image
 
 import dvi_jax as dvi
 from dvi_jax import plot, systems
+from dvi_jax.plot import films
 from dvi_jax.plot.house import MARKERS, SHADES, envelope
 
 mpl.use("Agg")
@@ -133,9 +134,34 @@ def test_lines_differ_in_a_black_and_white_print():
     assert len(set(plot.DASHES)) == len(plot.DASHES) == len(plot.COLOURS)
     assert len(set(MARKERS)) >= len(plot.COLOURS)
     axis = plot.phase_portrait(arrays(5))
-    drawn = [line for line in axis.lines if line.get_marker() == "None"]
+    drawn = [line for line in axis.lines if line.get_linestyle() != "None"]
     assert len({str(line._dash_pattern) for line in drawn}) == 5
+    assert len({line.get_marker() for line in drawn}) == 5
     assert [line.get_color() for line in drawn] == list(plot.COLOURS[:5])
+
+
+def test_orbits_that_retrace_themselves_are_told_apart_by_marks():
+    """Dashes of many turns fill one another up; marks at different places do not."""
+    t = np.linspace(0, 80 * np.pi, 4001)
+    q = np.stack([k * np.cos(t) for k in (1, 2, 3)])[..., None]
+    p = np.stack([-k * np.sin(t) for k in (1, 2, 3)])[..., None]
+    axis = plot.phase_portrait((np.broadcast_to(t, (3, 4001)), q, p), labels=["a", "b", "c"])
+    drawn = [line for line in axis.lines if line.get_linestyle() != "None"]
+    marks = [line.get_marker() for line in drawn]
+    assert len(set(marks)) == 3
+    assert not {"None", "o", "x"} & set(marks)
+    handles = axis.figure.legends[0].legend_handles[:3]
+    assert [handle.get_marker() for handle in handles] == marks
+    for line in drawn:
+        first, step = line.get_markevery()
+        assert 8 <= len(range(first, 4001, step)) <= 10
+    eight = np.stack([np.cos(t), np.sin(2 * t)] * 3, 1).reshape(-1, 3, 2)
+    bodies = plot.orbit((t, eight), names=["A", "B", "C"])
+    drawn = [line for line in bodies.lines if line.get_linestyle() != "None"]
+    assert len({line.get_marker() for line in drawn}) == 3
+    assert len({line.get_markevery() for line in drawn}) == 3
+    for plain in (plot.phase_portrait(arrays()), plot.phase_portrait(arrays(9))):
+        assert {x.get_marker() for x in plain.lines if x.get_linestyle() != "None"} == {"None"}
 
 
 def test_pictures_have_the_house_style_and_leave_the_user_his_own():
@@ -469,6 +495,7 @@ def test_choices_that_are_not_there_are_named():
         (two, {"colour": [1.0]}, "one orbit"),
         (bodies, {"bodies": [3]}, "from 0 to 2"),
         (bodies, {"names": ["A"]}, "1 entries for 3 bodies"),
+        (arrays(2, n=2), {"names": ["A", "B"]}, r"2 orbits.*labels="),
     ]:
         with pytest.raises(ValueError, match=match):
             plot.orbit(orbits, **kwargs)
@@ -905,6 +932,15 @@ def test_work_precision_measures_slopes_and_finds_the_front():
     assert legend(plot.work_precision(flat))[:2] == ["late: slope −2.0", "first: slope −1.0"]
     early = {"early": (cost, [1.0, 9.0, 1.0, 1e-3, 1e-6])}  # steps that are too long at first
     assert legend(plot.work_precision(early))[0] == "early: slope −3.0"
+    late = {"bent": (cost[:4], [1.0, 1e-1, 1e-3, 1e-6]), "two": (cost[:2], [1, 1e-2])}
+    assert legend(plot.work_precision(late))[:2] == [
+        "bent: slope −2.5, not settled", "two: slope −2.0 of two runs"
+    ]  # fmt: skip
+    # Two runs of one cost, as 1e-2 and 1e-4: together 1e-3.
+    twice = {"a": ([1, 10, 10, 100], [1.0, 1e-2, 1e-4, 1e-6])}
+    assert legend(plot.work_precision(twice))[0] == "a: slope −3.0"
+    swapped = {"a": ([1, 10, 10, 100], [1.0, 1e-4, 1e-2, 1e-6])}
+    assert legend(plot.work_precision(swapped))[0] == "a: slope −3.0"
     looks = {(line.get_marker(), line.get_color()) for line in axis.lines[:2]}
     assert looks == {("o", plot.COLOURS[0]), ("s", plot.COLOURS[1])}
     assert "front" not in legend(plot.work_precision(errors_of("a"), front=False))
@@ -1046,6 +1082,32 @@ def test_a_film_has_the_frames_and_the_length_asked_for(tmp_path, batch):
     assert (found[0][0, :5] == 255).all()  # white paper
 
 
+def test_a_film_names_all_its_orbits_and_tells_of_those_that_failed(tmp_path, monkeypatch):
+    """Eight long names in a narrow film: each of them lies within it."""
+    ts, q, p = arrays(8)
+    q = q.copy()
+    q[3, 20:] = np.nan
+    figures = []
+    monkeypatch.setattr(
+        films, "_write_gif", lambda part, scene, *rest: (
+            figures.append(scene.axis.figure), part.write_bytes(b"")
+        ),
+    )  # fmt: skip
+    names = [f"orbit with a long name {k}" for k in range(8)]
+    plot.animate((ts, q, p), tmp_path / "a.gif", labels=names, size=(5, 5), dpi=60)
+    (figure,) = figures
+    (drawn,) = figure.legends
+    said = [text.get_text() for text in drawn.get_texts()]
+    assert said == [*names, "1 of 8 orbits failed: not finite"]
+    figure.canvas.draw()
+    for text in drawn.get_texts():
+        box = text.get_window_extent()
+        assert 0 <= box.x0 < box.x1 <= 300
+        assert 0 <= box.y0 < box.y1 <= 300
+    plot.animate(arrays(), tmp_path / "b.gif", dpi=30)
+    assert not figures[1].legends
+
+
 def test_a_film_shows_each_moment_evenly_in_time(tmp_path):
     """Steps that grow: the head is where the orbit is, not at every so many states."""
     t = np.linspace(0, 3, 400) ** 2
@@ -1103,6 +1165,9 @@ def test_films_that_cannot_be_made_leave_nothing_behind(tmp_path, monkeypatch):
         with pytest.raises(ValueError, match=match):
             plot.animate(orbit, tmp_path / name, **kwargs)
     nowhere = (np.arange(3.0), np.full((3, 2), np.nan))
+    for orbits, match in [(arrays(2, n=2), "2 orbits"), (arrays(), "the state is one number")]:
+        with pytest.raises(ValueError, match=match):
+            plot.animate(orbits, tmp_path / "a.gif", names=["A", "B"])
     with pytest.raises(ValueError, match="no orbit has a state"):
         plot.animate(nowhere, tmp_path / "a.gif")
     with pytest.raises(TypeError, match="needs momenta"):

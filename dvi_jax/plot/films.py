@@ -11,9 +11,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from . import series
-from .house import in_style, named
-from .orbits import View, label_view, phase_portrait, view_of
-from .states import CROSS, Lane, Looks, lanes_of, looks_of, one_shape, subscript
+from .house import in_style, legend, named
+from .orbits import View, check_names, label_view, phase_portrait, view_of
+from .states import CROSS, Lane, Looks, cross, lanes_of, looks_of, one_shape, subscript, troubles
 
 _SUFFIXES = (".gif", ".mp4")
 _FASTEST_GIF = 50
@@ -74,8 +74,8 @@ def animate(
     - `size`: inches; `dpi`: pixels an inch. `progress`: called with the numbers of frames done and
       of all, after each.
 
-    A cross stays where an orbit ended too early. A file of that name is replaced once the film is
-    whole.
+    A cross stays where an orbit ended too early, and the legend says how many did and why. A file
+    of that name is replaced once the film is whole.
 
     **Returns** the path.
 
@@ -151,6 +151,7 @@ def _tracks(
     lanes: Sequence[Lane], coordinates: Any, bodies: Any, centre: Any, names: Any
 ) -> tuple[list[_Track], View | None, Looks]:
     shape = one_shape(lanes, "animate")
+    check_names(lanes, shape, names)
     if math.prod(shape) == 1 and coordinates is None:
         looks, tracks = looks_of(len(lanes)), []
         for i, lane in enumerate(lanes):
@@ -237,8 +238,9 @@ class _Scene:
                 axis.plot(*([x] for x in view.mark), marker="*", color="#E69F00", markersize=11,
                           markeredgecolor="black", linestyle="none", zorder=3)  # fmt: skip
             label_view(axis, view, units)
-        if any(track.name for track in self.tracks):
-            axis.figure.legend(loc="outside lower center", ncols=4)
+        handles = axis.get_legend_handles_labels()[0]
+        handles += [cross(text) for text in troubles(self.lanes)]
+        legend(axis, True, handles)
         axis.set_title(title)
 
     def mark_phase(self, axis: Any, orbits: Any, dof: Any, units: Any) -> None:

@@ -24,6 +24,9 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 
 DASHES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)))
 
+MARKS = ("s", "^", "D", "v", "P", "<", ">")
+"""On lines that may lie upon one another; no circle, a start, and no cross, an end."""
+
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 
 SHADES = ListedColormap(colormaps["viridis"](np.linspace(0, 0.88, 256)), "shades")
@@ -193,7 +196,7 @@ def legend(axis: Any, new: bool, handles: Sequence[Any] | None = None) -> Any:
     if not handles:
         return None
     if not new:
-        paper = {"frameon": True, "framealpha": 0.85, "edgecolor": "none"}
+        paper = {"frameon": True, "framealpha": 0.6, "edgecolor": "none"}
         return axis.legend(handles=handles, fontsize=8, **paper)
     figure = _root(axis)
     if axis.name == "3d":  # whose names of axes would be in the way below

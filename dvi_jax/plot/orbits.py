@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from .house import COLOURS, DASHES, canvas, in_style, legend, named, path, stack
+from .house import COLOURS, DASHES, MARKS, canvas, in_style, legend, named, path, stack
 from .states import (
     CROSS,
     START,
@@ -28,6 +28,9 @@ from .states import (
 
 _PANELS = 6
 """Degrees of freedom up to which each has a panel unasked."""
+
+_MARKS = 9
+"""Along a line, to tell it from others; no divisor of what numbers of turns often are."""
 
 _NARROW = 0.45
 """Of the longest side of a box in space: others are at least so long."""
@@ -66,7 +69,9 @@ def phase_portrait(
       `colour_label`; NaN is grey.
     - `units`: of "q" and "p". `ax`: where to draw, one `Axes` for each panel.
 
-    Circles are starts; crosses stand where an orbit ended too early, and the legend says why.
+    Circles are starts; crosses stand where an orbit ended too early, and the legend says why. Up to
+    seven orbits have marks along them, as dashes run into one another where an orbit retraces
+    itself.
 
     **Returns** the `Axes`, an array of them for a list or for several degrees of freedom.
 
@@ -146,12 +151,22 @@ def _draw_orbit(
         )  # fmt: skip
     else:
         path(axis, *xy, label=lane.label or None, color=colour, linestyle=looks.dashes[i],
-             linewidth=width)  # fmt: skip
+             linewidth=width, **_marks(looks, i, len(xy[0])))  # fmt: skip
     if len(looks.colours) <= len(COLOURS):
         axis.plot(*(x[:1] for x in xy), color=colour, zorder=3, **START)
     if lane.trouble:
         finite = np.flatnonzero(np.logical_and.reduce([np.isfinite(x) for x in xy]))[-1:]
         axis.plot(*(x[finite] for x in xy), linestyle="none", zorder=4, **CROSS)
+
+
+def _marks(looks: Looks, i: int, count: int) -> dict[str, Any]:
+    """Marks along one line of several of the palette: where an orbit retraces itself its dashes
+    fill one another up, and in print there is nothing else to tell it by."""
+    if not 1 < len(looks.colours) <= len(COLOURS) or looks.scale is not None:
+        return {}
+    step = max(1, count // _MARKS)
+    first = step * (2 * i + 1) // (2 * len(looks.colours))
+    return {"marker": MARKS[i], "markevery": (first, step), "markersize": 4.5}
 
 
 def _finish(
@@ -219,7 +234,8 @@ def orbit(
       (..., S, n) or (..., S, bodies, dim), or a list of these.
     - `coordinates`: two or three numbers of coordinates from 0; None: all, if they are two or
       three.
-    - `bodies`: numbers of those that are drawn; None: all. `names`: one for each of these.
+    - `bodies`: numbers of those that are drawn; None: all. `names`: one for each of these, of a
+      single orbit; `labels` name the orbits of a batch.
     - `centre`: number of the body that the others are drawn about, a star there; or a point, shape
       (dim,), that is marked. None: nothing is.
     - `dots`, `labels`, `colour`, `colour_label`: as for `phase_portrait`. In a batch a colour is an
@@ -231,10 +247,11 @@ def orbit(
     **Returns** the `Axes`.
 
     **Raises** `TypeError` for what are no orbits, `ValueError` for one coordinate, for bodies and
-    coordinates that are not there, and for axes of another dimension.
+    coordinates that are not there, for names in a batch, and for axes of another dimension.
     """
     lanes = lanes_of(orbits, "orbit", labels, momenta=False)
     shape = one_shape(lanes, "orbit")
+    check_names(lanes, shape, names)
     view = view_of(shape, coordinates, bodies, centre, names)
     several = len(lanes) > 1
     looks = looks_of(len(lanes) if several else len(view.bodies), colour if several else None)
@@ -244,7 +261,7 @@ def orbit(
     axis, new = canvas(ax, (5.4, 5.0), space)
     for (i, lane), (k, _) in itertools.product(enumerate(lanes), enumerate(view.bodies)):
         if not several:
-            lane = lane._replace(label=view.names[k])
+            lane = lane._replace(label=view.names[k] or (lane.label if k == 0 else ""))
         elif k:
             lane = lane._replace(label="")
         _draw_orbit(axis, lane, view.of(lane.qs, k), looks, i if several else k, dots,
@@ -323,6 +340,17 @@ def view_of(shape: tuple[int, ...], coordinates: Any, bodies: Any, centre: Any, 
             )
         view.mark = point[list(coordinates)]
     return view
+
+
+def check_names(lanes: Sequence[Lane], shape: tuple[int, ...], names: Any) -> None:
+    """Refuse names of bodies where a colour is an orbit."""
+    if names is not None and len(lanes) > 1:
+        raise ValueError(
+            f"names tell bodies of one orbit apart, and there are {len(lanes)} orbits, which have "
+            "a colour each: name these, labels=[...], or draw one orbit."
+        )
+    if names is not None and math.prod(shape) == 1:
+        raise ValueError("names are of bodies, and the state is one number: take labels=[...].")
 
 
 def label_view(axis: Any, view: View, units: Mapping[str, str]) -> None:

@@ -11,6 +11,9 @@ from .house import COLOURS, DASHES, MARKERS, PALE, canvas, in_style, legend, sig
 _FLATTER = 0.6
 """Of the slope before: a line that falls less steeply than that has reached round-off."""
 
+_SETTLED = 0.1
+"""Of a slope: what it may change from one pair of runs to the next."""
+
 _LAST = 3
 """Runs that a slope is taken from: those before have steps too long for it."""
 
@@ -30,8 +33,10 @@ def work_precision(
     - `results`: name of the method → (costs, errors), shape (runs,) each, in any order.
     - `cost`, `error`: labels, with units.
     - `slopes`: tell the slope of each line, d log(error)/d log(cost), in the legend: the
-      least-squares slope of its last three runs before round-off. Round-off begins where the error
-      no longer falls, or falls by less than 0.6 of the slope before.
+      least-squares slope of its last three runs before round-off, "not settled" where it still
+      changes by more than a tenth from one pair of them to the next. Round-off begins where the
+      error no longer falls, or falls by less than 0.6 of the slope before. Of runs of equal cost
+      the geometric mean of the errors counts.
     - `front`: a pale band under the runs than which no other is both cheaper and as exact.
     - `ax`: where to draw.
 
@@ -55,7 +60,7 @@ def work_precision(
         good = np.isfinite(errors) & (errors > 0)
         slope = _slope(costs[good], errors[good]) if slopes else None
         text = name if not slopes else f"{name}: " + (
-            f"slope {signed(slope, '.1f')}" if slope is not None else "no slope"
+            "no slope" if slope is None else f"slope {signed(slope[0], '.1f')}{slope[1]}"
         )  # fmt: skip
         axis.loglog(
             costs[good], errors[good], color=colour, marker=marker, linestyle=dash,
@@ -104,14 +109,20 @@ def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
     return costs[order], np.abs(errors[order])
 
 
-def _slope(costs: np.ndarray, errors: np.ndarray) -> float | None:
-    costs, first = np.unique(costs, return_index=True)
-    x, y = np.log(costs), np.log(errors[first])
+def _slope(costs: np.ndarray, errors: np.ndarray) -> tuple[float, str] | None:
+    """(slope of the last runs before round-off, what is to be said of it)."""
+    costs, place = np.unique(costs, return_inverse=True)
+    x, y = np.log(costs), np.bincount(place, np.log(errors)) / np.bincount(place)
     local, n = np.diff(y) / np.diff(x), len(x)
     while n > 1 and (local[n - 2] >= 0 or (n > 2 and local[n - 2] > _FLATTER * local[n - 3])):
         n -= 1
+    if n < 2:
+        return None
     part = slice(max(0, n - _LAST), n)
-    return float(np.polyfit(x[part], y[part], 1)[0]) if n > 1 else None
+    last = local[part.start : n - 1]
+    settled = len(last) > 1 and np.ptp(last) <= _SETTLED * np.abs(last).max()
+    about = "" if settled else ", not settled" if len(last) > 1 else " of two runs"
+    return float(np.polyfit(x[part], y[part], 1)[0]), about
 
 
 def _front(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
