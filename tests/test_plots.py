@@ -1,5 +1,6 @@
 """Pictures of orbits, sections, spectra and costs: what is drawn, where, and what is refused."""
 
+import importlib.util
 import inspect
 import itertools
 import re
@@ -1197,6 +1198,28 @@ def test_an_mp4_is_written_where_there_is_ffmpeg(tmp_path):
     start = path.read_bytes()[:12]
     assert start[4:8] == b"ftyp"
     assert path.stat().st_size > 2000
+
+
+def test_the_gallery_refuses_an_unknown_picture_before_it_draws(tmp_path, monkeypatch):
+    file = Path(__file__).parents[1] / "examples" / "gallery.py"
+    spec = importlib.util.spec_from_file_location("gallery", file)
+    gallery = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(gallery)
+    drawn = []
+
+    def picture(out):
+        drawn.append(out)
+        return out / "a.png"
+
+    monkeypatch.setattr(gallery, "PICTURES", [picture])
+    monkeypatch.setattr(gallery.sys, "argv", ["gallery.py", str(tmp_path / "g"), "picture", "no"])
+    with pytest.raises(SystemExit, match="no picture is called no: there are picture"):
+        gallery.main()
+    assert not drawn
+    assert not (tmp_path / "g").exists()
+    monkeypatch.setattr(gallery.sys, "argv", ["gallery.py", str(tmp_path / "g"), "picture"])
+    gallery.main()
+    assert drawn == [tmp_path / "g"]
 
 
 @pytest.mark.slow

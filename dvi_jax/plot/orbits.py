@@ -30,7 +30,7 @@ _PANELS = 6
 """Degrees of freedom up to which each has a panel unasked."""
 
 _MARKS = 9
-"""Along a line, to tell it from others; no divisor of what numbers of turns often are."""
+"""Along a line, to tell it from others."""
 
 _NARROW = 0.45
 """Of the longest side of a box in space: others are at least so long."""
