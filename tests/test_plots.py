@@ -320,6 +320,11 @@ def test_pictures_of_several_panels_take_as_many_axes():
     mine = plt.subplots(1, 3)[1]
     given = (np.arange(40), errors, list("abcdefghi"), np.arange(40.0), 1.0, 0.0)
     assert list(plot.ephemeris_comparison(*given, ax=mine)) == list(mine)
+    planets = plt.subplots(1, 2, figsize=(9, 5))[1]
+    plot.planet_orbits(RNG.normal(size=(4, 5, 3)), list("abcde"), ax=planets)
+    for axis in (mine[0], *planets):
+        axis.figure.canvas.draw()
+        assert axis.get_legend().get_window_extent().y0 >= axis.get_window_extent().y0
 
 
 # --- orbits -------------------------------------------------------------------------------------

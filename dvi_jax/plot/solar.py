@@ -6,7 +6,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from .house import COLOURS, MARKERS, given, in_style, stack
+from .house import COLOURS, MARKERS, given, in_style, legend, stack
 
 
 @in_style
@@ -37,7 +37,10 @@ def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
         axis.plot(0, 0, "*", color="#E69F00", markersize=11, markeredgecolor="black")
         axis.set(xlabel="x [au]", ylabel="y [au]", title=title)
         axis.set_aspect("equal", adjustable="datalim")
-        axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, handletextpad=0.2)
+        if new:  # a legend for each, below it
+            axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, handletextpad=0.2)
+        else:
+            legend(axis, new)
     if new:
         axes[0].figure.suptitle(
             "Heliocentric orbits on the ecliptic of J2000; marks: places at the start", fontsize=10
@@ -83,7 +86,10 @@ def ephemeris_comparison(
         ylabel="distance from the ephemeris [km]",
         title="Heliocentric position, integration − DE421",
     )
-    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
+    if ax is None:
+        left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
+    else:
+        legend(left, False)
     right.plot(years, perihelion, ".", color=COLOURS[0], markersize=2, label="osculating orbits")
     line = intercept + slope * years / 100
     if np.isfinite(slope):
