@@ -134,24 +134,28 @@ def pendulum(t0, t1, q, p, args):
 
 
 RATES = np.array([0.1, 1.0, 30.0])
+SCALES = np.array([1.0, 1e7, 1e-7])
+M_SWING = np.sin(1.0) ** 2  # the square of k = sin(q0/2)
+J_SWING = 8 / np.pi * (special.ellipe(M_SWING) - (1 - M_SWING) * special.ellipk(M_SWING))
 
 
 @functools.cache
 def one_degree():
-    """Windows of 500 samples: before and after the change at each rate, and a pendulum."""
+    """Windows of 500 samples: before and after the change at each rate, and a pendulum as it is
+    and in other units: its actions, times and signals."""
     sols = jax.vmap(lambda rate: run(slow, [1.0], [0.0], 0.05, 8, rate, samples=1500))(RATES)
     swing = run(pendulum, [2.0], [0.0], 0.05, 8, samples=500)
     z = np.asarray(sols.qs - 1j * sols.ps)[..., 0]
-    signals = [*z[:, :500], *z[:, -500:], np.asarray(swing.qs - 1j * swing.ps)[:, 0]]
-    ts = [*sols.ts[:, :500], *sols.ts[:, -500:], swing.ts]
-    return actions(np.stack(ts)[:, None], np.stack(signals)[:, None], count=14, throw=False)
+    swings = [np.asarray(s * swing.qs - 1j / s * swing.ps)[:, 0] for s in SCALES]
+    signals = np.stack([*z[:, :500], *z[:, -500:], *swings])[:, None]
+    ts = np.stack([*sols.ts[:, :500], *sols.ts[:, -500:], *[swing.ts] * 3])[:, None]
+    return actions(ts, signals, count=14, throw=False), ts, signals
 
 
 def test_pendulum_has_the_action_of_the_elliptic_integrals():
     """J = (8/π) (E(k) − (1 − k²) K(k)), k = sin(q0/2)."""
-    m = np.sin(1.0) ** 2
-    J = 8 / np.pi * (special.ellipe(m) - (1 - m) * special.ellipk(m))
-    torus = jax.tree.map(lambda x: x[-1], one_degree())
+    m, J = M_SWING, J_SWING
+    torus = jax.tree.map(lambda x: x[6], one_degree()[0])
     assert torus.status == "successful"
     assert torus.actions[0] == pytest.approx(J, rel=1e-10)
     assert torus.frequencies[0] == pytest.approx(np.pi / 2 / special.ellipk(m), rel=1e-11)
@@ -162,7 +166,7 @@ def test_pendulum_has_the_action_of_the_elliptic_integrals():
 
 def test_an_action_is_kept_where_the_change_is_slow():
     """E/ω is an adiabatic invariant; what a sudden change does to it, it does to J."""
-    of = one_degree()
+    of = one_degree()[0]
     assert (of.status == "successful").all()
     before, after = of.actions[:3, 0], of.actions[3:6, 0]
     np.testing.assert_allclose(before, 0.5, rtol=1e-9)
@@ -171,6 +175,57 @@ def test_an_action_is_kept_where_the_change_is_slow():
     assert change[0] < 1e-7  # slow
     assert change[1] > 1e-3
     assert change[2] > 0.1  # sudden, while E/J = ω in every case
+
+
+def test_an_action_is_the_same_in_all_units():
+    """q → sq, p → p/s is canonical."""
+    of, ts, z = one_degree()
+    scaled = jax.tree.map(lambda x: x[6:], of)
+    assert list(scaled.status) == ["successful"] * 3
+    np.testing.assert_allclose(scaled.actions[:, 0], J_SWING, rtol=1e-10)
+    np.testing.assert_allclose(scaled.errors[:, 0], scaled.errors[0, 0], rtol=1e-3)
+    assert scaled.errors.max() < 1e-9
+    np.testing.assert_allclose(scaled.residual, scaled.residual[0], rtol=1e-3)
+    np.testing.assert_allclose(scaled.scales[:, 0], scaled.scales[0, 0] * SCALES, rtol=1e-10)
+    raw = frequencies(ts, z, count=14, throw=False)  # the control: lines of q − i p as it is
+    omega, A = np.asarray(raw.frequencies[6:, 0]), np.asarray(raw.amplitudes[6:, 0])
+    k = np.rint(omega / of.frequencies[6])
+    bare = np.nansum(k * np.abs(A) ** 2, axis=1) / 2
+    assert abs(bare[0] / J_SWING - 1) < 1e-8
+    assert (np.abs(bare[1:] / J_SWING - 1) > 1e-4).all()
+
+
+def test_a_light_planet_has_its_action():
+    """With a mass m, p and J are m times as large."""
+    ts, z = planar()
+    light = actions(ts, z.real + 1e-6j * z.imag, count=24, num=1, throw=False)
+    np.testing.assert_array_equal(light.status, found(1).status)
+    of, planet = lane(found(1), "kepler"), lane(light, "kepler")
+    np.testing.assert_allclose(planet.actions, 1e-6 * of.actions, rtol=1e-9)
+    np.testing.assert_allclose(planet.errors, 1e-6 * of.errors, rtol=0.1)
+    assert planet.errors[0] < 1e-9 * planet.actions[0]
+
+
+@pytest.mark.parametrize(("weak", "status"), [(1e-2, "successful"), (1e-3, "not_quasi_periodic")])
+def test_an_action_below_its_error_is_none(weak, status):
+    """A line that is no combination, of 9e-4, may stand for 8e-7 of either action."""
+    z = [np.exp(1j * TS) + 9e-4 * np.exp(2.718j * TS), weak * np.exp(0.6180339887j * TS)]
+    torus = actions(TS, np.stack(z), count=4, order=4, throw=False)
+    assert torus.status == status
+    assert torus.residual == pytest.approx(9e-4, rel=0.1)
+    if status == "successful":
+        np.testing.assert_allclose(torus.actions, [0.5, weak**2 / 2], rtol=1e-5)
+        np.testing.assert_allclose(torus.errors, 9e-4**2, rtol=0.1)
+    else:
+        assert np.isnan([*torus.actions, *torus.errors, *torus.frequencies]).all()
+
+
+def test_what_stands_still_has_no_part_in_an_action():
+    z = np.stack([np.exp(1j * TS), np.full(256, 3.0 - 2j)])
+    torus = actions(TS, z, count=4, num=1)
+    np.testing.assert_allclose(torus.actions, 0.5, rtol=1e-12)
+    np.testing.assert_allclose(torus.scales, 1.0, rtol=0.01)
+    assert torus.scales[1] == 1
 
 
 @pytest.mark.slow
@@ -193,6 +248,64 @@ def test_a_chain_of_toda_has_one_frequency_less_than_particles():
 
 
 TS = 0.5 * np.arange(256)
+
+
+def as_solution(z):
+    """A trajectory (or a batch) with q − i p = z, shape (*batch, N, *state), at the times TS."""
+    batch = z.shape[: z.shape.index(256)]
+    ts = jnp.broadcast_to(jnp.asarray(TS), (*batch, 256))
+    q, p = jnp.asarray(z.real), jnp.asarray(-z.imag)
+    return dvi.Solution(ts, q, p, jnp.diff(ts), None, dvi.RESULTS.successful, {})
+
+
+def test_axes_of_the_state_are_not_those_of_a_batch():
+    """Two frequencies: of one torus, or of two trajectories of one degree of freedom."""
+    w = np.array([1.0, 0.6180339887])
+    x, y = np.exp(1j * np.outer(TS, w)).T
+    z = np.stack([x + 0.3 * y, y - 0.3 * x], axis=1)  # (N, 2)
+    for state in ((2,), (2, 1), (1, 2)):
+        sol = as_solution(z.reshape(256, *state))
+        lines = frequencies(sol, count=4)
+        assert lines.frequencies.shape == (*state, 4)
+        torus = fundamental_frequencies(lines)
+        np.testing.assert_allclose(torus.frequencies, w, rtol=1e-12)
+        assert torus.combinations.shape == (2, 4, 2)
+        of = actions(sol, count=4)
+        np.testing.assert_allclose(of.actions, [0.545, 0.545], rtol=1e-9)
+        np.testing.assert_array_equal(of.lines.frequencies.shape, (2, 4))
+    for state in ((), (1,)):
+        sol = as_solution(np.stack([x, y]).reshape(2, 256, *state))
+        lines = frequencies(sol, count=4)
+        assert lines.frequencies.shape == (2, *state, 4)
+        torus = fundamental_frequencies(lines)
+        assert torus.frequencies.shape == (2, 1)
+        np.testing.assert_allclose(torus.frequencies[:, 0], w, rtol=1e-12)
+        assert list(torus.status) == ["successful"] * 2
+        assert actions(sol, count=4).actions.shape == (2, 1)
+    # The control: as an array of shape (2, N) they are the two degrees of freedom of one torus.
+    one = fundamental_frequencies(frequencies(TS, np.stack([x, y]), count=4))
+    np.testing.assert_allclose(one.frequencies, w, rtol=1e-12)
+
+
+def test_what_vmap_adds_is_a_batch():
+    rows, sols = TS + 0j * np.ones((2, 1)), as_solution(np.ones((2, 256), complex))
+    each = jax.eval_shape(jax.vmap(lambda row: frequencies(TS, row, throw=False)), rows)
+    assert each.frequencies.shape == (2, 8)
+    assert each.state_axes == 0
+    assert jax.eval_shape(lambda z: frequencies(TS, z, throw=False), rows).state_axes == 1
+    assert jax.eval_shape(lambda s: frequencies(s, throw=False), sols).state_axes == 0
+
+
+def test_an_empty_batch_is_one_of_nothing():
+    none = np.zeros((0, 2, 256), complex)
+    torus = fundamental_frequencies(frequencies(TS, none, count=4))
+    assert torus.frequencies.shape == (0, 2)
+    assert torus.combinations.shape == (0, 2, 4, 2)
+    assert torus.combinations.dtype.kind == "i"
+    assert torus.matched.dtype == bool
+    of = actions(TS, none, count=4, leftover=np.float32(0.1))
+    assert of.actions.shape == of.errors.shape == of.scales.shape == (0, 2)
+    assert len(of.status) == 0
 
 
 def planted(*lines):
@@ -232,6 +345,11 @@ def test_a_line_that_is_no_combination_is_told():
         (lambda: fundamental_frequencies(planted((1.0, 1)), guess=[np.nan]), ValueError, "finite"),
         (lambda: fundamental_frequencies(planted((1.0, 1)), tolerance=0), ValueError, "positive"),
         (lambda: fundamental_frequencies(planted((1.0, 1)), threshold=2), ValueError, "a share"),
+        (lambda: fundamental_frequencies(planted((1.0, 1)), tolerance="a"), ValueError, "got 'a'"),
+        (lambda: fundamental_frequencies(planted((1.0, 1)), threshold="a"), ValueError, "a share"),
+        (lambda: fundamental_frequencies(planted((1.0, 1)), guess="a"), ValueError, "finite.*'a'"),
+        (lambda: actions(TS, np.exp(1j * TS), leftover="a"), ValueError, "positive number, got 'a"),
+        (lambda: actions(TS, np.zeros((0, 256), complex), count=4), ValueError, "at least one deg"),
         (lambda: jax.jit(lambda z: actions(TS, z))(TS + 0j), ValueError, "not under jit"),
     ],
 )

@@ -177,6 +177,67 @@ def test_a_real_signal_has_lines_of_positive_frequency():
     np.testing.assert_allclose(found.evaluate(TS), x, rtol=0, atol=1e-12)
 
 
+def test_a_real_signal_backwards_in_time_has_the_same_lines():
+    x = 0.7 + np.cos(TS + 0.3) + 0.2 * np.sin(2.2 * TS)
+    found = frequencies(TS[::-1], x[::-1], count=3)
+    np.testing.assert_allclose(found.frequencies[:2], [1, 2.2], rtol=0, atol=1e-13)
+    expected = [np.exp(0.3j), -0.2j]
+    np.testing.assert_allclose(found.amplitudes[:2], expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.evaluate(TS), x, rtol=0, atol=1e-12)
+    wrong = frequencies(TS, x[::-1], count=3)  # the control: the phases are those of other times
+    assert np.abs(wrong.amplitudes[:2] - np.array(expected)).min() > 0.01
+
+
+def test_a_line_in_doubt_is_no_number_where_it_is_evaluated():
+    values = np.asarray(analysed().evaluate(TS[:7]))
+    assert values.shape == (len(NAMES), 7)
+    lost = np.isnan(values)
+    for name, status in zip(NAMES, analysed().status, strict=True):
+        told = status in ("successful", "no_signal")  # absent lines are no doubt
+        assert (lost[NAMES.index(name)] == (not told)).all(), name
+    assert np.isnan(of("noisy").frequencies).any()
+    assert np.isfinite(of("unresolved").frequencies).any()  # which is not the whole signal
+    np.testing.assert_allclose(values[NAMES.index("no_signal")], 0.3 + 0.1j, atol=1e-14)
+
+
+def test_lines_are_evaluated_at_times_of_any_shape():
+    found, values = analysed(), analysed().evaluate(TS[:7].reshape(7, 1))
+    assert values.shape == (len(NAMES), 7, 1)
+    expected = SIGNALS["successful"][:7]
+    np.testing.assert_allclose(values[0, :, 0], expected, rtol=0, atol=1e-12)
+    for ts, shape in ((TS[0], ()), ([], (0,)), (TS[:512].reshape(2, 256), (2, 256))):
+        batch = jax.eval_shape(lambda f, ts=ts: f.evaluate(ts), found)
+        assert batch.shape == (len(NAMES), *shape)
+        one = jax.eval_shape(lambda f, ts=ts: jax.tree.map(lambda x: x[0], f).evaluate(ts), found)
+        assert one.shape == shape
+    assert np.isnan(found.evaluate(np.where(np.arange(7) == 3, np.nan, 0.0))[0]).sum() == 1
+    with pytest.raises(TypeError, match="times must be real"):
+        found.evaluate(1j)
+    with pytest.raises(TypeError, match="array of numbers"):
+        found.evaluate("a")
+
+
+@pytest.mark.parametrize("start", [0.0, 1000.0])
+def test_times_in_single_precision_are_uniform_to_their_rounding(start):
+    h, k = float(np.float32(0.05)), np.arange(N)
+    ts = (start + h * k).astype(np.float32)
+    z = np.exp(2j * (start + h * k)).astype(np.complex64)
+    found = frequencies(ts, z, count=COUNT, throw=False)
+    assert found.frequencies.dtype == np.float64
+    assert found.frequencies[0] == pytest.approx(2, rel=3e-8)
+    np.testing.assert_allclose(found.amplitudes[0], 1, atol=1e-4)
+    with pytest.raises(ValueError, match="not uniform"):  # in double precision they are not
+        frequencies(ts.astype(float), z)
+    with pytest.raises(ValueError, match="float32: give the times in float64"):
+        frequencies(ts + 0.01 * (k % 2).astype(np.float32), z)
+
+
+def test_times_whose_steps_are_rounded_away_are_refused():
+    ts = (1e6 + 0.05 * np.arange(N)).astype(np.float32)
+    with pytest.raises(ValueError, match="not uniform"):
+        frequencies(ts, torus())
+
+
 def test_against_the_frequency_analysis_of_rebound():
     rebound = pytest.importorskip("rebound")
     if not hasattr(rebound, "frequency_analysis"):
@@ -305,6 +366,7 @@ IRREGULAR = TS + 1e-3 * np.sin(TS)
         (lambda: frequencies(TS, torus(), count=2.0), ValueError, "positive integer, got 2.0"),
         (lambda: frequencies(TS[:64], torus()[:64], count=22), ValueError, "66 unknowns"),
         (lambda: frequencies(TS, torus(), window=6), ValueError, "from 0 to 5, got 6"),
+        (lambda: frequencies(TS, torus(), refine="no"), ValueError, "True or False, got 'no'"),
         (lambda: frequencies(swing(), torus()), ValueError, "brings its own signal"),
         (lambda: frequency_diffusion(TS[:60], torus()[:60]), ValueError, "at least 64"),
     ],

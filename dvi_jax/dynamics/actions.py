@@ -2,11 +2,14 @@
 
 import functools
 import itertools
+import math
+from numbers import Real
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._compat import is_traced
 from .._solution import Solution
@@ -31,13 +34,16 @@ _ORDERS = {1: 64, 2: 20, 3: 12, 4: 8, 5: 6}
 _SUBSETS = 300
 """Choices of lines that are tried as a basis."""
 
+_STILL = 64 * EPS
+"""A q or p whose spread is below this share of its size is constant, but for round-off."""
+
 
 class FundamentalFrequencies(eqx.Module):
     r"""Independent frequencies and the combinations k·ω that the lines are.
 
     - `frequencies`: ω [rad per unit of time], shape (num,); NaN where there are fewer.
     - `combinations`: k of every line, integers, shape (n, count, num); zeros where there is no
-      line, or none of the combinations.
+      line, or none of the combinations. The n degrees of freedom are those of the state, flattened.
     - `misfits`: line − k·ω [rad per unit of time], shape (n, count); to the nearest combination
       where none is within the tolerance, NaN where there is no line.
     - `matched`: whether it is within the tolerance, shape (n, count).
@@ -68,9 +74,11 @@ class Actions(eqx.Module):
       order. NaN where the status is not `successful`.
     - `errors`: an estimate of what the lines that were not found, or are no combinations, would
       add to each action, shape (num,).
-    - `residual`: root mean square of what is left over of the signals, over theirs; the largest
-      of the degrees of freedom.
-    - `torus`: the `FundamentalFrequencies`; `lines`: the `Frequencies` of each q_j − i p_j.
+    - `residual`: root of the mean square of what is left over of q_j/s_j − i s_j p_j, over
+      2 rms q_j rms p_j; the largest of the degrees of freedom.
+    - `scales`: s_j [units of (q/p)^½], shape (n,).
+    - `torus`: the `FundamentalFrequencies`; `lines`: the `Frequencies` of each q_j/s_j − i s_j p_j,
+      shape (n, count).
     - `result`: the status, one of `FREQUENCY_RESULTS`.
 
     Axes of a batch stand in front.
@@ -80,6 +88,7 @@ class Actions(eqx.Module):
     frequencies: np.ndarray
     errors: np.ndarray
     residual: np.ndarray
+    scales: np.ndarray
     torus: FundamentalFrequencies
     lines: Frequencies
     result: FREQUENCY_RESULTS
@@ -112,8 +121,10 @@ def fundamental_frequencies(
 
     **Arguments**
 
-    - `lines`: what `frequencies` returned for the n degrees of freedom of one trajectory, shape
-      (*batch, n, count), or (count,) for one.
+    - `lines`: what `frequencies` returned, shape (*batch, *state, count): each entry of the batch
+      is a trajectory, the n entries of its state are its degrees of freedom. A `Solution` brings
+      both; of signals that were given as arrays the last axis before count is the state, and what
+      `vmap` adds is batch. To take one trajectory out, index the axes of the batch alone.
     - `num`: how many frequencies there are, by default n. Fewer for a chain whose centre of mass
       moves freely, or a degenerate system.
     - `guess`: frequencies, shape (num,), good to half the resolution, to be used as the basis.
@@ -142,8 +153,11 @@ def fundamental_frequencies(
         raise ValueError("integer combinations are found on the host: not under jit or vmap.")
     omega, A = np.asarray(lines.frequencies), np.asarray(lines.amplitudes)
     code, resolution = np.asarray(code_of(lines.result)), np.asarray(lines.resolution)
-    if omega.ndim == 1:
-        omega, A, code, resolution = omega[None], A[None], code[None], resolution[None]
+    axes = min(lines.state_axes, omega.ndim - 1)  # of a single degree of freedom, taken out
+    lead, state = omega.shape[: omega.ndim - 1 - axes], omega.shape[omega.ndim - 1 - axes : -1]
+    shape = (*lead, math.prod(state))
+    omega, A = (x.reshape(*shape, x.shape[-1]) for x in (omega, A))
+    code, resolution = code.reshape(shape), resolution.reshape(shape)
     search = _search(omega.shape[-2], num, guess, order, tolerance, threshold)
     tori, codes = _tori(omega, A, code, resolution, search, soft=True)
     found = _gathered(tori, codes, omega.shape, search.num)
@@ -170,7 +184,11 @@ def actions(
         J_a = ½ Σ_j Σ_k k_a |z_{j,k}|²
 
     over the lines k·ω of every degree of freedom. For H = ω(q² + p²)/2 that is J = (q² + p²)/2 and
-    H = ωJ. J belongs to the frequencies beside it: for ω' = Mω, J' = M⁻ᵀ J.
+    H = ωJ. J belongs to the frequencies beside it: for ω' = Mω, J' = M⁻ᵀ J. So that neither the
+    lines found nor their errors depend on the units, z_j is taken as q_j/s_j − i s_j p_j, which is
+    canonical and leaves J as it is; s_j² = rms Δ²q_j / rms Δ²p_j, of second differences: they weigh
+    the weak lines of high frequency, on which the accuracy depends. s_j = 1 where q_j or p_j is
+    constant.
 
     **Arguments**
 
@@ -179,8 +197,9 @@ def actions(
       be contracted in phase space: an angle that rotates is no sum of lines.
     - `count`: lines for each degree of freedom; `window`: see `frequencies`.
     - `num`, `guess`, `order`: see `fundamental_frequencies`.
-    - `leftover`: root mean square of what is no combination of num frequencies, over that of the
-      signal, from which on the motion is not quasi-periodic.
+    - `leftover`: root of the mean square of what is no combination of num frequencies, over
+      2 rms q_j rms p_j (about their means; it is 2J of an oscillator), from which on the motion is
+      not quasi-periodic. The same in all units.
     - `throw`: raise if a trajectory has another status than `successful`.
 
     The Fourier transforms run on the device, the rest on the host: not under jit or vmap.
@@ -190,7 +209,9 @@ def actions(
     **Raises** as `frequencies` and `fundamental_frequencies`; `TypeError` for a real signal.
 
     **Accuracy** the square of the residual, times the order k of what is left over: `errors`. The
-    lines of a smooth torus fall off exponentially, so that more lines help fast.
+    lines of a smooth torus fall off exponentially, so that more lines help fast. An action whose
+    error is as large as ½Σ|k_a||z|², or as the largest of the actions, makes the status
+    `not_quasi_periodic`; one that is small because its lines cancel is given with its error.
 
     **Source** our own, from the definition; compare Binney & Spergel 1984, *Mon. Not. R. Astron.
     Soc.* 206, 159, and Laskar 1999, in *Hamiltonian Systems with Three or More Degrees of
@@ -198,14 +219,13 @@ def actions(
     """
     settings = settings_of(count, window, True)
     if isinstance(ts, Solution):
-        state = ts.qs.ndim - ts.ts.ndim
-        ts, signal = signals_of(ts, signal)
-        lead = signal.shape[: signal.ndim - 1 - state]
-        signal = signal.reshape(*lead, -1, signal.shape[-1])
+        ts, signal, eps, axes = signals_of(ts, signal)
+        lead, N = signal.shape[: signal.ndim - 1 - axes], signal.shape[-1]
+        signal = signal.reshape(*lead, math.prod(signal.shape[len(lead) : -1]), N)
         if ts.ndim > 1:
-            ts = ts.reshape(*lead, 1, ts.shape[-1])
+            ts = ts.reshape(*lead, 1, N)
     else:
-        ts, signal = signals_of(ts, signal)
+        ts, signal, eps, _ = signals_of(ts, signal)
     if not jnp.iscomplexobj(signal):
         raise TypeError(
             "actions need q and p of every degree of freedom: the complex signal q − i p, shape "
@@ -216,20 +236,22 @@ def actions(
     if signal.ndim == 1:
         signal = signal[None]
     check_count(settings, signal)
-    if isinstance(leftover, bool) or not isinstance(leftover, int | float) or not leftover > 0:
+    if not (_is_number(leftover) and leftover > 0):
         raise ValueError(f"leftover must be a positive number, got {leftover!r}.")
     search = _search(signal.shape[-2], num, guess, order, None, 1e-3)
-    lines, raw = analyse(ts, signal, settings)
+    signal, scales, size = _balanced(signal)
+    lines, raw = analyse(ts, signal, settings, eps, 1)
     lines, raw = _on_host(lines, raw)
     omega, A = np.asarray(lines.frequencies), np.asarray(lines.amplitudes)
     resolution = np.asarray(lines.resolution)
     tori, codes = _tori(omega, A, raw.code, resolution, search, soft=False)
 
     lead, n = omega.shape[:-2], omega.shape[-2]
-    power = np.where(np.isfinite(omega), np.abs(A) ** 2, 0.0).reshape(-1, n, count)
+    power = np.where(np.isfinite(omega), np.abs(A) ** 2, 0.0).reshape(len(tori), n, count)
     in_doubt = np.abs(raw.amplitudes.reshape(power.shape)) ** 2
     in_doubt = np.where(power > 0, 0.0, np.where(np.isfinite(in_doubt), in_doubt, 0.0))
-    left = np.nan_to_num(np.asarray(lines.residual)).reshape(-1, n) ** 2
+    size = np.asarray(size).reshape(len(tori), n)
+    left = np.nan_to_num(np.asarray(lines.residual)).reshape(len(tori), n) ** 2
     J, errors = (np.full((len(tori), search.num), np.nan) for _ in range(2))
     residual = np.full(len(tori), np.nan)
     for i, torus in enumerate(tori):
@@ -239,26 +261,56 @@ def actions(
         lost = power[i] - used + in_doubt[i]
         total = (power[i] + in_doubt[i]).sum(axis=1) / np.maximum(1 - left[i], EPS)
         rest = left[i] * total + lost.sum(axis=1)
-        residual[i] = np.sqrt(np.max(rest / np.where(total > 0, total, 1.0)))
+        over = np.where(size[i] > 0, size[i], np.where(total > 0, total, 1.0))
+        residual[i] = np.sqrt(np.max(rest / over))
         if codes[i] in (0, CODE["not_quasi_periodic"]):
             codes[i] = 0 if residual[i] <= leftover else CODE["not_quasi_periodic"]
         if codes[i] == 0:
             k = torus.combinations
-            J[i] = np.einsum("jk,jka->a", used, k) / 2
+            of_lines = np.einsum("jk,jka->a", used, k) / 2
+            gross = np.einsum("jk,jka->a", used, np.abs(k)) / 2
             largest = np.abs(k * torus.matched[..., None]).max(axis=(0, 1)) + 1
-            noise = 1e-14 * np.einsum("jk,jka->a", used, np.abs(k)) / 2
-            errors[i] = largest * rest.sum() / 2 + noise
+            estimate = largest * rest.sum() / 2 + 1e-14 * gross
+            if (estimate < np.minimum(gross, np.abs(of_lines).max())).all():
+                J[i], errors[i] = of_lines, estimate
+            else:
+                codes[i] = CODE["not_quasi_periodic"]
     torus = _gathered(tori, codes, omega.shape, search.num)
     found = Actions(
-        actions=J.reshape(*lead, -1),
-        frequencies=np.where(np.isfinite(J.reshape(*lead, -1)), torus.frequencies, np.nan),
-        errors=errors.reshape(*lead, -1),
+        actions=J.reshape(*lead, search.num),
+        frequencies=np.where(np.isfinite(J.reshape(*lead, search.num)), torus.frequencies, np.nan),
+        errors=errors.reshape(*lead, search.num),
         residual=residual.reshape(lead),
+        scales=np.asarray(scales).reshape(*lead, n),
         torus=torus,
         lines=lines,
         result=torus.result,
     )
     return raise_on_failure(found) if throw else found
+
+
+@eqx.filter_jit
+def _balanced(signal: Array) -> tuple[Array, Array, Array]:
+    """q/s − i s p of every q − i p, with s, and 2 rms q rms p, 0 where one of them is constant."""
+
+    def sizes(x):
+        largest = jnp.max(jnp.abs(x), axis=-1)
+        unit = x / jnp.where(largest > 0, largest, 1.0)[..., None]  # squares cannot overflow
+        spread, bend = jnp.std(unit, axis=-1), jnp.std(jnp.diff(unit, 2, axis=-1), axis=-1)
+        return largest, spread, bend, (spread > _STILL) & (bend > 0) & (largest < jnp.inf)
+
+    (top_q, of_q, bend_q, moves_q), (top_p, of_p, bend_p, moves_p) = (
+        sizes(x) for x in (signal.real, signal.imag)
+    )
+    both = moves_q & moves_p
+    s = jnp.where(both, top_q, 1.0) ** 0.5 / jnp.where(both, top_p, 1.0) ** 0.5
+    s = s * jnp.sqrt(jnp.where(both, bend_q, 1.0) / jnp.where(both, bend_p, 1.0))
+    size = jnp.where(both, 2 * (top_q * of_q) * (top_p * of_p), 0.0)
+    return signal.real / s[..., None] + 1j * s[..., None] * signal.imag, s, size
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _on_host(lines: Frequencies, raw: Raw) -> tuple[Frequencies, Raw]:
@@ -284,7 +336,13 @@ class _Torus(NamedTuple):
 
 
 def _search(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshold: Any) -> _Search:
-    guess = None if guess is None else np.atleast_1d(np.asarray(guess, float))
+    if n == 0:
+        raise ValueError("a torus needs at least one degree of freedom, got lines of none.")
+    if guess is not None:
+        try:
+            guess = np.atleast_1d(np.asarray(guess, float))
+        except (TypeError, ValueError):
+            raise ValueError(f"guess must hold finite frequencies, got {guess!r}.") from None
     if num is None:
         num = n if guess is None else len(guess)
     if isinstance(num, bool) or not isinstance(num, int | np.integer) or num < 1:
@@ -294,10 +352,14 @@ def _search(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshold:
     order = _ORDERS.get(int(num), 5) if order is None else order
     if isinstance(order, bool) or not isinstance(order, int | np.integer) or order < 1:
         raise ValueError(f"order, the largest Σ|k|, must be a positive integer, got {order!r}.")
-    if tolerance is not None and not tolerance > 0:
-        raise ValueError(f"tolerance must be positive, got {tolerance!r}.")
-    if not 0 < threshold <= 1:
-        raise ValueError(f"threshold is a share of the leading amplitude, got {threshold!r}.")
+    if tolerance is not None and not (_is_number(tolerance) and 0 < tolerance < math.inf):
+        raise ValueError(f"tolerance, of a frequency, must be positive, got {tolerance!r}.")
+    if not (_is_number(threshold) and 0 < threshold <= 1):
+        raise ValueError(
+            "threshold is a share of the leading amplitude, above 0 and up to 1, got "
+            f"{threshold!r}."
+        )
+    tolerance = None if tolerance is None else float(tolerance)
     return _Search(int(num), int(order), tolerance, float(threshold), guess)
 
 
@@ -306,9 +368,10 @@ def _tori(
 ) -> tuple[list[_Torus], np.ndarray]:
     """Of every trajectory the torus, and the code of its status; `soft`: a line in doubt counts."""
     n, count = omega.shape[-2:]
+    M = math.prod(omega.shape[:-2])
     rows = zip(
-        omega.reshape(-1, n, count), A.reshape(-1, n, count), code.reshape(-1, n),
-        resolution.reshape(-1, n), strict=True,
+        omega.reshape(M, n, count), A.reshape(M, n, count), code.reshape(M, n),
+        resolution.reshape(M, n), strict=True,
     )  # fmt: skip
     tori, codes = [], []
     for nu, a, status, width in rows:
@@ -323,7 +386,7 @@ def _tori(
         doubt = status[(status != 0) & ~silent]
         tori.append(torus)
         codes.append(doubt[0] if soft and len(doubt) else CODE[problem])
-    return tori, np.array(codes)
+    return tori, np.array(codes, int)
 
 
 def _nothing(n: int, count: int, num: int) -> _Torus:
@@ -448,7 +511,11 @@ def combinations_up_to(num: int, order: int) -> np.ndarray:
 
 def _gathered(tori: list[_Torus], codes: np.ndarray, shape, num: int) -> FundamentalFrequencies:
     lead, n, count = shape[:-2], *shape[-2:]
-    stacked = [np.stack([np.asarray(t[i]) for t in tori]) for i in range(5)]
+    one = _nothing(n, count, num)  # an empty batch has shapes and types too
+    stacked = [
+        np.stack([np.asarray(t[i]) for t in tori]) if tori else np.asarray(one[i])[None][:0]
+        for i in range(5)
+    ]
     return FundamentalFrequencies(
         frequencies=stacked[0].reshape(*lead, num),
         combinations=stacked[1].reshape(*lead, n, count, num),

@@ -1,5 +1,7 @@
 """Frequency analysis: the lines of a quasi-periodic signal, after Laskar."""
 
+import dataclasses
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,6 +18,7 @@ from .results import (
     CODE,
     FREQUENCY_RESULTS,
     WITHOUT_NUMBERS,
+    code_of,
     name_of,
     raise_on_failure,
     with_code,
@@ -32,13 +35,16 @@ class Frequencies(eqx.Module):
         x(t) ≈ c + Re Σ_k A_k e^{iω_k t}       (real, ω_k > 0)
 
     - `frequencies`: ω_k [rad per unit of time], shape (count,); `amplitudes`: A_k, complex, units
-      of the signal, shape (count,). NaN for lines that are not there, or not to be told.
+      of the signal, shape (count,). NaN for lines that are not there, or in doubt: not to be told.
     - `constant`: c, complex (its imaginary part is 0 for a real signal).
-    - `residual`: root mean square, in the window, of what these lines leave over that of z − c.
+    - `residual`: root mean square, in the window, of what all lines that are there leave over that
+      of z − c. Those in doubt are among them, so that it is not the rest of `evaluate`.
     - `resolution`: 2π/T [rad per unit of time].
     - `result`: the status, one of `FREQUENCY_RESULTS`.
+    - `is_real`: of a real signal; `state_axes`: how many axes belong to the degrees of freedom of
+      one trajectory. Both static.
 
-    Axes of a batch, and those of the degrees of freedom of a `Solution`, stand in front.
+    Axes of a batch, then those of the degrees of freedom, stand in front: (*batch, *state, count).
     """
 
     frequencies: Float[Array, "*batch count"]
@@ -48,6 +54,7 @@ class Frequencies(eqx.Module):
     resolution: Float[Array, "*batch"]
     result: FREQUENCY_RESULTS
     is_real: bool = eqx.field(static=True, default=False)
+    state_axes: int = eqx.field(static=True, default=0)
 
     @property
     def status(self) -> Any:
@@ -55,12 +62,21 @@ class Frequencies(eqx.Module):
         return name_of(self.result)
 
     def evaluate(self, ts: Any) -> Array:
-        """The sum of the lines at times `ts`, shape (N,): shape (*batch, N)."""
-        ts = jnp.asarray(ts)
+        """The constant and the sum of the lines at times `ts` of any shape (*times).
+
+        Shape (*batch, *times): every signal at every time; for times of its own for each signal
+        of a batch, ``jax.vmap(lambda f, t: f.evaluate(t))(found, ts)``. NaN where a line is in
+        doubt or the status leaves no numbers; the constant alone where there is no line at all.
+        """
+        ts = _real_times("ts", ts)
+        times, batch = ts.reshape(-1), self.constant.shape
         there = jnp.isfinite(self.frequencies)
         omega, A = jnp.where(there, self.frequencies, 0.0), jnp.where(there, self.amplitudes, 0.0)
-        phases = omega[..., :, None] * jnp.expand_dims(ts, tuple(range(omega.ndim)))
+        phases = omega[..., :, None] * jnp.expand_dims(times, tuple(range(omega.ndim)))
         z = self.constant[..., None] + jnp.sum(A[..., :, None] * jnp.exp(1j * phases), axis=-2)
+        code = code_of(self.result)
+        told = (code == CODE["successful"]) | (code == CODE["no_signal"])
+        z = jnp.where(told[..., None], z, jnp.nan).reshape(*batch, *ts.shape)
         return z.real if self.is_real else z
 
 
@@ -107,10 +123,11 @@ def frequencies(
 
     **Arguments**
 
-    - `ts`: times, shape (N,), uniform, N ≥ 32; or (*batch, N). Or a `Solution`: then the signal
-      of each degree of freedom is q_j − i p_j, for which H = (q² + p²)/2 turns at +1, shape
-      (*batch, *state, N).
-    - `signal`: shape (*batch, N), complex or real. A real one has lines at ω > 0 alone.
+    - `ts`: times, shape (N,), uniform to their rounding, ascending or not, N ≥ 32; or (*batch, N).
+      Or a `Solution`: then the signal of each degree of freedom is q_j − i p_j, for which
+      H = (q² + p²)/2 turns at +1, shape (*batch, *state, N).
+    - `signal`: shape (*batch, N), complex or real. A real one has lines at ω > 0 alone. Of more
+      than one axis, the last but one counts the degrees of freedom of a trajectory (`state_axes`).
     - `count`: lines to look for, 3·count < N (6·count < N if real); static.
     - `window`: power of Hann's window, 0 to 5; static. A line that is not among the `count` biases
       the others by a share T^−(2·window+2) of it.
@@ -127,16 +144,16 @@ def frequencies(
 
     **Accuracy** round-off, below 1e-13 ω for 2048 samples, for a signal of no more than `count`
     lines that are further apart than the resolution; see docs/frequencies.md. float32 is computed
-    in float64.
+    in float64, at the times of the lattice that fits the rounded ones best.
 
     **Source** Laskar 1990, *Icarus* 88, 266; 1993, *Physica D* 67, 257; 2003, arXiv:math/0305364.
     Joint refinement by least squares: our own, in the place of the corrections of Šidlichovský &
     Nesvorný 1996, *Celest. Mech. Dyn. Astron.* 65, 137.
     """
     settings = settings_of(count, window, refine)
-    ts, signal = signals_of(ts, signal)
+    ts, signal, eps, state_axes = signals_of(ts, signal)
     check_count(settings, signal)
-    found, _ = analyse(ts, signal, settings)
+    found, _ = analyse(ts, signal, settings, eps, state_axes)
     return raise_on_failure(found) if throw else found
 
 
@@ -167,7 +184,7 @@ def frequency_diffusion(
     **Source** Laskar 1993, *Physica D* 67, 257; Dumas & Laskar 1993, *Phys. Rev. Lett.* 70, 2975.
     """
     settings = settings_of(count, window, True)
-    ts, signal = signals_of(ts, signal)
+    ts, signal, eps, _ = signals_of(ts, signal)
     half = signal.shape[-1] // 2
     halves = jnp.stack([signal[..., :half], signal[..., half : 2 * half]])
     if half < _FEWEST:
@@ -175,7 +192,7 @@ def frequency_diffusion(
     times = jnp.stack([ts[..., :half], ts[..., half : 2 * half]])
     times = times.reshape(2, *(1,) * (halves.ndim - times.ndim), *times.shape[1:])
     check_count(settings, halves)
-    _, raw = analyse(times, halves, settings)
+    _, raw = analyse(times, halves, settings, eps)
     first = raw.frequencies[0, ..., 0]
     size = jnp.abs(raw.amplitudes)
     strong = size[1] >= 0.5 * size[0, ..., :1]
@@ -189,6 +206,19 @@ def frequency_diffusion(
     first, second, rate = (jnp.where(code == 0, x, jnp.nan) for x in (first, second, rate))
     of = FrequencyDiffusion(first, second, rate, with_code(code))
     return raise_on_failure(of) if throw else of
+
+
+class Signals(NamedTuple):
+    """Times (…, N) and signals (*batch, *state, N) in double precision.
+
+    `eps` is the spacing of the floating point numbers as which the times came, over them;
+    `state_axes` how many axes before the last belong to one trajectory.
+    """
+
+    ts: Array
+    signal: Array
+    eps: float
+    state_axes: int
 
 
 class Raw(NamedTuple):
@@ -206,6 +236,8 @@ def settings_of(count: Any, window: Any, refine: Any) -> Settings:
         raise ValueError(
             f"window, the power of Hann's window, must be an integer from 0 to 5, got {window!r}."
         )
+    if not isinstance(refine, bool | np.bool_):
+        raise ValueError(f"refine must be True or False, got {refine!r}.")
     return Settings(int(count), int(window), bool(refine))
 
 
@@ -218,20 +250,22 @@ def check_count(settings: Settings, signal: Array) -> None:
         )
 
 
-def signals_of(ts: Any, signal: Any) -> tuple[Array, Array]:
-    """Times (…, N) and signals (*batch, N), checked; of a `Solution` q − i p."""
+def signals_of(ts: Any, signal: Any) -> Signals:
+    """Times and signals, checked; of a `Solution` q − i p."""
+    state_axes = None
     if isinstance(ts, Solution):
         if signal is not None:
             raise ValueError("a Solution brings its own signal, q − i p: leave the other one out.")
         solution, lead = ts, ts.ts.ndim - 1
+        state_axes = solution.qs.ndim - solution.ts.ndim
         z = _double("the trajectory", solution.qs) - 1j * _double("the trajectory", solution.ps)
         signal, ts = jnp.moveaxis(z, lead, -1), solution.ts
         ts = ts.reshape(*ts.shape[:-1], *(1,) * (signal.ndim - ts.ndim), ts.shape[-1])
     elif signal is None:
         raise ValueError("frequencies(ts, signal) needs a signal, or a Solution in place of both.")
-    ts, signal = _double("ts", ts), _double("signal", signal)
-    if jnp.iscomplexobj(ts):
-        raise TypeError("the times must be real: frequencies(ts, signal) takes the times first.")
+    dtype: Any = getattr(ts, "dtype", np.dtype(float))
+    eps = float(np.finfo(dtype).eps) if dtype.kind == "f" else EPS
+    ts, signal = _real_times("ts", ts), _double("signal", signal)
     if signal.ndim == 0 or ts.ndim == 0 or ts.shape[-1] != signal.shape[-1]:
         raise ValueError(
             f"ts and signal must have one length along their last axis, got shapes {ts.shape} and "
@@ -255,15 +289,23 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array]:
     if not is_traced(ts):
         rows = np.asarray(ts).reshape(-1, ts.shape[-1])
         rows = rows[np.isfinite(rows).all(axis=1)]  # times that failed are a matter of statuses
-        uneven = np.asarray(_unevenness(jnp.asarray(rows))) if len(rows) else np.zeros(1)
+        uneven = np.asarray(_unevenness(jnp.asarray(rows), eps)) if len(rows) else np.zeros(1)
         if not (uneven <= 1).all():
+            steps = np.diff(rows[uneven.argmax()])
+            coarse = f" These are {dtype}: give the times in float64." if eps > EPS else ""
             raise ValueError(
-                "the times are not uniform: of their steps the shortest is "
-                f"{np.diff(rows[uneven.argmax()]).min():.17g} and the longest "
-                f"{np.diff(rows[uneven.argmax()]).max():.17g}. Save with dvi.Save(every=m) on the "
-                "lattice dvi.Uniform(), without final=True."
+                f"the times are not uniform: of their steps the shortest is {steps.min():.17g} and "
+                f"the longest {steps.max():.17g}. Save with dvi.Save(every=m) on the lattice "
+                f"dvi.Uniform(), without final=True.{coarse}"
             )
-    return ts, signal
+    return Signals(ts, signal, eps, min(signal.ndim - 1, 1) if state_axes is None else state_axes)
+
+
+def _real_times(name: str, value: Any) -> Array:
+    value = _double(name, value)
+    if jnp.iscomplexobj(value):
+        raise TypeError("the times must be real: frequencies(ts, signal) takes the times first.")
+    return value
 
 
 def _double(name: str, value: Any) -> Array:
@@ -280,37 +322,62 @@ def _double(name: str, value: Any) -> Array:
     return jnp.asarray(value, jnp.complex128 if value.dtype.kind == "c" else jnp.float64)
 
 
-def _unevenness(ts: Array) -> Array:
-    """Largest deviation from a uniform lattice over what is allowed; NaN for no lattice at all."""
+def _lattice(ts: Array) -> tuple[Array, Array, Array]:
+    """Spacing and centre of the uniform lattice of least squares, and how far times are from it."""
     N = ts.shape[-1]
+    n = np.arange(N).reshape((1,) * (ts.ndim - 1) + (N,)) - (N - 1) / 2
     h = (ts[..., -1:] - ts[..., :1]) / (N - 1)
-    off = jnp.max(
-        jnp.abs(ts - ts[..., :1] - h * np.arange(N).reshape((1,) * (ts.ndim - 1) + (N,))), -1
-    )
+    centre = (ts[..., -1:] + ts[..., :1]) / 2
+    off = ts - centre - h * n  # small, so that the corrections keep all digits
+    change = jnp.sum(off * n, axis=-1, keepdims=True) * (12 / (N * (N**2 - 1)))
+    shift = jnp.mean(off, axis=-1, keepdims=True)
+    away = jnp.max(jnp.abs(off - shift - change * n), axis=-1)
+    return (h + change)[..., 0], (centre + shift)[..., 0], away
+
+
+def _unevenness(ts: Array, eps: Any) -> Array:
+    """Largest deviation from a uniform lattice over what is allowed; NaN for no lattice at all.
+
+    Allowed are running sums in double precision, the rounding of each time to numbers of spacing
+    `eps`, and never more than an eighth of a step.
+    """
+    h, _, away = _lattice(ts)
     size = jnp.max(jnp.abs(ts), axis=-1)
-    allowed = 1e-9 * jnp.abs(h[..., 0]) + 4 * N * EPS * size  # times may be a running sum
-    return jnp.where(h[..., 0] != 0, off / allowed, jnp.nan)
+    allowed = 1e-9 * jnp.abs(h) + (4 * ts.shape[-1] * EPS + 2 * eps) * size
+    return jnp.where(h != 0, away / jnp.minimum(allowed, jnp.abs(h) / 8), jnp.nan)
+
+
+def analyse(
+    ts: Array, signal: Array, settings: Settings, eps: float = EPS, state_axes: int = 0
+) -> tuple[Frequencies, Raw]:
+    """The lines of every signal: those that are sure, and all."""
+    lead, N = signal.shape[:-1], signal.shape[-1]
+    flat = (math.prod(lead), N)  # one program for all shapes of a batch
+    if ts.ndim > 1:
+        ts = jnp.broadcast_to(ts, signal.shape).reshape(flat)
+    of = _analysed(ts, signal.reshape(flat), settings, jnp.asarray(eps))
+    found, raw = jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), of)
+    return dataclasses.replace(found, state_axes=state_axes), raw
 
 
 @eqx.filter_jit
-def analyse(ts: Array, signal: Array, settings: Settings) -> tuple[Frequencies, Raw]:
-    """The lines of every signal: those that are sure, and all."""
-    lead, N = signal.shape[:-1], signal.shape[-1]
+def _analysed(ts: Array, signal: Array, settings: Settings, eps: Array) -> tuple[Frequencies, Raw]:
+    """Of signals (M, N) at times (N,) or (M, N)."""
     ts = jnp.broadcast_to(ts, signal.shape)
-    h = (ts[..., -1] - ts[..., 0]) / (N - 1)
-    flat = signal.reshape(-1, N)
-    lines = jax.vmap(lambda z: lines_of(z, settings))(flat)
-    lines = jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), lines)
-    irregular = ~(_unevenness(ts) <= 1)
+    h, centre, _ = _lattice(ts)
+    N = signal.shape[-1]
+    lines = jax.vmap(lambda z: lines_of(z, settings))(signal)
+    irregular = ~(_unevenness(ts, eps) <= 1)
     code = jnp.where(
         (lines.code != CODE["not_finite"]) & irregular, CODE["irregular_times"], lines.code
     )
 
     scale = 2 / (N * h)
     omega = lines.s * scale[..., None]
-    centre = (ts[..., 0] + ts[..., -1]) / 2
     A = lines.amplitudes * jnp.exp(-1j * omega * centre[..., None])
-    A = A * (1 if jnp.iscomplexobj(signal) else 2)
+    if not jnp.iscomplexobj(signal):
+        back = (h < 0)[..., None]  # Re A e^{iωt} = Re Ā e^{−iωt}
+        omega, A = jnp.where(back, -omega, omega), 2 * jnp.where(back, jnp.conj(A), A)
     raw = Raw(omega, A, code)
     hard = (code > 0) & (code <= len(WITHOUT_NUMBERS))
     sure = lines.sure & ~hard[..., None]
