@@ -1,7 +1,10 @@
 """Frequency analysis: planted tori, orders in the window, statuses, an outside reference."""
 
 import functools
+import re
+import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -122,6 +125,7 @@ def test_near_lines_do_not_bias_one_another(name):
     np.testing.assert_allclose(lines, [-0.7, 1, 1 + bins * BIN], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_without_joint_refinement_they_do():
     z = np.stack([SIGNALS["pair 2"], SIGNALS["pair 1.5"]])
     found = frequencies(TS, z, count=3, refine=False, throw=False)
@@ -150,7 +154,7 @@ def test_noise_is_left_over():
     assert found.residual == pytest.approx(np.sqrt(0.02) / total, rel=0.1)
 
 
-@pytest.mark.parametrize("window", [0, pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("window", [*(pytest.param(w, marks=pytest.mark.slow) for w in (0, 1)), 2])
 def test_the_bias_of_a_line_not_fitted_falls_with_the_window(window):
     """|δω| ∝ T^−(2·window + 2): Laskar 1999."""
     spans = np.repeat([1.0, 2.0, 4.0], 8)  # the spacing grows and the number of samples stays
@@ -254,6 +258,7 @@ def test_against_the_frequency_analysis_of_rebound():
     assert np.abs(ours - OMEGA).max() < 1e-3 * np.abs(omega / 0.5 - OMEGA).max()
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_change_nothing():
     z = np.stack([SIGNALS[name] for name in ("successful", "noisy", "pair 2")])
     eager = frequencies(TS, z, count=COUNT)
@@ -380,3 +385,18 @@ def test_single_precision_alone_is_refused(monkeypatch):
     monkeypatch.setattr(sys.modules["dvi_jax.dynamics.frequencies"], "x64_enabled", lambda: False)
     with pytest.raises(TypeError, match="jax_enable_x64"):
         frequencies(TS.astype(np.float32), torus().astype(np.complex64))
+
+
+@pytest.mark.slow
+def test_the_quick_start_of_the_page_runs():
+    page = Path(__file__).parents[1] / "docs" / "frequencies.md"
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+    assert len(blocks) == 1
+    code = blocks[0] + "\nprint(float(tori.actions @ [1, 1]), *tori.status.split())\n"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert out.returncode == 0, out.stderr
+    first, last = out.stdout.strip().splitlines()
+    assert first.count("successful") == 4
+    total, status = last.split()
+    assert status == "successful"
+    assert float(total) == pytest.approx(0.0865, rel=0.01)
