@@ -353,8 +353,7 @@ def analyse(
     """The lines of every signal: those that are sure, and all."""
     lead, N = signal.shape[:-1], signal.shape[-1]
     flat = (math.prod(lead), N)  # one program for all shapes of a batch
-    if ts.ndim > 1:
-        ts = jnp.broadcast_to(ts, signal.shape).reshape(flat)
+    ts = jnp.broadcast_to(ts, signal.shape).reshape(flat)
     of = _analysed(ts, signal.reshape(flat), settings, jnp.asarray(eps))
     found, raw = jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), of)
     return dataclasses.replace(found, state_axes=state_axes), raw
@@ -362,8 +361,7 @@ def analyse(
 
 @eqx.filter_jit
 def _analysed(ts: Array, signal: Array, settings: Settings, eps: Array) -> tuple[Frequencies, Raw]:
-    """Of signals (M, N) at times (N,) or (M, N)."""
-    ts = jnp.broadcast_to(ts, signal.shape)
+    """Of signals (M, N) at times (M, N)."""
     h, centre, _ = _lattice(ts)
     N = signal.shape[-1]
     lines = jax.vmap(lambda z: lines_of(z, settings))(signal)
