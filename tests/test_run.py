@@ -192,7 +192,11 @@ REFUSED = [
     (KEPLER + 'steps = 5\n[state]\ndate = "1950-01-01"', "state.date:", "solar_system"),
     (KEPLER + "steps = 5\n[args]\nk = 1.0", "args.k: there is no such", "did you mean K?"),
     (KEPLER + 'steps = 5\n[args]\nK = "one"', "args: {'K': 'one'}", "numbers"),
-    (KEPLER + "steps = 5\n[args]\nK = [1.0, 2.0]", "must return a real scalar", "args that fit"),
+    (
+        KEPLER + "steps = 5\n[args]\nK = [1.0, 2.0]",
+        "args: K must be one real number, got an array of shape (2,)",
+        "args that fit",
+    ),
     (KEPLER + 'steps = 5\n[observables]\na = "enrgy"', "observables.a: 'enrgy'", "mean energy?"),
     (KEPLER + 'steps = 5\n[observables]\na = "Max(energy)"', "observables.a: 'Max(", "MaxDrift"),
     (KEPLER + 'steps = 5\n[observables]\na = "own.py:number"', "own.py:number' is int", "function"),

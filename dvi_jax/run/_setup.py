@@ -222,6 +222,8 @@ def check_start(problem: systems.Problem | None, q0: Any, p0: Any, args: Any) ->
     if problem is not None and problem.check is not None:
         try:
             problem.check(q0, p0, args)
+        except systems.ParameterError as error:
+            raise InputError("args", str(error), "args that fit the system") from None
         except ValueError as error:
             raise InputError(
                 "state", str(error), "a start that the system can go on from"

@@ -16,6 +16,10 @@ from .._system import System
 from ..symmetry.generators import Generator
 
 
+class ParameterError(ValueError):
+    """A parameter in args that cannot be meant."""
+
+
 @dataclass(frozen=True)
 class Adiabatic:
     """What is known of a quantity that is nearly kept.
@@ -170,7 +174,7 @@ def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], wante
 def number(args: Any, name: str) -> float:
     """The parameter of this name.
 
-    **Raises** `ValueError` where it is missing, or anything but one real number.
+    **Raises** `ParameterError` where it is missing, or anything but one real number.
     """
     value = parameter(args, name)
     try:
@@ -179,18 +183,18 @@ def number(args: Any, name: str) -> float:
         seen = np.asarray(None)
     if seen.shape != () or seen.dtype.kind not in "iuf":
         what = f"an array of shape {seen.shape}" if seen.shape else repr(value)
-        raise ValueError(f"{name} must be one real number, got {what}.")
+        raise ParameterError(f"{name} must be one real number, got {what}.")
     return float(seen)
 
 
 def parameter(args: Any, name: str) -> Any:
     """The parameter of this name, whatever it is.
 
-    **Raises** `ValueError` where it is missing, with those that are there.
+    **Raises** `ParameterError` where it is missing, with those that are there.
     """
     if not isinstance(args, Mapping) or name not in args:
         there = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
-        raise ValueError(
+        raise ParameterError(
             f"the parameter {name} is missing: args must be a dict that has {name!r}; "
             f"got {f'one with {there}' if there else repr(args)}."
         )
@@ -200,21 +204,21 @@ def parameter(args: Any, name: str) -> Any:
 def check_finite(args: Any, *names: str) -> None:
     """Refuse parameters of these names that are not finite numbers.
 
-    **Raises** `ValueError` with the name and the value.
+    **Raises** `ParameterError` with the name and the value.
     """
     for name in names:
         if not math.isfinite(value := number(args, name)):
-            raise ValueError(f"{name} must be finite, got {value}.")
+            raise ParameterError(f"{name} must be finite, got {value}.")
 
 
 def check_positive(args: Any, *names: str) -> None:
     """Refuse parameters of these names that are not positive and finite numbers.
 
-    **Raises** `ValueError` with the name and the value.
+    **Raises** `ParameterError` with the name and the value.
     """
     for name in names:
         if not ((value := number(args, name)) > 0 and math.isfinite(value)):
-            raise ValueError(f"{name} must be positive and finite, got {value}.")
+            raise ParameterError(f"{name} must be positive and finite, got {value}.")
 
 
 def check_nonzero(args: Any, without: str, *names: str) -> None:
@@ -222,29 +226,29 @@ def check_nonzero(args: Any, without: str, *names: str) -> None:
 
     - `without`: what there is none of at zero, a sentence.
 
-    **Raises** `ValueError` with the name, the value and that sentence.
+    **Raises** `ParameterError` with the name, the value and that sentence.
     """
     check_finite(args, *names)
     for name in names:
         if number(args, name) == 0:
-            raise ValueError(f"{name} is 0: {without}")
+            raise ParameterError(f"{name} is 0: {without}")
 
 
 def check_vector(args: Any, size: int, *names: str) -> None:
     """Refuse parameters of these names that are not `size` finite numbers.
 
-    **Raises** `ValueError` with the name and the shape or the value.
+    **Raises** `ParameterError` with the name and the shape or the value.
     """
     for name in names:
         given = parameter(args, name)
         try:
             value = np.asarray(given, float)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{name} must be {size} numbers: {error}") from None
+            raise ParameterError(f"{name} must be {size} numbers: {error}") from None
         if value.shape != (size,):
-            raise ValueError(f"{name} must have shape ({size},), got {value.shape}.")
+            raise ParameterError(f"{name} must have shape ({size},), got {value.shape}.")
         if not np.isfinite(value).all():
-            raise ValueError(f"{name} must be finite, got {value}.")
+            raise ParameterError(f"{name} must be finite, got {value}.")
 
 
 def check_count(name: str, count: Any, least: int, wanted: str) -> None:
