@@ -268,6 +268,12 @@ def test_sections_that_cannot_be_meant(make, message):
         make(*starts(3))
 
 
+def test_a_single_start_is_told_how_it_is_given():
+    with pytest.raises(TypeError) as error:
+        dvi.poincare_section(HENON.system, HENON.q0, HENON.p0, plane, h=0.1, num_steps=9)
+    assert "Give a single start as q0[None], p0[None]" in "".join(error.value.__notes__)
+
+
 # Return maps
 
 RETURN = dvi.ReturnMap(HENON.system, plane, h=0.02, num_steps=400, method=dvi.Yoshida(4))

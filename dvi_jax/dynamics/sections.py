@@ -182,9 +182,15 @@ def poincare_section(
                 f"{length}."
             )
     start = (as_scalar("t0", t0, q.dtype), _Varied(q), _Varied(p))
-    found = _orbits(
-        settings, start, as_scalar("h", h, q.dtype, zero_allowed=False), epsilon, args, q.shape[0]
-    )
+    h = as_scalar("h", h, q.dtype, zero_allowed=False)
+    try:
+        found = _orbits(settings, start, h, epsilon, args, q.shape[0])
+    except Exception as error:
+        error.add_note(
+            f"(q0 and p0 have the orbits in front: of shape {q.shape} they are {q.shape[0]} orbits "
+            f"with q0 of shape {q.shape[1:]}. Give a single start as q0[None], p0[None].)"
+        )
+        raise
     return _raise_on_failure(found, crossings, num_steps) if throw else found
 
 
