@@ -475,6 +475,7 @@ def test_running_values_with_progress_and_in_few_steps():
     assert np.max(np.abs(whole - pieces)) < 1e-12
 
 
+@pytest.mark.slow
 def test_batches_and_layouts():
     q, p = (np.array([a, b]) for a, b in zip(REGULAR, CHAOTIC, strict=True))
     kinds = (dvi.MEGNO(), dvi.LyapunovSpectrum(), dvi.GALI(3, log10=True))
@@ -555,6 +556,7 @@ def test_gradients_of_an_indicator():
     assert abs(by_differences) > 1e-3
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_steps():
     kinds = (dvi.MEGNO(), dvi.LyapunovSpectrum(), dvi.GALI(4))
 

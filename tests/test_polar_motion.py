@@ -291,6 +291,7 @@ def test_eight_years_are_exact_enough_to_fit():
     assert distance(strang, shorter) < 0.01 * MAS < 0.03 * MAS < distance(strang, ARGS)
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_parameters():
     """Forward and reverse through a run of two years, beside those of the closed form."""
 
