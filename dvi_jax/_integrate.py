@@ -123,11 +123,7 @@ def integrate(
     to round-off and energy to O(h^order) without drift. Gradients are those of the discrete
     map, by the implicit function theorem through each solve.
     """
-    if not isinstance(system, System):
-        raise TypeError(
-            f"system must be a dvi.System, got {type(system).__name__}. Wrap the discrete "
-            "Hamiltonian: dvi.System(H_D, force=W)."
-        )
+    check_system(system)
     for name, value, kind in (
         ("method", method, Method),
         ("lattice", lattice, Lattice),
@@ -354,6 +350,17 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
         f"{RESULTS[result]} {kept}",
         solution,
     )
+
+
+def check_system(system: Any) -> None:
+    """Refuse what is no `System`, with what it may have been meant for."""
+    if isinstance(system, System):
+        return
+    inner = getattr(system, "system", None)
+    hint = "Wrap the discrete Hamiltonian: dvi.System(H_D, force=W)."
+    if isinstance(inner, System):
+        hint = "Of a problem of the library take its system: problem.system."
+    raise TypeError(f"system must be a dvi.System, got {type(system).__name__}. {hint}")
 
 
 def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:

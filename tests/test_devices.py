@@ -58,6 +58,36 @@ def test_two_devices_give_what_one_does():
     assert devices == 2
 
 
+HOST_FIRST = """
+import socket, sys
+import jax
+from dvi_jax import systems
+from dvi_jax.symmetry import library
+for make in systems.LIBRARY.values():
+    try:
+        make()
+    except systems.solar_system.EphemerisMissing:
+        pass
+library.boost([1.0, 0.0], 2.0)
+if sys.argv[1] == "touched":
+    jax.device_count()
+with socket.socket() as free:
+    free.bind(("127.0.0.1", 0))
+    address = f"127.0.0.1:{free.getsockname()[1]}"
+jax.distributed.initialize(address, 1, 0)  # refuses once a device was asked for
+print("together")
+"""
+
+
+def test_the_library_can_be_made_before_the_hosts_are_joined():
+    """Importing the package and making its problems starts no device."""
+    out = run([sys.executable, "-c", HOST_FIRST, "not touched"], JAX_ENABLE_X64="1")
+    assert out.stdout.split() == ["together"]
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        run([sys.executable, "-c", HOST_FIRST, "touched"], JAX_ENABLE_X64="1")
+    assert "must be called before" in failed.value.stderr
+
+
 def test_one_device_and_what_is_refused():
     x, c = jnp.arange(6.0).reshape(2, 3), jnp.asarray(2.0)
     doubled = dvi.over_devices(lambda x, c: c * x, in_axes=(-1, None), out_axes=1)

@@ -1197,3 +1197,19 @@ def test_the_table_in_the_documentation_says_the_same(name):
     holds = {None: "–", 0.0: "yes", 1.0: "ε = 1"}
     assert exact.strip() == holds[made.exact_epsilon if made.exact else None]
     assert source.strip() == made.source
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: systems.magnetic_mirror(length=-1.0),
+            "length must be positive and finite, got -1",
+        ),
+        (lambda: systems.magnetic_mirror(distance=np.inf), "distance must be finite, got inf"),
+        (lambda: systems.dipole_field(radius=0.0), "radius must be positive and finite, got 0"),
+    ],
+)
+def test_fields_that_cannot_be_made(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -257,6 +257,12 @@ def test_an_orbit_that_escapes():
         (lambda q, p: dvi.poincare_section(
             HENON.system, q, p, plane, h=0.1, num_steps=9, crossings=0),
          "crossings must be a positive whole number, got 0"),
+        (lambda q, p: dvi.poincare_section(HENON, q, p, plane, h=0.1, num_steps=9),
+         "must be a dvi.System, got Problem.*problem.system"),
+        (lambda q, p: dvi.ReturnMap(HENON, plane, h=0.1, num_steps=9), "problem.system"),
+        (lambda q, p: dvi.bifurcation(
+            HENON.system, q[0], p[0], plane, epsilon=[0.0, np.nan], h=0.1, num_steps=9),
+         "epsilon must be finite, got .* nan"),
         (lambda q, p: dvi.stroboscope(1.0, np.nan), "phase of a stroboscope must be a time"),
         (lambda q, p: dvi.stroboscope(0.0), "period of a stroboscope must be a positive"),
         (lambda q, p: dvi.ReturnMap(HENON.system, plane, h=0.1, num_steps=9, returns=0),

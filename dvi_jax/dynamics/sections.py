@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 
 from .._arithmetic import Arithmetic, FloatingPoint
 from .._compat import is_traced
-from .._integrate import as_parameter, as_scalar, integrate, start_state
+from .._integrate import as_parameter, as_scalar, check_system, integrate, start_state
 from .._results import RESULTS, status_name
 from .._solution import Save
 from .._system import System
@@ -164,6 +164,7 @@ def poincare_section(
     **Source** Poincaré 1892; the crossing inside of a step: our own, compare Hénon 1982,
     *Physica D* 5, 412.
     """
+    check_system(system)
     q, p = start_state(q0, p0)
     if q.ndim == 0 or q.shape[0] == 0:
         raise ValueError(
@@ -186,10 +187,11 @@ def poincare_section(
     try:
         found = _orbits(settings, start, h, epsilon, args, q.shape[0])
     except Exception as error:
-        error.add_note(
-            f"(q0 and p0 have the orbits in front: of shape {q.shape} they are {q.shape[0]} orbits "
-            f"with q0 of shape {q.shape[1:]}. Give a single start as q0[None], p0[None].)"
-        )
+        if any("called with q0 of shape" in note for note in getattr(error, "__notes__", ())):
+            error.add_note(
+                f"(q0 and p0 have the orbits in front: of shape {q.shape} they are {q.shape[0]} "
+                f"orbits of q0 of shape {q.shape[1:]}. Give a single start as q0[None], p0[None].)"
+            )
         raise
     return _raise_on_failure(found, crossings, num_steps) if throw else found
 
@@ -232,6 +234,7 @@ def bifurcation(
 
     **Raises** as `poincare_section`.
     """
+    check_system(system)
     q, p = start_state(q0, p0)
     settings = _Settings(
         system, _section(g, direction, crossings, skip), method, newton, arithmetic, layout, stop,
@@ -316,6 +319,7 @@ class ReturnMap(eqx.Module):
     newton: RootSolver = PicardThenNewton()
 
     def __check_init__(self):
+        check_system(self.system)
         Section(self.g, self.direction, _positive("returns", self.returns))
         _positive("num_steps", self.num_steps)
 
@@ -356,6 +360,8 @@ def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
             raise ValueError(
                 f"{name} must be a number or a one-dimensional array, got shape {values.shape}."
             )
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} must be finite, got {values}.")
         found[name] = len(values)
         return _Varied(jnp.asarray(values))
 

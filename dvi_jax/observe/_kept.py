@@ -14,6 +14,7 @@ from ..engine.signature import accepts
 from ._reductions import Reduction
 
 _UNLESS_FIRST = 2
+"""In the first place of a row: a step to be kept, but in the first step of a run."""
 
 
 class Start(NamedTuple):

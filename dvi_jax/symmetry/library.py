@@ -64,7 +64,7 @@ def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
     if not (a.any() or b.any() or c.any()):
         raise ValueError("a scaling needs a weight other than zero.")
     weights = enumerate((a, b, c))
-    return Generator(*(_Scaled(i, jnp.asarray(w)) if w.any() else None for i, w in weights))
+    return Generator(*(_Scaled(i, w) if w.any() else None for i, w in weights))
 
 
 def boost(direction: Any, mass: Any = 1.0) -> Generator:
@@ -81,7 +81,7 @@ def boost(direction: Any, mass: Any = 1.0) -> Generator:
     if not (masses > 0).all():
         raise ValueError(f"masses must be positive, got {mass!r}.")
     v = _direction(direction)
-    return Generator(xi=_Boosted(v, None), eta=_Boosted(v, jnp.asarray(masses)))
+    return Generator(xi=_Boosted(v, None), eta=_Boosted(v, masses))
 
 
 def hamiltonian_flow(function: Callable[..., Any]) -> Generator:
@@ -115,7 +115,7 @@ def _one(t, q, p, args):
 
 
 class _Constant(eqx.Module):
-    value: Array
+    value: np.ndarray
 
     def __call__(self, t, q, p, args):
         return _fitted("direction", self.value, q)
@@ -141,7 +141,7 @@ class _Turned(eqx.Module):
 
 class _Scaled(eqx.Module):
     place: int = eqx.field(static=True)
-    weight: Array
+    weight: np.ndarray
 
     def __call__(self, t, q, p, args):
         value = (t, q, p)[self.place]
@@ -149,8 +149,8 @@ class _Scaled(eqx.Module):
 
 
 class _Boosted(eqx.Module):
-    direction: Array
-    mass: Array | None
+    direction: np.ndarray
+    mass: np.ndarray | None
 
     def __call__(self, t, q, p, args):
         v = _fitted("direction", self.direction, q)
@@ -187,20 +187,21 @@ class _Bracket(eqx.Module):
 
 
 def _finite(name: str, value: Any) -> np.ndarray:
+    """As an array of NumPy: a generator can be made before JAX has started its devices."""
     array = np.asarray(value, float)
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite, got {value!r}.")
     return array
 
 
-def _direction(value: Any) -> Array:
+def _direction(value: Any) -> np.ndarray:
     direction = _finite("direction", value)
     if not direction.any():
         raise ValueError("the direction must not be zero.")
-    return jnp.asarray(direction)
+    return direction
 
 
-def _fitted(name: str, value: Array, q: State) -> Array:
+def _fitted(name: str, value: np.ndarray, q: State) -> Array:
     """The value with the shape of q, if that can be."""
     try:
         return jnp.broadcast_to(value, q.shape).astype(q.dtype)

@@ -110,9 +110,12 @@ def dipole_field(radius: float = 50.0) -> Problem:
     - `radius`: R, over the gyroradius; the equations in units of Störmer's length depend on it by
       the start alone.
 
+    **Raises** `ValueError` for a radius that is not positive.
+
     **Source** Störmer 1907, *Arch. Sci. Phys. Nat.* 24, 5; Northrop 1963, *The Adiabatic Motion of
     Charged Particles*; field, start and step are ours.
     """
+    check_positive({"radius": radius}, "radius")
     args = {"charge": 1.0, "mass": 1.0, "B0": 1.0, "radius": float(radius)}
     q0, v0 = np.array([float(radius), 0.0, 0.0]), np.array([0.6, -0.8, 1.0])
     A = np.array([0.0, -args["B0"] * args["radius"], 0.0])  # `vector_potential` there

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from .._system import System
 from ..symmetry.library import rotation, time_translation
 from . import _guiding_centre as guiding_centre
-from ._problem import Adiabatic, Problem, check_nonzero, check_positive, check_shape
+from ._problem import Adiabatic, Problem, check_finite, check_nonzero, check_positive, check_shape
 
 
 def vector_potential(q, args):
@@ -118,9 +118,14 @@ def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
 
     - args: `charge` e, `mass` m, `B0`, `length` ℓ.
 
+    **Raises** `ValueError` for a length that is not positive, or a distance that is not finite.
+
     **Source** equations and adiabatic invariant: Northrop 1963, *The Adiabatic Motion of Charged
     Particles*.
     """
+    given = {"length": length, "distance": distance}
+    check_positive(given, "length")
+    check_finite(given, "distance")
     x, vy, vz = distance + 1, -1.0, 0.8
     return Problem(
         name="magnetic_mirror",
