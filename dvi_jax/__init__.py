@@ -22,7 +22,9 @@ from ._integrate import integrate as integrate
 from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._reversible import Reversible as Reversible
 from ._solution import Save as Save, Solution as Solution
+from ._step import Equations as Equations, StepInfo as StepInfo
 from ._system import System as System
+from ._types import Interval as Interval
 from .dynamics import (
     FREQUENCY_RESULTS as FREQUENCY_RESULTS,
     SECTION_RESULTS as SECTION_RESULTS,
@@ -92,6 +94,7 @@ from .lattices import (
     Given as Given,
     Lattice as Lattice,
     LatticeCondition as LatticeCondition,
+    Place as Place,
     TimeTransformed as TimeTransformed,
     Uniform as Uniform,
     Variational as Variational,

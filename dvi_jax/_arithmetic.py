@@ -150,8 +150,8 @@ class FixedPoint(Arithmetic):
                 "or arithmetic=dvi.Compensated(), which works with every method."
             )
         if not (
-            method._needs_no_solve(equations, interval, q0)
-            and method._inverse_needs_no_solve(equations, interval, q0)
+            method.needs_no_solve(equations, interval, q0)
+            and method.inverse_needs_no_solve(equations, interval, q0)
         ):
             raise ValueError(
                 "FixedPoint needs steps without a solve, forwards and backwards: here p1 enters "

@@ -318,7 +318,7 @@ def _rebuilt(
     equations = _solved_by(task, on_trust)
     group = largest_divisor(count, LOOKS)
     solves = not (
-        task.method._inverse_needs_no_solve(
+        task.method.inverse_needs_no_solve(
             task.equations, task.interval(jnp.asarray(0, jnp.int32)), end[0]
         )
     )

@@ -130,7 +130,7 @@ class _Segment:
     def __init__(self, task: Task, carry: Carry):
         self.task = task
         first = task.interval(jnp.asarray(0, jnp.int32))
-        self.solves = not task.method._needs_no_solve(task.equations, first, carry.q)
+        self.solves = not task.method.needs_no_solve(task.equations, first, carry.q)
         self.depends = _depend_on_the_state(task, carry)
 
     def __call__(self, steps: Callable, state: tuple[Carry, Array], first: Array):

@@ -45,11 +45,11 @@ class Altered(dvi.Method):
             return self.method.inverse(equations, interval, q1, p1)
         return self.own_inverse(self.method, equations, interval, q1, p1)
 
-    def _needs_no_solve(self, equations, interval, q):
-        return self.method._needs_no_solve(equations, interval, q)
+    def needs_no_solve(self, equations, interval, q):
+        return self.method.needs_no_solve(equations, interval, q)
 
-    def _inverse_needs_no_solve(self, equations, interval, q):
-        return self.method._inverse_needs_no_solve(equations, interval, q)
+    def inverse_needs_no_solve(self, equations, interval, q):
+        return self.method.inverse_needs_no_solve(equations, interval, q)
 
 
 def altered(

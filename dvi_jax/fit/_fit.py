@@ -7,14 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import optax
-import optimistix as optx
 from jaxtyping import PyTree
 
 from .._compat import x64_enabled
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Observations, as_arcs
-from .optimise import BFGS, LEVENBERG_MARQUARDT
 from .outcome import result_of
 from .problem import Problem
 from .progress import FitProgress, shown
@@ -22,14 +19,8 @@ from .result import FitResult
 from .results import FIT_RESULTS, FitError
 from .run import Run, identity
 from .shooting import MultipleShooting, Segments, SingleShooting
+from .solvers import goes_by_optax, is_gauss_newton, solver_for
 from .stages import MANY, by_gradient, in_segments, least_squares
-
-_MINIMISERS = (
-    optx.OptaxMinimiser
-    | optx.AbstractQuasiNewton
-    | optx.AbstractLBFGS
-    | optx.AbstractGradientDescent
-)
 
 
 def fit(
@@ -110,9 +101,11 @@ def fit(
             f"shooting must be a dvi.SingleShooting() or a dvi.MultipleShooting(n): {shooting!r}."
         )
     steps = 2000 if max_steps is None else max_steps
-    solver = _solver(optimiser, problem, steps if isinstance(steps, int) else 2000)
-    is_optax = isinstance(solver, optx.OptaxMinimiser)
-    is_vector = isinstance(solver, optx.AbstractGaussNewton)
+    is_residuals = isinstance(problem.loss, Loss)
+    enough = steps if isinstance(steps, int) else 2000
+    solver = solver_for(optimiser, is_residuals, problem.size > MANY, enough)
+    is_optax = goes_by_optax(solver)
+    is_vector = is_gauss_newton(solver)
     if not is_optax:
         problem.check_count()
     if max_steps is None:
@@ -142,34 +135,6 @@ def fit(
         f"{found.loss:.6g}). {FIT_RESULTS[status]} With throw=False what was found is returned "
         "with its status; here it is the `fit` attribute of this error.",
         found,
-    )
-
-
-def _solver(optimiser: Any, problem: Problem, steps: int) -> Any:
-    """The optimistix solver that is meant."""
-    residuals = isinstance(problem.loss, Loss)
-    if optimiser is None:
-        if problem.size > MANY:
-            rate = optax.warmup_cosine_decay_schedule(1e-5, 3e-3, max(steps // 20, 1), steps, 1e-5)
-            optimiser = optax.adam(rate)
-        elif residuals:
-            return LEVENBERG_MARQUARDT
-        else:
-            return BFGS
-    if isinstance(optimiser, optax.GradientTransformation):
-        return optx.OptaxMinimiser(optimiser, rtol=0.0, atol=0.0)
-    if isinstance(optimiser, optx.AbstractGaussNewton):
-        if not residuals:
-            raise ValueError(
-                "dvi.Likelihood has no residual vector: take a minimiser such as "
-                "optimistix.BFGS(rtol=1e-10, atol=1e-10), or leave optimiser out."
-            )
-        return optimiser
-    if isinstance(optimiser, _MINIMISERS):
-        return optimiser
-    raise TypeError(
-        "optimiser must be None, a least-squares solver or minimiser of optimistix, or a gradient "
-        f"transformation of optax, got {optimiser!r}."
     )
 
 

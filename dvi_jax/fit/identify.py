@@ -15,12 +15,13 @@ from .library import KEY, ForceLibrary, with_force
 from .losses import LeastSquares, Loss
 from .model import specification
 from .observations import Observations, as_arcs
-from .optimise import LEVENBERG_MARQUARDT, Evaluation, LeastSquaresStage
+from .optimise import Evaluation, LeastSquaresStage
 from .parameters import Prior
 from .problem import Problem
 from .result import FitResult, with_error
 from .results import FIT_RESULTS, FitError
 from .shooting import MultipleShooting, SingleShooting
+from .solvers import levenberg_marquardt
 from .uncertainty import Uncertainty, in_words, uncertainty
 
 _REFIT = 30
@@ -362,7 +363,7 @@ class _Search:
         self.where = _places(problem, library)
         usual = np.log(problem.count) + 2 * np.log(len(library))
         self.penalty = float(usual if penalty is None else penalty)
-        self.stage = LeastSquaresStage(self._evaluate, LEVENBERG_MARQUARDT)
+        self.stage = LeastSquaresStage(self._evaluate, levenberg_marquardt())
         self.path: list[Removal] = []
         self.undetermined: list[str] = []
         self.best = problem.space.to_u(problem.start)

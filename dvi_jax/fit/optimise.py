@@ -9,18 +9,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array
 
 from .results import FIT_RESULTS
+from .solvers import goes_by_optax
 
 _STIFFNESS = 30.0
 """Length of the columns of the scaled Jacobian. Optimistix damps with 1 to begin with, so that
 this is Marquardt's 1e-3 of the squared columns."""
-
-LEVENBERG_MARQUARDT = optx.LevenbergMarquardt(rtol=1e-14, atol=1e-300)
-BFGS = optx.BFGS(rtol=1e-10, atol=1e-10)
-# One object each, so that all fits share what is compiled for it. How they end is decided below.
 
 _HOPELESS = 12
 """Rejected steps in a row after which no step is expected to help."""
@@ -292,7 +288,7 @@ class ScalarStage:
             raise TypeError(f"{type(self.solver).__name__} does not tell the loss of its steps.")
         if resume is not None:
             state = _with_leaves(state, resume.leaves)
-        is_optax = isinstance(self.solver, optx.OptaxMinimiser)
+        is_optax = goes_by_optax(self.solver)
         last, still, rejected = (np.inf, 0, 0) if resume is None else resume.memory
         status = "" if resume is None else resume.status
         while not status and done < max_steps:

@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array
 
 from .._integrate import integrate
@@ -261,6 +260,8 @@ def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.
 
     if arc.observe == "state":
         return along(flat)
+    import optimistix as optx  # here, so that importing the package does not import it
+
     q, v = along(flat), along(np.gradient(flat, ts, axis=0))
     shape = np.shape(spec["q0"])
     system, args, epsilon = spec["system"], spec.get("args"), spec.get("epsilon", 0.0)

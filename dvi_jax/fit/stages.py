@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array
 
 from .horizons import suitable_horizon
@@ -16,6 +15,7 @@ from .problem import Problem
 from .results import FIT_RESULTS
 from .run import Run
 from .shooting import Segments
+from .solvers import goes_by_optax
 from .uncertainty import null_space
 
 MANY = 400
@@ -94,7 +94,7 @@ def _up_to(problem: Problem, whole: Evaluation, horizon: float) -> Evaluation:
 def by_gradient(run: Run, u: np.ndarray, solver: Any, wanted, batch, seed: int, units: bool):
     """The same by a minimiser of the scalar loss."""
     problem = run.problem
-    is_optax = isinstance(solver, optx.OptaxMinimiser)
+    is_optax = goes_by_optax(solver)
 
     # Per value, so that a learning rate means the same for any amount of data.
     stage = ScalarStage(problem.core, float(problem.count) if is_optax else 1.0, solver)

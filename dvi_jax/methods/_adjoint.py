@@ -49,8 +49,8 @@ class Adjoint(Method):
     def inverse(self, equations, interval, q1, p1):
         return self.method.step(equations, interval.reversed(), q1, p1)
 
-    def _needs_no_solve(self, equations, interval, q) -> bool:
-        return self.method._inverse_needs_no_solve(equations, interval, q)
+    def needs_no_solve(self, equations, interval, q) -> bool:
+        return self.method.inverse_needs_no_solve(equations, interval, q)
 
-    def _inverse_needs_no_solve(self, equations, interval, q) -> bool:
-        return self.method._needs_no_solve(equations, interval, q)
+    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
+        return self.method.needs_no_solve(equations, interval, q)

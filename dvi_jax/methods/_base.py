@@ -32,12 +32,12 @@ class Method(eqx.Module):
         """(q1, p1) at interval.t1 → (q0, p0) at interval.t0: what `step` came from."""
 
     @abc.abstractmethod
-    def _needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool: ...
+    def needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
+        """Whether `step` is explicit for these equations; `Equations` has the parts to ask."""
 
     @abc.abstractmethod
-    def _inverse_needs_no_solve(
-        self, equations: Equations, interval: Interval, q: State
-    ) -> bool: ...
+    def inverse_needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
+        """Whether `inverse` is."""
 
     def is_explicit(self, system: System, q: State | None = None, args: Args = None) -> bool:
         """Whether a step of this method on `system` needs no solve; read from the jaxpr.
@@ -52,7 +52,7 @@ class Method(eqx.Module):
 
         def probe(t0, t1, q, epsilon):
             equations = Equations(system, epsilon, args)
-            found.append(self._needs_no_solve(equations, Interval(t0, t1, t1), q))
+            found.append(self.needs_no_solve(equations, Interval(t0, t1, t1), q))
             return t0
 
         try:

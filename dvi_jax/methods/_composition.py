@@ -99,12 +99,12 @@ class CompositionMethod(Method):
         pairs = list(zip(parts[0::2], parts[1::2], strict=False))
         return pairs, parts[-1] if len(parts) % 2 else None
 
-    def _needs_no_solve(self, equations, interval, q) -> bool:
-        forwards = self.base._needs_no_solve(equations, interval, q)
-        return forwards and self.base._inverse_needs_no_solve(equations, interval, q)
+    def needs_no_solve(self, equations, interval, q) -> bool:
+        forwards = self.base.needs_no_solve(equations, interval, q)
+        return forwards and self.base.inverse_needs_no_solve(equations, interval, q)
 
-    def _inverse_needs_no_solve(self, equations, interval, q) -> bool:
-        return self._needs_no_solve(equations, interval, q)
+    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
+        return self.needs_no_solve(equations, interval, q)
 
 
 def _each(body: Callable, state: Any, pairs: list) -> Any:

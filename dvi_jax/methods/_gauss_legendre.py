@@ -110,8 +110,8 @@ class GaussLegendre(Method):
     def inverse(self, equations, interval, q1, p1):
         return self.step(equations, interval.reversed(), q1, p1)
 
-    def _needs_no_solve(self, equations, interval, q) -> bool:
+    def needs_no_solve(self, equations, interval, q) -> bool:
         return False
 
-    def _inverse_needs_no_solve(self, equations, interval, q) -> bool:
+    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
         return False

@@ -154,7 +154,7 @@ class LobattoIIIAIIIB(Method):
             return Q, momenta(Q, known[1])
 
         start = tuple(jnp.broadcast_to(z, (s, *z.shape)) for z in (q0, p0))
-        if self._needs_no_solve(equations, interval, q0):  # one sweep finds P_1 = P_2
+        if self.needs_no_solve(equations, interval, q0):  # one sweep finds P_1 = P_2
             no_residual = jnp.zeros((), jnp.finfo(q0.dtype).dtype)
             x = unknowns(*sweep(0, start))
             info = RootInfo(jnp.asarray(0, jnp.int32), no_residual, jnp.asarray(True))
@@ -171,11 +171,11 @@ class LobattoIIIAIIIB(Method):
     def inverse(self, equations, interval, q1, p1):
         return self.step(equations, interval.reversed(), q1, p1)
 
-    def _needs_no_solve(self, equations, interval, q) -> bool:
+    def needs_no_solve(self, equations, interval, q) -> bool:
         separable = equations.step_is_explicit(interval, q) and equations.inverse_is_explicit(
             interval, q
         )
         return self.stages == 2 and separable
 
-    def _inverse_needs_no_solve(self, equations, interval, q) -> bool:
-        return self._needs_no_solve(equations, interval, q)
+    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
+        return self.needs_no_solve(equations, interval, q)

@@ -53,8 +53,8 @@ class RungeKutta4(Method):
             "reversible gradient: use a variational method, or adjoint=dvi.Checkpointed()."
         )
 
-    def _needs_no_solve(self, equations, interval, q):
+    def needs_no_solve(self, equations, interval, q):
         return True
 
-    def _inverse_needs_no_solve(self, equations, interval, q):
+    def inverse_needs_no_solve(self, equations, interval, q):
         return False

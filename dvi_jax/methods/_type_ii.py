@@ -29,8 +29,8 @@ class TypeII(Method):
     def inverse(self, equations, interval, q1, p1):
         return inverse_step(equations, interval, q1, p1)
 
-    def _needs_no_solve(self, equations, interval, q):
+    def needs_no_solve(self, equations, interval, q):
         return equations.step_is_explicit(interval, q)
 
-    def _inverse_needs_no_solve(self, equations, interval, q):
+    def inverse_needs_no_solve(self, equations, interval, q):
         return equations.inverse_is_explicit(interval, q)

@@ -1,0 +1,268 @@
+"""The reference, from the docstrings: a page for each room of the package.
+
+The docstrings are Markdown, which Sphinx's own autodoc does not read; here each public name becomes
+a `py:function` or `py:class` of MyST with its docstring inside. A name in code font anywhere in the
+documentation, such as ``dvi.Save``, leads to its entry.
+"""
+
+import inspect
+import re
+import types
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import dvi_jax
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.transforms.post_transforms import SphinxPostTransform
+
+PAGES = {
+    "integration": ("Systems and integration", "dvi_jax"),
+    "methods": ("Methods", "dvi_jax.methods"),
+    "lattices": ("Lattices", "dvi_jax.lattices"),
+    "solvers": ("Root solvers, layout, devices", "dvi_jax.engine"),
+    "observables": ("Observables and reductions", "dvi_jax.observe"),
+    "symmetry": ("Symmetries", "dvi_jax.symmetry"),
+    "invariants": ("Invariants", "dvi_jax.invariants"),
+    "sweeps": ("Sweeps", "dvi_jax.sweep"),
+    "fitting": ("Fitting", "dvi_jax.fit"),
+    "dynamics": ("Order, chaos, frequencies", "dvi_jax.dynamics"),
+}
+"""Page → title, and the room whose public names stand on it."""
+
+MODULES = {
+    "generators": ("Generators of common symmetries", "generators"),
+    "starts": ("Starts of a sweep", "starts"),
+    "systems": ("Library of systems", "systems"),
+    "plot": ("Pictures", "plot"),
+}
+"""Page → title, and the public module that it tells of."""
+
+
+def public(module: types.ModuleType) -> dict[str, Any]:
+    """Public names of a module that are the package's own, in the order of the alphabet."""
+    own = {
+        name: thing
+        for name, thing in vars(module).items()
+        if not name.startswith("_")
+        and (inspect.isclass(thing) or inspect.isfunction(thing))
+        and thing.__module__.startswith("dvi_jax")
+    }
+    return dict(sorted(own.items(), key=lambda item: item[0].lower()))
+
+
+def _room(thing: Any) -> str:
+    """The page of a name of the front door, by the file where it is written."""
+    for page, (_, room) in PAGES.items():
+        if room != "dvi_jax" and thing.__module__.startswith(room + "."):
+            return page
+    return "integration"
+
+
+def entries() -> dict[str, dict[str, tuple[str, Any]]]:
+    """Page → name in the documentation → (name as one writes it, the thing)."""
+    found: dict[str, dict[str, tuple[str, Any]]] = {page: {} for page in (*PAGES, *MODULES)}
+    for name, thing in public(dvi_jax).items():
+        found[_room(thing)][f"dvi_jax.{name}"] = (f"dvi.{name}", thing)
+    for page, (_, attribute) in MODULES.items():
+        module = getattr(dvi_jax, attribute, None) or import_module(f"dvi_jax.{attribute}")
+        for name, thing in _members(module):
+            found[page][f"dvi_jax.{attribute}.{name}"] = (f"{attribute}.{name}", thing)
+    return found
+
+
+def _members(module: types.ModuleType) -> Iterator[tuple[str, Any]]:
+    yield from public(module).items()
+
+
+def signature(thing: Any) -> str:
+    """`(a, *, b=1)`: names and defaults; what they are the docstring says, in words."""
+    try:
+        found = inspect.signature(thing)
+    except (TypeError, ValueError):
+        return "()"
+    plain = [
+        p.replace(annotation=p.empty, default=_default(p.default))
+        for name, p in found.parameters.items()
+        if name not in ("self", "cls") and not name.startswith("_")
+    ]
+    try:
+        return str(found.replace(parameters=plain, return_annotation=found.empty))
+    except ValueError:
+        return "(...)"
+
+
+class _Shown:
+    def __init__(self, text: str):
+        self.text = text
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+def _default(value: Any) -> Any:
+    if value is inspect.Parameter.empty:
+        return value
+    text = repr(value)
+    if callable(value) and hasattr(value, "__name__"):
+        text = value.__name__
+    if "<" in text or len(text) > 40:
+        text = f"{type(value).__name__}(...)"
+    return _Shown(" ".join(text.split()))
+
+
+def _docstring(thing: Any) -> str:
+    return inspect.getdoc(thing) or ""
+
+
+def _is_own(thing: Any) -> bool:
+    return getattr(thing, "__module__", "").startswith("dvi_jax")
+
+
+def _class_members(cls: type) -> Iterator[tuple[str, str, Any]]:
+    """(kind, name, thing) of documented public members, inherited ones of the package included."""
+    seen = set()
+    for base in cls.__mro__:
+        if not _is_own(base):
+            continue
+        for name, member in vars(base).items():
+            if name.startswith("_") or name in seen:
+                continue
+            seen.add(name)
+            plain = inspect.unwrap(getattr(member, "__func__", member))
+            if isinstance(member, property):
+                if member.fget is not None and member.fget.__doc__:
+                    yield "property", name, member
+            elif isinstance(member, classmethod | staticmethod):
+                if plain.__doc__:
+                    yield "classmethod", name, getattr(cls, name)
+            elif (inspect.isfunction(plain) or callable(member)) and getattr(
+                plain, "__doc__", None
+            ):
+                if inspect.isfunction(plain) or hasattr(member, "__wrapped__"):
+                    yield "method", name, plain
+
+
+def _statuses(thing: Any) -> str:
+    """Table of an enumeration of statuses: name and message."""
+    items = getattr(thing, "_name_to_item", None)
+    if not items:
+        return ""
+    rows = [
+        f"| `{name}` | {str(thing[item]) or 'as it should be'} |" for name, item in items.items()
+    ]
+    return "\n".join(["| status | message |", "| --- | --- |", *rows, ""])
+
+
+def _entry(full: str, shown: str, thing: Any) -> str:
+    kind = "class" if inspect.isclass(thing) else "function"
+    arguments = signature(thing)
+    if kind == "class" and issubclass(thing, BaseException):
+        kind, arguments = "exception", ""
+    body = _docstring(thing) if _docstring(thing) else "…"
+    table = _statuses(thing) if kind == "class" else ""
+    if table:
+        arguments, body = "", "Statuses of a result, and what they say.\n\n" + table
+    lines = [f":::::{{py:{kind}}} {full}{arguments}", "", body, ""]
+    if kind == "class" and not table:
+        for what, name, member in _class_members(thing):
+            extra = "" if what == "property" else signature(member)
+            role = "method" if what == "classmethod" else what
+            lines += [f"::::{{py:{role}}} {name}{extra}"]
+            lines += [":classmethod:"] if what == "classmethod" else []
+            lines += ["", inspect.getdoc(member) or "", "::::", ""]
+    return "\n".join([*lines, ":::::", ""])
+
+
+def write(folder: Path) -> None:
+    """The pages of the reference, as Markdown; a page that did not change is left as it is."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = entries()
+    pages = {}
+    for page, (title, _) in {**PAGES, **MODULES}.items():
+        if not found[page]:
+            continue
+        listed = ", ".join(f"`{shown}`" for shown, _ in found[page].values())
+        parts = [f"# {title}", "", listed, ""]
+        parts += [_entry(full, *rest) for full, rest in found[page].items()]
+        pages[page] = "\n".join(parts)
+    index = [
+        "# Reference",
+        "",
+        "Every public name, from its docstring. `import dvi_jax as dvi`.",
+        "",
+    ]
+    index += ["```{toctree}", ":maxdepth: 1", "", *pages, "```", ""]
+    for page in pages:
+        title = {**PAGES, **MODULES}[page][0]
+        listed = ", ".join(f"`{shown}`" for shown, _ in found[page].values())
+        index += [f"**{title}.** {listed}", ""]
+    pages["index"] = "\n".join(index)
+    for page, text in pages.items():
+        path = folder / f"{page}.md"
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+    for stale in {p.stem for p in folder.glob("*.md")} - set(pages):
+        (folder / f"{stale}.md").unlink()
+
+
+class LinkNames(SphinxPostTransform):
+    """Names of the package in code font lead to the reference."""
+
+    default_priority = 5
+
+    def run(self, **kwargs: Any) -> None:
+        for literal in list(self.document.findall(nodes.literal)):
+            if isinstance(literal.parent, nodes.reference | addnodes.pending_xref):
+                continue
+            target = NAMES.get(re.sub(r"\(.*\)$", "", literal.astext(), flags=re.S))
+            if target is None or self._is_own_entry(literal, target):
+                continue
+            link = addnodes.pending_xref(
+                "",
+                refdomain="py",
+                reftype="obj",
+                reftarget=target,
+                refdoc=self.env.docname,
+                refexplicit=True,
+                refwarn=True,
+            )
+            literal.replace_self(link)
+            link += literal
+
+    @staticmethod
+    def _is_own_entry(node: nodes.Node, target: str) -> bool:
+        while node is not None:
+            if isinstance(node, addnodes.desc):
+                return any(
+                    sig.get("fullname") == target for sig in node.findall(addnodes.desc_signature)
+                )
+            node = node.parent
+        return False
+
+
+NAMES: dict[str, str] = {}
+"""What is written in code font → full name of its entry."""
+
+
+def _fill_names() -> None:
+    for page in entries().values():
+        for full, (shown, thing) in page.items():
+            names = {full, shown, full.removeprefix("dvi_jax.")}
+            if full.count(".") == 1 and (inspect.isclass(thing) or "_" in shown):
+                names.add(shown.removeprefix("dvi."))  # `Save` is told from a word; `fit` is not
+            for name in names:
+                NAMES.setdefault(name, full)
+
+
+def _write(app: Any) -> None:
+    _fill_names()
+    write(Path(app.srcdir) / "reference")
+
+
+def setup(app: Any) -> dict[str, Any]:
+    app.connect("builder-inited", _write)
+    app.add_post_transform(LinkNames)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
