@@ -13,10 +13,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import dvi_jax
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.transforms.post_transforms import SphinxPostTransform
+from sphinx.util.docutils import SphinxDirective
+
+import dvi_jax
+from dvi_jax.paper.equations import EQUATIONS
 
 PAGES = {
     "integration": ("Systems and integration", "dvi_jax"),
@@ -138,11 +141,8 @@ def _class_members(cls: type) -> Iterator[tuple[str, str, Any]]:
             elif isinstance(member, classmethod | staticmethod):
                 if plain.__doc__:
                     yield "classmethod", name, getattr(cls, name)
-            elif (inspect.isfunction(plain) or callable(member)) and getattr(
-                plain, "__doc__", None
-            ):
-                if inspect.isfunction(plain) or hasattr(member, "__wrapped__"):
-                    yield "method", name, plain
+            elif plain.__doc__ and (inspect.isfunction(plain) or hasattr(member, "__wrapped__")):
+                yield "method", name, plain
 
 
 def _statuses(thing: Any) -> str:
@@ -243,6 +243,21 @@ class LinkNames(SphinxPostTransform):
         return False
 
 
+class EquationMap(SphinxDirective):
+    """The paper's numbered equations, as `dvi_jax.paper.equations` has them."""
+
+    def run(self) -> list[nodes.Node]:
+        rows = ["| equation | what it says | code | as printed? |", "| --- | --- | --- | --- |"]
+        for equation in EQUATIONS:
+            code = ", ".join(f"`{name}`" for name in equation.code)
+            note = equation.note or "as printed"
+            cells = (f"({equation.number})", equation.what, code, note)
+            rows.append("| " + " | ".join(c.replace("|", r"\|") for c in cells) + " |")
+        holder = nodes.container()
+        self.state.nested_parse(rows, 0, holder)
+        return holder.children
+
+
 NAMES: dict[str, str] = {}
 """What is written in code font → full name of its entry."""
 
@@ -264,5 +279,6 @@ def _write(app: Any) -> None:
 
 def setup(app: Any) -> dict[str, Any]:
     app.connect("builder-inited", _write)
+    app.add_directive("equation-map", EquationMap)
     app.add_post_transform(LinkNames)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,292 @@
+"""The documentation: its examples run, it builds without a warning, and a browser shows it whole."""
+
+import functools
+import html.parser
+import http.server
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+import urllib.parse
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+
+BLOCK = re.compile(
+    r"^(?:<!-- not run by the tests: (?P<reason>.+?) -->\n)?```python\n(?P<code>.*?)^```",
+    re.S | re.M,
+)
+ELSEWHERE = {"sweeps", "fitting", "chaos"}
+"""Pages that tests/test_readme.py runs, and asks for their numbers."""
+
+
+def examples(page):
+    """(the code of a page, in one piece; the blocks that are left out)."""
+    found = list(BLOCK.finditer(page.read_text(encoding="utf-8")))
+    run = [m["code"] for m in found if m["reason"] is None]
+    return "\n".join(run), [m["reason"] for m in found if m["reason"] is not None]
+
+
+PAGES = [p for p in sorted(DOCS.glob("*.md")) if examples(p)[0] and p.stem not in ELSEWHERE]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_examples_run(page, tmp_path):
+    env = {**os.environ, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "Agg"}
+    out = subprocess.run(
+        [sys.executable, "-W", "error::DeprecationWarning:dvi_jax", "-c", examples(page)[0]],
+        capture_output=True, text=True, check=False, cwd=tmp_path, env=env, timeout=500,
+    )  # fmt: skip
+    assert out.returncode == 0, out.stderr[-3000:]
+
+
+def test_examples_that_are_left_out_say_why():
+    left = {page.stem: examples(page)[1] for page in sorted(DOCS.glob("*.md"))}
+    assert {name for name, reasons in left.items() if reasons} <= {"clusters"}
+    assert len(PAGES) >= 10
+    code, reasons = "", []
+    for m in BLOCK.finditer(
+        "```python\na\n```\n<!-- not run by the tests: it needs b -->\n```python\nb\n```\n"
+    ):
+        code, reasons = (
+            (code + m["code"], reasons) if m["reason"] is None else (code, [*reasons, m["reason"]])
+        )
+    assert (code, reasons) == ("a\n", ["it needs b"])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the pages, made in a copy; a warning is a failure."""
+    folder = tmp_path_factory.mktemp("docs")
+    ignore = shutil.ignore_patterns("_build", "reference", "__pycache__")
+    shutil.copytree(DOCS, folder / "docs", ignore=ignore)
+    shutil.copytree(ROOT / "notebooks", folder / "notebooks")
+    shutil.copy(ROOT / "CHANGELOG.md", folder)
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-q",
+        "-b",
+        "html",
+        "-j",
+        "auto",
+    ]
+    out = subprocess.run(
+        [*command, "docs", "html"], cwd=folder, capture_output=True, text=True, check=False,
+        env={**os.environ, "JAX_PLATFORMS": "cpu", "NO_COLOR": "1"}, timeout=500,
+    )  # fmt: skip
+    assert out.returncode == 0, out.stderr
+    assert out.stderr == ""
+    return folder / "html"
+
+
+class _Anchors(html.parser.HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.links, self.ids = [], set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        self.ids |= {attrs[k] for k in ("id", "name") if attrs.get(k)}
+        for key in ("href", "src"):
+            if attrs.get(key):
+                self.links.append(attrs[key])
+
+
+def dead_links(folder):
+    """(page, link) for each that leads nowhere within the folder."""
+    pages = {p: _Anchors(p.read_text(encoding="utf-8")) for p in sorted(folder.rglob("*.html"))}
+    dead = []
+    for page, found in pages.items():
+        for link in found.links:
+            parts = urllib.parse.urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            path = urllib.parse.unquote(parts.path)
+            target = (page.parent / path).resolve() if path else page
+            anchor = urllib.parse.unquote(parts.fragment)
+            if target.is_dir():
+                target = target / "index.html"
+            known = pages.get(target)
+            if not target.exists() or (anchor and known is not None and anchor not in known.ids):
+                dead.append((page.name, link))
+    return dead
+
+
+@pytest.mark.slow
+def test_links_resolve(site, tmp_path):
+    assert len(list(site.rglob("*.html"))) > 40
+    assert dead_links(site) == []
+    (tmp_path / "a.html").write_text('<p id="x"><a href="b.html">b</a><a href="#x"><a href="#y">')
+    assert dead_links(tmp_path) == [("a.html", "b.html"), ("a.html", "#y")]
+
+
+@pytest.mark.slow
+def test_every_public_name_has_an_entry(site):
+    import dvi_jax as dvi
+
+    text = "".join(p.read_text(encoding="utf-8") for p in (site / "reference").glob("*.html"))
+    names = [n for n, x in vars(dvi).items() if not n.startswith("_") and callable(x)]
+    assert len(names) > 120
+    assert [n for n in names if f'id="dvi_jax.{n}"' not in text] == []
+
+
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+FLAGS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+WIDTHS = (1280, 390)
+"""A desk's and a phone's."""
+
+FAULTS = r"""async (math) => {
+  if (math && window.MathJax && MathJax.startup) await MathJax.startup.promise;
+  const faults = [], all = s => [...document.querySelectorAll(s)];
+  const wanted = all('.math').length, shown = all('.math mjx-container').length;
+  if (wanted !== shown) faults.push(`${shown} of ${wanted} formulas are rendered`);
+  for (const e of all('mjx-merror, [data-mjx-error]')) faults.push('formula: ' + e.textContent);
+  const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  for (let n = walk.nextNode(); n; n = walk.nextNode())
+    if (/\$|\\\(|\\\[/.test(n.data) && !n.parentElement.closest('pre, code, script, style, mjx-container'))
+      faults.push('left over: ' + n.data.trim().slice(0, 60));
+  for (const i of all('img')) { i.loading = 'eager'; await i.decode().catch(() => 0);
+    if (!i.naturalWidth) faults.push('picture: ' + i.src); }
+  return [faults, wanted];
+}"""
+
+
+def browser_or_skip():
+    if BROWSER is None:
+        assert not os.environ.get("CI"), "CI has to have Chromium: see .ci/run"
+        pytest.skip("Chromium is not installed")
+    return pytest.importorskip("playwright.sync_api").sync_playwright
+
+
+@pytest.fixture(scope="module")
+def serve():
+    """folder → address, over HTTP on this machine."""
+    servers = []
+
+    def start(folder):
+        class Quiet(http.server.SimpleHTTPRequestHandler):
+            def log_message(self, *_):
+                pass
+
+        handler = functools.partial(Quiet, directory=str(folder))
+        server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        servers.append(server)
+        return f"http://127.0.0.1:{server.server_address[1]}"
+
+    yield start
+    for server in servers:
+        server.shutdown()
+
+
+@pytest.fixture(scope="module")
+def page():
+    """A tab; `page.faults(address)` → (what is wrong there, how many formulas)."""
+    with browser_or_skip()() as driver:
+        browser = driver.chromium.launch(executable_path=BROWSER, args=FLAGS)
+        tab, seen, home = browser.new_page(), [], []
+        tab.on("pageerror", lambda e: seen.append(f"script: {e}"))
+
+        def local_only(route):
+            if not home or route.request.url.startswith((home[0], "data:", "blob:")):
+                return route.continue_()
+            seen.append(f"asked for {route.request.url}")
+            return route.abort()
+
+        tab.route("**/*", local_only)
+
+        def faults(address):
+            home[:] = [address[: address.index("/", 8)]]
+            seen.clear()
+            tab.set_viewport_size({"width": WIDTHS[0], "height": 900})
+            tab.goto(address)
+            found, formulas = tab.evaluate(FAULTS, True)
+            for width in WIDTHS:
+                tab.set_viewport_size({"width": width, "height": 900})
+                over = tab.evaluate("document.documentElement.scrollWidth - window.innerWidth")
+                if over > 0:
+                    found.append(f"{over} pixels too wide at {width}")
+            return found + seen, formulas
+
+        tab.faults = faults
+        yield tab
+        browser.close()
+
+
+@pytest.mark.slow
+def test_a_browser_shows_every_page_whole(site, serve, page):
+    home, found, formulas = serve(site), {}, 0
+    for path in sorted(site.rglob("*.html")):
+        name = path.relative_to(site).as_posix()
+        faults, count = page.faults(f"{home}/{name}")
+        formulas += count
+        if faults:
+            found[name] = faults
+    assert found == {}
+    assert formulas > 60
+    assert page.faults(f"{home}/theory.html")[1] > 50
+
+
+@pytest.mark.slow
+def test_what_is_wrong_with_a_page_is_seen(site, serve, page, tmp_path):
+    """The controls: one fault of each kind."""
+    (tmp_path / "mathjax.js").symlink_to(site / "_static/mathjax/tex-svg-full.js")
+    page_text = """<!doctype html><meta charset="utf-8"><body>
+      <script>window.MathJax = {options: {processHtmlClass: "math", ignoreHtmlClass: "un"}}</script>
+      <script src="mathjax.js"></script>%s</body>"""
+    bodies = {
+        "fine": '<p class="math">\\(x^2\\)</p><code>$HOME</code>',
+        "unrendered": '<div class="un"><p class="math">x</p></div>',
+        "wrong": '<p class="math">\\(\\frac{1\\)</p>',
+        "dollar": '<p class="un">costs $x$</p>',
+        "wide": '<div style="width: 2000px">x</div>',
+        "picture": '<img src="none.png">',
+        "outside": '<script src="http://192.0.2.1/x.js"></script>',
+        "script": "<script>throw new Error('no')</script>",
+    }
+    seen = {}
+    home = serve(tmp_path)
+    for name, body in bodies.items():
+        (tmp_path / f"{name}.html").write_text(page_text % body, encoding="utf-8")
+        seen[name] = "; ".join(page.faults(f"{home}/{name}.html")[0])
+    assert seen.pop("fine") == ""
+    expected = {
+        "unrendered": "0 of 1 formulas", "wrong": "formula", "dollar": "left over: costs $x$",
+        "wide": "pixels too wide at 390", "picture": "none.png", "outside": "asked for http://192",
+        "script": "script: ",
+    }  # fmt: skip
+    for name, words in expected.items():
+        assert words in seen[name], (name, seen[name])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "where"),
+    [("balance law", "theory"), ("drift_order", "reference/invariants"), ("MEGNO", "chaos")],
+)
+def test_search_finds(site, serve, page, words, where):
+    home = serve(site)
+    page.set_viewport_size({"width": 1280, "height": 900})
+    page.goto(f"{home}/search.html?q={urllib.parse.quote(words)}")
+    page.wait_for_selector("#search-results li a", timeout=20_000)
+    links = page.eval_on_selector_all("#search-results li a", "as => as.map(a => a.href)")
+    assert any(f"/{where}.html" in link for link in links), links
+    page.goto(f"{home}/search.html?q=xyzzyq")
+    page.wait_for_function("document.querySelector('#search-results p.search-summary') !== null")
+    assert page.locator("#search-results li").count() == 0
