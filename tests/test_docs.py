@@ -1,4 +1,4 @@
-"""The documentation: its examples run, it builds without a warning, and a browser shows it whole."""
+"""The documentation: examples run, it builds without a warning, a browser shows it whole."""
 
 import functools
 import html.parser
@@ -159,7 +159,8 @@ FAULTS = r"""async (math) => {
   for (const e of all('mjx-merror, [data-mjx-error]')) faults.push('formula: ' + e.textContent);
   const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
   for (let n = walk.nextNode(); n; n = walk.nextNode())
-    if (/\$|\\\(|\\\[/.test(n.data) && !n.parentElement.closest('pre, code, script, style, mjx-container'))
+    if (/\$|\\\(|\\\[/.test(n.data)
+        && !n.parentElement.closest('pre, code, script, style, mjx-container'))
       faults.push('left over: ' + n.data.trim().slice(0, 60));
   for (const i of all('img')) { i.loading = 'eager'; await i.decode().catch(() => 0);
     if (!i.naturalWidth) faults.push('picture: ' + i.src); }
