@@ -29,7 +29,7 @@ from dvi_jax.certify import (
 )
 from dvi_jax.certify.checks import GROUPS
 from dvi_jax.certify.table import TITLE
-from dvi_jax.cli import app
+from dvi_jax_cli import app
 
 PAGE = Path(__file__).parent.parent / "docs" / "certificate.md"
 

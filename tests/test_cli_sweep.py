@@ -16,13 +16,13 @@ from jax._src import pretty_printer
 from typer.testing import CliRunner
 
 import dvi_jax as dvi
-from dvi_jax.cli import app
 from dvi_jax.run import InputError, sweep_file, sweep_status
 from dvi_jax.run._config import read_config
 from dvi_jax.run._setup import Loader
 from dvi_jax.run._sweep_config import SWEEP_KEYS
 from dvi_jax.run._sweep_setup import make_sweep_setup
 from dvi_jax.sweep import store
+from dvi_jax_cli import app
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "sweep.toml"
 
@@ -351,7 +351,7 @@ def test_ctrl_c_leaves_a_store_to_go_on_with(folder):
     path = write(folder, text.replace("lanes_per_task = 4", "lanes_per_task = 1"))
     # Started in the background, tests and their children have Ctrl-C ignored: here it raises.
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    code += "from dvi_jax.cli import main; main()"
+    code += "from dvi_jax_cli import main; main()"
     process = subprocess.Popen(
         [sys.executable, "-c", code, "sweep", str(path), "--threads", "1"],
         stderr=subprocess.PIPE, text=True,

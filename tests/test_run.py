@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 import dvi_jax as dvi
 from dvi_jax import systems
-from dvi_jax.cli import app
 from dvi_jax.run import InputError, library_tables, run_file
 from dvi_jax.run._config import KEYS
 from dvi_jax.run._setup import parse_method
+from dvi_jax_cli import app
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -327,7 +327,7 @@ def test_version_and_help():
 
 def test_entry_point_without_traceback(folder):
     path = write(folder, KEPLER + "steps = 0\n")
-    code = "from dvi_jax.cli import main; main()"
+    code = "from dvi_jax_cli import main; main()"
     done = subprocess.run(
         [sys.executable, "-c", code, "run", str(path)], capture_output=True, text=True, check=False
     )

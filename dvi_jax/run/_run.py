@@ -52,7 +52,7 @@ def run_file(
     path = Path(path)
     values, raw = read_config(path, KEYS)
     folder = Path(out if out is not None else values["output.dir"] or f"results/{path.stem}")
-    made = _reserve(folder, "--out" if out is not None else "output.dir", force)
+    made = reserve(folder, "--out" if out is not None else "output.dir", force)
     try:
         setup = make_setup(values, path.parent)
         seconds = time.perf_counter()
@@ -66,7 +66,7 @@ def run_file(
     return _write(setup, values, raw, solution, observables, seconds, folder, path)
 
 
-def _reserve(folder: Path, key: str, force: bool) -> bool:
+def reserve(folder: Path, key: str, force: bool) -> bool:
     """Make the directory before the work, or find why not; True when it is new."""
     allowed = "a directory that does not exist or is empty; with --force, one to write into"
     try:

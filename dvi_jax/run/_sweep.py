@@ -1,5 +1,6 @@
 """A sweep from a TOML file; and what is to be known of a store."""
 
+import dataclasses
 import json
 import math
 import os
@@ -81,9 +82,9 @@ def sweep_file(
     return _finished(result, last[0])
 
 
-def sweep_cost(path: str | Path) -> str:
-    """What the sweep of a TOML file would take, and larger ones: text with a table. One task is
-    computed and timed for it, and nothing is written.
+def sweep_cost(path: str | Path) -> SweepReport:
+    """What the sweep of a TOML file would take, and larger ones: the summary has a table. One task
+    is computed and timed for it, and nothing is written.
 
     **Raises** `InputError` for input that cannot be meant.
     """
@@ -94,7 +95,8 @@ def sweep_cost(path: str | Path) -> str:
         cost = dvi.sweep_cost(**setup.arguments)
     except Exception as error:
         raise _unfit(path, setup, error) from error
-    return f"{cost}\n\n{cost.table()}"
+    contents = dataclasses.asdict(cost) | {"seconds": cost.seconds()}
+    return SweepReport(contents, [], f"{cost}\n\n{cost.table()}")
 
 
 def _unfit(path: Path, setup: SweepSetup, error: Exception) -> InputError:

@@ -190,7 +190,7 @@ def _save(value: Any) -> dvi.Save:
     return dvi.Save(final=True)
 
 
-def _pair(value: Any) -> Any:
+def pair(value: Any) -> Any:
     """A table {q, p} of numbers or arrays, as a pair."""
     if not isinstance(value, dict) or set(value) != {"q", "p"}:
         raise ValueError
@@ -198,10 +198,10 @@ def _pair(value: Any) -> Any:
 
 
 def _corner(value: Any) -> Any:
-    return array(value) if isinstance(value, list) else _pair(value)
+    return array(value) if isinstance(value, list) else pair(value)
 
 
-def _seed(value: Any) -> int:
+def seed(value: Any) -> int:
     return 0 if value == 0 and isinstance(value, int) else count(value)
 
 
@@ -237,10 +237,10 @@ SWEEP_KEYS: Keys = {
         "high": Key(_corner, _CORNER),
         "q0": Key(array, ARRAY),
         "p0": Key(array, ARRAY),
-        "sigma": Key(_pair, "{q = …, p = …}: standard deviations, numbers or arrays"),
+        "sigma": Key(pair, "{q = …, p = …}: standard deviations, numbers or arrays"),
         "energy": Key(number, "a finite number"),
         "H": Key(text, '"file.py:name", a function (t, q, p, args)'),
-        "seed": Key(_seed, "a whole number that is not negative"),
+        "seed": Key(seed, "a whole number that is not negative"),
         "name": Key(_name, f"a name such as start, and none of {', '.join(RESERVED)}"),
     },
     "args": Key(_arguments, f"{_of_run('args').allowed}; a number may be an axis, {_AN_AXIS}"),

@@ -1,0 +1,131 @@
+"""Observations from CSV and npz files: columns of numbers, and where a bad one stands."""
+
+import csv
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from ._errors import InputError, one_of, shown
+
+_NOTHING = ("", "nan", "na", "null", "none", "-", "--")
+"""Cells in which nothing was observed."""
+
+_SEPARATORS = (",", ";", "\t")
+
+
+def read_columns(path: Path, key: str = "data.file") -> dict[str, np.ndarray]:
+    """The columns of a file by name: from a CSV each of shape (N,), from an npz of any shape.
+
+    A CSV has a line of names, then numbers, separated by commas, semicolons or tabs; lines that
+    begin with # are left out, and an empty cell, or ``nan``, is NaN.
+
+    **Raises** `InputError` with the key, and the line and column of a cell that is no number.
+    """
+    if not path.is_file():
+        raise InputError(key, f"there is no file {path}", "the path of a CSV or npz file")
+    try:
+        return _npz(path, key) if path.suffix == ".npz" else _csv(path, key)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(key, f"{path} cannot be read: {error}", "a CSV file in UTF-8") from None
+
+
+def _npz(path: Path, key: str) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            found = {name: file[name] for name in file.files}
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            key, f"{path} is no npz file ({error})", "what numpy.savez wrote"
+        ) from None
+    return {n: a for n, a in found.items() if a.ndim and np.issubdtype(a.dtype, np.number)}
+
+
+def _csv(path: Path, key: str) -> dict[str, np.ndarray]:
+    with open(path, encoding="utf-8-sig", newline="") as file:
+        lines = [
+            (i, line) for i, line in enumerate(file, 1) if line.strip() and line.lstrip()[0] != "#"
+        ]
+    if not lines:
+        raise InputError(key, f"{path} is empty", "a line of names, then lines of numbers")
+    separator = max(_SEPARATORS, key=lines[0][1].count)
+    names = [name.strip() for name in next(csv.reader([lines[0][1]], delimiter=separator))]
+    _check_names(path, key, names, lines[0][0])
+    rows = []
+    for number, line in lines[1:]:
+        cells = next(csv.reader([line], delimiter=separator))
+        if len(cells) != len(names):
+            raise InputError(
+                key, f"{path.name}, line {number}: {len(cells)} cells",
+                f"{len(names)}, one for each of the names {', '.join(names)}",
+            )  # fmt: skip
+        rows.append([
+            _number(cell, f"{path.name}, line {number}, column {name}", key)
+            for cell, name in zip(cells, names, strict=True)
+        ])  # fmt: skip
+    if not rows:
+        raise InputError(key, f"{path} has names and no numbers", "at least one line of numbers")
+    return dict(zip(names, np.array(rows).T, strict=True))
+
+
+def _check_names(path: Path, key: str, names: list[str], line: int) -> None:
+    """Refuse a first line that is no line of names."""
+    wanted = "different names, one for each column, such as t, x, y"
+    numbers = [name for name in names if _is_number(name)]
+    if numbers:
+        raise InputError(key, f"{path.name}, line {line}: the number {numbers[0]}", wanted)
+    twice = [name for i, name in enumerate(names) if name in names[:i] or not name]
+    if twice:
+        raise InputError(key, f"{path.name}, line {line}: the name {twice[0]!r} again", wanted)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return cell.lower() not in _NOTHING
+
+
+def _number(cell: str, where: str, key: str) -> float:
+    text = cell.strip()
+    if text.lower() in _NOTHING:
+        return np.nan
+    try:
+        found = float(text)
+    except ValueError:
+        found = np.inf
+    if not np.isfinite(found):
+        raise InputError(
+            key, f"{where}: {text!r}", "a finite number; empty, or nan, where nothing was observed"
+        )
+    return found
+
+
+def column(columns: dict[str, np.ndarray], key: str, name: str) -> np.ndarray:
+    """One of the columns.
+
+    **Raises** `InputError` when there is none of that name.
+    """
+    if name not in columns:
+        raise InputError(key, shown(name), f"a column of the file: {one_of(columns, name)}")
+    return np.asarray(columns[name], float)
+
+
+def check_times(ts: np.ndarray, key: str, name: str) -> None:
+    """Refuse times that are no sequence: with the place in it and what stands there."""
+    if ts.ndim != 1:
+        raise InputError(key, f"{name} has shape {ts.shape}", "one time for each observation")
+    bad = np.flatnonzero(~np.isfinite(ts))
+    if bad.size:
+        raise InputError(key, f"time number {bad[0] + 1} in {name} is {ts[bad[0]]}", "finite times")
+    steps = np.diff(ts)
+    direction = 1 if steps.size == 0 or ts[-1] >= ts[0] else -1
+    bad = np.flatnonzero(steps * direction <= 0)
+    if bad.size:
+        i = bad[0]
+        raise InputError(
+            key,
+            f"in {name} the time number {i + 2}, {ts[i + 1]:.17g}, comes after {ts[i]:.17g}",
+            "times in order, no two alike",
+        )

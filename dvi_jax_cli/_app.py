@@ -1,0 +1,31 @@
+"""The entry point: all commands, and how the process ends."""
+
+import sys
+import traceback
+
+# Each adds its commands to the application; in the order of the help page, not of the alphabet.
+# isort: off
+from . import _new, _runs, _sweeps, _inverse, _checks  # noqa: F401
+
+# isort: on
+from ._group import app
+from ._session import CODES, Session, quiet
+from ._show import complain
+
+__all__ = ["app", "main"]
+
+
+def main() -> None:
+    """The entry point ``dvi-jax``."""
+    try:
+        app(prog_name="dvi-jax")
+    except BrokenPipeError:
+        quiet()
+        sys.exit(CODES["failed"])
+    except KeyboardInterrupt:
+        sys.exit(CODES["interrupted"])
+    except Exception as error:  # with --debug, or of the command line itself
+        traceback.print_exc()
+        kind, message = Session(False, False, True).judge(error)
+        complain(kind, message)
+        sys.exit(CODES[kind])

@@ -1,0 +1,232 @@
+"""What all commands have in common: --json, --verbose, --debug, and how each of them ends."""
+
+import functools
+import inspect
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from ._show import Bar, complain, print_json, print_tables, stderr, stdout
+
+FAILED = 1
+BAD_INPUT = 2
+INTERRUPTED = 130
+AGAIN = "On the command line: the same with --resume goes on from what is done."
+CODES = {"bad input": BAD_INPUT, "failed": FAILED, "interrupted": INTERRUPTED, "fault": FAILED}
+"""Kind of an error → exit code."""
+
+_OUTPUT = "Output"
+Json = Annotated[
+    bool,
+    typer.Option(
+        "--json", help="One JSON object on stdout, nothing else there.", rich_help_panel=_OUTPUT
+    ),
+]
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "--verbose", "-v", help="Say on stderr what is done, with what.", rich_help_panel=_OUTPUT
+    ),
+]
+Debug = Annotated[
+    bool,
+    typer.Option("--debug", help="Show the whole traceback of an error.", rich_help_panel=_OUTPUT),
+]
+
+
+class Refused(Exception):
+    """A command that ends with an error: its kind, one of `CODES`, and what to say of it."""
+
+    def __init__(self, kind: str, message: str):
+        super().__init__(message)
+        self.kind = kind
+
+
+class Session:
+    """One call of a command: where its output goes, what it notes, how it ended.
+
+    - `unwritten`: what is said before an `OSError`; `hint`: a line after errors and interruptions
+      of work that can be gone on with.
+    """
+
+    unwritten = "the results cannot be written"
+    hint = ""
+
+    def __init__(self, as_json: bool, verbose: bool, debug: bool):
+        self.as_json, self.verbose, self.debug = as_json, verbose, debug
+        self._began = time.perf_counter()
+        self._compiled: list[float] = []
+
+    def start_jax(self) -> None:
+        """Double precision; pictures without a window. What JAX is and has, with --verbose."""
+        import jax
+        import matplotlib as mpl
+
+        jax.config.update("jax_enable_x64", True)
+        mpl.use("Agg")  # pictures go to files: no window, no display needed
+        if not self.verbose:
+            return
+        jax.monitoring.register_event_duration_secs_listener(self._heard)
+        devices = jax.local_devices()
+        self.note(
+            f"dvi-jax {version()}, jax {jax.__version__}, Python {sys.version.split()[0]}; "
+            f"{len(devices)} × {devices[0].device_kind} ({devices[0].platform}); double precision"
+        )
+
+    def _heard(self, event: str, seconds: float, **_: Any) -> None:
+        if event.endswith("backend_compile_duration"):
+            self._compiled.append(seconds)
+
+    def note(self, text: str) -> None:
+        """A line on stderr, with --verbose."""
+        if self.verbose:
+            stderr().print(text, markup=False, soft_wrap=True, style="dim")
+
+    def line(self, text: str, style: str | None = None) -> None:
+        """A line for the reader; not with --json."""
+        if not self.as_json:
+            stdout().print(text, markup=False, soft_wrap=True, style=style)
+
+    def tables(self, tables: Iterable[Any], words: bool = False) -> None:
+        """Tables for the reader; not with --json."""
+        if not self.as_json:
+            print_tables(stdout(), tables, words)
+
+    def bar(self, doing: str) -> Bar:
+        """A progress bar, on stderr."""
+        return Bar(doing)
+
+    def finish(self, contents: Mapping[str, Any], failed: str = "") -> None:
+        """The end of a command: with --json its object, with `failed` an error that says so."""
+        if self.as_json:
+            error = {"error": {"kind": "failed", "message": failed}} if failed else {}
+            print_json({**contents, **error})
+        elif failed:
+            complain("failed", failed)
+        if failed:
+            raise typer.Exit(FAILED)
+
+    def told(self) -> None:
+        """With --verbose, what the call took."""
+        seconds = time.perf_counter() - self._began
+        compiling = f", of which XLA compiled {len(self._compiled)} programs in " if (
+            self._compiled
+        ) else ""  # fmt: skip
+        compiling += f"{sum(self._compiled):.1f} s" if self._compiled else ""
+        self.note(f"{seconds:.1f} s in all{compiling}")
+
+    def refuse(self, kind: str, message: str) -> NoReturn:
+        """The error, told; the command ends with its exit code."""
+        if self.as_json:
+            print_json({"error": {"kind": kind, "message": message}})
+        else:
+            complain(kind, message)
+        raise typer.Exit(CODES[kind])
+
+    def judge(self, error: BaseException) -> tuple[str, str]:
+        """Kind and message of what was raised."""
+        if isinstance(error, Refused):
+            return error.kind, str(error)
+        if isinstance(error, KeyboardInterrupt):
+            what = str(error).removeprefix("interrupted: ") or "before anything was done"
+            return "interrupted", "\n".join(filter(None, (what, self.hint)))
+        if isinstance(
+            error, (*_known("dvi_jax.run", "InputError"), *_known("dvi_jax", "StoreMismatch"))
+        ):
+            return "bad input", str(error)
+        if isinstance(error, (OSError, *_known("dvi_jax", "StoreError"))):
+            return "failed", "\n".join(filter(None, (f"{self.unwritten}: {error}", self.hint)))
+        return "fault", fault(error)
+
+
+def _known(module: str, *names: str) -> tuple[type, ...]:
+    """Exceptions of a module, if it has been imported: an error of it comes from nowhere else."""
+    found = sys.modules.get(module)
+    return tuple(kind for name in names if isinstance(kind := getattr(found, name, None), type))
+
+
+def fault(error: BaseException) -> str:
+    """What is said of an exception that nothing in the package has foreseen."""
+    text = str(error).strip() or "(without a message)"
+    lines = text.splitlines()
+    if len(lines) > 12:
+        text = "\n".join([*lines[:12], f"… ({len(lines) - 12} more lines)"])
+    return (
+        f"this is a fault of dvi_jax, not of what you gave it.\n{type(error).__name__}: {text}\n"
+        "The same command with --debug shows where it comes from; with that, please report it."
+    )
+
+
+def version() -> str:
+    """The version of the package, installed or beside this one, without importing it."""
+    source = Path(__file__).parent.parent / "dvi_jax" / "__init__.py"
+    try:
+        for line in source.read_text(encoding="utf-8").splitlines():
+            if line.startswith("__version__"):
+                return line.split('"')[1]
+    except (OSError, IndexError):
+        pass
+    from importlib.metadata import version
+
+    return version("dvi-jax")
+
+
+def command(
+    group: typer.Typer, name: str, *, panel: str | None = None, examples: Iterable[str] = ()
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A command of a group: a function of a `Session` and of its own arguments and options.
+
+    It gets --json, --verbose and --debug, and examples below its help. What it raises is told in
+    one block and becomes an exit code; with --debug it is raised.
+    """
+
+    def register(function: Callable[..., None]) -> Callable[..., None]:
+        own = list(inspect.signature(function).parameters.values())[1:]
+        kind = inspect.Parameter.KEYWORD_ONLY
+        common = [
+            inspect.Parameter(word, kind, default=False, annotation=annotation)
+            for word, annotation in (("as_json", Json), ("verbose", Verbose), ("debug", Debug))
+        ]
+
+        @functools.wraps(function)
+        def call(as_json: bool, verbose: bool, debug: bool, **given: Any) -> None:
+            session = Session(as_json, verbose, debug)
+            try:
+                function(session, **given)
+                session.told()
+                sys.stdout.flush()  # a pipe that is closed is to be met here
+            except (typer.Exit, typer.Abort):
+                raise
+            except BrokenPipeError:
+                quiet()
+                raise typer.Exit(FAILED) from None
+            except (Exception, KeyboardInterrupt) as error:
+                kind, message = session.judge(error)
+                if debug and kind != "interrupted":
+                    raise
+                session.refuse(kind, message)
+
+        del call.__dict__["__wrapped__"]  # its signature is not this one's
+        parameters = [*(p.replace(kind=kind) for p in own), *common]
+        call.__dict__["__signature__"] = inspect.Signature(parameters)
+        call.__annotations__ = {p.name: p.annotation for p in parameters}
+        group.command(name, epilog=shown_examples(examples), rich_help_panel=panel)(call)
+        return function
+
+    return register
+
+
+def shown_examples(lines: Iterable[str]) -> str | None:
+    """Examples as a help page ends with: each on a line of its own."""
+    lines = [f"  {line}".replace("[", "\\[") for line in lines]
+    return "\n".join(["[bold]Examples[/bold]", *lines]) if lines else None
+
+
+def quiet() -> None:
+    """Let the interpreter end without a word about a pipe that nobody reads any more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

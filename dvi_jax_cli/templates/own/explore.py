@@ -1,0 +1,85 @@
+# %% [markdown]
+# # {{title}}
+#
+# The system of `system.py`: one trajectory, what it keeps, and how that depends on the disturbance.
+
+# %%
+import jax
+import numpy as np
+from system import angular_momentum, energy, system
+
+import dvi_jax as dvi
+from dvi_jax import plot
+
+jax.config.update("jax_enable_x64", True)  # invariants need double precision
+
+args = {"mass": 1.0, "stiffness": 1.0}
+q0, p0 = np.array([1.0, 0.0]), np.array([0.0, 0.6])
+
+# %% [markdown]
+# ## One trajectory
+#
+# `observe` takes functions of one step; in a reduction they cost no memory.
+
+# %%
+solution = dvi.integrate(
+    system,
+    q0,
+    p0,
+    h=0.05,
+    num_steps=4000,
+    epsilon=0.05,
+    args=args,
+    method=dvi.Strang(),
+    save=dvi.Save(every=4),
+    observe={
+        "energy": dvi.Range(energy),
+        "angular momentum": dvi.MaxDrift(angular_momentum),
+    },
+)
+print(solution.status, solution.observed)
+plot.orbit(solution.qs)
+
+# %% [markdown]
+# ## The order of the drift
+#
+# The energy without the disturbance wavers by ε to the first power.
+
+# %%
+order = dvi.drift_order(
+    system,
+    energy,
+    q0,
+    p0,
+    epsilons=np.geomspace(1e-4, 1e-2, 5),
+    h=0.05,
+    num_steps=1000,
+    args=args,
+    method=dvi.TypeII(),
+)
+print(order)
+
+# %% [markdown]
+# ## A derivative through the whole run
+#
+# Of the last position by the strength of the disturbance.
+
+
+# %%
+def last(epsilon):
+    found = dvi.integrate(
+        system,
+        q0,
+        p0,
+        h=0.05,
+        num_steps=400,
+        epsilon=epsilon,
+        args=args,
+        method=dvi.Strang(),
+        save=dvi.Save(final=True),
+    )
+    return found.qs[-1, 0]
+
+
+slope = jax.grad(last)(0.05)
+print(slope)

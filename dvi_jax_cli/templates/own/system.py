@@ -1,0 +1,39 @@
+"""A weight on a spring in the plane, which hardens a little: a system of one's own to begin with.
+
+Replace the functions by your own; each is plain JAX. The files beside this one name what is here
+as "system.py:system", "system.py:energy".
+"""
+
+import jax.numpy as jnp
+
+import dvi_jax as dvi
+
+
+def H_D(t0, t1, q0, p1, args):
+    """The discrete Hamiltonian of a step from t0 to t1 [energy]: here H at (q0, p1).
+
+    q0: position at the start of the step, shape (2,) [m]; p1: momentum at its end [kg m/s].
+    """
+    return p1 @ p1 / (2 * args["mass"]) + args["stiffness"] * (q0 @ q0) / 2
+
+
+def W(t0, t1, q0, p1, args):
+    """The disturbing force that epsilon multiplies: the spring hardens, −|q|² q.
+
+    For friction write -p1; a disturbance that is a potential can be System(..., perturbation=).
+    """
+    return -(q0 @ q0) * q0
+
+
+system = dvi.System(H_D, force=W)
+
+
+# An observable is a function of one step, of both its ends.
+def energy(t0, t1, q0, p0, q1, p1, args):
+    """The energy at the end of the step, without the disturbance [J]."""
+    return p1 @ p1 / (2 * args["mass"]) + args["stiffness"] * (q1 @ q1) / 2
+
+
+def angular_momentum(t0, t1, q0, p0, q1, p1, args):
+    """q × p [kg m²/s]: kept to round-off, as nothing here has a direction of its own."""
+    return jnp.cross(q1, p1)
