@@ -155,7 +155,9 @@ def bench(
 
     with session.bar("timing") as bar:
         found = measure(wanted, rounds, bar.show, session.note)
-    session.tables(tables(found))
+    about, speeds = tables(found)
+    session.tables([about], words=True)
+    session.tables([speeds])
     session.line(f"{found['machine']}; {found['setting']}")
     wrong = [r["row"] for r in found["rows"] if not r["agrees"]]
     session.finish(found, f"the two sides differ: {', '.join(wrong)}" if wrong else "")

@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 from ._session import BAD_INPUT, INTERRUPTED, shown_examples, version
 from ._show import complain, print_json
 
-_USAGE = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
+_USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
 """The base of errors in the words of a command line: typer has it under no public name."""
 
 

@@ -21,7 +21,7 @@ PACKAGES = (
     "xarray",
     "zarr",
 )
-_FLAGS = ("JAX_", "XLA_", "CUDA_", "OMP_", "TF_", "NVIDIA_")
+_FLAGS = ("JAX_", "XLA_", "CUDA_VISIBLE", "NVIDIA_VISIBLE", "OMP_", "TF_CPP")
 """Beginnings of the environment's names that change what JAX does."""
 
 
@@ -48,11 +48,12 @@ def gather() -> dict[str, Any]:
     }
     try:
         import jax
+        import jax.numpy as jnp
 
         found |= {
             "backend": jax.default_backend(),
             "devices": [_device(d) for d in jax.local_devices()],
-            "x64_of_this_process": bool(jax.config.jax_enable_x64),
+            "x64_of_this_process": jnp.result_type(float) == jnp.float64,
             "x64_of_commands": True,
         }
     except Exception as error:  # a driver that does not fit, a flag that XLA does not know
@@ -102,10 +103,10 @@ def tables(found: dict[str, Any]) -> list[Table]:
         ["processors", f"{machine}, {usable} usable" if usable is not None else str(machine)],
     ]
     if not found["failed"]:
-        on = "on" if found["x64_of_this_process"] else "off (this library asks for it on)"
+        on = "on" if found["x64_of_this_process"] else "off, to be turned on"
         about += [
             ["backend of JAX", found["backend"]],
-            ["double precision", f"commands turn it on; without them here: {on}"],
+            ["double precision", f"commands turn it on; in a script: {on}"],
         ]
     made = [Table("Versions", ["package", "version"], versions),
             Table("Machine", ["", ""], about)]  # fmt: skip

@@ -79,7 +79,7 @@ def _check(name: Path, system: str | None) -> None:
 
 def _files(kind: str, words: dict[str, str]) -> Any:
     """(name, text) of each template, with {{word}} filled in."""
-    for file in sorted((resources.files(__package__) / "templates" / kind).iterdir(), key=str):
+    for file in sorted((resources.files("dvi_jax_cli") / "templates" / kind).iterdir(), key=str):
         if not file.is_file():
             continue
         text = file.read_text(encoding="utf-8")

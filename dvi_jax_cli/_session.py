@@ -78,9 +78,9 @@ class Session:
             f"{len(devices)} × {devices[0].device_kind} ({devices[0].platform}); double precision"
         )
 
-    def _heard(self, event: str, seconds: float, **_: Any) -> None:
+    def _heard(self, event: str, duration_secs: float, **kwargs: Any) -> None:
         if event.endswith("backend_compile_duration"):
-            self._compiled.append(seconds)
+            self._compiled.append(duration_secs)
 
     def note(self, text: str) -> None:
         """A line on stderr, with --verbose."""
@@ -103,6 +103,9 @@ class Session:
 
     def finish(self, contents: Mapping[str, Any], failed: str = "") -> None:
         """The end of a command: with --json its object, with `failed` an error that says so."""
+        if place := contents.get("folder") or contents.get("store"):
+            self.note(f"written to {place}")
+        self.told()
         if self.as_json:
             error = {"error": {"kind": "failed", "message": failed}} if failed else {}
             print_json({**contents, **error})
@@ -114,11 +117,9 @@ class Session:
     def told(self) -> None:
         """With --verbose, what the call took."""
         seconds = time.perf_counter() - self._began
-        compiling = f", of which XLA compiled {len(self._compiled)} programs in " if (
-            self._compiled
-        ) else ""  # fmt: skip
-        compiling += f"{sum(self._compiled):.1f} s" if self._compiled else ""
-        self.note(f"{seconds:.1f} s in all{compiling}")
+        count = len(self._compiled)
+        part = f"; XLA compiled {count} programs in {sum(self._compiled):.1f} s" if count else ""
+        self.note(f"{seconds:.1f} s in all{part}")
 
     def refuse(self, kind: str, message: str) -> NoReturn:
         """The error, told; the command ends with its exit code."""
@@ -198,7 +199,6 @@ def command(
             session = Session(as_json, verbose, debug)
             try:
                 function(session, **given)
-                session.told()
                 sys.stdout.flush()  # a pipe that is closed is to be met here
             except (typer.Exit, typer.Abort):
                 raise

@@ -338,7 +338,8 @@ def _tables(contents: dict[str, Any]) -> list[Table]:
             low, high = drift["interval"]
             slope = f"{drift['slope']:.3f} ({low:.3f} … {high:.3f})"
         elif drift is not None:
-            slope = "none: see the drifts"
+            reasons = sorted({str(x) for x in drift["excluded"]} - {""})
+            slope = f"none: {', '.join(reasons)}"
         finite = [] if drift is None else [x for x in drift["drifts"] if np.isfinite(x)]
         largest = "" if drift is None else f"{max(finite):.2e}" if finite else "all failed"
         promised = "exact" if told["exact"] else f"{contents['order'] + 1}"
