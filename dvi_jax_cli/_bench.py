@@ -271,7 +271,7 @@ def _timed(row: Row, rounds: int) -> list[dict[str, Any]]:
 
 def _difference(a: Any, b: Any) -> float:
     """The largest difference of two states; infinite where one is not finite."""
-    found = max(float(np.max(np.abs(x - y))) for x, y in zip(a, b, strict=True))
+    found = float(np.max([np.max(np.abs(x - y)) for x, y in zip(a, b, strict=True)]))
     return found if math.isfinite(found) else math.inf
 
 
@@ -292,7 +292,7 @@ def tables(found: dict[str, Any]) -> list[Table]:
         Table(
             f"Speed beside references, {found['rounds']} rounds (a ratio above 1: dvi_jax is "
             "faster)",
-            ["row", "reference", "steps/s", "reference's", "ratio", "quartiles",
+            ["row", "reference", "steps/s", "theirs", "ratio", "quartiles",
              "compiling"],
             rows,
         ),

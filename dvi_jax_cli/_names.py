@@ -46,9 +46,9 @@ EXTRAS = {
 
 
 def completer(names: Sequence[str]) -> Callable[[str], list[str]]:
-    """What completes one of these names, whatever its case."""
+    """What completes one of these names."""
 
     def complete(incomplete: str) -> list[str]:
-        return [name for name in names if name.lower().startswith(incomplete.lower())]
+        return [name for name in names if name.startswith(incomplete)]
 
     return complete

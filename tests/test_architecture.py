@@ -25,10 +25,10 @@ FLOORS = [
     ["dynamics"],
     ["__init__", "systems", "plot"],
     ["paper", "run", "certify"],
-    ["cli"],
+    ["__main__"],
 ]
 FLOOR = {room: i for i, rooms in enumerate(FLOORS) for room in rooms}
-DOOR_ONLY = {"paper", "run", "certify", "cli"}
+DOOR_ONLY = {"paper", "run", "certify"}
 """Leaves: of the package they use the public door and other leaves, no private room."""
 
 
@@ -80,6 +80,36 @@ def test_first_line_says_what_the_file_is(path):
     docstring = ast.get_docstring(ast.parse(path.read_text()))
     assert docstring
     assert docstring.splitlines()[0].endswith(".")
+
+
+COMMAND_LINE = sorted((ROOT.parent / "dvi_jax_cli").glob("*.py"))
+HEAVY = {"dvi_jax", "jax", "numpy", "matplotlib", "equinox"}
+WORK = {"_bench"}
+"""Files of the command line that a command imports when it runs."""
+
+
+@pytest.mark.parametrize("path", COMMAND_LINE, ids=lambda p: p.name)
+def test_command_line_imports_the_package_within_its_commands_alone(path):
+    """And of it the public door and the other leaves, no private room."""
+    tree = ast.parse(path.read_text())
+    assert ast.get_docstring(tree).splitlines()[0].endswith(".")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            names = [node.module]
+        else:
+            continue
+        for name in names:
+            assert not any(part.startswith("_") for part in name.split(".")[1:]), name
+            if name.split(".")[0] in HEAVY and path.stem not in WORK:
+                assert node not in tree.body, f"{path.name} imports {name} before it runs"
+
+
+def test_nothing_imports_the_command_line():
+    for path in FILES:
+        if path.name != "__main__.py":
+            assert "dvi_jax_cli" not in path.read_text(), path
 
 
 def test_door_has_no_logic():

@@ -135,7 +135,8 @@ def make_discover_setup(values: dict[str, Any], folder: Path) -> DiscoverSetup:
     t0 = values["t0"]
     samples = tuple(random.uniform(a, b, (count, *shape)) for a, b in zip(low, high, strict=True))
     if values["samples.times"] is not None:
-        samples += (random.uniform(*values["samples.times"], count),)
+        first, last = values["samples.times"]
+        samples += (random.uniform(first, last, count),)
     else:
         samples += (np.full(count, t0),)
     starts = values["drift.starts"]

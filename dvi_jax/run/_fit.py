@@ -131,7 +131,7 @@ def _write(
     return report
 
 
-def _trajectory(setup: FitSetup, found: dvi.FitResult) -> tuple[dict[str, np.ndarray], str]:
+def _trajectory(setup: FitSetup, found: dvi.FitResult) -> tuple[dict[str, Any], str]:
     """The fitted trajectory from the start to the last observation, and its status."""
     spec = setup.model(found.params)
     t0, h = setup.data.t0, spec["h"]

@@ -3,6 +3,8 @@
 import math
 from typing import Any
 
+import numpy as np
+
 from ._config import KEYS, Key, Keys, array, boolean, count, number, text
 from ._errors import InputError, shown
 
@@ -24,7 +26,7 @@ def _sigma(value: Any) -> Any:
     if isinstance(value, str) or (isinstance(value, list) and value and isinstance(value[0], str)):
         return _text_or_texts(value)
     found = array(value) if isinstance(value, list) else number(value)
-    if not (found > 0 if isinstance(found, float) else (found > 0).all()):
+    if not np.all(np.asarray(found) > 0):
         raise ValueError
     return found
 
