@@ -246,7 +246,8 @@ def _discovered(setup: DiscoverSetup, values: dict[str, Any]) -> dvi.Discovery:
         raise InputError(
             "system",
             f"the map of {setup.name} cannot be searched: {said(error, *setup.files)}",
-            "functions, basis, samples and args that fit one another",
+            "functions, basis, samples (with samples.times where the map depends on the time) and "
+            "args that fit one another",
         ) from error
 
 

@@ -182,12 +182,11 @@ def _flat(params: Any) -> np.ndarray:
 
 
 def _tables(found: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
-    rows = []
-    for name, known in contents["parameters"].items():
-        remark = "at a bound" if name in found.at_bounds else ""
-        rows.append([name, with_error(known["value"], known["error"]), f"{known['start']:.6g}",
-                     remark])  # fmt: skip
-    tables = [Table("Parameters, ± standard error", ["name", "value", "start", ""], rows)]
+    rows = [
+        [name, with_error(known["value"], known["error"]), f"{known['start']:.6g}"]
+        for name, known in contents["parameters"].items()
+    ]
+    tables = [Table("Parameters, ± standard error", ["name", "value", "start"], rows)]
     if len(found.names) > 1:
         tables.append(_correlation_table(found))
     left = contents["residuals"]

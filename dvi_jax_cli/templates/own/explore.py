@@ -38,7 +38,7 @@ solution = dvi.integrate(
     },
 )
 print(solution.status, solution.observed)
-plot.orbit(solution.qs)
+plot.orbit(solution)
 
 # %% [markdown]
 # ## The order of the drift
