@@ -115,8 +115,8 @@ def _single() -> Row:
     run = jax.jit(_last(_KEPLER, dvi.TypeII(), steps))
     references = [Side("Python floats", lambda: _python_loop(q, p, steps), steps)]
     references += _diffrax(q, p, steps)
-    what = f"one orbit, {steps} steps of TypeII; beside the same map on Python's floats, and in "
-    what += "diffrax (SemiImplicitEuler)"
+    what = f"one orbit, {steps} steps of TypeII; beside the same map on Python's floats and, "
+    what += "where it is installed, in diffrax (SemiImplicitEuler)"
     return Row("single", what, Side("", lambda: run(q, p), steps), references, 1e-6)
 
 

@@ -18,8 +18,8 @@ from ._show import print_tables, stderr, stdout
     "paper",
     panel=TRUST,
     examples=[
-        "dvi-jax paper --out paper-out            figures, tables, verdicts; some minutes",
-        "dvi-jax paper --out paper-out --json     the verdicts on stdout as well",
+        "dvi-jax paper --out paper-out          figures, tables, verdicts",
+        "dvi-jax paper --out paper-out --json   the verdicts on stdout as well",
     ],
 )
 def paper(

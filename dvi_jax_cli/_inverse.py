@@ -16,7 +16,7 @@ from ._session import AGAIN, Session, command
     panel=INVERSE,
     examples=[
         "dvi-jax fit fit.toml",
-        "dvi-jax fit fit.toml --resume             goes on from its checkpoint, or begins",
+        "dvi-jax fit fit.toml --resume      goes on from its checkpoint, or begins",
         "dvi-jax fit fit.toml --json | jq .parameters",
     ],
 )

@@ -21,7 +21,7 @@ Out = Annotated[Path | None, typer.Option(help="Directory for the results, inste
     panel=START,
     examples=[
         "dvi-jax systems                  all of them",
-        "dvi-jax systems kepler           equations, parameters with units, what is conserved",
+        "dvi-jax systems kepler           equations, parameters, what is conserved",
         "dvi-jax systems kepler --json    the same for programs",
     ],
 )
@@ -30,7 +30,7 @@ def systems(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="[NAME]",
+            metavar="NAME",
             help="A system of the library.",
             autocompletion=completer(SYSTEMS),
             show_default=False,

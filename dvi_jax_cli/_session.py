@@ -215,10 +215,20 @@ def command(
         parameters = [*(p.replace(kind=kind) for p in own), *common]
         call.__dict__["__signature__"] = inspect.Signature(parameters)
         call.__annotations__ = {p.name: p.annotation for p in parameters}
-        group.command(name, epilog=shown_examples(examples), rich_help_panel=panel)(call)
+        group.command(
+            name,
+            help=_unwrapped(function.__doc__ or ""),
+            epilog=shown_examples(examples),
+            rich_help_panel=panel,
+        )(call)
         return function
 
     return register
+
+
+def _unwrapped(text: str) -> str:
+    """Paragraphs each in one line: a terminal has another width than this file."""
+    return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))
 
 
 def shown_examples(lines: Iterable[str]) -> str | None:

@@ -129,6 +129,8 @@ def test_every_command_has_help_with_examples(name):
         assert "--json" in shown.output
         assert "--verbose" in shown.output
         assert "--debug" in shown.output
+        examples = shown.output.partition("Examples")[2].strip().splitlines()
+        assert all(line.strip().startswith("dvi-jax") for line in examples)  # none is wrapped
 
 
 def test_help_names_every_command_and_no_other():
