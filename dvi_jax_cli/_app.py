@@ -1,5 +1,6 @@
 """The entry point: all commands, and how the process ends."""
 
+import io
 import sys
 import traceback
 
@@ -17,6 +18,9 @@ __all__ = ["app", "main"]
 
 def main() -> None:
     """The entry point ``dvi-jax``."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # an ε on a terminal that knows none is no error
+            stream.reconfigure(errors="replace")
     try:
         app(prog_name="dvi-jax")
     except BrokenPipeError:

@@ -39,6 +39,7 @@ def fit(
     Exit code 0: converged. 1: not so (what there is has been written). 2: bad input. 130: Ctrl-C.
     """
     session.start_jax()
+    session.stopped = "by Ctrl-C; there is a checkpoint if the fit had gone on for some seconds"
     session.hint = AGAIN
     from dvi_jax.run import fit_file
 

@@ -50,11 +50,12 @@ class Refused(Exception):
 class Session:
     """One call of a command: where its output goes, what it notes, how it ended.
 
-    - `unwritten`: what is said before an `OSError`; `hint`: a line after errors and interruptions
-      of work that can be gone on with.
+    - `unwritten`: what is said before an `OSError`; `stopped`: of a Ctrl-C that says nothing
+      itself; `hint`: a line after both, of work that can be gone on with.
     """
 
     unwritten = "the results cannot be written"
+    stopped = "by Ctrl-C; nothing has been written"
     hint = ""
 
     def __init__(self, as_json: bool, verbose: bool, debug: bool):
@@ -134,7 +135,7 @@ class Session:
         if isinstance(error, Refused):
             return error.kind, str(error)
         if isinstance(error, KeyboardInterrupt):
-            what = str(error).removeprefix("interrupted: ") or "before anything was done"
+            what = str(error).removeprefix("interrupted: ") or self.stopped
             return "interrupted", "\n".join(filter(None, (what, self.hint)))
         if isinstance(
             error, (*_known("dvi_jax.run", "InputError"), *_known("dvi_jax", "StoreMismatch"))

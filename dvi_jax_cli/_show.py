@@ -38,7 +38,8 @@ def strict(value: Any) -> Any:
 
 def print_json(contents: Mapping[str, Any]) -> None:
     """One object on standard output, and a line's end."""
-    text = json.dumps(strict(contents), indent=2, ensure_ascii=False, allow_nan=False)
+    ascii_only = (sys.stdout.encoding or "").lower().replace("-", "") != "utf8"
+    text = json.dumps(strict(contents), indent=2, ensure_ascii=ascii_only, allow_nan=False)
     sys.stdout.write(text + "\n")
 
 

@@ -71,7 +71,7 @@ def sweep_run(
     such as by a full disk. 2: bad input, or a store of another sweep. 130: Ctrl-C.
     """
     session.start_jax()
-    session.hint = AGAIN
+    session.stopped, session.hint = "before anything was done", AGAIN
     from dvi_jax.run import sweep_cost, sweep_file
 
     session.note(f"reading {config}")

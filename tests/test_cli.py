@@ -291,6 +291,17 @@ def test_no_control_codes_where_there_is_no_terminal():
     assert max(map(cell_len, wide.stdout.splitlines())) > 60
 
 
+def test_an_output_that_knows_no_greek():
+    code, heavy, out, said = ended("discover", "--help", PYTHONIOENCODING="ascii", COLUMNS="100")
+    assert (code, heavy, said) == (0, "", "")
+    assert "invariants in ? as formulas" in out
+    done = process(
+        "from dvi_jax_cli._show import print_json; print_json({'a': 'ε', 'b': float('nan')})",
+        PYTHONIOENCODING="ascii",
+    )
+    assert json.loads(done.stdout, parse_constant=pytest.fail) == {"a": "ε", "b": None}
+
+
 # info, bench
 
 

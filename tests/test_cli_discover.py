@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from typer.testing import CliRunner
 import dvi_jax as dvi
 from dvi_jax.run import InputError
 from dvi_jax.run._discover import parse_basis
+from dvi_jax.run._discover_config import DISCOVER_KEYS
 from dvi_jax.run._setup import Loader
 from dvi_jax_cli import app
 
@@ -162,6 +164,15 @@ def test_a_directory_that_has_something_is_left_alone(folder):
     assert result.exit_code == 2
     assert "is not empty" in result.stderr
     assert [p.name for p in (folder / "out").iterdir()] == ["mine"]
+
+
+def test_every_key_is_shown_in_an_example():
+    text = (EXAMPLES / "discover.toml").read_text(encoding="utf-8")
+    for key, inner in DISCOVER_KEYS.items():
+        if key not in ("state", "args", "t0"):  # those of a run
+            assert f"{key} = " in text or f"[{key}]" in text, key
+        for name in inner if isinstance(inner, Mapping) and key != "state" else ():
+            assert f"{name} = " in text or name == "plots", f"{key}.{name}"
 
 
 def test_nothing_but_a_basis_is_made(folder):

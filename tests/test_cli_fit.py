@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 
@@ -331,6 +332,15 @@ def test_toml_is_told_with_its_line(folder):
     result = command(write(folder, "system = 'kepler'\nh = = 3\n"))
     assert result.exit_code == 2
     assert "line 2" in result.stderr
+
+
+def test_every_key_is_shown_in_an_example():
+    """A key that no example shows is one that nobody finds."""
+    text = (EXAMPLES / "fit.toml").read_text(encoding="utf-8")
+    for key, inner in FIT_KEYS.items():
+        assert f"{key} = " in text or f"[{key}]" in text or key == "args", key
+        for name in inner if isinstance(inner, Mapping) and key != "state" else ():
+            assert f"{name} = " in text or name == "plots", f"{key}.{name}"
 
 
 def test_in_python_too(folder):
