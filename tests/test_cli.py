@@ -308,6 +308,7 @@ def test_an_output_that_knows_no_greek():
 def test_info(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "") + " ")
     monkeypatch.setitem(names.EXTRAS, "export", ("a_module_that_is_not_there",))
+    monkeypatch.setitem(names.EXTRAS, "bayes", ("jax",))
     found = json.loads(command("info", "--json").stdout)
     assert found["versions"]["dvi-jax"] == dvi.__version__
     assert found["backend"] == "cpu"
@@ -317,7 +318,7 @@ def test_info(monkeypatch):
         "missing": ["a_module_that_is_not_there"],
         "install": 'pip install "dvi-jax[export]"',
     }
-    assert found["extras"]["interop"]["missing"] == []
+    assert found["extras"]["bayes"] == {"missing": [], "install": None}
     shown = command("info")
     assert shown.exit_code == 0
     assert 'pip install "dvi-jax[export]"' in shown.output

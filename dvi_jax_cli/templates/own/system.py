@@ -22,7 +22,7 @@ def W(t0, t1, q0, p1, args):
 
     For friction write -p1; a disturbance that is a potential can be System(..., perturbation=).
     """
-    return -(q0 @ q0) * q0
+    return -jnp.sum(q0**2) * q0
 
 
 system = dvi.System(H_D, force=W)
@@ -36,4 +36,4 @@ def energy(t0, t1, q0, p0, q1, p1, args):
 
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     """q × p [kg m²/s]: kept to round-off, as nothing here has a direction of its own."""
-    return jnp.cross(q1, p1)
+    return q1[0] * p1[1] - q1[1] * p1[0]
