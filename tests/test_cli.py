@@ -435,7 +435,7 @@ def test_its_discovery(inside):
     momentum, energy = json.loads(result.stdout)["invariants"]
     assert momentum["formula"] == "−0.5 q1 p2 + 0.5 q2 p1"
     assert max(momentum["drift"]["drifts"]) < 1e-13
-    assert energy["drift"]["slope"] == pytest.approx(2, abs=0.15)
+    assert energy["drift"]["slope"] == pytest.approx(2, abs=0.01)
 
 
 @pytest.mark.slow

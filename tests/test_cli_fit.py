@@ -260,6 +260,7 @@ BAD_DATA = [
     (HEAD + "0.3,1\n,2\n", "time number 2 in t is nan", "finite times"),
     (HEAD + "0.3,1\n0.9,2\n0.6,2\n", "time number 3, 0.5", "times in order"),
     (HEAD + "0.3,1\n0.3,2\n", "time number 2, 0.29", "no two alike"),
+    (HEAD + "0.3,1\n", "1 values for 2 parameters", "at least as many"),
     (HEAD + "0.3,\n0.6,nan\n", "no value in any row", "columns with numbers"),
     ("0.3,1\n0.6,2\n", "line 1: the number 0.3", "different names"),
     ("t,t\n0.3,1\n", "the name 't' again", "different names"),

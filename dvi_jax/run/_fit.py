@@ -161,6 +161,7 @@ def _contents(
         },
         "correlations": {"names": found.names, "matrix": found.correlations},
         "chi2": found.chi2 if found.has_errors else None,
+        "prior_chi2": found.prior_chi2,
         "reduced_chi2": found.reduced_chi2 if found.has_errors else None,
         "rms": found.rms,
         "values": found.num_observed,
@@ -197,7 +198,10 @@ def _tables(found: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
         ["rms [units of the data]", f"{found.rms:.4g}"],
     ]
     if found.has_errors:
-        rows += [["chi²", f"{found.chi2:.6g}"], ["reduced chi²", f"{found.reduced_chi2:.4g}"]]
+        rows.append(["chi²", f"{found.chi2:.6g}"])
+        if found.prior_chi2:
+            rows.append(["chi² of the priors", f"{found.prior_chi2:.4g}"])
+        rows.append(["reduced chi²", f"{found.reduced_chi2:.4g}"])
         rows.append(["largest [standard errors]", f"{left['largest']:.3g}"])
     rows.append(["correlation of neighbours", f"{left['lag_one']:.3f}"])
     return [*tables, Table("What is left over", ["", "value"], rows)]

@@ -52,6 +52,7 @@ def make_fit_setup(values: dict[str, Any], folder: Path) -> FitSetup:
     check_start(problem, q0, p0, args)
     params = _parameters(values["parameters"], values["epsilon"], q0, p0, args)
     data, columns = _observations(values, loader, np.shape(q0), float(h))
+    _check_enough(data, params, values["priors"])
     segments = values["options.segments"]
     options = {
         "bounds": _nested(values["bounds"], "bounds", params, dvi.Bounds),
@@ -118,6 +119,22 @@ def _nested(pairs: dict[str, Any], key: str, params: dict[str, Any], kind: Any) 
         else:
             found[name] = made
     return found or None
+
+
+def _check_enough(data: dvi.Observations, params: dict[str, Any], priors: dict[str, Any]) -> None:
+    """Refuse fewer values than there are parameters, unless something is known beforehand."""
+    seen, wanted = int(np.isfinite(data.values).sum()), sum(np.size(x) for x in _leaves(params))
+    if seen < wanted and not priors:
+        raise InputError(
+            "data.file", f"{seen} values for {wanted} parameters",
+            "at least as many values as parameters, or priors",
+        )  # fmt: skip
+
+
+def _leaves(params: Any) -> list[Any]:
+    if not isinstance(params, dict):
+        return [params]
+    return [leaf for value in params.values() for leaf in _leaves(value)]
 
 
 # What was observed
