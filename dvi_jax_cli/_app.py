@@ -28,8 +28,10 @@ def main() -> None:
         sys.exit(CODES["failed"])
     except KeyboardInterrupt:
         sys.exit(CODES["interrupted"])
-    except Exception as error:  # with --debug, or of the command line itself
-        traceback.print_exc()
-        kind, message = Session(False, False, True).judge(error)
+    except Exception as error:  # raised with --debug, or of the command line itself
+        debug = "--debug" in sys.argv
+        if debug:
+            traceback.print_exc()
+        kind, message = Session(False, False, debug).judge(error)
         complain(kind, message)
         sys.exit(CODES[kind])

@@ -8,14 +8,15 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from ._session import BAD_INPUT, INTERRUPTED, shown_examples, version
+from ._help import WithExamples, shown_examples
+from ._session import BAD_INPUT, INTERRUPTED, version
 from ._show import complain, print_json
 
 _USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
 """The base of errors in the words of a command line: typer has it under no public name."""
 
 
-class Commands(TyperGroup):
+class Commands(WithExamples, TyperGroup):
     """All commands. Wrong words are told in the manner of every other error."""
 
     def main(self, args: Any = None, *rest: Any, standalone_mode: bool = True, **more: Any) -> Any:

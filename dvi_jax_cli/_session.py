@@ -11,6 +11,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from ._help import Command, shown_examples, unwrapped
 from ._show import Bar, complain, print_json, print_tables, stderr, stdout
 
 FAILED = 1
@@ -143,7 +144,7 @@ class Session:
             return "bad input", str(error)
         if isinstance(error, (OSError, *_known("dvi_jax", "StoreError"))):
             return "failed", "\n".join(filter(None, (f"{self.unwritten}: {error}", self.hint)))
-        return "fault", fault(error)
+        return "fault", fault(error, self.debug)
 
 
 def _known(module: str, *names: str) -> tuple[type, ...]:
@@ -152,16 +153,20 @@ def _known(module: str, *names: str) -> tuple[type, ...]:
     return tuple(kind for name in names if isinstance(kind := getattr(found, name, None), type))
 
 
-def fault(error: BaseException) -> str:
-    """What is said of an exception that nothing in the package has foreseen."""
+def fault(error: BaseException, traced: bool = False) -> str:
+    """What is said of an exception that nothing in the package has foreseen; `traced`: below its
+    traceback."""
     text = str(error).strip() or "(without a message)"
     lines = text.splitlines()
     if len(lines) > 12:
         text = "\n".join([*lines[:12], f"… ({len(lines) - 12} more lines)"])
-    return (
-        f"this is a fault of dvi_jax, not of what you gave it.\n{type(error).__name__}: {text}\n"
-        "The same command with --debug shows where it comes from; with that, please report it."
+    how = (
+        "Please report it, with the traceback above."
+        if traced
+        else "The same command with --debug shows where it comes from; with that, please report it."
     )
+    kind = type(error).__name__
+    return f"this is a fault of dvi_jax, not of what you gave it.\n{kind}: {text}\n{how}"
 
 
 def version() -> str:
@@ -209,7 +214,9 @@ def command(
             except (Exception, KeyboardInterrupt) as error:
                 kind, message = session.judge(error)
                 if debug and kind != "interrupted":
-                    raise
+                    if as_json:
+                        print_json({"error": {"kind": kind, "message": message}})
+                    raise  # to the entry point, which shows it whole
                 session.refuse(kind, message)
 
         del call.__dict__["__wrapped__"]  # its signature is not this one's
@@ -218,24 +225,14 @@ def command(
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         group.command(
             name,
-            help=_unwrapped(function.__doc__ or ""),
+            cls=Command,
+            help=unwrapped(function.__doc__ or ""),
             epilog=shown_examples(examples),
             rich_help_panel=panel,
         )(call)
         return function
 
     return register
-
-
-def _unwrapped(text: str) -> str:
-    """Paragraphs each in one line: a terminal has another width than this file."""
-    return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))
-
-
-def shown_examples(lines: Iterable[str]) -> str | None:
-    """Examples as a help page ends with: each on a line of its own."""
-    lines = [f"  {line}".replace("[", "\\[") for line in lines]
-    return "\n".join(["[bold]Examples[/bold]", *lines]) if lines else None
 
 
 def quiet() -> None:

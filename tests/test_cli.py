@@ -267,8 +267,9 @@ def test_an_exception_that_nobody_foresaw(monkeypatch, as_json):
 
 def test_debug_shows_the_traceback_and_keeps_the_exit_code():
     code = "from dvi_jax_cli import main; main()"
-    done = process(code, "run", "nowhere.toml", "--debug")
+    done = process(code, "run", "nowhere.toml", "--debug", "--json")
     assert done.returncode == 2
+    assert json.loads(done.stdout)["error"]["kind"] == "bad input"
     assert "Traceback (most recent call last)" in done.stderr
     assert done.stderr.rstrip().endswith("allowed: the path of a TOML file")
 
