@@ -25,10 +25,11 @@ FLOORS = [
     ["dynamics"],
     ["__init__", "systems", "plot"],
     ["paper", "run", "certify"],
+    ["interop"],
     ["__main__"],
 ]
 FLOOR = {room: i for i, rooms in enumerate(FLOORS) for room in rooms}
-DOOR_ONLY = {"paper", "run", "certify"}
+DOOR_ONLY = {"paper", "run", "certify", "interop"}
 """Leaves: of the package they use the public door and other leaves, no private room."""
 
 

@@ -1,0 +1,19 @@
+"""Good company: diffrax, REBOUND, SciPy, astropy and ArviZ beside the package.
+
+A leaf: ``from dvi_jax import interop``. The other package is imported by the function that needs
+it, when it is called; without it there is an `ImportError` with the line that installs it.
+"""
+
+from .diffrax_side import (
+    diffrax_solver as diffrax_solver,
+    diffrax_term as diffrax_term,
+    vector_field as vector_field,
+)
+from .labelled import to_inference_data as to_inference_data, to_xarray as to_xarray
+from .rebound_side import (
+    ReboundProblem as ReboundProblem,
+    from_rebound as from_rebound,
+    to_rebound as to_rebound,
+)
+from .scipy_side import solve_ivp as solve_ivp
+from .units import UnitSolution as UnitSolution, UnitSystem as UnitSystem, integrate as integrate

@@ -1,0 +1,88 @@
+"""Term and solver as classes of diffrax: the one file that imports it at the top."""
+
+from typing import Any, ClassVar
+
+import diffrax
+import jax
+from jaxtyping import Array
+
+import dvi_jax as dvi
+
+from .diffrax_side import as_pair, vector_field
+
+
+class DiscreteTerm(diffrax.AbstractTerm):
+    """A system and its ε as a term of diffrax; see `diffrax_term`."""
+
+    system: dvi.System
+    epsilon: Array
+
+    def vf(self, t, y, args):
+        return vector_field(self.system, self.epsilon)(t, y, args)
+
+    def contr(self, t0, t1, **kwargs):
+        return t1 - t0
+
+    def prod(self, vf, control):
+        return jax.tree.map(lambda rate: control * rate, vf)
+
+
+class DiscreteMap(diffrax.AbstractSolver):
+    """A method of the package as a solver of diffrax; see `diffrax_solver`."""
+
+    method: dvi.Method
+    newton: dvi.RootSolver
+
+    term_structure: ClassVar[Any] = DiscreteTerm
+    interpolation_cls: ClassVar[Any] = diffrax.ThirdOrderHermitePolynomialInterpolation
+
+    def order(self, terms):
+        del terms
+        return self.method.order
+
+    def init(self, terms, t0, t1, y0, args):
+        del terms, t0, t1, args
+        as_pair(y0)
+        return None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        del solver_state, made_jump
+        q0, p0 = y0
+        term, direction = unwrapped(terms)
+        # One step by the front door: the arithmetic and the verdict are those of `integrate`.
+        taken = dvi.integrate(
+            term.system, q0, p0, t0=direction * t0, h=direction * (t1 - t0), num_steps=1,
+            epsilon=term.epsilon, args=args, method=self.method, newton=self.newton,
+            save=dvi.Save(final=True), adjoint=dvi.Direct(), throw=False,
+        )  # fmt: skip
+        y1 = (taken.qs[-1], taken.ps[-1])
+        slopes = {
+            name: terms.prod(terms.vf(t, y, args), terms.contr(t0, t1))
+            for name, t, y in (("k0", t0, y0), ("k1", t1, y1))
+        }
+        return y1, None, {"y0": y0, "y1": y1, **slopes}, None, promoted(taken.result)
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+
+def unwrapped(terms: Any) -> tuple[DiscreteTerm, Any]:
+    """The term itself and the direction of time, 1 or −1: diffrax always runs forwards, through a
+    wrapper that tells the term −t where t1 < t0."""
+    if isinstance(terms, DiscreteTerm):
+        return terms, 1
+    return terms.term, terms.direction
+
+
+def promoted(result: dvi.RESULTS) -> diffrax.RESULTS:
+    """A status of ours as one of diffrax's."""
+    theirs = diffrax.RESULTS
+    of = {
+        "successful": theirs.successful,
+        "not_converged": theirs.nonlinear_max_steps_reached,
+        "not_finite": getattr(theirs, "nonfinite", theirs.nonlinear_divergence),
+    }
+    found = theirs.where(result == result, theirs.nonlinear_divergence, theirs.successful)
+    for name, other in of.items():
+        found = theirs.where(result == getattr(dvi.RESULTS, name), other, found)
+    return found

@@ -1,0 +1,41 @@
+"""Packages that the extra brings, imported when they are needed."""
+
+import importlib
+from typing import Any
+
+import dvi_jax as dvi
+
+from ..systems import Problem
+
+
+def needed(package: str, by: str) -> Any:
+    """The module `package`, which `by` cannot do without.
+
+    **Raises** `ImportError` with the line that installs it.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        if error.name not in (None, package.partition(".")[0]):
+            raise  # it is there, and something that it needs is not
+        raise ImportError(
+            f"{by} needs {package.partition('.')[0]}, which the extra brings: "
+            'pip install "dvi-jax[interop]".',
+            name=package,
+        ) from None
+
+
+def system_of(what: Any, by: str) -> dvi.System:
+    """The `System` that is meant by a `System` or a `Problem`.
+
+    **Raises** `TypeError` for anything else.
+    """
+    if isinstance(what, Problem):
+        return what.system
+    if isinstance(what, dvi.System):
+        return what
+    raise TypeError(
+        f"{by} takes a dvi.System or a problem of dvi_jax.systems, got {type(what).__name__}. "
+        "Wrap a discrete Hamiltonian, dvi.System(H_D, force=W), or a continuous one, "
+        "dvi.System(dvi.discretise(H))."
+    )

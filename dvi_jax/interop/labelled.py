@@ -1,0 +1,274 @@
+"""Results with labels: datasets of xarray, and what ArviZ takes."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+import dvi_jax as dvi
+
+from .extras import needed
+
+_STATUSES = (
+    "successful", "not_converged", "not_finite", "bad_step_size", "no_root", "out_of_range",
+    "stopped", "not_reached",
+)  # fmt: skip
+"""Names of `RESULTS`, by the number that stands for each in a dataset, as in that of a sweep."""
+
+_TAKEN = ("t", "q", "p", "h", "status", "time", "save", "step")
+
+
+def to_xarray(
+    solution: dvi.Solution,
+    *,
+    dims: Sequence[str] = (),
+    coords: Mapping[str, Any] | None = None,
+    observe: Any = None,
+    components: Mapping[str, Any] | Sequence[Any] | None = None,
+    units: Mapping[str, str] | None = None,
+    attrs: Mapping[str, Any] | None = None,
+) -> Any:
+    """A trajectory, or a batch of them, as an `xarray.Dataset`.
+
+    - `solution`: what `integrate` returned; under `vmap`, with the batch in front.
+    - `dims`: names for the dimensions of the batch, in order; `coords`: name → values along one.
+    - `observe`: what `integrate` was given under that name: it says which observables have one
+      value for each step. Without it none of their dimensions is called "step".
+    - `components`: labels along the axes of q and p: ``["x", "y"]`` for one axis, or name → labels
+      for each axis, ``{"body": ["Sun", "Jupiter"], "axis": ["x", "y", "z"]}``.
+    - `units`: name of a variable → text, such as ``problem.units``; `attrs`: attributes of the
+      whole, numbers and text as they are, anything else (a method) as its text.
+
+    **Returns** a dataset with dimensions `dims`, then
+
+    - ``time`` where all trajectories are saved at the same times, which are its coordinate; else
+      ``save``, and the times are a variable `t`;
+    - ``component`` or the names in `components`;
+    - ``step`` for what belongs to the step that ended at a saved time: its index is that of the
+      state it ended at (for ``Save(ts=...)`` the dimension of the states itself).
+
+    Variables: `q`, `p`, `h`; observables by their place in the pytree, joined by points, one alone
+    as ``observed``; `status` (int8, with ``flag_values`` and ``flag_meanings``); the arrays in
+    ``solution.stats``; ``stop_t``, ``stop_q``, ``stop_p`` for a run with a `Stop`. NaN stays NaN.
+    ``dataset.to_netcdf(path, engine="h5netcdf")`` writes it (extra ``export``).
+
+    **Raises** `ValueError` for a number of `dims` that is not that of the batch, labels that do not
+    fit, an `observe` of another structure, and names that are taken; `TypeError` for what is no
+    solution.
+    """
+    if not isinstance(solution, dvi.Solution):
+        raise TypeError(
+            f"to_xarray takes a dvi.Solution, got {type(solution).__name__}. (A sweep has its own, "
+            "result.to_xarray(); of a UnitSolution take .solution, and units=.)"
+        )
+    import xarray as xr
+
+    dims = (dims,) if isinstance(dims, str) else tuple(dims)
+    if solution.result.is_traced():
+        raise TypeError("to_xarray takes values: call it outside of jit, vmap and grad.")
+    ts, hs = np.asarray(solution.ts), np.asarray(solution.hs)
+    _check_dims(dims, ts.shape)
+    lead, count = ts.shape[: len(dims)], ts.shape[-1]
+    rows = ts.reshape(-1, count)
+    alike = bool(np.isfinite(rows).all() and (rows == rows[:1]).all())
+    at, index = ("time", rows[0]) if alike else ("save", np.arange(count))
+    step = at if hs.shape[-1] == count else "step"
+    of_state, labels = _components(components, np.shape(solution.qs)[len(dims) + 1 :])
+    found: dict[str, Any] = {} if alike else {"t": ((*dims, at), ts)}
+    found["q"] = ((*dims, at, *of_state), np.asarray(solution.qs))
+    found["p"] = ((*dims, at, *of_state), np.asarray(solution.ps))
+    found["h"] = ((*dims, step), hs)
+    for name, value, per_step in _observed(solution.observed, observe):
+        if name in found or name.partition(".")[0] in _TAKEN:
+            raise ValueError(f"the observable {name!r} has a name that is taken: give it another.")
+        own = value.shape[len(dims) :]
+        if per_step and own[:1] != hs.shape[-1:]:
+            raise ValueError(
+                f"observe says that {name!r} has a value for each of {hs.shape[-1]} steps, and its "
+                f"shape is {own}: give the observe that integrate was given."
+            )
+        front = (step,) if per_step else ()
+        found[name] = ((*dims, *front, *_own(name, own[len(front) :])), value)
+    found["status"] = (dims, _codes(solution.result, lead), {
+        "flag_values": np.arange(len(_STATUSES), dtype=np.int8),
+        "flag_meanings": " ".join(_STATUSES),
+    })  # fmt: skip
+    for name, value in solution.stats.items():
+        if name != "num_steps":
+            value = np.asarray(value)
+            found[name] = ((*dims, *_own(name, value.shape[len(lead) :])), value)
+    if solution.stop is not None:
+        for name, value in zip("tqp", solution.stop, strict=True):
+            own = () if name == "t" else of_state
+            found[f"stop_{name}"] = ((*dims, *own), np.asarray(value))
+    along = {at: index, **labels, **(coords or {})}
+    if step == "step":
+        along["step"] = np.arange(1, count)
+    data = xr.Dataset(found, along, {
+        "software": f"dvi_jax {dvi.__version__}",
+        "num_steps": int(np.ravel(solution.stats["num_steps"])[0]),
+        **{name: _attribute(value) for name, value in (attrs or {}).items()},
+    })  # fmt: skip
+    for name, text in (units or {}).items():
+        for known in {"t": ("t", "time", "h", "stop_t"), "q": ("q", "stop_q"),
+                      "p": ("p", "stop_p")}.get(name, (name,)):  # fmt: skip
+            if known in data.variables:
+                data[known].attrs["units"] = text
+    return data
+
+
+def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
+    """What ``dvi.sample`` returned, as ArviZ takes it.
+
+    - `samples`: a `Samples`. `observed`: the `Observations` it was drawn for, or a list of them;
+      or None.
+
+    **Returns** ArviZ's `InferenceData` for arviz 0.x; an `xarray.DataTree` for arviz 1.x and
+    arviz-base. Groups, dimensions chain and draw:
+
+    - ``posterior``: one variable for each name of `samples`;
+    - ``sample_stats``: ``diverging``, ``lp`` (log density in the free variables, up to a constant),
+      ``n_steps``, ``tree_depth`` (of a tree of so many leapfrog steps), and ``acceptance_rate``,
+      the mean of each chain, along chain alone;
+    - ``observed_data``, with `observed`: ``values`` (or ``values_0``, … of a list), along ``ts``.
+
+    **Raises** `ImportError` without arviz and arviz-base; `TypeError` for what is no `Samples`.
+    """
+    if not isinstance(samples, dvi.Samples):
+        raise TypeError(
+            f"to_inference_data takes what dvi.sample returns, got {type(samples).__name__}. "
+            "(Trajectories: interop.to_xarray.)"
+        )
+    old = _old_arviz()
+    import xarray as xr
+
+    tree = samples.to_xarray()
+    groups = {name: tree[name].to_dataset() for name in tree.children}
+    steps = np.asarray(samples.steps)
+    groups["sample_stats"] = groups["sample_stats"].assign(
+        tree_depth=(("chain", "draw"), np.ceil(np.log2(steps + 1)).astype(int)),
+        acceptance_rate=(("chain",), np.asarray(samples.acceptance)),
+    )
+    if observed is not None:
+        many = list(observed) if isinstance(observed, list | tuple) else [observed]
+        seen: dict[str, Any] = {}
+        where: dict[str, Any] = {}
+        for i, arc in enumerate(many):
+            if not isinstance(arc, dvi.Observations):
+                raise TypeError(f"observed takes dvi.Observations, got {type(arc).__name__}.")
+            end = "" if len(many) == 1 else f"_{i}"
+            values, own = np.asarray(arc.values), f"values{end}"
+            seen[own] = ((f"ts{end}", *_own(own, values.shape[1:])), values)
+            where[f"ts{end}"] = np.asarray(arc.ts)
+        groups["observed_data"] = xr.Dataset(seen, where)
+    about = {
+        "inference_library": "dvi_jax",
+        "inference_library_version": dvi.__version__,
+        "sampler": "NUTS of numpyro",
+        "status": samples.status,
+    }
+    for group in groups.values():
+        group.attrs.update(about)
+    return old.InferenceData(**groups) if old is not None else xr.DataTree.from_dict(groups)
+
+
+def _old_arviz() -> Any:
+    """The module arviz where it is of version 0.x; None where trees are taken."""
+    try:
+        arviz = needed("arviz", "interop.to_inference_data")
+    except ImportError:
+        needed("arviz_base", "interop.to_inference_data")
+        return None
+    return arviz if hasattr(arviz, "InferenceData") else None
+
+
+def _check_dims(dims: tuple[str, ...], shape: tuple[int, ...]) -> None:
+    batch = shape[:-1]
+    if len(dims) != len(batch):
+        raise ValueError(
+            f"the batch has {len(batch)} dimensions, of sizes {batch}, and dims names {len(dims)}: "
+            f"{dims}. Name each, in the order of the vmaps from the outermost."
+        )
+    if taken := [d for d in dims if d in _TAKEN or dims.count(d) > 1]:
+        raise ValueError(f"the dimension {taken[0]!r} has a name that is taken: give it another.")
+
+
+def _components(
+    components: Mapping[str, Any] | Sequence[Any] | None, shape: tuple[int, ...]
+) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Names of the axes of a state, and labels along them."""
+    if components is None:
+        return tuple(_own("component", shape)), {}
+    if not isinstance(components, Mapping):
+        components = {"component": components}
+    sizes = tuple(len(labels) for labels in components.values())
+    if sizes != tuple(shape):
+        raise ValueError(
+            f"components labels axes of sizes {sizes}, and q has the shape {tuple(shape)}: give "
+            "one list of labels for each axis."
+        )
+    return tuple(components), {name: list(labels) for name, labels in components.items()}
+
+
+def _own(name: str, shape: tuple[int, ...]) -> list[str]:
+    """Names for the dimensions that are a variable's own."""
+    word = name if name == "component" else f"{name}_dim"
+    return [word] if len(shape) == 1 else [f"{word}_{i}" for i in range(len(shape))]
+
+
+def _observed(observed: Any, observe: Any) -> list[tuple[str, np.ndarray, bool]]:
+    """Name, values and whether there is one for each step, of every array among the observed."""
+
+    def is_observable(x: Any) -> bool:
+        return callable(x) or isinstance(x, dvi.Reduction | dvi.Running)
+
+    if observe is None:
+        flags = jax.tree.map(lambda _: False, observed)
+    else:
+        try:
+            flags = jax.tree.map(
+                lambda f, of: jax.tree.map(lambda _: not isinstance(f, dvi.Reduction), of),
+                observe, observed, is_leaf=is_observable,
+            )  # fmt: skip
+        except ValueError as error:
+            raise ValueError(
+                f"observe is not what this solution was observed by: {error}."
+            ) from None
+    arrays = jax.tree.leaves_with_path(observed, is_leaf=eqx.is_array)
+    per_step = jax.tree.leaves(flags)
+    names = [".".join(_word(k) for k in path) or "observed" for path, _ in arrays]
+    return [
+        (name, np.asarray(x), flag)
+        for name, (_, x), flag in zip(names, arrays, per_step, strict=True)
+    ]
+
+
+def _word(key: Any) -> str:
+    """One step of a path in a pytree, as text."""
+    for field in ("key", "name", "idx"):
+        if hasattr(key, field):
+            return str(getattr(key, field))
+    return str(key)
+
+
+def _codes(result: Any, lead: tuple[int, ...]) -> np.ndarray:
+    codes = np.zeros(lead, np.int8)
+    for i, name in enumerate(_STATUSES):
+        codes = np.where(np.asarray(result == getattr(dvi.RESULTS, name)), np.int8(i), codes)
+    return codes.astype(np.int8)
+
+
+def _attribute(value: Any) -> Any:
+    """A value that a file can keep as an attribute."""
+    if isinstance(value, bool):
+        return str(value)
+    if isinstance(value, str | int | float | np.number):
+        return value
+    if isinstance(value, Mapping | list | tuple):
+        return str(value)
+    array = np.asarray(value) if hasattr(value, "shape") else None
+    return (
+        array if array is not None and array.ndim <= 1 and array.dtype.kind in "if" else str(value)
+    )

@@ -1,0 +1,302 @@
+"""Simulations of REBOUND as problems of the library, and back."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import dvi_jax as dvi
+
+from ..systems import Problem
+from ..systems.n_body import (
+    INVARIANTS,
+    PARAMETERS,
+    angular_momentum,
+    check_bodies,
+    hamiltonian,
+    linear_momentum,
+    symmetries,
+)
+from .extras import needed
+
+_NEWTONIAN = ("basic", "compensated", "jacobi", "mercurius", "trace")
+"""Modules for gravity that evaluate Newton's law in full, whichever way they order the sums."""
+
+_TURNED_ON = {
+    "_additional_forces": "additional_forces: write it as force= of a dvi.System",
+    "_pre_timestep_modifications": "pre_timestep_modifications",
+    "_post_timestep_modifications": "post_timestep_modifications",
+    "_heartbeat": "a heartbeat: dvi.integrate(observe=..., stop=...) watches a run",
+    "extras": "extras (REBOUNDx): write its effect as force= of a dvi.System",
+    "_N_odes": "ODEs of the user's",
+    "exit_max_distance": "exit_max_distance: take stop=dvi.Stop(g)",
+    "exit_min_distance": "exit_min_distance: take stop=dvi.Stop(g)",
+    "N_var": "variational particles: dvi.TangentMap(), dvi.MEGNO() or jax.jvp give derivatives",
+}
+"""What changes a simulation and is no number of a body; name of the field → how to say so."""
+
+_ASTROPY = {
+    "msun": "Msun", "msolar": "Msun", "solarmass": "Msun", "sunmass": "Msun", "mearth": "Mearth",
+    "mjupiter": "Mjup", "aus": "au", "parsec": "pc", "hr": "h", "d": "day", "days": "day",
+    "year": "yr", "years": "yr", "yrs": "yr", "jyr": "yr", "gram": "g", "kyr": "kyr", "myr": "Myr",
+    "gyr": "Gyr",
+}  # fmt: skip
+"""REBOUND's names of units → the usual ones; the others are the same."""
+
+
+def softened_hamiltonian(t0, t1, q0, p1, args):
+    r"""H_D = Σ_i |p1_i|² / (2 m_i) − G Σ_{i<j} m_i m_j / √(|q0_i − q0_j|² + b²), Plummer's law.
+
+    `args` as in `dvi_jax.systems.n_body.hamiltonian`, and ``"softening"``: b [length].
+    """
+    masses = jnp.asarray(args["masses"], q0.dtype)
+    kinetic = jnp.sum(jnp.sum(p1**2, axis=-1) / masses) / 2
+    itself = jnp.eye(masses.shape[0], dtype=bool)
+    difference = q0[:, None, :] - q0[None, :, :]
+    square = jnp.sum(difference**2, axis=-1) + args["softening"] ** 2
+    weight = jnp.where(itself, 0.0, masses[:, None] * masses[None, :])
+    distance = jnp.sqrt(jnp.where(itself, 1.0, square))
+    return kinetic - args["G"] * jnp.sum(weight / distance) / 2
+
+
+@dataclass(frozen=True)
+class ReboundProblem(Problem):
+    """A `Problem` of N bodies that was a simulation of REBOUND.
+
+    - `t0`: the time it was at. `h` is its dt, `q0` its positions, `p0` momenta m v.
+    - `names` of the bodies, or their hashes (REBOUND 4), None where there is none.
+    - `velocities`: as they were, shape (bodies, 3); p0 / m may be off by a last digit.
+    - `radii`: of the bodies [length]; nothing here collides.
+    - `integrator`: REBOUND's, by name; ours is chosen by ``method=``.
+    - `rebound_units`: its units of length, time and mass, or none.
+    """
+
+    t0: float = 0.0
+    names: tuple[Any, ...] = ()
+    velocities: Any = None
+    radii: Any = None
+    integrator: str = ""
+    rebound_units: tuple[str, ...] = ()
+
+
+def from_rebound(
+    simulation: Any, *, snapshot: int = -1, massless: float | None = None
+) -> ReboundProblem:
+    r"""The N-body problem of a simulation of REBOUND: masses, G, softening, state, time, names.
+
+        q0 = (x, y, z),  p0 = m (v_x, v_y, v_z),  H = Σ p²/2m − G Σ_{i<j} m_i m_j / √(r_ij² + b²)
+
+    with b REBOUND's softening: 0 gives the system `n_body`.
+
+    - `simulation`: a ``rebound.Simulation``, or the path of a Simulationarchive, of which
+      `snapshot` is taken (−1: the last).
+    - `massless`: the mass [of the simulation] that is given to bodies without any, whose momentum
+      would fix no velocity. They are refused where it is left out. It should be tiny beside the
+      others: orbits change by their ratio, about.
+
+    **Returns** a `ReboundProblem`, float64 arrays of shape (bodies, 3) in the simulation's units.
+
+        sol = dvi.integrate(problem.system, problem.q0, problem.p0, args=problem.args,
+                            t0=problem.t0, h=problem.h, num_steps=1000, method=dvi.KahanLi(8))
+
+    **Raises** `ValueError` for what would be lost otherwise: additional forces and other callbacks
+    (``sim.copy()`` leaves them out, if that is meant), REBOUNDx, boundaries, collisions, gravity
+    that is off, approximate or custom, shear (SEI), variational particles, exit distances, massive
+    test particles, a simulation that is not synchronised, bodies without mass; and for a start
+    that the N-body system cannot go on from. `ImportError` without rebound, `TypeError` for another
+    object.
+
+    **Accuracy** q, masses, G and t are the same bits; p0 is rounded once. Units: REBOUND's solar
+    mass is GM☉/G with its own G, 4e-5 away from others; the numbers stay those of the simulation.
+
+    **Source** Rein & Liu 2012, *Astron. Astrophys.* 537, A128.
+    """
+    rebound = needed("rebound", "interop.from_rebound")
+    if isinstance(simulation, str | PathLike):
+        simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
+    elif snapshot != -1:
+        raise ValueError(
+            f"snapshot={snapshot} goes with the path of a file, not with a simulation."
+        )
+    if not isinstance(simulation, rebound.Simulation):
+        raise TypeError(
+            "from_rebound takes a rebound.Simulation or the path of a file, got "
+            f"{type(simulation).__name__}" + (
+                ": take one of its snapshots, archive[i]."
+                if isinstance(simulation, rebound.Simulationarchive) else "."
+            )
+        )  # fmt: skip
+    _refuse_what_would_be_lost(simulation)
+    bodies = list(simulation.particles)
+    masses = _with_mass(simulation, np.array([b.m for b in bodies], float), massless)
+    q = np.array([[b.x, b.y, b.z] for b in bodies], float).reshape(-1, 3)
+    v = np.array([[b.vx, b.vy, b.vz] for b in bodies], float).reshape(-1, 3)
+    p = masses[:, None] * v
+    names = tuple(_name(b) for b in bodies)
+    args: dict[str, Any] = {"masses": masses, "G": float(simulation.G)}
+    check_bodies(q, p, args, [str(n or f"body {i}") for i, n in enumerate(names)])
+    softening = float(simulation.softening)
+    if softening:
+        args["softening"] = softening
+    function = softened_hamiltonian if softening else hamiltonian
+
+    def energy(t0, t1, q0, p0, q1, p1, args):
+        return function(t0, t1, q1, p1, args)
+
+    units, parameters = _texts(_units(simulation))
+    about = {} if softening else {"invariants": INVARIANTS, "symmetries": symmetries(3)}
+    return ReboundProblem(
+        name="rebound",
+        system=dvi.System(function),
+        q0=q,
+        p0=p,
+        h=float(simulation.dt),
+        args=args,
+        observables={
+            "energy": energy,
+            "linear_momentum": linear_momentum,
+            "angular_momentum": angular_momentum,
+        },
+        units=units,
+        source="a simulation of REBOUND",
+        check=check_bodies,
+        parameters={name: parameters.get(name, "b [length]") for name in args},
+        t0=float(simulation.t),
+        names=names,
+        velocities=v,
+        radii=np.array([b.r for b in bodies], float),
+        integrator=str(simulation.integrator),
+        rebound_units=_units(simulation),
+        **about,
+    )
+
+
+def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) -> Any:
+    """A simulation of REBOUND with the bodies of a problem, or with another state of them.
+
+    - `problem`: what `from_rebound` gave, or another N-body problem (`n_body`, `solar_system`).
+    - `q`, `p`: a state, shape (bodies, 2 or 3), such as ``sol.qs[-1], sol.ps[-1]``; the start of
+      the problem when left out. `t`: its time.
+
+    **Returns** a ``rebound.Simulation`` with masses, radii, names, G, softening, units, t, and
+    dt = h. Its integrator is REBOUND's default, IAS15. A start that came from REBOUND goes back bit
+    for bit; of another state v = p/m is rounded once.
+
+    **Raises** `TypeError` for what is no problem, or one of q and p alone; `ValueError` for a
+    system that is not Newton's N bodies, or that has a force or a perturbation, which REBOUND would
+    not know of, and for shapes that do not agree; `ImportError` without rebound.
+    """
+    rebound = needed("rebound", "interop.to_rebound")
+    if not isinstance(problem, Problem):
+        raise TypeError(f"to_rebound takes a problem, got {type(problem).__name__}.")
+    system, args = problem.system, problem.args
+    known = system.H_D in (hamiltonian, softened_hamiltonian) and isinstance(args, Mapping)
+    if not known or system.force is not None or system.perturbation is not None:
+        raise ValueError(
+            f"to_rebound knows Newton's law between N bodies alone; {problem.name} has another "
+            "Hamiltonian, a force or a perturbation, and REBOUND would go on without it."
+        )
+    if (q is None) != (p is None):
+        raise TypeError("a state is q and p together, or neither of them.")
+    masses = np.asarray(args["masses"], float)
+    of_problem = q is None
+    q, p = (np.asarray(x, float) for x in ((problem.q0, problem.p0) if of_problem else (q, p)))
+    check_bodies(q, p, args)
+    velocities = problem.velocities if isinstance(problem, ReboundProblem) and of_problem else None
+    v = p / masses[:, None] if velocities is None else np.asarray(velocities, float)
+    if q.shape[1] == 2:
+        q, v = (np.pad(x, ((0, 0), (0, 1))) for x in (q, v))
+    imported = isinstance(problem, ReboundProblem)
+    simulation = rebound.Simulation()
+    if imported and problem.rebound_units:
+        simulation.units = problem.rebound_units
+    simulation.G = float(args.get("G", 1.0))  # after the units, which set it to their own
+    simulation.softening = float(args.get("softening", 0.0))
+    simulation.dt = float(problem.h)
+    simulation.t = float((problem.t0 if imported else 0.0) if t is None else t)
+    names = problem.names if imported and problem.names else (None,) * len(masses)
+    radii = np.zeros(len(masses)) if not imported or problem.radii is None else problem.radii
+    for mass, (x, y, z), (vx, vy, vz), r, name in zip(masses, q, v, radii, names, strict=True):
+        label = {} if name is None else {"name" if isinstance(name, str) else "hash": name}
+        simulation.add(m=mass, x=x, y=y, z=z, vx=vx, vy=vy, vz=vz, r=r, **label)
+    return simulation
+
+
+def _refuse_what_would_be_lost(sim: Any) -> None:
+    found = [text for field, text in _TURNED_ON.items() if getattr(sim, field, None)]
+    for field, allowed in (("boundary", ("none",)), ("collision", ("none",))):
+        if (value := getattr(sim, field)) not in allowed:
+            found.append(f"{field} = {value!r}")
+    if sim.gravity not in _NEWTONIAN:
+        found.append(f"gravity = {sim.gravity!r}: Newton's law between all pairs is meant here")
+    if str(sim.integrator) == "sei":
+        found.append("the shearing sheet (integrator sei): see the system hill")
+    if found:
+        raise ValueError(
+            "this simulation has more than bodies that attract one another, and it would be lost: "
+            + "; ".join(found)
+            + ". Turn it off in REBOUND (sim.copy() leaves callbacks out) if it is not meant."
+        )
+    if not sim.is_synchronized:
+        raise ValueError("the simulation is in the middle of a step: call sim.synchronize() first.")
+    if sim.N == 0:
+        raise ValueError("the simulation has no bodies.")
+
+
+def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarray:
+    """Masses, those that are zero replaced; test particles as REBOUND means them, or refused."""
+    count = int(sim.N_active)
+    active = len(masses) if not 0 <= count < len(masses) else count  # −1, 2⁶⁴ − 1: all of them
+    heavy = np.flatnonzero(masses[active:]) + active
+    if heavy.size and (sim.testparticle_type == 0 or len(masses) - active > 1):
+        raise ValueError(
+            f"N_active = {active} and body {heavy[0]} behind it has the mass {masses[heavy[0]]:g}: "
+            "REBOUND leaves out some of the attraction between such test particles, which no "
+            "Hamiltonian does. Give them mass 0, or set sim.N_active to all bodies."
+        )
+    empty = masses == 0
+    if not empty.any():
+        return masses
+    if massless is None:
+        raise ValueError(
+            f"{empty.sum()} of {len(masses)} bodies have no mass (the first is number "
+            f"{int(np.argmax(empty))}), and p = m v would fix no velocity. Say which tiny mass "
+            f"they are to have: from_rebound(sim, massless={1e-20 * max(masses.max(), 1e-300):.0e})."
+        )
+    if not 0 < massless < np.inf:
+        raise ValueError(f"massless must be a positive mass, got {massless!r}.")
+    return np.where(empty, massless, masses)
+
+
+def _name(body: Any) -> Any:
+    if (name := getattr(body, "name", None)) is not None:
+        return name
+    value = getattr(getattr(body, "hash", None), "value", 0)  # REBOUND 4
+    return value or None
+
+
+def _units(sim: Any) -> tuple[str, ...]:
+    """REBOUND's units of length, time and mass; none where it has none."""
+    names = tuple(sim.units.get(k) for k in ("length", "time", "mass"))
+    return names if all(names) else ()
+
+
+def _texts(units: tuple[str, ...]) -> tuple[dict[str, str], dict[str, str]]:
+    """The `units` and the `parameters` of a problem in these units."""
+    if not units:
+        return {"q": "1", "p": "1", "t": "1", "energy": "1"}, dict(PARAMETERS)
+    length, time, mass = (_ASTROPY.get(name, name) for name in units)
+    of_state = {
+        "q": length,
+        "p": f"{mass} {length}/{time}",
+        "t": time,
+        "energy": f"{mass} {length}²/{time}²",
+    }
+    return of_state, {
+        "masses": f"of the bodies [{mass}]",
+        "G": f"gravity [{length}³/({mass} {time}²)]",
+        "softening": f"b [{length}]",
+    }
