@@ -2,7 +2,7 @@
 
 from typing import Any, ClassVar
 
-import diffrax
+import diffrax  # pyright: ignore[reportMissingImports]
 import jax
 from jaxtyping import Array
 
@@ -74,15 +74,15 @@ def unwrapped(terms: Any) -> tuple[DiscreteTerm, Any]:
     return terms.term, terms.direction
 
 
-def promoted(result: dvi.RESULTS) -> diffrax.RESULTS:
+def promoted(result: dvi.RESULTS) -> Any:
     """A status of ours as one of diffrax's."""
-    theirs = diffrax.RESULTS
+    theirs: Any = diffrax.RESULTS
     of = {
         "successful": theirs.successful,
         "not_converged": theirs.nonlinear_max_steps_reached,
         "not_finite": getattr(theirs, "nonfinite", theirs.nonlinear_divergence),
     }
-    found = theirs.where(result == result, theirs.nonlinear_divergence, theirs.successful)
+    found: Any = theirs.nonlinear_divergence
     for name, other in of.items():
         found = theirs.where(result == getattr(dvi.RESULTS, name), other, found)
     return found

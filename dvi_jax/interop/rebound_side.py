@@ -208,7 +208,7 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     velocities = problem.velocities if isinstance(problem, ReboundProblem) and of_problem else None
     v = p / masses[:, None] if velocities is None else np.asarray(velocities, float)
     if q.shape[1] == 2:
-        q, v = (np.pad(x, ((0, 0), (0, 1))) for x in (q, v))
+        q, v = (np.column_stack([x, np.zeros(len(x))]) for x in (q, v))
     imported = isinstance(problem, ReboundProblem)
     simulation = rebound.Simulation()
     if imported and problem.rebound_units:
@@ -264,7 +264,7 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
         raise ValueError(
             f"{empty.sum()} of {len(masses)} bodies have no mass (the first is number "
             f"{int(np.argmax(empty))}), and p = m v would fix no velocity. Say which tiny mass "
-            f"they are to have: from_rebound(sim, massless={1e-20 * max(masses.max(), 1e-300):.0e})."
+            f"they are to have: from_rebound(sim, massless={1e-20 * masses.max() or 1e-20:.0e})."
         )
     if not 0 < massless < np.inf:
         raise ValueError(f"massless must be a positive mass, got {massless!r}.")

@@ -85,8 +85,8 @@ def solve_ivp(
     not a function that is called a number of times.
 
     **Raises** `TypeError` for arguments of SciPy's that have no meaning on a fixed lattice (rtol,
-    …), each with its reason, and as ``dvi.integrate``; `ValueError` for t_span, t_eval, y0 and h that
-    cannot be meant.
+    …), each with its reason, and as ``dvi.integrate``; `ValueError` for t_span, t_eval, y0 and h
+    that cannot be meant.
 
     **Accuracy** the order of the method in h. Values are NumPy's: nothing can be differentiated
     through it; take ``dvi.integrate`` for that.

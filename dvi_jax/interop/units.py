@@ -173,8 +173,8 @@ def integrate(
     **Returns** a `UnitSolution`.
 
     **Raises** `TypeError` for a number where a unit is needed, `ValueError` for a quantity of
-    another kind, with what was seen and what is allowed; and as ``dvi.integrate``. `ImportError` without
-    astropy.
+    another kind, with what was seen and what is allowed; and as ``dvi.integrate``. `ImportError`
+    without astropy.
 
     **Accuracy** one rounding for each number that is converted; the same orbit in two systems of
     units agrees to round-off. Nothing here can be traced: quantities are values. For `jax.grad`,
@@ -253,10 +253,10 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
 
 def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
     """The value in this unit."""
-    value: Any = given
-    if isinstance(value, list | tuple) and any(isinstance(x, u.Quantity) for x in value):
+    value = given
+    if isinstance(given, list | tuple) and any(isinstance(x, u.Quantity) for x in given):
         try:
-            value = u.Quantity(value)
+            value = u.Quantity(given)
         except (TypeError, u.UnitsError) as error:
             raise TypeError(
                 f"{name} mixes quantities and numbers, or units that do not go together: {error}."
