@@ -16,7 +16,7 @@ def needed(package: str, by: str) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        if error.name not in (None, package.partition(".")[0]):
+        if error.name not in (None, package, package.partition(".")[0]):
             raise  # it is there, and something that it needs is not
         raise ImportError(
             f"{by} needs {package.partition('.')[0]}, which the extra brings: "

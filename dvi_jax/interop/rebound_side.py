@@ -117,6 +117,7 @@ def from_rebound(
     rebound = needed("rebound", "interop.from_rebound")
     if isinstance(simulation, str | PathLike):
         simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
+        simulation.synchronize()  # it is ours: a snapshot may have been taken between half steps
     elif snapshot != -1:
         raise ValueError(
             f"snapshot={snapshot} goes with the path of a file, not with a simulation."

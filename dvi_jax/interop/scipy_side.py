@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -32,6 +33,18 @@ _REFUSED = {
 
 _ROOM = 200
 """Crossings of an event that there is room for at first."""
+
+
+class _OfVector(eqx.Module):
+    """event(t, y) or event(t, y, args) as g(t, q, p, args); of one event the same at every call, so
+    that a run is compiled once."""
+
+    event: Callable[..., Any] = eqx.field(static=True)
+    with_args: bool = eqx.field(static=True)
+
+    def __call__(self, t, q, p, args):
+        y = jnp.concatenate([jnp.ravel(q), jnp.ravel(p)])
+        return self.event(t, y, args) if self.with_args else self.event(t, y)
 
 
 class _Event(NamedTuple):
@@ -257,12 +270,7 @@ def _event(event: Any) -> _Event:
             f"terminal of an event must be True, False or a number of crossings, got {terminal!r}."
         )
     with_args = _takes_three(event)
-
-    def g(t, q, p, args):
-        y = jnp.concatenate([jnp.ravel(q), jnp.ravel(p)])
-        return event(t, y, args) if with_args else event(t, y)
-
-    return _Event(g, terminal, int(np.sign(direction)))
+    return _Event(_OfVector(event, with_args), terminal, int(np.sign(direction)))
 
 
 def _takes_three(event: Callable[..., Any]) -> bool:

@@ -1,0 +1,223 @@
+"""Results with labels, in files and for ArviZ; and what is imported when."""
+
+import subprocess
+import sys
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+import dvi_jax as dvi
+from dvi_jax import interop, systems
+
+KEPLER = systems.kepler()
+ENERGY = KEPLER.observables["energy"]
+OBSERVE = {"E": ENERGY, "kept": {"drift": dvi.MaxDrift(ENERGY)}}
+
+
+def run(q0=KEPLER.q0, epsilon=0.0, **options):
+    options = {"h": 0.1, "num_steps": 6, "observe": OBSERVE, **options}
+    return dvi.integrate(
+        KEPLER.system, q0, jnp.asarray(KEPLER.p0), epsilon=epsilon, args=KEPLER.args, **options
+    )
+
+
+def test_one_trajectory():
+    sol = run()
+    data = interop.to_xarray(
+        sol, observe=OBSERVE, components=["x", "y"], units={**KEPLER.units, "E": "J", "t": "s"},
+        attrs={"method": dvi.TypeII(), "h": 0.1, "args": KEPLER.args},
+    )  # fmt: skip
+    assert dict(data.sizes) == {"time": 7, "component": 2, "step": 6}
+    assert np.array_equal(data.q.sel(component="y"), sol.qs[:, 1])
+    assert np.array_equal(data.time, sol.ts)
+    assert data.E.dims == data.h.dims == ("step",)
+    assert data["kept.drift"].dims == ()
+    assert float(data["kept.drift"]) == float(sol.observed["kept"]["drift"]) > 1e-3
+    assert (data.E.attrs["units"], data.time.attrs["units"]) == ("J", "s")
+    assert (data.attrs["h"], data.attrs["num_steps"]) == (0.1, 6)
+    assert data.attrs["method"] == "TypeII()"
+    assert int(data.status) == 0
+    assert data.status.attrs["flag_meanings"].split()[2] == "not_finite"
+
+
+@pytest.mark.parametrize("save", [dvi.Save(every=4, final=True), dvi.Save(ts=[0.05, 0.2])], ids=str)
+def test_what_is_saved_is_labelled_by_its_time(save):
+    sol = run(save=save)
+    data = interop.to_xarray(sol, observe=OBSERVE)
+    assert np.array_equal(data.time, sol.ts)
+    assert data.E.dims == (("time",) if save.ts is not None else ("step",))
+    assert np.array_equal(data.E, sol.observed["E"])
+
+
+def test_a_batch_goes_to_a_file_and_comes_back(tmp_path):
+    epsilon, starts = jnp.array([0.0, 0.1, 0.2]), jnp.array([[0.0, 1.2], [0.1, 1.0]])
+
+    def one(e, q):
+        return run(q, e, stop=dvi.Stop(lambda t, q, p, args: -0.2 - q[0]), throw=False)
+
+    sols = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(epsilon, starts)
+    data = interop.to_xarray(
+        sols, dims=("epsilon", "start"), coords={"epsilon": np.asarray(epsilon)}, observe=OBSERVE
+    )
+    assert dict(data.sizes)["start"] == 2
+    assert data.q.dims == ("epsilon", "start", "time", "component")
+    assert data.status.dims == data["stop_t"].dims == ("epsilon", "start")
+    assert (data.status == 6).all()  # they stopped
+    assert data["stop_q"].dims == ("epsilon", "start", "component")
+    np.testing.assert_allclose(data["stop_q"][..., 0], -0.2, rtol=1e-12)
+    assert np.isnan(data.q[..., -1, :]).all()
+    path = tmp_path / "batch.nc"
+    data.to_netcdf(path, engine="h5netcdf")
+    with xr.open_dataset(path, engine="h5netcdf") as read:
+        xr.testing.assert_identical(read.load(), data)
+        assert not read.identical(data.assign_attrs(software="another"))
+
+
+def test_trajectories_with_times_of_their_own():
+    def one(h):
+        return run(h=h, observe=None)
+
+    sols = jax.vmap(one)(jnp.array([0.1, 0.2]))
+    data = interop.to_xarray(sols, dims="h_size")
+    assert data.q.dims == ("h_size", "save", "component")
+    assert np.array_equal(data.t, sols.ts)
+    assert "time" not in data.dims
+
+
+def test_a_failure_stays_nan_and_is_told():
+    sol = run(h=1e200, throw=False, observe=None)
+    data = interop.to_xarray(sol)
+    assert int(data.status) in (1, 2)
+    assert int(data.failed_step) >= 0
+    assert np.isnan(data.q[-1]).all()
+
+
+def test_bodies_and_axes_have_names():
+    problem = systems.n_body()
+    sol = dvi.integrate(problem.system, problem.q0, problem.p0, h=0.01, num_steps=2,
+                        args=problem.args)  # fmt: skip
+    data = interop.to_xarray(sol, components={"body": ["a", "b", "c"], "axis": ["x", "y"]})
+    assert np.array_equal(data.p.sel(body="b", axis="y"), sol.ps[:, 1, 1])
+    assert interop.to_xarray(sol).q.dims == ("time", "component_0", "component_1")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"dims": ("batch",)}, "0 dimensions"),
+        ({"components": ["x"]}, r"q has the shape \(2,\)"),
+        ({"observe": {"E": ENERGY}}, "not what this solution was observed by"),
+        ({"observe": {"E": ENERGY, "kept": {"drift": ENERGY}}}, "kept.drift"),
+    ],
+    ids=lambda x: "",
+)
+def test_labels_that_do_not_fit_are_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        interop.to_xarray(run(), **options)
+
+
+def test_what_is_no_solution_is_refused():
+    with pytest.raises(TypeError, match=r"dvi\.Solution"):
+        interop.to_xarray({"q": 1})
+    with pytest.raises(TypeError, match="outside of jit"):
+        jax.jit(lambda h: interop.to_xarray(run(h=h)).q.values)(0.1)
+    with pytest.raises(ValueError, match="taken"):
+        interop.to_xarray(run(observe={"q": ENERGY}))
+
+
+# ---- ArviZ
+
+
+def draws(seed=0, chains=4, count=250):
+    x = np.random.default_rng(seed).normal([1.0, -2.0], [0.1, 0.3], (chains, count, 2))
+    potential = (((x - [1.0, -2.0]) / [0.1, 0.3]) ** 2).sum(-1) / 2
+    diverging = np.zeros((chains, count), bool)
+    diverging[1, 3] = True
+    return dvi.Samples(
+        names=["epsilon", "K"], x=x, params={"epsilon": x[..., 0], "K": x[..., 1]},
+        potential=potential, diverging=diverging, steps=np.full((chains, count), 7),
+        acceptance=np.linspace(0.8, 0.9, chains), r_hat={"epsilon": 1.0, "K": 1.0},
+        ess={"epsilon": 900.0, "K": 900.0},
+    )  # fmt: skip
+
+
+SEEN = dvi.Observations(ts=[0.0, 0.5, 1.0], values=np.arange(6.0).reshape(3, 2), sigma=0.1)
+
+
+def check_groups(found, group):
+    posterior, stats, seen = (group(found, n) for n in
+                              ("posterior", "sample_stats", "observed_data"))  # fmt: skip
+    assert posterior["K"].dims == ("chain", "draw")
+    assert int(stats["diverging"].sum()) == 1
+    assert int(stats["tree_depth"].max()) == 3  # 7 = 2³ − 1 leapfrog steps
+    assert stats["acceptance_rate"].dims == ("chain",)
+    np.testing.assert_allclose(stats["lp"], -draws().potential)
+    assert np.array_equal(seen["ts"], [0.0, 0.5, 1.0])
+    assert np.array_equal(seen["values"], SEEN.values)
+
+
+def test_arviz_takes_what_was_drawn():
+    arviz = pytest.importorskip("arviz")
+    found = interop.to_inference_data(draws(), SEEN)
+    if hasattr(arviz, "InferenceData"):
+        assert isinstance(found, arviz.InferenceData)
+    check_groups(found, lambda data, name: data[name])
+    summary = arviz.summary(found)
+    np.testing.assert_allclose(summary.loc["K", "mean"], -2.0, atol=0.05)
+    assert float(summary.loc["epsilon", "r_hat"]) < 1.02
+    apart = draws()
+    apart.x[0] += 1.0  # a chain elsewhere
+    assert float(arviz.summary(interop.to_inference_data(apart)).loc["K", "r_hat"]) > 1.1
+
+
+def test_newer_arviz_takes_a_tree(monkeypatch):
+    monkeypatch.setitem(sys.modules, "arviz", types.ModuleType("arviz"))  # 1.x has no such class
+    monkeypatch.setitem(sys.modules, "arviz_base", types.ModuleType("arviz_base"))
+    found = interop.to_inference_data(draws(), [SEEN])
+    assert isinstance(found, xr.DataTree)
+    check_groups(found, lambda tree, name: tree[name].to_dataset())
+    with pytest.raises(TypeError, match="to_xarray"):
+        interop.to_inference_data(run())
+
+
+# ---- what is imported when
+
+THEIRS = ("diffrax", "astropy", "arviz", "arviz_base", "rebound", "scipy", "xarray")
+
+
+def test_importing_the_room_imports_none_of_them():
+    code = (
+        "import sys, dvi_jax\nbefore = set(sys.modules)\nfrom dvi_jax import interop\n"
+        f"print([m for m in {THEIRS} if m in sys.modules], 'interop' in dir(interop))\n"
+        "print('dvi_jax.interop' in before)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert out.returncode == 0, out.stderr
+    assert out.stdout.splitlines() == ["[] False", "False"]
+
+
+@pytest.mark.parametrize(
+    ("package", "call"),
+    [
+        ("diffrax", lambda: interop.diffrax_term(KEPLER)),
+        ("diffrax", interop.diffrax_solver),
+        ("rebound", lambda: interop.from_rebound("file.bin")),
+        ("rebound", lambda: interop.to_rebound(systems.n_body())),
+        ("astropy", lambda: interop.UnitSystem("m", "s", "kg")),
+        ("astropy", lambda: interop.integrate(KEPLER, h=0.1, num_steps=1)),
+        ("scipy", lambda: interop.solve_ivp(KEPLER, (0, 1), [0.0, 1.0, 1.0, 0.0], h=0.1)),
+        ("arviz", lambda: interop.to_inference_data(draws())),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_without_the_package_the_line_that_installs_it(package, call, monkeypatch):
+    names = {"arviz": ("arviz", "arviz_base"), "scipy": ("scipy.optimize",)}
+    names["astropy"] = ("astropy.units",)
+    for name in names.get(package, (package,)):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=rf'{package}.*pip install "dvi-jax\[interop\]"'):
+        call()

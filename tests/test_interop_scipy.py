@@ -1,0 +1,203 @@
+"""`solve_ivp` in SciPy's manner, beside SciPy's own."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dvi_jax as dvi
+from dvi_jax import interop, systems
+
+KEPLER = systems.kepler()
+
+
+def pendulum(t0, t1, q0, p1, args):
+    return jnp.sum(p1**2) / 2 - args * jnp.sum(jnp.cos(q0))
+
+
+def drive(t0, t1, q0, p1, args):
+    return jnp.full_like(q0, jnp.cos(2 * t0))
+
+
+SYSTEM = dvi.System(pendulum, force=drive)
+Y0, K, EPSILON = [0.9, 0.3], 1.3, 0.05
+FIELD = jax.jit(interop.vector_field(SYSTEM, EPSILON))
+
+
+def rate(t, y):
+    return np.concatenate(FIELD(t, tuple(np.split(y, 2)), K))
+
+
+def theirs(t_span, **options):
+    return solve_ivp(rate, t_span, Y0, method="DOP853", rtol=1e-11, atol=1e-11, **options)
+
+
+def ours(t_span, method="BlanesMoan6", h=0.05, **options):
+    options = {"args": K, "epsilon": EPSILON, **options}
+    return interop.solve_ivp(SYSTEM, t_span, Y0, method, h=h, **options)
+
+
+def high(t, y):
+    return y[0] - 0.3
+
+
+def low(t, y, *rest):
+    return y[0] + 0.2 + 0.01 * t
+
+
+def marked(event, terminal=False, direction=0):
+    """The event itself, so that all tests share what is compiled for it."""
+    event.terminal, event.direction = terminal, direction
+    return event
+
+
+@pytest.mark.parametrize("t_span", [(0.0, 6.0), (2.0, -4.0)])
+def test_states_at_given_times(t_span):
+    times = np.linspace(*t_span, 12)
+    wanted, found = theirs(t_span, t_eval=times), ours(t_span, t_eval=times)
+    assert np.array_equal(found.t, wanted.t)
+    assert found.y.shape == wanted.y.shape == (2, 12)
+    np.testing.assert_allclose(found.y, wanted.y, rtol=0, atol=2e-9)
+    assert (found.status, found.success, found.sol) == (0, True, None)
+    assert found.message == wanted.message
+    coarse = ours(t_span, "Strang", t_eval=times)
+    assert 1e-5 < np.abs(coarse.y - wanted.y).max() < 1e-2
+    undriven = ours(t_span, t_eval=times, epsilon=0.0)
+    assert np.abs(undriven.y - wanted.y).max() > 1e-3
+
+
+def test_all_lattice_points_where_none_are_asked_for():
+    found = ours((0.0, 1.0), h=0.3)
+    np.testing.assert_allclose(found.t, [0, 0.25, 0.5, 0.75, 1], rtol=0, atol=1e-15)
+    assert (found.num_steps, found.h) == (4, 0.25)
+    assert ours((0.0, 1.0), h=0.1).num_steps == 10  # 1/0.1 is not quite 10
+    sol = dvi.integrate(
+        SYSTEM, Y0[:1], Y0[1:], h=0.25, num_steps=4, epsilon=EPSILON, args=K,
+        method=dvi.BlanesMoan(6),
+    )  # fmt: skip
+    assert np.array_equal(found.y, np.concatenate([sol.qs, sol.ps], axis=1).T)
+
+
+@pytest.mark.parametrize("t_span", [(0.0, 9.0), (2.0, -7.0)])
+@pytest.mark.parametrize("direction", [0, 1, -1])
+def test_events_are_where_those_of_scipy_are(t_span, direction):
+    both = {"events": [marked(high, direction=direction), marked(low)]}
+    wanted, found = theirs(t_span, **both), ours(t_span, **both)
+    assert [len(t) for t in found.t_events] == [len(t) for t in wanted.t_events]
+    assert len(wanted.t_events[1]) >= 2
+    for name in ("t_events", "y_events"):
+        for a, b in zip(found[name], wanted[name], strict=True):
+            np.testing.assert_allclose(a, b.reshape(a.shape), rtol=0, atol=2e-8)
+
+
+@pytest.mark.parametrize("terminal", [True, 2])
+@pytest.mark.parametrize("t_span", [(0.0, 9.0), (2.0, -7.0)])
+def test_a_terminal_event_ends_what_is_told(terminal, t_span):
+    events = [marked(high, terminal), marked(low)]
+    times = np.linspace(*t_span, 40)
+    wanted, found = theirs(t_span, events=events), ours(t_span, events=events)
+    assert found.status == wanted.status == 1
+    assert (found.success, found.message) == (True, wanted.message)
+    np.testing.assert_allclose(found.t[-1], wanted.t[-1], rtol=0, atol=2e-8)
+    np.testing.assert_allclose(found.y[:, -1], wanted.y[:, -1], rtol=0, atol=2e-8)
+    assert [len(t) for t in found.t_events] == [len(t) for t in wanted.t_events]
+    assert len(found.t_events[0]) == int(terminal)
+    told = ours(t_span, events=events, t_eval=times)
+    assert np.array_equal(told.t, theirs(t_span, events=events, t_eval=times).t)
+    assert len(told.t) < 40
+
+
+def test_more_crossings_than_there_was_room_for():
+    from dvi_jax.interop import scipy_side
+
+    system = dvi.System(lambda t0, t1, q0, p1, args: 50 * jnp.sum(p1**2 + q0**2))
+    found = interop.solve_ivp(
+        system, (0.0, 8.9), [1.0, 0.0], dvi.Strang(), h=0.005, events=lambda t, y: y[0]
+    )
+    assert len(found.t_events[0]) == 286  # half turns, 2 asin(1/4) of phase a step
+    assert scipy_side._ROOM < 286
+
+
+def collapse(t0, t1, q0, p1, args):
+    """A force that is no longer defined at q < 0."""
+    return jnp.sum(p1**2) / 2 + jnp.sum(q0**1.5)
+
+
+def test_a_failure_is_told_and_not_raised():
+    system = dvi.System(collapse)
+    found = interop.solve_ivp(system, (0.0, 4.0), [1.0, 0.0], "Strang", h=0.05)
+    assert (found.status, found.success) == (-1, False)
+    assert "Likely causes" in found.message
+    assert found.solution.status == "not_finite"
+    assert 20 < len(found.t) < 80
+    assert np.isfinite(found.y).all()
+    assert found.y.shape == (2, len(found.t))
+    early = interop.solve_ivp(system, (0.0, 4.0), [1.0, 0.0], "Strang", h=0.05, t_eval=[1.0, 3.0])
+    assert (early.status, list(early.t)) == (-1, [1.0])
+
+
+def test_an_event_before_the_failure_is_a_success():
+    def event(t, y):
+        return y[0] - 0.8
+
+    found = interop.solve_ivp(
+        dvi.System(collapse), (0.0, 4.0), [1.0, 0.0], "Strang", h=0.05,
+        events=marked(event, terminal=True),
+    )  # fmt: skip
+    assert (found.status, found.success) == (1, True)
+    np.testing.assert_allclose(found.y[0, -1], 0.8, rtol=1e-12)
+
+
+def test_bodies_are_raveled():
+    problem = systems.n_body()
+    y0 = np.concatenate([np.ravel(problem.q0), np.ravel(problem.p0)])
+    found = interop.solve_ivp(problem, (0.0, 0.1), y0, "Strang", h=0.01)
+    assert found.y.shape == (12, 11)
+    sol = dvi.integrate(problem.system, problem.q0, problem.p0, h=0.01, num_steps=10,
+                        args=problem.args, method=dvi.Strang())  # fmt: skip
+    np.testing.assert_allclose(found.y[:6, -1].reshape(3, 2), sol.qs[-1], rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match="shape"):
+        interop.solve_ivp(problem, (0.0, 0.1), y0[:-2], "Strang", h=0.01)
+
+
+def never(t, y):
+    return y[0]
+
+
+NEGATIVE = marked(never, terminal=-1)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"rtol": 1e-3}, TypeError, "rtol: .*lattice is fixed"),
+        ({"dense_output": True}, TypeError, "t_eval"),
+        ({"vectorized": True}, TypeError, "vmap"),
+        ({"jac": None}, TypeError, "autodiff"),
+        ({"foo": 1}, TypeError, "foo"),
+        ({"method": "RK45"}, ValueError, "KahanLi8"),
+        ({"t_eval": [0.0, 2.0]}, ValueError, "within t_span"),
+        ({"t_eval": [0.5, 0.2]}, ValueError, "order of the run"),
+        ({"events": 3}, TypeError, "event"),
+        ({"events": NEGATIVE}, ValueError, "terminal"),
+        ({"h": -0.1}, ValueError, "direction is that of t_span"),
+    ],
+    ids=lambda x: "",
+)
+def test_what_cannot_be_meant_is_refused(options, error, words):
+    with pytest.raises(error, match=words):
+        ours((0.0, 1.0), **options)
+
+
+@pytest.mark.parametrize("t_span", [(0.0, 0.0), (0.0, np.inf), 1.0])
+def test_a_span_is_two_times(t_span):
+    with pytest.raises(ValueError, match="t_span"):
+        ours(t_span)
+
+
+def test_y_is_q_and_then_p():
+    with pytest.raises(ValueError, match="q0 and then p0"):
+        interop.solve_ivp(KEPLER, (0, 1), [1.0, 2.0, 3.0], h=0.1)
+    with pytest.raises(TypeError, match=r"dvi\.System"):
+        interop.solve_ivp(rate, (0, 1), Y0, h=0.1)

@@ -1,0 +1,144 @@
+"""Quantities at the door, numbers behind it."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from astropy import units as u
+
+import dvi_jax as dvi
+from dvi_jax import interop, systems
+
+
+def H(t, q, p, args):
+    """One planet of mass m about a Sun of GM = mu."""
+    return jnp.sum(p**2) / (2 * args["m"]) - args["mu"] * args["m"] / jnp.sqrt(jnp.sum(q**2))
+
+
+SYSTEM = dvi.System(dvi.discretise(H))
+KINDS = {"mu": u.km**3 / u.s**2, "m": u.g}
+ARGS = {"mu": 1.32712440018e20 * u.m**3 / u.s**2, "m": 5.97e24 * u.kg}
+Q0, P0 = [1, 0] * u.au, [0, 29.78 * 5.97e24] * (u.kg * u.km / u.s)
+SI = interop.UnitSystem(u.m, u.s, u.kg, args=KINDS)
+SOLAR = interop.UnitSystem(length="au", time=u.day, mass=u.Msun, args=KINDS)
+
+
+def run(units, **changes):
+    given = {
+        "q0": Q0, "p0": P0, "h": 1 * u.day, "num_steps": 100, "args": ARGS,
+        "method": dvi.KahanLi(8), **changes,
+    }  # fmt: skip
+    return interop.integrate(SYSTEM, units=units, **given)
+
+
+def test_the_orbit_is_the_same_in_other_units():
+    a, b = run(SOLAR), run(SI)
+    assert (a.qs.unit, b.qs.unit) == (u.au, u.m)
+    assert a.ps.unit == u.Msun * u.au / u.day
+    assert a.status == "successful"
+    for x, y in ((a.qs, b.qs), (a.ps, b.ps), (a.ts, b.ts), (a.hs, b.hs)):
+        scale = np.abs(y).max()
+        np.testing.assert_allclose((x / scale).to_value(u.one), (y / scale).to_value(u.one),
+                                   rtol=0, atol=2e-13)  # fmt: skip
+    # the numbers behind the door are far apart
+    assert np.asarray(b.solution.qs).max() > 1e11 * np.asarray(a.solution.qs).max()
+    other = run(SOLAR, h=2 * u.day, num_steps=50, method=dvi.Strang())
+    assert np.abs((other.qs[-1] - a.qs[-1]).to_value(u.au)).max() > 1e-7
+
+
+def test_what_goes_in_may_be_in_any_unit():
+    a = run(SOLAR)
+    b = run(
+        SOLAR, q0=[149597870.7 * u.km, 0 * u.m], h=24 * u.hour,
+        args={"mu": 398600.435507 * 332946.0487 * u.km**3 / u.s**2, "m": 5.97e27 * u.g},
+    )  # fmt: skip
+    np.testing.assert_allclose(b.qs.value, a.qs.value, rtol=0, atol=1e-8)  # two values of GM☉
+    at = run(SOLAR, ts=[0, 12, 36] * u.hour)
+    np.testing.assert_allclose(at.ts.to_value(u.hour), [0, 12, 36], rtol=1e-15)
+    np.testing.assert_allclose(at.solution.ts, [0, 0.5, 1.5], rtol=1e-15)
+
+
+def test_observables_see_numbers_in_the_units():
+    def energy(t0, t1, q0, p0, q1, p1, args):
+        return H(t1, q1, p1, args)
+
+    a, b = (run(units, observe={"E": energy}) for units in (SOLAR, SI))
+    joule = [(x.observed["E"] * x.units.energy).to_value(u.J) for x in (a, b)]
+    np.testing.assert_allclose(*joule, rtol=1e-13)
+    np.testing.assert_allclose(joule[0][-1], joule[0][0], rtol=1e-11)
+    assert a.units.energy.is_equivalent(u.J)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"h": 1 * u.m}, ValueError, r"h is in m \(length\).*time"),
+        ({"h": 1.0}, TypeError, "no unit"),
+        ({"q0": np.array([1.0, 0.0])}, TypeError, "q0 .*no unit"),
+        ({"q0": [1 * u.au, 0.1]}, TypeError, "mixes"),
+        ({"q0": [1 * u.au, 0 * u.s]}, TypeError, "mixes"),
+        ({"q0": None}, TypeError, "q0 is missing"),
+        ({"p0": [0, 29.78] * u.km / u.s}, ValueError, "speed.*momentum"),
+        ({"t0": 1 * u.kg}, ValueError, "mass.*time"),
+        ({"args": {**ARGS, "m": 1.0}}, TypeError, "m .*no unit"),
+        ({"args": {**ARGS, "mu": 1 * u.m}}, ValueError, "args mu is in m"),
+        ({"args": {**ARGS, "J": 1 * u.m}}, TypeError, "declare it"),
+        ({"epsilon": 1 * u.m}, ValueError, "epsilon"),
+        ({"ts": [1, 2] * u.m}, ValueError, "ts is in m"),
+        ({"save": dvi.Save(ts=[1.0])}, TypeError, "without a unit"),
+        ({"lattice": dvi.Given([0.0, 1.0])}, TypeError, "without a unit"),
+        ({"ts": [1] * u.day, "save": dvi.Save()}, TypeError, "leave save out"),
+        ({"units": {"length": "m"}}, TypeError, "UnitSystem"),
+    ],
+    ids=lambda x: "",
+)
+def test_what_has_the_wrong_dimension_is_refused(changes, error, words):
+    with pytest.raises(error, match=words):
+        run(changes.pop("units", SI), **changes)
+
+
+def test_a_system_needs_units_and_a_problem_has_them():
+    with pytest.raises(TypeError, match="UnitSystem"):
+        run(None)
+    problem = systems.oblate_kepler()
+    units = interop.UnitSystem.of(problem)
+    assert (units.q, units.t, units.energy) == (u.km, u.s, (u.km / u.s) ** 2)
+    assert units.args == {"mu": u.km**3 / u.s**2, "R": u.km}
+    sol = interop.integrate(problem, h=10 * u.s, num_steps=10)
+    ours = dvi.integrate(
+        problem.system, problem.q0, problem.p0, h=10.0, num_steps=10, args=problem.args
+    )
+    assert np.array_equal(sol.qs.to_value(u.km), ours.qs)
+    higher = interop.integrate(
+        problem,
+        problem.q0 * u.km,
+        h=10 * u.s,
+        num_steps=10,
+        args={"mu": 3.986e14 * u.m**3 / u.s**2},
+    )
+    off = np.abs((higher.qs - sol.qs).to_value(u.m)).max()
+    assert 1e-3 < off < 10  # μ in the seventh digit
+    with pytest.raises(ValueError, match=r"hill measures q in"):
+        interop.UnitSystem.of(systems.hill())
+    with pytest.raises(ValueError, match="h is in s"):  # it is dimensionless
+        interop.integrate(systems.kepler(), h=1 * u.s, num_steps=3)
+
+
+def test_angles_and_their_momenta():
+    problem = systems.double_pendulum()
+    a = interop.integrate(problem, np.rad2deg(problem.q0) * u.deg, h=1e-3 * u.s, num_steps=5)
+    b = interop.integrate(problem, h=1 * u.ms, num_steps=5)
+    np.testing.assert_allclose(a.qs.value, b.qs.value, rtol=0, atol=1e-15)
+    assert a.qs.unit == u.rad
+    made = interop.UnitSystem("km", "s", "kg", q="angle", p="angular momentum")
+    assert made.p == u.kg * u.km**2 / u.s
+    assert made.p != problem.units["p"]
+
+
+def test_a_unit_of_another_kind_is_no_base():
+    with pytest.raises(ValueError, match=r"time must be a unit of time.*\(length\)"):
+        interop.UnitSystem(u.m, u.m, u.kg)
+    with pytest.raises(ValueError, match="not known"):
+        interop.UnitSystem(u.m, u.s, u.kg, q="longitude")
+    assert interop.UnitSystem(u.m, u.s, u.kg, args={"mu": u.au**3 / u.yr**2}).args["mu"] == (
+        u.m**3 / u.s**2
+    )
