@@ -168,6 +168,7 @@ def test_nothing_is_silently_ignored():
         interop.diffrax_term(KEPLER.system.H_D)
 
 
+@pytest.mark.slow
 def test_dense_output_has_order_four_and_is_not_the_map():
     def error(h):
         ts = jnp.linspace(0.03, 1.97, 23)
@@ -182,6 +183,7 @@ def test_dense_output_has_order_four_and_is_not_the_map():
     assert np.all(np.abs(orders - 4) < 0.5), orders
 
 
+@pytest.mark.slow
 def test_the_map_tends_to_the_vector_field():
     """Of the forced problem, with a perturbation, and in slow time: order 2 of `Strang`."""
 

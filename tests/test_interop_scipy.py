@@ -80,7 +80,9 @@ def test_all_lattice_points_where_none_are_asked_for():
 
 
 @pytest.mark.parametrize("t_span", [(0.0, 9.0), (2.0, -7.0)])
-@pytest.mark.parametrize("direction", [0, 1, -1])
+@pytest.mark.parametrize(
+    "direction", [0, *(pytest.param(d, marks=pytest.mark.slow) for d in (1, -1))]
+)
 def test_events_are_where_those_of_scipy_are(t_span, direction):
     both = {"events": [marked(high, direction=direction), marked(low)]}
     wanted, found = theirs(t_span, **both), ours(t_span, **both)

@@ -1,0 +1,65 @@
+"""The pages on other packages run as printed, and their numbers are what they say."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def run(page):
+    """The names that the blocks of a page leave behind, one after the other."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.S)
+    names: dict = {}
+    for i, block in enumerate(blocks):
+        exec(compile(block, f"{page}, block {i + 1}", "exec"), names)
+    return names, len(blocks)
+
+
+@pytest.mark.slow
+def test_the_page_on_interoperability_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names, count = run("interoperability.md")
+    assert count == 7
+    assert names["apart"] < 1e-14
+    assert 1e-5 < names["error_of_the_map"] < 1e-1
+    assert names["from_theirs"] < 1e-10
+    np.testing.assert_allclose(*names["energies"], rtol=1e-12)
+    assert names["energies"][0] == pytest.approx(names["energies"][1], rel=1e-12)
+    u = names["u"]
+    assert np.linalg.norm(names["position"]).to_value(u.au) == pytest.approx(1.0, abs=0.02)
+    assert 500 < names["height"].to_value(u.km) < 2500
+    assert names["found"].status == 1
+    assert len(names["found"].t_events[0]) == 1
+    assert names["x_at_the_end"].dims == ()
+    assert (tmp_path / "orbits.nc").exists()
+    assert float(names["table"].loc["a", "mean"]) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.slow
+def test_the_page_on_migration_runs():
+    names, count = run("migration.md")
+    assert count == 3
+    assert names["same_steps"] < 1e-13
+    assert names["leapfrog"] < 1e-11
+    assert 0 < names["ours"].observed["energy"] < 1e-3
+    assert names["one_map"] < 1e-12
+    assert np.max(np.abs(names["gauss"].qs - names["implicit"].qs)) > 1e-4  # another method
+
+
+@pytest.mark.parametrize("page", ["interoperability.md", "migration.md"])
+def test_names_on_the_pages_exist(page):
+    import dvi_jax
+    from dvi_jax import interop, systems
+
+    text = (DOCS / page).read_text(encoding="utf-8")
+    rooms = {"dvi": dvi_jax, "interop": interop, "systems": systems}
+    found = {(room, name) for room, name in re.findall(r"\b(dvi|interop|systems)\.(\w+)", text)
+             if name != "md"}  # fmt: skip
+    assert len(found) > 15
+    assert [f"{r}.{n}" for r, n in sorted(found) if not hasattr(rooms[r], n)] == []
+    for link in re.findall(r"\]\((\w[\w-]*\.md)\)", text):
+        assert (DOCS / link).exists(), link
