@@ -1,6 +1,5 @@
 """Maps of the package as solvers of diffrax, and the continuous limit that they tend to."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,8 @@ from helpers import measured_orders
 import dvi_jax as dvi
 from dvi_jax import interop, systems
 from dvi_jax._results import STATUS_NAMES
+
+diffrax = pytest.importorskip("diffrax")
 
 KEPLER = systems.kepler()
 Q0, P0 = jnp.asarray(KEPLER.q0), jnp.asarray(KEPLER.p0)

@@ -184,6 +184,13 @@ def test_newer_arviz_takes_a_tree(monkeypatch):
         interop.to_inference_data(run())
 
 
+def test_arviz_base_takes_the_tree():
+    arviz_base = pytest.importorskip("arviz_base")
+    found = arviz_base.extract(interop.to_inference_data(draws(), SEEN))
+    assert found.sizes["sample"] == 1000
+    assert float(found["K"].mean()) == pytest.approx(-2.0, abs=0.05)
+
+
 # ---- what is imported when
 
 THEIRS = ("diffrax", "astropy", "arviz", "arviz_base", "rebound", "scipy", "xarray")

@@ -21,6 +21,8 @@ def run(page):
 
 @pytest.mark.slow
 def test_the_page_on_interoperability_runs(tmp_path, monkeypatch):
+    for package in ("diffrax", "rebound", "astropy"):
+        pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     names, count = run("interoperability.md")
     assert count == 7
@@ -36,11 +38,13 @@ def test_the_page_on_interoperability_runs(tmp_path, monkeypatch):
     assert len(names["found"].t_events[0]) == 1
     assert names["x_at_the_end"].dims == ()
     assert (tmp_path / "orbits.nc").exists()
-    assert float(names["table"].loc["a", "mean"]) == pytest.approx(1.0, abs=0.02)
+    assert names["depth"] == 2  # 3 leapfrog steps
 
 
 @pytest.mark.slow
 def test_the_page_on_migration_runs():
+    for package in ("diffrax", "rebound"):
+        pytest.importorskip(package)
     names, count = run("migration.md")
     assert count == 3
     assert names["same_steps"] < 1e-13

@@ -3,10 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from astropy import units as u
 
 import dvi_jax as dvi
 from dvi_jax import interop, systems
+
+u = pytest.importorskip("astropy.units")
 
 
 def H(t, q, p, args):

@@ -110,7 +110,7 @@ def from_rebound(
     object.
 
     **Accuracy** q, masses, G and t are the same bits; p0 is rounded once. Units: REBOUND's solar
-    mass is GM☉/G with its own G, 4e-5 away from others; the numbers stay those of the simulation.
+    mass is GM☉/G with its own G, 3e-5 away from others; the numbers stay those of the simulation.
 
     **Source** Rein & Liu 2012, *Astron. Astrophys.* 537, A128.
     """
