@@ -213,6 +213,7 @@ def test_the_map_tends_to_the_vector_field():
     assert error(160, epsilon=0.11) > 30 * error(160)  # of another field it would not
 
 
+@pytest.mark.slow
 def test_their_solvers_take_our_term():
     options = {"stepsize_controller": diffrax.PIDController(rtol=1e-12, atol=1e-12)}
     sol = by_diffrax(diffrax.Dopri8(), 3.0, epsilon=0.0, **options)

@@ -120,6 +120,14 @@ def test_labels_that_do_not_fit_are_refused(options, words):
         interop.to_xarray(run(), **options)
 
 
+def test_observables_without_a_name_get_one():
+    assert interop.to_xarray(run(observe=ENERGY), observe=ENERGY).observed.dims == ("step",)
+    listed = [dvi.TangentMap(), ENERGY]
+    data = interop.to_xarray(run(observe=listed), observe=listed)
+    assert data["observed.0"].shape == (4, 4)
+    assert data["observed.1"].dims == ("step",)
+
+
 def test_what_is_no_solution_is_refused():
     with pytest.raises(TypeError, match=r"dvi\.Solution"):
         interop.to_xarray({"q": 1})

@@ -50,7 +50,7 @@ def to_xarray(
       state it ended at (for ``Save(ts=...)`` the dimension of the states itself).
 
     Variables: `q`, `p`, `h`; observables by their place in the pytree, joined by points, one alone
-    as ``observed``; `status` (int8, with ``flag_values`` and ``flag_meanings``); the arrays in
+    as ``observed``, the first of a list as ``observed.0``; `status` (int8, with ``flag_values`` and ``flag_meanings``); the arrays in
     ``solution.stats``; ``stop_t``, ``stop_q``, ``stop_p`` for a run with a `Stop`. NaN stays NaN.
     ``dataset.to_netcdf(path, engine="h5netcdf")`` writes it (extra ``export``).
 
@@ -238,7 +238,8 @@ def _observed(observed: Any, observe: Any) -> list[tuple[str, np.ndarray, bool]]
             ) from None
     arrays = jax.tree.leaves_with_path(observed, is_leaf=eqx.is_array)
     per_step = jax.tree.leaves(flags)
-    names = [".".join(_word(k) for k in path) or "observed" for path, _ in arrays]
+    names = [".".join(_word(k) for k in path) for path, _ in arrays]
+    names = [f"observed.{n}".rstrip(".") if not n or n[0].isdigit() else n for n in names]
     return [
         (name, np.asarray(x), flag)
         for name, (_, x), flag in zip(names, arrays, per_step, strict=True)
