@@ -50,8 +50,9 @@ def to_xarray(
       state it ended at (for ``Save(ts=...)`` the dimension of the states itself).
 
     Variables: `q`, `p`, `h`; observables by their place in the pytree, joined by points, one alone
-    as ``observed``, the first of a list as ``observed.0``; `status` (int8, with ``flag_values`` and ``flag_meanings``); the arrays in
-    ``solution.stats``; ``stop_t``, ``stop_q``, ``stop_p`` for a run with a `Stop`. NaN stays NaN.
+    as ``observed``, the first of a list as ``observed.0``; `status` (int8, with ``flag_values`` and
+    ``flag_meanings``); the arrays in ``solution.stats``; ``stop_t``, ``stop_q``, ``stop_p`` for a
+    run with a `Stop`. NaN stays NaN.
     ``dataset.to_netcdf(path, engine="h5netcdf")`` writes it (extra ``export``).
 
     **Raises** `ValueError` for a number of `dims` that is not that of the batch, labels that do not
