@@ -165,6 +165,10 @@ def test_nothing_is_silently_ignored():
         run(term, y0=jnp.concatenate([Q0, P0]))
     with pytest.raises(TypeError, match="method"):
         interop.diffrax_solver(diffrax.Tsit5())
+    undisturbed = dvi.System(non_separable)
+    for make in (interop.diffrax_term, interop.vector_field):
+        with pytest.warns(UserWarning, match="no effect"):
+            make(undisturbed, epsilon=0.1)
     with pytest.raises(TypeError, match=r"dvi\.System"):
         interop.diffrax_term(KEPLER.system.H_D)
 

@@ -1,5 +1,6 @@
 """A discrete map as a solver of diffrax, and the vector field that it discretises."""
 
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,7 @@ def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], t
     field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
     """
     system = system_of(system, "vector_field")
+    _warn_without_effect(system, epsilon)
 
     def field(t, y, args):
         q, p = as_pair(y)
@@ -64,6 +66,22 @@ def as_pair(y: Any) -> tuple[Any, Any]:
     return q, p
 
 
+def _warn_without_effect(system: dvi.System, epsilon: Any) -> None:
+    """As `integrate` warns, where the value is known."""
+    if system.force is not None or system.perturbation is not None or system.slow_time:
+        return
+    try:
+        value = float(epsilon)
+    except (TypeError, jax.errors.ConcretizationTypeError):  # it stands for values to come
+        return
+    if value != 0:
+        warnings.warn(
+            f"epsilon = {value:g} has no effect: the system has neither a force nor a "
+            "perturbation.",
+            stacklevel=3,
+        )
+
+
 def diffrax_term(system: Any, epsilon: Any = 0.0) -> "DiscreteTerm":
     """The term of diffrax that carries a system: what `diffrax_solver` steps.
 
@@ -78,7 +96,9 @@ def diffrax_term(system: Any, epsilon: Any = 0.0) -> "DiscreteTerm":
     needed("diffrax", "interop.diffrax_term")
     from .diffrax_classes import DiscreteTerm
 
-    return DiscreteTerm(system_of(system, "diffrax_term"), jnp.asarray(epsilon, float))
+    system = system_of(system, "diffrax_term")
+    _warn_without_effect(system, epsilon)
+    return DiscreteTerm(system, jnp.asarray(epsilon, float))
 
 
 def diffrax_solver(
