@@ -12,7 +12,7 @@ READY = $(VENV)/ready
 
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help paper test test-fast lint types format lock clean
+.PHONY: help paper notebooks test test-fast lint types format lock clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -20,6 +20,10 @@ help:
 ## make paper       reproduce the paper into ./paper-out (OUT=... for another new directory)
 paper: $(READY)
 	$(BIN)/dvi-jax paper --out $(OUT)
+
+## make notebooks   execute the notebooks anew (NOTEBOOKS=--check to compare, or names of some)
+notebooks: $(READY)
+	$(BIN)/python notebooks/make.py $(NOTEBOOKS)
 
 ## make test        all tests
 test: $(READY)

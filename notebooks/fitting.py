@@ -1,0 +1,148 @@
+# %% [markdown]
+# # Fitting $\varepsilon$: how strong is the disturbance?
+#
+# A disturbed system is observed, with noise. How large is $\varepsilon$, how well is that known,
+# and do the data ask for a disturbance at all? `dvi.fit` differentiates the discrete trajectory
+# itself, so that the answer belongs to the integrator that is used.
+#
+# The example has a known truth, an oscillator with weak friction,
+#
+# $$H = \tfrac12 p^2 + \tfrac12 k q^2, \qquad \dot p = -kq - \varepsilon p, \qquad
+# k = 1.3,\ \varepsilon = 0.02 ,$$
+#
+# seen 60 times within 30 units of time, with errors of 0.01. The data are made from the exact
+# solution, not from the model.
+
+# %%
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+import dvi_jax as dvi
+from dvi_jax import plot
+
+jax.config.update("jax_enable_x64", True)
+
+K, EPSILON, SIGMA = 1.3, 0.02, 0.01
+ts = np.linspace(0.5, 30, 60)
+
+
+def observed(seed, epsilon=EPSILON):
+    """Positions of the oscillator that is let go at q = 1, with noise."""
+    rate = np.sqrt(K - epsilon**2 / 4)
+    wave = np.cos(rate * ts) + epsilon / (2 * rate) * np.sin(rate * ts)
+    noise = SIGMA * np.random.default_rng(seed).normal(size=len(ts))
+    values = np.exp(-epsilon * ts / 2) * wave + noise
+    return dvi.Observations(ts, values[:, None], sigma=SIGMA, t0=0.0)
+
+
+# %% [markdown]
+# ## The fit
+#
+# `Model` holds what is known, the last argument of `fit` what is not, with values to begin from:
+# $\varepsilon = 0$ assumes no disturbance.
+
+
+# %%
+def H_D(t0, t1, q0, p1, args):
+    return p1 @ p1 / 2 + args["k"] * (q0 @ q0) / 2
+
+
+def friction(t0, t1, q0, p1, args):
+    return -p1
+
+
+system = dvi.System(H_D, force=friction)
+model = dvi.Model(system, h=0.05, p0=[0.0], method=dvi.Yoshida(4))
+guess = {"epsilon": 0.0, "q0": np.array([0.9]), "args": {"k": 1.2}}
+found = dvi.fit(model, observed(0), guess, progress=False)
+for name, x, sigma in zip(found.names, found.x, found.sigma, strict=True):
+    print(f"{name:8} = {x:.4f} ± {sigma:.4f}")
+print(f"{found.status}, reduced chi² = {found.reduced_chi2:.2f}")
+
+# %%
+axis = plot.fit_against_data(found)
+plt.show()
+
+# %% [markdown]
+# ## Are the errors honest?
+#
+# Thirty times other noise: the estimates must scatter about the truth by what the fit says. The
+# second fit of a kind needs no compilation.
+
+# %%
+epsilon_at = found.names.index("epsilon")
+fits = [dvi.fit(model, observed(seed), guess, progress=False) for seed in range(30)]
+estimates = np.array([fit.x[epsilon_at] for fit in fits])
+sigmas = np.array([fit.sigma[epsilon_at] for fit in fits])
+pulls = (estimates - EPSILON) / sigmas
+print(
+    f"ε: mean {estimates.mean():.5f}, scatter {estimates.std(ddof=1):.5f}, said {sigmas.mean():.5f}"
+)
+print(f"(estimate − truth)/sigma: mean {pulls.mean():.2f}, scatter {pulls.std(ddof=1):.2f}")
+
+assert all(fit.status == "converged" for fit in fits)
+assert abs(pulls.mean()) < 3 / np.sqrt(30)
+assert 0.7 < pulls.std(ddof=1) < 1.3
+
+# %% [markdown]
+# ## Do the data ask for it?
+#
+# The control is the same fit without friction. Its $\chi^2$ must say that it does not do. And where
+# there is none to be found, the fit must find none.
+
+# %%
+undisturbed = {"q0": np.array([0.9]), "args": {"k": 1.2}}
+without = dvi.fit(model, observed(0), undisturbed, progress=False, check_curvature=False)
+print(f"without friction: reduced chi² = {without.reduced_chi2:.1f}")
+
+none = dvi.fit(model, observed(0, epsilon=0.0), guess, progress=False)
+print(f"data without friction: ε = {none.x[epsilon_at]:.4f} ± {none.sigma[epsilon_at]:.4f}")
+
+assert found.reduced_chi2 < 1.5
+assert without.reduced_chi2 > 10
+assert abs(none.x[epsilon_at]) < 3 * none.sigma[epsilon_at]
+
+# %% [markdown]
+# ## Which force is it?
+#
+# Suppose that the law is not known. `identify` fits the coefficients of many candidate terms to the
+# trajectory and removes what the data do not ask for. Candidates are the monomials
+# $q^i p^j$ up to degree 3; positions and momenta are seen now. The truth is $-\varepsilon p$ alone.
+
+# %%
+times = np.linspace(0.25, 30, 120)
+run = dvi.integrate(
+    system, [1.0], [0.0], h=0.01, num_steps=3000, epsilon=EPSILON, args={"k": K},
+    method=dvi.Yoshida(4), save=dvi.Save(every=25),
+)  # fmt: skip
+states = np.concatenate([run.qs, run.ps], axis=1)[1:]
+states += SIGMA * np.random.default_rng(1).normal(size=states.shape)
+data = dvi.Observations(times, states, observe="state", sigma=SIGMA, t0=0.0)
+spring = dvi.Model(dvi.System(H_D), h=0.05, args={"k": K}, method=dvi.Strang())
+library = dvi.ForceLibrary.monomials(3, 1)
+start = {"q0": np.array([1.0]), "p0": np.array([0.0])}
+named = dvi.identify(spring, data, library, start, progress=False, check_curvature=False)
+print(named)
+assert named.terms == ("p",)
+assert abs(named.coefficients[0] + EPSILON) < 3 * named.sigma[0]
+
+# %%
+with plot.style():
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
+    left.hist(pulls, bins=np.arange(-3.5, 3.6, 0.5), color=plot.COLOURS[0], alpha=0.8)
+    left.set(xlabel="(estimate − truth)/sigma", ylabel="fits", title="Thirty noises")
+    for name, fit in {"with friction": found, "without": without}.items():
+        right.plot(ts, fit.whitened[0], ".-", lw=0.7, label=f"{name}: {fit.reduced_chi2:.1f}")
+    right.set(xlabel="time t", ylabel="residual over sigma", title="Residuals, reduced χ²")
+    right.legend()
+plt.show()
+
+# %% [markdown]
+# ## What next
+#
+# - Real data, with errors that are not honest: [general relativity](general_relativity.ipynb) and
+#   the [Chandler wobble](polar_motion.ipynb).
+# - `bounds`, `priors`, losses against outliers, several arcs, `MultipleShooting` for chaotic ones.
+# - `dvi.NetworkForce`: a potential and a damping by networks, where no library of terms is at hand.
+# - `dvi.sample`: the whole distribution in place of a $\pm$.

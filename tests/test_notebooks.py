@@ -1,0 +1,189 @@
+"""The notebooks: in step with their sources, executed, small; what they print comes out again."""
+
+import copy
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+for needed in ("jupytext", "nbclient", "nbformat", "ipykernel"):
+    pytest.importorskip(needed)
+
+NAMES = [
+    "discovering_invariants",
+    "fitting",
+    "general_relativity",
+    "gpu",
+    "limits",
+    "magnetic_moment",
+    "polar_motion",
+    "quick_start",
+    "sweeps",
+    "the_paper",
+    "your_own_system",
+]
+FROM_THE_EPHEMERIS = {"general_relativity", "polar_motion"}
+
+
+@pytest.fixture(scope="module")
+def make():
+    """The script that makes them."""
+    spec = importlib.util.spec_from_file_location("make_notebooks", ROOT / "notebooks/make.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_all_are_there(make):
+    assert make.names() == NAMES
+    assert sorted(path.stem for path in (ROOT / "notebooks").glob("*.ipynb")) == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_notebook_is_as_it_should_be(make, name):
+    """In step with its source, below 300 kB, executed in order, without errors or warnings."""
+    assert make.faults(name) == []
+    assert make.LARGEST <= 300_000
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_links_to_what_is_there(make, name):
+    """Other notebooks by relative links, files of the repository by their path."""
+    words = "\n".join(c.source for c in make.committed(name).cells if c.cell_type == "markdown")
+    for link in re.findall(r"\]\(([^)]+)\)", words):
+        assert (ROOT / "notebooks" / link).exists(), link
+    for path in re.findall(r"`(?:python )?((?:docs|examples|benchmarks)/[\w./-]+)", words):
+        assert (ROOT / path).exists(), path
+
+
+# --- negative controls: what the checks must catch ------------------------------------------------
+
+
+@pytest.fixture
+def book(make):
+    return copy.deepcopy(make.committed("quick_start"))
+
+
+def printed(book, text):
+    """The output that holds a text."""
+    return next(
+        output
+        for cell in book.cells
+        for output in cell.get("outputs", [])
+        if output.output_type == "stream" and text in output.text
+    )
+
+
+def test_a_changed_number_is_caught(make, book):
+    original = make.committed("quick_start")
+    assert make.differences(original, book) == []
+    output = printed(book, "slope 1.990")
+    output.text = output.text.replace("slope 1.990", "slope 1.899")
+    (found,) = make.differences(original, book)
+    assert "slope 1.990" in found
+    assert "slope 1.899" in found
+
+
+def test_a_number_may_differ_in_its_last_digit(make):
+    assert not make.unlike("slope 1.990", "slope 1.991")
+    assert make.unlike("slope 1.990", "slope 1.998")
+    assert not make.unlike("drift 3e-15, −1.234", "drift 9.1e-16, −1.235")  # round-off
+    assert make.unlike("drift 3e-5", "drift 9e-5")
+    assert make.unlike("drift 3e-15", "drift 3e-5")
+    assert make.unlike("8 of 9 points", "9 of 9 points")
+    assert make.unlike("q0[0] = 1.0", "q0[1] = 1.0")
+    assert make.unlike("found", "found\nmore")
+    assert make.unlike("slope 2.0", "slope nan")
+
+
+def test_a_missing_picture_is_caught(make, book):
+    cell = next(c for c in book.cells if any(map(make._is_picture, c.get("outputs", []))))
+    cell.outputs = []
+    assert any("kinds of outputs" in x for x in make.differences(make.committed(NAMES[7]), book))
+
+
+def test_a_changed_source_is_caught(make, book):
+    cell = next(c for c in book.cells if c.cell_type == "code")
+    cell.source += "\npass"
+    assert make.faults("quick_start", book) == ["cell 1 is not that of the source: make notebooks"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda cells: cells.pop(), "cells, the source has"),
+        (lambda cells: cells[1].update(execution_count=7), "in their order"),
+        (lambda cells: cells[1].update(id="aa"), "its id or metadata"),
+        (lambda cells: [c.update(outputs=[]) for c in cells if "outputs" in c], "no picture"),
+        (
+            lambda cells: cells[1].update(outputs=[stream("stderr", "UserWarning: no\n")]),
+            "cell 1 warns: UserWarning: no",
+        ),
+        (
+            lambda cells: cells[1].update(outputs=[stream("stdout", "see /some/where/file.py\n")]),
+            "names a place on a machine",
+        ),
+        (
+            lambda cells: cells[1].update(outputs=[stream("stdout", "x" * 300_000)]),
+            "fewer or smaller pictures",
+        ),
+    ],
+)
+def test_what_else_is_caught(make, book, spoil, says):
+    spoil(book.cells)
+    assert any(says in fault for fault in make.faults("quick_start", book))
+
+
+def stream(name, text):
+    from nbformat.v4 import new_output
+
+    return new_output("stream", name=name, text=text)
+
+
+def test_units_are_no_places(make):
+    """ "/" stands between units, too."""
+    assert not make._MACHINE.search("43.0 ″/century, 1/h and m/(N/m), 3 km/s/Mpc or 1/2/3")
+
+
+def test_an_unknown_notebook_is_refused():
+    run = subprocess.run(
+        [sys.executable, ROOT / "notebooks/make.py", "--check", "no_such"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 2
+    assert "no source for no_such; there are discovering_invariants" in run.stderr
+
+
+# --- executed anew ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("name", NAMES)
+def test_it_comes_out_again(make, name):
+    if name in FROM_THE_EPHEMERIS:
+        pytest.importorskip("jplephem")
+        if importlib.util.find_spec("skyfield_data") is None:
+            pytest.skip("the ephemeris is not installed")
+    assert make.made(name, check=True) == []
+
+
+@pytest.mark.slow
+def test_a_cell_that_raises_is_told(make, tmp_path, monkeypatch):
+    source = (ROOT / "notebooks/quick_start.py").read_text(encoding="utf-8")
+    wrong = source.replace(
+        "assert abs(order.slope - 2) < 0.02", "assert abs(order.slope - 3) < 0.02"
+    )
+    assert wrong != source
+    (tmp_path / "quick_start.py").write_text(wrong, encoding="utf-8")
+    monkeypatch.setattr(make, "HERE", tmp_path)
+    (told,) = make.made("quick_start", check=False)
+    assert "AssertionError" in told
+    assert not (tmp_path / "quick_start.ipynb").exists()
