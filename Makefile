@@ -12,7 +12,7 @@ READY = $(VENV)/ready
 
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help paper notebooks test test-fast lint types format lock clean
+.PHONY: help paper notebooks docs test test-fast lint types format lock clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -24,6 +24,11 @@ paper: $(READY)
 ## make notebooks   execute the notebooks anew (NOTEBOOKS=--check to compare, or names of some)
 notebooks: $(READY)
 	$(BIN)/python notebooks/make.py $(NOTEBOOKS)
+
+## make docs        the documentation, as pages in docs/_build/html
+docs: $(READY)
+	$(BIN)/python -m sphinx -W --keep-going -q -j auto -b html docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
 
 ## make test        all tests
 test: $(READY)

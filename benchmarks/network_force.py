@@ -29,7 +29,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax.fit.optimise import LEVENBERG_MARQUARDT, Evaluation, LeastSquaresStage
+from dvi_jax.fit.optimise import Evaluation, LeastSquaresStage
+from dvi_jax.fit.solvers import levenberg_marquardt
 
 jax.config.update("jax_enable_x64", True)
 
@@ -174,7 +175,7 @@ def _fit_foil(field, seed, steps):
     values, sigma = jnp.asarray(seen.values), jnp.asarray(seen.sigma)
     stage = LeastSquaresStage(
         lambda u, horizon, extra: _evaluate(static, (tree, shapes), u, horizon, values, sigma),
-        LEVENBERG_MARQUARDT,
+        levenberg_marquardt(),
     )
     left = steps
     for number, horizon in enumerate((*HORIZONS, np.inf)):

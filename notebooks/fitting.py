@@ -1,5 +1,5 @@
 # %% [markdown]
-# # Fitting $\varepsilon$: how strong is the disturbance?
+# # Fitting ε: how strong is the disturbance?
 #
 # A disturbed system is observed, with noise. How large is $\varepsilon$, how well is that known,
 # and do the data ask for a disturbance at all? `dvi.fit` differentiates the discrete trajectory

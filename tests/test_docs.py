@@ -160,7 +160,7 @@ FAULTS = r"""async (math) => {
   const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
   for (let n = walk.nextNode(); n; n = walk.nextNode())
     if (/\$|\\\(|\\\[/.test(n.data)
-        && !n.parentElement.closest('pre, code, script, style, mjx-container'))
+        && !n.parentElement.closest('pre, code, dt.sig, script, style, mjx-container'))
       faults.push('left over: ' + n.data.trim().slice(0, 60));
   for (const i of all('img')) { i.loading = 'eager'; await i.decode().catch(() => 0);
     if (!i.naturalWidth) faults.push('picture: ' + i.src); }
@@ -198,7 +198,10 @@ def serve():
 
 @pytest.fixture(scope="module")
 def page():
-    """A tab; `page.faults(address)` → (what is wrong there, how many formulas)."""
+    """A tab that asks nobody but the page's own server.
+
+    `page.open_page(address)`; `page.faults(address)` → (what is wrong there, how many formulas).
+    """
     with browser_or_skip()() as driver:
         browser = driver.chromium.launch(executable_path=BROWSER, args=FLAGS)
         tab, seen, home = browser.new_page(), [], []
@@ -212,11 +215,14 @@ def page():
 
         tab.route("**/*", local_only)
 
-        def faults(address):
+        def open_page(address):
             home[:] = [address[: address.index("/", 8)]]
             seen.clear()
-            tab.set_viewport_size({"width": WIDTHS[0], "height": 900})
             tab.goto(address)
+
+        def faults(address):
+            tab.set_viewport_size({"width": WIDTHS[0], "height": 900})
+            open_page(address)
             found, formulas = tab.evaluate(FAULTS, True)
             for width in WIDTHS:
                 tab.set_viewport_size({"width": width, "height": 900})
@@ -225,7 +231,7 @@ def page():
                     found.append(f"{over} pixels too wide at {width}")
             return found + seen, formulas
 
-        tab.faults = faults
+        tab.faults, tab.open_page = faults, open_page
         yield tab
         browser.close()
 
@@ -284,10 +290,10 @@ def test_what_is_wrong_with_a_page_is_seen(site, serve, page, tmp_path):
 def test_search_finds(site, serve, page, words, where):
     home = serve(site)
     page.set_viewport_size({"width": 1280, "height": 900})
-    page.goto(f"{home}/search.html?q={urllib.parse.quote(words)}")
+    page.open_page(f"{home}/search.html?q={urllib.parse.quote(words)}")
     page.wait_for_selector("#search-results li a", timeout=20_000)
     links = page.eval_on_selector_all("#search-results li a", "as => as.map(a => a.href)")
     assert any(f"/{where}.html" in link for link in links), links
-    page.goto(f"{home}/search.html?q=xyzzyq")
+    page.open_page(f"{home}/search.html?q=xyzzyq")
     page.wait_for_function("document.querySelector('#search-results p.search-summary') !== null")
     assert page.locator("#search-results li").count() == 0

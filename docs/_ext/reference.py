@@ -40,6 +40,7 @@ MODULES = {
     "starts": ("Starts of a sweep", "starts"),
     "systems": ("Library of systems", "systems"),
     "plot": ("Pictures", "plot"),
+    "interop": ("Other packages", "interop"),
 }
 """Page → title, and the public module that it tells of."""
 
