@@ -18,6 +18,7 @@ from ._compat import is_traced
 from ._dense import Curve, at_times, crossings, stopped
 from ._extended import run_extended
 from ._precision import refuse_double_without_x64
+from ._quantities import refuse_quantity
 from ._results import RESULTS, IntegrationError
 from ._reversible import Reversible
 from ._rollout import (
@@ -430,6 +431,7 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
 
 
 def _as_numpy(name: str, value: Any) -> np.ndarray:
+    refuse_quantity(name, value)
     try:
         return np.asarray(value)
     except (TypeError, ValueError) as error:
@@ -439,6 +441,7 @@ def _as_numpy(name: str, value: Any) -> np.ndarray:
 def as_parameter(leaf: Any) -> Any:
     """A leaf of args: floats become arrays, so that a new value needs no new compilation."""
     if isinstance(leaf, np.ndarray | np.generic):
+        refuse_quantity("args", leaf)
         refuse_double_without_x64("args", leaf.dtype)
         return jnp.asarray(leaf)
     return jnp.asarray(leaf) if isinstance(leaf, float) else leaf

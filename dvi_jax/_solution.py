@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from ._compat import is_traced
 from ._precision import refuse_double_without_x64
+from ._quantities import refuse_quantity
 from ._results import RESULTS, status_name
 from ._types import State
 from .engine.signature import accepts
@@ -18,6 +19,7 @@ from .engine.signature import accepts
 def _as_times(ts: Any) -> Any:
     if ts is None or is_traced(ts):
         return ts
+    refuse_quantity("ts", ts)
     ts = np.asarray(ts)
     refuse_double_without_x64("ts", ts.dtype)
     if not (np.issubdtype(ts.dtype, np.floating) or np.issubdtype(ts.dtype, np.integer)):

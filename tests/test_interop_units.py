@@ -143,3 +143,40 @@ def test_a_unit_of_another_kind_is_no_base():
     assert interop.UnitSystem(u.m, u.s, u.kg, args={"mu": u.au**3 / u.yr**2}).args["mu"] == (
         u.m**3 / u.s**2
     )
+
+
+SPRING = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + args["k"] * (q0 @ q0)) / 2)
+RUN = {"q0": np.ones(1), "p0": np.zeros(1), "h": 0.1, "num_steps": 2, "args": {"k": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("q0", {"q0": np.ones(1) * u.m}),
+        ("p0", {"p0": np.ones(1) * u.dimensionless_unscaled}),
+        ("h", {"h": 0.1 * u.s}),
+        ("epsilon", {"epsilon": 0.1 * u.percent}),
+        ("args", {"args": {"k": 1.0 * u.N / u.m}}),
+    ],
+)
+def test_numbers_are_not_taken_out_of_their_units(name, change):
+    """The door for numbers refuses a quantity: an array of it would drop the unit."""
+    with pytest.raises(TypeError, match=rf"^{name} has the unit .*interop.integrate"):
+        dvi.integrate(SPRING, **{**RUN, **change})
+
+
+def test_times_data_and_axes_with_units_are_refused():
+    ts, values = np.linspace(0.1, 1, 4), np.ones((4, 1))
+    with pytest.raises(TypeError, match="ts has the unit 's'"):
+        dvi.Observations(ts * u.s, values, sigma=1.0)
+    with pytest.raises(TypeError, match="ts has the unit 's'"):
+        dvi.Save(ts=ts * u.s)
+    with pytest.raises(TypeError, match="ts has the unit 's'"):
+        dvi.Given(ts * u.s)
+    with pytest.raises(TypeError, match="sigma has the unit 'km'"):
+        dvi.Observations(ts, values, sigma=1.0 * u.km)
+    with pytest.raises(TypeError, match="axis 'k' has the unit 'N'"):
+        dvi.Axis("k", ts * u.N)
+    with pytest.raises(TypeError, match="has the unit 'm'"):
+        dvi.frequencies(np.arange(100.0), np.ones(100) * u.m)
+    assert dvi.integrate(SPRING, **RUN).qs.shape == (3, 1)  # plain numbers are taken

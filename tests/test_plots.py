@@ -174,6 +174,19 @@ def test_pictures_have_the_house_style_and_leave_the_user_his_own():
     assert plot.phase_portrait(arrays()).xaxis.label.get_size() == 10
 
 
+def test_a_backend_that_a_first_figure_makes_interactive_stays_so():
+    """In Jupyter the first figure turns interactive mode on, perhaps inside of the style."""
+    before = mpl.is_interactive()
+    try:
+        for value in (True, False):
+            mpl.interactive(not value)
+            with plot.style():
+                mpl.interactive(value)
+            assert mpl.is_interactive() is value
+    finally:
+        mpl.interactive(before)
+
+
 def test_save_takes_what_the_pictures_return(tmp_path):
     one, several = plot.phase_portrait(arrays()), plot.phase_portrait(arrays(n=2))
     inside = plt.figure().subfigures(1, 2)[0].subplots()

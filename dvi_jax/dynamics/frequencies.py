@@ -12,6 +12,7 @@ from jaxtyping import Array, Complex, Float
 
 from .._compat import is_traced, x64_enabled
 from .._precision import refuse_double_without_x64
+from .._quantities import refuse_quantity
 from .._solution import Solution
 from .lines import EPS, Settings, lines_of
 from .results import (
@@ -310,6 +311,7 @@ def _real_times(name: str, value: Any) -> Array:
 
 def _double(name: str, value: Any) -> Array:
     """An array in double precision, real or complex."""
+    refuse_quantity(name, value)
     value = value if isinstance(value, jax.Array) else np.asarray(value)
     refuse_double_without_x64(name, value.dtype)
     if value.dtype.kind not in "fciu":

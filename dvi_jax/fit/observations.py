@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .._quantities import refuse_quantity
 from ..engine.signature import accepts
 
 
@@ -178,6 +179,7 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
 
 
 def _real(name: str, value: Any) -> np.ndarray:
+    refuse_quantity(name, value)
     try:
         found = np.asarray(value)
     except (TypeError, ValueError) as error:

@@ -1,10 +1,13 @@
 """What a fit shows while it runs."""
 
-import contextlib
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+
+from .._progress import told
 
 
 @dataclass(frozen=True)
@@ -22,27 +25,15 @@ class FitProgress:
     seconds: float
 
 
-@contextlib.contextmanager
 def shown(
     progress: bool | Callable[[FitProgress], None] | None,
-) -> Iterator[Callable[[FitProgress], None] | None]:
-    """A function that takes the progress: the user's, that of a bar, or None.
+) -> AbstractContextManager[Callable[[FitProgress], None] | None]:
+    """A context whose value takes the progress: the user's function, a bar's, or None."""
+    return told(progress, _bar)
 
-    None shows a bar where there is a terminal or a notebook.
 
-    **Raises** `TypeError` for anything else.
-    """
-    if callable(progress):
-        yield progress
-        return
-    if not (progress is None or isinstance(progress, bool)):
-        raise TypeError(f"progress must be True, False, None or a function, got {progress!r}.")
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if progress is False or (progress is None and not (console.is_terminal or console.is_jupyter)):
-        yield None
-        return
+@contextmanager
+def _bar(console: Any) -> Iterator[Callable[[FitProgress], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     texts = ("{task.description}", "{task.fields[loss]}", "{task.fields[params]}")

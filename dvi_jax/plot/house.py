@@ -81,9 +81,14 @@ def style() -> Iterator[None]:
     token = _asked_for.set(True)
     try:
         with mpl.rc_context(_STYLE):
-            yield
+            try:
+                yield
+            finally:
+                interactive = mpl.is_interactive()
     finally:
         _asked_for.reset(token)
+    # The first figure of a notebook chooses a backend, which is interactive: that is to stay.
+    mpl.interactive(interactive)
 
 
 def in_style(function: Callable[P, R]) -> Callable[P, R]:

@@ -1,33 +1,24 @@
 """The progress bar of a sweep."""
 
-import contextlib
 import math
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
+from .._progress import told
 from .workers import SweepProgress
 
 
-@contextlib.contextmanager
 def shown(
     progress: bool | Callable[[SweepProgress], None] | None,
-) -> Iterator[Callable[[SweepProgress], None] | None]:
-    """A function that takes the progress: the user's, that of a bar, or None.
+) -> AbstractContextManager[Callable[[SweepProgress], None] | None]:
+    """A context whose value takes the progress: the user's function, a bar's, or None."""
+    return told(progress, _bar)
 
-    **Raises** `TypeError` for anything else.
-    """
-    if callable(progress):
-        yield progress
-        return
-    if not (progress is None or isinstance(progress, bool)):
-        raise TypeError(f"progress must be True, False, None or a function, got {progress!r}.")
-    from rich.console import Console
 
-    console = Console(stderr=True)
-    if progress is False or (progress is None and not (console.is_terminal or console.is_jupyter)):
-        yield None
-        return
-    with _bar(console) as bar:
+@contextmanager
+def _bar(console: Any) -> Iterator[Callable[[SweepProgress], None]]:
+    with _columns(console) as bar:
         task = bar.add_task("sweep", total=None, rate="", failed="", left="")
 
         def show(p: SweepProgress) -> None:
@@ -43,7 +34,7 @@ def shown(
         yield show
 
 
-def _bar(console: Any) -> Any:
+def _columns(console: Any) -> Any:
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
     texts = ("{task.description}", "{task.fields[rate]}", "{task.fields[failed]}",

@@ -1,0 +1,36 @@
+"""Who is told how far a long call is: the user's function, a bar, or nobody."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from importlib.util import find_spec
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+def told(
+    progress: bool | Callable[[T], None] | None,
+    bar: Callable[[Any], AbstractContextManager[Callable[[T], None]]],
+) -> AbstractContextManager[Callable[[T], None] | None]:
+    """A context whose value takes the progress, or is None where nobody wants it.
+
+    - `progress`: a function, which is taken; True, a bar; False, nothing; None, a bar where there
+      is a terminal, or a notebook that has ipywidgets.
+    - `bar`: a console of rich's → a context that shows.
+
+    **Raises** `TypeError` for anything else.
+    """
+    if callable(progress):
+        return nullcontext(progress)
+    if not (progress is None or isinstance(progress, bool)):
+        raise TypeError(f"progress must be True, False, None or a function, got {progress!r}.")
+    if progress is False:
+        return nullcontext(None)
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if console.is_jupyter and find_spec("ipywidgets") is None:
+        console = Console(stderr=True, force_jupyter=False)  # rich would warn at each line
+    if progress is None and not (console.is_terminal or console.is_jupyter):
+        return nullcontext(None)
+    return bar(console)
