@@ -60,5 +60,11 @@ def _take_notebooks(app) -> None:
         stale.unlink()
 
 
+def _find_notebooks(app, docname, source) -> None:
+    """Links are written as a reader of the repository follows them."""
+    source[0] = source[0].replace("](../notebooks/", "](notebooks/")
+
+
 def setup(app) -> None:
     app.connect("builder-inited", _take_notebooks)
+    app.connect("source-read", _find_notebooks)

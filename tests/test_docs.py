@@ -60,6 +60,24 @@ def test_examples_that_are_left_out_say_why():
     assert (code, reasons) == ("a\n", ["it needs b"])
 
 
+def missing_files(page, text):
+    """Relative links of Markdown that lead to no file of the repository."""
+    found = re.findall(r"\]\((?!https?:|mailto:|#)([^)#\s]+)", text)
+    made = ("reference/",)  # by the build
+    return [x for x in found if not x.startswith(made) and not (page.parent / x).exists()]
+
+
+def test_links_lead_to_files_of_the_repository():
+    """Pages are read on a code host, too."""
+    pages = [*ROOT.glob("*.md"), *DOCS.glob("*.md")]
+    assert len(pages) > 25
+    missing = {p.name: missing_files(p, p.read_text(encoding="utf-8")) for p in pages}
+    assert {name: links for name, links in missing.items() if links} == {}
+    assert missing_files(ROOT / "README.md", "[a](docs/none.md) [b](docs/faq.md)") == [
+        "docs/none.md"
+    ]
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """The folder of the pages, made in a copy; a warning is a failure."""

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 README = Path(__file__).parents[1] / "README.md"
 
 
@@ -67,3 +69,38 @@ def test_commands_named_exist():
         assert re.search(rf"^{target}:", makefile, re.M), target
     for path in re.findall(r"examples/\w+\.\w+", text):
         assert (README.parent / path).exists(), path
+
+
+RUN_BY = {
+    "run examples/kepler.toml": "test_run.py",
+    "run examples/own_system.toml": "test_run.py",
+    "run examples/solar_system.toml": "test_run.py",
+    "discover examples/discover.toml": "test_cli_discover.py",
+    "sweep examples/sweep.toml": "test_cli_sweep.py",
+    "fit examples/fit.toml": "test_cli_fit.py",
+    "certify --quick": "test_certify.py",
+    "paper": "test_paper.py",
+}
+"""Commands of the README → the tests that run them, and look at what they give."""
+
+COMMANDS = re.findall(r"^dvi-jax (.+?) *(?:#.*)?$", README.read_text(encoding="utf-8"), re.M)
+SHORT = [command for command in COMMANDS if command not in RUN_BY]
+
+
+def test_each_command_is_run_somewhere():
+    assert set(RUN_BY) <= set(COMMANDS)
+    for command, file in RUN_BY.items():
+        text = (Path(__file__).parent / file).read_text(encoding="utf-8")
+        assert command.split("/")[-1].removeprefix("certify ") in text, command
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", SHORT)
+def test_short_commands_run(command, tmp_path):
+    out = subprocess.run(
+        [sys.executable, "-m", "dvi_jax_cli", *command.split()],
+        capture_output=True, text=True, check=False, cwd=tmp_path, timeout=200,
+    )  # fmt: skip
+    assert out.returncode == 0, out.stderr
+    assert out.stdout
+    assert command.startswith("new") == bool(list(tmp_path.iterdir()))
