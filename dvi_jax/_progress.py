@@ -30,7 +30,8 @@ def told(
 
     console = Console(stderr=True)
     if console.is_jupyter and find_spec("ipywidgets") is None:
-        console = Console(stderr=True, force_jupyter=False)  # rich would warn at each line
+        # Rich would warn at each line; and Jupyter says FORCE_COLOR, but shows no bar that moves.
+        console = Console(stderr=True, force_jupyter=False, force_terminal=False)
     if progress is None and not (console.is_terminal or console.is_jupyter):
         return nullcontext(None)
     return bar(console)

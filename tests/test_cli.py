@@ -448,6 +448,11 @@ def test_its_notebook_runs(inside, monkeypatch):
     found = runpy.run_path("explore.py")
     assert found["solution"].observed["angular momentum"] < 1e-13
     assert found["order"].slope == pytest.approx(1, abs=0.1)
+    drifts = found["many"].to_xarray().energy_drift
+    assert dict(drifts.sizes) == {"x": 24, "epsilon": 12}
+    largest = drifts.max("x").values
+    strengths = drifts["epsilon"].values  # large enough for the method's own error to be small
+    assert largest[-1] / largest[-4] == pytest.approx(strengths[-1] / strengths[-4], rel=0.15)
     q = [found["last"](e) for e in (0.05 - 1e-5, 0.05 + 1e-5)]
     assert float(found["slope"]) == pytest.approx(float(q[1] - q[0]) / 2e-5, rel=1e-6)
 

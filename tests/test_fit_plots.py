@@ -86,6 +86,8 @@ def test_residuals_stand_at_their_times_beside_their_distribution():
 
 def test_residuals_of_unknown_errors_are_in_the_error_that_was_found():
     fit = made(sigma=None)
+    named = plot.fit_residuals(fit, names=["x", "y"])
+    assert texts(named[0]) == ["x", "y"]
     axes = plot.fit_residuals(fit, component=1)
     (drawn,) = points(axes[0])
     s = np.sqrt(fit.reduced_chi2)
@@ -227,6 +229,8 @@ def test_data_with_their_errors_beside_the_prediction():
     np.testing.assert_array_equal(lines[0], np.stack([fit.ts[0], fit.predicted[0][:, 1]], 1))
     np.testing.assert_array_equal(lines[1], np.stack([fit.ts[0], fit.observed[0][:, 1]], 1))
     assert texts(axis) == ["component 1: fit", "component 1: observed"]
+    axis = plot.fit_against_data(fit, component=1, names=("x", "y"))
+    assert texts(axis) == ["y: fit", "y: observed"]
     both = plot.fit_against_data(fit)
     shown = [to_hex(line.get_color()).upper() for line in both.lines[::2]]
     assert shown == list(plot.COLOURS[:2])
@@ -317,6 +321,8 @@ MANY = made(names=[f"a{i}" for i in range(13)], x=np.ones(13), covariance=np.eye
         (lambda: plot.fit_residuals(BARE), TypeError, "fit_residuals takes a FitResult.*whitened"),
         (lambda: plot.fit_residuals(made(), arcs=1), ValueError, "no arc 1: .* 0 to 0"),
         (lambda: plot.fit_residuals(made(), component="q"), ValueError, "no component 'q'"),
+        (lambda: plot.fit_residuals(made(), names=["x"]), ValueError, "names must be 2"),
+        (lambda: plot.fit_against_data(made(), names="xy"), ValueError, "names must be 2"),
         (lambda: plot.fit_residuals(made(), arcs=[]), ValueError, "at least one arc"),
         (
             lambda: plot.fit_residuals(made(), axes=plt.subplots(1, 3)[1]),

@@ -42,6 +42,7 @@ def test_a_notebook_without_widgets_is_spared_their_warnings(
 ):
     """Rich has a bar for notebooks with ipywidgets, and warns of their absence with a path."""
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as Jupyter does
     monkeypatch.setattr(_progress, "find_spec", lambda name: widgets)
     for progress, expected in ((None, by_itself), (True, asked)):
         with _progress.told(progress, bar) as show:

@@ -30,6 +30,7 @@ def fit_residuals(
     arcs: int | Sequence[int] | None = None,
     component: int | Sequence[int] | None = None,
     axes: Sequence[Any] | None = None,
+    names: Sequence[str] | None = None,
 ) -> np.ndarray:
     """Residuals in standard errors against time, and their distribution beside a normal one.
 
@@ -38,6 +39,7 @@ def fit_residuals(
     - `arcs`: numbers of those that are drawn; None: all. Up to six have a panel each, more share
       one. `component`: of the flattened values of one observation; None: all.
     - `axes`: where to draw: one `Axes` for each panel and one for the distribution.
+    - `names`: of all components of one observation, for the legend.
 
     Dashed lines stand at ±1, dotted ones at ±3 standard errors. Residuals that are no numbers, such
     as those of values that were not observed, are counted below the distribution.
@@ -45,13 +47,14 @@ def fit_residuals(
     **Returns** the `Axes` of the panels and, last, of the distribution, shape (panels + 1,).
 
     **Raises** `TypeError` for what is no fit; `ValueError` for arcs or components that are not
-    there, and another number of axes.
+    there, and another number of axes or names.
     """
     _check_fit(fit, "fit_residuals", "whitened", "ts", "chi2", "degrees_of_freedom")
     numbers = _chosen(arcs, len(fit.whitened), "arc")
     size = 1.0 if fit.has_errors else math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
     rows = {i: np.asarray(fit.whitened[i]) / (size or 1.0) for i in numbers}
-    kept = _chosen(component, max(r.shape[1] for r in rows.values()), "component")
+    components = max(r.shape[1] for r in rows.values())
+    kept, named = _chosen(component, components, "component"), _named(names, components)
     panels = [[i] for i in numbers] if len(numbers) <= _PANELS else [numbers]
     new = axes is None
     axes = _residual_axes(axes, len(panels))
@@ -76,7 +79,8 @@ def fit_residuals(
             axis.set_yticks([-3, -1, 1, 3])
     axes[(len(panels) - 1) // 2].set_ylabel(label)
     axes[len(panels) - 1].set_xlabel("time t")
-    _legend_of_components(axes[0], kept, any(len(p) > 1 for p in panels), new)
+    if not any(len(those) > 1 for those in panels) and 1 < len(kept) <= len(COLOURS):
+        _legend_of_components(axes[0], {k: named[k] for k in kept}, new)
     return np.asarray(axes)
 
 
@@ -128,19 +132,26 @@ def _draw_distribution(axis: Any, r: np.ndarray, furthest: float) -> None:
     axis.set_xlabel("count")
 
 
-def _legend_of_components(axis: Any, kept: list[int], shared: bool, new: bool) -> None:
-    if shared or not 1 < len(kept) <= len(COLOURS):
-        return
+def _named(names: Sequence[str] | None, components: int) -> list[str]:
+    """A name for each component."""
+    if names is None:
+        return [f"component {k}" for k in range(components)]
+    if isinstance(names, str) or len(names) != components:
+        raise ValueError(f"names must be {components}, one for each component, got {names!r}.")
+    return [str(name) for name in names]
+
+
+def _legend_of_components(axis: Any, names: dict[int, str], new: bool) -> None:
     handles = [
         axis.plot([], [], MARKERS[k % len(MARKERS)], color=COLOURS[k % len(COLOURS)],
-                  markeredgewidth=0, label=f"component {k}")[0]
-        for k in kept
+                  markeredgewidth=0, label=name)[0]
+        for k, name in names.items()
     ]  # fmt: skip
     if not new:
         legend(axis, new, handles)
         return
     axis.legend(
-        handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(len(kept), 4),
+        handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(len(names), 4),
         handletextpad=0.1, borderaxespad=0.1, columnspacing=1.0,
     )  # fmt: skip
 
@@ -398,6 +409,7 @@ def fit_against_data(
     component: int | Sequence[int] | None = None,
     curve: tuple[Any, Any] | None = None,
     ax: Any = None,
+    names: Sequence[str] | None = None,
 ) -> Any:
     """What was observed along one arc, with its errors, and what the fit predicts.
 
@@ -408,17 +420,18 @@ def fit_against_data(
     - `curve`: (times, values) of the model on a finer grid, (T,) and (T, ...), in place of the
       straight lines between its predictions.
     - `ax`: where to draw; None: a new figure.
+    - `names`: of all components of one observation, for the legend.
 
     **Returns** the `Axes`.
 
     **Raises** `TypeError` for what is no fit; `ValueError` for an arc or a component that is not
-    there, or a curve of another shape.
+    there, a curve of another shape, or another number of names.
     """
     _check_fit(fit, "fit_against_data", "ts", "observed", "predicted", "errors")
     (arc,) = _chosen(arc, len(fit.ts), "arc")
     ts = np.asarray(fit.ts[arc])
     seen, model = (np.asarray(x[arc]).reshape(len(ts), -1) for x in (fit.observed, fit.predicted))
-    kept = _chosen(component, seen.shape[1], "component")
+    kept, named = _chosen(component, seen.shape[1], "component"), _named(names, seen.shape[1])
     if component is None and len(kept) > len(COLOURS):
         raise ValueError(
             f"{len(kept)} components are too many for one picture: choose some, "
@@ -432,7 +445,7 @@ def fit_against_data(
     order = np.argsort(fine[0])
     for k in kept:
         colour = COLOURS[k % len(COLOURS)]
-        name = f"component {k}: " if seen.shape[1] > 1 else ""
+        name = f"{named[k]}: " if seen.shape[1] > 1 or names is not None else ""
         ax.plot(fine[0][order], fine[1][order, k], color=colour, linewidth=1.1,
                 label=f"{name}fit")  # fmt: skip
         bars = errors[:, k]

@@ -2,7 +2,7 @@
 
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -127,7 +127,7 @@ def _write(
     report.notes += _notes(found)
     if values["output.plots"]:
         # The numbers are on disk before anything is drawn: a picture that fails costs no result.
-        report.files += _draw(found, folder)
+        report.files += _draw(found, folder, setup.columns)
     return report
 
 
@@ -254,11 +254,11 @@ def _failure(found: dvi.FitResult, status: str) -> str:
     return f"the fitted trajectory fails ({status}). What there is has been written."
 
 
-def _draw(found: dvi.FitResult, folder: Path) -> list[str]:
+def _draw(found: dvi.FitResult, folder: Path, columns: Sequence[str]) -> list[str]:
     """The pictures that this fit can have, by the names of their files."""
     pictures: dict[str, Callable[[Any], Any]] = {
-        "data.png": plot.fit_against_data,
-        "residuals.png": plot.fit_residuals,
+        "data.png": lambda fit: plot.fit_against_data(fit, names=columns),
+        "residuals.png": lambda fit: plot.fit_residuals(fit, names=columns),
         "learning.png": plot.learning_curve,
     }
     known = [n for n, s in zip(found.names, found.sigma, strict=True) if 0 < s < np.inf]

@@ -90,3 +90,23 @@ def last(epsilon):
 
 slope = jax.grad(last)(0.05)
 print(slope)
+
+# %% [markdown]
+# ## Many trajectories, as a picture
+#
+# Wherever a number stands there may be an axis. `dvi-jax sweep sweep.toml` does the same from a
+# file, and `dvi.open_sweep("results/sweep.zarr")` reads what it wrote.
+
+# %%
+many = dvi.sweep(
+    system,
+    [dvi.Axis("x", np.linspace(0.2, 1.2, 24), units="m"), 0.0],
+    p0,
+    h=0.05,
+    num_steps=1000,
+    epsilon=np.geomspace(1e-3, 1e-1, 12),
+    args=args,
+    method=dvi.Strang(),
+    observe={"energy_drift": dvi.MaxDrift(energy)},
+)
+plot.sweep_map(many.to_xarray().energy_drift, x="epsilon", y="x")
