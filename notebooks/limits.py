@@ -9,8 +9,7 @@
 # | broken by | the action changes by | with the condition kept |
 # |---|---|---|
 # | a resonance that is passed | $\varepsilon^{1/2}$ | $\varepsilon$ |
-# | dissipation, over a time $1/\varepsilon$ | $\varepsilon^0$: all of it | (rescaled)
-# $\varepsilon$ |
+# | dissipation, for a time $1/\varepsilon$ | $\varepsilon^0$: all of it | rescaled: $\varepsilon$ |
 # | crossing a separatrix | $\varepsilon$ | $e^{-c/\varepsilon}$ |
 
 # %%

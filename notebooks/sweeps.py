@@ -58,16 +58,13 @@ print(dict(data.sizes), result.status_counts())
 # counted, hatched in the picture, and left out where statistics are made.
 
 # %%
-with plot.style():
-    figure, axes = plt.subplots(1, 3, figsize=(10.4, 3.6), sharey=True)
-    data.p_x.attrs["long_name"] = "momentum p$_x$ at the start"
-    data.energy_drift.attrs["long_name"] = "largest drift of the energy"
-    plot.sweep_map(data.energy_drift, x="epsilon", limits=(1e-5, 1), ax=axes[0])
-    plot.slope_map(data.energy_drift, "epsilon", x="epsilon", limits=(0, 2), ax=axes[1])
-    plot.failure_map(data, ax=axes[2])
-    for axis, title in zip(axes, ["Drift", "Its order in ε", "How runs end"], strict=True):
-        axis.set_title(title)
-        axis.label_outer()
+data.p_x.attrs["long_name"] = "momentum p$_x$ at the start"
+data.energy_drift.attrs["long_name"] = "largest drift of the energy"
+plot.sweep_map(data.energy_drift, x="epsilon", limits=(1e-5, 1)).set_title("Drift")
+plt.show()
+plot.slope_map(data.energy_drift, "epsilon", x="epsilon", limits=(0, 2)).set_title("Its order in ε")
+plt.show()
+plot.failure_map(data).set_title("How runs end")
 plt.show()
 
 # %% [markdown]

@@ -24,8 +24,8 @@ class ParameterError(ValueError):
 class Adiabatic:
     """What is known of a quantity that is nearly kept.
 
-    Over long times it wavers about a constant by an amount that goes as small^`power` and does not
-    drift.
+    Over long times it wavers about a constant by an amount that goes with `small` to the `power`,
+    and does not drift.
 
     - `small`: what is small, in words.
     - `power`: the power of it that the quantity wavers by.
