@@ -181,6 +181,18 @@ def from_lagrangian(L_d: Callable[..., Any], newton: Newton = Newton()) -> Hamil
 
     **Source** Marsden & West 2001, *Acta Numerica* 10, 357, 1.5 and 3.2 (forces); Hairer, Lubich &
     Wanner 2006, *Geometric Numerical Integration*, VI.5 and VI.6.
+
+    **Example**
+
+    ```python
+    def midpoint(t0, t1, q0, q1, args):                      # L_d, an action over one step
+        v, middle = (q1 - q0) / (t1 - t0), (q0 + q1) / 2
+        return (t1 - t0) * (v @ v - middle @ middle) / 2
+    oscillator = dvi.System(dvi.from_lagrangian(midpoint))
+    sol = dvi.integrate(oscillator, [1.0], [0.0], h=0.1, num_steps=10)
+    print(round(float(sol.qs[-1, 0]), 4), round(float(np.cos(1.0)), 4))
+    # 0.541 0.5403
+    ```
     """
     _require(L_d, "L_d", "(t0, t1, q0, q1, args)")
     return _FromLagrangian(L_d, newton)

@@ -104,6 +104,17 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
     terms in h are those of the Hamilton–Jacobi recursion (Hairer, Lubich & Wanner 2006, VI.5),
     which nests r − 1 derivatives where this takes one: measured on Kepler at order 3, four times
     as long to compile and five times as long to run.
+
+    **Example**
+
+    ```python
+    def H(t, q, p, args):
+        return p[0] ** 2 / 2 - jnp.cos(q[0])
+    pendulum = dvi.System(dvi.discretise(H, order=4))
+    sol = dvi.integrate(pendulum, [1.0], [0.0], h=0.1, num_steps=10)
+    print(round(float(sol.qs[-1, 0]), 5))
+    # 0.60009
+    ```
     """
     if not callable(H):
         raise TypeError(f"H must be a function (t, q, p, args), got {H!r}.")

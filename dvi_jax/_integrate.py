@@ -123,6 +123,19 @@ def integrate(
     **Accuracy** order of the method in h. Symplectic methods keep the map's own invariants
     to round-off and energy to O(h^order) without drift. Gradients are those of the discrete
     map, by the implicit function theorem through each solve.
+
+    **Example**
+
+    ```python
+    kepler = systems.kepler()                                # a library of systems brings its start
+    sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1,
+                        num_steps=1000, epsilon=0.01, method=dvi.Strang(), save=dvi.Save(every=10),
+                        observe={"drift": dvi.MaxDrift(kepler.observables["energy"])})
+    print(sol.status, sol.ts.shape, sol.qs.shape)
+    # successful (101,) (101, 2)
+    print(round(float(sol.observed["drift"]), 4))
+    # 0.0633
+    ```
     """
     check_system(system)
     for name, value, kind in (

@@ -43,6 +43,18 @@ class Save(eqx.Module):
 
     **Raises** `ValueError` for an `every` that is not a positive integer, for `ts` beside another
     choice, and for times that are not one-dimensional, finite, in ascending or descending order.
+
+    **Example**
+
+    ```python
+    orbit = systems.kepler()
+    run = {"q0": orbit.q0, "p0": orbit.p0, "args": orbit.args, "h": 0.1, "num_steps": 1000}
+    for save in (dvi.Save(every=300), dvi.Save(every=300, final=True), dvi.Save(ts=[0.25, 99.0])):
+        print(np.round(dvi.integrate(orbit.system, **run, save=save).ts, 6))
+    # [ 0. 30. 60. 90.]
+    # [  0.  30.  60.  90. 100.]
+    # [ 0.25 99.  ]
+    ```
     """
 
     every: int | None = eqx.field(static=True, default=None)

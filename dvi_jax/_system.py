@@ -37,6 +37,16 @@ class System(eqx.Module):
     **Source** H_D: type II generating function S = p1·q0 + h H_D (Marsden & West 2001,
     *Discrete mechanics and variational integrators*; Leok & Zhang 2011). Disturbance: the
     paper, (6)–(13).
+
+    **Example**
+
+    ```python
+    system = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + args["k"] * (q0 @ q0) / 2,
+                        force=lambda t0, t1, q0, p1, args: -p1)          # friction
+    sol = dvi.integrate(system, [1.0], [0.0], h=0.1, num_steps=100, epsilon=0.2, args={"k": 4.0})
+    print(sol.status, round(float(sol.qs[-1, 0]), 3))
+    # successful 0.165
+    ```
     """
 
     H_D: HamiltonianFn

@@ -150,6 +150,15 @@ def frequencies(
     **Source** Laskar 1990, *Icarus* 88, 266; 1993, *Physica D* 67, 257; 2003, arXiv:math/0305364.
     Joint refinement by least squares: our own, in the place of the corrections of Šidlichovský &
     Nesvorný 1996, *Celest. Mech. Dyn. Astron.* 65, 137.
+
+    **Example**
+
+    ```python
+    ts = 0.1 * np.arange(2048)
+    found = dvi.frequencies(ts, np.exp(0.7j * ts) + 0.1 * np.exp(-1.9j * ts), count=2)
+    print(np.round(found.frequencies, 9), np.round(np.abs(found.amplitudes), 9))
+    # [ 0.7 -1.9] [1.  0.1]
+    ```
     """
     settings = settings_of(count, window, refine)
     ts, signal, eps, state_axes = signals_of(ts, signal)

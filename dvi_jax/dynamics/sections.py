@@ -163,6 +163,17 @@ def poincare_section(
 
     **Source** Poincaré 1892; the crossing inside of a step: our own, compare Hénon 1982,
     *Physica D* 5, 412.
+
+    **Example**
+
+    ```python
+    heiles = systems.henon_heiles()
+    q0, p0 = np.array([[0.0, 0.1], [0.0, 0.2]]), np.array([[0.3, 0.0], [0.25, 0.1]])
+    found = dvi.poincare_section(heiles.system, q0, p0, lambda t, q, p, args: q[0], h=0.1,
+                                 num_steps=2000, crossings=25)
+    print(found.qs.shape, bool(np.all(np.abs(found.qs[..., 0]) < 1e-12)))
+    # (2, 25, 2) True
+    ```
     """
     check_system(system)
     q, p = start_state(q0, p0)

@@ -36,6 +36,17 @@ def over_threads(
     **Raises** `ValueError` for arguments without lanes or with different numbers of them, and
     under jit, vmap or grad, which belong inside of `function`; `TypeError` for settings of another
     type.
+
+    **Example**
+
+    ```python
+    kepler = systems.kepler()
+    def final(epsilon):
+        return dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1,
+                             num_steps=1000, epsilon=epsilon, save=dvi.Save(final=True)).qs[-1]
+    print(dvi.over_threads(jax.jit(jax.vmap(final)))(jnp.linspace(0.0, 0.01, 64)).shape)
+    # (64, 2)
+    ```
     """
     if not callable(function):
         raise TypeError(

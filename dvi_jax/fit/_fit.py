@@ -87,6 +87,19 @@ def fit(
 
     **Source** Levenberg 1944, Marquardt 1963 (by optimistix); Nocedal & Wright 2006, *Numerical
     Optimization*, chapters 10 and 17; the covariance, Bard 1974, *Nonlinear parameter estimation*.
+
+    **Example**
+
+    ```python
+    spring = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + args["k"] * (q0 @ q0) / 2)
+    model = dvi.Model(spring, h=0.1, q0=[1.0], p0=[0.0], method=dvi.Strang())
+    ts = np.linspace(0.5, 10.0, 20)
+    seen = np.cos(1.1 * ts) + 0.01 * np.random.default_rng(0).normal(size=20)
+    data = dvi.Observations(ts, seen[:, None], sigma=0.01, t0=0.0)
+    found = dvi.fit(model, data, {"args": {"k": 1.0}})
+    print(found.status, round(float(found.params["args"]["k"]), 2))
+    # converged 1.21
+    ```
     """
     began = time.monotonic()
     if not x64_enabled():

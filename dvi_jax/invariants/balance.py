@@ -69,6 +69,20 @@ def noether_balance(
 
     **Source** our own; (31) of the paper is the case where the identities hold on the lattice
     of (14).
+
+    **Example**
+
+    ```python
+    kepler = systems.kepler()
+    wind = dvi.System(kepler.system.H_D, force=lambda t0, t1, q0, p1, args: jnp.array([1.0, 0.0]))
+    sol = dvi.integrate(wind, kepler.q0, kepler.p0, args=kepler.args, h=0.1, num_steps=50,
+                        epsilon=0.01)
+    told = dvi.noether_balance(wind, [dvi.generators.rotation()], [None], sol, epsilon=0.01,
+                               args=kepler.args)
+    sides = told.drift, told.symmetry + told.work + told.lattice
+    print(bool(np.allclose(*sides, atol=1e-13)), f"{float(np.abs(told.drift).max()):.2f}")
+    # True 0.03
+    ```
     """
     steps = int(jnp.size(solution.ts)) - 1
     if jnp.ndim(solution.ts) != 1 or steps < 2:

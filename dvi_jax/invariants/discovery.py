@@ -111,6 +111,18 @@ def discover_invariants(
     coefficients by nested forward autodiff, through implicit steps.
 
     **Source** our own.
+
+    **Example**
+
+    ```python
+    cubic = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2,
+                       force=lambda t0, t1, q0, p1, args: -q0**3)
+    samples = np.random.default_rng(0).uniform(-1, 1, (2, 400, 1))
+    found = dvi.discover_invariants(cubic, dvi.Polynomials(8), order=1, h=0.1, samples=samples,
+                                    representative="simplest")
+    print(found.invariants[0])
+    # 0.5 q² − 0.05 q p + 0.5 p² + ε (0.251256 q⁴ − 0.0502513 q³ p + 0.00251256 q² p²)
+    ```
     """
     require_system(system, newton)
     samples = as_samples(samples, t0)

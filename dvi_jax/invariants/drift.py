@@ -251,6 +251,19 @@ def drift_order(
 
     **Accuracy** the interval is that of a straight line with independent errors. The next order
     bends the line at large ε; `DriftOrder.limit` is the slope with that bend taken out.
+
+    **Example**
+
+    ```python
+    cubic = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2,
+                       force=lambda t0, t1, q0, p1, args: -q0**3)
+    def energy_of_the_map(t0, t1, q0, p0, q1, p1, args):
+        return (p1 @ p1 + q1 @ q1 - 0.1 * (q1 @ p1)) / 2
+    order = dvi.drift_order(cubic, energy_of_the_map, [0.4], [0.3], h=0.1, num_steps=1000,
+                            epsilons=[1e-3, 1e-2, 3e-2, 1e-1])
+    print(round(float(order.slope), 2))
+    # 1.0
+    ```
     """
     _check_observable(invariant)
     epsilons = _positive("epsilons", epsilons)

@@ -31,6 +31,17 @@ class TimeTransformed(Uniform):
 
     **Source** Hairer 1997, *Appl. Numer. Math.* 25, 219; Reich 1999, *SIAM J. Numer. Anal.* 36,
     1549; Hairer, Lubich & Wanner 2006, VIII.2.1.
+
+    **Example**
+
+    ```python
+    kepler = systems.kepler()
+    slow_near_the_sun = dvi.TimeTransformed(lambda t, q, p, args: jnp.sqrt(q @ q))
+    sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1, num_steps=100,
+                        lattice=slow_near_the_sun, method=dvi.Strang())
+    print(round(float(sol.hs.min()), 3), round(float(sol.hs.max()), 3))
+    # 0.083 0.57
+    ```
     """
 
     speed: Callable[..., Any]

@@ -180,6 +180,15 @@ class Composition(CompositionMethod):
 
     **Source** Hairer, Lubich & Wanner 2006, *Geometric Numerical Integration*, II.4 (4.6), V.3;
     the conditions: `order_defects`.
+
+    **Example**
+
+    ```python
+    mine = dvi.Composition((0.2, 0.3, 0.3, 0.2), order=2)    # in turn the adjoint and the map
+    sol = dvi.integrate(systems.oscillator().system, [1.0], [0.0], h=0.1, num_steps=63, method=mine)
+    print(mine.order, mine.is_symmetric)
+    # 2 True
+    ```
     """
 
     coefficients: tuple[float, ...] = eqx.field(static=True, converter=_as_coefficients)

@@ -169,6 +169,19 @@ class MEGNO(Deviations):
 
     **Source** Cincotta & Simó 2000, *A&AS* 147, 205; for maps Cincotta, Giordano & Simó 2003,
     *Physica D* 182, 151.
+
+    **Example**
+
+    ```python
+    heiles = systems.henon_heiles()
+    def megno(q0):
+        sol = dvi.integrate(heiles.system, q0, jnp.array([0.45, 0.0]), h=0.1, num_steps=10_000,
+                            observe={"megno": dvi.MEGNO()}, method=dvi.Strang(),
+                            save=dvi.Save(final=True))
+        return sol.observed["megno"]
+    print(np.asarray(jax.vmap(megno)(jnp.array([[0.0, 0.1], [0.0, -0.25]])) < 3))     # regular?
+    # [ True False]
+    ```
     """
 
     seed: int = eqx.field(static=True, default=0)

@@ -128,6 +128,18 @@ class Section(KeptSteps):
 
     **Raises** `TypeError` for a g that is no such function, `ValueError` for another direction, a
     max_crossings below 1, and in `integrate` for a g that is not a scalar.
+
+    **Example**
+
+    ```python
+    kepler = systems.kepler()
+    axis = dvi.Section(lambda t, q, p, args: q[0], direction=1, max_crossings=20)
+    sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1, num_steps=600,
+                        observe={"axis": axis}, method=dvi.Yoshida(4), save=dvi.Save(final=True))
+    crossed = sol.observed["axis"]
+    print(int(crossed.count), np.round(crossed.ts[:2], 2))
+    # 2 [ 2.91 39.9 ]
+    ```
     """
 
     g: Callable[..., Any]

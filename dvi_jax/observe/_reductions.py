@@ -45,7 +45,19 @@ class Reduction(eqx.Module):
 
 
 class MaxDrift(Reduction):
-    """Largest distance from the first value: max_k |f_k − f_1|, elementwise."""
+    """Largest distance from the first value: max_k |f_k − f_1|, elementwise.
+
+    **Example**
+
+    ```python
+    kepler = systems.kepler()
+    momentum = dvi.MaxDrift(kepler.observables["angular_momentum"])
+    sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1,
+                        num_steps=10_000, observe={"L": momentum}, save=dvi.Save(final=True))
+    print(sol.observed["L"] < 1e-13)
+    # True
+    ```
+    """
 
     function: Callable[..., Any]
 

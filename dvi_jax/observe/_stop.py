@@ -23,6 +23,17 @@ class Stop(eqx.Module):
 
     **Raises** `TypeError` for a g that is no such function, and in `integrate` `ValueError` for
     one that is not a scalar.
+
+    **Example**
+
+    ```python
+    kepler = systems.kepler()
+    near = dvi.Stop(lambda t, q, p, args: 1.0 - jnp.linalg.norm(q))
+    sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.05,
+                        num_steps=400, stop=near, method=dvi.Yoshida(4))
+    print(sol.status, round(float(sol.stop.t), 4))
+    # stopped 0.3568
+    ```
     """
 
     g: Callable[..., Any]

@@ -111,6 +111,17 @@ def sweep(
     store of another sweep, with what differs, and `StoreError` for one that cannot be used;
     `ClusterError` for a cluster that is lost;
     `SweepInterrupted`, a `KeyboardInterrupt`, after Ctrl-C, with what was finished.
+
+    **Example**
+
+    ```python
+    kepler = systems.kepler()
+    result = dvi.sweep(kepler.system, kepler.q0, [dvi.Axis("p_x", [-1.0, -0.9]), -0.6],
+                       epsilon=np.geomspace(1e-4, 1e-2, 3), args=kepler.args, h=0.1, num_steps=500,
+                       observe={"drift": dvi.MaxDrift(kepler.observables["energy"])})
+    print(dict(result.to_xarray().drift.sizes), result.status_counts())
+    # {'epsilon': 3, 'p_x': 2} {'successful': 6}
+    ```
     """
     made = make_sweep(
         system, q0, p0, start=start, h=h, num_steps=num_steps, t0=t0, epsilon=epsilon, args=args,

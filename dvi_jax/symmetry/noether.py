@@ -98,6 +98,18 @@ class AdiabaticInvariant(eqx.Module):
     **Raises** `ValueError` when there are not as many generators as gauges, or none.
 
     **Source** the paper, (26) (with its η·p mended to ξ·p) and (29).
+
+    **Example**
+
+    ```python
+    kepler = systems.kepler()
+    turn = dvi.generators.rotation()
+    L = dvi.AdiabaticInvariant([turn], [None])               # order 0: here it is exact
+    sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1,
+                        num_steps=1000, epsilon=0.01, observe={"L": dvi.MaxDrift(L)})
+    print(sol.observed["L"] < 1e-13)
+    # True
+    ```
     """
 
     generators: Sequence[Generator]

@@ -86,6 +86,17 @@ def find_symmetries(
     **Source** the paper's (17), (24) and (28), collected in ε on the disturbed map; the null
     space and the test off the solutions are our own (trivial symmetries: Olver 1993, Section
     5.1; symmetries of difference equations: Hydon 2014).
+
+    **Example**
+
+    ```python
+    cubic = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2 + (q0 @ q0) ** 2 / 4)
+    samples = np.random.default_rng(0).uniform(-1, 1, (2, 200, 2))
+    found = dvi.find_symmetries(cubic, dvi.Polynomials(1), h=0.1, samples=samples, time=False)
+    print(found)
+    # 1 symmetry of order 0 in 4 functions for each component: 1 variational, 0 conformal only…
+    #   ξ_q1 = q2, ξ_q2 = −q1, η_p1 = p2, η_p2 = −p1…
+    ```
     """
     if isinstance(order, bool) or not isinstance(order, int) or order < 0:
         raise ValueError(f"order must be an integer of at least 0, got {order!r}.")
