@@ -26,7 +26,7 @@ def test_the_page_on_interoperability_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names, count = run("interoperability.md")
     assert count == 7
-    # Two programs of one map: round-off of 160 steps, 2e-16 each, which the orbit's shear lets grow.
+    # Two programs of one map: the round-off of 160 steps, 2e-16 each.
     assert names["apart"] < 160 * 2.2e-16
     assert 1e-5 < names["error_of_the_map"] < 1e-1
     assert names["from_theirs"] < 1e-10
