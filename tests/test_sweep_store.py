@@ -251,9 +251,19 @@ def test_claims_exclude_threads_and_end_with_the_context(tmp_path):
         assert later
 
 
-def child(path, tasks, pause=0.01):
+def child(path, tasks, pause=0.01, cache=None):
+    """A process of its own; with `cache`, programs are read from there in place of compiled."""
     script = Path(__file__).with_name("sweep_child.py")
-    return subprocess.Popen([sys.executable, str(script), str(path), str(tasks), str(pause)])
+    env = dict(os.environ)
+    if cache is not None:
+        env |= {
+            "JAX_COMPILATION_CACHE_DIR": str(cache),
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        }
+    return subprocess.Popen(
+        [sys.executable, str(script), str(path), str(tasks), str(pause)], env=env
+    )
 
 
 def committed(path):
@@ -305,8 +315,15 @@ def test_two_processes_on_one_store(tmp_path):
 def test_killed_forty_times(tmp_path):
     """SIGKILL at random moments, two processes at a time: all done, once, with the same bits."""
     path, tasks = tmp_path / "s.zarr", 160
-    rng = random.Random(5)
-    running, kills, seen = [child(path, tasks, 0.6) for _ in range(2)], 0, 0
+
+    def start():  # who takes the place of the last one killed does the rest without pauses
+        return child(path, tasks, 0.6 if kills < 40 else 0.0, tmp_path / "programs")
+
+    # One that is not killed leaves its programs, so that of those below no time goes into
+    # compiling them once more and nobody is killed while he writes them.
+    assert child(tmp_path / "whole.zarr", tasks, 0.0, tmp_path / "programs").wait(200) == 0
+    rng, kills, seen = random.Random(5), 0, 0
+    running = [start() for _ in range(2)]
     until = time.monotonic() + 450
     while kills < 40 and time.monotonic() < until:
         while begun(path) == seen and time.monotonic() < until:  # somebody is at work
@@ -318,13 +335,13 @@ def test_killed_forty_times(tmp_path):
             running[i].send_signal(signal.SIGKILL)
             running[i].wait()
             kills += 1
-        running[i] = child(path, tasks, 0.6)
+        running[i] = start()
     for process in running:
         assert process.wait(200) == 0
     found = dvi.open_sweep(path)
     assert found.is_complete
     assert not found.verify().bad
-    same(found, sweep(None, tasks))
+    same(found, sweep(None, tasks))  # whose programs this process has compiled
     assert kills == 40
     assert max(committed(path).values()) == 1
     assert cut_off(path) > 0, "no kill met a task that was being written: nothing was tested"
