@@ -1,5 +1,6 @@
-"""Double precision, no silent rank promotion, run-time checked annotations."""
+"""Double precision, no silent rank promotion, run-time checked annotations; long files first."""
 
+from collections import Counter
 from pathlib import Path
 
 import jax
@@ -25,3 +26,29 @@ def no_more_programs_than_a_process_can_map():
     maps = Path("/proc/self/maps")
     if maps.exists() and len(maps.read_bytes().splitlines()) > MAPS:
         jax.clear_caches()
+
+
+FIRST = [
+    "test_fit_real_data.py",
+    "test_notebooks.py",
+    "test_lanes_property.py",
+    "test_lanes_runs.py",
+    "test_sweep_store.py",
+    "test_speed_baseline.py",
+    "test_fit_statistics.py",
+    "test_docs.py",
+]
+"""Files of minutes and few tests, the longest first."""
+
+
+def pytest_configure(config):
+    """xdist would begin with the files of many tests: a worker ended with a century, alone."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items):
+    """Files that take long before those that do not, so that all workers end at one time."""
+    tests = Counter(item.path for item in items)
+    rank = {name: i for i, name in enumerate(FIRST)}
+    items.sort(key=lambda item: (rank.get(item.path.name, len(FIRST)), -tests[item.path]))
