@@ -1,5 +1,6 @@
 """Double precision, no silent rank promotion, run-time checked annotations; long files first."""
 
+import gc
 from collections import Counter
 from pathlib import Path
 
@@ -17,6 +18,12 @@ _CHECKED = ["_step", "_rollout", "engine.linear", "engine.dependence"]
 
 with install_import_hook([f"dvi_jax.{room}" for room in _CHECKED], "beartype.beartype"):
     import dvi_jax  # noqa: F401  (the hook works on the first import)
+
+# Tracing makes small objects by the million, most of which stay: an eighth of the processor time
+# went into looking among them for cycles.
+gc.collect()
+gc.freeze()
+gc.set_threshold(50_000, 10, 10)
 
 
 @pytest.fixture(autouse=True, scope="module")
