@@ -19,8 +19,8 @@ _CHECKED = ["_step", "_rollout", "engine.linear", "engine.dependence"]
 with install_import_hook([f"dvi_jax.{room}" for room in _CHECKED], "beartype.beartype"):
     import dvi_jax  # noqa: F401  (the hook works on the first import)
 
-# Tracing makes small objects by the million, most of which stay: an eighth of the processor time
-# went into looking among them for cycles.
+# Tracing makes small objects by the million, most of which stay: up to an eighth of the processor
+# time of a file went into looking among them for cycles.
 gc.collect()
 gc.freeze()
 gc.set_threshold(50_000, 10, 10)

@@ -227,6 +227,7 @@ def neighbours(energy, num_steps, orbits, apart):
     return np.asarray(spectrum(q, p))
 
 
+@pytest.mark.slow
 def test_lyapunov_spectrum_at_the_published_start():
     """The mean over 512 copies, 1e-12 apart, after t = 4000; single ones scatter by 0.011."""
     energy = 0.42**2 / 2 + 0.25**2 / 2 + 0.25**3 / 3
@@ -249,6 +250,7 @@ def test_lyapunov_spectrum_over_long_times(energy, exponent):
     assert np.max(np.abs(spectra.mean(0) - [exponent, 0, 0, -exponent])) < 0.003
 
 
+@pytest.mark.slow
 def test_many_deviation_vectors():
     """All 28 of a chain of 14: the first 12 as alone, the volume kept, and gradients."""
     chain = systems.fput(14, beta=0.3)

@@ -34,6 +34,7 @@ def wobble():
     return example("polar_motion")
 
 
+@pytest.mark.slow
 def test_two_years_ask_for_relativity(relativity):
     data = relativity.observed(2)
     assert data.values.shape == (73, 3)
@@ -64,6 +65,7 @@ def test_a_wave_stands_where_its_period_is(relativity):
     assert abs(amplitude[top] - 3) < 0.05
 
 
+@pytest.mark.slow
 def test_short_arcs_of_the_wobble(wobble):
     data = wobble.arcs(2.5)
     assert [len(arc.ts) for arc in data] == [92] * 4
