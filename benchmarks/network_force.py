@@ -20,6 +20,7 @@ chosen on noise of the seeds 0 to 4; the table is of others.
 """
 
 import argparse
+import functools
 import time
 from pathlib import Path
 
@@ -62,7 +63,9 @@ def runge_kutta(field, x0, h, num_steps, substeps=1):
     return jnp.concatenate([x0[None], xs])
 
 
+@functools.cache
 def truth(start, num_steps):
+    """The orbit that is observed: asked for by every fit, and a loop that would compile anew."""
     return np.asarray(runge_kutta(slope, jnp.array(start), H, num_steps, substeps=10))
 
 

@@ -1,6 +1,5 @@
 """Networks as forces: parts that can be read, damping that never drives, fits of both kinds."""
 
-import functools
 import importlib.util
 from pathlib import Path
 
@@ -177,8 +176,6 @@ def benchmark():
     spec = importlib.util.spec_from_file_location("network_force", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    # Every fit asks for the same orbit of the truth, and compiles it anew.
-    module.truth = functools.cache(module.truth)
     return module
 
 
