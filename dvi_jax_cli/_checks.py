@@ -18,13 +18,15 @@ from ._show import print_tables, stderr, stdout
     "paper",
     panel=TRUST,
     examples=[
-        "dvi-jax paper --out paper-out          figures, tables, verdicts",
-        "dvi-jax paper --out paper-out --json   the verdicts on stdout as well",
+        "dvi-jax paper                    figures, tables, verdicts in ./paper-out",
+        "dvi-jax paper --out DIR --json   the verdicts on stdout as well",
     ],
 )
 def paper(
     session: Session,
-    out: Annotated[Path, typer.Option(help="Directory for figures and numbers.")],
+    out: Annotated[Path, typer.Option(help="Directory for figures and numbers.")] = Path(
+        "paper-out"
+    ),
     force: Force = False,
 ) -> None:
     """Reproduce the figures and numbers of the paper.
