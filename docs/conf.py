@@ -16,7 +16,7 @@ author = "The dvi_jax developers"
 copyright = "the dvi_jax developers, Apache-2.0"
 release = version = dvi_jax.__version__
 
-extensions = ["myst_nb", "sphinx.ext.mathjax", "sphinx_copybutton", "reference"]
+extensions = ["myst_nb", "sphinx.ext.mathjax", "sphinx_copybutton", "reference", "scripts"]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
 exclude_patterns = ["_build", "_static", "_ext"]
 templates_path = []
@@ -25,7 +25,7 @@ nitpicky = True
 # Notebooks are committed as they were executed; `make notebooks` renews them.
 nb_execution_mode = "off"
 nb_merge_streams = True
-myst_enable_extensions = ["dollarmath", "colon_fence", "amsmath"]
+myst_enable_extensions = ["dollarmath", "colon_fence", "amsmath", "tasklist"]
 myst_heading_anchors = 3
 myst_links_external_new_tab = True
 suppress_warnings = ["myst-nb.unknown_mime_type"]
@@ -39,7 +39,10 @@ html_title = f"dvi_jax {release}"
 html_static_path = ["_static"]
 html_css_files = ["dvi.css"]
 html_copy_source = False
-html_theme_options = {"navigation_with_keys": True}
+html_theme_options = {
+    "navigation_with_keys": True,
+    "light_css_variables": {"code-font-size": "78%"},  # a hundred characters in a line
+}
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 # Greek letters and formulas are what readers look for: no stemming of a language is lost on them.

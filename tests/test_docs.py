@@ -3,6 +3,7 @@
 import functools
 import html.parser
 import http.server
+import importlib
 import os
 import re
 import shutil
@@ -159,6 +160,79 @@ def test_every_public_name_has_an_entry(site):
     assert [n for n in names if f'id="dvi_jax.{n}"' not in text] == []
 
 
+def entry(site, page, name):
+    """The HTML of one entry of the reference, from its signature to the next one."""
+    text = (site / f"reference/{page}.html").read_text(encoding="utf-8")
+    return text[text.index(f'id="dvi_jax.{name}"') :].split('<dt class="sig')[0]
+
+
+@pytest.mark.slow
+def test_names_lead_where_they_are_meant(site):
+    """A parameter `fit` is no link; a picture's name is a picture; theirs is not ours."""
+    assert "#dvi_jax.fit" not in entry(site, "plot", "plot.fit_against_data")
+    assert "#dvi_jax.FitResult" in entry(site, "plot", "plot.fit_against_data")
+    assert "#dvi_jax.drift_surface" in entry(site, "plot", "plot.drift_surface")
+    read = {p: (site / f"{p}.html").read_text(encoding="utf-8") for p in ("plots", "systems")}
+    assert "#dvi_jax.plot.drift_surface" in read["plots"]
+    assert "#dvi_jax.drift_surface" not in read["plots"]
+    assert "#dvi_jax.systems.kepler" in read["systems"]
+    theirs = (site / "migration.html").read_text(encoding="utf-8")
+    first = re.findall(r"<tr[^>]*><td>(.*?)</td>", theirs, re.S)
+    assert any("LobattoIIIAIIIB" in cell for cell in first)
+    assert not [cell for cell in first if "<a " in cell]
+
+
+@pytest.mark.slow
+def test_formulas_in_characters_come_through(site):
+    """No emphasis between the underscores of q_k and p_k; indices are set as indices."""
+    emphasised = [
+        (path.name, words)
+        for path in site.rglob("*.html")
+        for words in re.findall(r"<em>([^<]*)</em>", path.read_text(encoding="utf-8"))
+        if re.search(r"[=·{}∘]", words)
+    ]
+    assert emphasised == []
+    paper = (site / "paper.html").read_text(encoding="utf-8")
+    assert "E⁺<sub>k</sub> − E⁻<sub>k</sub> = εW<sub>k</sub>·(q<sub>k+1</sub>" in paper
+    index = (site / "genindex.html").read_text(encoding="utf-8")
+    assert "integrate() (in module dvi_jax)" in index
+    assert "built-in" not in index
+
+
+@pytest.fixture(scope="module")
+def extensions():
+    """The two extensions of Sphinx in docs/_ext."""
+    pytest.importorskip("sphinx")
+    sys.path.insert(0, str(DOCS / "_ext"))
+    try:
+        yield importlib.import_module("reference"), importlib.import_module("scripts")
+    finally:
+        sys.path.remove(str(DOCS / "_ext"))
+
+
+def test_indices_and_numbers_of_running_text(extensions):
+    as_html = extensions[1].as_html
+    assert as_html("q_{k+1} − ξ0_m < h^−order") == (
+        "q<sub>k+1</sub> − ξ0<sub>m</sub> &lt; h<sup>−order</sup>"
+    )
+    assert as_html("T^−(2·w+2)") == "T<sup>−(2·w+2)</sup>"
+    assert as_html("10 000 steps, 2.8e-13") == (
+        '<span class="number">10 000</span> steps, <span class="number">2.8e-13</span>'
+    )
+    for plain in ("num_steps", "t_eval", "a < b", "2000 steps", "in 5 to 10"):
+        assert as_html(plain) is None, plain
+
+
+def test_docstrings_are_taken_literally_and_defaults_told(extensions):
+    import dvi_jax as dvi
+
+    reference = extensions[0]
+    assert reference.literally("E⁻_k and `a_b`, Φ*_h\n\n    x_1 *") == (
+        r"E⁻\_k and `a_b`, Φ\*\_h" + "\n\n    x_1 *"
+    )
+    assert reference.signature(dvi.Adjoint) == "(method=TypeII())"
+
+
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
@@ -177,13 +251,21 @@ FAULTS = r"""async (math) => {
   for (const e of all('mjx-merror, [data-mjx-error]')) faults.push('formula: ' + e.textContent);
   const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
   for (let n = walk.nextNode(); n; n = walk.nextNode())
-    if (/\$|\\\(|\\\[/.test(n.data)
-        && !n.parentElement.closest('pre, code, dt.sig, script, style, mjx-container'))
+    if (/\$|\\\(|\\\[|[_^]\{|^\s*\[ \] |HAS_DEFAULT/.test(n.data)
+        && (!n.parentElement.closest('pre, code, dt.sig, script, style, mjx-container')
+            || /HAS_DEFAULT/.test(n.data) && n.parentElement.closest('dt.sig')))
       faults.push('left over: ' + n.data.trim().slice(0, 60));
   for (const i of all('img')) { i.loading = 'eager'; await i.decode().catch(() => 0);
     if (!i.naturalWidth) faults.push('picture: ' + i.src); }
   return [faults, wanted];
 }"""
+
+TOO_WIDE = """() => {
+  const whole = document.documentElement, text = document.querySelector('.content');
+  return Math.max(whole.scrollWidth - window.innerWidth,
+                  text ? text.scrollWidth - text.clientWidth : 0);
+}"""
+"""Of the page, or of its text, which must not slide as a whole either."""
 
 
 def browser_or_skip():
@@ -244,7 +326,7 @@ def page():
             found, formulas = tab.evaluate(FAULTS, True)
             for width in WIDTHS:
                 tab.set_viewport_size({"width": width, "height": 900})
-                over = tab.evaluate("document.documentElement.scrollWidth - window.innerWidth")
+                over = tab.evaluate(TOO_WIDE)
                 if over > 0:
                     found.append(f"{over} pixels too wide at {width}")
             return found + seen, formulas
@@ -280,7 +362,11 @@ def test_what_is_wrong_with_a_page_is_seen(site, serve, page, tmp_path):
         "unrendered": '<div class="un"><p class="math">x</p></div>',
         "wrong": '<p class="math">\\(\\frac{1\\)</p>',
         "dollar": '<p class="un">costs $x$</p>',
+        "braces": '<p class="un">q_{k+1}</p>',
+        "task": "<ul><li>[ ] to do</li></ul>",
+        "default": '<dl><dt class="sig">f(x=_HAS_DEFAULT_FACTORY)</dt></dl>',
         "wide": '<div style="width: 2000px">x</div>',
+        "slides": '<div class="content" style="overflow: auto"><p style="width: 2000px">x</p>',
         "picture": '<img src="none.png">',
         "outside": '<script src="http://192.0.2.1/x.js"></script>',
         "script": "<script>throw new Error('no')</script>",
@@ -293,7 +379,9 @@ def test_what_is_wrong_with_a_page_is_seen(site, serve, page, tmp_path):
     assert seen.pop("fine") == ""
     expected = {
         "unrendered": "0 of 1 formulas", "wrong": "formula", "dollar": "left over: costs $x$",
-        "wide": "pixels too wide at 390", "picture": "none.png", "outside": "asked for http://192",
+        "braces": "left over: q_{k+1}", "task": "left over: [ ]", "default": "left over: f(x=_HAS",
+        "wide": "pixels too wide at 390",
+        "slides": "pixels too wide at 390", "picture": "none.png", "outside": "asked for http://192",
         "script": "script: ",
     }  # fmt: skip
     for name, words in expected.items():

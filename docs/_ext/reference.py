@@ -5,6 +5,7 @@ a `py:function` or `py:class` of MyST with its docstring inside. A name in code 
 documentation, such as ``dvi.Save``, leads to its entry.
 """
 
+import dataclasses
 import inspect
 import re
 import types
@@ -87,8 +88,9 @@ def signature(thing: Any) -> str:
         found = inspect.signature(thing)
     except (TypeError, ValueError):
         return "()"
+    made = _made_defaults(thing)
     plain = [
-        p.replace(annotation=p.empty, default=_default(p.default))
+        p.replace(annotation=p.empty, default=_default(made.get(name, p.default)))
         for name, p in found.parameters.items()
         if name not in ("self", "cls") and not name.startswith("_")
     ]
@@ -96,6 +98,13 @@ def signature(thing: Any) -> str:
         return str(found.replace(parameters=plain, return_annotation=found.empty))
     except ValueError:
         return "(...)"
+
+
+def _made_defaults(thing: Any) -> dict[str, Any]:
+    """Defaults that each instance of a class makes anew, of which a signature knows nothing."""
+    fields = dataclasses.fields(thing) if dataclasses.is_dataclass(thing) else ()
+    missing = dataclasses.MISSING
+    return {f.name: f.default_factory() for f in fields if f.default_factory is not missing}
 
 
 class _Shown:
@@ -117,8 +126,18 @@ def _default(value: Any) -> Any:
     return _Shown(" ".join(text.split()))
 
 
+CODE = re.compile(r"(```.*?```|``.*?``|`[^`]*`|(?m:^ {4}[^\n]*$))", re.S)
+
+
+def literally(text: str) -> str:
+    """Markdown in which E⁺_k − E⁻_k and Φ* are what they look like, and no emphasis."""
+    pieces = CODE.split(text)
+    pieces[::2] = [re.sub(r"_|(?<=Φ)\*", r"\\\g<0>", piece) for piece in pieces[::2]]
+    return "".join(pieces)
+
+
 def _docstring(thing: Any) -> str:
-    return inspect.getdoc(thing) or ""
+    return literally(inspect.getdoc(thing) or "")
 
 
 def _is_own(thing: Any) -> bool:
@@ -166,14 +185,15 @@ def _entry(full: str, shown: str, thing: Any) -> str:
     table = _statuses(thing) if kind == "class" else ""
     if table:
         arguments, body = "", "Statuses of a result, and what they say.\n\n" + table
-    lines = [f":::::{{py:{kind}}} {full}{arguments}", "", body, ""]
+    module, _, name = full.rpartition(".")
+    lines = [f":::::{{py:{kind}}} {name}{arguments}", f":module: {module}", "", body, ""]
     if kind == "class" and not table:
-        for what, name, member in _class_members(thing):
+        for what, member_name, member in _class_members(thing):
             extra = "" if what == "property" else signature(member)
             role = "method" if what == "classmethod" else what
-            lines += [f"::::{{py:{role}}} {name}{extra}"]
+            lines += [f"::::{{py:{role}}} {member_name}{extra}"]
             lines += [":classmethod:"] if what == "classmethod" else []
-            lines += ["", inspect.getdoc(member) or "", "::::", ""]
+            lines += ["", _docstring(member), "::::", ""]
     return "\n".join([*lines, ":::::", ""])
 
 
@@ -218,8 +238,11 @@ class LinkNames(SphinxPostTransform):
         for literal in list(self.document.findall(nodes.literal)):
             if isinstance(literal.parent, nodes.reference | addnodes.pending_xref):
                 continue
-            target = NAMES.get(re.sub(r"\(.*\)$", "", literal.astext(), flags=re.S))
-            if target is None or self._is_own_entry(literal, target):
+            if self.env.docname == "migration" and self._is_first_cell(literal):
+                continue  # their names, some of which are ours too
+            found = meant(literal.astext(), self.env.docname)
+            target = next((x for x in found if not self._is_own_entry(literal, x)), None)
+            if target is None:
                 continue
             link = addnodes.pending_xref(
                 "",
@@ -237,11 +260,16 @@ class LinkNames(SphinxPostTransform):
     def _is_own_entry(node: nodes.Node, target: str) -> bool:
         while node is not None:
             if isinstance(node, addnodes.desc):
-                return any(
-                    sig.get("fullname") == target for sig in node.findall(addnodes.desc_signature)
-                )
+                signatures = node.findall(addnodes.desc_signature)
+                return any(f"{s.get('module')}.{s.get('fullname')}" == target for s in signatures)
             node = node.parent
         return False
+
+    @staticmethod
+    def _is_first_cell(node: nodes.Node) -> bool:
+        while node is not None and not isinstance(node, nodes.entry):
+            node = node.parent
+        return node is not None and node.parent.index(node) == 0
 
 
 class EquationMap(SphinxDirective):
@@ -253,7 +281,7 @@ class EquationMap(SphinxDirective):
             code = ", ".join(f"`{name}`" for name in equation.code)
             note = equation.note or "as printed"
             cells = (f"({equation.number})", equation.what, code, note)
-            rows.append("| " + " | ".join(c.replace("|", r"\|") for c in cells) + " |")
+            rows.append("| " + " | ".join(literally(c).replace("|", r"\|") for c in cells) + " |")
         holder = nodes.container()
         self.state.nested_parse(rows, 0, holder)
         return holder.children
@@ -262,13 +290,31 @@ class EquationMap(SphinxDirective):
 NAMES: dict[str, str] = {}
 """What is written in code font → full name of its entry."""
 
+HOMES = {
+    "plots": "plot",
+    "reference/plot": "plot",
+    "systems": "systems",
+    "reference/systems": "systems",
+}
+"""Pages where a bare name is first that of a module."""
+
+OTHER_MEANINGS = {"fit", "sample", "sweep"}
+"""Bare words that are arguments, fields and commands as well."""
+
+
+def meant(text: str, page: str) -> list[str]:
+    """Full names of the entries that a text in code font may lead to, the likeliest first."""
+    name = re.sub(r"\(.*\)$", "", text, flags=re.S)
+    found = [NAMES.get(f"{HOMES[page]}.{name}")] if page in HOMES else []
+    if text not in OTHER_MEANINGS:
+        found.append(NAMES.get(name))
+    return [full for full in found if full is not None]
+
 
 def _fill_names() -> None:
     for page in entries().values():
-        for full, (shown, thing) in page.items():
+        for full, (shown, _) in page.items():
             names = {full, shown, full.removeprefix("dvi_jax.")}
-            if full.count(".") == 1 and (inspect.isclass(thing) or "_" in shown):
-                names.add(shown.removeprefix("dvi."))  # `Save` is told from a word; `fit` is not
             for name in names:
                 NAMES.setdefault(name, full)
 
