@@ -45,6 +45,22 @@ def test_examples_run(page, tmp_path):
         capture_output=True, text=True, check=False, cwd=tmp_path, env=env, timeout=500,
     )  # fmt: skip
     assert out.returncode == 0, out.stderr[-3000:]
+    for line in printed(page):
+        assert line in out.stdout.splitlines()
+
+
+PRINTED = re.compile(r"^<!-- printed -->\n```text\n(.*?)^```", re.S | re.M)
+
+
+def printed(page):
+    """The lines that a page says its code prints."""
+    return "".join(PRINTED.findall(page.read_text(encoding="utf-8"))).splitlines()
+
+
+def test_the_first_page_shows_what_it_prints():
+    found = printed(DOCS / "index.md")
+    assert found[0].startswith("0.5 q² − 0.05 q p + 0.5 p² + ε (")
+    assert found[1:] == ["ε^1.99"]
 
 
 def test_examples_that_are_left_out_say_why():
@@ -391,13 +407,33 @@ def test_what_is_wrong_with_a_page_is_seen(site, serve, page, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "where"),
-    [("balance law", "theory"), ("drift_order", "reference/invariants"), ("MEGNO", "chaos")],
+    [
+        ("balance law", "theory"),
+        ("drift_order", "reference/invariants"),
+        ("MEGNO", "chaos"),
+        ("adaptive", "lattices"),
+        ("Verlet", "which-method"),
+        ("Julia", "migration"),
+        ("plasma", "faq"),
+        ("neural network", "faq"),
+        ("cite", "faq"),
+        ("constraints", "faq"),
+        ("CUDA", "gpu"),
+        ("friction", "which-method"),
+        ("non-separable", "which-method"),
+        ("kepler", "systems"),
+        ("adiabatic invariant", "index"),
+        ("H_D", "faq"),
+    ],
 )
 def test_search_finds(site, serve, page, words, where):
     home = serve(site)
     page.set_viewport_size({"width": 1280, "height": 900})
     page.open_page(f"{home}/search.html?q={urllib.parse.quote(words)}")
-    page.wait_for_selector("#search-results li a", timeout=20_000)
+    page.wait_for_function(  # results come one after the other
+        "/found|not match/.test(document.querySelector('#search-results p.search-summary')"
+        "?.innerText)", timeout=20_000,
+    )  # fmt: skip
     links = page.eval_on_selector_all("#search-results li a", "as => as.map(a => a.href)")
     assert any(f"/{where}.html" in link for link in links), links
     page.open_page(f"{home}/search.html?q=xyzzyq")
