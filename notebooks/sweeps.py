@@ -103,7 +103,8 @@ assert 0 < share < 0.2
 #
 # The store belongs to this sweep. The same call finds everything done, and computes nothing; had it
 # been killed half-way, it would go on with what is missing. So it gives the same bits. And a single
-# trajectory of the sweep is the one that `integrate` gives by itself.
+# trajectory of the sweep is the one that `integrate` gives by itself: another program, which agrees
+# to round-off.
 
 # %%
 again = dvi.sweep(kepler.system, **asked, store=store)

@@ -49,6 +49,22 @@ def test_examples_run(page, tmp_path):
         assert line in out.stdout.splitlines()
 
 
+def too_long(text):
+    """Lines of code, in fences or indented, that a desk shows only with a scroll bar."""
+    code = re.findall(r"^```[^\n]*\n(.*?)^```", text, re.S | re.M)
+    code += re.findall(r"(?<=\n\n)((?: {4}[^\n]*\n)+)", text)
+    return [line for block in code for line in block.splitlines() if len(line) > 100]
+
+
+def test_code_fits_its_page():
+    pages = [ROOT / "README.md", *DOCS.glob("*.md")]
+    long = {page.name: too_long(page.read_text(encoding="utf-8")) for page in pages}
+    assert {name: lines for name, lines in long.items() if lines} == {}
+    line = "x" * 101
+    assert too_long(f"```\n{line}\n```\n") == [line]
+    assert too_long(f"a\n\n    {line}\n\n{line}\n") == [f"    {line}"]
+
+
 PRINTED = re.compile(r"^<!-- printed -->\n```text\n(.*?)^```", re.S | re.M)
 
 
@@ -192,6 +208,8 @@ def test_names_lead_where_they_are_meant(site):
     assert "#dvi_jax.plot.drift_surface" in read["plots"]
     assert "#dvi_jax.drift_surface" not in read["plots"]
     assert "#dvi_jax.systems.kepler" in read["systems"]
+    notebook = (site / "notebooks/the_paper.html").read_text(encoding="utf-8")
+    assert re.search(r'href="../what-is-conserved.html"><[^>]*>docs/what-is-conserved', notebook)
     theirs = (site / "migration.html").read_text(encoding="utf-8")
     first = re.findall(r"<tr[^>]*><td>(.*?)</td>", theirs, re.S)
     assert any("LobattoIIIAIIIB" in cell for cell in first)

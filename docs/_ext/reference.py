@@ -230,7 +230,7 @@ def write(folder: Path) -> None:
 
 
 class LinkNames(SphinxPostTransform):
-    """Names of the package in code font lead to the reference."""
+    """Names of the package in code font lead to the reference, names of pages to the pages."""
 
     default_priority = 5
 
@@ -240,21 +240,22 @@ class LinkNames(SphinxPostTransform):
                 continue
             if self.env.docname == "migration" and self._is_first_cell(literal):
                 continue  # their names, some of which are ours too
+            page = re.fullmatch(r"docs/([\w-]+)\.md", literal.astext())
+            if page is not None and page[1] in self.env.found_docs:
+                self._link(literal, refdomain="std", reftype="doc", reftarget=f"/{page[1]}")
+                continue
             found = meant(literal.astext(), self.env.docname)
             target = next((x for x in found if not self._is_own_entry(literal, x)), None)
             if target is None:
                 continue
-            link = addnodes.pending_xref(
-                "",
-                refdomain="py",
-                reftype="obj",
-                reftarget=target,
-                refdoc=self.env.docname,
-                refexplicit=True,
-                refwarn=True,
-            )
-            literal.replace_self(link)
-            link += literal
+            self._link(literal, refdomain="py", reftype="obj", reftarget=target)
+
+    def _link(self, literal: nodes.literal, **to: str) -> None:
+        link = addnodes.pending_xref(
+            "", refdoc=self.env.docname, refexplicit=True, refwarn=True, **to
+        )
+        literal.replace_self(link)
+        link += literal
 
     @staticmethod
     def _is_own_entry(node: nodes.Node, target: str) -> bool:
