@@ -208,6 +208,8 @@ def test_names_lead_where_they_are_meant(site):
     assert "#dvi_jax.plot.drift_surface" in read["plots"]
     assert "#dvi_jax.drift_surface" not in read["plots"]
     assert "#dvi_jax.systems.kepler" in read["systems"]
+    term = entry(site, "interop", "interop.diffrax_term")
+    assert "#dvi_jax.interop.vector_field" in term
     notebook = (site / "notebooks/the_paper.html").read_text(encoding="utf-8")
     assert re.search(r'href="../what-is-conserved.html"><[^>]*>docs/what-is-conserved', notebook)
     theirs = (site / "migration.html").read_text(encoding="utf-8")

@@ -309,6 +309,9 @@ def meant(text: str, page: str) -> list[str]:
     found = [NAMES.get(f"{HOMES[page]}.{name}")] if page in HOMES else []
     if text not in OTHER_MEANINGS:
         found.append(NAMES.get(name))
+    found.append(
+        NAMES.get(f"{page.removeprefix('reference/')}.{name}")
+    )  # `vector_field` in interop
     return [full for full in found if full is not None]
 
 
