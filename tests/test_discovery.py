@@ -9,6 +9,7 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax import systems
+from dvi_jax.invariants import obstructions
 from dvi_jax.symmetry.sampling import Samples
 
 H_D = systems.oscillator().system.H_D
@@ -131,6 +132,13 @@ def test_van_der_pol_loses_the_amplitude_and_says_how():
     assert law.kind == "dissipation"
     np.testing.assert_allclose(law.powers, [0, 0.1, -0.05], atol=2e-4)
     np.testing.assert_allclose(law.rest, [2.0], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("powers", "text"), [([0, -0.1], "−0.1 I"), ([1, -2, 3], "1 − 2 I + 3 I²"), ([0, 0], "0")]
+)
+def test_a_law_is_written_with_its_signs(powers, text):
+    assert obstructions._polynomial(np.array(powers, float)) == text
 
 
 @pytest.mark.parametrize("start", [0.5, 3.0])

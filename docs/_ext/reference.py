@@ -212,7 +212,14 @@ def write(folder: Path) -> None:
     index = [
         "# Reference",
         "",
-        "Every public name, from its docstring. `import dvi_jax as dvi`.",
+        "Every public name, from its docstring. In the examples, which the tests run,",
+        "",
+        "```python",
+        "import jax, jax.numpy as jnp, numpy as np",
+        'jax.config.update("jax_enable_x64", True)',
+        "import dvi_jax as dvi",
+        "from dvi_jax import systems",
+        "```",
         "",
     ]
     index += ["```{toctree}", ":maxdepth: 1", "", *pages, "```", ""]

@@ -171,4 +171,5 @@ def _polynomial(powers: np.ndarray) -> str:
     words = [
         f"{'−' if a < 0 else '+'} {abs(a):.6g}{'' if n == '1' else ' ' + n}" for a, n in present
     ]
-    return " ".join(words).removeprefix("+ ") or "0"
+    text = " ".join(words) or "0"
+    return "−" + text[2:] if text.startswith("−") else text.removeprefix("+ ")

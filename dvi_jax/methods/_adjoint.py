@@ -33,14 +33,17 @@ class Adjoint(Method):
 
     @property
     def order(self) -> int:
+        """That of the method."""
         return self.method.order
 
     @property
     def is_symmetric(self) -> bool:
+        """Whether the method is, which is then its own adjoint."""
         return self.method.is_symmetric
 
     @property
     def is_symplectic(self) -> bool:
+        """Whether the method is."""
         return self.method.is_symplectic
 
     def step(self, equations, interval, q0, p0):

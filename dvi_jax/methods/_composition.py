@@ -222,5 +222,6 @@ class Composition(CompositionMethod):
 
     @property
     def is_symmetric(self) -> bool:
+        """Whether the coefficients read the same from both ends."""
         c = self.coefficients
         return c == c[::-1] and (len(c) % 2 == 0 or self.base.is_symmetric)

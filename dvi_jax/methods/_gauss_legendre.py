@@ -77,6 +77,7 @@ class GaussLegendre(Method):
 
     @property
     def order(self) -> int:
+        """Twice the stages."""
         return 2 * self.stages
 
     def step(self, equations, interval, q0, p0):

@@ -117,6 +117,7 @@ class LobattoIIIAIIIB(Method):
 
     @property
     def order(self) -> int:
+        """Twice the stages, less two."""
         return 2 * self.stages - 2
 
     def step(self, equations, interval, q0, p0):

@@ -34,22 +34,27 @@ class SweepResult:
 
     @property
     def dims(self) -> dict[str, int]:
+        """Name of each dimension → its length."""
         return dict(self._plan.dims)
 
     @property
     def path(self) -> Path | None:
+        """The store, or None where the results are in memory."""
         return self._source.path if isinstance(self._source, Store) else None
 
     @property
     def num_tasks(self) -> int:
+        """Into how many tasks the grid is cut."""
         return self._plan.num_tasks
 
     @property
     def tasks_done(self) -> int:
+        """How many of them have their results; of a store all records are read."""
         return self._plan.num_tasks - len(self._source.todo())
 
     @property
     def is_complete(self) -> bool:
+        """Whether all tasks are done."""
         return self.tasks_done == self.num_tasks
 
     def __getitem__(self, name: str) -> np.ndarray:

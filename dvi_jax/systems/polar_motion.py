@@ -202,7 +202,7 @@ def check_start(q0: Any, p0: Any, args: Any) -> None:
 def polar_motion() -> Problem:
     r"""The pole on 2000-01-01 (t = 0), with ε = 1 the Earth's and with ε = 0 free and undamped.
 
-        H_D + ε H1_D  and  ε W    of  `hamiltonian`, `disturbance`, `damping`
+        H_D + ε H1_D  and  ε W    of  hamiltonian, disturbance, damping
 
     `args`, each of which a fit may set free:
 
