@@ -180,3 +180,58 @@ def test_times_data_and_axes_with_units_are_refused():
     with pytest.raises(TypeError, match="has the unit 'm'"):
         dvi.frequencies(np.arange(100.0), np.ones(100) * u.m)
     assert dvi.integrate(SPRING, **RUN).qs.shape == (3, 1)  # plain numbers are taken
+
+
+def weights(masses, k=1 * u.N / u.m, kinds=None):
+    """A weight on each of two springs."""
+
+    def energy(t, q, p, args):
+        return jnp.sum(p**2 / jnp.asarray(args["masses"])) / 2 + args["k"] * jnp.sum(q**2) / 2
+
+    kinds = {"masses": u.kg} | ({"k": u.N / u.m} if kinds is None else kinds)
+    return interop.integrate(
+        dvi.System(dvi.discretise(energy)), [1, 1] * u.m, [0, 0] * u.kg * u.m / u.s, h=0.1 * u.s,
+        num_steps=3, args={"masses": masses, "k": k},
+        units=interop.UnitSystem(u.m, u.s, u.kg, args=kinds),
+    ).qs[-1].value  # fmt: skip
+
+
+def test_a_unit_goes_for_all_that_is_below_its_name():
+    wanted = weights([1, 2] * u.kg)
+    np.testing.assert_array_equal(weights([1 * u.kg, 2000 * u.g]), wanted)
+    assert np.abs(weights([1 * u.kg, 2 * u.g]) - wanted).max() > 1e-3
+    with pytest.raises(TypeError, match=r"args masses.0 = 1.0 has no unit"):
+        weights([1.0, 2.0])
+
+
+def test_a_mistyped_name_lets_no_bare_number_through():
+    with pytest.raises(ValueError, match=r"units has kk, which args has not.*args has k without"):
+        weights([1, 2] * u.kg, k=5.0, kinds={"kk": u.N / u.m})
+    with pytest.raises(ValueError, match=r"'J22', and oblate_kepler has no such.*mu, R, J2"):
+        interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args={"J22": 0.0})
+    with pytest.raises(TypeError, match="mapping from name to value, got list"):
+        interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args=[0.0])
+
+
+def test_a_problem_of_the_library_in_other_units():
+    problem = systems.oblate_kepler()
+    own = interop.integrate(problem, h=10 * u.s, num_steps=20)
+    kinds = {"mu": u.m**3 / u.s**2, "R": u.m}
+    for changed in ({}, {"q0": problem.q0 * u.km, "args": {"J2": problem.args["J2"]}}):
+        si = interop.integrate(
+            problem, h=10 * u.s, num_steps=20, **changed,
+            units=interop.UnitSystem(u.m, u.s, u.kg, p="velocity", args=kinds),
+        )  # fmt: skip
+        assert si.qs.unit == u.m
+        np.testing.assert_allclose(si.qs.to_value(u.km), own.qs.value, rtol=1e-13)
+
+
+def test_masked_values_and_units_without_a_factor_are_refused():
+    masked = pytest.importorskip("astropy.utils.masked").Masked
+    with pytest.raises(ValueError, match="q0 has masked values"):
+        run(SOLAR, q0=masked([1, 0] * u.au, mask=[False, True]))
+    for unit in (u.deg_C, u.mag, u.ABmag, u.photon / u.s):
+        with pytest.raises(ValueError, match="T cannot be in"):
+            interop.UnitSystem(u.m, u.s, u.kg, args={"T": unit})
+    with pytest.raises(ValueError, match=r"in kelvin, x\.to\(u\.K, u\.temperature"):
+        weights([1, 2] * u.kg, k=5 * u.deg_C, kinds={"k": u.K})

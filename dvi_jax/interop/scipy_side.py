@@ -11,6 +11,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from .._quantities import refuse_quantity
 from ..systems import Problem
 from .extras import needed, system_of
 
@@ -78,7 +79,8 @@ def solve_ivp(
 
     - `system`: a `System` in place of SciPy's right side; or a problem of the library, whose args
       are taken where `args` is left out.
-    - `t_span`: (t0, t1); t1 < t0 runs backwards. `y0`: q0 and p0, raveled, one after the other.
+    - `t_span`: (t0, t1); t1 < t0 runs backwards. `y0`: q0 and p0, raveled, one after the other; the
+      run has its precision.
     - `method`: a `Method`, or its name in ``certify.METHODS``, such as ``"KahanLi8"``.
     - `t_eval`: times to be told, in order and within t_span; all lattice points where left out.
       Between lattice points it is the step of the method to that time.
@@ -114,6 +116,8 @@ def solve_ivp(
                 else "SciPy's solve_ivp does not know it either, or it is new."
             )
         )
+    for name, given in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
+        refuse_quantity(name, given)
     bunch = needed("scipy.optimize", "interop.solve_ivp").OptimizeResult
     problem = system if isinstance(system, Problem) else None
     system = system_of(system, "interop.solve_ivp")
@@ -126,11 +130,18 @@ def solve_ivp(
     found = [_event(e) for e in _several(events)]
     ahead = 1 if t1 > t0 else -1  # SciPy's direction is along the run, that of `Section` in time
 
+    step = (t1 - t0) / num_steps
+    # The last point of the lattice, t0 + N h', may lie a rounding before t1, or behind it.
+    last = min if t1 > t0 else max
+    at = None if times is None else last(t0 + num_steps * step, t1)
+
     def run(room: int) -> dvi.Solution:
-        save = dvi.Save() if times is None or times.size == 0 else dvi.Save(ts=times)
+        save = dvi.Save()
+        if times is not None and times.size:
+            save = dvi.Save(ts=np.minimum(times, at) if t1 > t0 else np.maximum(times, at))
         more: dict[str, Any] = {} if newton is None else {"newton": newton}
         return dvi.integrate(
-            system, q0, p0, h=(t1 - t0) / num_steps, num_steps=num_steps, t0=t0, epsilon=epsilon,
+            system, q0, p0, h=step, num_steps=num_steps, t0=t0, epsilon=epsilon,
             args=args, method=_method(method), save=save, throw=False,
             observe=[dvi.Section(e.g, ahead * e.direction, room) for e in found] or None, **more,
         )  # fmt: skip
@@ -144,8 +155,12 @@ def solve_ivp(
 
 def _told(sol: Any, events: list[_Event], t0: float, t1: float, num_steps: int, times: Any) -> dict:
     """A run as SciPy tells it: cut at a terminal event, or before a failure."""
-    t = np.asarray(sol.ts)
+    t = np.array(sol.ts)
     y = _rows(sol.qs, sol.ps)
+    if times is None:
+        t[-1] = t1  # and not t0 + N h', which is a rounding away
+    elif times.size:
+        t = times  # what was asked for, in its precision
     if times is not None and times.size == 0:
         t, y = t[:0], y[:0]
     crossings = [(np.asarray(c.ts), _rows(c.qs, c.ps)) for c in sol.observed or ()]
@@ -202,8 +217,11 @@ def _span(t_span: Any, h: Any) -> tuple[float, float, int]:
         raise ValueError(f"t_span must be two times (t0, t1), got {t_span!r}.") from None
     if not (math.isfinite(t0) and math.isfinite(t1)) or t0 == t1:
         raise ValueError(f"t_span must be two finite times that differ, got {t_span!r}.")
-    h = float(h)
-    if not (math.isfinite(h) and h > 0):
+    try:
+        h = float(h)
+    except (TypeError, ValueError):
+        h = math.nan if np.size(h) == 1 else h
+    if not (isinstance(h, float) and math.isfinite(h) and h > 0):
         raise ValueError(
             f"h must be a positive and finite step, got {h}; the direction is that of t_span."
         )
@@ -218,7 +236,11 @@ def _halves(y0: Any, shape: tuple[int, ...] | None) -> tuple[np.ndarray, np.ndar
             f"y0 must be one vector, q0 and then p0, of an even length; got shape {y0.shape}."
         )
     q0, p0 = np.split(y0, 2)
-    shape = q0.shape if shape is None else tuple(shape)
+    if shape is None:
+        shape = q0.shape
+    elif isinstance(shape, int | np.integer):
+        shape = (int(shape),)
+    shape = tuple(shape)
     if math.prod(shape) != q0.size:
         raise ValueError(f"half of y0 holds {q0.size} numbers, and q has the shape {shape}.")
     return q0.reshape(shape), p0.reshape(shape)
@@ -265,17 +287,21 @@ def _event(event: Any) -> _Event:
     direction, terminal = getattr(event, "direction", 0), getattr(event, "terminal", False)
     if isinstance(terminal, bool | type(None) | np.bool_):
         terminal = int(bool(terminal))
-    if not isinstance(terminal, int) or terminal < 0:
+    if not isinstance(terminal, int | np.integer) or terminal < 0:
         raise ValueError(
             f"terminal of an event must be True, False or a number of crossings, got {terminal!r}."
         )
-    with_args = _takes_three(event)
-    return _Event(_OfVector(event, with_args), terminal, int(np.sign(direction)))
+    with_args = _takes_args(event)
+    return _Event(_OfVector(event, with_args), int(terminal), int(np.sign(direction)))
 
 
-def _takes_three(event: Callable[..., Any]) -> bool:
+def _takes_args(event: Callable[..., Any]) -> bool:
+    """Whether an event is (t, y, args). A third parameter with a default is one only if it is
+    called so: ``lambda t, y, c=c: …`` keeps a value of its own there."""
     try:
+        parameters = list(inspect.signature(event).parameters.values())
         inspect.signature(event).bind(0, 0, 0)
     except (TypeError, ValueError):
         return False
-    return True
+    third = parameters[2] if len(parameters) > 2 else parameters[-1]
+    return third.default is inspect.Parameter.empty or third.name == "args"

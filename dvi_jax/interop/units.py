@@ -28,7 +28,8 @@ class UnitSystem:
       ``"velocity"`` (unit mass), ``"angular momentum"``, ``"specific angular momentum"``;
       ``"dimensionless"``; or any unit of that kind.
     - `args`: name of a parameter → some unit of its kind, ``{"mu": u.m**3 / u.s**2}``; of nested
-      ones by path, ``"planet.mass"``. What is not named is a number without a unit.
+      ones by path, ``"planet.mass"``; a name goes for all that is below it. What is not named is a
+      number without a unit.
 
     It has the units `q`, `p`, `t`, `energy` (p q/t) and `args` of the numbers. `UnitSystem.of`
     reads those of a problem of the library.
@@ -67,8 +68,15 @@ class UnitSystem:
 
         def coherent(name: str, what: Any) -> Any:
             unit = words[what] if isinstance(what, str) and what in words else _unit(u, name, what)
-            parts = unit.decompose(bases=[L, T, M, *others])
-            return u.CompositeUnit(1.0, parts.bases, parts.powers)
+            try:
+                parts = unit.decompose(bases=[L, T, M, *others])
+                return u.CompositeUnit(1.0, parts.bases, parts.powers)
+            except (AttributeError, u.UnitConversionError):  # °C, magnitudes, photons
+                raise ValueError(
+                    f"{name} cannot be in {unit}, which no factor takes to length, time, mass, "
+                    "angle, current, temperature (K), amount and luminous intensity: convert it "
+                    "before this door."
+                ) from None
 
         named = {name: coherent(name, unit) for name, unit in (args or {}).items()}
         self._set(coherent("q", q), coherent("p", p), T, named)
@@ -163,7 +171,7 @@ def integrate(
     numbers, in `units`.
 
     - `system`: a `System`; or a problem of the library, whose start and parameters stand in for
-      what is left out, and whose units are taken where `units` is.
+      what is left out, in its own units, which are taken where `units` is left out too.
     - `q0`, `p0`: quantities of the shape of the start. `h`, `t0` (zero when left out): times.
     - `num_steps`, and `options`: as for ``dvi.integrate``.
     - `units`: the `UnitSystem` behind the door.
@@ -173,8 +181,9 @@ def integrate(
     **Returns** a `UnitSolution`.
 
     **Raises** `TypeError` for a number where a unit is needed, `ValueError` for a quantity of
-    another kind, with what was seen and what is allowed; and as ``dvi.integrate``. `ImportError`
-    without astropy.
+    another kind, with what was seen and what is allowed, for masked values, for parameters that the
+    problem has not, and where `units` and `args` have different names; and as ``dvi.integrate``.
+    `ImportError` without astropy.
 
     **Accuracy** one rounding for each number that is converted; the same orbit in two systems of
     units agrees to round-off. Nothing here can be traced: quantities are values. For `jax.grad`,
@@ -183,14 +192,14 @@ def integrate(
     u = needed("astropy.units", "interop.integrate")
     problem = system if isinstance(system, Problem) else None
     system = system_of(system, "interop.integrate")
-    own = units is None and problem is not None
+    own = _own(problem, required=units is None) if problem is not None else None
     if units is None:
-        if problem is None:
+        if own is None:
             raise TypeError(
                 "a dvi.System does not say what its numbers are: give units=interop.UnitSystem("
                 "length=u.au, time=u.day, mass=u.Msun, args={...})."
             )
-        units = UnitSystem.of(problem)
+        units = own
     if not isinstance(units, UnitSystem):
         raise TypeError(f"units must be an interop.UnitSystem, got {units!r}.")
     save, lattice = options.get("save"), options.get("lattice")
@@ -203,17 +212,11 @@ def integrate(
         if save is not None:
             raise TypeError("ts= says which states are kept: leave save out.")
         options["save"] = dvi.Save(ts=_number(u, "ts", ts, units.t))
-    if own and problem is not None:
-        start = {"q0": problem.q0 if q0 is None else None, "p0": problem.p0 if p0 is None else None}
-    else:
-        start = {"q0": None, "p0": None}
-    numbers = _arguments(u, args, units)
-    if own and problem is not None and isinstance(problem.args, Mapping):
-        numbers = {**problem.args, **(numbers or {})}
+    q0, p0, args = _filled(u, problem, own, units, q0, p0, args)
     q, p = (
-        _number(u, name, value, unit) if start[name] is None else start[name]
-        for name, value, unit in (("q0", q0, units.q), ("p0", p0, units.p))
+        _number(u, name, x, unit) for name, x, unit in (("q0", q0, units.q), ("p0", p0, units.p))
     )
+    numbers = _arguments(u, args, units)
     sol = dvi.integrate(
         system,
         q,
@@ -232,23 +235,76 @@ def integrate(
     return UnitSolution(*with_unit, observed=sol.observed, units=units, solution=sol)
 
 
+def _own(problem: Problem, required: bool) -> UnitSystem | None:
+    """The units of a problem; None for one whose units are words, unless they are `required`."""
+    try:
+        return UnitSystem.of(problem)
+    except ValueError:
+        if required:
+            raise
+        return None
+
+
+def _filled(
+    u: Any, problem: Problem | None, own: UnitSystem | None, units: UnitSystem,
+    q0: Any, p0: Any, args: Any,
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """Start and args with what a problem has in the place of what was left out: as quantities."""
+    if problem is None:
+        return q0, p0, args
+    known = problem.args
+    if isinstance(known, Mapping) and (args is None or isinstance(args, Mapping)):
+        for name in args or {}:
+            if name not in known:
+                raise ValueError(
+                    f"args has {name!r}, and {problem.name} has no such parameter; it has "
+                    f"{', '.join(known)}."
+                )
+    elif args is not None and known is not None:
+        raise TypeError(
+            f"args of {problem.name} is a mapping from name to value, got {type(args).__name__}."
+        )
+    if own is None:  # its numbers have no unit that is known here
+        return q0, p0, args
+    q0 = u.Quantity(problem.q0, own.q) if q0 is None else q0
+    p0 = u.Quantity(problem.p0, own.p) if p0 is None else p0
+    if isinstance(known, Mapping):
+        rest = {
+            name: u.Quantity(value, own.args[name]) if name in own.args else value
+            for name, value in known.items()
+        }
+        args = {**rest, **(args or {})}
+    return q0, p0, args
+
+
 def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     """The same pytree with every quantity as a number."""
-    seen = set()
+    seen, bare = set(), []
 
     def number(path: Any, leaf: Any) -> Any:
-        name = ".".join(str(getattr(k, "key", getattr(k, "idx", k))) for k in path) or "args"
-        if name in units.args:
-            seen.add(name)
-            return _number(u, f"args {name}", leaf, units.args[name])
+        words = [str(getattr(k, "key", getattr(k, "idx", k))) for k in path]
+        # A unit goes for all that is below its name: "masses" for each of a list of masses.
+        above = [".".join(words[:i]) for i in range(len(words), 0, -1)]
+        name = above[0] if above else "args"
+        if declared := next((x for x in above if x in units.args), None):
+            seen.add(declared)
+            return _number(u, f"args {name}", leaf, units.args[declared])
         if isinstance(leaf, u.Quantity) and leaf.unit != u.dimensionless_unscaled:
             raise TypeError(
                 f"args has {name} in {leaf.unit}, and the units do not say what it should be in: "
                 f'declare it, UnitSystem(..., args={{"{name}": u.Unit("{leaf.unit}")}}).'
             )
+        bare.append(name)
         return _number(u, f"args {name}", leaf, u.dimensionless_unscaled)
 
-    return jax.tree.map_with_path(number, args)
+    numbers = jax.tree.map_with_path(number, args)
+    unmet = [name for name in units.args if name not in seen]
+    if unmet and bare:  # a mistyped name would let a bare number through
+        raise ValueError(
+            f"units has {', '.join(unmet)}, which args has not, and args has {', '.join(bare)} "
+            "without a unit: name in UnitSystem(args=...) what args has, and nothing else."
+        )
+    return numbers
 
 
 def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
@@ -261,6 +317,8 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
             raise TypeError(
                 f"{name} mixes quantities and numbers, or units that do not go together: {error}."
             ) from None
+    if np.any(getattr(value, "mask", False)):
+        raise ValueError(f"{name} has masked values, and a run needs them all: {value!r}.")
     if not isinstance(value, u.Quantity):
         if unit == u.dimensionless_unscaled:
             return value
@@ -272,9 +330,10 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
     try:
         return value.to_value(unit, equivalencies=u.dimensionless_angles())
     except u.UnitConversionError:
+        offset = ": in kelvin, x.to(u.K, u.temperature())" if value.unit == u.deg_C else ""
         raise ValueError(
             f"{name} is in {str(value.unit) or 1} ({value.unit.physical_type}); it has to be "
-            f"convertible to {str(unit) or 1} ({unit.physical_type})."
+            f"convertible to {str(unit) or 1} ({unit.physical_type}){offset}."
         ) from None
 
 
