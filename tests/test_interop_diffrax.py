@@ -235,3 +235,18 @@ def test_a_discrete_lagrangian_has_no_field_and_hides_no_nan():
     h2 = dvi.System(dvi.discretise(lambda t, q, p, args: jnp.sum(p**2 + q**2) / 2, order=2))
     rate = interop.vector_field(h2)(0.0, (jnp.ones(1), 2 * jnp.ones(1)), None)
     np.testing.assert_allclose(np.concatenate(rate), [2, -1], rtol=1e-15)
+
+
+def test_a_pair_may_be_a_list():
+    solver, term = interop.diffrax_solver(), interop.diffrax_term(KEPLER)
+    found = diffrax.diffeqsolve(term, solver, 0.0, H, H, y0=[Q0, P0], args=KEPLER.args)
+    wanted = by_diffrax(solver, t1=H, epsilon=0.0)
+    assert isinstance(found.ys, list)
+    np.testing.assert_array_equal(found.ys[0], wanted.ys[0])
+
+
+def test_a_strength_with_a_unit_is_refused():
+    u = pytest.importorskip("astropy.units")
+    for make in (interop.diffrax_term, interop.vector_field):
+        with pytest.raises(TypeError, match="epsilon has the unit 'm'"):
+            make(KEPLER, epsilon=5 * u.m)

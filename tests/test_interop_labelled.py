@@ -236,3 +236,16 @@ def test_without_the_package_the_line_that_installs_it(package, call, monkeypatc
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=rf'{package}.*pip install "dvi-jax\[interop\]"'):
         call()
+
+
+@pytest.mark.parametrize("name", ["newton_iterations", "failed_step", "max_residual"])
+def test_an_observable_is_not_lost_behind_what_a_run_tells_of_itself(name):
+    observe = {name: dvi.MaxDrift(ENERGY)}
+    with pytest.raises(ValueError, match=f"{name}' has a name that is taken"):
+        interop.to_xarray(run(observe=observe), observe=observe)
+
+
+def test_coordinates_with_units_are_not_stripped_of_them():
+    u = pytest.importorskip("astropy.units")
+    with pytest.raises(TypeError, match="coords time has the unit 'km'"):
+        interop.to_xarray(run(), coords={"time": np.arange(7) * u.km})

@@ -1,5 +1,7 @@
 """Simulations of REBOUND as problems of the library, and back."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -217,3 +219,38 @@ def test_other_objects_are_refused():
     sim.add(m=1e-5, x=sim.particles[1].x, y=sim.particles[1].y, z=sim.particles[1].z)
     with pytest.raises(ValueError, match="giant and body 3 are on top"):
         interop.from_rebound(sim)
+
+
+def test_a_replaced_start_goes_back_as_it_is_now():
+    problem = interop.from_rebound(three_bodies())
+    faster = dataclasses.replace(problem, p0=2 * problem.p0)
+    heavier = dataclasses.replace(
+        problem, args={**problem.args, "masses": 2 * problem.args["masses"]}
+    )
+    for changed, factor in ((faster, 2.0), (heavier, 0.5)):
+        v = [[b.vx, b.vy, b.vz] for b in interop.to_rebound(changed).particles]
+        np.testing.assert_allclose(v, factor * problem.velocities, rtol=1e-15)
+
+
+def test_a_failed_state_does_not_go_there():
+    problem = interop.from_rebound(three_bodies())
+    with pytest.raises(ValueError, match=r"q holds values that are not finite.*failing step"):
+        interop.to_rebound(problem, np.nan * problem.q0, problem.p0)
+    u = pytest.importorskip("astropy.units")
+    with pytest.raises(TypeError, match="p has the unit 'km'"):
+        interop.to_rebound(problem, problem.q0, problem.p0 * u.km)
+
+
+def test_a_simulation_by_bulirsch_and_stoer_has_no_equations_of_the_users():
+    simulation = three_bodies()
+    simulation.integrator = "bs"
+    simulation.integrate(0.1)
+    assert interop.from_rebound(simulation).integrator == "bs"
+
+
+def test_a_file_that_is_none_is_told(tmp_path):
+    with pytest.raises(FileNotFoundError, match="there is no Simulationarchive"):
+        interop.from_rebound(tmp_path / "none.bin")
+    three_bodies().save_to_file(str(tmp_path / "one.bin"))
+    with pytest.raises(ValueError, match="cannot read snapshot 7 of"):
+        interop.from_rebound(tmp_path / "one.bin", snapshot=7)

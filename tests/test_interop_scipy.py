@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 import dvi_jax as dvi
 from dvi_jax import interop, systems
+from dvi_jax.interop.scipy_side import _event
 
 KEPLER = systems.kepler()
 
@@ -209,3 +210,38 @@ def test_y_is_q_and_then_p():
         interop.solve_ivp(KEPLER, (0, 1), [1.0, 2.0, 3.0], h=0.1)
     with pytest.raises(TypeError, match=r"dvi\.System"):
         interop.solve_ivp(rate, (0, 1), Y0, h=0.1)
+
+
+@pytest.mark.parametrize("t_span", [(3.0, 1 / 3), (0.1, 7.3)])
+def test_both_ends_are_those_that_were_asked_for(t_span):
+    # t0 + N h' is a rounding beside t1: there is a last point all the same, and it is told as t1.
+    found = interop.solve_ivp(SYSTEM, t_span, Y0, "TypeII", h=0.013, args=K)
+    assert (found.t[0], found.t[-1]) == t_span
+    times = np.linspace(*t_span, 7)
+    at = interop.solve_ivp(SYSTEM, t_span, Y0, "TypeII", h=0.013, args=K, t_eval=times)
+    assert at.status == 0
+    np.testing.assert_array_equal(at.t, times)
+    np.testing.assert_allclose(at.y[:, -1], found.y[:, -1], rtol=0, atol=1e-13)
+
+
+def test_an_event_keeps_values_of_its_own():
+    closures = [lambda t, y, c=c: y[0] - c for c in (0.0, 0.3)]
+    found = ours((0.0, 3.0), "TypeII", events=closures)
+    for c, states in zip((0.0, 0.3), found.y_events, strict=True):
+        np.testing.assert_allclose(states[:, 0], [c], rtol=0, atol=1e-9)
+    named = [lambda t, y, args: y, lambda t, y, args=None: y, lambda t, y, *args: y]
+    assert [_event(e).g.with_args for e in [*closures, *named]] == [False] * 2 + [True] * 3
+
+
+def test_habits_of_numpy_and_units():
+    event = _event(marked(lambda t, y: y[0], np.int64(2), np.float64(-1)))
+    assert (event.terminal, event.direction) == (2, -1)
+    assert ours((0.0, 0.1), "TypeII", shape=1).y.shape == (2, 3)
+    with pytest.raises(ValueError, match=r"h must be a positive and finite step, got \[0.1, 0.1\]"):
+        ours((0.0, 1.0), h=[0.1, 0.1])
+    u = pytest.importorskip("astropy.units")
+    for changed in ({"t_eval": [0, 0.01] * u.min}, {"h": 1 * u.min}):
+        with pytest.raises(TypeError, match="has the unit 'min', and numbers are taken here"):
+            ours((0.0, 1.0), **changed)
+    with pytest.raises(TypeError, match="y0 has the unit 'm'"):
+        interop.solve_ivp(SYSTEM, (0, 1), Y0 * u.m, h=0.1, args=K)

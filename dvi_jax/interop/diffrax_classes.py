@@ -55,7 +55,7 @@ class DiscreteMap(diffrax.AbstractSolver):
             epsilon=term.epsilon, args=args, method=self.method, newton=self.newton,
             save=dvi.Save(final=True), adjoint=dvi.Direct(), throw=False,
         )  # fmt: skip
-        y1 = (taken.qs[-1], taken.ps[-1])
+        y1 = type(y0)((taken.qs[-1], taken.ps[-1]))  # a pair, of diffrax's kind: tuple or list
         slopes = {
             name: terms.prod(terms.vf(t, y, args), terms.contr(t0, t1))
             for name, t, y in (("k0", t0, y0), ("k1", t1, y1))

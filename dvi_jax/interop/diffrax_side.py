@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
+from .._quantities import refuse_quantity
 from .extras import needed, system_of
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], t
     field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
     """
     system = system_of(system, "vector_field")
+    refuse_quantity("epsilon", epsilon)
     _warn_without_effect(system, epsilon)
 
     def field(t, y, args):
@@ -45,7 +47,8 @@ def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], t
             t, t, q, p, strength, args
         )
         force = system.disturbing_force(t, t, q, p, strength, args)
-        return momentum, -position + jnp.asarray(force, q.dtype)
+        rates = momentum, -position + jnp.asarray(force, q.dtype)
+        return list(rates) if isinstance(y, list) else rates
 
     return field
 
@@ -97,6 +100,7 @@ def diffrax_term(system: Any, epsilon: Any = 0.0) -> "DiscreteTerm":
     from .diffrax_classes import DiscreteTerm
 
     system = system_of(system, "diffrax_term")
+    refuse_quantity("epsilon", epsilon)
     _warn_without_effect(system, epsilon)
     return DiscreteTerm(system, jnp.asarray(epsilon, float))
 

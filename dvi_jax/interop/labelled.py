@@ -1,7 +1,7 @@
 """Results with labels: datasets of xarray, and what ArviZ takes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
@@ -9,6 +9,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from .._quantities import refuse_quantity
 from .extras import needed
 
 _STATUSES = (
@@ -57,7 +58,7 @@ def to_xarray(
 
     **Raises** `ValueError` for a number of `dims` that is not that of the batch, labels that do not
     fit, an `observe` of another structure, and names that are taken; `TypeError` for what is no
-    solution.
+    solution, and for coords with units (say them in `units`).
     """
     if not isinstance(solution, dvi.Solution):
         raise TypeError(
@@ -83,7 +84,7 @@ def to_xarray(
     found["h"] = ((*dims, step), hs)
     for name, value, per_step in _observed(solution.observed, observe):
         if name in found or name.partition(".")[0] in _TAKEN:
-            raise ValueError(f"the observable {name!r} has a name that is taken: give it another.")
+            _taken(name)
         own = value.shape[len(dims) :]
         if per_step and own[:1] != hs.shape[-1:]:
             raise ValueError(
@@ -97,13 +98,17 @@ def to_xarray(
         "flag_meanings": " ".join(_STATUSES),
     })  # fmt: skip
     for name, value in solution.stats.items():
+        _check_free(name, found)
         if name != "num_steps":
             value = np.asarray(value)
             found[name] = ((*dims, *_own(name, value.shape[len(lead) :])), value)
     if solution.stop is not None:
         for name, value in zip("tqp", solution.stop, strict=True):
             own = () if name == "t" else of_state
+            _check_free(f"stop_{name}", found)
             found[f"stop_{name}"] = ((*dims, *own), np.asarray(value))
+    for name, values in (coords or {}).items():
+        refuse_quantity(f"coords {name}", values)
     along = {at: index, **labels, **(coords or {})}
     if step == "step":
         along["step"] = np.arange(1, count)
@@ -183,6 +188,16 @@ def _old_arviz() -> Any:
         needed("arviz_base", "interop.to_inference_data")
         return None
     return arviz if hasattr(arviz, "InferenceData") else None
+
+
+def _check_free(name: str, found: Mapping[str, Any]) -> None:
+    """Refuse an observable that has the name of what a solution tells of itself."""
+    if name in found:
+        _taken(name)
+
+
+def _taken(name: str) -> NoReturn:
+    raise ValueError(f"the observable {name!r} has a name that is taken: give it another.")
 
 
 def _check_dims(dims: tuple[str, ...], shape: tuple[int, ...]) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from .._quantities import refuse_quantity
 from ..systems import Problem
 from ..systems.n_body import (
     INVARIANTS,
@@ -106,8 +108,8 @@ def from_rebound(
     (``sim.copy()`` leaves them out, if that is meant), REBOUNDx, boundaries, collisions, gravity
     that is off, approximate or custom, shear (SEI), variational particles, exit distances, massive
     test particles, a simulation that is not synchronised, bodies without mass; and for a start
-    that the N-body system cannot go on from. `ImportError` without rebound, `TypeError` for another
-    object.
+    that the N-body system cannot go on from; `FileNotFoundError` for a path where there is no file;
+    `ImportError` without rebound, `TypeError` for another object.
 
     **Accuracy** q, masses, G and t are the same bits; p0 is rounded once. Units: REBOUND's solar
     mass is GM☉/G with its own G, 3e-5 away from others; the numbers stay those of the simulation.
@@ -116,7 +118,14 @@ def from_rebound(
     """
     rebound = needed("rebound", "interop.from_rebound")
     if isinstance(simulation, str | PathLike):
-        simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
+        if not Path(simulation).is_file():
+            raise FileNotFoundError(f"there is no Simulationarchive {str(simulation)!r}.")
+        try:
+            simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(
+                f"REBOUND cannot read snapshot {snapshot} of {str(simulation)!r}: {error}"
+            ) from None
         simulation.synchronize()  # it is ours: a snapshot may have been taken between half steps
     elif snapshot != -1:
         raise ValueError(
@@ -188,7 +197,8 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
 
     **Raises** `TypeError` for what is no problem, or one of q and p alone; `ValueError` for a
     system that is not Newton's N bodies, or that has a force or a perturbation, which REBOUND would
-    not know of, and for shapes that do not agree; `ImportError` without rebound.
+    not know of, for shapes that do not agree and for values that are not finite;
+    `ImportError` without rebound.
     """
     rebound = needed("rebound", "interop.to_rebound")
     if not isinstance(problem, Problem):
@@ -204,10 +214,21 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
         raise TypeError("a state is q and p together, or neither of them.")
     masses = np.asarray(args["masses"], float)
     of_problem = q is None
+    refuse_quantity("q", q)
+    refuse_quantity("p", p)
     q, p = (np.asarray(x, float) for x in ((problem.q0, problem.p0) if of_problem else (q, p)))
     check_bodies(q, p, args)
-    velocities = problem.velocities if isinstance(problem, ReboundProblem) and of_problem else None
-    v = p / masses[:, None] if velocities is None else np.asarray(velocities, float)
+    for name, values in (("q", q), ("p", p), ("t", 0.0 if t is None else float(t))):
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"{name} holds values that are not finite: a run that failed has NaN from its "
+                "failing step on; take a state before it."
+            )
+    v = p / masses[:, None]
+    if isinstance(problem, ReboundProblem) and of_problem and problem.velocities is not None:
+        known = np.asarray(problem.velocities, float)
+        if np.array_equal(p, masses[:, None] * known):  # p0 or the masses may have been replaced
+            v = known
     if q.shape[1] == 2:
         q, v = (np.column_stack([x, np.zeros(len(x))]) for x in (q, v))
     imported = isinstance(problem, ReboundProblem)
@@ -227,7 +248,14 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
 
 
 def _refuse_what_would_be_lost(sim: Any) -> None:
-    found = [text for field, text in _TURNED_ON.items() if getattr(sim, field, None)]
+    own = (
+        {"_N_odes": 1} if str(sim.integrator) == "bs" else {}
+    )  # the bodies' own, of that integrator
+    found = [
+        text
+        for field, text in _TURNED_ON.items()
+        if (getattr(sim, field, None) or 0) != own.get(field, 0)
+    ]
     for field, allowed in (("boundary", ("none",)), ("collision", ("none",))):
         if (value := getattr(sim, field)) not in allowed:
             found.append(f"{field} = {value!r}")

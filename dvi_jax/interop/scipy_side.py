@@ -131,39 +131,47 @@ def solve_ivp(
     ahead = 1 if t1 > t0 else -1  # SciPy's direction is along the run, that of `Section` in time
 
     step = (t1 - t0) / num_steps
-    # The last point of the lattice, t0 + N h', may lie a rounding before t1, or behind it.
-    last = min if t1 > t0 else max
-    at = None if times is None else last(t0 + num_steps * step, t1)
+    # The last point of the lattice, t0 + N h', is a rounding beside t1: its state is that at t1.
+    near = 16 * float(np.spacing(max(abs(t0), abs(t1))))
+    inside = None if times is None else times[np.abs(times - t1) > near]
 
     def run(room: int) -> dvi.Solution:
-        save = dvi.Save()
-        if times is not None and times.size:
-            save = dvi.Save(ts=np.minimum(times, at) if t1 > t0 else np.maximum(times, at))
+        save = dvi.Save(final=True) if inside is not None else dvi.Save()
+        if inside is not None and inside.size:
+            save = dvi.Save(ts=inside)
         more: dict[str, Any] = {} if newton is None else {"newton": newton}
         return dvi.integrate(
             system, q0, p0, h=step, num_steps=num_steps, t0=t0, epsilon=epsilon,
             args=args, method=_method(method), save=save, throw=False,
-            observe=[dvi.Section(e.g, ahead * e.direction, room) for e in found] or None, **more,
+            observe=[dvi.Section(e.g, ahead * e.direction, room) for e in found]
+            + [dvi.Last(_end)], **more,
         )  # fmt: skip
 
     sol = run(_ROOM)
-    most = max((int(c.count) for c in sol.observed or ()), default=0)
+    most = max((int(c.count) for c in sol.observed[:-1]), default=0)
     if most > _ROOM:
         sol = run(most)
-    return bunch(_told(sol, found, t0, t1, num_steps, times))
+    return bunch(_told(sol, found, t0, t1, num_steps, times, inside))
 
 
-def _told(sol: Any, events: list[_Event], t0: float, t1: float, num_steps: int, times: Any) -> dict:
+def _end(t0, t1, q0, p0, q1, p1, args):
+    return jnp.concatenate([jnp.ravel(q1), jnp.ravel(p1)])
+
+
+def _told(
+    sol: Any, events: list[_Event], t0: float, t1: float, num_steps: int, times: Any, inside: Any
+) -> dict[str, Any]:
     """A run as SciPy tells it: cut at a terminal event, or before a failure."""
-    t = np.array(sol.ts)
-    y = _rows(sol.qs, sol.ps)
+    *sections, last = sol.observed
+    failed = not bool(sol.result == dvi.RESULTS.successful)
+    t, y = np.array(sol.ts), _rows(sol.qs, sol.ps)
     if times is None:
-        t[-1] = t1  # and not t0 + N h', which is a rounding away
-    elif times.size:
-        t = times  # what was asked for, in its precision
-    if times is not None and times.size == 0:
-        t, y = t[:0], y[:0]
-    crossings = [(np.asarray(c.ts), _rows(c.qs, c.ps)) for c in sol.observed or ()]
+        t[-1] = t1
+    else:  # what was asked for, in its precision
+        end = np.where(failed, np.nan, np.asarray(last))
+        y = np.concatenate([y[: inside.size], end[None]])
+        t, y = times, y[np.minimum(np.arange(times.size), inside.size)]
+    crossings = [(np.asarray(c.ts), _rows(c.qs, c.ps)) for c in sections]
     crossings = [(ts[np.isfinite(ts)], ys[np.isfinite(ts)]) for ts, ys in crossings]
     sign = 1.0 if t1 > t0 else -1.0
     ends = [
@@ -172,7 +180,6 @@ def _told(sol: Any, events: list[_Event], t0: float, t1: float, num_steps: int, 
         if 0 < e.terminal <= len(ts)
     ]
     good = np.isfinite(y).all(axis=1)
-    failed = not bool(sol.result == dvi.RESULTS.successful)
     status, message = 0, "The solver successfully reached the end of the integration interval."
     if ends:
         end, y_end = min(ends, key=lambda found: sign * found[0])
