@@ -1,6 +1,7 @@
 """The entry point: all commands, and how the process ends."""
 
 import io
+import os
 import sys
 import traceback
 
@@ -18,6 +19,9 @@ __all__ = ["app", "main"]
 
 def main() -> None:
     """The entry point ``dvi-jax``."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed, as by >&-: nobody reads
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # an ε on a terminal that knows none is no error
             stream.reconfigure(errors="replace")

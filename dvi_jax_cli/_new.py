@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import sys
 from importlib import resources
 from pathlib import Path
@@ -56,7 +57,10 @@ def new(
         session.note(f"writing {name / file}")
         (name / file).write_text(text, encoding="utf-8")
     session.line(f"{name}: {', '.join(sorted(files))}")
-    session.line(f"Begin with: cd {name} && dvi-jax run run.toml; README.md goes on from there.")
+    session.line(
+        f"Begin with: cd {shlex.quote(str(name))} && dvi-jax run run.toml; README.md goes on from "
+        "there."
+    )
     session.finish({"folder": str(name), "files": sorted(files), "system": system})
 
 

@@ -518,3 +518,15 @@ def test_a_wheel_has_the_command_line_and_its_templates(tmp_path):
     assert len(wanted) >= 12
     assert wanted <= inside
     assert not any(n.startswith("tests") for n in inside)
+
+
+def test_a_standard_output_that_is_closed_is_no_fault():
+    code = "import os, sys; sys.stdout = None\n" + ONLY_HELP
+    done = process(code, "--version")
+    assert "Traceback" not in done.stderr
+    assert done.stderr.startswith("END 0 ")
+
+
+def test_the_line_to_begin_with_can_be_copied(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "cd 'a spring' &&" in command("new", "a spring").stdout

@@ -255,6 +255,7 @@ BAD_DATA = [
     ("", "is empty", "a line of names"),
     (HEAD, "has names and no numbers", "at least one line"),
     (HEAD + "0.3,1\n0.6,abc\n", "seen.csv, line 3, column x: 'abc'", "a finite number"),
+    (HEAD + "0.3,1\n0.6,1_000\n", "seen.csv, line 3, column x: '1_000'", "a finite number"),
     (HEAD + "0.3,1\n0.6,inf\n", "line 3, column x: 'inf'", "nan, where nothing was observed"),
     (HEAD + "0.3,1\n0.6\n", "line 3: 1 cells", "2, one for each"),
     (HEAD + "0.3,1\n,2\n", "time number 2 in t is nan", "finite times"),

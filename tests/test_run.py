@@ -14,6 +14,7 @@ import dvi_jax as dvi
 from dvi_jax import systems
 from dvi_jax.run import InputError, library_tables, run_file
 from dvi_jax.run._config import KEYS
+from dvi_jax.run._run import writing
 from dvi_jax.run._setup import parse_method
 from dvi_jax_cli import app
 
@@ -191,7 +192,7 @@ REFUSED = [
     (KEPLER + "steps = 5\n[state]\nq0 = [1, nan]", "state.q0: [1, nan]", "finite"),
     (KEPLER + 'steps = 5\n[state]\ndate = "1950-01-01"', "state.date:", "solar_system"),
     (KEPLER + "steps = 5\n[args]\nk = 1.0", "args.k: there is no such", "did you mean K?"),
-    (KEPLER + 'steps = 5\n[args]\nK = "one"', "args: {'K': 'one'}", "numbers"),
+    (KEPLER + 'steps = 5\n[args]\nK = "one"', "args.K: 'one' (text)", "numbers"),
     (
         KEPLER + "steps = 5\n[args]\nK = [1.0, 2.0]",
         "args: K must be one real number, got an array of shape (2,)",
@@ -200,7 +201,11 @@ REFUSED = [
     (KEPLER + 'steps = 5\n[observables]\na = "enrgy"', "observables.a: 'enrgy'", "mean energy?"),
     (KEPLER + 'steps = 5\n[observables]\na = "Max(energy)"', "observables.a: 'Max(", "MaxDrift"),
     (KEPLER + 'steps = 5\n[observables]\na = "own.py:number"', "own.py:number' is int", "function"),
-    (KEPLER + 'steps = 5\n[observables]\na = "own.py:too_few"', "too_few", "args that fit"),
+    (
+        KEPLER + 'steps = 5\n[observables]\na = "own.py:too_few"',
+        "too_few",
+        "a function (t0, t1, q0",
+    ),
     (KEPLER + "steps = 5\n[output]\nevery = 0", "output.every: 0", "positive whole number"),
     (KEPLER + "steps = 5\n[output]\nevrey = 1", "output.evrey: there is no", "mean every?"),
     ('system = "kepler', "is not TOML", "toml.io"),
@@ -447,3 +452,61 @@ def test_systems_are_listed_and_told_of():
     result = command("systems", "magnetic_miror")
     assert result.exit_code == 2
     assert "did you mean magnetic_mirror?" in result.output
+
+
+LONG = "a" * 5000
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (f'system = "{LONG}.py:system"', "system: .*File name too long"),
+        ('system = "a\\u0000.py:system"', "system: .*null byte"),
+        ('system = "kepler"\nsteps = 5\n[output]\ndir = "a\\u0000"', "output.dir: .*null byte"),
+        ("h = 1" + "0" * 5000, "is not TOML"),
+        ("h = " + "[" * 5000, "is not TOML"),
+        ('system = "kepler"\n[args]\nK = 1' + "0" * 400, r"args\.K: 1000"),
+        ('system = "kepler"\n[observables]\nE = 3', r"observables\.E: 3 \(a whole number\)"),
+        (
+            'system = "own.py:system"\nh = 0.1\nsteps = 5\n[observables]\nE = "own.py:too_few"\n'
+            "[state]\nq0 = [1.0]\np0 = [0.0]",
+            r"observables\.E: 'own.py:too_few' takes \(t0, t1\)",
+        ),
+    ],
+    ids=["long", "null", "null out", "digits", "brackets", "huge", "observable", "two arguments"],
+)
+def test_what_no_file_can_mean_is_bad_input(folder, text, words):
+    with pytest.raises(InputError, match=words):
+        run_file(write(folder, text))
+
+
+def test_a_file_may_begin_with_a_byte_order_mark(folder):
+    (folder / "bom.toml").write_bytes(b"\xef\xbb\xbf" + b'system = "none"\r\n')
+    with pytest.raises(InputError, match="system: 'none'"):
+        run_file(folder / "bom.toml")
+
+
+@pytest.mark.parametrize("line", ["return float(q0[0]) * q0", "return -q0 if q0[0] > 0 else q0"])
+def test_functions_that_cannot_be_traced_are_told_what_to_do(folder, line):
+    (folder / "own.py").write_text(f"{OWN}\ndef W(t0, t1, q0, p1, args):\n    {line}\n"
+                                   "forced = dvi.System(H_D, force=W)\n")  # fmt: skip
+    text = 'system = "own.py:forced"\nh = 0.1\nsteps = 5\n[state]\nq0 = [1.0]\np0 = [0.0]\n'
+    with pytest.raises(
+        InputError, match=r"\(own.py, line \d+\).*jnp.where in place of if\n"
+    ) as seen:
+        run_file(write(folder, text + "[args]\nk = 1.0"))
+    assert seen.value.seen.count("\n") == 0
+
+
+def test_what_is_written_when_ctrl_c_comes_is_told(tmp_path):
+    def interrupted():
+        with writing(tmp_path, False):
+            (tmp_path / "a.npz").touch()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match=r"where there is: a\.npz"):
+        interrupted()
+    with pytest.raises(FileExistsError, match="another process has written"):
+        interrupted()
+    with writing(tmp_path, True):
+        pass

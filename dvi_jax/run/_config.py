@@ -86,15 +86,35 @@ def _lattice(value: Any) -> Any:
     return value
 
 
-def parameter(value: Any) -> Any:
-    """A leaf of args, or a table of them. Arrays become float arrays; whole numbers stay whole."""
+def parameter(value: Any, key: str = "args") -> Any:
+    """A leaf of args, or a table of them. Arrays become float arrays; whole numbers stay whole.
+
+    **Raises** `InputError` with the key of the leaf that is none.
+    """
     if isinstance(value, dict):
-        return {name: parameter(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return array(value)
+        return {name: parameter(inner, f"{key}.{name}") for name, inner in value.items()}
     if isinstance(value, bool):
         return value
-    return value if isinstance(value, int) else number(value)
+    try:
+        if isinstance(value, list):
+            return array(value)
+        as_float = number(value)
+    except ValueError:
+        raise InputError(
+            key, shown(value), f"a finite number, true or false, {ARRAY}, or a table of these"
+        ) from None
+    return value if isinstance(value, int) else as_float
+
+
+def _texts(value: Any) -> dict[str, str]:
+    if not isinstance(value, dict):
+        raise ValueError
+    for name, inner in value.items():
+        if not isinstance(inner, str) or not inner.strip():
+            raise InputError(
+                f"observables.{name}", shown(inner), 'text such as "energy" or "MaxDrift(energy)"'
+            )
+    return value
 
 
 ARRAY = "an array of finite numbers, or of such arrays with rows of one length"
@@ -125,11 +145,7 @@ KEYS: Keys = {
         "uniform",
     ),
     "observables": Key(
-        lambda value: (
-            {name: text(inner) for name, inner in value.items()}
-            if isinstance(value, dict)
-            else text(0)
-        ),
+        _texts,
         'a table of texts, such as energy = "energy" or drift = "MaxDrift(energy)"',
     ),
     "output": {
@@ -150,12 +166,12 @@ def read_config(path: Path, keys: Keys) -> tuple[dict[str, Any], dict[str, Any]]
     unknown key and a value of the wrong type.
     """
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # some editors begin with a BOM
     except FileNotFoundError:
         raise InputError(str(path), "there is no such file", "the path of a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(str(path), f"cannot be read: {error}", "a TOML file in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # also thousands of digits, of brackets
         raise InputError(str(path), f"is not TOML: {error}", "https://toml.io") from None
     values = _read_table(keys, raw, "")
     if values["system"] is None:

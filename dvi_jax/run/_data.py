@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ._errors import InputError, one_of, shown
+from ._errors import InputError, one_of, reason, shown
 
 _NOTHING = ("", "nan", "na", "null", "none", "-", "--")
 """Cells in which nothing was observed."""
@@ -22,7 +22,11 @@ def read_columns(path: Path, key: str = "data.file") -> dict[str, np.ndarray]:
 
     **Raises** `InputError` with the key, and the line and column of a cell that is no number.
     """
-    if not path.is_file():
+    try:
+        is_file = path.is_file()
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise InputError(key, reason(error), "the path of a CSV or npz file") from None
+    if not is_file:
         raise InputError(key, f"there is no file {path}", "the path of a CSV or npz file")
     try:
         return _npz(path, key) if path.suffix == ".npz" else _csv(path, key)
@@ -92,7 +96,7 @@ def _number(cell: str, where: str, key: str) -> float:
     if text.lower() in _NOTHING:
         return np.nan
     try:
-        found = float(text)
+        found = np.inf if "_" in text else float(text)  # Python's 1_000 is no number in a file
     except ValueError:
         found = np.inf
     if not np.isfinite(found):

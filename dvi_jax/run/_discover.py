@@ -20,7 +20,7 @@ from ._config import read_config
 from ._discover_config import DISCOVER_KEYS
 from ._errors import InputError, one_of, shown
 from ._report import Report, Table, plain
-from ._run import reserve
+from ._run import reserve, writing
 from ._setup import (
     Loader,
     arguments_of,
@@ -94,7 +94,8 @@ def discover_file(
             folder.rmdir()
         raise
     seconds = time.perf_counter() - began
-    return _write(setup, values, raw, found, orders, seconds, folder, path)
+    with writing(folder, force):
+        return _write(setup, values, raw, found, orders, seconds, folder, path)
 
 
 # What is asked for

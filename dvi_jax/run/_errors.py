@@ -17,6 +17,11 @@ class InputError(ValueError):
         self.key, self.seen, self.allowed = key, seen, allowed
 
 
+def reason(error: BaseException) -> str:
+    """Why a path is none, without the path."""
+    return getattr(error, "strerror", None) or str(error)
+
+
 def shown(value: Any) -> str:
     """A value as TOML would name it: itself, shortened, and its kind."""
     kinds = ((bool, "a boolean"), (int, "a whole number"), (float, "a number"), (str, "text"))

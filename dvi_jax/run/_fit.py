@@ -20,7 +20,7 @@ from ._errors import InputError
 from ._fit_config import FIT_KEYS
 from ._fit_setup import FitSetup, make_fit_setup
 from ._report import Report, Table, plain
-from ._run import reserve
+from ._run import reserve, writing
 from ._setup import said
 
 WRITTEN = (
@@ -74,7 +74,8 @@ def fit_file(
         if made and not any(folder.iterdir()):  # a checkpoint is worth keeping
             folder.rmdir()
         raise
-    return _write(setup, values, raw, found, folder, path)
+    with writing(folder, force=True):  # its checkpoint is there
+        return _write(setup, values, raw, found, folder, path)
 
 
 def _fitted(setup: FitSetup, checkpoint: Path, progress: Any) -> dvi.FitResult:

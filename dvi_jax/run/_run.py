@@ -3,7 +3,8 @@
 import json
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import dvi_jax as dvi
 from .. import plot
 from ..systems.n_body import OBSERVABLES
 from ._config import KEYS, read_config
-from ._errors import InputError
+from ._errors import InputError, reason
 from ._pictures import draw, draw_solar_system
 from ._report import Report, plain, solar_contents, solar_tables, watched_table
 from ._setup import Setup, make_setup, said
@@ -63,7 +64,8 @@ def run_file(
         if made:
             folder.rmdir()
         raise
-    return _write(setup, values, raw, solution, observables, seconds, folder, path)
+    with writing(folder, force):
+        return _write(setup, values, raw, solution, observables, seconds, folder, path)
 
 
 def reserve(folder: Path, key: str, force: bool) -> bool:
@@ -77,9 +79,33 @@ def reserve(folder: Path, key: str, force: bool) -> bool:
                 raise InputError(key, f"{folder} exists and is not empty", allowed)
             return False
         folder.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(key, f"{folder}: {error.strerror or error}", allowed) from None
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        raise InputError(key, f"{folder}: {reason(error)}", allowed) from None
     return True
+
+
+@contextmanager
+def writing(folder: Path, force: bool) -> Iterator[None]:
+    """Results are written inside of this.
+
+    **Raises** `FileExistsError` where another process has been quicker, unless `force`; after
+    Ctrl-C a `KeyboardInterrupt` that says what is there.
+    """
+    if not force and any(folder.iterdir()):
+        raise FileExistsError(
+            f"{folder} was empty when this began, and another process has written there since; "
+            "take another directory, or --force"
+        )
+    try:
+        yield
+    except KeyboardInterrupt:
+        there = ", ".join(sorted(file.name for file in folder.iterdir())) or "nothing"
+        raise KeyboardInterrupt(
+            f"by Ctrl-C while results were written to {folder}, where there is: {there}. The last "
+            "may not be whole; the same with --force writes them anew"
+        ) from None
 
 
 def _always(setup: Setup) -> dict[str, Any]:

@@ -11,13 +11,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import dvi_jax as dvi
 
 from .. import systems
 from ..systems.solar_system import EphemerisMissing, check_covered, julian_date
-from ._errors import InputError, one_of, shown
+from ._errors import InputError, one_of, reason, shown
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,9 @@ def make_setup(values: dict[str, Any], folder: Path) -> Setup:
 # The system
 
 
+_A_FILE = '"file.py:name", a Python file (from the folder of the run file) and a name in it'
+
+
 class Loader:
     """Objects named ``file.py:name``; every file is run once, however often it is named."""
 
@@ -94,7 +98,11 @@ class Loader:
         running the file fails: with the line of it that did.
         """
         file, _, name = text.rpartition(":")
-        path = (self.folder / file).resolve()
+        try:
+            path = (self.folder / file).resolve()
+            path.is_file()
+        except (OSError, ValueError) as error:  # a name that no file can have
+            raise InputError(key, f"{shown(text)}: {reason(error)}", _A_FILE) from None
         if path not in self.modules:
             self.modules[path] = self._run(key, text, path)
         module = self.modules[path]
@@ -107,7 +115,7 @@ class Loader:
             ) from None
 
     def _run(self, key: str, text: str, path: Path) -> Any:
-        allowed = '"file.py:name", a Python file (from the folder of the run file) and a name in it'
+        allowed = _A_FILE
         if not path.is_file():
             raise InputError(key, f"{text!r}: there is no file {path}", allowed)
         spec = importlib.util.spec_from_file_location(f"dvi_jax_run_{path.stem}", path)
@@ -134,6 +142,13 @@ def said(error: BaseException, *files: Path) -> str:
     places = traceback.extract_tb(error.__traceback__)
     inside = [p for p in places if Path(p.filename) in files]
     where = f" ({Path(inside[-1].filename).name}, line {inside[-1].lineno})" if inside else ""
+    if isinstance(
+        error, (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
+    ):
+        return (
+            f"{type(error).__name__}{where}: what a function gets stands for values to come; write "
+            "it with jax.numpy in place of math and numpy, jnp.where in place of if"
+        )
     return f"{type(error).__name__}: {error}{where}"
 
 
@@ -356,8 +371,10 @@ def _observable(key: str, text: str, known: dict[str, Callable], loader: Loader)
         if not callable(function):
             raise InputError(
                 key, f"{inner!r} is {type(function).__name__}",
-                "a function (t0, t1, q0, p0, q1, p1, args)",
+                _AN_OBSERVABLE,
             )  # fmt: skip
+        if not hasattr(function, "bind"):
+            _check_takes_seven(key, inner, function)
     elif inner in known:
         function = known[inner]
     else:
@@ -368,6 +385,20 @@ def _observable(key: str, text: str, known: dict[str, Callable], loader: Loader)
             f"or {', '.join(f'{name}()' for name in indicators)}",
         )
     return wrap(function) if wrap is not None else function
+
+
+_AN_OBSERVABLE = "a function (t0, t1, q0, p0, q1, p1, args)"
+
+
+def _check_takes_seven(key: str, text: str, function: Callable) -> None:
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # one that does not tell
+        return
+    try:
+        signature.bind(*range(7))
+    except TypeError:
+        raise InputError(key, f"{text!r} takes {signature}", _AN_OBSERVABLE) from None
 
 
 def _named(base: type) -> dict[str, Any]:

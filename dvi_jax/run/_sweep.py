@@ -121,6 +121,8 @@ def _check_folder(folder: Path, key: str, resume: bool) -> None:
         raise InputError(
             key, f"{folder} exists, and is no store of a sweep ({error})", "a new directory"
         ) from None
+    except ValueError as error:  # a name that no directory can have
+        raise InputError(key, f"{folder}: {error}", "a new directory") from None
     if not resume:
         raise InputError(
             key,

@@ -135,7 +135,7 @@ def _argument(key: str, value: Any) -> Any:
     if isinstance(value, dict):
         return {inner: _argument(f"{key}.{inner}", v) for inner, v in value.items()}
     if not _holds_axis(value):
-        return parameter(value)
+        return parameter(value, key)
     axes: list[dvi.Axis] = []
 
     def component(v: Any, where: str) -> Any:

@@ -36,4 +36,5 @@ def energy(t0, t1, q0, p0, q1, p1, args):
 
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     """q × p [kg m²/s]: kept to round-off, as nothing here has a direction of its own."""
-    return q1[0] * p1[1] - q1[1] * p1[0]
+    (x, y), (u, v) = q1, p1  # q1[2] would be q1[1], without a word: JAX stays inside of an array
+    return x * v - y * u
