@@ -9,8 +9,7 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
-from .._quantities import refuse_quantity
-from .extras import needed, system_of
+from .extras import needed, refuse_quantity, system_of
 
 if TYPE_CHECKING:
     from .diffrax_classes import DiscreteMap, DiscreteTerm
@@ -47,7 +46,7 @@ def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], t
             t, t, q, p, strength, args
         )
         force = system.disturbing_force(t, t, q, p, strength, args)
-        rates = momentum, -position + jnp.asarray(force, q.dtype)
+        rates: Any = momentum, -position + jnp.asarray(force, q.dtype)
         return list(rates) if isinstance(y, list) else rates
 
     return field

@@ -9,8 +9,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from .._quantities import refuse_quantity
-from .extras import needed
+from .extras import needed, refuse_quantity
 
 _STATUSES = (
     "successful", "not_converged", "not_finite", "bad_step_size", "no_root", "out_of_range",

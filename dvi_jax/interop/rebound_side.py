@@ -11,7 +11,6 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from .._quantities import refuse_quantity
 from ..systems import Problem
 from ..systems.n_body import (
     INVARIANTS,
@@ -22,7 +21,7 @@ from ..systems.n_body import (
     linear_momentum,
     symmetries,
 )
-from .extras import needed
+from .extras import needed, refuse_quantity
 
 _NEWTONIAN = ("basic", "compensated", "jacobi", "mercurius", "trace")
 """Modules for gravity that evaluate Newton's law in full, whichever way they order the sums."""
