@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .diffrax_classes import DiscreteMap, DiscreteTerm
 
 
-def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], tuple[Any, Any]]:
+def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], Any]:
     r"""The continuous limit h → 0 of a system, as ``f(t, y, args)`` with ``y = (q, p)``.
 
         q̇ = ∂H/∂p,    ṗ = −∂H/∂q + ε W,      H(t, q, p) = H_D(t, t, q, p) + ε H1_D(t, t, q, p)
@@ -46,8 +46,8 @@ def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], t
             t, t, q, p, strength, args
         )
         force = system.disturbing_force(t, t, q, p, strength, args)
-        rates: Any = momentum, -position + jnp.asarray(force, q.dtype)
-        return list(rates) if isinstance(y, list) else rates
+        rates = momentum, -position + jnp.asarray(force, q.dtype)
+        return type(y)(rates) if isinstance(y, list) else rates
 
     return field
 
