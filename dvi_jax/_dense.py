@@ -81,9 +81,9 @@ def at_times(
         span = jnp.abs(start.until - requested.time(start.t0, start.q0, start.p0, args))
         return point, missed <= close * (span + jnp.abs(time))
 
-    def one(time):
-        i = jnp.minimum(jnp.searchsorted(ends, sense * time), ends.size - 1)
-        reached = exists[i] & (sense * began[i] < sense * time) & (sense * time <= ends[i])
+    def one(time, due):
+        i = jnp.minimum(jnp.searchsorted(ends, sense * due), ends.size - 1)
+        reached = exists[i] & (sense * began[i] < sense * due) & (sense * due <= ends[i])
         start = jax.tree.map(lambda x, y: jnp.where(reached, x[i], y), starts, safe)
         is_start = time == first
         if requested.clock is None:
@@ -96,7 +96,7 @@ def at_times(
         found = (reached & shown) | is_start
         return found, start, _or_nan(found, point)
 
-    return jax.vmap(one)(requested.ts)
+    return jax.vmap(one)(requested.ts, requested.due)
 
 
 def _just_after(time: Scalar, start: Start) -> Scalar:

@@ -278,13 +278,18 @@ def _with_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes,
         lambda f: f if isinstance(f, Reduction) else None, task.observe, is_leaf=is_observable
     )
     ts = jnp.asarray(save.ts, task.t0.dtype)
+    due = lax.stop_gradient(ts)
     if save.clock is None and not task.lattice.has_memory and num_steps > 0:
+        eps = jnp.finfo(ts.dtype).eps
         end = task.interval(jnp.asarray(num_steps - 1, jnp.int32)).t1
         for known in (task.t0, end):  # N·(T/N) need not be T to the last digit
-            near = jnp.abs(ts - known) <= 16 * jnp.finfo(ts.dtype).eps * jnp.abs(known)
+            size = jnp.maximum(jnp.abs(task.t0), jnp.abs(known))
+            near = jnp.abs(ts - known) <= 16 * eps * size
             ts = jnp.where(near, ts + lax.stop_gradient(known - ts), ts)
-    ordered = jnp.sort(lax.stop_gradient(ts))
-    return RequestedTimes(ts=ts, ordered=ordered, clock=save.clock), kept
+        # Nor is t0 + k h, compiled in a loop, the same to the last digit as it is here.
+        slack = 4 * eps * (jnp.abs(task.t0) + jnp.abs(ts))
+        due = lax.stop_gradient(ts - jnp.where(end >= task.t0, slack, -slack))
+    return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), kept
 
 
 @eqx.filter_jit

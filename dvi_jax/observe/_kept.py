@@ -183,10 +183,13 @@ class Section(KeptSteps):
 class RequestedTimes(KeptSteps):
     """The steps that the times of ``Save(ts=...)`` lie in, by t or by a clock of the user's.
 
-    `ordered` are the same times in ascending order: a step looks for its own by bisection.
+    `due` are the times less what they may be off by rounding: the step in which one is due is the
+    one that reaches it. `ordered` are these in ascending order: a step looks for its own by
+    bisection.
     """
 
     ts: Array
+    due: Array
     ordered: Array
     clock: Callable[..., Any] | None
     skip: ClassVar[int] = 0
