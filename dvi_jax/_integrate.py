@@ -18,7 +18,6 @@ from ._compat import is_traced
 from ._dense import Curve, at_times, crossings, stopped
 from ._extended import run_extended
 from ._precision import refuse_double_without_x64
-from ._quantities import refuse_quantity
 from ._results import RESULTS, IntegrationError
 from ._reversible import Reversible
 from ._rollout import (
@@ -42,6 +41,7 @@ from ._types import Interval
 from .engine.cpu import OPTIONS, takes_options
 from .engine.newton import RootSolver
 from .engine.picard import PicardThenNewton
+from .engine.quantities import refuse_quantity
 from .engine.tiles import Layout
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation

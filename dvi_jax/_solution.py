@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 
 from ._compat import is_traced
 from ._precision import refuse_double_without_x64
-from ._quantities import refuse_quantity
 from ._results import RESULTS, status_name
 from ._types import State
+from .engine.quantities import refuse_quantity
 from .engine.signature import accepts
 
 

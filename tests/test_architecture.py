@@ -10,7 +10,7 @@ import dvi_jax as dvi
 ROOT = Path(dvi.__file__).parent
 FLOORS = [
     ["_compat", "_types", "_results"],
-    ["_precision", "_quantities", "_progress"],
+    ["_precision", "_progress"],
     ["engine"],
     ["_system", "_solution"],
     ["_discretise", "_adapters", "_energies", "_step"],

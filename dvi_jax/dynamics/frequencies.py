@@ -12,8 +12,8 @@ from jaxtyping import Array, Complex, Float
 
 from .._compat import is_traced, x64_enabled
 from .._precision import refuse_double_without_x64
-from .._quantities import refuse_quantity
 from .._solution import Solution
+from ..engine.quantities import refuse_quantity
 from .lines import EPS, Settings, lines_of
 from .results import (
     CODE,

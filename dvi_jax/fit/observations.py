@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._quantities import refuse_quantity
+from ..engine.quantities import refuse_quantity
 from ..engine.signature import accepts
 
 

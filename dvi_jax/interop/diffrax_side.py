@@ -9,7 +9,8 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
-from .extras import needed, refuse_quantity, system_of
+from ..engine.quantities import refuse_quantity
+from .extras import needed, system_of
 
 if TYPE_CHECKING:
     from .diffrax_classes import DiscreteMap, DiscreteTerm

@@ -39,22 +39,3 @@ def system_of(what: Any, by: str) -> dvi.System:
         "Wrap a discrete Hamiltonian, dvi.System(H_D, force=W), or a continuous one, "
         "dvi.System(dvi.discretise(H))."
     )
-
-
-def refuse_quantity(name: str, value: Any) -> None:
-    """Refuse a quantity of astropy or pint called `name`, as `integrate` does: an array of it would
-    have lost its unit.
-
-    **Raises** `TypeError`.
-    """
-    unit = None
-    if hasattr(value, "to_value"):
-        unit = getattr(value, "unit", None)
-    elif hasattr(value, "magnitude"):
-        unit = getattr(value, "units", None)
-    if unit is not None:
-        raise TypeError(
-            f"{name} has the unit {str(unit) or '1'!r}, and numbers are taken here: it would be "
-            "lost. interop.integrate(..., units=...) takes quantities of astropy; or divide by the "
-            "unit that the numbers are in."
-        )

@@ -9,7 +9,8 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from .extras import needed, refuse_quantity
+from ..engine.quantities import refuse_quantity
+from .extras import needed
 
 _STATUSES = (
     "successful", "not_converged", "not_finite", "bad_step_size", "no_root", "out_of_range",

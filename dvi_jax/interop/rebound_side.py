@@ -11,6 +11,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from ..engine.quantities import refuse_quantity
 from ..systems import Problem
 from ..systems.n_body import (
     INVARIANTS,
@@ -21,7 +22,7 @@ from ..systems.n_body import (
     linear_momentum,
     symmetries,
 )
-from .extras import needed, refuse_quantity
+from .extras import needed
 
 _NEWTONIAN = ("basic", "compensated", "jacobi", "mercurius", "trace")
 """Modules for gravity that evaluate Newton's law in full, whichever way they order the sums."""

@@ -11,8 +11,9 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from ..engine.quantities import refuse_quantity
 from ..systems import Problem
-from .extras import needed, refuse_quantity, system_of
+from .extras import needed, system_of
 
 _REFUSED = {
     "rtol": "steps are not chosen by an estimate of the error: the lattice is fixed, which is what "

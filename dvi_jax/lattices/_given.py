@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 
 from .._compat import is_traced, x64_enabled
 from .._precision import refuse_double_without_x64
-from .._quantities import refuse_quantity
 from .._types import Interval
+from ..engine.quantities import refuse_quantity
 from ._base import Lattice, check_num_steps
 
 

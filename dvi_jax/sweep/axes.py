@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._precision import refuse_double_without_x64
-from .._quantities import refuse_quantity
+from ..engine.quantities import refuse_quantity
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
