@@ -212,7 +212,7 @@ def write(folder: Path) -> None:
     index = [
         "# Reference",
         "",
-        "Every public name, from its docstring. In the examples, which the tests run, these are known:",
+        "Every public name, from its docstring. In the examples, which are run, these are known:",
         "",
         "```python",
         "import jax, jax.numpy as jnp, numpy as np",
