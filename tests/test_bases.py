@@ -96,3 +96,9 @@ def test_bad_families_are_refused(make, says):
 def test_functions_with_other_arguments_are_refused():
     with pytest.raises(TypeError, match="must take"):
         dvi.Basis([lambda q: q])
+
+
+def test_a_basis_that_no_machine_can_search_is_refused_at_once():
+    with pytest.raises(ValueError, match=r"Polynomials\(400\) of 4 variables are 1.09e\+09 mono"):
+        dvi.Polynomials(400).for_shape((2,))
+    assert len(dvi.Polynomials(19).for_shape((2,)).names) == 8854  # just below the limit

@@ -1,6 +1,7 @@
 """Families of basis functions: polynomials, Chebyshev, trigonometric, powers of the radius."""
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -54,6 +55,10 @@ def _positive(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be a positive integer, got {value!r}.")
 
 
+_MOST = 10_000
+"""Monomials of a basis: its samples and singular values are dense matrices of this width."""
+
+
 class Polynomials(AbstractBasis):
     """All monomials in the components of q and p of degree 1 to `degree`.
 
@@ -62,8 +67,8 @@ class Polynomials(AbstractBasis):
       of the flattened array; "t" or "τ" for the time); None for all components of q and p.
     - `constant`: whether 1 is among them (for generators, and for products with other bases).
 
-    **Raises** `ValueError` for a degree that is not a positive integer, or names that the state
-    does not have.
+    **Raises** `ValueError` for a degree that is not a positive integer, names that the state does
+    not have, or more than 10 000 monomials, whose null space no machine would find.
     """
 
     degree: int = eqx.field(static=True)
@@ -76,6 +81,13 @@ class Polynomials(AbstractBasis):
     def for_shape(self, shape):
         chosen = coordinate_names(shape) if self.variables is None else self.variables
         places = _places(chosen, shape)
+        size = math.comb(len(chosen) + self.degree, self.degree)
+        if size > _MOST:
+            raise ValueError(
+                f"Polynomials({self.degree}) of {len(chosen)} variables are {size:.3g} monomials, "
+                f"and at most {_MOST} can be searched: take a lower degree, or fewer variables, "
+                'as in Polynomials(degree, ("q1", "p1")).'
+            )
         exponents = [
             tuple(sorted(c))
             for d in range(0 if self.constant else 1, self.degree + 1)
