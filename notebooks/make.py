@@ -104,7 +104,7 @@ def executed(name: str) -> Any:
             record_timing=False,
             resources={"metadata": {"path": folder}},
         )
-        client.execute(env=env)
+        client.execute(env=env, cleanup_kc=True)  # or the kernel would stay, with its memory
     for cell in book.cells:
         if cell.cell_type == "code":
             cell.outputs = [_plain(output) for output in _joined(cell.outputs)]

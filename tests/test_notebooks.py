@@ -164,6 +164,13 @@ def test_an_unknown_notebook_is_refused():
 # --- executed anew ------------------------------------------------------------------------------
 
 
+def kernels():
+    """Kernels that this process has started, and that still run."""
+    psutil = pytest.importorskip("psutil")
+    below = psutil.Process().children(recursive=True)
+    return [x.pid for x in below if x.status() != "zombie" and "ipykernel" in str(x.cmdline())]
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", NAMES)
@@ -173,6 +180,7 @@ def test_it_comes_out_again(make, name):
         if importlib.util.find_spec("skyfield_data") is None:
             pytest.skip("the ephemeris is not installed")
     assert make.made(name, check=True) == []
+    assert kernels() == []
 
 
 @pytest.mark.slow
@@ -186,4 +194,5 @@ def test_a_cell_that_raises_is_told(make, tmp_path, monkeypatch):
     monkeypatch.setattr(make, "HERE", tmp_path)
     (told,) = make.made("quick_start", check=False)
     assert "AssertionError" in told
+    assert kernels() == []
     assert not (tmp_path / "quick_start.ipynb").exists()
