@@ -534,7 +534,7 @@ def picture(points: list[Point], truth: Reference) -> plt.Figure:
     title = PROBLEMS[points[0].problem]().title
     figure.suptitle(
         f"{title}.  Wide grey: the best of all methods. Dotted: slope of the order. "
-        "Shaded: the reference is not known better.",
+        "Shaded: below what the reference is known to.",
         fontsize=10,
         x=0.01,
         ha="left",
@@ -565,11 +565,11 @@ def guide(ax, points, order):
 
 
 def save(figure, path: Path) -> None:
-    """As SVG, and as PNG with a palette of 64 colours, a third of the size."""
+    """As SVG, and as PNG with a palette of 256 colours, half the size."""
     figure.savefig(path.with_suffix(".svg"))
     figure.canvas.draw()
     picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
-    picture.quantize(64, dither=Image.Dither.NONE).save(path.with_suffix(".png"), optimize=True)
+    picture.quantize(256, dither=Image.Dither.NONE).save(path.with_suffix(".png"), optimize=True)
 
 
 # The command

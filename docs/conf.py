@@ -16,10 +16,17 @@ author = "The dvi_jax developers"
 copyright = "the dvi_jax developers, Apache-2.0"
 release = version = dvi_jax.__version__
 
-extensions = ["myst_nb", "sphinx.ext.mathjax", "sphinx_copybutton", "reference", "scripts"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.mathjax",
+    "sphinx_copybutton",
+    "reference",
+    "scripts",
+    "pictures",
+]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
 exclude_patterns = ["_build", "_static", "_ext"]
-templates_path = []
+templates_path = ["_templates"]
 nitpicky = True
 
 # Notebooks are committed as they were executed; `make notebooks` renews them.
@@ -43,6 +50,8 @@ html_theme_options = {
     "navigation_with_keys": True,
     "light_css_variables": {"code-font-size": "78%"},  # a hundred characters in a line
 }
+# Apostrophes are primes, and quotes are of code.
+smartquotes = False
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 # Greek letters and formulas are what readers look for: no stemming of a language is lost on them.

@@ -94,7 +94,7 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
     **Raises** `TypeError` for a function that does not take the four arguments,
     `ValueError` for any other order.
 
-    **Accuracy** H_D − H_D,exact = O(h^r). A force or a perturbation of `System` is taken as it is
+    **Accuracy** H_D − H_{D,exact} = O(h^r). A force or a perturbation of `System` is taken as it is
     written, at (q0, p1) say, and adds an error O(εh): put a perturbation into H through args, and
     compose a forced map. Orders 2 to 4 take h from t1 − t0: it loses digits late in a long run, and
     with `slow_time` it is not the step, so `System` refuses that.

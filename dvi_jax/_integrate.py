@@ -90,7 +90,7 @@ def integrate(
     - `t0`: time of the start. `epsilon`: strength of the disturbance.
     - `args`: pytree handed to H_D, W and the observables.
     - `method`: `TypeII`, `Adjoint`, `Strang`, the compositions `Yoshida`, `Suzuki`, `BlanesMoan`,
-      `McLachlan`, `KahanLi`, `Composition`; `GaussLegendre`; `RungeKutta4`.
+      `McLachlan`, `KahanLi`, `Composition`; `GaussLegendre`, `LobattoIIIAIIIB`; `RungeKutta4`.
     - `lattice`: `Uniform()`; `Given(ts)`, which replaces h, num_steps and t0;
       `TimeTransformed(g)`, whose steps adapt, and h is in its fictitious time; or
       `Variational()`, whose steps solve (14), and h is the first of them.

@@ -28,7 +28,7 @@ def _as_times(ts: Any) -> Any:
 
 
 class Save(eqx.Module):
-    """Which states are kept; the start always is.
+    """Which states are kept; the start always is, but with `ts`.
 
     - ``Save(every=m)``: the states after m, 2m, 3m, … steps.
     - ``Save(final=True)``: the state after the last step; together with `every`, also when
@@ -98,7 +98,7 @@ class Save(eqx.Module):
 class Solution(eqx.Module):
     """A computed trajectory.
 
-    - `ts`: saved times, shape (S,); ``ts[0]`` is t0.
+    - `ts`: saved times, shape (S,); ``ts[0]`` is t0, but with ``Save(ts=...)``.
     - `qs`, `ps`: saved positions and momenta, shape (S, *q0.shape).
     - `hs`: size of the step that ended at each saved time but the first, shape (S − 1,).
       With ``Save(ts=...)`` the first time is like the others: `hs` and what stands alone in

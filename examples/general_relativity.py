@@ -225,10 +225,10 @@ def draw(found):
     for i, (name, colour) in enumerate([("along", 2), ("radial", 3), ("across", 0)]):
         d.loglog(*spectrum(last[:, i]), lw=0.8, color=plot.COLOURS[colour], label=name)
     d.axvline(EARTH_1_4, color="0.5", lw=0.8, ls=":")
-    d.text(EARTH_1_4 * 1.15, 60, "Earth 1 : 4", color="0.3", va="center", fontsize=9)
+    d.text(EARTH_1_4 * 1.15, 20, "Earth 1 : 4", color="0.3", va="center", fontsize=9)
     d.set(title="What is left, oblate Sun", xlabel="period [day]", ylabel="amplitude [m]")
     d.set(ylim=(1e-2, 1e2), xlim=(20, 4e4))
-    d.legend(loc="lower right")
+    d.legend(loc="upper left", ncols=3, handlelength=1.2, columnspacing=1.0)
     return figure
 
 

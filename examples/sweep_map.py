@@ -49,6 +49,7 @@ def draw(data):
     for axis, title in zip(axes, ("Drift", "Order of the drift in ε", "How runs end"), strict=True):
         axis.set_title(title)
         axis.label_outer()
+    figure.get_layout_engine().set(w_pad=0.12)
     return figure
 
 

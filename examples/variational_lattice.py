@@ -186,11 +186,14 @@ def limits(out):
             t, radius = np.asarray(sol.ts)[:n], np.linalg.norm(np.asarray(sol.qs)[:n], axis=1)
             print(f"Kepler, first h = {first}: {sol.status} after {n} steps, ", end="")
             print(f"t = {float(sol.ts[n]):.3f}, at radius {radius[-1]:.3f}")
-            left.semilogy(t, np.asarray(sol.hs)[:n], lw=1, color=color, label=f"h, from {first}")
-            left.semilogy(sol.ts[n], sol.hs[n - 1], "x", color=color, ms=9, mew=2)
+            hs = np.asarray(sol.hs)[:n]
+            ends = np.append(t, sol.ts[n])
+            left.semilogy(ends, np.append(hs, hs[-1]), lw=1, color=color, label=f"h, from {first}")
+            left.semilogy(ends[-1], hs[-1], "x", color=color, ms=9, mew=2)
             if first == 0.01:
                 left.semilogy(t, radius, lw=0.8, color="0.6", label="distance from the centre")
-        left.set(xlabel="time", title="Kepler, H_D of order 1: no root beyond ×")
+        left.set(xlabel="time", ylabel="h, distance")
+        left.set(title="Kepler, H$_D$ of order 1: no root beyond ×")
         left.legend(loc="lower right", fontsize="small")
 
         hs = np.geomspace(1e-3, 0.3, 25)

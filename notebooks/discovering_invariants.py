@@ -67,7 +67,7 @@ plt.show()
 van_der_pol = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: (1 - q0**2) * p1)
 none = dvi.discover_invariants(van_der_pol, dvi.Polynomials(6), 1, h=0.1, samples=box(1, 400))
 law = none.obstructions[0]
-print("survivors of order 0 and 1:", none.survivors)
+print("functions of the basis kept to order 0, to order 1:", none.survivors)
 print(law)
 assert len(none.invariants) == 0
 

@@ -60,6 +60,9 @@ for name, x, sigma in zip(found.names, found.x, found.sigma, strict=True):
     print(f"{name:8} = {x:.4f} ± {sigma:.4f}")
 print(f"{found.status}, reduced chi² = {found.reduced_chi2:.2f}")
 
+# %% [markdown]
+# The line joins what is predicted at the times of observation.
+
 # %%
 axis = plot.fit_against_data(found)
 plt.show()
@@ -109,6 +112,7 @@ assert abs(none.x[epsilon_at]) < 3 * none.sigma[epsilon_at]
 # Suppose that the law is not known. `identify` fits the coefficients of many candidate terms to the
 # trajectory and removes what the data do not ask for. Candidates are the monomials
 # $q^i p^j$ up to degree 3; positions and momenta are seen now. The truth is $-\varepsilon p$ alone.
+# The criterion is $\chi^2$ and a price for every term: the smaller the better.
 
 # %%
 times = np.linspace(0.25, 30, 120)
@@ -133,7 +137,7 @@ with plot.style():
     left.hist(pulls, bins=np.arange(-3.5, 3.6, 0.5), color=plot.COLOURS[0], alpha=0.8)
     left.set(xlabel="(estimate − truth)/sigma", ylabel="fits", title="Thirty noises")
     for name, fit in {"with friction": found, "without": without}.items():
-        right.plot(ts, fit.whitened[0], ".-", lw=0.7, label=f"{name}: {fit.reduced_chi2:.1f}")
+        right.plot(ts, fit.whitened[0], ".-", lw=0.7, label=f"{name}: {fit.reduced_chi2:.2f}")
     right.set(xlabel="time t", ylabel="residual over sigma", title="Residuals, reduced χ²")
     right.legend()
 plt.show()

@@ -6,8 +6,9 @@
 #
 # $$\dot p = -\frac{\partial H}{\partial q} + \varepsilon\, W_{\rm PN}(q, p).$$
 #
-# How large an $\varepsilon$ do the positions of Mercury in JPL's ephemeris DE421 ask for? If the
-# theory is right, 1. Nothing of it is assumed: the fit begins at 0.
+# How large an $\varepsilon$ do the positions of Mercury in JPL's ephemeris DE421 ask for? DE421 is
+# itself an integration with relativity, fitted to observations: what is asked is whether its
+# relativity is found again, as $\varepsilon = 1$. The fit is not told: it begins at 0.
 #
 # Needs the ephemeris: `pip install "dvi-jax[ephemeris]"`. As a command, with pictures of what is
 # left: `python examples/general_relativity.py`.

@@ -7,8 +7,8 @@
 #
 # **What is known and what is not.** On a GPU a batch goes either through XLA, as any JAX program,
 # or into one kernel of the package's own that holds the whole time loop. That kernel is lowered
-# for CUDA and its numbers are interpreted on a CPU, in the tests; it has not been run on a GPU by
-# us, and no speed of it has been measured. `docs/gpu.md` says what was checked,
+# for CUDA and its numbers are checked in an interpreter on a CPU, by the tests; it has not been run
+# on a GPU by us, and no speed of it has been measured. `docs/gpu.md` says what was checked,
 # `benchmarks/gpu.py` is what to run on a device.
 
 # %%
@@ -27,7 +27,7 @@ print("platform:", device.platform)
 
 # %% [markdown]
 # `JAX_PLATFORMS=cpu` or `cuda` in the environment chooses before Python starts; for an NVIDIA GPU
-# install `jax[cuda12]`. Within a program `jax.default_device` chooses for a block, and an array
+# install `dvi-jax[cuda12]`. Within a program `jax.default_device` chooses for a block, and an array
 # that was put somewhere with `jax.device_put` is computed with there.
 #
 # ## A batch
@@ -155,10 +155,10 @@ plt.show()
 
 # %% [markdown]
 # In float32 the drift is that of float64 times the ratio of the units in the last place, some
-# $5 \times 10^8$. `Compensated()` carries what a sum loses, for a few operations more. After 200
-# 000 steps plain float32 has lost $10^{-5}$ of an invariant that is exact: an adiabatic one that
-# drifts by less cannot be measured with it, which is why the package asks for float64 unless told
-# otherwise.
+# $5 \times 10^8$. `Compensated()` carries what a sum loses, for a few operations more. After
+# 200 000 steps plain float32 has lost $2 \times 10^{-5}$ of an invariant that is exact: an
+# adiabatic one that drifts by less cannot be measured with it, which is why the package asks for
+# float64 unless told otherwise.
 #
 # ## What next
 #

@@ -2,7 +2,7 @@
 # # The Chandler wobble from measured poles
 #
 # The Earth's pole of rotation goes about the crust in some 433 days, is damped, and driven once a
-# year. In $q = x$, $p = y$ of the pole that is a damped and driven oscillator, whose disturbance
+# year. In $q = x,$ $p = y$ of the pole that is a damped and driven oscillator, whose disturbance
 # has the strength $\varepsilon = 1$. Four arcs of eight years share period, damping and driving;
 # each has a start of its own. How long is the period, how strong the damping, and how well is
 # either known?
@@ -85,8 +85,9 @@ assert np.all(error > 8 * fit.sigma[at])  # formal errors are far too small
 assert abs(inverse_Q) < 2 * error[1]  # 1/Q is not told from 0
 
 # %% [markdown]
-# The period agrees with the literature (433.0 ± 1.1 days) to 3 days. 1/Q is less than its error
-# from zero: these data do not determine Q.
+# Grey: measured; blue, upper panels: fitted; below, x in blue and y in orange. The period agrees
+# with the literature, 433.0 ± 1.1 days. 1/Q is less than its error from zero: these data do not
+# determine Q.
 
 # %%
 with plot.style():

@@ -1,12 +1,12 @@
 # %% [markdown]
-# # Quick start: an adiabatic invariant in ten lines, verified
+# # Quick start: an adiabatic invariant in a dozen lines, verified
 #
 # A mass on a spring is disturbed by a weak force that is not linear,
 #
 # $$H = \tfrac12\,(p^2 + q^2), \qquad \dot p = -q - \varepsilon q^3 .$$
 #
 # Its energy $H$ is no longer kept: it changes by $O(\varepsilon)$. Is there something else, near
-# the energy, that changes less? Such a quantity, $I = I_0 + \varepsilon I_1$, whose change stays
+# the energy, that changes less? Such a quantity, $I = I_0 + \varepsilon I_1,$ whose change stays
 # $O(\varepsilon^2)$ over a long time, is an *adiabatic invariant of first order*.
 #
 # `dvi_jax` iterates a map, the variational integrator, in place of the differential equation. So
@@ -24,7 +24,7 @@ jax.config.update("jax_enable_x64", True)  # invariants need double precision
 
 
 # %% [markdown]
-# ## Ten lines
+# ## A dozen lines
 #
 # A discrete Hamiltonian and a force, as plain functions of one step: `q0` is the position at its
 # beginning, `p1` the momentum at its end. `discover_invariants` looks for the series in the

@@ -87,7 +87,7 @@ plt.show()
 
 
 # %%
-def of_start(function):
+def of_end(function):
     """An observable of the end of a step, with its epsilon in args."""
 
     def observed(t0, t1, q0, p0, q1, p1, args):
@@ -109,7 +109,7 @@ def drifts(function, system, epsilons, **settings):
     def one(epsilon):
         sol = dvi.integrate(
             system, epsilon=epsilon, args={"epsilon": epsilon}, save=dvi.Save(final=True),
-            observe=dvi.MaxDrift(of_start(function)), **settings,
+            observe=dvi.MaxDrift(of_end(function)), **settings,
         )  # fmt: skip
         return sol.observed
 

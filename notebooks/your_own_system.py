@@ -136,7 +136,8 @@ assert abs(np.log2(bands[1] / bands[2]) - 2) < 0.3
 
 # %% [markdown]
 # **4. The drag does what a drag does.** By $\dot H = -\varepsilon\, \dot q \cdot p$ the energy
-# loses $\varepsilon \int \dot q \cdot p\, dt$, twice the kinetic energy times $\varepsilon$.
+# loses $\varepsilon \int \dot q \cdot p\, dt$: $\varepsilon$ times twice the kinetic energy, summed
+# over time.
 
 # %%
 r, p_r, p_t = damped.qs[:, 0], damped.ps[:, 0], damped.ps[:, 1]

@@ -218,6 +218,7 @@ def only_exact(names):
 
 
 @pytest.mark.parametrize("name", only_exact(MOST))
+@pytest.mark.slow
 def test_exact_solutions_are_those_of_the_flow(name):
     made = problem(name)
     ts, states = flow(name)
@@ -268,6 +269,7 @@ STRETCH = {"rigid_body": 8.0, "solar_system": 32.0, "polar_motion": 30.0}
 
 
 @pytest.mark.parametrize("name", FEW)
+@pytest.mark.slow
 def test_invariants_of_a_run_converge_with_its_order(name):
     """Drifts of declared invariants fall as h⁴ until they are round-off."""
     made = problem(name)
@@ -581,6 +583,7 @@ def test_a_run_file_names_it(name, tmp_path):
 # Elliptic functions, and exact solutions in every regime
 
 
+@pytest.mark.slow
 def test_elliptic_integrals_and_functions_are_those_of_scipy():
     rng = np.random.default_rng(0)
     m = np.r_[0.0, rng.uniform(0, 1, 60), 1 - 1e-6]
@@ -594,6 +597,7 @@ def test_elliptic_integrals_and_functions_are_those_of_scipy():
     np.testing.assert_allclose(swing(1e-12) / 1e-12, np.pi / 4, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_integrals_of_the_third_kind_are_those_of_scipy():
     """Of either sign of n, to 1 − n = 1e-12 and n = −1e8; beside another n."""
     rng = np.random.default_rng(1)
@@ -733,6 +737,7 @@ LONG = [  # name, q0, p0, time, largest difference from DOP853, whose own error 
 
 
 @pytest.mark.parametrize(("name", "q0", "p0", "time", "most"), LONG)
+@pytest.mark.slow
 def test_exact_solutions_hold_at_long_times_and_near_singularities(name, q0, p0, time, most):
     """Where a quadrature of few nodes in all of the time had lost φ, ψ and g."""
     made, rates = problem(name), functions(name)
@@ -749,6 +754,7 @@ def test_exact_solutions_hold_at_long_times_and_near_singularities(name, q0, p0,
     assert np.max(np.abs(late - run.y.T)) > 10 * most
 
 
+@pytest.mark.slow
 def test_duffing_swings_harmonically_at_the_bottom_of_a_well():
     """q = −1 − δ cos √2 t + O(δ²) from a distance δ, and rest at the bottom itself."""
     made, ts = problem("duffing"), np.array([0.0, 1.0, 2.0, 5.0])
@@ -761,6 +767,7 @@ def test_duffing_swings_harmonically_at_the_bottom_of_a_well():
     assert softer > 1e-10
 
 
+@pytest.mark.slow
 def test_the_pendulum_carries_gradients_at_rest():
     """Those of the linear oscillator. So do action, integrals and Van der Pol's amplitude."""
     at_rest, made, t = jnp.zeros(1), problem("pendulum"), 1.7
@@ -781,6 +788,7 @@ def test_the_pendulum_carries_gradients_at_rest():
     assert float(of_amplitude(jnp.ones(1), 2 * jnp.ones(1))[0]) == pytest.approx(5**-0.5)
 
 
+@pytest.mark.slow
 def test_kepler_carries_gradients_on_a_circle():
     """Beside central differences of the fourth order; and it is symplectic."""
     made, circle = problem("kepler"), jnp.array([1.0, 0.0, 0.0, 1.0])
@@ -893,11 +901,9 @@ def test_adiabatic_invariants_waver_by_the_declared_power(made, h, time):
 
 @pytest.mark.parametrize(
     ("name", "epsilon", "h"),
-    [
-        ("slow_oscillator", 0.02, 0.05),
-        pytest.param("lorentz_pendulum", 0.1, 0.02, marks=pytest.mark.slow),
-    ],
+    [("slow_oscillator", 0.02, 0.05), ("lorentz_pendulum", 0.1, 0.02)],
 )
+@pytest.mark.slow
 def test_slow_actions_waver_by_epsilon(name, epsilon, h):
     """E/ω, and the action of a large swing, over a whole cycle of the change; E goes with ω."""
     made, epsilons = problem(name), epsilon * FACTORS
@@ -932,6 +938,7 @@ def gyrating():
     return np.asarray(sol.ts)[1:], {key: np.asarray(x) for key, x in sol.observed.items()}
 
 
+@pytest.mark.slow
 def test_the_moment_oscillates_at_the_gyration():
     """Its spectrum has its peak at eB/(2πm); the correction takes nearly all of it away."""
     ts, seen = gyrating()
@@ -1019,6 +1026,7 @@ def test_the_bounce_action_is_what_a_bounce_adds_up_to(made, time):
 # References of single systems
 
 
+@pytest.mark.slow
 def test_the_relativistic_perihelion_advances_by_the_closed_form():
     made = problem("relativistic_kepler")
     sol = dvi.integrate(
@@ -1185,8 +1193,9 @@ def test_the_table_in_the_documentation_says_the_same(name):
     made = problem(name)
     text = (Path(__file__).parents[1] / "docs" / "systems.md").read_text(encoding="utf-8")
     rows = [line for line in text.splitlines() if line.startswith(f"| `{name}` |")]
-    assert len(rows) == 1, f"docs/systems.md has {len(rows)} rows for {name}"
-    _, _, _, kept, symmetries, exact, source, _ = rows[0].split("|")
+    assert len(rows) == 2, f"docs/systems.md has {len(rows)} rows for {name}"
+    _, _, _, exact, kept, symmetries, _ = rows[0].split("|")
+    _, _, source, _ = rows[1].split("|")
     kept, _, nearly = kept.partition("adiabatic")
     assert set(re.findall(r"`(\w+)`", kept)) == set(made.invariants)
     powers = {key: int(power) for key, power in re.findall(r"`(\w+)` \((\d)\)", nearly)}

@@ -18,7 +18,7 @@ from dvi_jax.sweep import _sweep
 from dvi_jax.sweep.cost import span
 from dvi_jax.sweep.plan import Plan, make_plan
 from dvi_jax.sweep.sinks import Memory
-from dvi_jax.sweep.starts import radical_inverse
+from dvi_jax.sweep.starts import _radical_inverse
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -56,6 +56,7 @@ def near(a, b):
     np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-16)
 
 
+@pytest.mark.slow
 def test_a_grid_has_the_numbers_of_single_runs_and_their_names():
     eps, k = np.linspace(0, 0.2, 4), [1.0, 1.5, 2.0]
     found = sweep(
@@ -80,6 +81,7 @@ def test_a_grid_has_the_numbers_of_single_runs_and_their_names():
     assert (found.failed_step == -1).all()
 
 
+@pytest.mark.slow
 def test_axes_of_one_name_go_together():
     found = sweep(
         epsilon=dvi.Axis("case", [0.0, 0.1, 0.2]), h=dvi.Axis("case", [0.1, 0.05, 0.02])
@@ -89,6 +91,7 @@ def test_axes_of_one_name_go_together():
     near(found.drift[2], single(epsilon=0.2, h=0.02).observed["drift"])
 
 
+@pytest.mark.slow
 def test_components_of_the_start_and_whole_states_are_axes():
     x = np.linspace(0.1, 0.5, 3)
     found = sweep(q0=[dvi.Axis("x", x), -0.2], p0=[0.1, dvi.Axis("py", [0.0, 0.3])]).to_xarray()
@@ -100,6 +103,7 @@ def test_components_of_the_start_and_whole_states_are_axes():
     near(found.drift[1], single(q0=states[1]).observed["drift"])
 
 
+@pytest.mark.slow
 def test_methods_and_numbers_of_steps_are_axes():
     methods = [dvi.TypeII(), dvi.Strang()]
     steps = dvi.Axis("h", [10, 20])
@@ -112,6 +116,7 @@ def test_methods_and_numbers_of_steps_are_axes():
             near(found.drift[i, j], single(method=method, num_steps=n, h=h).observed["drift"])
 
 
+@pytest.mark.slow
 def test_observables_that_stand_alone_have_the_saved_steps():
     found = sweep(epsilon=[0.0, 0.1], observe=energy, save=dvi.Save(every=5)).to_xarray()
     assert found.observed.dims == ("epsilon", "saved_step")
@@ -120,6 +125,7 @@ def test_observables_that_stand_alone_have_the_saved_steps():
     assert found.q.sizes["save"] == 5
 
 
+@pytest.mark.slow
 def test_the_same_bits_whatever_the_threads():
     eps = np.linspace(0, 0.3, 1000)
     results = [sweep(epsilon=eps, threads=n, lanes_per_task=128) for n in (1, 2, 3)]
@@ -130,6 +136,7 @@ def test_the_same_bits_whatever_the_threads():
     near(results[0]["drift"][999], single(epsilon=0.3).observed["drift"])
 
 
+@pytest.mark.slow
 def test_threads_compute_in_the_precision_of_the_caller():
     """jax.enable_x64 as a context holds in its own thread alone."""
     with jax.enable_x64(False):
@@ -157,6 +164,7 @@ class Busy(Memory):
         yield not (first and task.number % 3 == 0)
 
 
+@pytest.mark.slow
 def test_what_others_leave_undone_is_done(monkeypatch):
     monkeypatch.setattr(_sweep, "Memory", Busy)
     seen = []
@@ -169,6 +177,7 @@ def test_what_others_leave_undone_is_done(monkeypatch):
     assert computed[70:].all()
 
 
+@pytest.mark.slow
 def test_other_numbers_need_no_other_program():
     sweep(epsilon=np.linspace(0, 0.1, 7), h=0.1)
     traced = []
@@ -187,6 +196,7 @@ def test_other_numbers_need_no_other_program():
     assert counts[1] == counts[2] < counts[0] / 1.5  # shapes and identity alone
 
 
+@pytest.mark.slow
 def test_a_failing_lane_costs_itself_alone():
     eps = np.asarray([0.0, 0.1, 1e200, 0.2])
     with_it, without = sweep(epsilon=eps), sweep(epsilon=[0.0, 0.1, 0.15, 0.2])
@@ -240,6 +250,7 @@ def test_ctrl_c_keeps_what_is_finished():
 # --- what it takes ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_cost_of_a_sweep():
     settings = {"h": 0.1, "num_steps": 50, "args": {"k": 1.0}, "observe": OBSERVE}
     grid = {"epsilon": np.linspace(0, 0.1, 100), "method": [dvi.TypeII(), dvi.Strang()]}
@@ -280,12 +291,14 @@ def result(request, tmp_path_factory):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_store_opened_again_is_the_same(result):
     if result.path is not None:
         again = dvi.open_sweep(result.path)
         xr.testing.assert_identical(again.to_xarray(), result.to_xarray())
 
 
+@pytest.mark.slow
 def test_netcdf_is_the_dataset(result, tmp_path):
     result.to_netcdf(tmp_path / "s.nc")
     with xr.open_dataset(tmp_path / "s.nc", engine="h5netcdf") as found:
@@ -297,6 +310,7 @@ def test_netcdf_is_the_dataset(result, tmp_path):
         result.to_netcdf(tmp_path / "s.nc")
 
 
+@pytest.mark.slow
 def test_parquet_has_a_row_for_each_trajectory(result, tmp_path):
     result.to_parquet(tmp_path / "s.parquet")
     table = pd.read_parquet(tmp_path / "s.parquet")
@@ -315,6 +329,7 @@ def test_parquet_has_a_row_for_each_trajectory(result, tmp_path):
 
 
 @pytest.mark.parametrize("kind", [starts.Random, starts.Halton])
+@pytest.mark.slow
 def test_starts_fill_their_box(kind):
     start = kind(4096, LOW, HIGH, seed=3)
     q, p = jax.vmap(lambda i: start.at(i, 0.0, None))(jnp.arange(4096))
@@ -338,7 +353,7 @@ def test_radical_inverse_against_digits_written_backwards():
             while m:
                 m, d = divmod(m, base)
                 digits, k = digits + d * base**-k, k + 1
-            near(radical_inverse(jnp.asarray(n), base, 12345, jnp.float64), digits)
+            near(_radical_inverse(jnp.asarray(n), base, 12345, jnp.float64), digits)
 
 
 def test_random_starts_differ_beyond_32_bits():
@@ -355,6 +370,7 @@ def test_normal_starts_have_their_spread():
     np.testing.assert_allclose(np.std(p, axis=0), 0.3, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_the_energy_shell():
     def H(t, q, p, args):
         return hamiltonian(t, t, q, p, args)
@@ -370,6 +386,7 @@ def test_the_energy_shell():
     assert sweep(start=nowhere).status_counts() == {"not_finite": 4}
 
 
+@pytest.mark.slow
 def test_starts_are_a_dimension_of_their_own():
     start = starts.Halton(20, LOW, HIGH)
     found = sweep(start=start, epsilon=[0.0, 0.1]).to_xarray()

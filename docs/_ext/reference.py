@@ -7,6 +7,7 @@ documentation, such as ``dvi.Save``, leads to its entry.
 
 import dataclasses
 import inspect
+import math
 import re
 import types
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.transforms.post_transforms import SphinxPostTransform
@@ -79,7 +81,9 @@ def entries() -> dict[str, dict[str, tuple[str, Any]]]:
 
 
 def _members(module: types.ModuleType) -> Iterator[tuple[str, Any]]:
-    yield from public(module).items()
+    for name, thing in public(module).items():
+        if f"{thing.__module__}.".startswith(f"{module.__name__}."):
+            yield name, thing
 
 
 def signature(thing: Any) -> str:
@@ -118,10 +122,12 @@ class _Shown:
 def _default(value: Any) -> Any:
     if value is inspect.Parameter.empty:
         return value
-    text = repr(value)
+    text = "2π" if isinstance(value, float) and value == 2 * math.pi else repr(value)
+    if isinstance(value, np.ndarray) and value.size == 0:
+        text = "[]"
     if callable(value) and hasattr(value, "__name__"):
         text = value.__name__
-    if "<" in text or len(text) > 40:
+    if "<" in text or len(text) > 60:
         text = f"{type(value).__name__}(...)"
     return _Shown(" ".join(text.split()))
 
@@ -212,7 +218,8 @@ def write(folder: Path) -> None:
     index = [
         "# Reference",
         "",
-        "Every public name, from its docstring. In the examples, which are run, these are known:",
+        "Every public class and function, from its docstring. In the examples, which are run, "
+        "these are known:",
         "",
         "```python",
         "import jax, jax.numpy as jnp, numpy as np",
@@ -222,11 +229,11 @@ def write(folder: Path) -> None:
         "```",
         "",
     ]
-    index += ["```{toctree}", ":maxdepth: 1", "", *pages, "```", ""]
+    index += ["```{toctree}", ":hidden:", "", *pages, "```", ""]
     for page in pages:
         title = {**PAGES, **MODULES}[page][0]
         listed = ", ".join(f"`{shown}`" for shown, _ in found[page].values())
-        index += [f"**{title}.** {listed}", ""]
+        index += [f"**[{title}]({page}.md).** {listed}", ""]
     pages["index"] = "\n".join(index)
     for page, text in pages.items():
         path = folder / f"{page}.md"
@@ -284,11 +291,11 @@ class EquationMap(SphinxDirective):
     """The paper's numbered equations, as `dvi_jax.paper.equations` has them."""
 
     def run(self) -> list[nodes.Node]:
-        rows = ["| equation | what it says | code | as printed? |", "| --- | --- | --- | --- |"]
+        rows = ["| equation | what it says | as printed? | code |", "| --- | --- | --- | --- |"]
         for equation in EQUATIONS:
-            code = ", ".join(f"`{name}`" for name in equation.code)
+            code = ", ".join(f"`{_as_written(name)}`" for name in equation.code)
             note = equation.note or "as printed"
-            cells = (f"({equation.number})", equation.what, code, note)
+            cells = (f"({equation.number})", equation.what, note, code)
             rows.append("| " + " | ".join(literally(c).replace("|", r"\|") for c in cells) + " |")
         holder = nodes.container()
         self.state.nested_parse(rows, 0, holder)
@@ -306,7 +313,7 @@ HOMES = {
 }
 """Pages where a bare name is first that of a module."""
 
-OTHER_MEANINGS = {"fit", "sample", "sweep"}
+OTHER_MEANINGS = {"fit", "sample", "sweep", "actions", "frequencies", "lattice_defect"}
 """Bare words that are arguments, fields and commands as well."""
 
 
@@ -322,10 +329,15 @@ def meant(text: str, page: str) -> list[str]:
     return [full for full in found if full is not None]
 
 
+def _as_written(full: str) -> str:
+    """`dvi_jax.symmetry.prolong` after `import dvi_jax as dvi`."""
+    return re.sub(r"^dvi_jax\b", "dvi", full)
+
+
 def _fill_names() -> None:
     for page in entries().values():
         for full, (shown, _) in page.items():
-            names = {full, shown, full.removeprefix("dvi_jax.")}
+            names = {full, shown, full.removeprefix("dvi_jax."), _as_written(full)}
             for name in names:
                 NAMES.setdefault(name, full)
 

@@ -4,6 +4,7 @@ Pages and docstrings are read as text too, so that formulas in a line stand ther
 What is searched for, and what another builder shows, stays the text as it was written.
 """
 
+import ast
 import html
 import re
 from typing import Any
@@ -13,12 +14,24 @@ from sphinx.transforms.post_transforms import SphinxPostTransform
 
 SCRIPTED = re.compile(
     r"_(?:\{(?P<below>[^{}]*)\}|(?<=[^\W_][_])(?P<index>[^\W_])(?!\w)"
-    r"|(?<=[⁺⁻*'̄][_])(?P<after_mark>[^\W_])(?!\w))"
+    r"|(?<=[⁺⁻*'̄̃][_])(?P<after_mark>[^\W_])(?!\w))"
     r"|\^(?:\{(?P<above>[^{}]*)\}|(?P<power>[−-]?[^\W_]+(?:\.\d+)?)"
     r"|(?P<bracket>−?\((?:[^()]|\([^()]*\))*\)))"
 )
-NUMBER = re.compile(r"\d+(?:\.\d+)?e[-−+]?\d+|(?<!\d)\d{1,3}(?: \d{3})+(?!\d)")
+NUMBER = re.compile(
+    r"\d+(?:\.\d+)?e[-−+]?\d+|(?<!\d)\d{1,3}(?: \d{3})+(?!\d)|\d+ %"
+    r"|\b(?:pass|FAIL) \d\S*"
+)
 PIECE = re.compile(rf"(?P<number>{NUMBER.pattern})|(?:{SCRIPTED.pattern})")
+
+
+def is_code(text: str) -> bool:
+    """Whether a block is Python, or a formula in characters, such as H̃ = H + h^r H_r."""
+    try:
+        ast.parse(text)
+    except SyntaxError:
+        return text.isascii()
+    return True
 
 
 class typeset(nodes.inline):
@@ -50,6 +63,11 @@ class Typeset(SphinxPostTransform):
     )  # fmt: skip
 
     def run(self, **kwargs: Any) -> None:
+        for block in list(self.document.findall(nodes.literal_block)):
+            text = block.astext()
+            if block.get("language", "none") in ("none", "default") and not is_code(text):
+                made = as_html(text) or html.escape(text, quote=False)
+                block.replace_self(typeset("", nodes.Text(text), html=f"<pre>{made}</pre>"))
         for text in list(self.document.findall(nodes.Text)):
             above = text.parent
             while above is not None and not isinstance(above, self._as_it_is):

@@ -164,7 +164,7 @@ CONTROLS: tuple[Control, ...] = (
         "TypeII with an inverse wrong by 1e-8", "modes", altered(_FIRST, inverse=_not_quite_inverse)
     ),
     Control(
-        "TypeII with a number that Python counts",
+        "TypeII with a Python counter, which differs at each trace",
         "jit",
         altered(_FIRST, _with_a_number_from_python),
     ),
@@ -173,7 +173,7 @@ CONTROLS: tuple[Control, ...] = (
     ),
     Control("TypeII that puts numbers for NaN", "failure", altered(_FIRST, _hiding_nan)),
     Control(
-        "TypeII of which no two are equal",
+        "TypeII whose instances never compare equal",
         "traces",
         altered(_FIRST, functools.partial(_unchanged)),
     ),

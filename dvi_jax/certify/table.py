@@ -96,7 +96,8 @@ def cell(check: str, measured: Measured) -> str:
 
 
 _PROBLEMS = """\
-Two problems, a = 0.3 in both:
+H is the Hamiltonian, W the disturbing force, ε its strength ([theory](theory.md)). Two problems,
+a = 0.3 in both:
 
 - coupled: H = (1 + |q|²)(1 + |p|²)/2 + a |p|² Σq, W = −(1 + |q|²) p + cos t. Not separable and not
   linear; the force damps and drives, and depends on q, p and t (ε = 0.2 where it is on). Of two

@@ -186,9 +186,9 @@ def actions(
     over the lines k·ω of every degree of freedom. For H = ω(q² + p²)/2 that is J = (q² + p²)/2 and
     H = ωJ. J belongs to the frequencies beside it: for ω' = Mω, J' = M⁻ᵀ J. So that neither the
     lines found nor their errors depend on the units, z_j is taken as q_j/s_j − i s_j p_j, which is
-    canonical and leaves J as it is; s_j² = rms Δ²q_j / rms Δ²p_j, of second differences: they weigh
-    the weak lines of high frequency, on which the accuracy depends. s_j = 1 where q_j or p_j is
-    constant.
+    canonical and leaves J as it is; s_{j}² = rms Δ²q_j / rms Δ²p_j, of second differences: they
+    weigh the weak lines of high frequency, on which the accuracy depends. s_j = 1 where q_j or p_j
+    is constant.
 
     **Arguments**
 

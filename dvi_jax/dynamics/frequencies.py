@@ -144,7 +144,7 @@ def frequencies(
     signal has no `successful` status and `throw` is True (inside jit an equinox runtime error).
 
     **Accuracy** round-off, below 1e-13 ω for 2048 samples, for a signal of no more than `count`
-    lines that are further apart than the resolution; see docs/frequencies.md. float32 is computed
+    lines that are further apart than the resolution; see `docs/frequencies.md`. float32 is computed
     in float64, at the times of the lattice that fits the rounded ones best.
 
     **Source** Laskar 1990, *Icarus* 88, 266; 1993, *Physica D* 67, 257; 2003, arXiv:math/0305364.

@@ -38,8 +38,9 @@ class FREQUENCY_RESULTS(eqx.Enumeration):
         "which is no sum of lines: analyse exp(i q), or the momentum."
     )
     aliased = (
-        "The leading line lies above 9/10 of the Nyquist frequency π/h: its sign, and whether it "
-        "is the alias of a faster one, cannot be told. Save more often."
+        "The leading line lies above 9/10 of the Nyquist frequency π/Δt, Δt the time between "
+        "samples: its sign, and whether it is the alias of a faster one, cannot be told. Save "
+        "more often."
     )
     unresolved = (
         "Two lines are closer than the resolution 2π/T: their frequencies and amplitudes are not "

@@ -305,7 +305,9 @@ class Return(eqx.Module):
 
 
 class ReturnMap(eqx.Module):
-    r"""The map of a section g(t, q, p, args) = 0 onto itself: ``returns(q, p)`` → `Return`.
+    r"""The map of a section g(t, q, p, args) = 0 onto itself.
+
+    ``section_map(q, p, t0=0.0, epsilon=0.0, args=None)`` → `Return`.
 
     A function of JAX arrays: `jax.jacfwd` of it is the derivative of the return map, the change of
     the return time included, `vmap` takes many points, `lax.scan` iterates. A point on the section

@@ -25,9 +25,9 @@ def configure_cpu() -> None:
     - ``--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000``: a loop of
       any size is compiled as one piece, its state in registers, rather than operation by operation.
 
-    They hold for everything that the process compiles. Batches of trajectories run up to twice as
-    fast, single implicit ones up to ten times (see the page on speed). Numbers may differ in the
-    last digit. What XLA_FLAGS sets already is left as it is.
+    They hold for everything that the process compiles. Most programs gain some ten per cent or
+    nothing, since loops of arithmetic alone are one function already: see `docs/speed.md`. Numbers
+    may differ in the last digit. What XLA_FLAGS sets already is left as it is.
 
     **Raises** `RuntimeError` when JAX has started already: the flags would not be read any more.
     """

@@ -53,7 +53,7 @@ class Layout(eqx.Module):
       functions were written, batched by `vmap`; ``"auto"``: components, but for short runs (fewer
       than 100 000 lanes × steps), which they make longer by the time of their compilation, and
       for functions of very many operations; ``"kernel"``: a batch in one kernel of the GPU that
-      runs all steps (see the page on GPUs), which ``"auto"`` takes there too; what does not go into
+      runs all steps (see `docs/gpu.md`), which ``"auto"`` takes there too; what does not go into
       a kernel goes in components, with a warning. On a CPU the kernel is interpreted, for tests.
     - `width`: lanes of a tile, or of a block of a kernel (the next power of two); None means by the
       size of the state.

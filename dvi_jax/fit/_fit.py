@@ -53,7 +53,7 @@ def fit(
     **Arguments**
 
     - `model`: a `Model`, or a function ``(params)`` or ``(params, arc)`` that returns the
-      arguments of `integrate` as a dict: system, q0, p0, h, epsilon, args, method, ….
+      arguments of `integrate` as a dict: system, q0, p0, h, epsilon, args, method, …
     - `data`: `Observations`, or a list of them, one for each arc.
     - `params`: a pytree with starting values: numbers and floating-point arrays are fitted, what
       else it holds stays as it is. For a `Model` a dict with keys among q0, p0, epsilon, args.

@@ -178,7 +178,7 @@ def sample(
     - `start`: a `FitResult` of these parameters, or a pytree like `params`; None: a fit from
       `params`.
     - `target_accept`: of the step size; nearer to 1 against divergences. `max_tree_depth`: a path
-      takes at most 2 to this power steps.
+      takes at most 2^max_tree_depth steps.
     - `progress`: True shows a bar, False none, None where there is a terminal.
 
     **Returns** `Samples`. What is doubtful about them is warned of (`UserWarning`) and kept in

@@ -36,7 +36,10 @@ def _check_scale(scale: Any) -> None:
 
 
 class SoftL1(Loss):
-    """ρ(s) = 2 k² (√(1 + s/k²) − 1): like s up to k standard errors, then like 2 k √s."""
+    """ρ(s) = 2 k² (√(1 + s/k²) − 1): like s up to k standard errors, then like 2 k √s.
+
+    s is the square of a residual over its standard error, k is `scale`.
+    """
 
     scale: float = 1.5
 
@@ -49,7 +52,10 @@ class SoftL1(Loss):
 
 
 class Cauchy(Loss):
-    """ρ(s) = k² log(1 + s/k²): errors with the tails of Cauchy's distribution."""
+    """ρ(s) = k² log(1 + s/k²): errors with the tails of Cauchy's distribution.
+
+    s is the square of a residual over its standard error, k is `scale`.
+    """
 
     scale: float = 2.4
 

@@ -31,7 +31,8 @@ class NetworkForce(eqx.Module):
       makes it a network of sigmoids.
     - `velocity`: function ``(q, p)`` → v, shape (n,): the q̇ = ∂H/∂p with which the power is to be
       negative. None takes v = p, that of masses 1 and all others up to a positive factor.
-    - `scale_q`, `scale_p`: sizes of q and p: networks receive q / scale_q and p / scale_p.
+    - `scale_q`, `scale_p`: sizes of q and p: networks receive ``q / scale_q`` and
+      ``p / scale_p``.
     - `initial`: by what the last layers are made smaller to begin with, so that the force is small.
       Far smaller ones leave the layers before them without effect, which least squares take ill.
 

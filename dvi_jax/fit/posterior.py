@@ -47,7 +47,7 @@ class Posterior:
     **Raises** `ValueError` or `TypeError` for input that cannot be meant; `ValueError` for fewer
     values than parameters that neither a prior nor two bounds hold: such a density has no integral.
 
-    **Source** Gelman et al. 2013, *Bayesian Data Analysis*, 3.2 and 10.; the Jacobian, Stan
+    **Source** Gelman et al. 2013, *Bayesian Data Analysis*, 3.2 and 10; the Jacobian, Stan
     reference manual, "Constraint transforms".
     """
 

@@ -38,7 +38,7 @@ def name_of(result: FIT_RESULTS) -> str:
 
 
 class FitError(RuntimeError):
-    """Raised by `fit` with ``throw=True`` when it did not converge; `fit` holds what was found."""
+    """Raised by `fit` with ``throw=True`` when it did not converge; its `fit` is what was found."""
 
     def __init__(self, message: str, fit: object = None):
         super().__init__(message)

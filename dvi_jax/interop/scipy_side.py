@@ -73,7 +73,7 @@ def solve_ivp(
 ) -> Any:
     r"""One trajectory, asked for and told as by `scipy.integrate.solve_ivp`.
 
-        y = (q, p) in one vector,    the map of `method` on t0, t0 + h', …, t1,   h' = (t1 − t0)/N
+        y = (q, p) in one vector,    the map of method on t0, t0 + h', …, t1,   h' = (t1 − t0)/N
 
     with N the smallest number of steps that are not longer than h.
 

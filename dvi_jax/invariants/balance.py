@@ -65,6 +65,8 @@ def noether_balance(
     - `solution`: of `integrate` with ``method=TypeII()``, every state saved.
     - `epsilon`, `args`: those of the run.
 
+    **Returns** a `Balance`.
+
     **Raises** `ValueError` when the solution has not every state saved, or fewer than two steps.
 
     **Source** our own; (31) of the paper is the case where the identities hold on the lattice

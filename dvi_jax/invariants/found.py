@@ -45,7 +45,7 @@ class Discovery(eqx.Module):
       functions of the basis change by in a step. `dependent_residuals` likewise.
     - `reach`: shape (count,): the ε at which corrections are as large as the leading part; the
       series is of use far below it. Infinite without corrections.
-    - `obstructions`: a `DriftLaw` for each leading part that is lost at order 1, 2, ….
+    - `obstructions`: a `DriftLaw` for each leading part that is lost at order 1, 2, …
     - `basis`: with `names`. `sizes`: shape (order + 1, basis size), what a coefficient of 1
       amounts to on the samples. `condition`: of the basis there, each function scaled to one size.
     - `scale`: 1 over the ε at which the disturbance changes a step as much as H_D does.

@@ -21,7 +21,7 @@ from ..engine.taylor import taylor_coefficients
 class ShadowHamiltonian(eqx.Module):
     r"""The modified Hamiltonian of a discrete Hamiltonian, cut off after h^order.
 
-        H̃(t, q, p; h) = H̃_0 + h H̃_1 + … + h^order H̃_order
+        H̃(t, q, p; h) = H̃_0 + h H̃_1 + … + h^r H̃_r,    r = order
 
     is the Hamiltonian whose flow over h *is*, as a power series in h, the undisturbed map of
     `TypeII`. Hence H̃_0 = H_D(t, t, q, p) and H̃_1 = ∂H_D/∂t1 − (∂H̃_0/∂t + ∂H̃_0/∂q·∂H̃_0/∂p)/2.
@@ -109,7 +109,7 @@ class ShadowHamiltonian(eqx.Module):
         )
 
     def terms(self, t: Any, q: Any, p: Any, args: Args = None) -> Float[Array, " order+1"]:
-        r"""H̃_0, …, H̃_order at (t, q, p), shape (order + 1,); H̃_i in [energy / time^i].
+        r"""H̃_0, …, H̃_{order} at (t, q, p), shape (order + 1,); H̃_i in [energy / time^i].
 
         Let q_0 = q, p_0 = p, q_1, p_1, … be iterates of the map, as power series in h. The
         discrete action p_{k+1}·(q_{k+1} − q_k) − h H_D of a step is the action ∫ p dq − H̃ dt of the

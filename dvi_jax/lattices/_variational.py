@@ -198,6 +198,8 @@ class LatticeCondition(eqx.Module):
     A relative error δ in the energies moves h by κδ of itself: at κ = 1e13 the sizes of steps that
     `Variational` chooses have three digits in float64. Infinite where the energy has no slope, at
     the folds beyond which there is no root.
+
+    **Arguments** `system`, `epsilon`: those of the run, which tells them where they are left out.
     """
 
     system: System | None = None

@@ -36,6 +36,8 @@ class BlanesMoan(CompositionMethod):
     and has, for any map Φ with its adjoint, the order of the splitting: 12 and 20 coefficients,
     six and ten pairs.
 
+    **Arguments** `order`: 4 or 6. `base`: Φ, any method with an inverse.
+
     **Raises** `ValueError` for an order other than 4 or 6.
 
     **Accuracy** the conditions of order hold to round-off, 2e-16, with the 15 printed digits.

@@ -49,7 +49,7 @@ class CompositionMethod(Method):
 
     @property
     def has_negative_substeps(self) -> bool:
-        """Whether some part goes backwards in time, where a dissipative force makes grow."""
+        """Whether some part goes backwards in time, where a dissipative force makes motion grow."""
         inner = isinstance(self.base, CompositionMethod) and self.base.has_negative_substeps
         return inner or any(c < 0 for c in self.fractions())
 
@@ -222,6 +222,6 @@ class Composition(CompositionMethod):
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the coefficients read the same from both ends."""
+        """Whether the map is its own adjoint."""
         c = self.coefficients
         return c == c[::-1] and (len(c) % 2 == 0 or self.base.is_symmetric)

@@ -48,7 +48,7 @@ class GaussLegendre(Method):
 
         Σ_i b_i [H(t_i, Q_i, P_i) − (P_i − p1)·V_i],    Q_i = q0 + h Σ_j a_ij V_j
 
-    Each step solves for all stages at once by Newton's method, 2 s n real unknowns for q of n
+    Each step solves for all stages at once by `newton`, 2 s n real unknowns for q of n
     components, separable or not: the price of a high order without parts backwards in time.
 
     **Arguments**

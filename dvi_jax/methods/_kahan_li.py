@@ -37,6 +37,8 @@ class KahanLi(CompositionMethod):
     The ones to begin with when a high order is wanted: no part is longer than 0.8 h, and Σ|γ| is
     3.8 and 5.4.
 
+    **Arguments** `order`: 6 or 8. `base`: the map that `Strang` is made of, any with an inverse.
+
     **Raises** `ValueError` for an order other than 6 or 8.
 
     **Accuracy** the conditions of order hold to round-off, 4e-16.

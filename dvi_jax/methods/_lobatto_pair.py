@@ -72,7 +72,7 @@ class LobattoIIIAIIIB(Method):
 
     The energy, a perturbation and the force are taken on the diagonal t0 = t1, as `GaussLegendre`
     takes them; c, b and a are the nodes, weights and integrals of Lobatto quadrature (IIIA), and
-    â_ij = b_j (1 − a_ji / b_i) (IIIB). Q_1 = q0 and Q_s = q1. Symmetric; without a force
+    â_{ij} = b_j (1 − a_{ji} / b_i) (IIIB). Q_1 = q0 and Q_s = q1. Symmetric; without a force
     symplectic, and every invariant that is bilinear in q and p, angular momentum for instance, is
     kept to round-off. Without a force it is the type II variational map (12)–(13) of another
     discrete Hamiltonian, the value that is stationary in P_i and V_i of

@@ -39,6 +39,8 @@ class McLachlan(CompositionMethod):
     Order 4 has five pairs of the map with its adjoint of unequal length, coefficients in √19;
     orders 6 and 8 are symmetric compositions of 9 and 15 `Strang`.
 
+    **Arguments** `order`: 4, 6 or 8. `base`: Φ, any method with an inverse.
+
     **Raises** `ValueError` for another order.
 
     **Accuracy** the conditions of order hold to round-off, 2e-16.

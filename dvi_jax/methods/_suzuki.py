@@ -19,6 +19,8 @@ class Suzuki(CompositionMethod):
     One part goes back, by 0.66 h: less than in the triple jump of `Yoshida` (1.70 h), with an error
     some seventy times smaller in the same condition.
 
+    **Arguments** `order`: 4. `base`: the map that `Strang` is made of, any with an inverse.
+
     **Raises** `ValueError` for an order other than 4.
 
     **Source** Suzuki 1990, *Phys. Lett. A* 146, 319; Hairer, Lubich & Wanner 2006, II.4 (4.5).

@@ -34,6 +34,8 @@ class Yoshida(CompositionMethod):
     `BlanesMoan`, `McLachlan` and `KahanLi` have smaller errors for the same work. Strong
     dissipation is not for any of them.
 
+    **Arguments** `order`: 4, 6 or 8. `base`: the map that `Strang` is made of, any with an inverse.
+
     **Raises** `ValueError` for another order.
 
     **Accuracy** the conditions of order hold to round-off, 4e-16.

@@ -91,7 +91,7 @@ class TangentMap(Deviations):
     The product M_K ⋯ M_1 of the steps' derivatives, in coordinates (q, p) raveled; of no steps the
     identity. With a symplectic method and ε = 0, or a disturbance that derives from a Hamiltonian,
     MᵀJM = J. Over a closed orbit it is the monodromy matrix, whose eigenvalues are the Floquet
-    multipliers. On chaotic orbits its columns fall together once e^(λt) nears 1e16, and it
+    multipliers. On chaotic orbits its columns fall together once e^{λt} nears 1e16, and it
     overflows in the end: take `LyapunovSpectrum` there.
     """
 

@@ -47,6 +47,8 @@ class Reduction(eqx.Module):
 class MaxDrift(Reduction):
     """Largest distance from the first value: max_k |f_k − f_1|, elementwise.
 
+    `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
+
     **Example**
 
     ```python
@@ -83,7 +85,10 @@ class MaxDrift(Reduction):
 
 
 class Range(Reduction):
-    """Largest value minus smallest value: max_k f_k − min_k f_k, elementwise."""
+    """Largest value minus smallest value: max_k f_k − min_k f_k, elementwise.
+
+    `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
+    """
 
     function: Callable[..., Any]
 
@@ -119,6 +124,8 @@ class Trend(Reduction):
 
     Means and moments are updated together (Welford 1962), so long runs do not cancel. NaN for
     fewer than two steps.
+
+    `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
     """
 
     function: Callable[..., Any]
@@ -146,7 +153,10 @@ class Trend(Reduction):
 
 
 class Mean(Reduction):
-    """Mean over the steps: (1/N) Σ f_k, elementwise."""
+    """Mean over the steps: (1/N) Σ f_k, elementwise.
+
+    `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
+    """
 
     function: Callable[..., Any]
 
@@ -166,7 +176,10 @@ class Mean(Reduction):
 
 
 class Last(Reduction):
-    """The value at the last step."""
+    """The value at the last step.
+
+    `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
+    """
 
     function: Callable[..., Any]
 
@@ -189,7 +202,7 @@ class Running(eqx.Module):
     ``dvi.Running(dvi.MEGNO())`` with ``save=dvi.Save(every=m)`` shows how an indicator settles;
     the values have shape (S − 1, …), like those of an observable that stands alone.
 
-    **Arguments** `reduction`: any but a `Section`, whose rows are what they are.
+    **Arguments** `reduction`: any but a `Section`, which has a row for each crossing already.
 
     **Raises** `TypeError` for what is no such reduction.
     """

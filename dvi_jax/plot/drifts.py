@@ -135,7 +135,7 @@ def drift_orders(
     axis, new = canvas(ax, (6.4, 4.8))
     left = min(order.epsilons.min() for order in results.values())
     looks = zip(results.items(), slopes, itertools.cycle(COLOURS), MARKERS * 9, strict=False)
-    failed = nought = total = 0
+    failed = nought = total = left_out = 0
     for (label, order), slope, colour, marker in looks:
         x, y, used = order.epsilons, np.asarray(order.drifts), order.used
         there = np.isfinite(y) & (y > 0)
@@ -144,6 +144,7 @@ def drift_orders(
             text += f", promised {slope:g}"
         axis.loglog(x[used], y[used], marker, color=colour)
         out = there & ~used
+        left_out += out.sum()
         axis.loglog(x[out], y[out], marker, color=colour, markerfacecolor="white")
         face = colour if used.any() else "white"
         axis.plot([], [], marker, color=colour, markerfacecolor=face, label=f"{label}: {text}")
@@ -164,7 +165,9 @@ def drift_orders(
             axis.loglog(ends, guide, color="#888888", linewidth=1, linestyle="--", zorder=1)
     if promised is not None:
         axis.plot([], [], color="#888888", linewidth=1, linestyle="--", label="slope promised")
-    axis.plot([], [], "o", color="#444444", markerfacecolor="white", label="excluded from the fit")
+    if left_out:
+        label = "excluded from the fit"
+        axis.plot([], [], "o", color="#444444", markerfacecolor="white", label=label)
     axis.plot([], [], "_", color="#444444", markersize=12, markeredgewidth=2, label="at ε = 0")
     axis.set(xscale="log", yscale="log", xlabel="ε", ylabel="largest drift", title=title)
     handles = axis.get_legend_handles_labels()[0]
@@ -185,12 +188,11 @@ def drift_surface(
 ) -> Any:
     """Drifts over ε and h (`drift_surface`), and their orders in ε at each h.
 
-    - `promised`: z + 1. Dots mark what is excluded from the fits; bars are 95 % intervals.
-
-    A drift exactly 0 has no place on a logarithmic scale: it is black. One that failed is hatched;
-    the legend counts both.
-
+    - `surface`: what `drift_surface` returned. `promised`: z + 1.
     - `ax`: two `Axes`, of the drifts and of their orders.
+
+    Dots mark what is excluded from the fits; bars are 95 % intervals. A drift exactly 0 has no
+    place on a logarithmic scale: it is black. One that failed is hatched; the legend counts both.
 
     **Returns** the `Axes`, shape (2,).
     """
@@ -258,7 +260,9 @@ def _slope_text(order: DriftOrder) -> str:
     if not np.isfinite(order.slope):
         return "no order"
     low, high = order.interval
-    return f"slope {order.slope:.3f} ± {(high - low) / 2:.3f}"
+    half = (high - low) / 2
+    digits = 3 if not half > 0 else int(np.clip(1 - np.floor(np.log10(half)), 3, 6))
+    return f"slope {order.slope:.{digits}f} ± {half:.{digits}f}"
 
 
 def _one_each(value: Any, count: int) -> list[float | None]:

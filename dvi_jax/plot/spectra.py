@@ -97,7 +97,7 @@ def frequency_map(
     resonances: Sequence[tuple[int, int]] = (),
     limits: tuple[float, float] | None = None,
     names: tuple[str, str] | None = None,
-    diffusion_label: str = "log$_{10}$ |Δω/ω|",
+    diffusion_label: str = "log₁₀ |Δω/ω|",
     title: str = "",
     ax: Any = None,
 ) -> Any:

@@ -143,7 +143,7 @@ class Halton(InBox):
         shift = np.random.default_rng(self.seed).random(len(moves))
         u = jnp.zeros_like(like)
         for i, base, s in zip(moves, _primes(len(moves)), shift, strict=True):
-            x = radical_inverse(index + 1, base, self.count + 1, like.dtype) + s
+            x = _radical_inverse(index + 1, base, self.count + 1, like.dtype) + s
             u = u.at[i].set(jnp.where(x >= 1, x - 1, x))
         return u
 
@@ -183,7 +183,7 @@ class Normal(Starts):
         return _state(middle + sigma * z, self.shape)
 
 
-def radical_inverse(index: Array, base: int, largest: int, dtype: Any) -> Array:
+def _radical_inverse(index: Array, base: int, largest: int, dtype: Any) -> Array:
     """The digits of index (at most `largest`) in a base, mirrored at the point."""
     digits = max(1, math.ceil(math.log(largest + 1) / math.log(base)) + 1)
     value = jnp.zeros((), dtype)

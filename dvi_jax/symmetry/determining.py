@@ -25,7 +25,9 @@ def discrete_equations(
 
         F^q = (q1 − q0)/h − ∂H_D/∂p1,    F^p = (p1 − p0)/h + ∂H_D/∂q0 − εW,    h = t1 − t0
 
-    Both vanish on a solution. **Source** the paper, (16) and (23).
+    Both vanish on a solution. `first`, `second`: the points (t0, q0, p0) and (t1, q1, p1).
+
+    **Source** the paper, (16) and (23).
     """
     (t0, q0, p0), (t1, q1, p1) = _as_points(first, second)
     h = t1 - t0
@@ -108,6 +110,9 @@ def conformal_factor(
 
     **Arguments** `generators`: one, or a series in ε, order 0 first; `first`, `second`: points
     with a leading sample axis (S, …).
+
+    **Returns** `factor`, Λ; `residual`, relative: round-off where Λ exists, of order one where it
+    does not; `condition` of the problem that it is solved from.
 
     **Raises** `ValueError` for fewer than 2n pairs where Λ is constant.
 

@@ -80,6 +80,9 @@ def solve_gauge(
     looked for; `h`, `t0`, `args`: of the step; `samples`: (qs, ps) at t0, shapes (S, *q.shape),
     or (qs, ps, ts) with the times of the samples, shape (S,); a quarter of them held out.
 
+    **Returns** `gauges`, functions for `AdiabaticInvariant`; their `coefficients` in the basis; and
+    the `residual`: see there how far the identities close.
+
     **Raises** `ValueError` for samples of unequal shapes, too few of them, or where the step fails.
 
     **Source** our own; the identities: the paper, (25) and (28).

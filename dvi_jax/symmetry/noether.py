@@ -26,6 +26,7 @@ def lattice_defect(
         r = (E⁺_k − E⁻_k − εW_k·(q_{k+1} − q_k)) / h_k
 
     Zero when the lattice obeys (14); on a fixed mesh it is what energy is not conserved by.
+    `points`: three (t, q, p) in the order of time.
 
     **Source** the paper's (11) and (14) with the signs mended: (14) prints −H_{D,k−1} and
     differentiates it in t_{k−1}; stationarity in t_k gives the form above.
@@ -55,7 +56,7 @@ def noether_identity(
     *disturbed* map for `AdiabaticInvariant` to be one.
 
     **Arguments** `generators`, `gauges`: the series, order 0 first (a gauge None is zero);
-    `order`: m.
+    `order`: m; `first`, `second`: the points (t0, q0, p0) and (t1, q1, p1).
 
     **Source** the paper, (25) and (28).
     """

@@ -31,7 +31,7 @@ class BasisComponent(eqx.Module):
 class Symmetry(eqx.Module):
     r"""A symmetry Σ_m ε^m X_m that `find_symmetries` found; as formulas: `str`.
 
-    - `generators`: X_m, one for each order: for `prolong`, `determining_residual`, ….
+    - `generators`: X_m, one for each order: for `prolong`, `determining_residual`, …
     - `is_variational`: whether Noether's identity closes with a gauge; else it is a conformal
       symmetry only, as far as the gauge basis can tell.
     - `gauges`: G_m, one for each order; None where it is not variational.

@@ -74,9 +74,10 @@ def check_start(q0, p0, args):
 
 
 def lorentz_pendulum() -> Problem:
-    """The pendulum of one metre and one kilogram, l = l0 (1 + 0.3 sin εt), swinging to 1 rad.
+    """The pendulum of one metre and one kilogram, l = l0 (1 + d sin εt), swinging to 1 rad.
 
-    ε [1/s] is the rate of the change over d. Start and step are ours.
+    d = 0.3 (`depth` in args); ε [1/s] is the rate of the phase of that change. Start and step
+    are ours.
 
     **Source** Solvay congress 1911 (Langevin & de Broglie 1912, *La théorie du rayonnement et les
     quanta*, p. 450); action: Landau & Lifshitz 1976, *Mechanics*, §49.

@@ -72,8 +72,8 @@ def lotka_volterra() -> Problem:
     """Hares and lynxes of the Hudson's Bay Company, in thousands and years.
 
     Rates and the start of 33.9 and 5.9 thousand are ours, of the size that fits to the pelts of
-    1900–1920 give (as Carpenter 2018, *Predator–Prey Population Dynamics: the Lotka–Volterra model
-    in Stan*); one cycle takes 9.9 years.
+    1900–1920 have given (as Carpenter 2018, *Predator–Prey Population Dynamics: the Lotka–Volterra
+    model in Stan*); one cycle takes 9.9 years.
 
     **Source** Lotka 1925, *Elements of Physical Biology*; Volterra 1926, *Mem. Acad. Lincei Roma*
     2, 31; canonical form: Hairer, Lubich & Wanner 2006, I.1.1 and VII.2.

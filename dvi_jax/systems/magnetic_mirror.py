@@ -111,8 +111,8 @@ def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
     """A particle that bounces in B = B0 (1 + z²/ℓ²) on the axis; dimensionless.
 
     e = m = B0 = 1: gyroradius and gyrofrequency 1 at the start, on the middle plane with its
-    guiding centre at (`distance`, 0, 0). With v∥ = 0.8 v⊥ it turns where |B| is 1.64 times that,
-    near z = 0.8 ℓ. Field, start and step are ours.
+    guiding centre at (`distance`, 0, 0). With v_{∥} = 0.8 v_{⊥} it turns where |B| is 1.64 times
+    that, near z = 0.8 ℓ. Field, start and step are ours.
 
     - `length`: ℓ, and `distance` from the axis, both over the gyroradius.
 
