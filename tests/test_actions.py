@@ -67,6 +67,7 @@ def known_isochrone():
     return J, np.array([radial, (1 + L / root) / 2 * radial])
 
 
+@pytest.mark.slow
 def test_isochrone_has_its_radial_action_and_angular_momentum():
     torus = lane(found(), "isochrone")
     J, omega = known_isochrone()
@@ -85,6 +86,7 @@ def test_isochrone_has_its_radial_action_and_angular_momentum():
     assert np.abs(torus.actions - J).max() > 0.1  # the control: the basis matters
 
 
+@pytest.mark.slow
 def test_a_guess_chooses_the_basis():
     lines = lane(found(), "isochrone").lines
     _, omega = known_isochrone()
@@ -97,6 +99,7 @@ def test_a_guess_chooses_the_basis():
     np.testing.assert_array_equal(other.combinations[..., ::-1], torus.combinations)
 
 
+@pytest.mark.slow
 def test_kepler_is_degenerate_and_has_one_action():
     two, one = lane(found(), "kepler"), lane(found(1), "kepler")
     assert two.status == "resonant"
@@ -152,6 +155,7 @@ def one_degree():
     return actions(ts, signals, count=14, throw=False), ts, signals
 
 
+@pytest.mark.slow
 def test_pendulum_has_the_action_of_the_elliptic_integrals():
     """J = (8/π) (E(k) − (1 − k²) K(k)), k = sin(q0/2)."""
     m, J = M_SWING, J_SWING
@@ -164,6 +168,7 @@ def test_pendulum_has_the_action_of_the_elliptic_integrals():
     assert abs(few / J - 1) > 1e-3  # the control: the leading pair alone
 
 
+@pytest.mark.slow
 def test_an_action_is_kept_where_the_change_is_slow():
     """E/ω is an adiabatic invariant; what a sudden change does to it, it does to J."""
     of = one_degree()[0]
@@ -177,6 +182,7 @@ def test_an_action_is_kept_where_the_change_is_slow():
     assert change[2] > 0.1  # sudden, while E/J = ω in every case
 
 
+@pytest.mark.slow
 def test_an_action_is_the_same_in_all_units():
     """q → sq, p → p/s is canonical."""
     of, ts, z = one_degree()
@@ -207,6 +213,7 @@ def test_a_light_planet_has_its_action():
 
 
 @pytest.mark.parametrize(("weak", "status"), [(1e-2, "successful"), (1e-3, "not_quasi_periodic")])
+@pytest.mark.slow
 def test_an_action_below_its_error_is_none(weak, status):
     """A line that is no combination, of 9e-4, may stand for 8e-7 of either action."""
     z = [np.exp(1j * TS) + 9e-4 * np.exp(2.718j * TS), weak * np.exp(0.6180339887j * TS)]
@@ -258,6 +265,7 @@ def as_solution(z):
     return dvi.Solution(ts, q, p, jnp.diff(ts), None, dvi.RESULTS.successful, {})
 
 
+@pytest.mark.slow
 def test_axes_of_the_state_are_not_those_of_a_batch():
     """Two frequencies: of one torus, or of two trajectories of one degree of freedom."""
     w = np.array([1.0, 0.6180339887])

@@ -72,6 +72,7 @@ def apart(one, two):
     return max(np.max(np.abs(one.qs - two.qs)), np.max(np.abs(one.ps - two.ps)))
 
 
+@pytest.mark.slow
 def test_the_lagrangian_of_the_paper_is_its_kepler_problem():
     """Values, trajectories, and explicit where that is."""
     H_D, exact = dvi.legendre(kepler_lagrangian), KEPLER.system.H_D
@@ -88,6 +89,7 @@ def test_the_lagrangian_of_the_paper_is_its_kepler_problem():
     assert apart(run(dvi.legendre(printed), Q, P, 10), run(exact, Q, P, 10)) > 1e-2
 
 
+@pytest.mark.slow
 def test_a_continuous_lagrangian_gives_its_hamiltonian():
     """Against H by hand; one that is not quadratic too, up to momenta far beyond its mass."""
     H = dvi.legendre(curved)
@@ -140,6 +142,7 @@ def test_one_map_by_each_of_its_generating_functions():
     assert wrong > 1e-3  # type II with H⁻ in place of H_D
 
 
+@pytest.mark.slow
 def test_velocities_that_are_round_off_of_positions_are_found():
     """At small h, near turning points, v is known to eps |q0|/h only: no NaN comes of that."""
     H_D, h = jax.jit(jax.vmap(CURVED, in_axes=(None, None, 0, 0, None))), 1e-3
@@ -209,6 +212,7 @@ def lagrangian_of(H_D):
     return L_d
 
 
+@pytest.mark.slow
 def test_type_ii_to_type_i_and_back():
     q, p = jnp.array([0.3]), jnp.array([0.4])
     round_trip = dvi.from_lagrangian(lagrangian_of(backwards))
@@ -374,6 +378,7 @@ def test_gradients_go_through_the_inner_solve(adapt):
     assert np.min(np.abs(reverse)) > 1e-4
 
 
+@pytest.mark.slow
 def test_a_batch_is_the_loop_and_a_lost_lane_spoils_no_other():
     """Of log cosh v the momenta are between −1 and 1: beyond there is no v."""
     H_D = dvi.legendre(lambda t0, t1, q, v, args: jnp.sum(jnp.log(jnp.cosh(v))) - jnp.sum(q**2) / 2)

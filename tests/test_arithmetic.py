@@ -91,6 +91,7 @@ def ensemble_error(arithmetic, num_steps, h, starts=32):
     return np.asarray(last(q, p))
 
 
+@pytest.mark.slow
 def test_compensated_runs_lose_less():
     plain = ensemble_error(dvi.FloatingPoint(), 100_000, 2.0**-5)
     compensated = ensemble_error(dvi.Compensated(), 100_000, 2.0**-5)
@@ -136,6 +137,7 @@ def pairs():
 
 
 @pytest.mark.parametrize(("system", "method"), pairs())
+@pytest.mark.slow
 def test_every_method_is_the_same_in_local_coordinates(system, method):
     """The same map to round-off, with as many iterations, and a state that is not the same bits."""
     plain, one = final_state(system, method, dvi.FloatingPoint())
@@ -208,6 +210,7 @@ def test_memory_goes_along_in_pieces_and_in_batches():
     np.testing.assert_allclose(batch[1], run(q / 2, p / 2).qs, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_compensation_works_in_single_precision():
     """Against double precision: the error of float32 without it is ten times as large."""
     s = dvi.System(pendulum)
@@ -227,6 +230,7 @@ def test_compensation_works_in_single_precision():
     assert compensated < plain / 10
 
 
+@pytest.mark.slow
 def test_a_lane_that_fails_leaves_the_others_alone():
     s = KEPLER.system
     q = jnp.array([[1.0, 0.0], [0.0, 0.0], [0.9, 0.1]])
@@ -293,6 +297,7 @@ ROUTES = [
 
 
 @pytest.mark.parametrize(("orbit", "route"), ROUTES)
+@pytest.mark.slow
 def test_fixed_point_comes_back_bit_for_bit(orbit, route):
     """A million steps forth and as many back; plain and compensated sums do not come back."""
     methods = THERE_AND_BACK[route]
@@ -405,6 +410,7 @@ def test_rounding_is_odd_and_has_slope_one():
     np.testing.assert_array_equal(jax.vmap(jax.grad(lambda x: 3 * to_grid(x, 1.0)))(x), 3)
 
 
+@pytest.mark.slow
 def test_leaving_the_range_is_told():
     """A free particle: q = n after n steps, up to 2⁵³ quanta."""
     free = dvi.System(lambda t0, t1, q0, p1, args: jnp.sum(p1**2) / 2)

@@ -210,6 +210,7 @@ def test_certify_a_method_of_ones_own():
     assert "symplecticity" not in page.split("## Your own method")[0].split("## What")[0]
 
 
+@pytest.mark.slow
 def test_certify_tells_a_false_promise():
     liar = altered(dvi.TypeII(), is_symmetric=True)
     found = certify({"liar": liar, "honest": dvi.TypeII()}, ["reversal"])
@@ -222,6 +223,7 @@ def test_certify_tells_a_false_promise():
     assert "| honest | not claimed (" in str(found)
 
 
+@pytest.mark.slow
 def test_a_control_that_passes_is_told(monkeypatch):
     tried = (
         Control("Strang as it is", "reversal", dvi.Strang()),
@@ -269,6 +271,7 @@ def command(*words):
     return CliRunner().invoke(app, ["certify", *map(str, words)], env={"COLUMNS": "150"})
 
 
+@pytest.mark.slow
 def test_command_writes_the_page(tmp_path):
     page = tmp_path / "sub" / "page.md"
     result = command("--method", "RungeKutta4", "--check", "reversal", "--out", page)
@@ -280,6 +283,7 @@ def test_command_writes_the_page(tmp_path):
     assert page_for(tmp_path) == page_for(tmp_path / "new").parent.parent / "certificate.md"
 
 
+@pytest.mark.slow
 def test_command_fails_with_a_method(monkeypatch):
     monkeypatch.setitem(METHODS, "Liar", altered(dvi.RungeKutta4(), is_symmetric=True))
     result = command("--method", "Liar", "--check", "reversal")

@@ -93,6 +93,7 @@ def test_help_and_refusals_import_no_jax(words, code):
     assert out or said
 
 
+@pytest.mark.slow
 def test_a_command_at_work_imports_jax():
     """The control of the test above: it would be seen."""
     code, heavy, _, _ = ended("systems", "keppler")
@@ -100,6 +101,7 @@ def test_a_command_at_work_imports_jax():
     assert {"jax", "dvi_jax", "numpy"} <= set(heavy.split(","))
 
 
+@pytest.mark.slow
 def test_help_takes_a_fraction_of_what_jax_takes_to_import():
     """Measured in turn in one test, so that a busy machine slows all of them."""
     import time
@@ -265,6 +267,7 @@ def test_an_exception_that_nobody_foresaw(monkeypatch, as_json):
         command("systems", "--debug", catch_exceptions=False)
 
 
+@pytest.mark.slow
 def test_debug_shows_the_traceback_and_keeps_the_exit_code():
     code = "from dvi_jax_cli import main; main()"
     done = process(code, "run", "nowhere.toml", "--debug", "--json")
@@ -404,6 +407,7 @@ def test_its_run(inside):
     assert found["results"]["energy_range"]["value"] > 1e-3
 
 
+@pytest.mark.slow
 def test_its_sweep(inside):
     result = command("sweep", "sweep.toml", "--json")
     assert result.exit_code == 0, result.output

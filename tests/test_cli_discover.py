@@ -72,6 +72,7 @@ def command(*words):
     return CliRunner().invoke(app, ["discover", *(str(w) for w in words)])
 
 
+@pytest.mark.slow
 def test_a_small_discovery(folder):
     """What the undisturbed map of type II keeps, (p² + q² − h q p)/2, drifts by ε."""
     result = command(write(folder, SMALL), "--json")

@@ -112,6 +112,7 @@ def setup(folder, text):
 # What a fit finds and writes
 
 
+@pytest.mark.slow
 def test_a_small_fit(folder):
     result = command(write(folder, SMALL), "--json")
     assert result.exit_code == 0, result.output

@@ -119,6 +119,7 @@ def assert_same(a, b):
 # What a file means
 
 
+@pytest.mark.slow
 def test_the_same_sweep_in_python(folder):
     """A store goes on for the very same sweep alone: axes, methods, functions, to the last bit."""
     text = """
@@ -205,6 +206,7 @@ def test_starts(folder, kind):
     assert q.shape == p.shape == (1,)
 
 
+@pytest.mark.slow
 def test_the_example_and_every_key_in_it(folder):
     result = command(EXAMPLE)
     assert result.exit_code == 0, result.output
@@ -220,6 +222,7 @@ def test_the_example_and_every_key_in_it(folder):
         assert shown_elsewhere or f"{key} = " in text or f"[{key}]" in text, key
 
 
+@pytest.mark.slow
 def test_observables_of_several_numbers_on_given_times(folder):
     text = SMALL.replace('"own.py:energy"\n', '"own.py:both"\n', 1) + "\n"
     text = text.replace("h = 0.1\nsteps = 30", "lattice = {times = [0.0, 0.1, 0.3]}")
@@ -233,6 +236,7 @@ def test_observables_of_several_numbers_on_given_times(folder):
 # Stores
 
 
+@pytest.mark.slow
 def test_a_store_goes_on_with_resume_alone(small):
     before = contents("out.zarr")
     again = command(small)
@@ -258,6 +262,7 @@ def test_a_store_goes_on_with_resume_alone(small):
     assert_same(contents("other.zarr"), before)
 
 
+@pytest.mark.slow
 def test_another_sweep_is_not_mixed_in(folder, small):
     before = contents("out.zarr")
     path = write(folder, SMALL.replace("h = 0.1", "h = 0.2").replace("k = 1.0", "k = 1.5"))
@@ -304,6 +309,7 @@ def test_a_place_that_is_no_store(folder):
         assert "there is no sweep here" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_flipped_byte_is_found_and_repaired(folder, small):
     before = contents("out.zarr")
     assert command("verify", "out.zarr").exit_code == 0

@@ -34,6 +34,7 @@ print(sol.status)
 """
 
 
+@pytest.mark.slow
 def test_configured_process_runs():
     done = run(CONFIGURE)
     flags, status = done.stdout.splitlines()
@@ -42,6 +43,7 @@ def test_configured_process_runs():
     assert "vector_width=512" in flags
 
 
+@pytest.mark.slow
 def test_flags_of_the_users_are_left_alone():
     own = "--xla_cpu_prefer_vector_width=128 --xla_cpu_max_isa=AVX2"
     flags = run(CONFIGURE, XLA_FLAGS=own).stdout.splitlines()[0]

@@ -74,6 +74,7 @@ def cases(quick, names):
     ("name", "method"),
     cases([("double_pendulum", "TypeII"), ("kepler", "Strang")], ["kepler", "double_pendulum"]),
 )
+@pytest.mark.slow
 def test_tangent_map_is_the_derivative_of_the_run(name, method):
     """Against differences of runs, with a force; without the force it is another one."""
     of = flow(SYSTEMS[name][0], KINDS[method], 0.1, num_steps=5, epsilon=0.3)
@@ -111,6 +112,7 @@ def test_tangent_map_of_a_perturbation_is_symplectic():
         assert defect < 1e-13 if fine else defect > 1e-7
 
 
+@pytest.mark.slow
 def test_tangent_map_by_its_own_door():
     """One step if nothing is said; all of those of a lattice of given times."""
     system, q, p = SYSTEMS["kepler"]
@@ -128,6 +130,7 @@ def test_a_whole_number_of_numpy():
     assert found.shape == (2,)
 
 
+@pytest.mark.slow
 def test_tangent_map_on_other_lattices_and_arithmetic():
     plain = tangent("non_separable", dvi.Strang(), 0.3)
     by_sum = tangent("non_separable", dvi.Strang(), 0.3, arithmetic=dvi.Compensated())
@@ -140,6 +143,7 @@ def test_tangent_map_on_other_lattices_and_arithmetic():
     assert np.max(np.abs(plain - given)) < 1e-13
 
 
+@pytest.mark.slow
 def test_bodies_in_space():
     """A state of shape (3, 2): the order of the components is that of ravel."""
     eight = systems.figure_eight()
@@ -163,6 +167,7 @@ def damping(t0, t1, q0, p1, args):
     return -p1
 
 
+@pytest.mark.slow
 def test_lyapunov_exponents_of_a_damped_linear_system():
     """Those of its map: logarithms of the eigenvalues' sizes; their sum is that of its volume."""
     system = dvi.System(linear, force=damping)
@@ -194,6 +199,7 @@ def by_scipy(start, first, t):
 
 
 @pytest.mark.parametrize("start", [REGULAR, CHAOTIC], ids=["regular", "chaotic"])
+@pytest.mark.slow
 def test_growth_and_megno_are_those_of_the_variational_equations(start):
     """SciPy on equations by hand, the same first vector: the same logarithm and ⟨Y⟩."""
     first = np.asarray(dvi.MEGNO().start(jnp.zeros(4))[0][0])
@@ -210,6 +216,7 @@ def test_growth_and_megno_are_those_of_the_variational_equations(start):
     assert 1.7 < np.log2(errors[0] / errors[1]) < 2.3  # its integrals are midpoint sums
 
 
+@pytest.mark.slow
 def test_the_first_exponents_do_not_depend_on_how_many_are_asked_for():
     few = run(HENON.system, *CHAOTIC, dvi.LyapunovSpectrum(2), num_steps=2000).observed
     assert np.max(np.abs(few - observed("chaotic", 2000)["lyapunov"][:2])) < 1e-12
@@ -271,6 +278,7 @@ def test_many_deviation_vectors():
     assert np.max(np.abs(slope)) > 1e-3
 
 
+@pytest.mark.slow
 def test_indicators_in_single_precision():
     """A running sum of 10⁶ steps is off by per cents in float32; these are not."""
     spring = dvi.System(
@@ -286,6 +294,7 @@ def test_indicators_in_single_precision():
     assert abs(float(np.cumsum(np.full(1_000_000, 0.05, np.float32))[-1]) / 50_000 - 1) > 5e-3
 
 
+@pytest.mark.slow
 def test_backwards_the_exponents_change_their_signs():
     """Of a damped system: what shrank grows, and ⟨Y⟩ with it."""
     system = dvi.System(linear, force=damping)
@@ -303,6 +312,7 @@ def test_backwards_the_exponents_change_their_signs():
 # MEGNO
 
 
+@pytest.mark.slow
 def test_megno_tells_order_from_chaos():
     regular, chaotic = (observed(s, 400_000, every=40_000) for s in ("regular", "chaotic"))
     away = np.abs(regular["megno"] - 2)
@@ -323,6 +333,7 @@ def pendulum(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 - jnp.sum(jnp.cos(q0))
 
 
+@pytest.mark.slow
 def test_megno_with_a_disturbing_force():
     """A pendulum near its separatrix, driven: torus at small ε, chaos at larger ones."""
     system, args = dvi.System(pendulum, force=drive), {"frequency": 1.1}
@@ -346,6 +357,7 @@ def test_megno_with_a_disturbing_force():
     assert abs(spectrum[2].sum()) < 1e-12  # a force without p keeps the volume
 
 
+@pytest.mark.slow
 def test_megno_of_three_bodies_is_that_of_rebound():
     """A planet beside Jupiter: 2 where it is stable, for both, and large where it is not."""
     rebound = pytest.importorskip("rebound")
@@ -388,6 +400,7 @@ def brute_force(start, num_steps):
 
 
 @pytest.mark.parametrize("start", ["regular", "chaotic"])
+@pytest.mark.slow
 def test_gali_and_sali_are_volumes_of_unit_vectors(start):
     for num_steps in (1, 100, 1000):
         found = observed(start, num_steps)
@@ -399,6 +412,7 @@ def test_gali_and_sali_are_volumes_of_unit_vectors(start):
     assert abs(np.log10(plain[1]) - observed("regular", 100)["sali"]) < 1e-12
 
 
+@pytest.mark.slow
 def test_gali_of_chaos_falls_as_its_exponents_say():
     """ln GALI_k(t) = −Σ (λ_1 − λ_i) t, far beyond round-off."""
     num_steps = 100_000
@@ -411,6 +425,7 @@ def test_gali_of_chaos_falls_as_its_exponents_say():
     assert abs(found["sali"] - found["gali"][0]) < 1e-9  # of a small angle
 
 
+@pytest.mark.slow
 def test_gali_of_a_torus_of_two_dimensions_falls_by_powers():
     """GALI_2 stays, GALI_3 ~ t⁻², GALI_4 ~ t⁻⁴."""
     found = observed("regular", 400_000, every=40_000)["gali"]
@@ -419,6 +434,7 @@ def test_gali_of_a_torus_of_two_dimensions_falls_by_powers():
     assert np.max(np.abs(slopes - [0, -2, -4])) < 0.25
 
 
+@pytest.mark.slow
 def test_what_is_too_small_for_a_number_is_zero_and_its_logarithm_is_told():
     found = run(
         HENON.system, *CHAOTIC, (dvi.GALI(4), dvi.GALI(4, log10=True)), num_steps=200_000
@@ -430,6 +446,7 @@ def test_what_is_too_small_for_a_number_is_zero_and_its_logarithm_is_told():
 # What they have in common
 
 
+@pytest.mark.slow
 def test_units_do_not_matter_in_the_limit():
     scaled = run(
         HENON.system, *REGULAR, dvi.MEGNO(scale=(10.0, np.array([1.0, 3.0]))), num_steps=400_000
@@ -439,6 +456,7 @@ def test_units_do_not_matter_in_the_limit():
     assert abs(scaled - 2) < 0.01
 
 
+@pytest.mark.slow
 def test_running_values_are_those_of_shorter_runs():
     along = observed("chaotic", 2000, every=500)
     for i, n in enumerate((500, 1000, 1500, 2000)):
@@ -446,6 +464,7 @@ def test_running_values_are_those_of_shorter_runs():
             assert np.max(np.abs(along[name][i] - value)) < 1e-7, name
 
 
+@pytest.mark.slow
 def test_running_values_beside_others():
     energy = HENON.observables["energy"]
     mean_energy = dvi.Mean(energy)
@@ -464,6 +483,7 @@ def test_running_values_beside_others():
     ).observed)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_running_values_with_progress_and_in_few_steps():
     """Cut into pieces, or saved once in a long block: the same numbers."""
     options = {"num_steps": 600, "save": dvi.Save(every=300)}
@@ -496,6 +516,7 @@ def test_batches_and_layouts():
                 assert np.max(np.abs(a - b[i])) < 1e-8
 
 
+@pytest.mark.slow
 def test_an_orbit_that_escapes_has_a_status_and_no_number():
     q, p = (
         np.array([[0.0, 0.1], [0.0, 1.5], [0.0, 0.1]]),
@@ -541,6 +562,7 @@ def test_a_failure_in_the_very_last_step_leaves_no_number():
     assert np.isnan(sol.observed[1]).all()
 
 
+@pytest.mark.slow
 def test_gradients_of_an_indicator():
     """d⟨Y⟩/dε by reverse and forward mode against differences."""
     system = dvi.System(pendulum, force=drive)
@@ -579,6 +601,7 @@ def test_memory_does_not_grow_with_the_steps():
     assert stored.output_size_in_bytes > 1_000_000  # what is saved at every step does grow
 
 
+@pytest.mark.slow
 def test_indicators_under_sweep():
     """Orbits and ε in a grid, with a status beside each number; the same as one by one."""
     system = dvi.System(HENON.system.H_D, force=lambda t0, t1, q0, p1, args: -p1)

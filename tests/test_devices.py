@@ -79,6 +79,7 @@ print("together")
 """
 
 
+@pytest.mark.slow
 def test_the_library_can_be_made_before_the_hosts_are_joined():
     """Importing the package and making its problems starts no device."""
     out = run([sys.executable, "-c", HOST_FIRST, "not touched"], JAX_ENABLE_X64="1")

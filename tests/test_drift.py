@@ -47,6 +47,7 @@ def synthetic(drifts, floor=1e-15, epsilons=EPSILONS):
     return drift._order(np.asarray(epsilons), given, np.array([True]))
 
 
+@pytest.mark.slow
 def test_kept_form_of_the_map_drifts_to_first_order():
     measured = usual()
     assert measured.used.all()
@@ -211,6 +212,7 @@ def test_single_precision_has_its_own_floor():
     assert measured.slope == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_steps():
     def scratch(num_steps):
         lanes = jnp.ones(64), (jnp.ones((64, 1)), jnp.ones((64, 1)))
@@ -281,6 +283,7 @@ def test_surface_has_an_order_at_each_h_and_none_where_it_failed():
     assert "above round-off at 1 of 3 step sizes" in str(surface)
 
 
+@pytest.mark.slow
 def test_pictures_show_what_was_excluded():
     with plot.style():
         axis = plot.drift_orders({"kept": usual(), "energy": sweep(ENERGY)}, [1, None])

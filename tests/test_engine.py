@@ -98,6 +98,7 @@ def test_a_slow_lane_does_not_change_its_neighbours():
     np.testing.assert_array_equal(together[1][:3], [k for _, k in alone[:3]])
 
 
+@pytest.mark.slow
 def test_root_derivatives_are_those_of_the_implicit_function():
     def root(a):
         return find_root(lambda x: x**3 - a, jnp.array([1.0]), jnp.array([1.0]), Newton())[0][0]

@@ -85,6 +85,7 @@ def test_crossings_converge_with_the_order_of_the_method(order):
     np.testing.assert_allclose(orders, order, atol=0.2)
 
 
+@pytest.mark.slow
 def test_direction_is_chosen():
     up, down, both = (crossings_of(2, d, 0.01) for d in (1, -1, 0))
     assert (int(up.count), int(down.count), int(both.count)) == (2, 2, 4)
@@ -94,6 +95,7 @@ def test_direction_is_chosen():
     np.testing.assert_array_equal(together, both.ts[:4])
 
 
+@pytest.mark.slow
 def test_crossings_beyond_the_room_are_counted():
     sol = kepler(observe=dvi.Section(on_axis, max_crossings=3))
     assert int(sol.observed.count) == 4
@@ -167,6 +169,7 @@ def test_requested_times_have_the_order_of_the_method(order):
     np.testing.assert_allclose(measured_orders(errors, 2.0, 1e-12), order, atol=0.3)
 
 
+@pytest.mark.slow
 def test_requested_times_on_the_lattice_are_the_lattices_states():
     every = kepler(save=dvi.Save(every=100), observe={"L": momentum, "max": dvi.MaxDrift(momentum)})
     asked = kepler(
@@ -178,6 +181,7 @@ def test_requested_times_on_the_lattice_are_the_lattices_states():
     np.testing.assert_allclose(asked.hs[1:], every.hs, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_several_times_in_one_step_and_backwards():
     ts = np.array([-0.001, -0.002, -0.0021, -0.5])
     back = kepler(-0.02, 30, save=dvi.Save(ts=ts))
@@ -186,6 +190,7 @@ def test_several_times_in_one_step_and_backwards():
     assert np.abs(np.diff(np.asarray(ahead.qs[:, 1]))).min() > 1e-5
 
 
+@pytest.mark.slow
 def test_times_outside_of_the_run():
     late = kepler(num_steps=50, save=dvi.Save(ts=[0.5, 1.0, 1.01]), throw=False)
     assert late.status == "not_reached"
@@ -207,6 +212,7 @@ def test_gradient_in_the_requested_times_is_the_velocity():
         np.testing.assert_allclose(slope, p, rtol=1e-3)  # of the map's curve: order h²
 
 
+@pytest.mark.slow
 def test_a_clock_of_ones_own():
     """States at given angles of the pendulum that turns over."""
     system = dvi.System(lambda t0, t1, q, p, args: jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q)))
@@ -388,6 +394,7 @@ def test_conditions_in_place_of_functions_are_refused():
         kepler(num_steps=3, save=dvi.Save(ts=[0.1], clock=lambda t, q, p, args: q))
 
 
+@pytest.mark.slow
 def test_a_balance_needs_lattice_points():
     sol = kepler(num_steps=4, method=dvi.TypeII(), save=dvi.Save(ts=np.linspace(0.01, 0.07, 5)))
     with pytest.raises(ValueError, match="saved at times of their own"):
@@ -395,6 +402,7 @@ def test_a_balance_needs_lattice_points():
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.slow
 def test_every_lattice_time_is_reached_whatever_its_last_digit(dtype):
     """t0 + k h in a compiled loop may differ by rounding from what the user reads off or computes.
 

@@ -76,6 +76,7 @@ def test_the_truth_is_found(regular):
     np.testing.assert_allclose(found.predicted[0] + found.residuals[0], data.values, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_what_is_predicted_between_lattice_points_is_of_the_method(regular):
     """The same as `Save(ts=...)` to the order of the method, and not to a lower one."""
     errors = []
@@ -93,6 +94,7 @@ def test_what_is_predicted_between_lattice_points_is_of_the_method(regular):
     assert 3.4 < errors[0] / errors[1] < 4.6
 
 
+@pytest.mark.slow
 def test_lattice_points_are_picked():
     problem, u = problem_of(dvi.Observations(REGULAR, np.zeros((60, 1)), sigma=1.0, t0=0.0), TRUE)
     assert problem.groups[0].block == 10
@@ -105,6 +107,7 @@ def test_lattice_points_are_picked():
 
 
 @pytest.mark.parametrize("ts", [REGULAR, IRREGULAR], ids=["regular", "irregular"])
+@pytest.mark.slow
 def test_jacobian_against_differences(ts):
     problem, u = problem_of(dvi.Observations(ts, np.zeros((60, 1)), sigma=1.0, t0=0.0))
     J = np.asarray(problem.evaluate(u).jacobian)
@@ -132,6 +135,7 @@ def test_adjoints_agree(ts):
         np.testing.assert_allclose(backward, forward, rtol=1e-8, atol=1e-8 * np.abs(forward).max())
 
 
+@pytest.mark.slow
 def test_covariance_is_the_inverse_of_the_exact_hessian_at_a_perfect_fit():
     exact = np.asarray(states_at(REGULAR).qs)
     data = dvi.Observations(REGULAR, exact, sigma=NOISE, t0=0.0)
@@ -159,6 +163,7 @@ def test_errors_found_from_the_residuals():
     np.testing.assert_allclose(unknown.sigma, known.sigma * spread, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_direction_that_is_not_determined_is_named():
     def model(params):
         return MODEL({"epsilon": params["a"] + 2 * params["b"], "q0": params["q0"]}) | {
@@ -180,6 +185,7 @@ def test_a_direction_that_is_not_determined_is_named():
     assert "not determined" in str(found)
 
 
+@pytest.mark.slow
 def test_bounds_hold_and_are_named():
     data = dvi.Observations(REGULAR, noisy(REGULAR, 4), sigma=NOISE, t0=0.0)
     inside = dvi.fit(MODEL, data, START)
@@ -207,6 +213,7 @@ def test_a_prior_weighs_as_a_measurement():
     assert both.degrees_of_freedom == free.degrees_of_freedom + 1
 
 
+@pytest.mark.slow
 def test_outliers_pull_a_robust_loss_less():
     y = noisy(REGULAR, 7)
     y[[5, 20, 21, 40]] += 1.0
@@ -254,6 +261,7 @@ def test_a_likelihood_with_an_unknown_noise_level():
     np.testing.assert_allclose(found.sigma[2], 1 / np.sqrt(2 * 60), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_arcs_of_unlike_length_share_parameters():
     rng = np.random.default_rng(9)
     starts, arcs = rng.uniform(0.5, 1.5, (5, 1)), []
@@ -273,6 +281,7 @@ def test_arcs_of_unlike_length_share_parameters():
     assert (found.sigma[:2] < alone.sigma[:2]).all()
 
 
+@pytest.mark.slow
 def test_momenta_states_and_functions_are_observed():
     sol = states_at(REGULAR)
     both = np.concatenate([sol.qs, sol.ps], 1)
@@ -287,6 +296,7 @@ def test_momenta_states_and_functions_are_observed():
         np.testing.assert_allclose(found.x, [1.3, 0.02, 1.0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_backwards_in_time():
     back = -REGULAR
     sol = dvi.integrate(
@@ -323,6 +333,7 @@ def test_horizons_lead_where_everything_at_once_misleads():
     ],
     ids=["dogleg", "gauss-newton", "bfgs", "adam"],
 )
+@pytest.mark.slow
 def test_other_optimisers_find_the_same(regular, optimiser):
     data, found = regular
     is_optax = isinstance(optimiser, optax.GradientTransformation)
@@ -415,6 +426,7 @@ def test_resumed_with_the_same_bits(kind, tmp_path, monkeypatch):
     np.testing.assert_array_equal(again.covariance, whole.covariance)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "_EVERY", 0.0)
     data = dvi.Observations(REGULAR, noisy(REGULAR, 11), sigma=NOISE, t0=0.0)
@@ -476,6 +488,7 @@ def test_more_steps_go_on_from_the_checkpoint(regular, tmp_path, monkeypatch):
 # --- statuses and errors that must not lie: each of these once said otherwise --------------------
 
 
+@pytest.mark.slow
 def test_nearly_collinear_parameters_are_followed_to_the_minimum():
     small = 1e-5
 
@@ -494,6 +507,7 @@ def test_nearly_collinear_parameters_are_followed_to_the_minimum():
 
 
 @pytest.mark.parametrize("bounds", [dvi.Bounds(0.0), dvi.Bounds(0.0, 1.0)], ids=["one", "two"])
+@pytest.mark.slow
 def test_a_start_next_to_a_bound(bounds, regular):
     data, found = regular
     near = dvi.fit(MODEL, data, {**START, "epsilon": 1e-6}, bounds={"epsilon": bounds})
@@ -501,6 +515,7 @@ def test_a_start_next_to_a_bound(bounds, regular):
     assert near.at_bounds == []
 
 
+@pytest.mark.slow
 def test_a_small_parameter_is_not_at_its_bound():
     data = dvi.Observations(REGULAR, np.asarray(states_at(REGULAR).qs), sigma=1e-7, t0=0.0)
 
@@ -525,6 +540,7 @@ def test_a_piece_that_converged_is_not_the_whole():
         assert cut.sigma[0] < 2e-3  # of all the data
 
 
+@pytest.mark.slow
 def test_undetermined_parameters_take_no_degree_of_freedom():
     few = dvi.Observations(REGULAR[:6], noisy(REGULAR, 14)[:6], t0=0.0)
 
@@ -594,6 +610,7 @@ def with_drag(force):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_sizes_in_a_module_are_not_fitted():
     data = dvi.Observations(REGULAR, noisy(REGULAR, 1), sigma=NOISE, t0=0.0)
     found = dvi.fit(
@@ -636,6 +653,7 @@ def test_too_few_steps_raise_and_keep_what_was_found(regular):
     assert quiet.result == dvi.FIT_RESULTS.max_steps_reached
 
 
+@pytest.mark.slow
 def test_a_failed_trajectory_far_off_does_not_end_the_fit():
     """A trial step that leaves the region where the model has an answer is taken back."""
 
@@ -649,6 +667,7 @@ def test_a_failed_trajectory_far_off_does_not_end_the_fit():
     np.testing.assert_allclose(np.sqrt(found.x[0]) * 2, 1.3, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_multiple_shooting_agrees_with_single(regular):
     data, found = regular
     apart = dvi.fit(MODEL, data, START, shooting=dvi.MultipleShooting(6))
@@ -688,6 +707,7 @@ def test_multiple_shooting_where_single_is_lost():
     assert np.abs((from_positions.x - truth) / from_positions.sigma).max() < 3.5
 
 
+@pytest.mark.slow
 def test_multiple_shooting_from_the_models_own_trajectory(regular):
     """Segments that meet from the first step on must not hold the parameters fast."""
     data, found = regular
@@ -695,6 +715,7 @@ def test_multiple_shooting_from_the_models_own_trajectory(regular):
     assert np.abs((apart.x - found.x) / found.sigma).max() < 1e-2
 
 
+@pytest.mark.slow
 def test_a_guess_may_be_given_or_refused(regular):
     data, found = regular
 

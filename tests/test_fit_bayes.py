@@ -82,6 +82,7 @@ def student(predicted, observed, sigma, params):
     ],
     ids=["least squares", "unknown errors", "Cauchy", "likelihood"],
 )
+@pytest.mark.slow
 def test_slopes_against_differences(loss, sigma):
     data = swinging(sigma)
     about = {"bounds": LIMITS, "loss": loss, "priors": {"args": {"k": dvi.Prior(1.0, 0.02)}}}
@@ -99,6 +100,7 @@ def test_slopes_against_differences(loss, sigma):
     assert not np.allclose(slope * (1 + 3e-8), by_differences, rtol=1e-8, atol=0)
 
 
+@pytest.mark.slow
 def test_second_derivatives_and_both_modes():
     posterior = dvi.Posterior(OSCILLATOR, swinging(), NEAR, gradient="forward")
     u, d = jnp.asarray(posterior.start), jnp.array([1.0, -2.0, 0.5])
@@ -111,6 +113,7 @@ def test_second_derivatives_and_both_modes():
     np.testing.assert_allclose(jax.jvp(slope, (u,), (d,))[1], by_differences, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_priors_and_bounds_are_meant_in_x():
     """∫ exp(−U(u)) du over a part of u is the mass of the density of x there."""
     limits = {"p0": dvi.Bounds(0.8, 1.0), "q0": dvi.Bounds(lower=0.05)}
@@ -154,6 +157,7 @@ def test_unknown_errors_are_integrated_out():
     assert np.abs(found - found[0] - plug_in + plug_in[0]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_a_failing_trajectory_has_density_0_and_no_nan():
     def explosive(t0, t1, q0, p1, args):
         return p1 @ p1 / 2 - jnp.sum(jnp.exp(args["b"] * q0))
@@ -173,6 +177,7 @@ def test_a_failing_trajectory_has_density_0_and_no_nan():
         posterior.laplace([9.0])
 
 
+@pytest.mark.slow
 def test_the_mode_and_its_covariance():
     data = on_a_line()
     posterior = dvi.Posterior(LINE, data, {"q0": np.array([3.0]), "p0": np.array([-2.0])})
@@ -188,6 +193,7 @@ def test_the_mode_and_its_covariance():
 # --- draws ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_draws_of_a_linear_problem_have_the_mean_and_sigma_of_the_fit(monkeypatch):
     data = on_a_line()
     fit = dvi.fit(LINE, data, PAIR)
@@ -237,6 +243,7 @@ def truncated():
 
 
 @pytest.mark.parametrize("is_right", [True, False], ids=["right", "log-Jacobian left out"])
+@pytest.mark.slow
 def test_a_parameter_at_its_bound_has_the_truncated_distribution(monkeypatch, is_right):
     data, mean, sigma = truncated()
     expected = contextlib.nullcontext()
@@ -262,6 +269,7 @@ def test_a_parameter_at_its_bound_has_the_truncated_distribution(monkeypatch, is
         assert wider > 0.5
 
 
+@pytest.mark.slow
 def test_epsilon_of_a_disturbed_orbit_is_recovered():
     model = dvi.Model(
         dvi.System(kepler, force=lambda t0, t1, q0, p1, args: -q0), h=0.05,

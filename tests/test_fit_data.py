@@ -158,6 +158,7 @@ def test_a_robust_loss_has_a_positive_scale(loss):
         loss(-1.0)
 
 
+@pytest.mark.slow
 def test_fewer_values_than_parameters():
     few = dvi.Observations(TS[:1], VALUES[:1], sigma=0.1, t0=0.0)
     params = {"epsilon": 0.0, "args": {"k": 1.0}}
@@ -167,6 +168,7 @@ def test_fewer_values_than_parameters():
     assert fit(data=few, params=params, priors=priors).degrees_of_freedom == 0
 
 
+@pytest.mark.slow
 def test_a_wrong_unit_can_be_meant():
     found = fit(
         data=dvi.Observations(TS, 1e4 * VALUES, sigma=1.0, t0=0.0), check_units=False, throw=False
@@ -179,6 +181,7 @@ def test_single_precision_is_refused():
         fit()
 
 
+@pytest.mark.slow
 def test_missing_values_do_not_count():
     holes = VALUES.copy()
     holes[::3] = np.nan

@@ -70,6 +70,7 @@ def is_exact(name, seed):
     return it
 
 
+@pytest.mark.slow
 def test_finds_exactly_the_damped_cubic_among_twenty():
     it = is_exact("damped", 0)
     assert len(ONE) == 20
@@ -79,6 +80,7 @@ def test_finds_exactly_the_damped_cubic_among_twenty():
     assert "\n  q³  -0." in str(it)
 
 
+@pytest.mark.slow
 def test_the_identified_system_is_ready_for_discovery():
     """Friction forbids what the cubic alone has: an invariant of first order."""
     samples = np.random.default_rng(0).uniform(-1, 1, (2, 120, 1))
@@ -96,6 +98,7 @@ def test_the_identified_system_is_ready_for_discovery():
     assert d.coefficients[0, 1, names.index("q⁴")] == pytest.approx(0.3 / 4, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_finds_exactly_the_coupling_of_two_degrees_of_freedom_among_twenty():
     assert len(TWO) == 20
     is_exact("coupled", 0)
@@ -116,6 +119,7 @@ def nothing(seed, known=True):
     return dvi.identify(RESTING, data, ONE)
 
 
+@pytest.mark.slow
 def test_noise_on_an_undisturbed_system_gives_no_term():
     it = nothing(0)
     assert it.terms == ()
@@ -143,6 +147,7 @@ SMALL = dvi.ForceLibrary(
 )
 
 
+@pytest.mark.slow
 def test_candidates_that_are_the_same_are_reported():
     truth = dvi.System(H_D, force=SMALL.with_coefficients({"spring": 0.2, "cubic": 0.1}))
     data = observed(truth, [1.2], [0.0], 150, 0, known=False)
@@ -168,6 +173,7 @@ def test_exact_data_of_an_undisturbed_system_give_no_term():
     assert it.terms == ()
 
 
+@pytest.mark.slow
 def test_a_known_force_and_parameters_are_kept_beside_the_library():
     """A model as a function: a mass to be fitted, a known spring, ε and args of its own."""
     spring = lambda t0, t1, q, p, args: -args["k"] * q  # noqa: E731
@@ -203,6 +209,7 @@ def test_a_known_force_and_parameters_are_kept_beside_the_library():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_library_is_the_sum_of_its_candidates():
     q, p = jnp.array([0.7, -0.4]), jnp.array([0.2, 0.5])
     c = {"q1 q2 e1": 2.0, "p2² e2": -3.0}

@@ -30,6 +30,7 @@ def network(n=1, seed=0, **options):
     size=st.sampled_from([1e-3, 1.0, 30.0]),
     of=st.sampled_from(["q", "qp"]),
 )
+@pytest.mark.slow
 def test_damping_never_does_positive_work(seed, size, of):
     """Whatever the weights are, with the velocity of a metric that mixes momenta."""
     M = jnp.array([[2.0, 0.3], [0.3, 0.5]])
@@ -48,6 +49,7 @@ def test_damping_never_does_positive_work(seed, size, of):
     assert np.linalg.eigvalsh(D).min() >= -1e-12 * np.abs(D).max()
 
 
+@pytest.mark.slow
 def test_the_conservative_part_is_the_slope_of_a_potential():
     net = network(3, width=5)
     q, p = jnp.array([0.3, -0.2, 0.5]), jnp.array([0.1, 0.4, -0.3])
@@ -64,6 +66,7 @@ def test_the_conservative_part_is_the_slope_of_a_potential():
     assert np.abs(J).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_parts_are_switched_off_separately():
     q, p = jnp.array([0.3]), jnp.array([0.4])
     still, free = network(dissipative=False), network(conservative=False)
@@ -77,6 +80,7 @@ def test_parts_are_switched_off_separately():
     assert network(width=6, depth=1).size == 37
 
 
+@pytest.mark.slow
 def test_an_undamped_network_keeps_its_energy_and_damping_loses_it():
     q, p = [0.8], [0.0]
 
@@ -118,6 +122,7 @@ def model(net):
     }
 
 
+@pytest.mark.slow
 def test_a_network_is_fitted_as_it_stands():
     data, net = observed(), network(width=4, depth=1)
     prior = dvi.Prior(0.0, 1.0)
@@ -137,6 +142,7 @@ def test_a_network_is_fitted_as_it_stands():
     assert least.loss < start
 
 
+@pytest.mark.slow
 def test_a_network_is_fitted_by_gradients_too():
     adam = dvi.fit(
         model, observed(), network(width=4, depth=1), priors=dvi.Prior(0.0, 1.0), horizons=None,
@@ -166,6 +172,7 @@ def test_a_network_refuses_what_cannot_be_meant(change, error, match):
         network(**change)
 
 
+@pytest.mark.slow
 def test_a_state_of_another_shape_is_refused():
     with pytest.raises(ValueError, match=r"shape \(2,\), got \(1,\)"):
         network(2).conservative(jnp.array([1.0]))

@@ -117,6 +117,7 @@ def test_arcs_have_panels_until_there_are_many():
     assert list(plot.fit_residuals(made(), axes=mine)) == list(mine)
 
 
+@pytest.mark.slow
 def test_the_sign_that_the_label_says_is_that_of_a_real_fit():
     model = dvi.Model(dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2), h=0.1, p0=jnp.ones(1))
     data = dvi.Observations([0.0, 0.1, 0.2], np.array([[0.0], [0.1], [0.8]]), sigma=0.1)

@@ -67,6 +67,7 @@ def compiled():
 
 
 @pytest.mark.parametrize("name", ["successful", "small"])
+@pytest.mark.slow
 def test_lines_of_a_torus_are_found_to_round_off(name):
     found, size = of(name), 1e-200 if name == "small" else 1.0
     assert found.status == "successful"
@@ -163,7 +164,8 @@ def test_noise_is_left_over():
     assert found.residual == pytest.approx(np.sqrt(0.02) / total, rel=0.1)
 
 
-@pytest.mark.parametrize("window", [*(pytest.param(w, marks=pytest.mark.slow) for w in (0, 1)), 2])
+@pytest.mark.parametrize("window", [0, 1, 2])
+@pytest.mark.slow
 def test_the_bias_of_a_line_not_fitted_falls_with_the_window(window):
     """|δω| ∝ T^−(2·window + 2): Laskar 1999."""
     spans = np.repeat([1.0, 2.0, 4.0], 8)  # the spacing grows and the number of samples stays
@@ -180,6 +182,7 @@ def test_the_bias_of_a_line_not_fitted_falls_with_the_window(window):
         assert errors[-1] < 1e-11
 
 
+@pytest.mark.slow
 def test_a_real_signal_has_lines_of_positive_frequency():
     x = 0.7 + np.cos(TS + 0.3) + 0.2 * np.sin(2.2 * TS)
     found = frequencies(TS, x, count=3)
@@ -190,6 +193,7 @@ def test_a_real_signal_has_lines_of_positive_frequency():
     np.testing.assert_allclose(found.evaluate(TS), x, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_real_signal_backwards_in_time_has_the_same_lines():
     x = 0.7 + np.cos(TS + 0.3) + 0.2 * np.sin(2.2 * TS)
     found = frequencies(TS[::-1], x[::-1], count=3)
@@ -231,6 +235,7 @@ def test_lines_are_evaluated_at_times_of_any_shape():
 
 
 @pytest.mark.parametrize("start", [0.0, 1000.0])
+@pytest.mark.slow
 def test_times_in_single_precision_are_uniform_to_their_rounding(start):
     h, k = float(np.float32(0.05)), np.arange(N)
     ts = (start + h * k).astype(np.float32)
@@ -313,6 +318,7 @@ def swing():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_pendulum_swings_at_the_frequency_of_the_elliptic_integral():
     """π/(2K(k)), k = sin(q0/2); q − i p turns forward."""
     omega = np.pi / (2 * special.ellipk(np.sin(1.0) ** 2))
@@ -345,6 +351,7 @@ def stars():
     )(q, p)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_diffusion_tells_chaos_from_order():
     moved = frequency_diffusion(stars(), throw=False)
     assert moved.rate.shape == (5, 2)
@@ -353,6 +360,7 @@ def test_diffusion_tells_chaos_from_order():
     assert (moved.rate[2:4] > -3).all()
 
 
+@pytest.mark.slow
 def test_diffusion_of_what_failed_is_no_number():
     moved = frequency_diffusion(stars(), throw=False)
     assert (moved.status[4] == "not_finite").all()

@@ -252,6 +252,7 @@ def one_step(system, q, newton=dvi.Newton()):
     )
 
 
+@pytest.mark.slow
 def test_status_iterations_and_residual_are_reported():
     system, q, _ = SYSTEMS["non_separable"]
     good = one_step(system, q)

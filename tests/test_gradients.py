@@ -69,8 +69,7 @@ def gradient(system, adjoint):
 
 
 def is_long(system, adjoint):
-    short = adjoint == "Reversible" and system in ("kepler", "non_separable")
-    return [] if short else [pytest.mark.slow]
+    return [] if (system, adjoint) == ("kepler", "Reversible") else [pytest.mark.slow]
 
 
 @pytest.mark.parametrize(
@@ -94,6 +93,7 @@ def test_gradient_equals_central_differences(system, adjoint):
 
 
 @pytest.mark.parametrize("system", ["kepler", "non_separable", DOUBLE_PENDULUM])
+@pytest.mark.slow
 def test_adjoints_agree_to_round_off(system):
     x = point(system)
     direct = jax.tree.leaves(gradient(system, "Direct")(x))
@@ -104,13 +104,9 @@ def test_adjoints_agree_to_round_off(system):
 
 @pytest.mark.parametrize(
     "save",
-    [
-        dvi.Save(),
-        pytest.param(dvi.Save(final=True), marks=pytest.mark.slow),
-        pytest.param(dvi.Save(every=8), marks=pytest.mark.slow),
-        pytest.param(dvi.Save(every=40), marks=pytest.mark.slow),
-    ],
+    [dvi.Save(), dvi.Save(final=True), dvi.Save(every=8), dvi.Save(every=40)],
 )
+@pytest.mark.slow
 def test_reversible_gradient_for_every_way_of_saving(save):
     x = point("kepler")
     a = jax.grad(lambda x: loss(x, "kepler", ADJOINTS["Reversible"], save=save))(x)
@@ -138,6 +134,7 @@ def test_second_derivative_and_batched_gradient():
     np.testing.assert_allclose(batch, [slope(e) for e in es], rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_gradient_through_the_times_of_a_given_lattice():
     s, q, p = SYSTEMS["kepler"]
 
@@ -155,6 +152,7 @@ def test_gradient_through_the_times_of_a_given_lattice():
         assert abs(float(g[i] - expected)) < 1e-8
 
 
+@pytest.mark.slow
 def test_gradient_into_a_module_force():
     """W as an equinox module: its arrays are differentiable, no args needed."""
     import equinox as eqx
@@ -290,14 +288,8 @@ def closing_over(mu, where, adjoint):
     return jnp.sum(sol.qs[-1]) + (0.0 if observe is None else sol.observed)
 
 
-@pytest.mark.parametrize(
-    "where",
-    [
-        "H_D",
-        "observable",
-        *(pytest.param(w, marks=pytest.mark.slow) for w in ("force", "perturbation", "partial")),
-    ],
-)
+@pytest.mark.parametrize("where", ["H_D", "observable", "force", "perturbation", "partial"])
+@pytest.mark.slow
 def test_closed_over_parameters_have_gradients(where):
     expected = jax.grad(closing_over)(1.0, where, dvi.Direct())
     assert abs(expected) > 1e-3
@@ -325,6 +317,7 @@ def shared(mu, adjoint):
     return jnp.sum(jax.vmap(lane)(jnp.array([[0.5, 0.3], [0.0, 1.2]])) ** 2)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_batch_with_a_shared_parameter():
     expected = jax.grad(shared)(1.0, "Direct")
     np.testing.assert_allclose(jax.grad(shared)(1.0, "Reversible"), expected, rtol=1e-11)
@@ -399,6 +392,7 @@ def rebuilt(num_steps, e=0.0, save=None, every=20, form="arrays", **settings):
 
 
 @pytest.mark.parametrize("form", ["arrays", "components"])
+@pytest.mark.slow
 def test_round_trip_defect_says_how_well_states_are_rebuilt(form):
     """About round-off where the map keeps volume; e^(εt/2) times that where it is damped, whatever
     way the steps are cut into pieces."""
@@ -408,6 +402,7 @@ def test_round_trip_defect_says_how_well_states_are_rebuilt(form):
     assert rebuilt(80, 5.0, every=10, save=dvi.Save(final=True), form=form) < damped / 10
 
 
+@pytest.mark.slow
 def test_round_trip_defect_is_not_invented():
     with pytest.raises(ValueError, match=r"none are: RungeKutta4 has no inverse step.*Leave"):
         rebuilt(4, method=dvi.RungeKutta4())

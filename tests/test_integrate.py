@@ -155,6 +155,7 @@ def test_given_refuses_contradictions():
 # --- observables -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_reductions_equal_numpy_on_the_full_record():
     record = run(observe={"q": position, "E": energy}, epsilon=0.2)
     E, q, t = record.observed["E"], record.observed["q"], record.ts[1:]
@@ -185,6 +186,7 @@ def test_an_observable_sees_both_ends_of_its_step():
         np.testing.assert_allclose(row, [*expected, full.qs[k, 0], full.ps[k, 0], 3.0], rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_streamed_reductions_need_no_memory_for_the_steps():
     def final(n, form):
         return lambda q: (
@@ -261,6 +263,7 @@ def test_one_trace_per_shape():
     assert go(np.ones(3), 0.1, 0.0, 1.0) > 1
 
 
+@pytest.mark.slow
 def test_progress_reports_and_changes_nothing():
     calls = []
     kwargs = {
@@ -318,6 +321,7 @@ def test_failure_later_in_the_run_keeps_what_came_before():
         dvi.integrate(system, [0.0], [1.0], h=0.2, num_steps=9)
 
 
+@pytest.mark.slow
 def test_a_failed_lane_leaves_its_neighbours_alone():
     def go(h):
         return dvi.integrate(NON_SEPARABLE, [3.0], [4.0], h=h, num_steps=10, throw=False)
@@ -403,6 +407,7 @@ def test_save_refuses_what_does_not_count(bad):
         dvi.Save(every=bad)
 
 
+@pytest.mark.slow
 def test_double_precision_input_without_x64_is_refused_with_the_line_to_add():
     code = """
 import numpy as np, jax.numpy as jnp, dvi_jax as dvi
@@ -423,6 +428,7 @@ print(dvi.integrate(s, jnp.ones(1), jnp.ones(1), h=0.1, num_steps=1).qs.dtype)
     assert out.stdout.split() == ["True", "True", "True", "float32"]
 
 
+@pytest.mark.slow
 def test_a_light_body_is_solved_as_well_as_beside_nothing():
     """Newton's test is made for each component: momenta of 1e-12 beside momenta of 1."""
 

@@ -85,9 +85,8 @@ def end_of_ours(method, epsilon, K):
     return jnp.sum(sol.qs[-1] ** 2 + sol.ps[-1])
 
 
-@pytest.mark.parametrize(
-    "method", [dvi.TypeII(), pytest.param(dvi.GaussLegendre(1), marks=pytest.mark.slow)], ids=str
-)
+@pytest.mark.parametrize("method", [dvi.TypeII(), dvi.GaussLegendre(1)], ids=str)
+@pytest.mark.slow
 def test_gradients_are_those_of_the_map(method):
     at = (EPSILON, 1.0)
     wanted = jax.grad(end_of_ours, argnums=(1, 2))(method, *at)
@@ -110,6 +109,7 @@ def test_gradients_by_other_adjoints():
     np.testing.assert_allclose([direct, forward], [wanted, wanted], rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_batch_is_the_loop():
     def end(q0):
         return by_diffrax(interop.diffrax_solver(dvi.Strang()), 1.0, q0=q0).ys[0][-1]
@@ -119,6 +119,7 @@ def test_a_batch_is_the_loop():
     np.testing.assert_allclose(together, jnp.stack([end(q) for q in starts]), rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_failed_solve_is_told_in_words_of_diffrax():
     system = dvi.System(non_separable)
     start = (jnp.array([3.0]), jnp.array([3.0]))
@@ -225,6 +226,7 @@ def test_their_solvers_take_our_term():
     np.testing.assert_allclose(sol.ys[0][-1], q, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_discrete_lagrangian_has_no_field_and_hides_no_nan():
     def L_d(t0, t1, q0, q1, args):
         return jnp.sum((q1 - q0) ** 2) / (2 * (t1 - t0)) - (t1 - t0) * jnp.sum(q0**2) / 2

@@ -53,6 +53,7 @@ def test_what_is_saved_is_labelled_by_its_time(save):
     assert np.array_equal(data.E, sol.observed["E"])
 
 
+@pytest.mark.slow
 def test_a_batch_goes_to_a_file_and_comes_back(tmp_path):
     epsilon, starts = jnp.array([0.0, 0.1, 0.2]), jnp.array([[0.0, 1.2], [0.1, 1.0]])
 

@@ -74,6 +74,7 @@ def test_what_is_known_of_the_bodies():
 
 
 @pytest.mark.parametrize("softening", [0.0, 0.3])
+@pytest.mark.slow
 def test_the_same_orbit(softening):
     sim = three_bodies(softening=softening)
     problem = interop.from_rebound(sim)

@@ -54,6 +54,7 @@ def marked(event, terminal=False, direction=0):
 
 
 @pytest.mark.parametrize("t_span", [(0.0, 6.0), (2.0, -4.0)])
+@pytest.mark.slow
 def test_states_at_given_times(t_span):
     times = np.linspace(*t_span, 12)
     wanted, found = theirs(t_span, t_eval=times), ours(t_span, t_eval=times)
@@ -68,6 +69,7 @@ def test_states_at_given_times(t_span):
     assert np.abs(undriven.y - wanted.y).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_all_lattice_points_where_none_are_asked_for():
     found = ours((0.0, 1.0), h=0.3)
     np.testing.assert_allclose(found.t, [0, 0.25, 0.5, 0.75, 1], rtol=0, atol=1e-15)
@@ -133,6 +135,7 @@ def collapse(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 + jnp.sum(q0**1.5)
 
 
+@pytest.mark.slow
 def test_a_failure_is_told_and_not_raised():
     system = dvi.System(collapse)
     found = interop.solve_ivp(system, (0.0, 4.0), [1.0, 0.0], "Strang", h=0.05)
@@ -158,6 +161,7 @@ def test_an_event_before_the_failure_is_a_success():
     np.testing.assert_allclose(found.y[0, -1], 0.8, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_bodies_are_raveled():
     problem = systems.n_body()
     y0 = np.concatenate([np.ravel(problem.q0), np.ravel(problem.p0)])
@@ -213,6 +217,7 @@ def test_y_is_q_and_then_p():
 
 
 @pytest.mark.parametrize("t_span", [(3.0, 1 / 3), (0.1, 7.3)])
+@pytest.mark.slow
 def test_both_ends_are_those_that_were_asked_for(t_span):
     # t0 + N h' is a rounding beside t1: there is a last point all the same, and it is told as t1.
     found = interop.solve_ivp(SYSTEM, t_span, Y0, "TypeII", h=0.013, args=K)
@@ -224,6 +229,7 @@ def test_both_ends_are_those_that_were_asked_for(t_span):
     np.testing.assert_allclose(at.y[:, -1], found.y[:, -1], rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_an_event_keeps_values_of_its_own():
     closures = [lambda t, y, c=c: y[0] - c for c in (0.0, 0.3)]
     found = ours((0.0, 3.0), "TypeII", events=closures)

@@ -46,6 +46,7 @@ def test_the_orbit_is_the_same_in_other_units():
     assert np.abs((other.qs[-1] - a.qs[-1]).to_value(u.au)).max() > 1e-7
 
 
+@pytest.mark.slow
 def test_what_goes_in_may_be_in_any_unit():
     a = run(SOLAR)
     b = run(

@@ -115,6 +115,7 @@ RUNS_ALL = RUNS | MORE_RUNS
 
 
 @pytest.mark.parametrize("name", [*RUNS, *SLOW])
+@pytest.mark.slow
 def test_one_kernel_and_its_numbers(name):
     """One call on CUDA, no loop beside it; interpreted it gives the numbers of arrays."""
     system, settings = RUNS_ALL[name]
@@ -168,6 +169,7 @@ def test_other_forms_make_no_kernel_without_a_gpu():
         dvi.Layout(form="gpu")  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.slow
 def test_auto_takes_the_kernel_on_cuda():
     """From 100 000 lanes × steps on; with as few as here it does not pay."""
     run, q, p = batch("kepler", "auto", save=dvi.Save(final=True), num_steps=10_000)
@@ -176,6 +178,7 @@ def test_auto_takes_the_kernel_on_cuda():
     assert calls_and_loops(lowered_for_cuda(run, q, p))[0] == 0
 
 
+@pytest.mark.slow
 def test_failing_lanes():
     """A lane that fails has the status of the plain path, and leaves its neighbours their bits."""
     system = dvi.System(lambda t0, t1, q0, p1, args: jnp.sum(p1**2) / 2 - jnp.sum(q0**4) / 4)
@@ -218,11 +221,12 @@ def gradient(form, name, save, **settings):
 @pytest.mark.parametrize(
     ("name", "save", "steps"),
     [
-        pytest.param("product", dvi.Save(every=7, final=True), 4_000, marks=pytest.mark.slow),
+        ("product", dvi.Save(every=7, final=True), 4_000),
         ("kepler", dvi.Save(final=True), 20_000),
-        pytest.param("chain", dvi.Save(every=30), 4_000, marks=pytest.mark.slow),
+        ("chain", dvi.Save(every=30), 4_000),
     ],
 )
+@pytest.mark.slow
 def test_gradients_in_two_kernels(name, save, steps):
     """One there and one back; the loops beside them are those of a linear map never applied."""
     back, start = gradient("kernel", name, save, num_steps=steps)
@@ -313,6 +317,7 @@ def test_operations_on_real_numbers(dtype):
     assert LOWERED["f"] == named
 
 
+@pytest.mark.slow
 def test_operations_on_integers_and_truth_values():
     x, y = (jnp.asarray(a.ravel(), jnp.int32) for a in np.meshgrid((-5, 0, 1, 4), (1, 2, 3)))
 

@@ -186,6 +186,7 @@ def random_function(program):
 
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(program=st.lists(STEPS, min_size=1, max_size=6), n=st.integers(1, 4))
+@pytest.mark.slow
 def test_random_functions(program, n):
     f = random_function(program)
     check(lambda x: (f(x), jax.grad(f)(x)), numbers(n), rtol=1e-12)
@@ -215,6 +216,7 @@ def newton_step(force):
     return step
 
 
+@pytest.mark.slow
 def test_band_of_a_jacobian_is_found():
     """A chain's Jacobian is tridiagonal: elimination costs O(n), and gives the solution."""
     band = newton_step(jax.grad(chain))
@@ -430,14 +432,9 @@ def assert_same(a, b, rtol=1e-12):
 SLOW = pytest.mark.slow
 
 
-@pytest.mark.parametrize(
-    ("system", "save"),
-    [
-        pytest.param(s, w, marks=[] if (s, w) in (("kepler", "both"),) else SLOW)
-        for s in SYSTEMS
-        for w in SAVES
-    ],
-)
+@pytest.mark.parametrize("save", SAVES)
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.slow
 def test_components_give_the_numbers_of_arrays(system, save):
     arguments = (*starts(), 0.02, 0.5)
     assert_same(
@@ -491,6 +488,7 @@ def test_large_steps_take_more_iterations_and_lose_no_digit():
     np.testing.assert_array_equal(a[5]["failed_step"], b[5]["failed_step"])
 
 
+@pytest.mark.slow
 def test_a_lane_that_fails_is_told_and_leaves_the_others_alone():
     """The same step, status and NaN as by arrays; the neighbours' bits are what they were."""
     q, p = starts()

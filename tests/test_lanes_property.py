@@ -822,6 +822,7 @@ QUICK = (("known", 0), ("arithmetic-float32", 2), ("control", 0))
 
 
 @pytest.mark.parametrize(("cases", "pair", "rtol"), groups())
+@pytest.mark.slow
 def test_primitives(cases, pair, rtol):
     check(lambda x, y: {name: f(x, y) for name, f in cases.items()}, *pair, rtol=rtol)
 

@@ -169,6 +169,7 @@ def cases(*in_every_run):
 
 
 @pytest.mark.parametrize(("system", "stages"), cases(("non_separable", 2)))
+@pytest.mark.slow
 def test_undisturbed_step_is_symplectic_and_a_damped_one_is_not(system, stages):
     step = advance(system, stages)
 
@@ -201,9 +202,8 @@ def test_step_there_and_back_with_the_force_on(system, stages):
     assert np.max(np.abs(step(there, 0.2, -0.1, 0.1) - z)) > 1e-9 or system == "kepler"  # time
 
 
-@pytest.mark.parametrize(
-    "system", ["kepler", pytest.param("non_separable", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("system", ["kepler", "non_separable"])
+@pytest.mark.slow
 def test_two_stages_are_strang_forced_and_implicit_too(system):
     """Kick, drift, kick; drift, kick, drift is another map."""
     s, z = SYSTEMS[system][0], state(system)
@@ -216,6 +216,7 @@ def test_two_stages_are_strang_forced_and_implicit_too(system):
     assert np.max(np.abs(ours - end(dvi.Strang(base=dvi.Adjoint())))) > 1e-5
 
 
+@pytest.mark.slow
 def test_it_is_explicit_for_two_stages_of_a_separable_system():
     def damped(t0, t1, q0, p1, args):
         return -p1

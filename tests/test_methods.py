@@ -61,6 +61,7 @@ def test_runge_kutta_is_not(system, method):
     assert symplectic_defect(M) > 1e-9
 
 
+@pytest.mark.slow
 def test_a_dissipative_force_contracts():
     """With the disturbance on, the same map is not symplectic: its determinant is below one."""
     M = np.asarray(jacobian("non_separable", "TypeII", 0.3)(state("non_separable")))
@@ -207,6 +208,7 @@ def test_symmetric_methods_reverse_and_others_do_not(system, method):
         assert defect > 1e-9
 
 
+@pytest.mark.slow
 def test_adjoint_is_the_inverse_of_the_step_backwards():
     s, q, p = SYSTEMS["double_pendulum"]
     q, p = jnp.asarray(q), jnp.asarray(p)
@@ -342,6 +344,7 @@ def test_orders_that_do_not_exist_are_refused():
         dvi.Adjoint(dvi.TypeII)
 
 
+@pytest.mark.slow
 def test_kepler_momentum_is_kept_to_round_off():
     s, q, p = SYSTEMS["kepler"]  # its disturbance is central: L survives it
 

@@ -239,6 +239,7 @@ def single_pictures(single):
     }
 
 
+@pytest.mark.slow
 def test_every_picture_draws_on_the_axes_it_is_given_and_returns_them(single):
     for name, draw in single_pictures(single).items():
         figure, (mine, other) = plt.subplots(1, 2)
@@ -268,6 +269,7 @@ def test_every_public_picture_takes_axes():
         assert {"ax", "axes"} & set(inspect.signature(getattr(plot, name)).parameters), name
 
 
+@pytest.mark.slow
 def test_every_public_picture_refuses_what_are_no_axes(single):
     """A `TypeError` before anything is drawn, from all of them."""
     t = np.arange(1.0, 6.0)
@@ -841,6 +843,7 @@ def test_a_bifurcation_names_how_runs_ended():
     assert plot.bifurcation([1.0, 2.0, 3.0], made, y="q").get_ylim()[0] < -1e8
 
 
+@pytest.mark.slow
 def test_a_section_of_runs_that_failed_says_why(batch):
     assert "1 of 3 orbits failed: not finite" in legend(plot.section(batch))
     kepler = systems.kepler()

@@ -166,6 +166,7 @@ def test_the_wobble_turns_as_the_sign_of_y_says(measured):
 # The free wobble
 
 
+@pytest.mark.slow
 def test_undisturbed_pole_goes_round_a_circle():
     solution = run(QUIET, 1.0, 433, epsilon=0.0)
     radius = np.hypot(solution.qs[:, 0], solution.ps[:, 0])
@@ -176,6 +177,7 @@ def test_undisturbed_pole_goes_round_a_circle():
     assert np.ptp(np.hypot(ellipse.qs[:, 0], ellipse.ps[:, 0])) > 0.005 * radius[0]
 
 
+@pytest.mark.slow
 def test_undisturbed_pole_keeps_its_distance_from_the_mean_one():
     """Also where the mean pole is off the origin; not where it drifts, or at ε = 1."""
     still = ARGS | {"drift": np.zeros(2)}
@@ -193,6 +195,7 @@ def test_undisturbed_pole_keeps_its_distance_from_the_mean_one():
     assert spread["disturbed"] > 0.1
 
 
+@pytest.mark.slow
 def test_damping_is_that_of_q():
     cycles = 3
     solution = run(LOSSY, 1.0, 433 * cycles, save=dvi.Save(every=433))
@@ -202,6 +205,7 @@ def test_damping_is_that_of_q():
     assert abs(radius[-1] / radius[0] - 1) > 0.5  # negative control: it is not the circle
 
 
+@pytest.mark.slow
 def test_damping_is_the_same_in_every_direction():
     """The spiral is exact, not an average over a turn, as with a force −2γp alone."""
     end = START + 100.0
@@ -230,6 +234,7 @@ def test_closed_form_solves_the_equation(name):
     assert np.max(np.abs(solved(other, end) - exact(end, START, 0.1, 0.2, args))) > 1e-4
 
 
+@pytest.mark.slow
 def test_response_is_the_resonance():
     sigma, omega = 2 * np.pi / 433.0, 2 * np.pi / YEAR
     lossless = QUIET | {"inverse_Q": 0.0}
@@ -243,6 +248,7 @@ def test_response_is_the_resonance():
     assert sigma / (sigma - omega) == pytest.approx(-5.39, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_pole_on_the_forced_path_stays_there():
     q0, p0 = (float(c) for c in forced_pole(START, ARGS))
     solution = run(ARGS, 5.0, 584, q0=(q0,), p0=(p0,), observe=PROBLEM.observables)
@@ -257,6 +263,7 @@ def test_a_pole_on_the_forced_path_stays_there():
     assert np.max(np.hypot(solution.qs[:, 0] - x, solution.ps[:, 0] - y)) > 1 * MAS
 
 
+@pytest.mark.slow
 def test_free_amplitude_decays_about_the_forced_path():
     solution = run(ARGS, 5.0, 584, observe=PROBLEM.observables)
     _, gamma = rates(ARGS)
@@ -278,12 +285,14 @@ def test_mean_pole_moves_by_its_drift_in_a_year():
 @pytest.mark.parametrize(
     ("method", "order"), [(dvi.TypeII(), 1), (dvi.Strang(), 2), (dvi.Yoshida(4), 4)]
 )
+@pytest.mark.slow
 def test_order(method, order):
     errors = [distance(run(ARGS, 800.0 / n, n, method), ARGS) for n in (40, 80, 160)]
     slopes = np.log2(np.divide(errors[:-1], errors[1:]))
     np.testing.assert_allclose(slopes, order, atol=0.35)
 
 
+@pytest.mark.slow
 def test_eight_years_are_exact_enough_to_fit():
     assert distance(run(ARGS, 5.0, 584), ARGS) < 0.02 * MAS
     strang = run(ARGS, 1.0, 2920, dvi.Strang())

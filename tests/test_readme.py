@@ -10,6 +10,7 @@ import pytest
 README = Path(__file__).parents[1] / "README.md"
 
 
+@pytest.mark.slow
 def test_python_blocks_run():
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
     assert len(blocks) >= 2
@@ -25,6 +26,7 @@ def test_python_blocks_run():
     assert last == "(8,) True"
 
 
+@pytest.mark.slow
 def test_the_page_on_sweeps_runs(tmp_path):
     page = (README.parent / "docs" / "sweeps.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```python\n(.*?)```", page, re.S)
@@ -36,6 +38,7 @@ def test_the_page_on_sweeps_runs(tmp_path):
     assert out.stdout.strip() == "{'successful': 12000}"
 
 
+@pytest.mark.slow
 def test_the_page_on_fitting_runs():
     page = (README.parent / "docs" / "fitting.md").read_text(encoding="utf-8")
     block = re.findall(r"```python\n(.*?)```", page, re.S)[0]
@@ -47,6 +50,7 @@ def test_the_page_on_fitting_runs():
     assert float(off) < 2e-3
 
 
+@pytest.mark.slow
 def test_the_page_on_chaos_runs():
     page = (README.parent / "docs" / "chaos.md").read_text(encoding="utf-8")
     code = "\n".join(re.findall(r"```python\n(.*?)```", page, re.S))

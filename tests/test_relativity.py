@@ -208,6 +208,7 @@ def relativistic(form):
 
 
 @pytest.mark.parametrize("form", ["force", "hamiltonian"])
+@pytest.mark.slow
 def test_perihelion_advances_as_einstein_says(form):
     qs, vs = relativistic(form)
     turned = np.array([per_turn(q, v, np.eye(3)) for q, v in zip(qs[:3], vs[:3], strict=True)])
@@ -220,6 +221,7 @@ def test_perihelion_advances_as_einstein_says(form):
     assert abs(none) < 6e-10  # negative control: Newton; 4e-10 is the method's, of order h⁶
 
 
+@pytest.mark.slow
 def test_both_forms_are_one_orbit():
     """Apart by O(1/c⁴) when H1 starts from its own momenta, else by O(1/c²)."""
     force, canonical = (
@@ -318,6 +320,7 @@ def test_oblateness_turns_node_and_pericentre(inclination):
     np.testing.assert_allclose(prolate, -expected, rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_run_is_differentiable_in_j2():
     q0, v0 = start(ECCENTRICITY, 0.4, 0.7, axes(POLE))
 

@@ -195,6 +195,7 @@ def test_the_map_stays_symplectic(name):
 
 
 @EACH
+@pytest.mark.slow
 def test_a_long_run_keeps_energy_as_newton_does(name):
     """What a solve leaves must not add up: a bias of a unit of round-off a step would be seen."""
     assert abs(energy_after_many_steps(OTHERS[name]) - newtons_energy()) < 3e-14
@@ -243,6 +244,7 @@ def test_the_gradient_of_steps_is_newtons():
 
 
 @EACH
+@pytest.mark.slow
 def test_derivatives_of_a_root_to_second_order(name):
     def derivatives(solver):
         def of(a):
@@ -279,6 +281,7 @@ def strongly_damped(solver, gamma):
     return march(solver, PENDULUMS, *box(6), 0.1, 8, gamma)
 
 
+@pytest.mark.slow
 def test_picard_says_when_it_does_not_converge_and_the_default_goes_on_by_newton():
     q, _, _ = strongly_damped(Newton(), 30.0)
     assert bool(strongly_damped(Picard(), 30.0)[2].result == dvi.RESULTS.not_converged)
@@ -321,6 +324,7 @@ def test_a_lane_that_fails_does_not_spoil_its_neighbours(name, form):
 
 
 @pytest.mark.parametrize("name", ["picard", "picard_then_newton"])
+@pytest.mark.slow
 def test_a_step_that_fails_leaves_the_bits_of_its_neighbours(name):
     def run(gamma):
         q, p = box(6)
@@ -356,6 +360,7 @@ def test_nan_stops_at_once(name):
     assert int(info.iterations) <= 2
 
 
+@pytest.mark.slow
 def test_round_off_of_a_component_that_is_nothing_else_is_accepted():
     """A planar orbit seen from oblique axes, as for Newton's method in test_integrate.py."""
     turn = np.linalg.qr(np.array([[1.0, 2.0, 0.3], [0.4, 1.0, 2.0], [2.0, 0.1, 1.0]]))[0]
@@ -417,6 +422,7 @@ def test_components_on_trust_agree_with_arrays(name):
     np.testing.assert_array_equal(components[2], 64 * EPS)
 
 
+@pytest.mark.slow
 def test_trust_is_refused_to_what_has_not_converged():
     def F(x):
         return x - 1 + 0.1 * jnp.sin(x)

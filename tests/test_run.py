@@ -71,6 +71,7 @@ def write(folder, text, name="run.toml"):
 # What a run writes
 
 
+@pytest.mark.slow
 def test_kepler_example(folder):
     result = command("run", EXAMPLES / "kepler.toml")
     assert result.exit_code == 0, result.output
@@ -103,6 +104,7 @@ def test_kepler_example(folder):
         assert saved["hs"].shape == (2500,)
 
 
+@pytest.mark.slow
 def test_own_system_example(folder):
     result = command("run", EXAMPLES / "own_system.toml", "--out", folder / "pendulum")
     assert result.exit_code == 0, result.output
@@ -330,6 +332,7 @@ def test_version_and_help():
     assert command("walk").exit_code == 2
 
 
+@pytest.mark.slow
 def test_entry_point_without_traceback(folder):
     path = write(folder, KEPLER + "steps = 0\n")
     code = "from dvi_jax_cli import main; main()"
@@ -409,6 +412,7 @@ def test_inputs_that_once_broke_through(folder):
         assert key in result.output
 
 
+@pytest.mark.slow
 def test_indicators_of_chaos(folder):
     """Written as in Python; they follow no observable."""
     base = 'system = "henon_heiles"\nh = 0.05\nsteps = 2000\nmethod = "Strang"\n[observables]\n'

@@ -40,6 +40,7 @@ def portrait(count, crossings, num_steps, h=0.05):
     )
 
 
+@pytest.mark.slow
 def test_many_orbits_at_once():
     """Every crossing lies in the plane to round-off, upwards, on its energy shell."""
     found = portrait(8, 50, 8000)
@@ -55,6 +56,7 @@ def test_many_orbits_at_once():
     assert np.abs(found.ts[0] - found.ts[4]).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_one_orbit_is_that_of_integrate():
     q, p = starts(8)
     alone = dvi.integrate(
@@ -105,6 +107,7 @@ def test_ten_thousand_crossings_of_64_orbits():
     assert np.max(np.abs(shells - ENERGY)) < 1e-4
 
 
+@pytest.mark.slow
 def test_crossings_that_are_skipped():
     q, p = starts(8)
     later = dvi.poincare_section(
@@ -135,6 +138,7 @@ def circle(t, q, p, args):
     return jnp.sum(q**2) - 0.05
 
 
+@pytest.mark.slow
 def test_points_of_a_section_as_starts():
     """They are no crossings, whatever side of the surface rounding has left them on."""
     settings = {"h": 0.01, "num_steps": 3000, "crossings": 4}
@@ -147,6 +151,7 @@ def test_points_of_a_section_as_starts():
     assert np.any(sides < 0) or np.any(sides > 0)
 
 
+@pytest.mark.slow
 def test_a_section_does_not_depend_on_the_sense_of_the_run():
     """Backwards from where a run has come to, its own crossings, in reverse."""
     settings = {"h": 0.05, "num_steps": 1200, "crossings": 6}
@@ -173,6 +178,7 @@ def test_a_section_does_not_depend_on_the_sense_of_the_run():
         assert np.max(np.abs(flashes - 0.3 - np.round(flashes - 0.3))) < 1e-9
 
 
+@pytest.mark.slow
 def test_epsilon_that_is_traced():
     epsilon = jnp.array([0.0, 0.3])
     options = {"h": 0.05, "num_steps": 500, "crossings": 2, "throw": False}
@@ -206,6 +212,7 @@ def wanting(**options):
         ({"crossings": 50}, "too_few_crossings", "with [0-9]+ crossings.*Take more steps"),
     ],
 )
+@pytest.mark.slow
 def test_a_section_that_is_crossed_too_rarely(options, status, message):
     found = wanting(**options, throw=False)
     assert list(found.status) == [status] * 3
@@ -216,6 +223,7 @@ def test_a_section_that_is_crossed_too_rarely(options, status, message):
     assert list(wanting().status) == ["successful"] * 3
 
 
+@pytest.mark.slow
 def test_an_orbit_that_escapes():
     """It has a status of its own, and its neighbours their crossings."""
     q, p = starts(3)
@@ -285,6 +293,7 @@ def test_a_single_start_is_told_how_it_is_given():
 RETURN = dvi.ReturnMap(HENON.system, plane, h=0.02, num_steps=400, method=dvi.Yoshida(4))
 
 
+@pytest.mark.slow
 def test_iterated_returns_are_the_section():
     """Each point is the return of the one before, though it lies on the section."""
     found = dvi.poincare_section(
@@ -312,6 +321,7 @@ def in_plane(z):
     return jnp.stack([back.q[1], back.p[1]])
 
 
+@pytest.mark.slow
 def test_derivative_of_the_return_map():
     """Against differences; in (y, p_y) it keeps areas, which the whole tangent map shows not."""
     z = jnp.array([0.15, 0.05])
@@ -322,6 +332,7 @@ def test_derivative_of_the_return_map():
     assert np.max(np.abs(D - np.eye(2))) > 0.1
 
 
+@pytest.mark.slow
 def test_a_periodic_orbit_by_newton():
     """A fixed point of the return map, and that its multipliers are a pair on the unit circle."""
     z = jnp.array([0.28, 0.0])
@@ -360,6 +371,7 @@ def test_returns_to_a_surface_that_is_no_plane(dtype):
     assert np.max(times) < 9
 
 
+@pytest.mark.slow
 def test_a_map_that_does_not_return():
     never = dvi.ReturnMap(HENON.system, lambda t, q, p, args: q[0] - 9, h=0.1, num_steps=20)
     back = never(HENON.q0, HENON.p0)
@@ -372,6 +384,7 @@ def test_a_map_that_does_not_return():
 # What becomes of them as ε grows
 
 
+@pytest.mark.slow
 def test_bifurcation_of_a_linear_disturbance():
     """H = (p² + q²)/2 under −εq: periods 2π/√(1 + ε), each ε its own orbit."""
     problem = systems.oscillator()
@@ -393,6 +406,7 @@ DUFFING = dvi.System(
 """x'' + 0.3 x' − x + x³ = γ cos 1.2t at ε = 1."""
 
 
+@pytest.mark.slow
 def test_period_doubling_of_a_driven_duffing_oscillator():
     """How many points there are in the stroboscope, as published: 1, 2, 4, 5, chaos, 2.
 
@@ -411,6 +425,7 @@ def test_period_doubling_of_a_driven_duffing_oscillator():
     assert points[5] == 2
 
 
+@pytest.mark.slow
 def test_branches_are_followed():
     """Each ε goes on from the state of the one before."""
 

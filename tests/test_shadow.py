@@ -52,6 +52,7 @@ def drifts(system, observe, hs, q0, p0, **options):
     return jax.jit(jax.vmap(run))(jnp.asarray(hs))
 
 
+@pytest.mark.slow
 def test_oscillator_has_its_closed_form():
     """H̃ = 2 asin(h/2)/(h √(1 − h²/4)) (p² + q² − hqp)/2; the factor is Σ m!²/(2m+1)! h^{2m}."""
     series = [math.factorial(m) ** 2 / math.factorial(2 * m + 1) for m in range(3)]
@@ -126,6 +127,7 @@ def flow(H, t, z, h, small=32):
 
 
 @pytest.mark.parametrize(("H_D", "order"), [(non_separable, 2), (midpoint_like, 1)])
+@pytest.mark.slow
 def test_its_flow_is_the_map(H_D, order):
     system, t = dvi.System(H_D), 0.3
     shadow = dvi.ShadowHamiltonian(order, system)
@@ -214,6 +216,7 @@ def test_a_composed_method_has_another_one():
     assert measured_orders(found, 2, 1e-13)[-1] == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_step_size_given_by_hand_keeps_its_digits():
     """At t = 1e9 the difference t1 − t0 has seven digits left; the oscillator's form is exact."""
     observe = [dvi.ShadowHamiltonian(1), dvi.ShadowHamiltonian(1, h=0.1)]
@@ -222,6 +225,7 @@ def test_step_size_given_by_hand_keeps_its_digits():
     assert found[0] > 1e-10
 
 
+@pytest.mark.slow
 def test_states_of_any_shape_and_precision_batches_and_gradients():
     shadow = dvi.ShadowHamiltonian(1, dvi.System(pendulum))
     terms = jax.jit(lambda q, p: shadow.terms(0.0, q, p))

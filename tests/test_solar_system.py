@@ -163,6 +163,7 @@ def test_perihelion_of_a_known_ellipse():
 # N bodies
 
 
+@pytest.mark.slow
 def test_forces_are_newtons():
     rng = np.random.default_rng(0)
     m, q, p = rng.uniform(1, 3, 5), rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
@@ -252,6 +253,7 @@ def test_momenta_are_kept_and_runge_kutta_loses_them(run, century):
     assert lost > 100 * kept
 
 
+@pytest.mark.slow
 def test_outer_planets_follow_the_ephemeris(run):
     errors = beside_ephemeris(run(0.25)).errors.max(axis=0)
     jupiter = BODIES.index("Jupiter")
@@ -264,6 +266,7 @@ def test_outer_planets_follow_the_ephemeris(run):
     assert worse[jupiter] > 10 * errors[jupiter]
 
 
+@pytest.mark.slow
 def test_mercurys_perihelion_lacks_relativitys_share(run):
     coarse, fine = (beside_ephemeris(run(h)) for h in (0.25, 0.125))
     # The integrator turns the perihelion too, with h⁴: 10″ a century at h = 1/8.
@@ -279,6 +282,7 @@ def test_mercurys_perihelion_lacks_relativitys_share(run):
     assert alone.slope + own > 500
 
 
+@pytest.mark.slow
 def test_agrees_with_an_independent_integrator(run, century):
     rebound = pytest.importorskip("rebound")
     other = rebound.Simulation()

@@ -85,6 +85,7 @@ def defect(found, q, p):
 
 
 @pytest.mark.parametrize("name", ["oscillator", "kepler"])
+@pytest.mark.slow
 def test_explicit_kernels_agree_with_the_package(baseline, name):
     w, start, given = settings(name)
     qs, ps, (drift, slope) = expected(name)
@@ -100,6 +101,7 @@ def test_explicit_kernels_agree_with_the_package(baseline, name):
 
 
 @pytest.mark.parametrize("name", ["oscillator", "kepler"])
+@pytest.mark.slow
 def test_explicit_kernels_for_one_trajectory(baseline, name):
     w, start, given = settings(name)
     qs, ps, (drift, slope) = expected(name)
@@ -125,6 +127,7 @@ KERNELS = [
 
 
 @pytest.mark.parametrize(("name", "kernel"), KERNELS)
+@pytest.mark.slow
 def test_implicit_kernels_agree_with_the_package(baseline, name, kernel):
     _, start, given = settings(name)
     qs, ps, _ = expected(name)

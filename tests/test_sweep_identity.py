@@ -202,6 +202,7 @@ def test_whole_numbers_without_a_sign(tmp_path):
         found["cuont"]
 
 
+@pytest.mark.slow
 def test_starts_know_the_time_of_a_given_lattice():
     def H(t, q, p, args):
         return p @ p / 2 + 0.1 * t
@@ -252,6 +253,7 @@ def test_places(tmp_path, monkeypatch):
         dvi.open_sweep(tmp_path / "there")
 
 
+@pytest.mark.slow
 def test_sizes_without_divisors_are_not_crumbled():
     variable = stores.Variable("float64", (30,), ("x",))
     inner = stores._layout((32749,), variable)["chunks"]

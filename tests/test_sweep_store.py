@@ -54,6 +54,7 @@ def record(path, task=3):
     return Store.open(path).record_path(task)
 
 
+@pytest.mark.slow
 def test_a_store_has_the_bits_of_memory(undisturbed, finished):
     found = dvi.open_sweep(finished)
     assert found.is_complete
@@ -66,6 +67,7 @@ def test_a_store_has_the_bits_of_memory(undisturbed, finished):
         assert isinstance(a.attrs[key], str)
 
 
+@pytest.mark.slow
 def test_other_programs_read_it(undisturbed, finished):
     with xr.open_zarr(finished, chunks=None) as ds:
         assert ds.drift.dims == ("epsilon", "start")
@@ -74,6 +76,7 @@ def test_other_programs_read_it(undisturbed, finished):
         assert "q0" in ds.coords
 
 
+@pytest.mark.slow
 def test_parts_are_read_without_the_rest(finished, monkeypatch):
     lazy = dvi.open_sweep(finished).to_xarray()
     asked = []
@@ -140,6 +143,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("status", "q")]
 
 
 @pytest.mark.parametrize("name", ["drift", *SLOW])
+@pytest.mark.slow
 def test_every_flipped_bit_is_found_and_repaired(copy, undisturbed, name):
     file = shard(copy, name)
     whole = file.read_bytes()
@@ -185,6 +189,7 @@ def test_a_missing_or_short_shard_is_found(copy, undisturbed):
     same(sweep(copy), undisturbed)
 
 
+@pytest.mark.slow
 def test_a_full_disk_loses_nothing(tmp_path, undisturbed, monkeypatch):
     path, written = tmp_path / "s.zarr", []
     write = os.fsync

@@ -64,6 +64,7 @@ def test_generator_of_the_wrong_shape_is_named():
         dvi.Generator(eta=1.0)
 
 
+@pytest.mark.slow
 def test_conformal_factor_of_the_rotation_is_that_of_the_paper_times_one_plus_epsilon():
     """(48) for the generator (46): the matrix shown, times (1 + ε)."""
     first, second = random_points(0, 2, 30)
@@ -100,6 +101,7 @@ def test_no_factor_exists_for_a_generator_that_is_no_symmetry():
         dvi.conformal_factor(OSCILLATOR.system, SCALING, *random_points(1, 2, 3))
 
 
+@pytest.mark.slow
 def test_invariant_of_the_rotation_is_angular_momentum_at_every_epsilon():
     """(42) and (49), exact on the map; with η in place of ξ, as (26) prints, it is nothing."""
     invariant = dvi.AdiabaticInvariant([ROTATION, ROTATION], [None, None])
@@ -190,6 +192,7 @@ def test_balance_closes_for_any_generator_gauge_and_mesh(seed, z):
     assert np.max(np.abs(b.defect)) <= 1e-12 * size
 
 
+@pytest.mark.slow
 def test_every_cause_is_needed_for_the_balance_to_close():
     b, size = balance(*random_case(3, 1))
     assert np.max(np.abs(b.defect)) <= 1e-12 * size
@@ -259,6 +262,7 @@ def test_no_gauge_makes_34_an_invariant_of_first_order():
     assert found.residuals[1] > 1e-2
 
 
+@pytest.mark.slow
 def test_gauge_of_the_time_shift_closes_up_to_the_step_size():
     """N_1 = q·Dq + D G_1 with q·Dq = D(q²/2) − (h/2)|Dq|²: G_1 = −q²/2, and O(h) is left."""
     series = [TIME, dvi.Generator()]

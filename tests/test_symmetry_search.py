@@ -169,6 +169,7 @@ POINT = dvi.LatticePoint(0.0, np.ones(2), np.ones(2))
 # --- conformal factors -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pointwise_factor_is_the_constant_one_where_there_is_one():
     samples = box(2)
     pairs = dvi.random_pairs(h=0.1, samples=samples)
@@ -184,6 +185,7 @@ def test_pointwise_factor_is_the_constant_one_where_there_is_one():
     )
 
 
+@pytest.mark.slow
 def test_some_factors_are_pointwise_only():
     """The flow of an invariant's square turns each ellipse at its own speed."""
     generator, system, samples = KNOWN["flow"]
@@ -215,6 +217,7 @@ def test_conformal_factor_of_a_translation_is_zero_and_well_conditioned():
     assert found.is_conformal
 
 
+@pytest.mark.slow
 def test_no_verdict_from_what_determines_none():
     on = dvi.solution_pairs(OSCILLATOR, h=0.1, samples=box(1))
     found = dvi.conformal_factor(OSCILLATOR, library.scaling(), *on)
@@ -290,6 +293,7 @@ FORMULAS = {
 
 
 @pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.slow
 def test_known_symmetries_are_found_and_told_apart(name):
     symmetries = found(name)
     variational, conformal = FORMULAS[name]
@@ -305,9 +309,8 @@ def test_known_symmetries_are_found_and_told_apart(name):
         assert str(symmetries[0]) in str(symmetries)
 
 
-@pytest.mark.parametrize(
-    "name", ["kepler", "free", pytest.param("quartic", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("name", ["kepler", "free", "quartic"])
+@pytest.mark.slow
 def test_found_generators_satisfy_the_equations_at_other_points(name):
     system, samples = {
         "kepler": (KEPLER, ring(40, 9, times=True)),
@@ -325,6 +328,7 @@ def test_found_generators_satisfy_the_equations_at_other_points(name):
         assert np.log10(left[0] / left[1]) == pytest.approx(symmetry.order + 1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_scaling_is_conformal_with_a_constant_factor():
     (scaling,) = found("oscillator").conformal
     pairs = dvi.random_pairs(h=0.1, samples=box(1))
@@ -389,6 +393,7 @@ def test_gauge_and_identity_agree_with_noether_identity():
     assert np.log10(total(1e-2) / total(1e-3)) == pytest.approx(2, abs=0.1)
 
 
+@pytest.mark.slow
 def test_multiples_by_invariants_are_marked_as_dependent():
     symmetries = found("cubic")
     assert [s.is_dependent for s in symmetries] == [False, True, False, True]
@@ -411,6 +416,7 @@ def test_too_small_a_gauge_basis_is_suspected():
     assert str(symmetries).count("gauge basis may be too small") == 1
 
 
+@pytest.mark.slow
 def test_no_symmetry_of_a_chaotic_system_and_of_an_order_the_basis_cannot_express():
     assert "0 symmetries" in str(found("henon"))
     assert found("henon").survivors == (0,)
@@ -420,6 +426,7 @@ def test_no_symmetry_of_a_chaotic_system_and_of_an_order_the_basis_cannot_expres
     assert "does not go on" in str(linear)
 
 
+@pytest.mark.slow
 def test_friction_leaves_a_conformal_symmetry_only():
     """The map shrinks areas, so that what commutes with it is no Hamiltonian flow."""
     system = dvi.System(H_D, force=lambda t0, t1, q, p, args: -p)
@@ -430,6 +437,7 @@ def test_friction_leaves_a_conformal_symmetry_only():
     assert np.min([np.max(s.identity_residuals) for s in symmetries]) > 1e-3
 
 
+@pytest.mark.slow
 def test_held_out_samples_refuse_what_fits_by_chance():
     """Beyond q = 1 the spring hardens; all points there are held out."""
     hard = dvi.System(lambda t0, t1, q, p, args: H_D(t0, t1, q, p, args) + jnp.sum(
@@ -443,6 +451,7 @@ def test_held_out_samples_refuse_what_fits_by_chance():
     assert "held-out samples decide" in str(symmetries)
 
 
+@pytest.mark.slow
 def test_equations_with_time_need_samples_in_time():
     driven = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - q[0] * jnp.cos(t0))
     with pytest.raises(ValueError, match="depend on the time"):
@@ -508,7 +517,8 @@ def test_what_is_no_basis_is_refused():
         dvi.find_symmetries(OSCILLATOR, LINEAR, h=0.1, samples=box(1), gauges=3)
 
 
-@pytest.mark.parametrize("strength", [1e-10, pytest.param(1e10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("strength", [1e-10, 1e10])
+@pytest.mark.slow
 def test_the_strength_of_the_disturbance_does_not_matter(strength):
     """Friction, however weak or strong, takes away the same symmetries."""
     system = dvi.System(H_D, force=lambda t0, t1, q, p, args: -strength * p)

@@ -187,6 +187,7 @@ IN_EVERY_RUN = [(name, "type_ii") for name in SEPARABLE] + [
 @pytest.mark.parametrize(
     ("name", "method"), some_slow(IN_EVERY_RUN, [(n, m) for n in CASES for m in METHODS])
 )
+@pytest.mark.slow
 def test_two_formulations_of_one_method_agree(name, method):
     """Autodiff and Newton's method against derivatives by hand and fixed-point iteration."""
     ours, theirs = by_package(name, method), by_hand(name, method)
@@ -210,6 +211,7 @@ def test_a_ninth_digit_of_the_start_is_seen(name):
 
 
 @pytest.mark.parametrize("name", some_slow([("toda",)], [(name,) for name in CASES]))
+@pytest.mark.slow
 def test_the_flow_is_that_of_the_equations_by_hand(name):
     """GaussLegendre(3) against SciPy's DOP853 on the equations by hand."""
     problem, gradient, epsilon = CASES[name]
@@ -323,6 +325,7 @@ STRANG, BLANES_MOAN = (dvi.Strang(), 2), (dvi.BlanesMoan(4), 4)
 
 
 @pytest.mark.parametrize(("method", "order"), some_slow([STRANG], [STRANG, BLANES_MOAN]))
+@pytest.mark.slow
 def test_lax_integrals_waver_with_the_order_of_the_method(method, order):
     coarse, fine = (lax_drifts(method, h, round(100 / h)) for h in (0.1, 0.05))
     for a, b in ((coarse[0][1:], fine[0][1:]), (coarse[1], fine[1])):
@@ -346,6 +349,7 @@ def test_lax_integrals_stay_bounded_and_runge_kutta_loses_them():
 # FPUT
 
 
+@pytest.mark.slow
 def test_modes_of_the_linear_chain_are_kept():
     """α = β = 0: by the midpoint rule each to round-off, being quadratic; the cubic mixes them."""
     linear, cubic = systems.fput(6, alpha=0.0), systems.fput(6)
@@ -399,6 +403,7 @@ def test_energy_comes_back_to_the_first_mode():
     assert np.ptp(energy) < 2e-3 * energy[0]
 
 
+@pytest.mark.slow
 def test_stiff_springs_share_their_energy_and_keep_the_sum():
     """I = Σ I_i wavers by O(1/ω) over a time in which the I_i change places; ω = 50 and 100."""
     ranges, single = {}, {}
@@ -490,14 +495,9 @@ def test_the_particle_bounces_and_its_moment_is_bounded():
 
 @pytest.mark.parametrize(
     "method",
-    [
-        dvi.TypeII(),
-        pytest.param(dvi.GaussLegendre(1), marks=pytest.mark.slow),
-        pytest.param(dvi.Strang(), marks=pytest.mark.slow),
-        pytest.param(dvi.BlanesMoan(4), marks=pytest.mark.slow),
-        pytest.param(dvi.GaussLegendre(3), marks=pytest.mark.slow),
-    ],
+    [dvi.TypeII(), dvi.GaussLegendre(1), dvi.Strang(), dvi.BlanesMoan(4), dvi.GaussLegendre(3)],
 )
+@pytest.mark.slow
 def test_variational_maps_keep_canonical_angular_momentum(method):
     """Turns about the axis leave H_D as it is; the energy wavers, with the order of the method."""
     observed = drifts(systems.magnetic_mirror(), method, 0.1, 5000)
@@ -505,6 +505,7 @@ def test_variational_maps_keep_canonical_angular_momentum(method):
     assert float(observed["energy"]) > 1e-10
 
 
+@pytest.mark.slow
 def test_runge_kutta_loses_canonical_angular_momentum():
     observed = drifts(systems.magnetic_mirror(), dvi.RungeKutta4(), 0.1, 5000)
     assert float(observed["canonical_angular_momentum"]) > 1e-4
@@ -575,6 +576,7 @@ def test_parameters_that_cannot_be_are_refused():
 
 
 @pytest.mark.parametrize("name", some_slow([("toda",)], [(name,) for name in CASES]))
+@pytest.mark.slow
 def test_a_run_file_names_them(name, tmp_path):
     assert systems.LIBRARY[name]().name == name
     path = tmp_path / "run.toml"

@@ -62,10 +62,11 @@ def worst(observe, *args, **settings):
     ("e", "periods", "few", "many"),
     [
         (0.9, 10, 200, 4000),
-        pytest.param(0.9, 100, 200, 4000, marks=pytest.mark.slow),
-        pytest.param(0.99, 10, 400, 200_000, marks=pytest.mark.slow),
+        (0.9, 100, 200, 4000),
+        (0.99, 10, 400, 200_000),
     ],
 )
+@pytest.mark.slow
 def test_eccentric_orbits_need_far_fewer_steps(e, periods, few, many):
     """A twentieth of the steps of the uniform mesh, and still a smaller error in energy."""
     transformed = worst(energy, few, periods, e=e)
@@ -221,6 +222,7 @@ def test_what_cannot_be_meant_is_refused(speed, observe, says):
             dvi.TimeTransformed(wrong)
 
 
+@pytest.mark.slow
 def test_observables_are_bound_to_the_system_that_was_given():
     kept = dvi.AdiabaticInvariant(
         [dvi.Generator(xi=lambda t, q, p, args: jnp.stack([-q[1], q[0]]))], [None]

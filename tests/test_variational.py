@@ -70,6 +70,7 @@ def test_keplers_steps_end_where_the_equation_loses_its_root(h, steps, time):
 
 
 @pytest.mark.parametrize(("system", "epsilon"), [(PENDULUM, 0.1), (DRIVEN, 0.2)])
+@pytest.mark.slow
 def test_energy_is_in_balance_with_the_work_of_a_force(system, epsilon):
     """With forces that depend on p and t, and an H_D that depends on both times."""
     settings = {"h": 0.02, "num_steps": 25, "epsilon": epsilon, "throw": False}
@@ -82,6 +83,7 @@ def test_energy_is_in_balance_with_the_work_of_a_force(system, epsilon):
     assert np.max(np.abs(defects(system, fixed, epsilon))) > 1e-5
 
 
+@pytest.mark.slow
 def test_balance_law_has_no_part_of_the_lattice():
     """(31): with ξ0 = 1 energy changes by nothing but the work of the disturbance."""
     sol = dvi.integrate(
@@ -146,6 +148,7 @@ def test_backwards_and_bounded():
     assert np.max(np.asarray(kepler(0.1, 30).hs)) > 0.15
 
 
+@pytest.mark.slow
 def test_free_motion_keeps_its_step():
     """E⁺ does not depend on h there: every h is a root."""
     free = dvi.System(lambda t0, t1, q, p, args: jnp.sum(p**2) / 2)
