@@ -45,7 +45,7 @@ from .engine.quantities import refuse_quantity
 from .engine.tiles import Layout
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation
-from .observe import Deviations, Reduction, RequestedTimes, Running, Section, Stop
+from .observe import Deviations, Range, Reduction, RequestedTimes, Running, Section, Stop
 from .observe._kept import Start
 
 _STEP = "(t0, t1, q0, p0, q1, p1, args)"
@@ -462,6 +462,14 @@ def as_parameter(leaf: Any) -> Any:
         refuse_quantity("args", leaf)
         refuse_double_without_x64("args", leaf.dtype)
         return jnp.asarray(leaf)
+    if not isinstance(leaf, jax.Array):
+        try:
+            hash(leaf)
+        except TypeError:
+            raise TypeError(
+                f"args holds a {type(leaf).__name__}, which is neither an array nor hashable: "
+                f"{leaf!r:.80}. Give arrays and numbers, in dicts, lists and tuples."
+            ) from None
     return jnp.asarray(leaf) if isinstance(leaf, float) else leaf
 
 
@@ -513,4 +521,9 @@ def _check_observe(task: Task, q0: Array, p0: Array) -> None:
             raise TypeError(
                 f"an observable {_STEP} must return one array; "
                 f"{called} returned {type(out).__name__}."
+            )
+        if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
+            raise TypeError(
+                f"Range compares values, which complex numbers have no order for; {called} returns "
+                "them. Take the real and imaginary parts, or the absolute value."
             )

@@ -481,6 +481,8 @@ def test_a_discovery_is_saved_and_loaded(tmp_path):
     np.save(path.with_suffix(".npy"), np.zeros(3))
     with pytest.raises(ValueError, match="no file that Discovery"):
         dvi.Discovery.load(path.with_suffix(".npy"), named)
+    with pytest.raises(FileNotFoundError, match="there is no discovery at"):
+        dvi.Discovery.load(path.with_suffix(".none"), named)
     path.write_bytes(b"something else")
     with pytest.raises(ValueError, match="no file that Discovery"):
         dvi.Discovery.load(path, dvi.Polynomials(4))

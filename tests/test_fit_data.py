@@ -69,6 +69,12 @@ def test_observations_are_checked(wrong, error, says):
         dvi.Observations(**{"ts": TS, "values": VALUES, "sigma": 0.1, "t0": 0.0, **wrong})
 
 
+@pytest.mark.parametrize("h", ["0.1", None, 0.0, np.inf, True])
+def test_the_step_of_a_model_is_a_number(h):
+    with pytest.raises(ValueError, match="h must be one finite step size"):
+        dvi.Model(SYSTEM, h=h)
+
+
 def test_a_covariance_of_correlation_one_is_refused():
     values = np.stack([np.cos(TS), np.sin(TS)], 1)
     C = np.array([[1.0, 1.0], [1.0, 1.0]])

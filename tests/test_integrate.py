@@ -388,6 +388,8 @@ def test_traced_bad_input_becomes_a_status():
         ({"observe": 3.0}, TypeError, "pytree of functions"),
         ({"observe": dvi.Range(3.0)}, TypeError, "Range takes a function"),
         ({"observe": lambda *a: None}, TypeError, "must return one array"),
+        ({"observe": dvi.Range(lambda *a: a[2] * 1j)}, TypeError, "imaginary parts"),
+        ({"args": {"k": {1, 2}}}, TypeError, "args holds a set, which is neither"),
     ],
 )
 def test_bad_input_is_named(change, error, match):

@@ -317,6 +317,12 @@ def test_composition_refuses_inconsistent_coefficients(bad):
         dvi.Composition(bad)
 
 
+@pytest.mark.parametrize("bad", [0.5, "half", [None]])
+def test_composition_refuses_what_are_no_coefficients(bad):
+    with pytest.raises(TypeError, match="sequence of numbers"):
+        dvi.Composition(bad)
+
+
 def test_orders_that_do_not_exist_are_refused():
     with pytest.raises(ValueError, match="orders 4, 6 and 8, got 5"):
         dvi.Yoshida(5)

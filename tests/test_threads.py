@@ -86,6 +86,7 @@ def test_an_error_in_a_thread_is_raised():
         ({"in_axes": None}, (jnp.ones(3), 2.0), ValueError, "none with lanes"),
         ({"in_axes": (0,)}, (jnp.ones(3), 2.0), ValueError, "1 entries for 2 arguments"),
         ({}, (jnp.ones((0, 2)),), ValueError, "at least one"),
+        ({"threads": 2, "out_axes": 3}, (jnp.ones(4),), ValueError, "out_axes says .* axis 3"),
         ({"in_axes": "a"}, (jnp.ones(2),), TypeError, "whole number or None, got 'a'"),
     ],
 )

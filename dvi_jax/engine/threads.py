@@ -154,4 +154,9 @@ def _cut(x: Any, axis: int, start: int, size: int) -> Any:
 
 
 def _joined(xs: Sequence[Any], axis: int, lanes: int) -> Any:
+    if not -jnp.ndim(xs[0]) <= axis < jnp.ndim(xs[0]):
+        raise ValueError(
+            f"out_axes says that lanes are along axis {axis}, but an output has shape "
+            f"{jnp.shape(xs[0])} for {lanes} lanes: give the axis along which function has them."
+        )
     return jax.lax.slice_in_dim(jnp.concatenate(xs, axis), 0, lanes, axis=axis)

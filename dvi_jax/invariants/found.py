@@ -136,9 +136,12 @@ class Discovery(eqx.Module):
     def load(cls, path: str | os.PathLike[str], basis: AbstractBasis) -> "Discovery":
         """Read what `save` wrote; `basis` is the one that was searched (its names are compared).
 
-        **Raises** `ValueError` for a file of something else, or another basis.
+        **Raises** `FileNotFoundError` where there is none, `ValueError` for a file of something
+        else, or another basis.
         """
         refuse_double_without_x64("a Discovery", np.float64)
+        if not os.path.isfile(path):
+            raise FileNotFoundError(f"there is no discovery at {os.fspath(path)}.")
         try:
             with np.load(path, allow_pickle=False) as file:
                 about = json.loads(str(file["about"]))

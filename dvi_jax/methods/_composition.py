@@ -155,7 +155,12 @@ def check_order(name: str, order: Any, known: Sequence[int]) -> None:
 
 
 def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
-    return tuple(float(c) for c in values)
+    try:
+        return tuple(float(c) for c in values)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"the coefficients of a composition are a sequence of numbers, got {values!r}."
+        ) from None
 
 
 class Composition(CompositionMethod):
@@ -176,7 +181,8 @@ class Composition(CompositionMethod):
 
     **Raises** `ValueError` when the coefficients are empty, not finite, or do not sum to 1 (to
     1e-12), when they do not have the order claimed (the order that they have is named), and for a
-    base without an inverse; `TypeError` for a base that is no method.
+    base without an inverse; `TypeError` for a base that is no method and
+    for coefficients that are no numbers.
 
     **Source** Hairer, Lubich & Wanner 2006, *Geometric Numerical Integration*, II.4 (4.6), V.3;
     the conditions: `order_defects`.
