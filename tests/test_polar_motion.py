@@ -147,7 +147,7 @@ def test_other_files_are_refused(tmp_path, text, said):
 
 
 def test_missing_extra_names_the_command(monkeypatch):
-    module = sys.modules["dvi_jax.systems.polar_motion"]  # its name is the function's as well
+    module = sys.modules["dvi_jax.systems.solar_system"]  # where files are looked for
     monkeypatch.setattr(module, "find_spec", lambda name: None)
     with pytest.raises(EphemerisMissing, match=r'pip install "dvi-jax\[ephemeris\]"'):
         read_polar_motion()

@@ -18,7 +18,6 @@ Both components lose at the rate γ, exactly, to all orders in γ; −2γ p alon
 average over a period. What drives the wobble is linear in q and p and part of H.
 """
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +26,7 @@ import numpy as np
 
 from .._system import System
 from ._problem import Problem, check_finite, check_positive, check_shape, check_vector, over_times
-from .solar_system import EphemerisMissing
+from .solar_system import installed_file
 
 REFERENCE = 51544.0
 """Modified Julian date (UTC) of t = 0: 2000-01-01 at 0h [day]."""
@@ -35,7 +34,6 @@ REFERENCE = 51544.0
 YEAR = 365.25
 """Period of the annual terms, and the year of `drift` [day]."""
 
-_EXTRA = 'pip install "dvi-jax[ephemeris]"'
 _MJD, _FLAG = slice(7, 15), 16  # columns 8-15 and 17 of a line, counted from 1 in the format
 _X, _X_ERROR, _Y, _Y_ERROR = slice(18, 27), slice(27, 36), slice(37, 46), slice(46, 55)
 
@@ -73,7 +71,11 @@ def read_polar_motion(path: str | Path | None = None) -> PolarMotion:
     readme.finals2000A of the same centre, columns 8–15 (MJD), 17 (I measured, P predicted), 19–27,
     28–36, 38–46, 47–55. How Bulletin A is made: McCarthy & Luzum 1991, *Bull. Géod.* 65, 22.
     """
-    path = _installed() if path is None else Path(path)
+    path = (
+        installed_file("finals2000A.all", "the measured polar motion")
+        if path is None
+        else Path(path)
+    )
     with path.open(encoding="ascii", errors="replace") as file:
         lines = [(i, line) for i, line in enumerate(file, 1) if line[_FLAG : _FLAG + 1] == "I"]
     if not lines:
@@ -260,16 +262,3 @@ def polar_motion() -> Problem:
 def _exact_from_zero(t: Any, q0: Any, p0: Any, args: Any) -> tuple[Any, Any]:
     """`exact` as a `Problem` has it: of one start at t0 = 0."""
     return exact(t, 0.0, q0, p0, args)
-
-
-def _installed() -> Path:
-    # Looked up, not imported: on import that package warns of the age of its files.
-    package = find_spec("skyfield_data")
-    if package is None or package.origin is None:
-        raise EphemerisMissing(f"the measured polar motion is not installed: {_EXTRA}")
-    path = Path(package.origin).parent / "data" / "finals2000A.all"
-    if not path.is_file():
-        raise EphemerisMissing(
-            f"the installed skyfield-data has no finals2000A.all; a version that has it: {_EXTRA}"
-        )
-    return path

@@ -46,6 +46,23 @@ class EphemerisMissing(ImportError):
     """The ephemeris or its reader is not installed; the message has the command."""
 
 
+def installed_file(name: str, what: str) -> Path:
+    """A file of the package skyfield-data; `what` it is, in words. Nothing is fetched.
+
+    **Raises** `EphemerisMissing` where it is not installed.
+    """
+    # Looked up, not imported: on import that package warns of the age of its files.
+    package = find_spec("skyfield_data")
+    if package is None or package.origin is None:
+        raise EphemerisMissing(f"{what} is not installed: {_EXTRA}")
+    path = Path(package.origin).parent / "data" / name
+    if not path.is_file():
+        raise EphemerisMissing(
+            f"the installed skyfield-data has no {name}; a version that has it: {_EXTRA}"
+        )
+    return path
+
+
 def julian_date(date: str | datetime.date | float) -> float:
     """TDB Julian date of a calendar day at 0h, or of a number that is one already [day].
 
@@ -179,13 +196,4 @@ def _kernel() -> Any:
         from jplephem.spk import SPK
     except ImportError:
         raise EphemerisMissing(f"reading an ephemeris needs jplephem: {_EXTRA}") from None
-    # Looked up, not imported: on import that package warns of the age of another of its files.
-    package = find_spec("skyfield_data")
-    if package is None or package.origin is None:
-        raise EphemerisMissing(f"the ephemeris DE421 is not installed: {_EXTRA}")
-    path = Path(package.origin).parent / "data" / "de421.bsp"
-    if not path.is_file():
-        raise EphemerisMissing(
-            f"the installed skyfield-data has no de421.bsp; a version that has it: {_EXTRA}"
-        )
-    return SPK.open(path)
+    return SPK.open(installed_file("de421.bsp", "the ephemeris DE421"))
