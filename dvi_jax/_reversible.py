@@ -59,10 +59,14 @@ class Reversible(AbstractAdjoint):
     Where a rebuilt component misses the stored one by more than `max_defect` of its own size
     (None means 1e-6 in float64 and 1e-3 in float32; where that is round-off of the largest
     component, by more than this), or an inverse step has no solution, the lane goes from that
-    checkpoint once more, its states stored: slower, and right for any dynamics. The gradient of a
-    trajectory that has failed is NaN. With `report_defect` the solution gives the largest of these
-    misses, in ``stats["round_trip_defect"]`` (relative, ∞ where an inverse step has no solution),
-    for as much time as the states take to be rebuilt.
+    checkpoint once more, its states stored: slower, and right for any dynamics. With
+    `report_defect` the solution gives the largest of these misses, in
+    ``stats["round_trip_defect"]`` (relative, ∞ where an inverse step has no solution), for as much
+    time as the states take to be rebuilt.
+
+    The gradient of a trajectory that has failed is NaN. That of one that a loss does not look at is
+    0, failed or not, so that it spoils no parameter that lanes share: a loss takes
+    ``jnp.where(ok, q, 0.0)``, ok of ``sol.result == dvi.RESULTS.successful``, before it computes.
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
     without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop`, with deviation
@@ -191,6 +195,9 @@ class Reversible(AbstractAdjoint):
                     pull, moving, still, whole, trace, v,
                     layout=layout, steps=steps, entries=with_tangents,
                 )  # fmt: skip
+                # From a lane that nothing asks for nothing flows back, though it has failed.
+                asked = jnp.any(jnp.stack([jnp.any(x != 0) for x in jax.tree.leaves(v)]))
+                back = jax.tree.map(lambda x: jnp.where(asked, x, 0), back)
                 return flat(jax.tree.map(jnp.add, u, back), v)
 
             solver: Any = lax.custom_linear_solve  # its annotations differ between versions

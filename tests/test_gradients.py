@@ -325,6 +325,39 @@ def test_gradient_of_a_batch_with_a_shared_parameter():
     np.testing.assert_allclose(tangent, expected, rtol=1e-11)
 
 
+@pytest.mark.parametrize("form", ["arrays", pytest.param("components", marks=pytest.mark.slow)])
+def test_a_failed_lane_that_is_left_out_spoils_no_shared_parameter(form):
+    """A start that is none, and an implicit step without a root."""
+    q = jnp.array([[0.3, 0.0], [jnp.nan, 0.1], [0.1, 0.1], [0.2, 0.1]])
+    p = jnp.array([[0.3, 0.0], [0.1, 0.2], [60.0, 60.0], [0.0, 0.1]])
+
+    def total(x, lanes, left_out):
+        epsilon, K = x
+
+        def one(q, p):
+            sol = dvi.integrate(
+                SYSTEMS["non_separable"][0], q, p, h=0.05, num_steps=20, epsilon=epsilon,
+                args={"K": K}, save=dvi.Save(final=True), observe=dvi.Mean(product), throw=False,
+                layout=dvi.Layout(form=form),
+            )  # fmt: skip
+            ok = sol.result == dvi.RESULTS.successful
+            end, mean = sol.qs[-1], sol.observed
+            if left_out:
+                end, mean = jnp.where(ok, end, 0.0), jnp.where(ok, mean, 0.0)
+            return jnp.sum(end**2) + jnp.sum(mean), ok
+
+        values, ok = jax.vmap(one)(q[lanes], p[lanes])
+        return jnp.sum(values), ok
+
+    gradient = jax.jit(jax.grad(total, has_aux=True), static_argnums=2)
+    every, good = np.arange(4), np.array([0, 3])
+    found, ok = gradient((0.2, 1.1), every, True)
+    assert list(ok) == [True, False, False, True]
+    np.testing.assert_allclose(found, gradient((0.2, 1.1), good, False)[0], rtol=1e-12)
+    spoilt, _ = gradient((0.2, 1.1), every, False)
+    assert np.isnan(spoilt).all()  # NaN is not hidden where a failed lane is asked for
+
+
 @pytest.mark.slow
 def test_second_derivatives_in_every_combination_of_modes():
     for outer, inner in [
