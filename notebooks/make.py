@@ -56,8 +56,8 @@ def names() -> list[str]:
 
 
 def from_source(name: str) -> Any:
-    """The notebook without outputs: cells of NAME.py, numbered."""
-    text = (HERE / f"{name}.py").read_text(encoding="utf-8")
+    """The notebook without outputs: cells of NAME.py, numbered, without words to the formatter."""
+    text = (HERE / f"{name}.py").read_text(encoding="utf-8").replace("  # fmt: skip", "")
     return numbered(jupytext.reads(text, fmt="py:percent"))
 
 
