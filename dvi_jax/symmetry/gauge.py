@@ -80,8 +80,9 @@ def solve_gauge(
     looked for; `h`, `t0`, `args`: of the step; `samples`: (qs, ps) at t0, shapes (S, *q.shape),
     or (qs, ps, ts) with the times of the samples, shape (S,); a quarter of them held out.
 
-    **Returns** `gauges`, functions for `AdiabaticInvariant`; their `coefficients` in the basis; and
-    the `residual`: see there how far the identities close.
+    **Returns** `gauges`, functions for `AdiabaticInvariant`, one for each order; their
+    `coefficients` in the basis, shape (z + 1, basis size); and `residuals`, shape (z + 1,), on
+    held-out points: what they leave of the identity at each order, relative to its terms.
 
     **Raises** `ValueError` for samples of unequal shapes, too few of them, or where the step fails.
 
