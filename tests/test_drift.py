@@ -391,3 +391,9 @@ def test_what_is_no_observable_is_refused():
     for nothing in (3.0, None):
         with pytest.raises(TypeError, match="must be one observable"):
             sweep(nothing)
+
+
+@pytest.mark.parametrize("wrong", ["abc", [1.0], {"energy": None}])
+def test_a_picture_of_what_are_no_orders_is_refused(wrong):
+    with pytest.raises(TypeError, match=r"drift_orders draws what dvi\.drift_order returned, got"):
+        plot.drift_orders(wrong)

@@ -128,9 +128,16 @@ def drift_orders(
     legend counts them. `ax`: where to draw.
 
     **Returns** the `Axes`.
+
+    **Raises** `TypeError` for what is no `DriftOrder`.
     """
     if not isinstance(results, Mapping):
         results = {f"observable {i}": order for i, order in enumerate(results, 1)}
+    for label, order in results.items():
+        if not hasattr(order, "drifts"):
+            raise TypeError(
+                f"drift_orders draws what dvi.drift_order returned, got {order!r:.60} for {label}."
+            )
     slopes = _one_each(promised, len(results))
     axis, new = canvas(ax, (6.4, 4.8))
     left = min(order.epsilons.min() for order in results.values())
