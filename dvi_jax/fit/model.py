@@ -17,6 +17,7 @@ from .._solution import Save
 from .._system import System
 from ..engine.signature import accepts
 from ..lattices import Uniform
+from ..symmetry.basis import check_step_size
 from .observations import Observations
 
 _WASTE = 2_000_000
@@ -25,16 +26,6 @@ _WASTE = 2_000_000
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
 _OWN = ("num_steps", "save", "observe", "throw", "progress", "stop", "t0")
 """What `fit` sets itself."""
-
-
-def _step_size(h: Any) -> float:
-    try:
-        number = math.nan if isinstance(h, str | bool) else float(h)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not math.isfinite(number) or number == 0:
-        raise ValueError(f"h must be one finite step size other than zero, got {h!r}.")
-    return number
 
 
 class Model(eqx.Module):
@@ -82,7 +73,7 @@ class Model(eqx.Module):
         fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
         # Arrays, so that another value needs no other compilation.
         self.fixed = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, float) else x, fixed)
-        self.rest = {"system": system, "h": _step_size(h), **options}
+        self.rest = {"system": system, "h": check_step_size(h), **options}
 
     def __call__(self, params: Mapping[str, Any], arc: Any = None) -> dict[str, Any]:
         """The arguments of `integrate` for an arc (None: there is one, without rows)."""

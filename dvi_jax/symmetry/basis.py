@@ -48,7 +48,7 @@ def bind_basis(basis: Any, shape: tuple[int, ...]) -> "BoundBasis":
 def check_step_size(h: Any) -> float:
     """h as a number, after refusing zero (a step that goes nowhere keeps everything)."""
     try:
-        number = float(h)
+        number = np.nan if isinstance(h, str | bool) else float(h)
     except (TypeError, ValueError):
         number = np.nan
     if not np.isfinite(number) or number == 0:
