@@ -23,11 +23,6 @@ _SIGN = np.int64(-(2**63))
 _FRACTION = np.int64(2**52 - 1)
 _LOW_HALF = np.int64(2**32 - 1)
 _ONE = np.int64(0x3FF0_0000_0000_0000)
-_ROUNDER = 1.5 * 2.0**52
-"""Adding this number to a float below 2⁵¹ in size rounds it to an integer k.
-
-The sum's bits are those of `_ROUNDER` plus k, which saves a conversion to an integer.
-"""
 
 
 def _bits(x: Array) -> Array:
@@ -50,6 +45,16 @@ def _where(condition: Array, x: Array | float, y: Array | float) -> Array:
         np.float64(x) if isinstance(x, int | float) else x,
         np.float64(y) if isinstance(y, int | float) else y,
     )
+
+
+def _nearest(x: Array) -> tuple[Array, Array]:
+    """The integer k nearest to x, |x| < 2⁵¹, as a float and in the last bits of an integer.
+
+    The sum of k and 1.5·2⁵² has k in its last bits, which saves a conversion to an integer. It
+    would round as well, but XLA simplifies x + c − c to x.
+    """
+    k = lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN)
+    return k, _bits(k + 1.5 * 2.0**52)
 
 
 def _with_sign_of(value: Array, sign: Array) -> Array:
@@ -147,21 +152,17 @@ def _reduced(size: Array) -> tuple[Array, Array, Array]:
     with an error below 2^−117. No double except 0 is nearer than 2^−60.5 to a multiple of π/2 up to
     2²⁷ and than 2^−62 at all. Arguments beyond are reduced in a branch.
     """
-    turns = size * (2 / math.pi) + _ROUNDER
-    k = turns - _ROUNDER
+    k, bits = _nearest(size * (2 / math.pi))
     b = (size - k * _HALF_PI_4[0]) - k * _HALF_PI_4[1]
     part = k * _HALF_PI_4[2]
     r = b - part
     y = ((b - r) - part) - k * _HALF_PI_4[3]
-    return lax.cond(
-        size > _LIMIT_4, _reduced_large, lambda *args: args[1:], size, r, y, _bits(turns)
-    )
+    return lax.cond(size > _LIMIT_4, _reduced_large, lambda *args: args[1:], size, r, y, bits)
 
 
 def _reduced_large(size: Array, *_: Array) -> tuple[Array, Array, Array]:
     """The same in five parts for k ≤ 2²⁷, with a further branch beyond."""
-    turns = size * (2 / math.pi) + _ROUNDER
-    k = turns - _ROUNDER
+    k, bits = _nearest(size * (2 / math.pi))
     b = (size - k * _HALF_PI_5[0]) - k * _HALF_PI_5[1]
     part = k * _HALF_PI_5[2]
     t = b - part
@@ -172,9 +173,7 @@ def _reduced_large(size: Array, *_: Array) -> tuple[Array, Array, Array]:
     rest = (e + f) - k * _HALF_PI_5[4]
     r = u + rest
     y = (u - r) + rest
-    return lax.cond(
-        size > _LIMIT_5, _reduced_huge, lambda *args: args[1:], size, r, y, _bits(turns)
-    )
+    return lax.cond(size > _LIMIT_5, _reduced_huge, lambda *args: args[1:], size, r, y, bits)
 
 
 def _reduced_huge(size: Array, *_: Array) -> tuple[Array, Array, Array]:
@@ -428,12 +427,11 @@ _EXP_LIMIT = 708.0
 
 def _exp_reduced(x: Array) -> tuple[Array, Array, Array]:
     """(r, y, bits): r + y = x − k log 2, |r| ≤ (log 2)/2, with k in the last bits of `bits`."""
-    turns = x * (1 / math.log(2)) + _ROUNDER
-    k = turns - _ROUNDER
+    k, bits = _nearest(x * (1 / math.log(2)))
     high = x - k * _LOG_2[0]
     low = k * _LOG_2[1]
     r = high - low
-    return r, (high - r) - low, _bits(turns)
+    return r, (high - r) - low, bits
 
 
 def _exp_terms(r: Array, y: Array) -> tuple[Array, Array]:
@@ -450,7 +448,7 @@ def _scaled(value: Array, bits: Array) -> Array:
 
 def _scaled_twice(value: Array, bits: Array) -> Array:
     """`value` 2^k for |k| ≤ 2000, with one rounding at the end if the result is subnormal."""
-    half = _shift_right(bits, 1)  # the bits of `_ROUNDER` above, k/2 in the last ones
+    half = _shift_right(bits, 1)  # k/2 in the last bits; those above are shifted out
     first, second = (half << 52) + _ONE, ((bits - half) << 52) + _ONE
     return (value * _float(first)) * _float(second)
 
