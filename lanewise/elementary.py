@@ -62,6 +62,24 @@ def _with_sign_of(value: Array, sign: Array) -> Array:
     return _float(_bits(value) ^ (sign & _SIGN))
 
 
+def _fast_two_sum(x: Array, y: Array) -> tuple[Array, Array]:
+    """The rounded sum and its error, for |x| ≥ |y| or x = 0 (Dekker 1971)."""
+    total = x + y
+    return total, (x - total) + y
+
+
+def _two_sum(x: Array, y: Array) -> tuple[Array, Array]:
+    """The rounded sum and its error (Knuth 1969)."""
+    total = x + y
+    part = total - x
+    return total, (x - (total - part)) + (y - part)
+
+
+def _head(x: Array) -> Array:
+    """x cut to its first 26 significant bits: products of two such numbers are exact."""
+    return _float(_bits(x) & np.int64(-(2**27)))
+
+
 def _polynomial(z: Array, coefficients: Sequence[float]) -> Array:
     """Value of c0 + c1 z + c2 z² + … by Horner's scheme."""
     value = coefficients[-1]
@@ -234,7 +252,7 @@ def _reduced_huge(size: Array, *_: Array) -> tuple[Array, Array, Array]:
     g = g + f
 
     # times π/2
-    h_high = _float(_bits(h) & np.int64(-(2**27)))
+    h_high = _head(h)
     h_low = h - h_high
     first = h_high * _HALF_PI_3[0]
     second = (h_high * _HALF_PI_3[1] + h_low * _HALF_PI_3[0]) + (
@@ -243,12 +261,6 @@ def _reduced_huge(size: Array, *_: Array) -> tuple[Array, Array, Array]:
     r, y = _fast_two_sum(first, second)
     r = _where(size < math.inf, r, math.nan)
     return _float(_bits(r) ^ sign), _float(_bits(y) ^ sign), k
-
-
-def _fast_two_sum(x: Array, y: Array) -> tuple[Array, Array]:
-    """The rounded sum and its error, for |x| ≥ |y| or x = 0 (Dekker 1971)."""
-    total = x + y
-    return total, (x - total) + y
 
 
 def _sines(r: Array, y: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -405,24 +417,25 @@ def acos(x: Array) -> Array:
     return _where(is_steep, far, _PI_2[0] - (s - (_PI_2[1] - d)))
 
 
-# --- exp --------------------------------------------------------------------------------------
+# --- exp, exp2, expm1 and hyperbolic functions ------------------------------------------------
 
 _EXP = (
-    0.5000000000000001,
-    0.16666666666666669,
-    0.041666666666624164,
-    0.008333333333330065,
-    0.0013888888917196719,
-    0.00019841269863040545,
-    2.4801521322368692e-05,
-    2.7557268480310024e-06,
-    2.7620075879983367e-07,
-    2.5100375832561234e-08,
+    0.5000000000000013,
+    0.16666666666666677,
+    0.04166666666651114,
+    0.008333333333321374,
+    0.0013888888948162797,
+    0.00019841269886854143,
+    2.480148871974186e-05,
+    2.7557243408231995e-06,
+    2.7631729701439217e-07,
+    2.510933783878345e-08,
 )
-# log 2: 42 bits, so that multiples of it are exact, and the rest.
+# log 2 in 42 bits, so that multiples of it are exact, and in 26 bits, each with the rest.
 _LOG_2 = float.fromhex("0x1.62e42fefa3p-1"), float.fromhex("0x1.3de6af278ece6p-42")
+_LOG_2_HEAD = float.fromhex("0x1.62e42f8p-1"), float.fromhex("0x1.be8e7bcd5e4f2p-27")
 _EXP_LIMIT = 708.0
-"""The largest |x| whose exponential needs no care: e^x is a normal number."""
+"""For |x| below this number e^x is a normal number, and so is e^−x."""
 
 
 def _exp_reduced(x: Array) -> tuple[Array, Array, Array]:
@@ -441,6 +454,11 @@ def _exp_terms(r: Array, y: Array) -> tuple[Array, Array]:
     return w, ((1.0 - w) + r) + (z * _split_polynomial(r, z, _EXP) + y)
 
 
+def _power_of_two(bits: Array) -> Array:
+    """2^k, |k| ≤ 1022, with k in the last bits of `bits`."""
+    return _float((bits << 52) + _ONE)
+
+
 def _scaled(value: Array, bits: Array) -> Array:
     """`value` 2^k for a normal result, with k in the last bits of `bits`."""
     return _float(_bits(value) + (bits << 52))
@@ -449,29 +467,147 @@ def _scaled(value: Array, bits: Array) -> Array:
 def _scaled_twice(value: Array, bits: Array) -> Array:
     """`value` 2^k for |k| ≤ 2000, with one rounding at the end if the result is subnormal."""
     half = _shift_right(bits, 1)  # k/2 in the last bits; those above are shifted out
-    first, second = (half << 52) + _ONE, ((bits - half) << 52) + _ONE
-    return (value * _float(first)) * _float(second)
+    return (value * _power_of_two(half)) * _power_of_two(bits - half)
 
 
 def exp(x: Array) -> Array:
     """Exponential function."""
     r, y, bits = _exp_reduced(x)
     w, d = _exp_terms(r, y)
-    value = w + d
 
     def extreme(x, value, bits):
         value = _where(x > 710.0, math.inf, _scaled_twice(value, bits))
         value = _where(x < -746.0, 0.0, value)
         return _where(x == x, value, x)
 
-    def ordinary(x, value, bits):
-        del x
-        return _scaled(value, bits)
-
-    return lax.cond(lax.abs(x) < _EXP_LIMIT, ordinary, extreme, x, value, bits)
+    return lax.cond(
+        lax.abs(x) < _EXP_LIMIT, lambda x, *args: _scaled(*args), extreme, x, w + d, bits
+    )
 
 
-# --- log --------------------------------------------------------------------------------------
+def _exp2_terms(high: Array, low: Array) -> tuple[Array, Array]:
+    """w + d = 2^(high + low), |high| ≤ 1/2, |low| below 2^−25 |high| or 2^−25."""
+    head = _head(high)
+    low = (high - head) + low
+    # (head + low) log 2 as a rounded sum and its error; the first product is exact.
+    r, y = _fast_two_sum(
+        head * _LOG_2_HEAD[0], head * _LOG_2_HEAD[1] + low * (_LOG_2_HEAD[0] + _LOG_2_HEAD[1])
+    )
+    return _exp_terms(r, y)
+
+
+def exp2(x: Array) -> Array:
+    """Power of 2."""
+    k, bits = _nearest(x)
+    w, d = _exp2_terms(x - k, np.float64(0.0))
+
+    def extreme(x, value, bits):
+        value = _where(x >= 1024.0, math.inf, _scaled_twice(value, bits))
+        value = _where(x < -1076.0, 0.0, value)
+        return _where(x == x, value, x)
+
+    return lax.cond(lax.abs(x) < 1021.0, lambda x, *args: _scaled(*args), extreme, x, w + d, bits)
+
+
+def _expm1_terms(x: Array) -> tuple[Array, Array]:
+    r"""e^x − 1 as a rounded value's two terms, the first the larger one, for |x| < 708.
+
+    e^x − 1 = (2^k − 1) + 2^k r + 2^k (e^r − 1 − r), where the first two terms are summed without
+    error: 2^k − 1 is 0 or larger in size than the second, and exact where that matters.
+    """
+    r, y, bits = _exp_reduced(x)
+    z = r * r
+    scale = _power_of_two(bits)
+    w, e = _fast_two_sum(scale - 1.0, scale * r)
+    return w, e + scale * (z * _split_polynomial(r, z, _EXP) + y)
+
+
+def expm1(x: Array) -> Array:
+    """e^x − 1."""
+    w, d = _expm1_terms(x)
+
+    def extreme(x, value):
+        value = _where(x > 0.0, exp(x), -1.0)
+        return _where(x == x, value, x)
+
+    value = lax.cond(lax.abs(x) < _EXP_LIMIT, lambda x, value: value, extreme, x, w + d)
+    return _where(x == 0.0, x, value)  # −0
+
+
+def _exp_half(size: Array) -> Array:
+    """e^size/2 for size ≥ 708."""
+    r, y, bits = _exp_reduced(size)
+    w, d = _exp_terms(r, y)
+    value = _scaled_twice(w + d, bits - np.int64(1))
+    value = _where(size > 711.0, math.inf, value)
+    return _where(size == size, value, size)
+
+
+def sinh(x: Array) -> Array:
+    """Hyperbolic sine: with t = e^|x| − 1, (t + t/(t + 1))/2."""
+    size = lax.abs(x)
+
+    def ordinary(size):
+        t, dt = _fast_two_sum(*_expm1_terms(size))
+        n, dn = _two_sum(t, np.float64(1.0))
+        quotient = t / n
+        # 1/n to first order is 1 − quotient.
+        rest = dt + (dt - quotient * (dn + dt)) * (1.0 - quotient)
+        return 0.5 * ((t + quotient) + rest)
+
+    value = lax.cond(size < _EXP_LIMIT, ordinary, _exp_half, size)
+    return _with_sign_of(value, _bits(x))
+
+
+def cosh(x: Array) -> Array:
+    """Hyperbolic cosine: with E = e^|x|, (E + 1/E)/2."""
+    size = lax.abs(x)
+
+    def ordinary(size):
+        r, y, bits = _exp_reduced(size)
+        w, d = _exp_terms(r, y)
+        scale = _power_of_two(bits)
+        total, e = _fast_two_sum(scale * w, 1.0 / (scale * (w + d)))
+        return 0.5 * (total + (e + scale * d))
+
+    return lax.cond(size < _EXP_LIMIT, ordinary, _exp_half, size)
+
+
+def tanh(x: Array) -> Array:
+    """Hyperbolic tangent: with t = e^(2|x|) − 1, t/(t + 2)."""
+    size = lax.abs(x)
+    size = _where(size > 22.0, 22.0, size)  # where the value is 1 to rounding
+    t, dt = _fast_two_sum(*_expm1_terms(2.0 * size))
+    n, dn = _two_sum(t, np.float64(2.0))
+    quotient = t / n
+    # 1/n to first order is (1 − quotient)/2.
+    value = quotient + (dt - quotient * (dn + dt)) * (0.5 - 0.5 * quotient)
+    return _with_sign_of(value, _bits(x))
+
+
+def logistic(x: Array) -> Array:
+    """1/(1 + e^−x), as E/(1 + E) for x < 0, E = e^−|x|."""
+    size = lax.abs(x)
+
+    def ordinary(x, size):
+        r, y, bits = _exp_reduced(-size)
+        w, d = _exp_terms(r, y)
+        scale = _power_of_two(bits)
+        e, de = _fast_two_sum(scale * w, scale * d)
+        n, dn = _fast_two_sum(np.float64(1.0), e)
+        dn = dn + de
+        is_negative = x < 0.0
+        quotient = _where(is_negative, e, 1.0) / n
+        inverse = _where(is_negative, 1.0 - quotient, quotient)  # 1/n to first order
+        return quotient + (_where(is_negative, de, 0.0) - quotient * dn) * inverse
+
+    def extreme(x, size):
+        return _where(x > 0.0, 1.0, exp(-size))  # NaN too
+
+    return lax.cond(size < _EXP_LIMIT, ordinary, extreme, x, size)
+
+
+# --- log, log1p and inverse hyperbolic functions ----------------------------------------------
 
 _LOG = (
     0.6666666666666734,
@@ -490,15 +626,24 @@ _TINY = 2.0**-1022
 def _normalised(x: Array) -> tuple[Array, Array]:
     """(k, m) with x = 2^k m, √½ ≤ m < √2, for a normal x > 0."""
     bits = _bits(x) + (_ONE - _ROOT_HALF)
-    # An exponent in the last bits of 2⁵² becomes a float without a conversion.
+    return _exponent(bits), _float((bits & _FRACTION) + _ROOT_HALF)
+
+
+def _exponent(bits: Array) -> Array:
+    """The exponent of a positive number as a float."""
+    # In the last bits of 2⁵² it becomes a float without a conversion.
     exponent = _float(_shift_right(bits, 52) | np.int64(0x4330_0000_0000_0000))
-    return exponent - (2.0**52 + 1023), _float((bits & _FRACTION) + _ROOT_HALF)
+    return exponent - (2.0**52 + 1023)
 
 
-def _log_normal(x: Array, shift: float = 0.0) -> Array:
-    r"""log x + `shift` log 2 = k log 2 + log m, and with f = m − 1, s = f/(2 + f), z = s²
+def _log_sum(x: Array, e: Array | None = None, shift: float = 0.0) -> Array:
+    r"""log(x + e) + `shift` log 2 for a normal x and |e| of the size of its rounding error.
 
-    log m = f − (f²/2 − s (f²/2 + z P(z))).
+    With x = 2^k m, f = m − 1, s = f/(2 + f), z = s²,
+
+        log x = k log 2 + f − (f²/2 − s (f²/2 + z P(z))),   log(1 + e/x) = 2^−k e/(1 + f)
+
+    and 1/(1 + f) = (1 − s)/(1 + s) by the first terms of its series.
     """
     k, m = _normalised(x)
     k = k + shift if shift else k
@@ -506,8 +651,12 @@ def _log_normal(x: Array, shift: float = 0.0) -> Array:
     s = f / (2.0 + f)
     z = s * s
     half = 0.5 * f * f
+    small = k * _LOG_2[1]
+    if e is not None:
+        inverse = _float((_bits(m) - _bits(x)) + _ONE)
+        small = small + (e * inverse) * (1.0 - (2.0 * s) * (1.0 - s))
     series = s * (half + z * _split_polynomial(z, z * z, _LOG))
-    return k * _LOG_2[0] - ((half - (series + k * _LOG_2[1])) - f)
+    return k * _LOG_2[0] - ((half - (series + small)) - f)
 
 
 def log(x: Array) -> Array:
@@ -515,16 +664,377 @@ def log(x: Array) -> Array:
 
     def extreme(x, value):
         del value
-        value = _log_normal(x * 2.0**54, -54.0)
+        value = _log_sum(x * 2.0**54, shift=-54.0)
         value = _where(x >= _TINY, x, value)  # ∞
         value = _where(x > 0.0, value, math.nan)
         return _where(x == 0.0, -math.inf, value)
 
     is_ordinary = (x >= _TINY) & (x < math.inf)
-    return lax.cond(is_ordinary, lambda x, value: value, extreme, x, _log_normal(x))
+    return lax.cond(is_ordinary, lambda x, value: value, extreme, x, _log_sum(x))
+
+
+def log1p(x: Array) -> Array:
+    """log(1 + x), from the rounded sum and its error."""
+
+    def extreme(x, value):
+        value = _where(x > 0.0, log(x), _where(x == -1.0, -math.inf, math.nan))
+        return _where(x == x, value, x)
+
+    value = _log_sum(*_two_sum(np.float64(1.0), x))
+    is_ordinary = (x > -1.0) & (x < 2.0**500)
+    value = lax.cond(is_ordinary, lambda x, value: value, extreme, x, value)
+    return _where(x == 0.0, x, value)  # −0
+
+
+def _log1p_sum(z: Array, e: Array) -> Array:
+    """log(1 + z + e), 0 ≤ z < 2⁶⁰⁰, |e| below the rounding error of z."""
+    total, rest = _two_sum(np.float64(1.0), z)
+    return _log_sum(total, rest + e)
+
+
+def _log_double(x: Array) -> Array:
+    """log(2x) for x ≥ 2⁵⁰⁰, NaN for NaN."""
+    return _where(x < math.inf, _log_sum(x, shift=1.0), x)
+
+
+def asinh(x: Array) -> Array:
+    """Inverse hyperbolic sine: log(1 + z) with z = |x| + x²/(1 + √(1 + x²))."""
+    size = lax.abs(x)
+
+    def ordinary(size):
+        square = size * size
+        z, e = _fast_two_sum(size, square / (1.0 + lax.sqrt(1.0 + square)))
+        return _log1p_sum(z, e)
+
+    value = lax.cond(size < 2.0**500, ordinary, _log_double, size)
+    return _with_sign_of(value, _bits(x))
+
+
+def acosh(x: Array) -> Array:
+    """Inverse hyperbolic cosine: log(1 + z) with t = x − 1, z = t + √(2t + t²)."""
+
+    def ordinary(x):
+        t = x - 1.0
+        z, e = _fast_two_sum(lax.sqrt(2.0 * t + t * t), t)
+        return _log1p_sum(z, e)
+
+    def extreme(x):
+        return _where(x < 1.0, math.nan, _log_double(x))
+
+    return lax.cond((x >= 1.0) & (x < 2.0**500), ordinary, extreme, x)
+
+
+def atanh(x: Array) -> Array:
+    """Inverse hyperbolic tangent: log(1 + z)/2 with z = 2|x|/(1 − |x|)."""
+    size = lax.abs(x)
+
+    def ordinary(size):
+        n, dn = _fast_two_sum(np.float64(1.0), -size)
+        z = 2.0 * size / n
+        # The error of n, with 1/n = 1 + z/2.
+        return 0.5 * _log1p_sum(z, -(z * dn) * (1.0 + 0.5 * z))
+
+    def extreme(size):
+        return _where(size == 1.0, math.inf, math.nan)
+
+    value = lax.cond(size < 1.0, ordinary, extreme, size)
+    return _with_sign_of(value, _bits(x))
+
+
+# --- powers -----------------------------------------------------------------------------------
+
+# 2/log 2 times 1, 1/3 (its first 26 bits and the rest), and (1/5, 1/7, …) joined in a polynomial.
+_LOG2_1 = float.fromhex("0x1.71547652b82fep+1"), float.fromhex("0x1.777d0ffda0d24p-55")
+_LOG2_3 = float.fromhex("0x1.ec709d8p-1"), float.fromhex("0x1.0e80ff5d27f05p-27")
+_LOG2_5 = (
+    0.5770780163555878,
+    0.41219858310117996,
+    0.3205989111330921,
+    0.2623006008120142,
+    0.22393777798638248,
+)
+# Where the interval of c begins, c, and log2 c to 40 bits after the point and the rest.
+_LOG2_CENTRES = (
+    (1.125, 1.265625, float.fromhex("0x1.5c01a39fbcp-2"), float.fromhex("0x1.6879fa00b120ap-42")),
+    (1.42, 1.59375, float.fromhex("0x1.5848226988p-1"), float.fromhex("0x1.d33c38d8bd28dp-41")),
+    (1.785, 2.0, 1.0, 0.0),
+)
+
+
+def _log2_terms(x: Array, shift: float = 0.0) -> tuple[Array, Array]:
+    r"""log2 x + `shift` as a rounded value and its error, to 2^−67 of it, for a normal x > 0.
+
+    x = 2^k m, 1 ≤ m < 2, and with c one of 1, 1.27, 1.59, 2 next to m, s = (m − c)/(m + c), z = s²
+
+    log2 x = k + log2 c + s G,   G = 2/log 2 (1 + z/3 + z²/5 + …),   |s| < 0.06.
+
+    s, G and products are sums of two numbers, the first of 26 bits, so that no product is rounded
+    that matters.
+    """
+    bits = _bits(x)
+    m = _float((bits & _FRACTION) | _ONE)
+    c: Array | float = 1.0
+    k: Array | float = 0.0
+    dk: Array | float = 0.0
+    for begin, centre, high, low in _LOG2_CENTRES:
+        is_beyond = m > begin
+        c = _where(is_beyond, centre, c)
+        k, dk = _where(is_beyond, high, k), _where(is_beyond, low, dk)
+    k = k + (_exponent(bits) + shift if shift else _exponent(bits))
+
+    f = m - c
+    n = m + c
+    inverse = 1.0 / n
+    n_head = _head(n)
+    n_rest = (c - n_head) + m
+    s = _head(f * inverse)
+    ds = ((f - s * n_head) - s * n_rest) * inverse
+
+    square = s * s
+    z_head = _head(square)
+    dz = (square - z_head) + ds * (s + s + ds)
+    z = z_head + dz
+    leading = z_head * _LOG2_3[0]
+    rest = z * (_LOG2_3[1] + z * _polynomial(z, _LOG2_5)) + dz * _LOG2_3[0]
+    g = _head(_LOG2_1[0] + leading)
+    dg = ((_LOG2_1[0] - g) + leading) + (rest + _LOG2_1[1])
+
+    value, e = _fast_two_sum(k, s * g)  # k is 0 or the larger one
+    return _fast_two_sum(value, e + (dk + (s * dg + ds * (g + dg))))
+
+
+def _product_terms(y: Array, log: tuple[Array, Array]) -> tuple[Array, Array]:
+    """The product of y and the sum of two numbers: the first term has 52 bits, exactly."""
+    y_head, log_head = _head(y), _head(log[0])
+    rest = y_head * (log[0] - log_head) + (y - y_head) * log[0]
+    return y_head * log_head, rest + y * log[1]
+
+
+def pow(x: Array, y: Array) -> Array:
+    """x^y = 2^(y log2 x), with the special values of C99."""
+    high, low = _product_terms(y, _log2_terms(x))
+    k, bits = _nearest(high)
+    w, d = _exp2_terms(high - k, low)
+    is_ordinary = (x >= _TINY) & (x < math.inf) & (lax.abs(high) < 1021.0)
+    return lax.cond(
+        is_ordinary, lambda x, y, *args: _scaled(*args), _pow_extreme, x, y, w + d, bits
+    )
+
+
+def _pow_extreme(x: Array, y: Array, *_: Array) -> Array:
+    """The same for every x and y."""
+    size = lax.abs(x)
+    is_0 = size == 0.0
+    is_limit = is_0 | (size == math.inf)
+    is_subnormal = size < _TINY
+    # Beyond these limits of y and of the exponent the power is 0, 1 or ∞, and they avoid ∞ − ∞.
+    bounded = _where(lax.abs(y) > 2.0**65, _where(y > 0.0, 2.0**65, -(2.0**65)), y)
+    log, d_log = _log2_terms(_where(is_subnormal, size * 2.0**54, size))
+    exact, e = _two_sum(log, _where(is_subnormal, -54.0, 0.0))
+    high, low = _product_terms(bounded, _fast_two_sum(exact, e + d_log))
+    is_far = lax.abs(high) > 2000.0
+    high = _where(is_far, _where(high > 0.0, 2000.0, -2000.0), high)
+    low = _where(is_far, 0.0, low)
+    k, bits = _nearest(high)
+    w, d = _exp2_terms(high - k, low)
+    value = _scaled_twice(w + d, bits)
+
+    value = _where(is_limit, _where(is_0 ^ (y < 0.0), 0.0, math.inf), value)
+    is_integer = lax.floor(y) == y
+    half = 0.5 * y
+    is_odd = is_integer & (lax.floor(half) != half)
+    value = _where(is_odd & (_bits(x) < 0), -value, value)
+    value = _where((x < 0.0) & ~(is_limit | is_integer), math.nan, value)
+    value = _where(x == x, _where(y == y, value, y), x)
+    return _where((x == 1.0) | (y == 0.0), 1.0, value)
+
+
+def half_integer_power(twice: int) -> Callable[[Array], Array]:
+    """The function x^(twice/2) of odd `twice`: products, a root, and a quotient if negative.
+
+    Errors grow by about one ulp per product. Intermediate results leave the range of normal numbers
+    only if x^(|twice|/2) does.
+    """
+    if twice % 2 == 0:
+        raise ValueError(f"half_integer_power: twice must be odd, got {twice}")
+    count = abs(twice) // 2
+    at_infinity, at_0 = (0.0, math.inf) if twice < 0 else (math.inf, 0.0)
+
+    def power(x: Array) -> Array:
+        value, factor, remaining = lax.sqrt(x), x, count
+        while remaining:
+            value = value * factor if remaining % 2 else value
+            remaining //= 2
+            factor = factor * factor if remaining else factor
+        value = 1.0 / value if twice < 0 else value
+        value = _where(x == 0.0, at_0, value)  # −0 and −∞ included, as in C99
+        return _where(lax.abs(x) == math.inf, at_infinity, value)
+
+    return power
+
+
+_CBRT = (
+    1.6662787377309156,
+    -1.1623973573078166,
+    0.6846527077322325,
+    -0.21636185469244387,
+    0.02778280101858424,
+)
+"""m^(−1/3) for 1 ≤ m ≤ 2, to 2^−14."""
+
+
+def cbrt(x: Array) -> Array:
+    r"""Cube root, without a quotient.
+
+    |x| = 2^(3k) v, 1 ≤ v < 8. y ≈ v^(−1/3) from a polynomial is corrected once in third order,
+    t = v y² is cut to 26 bits, and v − t³, whose products are exact, gives the rest.
+    """
+    size = lax.abs(x)
+
+    def normal(size, shift):
+        bits = _bits(size)
+        m = _float((bits & _FRACTION) | _ONE)
+        exponent = _exponent(bits)
+        k, k_bits = _nearest(exponent * (1 / 3) - 1 / 3)
+        j = exponent - 3.0 * k
+        v = m * _where(j > 0.5, _where(j > 1.5, 4.0, 2.0), 1.0)
+        start = _where(j > 0.5, _where(j > 1.5, 4.0 ** (-1 / 3), 2.0 ** (-1 / 3)), 1.0)
+        y = _polynomial(m, _CBRT) * start
+        h = 1.0 - (v * y) * (y * y)
+        y = y + y * h * (1 / 3 + 2 / 9 * h)
+        square = y * y
+        t = v * square
+        head = _head(t)
+        cube = head * head
+        cube_head = _head(cube)
+        rest = (v - cube_head * head) - (cube - cube_head) * head
+        value = head + rest * (square * (1 / 3)) * (1.0 + (t - head) * y)
+        return _scaled(value, k_bits - np.int64(shift))
+
+    def extreme(size, value):
+        del value
+        return _where((size > 0.0) & (size < _TINY), normal(size * 2.0**54, 18), size)
+
+    is_ordinary = (size >= _TINY) & (size < math.inf)
+    value = lax.cond(is_ordinary, lambda size, value: value, extreme, size, normal(size, 0))
+    return _with_sign_of(value, _bits(x))
+
+
+# --- error functions --------------------------------------------------------------------------
+
+_ERF = (
+    0.1283791670955126,
+    -0.37612638903183715,
+    0.11283791670952596,
+    -0.026866170644428485,
+    0.005223977615420539,
+    -0.0008548326188759752,
+    0.00012055289567541706,
+    -1.4924196305569617e-05,
+    1.643068417974155e-06,
+    -1.5940066854661717e-07,
+    1.1472499701094691e-08,
+)
+"""(erf x − x)/x in powers of x², |x| ≤ 3/4."""
+_ERFC = (
+    0.885637101864549,
+    -0.47966144308433484,
+    0.22387273334256394,
+    -0.08762571665293113,
+    0.0273179871925529,
+    -0.005992101444580248,
+    0.0005111598752947777,
+    0.000205659832077786,
+    -8.285365527091147e-05,
+    2.220139044906247e-06,
+    6.227296889502188e-06,
+    -1.1155609585865108e-06,
+    -4.445714915621324e-07,
+    1.5282476354520886e-07,
+    3.609493014579401e-08,
+    -1.8602784890975483e-08,
+    -3.861539904064324e-09,
+    2.2184308431273025e-09,
+    6.065013745818855e-10,
+    -1.9632856778077817e-10,
+    -1.0123904659623566e-10,
+    -1.1886619779461667e-11,
+)
+"""(x + 3) e^(x²) erfc x in powers of 1 − 8/(x + 3), 3/4 ≤ x ≤ 28."""
+_ERFC_0 = -1.4715825033880924e-17
+"""The error of the rounding of the first of them."""
+
+
+def _erf_rest(x: Array) -> Array:
+    """erf x − x for |x| ≤ 3/4."""
+    z = x * x
+    return x * _split_polynomial(z, z * z, _ERF)
+
+
+def _erfc_tail(x: Array) -> Array:
+    r"""erfc x = e^(−x²) P(v)/(x + 3), v = 1 − 8/(x + 3), for x ≥ 3/4.
+
+    The square is the sum of h² exactly, h being the first 26 bits of x, and (x − h)(x + h).
+    """
+    x = _where(x > 28.0, 28.0, x)  # where the value is 0 to rounding
+    head = _head(x)
+    square, d_square = head * head, (x - head) * (x + head)
+    k, bits = _nearest(square * (-1 / math.log(2)))
+    r, y = _two_sum(-square - k * _LOG_2[0], -(k * _LOG_2[1] + d_square))
+    w, d = _exp_terms(r, y)
+
+    n, dn = _two_sum(x, np.float64(3.0))
+    n_head = _head(n)
+    t = 1.0 / n
+    t_head = _head(t)
+    # 1/n − t, the products of heads being exact
+    residual = (1.0 - t_head * n_head) - t_head * ((n - n_head) + dn)
+    t_rest = residual * t
+    v = 1.0 - 8.0 * t
+    dv = -8.0 * (t_rest - (t - t_head))
+    slope = _polynomial(v, [k * c for k, c in enumerate(_ERFC[:5])][1:])
+    factor, rest = _fast_two_sum(_ERFC[0], v * _split_polynomial(v, v * v, _ERFC[1:]))
+    factor_head = _head(factor)
+    factor_rest = (factor - factor_head) + (rest + (_ERFC_0 + slope * dv))
+
+    product = factor_head * t_head
+    head = _head(product)
+    rest = (product - head) + (factor_head * t_rest + factor_rest * t)
+    w_head = _head(w)
+    w_rest = (w - w_head) + d
+    return _scaled_twice(w_head * head + (w_head * rest + w_rest * (head + rest)), bits)
+
+
+def erf(x: Array) -> Array:
+    """Error function."""
+    size = lax.abs(x)
+    value = lax.cond(size > 0.75, lambda x: 1.0 - _erfc_tail(x), lambda x: x + _erf_rest(x), size)
+    return _with_sign_of(value, _bits(x))
+
+
+def erfc(x: Array) -> Array:
+    """Complementary error function."""
+
+    def tail(x):
+        value = _erfc_tail(lax.abs(x))
+        return _where(x < 0.0, 2.0 - value, value)
+
+    def centre(x):
+        total, e = _two_sum(np.float64(1.0), -x)
+        return total + (e - _erf_rest(x))
+
+    return lax.cond(lax.abs(x) > 0.75, tail, centre, x)
 
 
 FUNCTIONS: dict[str, Callable[..., Array]] = {
-    function.__name__: function for function in (sin, cos, tan, atan, atan2, asin, acos, exp, log)
+    function.__name__: function
+    for function in (
+        *(sin, cos, tan, asin, acos, atan, atan2),
+        *(sinh, cosh, tanh, asinh, acosh, atanh, logistic),
+        *(exp, exp2, expm1, log, log1p, pow, cbrt, erf, erfc),
+    )
 }
-"""From the name of a primitive of JAX to its function of float64 scalars."""
+"""From the name of a primitive of JAX to its function of float64 scalars.
+
+For float32 the result of the float64 function is rounded.
+"""
