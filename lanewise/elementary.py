@@ -51,7 +51,7 @@ def _nearest(x: Array) -> tuple[Array, Array]:
     """The integer k nearest to x, |x| < 2⁵¹, as a float and in the last bits of an integer.
 
     The sum of k and 1.5·2⁵² has k in its last bits, which saves a conversion to an integer. It
-    would round as well, but XLA simplifies x + c − c to x.
+    would round as well, but XLA simplifies x + c − c to x for constants c.
     """
     k = lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN)
     return k, _bits(k + 1.5 * 2.0**52)
@@ -69,7 +69,7 @@ def _fast_two_sum(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _two_sum(x: Array, y: Array) -> tuple[Array, Array]:
-    """The rounded sum and its error (Knuth 1969)."""
+    """The rounded sum and its error (Knuth 1969). A constant is y: XLA simplifies x + c − c."""
     total = x + y
     part = total - x
     return total, (x - (total - part)) + (y - part)
@@ -680,7 +680,7 @@ def log1p(x: Array) -> Array:
         value = _where(x > 0.0, log(x), _where(x == -1.0, -math.inf, math.nan))
         return _where(x == x, value, x)
 
-    value = _log_sum(*_two_sum(np.float64(1.0), x))
+    value = _log_sum(*_two_sum(x, np.float64(1.0)))
     is_ordinary = (x > -1.0) & (x < 2.0**500)
     value = lax.cond(is_ordinary, lambda x, value: value, extreme, x, value)
     return _where(x == 0.0, x, value)  # −0
@@ -688,7 +688,7 @@ def log1p(x: Array) -> Array:
 
 def _log1p_sum(z: Array, e: Array) -> Array:
     """log(1 + z + e), 0 ≤ z < 2⁶⁰⁰, |e| below the rounding error of z."""
-    total, rest = _two_sum(np.float64(1.0), z)
+    total, rest = _two_sum(z, np.float64(1.0))
     return _log_sum(total, rest + e)
 
 
@@ -1020,7 +1020,7 @@ def erfc(x: Array) -> Array:
         return _where(x < 0.0, 2.0 - value, value)
 
     def centre(x):
-        total, e = _two_sum(np.float64(1.0), -x)
+        total, e = _two_sum(-x, np.float64(1.0))
         return total + (e - _erf_rest(x))
 
     return lax.cond(lax.abs(x) > 0.75, tail, centre, x)
