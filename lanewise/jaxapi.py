@@ -1,0 +1,124 @@
+"""The few names of JAX that have moved between releases, or are not public: all of them, here."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
+from jax.interpreters import ad, batching, mlir, partial_eval
+
+__all__ = [
+    "ClosedJaxpr",
+    "Jaxpr",
+    "Literal",
+    "bodies",
+    "drops_outputs",
+    "identity",
+    "is_traced",
+    "jaxpr_as_fun",
+    "jaxprs_in_params",
+    "lower_on",
+    "primitive",
+    "scan_counts",
+    "without_outputs",
+]
+
+
+def is_traced(x: object) -> bool:
+    """Whether `x` stands for a value that is not known yet (inside jit, vmap, grad, …)."""
+    return isinstance(x, Tracer)
+
+
+def bodies(eqn: Any) -> Iterator[ClosedJaxpr]:
+    """The jaxprs among the parameters of an equation, closed: what it calls."""
+    if "_prim" in eqn.params:  # from jax 0.12 on, custom_root and others
+        yield _expanded(eqn)
+    for value in eqn.params.values():
+        for item in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(item, ClosedJaxpr):
+                yield item
+            elif isinstance(item, Jaxpr):
+                yield ClosedJaxpr(item, ())
+
+
+def _expanded(eqn: Any) -> ClosedJaxpr:
+    """What an equation stands for that is itself no operation yet."""
+    which = eqn.params["_prim"]
+
+    def function(*leaves):
+        return jax.tree.leaves(which.expand(*jax.tree.unflatten(which.in_tree, leaves)))
+
+    return jax.make_jaxpr(function)(*(v.aval for v in eqn.invars))
+
+
+def scan_counts(params: dict[str, Any]) -> tuple[int, int]:
+    """How many constants and how many parts of a carry a scan has, from its parameters."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(list(consts)), len(list(carry))
+
+
+def primitive(
+    name: str, function: Callable, batched: Callable | None = None, multiple: bool = False
+) -> Primitive:
+    """A primitive of its own name that does what `function` (of arrays and parameters) does.
+
+    `batched(arrays, axes, **params)` → (output, axis or None) is its rule under `vmap`, that of
+    `function` if left out. `multiple` says that it gives a list of arrays. It has no derivative.
+    """
+    new = Primitive(name)
+    new.multiple_results = multiple
+    new.def_impl(function)
+    new.def_abstract_eval(lambda *avals, **params: _abstract(function, avals, params))
+    mlir.register_lowering(new, mlir.lower_fun(function, multiple_results=multiple))
+
+    def as_function(arrays, axes, **params):
+        return jax.vmap(lambda *a: function(*a, **params), axes, 0)(*arrays), 0
+
+    batching.primitive_batchers[new] = batched or as_function
+    return new
+
+
+def lower_on(platform: str, of: Primitive, function: Callable) -> None:
+    """Have a primitive of several outputs compiled for `platform` as what `function` does."""
+    rule = mlir.lower_fun(function, multiple_results=True)
+    mlir.register_lowering(of, rule, platform=platform)
+
+
+def drops_outputs(of: Primitive, without: Callable) -> None:
+    """Have unused outputs of a primitive dropped: `without(params, used)` → its new parameters."""
+
+    def rule(used: list[bool], *more: Any):
+        eqn = more[-1]  # newer releases put something in between
+        if not any(used):
+            return [False] * len(eqn.invars), None
+        outvars = [v for v, u in zip(eqn.outvars, used, strict=True) if u]
+        new = eqn.replace(outvars=outvars, params=without(eqn.params, used))
+        return [True] * len(eqn.invars), new
+
+    partial_eval.dce_rules[of] = rule
+
+
+def without_outputs(closed: ClosedJaxpr, used: list[bool]) -> ClosedJaxpr:
+    """The jaxpr that computes only some outputs, of the same inputs."""
+    jaxpr = partial_eval.dce_jaxpr(closed.jaxpr, used, instantiate=True)[0]
+    return ClosedJaxpr(jaxpr, closed.consts)
+
+
+def identity(name: str, batched: Callable) -> Primitive:
+    """A primitive that does nothing but under `vmap`, for which `batched` is its rule."""
+    new = primitive(name, lambda x: x, batched)
+    ad.deflinear2(new, lambda cotangent, _: [new.bind(cotangent)])
+    return new
+
+
+def _abstract(function: Callable, avals: Any, params: dict[str, Any]) -> Any:
+    shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
+    shape_of = getattr(function, "shape_of", None)
+    if shape_of is not None:
+        out = shape_of(*shapes, **params)
+    else:
+        out = jax.eval_shape(lambda *a: function(*a, **params), *shapes)
+    return jax.tree.map(lambda x: ShapedArray(x.shape, x.dtype), out)
