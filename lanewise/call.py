@@ -253,7 +253,9 @@ def _on_cpu(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...
     """The program as machine code, through XLA where none can be generated."""
     try:
         name, params = compiled(program, on, lanes)
-    except Unsupported:
+    except Unsupported as reason:
+        if os.environ.get("LANEWISE_LOG"):
+            print("left to XLA:", reason, flush=True)
         return _through_xla(*operands, program=program, lanes=lanes, on=on)
     front = () if lanes is None else (lanes,)
     avals = program.traced.closed.out_avals

@@ -74,7 +74,7 @@ def objects(entries: Sequence[Any], shape: Sequence[int]) -> np.ndarray:
 class Kernel:
     """What an evaluation needs of the function around it; see `machine`."""
 
-    def scratch(self, shape: Sequence[int], dtype: str) -> Buffer:
+    def scratch(self, shape: Sequence[int], dtype: str, on: bool) -> Buffer:
         raise NotImplementedError
 
     def constant(self, array: np.ndarray) -> Buffer:
@@ -207,7 +207,7 @@ class Evaluator:
         known = value.known()
         if known is not None:
             return self.kernel.constant(known)
-        place = self.kernel.scratch(value.shape, value.dtype)
+        place = self.kernel.scratch(value.shape, value.dtype, value.has_lanes())
         self.write(value, place)
         return place
 
@@ -299,7 +299,8 @@ class Evaluator:
         (out,) = eqn.outvars
         axis = eqn.params["dimension"]
         if place is None:
-            place = self.kernel.scratch(out.aval.shape, str(out.aval.dtype))
+            on = any(v.has_lanes() for v in values)
+            place = self.kernel.scratch(out.aval.shape, str(out.aval.dtype), on)
         for value, part in zip(values, _parts(place, axis, [v.shape for v in values]), strict=True):
             self.write(value, part)
         return Value(out.aval.shape, out.aval.dtype, buffer=place)
@@ -319,14 +320,14 @@ class Evaluator:
         """An elementwise primitive on arrays that stay in memory."""
         (out,) = eqn.outvars
         shape = out.aval.shape
-        place = self.kernel.scratch(shape, str(out.aval.dtype))
+        on = any(v.has_lanes() for v in values)
+        place = self.kernel.scratch(shape, str(out.aval.dtype), on)
         sources = [v if v.shape == () else self.in_memory(v) for v in values]
 
         def one(places: list, target: Buffer) -> None:
             if not target.shape:
                 numbers = [
-                    self.entries(x)[()] if isinstance(x, Value) else load(self.b, x)
-                    for x in places
+                    self.entries(x)[()] if isinstance(x, Value) else load(self.b, x) for x in places
                 ]
                 store(self.b, target, rule(self, eqn.params, *numbers))
                 return
@@ -404,13 +405,15 @@ class Evaluator:
     # --- loops -------------------------------------------------------------------------------
 
     def varying(self, body: Jaxpr, consts, carry, xs) -> list[bool]:
-        """Which values that a scan carries differ between trajectories, in some round of it."""
+        """Which values that a scan carries, and which that it puts out, differ between
+        trajectories, in some round of it."""
         before, after = ([v.has_lanes() for v in values] for values in (consts, xs))
 
-        def next_round(on: list[bool]) -> list[bool]:
-            return reached_outputs(body, [*before, *on, *after], AGREED)[: len(on)]
+        def outputs(on: list[bool]) -> list[bool]:
+            return reached_outputs(body, [*before, *on, *after], AGREED)
 
-        return fixed_point(next_round, [v.has_lanes() for v in carry])
+        on = fixed_point(lambda on: outputs(on)[: len(on)], [v.has_lanes() for v in carry])
+        return [*on, *outputs(on)[len(on) :]]
 
     def _carried(self, carry: Sequence[Value], on: Sequence[bool]):
         """The numbers of a carry in a row, which of them are vectors, and the way back."""
@@ -454,12 +457,14 @@ class Evaluator:
         on = self.varying(jaxpr, consts, carry, xs)
         moving = [c for c, s in zip(carry, still, strict=True) if not s]
         numbers, vec, back = self._carried(
-            moving, [o for o, s in zip(on, still, strict=True) if not s]
+            moving, [o for o, s in zip(on[:num_carry], still, strict=True) if not s]
         )
         sources = [self.in_memory(x) for x in xs]
         rows = []
-        for v, place in zip(eqn.outvars[num_carry:], places[num_carry:], strict=True):
-            rows.append(place or self.kernel.scratch(v.aval.shape, str(v.aval.dtype)))
+        for v, place, o in zip(
+            eqn.outvars[num_carry:], places[num_carry:], on[num_carry:], strict=True
+        ):
+            rows.append(place or self.kernel.scratch(v.aval.shape, str(v.aval.dtype), o))
         end = self.kernel.parameter(length)
 
         def merged(numbers: Sequence[Num]) -> list[Value]:
@@ -1153,5 +1158,3 @@ def _reduced_precision(e: Evaluator, params: dict, x: Num) -> Num:
     if wide is None or params["exponent_bits"] < wide[0] or params["mantissa_bits"] < wide[1]:
         raise Unsupported("reduce_precision to fewer bits")
     return x
-
-

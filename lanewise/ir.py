@@ -557,6 +557,9 @@ class Builder:
         self.emit(f"br i1 {going}, label %{inner}, label %{end}")
         self.begin(inner)
         after = body(phis, counter)
+        assert not any(a.vec and not v for a, v in zip(after, vec, strict=True)), (
+            "a carry that varies"
+        )
         again = [
             [self.ref(a, u, v) for u in range(self.U if v else 1)]
             for a, v in zip(after, vec, strict=True)

@@ -12,6 +12,7 @@ __all__ = [
     "ClosedJaxpr",
     "Jaxpr",
     "Literal",
+    "backends_are_initialized",
     "bodies",
     "drops_outputs",
     "identity",
@@ -22,12 +23,25 @@ __all__ = [
     "primitive",
     "scan_counts",
     "without_outputs",
+    "x64_enabled",
 ]
 
 
 def is_traced(x: object) -> bool:
     """Whether `x` stands for a value that is not known yet (inside jit, vmap, grad, …)."""
     return isinstance(x, Tracer)
+
+
+def x64_enabled() -> bool:
+    """Whether arrays made now are in double precision (the flag, or a context that sets it)."""
+    return bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def backends_are_initialized() -> bool:
+    """Whether JAX has started, and read its environment variables."""
+    from jax._src import xla_bridge  # no public name tells
+
+    return xla_bridge.backends_are_initialized()
 
 
 def bodies(eqn: Any) -> Iterator[ClosedJaxpr]:

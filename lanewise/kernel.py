@@ -45,10 +45,11 @@ class Module(Kernel):
         self.values.append(int(value))
         return self.b.made([name], "int64", False)
 
-    def scratch(self, shape: Sequence[int], dtype: str) -> Buffer:
-        """Memory for an array of every trajectory of the block, next to each other."""
+    def scratch(self, shape: Sequence[int], dtype: str, on: bool) -> Buffer:
+        """Memory for an array of every trajectory of the block, next to each other; for one array
+        that all share unless `on`."""
         size = int(np.prod(shape, dtype=np.int64))
-        block = self.W * self.U
+        block = self.W * self.U if on else 1
         start = self.scratch_bytes
         self.scratch_bytes += (size * block * 8 + 63) // 64 * 64
         if self.scratch_bytes > LARGEST_SCRATCH:
@@ -56,9 +57,9 @@ class Module(Kernel):
         item = np.dtype(dtype).itemsize
         bases = tuple(
             self.b.new(f"getelementptr i8, ptr %scratch, i64 {start + u * self.W * item}")
-            for u in range(self.U)
+            for u in range(self.U if on else 1)
         )
-        return Buffer(bases, dtype, tuple(shape), contiguous(shape, block), 1)
+        return Buffer(bases, dtype, tuple(shape), contiguous(shape, block), 1 if on else None)
 
     def constant(self, array: np.ndarray) -> Buffer:
         """A known array in the module."""
@@ -124,7 +125,9 @@ class Module(Kernel):
         shared = {}
         for i, (pointer, aval, o) in enumerate(operands):
             if not o:
-                buffer = Buffer((pointer,), str(aval.dtype), aval.shape, contiguous(aval.shape), None)
+                buffer = Buffer(
+                    (pointer,), str(aval.dtype), aval.shape, contiguous(aval.shape), None
+                )
                 shared[i] = self._operand(evaluator, buffer)
 
         consts = [evaluator.constant(c) for c in closed.consts]
@@ -209,7 +212,7 @@ class Module(Kernel):
         return value
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _traced(name: str, count: int) -> ClosedJaxpr:
     """An elementary function as a jaxpr of scalars."""
     if name.startswith("half_integer_power"):
@@ -220,7 +223,7 @@ def _traced(name: str, count: int) -> ClosedJaxpr:
         return jax.make_jaxpr(function)(*[jnp.zeros((), jnp.float64)] * count)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _function_text(
     name: str, count: int, width: int, called: str
 ) -> tuple[str, frozenset[str], tuple[str, ...]]:

@@ -95,9 +95,8 @@ def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
     if code is None:
         code = object_code(ir)
         cache.write(key, code)
-    empty = llvm.parse_assembly("")
-    engine = llvm.create_mcjit_compiler(empty, _own_machine())
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _own_machine())
+    engine.set_object_cache(None, lambda module: code)
     engine.finalize_object()
     _kept.append(engine)
     return engine

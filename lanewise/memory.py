@@ -183,10 +183,17 @@ def _from_memory(b: Builder, x: Num) -> Num:
 def store(b: Builder, buffer: Buffer, x: Num, by: Num | int = 0) -> None:
     """Write a number to `by` elements from the start."""
     assert x.dtype == buffer.dtype, (x.dtype, buffer.dtype)
-    if buffer.lane is None:
-        raise Unsupported("writing to an array that all trajectories share")
     item = stored_type(buffer.dtype)
     moving, fixed = _offset(b, buffer, by)
+    if buffer.lane is None:
+        if x.vec or moving.vec:
+            raise Unsupported("writing to an array that all trajectories share")
+        name, at = b.ref(x, 0, False), b.ref(b.add(moving, b.known(fixed, "int64")), 0, False)
+        if x.dtype == "bool":
+            name = b.new(f"zext i1 {name} to i8")
+        where = b.new(f"getelementptr {item}, ptr {buffer.base[0]}, i64 {at}")
+        b.emit(f"store {item} {name}, ptr {where}, align {_bytes(item)}")
+        return
     vector = f"<{b.W} x {item}>"
     for u in range(b.U):
         name = b.ref(x, u, True)
