@@ -101,7 +101,7 @@ def _implicit(kernel: str, H_D, n: int, half_width: float, method=None) -> Workl
 
 
 def _mirror() -> Workload:
-    """The force of the other workloads added; the kernel solves the linear equation for p1."""
+    """The magnetic mirror with W = −q0; the kernel solves the linear equation for p1 directly."""
     problem = systems.magnetic_mirror()
     return Workload(
         "mirror", dvi.System(charged_particle, force=linear_force), 3, problem.h, problem.q0,
@@ -110,7 +110,7 @@ def _mirror() -> Workload:
 
 
 def _bodies() -> Workload:
-    """A star and seven planets on nearly circular orbits; no kernel of C."""
+    """A star and seven planets on nearly circular orbits, for which there is no kernel of C."""
     radius, angle, mass = 1 + np.arange(7) / 2, 2.4 * np.arange(7), 1e-4
     outwards = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     along = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)

@@ -20,8 +20,8 @@ too.
 - Gradients and forward mode are relative to their own forward pass; 10⁶ trajectories to 65 536, per
   trajectory. The memory of a gradient is what the compiler reports at two numbers of steps, in
   states (q, p) of a trajectory per step: backpropagation that stores every step needs at least 1.
-- First calls (tracing, compilation, run), two cores and the memory of a batch are measured in fresh
-  processes, see _fresh.py. "nothing on disk" has DVI_JAX_CACHE=off; "from disk" is the second
+- First calls (tracing, compilation, run), two cores, and the memory of a batch are measured in
+  fresh processes, see _fresh.py: with DVI_JAX_CACHE=off, and "from disk", which is the second
   process with DVI_JAX_CACHE set to a new folder.
 
 `--check FILE` compares the ratios with those of a file that `--write FILE` wrote, and exits with
@@ -141,7 +141,7 @@ def ratio(times: Times, work: tuple[float, float] = (1.0, 1.0), **details) -> Me
 
 
 class Bench:
-    """What the rows measure with: a clock, the C library, the axis of trajectories, the cores."""
+    """A clock, the C library, the axis of the trajectories and the cores: shared by the rows."""
 
     def __init__(self, clock: Clock, axis: int = 0, cores: tuple[int, ...] = (0,)):
         self.clock, self.axis, self.cores = clock, axis, cores
@@ -342,11 +342,11 @@ def table() -> list[Row]:
     def add(title, target, measure, unit="×", at_least=False, /, **settings):
         rows.append(Row(title, target, functools.partial(measure, **settings), unit, at_least))
 
-    for lanes, steps in ((1024, 8000), (8192, 1000), (65536, 200)):
-        add(
-            f"kepler, {lanes} trajectories", 1.3, batch_row, name="kepler", lanes=lanes, steps=steps
-        )
+    of: dict[str, Any]
     many: dict[str, Any] = {"lanes": 65536}
+    for lanes, steps in ((1024, 8000), (8192, 1000), (65536, 200)):
+        of = {"name": "kepler", "lanes": lanes, "steps": steps}
+        add(f"kepler, {lanes} trajectories", 1.3, batch_row, **of)
     add("kepler, last axis", 1.3, last_axis_row, name="kepler", steps=200, **many)
     add("oscillator", 1.3, batch_row, name="oscillator", steps=1000, **many)
     for what, title in (("invariants", "two invariants"), ("saved", "every 10th step saved")):
@@ -379,33 +379,25 @@ def table() -> list[Row]:
         add(f"forward mode, {name}", 2.0, forward_mode_row, name=name, lanes=lanes, steps=steps)
         of = {"name": name, "lanes": 16, "steps": (2000, 20_000)}
         add(f"memory of a gradient, {name}", 0.02, gradient_memory_row, "states/step", **of)
-    both = (1_000_000, 65536)
-    add(
-        "kepler, 10⁶ trajectories over 65536",
-        1.3,
-        million_row,
-        name="kepler",
-        lanes=both,
-        steps=100,
-    )
-
+    of = {"name": "kepler", "lanes": (1_000_000, 65536), "steps": 100}
+    add("kepler, 10⁶ trajectories over 65536", 1.3, million_row, **of)
     of = {"name": "kepler", "steps": 2000, **many}
     add("two cores, kepler", 1.8, cores_row, "× faster", True, **of)
     of = {"name": "kepler", "lanes": 1_000_000, "steps": 20}
     add("memory, 10⁶ trajectories", 1.1, memory_row, "× inputs and outputs", **of)
     add("integrate, ten steps again", 0.4, again_row, "ms", name="kepler", steps=10)
-    for on_disk, where in ((False, "nothing on disk"), (True, "from disk")):
+    for on_disk, start in ((False, "first call"), (True, "first call, from disk")):
         for title, targets, name, lanes, steps, gradient in (
             ("kepler", (0.35, 0.15), "kepler", 1024, 100, False),
             ("kepler, reverse gradient", (0.8, 0.35), "kepler", 1024, 100, True),
             ("GaussLegendre(2)", (1.0, 0.4), "pendulum_gauss", 1024, 100, False),
-            ("KahanLi(8)", (1.0, 0.4), "pendulum_kahan_li", 1024, 10, False),
-            ("8 bodies", (1.5, None), "bodies", 1024, 10, False),
+            ("KahanLi(8)", (1.0, 0.4), "pendulum_kahan_li", 1024, 100, False),
+            ("8 bodies", (1.5, None), "bodies", 1024, 100, False),
             ("chain, n = 1000", (2.0, None), "chain1000", 1, 10, False),
             ("chain, n = 1000, 64 trajectories", (2.0, None), "chain1000", 64, 10, False),
         ):
             of = {"name": name, "lanes": lanes, "steps": steps, "gradient": gradient}
-            title = f"first call, {where}: {title}"
+            title = f"{start}: {title}"
             add(title, targets[on_disk], first_call_row, "s", on_disk=on_disk, **of)
     return rows
 
@@ -540,12 +532,12 @@ def measure_rows(bench: Bench, patterns: list[str] | None) -> list[dict[str, Any
 def line(result: dict[str, Any]) -> str:
     """A row of the table, with a mark if its target is missed."""
     if result["status"] == "failed":
-        return f"{result['row']:52s} | FAILED {result['error']}"
+        return f"{result['row']:54s} | FAILED {result['error']}"
     low, high = result["quartiles"]
     sign = "≥" if result["at_least"] else "≤"
     target = "–" if result["target"] is None else f"{sign} {result['target']:g}"
     value = f"{result['value']:.3g} ({low:.3g}–{high:.3g}) {result['unit']}"
-    return f"{result['row']:52s} | {target:6s} | {value:40s} | {result['status']}{wall(result)}"
+    return f"{result['row']:54s} | {target:6s} | {value:40s} | {result['status']}{wall(result)}"
 
 
 def wall(result: dict[str, Any]) -> str:
@@ -641,7 +633,7 @@ def scaling_picture(curves: dict[str, list[dict[str, Any]]], path: Path) -> None
 
 
 def ratios(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """{row: ratio}; None for a row that failed. Seconds, and what fresh processes find, are not."""
+    """{row: ratio}, None for a row that failed; without rows in seconds or of fresh processes."""
     return {r["row"]: r.get("value") for r in rows if r["unit"] in ("×", "states/step")}
 
 
@@ -680,8 +672,8 @@ def better(one: dict, other: dict) -> dict[str, float | None]:
 def check(now: dict, path: Path, tolerance: float, again: Callable[[list[str]], dict]) -> int:
     """Exit status of the comparison with a committed table, which is printed.
 
-    What is worse is measured a second time by `again`, and the better of the two counts: a
-    disturbance of some seconds is not a regression.
+    A row that is worse is measured a second time by `again`, and the better result counts: other
+    work on the machine for some seconds is not a regression.
     """
     before = json.loads(path.read_text(encoding="utf-8"))["ratios"]
     try:
@@ -699,7 +691,7 @@ def check(now: dict, path: Path, tolerance: float, again: Callable[[list[str]], 
     print(f"worse than {path} by more than a factor {tolerance:g}, twice:")
     for row, value, old in found:
         shown = "failed" if value is None else f"{value:.3g}"
-        print(f"  {row:52s} {shown:>8s}   was {old:.3g}")
+        print(f"  {row:54s} {shown:>8s}   was {old:.3g}")
     return 1
 
 

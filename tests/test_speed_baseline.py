@@ -196,7 +196,7 @@ def test_the_table_has_every_row_of_the_targets(speed):
     for start, count in (
         ("kepler, ", 7), ("oscillator", 3), ("implicit", 6), ("double pendulum", 2),
         ("charged particle", 1), ("one trajectory", 4), ("reverse gradient", 4),
-        ("forward mode", 2), ("first call, nothing on disk", 7), ("first call, from disk", 7),
+        ("forward mode", 2), ("first call: ", 7), ("first call, from disk: ", 7),
     ):  # fmt: skip
         assert sum(name.startswith(start) for name in rows) == count, start
     assert len(rows) == len(speed.table())  # names are unique
