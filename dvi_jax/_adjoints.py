@@ -74,8 +74,7 @@ def _direct_rollout(
     def on_trust(arrays, q0, p0):
         task = eqx.combine(arrays, rest)
         begin = start(task, q0, p0)
-        ran = run_in_segments(task, plan, begin, one_row=layout.in_kernel)
-        return outcome(task, ran, q0, p0)
+        return outcome(task, run_in_segments(task, plan, begin), q0, p0)
 
     return lanewise(
         on_trust if can_trust(task) else forward, arrays, q0, p0,

@@ -1,16 +1,14 @@
 """The few names of JAX that have moved between releases, or are not public: all of them, here."""
 
-import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
-from jax import export, lax
+from jax import lax
 from jax.core import ShapedArray, Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
 from jax.interpreters import ad, batching, mlir, partial_eval
-from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 
 __all__ = [
     "ClosedJaxpr",
@@ -26,7 +24,6 @@ __all__ = [
     "jaxpr_as_fun",
     "jaxprs_in_params",
     "lower_on",
-    "lowered_for_cuda",
     "one_kernel",
     "primitive",
     "scan_counts",
@@ -119,22 +116,6 @@ def lower_on(platform: str, primitive: Primitive, function: Callable) -> None:
     """Have a primitive of several outputs compiled for `platform` as what `function` does."""
     rule = mlir.lower_fun(function, multiple_results=True)
     mlir.register_lowering(primitive, rule, platform=platform)
-
-
-_TRITON_CALLS = ("__gpu$xla.gpu.triton", "triton_kernel_call_ffi", "triton_kernel_call")
-
-
-def lowered_for_cuda(function: Any, *args: Any) -> str:
-    """The program of a jitted function for a GPU (StableHLO). No GPU is needed for that."""
-    checks = [export.DisabledSafetyCheck.custom_call(name) for name in _TRITON_CALLS]
-    device: Any = AbstractDevice
-    which: Any = contextlib.nullcontext()
-    if "platform" in device.__dataclass_fields__:  # from jax 0.12 on: for one of this kind
-        kind = device(device_kind="NVIDIA H200", num_cores=None, platform="gpu")
-        which = use_abstract_mesh(AbstractMesh((), (), abstract_device=kind))
-    with which:
-        done = export.export(function, platforms=["cuda"], disabled_checks=checks)(*args)
-    return str(done.mlir_module())
 
 
 def drops_outputs(primitive: Primitive, without: Callable) -> None:

@@ -123,8 +123,8 @@ class Reversible(AbstractAdjoint):
             theta, q0, p0 = inputs
             task = eqx.combine(theta, whole, fixed)
             begin = start(task, q0, p0)
-            every, one_row = self.checkpoint_every, layout.in_kernel
-            return finish(task, run_in_segments(task, plan, begin, every, one_row), q0, p0)
+            ran = run_in_segments(task, plan, begin, self.checkpoint_every)
+            return finish(task, ran, q0, p0)
 
         def finish(task, ran, *of):
             carry, saved, tail = ran
@@ -186,7 +186,7 @@ class Reversible(AbstractAdjoint):
                 theta, q0, p0 = eqx.combine(moving, still)
                 theta, others = eqx.partition(theta, moves[0])
                 rest = eqx.combine(others, whole, fixed)
-                back = _pull_back(self, rest, plan, not layout.in_kernel, (theta, q0, p0), trace, v)
+                back = _pull_back(self, rest, plan, (theta, q0, p0), trace, v)
                 return eqx.filter(back, moves)
 
             def transpose_solve(_, b):
@@ -383,13 +383,8 @@ def _round_trip_defect(
     return worst if tail is None else of_block(worst, start, tail, k, plan.tail)
 
 
-def _pull_back(
-    settings: Reversible, fixed, plan: Plan, may_store: bool, inputs, trace, cotangent: _Smooth
-):
-    """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start.
-
-    Unless it `may_store` the states of a piece, the gradient is NaN where rebuilding fails.
-    """
+def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent: _Smooth):
+    """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start."""
     theta, q_start, p_start = inputs
     carry, saved, tail, _ = trace
     task: Task = eqx.combine(theta, fixed)
@@ -467,8 +462,6 @@ def _pull_back(
 
         # Where the trajectory itself has failed there is nothing to mend: NaN, not a number.
         missing = ~fine & _all_finite(known_start) & _all_finite(end)
-        if not may_store:
-            return jax.tree.map(lambda x: jnp.where(missing, jnp.nan, x), tuple(out))
         return lax.cond(on_any_lane(missing), mend, lambda out: out, tuple(out))
 
     def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):

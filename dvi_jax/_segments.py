@@ -49,12 +49,11 @@ def can_trust(task: Task) -> bool:
 
 
 def run_in_segments(
-    task: Task, plan: Plan, carry: Carry, every: int = SEGMENT, one_row: bool = False
+    task: Task, plan: Plan, carry: Carry, every: int = SEGMENT
 ) -> tuple[Carry, Saved, Saved | None]:
     """`run`, on trust: all steps of `plan` in segments of about `every` steps.
 
-    In `Saved.inner` are the states at the ends of the segments inside of a long block. With
-    `one_row` no segment saves more than one state, which a kernel can keep in registers.
+    In `Saved.inner` are the states at the ends of the segments inside of a long block.
     """
     segment = _Segment(task, carry)
     iterations = jnp.asarray(FEWEST_ITERATIONS, jnp.int32)
@@ -68,8 +67,7 @@ def run_in_segments(
             block, state, jnp.asarray(0, jnp.int32), plan.block, plan.num_blocks
         )
     else:
-        most = 1 if one_row else every // plan.block
-        group = largest_divisor(plan.num_blocks, max(most, 1))
+        group = largest_divisor(plan.num_blocks, max(every // plan.block, 1))
 
         def blocks(state, k):
             part = Plan(group, plan.block, 0, False)

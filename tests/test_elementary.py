@@ -245,7 +245,7 @@ def test_derivatives(name):
 PLAIN = """
 abs add sub mul div neg floor eq ne lt le gt ge xor select_n convert_element_type broadcast_in_dim
 """
-"""What every backend of a kernel has."""
+"""What is one vector instruction each, with no call and no branch."""
 
 
 def primitives_of(jaxpr):
@@ -259,7 +259,7 @@ def primitives_of(jaxpr):
 
 @pytest.mark.parametrize("name", SINES)
 def test_arithmetic_is_plain(name):
-    """So it lowers in a Pallas kernel, its derivative included; the hand-over would not."""
+    """So a loop stays one over vectors, its derivative included; the hand-over would split it."""
     function, x = getattr(elementary, name), jnp.ones(3)
 
     def used(f):

@@ -2,8 +2,8 @@ r"""Elementary functions from multiplications and additions, for loops over many
 
 XLA calls the library lane by lane for sin, cos and others in float64 on a CPU, inside a loop that
 is vectorised otherwise. sin, cos and tan are made here of additions, products, floor, comparisons
-and selections (tan of a quotient too), so that the loop stays one over vectors and they go into a
-Pallas kernel; the others take a quotient or a root, atan2 and log the bits of a number besides.
+and selections (tan of a quotient too), so that the loop stays one over vectors; the others take a
+quotient or a root, atan2 and log the bits of a number besides.
 
 Errors are below 0.9 ulp for sin, cos and log, 1.2 for acos, 1.5 for atan, 1.7 for tan, asin and
 atan2, 4 for half-integer powers. As everywhere in XLA on a CPU, numbers below 2⁻¹⁰²² count as 0.

@@ -22,7 +22,6 @@ from .._compat import (
     without_outputs,
 )
 from .elementary import VECTORISED, pow
-from .kernel import NotInKernelError, run_in_kernel
 from .lanes import Evaluator, Value, operation_count
 from .lanes._value import on_lanes, whole
 
@@ -36,11 +35,24 @@ and over in some ten milliseconds."""
 FEWEST_FOR_OWN = 8
 """Lanes from which on elementary functions of our own are faster than the library's."""
 
-LARGEST_KERNEL = 10_000
-"""A function of more operations than this goes into no kernel, which has some 250 registers."""
-
 TILE_ENTRIES = 4096
 """Numbers of all lanes of a tile that a step works with: what a first-level cache holds."""
+
+
+Form = Literal["auto", "components", "arrays"]
+
+
+def _form(form: Any) -> Any:
+    """The form, with the name of the removed kernel replaced by what runs instead."""
+    if form != "kernel":
+        return form
+    warnings.warn(
+        'The GPU kernel was removed from dvi_jax: Layout(form="kernel") is now the same as '
+        'Layout(form="auto"). On a GPU the default is jax.lax.scan under jax.vmap.',
+        DeprecationWarning,
+        stacklevel=3,
+    )
+    return "auto"
 
 
 class Layout(eqx.Module):
@@ -52,37 +64,27 @@ class Layout(eqx.Module):
       `vmap` goes in tiles of such numbers, which stay in registers and cache; ``"arrays"``: as the
       functions were written, batched by `vmap`; ``"auto"``: components, but for short runs (fewer
       than 100 000 lanes × steps), which they make longer by the time of their compilation, and
-      for functions of very many operations; ``"kernel"``: a batch in one kernel of the GPU that
-      runs all steps (see `docs/gpu.md`), which ``"auto"`` takes there too; what does not go into
-      a kernel goes in components, with a warning. On a CPU the kernel is interpreted, for tests.
-    - `width`: lanes of a tile, or of a block of a kernel (the next power of two); None means by the
-      size of the state.
+      for functions of very many operations; on a GPU ``"auto"`` means ``"arrays"``.
+      ``"kernel"`` is a deprecated name of ``"auto"``.
+    - `width`: lanes of a tile; None means by the size of the state.
     - `library`: take sin, cos and their like from the library, as arrays do, also where components
       go in batches of float64 and arithmetic of our own is several times as fast.
 
     **Raises** `ValueError` for another form, or a width that is not positive.
     """
 
-    form: Literal["auto", "components", "arrays", "kernel"] = eqx.field(static=True, default="auto")
+    form: Form = eqx.field(static=True, default="auto", converter=_form)
     width: int | None = eqx.field(static=True, default=None)
     library: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        if self.form not in ("auto", "components", "arrays", "kernel"):
-            raise ValueError(
-                f'form must be "auto", "components", "arrays" or "kernel", got {self.form!r}.'
-            )
+        if self.form not in ("auto", "components", "arrays"):
+            raise ValueError(f'form must be "auto", "components" or "arrays", got {self.form!r}.')
         width = self.width
         if width is not None and (
             isinstance(width, bool) or not isinstance(width, int) or width < 1
         ):
             raise ValueError(f"width must be a positive integer or None, got {width!r}.")
-
-    @property
-    def in_kernel(self) -> bool:
-        """Whether a batch is to go into a kernel, as far as can be told before it is compiled."""
-        on_gpu = self.form == "auto" and jax.default_backend() == "gpu"
-        return self.form == "kernel" or on_gpu
 
 
 def lanewise(
@@ -193,15 +195,6 @@ class _Traced:
         evaluator = Evaluator(lanes, own)
         return evaluator.jaxpr(self.closed.jaxpr, consts, values[len(self.outer) :])
 
-    def in_kernel(
-        self, operands: Sequence[Any], on: Sequence[bool], lanes: int, **options: Any
-    ) -> list[jax.Array]:
-        """The outputs from one kernel; the first axis of an operand is the lanes where `on`."""
-        rest = iter(zip(operands, on, strict=True))
-        consts = [next(rest) if is_traced(c) else (c, None) for c in self.closed.consts]
-        arrays, flags = zip(*consts, *rest, strict=True)
-        return run_in_kernel(self.closed.jaxpr, arrays, flags, lanes, **options)
-
 
 class _Program:
     """Two ways to compute the same, and which is taken on how many lanes."""
@@ -218,33 +211,16 @@ class _Program:
         special = ordinary if self.special is self.ordinary else self.special.giving(used)
         return _Program(ordinary, special, self.layout, self.steps, self.entries)
 
-    def takes_components(self, lanes: int | None) -> bool:
+    def takes_components(self, lanes: int | None, is_gpu: bool = False) -> bool:
         if self.layout.form in ("arrays", "components"):
             return self.layout.form == "components"
+        if is_gpu:  # no speed of the other form was measured there
+            return False
         if len(self.special.outer) != len(self.ordinary.outer):
             return False
-        if (lanes or 1) * self.steps < SHORTEST and self.layout.form == "auto":
+        if (lanes or 1) * self.steps < SHORTEST:
             return False
         return operation_count(self.special.closed.jaxpr) <= LARGEST
-
-    def from_kernel(self, *operands: Any, **options: Any) -> list[jax.Array] | None:
-        """The outputs from one kernel, None where that is not wanted or cannot be."""
-        form, lanes = self.layout.form, options["lanes"]
-        if form not in ("auto", "kernel") or not lanes:
-            return None
-        if form == "auto" and not self.takes_components(lanes):
-            return None
-        try:
-            if len(self.special.outer) != len(self.ordinary.outer):
-                raise NotInKernelError("it closes over values that are not known yet.")
-            count = operation_count(self.special.closed.jaxpr)
-            if count > LARGEST_KERNEL:
-                raise NotInKernelError(f"it has some {count} operations.")
-            return self.special.in_kernel(operands, block=self.layout.width, **options)
-        except NotInKernelError as error:
-            if form == "kernel":
-                warnings.warn(f"A part of the run is left to XLA: {error}", stacklevel=2)
-            return None
 
     @property
     def width(self) -> int:
@@ -258,11 +234,7 @@ def _run(
     *operands, program: _Program, lanes: int | None, on: tuple[bool, ...], is_gpu: bool = False
 ) -> list[Any]:
     """The program on so many lanes: the first axis of operands where `on`, and of all outputs."""
-    if is_gpu or program.layout.form == "kernel":
-        kept = program.from_kernel(*operands, on=on, lanes=lanes, interpret=not is_gpu)
-        if kept is not None:
-            return kept
-    if not program.takes_components(lanes):
+    if not program.takes_components(lanes, is_gpu):
         if lanes is None:
             outs = program.ordinary(*operands)
         else:
