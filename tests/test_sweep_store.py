@@ -294,7 +294,7 @@ def cut_off(path):
 @pytest.mark.slow
 def test_two_devices_give_the_bits_of_one(tmp_path, undisturbed):
     code = "import sweep_child, sys, jax; sweep_child.sweep(sys.argv[1]); print(jax.device_count())"
-    flags = "--xla_force_host_platform_device_count=2"
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
     out = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "s.zarr")], capture_output=True, text=True,
         check=True,
