@@ -1,21 +1,15 @@
 """Double precision, no silent rank promotion, run-time checked annotations; long files first."""
 
 import gc
-import os
 from collections import Counter
 from pathlib import Path
 
+import compilation
 import jax
 import pytest
 from jaxtyping import install_import_hook
 
-# More than half of the processor time of the tests is compilation. The emitters that XLA:CPU uses
-# without these flags take twice as long to compile the same program; a second thread of compilation
-# gains nothing beside a second worker. Numbers may differ in the last digit. Processes that tests
-# start inherit the flags, but for notebooks and examples of the documentation (`as_users_run`).
-FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}".strip()
-
+compilation.set_flags()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import covering
 from hypothesis import given, settings, strategies as st
 from jax import lax
 
@@ -184,7 +185,7 @@ def random_function(program):
     return function
 
 
-@settings(max_examples=8, deadline=None, derandomize=True)
+@settings(max_examples=5, deadline=None, derandomize=True)
 @given(program=st.lists(STEPS, min_size=1, max_size=6), n=st.integers(1, 4))
 @pytest.mark.slow
 def test_random_functions(program, n):
@@ -193,7 +194,7 @@ def test_random_functions(program, n):
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=15, deadline=None, derandomize=True)
 @given(program=st.lists(STEPS, min_size=1, max_size=8), n=st.integers(1, 4))
 def test_random_functions_and_their_second_derivatives(program, n):
     f = random_function(program)
@@ -432,8 +433,7 @@ def assert_same(a, b, rtol=1e-12):
 SLOW = pytest.mark.slow
 
 
-@pytest.mark.parametrize("save", SAVES)
-@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize(("system", "save"), covering(SYSTEMS, SAVES))
 @pytest.mark.slow
 def test_components_give_the_numbers_of_arrays(system, save):
     arguments = (*starts(), 0.02, 0.5)
@@ -444,11 +444,13 @@ def test_components_give_the_numbers_of_arrays(system, save):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "method",
-    [dvi.Adjoint(), dvi.Strang(), dvi.Yoshida(4), dvi.GaussLegendre(2), dvi.RungeKutta4()],
+    ("system", "method"),
+    covering(
+        SYSTEMS,
+        [dvi.Adjoint(), dvi.Strang(), dvi.Yoshida(4), dvi.GaussLegendre(2), dvi.RungeKutta4()],
+    ),
     ids=repr,
 )
-@pytest.mark.parametrize("system", SYSTEMS)
 def test_every_method_goes_by_components(system, method):
     arguments = (*starts(), 0.02, 0.5)
     a, b = (

@@ -824,7 +824,14 @@ QUICK = (("known", 0), ("arithmetic-float32", 2), ("control", 0))
 @pytest.mark.parametrize(("cases", "pair", "rtol"), groups())
 @pytest.mark.slow
 def test_primitives(cases, pair, rtol):
-    check(lambda x, y: {name: f(x, y) for name, f in cases.items()}, *pair, rtol=rtol)
+    # Which arguments have lanes matters to the shapes of a primitive, not to its dtype.
+    patterns = None if pair[0].dtype == np.float64 else [[True, True], [False, True]]
+    check(
+        lambda x, y: {name: f(x, y) for name, f in cases.items()},
+        *pair,
+        rtol=rtol,
+        patterns=patterns,
+    )
 
 
 @pytest.mark.parametrize("on", [[True, True], [False, True], None])
@@ -959,14 +966,14 @@ def with_derivatives(f):
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=15, deadline=None, derandomize=True)
 @given(program=PROGRAMS, seed=st.integers(0, 3))
 def test_random_functions(program, seed):
     check(random_function(program), f64(3, seed=seed), f64(3, seed=seed + 9), rtol=1e-9)
 
 
 @pytest.mark.slow
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=5, deadline=None, derandomize=True)
 @given(program=PROGRAMS, seed=st.integers(0, 3))
 def test_derivatives_of_random_functions(program, seed):
     f = with_derivatives(random_function(program))
