@@ -1,6 +1,7 @@
 """A function of one lane on many lanes: in component form, in tiles that stay in cache."""
 
 import copy
+import functools
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -105,7 +106,13 @@ def lanewise(
     plain = function if plain is None else plain
     leaves, tree = jax.tree.flatten(args)
     ordinary = _Traced(plain, leaves, tree)
-    special = ordinary if plain is function else _Traced(function, leaves, tree)
+    if plain is function:
+        special = _known(ordinary)
+    elif ordinary.outer or not all(map(eqx.is_array, leaves)):
+        special = _known(_Traced(function, leaves, tree))
+    else:  # nothing is closed over that ceases to exist: it is traced when it is needed, if ever
+        shapes = [jax.typeof(x) for x in leaves]
+        special = functools.cache(lambda: _Traced(function, shapes, tree))
     program = _Program(ordinary, special, layout, steps, entries)
     # What is traced outside and closed over is an input like the others.
     outer = ordinary.outer
@@ -120,6 +127,10 @@ def lanewise(
         return jax.jvp(lambda *x: _all_alike(ordinary(*x), x), primals, tangents)
 
     return jax.tree.unflatten(ordinary.out_tree, call(*outer, *leaves))
+
+
+def _known(traced: "_Traced") -> Callable[[], "_Traced"]:
+    return lambda: traced
 
 
 def functions_in(eqn: Any) -> list[ClosedJaxpr]:
@@ -200,15 +211,24 @@ class _Program:
     """Two ways to compute the same, and which is taken on how many lanes."""
 
     def __init__(
-        self, ordinary: _Traced, special: _Traced, layout: Layout, steps: int, entries: int
+        self,
+        ordinary: _Traced,
+        special: Callable[[], _Traced],
+        layout: Layout,
+        steps: int,
+        entries: int,
     ):
-        self.ordinary, self.special = ordinary, special
+        self.ordinary, self._special = ordinary, special
         self.layout, self.steps, self.entries = layout, steps, entries
+
+    @property
+    def special(self) -> _Traced:
+        return self._special()
 
     def giving(self, used: list[bool]) -> "_Program":
         """The program that gives some of the outputs only."""
         ordinary = self.ordinary.giving(used)
-        special = ordinary if self.special is self.ordinary else self.special.giving(used)
+        special = functools.cache(lambda: self.special.giving(used))
         return _Program(ordinary, special, self.layout, self.steps, self.entries)
 
     def takes_components(self, lanes: int | None, is_gpu: bool = False) -> bool:
@@ -216,9 +236,9 @@ class _Program:
             return self.layout.form == "components"
         if is_gpu:  # no speed of the other form was measured there
             return False
-        if len(self.special.outer) != len(self.ordinary.outer):
-            return False
         if (lanes or 1) * self.steps < SHORTEST:
+            return False
+        if len(self.special.outer) != len(self.ordinary.outer):
             return False
         return operation_count(self.special.closed.jaxpr) <= LARGEST
 
