@@ -90,7 +90,7 @@ run = jax.vmap(lambda q, p: dvi.integrate(SYSTEM, q, p, h=h, num_steps=steps, ep
 y = np.asarray(run(jnp.asarray(q0), jnp.asarray(p0)))
 data = [dvi.Observations(ts, y[i], sigma=1e-3, t0=0.0) for i in range(arcs)]
 model = dvi.Model(SYSTEM, h=h, q0=q0, p0=p0, method=dvi.Strang())
-options = dict(optimiser=optax.adam(1e-6), max_steps=1) if how == "adam" else {{}}
+options = dict(optimiser=optax.adam(1e-6), max_steps=3) if how == "adam" else {{}}
 found = dvi.fit(model, data, {{"epsilon": 0.9e-4, "args": {{"mu": 1.00001}}}}, **options,
     check_curvature=False)
 assert how == "adam" or abs(found.x[1] - 1e-4) < 1e-9, found

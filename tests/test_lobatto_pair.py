@@ -10,6 +10,7 @@ from helpers import (
     ARGS,
     SYSTEMS,
     central_difference,
+    covering,
     flow,
     non_separable,
     pendulum,
