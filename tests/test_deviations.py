@@ -21,6 +21,7 @@ CHAOTIC = ([0.0, -0.25], [0.42, 0.0])
 
 def run(system, q0, p0, observe, **options):
     settings = {"h": 0.05, "method": dvi.Strang(), "save": dvi.Save(final=True)}
+    settings["adjoint"] = dvi.Direct()  # compiled soonest
     return dvi.integrate(system, q0, p0, observe=observe, **(settings | options))
 
 
@@ -598,7 +599,9 @@ def test_memory_does_not_grow_with_the_steps():
 
     def size(num_steps):
         def of(q, p):
-            return run(HENON.system, q, p, kinds, num_steps=num_steps).observed
+            return run(
+                HENON.system, q, p, kinds, num_steps=num_steps, adjoint=dvi.Reversible()
+            ).observed
 
         q, p = np.tile(REGULAR[0], (8, 1)), np.tile(REGULAR[1], (8, 1))
         memory = jax.jit(jax.vmap(of)).lower(q, p).compile().memory_analysis()

@@ -313,7 +313,8 @@ def test_gradients_in_the_state_epsilon_and_h(system, stages):
     s, method = SYSTEMS[system][0], dvi.LobattoIIIAIIIB(stages)
 
     def value(x):
-        return jnp.sum(flow(s, method, x[3], num_steps=3, epsilon=x[2])(x[:2]) ** 3)
+        of = flow(s, method, x[3], num_steps=3, epsilon=x[2], adjoint=dvi.Reversible())
+        return jnp.sum(of(x[:2]) ** 3)
 
     x, direction = jnp.array([0.3, 0.4, 0.2, 0.1]), jnp.array([0.6, -0.8, 0.4, 0.3])
     reverse = jax.jit(jax.grad(value))(x)
