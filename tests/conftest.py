@@ -4,10 +4,12 @@ import gc
 from collections import Counter
 from pathlib import Path
 
+import compilation
 import jax
 import pytest
 from jaxtyping import install_import_hook
 
+compilation.set_flags()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 

@@ -54,8 +54,22 @@ ADJOINTS = {
 }
 
 
-def flow(system, method, h, num_steps=1, epsilon=0.0, t0=0.0, args=ARGS):
-    """z = (q, p) as one vector → the state after `num_steps` steps, as one vector."""
+def covering(first, second, shift=0):
+    """Pairs in which each item of both lists appears at least once.
+
+    Every pair is a compilation. What is tested of a method, a system or an adjoint is tested of
+    each of them, and of their combinations of this sample; `shift` takes another one.
+    """
+    first, second = list(first), list(second)
+    count = max(len(first), len(second))
+    return [(first[i % len(first)], second[(i + shift) % len(second)]) for i in range(count)]
+
+
+def flow(system, method, h, num_steps=1, epsilon=0.0, t0=0.0, args=ARGS, adjoint=dvi.Direct()):
+    """z = (q, p) as one vector → the state after `num_steps` steps, as one vector.
+
+    `Direct` is compiled soonest; tests of gradients compare all adjoints.
+    """
 
     def of(z):
         q, p = jnp.split(z, 2)
@@ -70,6 +84,7 @@ def flow(system, method, h, num_steps=1, epsilon=0.0, t0=0.0, args=ARGS):
             args=args,
             method=method,
             save=dvi.Save(final=True),
+            adjoint=adjoint,
         )
         return jnp.concatenate([sol.qs[-1], sol.ps[-1]])
 

@@ -132,3 +132,12 @@ def test_hosts_are_killed_and_the_fit_is_the_same(tmp_path):
     assert abs(float(last[0][0]) - 0.02) < 1e-9
     a, b = (json.loads((tmp_path / f"{n}.json").read_text()) for n in "ab")
     assert a == b
+
+
+def test_the_removed_kernel_is_a_deprecated_name_of_auto():
+    with pytest.warns(DeprecationWarning, match="lax.scan under jax.vmap") as seen:
+        layout = dvi.Layout(form="kernel", width=4)  # pyright: ignore[reportArgumentType]
+    assert [w.filename for w in seen] == [__file__]  # the warning names the line of the caller
+    assert layout == dvi.Layout(form="auto", width=4)
+    with pytest.raises(ValueError, match='"auto", "components" or "arrays"'):
+        dvi.Layout(form="gpu")  # pyright: ignore[reportArgumentType]

@@ -60,15 +60,16 @@ def test_cubic_disturbance_has_invariants_of_every_order(order):
 
 
 @pytest.mark.parametrize(
-    ("order", "slope", "within"),
+    ("order", "slope", "within", "smallest"),
     [
-        (0, 1.0, 0.02),
-        (1, 2.0, 0.02),
-        pytest.param(2, 3.0, 0.03, marks=pytest.mark.slow),
-        pytest.param(3, 4.0, 0.4, marks=pytest.mark.slow),
+        (0, 1.0, 0.02, 1e-3),
+        (1, 2.0, 0.02, 1e-3),
+        pytest.param(2, 3.0, 0.03, 1e-3, marks=pytest.mark.slow),
+        # Where ε⁴ is above round-off.
+        pytest.param(3, 4.0, 0.4, 2e-3, marks=pytest.mark.slow),
     ],
 )
-def test_drift_has_the_order_promised(order, slope, within):
+def test_drift_has_the_order_promised(order, slope, within, smallest):
     d = found("cubic", 8, order)
     assert np.max(d.residuals) < 1e-12
     measured = dvi.drift_order(
@@ -76,7 +77,7 @@ def test_drift_has_the_order_promised(order, slope, within):
         d.invariants[0],
         [0.4],
         [0.3],
-        epsilons=1e-3 * 2.0 ** np.arange(6),
+        epsilons=smallest * 2.0 ** np.arange(6),
         h=0.1,
         num_steps=20_000,
     )
@@ -313,7 +314,7 @@ def distance(values, reference):
     return np.linalg.norm(factor * values - reference) / np.linalg.norm(reference)
 
 
-@pytest.mark.parametrize("tolerance", [1e-6, 1e-5, 1e-4])
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-4])
 @pytest.mark.slow
 def test_slowly_varying_oscillator_keeps_its_discrete_action_alone(tolerance):
     (q, p, tau), d = slow_oscillator(tolerance)

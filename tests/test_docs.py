@@ -14,6 +14,7 @@ import urllib.parse
 from pathlib import Path
 
 import pytest
+from compilation import flags_of_users
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -22,8 +23,8 @@ BLOCK = re.compile(
     r"^(?:<!-- not run by the tests: (?P<reason>.+?) -->\n)?```python\n(?P<code>.*?)^```",
     re.S | re.M,
 )
-ELSEWHERE = {"sweeps", "fitting", "chaos"}
-"""Pages that tests/test_readme.py runs, and asks for their numbers."""
+ELSEWHERE = {"sweeps", "fitting", "chaos", "certificate"}
+"""Pages that tests/test_readme.py and tests/test_certify.py run, and whose numbers they check."""
 
 
 def examples(page):
@@ -39,7 +40,7 @@ PAGES = [p for p in sorted(DOCS.glob("*.md")) if examples(p)[0] and p.stem not i
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_examples_run(page, tmp_path):
-    env = {**os.environ, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "Agg"}
+    env = {**os.environ, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "Agg", "XLA_FLAGS": flags_of_users()}
     out = subprocess.run(
         [sys.executable, "-W", "error::DeprecationWarning:dvi_jax", "-c", examples(page)[0]],
         capture_output=True, text=True, check=False, cwd=tmp_path, env=env, timeout=500,

@@ -122,16 +122,24 @@ def test_jacobian_against_differences(ts):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ts", [REGULAR, IRREGULAR], ids=["regular", "irregular"])
-def test_adjoints_agree(ts):
+@pytest.mark.parametrize(
+    ("ts", "adjoints"),
+    [
+        (REGULAR, (dvi.Reversible(), dvi.Checkpointed(), dvi.Direct())),
+        (IRREGULAR, (dvi.Reversible(),)),
+    ],
+    ids=["regular", "irregular"],
+)
+def test_adjoints_agree(ts, adjoints):
     """Reverse mode by each adjoint against the Jacobian by forward mode."""
     data = dvi.Observations(ts, np.cos(ts)[:, None], sigma=1.0, t0=0.0)
-    for adjoint in (dvi.Reversible(), dvi.Checkpointed(), dvi.Direct()):
+    problem, u = problem_of(data)
+    r, J, _ = problem.evaluate(u)
+    forward = np.asarray(J).T @ np.asarray(r)
+    for adjoint in adjoints:
         model = dvi.Model(SYSTEM, h=H_STEP, p0=[0.0], method=STRANG, adjoint=adjoint)
-        problem, u = problem_of(data, model=model)
-        r, J, _ = problem.evaluate(u)
-        forward = np.asarray(J).T @ np.asarray(r)
-        backward = np.asarray(jax.grad(problem.core.scalar)(jnp.asarray(u)))
+        problem, _ = problem_of(data, model=model)
+        backward = np.asarray(jax.jit(jax.grad(problem.core.scalar))(jnp.asarray(u)))
         np.testing.assert_allclose(backward, forward, rtol=1e-8, atol=1e-8 * np.abs(forward).max())
 
 
@@ -264,17 +272,17 @@ def test_a_likelihood_with_an_unknown_noise_level():
 @pytest.mark.slow
 def test_arcs_of_unlike_length_share_parameters():
     rng = np.random.default_rng(9)
-    starts, arcs = rng.uniform(0.5, 1.5, (5, 1)), []
-    for i, n in enumerate((12, 60, 25, 40, 9)):
+    starts, arcs = rng.uniform(0.5, 1.5, (3, 1)), []
+    for i, n in enumerate((12, 60, 9)):
         ts = np.sort(rng.uniform(0, 0.5 * n, n))
         y = np.asarray(states_at(ts, q0=starts[i]).qs) + NOISE * rng.normal(size=(n, 1))
         arcs.append(dvi.Observations(ts + 100 * i, y, sigma=NOISE, t0=100.0 * i))
-    model = dvi.Model(SYSTEM, h=H_STEP, p0=np.zeros((5, 1)), method=STRANG)
-    found = dvi.fit(model, arcs, {**START, "q0": np.ones((5, 1))})
+    model = dvi.Model(SYSTEM, h=H_STEP, p0=np.zeros((3, 1)), method=STRANG)
+    found = dvi.fit(model, arcs, {**START, "q0": np.ones((3, 1))})
     assert found.names[2:4] == ["q0[0, 0]", "q0[1, 0]"]
     off = (found.x - np.concatenate([[1.3, 0.02], starts[:, 0]])) / found.sigma
     assert np.abs(off).max() < 3.5
-    assert [len(t) for t in found.ts] == [12, 60, 25, 40, 9]
+    assert [len(t) for t in found.ts] == [12, 60, 9]
     alone = dvi.fit(
         dvi.Model(SYSTEM, h=H_STEP, p0=[0.0], method=STRANG), arcs[1], {**START, "q0": np.ones(1)}
     )

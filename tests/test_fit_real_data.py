@@ -78,17 +78,21 @@ def test_short_arcs_of_the_wobble(wobble):
     assert formal[0] > 0
 
 
+YEARS = 30
+"""Enough for the digits below; the century of docs/general-relativity.md takes minutes."""
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_a_century_gives_relativity_its_strength(relativity, tmp_path):
-    newton, einstein, oblate = found = relativity.stages(100)
+def test_decades_give_relativity_its_strength(relativity, tmp_path):
+    newton, einstein, oblate = found = relativity.stages(YEARS)
     assert abs(einstein.epsilon - 1.0006) <= 1e-4
     assert abs(oblate.epsilon - 1) <= 1e-4
     assert einstein.rms < 200  # m
     assert oblate.rms < einstein.rms
     assert newton.rms > 100 * einstein.rms  # negative control
     assert abs(einstein.advance - newton.advance - relativity.TEXTBOOK) < 0.1
-    text = relativity.table(found, 100)
+    text = relativity.table(found, YEARS)
     assert "much too small" in text
     mpl.use("Agg")
     relativity.draw(found).savefig(tmp_path / "picture.png")

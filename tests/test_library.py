@@ -252,6 +252,7 @@ def two_runs(name):
             epsilon=made.exact_epsilon,
             method=dvi.GaussLegendre(2),
             observe=dict(made.observables),
+            adjoint=dvi.Direct(),  # compiled soonest
         )
         return sol.ts, sol.qs, sol.ps, sol.observed
 

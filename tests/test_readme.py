@@ -6,8 +6,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from compilation import flags_of_users
 
 README = Path(__file__).parents[1] / "README.md"
+
+
+@pytest.fixture(autouse=True)
+def as_users_compile(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", flags_of_users())
 
 
 @pytest.mark.slow

@@ -1,0 +1,23 @@
+"""How the tests compile: two flags of XLA, set before JAX starts."""
+
+import os
+
+FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+"""The emitters that XLA:CPU uses by default take twice as long to compile the same program, and
+more than half of the processor time of the tests is compilation. A second thread of compilation
+gains nothing beside a second worker. Numbers may differ in the last digit."""
+
+
+def set_flags() -> None:
+    """Add the flags to XLA_FLAGS, which JAX and the processes that tests start read."""
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}".strip()
+
+
+def flags_of_users() -> str:
+    """XLA_FLAGS without those of the tests: notebooks, the README and the pages of the
+    documentation compile as they do for users."""
+    return os.environ["XLA_FLAGS"].replace(FLAGS, "").strip()
+
+
+AS_FOR_USERS = {"xla_cpu_use_fusion_emitters": True}
+"""`compiler_options` of a `jit` whose results are compared bit by bit with those of another one."""
