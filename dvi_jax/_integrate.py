@@ -41,7 +41,7 @@ from ._solution import Save, Solution
 from ._step import Equations
 from ._system import System
 from ._types import Interval
-from .engine.newton import RootSolver
+from .engine.newton import RootSolver, over
 from .engine.picard import PicardThenNewton
 from .engine.quantities import refuse_quantity
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
@@ -320,9 +320,9 @@ def _solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: 
         stats={
             "num_steps": num_steps,
             "newton_iterations": carry.iterations,
-            "max_residual": carry.residual,
+            "max_residual": over(*carry.residual),
             "failed_step": carry.failed_step,
-            "failed_residual": carry.failed_residual,
+            "failed_residual": over(*carry.failed_residual),
             **task.lattice.report(carry.lattice),
             **({} if defect is None else {"round_trip_defect": defect}),
         },

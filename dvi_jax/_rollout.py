@@ -9,11 +9,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
+import lanewise
+
 from ._arithmetic import Arithmetic, FloatingPoint
 from ._results import RESULTS, first_failure
 from ._solution import Save
 from ._step import Equations
 from ._types import Args, Bindable, Interval, Scalar, State
+from .engine.newton import no_residual, worse
 from .lattices import Lattice, Place
 from .methods import Method
 from .observe import Deviations, Pushed, Reduction, Running, Stop
@@ -121,9 +124,9 @@ class Carry(NamedTuple):
     lattice: Any
     result: RESULTS
     failed_step: Int[Array, ""]
-    failed_residual: Float[Array, ""]
+    failed_residual: Float[Array, "2"]
     iterations: Int[Array, ""]
-    residual: Float[Array, ""]
+    residual: Float[Array, "2"]
     reductions: list[Any]
     beside: Any = None  # what the arithmetic remembers
     stop: Any = None  # with a `Stop`: the step it ended, as a row
@@ -226,9 +229,9 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         task.lattice.begin(task.t0, task.h),
         result,
         jnp.where(failed, jnp.asarray(0, jnp.int32), jnp.asarray(-1, jnp.int32)),
-        jnp.zeros((), real),
+        no_residual(real),
         jnp.asarray(0, jnp.int32),
-        jnp.zeros((), real),
+        no_residual(real),
         [r.start(zero_value(r)) for r in reductions],
         task.arithmetic.start(q0, p0),
         stop,
@@ -249,19 +252,19 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
         (q1, p1), push, (beside, info) = jax.linearize(advance, carry.q, carry.p, has_aux=True)
     else:
         ((q1, p1), (beside, info)), push = advance(carry.q, carry.p), None
-    was_good = carry.result == RESULTS.successful
-    result = carry.result if exists is None else first_failure(carry.result, exists)
-    result = first_failure(result, info.result)
-    fails_now = was_good & (result != RESULTS.successful)
+    result = info.result if exists is None else first_failure(exists, info.result)
     result, stop = _stop(task, carry, interval, q1, p1, result)
+    # What has failed before stays NaN, so that this step is not good either.
     good = result == RESULTS.successful
-    # A state after a failed step is no answer: NaN keeps it from being taken for one.
-    q1, p1 = _or_nan(good, q1), _or_nan(good, p1)
+    q1, p1, result, failed_step, failed_residual = _noted(
+        carry, k, q1, p1, result, good, info.residual
+    )
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
     reduced = _reduced(task, carry, k, taken, push, interval.h)
     if stop is not None:  # what is reduced covers the steps before
         over = result == RESULTS.stopped
         reduced = jax.tree.map(lambda a, b: jnp.where(over, b, a), reduced, carry.reductions)
+    was_good = carry.result == RESULTS.successful
     residual = lax.stop_gradient(info.residual)
     return (
         Carry(
@@ -269,10 +272,10 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
             p1,
             jax.tree.map(lambda new, old: jnp.where(good, new, old), memory, carry.lattice),
             result,
-            jnp.where(fails_now, k, carry.failed_step),
-            jnp.where(fails_now, residual, carry.failed_residual),
+            failed_step,
+            failed_residual,
             carry.iterations + jnp.where(was_good, info.iterations, 0),
-            jnp.where(good, jnp.maximum(carry.residual, residual), carry.residual),
+            worse(carry.residual, jnp.where(good, residual, 0)),
             reduced,
             beside,
             stop,
@@ -280,6 +283,31 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
         interval,
         taken,
     )
+
+
+def _noted(
+    carry: Carry, k: Array, q1: State, p1: State, result: RESULTS, good: Array, residual: Array
+) -> tuple[State, State, RESULTS, Array, Array]:
+    """State, status, failed step and its residual after step k, where that is the first step that
+    is not good. The branch keeps this work out of steps in which nothing fails."""
+    residual = lax.stop_gradient(residual)
+
+    def note():
+        first = ~good & (carry.result == RESULTS.successful)
+        fails = first & (result != RESULTS.stopped)
+        return (
+            # A state after a failed step is no answer: NaN keeps it from being taken for one.
+            _or_nan(good, q1),
+            _or_nan(good, p1),
+            first_failure(carry.result, result),
+            jnp.where(fails, k, carry.failed_step),
+            jnp.where(fails, residual, carry.failed_residual),
+        )
+
+    def keep():
+        return q1, p1, carry.result, carry.failed_step, carry.failed_residual
+
+    return lax.cond(lanewise.on_any(~good), note, keep)
 
 
 def _reduced(

@@ -13,23 +13,32 @@ from lanewise.dependence import depends_on
 from ._results import RESULTS, first_failure
 from ._system import System
 from ._types import Args, Interval, Scalar, State
-from .engine.newton import Known, Newton, RootInfo, RootSolver, find_root
+from .engine.newton import (
+    Known,
+    Newton,
+    RootInfo,
+    RootSolver,
+    find_root,
+    no_residual,
+    worse,
+)
 from .engine.rounding import one_by_one
 
 
 class StepInfo(NamedTuple):
-    """Status of a step, iterations spent, largest relative correction of the last of them."""
+    """Status of a step, iterations spent, and the largest component of the last correction with the
+    scale that it is measured by."""
 
     result: RESULTS
     iterations: Int[Array, ""]
-    residual: Float[Array, ""]
+    residual: Float[Array, "2"]
 
     def then(self, later: "StepInfo") -> "StepInfo":
         """This step followed by another: first failure, total work, worst residual."""
         return StepInfo(
             first_failure(self.result, later.result),
             self.iterations + later.iterations,
-            jnp.maximum(self.residual, later.residual),
+            worse(self.residual, later.residual),
         )
 
 
@@ -38,7 +47,7 @@ def no_step_yet(like: State) -> StepInfo:
     real = jnp.finfo(like.dtype).dtype
     zero = jnp.asarray(0, jnp.int32)
     good = RESULTS.where(jnp.asarray(True), RESULTS.successful, RESULTS.not_finite)
-    return StepInfo(good, zero, jnp.zeros((), real))
+    return StepInfo(good, zero, no_residual(real))
 
 
 class Equations(eqx.Module):
@@ -178,7 +187,7 @@ def _increment(rate, x0, h, equations, known, explicit) -> tuple[State, RootInfo
     guess = x0 + equations.increment(h, rate(x0))
     if explicit:
         real = jnp.finfo(x0.dtype).dtype
-        return guess, RootInfo(jnp.asarray(0, jnp.int32), jnp.zeros((), real), jnp.asarray(True))
+        return guess, RootInfo(jnp.asarray(0, jnp.int32), no_residual(real), jnp.asarray(True))
     shape = x0.shape
     start = x0.ravel()
 

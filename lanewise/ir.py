@@ -235,6 +235,10 @@ class Builder:
         if a.known is not None and b.known is not None:
             return self._fold(np.multiply, a, b)
         for x, y in ((a, b), (b, a)):
+            joined = self._joined_factors(x, y)
+            if joined is not None:
+                return self.mul(*joined)
+        for x, y in ((a, b), (b, a)):
             if x.structural and x.is_known_as(0):
                 return x
             if x.is_known_as(1):
@@ -250,6 +254,23 @@ class Builder:
             if x.op == "neg":
                 return self.neg(self.mul(x.args[0], y))
         return self._commute("mul", a, b, lambda t, x, y: f"fmul {t} {x}, {y}")
+
+    def _joined_factors(self, c: Num, x: Num) -> tuple[Num, Num] | None:
+        """(c·d, y) for c and x = d·y with c and d known, where c·(d·y) = (c·d)·y to the bit and no
+        number leaves the range earlier: one of them is a power of two. x + x counts as 2·x."""
+        if c.known is None or not c.is_float or c.structural:
+            return None
+        if x.op == "add" and x.args[0].key == x.args[1].key:
+            d, y = self.known(2, x.dtype), x.args[0]
+        elif x.op == "mul" and (x.args[0].known is not None or x.args[1].known is not None):
+            d, y = x.args if x.args[0].known is not None else x.args[::-1]
+        else:
+            return None
+        two = _is_power_of_two(c.known) or _is_power_of_two(d.known)
+        both = np.asarray(c.known * d.known, x.dtype)
+        normal = np.finfo(x.dtype).tiny <= abs(both) < np.inf
+        # A subnormal d·y would have lost digits, which (c·d)·y has.
+        return (self.known(both, x.dtype), y) if two and normal else None
 
     def fma(self, a: Num, b: Num, c: Num) -> Num:
         if a.op == "neg" and b.op == "neg":
@@ -361,6 +382,10 @@ class Builder:
     def compare(self, op: str, a: Num, b: Num) -> Num:
         if a.known is not None and b.known is not None:
             return self.known(_COMPARISONS[op](a.known, b.known), "bool")
+        if a.op == "select" and b.known is not None and not a.is_float:
+            which, yes, no = a.args  # a status that was chosen: compare what it was chosen from
+            if yes.known is not None or no.known is not None:
+                return self.select(which, self.compare(op, yes, b), self.compare(op, no, b))
         if a.is_float:
             word = "fcmp " + {"eq": "oeq", "ne": "une"}.get(op, "o" + op)
         elif op in ("eq", "ne"):
@@ -375,6 +400,12 @@ class Builder:
         if a.known is not None and b.known is not None:
             of = {"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor}
             return self._fold(of[op], a, b)
+        if op == "and" and a.op == b.op == "finite" and a.args[0].dtype == b.args[0].dtype:
+            for x, y in ((a.args[0], b.args[0]), (b.args[0], a.args[0])):
+                if y.op == "0·x":  # one sum for both: a comparison less
+                    return self._ordered(
+                        self.op("Σ 0·x", (*y.args, x), x.dtype, self._sum(x.dtype))
+                    )
         if a.dtype == "bool" and op != "xor":
             for x, y in ((a, b), (b, a)):
                 if x.known is not None:
@@ -400,6 +431,15 @@ class Builder:
             return no
         if which.op == "not":
             return self.select(which.args[0], no, yes)
+        if yes.dtype == "bool":
+            if yes.known is not None:
+                return self.logic("or", which, no) if yes.known else self.logic(
+                    "and", self.invert(which), no
+                )  # fmt: skip
+            if no.known is not None:
+                return self.logic("or", self.invert(which), yes) if no.known else self.logic(
+                    "and", which, yes
+                )  # fmt: skip
         vec = which.vec or yes.vec or no.vec
         if vec and not which.vec:  # one bit for all trajectories
             t, one = self.type(yes.dtype, True), TYPES["bool"]
@@ -413,7 +453,7 @@ class Builder:
                     )
                     for u in range(self.U)
                 ]
-                found = self.made(names, yes.dtype, True, "select")
+                found = self.made(names, yes.dtype, True, "select", (which, yes, no))
                 self.note(key, found)
             return found
         bits, t = self.type("bool", vec), self.type(yes.dtype, vec)
@@ -436,6 +476,17 @@ class Builder:
             return larger
         return self.select(self.is_nan(a), a, larger)
 
+    def _sum(self, dtype: str) -> Callable[..., str]:
+        for vec in (False, True):
+            t = self.type(dtype, vec)
+            self.declare(f"{t} @llvm.fma.{self.suffix(dtype, vec)}({t}, {t}, {t})")
+
+        def write(t: str, x: str, y: str, z: str) -> str:
+            suffix = self.suffix(dtype, t.startswith("<"))
+            return f"call {t} @llvm.fma.{suffix}({t} {x}, {t} {y}, {t} {z})"
+
+        return write
+
     def is_nan(self, a: Num) -> Num:
         return self.op("isnan", (a,), "bool", lambda t, x: f"fcmp uno {t} {x}, {x}")
 
@@ -444,7 +495,11 @@ class Builder:
             return self.known(True, "bool")
         if a.known is not None:
             return self.known(np.isfinite(a.known), "bool")
-        return self.compare("lt", self.abs(a), self.known(np.inf, a.dtype))
+        return self._ordered(self.op("0·x", (self.known(0, a.dtype), a), a.dtype, _product))
+
+    def _ordered(self, zero: Num) -> Num:
+        """Whether a sum of products 0·x is not NaN: whether all x are finite."""
+        return self.op("finite", (zero,), "bool", lambda t, x: f"fcmp ord {t} {x}, {x}")
 
     # --- types -----------------------------------------------------------------------------------
 
@@ -617,6 +672,10 @@ class Builder:
                 )
             )  # fmt: skip
         return results
+
+
+def _product(t: str, x: str, y: str) -> str:
+    return f"fmul {t} {x}, {y}"
 
 
 _FLOATS = ("float64", "float32")

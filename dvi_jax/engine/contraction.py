@@ -17,7 +17,6 @@ from .newton import (
     Vector,
     check_settings,
     largest,
-    over,
 )
 
 
@@ -95,12 +94,12 @@ def contract(
         # Compiled for a batch, the largest of numbers may leave NaN out: no test rests on that.
         slow = (k > 1) & is_slow & jnp.any(~(good | round_off))
         goes_on = jnp.all(jnp.isfinite(last)) & ~slow
-        residual = over(largest(error), largest(scale))
+        residual = jnp.stack([largest(error), largest(scale)])
         return last, good, Found(x, k, residual, jnp.all(good)), goes_on
 
     no = jnp.asarray(False)
     unknown = jnp.full_like(x0, jnp.nan)  # no comparison with it is true
-    start = Found(x0, jnp.asarray(0, jnp.int32), unknown[0], no)
+    start = Found(x0, jnp.asarray(0, jnp.int32), jnp.stack([unknown[0]] * 2), no)
     state = (unknown, jnp.zeros(x0.shape, bool), start, ~no)
     return lax.while_loop(proceed, improve, state)[2]
 

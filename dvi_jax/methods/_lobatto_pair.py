@@ -11,7 +11,7 @@ from jax import lax
 from numpy.polynomial import legendre
 
 from .._step import judge
-from ..engine.newton import RootInfo, find_root
+from ..engine.newton import RootInfo, find_root, no_residual
 from ._base import Method
 from ._collocation import check_stages, continuous_rates, integrals
 
@@ -156,9 +156,12 @@ class LobattoIIIAIIIB(Method):
 
         start = tuple(jnp.broadcast_to(z, (s, *z.shape)) for z in (q0, p0))
         if self.needs_no_solve(equations, interval, q0):  # one sweep finds P_1 = P_2
-            no_residual = jnp.zeros((), jnp.finfo(q0.dtype).dtype)
             x = unknowns(*sweep(0, start))
-            info = RootInfo(jnp.asarray(0, jnp.int32), no_residual, jnp.asarray(True))
+            info = RootInfo(
+                jnp.asarray(0, jnp.int32),
+                no_residual(jnp.finfo(q0.dtype).dtype),
+                jnp.asarray(True),
+            )
         else:
             guess = lax.fori_loop(0, _SWEEPS, sweep, lax.stop_gradient(start))
             known = (jnp.broadcast_to(z, (s, *z.shape)) for z in equations.absolute(q0, p0))

@@ -308,6 +308,8 @@ def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
     while width > lanes:
         width //= 2
     vectors = 1
+    if most == 6 and lanes >= 6 * width:
+        return width, 6
     while 2 * vectors <= most and 2 * vectors * width <= lanes:
         vectors *= 2
     return width, vectors
