@@ -13,6 +13,11 @@ for the Hamiltonians
     chain         sum (1 + A q_i^2) p_i^2/2 + B sum q_i q_i+1 p_i p_i+1
                   + sum (d_i^2/2 + C d_i^4/4), d_i = q_i - q_i-1, ends fixed
     web           the same with B over all pairs: a full Jacobian
+    mirror        a charged particle between magnetic mirrors, |p - A|^2/2 with the vector
+                  potential A = (1 + (z/LENGTH)^2)/2 (-y, x, 0); (13) is linear in p1
+
+and, for the pendulum, two methods of order 4: `pendulum_gauss` is Gauss-Legendre collocation with
+two stages, `pendulum_yoshida` composes three Strang steps, each of the map and its adjoint.
 
 An implicit step starts from the explicit guess p0 - h dH/dq(q0, p0) - h eps q0 and makes a given
 number of Newton iterations; the caller asks (`correction` not NULL) how large the last one was.
@@ -37,6 +42,7 @@ single numbers (`_one`, with lanes = 1), by including this file from within itse
 #define A 0.5
 #define B 0.25
 #define C 0.3
+#define LENGTH 20.0 /* magnetic mirror */
 #define LONGEST 10 /* chain */
 
 enum coupling { NEIGHBOURS, ALL_PAIRS };
@@ -405,6 +411,263 @@ INLINE void NAME(chain_step)(int n, enum coupling coupling, enum solver solver, 
     }
 }
 
+/* Two stages z + y_i, i = 1, 2, with z = (q, p), f(q, p) = (dH/dp, -dH/dq - eps q) and y = h a f:
+   with a^-1 = [3, BACK; -AHEAD, 3], BACK AHEAD = 3, Newton's method solves
+
+       3 y_1 + BACK y_2 - h f(z + y_1) = 0,    -AHEAD y_1 + 3 y_2 - h f(z + y_2) = 0,
+
+   and the step is z + sqrt(3) (y_2 - y_1). The first one starts from y_i = c_i h f(z), the others
+   from the parabola through z and the stages of the step before. */
+#define MOST 8 /* vectors together */
+#define ROOT3 1.7320508075688772
+#define BACK (2.0 * ROOT3 - 3.0)
+#define AHEAD (2.0 * ROOT3 + 3.0)
+#define NODE1 (0.5 - ROOT3 / 6.0)
+#define NODE2 (0.5 + ROOT3 / 6.0)
+/* That parabola at 1 + c: c1 c2 = 1/6, c2 - c1 = 1/sqrt(3). */
+#define EXTRAPOLATED(c, y1, y2)                                                                    \
+    ((1.0 + (c)) * ROOT3 * (6.0 * NODE1 * (1.0 + (c) - NODE1) * (y2)                               \
+                            - 6.0 * NODE2 * (1.0 + (c) - NODE2) * (y1)))
+
+/* h f at a state, and the nonzero second derivatives of H, times h. With d = q_0 - q_1 as in
+   `pendulum_step`: `of_d` is d2T/dd2, `mixed` is d2T/dp dd, `mass` and `cross` are entries D and
+   -D cos d of d2T/dp2, `fall` is d2V/dq2 + eps. */
+typedef struct {
+    REAL f[4], mixed[2], of_d, mass, cross, fall[2];
+} NAME(rates);
+
+INLINE void NAME(pendulum_rates)(const REAL *q, const REAL *p, double h, double kick,
+                                 NAME(rates) *at)
+{
+    REAL s0 = SIN(q[0]), c0 = COS(q[0]), s1 = SIN(q[1]), c1 = COS(q[1]);
+    REAL s = s0 * c1 - c0 * s1, c = c0 * c1 + s0 * s1;
+    REAL D = 1.0 / (1.0 + s * s), hD = h * D, turn = s * c * D; /* dD/dd = -2 turn D */
+    REAL w0 = p[0] - c * p[1], w1 = 2.0 * p[1] - c * p[0];
+    REAL product = p[0] * p[1], M = p[0] * w0 + p[1] * w1;
+    REAL slope = hD * (s * product - turn * M);
+    at->f[0] = hD * w0;
+    at->f[1] = hD * w1;
+    at->f[2] = -slope - 2.0 * h * s0 - kick * q[0];
+    at->f[3] = slope - h * s1 - kick * q[1];
+    at->mixed[0] = hD * (s * p[1] - 2.0 * turn * w0);
+    at->mixed[1] = hD * (s * p[0] - 2.0 * turn * w1);
+    at->of_d = hD * (product * (c - 4.0 * turn * s)
+                     - M * (D * (c * c - s * s) - 4.0 * turn * turn));
+    at->mass = hD;
+    at->cross = -c * hD;
+    at->fall[0] = 2.0 * h * c0 + kick;
+    at->fall[1] = h * c1 + kick;
+}
+
+INLINE void NAME(stage_rates)(const REAL *q, const REAL *p, const REAL *y, double h, double kick,
+                              NAME(rates) *at)
+{
+    REAL Q[2] = {q[0] + y[0], q[1] + y[1]}, P[2] = {p[0] + y[2], p[1] + y[3]};
+    NAME(pendulum_rates)(Q, P, h, kick, at);
+}
+
+/* (3 - h df) x, with df the Jacobian of f. */
+INLINE void NAME(stage_times)(const NAME(rates) *at, const REAL *x, REAL *out)
+{
+    REAL e = x[0] - x[1];
+    REAL slope = at->of_d * e + at->mixed[0] * x[2] + at->mixed[1] * x[3];
+    out[0] = 3.0 * x[0] - at->mixed[0] * e - at->mass * x[2] - at->cross * x[3];
+    out[1] = 3.0 * x[1] - at->mixed[1] * e - at->cross * x[2] - 2.0 * at->mass * x[3];
+    out[2] = 3.0 * x[2] + slope + at->fall[0] * x[0];
+    out[3] = 3.0 * x[3] - slope + at->fall[1] * x[1];
+}
+
+/* Correct y1 and y2 once; the size of the correction. */
+INLINE REAL NAME(gauss_correct)(const NAME(rates) *one, const NAME(rates) *two, REAL *y1, REAL *y2)
+{
+    REAL r1[4], r2[4], d1[4], d2[4], J[LONGEST][LONGEST];
+    UNROLL for (int i = 0; i < 4; i++) {
+        r1[i] = 3.0 * y1[i] + BACK * y2[i] - one->f[i];
+        r2[i] = 3.0 * y2[i] - AHEAD * y1[i] - two->f[i];
+    }
+    /* Without d2: [(3 - h df_2) (3 - h df_1) + 3] d1 = (3 - h df_2) r1 - BACK r2 */
+    UNROLL for (int j = 0; j < 4; j++) {
+        REAL unit[4], column[4], out[4];
+        UNROLL for (int i = 0; i < 4; i++)
+            unit[i] = (i == j ? 1.0 : 0.0) + 0.0 * y1[0];
+        NAME(stage_times)(one, unit, column);
+        NAME(stage_times)(two, column, out);
+        UNROLL for (int i = 0; i < 4; i++)
+            J[i][j] = out[i] + 3.0 * unit[i];
+    }
+    NAME(stage_times)(two, r1, d1);
+    UNROLL for (int i = 0; i < 4; i++)
+        d1[i] -= BACK * r2[i];
+    NAME(solve)(4, J, d1);
+    NAME(stage_times)(one, d1, d2);
+    REAL largest = ABS(d1[0]);
+    UNROLL for (int i = 0; i < 4; i++) {
+        d2[i] = (r1[i] - d2[i]) * (1.0 / BACK);
+        y1[i] -= d1[i];
+        y2[i] -= d2[i];
+        largest = MAX(largest, MAX(ABS(d1[i]), ABS(d2[i])));
+    }
+    return largest;
+}
+
+INLINE void NAME(pendulum_gauss_start)(int many, REAL (*q)[2], REAL (*p)[2], double h, double kick,
+                                       REAL (*guess)[8])
+{
+    UNROLL for (int b = 0; b < many; b++) {
+        NAME(rates) at;
+        NAME(pendulum_rates)(q[b], p[b], h, kick, &at);
+        UNROLL for (int i = 0; i < 4; i++) {
+            guess[b][i] = NODE1 * at.f[i];
+            guess[b][i + 4] = NODE2 * at.f[i];
+        }
+    }
+}
+
+INLINE void NAME(pendulum_gauss_step)(int many, REAL (*q)[2], REAL (*p)[2], REAL (*guess)[8],
+                                      double h, double kick, int iterations, REAL *correction)
+{
+    REAL y1[MOST][4], y2[MOST][4];
+    UNROLL for (int b = 0; b < many; b++)
+        UNROLL for (int i = 0; i < 4; i++) {
+            y1[b][i] = guess[b][i];
+            y2[b][i] = guess[b][i + 4];
+        }
+    for (int k = 0; k < iterations; k++) {
+        NAME(rates) one[MOST], two[MOST];
+        UNROLL for (int b = 0; b < many; b++) {
+            NAME(stage_rates)(q[b], p[b], y1[b], h, kick, &one[b]);
+            NAME(stage_rates)(q[b], p[b], y2[b], h, kick, &two[b]);
+        }
+        UNROLL for (int b = 0; b < many; b++)
+            correction[b] = NAME(gauss_correct)(&one[b], &two[b], y1[b], y2[b]);
+    }
+    UNROLL for (int b = 0; b < many; b++)
+        UNROLL for (int i = 0; i < 4; i++) {
+            REAL change = ROOT3 * (y2[b][i] - y1[b][i]), *z = i < 2 ? &q[b][i] : &p[b][i - 2];
+            *z += change;
+            guess[b][i] = EXTRAPOLATED(NODE1, y1[b][i], y2[b][i]) - change;
+            guess[b][i + 4] = EXTRAPOLATED(NODE2, y1[b][i], y2[b][i]) - change;
+        }
+}
+
+/* Yoshida's composition: the map over r h, then its adjoint over r h, for r = GAMMA/2, 1/2 - GAMMA
+   and GAMMA/2. (13) changes both momenta by one slope x, to known_0 - x and known_1 + x; (12) of
+   the adjoint depends on d alone. Newton's method solves for x, then for d. The next map starts
+   with the sines that the adjoint ended with: `sines` holds sin d, cos d, D, sin q_0, sin q_1. */
+#define GAMMA 1.3512071919596578 /* 1/(2 - 2^(1/3)) */
+
+INLINE void NAME(pendulum_yoshida_start)(int many, REAL (*q)[2], REAL (*p)[2], double h,
+                                         double kick, REAL (*sines)[5])
+{
+    UNROLL for (int b = 0; b < many; b++) {
+        REAL s = SIN(q[b][0] - q[b][1]);
+        sines[b][0] = s;
+        sines[b][1] = COS(q[b][0] - q[b][1]);
+        sines[b][2] = 1.0 / (1.0 + s * s);
+        sines[b][3] = SIN(q[b][0]);
+        sines[b][4] = SIN(q[b][1]);
+    }
+}
+
+INLINE void NAME(pendulum_strang)(int many, REAL (*q)[2], REAL (*p)[2], REAL (*sines)[5], double h,
+                                  double kick, int iterations, REAL *correction)
+{
+    REAL d0[MOST], move[MOST], last[MOST], sine[MOST], cosine[MOST];
+    UNROLL for (int b = 0; b < many; b++) {
+        REAL s = sines[b][0], c = sines[b][1], D = sines[b][2];
+        REAL first = h * s * D, second = first * c * D;
+        REAL known0 = p[b][0] - 2.0 * h * sines[b][3] - kick * q[b][0];
+        REAL known1 = p[b][1] - h * sines[b][4] - kick * q[b][1];
+        REAL u = known0, v = known1, w0 = u - v * c, w1 = 2.0 * v - u * c;
+        REAL x = first * (u * v) - second * (u * w0 + v * w1), delta = x;
+        for (int k = 0; k < iterations; k++) {
+            u = known0 - x;
+            v = known1 + x;
+            w0 = u - v * c;
+            w1 = 2.0 * v - u * c;
+            REAL F = x - first * (u * v) + second * (u * w0 + v * w1);
+            delta = F / (1.0 + first * (v - u) - 2.0 * second * (w0 - w1));
+            x -= delta;
+        }
+        correction[b] = ABS(delta);
+        p[b][0] = u = known0 - x;
+        p[b][1] = v = known1 + x;
+        REAL move0 = h * D * (u - v * c), move1 = h * D * (2.0 * v - u * c);
+        q[b][0] += move0;
+        q[b][1] += move1;
+        d0[b] = q[b][0] - q[b][1];
+        /* The adjoint's guess: as far again, at a rate that is linear in d. */
+        REAL again = move0 - move1;
+        move[b] = again - 2.0 * again * s * (h * D * (u - v) + 2.0 * c * D * again);
+    }
+
+    /* d = d0 + h D (u - 2 v + (u - v) cos d), with both sides multiplied by 1/D = 1 + sin^2 d. */
+    for (int k = 0; k < iterations; k++) {
+        UNROLL for (int b = 0; b < many; b++) {
+            sine[b] = SIN(d0[b] + move[b]);
+            cosine[b] = COS(d0[b] + move[b]);
+        }
+        UNROLL for (int b = 0; b < many; b++) {
+            REAL s = sine[b], c = cosine[b], less = h * (p[b][0] - p[b][1]);
+            REAL E = 1.0 + s * s, g = less * (1.0 + c) - h * p[b][1];
+            last[b] = E * (E * move[b] - g) / (E * E + s * (2.0 * c * g + less * E));
+            move[b] -= last[b];
+        }
+    }
+    UNROLL for (int b = 0; b < many; b++) {
+        REAL u = p[b][0], v = p[b][1], delta = last[b], half = 0.5 * delta * delta;
+        REAL s = sine[b] - delta * cosine[b] - half * sine[b]; /* sin(d - delta) */
+        REAL c = cosine[b] + delta * sine[b] - half * cosine[b];
+        REAL D = 1.0 / (1.0 + s * s);
+        correction[b] = MAX(correction[b], ABS(delta));
+        q[b][0] += h * D * (u - v * c);
+        q[b][1] += h * D * (2.0 * v - u * c);
+        sines[b][0] = s;
+        sines[b][1] = c;
+        sines[b][2] = D;
+    }
+    UNROLL for (int b = 0; b < many; b++) {
+        sines[b][3] = SIN(q[b][0]);
+        sines[b][4] = SIN(q[b][1]);
+    }
+    UNROLL for (int b = 0; b < many; b++) {
+        REAL s = sines[b][0], c = sines[b][1], D = sines[b][2], u = p[b][0], v = p[b][1];
+        REAL slope = h * s * D * (u * v - c * D * (u * (u - v * c) + v * (2.0 * v - u * c)));
+        p[b][0] = u - slope - 2.0 * h * sines[b][3] - kick * q[b][0];
+        p[b][1] = v + slope - h * sines[b][4] - kick * q[b][1];
+    }
+}
+
+INLINE void NAME(pendulum_yoshida_step)(int many, REAL (*q)[2], REAL (*p)[2], REAL (*sines)[5],
+                                        double h, double kick, int iterations, REAL *correction)
+{
+    UNROLL for (int b = 0; b < many; b++)
+        correction[b] = 0.0 * q[b][0];
+    for (int part = 0; part < 3; part++) {
+        double r = part == 1 ? 0.5 - GAMMA : 0.5 * GAMMA;
+        REAL largest[MOST];
+        NAME(pendulum_strang)(many, q, p, sines, r * h, r * kick, iterations, largest);
+        UNROLL for (int b = 0; b < many; b++)
+            correction[b] = MAX(correction[b], largest[b]);
+    }
+}
+
+/* With the velocity v = p1 - A(q0) and g = (1 + (z/LENGTH)^2)/2, (13) is the linear system
+   v0 = a + h g v1, v1 = b - h g v0, which one iteration of Newton's method solves as well. */
+INLINE void NAME(mirror_step)(REAL *q, REAL *p, double h, double kick)
+{
+    REAL z = q[2] * (1.0 / LENGTH), g = 0.5 + 0.5 * z * z, hg = h * g;
+    REAL a = p[0] + g * q[1] - kick * q[0], b = p[1] - g * q[0] - kick * q[1];
+    REAL inverse = 1.0 / (1.0 + hg * hg);
+    REAL v0 = (a + hg * b) * inverse, v1 = (b - hg * a) * inverse;
+    p[0] = v0 - g * q[1];
+    p[1] = v1 + g * q[0];
+    p[2] += (h / LENGTH) * z * (q[0] * v1 - q[1] * v0) - kick * q[2];
+    q[0] += h * v0;
+    q[1] += h * v1;
+    q[2] += h * p[2];
+}
+
 /* Runs: the loops over lanes and time around a step. Lane `AT(b)` is the first of vector b. */
 
 #define AT(b) (first + (b) * LANES_OF_REAL)
@@ -531,6 +794,44 @@ INLINE void NAME(chain_step)(int n, enum coupling coupling, enum solver solver, 
         }                                                                                          \
     }
 
+/* As DEFINE_IMPLICIT, for a step that advances all `many` vectors in lockstep, which hides the
+   latency of a chain of sines and divisions. A step leaves `values` numbers to the next one in
+   `left`; name_start sets them for the first. */
+#define LOCKSTEP_LOOP(name, many, monitor)                                                         \
+    for (long k = 0; k < steps; k++) {                                                             \
+        REAL d[many];                                                                              \
+        NAME(name##_step)(many, q, p, left, h, kick, iterations, d);                               \
+        if (monitor)                                                                               \
+            UNROLL for (int b = 0; b < (many); b++)                                                \
+                largest[b] = MAX(largest[b], d[b]);                                                \
+    }
+
+#define DEFINE_LOCKSTEP(name, n, many, values)                                                     \
+    void NAME(name)(long lanes, long steps, int iterations, double h, double eps,                  \
+                    const double *q0, const double *p0, double *q1, double *p1,                    \
+                    double *correction)                                                            \
+    {                                                                                              \
+        double kick = h * eps;                                                                     \
+        for (long first = 0; first < lanes; first += (many) * LANES_OF_REAL) {                     \
+            LOAD_STATE(n, many)                                                                    \
+            REAL largest[many], left[many][values];                                                \
+            NAME(name##_start)(many, q, p, h, kick, left);                                         \
+            UNROLL for (int b = 0; b < (many); b++)                                                \
+                largest[b] = 0.0 * q[b][0];                                                        \
+            if (correction) {                                                                      \
+                LOCKSTEP_LOOP(name, many, 1)                                                       \
+                UNROLL for (int b = 0; b < (many); b++)                                            \
+                    STORE(correction + AT(b), largest[b]);                                         \
+            } else if (iterations == 2) { /* the usual number, known to the compiler */            \
+                enum { iterations = 2 };                                                           \
+                LOCKSTEP_LOOP(name, many, 0)                                                       \
+            } else {                                                                               \
+                LOCKSTEP_LOOP(name, many, 0)                                                       \
+            }                                                                                      \
+            STORE_STATE(n, many, q1, p1)                                                           \
+        }                                                                                          \
+    }
+
 DEFINE_EXPLICIT_FINAL(oscillator, 1, TOGETHER(4, 8))
 DEFINE_EXPLICIT_STREAMED(oscillator, 1, TOGETHER(2, 8))
 DEFINE_EXPLICIT_SAVED(oscillator, 1, TOGETHER(4, 8))
@@ -542,6 +843,10 @@ DEFINE_EXPLICIT_SAVED(kepler, 2, TOGETHER(2, 8))
 DEFINE_IMPLICIT(product, 1, TOGETHER(2, 8), NAME(product_step)(q[b], p[b], h, kick, iterations, &d))
 DEFINE_IMPLICIT(pendulum, 2, TOGETHER(1, 4),
                 NAME(pendulum_step)(q[b], p[b], h, kick, iterations, &d))
+
+DEFINE_LOCKSTEP(pendulum_gauss, 2, TOGETHER(2, 2), 8)
+DEFINE_LOCKSTEP(pendulum_yoshida, 2, TOGETHER(4, 4), 5)
+DEFINE_EXPLICIT_FINAL(mirror, 3, TOGETHER(2, 8))
 
 #define CHAIN_STEP(n, coupling, solver)                                                            \
     NAME(chain_step)(n, coupling, solver, q[b], p[b], h, kick, iterations, &d)
@@ -560,5 +865,15 @@ DEFINE_IMPLICIT(web10, 10, 1, CHAIN_STEP(10, ALL_PAIRS, DENSE))
 #undef DEFINE_EXPLICIT_SAVED
 #undef IMPLICIT_LOOP
 #undef DEFINE_IMPLICIT
+#undef LOCKSTEP_LOOP
+#undef DEFINE_LOCKSTEP
+#undef MOST
+#undef ROOT3
+#undef BACK
+#undef AHEAD
+#undef NODE1
+#undef NODE2
+#undef EXTRAPOLATED
+#undef GAMMA
 #undef CHAIN_STEP
 #endif

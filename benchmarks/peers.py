@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from _baseline import Baseline
 from _workloads import WORKLOADS, A, B, C, Workload
-from speed import JIT_OPTIONS, Clock, batched, last_state, pin, processor, ratio, say
+from speed import Clock, batched, last_state, pin, processor, ratio, say
 
 SAME_MAP, FIRST_ORDER = 1e-12, 2.0
 FINE_STEP, FINE_STEPS, FINE_LANES = 1e-3, 1000, 8
@@ -87,7 +87,7 @@ FIELDS = {"kepler": kepler_field, "chain2": chain_field}
 def run_dvi_jax(work: Work) -> Call:
     """This package."""
     one = last_state(work.w._replace(h=work.h), work.steps, epsilon=0.0)
-    f = jax.jit(batched(one) if work.q0.ndim == 2 else one, compiler_options=JIT_OPTIONS["plain"])
+    f = jax.jit(batched(one) if work.q0.ndim == 2 else one)
     start = jnp.asarray(work.q0), jnp.asarray(work.p0)
     return lambda: jax.block_until_ready(f(*start))[:2]
 
@@ -130,7 +130,7 @@ def run_diffrax(work: Work) -> Call:
         q, p = unpack(sol.ys)
         return q[-1], p[-1]
 
-    f = jax.jit(batched(one) if work.q0.ndim == 2 else one, compiler_options=JIT_OPTIONS["plain"])
+    f = jax.jit(batched(one) if work.q0.ndim == 2 else one)
     start = jnp.asarray(work.q0), jnp.asarray(work.p0)
     return lambda: jax.block_until_ready(f(*start))
 

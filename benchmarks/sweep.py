@@ -29,7 +29,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from speed import JIT_OPTIONS
 
 import dvi_jax as dvi
 from dvi_jax import systems
@@ -83,7 +82,7 @@ def bare(steps: int):
 
     start = dvi.starts.Halton(KERNEL_LANES, LOW, HIGH)
     states = jax.vmap(lambda i: start.at(i, 0.0, None))(jnp.arange(KERNEL_LANES))
-    kernel = jax.jit(jax.vmap(one), compiler_options=JIT_OPTIONS["plain"])
+    kernel = jax.jit(jax.vmap(one))
     return dvi.over_threads(kernel), states
 
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _workloads import WORKLOADS
-from speed import JIT_OPTIONS, Clock, batched, last_state
+from speed import Clock, batched, last_state
 
 import dvi_jax as dvi
 
@@ -25,7 +25,7 @@ def measured(name: str, lanes: int, steps: int, threads: int | None, rounds: int
     """Ratios of wall-clock times, one thread over several."""
     w = WORKLOADS[name]
     inputs = [jnp.asarray(x) for x in w.start(lanes)]
-    one = jax.jit(batched(last_state(w, steps)), compiler_options=JIT_OPTIONS["plain"])
+    one = jax.jit(batched(last_state(w, steps)))
     several = dvi.over_threads(one, threads, in_axes=-1, out_axes=-1)
     for a, b in zip(jax.tree.leaves(one(*inputs)), jax.tree.leaves(several(*inputs)), strict=True):
         np.testing.assert_array_equal(a, b)

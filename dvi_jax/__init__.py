@@ -1,5 +1,7 @@
 """Differentiable variational integrators for disturbed Hamiltonian systems."""
 
+from lanewise import Layout as Layout
+
 from ._adapters import (
     from_lagrangian as from_lagrangian,
     from_type_iii as from_type_iii,
@@ -52,7 +54,6 @@ from .engine.newton import Newton as Newton, RootSolver as RootSolver
 from .engine.picard import Picard as Picard, PicardThenNewton as PicardThenNewton
 from .engine.simplified import SimplifiedNewton as SimplifiedNewton
 from .engine.threads import over_threads as over_threads
-from .engine.tiles import Layout as Layout
 from .fit import (
     FIT_RESULTS as FIT_RESULTS,
     Bounds as Bounds,

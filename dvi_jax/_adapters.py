@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+import lanewise
+from lanewise.dependence import depends_on
+
 from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
-from .engine.dependence import depends_on
-from .engine.linear import solve_dense
 from .engine.newton import Newton, Vector, find_root
 from .engine.signature import accepts
 
@@ -310,10 +311,10 @@ def _velocity(
 
     rest = jnp.zeros_like(p)
     if not depends_on(jax.jacfwd(slope), 0, rest):  # quadratic in v
-        return solve_dense(jax.jacfwd(slope)(rest), p - slope(rest))
+        return lanewise.solve(jax.jacfwd(slope)(rest), p - slope(rest))
     start = _start(slope, p, rest)
     # where v is small beside the terms of p that cancel, their round-off is its scale
-    of_terms = solve_dense(jax.jacfwd(slope)(start), p)
+    of_terms = lanewise.solve(jax.jacfwd(slope)(start), p)
     scale = jnp.maximum(jnp.abs(scale), jnp.abs(start) + jnp.abs(of_terms))
     return _root(lambda v: slope(v) - p, start, scale, newton)
 
@@ -346,7 +347,7 @@ def _start(slope: Callable[[Vector], Vector], p: Vector, rest: Vector) -> Vector
 
     def closer(state):
         v, left, part, trials = state
-        tried = v - part * solve_dense(jax.jacfwd(defect)(v), defect(v))
+        tried = v - part * lanewise.solve(jax.jacfwd(defect)(v), defect(v))
         new = size(tried)
         gain = new < left  # false for NaN
         part = jnp.where(gain, jnp.minimum(2 * part, 1), part / 2)

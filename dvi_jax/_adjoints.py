@@ -8,6 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+import lanewise
+from lanewise import Layout
+
 from ._rollout import (
     Carry,
     Loop,
@@ -21,9 +24,7 @@ from ._rollout import (
     with_start,
     with_tail,
 )
-from ._segments import can_trust, run_in_segments
 from ._types import State
-from .engine.tiles import Layout, lanewise
 
 
 class Outcome(NamedTuple):
@@ -50,13 +51,6 @@ class AbstractAdjoint(eqx.Module):
         """The whole trajectory, differentiable in this adjoint's way."""
 
 
-def entries_of(task: Task, q0: State, p0: State) -> int:
-    """With how many numbers of a lane a step works: state, a Jacobian, memories of reductions."""
-    carry = jax.eval_shape(lambda: start(task, q0, p0))
-    memories = sum(x.size for x in jax.tree.leaves(carry.reductions))
-    return 2 * q0.size + q0.size**2 + memories
-
-
 def _direct_rollout(
     task: Task, plan: Plan, q0: State, p0: State, loop: Loop, layout: Layout
 ) -> Outcome:
@@ -71,15 +65,7 @@ def _direct_rollout(
         task = eqx.combine(arrays, rest)
         return outcome(task, run(task, plan, start(task, q0, p0), loop), q0, p0)
 
-    def on_trust(arrays, q0, p0):
-        task = eqx.combine(arrays, rest)
-        begin = start(task, q0, p0)
-        return outcome(task, run_in_segments(task, plan, begin), q0, p0)
-
-    return lanewise(
-        on_trust if can_trust(task) else forward, arrays, q0, p0,
-        layout=layout, steps=plan.num_steps, entries=entries_of(task, q0, p0), plain=forward,
-    )  # fmt: skip
+    return lanewise.call(forward, arrays, q0, p0, layout=layout)
 
 
 class Direct(AbstractAdjoint):

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._compat import is_traced
+from lanewise.jaxapi import is_traced
+
 from ._solution import Save, Solution
 from ._system import System
 from ._types import Args, Bindable, Scalar, State

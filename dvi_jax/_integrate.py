@@ -12,9 +12,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, PyTree
 
+import lanewise
+from lanewise import Layout
+from lanewise.jaxapi import is_traced
+
 from ._adjoints import AbstractAdjoint, Outcome
 from ._arithmetic import Arithmetic, FixedPoint, FloatingPoint
-from ._compat import is_traced
 from ._dense import Curve, at_times, crossings, stopped
 from ._extended import run_extended
 from ._precision import refuse_double_without_x64
@@ -38,11 +41,9 @@ from ._solution import Save, Solution
 from ._step import Equations
 from ._system import System
 from ._types import Interval
-from .engine.cpu import OPTIONS, takes_options
 from .engine.newton import RootSolver
 from .engine.picard import PicardThenNewton
 from .engine.quantities import refuse_quantity
-from .engine.tiles import Layout
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, warn_of_dissipation
 from .observe import Deviations, Range, Reduction, RequestedTimes, Running, Section, Stop
@@ -209,30 +210,15 @@ def integrate(
             "report_defect=True cannot be reported with progress: leave one of them out."
         )
     else:
-        outcome = _in_pieces(task, plan, q0, p0, num_steps, progress)
+        outcome = _in_pieces(task, plan, q0, p0, num_steps, progress, layout)
 
     solution = _solution(task, observe, outcome, q0, p0, num_steps)
     return _raise_on_failure(solution, task) if throw else solution
 
 
+@eqx.filter_jit
 def _whole(task: Task, plan: Plan, q0, p0, adjoint: AbstractAdjoint, layout: Layout) -> Outcome:
-    arrays = [x for x in jax.tree.leaves((task, q0, p0)) if isinstance(x, jax.Array)]
-    if takes_options(*arrays):
-        try:
-            return _rollout_with_options(adjoint, task, plan, q0, p0, layout)
-        except ValueError as error:  # a value of an outer jit or grad is closed over
-            if "compiler_options" not in str(error):
-                raise
-    return _rollout(adjoint, task, plan, q0, p0, layout)
-
-
-def _roll_out(adjoint: AbstractAdjoint, *of: Any) -> Outcome:
-    return adjoint.rollout(*of)
-
-
-_rollout = eqx.filter_jit(_roll_out)
-_filter_jit: Any = eqx.filter_jit  # its annotations leave out what goes on to jax.jit
-_rollout_with_options = _filter_jit(_roll_out, compiler_options=OPTIONS)
+    return adjoint.rollout(task, plan, q0, p0, layout)
 
 
 @eqx.filter_jit
@@ -241,12 +227,18 @@ def _begin(task: Task, q0, p0):
 
 
 @eqx.filter_jit
-def _piece(task: Task, plan: Plan, carry, first):
-    carry, saved, tail = run(task, plan, carry, counted_scan, first=first)
-    return carry, with_tail(plan, saved, tail)
+def _piece(task: Task, plan: Plan, carry, first, layout: Layout):
+    arrays, rest = eqx.partition(task, eqx.is_array)
+
+    def piece(arrays, carry, first):
+        task = eqx.combine(arrays, rest)
+        carry, saved, tail = run(task, plan, carry, counted_scan, first=first)
+        return carry, with_tail(plan, saved, tail)
+
+    return lanewise.call(piece, arrays, carry, first, layout=layout)
 
 
-def _in_pieces(task: Task, plan: Plan, q0, p0, num_steps, progress) -> Outcome:
+def _in_pieces(task: Task, plan: Plan, q0, p0, num_steps, progress, layout) -> Outcome:
     """The same scan as `_whole`, cut between save points, with a call after each piece."""
     blocks = max(1, -(-plan.num_blocks // _PIECES))
     carry, done, parts = _begin(task, q0, p0), 0, []
@@ -255,7 +247,7 @@ def _in_pieces(task: Task, plan: Plan, q0, p0, num_steps, progress) -> Outcome:
         is_last = done + count >= plan.num_blocks
         tail = (plan.tail, plan.save_tail) if is_last else (0, False)
         first = jnp.asarray(done * plan.block, jnp.int32)
-        carry, saved = _piece(task, Plan(count, plan.block, *tail), carry, first)
+        carry, saved = _piece(task, Plan(count, plan.block, *tail), carry, first, layout)
         jax.block_until_ready(carry)
         parts.append(saved)
         done += count

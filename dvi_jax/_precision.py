@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ._compat import x64_enabled
+from lanewise.jaxapi import x64_enabled
 
 
 def refuse_double_without_x64(name: str, dtype: Any) -> None:

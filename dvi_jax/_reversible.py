@@ -14,9 +14,13 @@ from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ._adjoints import AbstractAdjoint, Checkpointed, Outcome, entries_of
+import lanewise
+from lanewise import Layout
+from lanewise.jaxapi import is_traced
+
+from ._adjoints import AbstractAdjoint, Checkpointed, Outcome
 from ._arithmetic import FloatingPoint
-from ._compat import is_traced
+from ._results import RESULTS
 from ._rollout import (
     Plan,
     Saved,
@@ -31,17 +35,10 @@ from ._rollout import (
     with_start,
     with_tail,
 )
-from ._segments import can_trust, largest_divisor, run_in_segments
 from ._step import Equations
 from ._types import State
-from .engine.lanes import in_arrays
-from .engine.newton import Known, RootSolver, Trusted
-from .engine.tiles import Layout, lanewise
-from .engine.together import on_any_lane
+from .engine.newton import Known, RootSolver
 from .methods import TypeII
-
-BACKWARD_ITERATIONS = 3
-"""Of Newton's method in an inverse step, on trust."""
 
 LOOKS = 16
 """Steps back between two looks at how large the components are."""
@@ -109,21 +106,12 @@ class Reversible(AbstractAdjoint):
         theta, others = eqx.partition(task, eqx.is_inexact_array)
         # Whole numbers and truth values may be traced as well: inputs without a derivative.
         whole, fixed = eqx.partition(others, eqx.is_array)
-        entries, steps = entries_of(task, q0, p0), plan.num_steps
-        with_tangents = entries + 2 * q0.size
 
         @jax.jit  # so that its uses below share one trace, and one trace of its derivative
         def forward(inputs, whole):
             theta, q0, p0 = inputs
             task = eqx.combine(theta, whole, fixed)
             ran = run(task, plan, start(task, q0, p0), counted_scan, self._inner_loop)
-            return finish(task, ran, q0, p0)
-
-        def on_trust(inputs, whole):
-            theta, q0, p0 = inputs
-            task = eqx.combine(theta, whole, fixed)
-            begin = start(task, q0, p0)
-            ran = run_in_segments(task, plan, begin, self.checkpoint_every)
             return finish(task, ran, q0, p0)
 
         def finish(task, ran, *of):
@@ -133,13 +121,9 @@ class Reversible(AbstractAdjoint):
             smooth = _Smooth(carry.q, carry.p, kept, reduce(task, carry))
             return smooth, (carry, saved, tail, counts)
 
-        fast = on_trust if can_trust(task) else forward
-
         @jax.custom_jvp
         def trajectory(inputs, whole):
-            return lanewise(
-                fast, inputs, whole, layout=layout, steps=steps, entries=entries, plain=forward
-            )
+            return lanewise.call(forward, inputs, whole, layout=layout)
 
         @functools.partial(trajectory.defjvp, symbolic_zeros=True)
         def _(primals, tangents):
@@ -153,18 +137,14 @@ class Reversible(AbstractAdjoint):
             moving, still = eqx.partition(inputs, moves)
             change = eqx.filter(change, moves)
 
-            def along(function, moving, still, whole, u):
+            def along(moving, still, whole, u):
                 def of(moving):
-                    return function(eqx.combine(moving, still), whole)[0]
+                    return forward(eqx.combine(moving, still), whole)[0]
 
                 return jax.jvp(of, (moving,), (u,))[1]
 
             def push(u):
-                return lanewise(
-                    functools.partial(along, fast), moving, still, whole, u,
-                    layout=layout, steps=steps, entries=with_tangents,
-                    plain=functools.partial(along, forward),
-                )  # fmt: skip
+                return lanewise.call(along, moving, still, whole, u, layout=layout)
 
             # As one vector: the transposition of a linear solve wants all parts of its right side
             # to be linear in the tangents, also those that are zero.
@@ -175,7 +155,7 @@ class Reversible(AbstractAdjoint):
 
             def matvec(x):
                 u, v = unravel(x)
-                moved = along(forward, moving, still, whole, u)
+                moved = along(moving, still, whole, u)
                 return flat(u, jax.tree.map(jnp.subtract, v, moved))
 
             def solve(_, b):
@@ -191,10 +171,7 @@ class Reversible(AbstractAdjoint):
 
             def transpose_solve(_, b):
                 u, v = unravel(b)
-                back = lanewise(
-                    pull, moving, still, whole, trace, v,
-                    layout=layout, steps=steps, entries=with_tangents,
-                )  # fmt: skip
+                back = lanewise.call(pull, moving, still, whole, trace, v, layout=layout)
                 # From a lane that nothing asks for nothing flows back, though it has failed.
                 asked = jnp.any(jnp.stack([jnp.any(x != 0) for x in jax.tree.leaves(v)]))
                 back = jax.tree.map(lambda x: jnp.where(asked, x, 0), back)
@@ -212,10 +189,9 @@ class Reversible(AbstractAdjoint):
                 task = eqx.combine(theta, whole, fixed)
                 return _round_trip_defect(self, task, plan, *of)
 
-            rebuilt = lanewise(
-                defect, *lax.stop_gradient((theta, whole, (q0, p0), saved, tail)),
-                layout=layout, steps=steps, entries=entries,
-            )  # fmt: skip
+            rebuilt = lanewise.call(
+                defect, *lax.stop_gradient((theta, whole, (q0, p0), saved, tail)), layout=layout
+            )
         kept = eqx.combine(smooth.saved, counts)
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), kept, smooth.reduced, rebuilt)
 
@@ -314,44 +290,33 @@ def _rebuilt(
     along: Callable | None = None,
     sums: Any = None,
 ):
-    """The states from `end` back over `count` steps, by inverse steps on trust.
+    """The states from `end` back over `count` steps, by inverse steps.
 
     Given are the `sums` that ``along(k, after, before, sums)`` has made of each step on the way, by
     how much of its size each component misses `known_start`, and whether all solves went well.
     """
-    newton = task.equations.newton
-    assert isinstance(newton, RootSolver)
-    on_trust = Trusted(newton, jnp.asarray(BACKWARD_ITERATIONS, jnp.int32))
-    equations = _solved_by(task, on_trust)
     group = largest_divisor(count, LOOKS)
-    solves = not (
-        task.method.inverse_needs_no_solve(
-            task.equations, task.interval(jnp.asarray(0, jnp.int32)), end[0]
-        )
-    )
 
     def undo(state, k):
-        after, sums, excess = state
-        q, p, info = task.method.inverse(equations, task.interval(k), *after)
+        after, sums, solved = state
+        q, p, info = task.method.inverse(task.equations, task.interval(k), *after)
         if along is not None:
             sums = along(k, after, (q, p), sums)
-        return ((q, p), sums, jnp.maximum(excess, info.residual) if solves else None), None
+        return ((q, p), sums, solved & (info.result == RESULTS.successful)), None
 
     def undo_group(state, k):
         state, sizes = state
         state, _ = counted_scan(undo, state, k, 1, group, reverse=True)
         return (state, _largest(sizes, state[0])), None
 
-    worst = jnp.full((), -jnp.inf, end[0].dtype) if solves else None
-    begin = ((end, sums, worst), _largest(end, end))
-    ((state, sums, excess), sizes), _ = counted_scan(
+    begin = ((end, sums, jnp.asarray(True)), _largest(end, end))
+    ((state, sums, solved), sizes), _ = counted_scan(
         undo_group, begin, first, group, count // group, reverse=True
     )
     misses = [
         _miss(a, b, size, allowed).ravel()
         for a, b, size in zip(state, known_start, sizes, strict=True)
     ]
-    solved = excess <= 0 if solves else jnp.asarray(True)
     return sums, jnp.concatenate(misses), solved
 
 
@@ -427,7 +392,7 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
     def undo_steps(known_start, end, first, count, last, at_save, grad, cot):
         """`count` steps back from the exact state `end`, checked against `known_start`.
 
-        By inverse steps on trust; for lanes that then miss the start, through the steps again from
+        By inverse steps; where a trajectory then misses the start, through the steps again from
         there, their states stored.
         """
 
@@ -457,12 +422,12 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
             return sums
 
         def mend(out):
-            again = in_arrays(stored)(known_start, end, first, last, at_save, grad, cot)
+            again = stored(known_start, end, first, last, at_save, grad, cot)
             return jax.tree.map(lambda a, b: jnp.where(missing, a, b), again, out)
 
         # Where the trajectory itself has failed there is nothing to mend: NaN, not a number.
         missing = ~fine & _all_finite(known_start) & _all_finite(end)
-        return lax.cond(on_any_lane(missing), mend, lambda out: out, tuple(out))
+        return lax.cond(lanewise.on_any(missing), mend, lambda out: out, tuple(out))
 
     def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):
         last = first + count - 1
@@ -503,6 +468,10 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
     k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
     (_, grad, cot), _ = lax.scan(block, (k, grad, cot), (starts, saved, rows), reverse=True)
     return grad, *map(jnp.add, cot, of_start)
+
+
+def largest_divisor(n: int, most: int) -> int:
+    return next(d for d in range(min(n, most), 0, -1) if n % d == 0) if n else 1
 
 
 def _end_of(task: Task, k: Array) -> tuple[Array, Array]:

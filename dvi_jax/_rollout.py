@@ -85,9 +85,7 @@ class Task(eqx.Module):
         for f in self._leaves():
             if isinstance(f, Running):
                 value = f.reduction.finish(next(memories))
-                if carry.result is not None:
-                    value = _or_nan(carry.result == RESULTS.successful, value)
-                values.append(value)
+                values.append(_or_nan(carry.result == RESULTS.successful, value))
             elif isinstance(f, Reduction):
                 next(memories)
             else:
@@ -116,11 +114,7 @@ class Task(eqx.Module):
 
 
 class Carry(NamedTuple):
-    """What goes from step to step.
-
-    On trust, a step keeps no books: `result`, `failed_step` and `failed_residual` are None, and
-    `residual` is the largest excess of a solve (see `Trusted`), None where nothing is solved.
-    """
+    """What goes from step to step."""
 
     q: State
     p: State
@@ -255,21 +249,6 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
         (q1, p1), push, (beside, info) = jax.linearize(advance, carry.q, carry.p, has_aux=True)
     else:
         ((q1, p1), (beside, info)), push = advance(carry.q, carry.p), None
-    if carry.result is None:  # on trust
-        taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
-        excess = carry.residual
-        return (
-            carry._replace(
-                q=q1,
-                p=p1,
-                iterations=carry.iterations + info.iterations,
-                residual=None if excess is None else jnp.maximum(excess, info.residual),
-                reductions=_reduced(task, carry, k, taken, push, interval.h),
-                beside=beside,
-            ),
-            interval,
-            taken,
-        )
     was_good = carry.result == RESULTS.successful
     result = carry.result if exists is None else first_failure(carry.result, exists)
     result = first_failure(result, info.result)
@@ -360,22 +339,31 @@ def run(
     inner_loop = loop if inner_loop is None else inner_loop
     first = jnp.asarray(first, jnp.int32)
 
+    alone, _ = task.observables()
+    has_memory = task.lattice.has_memory
+
+    def last_of(carry, interval, taken):
+        """What a save point needs of the last step besides the carry."""
+        return interval if has_memory else None, (taken.q0, taken.p0) if alone else None
+
     def body(state, k):
-        carry, _, _ = state
-        return take_step(task, carry, k), None
+        carry, interval, taken = take_step(task, state[0], k)
+        return (carry, last_of(carry, interval, taken)), None
 
     def steps(carry, k, count):
         """`count` steps from number k, and the last of them as it is saved."""
-        inner = None
+        inner, last = None, k + (count - 1)
+        interval = task.interval(last)
         if count == 1:
-            state = take_step(task, carry, k)
+            carry, interval, taken = take_step(task, carry, k)
         else:
-            interval = task.interval(k)
-            none_yet = StepTaken(*interval[:2], carry.q, carry.p, carry.q, carry.p)
-            state, inner = inner_loop(body, (carry, interval, none_yet), k, 1, count)
-        carry, interval, taken = state
+            before = last_of(carry, interval, StepTaken(*interval[:2], *[carry.q, carry.p] * 2))
+            (carry, (now, before)), inner = inner_loop(body, (carry, before), k, 1, count)
+            interval = now if has_memory else interval
+            q0, p0 = before if alone else (carry.q, carry.p)
+            taken = StepTaken(interval.t0, interval.t1, q0, p0, carry.q, carry.p)
         observed = task.at_save(carry, taken)
-        return carry, Saved(interval.t1, interval.h, taken.q1, taken.p1, observed, inner)
+        return carry, Saved(interval.t1, interval.h, carry.q, carry.p, observed, inner)
 
     carry, saved = loop(
         lambda c, k: steps(c, k, plan.block), carry, first, plan.block, plan.num_blocks

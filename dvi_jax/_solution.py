@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._compat import is_traced
+from lanewise.jaxapi import is_traced
+
 from ._precision import refuse_double_without_x64
 from ._results import RESULTS, status_name
 from ._types import State

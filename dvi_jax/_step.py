@@ -8,16 +8,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from lanewise.dependence import depends_on
+
 from ._results import RESULTS, first_failure
 from ._system import System
 from ._types import Args, Interval, Scalar, State
-from .engine.dependence import depends_on
-from .engine.newton import Known, Newton, RootInfo, RootSolver, Trusted, find_root
+from .engine.newton import Known, Newton, RootInfo, RootSolver, find_root
 from .engine.rounding import one_by_one
 
 
 class StepInfo(NamedTuple):
-    """Status of a step, Newton iterations spent, largest relative residual left."""
+    """Status of a step, iterations spent, largest relative correction of the last of them."""
 
     result: RESULTS
     iterations: Int[Array, ""]
@@ -51,7 +52,7 @@ class Equations(eqx.Module):
     system: System
     epsilon: Scalar
     args: Args = None
-    newton: RootSolver | Trusted | Known = Newton()
+    newton: RootSolver | Known = Newton()
     origin: tuple[State, State] | None = None
     quantum: float | None = eqx.field(static=True, default=None)
 
@@ -71,7 +72,7 @@ class Equations(eqx.Module):
         at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
         if self.quantum is None:
             return _momentum_rate(self.system, *at)
-        return one_by_one(_momentum_rate, q0, self.system, *at)
+        return one_by_one(_momentum_rate, self.system, *at)
 
     def position_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""
@@ -79,7 +80,7 @@ class Equations(eqx.Module):
         at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
         if self.quantum is None:
             return _position_rate(self.system, *at)
-        return one_by_one(_position_rate, p1, self.system, *at)
+        return one_by_one(_position_rate, self.system, *at)
 
     def step_is_explicit(self, interval: Interval, like: State) -> bool:
         """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._compat import is_traced
+from lanewise.jaxapi import is_traced
+
 from .._solution import Solution
 from .frequencies import Frequencies, Raw, analyse, check_count, settings_of, signals_of
 from .lines import EPS

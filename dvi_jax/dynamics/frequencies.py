@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .._compat import is_traced, x64_enabled
+from lanewise.jaxapi import is_traced, x64_enabled
+
 from .._precision import refuse_double_without_x64
 from .._solution import Solution
 from ..engine.quantities import refuse_quantity

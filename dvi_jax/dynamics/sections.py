@@ -11,8 +11,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, PyTree
 
+from lanewise import Layout
+from lanewise.jaxapi import is_traced
+
 from .._arithmetic import Arithmetic, FloatingPoint
-from .._compat import is_traced
 from .._integrate import as_parameter, as_scalar, check_system, integrate, start_state
 from .._results import RESULTS, status_name
 from .._solution import Save
@@ -20,7 +22,6 @@ from .._system import System
 from .._types import Args, Scalar, State
 from ..engine.newton import RootSolver
 from ..engine.picard import PicardThenNewton
-from ..engine.tiles import Layout
 from ..methods import Method, Strang
 from ..observe import Section, Stop
 from ..sweep import Axis

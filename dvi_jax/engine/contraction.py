@@ -105,26 +105,6 @@ def contract(
     return lax.while_loop(proceed, improve, state)[2]
 
 
-def contract_on_trust(
-    correction: Callable[[Vector], Vector],
-    x0: Vector,
-    scales: Scales,
-    rtol: float | None,
-    atol: float,
-    iterations: Int[Array, ""],
-) -> tuple[Vector, Float[Array, ""]]:
-    """x after so many of these iterations, at least two, and −1 if it is good, else 1."""
-    # Only the last two are looked at: the others carry nothing but x.
-    x = lax.fori_loop(0, iterations - 2, lambda _, x: x - correction(x), x0)
-    first = correction(x)
-    x = x - first
-    last = correction(x)
-    x = x - last
-    sizes = jnp.abs(first), jnp.abs(last)
-    good = jnp.all(_verdict(x, x0, scales, sizes, iterations, rtol, atol).good)
-    return x, jnp.where(good, -1.0, 1.0).astype(x.dtype)
-
-
 class Contraction(RootSolver):
     """Base of the root solvers x ← x − correction(x) that converge linearly."""
 
@@ -142,17 +122,3 @@ class Contraction(RootSolver):
     def solve(self, F, x0, scales):
         correction = self.correction(F, x0)
         return contract(correction, x0, scales, self.rtol, self.atol, self.max_steps)
-
-    def solve_on_trust(self, F, x0, scales, effort):
-        count, correction = self.iterations(effort, x0.size), self.correction(F, x0)
-        return contract_on_trust(correction, x0, scales, self.rtol, self.atol, count)
-
-    def iterations(self, effort, n):
-        """2, 4, 8, 16, 32 for an effort of 2, 3, 4, 5, 6.
-
-        Lanes of one effort run together; those of another take the same steps once more.
-        """
-        return 1 << (effort - 1)
-
-    def most_effort(self):
-        return self.max_steps.bit_length()

@@ -1,14 +1,8 @@
 """What the CPU compiler of XLA is to be told for loops over lanes."""
 
 import os
-from typing import Any
 
-import jax
-
-from .._compat import backends_are_initialized
-
-OPTIONS = {"xla_cpu_prefer_vector_width": 512}
-"""Options of one compilation: vectors of 512 bits, where the processor has them."""
+from lanewise.jaxapi import backends_are_initialized
 
 _FLAGS = {
     "--xla_cpu_prefer_vector_width": "512",
@@ -44,20 +38,3 @@ def _with_flags(flags: str) -> str:
     parts = flags.split()
     named = {part.partition("=")[0] for part in parts}
     return " ".join([*parts, *(f"{k}={v}" for k, v in _FLAGS.items() if k not in named)])
-
-
-_probe = jax.jit(lambda *leaves: (), compiler_options=OPTIONS)
-
-
-def takes_options(*leaves: Any) -> bool:
-    """Whether a `jit` called on these arrays now may bring options of its own.
-
-    JAX allows that to the outermost one only, not under `jit` or `grad`.
-    """
-    if jax.default_backend() != "cpu":
-        return False
-    try:
-        _probe(*leaves)
-    except ValueError:
-        return False
-    return True

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
-from .linear import solve_dense, solve_near_identity, unit_vectors
+import lanewise
 
 Vector = Inexact[Array, " n"]
 Function = Callable[[Vector], Vector]
@@ -29,7 +29,8 @@ class Scales(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a solver gives: x, the iterations made, ‖F(x)‖ over the scale, and its verdict."""
+    """What a solver gives: x, the iterations made, the largest relative correction of the last of
+    them, and whether it has converged."""
 
     x: Vector
     iterations: Int[Array, ""]
@@ -47,26 +48,12 @@ class RootSolver(eqx.Module):
 
     @abc.abstractmethod
     def solve(self, F: Function, x0: Vector, scales: Scales) -> Found:
-        """The root near x0, with care: as many iterations as it takes, each one looked at."""
+        """The root near x0."""
 
     @abc.abstractmethod
-    def solve_on_trust(
-        self, F: Function, x0: Vector, scales: Scales, effort: Int[Array, ""]
-    ) -> tuple[Vector, Float[Array, ""]]:
-        """x after `iterations(effort)`, and the excess by which to judge it: see `Trusted`."""
-
-    @abc.abstractmethod
-    def iterations(self, effort: Int[Array, ""], n: int) -> Int[Array, ""]:
-        """How many iterations on trust go with an effort, from 2 upwards, for n unknowns."""
-
-    @abc.abstractmethod
-    def most_effort(self) -> int:
-        """The effort above which more iterations are made than the settings allow."""
-
-    @abc.abstractmethod
-    def solve_tangent(self, linear: Function, rhs: Vector, on_trust: bool) -> Vector:
+    def solve_tangent(self, linear: Function, rhs: Vector) -> Vector:
         """x with linear(x) = rhs, the Jacobian at a root; NaN if it is not found. It may be
-        transposed in `rhs`. `on_trust`: that root is good without pivoting, or was."""
+        transposed in `rhs`."""
 
 
 def check_settings(rtol: float | None, atol: float, max_steps: int) -> None:
@@ -108,15 +95,15 @@ class Newton(RootSolver):
         check_settings(self.rtol, self.atol, self.max_steps)
 
     def solve(self, F, x0, scales):
-        known = scales.known
-        rtol = 4096 * jnp.finfo(x0.dtype).eps if self.rtol is None else self.rtol
+        known, eps = scales.known, jnp.finfo(x0.dtype).eps
+        rtol = 4096 * eps if self.rtol is None else self.rtol
 
         def proceed(state: _Iterate):
             return ~state.converged & state.finite & (state.iterations < self.max_steps)
 
         def improve(state: _Iterate):
             value, jacobian = value_and_jacobian(F, state.x)
-            correction = solve_dense(jacobian, value)
+            correction = lanewise.solve(jacobian, value)
             x = state.x - correction
             error, scale = jnp.abs(correction), jnp.maximum(known, jnp.abs(x))
             settled = jnp.all(error <= rtol * scale + self.atol)
@@ -132,48 +119,11 @@ class Newton(RootSolver):
         unknown = jnp.full((), jnp.nan, x0.dtype)  # no comparison with it is true
         start = _Iterate(x0, unknown, ~no, no, jnp.asarray(0, jnp.int32))
         end = lax.while_loop(proceed, improve, start)
-        residual = over(largest(F(end.x)), jnp.maximum(largest(known), largest(end.x)))
-        return Found(end.x, end.iterations, residual, end.converged & jnp.isfinite(residual))
+        return Found(end.x, end.iterations, end.relative, end.converged & end.finite)
 
-    def solve_on_trust(self, F, x0, scales, effort):
-        def improve(_, state):
-            x, _ = state
-            value, jacobian = value_and_jacobian(F, x)
-            correction = solve_near_identity(jacobian, value)
-            return x - correction, correction
-
-        x, correction = lax.fori_loop(0, effort, improve, (x0, x0))
-        # √ε of a component: convergence being quadratic, the next would be below round-off.
-        eps = float(jnp.finfo(x.dtype).eps)
-        rtol = max(self.rtol or 0.0, 0.25 * eps**0.5)
-        scale = jnp.maximum(scales.known, jnp.abs(x))
-        floor = 64 * eps * jnp.max(scale, initial=0.0) + self.atol
-        return x, jnp.max(jnp.abs(correction) - rtol * scale - floor, initial=-jnp.inf)
-
-    def iterations(self, effort, n):
-        return effort
-
-    def most_effort(self):
-        return self.max_steps
-
-    def solve_tangent(self, linear, rhs, on_trust):
+    def solve_tangent(self, linear, rhs):
         _, matrix = value_and_jacobian(linear, jnp.zeros_like(rhs))
-        if on_trust:
-            return solve_near_identity(matrix, rhs, checked=True)  # nobody looks at a gradient
-        return solve_dense(matrix, rhs)
-
-
-class Trusted(eqx.Module):
-    """So many iterations of a solver, without looking at how they go.
-
-    How many is told by `effort`, 2, 3, …. The verdict comes as a number in place of the residual:
-    how much the last correction of a component exceeds what is allowed. At most zero means that
-    the root is good to round-off, or that what is left is nothing but round-off of larger
-    components. NaN and positive numbers mean that the solve is to be made again with care.
-    """
-
-    solver: RootSolver
-    effort: Int[Array, ""]
+        return lanewise.solve(matrix, rhs)
 
 
 class Known(eqx.Module):
@@ -184,7 +134,8 @@ class Known(eqx.Module):
 
 
 class RootInfo(NamedTuple):
-    """How a solve went: iterations made, ‖F‖ at the end over the scale, and its verdict."""
+    """How a solve went: iterations made, the largest relative correction of the last of them, and
+    whether it has converged."""
 
     iterations: Int[Array, ""]
     residual: Float[Array, ""]
@@ -205,7 +156,7 @@ def find_root(
     function: Function,
     guess: Vector,
     known: Vector,
-    solver: RootSolver | Trusted | Known,
+    solver: RootSolver | Known,
     start: Vector | None = None,
 ) -> tuple[Vector, RootInfo]:
     """Root x of function(x) = 0 near `guess`, and how it was found.
@@ -217,35 +168,25 @@ def find_root(
     """
     known = lax.stop_gradient(jnp.abs(known))
     start = known if start is None else lax.stop_gradient(jnp.abs(start))
-    scales, on_trust = Scales(known, start), isinstance(solver, Trusted | Known)
-    used = solver if isinstance(solver, RootSolver) else solver.solver
+    scales = Scales(known, start)
+    used = solver.solver if isinstance(solver, Known) else solver
 
     # custom_root gives its auxiliary outputs tangents of the same type, so no integers among them.
     def solve(F, x0):
         zero = jnp.zeros((), x0.dtype)
         if isinstance(solver, Known):
             return solver.root, (zero, zero, zero + 1)
-        if isinstance(solver, Trusted):
-            x, excess = used.solve_on_trust(F, x0, scales, solver.effort)
-            return x, (zero, excess, zero + 1)
         x, *how = used.solve(F, x0, scales)
         return x, tuple(jnp.asarray(a, x0.dtype) for a in how)
 
-    def solve_tangent(linear, rhs):
-        return used.solve_tangent(linear, rhs, on_trust)
-
-    root, aux = lax.custom_root(function, guess, solve, solve_tangent, has_aux=True)
+    root, aux = lax.custom_root(function, guess, solve, used.solve_tangent, has_aux=True)
     iterations, residual, converged = map(lax.stop_gradient, aux)
-    if isinstance(solver, Trusted):  # whole numbers stay what they are, in a hot loop
-        return root, RootInfo(
-            used.iterations(solver.effort, guess.size), residual, jnp.asarray(True)
-        )
     return root, RootInfo(iterations.astype(jnp.int32), residual, converged > 0)
 
 
 def value_and_jacobian(F: Function, x: Vector) -> tuple[Vector, Array]:
     value, push = jax.linearize(F, x)
-    return value, jax.vmap(push, out_axes=1)(unit_vectors(x.shape[0], x.dtype))
+    return value, jax.vmap(push, out_axes=1)(lanewise.unit_vectors(x.shape[0], x.dtype))
 
 
 def largest(x: Vector) -> Float[Array, ""]:

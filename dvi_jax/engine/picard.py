@@ -4,10 +4,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 
+import lanewise
+
 from .contraction import Contraction, contract
-from .linear import UNROLLED_UP_TO
 from .newton import Found, Function, Newton, RootSolver, Scales, Vector
-from .together import on_any_lane
 
 
 class Picard(Contraction):
@@ -42,7 +42,7 @@ class Picard(Contraction):
     def correction(self, F, x0):
         return F
 
-    def solve_tangent(self, linear, rhs, on_trust):
+    def solve_tangent(self, linear, rhs):
         return _without_matrix(self, linear, rhs)
 
 
@@ -58,8 +58,7 @@ class PicardThenNewton(RootSolver):
 
     - `newton_up_to`: unknowns up to which Newton's method is taken at once: the components of q for
       `TypeII` and what is made of it, times stages and sides for `GaussLegendre` and
-      `LobattoIIIAIIIB`. None means what was measured to be best: 16 where a batch goes by
-      components, and a Jacobian's zeros cost nothing; 4 in arrays, where more go through LAPACK.
+      `LobattoIIIAIIIB`. None means 16.
     - `picard`, `newton`: settings of the two.
 
     **Raises** `ValueError` for a number that is negative or no integer, `TypeError` for settings
@@ -79,13 +78,11 @@ class PicardThenNewton(RootSolver):
             if not isinstance(value, kind):
                 raise TypeError(f"{name} must be a dvi.{kind.__name__}(...), got {value!r}.")
 
-    def _is_few(self, n: int, on_trust: bool) -> bool:
-        if self.newton_up_to is not None:
-            return n <= self.newton_up_to
-        return n <= (_FEW_IN_COMPONENTS if on_trust else UNROLLED_UP_TO)
+    def _is_few(self, n: int) -> bool:
+        return n <= (_FEW if self.newton_up_to is None else self.newton_up_to)
 
     def solve(self, F, x0, scales):
-        if self._is_few(x0.size, on_trust=False):
+        if self._is_few(x0.size):
             return self.newton.solve(F, x0, scales)
         of = self.picard
         first = contract(F, x0, scales, of.rtol, of.atol, of.max_steps, slowest=0.5)
@@ -97,42 +94,16 @@ class PicardThenNewton(RootSolver):
                 *(jnp.where(first.converged, a, b) for a, b in zip(first, second, strict=True))
             )
 
-        return lax.cond(on_any_lane(~first.converged), mend, lambda first: first, first)
+        return lax.cond(lanewise.on_any(~first.converged), mend, lambda first: first, first)
 
-    def solve_on_trust(self, F, x0, scales, effort):
-        if self._is_few(x0.size, on_trust=True):
-            return self.newton.solve_on_trust(F, x0, scales, effort)
-        return lax.cond(
-            effort <= _LAST_OF_PICARD,
-            lambda: self.picard.solve_on_trust(F, x0, scales, effort),
-            lambda: self.newton.solve_on_trust(F, x0, scales, _then(effort)),
-        )
-
-    def iterations(self, effort, n):
-        if self._is_few(n, on_trust=True):
-            return self.newton.iterations(effort, n)
-        picard, newton = self.picard.iterations(effort, n), self.newton.iterations(_then(effort), n)
-        return jnp.where(effort <= _LAST_OF_PICARD, picard, newton)
-
-    def most_effort(self):
-        return self.newton.most_effort()
-
-    def solve_tangent(self, linear, rhs, on_trust):
-        if self._is_few(rhs.size, on_trust=True):
-            return self.newton.solve_tangent(linear, rhs, on_trust)
+    def solve_tangent(self, linear, rhs):
+        if self._is_few(rhs.size):
+            return self.newton.solve_tangent(linear, rhs)
         return _without_matrix(self, linear, rhs)
 
 
-_FEW_IN_COMPONENTS = 16
+_FEW = 16
 """Unknowns up to which the elimination of a band is faster than Picard's iteration."""
-
-_LAST_OF_PICARD = 4
-"""The effort on trust up to which Picard's iteration is tried."""
-
-
-def _then(effort):
-    """The effort of Newton's method after those of Picard's iteration: 3, 4."""
-    return effort - 2
 
 
 def _without_matrix(solver: RootSolver, linear: Function, rhs: Vector) -> Vector:

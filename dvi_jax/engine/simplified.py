@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import Array, Inexact
 
+import lanewise
+
 from .contraction import Contraction
-from .linear import UNROLLED_UP_TO, solve_dense
 from .newton import Vector, value_and_jacobian
 
 
@@ -38,19 +39,22 @@ class SimplifiedNewton(Contraction):
         solve = factorised(value_and_jacobian(F, x0)[1])
         return lambda x: solve(F(x))
 
-    def solve_tangent(self, linear, rhs, on_trust):
+    def solve_tangent(self, linear, rhs):
         _, matrix = value_and_jacobian(linear, jnp.zeros_like(rhs))
-        return solve_dense(matrix, rhs)
+        return lanewise.solve(matrix, rhs)
 
 
 def factorised(A: Inexact[Array, "n n"]) -> Callable[[Vector], Vector]:
     """b → the solution of A x = b, all that depends on A alone computed now.
 
-    For n ≤ `UNROLLED_UP_TO` by the inverse, whose errors an iteration corrects; else by factors.
+    For n ≤ 16 by the inverse, whose errors an iteration corrects; else by factors.
     """
     n = A.shape[0]
-    if n > UNROLLED_UP_TO:
+    if n > _BY_INVERSE:
         factors = lu_factor(A)
         return lambda b: lu_solve(factors, b)
-    inverse = jax.vmap(solve_dense, (None, 1), 1)(A, jnp.eye(n, dtype=A.dtype))
+    inverse = jax.vmap(lanewise.solve, (None, 1), 1)(A, jnp.eye(n, dtype=A.dtype))
     return lambda b: inverse @ b
+
+
+_BY_INVERSE = 16

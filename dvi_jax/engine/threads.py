@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .._compat import is_traced, x64_enabled
+from lanewise.jaxapi import is_traced, x64_enabled
 
 
 def over_threads(

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import PyTree
 
-from .._compat import x64_enabled
+from lanewise.jaxapi import x64_enabled
+
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Observations, as_arcs
 from .outcome import result_of

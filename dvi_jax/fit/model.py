@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._compat import is_traced
+from lanewise.jaxapi import is_traced
+
 from .._integrate import integrate
 from .._results import RESULTS
 from .._solution import Save

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._compat import x64_enabled
+from lanewise.jaxapi import x64_enabled
+
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Observations, as_arcs
 from .parameters import Space, make_space

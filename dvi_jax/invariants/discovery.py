@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from lanewise.dependence import depends_on
+
 from .._results import RESULTS
 from .._step import Equations
 from .._system import System
 from .._types import Args, Interval
-from ..engine.dependence import depends_on
 from ..engine.newton import Newton, RootSolver
 from ..engine.nullspace import (
     RANK,

@@ -10,11 +10,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._compat import is_traced
+from lanewise.dependence import depends_on
+from lanewise.jaxapi import is_traced
+
 from .._precision import refuse_double_without_x64
 from .._system import System
 from .._types import Args, Scalar, State
-from ..engine.dependence import depends_on
 from ..engine.taylor import taylor_coefficients
 
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._compat import is_traced, x64_enabled
+from lanewise.jaxapi import is_traced, x64_enabled
+
 from .._precision import refuse_double_without_x64
 from .._types import Interval
 from ..engine.quantities import refuse_quantity

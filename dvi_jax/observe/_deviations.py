@@ -11,7 +11,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .._compat import is_traced
+from lanewise.jaxapi import is_traced
+
 from .._types import Scalar
 from ._reductions import Reduction
 

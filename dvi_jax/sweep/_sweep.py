@@ -9,13 +9,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from lanewise import Layout
+from lanewise.jaxapi import x64_enabled
+
 from .._arithmetic import Arithmetic, FloatingPoint
-from .._compat import x64_enabled
 from .._solution import Save
 from .._system import System
 from ..engine.newton import RootSolver
 from ..engine.picard import PicardThenNewton
-from ..engine.tiles import Layout
 from ..lattices import Given, Lattice, Uniform
 from ..methods import Method, TypeII
 from ..observe import Stop

@@ -16,7 +16,8 @@ from typing import Any
 
 import jax
 
-from .._compat import backends_are_initialized, x64_enabled
+from lanewise.jaxapi import backends_are_initialized, x64_enabled
+
 from .plan import Plan
 from .program import Program, Sweep
 from .sinks import Sink

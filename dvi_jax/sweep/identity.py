@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._compat import ClosedJaxpr, bodies, is_traced
+from lanewise.call import functions_in
+from lanewise.jaxapi import ClosedJaxpr, bodies, is_traced
+
 from ..engine.signature import accepts
-from ..engine.tiles import functions_in
 from .axes import is_axis, leaves_with_axes
 from .plan import Plan
 from .program import Sweep, stacked

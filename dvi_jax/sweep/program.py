@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._compat import ClosedJaxpr, x64_enabled
+from lanewise.jaxapi import ClosedJaxpr, x64_enabled
+
 from .._integrate import integrate
 from .._results import status_code
 from .._solution import Save, Solution
-from ..engine.cpu import OPTIONS, takes_options
 from ..lattices import Given
 from .axes import is_axis, place
 from .plan import Plan, Task
@@ -144,7 +144,6 @@ def _batch(lanes: Lanes, chunk: tuple[int, ...], begin: Any, last: Any) -> dict[
 
 _filter_jit: Any = eqx.filter_jit  # its annotations leave out what goes on to jax.jit
 _compiled = _filter_jit(_batch)
-_compiled_with_options = _filter_jit(_batch, compiler_options=OPTIONS)
 
 
 def stacked(state: Any) -> Any:
@@ -210,7 +209,7 @@ class Program:
         return self.sweep.most_steps if steps is None else steps
 
     def _call(self, which: Any, *inputs: Any) -> Any:
-        function = _compiled_with_options if takes_options() else _compiled
+        function = _compiled
         with self._lock:
             first, ready = self._ready.setdefault(which, (threading.Lock(), []))
         if not ready:

@@ -15,7 +15,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._compat import x64_enabled
+from lanewise.jaxapi import x64_enabled
+
 from .._results import STATUS_NAMES
 from ..engine.threads import processors
 from .plan import Task

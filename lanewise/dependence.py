@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 
-from .._compat import Jaxpr, Literal, jaxprs_in_params, scan_counts
+from .jaxapi import Jaxpr, Literal, jaxprs_in_params, scan_counts
 
 
 def depends_on(function: Callable[..., Any], argnum: int, *args: Any) -> bool:

@@ -1,0 +1,112 @@
+"""Machine code on disk, so that a process need not make what an earlier one has made.
+
+The folder is ``$DVI_JAX_CACHE`` if that variable is set (``off`` switches the cache off), else
+``dvi_jax`` in ``$XDG_CACHE_HOME`` or ``~/.cache``. Code is loaded only from a folder that belongs
+to the user and that nobody else can write to. A file begins with a checksum of the rest; one that
+is damaged is made anew. Files are written under another name first, so that a process never sees
+half of one; the oldest are removed when the folder grows beyond `LARGEST`.
+"""
+
+import contextlib
+import hashlib
+import os
+import stat
+import tempfile
+from pathlib import Path
+from typing import Any
+
+VARIABLE = "DVI_JAX_CACHE"
+
+LARGEST = 256 * 2**20
+"""Bytes that the folder may hold."""
+
+_MARK = b"lanewise"
+
+
+def key(*parts: Any) -> str:
+    """A name for what these parts determine."""
+    return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()
+
+
+def folder() -> Path | None:
+    """Where machine code is kept, None where it is not."""
+    named = os.environ.get(VARIABLE, "").strip()
+    if named.lower() in ("off", "0", "no", "false"):
+        return None
+    if named:
+        return Path(named).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME", "").strip()
+    try:
+        return (Path(base) if base else Path.home() / ".cache") / "dvi_jax"
+    except RuntimeError:  # no home directory
+        return None
+
+
+def _is_safe(path: Path) -> bool:
+    """Whether a folder belongs to the user and nobody else can write to it."""
+    status = path.stat()
+    if not hasattr(os, "getuid"):
+        return True
+    others = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not others
+
+
+def read(name: str) -> bytes | None:
+    """The code under a name, None if there is none, or none that can be trusted."""
+    where = folder()
+    if where is None:
+        return None
+    path = where / name
+    try:
+        if not _is_safe(where):
+            return None
+        with path.open("rb") as file:
+            if hasattr(os, "getuid") and os.fstat(file.fileno()).st_uid != os.getuid():
+                return None
+            content = file.read()
+    except OSError:
+        return None
+    mark, check, code = content[:8], content[8:40], content[40:]
+    if mark != _MARK or hashlib.sha256(code).digest() != check:
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # the oldest are removed first: it was of use now
+    return code
+
+
+def write(name: str, code: bytes) -> None:
+    """Keep the code under a name, if that can be done."""
+    where = folder()
+    if where is None:
+        return
+    with contextlib.suppress(OSError):
+        where.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not _is_safe(where):
+            return
+        handle, made = tempfile.mkstemp(prefix=".new-", dir=where)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(_MARK + hashlib.sha256(code).digest() + code)
+            os.replace(made, where / name)
+        except OSError:
+            os.unlink(made)
+            raise
+        _bound(where)
+
+
+def _bound(where: Path) -> None:
+    """Remove the files that were not used for longest, down to three quarters of `LARGEST`."""
+    files = []
+    for entry in os.scandir(where):
+        with contextlib.suppress(OSError):
+            status = entry.stat()
+            files.append((status.st_mtime, status.st_size, entry.path))
+    total = sum(size for _, size, _ in files)
+    if total <= LARGEST:
+        return
+    for _, size, path in sorted(files):
+        with contextlib.suppress(OSError):
+            os.unlink(path)
+        total -= size
+        if total <= LARGEST * 3 // 4:
+            return

@@ -1,0 +1,429 @@
+"""The primitive: a function of one trajectory, whose batch under `vmap` becomes machine code."""
+
+import copy
+import dataclasses
+import functools
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from . import handler, machine
+from .ir import Unsupported
+from .jaxapi import (
+    ClosedJaxpr,
+    bodies,
+    drops_outputs,
+    identity,
+    is_traced,
+    jaxpr_as_fun,
+    lower_on,
+    primitive,
+    scan_counts,
+    without_outputs,
+)
+from .kernel import Module
+
+FORMS = ("auto", "components", "arrays", "kernel")
+
+SWITCH = "LANEWISE"
+"""The variable that switches the generator off: ``LANEWISE=off``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """How the arithmetic of a run is compiled; the numbers are the same to round-off.
+
+    **Arguments**
+
+    - `form`: ``"auto"``: machine code of our own on a CPU, XLA's loops elsewhere and for functions
+      that hold something for which no code is generated (see `explain`); ``"arrays"``: XLA's
+      loops, batched by `vmap`. ``"components"`` is an older name of ``"auto"``, and so is
+      ``"kernel"``, of a GPU kernel that was removed.
+    - `width`: trajectories of a block, rounded to a power of two that suits the processor; None
+      means by the size of the state. No result depends on it.
+    - `library`: has no effect any more; it chose the library's elementary functions.
+
+    **Raises** `ValueError` for another form, or a width that is not positive.
+    """
+
+    form: Literal["auto", "components", "arrays", "kernel"] = "auto"
+    width: int | None = None
+    library: bool = False
+
+    def __post_init__(self):
+        if self.form not in FORMS:
+            raise ValueError(
+                f'form must be "auto", "components", "arrays" or "kernel", got {self.form!r}.'
+            )
+        if self.form == "kernel":
+            warnings.warn(
+                'Layout(form="kernel") is now form="auto": the Pallas kernel was removed. On a GPU '
+                "a batch runs as lax.scan under vmap.",
+                DeprecationWarning,
+                stacklevel=3,
+            )
+        width = self.width
+        if width is not None and (
+            isinstance(width, bool) or not isinstance(width, int) or width < 1
+        ):
+            raise ValueError(f"width must be a positive integer or None, got {width!r}.")
+
+
+AUTO = Layout()
+
+
+def call(function: Callable, *args: Any, layout: Layout = AUTO) -> Any:
+    """``function(*args)`` for one trajectory, compiled to machine code, also under `vmap`.
+
+    `function` takes and returns pytrees of arrays. Forward and reverse derivatives are those of
+    `function` and are computed by XLA; write them with a `call` of their own to have them compiled
+    too.
+    """
+    leaves, tree = jax.tree.flatten(args)
+    traced = _Traced(function, leaves, tree)
+    program = _Program(traced, layout)
+    # What is traced outside and closed over is an input like the others.
+    outer = traced.outer
+
+    @jax.custom_jvp
+    def bound(*operands):
+        on = (False,) * len(operands)
+        return _lanewise.bind(*operands, program=program, lanes=None, on=on)
+
+    @bound.defjvp
+    def _(primals, tangents):
+        return jax.jvp(lambda *x: _all_alike(traced(*x), x), primals, tangents)
+
+    return jax.tree.unflatten(traced.out_tree, bound(*outer, *leaves))
+
+
+def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Callable:
+    """`function` of one trajectory as a function of a batch, compiled to machine code.
+
+    ``lanewise.batched(f)(x)`` gives what ``jax.vmap(f)(x)`` does, to round-off. It may be called
+    under `jit` and `vmap`; a result does not depend on the batch that a trajectory belongs to.
+
+    **Arguments**
+
+    - `function`: takes and returns pytrees of arrays.
+    - `in_axes`: the batch axis of each argument, as `jax.vmap` takes it.
+    - `layout`: see `Layout`.
+
+    **Example**
+
+    ```python
+    import jax, jax.numpy as jnp, lanewise
+
+    def pendulum(angle, momentum):
+        def step(state, _):
+            q, p = state
+            p = p - 0.1 * jnp.sin(q)
+            return (q + 0.1 * p, p), None
+        return jax.lax.scan(step, (angle, momentum), None, length=1000)[0]
+
+    angles, momenta = jax.jit(lanewise.batched(pendulum))(jnp.linspace(0.0, 1.0, 1000),
+                                                          jnp.zeros(1000))
+    ```
+    """
+    one = functools.partial(call, function, layout=layout)
+    return jax.vmap(one, in_axes)
+
+
+def functions_in(eqn: Any) -> list[ClosedJaxpr]:
+    """The jaxpr of what `call` was given, if an equation of a jaxpr is such a call: it is not
+    among those that the equation shows."""
+    program = eqn.params.get("program")
+    return [program.traced.closed] if isinstance(program, _Program) else []
+
+
+def generates() -> bool:
+    """Whether machine code is generated in this process; if not, all goes through XLA."""
+    if os.environ.get(SWITCH, "").strip().lower() in ("off", "0", "no", "false"):
+        return False
+    return _can_start()
+
+
+@functools.cache
+def _can_start() -> bool:
+    try:
+        machine.started()
+        handler.runtime()
+    except Exception as error:
+        warnings.warn(
+            f"No machine code can be generated here ({type(error).__name__}: {error}); batches run "
+            "through XLA, several times slower. Results agree to round-off.",
+            stacklevel=2,
+        )
+        return False
+    return True
+
+
+def _all_alike(outputs: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
+    """The outputs, batched under `vmap` as those of the primitive are: all of them, in front.
+
+    JAX takes for granted that a function and its derivative's rule batch their values alike.
+    """
+    parts = [x.ravel()[:0] for x in inputs if jnp.issubdtype(x.dtype, jnp.inexact)]
+    nothing = sum((jnp.sum(x) for x in parts), start=jnp.zeros(()))  # it depends on all inputs
+
+    def alike(x):
+        if jnp.issubdtype(x.dtype, jnp.inexact):
+            x = x + nothing.astype(x.dtype)
+        else:
+            x = jnp.where(nothing == 0, x, x)
+        return _lanes_in_front.bind(x)
+
+    return [alike(x) for x in outputs]
+
+
+_lanes_in_front = identity(
+    "lanes_in_front",
+    lambda arrays, axes: (_lanes_in_front.bind(jnp.moveaxis(arrays[0], axes[0], 0)), 0),
+)
+
+
+class _Traced:
+    """A function of one trajectory as a jaxpr, what it closes over as its first operands."""
+
+    def __init__(self, function: Callable, leaves: Sequence[Any], tree: Any):
+        trees: list[Any] = []
+
+        def flat(*leaves):
+            out, out_tree = jax.tree.flatten(function(*jax.tree.unflatten(tree, leaves)))
+            trees.append(out_tree)
+            return out
+
+        self.closed = jax.make_jaxpr(flat)(*leaves)
+        self.out_tree = trees[-1]
+        self.outer = [c for c in self.closed.consts if is_traced(c)]
+
+    def __call__(self, *operands: Any) -> list[Any]:
+        outer = iter(operands[: len(self.outer)])
+        consts = [next(outer) if is_traced(c) else c for c in self.closed.consts]
+        closed = ClosedJaxpr(self.closed.jaxpr, consts)
+        return jaxpr_as_fun(closed)(*operands[len(self.outer) :])
+
+    def giving(self, used: list[bool]) -> "_Traced":
+        """The function that gives some of the outputs only, as a flat list."""
+        fewer = copy.copy(self)
+        fewer.closed = without_outputs(self.closed, used)
+        return fewer
+
+    @property
+    def all_inputs(self) -> ClosedJaxpr:
+        """The jaxpr with what is closed over and traced in front of its inputs."""
+        jaxpr, consts = self.closed.jaxpr, self.closed.consts
+        if not self.outer:
+            return self.closed
+        traced = [is_traced(c) for c in consts]
+        front = [v for v, t in zip(jaxpr.constvars, traced, strict=True) if t]
+        known = [(v, c) for v, c, t in zip(jaxpr.constvars, consts, traced, strict=True) if not t]
+        new = jaxpr.replace(
+            constvars=[v for v, _ in known], invars=[*front, *jaxpr.invars], debug_info=None
+        )
+        return ClosedJaxpr(new, [c for _, c in known])
+
+
+class _Program:
+    """What a call computes, and how that is compiled."""
+
+    def __init__(self, traced: _Traced, layout: Layout):
+        self.traced, self.layout = traced, layout
+
+    def giving(self, used: list[bool]) -> "_Program":
+        """The program that gives some of the outputs only."""
+        return _Program(self.traced.giving(used), self.layout)
+
+
+def _through_xla(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]):
+    """The program as XLA compiles it: the first axis of operands where `on`, and of all outputs."""
+    if lanes is None:
+        return program.traced(*operands)
+    axes = [0 if o else None for o in on]
+    return jax.vmap(program.traced, axes, 0, axis_size=lanes)(*operands)
+
+
+def _on_cpu(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]):
+    """The program as machine code, through XLA where none can be generated."""
+    try:
+        name, params = compiled(program, on, lanes)
+    except Unsupported as reason:
+        if os.environ.get("LANEWISE_LOG"):
+            print("left to XLA:", reason, flush=True)
+        return _through_xla(*operands, program=program, lanes=lanes, on=on)
+    front = () if lanes is None else (lanes,)
+    avals = program.traced.closed.out_avals
+    like = [jax.ShapeDtypeStruct((*front, *a.shape), a.dtype) for a in avals]
+    return list(jax.ffi.ffi_call(name, like)(*operands, params=params))
+
+
+def compiled(
+    program: _Program, on: Sequence[bool], lanes: int | None, vectors: int | None = None
+) -> tuple[str, np.ndarray]:
+    """The name of the handler that computes a program for a batch, and its parameters.
+
+    **Raises** `Unsupported` where no code is generated, with what stands in the way.
+    """
+    if program.layout.form == "arrays":
+        raise Unsupported("code for form='arrays'")
+    if not generates():
+        raise Unsupported("code in this process")
+    if lanes == 0:
+        raise Unsupported("a batch of no trajectories")
+    module, text = kernel_of(program, on, 1 if lanes is None else lanes, vectors)
+    name = handler.registered(handler.module_text(text, module.W * module.U))
+    cost = max(module.b.operations * max([1, *module.values]), 1)
+    return name, np.asarray([lanes or 1, cost, *module.values], np.int64)
+
+
+def kernel_of(
+    program: _Program, on: Sequence[bool], lanes: int, vectors: int | None = None
+) -> tuple[Module, str]:
+    """The module of a program for so many trajectories, and its text."""
+    closed = program.traced.all_inputs
+    count = operation_count(closed.jaxpr)
+    if count > MOST_OPERATIONS:
+        raise Unsupported(f"a function of {count} operations")
+    if vectors is None and program.layout.width is not None:
+        vectors = max(program.layout.width // machine.width(), 1)
+    if vectors is None:
+        vectors = vectors_for(carried(closed.jaxpr), count)
+    module = Module(*variant(lanes, vectors))
+    return module, module.kernel(closed, on)
+
+
+MOST_OPERATIONS = 30_000
+"""More operations, loops counted once, are left to XLA."""
+
+
+def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
+    """(W, U): numbers in a vector, vectors in a block, for so many trajectories."""
+    width = machine.width() if width is None else width
+    while width > lanes:
+        width //= 2
+    vectors = 1
+    while 2 * vectors <= most and 2 * vectors * width <= lanes:
+        vectors *= 2
+    return width, vectors
+
+
+def vectors_for(carried: int, operations: int) -> int:
+    """Vectors in a block: enough to hide latency, few enough that the state stays in registers."""
+    if operations > 1500:
+        return 1
+    if carried <= 12:
+        return 8 if operations < 150 else 4
+    return 4 if carried <= 24 and operations < 600 else 2
+
+
+def carried(jaxpr: Any) -> int:
+    """Numbers that the innermost loop with most of them carries from step to step."""
+    most = 0
+    for eqn in jaxpr.eqns:
+        for body in bodies(eqn):
+            most = max(most, carried(body.jaxpr))
+        if eqn.primitive.name == "scan":
+            _, count = scan_counts(eqn.params)
+            most = max(most, sum(v.aval.size for v in eqn.outvars[:count] if v.aval.size <= 64))
+    return most
+
+
+def operation_count(jaxpr: Any) -> int:
+    """How many operations on numbers the evaluation is made of, loops counted once; roughly."""
+    count = 0
+    for eqn in jaxpr.eqns:
+        inner = [operation_count(b.jaxpr) for b in (*bodies(eqn), *functions_in(eqn))]
+        if inner:
+            count += sum(inner)
+            continue
+        size = max((v.aval.size for v in eqn.outvars), default=0)
+        if eqn.primitive.name == "dot_general":
+            (contracted, _), _ = eqn.params["dimension_numbers"]
+            size *= int(np.prod([eqn.invars[0].aval.shape[i] for i in contracted]))
+        elif eqn.primitive.name.startswith("reduce_"):
+            size = eqn.invars[0].aval.size
+        elif eqn.primitive.name == "eliminate":
+            size = eqn.invars[1].aval.size ** 3
+        elif eqn.primitive.name in _FREE:
+            size = 0
+        count += size
+    return count
+
+
+_FREE = frozenset(
+    ["broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "slice", "concatenate",
+     "stack", "split", "unstack", "pad", "rev", "copy", "convert_element_type", "stop_gradient"]
+)  # fmt: skip
+
+
+def _shape_of(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
+    front = () if lanes is None else (lanes,)
+    avals = program.traced.closed.out_avals
+    return [jax.ShapeDtypeStruct((*front, *a.shape), a.dtype) for a in avals]
+
+
+_through_xla.shape_of = _shape_of  # pyright: ignore[reportFunctionMemberAccess]
+
+
+def _batched(operands, axes, *, program: _Program, lanes: int | None, on: tuple[bool, ...]):
+    """One more axis of trajectories: all of them become one."""
+    batched = [axis is not None for axis in axes]
+    moved = [
+        x if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(operands, axes, strict=True)
+    ]
+    (size,) = {x.shape[0] for x, b in zip(moved, batched, strict=True) if b}
+    if lanes is None:
+        flags = tuple(batched)
+        outs = _lanewise.bind(*moved, program=program, lanes=size, on=flags)
+        return outs, [0] * len(outs)
+    merged = [_merge(x, b, o, size, lanes) for x, b, o in zip(moved, batched, on, strict=True)]
+    either = tuple(b or o for b, o in zip(batched, on, strict=True))
+    outs = _lanewise.bind(*merged, program=program, lanes=size * lanes, on=either)
+    outs = [x.reshape(size, lanes, *x.shape[1:]) for x in outs]
+    return outs, [0] * len(outs)
+
+
+_lanewise = primitive("lanewise", _through_xla, _batched, multiple=True)
+lower_on("cpu", _lanewise, _on_cpu)
+
+
+def _eagerly(*operands, **params):
+    """Outside of `jit`: as under it."""
+    key = tuple(sorted(params.items(), key=lambda item: item[0]))
+    return _compiled_call(key)(*operands)
+
+
+@functools.lru_cache(maxsize=64)
+def _compiled_call(params: tuple) -> Callable:
+    return jax.jit(lambda *operands: _lanewise.bind(*operands, **dict(params)))
+
+
+_lanewise.def_impl(_eagerly)
+
+
+def _without(params: dict[str, Any], used: list[bool]) -> dict[str, Any]:
+    return dict(params, program=params["program"].giving(used))
+
+
+drops_outputs(_lanewise, _without)
+
+
+def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> Any:
+    """Two axes of trajectories in front as one; one that is missing is filled with copies."""
+    if not (has_outer or has_inner):
+        return x
+    if not has_outer:
+        x = jnp.broadcast_to(x[None], (size, *x.shape))
+    elif not has_inner:
+        x = jnp.broadcast_to(x[:, None], (size, lanes, *x.shape[1:]))
+    return x.reshape(size * lanes, *x.shape[2:])
+
+
+__all__ = ["Layout", "batched", "call", "functions_in", "lax"]

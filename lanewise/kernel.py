@@ -1,0 +1,265 @@
+"""A function of one trajectory as the LLVM IR of a kernel for blocks of them."""
+
+import functools
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from . import elementary
+from .components import SMALL, Evaluator, Kernel, Value
+from .ir import Builder, Num, Unsupported, literal
+from .jaxapi import ClosedJaxpr
+from .memory import Buffer, contiguous, load, stored_type
+
+HEAD = 2
+"""Parameters in front of a kernel's own: trajectories, cost of a block."""
+
+LARGEST_SCRATCH = 64 * 2**20
+"""Bytes that a block may take for rows which are not results."""
+
+
+class Module(Kernel):
+    """One LLVM module: a kernel, the elementary functions that it calls, its constants."""
+
+    def __init__(self, width: int, vectors: int):
+        self.W, self.U = width, vectors
+        self.b = Builder(width, vectors)
+        self.values: list[int] = []
+        self.globals: list[str] = []
+        self.functions: dict[tuple[str, bool], str] = {}
+        self.declared: set[str] = set()
+        self.scratch_bytes = 0
+        self.lanes: dict[str, str] = {}
+        self._constants: dict[bytes, str] = {}
+        self._names = itertools.count()
+
+    # --- what an evaluation asks for -----------------------------------------------------------
+
+    def parameter(self, value: int) -> Num:
+        """A whole number that is an input of the machine code: another one needs no new code."""
+        name = f"%par{len(self.values)}"
+        self.values.append(int(value))
+        return self.b.made([name], "int64", False)
+
+    def scratch(self, shape: Sequence[int], dtype: str, on: bool) -> Buffer:
+        """Memory for an array of every trajectory of the block, next to each other; for one array
+        that all share unless `on`."""
+        size = int(np.prod(shape, dtype=np.int64))
+        block = self.W * self.U if on else 1
+        start = self.scratch_bytes
+        self.scratch_bytes += (size * block * 8 + 63) // 64 * 64
+        if self.scratch_bytes > LARGEST_SCRATCH:
+            raise Unsupported(f"{self.scratch_bytes} bytes of rows that are not results")
+        item = np.dtype(dtype).itemsize
+        bases = tuple(
+            self.b.new(f"getelementptr i8, ptr %scratch, i64 {start + u * self.W * item}")
+            for u in range(self.U if on else 1)
+        )
+        return Buffer(bases, dtype, tuple(shape), contiguous(shape, block), 1 if on else None)
+
+    def constant(self, array: np.ndarray) -> Buffer:
+        """A known array in the module."""
+        array = np.ascontiguousarray(array)
+        dtype = str(array.dtype)
+        item = stored_type(dtype)
+        key = dtype.encode() + str(array.shape).encode() + array.tobytes()
+        if key not in self._constants:
+            name = f"@data{len(self._constants)}"
+            self._constants[key] = name
+            stored = "int8" if dtype == "bool" else dtype
+            numbers = ", ".join(
+                f"{item} {literal(x, stored)}" for x in array.astype(stored).reshape(-1)
+            )
+            self.globals.append(
+                f"{name} = private unnamed_addr constant [{array.size} x {item}] [{numbers}]"
+            )
+        name = self._constants[key]
+        return Buffer((name,), dtype, array.shape, contiguous(array.shape), None)
+
+    def elementary(self, name: str, args: Sequence[Num]) -> Num:
+        """An elementary function of float64, as a call of a function of the module."""
+        vec = any(a.vec for a in args)
+        known = all(a.known is not None for a in args)
+        if known:
+            return self.b.known(_at_known(name, tuple(float(a.known) for a in args)), "float64")
+        called = self._function(name, len(args), vec)
+        return self.b.op(
+            f"call {name}", args, "float64",
+            lambda t, *x: f"call {t} {called}({', '.join(f'{t} {y}' for y in x)})",
+        )  # fmt: skip
+
+    def _function(self, name: str, count: int, vec: bool) -> str:
+        wide = vec and self.W > 1
+        called = f"@{name.replace(' ', '_').replace('-', 'm')}_{'v' if wide else 's'}"
+        if (name, wide) not in self.functions:
+            self.functions[name, wide] = ""
+            text, declared, constants = _function_text(name, count, self.W if wide else 1, called)
+            self.functions[name, wide] = text
+            self.declared |= declared
+            self.globals += [c for c in constants if c not in self.globals]
+        return called
+
+    # --- the kernel ----------------------------------------------------------------------------
+
+    def kernel(self, closed: ClosedJaxpr, on: Sequence[bool]) -> str:
+        """The text of the module; `on` says which inputs differ between trajectories."""
+        b, jaxpr = self.b, closed.jaxpr
+        lanes = "%lanes"
+        operands = []
+        for i, (v, o) in enumerate(zip(jaxpr.invars, on, strict=True)):
+            b.emit(f"%ap{i} = getelementptr ptr, ptr %args, i64 {i}")
+            b.emit(f"%a{i} = load ptr, ptr %ap{i}")
+            operands.append((f"%a{i}", v.aval, o))
+        results = []
+        for i, v in enumerate(jaxpr.outvars):
+            b.emit(f"%rp{i} = getelementptr ptr, ptr %rets, i64 {i}")
+            b.emit(f"%r{i} = load ptr, ptr %rp{i}")
+            results.append((f"%r{i}", v.aval))
+        strides = [self._lane_stride(a) for _, a, o in operands if o]
+        strides_out = [self._lane_stride(a) for _, a in results]
+        evaluator = Evaluator(b, self)
+        shared = {}
+        for i, (pointer, aval, o) in enumerate(operands):
+            if not o:
+                buffer = Buffer(
+                    (pointer,), str(aval.dtype), aval.shape, contiguous(aval.shape), None
+                )
+                shared[i] = self._operand(evaluator, buffer)
+
+        consts = [evaluator.constant(c) for c in closed.consts]
+
+        def block(_, i):
+            first = b.new(f"add i64 %first, {i}")
+            start = b.new(f"mul i64 {first}, {self.W * self.U}")
+            # The last block ends with the last trajectory, and computes some of them again.
+            fits = b.new(f"icmp slt i64 {start}, %last.start")
+            start = b.new(f"select i1 {fits}, i64 {start}, i64 %last.start")
+            own, of = iter(strides), []
+            for k, (pointer, aval, o) in enumerate(operands):
+                if o:
+                    buffer = self._per_lane(pointer, aval, next(own), start)
+                    of.append(self._operand(evaluator, buffer))
+                else:
+                    of.append(shared[k])
+            places = [
+                self._per_lane(pointer, aval, stride, start)
+                for (pointer, aval), stride in zip(results, strides_out, strict=True)
+            ]
+            outs = evaluator.jaxpr(jaxpr, consts, of, places)
+            for value, place in zip(outs, places, strict=True):
+                evaluator.write(value, place)
+            return []
+
+        b.loop([], [], lambda _, i: b.new(f"icmp slt i64 {i}, %count"), block, count=True)
+        prologue = [
+            "  %lanes = load i64, ptr %params",
+            "  %count = sub i64 %last, %first",
+            f"  %last.start = sub i64 {lanes}, {self.W * self.U}",
+        ]
+        for i in range(len(self.values)):
+            prologue += [
+                f"  %par{i}.at = getelementptr i64, ptr %params, i64 {HEAD + i}",
+                f"  %par{i} = load i64, ptr %par{i}.at",
+            ]
+        epilogue = []
+        if self.scratch_bytes:
+            b.declared |= {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
+            size = self.scratch_bytes + 64
+            prologue += [
+                f"  %memory = call ptr @malloc(i64 {size})",
+                "  %address = ptrtoint ptr %memory to i64",
+                "  %up = add i64 %address, 63",
+                "  %aligned = and i64 %up, -64",
+                "  %scratch = inttoptr i64 %aligned to ptr",
+            ]
+            epilogue.append("  call void @free(ptr %memory)")
+        body = "\n".join([*prologue, *b.lines, *epilogue, "  ret void"])
+        declared = "\n".join(sorted(self.declared | b.declared))
+        functions = "\n".join(self.functions.values())
+        return (
+            "\n".join(self.globals) + "\n" + declared + "\n" + functions
+            + "\ndefine void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, i64 %first, "
+            + "i64 %last) {\nentry:\n" + body + "\n}\n"
+        )  # fmt: skip
+
+    def _lane_stride(self, aval: Any) -> int | str:
+        """The distance between trajectories in elements; that of long arrays is an input."""
+        if aval.size <= SMALL:
+            return int(aval.size)
+        return self.parameter(aval.size).names[0]
+
+    def _per_lane(self, pointer: str, aval: Any, stride: int | str, start: str) -> Buffer:
+        b, item = self.b, stored_type(str(aval.dtype))
+        bases = []
+        for u in range(self.U):
+            at = start if u == 0 else b.new(f"add i64 {start}, {u * self.W}")
+            if stride != 1:
+                at = b.new(f"mul i64 {at}, {stride}")
+            bases.append(b.new(f"getelementptr {item}, ptr {pointer}, i64 {at}"))
+        return Buffer(tuple(bases), str(aval.dtype), aval.shape, contiguous(aval.shape), stride)
+
+    def _operand(self, evaluator: Evaluator, buffer: Buffer) -> Value:
+        value = Value(buffer.shape, buffer.dtype, buffer=buffer)
+        if value.size <= SMALL:
+            numbers = np.empty(buffer.shape, object)
+            for i in np.ndindex(buffer.shape):
+                numbers[i] = load(self.b, buffer, buffer.at(i))
+            value.entries = numbers
+        return value
+
+
+@functools.cache
+def _traced(name: str, count: int) -> ClosedJaxpr:
+    """An elementary function as a jaxpr of scalars."""
+    if name.startswith("half_integer_power"):
+        function = elementary.half_integer_power(int(name.split()[1]))
+    else:
+        function = elementary.FUNCTIONS[name]
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(function)(*[jnp.zeros((), jnp.float64)] * count)
+
+
+@functools.cache
+def _function_text(
+    name: str, count: int, width: int, called: str
+) -> tuple[str, frozenset[str], tuple[str, ...]]:
+    """An elementary function of vectors of `width`, with what it declares."""
+    inner = Module(width, 1)
+    closed = _traced(name, count)
+    b = inner.b
+    args = [b.made([f"%x{i}"], "float64", True) for i in range(count)]
+    evaluator = Evaluator(b, inner)
+    values = []
+    for x in args:
+        entries = np.empty((), object)
+        entries[()] = x
+        values.append(Value((), "float64", entries))
+    (out,) = evaluator.closed(closed, values)
+    t = b.type("float64", True)
+    result = b.ref(evaluator.entries(out)[()], 0, True)
+    prefix = called[1:]
+    text = "\n".join([*b.lines, f"  ret {t} {result}"])
+    data = []
+    for line in inner.globals:  # constants of each function have names of their own
+        old = line.split(" ", 1)[0]
+        new = f"@{prefix}.{old[1:]}"
+        text, line = text.replace(old + ",", new + ","), line.replace(old, new, 1)
+        data.append(line)
+    parameters = ", ".join(f"{t} %x{i}" for i in range(count))
+    body = f"define internal {t} {called}({parameters}) {{\nentry:\n{text}\n}}\n"
+    return body, frozenset(b.declared | inner.declared), tuple(data)
+
+
+@functools.lru_cache(maxsize=4096)
+def _at_known(name: str, args: tuple[float, ...]) -> float:
+    """The value at arguments that are known while the code is made, by XLA."""
+    if name.startswith("half_integer_power"):
+        function = elementary.half_integer_power(int(name.split()[1]))
+    else:
+        function = elementary.FUNCTIONS[name]
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        return float(function(*(jnp.asarray(x, jnp.float64) for x in args)))

@@ -1,0 +1,83 @@
+"""Small dense linear systems, and Jacobians that keep the zeros of their structure."""
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from .jaxapi import primitive
+
+WRITTEN_OUT = 4
+"""Systems up to this size are eliminated number by number in XLA too; larger ones go to LAPACK."""
+
+
+def solve(A: Array, b: Array) -> Array:
+    """The solution x of A x = b, for A of shape (n, n) and b of shape (n,).
+
+    Linear in b and differentiable in both. In machine code this is Gaussian elimination in which
+    zeros by the structure of A stay zeros (a band stays a band); rows are exchanged on those
+    trajectories where a pivot is small beside the numbers below it. A singular matrix gives
+    infinities or NaN, for the caller's status to report.
+    """
+    return lax.custom_linear_solve(
+        lambda x: A @ x,
+        b,
+        lambda _, b: _eliminate.bind(A, b),
+        lambda _, b: _eliminate.bind(A.T, b),
+    )
+
+
+def _in_arrays(A: Array, b: Array) -> Array:
+    return by_elimination(A, b) if b.shape[0] <= WRITTEN_OUT else jnp.linalg.solve(A, b)
+
+
+def by_elimination(A: Array, b: Array) -> Array:
+    """The solution of A x = b by elimination with partial pivoting, written out.
+
+    The exchanges are selections: under `vmap` every operation is elementwise over the batch.
+    """
+    n = b.shape[0]
+    rows = [[A[i, j] for j in range(n)] + [b[i]] for i in range(n)]
+    for c in range(n):
+        for i in range(c + 1, n):  # bring the larger of rows c and i to place c
+            larger = jnp.abs(rows[i][c]) > jnp.abs(rows[c][c])
+            exchanged = [
+                (jnp.where(larger, y, x), jnp.where(larger, x, y))
+                for x, y in zip(rows[c], rows[i], strict=True)
+            ]
+            rows[c] = [e[0] for e in exchanged]
+            rows[i] = [e[1] for e in exchanged]
+        for i in range(c + 1, n):
+            factor = rows[i][c] / rows[c][c]
+            rows[i] = [y - factor * x for x, y in zip(rows[c], rows[i], strict=True)]
+    x: list = [None] * n
+    for i in reversed(range(n)):
+        known = sum((rows[i][j] * x[j] for j in range(i + 1, n)), start=jnp.zeros_like(b[0]))
+        x[i] = (rows[i][n] - known) / rows[i][i]
+    return jnp.stack(x)
+
+
+_eliminate = primitive("eliminate", _in_arrays)
+
+
+def unit_vectors(n: int, dtype) -> Array:
+    """The identity matrix, whose zeros are known to be zeros where code is generated."""
+    return _unit_vectors.bind(n=n, dtype=jnp.dtype(dtype))
+
+
+_unit_vectors = primitive("unit_vectors", lambda *, n, dtype: jnp.eye(n, dtype=dtype))
+
+
+def on_any(x: Array) -> Array:
+    """Whether a truth value is true on any of the trajectories that run together.
+
+    It may decide what is computed, as a branch that most trajectories do not need, never what a
+    trajectory's result is: that must not depend on its neighbours.
+    """
+    return _least.bind(jnp.where(x, jnp.int32(0), jnp.int32(1))) == 0
+
+
+def _least_of_batch(arrays, axes):
+    (x,), (axis,) = arrays, axes
+    return _least.bind(jnp.min(x, axis=axis)), None
+
+
+_least = primitive("least_over_lanes", lambda x: x, _least_of_batch)

@@ -1,0 +1,110 @@
+"""LLVM IR to machine code: the host's features, the optimiser, and what an earlier process made."""
+
+import functools
+import itertools
+from typing import Any
+
+import llvmlite
+import llvmlite.binding as llvm
+
+from . import cache
+
+FORMAT = 1
+"""Goes up with each change of what the machine code expects of the process around it."""
+
+_kept: list[Any] = []
+"""Engines own the memory of their code; JAX may call it as long as the process lives."""
+
+_count = itertools.count()
+
+
+@functools.cache
+def started() -> None:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+
+
+@functools.cache
+def host() -> tuple[str, str]:
+    """(name, features) of the processor, as LLVM calls them."""
+    features = llvm.get_host_cpu_features().flatten()
+    if "+avx512f" in features.split(","):
+        features += ",-prefer-256-bit"
+    return llvm.get_host_cpu_name(), features
+
+
+@functools.cache
+def width() -> int:
+    """How many float64 a vector register has."""
+    features = set(host()[1].split(","))
+    if {"+avx512f", "+avx512dq", "+avx512vl"} <= features:
+        return 8
+    return 4 if "+avx2" in features else 2
+
+
+@functools.cache
+def target_machine(triple: str | None = None, cpu: str | None = None, features: str | None = None):
+    """LLVM's view of a machine, by default of this one."""
+    started()
+    if triple is None:
+        target, (cpu, features) = llvm.Target.from_default_triple(), host()
+    else:
+        target = llvm.Target.from_triple(triple)
+    return target.create_target_machine(
+        cpu=cpu or "", features=features or "", opt=2, reloc="pic", codemodel="default"
+    )
+
+
+def _optimised(module: Any, machine: Any) -> None:
+    """The passes that pay for code which is written number by number: no vectoriser, no unrolling,
+    nothing that may change an operation."""
+    options = llvm.create_pipeline_tuning_options(speed_level=2)
+    options.slp_vectorization = options.loop_vectorization = options.loop_unrolling = False
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+
+
+def object_code(ir: str, machine: Any = None) -> bytes:
+    """The object file of a module."""
+    machine = target_machine() if machine is None else machine
+    module = llvm.parse_assembly(ir)
+    module.verify()
+    module.triple = machine.triple
+    module.data_layout = str(machine.target_data)
+    _optimised(module, machine)
+    return machine.emit_object(module)
+
+
+def assembly(ir: str) -> str:
+    """The machine code of a module in the assembler's language."""
+    machine = target_machine()
+    module = llvm.parse_assembly(ir)
+    module.verify()
+    _optimised(module, machine)
+    return machine.emit_assembly(module)
+
+
+def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
+    """The engine that holds a module's machine code; from the cache on disk, if it is there."""
+    started()
+    for name, address in (symbols or {}).items():
+        llvm.add_symbol(name, address)
+    cpu, features = host()
+    key = cache.key(FORMAT, llvmlite.__version__, llvm.llvm_version_info, cpu, features, ir)
+    code = cache.read(key)
+    if code is None:
+        code = object_code(ir)
+        cache.write(key, code)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _own_machine())
+    engine.set_object_cache(None, lambda module: code)
+    engine.finalize_object()
+    _kept.append(engine)
+    return engine
+
+
+def _own_machine() -> Any:
+    """An engine takes the machine that it is given for itself."""
+    cpu, features = host()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=cpu, features=features, opt=2, reloc="pic", codemodel="jitdefault", jit=True
+    )

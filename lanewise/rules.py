@@ -1,0 +1,104 @@
+"""Where the entries of an array go: primitives of JAX that move numbers and compute nothing."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+
+def _broadcast_in_dim(x, *, shape, broadcast_dimensions, **_):
+    x = np.transpose(x, np.argsort(broadcast_dimensions))  # they may come in any order
+    places = [1] * len(shape)
+    for axis, dimension in enumerate(sorted(broadcast_dimensions)):
+        places[dimension] = x.shape[axis]
+    return np.broadcast_to(x.reshape(places), shape)
+
+
+def _slice(x, *, start_indices, limit_indices, strides, **_):
+    strides = strides or (1,) * x.ndim
+    return x[tuple(map(slice, start_indices, limit_indices, strides))]
+
+
+def _unstack(x: np.ndarray, *, axis: int, **_: Any) -> tuple[np.ndarray, ...]:
+    rows = np.moveaxis(x, axis, 0)
+    return tuple(rows[i, ...] for i in range(len(rows)))  # "...": an array, of one entry too
+
+
+def _split(x, *, sizes, axis, **_):
+    return tuple(np.split(x, np.cumsum(sizes)[:-1], axis))
+
+
+VIEWS: dict[str, Callable] = {
+    "broadcast_in_dim": _broadcast_in_dim,
+    "squeeze": lambda x, *, dimensions, **_: np.squeeze(x, tuple(dimensions)),
+    "expand_dims": lambda x, *, dimensions, **_: np.expand_dims(x, tuple(dimensions)),
+    "transpose": lambda x, *, permutation, **_: np.transpose(x, permutation),
+    "rev": lambda x, *, dimensions, **_: np.flip(x, tuple(dimensions)),
+    "slice": _slice,
+    "split": _split,
+    "unstack": _unstack,
+}
+"""One array seen with other axes or strides; an array in memory stays where it is."""
+
+
+def _pad(x, fill, *, padding_config, **_):
+    shape = [
+        low + high + max(size + (size - 1) * inner, 0)
+        for size, (low, high, inner) in zip(x.shape, padding_config, strict=True)
+    ]
+    # Negative padding crops: place the entries on a larger canvas, and cut.
+    crops = [(max(-low, 0), max(-high, 0)) for low, high, _ in padding_config]
+    canvas = np.empty([s + a + b for s, (a, b) in zip(shape, crops, strict=True)], object)
+    for i in np.ndindex(canvas.shape):
+        canvas[i] = fill.flat[0]
+    places = []
+    for size, (low, _high, inner) in zip(x.shape, padding_config, strict=True):
+        start = max(low, 0)
+        places.append(slice(start, start + max(size + (size - 1) * inner, 0), inner + 1))
+    canvas[tuple(places)] = x
+    cut = [slice(a, a + s) for s, (a, _) in zip(shape, crops, strict=True)]
+    return canvas[tuple(cut)]
+
+
+MOVES: dict[str, Callable] = {
+    **VIEWS,
+    "reshape": lambda x, *, new_sizes, **_: x.reshape(new_sizes),
+    "stack": lambda *xs, axis, **_: np.stack(xs, axis),
+    "tile": lambda x, *, reps, **_: np.tile(x, tuple(reps)),
+    "concatenate": lambda *xs, dimension, **_: np.concatenate(xs, axis=dimension),
+    "pad": _pad,
+}
+"""The same on arrays of entries, and those that make a new array."""
+
+CALLS = frozenset(
+    [
+        "jit",
+        "pjit",
+        "closed_call",
+        "core_call",
+        "call_hi_primitive",
+        "eval_jaxpr",
+        "custom_jvp_call",
+        "custom_vjp_call",
+        "custom_vjp_call_jaxpr",
+        "custom_vmap_call",
+        "checkpoint",
+        "remat",
+        "remat2",
+    ]
+)
+"""Calls of one jaxpr whose inputs and outputs are those of the equation."""
+
+REDUCTIONS = {
+    "reduce_sum": "add",
+    "reduce_prod": "mul",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_and": "and",
+    "reduce_or": "or",
+    "reduce_xor": "xor",
+}
+"""Taken from the first entry to the last, by this operation of two."""
+
+CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
+"""Running reductions along one axis."""

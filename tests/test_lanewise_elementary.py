@@ -1,0 +1,605 @@
+"""Elementary functions of generated code: errors in ulp, special values, constants.
+
+The functions are evaluated as generated code does it: a small interpreter runs the jaxpr with
+NumPy, in which subnormal numbers are not replaced by zero, once with separate products and sums
+and once with fused multiply-adds where the generator contracts them.
+"""
+
+import math
+from collections import Counter
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from jax.extend.core import primitives
+from mpmath import mpf
+
+from lanewise import elementary
+
+# --- an interpreter of jaxprs -----------------------------------------------------------------
+
+
+def _shift_right(x, count):
+    return (np.asarray(x).view(np.uint64) >> np.asarray(count).view(np.uint64)).view(np.int64)
+
+
+OPERATIONS = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+    "abs": np.abs,
+    "sqrt": np.sqrt,
+    "floor": np.floor,
+    "round": np.rint,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+    "not": np.bitwise_not,
+    "shift_left": np.left_shift,
+    "shift_right_logical": _shift_right,
+    "select_n": lambda condition, at_false, at_true: np.where(condition, at_true, at_false),
+}
+CONVERSIONS = {
+    "bitcast_convert_type": lambda x, dtype: np.ascontiguousarray(x).view(dtype),
+    "convert_element_type": lambda x, dtype: x.astype(dtype),
+}
+"""All that generated code has for these functions, besides branches."""
+
+
+def fused(a, b, c):
+    """a b + c with one rounding (Boldo & Melquiond 2008); with two where numbers are extreme."""
+
+    def two_sum(x, y):
+        total = x + y
+        part = total - x
+        return total, (x - (total - part)) + (y - part)
+
+    def halves(x):
+        high = 134217729 * x - (134217729 * x - x)
+        return high, x - high
+
+    a, b, c = np.broadcast_arrays(*(np.asarray(x, float) for x in (a, b, c)))
+    product = a * b
+    (a1, a2), (b1, b2) = halves(a), halves(b)
+    error = ((a1 * b1 - product) + a1 * b2 + a2 * b1) + a2 * b2
+    high, low = two_sum(c, error)
+    total, rest = two_sum(product, high)
+    tail, lost = two_sum(rest, low)
+    # Round the tail to odd: next to it in the direction of what was lost, if it is even.
+    bits = np.array(tail).view(np.int64)
+    is_even = (lost != 0) & np.isfinite(lost) & (bits & 1 == 0)
+    bits = bits + np.where(is_even, np.where((lost > 0) == (tail > 0), 1, -1), 0)
+    value = total + bits.view(np.float64).reshape(np.shape(tail))
+    is_safe = np.isfinite(value) & (np.abs(product) > 1e-270) & (np.abs(product) < 1e290)
+    return np.where(is_safe, value, product + c)
+
+
+def evaluate(closed, arguments, contracts):
+    """Values of a jaxpr on arrays; with `contracts`, products of a single use go into sums."""
+    jaxpr = closed.jaxpr
+    values = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
+    values |= dict(zip(jaxpr.invars, arguments, strict=True))
+    read = [v for e in jaxpr.eqns for v in e.invars] + list(jaxpr.outvars)
+    uses = Counter(v for v in read if not hasattr(v, "val"))
+    products = {
+        e.outvars[0]: e.invars
+        for e in jaxpr.eqns
+        if e.primitive.name == "mul" and e.outvars[0].aval.dtype == float
+    }
+
+    def value(v):
+        return np.asarray(v.val) if hasattr(v, "val") else values[v]
+
+    def is_product(v):
+        return contracts and not hasattr(v, "val") and v in products and uses[v] == 1
+
+    for e in jaxpr.eqns:
+        name, xs = e.primitive.name, [value(v) for v in e.invars]
+        if name == "cond":
+            at_0, at_1 = (evaluate(b, xs[1:], contracts) for b in e.params["branches"])
+            out = [np.where(xs[0] != 0, y, x) for x, y in zip(at_0, at_1, strict=True)]
+        elif name in CONVERSIONS:
+            out = [CONVERSIONS[name](xs[0], e.params["new_dtype"])]
+        elif name in ("add", "sub") and is_product(e.invars[1]):
+            a, b = map(value, products[e.invars[1]])
+            out = [fused(a if name == "add" else -a, b, xs[0])]
+        elif name in ("add", "sub") and is_product(e.invars[0]):
+            a, b = map(value, products[e.invars[0]])
+            out = [fused(a, b, xs[1] if name == "add" else -xs[1])]
+        else:
+            out = [OPERATIONS[name](*xs)]
+        values.update(zip(e.outvars, out, strict=True))
+    return [value(v) for v in jaxpr.outvars]
+
+
+def run(function, *xs, contracts=False):
+    """The function of scalars on arrays, as generated code evaluates it."""
+    closed = jax.make_jaxpr(function)(*[1.0] * len(xs))
+    with np.errstate(all="ignore"):
+        out = evaluate(closed, [np.asarray(x, float) for x in xs], contracts)
+    return out[0] if len(out) == 1 else out
+
+
+def test_fused_is_rounded_once():
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((2, 300))
+    c = -a * b * rng.choice([1.0, 1 + 2**-50, 0.3, 1e-20], 300)
+    exact = [
+        float(Fraction(x) * Fraction(y) + Fraction(z)) for x, y, z in zip(a, b, c, strict=True)
+    ]
+    np.testing.assert_array_equal(fused(a, b, c), exact)
+    assert np.any(a * b + c != exact)
+
+
+# --- errors -----------------------------------------------------------------------------------
+
+
+def exact(name, *xs):
+    """The function of that name with 100 correct bits at least."""
+    xs = [float(x) for x in xs]
+    # The bits that small arguments of 1 + x and large ones of sin take.
+    mpmath.mp.prec = 150 + 2 * max(abs(math.frexp(x)[1]) for x in xs)
+    xs = [mpf(x) for x in xs]
+    if name == "logistic":
+        return 1 / (1 + mpmath.exp(-xs[0]))
+    if name == "exp2":
+        return mpf(2) ** xs[0]
+    if name == "pow":
+        return mpmath.power(*xs)
+    if name == "cbrt":
+        return mpmath.sign(xs[0]) * mpmath.cbrt(abs(xs[0]))
+    return getattr(mpmath, name)(*xs)
+
+
+def errors(name, xs, values):
+    """|value − exact|/ulp at each point."""
+    out = []
+    for *x, value in zip(*xs, values, strict=True):
+        truth = exact(name, *x)
+        assert np.isfinite(value), (name, x)
+        out.append(abs(mpf(float(value)) - truth) / mpf(math.ulp(float(truth))))
+    return np.asarray(out, float)
+
+
+# Found by continued fractions of 2^e 2/π: nearest to a multiple of π/2 of all doubles up to 2²⁷,
+# of those from 2²³ on, and (J.-M. Muller, Elementary Functions, 2006, ch. 9) of all.
+NEAREST = [6411027962775774 * 2.0**-47, 7763785107565477 * 2.0**-29, 6381956970095103 * 2.0**797]
+BOUNDS = {
+    "sin": 0.95,
+    "cos": 0.95,
+    "tan": 1.65,
+    "asin": 1.65,
+    "acos": 1.15,
+    "atan": 1.45,
+    "atan2": 1.65,
+    "sinh": 1.75,
+    "cosh": 0.9,
+    "tanh": 1.5,
+    "asinh": 1.3,
+    "acosh": 1.8,
+    "atanh": 1.65,
+    "logistic": 1.2,
+    "exp": 0.87,
+    "exp2": 0.78,
+    "expm1": 1.35,
+    "log": 0.9,
+    "log1p": 0.94,
+    "pow": 0.78,
+    "cbrt": 0.52,
+    "erf": 1.05,
+    "erfc": 1.7,
+}
+"""Largest error [ulp]; the docstring of the module has the largest one seen."""
+
+
+def points(name, n=250, seed=0):
+    """Arguments over the whole range, dense near zeros and where one form of arithmetic ends."""
+    rng = np.random.default_rng(seed)
+
+    def of_both_signs(*parts):
+        xs = np.concatenate(parts)
+        return xs * rng.choice([-1.0, 1.0], xs.size)
+
+    def around(*places):
+        return np.concatenate(
+            [p + 10 ** rng.uniform(-16, -1, n // 4) * s for p in places for s in (-1, 1)]
+        )
+
+    def spread(low, high, count=n):
+        return rng.uniform(low, high, count)
+
+    tiny = np.append(10 ** rng.uniform(-323.3, -1, n), [5e-324, 2.0**-1022, 2.0**-1022 * 1.5])
+    huge = np.append(10 ** rng.uniform(1, 308.2, n), np.finfo(float).max)
+    if name in ("sin", "cos", "tan"):
+        near = np.append(np.arange(1, n // 2), rng.integers(1, 2**40, n // 2)) * np.pi / 2
+        ends = np.nextafter([2.0**21, 2.0**27], [[0.0], [np.inf]]).ravel()
+        regions = spread(0, 8), spread(2**20, 2**28), near, np.array(NEAREST), ends
+        return (of_both_signs(tiny, huge, *regions),)
+    if name in ("asin", "acos", "atanh"):
+        ones = np.nextafter([1.0, 0.5], 0)
+        xs = of_both_signs(spread(0, 1), tiny, 1 - 10 ** rng.uniform(-16, -1, n), ones)
+        return (np.append(xs, around(0.5)),)
+    if name in ("atan2", "pow"):
+        x, y = spread(-3, 3, 2 * n), spread(-3, 3, 2 * n)
+        if name == "pow":
+            near_1 = 1 + of_both_signs(10 ** rng.uniform(-15.5, -1, n))
+            x = np.concatenate([np.abs(x), 10 ** rng.uniform(-323.3, 308, n), near_1])
+            slow, fast = 10 ** rng.uniform(-5, 2.5, n), 10 ** rng.uniform(1, 17, n)
+            y = np.concatenate([y * 30, of_both_signs(slow), of_both_signs(fast)])
+            size = y * np.log(x)
+            keep = (size > -744) & (size < 709)
+        else:
+            y = np.append(y, of_both_signs(tiny, huge))
+            x = np.append(x, of_both_signs(rng.permutation(np.append(tiny, huge))))
+            keep = np.abs(np.log(np.abs(y)) - np.log(np.abs(x))) < 700  # y/x is a normal number
+        return (x[keep], y[keep]) if name == "pow" else (y[keep], x[keep])
+    if name in ("log", "acosh"):
+        xs = np.concatenate([spread(0, 5), around(1.0), spread(0.65, 1.5), huge, tiny])
+        return (xs[xs >= 1] if name == "acosh" else xs[xs > 0],)
+    if name == "log1p":
+        xs = np.append(of_both_signs(spread(0, 1), tiny, 1 - tiny[tiny > 1e-16]), huge)
+        return (xs[xs > -1],)
+    if name in ("atan", "asinh", "cbrt"):
+        return (of_both_signs(spread(0, 5), tiny, huge, spread(0.2, 1.3)),)
+    if name == "erfc":
+        return (
+            np.concatenate([spread(-6, 6), of_both_signs(tiny), spread(0.3, 1.5), spread(1, 26.6)]),
+        )
+    # Functions with e^x.
+    low, high = {"exp": (-745, 709.7), "expm1": (-60, 709.7), "exp2": (-1074, 1023.9)}.get(
+        name, {"erf": (-6, 6), "tanh": (-25, 25), "logistic": (-745, 50)}.get(name, (-710.4, 710.4))
+    )
+    breaks = np.log(2) * np.array([-0.5, 0.5, 1.5]) if name != "exp2" else np.array([-0.5, 0.5])
+    return (
+        np.concatenate([spread(low, high), spread(-2, 2), of_both_signs(tiny), around(*breaks)]),
+    )
+
+
+@pytest.mark.parametrize("contracts", [False, True], ids=["separate", "fused"])
+@pytest.mark.parametrize("name", elementary.FUNCTIONS)
+def test_error(name, contracts):
+    xs = points(name, seed=int(contracts))
+    values = run(elementary.FUNCTIONS[name], *xs, contracts=contracts)
+    assert errors(name, xs, values).max() < BOUNDS[name]
+
+
+@pytest.mark.parametrize("name", elementary.FUNCTIONS)
+def test_error_when_compiled_by_xla(name):
+    """XLA simplifies sums of several constants, which must not spoil an error-free sum."""
+    xs = [x[np.abs(x) > 1e-290] if len(p) == 1 else x for p in [points(name, 40)] for x in p]
+    values = np.asarray(jax.jit(jax.vmap(elementary.FUNCTIONS[name]))(*map(jnp.asarray, xs)))
+    keep = np.abs(values) > 1e-300
+    if len(xs) == 2:
+        keep &= np.minimum(*np.abs(xs)) > 1e-290
+    assert keep.sum() > 80
+    assert errors(name, [x[keep] for x in xs], values[keep]).max() < BOUNDS[name]
+
+
+def test_oracle_knows_a_published_value():
+    """cos of the worst case is 4.687165924254624e-19 in size (Muller 2006)."""
+    assert float(abs(exact("cos", NEAREST[2]))) == pytest.approx(4.687165924254624e-19, rel=1e-15)
+
+
+def test_sincos():
+    (xs,) = points("sin")
+    for value, name in zip(run(elementary.sincos, xs), ("sin", "cos"), strict=True):
+        np.testing.assert_array_equal(value, run(elementary.FUNCTIONS[name], xs))
+
+
+ODD = ["sin", "tan", "asin", "atan", "sinh", "tanh", "asinh", "atanh", "cbrt", "erf"]
+
+
+@pytest.mark.parametrize("name", [*ODD, "cos", "cosh"])
+def test_symmetry(name):
+    function, (xs,) = elementary.FUNCTIONS[name], points(name)
+    values = run(function, xs)
+    np.testing.assert_array_equal(run(function, -xs), -values if name in ODD else values)
+
+
+# --- a defect must be seen --------------------------------------------------------------------
+
+
+@pytest.fixture
+def defect(monkeypatch):
+    """Replaces a table; JAX must not reuse what it traced before, nor this afterwards."""
+
+    def replaced(table, values):
+        monkeypatch.setattr(elementary, table, values)
+        jax.clear_caches()
+
+    yield replaced
+    jax.clear_caches()
+
+
+@pytest.mark.parametrize(
+    ("table", "name"),
+    [
+        ("_SIN", "sin"),
+        ("_COS", "cos"),
+        ("_ATAN", "atan"),
+        ("_ATAN", "atan2"),
+        ("_ASIN", "asin"),
+        ("_EXP", "exp"),
+        ("_EXP", "expm1"),
+        ("_LOG", "log"),
+        ("_LOG", "asinh"),
+        ("_LOG2_5", "pow"),
+        ("_CBRT", "cbrt"),
+        ("_ERF", "erf"),
+        ("_ERFC", "erfc"),
+        ("_HALF_PI_4", "sin"),
+        ("_HALF_PI_5", "cos"),
+        ("_LOG_2", "exp"),
+        ("_LOG_2_HEAD", "exp2"),
+        ("_LOG2_1", "pow"),
+        ("_LOG2_3", "pow"),
+    ],
+)
+def test_error_without_the_last_coefficient(defect, table, name):
+    defect(table, (*getattr(elementary, table)[:-1], 0.0))
+    xs = points(name)
+    assert errors(name, xs, run(elementary.FUNCTIONS[name], *xs)).max() > 1.2 * BOUNDS[name]
+
+
+@pytest.mark.parametrize("count", [10, 17])
+def test_error_with_fewer_digits_of_two_over_pi(defect, count):
+    table = elementary._TWO_OVER_PI
+    defect("_TWO_OVER_PI", table[:count] + (0,) * (len(table) - count))
+    largest = np.random.default_rng(0).uniform(1e308, 1.7e308, 50)
+    assert errors("sin", [largest], run(elementary.sin, largest)).max() > 100
+
+
+# --- special values ---------------------------------------------------------------------------
+
+INF, NAN, PI, TINY = math.inf, math.nan, math.pi, 5e-324
+SPECIAL = {
+    "sin": {0.0: 0.0, INF: NAN, TINY: TINY},
+    "cos": {0.0: 1.0, INF: NAN, -INF: NAN, TINY: 1.0},
+    "tan": {0.0: 0.0, INF: NAN, TINY: TINY},
+    "asin": {0.0: 0.0, 1.0: PI / 2, 1 + 2**-52: NAN, INF: NAN, TINY: TINY},
+    "acos": {0.0: PI / 2, 1.0: 0.0, -1.0: PI, 2.0: NAN, -2.0: NAN, INF: NAN},
+    "atan": {0.0: 0.0, 1.0: PI / 4, INF: PI / 2, TINY: TINY},
+    "sinh": {0.0: 0.0, INF: INF, 711.0: INF, TINY: TINY},
+    "cosh": {0.0: 1.0, INF: INF, -INF: INF, 711.0: INF, -711.0: INF},
+    "tanh": {0.0: 0.0, INF: 1.0, 30.0: 1.0, 1e300: 1.0, TINY: TINY},
+    "asinh": {0.0: 0.0, INF: INF, TINY: TINY},
+    "acosh": {1.0: 0.0, 0.5: NAN, 0.0: NAN, -2.0: NAN, INF: INF, -INF: NAN},
+    "atanh": {0.0: 0.0, 1.0: INF, 1 + 2**-52: NAN, INF: NAN, TINY: TINY},
+    "logistic": {0.0: 0.5, INF: 1.0, -INF: 0.0, 800.0: 1.0, -800.0: 0.0},
+    "exp": {0.0: 1.0, INF: INF, -INF: 0.0, 709.8: INF, -745.2: 0.0, -745.1: TINY},
+    "exp2": {0.0: 1.0, INF: INF, -INF: 0.0, 1024.0: INF, -1074.0: TINY, -1075.5: 0.0}
+    | {float(k): 2.0**k for k in range(-1073, 1024, 99)},
+    "expm1": {0.0: 0.0, INF: INF, -INF: -1.0, 709.8: INF, -800.0: -1.0, TINY: TINY},
+    "log": {1.0: 0.0, 0.0: -INF, INF: INF, -INF: NAN, -1.0: NAN, -TINY: NAN},
+    "log1p": {0.0: 0.0, -1.0: -INF, -1.5: NAN, INF: INF, -INF: NAN, -TINY: -TINY},
+    "cbrt": {0.0: 0.0, INF: INF} | {k**3: k for k in (1.0, 3.0, 1e5, 123457.0, 2.0**-358)},
+    "erf": {0.0: 0.0, INF: 1.0, 7.0: 1.0, 1e300: 1.0, TINY: TINY},
+    "erfc": {0.0: 1.0, INF: 0.0, -INF: 2.0, 28.0: 0.0, 1e300: 0.0, -9.0: 2.0},
+}
+"""As in C99, Annex F; those of odd functions for one sign, and of 0 for that of +0."""
+AT_MINUS_0 = {"expm1": -0.0, "log1p": -0.0}
+
+
+@pytest.mark.parametrize("name", SPECIAL)
+def test_special_values(name):
+    xs, expected = np.array(list(SPECIAL[name].items())).T
+    if name in ODD:
+        xs, expected = np.append(xs, -xs), np.append(expected, -expected)
+    elif 0.0 in SPECIAL[name]:
+        at_0 = SPECIAL[name][0.0]
+        xs, expected = np.append(xs, -0.0), np.append(expected, at_0 if at_0 else AT_MINUS_0[name])
+    xs, expected = np.append(xs, NAN), np.append(expected, NAN)
+    values = run(elementary.FUNCTIONS[name], xs)
+    np.testing.assert_array_equal(values, expected)
+    number = ~np.isnan(expected)
+    np.testing.assert_array_equal(np.signbit(values)[number], np.signbit(expected)[number])
+
+
+@pytest.mark.parametrize(
+    ("name", "library"), [("pow", np.power), ("atan2", np.arctan2)], ids=["pow", "atan2"]
+)
+def test_special_values_of_two_arguments(name, library):
+    """On a grid, against the C library, which has those of C99."""
+    half = [0.0, TINY, 1e-310, 0.3, 0.5, 1 - 2**-53, 1.0, 1 + 2**-52, 2.0, 3.0, 2.0**53 - 1]
+    half = [*half, 2.0**53, 1e300, np.finfo(float).max, INF]
+    grid = np.array([*half, *(-x for x in half), NAN])
+    xs = [g.ravel() for g in np.meshgrid(grid, grid)]
+    with np.errstate(all="ignore"):
+        expected = library(*xs)
+    values = run(elementary.FUNCTIONS[name], *xs)
+    exceptional = (expected == 0) | ~np.isfinite(expected)
+    if name == "pow":
+        exceptional |= (np.abs(xs[0]) == 1) | (xs[1] == 0)
+    np.testing.assert_array_equal(values[exceptional], expected[exceptional])
+    np.testing.assert_allclose(values, expected, rtol=4.5e-16, atol=TINY)
+    number = ~np.isnan(expected)
+    np.testing.assert_array_equal(np.signbit(values)[number], np.signbit(expected)[number])
+
+
+# --- half-integer powers, and the table -------------------------------------------------------
+
+
+@pytest.mark.parametrize("twice", [-7, -5, -3, -1, 1, 3, 5, 7])
+def test_half_integer_powers(twice):
+    rng = np.random.default_rng(4)
+    xs = np.concatenate([rng.uniform(0.1, 5, 200), 10 ** rng.uniform(-66, 66, 200)])
+    ys = np.full_like(xs, twice / 2)
+    roundings = 1 + abs(twice) // 2 + (twice < 0)
+    values = run(elementary.half_integer_power(twice), xs)
+    assert errors("pow", (xs, ys), values).max() < 0.5 + 0.7 * roundings
+    special = np.array([0.0, -0.0, INF, -INF, NAN, -1.0])
+    at_0, at_infinity = (0.0, INF) if twice > 0 else (INF, 0.0)
+    expected = [at_0, at_0, at_infinity, at_infinity, NAN, NAN]
+    values = run(elementary.half_integer_power(twice), special)
+    np.testing.assert_array_equal(values, expected)
+    assert not np.any(np.signbit(values[:4]))
+
+
+def test_half_integer_power_rejects_an_integer():
+    with pytest.raises(ValueError, match="must be odd, got 4"):
+        elementary.half_integer_power(4)
+
+
+def primitives_of(jaxpr):
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for branch in equation.params.get("branches", ()):
+            assert not branch.consts
+            yield from primitives_of(branch.jaxpr)
+
+
+@pytest.mark.parametrize("name", elementary.FUNCTIONS)
+def test_primitives(name):
+    """Each is a primitive of JAX, and made of scalar operations that generated code has."""
+    count = 2 if name in ("pow", "atan2") else 1
+    assert getattr(primitives, f"{name}_p").name == name
+    closed = jax.make_jaxpr(elementary.FUNCTIONS[name])(*[1.0] * count)
+    assert set(primitives_of(closed.jaxpr)) <= {*OPERATIONS, *CONVERSIONS, "cond"}
+    assert all(v.aval.shape == () for e in closed.eqns for v in (*e.invars, *e.outvars))
+    assert [v.aval.dtype for v in closed.jaxpr.outvars] == [np.dtype(float)]
+
+
+# --- where constants come from ----------------------------------------------------------------
+
+
+def interpolated(function, nodes):
+    """Coefficients of the polynomial through the function at the nodes, by Newton's form."""
+    n = len(nodes)
+    divided = [function(z) for z in nodes]
+    for k in range(1, n):
+        for i in range(n - 1, k - 1, -1):
+            divided[i] = (divided[i] - divided[i - 1]) / (nodes[i] - nodes[i - k])
+    total = [mpf(0)] * n
+    for i in range(n - 1, -1, -1):  # Horner's scheme in z − z_i
+        shifted = [mpf(0), *total[:-1]]
+        total = [s - nodes[i] * t for s, t in zip(shifted, total, strict=True)]
+        total[0] += divided[i]
+    return total
+
+
+def chebyshev(low, high, n):
+    """Zeros of the Chebyshev polynomial of degree n on an interval."""
+    cosines = [mpmath.cos(mpmath.pi * (2 * j + 1) / (2 * n)) for j in range(n)]
+    return [(low + high) / 2 + (high - low) / 2 * c for c in cosines]
+
+
+def one_sided(length, n, bits=None):
+    """Zeros of that of degree n + 1 whose first zero is 0, without it: for g(z) in z g(z)."""
+    *cosines, first = (mpmath.cos(mpmath.pi * (2 * j + 1) / (2 * n + 2)) for j in range(n + 1))
+    nodes = [length * (c - first) / (1 - first) for c in cosines]
+    return nodes if bits is None else [mpmath.nint(z * 2**bits) / 2**bits for z in nodes]
+
+
+def series(coefficient, first):
+    """Σ a_k z^(k − first), of 120 terms."""
+    return lambda z: mpmath.fsum(coefficient(k) * z ** (k - first) for k in range(first, 120))
+
+
+def _erfc_factor(v):
+    x = 8 / (1 - v) - 3
+    return (x + 3) * mpmath.exp(x * x) * mpmath.erfc(x)
+
+
+def _exp_nodes(n):
+    """Of both signs, and for g in r² g: a double zero at 0."""
+    roots = [mpmath.sqrt(z) for z in one_sided(mpf("0.3475") ** 2, n // 2)]
+    return [sign * root for root in roots for sign in (-1, 1)]
+
+
+def _derivation(table):
+    """The function that a table approximates, and the nodes for n coefficients."""
+    if table in ("_SIN", "_COS"):
+        odd = table == "_SIN"
+        f = series(lambda k: mpf((-1) ** k) / mpmath.factorial(2 * k + odd), 2 - odd)
+        return f, lambda n: one_sided(mpf(0.625), n, 20)
+    return {
+        "_ATAN": (
+            series(lambda k: mpf((-1) ** k) / (2 * k + 1), 1),
+            lambda n: one_sided(mpf(0.09), n, 20),
+        ),
+        "_ASIN": (
+            series(lambda k: mpmath.binomial(2 * k, k) / mpf(4) ** k / (2 * k + 1), 1),
+            lambda n: one_sided(mpf(0.25), n, 20),
+        ),
+        "_LOG": (
+            series(lambda k: mpf(2) / (2 * k + 1), 1),
+            lambda n: one_sided(mpf(0.02945), n, 20),
+        ),
+        "_EXP": (lambda r: (mpmath.expm1(r) - r) / r**2, _exp_nodes),
+        "_LOG2_5": (
+            series(lambda k: 2 / mpmath.log(2) / (2 * k + 1), 2),
+            lambda n: one_sided(mpf("0.00348"), n),
+        ),
+        "_CBRT": (lambda m: 1 / mpmath.cbrt(m), lambda n: chebyshev(mpf(1), mpf(2), n)),
+        "_ERF": (
+            lambda z: mpmath.erf(mpmath.sqrt(z)) / mpmath.sqrt(z) - 1,
+            lambda n: chebyshev(mpf(0), mpf(9) / 16, n),
+        ),
+        "_ERFC": (
+            _erfc_factor,
+            lambda n: chebyshev(1 - 8 / mpf(3.75), 1 - 8 / mpf(31), n),
+        ),
+    }[table]
+
+
+TABLES = ["_SIN", "_COS", "_ATAN", "_ASIN", "_LOG", "_EXP", "_LOG2_5", "_CBRT", "_ERF", "_ERFC"]
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_coefficients_are_interpolated(table):
+    mine = getattr(elementary, table)
+    with mpmath.workprec(1500 if table == "_ERFC" else 400):
+        function, nodes = _derivation(table)
+        derived = interpolated(function, nodes(len(mine)))
+        assert tuple(map(float, derived)) == mine
+        if table == "_ERFC":
+            assert float(derived[0] - mine[0]) == elementary._ERFC_0
+
+
+def is_short(x, bits):
+    return Fraction(x).numerator.bit_length() <= bits
+
+
+def test_parts_of_constants():
+    """Each constant is the sum of its parts, which are short where products must be exact."""
+    with mpmath.workprec(400):
+        log_2, half_pi = mpmath.log(2), mpmath.pi / 2
+        for parts, whole, bits, correct in [
+            (elementary._HALF_PI_4, half_pi, 53 - 21, 138),
+            (elementary._HALF_PI_5, half_pi, 53 - 27, 157),
+            (elementary._HALF_PI_3, half_pi, 26, 105),
+            (elementary._PI_2, half_pi, 53, 107),
+            (elementary._ATAN_HALF, mpmath.atan(mpf(0.5)), 53, 107),
+            (elementary._LOG_2, log_2, 53 - 11, 94),
+            (elementary._LOG_2_HEAD, log_2, 26, 78),
+            (elementary._LOG2_1, 2 / log_2, 53, 105),
+            (elementary._LOG2_3, 2 / log_2 / 3, 26, 78),
+        ]:
+            assert abs(mpmath.fsum(parts) - whole) < mpf(2) ** -correct
+            assert all(is_short(part, bits) for part in parts[:-1])
+        last = mpf(1)
+        for begin, centre, high, low in elementary._LOG2_CENTRES:
+            assert is_short(centre, 8)
+            assert (Fraction(high) * 2**40).denominator == 1
+            assert abs(mpf(high) + low - mpmath.log(centre, 2)) < mpf(2) ** -93
+            assert begin == pytest.approx(float(mpmath.sqrt(last * centre)), abs=5e-4)
+            last = mpf(centre)
+
+
+def test_digits_of_two_over_pi():
+    zeros, *words = elementary._TWO_OVER_PI
+    with mpmath.workprec(64 * len(words) + 64):
+        digits = int(mpmath.floor(2 / mpmath.pi * mpf(2) ** (64 * len(words))))
+    assert zeros == 0
+    assert digits == int("".join(f"{word:016x}" for word in words), 16)
