@@ -38,14 +38,12 @@ def no_more_programs_than_a_process_can_map():
 
 
 SECONDS = {
-    "test_lanes_runs": 230,
     "test_notebooks": 200,
     "test_certify": 180,
     "test_fit": 150,
     "test_docs": 120,
     "test_fit_library": 100,
     "test_fit_real_data": 100,
-    "test_lanes": 90,
     "test_library": 80,
     "test_sweep_store": 80,
     "test_deviations": 80,
@@ -55,7 +53,6 @@ SECONDS = {
     "test_arithmetic": 70,
     "test_gradients": 70,
     "test_readme": 60,
-    "test_lanes_property": 60,
     "test_methods": 50,
     "test_sections": 50,
     "test_sweep_cluster": 40,
