@@ -37,21 +37,37 @@ def no_more_programs_than_a_process_can_map():
         jax.clear_caches()
 
 
-FIRST = [
-    "test_fit_real_data.py",
-    "test_notebooks.py",
-    "test_lanes_property.py",
-    "test_lanes_runs.py",
-    "test_sweep_store.py",
-    "test_speed_baseline.py",
-    "test_fit_statistics.py",
-    "test_docs.py",
-]
-"""Files of minutes and few tests, the longest first."""
+SECONDS = {
+    "test_notebooks": 200,
+    "test_certify": 180,
+    "test_fit": 150,
+    "test_docs": 120,
+    "test_fit_library": 100,
+    "test_fit_real_data": 100,
+    "test_library": 80,
+    "test_sweep_store": 80,
+    "test_deviations": 80,
+    "test_fit_statistics": 80,
+    "test_systems": 70,
+    "test_discovery": 70,
+    "test_arithmetic": 70,
+    "test_gradients": 70,
+    "test_readme": 60,
+    "test_methods": 50,
+    "test_sections": 50,
+    "test_sweep_cluster": 40,
+    "test_lobatto_pair": 40,
+    "test_cli_sweep": 30,
+    "test_paper": 30,
+    "test_run": 30,
+    "test_frequencies": 30,
+    "test_speed_baseline": 30,
+}
+"""Processor seconds of the files that take longest, measured once; others follow by their tests."""
 
 
 def pytest_configure(config):
-    """xdist would begin with the files of many tests: a worker ended with a century, alone."""
+    """xdist would begin with the files of many tests, and one worker end alone with a long file."""
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
 
@@ -59,5 +75,4 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(items):
     """Files that take long before those that do not, so that all workers end at one time."""
     tests = Counter(item.path for item in items)
-    rank = {name: i for i, name in enumerate(FIRST)}
-    items.sort(key=lambda item: (rank.get(item.path.name, len(FIRST)), -tests[item.path]))
+    items.sort(key=lambda item: (-SECONDS.get(item.path.stem, 0), -tests[item.path]))
