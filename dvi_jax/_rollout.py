@@ -275,7 +275,7 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
             failed_step,
             failed_residual,
             carry.iterations + jnp.where(was_good, info.iterations, 0),
-            worse(carry.residual, jnp.where(good, residual, 0)),
+            worse(carry.residual, residual, good),
             reduced,
             beside,
             stop,

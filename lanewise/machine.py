@@ -95,7 +95,8 @@ def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
     if code is None:
         code = object_code(ir)
         cache.write(key, code)
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _own_machine())
+    # One piece of memory for code and data, so that their distance fits into a relocation.
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _own_machine(), use_lmm=True)
     engine.set_object_cache(None, lambda module: code)
     engine.finalize_object()
     _kept.append(engine)

@@ -1,6 +1,7 @@
 """Roots of small systems of equations: what solvers have in common, and Newton's method."""
 
 import abc
+import functools
 from collections.abc import Callable
 from numbers import Real
 from typing import NamedTuple
@@ -105,33 +106,46 @@ class Newton(RootSolver):
         def proceed(state: _Iterate):
             return ~state.converged & state.finite & (state.iterations < self.max_steps)
 
-        def improve(state: _Iterate):
-            value, jacobian = value_and_jacobian(F, state.x)
+        def corrected(x):
+            """x after two corrections, their sizes, and the scale of each component."""
+            value, jacobian = value_and_jacobian(F, x)
             first = lanewise.solve(jacobian, value)
-            x = state.x - first
+            x = x - first
             second = lanewise.solve(jacobian, F(x))
             x = x - second
-            error, scale = jnp.abs(second), jnp.maximum(known, jnp.abs(x))
-            before, worst, size = largest(first), largest(error), largest(scale)
-            if self.rtol is None and self.atol == 0:
+            first, second, now = jnp.abs(first), jnp.abs(second), jnp.abs(x)
+            return x, first, second, jnp.where(known > now, known, now)
+
+        def judged(first, second, scale):
+            """Whether x is a root; the largest components of the corrections and of the scale."""
+            before, worst, size = map(_largest_of, (first, second, scale))
+            if by_rate:
                 # With one Jacobian corrections shrink linearly, and have been seen to, by a factor
                 # of worst/before: what is left is that much of the last one.
-                left = error * worst <= 0.5 * eps * before * scale
-                settled = jnp.all(left | (error <= 4 * eps * scale))
-                small = worst <= 4096 * eps * size
+                left = second * worst <= (0.5 * eps * before) * scale
+                settled = jnp.all(left | (second <= 4 * eps * scale))
             else:
-                settled = jnp.all(error <= (self.rtol or 0.0) * scale + self.atol)
-                small = worst <= (self.rtol or 0.0) * size + self.atol
+                settled = jnp.all(second <= (self.rtol or 0.0) * scale + self.atol)
+            return settled, before, worst, size
+
+        def improve(state: _Iterate):
+            x, first, second, scale = corrected(state.x)
+            settled, before, worst, size = judged(first, second, scale)
             # A component that is all round-off of the others never settles by its own measure: it
             # is enough that it is small beside them and shrinks no more.
+            rtol = 4096 * eps if by_rate else self.rtol or 0.0
+            small = worst <= rtol * size + self.atol
             stalled = small & ((worst >= 0.5 * before) | (worst >= 0.5 * state.error[0]))
             finite = jnp.all(jnp.isfinite(second))
             error = jnp.stack([worst, size])
             return _Iterate(x, error, finite, settled | stalled, state.iterations + 1)
 
-        no = jnp.asarray(False)
-        unknown = jnp.full((2,), jnp.nan, x0.dtype)  # no comparison with it is true
-        start = _Iterate(x0, unknown, ~no, no, jnp.asarray(0, jnp.int32))
+        by_rate = self.rtol is None and self.atol == 0
+        # Nearly all steps need one Jacobian, so that the first turn of the loop stands before it.
+        x, *sizes = corrected(x0)
+        settled, _, worst, size = judged(*sizes)
+        one = jnp.asarray(1, jnp.int32)
+        start = _Iterate(x, jnp.stack([worst, size]), jnp.asarray(True), settled, one)
         end = lax.while_loop(proceed, improve, start)
         return Found(end.x, end.iterations, end.error, end.converged & end.finite)
 
@@ -207,9 +221,19 @@ def largest(x: Vector) -> Float[Array, ""]:
     return jnp.max(jnp.abs(x), initial=0.0)
 
 
-def worse(a: Float[Array, "2"], b: Float[Array, "2"]) -> Float[Array, "2"]:
-    """The larger of two quotients, each given as (numerator, denominator); a, if b is NaN."""
-    return jnp.where(b[0] * a[1] > a[0] * b[1], b, a)
+def _largest_of(x: Vector) -> Float[Array, ""]:
+    """The largest of numbers that are not negative; a NaN among them may be left out."""
+    if x.size > 16:
+        return jnp.max(x, initial=0.0)
+    return functools.reduce(lambda a, b: jnp.where(a > b, a, b), [x[i] for i in range(x.size)])
+
+
+def worse(
+    a: Float[Array, "2"], b: Float[Array, "2"], counts: Bool[Array, ""] | bool = True
+) -> Float[Array, "2"]:
+    """The larger of two quotients, each given as (numerator, denominator); a, if b is NaN or does
+    not count."""
+    return jnp.where(counts & (b[0] * a[1] > a[0] * b[1]), b, a)
 
 
 def no_residual(dtype) -> Float[Array, "2"]:
