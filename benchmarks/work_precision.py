@@ -10,18 +10,17 @@ Work is counted as the package does it. One evaluation is one gradient of H_D, b
 the force W where there is one:
 
     explicit part of a step       1 (a half for p, a half for q)
-    implicit part of a step       1.5 (guess, residual, other half) and (1 + n w)/2 an iteration
-    Gauss, s stages               2 s (guess, end) and s + 2 s n · s w an iteration
-    Lobatto pair, s stages        4 m + s/2 (guess, residual, end) and m + 2 (s − 1) n · m w an
-                                  iteration, m = s − 1/2
-      where q is not in ∂H/∂p     the same, and m + (s − 1) n · m w an iteration
+    implicit part of a step       1 (guess, other half) and 1 + n w/2 an iteration
+    Gauss, s stages               2 s (guess, end) and 2 s + 2 s n · s w an iteration
+    Lobatto pair, s stages        3 m + s/2 (guess, end) and 2 m + 2 (s − 1) n · m w an iteration,
+                                  m = s − 1/2
+      where q is not in ∂H/∂p     3 m + s (guess, end) and 2 m + (s − 1) n · m w an iteration
       two stages without a solve  3.5
     RungeKutta4                   4
 
 with n the dimension of q and w = JACOBIAN_WEIGHT what one column of a Jacobian costs at one point,
-in evaluations. What the last residual and the end of a step have in common is evaluated once: all
-rates of Gauss, ∂H/∂p of the pair where q is not in it. Iterations are those that Newton's method
-reports, not assumed.
+in evaluations. An iteration is a Jacobian and the two residuals that are corrected by it; how many
+there are is what Newton's method reports, not an assumption.
 
 Kicks that meet between two parts are counted twice, as they are computed.
 
@@ -210,22 +209,20 @@ def cost(method: dvi.Method, problem: Problem) -> Cost:
         return Cost(4, 0, 0)
     if isinstance(method, dvi.GaussLegendre):
         s = method.stages
-        return Cost(2 * s, s, 2 * s * n * s)  # the last residual is that of the end
-    directions = (dvi.TypeII(), dvi.Adjoint())
-    explicit = [m.is_explicit(problem.system, q, problem.args) for m in directions]
+        return Cost(2 * s, 2 * s, 2 * s * n * s)
     if isinstance(method, dvi.LobattoIIIAIIIB):
+        directions = (dvi.TypeII(), dvi.Adjoint())
+        explicit = [m.is_explicit(problem.system, q, problem.args) for m in directions]
         return lobatto_cost(method.stages, n, *explicit)
     if isinstance(method, dvi.TypeII):
-        parts = (1, 0)
+        parts = 1
     elif isinstance(method, dvi.Adjoint) and isinstance(method.method, dvi.TypeII):
-        parts = (0, 1)
+        parts = 1
     elif hasattr(method, "fractions") and isinstance(method.base, dvi.TypeII):
-        count = len(method.fractions())
-        parts = (count - count // 2, count // 2)
+        parts = len(method.fractions())
     else:
         raise TypeError(f"what does a step of {method!r} cost? Say so in cost().")
-    step = sum(k * (1 if e else 1.5) for k, e in zip(parts, explicit, strict=True))
-    return Cost(step, 0.5, n / 2)
+    return Cost(parts, 1, n / 2)
 
 
 def lobatto_cost(s, n, step_is_explicit, inverse_is_explicit) -> Cost:
@@ -234,8 +231,8 @@ def lobatto_cost(s, n, step_is_explicit, inverse_is_explicit) -> Cost:
         return Cost(3.5, 0, 0)  # halves: one sweep of 2 + 1, 2 for Q, 2 at the end
     sweep = s - 1 / 2  # s halves for Q, s − 1 for P
     unknowns = (1 if inverse_is_explicit else 2) * (s - 1) * n
-    end = s / 2  # forces; Q is unknown, or that of the last residual
-    return Cost(4 * sweep + end, sweep, unknowns * sweep)  # three sweeps, one last residual
+    end = s if inverse_is_explicit else s / 2  # forces, and velocities unless Q is an unknown
+    return Cost(3 * sweep + end, 2 * sweep, unknowns * sweep)  # three sweeps for the guess
 
 
 class Run(NamedTuple):
