@@ -214,9 +214,8 @@ def cost(method: dvi.Method, problem: Problem) -> Cost:
         directions = (dvi.TypeII(), dvi.Adjoint())
         explicit = [m.is_explicit(problem.system, q, problem.args) for m in directions]
         return lobatto_cost(method.stages, n, *explicit)
-    if isinstance(method, dvi.TypeII):
-        parts = 1
-    elif isinstance(method, dvi.Adjoint) and isinstance(method.method, dvi.TypeII):
+    base = method.method if isinstance(method, dvi.Adjoint) else method
+    if isinstance(base, dvi.TypeII):
         parts = 1
     elif hasattr(method, "fractions") and isinstance(method.base, dvi.TypeII):
         parts = len(method.fractions())

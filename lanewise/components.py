@@ -14,6 +14,9 @@ from .jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies, scan_counts
 from .memory import Buffer, contiguous, load, store
 from .rules import CALLS, CUMULATIVE, MOVES, REDUCTIONS, VIEWS
 
+Entries = Any
+"""An array of `Num`, with dtype object: the types of NumPy cannot say so."""
+
 SMALL = 128
 """Arrays of up to so many elements are numbers of their own; larger ones stay in memory."""
 
@@ -34,7 +37,7 @@ class Value:
 
     def __init__(self, shape, dtype, entries=None, buffer: Buffer | None = None):
         self.shape, self.dtype = tuple(shape), str(dtype)
-        self.entries: np.ndarray | None = entries
+        self.entries: Entries | None = entries
         self.buffer = buffer
         self.is_tangent = False
 
@@ -63,7 +66,7 @@ class Value:
         return out
 
 
-def objects(entries: Sequence[Any], shape: Sequence[int]) -> np.ndarray:
+def objects(entries: Sequence[Any], shape: Sequence[int]) -> Entries:
     """An object array of these entries, in row-major order."""
     flat = np.empty(len(entries), object)
     for i, entry in enumerate(entries):
@@ -122,7 +125,7 @@ class Evaluator:
 
         def read(atom: Any) -> Value:
             if isinstance(atom, Literal):
-                return self.constant(np.asarray(atom.val, atom.aval.dtype))
+                return self.constant(np.asarray(atom.val, atom.aval.dtype))  # pyright: ignore[reportAttributeAccessIssue]
             return known[atom]
 
         for eqn in jaxpr.eqns:
@@ -182,7 +185,7 @@ class Evaluator:
 
     # --- values --------------------------------------------------------------------------------
 
-    def entries(self, value: Value, most: int = MADE) -> np.ndarray:
+    def entries(self, value: Value, most: int = MADE) -> Entries:
         """The numbers of an array, read from memory if it is there."""
         if value.entries is not None:
             return value.entries
@@ -580,7 +583,7 @@ class Evaluator:
         if not which.vec:
             results = self._one_of(takes, [run(x) for x in branches], vec, dtypes)
         else:
-            results = None
+            results: Any = None
             for take, branch in zip(takes, branches, strict=True):
                 zeros = [b.known(0, d) for d in dtypes]
                 mine = b.branch(b.any(take), run(branch), lambda z=zeros: z, vec, dtypes)
@@ -600,7 +603,7 @@ class Evaluator:
         rest = functools.partial(self._one_of, takes[1:], runs[1:], vec, dtypes)
         return b.branch(b.ref(takes[0], 0, False), runs[0], rest, vec, dtypes)
 
-    # --- linear systems ----------------------------------------------------------------------------
+    # --- linear systems ---------------------------------------------------------------------------
 
     def linear_solve(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         """custom_linear_solve: what it solves with."""
@@ -705,7 +708,7 @@ class Evaluator:
             total = b.new(f"call {TYPES[x.dtype]} @llvm.vector.reduce.smin.{full}({t} {total})")
         return [self.value([b.made([total], x.dtype, False)], eqn.outvars[0].aval)]
 
-    # --- numbers, indices ---------------------------------------------------------------------------
+    # --- numbers, indices -------------------------------------------------------------------------
 
     def iota(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         params = eqn.params
@@ -943,14 +946,14 @@ def _places(jaxpr: Jaxpr, wanted: Sequence[Buffer | None]) -> dict[Any, Buffer]:
             continue
         name = eqn.primitive.name
         if name == "concatenate":
-            shapes = [v.aval.shape for v in eqn.invars]
+            shapes = [v.aval.shape for v in eqn.invars]  # pyright: ignore[reportAttributeAccessIssue]
             parts = _parts(place, eqn.params["dimension"], shapes)
             for v, part in zip(eqn.invars, parts, strict=True):
                 if not isinstance(v, Literal):
                     places.setdefault(v, part)
         elif name in ("reshape", "squeeze", "expand_dims"):
             (v, *_) = eqn.invars
-            part = place.reshaped(v.aval.shape)
+            part = place.reshaped(v.aval.shape)  # pyright: ignore[reportAttributeAccessIssue]
             if part is not None and not isinstance(v, Literal):
                 places.setdefault(v, part)
     return places
@@ -994,7 +997,7 @@ _SPECIAL: dict[str, Callable] = {
 }  # fmt: skip
 
 
-# --- elementwise primitives: rule(evaluator, parameters, *numbers) → number -------------------------
+# --- elementwise primitives: rule(evaluator, parameters, *numbers) → number ----------------------
 
 
 def _binary(method: str) -> Callable:
@@ -1100,6 +1103,13 @@ def _mul(e: Evaluator, _: Any, a: Num, b: Num) -> Num:
     return e.combine("mul", a, b)
 
 
+def _reduced_precision(e: Evaluator, params: dict, x: Num) -> Num:
+    wide = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype)
+    if wide is None or params["exponent_bits"] < wide[0] or params["mantissa_bits"] < wide[1]:
+        raise Unsupported("reduce_precision to fewer bits")
+    return x
+
+
 ELEMENTWISE: dict[str, Callable] = {
     "add": _add,
     "add_any": _add,
@@ -1126,7 +1136,7 @@ ELEMENTWISE: dict[str, Callable] = {
     "is_finite": lambda e, _, x: e.b.is_finite(x),
     "convert_element_type": _convert,
     "bitcast_convert_type": _bitcast,
-    "reduce_precision": lambda e, p, x: _reduced_precision(e, p, x),
+    "reduce_precision": _reduced_precision,
     "copy": lambda e, _, x: x,
     "copy_p": lambda e, _, x: x,
     "stop_gradient": lambda e, _, x: x,
@@ -1151,10 +1161,3 @@ ELEMENTWISE: dict[str, Callable] = {
     },
 }  # fmt: skip
 """Applied number by number; an operand without axes goes with each number of the others."""
-
-
-def _reduced_precision(e: Evaluator, params: dict, x: Num) -> Num:
-    wide = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype)
-    if wide is None or params["exponent_bits"] < wide[0] or params["mantissa_bits"] < wide[1]:
-        raise Unsupported("reduce_precision to fewer bits")
-    return x

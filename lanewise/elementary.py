@@ -37,10 +37,14 @@ on a CPU, which generated code must not do.
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+
+Real = Any
+"""An array or a constant of NumPy or Python."""
 
 # --- bits and selections ----------------------------------------------------------------------
 
@@ -58,7 +62,7 @@ def _float(bits: Array) -> Array:
     return lax.bitcast_convert_type(bits, jnp.float64)
 
 
-def _shift_right(bits: Array, count: int | Array) -> Array:
+def _shift_right(bits: Array | np.int64, count: int | Array) -> Array:
     """Logical shift: zeros enter from the left."""
     return lax.shift_right_logical(bits, np.int64(count) if isinstance(count, int) else count)
 
@@ -98,13 +102,13 @@ def _with_sign_of(value: Array, sign: Array) -> Array:
     return _float(_bits(value) ^ (sign & _SIGN))
 
 
-def _fast_two_sum(x: Array, y: Array) -> tuple[Array, Array]:
+def _fast_two_sum(x: Real, y: Array) -> tuple[Array, Array]:
     """The rounded sum and its error, for |x| ≥ |y| or x = 0 (Dekker 1971)."""
     total = x + y
     return total, (x - total) + y
 
 
-def _two_sum(x: Array, y: Array) -> tuple[Array, Array]:
+def _two_sum(x: Array, y: Real) -> tuple[Array, Array]:
     """The rounded sum and its error (Knuth 1969). A constant is y: XLA simplifies x + c − c."""
     total = x + y
     part = total - x
@@ -118,7 +122,7 @@ def _head(x: Array) -> Array:
 
 def _polynomial(z: Array, coefficients: Sequence[float]) -> Array:
     """Value of c0 + c1 z + c2 z² + … by Horner's scheme."""
-    value = coefficients[-1]
+    value: Real = coefficients[-1]
     for c in coefficients[-2::-1]:
         value = value * z + c
     return value
@@ -389,7 +393,7 @@ _PI_4 = _PI_2[0] / 2, _PI_2[1] / 2
 _ATAN_HALF = float.fromhex("0x1.dac670561bb4fp-2"), float.fromhex("0x1.a2b7f222f65e2p-56")
 
 
-def _angle(y: Array, x: Array) -> Array:
+def _angle(y: Array, x: Real) -> Array:
     """atan(y/x) for 0 ≤ x, y < ∞, not both 0: between 0 and π/2.
 
     In the first octant, n ≤ d,  atan(n/d) = atan c + atan t,  t = (n − c d)/(d + c n), with
@@ -534,7 +538,7 @@ def exp(x: Array) -> Array:
     return _unless(lax.abs(x) < _EXP_LIMIT, _scaled(value, bits), extreme, x, value, bits)
 
 
-def _exp2_terms(high: Array, low: Array) -> tuple[Array, Array]:
+def _exp2_terms(high: Array, low: Real) -> tuple[Array, Array]:
     """w + d = 2^(high + low), |high| ≤ 1/2, |low| below 2^−25 |high| or 2^−25."""
     head = _head(high)
     low = (high - head) + low

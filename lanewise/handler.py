@@ -268,7 +268,7 @@ finish:
 """
 
 _FIRST_FUNCTION = 48
-"""Offset of the first function in XLA's table: its size, extension, version (24), internal table."""
+"""Offset of the first function in XLA's table: size, extension, version (24), internal table."""
 _SCHEDULE = _FIRST_FUNCTION + 8 * 11
 _COUNT = _FIRST_FUNCTION + 8 * 12
 

@@ -83,9 +83,9 @@ class Module(Kernel):
     def elementary(self, name: str, args: Sequence[Num]) -> Num:
         """An elementary function of float64, as a call of a function of the module."""
         vec = any(a.vec for a in args)
-        known = all(a.known is not None for a in args)
-        if known:
-            return self.b.known(_at_known(name, tuple(float(a.known) for a in args)), "float64")
+        known: list[Any] = [a.known for a in args]
+        if all(x is not None for x in known):
+            return self.b.known(_at_known(name, tuple(float(x) for x in known)), "float64")
         called = self._function(name, len(args), vec)
         return self.b.op(
             f"call {name}", args, "float64",

@@ -123,6 +123,7 @@ def _load_vector(b: Builder, buffer: Buffer, u, moving: Num, fixed: int, item: s
     base = buffer.base[u if buffer.lane is not None else 0]
     vector = f"<{b.W} x {item}>"
     if not moving.vec:
+        assert buffer.lane is not None  # else the number is the same on all trajectories
         where = base
         if moving.known is None:
             where = b.new(f"getelementptr {item}, ptr {base}, i64 {moving.names[0]}")
