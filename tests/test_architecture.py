@@ -1,6 +1,9 @@
 """Imports run downward only, and the public names are there."""
 
 import ast
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,7 +12,7 @@ import dvi_jax as dvi
 
 ROOT = Path(dvi.__file__).parent
 FLOORS = [
-    ["_compat", "_types", "_results"],
+    ["_types", "_results"],
     ["_precision", "_progress"],
     ["engine"],
     ["_system", "_solution"],
@@ -17,7 +20,6 @@ FLOORS = [
     ["methods", "lattices", "symmetry", "observe"],
     ["_arithmetic"],
     ["_rollout", "_extended", "_dense"],
-    ["_segments"],
     ["_adjoints"],
     ["_reversible"],
     ["_integrate"],
@@ -105,6 +107,93 @@ def test_command_line_imports_the_package_within_its_commands_alone(path):
             assert not any(part.startswith("_") for part in name.split(".")[1:]), name
             if name.split(".")[0] in HEAVY and path.stem not in WORK:
                 assert node not in tree.body, f"{path.name} imports {name} before it runs"
+
+
+LANEWISE = sorted((ROOT.parent / "lanewise").glob("*.py"))
+MOVING = ("jax._src", "jax.interpreters", "jax.extend", "jax.core")
+"""Names of JAX that change between releases."""
+
+
+def imported_modules(path: Path):
+    """The full name of all that a file imports from other packages."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and not node.level:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+@pytest.mark.parametrize("path", LANEWISE, ids=lambda p: p.name)
+def test_lanewise_imports_nothing_of_this_package(path):
+    names = [name.split(".")[0] for name in imported_modules(path)]
+    assert not {"dvi_jax", "dvi_jax_cli"} & set(names)
+    docstring = ast.get_docstring(ast.parse(path.read_text()))
+    assert docstring
+    assert docstring.splitlines()[0].endswith(".")
+
+
+def names_that_move(path: Path) -> list[str]:
+    return [
+        name
+        for name in imported_modules(path)
+        if any(f"{name}.".startswith(f"{moving}.") for moving in MOVING)
+    ]
+
+
+def test_names_of_jax_that_move_are_imported_in_one_file():
+    users = [path for path in (*LANEWISE, *FILES) if names_that_move(path)]
+    assert users == [ROOT.parent / "lanewise" / "jaxapi.py"]
+    attributes = [
+        (path.name, ast.unparse(node))
+        for path in (*LANEWISE, *FILES)
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Attribute) and ast.unparse(node) in MOVING
+    ]
+    assert attributes == []
+
+
+GLOBALS = """
+import json
+import jax, jax.numpy, jax.scipy.linalg, equinox, optimistix, lineax, optax
+from jax._src.interpreters.batching import fancy_primitive_batchers
+from jax.interpreters import ad, mlir, partial_eval
+
+TABLES = {
+    "dead code": partial_eval.dce_rules, "batching": fancy_primitive_batchers,
+    "forward": ad.primitive_jvps, "transposes": ad.primitive_transposes,
+    "lowering": mlir._lowerings, "lowering on a CPU": mlir._platform_specific_lowerings["cpu"],
+    "partial evaluation": partial_eval.custom_partial_eval_rules,
+}
+CONFIGURED = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_default_matmul_precision",
+              "jax_compilation_cache_dir", "jax_debug_nans")
+
+def state():
+    tables = {name: dict(table) for name, table in TABLES.items()}
+    return tables, {name: getattr(jax.config, name) for name in CONFIGURED}
+
+before, settings = state()
+import dvi_jax, dvi_jax.systems
+after, settings_after = state()
+assert settings == settings_after
+new = {}
+for name, table in before.items():
+    assert all(after[name][p] is rule for p, rule in table.items()), name
+    new[name] = sorted({p.name for p in after[name]} - {p.name for p in table})
+print(json.dumps(new))
+"""
+
+
+def test_importing_changes_no_rule_of_a_primitive_of_jax():
+    """Rules are added for primitives of lanewise only, and no setting is changed."""
+    out = subprocess.run(
+        [sys.executable, "-c", GLOBALS], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert out.returncode == 0, out.stderr
+    new = json.loads(out.stdout)
+    own = {"lanewise", "lanes_in_front", "eliminate", "unit_vectors", "least_over_lanes"}
+    assert new["dead code"] == ["lanewise"]  # none for a loop of JAX
+    assert "lanewise" in new["batching"]  # what is looked for can be found
+    assert {name for names in new.values() for name in names} <= own
 
 
 def test_nothing_imports_the_command_line():

@@ -4,12 +4,10 @@ import os
 import subprocess
 import sys
 
-import jax
 import jax.numpy as jnp
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax.engine.cpu import takes_options
 
 
 def run(code, **environment):
@@ -63,17 +61,3 @@ def test_too_late_is_refused_with_what_to_do():
 def test_importing_changes_no_flag():
     done = run("import os, dvi_jax; print(os.environ.get('XLA_FLAGS'))")
     assert done.stdout.strip() == "None"
-
-
-def test_options_go_to_the_outermost_compilation_only():
-    x = jnp.ones(2)
-    assert takes_options(x)
-    found = []
-
-    def probe(x):
-        found.append(takes_options(x))
-        return jnp.sum(x)
-
-    jax.vmap(probe)(jnp.ones((2, 2)))
-    jax.jit(probe)(x)
-    assert found == [True, False]

@@ -6,28 +6,35 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from dvi_jax.engine.dependence import depends_on
-from dvi_jax.engine.linear import UNROLLED_UP_TO, solve_dense
+import lanewise
 from dvi_jax.engine.newton import Newton, find_root
+from lanewise.dependence import depends_on
+from lanewise.linear import WRITTEN_OUT
 
-SOLVE = {n: jax.jit(solve_dense) for n in range(1, 6)}
+SOLVE = {
+    "XLA": jax.jit(lanewise.solve),
+    "machine code": jax.jit(lambda A, b: lanewise.call(lanewise.solve, A, b)),
+}
+EACH = pytest.mark.parametrize("solve", list(SOLVE))
 
 
+@EACH
 @settings(max_examples=60, deadline=None)
 @given(n=st.integers(1, 5), seed=st.integers(0, 2**31))
-def test_solve_agrees_with_lapack_in_backward_error(n, seed):
+def test_solve_agrees_with_lapack_in_backward_error(solve, n, seed):
     rng = np.random.default_rng(seed)
     A, b = rng.normal(size=(n, n)), rng.normal(size=n)
-    x = np.asarray(SOLVE[n](A, b))
+    x = np.asarray(SOLVE[solve](A, b))
     backward = np.max(np.abs(A @ x - b)) / (np.max(np.abs(A)) * np.max(np.abs(x)) + 1)
     assert backward < 1e-13
 
 
+@EACH
 @pytest.mark.parametrize("n", [2, 3, 4])
-def test_solve_pivots(n):
+def test_solve_pivots(solve, n):
     A = np.eye(n)[::-1].copy() + 1e-30 * np.eye(n)
     b = np.arange(1.0, n + 1)
-    np.testing.assert_allclose(SOLVE[n](A, b), b[::-1], rtol=1e-14)
+    np.testing.assert_allclose(SOLVE[solve](A, b), b[::-1], rtol=1e-14)
     assert not np.allclose(_eliminate_without_pivoting(A, b), b[::-1])  # what pivoting saves from
 
 
@@ -46,29 +53,38 @@ def _eliminate_without_pivoting(A, b):
     return x
 
 
-def test_singular_matrix_gives_no_number():
-    assert not np.isfinite(SOLVE[2](np.ones((2, 2)), np.array([1.0, 2.0]))).all()
+@EACH
+def test_singular_matrix_gives_no_number(solve):
+    assert not np.isfinite(SOLVE[solve](np.ones((2, 2)), np.array([1.0, 2.0]))).all()
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
 def test_batched_newton_calls_lapack_only_above_the_limit(n):
-    def batch(x):
-        def one(x):
-            return find_root(lambda y: y + 0.1 * jnp.sin(y) * jnp.sum(y) - x, x, x, Newton())[0]
+    """As XLA compiles it; machine code of our own never does."""
 
-        return jnp.sum(jax.vmap(one)(x))
+    def one(x):
+        return jnp.sum(
+            find_root(lambda y: y + 0.1 * jnp.sin(y) * jnp.sum(y) - x, x, x, Newton())[0]
+        )
 
-    for f in (batch, jax.grad(batch)):
-        text = str(jax.make_jaxpr(f)(jnp.ones((3, n))))
-        assert ("lu[" in text or "triangular_solve" in text) == (n > UNROLLED_UP_TO)
+    def has_lapack(batch):
+        text = jax.jit(batch).lower(jnp.ones((3, n))).as_text()
+        return "getrf" in text or "trsm" in text
+
+    for f in (one, jax.grad(one)):
+        assert has_lapack(jax.vmap(f)) == (n > WRITTEN_OUT)
+        assert not has_lapack(lanewise.batched(f))
 
 
 def test_newton_finds_the_root_to_round_off_and_counts():
     root, info = find_root(lambda x: x**3 - 2, jnp.array([1.5]), jnp.array([2.0]), Newton())
     assert abs(float(root[0]) - 2 ** (1 / 3)) < 4e-16
     assert bool(info.converged)
-    assert 3 <= int(info.iterations) <= 7
-    assert float(info.residual) < 1e-15
+    assert 2 <= int(info.iterations) <= 4
+    # The last correction is the root's error times the factor by which corrections shrink.
+    worst, scale = map(float, info.residual)
+    assert scale == 2
+    assert worst < 1e-10
 
 
 def test_newton_says_when_there_is_no_root():
@@ -80,7 +96,7 @@ def test_newton_says_when_there_is_no_root():
 def test_newton_stops_at_nan_at_once():
     _, info = find_root(jnp.log, jnp.array([-1.0]), jnp.array([1.0]), Newton())
     assert not bool(info.converged)
-    assert int(info.iterations) == 1
+    assert int(info.iterations) <= 2
 
 
 def test_a_slow_lane_does_not_change_its_neighbours():

@@ -1,15 +1,8 @@
-"""A batch cut into pieces, each in a thread of its own."""
+"""The processors of this process, and the older name for a batch on all of them."""
 
-import math
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
-
-import jax
-import jax.numpy as jnp
-
-from lanewise.jaxapi import is_traced, x64_enabled
 
 
 def over_threads(
@@ -18,24 +11,22 @@ def over_threads(
     in_axes: int | Sequence[int | None] | None = 0,
     out_axes: int = 0,
 ) -> Callable[..., Any]:
-    """The batched, jitted `function` on pieces of its batch at the same time, one to a thread.
+    """`function` itself: a batch of trajectories uses all cores without it.
 
-    ``over_threads(jax.jit(jax.vmap(one)))(q0, p0)`` gives what ``jax.jit(jax.vmap(one))(q0, p0)``
-    does: a compiled loop over steps runs on one core, this takes all of them.
+    It cut a batch into pieces, one for each thread, when a compiled loop over steps ran on one
+    core. Now ``jax.jit(jax.vmap(one))`` divides a batch among the threads that XLA has for the
+    processors of the process. The function stays for programs that call it.
 
     **Arguments**
 
-    - `function`: compiled (`jax.jit`), with lanes that do not depend on each other. It is called
-      with pieces of one size; the last is filled up with copies of the last lane.
-    - `threads`: pieces, and threads; None means the processors that this process may use.
-    - `in_axes`: the axis of lanes of all arguments, or of each; None where one has no lanes.
-    - `out_axes`: that of every output array.
+    - `function`: a function of arrays, for example ``jax.jit(jax.vmap(one))``.
+    - `threads`, `in_axes`, `out_axes`: have no effect any more; `lanewise.set_threads` limits the
+      number of threads.
 
-    **Returns** a function like `function`; it waits for the result.
+    **Returns** a function that calls `function` with the same arguments.
 
-    **Raises** `ValueError` for arguments without lanes or with different numbers of them, and
-    under jit, vmap or grad, which belong inside of `function`; `TypeError` for settings of another
-    type.
+    **Raises** `TypeError` if `function` cannot be called or `threads` is not an integer or None,
+    `ValueError` if `threads` is not positive.
 
     **Example**
 
@@ -52,38 +43,14 @@ def over_threads(
         raise TypeError(
             f"over_threads takes a function, e.g. jax.jit(jax.vmap(one)), got {function!r}."
         )
-    if threads is None:
-        threads = processors()
-    if isinstance(threads, bool) or not isinstance(threads, int):
-        raise TypeError(f"threads must be a whole number or None, got {threads!r}.")
-    if threads < 1:
-        raise ValueError(f"threads must be at least 1, got {threads}.")
-    count = threads
-    known: set[Any] = set()
+    if threads is not None:
+        if isinstance(threads, bool) or not isinstance(threads, int):
+            raise TypeError(f"threads must be a positive integer or None, got {threads!r}.")
+        if threads < 1:
+            raise ValueError(f"threads must be at least 1, got {threads}.")
 
     def call(*args: Any) -> Any:
-        leaves, axes, tree = _with_axes(args, in_axes)
-        lanes, x64 = _lanes(leaves, axes), x64_enabled()
-        size = math.ceil(lanes / min(count, lanes))
-        starts = range(0, lanes, size)
-
-        def piece(start: int) -> Any:
-            mine = [
-                x if a is None else _cut(x, a, start, size)
-                for x, a in zip(leaves, axes, strict=True)
-            ]
-            with jax.enable_x64(x64):  # a context of the caller's, which threads do not inherit
-                return jax.block_until_ready(function(*jax.tree.unflatten(tree, mine)))
-
-        like = (tree, size, tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves))
-        # What has not been compiled yet is compiled by one of the threads.
-        first = [] if like in known else [piece(0)]
-        known.add(like)
-        with ThreadPoolExecutor(count) as pool:
-            outs = [*first, *pool.map(piece, starts[len(first) :])]
-        if len(outs) == 1:
-            return outs[0]
-        return jax.tree.map(lambda *xs: _joined(xs, out_axes, lanes), *outs)
+        return function(*args)
 
     return call
 
@@ -93,70 +60,3 @@ def processors() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _with_axes(args: tuple, in_axes: Any) -> tuple[list[Any], list[int | None], Any]:
-    """The leaves of the arguments, the axis of lanes of each, and the tree."""
-    each = [in_axes] * len(args) if isinstance(in_axes, int | None) else list(in_axes)
-    if len(each) != len(args):
-        raise ValueError(
-            f"in_axes has {len(each)} entries for {len(args)} arguments: give one for each, or "
-            "one number for all."
-        )
-    for axis in each:
-        if axis is not None and (isinstance(axis, bool) or not isinstance(axis, int)):
-            raise TypeError(f"an axis of lanes is a whole number or None, got {axis!r}.")
-    axes = []
-    for argument, axis in zip(args, each, strict=True):
-        axes += [axis] * len(jax.tree.leaves(argument))
-    leaves, tree = jax.tree.flatten(args)
-    if any(is_traced(x) for x in leaves):
-        raise ValueError(
-            "over_threads cuts arrays that are there, but was called under jit, vmap or grad: put "
-            "those inside, over_threads(jax.jit(jax.vmap(jax.grad(loss))))."
-        )
-    return leaves, axes, tree
-
-
-def _lanes(leaves: list[Any], axes: list[int | None]) -> int:
-    found = {}
-    for x, axis in zip(leaves, axes, strict=True):
-        if axis is None:
-            continue
-        shape = jnp.shape(x)
-        if not -len(shape) <= axis < len(shape):
-            raise ValueError(
-                f"in_axes says that lanes are along axis {axis}, but an argument has shape "
-                f"{shape}: give None for arguments without lanes."
-            )
-        found[shape[axis]] = shape
-    if len(found) != 1:
-        raise ValueError(
-            "the arguments must have one number of lanes, got "
-            + (" and ".join(f"{n} (shape {s})" for n, s in found.items()) or "none with lanes")
-            + "."
-        )
-    (lanes,) = found
-    if lanes == 0:
-        raise ValueError("there are no lanes: a batch must have at least one.")
-    return lanes
-
-
-def _cut(x: Any, axis: int, start: int, size: int) -> Any:
-    """`size` lanes from number `start`, the last lane again where there are no more."""
-    x = jnp.asarray(x)
-    piece = jax.lax.slice_in_dim(x, start, min(start + size, x.shape[axis]), axis=axis)
-    missing = size - piece.shape[axis]
-    if not missing:
-        return piece
-    last = jax.lax.slice_in_dim(x, -1, None, axis=axis)
-    return jnp.concatenate([piece, *[last] * missing], axis=axis)
-
-
-def _joined(xs: Sequence[Any], axis: int, lanes: int) -> Any:
-    if not -jnp.ndim(xs[0]) <= axis < jnp.ndim(xs[0]):
-        raise ValueError(
-            f"out_axes says that lanes are along axis {axis}, but an output has shape "
-            f"{jnp.shape(xs[0])} for {lanes} lanes: give the axis along which function has them."
-        )
-    return jax.lax.slice_in_dim(jnp.concatenate(xs, axis), 0, lanes, axis=axis)
