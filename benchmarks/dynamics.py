@@ -43,7 +43,7 @@ def lyapunov() -> Iterator[Row]:
     rng = np.random.default_rng(0)
     q = jnp.asarray(np.array(CHAOTIC[0]) + 1e-12 * rng.normal(size=(512, 2)))
     run = jax.jit(jax.vmap(lambda x: along(x, CHAOTIC[1], dvi.LyapunovSpectrum(), 80_000)))
-    mean = np.asarray(dvi.over_threads(run)(q)).mean(0)
+    mean = np.asarray(run(q)).mean(0)
     off = np.abs(mean - [0.052, 0, 0, -0.052]).max()
     yield (
         "Lyapunov spectrum, t = 4000",

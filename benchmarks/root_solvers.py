@@ -4,8 +4,8 @@
 
 In each round every solver runs the same trajectories once, in random order; times are processor
 times of this process on one core, medians of the rounds. Layout and compiler options are those of
-a plain `jax.jit(jax.vmap(integrate))`: arrays for one trajectory of a thousand steps, components
-for a batch if the functions are small enough. Every row also has the iterations per step, whether
+a plain `jax.jit(jax.vmap(integrate))`: machine code of `lanewise` if the functions are small
+enough. Every row also has the iterations per step, whether
 all lanes succeeded, and the largest difference to Newton's states relative to the largest state.
 
 Rows: ten bodies (the Sun and nine planets on circles; n = 30) with forces that depend a little on
@@ -14,7 +14,8 @@ depend on the positions, tridiagonal Jacobian, n = 2 … 100; the same with all 
 Jacobian; Gauss's method on the ten bodies and on three; and, as controls, pendulums with a drag so
 strong that fixed-point iteration cannot converge.
 
-Predictions, written before the first run:
+Predictions, written before the first run, when Newton's method made one correction for each
+Jacobian and XLA compiled all of it:
 
 1. Ten bodies, one trajectory: a Newton iteration is some 30 directional derivatives of the rate (in
    one vectorised call), an LU of 30 × 30 and one residual; Picard's is one rate. Both make two
@@ -22,9 +23,9 @@ Predictions, written before the first run:
 2. Batch of ten bodies: arrays for all of them; LAPACK goes lane by lane, so 10 times and more.
 3. Chains, one trajectory, h = 0.02: Picard needs five to six iterations to Newton's three; equal
    at n = 4 to 10, 3 times as fast at n = 30, 10 times at n = 100.
-4. Chains in a batch, in components on trust: Newton's two iterations with a band cost about as much
+4. Chains in a batch, in components: Newton's two iterations with a band cost about as much
    as six of Picard's at any n: equal within 1.5. Full Jacobian: Picard faster from n = 10 on.
-5. Simplified Newton on trust goes through LAPACK above four unknowns: slower than Newton there.
+5. Simplified Newton goes through LAPACK above four unknowns: slower than Newton there.
 6. Controls: Picard fails with status `not_converged`; the default, which tries it first for many
    unknowns, costs at most 1.3 times Newton's method.
 """

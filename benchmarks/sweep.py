@@ -6,9 +6,9 @@
 
 rate: trajectories of the disturbed Kepler problem with three streamed invariants, written to a
 store, on all cores; beside it the bare kernel, the same reductions of the same states without
-sweep, store or starts: `dvi.over_threads(jax.jit(jax.vmap(one)))` on 2¹⁷ of these trajectories, its
-time scaled to their number. Both once in each round, in random order, in one process; the sweep
-compiles in a round before. The largest memory is that of the process, over all rounds.
+sweep, store or starts: `jax.jit(jax.vmap(one))` on 2¹⁷ of these trajectories, its time scaled
+to their number. Both once in each round, in random order, in one process; the sweep compiles in a
+round before. The largest memory is that of the process, over all rounds.
 
 cost: what `dvi.sweep_cost` says of that sweep and of larger ones.
 
@@ -82,8 +82,7 @@ def bare(steps: int):
 
     start = dvi.starts.Halton(KERNEL_LANES, LOW, HIGH)
     states = jax.vmap(lambda i: start.at(i, 0.0, None))(jnp.arange(KERNEL_LANES))
-    kernel = jax.jit(jax.vmap(one))
-    return dvi.over_threads(kernel), states
+    return jax.jit(jax.vmap(one)), states
 
 
 def seconds(f, *args) -> float:

@@ -1,4 +1,4 @@
-"""What `dvi.over_threads` gains: wall-clock time of a batch on one thread over that on several.
+"""What several threads gain: wall-clock time of a batch on one thread over that on several.
 
     python benchmarks/threads.py [--threads N] [--rounds N]
 
@@ -16,26 +16,30 @@ import numpy as np
 from _workloads import WORKLOADS
 from speed import Clock, batched, last_state
 
-import dvi_jax as dvi
+import lanewise
 
 ROWS = (("kepler", 65536, 2000), ("oscillator", 65536, 10000), ("chain4", 8192, 500))
 
 
-def measured(name: str, lanes: int, steps: int, threads: int | None, rounds: int) -> np.ndarray:
+def measured(name: str, lanes: int, steps: int, threads: int, rounds: int) -> np.ndarray:
     """Ratios of wall-clock times, one thread over several."""
     w = WORKLOADS[name]
     inputs = [jnp.asarray(x) for x in w.start(lanes)]
-    one = jax.jit(batched(last_state(w, steps)))
-    several = dvi.over_threads(one, threads, in_axes=-1, out_axes=-1)
-    for a, b in zip(jax.tree.leaves(one(*inputs)), jax.tree.leaves(several(*inputs)), strict=True):
+    run = jax.jit(batched(last_state(w, steps)))
+
+    def on(count: int):
+        lanewise.set_threads(count)
+        return jax.block_until_ready(run(*inputs))
+
+    for a, b in zip(jax.tree.leaves(on(1)), jax.tree.leaves(on(threads)), strict=True):
         np.testing.assert_array_equal(a, b)
-    wall = Clock(rounds, float("inf")).times(lambda: one(*inputs), lambda: several(*inputs)).wall
+    wall = Clock(rounds, float("inf")).times(lambda: on(1), lambda: on(threads)).wall
     return wall[:, 0] / wall[:, 1]
 
 
 def main():
     words = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    words.add_argument("--threads", type=int, help="how many (all that this process may use)")
+    words.add_argument("--threads", type=int, default=0, help="how many (0: all)")
     words.add_argument("--rounds", type=int, default=15)
     given = words.parse_args()
     jax.config.update("jax_enable_x64", True)

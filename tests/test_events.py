@@ -177,7 +177,8 @@ def test_requested_times_on_the_lattice_are_the_lattices_states():
     )
     np.testing.assert_allclose(asked.qs, every.qs, atol=1e-12)
     np.testing.assert_allclose(asked.observed["L"][1:], every.observed["L"], atol=1e-13)
-    np.testing.assert_array_equal(asked.observed["max"], every.observed["max"])
+    # Two programs: the last bit of the round-off that the drift is may differ.
+    np.testing.assert_allclose(asked.observed["max"], every.observed["max"], rtol=0, atol=1e-14)
     np.testing.assert_allclose(asked.hs[1:], every.hs, rtol=1e-9)
 
 
