@@ -1,4 +1,4 @@
-"""The reference, from the docstrings: a page for each room of the package.
+"""The reference, from the docstrings: a page for each package.
 
 The docstrings are Markdown, which Sphinx's own autodoc does not read; here each public name becomes
 a `py:function` or `py:class` of MyST with its docstring inside. A name in code font anywhere in the
@@ -22,6 +22,7 @@ from sphinx.transforms.post_transforms import SphinxPostTransform
 from sphinx.util.docutils import SphinxDirective
 
 import dvi_jax
+import lanewise
 from dvi_jax.paper.equations import EQUATIONS
 
 PAGES = {
@@ -36,7 +37,7 @@ PAGES = {
     "fitting": ("Fitting", "dvi_jax.fit"),
     "dynamics": ("Order, chaos, frequencies", "dvi_jax.dynamics"),
 }
-"""Page → title, and the room whose public names stand on it."""
+"""Page → title, and the package whose public names are on it."""
 
 MODULES = {
     "generators": ("Generators of common symmetries", "generators"),
@@ -45,23 +46,36 @@ MODULES = {
     "plot": ("Pictures", "plot"),
     "interop": ("Other packages", "interop"),
 }
-"""Page → title, and the public module that it tells of."""
+"""Page → title, and the public module that it documents."""
+
+GENERATOR = "lanewise"
+"""The page of the package that makes machine code, and its name."""
+
+TITLES = {page: title for page, (title, _) in {**PAGES, **MODULES}.items()} | {
+    GENERATOR: "Machine code for batches"
+}
+"""Page → title, in the order of the index."""
+
+OWN = ("dvi_jax", "lanewise")
+"""Packages that are documented here."""
 
 
 def public(module: types.ModuleType) -> dict[str, Any]:
-    """Public names of a module that are the package's own, in the order of the alphabet."""
+    """Public names of a module that are our own, in alphabetical order."""
     own = {
         name: thing
         for name, thing in vars(module).items()
         if not name.startswith("_")
         and (inspect.isclass(thing) or inspect.isfunction(thing))
-        and thing.__module__.startswith("dvi_jax")
+        and thing.__module__.startswith(OWN)
     }
     return dict(sorted(own.items(), key=lambda item: item[0].lower()))
 
 
 def _room(thing: Any) -> str:
-    """The page of a name of the front door, by the file where it is written."""
+    """The page of a public name of `dvi_jax`, by the file where it is written."""
+    if thing.__module__.startswith(GENERATOR):
+        return "solvers"
     for page, (_, room) in PAGES.items():
         if room != "dvi_jax" and thing.__module__.startswith(room + "."):
             return page
@@ -70,13 +84,16 @@ def _room(thing: Any) -> str:
 
 def entries() -> dict[str, dict[str, tuple[str, Any]]]:
     """Page → name in the documentation → (name as one writes it, the thing)."""
-    found: dict[str, dict[str, tuple[str, Any]]] = {page: {} for page in (*PAGES, *MODULES)}
+    found: dict[str, dict[str, tuple[str, Any]]] = {page: {} for page in TITLES}
     for name, thing in public(dvi_jax).items():
         found[_room(thing)][f"dvi_jax.{name}"] = (f"dvi.{name}", thing)
     for page, (_, attribute) in MODULES.items():
         module = getattr(dvi_jax, attribute, None) or import_module(f"dvi_jax.{attribute}")
         for name, thing in _members(module):
             found[page][f"dvi_jax.{attribute}.{name}"] = (f"{attribute}.{name}", thing)
+    for name, thing in public(lanewise).items():
+        if getattr(dvi_jax, name, None) is not thing:
+            found[GENERATOR][f"lanewise.{name}"] = (f"lanewise.{name}", thing)
     return found
 
 
@@ -147,7 +164,7 @@ def _docstring(thing: Any) -> str:
 
 
 def _is_own(thing: Any) -> bool:
-    return getattr(thing, "__module__", "").startswith("dvi_jax")
+    return getattr(thing, "__module__", "").startswith(OWN)
 
 
 def _class_members(cls: type) -> Iterator[tuple[str, str, Any]]:
@@ -208,7 +225,7 @@ def write(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     found = entries()
     pages = {}
-    for page, (title, _) in {**PAGES, **MODULES}.items():
+    for page, title in TITLES.items():
         if not found[page]:
             continue
         listed = ", ".join(f"`{shown}`" for shown, _ in found[page].values())
@@ -231,7 +248,7 @@ def write(folder: Path) -> None:
     ]
     index += ["```{toctree}", ":hidden:", "", *pages, "```", ""]
     for page in pages:
-        title = {**PAGES, **MODULES}[page][0]
+        title = TITLES[page]
         listed = ", ".join(f"`{shown}`" for shown, _ in found[page].values())
         index += [f"**[{title}]({page}.md).** {listed}", ""]
     pages["index"] = "\n".join(index)
