@@ -89,6 +89,9 @@ class Kernel:
     def elementary(self, name: str, args: Sequence[Num]) -> Num:
         raise NotImplementedError
 
+    def exchanged(self, numbers: Sequence[Num], vec: bool) -> list[Num]:
+        raise NotImplementedError
+
 
 class Evaluator:
     """One evaluation: numbers go through `b`, memory comes from `kernel`."""
@@ -628,7 +631,7 @@ class Evaluator:
             return [self.value(found, eqn.outvars[0].aval)]
 
         def exchanged() -> list[Num]:
-            others = self._with_exchanges([list(r) for r in rows])
+            others = self.kernel.exchanged(numbers, vec)
             return [b.select(weak, x, y) for x, y in zip(others, found, strict=True)]
 
         n = len(found)
@@ -661,7 +664,7 @@ class Evaluator:
             x[i] = b.mul(total, rows[i][i])
         return x, weak
 
-    def _with_exchanges(self, rows: list[list[Num]]) -> list[Num]:
+    def with_exchanges(self, rows: list[list[Num]]) -> list[Num]:
         """The solution by elimination with partial pivoting, exchanges by selection."""
         b, n = self.b, len(rows)
         for c in range(n):

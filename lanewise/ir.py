@@ -573,6 +573,13 @@ class Builder:
         """Whether a truth value is true on a trajectory of the block, as a scalar i1."""
         if not a.vec:
             return self.ref(a, 0, False)
+        if a.op == "not" and a.args[0].op == "finite":  # one comparison for the block
+            (zero,) = a.args[0].args
+            t, total = self.type(zero.dtype, True), zero.names[0]
+            for other in zero.names[1:]:
+                total = self.new(f"fadd {t} {total}, {other}")
+            bits = self.new(f"fcmp uno {t} {total}, {total}")
+            a = self.made([bits], "bool", True)
         t = self.type("bool", True)
         total = a.names[0]
         for other in a.names[1:]:

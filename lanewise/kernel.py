@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,9 +12,9 @@ import numpy as np
 
 from . import elementary
 from .components import SMALL, Evaluator, Kernel, Value
-from .ir import Builder, Num, Unsupported, literal
+from .ir import TYPES, Builder, Num, Unsupported, literal
 from .jaxapi import ClosedJaxpr
-from .memory import Buffer, contiguous, load, stored_type
+from .memory import Buffer, contiguous, load, store, stored_type
 
 HEAD = 2
 """Parameters in front of a kernel's own: trajectories, cost of a block."""
@@ -45,11 +46,11 @@ class Module(Kernel):
         self.values.append(int(value))
         return self.b.made([name], "int64", False)
 
-    def scratch(self, shape: Sequence[int], dtype: str, on: bool) -> Buffer:
+    def scratch(self, shape: Sequence[int], dtype: str, on: bool, each: int = 1) -> Buffer:
         """Memory for an array of every trajectory of the block, next to each other; for one array
         that all share unless `on`."""
         size = int(np.prod(shape, dtype=np.int64))
-        block = self.W * self.U if on else 1
+        block = self.W * self.U if on else each
         start = self.scratch_bytes
         self.scratch_bytes += (size * block * 8 + 63) // 64 * 64
         if self.scratch_bytes > LARGEST_SCRATCH:
@@ -102,6 +103,34 @@ class Module(Kernel):
             self.declared |= declared
             self.globals += [c for c in constants if c not in self.globals]
         return called
+
+    def exchanged(self, numbers: Sequence[Num], vec: bool) -> list[Num]:
+        """The solution of a linear system with exchanges of rows, of the numbers of its rows (A, b).
+
+        It is needed rarely and takes many operations: a function of the module, by way of memory.
+        """
+        b, dtype = self.b, numbers[0].dtype
+        n = math.isqrt(len(numbers))
+        wide = vec and self.W > 1
+        called = f"@exchanged_{n}_{TYPES[dtype]}_{'v' if wide else 's'}"
+        if (called, wide) not in self.functions:
+            text, declared = _exchange_text(n, dtype, self.W if wide else 1, called)
+            self.functions[called, wide] = text
+            self.declared |= declared
+        count, block = len(numbers) + n, (self.W if vec else 1)
+        # One trajectory's vector after the other: each call has a piece of memory of its own.
+        whole = self.scratch((count * (self.U if vec else 1),), dtype, False, block)
+        item = np.dtype(dtype).itemsize * block * count
+        pieces = [
+            b.new(f"getelementptr i8, ptr {whole.base[0]}, i64 {u * item}")
+            for u in range(self.U if vec else 1)
+        ]
+        place = Buffer(tuple(pieces), dtype, (count,), (block,), 1 if vec else None)
+        for i, x in enumerate(numbers):
+            store(b, place, x, i * block)
+        for piece in pieces:
+            b.emit(f"call void {called}(ptr {piece})")
+        return [load(b, place, (len(numbers) + i) * block) for i in range(n)]
 
     # --- the kernel ----------------------------------------------------------------------------
 
@@ -252,6 +281,20 @@ def _function_text(
     parameters = ", ".join(f"{t} %x{i}" for i in range(count))
     body = f"define internal {t} {called}({parameters}) {{\nentry:\n{text}\n}}\n"
     return body, frozenset(b.declared | inner.declared), tuple(data)
+
+
+@functools.lru_cache(maxsize=None)
+def _exchange_text(n: int, dtype: str, width: int, called: str) -> tuple[str, frozenset[str]]:
+    """A function that solves the system at a pointer, n rows (A, b), and puts x after it."""
+    inner = Module(width, 1)
+    b = inner.b
+    place = Buffer(("%p",), dtype, (n * (n + 2),), (width,), 1)
+    rows = [[load(b, place, (i * (n + 1) + j) * width) for j in range(n + 1)] for i in range(n)]
+    for i, x in enumerate(Evaluator(b, inner).with_exchanges(rows)):
+        store(b, place, x, (n * (n + 1) + i) * width)
+    lines = "\n".join(b.lines)
+    text = f"define internal void {called}(ptr %p) noinline {{\nentry:\n{lines}\n  ret void\n}}\n"
+    return text, frozenset(b.declared)
 
 
 @functools.lru_cache(maxsize=4096)

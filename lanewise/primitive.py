@@ -308,8 +308,8 @@ def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
     while width > lanes:
         width //= 2
     vectors = 1
-    if most == 6 and lanes >= 6 * width:
-        return width, 6
+    if lanes >= most * width:
+        return width, most
     while 2 * vectors <= most and 2 * vectors * width <= lanes:
         vectors *= 2
     return width, vectors
@@ -317,11 +317,11 @@ def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
 
 def vectors_for(carried: int, operations: int) -> int:
     """Vectors in a block: enough to hide latency, few enough that the state stays in registers."""
-    if operations > 1500:
-        return 1
-    if carried <= 12:
-        return 8 if operations < 150 else 4
-    return 4 if carried <= 24 and operations < 600 else 2
+    if operations < 150:
+        return max(1, min(8, 32 // max(carried, 1)))
+    if operations < 1500:
+        return 3 if carried <= 12 else 2
+    return 2 if operations < 4000 and carried <= 12 else 1
 
 
 def carried(jaxpr: Any) -> int:

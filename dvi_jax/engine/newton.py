@@ -141,17 +141,24 @@ class Newton(RootSolver):
             return _Iterate(x, error, finite, settled | stalled, state.iterations + 1)
 
         by_rate = self.rtol is None and self.atol == 0
-        # Nearly all steps need one Jacobian, so that the first turn of the loop stands before it.
-        x, *sizes = corrected(x0)
-        settled, _, worst, size = judged(*sizes)
-        one = jnp.asarray(1, jnp.int32)
-        start = _Iterate(x, jnp.stack([worst, size]), jnp.asarray(True), settled, one)
+        yes, unknown = jnp.asarray(True), jnp.full((2,), jnp.nan, x0.dtype)
+        start = _Iterate(x0, unknown, yes, ~yes, jnp.asarray(0, jnp.int32))
+        if x0.size <= _FIRST_APART:
+            # Nearly all steps need one Jacobian: the first turn is made in front of the loop, where
+            # no trajectory waits for another.
+            x, *sizes = corrected(x0)
+            settled, _, worst, size = judged(*sizes)
+            start = _Iterate(x, jnp.stack([worst, size]), yes, settled, jnp.asarray(1, jnp.int32))
         end = lax.while_loop(proceed, improve, start)
         return Found(end.x, end.iterations, end.error, end.converged & end.finite)
 
     def solve_tangent(self, linear, rhs):
         _, matrix = value_and_jacobian(linear, jnp.zeros_like(rhs))
         return lanewise.solve(matrix, rhs)
+
+
+_FIRST_APART = 4
+"""Unknowns up to which the first turn of Newton's loop is written out in front of it."""
 
 
 class Known(eqx.Module):
