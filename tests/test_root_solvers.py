@@ -9,14 +9,13 @@ import pytest
 from helpers import double_pendulum, symplectic_defect
 
 import dvi_jax as dvi
+import lanewise
 from dvi_jax import systems
 from dvi_jax._step import Equations, no_step_yet
 from dvi_jax._types import Interval
-from dvi_jax.engine.linear import UNROLLED_UP_TO
-from dvi_jax.engine.newton import Newton, Trusted, find_root
+from dvi_jax.engine.newton import Newton, find_root, over
 from dvi_jax.engine.picard import Picard, PicardThenNewton
-from dvi_jax.engine.simplified import SimplifiedNewton, factorised
-from dvi_jax.engine.tiles import lanewise
+from dvi_jax.engine.simplified import _BY_INVERSE, SimplifiedNewton, factorised
 
 EPS = np.finfo(float).eps
 MANY = PicardThenNewton(newton_up_to=0)
@@ -101,7 +100,7 @@ def test_ten_bodies_take_two_iterations():
         np.testing.assert_allclose(a, q, rtol=1e-12, atol=1e-13)
         assert is_good(info)
         assert int(info.iterations) <= 2.05 * 100
-        assert float(info.residual) < EPS
+        assert float(over(*info.residual)) < EPS
 
 
 @pytest.mark.parametrize("differentiated", [False, True])
@@ -111,7 +110,7 @@ def test_picard_forms_no_matrix_of_the_unknowns(differentiated):
             return jnp.sum(ten_bodies(solver, num_steps=1, epsilon=epsilon)[0])
 
         text = str(jax.make_jaxpr(jax.grad(last) if differentiated else last)(1e-6))
-        return "triangular_solve" in text, "[30,30]" in text
+        return "eliminate" in text, "[30,30]" in text
 
     assert text(Picard()) == (False, False)
     assert text(Newton()) == (True, True)  # what is looked for can be found
@@ -357,7 +356,8 @@ def test_many_lanes_take_the_iterations_of_one():
 def test_nan_stops_at_once(name):
     _, info = jax.jit(lambda x: find_root(jnp.log, x, jnp.ones(1), OTHERS[name]))(-jnp.ones(1))
     assert not bool(info.converged)
-    assert int(info.iterations) <= 2
+    # Newton's method, which goes on after Picard's first iteration, stops after its second.
+    assert int(info.iterations) <= (3 if name == "picard_then_newton" else 2)
 
 
 @pytest.mark.slow
@@ -397,12 +397,12 @@ def test_a_light_slow_component_is_solved_by_its_own_measure():
             assert np.max(error) < 8 * EPS
 
 
-# --- on trust, and everywhere ----------------------------------------------------------------
+# --- machine code and XLA, and everywhere ----------------------------------------------------
 
 
 @pytest.mark.slow
 @EACH
-def test_components_on_trust_agree_with_arrays(name):
+def test_components_agree_with_arrays(name):
     q, p = np.random.default_rng(3).uniform(-0.5, 0.5, (2, 8, 3))
 
     def run(form):
@@ -417,21 +417,23 @@ def test_components_on_trust_agree_with_arrays(name):
 
     components, arrays = run("components"), run("arrays")
     np.testing.assert_allclose(components[0], arrays[0], rtol=1e-12, atol=1e-13)
-    # On trust, and not by care in the end: the number of iterations is the same in every step.
-    assert all(np.asarray(components[1]) % 150 == 0)
-    np.testing.assert_array_equal(components[2], 64 * EPS)
+    # An iteration more or less is round-off in the test for the last one.
+    np.testing.assert_allclose(components[1], arrays[1], rtol=0.01)
+    for residual in (components[2], arrays[2]):
+        assert np.all(np.asarray(residual) < 4 * EPS)
 
 
-@pytest.mark.slow
-def test_trust_is_refused_to_what_has_not_converged():
+def test_no_iteration_ends_before_it_has_converged():
+    """With fewer iterations than it takes, the status says so; with more, the root is good."""
+
     def F(x):
         return x - 1 + 0.1 * jnp.sin(x)
 
     x0, one = jnp.full(3, 0.5), jnp.ones(3)
     verdicts = []
-    for effort in (2, 3, 4, 5, 6):
-        root, info = find_root(F, x0, one, Trusted(Picard(), jnp.asarray(effort)))
-        verdicts.append(float(info.residual) <= 0)
+    for most in (2, 3, 4, 5, 6, 12, 13, 14, 15):
+        root, info = find_root(F, x0, one, Picard(max_steps=most))
+        verdicts.append(bool(info.converged))
         if verdicts[-1]:
             assert float(jnp.max(jnp.abs(F(root)))) <= 4 * EPS
     assert verdicts == sorted(verdicts)
@@ -447,49 +449,45 @@ def whirl(t0, t1, q0, p1, args):
     return WHIRL @ p1
 
 
-def test_elimination_without_pivots_is_found_out_and_care_is_not():
+@pytest.mark.parametrize("strength", [0.1, 1.0])
+def test_a_jacobian_without_pivots_is_solved_with_exchanged_rows(strength):
     x, known = jnp.array([0.3, 0.4]), jnp.array([1.0, 2.0])
 
-    def in_components(solver):
-        def solve(strength):
-            def F(x):
-                return x - known - strength * WHIRL @ x
+    def solve(strength):
+        def F(x):
+            return x - known - strength * WHIRL @ x
 
-            root, info = find_root(F, x, jnp.ones(2), solver)
-            return root, info.residual, info.converged
+        root, info = find_root(F, x, jnp.ones(2), Newton())
+        return root, info.converged
 
-        layout = dvi.Layout(form="components")
-        return jax.jit(lambda s: lanewise(solve, s, layout=layout, steps=1, entries=2))
-
-    trusted = in_components(Trusted(Newton(), jnp.asarray(2)))
-    good = trusted(0.1)
-    assert float(good[1]) <= 0
-    np.testing.assert_allclose((jnp.eye(2) - 0.1 * WHIRL) @ good[0], known, rtol=1e-15)
-    assert not float(trusted(1.0)[1]) <= 0
-    root, _, converged = in_components(Newton())(1.0)
-    assert bool(converged)
-    np.testing.assert_allclose(root, [2.0, -1.0], rtol=1e-15)
+    expected = np.linalg.solve(np.eye(2) - strength * np.asarray(WHIRL), known)
+    for run in (solve, lanewise.batched(solve)):
+        strengths = jnp.asarray(strength) if run is solve else jnp.full(5, strength)
+        root, converged = jax.jit(run)(strengths)
+        assert np.all(converged)
+        np.testing.assert_allclose(root, np.broadcast_to(expected, root.shape), rtol=1e-15)
 
 
 @pytest.mark.slow
-def test_lanes_that_need_pivots_are_solved_again_with_care():
+def test_lanes_that_need_pivots_agree_and_leave_the_others_alone():
     system = dvi.System(lambda t0, t1, q, p, a: (p @ p + q @ q) / 2, force=whirl)
 
-    def run(form):
+    def run(form, *epsilons):
         def one(epsilon):
             sol = dvi.integrate(
                 system, [0.3, 0.1], [0.2, 0.5], h=0.5, num_steps=40, epsilon=epsilon,
                 layout=dvi.Layout(form=form), throw=False, save=dvi.Save(final=True),
             )  # fmt: skip
-            return sol.qs[-1], sol.result == dvi.RESULTS.successful, sol.stats["max_residual"]
+            return sol.qs[-1], sol.result == dvi.RESULTS.successful
 
-        return jax.jit(jax.vmap(one))(jnp.array([0.02, 2.0, -0.1]))
+        return jax.jit(jax.vmap(one))(jnp.array(epsilons))
 
-    (q, good, residual), (q_arrays, _, _) = run("components"), run("arrays")
+    q, good = run("components", 0.02, 2.0, -0.1)
+    q_arrays, _ = run("arrays", 0.02, 2.0, -0.1)
+    calm, _ = run("components", 0.02, 0.1, -0.1)
     assert all(good)
     np.testing.assert_allclose(q, q_arrays, rtol=1e-12)
-    on_trust = np.asarray(residual) == 64 * EPS
-    np.testing.assert_array_equal(on_trust, [True, False, True])
+    np.testing.assert_array_equal(q[::2], calm[::2])
 
 
 @pytest.mark.slow
@@ -505,7 +503,7 @@ def test_single_precision():
 
 @pytest.mark.slow
 def test_compensated_arithmetic_keeps_what_it_gains():
-    q, p = box(3, width=0.4)
+    q, p = box(3, seed=3, width=0.4)
 
     def run(solver, arithmetic):
         sol = dvi.integrate(
@@ -520,7 +518,7 @@ def test_compensated_arithmetic_keeps_what_it_gains():
     assert np.max(np.abs(run(Picard(), dvi.FloatingPoint()) - exact)) > 8 * EPS
 
 
-@pytest.mark.parametrize("n", [1, UNROLLED_UP_TO, UNROLLED_UP_TO + 1])
+@pytest.mark.parametrize("n", [1, _BY_INVERSE, _BY_INVERSE + 1])
 def test_factors_solve(n):
     A, b = np.random.default_rng(n).normal(size=(n, n)), np.arange(1.0, n + 1)
     np.testing.assert_allclose(A @ factorised(jnp.asarray(A))(b), b, rtol=1e-12)
