@@ -128,6 +128,30 @@ def test_bits_do_not_depend_on_the_batch(left, threads, dtype):
     assert not left
 
 
+def test_numbers_below_the_normal_ones(left, threads):
+    """They are replaced by zero on all threads, or on none."""
+
+    def function(x):
+        y, _ = lax.scan(lambda c, _: (c * 0.5 + x, None), x, None, length=300)
+        return x * 1e-10, y * 1e-10, (x * 1e-10) * 1e10, jnp.exp(x - 740), x * 0.5**40
+
+    x = np.linspace(1, 2, 20_000) * 1e-300
+    batch = jax.jit(lanewise.batched(function))
+    lanewise.set_threads(1)
+    every = jax.tree.map(np.asarray, batch(x))
+    lanewise.set_threads(0)
+    for _ in range(5):
+        assert_same(batch(x), every)
+    found = []
+    worker = threading.Thread(target=lambda: found.append(jax.tree.map(np.asarray, batch(x))))
+    worker.start()
+    worker.join(60)
+    assert_same(found[0], every)
+    rows = lax.map(lanewise.batched(function), x.reshape(20, 1000))
+    assert_same(jax.tree.map(lambda a: np.asarray(a).reshape(-1), rows), every)
+    assert not left
+
+
 def kepler_end(q, p):
     system, *_ = SYSTEMS["kepler"]
     sol = dvi.integrate(
@@ -430,6 +454,179 @@ def test_single_precision_with_x64_switched_off(left):
         wide = rows_of(jnp.asarray(VALUES[0]), 9)
     np.testing.assert_allclose(found[0][1][0], wide[1], rtol=1e-5)
     assert not left
+
+
+# --- what JAX's functions are made of -------------------------------------------------------------
+
+
+@jax.custom_vjp
+def with_a_rule(x):
+    return jnp.sin(x)
+
+
+with_a_rule.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (2 * g * jnp.cos(x),))
+
+
+def late_to_vary(x):
+    """A number that varies between trajectories reaches a carry after several rounds."""
+
+    def step(c, _):
+        a, b, d, n = c
+        return (b, d, x * 0.5, n), (a, b, n)
+
+    return lax.scan(step, (0.0, 0.0, 0.0, 3), None, length=6)
+
+
+def same_number_of_rounds(x):
+    def body(c):
+        k, y, _ = c
+        return k + 1, y * 0.5 + x, lax.cond(k > 2, lambda: y + 1, lambda: 0.0)
+
+    return lax.while_loop(lambda c: c[0] < 5, body, (0, 0.0, 0.0))
+
+
+def rows_in_a_branch(x):
+    def rows(x):
+        return lax.scan(lambda c, _: (c * 0.5 + 1, c), x, None, length=5)
+
+    return lax.cond(x > 0, rows, lambda x: (x, jnp.zeros(5)), x)
+
+
+def on_any_in_a_branch(x):
+    def positive(x):
+        return jnp.where(x > 0, jnp.sin(x), x)
+
+    return lax.cond(lanewise.on_any(x > 0), positive, lambda x: x, x)
+
+
+def rows_in_a_while_loop(x):
+    def body(c):
+        k, rows, y = c
+        return k + 1, rows.at[k].set(y), jnp.sin(y) + 1
+
+    return lax.while_loop(lambda c: (c[0] < 6) & (c[2] < 1.9), body, (0, jnp.zeros(6), x))
+
+
+def outside_of_arrays(x):
+    five = jnp.arange(5.0)
+    k = (x * 3).astype(int)
+    return (
+        lax.dynamic_slice(five, (jnp.int32(9),), (2,)),
+        jnp.arange(5)[jnp.int32(-7)],
+        jnp.zeros(3).at[7].set(x),
+        jnp.zeros(3).at[-1].set(x),
+        jnp.zeros(3).at[-4].add(x),
+        five[k],
+        five.at[k].get(mode="fill", fill_value=-1.0),
+        five.at[k].set(x, mode="drop"),
+    )
+
+
+def of_truth(x):
+    a, b = x > 0, x > 1
+    rows = jnp.stack([a, x < 1])
+    return a * 2.0, a + b, a == b, a < b, jnp.maximum(a, b), jnp.sum(rows), jnp.cumsum(rows)
+
+
+def remainders(x):
+    return x % 0.7, jnp.fmod(x, 0.3), x // 0.3, jnp.divmod(x, -0.7), lax.rem(x, 0.0)
+
+
+def powers(x):
+    y = jnp.abs(x)
+    return y**x, x**2, x**-3, 2.0**x, y**0.5, jnp.power(x, 3.0), 0.0 ** (x * 0), x**0.0, y**2.7
+
+
+def to_integers(x):
+    wide = (jnp.int8, jnp.uint8, jnp.int16, jnp.int32, jnp.uint32, jnp.int64)
+    return [[(x * s).astype(t) for t in wide] for s in (1.0, 1e3, 1e10, 1e30)], jnp.log(x).astype(
+        int
+    )
+
+
+def a_root(x):
+    def newton(f, start):
+        return lax.fori_loop(0, 20, lambda _, y: y - (y**3 - x) / (3 * y * y + 1e-9), start + 2)
+
+    return lax.custom_root(lambda y: y**3 - x, x, newton, lambda g, y: y / g(1.0))
+
+
+MATRICES = RNG.normal(size=(9, 3, 3))
+FUNCTIONS = {
+    "a derivative's rule": (jax.grad(with_a_rule), VALUES),
+    "late to vary": (late_to_vary, VALUES),
+    "same number of rounds": (same_number_of_rounds, VALUES),
+    "rows in a branch": (rows_in_a_branch, VALUES),
+    "on_any": (on_any_in_a_branch, VALUES),
+    "rows in a while loop": (rows_in_a_while_loop, VALUES),
+    "outside of arrays": (outside_of_arrays, VALUES),
+    "truth": (of_truth, VALUES),
+    "remainders": (remainders, VALUES),
+    "powers": (powers, VALUES),
+    "to integers": (to_integers, VALUES),
+    "root": (a_root, np.abs(VALUES)),
+    "matrices": (
+        lambda m: (
+            jnp.einsum("ij,jk->ki", m, m),
+            jnp.kron(m[0], m[1]),
+            jnp.tensordot(m, m, 2),
+            jnp.linalg.norm(m[0]),
+            jnp.cross(m[0], m[1]),
+            jnp.tril(m),
+            jnp.roll(m, 1),
+            m.std(),
+        ),
+        MATRICES,
+    ),
+    "along axes": (
+        lambda m: (jnp.diff(m), jnp.cumsum(m), jnp.prod(m, 0), m.argmax(), jnp.repeat(m, 2, 0)),
+        MATRICES,
+    ),
+    "map": (lambda m: lax.map(lambda r: jnp.sin(r).sum(), m), MATRICES),
+    "hessian": (lambda m: jax.hessian(lambda y: jnp.sum(jnp.sin(y) * y[0]))(m[0]), MATRICES),
+    "bits": (lambda x: lax.bitcast_convert_type(x, jnp.int64), VALUES),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_functions(left, name):
+    function, x = FUNCTIONS[name]
+    found, expected = jax.jit(lanewise.batched(function))(x), jax.jit(jax.vmap(function))(x)
+    assert_close(found, expected, 1e-12)
+    assert not left, left
+
+
+@pytest.mark.xfail(
+    strict=True, reason="a dot product without terms is a structural zero: 0·NaN is 0"
+)
+def test_a_product_with_an_empty_sum():
+    def function(x):
+        return lax.dot(jnp.zeros(0), jnp.zeros(0)) * x
+
+    assert np.isnan(jax.jit(lanewise.batched(function))(np.full(9, np.nan))).all()
+
+
+@pytest.mark.xfail(strict=True, reason="NumPy warns of −(−2³¹) while a constant is folded")
+def test_no_warning_from_constants():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        least = jax.device_put(np.int32(-(2**31)))
+        found = jax.jit(lanewise.batched(lambda x: (-least) * x))(np.arange(9, dtype="int32"))
+    np.testing.assert_array_equal(found[:3], [0, -(2**31), 0])
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="a copy of each element on each of 64 trajectories is written out in one basic block, "
+    "which takes LLVM 18 s for 128 elements",
+)
+def test_code_stays_short_for_arrays():
+    leaves, tree = jax.tree.flatten((1.0,))
+    traced = primitive._Traced(lambda x: jnp.full((128,), x), leaves, tree)
+    program = primitive._Program(traced, lanewise.Layout())
+    _, text = primitive.kernel_of(program, [True], 64)
+    blocks = text.split(":\n")
+    assert max(b.count("\n") for b in blocks) < 3000
 
 
 # --- derivatives ---------------------------------------------------
@@ -780,6 +977,7 @@ def called_back(x):
         lambda x: jax.random.uniform(jax.random.key(0)) * x,
         lambda x: lax.scan(lambda c, _: (c, jnp.sort(jnp.stack([c, 1.0]))), x, None, length=3),
         lambda x: jnp.sum(jnp.zeros((0,))) + x,
+        lambda x: jnp.interp(x, np.arange(5.0), np.arange(5.0) ** 2),
         lambda x: x.astype(jnp.bfloat16).astype(float),
     ],
     ids=[
@@ -791,11 +989,13 @@ def called_back(x):
         "random",
         "sort in scan",
         "empty sum",
+        "interp",
         "bfloat16",
     ],
 )
-def test_what_is_left_to_xla(function):
+def test_what_is_left_to_xla(left, function):
     assert_close(jax.jit(lanewise.batched(function))(VALUES), jax.jit(jax.vmap(function))(VALUES))
+    assert len(left) == 1
 
 
 # --- other processors ---------------------------------------------------
