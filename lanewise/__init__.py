@@ -1,5 +1,6 @@
 """Batches of trajectories compiled to machine code, from functions written in JAX for one."""
 
+from .explained import Explanation as Explanation, Part as Part, explain as explain
 from .handler import get_threads as get_threads, set_threads as set_threads
 from .linear import on_any as on_any, solve as solve, unit_vectors as unit_vectors
 from .primitive import Layout as Layout, batched as batched, call as call, generates as generates

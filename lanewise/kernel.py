@@ -137,6 +137,9 @@ class Module(Kernel):
     def kernel(self, closed: ClosedJaxpr, on: Sequence[bool]) -> str:
         """The text of the module; `on` says which inputs differ between trajectories."""
         b, jaxpr = self.b, closed.jaxpr
+        for v in (*jaxpr.invars, *jaxpr.outvars):
+            if str(v.aval.dtype) not in TYPES:
+                raise Unsupported(f"an argument or result of type {v.aval.dtype}")
         lanes = "%lanes"
         operands = []
         for i, (v, o) in enumerate(zip(jaxpr.invars, on, strict=True)):

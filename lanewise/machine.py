@@ -4,10 +4,17 @@ import functools
 import itertools
 from typing import Any
 
-import llvmlite
-import llvmlite.binding as llvm
-
 from . import cache
+
+try:
+    import llvmlite
+    import llvmlite.binding as llvm
+except ImportError as error:  # not on every platform: `started` says so, and all goes through XLA
+    llvmlite: Any = None
+    llvm: Any = None
+    _missing: ImportError | None = error
+else:
+    _missing = None
 
 FORMAT = 1
 """Goes up with each change of what the machine code expects of the process around it."""
@@ -20,6 +27,12 @@ _count = itertools.count()
 
 @functools.cache
 def started() -> None:
+    """Start LLVM, once.
+
+    **Raises** `ImportError` where llvmlite is not installed.
+    """
+    if _missing is not None:
+        raise _missing
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
 

@@ -241,6 +241,11 @@ class _Program:
         return _Program(self.traced.giving(used), self.layout)
 
 
+def program_of(function: Callable, leaves: Sequence[Any], layout: Layout) -> _Program:
+    """The program of a function of arrays, as `call` makes it."""
+    return _Program(_Traced(function, leaves, jax.tree.structure(tuple(leaves))), layout)
+
+
 def _through_xla(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]):
     """The program as XLA compiles it: the first axis of operands where `on`, and of all outputs."""
     if lanes is None:
@@ -270,10 +275,8 @@ def compiled(
 
     **Raises** `Unsupported` where no code is generated, with what stands in the way.
     """
-    if program.layout.form == "arrays":
-        raise Unsupported("code for form='arrays'")
     if not generates():
-        raise Unsupported("code in this process")
+        raise Unsupported("no machine code is generated in this process")
     if lanes == 0:
         raise Unsupported("a batch of no trajectories")
     module, text = kernel_of(program, on, 1 if lanes is None else lanes, vectors)
@@ -286,6 +289,8 @@ def kernel_of(
     program: _Program, on: Sequence[bool], lanes: int, vectors: int | None = None
 ) -> tuple[Module, str]:
     """The module of a program for so many trajectories, and its text."""
+    if program.layout.form == "arrays":
+        raise Unsupported('the layout has form="arrays"')
     closed = program.traced.all_inputs
     count = operation_count(closed.jaxpr)
     if count > MOST_OPERATIONS:
@@ -332,7 +337,8 @@ def carried(jaxpr: Any) -> int:
             most = max(most, carried(body.jaxpr))
         if eqn.primitive.name == "scan":
             _, count = scan_counts(eqn.params)
-            most = max(most, sum(v.aval.size for v in eqn.outvars[:count] if v.aval.size <= 64))
+            state = [v.aval for v in eqn.outvars[:count]]
+            most = max(most, sum(a.size for a in state if a.size <= 64 and a.dtype.kind == "f"))
     return most
 
 

@@ -42,6 +42,13 @@ def divide(linear: Function, rhs: Number) -> Number:
 
 
 def _false_position(f: Function, a, fa, b, fb, wanted) -> Number:
+    # Values that were computed elsewhere may have the other sign where they are round-off: without
+    # a change of sign the root is the end where the function is smaller.
+    apart_in_sign = jnp.sign(fa) * jnp.sign(fb) <= 0
+    is_at_a = ~apart_in_sign & (jnp.abs(fa) < jnp.abs(fb))
+    b, fb = jnp.where(is_at_a, a, b), jnp.where(is_at_a, fa, fb)
+    wanted = wanted & apart_in_sign
+
     def proceed(state):
         a, _, b, fb, n = state
         apart = jnp.abs(b - a) > 2 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(a), jnp.abs(b))

@@ -1,0 +1,119 @@
+"""What becomes of a function: operations, vectors, blocks, and what is left to XLA."""
+
+import dataclasses
+import re
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from . import handler, machine
+from .ir import Unsupported
+from .jaxapi import jaxprs_in_params
+from .primitive import AUTO, Layout, functions_in, kernel_of, program_of
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One call that is compiled as a whole.
+
+    - `reason`: why it is left to XLA, None where machine code is generated.
+    - `operations`: on numbers of one trajectory, loops counted once; a fused multiply-add is one.
+    - `width`, `vectors`: numbers in a vector, vectors in a block.
+    - `scratch`: bytes of a block for rows that are not results.
+    - `spills`: instructions of the machine code that move a register to or from the stack.
+    - `ir`: the module's LLVM IR, before optimisation.
+    """
+
+    reason: str | None
+    operations: int = 0
+    width: int = 0
+    vectors: int = 0
+    scratch: int = 0
+    spills: int = 0
+    ir: str = ""
+
+    @property
+    def assembly(self) -> str:
+        """The machine code in the assembler's language, empty where there is none."""
+        return machine.assembly(self.ir) if self.ir else ""
+
+    def __str__(self) -> str:
+        if self.reason is not None:
+            return f"left to XLA: {self.reason}"
+        return (
+            f"machine code: {self.operations} operations, blocks of {self.width * self.vectors} "
+            f"trajectories ({self.vectors} vectors of {self.width}), {self.scratch} bytes of "
+            f"memory a block, {self.spills} moves to or from the stack"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Explanation:
+    """What `explain` found: one `Part` for each call of machine code or its substitute."""
+
+    parts: tuple[Part, ...]
+
+    def __str__(self) -> str:
+        if not self.parts:
+            return "no call of lanewise: the function is compiled by XLA"
+        return "\n".join(f"{i + 1}. {part}" for i, part in enumerate(self.parts))
+
+
+def explain(
+    function: Callable, *args: Any, batch: int = 1024, layout: Layout = AUTO
+) -> Explanation:
+    """How ``function(*args)``, of one trajectory, is compiled for a batch of them.
+
+    Calls of `lanewise` in it are explained one by one, as in a function that calls
+    ``dvi_jax.integrate``; a function without any is taken as the argument of `batched`.
+
+    **Arguments**
+
+    - `function`, `args`: as `batched` calls it for one trajectory.
+    - `batch`: trajectories; all arguments are taken to differ between them.
+
+    **Returns** an `Explanation`: print it, or read its `parts`, each with `ir` and `assembly`.
+
+    **Example**
+
+    ```python
+    print(lanewise.explain(lambda x: jnp.sin(x) / x, 1.0))
+    ```
+    """
+    leaves, tree = jax.tree.flatten(args)
+    leaves = [jnp.asarray(x) for x in leaves]
+
+    def flat(*leaves):
+        return jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
+
+    closed = jax.make_jaxpr(flat)(*leaves)
+    programs = _calls(closed.jaxpr)
+    if not programs:
+        programs = [program_of(flat, leaves, layout)]
+    return Explanation(tuple(_part(program, batch) for program in programs))
+
+
+def _calls(jaxpr: Any) -> list[Any]:
+    """The programs of the calls in a jaxpr, in order."""
+    found = []
+    for eqn in jaxpr.eqns:
+        if functions_in(eqn):
+            found.append(eqn.params["program"])
+            continue
+        for body in jaxprs_in_params(eqn.params):
+            found += _calls(body)
+    return found
+
+
+def _part(program: Any, batch: int) -> Part:
+    count = len(program.traced.all_inputs.jaxpr.invars)
+    try:
+        module, text = kernel_of(program, [True] * count, batch)
+    except Unsupported as reason:
+        return Part(reason=str(reason))
+    ir = handler.module_text(text, module.W * module.U)
+    assembly = machine.assembly(ir)
+    spills = len(re.findall(r"\bv?mov[a-z0-9]*\s+.*\((?:%rsp|sp)\)", assembly))
+    return Part(None, module.b.operations, module.W, module.U, module.scratch_bytes, spills, ir)
