@@ -102,8 +102,10 @@ def fixed_point(after: Callable[[list[bool]], list[bool]], marks: list[bool]) ->
 def _called_jaxpr(eqn: Any) -> Jaxpr | None:
     """The body of a call whose inputs and outputs match the equation's one by one, if it is one.
 
-    (jit, custom_jvp, custom_vjp, checkpoint and their like.)
+    (jit, custom_jvp, custom_vjp, checkpoint and their like, and `lanewise.call`.)
     """
+    if eqn.primitive.name == "lanewise":
+        return eqn.params["program"].traced.all_inputs.jaxpr
     bodies = list(jaxprs_in_params(eqn.params))
     if len(bodies) != 1:
         return None

@@ -154,6 +154,11 @@ def test_newton_refuses_settings_that_cannot_work(bad):
         (lambda x, y: jax.lax.fori_loop(0, 3, lambda i, a: a * y, x), True),
         (lambda x, y: jax.lax.cond(y[0] > 0, lambda: x, lambda: 2 * x), True),
         (lambda x, y: jnp.linalg.norm(x) * x, False),
+        (lambda x, y: lanewise.call(lambda a, b: (2 * a, 3 * b), x, y)[0], False),
+        (lambda x, y: lanewise.call(lambda a, b: (2 * a, 3 * b), x, y)[1], True),
+        (lambda x, y: lanewise.call(lambda a: a * y, x), True),  # what is closed over
+        (lambda x, y: lanewise.call(lambda a: a * x, y), True),
+        (lambda x, y: lanewise.call(lambda a: a * x, x), False),
     ],
 )
 def test_dependence(function, expected):
