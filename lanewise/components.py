@@ -176,6 +176,8 @@ class Evaluator:
         """A call within a call: no product in it is contracted with a sum outside, nor the other
         way round, so that its numbers have the same bits wherever it is called."""
         program = eqn.params["program"]
+        if eqn.params["lanes"] is not None:
+            raise Unsupported("a batch within the function of one trajectory")
         outs = self.closed(program.traced.all_inputs, [self.closed_off(v) for v in values])
         return [self.closed_off(v) for v in outs]
 
@@ -361,7 +363,10 @@ class Evaluator:
         (out,) = eqn.outvars
         op, axes = REDUCTIONS[eqn.primitive.name], tuple(eqn.params["axes"])
         if value.size == 0:
-            raise Unsupported("a reduction of an empty array")
+            empty = np.empty((0, out.aval.size), value.dtype)
+            with np.errstate(all="ignore"):
+                neutral = _NEUTRAL[op](value.dtype)
+            return self.constant(np.full(out.aval.shape, neutral, empty.dtype))
         rows = np.moveaxis(self.entries(value), axes, range(len(axes)))
         rows = rows.reshape((-1, out.aval.size))
         totals = list(rows[0])
@@ -402,7 +407,7 @@ class Evaluator:
         for rows, columns in zip(x, y, strict=True):
             for row in rows:
                 for column in columns:
-                    total = self.b.known(0, dtype, structural=True)
+                    total = self.b.known(0, dtype, structural=contracted > 0)
                     for u, v in zip(row, column, strict=True):
                         total = self.b.add(total, self.b.mul(u, v))
                     results.append(total)
@@ -911,6 +916,26 @@ class Evaluator:
         return [Value(value.shape, value.dtype, entries)]
 
 
+_NEUTRAL: dict[str, Callable[[str], Any]] = {
+    "add": lambda dtype: np.zeros((), dtype),
+    "mul": lambda dtype: np.ones((), dtype),
+    "max": lambda dtype: _limit(dtype, "min"),
+    "min": lambda dtype: _limit(dtype, "max"),
+    "and": lambda dtype: np.invert(np.zeros((), dtype)),
+    "or": lambda dtype: np.zeros((), dtype),
+    "xor": lambda dtype: np.zeros((), dtype),
+}
+"""What a reduction of nothing gives."""
+
+
+def _limit(dtype: str, which: str) -> Any:
+    if dtype == "bool":
+        return which == "max"
+    if np.issubdtype(dtype, np.floating):
+        return np.inf if which == "max" else -np.inf
+    return getattr(np.iinfo(dtype), which)
+
+
 _LARGEST_FACTOR = 8.0
 """Of a row that is subtracted from another without an exchange."""
 
@@ -987,6 +1012,7 @@ _SPECIAL: dict[str, Callable] = {
     "dot_general": Evaluator.dot,
     "iota": Evaluator.iota,
     "optimization_barrier": Evaluator.same,
+    "lanes_in_front": Evaluator.same,
     "argmax": Evaluator.argument_of,
     "argmin": Evaluator.argument_of,
     "dynamic_slice": Evaluator.dynamic_slice,

@@ -311,9 +311,10 @@ def registered(text: str) -> str:
     with _lock:
         if key not in _targets:
             run = runtime().get_function_address("lanewise_run")
-            engine = machine.loaded(text, {"lanewise_run": run})
             name = f"lanewise_{key[:32]}"
-            address = engine.get_function_address("lanewise_handler")
+            text = text.replace("@lanewise_handler", f"@{name}")
+            engine = machine.loaded(text, {"lanewise_run": run})
+            address = engine.get_function_address(name)
             jax.ffi.register_ffi_target(name, _capsule(address), platform="cpu")
             _targets[key] = name
         return _targets[key]

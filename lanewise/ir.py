@@ -294,15 +294,16 @@ class Builder:
             return self.neg(self.div(a.args[0], b))
         if b.known is not None and _has_exact_reciprocal(b.known):
             return self.mul(a, self.known(1 / b.known, b.dtype))
-        if a.known is not None and not a.is_known_as(1) and _is_power_of_two(a.known):
-            # c/x = c·(1/x) to the bit where 1/x cannot leave the range: ±1, or x a square root.
-            if b.op == "sqrt" or abs(a.known) == 1:
-                return self.mul(a, self.div(self.known(1, a.dtype), b))
+        # c/x = c·(1/x) to the bit where 1/x cannot leave the range: −1, or x a square root.
+        by_reciprocal = b.op == "sqrt" and a.known is not None and _is_power_of_two(a.known)
+        if a.is_known_as(-1) or (by_reciprocal and not a.is_known_as(1)):
+            return self.mul(a, self.div(self.known(1, a.dtype), b))
         return self.op("div", (a, b), a.dtype, lambda t, x, y: f"fdiv {t} {x}, {y}")
 
     def neg(self, a: Num) -> Num:
         if a.known is not None:
-            return self.known(-a.known, a.dtype, a.structural and a.known == 0)
+            with np.errstate(all="ignore"):
+                return self.known(-a.known, a.dtype, a.structural and a.known == 0)
         if a.op == "neg":
             return a.args[0]
         if not a.is_float:
@@ -419,8 +420,12 @@ class Builder:
             return self._fold(np.invert, a)
         if a.op == "not":
             return a.args[0]
-        ones = self.known(True, "bool") if a.dtype == "bool" else self.known(-1, a.dtype)
-        ones = ones if not a.dtype.startswith("u") else self.known(np.iinfo(a.dtype).max, a.dtype)
+        all_bits = -1
+        if a.dtype == "bool":
+            all_bits = True
+        elif a.dtype.startswith("u"):
+            all_bits = np.iinfo(a.dtype).max
+        ones = self.known(all_bits, a.dtype)
         made = self.op("not", (a, ones), a.dtype, lambda t, x, y: f"xor {t} {x}, {y}")
         return made
 
@@ -567,7 +572,7 @@ class Builder:
             return value
         return self.select(inside, value, self.known(0, a.dtype))
 
-    # --- all trajectories of a block ----------------------------------------------------------------
+    # --- all trajectories of a block ------------------------------------------------------------
 
     def any(self, a: Num) -> str:
         """Whether a truth value is true on a trajectory of the block, as a scalar i1."""

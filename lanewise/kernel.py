@@ -105,7 +105,7 @@ class Module(Kernel):
         return called
 
     def exchanged(self, numbers: Sequence[Num], vec: bool) -> list[Num]:
-        """The solution of a linear system with exchanges of rows, of the numbers of its rows (A, b).
+        """The solution of a linear system with exchanges of rows, of its numbers row by row (A, b).
 
         It is needed rarely and takes many operations: a function of the module, by way of memory.
         """
@@ -214,8 +214,8 @@ class Module(Kernel):
         functions = "\n".join(self.functions.values())
         return (
             "\n".join(self.globals) + "\n" + declared + "\n" + functions
-            + "\ndefine void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, i64 %first, "
-            + "i64 %last) {\nentry:\n" + body + "\n}\n"
+            + "\ndefine internal void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, "
+            + "i64 %first, i64 %last) {\nentry:\n" + body + "\n}\n"
         )  # fmt: skip
 
     def _lane_stride(self, aval: Any) -> int | str:
@@ -286,7 +286,7 @@ def _function_text(
     return body, frozenset(b.declared | inner.declared), tuple(data)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _exchange_text(n: int, dtype: str, width: int, called: str) -> tuple[str, frozenset[str]]:
     """A function that solves the system at a pointer, n rows (A, b), and puts x after it."""
     inner = Module(width, 1)

@@ -1,7 +1,6 @@
 """LLVM IR to machine code: the host's features, the optimiser, and what an earlier process made."""
 
 import functools
-import itertools
 from typing import Any
 
 from . import cache
@@ -18,11 +17,6 @@ else:
 
 FORMAT = 1
 """Goes up with each change of what the machine code expects of the process around it."""
-
-_kept: list[Any] = []
-"""Engines own the memory of their code; JAX may call it as long as the process lives."""
-
-_count = itertools.count()
 
 
 @functools.cache
@@ -98,7 +92,11 @@ def assembly(ir: str) -> str:
 
 
 def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
-    """The engine that holds a module's machine code; from the cache on disk, if it is there."""
+    """The engine, with a module's machine code in it; from the cache on disk, if it is there.
+
+    One engine holds the code of all modules, which must define different names; JAX may call it as
+    long as the process lives.
+    """
     started()
     for name, address in (symbols or {}).items():
         llvm.add_symbol(name, address)
@@ -108,11 +106,27 @@ def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
     if code is None:
         code = object_code(ir)
         cache.write(key, code)
-    # One piece of memory for code and data, so that their distance fits into a relocation.
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _own_machine(), use_lmm=True)
-    engine.set_object_cache(None, lambda module: code)
-    engine.finalize_object()
-    _kept.append(engine)
+    engine = _engine()
+    empty = llvm.parse_assembly("")
+    empty.name = key
+    _codes[key] = code
+    try:
+        engine.add_module(empty)
+        engine.finalize_object()
+    finally:
+        del _codes[key]
+    return engine
+
+
+_codes: dict[str, bytes] = {}
+"""The code of a module that is being added to the engine, by the module's name."""
+
+
+@functools.cache
+def _engine() -> Any:
+    first = llvm.parse_assembly("define internal void @nothing() { ret void }")
+    engine = llvm.create_mcjit_compiler(first, _own_machine())
+    engine.set_object_cache(None, lambda module: _codes.get(module.name))
     return engine
 
 

@@ -225,7 +225,9 @@ class _Traced:
         front = [v for v, t in zip(jaxpr.constvars, traced, strict=True) if t]
         known = [(v, c) for v, c, t in zip(jaxpr.constvars, consts, traced, strict=True) if not t]
         new = jaxpr.replace(
-            constvars=[v for v, _ in known], invars=[*front, *jaxpr.invars], debug_info=None
+            constvars=[v for v, _ in known],
+            invars=[*front, *jaxpr.invars],
+            debug_info=jaxpr.debug_info.with_unknown_names(),
         )
         return ClosedJaxpr(new, [c for _, c in known])
 
@@ -298,7 +300,10 @@ def kernel_of(
     if vectors is None and program.layout.width is not None:
         vectors = max(program.layout.width // machine.width(), 1)
     if vectors is None:
-        vectors = vectors_for(carried(closed.jaxpr), count)
+        # Every number of an argument or a result is moved trajectory by trajectory.
+        ends = [v.aval.size for v in (*closed.jaxpr.invars, *closed.jaxpr.outvars)]
+        moved = sum(n for n in ends if n <= 128)
+        vectors = vectors_for(carried(closed.jaxpr), count) if moved <= 64 else 1
     module = Module(*variant(lanes, vectors))
     return module, module.kernel(closed, on)
 
