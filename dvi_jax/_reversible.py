@@ -206,6 +206,9 @@ class Reversible(AbstractAdjoint):
             state, _ = counted_scan(body, state, k, stride, size)
             return state, (state[0].q, state[0].p)
 
+        if count % size == 0:  # one loop to compile instead of two
+            state, ends = counted_scan(segment, state, first, stride * size, segments + 1)
+            return state, jax.tree.map(lambda x: x[:-1], ends)
         state, ends = counted_scan(segment, state, first, stride * size, segments)
         whole = segments * size
         state, _ = counted_scan(body, state, first + stride * whole, stride, count - whole)

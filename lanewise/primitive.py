@@ -303,7 +303,7 @@ def kernel_of(
         # Every number of an argument or a result is moved trajectory by trajectory.
         ends = [v.aval.size for v in (*closed.jaxpr.invars, *closed.jaxpr.outvars)]
         moved = sum(n for n in ends if n <= 128)
-        vectors = vectors_for(carried(closed.jaxpr), count) if moved <= 64 else 1
+        vectors = vectors_for(carried(closed.jaxpr), count) if moved <= 24 else 1
     module = Module(*variant(lanes, vectors))
     return module, module.kernel(closed, on)
 
@@ -328,7 +328,7 @@ def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
 def vectors_for(carried: int, operations: int) -> int:
     """Vectors in a block: enough to hide latency, few enough that the state stays in registers."""
     if operations < 150:
-        return max(1, min(8, 32 // max(carried, 1)))
+        return max(1, min(6, 32 // max(carried, 1)))
     if operations < 1500:
         return 3 if carried <= 12 else 2
     return 2 if operations < 4000 and carried <= 12 else 1

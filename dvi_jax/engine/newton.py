@@ -122,7 +122,7 @@ class Newton(RootSolver):
             if by_rate:
                 # With one Jacobian corrections shrink linearly, and have been seen to, by a factor
                 # of worst/before: what is left is that much of the last one.
-                left = second * worst <= (0.5 * eps * before) * scale
+                left = second * worst <= (eps / 16 * before) * scale
                 settled = jnp.all(left | (second <= 4 * eps * scale))
             else:
                 settled = jnp.all(second <= (self.rtol or 0.0) * scale + self.atol)
