@@ -15,7 +15,7 @@ except ImportError as error:  # not on every platform: `started` says so, and al
 else:
     _missing = None
 
-FORMAT = 1
+FORMAT = 2
 """Goes up with each change of what the machine code expects of the process around it."""
 
 
@@ -57,8 +57,9 @@ def target_machine(triple: str | None = None, cpu: str | None = None, features: 
         target, (cpu, features) = llvm.Target.from_default_triple(), host()
     else:
         target = llvm.Target.from_triple(triple)
+    # The large code model: the loader may put code and data further apart than 32 bits can say.
     return target.create_target_machine(
-        cpu=cpu or "", features=features or "", opt=2, reloc="pic", codemodel="default"
+        cpu=cpu or "", features=features or "", opt=2, reloc="static", codemodel="large"
     )
 
 

@@ -408,7 +408,9 @@ lower_on("cpu", _lanewise, _on_cpu)
 
 
 def _eagerly(*operands, **params):
-    """Outside of `jit`: as under it."""
+    """Outside of `jit`: as under it, where that is not switched off."""
+    if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+        return _through_xla(*operands, **params)
     key = tuple(sorted(params.items(), key=lambda item: item[0]))
     return _compiled_call(key)(*operands)
 

@@ -81,7 +81,6 @@ CALLS = frozenset(
         "custom_jvp_call",
         "custom_vjp_call",
         "custom_vjp_call_jaxpr",
-        "custom_vmap_call",
         "checkpoint",
         "remat",
         "remat2",

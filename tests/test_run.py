@@ -112,7 +112,7 @@ def test_own_system_example(folder):
     results = report["results"]
     assert 1e-6 < results["energy_range"]["relative"] < 1e-3  # bounded, and not zero
     assert report["stats"]["newton_iterations"] > 4000  # it is implicit
-    assert report["stats"]["max_residual"] < 1e-12
+    assert report["stats"]["max_residual"] < 1e-9  # the last correction; what is left is its square
 
 
 @pytest.mark.parametrize("system", ["own.py:system", "own.py:problem"])

@@ -102,6 +102,7 @@ class Newton(RootSolver):
 
     def solve(self, F, x0, scales):
         known, eps = scales.known, float(jnp.finfo(x0.dtype).eps)
+        tiny = float(jnp.finfo(x0.dtype).tiny)
 
         def proceed(state: _Iterate):
             return ~state.converged & state.finite & (state.iterations < self.max_steps)
@@ -122,7 +123,9 @@ class Newton(RootSolver):
             if by_rate:
                 # With one Jacobian corrections shrink linearly, and have been seen to, by a factor
                 # of worst/before: what is left is that much of the last one.
-                left = second * worst <= (eps / 16 * before) * scale
+                bound = (eps / 16 * before) * scale
+                in_range = (bound > tiny) & (bound < jnp.inf)  # else the products say nothing
+                left = in_range & (second * worst <= bound)
                 settled = jnp.all(left | (second <= 4 * eps * scale))
             else:
                 settled = jnp.all(second <= (self.rtol or 0.0) * scale + self.atol)
