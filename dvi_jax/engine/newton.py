@@ -108,18 +108,18 @@ class Newton(RootSolver):
             return ~state.converged & state.finite & (state.iterations < self.max_steps)
 
         def corrected(x):
-            """x after two corrections, their sizes, and the scale of each component."""
+            """x after two corrections, the second left out where it is larger than the first;
+            the size of each component of the second, its scale, and the largest of both."""
             value, jacobian = value_and_jacobian(F, x)
             first = lanewise.solve(jacobian, value)
             x = x - first
             second = lanewise.solve(jacobian, F(x))
-            x = x - second
-            first, second, now = jnp.abs(first), jnp.abs(second), jnp.abs(x)
-            return x, first, second, jnp.where(known > now, known, now)
+            before, worst = _largest_of(jnp.abs(first)), _largest_of(jnp.abs(second))
+            x = jnp.where(worst > before, x, x - second)
+            now = jnp.abs(x)
+            return x, jnp.abs(second), jnp.where(known > now, known, now), before, worst
 
-        def judged(first, second, scale):
-            """Whether x is a root; the largest components of the corrections and of the scale."""
-            before, worst, size = map(_largest_of, (first, second, scale))
+        def is_root(second, scale, before, worst):
             if by_rate:
                 # With one Jacobian corrections shrink linearly, and have been seen to, by a factor
                 # of worst/before: what is left is that much of the last one.
@@ -129,11 +129,11 @@ class Newton(RootSolver):
                 settled = jnp.all(left | (second <= 4 * eps * scale))
             else:
                 settled = jnp.all(second <= (self.rtol or 0.0) * scale + self.atol)
-            return settled, before, worst, size
+            return settled
 
         def improve(state: _Iterate):
-            x, first, second, scale = corrected(state.x)
-            settled, before, worst, size = judged(first, second, scale)
+            x, second, scale, before, worst = corrected(state.x)
+            settled, size = is_root(second, scale, before, worst), _largest_of(scale)
             # A component that is all round-off of the others never settles by its own measure: it
             # is enough that it is small beside them and shrinks no more.
             rtol = 4096 * eps if by_rate else self.rtol or 0.0
@@ -149,9 +149,10 @@ class Newton(RootSolver):
         if x0.size <= _FIRST_APART:
             # Nearly all steps need one Jacobian: the first turn is made in front of the loop, where
             # no trajectory waits for another.
-            x, *sizes = corrected(x0)
-            settled, _, worst, size = judged(*sizes)
-            start = _Iterate(x, jnp.stack([worst, size]), yes, settled, jnp.asarray(1, jnp.int32))
+            x, second, scale, before, worst = corrected(x0)
+            error = jnp.stack([worst, _largest_of(scale)])
+            settled = is_root(second, scale, before, worst)
+            start = _Iterate(x, error, yes, settled, jnp.asarray(1, jnp.int32))
         end = lax.while_loop(proceed, improve, start)
         return Found(end.x, end.iterations, end.error, end.converged & end.finite)
 
