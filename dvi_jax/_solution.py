@@ -111,9 +111,9 @@ class Solution(eqx.Module):
     - `result`: the status, one of `RESULTS`. From the failing step on states and observables
       are NaN.
     - `stop`: where a run with a `Stop` ended, a `Stopped` (t, q, p), NaN if it did not; else None.
-    - `stats`: `num_steps`; `newton_iterations` (total); `max_residual` (largest relative residual
-      of a solve); `failed_step` (number of the failing step from 0, or −1) and
-      `failed_residual` (its relative residual, or 0).
+    - `stats`: `num_steps`; `newton_iterations` (total); `max_residual` (largest last
+      correction of a solve relative to its scale); `failed_step` (number of the failing step from
+      0, or −1) and `failed_residual` (its last correction, likewise, or 0).
 
     Under `vmap` every field has the batch axis in front.
     """
