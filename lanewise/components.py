@@ -1012,7 +1012,9 @@ _SPECIAL: dict[str, Callable] = {
     "dot_general": Evaluator.dot,
     "iota": Evaluator.iota,
     "optimization_barrier": Evaluator.same,
-    **dict.fromkeys(["lanes_in_front", "reshard", "sharding_constraint", "mesh_cast"], Evaluator.same),
+    **dict.fromkeys(
+        ["lanes_in_front", "reshard", "sharding_constraint", "mesh_cast"], Evaluator.same
+    ),
     "argmax": Evaluator.argument_of,
     "argmin": Evaluator.argument_of,
     "dynamic_slice": Evaluator.dynamic_slice,
