@@ -58,9 +58,7 @@ class Layout:
 
     def __post_init__(self):
         if self.form not in FORMS:
-            raise ValueError(
-                f'form must be "auto", "components", "arrays" or "kernel", got {self.form!r}.'
-            )
+            raise ValueError(f'form must be "auto", "components" or "arrays", got {self.form!r}.')
         if self.form == "kernel":
             warnings.warn(
                 'Layout(form="kernel") is now form="auto": the Pallas kernel was removed. On a GPU '
@@ -68,6 +66,7 @@ class Layout:
                 DeprecationWarning,
                 stacklevel=3,
             )
+            object.__setattr__(self, "form", "auto")
         width = self.width
         if width is not None and (
             isinstance(width, bool) or not isinstance(width, int) or width < 1
