@@ -284,6 +284,10 @@ def runtime() -> Any:
 
 def set_threads(count: int) -> None:
     """Threads that a batch is shared over: 0 means all of XLA's pool."""
+    if isinstance(count, bool) or not isinstance(count, int):
+        raise TypeError(f"the number of threads must be an integer, got {count!r}.")
+    if count < 0:
+        raise ValueError(f"the number of threads must be at least 1, or 0 for all; got {count}.")
     import ctypes
 
     address = runtime().get_global_value_address("lanewise_threads")

@@ -375,9 +375,6 @@ class Builder:
             return a
         return self.select(self.compare("lt", a, self.known(0, a.dtype)), self.neg(a), a)
 
-    def fused_sum(self, a: Num, b: Num) -> Num:
-        return self.add(a, b)
-
     # --- comparisons and choices -----------------------------------------------------------------
 
     def compare(self, op: str, a: Num, b: Num) -> Num:

@@ -17,6 +17,11 @@ def solve(A: Array, b: Array) -> Array:
     trajectories where a pivot is small beside the numbers below it. A singular matrix gives
     infinities or NaN, for the caller's status to report.
     """
+    if A.ndim != 2 or A.shape[0] != A.shape[1] or b.shape != A.shape[:1]:
+        raise ValueError(
+            f"A must have shape (n, n) and b shape (n,), got {A.shape} and {b.shape}. For several "
+            "systems use jax.vmap or lanewise.batched."
+        )
     return lax.custom_linear_solve(
         lambda x: A @ x,
         b,

@@ -130,6 +130,12 @@ def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Call
                                                           jnp.zeros(1000))
     ```
     """
+    if not callable(function):
+        raise TypeError(f"batched takes a function of one trajectory, got {function!r}.")
+    if not isinstance(layout, Layout):
+        raise TypeError(
+            f"layout must be a lanewise.Layout, got {layout!r}: write Layout(form=...)."
+        )
     one = functools.partial(call, function, layout=layout)
     return jax.vmap(one, in_axes)
 
