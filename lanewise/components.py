@@ -1,5 +1,6 @@
 """A jaxpr evaluated number by number into LLVM IR, for a block of trajectories."""
 
+import contextlib
 import dataclasses
 import functools
 import math
@@ -8,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from .assumed import Assumed, NotAssumable, may_assume
 from .dependence import fixed_point, reached_outputs
 from .ir import TYPES, Builder, Num, Unsupported
 from .jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies, scan_counts
-from .memory import Buffer, contiguous, load, store
+from .memory import Buffer, contiguous, load, load_row, store, store_row, transposed
 from .rules import CALLS, CUMULATIVE, MOVES, REDUCTIONS, VIEWS
 
 Entries = Any
@@ -25,6 +27,10 @@ MADE = 4096
 
 AGREED = frozenset(["least_over_lanes"])
 """Primitives whose result is the same on all trajectories, whatever goes in."""
+
+_PORTION, _PATIENCE = 32, 8
+"""Rounds of a loop that are run on assumptions before these are looked at, and the portions run
+without any after one that has failed."""
 
 MOST_OPERATIONS = 60_000
 """More operations than this are left to XLA, loops counted once."""
@@ -93,11 +99,65 @@ class Kernel:
         raise NotImplementedError
 
 
+class Waiting:
+    """Rows of results that wait in fast memory until several are there, and are then written.
+
+    Trajectory after trajectory a result has rows far apart: writing `count` of them at a time fills
+    whole cache lines.
+    """
+
+    def __init__(self, evaluator: "Evaluator", results: Sequence[Buffer], count: int):
+        self.b, self.evaluator, self.results, self.count = evaluator.b, evaluator, results, count
+        self.stages = [evaluator.kernel.scratch((count, *r.shape[1:]), r.dtype, True) for r in results]
+
+    @classmethod
+    def of(cls, evaluator: "Evaluator", results: Sequence[Buffer], length: int) -> "Waiting | None":
+        """For results of a loop with `length` rounds, if it is worth while."""
+        b = evaluator.b
+        if b.W == 1 or not results or any(r.lane in (None, 1) or r.dtype == "bool" for r in results):
+            return None
+        width = sum(math.prod(r.shape[1:]) for r in results)
+        if not all(r.strides == contiguous(r.shape) for r in results) or not 0 < width <= 8:
+            return None
+        count = 32 if width <= 2 else 16 if width <= 4 else 8
+        return cls(evaluator, results, count) if length > count else None
+
+    def rows(self, k: Num, start: Num) -> list[Buffer]:
+        """Where round k writes, of a portion that begins with round `start`."""
+        b = self.b
+        return [s.row(b, b.sub(k, start)) for s in self.stages]
+
+    def write(self, start: Num, stop: Num) -> None:
+        """Write the rows start, …, stop − 1 to where they belong."""
+        b = self.b
+        count = b.known(self.count, "int64")
+
+        def whole() -> list[Num]:
+            for stage, result in zip(self.stages, self.results, strict=True):
+                transposed(b, stage, result.from_row(b, start))
+            return []
+
+        def some() -> list[Num]:
+            def row(state, _):
+                k = state[0]
+                for to, result in zip(self.rows(k, start), self.results, strict=True):
+                    value = Value(to.shape, to.dtype, buffer=to)
+                    self.evaluator.write(value, result.row(b, k))
+                return [b.add(k, b.known(1, "int64"))]
+
+            b.loop([start], [False], lambda state, _: b.ref(b.compare("lt", state[0], stop), 0, False), row)
+            return []
+
+        is_whole = b.compare("eq", b.sub(stop, start), count)
+        b.branch(b.ref(is_whole, 0, False), whole, some, [], [])
+
+
 class Evaluator:
     """One evaluation: numbers go through `b`, memory comes from `kernel`."""
 
     def __init__(self, b: Builder, kernel: Kernel):
         self.b, self.kernel = b, kernel
+        self.assumed: Assumed | None = None
 
     # --- jaxprs ------------------------------------------------------------------------------
 
@@ -158,7 +218,7 @@ class Evaluator:
             seen = self._viewed(eqn, values)
             if seen is not None:
                 return seen
-        if name == "concatenate" and not all(v.is_small for v in values):
+        if name == "concatenate" and any(v.entries is None for v in values):
             return [self._joined(eqn, values, places[0])]
         if name in MOVES:
             moved = MOVES[name](*(self.entries(v) for v in values), **eqn.params)
@@ -181,6 +241,11 @@ class Evaluator:
         outs = self.closed(program.traced.all_inputs, [self.closed_off(v) for v in values])
         return [self.closed_off(v) for v in outs]
 
+    def unrelated(self, value: Value) -> Value:
+        """The same numbers, as they come out of a loop or a branch."""
+        new = [self.b.unrelated(x) for x in self.entries(value).flat]
+        return Value(value.shape, value.dtype, objects(new, value.shape))
+
     def closed_off(self, value: Value) -> Value:
         """The same numbers, of which it is not known how they were made."""
         if value.entries is None:
@@ -201,8 +266,7 @@ class Evaluator:
         key = ("entries", id(value))
         found = self.b.find(key)
         if found is None:
-            numbers = [load(self.b, buffer, buffer.at(i)) for i in np.ndindex(value.shape)]
-            found = objects(numbers, value.shape)
+            found = objects(load_row(self.b, buffer), value.shape)
             self.b.note(key, found)
             self.b.note(("kept", id(value)), value)  # so that no other value gets its id
         return found
@@ -224,8 +288,7 @@ class Evaluator:
         if value.buffer == place:
             return
         if value.entries is not None:
-            for i in np.ndindex(value.shape):
-                store(self.b, place, value.entries[i], place.at(i))
+            store_row(self.b, place, list(value.entries.flat))
             return
         source = value.buffer
         assert source is not None
@@ -477,23 +540,20 @@ class Evaluator:
         ):
             rows.append(place or self.kernel.scratch(v.aval.shape, str(v.aval.dtype), o))
         end = self.kernel.parameter(length)
+        waiting = None if reverse else Waiting.of(self, rows, length)
 
         def merged(numbers: Sequence[Num]) -> list[Value]:
             of = iter(back(numbers))
             return [c if s else next(of) for c, s in zip(carry, still, strict=True)]
 
-        def test(_, i):
-            return b.new(f"icmp slt i64 {i}, {end.names[0]}")
-
-        def inner(numbers, i):
-            k = b.made([i], "int64", False)
+        def round_of(numbers: Sequence[Num], k: Num, start: Num) -> list[Num]:
             if reverse:
                 k = b.sub(b.sub(end, b.known(1, "int64")), k)
             slices = []
             for source in sources:
                 row = source.row(b, k)
                 slices.append(Value(row.shape, source.dtype, buffer=row))
-            targets = [r.row(b, k) for r in rows]
+            targets = [r.row(b, k) for r in rows] if waiting is None else waiting.rows(k, start)
             outs = self.jaxpr(
                 jaxpr,
                 [self.constant(c) for c in body.consts],
@@ -508,12 +568,139 @@ class Evaluator:
                     after += list(self.entries(y).flat)
             return after
 
-        done = merged(b.loop(numbers, vec, test, inner, count=True))
+        done = merged(self.rounds(jaxpr, numbers, vec, length, end, round_of, waiting))
         ys = [
             Value(v.aval.shape, v.aval.dtype, buffer=r)
             for v, r in zip(eqn.outvars[num_carry:], rows, strict=True)
         ]
         return [*done, *ys]
+
+    def rounds(
+        self, jaxpr: Jaxpr, numbers: list[Num], vec: list[bool], length: int, end: Num,
+        round_of: Callable[[Sequence[Num], Num, Num], list[Num]], waiting: Waiting | None,
+    ) -> list[Num]:  # fmt: skip
+        """What is carried after rounds 0, …, end − 1; `round_of(numbers, k, start)` is round k of
+        a portion that begins with round `start`."""
+        b, zero = self.b, self.b.known(0, "int64")
+        with self.assuming(None):
+            if length > 1 and may_assume(jaxpr):
+                mark = b.mark()
+                try:
+                    return self._on_assumptions(numbers, vec, length, end, round_of, waiting)
+                except NotAssumable:
+                    b.back_to(mark)
+            if waiting is None:
+                return self._rounds(numbers, vec, zero, end, round_of)
+
+            def portion(start: Num, stop: Num, state: Sequence[Num]) -> list[Num]:
+                return self._rounds(state, vec, start, stop, round_of)
+
+            size = b.known(waiting.count, "int64")
+            return self._portions(numbers, vec, size, end, portion, waiting)
+
+    def _rounds(self, numbers, vec, start: Num, end: Num, round_of) -> list[Num]:
+        """Rounds start, …, end − 1."""
+        b = self.b
+
+        def body(state, _):
+            k, *before = state
+            return [b.add(k, b.known(1, "int64")), *round_of(before, k, start)]
+
+        return b.loop(
+            [start, *numbers], [False, *vec],
+            lambda state, _: b.ref(b.compare("lt", state[0], end), 0, False), body,
+        )[1:]  # fmt: skip
+
+    def _portions(self, state, vec, size: Num, end: Num, portion, waiting) -> list[Num]:
+        """All rounds, ``portion(start, stop, state)`` by portion, and the rows of each written."""
+        b = self.b
+
+        def body(state, _):
+            start, *before = state
+            stop = b.add(start, size)
+            stop = b.select(b.compare("lt", stop, end), stop, end)
+            after = portion(start, stop, before)
+            if waiting is not None:
+                waiting.write(start, stop)
+            return [stop, *after]
+
+        return b.loop(
+            [b.known(0, "int64"), *state], [False, *vec],
+            lambda state, _: b.ref(b.compare("lt", state[0], end), 0, False), body,
+        )[1:]  # fmt: skip
+
+    def _on_assumptions(
+        self, numbers: list[Num], vec: list[bool], length: int, end: Num, round_of: Callable,
+        waiting: Waiting | None,
+    ) -> list[Num]:  # fmt: skip
+        """The rounds in portions: first without the branches that are rarely taken; if one should
+        have been taken by a trajectory of the block, the portion is repeated with all branches.
+
+        After such a portion some are run with all branches at once.
+        """
+        b = self.b
+        zero, false = b.known(0, "int64"), b.known(False, "bool")
+        if waiting is not None:
+            size = b.known(waiting.count, "int64")
+        else:
+            size = self.kernel.parameter(-(-length // -(-length // _PORTION)))
+        wait = b.mul(size, b.known(_PATIENCE, "int64"))
+        aside = [self.kernel.scratch((), x.dtype, v).base for x, v in zip(numbers, vec, strict=True)]
+        changed: list[bool] = []
+
+        def without_branches(start: Num, stop: Num, numbers: Sequence[Num]) -> list[Num]:
+            found = Assumed(b)
+
+            def body(state, _):
+                k, failed, *before = state
+                with self.assuming(found):
+                    after = round_of(before, k, start)
+                found.leave_to_the_end(before, after)
+                changed.extend(x is not y for x, y in zip(before, after, strict=True))
+                return [b.add(k, b.known(1, "int64")), found.wrong(failed), *after]
+
+            _, failed, *after = b.loop(
+                [start, false, *numbers], [False, False, *vec],
+                lambda state, _: b.ref(b.compare("lt", state[0], stop), 0, False), body,
+            )  # fmt: skip
+            return [found.wrong_at_the_end(failed, after), *after]
+
+        def portion(start: Num, stop: Num, state: Sequence[Num]) -> list[Num]:
+            until, *numbers = state
+            tried = b.compare("ge", start, until)
+            before_all = len(b.lines)
+            all_vec, dtypes = [False, *vec], ["bool", *(x.dtype for x in numbers)]
+            failed, *found = b.branch(
+                b.ref(tried, 0, False),
+                lambda: without_branches(start, stop, numbers),
+                lambda: [b.known(True, "bool"), *numbers],
+                all_vec, dtypes,
+            )  # fmt: skip
+            # Numbers that change wait in memory: registers are for the rounds.
+            kept = zip(changed, numbers, aside, vec, strict=True)
+            b.lines[before_all:before_all] = [
+                line for c, x, to, v in kept if c for line in b.set_aside(x, to, v)
+            ]
+
+            def again() -> list[Num]:
+                kept = zip(changed, numbers, aside, vec, strict=True)
+                old = [b.taken_back(x, at, v) if c else x for c, x, at, v in kept]
+                return self._rounds(old, vec, start, stop, round_of)
+
+            found = b.branch(b.ref(failed, 0, False), again, lambda: found, vec, dtypes[1:])
+            later = b.select(b.logic("and", tried, failed), b.add(stop, wait), until)
+            return [later, *found]
+
+        return self._portions([zero, *numbers], [False, *vec], size, end, portion, waiting)[1:]
+
+    @contextlib.contextmanager
+    def assuming(self, assumed: Any):
+        """Take branches that are rarely needed for not needed, and note that in `assumed`."""
+        before, self.assumed = self.assumed, assumed
+        try:
+            yield assumed
+        finally:
+            self.assumed = before
 
     def while_loop(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         params, b = eqn.params, self.b
@@ -541,13 +728,19 @@ class Evaluator:
             return [x for v in self.closed(body, [*of_body, *carry])
                     for x in self.entries(v).flat]  # fmt: skip
 
+        if per_lane and self.assumed is not None:
+            self.assumed.never(goes_on(back(numbers)))
+            return back([b.unrelated(x) for x in numbers])
+        with self.assuming(None):
+            return back(self._while(numbers, vec, per_lane, back, goes_on, step))
+
+    def _while(self, numbers, vec, per_lane: bool, back, goes_on, step) -> list[Num]:
+        b = self.b
         if not per_lane:
-            return back(
-                b.loop(
-                    numbers, vec,
-                    lambda state, _: b.ref(goes_on(back(state)), 0, False),
-                    lambda state, _: step(back(state)),
-                )
+            return b.loop(
+                numbers, vec,
+                lambda state, _: b.ref(goes_on(back(state)), 0, False),
+                lambda state, _: step(back(state)),
             )  # fmt: skip
 
         # Every trajectory stops by itself; the block goes on while one of them does.
@@ -560,7 +753,7 @@ class Evaluator:
 
         first = goes_on(back(numbers))
         end = b.loop([first, *numbers], [True, *vec], lambda state, _: b.any(state[0]), masked)
-        return back(end[1:])
+        return end[1:]
 
     def cond(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         branches, b = eqn.params["branches"], self.b
@@ -568,6 +761,16 @@ class Evaluator:
         which = self.entries(index)[()]
         if which.known is not None:
             return self.closed(branches[int(np.clip(which.known, 0, len(branches) - 1))], operands)
+        if self.assumed is not None:
+            taken = self.assumed.value(which)
+            if taken is not None:
+                chosen = branches[int(np.clip(taken, 0, len(branches) - 1))]
+                return [self.unrelated(v) for v in self.closed(chosen, operands)]
+        with self.assuming(None):
+            return self._branches(eqn, which, operands)
+
+    def _branches(self, eqn: Any, which: Num, operands: list[Value]) -> list[Value]:
+        branches, b = eqn.params["branches"], self.b
         if which.dtype == "bool":
             which = b.convert(which, "int32")
         flags = [v.has_lanes() for v in operands]
@@ -634,6 +837,9 @@ class Evaluator:
         found, weak = self._without_exchanges([list(r) for r in rows])
         if weak.known is not None and not weak.known:
             return [self.value(found, eqn.outvars[0].aval)]
+        if self.assumed is not None:
+            self.assumed.never(weak)
+            return [self.value([b.unrelated(x) for x in found], eqn.outvars[0].aval)]
 
         def exchanged() -> list[Num]:
             others = self.kernel.exchanged(numbers, vec)
@@ -703,6 +909,8 @@ class Evaluator:
     def agreed(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         """The least of an integer over the trajectories of a block."""
         b, x = self.b, self.entries(values[0])[()]
+        if self.assumed is not None:
+            return [self.value([self.assumed.least(x)], eqn.outvars[0].aval)]
         if not x.vec:
             return values
         t, full = b.type(x.dtype, True), b.suffix(x.dtype, True)

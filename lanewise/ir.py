@@ -136,9 +136,25 @@ class Builder:
         key = ("opaque", x.serial)
         found = self.find(key)
         if found is None:
-            found = self.made(x.names, x.dtype, x.vec)
+            found = self.made(x.names, x.dtype, x.vec, "same", (x,))
             self.note(key, found)
         return found
+
+    def unrelated(self, x: Num) -> Num:
+        """The number as it would come out of a loop: also a constant is a number like others."""
+        if x.known is None or not x.is_float:
+            return self.opaque(x)
+        return self.made([literal(x.known, x.dtype)], x.dtype, False)
+
+    def mark(self) -> tuple:
+        """The state of the text, for `back_to`."""
+        return len(self.lines), self.block, self.operations, len(self.scopes), dict(self.scopes[-1])
+
+    def back_to(self, mark: tuple) -> None:
+        """Forget what was written since the mark, which was made in the same function."""
+        count, self.block, self.operations, depth, scope = mark
+        del self.lines[count:], self.scopes[depth:]
+        self.scopes[-1] = scope
 
     def ref(self, x: Num, u: int, vec: bool) -> str:
         """The name of a number in vector u, as a vector where `vec`."""
@@ -399,11 +415,7 @@ class Builder:
             of = {"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor}
             return self._fold(of[op], a, b)
         if op == "and" and a.op == b.op == "finite" and a.args[0].dtype == b.args[0].dtype:
-            for x, y in ((a.args[0], b.args[0]), (b.args[0], a.args[0])):
-                if y.op == "0·x":  # one sum for both: a comparison less
-                    return self._ordered(
-                        self.op("Σ 0·x", (*y.args, x), x.dtype, self._sum(x.dtype))
-                    )
+            return self.all_finite([*self.finite_terms(a), *self.finite_terms(b)])
         if a.dtype == "bool" and op != "xor":
             for x, y in ((a, b), (b, a)):
                 if x.known is not None:
@@ -497,11 +509,51 @@ class Builder:
             return self.known(True, "bool")
         if a.known is not None:
             return self.known(np.isfinite(a.known), "bool")
-        return self._ordered(self.op("0·x", (self.known(0, a.dtype), a), a.dtype, _product))
+        return self.all_finite([a])
 
-    def _ordered(self, zero: Num) -> Num:
-        """Whether a sum of products 0·x is not NaN: whether all x are finite."""
-        return self.op("finite", (zero,), "bool", lambda t, x: f"fcmp ord {t} {x}, {x}")
+    def all_finite(self, terms: Sequence[Num]) -> Num:
+        """Whether all numbers, of one type, are finite: whether Σ 0·x is not NaN.
+
+        Those are left out whose infinities and NaN would be seen in another of them.
+        """
+        terms, needed = list({x.serial: x for x in terms}.values()), []
+        for i, x in enumerate(terms):
+            if not self.shown(frozenset([x.serial]), [*needed, *terms[i + 1 :]]):
+                needed.append(x)
+        zero = self.known(0, terms[0].dtype)
+        total = self.op("0·x", (zero, needed[0]), zero.dtype, _product)
+        for x in needed[1:]:
+            total = self.op("Σ 0·x", (zero, x, total), zero.dtype, self._sum(zero.dtype))
+        flag = self.op("finite", (total,), "bool", lambda t, x: f"fcmp ord {t} {x}, {x}")
+        return flag
+
+    def finite_terms(self, flag: Num) -> tuple[Num, ...]:
+        """The numbers that a result of `is_finite` or `all_finite` is about."""
+        terms, (total,) = [], flag.args
+        while total.op == "Σ 0·x":
+            terms.append(total.args[1])
+            total = total.args[2]
+        return (total.args[1], *reversed(terms))
+
+    def shown(self, targets: frozenset[int], by: Sequence[Num]) -> frozenset[int]:
+        """Which of `targets`, serials of numbers, are finite for certain where all numbers `by`
+        are: those numbers themselves, what they are a sum or a product of, and so on."""
+        found: dict[int, frozenset[int]] = {}
+
+        def walk(x: Num, depth: int) -> frozenset[int]:
+            if x.known is not None or depth > _DEEPEST or len(found) > _MOST_SEEN:
+                return frozenset()
+            if x.serial not in found:
+                mine = frozenset([x.serial]) & targets
+                if x.op in _HANDED_ON:
+                    mine = mine.union(*(walk(a, depth + 1) for a in x.args))
+                elif x.op == "select":
+                    _, yes, no = x.args
+                    mine |= walk(yes, depth + 1) & walk(no, depth + 1)
+                found[x.serial] = mine
+            return found[x.serial]
+
+        return frozenset().union(*(walk(x, 0) for x in by))
 
     # --- types -----------------------------------------------------------------------------------
 
@@ -590,6 +642,18 @@ class Builder:
             return total
         bits = self.new(f"bitcast {t} {total} to i{self.W}")
         return self.new(f"icmp ne i{self.W} {bits}, 0")
+
+    # --- numbers that wait in memory, where the optimiser does not see through it ------------------
+
+    def set_aside(self, x: Num, to: Sequence[str], vec: bool) -> list[str]:
+        """The lines that write a number of a carry to one pointer for each vector."""
+        t = self.type(x.dtype, vec)
+        return [f"  store volatile {t} {name}, ptr {at}" for name, at in zip(x.names, to, strict=True)]
+
+    def taken_back(self, x: Num, at: Sequence[str], vec: bool) -> Num:
+        """The number that was set aside there."""
+        t = self.type(x.dtype, vec)
+        return self.made([self.new(f"load volatile {t}, ptr {p}") for p in at], x.dtype, vec)
 
     # --- loops -----------------------------------------------------------------------------------
 
@@ -688,6 +752,12 @@ def _product(t: str, x: str, y: str) -> str:
 
 
 _FLOATS = ("float64", "float32")
+
+_HANDED_ON = frozenset(["add", "sub", "mul", "fma", "neg", "sqrt", "same"])
+"""Operations whose result is not finite where an operand is not."""
+
+_DEEPEST, _MOST_SEEN = 100, 1000
+"""How far operations are followed back."""
 
 _COMPARISONS: dict[str, Callable] = {
     "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal,

@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import elementary
-from .components import SMALL, Evaluator, Kernel, Value
+from .components import SMALL, Evaluator, Kernel, Value, objects
 from .ir import TYPES, Builder, Num, Unsupported, literal
 from .jaxapi import ClosedJaxpr
-from .memory import Buffer, contiguous, load, store, stored_type
+from .memory import Buffer, contiguous, load, load_row, store, stored_type
 
 HEAD = 2
-"""Parameters in front of a kernel's own: trajectories, cost of a block."""
+"""Parameters in front of a kernel's own: trajectories, cost of a block; and for each result the
+bytes of one trajectory."""
 
 LARGEST_SCRATCH = 64 * 2**20
 """Bytes that a block may take for rows which are not results."""
@@ -194,7 +195,7 @@ class Module(Kernel):
         ]
         for i in range(len(self.values)):
             prologue += [
-                f"  %par{i}.at = getelementptr i64, ptr %params, i64 {HEAD + i}",
+                f"  %par{i}.at = getelementptr i64, ptr %params, i64 {HEAD + len(results) + i}",
                 f"  %par{i} = load i64, ptr %par{i}.at",
             ]
         epilogue = []
@@ -237,10 +238,7 @@ class Module(Kernel):
     def _operand(self, evaluator: Evaluator, buffer: Buffer) -> Value:
         value = Value(buffer.shape, buffer.dtype, buffer=buffer)
         if value.size <= SMALL:
-            numbers = np.empty(buffer.shape, object)
-            for i in np.ndindex(buffer.shape):
-                numbers[i] = load(self.b, buffer, buffer.at(i))
-            value.entries = numbers
+            value.entries = objects(load_row(self.b, buffer), buffer.shape)
         return value
 
 

@@ -15,7 +15,7 @@ except ImportError as error:  # not on every platform: `started` says so, and al
 else:
     _missing = None
 
-FORMAT = 2
+FORMAT = 3
 """Goes up with each change of what the machine code expects of the process around it."""
 
 

@@ -47,6 +47,10 @@ class Buffer:
             self, shape=self.shape[1:], strides=self.strides[1:], offset=(*self.offset, by)
         )
 
+    def from_row(self, b: Builder, index: Num) -> "Buffer":
+        """``self[index:]``, of which the first axis keeps its name only."""
+        return self.moved(b.mul(index, b.known(self.strides[0], "int64")))
+
     def reshaped(self, shape: Sequence[int]) -> "Buffer | None":
         """The same elements in row-major order with other axes, if strides can say that."""
         if not self.is_contiguous:
@@ -227,3 +231,186 @@ def store(b: Builder, buffer: Buffer, x: Num, by: Num | int = 0) -> None:
                 value = b.new(f"extractelement {vector} {name}, i64 {i}")
                 at = _lane_pointer(b, where, i, buffer.lane, item)
                 b.emit(f"store {item} {value}, ptr {at}, align {_bytes(item)}")
+
+
+# --- whole rows: the numbers of each trajectory lie next to each other, those of a vector do not ---
+
+
+def load_row(b: Builder, buffer: Buffer) -> list[Num]:
+    """All elements in row-major order."""
+    if not _is_row(b, buffer):
+        return [load(b, buffer, buffer.at(i)) for i in np.ndindex(buffer.shape)]
+    item, moving, fixed = TYPES[buffer.dtype], *_offset(b, buffer, 0)
+    names: list[list[str]] = [[] for _ in range(buffer.size)]
+    for u in range(b.U):
+        where = _start_of_row(b, buffer, u, moving, item)
+        for first, count in _pieces(buffer.size, buffer.lane):
+            of_lanes = _load_lanes(b, buffer, where, fixed + first, count, item)
+            for j in range(count):
+                names[first + j].append(_picked(b, of_lanes, j, count, item))
+    return [b.made(of_u, buffer.dtype, True) for of_u in names]
+
+
+def store_row(b: Builder, buffer: Buffer, numbers: Sequence[Num]) -> None:
+    """Write all elements, given in row-major order."""
+    if not _is_row(b, buffer):
+        for i, x in zip(np.ndindex(buffer.shape), numbers, strict=True):
+            store(b, buffer, x, buffer.at(i))
+        return
+    item, moving, fixed = TYPES[buffer.dtype], *_offset(b, buffer, 0)
+    for u in range(b.U):
+        where = _start_of_row(b, buffer, u, moving, item)
+        for first, count in _pieces(buffer.size, buffer.lane):
+            vectors = [b.ref(x, u, True) for x in numbers[first : first + count]]
+            _store_lanes(b, buffer, where, fixed + first, vectors, item)
+
+
+_LONGEST_PIECE = 4
+
+
+def _pieces(size: int, lane: Any) -> list[tuple[int, int]]:
+    """A row cut into pieces that are moved as a whole: (first, count)."""
+    if lane == size and size <= _LONGEST_PIECE:
+        return [(0, size)]
+    pieces, first = [], 0
+    while first < size:
+        count = next(c for c in (4, 2, 1) if c <= size - first)
+        pieces.append((first, count))
+        first += count
+    return pieces
+
+
+def _is_row(b: Builder, buffer: Buffer) -> bool:
+    """Whether the elements of one trajectory are neighbours, and those of a vector are not."""
+    if b.W == 1 or buffer.lane in (None, 1) or buffer.dtype == "bool" or buffer.size < 2:
+        return False
+    moves = any(isinstance(x, Num) and x.vec for x in buffer.offset)
+    return not moves and buffer.strides == contiguous(buffer.shape)
+
+
+def _start_of_row(b: Builder, buffer: Buffer, u: int, moving: Num, item: str) -> str:
+    if moving.known is not None:
+        return buffer.base[u]
+    return b.new(f"getelementptr {item}, ptr {buffer.base[u]}, i64 {moving.names[0]}")
+
+
+def _load_lanes(b: Builder, buffer: Buffer, where: str, first: int, count: int, item: str) -> str:
+    """One vector with `count` neighbours of each trajectory, one trajectory after the other."""
+    assert buffer.lane is not None
+    if first:
+        where = b.new(f"getelementptr {item}, ptr {where}, i64 {first}")
+    if buffer.lane == count:
+        whole = f"<{b.W * count} x {item}>"
+        return b.new(f"load {whole}, ptr {where}, align {_bytes(item)}")
+    parts = []
+    for i in range(b.W):
+        at = _lane_pointer(b, where, i, buffer.lane, item)
+        parts.append(b.new(f"load <{count} x {item}>, ptr {at}, align {_bytes(item)}"))
+    return _joined(b, parts, count, item)
+
+
+def _store_lanes(
+    b: Builder, buffer: Buffer, where: str, first: int, vectors: list[str], item: str
+) -> None:
+    """Write one vector for each of some neighbours."""
+    assert buffer.lane is not None
+    count = len(vectors)
+    if first:
+        where = b.new(f"getelementptr {item}, ptr {where}, i64 {first}")
+    joined = _joined(b, vectors, b.W, item)
+    if buffer.lane == count:
+        order = [j * b.W + i for i in range(b.W) for j in range(count)]
+        whole = _shuffled(b, joined, b.W * count, order, item)
+        b.emit(f"store <{b.W * count} x {item}> {whole}, ptr {where}, align {_bytes(item)}")
+        return
+    for i in range(b.W):
+        mine = _shuffled(b, joined, b.W * count, [j * b.W + i for j in range(count)], item)
+        at = _lane_pointer(b, where, i, buffer.lane, item)
+        b.emit(f"store <{count} x {item}> {mine}, ptr {at}, align {_bytes(item)}")
+
+
+def _picked(b: Builder, joined: str, j: int, count: int, item: str) -> str:
+    """Number j of each trajectory, of `count` that lie next to each other."""
+    return _shuffled(b, joined, b.W * count, [i * count + j for i in range(b.W)], item)
+
+
+def _joined(b: Builder, parts: list[str], length: int, item: str) -> str:
+    """Vectors of one length, one after the other."""
+    parts = list(parts)
+    missing = (1 << (len(parts) - 1).bit_length()) - len(parts)
+    wanted = len(parts) * length
+    parts += ["poison"] * missing
+    while len(parts) > 1:
+        t, order = f"<{length} x {item}>", ", ".join(f"i32 {k}" for k in range(2 * length))
+        parts = [
+            "poison" if x == y == "poison" else
+            b.new(f"shufflevector {t} {x}, {t} {y}, <{2 * length} x i32> <{order}>")
+            for x, y in zip(parts[::2], parts[1::2], strict=True)
+        ]  # fmt: skip
+        length *= 2
+    return parts[0] if length == wanted else _shuffled(b, parts[0], length, range(wanted), item)
+
+
+def _shuffled(b: Builder, x: str, length: int, order: Sequence[int], item: str) -> str:
+    if list(order) == list(range(length)):
+        return x
+    t, which = f"<{length} x {item}>", ", ".join(f"i32 {k}" for k in order)
+    return b.new(f"shufflevector {t} {x}, {t} poison, <{len(order)} x i32> <{which}>")
+
+
+def transposed(b: Builder, source: Buffer, target: Buffer) -> None:
+    """Copy all elements of `source`, whose vectors lie in memory as such, to the first ones of
+    `target`, where those of one trajectory are neighbours. The size is a multiple of the width."""
+    item, W = TYPES[source.dtype], b.W
+    moving, fixed = _offset(b, target, 0)
+    start = _start_of_row(b, target, 0, moving, item)
+    if fixed:
+        start = b.new(f"getelementptr {item}, ptr {start}, i64 {fixed}")
+    lane = target.lane
+    block = b.U * W  # the vectors of one element
+    by_vector = f"{lane * W}" if isinstance(lane, int) else b.new(f"mul i64 {lane}, {W}")
+
+    def of_vector(_, u: str) -> list[Num]:
+        first = b.new(f"mul i64 {u}, {W}")
+        mine = b.new(f"getelementptr {item}, ptr {source.base[0]}, i64 {first}")
+        by = b.new(f"mul i64 {u}, {by_vector}")
+        yours = b.new(f"getelementptr {item}, ptr {start}, i64 {by}")
+
+        def square(_, c: str) -> list[Num]:
+            at = b.new(f"mul i64 {c}, {W * block}")
+            at = b.new(f"getelementptr {item}, ptr {mine}, i64 {at}")
+            vectors = []
+            for j in range(W):
+                where = b.new(f"getelementptr {item}, ptr {at}, i64 {j * block}")
+                vectors.append(b.new(f"load <{W} x {item}>, ptr {where}, align {_bytes(item)}"))
+            to = b.new(f"mul i64 {c}, {W}")
+            to = b.new(f"getelementptr {item}, ptr {yours}, i64 {to}")
+            for i, row in enumerate(_square_transposed(b, vectors, item)):
+                where = _lane_pointer(b, to, i, lane, item)
+                b.emit(f"store <{W} x {item}> {row}, ptr {where}, align {_bytes(item)}")
+            return []
+
+        squares = source.size // W
+        b.loop([], [], lambda _, c: b.new(f"icmp slt i64 {c}, {squares}"), square, count=True)
+        return []
+
+    b.loop([], [], lambda _, u: b.new(f"icmp slt i64 {u}, {b.U}"), of_vector, count=True)
+
+
+def _square_transposed(b: Builder, rows: list[str], item: str) -> list[str]:
+    """W vectors of W as rows of a matrix → its columns, by exchanging halves, quarters, …"""
+    W, rows = len(rows), list(rows)
+    t = f"<{W} x {item}>"
+    half = W // 2
+    while half:
+        for i in range(W):
+            if i & half:
+                continue
+            x, y = rows[i], rows[i + half]
+            low = [k if not k & half else W + k - half for k in range(W)]
+            high = [k + half if not k & half else W + k for k in range(W)]
+            for at, order in ((i, low), (i + half, high)):
+                which = ", ".join(f"i32 {k}" for k in order)
+                rows[at] = b.new(f"shufflevector {t} {x}, {t} {y}, <{W} x i32> <{which}>")
+        half //= 2
+    return rows

@@ -289,7 +289,9 @@ def compiled(
     module, text = kernel_of(program, on, 1 if lanes is None else lanes, vectors)
     name = handler.registered(handler.module_text(text, module.W * module.U))
     cost = max(module.b.operations * max([1, *module.values]), 1)
-    return name, np.asarray([lanes or 1, cost, *module.values], np.int64)
+    outs = program.traced.closed.out_avals
+    sizes = [a.size * a.dtype.itemsize for a in outs]
+    return name, np.asarray([lanes or 1, cost, *sizes, *module.values], np.int64)
 
 
 def kernel_of(
@@ -305,9 +307,8 @@ def kernel_of(
     if vectors is None and program.layout.width is not None:
         vectors = max(program.layout.width // machine.width(), 1)
     if vectors is None:
-        # Every number of an argument or a result is moved trajectory by trajectory.
-        ends = [v.aval.size for v in (*closed.jaxpr.invars, *closed.jaxpr.outvars)]
-        moved = sum(n for n in ends if n <= 128)
+        # Every number of an argument is moved trajectory by trajectory.
+        moved = sum(v.aval.size for v in closed.jaxpr.invars if v.aval.size <= 128)
         vectors = vectors_for(carried(closed.jaxpr), count) if moved <= 24 else 1
     module = Module(*variant(lanes, vectors))
     return module, module.kernel(closed, on)

@@ -1,0 +1,139 @@
+"""Rounds of a loop run on the assumption that no branch is taken that is rarely needed.
+
+A step that looks every time whether something has failed spends much of its time on looking. So
+some steps are run without: what would have been looked at is collected, and where one trajectory of
+the block should have taken a branch, those steps are run again with all branches, from where they
+began. The numbers are the same to the bit in both.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from .ir import Builder, Num
+from .jaxapi import Jaxpr, bodies
+
+
+class NotAssumable(Exception):
+    """Something stands in the way of running a loop without its branches."""
+
+
+class Assumed:
+    """What the rounds of a loop take for granted, while the code of one round is written."""
+
+    def __init__(self, b: Builder):
+        self.b = b
+        self.failures: list[Num] = []
+        self.finite: list[Num] = []
+        self.at_the_end: list[int] = []
+
+    def never(self, x: Num) -> None:
+        """A truth value is taken for false on all trajectories."""
+        b = self.b
+        if x.known is not None:
+            if x.known:
+                raise NotAssumable
+        elif x.op == "or" and x.dtype == "bool":
+            for part in x.args:
+                self.never(part)
+        elif x.op == "not" and x.args[0].op == "and":
+            for part in x.args[0].args:
+                self.never(b.invert(part))
+        elif x.op == "not" and x.args[0].op == "finite":
+            self.finite += b.finite_terms(x.args[0])
+        elif all(x.serial != other.serial for other in self.failures):
+            self.failures.append(x)
+
+    def least(self, x: Num) -> Num:
+        """The least over all trajectories of ``where(flag, 0, 1)``, the flag taken for false."""
+        if x.known is not None:
+            return x
+        if x.op != "select" or not all(a.known is not None for a in x.args[1:]):
+            raise NotAssumable
+        flag, yes, no = x.args
+        if yes.known < no.known:
+            self.never(flag)
+        else:
+            self.never(self.b.invert(flag))
+        most = max(yes.known, no.known)
+        return self.b.made([str(int(most))], x.dtype, False, "assumed", (self.b.known(most, x.dtype),))
+
+    def value(self, x: Num) -> Any:
+        """The value of a number by the assumptions, None if they do not give one."""
+        if x.known is not None:
+            return x.known
+        if x.op == "assumed":
+            return x.args[0].known
+        parts = [self.value(a) for a in x.args]
+        if not parts or any(part is None for part in parts):
+            return None
+        if x.op in ("eq", "ne"):
+            return (parts[0] == parts[1]) == (x.op == "eq")
+        if x.op == "not":
+            return not parts[0]
+        return int(parts[0]) if x.op in ("to zext", "to sext", "to trunc") else None
+
+    def leave_to_the_end(self, before: Sequence[Num], after: Sequence[Num]) -> None:
+        """Find out which numbers `after` a round, where they are finite, show that those which must
+        be, and the numbers themselves `before` the round, were finite in all rounds."""
+        b, terms = self.b, frozenset(x.serial for x in self.finite)
+        if not terms:
+            return
+
+        def is_enough(chosen: Sequence[int]) -> bool:
+            targets = terms | {before[i].serial for i in chosen}
+            return targets <= b.shown(targets, [after[i] for i in chosen])
+
+        chosen = [i for i, x in enumerate(after) if x.is_float and x.known is None]
+        chosen = [i for i in chosen if b.shown(terms, [after[i]])]
+        for i in tuple(chosen):  # as few as possible
+            fewer = [j for j in chosen if j != i]
+            if is_enough(fewer):
+                chosen = fewer
+        if is_enough(chosen):
+            self.at_the_end = chosen
+        else:
+            for dtype in sorted({x.dtype for x in self.finite}):
+                some = [x for x in self.finite if x.dtype == dtype]
+                self.failures.append(b.invert(b.all_finite(some)))
+
+    def wrong(self, before: Num) -> Num:
+        """Whether an assumption has failed on a trajectory of the block, in a round up to now."""
+        b = self.b
+        if not self.failures:
+            return before
+        total = self.failures[0]
+        for x in self.failures[1:]:
+            total = b.logic("or", total, x)
+        return b.logic("or", before, b.made([b.any(total)], "bool", False))
+
+    def wrong_at_the_end(self, before: Num, numbers: Sequence[Num]) -> Num:
+        """The same after all rounds."""
+        b = self.b
+        for dtype in ("float32", "float64"):
+            some = [numbers[i] for i in self.at_the_end if numbers[i].dtype == dtype]
+            if some:
+                bad = b.any(b.invert(b.all_finite(some)))
+                before = b.logic("or", before, b.made([bad], "bool", False))
+        return before
+
+
+_LONGEST = 300
+"""Operations of a round up to which it is written twice."""
+
+
+def may_assume(jaxpr: Jaxpr) -> bool:
+    """Whether a round of a loop asks by itself, not in a loop of its own, what all trajectories
+    agree on, and is short."""
+    from .primitive import operation_count
+
+    return _asks(jaxpr) and operation_count(jaxpr) <= _LONGEST
+
+
+def _asks(jaxpr: Jaxpr) -> bool:
+    for eqn in jaxpr.eqns:
+        name = eqn.primitive.name
+        if name == "least_over_lanes":
+            return True
+        if name not in ("scan", "while", "cond") and any(_asks(x.jaxpr) for x in bodies(eqn)):
+            return True
+    return False
