@@ -315,8 +315,9 @@ _targets: dict[str, str] = {}
 @functools.cache
 def runtime() -> Any:
     text = _RUNTIME.replace("SCHEDULE", str(_SCHEDULE)).replace("COUNT", str(_COUNT))
-    # NumPy does the same; only Linux knows the request.
-    text = text.replace("LARGE", str(4 * 2**20 if sys.platform == "linux" else 2**63 - 1))
+    # Only Linux knows the request. Below 32 MiB the C library hands out memory that it has had
+    # before, where the request costs more than it brings.
+    text = text.replace("LARGE", str(32 * 2**20 if sys.platform == "linux" else 2**63 - 1))
     return machine.loaded(text)
 
 

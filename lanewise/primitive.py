@@ -307,9 +307,12 @@ def kernel_of(
     if vectors is None and program.layout.width is not None:
         vectors = max(program.layout.width // machine.width(), 1)
     if vectors is None:
-        # Every number of an argument is moved trajectory by trajectory.
-        moved = sum(v.aval.size for v in closed.jaxpr.invars if v.aval.size <= 128)
-        vectors = vectors_for(carried(closed.jaxpr), count) if moved <= 24 else 1
+        # Every number of an argument or a result is moved trajectory by trajectory, but for the rows
+        # that a loop writes.
+        state = carried(closed.jaxpr)
+        ends = [*closed.jaxpr.invars, *([] if state else closed.jaxpr.outvars)]
+        moved = sum(v.aval.size for v in ends if v.aval.size <= 128)
+        vectors = vectors_for(state, count) if moved <= 24 else 1
     module = Module(*variant(lanes, vectors))
     return module, module.kernel(closed, on)
 

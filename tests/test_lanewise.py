@@ -601,11 +601,6 @@ def test_no_warning_from_constants():
     np.testing.assert_array_equal(found[:3], [0, -(2**31), 0])
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="a copy of each element on each of 64 trajectories is written out in one basic block, "
-    "which takes LLVM 18 s for 128 elements",
-)
 def test_code_stays_short_for_arrays():
     leaves, tree = jax.tree.flatten((1.0,))
     traced = primitive._Traced(lambda x: jnp.full((128,), x), leaves, tree)
