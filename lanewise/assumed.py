@@ -17,6 +17,28 @@ class NotAssumable(Exception):
     """Something stands in the way of running a loop without its branches."""
 
 
+def taken_for(b: Builder, value: int, dtype: str) -> Num:
+    """A number with a value that is known, where branches by it are treated as if it were not: what
+    comes out of them is a number like others."""
+    return b.made([str(int(value))], dtype, False, "taken for", (b.known(value, dtype),))
+
+
+def taken_value(x: Num) -> Any:
+    """The value of a number that comes from one of `taken_for`; else None."""
+    if x.known is not None:
+        return x.known
+    if x.op == "taken for":
+        return x.args[0].known
+    if x.op not in ("eq", "ne", "not", "to zext", "to sext", "to trunc"):
+        return None
+    parts = [taken_value(a) for a in x.args]
+    if any(part is None for part in parts):
+        return None
+    if x.op in ("eq", "ne"):
+        return (parts[0] == parts[1]) == (x.op == "eq")
+    return not parts[0] if x.op == "not" else int(parts[0])
+
+
 class Assumed:
     """What the rounds of a loop take for granted, while the code of one round is written."""
 
@@ -54,23 +76,7 @@ class Assumed:
             self.never(flag)
         else:
             self.never(self.b.invert(flag))
-        most = max(yes.known, no.known)
-        return self.b.made([str(int(most))], x.dtype, False, "assumed", (self.b.known(most, x.dtype),))
-
-    def value(self, x: Num) -> Any:
-        """The value of a number by the assumptions, None if they do not give one."""
-        if x.known is not None:
-            return x.known
-        if x.op == "assumed":
-            return x.args[0].known
-        parts = [self.value(a) for a in x.args]
-        if not parts or any(part is None for part in parts):
-            return None
-        if x.op in ("eq", "ne"):
-            return (parts[0] == parts[1]) == (x.op == "eq")
-        if x.op == "not":
-            return not parts[0]
-        return int(parts[0]) if x.op in ("to zext", "to sext", "to trunc") else None
+        return taken_for(self.b, max(yes.known, no.known), x.dtype)
 
     def leave_to_the_end(self, before: Sequence[Num], after: Sequence[Num]) -> None:
         """Find out which numbers `after` a round, where they are finite, show that those which must
@@ -117,7 +123,7 @@ class Assumed:
         return before
 
 
-_LONGEST = 300
+_LONGEST = int(__import__("os").environ.get("LONGEST","300"))
 """Operations of a round up to which it is written twice."""
 
 
@@ -132,7 +138,7 @@ def may_assume(jaxpr: Jaxpr) -> bool:
 def _asks(jaxpr: Jaxpr) -> bool:
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
-        if name == "least_over_lanes":
+        if name == "least_over_lanes" and eqn.params["rare"]:
             return True
         if name not in ("scan", "while", "cond") and any(_asks(x.jaxpr) for x in bodies(eqn)):
             return True

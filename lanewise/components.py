@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .assumed import Assumed, NotAssumable, may_assume
+from .assumed import Assumed, NotAssumable, may_assume, taken_for, taken_value
 from .dependence import fixed_point, reached_outputs
 from .ir import TYPES, Builder, Num, Unsupported
 from .jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies, scan_counts
@@ -761,11 +761,10 @@ class Evaluator:
         which = self.entries(index)[()]
         if which.known is not None:
             return self.closed(branches[int(np.clip(which.known, 0, len(branches) - 1))], operands)
-        if self.assumed is not None:
-            taken = self.assumed.value(which)
-            if taken is not None:
-                chosen = branches[int(np.clip(taken, 0, len(branches) - 1))]
-                return [self.unrelated(v) for v in self.closed(chosen, operands)]
+        taken = taken_value(which)
+        if taken is not None:
+            chosen = branches[int(np.clip(taken, 0, len(branches) - 1))]
+            return [self.unrelated(v) for v in self.closed(chosen, operands)]
         with self.assuming(None):
             return self._branches(eqn, which, operands)
 
@@ -909,10 +908,12 @@ class Evaluator:
     def agreed(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         """The least of an integer over the trajectories of a block."""
         b, x = self.b, self.entries(values[0])[()]
-        if self.assumed is not None:
+        if self.assumed is not None and eqn.params["rare"]:
             return [self.value([self.assumed.least(x)], eqn.outvars[0].aval)]
         if not x.vec:
             return values
+        if not eqn.params["rare"]:  # one of so many will need it
+            return [self.value([taken_for(b, 0, x.dtype)], eqn.outvars[0].aval)]
         t, full = b.type(x.dtype, True), b.suffix(x.dtype, True)
         total = x.names[0]
         for other in x.names[1:]:

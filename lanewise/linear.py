@@ -71,18 +71,19 @@ def unit_vectors(n: int, dtype) -> Array:
 _unit_vectors = primitive("unit_vectors", lambda *, n, dtype: jnp.eye(n, dtype=dtype))
 
 
-def on_any(x: Array) -> Array:
+def on_any(x: Array, rare: bool = True) -> Array:
     """Whether a truth value is true on any of the trajectories that run together.
 
     It may decide what is computed, as a branch that most trajectories do not need, never what a
-    trajectory's result is: that must not depend on its neighbours.
+    trajectory's result is: that must not depend on its neighbours. Where it is `rare` that the
+    answer is yes, steps are first run as if it were no, and repeated where it was not.
     """
-    return _least.bind(jnp.where(x, jnp.int32(0), jnp.int32(1))) == 0
+    return _least.bind(jnp.where(x, jnp.int32(0), jnp.int32(1)), rare=rare) == 0
 
 
-def _least_of_batch(arrays, axes):
+def _least_of_batch(arrays, axes, *, rare):
     (x,), (axis,) = arrays, axes
-    return _least.bind(jnp.min(x, axis=axis)), None
+    return _least.bind(jnp.min(x, axis=axis), rare=rare), None
 
 
-_least = primitive("least_over_lanes", lambda x: x, _least_of_batch)
+_least = primitive("least_over_lanes", lambda x, *, rare: x, _least_of_batch)

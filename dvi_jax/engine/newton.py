@@ -108,16 +108,28 @@ class Newton(RootSolver):
             return ~state.converged & state.finite & (state.iterations < self.max_steps)
 
         def corrected(x):
-            """x after two corrections, the second left out where it is larger than the first;
-            the size of each component of the second, its scale, and the largest of both."""
+            """x after two corrections with one Jacobian, or three where two are not enough; the
+            last is left out where it is larger than the one before. The size of each component of
+            the last, its scale, and the largest of the one before and of the last."""
             value, jacobian = value_and_jacobian(F, x)
             first = lanewise.solve(jacobian, value)
             x = x - first
             second = lanewise.solve(jacobian, F(x))
             before, worst = _largest_of(jnp.abs(first)), _largest_of(jnp.abs(second))
-            x = jnp.where(worst > before, x, x - second)
-            now = jnp.abs(x)
-            return x, jnp.abs(second), jnp.where(known > now, known, now), before, worst
+            scale = _larger(known, jnp.abs(x))
+            left = worst * worst > eps / 16 * before * _least_of(scale)
+
+            def another():
+                nearer = jnp.where(left, x - second, x)
+                last = jnp.where(left, lanewise.solve(jacobian, F(nearer)), second)
+                return nearer, last, jnp.where(left, worst, before)
+
+            x, last, before = lax.cond(
+                lanewise.on_any(left, rare=False), another, lambda: (x, second, before)
+            )
+            worst = _largest_of(jnp.abs(last))
+            x = jnp.where(worst > before, x, x - last)
+            return x, jnp.abs(last), _larger(known, jnp.abs(x)), before, worst
 
         def is_root(second, scale, before, worst):
             if by_rate:
@@ -237,6 +249,16 @@ def _largest_of(x: Vector) -> Float[Array, ""]:
     if x.size > 16:
         return jnp.max(x, initial=0.0)
     return functools.reduce(lambda a, b: jnp.where(a > b, a, b), [x[i] for i in range(x.size)])
+
+
+def _least_of(x: Vector) -> Float[Array, ""]:
+    if x.size > 16:
+        return jnp.min(x)
+    return functools.reduce(lambda a, b: jnp.where(a < b, a, b), [x[i] for i in range(x.size)])
+
+
+def _larger(a: Vector, b: Vector) -> Vector:
+    return jnp.where(a > b, a, b)
 
 
 def worse(
