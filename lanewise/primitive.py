@@ -338,6 +338,8 @@ def vectors_for(carried: int, operations: int) -> int:
     """Vectors in a block: enough to hide latency, few enough that the state stays in registers."""
     if operations < 150:
         return max(1, min(6, 32 // max(carried, 1)))
+    if operations < 400 and carried <= 6:
+        return 4
     if operations < 1500:
         return 3 if carried <= 12 else 2
     return 2 if operations < 4000 and carried <= 12 else 1
