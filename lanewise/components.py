@@ -95,6 +95,9 @@ class Kernel:
     def elementary(self, name: str, args: Sequence[Num]) -> Num:
         raise NotImplementedError
 
+    def sincos(self, x: Num) -> tuple[Num, Num]:
+        raise NotImplementedError
+
     def exchanged(self, numbers: Sequence[Num], vec: bool) -> list[Num]:
         raise NotImplementedError
 
@@ -191,8 +194,13 @@ class Evaluator:
                 return self.constant(np.asarray(atom.val, atom.aval.dtype))  # pyright: ignore[reportAttributeAccessIssue]
             return known[atom]
 
+        both = _sines_and_cosines(jaxpr)
         for eqn in jaxpr.eqns:
             inputs = [read(v) for v in eqn.invars]
+            if eqn.primitive.name in ("sin", "cos") and eqn.invars[0] in both:
+                outputs = [self.sine_or_cosine(eqn, inputs[0])]
+                known.update(zip(eqn.outvars, outputs, strict=True))
+                continue
             outputs = self.equation(eqn, inputs, [places.get(v) for v in eqn.outvars])
             if eqn.primitive.name not in _ENDS and any(v.is_tangent for v in inputs):
                 outputs = [self.as_tangent(v) for v in outputs]
@@ -200,6 +208,15 @@ class Evaluator:
         if self.b.operations > MOST_OPERATIONS:
             raise Unsupported(f"more than {MOST_OPERATIONS} operations a step")
         return [read(v) for v in jaxpr.outvars]
+
+    def sine_or_cosine(self, eqn: Any, value: Value) -> Value:
+        """sin x or cos x of an x of which both are needed."""
+        which = 0 if eqn.primitive.name == "sin" else 1
+        (out,) = eqn.outvars
+        if not value.is_small or value.dtype != "float64":
+            return self._elementwise(eqn, [value], ELEMENTWISE[eqn.primitive.name])
+        found = [self.kernel.sincos(x)[which] for x in self.entries(value).flat]
+        return self.value(found, out.aval)
 
     def equation(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         name = eqn.primitive.name
@@ -1205,6 +1222,15 @@ def _as_stack_of_matrices(x, batch: Sequence[int], contracted: Sequence[int]) ->
     free = [i for i in range(x.ndim) if i not in (*batch, *contracted)]
     sizes = [math.prod(x.shape[i] for i in axes) for axes in (batch, free, contracted)]
     return np.transpose(x, (*batch, *free, *contracted)).reshape(sizes)
+
+
+def _sines_and_cosines(jaxpr: Jaxpr) -> set[Any]:
+    """The variables of which a jaxpr takes the sine and the cosine."""
+    of = {
+        name: {e.invars[0] for e in jaxpr.eqns if e.primitive.name == name}
+        for name in ("sin", "cos")
+    }
+    return of["sin"] & of["cos"]
 
 
 _ENDS = frozenset(["custom_linear_solve", "eliminate"])

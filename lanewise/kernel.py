@@ -94,6 +94,24 @@ class Module(Kernel):
             lambda t, *x: f"call {t} {called}({', '.join(f'{t} {y}' for y in x)})",
         )  # fmt: skip
 
+    def sincos(self, x: Num) -> tuple[Num, Num]:
+        """sin x and cos x in one call."""
+        b = self.b
+        if x.known is not None:
+            return self.elementary("sin", [x]), self.elementary("cos", [x])
+        found = b.find(("sincos", x.serial))
+        if found is None:
+            called, t = self._function("sincos", 1, x.vec), b.type("float64", x.vec)
+            pair = f"{{{t}, {t}}}"
+            calls = [b.new(f"call {pair} {called}({t} {name})") for name in x.names]
+            b.operations += 2
+            found = tuple(
+                b.made([b.new(f"extractvalue {pair} {c}, {i}") for c in calls], "float64", x.vec)
+                for i in range(2)
+            )
+            b.note(("sincos", x.serial), found)
+        return found
+
     def _function(self, name: str, count: int, vec: bool) -> str:
         wide = vec and self.W > 1
         called = f"@{name.replace(' ', '_').replace('-', 'm')}_{'v' if wide else 's'}"
@@ -247,6 +265,8 @@ def _traced(name: str, count: int) -> ClosedJaxpr:
     """An elementary function as a jaxpr of scalars."""
     if name.startswith("half_integer_power"):
         function = elementary.half_integer_power(int(name.split()[1]))
+    elif name == "sincos":
+        function = elementary.sincos
     else:
         function = elementary.FUNCTIONS[name]
     with jax.enable_x64(True):
@@ -268,11 +288,16 @@ def _function_text(
         entries = np.empty((), object)
         entries[()] = x
         values.append(Value((), "float64", entries))
-    (out,) = evaluator.closed(closed, values)
-    t = b.type("float64", True)
-    result = b.ref(evaluator.entries(out)[()], 0, True)
+    outs = evaluator.closed(closed, values)
+    t = result_type = b.type("float64", True)
+    results = [b.ref(evaluator.entries(out)[()], 0, True) for out in outs]
+    result = results[0]
+    if len(outs) == 2:
+        result_type = f"{{{t}, {t}}}"
+        half = b.new(f"insertvalue {result_type} poison, {t} {results[0]}, 0")
+        result = b.new(f"insertvalue {result_type} {half}, {t} {results[1]}, 1")
     prefix = called[1:]
-    text = "\n".join([*b.lines, f"  ret {t} {result}"])
+    text = "\n".join([*b.lines, f"  ret {result_type} {result}"])
     data = []
     for line in inner.globals:  # constants of each function have names of their own
         old = line.split(" ", 1)[0]
@@ -280,7 +305,7 @@ def _function_text(
         text, line = text.replace(old + ",", new + ","), line.replace(old, new, 1)
         data.append(line)
     parameters = ", ".join(f"{t} %x{i}" for i in range(count))
-    body = f"define internal {t} {called}({parameters}) {{\nentry:\n{text}\n}}\n"
+    body = f"define internal {result_type} {called}({parameters}) {{\nentry:\n{text}\n}}\n"
     return body, frozenset(b.declared | inner.declared), tuple(data)
 
 
