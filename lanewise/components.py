@@ -14,6 +14,7 @@ from .dependence import fixed_point, reached_outputs
 from .ir import TYPES, Builder, Num, Unsupported
 from .jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies, scan_counts
 from .memory import Buffer, contiguous, load, load_row, store, store_row, transposed
+from .reuse import carried_over
 from .rules import CALLS, CUMULATIVE, MOVES, REDUCTIONS, VIEWS
 
 Entries = Any
@@ -28,9 +29,8 @@ MADE = 4096
 AGREED = frozenset(["least_over_lanes"])
 """Primitives whose result is the same on all trajectories, whatever goes in."""
 
-_PORTION, _PATIENCE = 32, 8
-"""Rounds of a loop that are run on assumptions before these are looked at, and the portions run
-without any after one that has failed."""
+_PORTION = 32
+"""Rounds of a loop that are run on assumptions before these are looked at."""
 
 MOST_OPERATIONS = 60_000
 """More operations than this are left to XLA, loops counted once."""
@@ -653,7 +653,7 @@ class Evaluator:
         """The rounds in portions: first without the branches that are rarely taken; if one should
         have been taken by a trajectory of the block, the portion is repeated with all branches.
 
-        After such a portion some are run with all branches at once.
+        After such a portion, from the second on, some are run with all branches at once.
         """
         b = self.b
         zero, false = b.known(0, "int64"), b.known(False, "bool")
@@ -661,7 +661,6 @@ class Evaluator:
             size = b.known(waiting.count, "int64")
         else:
             size = self.kernel.parameter(-(-length // -(-length // _PORTION)))
-        wait = b.mul(size, b.known(_PATIENCE, "int64"))
         aside = [self.kernel.scratch((), x.dtype, v).base for x, v in zip(numbers, vec, strict=True)]
         changed: list[bool] = []
 
@@ -679,11 +678,12 @@ class Evaluator:
             _, failed, *after = b.loop(
                 [start, false, *numbers], [False, False, *vec],
                 lambda state, _: b.ref(b.compare("lt", state[0], stop), 0, False), body,
+                carried_over=carried_over,
             )  # fmt: skip
             return [found.wrong_at_the_end(failed, after), *after]
 
         def portion(start: Num, stop: Num, state: Sequence[Num]) -> list[Num]:
-            until, *numbers = state
+            until, wait, *numbers = state
             tried = b.compare("ge", start, until)
             before_all = len(b.lines)
             all_vec, dtypes = [False, *vec], ["bool", *(x.dtype for x in numbers)]
@@ -705,10 +705,14 @@ class Evaluator:
                 return self._rounds(old, vec, start, stop, round_of)
 
             found = b.branch(b.ref(failed, 0, False), again, lambda: found, vec, dtypes[1:])
-            later = b.select(b.logic("and", tried, failed), b.add(stop, wait), until)
-            return [later, *found]
+            # After a failure more rounds each time are run with all branches.
+            has_failed = b.logic("and", tried, failed)
+            until = b.select(has_failed, b.add(stop, wait), until)
+            wait = b.select(has_failed, b.add(b.add(wait, wait), size), wait)
+            return [until, wait, *found]
 
-        return self._portions([zero, *numbers], [False, *vec], size, end, portion, waiting)[1:]
+        both = [False, False, *vec]
+        return self._portions([zero, zero, *numbers], both, size, end, portion, waiting)[2:]
 
     @contextlib.contextmanager
     def assuming(self, assumed: Any):
@@ -1274,9 +1278,22 @@ def _compared(op: str) -> Callable:
     return lambda e, _, a, b: e.b.compare(op, a, b)
 
 
+def _equal(e: Evaluator, _: Any, x: Num, y: Num) -> Num:
+    """A loop's counter equals a given number in one round: taken for rare."""
+    same = e.b.compare("eq", x, y)
+    is_count = taken_value(same) is None and not same.vec and not x.is_float
+    if e.assumed is not None and is_count and (x.known is not None or y.known is not None):
+        e.assumed.never(same)
+        return taken_for(e.b, 0, "bool")
+    return same
+
+
 def _select(e: Evaluator, _: Any, which: Num, *cases: Num) -> Num:
     b = e.b
     if which.dtype == "bool":
+        taken = None if which.known is not None else taken_value(which)
+        if taken is not None:
+            return b.unrelated(cases[int(taken)])
         return b.select(which, cases[1], cases[0])
     result = cases[-1]
     for i in reversed(range(len(cases) - 1)):
@@ -1412,7 +1429,8 @@ ELEMENTWISE: dict[str, Callable] = {
     "or": lambda e, _, a, b: e.b.logic("or", a, b),
     "xor": lambda e, _, a, b: e.b.logic("xor", a, b),
     "not": lambda e, _, x: e.b.invert(x),
-    **{op: _compared(op) for op in ("eq", "ne", "lt", "le", "gt", "ge")},
+    "eq": _equal,
+    **{op: _compared(op) for op in ("ne", "lt", "le", "gt", "ge")},
     **{
         op: (lambda e, _, a, b, op=op: e.b.shift(op, a, b))
         for op in ("shift_left", "shift_right_logical", "shift_right_arithmetic")

@@ -33,12 +33,13 @@ class Num:
     0 or 1 that the structure of the problem makes, whatever the values are: 0·x is 0 for such a 0.
     """
 
-    __slots__ = ("args", "dtype", "known", "names", "op", "serial", "structural", "vec")
+    __slots__ = ("args", "dtype", "known", "names", "op", "serial", "structural", "vec", "write")
 
     def __init__(self, names, dtype, vec, known=None, op="", args=(), serial=0, structural=False):
         self.names, self.dtype, self.vec = names, dtype, vec
         self.known, self.op, self.args = known, op, args
         self.serial, self.structural = serial, structural
+        self.write: Callable[..., str] | None = None
 
     @property
     def key(self) -> Any:
@@ -194,6 +195,7 @@ class Builder:
             for u in range(self.U if vec else 1)
         ]
         made = self.made(names, dtype, vec, op, tuple(args))
+        made.write = write
         if keep:
             self.note(key, made)
         return made
@@ -664,14 +666,19 @@ class Builder:
         test: Callable[[list[Num], str], str],
         body: Callable[[list[Num], str], list[Num]],
         count: bool = False,
+        carried_over: Callable[..., list[tuple[Num, Num]]] | None = None,
     ) -> list[Num]:
-        """The carry once ``test(carry, i)``, the name of an i1, is false; `i` counts if `count`."""
+        """The carry once ``test(carry, i)``, the name of an i1, is false; `i` counts if `count`.
+
+        `carried_over(carry before a round, carry after it)` finds pairs (x, y) where y is what x
+        will be in the next round; x is then not computed but carried.
+        """
         before = [
             [self.ref(c, u, v) for u in range(self.U if v else 1)]
             for c, v in zip(carry, vec, strict=True)
         ]
         self.largest_carry = max(self.largest_carry, sum(vec))
-        entered_from = self.block
+        entered_from, front = self.block, len(self.lines)
         head, inner, end = self.label(), self.label(), self.label()
         self.emit(f"br label %{head}")
         self.begin(head)
@@ -705,9 +712,44 @@ class Builder:
             ]
         if count:
             lines.append(f"  {counter} = phi i64 [0, %{entered_from}], [{following}, %{left_from}]")
+        first_lines = []
+        if carried_over is not None:
+            pairs = carried_over(phis, after)
+            instead = {
+                p.serial: self.made(old, p.dtype, v)
+                for p, old, v in zip(phis, before, vec, strict=True)
+            }
+            count_before = len(self.lines)
+            firsts = [self.made_again(x, instead) for x, _ in pairs]
+            first_lines = self.lines[count_before:]
+            del self.lines[count_before:]
+            for (x, y), first in zip(pairs, firsts, strict=True):
+                t = self.type(x.dtype, True)
+                for u, name in enumerate(x.names):
+                    at = next(i for i in range(place, len(self.lines))
+                              if self.lines[i].startswith(f"  {name} = "))  # fmt: skip
+                    del self.lines[at]
+                    old, new = self.ref(first, u, True), y.names[u]
+                    lines.append(f"  {name} = phi {t} [{old}, %{entered_from}], [{new}, %{left_from}]")
         self.lines[place:place] = lines
+        self.lines[front:front] = first_lines
         self.begin(end)
         return phis
+
+    def made_again(self, x: Num, instead: dict[int, Num]) -> Num:
+        """The number x with other numbers in place of some that it is made of."""
+        if x.known is not None or (not x.op and x.serial not in instead):
+            return x
+        found = instead.get(x.serial)
+        if found is None:
+            args = [self.made_again(a, instead) for a in x.args]
+            if x.op == "same":
+                found = args[0]
+            else:
+                assert x.write is not None
+                found = self.op(x.op, args, x.dtype, x.write)
+            instead[x.serial] = found
+        return found
 
     def branch(
         self, condition: str, yes: Callable[[], list[Num]], no: Callable[[], list[Num]],

@@ -1,0 +1,85 @@
+"""Numbers at the end of a round that the next round computes again at its beginning.
+
+A step ends with the energy, of the new state; the next one begins with the force, of the same
+state, and both need 1/r. A loop of rounds without branches carries such a number over instead.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from .ir import Num
+
+_COSTLY = frozenset(["sqrt", "div"])
+"""Operations worth carrying; calls of elementary functions are too."""
+
+_MOST = 8
+"""Numbers that are carried over."""
+
+
+def carried_over(before: Sequence[Num], after: Sequence[Num]) -> list[tuple[Num, Num]]:
+    """Pairs (x, y): x follows from the numbers `before` a round as y does from those `after` it, so
+    that y is the next round's x."""
+    place = {x.serial: i for i, x in enumerate(before)}
+    new_place = {x.serial: i for i, x in enumerate(after) if x.known is None and x.op}
+    first = _Forms(place, {})
+    second = _Forms({}, new_place, others=frozenset(place))
+    seen = _all_of(after)
+    ends = {}
+    for y in seen:
+        form = second.of(y)
+        if form is not None and _is_costly(y):
+            ends.setdefault(form, y)
+    pairs, found = [], set()
+    for x in seen:
+        form = first.of(x)
+        if form in ends and _is_costly(x) and x.vec and x.write and ends[form].vec:
+            pairs.append((x, ends[form]))
+            found.add(x.serial)
+    # What is needed by others that are carried over only, need not be.
+    needed = {a.serial for z in seen if z.serial not in found for a in z.args}
+    pairs = [(x, y) for x, y in pairs if x.serial in needed]
+    return pairs if len(pairs) <= _MOST else []
+
+
+def _is_costly(x: Num) -> bool:
+    return x.op in _COSTLY or x.op.startswith("call ")
+
+
+def _all_of(numbers: Sequence[Num]) -> list[Num]:
+    """The numbers and all that they are made of."""
+    seen, open_ = {}, list(numbers)
+    while open_:
+        x = open_.pop()
+        if x.known is None and x.serial not in seen:
+            seen[x.serial] = x
+            open_ += x.args
+    return list(seen.values())
+
+
+class _Forms:
+    """How numbers are made from a state, as keys: equal keys are equal numbers of equal states."""
+
+    def __init__(self, here: dict[int, int], there: dict[int, int], others=frozenset()):
+        self.place, self.others = {**here, **there}, others
+        self.forms: dict[int, Any] = {}
+
+    def of(self, x: Num) -> Any:
+        """The key, None for a number that depends on the other state too."""
+        if x.known is not None:
+            return x.key
+        if x.serial in self.place:
+            return "state", self.place[x.serial]
+        if x.serial in self.others:
+            return None
+        if not x.op:
+            return "outside", x.serial
+        if x.write is None and x.op != "same":
+            return None
+        if x.serial not in self.forms:
+            self.forms[x.serial] = None
+            parts = [self.of(a) for a in x.args]
+            if x.op == "same":
+                self.forms[x.serial] = parts[0]
+            elif all(part is not None for part in parts):
+                self.forms[x.serial] = (x.op, x.dtype, *parts)
+        return self.forms[x.serial]
