@@ -17,6 +17,7 @@ from ._rollout import (
     Plan,
     Saved,
     Task,
+    adds_start_outside,
     counted_scan,
     reduce,
     run,
@@ -55,17 +56,21 @@ def _direct_rollout(
     task: Task, plan: Plan, q0: State, p0: State, loop: Loop, layout: Layout
 ) -> Outcome:
     arrays, rest = eqx.partition(task, eqx.is_array)
+    outside = adds_start_outside(plan)
 
     def outcome(task, ran, *of):
         carry, saved, tail = ran
-        kept = with_start(with_tail(plan, saved, tail), *of)
+        kept = with_tail(plan, saved, tail)
+        if not outside:
+            kept = with_start(kept, *of)
         return Outcome(carry, kept, reduce(task, carry))
 
     def forward(arrays, q0, p0):
         task = eqx.combine(arrays, rest)
         return outcome(task, run(task, plan, start(task, q0, p0), loop), q0, p0)
 
-    return lanewise.call(forward, arrays, q0, p0, layout=layout)
+    result = lanewise.call(forward, arrays, q0, p0, layout=layout)
+    return result._replace(saved=with_start(result.saved, q0, p0)) if outside else result
 
 
 class Direct(AbstractAdjoint):

@@ -26,6 +26,7 @@ from ._rollout import (
     Saved,
     StepTaken,
     Task,
+    adds_start_outside,
     counted_scan,
     piece_length,
     reduce,
@@ -103,6 +104,7 @@ class Reversible(AbstractAdjoint):
                     "Leave it out: gradients go by dvi.Checkpointed() here."
                 )
             return Checkpointed().rollout(task, plan, q0, p0, layout)
+        outside = adds_start_outside(plan)
         theta, others = eqx.partition(task, eqx.is_inexact_array)
         # Whole numbers and truth values may be traced as well: inputs without a derivative.
         whole, fixed = eqx.partition(others, eqx.is_array)
@@ -116,7 +118,9 @@ class Reversible(AbstractAdjoint):
 
         def finish(task, ran, *of):
             carry, saved, tail = ran
-            rows = with_start(with_tail(plan, saved, tail), *of)
+            rows = with_tail(plan, saved, tail)
+            if not outside:
+                rows = with_start(rows, *of)
             kept, counts = eqx.partition(rows, eqx.is_inexact_array)
             smooth = _Smooth(carry.q, carry.p, kept, reduce(task, carry))
             return smooth, (carry, saved, tail, counts)
@@ -162,16 +166,20 @@ class Reversible(AbstractAdjoint):
                 u, v = unravel(b)
                 return flat(u, jax.tree.map(jnp.add, v, push(u)))
 
-            def pull(moving, still, whole, trace, v):
+            # No more than that: what nothing reads need not be computed on the way.
+            carry, saved, tail, _ = trace
+            known = carry.reductions, _states_of(saved), None if tail is None else _states_of(tail)
+
+            def pull(moving, still, whole, known, v):
                 theta, q0, p0 = eqx.combine(moving, still)
                 theta, others = eqx.partition(theta, moves[0])
                 rest = eqx.combine(others, whole, fixed)
-                back = _pull_back(self, rest, plan, (theta, q0, p0), trace, v)
+                back = _pull_back(self, rest, plan, (theta, q0, p0), known, v)
                 return eqx.filter(back, moves)
 
             def transpose_solve(_, b):
                 u, v = unravel(b)
-                back = lanewise.call(pull, moving, still, whole, trace, v, layout=layout)
+                back = lanewise.call(pull, moving, still, whole, known, v, layout=layout)
                 # From a lane that nothing asks for nothing flows back, though it has failed.
                 asked = jnp.any(jnp.stack([jnp.any(x != 0) for x in jax.tree.leaves(v)]))
                 back = jax.tree.map(lambda x: jnp.where(asked, x, 0), back)
@@ -193,6 +201,8 @@ class Reversible(AbstractAdjoint):
                 defect, *lax.stop_gradient((theta, whole, (q0, p0), saved, tail)), layout=layout
             )
         kept = eqx.combine(smooth.saved, counts)
+        if outside:
+            kept = with_start(kept, q0, p0)
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), kept, smooth.reduced, rebuilt)
 
     def _inner_loop(self, body, state, first, stride, count):
@@ -213,6 +223,11 @@ class Reversible(AbstractAdjoint):
         whole = segments * size
         state, _ = counted_scan(body, state, first + stride * whole, stride, count - whole)
         return state, ends
+
+
+def _states_of(saved: Saved) -> Saved:
+    """What the reverse pass reads of what was saved."""
+    return saved._replace(t=None, h=None, observed=[])
 
 
 class _Smooth(NamedTuple):
@@ -351,10 +366,10 @@ def _round_trip_defect(
     return worst if tail is None else of_block(worst, start, tail, k, plan.tail)
 
 
-def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent: _Smooth):
+def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, known, cotangent: _Smooth):
     """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start."""
     theta, q_start, p_start = inputs
-    carry, saved, tail, _ = trace
+    memories, saved, tail = known
     task: Task = eqx.combine(theta, fixed)
     _, reductions = task.observables()
     newton = task.equations.newton
@@ -384,7 +399,7 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
         at_end = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
         ct, seeds = jnp.zeros_like(t1), []
         for r, memory, c, value in zip(
-            reductions, carry.reductions, cotangent.reduced, values, strict=True
+            reductions, memories, cotangent.reduced, values, strict=True
         ):
             of_t, of_value = r.pull(memory, c, k, t1, value)
             ct = ct + of_t
@@ -453,7 +468,9 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
     grad = jax.tree.map(jnp.zeros_like, theta)
     cot = (cotangent.q, cotangent.p)
     rows = cotangent.saved
-    of_start, rows = (rows.q[0], rows.p[0]), rows._replace(q=rows.q[1:], p=rows.p[1:])
+    of_start = None
+    if not adds_start_outside(plan):
+        of_start, rows = (rows.q[0], rows.p[0]), rows._replace(q=rows.q[1:], p=rows.p[1:])
     if tail is not None:
         at_save = jax.tree.map(lambda x: _last_row(x, plan.save_tail), rows)
         newest = jax.tree.map(lambda x: x[-1], ends)
@@ -470,7 +487,7 @@ def _pull_back(settings: Reversible, fixed, plan: Plan, inputs, trace, cotangent
     rows = jax.tree.map(lambda x: x[: plan.num_blocks], rows)
     k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
     (_, grad, cot), _ = lax.scan(block, (k, grad, cot), (starts, saved, rows), reverse=True)
-    return grad, *map(jnp.add, cot, of_start)
+    return grad, *(cot if of_start is None else map(jnp.add, cot, of_start))
 
 
 def largest_divisor(n: int, most: int) -> int:

@@ -417,6 +417,15 @@ def with_tail(plan: Plan, saved: Saved, tail: Saved | None) -> Saved:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), saved, tail)
 
 
+def adds_start_outside(plan: Plan) -> bool:
+    """Whether the start is put in front of the saved states after the compiled run, not in it.
+
+    Of few states the start is a large part, which a user who reads the last one does not want
+    written; of many it is a small part, and adding it afterwards would copy them all.
+    """
+    return plan.num_blocks <= 4
+
+
 def with_start(saved: Saved, q0: State, p0: State) -> Saved:
     """What was saved, the states from the start on."""
     q, p = (jnp.concatenate([a[None], b]) for a, b in ((q0, saved.q), (p0, saved.p)))

@@ -111,13 +111,19 @@ class Waiting:
 
     def __init__(self, evaluator: "Evaluator", results: Sequence[Buffer], count: int):
         self.b, self.evaluator, self.results, self.count = evaluator.b, evaluator, results, count
-        self.stages = [evaluator.kernel.scratch((count, *r.shape[1:]), r.dtype, True) for r in results]
+        self.stages = [
+            evaluator.kernel.scratch((count, *r.shape[1:]), r.dtype, True) for r in results
+        ]
 
     @classmethod
     def of(cls, evaluator: "Evaluator", results: Sequence[Buffer], length: int) -> "Waiting | None":
         """For results of a loop with `length` rounds, if it is worth while."""
         b = evaluator.b
-        if b.W == 1 or not results or any(r.lane in (None, 1) or r.dtype == "bool" for r in results):
+        if (
+            b.W == 1
+            or not results
+            or any(r.lane in (None, 1) or r.dtype == "bool" for r in results)
+        ):
             return None
         width = sum(math.prod(r.shape[1:]) for r in results)
         if not all(r.strides == contiguous(r.shape) for r in results) or not 0 < width <= 8:
@@ -148,7 +154,12 @@ class Waiting:
                     self.evaluator.write(value, result.row(b, k))
                 return [b.add(k, b.known(1, "int64"))]
 
-            b.loop([start], [False], lambda state, _: b.ref(b.compare("lt", state[0], stop), 0, False), row)
+            b.loop(
+                [start],
+                [False],
+                lambda state, _: b.less(state[0], stop),
+                row,
+            )
             return []
 
         is_whole = b.compare("eq", b.sub(stop, start), count)
@@ -625,7 +636,7 @@ class Evaluator:
 
         return b.loop(
             [start, *numbers], [False, *vec],
-            lambda state, _: b.ref(b.compare("lt", state[0], end), 0, False), body,
+            lambda state, _: b.less(state[0], end), body,
         )[1:]  # fmt: skip
 
     def _portions(self, state, vec, size: Num, end: Num, portion, waiting) -> list[Num]:
@@ -643,7 +654,7 @@ class Evaluator:
 
         return b.loop(
             [b.known(0, "int64"), *state], [False, *vec],
-            lambda state, _: b.ref(b.compare("lt", state[0], end), 0, False), body,
+            lambda state, _: b.less(state[0], end), body,
         )[1:]  # fmt: skip
 
     def _on_assumptions(
@@ -661,7 +672,9 @@ class Evaluator:
             size = b.known(waiting.count, "int64")
         else:
             size = self.kernel.parameter(-(-length // -(-length // _PORTION)))
-        aside = [self.kernel.scratch((), x.dtype, v).base for x, v in zip(numbers, vec, strict=True)]
+        aside = [
+            self.kernel.scratch((), x.dtype, v).base for x, v in zip(numbers, vec, strict=True)
+        ]
         changed: list[bool] = []
 
         def without_branches(start: Num, stop: Num, numbers: Sequence[Num]) -> list[Num]:
@@ -677,7 +690,7 @@ class Evaluator:
 
             _, failed, *after = b.loop(
                 [start, false, *numbers], [False, False, *vec],
-                lambda state, _: b.ref(b.compare("lt", state[0], stop), 0, False), body,
+                lambda state, _: b.less(state[0], stop), body,
                 carried_over=carried_over,
             )  # fmt: skip
             return [found.wrong_at_the_end(failed, after), *after]
@@ -777,7 +790,7 @@ class Evaluator:
         return end[1:]
 
     def cond(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
-        branches, b = eqn.params["branches"], self.b
+        branches = eqn.params["branches"]
         index, operands = values[0], values[1:]
         which = self.entries(index)[()]
         if which.known is not None:

@@ -411,6 +411,10 @@ class Builder:
             word = f"icmp {'u' if unsigned else 's'}{op}"
         return self.op(op, (a, b), "bool", lambda t, x, y: f"{word} {t} {x}, {y}")
 
+    def less(self, a: Num, b: Num) -> str:
+        """Whether a < b, as a scalar i1, for two scalars."""
+        return self.ref(self.compare("lt", a, b), 0, False)
+
     def logic(self, op: str, a: Num, b: Num) -> Num:
         """and, or, xor of truth values or of bits."""
         if a.known is not None and b.known is not None:
@@ -645,12 +649,14 @@ class Builder:
         bits = self.new(f"bitcast {t} {total} to i{self.W}")
         return self.new(f"icmp ne i{self.W} {bits}, 0")
 
-    # --- numbers that wait in memory, where the optimiser does not see through it ------------------
+    # --- numbers that wait in memory, which the optimiser does not see through --------------------
 
     def set_aside(self, x: Num, to: Sequence[str], vec: bool) -> list[str]:
         """The lines that write a number of a carry to one pointer for each vector."""
         t = self.type(x.dtype, vec)
-        return [f"  store volatile {t} {name}, ptr {at}" for name, at in zip(x.names, to, strict=True)]
+        return [
+            f"  store volatile {t} {name}, ptr {at}" for name, at in zip(x.names, to, strict=True)
+        ]
 
     def taken_back(self, x: Num, at: Sequence[str], vec: bool) -> Num:
         """The number that was set aside there."""
@@ -730,7 +736,9 @@ class Builder:
                               if self.lines[i].startswith(f"  {name} = "))  # fmt: skip
                     del self.lines[at]
                     old, new = self.ref(first, u, True), y.names[u]
-                    lines.append(f"  {name} = phi {t} [{old}, %{entered_from}], [{new}, %{left_from}]")
+                    lines.append(
+                        f"  {name} = phi {t} [{old}, %{entered_from}], [{new}, %{left_from}]"
+                    )
         self.lines[place:place] = lines
         self.lines[front:front] = first_lines
         self.begin(end)

@@ -105,10 +105,11 @@ class Module(Kernel):
             pair = f"{{{t}, {t}}}"
             calls = [b.new(f"call {pair} {called}({t} {name})") for name in x.names]
             b.operations += 2
-            found = tuple(
+            sine, cosine = (
                 b.made([b.new(f"extractvalue {pair} {c}, {i}") for c in calls], "float64", x.vec)
                 for i in range(2)
             )
+            found = sine, cosine
             b.note(("sincos", x.serial), found)
         return found
 

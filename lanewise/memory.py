@@ -233,7 +233,7 @@ def store(b: Builder, buffer: Buffer, x: Num, by: Num | int = 0) -> None:
                 b.emit(f"store {item} {value}, ptr {at}, align {_bytes(item)}")
 
 
-# --- whole rows: the numbers of each trajectory lie next to each other, those of a vector do not ---
+# --- whole rows: the numbers of a trajectory are neighbours, those of a vector are not ------------
 
 
 def load_row(b: Builder, buffer: Buffer) -> list[Num]:
@@ -367,6 +367,7 @@ def transposed(b: Builder, source: Buffer, target: Buffer) -> None:
     if fixed:
         start = b.new(f"getelementptr {item}, ptr {start}, i64 {fixed}")
     lane = target.lane
+    assert lane is not None
     block = b.U * W  # the vectors of one element
     by_vector = f"{lane * W}" if isinstance(lane, int) else b.new(f"mul i64 {lane}, {W}")
 

@@ -307,12 +307,12 @@ def kernel_of(
     if vectors is None and program.layout.width is not None:
         vectors = max(program.layout.width // machine.width(), 1)
     if vectors is None:
-        # Every number of an argument or a result is moved trajectory by trajectory, but for the rows
-        # that a loop writes.
+        # Every number of an argument or a result is moved trajectory by trajectory: most work
+        # where there is no loop.
         state = carried(closed.jaxpr)
-        ends = [*closed.jaxpr.invars, *([] if state else closed.jaxpr.outvars)]
-        moved = sum(v.aval.size for v in ends if v.aval.size <= 128)
-        vectors = vectors_for(state, count) if moved <= 24 else 1
+        ends = [v.aval.size for v in (*closed.jaxpr.invars, *closed.jaxpr.outvars)]
+        moved = sum(n for n in ends if n <= 128)
+        vectors = vectors_for(state, count) if state or moved <= 24 else 1
     module = Module(*variant(lanes, vectors))
     return module, module.kernel(closed, on)
 
@@ -338,7 +338,7 @@ def vectors_for(carried: int, operations: int) -> int:
     """Vectors in a block: enough to hide latency, few enough that the state stays in registers."""
     if operations < 150:
         return max(1, min(6, 32 // max(carried, 1)))
-    if operations < 400 and carried <= 6:
+    if operations < 800 and carried <= 12:
         return 4
     if operations < 1500:
         return 3 if carried <= 12 else 2
