@@ -21,7 +21,7 @@ from ._arithmetic import Arithmetic, FixedPoint, FloatingPoint
 from ._dense import Curve, at_times, crossings, stopped
 from ._extended import run_extended
 from ._precision import refuse_double_without_x64
-from ._results import RESULTS, IntegrationError
+from ._results import RESULTS, IntegrationError, status_name
 from ._reversible import Reversible
 from ._rollout import (
     Plan,
@@ -45,7 +45,7 @@ from .engine.newton import RootSolver, over
 from .engine.picard import PicardThenNewton
 from .engine.quantities import refuse_quantity
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
-from .methods import Method, TypeII, warn_of_dissipation
+from .methods import Method, TypeII, goes_backwards, warn_of_dissipation
 from .observe import Deviations, Range, Reduction, RequestedTimes, Running, Section, Stop
 from .observe._kept import Start
 
@@ -198,27 +198,30 @@ def integrate(
             is_leaf=lambda x: x is None,
         )  # fmt: skip
     traced = any(is_traced(x) for x in jax.tree.leaves((task, q0, p0)))
-    if not traced:
+    if not traced and system.force is not None and goes_backwards(method):
         first = task.interval(jnp.asarray(0, jnp.int32))
         warn_of_dissipation(method, equations, first, q0, p0)
     if progress is None:
-        outcome = _whole(task, plan, q0, p0, adjoint, layout)
-    elif traced:
+        solution = _whole(task, plan, observe, q0, p0, num_steps, adjoint, layout)
+        return _raise_on_failure(solution, task) if throw else solution
+    if traced:
         raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
-    elif isinstance(adjoint, Reversible) and adjoint.report_defect:
+    if isinstance(adjoint, Reversible) and adjoint.report_defect:
         raise ValueError(
             "report_defect=True cannot be reported with progress: leave one of them out."
         )
-    else:
-        outcome = _in_pieces(task, plan, q0, p0, num_steps, progress, layout)
-
+    outcome = _in_pieces(task, plan, q0, p0, num_steps, progress, layout)
     solution = _solution(task, observe, outcome, q0, p0, num_steps)
     return _raise_on_failure(solution, task) if throw else solution
 
 
 @eqx.filter_jit
-def _whole(task: Task, plan: Plan, q0, p0, adjoint: AbstractAdjoint, layout: Layout) -> Outcome:
-    return adjoint.rollout(task, plan, q0, p0, layout)
+def _whole(
+    task: Task, plan: Plan, observe: PyTree, q0, p0, num_steps: int, adjoint: AbstractAdjoint,
+    layout: Layout,
+) -> Solution:  # fmt: skip
+    outcome = adjoint.rollout(task, plan, q0, p0, layout)
+    return _as_solution(task, observe, outcome, q0, p0, num_steps)
 
 
 @eqx.filter_jit
@@ -284,8 +287,9 @@ def _with_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes,
     return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), kept
 
 
-@eqx.filter_jit
-def _solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
+def _as_solution(
+    task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: int
+) -> Solution:
     """What a run has left behind, as its user sees it."""
     carry, saved, reduced, defect = outcome
     curve = Curve(task.method, task.equations)
@@ -330,12 +334,15 @@ def _solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: 
     )
 
 
+_solution = eqx.filter_jit(_as_solution)
+
+
 def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     result = solution.result
     if result.is_traced():
         fine = (result == RESULTS.successful) | (result == RESULTS.stopped)
         return result.error_if(solution, ~fine)
-    if bool((result == RESULTS.successful) | (result == RESULTS.stopped)):
+    if status_name(result) in ("successful", "stopped"):
         return solution
     kept = "With throw=False the solution up to there is returned with its status; here it is the "
     kept += "`solution` attribute of this error."
@@ -437,7 +444,7 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
             f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
             "or a negative one (backward)."
         )
-    return jnp.asarray(value, dtype)
+    return jnp.asarray(value if known is None else known.astype(dtype), dtype)
 
 
 def _as_numpy(name: str, value: Any) -> np.ndarray:

@@ -3,7 +3,7 @@
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array
 
@@ -75,10 +75,8 @@ def status_name(result: RESULTS) -> Any:
 
 
 def status_code(result: RESULTS) -> Array:
-    """The place of a status in `STATUS_NAMES`, for each lane of a batch."""
-    code = jnp.zeros(jnp.shape(result == RESULTS.successful), jnp.int32)
-    for i, name in enumerate(STATUS_NAMES):
-        code = jnp.where(result == getattr(RESULTS, name), i, code)
+    """The place of a status in `STATUS_NAMES`, for each trajectory of a batch."""
+    (code,) = jax.tree.leaves(result)  # numbered in the order of the class
     return code
 
 

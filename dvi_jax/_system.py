@@ -1,6 +1,7 @@
 """What the user writes: a discrete Hamiltonian, a disturbing force, a perturbation."""
 
 import inspect
+import weakref
 from collections.abc import Callable
 
 import equinox as eqx
@@ -94,7 +95,8 @@ class System(eqx.Module):
         return (epsilon * t0, epsilon * t1) if self.slow_time else (t0, t1)
 
     def check_shapes(self, t: Scalar, q: State, p: State, epsilon: Scalar, args: Args) -> None:
-        """Refuse functions whose values have the wrong shape or type, by tracing them once."""
+        """Refuse functions whose values have the wrong shape or type, by tracing them once for
+        each combination of shapes and types."""
         for name in ("H_D", "perturbation"):
             function = getattr(self, name)
             if function is not None:
@@ -118,9 +120,21 @@ class System(eqx.Module):
                 )
 
 
+_SEEN: weakref.WeakKeyDictionary[Callable, dict] = weakref.WeakKeyDictionary()
+"""What functions returned, by the shapes and types that they were given."""
+
+
 def _traced_output(
     function: Callable, name: str, t: Scalar, q: State, p: State, args: Args
 ) -> jax.ShapeDtypeStruct:
+    leaves, tree = jax.tree.flatten((t, q, p, args))
+    kinds = (tree, *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves))
+    try:
+        seen = _SEEN.setdefault(function, {})
+        if kinds in seen:
+            return seen[kinds]
+    except TypeError:  # a function or an argument that cannot be looked up
+        seen = {}
     try:
         out = eqx.filter_eval_shape(function, t, t, q, p, args)
     except Exception as error:
@@ -128,12 +142,12 @@ def _traced_output(
         raise
     if out is None or not hasattr(out, "shape"):
         if isinstance(out, int | float):
-            return jax.ShapeDtypeStruct((), jnp.result_type(float))
+            return seen.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))
         raise TypeError(
             f"{name}{_NAMES} must return one array; it returned "
             f"{'None (is a return missing?)' if out is None else type(out).__name__}."
         )
-    return out
+    return seen.setdefault(kinds, jax.ShapeDtypeStruct(out.shape, out.dtype))
 
 
 def _require_five_arguments(function: object, name: str) -> None:

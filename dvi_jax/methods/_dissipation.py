@@ -26,6 +26,11 @@ def substeps(method: Method) -> tuple[float, ...]:
     return (1.0,)
 
 
+def goes_backwards(method: Method) -> bool:
+    """Whether a part of a step goes backwards in time."""
+    return min(substeps(method)) < 0
+
+
 def warn_of_dissipation(
     method: Method, equations: Equations, interval: Interval, q0: State, p0: State
 ) -> None:
