@@ -391,10 +391,12 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
         )
     if q.size == 0:
         raise ValueError(f"q0 is empty (shape {q.shape}): there is nothing to integrate.")
-    dtype = jnp.result_type(q.dtype, p.dtype)
-    if jnp.finfo(dtype).bits < 32:
-        raise TypeError(f"q0 and p0 must be float32 or float64, got {dtype}: too few digits.")
-    return q.astype(dtype), p.astype(dtype)
+    if q.dtype != p.dtype:
+        dtype = jnp.result_type(q.dtype, p.dtype)
+        q, p = q.astype(dtype), p.astype(dtype)
+    if q.dtype.itemsize < 4:
+        raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype}: too few digits.")
+    return q, p
 
 
 def _real_array(name: str, value: Any) -> Array:
@@ -407,12 +409,12 @@ def _real_array(name: str, value: Any) -> Array:
         value = _as_numpy(name, value)
         kind = value.dtype
         refuse_double_without_x64(name, kind)
-    if jnp.issubdtype(kind, jnp.complexfloating):
+    if kind.kind == "c":
         raise TypeError(
             f"{name} must be real, got dtype {kind}. Write a complex variable as its real and "
             "imaginary parts (a canonical pair, up to a factor)."
         )
-    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+    if not _is_real(kind):
         raise TypeError(f"{name} must be a real array, got dtype {kind}.")
     if isinstance(value, np.ndarray) and not np.isfinite(value).all():
         where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
@@ -421,7 +423,12 @@ def _real_array(name: str, value: Any) -> Array:
             "Every component of the start must be a number."
         )
     array = jnp.asarray(value)
-    return array if jnp.issubdtype(kind, jnp.floating) else array.astype(jnp.result_type(float))
+    return array.astype(jnp.result_type(float)) if kind.kind in "iu" else array
+
+
+def _is_real(dtype: Any) -> bool:
+    """Whether numbers of this type are real; NumPy does not know those of two bytes."""
+    return dtype.kind in "fiu" or jnp.issubdtype(dtype, jnp.floating)
 
 
 def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
@@ -430,7 +437,7 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
     if isinstance(value, np.ndarray | np.generic):
         refuse_double_without_x64(name, value.dtype)
     kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
-    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+    if not _is_real(kind):
         raise TypeError(f"{name} must be a real number, got {value!r}.")
     if shape != ():
         raise ValueError(
@@ -444,7 +451,7 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
             f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
             "or a negative one (backward)."
         )
-    return jnp.asarray(value if known is None else known.astype(dtype), dtype)
+    return jnp.asarray(value, dtype) if known is None else jnp.asarray(known.astype(dtype))
 
 
 def _as_numpy(name: str, value: Any) -> np.ndarray:

@@ -70,8 +70,8 @@ STATUS_NAMES = (
 
 def status_name(result: RESULTS) -> Any:
     """The short name of a status, or an array of names for a batch."""
-    names = np.array(STATUS_NAMES)[np.asarray(status_code(result))]
-    return str(names) if names.ndim == 0 else names
+    code = np.asarray(status_code(result))
+    return STATUS_NAMES[int(code)] if code.ndim == 0 else np.array(STATUS_NAMES)[code]
 
 
 def status_code(result: RESULTS) -> Array:

@@ -97,10 +97,11 @@ class System(eqx.Module):
     def check_shapes(self, t: Scalar, q: State, p: State, epsilon: Scalar, args: Args) -> None:
         """Refuse functions whose values have the wrong shape or type, by tracing them once for
         each combination of shapes and types."""
-        for name in ("H_D", "perturbation"):
-            function = getattr(self, name)
+        leaves, tree = jax.tree.flatten((t, q, p, args))
+        kinds = (tree, *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves))
+        for name, function in (("H_D", self.H_D), ("perturbation", self.perturbation)):
             if function is not None:
-                out = _traced_output(function, name, t, q, p, args)
+                out = _traced_output(function, name, kinds, t, q, p, args)
                 if out.shape != () or not jnp.issubdtype(out.dtype, jnp.floating):
                     raise ValueError(
                         f"{name}{_NAMES} must return a real scalar (an energy); for q0 of shape "
@@ -112,7 +113,7 @@ class System(eqx.Module):
                         )
                     )
         if self.force is not None:
-            out = _traced_output(self.force, "force", t, q, p, args)
+            out = _traced_output(self.force, "force", kinds, t, q, p, args)
             if out.shape != q.shape or not jnp.issubdtype(out.dtype, jnp.floating):
                 raise ValueError(
                     f"force{_NAMES} must return a real array shaped like q0, {q.shape}; it "
@@ -125,10 +126,8 @@ _SEEN: weakref.WeakKeyDictionary[Callable, dict] = weakref.WeakKeyDictionary()
 
 
 def _traced_output(
-    function: Callable, name: str, t: Scalar, q: State, p: State, args: Args
+    function: Callable, name: str, kinds: tuple, t: Scalar, q: State, p: State, args: Args
 ) -> jax.ShapeDtypeStruct:
-    leaves, tree = jax.tree.flatten((t, q, p, args))
-    kinds = (tree, *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves))
     try:
         seen = _SEEN.setdefault(function, {})
         if kinds in seen:
