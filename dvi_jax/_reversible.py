@@ -32,7 +32,6 @@ from ._rollout import (
     reduce,
     run,
     start,
-    take_step,
     with_start,
     with_tail,
 )
@@ -96,14 +95,9 @@ class Reversible(AbstractAdjoint):
         return self.max_defect or (1e-6 if jnp.dtype(dtype).itemsize >= 8 else 1e-3)
 
     def rollout(self, task, plan, q0, p0, layout=Layout()):
-        why = _why_not(task, q0, p0)
+        why = _why_not(task)
         if why:
-            if self.report_defect:
-                raise ValueError(
-                    f"report_defect=True asks how well states are rebuilt, but none are: {why}. "
-                    "Leave it out: gradients go by dvi.Checkpointed() here."
-                )
-            return Checkpointed().rollout(task, plan, q0, p0, layout)
+            return self._otherwise(why, task, plan, q0, p0, layout)
         outside = adds_start_outside(plan)
         theta, others = eqx.partition(task, eqx.is_inexact_array)
         # Whole numbers and truth values may be traced as well: inputs without a derivative.
@@ -124,6 +118,12 @@ class Reversible(AbstractAdjoint):
             kept, counts = eqx.partition(rows, eqx.is_inexact_array)
             smooth = _Smooth(carry.q, carry.p, kept, reduce(task, carry))
             return smooth, (carry, saved, tail, counts)
+
+        # A value that is being differentiated or batched and that a function closes over is no
+        # input of the trajectory: a derivative written for its inputs would miss it.
+        if any(is_traced(c) for c in jax.make_jaxpr(forward)((theta, q0, p0), whole).consts):
+            why = "a function of the run closes over a traced value (hand it over in args)"
+            return self._otherwise(why, task, plan, q0, p0, layout)
 
         @jax.custom_jvp
         def trajectory(inputs, whole):
@@ -204,6 +204,15 @@ class Reversible(AbstractAdjoint):
         if outside:
             kept = with_start(kept, q0, p0)
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), kept, smooth.reduced, rebuilt)
+
+    def _otherwise(self, why: str, task, plan, q0, p0, layout) -> Outcome:
+        """The run without states that are rebuilt, for the reason given."""
+        if self.report_defect:
+            raise ValueError(
+                f"report_defect=True asks how well states are rebuilt, but none are: {why}. "
+                "Leave it out: gradients go by dvi.Checkpointed() here."
+            )
+        return Checkpointed().rollout(task, plan, q0, p0, layout)
 
     def _inner_loop(self, body, state, first, stride, count):
         """A scan over the steps of a block that keeps the state every `checkpoint_every` steps."""
@@ -515,7 +524,7 @@ def _miss(a, b, size, allowed):
     return jnp.abs(a - b) / (size + (round_off / allowed + jnp.finfo(a.dtype).tiny))
 
 
-def _why_not(task: Task, q0: State, p0: State) -> str | None:
+def _why_not(task: Task) -> str | None:
     """Why no states of this run can be rebuilt, None if they can."""
     if not task.method.is_invertible:
         return f"{type(task.method).__name__} has no inverse step"
@@ -527,26 +536,7 @@ def _why_not(task: Task, q0: State, p0: State) -> str | None:
         return "deviation vectors cannot be followed backwards"
     if task.has_running_values:
         return "running values of reductions are not rebuilt"
-    if _closes_over_traced(task, q0, p0):
-        return "a function of the run closes over a traced value (hand it over in args)"
     return None
-
-
-def _closes_over_traced(task: Task, q0: State, p0: State) -> bool:
-    """Whether a function of the task holds a value that is being differentiated or batched.
-
-    Such a value is no input of the trajectory, so that a derivative written for its inputs would
-    miss it.
-    """
-    arrays, rest = eqx.partition(task, eqx.is_array)
-
-    def one_step(arrays, q0, p0):
-        task = eqx.combine(arrays, rest)
-        alone, _ = task.observables()
-        carry, _, taken = take_step(task, start(task, q0, p0), jnp.asarray(0, jnp.int32))
-        return carry, [taken.value(f, task.args) for f in alone]
-
-    return any(is_traced(c) for c in jax.make_jaxpr(one_step)(arrays, q0, p0).consts)
 
 
 def _all_finite(state) -> Array:

@@ -421,7 +421,8 @@ class Builder:
             of = {"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor}
             return self._fold(of[op], a, b)
         if op == "and" and a.op == b.op == "finite" and a.args[0].dtype == b.args[0].dtype:
-            return self.all_finite([*self.finite_terms(a), *self.finite_terms(b)])
+            first = self.finite_terms(a)
+            return self.all_finite([*first, *self.finite_terms(b)], len(first))
         if a.dtype == "bool" and op != "xor":
             for x, y in ((a, b), (b, a)):
                 if x.known is not None:
@@ -517,15 +518,18 @@ class Builder:
             return self.known(np.isfinite(a.known), "bool")
         return self.all_finite([a])
 
-    def all_finite(self, terms: Sequence[Num]) -> Num:
+    def all_finite(self, terms: Sequence[Num], known: int = 1) -> Num:
         """Whether all numbers, of one type, are finite: whether Σ 0·x is not NaN.
 
-        Those are left out whose infinities and NaN would be seen in another of them.
+        Those are left out whose infinities and NaN would be seen in another of them, as long as
+        there are few; among the first `known` there are none such.
         """
-        terms, needed = list({x.serial: x for x in terms}.values()), []
-        for i, x in enumerate(terms):
-            if not self.shown(frozenset([x.serial]), [*needed, *terms[i + 1 :]]):
-                needed.append(x)
+        terms = list({x.serial: x for x in terms}.values())
+        needed = terms if len(terms) > _FEW else terms[:known]
+        for x in terms[len(needed) :]:
+            if not self.shown(frozenset([x.serial]), needed):
+                others = self.shown(frozenset(y.serial for y in needed), [x])
+                needed = [*(y for y in needed if y.serial not in others), x]
         zero = self.known(0, terms[0].dtype)
         total = self.op("0·x", (zero, needed[0]), zero.dtype, _product)
         for x in needed[1:]:
@@ -806,8 +810,11 @@ _FLOATS = ("float64", "float32")
 _HANDED_ON = frozenset(["add", "sub", "mul", "fma", "neg", "sqrt", "same"])
 """Operations whose result is not finite where an operand is not."""
 
-_DEEPEST, _MOST_SEEN = 100, 1000
+_DEEPEST, _MOST_SEEN = 50, 300
 """How far operations are followed back."""
+
+_FEW = 12
+"""Numbers among which those are looked for that others show to be finite."""
 
 _COMPARISONS: dict[str, Callable] = {
     "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal,
