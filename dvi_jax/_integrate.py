@@ -287,9 +287,7 @@ def _with_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes,
     return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), kept
 
 
-def _as_solution(
-    task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: int
-) -> Solution:
+def _as_solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
     """What a run has left behind, as its user sees it."""
     carry, saved, reduced, defect = outcome
     curve = Curve(task.method, task.equations)

@@ -11,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 import lanewise
 from lanewise import Layout
-from lanewise.jaxapi import is_traced
+from lanewise.jaxapi import is_traced, linear_map
 
 from ._adjoints import AbstractAdjoint, Checkpointed, Outcome
 from ._arithmetic import FloatingPoint
@@ -131,15 +130,17 @@ class Reversible(AbstractAdjoint):
 
         @functools.partial(trajectory.defjvp, symbolic_zeros=True)
         def _(primals, tangents):
-            # The tangent is L·dx with L the derivative. Written as the solution (u, v) of the
-            # linear system u = dx, v − L u = 0, it may be given a transpose of its own: forward
-            # mode runs L along the scan, reverse mode runs Lᵀ on rebuilt states.
+            # The tangent is L·dx with L the derivative: forward mode runs L along the scan, reverse
+            # mode runs Lᵀ on rebuilt states.
             (inputs, whole), (change, _) = primals, tangents
             smooth, trace = trajectory(inputs, whole)
             # By inputs that do not move nothing is differentiated.
             moves = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), change)
             moving, still = eqx.partition(inputs, moves)
             change = eqx.filter(change, moves)
+            # No more than that: what nothing reads need not be computed on the way.
+            carry, saved, tail, _ = trace
+            known = carry.reductions, _states_of(saved), None if tail is None else _states_of(tail)
 
             def along(moving, still, whole, u):
                 def of(moving):
@@ -147,46 +148,28 @@ class Reversible(AbstractAdjoint):
 
                 return jax.jvp(of, (moving,), (u,))[1]
 
-            def push(u):
+            def definition(residuals, u):
+                moving, still, whole, _ = residuals
+                return along(moving, still, whole, u)
+
+            def push(residuals, u):
+                moving, still, whole, _ = residuals
                 return lanewise.call(along, moving, still, whole, u, layout=layout)
 
-            # As one vector: the transposition of a linear solve wants all parts of its right side
-            # to be linear in the tangents, also those that are zero.
-            rhs, unravel = ravel_pytree((change, jax.tree.map(jnp.zeros_like, smooth)))
-
-            def flat(u, v):
-                return ravel_pytree((u, v))[0]
-
-            def matvec(x):
-                u, v = unravel(x)
-                moved = along(moving, still, whole, u)
-                return flat(u, jax.tree.map(jnp.subtract, v, moved))
-
-            def solve(_, b):
-                u, v = unravel(b)
-                return flat(u, jax.tree.map(jnp.add, v, push(u)))
-
-            # No more than that: what nothing reads need not be computed on the way.
-            carry, saved, tail, _ = trace
-            known = carry.reductions, _states_of(saved), None if tail is None else _states_of(tail)
-
-            def pull(moving, still, whole, known, v):
+            def back(moving, still, whole, known, v):
                 theta, q0, p0 = eqx.combine(moving, still)
                 theta, others = eqx.partition(theta, moves[0])
                 rest = eqx.combine(others, whole, fixed)
-                back = _pull_back(self, rest, plan, (theta, q0, p0), known, v)
-                return eqx.filter(back, moves)
+                return eqx.filter(_pull_back(self, rest, plan, (theta, q0, p0), known, v), moves)
 
-            def transpose_solve(_, b):
-                u, v = unravel(b)
-                back = lanewise.call(pull, moving, still, whole, known, v, layout=layout)
+            def pull(residuals, v):
+                out = lanewise.call(back, *residuals, v, layout=layout)
                 # From a lane that nothing asks for nothing flows back, though it has failed.
                 asked = jnp.any(jnp.stack([jnp.any(x != 0) for x in jax.tree.leaves(v)]))
-                back = jax.tree.map(lambda x: jnp.where(asked, x, 0), back)
-                return flat(jax.tree.map(jnp.add, u, back), v)
+                return jax.tree.map(lambda x: jnp.where(asked, x, 0), out)
 
-            solver: Any = lax.custom_linear_solve  # its annotations differ between versions
-            _, moved = unravel(solver(matvec, rhs, solve, transpose_solve))
+            residuals = moving, still, whole, known
+            moved = linear_map(push, pull, definition, residuals, change)
             return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
 
         smooth, (carry, saved, tail, counts) = trajectory((theta, q0, p0), whole)

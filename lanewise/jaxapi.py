@@ -1,9 +1,10 @@
 """The few names of JAX that have moved between releases, or are not public: all of them, here."""
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
 from jax.interpreters import ad, batching, mlir, partial_eval
@@ -19,6 +20,7 @@ __all__ = [
     "is_traced",
     "jaxpr_as_fun",
     "jaxprs_in_params",
+    "linear_map",
     "lower_on",
     "primitive",
     "scan_counts",
@@ -121,11 +123,112 @@ def without_outputs(closed: ClosedJaxpr, used: list[bool]) -> ClosedJaxpr:
     return ClosedJaxpr(jaxpr, closed.consts)
 
 
+def linear_map(push: Callable, pull: Callable, definition: Callable, residuals: Any, x: Any) -> Any:
+    """``push(residuals, x)``, linear in x, with the transpose ``pull(residuals, y)`` in reverse
+    mode; x and y are pytrees of floating-point arrays.
+
+    `definition` is the same function as `push` in operations that JAX can transpose: derivatives by
+    the residuals are taken of it, so that neither `push` nor `pull` need have any.
+    """
+    known, known_tree = jax.tree.flatten(residuals)
+    leaves, tree = jax.tree.flatten(x)
+    trees: list[Any] = []
+
+    def flat(function: Callable, of_tree: Callable) -> Callable:
+        def of(*arrays):
+            r, x = arrays[: len(known)], arrays[len(known) :]
+            y = function(jax.tree.unflatten(known_tree, r), jax.tree.unflatten(of_tree(), x))
+            out, out_tree = jax.tree.flatten(y)
+            trees.append(out_tree)
+            return out
+
+        return of
+
+    of_x, of_y = (lambda: tree), (lambda: trees[0])
+    functions = _Linear(flat(push, of_x), flat(pull, of_y), flat(definition, of_x), False)
+    out = _linear.bind(*known, *leaves, functions=functions, count=len(known))
+    return jax.tree.unflatten(trees[0], out)
+
+
+class _Linear(NamedTuple):
+    """A linear map and its transpose, of residuals and a vector in a row of arrays; the definition
+    of the map, or of its transpose where that is `transposed`."""
+
+    push: Callable
+    pull: Callable
+    definition: Callable
+    transposed: bool
+
+
+def _pushed(*arrays, functions: _Linear, count: int) -> list[Any]:
+    return functions.push(*arrays)
+
+
+def _linear_batched(arrays, axes, *, functions: _Linear, count: int):
+    pairs = list(zip(arrays, axes, strict=True))
+    (size,) = {x.shape[a] for x, a in pairs if a is not None}
+    moved = [x if a is None else jnp.moveaxis(x, a, 0) for x, a in pairs]
+    own = [None if a is None else 0 for a in axes[:count]]
+    vector = [
+        jnp.broadcast_to(x, (size, *x.shape)) if a is None else x
+        for x, a in zip(moved[count:], axes[count:], strict=True)
+    ]
+
+    def all_of(function: Callable) -> Callable:
+        def of(*arrays):
+            every = [*own, *[0] * (len(arrays) - count)]
+            return jax.vmap(function, every, 0, axis_size=size)(*arrays)
+
+        return of
+
+    push, pull, definition, transposed = functions
+    new = _Linear(all_of(push), all_of(pull), all_of(definition), transposed)
+    outs = _linear.bind(*moved[:count], *vector, functions=new, count=count)
+    return outs, [0] * len(outs)
+
+
+def _linear_transposed(cotangents, *arrays, functions: _Linear, count: int):
+    push, pull, definition, transposed = functions
+    like = jax.eval_shape(push, *(x.aval if ad.is_undefined_primal(x) else x for x in arrays))
+    given = [
+        jnp.zeros(a.shape, a.dtype) if isinstance(c, ad.Zero) else c
+        for c, a in zip(cotangents, like, strict=True)
+    ]
+    new = _Linear(pull, push, definition, not transposed)
+    return [None] * count + list(_linear.bind(*arrays[:count], *given, functions=new, count=count))
+
+
+def _linear_derivative(primals, tangents, *, functions: _Linear, count: int):
+    outs = _linear.bind(*primals, functions=functions, count=count)
+    known, x = primals[:count], primals[count:]
+    change = [ad.instantiate_zeros(t) for t in tangents[count:]]
+    total = _linear.bind(*known, *change, functions=functions, count=count)
+    moves = [i for i, t in enumerate(tangents[:count]) if not isinstance(t, ad.Zero)]
+    if moves:
+
+        def of(*moving):
+            values = dict(zip(moves, moving, strict=True))
+            residuals = [values.get(i, r) for i, r in enumerate(known)]
+            if not functions.transposed:
+                return functions.definition(*residuals, *x)
+            back = jax.linear_transpose(lambda *y: functions.definition(*residuals, *y), *outs)
+            return list(back(list(x)))
+
+        _, more = jax.jvp(of, [known[i] for i in moves], [tangents[i] for i in moves])
+        total = [a + b for a, b in zip(total, more, strict=True)]
+    return outs, total
+
+
 def identity(name: str, batched: Callable) -> Primitive:
     """A primitive that does nothing but under `vmap`, for which `batched` is its rule."""
     new = primitive(name, lambda x: x, batched)
     ad.deflinear2(new, lambda cotangent, _: [new.bind(cotangent)])
     return new
+
+
+_linear = primitive("linear_map", _pushed, _linear_batched, multiple=True)
+ad.primitive_transposes[_linear] = _linear_transposed
+ad.primitive_jvps[_linear] = _linear_derivative
 
 
 def _abstract(function: Callable, avals: Any, params: dict[str, Any]) -> Any:
