@@ -13,6 +13,7 @@ from lanewise.jaxapi import is_traced
 from ._solution import Save, Solution
 from ._system import System
 from ._types import Args, Bindable, Scalar, State
+from .engine.rounding import one_by_one
 from .lattices import TimeTransformed
 from .observe import Crossings, Deviations, Reduction, Running, Section, Stop, Stopped, Trend
 
@@ -30,7 +31,7 @@ class Extended(eqx.Module):
 
     def start(self, t: Scalar, q: State, p: State, args: Args) -> tuple[Array, Array]:
         """The extended state, on K = 0."""
-        energy = self.system.hamiltonian(t, t, q, p, self.epsilon, args)
+        energy = one_by_one(_energy, self.system, t, q, p, self.epsilon, args)
         return jnp.append(q.ravel(), t), jnp.append(p.ravel(), -energy)
 
     def parts(self, position: Array, momentum: Array) -> tuple[State, State, Scalar, Scalar]:
@@ -59,6 +60,10 @@ class Extended(eqx.Module):
     def as_system(self) -> System:
         """K and its force as a `System`, to be run at ε = 1."""
         return System(self.hamiltonian, None if self.system.force is None else self.force)
+
+
+def _energy(system: System, t: Scalar, q: State, p: State, epsilon: Scalar, args: Args) -> Scalar:
+    return system.hamiltonian(t, t, q, p, epsilon, args)
 
 
 class _Seen(eqx.Module):

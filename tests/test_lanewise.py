@@ -189,10 +189,85 @@ def stopped_end(q, p):
     return sol.qs, sol.ps, sol.result, sol.stop, sol.observed
 
 
+def streamed_end(q, p):
+    system, *_ = SYSTEMS["kepler"]
+    sol = dvi.integrate(
+        system, q, p, h=0.02, num_steps=100, args={"K": 1.0}, throw=False,
+        save=dvi.Save(final=True),
+        observe=[dvi.MaxDrift(kepler_energy), dvi.Trend(kepler_energy), dvi.Mean(kepler_energy)],
+    )  # fmt: skip
+    return sol.qs, sol.ps, sol.observed, sol.result
+
+
+def all_rows(q, p):
+    """Rows that wait in fast memory: more than two portions of them, and a rest."""
+    sol = dvi.integrate(dvi.System(pendulum), q, p, h=0.1, num_steps=75, throw=False)
+    return sol.qs, sol.ps, sol.result
+
+
+def gauss_end(q, p):
+    system, *_ = SYSTEMS["double_pendulum"]
+    sol = dvi.integrate(
+        system, q, p, h=0.05, num_steps=5, epsilon=0.1, throw=False, method=dvi.GaussLegendre(2)
+    )
+    return sol.qs, sol.ps, sol.result
+
+
+def single_end(q, p):
+    q, p = q.astype(jnp.float32), p.astype(jnp.float32)
+    sol = dvi.integrate(dvi.System(pendulum), q, p, h=0.1, num_steps=70, throw=False)
+    return sol.qs.astype(float), sol.ps.astype(float), sol.result
+
+
+def variational_end(q, p):
+    sol = dvi.integrate(
+        dvi.System(dvi.discretise(pendulum_energy, order=2)), q, p, h=0.05, num_steps=12,
+        lattice=dvi.Variational(), throw=False,
+    )  # fmt: skip
+    return sol.qs, sol.ps, sol.ts, sol.result
+
+
+def pendulum_energy(q, p, t, args):
+    return p @ p / 2 - jnp.sum(jnp.cos(q))
+
+
+def transformed_end(q, p):
+    system, *_ = SYSTEMS["kepler"]
+    sol = dvi.integrate(
+        system, q, p, h=0.05, num_steps=40, args={"K": 1.0}, throw=False,
+        lattice=dvi.TimeTransformed(lambda t, q, p, args: jnp.sqrt(q @ q)),
+    )  # fmt: skip
+    return sol.qs, sol.ps, sol.ts, sol.result
+
+
+def cubic_end(q, p):
+    """Trajectories that escape to infinity, each at a step of its own."""
+    sol = dvi.integrate(
+        dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + q0 @ q0 / 2 + jnp.sum(q0**3) / 6),
+        q, p, h=0.1, num_steps=90, throw=False, save=dvi.Save(every=30),
+    )  # fmt: skip
+    return sol.qs, sol.ps, sol.result, sol.stats["failed_step"]
+
+
+def implicit_cubic_end(q, p):
+    sol = dvi.integrate(
+        dvi.System(lambda t0, t1, q0, p1, args: (1 + 0.3 * q0 @ q0) * (p1 @ p1) / 2
+                   + q0 @ q0 / 2 + jnp.sum(q0**3) / 6),
+        q, p, h=0.1, num_steps=90, throw=False, save=dvi.Save(final=True),
+    )  # fmt: skip
+    return sol.qs, sol.ps, sol.result, sol.stats["failed_step"], sol.stats["newton_iterations"]
+
+
+RUNS = [
+    kepler_end, streamed_end, all_rows, implicit_end, gauss_end, fixed_point_end, stopped_end,
+    single_end, variational_end, transformed_end, cubic_end, implicit_cubic_end,
+]  # fmt: skip
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("run", [kepler_end, implicit_end, fixed_point_end, stopped_end])
+@pytest.mark.parametrize("run", RUNS)
 def test_bits_of_runs(left, threads, run):
-    """Alone, in two batches, with a neighbour that fails, on one and on two threads."""
+    """Alone, in batches of 7, 64 and 1 000, with a neighbour that fails, on one and two threads."""
     rng = np.random.default_rng(1)
     q, p = rng.uniform(0.3, 1.3, (2, 64, 2))
     q[:, 0] -= 0.9
@@ -201,9 +276,20 @@ def test_bits_of_runs(left, threads, run):
     every = jax.tree.map(np.asarray, batch(q, p))
     lanewise.set_threads(2)
     assert_same(batch(q, p), every)
-    assert np.all(np.isfinite(every[0][:5, 0]))
+    escapes = run in (cubic_end, implicit_cubic_end)
+    if escapes:  # at different steps, which is what this run is for; and some do not
+        steps = every[3][every[3] >= 0]
+        assert len(steps) < 64 and len(set(steps.tolist())) > 5
+    else:
+        assert np.all(np.isfinite(every[0][:5, 0]))
     assert_same(batch(q[30:37], p[30:37]), jax.tree.map(lambda a: a[30:37], every))
-    assert_same(jax.jit(run)(q[3], p[3]), jax.tree.map(lambda a: a[3], every))
+    alone = jax.jit(run)
+    for i in (3, 8, 21):
+        assert_same(alone(q[i], p[i]), jax.tree.map(lambda a, i=i: a[i], every))
+    where = rng.integers(0, 64, 1000)
+    assert_same(batch(q[where], p[where]), jax.tree.map(lambda a: a[where], every))
+    nested = jax.jit(jax.vmap(jax.vmap(run)))(q.reshape(4, 16, 2), p.reshape(4, 16, 2))
+    assert_same(jax.tree.map(lambda a: a.reshape(64, *a.shape[2:]), nested), every)
     q[::3] = np.nan
     fails = np.arange(64) % 3 == 0
     assert_same(
