@@ -503,19 +503,22 @@ def test_single_precision():
 
 @pytest.mark.slow
 def test_compensated_arithmetic_keeps_what_it_gains():
-    q, p = box(3, seed=3, width=0.4)
+    starts = np.random.default_rng(0).uniform(-0.4, 0.4, (2, 16, 3))
 
     def run(solver, arithmetic):
-        sol = dvi.integrate(
-            CHAIN, q, p, h=1 / 64, num_steps=4096, newton=solver, arithmetic=arithmetic,
-            save=dvi.Save(final=True),
-        )  # fmt: skip
-        return np.asarray(sol.qs[-1])
+        def one(q, p):
+            return dvi.integrate(
+                CHAIN, q, p, h=1 / 64, num_steps=4096, newton=solver, arithmetic=arithmetic,
+                save=dvi.Save(final=True),
+            ).qs[-1]  # fmt: skip
 
+        return np.asarray(jax.jit(jax.vmap(one))(*starts))
+
+    # Medians: some of the starts are unstable, and increase any difference.
     exact = run(Newton(), dvi.Compensated())
     for solver in OTHERS.values():
-        np.testing.assert_allclose(run(solver, dvi.Compensated()), exact, rtol=0, atol=4 * EPS)
-    assert np.max(np.abs(run(Picard(), dvi.FloatingPoint()) - exact)) > 8 * EPS
+        assert np.median(np.abs(run(solver, dvi.Compensated()) - exact)) < EPS / 2
+    assert np.median(np.abs(run(Picard(), dvi.FloatingPoint()) - exact)) > 3 * EPS
 
 
 @pytest.mark.parametrize("n", [1, _BY_INVERSE, _BY_INVERSE + 1])
