@@ -123,7 +123,7 @@ class Assumed:
         return before
 
 
-_LONGEST = int(__import__("os").environ.get("LONGEST", "300"))
+_LONGEST = 300
 """Operations of a round up to which it is written twice."""
 
 

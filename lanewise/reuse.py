@@ -21,8 +21,8 @@ def carried_over(before: Sequence[Num], after: Sequence[Num]) -> list[tuple[Num,
     that y is the next round's x."""
     place = {x.serial: i for i, x in enumerate(before)}
     new_place = {x.serial: i for i, x in enumerate(after) if x.known is None and x.op}
-    first = _Forms(place, {})
-    second = _Forms({}, new_place, others=frozenset(place))
+    first = _Forms(place, min(place))
+    second = _Forms(new_place, min(place))
     seen = _all_of(after)
     ends = {}
     for y in seen:
@@ -59,19 +59,19 @@ def _all_of(numbers: Sequence[Num]) -> list[Num]:
 class _Forms:
     """How numbers are made from a state, as keys: equal keys are equal numbers of equal states."""
 
-    def __init__(self, here: dict[int, int], there: dict[int, int], others=frozenset()):
-        self.place, self.others = {**here, **there}, others
+    def __init__(self, place: dict[int, int], inside: int):
+        """`place` has the numbers of the state; those from the serial `inside` on belong to the
+        round, and the others are the same in all rounds."""
+        self.place, self.inside = place, inside
         self.forms: dict[int, Any] = {}
 
     def of(self, x: Num) -> Any:
-        """The key, None for a number that depends on the other state too."""
+        """The key, None for a number that does not follow from this state alone."""
         if x.known is not None:
             return x.key
         if x.serial in self.place:
             return "state", self.place[x.serial]
-        if x.serial in self.others:
-            return None
-        if not x.op:
+        if x.serial < self.inside:
             return "outside", x.serial
         if x.write is None and x.op != "same":
             return None

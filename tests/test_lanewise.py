@@ -279,7 +279,8 @@ def test_bits_of_runs(left, threads, run):
     escapes = run in (cubic_end, implicit_cubic_end)
     if escapes:  # at different steps, which is what this run is for; and some do not
         steps = every[3][every[3] >= 0]
-        assert len(steps) < 64 and len(set(steps.tolist())) > 5
+        assert len(steps) < 64
+        assert len(set(steps.tolist())) > 5
     else:
         assert np.all(np.isfinite(every[0][:5, 0]))
     assert_same(batch(q[30:37], p[30:37]), jax.tree.map(lambda a: a[30:37], every))
@@ -297,6 +298,51 @@ def test_bits_of_runs(left, threads, run):
     )
     if run is not fixed_point_end:  # see `test_derivative_of_a_call_inside_of_generated_code`
         assert not left, left
+
+
+def looping(x):
+    """A state, its sum of distances, and when it first left a circle, asked in each round; 1/r and
+    the sine and cosine of the new state are those of the next round."""
+
+    def step(carry, k):
+        q, total, left_at = carry
+        r = jnp.sqrt(q @ q)
+        s, c = jnp.sin(q[0]), jnp.cos(q[0])
+        q = q + 0.05 * jnp.stack([c, s]) / r + 0.02 * x
+        outside = jnp.sqrt(q @ q) > 2.5
+
+        def note():
+            return jnp.where(outside & (left_at < 0), k, left_at)
+
+        left_at = lax.cond(lanewise.on_any(outside), note, lambda: left_at)
+        total = total + jnp.where(k == 0, 0.0, 1 / jnp.sqrt(q @ q)) + jnp.sin(q[0]) * jnp.cos(q[0])
+        return (q, total, left_at), q
+
+    start = jnp.stack([jnp.cos(x), jnp.sin(x)]), jnp.zeros_like(x), jnp.asarray(-1)
+    return lax.scan(step, start, jnp.arange(100))
+
+
+@pytest.mark.parametrize("longest", [0, 300])
+def test_rounds_without_rare_branches(left, monkeypatch, longest):
+    """The same bits with rounds that are run on assumptions and without; XLA's to round-off."""
+    monkeypatch.setattr(lanewise.assumed, "_LONGEST", longest)
+    x = np.linspace(-2.0, 2.0, 37)
+    found = jax.tree.leaves(jax.jit(lanewise.batched(lambda x: looping(x)))(x))
+    (part,) = lanewise.explain(looping, 1.0).parts
+    assert ("store volatile" in part.ir) == (longest > 0)
+    _SEEN_BITS.append([np.asarray(a) for a in found])
+    expected = jax.tree.leaves(jax.jit(jax.vmap(looping))(x))
+    never = expected[2] < 0
+    assert 5 < np.sum(never) < 32  # some trajectories need the branch, some do not
+    np.testing.assert_array_equal(found[2], expected[2])
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
+    for a, b in zip(_SEEN_BITS[0], _SEEN_BITS[-1], strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not left
+
+
+_SEEN_BITS: list = []
 
 
 # --- arrays in memory, types, sizes ---------------------------------------------------

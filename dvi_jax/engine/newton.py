@@ -124,9 +124,8 @@ class Newton(RootSolver):
                 last = jnp.where(left, lanewise.solve(jacobian, F(nearer)), second)
                 return nearer, last, jnp.where(left, worst, before)
 
-            x, last, before = lax.cond(
-                lanewise.on_any(left, rare=False), another, lambda: (x, second, before)
-            )
+            asked = lanewise.on_any(left, rare=x0.size > _FIRST_APART)
+            x, last, before = lax.cond(asked, another, lambda: (x, second, before))
             worst = _largest_of(jnp.abs(last))
             x = jnp.where(worst > before, x, x - last)
             return x, jnp.abs(last), _larger(known, jnp.abs(x)), before, worst
