@@ -337,7 +337,7 @@ def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
 def vectors_for(carried: int, operations: int) -> int:
     """Vectors in a block: enough to hide latency, few enough that the state stays in registers."""
     if operations < 150:
-        return max(1, min(6, 32 // max(carried, 1)))
+        return max(1, min(8, 32 // max(carried, 1)))
     if operations < 800 and carried <= 12:
         return 4
     if operations < 1500:
