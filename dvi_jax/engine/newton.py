@@ -71,25 +71,27 @@ def check_settings(rtol: float | None, atol: float, max_steps: int) -> None:
 
 
 class Newton(RootSolver):
-    """Newton's method with two corrections for each Jacobian J = ∂F/∂x(x), which autodiff gives:
+    """Newton's method with several corrections for each Jacobian J = ∂F/∂x(x), which autodiff
+    gives: two, and a third where two are not enough,
 
-        x ← x − J⁻¹ F(x),    x ← x − J⁻¹ F(x).
+        x ← x − J⁻¹ F(x),    x ← x − J⁻¹ F(x),    (x ← x − J⁻¹ F(x)).
 
-    The two corrections δ1, δ2 show how fast they shrink, by |δ2|/|δ1|. The iteration stops once
-    that factor of δ2 is below round-off in each component, relative to the larger of its known and
-    unknown value; or, for components that are nothing but round-off of larger ones, once they are
-    as small as those' and shrink no more. So the root is accurate to round-off also where J is not
-    the derivative of F; the iteration then takes longer. Convergence is of order 3.
+    The last two of them, δ and δ', show how fast they shrink, by |δ'|/|δ|. The iteration stops once
+    δ' times that factor is below round-off in each component, relative to the larger of its known
+    and unknown value; or, for components that are nothing but round-off of larger ones, once they
+    are as small as the round-off of those and shrink no more. So the root is accurate to round-off
+    also where J is not the derivative of F; the iteration then takes longer. Convergence is of
+    order 3 or 4.
 
     **Arguments**
 
-    - `rtol`: relative tolerance of the second correction; None means the rule above.
+    - `rtol`: relative tolerance of the last correction; None means the rule above.
     - `atol`: absolute tolerance [unit of the unknown].
     - `max_steps`: Jacobians after which the status becomes `not_converged`.
 
     **Raises** `ValueError` for tolerances that are negative or both zero, or fewer than one step.
 
-    **Source** Traub 1964, *Iterative Methods for the Solution of Equations* (one Jacobian for two
+    **Source** Traub 1964, *Iterative Methods for the Solution of Equations* (one Jacobian for several
     corrections); the rule for stopping is our own.
     """
 
