@@ -9,6 +9,7 @@ began. The numbers are the same to the bit in both.
 from collections.abc import Sequence
 from typing import Any
 
+from .extent import operation_count
 from .ir import Builder, Num
 from .jaxapi import Jaxpr, bodies
 
@@ -130,8 +131,6 @@ _LONGEST = 300
 def may_assume(jaxpr: Jaxpr) -> bool:
     """Whether a round of a loop asks by itself, not in a loop of its own, what all trajectories
     agree on, and is short."""
-    from .primitive import operation_count
-
     return _asks(jaxpr) and operation_count(jaxpr) <= _LONGEST
 
 

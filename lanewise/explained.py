@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 
 from . import handler, machine
+from .extent import functions_in
 from .ir import Unsupported
 from .jaxapi import jaxprs_in_params
-from .primitive import AUTO, Layout, functions_in, kernel_of, program_of
+from .primitive import AUTO, Layout, kernel_of, program_of
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,10 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import elementary
-from .components import SMALL, Evaluator, Kernel, Value, objects
+from .components import Evaluator
+from .elimination import solved
 from .ir import TYPES, Builder, Num, Unsupported, literal
 from .jaxapi import ClosedJaxpr
 from .memory import Buffer, contiguous, load, load_row, store, stored_type
+from .values import SMALL, Kernel, Value, objects
 
 HEAD = 2
 """Parameters in front of a kernel's own: trajectories, cost of a block; and for each result the
@@ -317,7 +319,7 @@ def _exchange_text(n: int, dtype: str, width: int, called: str) -> tuple[str, fr
     b = inner.b
     place = Buffer(("%p",), dtype, (n * (n + 2),), (width,), 1)
     rows = [[load(b, place, (i * (n + 1) + j) * width) for j in range(n + 1)] for i in range(n)]
-    for i, x in enumerate(Evaluator(b, inner).with_exchanges(rows)):
+    for i, x in enumerate(solved(b, rows, exchange=True)[0]):
         store(b, place, x, (n * (n + 1) + i) * width)
     lines = "\n".join(b.lines)
     text = f"define internal void {called}(ptr %p) noinline {{\nentry:\n{lines}\n  ret void\n}}\n"

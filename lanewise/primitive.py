@@ -11,20 +11,18 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from . import handler, machine
+from .extent import carried, operation_count
 from .ir import Unsupported
 from .jaxapi import (
     ClosedJaxpr,
-    bodies,
     drops_outputs,
     identity,
     is_traced,
     jaxpr_as_fun,
     lower_on,
     primitive,
-    scan_counts,
     without_outputs,
 )
 from .kernel import Module
@@ -138,13 +136,6 @@ def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Call
         )
     one = functools.partial(call, function, layout=layout)
     return jax.vmap(one, in_axes)
-
-
-def functions_in(eqn: Any) -> list[ClosedJaxpr]:
-    """The jaxpr of what `call` was given, if an equation of a jaxpr is such a call: it is not
-    among those that the equation shows."""
-    program = eqn.params.get("program")
-    return [program.traced.closed] if isinstance(program, _Program) else []
 
 
 def generates() -> bool:
@@ -345,47 +336,6 @@ def vectors_for(carried: int, operations: int) -> int:
     return 2 if operations < 4000 and carried <= 12 else 1
 
 
-def carried(jaxpr: Any) -> int:
-    """Numbers that the innermost loop with most of them carries from step to step."""
-    most = 0
-    for eqn in jaxpr.eqns:
-        for body in bodies(eqn):
-            most = max(most, carried(body.jaxpr))
-        if eqn.primitive.name == "scan":
-            _, count = scan_counts(eqn.params)
-            state = [v.aval for v in eqn.outvars[:count]]
-            most = max(most, sum(a.size for a in state if a.size <= 64 and a.dtype.kind == "f"))
-    return most
-
-
-def operation_count(jaxpr: Any) -> int:
-    """How many operations on numbers the evaluation is made of, loops counted once; roughly."""
-    count = 0
-    for eqn in jaxpr.eqns:
-        inner = [operation_count(b.jaxpr) for b in (*bodies(eqn), *functions_in(eqn))]
-        if inner:
-            count += sum(inner)
-            continue
-        size = max((v.aval.size for v in eqn.outvars), default=0)
-        if eqn.primitive.name == "dot_general":
-            (contracted, _), _ = eqn.params["dimension_numbers"]
-            size *= int(np.prod([eqn.invars[0].aval.shape[i] for i in contracted]))
-        elif eqn.primitive.name.startswith("reduce_"):
-            size = eqn.invars[0].aval.size
-        elif eqn.primitive.name == "eliminate":
-            size = eqn.invars[1].aval.size ** 3
-        elif eqn.primitive.name in _FREE:
-            size = 0
-        count += size
-    return count
-
-
-_FREE = frozenset(
-    ["broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "slice", "concatenate",
-     "stack", "split", "unstack", "pad", "rev", "copy", "convert_element_type", "stop_gradient"]
-)  # fmt: skip
-
-
 def _shape_of(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
     front = () if lanes is None else (lanes,)
     avals = program.traced.closed.out_avals
@@ -452,4 +402,4 @@ def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> A
     return x.reshape(size * lanes, *x.shape[2:])
 
 
-__all__ = ["Layout", "batched", "call", "functions_in", "lax"]
+__all__ = ["Layout", "batched", "call"]

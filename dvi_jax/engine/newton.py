@@ -91,8 +91,8 @@ class Newton(RootSolver):
 
     **Raises** `ValueError` for tolerances that are negative or both zero, or fewer than one step.
 
-    **Source** Traub 1964, *Iterative Methods for the Solution of Equations* (one Jacobian for several
-    corrections); the rule for stopping is our own.
+    **Source** Traub 1964, *Iterative Methods for the Solution of Equations* (one Jacobian for
+    several corrections); the rule for stopping is our own.
     """
 
     rtol: float | None = eqx.field(static=True, default=None)

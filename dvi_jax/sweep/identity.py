@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lanewise.extent import functions_in
 from lanewise.jaxapi import ClosedJaxpr, bodies, is_traced
-from lanewise.primitive import functions_in
 
 from ..engine.signature import accepts
 from .axes import is_axis, leaves_with_axes

@@ -1,0 +1,190 @@
+"""Elementwise primitives: rule(evaluator, parameters of the equation, *numbers) → number."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .assumed import taken_for, taken_value
+from .ir import Num, Unsupported
+
+if TYPE_CHECKING:
+    from .components import Evaluator
+
+
+def _binary(method: str) -> Callable:
+    return lambda e, _, a, b: getattr(e.b, method)(a, b)
+
+
+def _compared(op: str) -> Callable:
+    return lambda e, _, a, b: e.b.compare(op, a, b)
+
+
+def _equal(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
+    """A loop's counter equals a given number in one round: taken for rare."""
+    same = e.b.compare("eq", x, y)
+    # What is the same on all trajectories of a batch and changes is a counter.
+    is_count = e.b.W > 1 and taken_value(same) is None and not same.vec and not x.is_float
+    if e.assumed is not None and is_count and (x.known is not None or y.known is not None):
+        e.assumed.never(same)
+        return taken_for(e.b, 0, "bool")
+    return same
+
+
+def _select(e: "Evaluator", _: Any, which: Num, *cases: Num) -> Num:
+    b = e.b
+    if which.dtype == "bool":
+        taken = None if which.known is not None else taken_value(which)
+        if taken is not None:
+            return b.unrelated(cases[int(taken)])
+        return b.select(which, cases[1], cases[0])
+    result = cases[-1]
+    for i in reversed(range(len(cases) - 1)):
+        result = b.select(b.compare("le", which, b.known(i, which.dtype)), cases[i], result)
+    return result
+
+
+def _clamp(e: "Evaluator", _: Any, low: Num, x: Num, high: Num) -> Num:
+    return e.b.maximum(e.b.maximum(x, low), high, "lt")
+
+
+def _sign(e: "Evaluator", _: Any, x: Num) -> Num:
+    b, zero = e.b, e.b.known(0, x.dtype)
+    if x.dtype.startswith("u"):
+        return b.select(b.compare("eq", x, zero), zero, b.known(1, x.dtype))
+    one = b.select(b.compare("gt", x, zero), b.known(1, x.dtype), x)
+    return b.select(b.compare("lt", x, zero), b.known(-1, x.dtype), one)
+
+
+def _rounded(e: "Evaluator", params: dict, x: Num) -> Num:
+    if not x.is_float:
+        return x
+    away = int(params["rounding_method"]) == 0
+    if x.known is not None and not away:
+        return e.b.known(np.rint(x.known), x.dtype)
+    return e.b.intrinsic("round" if away else "roundeven", (x,))
+
+
+def _integral(name: str, function: Callable) -> Callable:
+    def rule(e: "Evaluator", _: Any, x: Num) -> Num:
+        if not x.is_float:
+            return x
+        if x.known is not None:
+            return e.b.known(function(x.known), x.dtype)
+        return e.b.intrinsic(name, (x,))
+
+    return rule
+
+
+def _power(e: "Evaluator", params: dict, x: Num) -> Num:
+    return e.b.power(x, params["y"])
+
+
+def _pow(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
+    if y.known is not None and x.is_float:
+        if not y.is_float or float(y.known).is_integer():
+            n = int(y.known)
+            if abs(n) <= 64:
+                return e.b.power(x, n)
+        elif abs(2 * float(y.known)) <= 7 and float(2 * y.known).is_integer():
+            name = f"half_integer_power {int(2 * float(y.known))}"
+            return _elementary(name)(e, {}, x)
+    if not y.is_float:
+        y = e.b.convert(y, x.dtype)
+    return _elementary("pow")(e, {}, x, y)
+
+
+def _elementary(name: str) -> Callable:
+    def rule(e: "Evaluator", _: Any, *xs: Num) -> Num:
+        if not xs[0].is_float:
+            raise Unsupported(f"{name} of {xs[0].dtype}")
+        if xs[0].dtype == "float32":
+            wide = e.kernel.elementary(name, [e.b.convert(x, "float64") for x in xs])
+            return e.b.convert(wide, "float32")
+        return e.kernel.elementary(name, xs)
+
+    return rule
+
+
+def _one(e: "Evaluator", like: Num) -> Num:
+    return e.b.known(1, like.dtype)
+
+
+def _convert(e: "Evaluator", params: dict, x: Num) -> Num:
+    return e.b.convert(x, str(np.dtype(params["new_dtype"])))
+
+
+def _bitcast(e: "Evaluator", params: dict, x: Num) -> Num:
+    new = np.dtype(params["new_dtype"])
+    if new.itemsize != np.dtype(x.dtype).itemsize or "bool" in (x.dtype, str(new)):
+        raise Unsupported(f"the bits of {x.dtype} as {new}")
+    return e.b.bitcast(x, str(new))
+
+
+def _add(e: "Evaluator", _: Any, a: Num, b: Num) -> Num:
+    return e.combine("add", a, b)
+
+
+def _mul(e: "Evaluator", _: Any, a: Num, b: Num) -> Num:
+    return e.combine("mul", a, b)
+
+
+def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
+    wide = {"float64": (11, 52), "float32": (8, 23)}.get(x.dtype)
+    if wide is None or params["exponent_bits"] < wide[0] or params["mantissa_bits"] < wide[1]:
+        raise Unsupported("reduce_precision to fewer bits")
+    return x
+
+
+ELEMENTWISE: dict[str, Callable] = {
+    "add": _add,
+    "add_any": _add,
+    "sub": _binary("sub"),
+    "mul": _mul,
+    "div": _binary("div"),
+    "rem": _binary("rem"),
+    "neg": lambda e, _, x: e.b.neg(x),
+    "abs": lambda e, _, x: e.b.abs(x),
+    "sign": _sign,
+    "max": lambda e, _, a, b: e.combine("max", a, b),
+    "min": lambda e, _, a, b: e.combine("min", a, b),
+    "clamp": _clamp,
+    "select_n": _select,
+    "sqrt": lambda e, _, x: e.b.sqrt(x),
+    "rsqrt": lambda e, _, x: e.b.div(_one(e, x), e.b.sqrt(x)),
+    "square": lambda e, _, x: e.b.mul(x, x),
+    "one_minus_square": lambda e, _, x: e.b.sub(_one(e, x), e.b.mul(x, x)),
+    "integer_pow": _power,
+    "pow": _pow,
+    "floor": _integral("floor", np.floor),
+    "ceil": _integral("ceil", np.ceil),
+    "round": _rounded,
+    "is_finite": lambda e, _, x: e.b.is_finite(x),
+    "convert_element_type": _convert,
+    "bitcast_convert_type": _bitcast,
+    "reduce_precision": _reduced_precision,
+    "copy": lambda e, _, x: x,
+    "copy_p": lambda e, _, x: x,
+    "stop_gradient": lambda e, _, x: x,
+    "real": lambda e, _, x: x,
+    "conj": lambda e, _, x: x,
+    "and": lambda e, _, a, b: e.b.logic("and", a, b),
+    "or": lambda e, _, a, b: e.b.logic("or", a, b),
+    "xor": lambda e, _, a, b: e.b.logic("xor", a, b),
+    "not": lambda e, _, x: e.b.invert(x),
+    "eq": _equal,
+    **{op: _compared(op) for op in ("ne", "lt", "le", "gt", "ge")},
+    **{
+        op: (lambda e, _, a, b, op=op: e.b.shift(op, a, b))
+        for op in ("shift_left", "shift_right_logical", "shift_right_arithmetic")
+    },
+    **{
+        name: _elementary(name)
+        for name in (
+            "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh",
+            "asinh", "acosh", "atanh", "exp", "exp2", "expm1", "log", "log1p", "log2", "cbrt",
+            "erf", "erfc", "logistic",
+        )
+    },
+}  # fmt: skip
+"""Applied number by number; an operand without axes goes with each number of the others."""

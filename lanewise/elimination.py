@@ -1,0 +1,86 @@
+"""Small dense linear systems, number by number."""
+
+from typing import TYPE_CHECKING, Any
+
+from .ir import Builder, Num, Unsupported
+from .values import MADE, Value
+
+if TYPE_CHECKING:
+    from .components import Evaluator
+
+
+_LARGEST_FACTOR = 8.0
+"""Of a row that is subtracted from another without an exchange."""
+
+
+def linear_solve(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+    """custom_linear_solve: what it solves with."""
+    lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
+    start = lengths.matvec + lengths.vecmat
+    consts = values[start : start + lengths.solve]
+    b = values[sum(lengths) :]
+    return e.closed(jaxprs.solve, [*consts, *b])
+
+
+def eliminate(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+    """A dense system, by elimination; rows are exchanged on trajectories that need it."""
+    b, (matrix, vector) = e.b, values
+    if matrix.size > MADE // 4:
+        raise Unsupported(f"a linear system with {vector.size} unknowns")
+    rows = [[*row, x] for row, x in zip(e.entries(matrix), e.entries(vector), strict=True)]
+    numbers = [x for row in rows for x in row]
+    vec = any(x.vec for x in numbers)
+    found, weak = solved(b, [list(r) for r in rows], exchange=False)
+    if weak.known is not None and not weak.known:
+        return [e.value(found, eqn.outvars[0].aval)]
+    if e.assumed is not None:
+        e.assumed.never(weak)
+        return [e.value([b.unrelated(x) for x in found], eqn.outvars[0].aval)]
+
+    def exchanged() -> list[Num]:
+        others = e.kernel.exchanged(numbers, vec)
+        return [b.select(weak, x, y) for x, y in zip(others, found, strict=True)]
+
+    n = len(found)
+    chosen = b.branch(b.any(weak), exchanged, lambda: found, [vec] * n, [vector.dtype] * n)
+    return [e.value(chosen, eqn.outvars[0].aval)]
+
+
+def solved(b: Builder, rows: list[list[Num]], exchange: bool) -> tuple[list[Num], Num]:
+    """The solution of the system with rows (A, b), zeros of the structure left out, and whether a
+    pivot was too small; with `exchange` by partial pivoting, where exchanges are selections."""
+    n, dtype, weak = len(rows), rows[0][0].dtype, b.known(False, "bool")
+    limit = b.known(_LARGEST_FACTOR, dtype)
+    for c in range(n):
+        for i in range(c + 1, n) if exchange else ():
+            larger = b.compare("gt", b.abs(rows[i][c]), b.abs(rows[c][c]))
+            for j in range(c, n + 1):
+                upper, lower = rows[c][j], rows[i][j]
+                rows[c][j] = b.select(larger, lower, upper)
+                rows[i][j] = b.select(larger, upper, lower)
+        one_over = b.div(b.known(1, dtype, structural=True), rows[c][c])
+        for i in range(c + 1, n):
+            if rows[i][c].is_known_as(0):
+                continue
+            factor = b.mul(rows[i][c], one_over)
+            # Not "larger than": NaN is weak too.
+            fine = b.compare("le", b.abs(factor), limit)
+            weak = b.logic("or", weak, b.invert(fine))
+            for j in range(c + 1, n + 1):
+                rows[i][j] = b.sub(rows[i][j], b.mul(factor, rows[c][j]))
+        rows[c][c] = one_over
+    x: list[Any] = [None] * n
+    for i in reversed(range(n)):
+        total = rows[i][n]
+        for j in range(i + 1, n):
+            total = b.sub(total, b.mul(rows[i][j], x[j]))
+        x[i] = b.mul(total, rows[i][i])
+    return x, weak
+
+
+def unit_vectors(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+    n, dtype = eqn.params["n"], str(eqn.params["dtype"])
+    numbers = [e.b.known(int(i == j), dtype, structural=True) for i in range(n) for j in range(n)]
+    value = e.value(numbers, eqn.outvars[0].aval)
+    value.is_tangent = True
+    return [value]

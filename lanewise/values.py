@@ -1,0 +1,87 @@
+"""Arrays while code is written: their numbers, or where they are in memory."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .ir import Num
+from .memory import Buffer
+
+Entries = Any
+"""An array of `Num`, with dtype object: the types of NumPy cannot say so."""
+
+
+SMALL = 128
+"""Arrays of up to so many elements are numbers of their own; larger ones stay in memory."""
+
+
+MADE = 4096
+"""Arrays made of numbers (a Jacobian) may have so many."""
+
+
+class Value:
+    """An array on every trajectory: its numbers, or where it is in memory."""
+
+    __slots__ = ("buffer", "dtype", "entries", "is_tangent", "shape")
+
+    def __init__(self, shape, dtype, entries=None, buffer: Buffer | None = None):
+        self.shape, self.dtype = tuple(shape), str(dtype)
+        self.entries: Entries | None = entries
+        self.buffer = buffer
+        self.is_tangent = False
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    @property
+    def is_small(self) -> bool:
+        return self.entries is not None or self.size <= SMALL
+
+    def has_lanes(self) -> bool:
+        if self.entries is not None:
+            return any(x.vec for x in self.entries.flat)
+        assert self.buffer is not None
+        moving = any(isinstance(x, Num) and x.vec for x in self.buffer.offset)
+        return self.buffer.lane is not None or moving
+
+    def known(self) -> np.ndarray | None:
+        """The numbers, if all of them are known now."""
+        if self.entries is None or any(x.known is None for x in self.entries.flat):
+            return None
+        out = np.empty(self.shape, self.dtype)
+        for i in np.ndindex(self.shape):
+            out[i] = self.entries[i].known
+        return out
+
+
+def objects(entries: Sequence[Any], shape: Sequence[int]) -> Entries:
+    """An object array of these entries, in row-major order."""
+    flat = np.empty(len(entries), object)
+    for i, entry in enumerate(entries):
+        flat[i] = entry
+    return flat.reshape(tuple(shape))
+
+
+class Kernel:
+    """What an evaluation needs of the function around it; see `machine`."""
+
+    def scratch(self, shape: Sequence[int], dtype: str, on: bool) -> Buffer:
+        raise NotImplementedError
+
+    def constant(self, array: np.ndarray) -> Buffer:
+        raise NotImplementedError
+
+    def parameter(self, value: int) -> Num:
+        raise NotImplementedError
+
+    def elementary(self, name: str, args: Sequence[Num]) -> Num:
+        raise NotImplementedError
+
+    def sincos(self, x: Num) -> tuple[Num, Num]:
+        raise NotImplementedError
+
+    def exchanged(self, numbers: Sequence[Num], vec: bool) -> list[Num]:
+        raise NotImplementedError
