@@ -1,7 +1,7 @@
 """Arrays in memory: operands, results, rows that a loop writes, all seen through strides."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -110,49 +110,75 @@ def _offset(b: Builder, buffer: Buffer, by: Num | int) -> tuple[Num, int]:
 
 def load(b: Builder, buffer: Buffer, by: Num | int = 0) -> Num:
     """The element at `by` elements from the start."""
-    t, item = TYPES[buffer.dtype], stored_type(buffer.dtype)
+    item = stored_type(buffer.dtype)
     moving, fixed = _offset(b, buffer, by)
-    fixed_num = b.known(fixed, "int64")
     if buffer.lane is None and not moving.vec:
-        at = b.ref(b.add(moving, fixed_num), 0, False)
-        where = b.new(f"getelementptr {item}, ptr {buffer.base[0]}, i64 {at}")
+        where = _moved(b, buffer.base[0], moving, fixed, item)
         return _from_memory(b, b.made([_load(b, item, where)], buffer.dtype, False))
     names = []
     for u in range(b.U):
-        names.append(_load_vector(b, buffer, u, moving, fixed, item, t))
+        if b.W > 1 and buffer.lane == 1 and not moving.vec:
+            where = _moved(b, buffer.base[u], moving, fixed, item)
+            names.append(_load(b, f"<{b.W} x {item}>", where, item))
+            continue
+        ones = [_load(b, item, at) for at in _pointers(b, buffer, u, moving, fixed, item)]
+        made = "poison" if b.W > 1 else ones[0]
+        for i in range(b.W if b.W > 1 else 0):
+            made = b.new(f"insertelement <{b.W} x {item}> {made}, {item} {ones[i]}, i64 {i}")
+        names.append(made)
     return _from_memory(b, b.made(names, buffer.dtype, True))
 
 
-def _load_vector(b: Builder, buffer: Buffer, u, moving: Num, fixed: int, item: str, t: str) -> str:
-    base = buffer.base[u if buffer.lane is not None else 0]
+def store(b: Builder, buffer: Buffer, x: Num, by: Num | int = 0) -> None:
+    """Write a number to `by` elements from the start."""
+    assert x.dtype == buffer.dtype, (x.dtype, buffer.dtype)
+    item = stored_type(buffer.dtype)
+    moving, fixed = _offset(b, buffer, by)
+    if buffer.lane is None:
+        if x.vec or moving.vec:
+            raise Unsupported("writing to an array that all trajectories share")
+        where = _moved(b, buffer.base[0], moving, fixed, item)
+        _store(b, item, _to_memory(b, x, 0, False), where)
+        return
     vector = f"<{b.W} x {item}>"
+    for u in range(b.U):
+        name = _to_memory(b, x, u, True)
+        if b.W > 1 and buffer.lane == 1 and not moving.vec:
+            _store(b, vector, name, _moved(b, buffer.base[u], moving, fixed, item), item)
+            continue
+        for i, at in enumerate(_pointers(b, buffer, u, moving, fixed, item)):
+            one = name
+            if b.W > 1:
+                one = b.new(f"extractelement {vector} {name}, i64 {i}")
+            _store(b, item, one, at)
+
+
+def _moved(b: Builder, base: str, moving: Num, fixed: int, item: str) -> str:
+    """A pointer moved by so many elements."""
+    where = base
+    if moving.known is None:
+        where = b.new(f"getelementptr {item}, ptr {where}, i64 {moving.names[0]}")
+    return b.new(f"getelementptr {item}, ptr {where}, i64 {fixed}") if fixed else where
+
+
+def _pointers(
+    b: Builder, buffer: Buffer, u: int, moving: Num, fixed: int, item: str
+) -> Iterator[str]:
+    """Where the element is, for each trajectory of vector u."""
+    base = buffer.base[u if buffer.lane is not None else 0]
     if not moving.vec:
         assert buffer.lane is not None  # else the number is the same on all trajectories
-        where = base
-        if moving.known is None:
-            where = b.new(f"getelementptr {item}, ptr {base}, i64 {moving.names[0]}")
-        if fixed:
-            where = b.new(f"getelementptr {item}, ptr {where}, i64 {fixed}")
-        if b.W == 1:
-            return _load(b, item, where)
-        if buffer.lane == 1:
-            return b.new(f"load {vector}, ptr {where}, align {_bytes(item)}")
-        made = "poison"
+        where = _moved(b, base, moving, fixed, item)
         for i in range(b.W):
-            at = _lane_pointer(b, where, i, buffer.lane, item)
-            one = _load(b, item, at)
-            made = b.new(f"insertelement {vector} {made}, {item} {one}, i64 {i}")
-        return made
-    made = "poison"
+            yield _lane_pointer(b, where, i, buffer.lane, item)
+        return
     index = b.ref(b.add(moving, b.known(fixed, "int64")), u, True)
-    if b.W == 1:
-        return _load(b, item, b.new(f"getelementptr {item}, ptr {base}, i64 {index}"))
     for i in range(b.W):
-        one = b.new(f"extractelement <{b.W} x i64> {index}, i64 {i}")
+        one = index
+        if b.W > 1:
+            one = b.new(f"extractelement <{b.W} x i64> {index}, i64 {i}")
         at = base if buffer.lane is None else _lane_pointer(b, base, i, buffer.lane, item)
-        at = b.new(f"getelementptr {item}, ptr {at}, i64 {one}")
-        made = b.new(f"insertelement {vector} {made}, {item} {_load(b, item, at)}, i64 {i}")
-    return made
+        yield b.new(f"getelementptr {item}, ptr {at}, i64 {one}")
 
 
 def _lane_pointer(b: Builder, base: str, i: int, lane: int | str, item: str) -> str:
@@ -168,8 +194,12 @@ def _lane_pointer(b: Builder, base: str, i: int, lane: int | str, item: str) -> 
     return b.new(f"getelementptr {item}, ptr {base}, i64 {by}")
 
 
-def _load(b: Builder, item: str, where: str) -> str:
-    return b.new(f"load {item}, ptr {where}, align {_bytes(item)}")
+def _load(b: Builder, what: str, where: str, item: str = "") -> str:
+    return b.new(f"load {what}, ptr {where}, align {_bytes(item or what)}")
+
+
+def _store(b: Builder, what: str, name: str, where: str, item: str = "") -> None:
+    b.emit(f"store {what} {name}, ptr {where}, align {_bytes(item or what)}")
 
 
 def _bytes(item: str) -> int:
@@ -185,52 +215,12 @@ def _from_memory(b: Builder, x: Num) -> Num:
     return b.made([b.new(f"icmp ne {t} {n}, {zero}") for n in x.names], "bool", x.vec)
 
 
-def store(b: Builder, buffer: Buffer, x: Num, by: Num | int = 0) -> None:
-    """Write a number to `by` elements from the start."""
-    assert x.dtype == buffer.dtype, (x.dtype, buffer.dtype)
-    item = stored_type(buffer.dtype)
-    moving, fixed = _offset(b, buffer, by)
-    if buffer.lane is None:
-        if x.vec or moving.vec:
-            raise Unsupported("writing to an array that all trajectories share")
-        name, at = b.ref(x, 0, False), b.ref(b.add(moving, b.known(fixed, "int64")), 0, False)
-        if x.dtype == "bool":
-            name = b.new(f"zext i1 {name} to i8")
-        where = b.new(f"getelementptr {item}, ptr {buffer.base[0]}, i64 {at}")
-        b.emit(f"store {item} {name}, ptr {where}, align {_bytes(item)}")
-        return
-    vector = f"<{b.W} x {item}>"
-    for u in range(b.U):
-        name = b.ref(x, u, True)
-        if x.dtype == "bool":
-            t = b.type("bool", True)
-            name = b.new(f"zext {t} {name} to {vector if b.W > 1 else item}")
-        base = buffer.base[u]
-        if moving.vec:
-            index = b.ref(b.add(moving, b.known(fixed, "int64")), u, True)
-            for i in range(b.W):
-                one, value = index, name
-                if b.W > 1:
-                    one = b.new(f"extractelement <{b.W} x i64> {index}, i64 {i}")
-                    value = b.new(f"extractelement {vector} {name}, i64 {i}")
-                at = _lane_pointer(b, base, i, buffer.lane, item)
-                at = b.new(f"getelementptr {item}, ptr {at}, i64 {one}")
-                b.emit(f"store {item} {value}, ptr {at}, align {_bytes(item)}")
-            continue
-        where = base
-        if moving.known is None:
-            where = b.new(f"getelementptr {item}, ptr {base}, i64 {moving.names[0]}")
-        if fixed:
-            where = b.new(f"getelementptr {item}, ptr {where}, i64 {fixed}")
-        if b.W == 1:
-            b.emit(f"store {item} {name}, ptr {where}, align {_bytes(item)}")
-        elif buffer.lane == 1:
-            b.emit(f"store {vector} {name}, ptr {where}, align {_bytes(item)}")
-        else:
-            for i in range(b.W):
-                value = b.new(f"extractelement {vector} {name}, i64 {i}")
-                at = _lane_pointer(b, where, i, buffer.lane, item)
-                b.emit(f"store {item} {value}, ptr {at}, align {_bytes(item)}")
+def _to_memory(b: Builder, x: Num, u: int, vec: bool) -> str:
+    name = b.ref(x, u, vec)
+    if x.dtype != "bool":
+        return name
+    wide = f"<{b.W} x i8>" if vec and b.W > 1 else "i8"
+    return b.new(f"zext {b.type('bool', vec)} {name} to {wide}")
 
 
 # --- whole rows: the numbers of a trajectory are neighbours, those of a vector are not ------------
