@@ -97,7 +97,11 @@ def test_evaluations_are_counted_as_they_are_made(bench, problem, method):
     _, _, iterations, good = jax.block_until_ready(run.function(0.1, num_steps // bench.PIECE))
     assert bool(good)
     made = len(halves) / 2
-    assert made == num_steps * price.of_step + int(iterations) * price.of_iteration
+    # Of the three residuals of an iteration the last is evaluated where it is needed.
+    least, most = (int(iterations) * price.of_iteration * part for part in (2 / 3, 1))
+    assert least <= made - num_steps * price.of_step <= most
+    if int(iterations) == 0:
+        assert made == num_steps * price.of_step
     assert made >= num_steps
 
 
