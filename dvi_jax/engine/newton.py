@@ -119,7 +119,8 @@ class Newton(RootSolver):
             second = lanewise.solve(jacobian, F(x))
             before, worst = _largest_of(jnp.abs(first)), _largest_of(jnp.abs(second))
             scale = _larger(known, jnp.abs(x))
-            left = worst * worst > eps / 16 * before * _least_of(scale)
+            shrinks = worst < before
+            left = shrinks & (worst * worst > eps / 16 * before * _least_of(scale))
 
             def another():
                 nearer = jnp.where(left, x - second, x)
