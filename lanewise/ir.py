@@ -285,7 +285,8 @@ class Builder:
         else:
             return None
         two = _is_power_of_two(c.known) or _is_power_of_two(d.known)
-        both = np.asarray(c.known * d.known, x.dtype)
+        with np.errstate(all="ignore"):
+            both = np.asarray(c.known * d.known, x.dtype)
         normal = np.finfo(x.dtype).tiny <= abs(both) < np.inf
         # A subnormal d·y would have lost digits, which (c·d)·y has.
         return (self.known(both, x.dtype), y) if two and normal else None

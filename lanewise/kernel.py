@@ -237,7 +237,7 @@ class Module(Kernel):
         return (
             "\n".join(self.globals) + "\n" + declared + "\n" + functions
             + "\ndefine internal void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, "
-            + "i64 %first, i64 %last) alignstack(64) {\nentry:\n" + body + "\n}\n"
+            + "i64 %first, i64 %last) alignstack(64) align 64 {\nentry:\n" + body + "\n}\n"
         )  # fmt: skip
 
     def _lane_stride(self, aval: Any) -> int | str:
