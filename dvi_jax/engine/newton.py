@@ -72,7 +72,7 @@ def check_settings(rtol: float | None, atol: float, max_steps: int) -> None:
 
 class Newton(RootSolver):
     """Newton's method with several corrections for each Jacobian J = ∂F/∂x(x), which autodiff
-    gives: two, and a third where two are not enough,
+    gives: two, and a third where two are not enough (up to 16 unknowns),
 
         x ← x − J⁻¹ F(x),    x ← x − J⁻¹ F(x),    (x ← x − J⁻¹ F(x)).
 
@@ -127,8 +127,10 @@ class Newton(RootSolver):
                 last = jnp.where(left, lanewise.solve(jacobian, F(nearer)), second)
                 return nearer, last, jnp.where(left, worst, before)
 
-            asked = lanewise.on_any(left, rare=x0.size > _FIRST_APART)
-            x, last, before = lax.cond(asked, another, lambda: (x, second, before))
+            last = second
+            if x0.size <= _THIRD_UP_TO:
+                asked = lanewise.on_any(left, rare=x0.size > _FIRST_APART)
+                x, last, before = lax.cond(asked, another, lambda: (x, second, before))
             worst = _largest_of(jnp.abs(last))
             x = jnp.where(worst > before, x, x - last)
             return x, jnp.abs(last), _larger(known, jnp.abs(x)), before, worst
@@ -177,6 +179,10 @@ class Newton(RootSolver):
 
 _FIRST_APART = 4
 """Unknowns up to which the first turn of Newton's loop is written out in front of it."""
+
+
+_THIRD_UP_TO = 16
+"""Unknowns up to which a third correction is made; of larger systems a second Jacobian is rare."""
 
 
 class Known(eqx.Module):
