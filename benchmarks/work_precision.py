@@ -19,9 +19,9 @@ the force W where there is one:
     RungeKutta4                   4
 
 with n the dimension of q and w = JACOBIAN_WEIGHT what one column of a Jacobian costs at one point,
-in evaluations. An iteration is a Jacobian and the three residuals that are corrected by it, of which
-the last is not needed at every step, so that the number is an upper bound; how many iterations
-there are is what Newton's method reports, not an assumption.
+in evaluations. An iteration is a Jacobian and the three residuals that are corrected by it. Not
+every step needs the last one, so that the number is an upper bound. How many iterations there are
+is what Newton's method reports, not an assumption.
 
 Kicks that meet between two parts are counted twice, as they are computed.
 

@@ -327,7 +327,7 @@ def test_rounds_without_rare_branches(left, monkeypatch, longest):
     """The same bits with rounds that are run on assumptions and without; XLA's to round-off."""
     monkeypatch.setattr(lanewise.assumed, "_LONGEST", longest)
     x = np.linspace(-2.0, 2.0, 37)
-    found = jax.tree.leaves(jax.jit(lanewise.batched(lambda x: looping(x)))(x))
+    found = jax.tree.leaves(jax.jit(lanewise.batched(looping))(x))
     (part,) = lanewise.explain(looping, 1.0).parts
     assert ("store volatile" in part.ir) == (longest > 0)
     _SEEN_BITS.append([np.asarray(a) for a in found])
