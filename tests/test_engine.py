@@ -9,6 +9,7 @@ from hypothesis import given, settings, strategies as st
 import lanewise
 from dvi_jax.engine.newton import Newton, find_root
 from lanewise.dependence import depends_on
+from lanewise.jaxapi import linear_map
 from lanewise.linear import WRITTEN_OUT
 
 SOLVE = {
@@ -164,3 +165,68 @@ def test_newton_refuses_settings_that_cannot_work(bad):
 def test_dependence(function, expected):
     x = jnp.ones(2)
     assert depends_on(function, 1, x, x) is expected
+
+
+# --- a linear map with a transpose of its own ------------------------------------------------
+
+
+def _scaled(residuals, x):
+    a, _ = residuals
+    return {"y": jnp.sin(a) * jnp.stack([x[0] + 2 * x[1], 3 * x[0], x[1]])}
+
+
+def _scaled_back(residuals, y):
+    a, marks = residuals
+    marks.append("transpose")
+    u, v, w = y["y"]
+    return jnp.sin(a) * jnp.stack([u + 3 * v, 2 * u + w])
+
+
+def _mapped(a, x, marks, definition=_scaled):
+    def pull(residuals, y):
+        return _scaled_back((residuals[0], marks), y)
+
+    def push(residuals, x):
+        return lanewise.call(_scaled, residuals, x)
+
+    return linear_map(push, pull, definition, (a, jnp.asarray(0)), x)
+
+
+def test_a_linear_map_goes_by_its_own_transpose():
+    """Forward, reverse, second derivatives, batched or not; against the map itself."""
+    x, w = jnp.array([0.3, -1.2]), jnp.array([1.0, -2.0, 0.5])
+    marks: list = []
+
+    def ours(a, x):
+        return w @ _mapped(a, x, marks)["y"] ** 2
+
+    def plain(a, x):
+        return w @ _scaled((a, None), x)["y"] ** 2
+
+    a = jnp.array([0.7, 1.1, -0.4])
+    for derivative in (
+        lambda f: f,
+        lambda f: jax.grad(f, 1),
+        lambda f: jax.grad(f, 0),
+        lambda f: jax.jacfwd(f, 1),
+        lambda f: jax.hessian(f, 1),
+        lambda f: jax.jacfwd(jax.grad(f, 1), 0),
+        lambda f: jax.jacrev(jax.grad(f, 0), 1),
+    ):
+        found, expected = derivative(ours), derivative(plain)
+        np.testing.assert_allclose(found(a[0], x), expected(a[0], x), rtol=1e-13)
+        for axes, args in (((0, None), (a, x)), ((0, 0), (a, jnp.outer(a, x)))):
+            np.testing.assert_allclose(
+                jax.vmap(found, axes)(*args), jax.vmap(expected, axes)(*args), rtol=1e-13
+            )
+    assert marks  # the transpose that was given is the one that is used
+
+
+def test_derivatives_of_a_linear_map_are_those_of_its_definition():
+    """By the residuals; negative control: a definition with another dependence on them."""
+
+    def of(definition):
+        return jax.grad(lambda a: jnp.sum(_mapped(a, jnp.ones(2), [], definition)["y"]))(0.7)
+
+    np.testing.assert_allclose(of(_scaled), np.cos(0.7) * 7, rtol=1e-13)
+    assert abs(float(of(lambda r, x: _scaled((2 * r[0], None), x))) - np.cos(0.7) * 7) > 0.1

@@ -10,6 +10,7 @@ import pytest
 from helpers import METHODS, SYSTEMS, non_separable
 
 import dvi_jax as dvi
+from dvi_jax import _rollout
 
 
 def H(t0, t1, q0, p1, args):
@@ -491,3 +492,32 @@ def test_failure_on_a_given_lattice_names_the_step_size_there():
 def test_epsilon_without_a_disturbance_is_pointed_out():
     with pytest.warns(UserWarning, match="no effect"):
         dvi.integrate(NON_SEPARABLE, [0.1], [0.1], h=0.1, num_steps=1, epsilon=0.5)
+
+
+def test_the_step_is_traced_once(monkeypatch):
+    """For a forward run and for its gradient; H_D once for its shape and once for each half."""
+    taken, asked = [], []
+    original = _rollout.take_step
+    monkeypatch.setattr(_rollout, "take_step", lambda *args: taken.append(1) or original(*args))
+
+    def H_D(t0, t1, q0, p1, args):
+        asked.append(1)
+        return jnp.sum((q0**2 + 1) * (p1**2 + 1)) / 2
+
+    system = dvi.System(H_D)
+
+    def end(q, p):
+        return dvi.integrate(system, q, p, h=0.1, num_steps=10, throw=False).qs[-1].sum()
+
+    q = jnp.linspace(0.1, 0.4, 4)[:, None]
+    jax.jit(jax.vmap(end))(q, q)
+    assert len(taken) == 1
+    assert len(asked) == 3
+    jax.jit(jax.vmap(jax.grad(end)))(q, q)
+    assert len(taken) == 2
+    assert len(asked) <= 5
+    before = len(asked)
+    for _ in range(3):  # alone, and again: the run is compiled once, and H_D is not asked again
+        dvi.integrate(system, q[0], q[0], h=0.1, num_steps=10)
+    assert len(asked) <= before + 2
+    assert len(taken) <= 3
