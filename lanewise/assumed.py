@@ -1,4 +1,4 @@
-"""Rounds of a loop run on the assumption that no branch is taken that is rarely needed.
+"""Loops that are first run on the assumption that no rare branch is needed.
 
 A step that looks every time whether something has failed spends much of its time on looking. So
 some steps are run without: what would have been looked at is collected, and where one trajectory of
@@ -19,8 +19,8 @@ class NotAssumable(Exception):
 
 
 def taken_for(b: Builder, value: int, dtype: str) -> Num:
-    """A number with a value that is known, where branches by it are treated as if it were not: what
-    comes out of them is a number like others."""
+    """A number whose value decides a branch while the code is written. The results of that branch
+    are marked as results of a branch, so that they have the same bits as in the full version."""
     return b.made([str(int(value))], dtype, False, "taken for", (b.known(value, dtype),))
 
 
@@ -41,7 +41,7 @@ def taken_value(x: Num) -> Any:
 
 
 class Assumed:
-    """What the rounds of a loop take for granted, while the code of one round is written."""
+    """The assumptions of a loop, collected while the code of one round is written."""
 
     def __init__(self, b: Builder):
         self.b = b
@@ -80,8 +80,11 @@ class Assumed:
         return taken_for(self.b, max(yes.known, no.known), x.dtype)
 
     def leave_to_the_end(self, before: Sequence[Num], after: Sequence[Num]) -> None:
-        """Find out which numbers `after` a round, where they are finite, show that those which must
-        be, and the numbers themselves `before` the round, were finite in all rounds."""
+        """Find numbers that need a check after the last round only.
+
+        If such a number is finite after a round, then so are all numbers that must be finite in
+        that round, and the number itself before it. By induction this covers all rounds.
+        """
         b, terms = self.b, frozenset(x.serial for x in self.finite)
         if not terms:
             return
@@ -114,7 +117,7 @@ class Assumed:
         return b.logic("or", before, b.made([b.any(total)], "bool", False))
 
     def wrong_at_the_end(self, before: Num, numbers: Sequence[Num]) -> Num:
-        """The same after all rounds."""
+        """The same after the last round, with the checks that were left to it."""
         b = self.b
         for dtype in ("float32", "float64"):
             some = [numbers[i] for i in self.at_the_end if numbers[i].dtype == dtype]
@@ -125,12 +128,11 @@ class Assumed:
 
 
 _LONGEST = 300
-"""Operations of a round up to which it is written twice."""
+"""A round with more operations is written once, with all branches."""
 
 
 def may_assume(jaxpr: Jaxpr) -> bool:
-    """Whether a round of a loop asks by itself, not in a loop of its own, what all trajectories
-    agree on, and is short."""
+    """Whether a round of a loop is short and calls `on_any` outside of inner loops."""
     return _asks(jaxpr) and operation_count(jaxpr) <= _LONGEST
 
 

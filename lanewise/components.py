@@ -125,7 +125,7 @@ class Evaluator:
         return [self.closed_off(v) for v in outs]
 
     def unrelated(self, value: Value) -> Value:
-        """The same numbers, as they come out of a loop or a branch."""
+        """The same numbers, treated as results of a loop or a branch."""
         new = [self.b.unrelated(x) for x in self.entries(value).flat]
         return Value(value.shape, value.dtype, objects(new, value.shape))
 
@@ -363,7 +363,7 @@ class Evaluator:
 
     @contextlib.contextmanager
     def assuming(self, assumed: Any):
-        """Take branches that are rarely needed for not needed, and note that in `assumed`."""
+        """Write code that assumes that no rare branch is needed; `assumed` collects what for."""
         before, self.assumed = self.assumed, assumed
         try:
             yield assumed
@@ -377,7 +377,7 @@ class Evaluator:
             return [self.value([self.assumed.least(x)], eqn.outvars[0].aval)]
         if not x.vec:
             return values
-        if not eqn.params["rare"]:  # one of so many will need it
+        if not eqn.params["rare"]:  # one of several trajectories nearly always needs it
             return [self.value([taken_for(b, 0, x.dtype)], eqn.outvars[0].aval)]
         t, full = b.type(x.dtype, True), b.suffix(x.dtype, True)
         total = x.names[0]

@@ -142,7 +142,7 @@ class Builder:
         return found
 
     def unrelated(self, x: Num) -> Num:
-        """The number as it would come out of a loop: also a constant is a number like others."""
+        """The number treated as a result of a loop: not even a constant is known any more."""
         if x.known is None or not x.is_float:
             return self.opaque(x)
         return self.made([literal(x.known, x.dtype)], x.dtype, False)
@@ -522,8 +522,8 @@ class Builder:
     def all_finite(self, terms: Sequence[Num], known: int = 1) -> Num:
         """Whether all numbers, of one type, are finite: whether Σ 0·x is not NaN.
 
-        Those are left out whose infinities and NaN would be seen in another of them, as long as
-        there are few; among the first `known` there are none such.
+        A number is left out if another one cannot be finite without it. The first `known` numbers
+        are not compared with each other.
         """
         terms = list({x.serial: x for x in terms}.values())
         needed = terms if len(terms) > _FEW else terms[:known]
@@ -815,7 +815,7 @@ _DEEPEST, _MOST_SEEN = 50, 300
 """How far operations are followed back."""
 
 _FEW = 12
-"""Numbers among which those are looked for that others show to be finite."""
+"""With more numbers than this each of them is checked."""
 
 _COMPARISONS: dict[str, Callable] = {
     "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal,

@@ -77,7 +77,18 @@ def on_any(x: Array, rare: bool = True) -> Array:
     It may decide what is computed, as a branch that most trajectories do not need, never what a
     trajectory's result is: that must not depend on its neighbours. Where it is `rare` that the
     answer is yes, steps are first run as if it were no, and repeated where it was not.
+
+    **Raises** `TypeError` unless `x` is one truth value, of one trajectory, and `rare` True or
+    False.
     """
+    kind = jnp.asarray(x)
+    if kind.dtype != bool or kind.shape != ():
+        raise TypeError(
+            f"on_any takes one truth value of one trajectory, got {kind.dtype} of shape "
+            f"{kind.shape}: write jnp.any(...) around a comparison."
+        )
+    if not isinstance(rare, bool):
+        raise TypeError(f"rare must be True or False, got {rare!r}.")
     return _least.bind(jnp.where(x, jnp.int32(0), jnp.int32(1)), rare=rare) == 0
 
 

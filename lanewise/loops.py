@@ -301,7 +301,7 @@ def _on_assumptions(
             lambda: [b.known(True, "bool"), *numbers],
             all_vec, dtypes,
         )  # fmt: skip
-        # Numbers that change wait in memory: registers are for the rounds.
+        # Numbers that change are stored in memory, so that the rounds have all registers.
         kept = zip(changed, numbers, aside, vec, strict=True)
         b.lines[before_all:before_all] = [
             line for c, x, to, v in kept if c for line in b.set_aside(x, to, v)
@@ -313,7 +313,7 @@ def _on_assumptions(
             return _rounds(e, old, vec, start, stop, round_of)
 
         found = b.branch(b.ref(failed, 0, False), again, lambda: found, vec, dtypes[1:])
-        # After a failure more rounds each time are run with all branches.
+        # After each failure a larger number of rounds is run with all branches.
         has_failed = b.logic("and", tried, failed)
         until = b.select(has_failed, b.add(stop, wait), until)
         wait = b.select(has_failed, b.add(b.add(wait, wait), size), wait)

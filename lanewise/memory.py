@@ -48,7 +48,7 @@ class Buffer:
         )
 
     def from_row(self, b: Builder, index: Num) -> "Buffer":
-        """``self[index:]``, of which the first axis keeps its name only."""
+        """The array from row `index` on; the length of its first axis is not adjusted."""
         return self.moved(b.mul(index, b.known(self.strides[0], "int64")))
 
     def reshaped(self, shape: Sequence[int]) -> "Buffer | None":

@@ -230,3 +230,11 @@ def test_derivatives_of_a_linear_map_are_those_of_its_definition():
 
     np.testing.assert_allclose(of(_scaled), np.cos(0.7) * 7, rtol=1e-13)
     assert abs(float(of(lambda r, x: _scaled((2 * r[0], None), x))) - np.cos(0.7) * 7) > 0.1
+
+
+def test_what_on_any_takes():
+    with pytest.raises(TypeError, match="one truth value"):
+        lanewise.on_any(jnp.array([1.5, 2.0]))
+    with pytest.raises(TypeError, match="rare"):
+        lanewise.on_any(jnp.asarray(True), rare="often")  # pyright: ignore[reportArgumentType]
+    assert bool(lanewise.on_any(jnp.asarray(True)))
