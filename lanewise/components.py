@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from . import elimination, indexing, loops
@@ -16,6 +17,7 @@ from .jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies
 from .memory import Buffer, load, load_row, store, store_row
 from .rules import CALLS, CUMULATIVE, MOVES, REDUCTIONS, VIEWS
 from .values import MADE, SMALL, Entries, Kernel, Value, objects
+from .written import WRITTEN
 
 MOST_OPERATIONS = 60_000
 """More operations than this are left to XLA, loops counted once."""
@@ -113,6 +115,10 @@ class Evaluator:
         rule = ELEMENTWISE.get(name)
         if rule is not None:
             return [self._elementwise(eqn, values, rule)]
+        written = WRITTEN.get(name)
+        if written is not None:
+            body = jax.make_jaxpr(functools.partial(written, **eqn.params))
+            return self.closed(body(*(v.aval for v in eqn.invars)), values)
         raise Unsupported(f"the primitive {name}")
 
     def by_itself(self, eqn: Any, values: list[Value]) -> list[Value]:

@@ -12,7 +12,7 @@ from . import handler, machine
 from .extent import functions_in
 from .ir import Unsupported
 from .jaxapi import jaxprs_in_params
-from .primitive import AUTO, Layout, kernel_of, program_of
+from .primitive import AUTO, Layout, kernel_of, pieces_of, program_of, program_of_jaxpr
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """What `explain` found: one `Part` for each call of machine code or its substitute."""
+    """What `explain` found: one `Part` for each piece that is compiled by itself."""
 
     parts: tuple[Part, ...]
 
@@ -93,7 +93,7 @@ def explain(
     programs = _calls(closed.jaxpr)
     if not programs:
         programs = [program_of(flat, leaves, layout)]
-    return Explanation(tuple(_part(program, batch) for program in programs))
+    return Explanation(tuple(part for program in programs for part in _parts(program, batch)))
 
 
 def _calls(jaxpr: Any) -> list[Any]:
@@ -108,13 +108,24 @@ def _calls(jaxpr: Any) -> list[Any]:
     return found
 
 
-def _part(program: Any, batch: int) -> Part:
+def _parts(program: Any, batch: int) -> list[Part]:
+    """What becomes of a program; its pieces where it is not compiled as a whole."""
     count = len(program.traced.all_inputs.jaxpr.invars)
     try:
         module, text = kernel_of(program, [True] * count, batch)
     except Unsupported as reason:
-        return Part(reason=str(reason))
+        found = pieces_of(program, batch)
+        if not any(piece.reason is None or piece.is_call for piece in found):
+            return [Part(reason=str(reason))]
+        return [part for piece in found for part in _of_piece(piece, program.layout, batch)]
     ir = handler.module_text(text, module.W * module.U)
     assembly = machine.assembly(ir)
     spills = len(re.findall(r"\bv?mov[a-z0-9]*\s+.*\((?:%rsp|sp)\)", assembly))
-    return Part(None, module.b.operations, module.W, module.U, module.scratch_bytes, spills, ir)
+    part = Part(None, module.b.operations, module.W, module.U, module.scratch_bytes, spills, ir)
+    return [part]
+
+
+def _of_piece(piece: Any, layout: Layout, batch: int) -> list[Part]:
+    if piece.reason is not None and not piece.is_call:
+        return [Part(reason=piece.reason)]
+    return _parts(program_of_jaxpr(piece.closed, layout), batch)

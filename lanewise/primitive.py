@@ -1,6 +1,5 @@
 """The primitive: a function of one trajectory, whose batch under `vmap` becomes machine code."""
 
-import copy
 import dataclasses
 import functools
 import os
@@ -26,6 +25,7 @@ from .jaxapi import (
     without_outputs,
 )
 from .kernel import Module
+from .pieces import Piece, in_pieces, pieces
 
 FORMS = ("auto", "components", "arrays", "kernel")
 
@@ -83,7 +83,7 @@ def call(function: Callable, *args: Any, layout: Layout = AUTO) -> Any:
     too.
     """
     leaves, tree = jax.tree.flatten(args)
-    traced = _Traced(function, leaves, tree)
+    traced = _Traced.of(function, leaves, tree)
     program = _Program(traced, layout)
     # What is traced outside and closed over is an input like the others.
     outer = traced.outer
@@ -184,10 +184,16 @@ _lanes_in_front = identity(
 )
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class _Traced:
-    """A function of one trajectory as a jaxpr, what it closes over as its first operands."""
+    """A function of one trajectory as a jaxpr; the values of a trace outside that it closes over
+    (`outer`) are its first operands."""
 
-    def __init__(self, function: Callable, leaves: Sequence[Any], tree: Any):
+    closed: ClosedJaxpr
+    out_tree: Any = None
+
+    @classmethod
+    def of(cls, function: Callable, leaves: Sequence[Any], tree: Any) -> "_Traced":
         trees: list[Any] = []
 
         def flat(*leaves):
@@ -195,9 +201,11 @@ class _Traced:
             trees.append(out_tree)
             return out
 
-        self.closed = jax.make_jaxpr(flat)(*leaves)
-        self.out_tree = trees[-1]
-        self.outer = [c for c in self.closed.consts if is_traced(c)]
+        return cls(jax.make_jaxpr(flat)(*leaves), trees[-1])
+
+    @functools.cached_property
+    def outer(self) -> list[Any]:
+        return [c for c in self.closed.consts if is_traced(c)]
 
     def __call__(self, *operands: Any) -> list[Any]:
         outer = iter(operands[: len(self.outer)])
@@ -207,11 +215,9 @@ class _Traced:
 
     def giving(self, used: list[bool]) -> "_Traced":
         """The function that gives some of the outputs only, as a flat list."""
-        fewer = copy.copy(self)
-        fewer.closed = without_outputs(self.closed, used)
-        return fewer
+        return _Traced(without_outputs(self.closed, used))
 
-    @property
+    @functools.cached_property
     def all_inputs(self) -> ClosedJaxpr:
         """The jaxpr with what is closed over and traced in front of its inputs."""
         jaxpr, consts = self.closed.jaxpr, self.closed.consts
@@ -239,9 +245,14 @@ class _Program:
         return _Program(self.traced.giving(used), self.layout)
 
 
+def program_of_jaxpr(closed: ClosedJaxpr, layout: Layout) -> _Program:
+    """The program of a jaxpr that closes over nothing that is traced."""
+    return _Program(_Traced(closed), layout)
+
+
 def program_of(function: Callable, leaves: Sequence[Any], layout: Layout) -> _Program:
     """The program of a function of arrays, as `call` makes it."""
-    return _Program(_Traced(function, leaves, jax.tree.structure(tuple(leaves))), layout)
+    return _Program(_Traced.of(function, leaves, jax.tree.structure(tuple(leaves))), layout)
 
 
 def _through_xla(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]):
@@ -259,11 +270,37 @@ def _on_cpu(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...
     except Unsupported as reason:
         if os.environ.get("LANEWISE_LOG"):
             print("left to XLA:", reason, flush=True)
-        return _through_xla(*operands, program=program, lanes=lanes, on=on)
+        found = pieces_of(program, lanes or 1) if lanes != 0 else []
+        if not any(piece.reason is None or piece.is_call for piece in found):
+            return _through_xla(*operands, program=program, lanes=lanes, on=on)
+
+        def run(piece: Piece, *arrays: Any, on: tuple[bool, ...]) -> list[Any]:
+            part = program_of_jaxpr(piece.closed, program.layout)
+            to_xla = piece.reason is not None and not piece.is_call
+            compute = _through_xla if to_xla else _lanewise.bind
+            return compute(*arrays, program=part, lanes=lanes, on=on)
+
+        return in_pieces(found, program.traced.all_inputs, operands, lanes, on, run)
     front = () if lanes is None else (lanes,)
     avals = program.traced.closed.out_avals
     like = [jax.ShapeDtypeStruct((*front, *a.shape), a.dtype) for a in avals]
     return list(jax.ffi.ffi_call(name, like)(*operands, params=params))
+
+
+def pieces_of(program: _Program, lanes: int) -> list[Piece]:
+    """What becomes of a program for which no code is generated as a whole."""
+    if program.layout.form == "arrays" or not generates():
+        return []
+
+    def reason(closed: ClosedJaxpr) -> str | None:
+        try:
+            part = program_of_jaxpr(closed, program.layout)
+            kernel_of(part, [True] * len(closed.jaxpr.invars), lanes)
+        except Unsupported as why:
+            return str(why)
+        return None
+
+    return pieces(program.traced.all_inputs, reason)
 
 
 def compiled(

@@ -18,7 +18,7 @@ from jax import export, lax
 
 import dvi_jax as dvi
 import lanewise
-from lanewise import cache, components, handler, machine, primitive
+from lanewise import assumed, cache, components, handler, machine, primitive
 from lanewise.kernel import Module
 
 RNG = np.random.default_rng(0)
@@ -325,7 +325,7 @@ def looping(x):
 @pytest.mark.parametrize("longest", [0, 300])
 def test_rounds_without_rare_branches(left, monkeypatch, longest):
     """The same bits with rounds that are run on assumptions and without; XLA's to round-off."""
-    monkeypatch.setattr(lanewise.assumed, "_LONGEST", longest)
+    monkeypatch.setattr(assumed, "_LONGEST", longest)
     x = np.linspace(-2.0, 2.0, 37)
     found = jax.tree.leaves(jax.jit(lanewise.batched(looping))(x))
     (part,) = lanewise.explain(looping, 1.0).parts
@@ -673,8 +673,63 @@ def a_root(x):
     return lax.custom_root(lambda y: y**3 - x, x, newton, lambda g, y: y / g(1.0))
 
 
+def tables(x):
+    """Look-ups in a table, at its nodes and outside too."""
+    nodes = np.array([-1.0, 0.0, 0.5, 2.0])
+    return (
+        jnp.interp(x, nodes, nodes**2),
+        jnp.interp(x, nodes, nodes**2, left=-7.0, right=7.0),
+        jnp.searchsorted(nodes, x),
+        jnp.searchsorted(nodes, x, side="right"),
+        jnp.digitize(x, nodes),
+    )
+
+
+def orders(x):
+    """Ties, zeros of both signs, NaN and infinities among what is sorted."""
+    row = jnp.stack([x, -x, x / 2, x * 0, jnp.abs(x), jnp.ones(())])
+    whole = jnp.round(row).astype(jnp.int32)
+    return (
+        jnp.sort(row),
+        jnp.argsort(row),
+        jnp.sort(row, descending=True),
+        jnp.argsort(whole, stable=True),
+        jnp.lexsort((row, whole)),
+        jnp.median(row),
+    )
+
+
+def neighbours(x):
+    return [jnp.nextafter(x, y) for y in (0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan, x)]
+
+
+def small_systems(m):
+    """Factors and solutions of small systems, exchanges of rows included."""
+    positive = m @ m.T + jnp.eye(3)
+    return (
+        jnp.linalg.inv(m),
+        jnp.linalg.solve(m, m[0]),
+        jnp.linalg.solve(m.T, m),
+        jax.scipy.linalg.lu_factor(m),
+        jnp.linalg.cholesky(positive),
+        jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(positive), True), m[1]),
+        jax.scipy.linalg.solve_triangular(m, m[2], trans=1, unit_diagonal=True),
+        jax.grad(lambda y: jnp.linalg.solve(y, y[0] ** 2).sum())(m),
+        jnp.linalg.slogdet(m),
+    )
+
+
 MATRICES = RNG.normal(size=(9, 3, 3))
 FUNCTIONS = {
+    "tables": (tables, VALUES),
+    "orders": (orders, VALUES),
+    "neighbours": (neighbours, VALUES),
+    "small systems": (small_systems, MATRICES),
+    "zeros as pivots": (small_systems, np.array([np.eye(3)[[1, 2, 0]], np.eye(3)[[2, 1, 0]]])),
+    "determinant of four": (
+        lambda m: jax.value_and_grad(jnp.linalg.det)(jnp.pad(m, (0, 1)) + jnp.eye(4)),
+        MATRICES,
+    ),
     "a derivative's rule": (jax.grad(with_a_rule), VALUES),
     "late to vary": (late_to_vary, VALUES),
     "same number of rounds": (same_number_of_rounds, VALUES),
@@ -735,7 +790,7 @@ def test_no_warning_from_constants():
 
 def test_code_stays_short_for_arrays():
     leaves, tree = jax.tree.flatten((1.0,))
-    traced = primitive._Traced(lambda x: jnp.full((128,), x), leaves, tree)
+    traced = primitive._Traced.of(lambda x: jnp.full((128,), x), leaves, tree)
     program = primitive._Program(traced, lanewise.Layout())
     _, text = primitive.kernel_of(program, [True], 64)
     blocks = text.split(":\n")
@@ -814,7 +869,7 @@ def test_an_exchange_of_rows_on_one_trajectory(left, n):
 
 def operations(function, *args):
     leaves, tree = jax.tree.flatten(args)
-    program = primitive._Program(primitive._Traced(function, leaves, tree), lanewise.Layout())
+    program = primitive._Program(primitive._Traced.of(function, leaves, tree), lanewise.Layout())
     module, _ = primitive.kernel_of(program, [True] * len(leaves), 64, 1)
     return module.b.operations
 
@@ -1077,14 +1132,13 @@ def called_back(x):
 @pytest.mark.parametrize(
     "function",
     [
-        lambda x: jnp.sort(jnp.stack([x, -x, x / 2])),
+        lambda x: jnp.sort(x * jnp.arange(20.0)),
         called_back,
         lambda x: jnp.abs(jnp.fft.fft(jnp.stack([x, 2 * x]))),
         lambda x: jnp.stack([x + 1j, x]).real,
         lambda x: jnp.linalg.eigvalsh(jnp.diag(jnp.stack([x, 2 * x]))),
         lambda x: jax.random.uniform(jax.random.key(0)) * x,
-        lambda x: lax.scan(lambda c, _: (c, jnp.sort(jnp.stack([c, 1.0]))), x, None, length=3),
-        lambda x: jnp.interp(x, np.arange(5.0), np.arange(5.0) ** 2),
+        lambda x: lax.scan(lambda c, _: (c, called_back(c)), x, None, length=3),
         lambda x: x.astype(jnp.bfloat16).astype(float),
     ],
     ids=[
@@ -1094,14 +1148,42 @@ def called_back(x):
         "complex",
         "eigvalsh",
         "random",
-        "sort in scan",
-        "interp",
+        "callback in scan",
         "bfloat16",
     ],
 )
 def test_what_is_left_to_xla(left, function):
     assert_close(jax.jit(lanewise.batched(function))(VALUES), jax.jit(jax.vmap(function))(VALUES))
-    assert len(left) == 1
+    assert left
+
+
+def loops_around_a_callback(x, y):
+    """Two loops, what is between them, and results that are not computed."""
+    first = lax.fori_loop(0, 20, lambda _, z: 0.9 * z + 0.1 * jnp.sin(z + y), x)
+    between = jax.jit(lambda z: called_back(z) + lax.fori_loop(0, 3, lambda _, u: u * z, z))(first)
+    last = lax.fori_loop(0, 20, lambda _, z: 0.9 * z, between)
+    return last, called_back(last) + 1.0, x, 3.0, y
+
+
+def test_loops_around_a_callback_are_compiled(left):
+    found = jax.jit(lanewise.batched(loops_around_a_callback, in_axes=(0, None)))(VALUES, 0.3)
+    expected = jax.jit(jax.vmap(loops_around_a_callback, in_axes=(0, None)))(VALUES, 0.3)
+    assert_close(found, expected)
+    assert len(left) == 2  # one for each callback
+    alone = jax.jit(lambda x: lanewise.call(loops_around_a_callback, x, 0.3))(VALUES[1])
+    assert_close(alone, [x[1] for x in found])
+    parts = lanewise.explain(loops_around_a_callback, 1.0, 0.3).parts
+    kinds = ["code" if p.reason is None else p.reason.split()[-1] for p in parts]
+    assert kinds == ["code", "pure_callback", "code", "code", "pure_callback"]
+
+
+def test_derivative_of_loops_around_a_sort():
+    def function(x):
+        row = jnp.sort(lax.fori_loop(0, 5, lambda _, z: 0.9 * z, x * jnp.arange(20.0)))
+        return lax.fori_loop(0, 5, lambda _, z: jnp.sin(z), row[-1])
+
+    found = jax.jit(jax.vmap(jax.grad(lambda x: lanewise.call(function, x))))(VALUES[:5])
+    assert_close(found, jax.vmap(jax.grad(function))(VALUES[:5]))
 
 
 # --- other processors ---------------------------------------------------
@@ -1130,7 +1212,7 @@ def test_code_for_other_processors(width):
         return rows_of(q, 200), jnp.any(x > 0), jnp.asarray(TABLE)[k], k.astype("float32")
 
     x, k = np.float64(1), np.int32(3)
-    traced = primitive._Traced(function, [x, k], jax.tree.structure((x, k)))
+    traced = primitive._Traced.of(function, [x, k], jax.tree.structure((x, k)))
     module = Module(width, 2)
     text = handler.module_text(module.kernel(traced.all_inputs, [True, True]), 2 * width)
     for triple, cpu, features, code in PROCESSORS.values():

@@ -1,0 +1,158 @@
+"""Primitives of JAX written out in simpler ones, for small arrays of one trajectory."""
+
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from .ir import Unsupported
+
+MOST_UNKNOWNS = 12
+"""Larger matrices are left to XLA, which calls LAPACK."""
+
+MOST_SORTED = 16
+"""Longer arrays are sorted by XLA."""
+
+
+def _square(x: Array, name: str) -> int:
+    if x.ndim != 2 or x.shape[0] > MOST_UNKNOWNS:
+        raise Unsupported(f"{name} of an array of shape {x.shape}")
+    return x.shape[0]
+
+
+def lu(a: Array, **_) -> tuple[Array, Array, Array]:
+    """L and U in one matrix, the row that each row was exchanged with, and the permutation."""
+    n = _square(a, "lu")
+    if a.shape[1] != n:
+        raise Unsupported(f"lu of an array of shape {a.shape}")
+    rows = [[a[i, j] for j in range(n)] for i in range(n)]
+    order, pivots = [jnp.int32(i) for i in range(n)], []
+    for c in range(n):
+        best, pivot = jnp.abs(rows[c][c]), jnp.int32(c)
+        for i in range(c + 1, n):
+            larger = jnp.abs(rows[i][c]) > best
+            best = lax.select(larger, jnp.abs(rows[i][c]), best)
+            pivot = lax.select(larger, jnp.int32(i), pivot)
+        pivots.append(pivot)
+        for i in range(c + 1, n):
+            here = pivot == i
+            for j in range(n):
+                upper, lower = rows[c][j], rows[i][j]
+                rows[c][j] = lax.select(here, lower, upper)
+                rows[i][j] = lax.select(here, upper, lower)
+            first, second = order[c], order[i]
+            order[c], order[i] = lax.select(here, second, first), lax.select(here, first, second)
+        for i in range(c + 1, n):
+            factor = rows[i][c] / rows[c][c]
+            rows[i][c] = lax.select(rows[c][c] == 0, rows[i][c], factor)
+            for j in range(c + 1, n):
+                rows[i][j] = rows[i][j] - rows[i][c] * rows[c][j]
+    return jnp.stack([jnp.stack(r) for r in rows]), jnp.stack(pivots), jnp.stack(order)
+
+
+def triangular_solve(
+    a: Array,
+    b: Array,
+    *,
+    left_side: bool,
+    lower: bool,
+    transpose_a: bool,
+    unit_diagonal: bool,
+    **_,
+) -> Array:
+    """X of A X = B, or of X A = B where the matrix is not on the left."""
+    n = _square(a, "triangular_solve")
+    if transpose_a:
+        a, lower = a.T, not lower
+    if not left_side:
+        a, b, lower = a.T, b.T, not lower
+    x: list = [None] * n
+    for i in range(n) if lower else reversed(range(n)):
+        total = b[i]
+        for j in range(i) if lower else range(i + 1, n):
+            total = total - a[i, j] * x[j]
+        x[i] = total if unit_diagonal else total / a[i, i]
+    solution = jnp.stack(x)
+    return solution if left_side else solution.T
+
+
+def cholesky(a: Array, **_) -> Array:
+    """The lower triangle of a symmetric positive definite matrix; NaN where it is not definite."""
+    n = _square(a, "cholesky")
+    rows: list[list] = [[jnp.zeros_like(a[0, 0])] * n for _ in range(n)]
+    for j in range(n):
+        rest = a[j, j] - sum((rows[j][k] ** 2 for k in range(j)), start=jnp.zeros_like(a[0, 0]))
+        rows[j][j] = jnp.sqrt(lax.select(rest > 0, rest, jnp.full_like(rest, jnp.nan)))
+        for i in range(j + 1, n):
+            total = a[i, j]
+            for k in range(j):
+                total = total - rows[i][k] * rows[j][k]
+            rows[i][j] = total / rows[j][j]
+    # One pivot that is not positive makes the whole factor NaN, as LAPACK's caller in JAX does.
+    nothing = sum(rows[j][j] * 0 for j in range(n))
+    return jnp.stack([jnp.stack([x + nothing for x in r]) for r in rows])
+
+
+def sort(*arrays: Array, dimension: int, num_keys: int, **_) -> list[Array]:
+    """Arrays in the order of the first `num_keys` of them, by exchanges of neighbours."""
+    n = arrays[0].shape[dimension]
+    if n > MOST_SORTED:
+        raise Unsupported(f"sort of {n} numbers")
+    items = [[lax.index_in_dim(x, i, dimension, False) for x in arrays] for i in range(n)]
+    for turn in range(n):
+        for i in range(turn % 2, n - 1, 2):
+            a, b = items[i], items[i + 1]
+            swap = _before(b[:num_keys], a[:num_keys])
+            items[i] = [lax.select(swap, y, x) for x, y in zip(a, b, strict=True)]
+            items[i + 1] = [lax.select(swap, x, y) for x, y in zip(a, b, strict=True)]
+    return [jnp.stack([item[k] for item in items], dimension) for k in range(len(arrays))]
+
+
+def _before(x: Sequence[Array], y: Sequence[Array]) -> Array:
+    """Whether x comes before y and not at one place with it; −0 equals 0, NaN is last."""
+    before = jnp.zeros(x[0].shape, bool)
+    for a, b in reversed(list(zip(x, y, strict=True))):
+        both_nan = (a != a) & (b != b)
+        before = (a < b) | ((a == a) & (b != b)) | (((a == b) | both_nan) & before)
+    return before
+
+
+def _ordered(x: Array) -> Array:
+    """Integers in the order of numbers, −NaN < −∞ < … < −0 < 0 < … < ∞ < NaN."""
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        return x
+    kind = jnp.dtype(f"int{8 * x.dtype.itemsize}")
+    bits = lax.bitcast_convert_type(x, kind)
+    most = jnp.asarray(jnp.iinfo(kind).max, kind)
+    return lax.select(bits < 0, bits ^ most, bits)
+
+
+def nextafter(x: Array, y: Array) -> Array:
+    """The number next to x in the direction of y."""
+    kind = jnp.dtype(f"int{8 * x.dtype.itemsize}")
+    bits = lax.bitcast_convert_type(x, kind)
+    away = (x < y) == (x > 0)
+    moved = lax.bitcast_convert_type(bits + lax.select(away, kind.type(1), kind.type(-1)), x.dtype)
+    least = lax.bitcast_convert_type(jnp.ones((), kind), x.dtype)
+    moved = lax.select(x == 0, lax.select(y > 0, least, -least), moved)
+    moved = lax.select(x == y, y, moved)
+    return lax.select((x != x) | (y != y), x + y, moved)
+
+
+def platform_index(*, platforms: Sequence, **_) -> Array:
+    """The branch that is taken on a CPU."""
+    names = [("cpu",) if p is None else p for p in platforms]
+    return jnp.int32(next(i for i, p in enumerate(names) if "cpu" in p))
+
+
+WRITTEN: dict[str, Callable] = {
+    "lu": lu,
+    "triangular_solve": triangular_solve,
+    "cholesky": cholesky,
+    "sort": sort,
+    "nextafter": nextafter,
+    "lt_to": lambda x, y: _ordered(x) < _ordered(y),
+    "le_to": lambda x, y: _ordered(x) <= _ordered(y),
+    "platform_index": platform_index,
+}
+"""function(*arrays, **parameters of the equation) → the equation's results."""
