@@ -498,7 +498,7 @@ _SPECIAL: dict[str, Callable] = {
     "iota": indexing.iota,
     "optimization_barrier": Evaluator.same,
     **dict.fromkeys(
-        ["lanes_in_front", "reshard", "sharding_constraint", "mesh_cast"], Evaluator.same
+        ["reshard", "sharding_constraint", "mesh_cast"], Evaluator.same
     ),
     "argmax": indexing.argument_of,
     "argmin": indexing.argument_of,

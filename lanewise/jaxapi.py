@@ -15,8 +15,8 @@ __all__ = [
     "Literal",
     "backends_are_initialized",
     "bodies",
+    "derivative_of",
     "drops_outputs",
-    "identity",
     "is_traced",
     "jaxpr_as_fun",
     "jaxprs_in_params",
@@ -115,6 +115,27 @@ def drops_outputs(of: Primitive, without: Callable) -> None:
         return [True] * len(eqn.invars), new
 
     partial_eval.dce_rules[of] = rule
+
+
+def derivative_of(of: Primitive, function: Callable) -> None:
+    """Have a primitive of several outputs differentiated as `function`, also after `vmap`."""
+
+    def rule(primals, tangents, **params):
+        moves = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
+
+        def of_moving(*moving):
+            values = dict(zip(moves, moving, strict=True))
+            return function(*(values.get(i, x) for i, x in enumerate(primals)), **params)
+
+        outs, changes = jax.jvp(
+            of_moving, [primals[i] for i in moves], [tangents[i] for i in moves]
+        )
+        return outs, [
+            t if jnp.issubdtype(x.dtype, jnp.inexact) else ad.Zero(jax.typeof(x).to_tangent_aval())
+            for x, t in zip(outs, changes, strict=True)
+        ]
+
+    ad.primitive_jvps[of] = rule
 
 
 def without_outputs(closed: ClosedJaxpr, used: list[bool]) -> ClosedJaxpr:
@@ -217,13 +238,6 @@ def _linear_derivative(primals, tangents, *, functions: _Linear, count: int):
         _, more = jax.jvp(of, [known[i] for i in moves], [tangents[i] for i in moves])
         total = [a + b for a, b in zip(total, more, strict=True)]
     return outs, total
-
-
-def identity(name: str, batched: Callable) -> Primitive:
-    """A primitive that does nothing but under `vmap`, for which `batched` is its rule."""
-    new = primitive(name, lambda x: x, batched)
-    ad.deflinear2(new, lambda cotangent, _: [new.bind(cotangent)])
-    return new
 
 
 _linear = primitive("linear_map", _pushed, _linear_batched, multiple=True)

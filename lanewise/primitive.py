@@ -16,8 +16,8 @@ from .extent import carried, operation_count
 from .ir import Unsupported
 from .jaxapi import (
     ClosedJaxpr,
+    derivative_of,
     drops_outputs,
-    identity,
     is_traced,
     jaxpr_as_fun,
     lower_on,
@@ -86,18 +86,10 @@ def call(function: Callable, *args: Any, layout: Layout = AUTO) -> Any:
     traced = _Traced.of(function, leaves, tree)
     program = _Program(traced, layout)
     # What is traced outside and closed over is an input like the others.
-    outer = traced.outer
-
-    @jax.custom_jvp
-    def bound(*operands):
-        on = (False,) * len(operands)
-        return _lanewise.bind(*operands, program=program, lanes=None, on=on)
-
-    @bound.defjvp
-    def _(primals, tangents):
-        return jax.jvp(lambda *x: _all_alike(traced(*x), x), primals, tangents)
-
-    return jax.tree.unflatten(traced.out_tree, bound(*outer, *leaves))
+    operands = [*traced.outer, *leaves]
+    on = (False,) * len(operands)
+    outs = _lanewise.bind(*operands, program=program, lanes=None, on=on)
+    return jax.tree.unflatten(traced.out_tree, outs)
 
 
 def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Callable:
@@ -158,30 +150,6 @@ def _can_start() -> bool:
         )
         return False
     return True
-
-
-def _all_alike(outputs: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
-    """The outputs, batched under `vmap` as those of the primitive are: all of them, in front.
-
-    JAX takes for granted that a function and its derivative's rule batch their values alike.
-    """
-    parts = [x.ravel()[:0] for x in inputs if jnp.issubdtype(x.dtype, jnp.inexact)]
-    nothing = sum((jnp.sum(x) for x in parts), start=jnp.zeros(()))  # it depends on all inputs
-
-    def alike(x):
-        if jnp.issubdtype(x.dtype, jnp.inexact):
-            x = x + nothing.astype(x.dtype)
-        else:
-            x = jnp.where(nothing == 0, x, x)
-        return _lanes_in_front.bind(x)
-
-    return [alike(x) for x in outputs]
-
-
-_lanes_in_front = identity(
-    "lanes_in_front",
-    lambda arrays, axes: (_lanes_in_front.bind(jnp.moveaxis(arrays[0], axes[0], 0)), 0),
-)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -403,6 +371,7 @@ def _batched(operands, axes, *, program: _Program, lanes: int | None, on: tuple[
 
 _lanewise = primitive("lanewise", _through_xla, _batched, multiple=True)
 lower_on("cpu", _lanewise, _on_cpu)
+derivative_of(_lanewise, _through_xla)
 
 
 def _eagerly(*operands, **params):
