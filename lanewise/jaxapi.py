@@ -15,8 +15,8 @@ __all__ = [
     "Literal",
     "backends_are_initialized",
     "bodies",
-    "derivative_of",
     "drops_outputs",
+    "has_derivative",
     "is_traced",
     "jaxpr_as_fun",
     "jaxprs_in_params",
@@ -117,25 +117,20 @@ def drops_outputs(of: Primitive, without: Callable) -> None:
     partial_eval.dce_rules[of] = rule
 
 
-def derivative_of(of: Primitive, function: Callable) -> None:
-    """Have a primitive of several outputs differentiated as `function`, also after `vmap`."""
+def has_derivative(of: Primitive, rule: Callable) -> None:
+    """Give a primitive of several outputs a derivative: ``rule(primals, changes, **params)`` →
+    (outputs, their changes), where `changes` has those of the operands that change, by position,
+    and None stands for an output that does not."""
 
-    def rule(primals, tangents, **params):
-        moves = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
-
-        def of_moving(*moving):
-            values = dict(zip(moves, moving, strict=True))
-            return function(*(values.get(i, x) for i, x in enumerate(primals)), **params)
-
-        outs, changes = jax.jvp(
-            of_moving, [primals[i] for i in moves], [tangents[i] for i in moves]
-        )
+    def both(primals, tangents, **params):
+        changes = {i: t for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)}
+        outs, moved = rule(primals, changes, **params)
         return outs, [
-            t if jnp.issubdtype(x.dtype, jnp.inexact) else ad.Zero(jax.typeof(x).to_tangent_aval())
-            for x, t in zip(outs, changes, strict=True)
+            ad.Zero(jax.typeof(x).to_tangent_aval()) if t is None else t
+            for x, t in zip(outs, moved, strict=True)
         ]
 
-    ad.primitive_jvps[of] = rule
+    ad.primitive_jvps[of] = both
 
 
 def without_outputs(closed: ClosedJaxpr, used: list[bool]) -> ClosedJaxpr:

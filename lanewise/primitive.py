@@ -16,16 +16,14 @@ from .extent import carried, operation_count
 from .ir import Unsupported
 from .jaxapi import (
     ClosedJaxpr,
-    derivative_of,
     drops_outputs,
-    is_traced,
-    jaxpr_as_fun,
+    has_derivative,
     lower_on,
     primitive,
-    without_outputs,
 )
 from .kernel import Module
 from .pieces import Piece, in_pieces, pieces
+from .traced import Traced
 
 FORMS = ("auto", "components", "arrays", "kernel")
 
@@ -83,7 +81,7 @@ def call(function: Callable, *args: Any, layout: Layout = AUTO) -> Any:
     too.
     """
     leaves, tree = jax.tree.flatten(args)
-    traced = _Traced.of(function, leaves, tree)
+    traced = Traced.of(function, leaves, tree)
     program = _Program(traced, layout)
     # What is traced outside and closed over is an input like the others.
     operands = [*traced.outer, *leaves]
@@ -152,60 +150,10 @@ def _can_start() -> bool:
     return True
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Traced:
-    """A function of one trajectory as a jaxpr; the values of a trace outside that it closes over
-    (`outer`) are its first operands."""
-
-    closed: ClosedJaxpr
-    out_tree: Any = None
-
-    @classmethod
-    def of(cls, function: Callable, leaves: Sequence[Any], tree: Any) -> "_Traced":
-        trees: list[Any] = []
-
-        def flat(*leaves):
-            out, out_tree = jax.tree.flatten(function(*jax.tree.unflatten(tree, leaves)))
-            trees.append(out_tree)
-            return out
-
-        return cls(jax.make_jaxpr(flat)(*leaves), trees[-1])
-
-    @functools.cached_property
-    def outer(self) -> list[Any]:
-        return [c for c in self.closed.consts if is_traced(c)]
-
-    def __call__(self, *operands: Any) -> list[Any]:
-        outer = iter(operands[: len(self.outer)])
-        consts = [next(outer) if is_traced(c) else c for c in self.closed.consts]
-        closed = ClosedJaxpr(self.closed.jaxpr, consts)
-        return jaxpr_as_fun(closed)(*operands[len(self.outer) :])
-
-    def giving(self, used: list[bool]) -> "_Traced":
-        """The function that gives some of the outputs only, as a flat list."""
-        return _Traced(without_outputs(self.closed, used))
-
-    @functools.cached_property
-    def all_inputs(self) -> ClosedJaxpr:
-        """The jaxpr with what is closed over and traced in front of its inputs."""
-        jaxpr, consts = self.closed.jaxpr, self.closed.consts
-        if not self.outer:
-            return self.closed
-        traced = [is_traced(c) for c in consts]
-        front = [v for v, t in zip(jaxpr.constvars, traced, strict=True) if t]
-        known = [(v, c) for v, c, t in zip(jaxpr.constvars, consts, traced, strict=True) if not t]
-        new = jaxpr.replace(
-            constvars=[v for v, _ in known],
-            invars=[*front, *jaxpr.invars],
-            debug_info=jaxpr.debug_info.with_unknown_names(),
-        )
-        return ClosedJaxpr(new, [c for _, c in known])
-
-
 class _Program:
     """What a call computes, and how that is compiled."""
 
-    def __init__(self, traced: _Traced, layout: Layout):
+    def __init__(self, traced: Traced, layout: Layout):
         self.traced, self.layout = traced, layout
 
     def giving(self, used: list[bool]) -> "_Program":
@@ -215,20 +163,25 @@ class _Program:
 
 def program_of_jaxpr(closed: ClosedJaxpr, layout: Layout) -> _Program:
     """The program of a jaxpr that closes over nothing that is traced."""
-    return _Program(_Traced(closed), layout)
+    return _Program(Traced(closed), layout)
 
 
 def program_of(function: Callable, leaves: Sequence[Any], layout: Layout) -> _Program:
     """The program of a function of arrays, as `call` makes it."""
-    return _Program(_Traced.of(function, leaves, jax.tree.structure(tuple(leaves))), layout)
+    return _Program(Traced.of(function, leaves, jax.tree.structure(tuple(leaves))), layout)
+
+
+def _in_jax(program: _Program, lanes: int | None, on: tuple[bool, ...]) -> Callable:
+    """The program as a function of JAX: the batch in front of operands where `on`, and of all
+    outputs."""
+    if lanes is None:
+        return program.traced
+    return jax.vmap(program.traced, [0 if o else None for o in on], 0, axis_size=lanes)
 
 
 def _through_xla(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]):
-    """The program as XLA compiles it: the first axis of operands where `on`, and of all outputs."""
-    if lanes is None:
-        return program.traced(*operands)
-    axes = [0 if o else None for o in on]
-    return jax.vmap(program.traced, axes, 0, axis_size=lanes)(*operands)
+    """The program as XLA compiles it."""
+    return _in_jax(program, lanes, on)(*operands)
 
 
 def _on_cpu(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]):
@@ -371,7 +324,21 @@ def _batched(operands, axes, *, program: _Program, lanes: int | None, on: tuple[
 
 _lanewise = primitive("lanewise", _through_xla, _batched, multiple=True)
 lower_on("cpu", _lanewise, _on_cpu)
-derivative_of(_lanewise, _through_xla)
+
+
+def _derivative(primals, changes: dict[int, Any], **params):
+    """The derivative of what the program stands for, computed by XLA."""
+
+    def moved(*moving):
+        values = dict(zip(changes, moving, strict=True))
+        return _in_jax(**params)(*(values.get(i, x) for i, x in enumerate(primals)))
+
+    outs, tangents = jax.jvp(moved, [primals[i] for i in changes], list(changes.values()))
+    real = [jnp.issubdtype(x.dtype, jnp.inexact) for x in outs]
+    return outs, [t if r else None for t, r in zip(tangents, real, strict=True)]
+
+
+has_derivative(_lanewise, _derivative)
 
 
 def _eagerly(*operands, **params):

@@ -81,6 +81,7 @@ CALLS = frozenset(
         "custom_jvp_call",
         "custom_vjp_call",
         "custom_vjp_call_jaxpr",
+        "implicit_root",
         "checkpoint",
         "remat",
         "remat2",

@@ -20,6 +20,7 @@ import dvi_jax as dvi
 import lanewise
 from lanewise import assumed, cache, components, handler, machine, primitive
 from lanewise.kernel import Module
+from lanewise.traced import Traced
 
 RNG = np.random.default_rng(0)
 
@@ -790,7 +791,7 @@ def test_no_warning_from_constants():
 
 def test_code_stays_short_for_arrays():
     leaves, tree = jax.tree.flatten((1.0,))
-    traced = primitive._Traced.of(lambda x: jnp.full((128,), x), leaves, tree)
+    traced = Traced.of(lambda x: jnp.full((128,), x), leaves, tree)
     program = primitive._Program(traced, lanewise.Layout())
     _, text = primitive.kernel_of(program, [True], 64)
     blocks = text.split(":\n")
@@ -869,7 +870,7 @@ def test_an_exchange_of_rows_on_one_trajectory(left, n):
 
 def operations(function, *args):
     leaves, tree = jax.tree.flatten(args)
-    program = primitive._Program(primitive._Traced.of(function, leaves, tree), lanewise.Layout())
+    program = primitive._Program(Traced.of(function, leaves, tree), lanewise.Layout())
     module, _ = primitive.kernel_of(program, [True] * len(leaves), 64, 1)
     return module.b.operations
 
@@ -1212,7 +1213,7 @@ def test_code_for_other_processors(width):
         return rows_of(q, 200), jnp.any(x > 0), jnp.asarray(TABLE)[k], k.astype("float32")
 
     x, k = np.float64(1), np.int32(3)
-    traced = primitive._Traced.of(function, [x, k], jax.tree.structure((x, k)))
+    traced = Traced.of(function, [x, k], jax.tree.structure((x, k)))
     module = Module(width, 2)
     text = handler.module_text(module.kernel(traced.all_inputs, [True, True]), 2 * width)
     for triple, cpu, features, code in PROCESSORS.values():

@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+import lanewise
+
 Number = Float[Array, ""]
 Function = Callable[[Number], Number]
 
@@ -31,9 +33,9 @@ def bracketed_root(
         return jnp.where(exists, function(x), x - b)
 
     def search(_, x):
-        return jnp.where(exists, _false_position(function, a, at_a, b, at_b, exists), x)
+        return jnp.where(exists, _false_position(function, a, at_a, b, at_b, exists), x), ()
 
-    return lax.custom_root(equation, b, search, divide)
+    return lanewise.implicit_root(equation, b, search, divide)[0]
 
 
 def divide(linear: Function, rhs: Number) -> Number:

@@ -230,17 +230,15 @@ def find_root(
     scales = Scales(known, start)
     used = solver.solver if isinstance(solver, Known) else solver
 
-    # custom_root gives its auxiliary outputs tangents of the same type, so no integers among them.
     def solve(F, x0):
-        zero = jnp.zeros((), x0.dtype)
         if isinstance(solver, Known):
-            return solver.root, (zero, jnp.stack([zero, zero]), zero + 1)
+            nothing = jnp.zeros(2, x0.dtype)
+            return solver.root, (jnp.int32(1), nothing, jnp.asarray(True))
         x, *how = used.solve(F, x0, scales)
-        return x, tuple(jnp.asarray(a, x0.dtype) for a in how)
+        return x, how
 
-    root, aux = lax.custom_root(function, guess, solve, used.solve_tangent, has_aux=True)
-    iterations, residual, converged = map(lax.stop_gradient, aux)
-    return root, RootInfo(iterations.astype(jnp.int32), residual, converged > 0)
+    root, how = lanewise.implicit_root(function, guess, solve, used.solve_tangent)
+    return root, RootInfo(*how)
 
 
 def value_and_jacobian(F: Function, x: Vector) -> tuple[Vector, Array]:

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
+import lanewise
+
 from .._energies import disturbing_work, incoming_energy, outgoing_energy
 from .._results import RESULTS
 from .._step import Equations, step
@@ -260,12 +262,12 @@ def _least(residual: Callable, hs: Array, values: Array, wanted: Array) -> Scala
 
     def search(_, h):
         a, b = fixed[jnp.maximum(best - 1, 0)], fixed[jnp.minimum(best + 1, hs.size - 1)]
-        return jnp.where(inside, _golden_section(lambda h: jnp.abs(residual(h)), a, b), h)
+        return jnp.where(inside, _golden_section(lambda h: jnp.abs(residual(h)), a, b), h), ()
 
     def stationary(h):
         return jnp.where(inside, jax.grad(residual)(h), h - hs[best])
 
-    return lax.custom_root(stationary, fixed[best], search, divide)
+    return lanewise.implicit_root(stationary, fixed[best], search, divide)[0]
 
 
 def _golden_section(f: Callable, a: Scalar, b: Scalar) -> Scalar:

@@ -1,0 +1,108 @@
+"""Roots of equations, with the derivative that the implicit function theorem gives."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from .jaxapi import ClosedJaxpr, has_derivative, jaxpr_as_fun, primitive
+from .traced import Traced
+
+
+def implicit_root(
+    function: Callable[[Array], Array],
+    guess: Array,
+    solve: Callable[[Callable, Array], tuple[Array, Any]],
+    divide: Callable[[Callable, Array], Array],
+) -> tuple[Array, Any]:
+    """``solve(function, guess)``: the root x of function(x) = 0, and arrays that say how it was
+    found.
+
+    The derivative of x with respect to anything that `function` closes over is dx = −(∂F/∂x)⁻¹ dF,
+    in forward and reverse mode and to any order; ``divide(linear, b)`` gives the y with
+    linear(y) = b. `solve` is never differentiated; neither the guess nor what `solve` closes over
+    matters for the derivative.
+
+    It differs from `jax.lax.custom_root` where reverse mode is taken of a batch, ``grad`` of
+    ``vmap``: `lax.cond` is allowed in `function` then, because the batch is formed before the
+    derivative. (JAX forms the batch of a `custom_jvp` rule after it, and has no transpose of the
+    result.)
+    """
+    one = jax.tree.structure((guess,))
+    equation = Traced.of(function, [guess], one)
+    trees: list[Any] = []
+
+    def found(*operands):
+        *consts, x0 = operands
+        x, how = solve(lambda x: equation(*consts, x)[0], x0)
+        leaves, tree = jax.tree.flatten(how)
+        trees.append(tree)
+        return [x, *leaves]
+
+    operands = [*equation.outer, guess]
+    search = Traced.of(found, operands, jax.tree.structure(tuple(operands)))
+    rest = _Rest(
+        lambda *at: jaxpr_as_fun(equation.all_inputs)(*at)[0],
+        lambda *at: _divided(equation.all_inputs, divide, *at),
+        len(search.outer),
+    )
+    x, *how = _root.bind(*search.outer, *operands, search=search.all_inputs, rest=rest)
+    return x, jax.tree.unflatten(trees[-1], how)
+
+
+class _Rest(NamedTuple):
+    """What the derivative needs: ``equation(*consts, x)``, ``divide(*consts, x, b)``, and how many
+    operands of the search the equation does not have."""
+
+    equation: Callable
+    divide: Callable
+    own: int
+
+
+def _divided(equation: ClosedJaxpr, divide: Callable, *at: Array) -> Array:
+    *consts, x, b = at
+    _, linear = jax.linearize(lambda x: jaxpr_as_fun(equation)(*consts, x)[0], x)
+    return divide(linear, b)
+
+
+def _searched(*operands: Array, search: ClosedJaxpr, rest: _Rest) -> list[Array]:
+    return jaxpr_as_fun(search)(*operands)
+
+
+def _batched(operands, axes, *, search: ClosedJaxpr, rest: _Rest):
+    (size,) = {x.shape[a] for x, a in zip(operands, axes, strict=True) if a is not None}
+    on = [None if a is None else 0 for a in axes]
+    operands = [
+        x if a is None else jnp.moveaxis(x, a, 0) for x, a in zip(operands, axes, strict=True)
+    ]
+    new = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(search), on, axis_size=size))(*operands)
+    consts = on[rest.own : -1]
+    of = _Rest(
+        jax.vmap(rest.equation, [*consts, 0], axis_size=size),
+        jax.vmap(rest.divide, [*consts, 0, 0], axis_size=size),
+        rest.own,
+    )
+    outs = _root.bind(*operands, search=new, rest=of)
+    return outs, [0] * len(outs)
+
+
+def _derivative(primals, changes: dict[int, Array], *, search: ClosedJaxpr, rest: _Rest):
+    outs = _root.bind(*primals, search=search, rest=rest)
+    x, consts = outs[0], primals[rest.own : -1]
+    moves = [i for i in range(len(consts)) if i + rest.own in changes]
+    if not moves:
+        return outs, [None] * len(outs)
+
+    def defect(*moving):
+        values = dict(zip(moves, moving, strict=True))
+        return rest.equation(*(values.get(i, c) for i, c in enumerate(consts)), x)
+
+    moved = [changes[i + rest.own] for i in moves]
+    _, change = jax.jvp(defect, [consts[i] for i in moves], moved)
+    return outs, [rest.divide(*consts, x, -change), *[None] * (len(outs) - 1)]
+
+
+_root = primitive("implicit_root", _searched, _batched, multiple=True)
+has_derivative(_root, _derivative)
