@@ -1,0 +1,170 @@
+"""Faults that were reported once, each as the script that showed it, made small."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import dvi_jax as dvi
+
+KEPLER = dvi.System(lambda t0, t1, q, p, a: p @ p / 2 - 1 / jnp.linalg.norm(q))
+Q0, P0 = [0.3, 1.2], [-1.0, -0.6]
+FINAL = dvi.Save(final=True)
+
+
+def kinetic(t0, t1, q0, p0, q1, p1, a):
+    return p1 @ p1
+
+
+def weighted(t0, t1, q0, p0, q1, p1, a):
+    return a * (p1 @ p1)
+
+
+# --- XLA aborted the process -------------------------------------------------------------------
+
+
+def test_a_swept_argument_that_only_an_observable_uses():
+    weights = np.linspace(1.0, 2.0, 6)
+    found = dvi.sweep(
+        KEPLER,
+        Q0,
+        P0,
+        args=dvi.Axis("a", weights),
+        h=0.05,
+        num_steps=5,
+        observe={"drift": dvi.MaxDrift(kinetic), "last": dvi.Last(weighted)},
+        progress=False,
+    )
+    np.testing.assert_allclose(found["last"], weights * found["last"][0], rtol=1e-14)
+    assert np.all(found["drift"] == found["drift"][0])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"layout": dvi.Layout(form="components")}, {"adjoint": dvi.Reversible(checkpoint_every=500)}],
+    ids=["components", "one checkpoint"],
+)
+def test_an_observable_of_one_trajectory(settings):
+    run = {"h": 0.05, "num_steps": 500, "observe": dvi.MaxDrift(kinetic), "save": FINAL}
+    found = dvi.integrate(KEPLER, Q0, P0, **run, **settings)
+    every = dvi.integrate(KEPLER, Q0, P0, h=0.05, num_steps=500)
+    values = np.sum(np.asarray(every.ps[1:]) ** 2, axis=1)
+    drift = np.max(np.abs(values - values[0]))
+    np.testing.assert_allclose(found.observed, drift, rtol=1e-14)
+
+
+# --- products in another order left the range of the numbers -----------------------------------
+
+
+def final_momenta(system, q, p, args, h, num_steps, stop=None):
+    def one(q, p, args):
+        run = {"epsilon": 1.0, "args": args, "stop": stop, "save": FINAL, "throw": False}
+        found = dvi.integrate(system, q, p, h=h, num_steps=num_steps, **run)
+        return found.ps[-1], found.result == dvi.RESULTS.successful
+
+    return jax.jit(jax.vmap(one, in_axes=(0, 0, None)))(q, p, args)
+
+
+def test_a_product_that_would_underflow_in_another_order():
+    """An atom in a light field, in SI units and float32: hbar·(c3·|E|²), while hbar·c3 is subnormal."""
+    hbar, c3, mass, h = 1.05e-34, 1e-8, 1.4e-25, 1e-9
+    system = dvi.System(
+        lambda t0, t1, q, p, a: jnp.sum(p * (p / (2 * a["m"]))),
+        force=lambda t0, t1, q, p, a: (
+            a["hbar"] * (a["c3"] * jnp.square(3.1622777e9 * jnp.cos(8e6 * q)))
+        ),
+    )
+    q = np.linspace(0, 1e-7, 9, dtype=np.float32)[:, None]
+    args = {k: np.float32(v) for k, v in {"m": mass, "hbar": hbar, "c3": c3}.items()}
+    found, successful = final_momenta(system, q, 0 * q, args, h, 10)
+    assert np.float32(hbar) * np.float32(c3) < np.finfo(np.float32).tiny
+    position, momentum = q.astype(float), np.zeros(q.shape)
+    for _ in range(10):
+        momentum = momentum + h * hbar * c3 * 1e19 * np.cos(8e6 * position) ** 2
+        position = position + h * momentum / mass
+    np.testing.assert_allclose(found, momentum, rtol=1e-4)
+    assert successful.all()
+
+
+@pytest.mark.parametrize("stop", [None, dvi.Stop(lambda t, q, p, a: jnp.linalg.norm(q) - 1e13)])
+def test_a_product_that_would_overflow_in_another_order(stop):
+    """Sun and Earth in SI units and float32: m·(M·…), while m·M is infinite."""
+    G, M, m = 6.674e-11, 2e30, 6e24
+    system = dvi.System(
+        lambda t0, t1, q, p, a: jnp.sum(p * (p / (2 * a["m"]))),
+        force=lambda t0, t1, q, p, a: (
+            -a["m"] * (a["M"] * (a["G"] * (q / jnp.linalg.norm(q) / jnp.sum(jnp.square(q)))))
+        ),
+    )
+    q = np.tile(np.float32([1.5e11, 0]), (9, 1))
+    p = np.tile(np.float32([0, m * 3e4]), (9, 1))
+    args = {k: np.float32(v) for k, v in {"G": G, "M": M, "m": m}.items()}
+    found, successful = final_momenta(system, q, p, args, np.float32(36000.0), 10, stop)
+    with np.errstate(over="ignore"):
+        assert np.isinf(np.float32(m) * np.float32(M))
+    position, momentum = np.array([1.5e11, 0]), np.array([0, m * 3e4])
+    for _ in range(10):
+        momentum = momentum - 36000 * G * M * m * position / np.linalg.norm(position) ** 3
+        position = position + 36000 * momentum / m
+    np.testing.assert_allclose(found, np.tile(momentum, (9, 1)), rtol=1e-5)
+    assert successful.all()
+
+
+# --- other faults --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("epsilon", [0.1, 0.6])
+def test_a_root_where_the_jacobian_of_autodiff_is_not_the_true_one(epsilon):
+    """Friction behind stop_gradient: Newton converges linearly, and must not stop too early."""
+    h = 0.1
+    system = dvi.System(
+        lambda t0, t1, q, p, a: p @ p / 2 + q @ q / 2,
+        force=lambda t0, t1, q, p, a: -lax.stop_gradient(p),
+    )
+
+    def one(q, p):
+        found = dvi.integrate(system, q, p, h=h, num_steps=50, epsilon=epsilon, throw=False)
+        return found.qs, found.ps, found.result == dvi.RESULTS.successful
+
+    rng = np.random.default_rng(0)
+    qs, ps, successful = jax.jit(jax.vmap(one))(*rng.uniform(0.5, 1, (2, 16, 1)))
+    q0, p0, p1 = qs[:, :-1], ps[:, :-1], ps[:, 1:]
+    defect = np.abs(p1 - p0 + h * q0 + h * epsilon * p1) / (np.abs(p0) + np.abs(p1))
+    assert np.max(defect) < 2e-15
+    assert successful.all()
+
+
+def test_a_batch_that_is_fine_under_debug_nans():
+    system = dvi.System(lambda t0, t1, q, p, a: p @ p / 2 + q @ q / 2)
+
+    def one(q):
+        return dvi.integrate(system, q, jnp.zeros(2), h=0.1, num_steps=200, save=FINAL).qs[-1]
+
+    expected = jax.jit(jax.vmap(one))(jnp.ones((64, 2)))
+    with jax.debug_nans(True):
+        found = jax.jit(jax.vmap(one))(jnp.ones((64, 2)))
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("adjoint", [dvi.Reversible(), dvi.Checkpointed(), dvi.Direct()])
+def test_gradient_of_a_batch_with_a_branch_in_the_hamiltonian(adjoint):
+    def H(t0, t1, q, p, a):
+        def square(y):
+            return y @ y
+
+        def cosine(y):
+            return jnp.sum(jnp.cos(y))
+
+        inner = lax.cond(q[0] + p[0] > 0, square, cosine, q + 0.3 * p)
+        return p @ p / 2 + q @ q / 2 + 0.1 * inner
+
+    def last(q):
+        run = {"h": 0.05, "num_steps": 4, "adjoint": adjoint, "throw": False}
+        return dvi.integrate(dvi.System(H), q, jnp.array([0.1, 0.2]), **run).qs[-1].sum()
+
+    q = jnp.array([[0.4, 0.3], [-0.4, 0.2]])
+    of_batch = jax.jit(jax.grad(lambda q: jax.vmap(last)(q).sum()))(q)
+    moved = np.asarray(q)[:, None, None] + 1e-5 * np.array([1, -1])[:, None, None] * np.eye(2)
+    ends = jax.jit(jax.vmap(last))(moved.reshape(-1, 2)).reshape(2, 2, 2)
+    np.testing.assert_allclose(of_batch, (ends[:, 0] - ends[:, 1]) / 2e-5, atol=1e-9)
