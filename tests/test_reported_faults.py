@@ -67,7 +67,7 @@ def final_momenta(system, q, p, args, h, num_steps, stop=None):
 
 
 def test_a_product_that_would_underflow_in_another_order():
-    """An atom in a light field, in SI units and float32: hbar·(c3·|E|²), while hbar·c3 is subnormal."""
+    """An atom in a light field, in SI units and float32: hbar·(c3·|E|²), hbar·c3 subnormal."""
     hbar, c3, mass, h = 1.05e-34, 1e-8, 1.4e-25, 1e-9
     system = dvi.System(
         lambda t0, t1, q, p, a: jnp.sum(p * (p / (2 * a["m"]))),
