@@ -39,11 +39,12 @@ from ._rollout import (
 )
 from ._solution import Save, Solution
 from ._step import Equations
-from ._system import System
+from ._system import System, check_system
 from ._types import Interval
 from .engine.newton import RootSolver, over
 from .engine.picard import PicardThenNewton
 from .engine.quantities import refuse_quantity
+from .engine.reads import reads
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, goes_backwards, warn_of_dissipation
 from .observe import Deviations, Range, Reduction, RequestedTimes, Running, Section, Stop
@@ -189,7 +190,8 @@ def integrate(
             stacklevel=2,
         )
     equations, q0, p0 = arithmetic.prepare(method, equations, Interval(t0, t0 + h, h), q0, p0)
-    task = Task(equations, method, lattice, observe, t0, h, arithmetic, stop)
+    seen = reads(observe, stop, lattice)
+    task = Task(equations, method, lattice, observe, t0, h, arithmetic, stop, seen)
     _check_observe(task, q0, p0)
     plan = make_plan(save, num_steps)
     if save.ts is not None:
@@ -366,17 +368,6 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
         f"{RESULTS[result]} {kept}",
         solution,
     )
-
-
-def check_system(system: Any) -> None:
-    """Refuse what is no `System`, with what it may have been meant for."""
-    if isinstance(system, System):
-        return
-    inner = getattr(system, "system", None)
-    hint = "Wrap the discrete Hamiltonian: dvi.System(H_D, force=W)."
-    if isinstance(inner, System):
-        hint = "Of a problem of the library take its system: problem.system."
-    raise TypeError(f"system must be a dvi.System, got {type(system).__name__}. {hint}")
 
 
 def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ from ._solution import Save
 from ._step import Equations
 from ._types import Args, Bindable, Interval, Scalar, State
 from .engine.newton import no_residual, worse
+from .engine.reads import Reads
 from .lattices import Lattice, Place
 from .methods import Method
 from .observe import Deviations, Pushed, Reduction, Running, Stop
@@ -54,6 +55,7 @@ class Task(eqx.Module):
     h: Scalar
     arithmetic: Arithmetic = FloatingPoint()
     stop: Stop | None = None
+    reads: Reads = eqx.field(static=True, default=())
 
     @property
     def args(self) -> Args:

@@ -3,12 +3,14 @@
 import inspect
 import weakref
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
+from .engine.reads import Reads, changed, reads
 
 _NAMES = "(t0, t1, q0, p1, args)"
 
@@ -54,6 +56,14 @@ class System(eqx.Module):
     force: ForceFn | None = None
     perturbation: HamiltonianFn | None = None
     slow_time: bool = eqx.field(static=True, default=False)
+    reads: Reads = eqx.field(static=True, init=False, repr=False)
+
+    def __post_init__(self):
+        self.reads = _read_by(self)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)  # a module is frozen
+        vars(self)["reads"] = _read_by(self)
 
     def __check_init__(self):
         _require_five_arguments(self.H_D, "H_D")
@@ -98,7 +108,11 @@ class System(eqx.Module):
         """Refuse functions whose values have the wrong shape or type, by tracing them once for
         each combination of shapes and types."""
         leaves, tree = jax.tree.flatten((t, q, p, args))
-        kinds = (tree, *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves))
+        kinds = (
+            self.reads,
+            tree,
+            *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves),
+        )
         for name, function in (("H_D", self.H_D), ("perturbation", self.perturbation)):
             if function is not None:
                 out = _traced_output(function, name, kinds, t, q, p, args)
@@ -121,8 +135,42 @@ class System(eqx.Module):
                 )
 
 
+def _read_by(system: System) -> Reads:
+    functions = (system.H_D, system.force, system.perturbation)
+    ignored = {name for f in functions for name in _changed_by_tracing(f)}
+    return tuple(item for item in reads(*functions) if item[0] not in ignored)
+
+
+def check_system(system: Any) -> None:
+    """Refuse what is no `System`, and a system whose functions read something that has changed
+    since it was made: programs that are compiled already have the old value."""
+    if not isinstance(system, System):
+        hint = "Wrap the discrete Hamiltonian: dvi.System(H_D, force=W)."
+        if isinstance(getattr(system, "system", None), System):
+            hint = "Take the system of a problem of the library: problem.system."
+        raise TypeError(f"system must be a dvi.System, got {type(system).__name__}. {hint}")
+    now = _read_by(system)
+    names = changed(system.reads, now) if now != system.reads else []
+    if names:
+        raise ValueError(
+            "the functions of the system read values that have changed since dvi.System(...) was "
+            f"called: {', '.join(names)}. Make a new System, or pass such values in args."
+        )
+
+
 _SEEN: weakref.WeakKeyDictionary[Callable, dict] = weakref.WeakKeyDictionary()
 """What functions returned, by the shapes and types that they were given."""
+
+
+_CHANGED_BY_TRACING: weakref.WeakKeyDictionary[Callable, frozenset] = weakref.WeakKeyDictionary()
+"""Names of what functions change themselves; no program depends on it."""
+
+
+def _changed_by_tracing(function: Callable | None) -> frozenset[str]:
+    try:
+        return _CHANGED_BY_TRACING.get(function, frozenset()) if function else frozenset()
+    except TypeError:  # a function that cannot be looked up
+        return frozenset()
 
 
 def _traced_output(
@@ -134,11 +182,18 @@ def _traced_output(
             return seen[kinds]
     except TypeError:  # a function or an argument that cannot be looked up
         seen = {}
+    before = reads(function)
     try:
         out = eqx.filter_eval_shape(function, t, t, q, p, args)
     except Exception as error:
         error.add_note(f"(in {name}{_NAMES}, called with q0 of shape {q.shape} and args={args!r})")
         raise
+    after = reads(function)
+    if after != before:  # such as a counter of calls
+        marks = dict(before)
+        _CHANGED_BY_TRACING[function] = _changed_by_tracing(function) | {
+            name for name, mark in after if marks.get(name) != mark
+        }
     if out is None or not hasattr(out, "shape"):
         if isinstance(out, int | float):
             return seen.setdefault(kinds, jax.ShapeDtypeStruct((), jnp.result_type(float)))

@@ -15,10 +15,10 @@ from lanewise import Layout
 from lanewise.jaxapi import is_traced
 
 from .._arithmetic import Arithmetic, FloatingPoint
-from .._integrate import as_parameter, as_scalar, check_system, integrate, start_state
+from .._integrate import as_parameter, as_scalar, integrate, start_state
 from .._results import RESULTS, status_name
 from .._solution import Save
-from .._system import System
+from .._system import System, check_system
 from .._types import Args, Scalar, State
 from ..engine.newton import RootSolver
 from ..engine.picard import PicardThenNewton

@@ -12,9 +12,10 @@ import numpy as np
 from .._integrate import as_parameter, as_scalar, integrate, start_state
 from .._results import status_name
 from .._solution import Save
-from .._system import System
+from .._system import System, check_system
 from .._types import Args
 from ..engine.newton import Newton, RootSolver
+from ..engine.reads import Reads, reads
 from ..methods import Method, TypeII
 from ..observe import MaxDrift
 
@@ -366,10 +367,13 @@ class _Lanes(NamedTuple):
 
 def _sweep(system, invariant, q0, p0, epsilons, h, num_steps, settings) -> _Lanes:
     """Every start at every ε and at 0, as one batch."""
+    check_system(system)
     shape = len(epsilons) + 1, len(q0)
     strengths = jnp.repeat(jnp.append(jnp.asarray(epsilons, q0.dtype), 0), shape[1])
     starts = tuple(jnp.concatenate([x] * shape[0]) for x in (q0, p0))
-    drifts, last, result = _run(system, invariant, strengths, starts, h, num_steps, settings)
+    drifts, last, result = _run(
+        system, invariant, reads(invariant), strengths, starts, h, num_steps, settings
+    )
     if drifts.ndim != 1:
         raise ValueError(
             f"the invariant must be a scalar, got values of shape {drifts.shape[1:]}: take one "
@@ -391,7 +395,7 @@ def _sweep(system, invariant, q0, p0, epsilons, h, num_steps, settings) -> _Lane
 
 
 @eqx.filter_jit
-def _run(system, invariant, strengths, starts, h, num_steps: int, settings):
+def _run(system, invariant, _: Reads, strengths, starts, h, num_steps: int, settings):
     """Drift, last value and status of every lane; nothing is saved on the way."""
 
     def lane(epsilon, q0, p0):

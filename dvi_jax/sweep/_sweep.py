@@ -14,7 +14,7 @@ from lanewise.jaxapi import x64_enabled
 
 from .._arithmetic import Arithmetic, FloatingPoint
 from .._solution import Save
-from .._system import System
+from .._system import System, check_system
 from ..engine.newton import RootSolver
 from ..engine.picard import PicardThenNewton
 from ..lattices import Given, Lattice, Uniform
@@ -224,11 +224,7 @@ def _interrupted(result: SweepResult) -> str:
 def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_steps: Any,
                **rest: Any) -> Sweep:  # fmt: skip
     """The sweep that these arguments describe; refuses what cannot be meant."""
-    if not isinstance(system, System):
-        raise TypeError(
-            f"system must be a dvi.System, got {type(system).__name__}. Wrap the discrete "
-            "Hamiltonian: dvi.System(H_D, force=W)."
-        )
+    check_system(system)
     inputs = {name: as_axis(name, _number(rest.pop(name))) for name in ("epsilon", "h", "t0")}
     inputs["args"] = rest.pop("args")
     if start is None:

@@ -16,6 +16,7 @@ from lanewise.jaxapi import ClosedJaxpr, x64_enabled
 from .._integrate import integrate
 from .._results import status_code
 from .._solution import Save, Solution
+from ..engine.reads import Reads, reads
 from ..lattices import Given
 from .axes import is_axis, place
 from .plan import Plan, Task
@@ -84,6 +85,7 @@ class Lanes(eqx.Module):
     options: dict[str, Any]
     num_steps: int | None = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
+    reads: Reads = eqx.field(static=True)
 
     def one(self, inside: tuple[Any, ...], index: tuple[Any, ...]) -> dict[str, Any]:
         """One trajectory: the variables of its result. For each dimension `inside` is its index in
@@ -126,6 +128,7 @@ def lanes_of(sweep: Sweep, task_start: tuple[int, ...], values: Any) -> Lanes:
         dict(sweep.options),
         sweep.value(sweep.num_steps, task_start),
         tuple(sweep.of_grid),
+        reads(*sweep.options.values()),
     )
 
 

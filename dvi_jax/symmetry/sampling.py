@@ -10,7 +10,7 @@ import numpy as np
 from .._precision import refuse_double_without_x64
 from .._results import RESULTS
 from .._step import Equations, step
-from .._system import System
+from .._system import System, check_system
 from .._types import Args, Interval
 from ..engine.newton import Newton, RootSolver
 from .basis import BoundBasis, check_step_size
@@ -67,11 +67,7 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
 
 def require_system(system: Any, newton: Any) -> None:
     """Refuse what is no `System` or no `RootSolver`."""
-    if not isinstance(system, System):
-        raise TypeError(
-            f"system must be a dvi.System, got {type(system).__name__}. Wrap the discrete "
-            "Hamiltonian: dvi.System(H_D, force=W)."
-        )
+    check_system(system)
     if not isinstance(newton, RootSolver):
         raise TypeError(f"newton must be a dvi.Newton(...), got {newton!r}.")
 

@@ -1,0 +1,213 @@
+"""Values that a user's function reads from outside: globals, closures, attributes of its object.
+
+They become constants of a compiled program, which must not be used again once they have changed.
+"""
+
+import contextlib
+import functools
+import inspect
+import sys
+import types
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+Reads = tuple[tuple[str, Any], ...]
+"""Names and what identifies their values; it can be compared and hashed."""
+
+_MOST_BYTES = 1 << 20
+"""Of larger NumPy arrays only some entries are compared."""
+
+_MOST_ENTRIES = 1000
+"""Of longer lists and dictionaries only the first entries are compared."""
+
+_LIBRARIES = frozenset(
+    ["jax", "jaxlib", "numpy", "scipy", "equinox", "lanewise", "dvi_jax", "dvi_jax_cli"]
+)
+
+_SIMPLE = (bool, int, float, complex, str, bytes, type(None), np.generic)
+
+
+class _Same:
+    """An object that is compared by identity, and lives as long as it is compared with."""
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.value is self.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+    def __deepcopy__(self, memo: Any) -> "_Same":
+        return self
+
+
+def reads(*values: Any) -> Reads:
+    """What the functions among `values`, and in pytrees and modules of them, read from outside.
+
+    - Numbers, strings, tuples, lists, dictionaries and NumPy arrays are compared by value (of
+      arrays above 1 MiB and of lists above 1000 entries only a part), other objects by identity.
+    - Of an object the attributes are compared whose names occur in the function.
+    - Functions that are called are followed where they belong to no library. What a `jax.jit` of
+      the user's has compiled, files, and values that are computed by a call are not seen.
+    """
+    reader = _Reader()
+    for value in values:
+        for function in _functions(value):
+            reader.follow(function)
+    return tuple(reader.found.items())
+
+
+def changed(before: Reads, now: Reads) -> list[str]:
+    """The names in both whose values differ, with the values where they can be printed."""
+    old = dict(before)
+    return [
+        f"{name} ({_shown(old[name])}, now {_shown(mark)})"
+        for name, mark in now
+        if name in old and old[name] != mark
+    ]
+
+
+def _shown(mark: Any) -> str:
+    return f"{mark[0]} {mark[1]}" if mark[0] in ("value", "length") else f"one {mark[0]}"
+
+
+def _functions(value: Any) -> Iterator[Callable]:
+    """The functions in a pytree, a module, or a container; arrays in it are arguments, not read."""
+    if isinstance(value, eqx.Module):
+        for inner in vars(value).values():
+            yield from _functions(inner)
+        if callable(value):
+            yield inspect.unwrap(type(value).__call__)
+    elif isinstance(value, dict):
+        for inner in value.values():
+            yield from _functions(inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            yield from _functions(inner)
+    elif callable(value) and not isinstance(value, type):
+        yield value
+
+
+class _Reader:
+    """Notes what functions read, in `found`."""
+
+    def __init__(self):
+        self.found: dict[str, Any] = {}
+        self.visited: dict[Any, Any] = {}
+
+    def is_new(self, thing: Any, names: tuple[str, ...] = ()) -> bool:
+        """Whether this is the first visit; the thing is held, so that no other gets its id."""
+        key = id(thing), names
+        new = key not in self.visited
+        self.visited[key] = thing
+        return new
+
+    def follow(self, function: Any) -> None:
+        """Note what a function reads, and those that it calls."""
+        if not self.is_new(function):
+            return
+        if isinstance(function, functools.partial):
+            for inner in (function.func, function.args, function.keywords):
+                self.note("an argument of a partial", inner, ())
+        elif inspect.ismethod(function):
+            code = getattr(function.__func__, "__code__", None)
+            self.note("self", function.__self__, _names(code) if code else ())
+            self.follow(function.__func__)
+        elif isinstance(function, types.FunctionType):
+            self.follow_code(function)
+        elif hasattr(function, "__wrapped__"):
+            self.follow(function.__wrapped__)
+        elif isinstance(function, eqx.Module):
+            for inner in _functions(function):
+                self.follow(inner)
+        elif callable(function) and inspect.ismethod(function.__call__):
+            self.follow(function.__call__)
+
+    def follow_code(self, function: types.FunctionType) -> None:
+        code = function.__code__
+        names = _names(code)
+        for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
+            with contextlib.suppress(ValueError):  # not assigned yet
+                self.note(name, cell.cell_contents, names)
+        for value in (function.__defaults__, function.__kwdefaults__):
+            if value:
+                self.note(f"the defaults of {function.__name__}", value, names)
+        if not _is_of_a_library(function.__module__):
+            outside = function.__globals__
+            for name in names:
+                if name in outside:
+                    self.note(name, outside[name], names)
+
+    def note(self, name: str, value: Any, names: tuple[str, ...]) -> None:
+        """Note one value and what it leads to; `names` are those in the code that reads it."""
+        if isinstance(value, types.ModuleType):
+            if not _is_of_a_library(value.__name__):
+                self.note_attributes(name, value, names)
+        elif isinstance(value, _SIMPLE):
+            self.add(name, ("value", repr(value)))
+        elif isinstance(value, np.ndarray):
+            self.add(name, ("array", value.shape, str(value.dtype), _digest(value)))
+        elif isinstance(value, list | tuple):
+            self.add(name, ("length", len(value)))
+            for i, x in enumerate(value[:_MOST_ENTRIES]):
+                self.note(f"{name}[{i}]", x, names)
+        elif isinstance(value, dict):
+            self.add(name, ("length", len(value)))
+            for key in list(value)[:_MOST_ENTRIES]:
+                self.note(f"{name}[{key!r}]", value[key], names)
+        else:
+            if isinstance(value, jax.Array) or not _is_of_a_library(type(value).__module__):
+                self.add(name, ("object", _Same(value)))
+            if isinstance(value, type):
+                return
+            self.note_attributes(name, value, names)
+            if callable(value):
+                self.follow(value)
+
+    def note_attributes(self, name: str, value: Any, names: tuple[str, ...]) -> None:
+        """Note the attributes of these names: of the object itself, of its class, and what its
+        methods and properties read."""
+        own = getattr(value, "__dict__", {})
+        for attribute in names if self.is_new(value, names) else ():
+            if attribute in own:
+                self.note(f"{name}.{attribute}", own[attribute], names)
+                continue
+            of_class = inspect.getattr_static(type(value), attribute, None)
+            method = of_class.fget if isinstance(of_class, property) else of_class
+            if isinstance(method, types.FunctionType):
+                self.note_attributes(name, value, _names(method.__code__))
+                self.follow(method)
+            elif isinstance(of_class, (*_SIMPLE, np.ndarray)) and of_class is not None:
+                self.note(f"{name}.{attribute}", of_class, names)
+
+    def add(self, name: str, mark: Any) -> None:
+        while name in self.found:  # the same name in another function
+            name += "′"
+        self.found[name] = mark
+
+
+def _digest(array: np.ndarray) -> Any:
+    if array.dtype.hasobject:
+        return _Same(array)
+    if array.nbytes > _MOST_BYTES:
+        array = array.reshape(-1)[:: array.nbytes // _MOST_BYTES + 1]
+    return hash(array.tobytes())
+
+
+@functools.lru_cache(maxsize=4096)
+def _names(code: types.CodeType) -> tuple[str, ...]:
+    """The names of globals and attributes in a function and in those inside of it."""
+    inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
+    return tuple(dict.fromkeys([*code.co_names, *(n for c in inner for n in _names(c))]))
+
+
+@functools.lru_cache(maxsize=4096)
+def _is_of_a_library(module: str | None) -> bool:
+    root = (module or "").partition(".")[0]
+    return root in _LIBRARIES or (root in sys.stdlib_module_names and root != "__main__")
