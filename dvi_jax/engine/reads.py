@@ -24,9 +24,7 @@ _MOST_BYTES = 1 << 20
 _MOST_ENTRIES = 1000
 """Of longer lists and dictionaries only the first entries are compared."""
 
-_LIBRARIES = frozenset(
-    ["jax", "jaxlib", "numpy", "scipy", "equinox", "lanewise", "dvi_jax", "dvi_jax_cli"]
-)
+_LIBRARIES = frozenset(["jax", "jaxlib", "numpy", "scipy", "equinox", "lanewise", "dvi_jax"])
 
 _SIMPLE = (bool, int, float, complex, str, bytes, type(None), np.generic)
 
