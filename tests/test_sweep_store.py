@@ -189,6 +189,21 @@ def test_a_missing_or_short_shard_is_found(copy, undisturbed):
     same(sweep(copy), undisturbed)
 
 
+def test_a_removed_shard_is_not_computed_and_computed_again(copy, undisturbed):
+    shard(copy, "drift", 3).unlink()
+    found = dvi.open_sweep(copy)
+    with pytest.warns(UserWarning, match=r"1 of the finished tasks lack a file .*drift"):
+        assert not found.is_complete
+    with pytest.warns(UserWarning, match="the same call"):
+        assert found.status_counts()["not_computed"] == 100
+    assert (found["status"][12:16] == -1).all()
+    assert np.isnan(found["end"][12:16]).all()
+    assert (found["status"][:12] != -1).all()
+    with pytest.warns(UserWarning, match="computes them again"):
+        same(sweep(copy), undisturbed)
+    assert dvi.open_sweep(copy).is_complete
+
+
 @pytest.mark.slow
 def test_a_full_disk_loses_nothing(tmp_path, undisturbed, monkeypatch):
     path, written = tmp_path / "s.zarr", []

@@ -2,8 +2,8 @@
 
 Each task has one shard in each array. A shard is written under another name, forced to the disk and
 renamed; then the task's record is, which names the shards with their sizes and checksums. A task
-is done when its record is there: whatever dies, at whatever moment, leaves done tasks whole and the
-others to be done again.
+is done when its record is there, and the shards that it names: whatever dies, at whatever moment,
+leaves done tasks whole and the others to be done again.
 """
 
 import contextlib
@@ -156,7 +156,25 @@ class Store(Sink):
         return self.path / TASKS / f"{number // 1000:06d}" / f"{number:09d}.json"
 
     def record(self, number: int) -> dict[str, Any] | None:
-        """What was committed of a task; None if it is not done or its record is damaged."""
+        """What was committed of a task that is done. None: it has no record, a damaged one, or one
+        that names a shard which is not there in full."""
+        found = self._written(number)
+        return found if found is not None and self._lacking(number, found) is None else None
+
+    def _lacking(self, number: int, record: Mapping[str, Any]) -> Path | None:
+        """The first shard of a task that is missing or has another size than its record says."""
+        for name in self.variables:
+            file = self.shard_path(name, number)
+            try:
+                is_there = file.stat().st_size == record["shards"][name]["bytes"]
+            except OSError:
+                is_there = False
+            if not is_there:
+                return file
+        return None
+
+    def _written(self, number: int) -> dict[str, Any] | None:
+        """The record of a task as it was written; None if there is none or it is damaged."""
         try:
             text = self.record_path(number).read_bytes()
         except OSError:
@@ -168,9 +186,18 @@ class Store(Sink):
         return found if found["config_sha256"] == self.sha else None
 
     def done(self) -> list[int]:
-        """The numbers of the tasks that are done."""
+        """The numbers of the tasks that are done. Warns of those that have lost a file."""
         named = sorted(int(f.stem) for f in (self.path / TASKS).glob("*/*.json"))
-        return [i for i in named if self.record(i) is not None]
+        written = ((i, self._written(i)) for i in named)
+        lacking = {i: self._lacking(i, found) for i, found in written if found is not None}
+        if lost := [file for file in lacking.values() if file is not None]:
+            warnings.warn(
+                f"{self.path}: {len(lost)} of the finished tasks lack a file (missing or of "
+                f"another size: {lost[0]}). They count as not computed; the same call of "
+                "dvi.sweep computes them again.",
+                stacklevel=2,
+            )
+        return [i for i, file in lacking.items() if file is None]
 
     def todo(self):
         done = set(self.done())
@@ -254,7 +281,7 @@ class Store(Sink):
         return Verification(sound, bad, self.plan.num_tasks - sound)
 
     def _what_is_wrong(self, number: int, group: Any) -> str:
-        record = self.record(number)
+        record = self._written(number)
         if record is None:
             return "the record is damaged"
         task = self.plan.task(number)
