@@ -38,7 +38,7 @@ class _Masked(BackendArray):
         plan, fill = self.store.plan, self.store.variables[self.name].fill
         own = len(plan.shape)
         wanted = [
-            np.arange(n)[k] if isinstance(k, slice) else np.atleast_1d(k)
+            np.arange(*k.indices(n)) if isinstance(k, slice) else np.atleast_1d(k)
             for k, n in zip(key, self.shape, strict=True)
         ]
         rows, behind = wanted[:own], wanted[own:]

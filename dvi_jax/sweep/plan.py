@@ -1,7 +1,7 @@
 """The grid of a sweep, and how it is cut into tasks."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -97,6 +97,10 @@ class Plan:
         for k, count in zip(place, self.counts, strict=True):
             number = number * count + k
         return number
+
+    def todo(self, done: Container[int]) -> Iterator[int]:
+        """The numbers of the other tasks, made when they are needed: there may be 10⁹ of them."""
+        return (i for i in range(self.num_tasks) if i not in done)
 
     def tasks(self) -> Iterator[Task]:
         return (self.task(i) for i in range(self.num_tasks))

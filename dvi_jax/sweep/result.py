@@ -50,7 +50,7 @@ class SweepResult:
     @property
     def tasks_done(self) -> int:
         """How many of them have their results; of a store all records are read."""
-        return self._plan.num_tasks - len(self._source.todo())
+        return len(self._source.done())
 
     @property
     def is_complete(self) -> bool:

@@ -185,8 +185,8 @@ class Store(Sink):
         found = json.loads(body)
         return found if found["config_sha256"] == self.sha else None
 
-    def done(self) -> list[int]:
-        """The numbers of the tasks that are done. Warns of those that have lost a file."""
+    def done(self):
+        """The numbers of finished tasks, in order. Warns of those that have lost a file."""
         named = sorted(int(f.stem) for f in (self.path / TASKS).glob("*/*.json"))
         written = ((i, self._written(i)) for i in named)
         lacking = {i: self._lacking(i, found) for i, found in written if found is not None}
@@ -198,10 +198,6 @@ class Store(Sink):
                 stacklevel=2,
             )
         return [i for i, file in lacking.items() if file is None]
-
-    def todo(self):
-        done = set(self.done())
-        return [i for i in range(self.plan.num_tasks) if i not in done]
 
     def is_done(self, number):
         return self.record(number) is not None
