@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import zlib
 from collections import Counter
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from sweep_child import sweep
 
 import dvi_jax as dvi
 from dvi_jax.sweep import store as stores
+from dvi_jax.sweep.identity import digest
 from dvi_jax.sweep.store import Store
 
 VARIABLES = ("drift", "end", "t", "q", "p", "status", "failed_step", "residual")
@@ -161,7 +163,7 @@ def test_a_flipped_bit_does_not_pass_for_a_number(copy):
     """Whoever reads without verifying is told by the codec."""
     file = shard(copy)
     flip(file, len(file.read_bytes()) // 3)
-    with pytest.raises(Exception, match=r"(?i)checksum|zstd|decompress|corrupt"):
+    with pytest.raises(dvi.StoreError, match=r"drift/c/3/0: is damaged .*verify\(\)"):
         dvi.open_sweep(copy)["drift"]
 
 
@@ -251,6 +253,126 @@ def test_what_is_no_store(tmp_path, copy):
     meta.write_text(text[:100])
     with pytest.raises(dvi.StoreError, match="cannot be read as that of a sweep"):
         sweep(copy)
+
+
+@pytest.mark.parametrize("path", ["a\0b", "x" * 300, "y/" * 3000])
+def test_a_path_that_no_directory_can_have(path, tmp_path):
+    for use in (dvi.open_sweep, sweep):
+        with pytest.raises(
+            dvi.StoreError, match=r"cannot be the path of a store .*: give the path"
+        ):
+            use(f"{tmp_path}/{path}")
+
+
+@pytest.mark.parametrize("key", ["../../x", "a/b"])
+def test_a_key_of_args_that_no_file_can_have(key, tmp_path):
+    axes = {name: dvi.Axis("x", [1.0, 2.0]) for name in (key, "k")}
+    with pytest.raises(ValueError, match="cannot be the name of an array in a store"):
+        dvi.sweep(
+            sweep_child.SYSTEM, [0.0], [1.0], args=axes, h=0.1, num_steps=2,
+            save=dvi.Save(final=True), store=tmp_path / "s.zarr",
+        )  # fmt: skip
+    assert not list(tmp_path.iterdir())
+
+
+def test_foreign_files_among_the_records_are_left_alone(copy):
+    folder = record(copy).parent
+    foreign = [folder / name for name in ("._000000003.json", "notes.json", "000000099.json")]
+    for file in foreign:
+        file.write_bytes(record(copy).read_bytes())
+    assert dvi.open_sweep(copy).verify() == (12, {}, 0)
+    assert sweep(copy).is_complete
+    assert all(file.exists() for file in foreign)
+
+
+def edited(path, change):
+    """Change the description of a store and its configuration, whose checksum becomes right."""
+    meta = path / "zarr.json"
+    content = json.loads(meta.read_text())
+    config = json.loads(content["attributes"]["config"])
+    change(config, content)
+    content["attributes"] |= {"config": json.dumps(config), "config_sha256": digest(config)}
+    meta.write_text(json.dumps(content))
+
+
+EDITS = {
+    "no length": lambda config, _: config.pop("dims"),
+    "negative length": lambda config, _: config["dims"].update(epsilon=-5),
+    "huge length": lambda config, _: config["dims"].update(epsilon=10**12),
+    "tasks of nothing": lambda config, _: config.update(chunk=[0, 0]),
+    "one dimension less": lambda config, _: config.update(chunk=[4]),
+    "variables of another kind": lambda config, _: config.update(variables={"drift": 3}),
+    "one variable more": lambda config, _: config["variables"].update(x=["float64", [], []]),
+    "another shape": lambda _, meta: meta["consolidated_metadata"]["metadata"]["drift"].update(
+        shape=[2, 2]
+    ),
+    "units that are no table": lambda _, meta: meta["attributes"].update(units="{"),
+    "an array": lambda _, meta: meta.update(node_type="array"),
+}
+
+
+@pytest.mark.parametrize("change", EDITS.values(), ids=EDITS.keys())
+def test_an_edited_description_is_refused_and_loses_nothing(copy, tmp_path, change):
+    sound = (copy / "zarr.json").read_text()
+    edited(copy, change)
+    with pytest.raises(dvi.StoreError, match=r"zarr\.json .*edited.* Restore the file"):
+        dvi.open_sweep(copy)
+    (copy / "zarr.json").write_text(sound)
+    assert dvi.open_sweep(copy).is_complete
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda found: {},
+        lambda found: [],
+        lambda found: found | {"shards": {}},
+        lambda found: found | {"shards": [1]},
+        lambda found: found | {"statuses": {"wonderful": 100}},
+        lambda found: found | {"size": [-3, 25]},
+        lambda found: found | {"task": 4},
+    ],
+)
+def test_an_edited_record_is_a_task_to_do(copy, change):
+    file = record(copy)
+    body = json.dumps(change(Store.open(copy).record(3))).encode()
+    file.write_bytes(body + f"\n{zlib.crc32(body):08x}\n".encode())
+    found = dvi.open_sweep(copy)
+    assert found.tasks_done == 11
+    assert found.status_counts()["not_computed"] == 100
+    assert found.verify().bad == {3: "the record is damaged"}
+
+
+@pytest.mark.parametrize("damage", ["removed", "cut", "flipped"])
+def test_a_damaged_coordinate_is_never_a_number_and_written_again(copy, undisturbed, damage):
+    file = copy / "epsilon" / "c" / "0"
+    if damage == "removed":
+        file.unlink()
+    elif damage == "cut":
+        file.write_bytes(file.read_bytes()[:20])
+    else:
+        flip(file, 12)
+    with pytest.raises(dvi.StoreError, match=r"the coordinate 'epsilon' .*The same call of dvi"):
+        dvi.open_sweep(copy)
+    same(sweep(copy), undisturbed)
+    np.testing.assert_array_equal(dvi.open_sweep(copy)["epsilon"], undisturbed["epsilon"])
+
+
+def test_a_lost_description_comes_from_a_new_store_of_the_same_call(copy, tmp_path, undisturbed):
+    (copy / "zarr.json").unlink()
+    for use in (dvi.open_sweep, sweep):
+        with pytest.raises(dvi.StoreError, match=r"was lost\. Restore the file .*copy it from"):
+            use(copy)
+
+    def stop(progress):
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        sweep(tmp_path / "new.zarr", progress=stop)
+    shutil.copy(tmp_path / "new.zarr" / "zarr.json", copy)
+    found = dvi.open_sweep(copy)
+    assert found.is_complete
+    same(found, undisturbed)
 
 
 def test_a_store_of_another_format(copy):

@@ -50,6 +50,12 @@ class Plan:
     dims: Mapping[str, int]
     chunk: tuple[int, ...]
 
+    def __post_init__(self):
+        lengths = (*self.dims.values(), *self.chunk)
+        is_whole = all(isinstance(n, int | np.integer) and n >= 1 for n in lengths)
+        if not is_whole or len(self.dims) != len(self.chunk):
+            raise ValueError(f"no grid of lengths {self.dims} can have tasks of {self.chunk}.")
+
     @property
     def shape(self) -> tuple[int, ...]:
         return tuple(self.dims.values())
