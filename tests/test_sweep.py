@@ -508,3 +508,9 @@ def test_more_than_memory_holds_needs_a_store():
     start = starts.Random(10**12, LOW, HIGH)
     with pytest.raises(ValueError, match=r"GiB of memory.*give store="):
         sweep(start=start)
+
+
+def test_the_memory_for_results_is_that_of_the_process(monkeypatch):
+    monkeypatch.setattr(_sweep, "machine_memory", lambda: 1000)  # the limit of a container, say
+    with pytest.raises(ValueError, match=r"GiB of memory.*give store="):
+        sweep(start=starts.Random(100, LOW, HIGH))
