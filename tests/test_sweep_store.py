@@ -1,17 +1,21 @@
 """The store of sweeps: resuming, dying at any moment, damage of every kind."""
 
+import itertools
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+import warnings
 import zlib
 from collections import Counter
 from pathlib import Path
 
+import faults
 import numpy as np
 import pytest
 import sweep_child
@@ -226,6 +230,108 @@ def test_a_full_disk_loses_nothing(tmp_path, undisturbed, monkeypatch):
     assert not found.verify().bad
     assert not list(path.rglob("*.tmp"))
     same(sweep(path), undisturbed)
+
+
+@pytest.mark.parametrize(
+    ("how", "files", "length"),
+    [
+        ("killed", 0, 0),
+        ("killed", 4, 1),
+        ("killed", 8, 200),
+        ("full", 7, 30),
+        ("full", 8, 0),
+        ("permission", 0, 0),
+    ],
+)
+def test_a_task_that_ends_at_any_byte_is_done_again(
+    copy, undisturbed, monkeypatch, how, files, length
+):
+    """Its eight shards are written, then its record."""
+    record(copy).unlink()
+    with monkeypatch.context() as patched:
+        faults.in_write(patched, how, length, after=files)
+        with pytest.raises((dvi.StoreError, faults.KilledError)) as caught:
+            sweep(copy)
+    assert how == "killed" or "the same call goes on" in str(caught.value)
+    assert len(list(copy.rglob("*.tmp"))) == (how == "killed")
+    found = dvi.open_sweep(copy)
+    assert found.tasks_done == 11
+    assert (found["status"][12:16] == -1).all()
+    same(sweep(copy), undisturbed)
+    assert dvi.open_sweep(copy).verify() == (12, {}, 0)
+
+
+@pytest.mark.parametrize("how", ["full", "killed"])
+def test_a_store_that_is_not_made_to_its_end_is_not_there(tmp_path, monkeypatch, how):
+    path = tmp_path / "s.zarr"
+    errors = {"full": OSError(28, "No space left on device"), "killed": faults.KilledError()}
+    with monkeypatch.context() as patched:
+
+        def fail(*_):
+            raise errors[how]
+
+        patched.setattr(os, "rename", fail)
+        if how == "killed":
+            patched.setattr(shutil, "rmtree", lambda *_, **__: None)
+        with pytest.raises((dvi.StoreError, faults.KilledError), match=r"cannot be made|^$"):
+            sweep(path)
+    assert not path.exists()
+    assert len(list(tmp_path.iterdir())) == (how == "killed")
+    assert sweep(path).is_complete
+
+
+def test_verify_clears_away_what_dead_processes_had_begun(copy):
+    old, new = (shard(copy).with_name(f".3.{k}.tmp") for k in ("old", "new"))
+    for file in (old, new):
+        file.write_bytes(b"some of it")
+    os.utime(old, (1, 1))
+    assert dvi.open_sweep(copy).verify() == (12, {}, 0)
+    assert not old.exists()
+    assert new.exists()  # another process may be writing it
+
+
+def test_no_removed_file_is_taken_for_results(copy, tmp_path, undisturbed):
+    """One file of each kind at a time: metadata, records, shards of each variable, coordinates."""
+    of_task = [record(copy), *(shard(copy, name) for name in VARIABLES)]
+    others = [*copy.glob("zarr.json"), *copy.glob("*/zarr.json"), *copy.glob("[es]*/c/0"),
+              copy / stores.CLAIMS]  # fmt: skip
+    refused = {}
+    for file in filter(Path.is_file, (*of_task, *others)):
+        file.rename(tmp_path / "gone")
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the task lacks a file
+                found = dvi.open_sweep(copy)
+                computed = found["status"] >= 0
+                assert computed.sum() == (1100 if file in of_task else 1200)
+                for name in ("drift", "end", "failed_step"):
+                    np.testing.assert_array_equal(
+                        found[name][computed], undisturbed[name][computed]
+                    )
+                np.testing.assert_array_equal(found["epsilon"], undisturbed["epsilon"])
+        except dvi.StoreError as error:
+            refused[file] = str(error)
+        (tmp_path / "gone").rename(file)
+    assert not refused.keys() & set(of_task)
+    assert {f.relative_to(copy).parts[0] for f in refused} == {"epsilon", "start", "zarr.json"}
+    assert all(re.search("Restore the file|writes it again", said) for said in refused.values())
+
+
+def test_a_clock_that_is_set_back_changes_nothing(copy, undisturbed, monkeypatch):
+    record(copy).unlink()
+    now = itertools.count(2e9, -3600)
+    monkeypatch.setattr(time, "time", lambda: next(now))
+    same(sweep(copy), undisturbed)
+    assert all(r["seconds"] >= 0 for r in dvi.open_sweep(copy).records())
+
+
+def test_a_description_that_may_not_be_read(copy, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_text", refuse)
+    with pytest.raises(dvi.StoreError, match=r"zarr.json cannot be read \(Permission denied\)"):
+        dvi.open_sweep(copy)
 
 
 def test_a_directory_that_cannot_be_written(copy, tmp_path, monkeypatch):

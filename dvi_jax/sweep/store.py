@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._files import TEMPORARY, publish, sync
 from .._results import STATUS_NAMES
 from .identity import FORMAT, differences, digest
 from .plan import Plan, Task
@@ -35,7 +36,6 @@ except ImportError:  # Windows: processes there do not divide a sweep between th
     fcntl = None
 
 TASKS, CLAIMS = ".tasks", ".claims"
-_TEMPORARY = ".tmp"
 _CHUNK_BYTES = 2**22
 """Of an inner chunk of a shard: what is read at least to see one number."""
 
@@ -103,7 +103,12 @@ class Store(Sink):
         except FileNotFoundError:
             lost = f" The file was lost. {_RESTORE}" if (path / TASKS).is_dir() else ""
             raise StoreError(f"{path}: there is no sweep here (no zarr.json).{lost}") from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except OSError as error:
+            raise StoreError(
+                f"{path}: zarr.json cannot be read ({error.strerror or error}): look after its "
+                "permissions and the disk."
+            ) from None
+        except (ValueError, KeyError, TypeError) as error:
             raise StoreError(
                 f"{path}: zarr.json cannot be read as that of a sweep ({error!r}). {_RESTORE}"
             ) from None
@@ -244,9 +249,14 @@ class Store(Sink):
             try:
                 self._coordinate(name)
             except StoreError:
-                with zarr.config.set({"array.write_empty_chunks": True}):
-                    group: Any = zarr.open_group(self.path, mode="r+", zarr_format=3)
-                    group[name][...] = _storable(values)
+                try:
+                    with zarr.config.set({"array.write_empty_chunks": True}):
+                        group: Any = zarr.open_group(self.path, mode="r+", zarr_format=3)
+                        group[name][...] = _storable(values)
+                except OSError as error:
+                    raise StoreError(
+                        f"{self.path}: the coordinate {name!r} cannot be written again: {error}."
+                    ) from error
 
     # --- tasks --------------------------------------------------------------------------------
 
@@ -418,7 +428,7 @@ class Store(Sink):
             for name in names:
                 file = Path(root, name)
                 with contextlib.suppress(OSError):
-                    if name.endswith(_TEMPORARY) and file.stat().st_mtime < before:
+                    if name.endswith(TEMPORARY) and file.stat().st_mtime < before:
                         file.unlink()
 
 
@@ -437,45 +447,6 @@ def _located(path: str | os.PathLike) -> Path:
             "directory."
         ) from None
     return found
-
-
-def publish(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, on the disk once this returns."""
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{_TEMPORARY}")
-    made = _make_folders(path.parent)
-    try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
-    for folder in (path.parent, *made):
-        _sync(folder)
-
-
-def _make_folders(folder: Path) -> list[Path]:
-    """Make a folder and those above it; the folders that have new entries and must be synced."""
-    missing = []
-    while not folder.exists():
-        missing.append(folder)
-        folder = folder.parent
-    for new in reversed(missing):
-        new.mkdir(exist_ok=True)
-    return [new.parent for new in missing]
-
-
-def _sync(folder: Path) -> None:
-    if os.name == "nt":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 # --- claims -------------------------------------------------------------------------------------
@@ -572,7 +543,7 @@ def _make(path, config, variables, coordinates, attributes) -> None:
             "from a key of args or from an observable: rename it."
         )
     plan = Plan(dict(config["dims"]), tuple(config["chunk"]))
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{_TEMPORARY}")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         group = zarr.create_group(
@@ -613,7 +584,7 @@ def _make(path, config, variables, coordinates, attributes) -> None:
         except OSError:  # another process was faster, or the directory holds something
             if not (path / "zarr.json").exists():
                 raise
-        _sync(path.parent)
+        sync(path.parent)
     except OSError as error:
         raise StoreError(f"{path}: cannot be made: {error}.") from error
     finally:

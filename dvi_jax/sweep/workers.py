@@ -100,12 +100,12 @@ def compute(
     program: Program, task: Task, device: Any
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The results of a task and what its record says about them."""
-    began = time.time()
+    began = time.monotonic()  # the clock of the machine may be set back meanwhile
     results = program(task, device)
     codes, counts = np.unique(results[STATUS], return_counts=True)
     facts = {
         "statuses": {STATUS_NAMES[c]: int(n) for c, n in zip(codes, counts, strict=True)},
-        "seconds": round(time.time() - began, 3),
+        "seconds": round(time.monotonic() - began, 3),
         "finished": time.time(),
         "host": os.uname().nodename if hasattr(os, "uname") else "",
         "pid": os.getpid(),
