@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -566,6 +567,18 @@ def test_the_memory_of_this_machine_is_known(monkeypatch, tmp_path):
     (tmp_path / "memory.max").write_text("12345678\n")
     monkeypatch.setattr(_memory.Path, "read_text", _read_text(_memory.Path.read_text))
     assert 12345678 in _memory._limits()
+
+
+def test_results_on_other_devices_have_the_memory_of_these(monkeypatch):
+    def device(limit):
+        return SimpleNamespace(memory_stats=lambda: {"bytes_limit": limit} if limit else None)
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    for devices, expected in (([device(5), device(7)], 12), ([device(5), device(0)], None)):
+        monkeypatch.setattr(jax, "devices", lambda found=devices: found)
+        _memory._devices_memory.cache_clear()
+        assert _memory.results_memory() == expected
+    _memory._devices_memory.cache_clear()
 
 
 def _read_text(read):
