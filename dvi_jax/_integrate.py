@@ -14,12 +14,14 @@ from jaxtyping import Array, PyTree
 
 import lanewise
 from lanewise import Layout
-from lanewise.jaxapi import is_traced
+from lanewise.jaxapi import batch_size, is_traced
+from lanewise.primitive import generates
 
 from ._adjoints import AbstractAdjoint, Outcome
 from ._arithmetic import Arithmetic, FixedPoint, FloatingPoint
 from ._dense import Curve, at_times, crossings, stopped
 from ._extended import run_extended
+from ._memory import results_memory
 from ._precision import refuse_double_without_x64
 from ._results import RESULTS, IntegrationError, status_name
 from ._reversible import Reversible
@@ -118,7 +120,8 @@ def integrate(
 
     **Returns** a `Solution`; time is the first axis of what it saved.
 
-    **Raises** `ValueError` or `TypeError` for input that cannot be meant (shapes, types, values);
+    **Raises** `ValueError` or `TypeError` for input that cannot be meant (shapes, types, values),
+    and for results that need more memory than there is;
     `IntegrationError` when the trajectory fails and `throw` is True, with the status, the step
     and the residual (inside jit or vmap an equinox runtime error with the status).
 
@@ -192,14 +195,16 @@ def integrate(
     equations, q0, p0 = arithmetic.prepare(method, equations, Interval(t0, t0 + h, h), q0, p0)
     seen = reads(observe, stop, lattice)
     task = Task(equations, method, lattice, observe, t0, h, arithmetic, stop, seen)
-    _check_observe(task, q0, p0)
+    beside = _check_observe(task, q0, p0)
     plan = make_plan(save, num_steps)
+    leaves = jax.tree.leaves((task, q0, p0))
+    _check_memory(save, plan, q0, beside, leaves, layout)
     if save.ts is not None:
         task = eqx.tree_at(
             lambda task: task.observe, task, _with_times(save, task, num_steps),
             is_leaf=lambda x: x is None,
         )  # fmt: skip
-    traced = any(is_traced(x) for x in jax.tree.leaves((task, q0, p0)))
+    traced = any(is_traced(x) for x in leaves)
     if not traced and system.force is not None and goes_backwards(method):
         first = task.interval(jnp.asarray(0, jnp.int32))
         warn_of_dissipation(method, equations, first, q0, p0)
@@ -370,6 +375,29 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     )
 
 
+def _check_memory(
+    save: Save, plan: Plan, q0: Array, beside: int, leaves: list[Any], layout: Layout
+) -> None:
+    """Refuse results that no memory can hold; `beside`: bytes of observables at a save point."""
+    memory = results_memory()
+    saved = plan.num_blocks + 1 + plan.save_tail if save.ts is None else save.ts.shape[0]
+    each = (2 * q0.size + 2) * q0.dtype.itemsize + beside  # q, p, t and h
+    count, is_compiled = batch_size(leaves)
+    if memory is None or count * saved * each <= memory:
+        return
+    if is_compiled and (layout.form == "arrays" or not generates()):
+        return  # XLA does not compute results that the function around this one does not use
+    batch = f" of each of {count} trajectories" if count > 1 else ""
+    raise ValueError(
+        f"the results need {count * saved * each / 2**30:.3g} GiB of memory ({saved} saved states"
+        f"{batch}), and there are {memory / 2**30:.3g} GiB. Save fewer states: "
+        "save=dvi.Save(every=m), dvi.Save(final=True) or dvi.Save(ts=times). A reduction such as "
+        "dvi.MaxDrift(function) observes every step in constant memory"
+        + (", and dvi.sweep(store=...) writes results of many trajectories to disk." if batch
+           else ".")
+    )  # fmt: skip
+
+
 def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
     """A start as real arrays of one shape and precision, or an error that says what is wrong."""
     q, p = _real_array("q0", q0), _real_array("p0", p0)
@@ -479,8 +507,12 @@ def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> Non
     eqx.filter_eval_shape(leaf.start, jnp.zeros(2 * q0.size, q0.dtype))  # counts and units
 
 
-def _check_observe(task: Task, q0: Array, p0: Array) -> None:
-    """Refuse observables that are not functions of a step with an array for a value."""
+def _check_observe(task: Task, q0: Array, p0: Array) -> int:
+    """Refuse observables that are not functions of a step with an array for a value.
+
+    **Returns** the bytes of those that stand alone, at one save point.
+    """
+    size = 0
     for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
         if isinstance(leaf, type) and issubclass(leaf, Deviations | Running):
             raise TypeError(
@@ -522,3 +554,6 @@ def _check_observe(task: Task, q0: Array, p0: Array) -> None:
                 f"Range compares values, which complex numbers have no order for; {called} returns "
                 "them. Take the real and imaginary parts, or the absolute value."
             )
+        if not isinstance(leaf, Reduction):
+            size += int(np.prod(np.shape(out), dtype=int)) * jnp.result_type(out).itemsize
+    return size

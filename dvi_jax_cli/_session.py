@@ -144,6 +144,8 @@ class Session:
             return "bad input", str(error)
         if isinstance(error, (OSError, *_known("dvi_jax", "StoreError"))):
             return "failed", "\n".join(filter(None, (f"{self.unwritten}: {error}", self.hint)))
+        if isinstance(error, MemoryError):
+            return "failed", f"the machine does not have the memory for this: {error}"
         return "fault", fault(error, self.debug)
 
 

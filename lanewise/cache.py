@@ -2,9 +2,9 @@
 
 The folder is ``$DVI_JAX_CACHE`` if that variable is set (``off`` switches the cache off), else
 ``dvi_jax`` in ``$XDG_CACHE_HOME`` or ``~/.cache``. Code is loaded only from a folder that belongs
-to the user and that nobody else can write to. A file begins with a checksum of the rest; one that
-is damaged is made anew. Files are written under another name first, so that a process never sees
-half of one; the oldest are removed when the folder grows beyond `LARGEST`.
+to the user and that nobody else can write to. A file begins with a checksum of its name and of the
+rest; one that is damaged is made again. Files are written under another name first, so that a
+process never sees half of one; the oldest are removed when the folder grows beyond `LARGEST`.
 """
 
 import contextlib
@@ -67,11 +67,16 @@ def read(name: str) -> bytes | None:
     except OSError:
         return None
     mark, check, code = content[:8], content[8:40], content[40:]
-    if mark != _MARK or hashlib.sha256(code).digest() != check:
+    if mark != _MARK or _checksum(name, code) != check:
         return None
     with contextlib.suppress(OSError):
         os.utime(path)  # the oldest are removed first: it was of use now
     return code
+
+
+def _checksum(name: str, code: bytes) -> bytes:
+    """Of the code and of its name, so that code under another name is not taken for its own."""
+    return hashlib.sha256(name.encode() + b"\0" + code).digest()
 
 
 def write(name: str, code: bytes) -> None:
@@ -86,7 +91,7 @@ def write(name: str, code: bytes) -> None:
         handle, made = tempfile.mkstemp(prefix=".new-", dir=where)
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(_MARK + hashlib.sha256(code).digest() + code)
+                file.write(_MARK + _checksum(name, code) + code)
             os.replace(made, where / name)
         except OSError:
             os.unlink(made)

@@ -1,6 +1,7 @@
 """The few names of JAX that have moved between releases, or are not public: all of them, here."""
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ __all__ = [
     "Jaxpr",
     "Literal",
     "backends_are_initialized",
+    "batch_size",
     "bodies",
     "drops_outputs",
     "has_derivative",
@@ -32,6 +34,25 @@ __all__ = [
 def is_traced(x: object) -> bool:
     """Whether `x` stands for a value that is not known yet (inside jit, vmap, grad, …)."""
     return isinstance(x, Tracer)
+
+
+def batch_size(values: Iterable[Any]) -> tuple[int, bool]:
+    """How many elements the batches of `vmap` have that these values stand for, all together; and
+    whether the values are those of a function that is compiled, around which there may be more."""
+    sizes: dict[Any, int] = {}
+    is_compiled = False
+    for x in values:
+        while isinstance(x, Tracer):
+            inner: Any = x
+            if isinstance(axis := getattr(inner, "batch_dim", None), int):
+                sizes[id(getattr(inner, "_trace", None))] = inner.val.shape[axis]
+                x = inner.val
+            elif hasattr(inner, "primal"):
+                x = inner.primal
+            else:
+                is_compiled = True
+                break
+    return math.prod(sizes.values()), is_compiled
 
 
 def x64_enabled() -> bool:

@@ -13,7 +13,7 @@ import dvi_jax as dvi
 ROOT = Path(dvi.__file__).parent
 FLOORS = [
     ["_types", "_results"],
-    ["_precision", "_progress"],
+    ["_precision", "_progress", "_memory", "_files"],
     ["engine"],
     ["_system", "_solution"],
     ["_discretise", "_adapters", "_energies", "_step"],

@@ -20,7 +20,7 @@ import dvi_jax_cli._names as names
 from dvi_jax import certify, run, systems
 from dvi_jax_cli import app
 from dvi_jax_cli._new import notebook
-from dvi_jax_cli._session import CODES, version
+from dvi_jax_cli._session import CODES, Session, version
 
 ROOT = Path(dvi.__file__).parent.parent
 COMMANDS = [
@@ -534,3 +534,9 @@ def test_a_standard_output_that_is_closed_is_no_fault():
 def test_the_line_to_begin_with_can_be_copied(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "cd 'a spring' &&" in command("new", "a spring").stdout
+
+
+def test_too_little_memory_is_a_failure_with_its_size():
+    kind, said = Session(False, False, False).judge(MemoryError("Unable to allocate 7.28 TiB"))
+    assert kind == "failed"
+    assert "does not have the memory for this: Unable to allocate 7.28 TiB" in said

@@ -2,6 +2,7 @@
 
 import functools
 
+import faults
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -459,7 +460,7 @@ def test_an_invariant_leads_back_to_a_symmetry():
 
 
 @pytest.mark.slow
-def test_a_discovery_is_saved_and_loaded(tmp_path):
+def test_a_discovery_is_saved_and_loaded(tmp_path, monkeypatch):
     for d, basis in (
         (found("van_der_pol", 6, 2), dvi.Polynomials(6)),
         (found("cubic", 8, 1), dvi.Polynomials(8)),
@@ -479,13 +480,20 @@ def test_a_discovery_is_saved_and_loaded(tmp_path):
     dvi.discover_invariants(dvi.System(H_D), named, h=0.1, samples=box(1, 20)).save(path)
     with pytest.raises(ValueError, match="other values: 'f' differs"):
         dvi.Discovery.load(path, dvi.Basis({"f": lambda q, p: q @ q}))
+    before = path.read_bytes()
+    again = dvi.Discovery.load(path, named)
+    with monkeypatch.context() as patched:
+        faults.in_write(patched, "full", 100)
+        with pytest.raises(OSError, match="No space left"):
+            again.save(path)
+    assert path.read_bytes() == before
     np.save(path.with_suffix(".npy"), np.zeros(3))
-    with pytest.raises(ValueError, match="no file that Discovery"):
+    with pytest.raises(ValueError, match="is no discovery of this package, or is damaged"):
         dvi.Discovery.load(path.with_suffix(".npy"), named)
     with pytest.raises(FileNotFoundError, match="there is no discovery at"):
         dvi.Discovery.load(path.with_suffix(".none"), named)
     path.write_bytes(b"something else")
-    with pytest.raises(ValueError, match="no file that Discovery"):
+    with pytest.raises(ValueError, match="is no discovery of this package, or is damaged"):
         dvi.Discovery.load(path, dvi.Polynomials(4))
 
 

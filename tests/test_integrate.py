@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import pytest
 from helpers import METHODS, SYSTEMS, non_separable
 
 import dvi_jax as dvi
-from dvi_jax import _rollout
+from dvi_jax import _integrate, _memory, _rollout
 
 
 def H(t0, t1, q0, p1, args):
@@ -521,3 +522,64 @@ def test_the_step_is_traced_once(monkeypatch):
         dvi.integrate(system, q[0], q[0], h=0.1, num_steps=10)
     assert len(asked) <= before + 2
     assert len(taken) <= 3
+
+
+def final_position(q0, save=dvi.Save()):
+    return dvi.integrate(OSCILLATOR, q0, START[1], h=0.1, num_steps=9, save=save).qs[-1]
+
+
+def test_results_that_no_memory_can_hold_are_refused_before_the_run(monkeypatch):
+    """Ten saved states of two degrees of freedom: 10 · (2 + 2 + t + h) · 8 bytes = 480 bytes."""
+    monkeypatch.setattr(_memory, "machine_memory", lambda: 479)
+    monkeypatch.setattr(_integrate, "_whole", None)  # nothing is traced or compiled for it
+    with pytest.raises(ValueError, match=r"need 4.47e-07 GiB .*\(10 saved states\).*dvi.Save\("):
+        run(num_steps=9)
+    with pytest.raises(ValueError, match="GiB of memory"):
+        run(num_steps=2**31 - 2)
+    monkeypatch.setattr(_memory, "machine_memory", lambda: 480 + 10 * 16 - 1)
+    with pytest.raises(ValueError, match="GiB of memory"):
+        run(num_steps=9, observe=position)  # 10 · 2 · 8 bytes more
+
+
+def test_results_of_a_batch_are_counted_together(monkeypatch):
+    monkeypatch.setattr(_memory, "machine_memory", lambda: 3 * 4 * 480 - 1)
+    starts = jnp.ones((3, 4, 2))
+    batch = jax.vmap(jax.vmap(final_position))
+    for f in (batch, jax.jit(batch), jax.grad(lambda x: batch(x).sum()),
+              jax.vmap(jax.vmap(jax.grad(lambda x: final_position(x).sum())))):  # fmt: skip
+        with pytest.raises(ValueError, match=r"10 saved states of each of 12 trajectories"):
+            f(starts)
+
+
+def test_results_that_fit_are_computed(monkeypatch):
+    monkeypatch.setattr(_memory, "machine_memory", lambda: 4 * 480)
+    assert jax.vmap(final_position)(jnp.ones((4, 2))).shape == (4, 2)
+    monkeypatch.setattr(_memory, "machine_memory", lambda: 2 * 48)
+    assert final_position(jnp.ones(2), dvi.Save(final=True)).shape == (2,)
+    monkeypatch.setattr(_memory, "machine_memory", lambda: None)  # not known
+    assert final_position(jnp.ones(2)).shape == (2,)
+
+
+def test_the_memory_of_this_machine_is_known(monkeypatch, tmp_path):
+    found = _memory.machine_memory()
+    assert found is None or found > 2**28
+    monkeypatch.setattr(_memory, "_CGROUPS", tmp_path)
+    (tmp_path / "memory.max").write_text("12345678\n")
+    monkeypatch.setattr(_memory.Path, "read_text", _read_text(_memory.Path.read_text))
+    assert 12345678 in _memory._limits()
+
+
+def test_results_on_other_devices_have_the_memory_of_these(monkeypatch):
+    def device(limit):
+        return SimpleNamespace(memory_stats=lambda: {"bytes_limit": limit} if limit else None)
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    for devices, expected in (([device(5), device(7)], 12), ([device(5), device(0)], None)):
+        monkeypatch.setattr(jax, "devices", lambda found=devices: found)
+        _memory._devices_memory.cache_clear()
+        assert _memory.results_memory() == expected
+    _memory._devices_memory.cache_clear()
+
+
+def _read_text(read):
+    return lambda path: "0::/job/step\n" if str(path) == "/proc/self/cgroup" else read(path)

@@ -1,6 +1,7 @@
 """Generated code: equal bits wherever a trajectory is computed, and everything around the code."""
 
 import ctypes
+import errno
 import os
 import subprocess
 import sys
@@ -968,6 +969,38 @@ def test_a_damaged_file_is_replaced(folder, made, damage):
     file.write_bytes(damage(good))
     assert number(41) == 41
     assert (file.read_bytes(), len(made)) == (good, 2)
+
+
+def test_code_under_the_name_of_other_code_is_not_loaded(folder, made):
+    number(41)
+    (one,) = folder.iterdir()
+    number(42)
+    (two,) = (p for p in folder.iterdir() if p != one)
+    two.write_bytes(one.read_bytes())
+    assert (number(42), len(made)) == (42, 3)
+
+
+@pytest.mark.parametrize("length", [0, 20, 200])
+def test_a_disk_that_is_full_at_any_byte_leaves_no_file(folder, made, monkeypatch, length):
+    class Cut:
+        def __init__(self, handle, mode):
+            self.file = open(handle, mode)  # noqa: SIM115
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            self.file.close()
+
+        def write(self, content):
+            self.file.write(content[:length])
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fdopen", Cut)
+        assert (number(41), names(folder)) == (41, [])
+    (folder / ".new-left-by-a-dead-process").write_bytes(b"some of it")
+    assert (number(41), number(41), len(made)) == (41, 41, 2)
 
 
 @pytest.mark.parametrize("off", ["off", "OFF", "0"])

@@ -200,6 +200,7 @@ REFUSED = [
         "args: K must be one real number, got an array of shape (2,)",
         "args that fit",
     ),
+    (KEPLER + "steps = 5\n[observables]\n'../x' = 'energy'", "the name '../x'", "without /"),
     (KEPLER + 'steps = 5\n[observables]\na = "enrgy"', "observables.a: 'enrgy'", "mean energy?"),
     (KEPLER + 'steps = 5\n[observables]\na = "Max(energy)"', "observables.a: 'Max(", "MaxDrift"),
     (KEPLER + 'steps = 5\n[observables]\na = "own.py:number"', "own.py:number' is int", "function"),

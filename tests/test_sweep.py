@@ -217,6 +217,29 @@ def test_progress_counts_everything():
     assert seen[-1].rate > 0
 
 
+@pytest.mark.parametrize("in_store", [False, True])
+def test_the_start_of_a_sweep_takes_no_longer_for_more_tasks(in_store, tmp_path, monkeypatch):
+    """The first report comes before the work; the tasks are not listed or counted for it."""
+
+    class FirstReportError(Exception):
+        pass
+
+    def first(progress):
+        seen.append(progress)
+        raise FirstReportError
+
+    seen, made, make = [], [], Plan.task
+    monkeypatch.setattr(Plan, "task", lambda self, i: made.append(i) or make(self, i))
+    start = dvi.starts.Random(100_000, (Q, P), (Q, P))
+    with pytest.raises(FirstReportError):
+        dvi.sweep(
+            SYSTEM, start=start, h=0.1, num_steps=3, args={"k": 1.0}, observe=OBSERVE,
+            lanes_per_task=1, progress=first, store=tmp_path / "s.zarr" if in_store else None,
+        )  # fmt: skip
+    assert seen[0].num_tasks == 100_000
+    assert len(made) < 10
+
+
 @pytest.fixture
 def ctrl_c():
     """Ctrl-C raises, also where tests were started in the background, with it ignored."""
@@ -485,3 +508,9 @@ def test_more_than_memory_holds_needs_a_store():
     start = starts.Random(10**12, LOW, HIGH)
     with pytest.raises(ValueError, match=r"GiB of memory.*give store="):
         sweep(start=start)
+
+
+def test_the_memory_for_results_is_that_of_the_process(monkeypatch):
+    monkeypatch.setattr(_sweep, "machine_memory", lambda: 1000)  # the limit of a container, say
+    with pytest.raises(ValueError, match=r"GiB of memory.*give store="):
+        sweep(start=starts.Random(100, LOW, HIGH))

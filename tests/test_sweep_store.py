@@ -1,16 +1,21 @@
 """The store of sweeps: resuming, dying at any moment, damage of every kind."""
 
+import itertools
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+import warnings
+import zlib
 from collections import Counter
 from pathlib import Path
 
+import faults
 import numpy as np
 import pytest
 import sweep_child
@@ -19,6 +24,7 @@ from sweep_child import sweep
 
 import dvi_jax as dvi
 from dvi_jax.sweep import store as stores
+from dvi_jax.sweep.identity import digest
 from dvi_jax.sweep.store import Store
 
 VARIABLES = ("drift", "end", "t", "q", "p", "status", "failed_step", "residual")
@@ -161,7 +167,7 @@ def test_a_flipped_bit_does_not_pass_for_a_number(copy):
     """Whoever reads without verifying is told by the codec."""
     file = shard(copy)
     flip(file, len(file.read_bytes()) // 3)
-    with pytest.raises(Exception, match=r"(?i)checksum|zstd|decompress|corrupt"):
+    with pytest.raises(dvi.StoreError, match=r"drift/c/3/0: is damaged .*verify\(\)"):
         dvi.open_sweep(copy)["drift"]
 
 
@@ -189,6 +195,21 @@ def test_a_missing_or_short_shard_is_found(copy, undisturbed):
     same(sweep(copy), undisturbed)
 
 
+def test_a_removed_shard_is_not_computed_and_computed_again(copy, undisturbed):
+    shard(copy, "drift", 3).unlink()
+    found = dvi.open_sweep(copy)
+    with pytest.warns(UserWarning, match=r"1 of the finished tasks lack a file .*drift"):
+        assert not found.is_complete
+    with pytest.warns(UserWarning, match="the same call"):
+        assert found.status_counts()["not_computed"] == 100
+    assert (found["status"][12:16] == -1).all()
+    assert np.isnan(found["end"][12:16]).all()
+    assert (found["status"][:12] != -1).all()
+    with pytest.warns(UserWarning, match="computes them again"):
+        same(sweep(copy), undisturbed)
+    assert dvi.open_sweep(copy).is_complete
+
+
 @pytest.mark.slow
 def test_a_full_disk_loses_nothing(tmp_path, undisturbed, monkeypatch):
     path, written = tmp_path / "s.zarr", []
@@ -209,6 +230,108 @@ def test_a_full_disk_loses_nothing(tmp_path, undisturbed, monkeypatch):
     assert not found.verify().bad
     assert not list(path.rglob("*.tmp"))
     same(sweep(path), undisturbed)
+
+
+@pytest.mark.parametrize(
+    ("how", "files", "length"),
+    [
+        ("killed", 0, 0),
+        ("killed", 4, 1),
+        ("killed", 8, 200),
+        ("full", 7, 30),
+        ("full", 8, 0),
+        ("permission", 0, 0),
+    ],
+)
+def test_a_task_that_ends_at_any_byte_is_done_again(
+    copy, undisturbed, monkeypatch, how, files, length
+):
+    """Its eight shards are written, then its record."""
+    record(copy).unlink()
+    with monkeypatch.context() as patched:
+        faults.in_write(patched, how, length, after=files)
+        with pytest.raises((dvi.StoreError, faults.KilledError)) as caught:
+            sweep(copy)
+    assert how == "killed" or "the same call goes on" in str(caught.value)
+    assert len(list(copy.rglob("*.tmp"))) == (how == "killed")
+    found = dvi.open_sweep(copy)
+    assert found.tasks_done == 11
+    assert (found["status"][12:16] == -1).all()
+    same(sweep(copy), undisturbed)
+    assert dvi.open_sweep(copy).verify() == (12, {}, 0)
+
+
+@pytest.mark.parametrize("how", ["full", "killed"])
+def test_a_store_that_is_not_made_to_its_end_is_not_there(tmp_path, monkeypatch, how):
+    path = tmp_path / "s.zarr"
+    errors = {"full": OSError(28, "No space left on device"), "killed": faults.KilledError()}
+    with monkeypatch.context() as patched:
+
+        def fail(*_):
+            raise errors[how]
+
+        patched.setattr(os, "rename", fail)
+        if how == "killed":
+            patched.setattr(shutil, "rmtree", lambda *_, **__: None)
+        with pytest.raises((dvi.StoreError, faults.KilledError), match=r"cannot be made|^$"):
+            sweep(path)
+    assert not path.exists()
+    assert len(list(tmp_path.iterdir())) == (how == "killed")
+    assert sweep(path).is_complete
+
+
+def test_verify_clears_away_what_dead_processes_had_begun(copy):
+    old, new = (shard(copy).with_name(f".3.{k}.tmp") for k in ("old", "new"))
+    for file in (old, new):
+        file.write_bytes(b"some of it")
+    os.utime(old, (1, 1))
+    assert dvi.open_sweep(copy).verify() == (12, {}, 0)
+    assert not old.exists()
+    assert new.exists()  # another process may be writing it
+
+
+def test_no_removed_file_is_taken_for_results(copy, tmp_path, undisturbed):
+    """One file of each kind at a time: metadata, records, shards of each variable, coordinates."""
+    of_task = [record(copy), *(shard(copy, name) for name in VARIABLES)]
+    others = [*copy.glob("zarr.json"), *copy.glob("*/zarr.json"), *copy.glob("[es]*/c/0"),
+              copy / stores.CLAIMS]  # fmt: skip
+    refused = {}
+    for file in filter(Path.is_file, (*of_task, *others)):
+        file.rename(tmp_path / "gone")
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the task lacks a file
+                found = dvi.open_sweep(copy)
+                computed = found["status"] >= 0
+                assert computed.sum() == (1100 if file in of_task else 1200)
+                for name in ("drift", "end", "failed_step"):
+                    np.testing.assert_array_equal(
+                        found[name][computed], undisturbed[name][computed]
+                    )
+                np.testing.assert_array_equal(found["epsilon"], undisturbed["epsilon"])
+        except dvi.StoreError as error:
+            refused[file] = str(error)
+        (tmp_path / "gone").rename(file)
+    assert not refused.keys() & set(of_task)
+    assert {f.relative_to(copy).parts[0] for f in refused} == {"epsilon", "start", "zarr.json"}
+    assert all(re.search("Restore the file|writes it again", said) for said in refused.values())
+
+
+def test_a_clock_that_is_set_back_changes_nothing(copy, undisturbed, monkeypatch):
+    record(copy).unlink()
+    now = itertools.count(2e9, -3600)
+    monkeypatch.setattr(time, "time", lambda: next(now))
+    same(sweep(copy), undisturbed)
+    assert all(r["seconds"] >= 0 for r in dvi.open_sweep(copy).records())
+
+
+def test_a_description_that_may_not_be_read(copy, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_text", refuse)
+    with pytest.raises(dvi.StoreError, match=r"zarr.json cannot be read \(Permission denied\)"):
+        dvi.open_sweep(copy)
 
 
 def test_a_directory_that_cannot_be_written(copy, tmp_path, monkeypatch):
@@ -236,6 +359,126 @@ def test_what_is_no_store(tmp_path, copy):
     meta.write_text(text[:100])
     with pytest.raises(dvi.StoreError, match="cannot be read as that of a sweep"):
         sweep(copy)
+
+
+@pytest.mark.parametrize("path", ["a\0b", "x" * 300, "y/" * 3000])
+def test_a_path_that_no_directory_can_have(path, tmp_path):
+    for use in (dvi.open_sweep, sweep):
+        with pytest.raises(
+            dvi.StoreError, match=r"cannot be the path of a store .*: give the path"
+        ):
+            use(f"{tmp_path}/{path}")
+
+
+@pytest.mark.parametrize("key", ["../../x", "a/b"])
+def test_a_key_of_args_that_no_file_can_have(key, tmp_path):
+    axes = {name: dvi.Axis("x", [1.0, 2.0]) for name in (key, "k")}
+    with pytest.raises(ValueError, match="cannot be the name of an array in a store"):
+        dvi.sweep(
+            sweep_child.SYSTEM, [0.0], [1.0], args=axes, h=0.1, num_steps=2,
+            save=dvi.Save(final=True), store=tmp_path / "s.zarr",
+        )  # fmt: skip
+    assert not list(tmp_path.iterdir())
+
+
+def test_foreign_files_among_the_records_are_left_alone(copy):
+    folder = record(copy).parent
+    foreign = [folder / name for name in ("._000000003.json", "notes.json", "000000099.json")]
+    for file in foreign:
+        file.write_bytes(record(copy).read_bytes())
+    assert dvi.open_sweep(copy).verify() == (12, {}, 0)
+    assert sweep(copy).is_complete
+    assert all(file.exists() for file in foreign)
+
+
+def edited(path, change):
+    """Change the description of a store and its configuration, whose checksum becomes right."""
+    meta = path / "zarr.json"
+    content = json.loads(meta.read_text())
+    config = json.loads(content["attributes"]["config"])
+    change(config, content)
+    content["attributes"] |= {"config": json.dumps(config), "config_sha256": digest(config)}
+    meta.write_text(json.dumps(content))
+
+
+EDITS = {
+    "no length": lambda config, _: config.pop("dims"),
+    "negative length": lambda config, _: config["dims"].update(epsilon=-5),
+    "huge length": lambda config, _: config["dims"].update(epsilon=10**12),
+    "tasks of nothing": lambda config, _: config.update(chunk=[0, 0]),
+    "one dimension less": lambda config, _: config.update(chunk=[4]),
+    "variables of another kind": lambda config, _: config.update(variables={"drift": 3}),
+    "one variable more": lambda config, _: config["variables"].update(x=["float64", [], []]),
+    "another shape": lambda _, meta: meta["consolidated_metadata"]["metadata"]["drift"].update(
+        shape=[2, 2]
+    ),
+    "units that are no table": lambda _, meta: meta["attributes"].update(units="{"),
+    "an array": lambda _, meta: meta.update(node_type="array"),
+}
+
+
+@pytest.mark.parametrize("change", EDITS.values(), ids=EDITS.keys())
+def test_an_edited_description_is_refused_and_loses_nothing(copy, tmp_path, change):
+    sound = (copy / "zarr.json").read_text()
+    edited(copy, change)
+    with pytest.raises(dvi.StoreError, match=r"zarr\.json .*edited.* Restore the file"):
+        dvi.open_sweep(copy)
+    (copy / "zarr.json").write_text(sound)
+    assert dvi.open_sweep(copy).is_complete
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda found: {},
+        lambda found: [],
+        lambda found: found | {"shards": {}},
+        lambda found: found | {"shards": [1]},
+        lambda found: found | {"statuses": {"wonderful": 100}},
+        lambda found: found | {"size": [-3, 25]},
+        lambda found: found | {"task": 4},
+    ],
+)
+def test_an_edited_record_is_a_task_to_do(copy, change):
+    file = record(copy)
+    body = json.dumps(change(Store.open(copy).record(3))).encode()
+    file.write_bytes(body + f"\n{zlib.crc32(body):08x}\n".encode())
+    found = dvi.open_sweep(copy)
+    assert found.tasks_done == 11
+    assert found.status_counts()["not_computed"] == 100
+    assert found.verify().bad == {3: "the record is damaged"}
+
+
+@pytest.mark.parametrize("damage", ["removed", "cut", "flipped"])
+def test_a_damaged_coordinate_is_never_a_number_and_written_again(copy, undisturbed, damage):
+    file = copy / "epsilon" / "c" / "0"
+    if damage == "removed":
+        file.unlink()
+    elif damage == "cut":
+        file.write_bytes(file.read_bytes()[:20])
+    else:
+        flip(file, 12)
+    with pytest.raises(dvi.StoreError, match=r"the coordinate 'epsilon' .*The same call of dvi"):
+        dvi.open_sweep(copy)
+    same(sweep(copy), undisturbed)
+    np.testing.assert_array_equal(dvi.open_sweep(copy)["epsilon"], undisturbed["epsilon"])
+
+
+def test_a_lost_description_comes_from_a_new_store_of_the_same_call(copy, tmp_path, undisturbed):
+    (copy / "zarr.json").unlink()
+    for use in (dvi.open_sweep, sweep):
+        with pytest.raises(dvi.StoreError, match=r"was lost\. Restore the file .*copy it from"):
+            use(copy)
+
+    def stop(progress):
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        sweep(tmp_path / "new.zarr", progress=stop)
+    shutil.copy(tmp_path / "new.zarr" / "zarr.json", copy)
+    found = dvi.open_sweep(copy)
+    assert found.is_complete
+    same(found, undisturbed)
 
 
 def test_a_store_of_another_format(copy):

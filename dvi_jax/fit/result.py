@@ -1,10 +1,7 @@
 """What a fit found: parameters, how well they are known, what is left over."""
 
-import json
 import os
-import tempfile
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from .._files import publish_npz, read_npz
 from .parameters import make_space
 from .results import FIT_RESULTS, NAMES, name_of
 from .uncertainty import correlations
@@ -153,7 +151,7 @@ class FitResult:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything but functions into one file (.npz), atomically."""
         about: dict[str, Any] = {
-            "format": _FORMAT, "names": self.names, "result": self.status, "loss": self.loss,
+            "names": self.names, "result": self.status, "loss": self.loss,
             "degrees_of_freedom": self.degrees_of_freedom, "num_observed": self.num_observed,
             "has_errors": self.has_errors, "undetermined": self.undetermined,
             "at_bounds": self.at_bounds, "trajectories": self.trajectories,
@@ -166,7 +164,7 @@ class FitResult:
             arrays |= {f"{name}.{i}": a for i, a in enumerate(getattr(self, name))}
         if self.curvature is not None:
             arrays["curvature"] = self.curvature
-        write_npz(path, about, arrays)
+        publish_npz(path, _FORMAT, about, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], params: PyTree = None) -> "FitResult":
@@ -178,7 +176,7 @@ class FitResult:
         **Raises** `FileNotFoundError`, and `ValueError` for a file that is no fit or of another
         format, or params of other names.
         """
-        about, arrays = read_npz(path, "fit")
+        about, arrays = read_npz(path, _FORMAT, "fit")
         if params is None:
             if about["shape"] is None:
                 raise ValueError(
@@ -242,39 +240,3 @@ def _is_plain(node: Any) -> bool:
     if isinstance(node, dict):
         return all(isinstance(k, str) and _is_plain(v) for k, v in node.items())
     return isinstance(node, np.ndarray | np.generic | jax.Array | float | int)
-
-
-def write_npz(path: str | os.PathLike[str], about: dict[str, Any], arrays: dict[str, Any]) -> None:
-    """One .npz file with a JSON header, written under another name first."""
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"there is no directory {path.parent} to write {path.name} into.")
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, about=np.array(json.dumps(about)), **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-
-
-def read_npz(path: str | os.PathLike[str], what: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Header and arrays of such a file.
-
-    **Raises** `FileNotFoundError`, `ValueError` for another file or format.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no {what} at {path}.")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        about = json.loads(str(arrays.pop("about")))
-    except Exception as error:
-        raise ValueError(f"{path} is no {what} of this package, or is damaged ({error}).") from None
-    if about.get("format") != _FORMAT:
-        raise ValueError(f"{path} has the format {about.get('format')!r}; this reads {_FORMAT}.")
-    return about, arrays

@@ -4,6 +4,7 @@ import hashlib
 import os
 import re
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._files import publish_npz, read_npz
 from .optimise import Position, Record
 from .problem import Problem
 from .progress import FitProgress
-from .result import read_npz, write_npz
 
 _EVERY = 5.0
 """Seconds between checkpoints."""
+
+_FORMAT = 1
 
 
 class Run:
@@ -63,7 +66,14 @@ class Run:
         record.x = x
         self.records.append(record)
         if self._file is not None and time.monotonic() - self._saved > _EVERY:
-            _write_checkpoint(self._file, self._identity, position, self.records)
+            try:
+                _write_checkpoint(self._file, self._identity, position, self.records)
+            except OSError as error:  # no reason to lose the fit as well
+                warnings.warn(
+                    f"the checkpoint cannot be written ({error}). The fit goes on and tries again; "
+                    "a checkpoint that was written before is unchanged.",
+                    stacklevel=2,
+                )
             self._saved = time.monotonic()
         if self._show is not None:
             self._show(
@@ -102,15 +112,15 @@ def _write_checkpoint(path: Any, identity: str, at: Position, records: list[Reco
     for name in ("stage", "horizon", "loss", "step", "accepted", "x"):
         arrays[f"record.{name}"] = np.array([getattr(r, name) for r in records])
     about = {
-        "format": 1, "identity": identity, "stage": at.stage, "horizon": at.horizon,
+        "identity": identity, "stage": at.stage, "horizon": at.horizon,
         "done": at.done, "memory": list(at.memory), "status": at.status,
         "leaves": len(at.leaves), "extra": len(at.extra),
     }  # fmt: skip
-    write_npz(path, about, arrays)
+    publish_npz(path, _FORMAT, about, arrays)
 
 
 def _read_checkpoint(path: Any, identity: str) -> tuple[Position, list[Record]]:
-    about, arrays = read_npz(path, "checkpoint of a fit")
+    about, arrays = read_npz(path, _FORMAT, "checkpoint of a fit")
     if about.get("identity") != identity:
         raise ValueError(
             f"the checkpoint {path} is of another fit (data, parameters, their start or settings "

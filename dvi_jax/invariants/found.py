@@ -1,8 +1,6 @@
 """What discovery returns: the invariants, what is lost, and a report; saved and loaded."""
 
-import json
 import os
-import zipfile
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._files import publish_npz, read_npz
 from .._precision import refuse_double_without_x64
 from .._types import State
 from ..symmetry.basis import AbstractBasis, BoundBasis, bind_basis
@@ -113,7 +112,6 @@ class Discovery(eqx.Module):
             for law in self.obstructions
         ]
         about = {
-            "format": _FORMAT,
             "names": self.basis.names,
             "exact": self.exact,
             "survivors": self.survivors,
@@ -129,8 +127,7 @@ class Discovery(eqx.Module):
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         arrays |= {f"probe_{name}": x for name, x in self.probe._asdict().items()}
         arrays["probe_values"] = _probed(self.basis, self.probe)
-        with open(path, "wb") as file:
-            np.savez(file, about=np.array(json.dumps(about)), **arrays)
+        publish_npz(path, _FORMAT, about, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], basis: AbstractBasis) -> "Discovery":
@@ -140,17 +137,12 @@ class Discovery(eqx.Module):
         else, or another basis.
         """
         refuse_double_without_x64("a Discovery", np.float64)
-        if not os.path.isfile(path):
-            raise FileNotFoundError(f"there is no discovery at {os.fspath(path)}.")
+        about, found = read_npz(path, _FORMAT, "discovery")
         try:
-            with np.load(path, allow_pickle=False) as file:
-                about = json.loads(str(file["about"]))
-                arrays = {name: file[name] for name in _ARRAYS}
-                probe = Samples(*(file[f"probe_{name}"] for name in Samples._fields))
-                values = file["probe_values"]
-            if about["format"] != _FORMAT:
-                raise KeyError("format")
-        except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            arrays: dict[str, Any] = {name: found[name] for name in _ARRAYS}
+            probe = Samples(*(found[f"probe_{name}"] for name in Samples._fields))
+            values = found["probe_values"]
+        except KeyError as error:
             raise ValueError(f"{os.fspath(path)} is no file that Discovery.save wrote.") from error
         shape = tuple(about["shape"])
         bound = bind_basis(basis, shape)

@@ -1,6 +1,7 @@
 """The TOML file of a run: its keys, their types, and nothing else; and how such files are read."""
 
 import datetime
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -106,10 +107,18 @@ def parameter(value: Any, key: str = "args") -> Any:
     return value if isinstance(value, int) else as_float
 
 
+_NOT_IN_NAMES = re.compile(r"[/\\\x00-\x1f]")
+
+
 def _texts(value: Any) -> dict[str, str]:
     if not isinstance(value, dict):
         raise ValueError
     for name, inner in value.items():
+        if _NOT_IN_NAMES.search(name):
+            raise InputError(
+                "observables", f"the name {name!r}",
+                "a name without / and \\, for it becomes the name of a file in an archive",
+            )  # fmt: skip
         if not isinstance(inner, str) or not inner.strip():
             raise InputError(
                 f"observables.{name}", shown(inner), 'text such as "energy" or "MaxDrift(energy)"'

@@ -3,6 +3,7 @@
 import ast
 import importlib.util
 import inspect
+import os
 import re
 import sys
 import traceback
@@ -81,7 +82,7 @@ def make_setup(values: dict[str, Any], folder: Path) -> Setup:
 # The system
 
 
-_A_FILE = '"file.py:name", a Python file (from the folder of the run file) and a name in it'
+_A_FILE = '"file.py:name", a Python file in the folder of the TOML file and a name in it'
 
 
 class Loader:
@@ -98,6 +99,8 @@ class Loader:
         running the file fails: with the line of it that did.
         """
         file, _, name = text.rpartition(":")
+        if os.path.isabs(file) or ".." in Path(file).parts:
+            raise InputError(key, f"{shown(text)} leaves the folder of the TOML file", _A_FILE)
         try:
             path = (self.folder / file).resolve()
             path.is_file()

@@ -13,6 +13,7 @@ from lanewise import Layout
 from lanewise.jaxapi import x64_enabled
 
 from .._arithmetic import Arithmetic, FloatingPoint
+from .._memory import machine_memory
 from .._solution import Save
 from .._system import System, check_system
 from ..engine.newton import RootSolver
@@ -355,10 +356,7 @@ def _starts(made: Sweep) -> list[np.ndarray]:
 
 
 def _check_memory(needed: int) -> None:
-    try:
-        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        there = 8 * 2**30
+    there = machine_memory() or 8 * 2**30
     if needed > _SHARE * there:
         raise ValueError(
             f"the results need {needed / 2**30:.1f} GiB of memory, and this machine has "

@@ -55,8 +55,9 @@ def run_on(
     from distributed import as_completed
 
     program = Program(sweep, plan)
-    todo = deque(sink.todo())
-    counter = Counter(program, list(todo), report)
+    before = set(sink.done())
+    todo, again = plan.todo(before), deque[int]()
+    counter = Counter(program, before, report)
     where = (str(sink.path.resolve()), sink.sha) if isinstance(sink, Store) else (None, None)
     job = cloudpickle.dumps((sweep, plan, *where, x64_enabled()))
     lost: dict[int, int] = {}
@@ -72,8 +73,10 @@ def run_on(
     def hand_out() -> None:
         nonlocal attempts
         threads = max(sum(client.nthreads().values()), 1)
-        while todo and len(numbers) < _AHEAD * threads:
-            number = todo.popleft()
+        while len(numbers) < _AHEAD * threads:
+            number = again.popleft() if again else next(todo, None)
+            if number is None:
+                return
             attempts += 1
             future = client.submit(
                 _task, payload, number, pure=False, key=f"dvi-task-{run}-{number}-{attempts}"
@@ -96,7 +99,7 @@ def run_on(
                 counter.add(task, statuses)
             else:
                 _look_at(future, number, lost)
-                todo.append(number)
+                again.append(number)
             hand_out()
     except KeyboardInterrupt:
         return False

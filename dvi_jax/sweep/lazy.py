@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import zarr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
@@ -25,8 +24,7 @@ class _Masked(BackendArray):
 
     def __init__(self, store: Store, name: str):
         self.store, self.name = store, name
-        array: Any = zarr.open_group(store.path, mode="r")[name]
-        self.array = array
+        array = store.array(name)
         self.shape, self.dtype = array.shape, array.dtype
 
     def __getitem__(self, key: Any) -> Any:
@@ -38,7 +36,7 @@ class _Masked(BackendArray):
         plan, fill = self.store.plan, self.store.variables[self.name].fill
         own = len(plan.shape)
         wanted = [
-            np.arange(n)[k] if isinstance(k, slice) else np.atleast_1d(k)
+            np.arange(*k.indices(n)) if isinstance(k, slice) else np.atleast_1d(k)
             for k, n in zip(key, self.shape, strict=True)
         ]
         rows, behind = wanted[:own], wanted[own:]
@@ -46,11 +44,12 @@ class _Masked(BackendArray):
         places = [w // c for w, c in zip(rows, plan.chunk, strict=True)]
         for place in _boxes(places):
             inside = [np.flatnonzero(p == k) for p, k in zip(places, place, strict=True)]
-            if self.store.record(plan.number(place)) is None:
+            number = plan.number(place)
+            if self.store.record(number) is None:
                 continue
             box = tuple(w[i] for w, i in zip(rows, inside, strict=True))
             to = np.ix_(*inside, *(np.arange(len(b)) for b in behind))
-            found[to] = self.array.get_orthogonal_selection((*box, *behind))
+            found[to] = self.store.read(self.name, number, (*box, *behind))
         scalar = tuple(0 if np.ndim(k) == 0 and not isinstance(k, slice) else slice(None)
                        for k in key)  # fmt: skip
         return found[scalar]

@@ -1,7 +1,7 @@
 """The grid of a sweep, and how it is cut into tasks."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -50,6 +50,12 @@ class Plan:
     dims: Mapping[str, int]
     chunk: tuple[int, ...]
 
+    def __post_init__(self):
+        lengths = (*self.dims.values(), *self.chunk)
+        is_whole = all(isinstance(n, int | np.integer) and n >= 1 for n in lengths)
+        if not is_whole or len(self.dims) != len(self.chunk):
+            raise ValueError(f"no grid of lengths {self.dims} can have tasks of {self.chunk}.")
+
     @property
     def shape(self) -> tuple[int, ...]:
         return tuple(self.dims.values())
@@ -97,6 +103,10 @@ class Plan:
         for k, count in zip(place, self.counts, strict=True):
             number = number * count + k
         return number
+
+    def todo(self, done: Container[int]) -> Iterator[int]:
+        """The numbers of the other tasks, made when they are needed: there may be 10⁹ of them."""
+        return (i for i in range(self.num_tasks) if i not in done)
 
     def tasks(self) -> Iterator[Task]:
         return (self.task(i) for i in range(self.num_tasks))

@@ -1,5 +1,6 @@
 """What a sweep returns: labelled arrays, in memory or in a store, with a status for each number."""
 
+import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ class SweepResult:
     @property
     def tasks_done(self) -> int:
         """How many of them have their results; of a store all records are read."""
-        return self._plan.num_tasks - len(self._source.todo())
+        return len(self._source.done())
 
     @property
     def is_complete(self) -> bool:
@@ -110,7 +111,7 @@ class SweepResult:
         are not done are masked."""
         import xarray as xr
 
-        data, units = {}, self.attributes.get("units", "{}")
+        data, units = {}, json.loads(self.attributes.get("units", "{}"))
         if isinstance(self._source, Memory):
             for name, v in self._source.variables.items():
                 dims = (*self.dims, *v.dims)
@@ -169,17 +170,5 @@ def open_sweep(path: Any) -> SweepResult:
 
     **Raises** `StoreError` where there is none.
     """
-    import zarr
-
     store = Store.open(path)
-    group = zarr.open_group(store.path, mode="r")
-    coordinates = {}
-    for name, array in group.arrays():
-        if name in store.variables:
-            continue
-        values: Any = array[:]
-        if values.dtype.kind == "T":
-            values = np.asarray(values.tolist())
-        dims = getattr(array.metadata, "dimension_names", None)
-        coordinates[name] = (dims, values, dict(array.attrs))
-    return SweepResult(store, coordinates, store.attributes)
+    return SweepResult(store, store.coordinates(), store.attributes)

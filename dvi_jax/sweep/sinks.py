@@ -2,7 +2,7 @@
 
 import abc
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,8 +15,8 @@ class Sink(abc.ABC):
     """Takes the results of tasks, and knows which it has."""
 
     @abc.abstractmethod
-    def todo(self) -> list[int]:
-        """The numbers of the tasks that are not done."""
+    def done(self) -> Collection[int]:
+        """The numbers of the tasks that are done."""
 
     @abc.abstractmethod
     def is_done(self, number: int) -> bool:
@@ -41,8 +41,8 @@ class Memory(Sink):
         }
         self._done: set[int] = set()
 
-    def todo(self):
-        return [i for i in range(self.plan.num_tasks) if i not in self._done]
+    def done(self):
+        return set(self._done)
 
     def is_done(self, number):
         return number in self._done

@@ -2,8 +2,8 @@
 
 Each task has one shard in each array. A shard is written under another name, forced to the disk and
 renamed; then the task's record is, which names the shards with their sizes and checksums. A task
-is done when its record is there: whatever dies, at whatever moment, leaves done tasks whole and the
-others to be done again.
+is done when its record is there, and the shards that it names: whatever dies, at whatever moment,
+leaves done tasks whole and the others to be done again.
 """
 
 import contextlib
@@ -23,11 +23,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._files import TEMPORARY, publish, sync
 from .._results import STATUS_NAMES
 from .identity import FORMAT, differences, digest
 from .plan import Plan, Task
 from .sinks import Sink
-from .variables import Variable
+from .variables import ARRAY_NAMES, Variable, is_array_name
 
 try:
     import fcntl
@@ -35,9 +36,14 @@ except ImportError:  # Windows: processes there do not divide a sweep between th
     fcntl = None
 
 TASKS, CLAIMS = ".tasks", ".claims"
-_TEMPORARY = ".tmp"
 _CHUNK_BYTES = 2**22
 """Of an inner chunk of a shard: what is read at least to see one number."""
+
+_RESTORE = (
+    "Restore the file from a backup, or copy it from a store that the same call of dvi.sweep makes "
+    "elsewhere: that call may be stopped as soon as its progress is shown. The results are in the "
+    "arrays beside the file."
+)
 
 STATUS = "status"
 """The variable whose shard is published after the others."""
@@ -72,11 +78,15 @@ class Store(Sink):
         self.attributes = attributes
         self.config = json.loads(attributes["config"])
         self.sha = attributes["config_sha256"]
+        if digest(self.config) != self.sha:
+            raise ValueError("the configuration does not have its checksum")
+        dict(json.loads(attributes.get("units", "{}")))  # what is wrong is raised here
         self.plan = Plan(dict(self.config["dims"]), tuple(self.config["chunk"]))
         self.variables = {
             name: Variable(dtype, tuple(shape), tuple(dims))
             for name, (dtype, shape, dims) in self.config["variables"].items()
         }
+        self._arrays: dict[str, Any] = {}
 
     # --- opening ----------------------------------------------------------------------------
 
@@ -86,16 +96,21 @@ class Store(Sink):
 
         **Raises** `StoreError` where there is none, or none that this version can read.
         """
-        path = Path(path).resolve()
+        path = _located(path)
         try:
             attributes = json.loads((path / "zarr.json").read_text())["attributes"]
             found = attributes["dvi_jax_sweep"]
         except FileNotFoundError:
-            raise StoreError(f"{path}: there is no sweep here (no zarr.json).") from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            lost = f" The file was lost. {_RESTORE}" if (path / TASKS).is_dir() else ""
+            raise StoreError(f"{path}: there is no sweep here (no zarr.json).{lost}") from None
+        except OSError as error:
             raise StoreError(
-                f"{path}: zarr.json cannot be read as that of a sweep ({error!r}). If this was a "
-                "sweep, its results are in the arrays beside it; restore the file from a backup."
+                f"{path}: zarr.json cannot be read ({error.strerror or error}): look after its "
+                "permissions and the disk."
+            ) from None
+        except (ValueError, KeyError, TypeError) as error:
+            raise StoreError(
+                f"{path}: zarr.json cannot be read as that of a sweep ({error!r}). {_RESTORE}"
             ) from None
         if not (path / TASKS).is_dir():
             raise StoreError(
@@ -107,9 +122,15 @@ class Store(Sink):
                 f"{path}: the store has format {found}, this version reads {FORMAT}: use the "
                 f"version that made it ({attributes.get('dvi-jax', 'unknown')})."
             )
-        if digest(json.loads(attributes["config"])) != attributes["config_sha256"]:
-            raise StoreError(f"{path}: the configuration in zarr.json is damaged or was edited.")
-        return cls(path, attributes)
+        try:
+            store = cls(path, attributes)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise StoreError(
+                f"{path}: zarr.json is damaged or was edited ({error!r}). {_RESTORE}"
+            ) from None
+        for name in store.variables:
+            store.array(name)
+        return store
 
     @classmethod
     def open_or_make(
@@ -125,9 +146,9 @@ class Store(Sink):
         **Raises** `StoreMismatch` if it holds another sweep; `StoreError` for a directory that
         holds something else, or cannot be written.
         """
-        path = Path(path).resolve()
+        path = _located(path)
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            if not (path / "zarr.json").exists():
+            if not any((path / name).exists() for name in ("zarr.json", TASKS)):
                 raise StoreError(
                     f"{path}: exists, and is no sweep: give a path that does not exist yet."
                 )
@@ -148,7 +169,94 @@ class Store(Sink):
                 f"{path}: cannot be written by this user: results would be lost. Give another "
                 "store, or change its permissions; dvi.open_sweep(path) reads it."
             )
+        store._restore(coordinates)
         return store
+
+    # --- arrays -------------------------------------------------------------------------------
+
+    def array(self, name: str) -> Any:
+        """The zarr array of one variable.
+
+        **Raises** `StoreError` where the store does not describe it as its configuration does.
+        """
+        if name in self._arrays:
+            return self._arrays[name]
+        variable = self.variables[name]
+        shape, dtype = (*self.plan.shape, *variable.shape), np.dtype(variable.dtype)
+        try:
+            found: Any = self._group()[name]
+            if (found.shape, found.dtype) == (shape, dtype):
+                self._arrays[name] = found
+                return found
+            seen = f"shape {found.shape} and dtype {found.dtype}, not {shape} and {dtype}"
+        except Exception as error:  # whatever zarr says of metadata that are no longer its own
+            seen = repr(error)
+        raise StoreError(
+            f"{self.path}: zarr.json does not describe the array {name!r} of this sweep ({seen}). "
+            f"It is damaged or was edited. {_RESTORE}"
+        )
+
+    def read(self, name: str, number: int, where: tuple[Any, ...]) -> np.ndarray:
+        """A part of a variable that lies in one task.
+
+        **Raises** `StoreError` with the file for one that cannot be decoded.
+        """
+        try:
+            return self.array(name).get_orthogonal_selection(where)
+        except StoreError:
+            raise
+        except Exception as error:  # whatever a codec says of bytes that it cannot take
+            raise StoreError(
+                f"{self.shard_path(name, number)}: is damaged ({error}). Open its task again with "
+                "dvi.open_sweep(path).verify(); then the same call of dvi.sweep computes it."
+            ) from error
+
+    def coordinates(self) -> dict[str, Any]:
+        """name → (dims, values, attributes) of all coordinates.
+
+        **Raises** `StoreError` for one that is missing or damaged.
+        """
+        names = [name for name, _ in self._group().arrays() if name not in self.variables]
+        return {name: self._coordinate(name) for name in names}
+
+    def _group(self) -> Any:
+        import zarr
+
+        return zarr.open_group(self.path, mode="r", zarr_format=3)
+
+    def _coordinate(self, name: str) -> tuple[Any, np.ndarray, dict[str, Any]]:
+        try:
+            array: Any = self._group()[name]
+            # One chunk. Of a chunk that is not there zarr would say that it is full of zeros.
+            file = self.path.joinpath(name, "c", *("0" for _ in array.shape))
+            if not file.exists():
+                raise FileNotFoundError(errno.ENOENT, "no such file", str(file))
+            values: Any = array[:]
+        except Exception as error:  # whatever a codec says of bytes that it cannot take
+            raise StoreError(
+                f"{self.path}: the coordinate {name!r} cannot be read ({error}). The same call of "
+                "dvi.sweep writes it again."
+            ) from error
+        if values.dtype.kind == "T":
+            values = np.asarray(values.tolist())
+        return getattr(array.metadata, "dimension_names", None), values, dict(array.attrs)
+
+    def _restore(self, coordinates: Mapping[str, Any]) -> None:
+        """Write coordinates again that are missing or damaged."""
+        import zarr
+
+        for name, (_, values, _) in coordinates.items():
+            try:
+                self._coordinate(name)
+            except StoreError:
+                try:
+                    with zarr.config.set({"array.write_empty_chunks": True}):
+                        group: Any = zarr.open_group(self.path, mode="r+", zarr_format=3)
+                        group[name][...] = _storable(values)
+                except OSError as error:
+                    raise StoreError(
+                        f"{self.path}: the coordinate {name!r} cannot be written again: {error}."
+                    ) from error
 
     # --- tasks --------------------------------------------------------------------------------
 
@@ -156,7 +264,25 @@ class Store(Sink):
         return self.path / TASKS / f"{number // 1000:06d}" / f"{number:09d}.json"
 
     def record(self, number: int) -> dict[str, Any] | None:
-        """What was committed of a task; None if it is not done or its record is damaged."""
+        """What was committed of a task that is done. None: it has no record, a damaged one, or one
+        that names a shard which is not there in full."""
+        found = self._written(number)
+        return found if found is not None and self._lacking(number, found) is None else None
+
+    def _lacking(self, number: int, record: Mapping[str, Any]) -> Path | None:
+        """The first shard of a task that is missing or has another size than its record says."""
+        for name in self.variables:
+            file = self.shard_path(name, number)
+            try:
+                is_there = file.stat().st_size == record["shards"][name]["bytes"]
+            except OSError:
+                is_there = False
+            if not is_there:
+                return file
+        return None
+
+    def _written(self, number: int) -> dict[str, Any] | None:
+        """The record of a task as it was written; None if there is none or it is damaged."""
         try:
             text = self.record_path(number).read_bytes()
         except OSError:
@@ -164,17 +290,42 @@ class Store(Sink):
         body, _, checksum = text.rstrip(b"\n").rpartition(b"\n")
         if checksum != f"{zlib.crc32(body):08x}".encode():
             return None
-        found = json.loads(body)
-        return found if found["config_sha256"] == self.sha else None
+        try:
+            found, task = json.loads(body), self.plan.task(number)
+            counts = found["statuses"]
+            is_of_task = (
+                (found["config_sha256"], found["task"]) == (self.sha, number)
+                and (tuple(found["start"]), tuple(found["size"])) == (task.start, task.size)
+                and all(
+                    found["shards"][name].keys() >= {"bytes", "crc32"} for name in self.variables
+                )
+                and counts.keys() <= set(STATUS_NAMES)
+                and sum(counts.values()) == task.lanes
+            )
+        except (AttributeError, KeyError, TypeError, ValueError):  # edited, with its checksum
+            return None
+        return found if is_of_task else None
 
-    def done(self) -> list[int]:
-        """The numbers of the tasks that are done."""
-        named = sorted(int(f.stem) for f in (self.path / TASKS).glob("*/*.json"))
-        return [i for i in named if self.record(i) is not None]
+    def _records(self) -> dict[int, Path]:
+        """Number of a task → the file of its record. Other files, such as those that macOS leaves
+        beside each file, are nobody's record."""
+        named = (f for f in (self.path / TASKS).glob("*/*.json") if f.stem.isdecimal())
+        found = {int(f.stem): f for f in named}
+        mine = (i for i in sorted(found) if i < self.plan.num_tasks)
+        return {i: found[i] for i in mine if found[i] == self.record_path(i)}
 
-    def todo(self):
-        done = set(self.done())
-        return [i for i in range(self.plan.num_tasks) if i not in done]
+    def done(self):
+        """The numbers of finished tasks, in order. Warns of those that have lost a file."""
+        written = ((i, self._written(i)) for i in self._records())
+        lacking = {i: self._lacking(i, found) for i, found in written if found is not None}
+        if lost := [file for file in lacking.values() if file is not None]:
+            warnings.warn(
+                f"{self.path}: {len(lost)} of the finished tasks lack a file (missing or of "
+                f"another size: {lost[0]}). They count as not computed; the same call of "
+                "dvi.sweep computes them again.",
+                stacklevel=2,
+            )
+        return [i for i, file in lacking.items() if file is None]
 
     def is_done(self, number):
         return self.record(number) is not None
@@ -236,14 +387,10 @@ class Store(Sink):
     def verify(self, progress: Any = None) -> Verification:
         """Read every shard of every task that is done, and compare it with its record. The records
         of bad ones are taken away, so that the next run does these tasks again."""
-        import zarr
-
-        group = zarr.open_group(self.path, mode="r")
         bad: dict[int, str] = {}
-        files = sorted((self.path / TASKS).glob("*/*.json"))
-        for n, file in enumerate(files):
-            number = int(file.stem)
-            wrong = self._what_is_wrong(number, group)
+        files = self._records()
+        for n, (number, file) in enumerate(files.items()):
+            wrong = self._what_is_wrong(number)
             if wrong:
                 bad[number] = wrong
                 file.unlink()
@@ -253,25 +400,25 @@ class Store(Sink):
         sound = len(files) - len(bad)
         return Verification(sound, bad, self.plan.num_tasks - sound)
 
-    def _what_is_wrong(self, number: int, group: Any) -> str:
-        record = self.record(number)
+    def _what_is_wrong(self, number: int) -> str:
+        record = self._written(number)
         if record is None:
             return "the record is damaged"
         task = self.plan.task(number)
         for name in self.variables:
-            known = record["shards"].get(name)
+            known = record["shards"][name]
             try:
                 content = self.shard_path(name, number).read_bytes()
             except OSError as error:
                 return f"the shard of {name} cannot be read ({error.strerror})"
-            if known is None or len(content) != known["bytes"]:
+            if len(content) != known["bytes"]:
                 return f"the shard of {name} has {len(content)} bytes"
             if f"{zlib.crc32(content):08x}" != known["crc32"]:
                 return f"the shard of {name} has another checksum"
             try:
-                group[name][task.box]
-            except Exception as error:  # whatever a codec says of bytes that it cannot take
-                return f"the shard of {name} cannot be decoded ({error!r})"
+                self.read(name, number, task.box)
+            except StoreError as error:
+                return f"the shard of {name} cannot be decoded ({error.__cause__!r})"
         return ""
 
     def _clear_away(self) -> None:
@@ -281,47 +428,25 @@ class Store(Sink):
             for name in names:
                 file = Path(root, name)
                 with contextlib.suppress(OSError):
-                    if name.endswith(_TEMPORARY) and file.stat().st_mtime < before:
+                    if name.endswith(TEMPORARY) and file.stat().st_mtime < before:
                         file.unlink()
 
 
-def publish(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, on the disk once this returns."""
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{_TEMPORARY}")
-    made = _make_folders(path.parent)
+def _located(path: str | os.PathLike) -> Path:
+    """A path in full.
+
+    **Raises** `StoreError` for one that no directory can have.
+    """
     try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
-    for folder in (path.parent, *made):
-        _sync(folder)
-
-
-def _make_folders(folder: Path) -> list[Path]:
-    """Make a folder and those above it; the folders that have new entries and must be synced."""
-    missing = []
-    while not folder.exists():
-        missing.append(folder)
-        folder = folder.parent
-    for new in reversed(missing):
-        new.mkdir(exist_ok=True)
-    return [new.parent for new in missing]
-
-
-def _sync(folder: Path) -> None:
-    if os.name == "nt":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        found = Path(path).resolve()
+        found.exists()
+    except (OSError, ValueError, RuntimeError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise StoreError(
+            f"{os.fspath(path)!r:.80}: cannot be the path of a store ({why}): give the path of a "
+            "directory."
+        ) from None
+    return found
 
 
 # --- claims -------------------------------------------------------------------------------------
@@ -412,8 +537,13 @@ def _make(path, config, variables, coordinates, attributes) -> None:
     import zarr
     from zarr import codecs
 
+    if bad := [name for name in (*coordinates, *variables) if not is_array_name(name)]:
+        raise ValueError(
+            f"{bad[0]!r} cannot be the name of an array in a store: {ARRAY_NAMES}. The name comes "
+            "from a key of args or from an observable: rename it."
+        )
     plan = Plan(dict(config["dims"]), tuple(config["chunk"]))
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{_TEMPORARY}")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         group = zarr.create_group(
@@ -427,18 +557,17 @@ def _make(path, config, variables, coordinates, attributes) -> None:
             },
         )
         for name, (dims, values, about) in coordinates.items():
-            if values.dtype.kind == "U":  # names of methods, of any length
-                values = values.astype(np.dtypes.StringDType())
             group.create_array(
-                name, data=values, chunks=values.shape, dimension_names=dims, attributes=about,
-                compressors=[codecs.ZstdCodec(), codecs.Crc32cCodec()],
+                name, data=_storable(values), chunks=values.shape, dimension_names=dims,
+                attributes=about, compressors=[codecs.ZstdCodec(), codecs.Crc32cCodec()],
+                config={"write_empty_chunks": True},
             )  # fmt: skip
         for name, v in variables.items():
             group.create_array(
                 name,
                 shape=(*plan.shape, *v.shape),
                 dimension_names=(*plan.dims, *v.dims),
-                attributes=about_variable(name, attributes.get("units", "{}")),
+                attributes=about_variable(name, json.loads(attributes.get("units", "{}"))),
                 **_layout(plan.chunk, v),
             )
         (temporary / TASKS).mkdir()
@@ -455,15 +584,20 @@ def _make(path, config, variables, coordinates, attributes) -> None:
         except OSError:  # another process was faster, or the directory holds something
             if not (path / "zarr.json").exists():
                 raise
-        _sync(path.parent)
+        sync(path.parent)
     except OSError as error:
-        raise StoreError(f"{path}: cannot be made: {error.strerror or error}.") from error
+        raise StoreError(f"{path}: cannot be made: {error}.") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def about_variable(name: str, units: str) -> dict[str, Any]:
-    """The attributes of a variable; `units` are those of all that have some, as JSON."""
+def _storable(values: np.ndarray) -> np.ndarray:
+    """Names of methods with a type for text of any length, which zarr has; numbers as they are."""
+    return values.astype(np.dtypes.StringDType()) if values.dtype.kind == "U" else values
+
+
+def about_variable(name: str, units: Mapping[str, str]) -> dict[str, Any]:
+    """The attributes of a variable; `units` are those of all that have some."""
     if name == STATUS:
         return {
             "long_name": "how each trajectory ended",
@@ -475,5 +609,4 @@ def about_variable(name: str, units: str) -> dict[str, Any]:
         "residual": "largest relative residual of an implicit solve",
     }
     found = {"long_name": known[name]} if name in known else {}
-    known_units = json.loads(units)
-    return {**found, "units": known_units[name]} if name in known_units else found
+    return {**found, "units": units[name]} if name in units else found

@@ -15,6 +15,11 @@ from .program import Sweep
 
 _NAME = re.compile(r"[\w +-]+(\.[\w +-]+)*")
 
+ARRAY_NAMES = (
+    "names are letters, digits, spaces and _ - + with points between them, but not zarr.json, for "
+    "they become names in files"
+)
+
 RESERVED = ("status", "failed_step", "residual", "t", "q", "p", "save", "q0", "p0")
 """Names in a result that are not the user's to give."""
 
@@ -53,11 +58,8 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     ]
     if twice := [n for n in given if given.count(n) > 1]:
         raise ValueError(f"two observables have the name {twice[0]!r}: give one of them another.")
-    if bad := [n for n in given if not _NAME.fullmatch(n)]:
-        raise ValueError(
-            f"the observable {bad[0]!r}: names are letters, digits, spaces and _ - + with points "
-            "between them, for they become names in files."
-        )
+    if bad := [n for n in given if not is_array_name(n)]:
+        raise ValueError(f"the observable {bad[0]!r}: {ARRAY_NAMES}.")
     taken = [n for n in given if n.split(".")[0] in RESERVED or n in sweep.dims]
     if taken:
         raise ValueError(
@@ -82,6 +84,11 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
             raise TypeError(f"the observable {name!r} has dtype {dtype}: it must be a number.")
         found[name] = Variable("int8" if dtype.kind == "b" else dtype.name, x.shape, tuple(dims))
     return found
+
+
+def is_array_name(name: str) -> bool:
+    """Whether an array in a store, or in another archive, may have this name."""
+    return bool(_NAME.fullmatch(name)) and name.lower() != "zarr.json"
 
 
 def check_names(

@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from math import nan
@@ -57,11 +57,15 @@ class SweepProgress:
 class Counter:
     """Counts tasks and tells a callback."""
 
-    def __init__(self, program: Program, todo: list[int], report: Callable[..., None] | None):
+    def __init__(
+        self, program: Program, before: Collection[int], report: Callable[..., None] | None
+    ):
+        """`before`: the tasks that were done earlier."""
         self.program, self.report = program, report
         self.plan, self.began = program.plan, time.monotonic()
-        self.lanes_todo = sum(self.plan.task(i).lanes for i in todo)
-        self.todo, self.done, self.lanes, self.steps, self.failed = len(todo), 0, 0, 0, 0
+        self.before = len(before)
+        self.lanes_before = sum(self.plan.task(i).lanes for i in before)
+        self.done, self.lanes, self.steps, self.failed = 0, 0, 0, 0
         self._lock = threading.Lock()
         self._tell()
 
@@ -77,17 +81,17 @@ class Counter:
         if self.report is None:
             return
         seconds = time.monotonic() - self.began
-        before = self.plan.lanes - self.lanes_todo
+        todo = self.plan.lanes - self.lanes_before
         self.report(
             SweepProgress(
-                tasks_done=self.plan.num_tasks - self.todo + self.done,
+                tasks_done=self.before + self.done,
                 num_tasks=self.plan.num_tasks,
-                lanes_done=before + self.lanes,
+                lanes_done=self.lanes_before + self.lanes,
                 num_lanes=self.plan.lanes,
                 failed=self.failed,
                 rate=self.steps / seconds if seconds > 0 else 0.0,
                 seconds=seconds,
-                seconds_left=seconds * (self.lanes_todo / self.lanes - 1) if self.lanes else nan,
+                seconds_left=seconds * (todo / self.lanes - 1) if self.lanes else nan,
             )
         )
 
@@ -96,12 +100,12 @@ def compute(
     program: Program, task: Task, device: Any
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The results of a task and what its record says about them."""
-    began = time.time()
+    began = time.monotonic()  # the clock of the machine may be set back meanwhile
     results = program(task, device)
     codes, counts = np.unique(results[STATUS], return_counts=True)
     facts = {
         "statuses": {STATUS_NAMES[c]: int(n) for c, n in zip(codes, counts, strict=True)},
-        "seconds": round(time.time() - began, 3),
+        "seconds": round(time.monotonic() - began, 3),
         "finished": time.time(),
         "host": os.uname().nodename if hasattr(os, "uname") else "",
         "pid": os.getpid(),
@@ -119,10 +123,10 @@ def default_threads() -> int:
 class Queue:
     """The tasks to do, and those that another process works on and may leave undone."""
 
-    def __init__(self, todo: list[int], sink: Sink, done_elsewhere: Callable[[int], None]):
+    def __init__(self, todo: Iterator[int], sink: Sink, done_elsewhere: Callable[[int], None]):
         self.sink, self.done_elsewhere = sink, done_elsewhere
         self.stop = threading.Event()
-        self._mine, self._theirs = deque(todo), deque()
+        self._todo, self._open_again, self._theirs = todo, deque(), deque()
         self._lock = threading.Lock()
 
     def put_off(self, number: int) -> None:
@@ -134,12 +138,9 @@ class Queue:
         """Numbers of tasks until all are done or it is stopped; several threads may ask."""
         while not self.stop.is_set():
             with self._lock:
-                if self._mine:
-                    number = self._mine.popleft()
-                elif not self._theirs:
+                number = self._open_again.popleft() if self._open_again else next(self._todo, None)
+                if number is None and not self._theirs:
                     return
-                else:
-                    number = None
             if number is not None:
                 yield number
             elif not self.stop.wait(_PATIENCE):
@@ -150,7 +151,7 @@ class Queue:
         with self._lock:
             for _ in range(len(self._theirs)):
                 number = self._theirs.popleft()
-                (done if self.sink.is_done(number) else self._mine).append(number)
+                (done if self.sink.is_done(number) else self._open_again).append(number)
         for number in done:
             self.done_elsewhere(number)
 
@@ -166,8 +167,9 @@ def run_here(
 
     **Raises** whatever a task or its writing raises, once the other threads have ended.
     """
-    todo = sink.todo()
-    counter = Counter(program, todo, report)
+    before = set(sink.done())
+    counter = Counter(program, before, report)
+    todo = program.plan.todo(before)
     queue = Queue(todo, sink, lambda number: counter.add(program.plan.task(number), {}))
     devices, x64 = jax.local_devices(), x64_enabled()
     count = threads or default_threads()

@@ -1,0 +1,108 @@
+"""Files that are written whole or not at all."""
+
+import contextlib
+import io
+import json
+import os
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TEMPORARY = ".tmp"
+"""How names of files end that are not whole yet."""
+
+
+def publish(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all, on the disk once this returns."""
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
+    made = _make_folders(path.parent)
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+    for folder in (path.parent, *made):
+        sync(folder)
+
+
+def _make_folders(folder: Path) -> list[Path]:
+    """Make a folder and those above it; the folders that have new entries and must be synced."""
+    missing = []
+    while not folder.exists():
+        missing.append(folder)
+        folder = folder.parent
+    for new in reversed(missing):
+        new.mkdir(exist_ok=True)
+    return [new.parent for new in missing]
+
+
+def sync(folder: Path) -> None:
+    """Have the entries of a folder on the disk once this returns."""
+    if os.name == "nt":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def publish_npz(
+    path: str | os.PathLike[str], form: int, about: Mapping[str, Any], arrays: Mapping[str, Any]
+) -> None:
+    """Write a JSON header and arrays into one file (NumPy's npz), whole or not at all.
+
+    - `form`: number of the format, which `read_npz` compares.
+
+    **Raises** `FileNotFoundError` where there is no directory for it, `OSError` for a file that
+    cannot be written; one that was there before is unchanged.
+    """
+    path, content = Path(path), io.BytesIO()
+    header = {"format": form, "holds": sorted(arrays), **about}
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"there is no directory {path.parent} to write {path.name} into.")
+    np.savez(content, about=np.array(json.dumps(header)), **arrays)
+    try:
+        publish(path, content.getvalue())
+    except OSError as error:
+        why = f"{error.strerror or error}; give another path, or make it possible to write there"
+        raise OSError(error.errno, why, str(path)) from error
+
+
+def read_npz(
+    path: str | os.PathLike[str], form: int, what: str
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of such a file; `what` says what it holds.
+
+    **Raises** `FileNotFoundError`; `ValueError` for a damaged or another file, or another format.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no {what} at {path}.")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        about = json.loads(str(arrays.pop("about")))
+        found = about["format"]
+        # The directory of a zip file has no checksum: a flipped bit there can hide an array.
+        if set(about.get("holds", arrays)) != set(arrays):
+            raise ValueError("it lacks an array")
+    except Exception as error:  # whatever zip and NumPy say of bytes that they cannot take
+        raise ValueError(
+            f"{path} is no {what} of this package, or is damaged ({error}): restore it from a "
+            "backup, or remove it and compute it again."
+        ) from None
+    if found != form:
+        raise ValueError(
+            f"{path} has the format {found!r}; this version reads {form}: use the version that "
+            "wrote it, or remove it and compute it again."
+        )
+    return about, arrays
