@@ -316,6 +316,17 @@ def test_backwards_in_time():
     np.testing.assert_allclose(dvi.fit(model, data, START).x, [1.3, 0.02, 1.0], atol=1e-6)
 
 
+def test_results_have_the_order_of_the_given_observations(regular):
+    """Newest first: the same parameters, and rows of the result that belong to the given times."""
+    data, known = regular
+    newest_first = dvi.Observations(REGULAR[::-1], data.values[::-1], sigma=NOISE, t0=0.0)
+    found = dvi.fit(MODEL, newest_first, START)
+    np.testing.assert_array_equal(found.x, known.x)
+    for name in ("ts", "observed", "predicted", "whitened", "errors", "residuals"):
+        of_one, of_other = getattr(found, name)[0], getattr(known, name)[0]
+        np.testing.assert_array_equal(of_one, of_other[::-1])
+
+
 def test_horizons_lead_where_everything_at_once_misleads():
     """A start that is wrong by several periods at the end of the arc."""
     data = dvi.Observations(REGULAR, noisy(REGULAR, 10), sigma=NOISE, t0=0.0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
+from dvi_jax.fit.problem import Problem
 
 
 def H(t0, t1, q0, p1, args):
@@ -43,7 +44,7 @@ def put(x, i, value):
         ({"ts": put(TS, 3, np.inf)}, ValueError, r"ts\[3\] is inf"),
         ({"ts": swapped(TS, 4, 5)}, ValueError, r"not in order: ts\[4\].*argsort"),
         ({"ts": put(TS, 4, TS[3])}, ValueError, r"ts\[3\] and ts\[4\] are the same time"),
-        ({"t0": 0.75}, ValueError, "lies before t0 = 0.75"),
+        ({"t0": 0.75}, ValueError, "t0 = 0.75.* lies between the times .*0.5 to 10.*h < 0"),
         ({"t0": np.nan}, ValueError, "t0 must be one finite number"),
         ({"ts": TS[:5]}, ValueError, r"one row for each time: ts has shape \(5,\)"),
         ({"ts": TS[:, None]}, ValueError, "one-dimensional array of times"),
@@ -86,6 +87,23 @@ def test_a_covariance_of_correlation_one_is_refused():
         dvi.Observations(TS, values, covariance=full)
 
 
+@pytest.mark.parametrize("sign", [1, -1], ids=["after t0", "before t0"])
+def test_the_order_of_the_observations_does_not_matter(sign):
+    """Errors and values are moved together, and all that a fit computes with is the same."""
+    errors = {
+        "sigma": np.linspace(0.1, 0.2, 20)[:, None],
+        "covariance": np.linspace(0.1, 0.2, 20)[:, None, None],
+    }
+    model = dvi.Model(SYSTEM, h=0.1 * sign, q0=[1.0], p0=[0.0], args={"k": 1.0})
+    for name, error in errors.items():
+        groups = []
+        for rows in (slice(None), slice(None, None, -1)):
+            data = dvi.Observations(sign * TS[rows], VALUES[rows], t0=0.0, **{name: error[rows]})
+            groups += Problem(model, [data], False, PARAMS).groups
+        for of_one, of_other in zip(*(vars(group).values() for group in groups), strict=True):
+            np.testing.assert_array_equal(of_one, of_other)
+
+
 def fit(model=MODEL, data=DATA, params=PARAMS, **options):
     return dvi.fit(model, data, params, **options)
 
@@ -104,7 +122,25 @@ def fails_at_start(params):
         ({"model": lambda p: {**MODEL(p), "num_steps": 3}}, ValueError, "must not set 'num_steps'"),
         ({"model": lambda p: {**MODEL(p), "t0": 0.0}}, ValueError, r"Observations\(\.\.\., t0"),
         ({"model": lambda p: {**MODEL(p), "h": 0.0}}, ValueError, "finite and not zero"),
-        ({"model": lambda p: {**MODEL(p), "h": -0.1}}, ValueError, "goes the other way"),
+        (
+            {"model": lambda p: {**MODEL(p), "h": -0.1}},
+            ValueError,
+            r"\(t = 0.5 to 10\) lie after t0 = 0, but h = -0.1 leads to earlier.*Give h = 0.1",
+        ),
+        (
+            {"data": dvi.Observations(-TS[::-1], VALUES, sigma=0.1, t0=0.0)},
+            ValueError,
+            r"\(t = -10 to -0.5\) lie before t0 = 0, but h = 0.1 leads to later.*Give h = -0.1",
+        ),
+        (
+            {
+                "model": dvi.Model(
+                    SYSTEM, h=-0.1, q0=[1.0], p0=[0.0], lattice=dvi.Variational(), num_steps=99
+                )
+            },
+            ValueError,
+            "lie after t0 = 0, but h = -0.1 leads to earlier",
+        ),
         ({"model": lambda p: {**MODEL(p), "h": 1e-12}}, ValueError, "Are the times"),
         ({"model": lambda p: {**MODEL(p), "h": 1e3}}, ValueError, "Are the times"),
         ({"model": lambda p: {**MODEL(p), "h": p["epsilon"] + 0.1}}, ValueError, "not a parameter"),

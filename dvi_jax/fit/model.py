@@ -211,10 +211,22 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
 
 
 def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
-    """How many steps reach the last observation."""
+    """How many steps reach the last observation.
+
+    **Raises** `ValueError` for an h that does not lead from t0 to the observations.
+    """
     h = float(spec["h"])
     if not np.isfinite(h) or h == 0:
         raise ValueError(f"the step size h of the model must be finite and not zero, got {h}.")
+    span = arc.ts[-1] - arc.t0
+    if span * h < 0:
+        side, direction = ("before", "later") if span < 0 else ("after", "earlier")
+        raise ValueError(
+            f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} "
+            f"t0 = {arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}, or the "
+            "t0 to which the model's q0 and p0 belong (Observations(..., t0=...); the first time "
+            "if it was left out)."
+        )
     if not _uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
@@ -222,12 +234,6 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
                 "the last observation: num_steps."
             )
         return spec["num_steps"]
-    span = arc.ts[-1] - arc.t0
-    if span * h < 0:
-        raise ValueError(
-            f"arc {i}: the observations go from t0 = {arc.t0:g} to {arc.ts[-1]:g}, but h = {h:g} "
-            "goes the other way. Give h the sign of the data's direction."
-        )
     steps = span / h
     if steps > 2e9:
         raise ValueError(

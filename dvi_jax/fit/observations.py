@@ -1,7 +1,7 @@
 """What was observed: times, values, errors; checked, and laid out for the device."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -36,7 +36,8 @@ def accepts_four(function: Any) -> bool:
 class Observations:
     r"""Observed values along one arc of a trajectory.
 
-    - `ts`: times, shape (N,), in the direction of the run, no two alike.
+    - `ts`: times, shape (N,), ascending or descending, no two equal, and all on one side of t0.
+      Either order may be combined with either sign of h; a `FitResult` has the order given here.
     - `values`: what was observed at them, shape (N, ...); NaN where a component is missing.
     - `observe`: what is observed of a state: ``"positions"`` (q, the default), ``"momenta"`` (p),
       ``"state"`` (both in one vector), or a function ``(t, q, p, args)`` that returns an array of
@@ -46,13 +47,14 @@ class Observations:
     - `covariance`: instead of sigma, covariances of the K components of one observation in the
       order of ``ravel``: shape (K, K) for all, or (N, K, K).
     - `t0`: time of the arc's start, where the model's q0 and p0 belong; ``ts[0]`` if left out.
+      The sign of the model's h must lead from t0 to the observations.
 
     Observations of several kinds along the same arc are one `observe` that returns them all, at
     the union of their times, with NaN for what was not seen.
 
     **Raises** `ValueError` or `TypeError` for what cannot be meant: times that are not finite,
-    not in order or twice the same, before t0; values of another shape, infinite, or all missing;
-    errors that are zero, negative or NaN; a covariance that is not positive definite.
+    not in order, twice the same or on both sides of t0; values of another shape, infinite, or all
+    missing; errors that are zero, negative or NaN; a covariance that is not positive definite.
     """
 
     ts: Any
@@ -92,13 +94,11 @@ class Observations:
         if np.isnan(values).all():
             raise ValueError("all values are NaN, which stands for missing: nothing was observed.")
         t0 = float(ts[0]) if self.t0 is None else _number("t0", self.t0)
-        direction = ts[-1] - t0
-        early = (ts - t0) * (1 if direction >= 0 else -1) < 0
-        if early.any():
+        if ts.min() < t0 < ts.max():
             raise ValueError(
-                f"the time {ts[early][0]:.17g} lies before t0 = {t0:.17g}, the start of the arc. "
-                "Move t0, or give the observations before it as an arc of their own that runs "
-                "backwards (h < 0, times in descending order)."
+                f"t0 = {t0:.17g}, the start of the arc, lies between the times of the observations "
+                f"({ts.min():.17g} to {ts.max():.17g}). All must be on one side of it: move t0, or "
+                "give the observations before t0 as a second arc, with h < 0."
             )
         if self.sigma is not None and self.covariance is not None:
             raise ValueError("give sigma or covariance, not both.")
@@ -114,6 +114,14 @@ class Observations:
     def function(self) -> Callable[..., Any]:
         """`observe` as a function (t, q, p, args)."""
         return NAMED[self.observe] if isinstance(self.observe, str) else self.observe
+
+    def ordered(self) -> "Observations":
+        """The same observations in the order in which a run from t0 reaches them."""
+        if abs(self.ts[0] - self.t0) <= abs(self.ts[-1] - self.t0):
+            return self
+        rows = ("ts", "values", "sigma", "covariance")
+        given = {name: getattr(self, name) for name in rows}
+        return replace(self, **{n: None if x is None else x[::-1] for n, x in given.items()})
 
     @property
     def components(self) -> int:

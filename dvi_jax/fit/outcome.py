@@ -45,9 +45,9 @@ def result_of(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
             curvature = _curvature_ratio(problem, u, J, about)
     return FitResult(
         params=space.to_params(jnp.asarray(x)), x=x, names=list(space.names), covariance=covariance,
-        history=run.history(), result=minimum.status, ts=[a.ts for a in problem.arcs],
-        observed=[a.values for a in problem.arcs], predicted=predicted, whitened=whitened,
-        errors=[a.errors for a in problem.arcs], loss=loss, degrees_of_freedom=degrees,
+        history=run.history(), result=minimum.status, ts=[a.ts for a in problem.given],
+        observed=[a.values for a in problem.given], predicted=predicted, whitened=whitened,
+        errors=[a.errors for a in problem.given], loss=loss, degrees_of_freedom=degrees,
         num_observed=problem.count, prior_chi2=float(np.sum(off**2)),
         has_errors=problem.has_errors, undetermined=words, singular_values=values,
         curvature=curvature, at_bounds=space.at_bounds(x, np.sqrt(np.diag(covariance))),

@@ -134,8 +134,8 @@ class Core(eqx.Module):
 class Problem:
     """What is to be fitted, in free variables u.
 
-    - `core`: its functions. `space`: the parameters, `start` their x. `arcs`: the data, `groups`
-      them as arrays.
+    - `core`: its functions. `space`: the parameters, `start` their x. `given`: the data as given,
+      `arcs`: in the order of the run, `groups`: as arrays.
     - `size`: how many free variables there are. `count`: how many values were observed.
     """
 
@@ -160,7 +160,8 @@ class Problem:
                 f"loss must be a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or "
                 f"dvi.Likelihood(f), got {loss!r}."
             )
-        self.arcs, self.loss = arcs, loss
+        self.given, self.loss = arcs, loss
+        self.arcs = arcs = [arc.ordered() for arc in arcs]
         self.space, self.start = make_space(params, bounds, priors)
         self.size = self.space.size
         self.has_errors = arcs[0].has_errors
@@ -224,14 +225,15 @@ class Problem:
 
     def by_arc(self, rows: list[Any], known: list[Any]) -> tuple[list, list, list[str]]:
         """For each arc predictions (N, ...), observed minus predicted in standard errors (N, K),
-        and the status."""
+        and the status; rows in the order of `given`."""
         predicted, whitened, names = {}, {}, {}
         for group, r, (values, result) in zip(self.groups, rows, known, strict=True):
             status = np.atleast_1d(status_name(result))
             for a, i in enumerate(group.arcs):
                 arc, n = self.arcs[i], len(self.arcs[i].ts)
-                predicted[i] = np.asarray(values[a, :n]).reshape(arc.values.shape)
-                whitened[i] = np.where(group.seen[a, :n], -np.asarray(r[a, :n]), np.nan)
+                order = slice(None, None, 1 if arc is self.given[i] else -1)
+                predicted[i] = np.asarray(values[a, :n]).reshape(arc.values.shape)[order]
+                whitened[i] = np.where(group.seen[a, :n], -np.asarray(r[a, :n]), np.nan)[order]
                 names[i] = str(status[a])
         each = range(len(self.arcs))
         return [predicted[i] for i in each], [whitened[i] for i in each], [names[i] for i in each]

@@ -137,7 +137,7 @@ def _trajectory(setup: FitSetup, found: dvi.FitResult) -> tuple[dict[str, Any], 
     spec = setup.model(found.params)
     t0, h = setup.data.t0, spec["h"]
     assert t0 is not None
-    steps = max(1, int(np.ceil((setup.data.ts[-1] - t0) / h - 1e-9)))
+    steps = max(1, int(np.ceil((setup.data.ordered().ts[-1] - t0) / h - 1e-9)))
     every = -(-steps // _MOST)
     solution = dvi.integrate(
         **spec, t0=t0, num_steps=steps, save=dvi.Save(every=every, final=True), throw=False
