@@ -135,11 +135,31 @@ def fails_at_start(params):
         (
             {
                 "model": dvi.Model(
-                    SYSTEM, h=-0.1, q0=[1.0], p0=[0.0], lattice=dvi.Variational(), num_steps=99
+                    SYSTEM,
+                    h=-0.1,
+                    q0=[1.0],
+                    p0=[0.0],
+                    args={"k": 1.0},
+                    lattice=dvi.Variational(),
+                    num_steps=99,
                 )
             },
             ValueError,
             "lie after t0 = 0, but h = -0.1 leads to earlier",
+        ),
+        (
+            {
+                "model": dvi.Model(
+                    SYSTEM,
+                    h=0.1,
+                    q0=[1.0],
+                    p0=[0.0],
+                    args={"k": 1.0},
+                    lattice=dvi.TimeTransformed(lambda t, q, p, args: 1 + q @ q),
+                )
+            },
+            ValueError,
+            "on the lattice TimeTransformed.* num_steps",
         ),
         ({"model": lambda p: {**MODEL(p), "h": 1e-12}}, ValueError, "Are the times"),
         ({"model": lambda p: {**MODEL(p), "h": 1e3}}, ValueError, "Are the times"),
