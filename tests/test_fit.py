@@ -11,6 +11,7 @@ import pytest
 import dvi_jax as dvi
 from dvi_jax.fit import run
 from dvi_jax.fit.observations import as_arcs
+from dvi_jax.fit.parameters import make_space
 from dvi_jax.fit.problem import Problem
 from dvi_jax.fit.uncertainty import correlations, null_space, uncertainty
 
@@ -523,6 +524,16 @@ def test_nearly_collinear_parameters_are_followed_to_the_minimum():
     found = dvi.fit(model, data, {"a": 0.9, "b": -0.5}, check_curvature=False)
     assert found.status == "converged"
     assert np.abs((found.x - [0.0, 1.0]) / found.sigma).max() < 4
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(1.1, 2.0), (-2.0, -1.1), (0.0, 1e-300), (-3.0, 0.0)])
+def test_numbers_stay_strictly_between_their_bounds(lower, upper):
+    ends = [-800.0, 800.0]
+    for bounds in (dvi.Bounds(lower), dvi.Bounds(None, upper), dvi.Bounds(lower, upper)):
+        space, _ = make_space([(lower + upper) / 2] * 2, [bounds] * 2)
+        x = np.asarray(space.to_x(jnp.array(ends)))
+        assert ((x > space.lower) & (x < space.upper) | ~np.isfinite(x)).all()
+        make_space(list(x[np.isfinite(x)]), [bounds] * int(np.isfinite(x).sum()))  # as a start
 
 
 @pytest.mark.parametrize("bounds", [dvi.Bounds(0.0), dvi.Bounds(0.0, 1.0)], ids=["one", "two"])

@@ -45,6 +45,12 @@ def _is_number(path: Any, x: Any) -> bool:
     return bool(eqx.is_inexact_array_like(x))
 
 
+def _gap(bound: Array) -> Array:
+    """Distance of a number next to a bound from it, at least one unit of its round-off."""
+    about = np.finfo(float)
+    return jnp.maximum(about.eps * jnp.abs(bound), about.tiny)
+
+
 class Space(eqx.Module):
     """The parameters of a fit as a vector x of all their numbers, and as a free vector u.
 
@@ -93,7 +99,10 @@ class Space(eqx.Module):
         one = jnp.exp(jnp.where(below ^ above, u, 0.0))
         x = jnp.where(below & above, lower + (upper - lower) * jax.nn.sigmoid(u), u)
         x = jnp.where(below & ~above, lower + one, x)
-        return jnp.where(above & ~below, upper - one, x)
+        x = jnp.where(above & ~below, upper - one, x)
+        # Rounding must not put x on a bound: there u is infinite.
+        x = jnp.where(below, jnp.maximum(x, lower + _gap(lower)), x)
+        return jnp.where(above, jnp.minimum(x, upper - _gap(upper)), x)
 
     def to_u(self, x: Any) -> np.ndarray:
         """The free vector of x."""
