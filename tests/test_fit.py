@@ -1,5 +1,7 @@
 """Fits: what they find, what they say of its errors, how they go on."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -208,6 +210,56 @@ def test_bounds_hold_and_are_named():
     assert held.x[1] <= 0.01
     assert held.x[1] > 0.00999
     assert held.at_bounds == ["epsilon"]
+    assert "its bound: no symmetric error" in str(held)
+
+
+def test_a_parameter_at_its_bound_is_neither_undetermined_nor_of_unknown_error():
+    """Far beyond the bound dx/du vanishes, and no covariance is found."""
+    data = dvi.Observations(REGULAR, noisy(REGULAR, 4), sigma=NOISE, t0=0.0)
+    model = dvi.Model(SYSTEM, h=H_STEP, q0=[1.0], p0=[0.0], epsilon=0.02, method=STRANG)
+    found = dvi.fit(
+        model, data, {"args": {"k": 0.8}}, bounds={"args": {"k": dvi.Bounds(0.0, 1.0)}},
+        check_curvature=False,
+    )  # fmt: skip
+    assert found.at_bounds == ["args.k"]
+    assert found.undetermined == []
+    assert "args.k  1 at its bound: no symmetric error" in str(found)
+    for words in ("nan", "not determined", "no errors"):
+        assert words not in str(found)
+
+
+def test_a_bounded_parameter_without_a_finite_error_is_at_a_bound_only_if_it_is_on_it():
+    space, _ = make_space([0.5] * 3, [dvi.Bounds(0.0, 1.0)] * 3)
+    x, sigma = np.array([0.5, 1e-170, 1 - 1e-16]), np.array([np.inf, np.nan, np.nan])
+    assert space.at_bounds(x, sigma) == ["[1]", "[2]"]
+
+
+def test_a_model_no_better_than_a_constant_is_reported(regular):
+    """A minimum in k far from the true one, from which nothing leads away."""
+    data, good = regular
+    without = dvi.Observations(REGULAR, data.values, t0=0.0)
+    start = {**START, "args": {"k": 9.0}}
+    bad = dvi.fit(MODEL, without, start, horizons=None, throw=False)
+    assert bad.explained < 0.1
+    assert "better than constants do" in str(bad)
+    assert 0.99 < good.explained < 1
+    assert "constants" not in str(good)
+
+
+def test_the_explained_variance_is_that_of_its_definition(regular):
+    """With errors of each value, a missing one, and a mean for each component."""
+    random = np.random.default_rng(0)
+    seen, model, errors = random.normal(size=(3, 9, 2))
+    seen[4, 1], errors = np.nan, np.abs(errors) + 0.1
+    given = {"observed": [seen], "predicted": [model], "errors": [errors]}
+    left = total = 0.0
+    for k in range(2):
+        good = np.isfinite(seen[:, k])
+        y, w = seen[good, k], errors[good, k] ** -2.0
+        left += np.sum(w * (y - model[good, k]) ** 2)
+        total += np.sum(w * (y - np.average(y, weights=w)) ** 2)
+    found = dataclasses.replace(regular[1], **given)
+    np.testing.assert_allclose(found.explained, 1 - left / total, rtol=1e-12)
 
 
 def test_a_prior_weighs_as_a_measurement():

@@ -56,6 +56,8 @@ def put(x, i, value):
         ({"sigma": 0.0}, ValueError, "sigma is 0.0 .* positive"),
         ({"sigma": -1.0}, ValueError, "positive"),
         ({"sigma": np.nan}, ValueError, "sigma is nan"),
+        ({"sigma": 1e-200}, ValueError, r"1e-200 .*values are up to 0.99.*double precision"),
+        ({"sigma": 1e200}, ValueError, "in the units of the values"),
         ({"sigma": np.ones((20, 2))}, ValueError, "does not broadcast"),
         ({"sigma": None, "covariance": np.zeros((1, 1))}, ValueError, "not positive definite"),
         ({"sigma": None, "covariance": -np.eye(1)}, ValueError, "not positive definite"),
@@ -206,9 +208,21 @@ def fails_at_start(params):
         ({"horizons": [2.0, 1.0]}, ValueError, "growing"),
         ({"horizons": "all"}, ValueError, "auto"),
         ({"progress": 3}, TypeError, "progress"),
-        ({"model": fails_at_start}, ValueError, "starting parameters the model gives no number"),
+        ({"model": fails_at_start}, ValueError, r"\(epsilon = 0\) the model gives no number"),
+        (
+            {"params": {"args": {"k": -30.0}}},
+            ValueError,
+            r"\(args.k = -30\) the model gives 2.*e\+03 for arc 0 at t = 1.5 "
+            r"\(at its start, t = 0, 1; largest .* the trajectory diverges",
+        ),
+        (
+            {"data": dvi.Observations(TS, VALUES, covariance=[[1e-310]], t0=0.0)},
+            dvi.FitError,
+            "not_finite after 0 steps, loss inf.* the sum of their squares",
+        ),
     ],
 )
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")  # the case of squares beyond range
 def test_fit_refuses(wrong, error, says):
     with pytest.raises(error, match=says):
         fit(**wrong)

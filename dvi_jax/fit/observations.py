@@ -23,6 +23,9 @@ def _state(t, q, p, args):
     return jnp.concatenate([jnp.ravel(q), jnp.ravel(p)])
 
 
+_RANGE = (1e-140, 1e140)
+"""Standard errors relative to the largest value of which a sum of squares can be computed."""
+
 NAMED = {"positions": _positions, "momenta": _momenta, "state": _state}
 """Observables of a state that have a name."""
 
@@ -244,6 +247,15 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
             f"sigma is {full[tuple(i)]} for the value at index {i}: standard errors must be "
             "positive and finite. A value that is not to count is given as NaN; one that is known "
             "exactly belongs into the model."
+        )
+    size = np.nanmax(np.abs(values)) or 1.0
+    overflow = ~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & ~np.isnan(values)
+    if overflow.any():
+        i = np.argwhere(overflow)[0].tolist()
+        raise ValueError(
+            f"sigma is {full[tuple(i)]:g} for the value at index {i}, and the values are up to "
+            f"{size:.3g}: squares of their ratio are beyond the range of double precision. Give "
+            "the standard errors in the units of the values."
         )
     return np.array(full)
 

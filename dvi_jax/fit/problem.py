@@ -17,7 +17,8 @@ from .optimise import Evaluation
 from .parameters import Space, make_space
 
 _UNITS = 1e3
-"""By which factor data and model may differ in size before it must be a matter of units."""
+"""Factor by which data and model may differ in size at the start of a fit: beyond it the units
+differ, or the trajectory diverges."""
 
 
 class Core(eqx.Module):
@@ -258,25 +259,46 @@ class Problem:
                 first = group.seen[a].any(axis=1).argmax()
                 if not np.isfinite(found[a, first][group.seen[a, first]]).all():
                     raise ValueError(
-                        f"at the starting parameters the model gives no number for the first "
-                        f"observation of arc {arc} (t = {group.ts[a, first]:g}; status "
-                        f"{names[a]!r}). Start from other parameters or take a smaller h."
+                        f"at the starting parameters ({self.space.in_words(self.start)}) the model "
+                        f"gives no number for the first observation of arc {arc} (t = "
+                        f"{group.ts[a, first]:g}; status {str(names[a])!r}). Start from other "
+                        "parameters or take a smaller h."
                     )
         if check_units:
-            self._check_units([np.asarray(found) for found, _ in known])
+            self._check_sizes([np.asarray(found) for found, _ in known])
 
-    def _check_units(self, found: list[np.ndarray]) -> None:
-        seen = np.concatenate([g.values[g.seen] for g in self.groups])
-        model = np.concatenate([f[g.seen] for f, g in zip(found, self.groups, strict=True)])
-        model = model[np.isfinite(model)]
-        data, own = np.abs(seen).max(), np.abs(model).max() if model.size else 0.0
-        if data == 0 or own == 0 or 1 / _UNITS < data / own < _UNITS:
+    def _check_sizes(self, found: list[np.ndarray]) -> None:
+        """Refuse predictions that are much larger or much smaller than the data."""
+        pairs = list(zip(self.groups, found, strict=True))
+        data = max(float(np.abs(g.values[g.seen]).max()) for g, _ in pairs)
+        own = [np.where(g.seen & np.isfinite(f), np.abs(f), 0.0).max(axis=2) for g, f in pairs]
+        largest = max(float(size.max()) for size in own)
+        if data == 0 or largest == 0 or 1 / _UNITS < data / largest < _UNITS:
             return
+        about = f"at the starting parameters ({self.space.in_words(self.start)}) the model gives "
+        if largest < data:
+            raise ValueError(
+                f"{about}values up to {largest:.3g}, the observed ones are up to {data:.3g}: a "
+                f"factor of {data / largest:.3g}. Are they in the same units? If this is "
+                "intended, use check_units=False."
+            )
+        group, size = next((g, s) for (g, _), s in zip(pairs, own, strict=True)
+                           if (s >= _UNITS * data).any())  # fmt: skip
+        a, row = np.argwhere(size >= _UNITS * data)[0]
+        arc = int(group.arcs[a])
         raise ValueError(
-            f"the observed values are up to {data:.3g}, those of the model at the starting "
-            f"parameters up to {own:.3g}: a factor of {data / own:.3g}. Are they in the same "
-            "units? If it is meant, say check_units=False."
+            f"{about}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g} (at its start, "
+            f"t = {group.t0[a]:g}, {self._at_start(arc):.3g}; largest value {size[a].max():.3g}), "
+            f"the observed ones are up to {data:.3g}. Likely causes: (a) the trajectory diverges "
+            "at these parameters: start from others, give bounds, or take a smaller h; (b) model "
+            "and data are not in the same units. If this is intended, use check_units=False."
         )
+
+    def _at_start(self, arc: int) -> float:
+        """Largest component of what the model predicts at the start of an arc."""
+        spec, data = self.specs[arc], self.arcs[arc]
+        q0, p0 = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
+        return float(jnp.max(jnp.abs(data.function(data.t0, q0, p0, spec.get("args")))))
 
 
 @eqx.filter_jit
