@@ -43,7 +43,7 @@ from ._system import System
 from ._types import Interval
 from .engine.newton import RootSolver, over
 from .engine.picard import PicardThenNewton
-from .engine.quantities import refuse_quantity
+from .engine.quantities import refuse_unit_or_mask
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, goes_backwards, warn_of_dissipation
 from .observe import Deviations, Range, Reduction, RequestedTimes, Running, Section, Stop
@@ -432,7 +432,7 @@ def _is_real(dtype: Any) -> bool:
 def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
     """A number of this precision, or an error that names it."""
     known = None if is_traced(value) else _as_numpy(name, value)
-    if isinstance(value, np.ndarray | np.generic):
+    if isinstance(value, np.ndarray | np.generic) and value.dtype == np.float64:
         refuse_double_without_x64(name, value.dtype)
     kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
     if not _is_real(kind):
@@ -453,7 +453,7 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
 
 
 def _as_numpy(name: str, value: Any) -> np.ndarray:
-    refuse_quantity(name, value)
+    refuse_unit_or_mask(name, value)
     try:
         return np.asarray(value)
     except (TypeError, ValueError) as error:
@@ -463,8 +463,11 @@ def _as_numpy(name: str, value: Any) -> np.ndarray:
 def as_parameter(leaf: Any) -> Any:
     """A leaf of args: floats become arrays, so that a new value needs no new compilation."""
     if isinstance(leaf, np.ndarray | np.generic):
-        refuse_quantity("args", leaf)
+        refuse_unit_or_mask("args", leaf)
+        leaf = np.asarray(leaf)
         refuse_double_without_x64("args", leaf.dtype)
+        if leaf.dtype.kind in "OMm":
+            raise TypeError(f"args holds an array of dtype {leaf.dtype}: numbers are needed.")
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
         try:

@@ -23,6 +23,8 @@ VALUES = np.cos(TS)[:, None]
 MODEL = dvi.Model(SYSTEM, h=0.1, q0=[1.0], p0=[0.0], args={"k": 1.0})
 DATA = dvi.Observations(TS, VALUES, sigma=0.1, t0=0.0)
 PARAMS = {"epsilon": 0.0}
+START = {"q0": [1.0], "p0": [0.0], "args": {"k": 1.0}}
+LONG = np.dtype(np.longdouble)  # the same as float64 on some machines
 
 
 def swapped(x, i, j):
@@ -56,6 +58,9 @@ def put(x, i, value):
         ({"sigma": 0.0}, ValueError, "sigma is 0.0 .* positive"),
         ({"sigma": -1.0}, ValueError, "positive"),
         ({"sigma": np.nan}, ValueError, "sigma is nan"),
+        ({"sigma": np.ma.array(VALUES, mask=TS[:, None] == 2)}, ValueError, r"index \[3, 0\]"),
+        ({"ts": np.ma.array(TS, mask=TS == 2)}, ValueError, r"ts is a masked .* index \[3\]"),
+        ({"t0": np.ma.masked}, ValueError, "t0 is a masked array with a masked number, which"),
         ({"sigma": 1e-200}, ValueError, r"1e-200 .*values are up to 0.99.*double precision"),
         ({"sigma": 1e200}, ValueError, "in the units of the values"),
         ({"sigma": np.ones((20, 2))}, ValueError, "does not broadcast"),
@@ -191,6 +196,31 @@ def fails_at_start(params):
         ({"params": {"k": 1.0}}, TypeError, "{\"args\": {'k': ...}}"),
         ({"params": {"epsilon": np.nan}}, ValueError, "epsilon starts at nan"),
         ({"params": {"args": {"k": np.ones(40)}}}, ValueError, "scalar|parameters cannot follow"),
+        ({"params": {"epsilon": np.ma.masked}}, ValueError, "the parameter epsilon is a masked"),
+        (
+            {"params": {"q0": np.ma.array([1.0], mask=[True])}},
+            ValueError,
+            r"the parameter q0 is a masked array with a masked number at index \[0\]",
+        ),
+        ({"bounds": {"epsilon": dvi.Bounds(np.ma.masked, 1)}}, ValueError, "lower of epsilon is a"),
+        *(
+            (
+                {"model": dvi.Model(SYSTEM, h=0.1, **{**START, **start})},
+                error,
+                says,
+            )
+            for start, error, says in (
+                ({"q0": np.ma.array([1.0], mask=[True])}, ValueError, "q0 is a masked array"),
+                *(
+                    [({"p0": np.array([0.0], LONG)}, TypeError, f"p0 is {LONG}")]
+                    if LONG.itemsize > 8
+                    else []
+                ),
+                ({"p0": np.array([0.0], object)}, TypeError, "p0 .* dtype object"),
+                ({"q0": np.array(["2000"], "M8[D]")}, TypeError, "q0 .* dtype datetime64"),
+                ({"args": {"k": np.array(1.0, object)}}, TypeError, "args .* dtype object"),
+            )
+        ),
         ({"bounds": {"epsilon": dvi.Bounds(1, 0)}}, ValueError, "lower one must be less"),
         ({"bounds": {"epsilon": dvi.Bounds(0.5, 1)}}, ValueError, "not between"),
         ({"bounds": {"eps": dvi.Bounds(0.5, 1)}}, ValueError, "given for 'eps'"),
@@ -226,6 +256,11 @@ def fails_at_start(params):
 def test_fit_refuses(wrong, error, says):
     with pytest.raises(error, match=says):
         fit(**wrong)
+
+
+def test_a_model_takes_a_masked_array_without_a_masked_number():
+    model = dvi.Model(SYSTEM, h=0.1, **{**START, "q0": np.ma.array([1.0])})
+    assert type(model(PARAMS)["q0"]) is np.ndarray
 
 
 @pytest.mark.parametrize("loss", [dvi.SoftL1, dvi.Cauchy])

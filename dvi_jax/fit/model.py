@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 
 from lanewise.jaxapi import is_traced
 
-from .._integrate import integrate
+from .._integrate import as_parameter, integrate, start_state
 from .._results import RESULTS
 from .._solution import Save
 from .._system import System
@@ -73,7 +73,7 @@ class Model(eqx.Module):
                 )
         fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
         # Arrays, so that another value needs no other compilation.
-        self.fixed = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, float) else x, fixed)
+        self.fixed = jax.tree.map(_as_array, fixed)
         self.rest = {"system": system, "h": check_step_size(h), **options}
 
     def __call__(self, params: Mapping[str, Any], arc: Any = None) -> dict[str, Any]:
@@ -111,6 +111,12 @@ class Model(eqx.Module):
                     f"{name} has shape {shape}, but data is a list of {arcs} arcs: it needs a row "
                     "for each."
                 )
+
+
+def _as_array(x: Any) -> Any:
+    """A float, or a masked array without a masked number, as an array; anything else as it is."""
+    is_plain = isinstance(x, np.ma.MaskedArray) and not np.ma.is_masked(x)
+    return np.asarray(x) if is_plain or isinstance(x, float) else x
 
 
 def _row(name: str, rows: Any, arc: Any) -> Array:
@@ -335,13 +341,15 @@ def _observed(group: Group, spec: Mapping[str, Any], ts: Array, qs: Array, ps: A
 
 
 def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> None:
-    """Refuse an observable that does not give one value of the shape of the data.
+    """Refuse a start and args that `integrate` refuses, and an observable that does not give one
+    value of the shape of the data.
 
     **Raises** `ValueError` with both shapes; errors of the function itself with a note.
     """
-    q, p = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
+    q, p = start_state(spec["q0"], spec["p0"])
+    args = jax.tree.map(as_parameter, spec.get("args"))
     try:
-        out = eqx.filter_eval_shape(arc.function, jnp.asarray(arc.t0), q, p, spec.get("args"))
+        out = eqx.filter_eval_shape(arc.function, jnp.asarray(arc.t0), q, p, args)
     except Exception as error:
         error.add_note(f"(in the observe of arc {i}, called with (t, q, p, args))")
         raise

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..engine.quantities import refuse_quantity
+from ..engine.quantities import refuse_unit_or_mask
 from ..engine.signature import accepts
 
 
@@ -41,7 +41,8 @@ class Observations:
 
     - `ts`: times, shape (N,), ascending or descending, no two equal, and all on one side of t0.
       Either order may be combined with either sign of h; a `FitResult` has the order given here.
-    - `values`: what was observed at them, shape (N, ...); NaN where a component is missing.
+    - `values`: what was observed at them, shape (N, ...); NaN, or a masked number, where a
+      component is missing. Only `values` may be masked.
     - `observe`: what is observed of a state: ``"positions"`` (q, the default), ``"momenta"`` (p),
       ``"state"`` (both in one vector), or a function ``(t, q, p, args)`` that returns an array of
       the shape of one value: a range, an angle, one body of many.
@@ -70,7 +71,7 @@ class Observations:
     def __post_init__(self):
         ts = _real("ts", self.ts)
         values = self.values
-        if isinstance(values, np.ma.MaskedArray):  # what is masked is missing
+        if np.ma.is_masked(values):  # what is masked is missing
             values = np.ma.filled(values.astype(float), np.nan)
         values = _real("values", values)
         known = (
@@ -190,7 +191,7 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
 
 
 def _real(name: str, value: Any) -> np.ndarray:
-    refuse_quantity(name, value)
+    refuse_unit_or_mask(name, value)
     try:
         found = np.asarray(value)
     except (TypeError, ValueError) as error:

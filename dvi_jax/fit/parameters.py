@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from ..engine.quantities import refuse_unit_or_mask
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -159,6 +161,7 @@ def make_space(
     names, shapes = [], []
     for path, leaf in paths:
         name, shape = _name(path), np.shape(leaf)
+        refuse_unit_or_mask(f"the parameter {name}", leaf)
         if np.iscomplexobj(leaf):
             raise TypeError(f"the parameter {name} is complex: write its parts.")
         places = ("" if not shape else f"[{', '.join(map(str, i))}]" for i in np.ndindex(shape))
@@ -276,6 +279,7 @@ def _pairs(a: Any, b: Any) -> list[tuple[Any, Any]]:
 
 
 def _spread(value: Any, where: np.ndarray, shape: tuple[int, ...], called: str) -> np.ndarray:
+    refuse_unit_or_mask(called, value)
     try:
         value = np.asarray(value, float)
     except (TypeError, ValueError):

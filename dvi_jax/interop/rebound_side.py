@@ -11,7 +11,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from ..engine.quantities import refuse_quantity
+from ..engine.quantities import refuse_unit_or_mask
 from ..systems import Problem
 from ..systems.n_body import (
     INVARIANTS,
@@ -214,8 +214,8 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
         raise TypeError("a state is q and p together, or neither of them.")
     masses = np.asarray(args["masses"], float)
     of_problem = q is None
-    refuse_quantity("q", q)
-    refuse_quantity("p", p)
+    refuse_unit_or_mask("q", q)
+    refuse_unit_or_mask("p", p)
     q, p = (np.asarray(x, float) for x in ((problem.q0, problem.p0) if of_problem else (q, p)))
     check_bodies(q, p, args)
     for name, values in (("q", q), ("p", p), ("t", 0.0 if t is None else float(t))):
