@@ -14,7 +14,7 @@ from jaxtyping import Array, PyTree
 
 import lanewise
 from lanewise import Layout
-from lanewise.jaxapi import batch_size, is_traced
+from lanewise.jaxapi import batch_size, is_traced, manual_axes
 from lanewise.primitive import generates
 
 from ._adjoints import AbstractAdjoint, Outcome
@@ -45,7 +45,7 @@ from ._system import System, check_system
 from ._types import Interval
 from .engine.newton import RootSolver, over
 from .engine.picard import PicardThenNewton
-from .engine.quantities import refuse_quantity
+from .engine.quantities import refuse_unit_or_mask
 from .engine.reads import reads
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, goes_backwards, warn_of_dissipation
@@ -346,7 +346,15 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     result = solution.result
     if result.is_traced():
         fine = (result == RESULTS.successful) | (result == RESULTS.stopped)
-        return result.error_if(solution, ~fine)
+        arrays, rest = eqx.partition(solution, eqx.is_array)
+        if not manual_axes(*jax.tree.leaves(arrays)):
+            return result.error_if(solution, ~fine)
+        # In jax.shard_map the branches of error_if differ in type: form it for one device.
+        checked = lanewise.call(
+            lambda result, arrays, fine: result.error_if(arrays, ~fine),
+            result, arrays, fine, layout=Layout(form="arrays"),
+        )  # fmt: skip
+        return eqx.combine(checked, rest)
     if status_name(result) in ("successful", "stopped"):
         return solution
     kept = "With throw=False the solution up to there is returned with its status; here it is the "
@@ -451,7 +459,7 @@ def _is_real(dtype: Any) -> bool:
 def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
     """A number of this precision, or an error that names it."""
     known = None if is_traced(value) else _as_numpy(name, value)
-    if isinstance(value, np.ndarray | np.generic):
+    if isinstance(value, np.ndarray | np.generic) and value.dtype == np.float64:
         refuse_double_without_x64(name, value.dtype)
     kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
     if not _is_real(kind):
@@ -472,7 +480,7 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
 
 
 def _as_numpy(name: str, value: Any) -> np.ndarray:
-    refuse_quantity(name, value)
+    refuse_unit_or_mask(name, value)
     try:
         return np.asarray(value)
     except (TypeError, ValueError) as error:
@@ -482,8 +490,11 @@ def _as_numpy(name: str, value: Any) -> np.ndarray:
 def as_parameter(leaf: Any) -> Any:
     """A leaf of args: floats become arrays, so that a new value needs no new compilation."""
     if isinstance(leaf, np.ndarray | np.generic):
-        refuse_quantity("args", leaf)
+        refuse_unit_or_mask("args", leaf)
+        leaf = np.asarray(leaf)
         refuse_double_without_x64("args", leaf.dtype)
+        if leaf.dtype.kind in "OMm":
+            raise TypeError(f"args holds an array of dtype {leaf.dtype}: numbers are needed.")
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
         try:

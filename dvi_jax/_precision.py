@@ -1,4 +1,4 @@
-"""Double precision is asked for, never switched on behind the user's back."""
+"""Double precision must be requested: it is never switched on for the user."""
 
 from typing import Any
 
@@ -8,7 +8,13 @@ from lanewise.jaxapi import x64_enabled
 
 
 def refuse_double_without_x64(name: str, dtype: Any) -> None:
-    """Refuse a float64 input called `name` in a process that computes in float32."""
+    """Refuse a float64 input called `name` in a process that computes in float32, and one of more
+    than double precision anywhere."""
+    if np.issubdtype(dtype, np.inexact) and np.finfo(dtype).eps < np.finfo(np.float64).eps:
+        raise TypeError(
+            f"{name} is {np.dtype(dtype)}, and JAX has no numbers beyond double precision: give "
+            f"np.asarray({name}, np.float64), which rounds them."
+        )
     if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():
         raise TypeError(
             f"{name} is float64, but this process computes in float32. Invariants need double "

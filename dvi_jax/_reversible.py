@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 import lanewise
 from lanewise import Layout
-from lanewise.jaxapi import is_traced, linear_map
+from lanewise.jaxapi import is_traced, linear_map, manual_axes
 
 from ._adjoints import AbstractAdjoint, Checkpointed, Outcome
 from ._arithmetic import FloatingPoint
@@ -117,6 +117,10 @@ class Reversible(AbstractAdjoint):
             kept, counts = eqx.partition(rows, eqx.is_inexact_array)
             smooth = _Smooth(carry.q, carry.p, kept, reduce(task, carry))
             return smooth, (carry, saved, tail, counts)
+
+        if manual_axes(*jax.tree.leaves((theta, whole, q0, p0))):
+            why = "the run is inside of jax.shard_map with check_vma=True"
+            return self._otherwise(why, task, plan, q0, p0, layout)
 
         # A value that is being differentiated or batched and that a function closes over is no
         # input of the trajectory: a derivative written for its inputs would miss it.

@@ -13,14 +13,14 @@ from lanewise.jaxapi import is_traced
 from ._precision import refuse_double_without_x64
 from ._results import RESULTS, status_name
 from ._types import State
-from .engine.quantities import refuse_quantity
+from .engine.quantities import refuse_unit_or_mask
 from .engine.signature import accepts
 
 
 def _as_times(ts: Any) -> Any:
     if ts is None or is_traced(ts):
         return ts
-    refuse_quantity("ts", ts)
+    refuse_unit_or_mask("ts", ts)
     ts = np.asarray(ts)
     refuse_double_without_x64("ts", ts.dtype)
     if not (np.issubdtype(ts.dtype, np.floating) or np.issubdtype(ts.dtype, np.integer)):

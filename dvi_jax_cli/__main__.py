@@ -1,6 +1,6 @@
 """``python -m dvi_jax_cli``: the command line without its script."""
 
-from ._app import main
+from ._main import main
 
 if __name__ == "__main__":
     main()

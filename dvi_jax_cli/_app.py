@@ -1,4 +1,4 @@
-"""The entry point: all commands, and how the process ends."""
+"""All commands, and how the process ends."""
 
 import io
 import os
@@ -14,11 +14,11 @@ from ._group import app
 from ._session import CODES, Session, quiet
 from ._show import complain
 
-__all__ = ["app", "main"]
+__all__ = ["app", "run"]
 
 
-def main() -> None:
-    """The entry point ``dvi-jax``."""
+def run() -> None:
+    """The command that the words of the command line name, and its exit code."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed, as by >&-: nobody reads
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
@@ -30,8 +30,6 @@ def main() -> None:
     except BrokenPipeError:
         quiet()
         sys.exit(CODES["failed"])
-    except KeyboardInterrupt:
-        sys.exit(CODES["interrupted"])
     except Exception as error:  # raised with --debug, or of the command line itself
         debug = "--debug" in sys.argv
         if debug:

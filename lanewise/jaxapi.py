@@ -1,7 +1,7 @@
 """The few names of JAX that have moved between releases, or are not public: all of them, here."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
 from jax.interpreters import ad, batching, mlir, partial_eval
+from jax.sharding import NamedSharding, PartitionSpec
 
 __all__ = [
     "ClosedJaxpr",
@@ -24,8 +25,11 @@ __all__ = [
     "jaxprs_in_params",
     "linear_map",
     "lower_on",
+    "manual_axes",
     "primitive",
     "scan_counts",
+    "with_equal_axes",
+    "without_manual_axes",
     "without_outputs",
     "x64_enabled",
 ]
@@ -97,6 +101,47 @@ def scan_counts(params: dict[str, Any]) -> tuple[int, int]:
     return len(list(consts)), len(list(carry))
 
 
+def manual_axes(*values: Any) -> frozenset[str]:
+    """The mesh axes of `jax.shard_map` along which one of some values or types varies."""
+    types = [jax.typeof(x) if not isinstance(x, ShapedArray) else x for x in values]
+    return frozenset().union(*(t.manual_axis_type.varying for t in types))
+
+
+def without_manual_axes(x: Any) -> Any:
+    """The type of an array that varies along axes of `jax.shard_map`, without them; else x.
+
+    A function is traced for one device: constants in it need no such axes then.
+    """
+    return jax.ShapeDtypeStruct(x.shape, x.dtype) if manual_axes(x) else x
+
+
+def with_equal_axes(xs: Sequence[Any]) -> list[Any]:
+    """Floating-point values that all vary along the axes of `jax.shard_map` along which one of them
+    varies, so that their derivatives are summed over devices where they must be."""
+    axes = manual_axes(*xs)
+    return [
+        jax.lax.pcast(x, tuple(axes - manual_axes(x)), to="varying")
+        if axes - manual_axes(x) and jnp.issubdtype(jax.typeof(x).dtype, jnp.floating)
+        else x
+        for x in xs
+    ]
+
+
+def _lowered(function: Callable, multiple: bool) -> Callable:
+    """The lowering of a primitive as what `function` does on one device."""
+    rule = mlir.lower_fun(function, multiple_results=multiple)
+
+    def for_one_device(ctx: Any, *operands: Any, **params: Any) -> Any:
+        plain = {
+            name: [ShapedArray(a.shape, a.dtype) for a in getattr(ctx, name)]
+            for name in ("avals_in", "avals_out")
+            if manual_axes(*getattr(ctx, name))
+        }
+        return rule(ctx.replace(**plain) if plain else ctx, *operands, **params)
+
+    return for_one_device
+
+
 def primitive(
     name: str, function: Callable, batched: Callable | None = None, multiple: bool = False
 ) -> Primitive:
@@ -109,7 +154,7 @@ def primitive(
     new.multiple_results = multiple
     new.def_impl(function)
     new.def_abstract_eval(lambda *avals, **params: _abstract(function, avals, params))
-    mlir.register_lowering(new, mlir.lower_fun(function, multiple_results=multiple))
+    mlir.register_lowering(new, _lowered(function, multiple))
 
     def as_function(arrays, axes, **params):
         return jax.vmap(lambda *a: function(*a, **params), axes, 0)(*arrays), 0
@@ -120,8 +165,7 @@ def primitive(
 
 def lower_on(platform: str, of: Primitive, function: Callable) -> None:
     """Have a primitive of several outputs compiled for `platform` as what `function` does."""
-    rule = mlir.lower_fun(function, multiple_results=True)
-    mlir.register_lowering(of, rule, platform=platform)
+    mlir.register_lowering(of, _lowered(function, True), platform=platform)
 
 
 def drops_outputs(of: Primitive, without: Callable) -> None:
@@ -226,7 +270,8 @@ def _linear_batched(arrays, axes, *, functions: _Linear, count: int):
 
 def _linear_transposed(cotangents, *arrays, functions: _Linear, count: int):
     push, pull, definition, transposed = functions
-    like = jax.eval_shape(push, *(x.aval if ad.is_undefined_primal(x) else x for x in arrays))
+    types = [x.aval if ad.is_undefined_primal(x) else jax.typeof(x) for x in arrays]
+    like = jax.eval_shape(push, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in types))
     given = [
         jnp.zeros(a.shape, a.dtype) if isinstance(c, ad.Zero) else c
         for c, a in zip(cotangents, like, strict=True)
@@ -268,4 +313,14 @@ def _abstract(function: Callable, avals: Any, params: dict[str, Any]) -> Any:
         out = shape_of(*shapes, **params)
     else:
         out = jax.eval_shape(lambda *a: function(*a, **params), *shapes)
-    return jax.tree.map(lambda x: ShapedArray(x.shape, x.dtype), out)
+    axes = manual_axes(*avals)
+    if not axes:
+        return jax.tree.map(lambda x: ShapedArray(x.shape, x.dtype), out)
+    varying = type(avals[0].manual_axis_type)(varying=axes)
+    mesh = next(a.sharding.mesh for a in avals if manual_axes(a))
+
+    def typed(x: Any) -> ShapedArray:
+        sharding = NamedSharding(mesh, PartitionSpec(*[None] * len(x.shape)))
+        return ShapedArray(x.shape, x.dtype, sharding=sharding, manual_axis_type=varying)
+
+    return jax.tree.map(typed, out)

@@ -18,8 +18,11 @@ from .jaxapi import (
     ClosedJaxpr,
     drops_outputs,
     has_derivative,
+    linear_map,
     lower_on,
+    manual_axes,
     primitive,
+    with_equal_axes,
 )
 from .kernel import Module
 from .pieces import Piece, in_pieces, pieces
@@ -84,7 +87,7 @@ def call(function: Callable, *args: Any, layout: Layout = AUTO) -> Any:
     traced = Traced.of(function, leaves, tree)
     program = _Program(traced, layout)
     # What is traced outside and closed over is an input like the others.
-    operands = [*traced.outer, *leaves]
+    operands = with_equal_axes([*traced.outer, *leaves])
     on = (False,) * len(operands)
     outs = _lanewise.bind(*operands, program=program, lanes=None, on=on)
     return jax.tree.unflatten(traced.out_tree, outs)
@@ -329,13 +332,36 @@ lower_on("cpu", _lanewise, _on_cpu)
 def _derivative(primals, changes: dict[int, Any], **params):
     """The derivative of what the program stands for, computed by XLA."""
 
-    def moved(*moving):
-        values = dict(zip(changes, moving, strict=True))
-        return _in_jax(**params)(*(values.get(i, x) for i, x in enumerate(primals)))
+    moving = list(changes.values())
+    function = _in_jax(**params)
 
-    outs, tangents = jax.jvp(moved, [primals[i] for i in changes], list(changes.values()))
-    real = [jnp.issubdtype(x.dtype, jnp.inexact) for x in outs]
-    return outs, [t if r else None for t, r in zip(tangents, real, strict=True)]
+    def moved(primals, *moving):
+        values = dict(zip(changes, moving, strict=True))
+        return function(*(values.get(i, x) for i, x in enumerate(primals)))
+
+    def is_real(x: Any) -> bool:
+        return jnp.issubdtype(x.dtype, jnp.inexact)
+
+    if not manual_axes(*primals, *moving):
+        of = functools.partial(moved, primals)
+        outs, tangents = jax.jvp(of, [primals[i] for i in changes], moving)
+        return outs, [t if is_real(x) else None for x, t in zip(outs, tangents, strict=True)]
+
+    # In jax.shard_map the derivative is taken for one device, like the function itself.
+    def real(primals, *moving):
+        return [x for x in moved(primals, *moving) if is_real(x)]
+
+    def push(primals, moving):
+        of = functools.partial(real, primals)
+        return jax.jvp(of, [primals[i] for i in changes], moving)[1]
+
+    def pull(primals, ys):
+        _, back = jax.vjp(functools.partial(real, primals), *(primals[i] for i in changes))
+        return list(back(ys))
+
+    outs = _lanewise.bind(*primals, **params)
+    tangents = iter(linear_map(push, pull, push, list(primals), with_equal_axes(moving)))
+    return outs, [next(tangents) if is_real(x) else None for x in outs]
 
 
 has_derivative(_lanewise, _derivative)

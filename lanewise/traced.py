@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from .jaxapi import ClosedJaxpr, is_traced, jaxpr_as_fun, without_outputs
+from .jaxapi import ClosedJaxpr, is_traced, jaxpr_as_fun, without_manual_axes, without_outputs
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Traced:
             trees.append(out_tree)
             return out
 
-        return cls(jax.make_jaxpr(flat)(*leaves), trees[-1])
+        return cls(jax.make_jaxpr(flat)(*map(without_manual_axes, leaves)), trees[-1])
 
     @functools.cached_property
     def outer(self) -> list[Any]:

@@ -137,6 +137,17 @@ def test_a_small_fit(folder):
 
 
 @pytest.mark.slow
+def test_a_file_with_the_newest_observation_first(folder, data):
+    oldest = command(write(folder, SMALL), "--json")
+    (folder / "seen.csv").write_text(csv(*(x[::-1] for x in data)), encoding="utf-8")
+    newest = command(write(folder, SMALL), "--json", "--force")
+    assert newest.exit_code == 0, newest.output
+    first, second = (json.loads(r.stdout)["parameters"] for r in (oldest, newest))
+    assert first == second
+    assert np.load(folder / "out" / "trajectory.npz")["ts"][-1] == pytest.approx(data[0][-1])
+
+
+@pytest.mark.slow
 def test_the_example(folder):
     shutil.copy(EXAMPLES / "fit.toml", folder)
     shutil.copy(EXAMPLES / "observations.csv", folder)
@@ -269,8 +280,9 @@ BAD_DATA = [
     ("t,x,y\n0.3,1,2\n0.6,1,2\n", "2 numbers for each time (x, y)", "1: the positions"),
     ("time,x\n0.3,1\n", "'t' (text)", "a column of the file: time, x"),
     ("t\n0.3\n0.6\n", "no column is left", "out of t"),
-    (HEAD + "-0.3,1\n0.6,2\n", "lies before t0", "in the order of time"),
-    (HEAD + "-0.3,1\n-0.6,2\n", "0.1 with times that go by -0.6", "an h of the data's sign"),
+    (HEAD + "-0.3,1\n0.6,2\n", "between the times", "in the order of time"),
+    (HEAD + "-0.3,1\n-0.6,2\n", "0.1, which leads from t0 = 0 away", "-0.1, or a t0"),
+    (HEAD + "-0.6,1\n-0.3,2\n", "0.1, which leads from t0 = 0 away", "-0.1, or a t0"),
 ]
 
 

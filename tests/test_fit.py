@@ -1,5 +1,7 @@
 """Fits: what they find, what they say of its errors, how they go on."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ import pytest
 import dvi_jax as dvi
 from dvi_jax.fit import run
 from dvi_jax.fit.observations import as_arcs
+from dvi_jax.fit.parameters import make_space
 from dvi_jax.fit.problem import Problem
 from dvi_jax.fit.uncertainty import correlations, null_space, uncertainty
 
@@ -207,6 +210,56 @@ def test_bounds_hold_and_are_named():
     assert held.x[1] <= 0.01
     assert held.x[1] > 0.00999
     assert held.at_bounds == ["epsilon"]
+    assert "its bound: no symmetric error" in str(held)
+
+
+def test_a_parameter_at_its_bound_is_neither_undetermined_nor_of_unknown_error():
+    """Far beyond the bound dx/du vanishes, and no covariance is found."""
+    data = dvi.Observations(REGULAR, noisy(REGULAR, 4), sigma=NOISE, t0=0.0)
+    model = dvi.Model(SYSTEM, h=H_STEP, q0=[1.0], p0=[0.0], epsilon=0.02, method=STRANG)
+    found = dvi.fit(
+        model, data, {"args": {"k": 0.8}}, bounds={"args": {"k": dvi.Bounds(0.0, 1.0)}},
+        check_curvature=False,
+    )  # fmt: skip
+    assert found.at_bounds == ["args.k"]
+    assert found.undetermined == []
+    assert "args.k  1 at its bound: no symmetric error" in str(found)
+    for words in ("nan", "not determined", "no errors"):
+        assert words not in str(found)
+
+
+def test_a_bounded_parameter_without_a_finite_error_is_at_a_bound_only_if_it_is_on_it():
+    space, _ = make_space([0.5] * 3, [dvi.Bounds(0.0, 1.0)] * 3)
+    x, sigma = np.array([0.5, 1e-170, 1 - 1e-16]), np.array([np.inf, np.nan, np.nan])
+    assert space.at_bounds(x, sigma) == ["[1]", "[2]"]
+
+
+def test_a_model_no_better_than_a_constant_is_reported(regular):
+    """A minimum in k far from the true one, from which nothing leads away."""
+    data, good = regular
+    without = dvi.Observations(REGULAR, data.values, t0=0.0)
+    start = {**START, "args": {"k": 9.0}}
+    bad = dvi.fit(MODEL, without, start, horizons=None, throw=False)
+    assert bad.explained < 0.1
+    assert "better than constants do" in str(bad)
+    assert 0.99 < good.explained < 1
+    assert "constants" not in str(good)
+
+
+def test_the_explained_variance_is_that_of_its_definition(regular):
+    """With errors of each value, a missing one, and a mean for each component."""
+    random = np.random.default_rng(0)
+    seen, model, errors = random.normal(size=(3, 9, 2))
+    seen[4, 1], errors = np.nan, np.abs(errors) + 0.1
+    given = {"observed": [seen], "predicted": [model], "errors": [errors]}
+    left = total = 0.0
+    for k in range(2):
+        good = np.isfinite(seen[:, k])
+        y, w = seen[good, k], errors[good, k] ** -2.0
+        left += np.sum(w * (y - model[good, k]) ** 2)
+        total += np.sum(w * (y - np.average(y, weights=w)) ** 2)
+    found = dataclasses.replace(regular[1], **given)
+    np.testing.assert_allclose(found.explained, 1 - left / total, rtol=1e-12)
 
 
 def test_a_prior_weighs_as_a_measurement():
@@ -314,6 +367,17 @@ def test_backwards_in_time():
     model = dvi.Model(SYSTEM, h=-H_STEP, p0=[0.0], method=STRANG)
     data = dvi.Observations(back, np.asarray(sol.qs), sigma=NOISE, t0=0.0)
     np.testing.assert_allclose(dvi.fit(model, data, START).x, [1.3, 0.02, 1.0], atol=1e-6)
+
+
+def test_results_have_the_order_of_the_given_observations(regular):
+    """Newest first: the same parameters, and rows of the result that belong to the given times."""
+    data, known = regular
+    newest_first = dvi.Observations(REGULAR[::-1], data.values[::-1], sigma=NOISE, t0=0.0)
+    found = dvi.fit(MODEL, newest_first, START)
+    np.testing.assert_array_equal(found.x, known.x)
+    for name in ("ts", "observed", "predicted", "whitened", "errors", "residuals"):
+        of_one, of_other = getattr(found, name)[0], getattr(known, name)[0]
+        np.testing.assert_array_equal(of_one, of_other[::-1])
 
 
 def test_horizons_lead_where_everything_at_once_misleads():
@@ -512,6 +576,16 @@ def test_nearly_collinear_parameters_are_followed_to_the_minimum():
     found = dvi.fit(model, data, {"a": 0.9, "b": -0.5}, check_curvature=False)
     assert found.status == "converged"
     assert np.abs((found.x - [0.0, 1.0]) / found.sigma).max() < 4
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(1.1, 2.0), (-2.0, -1.1), (0.0, 1e-300), (-3.0, 0.0)])
+def test_numbers_stay_strictly_between_their_bounds(lower, upper):
+    ends = [-800.0, 800.0]
+    for bounds in (dvi.Bounds(lower), dvi.Bounds(None, upper), dvi.Bounds(lower, upper)):
+        space, _ = make_space([(lower + upper) / 2] * 2, [bounds] * 2)
+        x = np.asarray(space.to_x(jnp.array(ends)))
+        assert ((x > space.lower) & (x < space.upper) | ~np.isfinite(x)).all()
+        make_space(list(x[np.isfinite(x)]), [bounds] * int(np.isfinite(x).sum()))  # as a start
 
 
 @pytest.mark.parametrize("bounds", [dvi.Bounds(0.0), dvi.Bounds(0.0, 1.0)], ids=["one", "two"])

@@ -2,6 +2,7 @@
 
 import builtins
 import contextlib
+import dataclasses
 import sys
 import types
 
@@ -267,6 +268,38 @@ def test_a_parameter_at_its_bound_has_the_truncated_distribution(monkeypatch, is
         assert found.status == "not_mixed"
         assert not off < 8
         assert wider > 0.5
+
+
+ABOVE_1 = {"q0": dvi.Bounds(1.0, 2.0)}
+
+
+def beyond_1():
+    """The data of `truncated` with the bound at 1: where a number is rounded onto it."""
+    data, mean, sigma = truncated()
+    return dataclasses.replace(data, values=data.values + 1), mean + 1, sigma
+
+
+def test_a_fit_that_ended_at_a_bound_is_a_start():
+    """There u is infinite: the number starts where `params` has it, inside of the bounds."""
+    data, _, _ = beyond_1()
+    params = {"q0": np.array([1.1])}
+    found = dvi.fit(NEAR_0, data, params, bounds=ABOVE_1, check_curvature=False)
+    assert found.at_bounds == ["q0[0]"]
+    dvi.Posterior(NEAR_0, data, found.params, bounds=ABOVE_1)  # its numbers are within bounds
+    made = dvi.Posterior(NEAR_0, data, params, bounds=ABOVE_1)
+    u = bayes._start_of(made, found, ABOVE_1, None)
+    np.testing.assert_allclose(made.to_x(u), 1.1, rtol=1e-12)
+    with pytest.raises(ValueError, match="not between its bounds"):
+        bayes._start_of(made, {"q0": np.ones(1)}, ABOVE_1, None)
+
+
+@pytest.mark.slow
+def test_an_optimum_beyond_a_bound_is_sampled_from_a_fit_of_its_own():
+    data, mean, sigma = beyond_1()
+    params = {"q0": np.array([1.1])}
+    found = dvi.sample(NEAR_0, data, params, bounds=ABOVE_1, chains=2, seed=4)
+    assert found.x.min() > 1
+    assert abs(found.mean[0] - mean) < 4 * sigma / np.sqrt(found.ess["q0[0]"])
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
+from dvi_jax.fit.problem import Problem
 
 
 def H(t0, t1, q0, p1, args):
@@ -22,6 +23,8 @@ VALUES = np.cos(TS)[:, None]
 MODEL = dvi.Model(SYSTEM, h=0.1, q0=[1.0], p0=[0.0], args={"k": 1.0})
 DATA = dvi.Observations(TS, VALUES, sigma=0.1, t0=0.0)
 PARAMS = {"epsilon": 0.0}
+START = {"q0": [1.0], "p0": [0.0], "args": {"k": 1.0}}
+LONG = np.dtype(np.longdouble)  # the same as float64 on some machines
 
 
 def swapped(x, i, j):
@@ -43,7 +46,7 @@ def put(x, i, value):
         ({"ts": put(TS, 3, np.inf)}, ValueError, r"ts\[3\] is inf"),
         ({"ts": swapped(TS, 4, 5)}, ValueError, r"not in order: ts\[4\].*argsort"),
         ({"ts": put(TS, 4, TS[3])}, ValueError, r"ts\[3\] and ts\[4\] are the same time"),
-        ({"t0": 0.75}, ValueError, "lies before t0 = 0.75"),
+        ({"t0": 0.75}, ValueError, "t0 = 0.75.* lies between the times .*0.5 to 10.*h < 0"),
         ({"t0": np.nan}, ValueError, "t0 must be one finite number"),
         ({"ts": TS[:5]}, ValueError, r"one row for each time: ts has shape \(5,\)"),
         ({"ts": TS[:, None]}, ValueError, "one-dimensional array of times"),
@@ -55,6 +58,11 @@ def put(x, i, value):
         ({"sigma": 0.0}, ValueError, "sigma is 0.0 .* positive"),
         ({"sigma": -1.0}, ValueError, "positive"),
         ({"sigma": np.nan}, ValueError, "sigma is nan"),
+        ({"sigma": np.ma.array(VALUES, mask=TS[:, None] == 2)}, ValueError, r"index \[3, 0\]"),
+        ({"ts": np.ma.array(TS, mask=TS == 2)}, ValueError, r"ts is a masked .* index \[3\]"),
+        ({"t0": np.ma.masked}, ValueError, "t0 is a masked array with a masked number, which"),
+        ({"sigma": 1e-200}, ValueError, r"1e-200 .*values are up to 0.99.*double precision"),
+        ({"sigma": 1e200}, ValueError, "in the units of the values"),
         ({"sigma": np.ones((20, 2))}, ValueError, "does not broadcast"),
         ({"sigma": None, "covariance": np.zeros((1, 1))}, ValueError, "not positive definite"),
         ({"sigma": None, "covariance": -np.eye(1)}, ValueError, "not positive definite"),
@@ -86,6 +94,23 @@ def test_a_covariance_of_correlation_one_is_refused():
         dvi.Observations(TS, values, covariance=full)
 
 
+@pytest.mark.parametrize("sign", [1, -1], ids=["after t0", "before t0"])
+def test_the_order_of_the_observations_does_not_matter(sign):
+    """Errors and values are moved together, and all that a fit computes with is the same."""
+    errors = {
+        "sigma": np.linspace(0.1, 0.2, 20)[:, None],
+        "covariance": np.linspace(0.1, 0.2, 20)[:, None, None],
+    }
+    model = dvi.Model(SYSTEM, h=0.1 * sign, q0=[1.0], p0=[0.0], args={"k": 1.0})
+    for name, error in errors.items():
+        groups = []
+        for rows in (slice(None), slice(None, None, -1)):
+            data = dvi.Observations(sign * TS[rows], VALUES[rows], t0=0.0, **{name: error[rows]})
+            groups += Problem(model, [data], False, PARAMS).groups
+        for of_one, of_other in zip(*(vars(group).values() for group in groups), strict=True):
+            np.testing.assert_array_equal(of_one, of_other)
+
+
 def fit(model=MODEL, data=DATA, params=PARAMS, **options):
     return dvi.fit(model, data, params, **options)
 
@@ -104,7 +129,45 @@ def fails_at_start(params):
         ({"model": lambda p: {**MODEL(p), "num_steps": 3}}, ValueError, "must not set 'num_steps'"),
         ({"model": lambda p: {**MODEL(p), "t0": 0.0}}, ValueError, r"Observations\(\.\.\., t0"),
         ({"model": lambda p: {**MODEL(p), "h": 0.0}}, ValueError, "finite and not zero"),
-        ({"model": lambda p: {**MODEL(p), "h": -0.1}}, ValueError, "goes the other way"),
+        (
+            {"model": lambda p: {**MODEL(p), "h": -0.1}},
+            ValueError,
+            r"\(t = 0.5 to 10\) lie after t0 = 0, but h = -0.1 leads to earlier.*Give h = 0.1",
+        ),
+        (
+            {"data": dvi.Observations(-TS[::-1], VALUES, sigma=0.1, t0=0.0)},
+            ValueError,
+            r"\(t = -10 to -0.5\) lie before t0 = 0, but h = 0.1 leads to later.*Give h = -0.1",
+        ),
+        (
+            {
+                "model": dvi.Model(
+                    SYSTEM,
+                    h=-0.1,
+                    q0=[1.0],
+                    p0=[0.0],
+                    args={"k": 1.0},
+                    lattice=dvi.Variational(),
+                    num_steps=99,
+                )
+            },
+            ValueError,
+            "lie after t0 = 0, but h = -0.1 leads to earlier",
+        ),
+        (
+            {
+                "model": dvi.Model(
+                    SYSTEM,
+                    h=0.1,
+                    q0=[1.0],
+                    p0=[0.0],
+                    args={"k": 1.0},
+                    lattice=dvi.TimeTransformed(lambda t, q, p, args: 1 + q @ q),
+                )
+            },
+            ValueError,
+            "on the lattice TimeTransformed.* num_steps",
+        ),
         ({"model": lambda p: {**MODEL(p), "h": 1e-12}}, ValueError, "Are the times"),
         ({"model": lambda p: {**MODEL(p), "h": 1e3}}, ValueError, "Are the times"),
         ({"model": lambda p: {**MODEL(p), "h": p["epsilon"] + 0.1}}, ValueError, "not a parameter"),
@@ -133,6 +196,31 @@ def fails_at_start(params):
         ({"params": {"k": 1.0}}, TypeError, "{\"args\": {'k': ...}}"),
         ({"params": {"epsilon": np.nan}}, ValueError, "epsilon starts at nan"),
         ({"params": {"args": {"k": np.ones(40)}}}, ValueError, "scalar|parameters cannot follow"),
+        ({"params": {"epsilon": np.ma.masked}}, ValueError, "the parameter epsilon is a masked"),
+        (
+            {"params": {"q0": np.ma.array([1.0], mask=[True])}},
+            ValueError,
+            r"the parameter q0 is a masked array with a masked number at index \[0\]",
+        ),
+        ({"bounds": {"epsilon": dvi.Bounds(np.ma.masked, 1)}}, ValueError, "lower of epsilon is a"),
+        *(
+            (
+                {"model": dvi.Model(SYSTEM, h=0.1, **{**START, **start})},
+                error,
+                says,
+            )
+            for start, error, says in (
+                ({"q0": np.ma.array([1.0], mask=[True])}, ValueError, "q0 is a masked array"),
+                *(
+                    [({"p0": np.array([0.0], LONG)}, TypeError, f"p0 is {LONG}")]
+                    if LONG.itemsize > 8
+                    else []
+                ),
+                ({"p0": np.array([0.0], object)}, TypeError, "p0 .* dtype object"),
+                ({"q0": np.array(["2000"], "M8[D]")}, TypeError, "q0 .* dtype datetime64"),
+                ({"args": {"k": np.array(1.0, object)}}, TypeError, "args .* dtype object"),
+            )
+        ),
         ({"bounds": {"epsilon": dvi.Bounds(1, 0)}}, ValueError, "lower one must be less"),
         ({"bounds": {"epsilon": dvi.Bounds(0.5, 1)}}, ValueError, "not between"),
         ({"bounds": {"eps": dvi.Bounds(0.5, 1)}}, ValueError, "given for 'eps'"),
@@ -150,12 +238,29 @@ def fails_at_start(params):
         ({"horizons": [2.0, 1.0]}, ValueError, "growing"),
         ({"horizons": "all"}, ValueError, "auto"),
         ({"progress": 3}, TypeError, "progress"),
-        ({"model": fails_at_start}, ValueError, "starting parameters the model gives no number"),
+        ({"model": fails_at_start}, ValueError, r"\(epsilon = 0\) the model gives no number"),
+        (
+            {"params": {"args": {"k": -30.0}}},
+            ValueError,
+            r"\(args.k = -30\) the model gives 2.*e\+03 for arc 0 at t = 1.5 "
+            r"\(at its start, t = 0, 1; largest .* the trajectory diverges",
+        ),
+        (
+            {"data": dvi.Observations(TS, VALUES, covariance=[[1e-310]], t0=0.0)},
+            dvi.FitError,
+            "not_finite after 0 steps, loss inf.* the sum of their squares",
+        ),
     ],
 )
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")  # the case of squares beyond range
 def test_fit_refuses(wrong, error, says):
     with pytest.raises(error, match=says):
         fit(**wrong)
+
+
+def test_a_model_takes_a_masked_array_without_a_masked_number():
+    model = dvi.Model(SYSTEM, h=0.1, **{**START, "q0": np.ma.array([1.0])})
+    assert type(model(PARAMS)["q0"]) is np.ndarray
 
 
 @pytest.mark.parametrize("loss", [dvi.SoftL1, dvi.Cauchy])

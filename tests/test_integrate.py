@@ -363,6 +363,36 @@ def test_traced_bad_input_becomes_a_status():
 
 # --- what is refused -------------------------------------------------------------------------
 
+MASKED = np.ma.array([1.0, 2.0], mask=[False, True])
+
+
+def test_a_masked_array_without_a_masked_number_is_an_array():
+    given = {"h": 0.1, "num_steps": 3, "args": {"k": np.ma.array([1.0, 2.0])}}
+    found = dvi.integrate(OSCILLATOR, np.ma.array(START[0]), START[1], **given)
+    same = dvi.integrate(OSCILLATOR, *START, h=0.1, num_steps=3)
+    np.testing.assert_array_equal(found.qs, same.qs)
+
+
+@pytest.mark.skipif(np.dtype(np.longdouble).itemsize == 8, reason="longdouble is float64 here")
+@pytest.mark.parametrize("where", ["q0", "p0", "args", "Save", "Given"])
+def test_numbers_beyond_double_precision_are_named(where):
+    ones = np.array([1.0, 2.0], np.longdouble)
+    calls = {
+        "q0": lambda: dvi.integrate(OSCILLATOR, ones, START[1], h=0.1, num_steps=3),
+        "p0": lambda: dvi.integrate(OSCILLATOR, START[0], ones, h=0.1, num_steps=3),
+        "args": lambda: dvi.integrate(OSCILLATOR, *START, h=0.1, num_steps=3, args={"k": ones}),
+        "Save": lambda: dvi.Save(ts=ones),
+        "Given": lambda: dvi.Given(ones),
+    }
+    with pytest.raises(TypeError, match="beyond double precision"):
+        calls[where]()
+
+
+@pytest.mark.parametrize("times", [dvi.Save, dvi.Given])
+def test_masked_times_are_refused(times):
+    with pytest.raises(ValueError, match="ts is a masked array"):
+        times(ts=MASKED)
+
 
 @pytest.mark.parametrize(
     ("change", "error", "match"),
@@ -392,6 +422,14 @@ def test_traced_bad_input_becomes_a_status():
         ({"observe": lambda *a: None}, TypeError, "must return one array"),
         ({"observe": dvi.Range(lambda *a: a[2] * 1j)}, TypeError, "imaginary parts"),
         ({"args": {"k": {1, 2}}}, TypeError, "args holds a set, which is neither"),
+        ({"q0": MASKED}, ValueError, r"q0 is a masked array with a masked number at index \[1\]"),
+        ({"p0": MASKED}, ValueError, "p0 is a masked array"),
+        ({"t0": np.ma.masked}, ValueError, "t0 is a masked array"),
+        ({"h": np.ma.array(0.1, mask=True)}, ValueError, "h is a masked array"),
+        ({"args": {"k": MASKED}}, ValueError, "args is a masked array"),
+        ({"t0": np.datetime64("2000")}, TypeError, "t0 must be a real number"),
+        ({"args": {"k": np.array([1.0], object)}}, TypeError, "args .* dtype object"),
+        ({"args": {"k": np.array(["2000"], "M8[D]")}}, TypeError, "args .* dtype datetime64"),
     ],
 )
 def test_bad_input_is_named(change, error, match):

@@ -116,6 +116,30 @@ def test_there_and_back_bit_for_bit():
     assert np.array_equal(again.p0, interop.from_rebound(sim).p0)
 
 
+def test_the_velocities_of_a_given_state_are_rounded():
+    """p = m v and v = p/m are each rounded: the velocities differ by one unit of round-off."""
+    sim, random = rebound.Simulation(), np.random.default_rng(0)
+    for x in range(20):
+        vx, vy, vz = random.normal(size=3)
+        sim.add(m=random.uniform(), x=x, vx=vx, vy=vy, vz=vz)
+    problem = interop.from_rebound(sim)
+    back = interop.from_rebound(interop.to_rebound(problem, problem.q0, problem.p0))
+    off = np.abs(back.velocities / problem.velocities - 1)
+    assert 0 < off.max() <= np.finfo(float).eps
+    assert numbers(interop.to_rebound(problem)) == numbers(sim)  # the control
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("name", ["x", "vz", "m", "r", "t", "dt", "G", "softening"])
+def test_numbers_that_are_not_finite_are_refused(name, value):
+    sim = three_bodies()
+    of_body = hasattr(sim.particles[1], name)
+    setattr(sim.particles[1] if of_body else sim, name, value)
+    where = f"{name} of giant" if of_body else f"{name} of the simulation"
+    with pytest.raises(ValueError, match=f"{where} is {value}"):
+        interop.from_rebound(sim)
+
+
 def test_another_state_goes_back():
     problem = interop.from_rebound(three_bodies())
     sol = advanced(problem, 2.0, dvi.KahanLi(8))

@@ -14,7 +14,7 @@ from lanewise.jaxapi import is_traced, x64_enabled
 
 from .._precision import refuse_double_without_x64
 from .._solution import Solution
-from ..engine.quantities import refuse_quantity
+from ..engine.quantities import refuse_unit_or_mask
 from .lines import EPS, Settings, lines_of
 from .results import (
     CODE,
@@ -321,7 +321,7 @@ def _real_times(name: str, value: Any) -> Array:
 
 def _double(name: str, value: Any) -> Array:
     """An array in double precision, real or complex."""
-    refuse_quantity(name, value)
+    refuse_unit_or_mask(name, value)
     value = value if isinstance(value, jax.Array) else np.asarray(value)
     refuse_double_without_x64(name, value.dtype)
     if value.dtype.kind not in "fciu":

@@ -176,7 +176,7 @@ def sample(
       which step size and masses adapt. `chains` run side by side; two or more show whether they
       agree. `seed`: of all of it; the same seed, the same draws.
     - `start`: a `FitResult` of these parameters, or a pytree like `params`; None: a fit from
-      `params`.
+      `params`. A parameter that such a fit left at a bound starts at its value in `params`.
     - `target_accept`: of the step size; nearer to 1 against divergences. `max_tree_depth`: a path
       takes at most 2^max_tree_depth steps.
     - `progress`: True shows a bar, False none, None where there is a terminal.
@@ -273,16 +273,22 @@ def _shows(progress: bool | None) -> bool:
 def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -> np.ndarray:
     """The free vector of a fit or of a pytree.
 
-    **Raises** `ValueError` for one of other parameters, or outside of the bounds.
+    A number that the fit left at a bound, where u is infinite, starts as in the `params` given.
+
+    **Raises** `ValueError` for one of other parameters, or a pytree outside of the bounds.
     """
-    given = start.params if isinstance(start, FitResult) else start
-    space, x = make_space(given, bounds, priors)
+    is_fit = isinstance(start, FitResult)
+    given = (start.params,) if is_fit else (start, bounds, priors)
+    space, x = make_space(*given)
     if list(space.names) != posterior.names:
         raise ValueError(
             f"start has the parameters {', '.join(space.names[:8])}, those to be sampled are "
             f"{', '.join(posterior.names[:8])}."
         )
-    return space.to_u(x)
+    if is_fit:
+        at_bounds = np.isin(posterior.names, posterior._space.at_bounds(x, start.sigma))
+        x = np.where(at_bounds, posterior.to_x(jnp.asarray(posterior.start)), x)
+    return posterior.to_u(x)
 
 
 def _starts(potential: Callable[[Array], Array], chains: int, size: int, seed: int) -> Array:

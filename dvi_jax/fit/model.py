@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 
 from lanewise.jaxapi import is_traced
 
-from .._integrate import integrate
+from .._integrate import as_parameter, integrate, start_state
 from .._results import RESULTS
 from .._solution import Save
 from .._system import System
@@ -36,7 +36,7 @@ class Model(eqx.Module):
       `integrate`; what is among the parameters may be left out here. When `data` is a list of
       arcs, q0 and p0 have one row for each arc, here and among the parameters.
     - `options`: further arguments of `integrate`: `method`, `lattice`, `newton`, `adjoint`,
-      `arithmetic`, `layout`; for a lattice that is not uniform also `num_steps`.
+      `arithmetic`, `layout`; for a lattice that is not `Uniform` also `num_steps`.
 
     Parameters are a dict with keys among ``"q0"``, ``"p0"``, ``"epsilon"``, ``"args"``; when args
     are dicts, the entries of the parameters' are put into those given here. For any other
@@ -73,7 +73,7 @@ class Model(eqx.Module):
                 )
         fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
         # Arrays, so that another value needs no other compilation.
-        self.fixed = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, float) else x, fixed)
+        self.fixed = jax.tree.map(_as_array, fixed)
         self.rest = {"system": system, "h": check_step_size(h), **options}
 
     def __call__(self, params: Mapping[str, Any], arc: Any = None) -> dict[str, Any]:
@@ -111,6 +111,12 @@ class Model(eqx.Module):
                     f"{name} has shape {shape}, but data is a list of {arcs} arcs: it needs a row "
                     "for each."
                 )
+
+
+def _as_array(x: Any) -> Any:
+    """A float, or a masked array without a masked number, as an array; anything else as it is."""
+    is_plain = isinstance(x, np.ma.MaskedArray) and not np.ma.is_masked(x)
+    return np.asarray(x) if is_plain or isinstance(x, float) else x
 
 
 def _row(name: str, rows: Any, arc: Any) -> Array:
@@ -177,7 +183,8 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: boo
 
 
 def _uniform(spec: Mapping[str, Any]) -> bool:
-    return isinstance(spec.get("lattice", Uniform()), Uniform)
+    # Not isinstance: the equal steps of TimeTransformed are not equal in time.
+    return type(spec.get("lattice", Uniform())) is Uniform
 
 
 def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[Group]:
@@ -211,10 +218,22 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
 
 
 def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
-    """How many steps reach the last observation."""
+    """How many steps reach the last observation.
+
+    **Raises** `ValueError` for an h that does not lead from t0 to the observations.
+    """
     h = float(spec["h"])
     if not np.isfinite(h) or h == 0:
         raise ValueError(f"the step size h of the model must be finite and not zero, got {h}.")
+    span = arc.ts[-1] - arc.t0
+    if span * h < 0:
+        side, direction = ("before", "later") if span < 0 else ("after", "earlier")
+        raise ValueError(
+            f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} "
+            f"t0 = {arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}, or the "
+            "t0 to which the model's q0 and p0 belong (Observations(..., t0=...); the first time "
+            "if it was left out)."
+        )
     if not _uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
@@ -222,12 +241,6 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
                 "the last observation: num_steps."
             )
         return spec["num_steps"]
-    span = arc.ts[-1] - arc.t0
-    if span * h < 0:
-        raise ValueError(
-            f"arc {i}: the observations go from t0 = {arc.t0:g} to {arc.ts[-1]:g}, but h = {h:g} "
-            "goes the other way. Give h the sign of the data's direction."
-        )
     steps = span / h
     if steps > 2e9:
         raise ValueError(
@@ -328,13 +341,15 @@ def _observed(group: Group, spec: Mapping[str, Any], ts: Array, qs: Array, ps: A
 
 
 def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> None:
-    """Refuse an observable that does not give one value of the shape of the data.
+    """Refuse a start and args that `integrate` refuses, and an observable that does not give one
+    value of the shape of the data.
 
     **Raises** `ValueError` with both shapes; errors of the function itself with a note.
     """
-    q, p = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
+    q, p = start_state(spec["q0"], spec["p0"])
+    args = jax.tree.map(as_parameter, spec.get("args"))
     try:
-        out = eqx.filter_eval_shape(arc.function, jnp.asarray(arc.t0), q, p, spec.get("args"))
+        out = eqx.filter_eval_shape(arc.function, jnp.asarray(arc.t0), q, p, args)
     except Exception as error:
         error.add_note(f"(in the observe of arc {i}, called with (t, q, p, args))")
         raise

@@ -1,13 +1,13 @@
 """What was observed: times, values, errors; checked, and laid out for the device."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from ..engine.quantities import refuse_quantity
+from ..engine.quantities import refuse_unit_or_mask
 from ..engine.signature import accepts
 
 
@@ -23,6 +23,9 @@ def _state(t, q, p, args):
     return jnp.concatenate([jnp.ravel(q), jnp.ravel(p)])
 
 
+_RANGE = (1e-140, 1e140)
+"""Standard errors relative to the largest value of which a sum of squares can be computed."""
+
 NAMED = {"positions": _positions, "momenta": _momenta, "state": _state}
 """Observables of a state that have a name."""
 
@@ -36,8 +39,10 @@ def accepts_four(function: Any) -> bool:
 class Observations:
     r"""Observed values along one arc of a trajectory.
 
-    - `ts`: times, shape (N,), in the direction of the run, no two alike.
-    - `values`: what was observed at them, shape (N, ...); NaN where a component is missing.
+    - `ts`: times, shape (N,), ascending or descending, no two equal, and all on one side of t0.
+      Either order may be combined with either sign of h; a `FitResult` has the order given here.
+    - `values`: what was observed at them, shape (N, ...); NaN, or a masked number, where a
+      component is missing. Only `values` may be masked.
     - `observe`: what is observed of a state: ``"positions"`` (q, the default), ``"momenta"`` (p),
       ``"state"`` (both in one vector), or a function ``(t, q, p, args)`` that returns an array of
       the shape of one value: a range, an angle, one body of many.
@@ -46,13 +51,14 @@ class Observations:
     - `covariance`: instead of sigma, covariances of the K components of one observation in the
       order of ``ravel``: shape (K, K) for all, or (N, K, K).
     - `t0`: time of the arc's start, where the model's q0 and p0 belong; ``ts[0]`` if left out.
+      The sign of the model's h must lead from t0 to the observations.
 
     Observations of several kinds along the same arc are one `observe` that returns them all, at
     the union of their times, with NaN for what was not seen.
 
     **Raises** `ValueError` or `TypeError` for what cannot be meant: times that are not finite,
-    not in order or twice the same, before t0; values of another shape, infinite, or all missing;
-    errors that are zero, negative or NaN; a covariance that is not positive definite.
+    not in order, twice the same or on both sides of t0; values of another shape, infinite, or all
+    missing; errors that are zero, negative or NaN; a covariance that is not positive definite.
     """
 
     ts: Any
@@ -65,7 +71,7 @@ class Observations:
     def __post_init__(self):
         ts = _real("ts", self.ts)
         values = self.values
-        if isinstance(values, np.ma.MaskedArray):  # what is masked is missing
+        if np.ma.is_masked(values):  # what is masked is missing
             values = np.ma.filled(values.astype(float), np.nan)
         values = _real("values", values)
         known = (
@@ -92,13 +98,11 @@ class Observations:
         if np.isnan(values).all():
             raise ValueError("all values are NaN, which stands for missing: nothing was observed.")
         t0 = float(ts[0]) if self.t0 is None else _number("t0", self.t0)
-        direction = ts[-1] - t0
-        early = (ts - t0) * (1 if direction >= 0 else -1) < 0
-        if early.any():
+        if ts.min() < t0 < ts.max():
             raise ValueError(
-                f"the time {ts[early][0]:.17g} lies before t0 = {t0:.17g}, the start of the arc. "
-                "Move t0, or give the observations before it as an arc of their own that runs "
-                "backwards (h < 0, times in descending order)."
+                f"t0 = {t0:.17g}, the start of the arc, lies between the times of the observations "
+                f"({ts.min():.17g} to {ts.max():.17g}). All must be on one side of it: move t0, or "
+                "give the observations before t0 as a second arc, with h < 0."
             )
         if self.sigma is not None and self.covariance is not None:
             raise ValueError("give sigma or covariance, not both.")
@@ -114,6 +118,14 @@ class Observations:
     def function(self) -> Callable[..., Any]:
         """`observe` as a function (t, q, p, args)."""
         return NAMED[self.observe] if isinstance(self.observe, str) else self.observe
+
+    def ordered(self) -> "Observations":
+        """The same observations in the order in which a run from t0 reaches them."""
+        if abs(self.ts[0] - self.t0) <= abs(self.ts[-1] - self.t0):
+            return self
+        rows = ("ts", "values", "sigma", "covariance")
+        given = {name: getattr(self, name) for name in rows}
+        return replace(self, **{n: None if x is None else x[::-1] for n, x in given.items()})
 
     @property
     def components(self) -> int:
@@ -179,7 +191,7 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
 
 
 def _real(name: str, value: Any) -> np.ndarray:
-    refuse_quantity(name, value)
+    refuse_unit_or_mask(name, value)
     try:
         found = np.asarray(value)
     except (TypeError, ValueError) as error:
@@ -236,6 +248,15 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
             f"sigma is {full[tuple(i)]} for the value at index {i}: standard errors must be "
             "positive and finite. A value that is not to count is given as NaN; one that is known "
             "exactly belongs into the model."
+        )
+    size = np.nanmax(np.abs(values)) or 1.0
+    overflow = ~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & ~np.isnan(values)
+    if overflow.any():
+        i = np.argwhere(overflow)[0].tolist()
+        raise ValueError(
+            f"sigma is {full[tuple(i)]:g} for the value at index {i}, and the values are up to "
+            f"{size:.3g}: squares of their ratio are beyond the range of double precision. Give "
+            "the standard errors in the units of the values."
         )
     return np.array(full)
 

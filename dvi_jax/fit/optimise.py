@@ -159,7 +159,8 @@ class LeastSquaresStage:
         """
         if resume is None:
             best = self.at(u, horizon, extra) if first is None else first
-            if not (np.isfinite(best.residual).all() and np.isfinite(best.jacobian).all()):
+            square = best.residual @ best.residual
+            if not (np.isfinite(square) and np.isfinite(best.jacobian).all()):
                 return u, best, FIT_RESULTS.not_finite
             length = np.linalg.norm(np.asarray(best.jacobian), axis=0)
             scale = np.where(length > 0, _STIFFNESS / np.where(length > 0, length, 1.0), 1.0)

@@ -30,7 +30,7 @@ def result_of(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
     degrees = problem.degrees_of_freedom
     off = np.asarray(problem.core.prior_rows(jnp.asarray(u)))
     variance = 1.0
-    covariance, curvature, words, values = np.full((n, n), np.nan), None, [], np.zeros(0)
+    covariance, curvature, lost, values = np.full((n, n), np.nan), None, [], np.zeros(0)
     if minimum.jacobian is not None and np.isfinite(minimum.jacobian).all():
         J = np.asarray(minimum.jacobian)
         about = uncertainty(J, 1.0, minimum.free)
@@ -40,17 +40,20 @@ def result_of(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
         slope, values = space.slope(u), about.singular_values
         with np.errstate(invalid="ignore"):  # infinite variance, of a parameter without effect
             covariance = variance * about.covariance[:n, :n] * np.outer(slope, slope)
-        words = [in_words(d[:n], list(space.names)) for d in about.undetermined.T if np.any(d[:n])]
+        lost = about.undetermined[:n].T
         if check_curvature and minimum.free is None and has_residuals and n <= _FEW:
             curvature = _curvature_ratio(problem, u, J, about)
+    at_bounds = space.at_bounds(x, np.sqrt(np.diag(covariance)))
+    free = ~np.isin(space.names, at_bounds)  # a parameter at its bound is known: it is there
+    words = [in_words(d, list(space.names)) for d in lost if np.abs(d[free]).max(initial=0) > 1e-6]
     return FitResult(
         params=space.to_params(jnp.asarray(x)), x=x, names=list(space.names), covariance=covariance,
-        history=run.history(), result=minimum.status, ts=[a.ts for a in problem.arcs],
-        observed=[a.values for a in problem.arcs], predicted=predicted, whitened=whitened,
-        errors=[a.errors for a in problem.arcs], loss=loss, degrees_of_freedom=degrees,
+        history=run.history(), result=minimum.status, ts=[a.ts for a in problem.given],
+        observed=[a.values for a in problem.given], predicted=predicted, whitened=whitened,
+        errors=[a.errors for a in problem.given], loss=loss, degrees_of_freedom=degrees,
         num_observed=problem.count, prior_chi2=float(np.sum(off**2)),
         has_errors=problem.has_errors, undetermined=words, singular_values=values,
-        curvature=curvature, at_bounds=space.at_bounds(x, np.sqrt(np.diag(covariance))),
+        curvature=curvature, at_bounds=at_bounds,
         trajectories=trajectories, seconds=time.monotonic() - run.began,
     )  # fmt: skip
 

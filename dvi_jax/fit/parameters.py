@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from ..engine.quantities import refuse_unit_or_mask
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -43,6 +45,16 @@ def _is_number(path: Any, x: Any) -> bool:
     if isinstance(x, int) and not isinstance(x, bool):
         return not any(isinstance(key, jax.tree_util.GetAttrKey) for key in path)
     return bool(eqx.is_inexact_array_like(x))
+
+
+_UNDERFLOW = 1e-150
+"""Distance from a bound below which the square of dx/du is zero, and no error is found."""
+
+
+def _gap(bound: Array) -> Array:
+    """Distance of a number next to a bound from it, at least one unit of its round-off."""
+    about = np.finfo(float)
+    return jnp.maximum(about.eps * jnp.abs(bound), about.tiny)
 
 
 class Space(eqx.Module):
@@ -93,7 +105,11 @@ class Space(eqx.Module):
         one = jnp.exp(jnp.where(below ^ above, u, 0.0))
         x = jnp.where(below & above, lower + (upper - lower) * jax.nn.sigmoid(u), u)
         x = jnp.where(below & ~above, lower + one, x)
-        return jnp.where(above & ~below, upper - one, x)
+        x = jnp.where(above & ~below, upper - one, x)
+        # Rounding must not put x on a bound: there u is infinite. Derivatives stay those of exp.
+        low = jnp.where(below, lower + _gap(lower), -jnp.inf)
+        high = jnp.where(above, upper - _gap(upper), jnp.inf)
+        return x + jax.lax.stop_gradient(jnp.clip(x, low, high) - x)
 
     def to_u(self, x: Any) -> np.ndarray:
         """The free vector of x."""
@@ -108,15 +124,22 @@ class Space(eqx.Module):
         u[i] = np.log(upper[i] - u[i])
         return u
 
+    def in_words(self, x: np.ndarray, most: int = 8) -> str:
+        """``args.k = 1.2, epsilon = 0``, the first few numbers."""
+        pairs = [f"{n} = {v:.6g}" for n, v in zip(self.names[:most], x, strict=False)]
+        return ", ".join(pairs) + (", …" if self.size > most else "")
+
     def slope(self, u: Any) -> np.ndarray:
         """dx/du, component by component."""
         u = jnp.asarray(u)
         return np.asarray(jax.jvp(self.to_x, (u,), (jnp.ones_like(u),))[1])
 
     def at_bounds(self, x: np.ndarray, sigma: np.ndarray) -> list[str]:
-        """Names of the numbers that lie within a tenth of their standard error from a bound."""
+        """Names of the numbers that lie within a tenth of their standard error from a bound, or,
+        without a finite error, on it but for rounding."""
         off = np.minimum(x - np.asarray(self.lower), np.asarray(self.upper) - x)
-        near = np.isfinite(off) & ~(off > 0.1 * np.nan_to_num(sigma, nan=np.inf))
+        reach = np.where(np.isfinite(sigma), 0.1 * sigma, 1e-12 * np.abs(x) + _UNDERFLOW)
+        near = np.isfinite(off) & (off <= reach)
         return [name for name, is_near in zip(self.names, near, strict=True) if is_near]
 
 
@@ -138,6 +161,7 @@ def make_space(
     names, shapes = [], []
     for path, leaf in paths:
         name, shape = _name(path), np.shape(leaf)
+        refuse_unit_or_mask(f"the parameter {name}", leaf)
         if np.iscomplexobj(leaf):
             raise TypeError(f"the parameter {name} is complex: write its parts.")
         places = ("" if not shape else f"[{', '.join(map(str, i))}]" for i in np.ndindex(shape))
@@ -255,6 +279,7 @@ def _pairs(a: Any, b: Any) -> list[tuple[Any, Any]]:
 
 
 def _spread(value: Any, where: np.ndarray, shape: tuple[int, ...], called: str) -> np.ndarray:
+    refuse_unit_or_mask(called, value)
     try:
         value = np.asarray(value, float)
     except (TypeError, ValueError):

@@ -193,10 +193,10 @@ class Posterior:
     def _check_value(self, u: np.ndarray, value: float) -> None:
         if not np.isfinite(value):
             x = np.asarray(self.to_x(jnp.asarray(u)))
-            at = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.names[:8], x, strict=False))
             raise ValueError(
-                f"the posterior density is 0 at the start ({at}): the model's trajectory fails, or "
-                "its misfit is no number. Start from other parameters, or take a smaller h."
+                f"the posterior density is 0 at the start ({self._space.in_words(x)}): the "
+                "model's trajectory fails, or its misfit is no number. Start from other "
+                "parameters, or take a smaller h."
             )
 
     def _descend(self, u: np.ndarray, max_steps: int) -> tuple[np.ndarray, np.ndarray]:

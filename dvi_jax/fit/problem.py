@@ -17,7 +17,8 @@ from .optimise import Evaluation
 from .parameters import Space, make_space
 
 _UNITS = 1e3
-"""By which factor data and model may differ in size before it must be a matter of units."""
+"""Factor by which data and model may differ in size at the start of a fit: beyond it the units
+differ, or the trajectory diverges."""
 
 
 class Core(eqx.Module):
@@ -134,8 +135,8 @@ class Core(eqx.Module):
 class Problem:
     """What is to be fitted, in free variables u.
 
-    - `core`: its functions. `space`: the parameters, `start` their x. `arcs`: the data, `groups`
-      them as arrays.
+    - `core`: its functions. `space`: the parameters, `start` their x. `given`: the data as given,
+      `arcs`: in the order of the run, `groups`: as arrays.
     - `size`: how many free variables there are. `count`: how many values were observed.
     """
 
@@ -160,7 +161,8 @@ class Problem:
                 f"loss must be a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or "
                 f"dvi.Likelihood(f), got {loss!r}."
             )
-        self.arcs, self.loss = arcs, loss
+        self.given, self.loss = arcs, loss
+        self.arcs = arcs = [arc.ordered() for arc in arcs]
         self.space, self.start = make_space(params, bounds, priors)
         self.size = self.space.size
         self.has_errors = arcs[0].has_errors
@@ -224,14 +226,15 @@ class Problem:
 
     def by_arc(self, rows: list[Any], known: list[Any]) -> tuple[list, list, list[str]]:
         """For each arc predictions (N, ...), observed minus predicted in standard errors (N, K),
-        and the status."""
+        and the status; rows in the order of `given`."""
         predicted, whitened, names = {}, {}, {}
         for group, r, (values, result) in zip(self.groups, rows, known, strict=True):
             status = np.atleast_1d(status_name(result))
             for a, i in enumerate(group.arcs):
                 arc, n = self.arcs[i], len(self.arcs[i].ts)
-                predicted[i] = np.asarray(values[a, :n]).reshape(arc.values.shape)
-                whitened[i] = np.where(group.seen[a, :n], -np.asarray(r[a, :n]), np.nan)
+                order = slice(None, None, 1 if arc is self.given[i] else -1)
+                predicted[i] = np.asarray(values[a, :n]).reshape(arc.values.shape)[order]
+                whitened[i] = np.where(group.seen[a, :n], -np.asarray(r[a, :n]), np.nan)[order]
                 names[i] = str(status[a])
         each = range(len(self.arcs))
         return [predicted[i] for i in each], [whitened[i] for i in each], [names[i] for i in each]
@@ -256,25 +259,46 @@ class Problem:
                 first = group.seen[a].any(axis=1).argmax()
                 if not np.isfinite(found[a, first][group.seen[a, first]]).all():
                     raise ValueError(
-                        f"at the starting parameters the model gives no number for the first "
-                        f"observation of arc {arc} (t = {group.ts[a, first]:g}; status "
-                        f"{names[a]!r}). Start from other parameters or take a smaller h."
+                        f"at the starting parameters ({self.space.in_words(self.start)}) the model "
+                        f"gives no number for the first observation of arc {arc} (t = "
+                        f"{group.ts[a, first]:g}; status {str(names[a])!r}). Start from other "
+                        "parameters or take a smaller h."
                     )
         if check_units:
-            self._check_units([np.asarray(found) for found, _ in known])
+            self._check_sizes([np.asarray(found) for found, _ in known])
 
-    def _check_units(self, found: list[np.ndarray]) -> None:
-        seen = np.concatenate([g.values[g.seen] for g in self.groups])
-        model = np.concatenate([f[g.seen] for f, g in zip(found, self.groups, strict=True)])
-        model = model[np.isfinite(model)]
-        data, own = np.abs(seen).max(), np.abs(model).max() if model.size else 0.0
-        if data == 0 or own == 0 or 1 / _UNITS < data / own < _UNITS:
+    def _check_sizes(self, found: list[np.ndarray]) -> None:
+        """Refuse predictions that are much larger or much smaller than the data."""
+        pairs = list(zip(self.groups, found, strict=True))
+        data = max(float(np.abs(g.values[g.seen]).max()) for g, _ in pairs)
+        own = [np.where(g.seen & np.isfinite(f), np.abs(f), 0.0).max(axis=2) for g, f in pairs]
+        largest = max(float(size.max()) for size in own)
+        if data == 0 or largest == 0 or 1 / _UNITS < data / largest < _UNITS:
             return
+        about = f"at the starting parameters ({self.space.in_words(self.start)}) the model gives "
+        if largest < data:
+            raise ValueError(
+                f"{about}values up to {largest:.3g}, the observed ones are up to {data:.3g}: a "
+                f"factor of {data / largest:.3g}. Are they in the same units? If this is "
+                "intended, use check_units=False."
+            )
+        group, size = next((g, s) for (g, _), s in zip(pairs, own, strict=True)
+                           if (s >= _UNITS * data).any())  # fmt: skip
+        a, row = np.argwhere(size >= _UNITS * data)[0]
+        arc = int(group.arcs[a])
         raise ValueError(
-            f"the observed values are up to {data:.3g}, those of the model at the starting "
-            f"parameters up to {own:.3g}: a factor of {data / own:.3g}. Are they in the same "
-            "units? If it is meant, say check_units=False."
+            f"{about}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g} (at its start, "
+            f"t = {group.t0[a]:g}, {self._at_start(arc):.3g}; largest value {size[a].max():.3g}), "
+            f"the observed ones are up to {data:.3g}. Likely causes: (a) the trajectory diverges "
+            "at these parameters: start from others, give bounds, or take a smaller h; (b) model "
+            "and data are not in the same units. If this is intended, use check_units=False."
         )
+
+    def _at_start(self, arc: int) -> float:
+        """Largest component of what the model predicts at the start of an arc."""
+        spec, data = self.specs[arc], self.arcs[arc]
+        q0, p0 = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
+        return float(jnp.max(jnp.abs(data.function(data.t0, q0, p0, spec.get("args")))))
 
 
 @eqx.filter_jit

@@ -17,6 +17,9 @@ from .uncertainty import correlations
 
 _FORMAT = 1
 
+_LITTLE = 0.1
+"""Fraction of the variance below which a model is reported as little better than a constant."""
+
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
@@ -42,7 +45,8 @@ class FitResult:
     - `singular_values`: of the Jacobian with columns of unit length, largest first.
     - `curvature`: the exact second derivative of the loss along each principal direction over
       that of Gauss–Newton: near 1 where the errors can be trusted. None if it was not asked for.
-    - `at_bounds`: names of the parameters that ended at a bound.
+    - `at_bounds`: names of the parameters that ended at a bound. Their entries of `covariance` are
+      those of a free parameter or NaN: the error of such a parameter is not symmetric.
     - `trajectories`: status of each arc's trajectory.
     """
 
@@ -95,6 +99,27 @@ class FitResult:
         return float(np.sqrt(np.nanmean(np.concatenate([r.ravel() for r in self.residuals]) ** 2)))
 
     @property
+    def explained(self) -> float:
+        """Fraction of the variance of the data that the model explains,
+
+            1 − Σ ((observed − predicted)/σ)² / Σ ((observed − mean)/σ)²,
+
+        with the weighted mean of each component over each arc; σ = 1 for data without errors. It
+        is 1 for a perfect fit, 0 for a model that is as good as these constants, and negative for
+        a worse one. NaN for data that are constant.
+        """
+        left = total = 0.0
+        for seen, model, errors in zip(self.observed, self.predicted, self.errors, strict=True):
+            known = np.isfinite(seen)
+            sigma = np.where(known, errors if self.has_errors else 1.0, np.inf)
+            weight, values = 1 / sigma**2, np.where(known, seen, 0.0)
+            total_weight = np.where(known.any(axis=0), weight.sum(axis=0), 1.0)
+            mean = (weight * values).sum(axis=0) / total_weight
+            left += np.sum(weight * np.where(known, values - model, 0.0) ** 2)
+            total += np.sum(weight * (values - mean) ** 2)
+        return float(1 - left / total) if total > 0 else np.nan
+
+    @property
     def chi2(self) -> float:
         """Σ of the squared whitened residuals."""
         return float(sum(np.nansum(r**2) for r in self.whitened))
@@ -126,22 +151,23 @@ class FitResult:
         }
 
     def __str__(self) -> str:
-        sigma, width = self.sigma, max(len(n) for n in self.names[:40])
+        width = max(len(n) for n in self.names[:40])
         lines = [f"{self.status} after {len(self.history['loss'])} steps, {self.seconds:.1f} s"]
-        for name, x, s in list(zip(self.names, self.x, sigma, strict=True))[:40]:
-            lines.append(f"  {name:{width}}  {with_error(x, s)}")
-        if np.isnan(self.covariance).all():
+        for name, words in list(zip(self.names, numbers_in_words(self), strict=True))[:40]:
+            lines.append(f"  {name:{width}}  {words}")
+        if np.isnan(self.covariance).all() and len(self.at_bounds) < len(self.names):
             lines.append("  no errors: more than 400 parameters, or a derivative is not finite")
         if len(self.names) > 40:
             lines.append(f"  … and {len(self.names) - 40} more")
         errors = f"reduced chi² {self.reduced_chi2:.4g}, " if self.has_errors else ""
+        part = max(self.explained, 0.0)
+        explained = f"{100 * part:.4g} % of the variance explained, " if part == part else ""
         lines.append(
-            f"{errors}rms {self.rms:.4g}, {self.num_observed} values, "
+            f"{errors}rms {self.rms:.4g}, {explained}{self.num_observed} values, "
             f"{self.degrees_of_freedom} degrees of freedom"
         )
+        lines += [words for words in [little_explained(self)] if words]
         lines += [f"not determined: {words}" for words in self.undetermined]
-        if self.at_bounds:
-            lines.append(f"at their bounds: {', '.join(self.at_bounds)}")
         if self.result != FIT_RESULTS.converged and str(FIT_RESULTS[self.result]):
             lines.append(str(FIT_RESULTS[self.result]))
         return "\n".join(lines)
@@ -215,6 +241,26 @@ def _known(name: str) -> str:
     if name not in NAMES:
         raise ValueError(f"the file has the unknown status {name!r}: it is of a newer version.")
     return name
+
+
+def numbers_in_words(found: FitResult) -> list[str]:
+    """Each fitted number with its standard error, or as one at its bound."""
+    return [
+        f"{x:.8g} at its bound: no symmetric error" if name in found.at_bounds else with_error(x, s)
+        for name, x, s in zip(found.names, found.x, found.sigma, strict=True)
+    ]
+
+
+def little_explained(found: FitResult) -> str:
+    """The remark on a fit that is little better than a constant; empty for a better one."""
+    part = found.explained
+    if not part < _LITTLE:
+        return ""
+    than = "no better than constants do" if part <= 0 else "little better than constants do"
+    return (
+        f"the model describes the data {than}: this may be a local minimum, or the data are "
+        "constants and noise. Start from other parameters."
+    )
 
 
 def with_error(x: float, sigma: float) -> str:

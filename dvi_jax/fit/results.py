@@ -20,8 +20,10 @@ class FIT_RESULTS(eqx.Enumeration):
         "(b) a trajectory that fails for nearby parameters."
     )
     not_finite = (
-        "The residuals or their derivatives are not finite. Likely causes: (a) a trajectory fails "
-        "at these parameters; (b) a function of the model has no derivative there."
+        "The residuals, the sum of their squares or their derivatives are not finite. Likely "
+        "causes: (a) a trajectory fails at these parameters; (b) a function of the model has no "
+        "derivative there; (c) predictions are larger than the standard errors by more than "
+        "10¹⁵⁰: the trajectory diverges, or sigma is in other units."
     )
     discontinuous = (
         "The segments of multiple shooting do not meet within the tolerance. Likely causes: (a) "

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
-from ..engine.quantities import refuse_quantity
+from ..engine.quantities import refuse_unit_or_mask
 from .extras import needed, system_of
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], A
     field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
     """
     system = system_of(system, "vector_field")
-    refuse_quantity("epsilon", epsilon)
+    refuse_unit_or_mask("epsilon", epsilon)
     _warn_without_effect(system, epsilon)
 
     def field(t, y, args):
@@ -100,7 +100,7 @@ def diffrax_term(system: Any, epsilon: Any = 0.0) -> "DiscreteTerm":
     from .diffrax_classes import DiscreteTerm
 
     system = system_of(system, "diffrax_term")
-    refuse_quantity("epsilon", epsilon)
+    refuse_unit_or_mask("epsilon", epsilon)
     _warn_without_effect(system, epsilon)
     return DiscreteTerm(system, jnp.asarray(epsilon, float))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from ..engine.quantities import refuse_quantity
+from ..engine.quantities import refuse_unit_or_mask
 from .extras import needed
 
 _STATUSES = (
@@ -108,7 +108,7 @@ def to_xarray(
             _check_free(f"stop_{name}", found)
             found[f"stop_{name}"] = ((*dims, *own), np.asarray(value))
     for name, values in (coords or {}).items():
-        refuse_quantity(f"coords {name}", values)
+        refuse_unit_or_mask(f"coords {name}", values)
     along = {at: index, **labels, **(coords or {})}
     if step == "step":
         along["step"] = np.arange(1, count)

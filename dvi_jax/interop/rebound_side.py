@@ -11,7 +11,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from ..engine.quantities import refuse_quantity
+from ..engine.quantities import refuse_unit_or_mask
 from ..systems import Problem
 from ..systems.n_body import (
     INVARIANTS,
@@ -107,11 +107,12 @@ def from_rebound(
     **Raises** `ValueError` for what would be lost otherwise: additional forces and other callbacks
     (``sim.copy()`` leaves them out, if that is meant), REBOUNDx, boundaries, collisions, gravity
     that is off, approximate or custom, shear (SEI), variational particles, exit distances, massive
-    test particles, a simulation that is not synchronised, bodies without mass; and for a start
-    that the N-body system cannot go on from; `FileNotFoundError` for a path where there is no file;
-    `ImportError` without rebound, `TypeError` for another object.
+    test particles, a simulation that is not synchronised, bodies without mass; for numbers that
+    are NaN or infinite; and for a start that the N-body system cannot go on from;
+    `FileNotFoundError` for a path where there is no file; `ImportError` without rebound,
+    `TypeError` for another object.
 
-    **Accuracy** q, masses, G and t are the same bits; p0 is rounded once. Units: REBOUND's solar
+    **Accuracy** q, masses, G and t are the same bits; p0 = m v is rounded. Units: REBOUND's solar
     mass is GM☉/G with its own G, 3e-5 away from others; the numbers stay those of the simulation.
 
     **Source** Rein & Liu 2012, *Astron. Astrophys.* 537, A128.
@@ -140,6 +141,7 @@ def from_rebound(
             )
         )  # fmt: skip
     _refuse_what_would_be_lost(simulation)
+    _refuse_not_finite(simulation)
     bodies = list(simulation.particles)
     masses = _with_mass(simulation, np.array([b.m for b in bodies], float), massless)
     q = np.array([[b.x, b.y, b.z] for b in bodies], float).reshape(-1, 3)
@@ -192,8 +194,9 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
       the problem when left out. `t`: its time.
 
     **Returns** a ``rebound.Simulation`` with masses, radii, names, G, softening, units, t, and
-    dt = h. Its integrator is REBOUND's default, IAS15. A start that came from REBOUND goes back bit
-    for bit; of another state v = p/m is rounded once.
+    dt = h. Its integrator is REBOUND's default, IAS15. The start of a problem of `from_rebound`
+    has the same bits, as its `velocities` are stored. Of a state given as q and p the velocities
+    p/m are rounded: they differ by up to 2.2e-16, relative, from v in p = m v.
 
     **Raises** `TypeError` for what is no problem, or one of q and p alone; `ValueError` for a
     system that is not Newton's N bodies, or that has a force or a perturbation, which REBOUND would
@@ -214,8 +217,8 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
         raise TypeError("a state is q and p together, or neither of them.")
     masses = np.asarray(args["masses"], float)
     of_problem = q is None
-    refuse_quantity("q", q)
-    refuse_quantity("p", p)
+    refuse_unit_or_mask("q", q)
+    refuse_unit_or_mask("p", p)
     q, p = (np.asarray(x, float) for x in ((problem.q0, problem.p0) if of_problem else (q, p)))
     check_bodies(q, p, args)
     for name, values in (("q", q), ("p", p), ("t", 0.0 if t is None else float(t))):
@@ -273,6 +276,20 @@ def _refuse_what_would_be_lost(sim: Any) -> None:
         raise ValueError("the simulation is in the middle of a step: call sim.synchronize() first.")
     if sim.N == 0:
         raise ValueError("the simulation has no bodies.")
+
+
+def _refuse_not_finite(sim: Any) -> None:
+    """Refuse NaN and infinite numbers in what is taken from a simulation."""
+    for name in ("t", "dt", "G", "softening"):
+        if not np.isfinite(value := getattr(sim, name)):
+            raise ValueError(f"{name} of the simulation is {value}: it must be a finite number.")
+    for i, body in enumerate(sim.particles):
+        for name in ("m", "x", "y", "z", "vx", "vy", "vz", "r"):
+            if not np.isfinite(value := getattr(body, name)):
+                raise ValueError(
+                    f"{name} of {_name(body) or f'body {i}'} is {value}: it must be a finite "
+                    "number. A simulation that failed has NaN: take a snapshot before it."
+                )
 
 
 def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from ..engine.quantities import refuse_quantity
+from ..engine.quantities import refuse_unit_or_mask
 from ..systems import Problem
 from .extras import needed, system_of
 
@@ -117,7 +117,7 @@ def solve_ivp(
             )
         )
     for name, given in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
-        refuse_quantity(name, given)
+        refuse_unit_or_mask(name, given)
     bunch = needed("scipy.optimize", "interop.solve_ivp").OptimizeResult
     problem = system if isinstance(system, Problem) else None
     system = system_of(system, "interop.solve_ivp")

@@ -11,13 +11,13 @@ from lanewise.jaxapi import is_traced, x64_enabled
 
 from .._precision import refuse_double_without_x64
 from .._types import Interval
-from ..engine.quantities import refuse_quantity
+from ..engine.quantities import refuse_unit_or_mask
 from ._base import Lattice, check_num_steps
 
 
 def _as_times(ts: Any) -> Array:
     if not is_traced(ts):
-        refuse_quantity("ts", ts)
+        refuse_unit_or_mask("ts", ts)
         ts = np.asarray(ts)
         if np.issubdtype(ts.dtype, np.integer):
             ts = ts.astype(np.float64 if x64_enabled() else np.float32)

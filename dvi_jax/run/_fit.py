@@ -14,7 +14,7 @@ import dvi_jax as dvi
 
 from .. import plot
 from ..fit.progress import shown as shown_bar
-from ..fit.result import with_error
+from ..fit.result import little_explained, numbers_in_words
 from ._config import read_config
 from ._errors import InputError
 from ._fit_config import FIT_KEYS
@@ -137,7 +137,7 @@ def _trajectory(setup: FitSetup, found: dvi.FitResult) -> tuple[dict[str, Any], 
     spec = setup.model(found.params)
     t0, h = setup.data.t0, spec["h"]
     assert t0 is not None
-    steps = max(1, int(np.ceil((setup.data.ts[-1] - t0) / h - 1e-9)))
+    steps = max(1, int(np.ceil((setup.data.ordered().ts[-1] - t0) / h - 1e-9)))
     every = -(-steps // _MOST)
     solution = dvi.integrate(
         **spec, t0=t0, num_steps=steps, save=dvi.Save(every=every, final=True), throw=False
@@ -165,6 +165,7 @@ def _contents(
         "prior_chi2": found.prior_chi2,
         "reduced_chi2": found.reduced_chi2 if found.has_errors else None,
         "rms": found.rms,
+        "explained": found.explained,
         "values": found.num_observed,
         "missing": int(np.isnan(setup.data.values).sum()),
         "degrees_of_freedom": found.degrees_of_freedom,
@@ -185,8 +186,10 @@ def _flat(params: Any) -> np.ndarray:
 
 def _tables(found: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
     rows = [
-        [name, with_error(known["value"], known["error"]), f"{known['start']:.6g}"]
-        for name, known in contents["parameters"].items()
+        [name, words, f"{known['start']:.6g}"]
+        for (name, known), words in zip(
+            contents["parameters"].items(), numbers_in_words(found), strict=True
+        )
     ]
     tables = [Table("Parameters, ± standard error", ["name", "value", "start"], rows)]
     if len(found.names) > 1:
@@ -197,6 +200,7 @@ def _tables(found: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
         ["values missing", str(contents["missing"])],
         ["degrees of freedom", str(found.degrees_of_freedom)],
         ["rms [units of the data]", f"{found.rms:.4g}"],
+        ["variance explained [%]", f"{100 * found.explained:.4g}"],
     ]
     if found.has_errors:
         rows.append(["chi²", f"{found.chi2:.6g}"])
@@ -225,8 +229,10 @@ def _correlation_table(found: dvi.FitResult) -> Table:
 
 def _notes(found: dvi.FitResult) -> list[str]:
     notes = [f"not determined by the data: {words}" for words in found.undetermined]
+    if little := little_explained(found):
+        notes.append(little[0].upper() + little[1:])
     if found.at_bounds:
-        notes.append(f"at their bounds, where errors are not those of a free parameter: "
+        notes.append(f"at their bounds, where an error is not symmetric: "
                      f"{', '.join(found.at_bounds)}")  # fmt: skip
     if not found.has_errors:
         notes.append("Without sigma the size of the errors is that of the residuals.")

@@ -184,13 +184,16 @@ def _observations(
         raise InputError("data.file", "one observation", "two times at least, or t0 before it")
     if np.isnan(observed).all():
         raise InputError("data.columns", "no value in any row", "columns with numbers")
-    run = ts[-1] - (ts[0] if t0 is None else t0)
-    if run * h < 0:
-        raise InputError("h", f"{h:g} with times that go by {run:g}", "an h of the data's sign")
     try:
-        return dvi.Observations(ts, observed, observe, sigma=sigma, t0=t0), names
+        data = dvi.Observations(ts, observed, observe, sigma=sigma, t0=t0)
     except (TypeError, ValueError) as error:
         raise InputError("data", str(error), "observations in the order of time") from None
+    if (data.ordered().ts[-1] - data.t0) * h < 0:
+        raise InputError(
+            "h", f"{h:g}, which leads from t0 = {data.t0:g} away from the observations",
+            f"{-h:g}, or a t0 on the other side of the observations",
+        )  # fmt: skip
+    return data, names
 
 
 def _joined(parts: list[np.ndarray], names: list[str], rows: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._precision import refuse_double_without_x64
-from ..engine.quantities import refuse_quantity
+from ..engine.quantities import refuse_unit_or_mask
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
@@ -41,7 +41,7 @@ class Axis:
             raise ValueError(f"the name of an axis must be an identifier, got {name!r}.")
         if not isinstance(units, str):
             raise TypeError(f"units of the axis {name!r} must be text, got {units!r}.")
-        refuse_quantity(f"the axis {name!r}", values)
+        refuse_unit_or_mask(f"the axis {name!r}", values)
         if isinstance(values, jax.Array):
             values = np.asarray(values)
         if not isinstance(values, np.ndarray):

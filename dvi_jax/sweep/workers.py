@@ -234,12 +234,14 @@ def _instead_of_interrupt(*events: threading.Event) -> Iterator[None]:
     """Have the first Ctrl-C set these events. The exception that Python raises instead can meet any
     line, and is lost in some, such as a callback of the garbage collector."""
     in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    before: Any = signal.getsignal(signal.SIGINT)
+    # Python's handler, or one that wraps it.
+    if not in_main or getattr(before, "__wrapped__", before) is not signal.default_int_handler:
         yield
         return
 
     def handle(number: int, frame: Any) -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, before)
         for event in events:
             event.set()
 
@@ -247,4 +249,4 @@ def _instead_of_interrupt(*events: threading.Event) -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, before)
