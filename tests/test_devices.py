@@ -58,6 +58,50 @@ def test_two_devices_give_what_one_does():
     assert devices == 2
 
 
+FOUR_DEVICES = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec as P
+import dvi_jax as dvi
+mesh = Mesh(np.array(jax.devices()), ("x",))
+assert len(jax.devices()) == 4
+system = dvi.System(
+    lambda t0, t1, q, p, a: p @ p / 2 * (1 + 0.3 * q @ q) + a * (q @ q) / 2,
+    force=lambda t0, t1, q, p, a: -p,
+)
+q, k = jnp.linspace(0.5, 1.5, 8)[:, None], jnp.asarray(1.2)
+adjoint = ADJOINT
+def one(q, k):
+    run = {"h": 0.1, "num_steps": 4, "epsilon": 0.1, "adjoint": adjoint}
+    return dvi.integrate(system, q, jnp.zeros(1), args=k, **run).qs[-1]
+batch = jax.vmap(one, in_axes=(0, None))
+alone = jax.jit(batch)(q, k)
+def total(of):
+    return jax.jit(jax.grad(lambda q, k: jnp.sum(of(q, k) ** 2), argnums=(0, 1)))(q, k)
+expected = total(batch)
+largest = lambda a, b: float(max(jnp.max(jnp.abs(x - y)) for x, y in zip(a, b)))
+for check in (True, False):
+    over = jax.shard_map(
+        batch, mesh=mesh, in_specs=(P("x"), P()), out_specs=P("x"), check_vma=check
+    )
+    print(largest([over(q, k)], [alone]), largest([jax.jit(over)(q, k)], [alone]))
+    print(largest(total(over), expected))
+placed = jax.device_put(q, NamedSharding(mesh, P("x")))
+print(largest([jax.jit(batch)(placed, k)], [alone]))
+print(largest([jax.pmap(batch, in_axes=(0, None))(q.reshape(4, 2, 1), k).reshape(8, 1)], [alone]))
+"""
+
+
+@pytest.mark.parametrize("adjoint", ["Reversible()", "Direct()"])
+def test_four_devices_by_shard_map_shardings_and_pmap(adjoint):
+    """Numbers and gradients, also by a parameter that all devices share, are those of one."""
+    flags = "--xla_force_host_platform_device_count=4"
+    code = FOUR_DEVICES.replace("ADJOINT", f"dvi.{adjoint}")
+    out = run([sys.executable, "-W", "ignore", "-c", code], XLA_FLAGS=flags, JAX_ENABLE_X64="1")
+    differences = list(map(float, out.stdout.split()))
+    assert len(differences) == 8
+    assert max(differences) < 1e-14
+
+
 HOST_FIRST = """
 import socket, sys
 import jax
