@@ -65,7 +65,7 @@ class Evaluator:
         both = _sines_and_cosines(jaxpr)
         for eqn in jaxpr.eqns:
             inputs = [read(v) for v in eqn.invars]
-            if eqn.primitive.name in ("sin", "cos") and eqn.invars[0] in both:
+            if id(eqn) in both:
                 outputs = [self.sine_or_cosine(eqn, inputs[0])]
                 known.update(zip(eqn.outvars, outputs, strict=True))
                 continue
@@ -474,13 +474,15 @@ def _as_stack_of_matrices(x, batch: Sequence[int], contracted: Sequence[int]) ->
     return np.transpose(x, (*batch, *free, *contracted)).reshape(sizes)
 
 
-def _sines_and_cosines(jaxpr: Jaxpr) -> set[Any]:
-    """The variables of which a jaxpr takes the sine and the cosine."""
-    of = {
-        name: {e.invars[0] for e in jaxpr.eqns if e.primitive.name == name}
-        for name in ("sin", "cos")
-    }
-    return of["sin"] & of["cos"]
+def _sines_and_cosines(jaxpr: Jaxpr) -> set[int]:
+    """The equations that are the sine or the cosine of a variable of which both are taken."""
+    taken = [
+        (eqn.primitive.name, eqn.invars[0], id(eqn))
+        for eqn in jaxpr.eqns
+        if eqn.primitive.name in ("sin", "cos") and not isinstance(eqn.invars[0], Literal)
+    ]
+    sines, cosines = ({x for name, x, _ in taken if name == which} for which in ("sin", "cos"))
+    return {eqn for _, x, eqn in taken if x in sines & cosines}
 
 
 _ENDS = frozenset(["custom_linear_solve", "eliminate"])

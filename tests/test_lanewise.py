@@ -723,6 +723,7 @@ def small_systems(m):
 
 MATRICES = RNG.normal(size=(9, 3, 3))
 FUNCTIONS = {
+    "sine of a literal": (lambda x: lax.sin(0.3) * lax.cos(x) + lax.sin(x) + lax.cos(0.3), VALUES),
     "tables": (tables, VALUES),
     "orders": (orders, VALUES),
     "neighbours": (neighbours, VALUES),
