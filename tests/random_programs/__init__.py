@@ -1,0 +1,1 @@
+"""Random systems and runs, each checked against the same map in plain arrays on XLA."""

@@ -1,0 +1,188 @@
+"""What every random program must do, and how it is compared with XLA in plain arrays."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dvi_jax as dvi
+
+COPIES = 6
+"""Perturbed copies of each start, which show how much round-off grows along the trajectory."""
+
+ALLOWED = 100
+"""Allowed difference, in units of what perturbations of some ulp make, and of round-off."""
+
+
+class Ill(Exception):
+    """A program that is refused when it is called, as a user's mistake would be."""
+
+
+def load(text: str) -> dict[str, Any]:
+    """The names of a program."""
+    names: dict[str, Any] = {"__name__": "program"}
+    exec(compile(text, "<program>", "exec"), names)
+    return names
+
+
+def _numbers(solution: Any) -> dict[str, Any]:
+    stop = () if solution.stop is None else tuple(solution.stop)
+    return {
+        "states": (solution.ts, solution.qs, solution.ps, solution.observed, stop),
+        "status": dvi._results.status_code(solution.result),
+        "failed_step": solution.stats["failed_step"],
+    }
+
+
+class Case:
+    """A loaded program, ready to be run in several ways."""
+
+    def __init__(self, names: dict[str, Any], seed: int = 0):
+        self.run, self.start, self.smooth = names["run"], names["START"], names["SMOOTH"]
+        shared = names["SHARED"]
+        self.axes = {k: None if k in shared else 0 for k in self.start}
+        self.rng = np.random.default_rng(seed)
+
+    def one(self, start: dict[str, Any], form: str = "auto") -> dict[str, Any]:
+        return _numbers(self.run(start["q"], start["p"], start["epsilon"], start["args"], form))
+
+    @functools.cache  # noqa: B019
+    def compiled(self, form: str) -> Callable:
+        # XLA's reference is compiled without its optimisations, in two thirds of the time.
+        options = {"xla_backend_optimization_level": 0} if form == "arrays" else None
+        of = jax.vmap(lambda s: self.one(s, form), in_axes=(self.axes,))
+        return jax.jit(of, compiler_options=options)
+
+    def batch(self, start: dict[str, Any], form: str = "auto") -> dict[str, Any]:
+        return jax.tree.map(np.asarray, self.compiled(form)(start))
+
+    def lane(self, i: int) -> dict[str, Any]:
+        return {
+            k: x if self.axes[k] is None else jax.tree.map(lambda y: y[i], x)
+            for k, x in self.start.items()
+        }
+
+    def copies(self, count: int) -> dict[str, Any]:
+        """The starts, and after them `count` copies whose states are moved by some ulp."""
+        start = dict(self.start)
+        for name, x in self.start.items():
+            if self.axes[name] is None:
+                continue
+            if name in ("q", "p"):
+                eps = np.finfo(x.dtype).eps
+                moved = [
+                    (x * (1 + 4 * eps * self.rng.uniform(-1, 1, x.shape))).astype(x.dtype)
+                    for _ in range(count)
+                ]
+                start[name] = np.concatenate([x, *moved])
+            else:
+                start[name] = jax.tree.map(lambda y: np.concatenate([y] * (count + 1)), x)
+        return start
+
+
+def check(text: str, gradient: bool = True) -> str:
+    """Check a program. Returns what was compared; raises `AssertionError` for a difference, and
+    `Ill` where dvi_jax refuses the program with an error of its own."""
+    case = Case(load(text))
+    try:
+        jax.eval_shape(lambda: case.one(case.lane(0)))
+    except (ValueError, TypeError) as error:
+        raise Ill(str(error)) from error
+    start = case.copies(COPIES)
+    found = case.batch(start)
+    expected = case.batch(start, "arrays")
+    count = len(case.start["q"])
+    compared = _compare(found, expected, count)
+    _same_bits_elsewhere(case, start, found)
+    if gradient and case.smooth:
+        compared += _compare_gradient(case)
+    return compared
+
+
+def _rows(tree: Any) -> list[np.ndarray]:
+    return [np.asarray(x) for x in jax.tree.leaves(tree)]
+
+
+def _compare(found: dict[str, Any], expected: dict[str, Any], count: int) -> str:
+    """Numbers and statuses of the first `count` trajectories; the others are copies of them."""
+    copies = len(found["status"]) // count
+    skipped = 0
+    for i in range(count):
+        those = np.arange(copies) * count + i
+        verdicts = np.stack([expected["status"][those], expected["failed_step"][those]])
+        rows = [x[those].astype(float) for x in _rows(expected["states"])]
+        patterns = [np.isnan(x) for x in rows]
+        # Where perturbations by some ulp change what happens, there is nothing to compare.
+        if np.any(verdicts != verdicts[:, :1]) or any(np.any(x != x[:1]) for x in patterns):
+            skipped += 1
+            continue
+        for name in ("status", "failed_step"):
+            assert found[name][i] == expected[name][i], (
+                f"{name} of trajectory {i}: {found[name][i]}, XLA {expected[name][i]}"
+            )
+        largest = [np.max(np.abs(x[np.isfinite(x)]), initial=0.0) for x in rows]
+        for mine, theirs, size in zip(_rows(found["states"]), rows, largest, strict=True):
+            eps = np.finfo(mine.dtype).eps if mine.dtype.kind == "f" else 0.0
+            a, b = mine[i].astype(float), theirs[0]
+            with np.errstate(invalid="ignore"):
+                spread = np.max(np.where(np.isfinite(theirs), np.abs(theirs - b), 0.0), axis=0)
+            assert np.array_equal(np.isnan(a), np.isnan(b)), (
+                f"NaN of trajectory {i}: {a.tolist()}, XLA {b.tolist()}"
+            )
+            finite = np.isfinite(b)
+            assert np.array_equal(a[~finite & ~np.isnan(b)], b[~finite & ~np.isnan(b)]), (
+                f"infinities of trajectory {i}: {a.tolist()}, XLA {b.tolist()}"
+            )
+            allowed = ALLOWED * (spread + eps * (np.abs(b) + size) + np.finfo(mine.dtype).tiny
+                                 if mine.dtype.kind == "f" else 0.0)  # fmt: skip
+            wrong = finite & (np.abs(a - b) > allowed)
+            assert not wrong.any(), (
+                f"numbers of trajectory {i}: {a[wrong].tolist()}, XLA {b[wrong].tolist()}, "
+                f"allowed difference {np.broadcast_to(allowed, b.shape)[wrong].tolist()}"
+            )
+    return f"{count - skipped} of {count} trajectories"
+
+
+def _same_bits_elsewhere(case: Case, start: dict[str, Any], found: dict[str, Any]) -> None:
+    """A trajectory alone, and at another place of the batch, has the same bits."""
+    turned = {
+        k: x if case.axes[k] is None else jax.tree.map(lambda y: y[::-1].copy(), x)
+        for k, x in start.items()
+    }
+    for a, b in zip(_rows(case.batch(turned)), _rows(found), strict=True):
+        assert np.array_equal(a[::-1], b, equal_nan=a.dtype.kind == "f"), "bits at another place"
+    alone = jax.tree.map(np.asarray, jax.jit(case.one)(case.lane(0)))
+    for a, b in zip(_rows(alone), _rows(found), strict=True):
+        assert np.array_equal(a, b[0], equal_nan=a.dtype.kind == "f"), "bits of one alone"
+
+
+def _loss(solution: Any) -> Any:
+    numbers = [solution.qs, solution.ps, *jax.tree.leaves(solution.observed)]
+    return sum(jnp.sum(jnp.tanh(x)) for x in numbers)
+
+
+def _compare_gradient(case: Case) -> str:
+    """The gradient by the start of one trajectory against central differences."""
+    start = case.lane(0)
+
+    def loss(q):
+        return _loss(case.run(q, start["p"], start["epsilon"], start["args"]))
+
+    q = jnp.asarray(start["q"])
+    value, slope = map(np.asarray, jax.jit(jax.value_and_grad(loss))(q))
+    if not np.isfinite(value):
+        return ", no gradient of a trajectory that fails"
+    deltas = [3e-4, 1e-4, 3e-5, 1e-5]
+    points = np.stack([q + s * d * e for d in deltas for e in np.eye(q.size) for s in (1, -1)])
+    values = np.asarray(jax.jit(jax.vmap(loss))(points)).reshape(len(deltas), q.size, 2)
+    slopes = (values[..., 0] - values[..., 1]) / (2 * np.array(deltas)[:, None])
+    # The difference of two neighbours estimates the error of a difference.
+    errors = np.abs(np.diff(slopes, axis=0)) + 1e-16 / np.array(deltas[1:])[:, None]
+    allowed = 10 * np.min(errors, axis=0) + 1e-7 * (1 + np.abs(slope))
+    close = np.min(np.abs(slopes[1:] - slope), axis=0) <= allowed
+    if np.all(np.isfinite(slopes)):
+        assert np.all(close), f"gradient {slope}, differences {slopes.tolist()}"
+    return ", a gradient"

@@ -1,0 +1,138 @@
+"""Search for random programs that fail.
+
+    python tests/random_programs/search.py [--count 2000] [--minutes M] [--seed S] [--out FOLDER]
+
+Programs are drawn and checked in child processes, by portions with seeds S, S + 1, …, until the
+count or the time is reached. A failure is shrunk by hypothesis, and its program is written into
+FOLDER as a script that can be run. A child that dies or that takes too long is a failure as well:
+the program that it was at is written, not shrunk. The exit status is 1 if anything was found.
+"""
+
+import argparse
+import collections
+import os
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+TESTS = Path(__file__).parents[1]
+PORTION = 50
+"""Programs of a child process."""
+
+LONGEST = 1800
+"""Seconds after which a child is taken for stuck."""
+
+FOOTER = """
+
+if __name__ == "__main__":  # run with the folder `tests` in PYTHONPATH
+    from pathlib import Path
+
+    from random_programs.checks import check
+
+    print(check(Path(__file__).read_text()))
+"""
+
+
+def portion(seed: int, count: int, out: Path) -> None:
+    """Draw and check `count` programs; the one that is being checked is in out/current.py."""
+    import jax
+    from hypothesis import HealthCheck, Phase, given, seed as seeded, settings
+
+    from random_programs.checks import Ill, check
+    from random_programs.programs import programs
+
+    warnings.simplefilter("ignore")
+    jax.config.update("jax_enable_x64", True)
+    counted = collections.Counter()
+    failed: list[tuple[str, Exception]] = []
+
+    @seeded(seed)
+    @settings(
+        max_examples=count,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate, Phase.shrink],
+        suppress_health_check=list(HealthCheck),
+        report_multiple_bugs=False,
+    )
+    @given(programs())
+    def check_all(program):
+        (out / "current.py").write_text(program.text + FOOTER)
+        counted["programs"] += 1
+        if counted["programs"] % 25 == 0:
+            jax.clear_caches()
+        try:
+            counted[check(program.text)] += 1
+        except Ill:
+            counted["refused by dvi_jax"] += 1
+        except Exception as error:
+            failed.append((program.text, error))
+            raise
+
+    try:
+        check_all()
+    except Exception as error:  # the last one that failed is the smallest
+        text, error = failed[-1] if failed else ("", error)
+        place = out / f"failure_{seed}.py"
+        place.write_text(text + FOOTER)
+        first = str(error).strip().splitlines() or [""]
+        print(f"failure: seed {seed}: {type(error).__name__}: {first[0][:300]}\n  {place}")
+    for what, number in sorted(counted.items()):
+        print(f"count: {number} {what}")
+
+
+def search(count: int, minutes: float, seed: int, out: Path) -> int:
+    out.mkdir(parents=True, exist_ok=True)
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)])}
+    began, total, found = time.monotonic(), collections.Counter(), 0
+    while total["programs"] < count and time.monotonic() - began < 60 * minutes:
+        size = min(PORTION, count - total["programs"])
+        command = [sys.executable, __file__, "--child", str(size), "--seed", str(seed)]
+        try:
+            done = subprocess.run(
+                [*command, "--out", str(out)],
+                env=env, capture_output=True, text=True, check=False, timeout=LONGEST,
+            )  # fmt: skip
+            code, lines = done.returncode, done.stdout.splitlines()
+            last = (done.stderr.strip().splitlines() or [""])[-1]
+        except subprocess.TimeoutExpired:
+            code, lines, last = -1, [], f"no end after {LONGEST} s"
+        for line in lines:
+            if line.startswith("count: "):
+                number, _, what = line.removeprefix("count: ").partition(" ")
+                total[what] += int(number)
+            else:
+                found += line.startswith("failure: ")
+                print(line, flush=True)
+        if code:
+            found += 1
+            place = out / f"crash_{seed}.py"
+            (out / "current.py").replace(place)
+            total["programs"] += size
+            print(f"failure: seed {seed}: exit status {code}: {last}\n  {place}", flush=True)
+        seed += 1
+        spent = time.monotonic() - began
+        print(f"{total['programs']} programs, {found} failures, {spent:.0f} s", flush=True)
+    for what, number in total.most_common():
+        print(f"{number:6} {what}")
+    return 1 if found else 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Search for random programs that fail.")
+    parser.add_argument("--count", type=int, default=2000, help="programs (default 2000)")
+    parser.add_argument("--minutes", type=float, default=1e9, help="at most (default: no limit)")
+    parser.add_argument("--seed", type=int, default=0, help="of the first portion (default 0)")
+    parser.add_argument("--out", type=Path, default=Path("random-programs"), help="folder")
+    parser.add_argument("--child", type=int, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.child is not None:
+        portion(given.seed, given.child, given.out)
+        return 0
+    return search(given.count, given.minutes, given.seed, given.out)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
