@@ -550,21 +550,20 @@ class Builder:
         """Which of `targets`, serials of numbers, are finite for certain where all numbers `by`
         are: those numbers themselves, what they are a sum or a product of, and so on."""
         found: dict[int, frozenset[int]] = {}
-
-        def walk(x: Num, depth: int) -> frozenset[int]:
-            if x.known is not None or depth > _DEEPEST or len(found) > _MOST_SEEN:
-                return frozenset()
-            if x.serial not in found:
-                mine = frozenset([x.serial]) & targets
-                if x.op in _HANDED_ON:
-                    mine = mine.union(*(walk(a, depth + 1) for a in x.args))
-                elif x.op == "select":
-                    _, yes, no = x.args
-                    mine |= walk(yes, depth + 1) & walk(no, depth + 1)
-                found[x.serial] = mine
-            return found[x.serial]
-
-        return frozenset().union(*(walk(x, 0) for x in by))
+        stack = [(x, False) for x in by]
+        while stack:
+            x, is_seen = stack.pop()
+            if x.known is not None or x.serial in found:
+                continue
+            parts = x.args if x.op in _HANDED_ON else x.args[1:] if x.op == "select" else ()
+            if parts and not is_seen and len(found) + len(stack) < _MOST_SEEN:
+                stack.append((x, True))
+                stack += [(a, False) for a in parts]
+                continue
+            mine = [found.get(a.serial, frozenset()) for a in parts] or [frozenset()]
+            of_parts = mine[0].intersection if x.op == "select" else mine[0].union
+            found[x.serial] = of_parts(*mine[1:]) | (frozenset([x.serial]) & targets)
+        return frozenset().union(*(found.get(x.serial, frozenset()) for x in by))
 
     # --- types -----------------------------------------------------------------------------------
 
@@ -811,8 +810,8 @@ _FLOATS = ("float64", "float32")
 _HANDED_ON = frozenset(["add", "sub", "mul", "fma", "neg", "sqrt", "same"])
 """Operations whose result is not finite where an operand is not."""
 
-_DEEPEST, _MOST_SEEN = 50, 300
-"""How far operations are followed back."""
+_MOST_SEEN = 300
+"""How many operations are followed back."""
 
 _FEW = 12
 """With more numbers than this each of them is checked."""

@@ -224,7 +224,9 @@ def pieces_of(program: _Program, lanes: int) -> list[Piece]:
             return str(why)
         return None
 
-    return pieces(program.traced.all_inputs, reason)
+    found = pieces(program.traced.all_inputs, reason)
+    # One piece is all of it, and too large as a whole: it cannot be cut any further.
+    return [] if len(found) == 1 and not found[0].is_call else found
 
 
 def compiled(

@@ -2,6 +2,7 @@
 
 import ctypes
 import errno
+import inspect
 import os
 import subprocess
 import sys
@@ -1212,6 +1213,20 @@ def test_loops_around_a_callback_are_compiled(left):
     assert kinds == ["code", "pure_callback", "code", "code", "pure_callback"]
 
 
+def test_loops_that_are_too_large_together_end_in_xla(left, monkeypatch):
+    """Each loop could be compiled, the function of both cannot: no search without an end."""
+    monkeypatch.setattr(primitive, "MOST_OPERATIONS", 12)
+
+    def loop(x):
+        return lax.fori_loop(0, 3, lambda _, y: jnp.sin(jnp.sin(jnp.sin(y) + x) + x), x)
+
+    def function(x):
+        return loop(loop(loop(x)))
+
+    assert_close(jax.jit(lanewise.batched(function))(VALUES), jax.jit(jax.vmap(function))(VALUES))
+    assert len(left) == 1
+
+
 def test_derivative_of_loops_around_a_sort():
     def function(x):
         row = jnp.sort(lax.fori_loop(0, 5, lambda _, z: 0.9 * z, x * jnp.arange(20.0)))
@@ -1357,3 +1372,20 @@ def test_constant_arrays_of_every_type(left):
 def test_small_arrays_are_numbers():
     """The bound that the cases above lie on both sides of."""
     assert 100 < components.SMALL < 150
+
+
+def test_long_chains_of_operations_need_no_deep_stack():
+    """A trace within traces has little of Python's stack left."""
+    b = Module(4, 1).b
+    first = x = b.made(["%x"], "float64", True)
+    for _ in range(200):
+        x = b.add(x, b.mul(x, x))
+    before = sys.getrecursionlimit()
+    try:
+        sys.setrecursionlimit(len(inspect.stack()) + 30)
+        found = b.shown(frozenset([first.serial]), [x])
+    finally:
+        sys.setrecursionlimit(before)
+    assert found <= {first.serial}
+    short = b.add(first, b.mul(first, first))
+    assert b.shown(frozenset([first.serial]), [short]) == {first.serial}
