@@ -35,6 +35,10 @@ class System(eqx.Module):
     q0 and p1 are arrays of one shape, whichever was given to `integrate`. `args` is
     any pytree; what of it is an array or a float is differentiable.
 
+    Values that the functions read from outside (globals, closures, ``self.k``) are those of the
+    moment when the system is made. If they change, runs of this system raise `ValueError`: make a
+    new system, or pass such values in `args`.
+
     **Raises** `TypeError` when a function is not callable or cannot take the five arguments.
 
     **Source** H_D: type II generating function S = p1·q0 + h H_D (Marsden & West 2001,

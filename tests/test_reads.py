@@ -175,6 +175,25 @@ def test_a_sweep_reads_the_new_value(monkeypatch):
     assert last() == pytest.approx(exact(4.0), rel=1e-14)
 
 
+def test_a_fit_of_a_function_reads_the_new_value():
+    mass = {"m": 1.0}
+    system = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 + args["k"] * (q0 @ q0) / 2)
+    ts = np.linspace(0.5, 3.0, 6)
+    data = dvi.Observations(ts, np.cos(ts)[:, None], sigma=0.01, t0=0.0)
+
+    def model(params):
+        args = {"k": params["k"] * mass["m"]}
+        return {"system": system, "q0": [1.0], "p0": [0.0], "h": 0.1, "args": args}
+
+    def found():
+        result = dvi.fit(model, data, {"k": 1.1}, progress=False, check_curvature=False)
+        return float(result.params["k"])
+
+    first = found()
+    mass["m"] = 2.0
+    assert found() == pytest.approx(first / 2, rel=1e-6)
+
+
 def test_what_a_function_changes_itself_is_no_change():
     """A counter of calls makes no error, and no new compilation either."""
     calls = []

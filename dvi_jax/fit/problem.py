@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._results import RESULTS, status_name
+from .._system import check_system
+from ..engine.reads import Reads, reads
 from .losses import LeastSquares, Likelihood, Loss
 from .model import Group, Model, check_observable, make_groups, predict, specification
 from .observations import Observations
@@ -26,7 +28,7 @@ class Core(eqx.Module):
     all fits of one model with data of one shape.
 
     - `model`, `loss`: as given. `groups`: the data. `space`: the parameters. `many`: whether arcs
-      were given as a list.
+      were given as a list. `reads`: values that functions of the user read from outside.
     """
 
     model: Any
@@ -34,6 +36,7 @@ class Core(eqx.Module):
     space: Space
     loss: Any
     many: bool = eqx.field(static=True)
+    reads: Reads = eqx.field(static=True)
 
     def specification(self, params: PyTree, arc: Any) -> dict[str, Any]:
         """The arguments of `integrate` for an arc."""
@@ -176,6 +179,8 @@ class Problem:
                         f"{what} can only be weighed against data with errors: give sigma or "
                         "covariance with the observations."
                     )
+        if isinstance(model, Model):
+            check_system(model.rest["system"])
         arrays = self.space.to_params(jnp.asarray(self.start))
         if many and isinstance(model, Model):
             specification(model, arrays, 0, many)  # which says what is missing
@@ -184,7 +189,8 @@ class Problem:
         for i, arc in enumerate(arcs):
             check_observable(i, arc, self.specs[i])
         self.groups = make_groups(arcs, self.specs)
-        self.core = Core(model, tuple(self.groups), self.space, loss, many)
+        seen = reads(model, loss, [arc.function for arc in arcs])
+        self.core = Core(model, tuple(self.groups), self.space, loss, many, seen)
         self.count = int(sum(group.seen.sum() for group in self.groups))
 
     @property
