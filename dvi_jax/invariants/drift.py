@@ -372,7 +372,7 @@ def _sweep(system, invariant, q0, p0, epsilons, h, num_steps, settings) -> _Lane
     strengths = jnp.repeat(jnp.append(jnp.asarray(epsilons, q0.dtype), 0), shape[1])
     starts = tuple(jnp.concatenate([x] * shape[0]) for x in (q0, p0))
     drifts, last, result = _run(
-        system, invariant, reads(invariant), strengths, starts, h, num_steps, settings
+        system, invariant, strengths, starts, h, num_steps, settings, reads(invariant)
     )
     if drifts.ndim != 1:
         raise ValueError(
@@ -395,7 +395,7 @@ def _sweep(system, invariant, q0, p0, epsilons, h, num_steps, settings) -> _Lane
 
 
 @eqx.filter_jit
-def _run(system, invariant, _: Reads, strengths, starts, h, num_steps: int, settings):
+def _run(system, invariant, strengths, starts, h, num_steps: int, settings, _: Reads = ()):
     """Drift, last value and status of every lane; nothing is saved on the way."""
 
     def lane(epsilon, q0, p0):
