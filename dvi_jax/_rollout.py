@@ -150,7 +150,11 @@ class StepTaken(NamedTuple):
     def number(self, observable: Callable, args: Args) -> Array:
         """The value for a reduction: whole numbers and truth values count as real numbers."""
         value = self.value(observable, args)
-        return value if jnp.issubdtype(value.dtype, jnp.inexact) else value.astype(self.q1.dtype)
+        if not jnp.issubdtype(value.dtype, jnp.inexact):
+            value = value.astype(self.q1.dtype)
+        # Rounded, and no product that is contracted with the reduction's difference: equal values
+        # have the drift zero.
+        return lax.optimization_barrier(value)
 
 
 class Saved(NamedTuple):

@@ -396,6 +396,10 @@ class Evaluator:
             total = b.new(f"call {TYPES[x.dtype]} @llvm.vector.reduce.smin.{full}({t} {total})")
         return [self.value([b.made([total], x.dtype, False)], eqn.outvars[0].aval)]
 
+    def rounded(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
+        """The values as they are, in no operation that is contracted with those after them."""
+        return [self.closed_off(v) for v in values]
+
     def same(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         return values
 
@@ -498,7 +502,7 @@ _SPECIAL: dict[str, Callable] = {
     "eliminate": elimination.eliminate,
     "dot_general": Evaluator.dot,
     "iota": indexing.iota,
-    "optimization_barrier": Evaluator.same,
+    "optimization_barrier": Evaluator.rounded,
     **dict.fromkeys(
         ["reshard", "sharding_constraint", "mesh_cast"], Evaluator.same
     ),

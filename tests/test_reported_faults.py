@@ -168,3 +168,10 @@ def test_gradient_of_a_batch_with_a_branch_in_the_hamiltonian(adjoint):
     moved = np.asarray(q)[:, None, None] + 1e-5 * np.array([1, -1])[:, None, None] * np.eye(2)
     ends = jax.jit(jax.vmap(last))(moved.reshape(-1, 2)).reshape(2, 2, 2)
     np.testing.assert_allclose(of_batch, (ends[:, 0] - ends[:, 1]) / 2e-5, atol=1e-9)
+
+
+def test_the_drift_over_one_step_is_zero():
+    """q² is contracted into no difference, which would give its rounding error."""
+    run = {"h": 0.1, "num_steps": 1, "observe": dvi.MaxDrift(lambda *at: at[4][0] ** 2)}
+    one = jax.jit(jax.vmap(lambda q: dvi.integrate(KEPLER, q, jnp.ones(2), **run).observed))
+    assert np.all(one(np.random.default_rng(0).uniform(0.5, 1.0, (16, 2))) == 0.0)
