@@ -87,7 +87,7 @@ def call(function: Callable, *args: Any, layout: Layout = AUTO) -> Any:
     traced = Traced.of(function, leaves, tree)
     program = _Program(traced, layout)
     # What is traced outside and closed over is an input like the others.
-    operands = with_equal_axes([*traced.outer, *leaves])
+    operands = [*traced.outer, *leaves]
     on = (False,) * len(operands)
     outs = _lanewise.bind(*operands, program=program, lanes=None, on=on)
     return jax.tree.unflatten(traced.out_tree, outs)

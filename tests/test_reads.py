@@ -149,12 +149,15 @@ def test_an_observable_and_a_stop_read_the_new_value():
     run = {"h": 0.1, "num_steps": 20, "throw": False}
     system = dvi.System(of_global)
 
+    def observable(t0, t1, q0, p0, q1, p1, args):
+        return q1[0] - limit["q"]
+
+    def event(t, q, p, args):
+        return limit["q"] - q[0]
+
     def found():
-        sol = dvi.integrate(
-            system, [1.0], [0.0], **run,
-            observe=lambda t0, t1, q0, p0, q1, p1, a: q1[0] - limit["q"],
-            stop=dvi.Stop(lambda t, q, p, a: limit["q"] - q[0]),
-        )  # fmt: skip
+        at = {"observe": observable, "stop": dvi.Stop(event)}
+        sol = dvi.integrate(system, [1.0], [0.0], **run, **at)
         return float(sol.observed[0]), float(sol.stop.q[0])
 
     first = found()
@@ -173,6 +176,27 @@ def test_a_sweep_reads_the_new_value(monkeypatch):
     assert last() == pytest.approx(exact(1.0), rel=1e-14)
     monkeypatch.setitem(globals(), "STIFFNESS", 4.0)
     assert last() == pytest.approx(exact(4.0), rel=1e-14)
+
+
+def test_observables_of_a_sweep_and_of_a_drift_read_the_new_value():
+    """The system stays the same, and so do the functions."""
+    scale = {"s": 1.0}
+    system = dvi.System(of_global, force=lambda t0, t1, q0, p1, args: -p1)
+
+    def momentum(t0, t1, q0, p0, q1, p1, args):
+        return scale["s"] * p1[0]
+
+    def found():
+        run = {"h": 0.1, "num_steps": 3, "progress": False}
+        of = {"observe": {"end": dvi.Last(momentum)}, "epsilon": dvi.Axis("e", [0.0])}
+        swept = float(dvi.sweep(system, [1.0], [0.0], **of, **run)["end"][0])
+        run = {"h": 0.1, "num_steps": 3, "epsilons": [1e-3, 1e-2]}
+        order = dvi.drift_order(system, momentum, [1.0], [0.0], **run)
+        return swept, float(order.start_drifts[-1, 0])
+
+    first = found()
+    scale["s"] = 3.0
+    assert found() == pytest.approx(tuple(3 * x for x in first), rel=1e-12)
 
 
 def test_a_fit_of_a_function_reads_the_new_value():
