@@ -149,7 +149,7 @@ def expressions(draw, leaves, n, smooth, depth=3):
 # --- runs ---------------------------------------------------------------------------------------
 
 METHODS = st.sampled_from(
-    ["dvi.TypeII()"] * 4
+    ["dvi.TypeII()"] * 12
     + ["dvi.Adjoint(dvi.TypeII())", "dvi.Strang()", "dvi.Yoshida(4)", "dvi.GaussLegendre(2)",
        "dvi.RungeKutta4()", "dvi.LobattoIIIAIIIB(2)"]
 )  # fmt: skip
