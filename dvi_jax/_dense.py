@@ -4,31 +4,40 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from lanewise import Layout
+
 from ._step import Equations
 from ._types import Interval, Scalar, State
 from .engine.bracket import bracketed_root
+from .engine.rounding import each, one_by_one
 from .methods import Method
 from .observe import Crossings, Section, Stop, Stopped
-from .observe._kept import RequestedTimes, Start, event, from_rows
+from .observe._kept import RequestedTimes, Start, event, from_rows, shown
 
 Point = tuple[Scalar, State, State]
 """(t, q, p)."""
 
 
-class Curve:
+class Curve(eqx.Module):
     """The curve that a method draws inside of a step, Φ_{θh}(q0, p0) for 0 ≤ θ ≤ 1.
 
     It is of the method's own order, and ends where the step ends.
     """
 
-    def __init__(self, method: Method, equations: Equations):
+    method: Method
+    equations: Equations
+    layout: Layout = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, method: Method, equations: Equations, layout: Layout) -> "Curve":
         # On a grid of its own the curve would be a staircase: between lattice points it is smooth.
-        self.method, self.equations = method, dataclasses.replace(equations, quantum=None)
+        return cls(method, dataclasses.replace(equations, quantum=None), layout)
 
     def point(self, start: Start, theta: Scalar) -> Point:
         """(t, q, p) at the fraction θ of the step."""
@@ -55,8 +64,11 @@ def crossings(curve: Curve, section: Section, kept: tuple[Array, Array], safe: S
     """The crossings in the steps that a section has kept. `safe` is any step that can be taken."""
     rows, count = kept
     exists, starts = _steps(rows, safe)
-    points = jax.vmap(lambda start, exists: curve.where(section.g, start, exists))(starts, exists)
-    ts, qs, ps = _or_nan(exists, points)
+    found = each(
+        lambda given, *row: given[0].where(given[1].g, *row), (curve, section), starts, exists,
+        layout=curve.layout,
+    )  # fmt: skip
+    ts, qs, ps = _or_nan(exists, found)
     return Crossings(ts, qs, ps, count.astype(jnp.int32))
 
 
@@ -65,21 +77,11 @@ def at_times(
 ) -> tuple[Array, Start, Point]:
     """For each requested time: if it was reached, the step that it lies in, and the point there."""
     exists, starts = _steps(kept[0], safe)
-    args = curve.equations.args
-    began = jax.vmap(lambda s: requested.time(s.t0, s.q0, s.p0, args))(starts)
-    first = requested.time(safe.t0, safe.q0, safe.p0, args)
+    given = (curve, requested.clock)
+    began = each(_shown, given, starts, layout=curve.layout)
+    first = one_by_one(_shown, given, safe, layout=curve.layout)
     sense = jnp.where(starts.until[0] >= began[0], 1, -1)  # −1: time runs backwards
     ends = jnp.where(exists, sense * starts.until, jnp.inf)
-    close = jnp.sqrt(jnp.finfo(safe.q0.dtype).eps)
-
-    def within(start, time, reached):
-        if requested.clock is None:
-            return curve.point(start, (time - start.t0) / (start.t1 - start.t0)), True
-        point = curve.where(lambda *at: requested.time(*at) - time, start, reached)
-        # A clock that jumps, or turns, has passed the value without showing it.
-        missed = jnp.abs(requested.time(*point, args) - time)
-        span = jnp.abs(start.until - requested.time(start.t0, start.q0, start.p0, args))
-        return point, missed <= close * (span + jnp.abs(time))
 
     def one(time, due):
         i = jnp.minimum(jnp.searchsorted(ends, sense * due), ends.size - 1)
@@ -88,15 +90,36 @@ def at_times(
         is_start = time == first
         if requested.clock is None:
             time = jnp.where(is_start, _just_after(time, start), time)
-        point, shown = within(start, time, reached)
+        point, is_shown = one_by_one(_within, given, start, time, reached, layout=curve.layout)
         known = (safe.t0, safe.q0, safe.p0)
         if requested.clock is None:  # the start to the bit, with the slope of the curve
             known = jax.tree.map(lambda a, b: a + lax.stop_gradient(b - a), point, known)
         point = jax.tree.map(lambda a, b: jnp.where(is_start, b, a), point, known)
-        found = (reached & shown) | is_start
+        found = (reached & is_shown) | is_start
         return found, start, _or_nan(found, point)
 
     return jax.vmap(one)(requested.ts, requested.due)
+
+
+def _shown(given, start: Start) -> Scalar:
+    """What the clock shows where a step begins."""
+    curve, clock = given
+    return shown(clock, start.t0, start.q0, start.p0, curve.equations.args)
+
+
+def _within(given, start: Start, time: Scalar, reached: Array) -> tuple[Point, Array]:
+    """The point of the step at a requested time, and if the clock shows that time there."""
+    curve, clock = given
+    if clock is None:
+        theta = (time - start.t0) / (start.t1 - start.t0)
+        return curve.point(start, theta), jnp.asarray(True)
+    args = curve.equations.args
+    point = curve.where(lambda *at: shown(clock, *at) - time, start, reached)
+    # A clock that jumps, or turns, has passed the value without showing it.
+    missed = jnp.abs(shown(clock, *point, args) - time)
+    span = jnp.abs(start.until - _shown(given, start))
+    close = jnp.sqrt(jnp.finfo(start.q0.dtype).eps)
+    return point, missed <= close * (span + jnp.abs(time))
 
 
 def _just_after(time: Scalar, start: Start) -> Scalar:
@@ -109,10 +132,18 @@ def stopped(curve: Curve, stop: Stop, row: Array, safe: Start) -> Stopped:
     """Where g = 0 in the step that a run stopped in; its start if g ≥ 0 already there."""
     exists, start = _steps(row, safe)
     began = (start.t0, start.q0, start.p0)
-    at_start = event(stop.g, *began, curve.equations.args) >= 0
-    point = curve.where(stop.g, start, exists & ~at_start)
+    args = curve.equations.args
+    at_start = one_by_one(_event, stop, began, args, layout=curve.layout) >= 0
+    point = one_by_one(
+        lambda curve, stop, *row: curve.where(stop.g, *row), curve, stop, start, exists & ~at_start,
+        layout=curve.layout,
+    )  # fmt: skip
     point = jax.tree.map(lambda a, b: jnp.where(at_start, b, a), point, began)
     return Stopped(*_or_nan(exists, point))
+
+
+def _event(stop: Stop, point: Point, args) -> Scalar:
+    return event(stop.g, *point, args)
 
 
 def _steps(rows: Array, safe: Start) -> tuple[Array, Start]:

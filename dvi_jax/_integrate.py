@@ -47,6 +47,7 @@ from .engine.newton import RootSolver, over
 from .engine.picard import PicardThenNewton
 from .engine.quantities import refuse_unit_or_mask
 from .engine.reads import reads
+from .engine.rounding import each
 from .lattices import Lattice, TimeTransformed, Uniform, Variational
 from .methods import Method, TypeII, goes_backwards, warn_of_dissipation
 from .observe import Deviations, Range, Reduction, RequestedTimes, Running, Section, Stop
@@ -219,7 +220,7 @@ def integrate(
             "report_defect=True cannot be reported with progress: leave one of them out."
         )
     outcome = _in_pieces(task, plan, q0, p0, num_steps, progress, layout)
-    solution = _solution(task, observe, outcome, q0, p0, num_steps)
+    solution = _solution(task, observe, outcome, q0, p0, num_steps, layout)
     return _raise_on_failure(solution, task) if throw else solution
 
 
@@ -229,7 +230,7 @@ def _whole(
     layout: Layout,
 ) -> Solution:  # fmt: skip
     outcome = adjoint.rollout(task, plan, q0, p0, layout)
-    return _as_solution(task, observe, outcome, q0, p0, num_steps)
+    return _as_solution(task, observe, outcome, q0, p0, num_steps, layout)
 
 
 @eqx.filter_jit
@@ -295,10 +296,12 @@ def _with_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes,
     return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), kept
 
 
-def _as_solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: int) -> Solution:
+def _as_solution(
+    task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: int, layout: Layout
+) -> Solution:
     """What a run has left behind, as its user sees it."""
     carry, saved, reduced, defect = outcome
-    curve = Curve(task.method, task.equations)
+    curve = Curve.of(task.method, task.equations, layout)
     first = task.interval(jnp.asarray(0, jnp.int32))
     safe = Start(first.t0, first.t1, first.t1, q0, p0)
     _, reductions = task.observables()
@@ -316,7 +319,7 @@ def _as_solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_step
         values, hs = values[1:], ts - starts.t0
         steps = StepTaken(starts.t0, ts, starts.q0, starts.p0, qs, ps)
         own, _ = dataclasses.replace(task, observe=observe).observables()
-        alone = [jax.vmap(lambda step, f=f: step.value(f, task.args))(steps) for f in own]
+        alone = each(_observed, (own, task.args), steps, layout=layout)
     else:
         ts = jnp.concatenate([task.t0[None], saved.t])
         qs, ps, hs, alone = saved.q, saved.p, saved.h, saved.observed
@@ -338,6 +341,11 @@ def _as_solution(task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_step
         },
         stop=None if task.stop is None else stopped(curve, task.stop, carry.stop, safe),
     )
+
+
+def _observed(given: tuple[Any, Any], step: StepTaken) -> list[PyTree]:
+    observables, args = given
+    return [step.value(f, args) for f in observables]
 
 
 _solution = eqx.filter_jit(_as_solution)

@@ -14,8 +14,18 @@ import jax
 import lanewise
 
 
-def one_by_one(function: Callable[..., jax.Array], *args: Any) -> jax.Array:
-    """``function(*args)``, an array, compiled by itself: nothing in it is joined with operations
-    outside, within a run or elsewhere."""
+def one_by_one(
+    function: Callable[..., Any], *args: Any, layout: lanewise.Layout = lanewise.Layout()
+) -> Any:
+    """``function(*args)``, compiled by itself: nothing in it is joined with operations outside,
+    within a run or elsewhere. It takes pytrees, and returns a pytree of arrays."""
     arrays, rest = eqx.partition(args, eqx.is_array)
-    return lanewise.call(lambda arrays: function(*eqx.combine(arrays, rest)), arrays)
+    return lanewise.call(lambda arrays: function(*eqx.combine(arrays, rest)), arrays, layout=layout)
+
+
+def each(
+    function: Callable[..., Any], given: Any, *rows: Any,
+    layout: lanewise.Layout = lanewise.Layout(),
+) -> Any:  # fmt: skip
+    """``function(given, *row)`` for every row, with the bits that it has for one row alone."""
+    return jax.vmap(lambda *row: one_by_one(function, given, *row, layout=layout))(*rows)

@@ -198,16 +198,17 @@ class RequestedTimes(KeptSteps):
     def capacity(self) -> int:
         return self.ts.shape[0]
 
-    def time(self, t: Scalar, q: State, p: State, args: Args) -> Scalar:
-        """What the clock shows at a point."""
-        return t if self.clock is None else event(self.clock, t, q, p, args, "the clock")
-
     def _row(self, t0, t1, q0, p0, q1, p1, args):
-        start, end = self.time(t0, q0, p0, args), self.time(t1, q1, p1, args)
+        start, end = shown(self.clock, t0, q0, p0, args), shown(self.clock, t1, q1, p1, args)
         passed, inside = (jnp.searchsorted(self.ordered, x, side="right") for x in (start, end))
         ahead, behind = (jnp.searchsorted(self.ordered, x, side="left") for x in (start, end))
         hit = jnp.where(end >= start, inside > passed, ahead > behind)  # (start, end], [end, start)
         return as_row(hit & jnp.all(jnp.isfinite(q1)), Start(t0, t1, end, q0, p0))
+
+
+def shown(clock: Callable[..., Any] | None, t: Scalar, q: State, p: State, args: Args) -> Scalar:
+    """What a clock shows at a point: the time, where there is none."""
+    return t if clock is None else event(clock, t, q, p, args, "the clock")
 
 
 def event(

@@ -105,7 +105,7 @@ UNARY_OTHER = [
     "jnp.log(jnp.abs({0}))", "jnp.exp({0})", "1.0 / ({0})", "({0}) ** -2", "jnp.floor({0})",
     "lax.stop_gradient({0})", "bent({0})", "jnp.arcsin({0})", "rounds({0}, 0.3)",
     "TABLE[jnp.clip(jnp.abs({0}), 0, 4).astype(int)]", "jnp.interp({0}, TABLE[:0:-1].cumsum(), "
-    "TABLE[1:])", "({0}).astype(jnp.float32).astype(q.dtype)", "jnp.abs({0}) ** 1.5",
+    "TABLE[1:])", "jnp.float32({0}).astype(q.dtype)", "jnp.abs({0}) ** 1.5",
     "jnp.linalg.norm(jnp.stack([{0}, 0.5]))",
     "lax.fori_loop(0, jnp.clip(jnp.abs({0}), 0, 3).astype(int), lambda i, y: 0.9 * y, {0})",
 ]  # fmt: skip
@@ -154,17 +154,30 @@ METHODS = st.sampled_from(
        "dvi.RungeKutta4()", "dvi.LobattoIIIAIIIB(2)"]
 )  # fmt: skip
 SAVES = st.sampled_from(
-    ["dvi.Save()", "dvi.Save(every=3)", "dvi.Save(final=True)", "dvi.Save(every=4, final=True)",
-     "dvi.Save(ts=np.array([0.07, 0.21]))"]
+    ["dvi.Save()", "dvi.Save(every=3)", "dvi.Save(final=True)", "dvi.Save(every=4, final=True)"] * 4
+    + ["dvi.Save(ts=np.array([0.07, 0.21]))"] * 2
+    + ["dvi.Save(ts=np.array([0.01, 0.02]), clock=lambda t, q, p, args: t * (1 + 0.1 * t))"]
 )  # fmt: skip
 OBSERVED = st.sampled_from(
     ["observable", "dvi.MaxDrift(observable)", "dvi.Last(observable)", "dvi.Mean(observable)",
-     "dvi.Range(observable)", "{'a': dvi.MaxDrift(observable), 'b': [observable, None]}"]
+     "dvi.Range(observable)", "{'a': dvi.MaxDrift(observable), 'b': [observable, None]}"] * 3
+    + ["[dvi.Mean(observable), dvi.Range(observable), dvi.Running(dvi.MaxDrift(observable))]",
+     "dvi.Section(lambda t, q, p, args: q[0] - 0.45, max_crossings=3)",
+     "(dvi.Section(lambda t, q, p, args: p[0], direction=1, max_crossings=2), observable)"]
 )  # fmt: skip
+# A program of Variational() takes XLA half a minute.
 LATTICES = st.sampled_from(
-    ["dvi.Uniform()"] * 6 + ["dvi.Given(np.array([0.0, 0.05, 0.2, 0.25, 0.3]))"]
+    ["dvi.Uniform()"] * 48
+    + ["dvi.Given(np.array([0.0, 0.05, 0.2, 0.25, 0.3]))"] * 5
+    + ["dvi.TimeTransformed(lambda t, q, p, args: jnp.sqrt(0.1 + q @ q))"] * 3
+    + ["dvi.Variational()"]
 )
-ARITHMETICS = st.sampled_from(["dvi.FloatingPoint()"] * 6 + ["dvi.Compensated()"])
+ARITHMETICS = st.sampled_from(
+    ["dvi.FloatingPoint()"] * 6 + ["dvi.Compensated()", "dvi.FixedPoint(2.0 ** -30)"]
+)
+SOLVERS = st.sampled_from(
+    ["dvi.Newton()"] * 6 + ["dvi.SimplifiedNewton()", "dvi.Picard()", "dvi.PicardThenNewton()"]
+)
 STARTS = st.one_of(
     st.sampled_from([0.5, -0.4, 1.1, 0.3, -0.9, 0.8]),
     st.sampled_from([0.5, -0.4, 1.1, 0.3, -0.9, 0.8]),
@@ -182,9 +195,16 @@ def settings(draw):
     save = draw(SAVES)
     if "ts=" in save and "-0.1" in steps:
         save = "dvi.Save()"
+    observed = draw(OBSERVED)
+    if "ts=" in save and "Running" in observed:
+        observed = "observable"
+    # Each of these goes with some methods only.
+    arithmetic = "dvi.FloatingPoint()" if "Uniform" not in lattice else draw(ARITHMETICS)
+    explicit_only = "Variational" in lattice or "FixedPoint" in arithmetic
+    method = "dvi.TypeII()" if explicit_only else draw(METHODS)
     return (
-        f"method={draw(METHODS)}, save={save}, observe={draw(OBSERVED)}, lattice={lattice}, "
-        f"arithmetic={draw(ARITHMETICS)}{steps}"
+        f"method={method}, save={save}, observe={observed}, lattice={lattice}, "
+        f"arithmetic={arithmetic}, newton={draw(SOLVERS)}{steps}"
     )
 
 
@@ -201,7 +221,12 @@ def programs(draw):
     state = [f"{x}[{i}]" for x in "qp" for i in range(n)]
     leaves = [*state, "t0", "args['k']", "args['more']['c'][0]"]
     one = expressions(leaves, n, smooth)
-    kinetic = draw(st.sampled_from(["p @ p / 2", "p @ p / 2 * (1.0 + 0.1 * q @ q)", "0.0 * p[0]"]))
+    chosen = draw(settings())
+    kinetics = ["p @ p / 2", "p @ p / 2 * (1.0 + 0.1 * q @ q)", "0.0 * p[0]"]
+    if "FixedPoint" in chosen:  # no step may need a solve
+        of_q = ["q[0] * 1.0", *(x for x in leaves if "p[" not in x and x != "q[0]")]
+        one, kinetics = expressions(of_q, n, smooth), kinetics[:1]
+    kinetic = draw(st.sampled_from(kinetics))
     H = f"{kinetic} + {draw(one)}"
     W = None
     if draw(st.booleans()):
@@ -210,7 +235,6 @@ def programs(draw):
     stop = None
     if draw(st.integers(0, 4)) == 0:
         stop = draw(expressions(["q[0]", "p[0]", "t"], n, smooth, 1)) + " - 1.0"
-    chosen = draw(settings())
     shared = draw(st.sets(st.sampled_from(["p", "epsilon", "args"])))
     starts = st.sampled_from([0.5, -0.4, 1.1, 0.3]) if smooth else STARTS
 
@@ -221,11 +245,15 @@ def programs(draw):
         return rows[0] if name in shared else f"np.stack([{', '.join(rows)}])"
 
     epsilon, k, c = (numbers(1, name) for name in ("epsilon", "args", "args"))
+    if "args" not in shared or draw(st.booleans()):
+        c += draw(st.sampled_from(["", "", ".astype(np.float32)"]))
     start = (
         f"SHARED = {sorted(shared)}\nSTART = {{\n    'q': {numbers(n, 'q')},\n    'p': "
         f"{numbers(n, 'p')},\n    'epsilon': {epsilon}[..., 0],\n    'args': {{'k': {k}[..., 0], "
         f"'more': {{'c': {c}, 'none': None}}}},\n}}"
     )
     # A gradient takes longer to compile than all the rest: of one program in six.
-    smooth = smooth and stop is None and dtype == "float64" and draw(st.integers(0, 1)) == 0
+    smooth = smooth and stop is None and dtype == "float64" and "Variational" not in chosen
+    # FixedPoint has the slope of the map without rounding.
+    smooth = smooth and "FixedPoint" not in chosen and draw(st.integers(0, 1)) == 0
     return Program(n, dtype, H, W, observable, stop, chosen, start, smooth)
