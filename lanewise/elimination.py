@@ -1,8 +1,10 @@
 """Small dense linear systems, number by number."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from .ir import Builder, Num, Unsupported
+from .memory import Buffer, load, store
 from .values import MADE, Value
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ def eliminate(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> li
     rows = [[*row, x] for row, x in zip(e.entries(matrix), e.entries(vector), strict=True)]
     numbers = [x for row in rows for x in row]
     vec = any(x.vec for x in numbers)
-    found, weak = solved(b, [list(r) for r in rows], exchange=False)
+    found, weak = solved(b, [list(r) for r in rows])
     if weak.known is not None and not weak.known:
         return [e.value(found, eqn.outvars[0].aval)]
     if e.assumed is not None:
@@ -46,18 +48,12 @@ def eliminate(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> li
     return [e.value(chosen, eqn.outvars[0].aval)]
 
 
-def solved(b: Builder, rows: list[list[Num]], exchange: bool) -> tuple[list[Num], Num]:
-    """The solution of the system with rows (A, b), zeros of the structure left out, and whether a
-    pivot was too small; with `exchange` by partial pivoting, where exchanges are selections."""
+def solved(b: Builder, rows: list[list[Num]]) -> tuple[list[Num], Num]:
+    """The solution of the system with rows (A, b), zeros of the structure left out and no rows
+    exchanged, and whether a pivot was too small for that."""
     n, dtype, weak = len(rows), rows[0][0].dtype, b.known(False, "bool")
     limit = b.known(_LARGEST_FACTOR, dtype)
     for c in range(n):
-        for i in range(c + 1, n) if exchange else ():
-            larger = b.compare("gt", b.abs(rows[i][c]), b.abs(rows[c][c]))
-            for j in range(c, n + 1):
-                upper, lower = rows[c][j], rows[i][j]
-                rows[c][j] = b.select(larger, lower, upper)
-                rows[i][j] = b.select(larger, upper, lower)
         one_over = b.div(b.known(1, dtype, structural=True), rows[c][c])
         for i in range(c + 1, n):
             if rows[i][c].is_known_as(0):
@@ -76,6 +72,69 @@ def solved(b: Builder, rows: list[list[Num]], exchange: bool) -> tuple[list[Num]
             total = b.sub(total, b.mul(rows[i][j], x[j]))
         x[i] = b.mul(total, rows[i][i])
     return x, weak
+
+
+def with_exchanges(b: Builder, system: Buffer, solution: Buffer) -> None:
+    """Solve the system with rows (A, b) in memory by partial pivoting, where exchanges are
+    selections; the system is overwritten."""
+    n, one = system.shape[0], b.known(1, "int64")
+    size, width = b.known(n, "int64"), b.known(n + 1, "int64")
+
+    def each(first: Num, last: Num, body: Callable[[Num], None]) -> None:
+        def turn(state, _):
+            body(state[0])
+            return [b.add(state[0], one)]
+
+        b.loop([first], [False], lambda state, _: b.less(state[0], last), turn)
+
+    def at(i: Num, j: Num) -> Buffer:
+        return system.row(b, i).row(b, j)
+
+    def column(c: Num) -> None:
+        after = b.add(c, one)
+
+        def pivot(i: Num) -> None:  # the larger of rows c and i to place c
+            larger = b.compare("gt", b.abs(load(b, at(i, c))), b.abs(load(b, at(c, c))))
+
+            def exchange(j: Num) -> None:
+                upper, lower = load(b, at(c, j)), load(b, at(i, j))
+                store(b, at(c, j), b.select(larger, lower, upper))
+                store(b, at(i, j), b.select(larger, upper, lower))
+
+            each(c, width, exchange)
+
+        each(after, size, pivot)
+        one_over = b.div(b.known(1, system.dtype), load(b, at(c, c)))
+
+        def clear(i: Num) -> None:
+            factor = b.mul(load(b, at(i, c)), one_over)
+
+            def subtract(j: Num) -> None:
+                product = b.mul(factor, load(b, at(c, j)))
+                store(b, at(i, j), b.sub(load(b, at(i, j)), product))
+
+            each(after, width, subtract)
+
+        each(after, size, clear)
+        store(b, at(c, c), one_over)
+
+    def unknown(k: Num) -> None:
+        i = b.sub(b.known(n - 1, "int64"), k)
+
+        def subtract(state, _):
+            j, total = state
+            product = b.mul(load(b, at(i, j)), load(b, solution.row(b, j)))
+            return [b.add(j, one), b.sub(total, product)]
+
+        first, right = b.add(i, one), load(b, at(i, size))
+        _, total = b.loop(
+            [first, right], [False, True], lambda state, _: b.less(state[0], size), subtract
+        )
+        store(b, solution.row(b, i), b.mul(total, load(b, at(i, i))))
+
+    zero = b.known(0, "int64")
+    each(zero, size, column)
+    each(zero, size, unknown)
 
 
 def unit_vectors(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:

@@ -22,6 +22,12 @@ def iota(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Va
     return [e.constant(np.broadcast_to(line.reshape(other), shape))]
 
 
+def empty(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
+    """An array that is written before it is read."""
+    (out,) = eqn.outvars
+    return [e.constant(np.zeros(out.aval.shape, out.aval.dtype))]
+
+
 def argument_of(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
     """argmax, argmin: the first of the largest, or the first NaN."""
     (value,), b = values, e.b

@@ -12,7 +12,7 @@ import numpy as np
 
 from . import elementary
 from .components import Evaluator
-from .elimination import solved
+from .elimination import with_exchanges
 from .ir import TYPES, Builder, Num, Unsupported, literal
 from .jaxapi import ClosedJaxpr
 from .memory import Buffer, contiguous, load, load_row, store, stored_type
@@ -317,10 +317,9 @@ def _exchange_text(n: int, dtype: str, width: int, called: str) -> tuple[str, fr
     """A function that solves the system at a pointer, n rows (A, b), and puts x after it."""
     inner = Module(width, 1)
     b = inner.b
-    place = Buffer(("%p",), dtype, (n * (n + 2),), (width,), 1)
-    rows = [[load(b, place, (i * (n + 1) + j) * width) for j in range(n + 1)] for i in range(n)]
-    for i, x in enumerate(solved(b, rows, exchange=True)[0]):
-        store(b, place, x, (n * (n + 1) + i) * width)
+    system = Buffer(("%p",), dtype, (n, n + 1), ((n + 1) * width, width), 1)
+    solution = Buffer(("%p",), dtype, (n,), (width,), 1, (n * (n + 1) * width,))
+    with_exchanges(b, system, solution)
     lines = "\n".join(b.lines)
     text = f"define internal void {called}(ptr %p) noinline {{\nentry:\n{lines}\n  ret void\n}}\n"
     return text, frozenset(b.declared)

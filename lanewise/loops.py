@@ -9,7 +9,7 @@ import numpy as np
 
 from .assumed import Assumed, NotAssumable, may_assume, taken_value
 from .dependence import fixed_point, reached_outputs
-from .ir import Num, Unsupported
+from .ir import Num
 from .jaxapi import ClosedJaxpr, Jaxpr, scan_counts
 from .memory import Buffer, contiguous, transposed
 from .reuse import carried_over
@@ -324,11 +324,12 @@ def _on_assumptions(
 
 
 def while_loop(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
-    params, b = eqn.params, e.b
+    """`while`; a condition that is an array says of each of its entries whether that entry of the
+    carry, by its leading axes, goes on."""
+    params = eqn.params
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
     of_test, of_body, carry = _cut(values, params["cond_nconsts"], params["body_nconsts"])
-    if test.jaxpr.outvars[0].aval.shape:
-        raise Unsupported("a while loop with an array for a condition")
+    shape = test.jaxpr.outvars[0].aval.shape
     lanes_of_test = [v.has_lanes() for v in of_test]
     lanes_of_body = [v.has_lanes() for v in of_body]
 
@@ -340,42 +341,57 @@ def while_loop(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> l
     on = fixed_point(after, [v.has_lanes() for v in carry])
     (per_lane,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on], AGREED)
     numbers, vec, back = _carried(e, carry, on)
+    parts = math.prod(shape)
+    part = [i * parts // v.size for v in carry for i in range(v.size)]  # of which a number is
 
-    def goes_on(carry: list[Value]) -> Num:
-        (answer,) = e.closed(test, [*of_test, *carry])
-        return e.entries(answer)[()]
+    def goes_on(numbers: Sequence[Num]) -> list[Num]:
+        (answer,) = e.closed(test, [*of_test, *back(numbers)])
+        return list(e.entries(answer).flat)
 
-    def step(carry: list[Value]) -> list[Num]:
-        return [x for v in e.closed(body, [*of_body, *carry])
+    def step(numbers: Sequence[Num]) -> list[Num]:
+        return [x for v in e.closed(body, [*of_body, *back(numbers)])
                 for x in e.entries(v).flat]  # fmt: skip
 
     if per_lane and e.assumed is not None:
-        e.assumed.never(goes_on(back(numbers)))
-        return back([b.unrelated(x) for x in numbers])
+        for going in goes_on(numbers):
+            e.assumed.never(going)
+        return back([e.b.unrelated(x) for x in numbers])
     with e.assuming(None):
-        return back(_while(e, numbers, vec, per_lane, back, goes_on, step))
-
-
-def _while(e: "Evaluator", numbers, vec, per_lane: bool, back, goes_on, step) -> list[Num]:
-    b = e.b
-    if not per_lane:
-        return b.loop(
-            numbers, vec,
-            lambda state, _: b.ref(goes_on(back(state)), 0, False),
-            lambda state, _: step(back(state)),
+        if per_lane or shape:
+            return back(_masked(e, numbers, vec, per_lane, part, goes_on, step))
+        return back(
+            e.b.loop(
+                numbers, vec,
+                lambda state, _: e.b.ref(*goes_on(state), 0, False),
+                lambda state, _: step(state),
+            )
         )  # fmt: skip
 
-    # Every trajectory stops by itself; the block goes on while one of them does.
-    def masked(state, _):
-        active, numbers = state[0], state[1:]
-        news = step(back(numbers))
-        going = b.logic("and", active, goes_on(back(news)))
-        kept = [b.select(active, new, old) for new, old in zip(news, numbers, strict=True)]
-        return [going, *kept]
 
-    first = goes_on(back(numbers))
-    end = b.loop([first, *numbers], [True, *vec], lambda state, _: b.any(state[0]), masked)
-    return end[1:]
+def _masked(e: "Evaluator", numbers, vec, per_lane, part, goes_on, step) -> list[Num]:
+    """A loop of which every trajectory, or every part of the carry, stops by itself; the block goes
+    on while one of them does. `part[i]` is the condition of number i."""
+    b = e.b
+    first = goes_on(numbers)
+    count = len(first)
+
+    def any_goes_on(state, _):
+        one = functools.reduce(lambda x, y: b.logic("or", x, y), state[:count])
+        return b.any(one) if per_lane else b.ref(one, 0, False)
+
+    def masked(state, _):
+        active, numbers = state[:count], state[count:]
+        news = step(numbers)
+        kept = [
+            b.select(active[i], new, old) for i, new, old in zip(part, news, numbers, strict=True)
+        ]
+        # What a trajectory or a part that has stopped would do next decides nothing.
+        of = kept if count > 1 else news
+        going = [b.logic("and", x, y) for x, y in zip(active, goes_on(of), strict=True)]
+        return [*going, *kept]
+
+    end = b.loop([*first, *numbers], [*[per_lane] * count, *vec], any_goes_on, masked)
+    return end[count:]
 
 
 def cond(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:

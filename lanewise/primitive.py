@@ -271,7 +271,7 @@ def kernel_of(
     return module, module.kernel(closed, on)
 
 
-MOST_OPERATIONS = 30_000
+MOST_OPERATIONS = 45_000
 """More operations, loops counted once, are left to XLA."""
 
 

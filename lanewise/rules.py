@@ -1,12 +1,15 @@
 """Where the entries of an array go: primitives of JAX that move numbers and compute nothing."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from .ir import Unsupported
 
-def _broadcast_in_dim(x, *, shape, broadcast_dimensions, **_):
+
+def _broadcast_in_dim(x, *, shape, broadcast_dimensions):
     x = np.transpose(x, np.argsort(broadcast_dimensions))  # they may come in any order
     places = [1] * len(shape)
     for axis, dimension in enumerate(sorted(broadcast_dimensions)):
@@ -14,26 +17,30 @@ def _broadcast_in_dim(x, *, shape, broadcast_dimensions, **_):
     return np.broadcast_to(x.reshape(places), shape)
 
 
-def _slice(x, *, start_indices, limit_indices, strides, **_):
+def _slice(x, *, start_indices, limit_indices, strides):
     strides = strides or (1,) * x.ndim
     return x[tuple(map(slice, start_indices, limit_indices, strides))]
 
 
-def _unstack(x: np.ndarray, *, axis: int, **_: Any) -> tuple[np.ndarray, ...]:
+def _unstack(x: np.ndarray, *, axis: int) -> tuple[np.ndarray, ...]:
     rows = np.moveaxis(x, axis, 0)
     return tuple(rows[i, ...] for i in range(len(rows)))  # "...": an array, of one entry too
 
 
-def _split(x, *, sizes, axis, **_):
+def _split(x, *, sizes, axis):
     return tuple(np.split(x, np.cumsum(sizes)[:-1], axis))
+
+
+def _reshape(x, *, new_sizes, dimensions):
+    return (x if dimensions is None else np.transpose(x, dimensions)).reshape(new_sizes)
 
 
 VIEWS: dict[str, Callable] = {
     "broadcast_in_dim": _broadcast_in_dim,
-    "squeeze": lambda x, *, dimensions, **_: np.squeeze(x, tuple(dimensions)),
-    "expand_dims": lambda x, *, dimensions, **_: np.expand_dims(x, tuple(dimensions)),
-    "transpose": lambda x, *, permutation, **_: np.transpose(x, permutation),
-    "rev": lambda x, *, dimensions, **_: np.flip(x, tuple(dimensions)),
+    "squeeze": lambda x, *, dimensions: np.squeeze(x, tuple(dimensions)),
+    "expand_dims": lambda x, *, dimensions: np.expand_dims(x, tuple(dimensions)),
+    "transpose": lambda x, *, permutation: np.transpose(x, permutation),
+    "rev": lambda x, *, dimensions: np.flip(x, tuple(dimensions)),
     "slice": _slice,
     "split": _split,
     "unstack": _unstack,
@@ -41,7 +48,7 @@ VIEWS: dict[str, Callable] = {
 """One array seen with other axes or strides; an array in memory stays where it is."""
 
 
-def _pad(x, fill, *, padding_config, **_):
+def _pad(x, fill, *, padding_config):
     shape = [
         low + high + max(size + (size - 1) * inner, 0)
         for size, (low, high, inner) in zip(x.shape, padding_config, strict=True)
@@ -62,13 +69,30 @@ def _pad(x, fill, *, padding_config, **_):
 
 MOVES: dict[str, Callable] = {
     **VIEWS,
-    "reshape": lambda x, *, new_sizes, **_: x.reshape(new_sizes),
-    "stack": lambda *xs, axis, **_: np.stack(xs, axis),
-    "tile": lambda x, *, reps, **_: np.tile(x, tuple(reps)),
-    "concatenate": lambda *xs, dimension, **_: np.concatenate(xs, axis=dimension),
+    "reshape": _reshape,
+    "stack": lambda *xs, axis: np.stack(xs, axis),
+    "tile": lambda x, *, reps: np.tile(x, tuple(reps)),
+    "concatenate": lambda *xs, dimension: np.concatenate(xs, axis=dimension),
     "pad": _pad,
 }
 """The same on arrays of entries, and those that make a new array."""
+
+
+def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The outputs of a primitive that moves numbers.
+
+    **Raises** `Unsupported` for a parameter that its rule does not know, which might move them
+    elsewhere.
+    """
+    rule, params = MOVES[name], {k: v for k, v in params.items() if k not in _ABOUT_DEVICES}
+    unknown = params.keys() - inspect.signature(rule).parameters.keys()
+    if unknown:
+        raise Unsupported(f"{name} with {', '.join(sorted(unknown))}")
+    out = rule(*arrays, **params)
+    return out if isinstance(out, tuple) else (out,)
+
+
+_ABOUT_DEVICES = frozenset(["sharding", "out_sharding"])
 
 CALLS = frozenset(
     [

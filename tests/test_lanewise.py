@@ -20,7 +20,7 @@ from jax import export, lax
 
 import dvi_jax as dvi
 import lanewise
-from lanewise import assumed, cache, components, handler, machine, primitive
+from lanewise import assumed, cache, components, handler, machine, primitive, rules
 from lanewise.kernel import Module
 from lanewise.traced import Traced
 
@@ -722,6 +722,23 @@ def small_systems(m):
     )
 
 
+def rounds_of_each_row(m):
+    """While loops under vmap: their condition is an array."""
+
+    def halved(row, most):
+        def proceed(state):
+            return (jnp.abs(state[0]).max() > most) & (state[1] < 9)
+
+        return lax.while_loop(proceed, lambda state: (state[0] / 2, state[1] + 1), (row, 0))
+
+    def inner(row):  # in a loop whose condition is an array too
+        x, n = halved(row, 0.3)
+        return jax.vmap(halved, (None, 0))(x, jnp.array([0.2, 0.01])), n
+
+    bounds = jnp.array([0.1, 0.5, 9.0])
+    return jax.vmap(halved)(m, bounds), jax.vmap(halved, (None, 0))(m[0], bounds), inner(m[1])
+
+
 MATRICES = RNG.normal(size=(9, 3, 3))
 FUNCTIONS = {
     "sine of a literal": (lambda x: lax.sin(0.3) * lax.cos(x) + lax.sin(x) + lax.cos(0.3), VALUES),
@@ -763,6 +780,16 @@ FUNCTIONS = {
         lambda m: (jnp.diff(m), jnp.cumsum(m), jnp.prod(m, 0), m.argmax(), jnp.repeat(m, 2, 0)),
         MATRICES,
     ),
+    "axes in another order": (
+        lambda m: (
+            jax.vmap(jnp.prod, in_axes=1)(m),
+            jax.vmap(jax.grad(jnp.prod), in_axes=1)(m),
+            lax.reshape(m, (9,), dimensions=(1, 0)),
+            jax.jacfwd(jax.vmap(lambda z: jnp.prod(z[0])))(jnp.stack([m[:2], m[1:]])),
+        ),
+        MATRICES,
+    ),
+    "rounds of each row": (rounds_of_each_row, MATRICES),
     "map": (lambda m: lax.map(lambda r: jnp.sin(r).sum(), m), MATRICES),
     "hessian": (lambda m: jax.hessian(lambda y: jnp.sum(jnp.sin(y) * y[0]))(m[0]), MATRICES),
     "bits": (lambda x: lax.bitcast_convert_type(x, jnp.int64), VALUES),
@@ -848,7 +875,7 @@ def test_derivative_of_a_call_inside_of_generated_code(left):
 # --- linear systems ---------------------------------------------------
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 6])
+@pytest.mark.parametrize("n", [1, 2, 3, 6, 20])
 def test_an_exchange_of_rows_on_one_trajectory(left, n):
     """It does not change a bit of the others, and is needed for the right result."""
     rng = np.random.default_rng(n)
@@ -869,6 +896,17 @@ def test_an_exchange_of_rows_on_one_trajectory(left, n):
     A[5] = np.nan
     assert_same(np.asarray(solve(A, b))[others], plain[others])
     assert not left
+
+
+def test_an_unknown_parameter_is_left_to_xla():
+    """Of a primitive that moves numbers: a rule that does not know it might move them wrongly."""
+    of = {"new_sizes": (4,), "dimensions": None, "sharding": None}
+    x = np.arange(4.0).reshape(2, 2)
+    np.testing.assert_array_equal(rules.moved("reshape", of, x)[0], [0, 1, 2, 3])
+    of["dimensions"] = (1, 0)
+    np.testing.assert_array_equal(rules.moved("reshape", of, x)[0], [0, 2, 1, 3])
+    with pytest.raises(lanewise.ir.Unsupported, match="reshape with order"):
+        rules.moved("reshape", {**of, "order": "F"}, x)
 
 
 def operations(function, *args):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilation import AS_FOR_USERS
 from jax import lax
 
 import dvi_jax as dvi
@@ -175,3 +176,42 @@ def test_the_drift_over_one_step_is_zero():
     run = {"h": 0.1, "num_steps": 1, "observe": dvi.MaxDrift(lambda *at: at[4][0] ** 2)}
     one = jax.jit(jax.vmap(lambda q: dvi.integrate(KEPLER, q, jnp.ones(2), **run).observed))
     assert np.all(one(np.random.default_rng(0).uniform(0.5, 1.0, (16, 2))) == 0.0)
+
+
+def test_products_of_the_stages_of_gauss():
+    """`jnp.prod` under `vmap` takes axes in another order: the Jacobian of the stages was wrong,
+    and no step converged."""
+    system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + p[1] * jnp.prod(q))
+
+    def end(layout):
+        sol = dvi.integrate(
+            system, jnp.array([0.5, 0.3]), jnp.array([0.3, -0.4]), h=0.1, num_steps=3,
+            method=dvi.GaussLegendre(2), layout=layout,
+        )  # fmt: skip
+        return sol.qs
+
+    np.testing.assert_allclose(end(dvi.Layout()), end(dvi.Layout(form="arrays")), rtol=1e-13)
+
+
+@pytest.mark.parametrize("observe", ["times", "crossings", "stop"])
+def test_points_inside_of_steps_have_the_same_bits(observe):
+    """XLA computed them, which rounds otherwise in its vectors than in what is left over."""
+    system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q[0] * jnp.arctan(q[1]))
+    axis = dvi.Section(lambda t, q, p, args: q[0] - 0.5, max_crossings=2)
+    seen = {
+        "times": {"save": dvi.Save(ts=np.linspace(0.01, 0.39, 6)),
+                  "observe": lambda t0, t1, q0, p0, q, p, args: jnp.arctan(q[0])},
+        "crossings": {"observe": axis},
+        "stop": {"stop": dvi.Stop(lambda t, q, p, args: jnp.sin(q[0]) - 0.5)},
+    }[observe]  # fmt: skip
+
+    def one(q):
+        p = jnp.array([1.0, 0.3])
+        sol = dvi.integrate(system, q, p, h=0.1, num_steps=4, throw=False, **seen)
+        return sol.qs, sol.observed, sol.stop
+
+    starts = np.random.default_rng(5).uniform(0.3, 0.5, (263, 2))
+    batch = jax.jit(jax.vmap(one), compiler_options=AS_FOR_USERS)
+    found, turned = jax.tree.leaves(batch(starts)), jax.tree.leaves(batch(starts[::-1]))
+    for a, b in zip(found, turned, strict=True):
+        np.testing.assert_array_equal(a, b[::-1])

@@ -9,6 +9,7 @@ import pytest
 from helpers import central_difference
 
 import dvi_jax as dvi
+import lanewise
 from dvi_jax import systems
 
 KEPLER = systems.kepler()
@@ -196,6 +197,25 @@ def gradient(adjoint):
 
 
 @pytest.mark.slow
+def test_steps_that_are_solved_for_have_the_same_bits_in_a_batch():
+    """With a force of p each candidate of (14) needs a solve of its own, each of other length."""
+    system = dvi.System(
+        lambda t0, t1, q, p, args: p @ p / 2 + q @ q / 2,
+        force=lambda t0, t1, q, p, args: -p * (q @ q),
+    )
+
+    def one(q, p):
+        sol = dvi.integrate(system, q, p, epsilon=0.1, h=0.1, num_steps=5, throw=False,
+                            lattice=dvi.Variational())  # fmt: skip
+        return sol.ts, sol.qs, sol.ps
+
+    q, p = np.random.default_rng(1).normal(size=(2, 9, 2))
+    assert "left to XLA" not in str(lanewise.explain(one, q[0], p[0]))
+    batch, single = jax.jit(jax.vmap(one))(q, p), jax.jit(one)(q[4], p[4])
+    for a, b in zip(batch, single, strict=True):
+        np.testing.assert_array_equal(a[4], b)
+
+
 def test_gradient_equals_central_differences():
     value = jax.jit(lambda x: ends(x, dvi.Variational(), dvi.Direct()))
     ones = jax.tree.map(jnp.ones_like, POINT)

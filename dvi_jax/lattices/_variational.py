@@ -172,7 +172,7 @@ class Variational(Lattice):
         """
         last = hs[_CELLS]
         fixed = lax.stop_gradient(hs)
-        values = lax.stop_gradient(jax.vmap(residual)(fixed))
+        values = lax.stop_gradient(lax.map(residual, fixed))
         flat = jnp.all(jnp.abs(values) <= 8 * jnp.finfo(hs.dtype).eps * scale)
 
         # Cell i is [hs[i], hs[i + 1]]; NaN, where (13) has no solution, is no change of sign.

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
+import lanewise
 
 COPIES = 6
 """Perturbed copies of each start, which show how much round-off grows along the trajectory."""
@@ -96,7 +97,11 @@ def check(text: str, gradient: bool = True) -> str:
     expected = case.batch(start, "arrays")
     count = len(case.start["q"])
     compared = _compare(found, expected, count)
-    _same_bits_elsewhere(case, start, found)
+    try:
+        _same_bits_elsewhere(case, start, found)
+    except AssertionError:  # what is too large to be compiled has no equal bits
+        if "left to XLA: a function of" not in str(lanewise.explain(case.one, case.lane(0))):
+            raise
     if gradient and case.smooth:
         compared += _compare_gradient(case)
     return compared
