@@ -114,7 +114,11 @@ def _within(given, start: Start, time: Scalar, reached: Array) -> tuple[Point, A
         theta = (time - start.t0) / (start.t1 - start.t0)
         return curve.point(start, theta), jnp.asarray(True)
     args = curve.equations.args
-    point = curve.where(lambda *at: shown(clock, *at) - time, start, reached)
+
+    def late(t, q, p, args):
+        return shown(clock, t, q, p, args) - time
+
+    point = curve.where(late, start, reached)
     # A clock that jumps, or turns, has passed the value without showing it.
     missed = jnp.abs(shown(clock, *point, args) - time)
     span = jnp.abs(start.until - _shown(given, start))

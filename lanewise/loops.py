@@ -359,13 +359,12 @@ def while_loop(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> l
     with e.assuming(None):
         if per_lane or shape:
             return back(_masked(e, numbers, vec, per_lane, part, goes_on, step))
-        return back(
-            e.b.loop(
-                numbers, vec,
-                lambda state, _: e.b.ref(*goes_on(state), 0, False),
-                lambda state, _: step(state),
-            )
+        end = e.b.loop(
+            numbers, vec,
+            lambda state, _: e.b.ref(goes_on(state)[0], 0, False),
+            lambda state, _: step(state),
         )  # fmt: skip
+        return back(end)
 
 
 def _masked(e: "Evaluator", numbers, vec, per_lane, part, goes_on, step) -> list[Num]:
