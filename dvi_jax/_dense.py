@@ -118,12 +118,12 @@ def _within(given, start: Start, time: Scalar, reached: Array) -> tuple[Point, A
     def late(t, q, p, args):
         return shown(clock, t, q, p, args) - time
 
-    point = curve.where(late, start, reached)
+    t, q, p = curve.where(late, start, reached)
     # A clock that jumps, or turns, has passed the value without showing it.
-    missed = jnp.abs(shown(clock, *point, args) - time)
+    missed = jnp.abs(shown(clock, t, q, p, args) - time)
     span = jnp.abs(start.until - _shown(given, start))
     close = jnp.sqrt(jnp.finfo(start.q0.dtype).eps)
-    return point, missed <= close * (span + jnp.abs(time))
+    return (t, q, p), missed <= close * (span + jnp.abs(time))
 
 
 def _just_after(time: Scalar, start: Start) -> Scalar:
