@@ -21,8 +21,8 @@ def carried_over(before: Sequence[Num], after: Sequence[Num]) -> list[tuple[Num,
     that y is the next round's x."""
     place = {x.serial: i for i, x in enumerate(before)}
     new_place = {x.serial: i for i, x in enumerate(after) if x.known is None and x.op}
-    first = _Forms(place, min(place))
-    second = _Forms(new_place, min(place))
+    names: dict[Any, int] = {}
+    first, second = _Forms(place, min(place), names), _Forms(new_place, min(place), names)
     seen = _all_of(after)
     ends = {}
     for y in seen:
@@ -57,22 +57,29 @@ def _all_of(numbers: Sequence[Num]) -> list[Num]:
 
 
 class _Forms:
-    """How numbers are made from a state, as keys: equal keys are equal numbers of equal states."""
+    """How numbers are made from a state, as keys: equal keys are equal numbers of equal states.
 
-    def __init__(self, place: dict[int, int], inside: int):
+    A key is a short name of an operation and the keys of its operands. Written out, an expression
+    in which one number occurs twice, again and again, is as long as a power of two.
+    """
+
+    def __init__(self, place: dict[int, int], inside: int, names: dict[Any, int]):
         """`place` has the numbers of the state; those from the serial `inside` on belong to the
-        round, and the others are the same in all rounds."""
-        self.place, self.inside = place, inside
-        self.forms: dict[int, Any] = {}
+        round, and the others are the same in all rounds. `names`: keys given so far."""
+        self.place, self.inside, self.names = place, inside, names
+        self.forms: dict[int, int | None] = {}
 
-    def of(self, x: Num) -> Any:
+    def _named(self, *form: Any) -> int:
+        return self.names.setdefault(form, len(self.names))
+
+    def of(self, x: Num) -> int | None:
         """The key, None for a number that does not follow from this state alone."""
         if x.known is not None:
-            return x.key
+            return self._named("known", x.key)
         if x.serial in self.place:
-            return "state", self.place[x.serial]
+            return self._named("state", self.place[x.serial])
         if x.serial < self.inside:
-            return "outside", x.serial
+            return self._named("outside", x.serial)
         if x.write is None and x.op != "same":
             return None
         if x.serial not in self.forms:
@@ -81,5 +88,5 @@ class _Forms:
             if x.op == "same":
                 self.forms[x.serial] = parts[0]
             elif all(part is not None for part in parts):
-                self.forms[x.serial] = (x.op, x.dtype, *parts)
+                self.forms[x.serial] = self._named(x.op, x.dtype, *parts)
         return self.forms[x.serial]

@@ -872,6 +872,23 @@ def test_derivative_of_a_call_inside_of_generated_code(left):
     assert not left, left
 
 
+def test_a_number_that_is_used_twice_again_and_again(left):
+    """Written out, it has 2^40 operands: what one round shares with the next took for ever."""
+
+    def function(x):
+        def step(y, _):
+            z = y
+            for _ in range(40):
+                z = jnp.sqrt(0.25 + 0.5 * z * z)
+            z = lax.cond(lanewise.on_any(z > 9.0), lambda: 0.5 * z, lambda: z)
+            return 0.5 * z, z
+
+        return lax.scan(step, x, None, length=9)
+
+    assert_close(jax.jit(lanewise.batched(function))(VALUES), jax.vmap(function)(VALUES), 1e-12)
+    assert not left
+
+
 # --- linear systems ---------------------------------------------------
 
 
