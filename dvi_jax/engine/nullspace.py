@@ -16,6 +16,51 @@ _NOISE = 1e-14
 RANK = 1e-7
 """Relative size below which a direction counts as dependent on others."""
 
+ROUNDING = 1e-12
+"""Rows are weighted so that their rounding is below this; `NULL` stands above it."""
+
+_RESOLVED = 1e-3
+"""Rounding may be this share of a change that can be told from none."""
+
+_COEFFICIENTS = 1e-15
+"""Errors of the coefficients of a null vector, relative to its length."""
+
+
+class Motion(NamedTuple):
+    """How much functions change in the step of each sample, by their slopes, and by rounding.
+
+    - `changes`: ∂φ_b/∂z_i Δz_i of each function and coordinate z = (q, p, t), shape (S, 2n + 1,
+      size).
+    - `rounding`: the largest rounding error of each function's change, shape (S, size).
+    """
+
+    changes: np.ndarray
+    rounding: np.ndarray
+
+    def of(self, combinations: np.ndarray) -> "Motion":
+        """Of combinations of the functions, columns of shape (size, count)."""
+        return Motion(self.changes @ combinations, self.rounding @ np.abs(combinations))
+
+    def at_most(self, spread: float) -> "Motion":
+        """The same, with no larger changes than the functions differ by between samples: a step
+        that expands goes beyond the range where slopes predict anything."""
+        size = np.sqrt(np.sum(self.changes**2, axis=(1, 2), keepdims=True))
+        return self._replace(changes=self.changes / np.maximum(size / spread, 1))
+
+    def weights(self) -> np.ndarray:
+        """For rows of changes, shape (S,): what functions typically change by becomes 1, where
+        that stands far enough above rounding, so that no sample with a large step decides alone."""
+        typical = np.sqrt(np.sum(self.changes**2, axis=(1, 2)))
+        rounding = np.sqrt(np.sum(self.rounding**2, axis=1))
+        return 1 / np.maximum(np.maximum(typical, rounding / ROUNDING), np.finfo(float).tiny)
+
+    def undecided(self) -> int:
+        """How many combinations change in the steps by hardly more than rounding."""
+        weighted = self.weights()[:, None, None] * self.changes
+        slopes = np.linalg.svd(triangle(weighted.reshape(-1, weighted.shape[2])), compute_uv=False)
+        missing = weighted.shape[2] - len(slopes)
+        return missing + int(np.sum(slopes / np.sqrt(len(weighted)) < ROUNDING / _RESOLVED))
+
 
 class NullSpace(NamedTuple):
     """Null vectors as columns; all singular values relative to the largest; ratio at the cut."""
@@ -53,11 +98,13 @@ def toeplitz(terms: np.ndarray, order: int) -> np.ndarray:
     return blocks.reshape((order + 1) * rows, (order + 1) * size)
 
 
-def null_space(matrix: np.ndarray, tolerance: float | None = None) -> NullSpace:
+def null_space(
+    matrix: np.ndarray, tolerance: float | None = None, unit: float | None = None
+) -> NullSpace:
     """Directions that the matrix takes to zero.
 
     With a tolerance: all singular values at most that share of the largest. Without: those
-    below the widest gap, as long as they are below `NULL`.
+    below the widest gap, as long as they are below `NULL`, in units of `unit` or of the largest.
     """
     if matrix.shape[0] > matrix.shape[1]:
         matrix = triangle(matrix)
@@ -65,7 +112,8 @@ def null_space(matrix: np.ndarray, tolerance: float | None = None) -> NullSpace:
     size = matrix.shape[1]
     if len(singular) == 0 or singular[0] == 0:
         return NullSpace(V.T, np.zeros(size), np.inf)
-    relative = np.append(singular / singular[0], np.zeros(size - len(singular)))
+    unit = singular[0] if unit is None or tolerance is not None else unit
+    relative = np.append(singular / unit, np.zeros(size - len(singular)))
     floor = np.finfo(float).eps
     # ratio[i]: how far the value i stands above the one after it
     ratio = relative / np.maximum(np.append(relative[1:], 0.0), floor)
@@ -130,31 +178,32 @@ class SeriesSpace(NamedTuple):
 
 def series_spaces(
     fitted: np.ndarray,
-    held_out: np.ndarray,
+    terms: np.ndarray,
+    motion: Motion,
     tolerance: float | None = None,
     trivial: np.ndarray | None = None,
 ) -> list[SeriesSpace]:
     """The null spaces of the Toeplitz matrices of order 0, 1, … as series.
 
-    A vector with a small first block is no series unless it is null for the size of that block:
-    first blocks are made orthonormal and judged again, by fitted and held-out conditions. Those of
-    an order have to lie among those of the order before.
+    A vector with a small first block is no series unless it is null for the size of that block,
+    nor one whose first block has small slopes: candidates are judged again by their own slopes, on
+    all samples, see `_judged`. Those of an order have to lie among those of the order before.
 
-    - `fitted`, `held_out`: A_0 … A_z, shapes (rows, z + 1, size). `trivial`: a first block that
-      is no series, shape (size,): that of a constant.
+    - `fitted`: weighted rows of A_0 … A_z, shape (rows, z + 1, size). `terms`: the rows of all
+      samples without weights; `motion`: what the functions change by there, and its rounding.
+    - `trivial`: a first block that is no series, shape (size,): that of a constant.
     """
     size = fitted.shape[2]
     spaces: list[SeriesSpace] = []
     for order in range(fitted.shape[1]):
         matrix = toeplitz(fitted, order)
-        space = null_space(matrix, tolerance)
+        space = null_space(matrix, tolerance, 1.0)
         leading, shifts = _by_first_block(space.columns, size, tolerance)
-        found = leading.shape[1]
-        conditions = np.vstack([matrix, toeplitz(held_out, order)])
-        leading = _judged(leading, conditions, np.linalg.norm(matrix, 2), tolerance)
-        refused = found - leading.shape[1]
         if trivial is not None:
             leading = leading @ _orthogonal_to(trivial @ leading[:size])
+        found = leading.shape[1]
+        leading = _judged(leading, terms, motion, tolerance)
+        refused = found - leading.shape[1]
         if spaces:
             found = leading.shape[1]
             leading = _within(leading, spaces[-1].leading[:size], size)
@@ -170,14 +219,44 @@ def _by_first_block(columns, size, tolerance) -> tuple[np.ndarray, np.ndarray]:
     return leading, columns @ np.delete(V, large, axis=0).T
 
 
-def _judged(leading, conditions, norm, tolerance) -> np.ndarray:
-    """The combinations that all conditions take for null."""
-    if leading.shape[1] == 0 or norm == 0:
+def _judged(leading, terms, motion, tolerance) -> np.ndarray:
+    """The combinations of series that change in a step by no more than rounding, each measured by
+    what its own slopes predict, sample by sample."""
+    count, size = leading.shape[1], terms.shape[2]
+    if count == 0:
         return leading
+    own = motion.of(leading[:size])
+    # The coefficients too are known to some digits only, each to those of the largest one.
+    digits = _COEFFICIENTS * np.linalg.norm(terms, axis=(1, 2))[:, None]
+    own = own._replace(rounding=own.rounding + digits).at_most(1.0)
+    weights = own.weights() / np.sqrt(len(terms))
+    changes = weights[:, None, None] * series_changes(terms, leading)
+    predicted = (weights[:, None, None] * own.changes).reshape(-1, count)
+    _, slopes, V = np.linalg.svd(triangle(predicted))
     limit = HELD_OUT * (NULL if tolerance is None else tolerance)
-    left, V = np.linalg.svd(triangle(conditions @ leading / norm))[1:]
-    left = np.append(left, np.zeros(len(V) - len(left)))
-    return leading @ V[left <= limit].T
+    # Where slopes predict little more than rounding, that is what a change is compared with.
+    by_slopes = V.T / np.maximum(slopes, HELD_OUT * ROUNDING / limit)
+    left, U = np.linalg.svd(triangle(changes.reshape(-1, count) @ by_slopes))[1:]
+    left = np.append(left, np.zeros(count - len(left)))
+    kept = leading @ by_slopes @ U[left <= limit].T
+    return kept @ np.linalg.inv(triangle(kept[:size])) if kept.size else kept
+
+
+def relative_changes(terms, series: np.ndarray, motion: Motion, spread: float) -> np.ndarray:
+    """What one series changes by at each order, by the measure of `_judged`: shape (S, z + 1).
+
+    `terms`: (S, z + 1, size); `series`: (z + 1, size); `spread`: of its leading part.
+    """
+    own = motion.of(series[:1].T).at_most(spread)
+    return own.weights()[:, None] * np.abs(series_changes(terms, series.reshape(-1, 1))[..., 0])
+
+
+def series_changes(terms: np.ndarray, series: np.ndarray) -> np.ndarray:
+    """Σ_{m≤k} A_{k−m} c_m for k = 0 … z, of series as columns: shape (S, z + 1, count)."""
+    size = terms.shape[2]
+    blocks = series.reshape(-1, size, series.shape[1])
+    sums = [sum(terms[:, k - m] @ blocks[m] for m in range(k + 1)) for k in range(len(blocks))]
+    return np.stack(sums, axis=1)
 
 
 def _within(leading, before, size) -> np.ndarray:

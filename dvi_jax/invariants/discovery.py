@@ -1,7 +1,7 @@
 """Adiabatic invariants found as a null space on the map that is actually iterated."""
 
 import operator
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,9 +18,13 @@ from .._types import Args, Interval
 from ..engine.newton import Newton, RootSolver
 from ..engine.nullspace import (
     RANK,
+    ROUNDING,
+    Motion,
     compress,
     epsilon_scale,
     in_units_of,
+    null_space,
+    relative_changes,
     series_spaces,
     triangle as triangle_of,
 )
@@ -52,6 +56,15 @@ _EXACT_STEPS = 100
 
 _LATER = (1.0, 2.7)
 """Shifts of time at which a map that does not depend on it is the same."""
+
+_CLEARLY = 1e-9
+"""Changes of an invariant, by the measure of `Motion`, for nearly all samples."""
+
+_SAME = 1e-3
+"""Two functions whose difference is this share of them are one, with and without errors."""
+
+_LARGER = (1.0, 2.0, 4.0, 8.0)
+"""Sizes of the samples, about their middle, on which an exact invariant is kept alike."""
 
 _ROUND_OFF = 1e-13
 """Shares below this of the largest are not there."""
@@ -134,7 +147,7 @@ def discover_invariants(
     q, p, t = (jnp.asarray(x[0]) for x in samples)
     system.check_shapes(t, q, p, jnp.zeros(()), args)
     equations = Equations(system, jnp.zeros(()), args, newton)
-    values, changes, volume = _checked_changes(equations, h, method, bound, order, samples)
+    values, changes, volume, motion = _checked_changes(equations, h, method, bound, order, samples)
     held, fit = samples.held_out, ~samples.held_out
     condition = check_basis(bound, values[fit])
     rms = np.sqrt(np.mean(values[fit] ** 2, axis=0))
@@ -142,12 +155,15 @@ def discover_invariants(
     R = triangle_of(values[fit] / rms) / np.sqrt(np.sum(fit))
     scaled = np.linalg.solve(R.T, (changes / rms).reshape(-1, bound.size).T).T
     scaled = scaled.reshape(changes.shape)
-    scale = epsilon_scale(scaled[fit])
+    orthonormal = motion.of(np.linalg.inv(R) / rms[:, None])
+    weights = orthonormal.weights()[:, None, None]
+    scale = epsilon_scale(weights[fit] * scaled[fit])
     scaled = in_units_of(scale, scaled)
     constant = _shares_of_constant(bound, rms, values[fit], _some(samples))
     spaces = series_spaces(
-        compress(scaled[fit]),
-        compress(scaled[held]),
+        compress(weights[fit] * scaled[fit]),
+        scaled,
+        orthonormal,
         tolerance,
         None if constant is None else R @ constant,
     )
@@ -161,7 +177,11 @@ def discover_invariants(
     def chosen(series):
         """Coefficients of the user's functions, and whether the series is exact."""
         if order == 0:
-            return _cleaned(series) / sizes, False
+            given = _cleaned(series)[0]
+            if tolerance is None:
+                rows = changes[fit, 0], Motion(*(x[fit] for x in motion)), values[fit]
+                given = _in_fewest(given, rms, np.array(bound.complexity), *rows)
+            return given[None] / sizes, False
         simplest = _cleaned(span.simplest(series)) / sizes
         given, typical_, scale_ = (jnp.asarray(x) for x in (simplest, typical, scale))
         here = _some(samples)
@@ -179,7 +199,21 @@ def discover_invariants(
         return np.array(series).reshape(len(series), order + 1, bound.size), exact
 
     (coefficients, exact), (dependent, _) = those(True), those(False)
-    judge = values[held], in_units_of(scale, changes[held]) / typical
+    judge = _Judge(values, in_units_of(scale, changes), motion, held, scale)
+    refused = spaces[-1].refused
+    if tolerance is None:  # with the digits that the coefficients have in the end
+        kept, others = (
+            np.all(judge.quantiles(c, 0.95) <= _CLEARLY, axis=1) for c in (coefficients, dependent)
+        )
+        refused += int(np.sum(~kept) + np.sum(~others))
+        coefficients, dependent = coefficients[kept], dependent[others]
+        exact = tuple(e for e, k in zip(exact, kept, strict=True) if k)
+    known = len(coefficients) + len(dependent) + (constant is not None)
+    impossible = len(coefficients) == 2 * samples.q[0].size and not bound.uses_time
+    impossible = impossible and not system.slow_time and bool(np.any(motion.changes))
+    if impossible:
+        refused, exact = refused + len(coefficients) + len(dependent), ()
+        coefficients, dependent = coefficients[:0], dependent[:0]
     return Discovery(
         coefficients=jnp.asarray(coefficients),
         dependent=jnp.asarray(dependent),
@@ -188,16 +222,23 @@ def discover_invariants(
         survivors=tuple(space.leading.shape[1] for space in spaces),
         singular_values=spaces[-1].singular_values,
         gap=spaces[-1].gap,
-        refused=spaces[-1].refused,
-        residuals=_residuals(coefficients, scale, *judge),
-        dependent_residuals=_residuals(dependent, scale, *judge),
+        refused=refused,
+        residuals=judge.quantiles(coefficients, 1.0),
+        typical_residuals=np.stack([judge.quantiles(coefficients, x) for x in (0.5, 0.95)], -1),
+        dependent_residuals=judge.quantiles(dependent, 1.0),
+        undecided=max(orthonormal.undecided() - known, 0),
+        impossible=impossible,
+        powers=_powers_of_size(equations, h, method, bound, coefficients, samples)
+        if order == 0 and tolerance is None
+        else np.full(len(coefficients), np.nan),
         reach=_reach(coefficients, values[fit]),
         obstructions=drift_laws(
             bound,
             rms,
             R,
-            scaled[fit],
+            weights[fit] * scaled[fit],
             values[fit],
+            weights[fit, :, 0],
             spaces,
             np.max(np.abs(in_units_of(scale, volume)), axis=0),
             scale,
@@ -237,7 +278,7 @@ def _check_options(order: Any, tolerance: Any, representative: Any, method: Any)
 
 def _checked_changes(equations, h, method, basis, order, samples):
     """φ, A_0 … A_z and the changes of log phase volume, after refusing what is not finite."""
-    values, changes, volume, good = map(
+    values, changes, volume, good, slopes, move, blur = map(
         np.asarray, _at_points(equations, h, method, basis, order, samples)
     )
     require_steps(good, samples)
@@ -268,7 +309,14 @@ def _checked_changes(equations, h, method, basis, order, samples):
                     "the map depends on the time, and all samples are of one time: give "
                     "samples=(qs, ps, ts)."
                 )
-    return values, changes, volume
+    return values, changes, volume, _motion(values, changes, slopes, move, blur)
+
+
+def _motion(values, changes, slopes, move, blur) -> Motion:
+    """`move`: z1 − z; `blur`: what z1 and z − z1 are rounded by, in units of the last digit."""
+    rounding = np.abs(values) + np.abs(values + changes[:, 0])
+    rounding = rounding + np.einsum("sbi,si->sb", np.abs(slopes), blur)
+    return Motion((slopes * move[:, None]).swapaxes(1, 2), np.finfo(float).eps * rounding)
 
 
 def _may_depend_on_time(equations, samples) -> bool:
@@ -325,7 +373,22 @@ def _at_points(equations, h, method, basis, order: int, samples):
             volumes = jnp.zeros(1)
         else:
             volumes = taylor_coefficients(volume, zero, order)
-        return basis(q, p, t), terms, volumes, change(zero)[1]
+
+        def flat(z):
+            half = z[: q.size].reshape(q.shape), z[q.size : -1].reshape(p.shape), z[-1]
+            q1, p1, t1, _ = _map(equations, h, method, zero)(*half)
+            return jnp.concatenate([q1.ravel(), p1.ravel(), t1[None]])
+
+        def functions(z):
+            return basis(z[: q.size].reshape(q.shape), z[q.size : -1].reshape(p.shape), z[-1])
+
+        z = jnp.concatenate([q.ravel(), p.ravel(), jnp.asarray(t)[None]])
+        # Rounding of z moves z1 − z by as much as the derivative along some vector of its size.
+        signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], z.size))
+        z1, dz1 = jax.jvp(flat, (z,), (signs * jnp.abs(z),))
+        blur = jnp.abs(z1) + jnp.abs(dz1 - signs * jnp.abs(z))
+        slopes = jax.jacfwd(functions)(z)
+        return basis(q, p, t), terms, volumes, change(zero)[1], slopes, z1 - z, blur
 
     return jax.vmap(at_point)(*samples)
 
@@ -362,7 +425,8 @@ def _shares_of_constant(basis, rms, values, samples) -> np.ndarray | None:
     """The combination that is 1 everywhere (and not only on these samples), if there is one."""
     shares = np.linalg.lstsq(values / rms, np.ones(len(values)), rcond=None)[0]
     shares = np.where(np.abs(shares) > 1e-9 * np.max(np.abs(shares)), shares, 0.0)
-    if np.max(np.abs(values / rms @ shares - 1)) > 1e-8:
+    terms = np.abs(values / rms) @ np.abs(shares)
+    if np.max(np.abs(values / rms @ shares - 1) / terms) > 1e4 * np.finfo(float).eps:
         return None
     slopes = np.asarray(differentials(basis, *samples)) / rms[:, None]
     terms = np.abs(slopes) * np.abs(shares)[:, None]
@@ -386,18 +450,81 @@ def _normalised(series: np.ndarray, rms: np.ndarray) -> np.ndarray:
     return series / (2 * series[0, np.argmax(np.abs(series[0] * rms))])
 
 
-def _residuals(coefficients, scale, values, changes) -> np.ndarray:
-    """Shape (count, z + 1); `changes` in units of `scale`, relative to what is typical."""
-    out = np.zeros(coefficients.shape[:2])
-    for i, c in enumerate(coefficients):
-        leading = values @ c[0]
-        spread = np.std(leading)
-        size = np.sqrt(np.mean(leading**2))
-        spread = spread if spread > 1e-6 * size else size
-        for k in range(c.shape[0]):
-            total = sum(changes[:, k - m] @ (c[m] / scale**m) for m in range(k + 1))
-            out[i, k] = np.max(np.abs(total)) / spread
-    return out
+def _in_fewest(shares, rms, complexity, changes, motion, values) -> np.ndarray:
+    """The invariant again, to more digits, in the functions up to the lowest complexity that hold
+    it: of functions that it does not need the coefficients are errors only."""
+    target = values @ (shares / rms)
+    for level in sorted(set(complexity)):
+        some = complexity <= level
+        R = triangle_of(values[:, some] / rms[some]) / np.sqrt(len(values))
+        if len(R) < np.sum(some) or np.linalg.cond(R) > 1 / RANK**2:
+            continue
+        orthonormal = np.linalg.inv(R) / rms[some][:, None]
+        own = Motion(motion.changes[..., some], motion.rounding[:, some]).of(orthonormal)
+        rows = own.weights()[:, None] * (changes[:, some] @ orthonormal) / np.sqrt(len(values))
+        null = null_space(rows, unit=1.0).columns
+        functions = values[:, some] @ orthonormal @ null
+        found = np.linalg.lstsq(functions, target)[0]
+        if np.linalg.norm(functions @ found - target) <= _SAME * np.linalg.norm(target):
+            again = np.zeros(len(shares))
+            again[some] = (orthonormal @ null @ found) * rms[some]
+            return _cleaned(again)
+    return shares
+
+
+def _powers_of_size(equations, h, method, basis, coefficients, samples) -> np.ndarray:
+    """The power of the samples' size by which changes grow, shape (count,): 0 for an invariant that
+    is kept on samples several times as large, which an expansion about their middle is not; NaN
+    where no map or function is defined there."""
+    changes = []
+    for factor in _LARGER:
+        middle = [np.mean(x, axis=0) for x in samples[:2]]
+        larger = [m + factor * (x - m) for m, x in zip(middle, samples[:2], strict=True)]
+        at = samples._replace(q=larger[0], p=larger[1])
+        found = map(np.asarray, _at_points(equations, h, method, basis, 0, at))
+        values, moved, _, good, slopes, move, blur = found
+        finite = [np.isfinite(x.reshape(len(good), -1)).all(axis=1)
+                  for x in (values, moved, slopes, move, blur)]  # fmt: skip
+        good = good & np.all(finite, axis=0)
+        if len(coefficients) == 0 or np.mean(good) < 0.5:
+            break
+        motion = _motion(values[good], moved[good], slopes[good], move[good], blur[good])
+        judge = _Judge(values[good], moved[good], motion, np.full(np.sum(good), True), 1.0)
+        changes.append(judge.quantiles(coefficients, 0.95)[:, 0])
+    if len(changes) < 2:
+        return np.full(len(coefficients), np.nan)
+    powers = np.zeros(len(coefficients))
+    for i, row in enumerate(np.stack(changes, axis=1)):
+        above = np.flatnonzero(row > 10 * _CLEARLY)
+        if len(above):
+            k = max(above[0], 1)
+            powers[i] = np.log(row[k] / max(row[k - 1], ROUNDING)) / np.log(
+                _LARGER[k] / _LARGER[k - 1]
+            )
+    return powers
+
+
+class _Judge(NamedTuple):
+    """The held-out samples: values, changes in units of ε · scale, and what slopes predict."""
+
+    values: np.ndarray
+    changes: np.ndarray
+    motion: Motion
+    held: np.ndarray
+    scale: float
+
+    def quantiles(self, coefficients: np.ndarray, share: float) -> np.ndarray:
+        """The change that the given share of the samples stays below, shape (count, z + 1)."""
+        out = np.zeros(coefficients.shape[:2])
+        motion = Motion(*(x[self.held] for x in self.motion))
+        for i, c in enumerate(coefficients):
+            leading = self.values[self.held] @ c[0]
+            size = np.sqrt(np.mean(leading**2))
+            spread = float(max(np.std(leading), 1e-6 * size, np.finfo(float).tiny))
+            series = c / self.scale ** np.arange(len(c))[:, None]
+            changes = relative_changes(self.changes[self.held], series, motion, spread)
+            out[i] = np.quantile(changes, share, axis=0)
+        return out
 
 
 def _reach(coefficients, values) -> np.ndarray:

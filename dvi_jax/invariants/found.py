@@ -40,8 +40,17 @@ class Discovery(eqx.Module):
       ratio at which they were cut (large is clear, below 1e3 is not). `refused`: null vectors of
       the fitted samples that held-out samples, or a lower order, refuse.
     - `residuals`: shape (count, order + 1), on held-out points: the largest change over one
-      step at each order in ε · `scale`, relative to the spread of the leading part and to what
-      functions of the basis change by in a step. `dependent_residuals` likewise.
+      step at each order in ε · `scale`, relative to what the slopes of the leading part predict,
+      |∇I|·|Δz|, or to its spread over the samples where that is less. `typical_residuals`: what
+      half of the points, and 95 % of them, stay below, shape (count, order + 1, 2).
+      `dependent_residuals`: as `residuals`.
+    - `undecided`: how many combinations of the functions change in the steps by less than 1000
+      times their rounding, so that it cannot be decided whether they are kept. `impossible`:
+      whether as many independent invariants were found as there are coordinates, though the map
+      moves; none is then reported.
+    - `powers`: shape (count,), at order 0: the power of the size of the samples by which the
+      changes in a step grow. 0 is an exact invariant; an expansion about the middle of the
+      samples, cut off, has another power. NaN where it was not tried.
     - `reach`: shape (count,): the ε at which corrections are as large as the leading part; the
       series is of use far below it. Infinite without corrections.
     - `obstructions`: a `DriftLaw` for each leading part that is lost at order 1, 2, …
@@ -63,7 +72,11 @@ class Discovery(eqx.Module):
     gap: float = eqx.field(static=True)
     refused: int = eqx.field(static=True)
     residuals: np.ndarray
+    typical_residuals: np.ndarray
     dependent_residuals: np.ndarray
+    undecided: int = eqx.field(static=True)
+    impossible: bool = eqx.field(static=True)
+    powers: np.ndarray
     reach: np.ndarray
     obstructions: tuple[DriftLaw, ...]
     basis: BoundBasis
@@ -117,6 +130,8 @@ class Discovery(eqx.Module):
             "survivors": self.survivors,
             "gap": self.gap,
             "refused": self.refused,
+            "undecided": self.undecided,
+            "impossible": self.impossible,
             "condition": self.condition,
             "scale": self.scale,
             "shape": self.shape,
@@ -166,6 +181,8 @@ class Discovery(eqx.Module):
             survivors=tuple(about["survivors"]),
             gap=about["gap"],
             refused=about["refused"],
+            undecided=about["undecided"],
+            impossible=about["impossible"],
             condition=about["condition"],
             scale=about["scale"],
             obstructions=laws,
@@ -187,8 +204,20 @@ class Discovery(eqx.Module):
         ]
         if self.tolerance is not None:
             lines.append(f"  singular values up to {self.tolerance:g} of the largest count as zero")
-        elif self.survivors[0] and self.gap < _CLEAR:
+        if self.survivors[0] and self.gap < _CLEAR:
             lines.append("  the gap is not clear: let drift_order on a long run decide")
+        if self.impossible:
+            lines.append(
+                "  as many independent invariants as coordinates were found, which is impossible "
+                "for a map that moves: none is reported; take a smaller tolerance, or samples "
+                "where functions change clearly in a step"
+            )
+        if self.undecided > 0:
+            lines.append(
+                f"  {self.undecided} combinations of the functions change in a step by less than "
+                "1000 times their rounding: whether they are kept cannot be decided in this "
+                "arithmetic; take a larger h, samples that spread wider, or an origin among them"
+            )
         if self.refused:
             lines.append(
                 f"  {self.refused} null vectors of the fitted samples refused: held-out samples or "
@@ -199,14 +228,24 @@ class Discovery(eqx.Module):
                 f"  the basis is ill-conditioned on the samples ({self.condition:.0e}): formulas "
                 "are not reliable; shift and scale the coordinates"
             )
-        for series, residual, exact, reach in zip(
-            self.invariants, self.residuals, self.exact, self.reach, strict=True
-        ):
+        for series, residual, typical, exact, reach, power in zip(
+            self.invariants, self.residuals, self.typical_residuals, self.exact, self.reach,
+            self.powers, strict=True,
+        ):  # fmt: skip
             lines.append(f"  I = {series.formula(_SHOWN, drop)}")
             told = ", exact at every ε tried" if exact else ""
             if np.isfinite(reach) and not exact:
                 told = f"; corrections are as large as the leading part at ε = {reach:.2g}"
-            lines.append(f"      held-out residual {np.max(residual):.1e}{told}")
+            half, most = np.max(typical, axis=0)
+            lines.append(
+                f"      changes in a step on held-out samples: median {half:.1e}, 95 % below "
+                f"{most:.1e}, largest {np.max(residual):.1e} of what its slopes predict{told}"
+            )
+            if power > 0:
+                lines.append(
+                    f"      not exact: with the size of the samples changes grow as its power "
+                    f"{power:.2g}, as those of an expansion about their middle do"
+                )
         if len(self.dependent):
             lines.append(f"  functions of them, as differentials say: {len(self.dependent)}")
             for series in self.dependent_invariants[:3]:
@@ -238,7 +277,9 @@ _ARRAYS = (
     "leading_parts",
     "singular_values",
     "residuals",
+    "typical_residuals",
     "dependent_residuals",
+    "powers",
     "reach",
     "sizes",
 )

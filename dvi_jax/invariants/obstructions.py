@@ -64,6 +64,7 @@ def drift_laws(
     R: np.ndarray,
     terms: np.ndarray,
     values: np.ndarray,
+    weights: np.ndarray,
     spaces: Sequence[SeriesSpace],
     volume: np.ndarray,
     scale: float,
@@ -76,8 +77,9 @@ def drift_laws(
     Σ_k A_{m−k} c_k + A_0 c_m = 0, has no solution c_m; with a function of what order 0 keeps on
     the right it may: = φ·K d, K the null space of A_0. That is the averaged law.
 
-    `terms`: A in the orthonormal basis, shape (rows, z + 1, size); `values`: φ there, shape (rows,
-    size); `rms`: their sizes; `R`: see `Span`; `spaces`: of order 0, 1, …; `volume`: per order,
+    `terms`: A in the orthonormal basis, shape (rows, z + 1, size), times the `weights` of rows,
+    shape (rows, 1); `values`: φ there, shape (rows, size);
+    `rms`: their sizes; `R`: see `Span`; `spaces`: of order 0, 1, …; `volume`: per order,
     how much phase volume changes; `scale`: the unit of ε, in which all this is; `slow_time`: of
     the system.
     """
@@ -86,7 +88,7 @@ def drift_laws(
     laws = []
     orthonormal = np.linalg.solve(R.T, (values / rms).T).T
     kept = spaces[0].leading
-    system = np.concatenate([-terms[:, 0], orthonormal @ kept], axis=1)
+    system = np.concatenate([-terms[:, 0], weights * orthonormal @ kept], axis=1)
     size, allowed = basis.size, max(EXPLAINED, blur)
     for m in range(1, len(spaces)):
         before = np.concatenate([spaces[m - 1].leading, spaces[m - 1].shifts], axis=1)

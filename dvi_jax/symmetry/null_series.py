@@ -41,7 +41,7 @@ class Search:
         fit, n = ~self.held, raw.slopes.shape[3] // 2
         q, p = spread(samples.q), spread(samples.p)
         rows = h / np.repeat([q, p], n)
-        t = _inverse(np.sqrt(np.mean((raw.clock[fit, 0] * rows) ** 2)))
+        t = _inverse(np.median(np.sqrt(np.mean((raw.clock[fit, 0] * rows) ** 2, axis=1))))
         used = slice(0 if time else 1, None)
         self.units = np.repeat([t, q, p], [1, n, n])[used]
         self.size = len(self.units) * basis.size  # unknowns of each order
@@ -52,13 +52,19 @@ class Search:
 
         determining = raw.determining[..., used, :] * rows[:, None, None]
         identity = raw.identity[..., used, :] * actions[:, None, None]
+        gauge = raw.gauge * actions[:, None]
+        # Every sample counts alike, however strong its kick.
+        determining = determining / self._size(determining).reshape(-1, 1, 1, 1, 1, 1)
+        of_identity = np.hypot(self._size(identity), np.linalg.norm(gauge[:, 0], axis=(1, 2)))
+        identity = identity / of_identity.reshape(-1, 1, 1, 1, 1, 1)
+        gauge = gauge / of_identity.reshape(-1, 1, 1, 1)
         # ε in the unit in which the disturbance is as large as the rest
         sums = rows_of(self._orthonormal(determining.sum(axis=2))[fit])
         self.scale = epsilon_scale(sums)
         determining, identity = (in_units_of(self.scale, x) for x in (determining, identity))
         self.determining, self.identity = determining.sum(axis=2), identity.sum(axis=2)
         self.parts = determining[:, 0], identity[:, 0]  # of each point, at ε = 0
-        self.gauge = in_units_of(self.scale, raw.gauge * actions[:, None])
+        self.gauge = in_units_of(self.scale, gauge)
         of_fit = rows_of(self.gauge[fit, 0])
         self.R_gauge = triangle(of_fit) / np.sqrt(len(of_fit))
         self.complexity = np.tile(basis.complexity, len(self.units))
@@ -95,6 +101,12 @@ class Search:
             basis=self.basis,
             gauge_basis=self.gauge_basis,
         )
+
+    def _size(self, terms: np.ndarray) -> np.ndarray:
+        """How large the terms of each sample are at ε = 0, of both points apart; 1 for none."""
+        parts = [self._orthonormal(terms[:, :1, j]) for j in range(2)]
+        size = np.sqrt(sum(np.sum(x**2, axis=(1, 2, 3)) for x in parts))
+        return np.where(size > 0, size, 1.0)
 
     def _orthonormal(self, terms: np.ndarray) -> np.ndarray:
         """Terms (S, z + 1, rows, C, B) for unknown shares, (S, rows, z + 1, unknowns)."""

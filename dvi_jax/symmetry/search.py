@@ -160,7 +160,9 @@ class _Chosen(eqx.Module):
 
 def _independent_gauges(basis: BoundBasis, raw: Conditions, samples: Samples):
     """The gauge functions without constants and those that depend on simpler ones."""
-    columns = triangle(rows_of(raw.gauge[~samples.held_out, 0]))
+    rows = raw.gauge[~samples.held_out, 0]
+    length = np.linalg.norm(rows, axis=(1, 2), keepdims=True)
+    columns = triangle(rows_of(rows / np.where(length > 0, length, 1)))
     size = np.linalg.norm(columns, axis=0)
     taken: list[int] = []
     done = np.zeros((len(columns), 0))
