@@ -36,9 +36,11 @@ class Discovery(eqx.Module):
       order-0 parts of *all* invariants in the span.
     - `survivors`: for m = 0 … order, how many leading parts have an invariant of order m
       (a constant is none).
-    - `singular_values`: of the whole system, descending, relative to the largest; `gap`: the
-      ratio at which they were cut (large is clear, below 1e3 is not). `refused`: null vectors of
-      the fitted samples that held-out samples, or a lower order, refuse.
+    - `singular_values`: of the whole system, descending, relative to the changes that the slopes
+      of the functions predict (with a tolerance, to the largest value); `gap`: the ratio at which
+      they were cut (large is clear, below 1e3 is not). `refused`: null vectors of the fitted
+      samples that change by more than rounding by their own measure, or that a lower order
+      refuses.
     - `residuals`: shape (count, order + 1), on held-out points: the largest change over one
       step at each order in ε · `scale`, relative to what the slopes of the leading part predict,
       |∇I|·|Δz|, or to its spread over the samples where that is less. `typical_residuals`: what
@@ -220,8 +222,9 @@ class Discovery(eqx.Module):
             )
         if self.refused:
             lines.append(
-                f"  {self.refused} null vectors of the fitted samples refused: held-out samples or "
-                "a lower order decide (chaos, too few samples, or too large a tolerance)"
+                f"  {self.refused} null vectors of the fitted samples refused: by their own slopes "
+                "they change by more than rounding, or a lower order decides (chaos, too few "
+                "samples, or too large a tolerance)"
             )
         if self.condition > _ILL:
             lines.append(
