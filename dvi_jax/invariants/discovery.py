@@ -174,13 +174,15 @@ def discover_invariants(
     typical = typical if typical > 0 else 1.0
     sizes = rms / scale ** np.arange(order + 1)[:, None]
 
+    of_fit = changes[fit, 0], Motion(*(x[fit] for x in motion)), values[fit]
+    fewest = _Fewest(bound.complexity, rms, *of_fit)
+
     def chosen(series):
         """Coefficients of the user's functions, and whether the series is exact."""
         if order == 0:
             given = _cleaned(series)[0]
             if tolerance is None:
-                rows = changes[fit, 0], Motion(*(x[fit] for x in motion)), values[fit]
-                given = _in_fewest(given, rms, np.array(bound.complexity), *rows)
+                given = fewest.again(given)
             return given[None] / sizes, False
         simplest = _cleaned(span.simplest(series)) / sizes
         given, typical_, scale_ = (jnp.asarray(x) for x in (simplest, typical, scale))
@@ -450,26 +452,45 @@ def _normalised(series: np.ndarray, rms: np.ndarray) -> np.ndarray:
     return series / (2 * series[0, np.argmax(np.abs(series[0] * rms))])
 
 
-def _in_fewest(shares, rms, complexity, changes, motion, values) -> np.ndarray:
-    """The invariant again, to more digits, in the functions up to the lowest complexity that hold
-    it: of functions that it does not need the coefficients are errors only."""
-    target = values @ (shares / rms)
-    for level in sorted(set(complexity)):
-        some = complexity <= level
-        R = triangle_of(values[:, some] / rms[some]) / np.sqrt(len(values))
+class _Fewest:
+    """Invariants of order 0 solved for again, to more digits, in the functions up to the lowest
+    complexity that hold them: of functions that one does not need the coefficients are errors only.
+    """
+
+    def __init__(self, complexity, rms, changes, motion, values):
+        self.complexity, self.rms = np.array(complexity), rms
+        self.changes, self.motion, self.values = changes, motion, values
+        self.kept: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
+
+    def up_to(self, level: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """What is kept by the functions up to a complexity: columns of coefficients, and values."""
+        some = self.complexity <= level
+        R = triangle_of(self.values[:, some] / self.rms[some]) / np.sqrt(len(self.values))
         if len(R) < np.sum(some) or np.linalg.cond(R) > 1 / RANK**2:
-            continue
-        orthonormal = np.linalg.inv(R) / rms[some][:, None]
-        own = Motion(motion.changes[..., some], motion.rounding[:, some]).of(orthonormal)
-        rows = own.weights()[:, None] * (changes[:, some] @ orthonormal) / np.sqrt(len(values))
-        null = null_space(rows, unit=1.0).columns
-        functions = values[:, some] @ orthonormal @ null
-        found = np.linalg.lstsq(functions, target)[0]
-        if np.linalg.norm(functions @ found - target) <= _SAME * np.linalg.norm(target):
-            again = np.zeros(len(shares))
-            again[some] = (orthonormal @ null @ found) * rms[some]
-            return _cleaned(again)
-    return shares
+            return None
+        orthonormal = np.linalg.inv(R) / self.rms[some][:, None]
+        motion = Motion(self.motion.changes[..., some], self.motion.rounding[:, some])
+        rows = self.changes[:, some] @ orthonormal
+        rows = motion.of(orthonormal).weights()[:, None] * rows / np.sqrt(len(rows))
+        columns = orthonormal @ null_space(rows, unit=1.0).columns
+        return columns, self.values[:, some] @ columns
+
+    def again(self, shares: np.ndarray) -> np.ndarray:
+        """The shares of an invariant, in as few functions as can be."""
+        target = self.values @ (shares / self.rms)
+        for level in sorted(set(self.complexity)):
+            if level not in self.kept:
+                self.kept[level] = self.up_to(level)
+            kept = self.kept[level]
+            if kept is None or kept[0].shape[1] == 0:
+                continue
+            found = np.linalg.lstsq(kept[1], target)[0]
+            if np.linalg.norm(kept[1] @ found - target) <= _SAME * np.linalg.norm(target):
+                out = np.zeros(len(shares))
+                some = self.complexity <= level
+                out[some] = (kept[0] @ found) * self.rms[some]
+                return _cleaned(out)
+        return shares
 
 
 def _powers_of_size(equations, h, method, basis, coefficients, samples) -> np.ndarray:

@@ -222,9 +222,9 @@ class Discovery(eqx.Module):
             )
         if self.refused:
             lines.append(
-                f"  {self.refused} null vectors of the fitted samples refused: by their own slopes "
-                "they change by more than rounding, or a lower order decides (chaos, too few "
-                "samples, or too large a tolerance)"
+                f"  {self.refused} null vectors of the fitted samples refused: held-out samples, "
+                "their own slopes or a lower order decide (chaos, too few samples, or too large a "
+                "tolerance)"
             )
         if self.condition > _ILL:
             lines.append(

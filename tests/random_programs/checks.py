@@ -67,21 +67,16 @@ class Case:
         }
 
     def copies(self, count: int) -> dict[str, Any]:
-        """The starts, and after them `count` copies whose states are moved by some ulp."""
-        start = dict(self.start)
-        for name, x in self.start.items():
-            if self.axes[name] is None:
-                continue
-            if name in ("q", "p"):
-                eps = np.finfo(x.dtype).eps
-                moved = [
-                    (x * (1 + 4 * eps * self.rng.uniform(-1, 1, x.shape))).astype(x.dtype)
-                    for _ in range(count)
-                ]
-                start[name] = np.concatenate([x, *moved])
-            else:
-                start[name] = jax.tree.map(lambda y: np.concatenate([y] * (count + 1)), x)
-        return start
+        """The starts, and after them `count` copies, all of whose numbers are moved by some ulp."""
+
+        def moved(x):
+            parts = 4 * np.finfo(x.dtype).eps * self.rng.uniform(-1, 1, (count, *x.shape))
+            return np.concatenate([x, *(x * (1 + parts)).astype(x.dtype)])
+
+        return {
+            name: x if self.axes[name] is None else jax.tree.map(moved, x)
+            for name, x in self.start.items()
+        }
 
 
 def check(text: str, gradient: bool = True) -> str:
