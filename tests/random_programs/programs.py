@@ -112,7 +112,8 @@ UNARY_OTHER = [
 BINARY_SMOOTH = ["({0}) + ({1})", "({0}) - ({1})", "({0}) * ({1})", "({0}) / (1.0 + ({1}) ** 2)"]
 BINARY_OTHER = [
     "({0}) / ({1})", "jnp.maximum({0}, {1})", "jnp.minimum({0}, {1})", "jnp.hypot({0}, {1})",
-    "jnp.where(({0}) > ({1}), {0}, {1})", "jnp.arctan2({0}, {1})", "jnp.mod(jnp.clip({0}, -9, 9), {1})",
+    "jnp.where(({0}) > ({1}), {0}, {1})", "jnp.arctan2({0}, {1})",
+    "jnp.mod(jnp.clip({0}, -9, 9), {1})",
     "lax.cond(({0}) > 0.2, lambda x: jnp.sin(x), lambda x: 0.3 * x, {1})",
     "jnp.abs({0}) ** ({1})", "jnp.logaddexp({0}, {1})",
 ]  # fmt: skip
