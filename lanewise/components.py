@@ -348,7 +348,9 @@ class Evaluator:
         (out,) = eqn.outvars
         (of_a, of_c), (batch_a, batch_c) = eqn.params["dimension_numbers"]
         dtype = str(out.aval.dtype)
-        if a.dtype != dtype or c.dtype != dtype or dtype == "bool":
+        same = a.dtype == dtype and c.dtype == dtype and dtype != "bool"
+        wider = dtype == "float64" and {a.dtype, c.dtype} <= {"float64", "float32"}
+        if not (same or wider):
             raise Unsupported(f"a product of {a.dtype} and {c.dtype} arrays")
         contracted = math.prod(a.shape[i] for i in of_a)
         if out.aval.size * contracted > 8 * MADE:
@@ -361,6 +363,7 @@ class Evaluator:
                 for column in columns:
                     total = self.b.known(0, dtype, structural=contracted > 0)
                     for u, v in zip(row, column, strict=True):
+                        u, v = self.b.convert(u, dtype), self.b.convert(v, dtype)
                         total = self.b.add(total, self.b.mul(u, v))
                     results.append(total)
         return [self.value(results, out.aval)]

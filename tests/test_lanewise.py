@@ -768,6 +768,7 @@ FUNCTIONS = {
             jnp.einsum("ij,jk->ki", m, m),
             jnp.kron(m[0], m[1]),
             jnp.tensordot(m, m, 2),
+            lax.dot(m.astype(jnp.float32), m, preferred_element_type=jnp.float64),
             jnp.linalg.norm(m[0]),
             jnp.cross(m[0], m[1]),
             jnp.tril(m),
