@@ -7,6 +7,9 @@ import numpy as np
 NULL = 1e-11
 """Without a tolerance, a singular value above this share of the largest is never zero."""
 
+CLEAR = 1e3
+"""A gap in the singular values below this is not clear."""
+
 HELD_OUT = 10
 """Held-out samples may leave this many times what fitted ones are allowed to."""
 

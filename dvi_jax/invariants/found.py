@@ -12,13 +12,11 @@ from jaxtyping import Array
 from .._files import publish_npz, read_npz
 from .._precision import refuse_double_without_x64
 from .._types import State
+from ..engine.nullspace import CLEAR
 from ..symmetry.basis import AbstractBasis, BoundBasis, bind_basis
 from ..symmetry.sampling import Samples
 from .obstructions import DriftLaw
 from .series import InvariantSeries
-
-_CLEAR = 1e3
-"""A gap in the singular values below this is not clear."""
 
 _ILL = 1e8
 """Condition number of a basis from which on formulas have lost half of their digits."""
@@ -115,6 +113,31 @@ class Discovery(eqx.Module):
             InvariantSeries(self.basis, c, self.slow_time, sizes=self.sizes) for c in coefficients
         ]
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the answer is not to be relied on, each with what would help; empty if it is."""
+        told = []
+        if self.survivors[0] and self.gap < CLEAR:
+            told.append("the gap is not clear: let drift_order on a long run decide")
+        if self.impossible:
+            told.append(
+                "as many independent invariants as coordinates were found, which is impossible "
+                "for a map that moves: none is reported; take a smaller tolerance, or samples "
+                "where functions change clearly in a step"
+            )
+        if self.undecided > 0:
+            told.append(
+                f"{self.undecided} combinations of the functions change in a step by less than "
+                "1000 times their rounding: whether they are kept cannot be decided in this "
+                "arithmetic; take a larger h, samples that spread wider, or an origin among them"
+            )
+        if self.condition > _ILL:
+            told.append(
+                f"the basis is ill-conditioned on the samples ({self.condition:.0e}): formulas "
+                "are not reliable; shift and scale the coordinates"
+            )
+        return tuple(told)
+
     def evaluate(self, q: State, p: State, epsilon: Any, t: Any = 0.0) -> Array:
         """The values of the independent invariants at a point, shape (count,)."""
         powers = jnp.asarray(epsilon) ** jnp.arange(self.order + 1)
@@ -206,30 +229,12 @@ class Discovery(eqx.Module):
         ]
         if self.tolerance is not None:
             lines.append(f"  singular values up to {self.tolerance:g} of the largest count as zero")
-        if self.survivors[0] and self.gap < _CLEAR:
-            lines.append("  the gap is not clear: let drift_order on a long run decide")
-        if self.impossible:
-            lines.append(
-                "  as many independent invariants as coordinates were found, which is impossible "
-                "for a map that moves: none is reported; take a smaller tolerance, or samples "
-                "where functions change clearly in a step"
-            )
-        if self.undecided > 0:
-            lines.append(
-                f"  {self.undecided} combinations of the functions change in a step by less than "
-                "1000 times their rounding: whether they are kept cannot be decided in this "
-                "arithmetic; take a larger h, samples that spread wider, or an origin among them"
-            )
+        lines += [f"  {warning}" for warning in self.warnings]
         if self.refused:
             lines.append(
                 f"  {self.refused} null vectors of the fitted samples refused: held-out samples, "
                 "their own slopes or a lower order decide (chaos, too few samples, or too large a "
                 "tolerance)"
-            )
-        if self.condition > _ILL:
-            lines.append(
-                f"  the basis is ill-conditioned on the samples ({self.condition:.0e}): formulas "
-                "are not reliable; shift and scale the coordinates"
             )
         for series, residual, typical, exact, reach, power in zip(
             self.invariants, self.residuals, self.typical_residuals, self.exact, self.reach,

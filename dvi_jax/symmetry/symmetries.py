@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
-from ..engine.nullspace import in_units_of
+from ..engine.nullspace import CLEAR, in_units_of
 from .basis import BoundBasis
 from .gauge import BasisGauge
 from .generators import Generator
@@ -133,6 +133,13 @@ class Symmetries(eqx.Module):
         """Number of symmetries found, dependent ones included."""
         return len(self.found)
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the answer is not to be relied on, each with what would help; empty if it is."""
+        if self.survivors[0] and self.gap < CLEAR:
+            return ("the gap is not clear: take more samples, or others",)
+        return ()
+
     def __len__(self) -> int:
         return self.count
 
@@ -150,6 +157,7 @@ class Symmetries(eqx.Module):
             f"{len(self.conformal)} conformal only; leading parts that survive order 0 … "
             f"{self.order}: {', '.join(map(str, self.survivors))}; gap {self.gap:.1e}"
         ]
+        lines += [f"  {warning}" for warning in self.warnings]
         if not count and self.survivors[0]:
             lines.append("  what order 0 has does not go on: a lower order, or a larger basis?")
         for symmetry in self.found:

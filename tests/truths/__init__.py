@@ -1,0 +1,172 @@
+"""Cases of which it is known what is conserved, and how the answer of a search compares.
+
+A case is data: a map, functions to look in, samples, and the truth with its source. `outcome` runs
+the search and names what it did, by one principle for all cases:
+
+- "found": everything that is true was found, nothing else, without a warning.
+- "undecided": the report warns that its answer is not to be relied on.
+- "missed": something true was not found, without a warning.
+- "false": something was reported that is not true, without a warning.
+"""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dvi_jax as dvi
+
+SPAN = 1e-5
+"""A function whose distance from a span is below this share of its size lies in it."""
+
+GENERIC = 1e-4
+"""Differentials whose smallest singular value is below this are dependent at a point."""
+
+
+class Case(NamedTuple):
+    """What is to be found by `discover_invariants`.
+
+    - `kind`: "integrable", "neighbour", …: a row of the table. `source`: of the truth.
+    - `samples`: a function of a NumPy generator that draws (qs, ps) or (qs, ps, ts).
+    - `truth`: functions (q, p) or (q, p, t), each a combination of the basis: a largest set of
+      independent invariants of the basis, for order > 0 the leading parts that reach that order.
+    - `points`: like `samples`, for the comparison with the truth; None for the samples.
+    - `options`: further arguments of the search.
+    """
+
+    name: str
+    kind: str
+    source: str
+    system: dvi.System
+    basis: Any
+    samples: Callable[[np.random.Generator], tuple]
+    truth: tuple[Callable[..., Any], ...] = ()
+    h: float = 0.1
+    order: int = 0
+    points: Callable[[np.random.Generator], tuple] | None = None
+    options: Mapping[str, Any] = MappingProxyType({})
+
+
+class SymmetryCase(NamedTuple):
+    """What is to be found by `find_symmetries`.
+
+    - `truth`: generators that span all symmetries of the basis that do not depend on one
+      another with invariants for coefficients; `variational`: how many of them are variational.
+    """
+
+    name: str
+    kind: str
+    source: str
+    system: dvi.System
+    basis: Any
+    samples: Callable[[np.random.Generator], tuple]
+    truth: tuple[dvi.Generator, ...] = ()
+    variational: int = 0
+    h: float = 0.1
+    order: int = 0
+    options: Mapping[str, Any] = MappingProxyType({})
+
+
+def search(case: Case | SymmetryCase, seed: int = 0) -> Any:
+    """The answer of the package, on samples drawn with this seed."""
+    samples = case.samples(np.random.default_rng(seed))
+    run = dvi.find_symmetries if isinstance(case, SymmetryCase) else dvi.discover_invariants
+    return run(case.system, case.basis, case.order, h=case.h, samples=samples, **case.options)
+
+
+def outcome(case: Case | SymmetryCase, answer: Any, seed: int = 0) -> str:
+    """How the answer compares with the truth: "found", "undecided", "missed" or "false"."""
+    if answer.warnings:
+        return "undecided"
+    if isinstance(case, SymmetryCase):
+        return _of_symmetries(case, answer, seed)
+    return _of_invariants(case, answer, seed)
+
+
+def _of_invariants(case: Case, answer: dvi.Discovery, seed: int) -> str:
+    # An invariant that the report itself calls an expansion is not claimed to be one.
+    claimed = [i for i, power in enumerate(answer.powers) if not power > 0]
+    parts = np.asarray(answer.coefficients)[claimed, 0]
+    others = np.asarray(answer.dependent)[:, 0] if len(claimed) == answer.count else parts[:0]
+    draw = case.points or case.samples
+    at = [jnp.asarray(x) for x in draw(np.random.default_rng(seed + 1))]
+    at = tuple(at) if len(at) == 3 else (*at, jnp.zeros(len(at[0])))
+
+    def reported(q, p, t):
+        return jnp.asarray(np.concatenate([parts, others])) @ answer.basis(q, p, t)
+
+    def true(q, p, t):
+        values = [f(q, p, t) if _timed(f) else f(q, p) for f in case.truth]
+        return jnp.stack(values) if values else jnp.zeros(0)
+
+    found, wanted = (_differentials(f, at) for f in (reported, true))
+    if len(parts) and _rank(np.concatenate([wanted, found], axis=1)) > len(case.truth):
+        return "false"
+    if len(parts) > len(case.truth):
+        return "false"
+    if len(parts) < len(case.truth):
+        return "missed"
+    columns = np.asarray(jax.vmap(reported)(*at))
+    columns = np.column_stack([columns, np.ones(len(columns))])
+    for values in np.asarray(jax.vmap(true)(*at)).T:
+        if _distance(columns, values) > SPAN:
+            return "missed"
+    return "found"
+
+
+def _of_symmetries(case: SymmetryCase, answer: dvi.Symmetries, seed: int) -> str:
+    q, p = (jnp.asarray(x) for x in case.samples(np.random.default_rng(seed + 1))[:2])
+    t = jnp.linspace(0.3, 1.7, len(q))
+
+    def vectors(generator):
+        def at_point(q, p, t):
+            parts = generator(dvi.LatticePoint(t, q, p), None)
+            return jnp.concatenate([jnp.ravel(jnp.asarray(x, float)) for x in parts])
+
+        return np.asarray(jax.vmap(at_point)(q, p, t)).ravel()
+
+    independent = [s for s in answer if not s.is_dependent]
+    found = [vectors(s.generators[0]) for s in answer]
+    wanted = [vectors(g) for g in case.truth]
+    if len(independent) > len(wanted):
+        return "false"
+    if len(independent) < len(wanted):
+        return "missed"
+    if any(_distance(np.column_stack(found), w) > SPAN for w in wanted):
+        return "missed"
+    variational = sum(s.is_variational for s in independent)
+    if variational != case.variational:
+        return "false" if variational > case.variational else "missed"
+    return "found"
+
+
+def _timed(function: Callable[..., Any]) -> bool:
+    return function.__code__.co_argcount == 3
+
+
+def _differentials(functions, at) -> np.ndarray:
+    """Of each function at each point, shape (points, count, 2n), each in units of the spread of
+    the coordinates and of length one."""
+    q, p = at[0], at[1]
+    slopes = jax.vmap(jax.jacfwd(functions, argnums=(0, 1)))(*at)
+    units = [np.maximum(np.std(np.asarray(x), axis=0).ravel(), 1e-300) for x in (q, p)]
+    rows = [np.asarray(s).reshape(*s.shape[:2], -1) * u for s, u in zip(slopes, units, strict=True)]
+    rows = np.concatenate(rows, axis=2)
+    return rows / np.maximum(np.linalg.norm(rows, axis=2, keepdims=True), 1e-300)
+
+
+def _rank(differentials: np.ndarray) -> int:
+    singular = np.linalg.svd(differentials, compute_uv=False)
+    return int(np.median(np.sum(singular > GENERIC, axis=1)))
+
+
+def _distance(columns: np.ndarray, values: np.ndarray) -> float:
+    """Of values from the span of columns, as a share of how much they vary."""
+    sizes = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(sizes > 0, sizes, 1)
+    found = np.linalg.lstsq(columns, values, rcond=1e-14)[0]
+    size = np.linalg.norm(values - np.mean(values)) or np.linalg.norm(values) or 1.0
+    return float(np.linalg.norm(columns @ found - values) / size)

@@ -1,0 +1,77 @@
+"""All cases, searched: the table of the page on discovery.
+
+    python tests/truths/table.py [--kind KIND] [--case PART_OF_NAME] [--seeds N] [--report]
+
+prints how many of each kind are found, undecided, missed and false, and names what is not found.
+With `--seeds` each case is searched on that many draws of its samples. `--report` prints what the
+package says of each case.
+"""
+
+import argparse
+import collections
+import importlib
+import pkgutil
+import sys
+from pathlib import Path
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import truths  # noqa: E402
+
+OUTCOMES = ("found", "undecided", "missed", "false")
+
+
+def all_cases() -> list:
+    """Of every module of this folder, in the order of their names."""
+    names = sorted(module.name for module in pkgutil.iter_modules(truths.__path__))
+    modules = [importlib.import_module(f"truths.{name}") for name in names if name != "table"]
+    return [case for module in modules for case in module.CASES]
+
+
+def table(outcomes: dict[str, list[str]]) -> str:
+    """Rows of a table from the outcomes of each kind."""
+    lines = [
+        "| kind | cases | " + " | ".join(OUTCOMES) + " |",
+        "|---|---|" + "---|" * len(OUTCOMES),
+    ]
+    total = collections.Counter()
+    for kind, found in outcomes.items():
+        counts = collections.Counter(found)
+        total.update(counts)
+        cells = [str(len(found)), *(str(counts[outcome]) for outcome in OUTCOMES)]
+        lines.append(f"| {kind} | " + " | ".join(cells) + " |")
+    cells = [str(sum(total.values())), *(str(total[outcome]) for outcome in OUTCOMES)]
+    return "\n".join([*lines, "| all | " + " | ".join(cells) + " |"])
+
+
+def main() -> int:
+    """Search, print, and return 1 if anything was missed or false."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--kind", default="")
+    parser.add_argument("--case", default="")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--report", action="store_true")
+    chosen = parser.parse_args()
+    outcomes: dict[str, list[str]] = {}
+    for case in all_cases():
+        if chosen.kind not in case.kind or chosen.case not in case.name:
+            continue
+        for seed in range(chosen.seeds):
+            answer = truths.search(case, seed)
+            outcome = truths.outcome(case, answer, seed)
+            outcomes.setdefault(case.kind, []).append(outcome)
+            if outcome != "found" or chosen.report:
+                print(f"{outcome}: {case.name} (samples of seed {seed})", flush=True)
+            if chosen.report:
+                print(answer)
+    print(table(outcomes))
+    return int(any(o in ("missed", "false") for found in outcomes.values() for o in found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
