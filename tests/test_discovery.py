@@ -729,6 +729,7 @@ def test_what_is_no_basis_no_step_or_no_observable_is_refused():
 
 
 OSCILLATOR = dvi.System(H_D)
+CENTRAL = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2 + (q @ q) ** 2 / 4)
 
 PAIR = dvi.System(
     lambda t0, t1, q, p, args: p @ p / 2 + ((q[0] - q[1]) ** 2) ** -6 - ((q[0] - q[1]) ** 2) ** -3
@@ -791,11 +792,39 @@ def test_invariants_of_small_steps_are_found(h):
     assert (d.count, d.undecided, d.warnings) == (1, 0, ())
 
 
-@pytest.mark.parametrize("offset", [1e4, 1e5, 1e8])
-def test_what_rounding_hides_is_told(offset):
-    system = dvi.System(lambda t0, t1, q, p, args: (p @ p + (q - offset) @ (q - offset)) / 2)
+def away(offset):
+    """An oscillator about q = offset, and its energy."""
+    return dvi.System(lambda t0, t1, q, p, args: (p @ p + (q - offset) @ (q - offset)) / 2)
+
+
+@pytest.mark.parametrize("offset", [1e4, 1e8])
+def test_invariants_far_from_the_origin_are_found(offset, tmp_path):
     q, p = box(1, 100)
-    d = dvi.discover_invariants(system, dvi.Polynomials(2), h=0.1, samples=(q + offset, p))
+    d = dvi.discover_invariants(away(offset), dvi.Polynomials(4), h=0.1, samples=(q + offset, p))
+    assert (d.count, d.warnings) == (1, ())
+    shifted = f"(q − {offset:.0f})"
+    assert str(d.invariants[0]).startswith(f"0.5 {shifted}² − 0.05")
+    energy = (q**2 + p**2 - 0.1 * q * p)[:, 0] / 2
+    values = np.asarray(jax.vmap(d.invariants[0].evaluate, (0, 0, None))(q + offset, p, 0.0))
+    np.testing.assert_allclose(values, energy, atol=1e-15 * offset)
+    # In the user's functions: −offset q + q²/2 + h/2 (offset p − q p) + p²/2
+    c = dict(zip(d.basis.names, np.asarray(d.coefficients[0, 0]), strict=True))
+    assert c["q"] / offset == pytest.approx(-1, rel=1e-15 * offset)
+    assert c["p"] / offset == pytest.approx(0.05, rel=1e-14 * offset)
+    d.save(tmp_path / "far.npz")
+    again = dvi.Discovery.load(tmp_path / "far.npz", dvi.Polynomials(4))
+    np.testing.assert_array_equal(again.coefficients, d.coefficients)
+    assert str(again) == str(d)
+
+
+def test_what_rounding_hides_is_told():
+    """Functions of the user's cannot be taken about another point."""
+    offset = 1e5
+    functions = {"q": lambda q, p: q[0], "p": lambda q, p: p[0], "q q": lambda q, p: q[0] ** 2,
+                 "q p": lambda q, p: q[0] * p[0], "p p": lambda q, p: p[0] ** 2}  # fmt: skip
+    q, p = box(1, 100)
+    basis, samples = dvi.Basis(functions), (q + offset, p)
+    d = dvi.discover_invariants(away(offset), basis, h=0.1, samples=samples)
     assert d.count == 0
     assert d.undecided >= 1
     assert any("cannot be decided in this arithmetic" in text for text in d.warnings)
@@ -829,3 +858,57 @@ def test_expansions_that_are_cut_off_are_told_from_invariants():
     d = dvi.discover_invariants(mcmillan, dvi.Polynomials(4), h=1.0, samples=(q, p))
     assert (d.count, list(d.powers)) == (1, [0.0])
     assert "not exact" not in str(d)
+
+
+def test_outliers_hide_nothing():
+    q, p = box(2, 200)
+    q[::20] *= 1e5
+    p[::20] *= 1e4
+    d = dvi.discover_invariants(CENTRAL, dvi.Polynomials(4), h=0.1, samples=(q, p))
+    assert (d.count, d.warnings) == (1, ())
+    assert str(d.invariants[0]) in ("0.5 q1 p2 − 0.5 q2 p1", "−0.5 q1 p2 + 0.5 q2 p1")
+    found = dvi.find_symmetries(CENTRAL, dvi.Polynomials(1), h=0.1, samples=(q, p), time=False)
+    assert (found.count, len(found.variational), found.warnings) == (1, 1, ())
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e30])
+def test_units_of_atoms_and_planets_are_as_good_as_any(size):
+    """Lengths of `size`, momenta 1e14 times as large, and times of 1e-14."""
+    system = dvi.System(lambda t0, t1, q, p, args: 1e14 * (p @ p / 1e14 + 1e14 * (q @ q)) / 2)
+    q, p = box(2, 120)
+    q, p, h = size * q, 1e14 * size * p, 1e-15
+    d = dvi.discover_invariants(system, dvi.Polynomials(2), h=h, samples=(q, p))
+    assert (d.warnings, d.gap > 1e8) == ((), True)
+    assert "0.5 q1 p2 − 0.5 q2 p1" in str(d).replace("−0.5 q1 p2 + 0.5", "0.5 q1 p2 − 0.5")
+    found = dvi.find_symmetries(system, dvi.Polynomials(1), h=h, samples=(q, p), time=False)
+    assert found.warnings == ()
+    assert len(found.variational) == 4  # U(2)
+
+
+def test_symmetries_far_from_the_origin_are_found():
+    q, p = box(2, 60)
+    system = dvi.System(lambda t0, t1, q, p, args: CENTRAL.H_D(t0, t1, q - 1e8, p, args))
+    found = dvi.find_symmetries(
+        system, dvi.Polynomials(1, constant=True), h=0.1, samples=(q + 1e8, p), time=False
+    )
+    assert (found.count, found.warnings) == (1, ())
+    turned = "ξ_q1 = (q2 − 100000000), ξ_q2 = −(q1 − 100000000), η_p1 = p2, η_p2 = −p1"
+    assert str(found[0]) == turned
+    huge = dvi.System(lambda t0, t1, q, p, args: CENTRAL.H_D(t0, t1, q - 1e11, p, args))
+    found = dvi.find_symmetries(
+        huge, dvi.Polynomials(1, constant=True), h=0.1, samples=(q + 1e11, p), time=False
+    )
+    assert "cannot be decided" in str(found)
+
+
+@pytest.mark.parametrize("strength", [1e-15, 1e15])
+def test_a_disturbance_of_any_strength_gives_the_same_series(strength):
+    system = dvi.System(H_D, force=lambda t0, t1, q, p, args: -strength * q**3)
+    series = dvi.discover_invariants(
+        system, dvi.Polynomials(4), 1, h=0.1, samples=box(1, 120), representative="simplest"
+    ).invariants
+    first = series[0].coefficients[1] / strength
+    names = list(series[0].basis.names)
+    assert first[names.index("q⁴")] == pytest.approx(0.251256, rel=1e-5)
+    assert first[names.index("q³ p")] == pytest.approx(-0.0502513, rel=1e-5)
+    assert len(series) == 1

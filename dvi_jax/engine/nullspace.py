@@ -13,8 +13,8 @@ CLEAR = 1e3
 HELD_OUT = 10
 """Held-out samples may leave this many times what fitted ones are allowed to."""
 
-_NOISE = 1e-14
-"""A disturbance that changes a step by less than this share of the step is round-off."""
+_NOTHING = 1e-250
+"""A disturbance that changes a step by less than this share of the step is none."""
 
 RANK = 1e-7
 """Relative size below which a direction counts as dependent on others."""
@@ -27,6 +27,25 @@ _RESOLVED = 1e-3
 
 _COEFFICIENTS = 1e-15
 """Errors of the coefficients of a null vector, relative to its length."""
+
+
+_RARE = 100.0
+"""Samples at which functions are so many times larger than at three quarters of them count less."""
+
+
+def typical_sizes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How large functions are on samples, root mean square, shape (size,), and weights of the
+    samples, shape (S,): 1, and less where functions are larger than at nearly all others.
+
+    `values`: shape (S, size).
+    """
+    units = np.median(np.abs(values), axis=0)
+    units = np.where(units > 0, units, np.max(np.abs(values), axis=0))
+    units = np.where(units > 0, units, 1.0)
+    relative = values / units
+    size = np.max(np.abs(relative), axis=1)
+    weights = np.minimum(1, _RARE * np.quantile(size, 0.75) / np.maximum(size, 1.0))
+    return units * np.sqrt(np.mean((weights[:, None] * relative) ** 2, axis=0)), weights
 
 
 class Motion(NamedTuple):
@@ -103,12 +122,15 @@ def toeplitz(terms: np.ndarray, order: int) -> np.ndarray:
 
 
 def null_space(
-    matrix: np.ndarray, tolerance: float | None = None, unit: float | None = None
+    matrix: np.ndarray,
+    tolerance: float | None = None,
+    unit: float | None = None,
+    below: float = NULL,
 ) -> NullSpace:
     """Directions that the matrix takes to zero.
 
     With a tolerance: all singular values at most that share of the largest. Without: those
-    below the widest gap, as long as they are below `NULL`, in units of `unit` or of the largest.
+    before the widest gap, as long as they are under `below`, in units of `unit` or of the largest.
     """
     if matrix.shape[0] > matrix.shape[1]:
         matrix = triangle(matrix)
@@ -124,7 +146,7 @@ def null_space(
     if tolerance is not None:
         kept = int(np.sum(relative > tolerance))
     else:
-        allowed = np.append(relative[1:] < NULL, False)
+        allowed = np.append(relative[1:] < below, False)
         kept = 1 + int(np.argmax(np.where(allowed, ratio, 0))) if allowed.any() else size
     return NullSpace(V.T[:, kept:], relative, float(ratio[kept - 1]) if kept < size else 1.0)
 
@@ -154,7 +176,7 @@ def epsilon_scale(terms: np.ndarray) -> float:
     if len(orders) == 0 or sizes[0] == 0:
         return 1.0
     scale = float(np.max((sizes[1:] / sizes[0]) ** (1 / orders)))
-    return scale if scale > _NOISE else 1.0
+    return scale if scale > _NOTHING else 1.0
 
 
 def in_units_of(scale: float, terms: np.ndarray, axis: int = 1) -> np.ndarray:

@@ -54,8 +54,13 @@ class Discovery(eqx.Module):
     - `reach`: shape (count,): the ε at which corrections are as large as the leading part; the
       series is of use far below it. Infinite without corrections.
     - `obstructions`: a `DriftLaw` for each leading part that is lost at order 1, 2, …
-    - `basis`: with `names`. `sizes`: shape (order + 1, basis size), what a coefficient of 1
-      amounts to on the samples. `condition`: of the basis there, each function scaled to one size.
+    - `basis`: φ, with `names`. `middle`: m, of z = (q, p, t), shape (2n + 1,). Where it is not
+      zero, the samples lie so far from the origin that polynomials lose digits there; they are
+      then taken about m: functions `inner` = `to_basis` @ φ + constants, with
+      `inner_coefficients` and `inner_dependent`. Formulas, values and laws are of those; values
+      differ from those of `coefficients` by a constant.
+    - `sizes`: shape (order + 1, basis size), what a coefficient of 1 amounts to on the samples, of
+      `inner`. `condition`: of `inner` there, each function scaled to one size.
     - `scale`: 1 over the ε at which the disturbance changes a step as much as H_D does.
     - `slow_time`: of the system. `tolerance`: None, or that of approximate invariants.
 
@@ -63,8 +68,8 @@ class Discovery(eqx.Module):
     appear that are none. Held-out residuals and `drift_order` on a long run decide.
     """
 
-    coefficients: Array
-    dependent: Array
+    inner_coefficients: Array
+    inner_dependent: Array
     exact: tuple[bool, ...] = eqx.field(static=True)
     leading_parts: np.ndarray
     survivors: tuple[int, ...] = eqx.field(static=True)
@@ -80,6 +85,9 @@ class Discovery(eqx.Module):
     reach: np.ndarray
     obstructions: tuple[DriftLaw, ...]
     basis: BoundBasis
+    inner: BoundBasis
+    middle: np.ndarray
+    to_basis: np.ndarray
     sizes: np.ndarray
     condition: float = eqx.field(static=True)
     scale: float = eqx.field(static=True)
@@ -91,7 +99,20 @@ class Discovery(eqx.Module):
     @property
     def count(self) -> int:
         """Number of independent invariants found."""
-        return self.coefficients.shape[0]
+        return self.inner_coefficients.shape[0]
+
+    @property
+    def coefficients(self) -> Array:
+        """Of the functions of `basis`, shape (count, order + 1, basis size)."""
+        return self._of_basis(self.inner_coefficients)
+
+    @property
+    def dependent(self) -> Array:
+        """The same for the invariants that are functions of those."""
+        return self._of_basis(self.inner_dependent)
+
+    def _of_basis(self, coefficients: Array) -> Array:
+        return coefficients @ self.to_basis if self.middle.any() else coefficients
 
     @property
     def order(self) -> int:
@@ -101,16 +122,16 @@ class Discovery(eqx.Module):
     @property
     def invariants(self) -> list[InvariantSeries]:
         """The independent invariants as observables."""
-        return self._series(self.coefficients)
+        return self._series(self.inner_coefficients)
 
     @property
     def dependent_invariants(self) -> list[InvariantSeries]:
         """Those in the span that are functions of the independent ones."""
-        return self._series(self.dependent)
+        return self._series(self.inner_dependent)
 
     def _series(self, coefficients: Array) -> list[InvariantSeries]:
         return [
-            InvariantSeries(self.basis, c, self.slow_time, sizes=self.sizes) for c in coefficients
+            InvariantSeries(self.inner, c, self.slow_time, sizes=self.sizes) for c in coefficients
         ]
 
     @property
@@ -141,7 +162,7 @@ class Discovery(eqx.Module):
     def evaluate(self, q: State, p: State, epsilon: Any, t: Any = 0.0) -> Array:
         """The values of the independent invariants at a point, shape (count,)."""
         powers = jnp.asarray(epsilon) ** jnp.arange(self.order + 1)
-        return jnp.einsum("m,kmb,b->k", powers, self.coefficients, self.basis(q, p, t))
+        return jnp.einsum("m,kmb,b->k", powers, self.inner_coefficients, self.inner(q, p, t))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything but the basis functions themselves to a file (NumPy's npz)."""
@@ -186,6 +207,7 @@ class Discovery(eqx.Module):
             raise ValueError(f"{os.fspath(path)} is no file that Discovery.save wrote.") from error
         shape = tuple(about["shape"])
         bound = bind_basis(basis, shape)
+        inner, to_basis = bound.about(arrays["middle"])
         if list(bound.names) != about["names"]:
             raise ValueError(
                 f"{os.fspath(path)} was found in a basis of {len(about['names'])} functions "
@@ -199,7 +221,7 @@ class Discovery(eqx.Module):
                 f"{bound.names[int(np.argmax(differs.any(axis=0)))]!r} differs."
             )
         laws = tuple(_law(law) for law in about["obstructions"])
-        for name in ("coefficients", "dependent"):
+        for name in ("inner_coefficients", "inner_dependent"):
             arrays[name] = jnp.asarray(arrays[name])
         return cls(
             exact=tuple(about["exact"]),
@@ -212,6 +234,8 @@ class Discovery(eqx.Module):
             scale=about["scale"],
             obstructions=laws,
             basis=bound,
+            inner=inner,
+            to_basis=to_basis,
             probe=probe,
             shape=shape,
             slow_time=about["slow_time"],
@@ -222,6 +246,8 @@ class Discovery(eqx.Module):
     def __str__(self) -> str:
         kind = "independent" if self.tolerance is None else "independent approximate"
         drop = 1e-9 if self.tolerance is None else np.sqrt(self.tolerance)
+        # Coefficients are known to about as many digits as the gap has.
+        digits = int(np.clip(np.log10(self.gap) - 2, 2, 6)) if self.order == 0 else 6
         lines = [
             f"{self.count} {kind} invariant{'' if self.count == 1 else 's'} of order "
             f"{self.order} in {self.basis.size} functions; leading parts that survive order 0 … "
@@ -240,7 +266,7 @@ class Discovery(eqx.Module):
             self.invariants, self.residuals, self.typical_residuals, self.exact, self.reach,
             self.powers, strict=True,
         ):  # fmt: skip
-            lines.append(f"  I = {series.formula(_SHOWN, drop)}")
+            lines.append(f"  I = {series.formula(_SHOWN, drop, digits)}")
             told = ", exact at every ε tried" if exact else ""
             if np.isfinite(reach) and not exact:
                 told = f"; corrections are as large as the leading part at ε = {reach:.2g}"
@@ -257,7 +283,7 @@ class Discovery(eqx.Module):
         if len(self.dependent):
             lines.append(f"  functions of them, as differentials say: {len(self.dependent)}")
             for series in self.dependent_invariants[:3]:
-                lines.append(f"      {series.formula(_SHOWN, drop)}")
+                lines.append(f"      {series.formula(_SHOWN, drop, digits)}")
         told = [law for law in self.obstructions if law.kind != "unexplained"]
         lines += [f"  {law}" for law in told[:_LAWS]]
         if len(told) > _LAWS:
@@ -280,8 +306,9 @@ def _law(values: dict[str, Any]) -> DriftLaw:
 
 
 _ARRAYS = (
-    "coefficients",
-    "dependent",
+    "inner_coefficients",
+    "inner_dependent",
+    "middle",
     "leading_parts",
     "singular_values",
     "residuals",
@@ -292,7 +319,7 @@ _ARRAYS = (
     "sizes",
 )
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 def _probed(basis: BoundBasis, probe: Samples) -> np.ndarray:

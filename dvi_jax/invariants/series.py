@@ -75,18 +75,19 @@ class InvariantSeries(eqx.Module):
     def __str__(self) -> str:
         return self.formula()
 
-    def formula(self, terms: int | None = None, drop: float = 1e-9) -> str:
+    def formula(self, terms: int | None = None, drop: float = 1e-9, digits: int = 6) -> str:
         """The series as text: at each order at most so many terms, all above a share `drop`.
 
         How many are left out is said, unless they are round-off.
         """
         c = np.asarray(self.coefficients)
         shares = np.abs(c if self.sizes is None else c * np.asarray(self.sizes))
-        text = shortened(self.basis, c[0], shares[0], terms, drop)
+        text = shortened(self.basis, c[0], shares[0], terms, drop, digits)
         for m in range(1, len(c)):
             if np.max(shares[m]) > 1e-9 * np.max(shares):
                 power = "ε" if m == 1 else f"ε{m}".translate(_POWERS)
-                text += f" + {power} ({shortened(self.basis, c[m], shares[m], terms, drop)})"
+                part = shortened(self.basis, c[m], shares[m], terms, drop, digits)
+                text += f" + {power} ({part})"
         return text
 
 
@@ -96,12 +97,13 @@ def shortened(
     shares: np.ndarray,
     terms: int | None = None,
     drop: float = 1e-9,
+    digits: int = 6,
 ) -> str:
     """The combination as text: at most so many terms, all above the share `drop` of the largest."""
     shown = np.where(shares > drop * np.max(shares), c, 0.0)
     if terms is not None:
         shown[np.argsort(-shares, kind="stable")[terms:]] = 0.0
-    text = basis.formula(shown, drop=0.0)
+    text = basis.formula(shown, digits, drop=0.0)
     hidden = np.sum(shares > 1e-9 * np.max(shares)) - np.count_nonzero(shown)
     return f"{text} + … ({hidden} smaller terms)" if hidden else text
 

@@ -5,7 +5,7 @@ import dataclasses
 import inspect
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -105,6 +105,46 @@ class BoundBasis(eqx.Module):
             text += f" {sign} {term}" if text else (f"−{term}" if value < 0 else term)
         return text
 
+    def about(self, middle: np.ndarray, exactly: bool = False) -> "tuple[BoundBasis, np.ndarray]":
+        """Functions ψ of z − middle that span the same space, and N with ψ = N φ + constants.
+
+        - `middle`: of z = (q, p, t), shape (2n + 1,). Polynomials are taken about it, other
+          functions stay as they are.
+        - `exactly`: only if no constants are left over.
+        """
+        found = _about(self.function, middle)
+        if found is None or (exactly and not found.closed):
+            return self, np.eye(self.size)
+        return dataclasses.replace(self, function=found.function, names=found.names), found.matrix
+
+
+class About(NamedTuple):
+    """Functions ψ of z − middle; N with ψ = N φ + constants; whether no constants are left."""
+
+    function: Callable[[State, State, Scalar], Array]
+    names: tuple[str, ...]
+    matrix: np.ndarray
+    closed: bool
+
+
+def _about(function: Any, middle: np.ndarray) -> About | None:
+    """As `BoundBasis.about`; None where all functions stay as they are."""
+    if isinstance(function, BoundBasis):
+        function = function.function
+    return function.about(middle) if hasattr(function, "about") else None
+
+
+def _parts_about(parts: "tuple[BoundBasis, BoundBasis]", middle: np.ndarray, exactly: bool):
+    """Of both parts of a sum or product; None where both stay as they are."""
+    found = [_about(part, middle) for part in parts]
+    found = [None if exactly and one and not one.closed else one for one in found]
+    if found[0] is None and found[1] is None:
+        return None
+    return [
+        one or About(part.function, part.names, np.eye(part.size), True)
+        for one, part in zip(found, parts, strict=True)
+    ]
+
 
 class Basis(AbstractBasis):
     """Functions of the user's.
@@ -199,10 +239,20 @@ class Sum(AbstractBasis):
 
     def for_shape(self, shape):
         a, b = self.first.for_shape(shape), self.second.for_shape(shape)
-        again = tuple(name + "′" if name in a.names else name for name in b.names)
         return BoundBasis(
-            _Both(a, b), a.names + again, a.complexity + b.complexity, a.uses_time or b.uses_time
+            _Both(a, b),
+            _names_of_sum(a.names, b.names),
+            a.complexity + b.complexity,
+            a.uses_time or b.uses_time,
         )
+
+
+def _names_of_sum(a: tuple[str, ...], b: tuple[str, ...]) -> tuple[str, ...]:
+    return a + tuple(name + "′" if name in a else name for name in b)
+
+
+def _with(basis: BoundBasis, moved: About) -> BoundBasis:
+    return dataclasses.replace(basis, function=moved.function, names=moved.names)
 
 
 class _Both(eqx.Module):
@@ -211,6 +261,17 @@ class _Both(eqx.Module):
 
     def __call__(self, q, p, t):
         return jnp.concatenate([self.first(q, p, t), self.second(q, p, t)])
+
+    def about(self, middle: np.ndarray) -> About | None:
+        parts = _parts_about((self.first, self.second), middle, exactly=False)
+        if parts is None:
+            return None
+        a, b = parts
+        matrix = np.zeros((self.first.size + self.second.size,) * 2)
+        matrix[: self.first.size, : self.first.size] = a.matrix
+        matrix[self.first.size :, self.first.size :] = b.matrix
+        moved = _Both(_with(self.first, a), _with(self.second, b))
+        return About(moved, _names_of_sum(a.names, b.names), matrix, a.closed and b.closed)
 
 
 class Product(AbstractBasis):
@@ -221,7 +282,7 @@ class Product(AbstractBasis):
 
     def for_shape(self, shape):
         a, b = self.first.for_shape(shape), self.second.for_shape(shape)
-        names = tuple(_product_name(m, n) for m, n in itertools.product(a.names, b.names))
+        names = _names_of_product(a.names, b.names)
         pairs = itertools.product(a.complexity, b.complexity)
         complexity = tuple(c + d for c, d in pairs)
         return BoundBasis(_Products(a, b), names, complexity, a.uses_time or b.uses_time)
@@ -233,6 +294,19 @@ class _Products(eqx.Module):
 
     def __call__(self, q, p, t):
         return jnp.outer(self.first(q, p, t), self.second(q, p, t)).ravel()
+
+    def about(self, middle: np.ndarray) -> About | None:
+        # A constant that is left over would be multiplied by functions.
+        parts = _parts_about((self.first, self.second), middle, exactly=True)
+        if parts is None:
+            return None
+        a, b = parts
+        moved = _Products(_with(self.first, a), _with(self.second, b))
+        return About(moved, _names_of_product(a.names, b.names), np.kron(a.matrix, b.matrix), True)
+
+
+def _names_of_product(a: tuple[str, ...], b: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(_product_name(m, n) for m, n in itertools.product(a, b))
 
 
 def _product_name(a: str, b: str) -> str:

@@ -14,10 +14,7 @@ from ..engine.taylor import taylor_coefficients
 from .basis import BoundBasis
 from .determining import discrete_equations
 from .generators import LatticePoint
-from .sampling import Samples
-
-_LATER = (1.0, 2.7)
-"""Shifts of time at which equations without t are the same."""
+from .sampling import LATER, Samples
 
 
 class Conditions(NamedTuple):
@@ -85,7 +82,7 @@ def at_samples(equations, h, basis, gauge_basis, order, samples) -> Conditions:
 
         by_pair = jax.jacfwd(F)(pair)  # (2n, 2, C)
         noether, gauge = map(rows, identity(pair), jax.jacfwd(identity)(pair))
-        later = [F(pair.at[:, 0].add(shift)) for shift in _LATER]
+        later = [F(pair.at[:, 0].add(shift * h)) for shift in LATER]
         return (
             jnp.einsum("rjc,jb->jrcb", by_pair, values[:, : basis.size]),
             jnp.moveaxis(noether, 0, 1),
@@ -129,7 +126,8 @@ def require_finite(raw: Conditions) -> None:
 def require_times(raw: Conditions, samples: Samples, h: float) -> None:
     """Refuse samples of one time for equations that depend on it."""
     size = abs(h) * np.max(np.abs(raw.clock)) + np.finfo(float).tiny
-    same = np.max(np.abs(raw.later)) <= 1e-8 * size  # False for NaN
+    rounding = 64 * np.finfo(float).eps * max(np.max(np.abs(x)) for x in (samples.q, samples.p))
+    same = np.max(np.abs(raw.later)) <= 1e-8 * size + rounding  # False for NaN
     if np.ptp(samples.t) == 0 and not same:
         raise ValueError(
             "the discrete equations depend on the time, and all samples are of one time: give "

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .basis import AbstractBasis, BoundBasis
+from .basis import About, AbstractBasis, BoundBasis
 
 TIME = ("t", "τ")
 """Names of the time, which is the slow time of a system with ``slow_time=True``."""
@@ -95,7 +95,7 @@ class Polynomials(AbstractBasis):
         ]
         names = tuple(_monomial([chosen[i] for i in c]) for c in exponents)
         return BoundBasis(
-            _Monomials(places, tuple(exponents)),
+            _Monomials(places, tuple(exponents), chosen),
             names,
             tuple(len(c) for c in exponents),
             any(v in TIME for v in chosen),
@@ -110,15 +110,46 @@ def _monomial(factors: Sequence[str]) -> str:
 class _Monomials(eqx.Module):
     places: tuple[int, ...] = eqx.field(static=True)
     exponents: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    middle: Any = None
 
     def __call__(self, q, p, t):
         flat = _at(self.places, q, p, t)
+        if self.middle is not None:
+            flat = flat - self.middle
         counts = np.array([[c.count(i) for i in range(len(self.places))] for c in self.exponents])
         powers = [jnp.ones_like(flat)]
         for _ in range(int(counts.max())):
             powers.append(powers[-1] * flat)
         table = jnp.stack(powers)  # (power, variable)
         return jnp.prod(table[counts, np.arange(len(self.places))], axis=-1)
+
+    def about(self, middle: np.ndarray) -> About | None:
+        """Π (x_i − m_i)^{k_i} = Π Σ_j binomial(k_i, j) (−m_i)^{k_i − j} x_i^j: all of them are
+        combinations of those of lower degree, which this basis has, up to the constant."""
+        shift = middle[list(self.places)]
+        if not shift.any():
+            return None
+        place = {c: i for i, c in enumerate(self.exponents)}
+        matrix = np.zeros((len(place), len(place)))
+        for row, factors in enumerate(self.exponents):
+            counts = [factors.count(i) for i in range(len(self.places))]
+            for kept in itertools.product(*(range(k + 1) if m else (k,) for k, m in
+                                            zip(counts, shift, strict=True))):  # fmt: skip
+                column = place.get(tuple(i for i, j in enumerate(kept) for _ in range(j)))
+                if column is not None:
+                    terms = zip(counts, kept, shift, strict=True)
+                    matrix[row, column] = math.prod(math.comb(k, j) * (-m) ** (k - j)
+                                                    for k, j, m in terms)  # fmt: skip
+        words = [
+            v
+            if m == 0
+            else f"({v} {'−' if m > 0 else '+'} {np.format_float_positional(abs(m), trim='-')})"
+            for v, m in zip(self.names, shift, strict=True)
+        ]
+        names = tuple(_monomial([words[i] for i in c]) for c in self.exponents)
+        moved = _Monomials(self.places, self.exponents, self.names, shift)
+        return About(moved, names, matrix, () in place)
 
 
 def _pair(ends: Any) -> Any:

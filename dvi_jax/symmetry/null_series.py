@@ -18,12 +18,16 @@ from ..engine.nullspace import (
     rank,
     toeplitz,
     triangle,
+    typical_sizes,
 )
 from .families import coordinate_names
 from .gauge import BasisGauge
 from .generators import Generator
-from .sampling import spread
+from .sampling import rounding, spread
 from .symmetries import BasisComponent, Symmetries, Symmetry
+
+_ROUNDINGS = 100.0
+"""Conditions below so many times the rounding of the samples count as fulfilled."""
 
 _TINY = 1e-12
 """Coefficients whose share of a generator is below this are round-off."""
@@ -37,6 +41,7 @@ class Search:
         self.shape = samples.q.shape[1:]
         self.names = _component_names(self.shape)[0 if time else 1 :]
         self.held, self.tolerance = samples.held_out, tolerance
+        self.null = tolerance or max(NULL, _ROUNDINGS * rounding(samples))
         self.order = raw.determining.shape[1] - 1
         fit, n = ~self.held, raw.slopes.shape[3] // 2
         q, p = spread(samples.q), spread(samples.p)
@@ -45,14 +50,17 @@ class Search:
         used = slice(0 if time else 1, None)
         self.units = np.repeat([t, q, p], [1, n, n])[used]
         self.size = len(self.units) * basis.size  # unknowns of each order
-        values = raw.values[fit, 0, 0]
-        self.rms = np.sqrt(np.mean(values**2, axis=0))
-        self.R = triangle(values) / np.sqrt(len(values))
+        values = raw.values[:, 0, 0]
+        self.rms, calm = typical_sizes(values)
+        self.R = triangle((calm[:, None] * values)[fit]) / np.sqrt(np.sum(fit))
         actions = h / (q * p) * np.repeat([1, q, p], [1, n, n])
 
         determining = raw.determining[..., used, :] * rows[:, None, None]
         identity = raw.identity[..., used, :] * actions[:, None, None]
         gauge = raw.gauge * actions[:, None]
+        size = typical_sizes(rows_of(gauge[:, 0]))[0]
+        self.gauge_units = np.where(size > 0, size, 1.0)
+        gauge = gauge / self.gauge_units
         # Every sample counts alike, however strong its kick.
         determining = determining / self._size(determining).reshape(-1, 1, 1, 1, 1, 1)
         of_identity = np.hypot(self._size(identity), np.linalg.norm(gauge[:, 0], axis=(1, 2)))
@@ -75,7 +83,7 @@ class Search:
         spaces = []
         for m in range(self.order + 1):
             matrix = toeplitz(fitted, m)
-            space = null_space(matrix, self.tolerance)
+            space = null_space(matrix, self.tolerance, below=self.null)
             conditions = np.vstack([matrix, toeplitz(judged, m)])
             kept = self._judged(space.columns, space.columns, conditions)
             spaces.append((kept, space))
@@ -97,6 +105,7 @@ class Search:
             survivors=tuple(rank(kept[: self.size]) for kept, _ in spaces),
             singular_values=space.singular_values,
             gap=space.gap,
+            null=self.null,
             refused=space.columns.shape[1] - null.shape[1],
             basis=self.basis,
             gauge_basis=self.gauge_basis,
@@ -126,7 +135,7 @@ class Search:
         norm = max(np.linalg.norm(conditions, 2), np.finfo(float).tiny)
         singular, V = np.linalg.svd(triangle(conditions @ columns / norm))[1:]
         singular = np.append(singular, np.zeros(len(V) - len(singular)))
-        return columns @ V[singular <= HELD_OUT * (self.tolerance or NULL)].T
+        return columns @ V[singular <= HELD_OUT * self.null].T
 
     def _variational(self, null: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The series in the null space whose identity closes, and their gauges."""
@@ -145,7 +154,7 @@ class Search:
             return np.hstack([of_series, of_gauge.reshape(len(matrix), -1)])
 
         fitted, count = conditions(~self.held), null.shape[1]
-        both = null_space(fitted, self.tolerance).columns
+        both = null_space(fitted, self.tolerance, below=self.null).columns
         every = np.vstack([fitted, conditions(self.held)])
         both = self._judged(both, null @ both[:count], every)
         # No gauge closes the identity of X = 0: constants have been left out.
@@ -210,14 +219,16 @@ class Search:
     def _symmetry(self, vector, variational, symplectic, before) -> Symmetry:
         orders, components = self.order + 1, len(self.units)
         shares = vector[: orders * self.size].reshape(orders, components, self.basis.size)
-        shares = np.where(np.abs(shares) > _TINY * np.max(np.abs(shares)), shares, 0.0)
+        above = (_TINY if self.null <= NULL else self.null) * np.max(np.abs(shares))
+        shares = np.where(np.abs(shares) > above, shares, 0.0)
         c = shares * self.units[:, None] / self.rms
         largest = np.argmax(np.round(np.abs(c[0]) / np.max(np.abs(c[0])), 6))
         scale = 1 / c[0].ravel()[largest]
         c = c * scale
         identity = self._sums(self.identity, c)
         if variational:
-            g = vector[orders * self.size :].reshape(orders, self.gauge_basis.size) * scale
+            g = vector[orders * self.size :].reshape(orders, self.gauge_basis.size)
+            g = np.where(np.abs(g) > (above if self.null > NULL else 0), g, 0.0) * scale
         else:
             g = self._best_gauge(identity)
         identity = identity + _toeplitz_sums(self.gauge, g)
@@ -225,7 +236,7 @@ class Search:
         identity_residuals = self._relative(identity, self.parts[1], c)
         c, g = (in_units_of(1 / self.scale, x, axis=0) for x in (c, g))
         generators = tuple(self._generator(x) for x in c)
-        gauges = tuple(BasisGauge(self.gauge_basis, jnp.asarray(x)) for x in g)
+        gauges = tuple(BasisGauge(self.gauge_basis, jnp.asarray(x / self.gauge_units)) for x in g)
         return Symmetry(
             generators=generators,
             is_variational=variational,
@@ -238,6 +249,8 @@ class Search:
             names=self.names,
             basis=self.basis,
             scale=self.scale,
+            sizes=self.rms / self.units[:, None],
+            gauge_sizes=self.gauge_units,
         )
 
     def _generator(self, c: np.ndarray) -> Generator:

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._precision import refuse_double_without_x64
+from lanewise.jaxapi import x64_enabled
+
 from .._results import RESULTS
 from .._step import Equations, step
 from .._system import System, check_system
@@ -32,15 +33,61 @@ class Samples(NamedTuple):
         return held
 
 
+LATER = (37.3, 1000.7)
+"""Shifts of time, in steps, at which a map that does not depend on it is the same."""
+
+_FAR = 100.0
+"""A sample that is farther from the median than this many typical distances does not tell how wide
+the others spread."""
+
+_LOST = 1e5
+"""Polynomials are taken about the middle of the samples where they would lose so much by rounding
+about the origin."""
+
+
 def spread(values: np.ndarray) -> float:
-    """Standard deviation of the components about their means; 1 where nothing varies."""
+    """Standard deviation of the components about their means; 1 where nothing varies. Samples far
+    away from nearly all others are left out."""
+    distance = np.abs(values - np.median(values, axis=0))
+    near = distance <= _FAR * np.median(distance, axis=0)
+    near = near.reshape(len(values), -1).all(axis=1)
+    values = values[near] if 2 * np.sum(near) > len(values) else values
     size = float(np.sqrt(np.mean((values - np.mean(values, axis=0)) ** 2)))
     return size if size > 0 else 1.0
 
 
+def rounding(samples: Samples) -> float:
+    """The last digit of the coordinates as a share of how much they vary over the samples."""
+    sizes = [np.median(np.abs(x), axis=0).max() / spread(x) for x in (samples.q, samples.p)]
+    return float(np.finfo(float).eps * max(sizes))
+
+
+def middle(samples: Samples, degree: int) -> np.ndarray:
+    """Where polynomials of a degree are taken about: m of z = (q, p, t), shape (2n + 1,).
+
+    m_i = 0 where the origin is as good; else the median of z_i, rounded to about as much as the
+    samples spread.
+    """
+    z = [x.reshape(len(samples.q), -1) for x in (samples.q, samples.p, samples.t)]
+    z = np.concatenate(z, axis=1)
+    out = np.zeros(z.shape[1])
+    for i, x in enumerate(z.T):
+        median = np.median(x)
+        width = np.median(np.abs(x - median))
+        if width > 0 and degree * np.log(max(abs(median), width) / width) > np.log(_LOST):
+            step = 10.0 ** np.round(np.log10(width))
+            out[i] = float(np.format_float_scientific(np.round(median / step) * step, 15))
+    return out
+
+
 def as_samples(samples: Any, t0: float = 0.0) -> Samples:
     """(qs, ps) at the time t0, or (qs, ps, ts), after refusing what cannot be sampled points."""
-    refuse_double_without_x64("samples", np.float64)
+    if not x64_enabled():
+        raise TypeError(
+            "this process computes in float32, and what is conserved can be told in double "
+            'precision only, whatever the type of the samples: put\n    jax.config.update("'
+            'jax_enable_x64", True)\nbefore the first array is made.'
+        )
     if isinstance(samples, Samples):
         return samples
     try:
@@ -120,6 +167,7 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
     Returns the condition number of the functions, each scaled to one size.
     """
     check_finite(basis, values)
+    values = values / np.maximum(np.max(np.abs(values), axis=0), np.finfo(float).tiny)
     scale = np.linalg.norm(values, axis=0)
     zero = np.flatnonzero(scale == 0)
     normal = values / np.where(scale > 0, scale, 1)

@@ -10,7 +10,7 @@ from .._step import Equations
 from .._system import System
 from .._types import Args
 from ..engine.newton import Newton, RootSolver
-from ..engine.nullspace import triangle
+from ..engine.nullspace import triangle, typical_sizes
 from .basis import AbstractBasis, Basis, BoundBasis, Product, Sum, bind_basis, check_step_size
 from .conditions import Conditions, at_samples, require_finite, require_times, values_at
 from .families import TIME, Polynomials, coordinate_names
@@ -19,10 +19,13 @@ from .sampling import (
     Samples,
     as_samples,
     check_basis,
+    check_finite,
+    middle,
     require_enough,
     require_steps,
     require_system,
     require_time,
+    spread,
 )
 from .symmetries import Symmetries
 
@@ -108,6 +111,8 @@ def find_symmetries(
     bound = bind_basis(basis, shape)
     require_time(bound, samples)
     gauge_basis = bind_basis(_enlarged(basis, shape) if gauges is None else gauges, shape)
+    at = middle(samples, max(gauge_basis.complexity))
+    bound, gauge_basis = bound.about(at, exactly=True)[0], gauge_basis.about(at)[0]
     if gauges is not None:
         require_time(gauge_basis, samples)
     n = int(np.prod(shape, dtype=int))
@@ -119,13 +124,15 @@ def find_symmetries(
     system.check_shapes(t, q, p, jnp.zeros(()), args)
     equations = Equations(system, jnp.zeros(()), args, newton)
     for one in (bound, gauge_basis) if gauges is not None else (bound,):
-        check_basis(one, values_at(one, samples))
+        values = values_at(one, samples)
+        check_finite(one, values)
+        check_basis(one, typical_sizes(values)[1][:, None] * values)
     raw = at_samples(equations, jnp.asarray(h), bound, gauge_basis, order, samples)
     raw = Conditions(*map(np.asarray, raw))
     require_steps(raw.good[:, 0] == 1, samples)
     require_finite(raw)
     require_times(raw, samples, h)
-    gauge_basis, raw = _independent_gauges(gauge_basis, raw, samples)
+    gauge_basis, raw = _independent_gauges(gauge_basis, raw, samples, h)
     return Search(raw, samples, h, bool(time), bound, gauge_basis, tolerance).result()
 
 
@@ -158,9 +165,13 @@ class _Chosen(eqx.Module):
         return self.basis(q, p, t)[np.array(self.places, int)]
 
 
-def _independent_gauges(basis: BoundBasis, raw: Conditions, samples: Samples):
+def _independent_gauges(basis: BoundBasis, raw: Conditions, samples: Samples, h: float):
     """The gauge functions without constants and those that depend on simpler ones."""
-    rows = raw.gauge[~samples.held_out, 0]
+    fit = ~samples.held_out
+    n = samples.q[0].size
+    units = np.repeat([abs(h), spread(samples.q), spread(samples.p)], [1, n, n])
+    typical = typical_sizes(values_at(basis, samples))[0]
+    rows = raw.gauge[fit, 0] * units[:, None] / np.where(typical > 0, typical, abs(h))
     length = np.linalg.norm(rows, axis=(1, 2), keepdims=True)
     columns = triangle(rows_of(rows / np.where(length > 0, length, 1)))
     size = np.linalg.norm(columns, axis=0)

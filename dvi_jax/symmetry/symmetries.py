@@ -12,6 +12,9 @@ from .gauge import BasisGauge
 from .generators import Generator
 from .noether import AdiabaticInvariant
 
+_COARSE = 1e-5
+"""A search that cannot see terms of this relative size says so."""
+
 _RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -46,6 +49,8 @@ class Symmetry(eqx.Module):
     - `coefficients`: shape (z + 1, components, basis size), components ξ0 (if looked for), those
       of ξ, those of η, named in `names`.
     - `scale`: 1 over the ε at which the disturbance is as large as the rest.
+    - `sizes`: shape (components, basis size), what a coefficient of 1 amounts to on the samples;
+      `gauge_sizes`: the same for the gauges. Formulas leave out terms below 1e-9 of the largest.
     """
 
     generators: tuple[Generator, ...]
@@ -59,6 +64,8 @@ class Symmetry(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     basis: BoundBasis
     scale: float = eqx.field(static=True, default=1.0)
+    sizes: np.ndarray | None = None
+    gauge_sizes: np.ndarray | None = None
 
     @property
     def order(self) -> int:
@@ -79,6 +86,7 @@ class Symmetry(eqx.Module):
 
     def __str__(self) -> str:
         shares = np.abs(in_units_of(self.scale, self.coefficients, axis=0))
+        shares = shares if self.sizes is None else shares * self.sizes
         largest = np.max(shares, initial=0.0)
         c = np.where(shares > 1e-9 * largest, self.coefficients, 0.0)
         parts = [
@@ -96,8 +104,10 @@ class Symmetries(eqx.Module):
     - `survivors`: for m = 0 … order, how many leading parts X_0 go on to order m.
     - `singular_values`: of all conditions, descending, relative to the largest; `gap`: the ratio
       at which they were cut (large is clear, below 1e3 is not).
+    - `null`: below this relative size a singular value is zero, as far as rounding lets one tell.
     - `refused`: null vectors of the fitted samples that failed on the held-out ones.
-    - `basis`: of the components of the generators. `gauge_basis`: of the gauges, functions left
+    - `basis`: of the components of the generators; where the samples lie far from the origin,
+      polynomials about their middle, as the names say. `gauge_basis`: of the gauges, functions left
       out that are constant or depend on others.
 
     On resonant or integrable systems the null space is large: a symmetry times an invariant is a
@@ -109,6 +119,7 @@ class Symmetries(eqx.Module):
     survivors: tuple[int, ...] = eqx.field(static=True)
     singular_values: np.ndarray
     gap: float = eqx.field(static=True)
+    null: float = eqx.field(static=True)
     refused: int = eqx.field(static=True)
     basis: BoundBasis
     gauge_basis: BoundBasis
@@ -136,9 +147,15 @@ class Symmetries(eqx.Module):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Why the answer is not to be relied on, each with what would help; empty if it is."""
+        told = []
         if self.survivors[0] and self.gap < CLEAR:
-            return ("the gap is not clear: take more samples, or others",)
-        return ()
+            told.append("the gap is not clear: take more samples, or others")
+        if self.null > _COARSE:
+            told.append(
+                f"what breaks a symmetry by less than {self.null:.0e} cannot be decided in this "
+                "arithmetic: the samples lie far from the origin, or the tolerance is large"
+            )
+        return tuple(told)
 
     def __len__(self) -> int:
         return self.count
@@ -190,6 +207,8 @@ def _described(symmetry: Symmetry) -> list[str]:
         shares, others = (
             np.abs(in_units_of(symmetry.scale, x, axis=0)) for x in (gauges, symmetry.coefficients)
         )
+        if symmetry.sizes is not None and symmetry.gauge_sizes is not None:
+            shares, others = shares * symmetry.gauge_sizes, others * symmetry.sizes
         size = max(np.max(shares, initial=0.0), np.max(others))
         gauges = np.where(shares > 1e-9 * size, gauges, 0.0)
         lines.append(f"      gauge G = {_series(symmetry.gauges[0].basis, gauges)}")

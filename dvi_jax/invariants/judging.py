@@ -1,0 +1,153 @@
+"""How well what was found is conserved: sample by sample, by size, and in how few functions."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..engine.nullspace import (
+    RANK,
+    ROUNDING,
+    Motion,
+    null_space,
+    relative_changes,
+    triangle,
+)
+from ..symmetry.sampling import Samples
+from .changes import Changes, Stepped, changes_at
+
+CLEARLY = 1e-9
+"""Changes of an invariant, by the measure of `Motion`, for nearly all samples."""
+
+_SAME = 1e-3
+"""Two functions whose difference is this share of them are one, with and without errors."""
+
+_LARGER = (2.0, 4.0, 8.0)
+"""Sizes of the samples, about their middle, on which an exact invariant is kept alike."""
+
+_ROUND_OFF = 1e-13
+"""Shares below this of the largest are not there."""
+
+
+class Judge(NamedTuple):
+    """Samples that judge: what functions change by there, in units of ε · `scale`, and weights of
+    the samples, shape (S,)."""
+
+    changes: Changes
+    calm: np.ndarray
+    scale: float = 1.0
+
+    def quantiles(self, coefficients: np.ndarray, share: float) -> np.ndarray:
+        """The change that the given share of the samples stays below, shape (count, z + 1)."""
+        out = np.zeros(coefficients.shape[:2])
+        calm = self.calm**2 / np.sum(self.calm**2)
+        for i, c in enumerate(coefficients):
+            leading = self.changes.values @ c[0]
+            size = np.sqrt(calm @ leading**2)
+            spread = np.sqrt(calm @ (leading - calm @ leading) ** 2)
+            spread = float(max(spread, 1e-6 * size, np.finfo(float).tiny))
+            series = c / self.scale ** np.arange(len(c))[:, None]
+            found = relative_changes(self.changes.terms, series, self.changes.motion, spread)
+            out[i] = np.quantile(found, share, axis=0)
+        return out
+
+    def keep(self, coefficients: np.ndarray) -> np.ndarray:
+        """Which series change by no more than rounding, shape (count,)."""
+        return np.all(self.quantiles(coefficients, 0.95) <= CLEARLY, axis=1)
+
+
+class Fewest:
+    """Invariants of order 0 solved for again, to more digits, in the functions up to the lowest
+    complexity that hold them: of functions that one does not need the coefficients are errors only.
+    """
+
+    def __init__(self, complexity, rms, changes, motion, values):
+        self.complexity, self.rms = np.array(complexity), rms
+        self.changes, self.motion, self.values = changes, motion, values
+        self.kept: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
+
+    def up_to(self, level: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """What is kept by the functions up to a complexity: columns of coefficients, and values."""
+        some = self.complexity <= level
+        R = triangle(self.values[:, some] / self.rms[some]) / np.sqrt(len(self.values))
+        if len(R) < np.sum(some) or np.linalg.cond(R) > 1 / RANK**2:
+            return None
+        orthonormal = np.linalg.inv(R) / self.rms[some][:, None]
+        motion = Motion(self.motion.changes[..., some], self.motion.rounding[:, some])
+        rows = self.changes[:, some] @ orthonormal
+        rows = motion.of(orthonormal).weights()[:, None] * rows / np.sqrt(len(rows))
+        columns = orthonormal @ null_space(rows, unit=1.0).columns
+        return columns, self.values[:, some] @ columns
+
+    def again(self, shares: np.ndarray) -> np.ndarray:
+        """The shares of an invariant, in as few functions as can be."""
+        target = self.values @ (shares / self.rms)
+        for level in sorted(set(self.complexity)):
+            if level not in self.kept:
+                self.kept[level] = self.up_to(level)
+            kept = self.kept[level]
+            if kept is None or kept[0].shape[1] == 0:
+                continue
+            found = np.linalg.lstsq(kept[1], target)[0]
+            if np.linalg.norm(kept[1] @ found - target) <= _SAME * np.linalg.norm(target):
+                out = np.zeros(len(shares))
+                some = self.complexity <= level
+                out[some] = (kept[0] @ found) * self.rms[some]
+                return cleaned(out)
+        return shares
+
+
+def cleaned(shares: np.ndarray, blur: float = RANK) -> np.ndarray:
+    """The shares without what is round-off of the others."""
+    above = _ROUND_OFF if blur <= RANK else blur
+    return np.where(np.abs(shares) > above * np.max(np.abs(shares)), shares, 0.0)
+
+
+def powers_of_size(
+    stepped: Stepped, coefficients: np.ndarray, samples: Samples, most: np.ndarray
+) -> np.ndarray:
+    """The power of the samples' size by which changes grow, shape (count,): 0 for an invariant that
+    is kept on samples several times as large, which an expansion about their middle is not; NaN
+    where no map or function is defined there. `most`: the changes on the samples themselves."""
+    unknown = np.full(len(coefficients), np.nan)
+    if len(coefficients) == 0:
+        return unknown
+    which = np.arange(len(samples.q)) % len(_LARGER)
+    factors = np.array(_LARGER)[which]
+    larger = [_enlarged(x, factors) for x in samples[:2]]
+    at = samples._replace(q=larger[0], p=larger[1])
+    found = changes_at(stepped, 0, at)
+    changes, sizes = [most], [1.0]
+    for k, factor in enumerate(_LARGER):
+        some = found.good & (which == k)
+        if np.sum(some) < 0.5 * np.sum(which == k):
+            break
+        judge = Judge(found.at(some), np.ones(np.sum(some)))
+        changes.append(judge.quantiles(coefficients, 0.95)[:, 0])
+        sizes.append(factor)
+    if len(changes) < 2:
+        return unknown
+    powers = np.zeros(len(coefficients))
+    for i, row in enumerate(np.stack(changes, axis=1)):
+        above = np.flatnonzero(row > 10 * CLEARLY)
+        if len(above):
+            k = max(above[0], 1)
+            grows = np.log(row[k] / max(row[k - 1], ROUNDING))
+            powers[i] = grows / np.log(sizes[k] / sizes[k - 1])
+    return powers
+
+
+def _enlarged(x: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Each sample at its multiple of the distance from the median."""
+    centre = np.median(x, axis=0)
+    return centre + factors.reshape(-1, *[1] * (x.ndim - 1)) * (x - centre)
+
+
+def reach(coefficients: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The smallest ε at which a correction is as large as the leading part, shape (count,)."""
+    out = np.full(len(coefficients), np.inf)
+    for i, c in enumerate(coefficients):
+        sizes = np.sqrt(np.mean((values @ c.T) ** 2, axis=0))
+        for m in range(1, len(c)):
+            if sizes[m] > 0:
+                out[i] = min(out[i], (sizes[0] / sizes[m]) ** (1 / m))
+    return out
