@@ -1176,6 +1176,22 @@ def test_a_top_precesses_steadily_where_it_should():
     assert np.all(np.isnan(steady_precession(theta, 0.5, args)))  # too slow
 
 
+@pytest.mark.parametrize(("mode", "growth"), [(0, np.sqrt(0.28)), (3, 0.0)])
+def test_plane_waves_of_the_schroedinger_lattice_are_unstable_where_cos_k_is_positive(mode, growth):
+    n, amplitude, time = 6, 0.8, 15.0
+    problem = systems.nls_lattice(n)
+    q, p = plane_wave(0.0, n, mode, amplitude, problem.args)
+    modulation = 1 + 1e-7 * np.cos(2 * np.pi * np.arange(n) / n)
+    run = functools.partial(
+        dvi.integrate, problem.system, h=0.1, num_steps=round(time / 0.1), args=problem.args,
+        method=dvi.GaussLegendre(2), save=dvi.Save(final=True),
+    )  # fmt: skip
+    solution = run(np.asarray(q) * modulation, np.asarray(p) * modulation)
+    density = (solution.qs[-1] ** 2 + solution.ps[-1] ** 2) / 2
+    left = float(np.ptp(density)) / (4e-7 * amplitude**2)  # what it began with is 1
+    assert left == pytest.approx(np.cosh(growth * time), rel=0.02) if growth else left < 2
+
+
 def test_plane_waves_solve_the_schroedinger_lattice():
     args = {"kappa": 0.7, "gamma": 1.3}
     for mode in (0, 2):

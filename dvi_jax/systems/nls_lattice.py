@@ -44,8 +44,16 @@ def plane_wave(t, n, mode, amplitude, args):
 
         k = 2π mode/n,    ω = 4κ sin²(k/2) − γ a²
 
-    - `t`: times, any shape. Returns q, p of shape t.shape + (n,). With κγ > 0 and a large enough
-      it is unstable. **Source** Kevrekidis 2009, *The Discrete Nonlinear Schrödinger Equation*.
+    - `t`: times, any shape. Returns q, p of shape t.shape + (n,).
+
+    A modulation of it with wave number Q ≠ 0, a multiple of 2π/n, grows as exp(σt),
+
+        σ² = 4κ cos k sin²(Q/2) (2γa² − 4κ cos k sin²(Q/2)) ,
+
+    where that is positive: for κγ cos k > 0 and |γ|a² > 2|κ cos k| sin²(Q/2); else none grows.
+
+    **Source** Kivshar and Peyrard 1992, Phys. Rev. A 46, 3198; Kevrekidis 2009, *The Discrete
+    Nonlinear Schrödinger Equation*.
     """
     k = 2 * np.pi * mode / n
     omega = 4 * args["kappa"] * np.sin(k / 2) ** 2 - args["gamma"] * amplitude**2
