@@ -1,12 +1,17 @@
 """Small dense linear systems, and Jacobians that keep the zeros of their structure."""
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from .jaxapi import primitive
 
 WRITTEN_OUT = 4
-"""Systems up to this size are eliminated number by number in XLA too; larger ones go to LAPACK."""
+"""Systems up to this size are eliminated number by number in XLA too."""
+
+IN_A_LOOP = 64
+"""Batches of systems up to this size are eliminated column by column on a CPU: LAPACK's calls for
+batches share the threads of XLA, and may wait for ever for a thread that waits for them."""
 
 
 def solve(A: Array, b: Array) -> Array:
@@ -60,7 +65,40 @@ def by_elimination(A: Array, b: Array) -> Array:
     return jnp.stack(x)
 
 
-_eliminate = primitive("eliminate", _in_arrays)
+def column_by_column(A: Array, b: Array) -> tuple[Array, Array]:
+    """The solution x of A x = b, and log |det A|: Gauss and Jordan's elimination, as a loop.
+
+    In column c the largest number of the rows not used yet is the pivot; the column is then
+    eliminated from all other rows.
+    """
+    n = b.shape[0]
+
+    def eliminate(c, state):
+        rows, logarithm = state
+        size = jnp.where(jnp.arange(n) >= c, jnp.abs(rows[:, c]), -1.0)
+        p = jnp.argmax(size)
+        pivot, there = rows[p], rows[c]
+        rows = rows.at[p].set(there).at[c].set(pivot / pivot[c])
+        factors = jnp.where(jnp.arange(n) == c, 0.0, rows[:, c])
+        return rows - factors[:, None] * rows[c][None], logarithm + jnp.log(jnp.abs(pivot[c]))
+
+    start = jnp.concatenate([A, b[:, None]], axis=1), jnp.zeros((), A.dtype)
+    rows, logarithm = lax.fori_loop(0, n, eliminate, start)
+    return rows[:, n], logarithm
+
+
+def _in_batches(arrays, axes):
+    def one(A, b):
+        if not WRITTEN_OUT < b.shape[0] <= IN_A_LOOP:
+            return _in_arrays(A, b)
+        return lax.platform_dependent(
+            A, b, cpu=lambda A, b: column_by_column(A, b)[0], default=_in_arrays
+        )
+
+    return jax.vmap(one, axes, 0)(*arrays), 0
+
+
+_eliminate = primitive("eliminate", _in_arrays, _in_batches)
 
 
 def unit_vectors(n: int, dtype) -> Array:

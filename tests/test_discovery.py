@@ -1,6 +1,9 @@
 """Discovery of adiabatic invariants on the map that is iterated."""
 
 import functools
+import re
+import subprocess
+import sys
 
 import faults
 import jax
@@ -10,8 +13,11 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax import systems
-from dvi_jax.invariants import obstructions
-from dvi_jax.symmetry.sampling import Samples
+from dvi_jax._step import Equations
+from dvi_jax.invariants import changes, obstructions
+from dvi_jax.symmetry import conditions
+from dvi_jax.symmetry.basis import bind_basis
+from dvi_jax.symmetry.sampling import Samples, as_samples
 
 H_D = systems.oscillator().system.H_D
 SPRING = dvi.System(H_D, force=lambda t0, t1, q, p, args: -q)
@@ -912,3 +918,46 @@ def test_a_disturbance_of_any_strength_gives_the_same_series(strength):
     assert first[names.index("q⁴")] == pytest.approx(0.251256, rel=1e-5)
     assert first[names.index("q³ p")] == pytest.approx(-0.0502513, rel=1e-5)
     assert len(series) == 1
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_searches_call_no_lapack_for_a_batch(order):
+    """Such calls waited for one another for ever, on two cores and more."""
+    samples = as_samples(box(3, 40))
+    system = dvi.System(
+        lambda t0, t1, q, p, args: (p @ p + q @ q) / 2 + (p @ q) ** 2,
+        perturbation=lambda t0, t1, q, p, args: q[0] ** 2 * q[1],
+    )
+    equations = Equations(system, jnp.zeros(()), None, dvi.Newton())
+    basis = bind_basis(dvi.Polynomials(1), (3,))
+    stepped = changes.Stepped(equations, np.asarray(0.1), dvi.GaussLegendre(2), basis)
+    texts = [
+        changes.batched_changes.lower(stepped, order, samples),
+        conditions.at_samples.lower(equations, jnp.asarray(0.1), basis, basis, order, samples),
+    ]
+    for lowered in texts:
+        assert not re.findall("getrf|trsm|lapack", lowered.as_text())
+
+
+HANGING = """
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+import dvi_jax as dvi
+samples = tuple(np.random.default_rng(3).uniform(-1, 1, (2, 300, 2)))
+system = dvi.System(lambda t0, t1, q, p, a: (p @ p + q @ q) / 2,
+                    perturbation=lambda t0, t1, q, p, a: q[0] ** 2 * q[1] - q[1] ** 3 / 3)
+basis, method = dvi.Polynomials({degree}), dvi.GaussLegendre(4)
+for _ in range({repeats}):
+    if {order} < 0:
+        dvi.find_symmetries(system, dvi.Polynomials(1), h=0.02, samples=samples)
+    else:
+        dvi.discover_invariants(system, basis, {order}, h=0.02, samples=samples, method=method)
+"""
+
+
+@pytest.mark.parametrize(("order", "degree"), [(1, 4), (-1, 1)])
+@pytest.mark.slow
+def test_searches_end(order, degree):
+    """20 times in a child process."""
+    text = HANGING.format(order=order, degree=degree, repeats=20)
+    subprocess.run([sys.executable, "-c", text], timeout=500, check=True)

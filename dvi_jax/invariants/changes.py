@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+import lanewise
 from lanewise.dependence import depends_on
+from lanewise.linear import column_by_column
 
 from .._results import RESULTS
 from .._step import Equations
@@ -63,7 +65,7 @@ class Changes(NamedTuple):
 
 def changes_at(stepped: Stepped, order: int, samples: Samples) -> Changes:
     """Without a check of anything."""
-    found = [np.asarray(x) for x in _at_points(stepped, order, samples)]
+    found = [np.asarray(x) for x in batched_changes(stepped, order, samples)]
     values, terms, volume, good, slopes, move, blur = found
     finite = [np.isfinite(x.reshape(len(good), -1)).all(axis=1) for x in found]
     with np.errstate(all="ignore"):
@@ -79,7 +81,7 @@ def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
     basis = stepped.basis
     found = changes_at(stepped, order, samples)
     if not found.good.all():
-        require_steps(np.asarray(_at_points(stepped, order, samples)[3]), samples)
+        require_steps(np.asarray(batched_changes(stepped, order, samples)[3]), samples)
     check_finite(basis, found.values)
     bad = ~np.isfinite(found.terms)
     if bad.any():
@@ -144,8 +146,21 @@ def _map(stepped: Stepped, epsilon: Array) -> Any:
     return step
 
 
+@jax.custom_jvp
+def _log_determinant(A: Array) -> Array:
+    """log |det A|, without LAPACK (see `lanewise.linear.IN_A_LOOP`)."""
+    return column_by_column(A, A[:, 0])[1]
+
+
+@_log_determinant.defjvp
+def _of_log_determinant(primals, tangents):
+    (A,), (dA,) = primals, tangents
+    solved = jax.vmap(lanewise.solve, (None, 1), 1)(A, dA)
+    return _log_determinant(A), jnp.trace(solved)
+
+
 @eqx.filter_jit
-def _at_points(stepped: Stepped, order: int, samples):
+def batched_changes(stepped: Stepped, order: int, samples):
     """Values of the basis, Taylor coefficients in ε of their changes and of log |det DΦ|.
 
     Shapes (S, B), (S, z + 1, B), (S, z + 1); whether the steps succeed, (S,); slopes of the
@@ -167,7 +182,7 @@ def _at_points(stepped: Stepped, order: int, samples):
                 return jnp.concatenate([q1.ravel(), p1.ravel()])
 
             z = jnp.concatenate([q.ravel(), p.ravel()])
-            return jnp.linalg.slogdet(jax.jacfwd(flat)(z))[1]
+            return _log_determinant(jax.jacfwd(flat)(z))
 
         zero = jnp.zeros(())
         terms = taylor_coefficients(lambda e: change(e)[0], zero, order)
