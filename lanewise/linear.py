@@ -65,35 +65,30 @@ def by_elimination(A: Array, b: Array) -> Array:
     return jnp.stack(x)
 
 
-def column_by_column(A: Array, b: Array) -> tuple[Array, Array]:
-    """The solution x of A x = b, and log |det A|: Gauss and Jordan's elimination, as a loop.
+def _column_by_column(A: Array, b: Array) -> Array:
+    """The solution x of A x = b by Gauss and Jordan's elimination, as a loop.
 
     In column c the largest number of the rows not used yet is the pivot; the column is then
     eliminated from all other rows.
     """
     n = b.shape[0]
 
-    def eliminate(c, state):
-        rows, logarithm = state
+    def eliminate(c, rows):
         size = jnp.where(jnp.arange(n) >= c, jnp.abs(rows[:, c]), -1.0)
         p = jnp.argmax(size)
         pivot, there = rows[p], rows[c]
         rows = rows.at[p].set(there).at[c].set(pivot / pivot[c])
         factors = jnp.where(jnp.arange(n) == c, 0.0, rows[:, c])
-        return rows - factors[:, None] * rows[c][None], logarithm + jnp.log(jnp.abs(pivot[c]))
+        return rows - factors[:, None] * rows[c][None]
 
-    start = jnp.concatenate([A, b[:, None]], axis=1), jnp.zeros((), A.dtype)
-    rows, logarithm = lax.fori_loop(0, n, eliminate, start)
-    return rows[:, n], logarithm
+    return lax.fori_loop(0, n, eliminate, jnp.concatenate([A, b[:, None]], axis=1))[:, n]
 
 
 def _in_batches(arrays, axes):
     def one(A, b):
         if not WRITTEN_OUT < b.shape[0] <= IN_A_LOOP:
             return _in_arrays(A, b)
-        return lax.platform_dependent(
-            A, b, cpu=lambda A, b: column_by_column(A, b)[0], default=_in_arrays
-        )
+        return lax.platform_dependent(A, b, cpu=_column_by_column, default=_in_arrays)
 
     return jax.vmap(one, axes, 0)(*arrays), 0
 

@@ -10,7 +10,6 @@ from jaxtyping import Array
 
 import lanewise
 from lanewise.dependence import depends_on
-from lanewise.linear import column_by_column
 
 from .._results import RESULTS
 from .._step import Equations
@@ -45,8 +44,9 @@ class Changes(NamedTuple):
     """At S samples, for B functions.
 
     - `values`: φ, (S, B). `terms`: A_0 … A_z, (S, z + 1, B): Taylor coefficients in ε of
-      φ(Φ_ε(z), t + h) − φ(z, t). `volume`: those of log |det DΦ|, (S, z + 1).
+      φ(Φ_ε(z), t + h) − φ(z, t). `volume`: those of log |det DΦ_ε| from order 1, (S, z + 1).
     - `motion`: what slopes predict for A_0, and its rounding.
+    - `slopes`: ∂φ/∂(q, p, t), (S, B, 2n + 1).
     - `good`: where the step succeeds and all is finite, (S,).
     """
 
@@ -54,13 +54,20 @@ class Changes(NamedTuple):
     terms: np.ndarray
     volume: np.ndarray
     motion: Motion
+    slopes: np.ndarray
     good: np.ndarray
 
     def at(self, some: np.ndarray) -> "Changes":
         """Of some of the samples."""
         motion = Motion(*(x[some] for x in self.motion))
-        return Changes(self.values[some], self.terms[some], self.volume[some], motion,
-                       self.good[some])  # fmt: skip
+        return Changes(
+            values=self.values[some],
+            terms=self.terms[some],
+            volume=self.volume[some],
+            motion=motion,
+            slopes=self.slopes[some],
+            good=self.good[some],
+        )
 
 
 def changes_at(stepped: Stepped, order: int, samples: Samples) -> Changes:
@@ -73,7 +80,7 @@ def changes_at(stepped: Stepped, order: int, samples: Samples) -> Changes:
         rounding = rounding + np.einsum("sbi,si->sb", np.abs(slopes), blur)
         predicted = (slopes * move[:, None]).swapaxes(1, 2)
     motion = Motion(predicted, np.finfo(float).eps * rounding)
-    return Changes(values, terms, volume, motion, good & np.all(finite, axis=0))
+    return Changes(values, terms, volume, motion, slopes, good & np.all(finite, axis=0))
 
 
 def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
@@ -146,22 +153,10 @@ def _map(stepped: Stepped, epsilon: Array) -> Any:
     return step
 
 
-@jax.custom_jvp
-def _log_determinant(A: Array) -> Array:
-    """log |det A|, without LAPACK (see `lanewise.linear.IN_A_LOOP`)."""
-    return column_by_column(A, A[:, 0])[1]
-
-
-@_log_determinant.defjvp
-def _of_log_determinant(primals, tangents):
-    (A,), (dA,) = primals, tangents
-    solved = jax.vmap(lanewise.solve, (None, 1), 1)(A, dA)
-    return _log_determinant(A), jnp.trace(solved)
-
-
 @eqx.filter_jit
 def batched_changes(stepped: Stepped, order: int, samples):
-    """Values of the basis, Taylor coefficients in ε of their changes and of log |det DΦ|.
+    """Values of the basis, Taylor coefficients in ε of their changes and of log |det DΦ_ε| (but
+    its order 0, which is left at 0).
 
     Shapes (S, B), (S, z + 1, B), (S, z + 1); whether the steps succeed, (S,); slopes of the
     functions, (S, B, 2n + 1); z1 − z, and what z1 and z − z1 are rounded by in units of the last
@@ -174,22 +169,26 @@ def batched_changes(stepped: Stepped, order: int, samples):
             q1, p1, t1, info = _map(stepped, epsilon)(q, p, t)
             return basis(q1, p1, t1) - basis(q, p, t), info.result == RESULTS.successful
 
-        def volume(epsilon):
+        def jacobian(epsilon):
             def flat(z):
                 q1, p1, _, _ = _map(stepped, epsilon)(
                     z[: q.size].reshape(q.shape), z[q.size :].reshape(p.shape), t
                 )
                 return jnp.concatenate([q1.ravel(), p1.ravel()])
 
-            z = jnp.concatenate([q.ravel(), p.ravel()])
-            return _log_determinant(jax.jacfwd(flat)(z))
+            return jax.jacfwd(flat)(jnp.concatenate([q.ravel(), p.ravel()]))
+
+        def growth(epsilon):
+            """d log |det DΦ| / dε = tr(DΦ⁻¹ dDΦ/dε)."""
+            D, dD = jax.jvp(jacobian, (epsilon,), (jnp.ones(()),))
+            return jnp.trace(jax.vmap(lanewise.solve, (None, 1), 1)(D, dD))
 
         zero = jnp.zeros(())
         terms = taylor_coefficients(lambda e: change(e)[0], zero, order)
-        if order == 0:  # no law is asked for
-            volumes = jnp.zeros(1)
-        else:
-            volumes = taylor_coefficients(volume, zero, order)
+        volumes = jnp.zeros(order + 1)
+        if order > 0:
+            growths = taylor_coefficients(growth, zero, order - 1)
+            volumes = volumes.at[1:].set(growths / jnp.arange(1, order + 1))
 
         def flat(z):
             half = z[: q.size].reshape(q.shape), z[q.size : -1].reshape(p.shape), z[-1]

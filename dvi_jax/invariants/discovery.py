@@ -34,7 +34,7 @@ from .changes import Changes, Stepped, checked_changes, is_exact
 from .found import Discovery
 from .judging import Fewest, Judge, cleaned, powers_of_size, reach
 from .obstructions import drift_laws
-from .representatives import Span, differentials
+from .representatives import Span
 
 _FUZZY = 30.0
 """Coefficients are known up to this share of the largest, over the gap in singular values."""
@@ -204,7 +204,8 @@ class _Search:
         self.scale = epsilon_scale(weights[fit, None, None] * terms[fit])
         terms = in_units_of(self.scale, terms)
         self.sizes = self.rms / self.scale ** np.arange(order + 1)[:, None]
-        constant = _shares_of_constant(basis, self.rms, self.values, calm[fit], self._some())
+        self.slopes = changes.slopes[fit, :, :-1]
+        constant = _shares_of_constant(self.rms, self.values, calm[fit], self.slopes)
         self.constant = constant
         self.weights, self.rows = weights[fit], weights[fit, None, None] * terms[fit]
         self.spaces = series_spaces(
@@ -234,7 +235,7 @@ class _Search:
     def chosen(self, blur: float, representative: str) -> _Chosen:
         """One series for each leading part, in functions of the basis; `blur`: see `Span`."""
         span = Span(self.basis, self.rms, self.R, self.spaces[-1], blur, self.constant)
-        found = span.representatives(self.fitted)
+        found = span.representatives(self.fitted, self.slopes)
         picked = [self._picked(span, series, representative) for series in found.series]
         size = self.order + 1, self.basis.size
 
@@ -310,7 +311,7 @@ def _check_options(order: Any, tolerance: Any, representative: Any, method: Any)
     return number
 
 
-def _shares_of_constant(basis, rms, values, calm, samples) -> np.ndarray | None:
+def _shares_of_constant(rms, values, calm, slopes) -> np.ndarray | None:
     """The combination that is 1 everywhere (and not only on these samples), if there is one.
 
     `values`: of the functions, times the weights `calm` of the samples.
@@ -320,7 +321,7 @@ def _shares_of_constant(basis, rms, values, calm, samples) -> np.ndarray | None:
     terms = np.abs(values / rms) @ np.abs(shares)
     if np.max(np.abs(values / rms @ shares - calm) / terms) > 1e4 * np.finfo(float).eps:
         return None
-    slopes = np.asarray(differentials(basis, *samples)) / rms[:, None]
+    slopes = slopes / rms[:, None]
     terms = np.abs(slopes) * np.abs(shares)[:, None]
     sums = np.einsum("sbn,b->sn", slopes, shares)
     return shares if np.max(np.abs(sums)) <= 1e-9 * np.max(terms, initial=1.0) else None

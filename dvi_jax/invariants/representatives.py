@@ -1,12 +1,8 @@
 """Which series stands for an invariant: independent leading parts, and their corrections."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from ..engine.echelon import reduced, reduction
 from ..engine.nullspace import SeriesSpace, orthonormal_range
@@ -40,8 +36,10 @@ class Span:
         blocks = columns.reshape(self.orders, self.size, -1)
         return np.linalg.solve(self.R, blocks).reshape(columns.shape)
 
-    def representatives(self, samples: Samples) -> Representatives:
+    def representatives(self, samples: Samples, slopes: np.ndarray) -> Representatives:
         """One series for each leading part, the simplest leading parts first.
+
+        `slopes`: ∂φ/∂(q, p) of the functions at the samples, shape (S, size, 2n).
 
         A leading part is independent when its differential is, at generic points, outside the
         span of the differentials of those before it; otherwise it is a function of them.
@@ -49,11 +47,10 @@ class Span:
         if self.space.leading.shape[1] == 0:
             return Representatives([], [])
         some = slice(None, None, max(1, len(samples.q) // 40))
-        gradients = np.asarray(differentials(self.basis, *(x[some] for x in samples)))
+        gradients = slopes[some]
         # as fast as (q, p) change over the samples, so that their units do not matter
         units = np.repeat([spread(samples.q), spread(samples.p)], gradients.shape[2] // 2)
         gradients = gradients * units / self.rms[:, None]
-        _require_finite(self.basis, gradients)
         complexity = np.array(self.basis.complexity)
         series: list[np.ndarray] = []
         independent: list[bool] = []
@@ -118,23 +115,3 @@ class Span:
 def _svd(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Singular values and all right singular vectors as rows."""
     return np.linalg.svd(matrix)[1:] if matrix.size else (np.zeros(0), np.eye(matrix.shape[1]))
-
-
-def _require_finite(basis: BoundBasis, gradients: np.ndarray) -> None:
-    bad = ~np.isfinite(gradients).all(axis=(0, 2))
-    if bad.any():
-        raise ValueError(
-            f"the derivatives of the basis function {basis.names[int(np.argmax(bad))]!r} are not "
-            "finite on the samples: keep them off its singularity."
-        )
-
-
-@eqx.filter_jit
-def differentials(basis: BoundBasis, q: Any, p: Any, t: Any) -> Array:
-    """∂φ/∂(q, p) at points, shape (points, size, 2n)."""
-
-    def at_point(q, p, t):
-        slopes = jax.jacfwd(basis, argnums=(0, 1))(q, p, t)
-        return jnp.concatenate([j.reshape(basis.size, -1) for j in slopes], axis=1)
-
-    return jax.vmap(at_point)(q, p, t)
