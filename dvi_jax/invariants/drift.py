@@ -1,6 +1,5 @@
 """The order in ε to which something is conserved, measured."""
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -18,18 +17,18 @@ from ..engine.newton import Newton, RootSolver
 from ..engine.reads import Reads, reads
 from ..methods import Method, TypeII
 from ..observe import MaxDrift
+from .exponents import (
+    ENOUGH,
+    Exponent,
+    line,
+    line_interval,
+    plateau_level,
+    resolving_range,
+    small_epsilon_exponent,
+)
 
 _ABOVE_FLOOR = 10
 """A point counts when its drift is this many times the one that ε has no part in."""
-
-_ENOUGH = 3
-"""Points that a slope needs: two always lie on a line."""
-
-_FLAT = 0.5
-"""Below this slope a run of points at the smallest ε is a plateau."""
-
-_FLAT_SPAN = np.sqrt(10)
-"""Ratio of largest to smallest ε from which on such a run is believed."""
 
 _MEANINGS = {
     "failed": "too many of the starts failed",
@@ -49,11 +48,13 @@ class DriftOrder(NamedTuple):
       by the undisturbed map), or "failed" (then it is NaN).
     - `used`: which points the fit takes, shape (E,). `excluded`: why not the others: "failed",
       "no floor", "round-off", "mesh", "flat"; "" where used.
-    - `slope`, `stderr`: d log(drift) / d log(ε) by least squares and its standard error; NaN with
-      fewer than three points.
-    - `kept`: the starts that count, shape (S,). `start_drifts`, `statuses`: of every trajectory,
-      shape (E + 1, S), the last row at ε = 0. A status is one of `RESULTS` by name, or
-      "observable_not_finite".
+    - `slope`: the order s of drift ∝ ε^s for ε → 0 if it is `resolved`, else the slope of the
+      straight line by least squares; NaN with fewer than three points. `stderr`: half of the
+      95 % interval, divided by Student's t.
+    - `kept`: the initial conditions that count, shape (S,). `start_drifts`, `statuses`: of every
+      trajectory, shape (E + 1, S), the last row at ε = 0. A status is one of `RESULTS` by name,
+      or "observable_not_finite".
+    - `fit`: the comparison of models, an `Exponent`: probabilities, crossover, straight line.
     """
 
     epsilons: np.ndarray
@@ -67,27 +68,49 @@ class DriftOrder(NamedTuple):
     kept: np.ndarray
     start_drifts: np.ndarray
     statuses: np.ndarray
+    fit: Exponent
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the slope, by Student's t.
+        """95 % interval of the order for ε → 0, from the scatter and from the choice of the law.
 
-        It knows the scatter about a straight line; the bend that the next order brings at large ε
-        is a bias that it does not know (see `limit`).
+        If the order is not `resolved`, it also contains `slope`, the slope of the straight line.
         """
-        return _interval(self.slope, self.stderr, int(self.used.sum()))
+        return self.fit.interval
 
     @property
-    def limit(self) -> float:
-        """The slope for ε → 0: s in the fit drift = C ε^s exp(cε), the next order as a factor.
+    def resolved(self) -> bool:
+        """Whether the 95 % interval of the order for ε → 0 is at most 0.5 long."""
+        return self.fit.resolved
+
+    @property
+    def model(self) -> str:
+        """The most probable law: "power", "sum of two powers", …; see `Exponent`."""
+        return self.fit.model
+
+    @property
+    def curvature(self) -> float:
+        """d² log(drift) / d log(ε)² of a parabola through the points used, 0 for a power law.
 
         NaN with fewer than four points used.
         """
-        if self.used.sum() <= _ENOUGH:
-            return np.nan
-        x, y = self.epsilons[self.used], np.log(self.drifts[self.used])
-        columns = np.stack([np.ones_like(x), np.log(x), x / x.max()], axis=1)
-        return float(np.linalg.lstsq(columns, y)[0][1])
+        return self.fit.curvature
+
+    @property
+    def limit(self) -> float:
+        """The order for ε → 0 if it is `resolved`, else NaN."""
+        return self.slope if self.resolved else np.nan
+
+    @property
+    def resolving_range(self) -> tuple[float, float]:
+        """The smallest and the largest ε of a sweep that would resolve the order.
+
+        NaN if smaller ε are required and the drift at ε = 0 hides them, or with fewer than three
+        points used. See `small_epsilon_exponent`.
+        """
+        return resolving_range(
+            self.fit, self.epsilons[self.used], self.drifts[self.used], _ABOVE_FLOOR * self.floor
+        )
 
     @property
     def successful(self) -> np.ndarray:
@@ -98,21 +121,15 @@ class DriftOrder(NamedTuple):
     def slope_of_all(self) -> float:
         """The slope through all points, plateaus included: near 0 where ε has no part."""
         good = self.drifts > 0
-        return _line(np.log(self.epsilons[good]), np.log(self.drifts[good]))[0]
+        return line(np.log(self.epsilons[good]), np.log(self.drifts[good]))[0]
 
     def __str__(self) -> str:
         points, used = len(self.epsilons), int(self.used.sum())
-        low, high = self.interval
-        if used >= _ENOUGH:
-            lines = [
-                f"drift ∝ ε^{self.slope:.4g}, 95 % interval {low:.4g} … {high:.4g}, by {used} of "
-                f"{points} points"
-            ]
-            if np.isfinite(self.limit):
-                lines[0] += f"; for ε → 0 it tends to ε^{self.limit:.4g}"
+        if used >= ENOUGH:
+            lines = self.fit.report(points, self.resolving_range)
         else:
             lines = [
-                f"no order: {used} of {points} points can be used, {_ENOUGH} are needed (through "
+                f"no order: {used} of {points} points can be used, {ENOUGH} are needed (through "
                 f"all of them the slope is {self.slope_of_all:.2g})"
             ]
         lines.append(f"  drift at ε = 0: {self.floor:.2g} ({self.floor_cause})")
@@ -167,18 +184,18 @@ class DriftSurface(NamedTuple):
 
     @property
     def slopes(self) -> np.ndarray:
-        """The order in ε at each h, shape (H,)."""
+        """The order in ε at each h, shape (H,); of the straight line where it is not resolved."""
         return np.array([o.slope for o in self.orders])
 
     @property
     def intervals(self) -> np.ndarray:
-        """Their 95 % confidence intervals, shape (H, 2)."""
+        """Their 95 % intervals, shape (H, 2)."""
         return np.array([o.interval for o in self.orders])
 
     @property
     def mesh_interval(self) -> tuple[float, float]:
         """95 % confidence interval of the order in h of the drift at ε = 0."""
-        return _interval(self.mesh_slope, self.mesh_stderr, int(self.mesh_used.sum()))
+        return line_interval(self.mesh_slope, self.mesh_stderr, int(self.mesh_used.sum()))
 
     def __str__(self) -> str:
         def row(name, cells):
@@ -190,15 +207,21 @@ class DriftSurface(NamedTuple):
             cells = [f"{d:.2e}{m}" for d, m in zip(drifts, mark, strict=True)]
             lines.append(row(f"{epsilon:.3g}", cells))
         lines.append(row("0", [f"{floor:.2e} " for floor in self.floors]))
-        lines.append(row("slope", [f"{slope:.3f} " for slope in self.slopes]))
+        unclear = [np.isfinite(o.slope) and not o.resolved for o in self.orders]
+        cells = [
+            f"{o.slope:.3f}{'?' if u else ' '}" for o, u in zip(self.orders, unclear, strict=True)
+        ]
+        lines.append(row("slope", cells))
         half = (self.intervals[:, 1] - self.intervals[:, 0]) / 2
         lines.append(row("±", [f"{x:.3f} " for x in half]))
+        if any(unclear):
+            lines.append("? no order resolved in this range of ε: slope of the straight line")
         for reason, meaning in _MEANINGS.items():
             count = int(np.sum(self.excluded == reason))
             if count:
                 lines.append(f"* {count} excluded: {meaning}")
         count = int(self.mesh_used.sum())
-        if count >= _ENOUGH:
+        if count >= ENOUGH:
             low, high = self.mesh_interval
             lines.append(
                 f"drift at ε = 0 ∝ h^{self.mesh_slope:.4g}, 95 % interval {low:.4g} … {high:.4g}, "
@@ -229,10 +252,15 @@ def drift_order(
 
         max_starts max_k |I_ε(k) − I_ε(1)| ∝ ε^slope      (z + 1 for an invariant of order z)
 
-    One batched sweep over ε and the starts, reduced on the device: memory does not grow with
-    num_steps. The same runs at ε = 0 give the floor, by the mesh or by round-off. The line is
-    fitted to the points that stand ten times above it, and above a plateau at the smallest ε if
-    there is one; the others are excluded and reported.
+    One batched sweep over ε and the initial conditions, reduced on the device: memory does not
+    grow with num_steps. The same runs at ε = 0 give the floor, by the mesh or by round-off. The
+    order is fitted to the points that are more than ten times above it, and above a plateau at
+    the smallest ε if there is one; the others are excluded and reported.
+
+    Several laws are compared: one power, the sum or the difference of two, saturation at large
+    ε, a resonance. The report gives the order for ε → 0 only where the points determine it to
+    ± 0.25 whichever of these laws holds. Otherwise it says that no order is resolved, and which ε
+    would resolve it.
 
     An ε at which more than half of the starts fail is excluded. A start that fails at one of the
     others is left out at all of them, so that every point is the largest over the same starts.
@@ -250,8 +278,10 @@ def drift_order(
     **Raises** `ValueError` for epsilons that are not positive, finite and distinct, starts that
     are not of one shape, or an observable that is not a scalar.
 
-    **Accuracy** the interval is that of a straight line with independent errors. The next order
-    bends the line at large ε; `DriftOrder.limit` is the slope with that bend taken out.
+    **Accuracy** among 400 synthetic curves (powers, sums, saturation, next orders, drifts at
+    ε = 0, noise of 0.1 to 20 %) the 95 % interval contains the true order in 93 to 97 % of those
+    that are resolved (tests/test_drift.py). The order is that of the smallest ε in the sweep: no
+    measurement excludes another power below it. A logarithm, ε log(1/ε), is fitted by a power.
 
     **Example**
 
@@ -344,7 +374,7 @@ def drift_surface(
     orders = tuple(_order(epsilons, lane, kept) for lane in lanes)
     floors = np.array([o.floor for o in orders])
     by_mesh = np.isfinite(floors) & np.array([o.floor_cause == "mesh" for o in orders])
-    mesh_slope, mesh_stderr = _line(np.log(hs[by_mesh]), np.log(floors[by_mesh]))
+    mesh_slope, mesh_stderr = line(np.log(hs[by_mesh]), np.log(floors[by_mesh]))
     return DriftSurface(epsilons, hs, num_steps, orders, by_mesh, mesh_slope, mesh_stderr)
 
 
@@ -441,58 +471,14 @@ def _order(epsilons: np.ndarray, lanes: _Lanes, kept: np.ndarray) -> DriftOrder:
         excluded[:] = "no floor"
     excluded[~passed[:-1]] = "failed"
     candidates = excluded == ""
-    level = _plateau(epsilons[candidates], drifts[candidates])
+    level = plateau_level(epsilons[candidates], drifts[candidates])
     excluded[candidates & ~(drifts > _ABOVE_FLOOR * level)] = "flat"
     used = excluded == ""
-    slope, stderr = _line(np.log(epsilons[used]), np.log(drifts[used]))
+    fit = small_epsilon_exponent(epsilons[used], drifts[used], max(floor, level))
     return DriftOrder(
-        epsilons, drifts, floor, cause, used, excluded, slope, stderr, kept, lanes.drifts,
-        lanes.statuses,
+        epsilons, drifts, floor, cause, used, excluded, fit.slope, fit.stderr, kept, lanes.drifts,
+        lanes.statuses, fit,
     )  # fmt: skip
-
-
-def _plateau(epsilons: np.ndarray, drifts: np.ndarray) -> float:
-    """The level on which the drifts at the smallest ε lie, 0 if they rise from the first on."""
-    order = np.argsort(epsilons)
-    x, y = np.log(epsilons[order]), np.log(drifts[order])
-    for count in range(len(x), _ENOUGH - 1, -1):
-        if x[count - 1] - x[0] < np.log(_FLAT_SPAN):
-            break
-        rises = _line(x[:count], y[:count])[0] >= _FLAT or np.ptp(y[:count]) > np.log(_ABOVE_FLOOR)
-        if not rises:
-            return float(np.exp(np.median(y[:count])))
-    return 0.0
-
-
-def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Least-squares slope and its standard error; NaN for fewer than three points."""
-    if len(x) < _ENOUGH:
-        return np.nan, np.nan
-    dx = x - x.mean()
-    slope = float(dx @ (y - y.mean()) / (dx @ dx))
-    rest = y - y.mean() - slope * dx
-    return slope, float(np.sqrt(rest @ rest / (len(x) - 2) / (dx @ dx)))
-
-
-def _interval(slope: float, stderr: float, points: int) -> tuple[float, float]:
-    if points < _ENOUGH:
-        return np.nan, np.nan
-    half = _student_t(points - 2) * stderr
-    return slope - half, slope + half
-
-
-@functools.cache
-def _student_t(freedom: int) -> float:
-    """The t that |T| stays below with probability 95 %, for T of Student's distribution.
-
-    P(|T| > t) = I_x(ν/2, 1/2) with x = ν/(ν + t²), increasing in x: solved by bisection.
-    """
-    low, high = 0.0, 1.0
-    for _ in range(60):
-        x = (low + high) / 2
-        outside = jax.scipy.special.betainc(freedom / 2, 0.5, x)
-        low, high = (x, high) if outside < 0.05 else (low, x)
-    return float(np.sqrt(freedom * (1 - low) / low))
 
 
 def _check_observable(invariant: Any) -> None:
