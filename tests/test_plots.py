@@ -221,7 +221,7 @@ def single_pictures(single):
     """Every function that draws on one `Axes`, by name."""
     t = np.arange(1.0, 9.0)
     order = types.SimpleNamespace(
-        epsilons=t, drifts=t, used=t > 0, slope=1.0, interval=(0.9, 1.1), floor=0.5
+        epsilons=t, drifts=t, used=t > 0, slope=1.0, interval=(0.9, 1.1), floor=0.5, resolved=True
     )
     return {
         "phase_portrait": lambda ax: plot.phase_portrait(single, dof=0, ax=ax),
@@ -727,6 +727,7 @@ def test_what_has_no_place_on_a_logarithmic_axis_is_counted():
     order = types.SimpleNamespace(
         epsilons=np.array([0.1, 0.2, 0.4, 0.8]), drifts=np.array([0.0, 0.1, np.nan, 0.3]),
         used=np.array([False, True, False, True]), slope=1.0, interval=(0.9, 1.1), floor=0.0,
+        resolved=True,
     )  # fmt: skip
     axis = plot.drift_orders({"a": order})
     marks = {x.get_marker(): list(x.get_xdata()) for x in axis.lines if x.get_marker() in "xv"}

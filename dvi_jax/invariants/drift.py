@@ -80,7 +80,7 @@ class DriftOrder(NamedTuple):
 
     @property
     def resolved(self) -> bool:
-        """Whether the 95 % interval of the order for ε → 0 is at most 0.5 long."""
+        """Whether the 95 % interval of the order for ε → 0 is at most 0.6 long."""
         return self.fit.resolved
 
     @property
@@ -259,7 +259,7 @@ def drift_order(
 
     Several laws are compared: one power, the sum or the difference of two, saturation at large
     ε, a resonance. The report gives the order for ε → 0 only where the points determine it to
-    ± 0.25 whichever of these laws holds. Otherwise it says that no order is resolved, and which ε
+    ± 0.3 whichever of these laws holds. Otherwise it says that no order is resolved, and which ε
     would resolve it.
 
     An ε at which more than half of the starts fail is excluded. A start that fails at one of the

@@ -10,7 +10,7 @@ from .laws import Fits, fits_of_laws, lines, names
 ENOUGH = 3
 """Points that a slope needs: two points always lie on a line."""
 
-_RESOLVED = 0.25
+_RESOLVED = 0.3
 """An order is resolved when half of its 95 % interval is at most this."""
 
 _CURVED = 0.05
@@ -24,7 +24,7 @@ class Exponent(NamedTuple):
       points.
     - `interval`: 95 % interval of s; if not `resolved`, extended so that it contains `slope`.
       `stderr`: half of its length, divided by Student's t of n − 2 degrees of freedom.
-    - `resolved`: whether the 95 % interval of s is at most 0.5 long.
+    - `resolved`: whether the 95 % interval of s is at most 0.6 long.
     - `model`: the most probable shape, a key of `probabilities`: "power", "sum of two powers",
       "saturation", "difference of two powers", "resonance"; "" with fewer than three points.
     - `crossover`: ε at which the two powers are equal, the saturation begins, or the resonance
@@ -32,7 +32,7 @@ class Exponent(NamedTuple):
     - `line_slope`, `line_stderr`: of the straight line through all points, by least squares.
     - `curvature`: d² log(drift) / d log(ε)² of the parabola through all points by least squares;
       NaN with fewer than four points.
-    - `points`: number of points n.
+    - `points`: number of points n. `range`: smallest and largest ε; NaN with fewer than three.
     """
 
     slope: float
@@ -46,6 +46,7 @@ class Exponent(NamedTuple):
     line_stderr: float
     curvature: float
     points: int
+    range: tuple[float, float]
 
     @property
     def curved(self) -> bool:
@@ -59,20 +60,22 @@ class Exponent(NamedTuple):
           returns.
         """
         low, high = self.interval
-        law = f"{self.model} near ε = {self.crossover:.2g}"
+        law = f"not one power: {self.model} near ε = {self.crossover:.2g}"
+        if self.crossover > self.range[1]:
+            law = "the slope changes toward larger ε"
         by = f"by {self.points} of {points} points"
         straight = f"the slope of the straight line is {self.line_slope:.3g}"
         if self.resolved:
             found = f"ε^{self.slope:.4g}, 95 % interval {low:.4g} … {high:.4g}, {by}"
             if self.model == "power":
                 return [f"drift ∝ {found}"]
-            return [f"for ε → 0 the drift tends to {found}", f"  not one power: {law}; {straight}"]
+            return [f"for ε → 0 the drift tends to {found}", f"  {law}; {straight}"]
         lines = [
             f"no order resolved in this range: for ε → 0 it may be {low:.2g} … {high:.2g} (95 %), "
             f"{by} ({straight})"
         ]
         if self.curved:
-            lines.append(f"  not one power: perhaps {law}")
+            lines.append(f"  {law}")
         if np.isfinite(wanted).all():
             lines.append(
                 f"  to resolve it, take more points (eight or more) at ε = {wanted[0]:.2g} … "
@@ -126,7 +129,9 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
     epsilons, drifts = _checked(epsilons, drifts, floor)
     if len(epsilons) < ENOUGH:
         nan = np.nan
-        return Exponent(nan, (nan, nan), nan, False, "", {}, nan, nan, nan, nan, len(epsilons))
+        return Exponent(
+            nan, (nan, nan), nan, False, "", {}, nan, nan, nan, nan, len(epsilons), (nan, nan)
+        )
     x, y = np.log(epsilons), np.log(drifts)
     freedom = len(x) - 2
     fits = fits_of_laws(x, drifts, floor)
@@ -155,6 +160,7 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
         line_stderr=line_stderr,
         curvature=2 * float(np.polyfit(x - x.mean(), y, 2)[0]) if len(x) > ENOUGH else np.nan,
         points=len(x),
+        range=(float(epsilons.min()), float(epsilons.max())),
     )
 
 

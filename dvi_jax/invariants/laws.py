@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-_LEAST_SCATTER = 1e-4
+_LEAST_SCATTER = 1e-3
 """Relative error of a drift that is always assumed: no law is more accurate than this."""
 
 _DIP = 1e-3
@@ -64,11 +64,11 @@ class _Law(NamedTuple):
 
 
 _LAWS = (
-    _Law("power", _no_shape, 0.5),
+    _Law("power", _no_shape, 0.43),
     _Law(
         "sum of two powers",
         _sum,
-        0.26,
+        0.29,
         sizes=((1, 0.35), (2, 0.2), (3, 0.1)),
         ranges=((0.4, 2, 0.23), (2, 4, 0.12)),
         sharpnesses=((1, 0.7), (2, 0.3)),
@@ -76,16 +76,16 @@ _LAWS = (
     _Law(
         "saturation",
         _saturation,
-        0.15,
+        0.17,
         sizes=((1, 0.2), (2, 0.15), (3, 0.1), (4, 0.1)),
         ranges=((0.3, 1.5, 0.25), (1.5, 4, 0.2)),
         sharpnesses=((1, 0.4), (2, 0.4), (4, 0.2)),
     ),
-    _Law("difference of two powers", _difference, 0.05, sizes=((1, 0.7), (2, 0.3))),
+    _Law("difference of two powers", _difference, 0.06, sizes=((1, 0.7), (2, 0.3))),
     _Law(
         "resonance",
         _resonance,
-        0.04,
+        0.05,
         ranges=((-4, -0.5, 0.4), (0.5, 2.5, 0.4), (2.5, 6, 0.2)),
         sharpnesses=((1, 0.3), (2, 0.4), (5, 0.3)),
         points=6,

@@ -198,8 +198,9 @@ def drift_surface(
     - `surface`: what `drift_surface` returned. `promised`: z + 1.
     - `ax`: two `Axes`, of the drifts and of their orders.
 
-    Dots mark what is excluded from the fits; bars are 95 % intervals. A drift exactly 0 has no
-    place on a logarithmic scale: it is black. One that failed is hatched; the legend counts both.
+    Dots mark what is excluded from the fits; bars are 95 % intervals, and orders that are not
+    resolved are hollow. A drift that is exactly 0 has no place on a logarithmic scale: it is black.
+    One that failed is hatched; the legend counts both.
 
     **Returns** the `Axes`, shape (2,).
     """
@@ -230,22 +231,23 @@ def drift_surface(
         handles.append(Patch(label=f"{failed.sum()} of {drifts.size} failed", **HATCH))
     left.set(xscale="log", yscale="log", xlabel="ε", ylabel="step size h", title=title)
     measured = np.isfinite(surface.slopes)
-    h, slopes = surface.hs[measured], surface.slopes[measured]
-    low, high = surface.intervals[measured].T
-    right.errorbar(
-        h, slopes, yerr=[slopes - low, high - slopes], fmt="o", color=COLOURS[0], capsize=3,
-        label="fit, 95 % interval",
-    )  # fmt: skip
-    limits = np.array([order.limit for order in surface.orders])
-    right.plot(
-        surface.hs, limits, "s", color=COLOURS[1], markerfacecolor="none", label="limit for ε → 0"
-    )
+    resolved = np.array([order.resolved for order in surface.orders])
+    low, high = surface.intervals.T
+    for here, face, label in (
+        (measured & resolved, COLOURS[0], "order for ε → 0, 95 % interval"),
+        (measured & ~resolved, "white", "not resolved: slope of the straight line"),
+    ):
+        if here.any():
+            slopes = surface.slopes[here]
+            right.errorbar(
+                surface.hs[here], slopes, yerr=[slopes - low[here], high[here] - slopes], fmt="o",
+                color=COLOURS[0], markerfacecolor=face, capsize=3, label=label,
+            )  # fmt: skip
     if promised is not None:
         right.axhline(promised, color="#888888", linewidth=1, linestyle="--", label="promised")
-        known = limits[np.isfinite(limits)]
         right.set_ylim(
-            min([promised - 0.1, *(low - 0.05), *(known - 0.05)]),
-            max([promised + 0.1, *(high + 0.05), *(known + 0.05)]),
+            min([promised - 0.1, *(low[measured] - 0.05)]),
+            max([promised + 0.1, *(high[measured] + 0.05)]),
         )
     for value in surface.hs[~measured]:
         right.annotate(
@@ -266,6 +268,8 @@ def drift_surface(
 def _slope_text(order: DriftOrder) -> str:
     if not np.isfinite(order.slope):
         return "no order"
+    if not order.resolved:
+        return f"no order resolved, slope of the line {order.slope:.2f}"
     low, high = order.interval
     half = (high - low) / 2
     digits = 3 if not half > 0 else int(np.clip(1 - np.floor(np.log10(half)), 3, 6))

@@ -326,6 +326,8 @@ def _invariant(found: dvi.Discovery, orders: list[dvi.DriftOrder], i: int) -> di
             "floor_cause": o.floor_cause,
             "slope": o.slope,
             "interval": o.interval,
+            "resolved": o.resolved,
+            "model": o.model,
             "starts": len(o.kept),
             "starts_kept": int(o.kept.sum()),
         }
@@ -340,6 +342,8 @@ def _tables(contents: dict[str, Any]) -> list[Table]:
         if drift is not None and np.isfinite(drift["slope"]):
             low, high = drift["interval"]
             slope = f"{drift['slope']:.3f} ({low:.3f} … {high:.3f})"
+            if not drift["resolved"]:
+                slope = f"not resolved ({low:.2f} … {high:.2f})"
         elif drift is not None:
             reasons = sorted({str(x) for x in drift["excluded"]} - {""})
             slope = f"none: {', '.join(reasons)}"
