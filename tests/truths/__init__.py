@@ -35,6 +35,9 @@ class Case(NamedTuple):
       independent invariants of the basis, for order > 0 the leading parts that reach that order.
     - `points`: like `samples`, for the comparison with the truth; None for the samples.
     - `options`: further arguments of the search.
+    - `survivors`: how many leading parts have an invariant of order 0 … `order`, functions of
+      one another included, a constant not; None where that is not compared.
+    - `exact`: whether the series of order > 0 are conserved at every ε; None as above.
     """
 
     name: str
@@ -48,6 +51,8 @@ class Case(NamedTuple):
     order: int = 0
     points: Callable[[np.random.Generator], tuple] | None = None
     options: Mapping[str, Any] = MappingProxyType({})
+    survivors: tuple[int, ...] | None = None
+    exact: bool | None = None
 
 
 class SymmetryCase(NamedTuple):
@@ -114,7 +119,16 @@ def _of_invariants(case: Case, answer: dvi.Discovery, seed: int) -> str:
     for values in np.asarray(jax.vmap(true)(*at)).T:
         if _distance(columns, values) > SPAN:
             return "missed"
-    return "found"
+    if case.exact is not None and any(exact != case.exact for exact in answer.exact):
+        return "missed" if case.exact else "false"
+    return _of_counts(case.survivors, answer.survivors)
+
+
+def _of_counts(wanted: tuple[int, ...] | None, found: tuple[int, ...]) -> str:
+    if wanted is None or found == wanted:
+        return "found"
+    more = any(f > w for f, w in zip(found, wanted, strict=True))
+    return "false" if more else "missed"
 
 
 def _of_symmetries(case: SymmetryCase, answer: dvi.Symmetries, seed: int) -> str:
@@ -153,7 +167,7 @@ def _differentials(functions, at) -> np.ndarray:
     q, p = at[0], at[1]
     slopes = jax.vmap(jax.jacfwd(functions, argnums=(0, 1)))(*at)
     units = [np.maximum(np.std(np.asarray(x), axis=0).ravel(), 1e-300) for x in (q, p)]
-    rows = [np.asarray(s).reshape(*s.shape[:2], -1) * u for s, u in zip(slopes, units, strict=True)]
+    rows = [np.reshape(s, (*s.shape[:2], len(u))) * u for s, u in zip(slopes, units, strict=True)]
     rows = np.concatenate(rows, axis=2)
     return rows / np.maximum(np.linalg.norm(rows, axis=2, keepdims=True), 1e-300)
 

@@ -1,0 +1,420 @@
+"""How many invariants of each order a map has in a basis, by exact arithmetic modulo a prime.
+
+It shares no code with the search. Numbers are integers modulo a prime, so that a rank is exact:
+the truncated power series in ε of a step is computed at random points, and the linear equations of
+an invariant of order z are solved by elimination. Functions that have no value modulo a prime
+(sines, cosines, square roots) are computed in double precision, and ranks by singular values.
+"""
+
+import math
+from fractions import Fraction
+from itertools import combinations_with_replacement
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import dvi_jax as dvi
+from dvi_jax.symmetry.basis import Product, Sum
+from dvi_jax.symmetry.families import coordinate_names
+
+PRIME = 2**31 - 1
+"""A rank modulo this prime is less than that of the rational numbers by chance of 1e-6 or so."""
+
+FLOAT_RANK = 1e-10
+"""Singular values below this share of the largest are zero in double precision."""
+
+
+def cos(x: Any) -> Any:
+    """Of a number of JAX, or of this module."""
+    return x.cos() if hasattr(x, "cos") else jnp.cos(x)
+
+
+def sin(x: Any) -> Any:
+    """Of a number of JAX, or of this module."""
+    return x.sin() if hasattr(x, "sin") else jnp.sin(x)
+
+
+def log(x: Any) -> Any:
+    """Of a number of JAX, or of this module."""
+    return x.log() if hasattr(x, "log") else jnp.log(x)
+
+
+def vector(*components: Any) -> Any:
+    """An array of these components, of JAX or of numbers of this module."""
+    if any(isinstance(x, Dual | Series) for x in components):
+        out = np.empty(len(components), object)
+        out[:] = components
+        return out
+    return jnp.stack(components)
+
+
+class Series:
+    """Σ ε^m c_m, cut off after ε^z, at many points: `c` of shape (z + 1, points).
+
+    `prime`: integers modulo it, or None for double precision.
+    """
+
+    def __init__(self, c: np.ndarray, prime: int | None):
+        self.c, self.prime = c, prime
+
+    def of(self, value: Any) -> "Series":
+        """A series, also of a constant. A float counts as the decimal number that it prints."""
+        if isinstance(value, Series):
+            return value
+        c = np.zeros_like(self.c)
+        if self.prime is None:
+            c[0] = float(value)
+        else:
+            fraction = Fraction(repr(float(value)))
+            c[0] = fraction.numerator * pow(fraction.denominator, -1, self.prime) % self.prime
+        return Series(c, self.prime)
+
+    def made(self, c: np.ndarray) -> "Series":
+        return Series(c if self.prime is None else c % self.prime, self.prime)
+
+    def __add__(self, other):
+        return NotImplemented if _above(other) else self.made(self.c + self.of(other).c)
+
+    def __sub__(self, other):
+        return NotImplemented if _above(other) else self.made(self.c - self.of(other).c)
+
+    def __rsub__(self, other):
+        return self.of(other) - self
+
+    def __neg__(self):
+        return self.made(-self.c)
+
+    def __mul__(self, other):
+        if _above(other):
+            return NotImplemented
+        a, b = self.c, self.of(other).c
+        out = np.zeros_like(a)
+        for k in range(len(a)):
+            for m in range(k + 1):
+                out[k] = self.made(out[k] + self.made(a[m] * b[k - m]).c).c
+        return self.made(out)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __truediv__(self, other):
+        return NotImplemented if _above(other) else self * self.of(other).inverse()
+
+    def __rtruediv__(self, other):
+        return self.of(other) * self.inverse()
+
+    def inverse(self) -> "Series":
+        first = np.zeros_like(self.c)
+        first[0] = 1 / self.c[0] if self.prime is None else _power(self.c[0], -1, self.prime)
+        start, out = Series(first, self.prime), Series(first, self.prime)
+        for _ in range(len(self.c)):
+            out = out + start * (1 - self * out)
+        return out
+
+    def __pow__(self, power):
+        if power == int(power):
+            base = self if power >= 0 else self.inverse()
+            out = self.of(1)
+            for _ in range(abs(int(power))):
+                out = out * base
+            return out
+        return self.through(lambda x, k: np.prod(power - np.arange(k)) * x ** (power - k))
+
+    def cos(self):
+        return self.through(lambda x, k: np.cos(x + k * np.pi / 2))
+
+    def sin(self):
+        return self.through(lambda x, k: np.sin(x + k * np.pi / 2))
+
+    def log(self):
+        return self.through(
+            lambda x, k: np.log(x) if k == 0 else -math.factorial(k - 1) * (-x) ** -k
+        )
+
+    def through(self, derivative) -> "Series":
+        """f of the series, from derivative(x, k), the k-th derivative of f at x."""
+        if self.prime is not None:
+            raise ValueError("this function has no value modulo a prime")
+        first, rest = self.c[0], self.c.copy()
+        rest[0] = 0
+        out, power, factorial = self.of(0), self.of(1), 1.0
+        for k in range(len(self.c)):
+            factorial *= max(k, 1)
+            scaled = np.zeros_like(self.c)
+            scaled[0] = derivative(first, k) / factorial
+            out, power = out + power * Series(scaled, None), power * Series(rest, None)
+        return out
+
+
+class Dual:
+    """value + slope δ with δ² = 0: the derivative of a function of a Series."""
+
+    def __init__(self, value: Series, slope: Any):
+        self.value, self.slope = value, slope
+
+    def _of(self, other):
+        return other if isinstance(other, Dual) else Dual(self.value.of(other), self.value.of(0))
+
+    def __add__(self, other):
+        if isinstance(other, np.ndarray):
+            return NotImplemented
+        other = self._of(other)
+        return Dual(self.value + other.value, self.slope + other.slope)
+
+    def __neg__(self):
+        return Dual(-self.value, -self.slope)
+
+    def __sub__(self, other):
+        return self + -self._of(other)
+
+    def __rsub__(self, other):
+        return self._of(other) - self
+
+    def __mul__(self, other):
+        if isinstance(other, np.ndarray):
+            return NotImplemented
+        other = self._of(other)
+        return Dual(self.value * other.value, self.value * other.slope + self.slope * other.value)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __truediv__(self, other):
+        return self * self._of(other) ** -1
+
+    def __rtruediv__(self, other):
+        return self._of(other) / self
+
+    def __pow__(self, power):
+        if power == 0:
+            return self._of(1)
+        return Dual(self.value**power, self.value ** (power - 1) * self.slope * power)
+
+    def cos(self):
+        return Dual(self.value.cos(), -(self.value.sin() * self.slope))
+
+    def sin(self):
+        return Dual(self.value.sin(), self.value.cos() * self.slope)
+
+    def log(self):
+        return Dual(self.value.log(), self.slope / self.value)
+
+
+def _above(other) -> bool:
+    return isinstance(other, Dual | np.ndarray)
+
+
+def _power(x: np.ndarray, power: int, prime: int) -> np.ndarray:
+    power %= prime - 1
+    out = np.ones_like(x)
+    while power:
+        if power & 1:
+            out = out * x % prime
+        x, power = x * x % prime, power >> 1
+    return out
+
+
+def objects(values: Any) -> np.ndarray:
+    out = np.empty(len(values), object)
+    out[:] = list(values)
+    return out
+
+
+def gradient(function, place: int, arguments: list) -> np.ndarray:
+    """∂function/∂arguments[place], an array of Series."""
+    zero = arguments[place][0].of(0)
+    out = []
+    for i in range(len(arguments[place])):
+        dual = list(arguments)
+        slopes = [zero.of(float(i == j)) for j in range(len(arguments[place]))]
+        dual[place] = objects([Dual(x, s) for x, s in zip(arguments[place], slopes, strict=True)])
+        value = function(*dual)
+        out.append(value.slope if isinstance(value, Dual) else zero)
+    return objects(out)
+
+
+def step(system: dvi.System, h: float, epsilon: Series, q: Any, p: Any, t: Series) -> tuple:
+    """The map (q, p, t) → (q1, p1, t1) of type II, from its generating function."""
+    t1 = t + (epsilon * h if system.slow_time else epsilon.of(h))
+
+    def energy(q, p):
+        H = system.H_D(t, t1, q, p, None)
+        if system.perturbation is not None:
+            H = H + system.perturbation(t, t1, q, p, None) * epsilon
+        return H
+
+    p1 = p
+    for _ in range(len(epsilon.c) + 1 if epsilon.prime else 60):
+        before = p1
+        p1 = p - gradient(energy, 0, [q, p1]) * h
+        if system.force is not None:
+            p1 = p1 + objects(list(system.force(t, t1, q, before, None))) * epsilon * h
+    for a, b in zip(before, p1, strict=True):
+        off = np.max(np.abs(a.c - b.c))
+        if off > (0 if epsilon.prime else 1e-10):
+            raise ValueError(f"p1 of the step is not found by iteration: {off:.1e}")
+    return q + gradient(energy, 1, [q, p1]) * h, p1, t1
+
+
+def functions_of(basis: Any, n: int) -> list:
+    """The functions (q, p, t) of a basis, for q and p of n components."""
+    names = coordinate_names((n,))
+    match basis:
+        case Sum():
+            return functions_of(basis.first, n) + functions_of(basis.second, n)
+        case Product():
+            first, second = functions_of(basis.first, n), functions_of(basis.second, n)
+            return [
+                lambda q, p, t, f=f, g=g: f(q, p, t) * g(q, p, t) for f in first for g in second
+            ]
+        case dvi.Polynomials():
+            chosen = [_component(name, names) for name in basis.variables or names]
+            powers = range(0 if basis.constant else 1, basis.degree + 1)
+            every = [c for d in powers for c in combinations_with_replacement(chosen, d)]
+            return [lambda q, p, t, c=c: _product(t, [x(q, p, t) for x in c]) for c in every]
+        case dvi.Trigonometric():
+            x, rate = _component(basis.variable, names), 2 * np.pi / basis.period
+            waves = [
+                lambda q, p, t, f=f, k=k: f(x(q, p, t) * (rate * k))
+                for k in range(1, basis.count + 1)
+                for f in (cos, sin)
+            ]
+            return [lambda q, p, t: t.of(1)] * basis.constant + waves
+        case dvi.Radial():
+            return [lambda q, p, t, k=k: (q @ q) ** (k / 2) for k in basis.powers]
+        case dvi.Basis():
+            return [_timed(f) for f in basis.functions]
+    raise TypeError(f"no functions of {basis!r}")
+
+
+def _component(name: str, names: tuple[str, ...]):
+    if name in ("t", "τ"):
+        return lambda q, p, t: t
+    i, n = names.index(name), len(names) // 2
+    return (lambda q, p, t: q[i]) if i < n else (lambda q, p, t: p[i - n])
+
+
+def _product(t, factors):
+    out = t.of(1)
+    for factor in factors:
+        out = out * factor
+    return out
+
+
+def _timed(function):
+    if function.__code__.co_argcount - len(function.__defaults__ or ()) == 3:
+        return function
+    return lambda q, p, t: function(q, p)
+
+
+def rref(matrix: np.ndarray, prime: int) -> tuple[np.ndarray, list[int]]:
+    """The reduced echelon form and its pivots, modulo a prime."""
+    matrix, pivots = matrix.copy() % prime, []
+    for j in range(matrix.shape[1]):
+        row = len(pivots)
+        below = np.flatnonzero(matrix[row:, j]) if row < len(matrix) else []
+        if len(below) == 0:
+            continue
+        matrix[[row, row + below[0]]] = matrix[[row + below[0], row]]
+        matrix[row] = matrix[row] * pow(int(matrix[row, j]), -1, prime) % prime
+        factors = matrix[:, j].copy()
+        factors[row] = 0
+        some = np.flatnonzero(factors)
+        matrix[some] = (matrix[some] - factors[some, None] * matrix[row] % prime) % prime
+        pivots.append(j)
+    return matrix[: len(pivots)], pivots
+
+
+def null_columns(matrix: np.ndarray, prime: int | None) -> np.ndarray:
+    """The null space, as columns."""
+    size = matrix.shape[1]
+    if prime is None:
+        scale = np.linalg.norm(matrix, axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        singular, V = np.linalg.svd(matrix / scale)[1:]
+        rank = int(np.sum(singular > FLOAT_RANK * max(singular[0], 1e-300)))
+        return np.linalg.qr(V[rank:].T / scale[:, None])[0]
+    reduced, pivots = rref(matrix, prime)
+    free = [j for j in range(size) if j not in set(pivots)]
+    out = np.zeros((size, len(free)), np.int64)
+    for k, j in enumerate(free):
+        out[j, k] = 1
+        out[pivots, k] = -reduced[:, j] % prime
+    return out
+
+
+def rank_of(columns: np.ndarray, prime: int | None) -> int:
+    """The rank; in double precision that of columns whose length is about one."""
+    if columns.size == 0:
+        return 0
+    if prime is None:
+        singular = np.linalg.svd(columns, compute_uv=False)
+        return int(np.sum(singular > 1e-7))
+    return len(rref(columns, prime)[1])
+
+
+class Count:
+    """The leading parts of invariants of order 0 … z in a basis.
+
+    - `survivors`: how many of each order; a constant is none.
+    - `reaches(function)`: the highest order of an invariant with this leading part; −1 for a
+      function that is not conserved at order 0, or not in the basis.
+    """
+
+    def __init__(self, system, basis, order, h, samples, modular=True):
+        """`samples`: points (qs, ps) or (qs, ps, ts), of which only the shape is used in exact
+        arithmetic."""
+        qs, ps = (np.reshape(x, (len(x), -1)) for x in samples[:2])
+        ts = samples[2] if len(samples) == 3 else np.zeros(len(qs))
+        functions, rng = functions_of(basis, qs.shape[1]), np.random.default_rng(0)
+        size, self.prime = len(functions), PRIME if modular else None
+        points = 2 * size + 10 if modular else len(qs)
+        zero = np.zeros((order + 1, points), np.int64 if modular else float)
+
+        def number(values):
+            c = zero.copy()
+            c[0] = rng.integers(1, PRIME, points) if modular else values
+            return Series(c, self.prime)
+
+        q, p = (objects([number(x) for x in values.T]) for values in (qs, ps))
+        t = number(ts)
+        epsilon = Series(zero.copy(), self.prime)
+        if order:
+            epsilon.c[1] = 1
+        there = step(system, h, epsilon, q, p, t)
+        before = np.stack([f(q, p, t).c for f in functions], axis=-1)
+        after = np.stack([f(*there).c for f in functions], axis=-1)
+        self.values, terms = before[0], after - before
+        if modular:
+            terms %= PRIME
+        self.point, self.size, self.spaces = (q, p, t), size, []
+        ones = null_columns(np.column_stack([self.values, np.ones_like(t.c[0])]), self.prime)
+        constants = ones[:size]
+        for z in range(order + 1):
+            blocks = np.zeros((z + 1, points, z + 1, size), terms.dtype)
+            for k in range(z + 1):
+                for m in range(k + 1):
+                    blocks[k, :, m] = terms[k - m]
+            null = null_columns(blocks.reshape((z + 1) * points, -1), self.prime)[:size]
+            self.spaces.append(np.column_stack([null, constants]))
+        self.survivors = tuple(
+            rank_of(x, self.prime) - rank_of(constants, self.prime) for x in self.spaces
+        )
+
+    def reaches(self, function) -> int:
+        values = function(*self.point[: function.__code__.co_argcount]).c[0]
+        unit = np.linalg.norm(values) if self.prime is None else 1
+        matrix = np.column_stack(
+            [self.values, np.ones_like(values), values if self.prime else values / unit]
+        )
+        c = null_columns(matrix, self.prime)
+        c = c[:, np.flatnonzero(np.abs(c[-1]) > 1e-9)[:1]]
+        if c.shape[1] == 0:
+            return -1
+        last = -1
+        for z, space in enumerate(self.spaces):
+            c_0 = c[:-2] if self.prime else c[:-2] / np.linalg.norm(c[:-2])
+            both = np.column_stack([space, c_0])
+            if rank_of(both, self.prime) > rank_of(space, self.prime):
+                break
+            last = z
+        return last
