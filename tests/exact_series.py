@@ -232,7 +232,7 @@ def gradient(function, place: int, arguments: list) -> np.ndarray:
     return objects(out)
 
 
-def step(system: dvi.System, h: float, epsilon: Series, q: Any, p: Any, t: Series) -> tuple:
+def step(system: dvi.System, h: Any, epsilon: Series, q: Any, p: Any, t: Series) -> tuple:
     """The map (q, p, t) → (q1, p1, t1) of type II, from its generating function."""
     t1 = t + (epsilon * h if system.slow_time else epsilon.of(h))
 
@@ -243,7 +243,7 @@ def step(system: dvi.System, h: float, epsilon: Series, q: Any, p: Any, t: Serie
         return H
 
     p1 = p
-    for _ in range(len(epsilon.c) + 1 if epsilon.prime else 60):
+    for _ in range(len(epsilon.c) + 3 if epsilon.prime else 60):
         before = p1
         p1 = p - gradient(energy, 0, [q, p1]) * h
         if system.force is not None:
@@ -263,9 +263,7 @@ def functions_of(basis: Any, n: int) -> list:
             return functions_of(basis.first, n) + functions_of(basis.second, n)
         case Product():
             first, second = functions_of(basis.first, n), functions_of(basis.second, n)
-            return [
-                lambda q, p, t, f=f, g=g: f(q, p, t) * g(q, p, t) for f in first for g in second
-            ]
+            return [lambda *z, f=f, g=g: f(*z) * g(*z) for f in first for g in second]
         case dvi.Polynomials():
             chosen = [_component(name, names) for name in basis.variables or names]
             powers = range(0 if basis.constant else 1, basis.degree + 1)
@@ -402,10 +400,9 @@ class Count:
 
     def reaches(self, function) -> int:
         values = function(*self.point[: function.__code__.co_argcount]).c[0]
-        unit = np.linalg.norm(values) if self.prime is None else 1
-        matrix = np.column_stack(
-            [self.values, np.ones_like(values), values if self.prime else values / unit]
-        )
+        if self.prime is None:
+            values = values / np.linalg.norm(values)
+        matrix = np.column_stack([self.values, np.ones_like(values), values])
         c = null_columns(matrix, self.prime)
         c = c[:, np.flatnonzero(np.abs(c[-1]) > 1e-9)[:1]]
         if c.shape[1] == 0:
@@ -418,3 +415,154 @@ class Count:
                 break
             last = z
         return last
+
+
+class Symmetries:
+    """The symmetries of order 0 … z in a basis, from X(Φ(z)) = DΦ X(z).
+
+    With ξ0, times move too: DΦ has the derivatives by t and by h, which changes by the difference
+    of ξ0. With K = z + 1, ε is η and a nilpotent δ is η^K, in series cut off after η^{2K − 1}.
+
+    - `survivors`: how many leading parts, for order 0 … z. `hamiltonian`: of the last order, how
+      many can have ξ0 = 0 and Hamiltonian vector fields at all orders.
+    - `independent`, `independent_hamiltonian`: the rank of them as vectors at both points of a
+      step, at generic points: how many do not depend on one another with invariants for
+      coefficients.
+    """
+
+    def __init__(self, system, basis, order, h, samples, time, modular=True):
+        shape = np.shape(samples[0])[1:]
+        qs, ps = (np.reshape(x, (len(x), -1)) for x in samples[:2])
+        ts = samples[2] if len(samples) == 3 else np.zeros(len(qs))
+        n, rng, K = qs.shape[1], np.random.default_rng(0), order + 1
+        functions = functions_of(basis, n)
+        self.prime, size = PRIME if modular else None, len(functions)
+        points = min(len(qs), 2 * (2 * n + 1) * size // n + 10)
+        zero = np.zeros((2 * K, points), np.int64 if modular else float)
+
+        def number(values, power=0):
+            c = zero.copy()
+            c[power] = values
+            return Series(c, self.prime)
+
+        def start(values):
+            return number(rng.integers(1, PRIME, points) if modular else values[:points])
+
+        q, p = (objects([start(x) for x in values.T]) for values in (qs, ps))
+        t, epsilon, delta = start(ts), number(1.0, 1) if order else number(0.0), number(1.0, K)
+        flat = [*q, *p, t, number(0.0).of(h)]
+        shaped = _shaped(system, shape)
+
+        def moved(j):
+            z = list(flat)
+            if j is not None:
+                z[j] = z[j] + delta
+            q, p, t1 = step(shaped, z[-1], epsilon, objects(z[:n]), objects(z[n:-2]), z[-2])
+            return q, p, t1
+
+        there = moved(None)
+        jacobian = []
+        for at in map(moved, range(2 * n + 2)):
+            pairs = zip((*at[0], *at[1]), (*there[0], *there[1]), strict=True)
+            slopes = [(x - y).c[K:] for x, y in pairs]  # without ε^K and higher powers
+            jacobian.append([Series(np.concatenate([c, 0 * c]), self.prime) for c in slopes])
+        before = [f(q, p, t) for f in functions]
+        after = [f(*there) for f in functions]
+        components = range(0 if time else 1, 2 * n + 1)
+        rows = []  # (component, function): a list of 2n Series
+        for j in components:
+            for here, later in zip(before, after, strict=True):
+                if j == 0:
+                    change = later - here
+                    rows.append([jacobian[2 * n][i] * here + jacobian[2 * n + 1][i] * change
+                                 for i in range(2 * n)])  # fmt: skip
+                else:
+                    rows.append([jacobian[j - 1][i] * here - (later if i == j - 1 else 0)
+                                 for i in range(2 * n)])  # fmt: skip
+        terms = np.array([[x.c[:K] for x in row] for row in rows])  # (unknown, 2n, K, points)
+        terms = np.moveaxis(terms, (0, 2), (3, 1)).transpose(0, 2, 1, 3)
+        terms = terms.reshape(-1, K, len(rows))
+        slopes = [[f(*_at(flat, j, delta, n)).c[K] for f in functions] for j in range(2 * n)]
+        curl = self._curl(np.array(slopes), list(components), n, size)
+        self.survivors, self.hamiltonian = (), 0
+        for z in range(K):
+            matrix = np.zeros((z + 1, len(terms), z + 1, len(rows)), terms.dtype)
+            for k in range(z + 1):
+                for m in range(k + 1):
+                    matrix[k, :, m] = terms[:, k - m]
+            matrix = matrix.reshape((z + 1) * len(terms), -1)
+            null = null_columns(matrix, self.prime)[: len(rows)]
+            self.survivors += (rank_of(null, self.prime),)
+            if z == order:
+                curls = np.kron(np.eye(z + 1, dtype=curl.dtype), curl)
+                both = null_columns(np.vstack([matrix, curls]), self.prime)[: len(rows)]
+                self.hamiltonian = rank_of(both, self.prime)
+                self.null, self.values = null, np.array([x.c[0] for x in before])
+                here, later = (np.array([x.c[0] for x in v]) for v in (before, after))
+                self.independent, self.independent_hamiltonian = (
+                    rank_of(self._at_pair(x, here, later), self.prime) for x in (null, both)
+                )
+
+    def _curl(self, slopes, components, n, size):
+        """Rows that vanish for a Hamiltonian vector field: ∂(η, −ξ) is symmetric, and ξ0 = 0."""
+        points, rows = slopes.shape[2], []
+        place = {j: k for k, j in enumerate(components)}
+        ones = np.ones((2 * n,), slopes.dtype)
+        for a in range(2 * n):
+            for b in range(a):
+                row = np.zeros((points, len(components), size), slopes.dtype)
+                for sign, i, j in ((1, a, b), (-1, b, a)):  # ∂_i of the form's component j
+                    other, s = (j + n, 1) if j < n else (j - n, -1)
+                    row[:, place[other + 1]] += sign * s * ones[0] * slopes[i].T
+                rows.append(row.reshape(points, -1))
+        if 0 in place:
+            row = np.zeros((size, len(components), size), slopes.dtype)
+            row[np.arange(size), 0, np.arange(size)] = 1
+            rows.append(row.reshape(size, -1))
+        out = np.concatenate(rows)
+        return out % self.prime if self.prime else out
+
+    def _at_pair(self, null, here, later):
+        """Vectors at both ends of one step, as columns."""
+        blocks = null.reshape(len(null) // len(here), len(here), null.shape[1])
+        point = 3
+        out = []
+        for values in (here, later):
+            row = np.zeros((blocks.shape[0], null.shape[1]), null.dtype)
+            for b in range(len(here)):
+                product = blocks[:, b] * values[b, point]
+                row = row + (product % self.prime if self.prime else product)
+            out.append(row)
+        columns = np.concatenate(out)
+        if self.prime:
+            return columns % self.prime
+        lengths = np.linalg.norm(columns, axis=0)
+        return columns / np.where(lengths > 0, lengths, 1.0)
+
+    def holds(self, vectors) -> bool:
+        """Whether a generator is a leading part; its components at the points, (components,
+        points), in double precision."""
+        shares = np.linalg.lstsq(self.values.T, vectors.T, rcond=None)[0]
+        left = self.values.T @ shares - vectors.T
+        if np.max(np.abs(left)) > 1e-8 * np.max(np.abs(vectors)):
+            return False
+        c = shares.T.ravel()[:, None] / np.linalg.norm(shares)
+        return rank_of(np.column_stack([self.null, c]), None) == rank_of(self.null, None)
+
+
+def _at(flat, j, delta, n):
+    z = list(flat)
+    z[j] = z[j] + delta
+    return objects(z[:n]), objects(z[n : 2 * n]), z[-2]
+
+
+def _shaped(system: dvi.System, shape: tuple[int, ...]) -> dvi.System:
+    """The same for states as vectors."""
+
+    def of(function):
+        if function is None:
+            return None
+        return lambda t0, t1, q, p, a: function(t0, t1, q.reshape(shape), p.reshape(shape), a)
+
+    force = None if system.force is None else lambda *z: objects(list(of(system.force)(*z).ravel()))
+    return dvi.System(of(system.H_D), force, of(system.perturbation))

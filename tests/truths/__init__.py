@@ -25,6 +25,9 @@ SPAN = 1e-5
 GENERIC = 1e-4
 """Differentials whose smallest singular value is below this are dependent at a point."""
 
+CLOSED, OPEN = 1e-9, 1e-3
+"""Residuals of `solve_gauge` below the one are round-off, and above the other of order one."""
+
 
 class Case(NamedTuple):
     """What is to be found by `discover_invariants`.
@@ -60,6 +63,8 @@ class SymmetryCase(NamedTuple):
 
     - `truth`: generators that span all symmetries of the basis that do not depend on one
       another with invariants for coefficients; `variational`: how many of them are variational.
+    - `survivors`: how many symmetries there are for order 0 … `order`, with those that depend on
+      others; None where that is not compared.
     """
 
     name: str
@@ -73,17 +78,42 @@ class SymmetryCase(NamedTuple):
     h: float = 0.1
     order: int = 0
     options: Mapping[str, Any] = MappingProxyType({})
+    survivors: tuple[int, ...] | None = None
 
 
-def search(case: Case | SymmetryCase, seed: int = 0) -> Any:
+class GaugeCase(NamedTuple):
+    """What is to be found by `solve_gauge`.
+
+    - `closes`: whether a gauge in the basis closes Noether's identity, for each order up to the
+      first at which none does.
+    """
+
+    name: str
+    kind: str
+    source: str
+    system: dvi.System
+    generators: tuple[dvi.Generator, ...]
+    basis: Any
+    samples: Callable[[np.random.Generator], tuple]
+    closes: tuple[bool, ...]
+    h: float = 0.1
+
+
+def search(case: Case | SymmetryCase | GaugeCase, seed: int = 0) -> Any:
     """The answer of the package, on samples drawn with this seed."""
     samples = case.samples(np.random.default_rng(seed))
+    if isinstance(case, GaugeCase):
+        return dvi.solve_gauge(
+            case.system, list(case.generators), case.basis, h=case.h, samples=samples
+        )
     run = dvi.find_symmetries if isinstance(case, SymmetryCase) else dvi.discover_invariants
     return run(case.system, case.basis, case.order, h=case.h, samples=samples, **case.options)
 
 
-def outcome(case: Case | SymmetryCase, answer: Any, seed: int = 0) -> str:
+def outcome(case: Case | SymmetryCase | GaugeCase, answer: Any, seed: int = 0) -> str:
     """How the answer compares with the truth: "found", "undecided", "missed" or "false"."""
+    if isinstance(case, GaugeCase):
+        return _of_gauges(case, answer)
     if answer.warnings:
         return "undecided"
     if isinstance(case, SymmetryCase):
@@ -154,6 +184,15 @@ def _of_symmetries(case: SymmetryCase, answer: dvi.Symmetries, seed: int) -> str
     variational = sum(s.is_variational for s in independent)
     if variational != case.variational:
         return "false" if variational > case.variational else "missed"
+    return _of_counts(case.survivors, answer.survivors)
+
+
+def _of_gauges(case: GaugeCase, answer: Any) -> str:
+    for closes, residual in zip(case.closes, answer.residuals, strict=False):
+        if closes and not residual < CLOSED:
+            return "missed"
+        if not closes and not residual > OPEN:
+            return "false"
     return "found"
 
 
