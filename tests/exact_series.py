@@ -242,7 +242,7 @@ def step(system: dvi.System, h: Any, epsilon: Series, q: Any, p: Any, t: Series)
             H = H + system.perturbation(t, t1, q, p, None) * epsilon
         return H
 
-    p1 = p
+    before = p1 = p
     for _ in range(len(epsilon.c) + 3 if epsilon.prime else 60):
         before = p1
         p1 = p - gradient(energy, 0, [q, p1]) * h
@@ -559,10 +559,14 @@ def _at(flat, j, delta, n):
 def _shaped(system: dvi.System, shape: tuple[int, ...]) -> dvi.System:
     """The same for states as vectors."""
 
-    def of(function):
-        if function is None:
-            return None
+    def of(function: Any) -> Any:
         return lambda t0, t1, q, p, a: function(t0, t1, q.reshape(shape), p.reshape(shape), a)
 
-    force = None if system.force is None else lambda *z: objects(list(of(system.force)(*z).ravel()))
-    return dvi.System(of(system.H_D), force, of(system.perturbation))
+    def force(*arguments):
+        return objects(list(of(system.force)(*arguments).ravel()))
+
+    return dvi.System(
+        of(system.H_D),
+        None if system.force is None else force,
+        None if system.perturbation is None else of(system.perturbation),
+    )

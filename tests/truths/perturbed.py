@@ -41,7 +41,7 @@ def oscillators(*squares):
     return lambda t0, t1, q, p, args: (p @ p + (k * q) @ q) / 2
 
 
-def form(q, p, i, square=1, h=H):
+def form(q, p, i, square=1.0, h=H):
     """The quadratic form that the map of oscillator i conserves: p² + ω²q² − hω²qp."""
     return p[i] * p[i] + square * q[i] * q[i] - h * square * q[i] * p[i]
 
@@ -152,6 +152,19 @@ OSCILLATORS = (
         4, 1, (2, 1), (lambda q, p: p @ p * 1e26 + q @ q - 1e12 * (q @ p),), h=1e-14, exact=False,
         samples=lambda rng: (1e-10 * rng.uniform(-1, 1, (200, 1)),
                              1e-23 * rng.uniform(-1, 1, (200, 1)))),
+    one("cubic spring, h = 1", KEPT, CUBIC, 4, 1, (2, 1), (lambda q, p: form(q, p, 0, 1, 1.0),),
+        h=1.0, exact=False),
+    one("cubic spring, h = 1e-4", KEPT, CUBIC, 4, 1, (2, 1),
+        (lambda q, p: form(q, p, 0, 1, 1e-4),), h=1e-4, exact=False),
+    one("cubic spring, backwards in time", KEPT, CUBIC, 4, 1, (2, 1),
+        (lambda q, p: form(q, p, 0, 1, -0.1),), h=-0.1, exact=False),
+    one("cubic spring, samples of size 1e-6", KEPT, CUBIC, 4, 1, (2, 1), exact=False,
+        samples=box(1, 200, -1e-6, 1e-6)),
+    one("cubic spring with friction of 1e-7", LOST, forced(lambda q, p: -(q**3) - 1e-7 * p), 6, 1,
+        (3, 0), ()),
+    one("cubic spring with noise of 1e-8", LOST,
+        forced(lambda q, p: -(q**3) + 1e-8 * vector(*(sin(1e4 * x) for x in q))), 6, 1, (3, 0),
+        ()),
     one("cubic spring about q = 3", KEPT,
         dvi.System(lambda t0, t1, q, p, args: (p @ p + (q - 3) @ (q - 3)) / 2,
                    force=lambda t0, t1, q, p, args: -((q - 3) ** 3)),
@@ -249,6 +262,12 @@ COUPLED = (
     two("equal frequencies, force of a curl", RESONANT,
         forced(lambda q, p: vector(-q[1], q[0]), TWO), 2, 1, (4, 2),
         (mixed, lambda q, p: action(q, p) - second_action(q, p))),
+    two("frequencies that differ by 5e-4, coupling q1q2", RESONANT,
+        perturbed(lambda q, p: q[0] * q[1], oscillators(1, 1.001)), 2, 1, (2, 2),
+        (action, lambda q, p: form(q, p, 1, 1.001))),
+    two("frequencies that differ by 5e-7, coupling q1q2", RESONANT,
+        perturbed(lambda q, p: q[0] * q[1], oscillators(1, 1.000001)), 2, 1, (2, 2),
+        (action, lambda q, p: form(q, p, 1, 1.000001))),
     two("Hénon–Heiles, order 1", RESONANT, HENON_HEILES, 3, 1, (4, 4),
         (action, second_action, angular_momentum)),
     two("Hénon–Heiles, order 2", RESONANT, HENON_HEILES, 4, 2, (13, 4, 2),
@@ -312,9 +331,14 @@ DRIVEN = (
         driven(lambda t, q, p: cos(RATE * t) + 0 * q),
         dvi.Basis({"t": lambda q, p, t: t}) + LINES * waves(RATE, 2), 1, (2, 2),
         (turned("imaginary", RATE), turned("real", RATE)), times=20.0),
-    at_times("drive on the resonance of the flow, which the step detunes", RESONANT,
+    at_times("drive on the resonance of the flow, which the step detunes, late times", RESONANT,
         driven(lambda t, q, p: cos(t) + 0 * q), QUADRATICS + LINES * waves(1.0), 1, (1, 1),
         (action,), times=400.0),
+    at_times("drive on the resonance of the flow, early times", RESONANT,
+        driven(lambda t, q, p: cos(t) + 0 * q), QUADRATICS + LINES * waves(1.0), 1, (1, 1),
+        (action,), times=40.0),
+    at_times("drive off resonance, late times", KEPT, driven(lambda t, q, p: cos(2.3 * t) + 0 * q),
+        QUADRATICS + LINES * waves(2.3), 1, (1, 1), (action,), times=1e4),
     at_times("frequency modulated off resonance", KEPT, driven(lambda t, q, p: -cos(2.7 * t) * q),
         QUADRATICS * waves(2.7), 1, (1, 1), (action,)),
     at_times("frequency modulated at twice the frequency", RESONANT,

@@ -26,13 +26,14 @@ from .perturbed import (
     ONE,
     TWO,
     box,
-    form,
     forced,
+    form,
     kepler,
     mixed,
     oscillators,
     perturbed,
     shell,
+    total,
 )
 
 H = 0.1
@@ -73,11 +74,11 @@ def bodies(count, dim, samples):
     return lambda rng: (rng.uniform(-1, 1, shape), rng.uniform(-1, 1, shape))
 
 
-def case(name, kind, system, samples, truth, variational, total, basis=AFFINE, time=True, **more):
-    """A case whose `total` is the number of symmetries for each order."""
+def case(name, kind, system, samples, truth, variational, counts, basis=AFFINE, time=True, **more):
+    """A case with `counts`, the numbers of symmetries of each order."""
     source = more.pop("source", "the group of the equations; counted by exact arithmetic")
     return SymmetryCase(name, kind, source, system, basis, samples, truth, variational,
-                        survivors=total, options={"time": time}, **more)  # fmt: skip
+                        survivors=counts, options={"time": time}, **more)  # fmt: skip
 
 
 def central(k=0.0, offset=0.0, depth=0.25):
@@ -164,10 +165,10 @@ def of_centre(linear):
         return 1.0 + np.arange(len(q))[:, None]
 
     def xi(t, q, p, args):
-        return linear((masses(q) * q).sum(0) / masses(q).sum()) + 0 * q
+        return linear((masses(q) * q).sum(0) / masses(q).sum())[None] + 0 * q
 
     def eta(t, q, p, args):
-        return linear(p.sum(0)) * masses(q) / masses(q).sum()
+        return linear(p.sum(0))[None] * masses(q) / masses(q).sum()
 
     return Generator(xi=xi, eta=eta)
 
@@ -301,8 +302,7 @@ FIRST_ORDER = (
         bodies(2, 1, 80), (space_translation([1.0]), of_centre(lambda x: x)), 0, (3, 3), order=1,
         time=False),
     case("two equal oscillators, coupled by q1q2", FIRST, perturbed(lambda q, p: q[0] * q[1]),
-        box(2, 80), (flow(lambda q, p: first_form(q, p) + second_form(q, p)), flow(mixed), scaling(),
-                    SWAPPED), 2, (8, 4), order=1, time=False),
+        box(2, 80), (flow(total), flow(mixed), scaling(), SWAPPED), 2, (8, 4), order=1, time=False),
 )  # fmt: skip
 
 SYMMETRIES = (*LINEAR_MAPS, *NONLINEAR, *NO_SYMMETRY, *FIRST_ORDER)
