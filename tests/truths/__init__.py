@@ -216,7 +216,8 @@ def _of_gauges(case: GaugeCase, answer: Any) -> str:
 
 
 def _timed(function: Callable[..., Any]) -> bool:
-    return function.__code__.co_argcount == 3
+    given = len(function.__defaults__ or ())
+    return function.__code__.co_argcount - given == 3
 
 
 def _differentials(functions, at) -> np.ndarray:

@@ -6,11 +6,7 @@ import dvi_jax as dvi
 from dvi_jax.symmetry.library import rotation
 
 from . import Case, SymmetryCase
-
-
-def box(n, count, low=-1.0, high=1.0):
-    """Uniform samples in a box of 2n dimensions."""
-    return lambda rng: (rng.uniform(low, high, (count, n)), rng.uniform(low, high, (count, n)))
+from .maps import box
 
 
 OSCILLATOR = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2)

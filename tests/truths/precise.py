@@ -1,0 +1,480 @@
+"""The truths of discovery checked in 60 digits, without the search.
+
+    python tests/truths/precise.py [--kind KIND] [--case PART_OF_NAME]
+
+evaluates derivatives of H_D, and the functions of the basis, from their jaxprs in the arithmetic
+of mpmath, makes the step of the method there, and compares three things for each case:
+
+- each function of the truth is conserved by the step, up to the rounding of its coefficients;
+- each function of the truth is a linear combination of the basis;
+- the matrix of the changes of the basis has a null space with as many independent functions as
+  the truth. Its rank is that of a Gaussian elimination with complete pivoting.
+
+The smallest pivot of the rank and the largest one of the null space are printed: a null space is
+clear if they are many decades apart.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp  # noqa: E402
+import mpmath  # noqa: E402
+import numpy as np  # noqa: E402
+from jax.interpreters import partial_eval  # noqa: E402
+
+import dvi_jax as dvi  # noqa: E402
+import truths  # noqa: E402
+from dvi_jax.symmetry.basis import bind_basis  # noqa: E402
+
+mpmath.mp.dps = 60
+mpf = mpmath.mpf
+
+ZERO = mpf(10) ** -13
+"""Largest pivot of a null space: coefficients of maps are rounded to 16 digits."""
+
+
+def exactly(x) -> np.ndarray:
+    """An array of numbers of mpmath, each the exact value of the float."""
+    x = np.asarray(x)
+    out = np.empty(x.shape, object)
+    for i in np.ndindex(x.shape):
+        out[i] = x[i] if isinstance(x[i], mpmath.mpf | bool | np.bool_) else mpf(float(x[i]))
+    return out
+
+
+def _each(function):
+    return np.frompyfunc(function, 1, 1)
+
+
+_UNARY = {
+    "neg": lambda x: -x,
+    "sin": _each(mpmath.sin),
+    "cos": _each(mpmath.cos),
+    "tan": _each(mpmath.tan),
+    "exp": _each(mpmath.exp),
+    "log": _each(mpmath.log),
+    "log1p": _each(mpmath.log1p),
+    "sqrt": _each(mpmath.sqrt),
+    "rsqrt": _each(lambda x: 1 / mpmath.sqrt(x)),
+    "tanh": _each(mpmath.tanh),
+    "sinh": _each(mpmath.sinh),
+    "cosh": _each(mpmath.cosh),
+    "atan": _each(mpmath.atan),
+    "abs": _each(abs),
+    "sign": _each(mpmath.sign),
+    "square": lambda x: x * x,
+    "copy": lambda x: x,
+    "copy_p": lambda x: x,
+    "stop_gradient": lambda x: x,
+    "convert_element_type": lambda x: x,
+    "reduce_precision": lambda x: x,
+}
+_BINARY = {
+    "add": lambda x, y: x + y,
+    "add_any": lambda x, y: x + y,
+    "sub": lambda x, y: x - y,
+    "mul": lambda x, y: x * y,
+    "div": lambda x, y: x / y,
+    "max": np.frompyfunc(max, 2, 1),
+    "min": np.frompyfunc(min, 2, 1),
+    "pow": np.frompyfunc(lambda x, y: x**y, 2, 1),
+    "atan2": np.frompyfunc(mpmath.atan2, 2, 1),
+    "gt": lambda x, y: x > y,
+    "lt": lambda x, y: x < y,
+    "ge": lambda x, y: x >= y,
+    "le": lambda x, y: x <= y,
+    "eq": lambda x, y: x == y,
+    "ne": lambda x, y: x != y,
+}
+
+
+def _general_product(x, y, params):
+    (cx, cy), (bx, by) = params["dimension_numbers"]
+    if bx or by:
+        raise NotImplementedError("batched products")
+    return np.tensordot(x, y, (cx, cy)) if cx else np.multiply.outer(x, y)
+
+
+def _broadcast(x, params):
+    shape = [1] * len(params["shape"])
+    for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
+        shape[axis] = size
+    return np.broadcast_to(x.reshape(shape), params["shape"])
+
+
+def _pad(x, y, params):
+    (low, high, inner), *more = params["padding_config"]
+    if more or inner:
+        raise NotImplementedError("padding of several axes")
+    left, right = (np.full(max(k, 0), y.item(), object) for k in (low, high))
+    x = x[max(-low, 0) : len(x) + min(high, 0)]
+    return np.concatenate([left, x, right])
+
+
+def _integers(x) -> np.ndarray:
+    return np.vectorize(int)(x).astype(int) if np.size(x) else np.zeros(np.shape(x), int)
+
+
+def _gather(x, indices, params):
+    """Of single elements or whole rows, as they come from indexing with constants."""
+    numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
+    indices = _integers(indices)
+    out = []
+    for index in indices.reshape(-1, indices.shape[-1]):
+        start = [0] * x.ndim
+        for axis, i in zip(numbers.start_index_map, index, strict=True):
+            start[axis] = int(i)
+        part = x[tuple(slice(i, i + n) for i, n in zip(start, sizes, strict=True))]
+        kept = [n for a, n in enumerate(sizes) if a not in numbers.collapsed_slice_dims]
+        out.append(part.reshape(kept))
+    if not out[0].shape:
+        flat = np.empty(len(out), object)
+        flat[:] = [part.item() for part in out]
+        return flat.reshape(indices.shape[:-1])
+    stacked = np.stack(out).reshape(*indices.shape[:-1], *out[0].shape)
+    return np.moveaxis(
+        stacked, range(indices.ndim - 1, stacked.ndim), numbers.offset_dims
+    )
+
+
+def _scatter_add(x, indices, updates, params):
+    numbers = params["dimension_numbers"]
+    x, indices = np.array(x), _integers(indices)
+    if indices.ndim != 1:
+        raise NotImplementedError("scatter of several")
+    at = [slice(None)] * x.ndim
+    for axis, i in zip(numbers.scatter_dims_to_operand_dims, indices, strict=True):
+        at[axis] = int(i) if axis in numbers.inserted_window_dims else slice(
+            int(i), int(i) + np.shape(updates)[0])  # fmt: skip
+    x[tuple(at)] = x[tuple(at)] + updates
+    return x
+
+
+def _evaluate(jaxpr, consts, *inputs):
+    values = {}
+
+    def read(atom):
+        if hasattr(atom, "val"):
+            return exactly(atom.val)
+        return values[atom]
+
+    values.update(zip(jaxpr.constvars, map(exactly, consts), strict=True))
+    values.update(zip(jaxpr.invars, inputs, strict=True))
+    for eqn in jaxpr.eqns:
+        name, params = eqn.primitive.name, eqn.params
+        x = [read(atom) for atom in eqn.invars]
+        inner = params.get("jaxpr", params.get("call_jaxpr"))
+        if inner is not None and name not in ("scan", "while", "cond"):
+            inner = inner if hasattr(inner, "jaxpr") else jax.extend.core.ClosedJaxpr(inner, ())
+            out = _evaluate(inner.jaxpr, inner.consts, *x)
+        else:
+            out = _primitive(name, params, x)
+            out = out if name == "split" else [np.asarray(out, object)]
+        values.update(zip(eqn.outvars, out, strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _primitive(name, params, x):
+    if name in _UNARY:
+        return _UNARY[name](x[0])
+    if name in _BINARY:
+        return _BINARY[name](*x)
+    simple = {
+        "integer_pow": lambda: x[0] ** params["y"],
+        "reshape": lambda: np.reshape(x[0], params["new_sizes"]),
+        "squeeze": lambda: np.squeeze(x[0], params["dimensions"]),
+        "expand_dims": lambda: np.expand_dims(x[0], params["dimensions"]),
+        "transpose": lambda: np.transpose(x[0], params["permutation"]),
+        "rev": lambda: np.flip(x[0], params["dimensions"]),
+        "broadcast_in_dim": lambda: _broadcast(x[0], params),
+        "concatenate": lambda: np.concatenate(x, params["dimension"]),
+        "split": lambda: np.split(x[0], np.cumsum(params["sizes"])[:-1], params["axis"]),
+        "stack": lambda: np.stack(x, params["axis"]),
+        "reduce_sum": lambda: np.sum(x[0], axis=tuple(params["axes"])),
+        "reduce_prod": lambda: np.prod(x[0], axis=tuple(params["axes"])),
+        "dot_general": lambda: _general_product(*x, params),
+        "slice": lambda: x[0][
+            tuple(
+                map(
+                    slice,
+                    params["start_indices"],
+                    params["limit_indices"],
+                    params["strides"] or [1] * x[0].ndim,
+                )
+            )
+        ],
+        "pad": lambda: _pad(*x, params),
+        "gather": lambda: _gather(*x, params),
+        "scatter-add": lambda: _scatter_add(*x, params),
+        "iota": lambda: exactly(np.arange(params["shape"][0])),
+        "select_n": lambda: np.where(
+            np.vectorize(bool)(x[0]).reshape(np.shape(x[0])), x[2], x[1]
+        ),
+    }
+    if name not in simple:
+        raise NotImplementedError(f"{name} {params}")
+    return simple[name]()
+
+
+def precisely(function, *like):
+    """The function of arrays, evaluated in many digits; `like`: examples of its arguments."""
+    closed = jax.make_jaxpr(function)(*like)
+    jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), True)
+    return lambda *x: _evaluate(jaxpr, closed.consts, *map(exactly, x))
+
+
+def solved(residual, start):
+    """A root by Newton's method with differences for derivatives."""
+    x, step = start, mpf(10) ** -28
+    for _ in range(60):
+        r = residual(x)
+        scale = max(max(abs(v) for v in x), mpf(10) ** -40)
+        J = mpmath.matrix(len(x), len(x))
+        for j in range(len(x)):
+            moved = x.copy()
+            moved[j] = moved[j] + step * scale
+            for i, value in enumerate((residual(moved) - r) / (step * scale)):
+                J[i, j] = value
+        dx = mpmath.lu_solve(J, mpmath.matrix(list(-r)))
+        x = x + np.array([dx[i] for i in range(len(x))], object)
+        if max(abs(v) for v in dx) < scale * mpf(10) ** -52:
+            return x
+    raise ArithmeticError("no root")
+
+
+class Step:
+    """The step of a case in many digits."""
+
+    def __init__(self, case: truths.Case, shape):
+        system, options = case.system, dict(case.options)
+        args, self.h = options.get("args"), mpf(float(case.h))
+        self.method, self.shape = options.get("method", dvi.TypeII()), shape
+        self.slow = system.slow_time
+        one, state = jnp.zeros(()), jnp.zeros(shape)
+
+        def slopes(t0, t1, q, p):
+            H = lambda q, p: jnp.asarray(system.H_D(t0, t1, q, p, args), float)  # noqa: E731
+            return jax.grad(H, argnums=(0, 1))(q, p)
+
+        self.slopes = precisely(slopes, one, one, state, state)
+
+    def __call__(self, q, p, t):
+        h = self.h
+        q, p = self.of(self.method, q, p, t, t if self.slow else t + h, h)
+        return q, p, t if self.slow else t + h
+
+    def of(self, method, q, p, t0, t1, h):
+        if isinstance(method, dvi.TypeII):
+            rate = lambda p1: self.slopes(t0, t1, q, p1.reshape(self.shape))  # noqa: E731
+            p1 = self._fixed(lambda p1: p.ravel() - h * rate(p1)[0].ravel(), p.ravel())
+            return q + h * rate(p1)[1], p1.reshape(self.shape)
+        if isinstance(method, dvi.Adjoint):
+            return self.inverse(method.method, q, p, t1, t0, -h)
+        if isinstance(method, dvi.GaussLegendre):
+            return self._gauss(method.stages, q, p, t0, t1, h)
+        start = mpf(0)
+        for i, c in enumerate(method.fractions()):
+            a, b = t0 + start * (t1 - t0), t0 + (start + c) * (t1 - t0)
+            if i % 2:
+                q, p = self.inverse(method.base, q, p, b, a, -c * h)
+            else:
+                q, p = self.of(method.base, q, p, a, b, c * h)
+            start = start + c
+        return q, p
+
+    def inverse(self, method, q, p, t0, t1, h):
+        """What the step (t0, t1, h) of a method leads from to (q, p)."""
+        if isinstance(method, dvi.Adjoint):
+            return self.of(method.method, q, p, t1, t0, -h)
+        if not isinstance(method, dvi.TypeII):
+            raise NotImplementedError(repr(method))
+        rate = lambda q0: self.slopes(t0, t1, q0.reshape(self.shape), p)  # noqa: E731
+        q0 = self._fixed(lambda q0: q.ravel() - h * rate(q0)[1].ravel(), q.ravel())
+        return q0.reshape(self.shape), p + h * rate(q0)[0]
+
+    def _fixed(self, function, x):
+        first = function(x)
+        if all(first == function(first)):
+            return first
+        return solved(lambda y: y - function(y), first)
+
+    def _gauss(self, stages, q, p, t0, t1, h):
+        nodes = [r.real for r in mpmath.polyroots(_legendre(stages), maxsteps=200, extraprec=200)]
+        c = [(x + 1) / 2 for x in sorted(nodes)]
+        powers = mpmath.matrix([[x**k for x in c] for k in range(stages)])
+        b = mpmath.lu_solve(powers, mpmath.matrix([mpf(1) / (k + 1) for k in range(stages)]))
+        a = [mpmath.lu_solve(powers, mpmath.matrix([x ** (k + 1) / (k + 1) for k in range(stages)]))
+             for x in c]  # fmt: skip
+        z0 = np.concatenate([q.ravel(), p.ravel()])
+        n = q.size
+
+        def rates(z):
+            out = []
+            for i, x in enumerate(z.reshape(stages, 2 * n)):
+                t = t0 + c[i] * (t1 - t0)
+                Hq, Hp = self.slopes(t, t, x[:n].reshape(self.shape), x[n:].reshape(self.shape))
+                out.append(np.concatenate([Hp.ravel(), -Hq.ravel()]))
+            return out
+
+        def function(z):
+            f = rates(z)
+            return np.concatenate(
+                [z0 + h * sum(a[i][j] * f[j] for j in range(stages)) for i in range(stages)]
+            )
+
+        z = self._fixed(function, np.concatenate([z0] * stages))
+        f = rates(z)
+        z1 = z0 + h * sum(b[j] * f[j] for j in range(stages))
+        return z1[:n].reshape(self.shape), z1[n:].reshape(self.shape)
+
+
+def _legendre(n):
+    """Coefficients, highest power first."""
+    low, high = [mpf(1)], [mpf(1), mpf(0)]
+    if n == 0:
+        return low
+    for k in range(1, n):
+        longer = [(2 * k + 1) * x for x in [*high, 0]]
+        shorter = [0, 0, *[k * x for x in low]]
+        low, high = high, [(x - y) / (k + 1) for x, y in zip(longer, shorter, strict=True)]
+    return high
+
+
+def eliminated(matrix):
+    """Pivots in descending order of their choice, and the null vectors below `ZERO`."""
+    A = matrix.copy()
+    rows, columns = A.shape
+    order = np.arange(columns)
+    pivots = []
+    size = np.abs(A)
+    for k in range(min(rows, columns)):
+        i, j = np.unravel_index(np.argmax(size[k:, k:]), (rows - k, columns - k))
+        i, j = i + k, j + k
+        if size[i, j] == 0:
+            break
+        A[[k, i]] = A[[i, k]]
+        A[:, [k, j]] = A[:, [j, k]]
+        order[[k, j]] = order[[j, k]]
+        pivots.append(abs(A[k, k]))
+        A[k + 1 :, k:] = A[k + 1 :, k:] - np.multiply.outer(A[k + 1 :, k] / A[k, k], A[k, k:])
+        A[k + 1 :, k] = mpf(0)
+        size = np.abs(A)
+    pivots = [x / pivots[0] for x in pivots]
+    rank = sum(x > ZERO for x in pivots)
+    null = np.full((columns, columns - rank), mpf(0), object)
+    for m in range(columns - rank):
+        x = np.full(columns, mpf(0), object)
+        x[rank + m] = mpf(1)
+        for k in range(rank - 1, -1, -1):
+            x[k] = -np.sum(A[k, k + 1 :] * x[k + 1 :]) / A[k, k]
+        null[order, m] = x
+    return pivots, rank, null
+
+
+def check(case: truths.Case) -> tuple[bool, str]:
+    """Whether the truth of the case is one, and what was measured."""
+    points = []
+    draw, seed = case.points or case.samples, 100
+    shape = np.shape(case.samples(np.random.default_rng(0))[0])[1:]
+    bound = bind_basis(case.basis, shape)
+    needed = bound.size + 12
+    while len(points) < needed:
+        drawn = [np.asarray(x, float) for x in draw(np.random.default_rng(seed))]
+        drawn = drawn if len(drawn) == 3 else [*drawn, np.zeros(len(drawn[0]))]
+        some = np.random.default_rng(seed).permutation(len(drawn[0]))[:needed]
+        points += list(zip(*(x[some] for x in drawn), strict=True))
+        seed += 1
+        if seed > 130:
+            break
+    step, one, state = Step(case, shape), jnp.zeros(()), jnp.zeros(shape)
+
+    def true(q, p, t):
+        values = [f(q, p, t) if truths._timed(f) else f(q, p) for f in case.truth]
+        return jnp.stack([jnp.asarray(v, float) for v in values]) if values else jnp.zeros(0)
+
+    basis = precisely(lambda q, p, t: bound(q, p, t), state, state, one)
+    truth = precisely(true, state, state, one)
+    values, changes, kept, wanted = [], [], [], []
+    for point in points[:needed]:
+        z = [exactly(x) for x in point]
+        z1 = step(*z)
+        (f0,), (f1,) = basis(*z), basis(*z1)
+        values.append(f0)
+        changes.append(f1 - f0)
+        if case.truth:
+            (g0,), (g1,) = truth(*z), truth(*z1)
+            wanted.append(g0)
+            kept.append(g1 - g0)
+    values, changes = np.array(values), np.array(changes)
+    scale = np.array([_norm(c) for c in values.T])
+    rows = changes / scale
+    sizes = np.array([_norm(r) or mpf(1) for r in rows])
+    pivots, rank, null = eliminated(rows / sizes[:, None])
+    null = null / scale[:, None]
+    q, p, t = (jnp.asarray(np.array(x)) for x in zip(*points[:needed], strict=True))
+    null = np.array(null / np.array([_norm(c) for c in (values @ null).T]), float)
+    found = 0
+    if null.shape[1]:
+        d = truths._differentials(lambda q, p, t: jnp.asarray(null).T @ bound(q, p, t), (q, p, t))
+        found = truths._rank(d)
+    text = f"rank {rank} of {bound.size}, {found} independent"
+    text += f", pivots {mpmath.nstr(pivots[rank - 1] if rank else mpf(0), 2)}"
+    text += f" | {mpmath.nstr(pivots[rank] if rank < len(pivots) else mpf(0), 2)}"
+    good = found == len(case.truth)
+    if case.truth:
+        kept, wanted = np.array(kept), np.array(wanted)
+        # relative to how the function varies over the samples
+        change = max(
+            float(_norm(k) / (_norm(w - np.mean(w)) or _norm(w)))
+            for k, w in zip(kept.T, wanted.T, strict=True)
+        )
+        floats = np.column_stack([np.array(values / scale, float), np.ones(len(values))])
+        off = max(
+            truths._distance(floats, np.array(w / (_norm(w) or 1), float)) for w in wanted.T
+        )
+        independent = truths._rank(truths._differentials(true, (q, p, t)))
+        text += f", truth of rank {independent} changes by {change:.1e}, off the basis {off:.1e}"
+        good = good and change < 1e-11 and off < 1e-6 and independent == len(case.truth)
+    return good, text
+
+
+def _norm(x):
+    return mpmath.sqrt(sum(v * v for v in np.ravel(x)))
+
+
+def main() -> int:
+    """Check, print, and return 1 if a truth is none."""
+    from truths.table import all_cases
+
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--kind", default="")
+    parser.add_argument("--case", default="")
+    chosen = parser.parse_args()
+    bad = 0
+    for case in all_cases():
+        if not isinstance(case, truths.Case) or case.order > 0:
+            continue
+        if chosen.kind not in case.kind or chosen.case not in case.name:
+            continue
+        start = time.time()
+        try:
+            good, text = check(case)
+        except Exception as error:
+            good, text = False, f"{type(error).__name__}: {str(error)[:300]}"
+        bad += not good
+        print(f"{'ok ' if good else 'BAD'} {case.name}: {text} ({time.time() - start:.1f} s)",
+              flush=True)  # fmt: skip
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
