@@ -226,10 +226,9 @@ def _differentials(functions, at) -> np.ndarray:
     q, p = at[0], at[1]
     slopes = jax.vmap(jax.jacfwd(functions, argnums=(0, 1)))(*at)
     units = [np.maximum(np.std(np.asarray(x), axis=0).ravel(), 1e-300) for x in (q, p)]
-    slopes = [
-        np.asarray(s).reshape(*s.shape[:2], len(u)) for s, u in zip(slopes, units, strict=True)
+    rows = [
+        np.asarray(s).reshape(*s.shape[:2], len(u)) * u for s, u in zip(slopes, units, strict=True)
     ]
-    rows = [s * u for s, u in zip(slopes, units, strict=True)]
     rows = np.concatenate(rows, axis=2)
     return rows / np.maximum(np.linalg.norm(rows, axis=2, keepdims=True), 1e-300)
 
