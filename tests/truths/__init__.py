@@ -4,7 +4,8 @@ A case is data: a map, functions to look in, samples, and the truth with its sou
 the search and names what it did, by one principle for all cases:
 
 - "found": everything that is true was found, nothing else, without a warning.
-- "undecided": the report warns that its answer is not to be relied on.
+- "undecided": the report warns that its answer is not to be relied on, or the case is refused
+  with an error that says why.
 - "missed": something true was not found, without a warning.
 - "false": something was reported that is not true, without a warning.
 """
@@ -121,6 +122,18 @@ def outcome(case: Case | SymmetryCase | GaugeCase, answer: Any, seed: int = 0) -
     if isinstance(case, SymmetryCase):
         return _of_symmetries(case, answer, seed)
     return _of_invariants(case, answer, seed)
+
+
+def judged(case: Case | SymmetryCase, seed: int = 0) -> tuple[str, Any]:
+    """The outcome, and the answer or the error by which the package refuses the case.
+
+    A refusal names what would help, and no conclusion: it counts as "undecided".
+    """
+    try:
+        answer = search(case, seed)
+    except ValueError as error:
+        return "undecided", error
+    return outcome(case, answer, seed), answer
 
 
 def _of_invariants(case: Case, answer: dvi.Discovery, seed: int) -> str:

@@ -428,12 +428,17 @@ def _check(case: truths.Case, zero) -> tuple[bool, str]:
             kept.append(g1 - g0)
     values, changes = np.array(values), np.array(changes)
     scale = np.array([_norm(c) for c in values.T])
+    still = [_norm(c) < s * mpf(10) ** -40 for c, s in zip(changes.T, scale, strict=True)]
+    changes[:, np.array(still)] = mpf(0)
     rows = changes / scale
     sizes = np.array([_norm(r) or mpf(1) for r in rows])
     pivots, rank, null = eliminated(rows / sizes[:, None], zero)
     null = null / scale[:, None]
     q, p, t = (jnp.asarray(np.array(x)) for x in zip(*points[:needed], strict=True))
-    null = np.array(null / np.array([_norm(c) for c in (values @ null).T]), float)
+    null = null / np.array([_norm(c) for c in (values @ null).T])
+    spread = np.array(values @ null - np.mean(values @ null, axis=0), float)
+    _, sizes, V = np.linalg.svd(spread, full_matrices=False)
+    null = np.array(null @ exactly(V[sizes > 1e-9].T), float)  # without a constant
     found = 0
     if null.shape[1]:
         d = truths._differentials(lambda q, p, t: jnp.asarray(null).T @ bound(q, p, t), (q, p, t))

@@ -1,10 +1,10 @@
 """All cases, searched: the table of the page on discovery.
 
-    python tests/truths/table.py [--kind KIND] [--case PART_OF_NAME] [--seeds N] [--report]
+    python tests/truths/table.py [--kind KIND] [--case PART_OF_NAME] [--seeds N] [--report] [--times]
 
 prints how many of each kind are found, undecided, missed and false, and names what is not found.
 With `--seeds` each case is searched on that many draws of its samples. `--report` prints what the
-package says of each case.
+package says of each case, `--times` how long it takes.
 """
 
 import argparse
@@ -12,6 +12,7 @@ import collections
 import importlib
 import pkgutil
 import sys
+import time
 from pathlib import Path
 
 if __name__ == "__main__":
@@ -56,19 +57,22 @@ def main() -> int:
     parser.add_argument("--case", default="")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--report", action="store_true")
+    parser.add_argument("--times", action="store_true")
     chosen = parser.parse_args()
     outcomes: dict[str, list[str]] = {}
     for case in all_cases():
         if chosen.kind not in case.kind or chosen.case not in case.name:
             continue
+        start = time.time()
         for seed in range(chosen.seeds):
-            answer = truths.search(case, seed)
-            outcome = truths.outcome(case, answer, seed)
+            outcome, answer = truths.judged(case, seed)
             outcomes.setdefault(case.kind, []).append(outcome)
             if outcome != "found" or chosen.report:
                 print(f"{outcome}: {case.name} (samples of seed {seed})", flush=True)
-            if chosen.report:
+            if chosen.report or isinstance(answer, ValueError):
                 print(answer)
+        if chosen.times:
+            print(f"{time.time() - start:6.1f} s  {case.name}", flush=True)
     print(table(outcomes))
     return int(any(o in ("missed", "false") for found in outcomes.values() for o in found))
 
