@@ -21,9 +21,7 @@ def orbit_of_force(omega, h, amplitude=1.0):
     """Coefficients of the periodic orbit z*(t) = Re(Z e^{iωt}) of
     p1 = p − h(q − F cos ωt), q1 = q + h p1: (e^{iωh} − M) Z = (h², h)·F."""
     M = np.array([[1 - h * h, h], [-h, 1.0]])
-    return np.linalg.solve(
-        np.exp(1j * omega * h) * np.eye(2) - M, amplitude * np.array([h * h, h])
-    )
+    return np.linalg.solve(np.exp(1j * omega * h) * np.eye(2) - M, amplitude * np.array([h * h, h]))
 
 
 def about_orbit(omega, h):
@@ -49,9 +47,7 @@ def driven(omega):
 def damped(V, rate=0.3):
     """H_D = e^{−γt₀} p²/2 + e^{γt₀} V(q): Caldirola 1941, Kanai 1948."""
     return dvi.System(
-        lambda t0, t1, q, p, args: (
-            jnp.exp(-rate * t0) * (p @ p) / 2 + jnp.exp(rate * t0) * V(q)
-        )
+        lambda t0, t1, q, p, args: jnp.exp(-rate * t0) * (p @ p) / 2 + jnp.exp(rate * t0) * V(q)
     )
 
 
@@ -93,9 +89,7 @@ def rotating_too(q, p, t):
 CENTRAL = dvi.System(
     lambda t0, t1, q, p, args: p @ p / 2 + (1 + 0.3 * jnp.cos(t0)) * (q @ q) ** 2 / 4
 )
-PERIODIC = dvi.System(
-    lambda t0, t1, q, p, args: (p @ p + (1 + 0.3 * jnp.cos(t0)) * (q @ q)) / 2
-)
+PERIODIC = dvi.System(lambda t0, t1, q, p, args: (p @ p + (1 + 0.3 * jnp.cos(t0)) * (q @ q)) / 2)
 
 CASES = (
     Case(
@@ -230,9 +224,7 @@ CASES = (
         ),
         QUADRATICS * dvi.Chebyshev(4, "τ", (0.0, 3.0)),
         timed(box(1, 60), 0.0, 3.0),
-        truth=(
-            lambda q, p, t: p[0] ** 2 + (1 + 0.3 * t) * (q[0] ** 2 - 0.1 * q[0] * p[0]),
-        ),
+        truth=(lambda q, p, t: p[0] ** 2 + (1 + 0.3 * t) * (q[0] ** 2 - 0.1 * q[0] * p[0]),),
     ),
     Case(
         "slow oscillator at order 0 with functions of τ alone",
@@ -243,9 +235,7 @@ CASES = (
         ),
         dvi.Polynomials(2, constant=True) * dvi.Chebyshev(3, "τ", (0.0, 3.0)),
         timed(box(1, 80), 0.0, 3.0),
-        truth=(
-            lambda q, p, t: p[0] ** 2 + (1 + 0.3 * t) * (q[0] ** 2 - 0.1 * q[0] * p[0]),
-        ),
+        truth=(lambda q, p, t: p[0] ** 2 + (1 + 0.3 * t) * (q[0] ** 2 - 0.1 * q[0] * p[0]),),
     ),
     Case(
         "slow pendulum at order 0",
@@ -266,5 +256,22 @@ CASES = (
         dvi.Polynomials(4),
         timed(box(1, 80), -1e6, 1e6),
         truth=(energy(1.0, 0.1),),
+    ),
+    Case(
+        "discrete Painlevé I",
+        KIND,
+        "q₊ + q₋ = (a + δt)/q + b/q²: integrable, and without an invariant; " + NONE,
+        dvi.System(
+            lambda t0, t1, q, p, args: (
+                p @ p / 2 + jnp.sum(q**2 - (0.8 + 0.05 * t0) * jnp.log(q) + 0.3 / q)
+            )
+        ),
+        dvi.Polynomials(4),
+        timed(
+            lambda rng: (rng.uniform(0.3, 2.0, (100, 1)), rng.uniform(-1.0, 1.0, (100, 1))),
+            0.0,
+            10.0,
+        ),
+        h=1.0,
     ),
 )

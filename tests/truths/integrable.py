@@ -1,5 +1,8 @@
 """Maps that are integrable at their step size: linear ones, QRT maps, and maps of Suris."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -80,9 +83,7 @@ def biquadratic(alpha, beta, gamma, epsilon, xi, h=1.0):
 
 def qrt(alpha, beta, gamma, epsilon, xi):
     """q₊ + q₋ = −(β q² + ε q + ξ)/(α q² + β q + γ)."""
-    return additive(
-        lambda q: -(beta * q**2 + epsilon * q + xi) / (alpha * q**2 + beta * q + gamma)
-    )
+    return additive(lambda q: -(beta * q**2 + epsilon * q + xi) / (alpha * q**2 + beta * q + gamma))
 
 
 QRT = (
@@ -183,7 +184,9 @@ def of_toda(h, n, periodic=False):
 
 def toda_basis(h, n, periodic=False):
     """e^{±hp_k}, e^{q_{k+1} − q_k} and its products with e^{±hp_k}, e^{±hp_{k+1}}, and p_k."""
-    functions = {f"p{k + 1}": lambda q, p, k=k: p[k] for k in range(n)}
+    functions: dict[str, Callable[..., Any]] = {
+        f"p{k + 1}": lambda q, p, k=k: p[k] for k in range(n)
+    }
     for s in (1, -1):
         for k in range(n):
             functions[f"e^{s}hp{k + 1}"] = lambda q, p, k=k, s=s: jnp.exp(s * h * p[k])
@@ -382,9 +385,7 @@ CASES = (
         "three coupled oscillators",
         KIND,
         LINEAR,
-        separable(
-            lambda q: (q @ q + (q[0] - q[1]) ** 2 + 0.7 * (q[1] - q[2]) ** 2) / 2
-        ),
+        separable(lambda q: (q @ q + (q[0] - q[1]) ** 2 + 0.7 * (q[1] - q[2]) ** 2) / 2),
         dvi.Polynomials(2),
         box(3, 120),
         truth=tuple(
@@ -423,7 +424,7 @@ CASES = (
         dvi.Polynomials(4),
         box(1, 120),
         truth=(
-            # bilinear: a q² + b·… from the matrix M = [[m, n], [k, l]]: n p² + (m − l) q p − k q²
+            # M = [[m, n], [k, l]] conserves n p² + (m − l) q p − k q²
             lambda q, p: (
                 0.2 * 1.1 / 1.06 * p[0] ** 2
                 + (1.06 - (0.2 * 1.1 * 0.2 * 0.8 + 1) / 1.06) * q[0] * p[0]
@@ -435,8 +436,9 @@ CASES = (
     Case(
         "sixth of a turn in each step",
         KIND,
-        "h = 1: λ = e^{iπ/3}, λ⁶ = 1, so that Re ζ⁶ is conserved besides |ζ|²; as many independent "
-        "invariants as coordinates, since the sixth iterate is the identity",
+        "h = 1: λ = e^{iπ/3}, λ⁶ = 1, so that Re ζ⁶ is conserved besides |ζ|²; the map "
+        "moves and has as many independent invariants as coordinates, since its sixth iterate is "
+        "the identity",
         OSCILLATOR,
         dvi.Polynomials(6),
         box(1, 120),
@@ -630,9 +632,7 @@ CASES = (
         "McMillan's map beside an oscillator",
         KIND,
         "separable: one invariant each",
-        separable(
-            lambda q: q[0] ** 2 - 0.7 * jnp.log(1 + q[0] ** 2) + 0.3 * q[1] ** 2 / 2
-        ),
+        separable(lambda q: q[0] ** 2 - 0.7 * jnp.log(1 + q[0] ** 2) + 0.3 * q[1] ** 2 / 2),
         dvi.Polynomials(4, ["q1", "p1"]) + dvi.Polynomials(4, ["q2", "p2"]),
         box(2, 120),
         truth=(biquadratic(1, 0, 1, -1.4, 0), energy(0.3, 1.0, 1)),
@@ -692,5 +692,108 @@ CASES = (
         box(1, 120),
         truth=(lambda q, p: q[0] * p[0],),
         h=0.5,
+    ),
+    Case(
+        "resonance 1:3 of the map",
+        KIND,
+        "cos θ₁ = 3/4 and cos θ₂ = 4 cos³ θ₁ − 3 cos θ₁ = −9/16, so that ζ₁³ conj ζ₂ is conserved",
+        spring(0.5, 3.125),
+        dvi.Polynomials(4),
+        box(2, 150),
+        truth=(energy(0.5, 1.0, 0), energy(3.125, 1.0, 1), resonant(0.5, 3, 3.125, 1)),
+        h=1.0,
+    ),
+    Case(
+        "McMillan's map by Strang's method",
+        KIND,
+        "q₊ = p + f(q)/2 with f = 1.4 q/(1 + q²): the biquadratic is (1 + q²)p² + q² + "
+        "0.49/(1 + q²) and a constant",
+        MCMILLAN,
+        dvi.Polynomials(4) + dvi.Basis({"1/(1+q²)": lambda q, p: 1 / (1 + q[0] ** 2)}),
+        box(1, 100),
+        truth=(lambda q, p: (1 + q[0] ** 2) * p[0] ** 2 + q[0] ** 2 + 0.49 / (1 + q[0] ** 2),),
+        h=1.0,
+        options={"method": dvi.Strang()},
+    ),
+    Case(
+        "McMillan's map by the adjoint method",
+        KIND,
+        "drift–kick: q₊ = q + p, the biquadratic of q and q + p",
+        MCMILLAN,
+        dvi.Polynomials(4),
+        box(1, 100),
+        truth=(lambda q, p: biquadratic(1, 0, 1, -1.4, 0)(q, -p),),
+        h=1.0,
+        options={"method": dvi.Adjoint()},
+    ),
+    Case(
+        "autonomous discrete Painlevé I with poles of order 2",
+        KIND,
+        "q₊ + q₋ = a/q + b/q²: x²y² − a xy − b (x + y); " + QRT,
+        separable(lambda q: jnp.sum(q**2 - 0.8 * jnp.log(q) + 0.3 / q)),
+        dvi.Polynomials(4),
+        lambda rng: (rng.uniform(0.3, 2.0, (100, 1)), rng.uniform(-1.0, 1.0, (100, 1))),
+        truth=(biquadratic(1.0, 0.0, 0.0, -0.8, -0.3),),
+        h=1.0,
+    ),
+    Case(
+        "autonomous discrete Painlevé I with poles of order 1",
+        KIND,
+        "q₊ + q + q₋ = a/q + b: xy(x + y) − b xy − a (x + y); " + QRT,
+        separable(lambda q: jnp.sum(1.5 * q**2 - 0.5 * q - 0.8 * jnp.log(q))),
+        dvi.Polynomials(4),
+        lambda rng: (rng.uniform(0.3, 2.0, (100, 1)), rng.uniform(-1.0, 1.0, (100, 1))),
+        truth=(biquadratic(0.0, 1.0, 0.0, -0.5, -0.8),),
+        h=1.0,
+    ),
+    Case(
+        "autonomous discrete Painlevé II",
+        KIND,
+        "q₊ + q₋ = (a q + b)/(1 − q²): −x²y² + x² + y² − a xy − b (x + y); " + QRT,
+        qrt(-1.0, 0.0, 1.0, -0.8, -0.2),
+        dvi.Polynomials(4),
+        box(1, 100, -0.9, 0.9),
+        truth=(biquadratic(-1.0, 0.0, 1.0, -0.8, -0.2),),
+        h=1.0,
+    ),
+    Case(
+        "free top by two vectors, midpoint rule",
+        KIND,
+        "H = Σ Lᵢ²/2Iᵢ with L = q × p turns q and p together: q·q, q·p and p·p are quadratic "
+        "invariants of the equations: HLW IV.2.1",
+        dvi.System(
+            lambda t0, t1, q, p, args: (
+                jnp.sum(jnp.cross(q, p) ** 2 / jnp.array([1.0, 2.0, 3.0])) / 2
+            )
+        ),
+        dvi.Polynomials(2),
+        box(3, 70),
+        truth=(lambda q, p: q @ q, lambda q, p: q @ p, lambda q, p: p @ p),
+        h=0.2,
+        options={"method": dvi.GaussLegendre(1)},
+    ),
+    Case(
+        "radial McMillan map in space",
+        KIND,
+        "as in the plane, with three components of x ∧ y, and functions of scalar products",
+        garnier([0.7, 0.7, 0.7]),
+        dvi.Polynomials(2)
+        + dvi.Basis(
+            {
+                "q²q²": lambda q, p: (q @ q) ** 2,
+                "q²qp": lambda q, p: (q @ q) * (q @ p),
+                "q²p²": lambda q, p: (q @ q) * (p @ p),
+                "qp qp": lambda q, p: (q @ p) ** 2,
+                "qp p²": lambda q, p: (q @ p) * (p @ p),
+            }
+        ),
+        box(3, 90),
+        truth=(
+            turning(0, 1),
+            turning(0, 2),
+            turning(1, 2),
+            of_garnier([0.7, 0.7, 0.7]),
+        ),
+        h=1.0,
     ),
 )

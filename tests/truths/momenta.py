@@ -53,9 +53,7 @@ def bilinear(n, d=2):
     """The momenta, and every product of a position and a momentum."""
     names = [f"q{i + 1}" for i in range(n * d)]
     momenta = [f"p{i + 1}" for i in range(n * d)]
-    return dvi.Polynomials(1, momenta) + (
-        dvi.Polynomials(1, names) * dvi.Polynomials(1, momenta)
-    )
+    return dvi.Polynomials(1, momenta) + (dvi.Polynomials(1, names) * dvi.Polynomials(1, momenta))
 
 
 BODIES = bodies()
@@ -86,7 +84,8 @@ CASES = (
         Case(
             f"three bodies in the plane, {name}",
             KIND,
-            NOETHER + ": translations and rotations of the plane; the angular momentum of the centre of "
+            NOETHER
+            + ": translations and rotations of the plane; the angular momentum of the centre of "
             "mass, which moves uniformly",
             BODIES,
             bilinear(3),
@@ -200,9 +199,9 @@ CASES = (
         KIND,
         "the azimuth is cyclic; type II solves for p_θ alone",
         SPHERE,
-        dvi.Polynomials(3, ["p1", "p2"]) + dvi.Trigonometric(2, "q1") + (
-            dvi.Polynomials(1, ["p1", "p2"]) * dvi.Trigonometric(1, "q1")
-        ),
+        dvi.Polynomials(3, ["p1", "p2"])
+        + dvi.Trigonometric(2, "q1")
+        + (dvi.Polynomials(1, ["p1", "p2"]) * dvi.Trigonometric(1, "q1")),
         around(1.5, box(2, 80)),
         truth=(component(1),),
         h=0.05,

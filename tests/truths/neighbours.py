@@ -28,8 +28,10 @@ PENDULUM = separable(lambda q: -jnp.sum(jnp.cos(q)))
 ENERGIES = dvi.Polynomials(2) + dvi.Radial()
 """Functions of Kepler's problem with the energy p²/2 − 1/r in their span."""
 
-PENDULUM_BASIS = dvi.Polynomials(3, ["p"]) + dvi.Trigonometric(2, "q") + (
-    dvi.Polynomials(1, ["p"]) * dvi.Trigonometric(1, "q")
+PENDULUM_BASIS = (
+    dvi.Polynomials(3, ["p"])
+    + dvi.Trigonometric(2, "q")
+    + (dvi.Polynomials(1, ["p"]) * dvi.Trigonometric(1, "q"))
 )
 
 
@@ -86,9 +88,7 @@ CASES = (
         "symmetric QRT map with one coefficient changed",
         KIND,
         "β differs between numerator and denominator by 0.001; " + NONE,
-        additive(
-            lambda q: -(0.501 * q**2 - 1.2 * q + 0.3) / (q**2 + 0.5 * q + 2)
-        ),
+        additive(lambda q: -(0.501 * q**2 - 1.2 * q + 0.3) / (q**2 + 0.5 * q + 2)),
         dvi.Polynomials(4),
         box(1, 120),
         h=1.0,
@@ -305,5 +305,52 @@ CASES = (
         separable(lambda q: jnp.sum(q**2 / 2 + jnp.maximum(q - 0.9, 0.0) ** 4 / 4)),
         dvi.Polynomials(3),
         box(1, 400),
+    ),
+    Case(
+        "McMillan's map by Yoshida's method",
+        KIND,
+        "a composition of integrable maps of different steps is not integrable; " + NONE,
+        separable(lambda q: jnp.sum(q**2 - 0.7 * jnp.log(1 + q**2))),
+        dvi.Polynomials(4) + dvi.Basis({"1/(1+q²)": lambda q, p: 1 / (1 + q[0] ** 2)}),
+        box(1, 100),
+        h=1.0,
+        options={"method": dvi.Yoshida(4)},
+    ),
+    Case(
+        "McMillan's map by Strang's method in polynomials",
+        KIND,
+        "the invariant has 1/(1 + q²), which no polynomial is; " + NONE,
+        separable(lambda q: jnp.sum(q**2 - 0.7 * jnp.log(1 + q**2))),
+        dvi.Polynomials(6),
+        box(1, 100),
+        h=1.0,
+        options={"method": dvi.Strang()},
+    ),
+    Case(
+        "resonance 1:3 of the map, detuned by 1e-5",
+        KIND,
+        "the quartic invariant needs the resonance",
+        spring(0.5, 3.12501),
+        dvi.Polynomials(4, ["q1", "p1"])
+        + dvi.Polynomials(3, ["q1", "p1"]) * dvi.Polynomials(1, ["q2", "p2"])
+        + dvi.Polynomials(2, ["q2", "p2"]),
+        box(2, 100),
+        truth=(energy(0.5, 1.0, 0), energy(3.12501, 1.0, 1)),
+        h=1.0,
+    ),
+    Case(
+        "free top by two vectors, type II",
+        KIND,
+        "a type II map has the symmetries that are linear in q: of the three quadratic invariants "
+        "of the flow q·p is left, that of q → λq, p → p/λ",
+        dvi.System(
+            lambda t0, t1, q, p, args: (
+                jnp.sum(jnp.cross(q, p) ** 2 / jnp.array([1.0, 2.0, 3.0])) / 2
+            )
+        ),
+        dvi.Polynomials(2),
+        box(3, 70),
+        truth=(lambda q, p: q @ p,),
+        h=0.2,
     ),
 )

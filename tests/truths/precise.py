@@ -18,6 +18,7 @@ import argparse
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -29,6 +30,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp  # noqa: E402
 import mpmath  # noqa: E402
 import numpy as np  # noqa: E402
+from jax.extend.core import ClosedJaxpr  # noqa: E402
 from jax.interpreters import partial_eval  # noqa: E402
 
 import dvi_jax as dvi  # noqa: E402
@@ -40,7 +42,7 @@ mpf = mpmath.mpf
 
 ZEROS = (mpf(10) ** -14, mpf(10) ** -25)
 """Largest pivots of a null space that are tried: coefficients of most maps are rounded to 16
-digits; maps that expand by 1e4 have smaller pivots, and coefficients without rounding."""
+digits. Maps that expand by 1e4 have smaller pivots, and coefficients without rounding."""
 
 
 def exactly(x) -> np.ndarray:
@@ -144,9 +146,7 @@ def _gather(x, indices, params):
         flat[:] = [part.item() for part in out]
         return flat.reshape(indices.shape[:-1])
     stacked = np.stack(out).reshape(*indices.shape[:-1], *out[0].shape)
-    return np.moveaxis(
-        stacked, range(indices.ndim - 1, stacked.ndim), numbers.offset_dims
-    )
+    return np.moveaxis(stacked, range(indices.ndim - 1, stacked.ndim), numbers.offset_dims)
 
 
 def _scatter_add(x, indices, updates, params):
@@ -154,7 +154,7 @@ def _scatter_add(x, indices, updates, params):
     x, indices = np.array(x), _integers(indices)
     if indices.ndim != 1:
         raise NotImplementedError("scatter of several")
-    at = [slice(None)] * x.ndim
+    at: list[Any] = [slice(None)] * x.ndim
     for axis, i in zip(numbers.scatter_dims_to_operand_dims, indices, strict=True):
         at[axis] = int(i) if axis in numbers.inserted_window_dims else slice(
             int(i), int(i) + np.shape(updates)[0])  # fmt: skip
@@ -177,7 +177,7 @@ def _evaluate(jaxpr, consts, *inputs):
         x = [read(atom) for atom in eqn.invars]
         inner = params.get("jaxpr", params.get("call_jaxpr"))
         if inner is not None and name not in ("scan", "while", "cond"):
-            inner = inner if hasattr(inner, "jaxpr") else jax.extend.core.ClosedJaxpr(inner, ())
+            inner = inner if hasattr(inner, "jaxpr") else ClosedJaxpr(inner, ())
             out = _evaluate(inner.jaxpr, inner.consts, *x)
         else:
             out = _primitive(name, params, x)
@@ -204,7 +204,7 @@ def _primitive(name, params, x):
         "stack": lambda: np.stack(x, params["axis"]),
         "reduce_sum": lambda: np.sum(x[0], axis=tuple(params["axes"])),
         "reduce_prod": lambda: np.prod(x[0], axis=tuple(params["axes"])),
-        "dot_general": lambda: _general_product(*x, params),
+        "dot_general": lambda: _general_product(x[0], x[1], params),
         "slice": lambda: x[0][
             tuple(
                 map(
@@ -215,13 +215,11 @@ def _primitive(name, params, x):
                 )
             )
         ],
-        "pad": lambda: _pad(*x, params),
-        "gather": lambda: _gather(*x, params),
-        "scatter-add": lambda: _scatter_add(*x, params),
+        "pad": lambda: _pad(x[0], x[1], params),
+        "gather": lambda: _gather(x[0], x[1], params),
+        "scatter-add": lambda: _scatter_add(x[0], x[1], x[2], params),
         "iota": lambda: exactly(np.arange(params["shape"][0])),
-        "select_n": lambda: np.where(
-            np.vectorize(bool)(x[0]).reshape(np.shape(x[0])), x[2], x[1]
-        ),
+        "select_n": lambda: np.where(np.vectorize(bool)(x[0]).reshape(np.shape(x[0])), x[2], x[1]),
     }
     if name not in simple:
         raise NotImplementedError(f"{name} {params}")
@@ -231,7 +229,7 @@ def _primitive(name, params, x):
 def precisely(function, *like):
     """The function of arrays, evaluated in many digits; `like`: examples of its arguments."""
     closed = jax.make_jaxpr(function)(*like)
-    jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), True)
+    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), True)
     return lambda *x: _evaluate(jaxpr, closed.consts, *map(exactly, x))
 
 
@@ -240,7 +238,7 @@ def solved(residual, start):
     x, step = start, mpf(10) ** -28
     for _ in range(60):
         r = residual(x)
-        scale = max(max(abs(v) for v in x), mpf(10) ** -40)
+        scale = max(*(abs(v) for v in x), mpf(10) ** -40)
         J = mpmath.matrix(len(x), len(x))
         for j in range(len(x)):
             moved = x.copy()
@@ -413,7 +411,7 @@ def _check(case: truths.Case, zero) -> tuple[bool, str]:
         values = [f(q, p, t) if truths._timed(f) else f(q, p) for f in case.truth]
         return jnp.stack([jnp.asarray(v, float) for v in values]) if values else jnp.zeros(0)
 
-    basis = precisely(lambda q, p, t: bound(q, p, t), state, state, one)
+    basis = precisely(bound, state, state, one)
     truth = precisely(true, state, state, one)
     values, changes, kept, wanted = [], [], [], []
     for point in points[:needed]:
@@ -455,9 +453,7 @@ def _check(case: truths.Case, zero) -> tuple[bool, str]:
             for k, w in zip(kept.T, wanted.T, strict=True)
         )
         floats = np.column_stack([np.array(values / scale, float), np.ones(len(values))])
-        off = max(
-            truths._distance(floats, np.array(w / (_norm(w) or 1), float)) for w in wanted.T
-        )
+        off = max(truths._distance(floats, np.array(w / (_norm(w) or 1), float)) for w in wanted.T)
         independent = truths._rank(truths._differentials(true, (q, p, t)))
         text += f", truth of rank {independent} changes by {change:.1e}, off the basis {off:.1e}"
         good = good and change < 1e-11 and off < 1e-6 and independent == len(case.truth)
@@ -469,7 +465,7 @@ def _norm(x):
 
 
 def main() -> int:
-    """Check, print, and return 1 if a truth is none."""
+    """Check, print, and return 1 if a truth is wrong."""
     from truths.table import all_cases
 
     parser = argparse.ArgumentParser()

@@ -1,5 +1,7 @@
 """Units from 1e-35 to 1e30, origins far away, outliers, and step sizes from 1e-9 to 100."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,7 +21,7 @@ def mechanical(m, V):
     return dvi.System(lambda t0, t1, q, p, args: p @ p / (2 * m) + V(q))
 
 
-def moved(samples, q=0.0, p=0.0):
+def moved(samples, q: Any = 0.0, p: Any = 0.0):
     """The samples about another origin."""
 
     def draw(rng):
@@ -478,5 +480,18 @@ CASES = (
         box(1, 100, -1e3, 1e3),
         truth=(biquadratic(1, 0, 1, -1.4, 0),),
         h=1.0,
+    ),
+    Case(
+        "frequencies of 1 and 1e4",
+        STEPS,
+        "a quadratic form each",
+        spring(1.0, 1e8),
+        dvi.Polynomials(2),
+        box(2, 80),
+        truth=(
+            energy(1.0, 1e-4, 0),
+            lambda q, p: energy(1e8, 1e-4, 1)(q, p) / 1e8,
+        ),
+        h=1e-4,
     ),
 )

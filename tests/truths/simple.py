@@ -8,7 +8,6 @@ from dvi_jax.symmetry.library import rotation
 from . import Case, SymmetryCase
 from .maps import box
 
-
 OSCILLATOR = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2)
 CENTRAL = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2 + (q @ q) ** 2 / 4)
 

@@ -28,9 +28,7 @@ def on_line(V, n):
 
 def in_plane(V):
     """Two particles in the plane with a pair potential V(r²)."""
-    return dvi.System(
-        lambda t0, t1, q, p, args: jnp.sum(p**2) / 2 + V(jnp.sum((q[0] - q[1]) ** 2))
-    )
+    return dvi.System(lambda t0, t1, q, p, args: jnp.sum(p**2) / 2 + V(jnp.sum((q[0] - q[1]) ** 2)))
 
 
 def sum_of_momenta(q, p):
@@ -88,16 +86,13 @@ CASES = (
         KIND,
         "the centre of mass is an oscillator: P² + 3Q² − h…, with P = Σp, Q = Σq: P² + Q² − hQP",
         separable(
-            lambda q: q @ q / 2 + 1 / (q[0] - q[1]) ** 2 + 1 / (q[0] - q[2]) ** 2
-            + 1 / (q[1] - q[2]) ** 2
+            lambda q: (
+                q @ q / 2 + 1 / (q[0] - q[1]) ** 2 + 1 / (q[0] - q[2]) ** 2 + 1 / (q[1] - q[2]) ** 2
+            )
         ),
         dvi.Polynomials(2),
         box(3, 120),
-        truth=(
-            lambda q, p: (
-                jnp.sum(p) ** 2 + jnp.sum(q) ** 2 - 0.1 * jnp.sum(q) * jnp.sum(p)
-            ),
-        ),
+        truth=(lambda q, p: jnp.sum(p) ** 2 + jnp.sum(q) ** 2 - 0.1 * jnp.sum(q) * jnp.sum(p),),
     ),
     Case(
         "Kepler with samples from 1e-6 to 1",
@@ -171,8 +166,10 @@ CASES = (
         KIND,
         "two centres on the first axis in space: rotations about it",
         separable(
-            lambda q: -1 / jnp.sqrt((q[0] - 0.5) ** 2 + q[1] ** 2 + q[2] ** 2)
-            - 1 / jnp.sqrt((q[0] + 0.5) ** 2 + q[1] ** 2 + q[2] ** 2)
+            lambda q: (
+                -1 / jnp.sqrt((q[0] - 0.5) ** 2 + q[1] ** 2 + q[2] ** 2)
+                - 1 / jnp.sqrt((q[0] + 0.5) ** 2 + q[1] ** 2 + q[2] ** 2)
+            )
         ),
         dvi.Polynomials(2),
         box(3, 100),

@@ -1,10 +1,10 @@
 """All cases, searched: the table of the page on discovery.
 
-    python tests/truths/table.py [--kind KIND] [--case PART_OF_NAME] [--seeds N] [--report] [--times]
+    python tests/truths/table.py [--kind KIND] [--case PART_OF_NAME] [--seeds N] [--report]
 
 prints how many of each kind are found, undecided, missed and false, and names what is not found.
 With `--seeds` each case is searched on that many draws of its samples. `--report` prints what the
-package says of each case, `--times` how long it takes.
+package says of each case, and `--times` how long it takes.
 """
 
 import argparse
