@@ -560,9 +560,9 @@ CASES = (
         h=1.0,
     ),
     Case(
-        "McMillan's map, normal samples with long tails",
+        "McMillan's map, samples of a Cauchy distribution",
         WHERE,
-        "McMillan 1971; Cauchy distribution",
+        "McMillan 1971",
         MCMILLAN,
         dvi.Polynomials(4),
         lambda rng: tuple(rng.standard_cauchy((2, 150, 1))),
