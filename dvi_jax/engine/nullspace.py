@@ -16,6 +16,10 @@ HELD_OUT = 10
 _NOTHING = 1e-250
 """A disturbance that changes a step by less than this share of the step is none."""
 
+UNCLEAR = 1e-6
+"""A null vector that changes by less than this share of what its slopes predict, but by more than
+rounding, may be an invariant or not."""
+
 RANK = 1e-7
 """Relative size below which a direction counts as dependent on others."""
 
@@ -140,15 +144,15 @@ def null_space(
         return NullSpace(V.T, np.zeros(size), np.inf)
     unit = singular[0] if unit is None or tolerance is not None else unit
     relative = np.append(singular / unit, np.zeros(size - len(singular)))
-    floor = np.finfo(float).eps
-    # ratio[i]: how far the value i stands above the one after it
-    ratio = relative / np.maximum(np.append(relative[1:], 0.0), floor)
+    # ratio[i]: how far the value i stands below the one before it, the first below the unit
+    before = np.append(max(1.0, relative[0]), relative[:-1])
+    ratio = before / np.maximum(relative, np.finfo(float).eps)
     if tolerance is not None:
         kept = int(np.sum(relative > tolerance))
     else:
-        allowed = np.append(relative[1:] < below, False)
-        kept = 1 + int(np.argmax(np.where(allowed, ratio, 0))) if allowed.any() else size
-    return NullSpace(V.T[:, kept:], relative, float(ratio[kept - 1]) if kept < size else 1.0)
+        allowed = relative < below
+        kept = int(np.argmax(np.where(allowed, ratio, 0))) if allowed.any() else size
+    return NullSpace(V.T[:, kept:], relative, float(ratio[kept]) if kept < size else 1.0)
 
 
 def rank(columns: np.ndarray, above: float = RANK) -> int:
@@ -193,6 +197,7 @@ class SeriesSpace(NamedTuple):
     - `shifts`: orthonormal columns without a first block: what may be added to any of them.
     - `singular_values`, `gap`: of the Toeplitz matrix, see `NullSpace`.
     - `refused`: how many more there were that held-out conditions or a lower order refuse.
+    - `unclear`: how many of them change by less than `UNCLEAR`, but by more than rounding.
     """
 
     leading: np.ndarray
@@ -200,6 +205,7 @@ class SeriesSpace(NamedTuple):
     singular_values: np.ndarray
     gap: float
     refused: int
+    unclear: int
 
 
 def series_spaces(
@@ -228,13 +234,15 @@ def series_spaces(
         if trivial is not None:
             leading = leading @ _orthogonal_to(trivial @ leading[:size])
         found = leading.shape[1]
-        leading = _judged(leading, terms, motion, tolerance)
+        leading, unclear = _judged(leading, terms, motion, tolerance)
         refused = found - leading.shape[1]
         if spaces:
             found = leading.shape[1]
             leading = _within(leading, spaces[-1].leading[:size], size)
             refused += found - leading.shape[1]
-        spaces.append(SeriesSpace(leading, shifts, space.singular_values, space.gap, refused))
+        spaces.append(
+            SeriesSpace(leading, shifts, space.singular_values, space.gap, refused, unclear)
+        )
     return spaces
 
 
@@ -245,12 +253,12 @@ def _by_first_block(columns, size, tolerance) -> tuple[np.ndarray, np.ndarray]:
     return leading, columns @ np.delete(V, large, axis=0).T
 
 
-def _judged(leading, terms, motion, tolerance) -> np.ndarray:
+def _judged(leading, terms, motion, tolerance) -> tuple[np.ndarray, int]:
     """The combinations of series that change in a step by no more than rounding, each measured by
-    what its own slopes predict, sample by sample."""
+    what its own slopes predict, sample by sample; and how many are unclear."""
     count, size = leading.shape[1], terms.shape[2]
     if count == 0:
-        return leading
+        return leading, 0
     own = motion.of(leading[:size])
     # The coefficients too are known to some digits only, each to those of the largest one.
     digits = _COEFFICIENTS * np.linalg.norm(terms, axis=(1, 2))[:, None]
@@ -265,7 +273,8 @@ def _judged(leading, terms, motion, tolerance) -> np.ndarray:
     left, U = np.linalg.svd(triangle(changes.reshape(-1, count) @ by_slopes))[1:]
     left = np.append(left, np.zeros(count - len(left)))
     kept = leading @ by_slopes @ U[left <= limit].T
-    return kept @ np.linalg.inv(triangle(kept[:size])) if kept.size else kept
+    unclear = int(np.sum((left > limit) & (left < UNCLEAR)))
+    return kept @ np.linalg.inv(triangle(kept[:size])) if kept.size else kept, unclear
 
 
 def relative_changes(terms, series: np.ndarray, motion: Motion, spread: float) -> np.ndarray:

@@ -12,6 +12,7 @@ from .._types import Args
 from ..engine.newton import Newton, RootSolver
 from ..engine.nullspace import (
     RANK,
+    UNCLEAR,
     compress,
     epsilon_scale,
     in_units_of,
@@ -32,7 +33,7 @@ from ..symmetry.sampling import (
 )
 from .changes import Changes, Stepped, checked_changes, is_exact
 from .found import Discovery
-from .judging import Fewest, Judge, cleaned, powers_of_size, reach
+from .judging import CLEARLY, Fewest, Judge, cleaned, powers_of_size, reach
 from .obstructions import drift_laws
 from .representatives import Span
 
@@ -129,20 +130,23 @@ def discover_invariants(
     fuzzy = min(_FUZZY / found.gap, _FUZZIEST) if tolerance is None else np.sqrt(tolerance)
     chosen = found.chosen(max(RANK, fuzzy), representative)
     if tolerance is None and chosen.refused and fuzzy > RANK:
-        chosen = found.chosen(RANK, representative)
+        chosen = min(found.chosen(RANK, representative), chosen, key=lambda x: x.refused)
     coefficients, dependent, exact = chosen.coefficients, chosen.dependent, chosen.exact
     refused = found.spaces[-1].refused + chosen.refused
-    known = len(coefficients) + len(dependent) + (found.constant is not None)
-    impossible = len(coefficients) == 2 * samples.q[0].size and not bound.uses_time
-    impossible = impossible and not system.slow_time and bool(np.any(changes.motion.changes))
-    if impossible:
-        refused, exact = refused + len(coefficients) + len(dependent), ()
-        coefficients, dependent = coefficients[:0], dependent[:0]
+    known = found.spaces[0].leading.shape[1] + (found.constant is not None)
     judge = found.judge
     typical_residuals = np.stack([judge.quantiles(coefficients, x) for x in (0.5, 0.95)], axis=-1)
     powers = np.full(len(coefficients), np.nan)
     if order == 0 and tolerance is None:
         powers = powers_of_size(stepped, coefficients, samples, typical_residuals[:, 0, 1])
+    everything = len(coefficients) == 2 * samples.q[0].size and not bound.uses_time
+    everything = everything and not system.slow_time and bool(np.any(changes.motion.changes))
+    # The orbits of a map that keeps that much are finite sets of points, or periods of functions.
+    impossible = everything and not (powers == 0).all()
+    if impossible:
+        refused, exact = refused + len(coefficients) + len(dependent), ()
+        coefficients, dependent = coefficients[:0], dependent[:0]
+        typical_residuals, powers = typical_residuals[:0], powers[:0]
     return Discovery(
         inner_coefficients=jnp.asarray(coefficients),
         inner_dependent=jnp.asarray(dependent),
@@ -155,7 +159,7 @@ def discover_invariants(
         residuals=judge.quantiles(coefficients, 1.0),
         typical_residuals=typical_residuals,
         dependent_residuals=judge.quantiles(dependent, 1.0),
-        undecided=max(found.motion.undecided() - known, 0),
+        undecided=max(found.motion.undecided() - known, 0) + found.unclear + chosen.unclear,
         impossible=impossible,
         powers=powers,
         reach=reach(coefficients, found.values),
@@ -175,12 +179,14 @@ def discover_invariants(
 
 
 class _Chosen(NamedTuple):
-    """Representatives, shape (count, order + 1, size); how many were refused; the blur."""
+    """Representatives, shape (count, order + 1, size); how many were refused, and how many of
+    those are unclear; the blur."""
 
     coefficients: np.ndarray
     dependent: np.ndarray
     exact: tuple[bool, ...]
     refused: int
+    unclear: int
     blur: float
 
 
@@ -219,6 +225,7 @@ class _Search:
         self.typical = np.linalg.norm(step, 2) or 1.0
         in_units = changes._replace(terms=in_units_of(self.scale, changes.terms))
         self.judge = Judge(in_units.at(~fit), calm[~fit], self.scale)
+        self.judge_fitted = Judge(in_units.at(fit), calm[fit], self.scale)
         of_fit = changes.terms[fit, 0], changes.at(fit).motion, self.values
         self.fewest = Fewest(basis.complexity, self.rms, *of_fit)
 
@@ -246,13 +253,14 @@ class _Search:
             return np.array(series).reshape(-1, *size), np.array([e for _, e in kept], bool)
 
         (coefficients, exact), (dependent, _) = those(True), those(False)
-        count = len(coefficients) + len(dependent)
+        refused, unclear = 0, 0
         if self.tolerance is None:  # with the digits that the coefficients have in the end
-            kept = self.judge.keep(coefficients)
-            coefficients, exact = coefficients[kept], exact[kept]
-            dependent = dependent[self.judge.keep(dependent)]
-        refused = count - len(coefficients) - len(dependent)
-        return _Chosen(coefficients, dependent, tuple(map(bool, exact)), refused, blur)
+            kept, others = self.judge.keep(coefficients), self.judge.keep(dependent)
+            lost = np.concatenate([coefficients[~kept], dependent[~others]])
+            refused = len(lost)
+            unclear = int(np.sum(self.judge.largest(lost) < UNCLEAR))
+            coefficients, exact, dependent = coefficients[kept], exact[kept], dependent[others]
+        return _Chosen(coefficients, dependent, tuple(map(bool, exact)), refused, unclear, blur)
 
     def _picked(self, span: Span, series: np.ndarray, representative: str):
         """Coefficients, shape (order + 1, size), and whether the series is exact."""
@@ -260,6 +268,7 @@ class _Search:
             given = cleaned(series, span.blur)[0]
             if self.tolerance is None:
                 given = cleaned(self.fewest.again(given), span.blur)
+                given = self._refined(given, series[0], span.blur)
             return given[None] / self.sizes, False
         simplest = cleaned(span.simplest(series)) / self.sizes
         typical, scale = jnp.asarray(self.typical), jnp.asarray(self.scale)
@@ -268,6 +277,27 @@ class _Search:
         if exact or representative == "simplest":
             return simplest, exact
         return cleaned(span.least(series)) / self.sizes, exact
+
+    def _refined(self, given: np.ndarray, series: np.ndarray, blur: float) -> np.ndarray:
+        """Shares of an invariant of order 0: `given`, or, where it changes too much, the null
+        vector of rows that are weighted by what the slopes of `series` itself predict."""
+
+        def change(shares):
+            return self.judge.largest((shares / self.sizes[0])[None, None])[0]
+
+        if change(given) <= CLEARLY:
+            return given
+        rows = self.judge_fitted.own_rows(series / self.sizes[0]) / self.rms
+        _, singular, V = np.linalg.svd(triangle(rows))
+        null = V[: len(singular)][singular <= CLEARLY * np.sqrt(len(rows))]
+        tried = [given, null.T @ (null @ series)]
+        tried = [x for x in (*tried, cleaned(tried[1], blur)) if x.any()]
+        return min(tried, key=change)
+
+    @property
+    def unclear(self) -> int:
+        """Null vectors of which rounding decides whether they are series."""
+        return max(space.unclear for space in self.spaces) if self.tolerance is None else 0
 
     def laws(self, volume: np.ndarray, slow_time: bool, blur: float):
         """The `DriftLaw` of each leading part that is lost."""
@@ -319,6 +349,7 @@ def _shares_of_constant(rms, values, calm, slopes) -> np.ndarray | None:
     shares = np.linalg.lstsq(values / rms, calm, rcond=None)[0]
     shares = np.where(np.abs(shares) > 1e-9 * np.max(np.abs(shares)), shares, 0.0)
     terms = np.abs(values / rms) @ np.abs(shares)
+    terms = np.maximum(terms, np.finfo(float).tiny)
     if np.max(np.abs(values / rms @ shares - calm) / terms) > 1e4 * np.finfo(float).eps:
         return None
     slopes = slopes / rms[:, None]

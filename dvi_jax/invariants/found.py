@@ -45,9 +45,10 @@ class Discovery(eqx.Module):
       half of the points, and 95 % of them, stay below, shape (count, order + 1, 2).
       `dependent_residuals`: as `residuals`.
     - `undecided`: how many combinations of the functions change in the steps by less than 1000
-      times their rounding, so that it cannot be decided whether they are kept. `impossible`:
-      whether as many independent invariants were found as there are coordinates, though the map
-      moves; none is then reported.
+      times their rounding, or are null and change by more than rounding and less than 1e-6 of what
+      their slopes predict, so that it cannot be decided whether they are kept. `impossible`:
+      whether as many independent invariants were found as there are coordinates, with a tolerance
+      or as expansions, though the map moves; none is then reported.
     - `powers`: shape (count,), at order 0: the power of the size of the samples by which the
       changes in a step grow. 0 is an exact invariant; an expansion about the middle of the
       samples, cut off, has another power. NaN where it was not tried.
@@ -149,8 +150,9 @@ class Discovery(eqx.Module):
         if self.undecided > 0:
             told.append(
                 f"{self.undecided} combinations of the functions change in a step by less than "
-                "1000 times their rounding: whether they are kept cannot be decided in this "
-                "arithmetic; take a larger h, samples that spread wider, or an origin among them"
+                "1000 times their rounding, or by hardly more than it: whether they are kept "
+                "cannot be decided in this arithmetic; take another h, samples that spread wider, "
+                "or an origin among them"
             )
         if self.condition > _ILL:
             told.append(
@@ -256,6 +258,11 @@ class Discovery(eqx.Module):
         if self.tolerance is not None:
             lines.append(f"  singular values up to {self.tolerance:g} of the largest count as zero")
         lines += [f"  {warning}" for warning in self.warnings]
+        if self.count and self.count == 2 * int(np.prod(self.shape, dtype=int)):
+            lines.append(
+                "  as many independent invariants as coordinates: each orbit of the map has "
+                "finitely many points, or the functions repeat along it"
+            )
         if self.refused:
             lines.append(
                 f"  {self.refused} null vectors of the fitted samples refused: held-out samples, "

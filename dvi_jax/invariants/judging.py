@@ -39,20 +39,33 @@ class Judge(NamedTuple):
     def quantiles(self, coefficients: np.ndarray, share: float) -> np.ndarray:
         """The change that the given share of the samples stays below, shape (count, z + 1)."""
         out = np.zeros(coefficients.shape[:2])
-        calm = self.calm**2 / np.sum(self.calm**2)
         for i, c in enumerate(coefficients):
-            leading = self.changes.values @ c[0]
-            size = np.sqrt(calm @ leading**2)
-            spread = np.sqrt(calm @ (leading - calm @ leading) ** 2)
-            spread = float(max(spread, 1e-6 * size, np.finfo(float).tiny))
             series = c / self.scale ** np.arange(len(c))[:, None]
+            spread = self._spread(c[0])
             found = relative_changes(self.changes.terms, series, self.changes.motion, spread)
             out[i] = np.quantile(found, share, axis=0)
         return out
 
+    def _spread(self, leading: np.ndarray) -> float:
+        calm = self.calm**2 / np.sum(self.calm**2)
+        values = self.changes.values @ leading
+        size = np.sqrt(calm @ values**2)
+        spread = np.sqrt(calm @ (values - calm @ values) ** 2)
+        return float(max(spread, 1e-6 * size, np.finfo(float).tiny))
+
+    def own_rows(self, leading: np.ndarray) -> np.ndarray:
+        """What functions change by at order 0, weighted by what the slopes of one of their
+        combinations predict, shape (S, size)."""
+        own = self.changes.motion.of(leading[:, None]).at_most(self._spread(leading))
+        return own.weights()[:, None] * self.changes.terms[:, 0]
+
+    def largest(self, coefficients: np.ndarray) -> np.ndarray:
+        """The change of nearly all samples, the largest of all orders, shape (count,)."""
+        return np.max(self.quantiles(coefficients, 0.95), axis=1, initial=0.0)
+
     def keep(self, coefficients: np.ndarray) -> np.ndarray:
         """Which series change by no more than rounding, shape (count,)."""
-        return np.all(self.quantiles(coefficients, 0.95) <= CLEARLY, axis=1)
+        return self.largest(coefficients) <= CLEARLY
 
 
 class Fewest:

@@ -100,7 +100,7 @@ def solve_gauge(
     require_time(bound, samples)
     held, order = samples.held_out, len(generators) - 1
     equations = Equations(system, jnp.zeros(()), args)
-    terms, good = _identity_terms(equations, h, list(generators), bound, samples)
+    terms, sizes, good = _identity_terms(equations, h, list(generators), bound, samples)
     require_steps(good, samples)
     terms = np.asarray(terms)
     n, changes = terms[:, :, 0], terms[:, :, 1:] / h
@@ -120,7 +120,7 @@ def solve_gauge(
     g = reduction(free, np.tile(bound.complexity, order + 1), size)(g)
     left = blocks[:, held] @ g + n[held].T
     g = g.reshape(order + 1, size)
-    largest = np.maximum(np.max(np.abs(n)), np.finfo(float).tiny)
+    largest = np.maximum(np.max(np.asarray(sizes)), np.finfo(float).tiny)
     return GaugeSolution(
         tuple(BasisGauge(bound, jnp.asarray(c)) for c in g),
         g,
@@ -128,9 +128,26 @@ def solve_gauge(
     )
 
 
+def _weighted(generator: Generator, first: LatticePoint, weights: Array) -> Generator:
+    """The generator with components times weights, at the first point and elsewhere, shape
+    (2, 2n + 1)."""
+
+    def component(place):
+        def function(t, q, p, args):
+            value = generator(LatticePoint(t, q, p), args)[place]
+            w = jnp.where(t == first.t, weights[0], weights[1])
+            return value * jnp.split(w, [1, 1 + q.size])[place].reshape(value.shape)
+
+        return function
+
+    return Generator(*map(component, range(3)))
+
+
 @eqx.filter_jit
 def _identity_terms(equations, h, generators, basis, samples):
-    """Taylor coefficients in ε of [Σ ε^m N_m without gauges, φ(Φ_ε) − φ], (S, z + 1, 1 + B)."""
+    """Taylor coefficients in ε of [Σ ε^m N_m without gauges, φ(Φ_ε) − φ], (S, z + 1, 1 + B); the
+    sizes of the terms of N_m at ε = 0 before they cancel, one for each component of the generator
+    at both points, (S,); and whether the steps succeed, (S,)."""
     nothing = [None] * len(generators)
 
     def at_point(q, p, t):
@@ -149,7 +166,24 @@ def _identity_terms(equations, h, generators, basis, samples):
             )
             return jnp.append(total, basis(q1, p1, interval.t1) - basis(q, p, interval.t0)), info
 
+        def in_parts(weights):
+            """The identities of all orders at ε = 0, linear in weights of the components."""
+            here = Equations(equations.system, jnp.zeros(()), equations.args, Newton())
+            q1, p1, _ = step(here, interval, q, p)
+            first, second = LatticePoint(interval.t0, q, p), LatticePoint(interval.t1, q1, p1)
+            weighted = [_weighted(g, first, weights[m]) for m, g in enumerate(generators)]
+            return jnp.stack(
+                [
+                    noether_identity(
+                        here.system, weighted, nothing, m, first, second, 0.0, here.args
+                    )
+                    for m in range(len(generators))
+                ]
+            )
+
+        parts = jax.jacfwd(in_parts)(jnp.ones((len(generators), 2, 1 + 2 * q.size)))
+        size = jnp.max(jnp.sum(jnp.abs(parts), axis=(1, 2, 3)))
         terms = taylor_coefficients(lambda e: of(e)[0], jnp.zeros(()), len(generators) - 1)
-        return terms, of(jnp.zeros(()))[1].result == RESULTS.successful
+        return terms, size, of(jnp.zeros(()))[1].result == RESULTS.successful
 
     return jax.vmap(at_point)(*samples)

@@ -29,6 +29,9 @@ from .symmetries import BasisComponent, Symmetries, Symmetry
 _ROUNDINGS = 100.0
 """Conditions below so many times the rounding of the samples count as fulfilled."""
 
+_NEARLY = 1e-8
+"""Noether's identity has to close to this at least."""
+
 _TINY = 1e-12
 """Coefficients whose share of a generator is below this are round-off."""
 
@@ -85,9 +88,11 @@ class Search:
             matrix = toeplitz(fitted, m)
             space = null_space(matrix, self.tolerance, below=self.null)
             conditions = np.vstack([matrix, toeplitz(judged, m)])
-            kept = self._judged(space.columns, space.columns, conditions)
+            kept = self._judged(space.columns, space.columns, conditions, self.null)
             spaces.append((kept, space))
         null, space = spaces[-1]
+        # Null vectors hold a share of 1 / gap of directions that are nearly null.
+        self.closing = max(self.null, min(1 / space.gap, _NEARLY)) if space.gap > 1 else self.null
         closed, gauges = self._variational(null)
         symplectic = self._symplectic(null)
         both = np.hstack([closed, symplectic])
@@ -123,7 +128,7 @@ class Search:
         scaled = flat.reshape(terms.shape) * self.units[:, None]
         return np.moveaxis(scaled.reshape(*terms.shape[:3], self.size), 1, 2)
 
-    def _judged(self, columns, series, conditions) -> np.ndarray:
+    def _judged(self, columns, series, conditions, null) -> np.ndarray:
         """The combinations of null vectors that all samples take for null, held-out ones too.
 
         A vector with a small leading part is null for no better reason: leading parts are made
@@ -135,7 +140,7 @@ class Search:
         norm = max(np.linalg.norm(conditions, 2), np.finfo(float).tiny)
         singular, V = np.linalg.svd(triangle(conditions @ columns / norm))[1:]
         singular = np.append(singular, np.zeros(len(V) - len(singular)))
-        return columns @ V[singular <= HELD_OUT * self.null].T
+        return columns @ V[singular <= HELD_OUT * null].T
 
     def _variational(self, null: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The series in the null space whose identity closes, and their gauges."""
@@ -154,9 +159,9 @@ class Search:
             return np.hstack([of_series, of_gauge.reshape(len(matrix), -1)])
 
         fitted, count = conditions(~self.held), null.shape[1]
-        both = null_space(fitted, self.tolerance, below=self.null).columns
+        both = null_space(fitted, self.tolerance, below=self.closing).columns
         every = np.vstack([fitted, conditions(self.held)])
-        both = self._judged(both, null @ both[:count], every)
+        both = self._judged(both, null @ both[:count], every, self.closing)
         # No gauge closes the identity of X = 0: constants have been left out.
         return null @ both[:count], both[count:]
 
