@@ -22,7 +22,13 @@ def count(case):
         return Count(case.system, case.basis, case.order, case.h, samples, modular=False)
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, id=case.name) for case in CASES])
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=case.name, marks=[pytest.mark.slow] if i % 12 else [])
+        for i, case in enumerate(CASES)
+    ],
+)
 def test_truths_of_perturbed_systems(case):
     counted = count(case)
     assert counted.survivors == case.survivors

@@ -43,6 +43,12 @@ _FUZZY = 30.0
 _FUZZIEST = 1e-3
 """No larger shares than this are taken for errors of others."""
 
+_AS_GOOD = 10.0
+"""An invariant with fewer terms may change by so many times more."""
+
+_ROUND_OFF = 1e-12
+"""Changes below this need not be smaller."""
+
 
 def discover_invariants(
     system: System,
@@ -133,7 +139,8 @@ def discover_invariants(
         chosen = min(found.chosen(RANK, representative), chosen, key=lambda x: x.refused)
     coefficients, dependent, exact = chosen.coefficients, chosen.dependent, chosen.exact
     refused = found.spaces[-1].refused + chosen.refused
-    known = found.spaces[0].leading.shape[1] + (found.constant is not None)
+    known = found.spaces[0].leading.shape[1] if order else len(coefficients) + len(dependent)
+    known += found.constant is not None
     judge = found.judge
     typical_residuals = np.stack([judge.quantiles(coefficients, x) for x in (0.5, 0.95)], axis=-1)
     powers = np.full(len(coefficients), np.nan)
@@ -265,11 +272,7 @@ class _Search:
     def _picked(self, span: Span, series: np.ndarray, representative: str):
         """Coefficients, shape (order + 1, size), and whether the series is exact."""
         if self.order == 0:
-            given = cleaned(series, span.blur)[0]
-            if self.tolerance is None:
-                given = cleaned(self.fewest.again(given), span.blur)
-                given = self._refined(given, series[0], span.blur)
-            return given[None] / self.sizes, False
+            return self._of_order_0(series[0], span.blur)[None] / self.sizes, False
         simplest = cleaned(span.simplest(series)) / self.sizes
         typical, scale = jnp.asarray(self.typical), jnp.asarray(self.scale)
         given = jnp.asarray(simplest)
@@ -278,21 +281,28 @@ class _Search:
             return simplest, exact
         return cleaned(span.least(series)) / self.sizes, exact
 
-    def _refined(self, given: np.ndarray, series: np.ndarray, blur: float) -> np.ndarray:
-        """Shares of an invariant of order 0: `given`, or, where it changes too much, the null
-        vector of rows that are weighted by what the slopes of `series` itself predict."""
+    def _of_order_0(self, series: np.ndarray, blur: float) -> np.ndarray:
+        """Shares of an invariant of order 0, with as few terms and as many digits as can be."""
+        if self.tolerance is not None:
+            return cleaned(series, blur)
 
         def change(shares):
             return self.judge.largest((shares / self.sizes[0])[None, None])[0]
 
-        if change(given) <= CLEARLY:
-            return given
-        rows = self.judge_fitted.own_rows(series / self.sizes[0]) / self.rms
-        _, singular, V = np.linalg.svd(triangle(rows))
-        null = V[: len(singular)][singular <= CLEARLY * np.sqrt(len(rows))]
-        tried = [given, null.T @ (null @ series)]
-        tried = [x for x in (*tried, cleaned(tried[1], blur)) if x.any()]
-        return min(tried, key=change)
+        tried = [cleaned(self.fewest.again(cleaned(series, blur)), blur)]
+        if blur > RANK:  # what was taken for errors of others may be a part of it
+            tried += [self.fewest.again(cleaned(series)), cleaned(series)]
+        tried = [x for x in tried if x.any()] or [series]
+        changes = np.array([change(x) for x in tried])
+        if np.min(changes) > CLEARLY:  # rows weighted by what its own slopes predict
+            rows = self.judge_fitted.own_rows(series / self.sizes[0]) / self.rms
+            _, singular, V = np.linalg.svd(triangle(rows))
+            null = V[: len(singular)][singular <= CLEARLY * np.sqrt(len(rows))]
+            own = null.T @ (null @ series)
+            tried = [x for x in (cleaned(own, blur), own, *tried) if x.any()]
+            changes = np.array([change(x) for x in tried])
+        good = changes <= max(_AS_GOOD * np.min(changes), _ROUND_OFF)
+        return tried[int(np.argmax(good))]
 
     @property
     def unclear(self) -> int:

@@ -250,6 +250,8 @@ class Discovery(eqx.Module):
         drop = 1e-9 if self.tolerance is None else np.sqrt(self.tolerance)
         # Coefficients are known to about as many digits as the gap has.
         digits = int(np.clip(np.log10(self.gap) - 2, 2, 6)) if self.order == 0 else 6
+        if self.tolerance is None and digits < 6:
+            drop = 10.0 ** -(digits + 1)
         lines = [
             f"{self.count} {kind} invariant{'' if self.count == 1 else 's'} of order "
             f"{self.order} in {self.basis.size} functions; leading parts that survive order 0 … "

@@ -104,7 +104,7 @@ def shortened(
     if terms is not None:
         shown[np.argsort(-shares, kind="stable")[terms:]] = 0.0
     text = basis.formula(shown, digits, drop=0.0)
-    hidden = np.sum(shares > 1e-9 * np.max(shares)) - np.count_nonzero(shown)
+    hidden = np.sum(shares > drop * np.max(shares)) - np.count_nonzero(shown)
     return f"{text} + … ({hidden} smaller terms)" if hidden else text
 
 

@@ -139,14 +139,15 @@ def judged(case: Case | SymmetryCase, seed: int = 0) -> tuple[str, Any]:
 def _of_invariants(case: Case, answer: dvi.Discovery, seed: int) -> str:
     # An invariant that the report itself calls an expansion is not claimed to be one.
     claimed = [i for i, power in enumerate(answer.powers) if not power > 0]
-    parts = np.asarray(answer.coefficients)[claimed, 0]
-    others = np.asarray(answer.dependent)[:, 0] if len(claimed) == answer.count else parts[:0]
+    parts = np.asarray(answer.inner_coefficients)[claimed, 0]
+    others = np.asarray(answer.inner_dependent)[:, 0]
+    others = others if len(claimed) == answer.count else parts[:0]
     draw = case.points or case.samples
     at = [jnp.asarray(x) for x in draw(np.random.default_rng(seed + 1))]
     at = tuple(at) if len(at) == 3 else (*at, jnp.zeros(len(at[0])))
 
     def reported(q, p, t):
-        return jnp.asarray(np.concatenate([parts, others])) @ answer.basis(q, p, t)
+        return jnp.asarray(np.concatenate([parts, others])) @ answer.inner(q, p, t)
 
     def true(q, p, t):
         values = [f(q, p, t) if _timed(f) else f(q, p) for f in case.truth]

@@ -3,8 +3,8 @@
     python tests/truths/table.py [--kind KIND] [--case PART_OF_NAME] [--seeds N] [--report]
 
 prints how many of each kind are found, undecided, missed and false, and names what is not found.
-With `--seeds` each case is searched on that many draws of its samples. `--report` prints what the
-package says of each case, and `--times` how long it takes.
+With `--seeds` each case is searched on that many draws of its samples, with `--drawn` ten cases
+only. `--report` prints what the package says of each case, and `--times` how long it takes.
 """
 
 import argparse
@@ -23,6 +23,20 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 import truths  # noqa: E402
+
+DRAWN = (
+    "oscillator, symplectic Euler",
+    "standard map at K = 0.5",
+    "quartic oscillator with the constant 1 in the basis",
+    "McMillan's map with a cubic force of 0.0001",
+    "oscillator with a periodic force",
+    "Lennard-Jones pair on a line",
+    "oscillator about 100",
+    "cubic spring, order 1",
+    "linear friction",
+    "central force with an axis stiffer by 1e-3",
+)
+"""Ten cases, one of each sort, that are searched on many draws of their samples."""
 
 OUTCOMES = ("found", "undecided", "missed", "false")
 
@@ -56,6 +70,7 @@ def main() -> int:
     parser.add_argument("--kind", default="")
     parser.add_argument("--case", default="")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--drawn", action="store_true")
     parser.add_argument("--report", action="store_true")
     parser.add_argument("--times", action="store_true")
     chosen = parser.parse_args()
@@ -63,7 +78,9 @@ def main() -> int:
     for case in all_cases():
         if chosen.kind not in case.kind or chosen.case not in case.name:
             continue
-        start = time.time()
+        if chosen.drawn and case.name not in DRAWN:
+            continue
+        start, before = time.time(), collections.Counter(outcomes.get(case.kind, ()))
         for seed in range(chosen.seeds):
             outcome, answer = truths.judged(case, seed)
             outcomes.setdefault(case.kind, []).append(outcome)
@@ -71,8 +88,12 @@ def main() -> int:
                 print(f"{outcome}: {case.name} (samples of seed {seed})", flush=True)
             if chosen.report or isinstance(answer, ValueError):
                 print(answer)
+        if chosen.seeds > 1:
+            counts = collections.Counter(outcomes[case.kind]) - before
+            print(f"{dict(counts)}: {case.name}", flush=True)
         if chosen.times:
             print(f"{time.time() - start:6.1f} s  {case.name}", flush=True)
+        jax.clear_caches()
     print(table(outcomes))
     return int(any(o in ("missed", "false") for found in outcomes.values() for o in found))
 
