@@ -217,7 +217,8 @@ def orbits_in_km(rng):
 NONLINEAR = (
     case("central force, with time", EXACT, CENTRAL, box(2, 80),
         (time_translation(), rotation(0, 1)), 2, (2,)),
-    case("rotations of a central force in space", EXACT, CENTRAL, box(3, 100), ROTATIONS, 3, (3,), time=False),
+    case("rotations of a central force in space", EXACT, CENTRAL, box(3, 100), ROTATIONS, 3, (3,),
+        time=False),
     case("central force, few samples", EXACT, CENTRAL, box(2, 14), (rotation(0, 1),), 1, (1,),
         time=False),
     case("central force, 5 % outliers", EXACT, CENTRAL, with_outliers, (rotation(0, 1),), 1, (1,),
