@@ -102,6 +102,24 @@ def triangle(matrix: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(matrix, mode="r"))
 
 
+def singular_vectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The singular value of each column's direction, descending, zeros included, shape (columns,);
+    and all right singular vectors as rows."""
+    rows, columns = matrix.shape
+    if matrix.size == 0:
+        return np.zeros(columns), np.eye(columns)
+    singular, V = np.linalg.svd(triangle(matrix) if rows > columns else matrix)[1:]
+    return np.append(singular, np.zeros(columns - len(singular))), V
+
+
+def by_leading(leading: np.ndarray, above: float = RANK) -> tuple[np.ndarray, np.ndarray]:
+    """Combinations of columns whose leading parts are orthonormal, and those without one, up to
+    the size `above`. `leading`: the leading parts of the columns, shape (size, count)."""
+    singular, V = singular_vectors(leading)
+    large = singular > above
+    return V[large].T / singular[large], V[~large].T
+
+
 def compress(terms: np.ndarray) -> np.ndarray:
     """Rows with the same inner products of all columns of A_0 … A_z, as few as can be.
 
@@ -136,14 +154,12 @@ def null_space(
     With a tolerance: all singular values at most that share of the largest. Without: those
     before the widest gap, as long as they are under `below`, in units of `unit` or of the largest.
     """
-    if matrix.shape[0] > matrix.shape[1]:
-        matrix = triangle(matrix)
-    singular, V = np.linalg.svd(matrix)[1:]
     size = matrix.shape[1]
-    if len(singular) == 0 or singular[0] == 0:
+    singular, V = singular_vectors(matrix)
+    if size == 0 or singular[0] == 0:
         return NullSpace(V.T, np.zeros(size), np.inf)
     unit = singular[0] if unit is None or tolerance is not None else unit
-    relative = np.append(singular / unit, np.zeros(size - len(singular)))
+    relative = singular / unit
     # ratio[i]: how far the value i stands below the one before it, the first below the unit
     before = np.append(max(1.0, relative[0]), relative[:-1])
     ratio = before / np.maximum(relative, np.finfo(float).eps)
@@ -230,7 +246,8 @@ def series_spaces(
     for order in range(fitted.shape[1]):
         matrix = toeplitz(fitted, order)
         space = null_space(matrix, tolerance, 1.0)
-        leading, shifts = _by_first_block(space.columns, size, tolerance)
+        led, free = by_leading(space.columns[:size], max(RANK, tolerance or 0.0))
+        leading, shifts = space.columns @ led, space.columns @ free
         if trivial is not None:
             leading = leading @ _orthogonal_to(trivial @ leading[:size])
         found = leading.shape[1]
@@ -246,13 +263,6 @@ def series_spaces(
     return spaces
 
 
-def _by_first_block(columns, size, tolerance) -> tuple[np.ndarray, np.ndarray]:
-    singular, V = np.linalg.svd(columns[:size])[1:]
-    large = np.flatnonzero(singular > (RANK if tolerance is None else max(RANK, tolerance)))
-    leading = columns @ (V[large].T / singular[large])
-    return leading, columns @ np.delete(V, large, axis=0).T
-
-
 def _judged(leading, terms, motion, tolerance) -> tuple[np.ndarray, int]:
     """The combinations of series that change in a step by no more than rounding, each measured by
     what its own slopes predict, sample by sample; and how many are unclear."""
@@ -266,12 +276,11 @@ def _judged(leading, terms, motion, tolerance) -> tuple[np.ndarray, int]:
     weights = own.weights() / np.sqrt(len(terms))
     changes = weights[:, None, None] * series_changes(terms, leading)
     predicted = (weights[:, None, None] * own.changes).reshape(-1, count)
-    _, slopes, V = np.linalg.svd(triangle(predicted))
+    slopes, V = singular_vectors(predicted)
     limit = HELD_OUT * (NULL if tolerance is None else tolerance)
     # Where slopes predict little more than rounding, that is what a change is compared with.
     by_slopes = V.T / np.maximum(slopes, HELD_OUT * ROUNDING / limit)
-    left, U = np.linalg.svd(triangle(changes.reshape(-1, count) @ by_slopes))[1:]
-    left = np.append(left, np.zeros(count - len(left)))
+    left, U = singular_vectors(changes.reshape(-1, count) @ by_slopes)
     kept = leading @ by_slopes @ U[left <= limit].T
     unclear = int(np.sum((left > limit) & (left < UNCLEAR)))
     return kept @ np.linalg.inv(triangle(kept[:size])) if kept.size else kept, unclear
@@ -287,8 +296,11 @@ def relative_changes(terms, series: np.ndarray, motion: Motion, spread: float) -
 
 
 def series_changes(terms: np.ndarray, series: np.ndarray) -> np.ndarray:
-    """Σ_{m≤k} A_{k−m} c_m for k = 0 … z, of series as columns: shape (S, z + 1, count)."""
-    size = terms.shape[2]
+    """Σ_{m≤k} A_{k−m} c_m for k = 0 … z, of series as columns: shape (S, z + 1, …, count).
+
+    `terms`: A, shape (S, z + 1, …, size); `series`: shape ((z + 1) · size, count).
+    """
+    size = terms.shape[-1]
     blocks = series.reshape(-1, size, series.shape[1])
     sums = [sum(terms[:, k - m] @ blocks[m] for m in range(k + 1)) for k in range(len(blocks))]
     return np.stack(sums, axis=1)
@@ -298,8 +310,7 @@ def _within(leading, before, size) -> np.ndarray:
     """The combinations whose first blocks lie in the span of orthonormal columns."""
     if leading.shape[1] == 0 or before.shape[1] == 0:
         return leading[:, :0]
-    cosines, V = np.linalg.svd(before.T @ leading[:size])[1:]
-    cosines = np.append(cosines, np.zeros(len(V) - len(cosines)))
+    cosines, V = singular_vectors(before.T @ leading[:size])
     return leading @ V[cosines > 0.9].T
 
 

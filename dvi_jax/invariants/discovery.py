@@ -17,6 +17,7 @@ from ..engine.nullspace import (
     epsilon_scale,
     in_units_of,
     series_spaces,
+    singular_vectors,
     triangle,
     typical_sizes,
 )
@@ -296,8 +297,8 @@ class _Search:
         changes = np.array([change(x) for x in tried])
         if np.min(changes) > CLEARLY:  # rows weighted by what its own slopes predict
             rows = self.judge_fitted.own_rows(series / self.sizes[0]) / self.rms
-            _, singular, V = np.linalg.svd(triangle(rows))
-            null = V[: len(singular)][singular <= CLEARLY * np.sqrt(len(rows))]
+            singular, V = singular_vectors(rows)
+            null = V[singular <= CLEARLY * np.sqrt(len(rows))]
             own = null.T @ (null @ series)
             tried = [x for x in (cleaned(own, blur), own, *tried) if x.any()]
             changes = np.array([change(x) for x in tried])

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..engine.echelon import reduced, reduction
-from ..engine.nullspace import SeriesSpace, orthonormal_range
+from ..engine.nullspace import SeriesSpace, orthonormal_range, singular_vectors
 from ..symmetry.basis import BoundBasis
 from ..symmetry.sampling import Samples, spread
 
@@ -80,8 +80,7 @@ class Span:
         shares = self.shares(self.space.leading)
         leading = shares[: self.size]
         above = leading[np.array(self.basis.complexity) > level]
-        singular, V = _svd(above / max(np.linalg.norm(leading, 2), 1e-300))
-        singular = np.append(singular, np.zeros(len(V) - len(singular)))
+        singular, V = singular_vectors(above / max(np.linalg.norm(leading, 2), 1e-300))
         return shares @ V[singular < self.blur].T
 
     def _rank_of(self, differentials: list[np.ndarray]) -> int:
@@ -110,8 +109,3 @@ class Span:
             return series
         j = np.argmax(np.abs(self.constant))
         return series - np.outer(series[:, j] / self.constant[j], self.constant)
-
-
-def _svd(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Singular values and all right singular vectors as rows."""
-    return np.linalg.svd(matrix)[1:] if matrix.size else (np.zeros(0), np.eye(matrix.shape[1]))

@@ -10,12 +10,15 @@ from ..engine.nullspace import (
     HELD_OUT,
     NULL,
     RANK,
+    by_leading,
     compress,
     epsilon_scale,
     in_units_of,
     null_space,
     orthonormal_range,
     rank,
+    series_changes,
+    singular_vectors,
     toeplitz,
     triangle,
     typical_sizes,
@@ -136,10 +139,9 @@ class Search:
         """
         if columns.shape[1] == 0:
             return columns
-        columns = columns @ np.hstack(_by_leading(series[: self.size]))
+        columns = columns @ np.hstack(by_leading(series[: self.size]))
         norm = max(np.linalg.norm(conditions, 2), np.finfo(float).tiny)
-        singular, V = np.linalg.svd(triangle(conditions @ columns / norm))[1:]
-        singular = np.append(singular, np.zeros(len(V) - len(singular)))
+        singular, V = singular_vectors(conditions @ columns / norm)
         return columns @ V[singular <= HELD_OUT * null].T
 
     def _variational(self, null: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -176,14 +178,14 @@ class Search:
         blocks = gauges.reshape(self.order + 1, self.gauge_basis.size, gauges.shape[1])
         gauges = np.linalg.solve(self.R_gauge, blocks).reshape(gauges.shape)
         columns = np.vstack([self._shares(series), gauges])
-        led, shifts = _by_leading(series[: self.size])
+        led, shifts = by_leading(series[: self.size])
         return self._simplest(columns @ led, columns @ shifts)
 
     def _representatives(self, space, known, free) -> np.ndarray:
         """One series of a space for each leading part not known, the simplest up to free ones."""
         basis = orthonormal_range(known[: self.size])
-        led, _ = _by_leading(space[: self.size] - basis @ (basis.T @ space[: self.size]))
-        _, shifts = _by_leading(space[: self.size])
+        led, _ = by_leading(space[: self.size] - basis @ (basis.T @ space[: self.size]))
+        _, shifts = by_leading(space[: self.size])
         free = np.hstack([self._shares(free), self._shares(space @ shifts)])
         return self._simplest(self._shares(space @ led), free)
 
@@ -203,8 +205,7 @@ class Search:
             values = self.raw.values[some, 0, 0]
             left.append(np.einsum("sb,mbk->smk", values, c[:, 0]).reshape(-1, series.shape[1]))
         rows = np.concatenate(left) / np.sqrt(len(slopes))
-        singular, V = np.linalg.svd(triangle(rows))[1:]
-        singular = np.append(singular, np.zeros(len(V) - len(singular)))
+        singular, V = singular_vectors(rows)
         return series @ V[singular <= RANK].T
 
     def _simplest(self, columns: np.ndarray, free: np.ndarray) -> np.ndarray:
@@ -236,7 +237,7 @@ class Search:
             g = np.where(np.abs(g) > (above if self.null > NULL else 0), g, 0.0) * scale
         else:
             g = self._best_gauge(identity)
-        identity = identity + _toeplitz_sums(self.gauge, g)
+        identity = identity + series_changes(self.gauge, g.reshape(-1, 1))[..., 0]
         residuals = self._relative(self._sums(self.determining, c), self.parts[0], c)
         identity_residuals = self._relative(identity, self.parts[1], c)
         c, g = (in_units_of(1 / self.scale, x, axis=0) for x in (c, g))
@@ -269,7 +270,7 @@ class Search:
     def _sums(self, terms, c) -> np.ndarray:
         """Σ_m terms_{k−m} c_m, shape (S, z + 1, rows)."""
         flat = terms.reshape(*terms.shape[:3], -1)
-        return _toeplitz_sums(flat, c.reshape(len(c), -1))
+        return series_changes(flat, c.reshape(-1, 1))[..., 0]
 
     def _best_gauge(self, identity) -> np.ndarray:
         """The gauge that closes the identity best on the fitted samples."""
@@ -303,21 +304,6 @@ class Search:
 def rows_of(terms: np.ndarray) -> np.ndarray:
     """The first two axes, samples and rows, as one."""
     return terms.reshape(terms.shape[0] * terms.shape[1], *terms.shape[2:])
-
-
-def _toeplitz_sums(terms: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Σ_{m≤k} terms[:, k − m] c_m for k = 0 … z: shape (S, z + 1, rows)."""
-    sums = [sum(terms[:, k - m] @ c[m] for m in range(k + 1)) for k in range(len(c))]
-    return np.stack(sums, axis=1)
-
-
-def _by_leading(leading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Combinations of columns with orthonormal leading parts, and those without a leading part."""
-    if leading.shape[1] == 0:
-        return np.zeros((0, 0)), np.zeros((0, 0))
-    singular, V = np.linalg.svd(leading)[1:]
-    count = int(np.sum(singular > RANK))
-    return V[:count].T / singular[:count], V[count:].T
 
 
 def _component_names(shape: tuple[int, ...]) -> tuple[str, ...]:
