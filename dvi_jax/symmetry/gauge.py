@@ -22,6 +22,9 @@ from .generators import Generator, LatticePoint
 from .noether import noether_identity
 from .sampling import as_samples, require_enough, require_steps, require_system, require_time
 
+_CANCELLED = 1e-9
+"""An identity below this fraction of its terms is zero up to rounding."""
+
 
 class BasisGauge(eqx.Module):
     """A gauge G(t, q, p, args) = g·φ(q, p, t); as a formula: `str`."""
@@ -41,9 +44,10 @@ class GaugeSolution(NamedTuple):
 
     - `gauges`: one for each order, for `AdiabaticInvariant`.
     - `coefficients`: shape (z + 1, basis size).
-    - `residuals`: shape (z + 1,), on held-out points: what the gauge leaves of the identity at
-      each order in ε, relative to the size of the terms. Round-off: a gauge exists, and the
-      identity closes to that order; of order one: no gauge in this basis closes it.
+    - `residuals`: shape (z + 1,), on held-out points: the residual of the identity with the
+      gauge at each order in ε, relative to the identity without gauges, or to its terms if that
+      is zero. Round-off: a gauge exists, and the identity closes to that order; of order one: no
+      gauge in this basis closes it.
     """
 
     gauges: tuple[BasisGauge, ...]
@@ -120,7 +124,10 @@ def solve_gauge(
     g = reduction(free, np.tile(bound.complexity, order + 1), size)(g)
     left = blocks[:, held] @ g + n[held].T
     g = g.reshape(order + 1, size)
-    largest = np.maximum(np.max(np.asarray(sizes)), np.finfo(float).tiny)
+    largest, terms = np.max(np.abs(n)), np.max(np.asarray(sizes))
+    if largest <= _CANCELLED * terms:  # the identity closes by itself: n is rounding
+        largest = terms
+    largest = np.maximum(largest, np.finfo(float).tiny)
     return GaugeSolution(
         tuple(BasisGauge(bound, jnp.asarray(c)) for c in g),
         g,

@@ -32,8 +32,14 @@ from .symmetries import BasisComponent, Symmetries, Symmetry
 _ROUNDINGS = 100.0
 """Conditions below so many times the rounding of the samples count as fulfilled."""
 
+_CLEARLY = 1e-5
+"""A vector field with a larger residual at more than 5 % of the held-out samples is no symmetry."""
+
 _NEARLY = 1e-8
 """Noether's identity has to close to this at least."""
+
+_LEAST = 1e-6
+"""Terms of a sample are at least this fraction of the median of all samples."""
 
 _TINY = 1e-12
 """Coefficients whose share of a generator is below this are round-off."""
@@ -105,16 +111,21 @@ class Search:
             self._representatives(null, both, both),
         )
         found: list[Symmetry] = []
+        refused = space.columns.shape[1] - null.shape[1]
         for kind, group in enumerate(groups):
             for vector in group.T:
-                found.append(self._symmetry(vector, kind == 0, kind < 2, found))
+                symmetry = self._symmetry(vector, kind == 0, kind < 2, found)
+                if self.tolerance is None and np.max(symmetry.typical_residuals) > _CLEARLY:
+                    refused += 1
+                else:
+                    found.append(symmetry)
         return Symmetries(
             found=tuple(found),
             survivors=tuple(rank(kept[: self.size]) for kept, _ in spaces),
             singular_values=space.singular_values,
             gap=space.gap,
             null=self.null,
-            refused=space.columns.shape[1] - null.shape[1],
+            refused=refused,
             basis=self.basis,
             gauge_basis=self.gauge_basis,
         )
@@ -247,8 +258,9 @@ class Search:
             generators=generators,
             is_variational=variational,
             gauges=gauges if variational else None,
-            residuals=residuals,
-            identity_residuals=identity_residuals,
+            residuals=np.max(residuals, axis=0),
+            typical_residuals=np.quantile(residuals, [0.5, 0.95], axis=0).T,
+            identity_residuals=np.max(identity_residuals, axis=0),
             is_dependent=self._depends(c, before),
             is_symplectic=symplectic and all(g.xi0 is None for g in generators),
             coefficients=c,
@@ -280,10 +292,13 @@ class Search:
         return np.linalg.lstsq(matrix, -right)[0].reshape(orders, self.gauge_basis.size)
 
     def _relative(self, left, parts, c) -> np.ndarray:
-        """Largest of what is left at each order, on held-out samples, over the terms' size."""
+        """The residual of each held-out sample at each order, relative to the terms of order 0 at
+        that sample before they cancel: shape (held-out samples, z + 1)."""
         terms = np.einsum("sjrcb,cb->sjrc", parts[self.held], c[0])
-        largest = np.max(np.sum(np.abs(terms), axis=(1, 3)))
-        return np.max(np.abs(left[self.held]), axis=(0, 2)) * _inverse(largest)
+        sizes = np.max(np.sum(np.abs(terms), axis=(1, 3)), axis=1)
+        least = _LEAST * float(np.median(sizes))
+        sizes = np.maximum(sizes, least) if least > 0 else np.ones(len(sizes))
+        return np.max(np.abs(left[self.held]), axis=2) / sizes[:, None]
 
     def _depends(self, c, before: list[Symmetry]) -> bool:
         """Whether X_0 is a combination of those before it, with invariants for coefficients.

@@ -38,8 +38,9 @@ class Symmetry(eqx.Module):
     - `is_variational`: whether Noether's identity closes with a gauge; else it is a conformal
       symmetry only, as far as the gauge basis can tell.
     - `gauges`: G_m, one for each order; None where it is not variational.
-    - `residuals`: shape (z + 1,), on held-out samples: what is left of the determining equations
-      at each order in ε, relative to the size of their terms.
+    - `residuals`: shape (z + 1,): the largest residual of the determining equations at each order
+      in ε on held-out samples, relative to the size of their terms at the same sample.
+      `typical_residuals`: median and 95 % quantile, shape (z + 1, 2).
     - `identity_residuals`: shape (z + 1,): the same of Noether's identity and of its derivatives
       off the solutions; where it is not variational, with the best gauge in the basis.
     - `is_dependent`: whether X_0 is a combination of those listed before it with invariants of
@@ -57,6 +58,7 @@ class Symmetry(eqx.Module):
     is_variational: bool = eqx.field(static=True)
     gauges: tuple[BasisGauge, ...] | None
     residuals: np.ndarray
+    typical_residuals: np.ndarray
     identity_residuals: np.ndarray
     is_dependent: bool = eqx.field(static=True)
     is_symplectic: bool = eqx.field(static=True)
@@ -197,10 +199,12 @@ class Symmetries(eqx.Module):
 def _described(symmetry: Symmetry) -> list[str]:
     kind = "variational" if symmetry.is_variational else "conformal only"
     mark = ", dependent" if symmetry.is_dependent else ""
+    half, most = np.max(symmetry.typical_residuals, axis=0)
     lines = [
         f"  {symmetry}",
-        f"      {kind}{mark}; held-out residual {np.max(symmetry.residuals):.1e}, of Noether's "
-        f"identity {np.max(symmetry.identity_residuals):.1e}",
+        f"      {kind}{mark}; residuals on held-out samples: median {half:.1e}, 95 % below "
+        f"{most:.1e}, largest {np.max(symmetry.residuals):.1e}; of Noether's identity "
+        f"{np.max(symmetry.identity_residuals):.1e}",
     ]
     if symmetry.gauges is not None:
         gauges = np.stack([np.asarray(g.coefficients) for g in symmetry.gauges])
