@@ -281,7 +281,7 @@ def test_every_public_picture_refuses_what_are_no_axes(single):
         observed=[t], predicted=[t], errors=[t], names=["a"], x=[1.0], covariance=[[1.0]],
         history={"stage": 0 * t, "loss": t, "accepted": t > 0, "horizon": t},
     )  # fmt: skip
-    order = types.SimpleNamespace(limit=1.0)
+    order = types.SimpleNamespace(resolved=True)
     surface = types.SimpleNamespace(
         epsilons=t, hs=t, drifts=np.ones((5, 5)), used=np.ones((5, 5), bool), slopes=t,
         intervals=np.stack([t, t], 1), orders=[order] * 5,
