@@ -767,7 +767,9 @@ def test_strong_kicks_make_no_symmetry():
         PAIR, dvi.Polynomials(1, constant=True), h=0.01, samples=pair_samples(150)
     )
     assert len(found.found) == 5
-    assert max(np.max(s.residuals) for s in found.found) < 1e-12
+    # relative to the terms of the same sample, which are small at samples with strong kicks
+    assert max(np.max(s.residuals) for s in found.found) < 1e-9
+    assert max(s.typical_residuals[0, 0] for s in found.found) < 1e-14
     assert sum(s.is_variational for s in found.found) == 3
 
 

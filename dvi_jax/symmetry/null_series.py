@@ -38,7 +38,7 @@ _CLEARLY = 1e-5
 _NEARLY = 1e-8
 """Noether's identity has to close to this at least."""
 
-_LEAST = 1e-6
+_LEAST = 1e-4
 """Terms of a sample are at least this fraction of the median of all samples."""
 
 _TINY = 1e-12
