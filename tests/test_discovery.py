@@ -653,6 +653,15 @@ def test_derivatives_that_are_not_finite_are_named():
     radius = dvi.Basis({"r": lambda q, p: jnp.sqrt(q[0] ** 2 + p[0] ** 2)})
     with pytest.raises(ValueError, match="'r' has in order 1 of ε in a step is not finite at 1"):
         dvi.discover_invariants(SPRING, radius, 1, h=0.1, samples=(q, p))
+    root = dvi.Basis({"root": lambda q, p: jnp.sqrt(jnp.abs(q[0])), "E": lambda q, p: q @ q})
+    with pytest.raises(ValueError, match=r"derivatives of the basis function 'root' .* at 1 of 80"):
+        dvi.discover_invariants(SPRING, root, h=0.1, samples=(q, p))
+
+
+def test_powers_that_underflow_are_named():
+    q, p = box(1, 400, low=-1e-23, high=1e-23)
+    with pytest.raises(ValueError, match=r"functions are 0 on all samples .'q¹⁴'.*larger units"):
+        dvi.discover_invariants(SPRING, dvi.Polynomials(16), h=0.1, samples=(q, p))
 
 
 @pytest.mark.slow

@@ -100,11 +100,19 @@ def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
             "the force or the function is singular there or where the step leads. Keep the "
             "samples off the singularity."
         )
+    bad = ~np.isfinite(found.slopes).all(axis=2)
+    if bad.any():
+        i, j = np.argwhere(bad)[0]
+        raise ValueError(
+            f"the derivatives of the basis function {basis.names[j]!r} are not finite at "
+            f"{int(bad[:, j].sum())} of {len(bad)} samples (first: number {i}): keep the samples "
+            "off its singularity."
+        )
     if not found.good.all():
         raise ValueError(
-            "the derivative of the map or of a basis function is not finite at "
-            f"{int(np.sum(~found.good))} of {len(bad)} samples: keep them off singularities of "
-            "H_D, the force and the functions."
+            f"the derivative of the map is not finite at {int(np.sum(~found.good))} of {len(bad)} "
+            f"samples (first: number {int(np.argmin(found.good))}): keep them off singularities of "
+            "H_D and the force."
         )
     if np.ptp(samples.t) == 0 and _may_depend_on_time(stepped.equations, samples):
         _require_no_time(stepped, order, samples, found)

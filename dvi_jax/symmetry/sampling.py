@@ -172,12 +172,18 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
     zero = np.flatnonzero(scale == 0)
     normal = values / np.where(scale > 0, scale, 1)
     singular, V = np.linalg.svd(normal, full_matrices=False)[1:]
-    if zero.size or singular[-1] < 1e-13 * singular[0]:
-        members = [basis.names[j] for j in (zero if zero.size else np.argsort(-abs(V[-1]))[:4])]
+    if zero.size:
+        members = ", ".join(repr(basis.names[j]) for j in zero[:4])
         raise ValueError(
-            "the basis is rank-deficient on the samples: a combination of "
-            f"{', '.join(map(repr, members))}{' …' if not zero.size else ''} vanishes on all of "
-            "them. Leave one out, or take samples that fill the domain."
+            f"the basis is rank-deficient: {zero.size} of {len(scale)} functions are 0 on all "
+            f"samples ({members}{' …' if zero.size > 4 else ''}). Leave them out; if the "
+            "coordinates are so small that their powers underflow, use larger units."
+        )
+    if singular[-1] < 1e-13 * singular[0]:
+        members = ", ".join(repr(basis.names[j]) for j in np.argsort(-abs(V[-1]))[:4])
+        raise ValueError(
+            f"the basis is rank-deficient on the samples: a combination of {members} … vanishes "
+            "on all of them. Leave one out, or take samples that fill the domain."
         )
     return float(singular[0] / singular[-1])
 
