@@ -100,7 +100,7 @@ def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
             "the force or the function is singular there or where the step leads. Keep the "
             "samples off the singularity."
         )
-    bad = ~np.isfinite(found.slopes).all(axis=2)
+    bad = np.asarray(~np.isfinite(found.slopes).all(axis=2))
     if bad.any():
         i, j = np.argwhere(bad)[0]
         raise ValueError(
