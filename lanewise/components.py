@@ -171,6 +171,17 @@ class Evaluator:
         self.write(value, place)
         return place
 
+    def reshaped(self, value: Value, shape: Sequence[int]) -> Buffer:
+        """Where an array is in memory with other axes, copied if its strides cannot say that."""
+        seen = self.in_memory(value).reshaped(shape)
+        if seen is not None:
+            return seen
+        place = self.kernel.scratch(value.shape, value.dtype, value.has_lanes())
+        self.write(value, place)
+        copied = place.reshaped(shape)
+        assert copied is not None
+        return copied
+
     def write(self, value: Value, place: Buffer) -> None:
         """Write an array to a place of its shape."""
         if value.buffer == place:
@@ -236,12 +247,8 @@ class Evaluator:
             return None
         assert value.buffer is not None
         name, params = eqn.primitive.name, eqn.params
-        if name == "reshape":
-            order = params["dimensions"]
-            seen = (
-                value.buffer if order is None else value.buffer.seen(lambda x: x.transpose(order))
-            )
-            buffers = [seen and seen.reshaped(params["new_sizes"])]
+        if name == "reshape" and params["dimensions"] is None:
+            buffers = [self.reshaped(value, params["new_sizes"])]
         else:
             buffers = [
                 value.buffer.seen(lambda x, i=i: moved(name, params, x)[i])

@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from .ir import Builder, Num, Unsupported
 from .memory import Buffer, load, store
-from .values import MADE, Value
+from .values import MADE, Entries, Value
 
 if TYPE_CHECKING:
     from .components import Evaluator
@@ -25,27 +27,35 @@ def linear_solve(e: "Evaluator", eqn: Any, values: list[Value], places: list) ->
 
 
 def eliminate(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
-    """A dense system, by elimination; rows are exchanged on trajectories that need it."""
-    b, (matrix, vector) = e.b, values
-    if matrix.size > MADE // 4:
-        raise Unsupported(f"a linear system with {vector.size} unknowns")
-    rows = [[*row, x] for row, x in zip(e.entries(matrix), e.entries(vector), strict=True)]
+    """Dense systems, by elimination; rows are exchanged on trajectories that need it."""
+    matrices, vectors = values
+    if matrices.size > MADE // 4:
+        raise Unsupported(f"a linear system with {vectors.shape[-1]} unknowns")
+    (out,) = eqn.outvars
+    front = out.aval.shape[:-1]
+    A = np.broadcast_to(e.entries(matrices), (*front, *matrices.shape[-2:]))
+    b = np.broadcast_to(e.entries(vectors), out.aval.shape)
+    return [e.value([x for i in np.ndindex(front) for x in _one(e, A[i], b[i])], out.aval)]
+
+
+def _one(e: "Evaluator", matrix: Entries, vector: Entries) -> list[Num]:
+    b = e.b
+    rows = [[*row, x] for row, x in zip(matrix, vector, strict=True)]
     numbers = [x for row in rows for x in row]
     vec = any(x.vec for x in numbers)
     found, weak = solved(b, [list(r) for r in rows])
     if weak.known is not None and not weak.known:
-        return [e.value(found, eqn.outvars[0].aval)]
+        return found
     if e.assumed is not None:
         e.assumed.never(weak)
-        return [e.value([b.unrelated(x) for x in found], eqn.outvars[0].aval)]
+        return [b.unrelated(x) for x in found]
 
     def exchanged() -> list[Num]:
         others = e.kernel.exchanged(numbers, vec)
         return [b.select(weak, x, y) for x, y in zip(others, found, strict=True)]
 
     n = len(found)
-    chosen = b.branch(b.any(weak), exchanged, lambda: found, [vec] * n, [vector.dtype] * n)
-    return [e.value(chosen, eqn.outvars[0].aval)]
+    return b.branch(b.any(weak), exchanged, lambda: found, [vec] * n, [numbers[0].dtype] * n)
 
 
 def solved(b: Builder, rows: list[list[Num]]) -> tuple[list[Num], Num]:

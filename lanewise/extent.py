@@ -31,7 +31,10 @@ def operation_count(jaxpr: Any) -> int:
     """How many operations on numbers the evaluation is made of, loops counted once; roughly."""
     count = 0
     for eqn in jaxpr.eqns:
-        inner = [operation_count(b.jaxpr) for b in (*bodies(eqn), *functions_in(eqn))]
+        inside = (*bodies(eqn), *functions_in(eqn))
+        if eqn.primitive.name == "custom_linear_solve":
+            inside = (eqn.params["jaxprs"].solve,)
+        inner = [operation_count(b.jaxpr) for b in inside]
         if inner:
             count += sum(inner)
             continue
@@ -42,7 +45,8 @@ def operation_count(jaxpr: Any) -> int:
         elif eqn.primitive.name.startswith("reduce_"):
             size = eqn.invars[0].aval.size
         elif eqn.primitive.name == "eliminate":
-            size = eqn.invars[1].aval.size ** 3 // 3
+            n, matrices = eqn.invars[0].aval.shape[-1], eqn.invars[0].aval.size
+            size = matrices * n // 3 + size * n - matrices  # more columns of one matrix
         elif eqn.primitive.name in _FREE:
             size = 0
         count += size

@@ -70,10 +70,7 @@ def _pick(e: "Evaluator", value: Value, index: Num) -> Num:
             here = b.compare("eq", index, b.known(i, "int64"))
             result = b.select(here, value.entries.flat[i], result)
         return result
-    buffer = e.in_memory(value)
-    flat = buffer.reshaped((buffer.size,))
-    if flat is None:
-        raise Unsupported("an index into an array that is not contiguous in memory")
+    flat = e.reshaped(value, (value.size,))
     return load(b, flat, b.mul(index, b.known(flat.strides[0], "int64")))
 
 

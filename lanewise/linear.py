@@ -1,8 +1,10 @@
 """Small dense linear systems, and Jacobians that keep the zeros of their structure."""
 
-import jax
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.typing import ArrayLike
 
 from .jaxapi import primitive
 
@@ -35,8 +37,19 @@ def solve(A: Array, b: Array) -> Array:
     )
 
 
-def _in_arrays(A: Array, b: Array) -> Array:
-    return by_elimination(A, b) if b.shape[0] <= WRITTEN_OUT else jnp.linalg.solve(A, b)
+def _in_arrays(A: ArrayLike, b: ArrayLike) -> Array:
+    """The solutions of systems with the shapes (..., n, n) and (..., n)."""
+    A, b = jnp.asarray(A), jnp.asarray(b)
+    n, lapack = b.shape[-1], _on_each(jnp.linalg.solve)
+    if n <= WRITTEN_OUT:
+        return _on_each(by_elimination)(A, b)
+    if b.ndim == 1 or n > IN_A_LOOP:
+        return lapack(A, b)
+    return lax.platform_dependent(A, b, cpu=_on_each(_column_by_column), default=lapack)
+
+
+def _on_each(one: Callable) -> Callable:
+    return jnp.vectorize(one, signature="(n,n),(n)->(n)")
 
 
 def by_elimination(A: Array, b: Array) -> Array:
@@ -85,12 +98,12 @@ def _column_by_column(A: Array, b: Array) -> Array:
 
 
 def _in_batches(arrays, axes):
-    def one(A, b):
-        if not WRITTEN_OUT < b.shape[0] <= IN_A_LOOP:
-            return _in_arrays(A, b)
-        return lax.platform_dependent(A, b, cpu=_column_by_column, default=_in_arrays)
-
-    return jax.vmap(one, axes, 0)(*arrays), 0
+    """More systems at once: their axis goes in front, of length 1 for what they share."""
+    moved = [
+        jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(jnp.asarray(x), axis, 0)
+        for x, axis in zip(arrays, axes, strict=True)
+    ]
+    return _eliminate.bind(*moved), 0
 
 
 _eliminate = primitive("eliminate", _in_arrays, _in_batches)

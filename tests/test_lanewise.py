@@ -463,6 +463,10 @@ CASES = {
         lambda x: lax.dynamic_slice(x, ((x[0, 0] * 9).astype(int), 3), (2, 200 // 20)),
         WIDE,
     ),
+    "wide, turned and indexed": (
+        lambda x: (x.T.reshape(-1)[::7], jnp.take(x.T, (x[0, 0] * 600).astype(int), mode="clip")),
+        WIDE,
+    ),
     "wide sum": (lambda x: (jnp.sum(x[:, :7], 0), jnp.max(x[:7, ::2], 1)), WIDE),
     "truth": (
         lambda x: (x & ~x[::-1], jnp.any(x), x[None].T, x.astype(float)),
@@ -914,6 +918,24 @@ def test_an_exchange_of_rows_on_one_trajectory(left, n):
     A[5] = np.nan
     assert_same(np.asarray(solve(A, b))[others], plain[others])
     assert not left
+
+
+def test_several_right_hand_sides_share_the_elimination_of_their_matrix(left):
+    """Of two matrices on each trajectory, in generated code and in XLA."""
+    A, B = RNG.normal(size=(9, 6, 6)), RNG.normal(size=(9, 6, 5))
+
+    def columns(A, B):
+        return jax.vmap(lanewise.solve, (None, 1), 1)(A, B)
+
+    def both(A, B):
+        return jax.vmap(columns, (0, None))(jnp.stack([A, A.T]), B)
+
+    expected = np.linalg.solve(np.stack([A, A.swapaxes(1, 2)], 1), B[:, None])
+    assert_close(jax.jit(lanewise.batched(both))(A, B), jnp.asarray(expected), 1e-11)
+    assert not left
+    assert_close(jax.jit(jax.vmap(both))(A, B), jnp.asarray(expected), 1e-11)
+    one, five = (operations(columns, A[0], B[0, :, :k]) for k in (1, 5))
+    assert five - one <= 4 * (2 * 6**2)
 
 
 def test_an_unknown_parameter_is_left_to_xla():

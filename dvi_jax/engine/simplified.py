@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import Array, Inexact
@@ -14,12 +13,13 @@ from .newton import Vector, value_and_jacobian
 
 
 class SimplifiedNewton(Contraction):
-    """Simplified Newton iteration, x ← x − J⁻¹ F(x), J = ∂F/∂x at the guess, factorised once.
+    """Simplified Newton iteration, x ← x − J⁻¹ F(x), J = ∂F/∂x at the guess.
 
-    The Jacobian and its factors, the dear parts of Newton's method for many unknowns, are made
-    once a step; convergence is linear, with a factor of about the relative change of the Jacobian
-    from the guess to the root, O(h²) for the type II map. Unlike Picard's it may converge where h
-    times the derivative of the rate is larger than one, unless that derivative changes much.
+    The Jacobian, for many unknowns the most expensive part of Newton's method, is computed once a
+    step, and factorised once if there are more than 64 unknowns. Convergence is linear, with a
+    factor of about the relative change of the Jacobian from the guess to the root, O(h²) for the
+    type II map. Unlike Picard's it may converge where h times the derivative of the rate is larger
+    than one, unless that derivative changes much.
 
     Stops as `Picard` does, by the error that the linear convergence leaves; same arguments. Its
     derivatives are Newton's: the Jacobian at the root.
@@ -47,14 +47,14 @@ class SimplifiedNewton(Contraction):
 def factorised(A: Inexact[Array, "n n"]) -> Callable[[Vector], Vector]:
     """b → the solution of A x = b, all that depends on A alone computed now.
 
-    For n ≤ 16 by the inverse, whose errors an iteration corrects; else by factors.
+    Small systems are eliminated again for each b: generated code does that in fewer operations than
+    it takes to find the inverse once.
     """
-    n = A.shape[0]
-    if n > _BY_INVERSE:
+    if A.shape[0] > _ELIMINATED:
         factors = lu_factor(A)
         return lambda b: lu_solve(factors, b)
-    inverse = jax.vmap(lanewise.solve, (None, 1), 1)(A, jnp.eye(n, dtype=A.dtype))
-    return lambda b: inverse @ b
+    return lambda b: lanewise.solve(A, b)
 
 
-_BY_INVERSE = 16
+_ELIMINATED = 64
+"""Unknowns up to which a system is eliminated again for each right-hand side."""
