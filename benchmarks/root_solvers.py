@@ -5,8 +5,8 @@
 In each round every solver runs the same trajectories once, in random order; times are processor
 times of this process on one core, medians of the rounds. Layout and compiler options are those of
 a plain `jax.jit(jax.vmap(integrate))`: machine code of `lanewise` if the functions are small
-enough. Every row also has the iterations per step, whether
-all lanes succeeded, and the largest difference to Newton's states relative to the largest state.
+enough. Every row also has the iterations per step, whether all trajectories succeeded, and the
+largest difference to Newton's states relative to the largest state.
 
 Rows: ten bodies (the Sun and nine planets on circles; n = 30) with forces that depend a little on
 the momenta: the first post-Newtonian Hamiltonian, and a drag of 1e-6 a day; chains with masses that
@@ -142,7 +142,7 @@ def _box(system, n: int, lanes: int, h: float, steps: int, width=0.3) -> Row:
 
 
 def _name(of: str, lanes: int) -> str:
-    return f"{of}, {lanes} lane" + "s" * (lanes > 1)
+    return f"{of}, {lanes} " + ("trajectory" if lanes == 1 else "trajectories")
 
 
 def rows() -> dict[str, Row]:
@@ -157,16 +157,18 @@ def rows() -> dict[str, Row]:
             made[_name(name, lanes)] = Row(system, *planets(lanes), 0.5, steps, epsilon)
     gauss = dvi.GaussLegendre(2)
     relativity = of_planets["ten bodies, relativity"][0]
-    made["ten bodies, Gauss, 1 lane"] = Row(relativity, *planets(1), 0.5, 200, 0.0, gauss)
+    made["ten bodies, Gauss, 1 trajectory"] = Row(relativity, *planets(1), 0.5, 200, 0.0, gauss)
     for n in (2, 4, 10, 20, 30, 100):
-        made[f"chain {n}, 1 lane"] = _box(dvi.System(chain), n, 1, 0.02, 2000 if n < 100 else 200)
+        made[f"chain {n}, 1 trajectory"] = _box(
+            dvi.System(chain), n, 1, 0.02, 2000 if n < 100 else 200
+        )
     for n in (2, 4, 10, 20, 30):
-        made[f"chain {n}, 256 lanes"] = _box(dvi.System(chain), n, 256, 0.02, 400)
+        made[f"chain {n}, 256 trajectories"] = _box(dvi.System(chain), n, 256, 0.02, 400)
     for n in (10, 20):
-        made[f"full {n}, 1 lane"] = _box(dvi.System(web), n, 1, 0.02, 2000)
-        made[f"full {n}, 256 lanes"] = _box(dvi.System(web), n, 256, 0.02, 400)
+        made[f"full {n}, 1 trajectory"] = _box(dvi.System(web), n, 1, 0.02, 2000)
+        made[f"full {n}, 256 trajectories"] = _box(dvi.System(web), n, 256, 0.02, 400)
     two = systems.n_body()
-    made["figure eight, Gauss, 1 lane"] = Row(
+    made["figure eight, Gauss, 1 trajectory"] = Row(
         two.system, two.q0[None], two.p0[None], 0.05, 1000, 0.0, gauss
     )
     pendulums = dvi.System(separate_pendulums, force=strong_drag)

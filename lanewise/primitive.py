@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import handler, machine
+from .components import MOST_OPERATIONS
 from .extent import carried, operation_count
 from .ir import Unsupported
 from .jaxapi import (
@@ -269,10 +270,6 @@ def kernel_of(
         vectors = vectors_for(state, count) if state or moved <= 24 else 1
     module = Module(*variant(lanes, vectors))
     return module, module.kernel(closed, on)
-
-
-MOST_OPERATIONS = 45_000
-"""More operations, loops counted once, are left to XLA."""
 
 
 def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Newton's method with one Jacobian, factorised once."""
+"""Newton's method with one Jacobian a step."""
 
 from collections.abc import Callable
 
