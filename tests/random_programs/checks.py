@@ -196,8 +196,11 @@ def _same_bits_elsewhere(case: Case, start: dict[str, Any], found: dict[str, Any
 
 
 def _loss(solution: Any) -> Any:
+    """NaN for a trajectory that fails, though it may be after all that is saved."""
     numbers = [solution.qs, solution.ps, *jax.tree.leaves(solution.observed)]
-    return sum(jnp.sum(jnp.tanh(x)) for x in numbers)
+    total = sum(jnp.sum(jnp.tanh(x)) for x in numbers)
+    fine = [solution.result == kind for kind in (dvi.RESULTS.successful, dvi.RESULTS.stopped)]
+    return jnp.where(fine[0] | fine[1], total, jnp.nan)
 
 
 def _compare_gradient(case: Case) -> str:
