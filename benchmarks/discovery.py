@@ -9,11 +9,20 @@ the linear algebra alone.
 Predictions, written down before this file was run: under 1 s on one core, most of it in the
 singular values; below three times the reference.
 
-Run: python benchmarks/discovery.py
+Run: python benchmarks/discovery.py [--against FOLDER]
+
+With `--against`, another checkout of the package does the same in processes of its own, in turn
+with this one, and the ratio of the times is printed.
 """
 
+import argparse
+import os
+import re
 import statistics
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -48,7 +57,7 @@ def seconds(function, *args):
     return time.perf_counter() - start
 
 
-def main():
+def measure():
     """Print times and their ratio, interleaved in one process."""
     first = seconds(discover, 0)
     rows = (ORDER + 1) * SAMPLES * 3 // 4
@@ -64,6 +73,39 @@ def main():
     ratio = statistics.median(a / b for a, b in zip(ours, theirs, strict=True))
     print(f"over dense singular values alone ({rows} × {matrix.shape[1]}): ratio {ratio:.2f}")
     print(f"survivors {found.survivors}, largest residual {found.residuals.max():.1e}")
+
+
+def compared(folder, rounds=3):
+    """Print this checkout's times over those of another, medians of the rounds."""
+    ratios = {"first call, with compilation": [], "after compilation: median": []}
+    for _ in range(rounds):
+        ours, theirs = (_times_of(where) for where in (Path(__file__).parents[1], folder))
+        for what, found in ratios.items():
+            found.append(ours[what] / theirs[what])
+    for what, found in ratios.items():
+        print(f"{what}: {statistics.median(found):.2f} × that of {folder}")
+
+
+def _times_of(folder):
+    """The times that this file prints with the package of a folder, without its cache of code."""
+    environment = os.environ | {"PYTHONPATH": str(Path(folder).resolve()), "DVI_JAX_CACHE": "off"}
+    printed = subprocess.run(
+        [sys.executable, __file__], env=environment, capture_output=True, text=True, check=True
+    ).stdout
+    return {what: float(t) for what, t in re.findall(r"^(.*?):? ([0-9.]+) s", printed, re.M)}
+
+
+def main():
+    """One measurement, or two checkouts in turn."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--against", type=Path, help="folder of another checkout")
+    folder = parser.parse_args().against
+    if folder is None:
+        measure()
+    elif (folder / "dvi_jax" / "__init__.py").is_file():
+        compared(folder)
+    else:
+        parser.error(f"{folder} has no dvi_jax/__init__.py: give the folder of a checkout.")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,18 @@ from ._adjoints import (
     Checkpointed as Checkpointed,
     Direct as Direct,
 )
+from ._aliases import (
+    RK4 as RK4,
+    Chord as Chord,
+    Event as Event,
+    Leapfrog as Leapfrog,
+    LinearTrend as LinearTrend,
+    PeakToPeak as PeakToPeak,
+    SaveAt as SaveAt,
+    StormerVerlet as StormerVerlet,
+    SymplecticEuler as SymplecticEuler,
+    naff as naff,
+)
 from ._arithmetic import (
     Arithmetic as Arithmetic,
     Compensated as Compensated,
@@ -21,12 +33,47 @@ from ._arithmetic import (
 from ._discretise import discretise as discretise
 from ._energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
 from ._integrate import integrate as integrate
+from ._integrator import Integrator as Integrator
 from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._reversible import Reversible as Reversible
 from ._solution import Save as Save, Solution as Solution
 from ._step import Equations as Equations, StepInfo as StepInfo
 from ._system import System as System
 from ._types import Interval as Interval
+from .discover import (
+    AdiabaticInvariant as AdiabaticInvariant,
+    Balance as Balance,
+    Basis as Basis,
+    Chebyshev as Chebyshev,
+    Discovery as Discovery,
+    DriftLaw as DriftLaw,
+    DriftOrder as DriftOrder,
+    DriftSurface as DriftSurface,
+    Generator as Generator,
+    InvariantSeries as InvariantSeries,
+    LatticePoint as LatticePoint,
+    Polynomials as Polynomials,
+    Radial as Radial,
+    ShadowHamiltonian as ShadowHamiltonian,
+    Symmetries as Symmetries,
+    Symmetry as Symmetry,
+    Trigonometric as Trigonometric,
+    conformal_factor as conformal_factor,
+    determining_residual as determining_residual,
+    discover_invariants as discover_invariants,
+    discrete_equations as discrete_equations,
+    drift_order as drift_order,
+    drift_surface as drift_surface,
+    find_symmetries as find_symmetries,
+    lattice_defect as lattice_defect,
+    library as _library,
+    noether_balance as noether_balance,
+    noether_identity as noether_identity,
+    prolong as prolong,
+    random_pairs as random_pairs,
+    solution_pairs as solution_pairs,
+    solve_gauge as solve_gauge,
+)
 from .dynamics import (
     FREQUENCY_RESULTS as FREQUENCY_RESULTS,
     SECTION_RESULTS as SECTION_RESULTS,
@@ -77,19 +124,6 @@ from .fit import (
     fit as fit,
     identify as identify,
     sample as sample,
-)
-from .invariants import (
-    Balance as Balance,
-    Discovery as Discovery,
-    DriftLaw as DriftLaw,
-    DriftOrder as DriftOrder,
-    DriftSurface as DriftSurface,
-    InvariantSeries as InvariantSeries,
-    ShadowHamiltonian as ShadowHamiltonian,
-    discover_invariants as discover_invariants,
-    drift_order as drift_order,
-    drift_surface as drift_surface,
-    noether_balance as noether_balance,
 )
 from .lattices import (
     Given as Given,
@@ -146,29 +180,6 @@ from .sweep import (
     starts as starts,
     sweep as sweep,
     sweep_cost as sweep_cost,
-)
-from .symmetry import (
-    AdiabaticInvariant as AdiabaticInvariant,
-    Basis as Basis,
-    Chebyshev as Chebyshev,
-    Generator as Generator,
-    LatticePoint as LatticePoint,
-    Polynomials as Polynomials,
-    Radial as Radial,
-    Symmetries as Symmetries,
-    Symmetry as Symmetry,
-    Trigonometric as Trigonometric,
-    conformal_factor as conformal_factor,
-    determining_residual as determining_residual,
-    discrete_equations as discrete_equations,
-    find_symmetries as find_symmetries,
-    lattice_defect as lattice_defect,
-    library as _library,
-    noether_identity as noether_identity,
-    prolong as prolong,
-    random_pairs as random_pairs,
-    solution_pairs as solution_pairs,
-    solve_gauge as solve_gauge,
 )
 
 generators = _library

@@ -56,6 +56,11 @@ class _ActionRule(eqx.Module):
         return jnp.dot(b, energy(times, qs, ps, args) - pq)
 
 
+def is_first_order(H_D: Any) -> bool:
+    """Whether a discrete Hamiltonian is a continuous one taken at (t0, q0, p1)."""
+    return isinstance(H_D, _LeftRule)
+
+
 def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
     r"""The discrete Hamiltonian of order r of a continuous one.
 

@@ -18,9 +18,10 @@ from lanewise.jaxapi import batch_size, is_traced, manual_axes
 from lanewise.primitive import generates
 
 from ._adjoints import AbstractAdjoint, Outcome
-from ._arithmetic import Arithmetic, FixedPoint, FloatingPoint
+from ._arithmetic import Arithmetic, FixedPoint
 from ._dense import Curve, at_times, crossings, stopped
 from ._extended import run_extended
+from ._integrator import Integrator, chosen
 from ._memory import results_memory
 from ._precision import refuse_double_without_x64
 from ._results import RESULTS, IntegrationError, status_code, status_name
@@ -44,11 +45,10 @@ from ._step import Equations
 from ._system import System, check_system
 from ._types import Interval
 from .engine.newton import RootSolver, over
-from .engine.picard import PicardThenNewton
 from .engine.quantities import refuse_unit_or_mask
 from .engine.reads import reads
 from .engine.rounding import each
-from .lattices import Lattice, TimeTransformed, Uniform, Variational
+from .lattices import Lattice, TimeTransformed, Variational
 from .methods import Method, TypeII, goes_backwards, warn_of_dissipation
 from .observe import Deviations, Range, Reduction, RequestedTimes, Running, Section, Stop
 from .observe._kept import Start
@@ -69,21 +69,22 @@ def integrate(
     t0: Any = 0.0,
     epsilon: Any = 0.0,
     args: PyTree = None,
-    method: Method = TypeII(),
-    lattice: Lattice = Uniform(),
+    method: Method | None = None,
+    lattice: Lattice | None = None,
     save: Save = Save(),
     observe: PyTree = None,
-    adjoint: AbstractAdjoint = Reversible(),
-    newton: RootSolver = PicardThenNewton(),
-    arithmetic: Arithmetic = FloatingPoint(),
-    layout: Layout = Layout(),
+    adjoint: AbstractAdjoint | None = None,
+    newton: RootSolver | None = None,
+    arithmetic: Arithmetic | None = None,
+    layout: Layout | None = None,
+    integrator: Integrator | None = None,
     stop: Stop | None = None,
     throw: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Solution:
     r"""One trajectory of a disturbed discrete Hamiltonian system.
 
-    Iterates the map of `method`, by default the paper's (12)–(13),
+    Iterates the map of `method`, by default (see `Integrator`) the paper's (12)–(13),
 
         q1 = q0 + h ∂H_D/∂p1,    p1 = p0 − h ∂H_D/∂q0 + h ε W(t0, t1, q0, p1).
 
@@ -111,6 +112,8 @@ def integrate(
       `Picard`.
     - `arithmetic`: how the state is kept: `FloatingPoint`; for long runs `Compensated`, or
       `FixedPoint`, whose explicit steps go back bit for bit.
+    - `integrator`: an `Integrator` in place of method, lattice, adjoint, newton, arithmetic and
+      layout.
     - `throw`: raise if the trajectory fails; otherwise read ``solution.result``.
     - `progress`: called as ``progress(steps_done, num_steps)`` at save points, at most about a
       hundred times during the run, which then goes in pieces (same numbers, bit for bit). Not
@@ -144,20 +147,15 @@ def integrate(
     ```
     """
     check_system(system)
-    for name, value, kind in (
-        ("method", method, Method),
-        ("lattice", lattice, Lattice),
-        ("save", save, Save),
-        ("adjoint", adjoint, AbstractAdjoint),
-        ("newton", newton, RootSolver),
-        ("arithmetic", arithmetic, Arithmetic),
-        ("layout", layout, Layout),
-    ):
-        if not isinstance(value, kind):
-            hint = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
-            if kind is RootSolver:
-                hint += "; take dvi.Newton(), dvi.SimplifiedNewton(), dvi.Picard() or leave it out"
-            raise TypeError(f"{name} must be a {kind.__name__}, got {value!r}{hint}.")
+    integrator = chosen(
+        integrator, method=method, lattice=lattice, adjoint=adjoint, root_finder=newton,
+        arithmetic=arithmetic, layout=layout,
+    )  # fmt: skip
+    method, lattice, adjoint = integrator.method_for(system), integrator.lattice, integrator.adjoint
+    newton, arithmetic, layout = integrator.root_finder, integrator.arithmetic, integrator.layout
+    if not isinstance(save, Save):
+        hint = " (is a pair of parentheses missing?)" if isinstance(save, type) else ""
+        raise TypeError(f"save must be a Save, got {save!r}{hint}.")
     if not (stop is None or isinstance(stop, Stop)):
         raise TypeError(f"stop must be a dvi.Stop(g), got {stop!r}.")
 

@@ -1,4 +1,4 @@
-"""Commands that tell what to rely on: paper, certify, bench, info."""
+"""Commands that check and measure: paper, certify, bench, info."""
 
 import json
 from pathlib import Path
@@ -6,22 +6,15 @@ from typing import Annotated
 
 import typer
 
-from ._group import TRUST, app
+from ._errors import InputError, one_of
+from ._group import CHECKING, app
 from ._names import CHECKS, METHODS, WORKLOADS, completer
 from ._runs import Force
-from ._session import FAILED, Refused, Session, command
-from ._show import print_tables, stderr, stdout
+from ._session import FAILED, Session, command
+from ._show import stderr, stdout
 
 
-@command(
-    app,
-    "paper",
-    panel=TRUST,
-    examples=[
-        "dvi-jax paper                    figures, tables, verdicts in ./paper-out",
-        "dvi-jax paper --out DIR --json   the verdicts on stdout as well",
-    ],
-)
+@command(app, "paper", CHECKING)
 def paper(
     session: Session,
     out: Annotated[Path, typer.Option(help="Directory for figures and numbers.")] = Path(
@@ -32,6 +25,10 @@ def paper(
     """Reproduce the figures and numbers of the paper.
 
     Exit code 0: done, whatever the verdicts are. 1: failed. 2: bad input.
+
+    Examples
+        dvi-jax paper                    figures, tables, verdicts in ./paper-out
+        dvi-jax paper --out DIR --json   the verdicts on stdout as well
     """
     session.start_jax()
     from dvi_jax.paper import reproduce
@@ -39,38 +36,23 @@ def paper(
     try:
         done = reproduce(out, force, stderr() if session.as_json else stdout())
     except (FileExistsError, NotADirectoryError, PermissionError) as error:
-        raise Refused("bad input", f"--out: {error}") from None
+        raise InputError("--out", str(error), "a new directory, or --force") from None
     verdicts = json.loads((done.out / "verdicts.json").read_text(encoding="utf-8"))
     session.finish({"folder": str(done.out), **verdicts})
 
 
-@command(
-    app,
-    "certify",
-    panel=TRUST,
-    examples=[
-        "dvi-jax certify --quick",
-        "dvi-jax certify --method Strang --check order --check energy",
-        "dvi-jax certify --out docs/certificate.md",
-    ],
-)
+@command(app, "certify", CHECKING)
 def certify(
     session: Session,
     method: Annotated[
         list[str] | None,
         typer.Option(
-            help="A method to certify; may be repeated. All if none.",
-            autocompletion=completer(METHODS),
-            show_default=False,
+            help="A method to certify; may be repeated. All if none.", **completer(METHODS)
         ),
     ] = None,
     check: Annotated[
         list[str] | None,
-        typer.Option(
-            help="A check to make; may be repeated. All if none.",
-            autocompletion=completer(CHECKS),
-            show_default=False,
-        ),
+        typer.Option(help="A check to make; may be repeated. All if none.", **completer(CHECKS)),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Markdown file, or directory, for the certificate.")
@@ -82,60 +64,58 @@ def certify(
     Each check is also shown to catch a method that is broken on purpose (the controls).
 
     Exit code 0: all promises kept, all controls caught. 1: not so. 2: bad input.
+
+    Examples
+        dvi-jax certify --quick
+        dvi-jax certify --method Strang --check order --check energy
+        dvi-jax certify --out docs/certificate.md
     """
     session.start_jax()
     session.unwritten = "the certificate cannot be written"
     from dvi_jax.certify import QUICK, certify, page_for
 
     if quick and method:
-        raise Refused("bad input", "give --quick or --method, not both.")
+        raise InputError("--quick", "given together with --method", "one of the two")
     try:
         page = None if out is None else page_for(out)
         with session.bar("certifying") as bar:
             certificate = certify(QUICK if quick else method or None, check or None, bar.show)
     except (ValueError, TypeError) as error:
-        raise Refused("bad input", str(error)) from error
+        allowed = "names as in dvi-jax certify --help, and a page that can be written"
+        raise InputError("certify", str(error), allowed) from error
     failures = [
         f"{name}, {tried}: {measured.verdict}, allowed {measured.allowed}. {measured.detail}"
         for name, tried, measured in certificate.failures
     ]
-    if not session.as_json:
-        print_tables(stdout(), certificate.tables())
-    for said in failures:
-        session.line(said)
+    tables = certificate.tables()
+    session.tables(tables)
+    for failure in failures:
+        session.line(failure)
     session.line(certificate.summary, style="bold")
     if page is not None:
         page.parent.mkdir(parents=True, exist_ok=True)
         page.write_text(certificate.markdown(), encoding="utf-8")
         session.line(f"written to {page}")
-    tables = [
-        {"title": t.title, "columns": t.columns, "rows": t.rows} for t in certificate.tables()
-    ]
-    contents = {"summary": certificate.summary, "failures": failures, "tables": tables,
-                "file": page and str(page)}  # fmt: skip
+    contents = {
+        "summary": certificate.summary,
+        "failures": failures,
+        "tables": [{"title": t.title, "columns": t.columns, "rows": t.rows} for t in tables],
+        "file": page and str(page),
+    }
     if certificate.ok or session.as_json:
         session.finish(contents, "" if certificate.ok else certificate.summary)
     else:  # the summary has said it
         raise typer.Exit(FAILED)
 
 
-@command(
-    app,
-    "bench",
-    panel=TRUST,
-    examples=[
-        "dvi-jax bench                            under a minute",
-        "dvi-jax bench --row batch --json",
-    ],
-)
+@command(app, "bench", CHECKING)
 def bench(
     session: Session,
     row: Annotated[
         list[str] | None,
         typer.Option(
             help="A row: single, batch, implicit, gradient; may be repeated. All if none.",
-            autocompletion=completer(WORKLOADS),
-            show_default=False,
+            **completer(WORKLOADS),
         ),
     ] = None,
     rounds: Annotated[int, typer.Option(min=3, help="How often each side is timed.")] = 7,
@@ -147,13 +127,17 @@ def bench(
     over the rounds. Compilation is not in it, and is told apart.
 
     Exit code 0: done. 1: a reference and the package do not agree. 2: bad input.
+
+    Examples
+        dvi-jax bench                            under a minute
+        dvi-jax bench --row batch --json
     """
     wanted = list(row or WORKLOADS)
     for name in wanted:
         if name not in WORKLOADS:
-            raise Refused("bad input", f"--row: {name!r}\n  allowed: {', '.join(WORKLOADS)}")
+            raise InputError("--row", repr(name), one_of(WORKLOADS, name))
     session.start_jax()
-    from ._bench import measure, tables
+    from .work.bench import measure, tables
 
     with session.bar("timing") as bar:
         found = measure(wanted, rounds, bar.show, session.note)
@@ -165,11 +149,15 @@ def bench(
     session.finish(found, f"the two sides differ: {', '.join(wrong)}" if wrong else "")
 
 
-@command(app, "info", panel=TRUST, examples=["dvi-jax info", "dvi-jax info --json > machine.json"])
+@command(app, "info", CHECKING)
 def info(session: Session) -> None:
     """Versions, devices, precision, flags, extras: what to send along with a question.
 
     Exit code 0: done. 1: JAX cannot be started.
+
+    Examples
+        dvi-jax info
+        dvi-jax info --json > machine.json
     """
     from ._info import gather, tables
 

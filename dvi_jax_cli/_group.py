@@ -1,6 +1,5 @@
-"""The application that commands are added to, and what it says to words that it does not know."""
+"""The application that commands are added to, and errors in the arguments."""
 
-import difflib
 import re
 import sys
 from typing import Annotated, Any
@@ -8,16 +7,17 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from ._errors import nearest
 from ._help import WithExamples, shown_examples
 from ._session import BAD_INPUT, INTERRUPTED, version
-from ._show import complain, print_json
+from ._show import print_error
 
 _USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
-"""The base of errors in the words of a command line: typer has it under no public name."""
+"""The base class of errors in the arguments; it is not public in typer."""
 
 
 class Commands(WithExamples, TyperGroup):
-    """All commands. Wrong words are told in the manner of every other error."""
+    """All commands. Errors in the arguments are shown like every other error."""
 
     def main(self, args: Any = None, *rest: Any, standalone_mode: bool = True, **more: Any) -> Any:
         words = list(sys.argv[1:] if args is None else args)
@@ -39,42 +39,35 @@ class Commands(WithExamples, TyperGroup):
 def _refuse(error: Any, as_json: bool) -> None:
     context = error.ctx
     message = re.split(r"\.? Did you mean|\.? \((?:Possible|Did)", error.format_message())[0]
-    nearest = _nearest(message, context)
-    message = message.rstrip(".") + (f" (did you mean {nearest}?)" if nearest else "")
+    message = message.rstrip(".")
     if context is not None:
-        message += f"\n  {context.command_path} --help says what there is"
-    if as_json:
-        print_json({"error": {"kind": "bad input", "message": message}})
-    else:
-        complain("bad input", message)
+        if seen := re.search(r"No such (?:command|option):? '?([^'\s]+)'?", message):
+            message += nearest(seen[1], _names(context.command))
+        message += f"\n  {context.command_path} --help lists what there is"
+    print_error("bad input", message, as_json)
 
 
-def _nearest(message: str, context: Any) -> str:
-    """The command or option that a mistyped one may have been."""
-    seen = re.search(r"No such (?:command|option):? '?([^'\s]+)'?", message)
-    if seen is None or context is None:
-        return ""
-    names = [option for p in context.command.params for option in p.opts]
-    names += list(getattr(context.command, "commands", ()))
-    return next(iter(difflib.get_close_matches(seen[1].rstrip("."), names, n=1)), "")
+def _names(command: Any) -> list[str]:
+    """The options and commands of a command."""
+    return [o for p in command.params for o in p.opts] + list(getattr(command, "commands", ()))
 
 
 app = typer.Typer(
     name="dvi-jax",
     cls=Commands,
-    help="Differentiable variational integrators for disturbed Hamiltonian systems.\n\n"
+    help="Differentiable variational integrators for perturbed Hamiltonian systems.\n\n"
     "Exit codes: 0 done, 1 failed, 2 bad input, 130 Ctrl-C. Every command has --help with "
-    "examples, --json for programs, -v to say what it does.",
+    "examples, --json for programs, -v for what it does.",
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     epilog=shown_examples(
         [
-            "dvi-jax new spring                  begin: a system, TOML files, a notebook",
+            "dvi-jax new spring                  a new project: system, TOML files, notebook",
             "dvi-jax systems                     the library of systems",
             "dvi-jax run run.toml                one trajectory, report, pictures",
-            "dvi-jax sweep sweep.toml --resume   many; goes on after whatever ended it",
+            "dvi-jax sweep sweep.toml --resume   many; continues after an interruption",
             "dvi-jax fit fit.toml --json         parameters from observations",
             "dvi-jax paper --out paper-out       the paper's figures and numbers",
             "dvi-jax --install-completion        completion in bash, zsh, fish",
@@ -82,7 +75,7 @@ app = typer.Typer(
     ),
 )
 
-RUNS, INVERSE, TRUST, START = "Trajectories", "From data", "Trust", "Begin"
+RUNS, INVERSE, CHECKING, START = "Trajectories", "From data", "Checks", "Start"
 
 
 def _show_version(wanted: bool) -> None:

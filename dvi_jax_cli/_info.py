@@ -5,32 +5,18 @@ import os
 import platform
 import sys
 from importlib import metadata
-from typing import Any, NamedTuple
+from typing import Any
 
 from ._names import EXTRAS
 from ._session import version
+from ._show import Table
 
 PACKAGES = (
-    "jax",
-    "jaxlib",
-    "equinox",
-    "optax",
-    "optimistix",
-    "numpy",
-    "matplotlib",
-    "xarray",
-    "zarr",
-)
+    "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "matplotlib", "xarray", "zarr",
+    "pydantic",
+)  # fmt: skip
 _FLAGS = ("JAX_", "XLA_", "CUDA_VISIBLE", "NVIDIA_VISIBLE", "OMP_", "TF_CPP")
 """Beginnings of the environment's names that change what JAX does."""
-
-
-class Table(NamedTuple):
-    """A table for the reader."""
-
-    title: str
-    columns: list[str]
-    rows: list[list[str]]
 
 
 def gather() -> dict[str, Any]:

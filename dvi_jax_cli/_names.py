@@ -1,9 +1,10 @@
-"""Names that a shell completes: a list of its own, since to ask the package would import JAX.
+"""Names that a shell completes, listed here since reading them from the package imports JAX.
 
-`tests/test_cli.py` holds it to what the package has.
+`tests/test_cli.py` compares them with the package.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 SYSTEMS = (
     "oscillator", "duffing", "van_der_pol", "slow_oscillator", "pendulum", "perturbed_pendulum",
@@ -30,6 +31,9 @@ CHECKS = (
 )  # fmt: skip
 """Checks of a certificate, as `dvi-jax certify --check` takes them."""
 
+FILES = ("run", "sweep", "fit", "discover")
+"""Kinds of TOML files."""
+
 WORKLOADS = ("single", "batch", "implicit", "gradient")
 """Rows of `dvi-jax bench`."""
 
@@ -45,10 +49,10 @@ EXTRAS = {
 """Extra of the package → modules that it brings."""
 
 
-def completer(names: Sequence[str]) -> Callable[[str], list[str]]:
-    """What completes one of these names."""
+def completer(names: Sequence[str]) -> dict[str, Any]:
+    """The arguments of an option of typer that takes one of these names, or none."""
 
     def complete(incomplete: str) -> list[str]:
         return [name for name in names if name.startswith(incomplete)]
 
-    return complete
+    return {"autocompletion": complete, "show_default": False}

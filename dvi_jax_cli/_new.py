@@ -1,4 +1,4 @@
-"""The command that writes a project to begin with: new NAME."""
+"""The command that writes a new project: new NAME."""
 
 import json
 import re
@@ -10,24 +10,17 @@ from typing import Annotated, Any
 
 import typer
 
+from ._errors import InputError, one_of
 from ._group import START, app
 from ._names import SYSTEMS, completer
-from ._session import Refused, Session, command
+from ._session import Session, command
 
 _NAME = re.compile(r"[^\W_][\w. -]{0,99}")
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{x}{i}" for x in ("com", "lpt") for i in range(1, 10))}
-"""Names that Windows has taken for devices."""
+"""Names of devices on Windows."""
 
 
-@command(
-    app,
-    "new",
-    panel=START,
-    examples=[
-        "dvi-jax new spring && cd spring && dvi-jax run run.toml",
-        "dvi-jax new orbits --system kepler",
-    ],
-)
+@command(app, "new", START)
 def new(
     session: Session,
     name: Annotated[
@@ -37,48 +30,43 @@ def new(
         str | None,
         typer.Option(
             help="Begin with a system of the library instead of one of your own.",
-            autocompletion=completer(SYSTEMS),
-            show_default=False,
+            **completer(SYSTEMS),
         ),
     ] = None,
 ) -> None:
-    """Write a project to begin with: a system, TOML files, a notebook, that run as they are.
+    """Write a new project: a system, TOML files and a notebook that run without changes.
 
-    Exit code 0: done. 1: it cannot be written. 2: a name that is taken, or that is none.
+    Exit code 0: done. 1: it cannot be written. 2: the name exists already, or is not allowed.
+
+    Examples
+        dvi-jax new spring && cd spring && dvi-jax run run.toml
+        dvi-jax new orbits --system kepler
     """
     session.unwritten = "the project cannot be written"
     _check(name, system)
     words = {"title": name.name, "system": system or ""}
     files = dict(_files("own" if system is None else "library", words))
-    files["explore.ipynb"] = json.dumps(notebook(files["explore.py"]), indent=1,
-                                        ensure_ascii=False) + "\n"  # fmt: skip
+    cells = notebook(files["explore.py"])
+    files["explore.ipynb"] = json.dumps(cells, indent=1, ensure_ascii=False) + "\n"
     name.mkdir(parents=True)
     for file, text in files.items():
         session.note(f"writing {name / file}")
         (name / file).write_text(text, encoding="utf-8")
     session.line(f"{name}: {', '.join(sorted(files))}")
-    session.line(
-        f"Begin with: cd {shlex.quote(str(name))} && dvi-jax run run.toml; README.md goes on from "
-        "there."
-    )
+    first = f"cd {shlex.quote(str(name))} && dvi-jax run run.toml"
+    session.line(f"Begin with: {first}; README.md has the next steps.")
     session.finish({"folder": str(name), "files": sorted(files), "system": system})
 
 
 def _check(name: Path, system: str | None) -> None:
     last = name.name
     if not _NAME.fullmatch(last) or last.split(".")[0].lower() in _RESERVED or last[-1] in " .":
-        raise Refused(
-            "bad input",
-            f"NAME: {str(name)!r}\n  allowed: letters and digits first, then also . _ - and spaces",
-        )
+        allowed = "letters and digits first, then also . _ - and spaces"
+        raise InputError("NAME", repr(str(name)), allowed)
     if name.exists() or name.is_symlink():
-        raise Refused("bad input", f"NAME: {name} exists already\n  allowed: a new directory")
+        raise InputError("NAME", f"{name} exists already", "a new directory")
     if system is not None and system not in SYSTEMS:
-        import difflib
-
-        near = difflib.get_close_matches(system, SYSTEMS, n=1)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        raise Refused("bad input", f"--system: {system!r}\n  allowed: {', '.join(SYSTEMS)}{hint}")
+        raise InputError("--system", repr(system), one_of(SYSTEMS, system))
 
 
 def _files(kind: str, words: dict[str, str]) -> Any:
@@ -93,7 +81,7 @@ def _files(kind: str, words: dict[str, str]) -> Any:
 
 
 def notebook(script: str) -> dict[str, Any]:
-    """A notebook (format 4.5) out of a script in cells, which begin with ``# %%``."""
+    """A notebook (format 4.5) from a script whose cells begin with ``# %%``."""
     cells = []
     for i, part in enumerate(re.split(r"^# %%", script, flags=re.MULTILINE)[1:]):
         head, _, body = part.partition("\n")

@@ -1,4 +1,4 @@
-"""What all commands have in common: --json, --verbose, --debug, and how each of them ends."""
+"""Common parts of all commands: --json, --verbose, --debug, errors and exit codes."""
 
 import functools
 import inspect
@@ -7,17 +7,18 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 
+from ._errors import InputError
 from ._help import Command, shown_examples, unwrapped
-from ._show import Bar, complain, print_json, print_tables, stderr, stdout
+from ._show import Bar, print_error, print_json, print_tables, stderr, stdout
 
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
-AGAIN = "On the command line: the same with --resume goes on from what is done."
+AGAIN = "On the command line: the same with --resume continues from what is done."
 CODES = {"bad input": BAD_INPUT, "failed": FAILED, "interrupted": INTERRUPTED, "fault": FAILED}
 """Kind of an error → exit code."""
 
@@ -40,19 +41,11 @@ Debug = Annotated[
 ]
 
 
-class Refused(Exception):
-    """A command that ends with an error: its kind, one of `CODES`, and what to say of it."""
-
-    def __init__(self, kind: str, message: str):
-        super().__init__(message)
-        self.kind = kind
-
-
 class Session:
-    """One call of a command: where its output goes, what it notes, how it ended.
+    """One call of a command: its output, its notes and how it ends.
 
-    - `unwritten`: what is said before an `OSError`; `stopped`: of a Ctrl-C that says nothing
-      itself; `hint`: a line after both, of work that can be gone on with.
+    - `unwritten`: text before an `OSError`; `stopped`: text for a Ctrl-C without one; `hint`: a
+      line after both, for work that can be continued.
     """
 
     unwritten = "the results cannot be written"
@@ -65,7 +58,7 @@ class Session:
         self._compiled: list[float] = []
 
     def start_jax(self) -> None:
-        """Double precision; pictures without a window. What JAX is and has, with --verbose."""
+        """Set double precision and pictures without a window; with --verbose, show what JAX has."""
         import jax
         import matplotlib as mpl
 
@@ -90,12 +83,12 @@ class Session:
             stderr().print(text, markup=False, soft_wrap=True, style="dim")
 
     def line(self, text: str, style: str | None = None) -> None:
-        """A line for the reader; not with --json."""
+        """A line for the reader, without --json."""
         if not self.as_json:
             stdout().print(text, markup=False, soft_wrap=True, style=style)
 
     def tables(self, tables: Iterable[Any], words: bool = False) -> None:
-        """Tables for the reader; not with --json."""
+        """Tables for the reader, without --json."""
         if not self.as_json:
             print_tables(stdout(), tables, words)
 
@@ -104,43 +97,38 @@ class Session:
         return Bar(doing)
 
     def finish(self, contents: Mapping[str, Any], failed: str = "") -> None:
-        """The end of a command: with --json its object, with `failed` an error that says so."""
+        """End a command: with --json its object, with `failed` an error."""
         if place := contents.get("folder") or contents.get("store"):
             self.note(f"written to {place}")
-        self.told()
+        seconds, count = time.perf_counter() - self._began, len(self._compiled)
+        part = f"; XLA compiled {count} programs in {sum(self._compiled):.1f} s" if count else ""
+        self.note(f"{seconds:.1f} s in all{part}")
         if self.as_json:
             error = {"error": {"kind": "failed", "message": failed}} if failed else {}
             print_json({**contents, **error})
         elif failed:
-            complain("failed", failed)
+            print_error("failed", failed)
         if failed:
             raise typer.Exit(FAILED)
 
-    def told(self) -> None:
-        """With --verbose, what the call took."""
-        seconds = time.perf_counter() - self._began
-        count = len(self._compiled)
-        part = f"; XLA compiled {count} programs in {sum(self._compiled):.1f} s" if count else ""
-        self.note(f"{seconds:.1f} s in all{part}")
+    def finish_report(self, report: Any) -> None:
+        """End a command with the report of its work."""
+        self.tables(report.tables)
+        for note in report.notes:
+            self.line(note, style="bold")
+        contents = report.contents
+        if report.files:
+            contents = {"folder": str(report.folder), "files": report.files, **contents}
+            report.summary += f"; written to {report.folder}: {', '.join(report.files)}"
+        self.line(report.summary)
+        self.finish(contents, report.message)
 
-    def refuse(self, kind: str, message: str) -> NoReturn:
-        """The error, told; the command ends with its exit code."""
-        if self.as_json:
-            print_json({"error": {"kind": kind, "message": message}})
-        else:
-            complain(kind, message)
-        raise typer.Exit(CODES[kind])
-
-    def judge(self, error: BaseException) -> tuple[str, str]:
-        """Kind and message of what was raised."""
-        if isinstance(error, Refused):
-            return error.kind, str(error)
+    def kind_and_message(self, error: BaseException) -> tuple[str, str]:
+        """The kind of an exception, one of `CODES`, and the message for the reader."""
         if isinstance(error, KeyboardInterrupt):
             what = str(error).removeprefix("interrupted: ") or self.stopped
             return "interrupted", "\n".join(filter(None, (what, self.hint)))
-        if isinstance(
-            error, (*_known("dvi_jax.run", "InputError"), *_known("dvi_jax", "StoreMismatch"))
-        ):
+        if isinstance(error, (InputError, *_known("dvi_jax", "StoreMismatch"))):
             return "bad input", str(error)
         if isinstance(error, (OSError, *_known("dvi_jax", "StoreError"))):
             return "failed", "\n".join(filter(None, (f"{self.unwritten}: {error}", self.hint)))
@@ -150,14 +138,13 @@ class Session:
 
 
 def _known(module: str, *names: str) -> tuple[type, ...]:
-    """Exceptions of a module, if it has been imported: an error of it comes from nowhere else."""
+    """Exceptions of a module, if it has been imported."""
     found = sys.modules.get(module)
     return tuple(kind for name in names if isinstance(kind := getattr(found, name, None), type))
 
 
 def fault(error: BaseException, traced: bool = False) -> str:
-    """What is said of an exception that nothing in the package has foreseen; `traced`: below its
-    traceback."""
+    """The message for an unexpected exception; `traced`: below its traceback."""
     text = str(error).strip() or "(without a message)"
     lines = text.splitlines()
     if len(lines) > 12:
@@ -165,10 +152,10 @@ def fault(error: BaseException, traced: bool = False) -> str:
     how = (
         "Please report it, with the traceback above."
         if traced
-        else "The same command with --debug shows where it comes from; with that, please report it."
+        else "The same command with --debug shows where it comes from; please report it with that."
     )
     kind = type(error).__name__
-    return f"this is a fault of dvi_jax, not of what you gave it.\n{kind}: {text}\n{how}"
+    return f"this is a fault of dvi_jax, not of your input.\n{kind}: {text}\n{how}"
 
 
 def version() -> str:
@@ -186,12 +173,13 @@ def version() -> str:
 
 
 def command(
-    group: typer.Typer, name: str, *, panel: str | None = None, examples: Iterable[str] = ()
+    group: typer.Typer, name: str, panel: str | None = None
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A command of a group: a function of a `Session` and of its own arguments and options.
 
-    It gets --json, --verbose and --debug, and examples below its help. What it raises is told in
-    one block and becomes an exit code; with --debug it is raised.
+    It gets --json, --verbose and --debug. Its docstring is the help; the lines below "Examples" are
+    shown as they are. An exception is shown in one block and becomes an exit code; with --debug it
+    is raised.
     """
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
@@ -214,29 +202,29 @@ def command(
                 quiet()
                 raise typer.Exit(FAILED) from None
             except (Exception, KeyboardInterrupt) as error:
-                kind, message = session.judge(error)
-                if debug and kind != "interrupted":
-                    if as_json:
-                        print_json({"error": {"kind": kind, "message": message}})
-                    raise  # to the entry point, which shows it whole
-                session.refuse(kind, message)
+                kind, message = session.kind_and_message(error)
+                is_raised = debug and kind != "interrupted"  # the entry point shows it in full
+                if as_json or not is_raised:
+                    print_error(kind, message, as_json)
+                if is_raised:
+                    raise
+                raise typer.Exit(CODES[kind]) from None
 
         del call.__dict__["__wrapped__"]  # its signature is not this one's
         parameters = [*(p.replace(kind=kind) for p in own), *common]
         call.__dict__["__signature__"] = inspect.Signature(parameters)
         call.__annotations__ = {p.name: p.annotation for p in parameters}
-        group.command(
-            name,
-            cls=Command,
-            help=unwrapped(function.__doc__ or ""),
-            epilog=shown_examples(examples),
-            rich_help_panel=panel,
-        )(call)
+        text, _, examples = (inspect.getdoc(function) or "").partition("\n\nExamples\n")
+        epilog = shown_examples(inspect.cleandoc(examples).splitlines())
+        added = group.command(
+            name, cls=Command, help=unwrapped(text), epilog=epilog, rich_help_panel=panel
+        )
+        added(call)
         return function
 
     return register
 
 
 def quiet() -> None:
-    """Let the interpreter end without a word about a pipe that nobody reads any more."""
+    """Let the interpreter end without a message about a closed pipe."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,14 +1,22 @@
-"""What a reader sees: tables and lines on stdout, errors, notes and bars on stderr, strict JSON."""
+"""Output for the reader and for programs: tables, errors, progress bars, strict JSON."""
 
 import json
 import math
 import sys
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+
+class Table(NamedTuple):
+    """A table for the reader: names of the columns, rows of texts."""
+
+    title: str
+    columns: list[str]
+    rows: list[list[str]]
 
 
 def stdout() -> Any:
-    """A console of standard output: no control codes where it is no terminal or NO_COLOR is set."""
+    """A console of standard output: no control codes without a terminal or with NO_COLOR."""
     from rich.console import Console
 
     return Console(highlight=False)
@@ -21,53 +29,56 @@ def stderr() -> Any:
     return Console(stderr=True, highlight=False)
 
 
-def strict(value: Any) -> Any:
-    """The same in types that JSON has; numbers that are not finite become null."""
+def json_types(value: Any, not_finite: Callable[[float], Any] = lambda x: None) -> Any:
+    """The same in types that JSON has; numbers that are not finite become null, or `not_finite`."""
     if isinstance(value, Mapping):
-        return {str(k): strict(v) for k, v in value.items()}
+        return {str(k): json_types(v, not_finite) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [strict(v) for v in value]
+        return [json_types(v, not_finite) for v in value]
     if hasattr(value, "tolist"):  # arrays and their numbers, without importing NumPy for it
-        return strict(value.tolist())
+        return json_types(value.tolist(), not_finite)
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return value if math.isfinite(value) else not_finite(value)
     if value is None or isinstance(value, bool | int | str):
         return value
     return str(value)
 
 
 def print_json(contents: Mapping[str, Any]) -> None:
-    """One object on standard output, and a line's end."""
+    """One object on standard output, and the end of the line."""
     ascii_only = (sys.stdout.encoding or "").lower().replace("-", "") != "utf8"
-    text = json.dumps(strict(contents), indent=2, ensure_ascii=ascii_only, allow_nan=False)
+    text = json.dumps(json_types(contents), indent=2, ensure_ascii=ascii_only, allow_nan=False)
     sys.stdout.write(text + "\n")
 
 
-def complain(what: str, message: str) -> None:
-    """An error in one block on standard error: what kind, and what is to be known of it."""
+def print_error(kind: str, message: str, as_json: bool = False) -> None:
+    """An error in one block on standard error, or as an object on standard output."""
+    if as_json:
+        print_json({"error": {"kind": kind, "message": message}})
+        return
     from rich.text import Text
 
-    stderr().print(Text.assemble((f"{what}: ", "bold red"), message), soft_wrap=True)
+    stderr().print(Text.assemble((f"{kind}: ", "bold red"), message), soft_wrap=True)
 
 
 def print_tables(console: Any, tables: Iterable[Any], words: bool = False) -> None:
-    """Tables, their columns but the first to the right, where numbers stand; `words`: all left."""
+    """Tables; columns of numbers, all but the first, are aligned right unless they are `words`."""
     from rich.markup import escape
-    from rich.table import Table
+    from rich.table import Table as Grid
 
     for table in tables:
         console.print(table.title, style="bold", markup=False, soft_wrap=True)
-        shown = Table()
+        grid = Grid()
         for i, column in enumerate(table.columns):
             side = "left" if words or i == 0 else "right"
-            shown.add_column(escape(column), justify=side, overflow="fold")
+            grid.add_column(escape(column), justify=side, overflow="fold")
         for row in table.rows:
-            shown.add_row(*(escape(cell) for cell in row))
-        console.print(shown)
+            grid.add_row(*(escape(cell) for cell in row))
+        console.print(grid)
 
 
 class Bar:
-    """A progress bar on stderr that appears with the first call, where that is a terminal."""
+    """A progress bar on stderr that appears with the first call, if that is a terminal."""
 
     def __init__(self, doing: str):
         self.doing = doing
@@ -77,11 +88,11 @@ class Bar:
         return self
 
     def show(self, done: int, total: int) -> None:
-        from rich.console import Console
+        """Show that `done` parts of `total` are done."""
         from rich.progress import Progress
 
         if self.progress is None:
-            console = Console(stderr=True)
+            console = stderr()
             self.progress = Progress(
                 console=console, transient=True, disable=not console.is_terminal
             )

@@ -7,13 +7,15 @@ import typer
 from typer.core import TyperGroup
 
 from ._group import RUNS, app
+from ._runs import Config
 from ._session import AGAIN, Session, command
 
 
 class _RunFirst(TyperGroup):
-    """Commands of which `run` is meant where none is named."""
+    """Commands; `run` is the one where none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put `run` in front of other arguments."""
         if args and args[0] not in (*self.commands, "--help"):
             args = ["run", *args]
         return super().parse_args(ctx, args)
@@ -24,95 +26,85 @@ sweeps = typer.Typer(
     no_args_is_help=True,
     subcommand_metavar="CONFIG | status STORE | verify STORE",
     rich_markup_mode="rich",
-    help="Many trajectories: run the sweep of a TOML file, look at its store, verify it.",
+    help="Many trajectories: run the sweep of a TOML file, show the state of its store, verify it.",
 )
 app.add_typer(sweeps, name="sweep", rich_help_panel=RUNS)
 
 StorePath = Annotated[Path, typer.Argument(metavar="STORE", help="Directory of a sweep.")]
+Store = Annotated[
+    Path | None, typer.Option(help="Directory for the results, instead of output.store.")
+]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Continue with a store that exists, if it does.")
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Threads; one for each processor or GPU if not given.", show_default=False
+    ),
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Show tasks, bytes and seconds only.")]
 
 
-@command(
-    sweeps,
-    "run",
-    examples=[
-        "dvi-jax sweep sweep.toml --dry-run      tasks, bytes and seconds that it would take",
-        "dvi-jax sweep sweep.toml",
-        "dvi-jax sweep sweep.toml --resume       goes on, or begins",
-    ],
-)
+@command(sweeps, "run")
 def sweep_run(
     session: Session,
-    config: Annotated[
-        Path, typer.Argument(metavar="CONFIG", help="TOML file that describes the sweep.")
-    ],
-    store: Annotated[
-        Path | None, typer.Option(help="Directory for the results, instead of output.store.")
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a store that exists, if it does.")
-    ] = False,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Threads; one for each processor or GPU if not given.",
-            show_default=False,
-        ),
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only say what it would take: tasks, bytes, seconds.")
-    ] = False,
+    config: Config,
+    store: Store = None,
+    resume: Resume = False,
+    threads: Threads = None,
+    dry_run: DryRun = False,
 ) -> None:
-    """Do the sweep that a TOML file describes; this is what CONFIG alone means.
+    """Run the sweep of a TOML file; `sweep CONFIG` is short for this.
 
-    Each task is in the store once it is done. Whatever ends the sweep, --resume goes on from there.
+    Each task is in the store once it is done. After an interruption --resume continues from there.
 
     Exit code 0: done; trajectories that fail are results, and are counted in a table. 1: failed,
     such as by a full disk. 2: bad input, or a store of another sweep. 130: Ctrl-C.
+
+    Examples
+        dvi-jax sweep sweep.toml --dry-run      tasks, bytes and seconds that it would take
+        dvi-jax sweep sweep.toml
+        dvi-jax sweep sweep.toml --resume       continues, or begins
     """
     session.start_jax()
     session.stopped, session.hint = "before anything was done", AGAIN
-    from dvi_jax.run import sweep_cost, sweep_file
+    from .work.sweep import sweep_cost, sweep_file
 
     session.note(f"reading {config}")
-    if dry_run:
-        _show(session, sweep_cost(config))
-    else:
-        _show(session, sweep_file(config, store, resume, threads))
+    report = sweep_cost(config) if dry_run else sweep_file(config, store, resume, threads)
+    session.finish_report(report)
 
 
-@command(sweeps, "status", examples=["dvi-jax sweep status results/sweep.zarr"])
+@command(sweeps, "status")
 def sweep_status(session: Session, store: StorePath) -> None:
-    """How far a sweep is: tasks, trajectories, rate, size, and what it was made with.
+    """Show the state of a sweep: tasks, trajectories, rate, size, provenance.
 
     It may be running meanwhile. Exit code 0: done. 2: there is no store.
+
+    Examples
+        dvi-jax sweep status results/sweep.zarr
     """
-    from dvi_jax.run import sweep_status
+    from .work.sweep import sweep_status
 
-    _show(session, sweep_status(store))
+    session.finish_report(sweep_status(store))
 
 
-@command(sweeps, "verify", examples=["dvi-jax sweep verify results/sweep.zarr"])
+@command(sweeps, "verify")
 def sweep_verify(session: Session, store: StorePath) -> None:
-    """Read everything in a store again: checksums, and that it can be decoded.
+    """Read everything in a store again: checksums, and whether it can be decoded.
 
-    Tasks that are bad are open again, and the sweep with --resume does them anew: in the same bits.
+    Bad tasks are marked as not done; the sweep with --resume computes them again, to the same bits.
 
-    Exit code 0: all is sound. 1: something was bad, or cannot be read. 2: there is no store.
+    Exit code 0: everything is correct. 1: something was bad, or cannot be read. 2: there is no
+    store.
+
+    Examples
+        dvi-jax sweep verify results/sweep.zarr
     """
-    session.unwritten = "the bad tasks cannot be opened again"
-    from dvi_jax.run import verify_store
+    session.unwritten = "the bad tasks cannot be marked as not done"
+    from .work.sweep import verify_store
 
     with session.bar("verifying") as bar:
         report = verify_store(store, bar.show)
-    bad = (
-        "bad tasks were found; they are open again. To repair the store, do the sweep again with "
-        "--resume."
-    )
-    _show(session, report, bad if report.contents["bad"] else "")
-
-
-def _show(session: Session, report: Any, failed: str = "") -> None:
-    session.tables(report.tables)
-    session.line(report.summary)
-    session.finish(report.contents, failed)
+    session.finish_report(report)

@@ -239,7 +239,7 @@ def duffing(out):
     found = dvi.bifurcation(
         problem.system, problem.q0, problem.p0, dvi.stroboscope(period), h=period / 60,
         num_steps=60 * 152, epsilon=1.0, args={**problem.args, "gamma": dvi.Axis("gamma", gamma)},
-        skip=90, crossings=60,
+        skip=90, crossings=60, method=dvi.Strang(),
     )  # fmt: skip
     axis = plot.bifurcation(
         gamma, found, name="γ, size of the driving force", title="Duffing's oscillator"

@@ -1,23 +1,44 @@
 """Primitives of JAX written out in simpler ones, for small arrays of one trajectory."""
 
+import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from .ir import Unsupported
 
 MOST_UNKNOWNS = 12
-"""Larger matrices are left to XLA, which calls LAPACK."""
+"""Larger matrices are left to XLA, which calls LAPACK; so are stacks that cost more operations than
+one matrix of this size."""
 
 MOST_SORTED = 16
 """Longer arrays are sorted by XLA."""
 
 
 def _square(x: Array, name: str) -> int:
-    if x.ndim != 2 or x.shape[0] > MOST_UNKNOWNS:
+    if x.shape[0] > MOST_UNKNOWNS:
         raise Unsupported(f"{name} of an array of shape {x.shape}")
     return x.shape[0]
+
+
+def _of_each_matrix(one: Callable) -> Callable:
+    """A function of matrices, for stacks of them."""
+
+    def of_stacks(*arrays: Array, **parameters: Any) -> Any:
+        *front, n, _ = arrays[0].shape
+        if not front:
+            return one(*arrays, **parameters)
+        count = math.prod(front)
+        if not 0 < count * n**3 <= MOST_UNKNOWNS**3:
+            raise Unsupported(f"{one.__name__} of an array of shape {arrays[0].shape}")
+        flat = [x.reshape(count, *x.shape[len(front) :]) for x in arrays]
+        found = [one(*(x[i] for x in flat), **parameters) for i in range(count)]
+        return jax.tree.map(lambda *x: jnp.stack(x).reshape(*front, *x[0].shape), *found)
+
+    return of_stacks
 
 
 def lu(a: Array, **_) -> tuple[Array, Array, Array]:
@@ -146,9 +167,9 @@ def platform_index(*, platforms: Sequence, **_) -> Array:
 
 
 WRITTEN: dict[str, Callable] = {
-    "lu": lu,
-    "triangular_solve": triangular_solve,
-    "cholesky": cholesky,
+    "lu": _of_each_matrix(lu),
+    "triangular_solve": _of_each_matrix(triangular_solve),
+    "cholesky": _of_each_matrix(cholesky),
     "sort": sort,
     "nextafter": nextafter,
     "lt_to": lambda x, y: _ordered(x) < _ordered(y),

@@ -1,14 +1,17 @@
 """The systems and methods that tests parametrise over, and the oracles they compare with.
 
-All methods are in `dvi_jax.certify.METHODS`: being listed there, a new one is certified and tested.
+All methods are in `dvi_jax.testing.METHODS`: being listed there, a new one is certified and tested.
 """
+
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax import certify, systems
+from dvi_jax import systems, testing
+from dvi_jax.testing import symplectic_defect as symplectic_defect
 
 
 def non_separable(t0, t1, q0, p1, args):
@@ -43,8 +46,16 @@ SYSTEMS = {
 }
 ARGS = {"K": 1.0}
 
+
+@functools.cache
+def problem(name, h=0.1):
+    """A registered system as the checks of `dvi_jax.testing` take it."""
+    system, q, p = SYSTEMS[name]
+    return systems.Problem(name, system, np.array(q), np.array(p), h=h, args=ARGS)
+
+
 IN_EVERY_RUN = ("TypeII", "Adjoint", "Strang", "Yoshida4", "Composition2", "RungeKutta4")
-METHODS = {name: certify.METHODS[name] for name in IN_EVERY_RUN}
+METHODS = {name: testing.METHODS[name] for name in IN_EVERY_RUN}
 """Those that run on every system in the quick tests too."""
 
 ADJOINTS = {
@@ -95,13 +106,6 @@ def state(name):
     """The start of a registered system as one vector."""
     _, q, p = SYSTEMS[name]
     return jnp.asarray([*q, *p])
-
-
-def symplectic_defect(M):
-    """max |MᵀJM − J|."""
-    n = M.shape[0] // 2
-    J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
-    return np.max(np.abs(M.T @ J @ M - J))
 
 
 def central_difference(f, x, direction, step=1e-5):

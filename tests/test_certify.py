@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import problem
 from scipy.integrate import solve_ivp
 from typer.testing import CliRunner
 
@@ -23,12 +24,10 @@ from dvi_jax.certify import (
     altered,
     certificate as certificate_module,
     certify,
-    orders,
     page_for,
-    problems,
 )
-from dvi_jax.certify.checks import GROUPS
-from dvi_jax.certify.table import TITLE
+from dvi_jax.certify.page import GROUPS, TITLE
+from dvi_jax.testing import problems
 from dvi_jax_cli import app
 
 PAGE = Path(__file__).parent.parent / "docs" / "certificate.md"
@@ -104,22 +103,25 @@ def test_every_check_has_a_control_and_a_place():
 def test_order_of_the_force_alone_can_be_wrong():
     """The control of the forced order passes without the force: that check sees what this does."""
     (control,) = (c for c in CONTROLS if c.check == "forced-order")
-    assert orders.order(Candidate(control.method)).passed
+    assert CHECKS["order"](Candidate(control.method)).passed
 
 
 @pytest.mark.parametrize("epsilon", [0.0, problems.FORCED])
-def test_reference_agrees_with_scipy(epsilon):
-    gradient = jax.jit(jax.grad(problems.coupled, argnums=(2, 3)))
+@pytest.mark.parametrize("problem", [problems.COUPLED, problem("double_pendulum", h=0.05)])
+def test_reference_agrees_with_scipy(problem, epsilon):
+    system, args = problem.system, problem.args
+    gradient = jax.jit(jax.grad(system.H_D, argnums=(2, 3)))
 
     def field(t, z):
         q, p = np.split(z, 2)
-        dq, dp = gradient(t, t, q, p, problems.A)
-        return np.concatenate([dp, -dq + epsilon * problems.damping(t, t, q, p, problems.A)])
+        dq, dp = gradient(t, t, q, p, args)
+        return np.concatenate([dp, -dq + epsilon * system.force(t, t, q, p, args)])
 
-    start = np.concatenate(problems.TWO)
-    by_scipy = solve_ivp(field, (0, problems.SPAN), start, "DOP853", rtol=1e-13, atol=1e-14)
-    ours, doubt = problems.reference(epsilon)
-    assert doubt < 1e-14
+    start = np.concatenate([problem.q0, problem.p0])
+    end = problems.SPAN * problem.h
+    by_scipy = solve_ivp(field, (0, end), start, "DOP853", rtol=1e-13, atol=1e-14)
+    ours, doubt = problems.reference(problem, epsilon)
+    assert doubt < 1e-13
     np.testing.assert_allclose(ours.ravel(), by_scipy.y[:, -1], rtol=0, atol=2e-12)
 
 
@@ -156,8 +158,8 @@ def test_nan_never_passes(check, nan_candidate):
 def test_too_few_points_above_round_off_are_no_measurement():
     """The Gauss method of order 16 is there after a few steps."""
     accurate = Candidate(dvi.GaussLegendre(8))
-    accurate.__dict__["flow"] = problems._most_accurate()
-    measured = orders.order(accurate)
+    accurate.__dict__["flow"] = problems.most_accurate(problems.COUPLED)
+    measured = CHECKS["order"](accurate)
     assert measured.verdict == "NOT MEASURED"
     assert re.search(r"^\d points above round-off, at least 6 needed", measured.detail)
 
@@ -299,7 +301,7 @@ def test_command_refuses_bad_input(tmp_path):
     for words, said in [
         (("--method", "strang"), "did you mean Strang"),
         (("--check", "energies"), "did you mean energy"),
-        (("--quick", "--method", "Strang"), "give --quick or --method, not both"),
+        (("--quick", "--method", "Strang"), "--quick: given together with --method"),
         (("--out", other), "exists and is no certificate"),
         (("--out", tmp_path / "file"), "neither a directory nor a .md file"),
     ]:

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 import dvi_jax as dvi
 import dvi_jax_cli._names as names
-from dvi_jax import certify, run, systems
+from dvi_jax import certify, systems
 from dvi_jax_cli import app
 from dvi_jax_cli._new import notebook
 from dvi_jax_cli._session import CODES, Session, version
@@ -26,6 +26,7 @@ ROOT = Path(dvi.__file__).parent.parent
 COMMANDS = [
     "new",
     "systems",
+    "schema",
     "run",
     "sweep",
     "fit",
@@ -186,7 +187,7 @@ def test_names_that_complete_are_those_that_there_are():
     assert tuple(systems.LIBRARY) == names.SYSTEMS
     assert tuple(certify.METHODS) == names.METHODS
     assert tuple(certify.CHECKS) == names.CHECKS
-    assert tuple(import_module("dvi_jax_cli._bench")._ROWS) == names.WORKLOADS
+    assert tuple(import_module("dvi_jax_cli.work.bench")._ROWS) == names.WORKLOADS
     with open(ROOT / "pyproject.toml", "rb") as file:
         project = tomllib.load(file)["project"]
     extras = set(project["optional-dependencies"]) - {"test", "docs", "peers"}
@@ -195,6 +196,30 @@ def test_names_that_complete_are_those_that_there_are():
 
 
 # Output for programs, and errors
+
+
+@pytest.mark.parametrize("kind", [*names.FILES, None])
+def test_the_json_schema_accepts_the_examples_and_no_unknown_key(kind):
+    result = command("schema", *([kind] if kind else []))
+    assert result.exit_code == 0, result.output
+    schema = json.loads(result.stdout)
+    validator = pytest.importorskip("jsonschema").Draft202012Validator
+    validator.check_schema(schema)
+    for file in {"run": "kepler", None: "fit"}.get(kind, kind), "sweep":
+        text = (ROOT / "examples" / f"{file}.toml").read_text(encoding="utf-8")
+        values = tomllib.loads(text)
+        is_valid = validator(schema).is_valid
+        assert is_valid(values) == (kind in (None, "sweep") or file != "sweep")
+        assert not is_valid(values | {"stepps": 5})
+        assert not is_valid(values | {"h": "large"})
+
+
+def test_the_schema_of_an_unknown_kind():
+    result = command("schema", "swep")
+    assert result.exit_code == 2
+    assert "KIND: 'swep'" in result.stderr
+    assert "did you mean sweep?" in result.stderr
+    assert tuple(import_module("dvi_jax_cli.work.schema").FILES) == names.FILES
 
 
 def test_json_of_a_run_is_one_strict_object(tmp_path, monkeypatch):
@@ -255,7 +280,7 @@ def test_an_exception_that_nobody_foresaw(monkeypatch, as_json):
     def broken(name):
         raise ZeroDivisionError("one by nought")
 
-    monkeypatch.setattr(run, "library_tables", broken)
+    monkeypatch.setattr(import_module("dvi_jax_cli.work.library"), "library_tables", broken)
     result = command("systems", *(["--json"] if as_json else []))
     assert result.exit_code == 1 == CODES["fault"]
     said = json.loads(result.stdout)["error"]["message"] if as_json else result.stderr
@@ -341,7 +366,7 @@ def test_bench_agrees_with_its_references():
 
 
 def test_bench_tells_when_the_two_sides_differ(monkeypatch):
-    bench = import_module("dvi_jax_cli._bench")
+    bench = import_module("dvi_jax_cli.work.bench")
     side = bench.Side("", lambda: (np.zeros(2), np.zeros(2)), 10)
     other = bench.Side("another", lambda: (np.zeros(2), np.full(2, np.nan)), 10)
     row = bench.Row("single", "nothing", side, [side, other], 1e-6)
@@ -537,6 +562,8 @@ def test_the_line_to_begin_with_can_be_copied(tmp_path, monkeypatch):
 
 
 def test_too_little_memory_is_a_failure_with_its_size():
-    kind, said = Session(False, False, False).judge(MemoryError("Unable to allocate 7.28 TiB"))
+    kind, said = Session(False, False, False).kind_and_message(
+        MemoryError("Unable to allocate 7.28 TiB")
+    )
     assert kind == "failed"
     assert "does not have the memory for this: Unable to allocate 7.28 TiB" in said

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 
@@ -11,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 import dvi_jax as dvi
-from dvi_jax.run import InputError, _fit as room, fit_file
-from dvi_jax.run._config import read_config
-from dvi_jax.run._data import read_columns
-from dvi_jax.run._fit_config import FIT_KEYS
-from dvi_jax.run._fit_setup import make_fit_setup
+from dvi_jax.run import InputError, fit_file
 from dvi_jax_cli import app
+from dvi_jax_cli.work.columns import read_columns
+from dvi_jax_cli.work.fit_problem import fit_problem
+from dvi_jax_cli.work.schema import FitFile
+from dvi_jax_cli.work.table import Table, read_file
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -106,7 +105,7 @@ def command(*words):
 
 
 def setup(folder, text):
-    return make_fit_setup(read_config(write(folder, text), FIT_KEYS)[0], folder)
+    return fit_problem(read_file(write(folder, text), FitFile)[0], folder)
 
 
 # What a fit finds and writes
@@ -212,7 +211,7 @@ def test_an_error_amid_the_work_is_a_fault_and_no_bad_input(folder, monkeypatch)
         progress(dvi.FitProgress(1, 2, 0, 1.0, 1.0, np.ones(1), ["x"], 1.0))
         raise ValueError("amid")
 
-    monkeypatch.setattr(room.dvi, "fit", broken)
+    monkeypatch.setattr(dvi, "fit", broken)
     result = command(write(folder, SMALL))
     assert result.exit_code == 1
     assert "a fault of dvi_jax" in result.stderr
@@ -279,7 +278,7 @@ BAD_DATA = [
     ("t,t\n0.3,1\n", "the name 't' again", "different names"),
     ("t,x,y\n0.3,1,2\n0.6,1,2\n", "2 numbers for each time (x, y)", "1: the positions"),
     ("time,x\n0.3,1\n", "'t' (text)", "a column of the file: time, x"),
-    ("t\n0.3\n0.6\n", "no column is left", "out of t"),
+    ("t\n0.3\n0.6\n", "no column remains", "out of t"),
     (HEAD + "-0.3,1\n0.6,2\n", "between the times", "in the order of time"),
     (HEAD + "-0.3,1\n-0.6,2\n", "0.1, which leads from t0 = 0 away", "-0.1, or a t0"),
     (HEAD + "-0.6,1\n-0.3,2\n", "0.1, which leads from t0 = 0 away", "-0.1, or a t0"),
@@ -304,7 +303,7 @@ REFUSED = [
         "did you mean parameters?",
     ),
     ('"args.k"]', '"args.K"]', "parameters: 'args.K'", "did you mean args.k?"),
-    ('"args.k"]', '"epsilon"]', "stands there twice", "each name once"),
+    ('"args.k"]', '"epsilon"]', "is listed twice", "each name once"),
     ('["epsilon", "args.k"]', "[]", "parameters: []", "an array of names"),
     ('parameters = ["epsilon", "args.k"]', "", "parameters: the key is missing", "epsilon, q0, p0"),
     ("seen.csv", "sen.csv", "data.file: there is no file", "a CSV or npz file"),
@@ -352,9 +351,12 @@ def test_toml_is_told_with_its_line(folder):
 def test_every_key_is_shown_in_an_example():
     """A key that no example shows is one that nobody finds."""
     text = (EXAMPLES / "fit.toml").read_text(encoding="utf-8")
-    for key, inner in FIT_KEYS.items():
+    for key, field in FitFile.model_fields.items():
         assert f"{key} = " in text or f"[{key}]" in text or key == "args", key
-        for name in inner if isinstance(inner, Mapping) and key != "state" else ():
+        default = field.default
+        for name in (
+            type(default).model_fields if isinstance(default, Table) and key != "state" else ()
+        ):
             assert f"{name} = " in text or name == "plots", f"{key}.{name}"
 
 

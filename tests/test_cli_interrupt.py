@@ -52,7 +52,9 @@ def ended(code, *words, folder):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("module", ["typer", "numpy.matrixlib", "jax._src.core", "dvi_jax.run"])
+@pytest.mark.parametrize(
+    "module", ["typer", "numpy.matrixlib", "jax._src.core", "dvi_jax_cli.work.run"]
+)
 def test_ctrl_c_during_the_imports(module, tmp_path):
     """NumPy is imported by an extension module, which makes an ImportError of any exception."""
     (tmp_path / "run.toml").write_text(RUN, encoding="utf-8")

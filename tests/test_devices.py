@@ -106,7 +106,7 @@ HOST_FIRST = """
 import socket, sys
 import jax
 from dvi_jax import systems
-from dvi_jax.symmetry import library
+from dvi_jax.discover import library
 for make in systems.LIBRARY.values():
     try:
         make()

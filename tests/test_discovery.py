@@ -14,10 +14,9 @@ import pytest
 import dvi_jax as dvi
 from dvi_jax import systems
 from dvi_jax._step import Equations
-from dvi_jax.invariants import changes, obstructions
-from dvi_jax.symmetry import conditions
-from dvi_jax.symmetry.basis import bind_basis
-from dvi_jax.symmetry.sampling import Samples, as_samples
+from dvi_jax.discover import changes, conditions, obstructions
+from dvi_jax.discover.basis import bind_basis
+from dvi_jax.discover.sampling import Samples, as_samples
 
 H_D = systems.oscillator().system.H_D
 SPRING = dvi.System(H_D, force=lambda t0, t1, q, p, args: -q)
@@ -726,7 +725,7 @@ def test_what_is_no_basis_no_step_or_no_observable_is_refused():
             search(SPRING, dvi.Polynomials(2), h=0.1, samples=samples, newton=5)
     with pytest.raises(ValueError, match=r"states of shape \(1,\); got q of shape \(2,\)"):
         found("spring", 4, 2).evaluate([0.1, 0.2], [0.3, 0.4], 0.1)
-    with pytest.raises(TypeError, match="must be a method"):
+    with pytest.raises(TypeError, match="method must be a Method"):
         dvi.discover_invariants(SPRING, dvi.Polynomials(2), h=0.1, samples=samples, method="Strang")
     broadcast = dvi.System(H_D, force=lambda t0, t1, q, p, args: jnp.sum(q))
     with pytest.raises(ValueError, match="shaped like q0"):
@@ -778,7 +777,7 @@ def test_strong_kicks_make_no_symmetry():
     assert len(found.found) == 5
     # relative to the terms of the same sample, which are small at samples with strong kicks
     assert max(np.max(s.residuals) for s in found.found) < 1e-9
-    assert max(s.typical_residuals[0, 0] for s in found.found) < 1e-14
+    assert max(s.typical_residuals[0, 0] for s in found.found) < 1e-13
     assert sum(s.is_variational for s in found.found) == 3
 
 
@@ -869,6 +868,7 @@ def test_expansions_that_are_cut_off_are_told_from_invariants():
     assert d.count == 1
     assert d.powers[0] > 2
     assert "not exact: with the size of the samples" in str(d)
+    assert "0 of them on samples" in d.warnings[0]
     mcmillan = dvi.System(
         lambda t0, t1, q, p, args: jnp.sum(p**2 / 2 + q**2 - 0.7 * jnp.log(1 + q**2))
     )
@@ -944,7 +944,9 @@ def test_searches_call_no_lapack_for_a_batch(order):
     stepped = changes.Stepped(equations, np.asarray(0.1), dvi.GaussLegendre(2), basis)
     texts = [
         changes.batched_changes.lower(stepped, order, samples),
-        conditions.at_samples.lower(equations, jnp.asarray(0.1), basis, basis, order, samples),
+        conditions.at_samples.lower(
+            equations, jnp.asarray(0.1), basis, basis, order, samples, np.ones(2)
+        ),
     ]
     for lowered in texts:
         assert not re.findall("getrf|trsm|lapack", lowered.as_text())

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from matplotlib.colors import LogNorm
 from scipy import special
+from truths import curves
 
 import dvi_jax as dvi
 from dvi_jax import plot, systems
-from dvi_jax.invariants import drift, exponents
+from dvi_jax.discover import drift, exponents
 
 OSCILLATOR = systems.oscillator()
 CUBIC = dvi.System(OSCILLATOR.system.H_D, force=lambda t0, t1, q, p, args: -(q**3))
@@ -243,56 +244,15 @@ def test_a_crossover_below_the_range_is_reported_as_the_power_in_the_range():
     assert not covers(measured.fit, 1)
 
 
-def synthetic_curve(rng):
-    """(epsilons, drifts, floor, order for ε → 0, kind, noise) of a random law with noise."""
-    points, decades, largest = rng.integers(4, 13), rng.uniform(1, 3), 10.0 ** rng.uniform(-2, 0)
-    x = np.geomspace(10.0**-decades, 1, points)
-    s, noise = float(rng.integers(1, 5)), 10 ** rng.uniform(-3, -0.7)
-    kind = rng.choice(
-        ["power", "sum", "saturation", "bend", "floor"], p=[0.35, 0.25, 0.15, 0.15, 0.1]
-    )
-    crossover, floor, y = 10 ** rng.uniform(-decades, 0.5), 0.0, x**s
-    if kind == "sum":
-        second = (x / crossover) ** rng.choice([1, 2, 3, rng.uniform(0.5, 3)])
-        y = y * (1 + second) if rng.random() < 0.7 else y * np.hypot(1, second)
-    elif kind == "saturation":
-        p = rng.choice([1, 2])
-        y = y * (1 + (x / crossover) ** p) ** (-s / p)
-    elif kind == "bend":
-        y = y * (1 + rng.uniform(-0.6, 0.6) * x)
-    y = 10 ** rng.uniform(-3, 3) * y * np.exp(noise * rng.standard_normal(points))
-    if kind == "floor":
-        floor = y[rng.integers(0, points - 3)] / rng.uniform(10, 100)
-        y = y + floor * rng.integers(0, 2)
-    return x * largest, y, floor, s, kind, noise
-
-
 def test_orders_of_400_synthetic_curves():
     """95 % intervals that contain the true order in 93 to 97 %, and few curves unresolved."""
-    rng = np.random.default_rng(0)
-    curves = [synthetic_curve(rng) for _ in range(400)]
-    used = [drifts > 10 * floor for _, drifts, floor, *_ in curves]
-    fits = [
-        exponents.small_epsilon_exponent(epsilons[here], drifts[here], floor)
-        for (epsilons, drifts, floor, *_), here in zip(curves, used, strict=True)
-    ]
-    order, kind, noise = (np.array([curve[i] for curve in curves]) for i in (3, 4, 5))
-    slope, resolved = np.array([(f.slope, f.resolved) for f in fits]).T
-    resolved = resolved.astype(bool)
-    inside = np.array([covers(f, s) for f, s in zip(fits, order, strict=True)])
-    assert 0.93 <= inside[resolved].mean() <= 0.97
-    wrong = np.abs(slope - order) > 0.25
-    assert wrong[resolved].mean() <= 0.02
-    assert resolved.mean() > 0.75
-    points = np.array([here.sum() for here in used])
-    clean = (kind == "power") & (points >= 5) & (noise <= 0.05)
-    assert clean.sum() > 50
-    assert resolved[clean].mean() > 0.98
-    assert resolved[kind == "sum"].mean() > 0.5
-    # What a straight line alone would give.
-    lines = [exponents.line_interval(f.line_slope, f.line_stderr, f.points) for f in fits]
-    by_line = np.array([low <= s <= high for (low, high), s in zip(lines, order, strict=True)])
-    assert by_line.mean() < 0.8
+    found = curves.measured(seed=0)
+    assert 0.93 <= found.covered <= 0.97
+    assert found.wrong <= 0.02
+    assert found.resolved > 0.75
+    assert found.clean_resolved > 0.98
+    assert found.sums_resolved > 0.5
+    assert found.covered_by_line < 0.8
 
 
 def test_sums_with_clear_separation_are_resolved():
@@ -563,8 +523,8 @@ def test_pictures_show_what_was_excluded():
         plt.close(axis.figure)
         for surface in (kept_surface(), energy_surface()):
             axes = plot.drift_surface(surface, promised=1)
-            excluded = axes[0].lines[0].get_xdata()
-            assert len(excluded) == np.sum(~surface.used & np.isfinite(surface.drifts))
+            excluded = sum(len(line.get_xdata()) for line in axes[0].lines)
+            assert excluded == np.sum(~surface.used & np.isfinite(surface.drifts))
             axes[0].figure.canvas.draw()
             plt.close(axes[0].figure)
         with pytest.raises(ValueError, match="1 orders for 2 results"):

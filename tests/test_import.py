@@ -1,7 +1,12 @@
 """What importing the package costs: it takes JAX and Equinox, and leaves the rest for later."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
+
+import dvi_jax as dvi
+from dvi_jax._aliases import ALIASES
 
 LATER = (
     "optax", "optimistix", "lineax", "matplotlib", "scipy", "xarray", "zarr", "rich", "typer",
@@ -22,3 +27,17 @@ def imported(code):
 def test_importing_takes_only_what_every_program_needs():
     assert imported("import dvi_jax, dvi_jax.systems") == []
     assert imported("import dvi_jax.plot") == ["matplotlib"]  # and so it would be seen
+
+
+def test_every_alias_is_listed_and_means_its_name():
+    page = (Path(__file__).parents[1] / "docs" / "migration.md").read_text(encoding="utf-8")
+    table = page.split("## Aliases")[1].split("##")[0]
+    rows = [line.split("|")[1:3] for line in table.splitlines() if line.startswith("| `")]
+    listed = {
+        alias: re.findall(r"`dvi\.(\w+)`", meant)[0]
+        for aliases, meant in rows
+        for alias in re.findall(r"`dvi\.(\w+)`", aliases)
+    }
+    assert listed.keys() == ALIASES.keys()
+    for alias, name in listed.items():
+        assert getattr(dvi, alias) is ALIASES[alias] is getattr(dvi, name)

@@ -726,6 +726,17 @@ def small_systems(m):
     )
 
 
+def stacks_of_systems(m):
+    """As many small systems at once as there are stages of a method."""
+    two = jnp.stack([m, m.T])
+    return (
+        jnp.linalg.solve(two, m[:2, :, None]),
+        jnp.linalg.cholesky(two @ jnp.swapaxes(two, 1, 2) + jnp.eye(3)[None]),
+        jax.vmap(jnp.linalg.inv)(two),
+        jnp.linalg.det(two[None]),
+    )
+
+
 def rounds_of_each_row(m):
     """While loops under vmap: their condition is an array."""
 
@@ -750,6 +761,7 @@ FUNCTIONS = {
     "orders": (orders, VALUES),
     "neighbours": (neighbours, VALUES),
     "small systems": (small_systems, MATRICES),
+    "stacks of systems": (stacks_of_systems, MATRICES),
     "zeros as pivots": (small_systems, np.array([np.eye(3)[[1, 2, 0]], np.eye(3)[[2, 1, 0]]])),
     "determinant of four": (
         lambda m: jax.value_and_grad(jnp.linalg.det)(jnp.pad(m, (0, 1)) + jnp.eye(4)),

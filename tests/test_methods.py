@@ -1,40 +1,31 @@
 """Every method on more systems than it is certified on, and what methods are made of."""
 
-import functools
 import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import (
-    ARGS,
-    IN_EVERY_RUN,
-    SYSTEMS,
-    covering,
-    flow,
-    state,
-    symplectic_defect,
-)
-from scipy.integrate import solve_ivp
+from helpers import ARGS, IN_EVERY_RUN, SYSTEMS, covering, flow, problem, state
 
 import dvi_jax as dvi
 from dvi_jax._step import Equations, adjoint_step, inverse_step, step
 from dvi_jax._types import Interval
-from dvi_jax.certify import METHODS
 from dvi_jax.methods import warn_of_dissipation
 from dvi_jax.methods._composition import CompositionMethod, of_strang
 from dvi_jax.methods._order_conditions import order_defects
+from dvi_jax.testing import (
+    METHODS,
+    check_inverse,
+    check_reversible,
+    check_symplectic,
+    problems,
+)
 
 SYMPLECTIC = {k: m for k, m in METHODS.items() if m.is_symplectic}
 INVERTIBLE = {k: m for k, m in METHODS.items() if m.is_invertible}
 OTHERS = ["pendulum", "kepler", "double_pendulum"]
 """Systems beside those of the certificate, which are not separable and rosettes."""
-
-
-@functools.cache
-def jacobian(system, method, epsilon=0.0):
-    return jax.jit(jax.jacfwd(flow(SYSTEMS[system][0], METHODS[method], 0.1, epsilon=epsilon)))
 
 
 def is_long(system, method):
@@ -51,75 +42,42 @@ def pairs(methods, names, shift=0):
 
 @pytest.mark.parametrize(("system", "method"), pairs(SYMPLECTIC, OTHERS))
 def test_undisturbed_step_is_symplectic(system, method):
-    M = np.asarray(jacobian(system, method)(state(system)))
-    assert symplectic_defect(M) <= 1e-12
+    check_symplectic(METHODS[method], problem(system))
 
 
 @pytest.mark.parametrize(("system", "method"), pairs(["RungeKutta4"], OTHERS))
 def test_runge_kutta_is_not(system, method):
-    M = np.asarray(jacobian(system, method)(state(system)))
-    assert symplectic_defect(M) > 1e-9
+    assert check_symplectic(METHODS[method], problem(system)).value > 1e-9
 
 
 @pytest.mark.slow
 def test_a_dissipative_force_contracts():
     """With the disturbance on, the same map is not symplectic: its determinant is below one."""
-    M = np.asarray(jacobian("non_separable", "TypeII", 0.3)(state("non_separable")))
+    step = flow(SYSTEMS["non_separable"][0], METHODS["TypeII"], 0.1, epsilon=0.3)
+    M = np.asarray(jax.jit(jax.jacfwd(step))(state("non_separable")))
     assert np.linalg.det(M) < 0.99
-
-
-@functools.cache
-def reference(system, epsilon, t_end):
-    """SciPy's DOP853 on the continuous equations."""
-    s, q, p = SYSTEMS[system]
-    t = jnp.asarray(0.0)
-    dH = jax.jit(jax.grad(s.H_D, argnums=(2, 3)))
-    W = jax.jit(s.force)
-
-    def field(t, z):
-        q, p = np.split(z, 2)
-        dq, dp = dH(t, t, q, p, ARGS)
-        return np.concatenate([dp, -dq + epsilon * W(t, t, q, p, ARGS)])
-
-    del t
-    z = solve_ivp(field, (0, t_end), [*q, *p], method="DOP853", rtol=1e-13, atol=1e-14)
-    return z.y[:, -1]
-
-
-FORCED = 0.2  # strength of the force where orders are measured
 
 
 STEPS_FOR_HIGH_ORDER = [12, 16, 24, 32, 48, 64, 72]
 
 
-@functools.cache
-def forced_step(system, method):
-    """One jitted step (z, t0, h) → z under the damped and driven force, for any number of steps."""
-    s = SYSTEMS[system][0]
-    return jax.jit(lambda z, t0, h: flow(s, method, h, t0=t0, epsilon=FORCED)(z))
-
-
-def measured_order(system, method, t_end=2.0):
-    """The order between the two smallest steps whose errors are above round-off."""
+def measured_order(method, problem):
+    """The order between the two smallest steps whose errors are above round-off, force on."""
     number = np.array([16, 32, 64, 128] if method.order <= 4 else STEPS_FOR_HIGH_ORDER)
-    exact, advance = reference(system, FORCED, t_end), forced_step(system, method)
-    errors = []
-    for n in number:
-        z = state(system)
-        for k in range(n):
-            z = advance(z, k * t_end / n, t_end / n)
-        errors.append(np.max(np.abs(z - exact)))
-    keep = np.array(errors) > 1e-12
+    exact, _ = problems.reference(problem, problems.FORCED)
+    advance, x = problems.flow(problem, method), problems.inputs(problem, 0.0)
+    ends = [advance(x | {"h": problems.SPAN * problem.h / n}, n) for n in number]
+    errors = np.array([np.max(np.abs(end - exact)) for end in ends])
+    keep = errors > 1e-12
     assert keep.sum() >= 3, f"fewer than three points above round-off: {errors}"
-    orders = -np.diff(np.log(np.array(errors)[keep])) / np.diff(np.log(number[keep]))
-    return orders[-1]
+    return -(np.diff(np.log(errors[keep])) / np.diff(np.log(number[keep])))[-1]
 
 
 @pytest.mark.parametrize(("system", "method"), pairs(METHODS, ["double_pendulum"]))
 def test_order_with_a_damped_and_driven_force(system, method):
     """The order is that named, on a non-separable, forced, implicit problem."""
     m = METHODS[method]
-    assert abs(measured_order(system, m) - m.order) < 0.2
+    assert abs(measured_order(m, problem(system, h=0.05)) - m.order) < 0.2
 
 
 def test_a_wrong_digit_is_refused():
@@ -175,37 +133,14 @@ def test_printed_digits_are_enough_for_a_claim():
 
 @pytest.mark.parametrize(("system", "method"), pairs(INVERTIBLE, OTHERS, shift=1))
 def test_inverse_undoes_the_step_with_the_force_on(system, method):
-    s, q, p = SYSTEMS[system]
-    m = METHODS[method]
-
-    @jax.jit
-    def there_and_back(q, p):
-        interval = Interval(jnp.asarray(0.2), jnp.asarray(0.3), jnp.asarray(0.1))
-        equations = Equations(s, jnp.asarray(0.3), ARGS)
-        q1, p1, one = m.step(equations, interval, q, p)
-        q0, p0, two = m.inverse(equations, interval, q1, p1)
-        good = (one.result == dvi.RESULTS.successful) & (two.result == dvi.RESULTS.successful)
-        return q1, q0, p0, good
-
-    q, p = jnp.asarray(q), jnp.asarray(p)
-    q1, q0, p0, good = there_and_back(q, p)
-    assert bool(good)
-    assert np.max(np.abs(q0 - q)) < 1e-13
-    assert np.max(np.abs(p0 - p)) < 1e-13
-    assert np.max(np.abs(q1 - q)) > 1e-3  # it did move
+    assert check_inverse(METHODS[method], problem(system)).value < 1e-13
 
 
 @pytest.mark.parametrize(("system", "method"), pairs(METHODS, OTHERS, shift=2))
 def test_symmetric_methods_reverse_and_others_do_not(system, method):
-    m = METHODS[method]
-    s = SYSTEMS[system][0]
-    there, back = flow(s, m, 0.1, epsilon=0.1), flow(s, m, -0.1, t0=0.1, epsilon=0.1)
-    z = state(system)
-    defect = np.max(np.abs(jax.jit(lambda z: back(there(z)))(z) - z))
-    if m.is_symmetric:
-        assert defect <= 1e-12
-    else:
-        assert defect > 1e-9
+    measured = check_reversible(METHODS[method], problem(system))
+    assert measured.claimed == METHODS[method].is_symmetric
+    assert measured.claimed or measured.value > 1e-9
 
 
 @pytest.mark.slow

@@ -21,7 +21,8 @@ from PIL import Image
 import dvi_jax as dvi
 from dvi_jax import plot, systems
 from dvi_jax.plot import films
-from dvi_jax.plot.house import MARKERS, SHADES, envelope
+from dvi_jax.plot.axes import envelope
+from dvi_jax.plot.style import MARKERS, SHADES
 
 mpl.use("Agg")
 
@@ -77,7 +78,7 @@ def legend(axis):
     return [] if found is None else [text.get_text() for text in found.get_texts()]
 
 
-# --- the house ----------------------------------------------------------------------------------
+# --- the style ----------------------------------------------------------------------------------
 
 # Machado, Oliveira & Fernandes 2009, IEEE Trans. Vis. Comput. Graph. 15, 1291: severity 1, in
 # linear RGB.
@@ -165,7 +166,7 @@ def test_orbits_that_retrace_themselves_are_told_apart_by_marks():
         assert {x.get_marker() for x in plain.lines if x.get_linestyle() != "None"} == {"None"}
 
 
-def test_pictures_have_the_house_style_and_leave_the_user_his_own():
+def test_pictures_have_the_style_and_leave_the_user_his_own():
     axis = plot.phase_portrait(arrays())
     assert not axis.spines["top"].get_visible()
     assert plt.rcParams["axes.spines.top"]  # nothing global is changed

@@ -112,6 +112,21 @@ def test_a_crash_is_reported_and_the_search_goes_on(tmp_path, monkeypatch, capsy
     assert "100 programs, 1 failures" in capsys.readouterr().out
 
 
+def test_a_program_without_an_end_is_reported(tmp_path, monkeypatch, capsys):
+    stuck = tmp_path / "stuck.py"
+    stuck.write_text(
+        "import pathlib, sys, time\n"
+        "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1])\n"
+        "(out / 'current.py').write_text('the program')\n"
+        "time.sleep(100)\n"
+    )
+    monkeypatch.setattr(search, "__file__", str(stuck))
+    monkeypatch.setattr(search, "LONGEST", 1)
+    assert search.search(50, 1.0, 7, tmp_path / "out") == 1
+    assert (tmp_path / "out" / "crash_7.py").read_text() == "the program"
+    assert "no end of a program after 1 s" in capsys.readouterr().out
+
+
 def test_a_failure_is_shrunk_to_a_script(tmp_path, monkeypatch, capsys):
     def fail(text):
         assert "jnp" not in text, "a control"

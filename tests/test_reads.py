@@ -67,8 +67,8 @@ def position(t0, t1, q0, p0, q1, p1, args):
 
 def final(H):
     system = H if isinstance(H, dvi.System) else dvi.System(H)
-    save = dvi.Save(final=True)
-    return float(dvi.integrate(system, [1.0], [0.0], h=0.1, num_steps=3, save=save).qs[-1, 0])
+    how = {"method": dvi.TypeII(), "save": dvi.Save(final=True)}
+    return float(dvi.integrate(system, [1.0], [0.0], h=0.1, num_steps=3, **how).qs[-1, 0])
 
 
 def cases(monkeypatch):

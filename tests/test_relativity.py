@@ -10,7 +10,6 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import dvi_jax as dvi
-from dvi_jax.run._solar import compare
 from dvi_jax.systems import solar_system
 from dvi_jax.systems.n_body import hamiltonian
 from dvi_jax.systems.relativity import (
@@ -26,6 +25,7 @@ from dvi_jax.systems.relativity import (
     velocities_from_momenta,
 )
 from dvi_jax.systems.solar_system import BODIES, GM, to_ecliptic
+from dvi_jax_cli.work.solar import compare
 
 LIGHT = 1e-12  # mass of a planet here: what goes with m/M is then below what is measured
 TURN = 2 * np.pi

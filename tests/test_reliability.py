@@ -15,8 +15,8 @@ from dvi_jax._files import publish_npz, read_npz
 from dvi_jax.fit import run
 from dvi_jax.fit.optimise import Position, Record
 from dvi_jax.run import InputError
-from dvi_jax.run._data import read_columns
-from dvi_jax.run._setup import Loader
+from dvi_jax_cli.work.columns import read_columns
+from dvi_jax_cli.work.loader import Loader
 
 ROOT = Path(dvi.__file__).parent.parent
 SOURCES = [
@@ -32,7 +32,7 @@ IMPORTING = {"import_module", "__import__", "exec_module", "eval", "exec", "comp
 
 ALLOWED = {
     "dvi_jax/sweep/cluster.py": {"pickle", "cloudpickle"},  # between processes of one cluster
-    "dvi_jax/run/_setup.py": {"exec_module"},  # the Python files that a TOML file names
+    "dvi_jax_cli/work/loader.py": {"exec_module"},  # the Python files that a TOML file names
     "dvi_jax/interop/extras.py": {"import_module"},  # names that are in the code
     "dvi_jax/paper/equations.py": {"import_module"},
     "dvi_jax/sweep/export.py": {"__import__"},

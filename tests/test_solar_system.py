@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax.run._solar import compare
 from dvi_jax.systems import figure_eight, n_body, solar_system
 from dvi_jax.systems.figure_eight import PERIOD
 from dvi_jax.systems.n_body import OBSERVABLES, angular_momentum, check_bodies, hamiltonian
@@ -24,6 +23,7 @@ from dvi_jax.systems.solar_system import (
     perihelion_longitude,
     to_ecliptic,
 )
+from dvi_jax_cli.work.solar import compare
 
 pytest.importorskip("jplephem")
 if importlib.util.find_spec("skyfield_data") is None:

@@ -15,7 +15,7 @@ import dvi_jax as dvi
 from dvi_jax import plot
 from dvi_jax._results import STATUS_NAMES
 from dvi_jax.plot import blocks
-from dvi_jax.plot.house import SHADES
+from dvi_jax.plot.style import SHADES
 from dvi_jax.sweep import lazy
 
 mpl.use("Agg")
@@ -162,7 +162,7 @@ def test_one_dimension_is_a_line():
 def test_facets_share_their_colours():
     data = xr.concat([drift(), 100 * drift()], xr.IndexVariable("h", [0.1, 0.05], {"units": "s"}))
     axes = plot.sweep_map(data, facet="h")
-    titles = [a.get_title(loc="left") for a in axes]  # where the house style has them
+    titles = [a.get_title(loc="left") for a in axes]  # where the style puts them
     assert titles == ["step size h = 0.1 s", "step size h = 0.05 s"]
     for axis, scale in zip(axes, (1, 100), strict=True):
         np.testing.assert_array_equal(array_of(axis), scale * drift().values.T)

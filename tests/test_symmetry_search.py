@@ -10,7 +10,7 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax import generators as library, systems
-from dvi_jax.symmetry.sampling import Samples
+from dvi_jax.discover.sampling import Samples
 
 KEPLER = systems.kepler()
 H_D = systems.oscillator().system.H_D

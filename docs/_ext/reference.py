@@ -23,6 +23,7 @@ from sphinx.util.docutils import SphinxDirective
 
 import dvi_jax
 import lanewise
+from dvi_jax._aliases import ALIASES
 from dvi_jax.paper.equations import EQUATIONS
 
 PAGES = {
@@ -31,8 +32,7 @@ PAGES = {
     "lattices": ("Lattices", "dvi_jax.lattices"),
     "solvers": ("Root solvers, layout, devices", "dvi_jax.engine"),
     "observables": ("Observables and reductions", "dvi_jax.observe"),
-    "symmetry": ("Symmetries", "dvi_jax.symmetry"),
-    "invariants": ("Invariants", "dvi_jax.invariants"),
+    "discovery": ("Symmetries and invariants", "dvi_jax.discover"),
     "sweeps": ("Sweeps", "dvi_jax.sweep"),
     "fitting": ("Fitting", "dvi_jax.fit"),
     "dynamics": ("Order, chaos, frequencies", "dvi_jax.dynamics"),
@@ -61,13 +61,14 @@ OWN = ("dvi_jax", "lanewise")
 
 
 def public(module: types.ModuleType) -> dict[str, Any]:
-    """Public names of a module that are our own, in alphabetical order."""
+    """Public names of a module that are our own, in alphabetical order, without aliases."""
     own = {
         name: thing
         for name, thing in vars(module).items()
         if not name.startswith("_")
         and (inspect.isclass(thing) or inspect.isfunction(thing))
         and thing.__module__.startswith(OWN)
+        and not (module is dvi_jax and name in ALIASES)
     }
     return dict(sorted(own.items(), key=lambda item: item[0].lower()))
 

@@ -1,9 +1,15 @@
-"""Methods certified by measurement: order, structure, gradients, compilation, with controls."""
+"""The certificate: every method under every check of `dvi_jax.testing`, with controls."""
 
-from .candidate import Candidate as Candidate
+from ..testing import (
+    CHECKS as CHECKS,
+    CONTROLS as CONTROLS,
+    METHODS as METHODS,
+    QUICK as QUICK,
+    Candidate as Candidate,
+    Check as Check,
+    Control as Control,
+    Measured as Measured,
+    altered as altered,
+)
 from .certificate import Certificate as Certificate, certify as certify
-from .checks import CHECKS as CHECKS, Check as Check
-from .controls import CONTROLS as CONTROLS, Control as Control, altered as altered
-from .measured import Measured as Measured
-from .registry import METHODS as METHODS, QUICK as QUICK
-from .table import page_for as page_for
+from .page import page_for as page_for

@@ -1,23 +1,17 @@
 """Every method under every check, and whether every check can fail."""
 
-import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
-
 import dvi_jax as dvi
 
-from . import problems
-from .candidate import Candidate
-from .checks import CHECKS
-from .controls import CONTROLS, Control
-from .measured import Measured
-from .registry import METHODS
-from .table import Table, markdown, tables
+from ..testing import CHECKS, CONTROLS, METHODS, Candidate, Control, Measured
+from ..testing.check import chosen, require_double_precision
+from ..testing.problems import COUPLED, FORCED, reference
+from .page import Table, markdown, tables
 
 _WORKERS = 2
 """Methods at a time: while one compiles another is traced."""
@@ -28,7 +22,7 @@ class Certificate:
     """What was measured.
 
     - `methods`: name → method. `rows`: name → check → `Measured`.
-    - `controls`: the broken methods with what the check that must catch each has measured.
+    - `controls`: the broken methods, each with the result of the check that must find its defect.
     """
 
     methods: Mapping[str, dvi.Method]
@@ -37,17 +31,17 @@ class Certificate:
 
     @property
     def failures(self) -> list[tuple[str, str, Measured]]:
-        """(method, check, measured) wherever a method does not keep what it promises."""
+        """(method, check, measured) wherever a method lacks a property that it claims."""
         return [(m, c, x) for m, row in self.rows.items() for c, x in row.items() if not x.ok]
 
     @property
     def missed(self) -> list[Control]:
-        """The controls that no number caught (an exception is none): their checks prove nothing."""
+        """The controls without a number that fails (an exception is not one)."""
         return [control for control, measured in self.controls if measured.verdict != "FAIL"]
 
     @property
     def ok(self) -> bool:
-        """Whether every method keeps its promises and every control was caught."""
+        """Whether there are no `failures`, and no control is `missed`."""
         return not self.failures and not self.missed
 
     @property
@@ -77,10 +71,7 @@ def certify(
     checks: Iterable[str] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Certificate:
-    """What methods promise, measured: order, structure, long runs, gradients, compilation.
-
-    Each check holds a number of the method's against a bound, and each is shown to catch at least
-    one method that is broken on purpose (the controls).
+    """The properties that methods claim, measured, with a control for each check.
 
     **Arguments**
 
@@ -90,31 +81,27 @@ def certify(
 
     **Returns** a `Certificate`; ``print`` it, or read `ok`, `failures`, `rows`.
 
-    **Raises** `ValueError` for a name that is not there, for none at all, and where x64 is off;
-    `TypeError` for what is no method. An exception that a method raises is a failure of the check
-    at hand.
+    **Raises** `ValueError` for an unknown name, for no name at all, and where x64 is off;
+    `TypeError` for what is not a method. An exception that a method raises is a failure of the
+    check that called it.
 
-    **Accuracy** the bounds are those of double precision. All methods of the package take some
+    **Accuracy** the bounds are those of double precision. All methods of the package take about
     ten minutes of processor time, nearly all of it compilation, and 2 GB of memory or more; one
     method takes 15 to 35 seconds.
     """
-    if jnp.result_type(float) != jnp.float64:
-        raise ValueError(
-            "certify measures in double precision, and x64 is off. Turn it on before anything "
-            'else: jax.config.update("jax_enable_x64", True).'
-        )
-    chosen = _chosen_methods(methods)
-    wanted = list(CHECKS) if checks is None else _names("check", checks, CHECKS)
-    controls = [control for control in CONTROLS if control.check in wanted]
-    if {"order", "forced-order"} & set(wanted):
-        for epsilon in (0.0, problems.FORCED):
-            problems.reference(epsilon)  # here, not in each worker at once
+    require_double_precision()
+    named = _named(methods)
+    names = chosen("check", checks, CHECKS)
+    controls = [control for control in CONTROLS if control.check in names]
+    if {"order", "forced-order"} & set(names):
+        for epsilon in (0.0, FORCED):
+            reference(COUPLED, epsilon)  # here, not in each worker at once
 
     def row(method: dvi.Method, names: list[str]) -> dict[str, Measured]:
         candidate = Candidate(method)
         return {name: CHECKS[name](candidate) for name in names}
 
-    work = [(method, wanted) for method in chosen.values()]
+    work = [(method, names) for method in named.values()]
     work += [(control.method, [control.check]) for control in controls]
     pool = ThreadPoolExecutor(_WORKERS)
     try:
@@ -126,44 +113,26 @@ def certify(
         found = [future.result() for future in futures]
     finally:
         pool.shutdown(cancel_futures=True)
-    rows = dict(zip(chosen, found, strict=False))
-    outcomes = [x[c.check] for c, x in zip(controls, found[len(chosen) :], strict=True)]
-    return Certificate(chosen, rows, tuple(zip(controls, outcomes, strict=True)))
+    rows = dict(zip(named, found, strict=False))
+    outcomes = [x[c.check] for c, x in zip(controls, found[len(named) :], strict=True)]
+    return Certificate(named, rows, tuple(zip(controls, outcomes, strict=True)))
 
 
-def _chosen_methods(methods: Any) -> dict[str, dvi.Method]:
-    if methods is None:
-        return dict(METHODS)
-    if isinstance(methods, Mapping):
-        for name, method in methods.items():
-            if not isinstance(method, dvi.Method):
-                raise TypeError(f"{name!r} must be a method such as dvi.TypeII(), got {method!r}.")
-            order = method.order
-            if isinstance(order, bool) or not isinstance(order, int | float):
-                raise TypeError(f"the order of {name!r} must be a number, got {order!r}.")
-            if not (math.isfinite(order) and order > 0):
-                raise ValueError(f"the order of {name!r} must be positive, got {order!r}.")
-        if not methods:
-            raise ValueError("no method was given: certify({}) would certify nothing.")
-        return {str(name): method for name, method in methods.items()}
+def _named(methods: Any) -> dict[str, dvi.Method]:
+    """Name → method, checked."""
     if isinstance(methods, dvi.Method):
         raise TypeError(f'give the method a name: certify({{"mine": {methods!r}}}).')
-    return {name: METHODS[name] for name in _names("method", methods, METHODS)}
-
-
-def _names(kind: str, given: Any, known: Mapping[str, Any]) -> list[str]:
-    if isinstance(given, str) or not isinstance(given, Iterable):
-        raise TypeError(f"{kind}s must be a list of names, got {given!r}.")
-    given = list(dict.fromkeys(given))
-    if not given:
-        raise ValueError(f"no {kind} was named; known are {', '.join(known)}.")
-    for name in given:
-        if name not in known:
-            lowered = {k.lower(): k for k in known}
-            near = difflib.get_close_matches(str(name).lower(), lowered, n=1)
-            hint = f" (did you mean {lowered[near[0]]}?)" if near else ""
-            raise ValueError(
-                f"there is no {kind} {name!r}{hint}; known are {', '.join(known)}."
-                + (" A method of your own: certify({name: method})." if kind == "method" else "")
-            )
-    return given
+    if not isinstance(methods, Mapping):
+        own = " A method of your own: certify({name: method})."
+        return {name: METHODS[name] for name in chosen("method", methods, METHODS, own)}
+    for name, method in methods.items():
+        if not isinstance(method, dvi.Method):
+            raise TypeError(f"{name!r} must be a method such as dvi.TypeII(), got {method!r}.")
+        order = method.order
+        if isinstance(order, bool) or not isinstance(order, int | float):
+            raise TypeError(f"the order of {name!r} must be a number, got {order!r}.")
+        if not (math.isfinite(order) and order > 0):
+            raise ValueError(f"the order of {name!r} must be positive, got {order!r}.")
+    if not methods:
+        raise ValueError("no method was given: certify({}) would certify nothing.")
+    return {str(name): method for name, method in methods.items()}

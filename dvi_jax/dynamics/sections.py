@@ -14,15 +14,15 @@ from jaxtyping import Array, PyTree
 from lanewise import Layout
 from lanewise.jaxapi import is_traced
 
-from .._arithmetic import Arithmetic, FloatingPoint
+from .._arithmetic import Arithmetic
 from .._integrate import as_parameter, as_scalar, integrate, start_state
+from .._integrator import Integrator, chosen
 from .._results import RESULTS, status_name
 from .._solution import Save
 from .._system import System, check_system
 from .._types import Args, Scalar, State
 from ..engine.newton import RootSolver
-from ..engine.picard import PicardThenNewton
-from ..methods import Method, Strang
+from ..methods import Method
 from ..observe import Section, Stop
 from ..sweep import Axis
 from .section_results import SECTION_RESULTS, SectionError, judge, name_of
@@ -58,10 +58,7 @@ class _Settings(eqx.Module):
 
     system: System
     section: Section
-    method: Method
-    newton: RootSolver
-    arithmetic: Arithmetic
-    layout: Layout
+    integrator: Integrator
     stop: Stop | None
     num_steps: int = eqx.field(static=True)
 
@@ -69,9 +66,8 @@ class _Settings(eqx.Module):
         """A run with its crossings and its last state."""
         return integrate(
             self.system, q, p, h=h, num_steps=self.num_steps, t0=t0, epsilon=epsilon, args=args,
-            method=self.method, newton=self.newton, arithmetic=self.arithmetic,
-            layout=self.layout, stop=self.stop, observe=self.section, save=Save(final=True),
-            throw=False,
+            integrator=self.integrator, stop=self.stop, observe=self.section,
+            save=Save(final=True), throw=False,
         )  # fmt: skip
 
     def orbit(self, q, p, h, t0, epsilon, args):
@@ -136,10 +132,11 @@ def poincare_section(
     t0: Any = 0.0,
     epsilon: Any = 0.0,
     args: PyTree = None,
-    method: Method = Strang(),
-    newton: RootSolver = PicardThenNewton(),
-    arithmetic: Arithmetic = FloatingPoint(),
-    layout: Layout = Layout(),
+    method: Method | None = None,
+    newton: RootSolver | None = None,
+    arithmetic: Arithmetic | None = None,
+    layout: Layout | None = None,
+    integrator: Integrator | None = None,
     stop: Stop | None = None,
     throw: bool = True,
 ) -> PoincareSection:
@@ -183,10 +180,11 @@ def poincare_section(
             f"q0 and p0 must have the orbits in front, (orbits, …); got shape {q.shape}. Give a "
             "single start as q0[None], p0[None]."
         )
-    settings = _Settings(
-        system, _section(g, direction, crossings, skip), method, newton, arithmetic, layout, stop,
-        _positive("num_steps", num_steps),
-    )  # fmt: skip
+    integrator = chosen(
+        integrator, method=method, root_finder=newton, arithmetic=arithmetic, layout=layout
+    )
+    section, steps = _section(g, direction, crossings, skip), _positive("num_steps", num_steps)
+    settings = _Settings(system, section, integrator, stop, steps)
     epsilon, args, varied = _varied(epsilon, args)
     for name, length in varied.items():
         if length != q.shape[0]:
@@ -223,10 +221,11 @@ def bifurcation(
     follow: bool = False,
     t0: Any = 0.0,
     args: PyTree = None,
-    method: Method = Strang(),
-    newton: RootSolver = PicardThenNewton(),
-    arithmetic: Arithmetic = FloatingPoint(),
-    layout: Layout = Layout(),
+    method: Method | None = None,
+    newton: RootSolver | None = None,
+    arithmetic: Arithmetic | None = None,
+    layout: Layout | None = None,
+    integrator: Integrator | None = None,
     stop: Stop | None = None,
     throw: bool = True,
 ) -> PoincareSection:
@@ -248,10 +247,11 @@ def bifurcation(
     """
     check_system(system)
     q, p = start_state(q0, p0)
-    settings = _Settings(
-        system, _section(g, direction, crossings, skip), method, newton, arithmetic, layout, stop,
-        _positive("num_steps", num_steps),
-    )  # fmt: skip
+    integrator = chosen(
+        integrator, method=method, root_finder=newton, arithmetic=arithmetic, layout=layout
+    )
+    section, steps = _section(g, direction, crossings, skip), _positive("num_steps", num_steps)
+    settings = _Settings(system, section, integrator, stop, steps)
     epsilon, args, varied = _varied(epsilon, args)
     lengths = set(varied.values())
     if len(lengths) != 1 or 0 in lengths:
@@ -314,7 +314,8 @@ class ReturnMap(eqx.Module):
     the return time included, `vmap` takes many points, `lax.scan` iterates. A point on the section
     is not its own return.
 
-    **Arguments** `system`, `g`, `direction`, `method` and `newton` as for `poincare_section`;
+    **Arguments** `system`, `g`, `direction`, `method`, `newton` and `integrator` as for
+    `poincare_section`;
 
     - `h`, `num_steps`: steps that are taken at most, and always.
     - `returns`: which return, 1 for the first.
@@ -329,11 +330,13 @@ class ReturnMap(eqx.Module):
     num_steps: int = eqx.field(static=True)
     direction: int = eqx.field(static=True, default=1)
     returns: int = eqx.field(static=True, default=1)
-    method: Method = Strang()
-    newton: RootSolver = PicardThenNewton()
+    method: Method | None = None
+    newton: RootSolver | None = None
+    integrator: Integrator | None = None
 
     def __check_init__(self):
         check_system(self.system)
+        chosen(self.integrator, method=self.method, root_finder=self.newton)
         Section(self.g, self.direction, _positive("returns", self.returns))
         _positive("num_steps", self.num_steps)
 
@@ -341,10 +344,8 @@ class ReturnMap(eqx.Module):
         self, q: Any, p: Any, t0: Any = 0.0, epsilon: Any = 0.0, args: Args = None
     ) -> Return:
         section = Section(self.g, self.direction, self.returns)
-        settings = _Settings(
-            self.system, section, self.method, self.newton, FloatingPoint(), Layout(), None,
-            self.num_steps,
-        )  # fmt: skip
+        integrator = chosen(self.integrator, method=self.method, root_finder=self.newton)
+        settings = _Settings(self.system, section, integrator, None, self.num_steps)
         sol = settings.run(q, p, self.h, t0, epsilon, args)
         crossed: Any = sol.observed
         result = judge(crossed.count, self.returns, sol.result)

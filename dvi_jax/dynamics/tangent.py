@@ -4,14 +4,14 @@ from typing import Any
 
 from jaxtyping import Array, PyTree
 
-from .._arithmetic import Arithmetic, FloatingPoint
+from .._arithmetic import Arithmetic
 from .._integrate import integrate
+from .._integrator import Integrator, chosen
 from .._solution import Save
 from .._system import System
 from ..engine.newton import RootSolver
-from ..engine.picard import PicardThenNewton
-from ..lattices import Given, Lattice, Uniform
-from ..methods import Method, TypeII
+from ..lattices import Given, Lattice
+from ..methods import Method
 from ..observe import TangentMap
 
 
@@ -25,10 +25,11 @@ def tangent_map(
     t0: Any = 0.0,
     epsilon: Any = 0.0,
     args: PyTree = None,
-    method: Method = TypeII(),
-    lattice: Lattice = Uniform(),
-    newton: RootSolver = PicardThenNewton(),
-    arithmetic: Arithmetic = FloatingPoint(),
+    method: Method | None = None,
+    lattice: Lattice | None = None,
+    newton: RootSolver | None = None,
+    arithmetic: Arithmetic | None = None,
+    integrator: Integrator | None = None,
     throw: bool = True,
 ) -> Array:
     """M = ∂(q_K, p_K)/∂(q_0, p_0) of K steps, shape (2N, 2N), by the chain rule along the orbit.
@@ -41,10 +42,12 @@ def tangent_map(
     **Raises** as `integrate` does; with ``throw=False`` M of a
     run that failed is NaN.
     """
-    if num_steps is None and not isinstance(lattice, Given):
+    integrator = chosen(
+        integrator, method=method, lattice=lattice, root_finder=newton, arithmetic=arithmetic
+    )
+    if num_steps is None and not isinstance(integrator.lattice, Given):
         num_steps = 1
     return integrate(
-        system, q0, p0, h=h, num_steps=num_steps, t0=t0, epsilon=epsilon, args=args, method=method,
-        lattice=lattice, newton=newton, arithmetic=arithmetic, observe=TangentMap(),
-        save=Save(final=True), throw=throw,
+        system, q0, p0, h=h, num_steps=num_steps, t0=t0, epsilon=epsilon, args=args,
+        integrator=integrator, observe=TangentMap(), save=Save(final=True), throw=throw,
     ).observed  # fmt: skip

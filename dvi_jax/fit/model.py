@@ -13,12 +13,13 @@ from jaxtyping import Array, PyTree
 from lanewise.jaxapi import is_traced
 
 from .._integrate import as_parameter, integrate, start_state
+from .._integrator import Integrator
 from .._results import RESULTS
 from .._solution import Save
 from .._system import System
+from ..discover.basis import check_step_size
 from ..engine.signature import accepts
 from ..lattices import Uniform
-from ..symmetry.basis import check_step_size
 from .observations import Observations
 
 _WASTE = 2_000_000
@@ -36,7 +37,8 @@ class Model(eqx.Module):
       `integrate`; what is among the parameters may be left out here. When `data` is a list of
       arcs, q0 and p0 have one row for each arc, here and among the parameters.
     - `options`: further arguments of `integrate`: `method`, `lattice`, `newton`, `adjoint`,
-      `arithmetic`, `layout`; for a lattice that is not `Uniform` also `num_steps`.
+      `arithmetic`, `layout`, or an `integrator` in place of them; for a lattice that is not
+      `Uniform` also `num_steps`.
 
     Parameters are a dict with keys among ``"q0"``, ``"p0"``, ``"epsilon"``, ``"args"``; when args
     are dicts, the entries of the parameters' are put into those given here. For any other
@@ -64,7 +66,10 @@ class Model(eqx.Module):
     ):
         if not isinstance(system, System):
             raise TypeError(f"system must be a dvi.System, got {system!r}.")
-        known = ("method", "lattice", "newton", "adjoint", "arithmetic", "layout", "num_steps")
+        known = (
+            *("method", "lattice", "newton", "adjoint", "arithmetic", "layout"),
+            *("integrator", "num_steps"),
+        )
         for name in options:
             if name not in known:
                 raise TypeError(
@@ -184,7 +189,12 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: boo
 
 def _uniform(spec: Mapping[str, Any]) -> bool:
     # Not isinstance: the equal steps of TimeTransformed are not equal in time.
-    return type(spec.get("lattice", Uniform())) is Uniform
+    return type(_lattice(spec)) is Uniform
+
+
+def _lattice(spec: Mapping[str, Any]) -> Any:
+    integrator = spec.get("integrator") or Integrator()
+    return spec.get("lattice", integrator.lattice)
 
 
 def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[Group]:
@@ -237,7 +247,7 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
     if not _uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
-                f"on the lattice {spec['lattice']!r} the model has to say how many steps reach "
+                f"on the lattice {_lattice(spec)!r} the model has to say how many steps reach "
                 "the last observation: num_steps."
             )
         return spec["num_steps"]

@@ -81,7 +81,7 @@ def solve_ivp(
       are taken where `args` is left out.
     - `t_span`: (t0, t1); t1 < t0 runs backwards. `y0`: q0 and p0, raveled, one after the other; the
       run has its precision.
-    - `method`: a `Method`, or its name in ``certify.METHODS``, such as ``"KahanLi8"``.
+    - `method`: a `Method`, or its name in ``testing.METHODS``, such as ``"KahanLi8"``.
     - `t_eval`: times to be told, in order and within t_span; all lattice points where left out.
       Between lattice points it is the step of the method to that time.
     - `h`: the longest step [time]. `epsilon`, `args`, `newton`: as for ``dvi.integrate``.
@@ -271,7 +271,7 @@ def _times(t_eval: Any, t0: float, t1: float) -> np.ndarray | None:
 def _method(method: Any) -> dvi.Method:
     if isinstance(method, dvi.Method):
         return method
-    from ..certify import METHODS
+    from ..testing import METHODS
 
     if isinstance(method, str) and method in METHODS:
         return METHODS[method]

@@ -13,11 +13,10 @@ from rich.table import Table
 
 import dvi_jax as dvi
 
-from .claims import judge
+from .claims import Claim, Verdict, judge, pretty
 from .experiments import Measurements, measure
 from .figures import FIGURES, draw
 from .report import MARKS, counts, write_html, write_json, write_markdown, write_tables
-from .verdicts import Claim, Verdict, pretty
 
 _COLOUR = {Verdict.HOLDS: "green", Verdict.MENDED: "yellow", Verdict.FAILS: "red"}
 

@@ -1,13 +1,128 @@
-"""The paper's claims, each with a verdict that is computed from what was measured."""
+"""The paper's claims, each with a verdict that is computed from what was measured.
 
-from .claims_kepler import kepler_claims
-from .claims_oscillator import oscillator_claims
-from .claims_theory import theory_claims
+The claims are rows of `claims.toml`, whose first lines say how they are judged.
+"""
+
+import math
+import tomllib
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
 from .experiments import Measurements
-from .verdicts import Check as Check, Claim as Claim, Verdict as Verdict
+from .values import numbers
+
+
+class Verdict(Enum):
+    """What became of a claim."""
+
+    HOLDS = "holds"
+    MENDED = "holds once mended"
+    FAILS = "does not hold"
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def pretty(value: float) -> str:
+    """The number with three digits as text, 1.39e-08 written as 1.39×10⁻⁸."""
+    mantissa, _, exponent = f"{value:.3g}".partition("e")
+    mantissa = mantissa.replace("-", "−")
+    return f"{mantissa}×10{str(int(exponent)).translate(_RAISED)}" if exponent else mantissa
+
+
+@dataclass(frozen=True)
+class Check:
+    """A measured number and the band in which it has to lie, bounds included; NaN never does."""
+
+    what: str
+    value: float
+    low: float = -math.inf
+    high: float = math.inf
+
+    @property
+    def passes(self) -> bool:
+        return bool(self.low <= self.value <= self.high)
+
+    @property
+    def decides(self) -> bool:
+        """Whether there is a bound."""
+        return self.low > -math.inf or self.high < math.inf
+
+    @property
+    def band(self) -> str:
+        if self.low == math.inf:
+            return "none"
+        if math.isinf(self.low) or self.low == 0:  # sizes: 0 is no bound
+            return f"≤ {pretty(self.high)}"
+        if math.isinf(self.high):
+            return f"≥ {pretty(self.low)}"
+        return f"{pretty(self.low)} … {pretty(self.high)}"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One claim and how it is judged: a row of `claims.toml` with its numbers.
+
+    `why` explains the verdict `on_record`; when a measurement leads elsewhere, the row says so in
+    place of it.
+    """
+
+    key: str
+    where: str
+    says: str
+    printed: tuple[Check, ...]
+    mended: tuple[Check, ...]
+    on_record: Verdict
+    why: str
+    also: tuple[Check, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        if all(check.passes for check in self.printed):
+            return Verdict.HOLDS
+        if self.mended and all(check.passes for check in self.mended):
+            return Verdict.MENDED
+        return Verdict.FAILS
+
+    @property
+    def is_expected(self) -> bool:
+        return self.verdict is self.on_record
+
+    @property
+    def reason(self) -> str:
+        if self.is_expected:
+            return self.why
+        return (
+            f"Unexpected: on record is “{self.on_record.value}”. Something has changed, in the "
+            "package or in what it runs on; compare the numbers with their bands."
+        )
 
 
 def judge(measurements: Measurements) -> list[Claim]:
     """All claims of the paper, judged on these measurements."""
-    parts = (theory_claims, oscillator_claims, kepler_claims)
-    return [claim for part in parts for claim in part(measurements)]
+    values = numbers(measurements)
+    rows = tomllib.loads(Path(__file__).with_name("claims.toml").read_text(encoding="utf-8"))
+    return [_judged(row, values) for row in rows["claim"]]
+
+
+def _judged(row: dict[str, Any], values: dict[str, Any]) -> Claim:
+    """A row with the numbers that it names."""
+
+    def checks(part):
+        return tuple(
+            Check(what, values[name], *map(float, bounds))
+            for what, name, *bounds in row.get(part, ())
+        )
+
+    return Claim(
+        key=row["key"],
+        where=row["where"],
+        says=row["says"],
+        printed=checks("printed"),
+        mended=checks("mended"),
+        also=checks("also"),
+        on_record=Verdict(row["on_record"]),
+        why=row["why"],
+    )

@@ -1,6 +1,7 @@
 """All measurements of a reproduction, with progress."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -19,10 +20,10 @@ class Measurements:
     long_runs: dict[str, kepler.LongRun]
     repulsion: kepler.Repulsion
     variational_mesh: kepler.VariationalMesh
-    limits: theory.Limits
-    symmetries: theory.Symmetries
-    identities: theory.Identities
-    discoveries: discoveries.Discoveries
+    limits: dict[str, float]
+    symmetries: dict[str, float]
+    identities: dict[str, float]
+    discoveries: dict[str, Any]
 
 
 EXPERIMENTS = {

@@ -17,7 +17,25 @@ MARKERS = "osD^vP"
 TIME = "time t (dimensionless; one period is 2π)"
 KEPLER_TIME = "time t (dimensionless)"
 
+FIGURES: dict[str, tuple[Callable[[Measurements], Any], str]] = {}
+"""File name → the function that draws it and its caption."""
 
+
+def _figure(name: str, caption: str):
+    """Register the function that draws a figure."""
+
+    def register(function: Callable[[Measurements], Any]):
+        FIGURES[name] = (function, caption)
+        return function
+
+    return register
+
+
+@_figure(
+    "fig1",
+    "Energy error of the free oscillator: on the fixed mesh the energy wiggles by O(h), and "
+    "another quadratic form is kept.",
+)
 def energy_error(m: Measurements) -> Any:
     """Figure 1: energy error of the variational method, free oscillator."""
     run = m.fixed_mesh
@@ -40,10 +58,12 @@ def energy_error(m: Measurements) -> Any:
         ["(p$_k$² + q$_{k−1}$²)/2, the paper's I₀", "(p² + q² − hqp)/2, kept exactly"],
         loc="upper right",
     )
-    _heading(figure, f"Figure 1   Energy error of the variational method, h = {run.h:g}, ε = 0")
-    return figure
+    return _headed(
+        figure, f"Figure 1   Energy error of the variational method, h = {run.h:g}, ε = 0"
+    )
 
 
+@_figure("fig2", "The same beside RK4, for the paper's number of steps.")
 def against_rk4(m: Measurements) -> Any:
     """Figure 2: energy error of the variational method and of RK4."""
     run = m.fixed_mesh
@@ -57,10 +77,16 @@ def against_rk4(m: Measurements) -> Any:
     axes.set(xlabel=TIME, ylabel="|error in the energy|  (dimensionless)", ylim=(1e-12, 1e-3))
     axes.text(run.ts[-1], 2e-5, "variational: largest in each period", color=BLUE, ha="right")
     axes.text(run.ts[-1], 1.5e-9, "RK4: grows in proportion to t", color=ORANGE, ha="right")
-    _heading(figure, f"Figure 2   Energy error of the two methods, h = {run.h:g}, 10 000 steps")
-    return figure
+    return _headed(
+        figure, f"Figure 2   Energy error of the two methods, h = {run.h:g}, 10 000 steps"
+    )
 
 
+@_figure(
+    "fig3",
+    "The adiabatic invariant (34): the wiggle O(h) hides ε; right, the form that the "
+    "disturbed map keeps.",
+)
 def adiabatic_34(m: Measurements) -> Any:
     """Figure 3: relative change of the adiabatic invariant (34)."""
     run = m.fixed_mesh
@@ -69,7 +95,7 @@ def adiabatic_34(m: Measurements) -> Any:
     for i, epsilon in enumerate(run.epsilons):
         if epsilon == 0:
             continue
-        look = {"color": plot.COLOURS[i - 1], "linestyle": plot.DASHES[i - 1]}
+        look = _look(i - 1)
         look |= {"marker": MARKERS[i - 1], "markevery": (3 * i, 14), "label": f"ε = {epsilon:g}"}
         values = run.printed[i]
         left.plot(run.ts[part], (values[part] / values[0] - 1) * 100, **look)
@@ -83,10 +109,10 @@ def adiabatic_34(m: Measurements) -> Any:
     left.legend(ncols=2, loc="upper center")
     right.set(title="(p² + (1+ε)q² − h(1+ε)qp)/2: all steps", xlabel=TIME)
     right.set_ylabel("relative change  (10⁻¹⁴)")
-    _heading(figure, f"Figure 3   Adiabatic invariant (34) for different ε, h = {run.h:g}")
-    return figure
+    return _headed(figure, f"Figure 3   Adiabatic invariant (34) for different ε, h = {run.h:g}")
 
 
+@_figure("fig4", "Phase diagrams, coloured by time. The + is the centre of attraction.")
 def phase_diagrams(m: Measurements) -> Any:
     """Figure 4: orbits by RK4 and by the variational method."""
     shown = [m.long_runs[k] for k in ("RK4", "variational (order 1)")]
@@ -126,16 +152,16 @@ def phase_diagrams(m: Measurements) -> Any:
     window.spines[["top", "right"]].set_visible(True)
     axes[0].indicate_inset_zoom(window, edgecolor=GREY)
     figure.colorbar(colours, ax=axes, label="time t  (thousands, dimensionless)", shrink=0.85)
-    _heading(figure, "Figure 4   Undisturbed Kepler orbit, h = 0.1, 100 000 steps")
-    return figure
+    return _headed(figure, "Figure 4   Undisturbed Kepler orbit, h = 0.1, 100 000 steps")
 
 
+@_figure("fig4_errors", "The same runs, and compositions of the paper's map of order 2 and 4.")
 def long_run_errors(m: Measurements) -> Any:
     """What Figure 4 does not show: errors of energy and angular momentum."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.4, 3.9), sharex=True)
     block = 500
     for i, run in enumerate(m.long_runs.values()):
-        look = {"color": plot.COLOURS[i], "linestyle": plot.DASHES[i], "label": run.name}
+        look = _look(i) | {"label": run.name}
         count = len(run.energy_errors) // block
         t = run.ts[1:][block // 2 :: block][:count] / 1000
         for axis, errors in ((left, run.energy_errors), (right, run.momentum_errors)):
@@ -147,17 +173,20 @@ def long_run_errors(m: Measurements) -> Any:
     right.set(title=f"angular momentum: largest in {block} steps")
     right.set_ylabel("|error|  (dimensionless)")
     right.legend(loc="center")
-    _heading(figure, "Figure 4, continued   Errors of four methods, h = 0.1, ε = 0")
-    return figure
+    return _headed(figure, "Figure 4, continued   Errors of four methods, h = 0.1, ε = 0")
 
 
+@_figure(
+    "fig5",
+    "The adiabatic invariant (50) on the paper's mesh, and with the mesh out of the way.",
+)
 def adiabatic_50(m: Measurements) -> Any:
     """Figure 5: the adiabatic invariant (50) with time."""
     sweep, small = m.mesh_sweep, m.small_step_sweep
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.4, 4.1))
     part = sweep.ts < 100
     for i, epsilon in enumerate(sweep.epsilons[:4]):
-        look = {"color": plot.COLOURS[i], "linestyle": plot.DASHES[i]}
+        look = _look(i)
         look |= {"marker": MARKERS[i], "markevery": (40 * i, 160), "label": f"ε = {epsilon:g}"}
         left.plot(sweep.ts[part], sweep.values_50[i, part], **look)
     left.set(title=f"the paper's map, h = {sweep.hs[0]:g}", xlabel=KEPLER_TIME)
@@ -170,16 +199,19 @@ def adiabatic_50(m: Measurements) -> Any:
         if epsilon not in sweep.epsilons:
             continue
         i = list(sweep.epsilons).index(epsilon)  # one colour for one ε in both pictures
-        look = {"color": plot.COLOURS[i], "linestyle": plot.DASHES[i]}
+        look = _look(i)
         change = np.abs(small.values[k] - small.values[k, 0])
         right.semilogy(small.ts[part], change[part], **look, label=f"ε = {epsilon:g}")
     right.set(title=f"as h → 0 (order 4, h = {small.h:g})", xlabel=KEPLER_TIME)
     right.set(ylabel="|change of (50)|  (dimensionless)", ylim=(1e-11, 1))
     right.legend(ncols=2, loc="upper center")
-    _heading(figure, "Figure 5   Adiabatic invariant (50) with time, force −εq")
-    return figure
+    return _headed(figure, "Figure 5   Adiabatic invariant (50) with time, force −εq")
 
 
+@_figure(
+    "crossover",
+    "RK4 run until its energy error has passed the band of the variational method.",
+)
 def rk4_crossover(m: Measurements) -> Any:
     """When RK4's energy error passes the variational band."""
     cross = m.crossover
@@ -210,10 +242,10 @@ def rk4_crossover(m: Measurements) -> Any:
     right.set_xticks(cross.hs, [f"{h:g}" for h in cross.hs])
     right.minorticks_off()
     right.legend()
-    _heading(figure, "Crossover   When RK4's energy error outgrows the variational band")
-    return figure
+    return _headed(figure, "Crossover   When RK4's energy error outgrows the variational band")
 
 
+@_figure("sweep_34", "Range of (34) against ε, as printed and corrected.")
 def sweep_34(m: Measurements) -> Any:
     """Drift of (34) and of its corrected forms against ε."""
     small, mesh = m.small_step, m.fixed_mesh
@@ -229,22 +261,25 @@ def sweep_34(m: Measurements) -> Any:
         ),
     )
     for i, (x, y, label) in enumerate(rows):
-        look = {"color": plot.COLOURS[i], "linestyle": plot.DASHES[i], "marker": MARKERS[i]}
+        look = _look(i) | {"marker": MARKERS[i]}
         axes.loglog(x, y, **look, label=f"{label}:  exponent {slope(x, y):.2f}")
     axes.legend(loc="upper left")
     axes.set(xlabel="strength of the disturbance ε", ylim=(1e-15, 1e6))
     axes.set_ylabel("range over the run, relative")
-    _heading(figure, "Equation (34)   An invariant of first order would have exponent 2")
-    return figure
+    return _headed(figure, "Equation (34)   An invariant of first order would have exponent 2")
 
 
+@_figure(
+    "sweep_49_50",
+    "Range of (49) and (50) over ε and h; as h → 0 the drift beyond that of ε = 0.",
+)
 def sweep_50(m: Measurements) -> Any:
     """Range of (49) and (50) over ε and h."""
     sweep, small = m.mesh_sweep, m.small_step_sweep
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.8, 4.6))
     positive = sweep.epsilons[1:]
     for i, h in enumerate(sweep.hs):
-        look = {"color": plot.COLOURS[i], "linestyle": plot.DASHES[i], "marker": MARKERS[i]}
+        look = _look(i) | {"marker": MARKERS[i]}
         left.loglog(positive, sweep.spread_50[i, 1:], **look, label=f"fixed mesh, h = {h:g}")
     for drifts, label, look in (
         (small.attracting, "h → 0, force −εq", {"color": "k", "marker": "o"}),
@@ -276,7 +311,7 @@ def sweep_50(m: Measurements) -> Any:
     for i, epsilon in enumerate(sweep.epsilons):
         if epsilon not in (0.0, 1e-2, 1e-1):
             continue
-        look = {"color": plot.COLOURS[i], "linestyle": plot.DASHES[i], "marker": MARKERS[i]}
+        look = _look(i) | {"marker": MARKERS[i]}
         right.loglog(sweep.hs, sweep.spread_50[:, i], **look, label=f"(50), ε = {epsilon:g}")
     right.loglog(
         sweep.hs,
@@ -291,48 +326,7 @@ def sweep_50(m: Measurements) -> Any:
     right.minorticks_off()
     right.set_ylabel("range over t = 200")
     right.legend(fontsize=8.5, ncols=2, loc="upper center", columnspacing=1)
-    _heading(figure, "Equations (49) and (50)   Sweep of ε and h, t = 200")
-    return figure
-
-
-FIGURES: dict[str, tuple[Callable[[Measurements], Any], str]] = {
-    "fig1": (
-        energy_error,
-        "Energy error of the free oscillator: on the fixed mesh the energy wiggles by O(h), and "
-        "another quadratic form is kept.",
-    ),
-    "fig2": (
-        against_rk4,
-        "The same beside RK4, for the paper's number of steps.",
-    ),
-    "fig3": (
-        adiabatic_34,
-        "The adiabatic invariant (34): the wiggle O(h) hides ε; right, the form that the disturbed "
-        "map keeps.",
-    ),
-    "fig4": (
-        phase_diagrams,
-        "Phase diagrams, coloured by time. The + is the centre of attraction.",
-    ),
-    "fig4_errors": (
-        long_run_errors,
-        "The same runs, and compositions of the paper's map of order 2 and 4.",
-    ),
-    "fig5": (
-        adiabatic_50,
-        "The adiabatic invariant (50) on the paper's mesh, and with the mesh out of the way.",
-    ),
-    "crossover": (
-        rk4_crossover,
-        "RK4 run until its energy error has passed the band of the variational method.",
-    ),
-    "sweep_34": (sweep_34, "Range of (34) against ε, as printed and corrected."),
-    "sweep_49_50": (
-        sweep_50,
-        "Range of (49) and (50) over ε and h; as h → 0 the drift beyond that of ε = 0.",
-    ),
-}
-"""File name → the function that draws it and its caption."""
+    return _headed(figure, "Equations (49) and (50)   Sweep of ε and h, t = 200")
 
 
 def draw(measurements: Measurements, folder: Path) -> Iterator[Path]:
@@ -342,8 +336,14 @@ def draw(measurements: Measurements, folder: Path) -> Iterator[Path]:
             yield plot.save(function(measurements), folder / f"{name}.png")
 
 
-def _heading(figure: Any, text: str) -> None:
+def _headed(figure: Any, text: str) -> Any:
     figure.suptitle(text, x=0.01, ha="left", fontsize=11.5, fontweight="bold")
+    return figure
+
+
+def _look(i: int) -> dict[str, Any]:
+    """Colour and dashes of curve i."""
+    return {"color": plot.COLOURS[i], "linestyle": plot.DASHES[i]}
 
 
 def _bands(ts: np.ndarray, values: np.ndarray, h: float) -> tuple[np.ndarray, ...]:

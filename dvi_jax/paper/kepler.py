@@ -1,5 +1,6 @@
 """Measurements on the Kepler problem: Figures 4 and 5, the sweeps of (49) and (50)."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +11,7 @@ import numpy as np
 import dvi_jax as dvi
 from dvi_jax import systems
 
-from .numbers import relative_spread, slope, spread
-from .oscillator import Tick
+from .numbers import Tick, largest, over, relative_spread, run, slope, spread
 
 DURATION = 200.0
 """Time over which ranges and drifts are taken; about five revolutions."""
@@ -21,17 +21,15 @@ def _turned(v):
     return jnp.stack([-v[1], v[0]])
 
 
-ROTATION = dvi.Generator(
-    xi=lambda t, q, p, args: _turned(q),
-    eta=lambda t, q, p, args: _turned(p),
-)
+_TURN: Any = {
+    "xi": lambda t, q, p, args: _turned(q),
+    "eta": lambda t, q, p, args: _turned(p),
+}
+
+ROTATION = dvi.Generator(**_TURN)
 """The rotation (40); its series in ε, (46), has it twice."""
 
-CLOCKED_ROTATION = dvi.Generator(
-    xi0=lambda t, q, p, args: jnp.ones_like(t),
-    xi=lambda t, q, p, args: _turned(q),
-    eta=lambda t, q, p, args: _turned(p),
-)
+CLOCKED_ROTATION = dvi.Generator(xi0=lambda t, q, p, args: jnp.ones_like(t), **_TURN)
 """The rotation with a shift of time (41)."""
 
 
@@ -114,7 +112,7 @@ class LongRun:
 
     def error_at(self, part: float) -> float:
         """Largest relative energy error in the first `part` of the run."""
-        return float(np.max(np.abs(self.energy_errors[: int(part * len(self.energy_errors))])))
+        return largest(self.energy_errors[: int(part * len(self.energy_errors))])
 
 
 @dataclass(frozen=True)
@@ -144,22 +142,13 @@ def mesh_sweep(tick: Tick) -> MeshSweep:
     problem = systems.kepler()
     hs = np.array([0.1, 0.05, 0.02, 0.01])
     epsilons = np.array([0.0, 1e-4, 1e-3, 1e-2, 1e-1])
+    observe = {"49": INVARIANT_49, "50": INVARIANT_50}
     runs = []
     for i, h in enumerate(hs):
-
-        def run(epsilon, h=h):
-            return dvi.integrate(
-                problem.system,
-                problem.q0,
-                problem.p0,
-                h=h,
-                num_steps=round(DURATION / h),
-                epsilon=epsilon,
-                args=problem.args,
-                observe={"49": INVARIANT_49, "50": INVARIANT_50},
-            )
-
-        runs.append(jax.vmap(run)(jnp.asarray(epsilons)))
+        steps = round(DURATION / h)
+        runs.append(
+            over(epsilons, lambda e, h=h, n=steps: run(problem, h, n, epsilon=e, observe=observe))
+        )
         tick((i + 1) / len(hs))
     return MeshSweep(
         hs=hs,
@@ -186,27 +175,15 @@ def small_step_sweep(tick: Tick) -> SmallStepSweep:
         epsilon, q1 = step[-1]["epsilon"], step[4]
         return (1 + epsilon) * momentum(*step) - energy(*step) - epsilon * jnp.sum(q1**2) / 2
 
-    def run(signed, epsilon):
-        return dvi.integrate(
-            problem.system,
-            problem.q0,
-            problem.p0,
-            h=h,
-            num_steps=round(DURATION / h),
-            epsilon=signed,
-            args={**problem.args, "epsilon": epsilon},
-            method=dvi.Yoshida(4),
-            save=dvi.Save(every=10),
-            observe={
-                "values": printed,
-                "printed": dvi.MaxDrift(printed),
-                "literal": dvi.MaxDrift(literal),
-            },
-        )
+    def orbit(signed, epsilon):
+        drifts = {"printed": dvi.MaxDrift(printed), "literal": dvi.MaxDrift(literal)}
+        options = {"epsilon": signed, "args": {**problem.args, "epsilon": epsilon}}
+        options |= {"observe": {"values": printed, **drifts}, "save": dvi.Save(every=10)}
+        return run(problem, h, round(DURATION / h), method=dvi.Yoshida(4), **options)
 
     # W = −q: a negative strength is the force +|ε|q, while the formula keeps |ε|.
     both = np.concatenate([epsilons, -epsilons])
-    runs = jax.vmap(run)(jnp.asarray(both), jnp.asarray(np.abs(both)))
+    runs = jax.vmap(orbit)(jnp.asarray(both), jnp.asarray(np.abs(both)))
     drifts = np.asarray(runs.observed["printed"])
     repelling = drifts[len(epsilons) :]
     farthest = np.max(np.linalg.norm(np.asarray(runs.qs), axis=-1), axis=-1)[len(epsilons) :]
@@ -239,16 +216,8 @@ def long_runs(tick: Tick) -> dict[str, LongRun]:
     apocentre = np.arctan2(-pericentre[1], -pericentre[0])
     runs = {}
     for i, (name, method) in enumerate(METHODS.items()):
-        solution = dvi.integrate(
-            problem.system,
-            problem.q0,
-            problem.p0,
-            h=problem.h,
-            num_steps=100_000,
-            args=problem.args,
-            method=method,
-            observe={k: problem.observables[k] for k in ("energy", "angular_momentum")},
-        )
+        observe = {k: problem.observables[k] for k in ("energy", "angular_momentum")}
+        solution = run(problem, problem.h, 100_000, method=method, observe=observe)
         ts, qs, ps = (np.asarray(x) for x in (solution.ts, solution.qs, solution.ps))
         angle = np.unwrap(np.arctan2(qs[:, 1], qs[:, 0]))
         first = np.ceil((angle[0] - apocentre) / (2 * np.pi))
@@ -285,14 +254,8 @@ def repulsion(tick: Tick) -> Repulsion:
 
     radii = []
     for system in (dvi.System(printed), problem.system):
-        solution = dvi.integrate(
-            system,
-            problem.q0,
-            problem.p0,
-            h=problem.h,
-            num_steps=round(DURATION / problem.h),
-            args=problem.args,
-        )
+        one = dataclasses.replace(problem, system=system)
+        solution = run(one, problem.h, round(DURATION / problem.h))
         radii.append(np.linalg.norm(np.asarray(solution.qs), axis=1))
         tick(len(radii) / 2)
     return Repulsion(np.asarray(solution.ts), *radii)
@@ -305,16 +268,7 @@ def variational_mesh(tick: Tick) -> VariationalMesh:
     ends = []
     hs = np.array([0.1, 0.01])
     for i, first in enumerate(hs):
-        solution = dvi.integrate(
-            problem.system,
-            problem.q0,
-            problem.p0,
-            h=first,
-            num_steps=limit,
-            args=problem.args,
-            lattice=dvi.Variational(),
-            throw=False,
-        )
+        solution = run(problem, first, limit, lattice=dvi.Variational(), throw=False)
         k = int(solution.stats["failed_step"])
         ends.append((np.inf, np.inf) if k < 0 else (k, float(solution.ts[k])))
         tick((i + 1) / len(hs))

@@ -1,6 +1,35 @@
-"""The few statistics that every measurement here is made of."""
+"""What every measurement uses: a run of a problem, and a few statistics."""
 
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
 import numpy as np
+
+import dvi_jax as dvi
+from dvi_jax.systems import Problem
+
+Tick = Callable[[float], None]
+"""Called with the part of an experiment that is done, from 0 to 1."""
+
+
+def run(problem: Problem, h: Any, num_steps: int, **options: Any) -> dvi.Solution:
+    """`integrate` from the problem's initial conditions with its parameters."""
+    options = {"args": problem.args, **options}
+    return dvi.integrate(
+        problem.system, problem.q0, problem.p0, h=h, num_steps=num_steps, **options
+    )
+
+
+def over(values: np.ndarray, function: Callable[[Any], Any]) -> Any:
+    """The function of each value, as one batch."""
+    return jax.vmap(function)(jnp.asarray(values))
+
+
+def largest(values: Any) -> float:
+    """Largest absolute value."""
+    return float(np.max(np.abs(np.asarray(values))))
 
 
 def spread(values: np.ndarray, axis: int = -1) -> np.ndarray:

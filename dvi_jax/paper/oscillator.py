@@ -1,19 +1,21 @@
 """Measurements on the oscillator: Figures 1 to 3, the crossover, the sweep of (34)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import systems
 
-from .numbers import crossing
+from .numbers import Tick, crossing, over, run
 
-Tick = Callable[[float], None]
-"""Told the part of an experiment that is done, from 0 to 1."""
+SCALING = dvi.Generator(
+    xi0=lambda t, q, p, args: jnp.ones_like(t),
+    xi=lambda t, q, p, args: q,
+    eta=lambda t, q, p, args: p,
+)
+"""The generator of (34) in both orders: a scaling with a shift of time, (33) mended."""
 
 STEPS = 10_000
 """Length of the paper's runs in steps."""
@@ -79,34 +81,19 @@ class SmallStep:
     corrected: np.ndarray
 
 
+def _start(problem) -> float:
+    """The energy of the initial conditions."""
+    return float(np.sum(np.square(problem.q0) + np.square(problem.p0)) / 2)
+
+
 def fixed_mesh(tick: Tick) -> FixedMesh:
     """The oscillator at the paper's h = 0.1, by the variational map and by RK4."""
     problem = systems.oscillator()
-    h = problem.h
-    epsilons = np.array(EPSILONS)
-
-    def run(epsilon):
-        return dvi.integrate(
-            problem.system,
-            problem.q0,
-            problem.p0,
-            h=h,
-            num_steps=STEPS,
-            epsilon=epsilon,
-            observe=problem.observables["mixed_energy"],
-        )
-
-    variational = jax.vmap(run)(jnp.asarray(epsilons))
+    h, epsilons = problem.h, np.array(EPSILONS)
+    mixed, energy = problem.observables["mixed_energy"], problem.observables["energy"]
+    variational = over(epsilons, lambda e: run(problem, h, STEPS, epsilon=e, observe=mixed))
     tick(0.5)
-    rk4 = dvi.integrate(
-        problem.system,
-        problem.q0,
-        problem.p0,
-        h=h,
-        num_steps=STEPS,
-        method=dvi.RungeKutta4(),
-        observe=problem.observables["energy"],
-    )
+    rk4 = run(problem, h, STEPS, method=dvi.RungeKutta4(), observe=energy)
     q, p = np.asarray(variational.qs)[..., 0], np.asarray(variational.ps)[..., 0]
     stiffness = 1 + epsilons[:, None]
     return FixedMesh(
@@ -117,59 +104,43 @@ def fixed_mesh(tick: Tick) -> FixedMesh:
         # The disturbed map is the undisturbed one with stiffness 1 + ε, and so is its invariant.
         exact=((p**2 + stiffness * q**2 - h * stiffness * q * p) / 2)[:, 1:],
         rk4=np.asarray(rk4.observed),
-        energy=float(np.sum(np.square(problem.q0) + np.square(problem.p0)) / 2),
+        energy=_start(problem),
     )
 
 
 def crossover(tick: Tick) -> Crossover:
     """RK4 run until its energy error has passed the variational band, for several h."""
     problem = systems.oscillator()
-    energy = problem.observables["energy"]
-    start = float(np.sum(np.square(problem.q0) + np.square(problem.p0)) / 2)
-    hs = np.array([0.1, 0.2, 0.3, 0.4])
+    start, hs = _start(problem), np.array([0.1, 0.2, 0.3, 0.4])
 
     def band(h):
-        return dvi.integrate(
-            problem.system,
-            problem.q0,
-            problem.p0,
-            h=h,
-            num_steps=STEPS,
-            save=dvi.Save(final=True),
-            observe=dvi.Range(problem.observables["mixed_energy"]),
-        ).observed
+        observe = dvi.Range(problem.observables["mixed_energy"])
+        return run(problem, h, STEPS, save=dvi.Save(final=True), observe=observe).observed
 
     def rk4(h, num_steps, every, progress=None):
-        return dvi.integrate(
-            problem.system,
-            problem.q0,
-            problem.p0,
-            h=h,
-            num_steps=num_steps,
-            method=dvi.RungeKutta4(),
-            save=dvi.Save(every=every),
-            observe=energy,
-            progress=progress,
+        options = {"save": dvi.Save(every=every), "observe": problem.observables["energy"]}
+        return run(
+            problem, h, num_steps, method=dvi.RungeKutta4(), progress=progress, **options
         ).observed
 
-    bands = np.asarray(jax.vmap(band)(jnp.asarray(hs)))
+    bands = np.asarray(over(hs, band))
     long, every = 7_500_000, 2500
-    run = rk4(hs[0], long, every, lambda done, total: tick(0.9 * done / total))
+    first = rk4(hs[0], long, every, lambda done, total: tick(0.9 * done / total))
     short, often = 300_000, 20
-    others = jax.vmap(lambda h: rk4(h, short, often))(jnp.asarray(hs[1:]))
+    others = over(hs[1:], lambda h: rk4(h, short, often))
 
     def history(values, every):
         values = np.asarray(values)
         return every * np.arange(1, len(values) + 1), np.abs(values - start)
 
-    runs = [history(run, every), *(history(values, often) for values in others)]
+    runs = [history(first, every), *(history(values, often) for values in others)]
     return Crossover(
         hs=hs,
         bands=bands,
         steps=np.array([crossing(n, e, b) for (n, e), b in zip(runs, bands, strict=True)]),
         # E_N = E_0 (1 − h⁶/72)^N, and the error is E_0 − E_N.
         predicted=np.log1p(-bands / start) / np.log1p(-(hs**6) / 72),
-        loss=-float(np.expm1(np.log(float(run[-1]) / start) / long)),
+        loss=-float(np.expm1(np.log(float(first[-1]) / start) / long)),
         loss_theory=hs[0] ** 6 / 72,
         run_steps=runs[0][0],
         run_errors=runs[0][1],
@@ -187,25 +158,16 @@ def small_step(tick: Tick) -> SmallStep:
     def corrected(t0, t1, q0, p0, q1, p1, args):
         return (jnp.sum(p1**2) + (1 + args["epsilon"]) * jnp.sum(q1**2)) / 2
 
-    def run(epsilon):
-        return dvi.integrate(
-            problem.system,
-            problem.q0,
-            problem.p0,
-            h=h,
-            num_steps=round(200 / h),
-            epsilon=epsilon,
-            args={"epsilon": epsilon},
-            method=dvi.Yoshida(4),
-            save=dvi.Save(final=True),
-            observe={"printed": dvi.Range(printed), "corrected": dvi.Range(corrected)},
-        ).observed
+    def ranges(epsilon):
+        observe = {"printed": dvi.Range(printed), "corrected": dvi.Range(corrected)}
+        options = {"epsilon": epsilon, "args": {"epsilon": epsilon}, "observe": observe}
+        options |= {"method": dvi.Yoshida(4), "save": dvi.Save(final=True)}
+        return run(problem, h, round(200 / h), **options).observed
 
-    ranges = jax.vmap(run)(jnp.asarray(epsilons))
-    start = float(np.sum(np.square(problem.q0) + np.square(problem.p0)) / 2)
+    found, start = over(epsilons, ranges), _start(problem)
     return SmallStep(
         h=h,
         epsilons=epsilons,
-        printed=np.asarray(ranges["printed"]) / start,
-        corrected=np.asarray(ranges["corrected"]) / start,
+        printed=np.asarray(found["printed"]) / start,
+        corrected=np.asarray(found["corrected"]) / start,
     )

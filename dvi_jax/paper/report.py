@@ -6,6 +6,7 @@ import html
 import json
 import math
 import re
+import string
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from .equations import EQUATIONS
+from .claims import Check, Claim, Verdict, pretty
+from .equations import EQUATIONS, Equation
 from .experiments import Measurements
 from .figures import FIGURES
-from .numbers import relative_spread, spread
-from .verdicts import Check, Claim, Verdict, pretty
+from .numbers import largest, relative_spread, spread
 
 MARKS = {Verdict.HOLDS: "✓", Verdict.MENDED: "≈", Verdict.FAILS: "✗"}
 """A sign beside every colour, so that no verdict hangs on colour alone."""
@@ -38,71 +39,67 @@ def counts(claims: Sequence[Claim]) -> str:
 def write_json(claims: Sequence[Claim], setting: dict[str, Any], path: Path) -> None:
     """The verdicts with every number, its band and its place; non-finite numbers as null."""
 
-    def check(check: Check) -> dict[str, Any]:
-        return {
-            "what": check.what,
-            "value": check.value if math.isfinite(check.value) else None,
-            "band": check.band,
-            "passes": check.passes,
-        }
+    def value(check: Check) -> float | None:
+        return check.value if math.isfinite(check.value) else None
 
-    rows = [
-        {
-            "key": claim.key,
-            "where": claim.where,
-            "paper_says": claim.says,
-            "verdict": claim.verdict.value,
-            "why": claim.reason,
-            "as_on_record": claim.is_expected,
-            "checks_as_printed": [check(c) for c in claim.printed],
-            "checks_as_mended": [check(c) for c in claim.mended],
-            "also_measured": {c.what: check(c)["value"] for c in claim.also},
-        }
-        for claim in claims
-    ]
-    document = {"setting": setting, "summary": counts(claims), "claims": rows}
+    def rows(checks: Sequence[Check]) -> list[dict[str, Any]]:
+        return [
+            {"what": c.what, "value": value(c), "band": c.band, "passes": c.passes} for c in checks
+        ]
+
+    document = {
+        "setting": setting,
+        "summary": counts(claims),
+        "claims": [
+            {
+                "key": claim.key,
+                "where": claim.where,
+                "paper_says": claim.says,
+                "verdict": claim.verdict.value,
+                "why": claim.reason,
+                "as_on_record": claim.is_expected,
+                "checks_as_printed": rows(claim.printed),
+                "checks_as_mended": rows(claim.mended),
+                "also_measured": {c.what: value(c) for c in claim.also},
+            }
+            for claim in claims
+        ],
+    }
     path.write_text(json.dumps(document, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def write_markdown(claims: Sequence[Claim], setting: dict[str, Any], path: Path) -> None:
     """The verdicts and the table of equations as Markdown."""
 
-    def row(cells: Iterable[object]) -> str:
-        return "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"
+    def table(*rows: Sequence[str]) -> list[str]:
+        header, *body = ([cell.replace("|", "\\|") for cell in row] for row in rows)
+        lines = [header, ["---"] * len(header), *body]
+        return ["| " + " | ".join(cells) + " |" for cells in lines]
 
+    def judged(claim: Claim) -> Sequence[str]:
+        checks = "<br>".join(f"*{kind}*: {text}" for kind, text in _check_texts(claim))
+        verdict = f"{MARKS[claim.verdict]} **{claim.verdict.value}**"
+        return claim.where, claim.says, checks, verdict, claim.reason
+
+    columns = ("where", "the paper says", "measured now", "verdict", "why")
     lines = [
         "# The paper's claims, measured",
         "",
         f"{counts(claims)}. {_setting_line(setting)}",
         "",
-        row(("where", "the paper says", "measured now", "verdict", "why")),
-        row(["---"] * 5),
-        *(
-            row(
-                (
-                    claim.where,
-                    claim.says,
-                    "<br>".join(f"*{kind}*: {text}" for kind, text in _check_texts(claim)),
-                    f"{MARKS[claim.verdict]} **{claim.verdict.value}**",
-                    claim.reason,
-                )
-            )
-            for claim in claims
-        ),
+        *table(columns, *map(judged, claims)),
         "",
         "## Figures",
         "",
-        *(
-            f"![{caption}](figures/{name}.png)\n\n{caption}\n"
-            for name, (_, caption) in FIGURES.items()
-        ),
+        *(f"![{text}](figures/{name}.png)\n\n{text}\n" for name, (_, text) in FIGURES.items()),
         "## The numbered equations and the code",
         "",
-        row(("equation", "what", "code", "the print, and what is right")),
-        row(["---"] * 4),
-        *(
-            row((f"({e.number})", e.what, ", ".join(f"`{c}`" for c in e.code), e.note))
-            for e in EQUATIONS
+        *table(
+            ("equation", "what", "code", "the print, and what is right"),
+            *(
+                (f"({e.number})", e.what, ", ".join(f"`{c}`" for c in e.code), e.note)
+                for e in EQUATIONS
+            ),
         ),
         "",
     ]
@@ -111,37 +108,42 @@ def write_markdown(claims: Sequence[Claim], setting: dict[str, Any], path: Path)
 
 def write_html(claims: Sequence[Claim], setting: dict[str, Any], figures: Path, path: Path) -> None:
     """One page that needs nothing beside it: verdicts, figures (embedded), equations."""
-    sections = []
-    for claim in claims:
+
+    def row(cells: Iterable[str]) -> str:
+        return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+
+    def judged(claim: Claim) -> str:
         kind = claim.verdict.name.lower()
-        checks = "".join(
-            f"<li><i>{label}:</i> {_math(text)}</li>" for label, text in _check_texts(claim)
-        )
-        sections.append(
-            f'<tr><td class="where">{_esc(claim.where)}</td><td>{_math(claim.says)}</td>'
-            f"<td><ul>{checks}</ul></td>"
-            f'<td><span class="verdict {kind}">{MARKS[claim.verdict]} {claim.verdict.value}</span>'
-            f"</td><td>{_math(claim.reason)}</td></tr>"
-        )
-    pictures = []
-    for name, (_, caption) in FIGURES.items():
+        checks = "".join(f"<li><i>{k}:</i> {_math(text)}</li>" for k, text in _check_texts(claim))
+        verdict = f"{MARKS[claim.verdict]} {claim.verdict.value}"
+        return row(
+            (
+                _esc(claim.where),
+                _math(claim.says),
+                f"<ul>{checks}</ul>",
+                f'<span class="verdict {kind}">{verdict}</span>',
+                _math(claim.reason),
+            )
+        ).replace("<td>", '<td class="where">', 1)
+
+    def picture(name: str, caption: str) -> str:
         data = base64.b64encode((figures / f"{name}.png").read_bytes()).decode()
-        pictures.append(
+        return (
             f'<figure><img alt="{_esc(caption)}" src="data:image/png;base64,{data}">'
             f"<figcaption>{_math(caption)}</figcaption></figure>"
         )
-    equations = [
-        f"<tr><td>({e.number})</td><td>{_math(e.what)}</td>"
-        f"<td>{' '.join(f'<code>{_esc(c)}</code>' for c in e.code)}</td>"
-        f"<td>{_math(e.note)}</td></tr>"
-        for e in EQUATIONS
-    ]
-    page = _PAGE.format(
+
+    def listed(e: Equation) -> str:
+        code = " ".join(f"<code>{_esc(c)}</code>" for c in e.code)
+        return row((f"({e.number})", _math(e.what), code, _math(e.note)))
+
+    template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+    page = string.Template(template).substitute(
         summary=_esc(counts(claims)),
         setting=_esc(_setting_line(setting)),
-        claims="\n".join(sections),
-        figures="\n".join(pictures),
-        equations="\n".join(equations),
+        claims="\n".join(map(judged, claims)),
+        figures="\n".join(picture(name, caption) for name, (_, caption) in FIGURES.items()),
+        equations="\n".join(map(listed, EQUATIONS)),
     )
     path.write_text(page, encoding="utf-8")
 
@@ -149,84 +151,55 @@ def write_html(claims: Sequence[Claim], setting: dict[str, Any], figures: Path, 
 def write_tables(m: Measurements, folder: Path) -> None:
     """The sweeps as CSV, one row per point; dimensionless."""
     mesh, small, cross = m.fixed_mesh, m.small_step, m.crossover
-    sweep, limit = m.mesh_sweep, m.small_step_sweep
-    _write_csv(
-        folder / "crossover.csv",
-        ("h", "variational_band", "rk4_steps_measured", "rk4_steps_predicted"),
-        zip(cross.hs, cross.bands, cross.steps, cross.predicted, strict=True),
-    )
-    _write_csv(
-        folder / "sweep_34_fixed_mesh.csv",
-        ("h", "epsilon", "range_34_printed", "relative_range_34", "relative_range_exact"),
-        zip(
-            [mesh.h] * len(mesh.epsilons),
-            mesh.epsilons,
-            spread(mesh.printed),
-            relative_spread(mesh.printed),
-            relative_spread(mesh.exact),
-            strict=True,
-        ),
-    )
-    _write_csv(
-        folder / "sweep_34_small_step.csv",
-        ("h", "epsilon", "relative_range_34_printed", "relative_range_34_corrected"),
-        zip(
-            [small.h] * len(small.epsilons),
-            small.epsilons,
-            small.printed,
-            small.corrected,
-            strict=True,
-        ),
-    )
-    _write_csv(
-        folder / "sweep_49_50_fixed_mesh.csv",
-        ("h", "epsilon", "relative_range_49", "range_50"),
-        (
-            (h, epsilon, sweep.relative_49[i, j], sweep.spread_50[i, j])
-            for i, h in enumerate(sweep.hs)
-            for j, epsilon in enumerate(sweep.epsilons)
-        ),
-    )
-    _write_csv(
-        folder / "sweep_50_small_step.csv",
-        ("h", "epsilon", "drift_force_minus", "drift_force_plus", "drift_xi0_1_force_minus"),
-        zip(
-            [limit.h] * len(limit.epsilons),
-            limit.epsilons,
-            limit.attracting,
-            limit.repelling,
-            limit.literal,
-            strict=True,
-        ),
-    )
-    _write_csv(
-        folder / "long_runs.csv",
-        (
-            "method",
-            "largest_relative_energy_error",
-            "largest_angular_momentum_error",
-            "loop_width_at_apocentre",
-            "turn_per_revolution_rad",
-        ),
-        (
-            (
-                run.name,
-                run.error_at(1.0),
-                float(np.max(np.abs(run.momentum_errors))),
-                run.width,
-                run.turn,
-            )
-            for run in m.long_runs.values()
-        ),
-    )
-
-
-def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        for row in rows:
-            writer.writerow([x if isinstance(x, str) else f"{float(x):.9g}" for x in row])
+    sweep, limit, runs = m.mesh_sweep, m.small_step_sweep, m.long_runs.values()
+    h, epsilon = (x.ravel() for x in np.meshgrid(sweep.hs, sweep.epsilons, indexing="ij"))
+    tables: dict[str, dict[str, Any]] = {
+        "crossover": {
+            "h": cross.hs,
+            "variational_band": cross.bands,
+            "rk4_steps_measured": cross.steps,
+            "rk4_steps_predicted": cross.predicted,
+        },
+        "sweep_34_fixed_mesh": {
+            "h": mesh.h,
+            "epsilon": mesh.epsilons,
+            "range_34_printed": spread(mesh.printed),
+            "relative_range_34": relative_spread(mesh.printed),
+            "relative_range_exact": relative_spread(mesh.exact),
+        },
+        "sweep_34_small_step": {
+            "h": small.h,
+            "epsilon": small.epsilons,
+            "relative_range_34_printed": small.printed,
+            "relative_range_34_corrected": small.corrected,
+        },
+        "sweep_49_50_fixed_mesh": {
+            "h": h,
+            "epsilon": epsilon,
+            "relative_range_49": sweep.relative_49.ravel(),
+            "range_50": sweep.spread_50.ravel(),
+        },
+        "sweep_50_small_step": {
+            "h": limit.h,
+            "epsilon": limit.epsilons,
+            "drift_force_minus": limit.attracting,
+            "drift_force_plus": limit.repelling,
+            "drift_xi0_1_force_minus": limit.literal,
+        },
+        "long_runs": {
+            "method": [run.name for run in runs],
+            "largest_relative_energy_error": [run.error_at(1.0) for run in runs],
+            "largest_angular_momentum_error": [largest(run.momentum_errors) for run in runs],
+            "loop_width_at_apocentre": [run.width for run in runs],
+            "turn_per_revolution_rad": [run.turn for run in runs],
+        },
+    }
+    for name, columns in tables.items():
+        with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            for row in zip(*np.broadcast_arrays(*columns.values()), strict=True):
+                writer.writerow([x if isinstance(x, str) else f"{float(x):.9g}" for x in row])
 
 
 def _check_texts(claim: Claim) -> list[tuple[str, str]]:
@@ -236,9 +209,8 @@ def _check_texts(claim: Claim) -> list[tuple[str, str]]:
 
 
 def _check_text(check: Check) -> str:
-    decides = math.isfinite(check.low) or math.isfinite(check.high) or check.low == math.inf
     value = f"{check.what}: {pretty(check.value)}"
-    if not decides:
+    if not check.decides:
         return value
     return f"{value} ({'✓' if check.passes else '✗'} asked for: {check.band})"
 
@@ -255,75 +227,3 @@ def _math(text: str) -> str:
     """Escaped text with the indices and exponents written as _x, _{…} and ^{…} set as such."""
     text = re.sub(r"_(?:\{([^}]*)\}|([A-Za-z0-9])(?![A-Za-z0-9]))", r"<sub>\1\2</sub>", _esc(text))
     return re.sub(r"\^(?:\{([^}]*)\}|([A-Za-z0-9])(?![A-Za-z0-9]))", r"<sup>\1\2</sup>", text)
-
-
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>The paper's claims, measured</title>
-<style>
-:root {{ --ink: #1d2430; --soft: #5a6473; --line: #dfe3e8; --paper: #fff; --tint: #f6f7f9; }}
-* {{ box-sizing: border-box; }}
-body {{ margin: 0; background: var(--paper); color: var(--ink);
-  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }}
-main {{ max-width: 78rem; margin: 0 auto; padding: 2rem 1.25rem 4rem; }}
-h1 {{ font-size: 1.7rem; margin: 0 0 .4rem; }}
-h2 {{ font-size: 1.2rem; margin: 2.6rem 0 .8rem; }}
-p.lead {{ font-size: 1.05rem; margin: 0; }}
-p.setting {{ color: var(--soft); margin: .3rem 0 0; }}
-nav a {{ margin-right: 1.2rem; color: #005a94; }}
-nav {{ margin-top: .8rem; }}
-.wide {{ overflow-x: auto; }}
-table {{ border-collapse: collapse; width: 100%; min-width: 58rem; font-size: .9rem; }}
-th.says {{ width: 20%; }} th.measured {{ width: 32%; }} th.why {{ width: 24%; }}
-th {{ text-align: left; background: var(--tint); position: sticky; top: 0; }}
-th, td {{ border-bottom: 1px solid var(--line); padding: .5rem .6rem; vertical-align: top; }}
-td ul {{ margin: 0; padding: 0; list-style: none; }}
-td li + li {{ margin-top: .25rem; }}
-td li i {{ color: var(--soft); }}
-sub, sup {{ font-size: .75em; line-height: 0; }}
-.where {{ white-space: normal; font-weight: 600; min-width: 6.5rem; }}
-.verdict {{ display: inline-block; white-space: nowrap; padding: .1rem .5rem; border-radius: 1rem;
-  font-weight: 600; border: 1.5px solid currentColor; }}
-.holds {{ color: #00614a; }}
-.mended {{ color: #8a5a00; }}
-.fails {{ color: #a63c00; }}
-code {{ font: .85em ui-monospace, SFMono-Regular, Menlo, Consolas, monospace;
-  background: var(--tint); padding: 0 .25em; overflow-wrap: anywhere; }}
-figure {{ margin: 0 0 1.6rem; max-width: 60rem; }}
-figure img {{ width: 100%; height: auto; border: 1px solid var(--line); border-radius: 4px;
-  padding: .6rem; }}
-figcaption {{ color: var(--soft); margin-top: .3rem; }}
-</style>
-</head>
-<body><main>
-<h1>The paper's claims, measured</h1>
-<p class="lead">{summary}.</p>
-<p class="setting">{setting}</p>
-<p class="setting">Every number was measured in this run, and every verdict follows from the
-numbers: a claim holds if the checks of what is printed pass, holds once mended if those of the
-mended form do, and does not hold otherwise. All quantities are dimensionless, as in the
-paper.</p>
-<nav>
-<a href="#claims">Claims</a><a href="#figures">Figures</a><a href="#equations">Equations</a>
-</nav>
-<h2 id="claims">Claims</h2>
-<div class="wide"><table>
-<thead><tr>
-<th>where</th><th class="says">the paper says</th><th class="measured">measured now</th>
-<th>verdict</th><th class="why">why</th>
-</tr></thead><tbody>
-{claims}
-</tbody></table></div>
-<h2 id="figures">Figures</h2>
-{figures}
-<h2 id="equations">The numbered equations and the code</h2>
-<div class="wide"><table>
-<thead><tr><th>equation</th><th>what</th><th>code</th><th>the print, and what is right</th></tr>
-</thead><tbody>
-{equations}
-</tbody></table></div>
-</main></body></html>
-"""

@@ -1,6 +1,9 @@
-"""Measurements on the theory: limits, the lattice equation, symmetries, identities, balance."""
+"""Measurements on the theory: limits, the lattice equation, symmetries, identities, balance.
 
-from dataclasses import dataclass
+Each returns its numbers by the names that `claims.toml` has for them.
+"""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +13,8 @@ import dvi_jax as dvi
 from dvi_jax import systems
 
 from .kepler import CLOCKED_ROTATION, INVARIANT_50, ROTATION, gauge
-from .oscillator import Tick
+from .numbers import Tick, largest, run, slope
+from .oscillator import SCALING
 
 EPSILON = 0.01
 """Strength of the disturbance in the checks that need one value of it."""
@@ -18,123 +22,42 @@ EPSILON = 0.01
 STEP_SIZES = np.array([0.04, 0.02, 0.01, 0.005])
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What happens as h → 0: `hs` (H,), each other field (H,), largest over sampled starts.
+def limits(tick: Tick) -> dict[str, float]:
+    """What happens as h → 0: exponents in h of the largest error over sampled starts.
 
-    `local_error`: one step of (12)–(13) against the flow. On a driven oscillator, per unit of
-    time: `lattice_mended`, residual of (14) with the signs of (11); `lattice_sign`, of (14) as
-    printed; `lattice_slot`, with the sign mended and H_{D,k−1} still differentiated in t_{k−1}.
-    `stationarity` (): largest difference between the mended form and the derivative of the
-    action with respect to t_k, by autodiff.
+    `local_error_exponent`: one step of (12)–(13) against the flow. On a driven oscillator, per unit
+    of time: `lattice_mended_exponent`, residual of (14) with the signs of (11);
+    `lattice_sign_exponent`, of (14) as printed; `lattice_slot_exponent`, with the sign mended and
+    H_{D,k−1} still differentiated in t_{k−1}. `stationarity`: largest difference between the mended
+    form and the derivative of the action with respect to t_k, by autodiff.
     """
-
-    hs: np.ndarray
-    local_error: np.ndarray
-    lattice_mended: np.ndarray
-    lattice_sign: np.ndarray
-    lattice_slot: np.ndarray
-    stationarity: float
-
-
-@dataclass(frozen=True)
-class Symmetries:
-    """Conformal factors, each a least-squares Λ over sampled points off the solutions.
-
-    Residuals are relative (round-off: Λ exists). `kepler_off_printed`, `kepler_off_mended`:
-    distance of the measured Λ from (48), and from (1+ε) times it. `scaling_printed`: residual
-    with the generator (33) as printed; `scaling_mended`: with its momentum part;
-    `scaling_factor`: the factor then. `display_*`: distance of the equation of motion
-    displayed after (32) from (13) with W = q and with W = −q. `epsilon`: used throughout.
-    """
-
-    epsilon: float
-    rotation: float
-    clocked: float
-    kepler_disturbed: float
-    kepler_off_printed: float
-    kepler_off_mended: float
-    scaling_printed: float
-    scaling_mended: float
-    scaling_factor: float
-    display_printed: float
-    display_mended: float
-
-
-@dataclass(frozen=True)
-class Identities:
-    """Noether's identities and the balance law along trajectories; largest absolute values.
-
-    `oscillator_0`: N_0 with the gauge −pq at ε = 0; `oscillator_1`: N_1 of (34) at ε, and
-    `oscillator_1_rest`: what is left of it after q_k(p_{k+1} − q_k) + εq_k². Kepler at `hs`:
-    `kepler_1` (H,), N_1 of (50), and `kepler_1_rest` (H,), after −(h/2)|Dq|². `law_31` (H,):
-    D I − ε²W·(ξ − Dq ξ0) for (50); `balance` (H,): the same with the causes that (31) leaves
-    out. `rotation`: largest D I of (49). `eta_p`, `xi_p`: largest distance of η·p and ξ·p from
-    the angular momentum.
-    """
-
-    epsilon: float
-    oscillator_0: float
-    oscillator_1: float
-    oscillator_1_rest: float
-    scale_oscillator: float
-    hs: np.ndarray
-    kepler_1: np.ndarray
-    kepler_1_rest: np.ndarray
-    law_31: np.ndarray
-    balance: np.ndarray
-    rotation: float
-    eta_p: float
-    xi_p: float
-
-
-def limits(tick: Tick) -> Limits:
-    """One-step error and the forms of the lattice equation as h → 0, from sampled starts."""
     problem = systems.kepler()
-    orbit = dvi.integrate(
-        problem.system,
-        problem.q0,
-        problem.p0,
-        h=0.01,
-        num_steps=4000,
-        args=problem.args,
-        method=dvi.Yoshida(4),
-        save=dvi.Save(every=125),
-    )
+    orbit = run(problem, 0.01, 4000, method=dvi.Yoshida(4), save=dvi.Save(every=125))
     tick(0.2)
 
     def flight(method, parts):
-        def run(h, q, p):
-            solution = dvi.integrate(
-                problem.system,
-                q,
-                p,
-                h=h / parts,
-                num_steps=parts,
-                epsilon=EPSILON,
-                args=problem.args,
-                method=method,
-                save=dvi.Save(final=True),
-            )
+        def one(h, q, p):
+            start = dataclasses.replace(problem, q0=q, p0=p)
+            options = {"epsilon": EPSILON, "method": method, "save": dvi.Save(final=True)}
+            solution = run(start, h / parts, parts, **options)
             return jnp.concatenate([solution.qs[-1], solution.ps[-1]])
 
-        over_starts = jax.vmap(run, in_axes=(None, 0, 0))
+        over_starts = jax.vmap(one, in_axes=(None, 0, 0))
         return jax.vmap(over_starts, in_axes=(0, None, None))(
             jnp.asarray(STEP_SIZES), orbit.qs, orbit.ps
         )
 
-    gap = flight(dvi.TypeII(), 1) - flight(dvi.Yoshida(4), 32)
+    gap = np.abs(np.asarray(flight(dvi.TypeII(), 1) - flight(dvi.Yoshida(4), 32)))
     tick(0.6)
     mended, sign, slot, stationarity = (np.asarray(x) for x in _lattice_forms())
     tick(1.0)
-    return Limits(
-        hs=STEP_SIZES,
-        local_error=np.max(np.abs(np.asarray(gap)), axis=(1, 2)),
-        lattice_mended=mended,
-        lattice_sign=sign,
-        lattice_slot=slot,
-        stationarity=float(stationarity),
-    )
+    return {
+        "local_error_exponent": slope(STEP_SIZES, np.max(gap, axis=(1, 2))),
+        "lattice_mended_exponent": slope(STEP_SIZES, mended),
+        "lattice_sign_exponent": slope(STEP_SIZES, sign),
+        "lattice_slot_exponent": slope(STEP_SIZES, slot),
+        "stationarity": float(stationarity),
+    }
 
 
 @jax.jit
@@ -190,11 +113,21 @@ def _lattice_forms():
     return mended, sign, slot, jnp.max(gap)
 
 
-def symmetries(tick: Tick) -> Symmetries:
-    """The conformal factors of the examples, from points off the solutions."""
+def symmetries(tick: Tick) -> dict[str, float]:
+    """Conformal factors of the examples, each a least-squares Λ over points off the solutions.
+
+    Residuals are relative (round-off: Λ exists). `kepler_factor_off_…`: distance of the measured Λ
+    from (48) as printed, and from (1+ε) times it. `scaling_…`: with the generator (33) as printed,
+    and with its momentum part. `display_off_…`: distance of the equation of motion displayed after
+    (32) from (13) with W = q (printed) and with W = −q (mended).
+    """
     found = {k: float(v) for k, v in _conformal_factors().items()}
+    factor = found.pop("scaling_factor")
     tick(1.0)
-    return Symmetries(epsilon=EPSILON, **found)
+    return found | {
+        "scaling_factor_off_1": abs(factor - 1),
+        "scaling_factor_off_mended": abs(factor - 1 - EPSILON),
+    }
 
 
 @jax.jit
@@ -236,114 +169,95 @@ def _conformal_factors():
         return jnp.max(jax.vmap(gap)(*pairs(1)))
 
     return {
-        "rotation": kepler_factor(ROTATION, 0.0).residual,
-        "clocked": kepler_factor(CLOCKED_ROTATION, 0.0).residual,
-        "kepler_disturbed": disturbed.residual,
-        "kepler_off_printed": jnp.max(jnp.abs(disturbed.factor - printed)),
-        "kepler_off_mended": jnp.max(jnp.abs(disturbed.factor - (1 + EPSILON) * printed)),
-        "scaling_printed": without.residual,
-        "scaling_mended": with_momenta.residual,
+        "rotation_residual": kepler_factor(ROTATION, 0.0).residual,
+        "clocked_residual": kepler_factor(CLOCKED_ROTATION, 0.0).residual,
+        "kepler_factor_residual": disturbed.residual,
+        "kepler_factor_off_printed": jnp.max(jnp.abs(disturbed.factor - printed)),
+        "kepler_factor_off_mended": jnp.max(jnp.abs(disturbed.factor - (1 + EPSILON) * printed)),
+        "scaling_residual_printed": without.residual,
+        "scaling_residual_mended": with_momenta.residual,
         "scaling_factor": with_momenta.factor[0, 0],
-        "display_printed": display(1.0),
-        "display_mended": display(-1.0),
+        "display_off_printed": display(1.0),
+        "display_off_mended": display(-1.0),
     }
 
 
-def identities(tick: Tick) -> Identities:
-    """Noether's identities and the balance of the invariants along trajectories."""
-    kepler, oscillator = systems.kepler(), systems.oscillator()
-    start = np.sum(np.square(oscillator.q0) + np.square(oscillator.p0)) / 2
-    on_oscillator = {k: float(v) for k, v in _oscillator_identities().items()}
+def identities(tick: Tick) -> dict[str, float]:
+    """Noether's identities and the balance law along trajectories; largest absolute values.
+
+    Oscillator, relative to its energy: `oscillator_identity_0`, N_0 with the gauge −pq at ε = 0;
+    `…_1`, N_1 of (34) at ε, and `…_1_rest`, what is left of it after q_k(p_{k+1} − q_k) + εq_k².
+    Kepler at h = 0.1: `kepler_identity_1`, N_1 of (50), and its exponent in h;
+    `kepler_identity_rest`, after −(h/2)|Dq|², at all h. `law_31_gap`: D I − ε²W·(ξ − Dq ξ0) for
+    (50), with its exponent in h; `balance_gap`, the same with the causes that (31) leaves out, at
+    all h. `eta_p_off`, `xi_p_off`: largest distance of η·p and ξ·p from the angular momentum.
+    """
+    kepler = systems.kepler()
+    oscillator = systems.oscillator()
+    scale = float(np.sum(np.square(oscillator.q0) + np.square(oscillator.p0)) / 2)
+    on_oscillator = {k: float(v) / scale for k, v in _oscillator_identities().items()}
     tick(0.4)
     hs = np.array([0.1, 0.05, 0.02, 0.01])
     span = 20.0  # through the first two passages near the centre, where |Dq| is largest
-
-    def orbit(h):
-        return dvi.integrate(
-            kepler.system,
-            kepler.q0,
-            kepler.p0,
-            h=h,
-            num_steps=round(span / h),
-            epsilon=EPSILON,
-            args=kepler.args,
-            observe={"50": INVARIANT_50, "49": kepler.observables["angular_momentum"]},
-        )
-
-    runs, rows = [], []
+    observe = {"50": INVARIANT_50, "49": kepler.observables["angular_momentum"]}
+    orbits, rows = [], []
     for i, h in enumerate(hs):
-        run = orbit(h)
-        runs.append(run)
+        orbit = run(kepler, h, round(span / h), epsilon=EPSILON, observe=observe)
+        orbits.append(orbit)
         # As many triples at every h, evenly chosen: one compiled program for all of them.
         middle = np.linspace(1, round(span / h) - 1, 199).astype(int)
-        triples = [dvi.LatticePoint(run.ts[k], run.qs[k], run.ps[k]) for k in (middle - 1, middle)]
-        triples.append(dvi.LatticePoint(run.ts[middle + 1], run.qs[middle + 1], run.ps[middle + 1]))
-        values = run.observed["50"]
+        triples = [
+            dvi.LatticePoint(orbit.ts[k], orbit.qs[k], orbit.ps[k])
+            for k in (middle - 1, middle, middle + 1)
+        ]
+        values = orbit.observed["50"]
         gain = (values[middle] - values[middle - 1]) / h
-        rows.append({k: float(v) for k, v in _kepler_balance(triples, gain).items()})
+        rows.append(_kepler_balance(triples, gain))
         tick(0.4 + 0.6 * (i + 1) / len(hs))
+    column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    momentum = np.asarray(orbits[0].observed["49"])
+    q, p = np.asarray(orbits[0].qs)[1:], np.asarray(orbits[0].ps)[1:]
 
-    def column(name):
-        return np.array([row[name] for row in rows])
+    def turned_times_p(v):
+        return np.sum(np.stack([-v[:, 1], v[:, 0]], 1) * p, axis=1)
 
-    momentum = np.asarray(runs[0].observed["49"])
-    q, p = np.asarray(runs[0].qs)[1:], np.asarray(runs[0].ps)[1:]
-    eta_p = np.sum(np.stack([-p[:, 1], p[:, 0]], 1) * p, axis=1)
-    xi_p = np.sum(np.stack([-q[:, 1], q[:, 0]], 1) * p, axis=1)
-    return Identities(
-        epsilon=EPSILON,
-        **on_oscillator,
-        scale_oscillator=float(start),
-        hs=hs,
-        kepler_1=column("identity"),
-        kepler_1_rest=column("rest"),
-        law_31=column("law_31"),
-        balance=column("balance"),
-        rotation=float(np.max(column("rotation"))),
-        eta_p=float(np.max(np.abs(eta_p - momentum))),
-        xi_p=float(np.max(np.abs(xi_p - momentum))),
-    )
+    return on_oscillator | {
+        "kepler_identity_1": column["identity"][0],
+        "kepler_identity_exponent": slope(hs, column["identity"]),
+        "kepler_identity_rest": np.max(column["rest"]),
+        "law_31_gap": column["law_31"][0],
+        "law_31_smallest_gap": np.min(column["law_31"]),
+        "law_31_exponent": slope(hs, column["law_31"]),
+        "balance_gap": np.max(column["balance"]),
+        "eta_p_off": largest(turned_times_p(p) - momentum),
+        "xi_p_off": largest(turned_times_p(q) - momentum),
+    }
 
 
 @jax.jit
 def _oscillator_identities():
     problem = systems.oscillator()
-    generator = dvi.Generator(
-        xi0=lambda t, q, p, args: jnp.ones_like(t),
-        xi=lambda t, q, p, args: q,
-        eta=lambda t, q, p, args: p,
-    )
     gauges = [lambda t, q, p, args: -jnp.sum(p * q)] * 2
 
-    def pairs(epsilon):
-        run = dvi.integrate(
-            problem.system, problem.q0, problem.p0, h=problem.h, num_steps=500, epsilon=epsilon
-        )
-        points = dvi.LatticePoint(run.ts, run.qs, run.ps)
-        return jax.tree.map(lambda x: x[:-1], points), jax.tree.map(lambda x: x[1:], points)
-
     def identity(order, epsilon):
+        orbit = run(problem, problem.h, 500, epsilon=epsilon)
+        points = dvi.LatticePoint(orbit.ts, orbit.qs, orbit.ps)
+        first, second = (jax.tree.map(lambda x, k=k: x[k : 500 + k], points) for k in (0, 1))
+
         def one(first, second):
             return dvi.noether_identity(
-                problem.system,
-                [generator, generator],
-                gauges,
-                order,
-                first,
-                second,
-                jnp.asarray(epsilon),
+                problem.system, [SCALING] * 2, gauges, order, first, second, jnp.asarray(epsilon)
             )
 
-        first, second = pairs(epsilon)
         q0, p1 = first.q[:, 0], second.p[:, 0]
         return jax.vmap(one)(first, second), q0 * (p1 - q0) + epsilon * q0**2
 
     order_0, _ = identity(0, 0.0)
     order_1, known = identity(1, EPSILON)
     return {
-        "oscillator_0": jnp.max(jnp.abs(order_0)),
-        "oscillator_1": jnp.max(jnp.abs(order_1)),
-        "oscillator_1_rest": jnp.max(jnp.abs(order_1 - known)),
+        "oscillator_identity_0": jnp.max(jnp.abs(order_0)),
+        "oscillator_identity_1": jnp.max(jnp.abs(order_1)),
+        "oscillator_identity_1_rest": jnp.max(jnp.abs(order_1 - known)),
     }
 
 
@@ -360,24 +274,22 @@ def _kepler_balance(triples, gain):
     epsilon = jnp.asarray(EPSILON)
 
     def one(before, here, after, gain):
-        def identity(generators, gauges, order):
+        def identity(order):
             return dvi.noether_identity(
-                problem.system, generators, gauges, order, here, after, epsilon, problem.args
+                problem.system, series, gauges, order, here, after, epsilon, problem.args
             )
 
         velocity = (after.q - here.q) / (after.t - here.t)
-        zeroth, first = (identity(series, gauges, order) for order in (0, 1))
+        zeroth, first = identity(0), identity(1)
         _, xi, _ = CLOCKED_ROTATION(here, problem.args)
         work = EPSILON**2 * jnp.sum(-here.q * (xi - velocity))
         defect = dvi.lattice_defect(problem.system, (before, here, after), epsilon, problem.args)
         symmetry = zeroth + EPSILON * first
-        turning = identity([ROTATION, ROTATION], [None, None], 1)
         return {
             "identity": first,
             "rest": first + (after.t - here.t) / 2 * jnp.sum(velocity**2),
             "law_31": gain - work,
             "balance": gain - symmetry - work + (1 + EPSILON) * defect,
-            "rotation": turning,
         }
 
     before, here, after = triples

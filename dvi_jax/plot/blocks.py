@@ -51,13 +51,13 @@ class Bins(NamedTuple):
 
 
 def make_bins(size: int, pixels: int, order: np.ndarray | None = None) -> Bins:
-    """Pixels of equal counts of points as nearly as can be; one point each where there is room."""
+    """Pixels with nearly equal counts of points; one point each if there are enough pixels."""
     count = min(size, pixels)
     return Bins(size, np.arange(count) * size // count, order)
 
 
 class Lines(NamedTuple):
-    """What is made of each line of the grid along `dim`, before the numbers of a pixel meet.
+    """Function of each line of the grid along `dim`, applied before the reduction to pixels.
 
     - `function`: lines of shape (n, ...) → shape (m, ...).
     - `keeps`: whether `dim` is a dimension of the result, with m points; else m = 1.
@@ -80,40 +80,49 @@ class Picture(NamedTuple):
     points: int
 
 
+_COMBINE: dict[str, Any] = {"max": np.fmax, "min": np.fmin, "mean": np.add}
+
+
 def reduced(
     data: Any, bins: Mapping[str, Bins], reduce: str, lines: Lines | None = None
 ) -> Picture:
-    """The numbers of a grid, reduced to pixels.
+    """The values of a grid, reduced to pixels.
 
     - `data`: `xarray.DataArray`, of which one block is read at a time.
     - `bins`: dimension → its pixels, for each axis of the result in turn; the other dimensions
       are reduced as a whole.
     - `reduce`: a key of `REDUCTIONS`; entries that are not finite are left out.
 
-    **Raises** `ValueError` for a median where one pixel alone is more than a block.
+    **Raises** `ValueError` for a median if one pixel is larger than a block.
     """
-    shape = tuple(len(b.starts) for b in bins.values())
-    keep = _Median(shape) if reduce == "median" else _Running(shape, reduce)
-    missing = points = 0
-    whole = reduce == "median"
-    for pixels, block in blocks(data, bins, lines, whole):
-        block = np.where(np.isfinite(block), block, np.nan)
-        missing += int(np.isnan(block).sum())
+    shape, points = tuple(len(b.starts) for b in bins.values()), 0
+    nothing = 0.0 if reduce == "mean" else np.nan
+    values, counts = np.full(shape, nothing), np.zeros(shape, np.int64)
+    for pixels, block in blocks(data, bins, lines, whole=reduce == "median"):
+        finite = np.isfinite(block)
         points += block.size
-        keep.add(pixels, block)
-    return Picture(keep.result(), missing, points)
+        where, found = _by_pixel(pixels, finite.sum(0), np.add)
+        counts[where] += found
+        block = np.where(finite, block, nothing)
+        if reduce == "median":
+            _set_medians(values, pixels, block)
+        else:
+            combine = _COMBINE[reduce]
+            where, found = _by_pixel(pixels, combine.reduce(block, axis=0), combine)
+            values[where] = combine(values[where], found)
+    if reduce == "mean":
+        values = values / np.where(counts, counts, np.nan)
+    return Picture(values, points - int(counts.sum()), points)
 
 
-def counted(data: Any, bins: Mapping[str, Bins], codes: Sequence[int]) -> np.ndarray:
+def count_codes(data: Any, bins: Mapping[str, Bins], codes: Sequence[int]) -> np.ndarray:
     """How often each code occurs in each pixel, shape (codes, *pixels); read block by block."""
     shape = tuple(len(b.starts) for b in bins.values())
     counts = np.zeros((len(codes), *shape), np.int64)
     for pixels, block in blocks(data, bins):
         for i, code in enumerate(codes):
-            here = block == code
-            if here.any():
-                where, sums = _by_pixel(pixels, here.sum(0), np.add)
-                counts[i][where] += sums
+            where, sums = _by_pixel(pixels, (block == code).sum(0), np.add)
+            counts[i][where] += sums
     return counts
 
 
@@ -148,7 +157,7 @@ def _is(lines: Lines | None, dim: str) -> bool:
 def _selections(
     data: Any, bins: Mapping[str, Bins], lines: Lines | None, whole: bool
 ) -> Iterator[dict[str, Any]]:
-    """What is read at a time: whole chunks where the array tells its own, last dimension first."""
+    """Selections of one block each: whole chunks if they are known, last dimension first."""
     parts: dict[str, list[Any]] = {}
     sizes = dict(zip(data.dims, data.shape, strict=True))
     together = {d for d in sizes if _is(lines, d) or (whole and d not in bins)}
@@ -177,7 +186,7 @@ def _selections(
 
 
 def _whole_pixels(bins: Bins, room: int) -> tuple[list[Any], int]:
-    """The points of as many whole pixels as fit, a part at a time, and the room left."""
+    """The points of as many whole pixels as fit, a part at a time, and the size that remains."""
     count = len(bins.starts)
     step = min(count, max(1, room // bins.most))
     parts = [bins.points(i, min(i + step, count)) for i in range(0, count, step)]
@@ -194,54 +203,17 @@ def _check_pixel(sizes: Mapping[str, int], bins: Mapping[str, Bins], together: s
         )
 
 
-class _Running:
-    """Largest, smallest or mean of what has come so far."""
-
-    def __init__(self, shape: tuple[int, ...], reduce: str):
-        self.mean = reduce == "mean"
-        self.combine: Any = {"max": np.fmax, "min": np.fmin, "mean": np.add}[reduce]
-        self.values = np.full(shape, 0.0 if self.mean else np.nan)
-        self.counts = np.zeros(shape, np.int64)
-
-    def add(self, pixels: list[np.ndarray], block: np.ndarray) -> None:
-        if self.mean:
-            there = (~np.isnan(block)).sum(0)
-            where, counts = _by_pixel(pixels, there, np.add)
-            self.counts[where] += counts
-            block = np.nan_to_num(block, copy=False, nan=0.0)
-        where, values = _by_pixel(pixels, self.combine.reduce(block, axis=0), self.combine)
-        self.values[where] = self.combine(self.values[where], values)
-
-    def result(self) -> np.ndarray:
-        if not self.mean:
-            return self.values
-        with np.errstate(invalid="ignore"):
-            return self.values / np.where(self.counts, self.counts, np.nan)
-
-
-class _Median:
-    """Medians of pixels that come whole."""
-
-    def __init__(self, shape: tuple[int, ...]):
-        self.values = np.full(shape, np.nan)
-
-    def add(self, pixels: list[np.ndarray], block: np.ndarray) -> None:
-        each = [[np.flatnonzero(p == k) for k in np.unique(p)] for p in pixels]
-        numbers = [np.unique(p) for p in pixels]
-        for at in np.ndindex(*(len(e) for e in each)):
-            inside = np.ix_(*(e[i] for e, i in zip(each, at, strict=True)))
-            values = block[(slice(None), *inside)]
-            values = values[~np.isnan(values)]
-            if values.size:
-                place = tuple(n[i] for n, i in zip(numbers, at, strict=True))
-                self.values[place] = np.median(values)
-
-    def result(self) -> np.ndarray:
-        return self.values
+def _set_medians(values: np.ndarray, pixels: list[np.ndarray], block: np.ndarray) -> None:
+    """Medians of the pixels that lie in a block, each of them as a whole."""
+    each = [[(k, np.flatnonzero(p == k)) for k in np.unique(p)] for p in pixels]
+    for chosen in itertools.product(*each):
+        part = block[np.ix_(np.arange(len(block)), *(inside for _, inside in chosen))]
+        if not np.isnan(part).all():
+            values[tuple(k for k, _ in chosen)] = np.nanmedian(part)
 
 
 def _by_pixel(pixels: list[np.ndarray], values: np.ndarray, combine: Any) -> tuple[Any, np.ndarray]:
-    """(open mesh of the pixels that are met, values of shape `points` combined to them)."""
+    """(index of the pixels that have points, values of shape `points` combined to them)."""
     met = []
     for axis, numbers in enumerate(pixels):
         if (np.diff(numbers) < 0).any():

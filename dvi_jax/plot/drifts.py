@@ -5,25 +5,23 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import ListedColormap, LogNorm
+from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from ..invariants import DriftOrder, DriftSurface
-from .house import (
-    COLOURS,
-    HATCH,
-    MARKERS,
-    PALE,
-    SHADES,
-    ZERO,
+from ..discover import DriftOrder, DriftSurface
+from .axes import (
     canvas,
     cell_edges,
-    in_style,
+    cells,
+    flat_cells,
+    guide,
     legend,
-    named,
     stack,
+    without_place,
+    without_place_entries,
 )
+from .style import COLOURS, GREY, HATCH, MARKERS, SHADES, ZERO, in_style, named
 
 
 @in_style
@@ -42,12 +40,12 @@ def balance(
     - `ts`: a `dvi.Balance`, as `dvi.noether_balance` returns it; or start of each step, shape (S,),
       with `drift`: rate of change, shape (S,), and `causes`: label → its share of the rate, shape
       (S,).
-    - `cumulative`: what has come together since the first of `ts`, Σ rate · step, in place of
+    - `cumulative`: the sum Σ rate · step since the first of `ts`, in place of
       rates: 0 there, and at each later time what the steps before it brought. The last rate has no
       part in it, as nothing says when its step ends.
-    - `unit`: of the rates, of what has come together with `cumulative`. `ax`: two `Axes`.
+    - `unit`: of the rates, of the sums with `cumulative`. `ax`: two `Axes`.
 
-    Areas stand upon one another: what raises the invariant upward from 0, what lowers it downward.
+    The areas are stacked: causes that raise the invariant upward from 0, others downward.
     The line is the drift; below is what it differs from the sum of the causes by.
 
     **Returns** the `Axes` of the stack and of what is left, shape (2,).
@@ -57,12 +55,11 @@ def balance(
     t, rate, shares = _of_balance(ts, drift, causes)
     if cumulative:
         rate, shares = _summed(t, rate), {name: _summed(t, v) for name, v in shares.items()}
-    (top, bottom), new = stack(
-        ax, 2, "the stack and what is left", (6.4, 4.6), sharex=True,
-        gridspec_kw={"height_ratios": (3, 1)},
-    )  # fmt: skip
+    ratios = {"height_ratios": (3, 1)}
+    what = "the stack and what is left"
+    (top, bottom), new = stack(ax, 2, what, (6.4, 4.6), sharex=True, gridspec_kw=ratios)
     up = down = np.zeros(len(t))
-    # Hatches, too, tell areas apart where there are no colours.
+    # Hatches distinguish the areas in print without colours.
     looks = zip(itertools.cycle(COLOURS[:-1]), itertools.cycle(_HATCHES))
     for (label, values), (colour, hatch) in zip(shares.items(), looks, strict=False):
         look = {"facecolor": colour, "hatch": hatch, "edgecolor": "#ffffff", "linewidth": 0}
@@ -114,17 +111,17 @@ def _of_balance(
 def drift_orders(
     results: Mapping[str, DriftOrder] | Sequence[DriftOrder],
     promised: Sequence[float | None] | float | None = None,
-    title: str = "Largest drift against the disturbance",
+    title: str = "Largest drift against the perturbation",
     ax: Any = None,
 ) -> Any:
-    """Drifts over ε (`drift_order`) beside the orders that were promised.
+    """Drifts over ε (`drift_order`) and the orders that were promised.
 
     - `results`: label → measured order, or a sequence of them.
     - `promised`: z + 1 for each result in turn (None: no promise), or one for all; a grey line
       of that slope goes through the first point of the fit.
 
     Hollow points are excluded from the fit; bars at the left end mark the drift at ε = 0. Drifts
-    that failed stand as crosses at the top, those exactly 0 as triangles at the bottom, and the
+    that failed are crosses at the top, those exactly 0 as triangles at the bottom, and the
     legend counts them. `ax`: where to draw.
 
     **Returns** the `Axes`.
@@ -140,50 +137,49 @@ def drift_orders(
             )
     slopes = _one_each(promised, len(results))
     axis, new = canvas(ax, (6.4, 4.8))
-    left = min(order.epsilons.min() for order in results.values())
-    looks = zip(results.items(), slopes, itertools.cycle(COLOURS), MARKERS * 9, strict=False)
-    failed = nought = total = left_out = 0
+    left = 0.7 * min(order.epsilons.min() for order in results.values())
+    looks = zip(results.items(), slopes, itertools.cycle(COLOURS), itertools.cycle(MARKERS))
+    lost, total, excluded = np.zeros(2, int), 0, False
     for (label, order), slope, colour, marker in looks:
-        x, y, used = order.epsilons, np.asarray(order.drifts), order.used
-        there = np.isfinite(y) & (y > 0)
-        text = _slope_text(order)
-        if slope is not None:
-            text += f", promised {slope:g}"
-        axis.loglog(x[used], y[used], marker, color=colour)
-        out = there & ~used
-        left_out += out.sum()
-        axis.loglog(x[out], y[out], marker, color=colour, markerfacecolor="white")
-        face = colour if used.any() else "white"
-        axis.plot([], [], marker, color=colour, markerfacecolor=face, label=f"{label}: {text}")
+        text = f"{label}: {_slope_text(order)}" + ("" if slope is None else f", promised {slope:g}")
+        excluded |= _draw_order(axis, order, text, color=colour, marker=marker)
+        # The drift at ε = 0 is a bar at the left end of the axis.
         if np.isfinite(order.floor) and order.floor > 0:
-            axis.plot(left * 0.7, order.floor, "_", color=colour, markersize=12, markeredgewidth=2)
-        # Without a place on this axis: with that at ε = 0, where the bar would stand.
-        xs, ys = np.append(x, left * 0.7), np.append(y, order.floor)
-        edge = {"transform": axis.get_xaxis_transform(), "color": colour, "linestyle": "none"}
-        for here, at, mark in ((~np.isfinite(ys), 0.985, "x"), (ys == 0, 0.015, "v")):
-            if here.any():
-                axis.plot(xs[here], np.full(here.sum(), at), mark, markersize=6, **edge)
-        failed, nought = failed + int(np.sum(~np.isfinite(ys))), nought + int(np.sum(ys == 0))
-        total += len(ys)
-        if slope is not None and used.any():
-            first = np.argmin(np.where(used, x, np.inf))
-            ends = np.array([x[first], x.max()])
-            guide = y[first] * (ends / x[first]) ** slope
-            axis.loglog(ends, guide, color="#888888", linewidth=1, linestyle="--", zorder=1)
-    if promised is not None:
-        axis.plot([], [], color="#888888", linewidth=1, linestyle="--", label="slope promised")
-    if left_out:
-        label = "excluded from the fit"
-        axis.plot([], [], "o", color="#444444", markerfacecolor="white", label=label)
-    axis.plot([], [], "_", color="#444444", markersize=12, markeredgewidth=2, label="at ε = 0")
+            axis.plot(left, order.floor, color=colour, **_BAR)
+        x, y = np.append(order.epsilons, left), np.append(order.drifts, order.floor)
+        lost += without_place(axis, x, y, colour)
+        total += len(y)
+        if slope is not None and order.used.any():
+            first = np.argmin(np.where(order.used, order.epsilons, np.inf))
+            start = order.epsilons[first], order.epsilons.max()
+            guide(axis, start, np.asarray(order.drifts)[first], slope, zorder=1)
     axis.set(xscale="log", yscale="log", xlabel="ε", ylabel="largest drift", title=title)
-    handles = axis.get_legend_handles_labels()[0]
-    for count, mark, what in ((failed, "x", "failed"), (nought, "v", "are exactly 0")):
-        if count:
-            handles.append(Line2D([], [], color=PALE, marker=mark, linestyle="none",
-                                  label=f"{count} of {total} drifts {what}"))  # fmt: skip
-    legend(axis, new, handles)
+    extra: list[Any] = []
+    if promised is not None:
+        dashed: Any = {"color": GREY, "linestyle": "--", "linewidth": 1}
+        extra.append(Line2D([], [], label="slope promised", **dashed))
+    if excluded:
+        hollow: Any = {"marker": "o", "markerfacecolor": "white", "linestyle": "none"}
+        extra.append(Line2D([], [], color="#444444", label="excluded from the fit", **hollow))
+    extra.append(Line2D([], [], color="#444444", label="at ε = 0", **_BAR))
+    extra += without_place_entries(lost, total, ("drifts failed", "drifts are exactly 0"))
+    legend(axis, new, extra)
     return axis
+
+
+_BAR: dict[str, Any] = {"marker": "_", "markersize": 12, "markeredgewidth": 2, "linestyle": "none"}
+
+
+def _draw_order(axis: Any, order: DriftOrder, label: str, **look: Any) -> bool:
+    """Drifts over ε, hollow where they are excluded from the fit; whether any are."""
+    x, y, used = order.epsilons, np.asarray(order.drifts), order.used
+    out = np.isfinite(y) & (y > 0) & ~used
+    look = {"linestyle": "none", **look}
+    axis.loglog(x[used], y[used], **look)
+    axis.loglog(x[out], y[out], markerfacecolor="white", **look)
+    face = look["color"] if used.any() else "white"
+    axis.plot([], [], markerfacecolor=face, label=label, **look)
+    return bool(out.any())
 
 
 @in_style
@@ -204,32 +200,47 @@ def drift_surface(
 
     **Returns** the `Axes`, shape (2,).
     """
-    (left, right), new = stack(
-        ax, 2, "the drifts and their orders", (9.6, 4.2), ncols=2,
-        gridspec_kw={"width_ratios": (5, 4)},
-    )  # fmt: skip
-    drifts = np.asarray(surface.drifts)
-    nought, failed = drifts == 0, ~np.isfinite(drifts)
-    shown = np.ma.masked_where(nought | failed, drifts)
+    ratios = {"width_ratios": (5, 4)}
+    what = "the drifts and their orders"
+    (left, right), new = stack(ax, 2, what, (9.6, 4.2), ncols=2, gridspec_kw=ratios)
     edges = cell_edges(surface.epsilons, log=True), cell_edges(surface.hs, log=True)
-    norm = LogNorm() if shown.count() else None
-    image = left.pcolormesh(*edges, shown.T, norm=norm, cmap=SHADES, rasterized=True)
-    left.figure.colorbar(image, ax=left, label="largest drift")
-    left.grid(False)
-    left.patch.set(**HATCH)
-    i, j = np.nonzero(~surface.used & ~failed)
-    left.plot(
-        surface.epsilons[i], surface.hs[j], "o", color="black", markerfacecolor="white",
-        markersize=4, markeredgewidth=0.8, linestyle="none", label="excluded from the fit",
-    )  # fmt: skip
-    handles = left.get_legend_handles_labels()[0] if len(i) else []
-    if nought.any():
-        black = np.ma.masked_where(~nought, np.ones(drifts.shape))
-        left.pcolormesh(*edges, black.T, cmap=ListedColormap([ZERO]), rasterized=True)
-        handles.append(Patch(color=ZERO, label=f"{nought.sum()} of {drifts.size} exactly 0"))
-    if failed.any():
-        handles.append(Patch(label=f"{failed.sum()} of {drifts.size} failed", **HATCH))
+    entries = _draw_drifts(left, surface, edges)
     left.set(xscale="log", yscale="log", xlabel="ε", ylabel="step size h", title=title)
+    _draw_orders_in_epsilon(right, surface, promised)
+    right.set(xscale="log", xlabel="step size h", ylabel="order in ε", title="Order in ε")
+    right.set_xlim(*edges[1][[0, -1]])
+    orders = right.get_legend_handles_labels()[0]
+    legend(left, new, entries + (orders if new else []), labelled=False)
+    if not new:
+        legend(right, new)
+    return np.asarray([left, right])
+
+
+def _draw_drifts(axis: Any, surface: DriftSurface, edges: Any) -> list[Any]:
+    """A map of the drifts, with dots where they are excluded from the fits; its legend entries."""
+    drifts = np.asarray(surface.drifts)
+    zero, failed = drifts == 0, ~np.isfinite(drifts)
+    norm = None if (zero | failed).all() else LogNorm()
+    x, y = edges
+    image = cells(axis, x, y, np.where(zero, np.nan, drifts).T, norm, SHADES)
+    axis.figure.colorbar(image, ax=axis, label="largest drift")
+    flat_cells(axis, x, y, zero.T, ZERO)
+    entries: list[Any] = []
+    i, j = np.nonzero(~surface.used & ~failed)
+    if len(i):
+        look: Any = {"color": "black", "markerfacecolor": "white", "markersize": 4}
+        look |= {"markeredgewidth": 0.8, "linestyle": "none", "marker": "o"}
+        label = "excluded from the fit"
+        entries += axis.plot(surface.epsilons[i], surface.hs[j], label=label, **look)
+    if zero.any():
+        entries.append(Patch(color=ZERO, label=f"{zero.sum()} of {drifts.size} exactly 0"))
+    if failed.any():
+        entries.append(Patch(label=f"{failed.sum()} of {drifts.size} failed", **HATCH))
+    return entries
+
+
+def _draw_orders_in_epsilon(axis: Any, surface: DriftSurface, promised: float | None) -> None:
+    """The orders in ε at each h with their 95 % intervals."""
     measured = np.isfinite(surface.slopes)
     resolved = np.array([order.resolved for order in surface.orders])
     low, high = surface.intervals.T
@@ -238,31 +249,17 @@ def drift_surface(
         (measured & ~resolved, "white", "not resolved: slope of the straight line"),
     ):
         if here.any():
-            slopes = surface.slopes[here]
-            right.errorbar(
-                surface.hs[here], slopes, yerr=[slopes - low[here], high[here] - slopes], fmt="o",
-                color=COLOURS[0], markerfacecolor=face, capsize=3, label=label,
-            )  # fmt: skip
+            y = surface.slopes[here]
+            look = {"color": COLOURS[0], "markerfacecolor": face, "capsize": 3, "label": label}
+            bars = [y - low[here], high[here] - y]
+            axis.errorbar(surface.hs[here], y, yerr=bars, fmt="o", **look)
     if promised is not None:
-        right.axhline(promised, color="#888888", linewidth=1, linestyle="--", label="promised")
-        right.set_ylim(
-            min([promised - 0.1, *(low[measured] - 0.05)]),
-            max([promised + 0.1, *(high[measured] + 0.05)]),
-        )
+        axis.axhline(promised, color=GREY, linewidth=1, linestyle="--", label="promised")
+        least, most = [promised - 0.1, *(low[measured] - 0.05)], [promised + 0.1]
+        axis.set_ylim(min(least), max([*most, *(high[measured] + 0.05)]))
+    look = {"rotation": 90, "ha": "center", "va": "bottom", "fontsize": 8, "color": "#555555"}
     for value in surface.hs[~measured]:
-        right.annotate(
-            "no order", (value, 0.02), xycoords=("data", "axes fraction"), rotation=90,
-            ha="center", va="bottom", fontsize=8, color="#555555",
-        )  # fmt: skip
-    right.set(xscale="log", xlabel="step size h", ylabel="order in ε", title="Order in ε")
-    right.set_xlim(*edges[1][[0, -1]])
-    orders = right.get_legend_handles_labels()[0]
-    if new:
-        legend(left, new, handles + orders)
-    else:
-        legend(left, new, handles)
-        legend(right, new, orders)
-    return np.asarray([left, right])
+        axis.annotate("no order", (value, 0.02), xycoords=("data", "axes fraction"), **look)
 
 
 def _slope_text(order: DriftOrder) -> str:

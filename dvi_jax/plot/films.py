@@ -1,36 +1,45 @@
 """Films of orbits: GIF by Pillow, which comes with matplotlib, MP4 by ffmpeg, if it is there."""
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.animation import FFMpegWriter, writers
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
+from PIL import Image
 
 from . import series
-from .house import in_style, legend, named
-from .orbits import View, check_names, label_view, phase_portrait, view_of
-from .states import CROSS, Lane, Looks, cross, lanes_of, looks_of, one_shape, subscript, troubles
+from .axes import legend
+from .orbits import View, check_names, label_plane, label_view, phase_portrait, view_of
+from .states import Lane, cross, lanes_of, looks_of, one_shape, troubles
+from .style import CROSS, STAR, in_style
 
 _SUFFIXES = (".gif", ".mp4")
 _FASTEST_GIF = 50
 """Frames a second: viewers slow down a GIF with shorter delays than 2/100 s."""
 
 _MOST_BYTES = 2**28
-"""Of the frames of a GIF, a byte for each pixel, all in memory until they are written."""
+"""Largest size of all frames of a GIF, a byte for each pixel, which are in memory together."""
 
 _TAIL = 300
 """Segments of a tail at most."""
 
 _GHOSTS = 12
-"""Orbits up to which each is drawn as a whole, pale, behind what moves."""
+"""Largest number of tracks that are drawn as a whole, pale, behind the moving parts."""
+
+_DOT: dict[str, Any] = {"marker": "o", "linestyle": "none", "markersize": 6}
+_DOT |= {"markeredgecolor": "black", "markeredgewidth": 0.6}
 
 
 class _Track(NamedTuple):
-    """What moves: coordinates of shape (S,) each, its orbit and its colour."""
+    """One moving body: its coordinates, of shape (S,) each, its orbit and its colour."""
 
     lane: int
     coordinates: list[np.ndarray]
@@ -64,7 +73,7 @@ def animate(
     """A film of orbits with a fading tail, evenly in time; of one degree of freedom in (q, p).
 
     - `orbits`, `coordinates`, `bodies`, `centre`, `names`, `labels`, `units`, `title`: as for
-      `orbit`; `units` of "t" as well, beside the time that is shown.
+      `orbit`; `units` also of "t", for the time that is shown.
     - `path`: ends in ``.gif``, or in ``.mp4`` if ffmpeg is installed. Its folder must exist.
     - `beside`: "phase_portrait", of `dof`, or "invariants", of `values`, `change` and `log`: a
       second picture, as the functions of these names draw it, in which the moment is marked.
@@ -85,7 +94,7 @@ def animate(
     path = Path(path)
     _check_film(path, seconds, fps, tail, beside)
     lanes = lanes_of(orbits, "animate", labels, momenta=False)
-    tracks, view, looks = _tracks(lanes, coordinates, bodies, centre, names)
+    tracks, view = _tracks(lanes, coordinates, bodies, centre, names)
     times = _moments(lanes, seconds * fps)
     width, height = size or ((9.6, 4.6) if beside else (5.0, 4.8))
     pixels = round(width * dpi) * round(height * dpi)
@@ -99,8 +108,8 @@ def animate(
     space = view is not None and len(view.coordinates) == 3
     grid = figure.add_gridspec(1, 2 if beside else 1)
     axis = figure.add_subplot(grid[0], projection="3d" if space else None)
-    scene = _Scene(axis, tracks, lanes, times, tail, (units or {}).get("t"))
-    scene.prepare(view, looks, units or {}, title)
+    scene = _Scene(axis, tracks, lanes, times, tail)
+    scene.prepare(view, units or {}, title)
     if beside == "phase_portrait":
         scene.mark_phase(figure.add_subplot(grid[1]), orbits, dof, units)
     elif beside == "invariants":
@@ -124,32 +133,25 @@ def _check_film(path: Path, seconds: float, fps: float, tail: float, beside: Any
         raise ValueError(f"a film is a .gif or an .mp4, got {path.name!r}.")
     if not path.parent.is_dir():
         raise ValueError(f"the folder of the film is not there: {path.parent}.")
-    for name, value, good in (
-        ("seconds", seconds, 0 < seconds < math.inf),
-        ("fps", fps, 0 < fps < math.inf),
-        ("tail", tail, 0 <= tail <= 1),
-    ):
-        if not good:
-            wanted = "a share from 0 to 1" if name == "tail" else "a positive number"
-            raise ValueError(f"{name} must be {wanted}, got {value!r}.")
+    for name, value in (("seconds", seconds), ("fps", fps)):
+        if not 0 < value < math.inf:
+            raise ValueError(f"{name} must be a positive number, got {value!r}.")
+    if not 0 <= tail <= 1:
+        raise ValueError(f"tail must be a share from 0 to 1, got {tail!r}.")
     if suffix == ".gif" and fps > _FASTEST_GIF:
         raise ValueError(f"a GIF shows at most {_FASTEST_GIF} frames a second, got fps={fps:g}.")
     if beside not in (None, "phase_portrait", "invariants"):
         raise ValueError(f'beside must be "phase_portrait" or "invariants", got {beside!r}.')
-    if suffix == ".mp4":
-        from matplotlib.animation import writers
-
-        if not writers.is_available("ffmpeg"):
-            raise RuntimeError(
-                "an .mp4 is written by ffmpeg, which is not found: install it (apt install ffmpeg, "
-                'brew install ffmpeg, conda install ffmpeg), name it by matplotlib.rcParams["'
-                'animation.ffmpeg_path"], or write a .gif, which needs nothing more.'
-            )
+    if suffix == ".mp4" and not writers.is_available("ffmpeg"):
+        raise RuntimeError(
+            "an .mp4 is written by ffmpeg, which is not found: install it (apt, brew or conda "
+            'install ffmpeg), set matplotlib.rcParams["animation.ffmpeg_path"], or write a .gif.'
+        )
 
 
 def _tracks(
     lanes: Sequence[Lane], coordinates: Any, bodies: Any, centre: Any, names: Any
-) -> tuple[list[_Track], View | None, Looks]:
+) -> tuple[list[_Track], View | None]:
     shape = one_shape(lanes, "animate")
     check_names(lanes, shape, names)
     if math.prod(shape) == 1 and coordinates is None:
@@ -159,15 +161,16 @@ def _tracks(
                 raise TypeError("a film of one degree of freedom needs momenta: (ts, qs, ps).")
             pair = [lane.qs.reshape(-1), lane.ps.reshape(-1)]
             tracks.append(_Track(i, pair, looks.colours[i], lane.label))
-        return tracks, None, looks
+        return tracks, None
     view = view_of(shape, coordinates, bodies, centre, names)
     several = len(lanes) > 1
     looks = looks_of(len(lanes) if several else len(view.bodies))
-    return [
-        _Track(i, view.of(lane.qs, k), looks.colours[i if several else k],
-               (lane.label if k == 0 else "") if several else view.names[k])
-        for i, lane in enumerate(lanes) for k in range(len(view.bodies))
-    ], view, looks  # fmt: skip
+    tracks = []
+    for (i, lane), k in itertools.product(enumerate(lanes), range(len(view.bodies))):
+        name = view.names[k] if not several else lane.label if k == 0 else ""
+        colour = looks.colours[i if several else k]
+        tracks.append(_Track(i, view.of(lane.qs, k), colour, name))
+    return tracks, view
 
 
 def _moments(lanes: Sequence[Lane], frames: float) -> np.ndarray:
@@ -184,23 +187,18 @@ def _moments(lanes: Sequence[Lane], frames: float) -> np.ndarray:
 
 
 class _Scene:
-    """The figure of a film, and what moves in it."""
+    """The figure of a film, and its moving parts."""
 
     def __init__(
-        self, axis: Any, tracks: list[_Track], lanes: list[Lane], times: np.ndarray, tail: float,
-        unit: str | None,
-    ):  # fmt: skip
-        self.axis, self.tracks, self.lanes, self.times, self.unit = axis, tracks, lanes, times, unit
-        self.space = axis.name == "3d"
+        self, axis: Any, tracks: list[_Track], lanes: list[Lane], times: np.ndarray, tail: float
+    ):
+        self.axis, self.tracks, self.lanes, self.times = axis, tracks, lanes, times
         self.length = tail * abs(times[-1] - times[0])
         self.sign = 1.0 if times[-1] >= times[0] else -1.0
-        step = abs(times[-1] - times[0]) / len(times)
-        self.digits = int(np.clip(np.ceil(-np.log10(step)), 0, 12)) if step > 0 else 0
-        # Each orbit as far as it goes: behind that there is nothing to be found.
+        # Each orbit until its last state.
         self.last = [lane.ended for lane in lanes]
-        self.clock = [
-            self.sign * lane.ts[: n + 1] for lane, n in zip(lanes, self.last, strict=True)
-        ]
+        ends = zip(lanes, self.last, strict=True)
+        self.clock = [self.sign * lane.ts[: n + 1] for lane, n in ends]
         longest = max(len(c) for c in self.clock)
         self.stride = max(1, math.ceil(tail * longest / _TAIL))
         self.heads: list[Any] = []
@@ -208,40 +206,35 @@ class _Scene:
         self.crosses: list[Any] = []
         self.moving: list[Callable[[int, float], None]] = []
 
-    def prepare(
-        self, view: View | None, looks: Looks, units: Mapping[str, str], title: str
-    ) -> None:
-        """What stands still, and one head and one tail for each track."""
-        from matplotlib.collections import LineCollection
-        from mpl_toolkits.mplot3d.art3d import Line3DCollection
-
-        axis, ghosts = self.axis, len(self.tracks) <= _GHOSTS
+    def prepare(self, view: View | None, units: Mapping[str, str], title: str) -> None:
+        """Draw what does not move, and one head, tail and cross for each track."""
+        axis, space = self.axis, self.axis.name == "3d"
+        pale = {"color": "#cccccc", "linewidth": 0.6, "zorder": 0.8}
+        pale["alpha"] = 1.0 if len(self.tracks) <= _GHOSTS else 0.0
         for track in self.tracks:
-            axis.plot(*track.coordinates, color="#cccccc", linewidth=0.6,
-                      alpha=1.0 if ghosts else 0.0, zorder=0.8)  # fmt: skip
+            axis.plot(*track.coordinates, **pale)
             start = [[float(x[0])] for x in track.coordinates]
             nothing = [np.tile(np.ravel(start), (2, 1))]
-            if self.space:
+            if space:
                 self.tails.append(axis.add_collection3d(Line3DCollection(nothing)))
             else:
                 self.tails.append(axis.add_collection(LineCollection(nothing), autolim=False))
             self.tails[-1].set_linewidth(1.6)
-            self.heads += axis.plot(*start, marker="o", color=track.colour, linestyle="none",
-                                    markersize=6, markeredgecolor="black", markeredgewidth=0.6,
-                                    label=track.name or None, zorder=4)  # fmt: skip
+            look = {"color": track.colour, "label": track.name or None, "zorder": 4}
+            self.heads += axis.plot(*start, **_DOT, **look)
             self.crosses += axis.plot(*start, linestyle="none", zorder=5, **CROSS)
         if view is None:
-            axis.set_xlabel(named(subscript("q", (0,), (1,)), units.get("q")))
-            axis.set_ylabel(named(subscript("p", (0,), (1,)), units.get("p")))
+            label_plane(axis, (0,), (1,), units)
         else:
             if view.mark is not None:
-                axis.plot(*([x] for x in view.mark), marker="*", color="#E69F00", markersize=11,
-                          markeredgecolor="black", linestyle="none", zorder=3)  # fmt: skip
+                axis.plot(*([x] for x in view.mark), zorder=3, **STAR)
             label_view(axis, view, units)
-        handles = axis.get_legend_handles_labels()[0]
-        handles += [cross(text) for text in troubles(self.lanes)]
-        legend(axis, True, handles)
+        legend(axis, True, [cross(text) for text in troubles(self.lanes)])
         axis.set_title(title)
+        step = abs(self.times[-1] - self.times[0]) / len(self.times)
+        digits = int(np.clip(np.ceil(-np.log10(step)), 0, 12)) if step > 0 else 0
+        unit = "" if units.get("t") in (None, "", "1") else f" {units['t']}"
+        self.clock_text = f"t = {{:.{digits}f}}{unit}"
 
     def mark_phase(self, axis: Any, orbits: Any, dof: Any, units: Any) -> None:
         """A phase portrait with a dot at the moment."""
@@ -249,12 +242,8 @@ class _Scene:
         dof = (0,) * len(shape) if dof is None else dof
         phase_portrait(orbits, dof=dof, units=units, ax=axis)
         place = (dof,) if isinstance(dof, int) else tuple(dof)
-        looks = looks_of(len(self.lanes))
-        dots = [
-            axis.plot([], [], "o", color=c, markeredgecolor="black", markeredgewidth=0.6,
-                      markersize=6, zorder=5)[0]
-            for c in looks.colours
-        ]  # fmt: skip
+        colours = looks_of(len(self.lanes)).colours
+        dots = [axis.plot([], [], color=c, zorder=5, **_DOT)[0] for c in colours]
 
         def move(lane: int, t: float) -> None:
             k, one = self._now(lane, t), self.lanes[lane]
@@ -294,11 +283,7 @@ class _Scene:
         for move in self.moving:
             for lane in range(len(self.lanes)):
                 move(lane, t)
-        text = f"t = {t:.{self.digits}f}"
-        self.axis.set_title(
-            text if self.unit in (None, "", "1") else f"{text} {self.unit}", loc="right",
-            fontweight="normal",
-        )  # fmt: skip
+        self.axis.set_title(self.clock_text.format(t), loc="right", fontweight="normal")
 
     def _show_track(self, i: int, track: _Track, t: float) -> None:
         now, last = self._now(track.lane, t), self.last[track.lane]
@@ -308,7 +293,7 @@ class _Scene:
         places = np.arange(first, now + 1)
         places = places[(places % self.stride == 0) | (places == now)]
         points = np.stack([x[places] for x in track.coordinates], 1)
-        if len(points) < 2:  # a tail of no length: matplotlib has no room for one of no points
+        if len(points) < 2:  # matplotlib cannot draw a tail without points
             points = np.full((2, len(track.coordinates)), np.nan)
         segments = np.stack([points[:-1], points[1:]], 1)
         fade = np.linspace(0, 1, len(segments) + 1)[1:]
@@ -329,8 +314,6 @@ def _put(line: Any, coordinates: Sequence[Any]) -> None:
 
 
 def _write_gif(path: Path, scene: _Scene, canvas: Any, seconds: float, progress: Any) -> None:
-    from PIL import Image
-
     def drawn() -> Any:
         canvas.draw()
         return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
@@ -354,7 +337,7 @@ def _write_gif(path: Path, scene: _Scene, canvas: Any, seconds: float, progress:
             yield drawn().quantize(palette=palette, dither=Image.Dither.NONE)
             progress(frame + 1, count)
 
-    # Delays are whole hundredths of a second: together they are what was asked for.
+    # Delays are whole hundredths of a second, and their sum is `seconds`.
     ends = np.round(100 * seconds * np.arange(count + 1) / count)
     delays = [int(10 * d) for d in np.diff(ends)]
     images = frames()
@@ -364,10 +347,9 @@ def _write_gif(path: Path, scene: _Scene, canvas: Any, seconds: float, progress:
 
 
 def _write_mp4(path: Path, scene: _Scene, canvas: Any, seconds: float, progress: Any) -> None:
-    from matplotlib.animation import FFMpegWriter
-
     count, figure = len(scene.times), canvas.figure
-    writer = FFMpegWriter(fps=count / seconds)  # type: ignore[arg-type]
+    rate: Any = count / seconds
+    writer = FFMpegWriter(fps=rate)
     with writer.saving(figure, str(path), figure.dpi):
         for frame in range(count):
             scene.show(frame)

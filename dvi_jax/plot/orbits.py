@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,29 +11,18 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from .house import COLOURS, DASHES, MARKS, canvas, in_style, legend, named, path, stack
-from .states import (
-    CROSS,
-    START,
-    Lane,
-    Looks,
-    cross,
-    lanes_of,
-    looks_of,
-    one_shape,
-    place_in,
-    subscript,
-    troubles,
-)
+from .axes import canvas, legend, path, stack
+from .states import Lane, Looks, cross, lanes_of, looks_of, one_shape, place_in, subscript, troubles
+from .style import COLOURS, CROSS, DASHES, MARKS, STAR, START, in_style, named
 
 _PANELS = 6
-"""Degrees of freedom up to which each has a panel unasked."""
+"""Largest number of degrees of freedom that are drawn without a selection."""
 
 _MARKS = 9
-"""Along a line, to tell it from others."""
+"""Number of markers along a line, which distinguish it from others."""
 
 _NARROW = 0.45
-"""Of the longest side of a box in space: others are at least so long."""
+"""Shortest side of a box in space, relative to the longest."""
 
 _MESH = 161
 """Points of a side of the mesh on which a Hamiltonian is drawn."""
@@ -65,12 +54,12 @@ def phase_portrait(
       which.
     - `period`: of q as an angle, which is drawn from −period/2 to period/2.
     - `dots`: the states alone, without a line between them.
-    - `labels`: one name for each orbit. `colour`: a number for each, told by a bar with
+    - `labels`: one name for each orbit. `colour`: a number for each, shown by a bar with
       `colour_label`; NaN is grey.
     - `units`: of "q" and "p". `ax`: where to draw, one `Axes` for each panel.
 
-    Circles are starts; crosses stand where an orbit ended too early, and the legend says why. Up to
-    seven orbits have marks along them, as dashes run into one another where an orbit retraces
+    Circles are initial states; crosses mark early ends of orbits, with the reason in the legend.
+    Up to seven orbits have marks along them, as dashes run into one another where an orbit retraces
     itself.
 
     **Returns** the `Axes`, an array of them for a list or for several degrees of freedom.
@@ -83,20 +72,16 @@ def phase_portrait(
     shape, units = one_shape(lanes, what), units or {}
     places = _places(shape, dof, what)
     looks = looks_of(len(lanes), colour)
-    size = (5.2, 4.4) if len(places) == 1 else (1.2 + 3.4 * min(3, len(places)), 4.0)
-    if len(places) > 3:
-        size = (size[0], 6.8)
-    axes, new = stack(
-        ax, len(places), "one for each degree of freedom", size, ncols=min(3, len(places))
-    )
+    columns, height = min(3, len(places)), 4.0 if len(places) <= 3 else 6.8
+    size = (5.2, 4.4) if len(places) == 1 else (1.2 + 3.4 * columns, height)
+    axes, new = stack(ax, len(places), "one for each degree of freedom", size, ncols=columns)
     for axis, place in zip(axes, places, strict=True):
         at = (slice(None), *place)
         for i, lane in enumerate(lanes):
             assert lane.ps is not None
             q, p = lane.qs[at], lane.ps[at]
             _draw_orbit(axis, lane, _folded(q, p, period), looks, i, dots)
-        axis.set_xlabel(named(subscript("q", place, shape), units.get("q")))
-        axis.set_ylabel(named(subscript("p", place, shape), units.get("p")))
+        label_plane(axis, place, shape, units)
         if period is not None:
             axis.set_xlim(-period / 2, period / 2)
             if math.isclose(period, 2 * math.pi):
@@ -108,6 +93,12 @@ def phase_portrait(
     _finish(axes, lanes, looks, colour_label, new, hamiltonian is not None)
     single = len(axes) == 1 and not isinstance(dof, list)
     return axes[0] if single else np.asarray(axes)
+
+
+def label_plane(axis: Any, place: Any, shape: tuple[int, ...], units: Mapping[str, str]) -> None:
+    """Names of the axes of one degree of freedom, q and p."""
+    axis.set_xlabel(named(subscript("q", place, shape), units.get("q")))
+    axis.set_ylabel(named(subscript("p", place, shape), units.get("p")))
 
 
 def _places(shape: tuple[int, ...], dof: Any, what: str) -> list[tuple[int, ...]]:
@@ -138,22 +129,20 @@ def _folded(q: np.ndarray, p: np.ndarray, period: float | None) -> tuple[np.ndar
 
 
 def _draw_orbit(
-    axis: Any, lane: Lane, xy: Sequence[np.ndarray], looks: Looks, i: int, dots: bool = False,
-    width: float = 1.0,
-) -> None:  # fmt: skip
+    axis: Any, lane: Lane, xy: Sequence[np.ndarray], looks: Looks, i: int, dots: bool
+) -> None:
     """A line with a circle at its start, and a cross at its end if that came too early."""
-    colour = looks.colours[i]
+    look: dict[str, Any] = {"color": looks.colours[i], "label": lane.label or None}
+    n = len(xy[0])
     if dots:
-        n = len(xy[0])
-        axis.plot(
-            *xy, linestyle="none", marker="o", color=colour, markersize=2.2 if n < 3000 else 0.9,
-            markeredgewidth=0, label=lane.label or None, rasterized=n > 5000,
-        )  # fmt: skip
+        look |= {"linestyle": "none", "marker": "o", "markeredgewidth": 0}
+        size = 2.2 if n < 3000 else 0.9
+        axis.plot(*xy, markersize=size, rasterized=n > 5000, **look)
     else:
-        path(axis, *xy, label=lane.label or None, color=colour, linestyle=looks.dashes[i],
-             linewidth=width, **_marks(looks, i, len(xy[0])))  # fmt: skip
+        look |= {"linestyle": looks.dashes[i], "linewidth": 1.0} | _marks(looks, i, n)
+        path(axis, *xy, **look)
     if len(looks.colours) <= len(COLOURS):
-        axis.plot(*(x[:1] for x in xy), color=colour, zorder=3, **START)
+        axis.plot(*(x[:1] for x in xy), color=looks.colours[i], zorder=3, **START)
     if lane.trouble:
         finite = np.flatnonzero(np.logical_and.reduce([np.isfinite(x) for x in xy]))[-1:]
         axis.plot(*(x[finite] for x in xy), linestyle="none", zorder=4, **CROSS)
@@ -161,7 +150,7 @@ def _draw_orbit(
 
 def _marks(looks: Looks, i: int, count: int) -> dict[str, Any]:
     """Marks along one line of several of the palette: where an orbit retraces itself its dashes
-    fill one another up, and in print there is nothing else to tell it by."""
+    overlap to a full line, and a print without colours would not distinguish it."""
     if not 1 < len(looks.colours) <= len(COLOURS) or looks.scale is not None:
         return {}
     step = max(1, count // _MARKS)
@@ -170,16 +159,14 @@ def _marks(looks: Looks, i: int, count: int) -> dict[str, Any]:
 
 
 def _finish(
-    axes: Sequence[Any], lanes: Sequence[Lane], looks: Looks, colour_label: str, new: bool,
-    leveled: bool = False,
-) -> None:  # fmt: skip
+    axes: Sequence[Any], lanes: Any, looks: Looks, label: str, new: bool, levels: bool = False
+) -> None:
     """The bar of colours and the legend of a picture of orbits."""
-    if looks.scale is not None:
-        axes[0].figure.colorbar(looks.scale, ax=list(axes), label=colour_label)
-    handles = axes[0].get_legend_handles_labels()[0]
+    looks.colour_bar(axes, label)
+    handles: list[Any] = []
     if len(lanes) <= len(COLOURS):
         handles.append(Line2D([], [], color="#444444", label="start", **START))
-    if leveled:
+    if levels:
         handles.append(Line2D([], [], color="#a8a8a8", linewidth=0.8, label="levels of H"))
     handles += looks.entries()
     handles += [cross(text) for text in troubles(lanes)]
@@ -205,8 +192,8 @@ def _level_lines(
         )
     limits = axis.get_xlim(), axis.get_ylim()
     if np.isfinite(H).any():
-        axis.contour(x, y, np.ma.masked_invalid(H), levels, colors="#a8a8a8", linewidths=0.7,
-                     linestyles="-", zorder=0.9)  # fmt: skip
+        look: dict[str, Any] = {"colors": "#a8a8a8", "linewidths": 0.7, "linestyles": "-"}
+        axis.contour(x, y, np.ma.masked_invalid(H), levels, zorder=0.9, **look)
     axis.set(xlim=limits[0], ylim=limits[1])
 
 
@@ -242,7 +229,7 @@ def orbit(
       orbit, else a body.
     - `units`: of "q". `ax`: where to draw, with ``projection="3d"`` for three coordinates.
 
-    Circles are starts; crosses stand where an orbit ended too early, and the legend says why.
+    Circles are initial states; crosses mark early ends of orbits, with the reason in the legend.
 
     **Returns** the `Axes`.
 
@@ -256,7 +243,7 @@ def orbit(
     several = len(lanes) > 1
     looks = looks_of(len(lanes) if several else len(view.bodies), colour if several else None)
     if colour is not None and not several:
-        raise ValueError("colour tells orbits of a batch apart, and there is one orbit.")
+        raise ValueError("colour distinguishes orbits of a batch, and there is one orbit.")
     space = len(view.coordinates) == 3
     axis, new = canvas(ax, (5.4, 5.0), space)
     for (i, lane), (k, _) in itertools.product(enumerate(lanes), enumerate(view.bodies)):
@@ -264,89 +251,87 @@ def orbit(
             lane = lane._replace(label=view.names[k] or (lane.label if k == 0 else ""))
         elif k:
             lane = lane._replace(label="")
-        _draw_orbit(axis, lane, view.of(lane.qs, k), looks, i if several else k, dots,
-                    0.9 if len(looks.colours) > 3 else 1.1)  # fmt: skip
+        _draw_orbit(axis, lane, view.of(lane.qs, k), looks, i if several else k, dots)
     if view.mark is not None:
-        axis.plot(*([x] for x in view.mark), marker="*", color="#E69F00", markersize=11,
-                  markeredgecolor="black", linestyle="none", label=view.mark_name)  # fmt: skip
+        axis.plot(*([x] for x in view.mark), label=view.mark_name, **STAR)
     label_view(axis, view, units or {})
     axis.set_title(title)
     _finish([axis], lanes, looks, colour_label, new)
     return axis
 
 
-class View:
-    """Which coordinates of which bodies are drawn, about which point."""
+class View(NamedTuple):
+    """Which coordinates of which bodies are drawn, relative to which point.
 
-    def __init__(
-        self, coordinates: tuple[int, ...], bodies: list[int], names: list[str], many: bool
-    ):
-        self.coordinates, self.bodies, self.names, self.many = coordinates, bodies, names, many
-        self.about: int | None = None
-        self.mark: np.ndarray | None = None
-        self.mark_name = "centre"
+    - `many`: whether a state has bodies. `about`: number of the body at the origin, or None.
+    - `mark`: the point that has a star, or None, and `mark_name`: its name in the legend.
+    """
+
+    coordinates: tuple[int, ...]
+    bodies: list[int]
+    names: list[str]
+    many: bool
+    about: int | None
+    mark: np.ndarray | None
+    mark_name: str
 
     def of(self, qs: np.ndarray, k: int) -> list[np.ndarray]:
         """Coordinates of drawn body number k, shape (S,) each."""
-        if not self.many:
-            return [qs[:, c] for c in self.coordinates]
-        x = qs[:, self.bodies[k]]
+        x = qs[:, self.bodies[k]] if self.many else qs
         if self.about is not None:
             x = x - qs[:, self.about]
         return [x[:, c] for c in self.coordinates]
 
 
 def view_of(shape: tuple[int, ...], coordinates: Any, bodies: Any, centre: Any, names: Any) -> View:
-    """What is drawn of states of a shape, checked."""
+    """The checked choice of what is drawn of states of a shape."""
     if len(shape) not in (1, 2):
         raise ValueError(f"orbit draws states of shape (n,) or (bodies, dim), got {shape}.")
-    dim, count = shape[-1], shape[0] if len(shape) == 2 else 1
-    if coordinates is None:
-        if dim not in (2, 3):
-            other = (
-                "phase_portrait draws it" if dim == 1 else "name two or three, coordinates=(0, 1)"
-            )
-            raise ValueError(f"an orbit has two or three coordinates, there are {dim}: {other}.")
-        coordinates = tuple(range(dim))
-    coordinates = tuple(coordinates)
-    if len(coordinates) not in (2, 3) or not all(
-        isinstance(c, int | np.integer) and 0 <= c < dim for c in coordinates
-    ):
-        raise ValueError(
-            f"coordinates must be two or three numbers from 0 to {dim - 1}, got {coordinates!r}."
-        )
+    many, count = len(shape) == 2, shape[0] if len(shape) == 2 else 1
+    coordinates = _coordinates(shape[-1], coordinates)
     chosen = list(range(count)) if bodies is None else [int(b) for b in bodies]
     if not chosen or not all(0 <= b < count for b in chosen):
         raise ValueError(f"bodies must be numbers from 0 to {count - 1}, got {bodies!r}.")
-    about = None
+    about, mark, mark_name = None, None, "centre"
     if isinstance(centre, int | np.integer) and not isinstance(centre, bool):
-        if len(shape) == 1 or not 0 <= centre < count:
+        if not many or not 0 <= centre < count:
             raise ValueError(f"centre is no body of a state of shape {shape}: got {centre!r}.")
-        about = int(centre)
+        about, mark, mark_name = int(centre), np.zeros(len(coordinates)), f"body {centre + 1}"
         if bodies is None:
             chosen = [b for b in chosen if b != about]
-    if names is not None and (isinstance(names, str) or len(names) != len(chosen)):
-        raise ValueError(f"names has {len(names)} entries for {len(chosen)} bodies.")
-    view = View(coordinates, chosen, [*(names or [""] * len(chosen))], len(shape) == 2)
-    if about is not None:
-        view.about, view.mark = about, np.zeros(len(coordinates))
-        view.mark_name = f"body {about + 1}"
     elif centre is not None:
         point = np.asarray(centre, float)
-        if point.shape != (dim,):
+        if point.shape != shape[-1:]:
             raise ValueError(
-                f"centre must be the number of a body or a point of shape ({dim},), got shape "
+                f"centre must be the number of a body or a point of shape {shape[-1:]}, got shape "
                 f"{point.shape}."
             )
-        view.mark = point[list(coordinates)]
-    return view
+        mark = point[list(coordinates)]
+    if names is not None and (isinstance(names, str) or len(names) != len(chosen)):
+        raise ValueError(f"names has {len(names)} entries for {len(chosen)} bodies.")
+    names = [*(names or [""] * len(chosen))]
+    return View(coordinates, chosen, names, many, about, mark, mark_name)
+
+
+def _coordinates(dim: int, chosen: Any) -> tuple[int, ...]:
+    """Two or three numbers of coordinates, all of them for None."""
+    if chosen is None and dim not in (2, 3):
+        other = "phase_portrait draws it" if dim == 1 else "name some, coordinates=(0, 1)"
+        raise ValueError(f"an orbit has two or three coordinates, there are {dim}: {other}.")
+    found = tuple(range(dim) if chosen is None else chosen)
+    fits = all(isinstance(c, int | np.integer) and 0 <= c < dim for c in found)
+    if len(found) not in (2, 3) or not fits:
+        raise ValueError(
+            f"coordinates must be two or three numbers from 0 to {dim - 1}, got {found!r}."
+        )
+    return found
 
 
 def check_names(lanes: Sequence[Lane], shape: tuple[int, ...], names: Any) -> None:
     """Refuse names of bodies where a colour is an orbit."""
     if names is not None and len(lanes) > 1:
         raise ValueError(
-            f"names tell bodies of one orbit apart, and there are {len(lanes)} orbits, which have "
+            f"names are of bodies of one orbit, and there are {len(lanes)} orbits, which have "
             "a colour each: name these, labels=[...], or draw one orbit."
         )
     if names is not None and math.prod(shape) == 1:
@@ -363,7 +348,7 @@ def label_view(axis: Any, view: View, units: Mapping[str, str]) -> None:
         getattr(axis, f"set_{which}label")(named(name, units.get("q")))
     if len(view.coordinates) == 3:
         sides = _widen(axis)
-        # One scale for all; smaller than the figure, in which there is no room for labels else.
+        # One scale for all axes, and a smaller box, so that the labels fit into the figure.
         axis.set_box_aspect(sides, zoom=0.84)
         axis.zaxis.labelpad = 9
     else:
@@ -432,6 +417,5 @@ def trajectory(
     if flat.shape[1] > 12:
         for line in axis.lines:
             line.set_label(None)
-    handles = axis.get_legend_handles_labels()[0]
-    legend(axis, new, handles + [cross(text) for text in troubles(lanes)])
+    legend(axis, new, [cross(text) for text in troubles(lanes)])
     return axis

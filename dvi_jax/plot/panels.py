@@ -1,4 +1,4 @@
-"""Panels of a map: which dimension goes where, axes, colours, legends."""
+"""Panels of a map: assignment of dimensions, axes, colours, legends."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,33 +6,31 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.colors import CenteredNorm, ListedColormap, LogNorm, Normalize
+from matplotlib.colors import CenteredNorm, LogNorm, Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogFormatterMathtext, LogLocator
 
-from .house import COLOURS, HATCH, NO_NUMBER, SHADES, ZERO, canvas
+from .axes import at_edge, canvas, cells, extend, flat_cells, stack
 from .places import Place, dim_of, find_place, label_of, names_of
+from .style import COLOURS, GREY, HATCH, NO_NUMBER, SHADES, ZERO
 
 NOT_COMPUTED = "#ffffff"
-"""Of cells that are not computed; `NO_NUMBER` and `ZERO` are those of other pictures, too."""
+"""Colour of cells that are not computed."""
 
-_MARKS: dict[str, Any] = {
-    NO_NUMBER: {"marker": "x", "color": "#777777", "linestyle": "none"},
-    ZERO: {"marker": "v", "color": ZERO, "linestyle": "none"},
-}
-"""The same along a line."""
+_MARKS = {NO_NUMBER: ("x", GREY), ZERO: ("v", ZERO)}
+"""Marker and colour of the same along a line."""
 
 _MOST_PANELS = 16
 _BOTH_SIGNS = 0.05
-"""Of the larger side: numbers that reach less far on the other side of 0 need no middle."""
+"""Values of both signs have a centred scale if the smaller side exceeds this share."""
 
 _DECADES = 2
 """Positive numbers that reach over more of them get a logarithmic scale."""
 
 
 class Grid(NamedTuple):
-    """What is drawn: one array for each panel, and the axes that all of them share.
+    """One array for each panel, and the axes that all panels share.
 
     - `panels`: (title, array) of each. `x`, `y`: axes; no `y` for a line.
     - `over`: dimensions of which the numbers meet in a pixel.
@@ -66,14 +64,16 @@ def arrange(
     pixels: Any,
     made: Mapping[str, Any] | None = None,
 ) -> Grid:
-    """Who is where: dimensions that are not named become x and y in turn.
+    """Assign dimensions to x, y and facets; those that are not named become x and y in turn.
 
     - `made`: name → array that stands for that of the data where its axis is found; None for a
       dimension that does not appear.
 
     **Raises** `ValueError` for a dimension that is not there, is named twice, or is one too many.
     """
-    width, height = _checked_pixels(pixels)
+    width, height = _two(pixels)
+    if not (width >= 1 and height >= 1):
+        raise ValueError(f"pixels must be (width, height), two positive numbers, got {pixels!r}.")
     made = made or {}
     if empty := [str(d) for d, n in data.sizes.items() if n == 0]:
         raise ValueError(f"there is nothing to draw: {', '.join(empty)} has no values.")
@@ -101,7 +101,7 @@ def arrange(
         raise ValueError(_too_many(data, x, y, free))
     data = data.isel(dict.fromkeys(single, 0))
     places = {}
-    for name, size in ((x, width), (y, height)):
+    for name, size in ((x, int(width)), (y, int(height))):
         if name is not None:
             stand_in = made.get(name)
             places[name] = find_place(data if stand_in is None else stand_in, name, size)
@@ -118,14 +118,13 @@ def _too_many(data: Any, x: str, y: str | None, free: list[str]) -> str:
     )
 
 
-def _checked_pixels(pixels: Any) -> tuple[int, int]:
+def _two(values: Any) -> tuple[float, float]:
+    """Two numbers, NaN for anything else, which fails every comparison."""
     try:
-        width, height = (int(n) for n in pixels)
+        first, second = (float(v) for v in values)
     except (TypeError, ValueError):
-        width = height = 0
-    if min(width, height) < 1:
-        raise ValueError(f"pixels must be (width, height), two positive numbers, got {pixels!r}.")
-    return width, height
+        return math.nan, math.nan
+    return first, second
 
 
 def _panels(data: Any, facet: str | None) -> list[tuple[str, Any]]:
@@ -148,7 +147,7 @@ def _panels(data: Any, facet: str | None) -> list[tuple[str, Any]]:
 
 
 def checked_array(data: Any, what: str) -> Any:
-    """A `DataArray` of numbers, or an error that says how to come by one."""
+    """A `DataArray` of numbers, or an error that shows how to get one."""
     import xarray as xr
 
     if isinstance(data, xr.Dataset):
@@ -177,20 +176,11 @@ def make_axes(grid: Grid, ax: Any, height: float | None = None) -> list[Any]:
             raise ValueError("a facet has a figure of its own: leave out ax, or facet.")
         return [canvas(ax)[0]]
     if count == 1:
-        figure, axis = plt.subplots(layout="constrained")
-        if height is not None:
-            figure.set_figheight(height)
-        return [axis]
-    columns = min(count, 3 if count > 4 else 2 if count == 4 else count)
-    rows = -(-count // columns)
-    size = (1.4 + 2.7 * columns, 1.0 + 2.3 * rows)
-    figure, axes = plt.subplots(
-        rows, columns, sharex=True, sharey=True, squeeze=False, figsize=size, layout="constrained"
-    )
-    for i, spare in enumerate(axes.flat):
-        if i >= count:
-            figure.delaxes(spare)
-    return list(axes.flat)[:count]
+        size = None if height is None else (plt.rcParams["figure.figsize"][0], height)
+        return [canvas(None, size)[0]]
+    columns = min(count, 3 if count > 4 else 2)
+    size = (1.4 + 2.7 * columns, 1.0 + 2.3 * -(-count // columns))
+    return stack(None, count, "one for each", size, columns, sharex=True, sharey=True)[0]
 
 
 def finish(axes: Sequence[Any], grid: Grid) -> None:
@@ -265,32 +255,19 @@ def make_scale(values: Sequence[np.ndarray], log: bool | None, limits: Any) -> S
     inside = positive if log else found
     low, high = (inside.min(), inside.max()) if inside.size else (0.1 if log else 0.0, 1.0)
     if limits is not None:
-        least, most = low, high
-        low, high = _checked_limits(limits, log)
-        below, above = inside.size and least < low, inside.size and most > high
-        extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
-        extend = extend[int(below), int(above)]
-    else:
-        extend = "neither"
+        low, high = _two(limits)
+        if not low < high or (log and low <= 0):
+            wanted = "two rising positive numbers" if log else "two rising numbers"
+            raise ValueError(f"limits must be {wanted}, got {limits!r}.")
+    ends = extend(inside, low, high)
     if log:
         wide = 1.0 if high > low else 2.0
-        return Scale(LogNorm(low / wide, high * wide), SHADES, True, extend)
+        return Scale(LogNorm(low / wide, high * wide), SHADES, True, ends)
     if limits is None and min(-low, high) > _BOTH_SIGNS * max(-low, high):
-        return Scale(CenteredNorm(0, max(-low, high)), "PuOr_r", False, extend)
+        return Scale(CenteredNorm(0, max(-low, high)), "PuOr_r", False, ends)
     if high == low:
         low, high = low - (abs(low) or 1) / 2, high + (abs(high) or 1) / 2
-    return Scale(Normalize(low, high), SHADES, False, extend)
-
-
-def _checked_limits(limits: Any, log: bool) -> tuple[float, float]:
-    try:
-        low, high = (float(v) for v in limits)
-    except (TypeError, ValueError):
-        low = high = math.nan
-    if not low < high or (log and low <= 0):
-        wanted = "two rising positive numbers" if log else "two rising numbers"
-        raise ValueError(f"limits must be {wanted}, got {limits!r}.")
-    return low, high
+    return Scale(Normalize(low, high), SHADES, False, ends)
 
 
 def draw_values(axis: Any, grid: Grid, values: np.ndarray, scale: Scale) -> Any:
@@ -299,42 +276,22 @@ def draw_values(axis: Any, grid: Grid, values: np.ndarray, scale: Scale) -> Any:
     A line is drawn over marks at the bottom where there is none. Returns what has the colours, or
     None.
     """
-    zero = values == 0 if scale.log else np.zeros(values.shape, bool)
-    shown = np.ma.masked_where(zero | ~np.isfinite(values), values)
-    if grid.y is None:
-        mark = "o" if values.size <= 60 else ""
-        axis.plot(grid.x.centres, np.where(shown.mask, np.nan, values), marker=mark,
-                  color=COLOURS[0])  # fmt: skip
-        if scale.log:
-            axis.set_yscale("log")
-        _rug(axis, grid.x.centres[zero], ZERO)
-        _rug(axis, grid.x.centres[~np.isfinite(values)], NO_NUMBER)
-        return None
-    frame(axis)
-    axis.patch.set(**HATCH)
-    cmap = plt.get_cmap(scale.cmap)
-    mesh = axis.pcolormesh(
-        grid.x.edges, grid.y.edges, shown, norm=scale.norm, cmap=cmap, rasterized=True
-    )
-    if zero.any():
-        draw_flags(axis, grid, zero, ZERO)
-    return mesh
-
-
-def _rug(axis: Any, x: np.ndarray, kind: str) -> None:
-    """Marks at the bottom of a panel."""
-    if len(x):
-        y = np.full(len(x), 0.025)
-        axis.plot(x, y, transform=axis.get_xaxis_transform(), **_MARKS[kind])
-
-
-def draw_flags(axis: Any, grid: Grid, where: np.ndarray, colour: str) -> None:
-    """Cells of one colour over a map."""
+    zero = (values == 0) & scale.log
     if grid.y is not None:
-        axis.pcolormesh(
-            grid.x.edges, grid.y.edges, np.ma.masked_where(~where, np.ones(where.shape)),
-            cmap=ListedColormap([colour]), rasterized=True,
-        )  # fmt: skip
+        frame(axis)
+        x, y = grid.x.edges, grid.y.edges
+        mesh = cells(axis, x, y, np.where(zero, np.nan, values), scale.norm, scale.cmap)
+        flat_cells(axis, x, y, zero, ZERO)
+        return mesh
+    missing = ~np.isfinite(values)
+    mark = "o" if values.size <= 60 else ""
+    shown = np.where(zero | missing, np.nan, values)
+    axis.plot(grid.x.centres, shown, marker=mark, color=COLOURS[0])
+    axis.set_yscale("log" if scale.log else "linear")
+    for where, kind in ((zero, ZERO), (missing, NO_NUMBER)):
+        marker, colour = _MARKS[kind]
+        at_edge(axis, grid.x.centres[where], marker, 0.025, color=colour, markersize=4.5)
+    return None
 
 
 def frame(axis: Any) -> None:
@@ -355,14 +312,15 @@ def colour_bar(axes: Sequence[Any], mesh: Any, scale: Scale, label: str) -> None
 def flag(colour: str, label: str, line: bool = False) -> Any:
     """An entry of a legend, of a map or of a line."""
     if line and colour in _MARKS:
-        return Line2D([], [], label=label, **_MARKS[colour])
+        marker, shown = _MARKS[colour]
+        return Line2D([], [], label=label, marker=marker, color=shown, linestyle="none")
     if colour == NO_NUMBER:
         return Patch(label=label, **HATCH)
     return Patch(facecolor=colour, edgecolor="#8c8c8c", linewidth=0.6, label=label)
 
 
 def share(count: int, total: int) -> str:
-    """How many of how many."""
+    """Text "n of N (p %)"."""
     percent = 100 * count / total
     text = "< 0.1" if 0 < percent < 0.1 else f"{percent:.3g}"
     return f"{count} of {total} ({text} %)"

@@ -1,11 +1,11 @@
-"""Where the points of a dimension lie along an axis of a picture, and what is written there."""
+"""Positions and tick labels of the points of a dimension along an axis of a picture."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from .axes import cell_edges
 from .blocks import Bins, make_bins
-from .house import cell_edges
 
 _GREEK = {"epsilon": "ε", "h": "step size h", "start": "number of the start", "t0": "t$_0$"}
 _MOST_NAMES = 12
@@ -37,7 +37,7 @@ def find_place(data: Any, name: str, pixels: int) -> Place:
 
     Numbers that are all different are put in their order, on a logarithmic axis where they are
     spaced like that; a 0 before such numbers has a place of its own at the left. Anything else has
-    its position, and its name beside it.
+    its position, with its name as a label.
     """
     dim = dim_of(data, name)
     size = data.sizes[dim]
@@ -68,7 +68,7 @@ def find_place(data: Any, name: str, pixels: int) -> Place:
 
 
 def dim_of(data: Any, name: str) -> str:
-    """The dimension along which a name stands.
+    """The dimension of a name, which may be a coordinate along it.
 
     **Raises** `ValueError` if there is none, with those that there are.
     """
@@ -80,7 +80,7 @@ def dim_of(data: Any, name: str) -> str:
 
 
 def names_of(data: Any) -> str:
-    """What can be an axis, for a message."""
+    """Names that can be an axis, for an error message."""
     sizes = ", ".join(f"{d} ({n})" for d, n in data.sizes.items())
     others = [str(c) for c in data.coords if c not in data.dims and data.coords[c].ndim == 1]
     return (sizes or "none") + (f", and along them {', '.join(others)}" if others else "")

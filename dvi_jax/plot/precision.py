@@ -1,4 +1,4 @@
-"""Pictures of what accuracy costs."""
+"""Work-precision diagrams."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,16 +6,17 @@ from typing import Any
 import numpy as np
 from matplotlib.lines import Line2D
 
-from .house import COLOURS, DASHES, MARKERS, PALE, canvas, in_style, legend, signed
+from .axes import canvas, legend, without_place, without_place_entries
+from .style import COLOURS, DASHES, MARKERS, in_style, signed
 
 _FLATTER = 0.6
-"""Of the slope before: a line that falls less steeply than that has reached round-off."""
+"""A line whose slope is below this share of the slope before has reached round-off."""
 
 _SETTLED = 0.1
-"""Of a slope: what it may change from one pair of runs to the next."""
+"""Largest relative change of a settled slope from one pair of runs to the next."""
 
 _LAST = 3
-"""Runs that a slope is taken from: those before have steps too long for it."""
+"""Number of runs that determine a slope: earlier ones have too long steps."""
 
 
 @in_style
@@ -32,7 +33,7 @@ def work_precision(
 
     - `results`: name of the method → (costs, errors), shape (runs,) each, in any order.
     - `cost`, `error`: labels, with units.
-    - `slopes`: tell the slope of each line, d log(error)/d log(cost), in the legend: the
+    - `slopes`: report the slope of each line, d log(error)/d log(cost), in the legend: the
       least-squares slope of its last three runs before round-off, "not settled" where it still
       changes by more than a tenth from one pair of them to the next. Round-off begins where the
       error no longer falls, or falls by less than 0.6 of the slope before. Of runs of equal cost
@@ -40,7 +41,7 @@ def work_precision(
     - `front`: a pale band under the runs than which no other is both cheaper and as exact.
     - `ax`: where to draw.
 
-    A run whose error is not finite stands as a cross at the top, one whose error is exactly 0 as a
+    A run whose error is not finite is a cross at the top, one whose error is exactly 0 as a
     triangle at the bottom, and the legend counts them.
 
     **Returns** the `Axes`.
@@ -52,43 +53,29 @@ def work_precision(
         raise ValueError("work_precision was given no method.")
     axis, new = canvas(ax, (6.4, 4.8))
     runs = {name: _checked(name, pair) for name, pair in results.items()}
-    out, nought = 0, 0
+    lost = np.zeros(2, int)
     for i, (name, (costs, errors)) in enumerate(runs.items()):
         colour = COLOURS[i % len(COLOURS)]
         # The same marker comes back with another colour: 9 and 7 have no common factor.
         marker, dash = MARKERS[i % len(MARKERS)], DASHES[i // len(COLOURS) % len(DASHES)]
         good = np.isfinite(errors) & (errors > 0)
         slope = _slope(costs[good], errors[good]) if slopes else None
-        text = name if not slopes else f"{name}: " + (
-            "no slope" if slope is None else f"slope {signed(slope[0], '.1f')}{slope[1]}"
-        )  # fmt: skip
-        axis.loglog(
-            costs[good], errors[good], color=colour, marker=marker, linestyle=dash,
-            linewidth=1.2, label=text,
-        )  # fmt: skip
-        edge = {"transform": axis.get_xaxis_transform(), "color": colour, "linestyle": "none"}
-        lost, exact = ~np.isfinite(errors), errors == 0
-        if lost.any():
-            axis.plot(costs[lost], np.full(lost.sum(), 0.985), "x", markersize=6, **edge)
-        if exact.any():
-            axis.plot(costs[exact], np.full(exact.sum(), 0.015), "v", markersize=5, **edge)
-        out, nought = out + int(lost.sum()), nought + int(exact.sum())
+        if slopes:
+            steep = "no slope" if slope is None else f"slope {signed(slope[0], '.1f')}{slope[1]}"
+            name = f"{name}: {steep}"
+        look = {"color": colour, "marker": marker, "linestyle": dash, "linewidth": 1.2}
+        axis.loglog(costs[good], errors[good], label=name, **look)
+        lost += without_place(axis, costs, errors, colour)
     axis.set(xscale="log", yscale="log", xlabel=cost, ylabel=error, title=title)
-    handles = axis.get_legend_handles_labels()[0]
-    if front:
-        line = _front(list(runs.values()))
-        if len(line):
-            (band,) = axis.plot(*line.T, color="#dcdcdc", linewidth=9, zorder=0.5, label="front",
-                                solid_capstyle="round", solid_joinstyle="round")  # fmt: skip
-            handles.append(Line2D([], [], color=band.get_color(), linewidth=7, label="front"))
+    extra: list[Any] = []
+    line = _front(list(runs.values()))
+    if front and len(line):
+        look = {"color": "#dcdcdc", "linewidth": 9, "zorder": 0.5}
+        axis.plot(*line.T, **look, solid_capstyle="round", solid_joinstyle="round")
+        extra.append(Line2D([], [], color="#dcdcdc", linewidth=7, label="front"))
     total = sum(len(c) for c, _ in runs.values())
-    if out:
-        handles.append(Line2D([], [], color=PALE, marker="x", linestyle="none",
-                              label=f"{out} of {total} runs failed"))  # fmt: skip
-    if nought:
-        handles.append(Line2D([], [], color=PALE, marker="v", linestyle="none",
-                              label=f"{nought} of {total} runs without error"))  # fmt: skip
-    legend(axis, new, handles)
+    extra += without_place_entries(lost, total, ("runs failed", "runs without error"))
+    legend(axis, new, extra)
     return axis
 
 

@@ -6,17 +6,19 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.colors import to_rgba
 
 from .._results import status_name
-from .house import COLOURS, canvas, in_style, legend, note
+from .axes import at_edge, canvas, check_labels, counted, legend
 from .states import component, looks_of
+from .style import COLOURS, GREY, in_style
 
 _MANY = 3000
 """Points from which a picture has pixels of them in a file of vectors."""
 
 
 _GOOD = ("", "successful", "stopped", "never_crossed", "too_few_crossings")
-"""Statuses of orbits whose states can be trusted: all but "failed"."""
+"""Statuses of orbits whose states are valid: all but "failed"."""
 
 
 class _Points(NamedTuple):
@@ -72,18 +74,18 @@ def section(
       `Solution` that observed one.
     - `x`, `y`: what is drawn: "q[0]", "p[-1]", of bodies "q[0, 2]"; or a function ``(q, p)`` →
       number of one state, e.g. of an angle that is to be folded.
-    - `colour`: a number for each orbit, such as its MEGNO, told by a bar with `colour_label` from
+    - `colour`: a number for each orbit, such as its MEGNO, shown by a bar with `colour_label` from
       `limits` (low, high); NaN is grey. None: each orbit has a colour of its own. `labels`: one
       name for each orbit.
     - `size`: of a point, in points across; None: by their number. `units`: of "q" and "p".
     - `ax`: where to draw.
 
-    10⁶ points and more are one collection, drawn as pixels. The legend tells of orbits that
-    crossed more often than there was room for, less often than was asked for, or never, and of
-    those that were stopped or failed; where there is no crossing at all, the axes say so.
+    10⁶ points and more are one collection, drawn as pixels. The legend counts orbits
+    that crossed more often than could be stored, less often than requested, or never, and those
+    that were stopped or failed; if there is no crossing at all, a text on the axes says so.
 
-    An orbit that failed may have gone far astray before: the others alone set the limits of the
-    axes, and the legend counts crossings of failed ones beyond them.
+    An orbit that failed may have points far away: only the others set the limits of the axes, and
+    the legend counts crossings of failed orbits outside them.
 
     **Returns** the `Axes`.
 
@@ -96,11 +98,9 @@ def section(
     there = points.there
     count = len(there)
     looks = looks_of(count, colour, limits)
-    if labels is not None and len(labels) != count:
-        raise ValueError(f"labels has {len(labels)} names for {count} orbits.")
+    check_labels(labels, count, "orbits")
     axis, new = canvas(ax, (5.8, 4.8))
     axis.set(xlabel=x_label, ylabel=y_label, title=title)
-    handles: list[Any] = []
     far = np.zeros(0, bool)
     if not there.any():
         _say_empty(axis)
@@ -112,39 +112,36 @@ def section(
             for i in range(count):
                 name = None if labels is None else str(labels[i])
                 with _limits_kept(axis, bool(failed[i])):
-                    axis.scatter(xs[i][there[i]], ys[i][there[i]], color=looks.colours[i],
-                                 label=name, **look)  # fmt: skip
+                    xy = xs[i][there[i]], ys[i][there[i]]
+                    axis.scatter(*xy, color=looks.colours[i], label=name, **look)
         else:
-            # Orbits of neighbouring starts lie beside one another: neighbouring colours there.
-            shades = np.asarray([_rgba(c) for c in looks.colours])
-            for astray in (False, True):
-                rows = there & (failed == astray)[:, None]
-                each = np.repeat(np.arange(count), rows.sum(1))
-                if len(each):
-                    with _limits_kept(axis, astray):
-                        axis.scatter(xs[rows], ys[rows], c=shades[each], **look)
-        handles = axis.get_legend_handles_labels()[0]
+            # Orbits with neighbouring initial states have similar colours.
+            shades = np.asarray([to_rgba(c) for c in looks.colours])
+            _scatter(axis, xs, ys, there, failed, shades, look)
         far = _beyond(axis, xs, ys)[there & failed[:, None]]
-    if looks.scale is not None:
-        axis.figure.colorbar(looks.scale, ax=axis, label=colour_label)
-    handles += looks.entries() + _notes(points) + _far(far)
-    found = legend(axis, new, handles)
+    looks.colour_bar([axis], colour_label)
+    found = legend(axis, new, [*looks.entries(), *_notes(points), *_far(far)])
     for handle in found.legend_handles if found else ():
         if hasattr(handle, "set_sizes"):
             handle.set_sizes([25])
     return axis
 
 
-def _rgba(colour: Any) -> tuple[float, ...]:
-    from matplotlib.colors import to_rgba
-
-    return to_rgba(colour)
-
-
 def _leaves_limits(points: _Points) -> np.ndarray:
     """Which orbits do not set the limits of the axes: failed ones, unless there are no others."""
     others = points.there.any(1) & ~points.failed
     return points.failed & others.any()
+
+
+def _scatter(
+    axis: Any, x: np.ndarray, y: np.ndarray, there: Any, failed: Any, colours: Any, look: Any
+) -> None:
+    """The points of every orbit in its colour; those of failed ones do not set the limits."""
+    for failing in (False, True):
+        rows = there & (failed == failing)[:, None]
+        if rows.any():
+            with _limits_kept(axis, failing):
+                axis.scatter(x[rows], y[rows], c=np.repeat(colours, rows.sum(1), axis=0), **look)
 
 
 @contextmanager
@@ -163,11 +160,10 @@ def _beyond(axis: Any, xs: np.ndarray, ys: np.ndarray) -> np.ndarray:
     return ~((xs >= left) & (xs <= right) & (ys >= low) & (ys <= high))
 
 
-def _far(beyond: np.ndarray) -> list[Any]:
-    """What a legend says of crossings of failed orbits that are outside the picture."""
-    count = int(beyond.sum())
-    text = f"{count} of {len(beyond)} crossings of failed orbits lie outside the picture"
-    return [note(text)] if count else []
+def _far(beyond: np.ndarray) -> list[str]:
+    """Legend text that counts crossings of failed orbits outside the picture."""
+    text = f"of {len(beyond)} crossings of failed orbits lie outside the picture"
+    return counted({text: beyond.sum()})
 
 
 def _dots(count: int, size: float | None) -> dict[str, Any]:
@@ -195,7 +191,7 @@ def _points_of(crossings: Any, what: str) -> _Points:
     shape = (math.prod(ts.shape[:-1]), *qs.shape[ts.ndim - 1 :])
     counts = np.ravel(np.asarray(one.count))
     reasons: Any = status
-    if hasattr(one, "status"):  # a PoincareSection: just so many were asked for
+    if hasattr(one, "status"):  # a PoincareSection, which stops at this number
         counts = np.minimum(counts, ts.shape[-1])
         status = one.status
         reasons = status_name(one.run) if hasattr(one, "run") else ""
@@ -207,8 +203,7 @@ def _points_of(crossings: Any, what: str) -> _Points:
 
 
 def _crossings_in(tree: Any, status: Any = "") -> list[tuple[Any, Any]]:
-    """Every `Crossings`, told by its fields, of a solution, its observables or a part of them; with
-    the status of the solution."""
+    """Every `Crossings` of a solution or of its observables, with the status of the solution."""
     if all(hasattr(tree, name) for name in ("ts", "qs", "ps")):
         if _is_count(tree):
             return [(tree, status)]
@@ -223,8 +218,8 @@ def _is_count(tree: Any) -> bool:
     return hasattr(tree, "count") and not callable(tree.count)
 
 
-def _notes(points: _Points) -> list[Any]:
-    """What a legend says of orbits with more crossings than room, fewer than asked for, or none."""
+def _notes(points: _Points) -> list[str]:
+    """Legend texts on orbits with too many, too few or no crossings, and on failed ones."""
     total, room, failed = len(points.counts), points.qs.shape[1], points.failed
     over = int(np.sum(points.counts > room))
     none = int(np.sum((points.counts == 0) & ~failed & (points.statuses != "stopped")))
@@ -245,12 +240,12 @@ def _notes(points: _Points) -> list[Any]:
         texts.append(f"{none} of {total} orbits did not cross")
     if unknown:
         texts.append(f"{unknown} of {total} orbits have no count of crossings")
-    return [note(text) for text in texts]
+    return texts
 
 
 def _say_empty(axis: Any) -> None:
-    axis.text(0.5, 0.5, "no orbit crossed the section", transform=axis.transAxes, ha="center",
-              va="center", color="#555555")  # fmt: skip
+    look = {"ha": "center", "va": "center", "color": "#555555"}
+    axis.text(0.5, 0.5, "no orbit crossed the section", transform=axis.transAxes, **look)
     axis.set(xticks=[], yticks=[])
 
 
@@ -267,7 +262,7 @@ def bifurcation(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """What orbits show at a section against a parameter, such as ε.
+    """A coordinate of orbits at a section against a parameter, such as ε.
 
     - `parameter`: shape (runs,). `name`: its label, with a unit if it has one.
     - `crossings`: a batch of `dvi.Crossings` with one axis, (runs,), or a `Solution` that observed
@@ -278,7 +273,7 @@ def bifurcation(
     - `log`: a logarithmic axis of the parameter. `size`: of a point, in points across; `units`: of
       "q" and "p". `ax`: where to draw.
 
-    The legend tells how orbits ended, and crossings of failed ones do not set the limits, as in
+    The legend counts how orbits ended, and crossings of failed ones do not set the limits, as in
     `section`.
 
     **Returns** the `Axes`.
@@ -291,7 +286,7 @@ def bifurcation(
     if numbers is not None:
         values, failed = numbers.astype(float), np.zeros(len(numbers), bool)
         label = "" if y == "q[-1]" else y if isinstance(y, str) else ""
-        notes: list[Any] = []
+        notes: list[str] = []
     else:
         points = _points_of(crossings, "bifurcation")
         get, label = component(y, points.shape, units or {}, "bifurcation")
@@ -314,11 +309,8 @@ def bifurcation(
     if there.any():
         look = _dots(int(there.sum()), size)
         failed = failed & (there.any(1) & ~failed).any()  # those left after the first
-        for astray in (False, True):
-            rows = there & (failed == astray)[:, None]
-            if rows.any():
-                with _limits_kept(axis, astray):
-                    axis.scatter(x[rows], values[rows], color="#000000", **look)
+        black = np.tile(to_rgba("#000000"), (len(values), 1))
+        _scatter(axis, x, values, there, failed, black, look)
         if log:
             axis.set_xscale("log")
         notes += _far(_beyond(axis, x, values)[there & failed[:, None]])
@@ -326,12 +318,8 @@ def bifurcation(
         if silent:
             text = f"{silent} of {len(values)} runs have no crossing"
             text += f" after the first {skip}" if skip else ""
-            notes = [n for n in notes if "did not cross" not in n.get_label()]
-            notes.append(note(text))
-            axis.plot(
-                parameter[~there.any(1)], np.full(silent, 0.015), "|", color="#777777",
-                markersize=6, transform=axis.get_xaxis_transform(),
-            )  # fmt: skip
+            notes = [n for n in notes if "did not cross" not in n] + [text]
+            at_edge(axis, parameter[~there.any(1)], "|", color=GREY)
     else:
         _say_empty(axis)
     legend(axis, new, notes)

@@ -1,4 +1,4 @@
-"""Pictures of the solar system beside an ephemeris."""
+"""Pictures of the solar system and of its comparison with an ephemeris."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,12 +6,13 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from .house import COLOURS, MARKERS, given, in_style, legend, stack
+from .axes import given, legend, stack
+from .style import COLOURS, MARKERS, STAR, in_style
 
 
 @in_style
 def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
-    """Heliocentric orbits on the ecliptic [au], the inner four beside the rest.
+    """Heliocentric orbits on the ecliptic [au], the inner four planets and the others.
 
     - `positions`: shape (times, planets, 3); `names` of the planets. `ax`: two `Axes`.
 
@@ -30,11 +31,10 @@ def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
             x, y = positions[:, i, 0], positions[:, i, 1]
             colour = COLOURS[(i - group[0]) % len(COLOURS)]
             axis.plot(x, y, ".", markersize=1, color=colour, alpha=0.35, rasterized=True)
-            axis.plot(
-                x[:1], y[:1], MARKERS[i - group[0]], color=colour, markersize=7,
-                markeredgecolor="black", markeredgewidth=0.7, label=names[i], linestyle="none",
-            )  # fmt: skip
-        axis.plot(0, 0, "*", color="#E69F00", markersize=11, markeredgecolor="black")
+            look: Any = {"color": colour, "marker": MARKERS[i - group[0]], "linestyle": "none"}
+            look |= {"markersize": 7, "markeredgecolor": "black", "markeredgewidth": 0.7}
+            axis.plot(x[:1], y[:1], label=names[i], **look)
+        axis.plot(0, 0, **STAR)
         axis.set(xlabel="x [au]", ylabel="y [au]", title=title)
         axis.set_aspect("equal", adjustable="datalim")
         if new:  # a legend for each, below it
@@ -58,7 +58,7 @@ def ephemeris_comparison(
     intercept: float,
     ax: Any = None,
 ) -> Any:
-    """Position errors of the planets, and Mercury's perihelion, beside an ephemeris.
+    """Position errors of the planets, and Mercury's perihelion, relative to an ephemeris.
 
     - `years`: since the start, shape (T,). `errors`: [km], shape (T, planets).
     - `perihelion`: ephemeris minus integration [″], shape (T,); `slope` [″/century] and
@@ -77,10 +77,9 @@ def ephemeris_comparison(
         left, right, below = given(ax, 3, "for the errors, the perihelion and what its line leaves")
     for i, name in enumerate(names):
         x, y = _upper_envelope(years, errors[:, i])
-        left.semilogy(
-            x, y, color=COLOURS[i % len(COLOURS)], linewidth=1.3, marker=MARKERS[i],
-            markevery=(i * 2 % 12, 12), label=name, linestyle="-" if i < len(COLOURS) else "--",
-        )  # fmt: skip
+        look: Any = {"color": COLOURS[i % len(COLOURS)], "linewidth": 1.3, "marker": MARKERS[i]}
+        look |= {"linestyle": "-" if i < len(COLOURS) else "--"}
+        left.semilogy(x, y, markevery=(i * 2 % 12, 12), label=name, **look)
     left.set(
         xlabel="years since the start",
         ylabel="distance from the ephemeris [km]",
@@ -93,12 +92,10 @@ def ephemeris_comparison(
     right.plot(years, perihelion, ".", color=COLOURS[0], markersize=2, label="osculating orbits")
     line = intercept + slope * years / 100
     if np.isfinite(slope):
-        right.plot(
-            years, line, color=COLOURS[1], linewidth=1.2, linestyle="--",
-            label=f"line: {slope:.2f}″ per century",
-        )  # fmt: skip
+        look = {"color": COLOURS[1], "linewidth": 1.2, "linestyle": "--"}
+        right.plot(years, line, label=f"line: {slope:.2f}″ per century", **look)
         below.plot(years, perihelion - line, color=COLOURS[0], linewidth=0.5)
-        below.axhline(0, color=COLOURS[1], linewidth=1.2, linestyle="--")
+        below.axhline(0, **look)
     right.set(
         ylabel="ϖ(DE421) − ϖ(integration) [″]",
         title="Mercury's perihelion, DE421 − integration",

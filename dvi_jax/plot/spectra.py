@@ -1,28 +1,19 @@
 """Pictures of frequencies: lines of a spectrum, maps of fundamental frequencies."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.patches import Patch
 
-from .house import (
-    COLOURS,
-    DASHES,
-    GREY,
-    HATCH,
-    MARKERS,
-    SHADES,
-    canvas,
-    cell_edges,
-    in_style,
-    legend,
-    named,
-    note,
-    signed,
-)
+from .axes import canvas, cell_edges, cells, check_labels, counted, interval, legend
 from .states import looks_of
+from .style import COLOURS, DASHES, GREY, HATCH, MARKERS, PALE, SHADES, in_style, named, signed
+
+_PERCENTILES = (2, 98)
+"""Range of the colours, so that a few extreme values do not determine it."""
 
 
 @in_style
@@ -61,31 +52,26 @@ def spectrum(
             f"count), got {w.shape} of {w.dtype} and {A.shape}."
         )
     w, A = w.reshape(-1, w.shape[-1]), A.reshape(-1, A.shape[-1])
-    if labels is not None and len(labels) != len(w):
-        raise ValueError(f"labels has {len(labels)} names for {len(w)} signals.")
+    check_labels(labels, len(w), "signals")
     looks, units = looks_of(len(w)), units or {}
     there = np.isfinite(w) & np.isfinite(A) & ((A > 0) | (not log))
     axis, new = canvas(ax)
     least = A[there].min() if there.any() else 1.0
     floor = least / 3 if log else 0.0
     for i, (x, y, good) in enumerate(zip(w, A, there, strict=True)):
+        look = {"color": looks.colours[i], "label": None if labels is None else str(labels[i])}
         axis.vlines(x[good], floor, y[good], color=looks.colours[i], linewidth=1.3)
-        axis.plot(x[good], y[good], MARKERS[i % len(MARKERS)], color=looks.colours[i],
-                  label=None if labels is None else str(labels[i]))  # fmt: skip
+        axis.plot(x[good], y[good], MARKERS[i % len(MARKERS)], **look)
     if log:
         axis.set_yscale("log")
     if there.any():
         axis.set_ylim(bottom=floor)
-    for i, (name, at) in enumerate((fundamental or {}).items()):
-        axis.axvline(at, color=GREY, linewidth=1, linestyle=DASHES[1 + i % (len(DASHES) - 1)],
-                     label=name, zorder=0.8)  # fmt: skip
+    for (name, at), dash in zip((fundamental or {}).items(), itertools.cycle(DASHES[1:])):
+        axis.axvline(at, color=GREY, linewidth=1, linestyle=dash, label=name, zorder=0.8)
     axis.set(xlabel=named("frequency", units.get("frequency", "rad per unit of time")))
     axis.set(ylabel=named("amplitude", units.get("amplitude")), title=title)
-    handles = axis.get_legend_handles_labels()[0]
-    if not there.all():
-        text = f"{np.sum(~there)} of {there.size} lines have no frequency or amplitude"
-        handles.append(note(text))
-    legend(axis, new, handles)
+    lost = f"of {there.size} lines have no frequency or amplitude"
+    legend(axis, new, counted({lost: np.sum(~there)}))
     return axis
 
 
@@ -119,9 +105,7 @@ def frequency_map(
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     D = None if diffusion is None else np.asarray(diffusion, float)
-    on_grid = D is not None and D.ndim == 2 and x.ndim == y.ndim == 1 and (
-        D.shape == (len(x), len(y))
-    )  # fmt: skip
+    on_grid = D is not None and x.ndim == y.ndim == 1 and D.shape == (len(x), len(y))
     if not on_grid and (x.shape != y.shape or (D is not None and D.shape != x.shape)):
         shape = "" if D is None else f" and diffusion of shape {D.shape}"
         raise ValueError(
@@ -135,74 +119,53 @@ def frequency_map(
             f"{(len(x), len(y))}."
         )
     axis, new = canvas(ax, (6.0, 4.8))
-    handles: list[Any] = []
     if on_grid:
         assert D is not None
-        _draw_plane(axis, x, y, D, limits, diffusion_label, handles)
+        drawn, extra = _draw_plane(axis, x, y, D, limits)
     else:
-        _draw_points(axis, x, y, D, limits, diffusion_label, handles)
+        drawn, extra = _draw_points(axis, x, y, D, limits)
+    if drawn is not None:
+        axis.figure.colorbar(drawn[0], ax=axis, label=diffusion_label, extend=drawn[1])
     _draw_resonances(axis, resonances)
     names = names or (("x", "y") if on_grid else ("ω$_1$", "ω$_2$"))
-    axis.set(xlabel=names[0], ylabel=names[1])
-    axis.set_title(title)
-    legend(axis, new, axis.get_legend_handles_labels()[0] + handles)
+    axis.set(xlabel=names[0], ylabel=names[1], title=title)
+    legend(axis, new, extra)
     return axis
 
 
-def _norm(D: np.ndarray, limits: tuple[float, float] | None) -> tuple[Normalize, str]:
-    """The scale of colours, and at which ends numbers lie beyond it."""
-    known = D[np.isfinite(D)]
-    if limits is None:
-        low, high = np.percentile(known, [2, 98]) if known.size else (0.0, 1.0)
-    else:
-        low, high = (float(v) for v in limits)
-    if high <= low:
-        low, high = low - 0.5, high + 0.5
-    below, above = bool((known < low).any()), bool((known > high).any())
-    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
-    return Normalize(low, high), extend[int(below), int(above)]
-
-
 def _draw_plane(
-    axis: Any, x: np.ndarray, y: np.ndarray, D: np.ndarray, limits: Any, label: str, handles: list
-) -> None:
+    axis: Any, x: np.ndarray, y: np.ndarray, D: np.ndarray, limits: Any
+) -> tuple[Any, list[Any]]:
+    """Cells over a plane of initial conditions; ((cells, ends of the bar), legend entries)."""
     for name, values in (("x", x), ("y", y)):
         if not (np.diff(values) > 0).all() or not np.isfinite(values).all():
             raise ValueError(f"the coordinates {name} of a grid of starts must rise.")
-    norm, extend = _norm(D, limits)
-    axis.grid(False)
-    axis.patch.set(**HATCH)
-    mesh = axis.pcolormesh(cell_edges(x), cell_edges(y), np.ma.masked_invalid(D.T), norm=norm,
-                           cmap=SHADES, rasterized=True)  # fmt: skip
-    axis.figure.colorbar(mesh, ax=axis, label=label, extend=extend)
-    lost = int(np.sum(~np.isfinite(D)))
-    if lost:
-        handles.append(Patch(label=f"{lost} of {D.size} starts without a value", **HATCH))
+    low, high, beyond = interval(D, limits, _PERCENTILES)
+    mesh = cells(axis, cell_edges(x), cell_edges(y), D.T, Normalize(low, high), SHADES)
+    texts = counted({f"of {D.size} starts without a value": np.sum(~np.isfinite(D))})
+    return (mesh, beyond), [Patch(label=text, **HATCH) for text in texts]
 
 
 def _draw_points(
-    axis: Any, x: np.ndarray, y: np.ndarray, D: np.ndarray | None, limits: Any, label: str,
-    handles: list,
-) -> None:  # fmt: skip
+    axis: Any, x: np.ndarray, y: np.ndarray, D: np.ndarray | None, limits: Any
+) -> tuple[Any, list[Any]]:
+    """A point for each orbit; ((points, ends of the bar) or None, legend entries)."""
     there = np.isfinite(x) & np.isfinite(y)
     count = int(there.sum())
-    look: Any = {"s": float(np.clip(3000 / max(count, 1), 2, 16)), "linewidths": 0,
-                 "rasterized": count > 3000}  # fmt: skip
+    size = float(np.clip(3000 / max(count, 1), 2, 16))
+    look: Any = {"s": size, "linewidths": 0, "rasterized": count > 3000}
+    drawn = None
     if D is None:
         axis.scatter(x[there], y[there], color=COLOURS[0], **look)
     else:
-        known = there & np.isfinite(D)
-        norm, extend = _norm(D[there], limits)
-        drawn = axis.scatter(x[known], y[known], c=D[known], norm=norm, cmap=SHADES, **look)
-        axis.figure.colorbar(drawn, ax=axis, label=label, extend=extend)
-        grey = there & ~np.isfinite(D)
+        known, grey = there & np.isfinite(D), there & ~np.isfinite(D)
+        low, high, beyond = interval(D[there], limits, _PERCENTILES)
+        norm = Normalize(low, high)
+        drawn = axis.scatter(x[known], y[known], c=D[known], norm=norm, cmap=SHADES, **look), beyond
         if grey.any():
-            axis.scatter(x[grey], y[grey], c=np.zeros(grey.sum()), cmap=ListedColormap(["#b8b8b8"]),
-                         label=f"{grey.sum()} orbits without a diffusion", **look)  # fmt: skip
-    lost = int(np.sum(~there))
-    if lost:
-        text = f"{lost} of {there.size} orbits have no frequencies"
-        handles.append(note(text))
+            label = f"{grey.sum()} orbits without a diffusion"
+            axis.scatter(x[grey], y[grey], color=PALE, label=label, **look)
+    return drawn, counted({f"of {there.size} orbits have no frequencies": np.sum(~there)})
 
 
 def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, int]]) -> None:
@@ -237,6 +200,6 @@ def _name_resonance(axis: Any, k: tuple[int, int], limits: Any) -> None:
         place, how, off = (left, at_left), {"ha": "left", "va": "center"}, (3, 0)
     else:
         return
-    axis.annotate(f"({signed(a)}, {signed(b)})", place, fontsize=8, color="#555555",
-                  xytext=off, textcoords="offset points", annotation_clip=False,
-                  **how)  # fmt: skip
+    look = {"fontsize": 8, "color": "#555555", "annotation_clip": False} | how
+    name = f"({signed(a)}, {signed(b)})"
+    axis.annotate(name, place, xytext=off, textcoords="offset points", **look)

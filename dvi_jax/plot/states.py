@@ -1,4 +1,4 @@
-"""Trajectories as pictures take them: lanes of states, their components, colours and failures."""
+"""Input of the pictures: trajectories, their components, colours and failures."""
 
 import math
 import re
@@ -11,7 +11,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 
-from .house import COLOURS, DASHES, PALE, SHADES, named
+from .axes import check_labels, interval
+from .style import COLOURS, CROSS, DASHES, PALE, SHADES, named
 
 _GOOD = ("", "successful", "stopped")
 
@@ -74,11 +75,9 @@ def lanes_of(
         raise ValueError(f"{what} was given no orbit: the list or the batch is empty.")
     if momenta and any(lane.ps is None for lane in lanes):
         raise TypeError(f"{what} needs momenta: a Solution, or the arrays (ts, qs, ps).")
+    check_labels(labels, len(lanes), "orbits")
     if labels is None:
         return lanes
-    if isinstance(labels, str) or len(labels) != len(lanes):
-        count = 1 if isinstance(labels, str) else len(labels)
-        raise ValueError(f"labels has {count} names for {len(lanes)} orbits: give a list of them.")
     return [lane._replace(label=str(name)) for lane, name in zip(lanes, labels, strict=True)]
 
 
@@ -189,8 +188,11 @@ def component(
     letter, inside = found.groups()
     numbers = (0,) * len(shape) if inside is None else tuple(int(i) for i in inside.split(","))
     if inside is None and math.prod(shape) != 1:
-        raise ValueError(f'{what}: a state of shape {shape} has several "{letter}": take '
-                         f'"{letter}[{", ".join("0" * len(shape))}]".')  # fmt: skip
+        example = f"{letter}[{', '.join('0' * len(shape))}]"
+        raise ValueError(
+            f'{what}: a state of shape {shape} has several "{letter}": '
+            f'choose one, as in "{example}".'
+        )
     place = place_in(shape, numbers, what)
     label = named(subscript(letter, place, shape), units.get(letter))
     return lambda qs, ps: (qs if letter == "q" else ps)[(slice(None), *place)], label
@@ -206,7 +208,7 @@ def each_state(
     return values
 
 
-# --- how orbits are told apart ------------------------------------------------------------------
+# --- colours and dashes of orbits -----------------------------------------------------------------
 
 
 class Looks(NamedTuple):
@@ -217,8 +219,13 @@ class Looks(NamedTuple):
     scale: ScalarMappable | None
     unknown: int = 0
 
+    def colour_bar(self, axes: Sequence[Any], label: str) -> None:
+        """A bar of the scale of values next to the axes, if there is a scale."""
+        if self.scale is not None:
+            axes[0].figure.colorbar(self.scale, ax=list(axes), label=label)
+
     def entries(self) -> list[Line2D]:
-        """What a legend says of orbits without a value."""
+        """Legend entry of the orbits without a value."""
         if not self.unknown:
             return []
         text = f"{self.unknown} of {len(self.colours)} orbits have no value"
@@ -241,20 +248,13 @@ def looks_of(
     if len(values) != count:
         raise ValueError(f"{what} has {len(values)} values for {count} orbits: give one for each.")
     known = np.isfinite(values)
-    low, high = (0.0, 1.0)
-    if limits is not None:
-        low, high = (float(v) for v in limits)
-    elif known.any():
-        low, high = float(values[known].min()), float(values[known].max())
-    if high <= low:
-        low, high = low - 0.5, high + 0.5
-    scale = ScalarMappable(Normalize(low, high), SHADES)
+    scale = ScalarMappable(Normalize(*interval(values, limits)[:2]), SHADES)
     shades = [tuple(scale.to_rgba(v)) if k else PALE for v, k in zip(values, known, strict=True)]
     return Looks(shades, ["-"] * count, scale, int(np.sum(~known)))
 
 
 def troubles(lanes: Sequence[Lane]) -> list[str]:
-    """What is to be said of orbits that have no states to the end, one line for each reason."""
+    """Legend texts of orbits without states to the end, one for each reason."""
     reasons = [lane.trouble for lane in lanes]
     lines = []
     for reason in dict.fromkeys(r for r in reasons if r):
@@ -270,7 +270,3 @@ def troubles(lanes: Sequence[Lane]) -> list[str]:
 def cross(text: str) -> Line2D:
     """The entry of a legend for the places where orbits ended."""
     return Line2D([], [], linestyle="none", label=text, **CROSS)
-
-
-CROSS: dict[str, Any] = {"marker": "x", "color": "#000000", "markersize": 7, "markeredgewidth": 1.5}
-START: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "linestyle": "none"}

@@ -12,13 +12,14 @@ import numpy as np
 from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from . import panels
-from .blocks import REDUCTIONS, Lines, Picture, counted, reduced
-from .house import COLOURS, NO_NUMBER, ZERO, in_style, legend
+from .axes import flat_cells, legend
+from .blocks import REDUCTIONS, Lines, Picture, count_codes, reduced
 from .panels import NOT_COMPUTED, Grid, flag, share
 from .places import dim_of, label_of, names_of
+from .style import COLOURS, NO_NUMBER, ZERO, in_style
 
 PIXELS = (480, 320)
-"""Of a map at most, in x and y."""
+"""Largest number of pixels of a map, in x and y."""
 
 _GOOD = ("successful", "stopped")
 _OPEN = "not_computed"
@@ -60,7 +61,7 @@ def sweep_map(
       not finite is left out; the legend says how much that was.
     - `log`: scale of the numbers; None: logarithmic for positive numbers over two decades. Then
       exact zeros are black.
-    - `status`: that of the same sweep; tells what failed from what is not computed.
+    - `status`: that of the same sweep; distinguishes failed from not computed cells.
     - `limits`: (low, high) of the scale. `ax`: where to draw; None: a new figure.
 
     Axes are logarithmic where the values are spaced so. Pixels without a number are hatched grey.
@@ -68,8 +69,7 @@ def sweep_map(
     **Returns** the `Axes`, an array of them with `facet`.
 
     **Raises** `TypeError` for what is no array of numbers; `ValueError` for dimensions that are not
-    there or too many, a median of more numbers than are read at a time, and other input that cannot
-    be meant.
+    there or too many, a median of more numbers than are read at a time, and other invalid input.
     """
     data = panels.checked_array(data, "sweep_map")
     _check_reduce(reduce, REDUCTIONS)
@@ -118,7 +118,8 @@ def slope_map(
     _check_reduce(reduce, REDUCTIONS)
     dim = dim_of(data, along)
     values, order = _positive(data, along)
-    if any(dim_of(data, name) == dim for name in ([facet] if facet else []) + _several(over)):
+    others = [over] if isinstance(over, str) else list(over)
+    if any(dim_of(data, name) == dim for name in ([facet] if facet else []) + others):
         raise ValueError(f"slopes along {along!r} leave nothing of it for a facet or for over.")
     x, y = (along if name is not None and dim_of(data, name) == dim else name for name in (x, y))
     local = local or along in (x, y)
@@ -168,7 +169,7 @@ def failure_map(
     _check_reduce(reduce, ("any", "fraction"))
     codes, names = _flags(status)
     grid = panels.arrange(status, x, y, facet, over, pixels)
-    counts = [counted(panel, grid.bins, codes) for _, panel in grid.panels]
+    counts = [count_codes(panel, grid.bins, codes) for _, panel in grid.panels]
     if reduce == "fraction":
         pictures = [_failed_share(c, names) for c in counts]
         label = "share of trajectories that failed"
@@ -183,7 +184,7 @@ def failure_map(
         for i, (name, n) in enumerate(zip(names, total, strict=True))
         if n
     ]
-    legend(axes[0], ax is None, entries)
+    legend(axes[0], ax is None, entries, labelled=False)
     return axes[0] if facet is None else np.asarray(axes)
 
 
@@ -206,8 +207,9 @@ def _draw(
     mesh = None
     for i, (axis, picture) in enumerate(zip(axes, pictures, strict=True)):
         mesh = panels.draw_values(axis, grid, picture.values, scale)
-        if opens is not None:
-            panels.draw_flags(axis, grid, opens[0][i] & np.isnan(picture.values), NOT_COMPUTED)
+        if opens is not None and grid.y is not None:
+            where = opens[0][i] & np.isnan(picture.values)
+            flat_cells(axis, grid.x.edges, grid.y.edges, where, NOT_COMPUTED)
     panels.finish(axes, grid)
     panels.colour_bar(axes, mesh, scale, label)
     points = sum(p.points for p in pictures)
@@ -223,7 +225,7 @@ def _draw(
     ]
     if scale.log and any((p.values == 0).any() for p in pictures):
         entries.append(flag(ZERO, "exactly 0", line))
-    legend(axes[0], ax is None, entries)
+    legend(axes[0], ax is None, entries, labelled=False)
     return axes[0] if len(grid.panels) == 1 and not grid.panels[0][0] else np.asarray(axes)
 
 
@@ -232,16 +234,10 @@ def _check_reduce(reduce: Any, known: Any) -> None:
         raise ValueError(f"reduce must be one of {', '.join(map(repr, known))}, got {reduce!r}.")
 
 
-def _several(names: str | Sequence[str]) -> list[str]:
-    return [names] if isinstance(names, str) else list(names)
-
-
 def _with_along(along: str, x: str | None, y: str | None) -> tuple[str, str | None]:
-    """Axes with that of the slopes where there is room."""
+    """x and y, with the dimension of the slopes for the one that is free."""
     if x is not None and y is not None:
-        raise ValueError(
-            f"local slopes stand along {along!r}: name it as x or y, or leave one out."
-        )
+        raise ValueError(f"local slopes are along {along!r}: name it as x or y, or leave one out.")
     return (along, y) if x is None else (x, along)
 
 
@@ -253,8 +249,9 @@ def _is_reduced(grid: Grid, data: Any) -> bool:
 def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
     """(positive values of a coordinate, rising; their places along the dimension)."""
     if along not in data.coords:
-        raise ValueError(f"{along!r} has no values to take a slope along: there are "
-                         f"{names_of(data)}.")  # fmt: skip
+        raise ValueError(
+            f"{along!r} has no values to take a slope along; choose one of {names_of(data)}."
+        )
     values = data.coords[along].values
     if values.dtype.kind not in "iuf":
         raise ValueError(f"{along!r} has no numbers to take a slope along: {values.dtype}.")
@@ -300,9 +297,8 @@ def _status_of(data: Any) -> Any:
 
     if isinstance(data, xr.Dataset):
         if "status" not in data:
-            raise ValueError(
-                f"the Dataset has no status: there are {', '.join(map(str, data.data_vars))}."
-            )
+            held = ", ".join(map(str, data.data_vars))
+            raise ValueError(f"the Dataset has no status: it contains {held}.")
         data = data["status"]
     return panels.checked_array(data, "failure_map")
 
@@ -334,26 +330,28 @@ def _open_cells(status: Any, grid: Grid, facet: str | None) -> tuple[list[np.nda
     is_open = np.asarray([name == _OPEN for name in names])
     for i in range(len(grid.panels)):
         panel = status if facet is None else status.isel({dim_of(status, facet): i})
-        counts = counted(panel, grid.bins, codes)
+        counts = count_codes(panel, grid.bins, codes)
         found.append(counts[~is_open].sum(0) == 0)
         not_computed, points = not_computed + counts[is_open].sum(), points + counts.sum()
     return found, float(not_computed / points)
 
 
+def _is_bad(names: list[str]) -> np.ndarray:
+    """Which statuses are failures."""
+    return np.asarray([name not in (*_GOOD, _OPEN) for name in names])
+
+
 def _shown(counts: np.ndarray, codes: list[int], names: list[str]) -> np.ndarray:
     """The code of each pixel: its commonest failure, else its commonest status."""
-    bad = np.asarray([name not in (*_GOOD, _OPEN) for name in names])
-    failures = counts * bad.reshape(-1, *(1 for _ in counts.shape[1:]))
+    failures = counts * _is_bad(names).reshape(-1, *(1 for _ in counts.shape[1:]))
     commonest = np.where(failures.any(0), failures.argmax(0), counts.argmax(0))
     return np.asarray(codes)[commonest]
 
 
 def _failed_share(counts: np.ndarray, names: list[str]) -> Picture:
     is_open = np.asarray([name == _OPEN for name in names])
-    bad = np.asarray([name not in (*_GOOD, _OPEN) for name in names])
     computed = counts[~is_open].sum(0)
-    with np.errstate(invalid="ignore"):
-        values = counts[bad].sum(0) / np.where(computed, computed, np.nan)
+    values = counts[_is_bad(names)].sum(0) / np.where(computed, computed, np.nan)
     return Picture(values, int(counts[is_open].sum()), int(counts.sum()))
 
 

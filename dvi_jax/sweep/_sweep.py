@@ -12,14 +12,14 @@ import numpy as np
 from lanewise import Layout
 from lanewise.jaxapi import x64_enabled
 
-from .._arithmetic import Arithmetic, FloatingPoint
+from .._arithmetic import Arithmetic
+from .._integrator import Integrator, chosen
 from .._memory import machine_memory
 from .._solution import Save
 from .._system import System, check_system
 from ..engine.newton import RootSolver
-from ..engine.picard import PicardThenNewton
-from ..lattices import Given, Lattice, Uniform
-from ..methods import Method, TypeII
+from ..lattices import Given, Lattice
+from ..methods import Method
 from ..observe import Stop
 from .axes import Axis, as_axis, is_axis, leaves_with_axes, lengths
 from .bar import shown
@@ -60,14 +60,15 @@ def sweep(
     t0: Any = 0.0,
     epsilon: Any = 0.0,
     args: Any = None,
-    method: Any = TypeII(),
-    lattice: Lattice = Uniform(),
+    method: Any = None,
+    lattice: Lattice | None = None,
     save: Save | None = None,
     observe: Any = None,
     units: Mapping[str, str] | None = None,
-    newton: RootSolver = PicardThenNewton(),
-    arithmetic: Arithmetic = FloatingPoint(),
-    layout: Layout = Layout(),
+    newton: RootSolver | None = None,
+    arithmetic: Arithmetic | None = None,
+    layout: Layout | None = None,
+    integrator: Integrator | None = None,
     stop: Stop | None = None,
     store: str | os.PathLike | None = None,
     client: Any = None,
@@ -128,7 +129,7 @@ def sweep(
     made = make_sweep(
         system, q0, p0, start=start, h=h, num_steps=num_steps, t0=t0, epsilon=epsilon, args=args,
         method=method, lattice=lattice, save=save, observe=observe, newton=newton,
-        arithmetic=arithmetic, layout=layout, stop=stop,
+        arithmetic=arithmetic, layout=layout, integrator=integrator, stop=stop,
     )  # fmt: skip
     program, found, programs = prepare(made, lanes_per_task)
     coordinates = coordinates_of(made)
@@ -244,7 +245,19 @@ def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_st
             "nothing would be kept: give observe={...}, or save=dvi.Save(final=True) for the last "
             "states."
         )
-    method = _static("method", method, Method)
+    varied = is_axis(method) or isinstance(method, list | tuple)
+    integrator = chosen(
+        rest.pop("integrator"),
+        **{"root_finder": rest.pop("newton"), "method": None if varied else method},
+        **{name: rest.pop(name) for name in ("lattice", "arithmetic", "layout")},
+    )
+    rest |= {
+        "lattice": integrator.lattice,
+        "newton": integrator.root_finder,
+        "arithmetic": integrator.arithmetic,
+        "layout": integrator.layout,
+    }
+    method = _static("method", method if varied else integrator.method_for(system), Method)
     num_steps = _static("num_steps", num_steps, int | np.integer)
     leaves = leaves_with_axes(inputs)
     in_front = [

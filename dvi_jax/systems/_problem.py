@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.generators import Generator
+from ..discover.generators import Generator
 
 
 class ParameterError(ValueError):
@@ -38,7 +38,7 @@ class Adiabatic:
     smaller: Callable[[float], "Problem"] | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Problem:
     """A system with parameters, a start, a step size and what is known of it.
 

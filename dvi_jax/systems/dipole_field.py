@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.library import rotation, time_translation
+from ..discover.library import rotation, time_translation
 from . import _guiding_centre as guiding_centre
 from ._problem import Adiabatic, Problem, check_nonzero, check_positive, check_shape
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.library import time_translation
+from ..discover.library import time_translation
 from ._problem import Problem, check_shape
 from .restricted_three_body import velocity
 

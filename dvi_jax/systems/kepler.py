@@ -5,7 +5,7 @@ import numpy as np
 from jax import lax
 
 from .._system import System
-from ..symmetry.library import rotation, scaling, time_translation
+from ..discover.library import rotation, scaling, time_translation
 from ._problem import Problem, check_positive, check_shape, over_times
 
 

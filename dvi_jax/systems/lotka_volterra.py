@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.library import time_translation
+from ..discover.library import time_translation
 from ._problem import Problem, check_positive, check_shape
 
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.generators import Generator
-from ..symmetry.library import rotation, scaling, space_translation, time_translation
+from ..discover.generators import Generator
+from ..discover.library import rotation, scaling, space_translation, time_translation
 from ._problem import Problem, check_finite, number, parameter
 
 

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 
 from .._system import System
-from ..symmetry.generators import Generator
-from ..symmetry.library import scaling, time_translation
+from ..discover.generators import Generator
+from ..discover.library import scaling, time_translation
 from ._problem import Problem, check_shape, over_times
 
 PHASE = Generator(xi=lambda t, q, p, args: p, eta=lambda t, q, p, args: -q)

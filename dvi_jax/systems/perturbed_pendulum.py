@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from .._system import System
-from ..symmetry.library import time_translation
+from ..discover.library import time_translation
 from ._problem import Problem, check_shape
 from .pendulum import exact as of_pendulum
 

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.generators import Generator
-from ..symmetry.library import scaling, space_translation, time_translation
+from ..discover.generators import Generator
+from ..discover.library import scaling, space_translation, time_translation
 from ._elliptic import first_kind, jacobi, third_kind
 from ._problem import Problem, check_positive, check_shape, over_times
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.library import scaling
+from ..discover.library import scaling
 from ._problem import Adiabatic, InSlowTime, Problem, check_shape, number
 from .oscillator import exact as of_oscillator
 

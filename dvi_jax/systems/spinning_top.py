@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.library import space_translation, time_translation
+from ..discover.library import space_translation, time_translation
 from ._elliptic import first_kind, jacobi, third_kind
 from ._problem import Problem, check_positive, check_shape, over_times
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.library import time_translation
+from ..discover.library import time_translation
 from ._problem import Adiabatic, Problem, check_count, check_positive, check_shape
 
 

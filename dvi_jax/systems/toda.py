@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.library import space_translation, time_translation
+from ..discover.library import space_translation, time_translation
 from ._problem import Problem, check_count, check_shape
 
 

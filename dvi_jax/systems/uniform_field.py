@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..symmetry.generators import Generator
-from ..symmetry.library import time_translation
+from ..discover.generators import Generator
+from ..discover.library import time_translation
 from ._problem import Problem, check_nonzero, check_positive, check_shape, check_vector, over_times
 
 

@@ -13,6 +13,7 @@ import collections
 import os
 import subprocess
 import sys
+import tempfile
 import time
 import warnings
 from pathlib import Path
@@ -21,8 +22,8 @@ TESTS = Path(__file__).parents[1]
 PORTION = 50
 """Programs of a child process."""
 
-LONGEST = 1800
-"""Seconds after which a child is taken for stuck."""
+LONGEST = 600
+"""Seconds after which a child that is at the same program is taken for stuck."""
 
 FOOTER = """
 
@@ -89,6 +90,27 @@ def portion(seed: int, count: int, out: Path) -> None:
         print(f"count: {number} {what}")
 
 
+def _finished(command: list[str], env: dict[str, str], current: Path) -> tuple[int, list[str], str]:
+    """Exit status, output, and last line of the errors of a child, which is ended where it does not
+    begin another program for a long time."""
+    with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
+        child = subprocess.Popen(command, env=env, stdout=output, stderr=errors)
+        seen, since = 0.0, time.monotonic()
+        while child.poll() is None:
+            time.sleep(0.2)
+            changed = current.stat().st_mtime if current.exists() else 0.0
+            if changed != seen:
+                seen, since = changed, time.monotonic()
+            if time.monotonic() - since > LONGEST:
+                child.kill()
+                child.wait()
+                return -1, [], f"no end of a program after {LONGEST} s"
+        output.seek(0)
+        errors.seek(0)
+        lines, said = output.read().splitlines(), errors.read().strip().splitlines()
+        return child.returncode, lines, (said or [""])[-1]
+
+
 def search(count: int, minutes: float, seed: int, out: Path) -> int:
     out.mkdir(parents=True, exist_ok=True)
     # One seed draws the same programs everywhere: hypothesis asks for CI, and sets have an order.
@@ -99,15 +121,7 @@ def search(count: int, minutes: float, seed: int, out: Path) -> int:
     while total["programs"] < count and time.monotonic() - began < 60 * minutes:
         size = min(PORTION, count - total["programs"])
         command = [sys.executable, __file__, "--child", str(size), "--seed", str(seed)]
-        try:
-            done = subprocess.run(
-                [*command, "--out", str(out)],
-                env=env, capture_output=True, text=True, check=False, timeout=LONGEST,
-            )  # fmt: skip
-            code, lines = done.returncode, done.stdout.splitlines()
-            last = (done.stderr.strip().splitlines() or [""])[-1]
-        except subprocess.TimeoutExpired:
-            code, lines, last = -1, [], f"no end after {LONGEST} s"
+        code, lines, last = _finished([*command, "--out", str(out)], env, out / "current.py")
         for line in lines:
             if line.startswith("count: "):
                 number, _, what = line.removeprefix("count: ").partition(" ")

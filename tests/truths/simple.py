@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 import dvi_jax as dvi
-from dvi_jax.symmetry.library import rotation
+from dvi_jax.discover.library import rotation
 
 from . import Case, SymmetryCase
 from .maps import box

@@ -10,8 +10,8 @@ import numpy as np
 from exact_series import cos, vector
 
 import dvi_jax as dvi
-from dvi_jax.symmetry.generators import Generator
-from dvi_jax.symmetry.library import (
+from dvi_jax.discover.generators import Generator
+from dvi_jax.discover.library import (
     boost,
     hamiltonian_flow,
     rotation,

@@ -1,0 +1,124 @@
+"""How to integrate, as one object that every function that runs trajectories accepts."""
+
+from typing import Any
+
+import equinox as eqx
+
+from lanewise import Layout
+
+from ._adjoints import AbstractAdjoint
+from ._arithmetic import Arithmetic, FloatingPoint
+from ._discretise import is_first_order
+from ._reversible import Reversible
+from ._system import System
+from .engine.newton import RootSolver
+from .engine.picard import PicardThenNewton
+from .lattices import Lattice, Uniform
+from .methods import Method, Strang, TypeII
+
+
+class Integrator(eqx.Module):
+    """How to integrate: the keywords of `integrate` that say nothing about the problem.
+
+    - `method`: see `integrate`. None: the map that the user wrote, `TypeII()`; for a system with
+      `discretise(H, order=1)`, whose own map is of order one, `Strang()`.
+    - `root_finder`: how implicit steps are solved, `newton` of `integrate`.
+    - `lattice`: the time grid. `arithmetic`: how the state is represented.
+    - `layout`: machine code or arrays. `adjoint`: how reverse-mode gradients are computed.
+
+    `integrate`, `sweep`, `Model` (for `fit`), `poincare_section`, `bifurcation`, `ReturnMap`,
+    `tangent_map`, `drift_order`, `drift_surface`, `discover_invariants`, `find_symmetries` and
+    `solution_pairs` accept it as `integrator=`. The last three examine one step, and refuse fields
+    without an effect there that are not the defaults. `sweep` computes no gradients and does not
+    use `adjoint`.
+
+    **Raises** `TypeError` for a field of another type.
+
+    **Example**
+
+    ```python
+    accurate = dvi.Integrator(method=dvi.KahanLi(8), arithmetic=dvi.Compensated())
+    kepler = systems.kepler()
+    sol = dvi.integrate(kepler.system, kepler.q0, kepler.p0, args=kepler.args, h=0.1, num_steps=100,
+                        integrator=accurate)
+    print(sol.status)
+    # successful
+    ```
+    """
+
+    method: Method | None = None
+    root_finder: RootSolver = PicardThenNewton()
+    lattice: Lattice = Uniform()
+    arithmetic: Arithmetic = FloatingPoint()
+    layout: Layout = Layout()
+    adjoint: AbstractAdjoint = Reversible()
+
+    def __check_init__(self):
+        for name, kind in _KINDS:
+            value = getattr(self, name)
+            if isinstance(value, kind) or (name == "method" and value is None):
+                continue
+            hint = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
+            if kind is RootSolver:
+                name = "newton"
+                hint += "; take dvi.Newton(), dvi.SimplifiedNewton(), dvi.Picard() or leave it out"
+            raise TypeError(f"{name} must be a {kind.__name__}, got {value!r}{hint}.")
+
+    @property
+    def newton(self) -> RootSolver:
+        """Another name of `root_finder`."""
+        return self.root_finder
+
+    def method_for(self, system: System) -> Method:
+        """The method, or the default for this system."""
+        return default_method(system) if self.method is None else self.method
+
+
+_KINDS = (
+    ("method", Method),
+    ("lattice", Lattice),
+    ("adjoint", AbstractAdjoint),
+    ("root_finder", RootSolver),
+    ("arithmetic", Arithmetic),
+    ("layout", Layout),
+)
+
+_DEFAULT = Integrator()
+
+
+def default_method(system: System) -> Method:
+    """The map that the user wrote; Strang's composition of a map that is only of order one because
+    it was made from a continuous Hamiltonian."""
+    return Strang() if is_first_order(system.H_D) else TypeII()
+
+
+def chosen(integrator: Integrator | None, **given: Any) -> Integrator:
+    """The integrator of a call: the object, or one made of single keywords (None: not given).
+
+    **Raises** `TypeError` for another object, `ValueError` for both.
+    """
+    given = {name: value for name, value in given.items() if value is not None}
+    if integrator is None:
+        return Integrator(**given) if given else _DEFAULT
+    if not isinstance(integrator, Integrator):
+        raise TypeError(f"integrator must be a dvi.Integrator(...), got {integrator!r}.")
+    if given:
+        names = ", ".join("newton" if name == "root_finder" else name for name in given)
+        raise ValueError(
+            f"{names} and integrator are both given: put all in dvi.Integrator(...), or leave "
+            "integrator out."
+        )
+    return integrator
+
+
+def only(integrator: Integrator, function: str, *used: str) -> Integrator:
+    """The integrator, after refusing fields that a function does not use and that differ from the
+    defaults."""
+    for name, _ in _KINDS:
+        value, default = getattr(integrator, name), getattr(_DEFAULT, name)
+        if name not in used and not eqx.tree_equal(value, default):
+            raise ValueError(
+                f"{function} does not use {name}, and integrator has {name}={value!r}: it uses "
+                f"{', '.join(used)}."
+            )
+    return integrator

@@ -1,0 +1,252 @@
+"""What functions change by in one step of a map, at sampled points, order by order in ε."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import lanewise
+from lanewise.dependence import depends_on
+
+from .._results import RESULTS
+from .._step import Equations
+from .._system import System
+from .._types import Interval
+from ..methods import Method
+from .basis import BoundBasis
+from .motion import Motion
+from .sampling import Samples, check_finite, later, relative_step, require_steps
+from .taylor import taylor_coefficients
+
+_EXACT = 1e-12
+"""A series that changes by less, of what functions change by, at large ε is no expansion."""
+
+_TRIED = (0.5, -0.3)
+"""The ε at which that is tried, in units of that at which the disturbance is as large as H_D."""
+
+_EXACT_STEPS = 100
+"""Steps over which it is tried."""
+
+
+class Stepped(NamedTuple):
+    """The map of one step of a method, and functions of which the change is asked."""
+
+    equations: Equations
+    h: Any
+    method: Method
+    basis: BoundBasis
+
+
+class Changes(NamedTuple):
+    """At S samples, for B functions.
+
+    - `values`: φ, (S, B). `terms`: A_0 … A_z, (S, z + 1, B): Taylor coefficients in ε of
+      φ(Φ_ε(z), t + h) − φ(z, t). `volume`: those of log |det DΦ_ε| from order 1, (S, z + 1).
+    - `motion`: what slopes predict for A_0, and its rounding.
+    - `slopes`: ∂φ/∂(q, p, t), (S, B, 2n + 1). `moved`: z1 − z of z = (q, p, t), (S, 2n + 1).
+    - `good`: where the step succeeds and all is finite, (S,).
+    """
+
+    values: np.ndarray
+    terms: np.ndarray
+    volume: np.ndarray
+    motion: Motion
+    slopes: np.ndarray
+    moved: np.ndarray
+    good: np.ndarray
+
+    def at(self, some: np.ndarray) -> "Changes":
+        """Of some of the samples."""
+        motion = Motion(*(x[some] for x in self.motion))
+        return Changes(
+            values=self.values[some],
+            terms=self.terms[some],
+            volume=self.volume[some],
+            motion=motion,
+            slopes=self.slopes[some],
+            moved=self.moved[some],
+            good=self.good[some],
+        )
+
+
+def changes_at(stepped: Stepped, order: int, samples: Samples) -> Changes:
+    """Without a check of anything."""
+    found = [np.asarray(x) for x in batched_changes(stepped, order, samples)]
+    values, terms, volume, good, slopes, move, blur = found
+    finite = [np.isfinite(x.reshape(len(good), -1)).all(axis=1) for x in found]
+    with np.errstate(all="ignore"):
+        rounding = np.abs(values) + np.abs(values + terms[:, 0])
+        rounding = rounding + np.einsum("sbi,si->sb", np.abs(slopes), blur)
+        predicted = (slopes * move[:, None]).swapaxes(1, 2)
+    motion = Motion(predicted, np.finfo(float).eps * rounding)
+    good = good & np.all(finite, axis=0)
+    return Changes(values, terms, volume, motion, slopes, move, good)
+
+
+def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
+    """After refusing steps that fail, what is not finite, and a time that is not sampled."""
+    basis = stepped.basis
+    found = changes_at(stepped, order, samples)
+    if not found.good.all():
+        require_steps(np.asarray(batched_changes(stepped, order, samples)[3]), samples)
+    check_finite(basis, found.values)
+    bad = ~np.isfinite(found.terms)
+    if bad.any():
+        i, m, j = np.argwhere(bad)[0]
+        what = "changes by" if m == 0 else f"has in order {m} of ε"
+        raise ValueError(
+            f"what the basis function {basis.names[j]!r} {what} in a step is not finite at "
+            f"{int(bad.any(axis=(1, 2)).sum())} of {len(bad)} samples (first: number {i}): H_D, "
+            "the force or the function is singular there or where the step leads. Keep the "
+            "samples off the singularity."
+        )
+    bad = np.asarray(~np.isfinite(found.slopes).all(axis=2))
+    if bad.any():
+        i, j = np.argwhere(bad)[0]
+        raise ValueError(
+            f"the derivatives of the basis function {basis.names[j]!r} are not finite at "
+            f"{int(bad[:, j].sum())} of {len(bad)} samples (first: number {i}): keep the samples "
+            "off its singularity."
+        )
+    if not found.good.all():
+        raise ValueError(
+            f"the derivative of the map is not finite at {int(np.sum(~found.good))} of {len(bad)} "
+            f"samples (first: number {int(np.argmin(found.good))}): keep them off singularities of "
+            "H_D and the force."
+        )
+    if np.ptp(samples.t) == 0 and _may_depend_on_time(stepped.equations, samples):
+        _require_no_time(stepped, order, samples, found)
+    return found
+
+
+def _require_no_time(stepped, order, samples, found) -> None:
+    allowed = 1e-8 * np.max(np.abs(found.terms), axis=0, keepdims=True)
+    allowed = np.broadcast_to(allowed, found.terms.shape).copy()
+    predicted = np.sum(np.abs(found.motion.changes), axis=1)
+    relative = relative_step(samples, found.moved[:, :-1])
+    for shift in later(float(stepped.h), relative):
+        # t1 − t0 loses digits at a later time, and a step is in proportion to it.
+        lost = 4 * np.finfo(float).eps * (np.max(np.abs(samples.t)) + shift) / abs(stepped.h)
+        other = changes_at(stepped, order, samples._replace(t=samples.t + shift)).terms
+        allowed[:, 0] = np.maximum(1e-8, lost) * predicted + 8 * found.motion.rounding
+        if not (np.abs(other - found.terms) <= allowed).all():
+            raise ValueError(
+                "the map depends on the time, and all samples are of one time: give "
+                "samples=(qs, ps, ts)."
+            )
+
+
+def _may_depend_on_time(equations, samples) -> bool:
+    """Whether t enters H_D, perturbation or force at all."""
+    q, p, t = (jnp.asarray(x[0]) for x in samples)
+    system, args, one = equations.system, equations.args, jnp.ones(())
+
+    def energies(t):
+        H = system.hamiltonian(t, t, q, p, one, args)
+        return H, system.disturbing_force(t, t, q, p, one, args)
+
+    return depends_on(energies, 0, t)
+
+
+def _map(stepped: Stepped, epsilon: Array) -> Any:
+    """(q, p, t) → (q1, p1, t1) and the status, with t the slow time for a system that has one."""
+    equations, h, method, _ = stepped
+    system, slow = equations.system, equations.system.slow_time
+    plain = System(system.H_D, system.force, system.perturbation)
+    here = Equations(plain, epsilon, equations.args, equations.newton)
+
+    def step(q, p, t):
+        t1 = t + (epsilon * h if slow else h)
+        q1, p1, info = method.step(here, Interval(t, t1, jnp.asarray(h, float)), q, p)
+        return q1, p1, t1, info
+
+    return step
+
+
+@eqx.filter_jit
+def batched_changes(stepped: Stepped, order: int, samples):
+    """Values of the basis, Taylor coefficients in ε of their changes and of log |det DΦ_ε| (but
+    its order 0, which is left at 0).
+
+    Shapes (S, B), (S, z + 1, B), (S, z + 1); whether the steps succeed, (S,); slopes of the
+    functions, (S, B, 2n + 1); z1 − z, and what z1 and z − z1 are rounded by in units of the last
+    digit, (S, 2n + 1).
+    """
+    basis = stepped.basis
+
+    def at_point(q, p, t):
+        def change(epsilon):
+            q1, p1, t1, info = _map(stepped, epsilon)(q, p, t)
+            return basis(q1, p1, t1) - basis(q, p, t), info.result == RESULTS.successful
+
+        def jacobian(epsilon):
+            def flat(z):
+                q1, p1, _, _ = _map(stepped, epsilon)(
+                    z[: q.size].reshape(q.shape), z[q.size :].reshape(p.shape), t
+                )
+                return jnp.concatenate([q1.ravel(), p1.ravel()])
+
+            return jax.jacfwd(flat)(jnp.concatenate([q.ravel(), p.ravel()]))
+
+        def growth(epsilon):
+            """d log |det DΦ| / dε = tr(DΦ⁻¹ dDΦ/dε)."""
+            D, dD = jax.jvp(jacobian, (epsilon,), (jnp.ones(()),))
+            return jnp.trace(jax.vmap(lanewise.solve, (None, 1), 1)(D, dD))
+
+        zero = jnp.zeros(())
+        terms = taylor_coefficients(lambda e: change(e)[0], zero, order)
+        volumes = jnp.zeros(order + 1)
+        if order > 0:
+            growths = taylor_coefficients(growth, zero, order - 1)
+            volumes = volumes.at[1:].set(growths / jnp.arange(1, order + 1))
+
+        def flat(z):
+            half = z[: q.size].reshape(q.shape), z[q.size : -1].reshape(p.shape), z[-1]
+            q1, p1, t1, _ = _map(stepped, zero)(*half)
+            return jnp.concatenate([q1.ravel(), p1.ravel(), t1[None]])
+
+        def functions(z):
+            return basis(z[: q.size].reshape(q.shape), z[q.size : -1].reshape(p.shape), z[-1])
+
+        z = jnp.concatenate([q.ravel(), p.ravel(), jnp.asarray(t)[None]])
+        # Rounding of z moves z1 − z by as much as the derivative along some vector of its size.
+        signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], z.size))
+        z1, dz1 = jax.jvp(flat, (z,), (signs * jnp.abs(z),))
+        blur = jnp.abs(z1) + jnp.abs(dz1 - signs * jnp.abs(z))
+        slopes = jax.jacfwd(functions)(z)
+        return basis(q, p, t), terms, volumes, change(zero)[1], slopes, z1 - z, blur
+
+    return jax.vmap(at_point)(*samples)
+
+
+@eqx.filter_jit
+def is_exact(stepped: Stepped, series, typical, scale, samples):
+    """Whether Σ ε^m c_m·φ is kept over many steps at ε that are not small."""
+
+    basis = stepped.basis
+
+    def at(epsilon):
+        c = epsilon ** jnp.arange(series.shape[0]) @ series
+        step = _map(stepped, epsilon)
+
+        def value(q, p, t):
+            def once(_, state):
+                q, p, t, good = state
+                q, p, t, info = step(q, p, t)
+                return q, p, t, good & (info.result == RESULTS.successful)
+
+            good = jnp.asarray(True)
+            q1, p1, t1, good = jax.lax.fori_loop(0, _EXACT_STEPS, once, (q, p, t, good))
+            before, after = basis(q, p, t), basis(q1, p1, t1)
+            rounding = jnp.abs(c) @ (jnp.abs(before) + jnp.abs(after))
+            return c @ before, c @ after - c @ before, rounding, good
+
+        before, change, rounding, good = jax.vmap(value)(*map(jnp.asarray, samples))
+        moved = jnp.minimum(_EXACT_STEPS * typical, 1) * jnp.std(before)
+        allowed = _EXACT * moved + _EXACT_STEPS * jnp.finfo(before.dtype).eps * rounding
+        return jnp.all(good) & jnp.all(jnp.abs(change) <= allowed)
+
+    return jnp.all(jax.vmap(at)(jnp.array(_TRIED) / scale))

@@ -1,0 +1,249 @@
+"""Gauge functions that close Noether's identities, found in a basis."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._results import RESULTS
+from .._step import Equations, step
+from .._system import System, check_system
+from .._types import Args, Interval
+from ..engine.newton import Newton
+from .basis import AbstractBasis, BoundBasis, bind_basis, check_step_size
+from .echelon import reduction
+from .generators import Generator, LatticePoint
+from .noether import noether_identity
+from .null_series import series_changes, solve_series
+from .sampling import (
+    as_samples,
+    relative_step,
+    require_enough,
+    require_steps,
+    require_time,
+)
+from .taylor import taylor_coefficients
+
+_ROUNDINGS = 64.0
+"""An identity below so many roundings of its terms is zero."""
+
+_HIDDEN = 1e-6
+"""Where rounding makes a larger residual, it does not decide whether a gauge exists."""
+
+_STRONG = 100.0
+"""A sample is compared with itself where the identity is so many times larger than at 75 %."""
+
+
+class BasisGauge(eqx.Module):
+    """A gauge G(t, q, p, args) = g·φ(q, p, t); as a formula: `str`."""
+
+    basis: BoundBasis
+    coefficients: Array
+
+    def __call__(self, t, q, p, args):
+        return self.coefficients @ self.basis(q, p, t)
+
+    def __str__(self) -> str:
+        return self.basis.formula(self.coefficients)
+
+
+class GaugeSolution(eqx.Module):
+    """What `solve_gauge` found; print it for a report. A sequence of its first three fields.
+
+    - `gauges`: one for each order, for `AdiabaticInvariant`.
+    - `coefficients`: shape (z + 1, basis size).
+    - `residuals`: shape (z + 1,), on held-out points: the largest residual of the identity with the
+      gauge at each order in ε, relative to the identity without gauges (or to its terms if that
+      is zero). Rounding: a gauge exists, and the identity closes to that order; of order one: no
+      gauge in this basis closes it.
+    - `rounding`: the residual that rounding alone makes at order 0. Where it is above 1e-6, whether
+      the identity closes cannot be decided (`warnings`).
+    """
+
+    gauges: tuple[BasisGauge, ...]
+    coefficients: np.ndarray
+    residuals: np.ndarray
+    rounding: float = eqx.field(static=True)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the answer is not reliable, with what would help; empty if it is."""
+        if self.rounding <= _HIDDEN:
+            return ()
+        return (
+            f"rounding alone makes a residual of {self.rounding:.0e}: whether a gauge exists "
+            "cannot be decided in this arithmetic; take a larger h, or samples that spread wider",
+        )
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.gauges, self.coefficients, self.residuals))
+
+    def __getitem__(self, i: int) -> Any:
+        return tuple(self)[i]
+
+    def __len__(self) -> int:
+        return 3
+
+    def __str__(self) -> str:
+        lines = [
+            f"order {m}: residual {residual:.1e}, G = {gauge}"
+            for m, (gauge, residual) in enumerate(zip(self.gauges, self.residuals, strict=True))
+        ]
+        return "\n".join([*lines, *self.warnings])
+
+
+def solve_gauge(
+    system: System,
+    generators: Sequence[Generator],
+    basis: AbstractBasis,
+    *,
+    h: float,
+    samples: Any,
+    t0: float = 0.0,
+    args: Args = None,
+) -> GaugeSolution:
+    r"""The gauge functions that close Noether's identities on the disturbed map, by least squares.
+
+    With Φ_ε the map (12)–(13), the sum Σ_m ε^m N_m of the identities (28) has to vanish on
+    (q, p) → Φ_ε(q, p) up to O(ε^{z+1}). Powers of ε are collected *after* the map is put in:
+
+        n_k + (1/h) Σ_{m≤k} A_{k−m} g_m = 0    for k = 0 … z
+
+    with n_k the Taylor coefficients of the sum without gauges and A_k those of φ(Φ_ε) − φ.
+    (Taken order by order with the undisturbed map, as (28) is printed, terms are lost: (34)
+    fails by it.)
+
+    On the solutions every generator with ξ0 = 0 has the gauge −ξ·p, whose invariant is 0: where
+    the basis holds it, look at the invariant and not at the residual alone. `find_symmetries`
+    tells such generators from those that lead to an invariant.
+
+    **Arguments** `generators`: the series, order 0 first; `basis`: φ(q, p), where the gauges are
+    looked for; `h`, `t0`, `args`: of the step; `samples`: (qs, ps) at t0, shapes (S, *q.shape),
+    or (qs, ps, ts) with the times of the samples, shape (S,); a quarter of them held out.
+
+    **Returns** a `GaugeSolution`: `gauges`, functions for `AdiabaticInvariant`, one for each order;
+    their `coefficients` in the basis; `residuals` of the identity at each order on held-out points;
+    and `warnings` where rounding hides the answer. No sample counts more than another, however
+    large the identity is there.
+
+    **Raises** `ValueError` for samples of unequal shapes, too few of them, or where the step fails.
+
+    **Source** our own; the identities: the paper, (25) and (28).
+    """
+    check_system(system)
+    samples = as_samples(samples, t0)
+    if isinstance(generators, Generator) or len(generators) == 0:
+        raise ValueError(
+            "generators must be a list with one Generator for each order, order 0 first; got "
+            f"{generators!r}."
+        )
+    bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
+    require_enough(samples, bound.size)
+    require_time(bound, samples)
+    held, order = samples.held_out, len(generators) - 1
+    equations = Equations(system, jnp.zeros(()), args)
+    terms, sizes, moved, good = map(
+        np.asarray, _identity_terms(equations, h, list(generators), bound, samples)
+    )
+    require_steps(good, samples)
+    n, changes, size = terms[:, :, 0], terms[:, :, 1:] / h, bound.size
+    largest = np.max(np.abs(n), axis=1)
+    scale = _scale(largest, sizes)
+    # An identity that does not close is at least this fraction of its terms.
+    relative = np.maximum(largest / np.maximum(sizes, np.finfo(float).tiny), 1e-300)
+    relative = np.where(relative > _ROUNDINGS * np.finfo(float).eps, relative, 1e-300)
+    relative = np.maximum(relative, relative_step(samples, moved))
+
+    rows = changes / scale[:, None, None]
+    g, free = solve_series(rows[~held], -n[~held] / scale[~held, None])
+    # What is left free is invariants, which may be added to any gauge: the simplest is taken.
+    g = reduction(free, np.tile(bound.complexity, order + 1), size)(g)
+    left = series_changes(rows, g[:, None])[held, :, 0] + n[held] / scale[held, None]
+    g = g.reshape(order + 1, size)
+    return GaugeSolution(
+        gauges=tuple(BasisGauge(bound, jnp.asarray(c)) for c in g),
+        coefficients=g,
+        residuals=np.max(np.abs(left), axis=0),
+        rounding=min(1.0, float(_ROUNDINGS * np.finfo(float).eps / np.median(relative))),
+    )
+
+
+def _scale(n: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """What the residual of each sample is divided by, shape (S,): the largest identity without
+    gauges, or its own where that is far larger than at nearly all samples.
+
+    `n`: the identity without gauges; `sizes`: of its terms before they cancel.
+    """
+    if np.mean(n <= _ROUNDINGS * np.finfo(float).eps * sizes) > 0.95:
+        n = sizes  # the identity closes by itself: n is rounding
+    usual = n <= _STRONG * np.quantile(n, 0.75)
+    return np.maximum(np.where(usual, np.max(n[usual], initial=0.0), n), np.finfo(float).tiny)
+
+
+def _weighted(generator: Generator, first: LatticePoint, weights: Array) -> Generator:
+    """The generator with components times weights, at the first point and elsewhere, shape
+    (2, 2n + 1)."""
+
+    def component(place):
+        def function(t, q, p, args):
+            value = generator(LatticePoint(t, q, p), args)[place]
+            w = jnp.where(t == first.t, weights[0], weights[1])
+            return value * jnp.split(w, [1, 1 + q.size])[place].reshape(value.shape)
+
+        return function
+
+    return Generator(*map(component, range(3)))
+
+
+@eqx.filter_jit
+def _identity_terms(equations, h, generators, basis, samples):
+    """Taylor coefficients in ε of [Σ ε^m N_m without gauges, φ(Φ_ε) − φ], (S, z + 1, 1 + B); the
+    sizes of the terms of N_m at ε = 0 before they cancel, one for each component of the generator
+    at both points, (S,); z1 − z, (S, 2n); and whether the steps succeed, (S,)."""
+    nothing = [None] * len(generators)
+
+    def at_point(q, p, t):
+        interval = Interval(t, t + h, jnp.asarray(h, float))
+
+        def of(epsilon):
+            here = Equations(equations.system, epsilon, equations.args, Newton())
+            q1, p1, _ = step(here, interval, q, p)
+            first, second = LatticePoint(interval.t0, q, p), LatticePoint(interval.t1, q1, p1)
+            total = sum(
+                epsilon**m
+                * noether_identity(
+                    here.system, generators, nothing, m, first, second, epsilon, here.args
+                )
+                for m in range(len(generators))
+            )
+            return jnp.append(total, basis(q1, p1, interval.t1) - basis(q, p, interval.t0))
+
+        def in_parts(weights):
+            """The identities of all orders at ε = 0, linear in weights of the components."""
+            here = Equations(equations.system, jnp.zeros(()), equations.args, Newton())
+            q1, p1, _ = step(here, interval, q, p)
+            first, second = LatticePoint(interval.t0, q, p), LatticePoint(interval.t1, q1, p1)
+            weighted = [_weighted(g, first, weights[m]) for m, g in enumerate(generators)]
+            return jnp.stack(
+                [
+                    noether_identity(
+                        here.system, weighted, nothing, m, first, second, 0.0, here.args
+                    )
+                    for m in range(len(generators))
+                ]
+            )
+
+        parts = jax.jacfwd(in_parts)(jnp.ones((len(generators), 2, 1 + 2 * q.size)))
+        size = jnp.max(jnp.sum(jnp.abs(parts), axis=(1, 2, 3)))
+        terms = taylor_coefficients(of, jnp.zeros(()), len(generators) - 1)
+        q1, p1, info = step(
+            Equations(equations.system, jnp.zeros(()), equations.args, Newton()), interval, q, p
+        )
+        moved = jnp.concatenate([(q1 - q).ravel(), (p1 - p).ravel()])
+        return terms, size, moved, info.result == RESULTS.successful
+
+    return jax.vmap(at_point)(*samples)

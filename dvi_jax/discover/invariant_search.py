@@ -1,0 +1,403 @@
+"""Adiabatic invariants found as a null space on the map that is actually iterated."""
+
+import operator
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._integrator import Integrator
+from .._step import Equations
+from .._system import System, check_system
+from .._types import Args
+from ..engine.newton import RootSolver
+from ..methods import Method
+from .basis import AbstractBasis, bind_basis, check_step_size
+from .changes import Changes, Stepped, changes_at, checked_changes, is_exact
+from .expansions import Larger, at_larger_step, in_larger_box, powers_of_size
+from .found import Discovery
+from .judging import CLEARLY, Fewest, Judge, cleaned, reach
+from .motion import UNCLEAR, coefficient_errors, conserved, typical_sizes
+from .null_series import compress, epsilon_scale, in_units_of, series_spaces
+from .nullspace import RANK, singular_vectors, triangle
+from .obstructions import drift_laws
+from .representatives import Span
+from .sampling import (
+    Samples,
+    as_samples,
+    check_basis,
+    map_of,
+    middle,
+    relative_step,
+    require_enough,
+    require_time,
+)
+
+_FUZZY = 30.0
+"""Coefficients are known up to this share of the largest, over the gap in singular values."""
+
+_FUZZIEST = 1e-3
+"""No larger shares than this are taken for errors of others."""
+
+_AS_GOOD = 10.0
+"""An invariant with fewer terms may change by so many times more."""
+
+_ROUND_OFF = 1e-12
+"""Changes below this need not be smaller."""
+
+
+def discover_invariants(
+    system: System,
+    basis: AbstractBasis,
+    order: int = 0,
+    *,
+    h: float,
+    samples: Any,
+    t0: float = 0.0,
+    args: Args = None,
+    method: Method | None = None,
+    newton: RootSolver | None = None,
+    integrator: Integrator | None = None,
+    tolerance: float | None = None,
+    representative: Literal["least", "simplest"] = "least",
+) -> Discovery:
+    r"""The adiabatic invariants of order z that a basis can express, on the iterated map itself.
+
+    With φ the basis, Φ_ε the map of one step, and A_m(q, p, t) the m-th Taylor coefficient in ε
+    of φ(Φ_ε(q, p), t + h) − φ(q, p, t), the series Σ ε^m c_m·φ changes by O(ε^{z+1}) in a step
+    exactly when
+
+        Σ_{m≤k} A_{k−m} c_m = 0    for k = 0 … z
+
+    at every point: a block-Toeplitz system, whose null space is found order by order by singular
+    values on sampled points (basis made orthonormal on them first).
+
+    For a system with ``slow_time=True`` the time of samples and basis is the slow time τ: a step
+    goes from τ to τ + εh, and φ(q, p, τ) may change with it.
+
+    **Arguments**
+
+    - `basis`: for example ``Polynomials(6)``, ``Basis([f, g])``, sums and products of bases.
+    - `order`: z ≥ 0. `h`: step size [time]. `method`, `newton`, `integrator`: as for
+      `integrate`; only the map of one step is used.
+    - `samples`: (qs, ps) at t0, shapes (S, *q.shape), or (qs, ps, ts) with times of shape (S,):
+      points of the domain of interest; a quarter is held out. At least twice as many as
+      functions in the basis.
+    - `tolerance`: for *approximate* invariants: singular values up to that share of the largest
+      count as zero. What a method of order r keeps up to O(h^r), such as the energy, has
+      singular values and residuals that shrink as h^r.
+      None: only what is below 1e-11.
+    - `representative`: an invariant of order z is free by ε times any other. "least" takes the
+      corrections that are smallest on the samples (the convention of averaging: no part along
+      what order 0 keeps), unless the simplest ones are exact; "simplest" takes those of simple
+      functions, which tend to drift less and to read better.
+
+    **Returns** a `Discovery`; print it for a report.
+
+    **Raises** `ValueError` for too few samples, samples or basis functions that are not
+    finite there, a step that fails there, a basis that is rank-deficient on them, a basis or a
+    map of time with samples of one time, a tolerance that is none, or h = 0; `TypeError` for
+    what is no system, basis, method or Newton, and for samples without x64.
+
+    **Accuracy** round-off of the singular values, times the conditioning of the basis; Taylor
+    coefficients by nested forward autodiff, through implicit steps.
+
+    **Source** our own.
+
+    **Example**
+
+    ```python
+    cubic = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2,
+                       force=lambda t0, t1, q0, p1, args: -q0**3)
+    samples = np.random.default_rng(0).uniform(-1, 1, (2, 400, 1))
+    found = dvi.discover_invariants(cubic, dvi.Polynomials(8), order=1, h=0.1, samples=samples,
+                                    representative="simplest")
+    print(found.invariants[0])
+    # 0.5 q² − 0.05 q p + 0.5 p² + ε (0.251256 q⁴ − 0.0502513 q³ p + 0.00251256 q² p²)
+    ```
+    """
+    check_system(system)
+    method, newton = map_of("discover_invariants", system, integrator, method, newton)
+    samples = as_samples(samples, t0)
+    order = _check_options(order, tolerance, representative)
+    bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
+    require_enough(samples, bound.size)
+    require_time(bound, samples)
+    q, p, t = (jnp.asarray(x[0]) for x in samples)
+    system.check_shapes(t, q, p, jnp.zeros(()), args)
+    equations = Equations(system, jnp.zeros(()), args, newton)
+    at = middle(samples, max(bound.complexity))
+    inner, to_basis = bound.about(at)
+    stepped = Stepped(equations, np.asarray(h), method, inner)
+    changes = checked_changes(stepped, order, samples)
+    found = _Search(stepped, changes, samples, order, tolerance)
+    # Null vectors are known up to a share of about 1 / gap.
+    fuzzy = min(_FUZZY / found.gap, _FUZZIEST) if tolerance is None else np.sqrt(tolerance)
+    chosen = found.chosen(max(RANK, fuzzy), representative)
+    if tolerance is None and chosen.refused and fuzzy > RANK:
+        chosen = min(found.chosen(RANK, representative), chosen, key=lambda x: x.refused)
+    coefficients, dependent, exact = chosen.coefficients, chosen.dependent, chosen.exact
+    refused = found.spaces[-1].refused + chosen.refused
+    known = found.spaces[0].leading.shape[1] if order else len(coefficients) + len(dependent)
+    known += found.constant is not None
+    larger: tuple[Larger, ...] = ()
+    if tolerance is None and known > (found.constant is not None):
+
+        def at_step(step, at=samples):
+            other = stepped._replace(h=np.asarray(step))
+            changes = changes_at(other, 0, at)
+            if not changes.good.all():
+                return None
+            return _Search(other, changes, at, 0, None).spaces[0].leading.shape[1]
+
+        def moved(at):
+            here = changes if at is samples else changes_at(stepped, 0, at)
+            return here.moved[:, :-1]
+
+        def relative(step):
+            other = stepped._replace(h=np.asarray(step))
+            here = changes if step == h else changes_at(other, 0, samples)
+            return relative_step(samples, here.moved[:, :-1])
+
+        larger = at_larger_step(h, relative, at_step)
+        if order == 0:
+            larger += in_larger_box(samples, moved, lambda at: at_step(h, at))
+    judge = found.judge
+    typical_residuals = np.stack([judge.quantiles(coefficients, x) for x in (0.5, 0.95)], axis=-1)
+    powers = np.full(len(coefficients), np.nan)
+    if order == 0 and tolerance is None:
+        # Where fewer are conserved in a larger box, growth is not from errors of coefficients.
+        count = found.spaces[0].leading.shape[1]
+        doubted = any(x.kind == "box" and x.conserved < count for x in larger)
+        powers = powers_of_size(
+            stepped, coefficients, samples, typical_residuals[:, 0, 1],
+            found.judge_fitted.sizes(coefficients), found.orthonormal * (not doubted),
+        )  # fmt: skip
+    everything = len(coefficients) == 2 * samples.q[0].size and not bound.uses_time
+    everything = everything and not system.slow_time and bool(np.any(changes.motion.changes))
+    # The orbits of a map that keeps that much are finite sets of points, or periods of functions.
+    impossible = everything and not (powers == 0).all()
+    if impossible:
+        refused, exact = refused + len(coefficients) + len(dependent), ()
+        coefficients, dependent = coefficients[:0], dependent[:0]
+        typical_residuals, powers = typical_residuals[:0], powers[:0]
+    return Discovery(
+        inner_coefficients=jnp.asarray(coefficients),
+        inner_dependent=jnp.asarray(dependent),
+        exact=exact,
+        leading_parts=found.leading_parts @ to_basis,
+        survivors=tuple(space.leading.shape[1] for space in found.spaces),
+        singular_values=found.spaces[-1].singular_values,
+        gap=found.gap,
+        refused=refused,
+        residuals=judge.quantiles(coefficients, 1.0),
+        typical_residuals=typical_residuals,
+        dependent_residuals=judge.quantiles(dependent, 1.0),
+        undecided=max(found.motion.undecided() - known, 0) + found.unclear + chosen.unclear,
+        impossible=impossible,
+        larger=larger,
+        powers=powers,
+        reach=reach(coefficients, found.values),
+        obstructions=found.laws(changes.volume, system.slow_time, chosen.blur),
+        basis=bound,
+        inner=inner,
+        middle=at,
+        to_basis=to_basis,
+        sizes=found.sizes,
+        condition=found.condition,
+        scale=found.scale,
+        probe=Samples(*(x[:3] for x in samples)),
+        shape=samples.q.shape[1:],
+        slow_time=system.slow_time,
+        tolerance=tolerance,
+    )
+
+
+class _Chosen(NamedTuple):
+    """Representatives, shape (count, order + 1, size); how many were refused, and how many of
+    those are unclear; the blur."""
+
+    coefficients: np.ndarray
+    dependent: np.ndarray
+    exact: tuple[bool, ...]
+    refused: int
+    unclear: int
+    blur: float
+
+
+class _Search:
+    """The null space of a search, in functions that are orthonormal on the fitted samples:
+    singular values then measure functions, not their scaling."""
+
+    def __init__(self, stepped: Stepped, changes: Changes, samples: Samples, order, tolerance):
+        self.stepped, self.order, self.tolerance = stepped, order, tolerance
+        basis, fit = stepped.basis, ~samples.held_out
+        self.basis, self.fitted = basis, Samples(*(x[fit] for x in samples))
+        self.rms, calm = typical_sizes(changes.values)
+        self.fitted_values = changes.values[fit]
+        self.values = calm[fit, None] * self.fitted_values
+        self.condition = check_basis(basis, self.values)
+        self.R = triangle(self.values / self.rms) / np.sqrt(len(self.values))
+        terms = np.linalg.solve(self.R.T, (changes.terms / self.rms).reshape(-1, basis.size).T)
+        terms = terms.T.reshape(changes.terms.shape)
+        self.orthonormal = np.linalg.inv(self.R) / self.rms[:, None]
+        self.motion = changes.motion.of(self.orthonormal)
+        weights = self.motion.weights()
+        self.scale = epsilon_scale(weights[fit, None, None] * terms[fit])
+        terms = in_units_of(self.scale, terms)
+        self.sizes = self.rms / self.scale ** np.arange(order + 1)[:, None]
+        self.slopes = changes.slopes[fit, :, :-1]
+        constant = _shares_of_constant(self.rms, self.values, calm[fit], self.slopes)
+        self.constant = constant
+        self.weights, self.rows = weights[fit], weights[fit, None, None] * terms[fit]
+
+        def judge(leading, shifts):
+            leading, unclear = conserved(leading, terms, self.motion, tolerance)
+            return leading, shifts, unclear
+
+        trivial = None if constant is None else self.R @ constant
+        fitted = compress(self.rows)
+        self.spaces = series_spaces(fitted, judge, tolerance, 1.0, trivial=trivial)
+        step = triangle(calm[fit, None] * terms[fit, 0]) / np.sqrt(len(self.values))
+        self.typical = np.linalg.norm(step, 2) or 1.0
+        in_units = changes._replace(terms=in_units_of(self.scale, changes.terms))
+        digits = coefficient_errors(terms)
+        self.judge, self.judge_fitted = (
+            Judge(in_units.at(some), calm[some], self.scale, digits[some]) for some in (~fit, fit)
+        )
+        of_fit = changes.terms[fit, 0], changes.at(fit).motion, self.values
+        self.fewest = Fewest(basis.complexity, self.rms, *of_fit)
+
+    @property
+    def gap(self) -> float:
+        return self.spaces[-1].gap
+
+    @property
+    def leading_parts(self) -> np.ndarray:
+        """Order 0 of everything in the null space, in functions of the basis, (count, size)."""
+        leading = self.spaces[-1].leading[: self.basis.size]
+        return (np.linalg.solve(self.R, leading) / self.rms[:, None]).T
+
+    def chosen(self, blur: float, representative: str) -> _Chosen:
+        """One series for each leading part, in functions of the basis; `blur`: see `Span`."""
+        span = Span(self.basis, self.rms, self.R, self.spaces[-1], blur, self.constant)
+        found = span.representatives(self.fitted, self.slopes)
+        picked = [self._picked(span, series, representative) for series in found.series]
+        size = self.order + 1, self.basis.size
+
+        def those(independent):
+            kept = [pick for pick, f in zip(picked, found.independent, strict=True)
+                    if f == independent]  # fmt: skip
+            series = [_normalised(c, self.rms) for c, _ in kept]
+            return np.array(series).reshape(-1, *size), np.array([e for _, e in kept], bool)
+
+        (coefficients, exact), (dependent, _) = those(True), those(False)
+        refused, unclear = 0, 0
+        if self.tolerance is None:  # with the digits that the coefficients have in the end
+            kept, others = self.judge.keep(coefficients), self.judge.keep(dependent)
+            lost = np.concatenate([coefficients[~kept], dependent[~others]])
+            refused = len(lost)
+            unclear = int(np.sum(self.judge.largest(lost) < UNCLEAR))
+            coefficients, exact, dependent = coefficients[kept], exact[kept], dependent[others]
+        return _Chosen(coefficients, dependent, tuple(map(bool, exact)), refused, unclear, blur)
+
+    def _picked(self, span: Span, series: np.ndarray, representative: str):
+        """Coefficients, shape (order + 1, size), and whether the series is exact."""
+        if self.order == 0:
+            return self._of_order_0(series[0], span.blur)[None] / self.sizes, False
+        simplest = cleaned(span.simplest(series)) / self.sizes
+        typical, scale = jnp.asarray(self.typical), jnp.asarray(self.scale)
+        given = jnp.asarray(simplest)
+        exact = bool(is_exact(self.stepped, given, typical, scale, self._some()))
+        if exact or representative == "simplest":
+            return simplest, exact
+        return cleaned(span.least(series)) / self.sizes, exact
+
+    def _of_order_0(self, series: np.ndarray, blur: float) -> np.ndarray:
+        """Shares of an invariant of order 0, with as few terms and as many digits as can be."""
+        if self.tolerance is not None:
+            return cleaned(series, blur)
+
+        def change(shares):
+            return self.judge.largest((shares / self.sizes[0])[None, None])[0]
+
+        tried = [cleaned(self.fewest.again(cleaned(series, blur)), blur)]
+        if blur > RANK:  # what was taken for errors of others may be a part of it
+            tried += [self.fewest.again(cleaned(series)), cleaned(series)]
+        tried = [x for x in tried if x.any()] or [series]
+        changes = np.array([change(x) for x in tried])
+        if np.min(changes) > CLEARLY:  # rows weighted by what its own slopes predict
+            rows = self.judge_fitted.own_rows(series / self.sizes[0]) / self.rms
+            singular, V = singular_vectors(rows)
+            null = V[singular <= CLEARLY * np.sqrt(len(rows))]
+            own = null.T @ (null @ series)
+            tried = [x for x in (cleaned(own, blur), own, *tried) if x.any()]
+            changes = np.array([change(x) for x in tried])
+        good = changes <= max(_AS_GOOD * np.min(changes), _ROUND_OFF)
+        return tried[int(np.argmax(good))]
+
+    @property
+    def unclear(self) -> int:
+        """Null vectors of which rounding decides whether they are series."""
+        return max(space.unclear for space in self.spaces) if self.tolerance is None else 0
+
+    def laws(self, volume: np.ndarray, slow_time: bool, blur: float):
+        """The `DriftLaw` of each leading part that is lost."""
+        return drift_laws(
+            self.basis,
+            self.rms,
+            self.R,
+            self.rows,
+            self.fitted_values,
+            self.weights[:, None],
+            self.spaces,
+            np.max(np.abs(in_units_of(self.scale, volume)), axis=0),
+            self.scale,
+            slow_time,
+            blur,
+        )
+
+    def _some(self) -> Samples:
+        """At most about a hundred of the fitted samples."""
+        some = slice(None, None, max(1, len(self.fitted.q) // 100))
+        return Samples(*(x[some] for x in self.fitted))
+
+
+def _check_options(order: Any, tolerance: Any, representative: Any) -> int:
+    try:
+        number = -1 if isinstance(order, bool) else operator.index(order)
+    except TypeError:
+        number = -1
+    if number < 0:
+        raise ValueError(f"order must be an integer of at least 0, got {order!r}.")
+    is_number = isinstance(tolerance, float | np.floating)
+    if tolerance is not None and not (is_number and 0 < tolerance < 1):
+        raise ValueError(
+            "tolerance must be None or a number between 0 and 1 (a share of the largest singular "
+            f"value), got {tolerance!r}."
+        )
+    if representative not in ("least", "simplest"):
+        raise ValueError(f"representative must be 'least' or 'simplest', got {representative!r}.")
+    return number
+
+
+def _shares_of_constant(rms, values, calm, slopes) -> np.ndarray | None:
+    """The combination that is 1 everywhere (and not only on these samples), if there is one.
+
+    `values`: of the functions, times the weights `calm` of the samples.
+    """
+    shares = np.linalg.lstsq(values / rms, calm, rcond=None)[0]
+    shares = np.where(np.abs(shares) > 1e-9 * np.max(np.abs(shares)), shares, 0.0)
+    terms = np.abs(values / rms) @ np.abs(shares)
+    terms = np.maximum(terms, np.finfo(float).tiny)
+    if np.max(np.abs(values / rms @ shares - calm) / terms) > 1e4 * np.finfo(float).eps:
+        return None
+    slopes = slopes / rms[:, None]
+    terms = np.abs(slopes) * np.abs(shares)[:, None]
+    sums = np.einsum("sbn,b->sn", slopes, shares)
+    return shares if np.max(np.abs(sums)) <= 1e-9 * np.max(terms, initial=1.0) else None
+
+
+def _normalised(series: np.ndarray, rms: np.ndarray) -> np.ndarray:
+    """Scaled so that the coefficient with the largest share is one half, as of an energy."""
+    return series / (2 * series[0, np.argmax(np.abs(series[0] * rms))])

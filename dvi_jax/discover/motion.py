@@ -1,0 +1,211 @@
+"""Whether functions and vector fields change in a step by more than rounding, sample by sample."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .null_series import series_changes
+from .nullspace import HELD_OUT, NULL, singular_vectors, triangle
+
+UNCLEAR = 1e-6
+"""A null vector that changes by less than this share of what its slopes predict, but by more than
+rounding, may be an invariant or not."""
+
+ROUNDING = 1e-12
+"""Rows are weighted so that their rounding is below this; `NULL` stands above it."""
+
+_RESOLVED = 1e-3
+"""Rounding may be this share of a change that can be told from none."""
+
+_COEFFICIENTS = 1e-15
+"""Errors of the coefficients of a null vector, relative to its length."""
+
+_RARE = 100.0
+"""Samples at which functions are so many times larger than at three quarters of them count less."""
+
+
+def typical_sizes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How large functions are on samples, root mean square, shape (size,), and weights of the
+    samples, shape (S,): 1, and less where functions are larger than at nearly all others.
+
+    `values`: shape (S, size).
+    """
+    units = np.median(np.abs(values), axis=0)
+    units = np.where(units > 0, units, np.max(np.abs(values), axis=0))
+    units = np.where(units > 0, units, 1.0)
+    relative = values / units
+    size = np.max(np.abs(relative), axis=1)
+    weights = np.minimum(1, _RARE * np.quantile(size, 0.75) / np.maximum(size, 1.0))
+    return units * np.sqrt(np.mean((weights[:, None] * relative) ** 2, axis=0)), weights
+
+
+class Motion(NamedTuple):
+    """How much functions change in the step of each sample, by their slopes, and by rounding.
+
+    - `changes`: ∂φ_b/∂z_i Δz_i of each function and coordinate z = (q, p, t), shape (S, 2n + 1,
+      size).
+    - `rounding`: the largest rounding error of each function's change, shape (S, size).
+    """
+
+    changes: np.ndarray
+    rounding: np.ndarray
+
+    def of(self, combinations: np.ndarray) -> "Motion":
+        """Of combinations of the functions, columns of shape (size, count)."""
+        return Motion(self.changes @ combinations, self.rounding @ np.abs(combinations))
+
+    def at_most(self, spread: float) -> "Motion":
+        """The same, with no larger changes than the functions differ by between samples: a step
+        that expands goes beyond the range where slopes predict anything."""
+        size = np.sqrt(np.sum(self.changes**2, axis=(1, 2), keepdims=True))
+        return self._replace(changes=self.changes / np.maximum(size / spread, 1))
+
+    def weights(self) -> np.ndarray:
+        """For rows of changes, shape (S,): what functions typically change by becomes 1, where
+        that stands far enough above rounding, so that no sample with a large step decides alone."""
+        typical = np.sqrt(np.sum(self.changes**2, axis=(1, 2)))
+        rounding = np.sqrt(np.sum(self.rounding**2, axis=1))
+        return 1 / np.maximum(np.maximum(typical, rounding / ROUNDING), np.finfo(float).tiny)
+
+    def undecided(self) -> int:
+        """How many combinations change in the steps by hardly more than rounding."""
+        some = _enough(len(self.changes), *self.changes.shape[1:])
+        weighted = (self.weights()[:, None, None] * self.changes)[some]
+        slopes = np.linalg.svd(triangle(weighted.reshape(-1, weighted.shape[2])), compute_uv=False)
+        missing = weighted.shape[2] - len(slopes)
+        return missing + int(np.sum(slopes / np.sqrt(len(weighted)) < ROUNDING / _RESOLVED))
+
+
+class FieldMotion(NamedTuple):
+    r"""The same for vector fields X = Σ c_kb φ_b e_k, which the equations F = 0 of a step compare
+    at its two points z0 and z1.
+
+    With J_j = ∂F/∂z_j the condition J_1 X(z1) + J_0 X(z0) = 0 is
+
+        J_1 (X(z1) − X(z0)) + (J_0 + J_1) X(z0) = 0,
+
+    and its typical residual for a field with these slopes is the size of the two terms before they
+    cancel, with ∂X/∂z_i Δz_i for the difference.
+
+    - `values`: φ at z0, (S, B). `changes`: ∂φ/∂z_i Δz_i, (S, 2n + 1, B).
+    - `second`, `both`: lengths of the columns of J_1 and of J_0 + J_1, (S, C).
+    - `rounding`: the largest rounding error of the left side for each φ_b e_k, (S, C, B).
+    """
+
+    values: np.ndarray
+    changes: np.ndarray
+    second: np.ndarray
+    both: np.ndarray
+    rounding: np.ndarray
+
+    def at(self, some: Any) -> "FieldMotion":
+        """Of some of the samples."""
+        return FieldMotion(*(x[some] for x in self))
+
+    def of_functions(self, combinations: np.ndarray) -> "FieldMotion":
+        """For combinations of the functions φ, columns of shape (B, count)."""
+        return self._replace(
+            values=self.values @ combinations,
+            changes=self.changes @ combinations,
+            rounding=self.rounding @ np.abs(combinations),
+        )
+
+    def of(self, fields: np.ndarray) -> Motion:
+        """Of fields, columns of shape (C · B, count)."""
+        X = fields.reshape(self.second.shape[1], self.values.shape[1], -1)
+        changes = np.einsum("sdb,cbk->scdk", self.changes, X) * self.second[:, :, None, None]
+        both = np.einsum("sb,cbk->sck", self.values, X) * self.both[..., None]
+        changes = np.concatenate([changes, both[:, :, None]], axis=2)
+        rounding = np.einsum("scb,cbk->sk", self.rounding, np.abs(X))
+        return Motion(changes.reshape(len(changes), -1, fields.shape[1]), rounding)
+
+    def over(self, sizes: np.ndarray) -> "FieldMotion":
+        """With the equations of each sample divided by a number, shape (S,)."""
+        return self._replace(
+            second=self.second / sizes[:, None],
+            both=self.both / sizes[:, None],
+            rounding=self.rounding / sizes[:, None, None],
+        )
+
+    def typical(self) -> np.ndarray:
+        """The typical residual of all fields together, shape (S,)."""
+        changes, values, second, both = (
+            np.sum(x.reshape(len(x), -1) ** 2, axis=1)
+            for x in (self.changes, self.values, self.second, self.both)
+        )
+        return np.sqrt(second * changes + both * values)
+
+    def weights(self) -> np.ndarray:
+        """For rows of conditions, shape (S,): see `Motion.weights`."""
+        rounding = np.sqrt(np.sum(self.rounding**2, axis=(1, 2)))
+        largest = np.maximum(self.typical(), rounding / ROUNDING)
+        return 1 / np.maximum(largest, np.finfo(float).tiny)
+
+    def undecided(self) -> int:
+        """How many fields change in the steps by hardly more than rounding."""
+        size = self.rounding[0].size
+        rows = self.second.shape[1] * (self.changes.shape[1] + 1)
+        return self.at(_enough(len(self.second), rows, size)).of(np.eye(size)).undecided()
+
+
+def _enough(samples: int, rows: int, size: int) -> slice:
+    """Samples, each with so many rows, that have about eight rows for each of `size` columns."""
+    return slice(None, None, max(1, samples * rows // (8 * size)))
+
+
+def coefficient_errors(terms: np.ndarray) -> np.ndarray:
+    """What errors of the coefficients of a series of length one change at each sample, (S,): all
+    are known to the same absolute size. `terms`: see `conserved`."""
+    return _COEFFICIENTS * np.linalg.norm(terms.reshape(len(terms), -1), axis=1)
+
+
+def conserved(
+    leading: np.ndarray,
+    terms: np.ndarray,
+    motion: Motion | FieldMotion,
+    tolerance: float | None = None,
+) -> tuple[np.ndarray, int]:
+    """The combinations of series that change in a step by no more than rounding, each measured by
+    what its own slopes predict, sample by sample; and how many are unclear.
+
+    - `leading`: series as columns, shape ((m + 1) · size, count), leading parts orthonormal.
+    - `terms`: A_0 … A_z at all samples, without weights, shape (S, z + 1, size), or for fields
+      (S, z + 1, rows, size); `motion`: what the functions change by there.
+    """
+    count, size = leading.shape[1], terms.shape[-1]
+    if count == 0:
+        return leading, 0
+    own = motion.of(leading[:size])
+    digits = coefficient_errors(terms)[:, None]
+    own = own._replace(rounding=own.rounding + digits).at_most(1.0)
+    weights = own.weights() / np.sqrt(len(terms))
+    changes = series_changes(terms, leading).reshape(len(terms), -1, count)
+    changes, predicted = (weights[:, None, None] * x for x in (changes, own.changes))
+    predicted = predicted.reshape(-1, count)
+    slopes, V = singular_vectors(predicted)
+    limit = HELD_OUT * (NULL if tolerance is None else tolerance)
+    # Where slopes predict little more than rounding, that is what a change is compared with.
+    by_slopes = V.T / np.maximum(slopes, HELD_OUT * ROUNDING / limit)
+    left, U = singular_vectors(changes.reshape(-1, count) @ by_slopes)
+    kept = leading @ by_slopes @ U[left <= limit].T
+    unclear = int(np.sum((left > limit) & (left < UNCLEAR)))
+    return kept @ np.linalg.inv(triangle(kept[:size])) if kept.size else kept, unclear
+
+
+def relative_changes(
+    terms: np.ndarray,
+    series: np.ndarray,
+    motion: Motion | FieldMotion,
+    spread: float,
+    digits: np.ndarray | float = 0.0,
+) -> np.ndarray:
+    """What one series changes by at each order, by the measure of `conserved`: shape (S, z + 1).
+
+    `terms`: (S, z + 1, size), or for fields (S, z + 1, rows, size); `series`: (z + 1, size);
+    `spread`: of its leading part; `digits`: errors of its coefficients, see `coefficient_errors`.
+    """
+    own = motion.of(series[:1].T)
+    own = own._replace(rounding=own.rounding + np.reshape(digits, (-1, 1))).at_most(spread)
+    changes = series_changes(terms, series.reshape(-1, 1))[..., 0]
+    changes = np.linalg.norm(changes.reshape(*changes.shape[:2], -1), axis=2)
+    return own.weights()[:, None] * changes

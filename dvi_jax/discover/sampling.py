@@ -1,0 +1,309 @@
+"""Sampled points, at which symmetries and invariants are tested."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lanewise.jaxapi import x64_enabled
+
+from .._integrator import Integrator, chosen, only
+from .._results import RESULTS
+from .._step import Equations, step
+from .._system import System, check_system
+from .._types import Args, Interval
+from ..engine.newton import Newton, RootSolver
+from ..methods import Method
+from .basis import BoundBasis, check_step_size
+from .generators import LatticePoint
+
+
+class Samples(NamedTuple):
+    """Points (q, p) at times t: shapes (S, *shape), (S, *shape), (S,)."""
+
+    q: np.ndarray
+    p: np.ndarray
+    t: np.ndarray
+
+    @property
+    def held_out(self) -> np.ndarray:
+        """Which points are not fitted but judge the fit: a quarter, at random, always the same."""
+        held = np.zeros(len(self.q), bool)
+        held[np.random.default_rng(0).permutation(len(held))[: len(held) // 4]] = True
+        return held
+
+
+_LATER = (37.3, 1000.7)
+"""Shifts of time, in steps, at which a map that does not depend on it is the same."""
+
+UNSEEN = 1e-11
+"""A relative step below this is not known to three digits, because of rounding."""
+
+SMALL = 1e-2
+"""A step that moves the samples by less than this share of their spread is small, and so are
+samples on which a map differs from a linear one by less than this share of how much it varies: what
+changes by less than rounding may be conserved, or an expansion in the step or about the samples."""
+
+_FAR = 100.0
+"""A sample that is farther from the median than this many typical distances does not tell how wide
+the others spread."""
+
+_LOST = 1e5
+"""Polynomials are taken about the middle of the samples where they would lose so much by rounding
+about the origin."""
+
+
+def spread(values: np.ndarray) -> float:
+    """Standard deviation of the components about their means; 1 where nothing varies. Samples far
+    away from nearly all others are left out."""
+    distance = np.abs(values - np.median(values, axis=0))
+    near = distance <= _FAR * np.median(distance, axis=0)
+    near = near.reshape(len(values), -1).all(axis=1)
+    values = values[near] if 2 * np.sum(near) > len(values) else values
+    size = float(np.sqrt(np.mean((values - np.mean(values, axis=0)) ** 2)))
+    return size if size > 0 else 1.0
+
+
+def relative_step(samples: Samples, moved: np.ndarray) -> float:
+    """How far a step moves the samples, as a share of how much they spread; the median.
+
+    `moved`: z1 − z of (q, p), shape (S, 2n).
+    """
+    n = moved.shape[1] // 2
+    sizes = np.repeat([spread(samples.q), spread(samples.p)], n)
+    return float(np.median(np.max(np.abs(moved) / sizes, axis=1)))
+
+
+def nonlinearity(samples: Samples, moved: np.ndarray) -> float:
+    """How far a map is from a linear one on the samples, as a share of how much it varies; the
+    median. `moved`: as for `relative_step`."""
+    n = moved.shape[1] // 2
+    sizes = np.repeat([spread(samples.q), spread(samples.p)], n)
+    z = np.concatenate([x.reshape(len(x), -1) for x in samples[:2]], axis=1)
+    z = np.column_stack([(z - np.median(z, axis=0)) / sizes, np.ones(len(z))])
+    moved = moved / sizes
+    left = np.linalg.norm(moved - z @ np.linalg.lstsq(z, moved, rcond=None)[0], axis=1)
+    varies = np.linalg.norm(moved - np.median(moved, axis=0), axis=1)
+    return float(np.median(left) / max(np.median(varies), 1e-300))
+
+
+def later(h: float, relative: float = 1.0) -> np.ndarray:
+    """Shifts of the time, [time], longer in steps where a step is small relative to the samples."""
+    return np.array(_LATER) * abs(h) * max(1.0, 0.1 / max(relative, UNSEEN))
+
+
+def rounding(samples: Samples) -> float:
+    """The last digit of the coordinates as a share of how much they vary over the samples."""
+    sizes = [np.median(np.abs(x), axis=0).max() / spread(x) for x in (samples.q, samples.p)]
+    return float(np.finfo(float).eps * max(sizes))
+
+
+def middle(samples: Samples, degree: int) -> np.ndarray:
+    """Where polynomials of a degree are taken about: m of z = (q, p, t), shape (2n + 1,).
+
+    m_i = 0 where the origin is as good; else the median of z_i, rounded to about as much as the
+    samples spread.
+    """
+    z = [x.reshape(len(samples.q), -1) for x in (samples.q, samples.p, samples.t)]
+    z = np.concatenate(z, axis=1)
+    out = np.zeros(z.shape[1])
+    for i, x in enumerate(z.T):
+        median = np.median(x)
+        width = np.median(np.abs(x - median))
+        if width > 0 and degree * np.log(max(abs(median), width) / width) > np.log(_LOST):
+            step = 10.0 ** np.round(np.log10(width))
+            out[i] = float(np.format_float_scientific(np.round(median / step) * step, 15))
+    return out
+
+
+def as_samples(samples: Any, t0: float = 0.0) -> Samples:
+    """(qs, ps) at the time t0, or (qs, ps, ts), after refusing what cannot be sampled points."""
+    if not x64_enabled():
+        raise TypeError(
+            "this process computes in float32, and what is conserved can be told in double "
+            'precision only, whatever the type of the samples: put\n    jax.config.update("'
+            'jax_enable_x64", True)\nbefore the first array is made.'
+        )
+    if isinstance(samples, Samples):
+        return samples
+    try:
+        arrays = [np.asarray(x, float) for x in samples]
+    except (TypeError, ValueError):
+        arrays = []
+    if len(arrays) not in (2, 3):
+        raise ValueError(
+            "samples must be a pair (qs, ps) of arrays with one row for each point, or (qs, ps, "
+            "ts) with their times."
+        )
+    q, p = arrays[:2]
+    if q.shape != p.shape or q.ndim < 1 or len(q) == 0:
+        raise ValueError(
+            f"samples (qs, ps) must have one shape (points, *q.shape), got {q.shape} and {p.shape}."
+        )
+    t = arrays[2] if len(arrays) == 3 else np.full(len(q), float(t0))
+    if t.shape != (len(q),):
+        raise ValueError(f"the times of {len(q)} samples must have shape ({len(q)},): {t.shape}.")
+    if not all(np.isfinite(x).all() for x in (q, p, t)):
+        raise ValueError("samples hold a value that is not finite: take points of the domain.")
+    return Samples(q, p, t)
+
+
+def map_of(
+    function: str,
+    system: System,
+    integrator: Integrator | None,
+    method: Method | None,
+    newton: RootSolver | None,
+) -> tuple[Method, RootSolver]:
+    """The method and the root finder of the map that a search examines: by default Newton's
+    iteration, through which Taylor coefficients in ε are exact."""
+    if integrator is None and newton is None:
+        newton = Newton()
+    found = chosen(integrator, method=method, root_finder=newton)
+    only(found, function, "method", "root_finder")
+    return found.method_for(system), found.root_finder
+
+
+def root_finder_of(
+    function: str, integrator: Integrator | None, newton: RootSolver | None
+) -> RootSolver:
+    """The same where the map is the paper's, of `TypeII()`."""
+    if integrator is None and newton is None:
+        newton = Newton()
+    found = chosen(integrator, root_finder=newton)
+    return only(found, function, "root_finder").root_finder
+
+
+def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None:
+    """Refuse fewer samples than determine `unknowns`, with `conditions` from each one."""
+    needed = int(np.ceil(2 * unknowns / conditions))
+    if len(samples.q) < needed:
+        raise ValueError(
+            f"{len(samples.q)} samples are too few for {unknowns} unknown coefficients (a quarter "
+            f"is held out): give at least {needed}."
+        )
+
+
+def require_time(basis: BoundBasis, samples: Samples) -> None:
+    """Refuse a basis with functions of time when all samples are of one time."""
+    if basis.uses_time and np.ptp(samples.t) == 0:
+        raise ValueError(
+            "the basis has functions of time, and all samples are of one time: give samples=(qs, "
+            "ps, ts)."
+        )
+
+
+def require_steps(good: Any, samples: Samples) -> None:
+    """Refuse samples at which the map's step failed."""
+    good = np.asarray(good)
+    if not good.all():
+        i = int(np.argmin(good))
+        raise ValueError(
+            f"the step fails at {int(np.sum(~good))} of {len(good)} samples, first at q = "
+            f"{samples.q[i].tolist()}, p = {samples.p[i].tolist()}: take samples where the map is "
+            "defined, or a smaller h."
+        )
+
+
+def check_finite(basis: BoundBasis, values: np.ndarray) -> None:
+    """Refuse functions that are not finite on the samples; `values`: (S, size)."""
+    bad = ~np.isfinite(values)
+    if bad.any():
+        i, j = np.argwhere(bad)[0]
+        raise ValueError(
+            f"the basis function {basis.names[j]!r} is not finite at {int(bad[:, j].sum())} of "
+            f"{len(values)} samples (first: number {i}): keep the samples off its singularity."
+        )
+
+
+def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
+    """Refuse functions that are not finite on the samples, or dependent; `values`: (S, size).
+
+    Returns the condition number of the functions, each scaled to one size.
+    """
+    check_finite(basis, values)
+    values = values / np.maximum(np.max(np.abs(values), axis=0), np.finfo(float).tiny)
+    scale = np.linalg.norm(values, axis=0)
+    zero = np.flatnonzero(scale == 0)
+    normal = values / np.where(scale > 0, scale, 1)
+    singular, V = np.linalg.svd(normal, full_matrices=False)[1:]
+    if zero.size:
+        members = ", ".join(repr(basis.names[j]) for j in zero[:4])
+        raise ValueError(
+            f"the basis is rank-deficient: {zero.size} of {len(scale)} functions are 0 on all "
+            f"samples ({members}{' …' if zero.size > 4 else ''}). Leave them out; if the "
+            "coordinates are so small that their powers underflow, use larger units."
+        )
+    if singular[-1] < 1e-13 * singular[0]:
+        members = ", ".join(repr(basis.names[j]) for j in np.argsort(-abs(V[-1]))[:4])
+        raise ValueError(
+            f"the basis is rank-deficient on the samples: a combination of {members} … vanishes "
+            "on all of them. Leave one out, or take samples that fill the domain."
+        )
+    return float(singular[0] / singular[-1])
+
+
+def solution_pairs(
+    system: System,
+    *,
+    h: float,
+    samples: Any,
+    epsilon: Any = 0.0,
+    t0: float = 0.0,
+    args: Args = None,
+    newton: RootSolver | None = None,
+    integrator: Integrator | None = None,
+) -> tuple[LatticePoint, LatticePoint]:
+    r"""Pairs of lattice points on solutions: each sample, and where one step of the map takes it.
+
+    For `determining_residual` under ``vmap``: it vanishes on them for a symmetry.
+
+    **Arguments** `samples`: (qs, ps) at t0, shapes (S, *q.shape), or (qs, ps, ts) with their
+    times, shape (S,); `h`: step size [time]; `epsilon`, `args`, `newton`: as for `integrate`.
+
+    **Returns** two points with a leading axis of length S. **Raises** `ValueError` for samples
+    of unequal shapes or not finite, h = 0, or a step that fails on them.
+    """
+    samples, h = as_samples(samples, t0), check_step_size(h)
+    check_system(system)
+    newton = root_finder_of("solution_pairs", integrator, newton)
+    equations = Equations(system, jnp.asarray(epsilon, float), args, newton)
+    first, second, good = _stepped(equations, jnp.asarray(h), samples)
+    require_steps(good, samples)
+    return first, second
+
+
+@eqx.filter_jit
+def _stepped(equations, h, samples):
+    def at_point(q, p, t):
+        q1, p1, info = step(equations, Interval(t, t + h, h), q, p)
+        good = info.result == RESULTS.successful
+        return LatticePoint(t, q, p), LatticePoint(t + h, q1, p1), good
+
+    return jax.vmap(at_point)(*map(jnp.asarray, samples))
+
+
+def random_pairs(
+    *, h: float, samples: Any, t0: float = 0.0, seed: int = 0
+) -> tuple[LatticePoint, LatticePoint]:
+    """Pairs of lattice points off the solutions: each sample, and another one at random.
+
+    For `conformal_factor`, whose Λ is asked of all points. The second point is at t + h.
+
+    **Arguments** `samples`: as for `solution_pairs`, at least two; `seed`: of the random order.
+
+    **Returns** two points with a leading axis of length S. **Raises** `ValueError` for samples
+    of unequal shapes, not finite, or fewer than two; h = 0.
+    """
+    samples, h = as_samples(samples, t0), check_step_size(h)
+    count = len(samples.q)
+    if count < 2:
+        raise ValueError("pairs off the solutions need at least two samples, got one.")
+    order = np.random.default_rng(seed).permutation(count)
+    other = np.empty(count, int)
+    other[order] = np.roll(order, 1)  # one cycle: no sample is paired with itself
+    first = LatticePoint(*map(jnp.asarray, (samples.t, samples.q, samples.p)))
+    moved = (samples.t + h, samples.q[other], samples.p[other])
+    return first, LatticePoint(*map(jnp.asarray, moved))

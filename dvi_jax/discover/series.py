@@ -1,0 +1,118 @@
+"""A series in ε of combinations of basis functions: what discovery returns, as an observable."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._system import System
+from .._types import Scalar, State
+from .basis import BoundBasis
+from .generators import Generator
+
+_POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+class InvariantSeries(eqx.Module):
+    r"""An invariant Σ_m ε^m c_m·φ(q, p, t), as an observable.
+
+    - `coefficients`: c, shape (order + 1, basis size). `basis`: φ.
+    - `slow_time`: whether φ is a function of the slow time τ = εt in place of t.
+    - `sizes`: shape of `coefficients`: what a coefficient of 1 amounts to where the series was
+      found, by which terms of a formula are left out; None counts all alike.
+
+    Give it to `integrate` as it is; there it is bound to the run's ε. As a formula: `str`.
+    """
+
+    basis: BoundBasis
+    coefficients: Float[Array, "orders functions"]
+    slow_time: bool = eqx.field(static=True, default=False)
+    epsilon: Any = None
+    sizes: Any = None
+
+    @property
+    def order(self) -> int:
+        """z, the order up to which the series goes."""
+        return self.coefficients.shape[0] - 1
+
+    def bind(self, system: System, epsilon: Any) -> "InvariantSeries":
+        """The same series at this ε."""
+        del system
+        return InvariantSeries(self.basis, self.coefficients, self.slow_time, epsilon, self.sizes)
+
+    def evaluate(self, q: State, p: State, epsilon: Any, t: Any = 0.0) -> Scalar:
+        """The value at a point, a scalar; t is the slow time τ when `slow_time` is set."""
+        powers = jnp.asarray(epsilon) ** jnp.arange(self.order + 1)
+        return powers @ self.coefficients @ self.basis(q, p, t)
+
+    def __call__(self, t0, t1, q0, p0, q1, p1, args):
+        if self.epsilon is None:
+            raise ValueError(
+                "an InvariantSeries has to know ε: call invariant.bind(system, epsilon)(...), or "
+                "give it to dvi.integrate(observe=...)."
+            )
+        time = self.epsilon * t1 if self.slow_time else t1
+        return self.evaluate(q1, p1, self.epsilon, time)
+
+    @property
+    def generators(self) -> list[Generator]:
+        r"""The symplectic gradient, one generator for each order: ξ_m = ∂I_m/∂p, η_m = −∂I_m/∂q.
+
+        Noether's theorem walked backwards. Where the map is symplectic (no force but a
+        gradient), the series of an invariant satisfies the determining equations (24) on the
+        solutions, to the order of the invariant: see `determining_residual`. Not to be had for
+        functions of the slow time.
+        """
+        if self.slow_time and self.basis.uses_time:
+            raise ValueError(
+                "a generator is a function of the time t, and this invariant of the slow time εt."
+            )
+        return [_symplectic_gradient(self.basis, c) for c in self.coefficients]
+
+    def __str__(self) -> str:
+        return self.formula()
+
+    def formula(self, terms: int | None = None, drop: float = 1e-9, digits: int = 6) -> str:
+        """The series as text: at each order at most so many terms, all above a share `drop`.
+
+        How many are left out is said, unless they are round-off.
+        """
+        c = np.asarray(self.coefficients)
+        shares = np.abs(c if self.sizes is None else c * np.asarray(self.sizes))
+        text = shortened(self.basis, c[0], shares[0], terms, drop, digits)
+        for m in range(1, len(c)):
+            if np.max(shares[m]) > 1e-9 * np.max(shares):
+                power = "ε" if m == 1 else f"ε{m}".translate(_POWERS)
+                part = shortened(self.basis, c[m], shares[m], terms, drop, digits)
+                text += f" + {power} ({part})"
+        return text
+
+
+def shortened(
+    basis: BoundBasis,
+    c: np.ndarray,
+    shares: np.ndarray,
+    terms: int | None = None,
+    drop: float = 1e-9,
+    digits: int = 6,
+) -> str:
+    """The combination as text: at most so many terms, all above the share `drop` of the largest."""
+    shown = np.where(shares > drop * np.max(shares), c, 0.0)
+    if terms is not None:
+        shown[np.argsort(-shares, kind="stable")[terms:]] = 0.0
+    text = basis.formula(shown, digits, drop=0.0)
+    hidden = np.sum(shares > drop * np.max(shares)) - np.count_nonzero(shown)
+    return f"{text} + … ({hidden} smaller terms)" if hidden else text
+
+
+def _symplectic_gradient(basis: BoundBasis, coefficients: Array) -> Generator:
+    def value(t, q, p):
+        return coefficients @ basis(q, p, t)
+
+    return Generator(
+        xi=lambda t, q, p, args: jax.grad(value, argnums=2)(t, q, p),
+        eta=lambda t, q, p, args: -jax.grad(value, argnums=1)(t, q, p),
+    )

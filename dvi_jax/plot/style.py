@@ -1,0 +1,129 @@
+"""Style of the pictures: colours, dashes, markers, and how a figure is written to a file.
+
+The settings of matplotlib are in ``dvi.mplstyle``, next to this file.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
+from functools import wraps
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import ListedColormap
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_SETTINGS = mpl.rc_params_from_file(
+    Path(__file__).with_name("dvi.mplstyle"), use_default_template=False
+)
+
+COLOURS: tuple[str, ...] = tuple(_SETTINGS["axes.prop_cycle"].by_key()["color"])
+"""The palette of Okabe and Ito (2008), dark first. Lines differ by marker or dash as well."""
+
+DASHES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)))
+
+MARKS = ("s", "^", "D", "v", "P", "<", ">")
+"""Markers on lines that may overlap. The circle marks a start and the cross an early end."""
+
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+
+SHADES = ListedColormap(colormaps["viridis"](np.linspace(0, 0.88, 256)), "shades")
+"""Colours of numbers: viridis without its light yellow, which is invisible on white paper."""
+
+GREY, PALE = "#777777", "#b8b8b8"
+"""Colours of reference lines and of missing values."""
+
+NO_NUMBER, ZERO = "#d0d0d0", "#000000"
+"""Colours of cells without a number (hatched as well) and of exact zeros on a logarithmic scale."""
+
+HATCH: dict[str, Any] = {"facecolor": NO_NUMBER, "edgecolor": "#8c8c8c", "hatch": "/////"}
+HATCH["linewidth"] = 0
+
+CROSS: dict[str, Any] = {"marker": "x", "color": "#000000", "markersize": 7, "markeredgewidth": 1.5}
+START: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "linestyle": "none"}
+STAR: dict[str, Any] = {"marker": "*", "color": "#E69F00", "markersize": 11, "linestyle": "none"}
+STAR["markeredgecolor"] = "black"
+
+_chosen: ContextVar[bool] = ContextVar("chosen", default=False)
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """The style of this package for figures made inside the block; no global setting changes.
+
+    The functions of `dvi_jax.plot` use it anyway. A block serves figures of your own and changes
+    of the style: settings made inside it by ``matplotlib.rc_context`` take effect.
+    """
+    token = _chosen.set(True)
+    try:
+        with mpl.rc_context(_SETTINGS):
+            try:
+                yield
+            finally:
+                interactive = mpl.is_interactive()
+    finally:
+        _chosen.reset(token)
+    # The first figure of a notebook selects an interactive backend. That choice must survive.
+    mpl.interactive(interactive)
+
+
+def in_style(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, drawing in this style unless its caller is inside a `style()` block."""
+
+    @wraps(function)
+    def drawn(*args: P.args, **kwargs: P.kwargs) -> R:
+        with nullcontext() if _chosen.get() else style():
+            return function(*args, **kwargs)
+
+    return drawn
+
+
+@in_style
+def save(drawn: Any, path: str | Path) -> Path:
+    """Write the figure (type from the suffix) and close it; returns the path.
+
+    - `drawn`: a figure, or axes of one, as every function of `dvi_jax.plot` returns them.
+
+    **Raises** `TypeError` for anything else, `ValueError` for axes of several figures.
+    """
+    path = Path(path)
+    figure = _figure_to_save(drawn)
+    figure.savefig(path)
+    plt.close(figure)
+    return path
+
+
+def figure_of(axis: Any) -> Any:
+    """The figure that contains the axes, the outermost one for axes of a subfigure."""
+    figure = axis.figure
+    while figure.figure is not figure:
+        figure = figure.figure
+    return figure
+
+
+def _figure_to_save(drawn: Any) -> Any:
+    if hasattr(drawn, "savefig"):
+        return drawn
+    axes = list(np.ravel(np.asarray(drawn, object)))
+    if not axes or not all(hasattr(axis, "figure") for axis in axes):
+        raise TypeError(f"save takes a figure or axes, as the plots return them, got {drawn!r}.")
+    figures = {figure_of(axis) for axis in axes}
+    if len(figures) > 1:
+        raise ValueError(f"these axes belong to {len(figures)} figures: save one at a time.")
+    return figures.pop()
+
+
+def signed(value: float, form: str = "g") -> str:
+    """A number with a minus sign as wide as a plus sign."""
+    return f"{value:{form}}".replace("-", "−")
+
+
+def named(name: str, unit: str | None) -> str:
+    """A label with its unit, if it has one."""
+    return name if unit in (None, "", "1") else f"{name} [{unit}]"

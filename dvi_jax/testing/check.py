@@ -1,0 +1,171 @@
+"""A check: what it measures of a method, its bound, and what to do where it fails."""
+
+import difflib
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+
+import dvi_jax as dvi
+from dvi_jax.systems import Problem
+
+from .candidate import Candidate
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One measured property of one method.
+
+    - `value`: the number measured; NaN when nothing could be measured.
+    - `allowed`: the bound in words, such as ``"≤ 1e-12"`` or ``"4 ± 0.2"``.
+    - `passed`: whether the value meets the bound; never for a value that is NaN.
+    - `claimed`: whether the method claims the property. A property that is not claimed is measured
+      where that is possible, and is not a failure.
+    - `detail`: the points of a fit, the status of a trajectory, and the like.
+    """
+
+    value: float
+    allowed: str
+    passed: bool
+    claimed: bool = True
+    detail: str = ""
+
+    def __post_init__(self):
+        if self.passed and not math.isfinite(self.value):
+            raise ValueError(f"a value of {self.value} cannot have passed ({self.detail}).")
+
+    @property
+    def ok(self) -> bool:
+        """Whether the method has the property, or does not claim it."""
+        return self.passed or not self.claimed
+
+    @property
+    def verdict(self) -> str:
+        """``"pass"``, ``"FAIL"``, ``"NOT MEASURED"`` (a failure too) or ``"not claimed"``."""
+        if not self.claimed:
+            return "not claimed"
+        if self.passed:
+            return "pass"
+        return "NOT MEASURED" if math.isnan(self.value) else "FAIL"
+
+
+def at_most(value: float, bound: float, claimed: bool = True, detail: str = "") -> Measured:
+    """value ≤ bound."""
+    passed = math.isfinite(value) and value <= bound
+    return Measured(float(value), f"≤ {bound:g}", passed, claimed, detail)
+
+
+def not_measured(allowed: str, detail: str, claimed: bool = True) -> Measured:
+    """Nothing could be measured, which is a failure where the property is claimed."""
+    return Measured(math.nan, allowed, False, claimed, detail)
+
+
+@dataclass(frozen=True)
+class Check:
+    """A check: its name, what it is in words, how it measures, what to do where it fails."""
+
+    name: str
+    says: str
+    measure: Callable[[Candidate], Measured]
+    remedy: str
+    digits: str
+    any_problem: bool
+
+    def __call__(self, candidate: Candidate) -> Measured:
+        """What the check measures; an exception that the method raises is a failure."""
+        try:
+            return self.measure(candidate)
+        except Exception as error:  # whatever the user's method raises
+            said = str(error).strip().splitlines() or [""]
+            return not_measured("no error", f"{type(error).__name__}: {said[0][:200]}")
+
+
+CHECKS: dict[str, Check] = {}
+"""Name → check, in the order in which tables show them."""
+
+
+def check(name: str, remedy: str, digits: str = ".0e", any_problem: bool = False):
+    """Register a measurement under a name; the function becomes one that raises where it fails.
+
+    `any_problem`: whether the property can be measured on any problem.
+    """
+
+    def register(measure: Callable[[Candidate], Measured]):
+        says = " ".join((measure.__doc__ or "").split())
+        CHECKS[name] = Check(name, says, measure, remedy, digits, any_problem)
+
+        def required(method: dvi.Method, problem: Problem | None = None) -> Measured:
+            if problem is not None and not any_problem:
+                raise ValueError(f"{name} is measured on its own problem: leave `problem` out.")
+            return _require(Candidate(method, problem), [name])[name]
+
+        for attribute in ("__name__", "__qualname__", "__module__", "__doc__"):
+            setattr(required, attribute, getattr(measure, attribute))
+        return required
+
+    return register
+
+
+def check_method(method: dvi.Method, checks: Iterable[str] | None = None) -> dict[str, Measured]:
+    """Require that a method has the properties that it claims.
+
+    **Arguments**
+
+    - `checks`: names of `CHECKS`; None for all, which takes 15 to 35 seconds.
+
+    **Returns** name → `Measured`, also of what the method does not claim.
+
+    **Raises** `AssertionError` with what was measured, what is required and what to do, for all
+    checks that fail; `ValueError` for an unknown name, and where x64 is off.
+    """
+    return _require(Candidate(method), checks)
+
+
+def _require(candidate: Candidate, checks: Iterable[str] | None) -> dict[str, Measured]:
+    require_double_precision()
+    found = {name: CHECKS[name](candidate) for name in chosen("check", checks, CHECKS)}
+    failed = [
+        f"{name}: measured {measured.value:.3g}, required {measured.allowed}. {measured.detail}\n"
+        f"  What is measured: {CHECKS[name].says}\n  What to do: {CHECKS[name].remedy}"
+        for name, measured in found.items()
+        if not measured.ok
+    ]
+    if failed:
+        claims = f"{type(candidate.method).__name__} does not have properties that it claims"
+        raise AssertionError("\n".join([claims, *failed]))
+    return found
+
+
+def require_double_precision() -> None:
+    """**Raises** `ValueError` where x64 is off: the bounds are those of double precision."""
+    if jnp.result_type(float) != jnp.float64:
+        raise ValueError(
+            "methods are measured in double precision, and x64 is off. Turn it on before anything "
+            'else: jax.config.update("jax_enable_x64", True).'
+        )
+
+
+def chosen(kind: str, names: Any, known: Iterable[str], hint: str = "") -> list[str]:
+    """`names` without repetitions, or all that are known for None.
+
+    **Raises** `ValueError` for an unknown name and for none at all, `TypeError` for no list.
+    """
+    known = list(known)
+    if names is None:
+        return known
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise TypeError(f"{kind}s must be a list of names, got {names!r}.")
+    names = list(dict.fromkeys(names))
+    if not names:
+        raise ValueError(f"no {kind} was named; known are {', '.join(known)}.")
+    lowered = {name.lower(): name for name in known}
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(str(name).lower(), lowered, n=1)
+            meant = f" (did you mean {lowered[near[0]]}?)" if near else ""
+            raise ValueError(
+                f"there is no {kind} {name!r}{meant}; known are {', '.join(known)}.{hint}"
+            )
+    return names

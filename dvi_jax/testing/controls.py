@@ -1,0 +1,181 @@
+"""Methods that are broken on purpose: each check has to catch one, or it could not fail."""
+
+# Abstract variables of equinox stay arguments of a subclass for pyright, though not at run time.
+# pyright: reportCallIssue=false
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+import dvi_jax as dvi
+
+
+@dataclass(frozen=True)
+class Control:
+    """A broken method and the check that must catch it."""
+
+    name: str
+    check: str
+    method: dvi.Method
+
+
+class Altered(dvi.Method):
+    """Another method, with claims of its own and a step or an inverse in place of its own."""
+
+    method: dvi.Method
+    order: int = eqx.field(static=True)
+    is_symmetric: bool = eqx.field(static=True)
+    is_symplectic: bool = eqx.field(static=True)
+    is_invertible: bool = eqx.field(static=True)
+    own_step: Callable[..., Any] = eqx.field(static=True)
+    own_inverse: Callable[..., Any] = eqx.field(static=True)
+
+    def step(self, equations, interval, q0, p0):
+        return self.own_step(self.method, equations, interval, q0, p0)
+
+    def inverse(self, equations, interval, q1, p1):
+        return self.own_inverse(self.method, equations, interval, q1, p1)
+
+    def needs_no_solve(self, equations, interval, q):
+        return self.method.needs_no_solve(equations, interval, q)
+
+    def inverse_needs_no_solve(self, equations, interval, q):
+        return self.method.inverse_needs_no_solve(equations, interval, q)
+
+
+def _step(method, equations, interval, q, p):
+    return method.step(equations, interval, q, p)
+
+
+def _inverse(method, equations, interval, q, p):
+    return method.inverse(equations, interval, q, p)
+
+
+def altered(
+    method: dvi.Method,
+    step: Callable[..., Any] = _step,
+    inverse: Callable[..., Any] = _inverse,
+    **claims: Any,
+) -> Altered:
+    """`method` with another step or inverse, ``(method, equations, interval, q, p)``, or claims."""
+    names = ("order", "is_symmetric", "is_symplectic", "is_invertible")
+    claimed: Any = {name: getattr(method, name) for name in names} | claims
+    return Altered(method=method, **claimed, own_step=step, own_inverse=inverse)
+
+
+def _explicit_euler(method, equations, interval, q, p):
+    _, _, info = method.step(equations, interval, q, p)
+    rates = equations.position_rate(interval, q, p), equations.momentum_rate(interval, q, p)
+    return q + interval.h * rates[0], p + interval.h * rates[1], info
+
+
+def _with_frozen_time(method, equations, interval, q, p):
+    return method.step(equations, interval._replace(t1=interval.t0), q, p)
+
+
+def _backwards(method, equations, interval, q, p):
+    return method.step(equations, interval.reversed(), q, p)
+
+
+def _not_quite_inverse(method, equations, interval, q, p):
+    q, p, info = method.inverse(equations, interval, q, p)
+    return q * (1 + 1e-8), p, info
+
+
+def _without_gradient_of_h(method, equations, interval, q, p):
+    fixed = interval._replace(h=jax.lax.stop_gradient(interval.h))
+    return method.step(equations, fixed, q, p)
+
+
+_calls = [0]
+
+
+def _with_a_number_from_python(method, equations, interval, q, p):
+    _calls[0] += 1
+    q, p, info = method.step(equations, interval, q, p)
+    return q * (1 + 1e-9 * _calls[0]), p, info
+
+
+@jax.custom_batching.custom_vmap
+def _itself(q):
+    return q
+
+
+@_itself.def_vmap
+def _mixed(axis_size, in_batched, q):
+    del axis_size, in_batched
+    return q + 1e-9 * jnp.mean(q, axis=0, keepdims=True), True
+
+
+def _mixing_lanes(method, equations, interval, q, p):
+    return method.step(equations, interval, _itself(q), p)
+
+
+def _hiding_nan(method, equations, interval, q, p):
+    q1, p1, _ = method.step(equations, interval, q, p)
+    _, _, fine = method.step(equations, interval, jnp.zeros_like(q), jnp.zeros_like(p))
+    return jnp.nan_to_num(q1), jnp.nan_to_num(p1), fine
+
+
+def _with_other_digits() -> dvi.Method:
+    c = list(dvi.KahanLi(8).fractions())
+    for i, sign in ((0, 1), (2, -1), (-1, 1), (-3, -1)):
+        c[i] += sign * 1e-3
+    return dvi.Composition(c, order=2)
+
+
+_FIRST, _SECOND = dvi.TypeII(), dvi.Strang()
+_RK4 = altered(dvi.RungeKutta4(), is_symplectic=True)
+
+CONTROLS: tuple[Control, ...] = (
+    Control("TypeII said to be of order 2", "order", altered(_FIRST, order=2)),
+    Control("Strang said to be of order 1", "order", altered(_SECOND, order=1)),
+    Control(
+        "KahanLi8 with third digits changed, said to be of order 8",
+        "order",
+        altered(_with_other_digits(), order=8),
+    ),
+    Control(
+        "Strang whose force sees the time of the step's start",
+        "forced-order",
+        altered(_SECOND, _with_frozen_time),
+    ),
+    Control("RungeKutta4 said to be symplectic", "symplecticity", _RK4),
+    Control("explicit Euler in place of TypeII", "symplecticity", altered(_FIRST, _explicit_euler)),
+    Control("TypeII said to be symmetric", "reversal", altered(_FIRST, is_symmetric=True)),
+    Control(
+        "TypeII with the step over −h for an inverse",
+        "adjoint",
+        altered(_FIRST, inverse=_backwards),
+    ),
+    Control("RungeKutta4 said to be symplectic", "energy", _RK4),
+    Control("RungeKutta4 said to be symplectic", "momentum", _RK4),
+    Control(
+        "TypeII with h taken for a constant by autodiff",
+        "gradient",
+        altered(_FIRST, _without_gradient_of_h),
+    ),
+    Control(
+        "TypeII with an inverse wrong by 1e-8", "modes", altered(_FIRST, inverse=_not_quite_inverse)
+    ),
+    Control(
+        "TypeII with a Python counter, which differs at each trace",
+        "jit",
+        altered(_FIRST, _with_a_number_from_python),
+    ),
+    Control(
+        "TypeII with a rule for batches that mixes lanes", "vmap", altered(_FIRST, _mixing_lanes)
+    ),
+    Control("TypeII that puts numbers for NaN", "failure", altered(_FIRST, _hiding_nan)),
+    Control(
+        "TypeII whose instances never compare equal",
+        "traces",
+        altered(_FIRST, functools.partial(_step)),
+    ),
+)
+"""Each of them must fail its check by a number that is measured."""

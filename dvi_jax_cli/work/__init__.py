@@ -1,0 +1,1 @@
+"""The work of the commands: TOML files, what they describe, reports. These files import JAX."""

@@ -1,0 +1,112 @@
+"""Texts such as ``Yoshida(4)``: names of known classes with arguments; nothing else is called."""
+
+import ast
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import dvi_jax as dvi
+from dvi_jax.discover import AbstractBasis
+
+from .._errors import InputError, one_of
+from .loader import Loader
+
+
+def public(base: type, *without: type) -> dict[str, type]:
+    """The public classes of the package that are subclasses of `base`, by name."""
+    classes = {n: c for n, c in vars(dvi).items() if isinstance(c, type) and issubclass(c, base)}
+    return {n: c for n, c in classes.items() if c is not base and c not in without}
+
+
+@dataclass(frozen=True)
+class Expressions:
+    """Reader of the texts of one key.
+
+    - `kind`: what a text describes. `known`: name → class.
+    - `allowed`: follows the names in an error.
+    """
+
+    key: str
+    kind: type
+    known: Mapping[str, type]
+    allowed: str = ""
+
+    def read(self, text: str) -> Any:
+        """The object that a text describes.
+
+        **Raises** `InputError`.
+        """
+        try:
+            made = self._made(ast.parse(text.strip(), mode="eval").body)
+        except InputError:
+            raise
+        except SyntaxError:
+            raise self.error(f"{text!r}: the syntax is not that of a call") from None
+        except (ValueError, TypeError, RecursionError, MemoryError) as error:
+            raise self.error(f"{text!r}: {error}") from None
+        if not isinstance(made, self.kind):
+            raise self.error(repr(text))
+        return made
+
+    def error(self, seen: str, name: str = "") -> InputError:
+        return InputError(self.key, seen, one_of(self.known, name) + self.allowed)
+
+    def _made(self, node: ast.expr) -> Any:
+        match node:
+            case ast.Constant(value=value):
+                return value
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                return -self._made(operand)
+            case ast.List(elts=items):
+                return [self._made(item) for item in items]
+            case ast.Tuple(elts=items):
+                return tuple(self._made(item) for item in items)
+            case ast.BinOp(left=left, op=ast.Add() | ast.Mult() as op, right=right):
+                return self._joined(self._made(left), op, self._made(right))
+            case ast.Name(id=name):
+                try:
+                    return self._called(name, [], [])
+                except TypeError:
+                    raise self.error(f"{name!r} without its arguments in parentheses") from None
+            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=keywords):
+                return self._called(name, arguments, keywords)
+        raise ValueError(f"{ast.unparse(node)!r} is not one of these, a number or a list of them")
+
+    def _joined(self, left: Any, op: ast.operator, right: Any) -> Any:
+        if not (isinstance(left, self.kind) and isinstance(right, self.kind)):
+            raise ValueError("numbers are written out, without + and *")
+        return left + right if isinstance(op, ast.Add) else left * right
+
+    def _called(self, name: str, arguments: list[Any], keywords: list[ast.keyword]) -> Any:
+        if name not in self.known:
+            raise self.error(repr(name), name)
+        options = {k.arg: self._made(k.value) for k in keywords if k.arg is not None}
+        return self.known[name](*(self._made(a) for a in arguments), **options)
+
+
+def parse_method(text: str) -> dvi.Method:
+    """The method that a text such as ``"Yoshida(4)"`` or ``"Adjoint(TypeII)"`` describes.
+
+    **Raises** `InputError`.
+    """
+    return Expressions("method", dvi.Method, public(dvi.Method)).read(text)
+
+
+def parse_basis(text: str, loader: Loader) -> Any:
+    """The basis that a text such as ``"Polynomials(2) + Radial((-1,))"`` describes, or that a file
+    has under the name in it.
+
+    **Raises** `InputError`.
+    """
+    bases = public(AbstractBasis, dvi.Basis)
+    reader = Expressions(
+        "basis", AbstractBasis, bases, ', their sums and products; or "file.py:name"'
+    )
+    if ".py:" not in text:
+        return reader.read(text)
+    made = loader.load("basis", text)
+    if isinstance(made, list | dict):
+        made = dvi.Basis(made)
+    if not isinstance(made, AbstractBasis):
+        raise reader.error(repr(text))
+    return made

@@ -1,0 +1,230 @@
+"""One fit: read, fit, write."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import dvi_jax as dvi
+from dvi_jax import plot
+from dvi_jax.fit.progress import shown as shown_bar
+from dvi_jax.fit.result import little_explained, numbers_in_words
+
+from .._errors import InputError
+from .._show import Table
+from .fit_problem import FitProblem, fit_problem
+from .output import Output, Report, output_for, provenance, watched
+from .schema import FitFile
+from .table import read_file
+
+CHECKPOINT = "checkpoint.npz"
+WRITTEN = (
+    "fit.npz", "fit.json", "trajectory.npz", CHECKPOINT,
+    "data.png", "residuals.png", "parameters.png", "learning.png",
+)  # fmt: skip
+"""Every file that a fit may write; with `force` these are replaced and nothing else."""
+
+_MOST = 20_000
+"""Steps up to which every state of the fitted trajectory is written."""
+_CORNER = 8
+"""Parameters up to which pairs are drawn: the first ones."""
+_MATRIX = 8
+"""Parameters up to which the correlations are shown as a matrix; more: the strongest pairs."""
+
+
+def fit_file(
+    path: str | Path,
+    out: str | Path | None = None,
+    force: bool = False,
+    resume: bool = False,
+    progress: bool | Callable[[dvi.FitProgress], None] | None = None,
+) -> Report:
+    """The fit that a TOML file describes.
+
+    - `path`: the file; its keys are in `FitFile` and in the documentation.
+    - `out`: directory to write to, as for `run_file`.
+    - `force`: replace the results of an earlier fit there. `resume`: continue from the checkpoint
+      there; begin where there is none.
+    - `progress`: as for `dvi.fit`.
+
+    Writes fit.npz (`FitResult.save`), fit.json, trajectory.npz (ts, qs, ps of the fitted
+    trajectory) and pictures. A fit that does not converge is written as well, and ``ok`` is
+    False; its checkpoint remains.
+
+    **Raises** `InputError` for bad input; nothing is written then.
+    """
+    path = Path(path)
+    file, raw = read_file(path, FitFile)
+    problem = fit_problem(file, path.parent)
+    output = output_for(path, out, file.output.dir, WRITTEN, force or resume)
+    with output.reserved():  # a checkpoint remains after an error
+        if not resume:
+            (output.folder / CHECKPOINT).unlink(missing_ok=True)
+        found = _fitted(problem, output.folder / CHECKPOINT, progress)
+    with output.writing(keep=CHECKPOINT):
+        return _write(problem, provenance("fit", path, raw), found, output, file.output.plots)
+
+
+def _fitted(problem: FitProblem, checkpoint: Path, progress: Any) -> dvi.FitResult:
+    def work(report: Callable[[Any], None]) -> dvi.FitResult:
+        return dvi.fit(
+            problem.model, problem.data, problem.params, **problem.options,
+            checkpoint=checkpoint, progress=report, throw=False,
+        )  # fmt: skip
+
+    def misfit(error: Exception) -> InputError:
+        allowed = "functions, start, args and data that fit one another"
+        return problem.source.misfit("fit", "fitted", error, allowed)
+
+    return watched(work, shown_bar(progress), misfit)[0]
+
+
+def _write(
+    problem: FitProblem, about: dict[str, Any], found: dvi.FitResult, output: Output, plots: bool
+) -> Report:
+    found.save(output.folder / "fit.npz")
+    trajectory, status = _trajectory(problem, found)
+    np.savez(output.folder / "trajectory.npz", **trajectory)
+    contents = about | _contents(problem, found) | {"trajectory": status}
+    output.write_json("fit.json", contents)
+    report = Report(contents, _tables(found, contents), _notes(found), folder=output.folder)
+    report.message = _failure(found, status)
+    report.files = ["fit.npz", "trajectory.npz", "fit.json"]
+    steps = len(found.history["loss"])
+    report.summary = (
+        f"{found.status} after {steps} steps, {found.seconds:.1f} s (compilation included)"
+    )
+    if plots:  # after the numbers: a picture that fails costs no result
+        report.files += output.draw(_pictures(found, problem.columns))
+    return report
+
+
+def _trajectory(problem: FitProblem, found: dvi.FitResult) -> tuple[dict[str, Any], str]:
+    """The fitted trajectory from the start to the last observation, and its status."""
+    spec = problem.model(found.params)
+    t0, h = problem.data.t0, spec["h"]
+    assert t0 is not None
+    steps = max(1, int(np.ceil((problem.data.ordered().ts[-1] - t0) / h - 1e-9)))
+    save = dvi.Save(every=-(-steps // _MOST), final=True)
+    solution = dvi.integrate(**spec, t0=t0, num_steps=steps, save=save, throw=False)
+    return {n: np.asarray(getattr(solution, n)) for n in ("ts", "qs", "ps")}, solution.status
+
+
+def _contents(problem: FitProblem, found: dvi.FitResult) -> dict[str, Any]:
+    # The numbers of the start in the order of their names: that of JAX's leaves.
+    start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(problem.params)])
+    return {
+        "status": found.status,
+        "message": str(dvi.FIT_RESULTS[found.result]),
+        "parameters": {
+            name: {"value": x, "error": s, "start": a}
+            for name, x, s, a in zip(found.names, found.x, found.sigma, start, strict=True)
+        },
+        "correlations": {"names": found.names, "matrix": found.correlations},
+        "chi2": found.chi2 if found.has_errors else None,
+        "prior_chi2": found.prior_chi2,
+        "reduced_chi2": found.reduced_chi2 if found.has_errors else None,
+        "rms": found.rms,
+        "explained": found.explained,
+        "values": found.num_observed,
+        "missing": int(np.isnan(problem.data.values).sum()),
+        "degrees_of_freedom": found.degrees_of_freedom,
+        "residuals": found.statistics(),
+        "curvature": found.curvature,
+        "undetermined": found.undetermined,
+        "at_bounds": found.at_bounds,
+        "steps": len(found.history["loss"]),
+        "seconds": found.seconds,
+        "columns": problem.columns,
+    }
+
+
+def _tables(found: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
+    values = zip(contents["parameters"].items(), numbers_in_words(found), strict=True)
+    rows = [[name, words, f"{known['start']:.6g}"] for (name, known), words in values]
+    tables = [Table("Parameters, ± standard error", ["name", "value", "start"], rows)]
+    if len(found.names) > 1:
+        tables.append(_correlation_table(found))
+    residuals = contents["residuals"]
+    rows = [
+        ["values", str(found.num_observed)],
+        ["values missing", str(contents["missing"])],
+        ["degrees of freedom", str(found.degrees_of_freedom)],
+        ["rms [units of the data]", f"{found.rms:.4g}"],
+        ["variance explained [%]", f"{100 * found.explained:.4g}"],
+    ]
+    if found.has_errors:
+        rows.append(["chi²", f"{found.chi2:.6g}"])
+        if found.prior_chi2:
+            rows.append(["chi² of the priors", f"{found.prior_chi2:.4g}"])
+        rows.append(["reduced chi²", f"{found.reduced_chi2:.4g}"])
+        rows.append(["largest [standard errors]", f"{residuals['largest']:.3g}"])
+    rows.append(["correlation of neighbours", f"{residuals['lag_one']:.3f}"])
+    return [*tables, Table("Residuals", ["", "value"], rows)]
+
+
+def _correlation_table(found: dvi.FitResult) -> Table:
+    matrix, names = found.correlations, found.names
+    if len(names) <= _MATRIX:
+        rows = [
+            [name, *(f"{matrix[i, j]:.2f}" if j < i else "" for j in range(len(names) - 1))]
+            for i, name in enumerate(names)
+            if i
+        ]
+        return Table("Correlations", ["", *names[:-1]], rows)
+    pairs = [(i, j) for i in range(len(names)) for j in range(i)]
+    strongest = sorted(pairs, key=lambda ij: -np.nan_to_num(abs(matrix[ij]), nan=-1))[:10]
+    rows = [[names[i], names[j], f"{matrix[i, j]:.3f}"] for i, j in strongest]
+    return Table("Strongest correlations", ["of", "and", "value"], rows)
+
+
+def _notes(found: dvi.FitResult) -> list[str]:
+    notes = [f"not determined by the data: {words}" for words in found.undetermined]
+    if little := little_explained(found):
+        notes.append(little[0].upper() + little[1:])
+    if found.at_bounds:
+        at_bounds = ", ".join(found.at_bounds)
+        notes.append(f"at their bounds, where an error is not symmetric: {at_bounds}")
+    if not found.has_errors:
+        notes.append("Without sigma the size of the errors is that of the residuals.")
+    lag = found.statistics()["lag_one"]
+    if abs(lag) > max(0.2, 3 / np.sqrt(max(found.num_observed, 1))):
+        notes.append(
+            f"Neighbouring residuals are correlated ({lag:.2f}): the model is incomplete, and the "
+            "errors are too small."
+        )
+    curvature = np.empty(0) if found.curvature is None else found.curvature
+    finite = curvature[np.isfinite(curvature)]
+    if finite.size and (finite.min() < 0.5 or finite.max() > 2):
+        notes.append(
+            f"Second derivatives are {finite.min():.2g} … {finite.max():.2g} of those that the "
+            "errors assume: far from 1 they are not those of a quadratic minimum."
+        )
+    return notes
+
+
+def _failure(found: dvi.FitResult, status: str) -> str:
+    if found.status != "converged":
+        return (
+            f"the fit did not converge ({found.status} after {len(found.history['loss'])} steps). "
+            f"{dvi.FIT_RESULTS[found.result]}\nIts results so far have been written."
+        )
+    if status != "successful":
+        return f"the fitted trajectory fails ({status}). The results have been written."
+    return ""
+
+
+def _pictures(found: dvi.FitResult, columns: Sequence[str]) -> dict[str, Callable[[], Any]]:
+    """File name → function that draws, for the pictures that this fit can have."""
+    pictures: dict[str, Callable[[], Any]] = {
+        "data.png": partial(plot.fit_against_data, found, names=columns),
+        "residuals.png": partial(plot.fit_residuals, found, names=columns),
+        "learning.png": partial(plot.learning_curve, found),
+    }
+    known = [n for n, s in zip(found.names, found.sigma, strict=True) if 0 < s < np.inf]
+    if len(known) > 1:
+        pictures["parameters.png"] = partial(plot.fit_corner, found, known[:_CORNER])
+    return pictures

@@ -1,0 +1,80 @@
+"""Objects of the Python files that a TOML file names, and errors of these files in one line."""
+
+import importlib.util
+import os
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from .._errors import InputError, one_of, reason, shown
+
+_ALLOWED = '"file.py:name", a Python file in the folder of the TOML file and a name in it'
+
+
+class Loader:
+    """Objects named ``file.py:name``; every file is run once, however often it is named."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.modules: dict[Path, Any] = {}
+
+    def load(self, key: str, text: str) -> Any:
+        """The object that `text` names.
+
+        **Raises** `InputError` with the key when the file or the name does not exist, or when
+        running the file fails: with the line that failed.
+        """
+        file, _, name = text.rpartition(":")
+        if os.path.isabs(file) or ".." in Path(file).parts:
+            raise InputError(key, f"{shown(text)} leaves the folder of the TOML file", _ALLOWED)
+        try:
+            path = (self.folder / file).resolve()
+            is_file = path.is_file()
+        except (OSError, ValueError) as error:  # a name that no file can have
+            raise InputError(key, f"{shown(text)}: {reason(error)}", _ALLOWED) from None
+        if not is_file:
+            raise InputError(key, f"{text!r}: there is no file {path}", _ALLOWED)
+        if path not in self.modules:
+            self.modules[path] = self._run(key, text, path)
+        module = self.modules[path]
+        if not hasattr(module, name):
+            names = [n for n in vars(module) if not n.startswith("_")]
+            allowed = f"a name in that file: {one_of(names, name)}"
+            raise InputError(key, f"{file} has no {name!r}", allowed)
+        return getattr(module, name)
+
+    def _run(self, key: str, text: str, path: Path) -> Any:
+        spec = importlib.util.spec_from_file_location(f"dvi_jax_run_{path.stem}", path)
+        if spec is None or spec.loader is None:
+            raise InputError(key, f"{text!r}: {path.name} is not a Python file", _ALLOWED)
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[spec.name] = module  # dataclasses and pickle look their module up
+        sys.path.insert(0, str(path.parent))  # so that it may import its neighbours
+        try:
+            spec.loader.exec_module(module)
+        except (Exception, SystemExit) as error:
+            seen = f"{text!r} does not import: {in_one_line(error, path)}"
+            raise InputError(key, seen, "a file that imports") from error
+        finally:
+            sys.path.remove(str(path.parent))
+        return module
+
+
+def in_one_line(error: BaseException, *files: Path) -> str:
+    """An exception in one line, with the last place in the user's files that it came through."""
+    kind = type(error).__name__
+    if isinstance(error, SyntaxError):
+        return f"{kind}: {error.msg} (line {error.lineno})"
+    places = traceback.extract_tb(error.__traceback__)
+    inside = [p for p in places if Path(p.filename) in files]
+    where = f" ({Path(inside[-1].filename).name}, line {inside[-1].lineno})" if inside else ""
+    errors = jax.errors
+    if isinstance(error, errors.ConcretizationTypeError | errors.TracerArrayConversionError):
+        return (
+            f"{kind}{where}: the arguments of a function are placeholders while it is compiled; "
+            "write it with jax.numpy in place of math and numpy, jnp.where in place of if"
+        )
+    return f"{kind}: {error}{where}"

@@ -1,0 +1,431 @@
+"""The TOML files of run, sweep, fit and discover: their keys, types, ranges and defaults."""
+# pyright: reportInvalidTypeForm=false
+
+import datetime
+import re
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    PlainValidator,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic.json_schema import models_json_schema
+from typing_extensions import TypeAliasType
+
+from .._errors import InputError, one_of, shown
+from .axis import AN_AXIS, Axis, AxisName, StateOrAxis, SweepParameter, number_or_axis
+from .table import (
+    Array,
+    Count,
+    Fraction,
+    JsonSchema,
+    Limit,
+    Many,
+    Number,
+    NumberOrArray,
+    Scalar,
+    StepSize,
+    Table,
+    Text,
+    Two,
+    Whole,
+    check,
+    key,
+    type_in_toml,
+    union,
+)
+
+ARRAY = "an array of finite numbers, or of such arrays with rows of one length"
+COUNT = "a positive whole number"
+FINITE = "a finite number"
+FRACTION = "a number between 0 and 1"
+FILE = '"file.py:name"'
+SYSTEM = f"the name of a system in the library, or {FILE}"
+DATE = 'a day such as "1900-01-01" or a Julian date; for solar_system alone'
+ARGS = "a table of numbers, booleans, arrays of numbers, or tables of these"
+METHOD = 'text such as "TypeII", "Strang" or "Yoshida(4)"'
+STEP_SIZE = "a finite number that is not zero (negative runs backwards)"
+BOOLEAN = "true or false"
+BASIS = f'text such as "Polynomials(4)", "Polynomials(2) + Radial((-1,))", or {FILE} of a basis'
+BOX = "{q = […], p = […]}: numbers, or arrays of the shape of q"
+NEW_DIRECTORY = "the path of a directory that does not exist yet"
+OR_AXIS = f"; or an axis, {AN_AXIS}"
+SEED = "a whole number that is not negative"
+TIMES = "at least two times, all increasing or all decreasing"
+
+# The system, its state and its parameters
+
+
+def _date(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, str | int | float | datetime.date):
+        raise ValueError
+    return value
+
+
+Date = Annotated[Any, PlainValidator(_date), WithJsonSchema({"type": ["string", "number"]})]
+Parameter = TypeAliasType(
+    "Parameter", union(boolean=bool, number=Scalar, array=Array, table=dict[str, "Parameter"])
+)
+
+
+class State(Table):
+    """The initial condition."""
+
+    q0: Array | None = key(None, ARRAY)
+    p0: Array | None = key(None, ARRAY)
+    date: Date | None = key(None, DATE)
+
+    @model_validator(mode="after")
+    def _date_or_arrays(self) -> Any:
+        if self.date is not None and (self.q0 is not None or self.p0 is not None):
+            raise InputError("date", "given together with q0 or p0", "date, or q0 and p0")
+        return self
+
+
+class SystemFile(Table):
+    """The common keys of the files of run, fit and discover."""
+
+    system: Text = key(..., SYSTEM)
+    state: State = State()
+    args: dict[str, Parameter] | None = key(None, ARGS)
+    t0: Number = key(0.0, FINITE)
+    h: StepSize | None = key(None, STEP_SIZE)
+    method: Text = key("TypeII", METHOD)
+
+
+class Output(Table):
+    """The directory of the results, and whether there are pictures."""
+
+    dir: Text | None = key(None, NEW_DIRECTORY)
+    plots: bool = key(True, BOOLEAN)
+
+
+# A run
+
+
+def _in_order(times: np.ndarray) -> bool:
+    steps = np.diff(times) if times.ndim == 1 else np.zeros(1)
+    return steps.size > 0 and bool((steps > 0).all() or (steps < 0).all())
+
+
+class Times(Table):
+    """The times of the steps."""
+
+    times: Annotated[Array, check(_in_order)] = key(..., TIMES)
+
+
+def _check_names(observables: dict[str, str]) -> dict[str, str]:
+    for name in observables:
+        if re.search(r"[/\\\x00-\x1f]", name):
+            allowed = "a name without / and \\, for it becomes the name of a file in an archive"
+            raise InputError("", f"the name {name!r}", allowed)
+    return observables
+
+
+class Integration(Table):
+    """The common keys of the files of run and sweep."""
+
+    lattice: union(text=Literal["uniform"], table=Times) = key(
+        "uniform", f'"uniform", or {{times = [t0, t1, …]}} with {TIMES}'
+    )
+    observables: Annotated[dict[str, Text], AfterValidator(_check_names)] | None = key(
+        None, 'a table of texts, such as energy = "energy" or drift = "MaxDrift(energy)"'
+    )
+
+    @model_validator(mode="after")
+    def _times_or_steps(self) -> Any:
+        given: Any = self  # of a run or of a sweep, with h, steps and t0
+        if isinstance(self.lattice, Times):
+            for name in ("h", "steps"):
+                if (value := getattr(given, name)) is not None:
+                    raise InputError(name, shown(value), "nothing: lattice.times sets the steps")
+            if given.t0 not in (0.0, self.lattice.times[0]):
+                raise InputError("t0", shown(given.t0), "nothing: lattice.times has the start")
+        return self
+
+
+class RunOutput(Output):
+    """The results of a run."""
+
+    every: Count = key(1, f"{COUNT}: steps from one saved state to the next")
+
+
+class RunFile(SystemFile, Integration):
+    """One trajectory."""
+
+    steps: Count | None = key(None, COUNT)
+    epsilon: Number = key(0.0, FINITE)
+    output: RunOutput = RunOutput()
+
+
+# A sweep
+
+
+class SweepState(State):
+    """The initial condition, with axes."""
+
+    q0: StateOrAxis | None = key(None, f"{ARRAY}; numbers in it may be axes")
+    p0: StateOrAxis | None = key(None, f"{ARRAY}; numbers in it may be axes")
+
+
+class Pair(Table):
+    """Two values, for q and for p."""
+
+    q: NumberOrArray = key(..., "a number, or an array of the shape of q")
+    p: NumberOrArray = key(..., "a number, or an array of the shape of q")
+
+
+class _Start(Table):
+    count: Count = key(..., COUNT)
+    seed: Whole = key(0, SEED)
+    name: AxisName = key("start", "a name such as start")
+
+
+class BoxStart(_Start):
+    """Points in a box."""
+
+    kind: Literal["halton", "random"]
+    low: Pair = key(..., BOX)
+    high: Pair = key(..., BOX)
+
+
+class NormalStart(_Start):
+    """Normally distributed points."""
+
+    kind: Literal["normal"]
+    q0: Array | None = key(None, ARRAY)
+    p0: Array | None = key(None, ARRAY)
+    sigma: Pair = key(..., "{q = …, p = …}: standard deviations, numbers or arrays")
+
+
+class EnergyShellStart(_Start):
+    """Points of one energy."""
+
+    kind: Literal["energy_shell"]
+    H: Text = key(..., f"{FILE}, a function (t, q, p, args)")
+    energy: Number = key(..., FINITE)
+    low: Array = key(..., f"a corner of the box of q, {ARRAY}")
+    high: Array = key(..., f"a corner of the box of q, {ARRAY}")
+
+
+Start = BoxStart | NormalStart | EnergyShellStart
+_START_TAGS = {"halton": "box", "random": "box", "normal": "normal", "energy_shell": "energy_shell"}
+
+
+def _check_kind(start: Any) -> Any:
+    if not isinstance(start, dict):
+        raise InputError("", shown(start), f"a table with kind = {one_of(_START_TAGS)}")
+    if (kind := start.get("kind")) not in _START_TAGS:
+        seen = "the key is missing" if kind is None else repr(kind)
+        raise InputError("kind", seen, one_of(_START_TAGS, str(kind)))
+    return start
+
+
+AnyStart = Annotated[
+    union(
+        lambda start: f"<{_START_TAGS[start['kind']]}>",
+        box=BoxStart, normal=NormalStart, energy_shell=EnergyShellStart,
+    ),
+    BeforeValidator(_check_kind),
+]  # fmt: skip
+
+
+class SaveEvery(Table):
+    """Every n-th state is saved."""
+
+    every: Count = key(..., COUNT)
+
+
+class SweepOutput(Table):
+    """The store of a sweep."""
+
+    store: Text | None = key(None, NEW_DIRECTORY)
+    lanes_per_task: Count | None = key(None, f"{COUNT}: trajectories of one task")
+
+
+def _whole(value: Any) -> Any:  # linspace makes 100.0
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+class SweepFile(SystemFile, Integration):
+    """Many trajectories: the keys of a run with axes in the place of numbers."""
+
+    state: SweepState = SweepState()
+    start: AnyStart | None = key(None, "initial conditions that are generated")
+    args: dict[str, SweepParameter] | None = key(
+        None, f"{ARGS}; a number may be an axis, {AN_AXIS}"
+    )
+    t0: number_or_axis(Number) = key(0.0, FINITE + OR_AXIS)
+    h: number_or_axis(StepSize) | None = key(None, STEP_SIZE + OR_AXIS)
+    steps: number_or_axis(Count, Annotated[Count, BeforeValidator(_whole)]) | None = key(
+        None, f"{COUNT}{OR_AXIS} of such"
+    )
+    epsilon: number_or_axis(Number) = key(0.0, FINITE + OR_AXIS)
+    method: union(text=Text, array=Many[Text], table=Axis[Text]) = key(
+        "TypeII", f"{METHOD}; or an array of such texts"
+    )
+    save: union(text=Literal["final"], table=SaveEvery) | None = key(
+        None, '"final", or {every = n} with a positive whole number'
+    )
+    output: SweepOutput = SweepOutput()
+
+    @model_validator(mode="after")
+    def _start_or_state(self) -> Any:
+        for name in ("q0", "p0", "date"):
+            if self.start is not None and getattr(self.state, name) is not None:
+                seen = "given together with [start]"
+                raise InputError(f"state.{name}", seen, "[state] or [start]")
+        return self
+
+
+# A fit
+
+
+def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Parameter → pair: ``[bounds] args.k`` is a table in TOML, ``"args.k"`` is not."""
+    found: dict[str, Any] = {}
+    for name, inner in table.items():
+        is_table = isinstance(inner, dict)
+        found |= _flat(inner, f"{prefix}{name}.") if is_table else {prefix + name: inner}
+    return found
+
+
+Limits = TypeAliasType("Limits", union(number=Limit, array=list["Limits"]))
+Bounds = TypeAliasType("Bounds", union(array=Two[Limits], table=dict[str, "Bounds"]))
+Priors = TypeAliasType("Priors", union(array=Two[NumberOrArray], table=dict[str, "Priors"]))
+
+
+def _sigma_tag(value: Any) -> str:
+    is_names = isinstance(value, list) and value and isinstance(value[0], str)
+    return "<names>" if is_names else type_in_toml(value)
+
+
+Sigma = union(
+    _sigma_tag,
+    number=Annotated[Number, check(lambda sigma: sigma > 0)],
+    array=Annotated[Array, check(lambda sigma: (sigma > 0).all())],
+    text=Annotated[Text, AfterValidator(lambda name: [name])],
+    names=list[Text],
+)
+
+
+class Data(Table):
+    """The observations."""
+
+    file: Text | None = key(None, "the path of a CSV or npz file, from the folder of this one")
+    time: Text = key("t", "the name of the column with the times")
+    columns: Many[Text] | None = key(
+        None, "an array of names of columns; all but time and sigma if not given"
+    )
+    observe: Text = key(
+        "positions", f'"positions", "momenta", "state", or {FILE} of a function (t, q, p, args)'
+    )
+    sigma: Sigma | None = key(
+        None,
+        "standard errors: a positive number, an array of them, one for each column, or names of "
+        "columns",
+    )
+
+
+class Options(Table):
+    """The options of a fit."""
+
+    loss: Literal["LeastSquares", "SoftL1", "Cauchy"] = key(
+        "LeastSquares", "LeastSquares, SoftL1, Cauchy"
+    )
+    segments: Count | None = key(None, f"{COUNT}: segments of multiple shooting")
+    horizons: union(text=Literal["auto", "none"], array=list[Number]) = key(
+        "auto", '"auto", "none", or an array of growing times'
+    )
+    max_steps: Count | None = key(None, COUNT)
+    tolerance: Fraction = key(1e-4, FRACTION)
+    curvature: bool = key(True, BOOLEAN)
+
+
+class FitFile(SystemFile):
+    """Parameters from observations."""
+
+    t0: Number | None = key(
+        None, f"{FINITE}: the time of [state]; that of the first observation if not given"
+    )
+    epsilon: Number = key(0.0, FINITE)
+    parameters: Many[Text] | None = key(
+        None, 'an array of names: "epsilon", "q0", "p0", "args.NAME"'
+    )
+    bounds: Annotated[dict[str, Bounds], AfterValidator(_flat)] = key(
+        {}, "[lower, upper], numbers or arrays; -inf, inf for none"
+    )
+    priors: Annotated[dict[str, Priors], AfterValidator(_flat)] = key(
+        {}, "[mean, standard error], numbers or arrays"
+    )
+    data: Data = Data()
+    options: Options = Options()
+    output: Output = Output()
+
+
+# A discovery
+
+
+class Samples(Table):
+    """The box that samples are taken from."""
+
+    count: Count | None = key(None, f"{COUNT}; not given: four for each function")
+    low: Pair | None = key(None, BOX)
+    high: Pair | None = key(None, BOX)
+    times: Annotated[Two[Number], check(lambda span: span[0] < span[1])] | None = key(
+        None, "[first, last]: times of the samples, all at t0 if not given"
+    )
+    seed: Whole = key(0, SEED)
+
+
+def _strengths(given: Any) -> list[float]:
+    found = given.all if isinstance(given, Axis) else given
+    if len(found) < 3 or min(found) <= 0 or len(set(found)) < len(found):
+        raise ValueError
+    return found
+
+
+class Drift(Table):
+    """How drifts are measured."""
+
+    epsilons: Annotated[
+        union(array=list[Number], table=Axis[Number]), AfterValidator(_strengths)
+    ] = key(
+        [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2],
+        "three numbers or more above zero, no two the same: an array, or {geomspace = [a, b, n]}",
+    )
+    steps: Count = key(1000, COUNT)
+    starts: Count = key(8, f"{COUNT}: trajectories from the box")
+    measure: bool = key(True, f"{BOOLEAN}: whether drifts are measured")
+
+
+class DiscoverFile(SystemFile):
+    """What a map conserves."""
+
+    basis: Text | None = key(None, BASIS)
+    order: Whole = key(1, SEED)
+    tolerance: Fraction | None = key(None, f"{FRACTION}; not given: exact invariants alone")
+    representative: Literal["least", "simplest"] = key("least", '"least" or "simplest"')
+    samples: Samples = Samples()
+    drift: Drift = Drift()
+    output: Output = Output()
+
+
+FILES: dict[str, type[Table]] = {
+    "run": RunFile, "sweep": SweepFile, "fit": FitFile, "discover": DiscoverFile,
+}  # fmt: skip
+"""Kind of file → its model."""
+
+
+def json_schema(kind: str | None = None) -> dict[str, Any]:
+    """The JSON schema of the files of one kind, or of a file of any kind."""
+    models = [FILES[kind]] if kind else list(FILES.values())
+    refs, found = models_json_schema(
+        [(model, "validation") for model in models], schema_generator=JsonSchema
+    )
+    found["anyOf"] = [refs[model, "validation"] for model in models]
+    return {"$schema": JsonSchema.schema_dialect, "title": f"dvi-jax {kind or 'TOML'} file"} | found

@@ -1,0 +1,213 @@
+"""The solar system in comparison with the ephemeris that it was started from."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import dvi_jax as dvi
+from dvi_jax import plot
+from dvi_jax.systems.n_body import OBSERVABLES
+from dvi_jax.systems.solar_system import (
+    AU_IN_KM,
+    BODIES,
+    GM,
+    ephemeris,
+    perihelion_longitude,
+    to_ecliptic,
+)
+
+from .._show import Table
+from .observables import Observed
+from .output import Report
+
+CENTURY = 36525.0
+"""A Julian century [day]."""
+
+_ARCSEC = 180 * 3600 / np.pi
+_LIGHT = 299792.458 * 86400 / AU_IN_KM  # speed of light [au/day]
+_AGAIN = 4 * 365.25  # stretch that is repeated to find the integrator's error [day]
+_MERCURY = BODIES.index("Mercury")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """An integration and the ephemeris at the saved times.
+
+    - `years`: since the start, shape (T,). `heliocentric`: positions on ecliptic axes [au],
+      shape (T, bodies, 3).
+    - `errors`: distance between integrated and tabulated heliocentric position [km], shape
+      (T, bodies). `angles`: the same as seen from the Sun [″].
+    - `perihelion`: Mercury's longitude of perihelion, ephemeris minus integration [″], shape (T,).
+    - `slope`, `intercept`: its least-squares line [″/century], [″]; `scatter`: the root mean
+      square about the line [″].
+    - `relativity`: the slope according to general relativity [″/century].
+    """
+
+    years: np.ndarray
+    heliocentric: np.ndarray
+    errors: np.ndarray
+    angles: np.ndarray
+    perihelion: np.ndarray
+    slope: float
+    intercept: float
+    scatter: float
+    relativity: float
+
+
+def compare(jd: np.ndarray, qs: np.ndarray, ps: np.ndarray, masses: np.ndarray) -> Comparison:
+    r"""An integration of the ten bodies compared with DE421.
+
+    - `jd`: TDB Julian dates of the saved states, shape (T,), the start first.
+    - `qs` [au], `ps` [au⁴/day³]: barycentric, on ICRF axes, shape (T, bodies, 3). `masses`: GM.
+
+    The longitude of perihelion ϖ = Ω + ω is that of the osculating heliocentric orbit on the
+    ecliptic of J2000 (`perihelion_longitude`), from positions and velocities of either side;
+    the slope of its difference is a least-squares fit over the saved times. That of relativity is
+
+        6π mu / (c² a (1 − e²)) per revolution,
+
+    with the osculating a and e of the start. States that are not finite are left out of the fit.
+
+    **Source** Einstein 1915; Park et al. 2017, *AJ* 153, 121 (42.98″ per century).
+    """
+    q_tab, v_tab = ephemeris(jd)
+    vs = ps / masses[:, None]
+    q, v, q_tab, v_tab = (to_ecliptic(x - x[:, :1]) for x in (qs, vs, q_tab, v_tab))
+    distance = np.linalg.norm(q - q_tab, axis=-1)
+    radius = np.maximum(np.linalg.norm(q_tab, axis=-1), np.finfo(float).tiny)
+
+    m, mu = _MERCURY, GM[0] + GM[_MERCURY]
+    tabulated = perihelion_longitude(q_tab[:, m], v_tab[:, m], mu)
+    integrated = perihelion_longitude(q[:, m], v[:, m], masses[0] + masses[m])
+    difference = (tabulated - integrated) * _ARCSEC
+    years = (jd - jd[0]) / 365.25
+    line = _line(years / 100, difference)
+
+    L = np.linalg.norm(np.cross(q_tab[0, m], v_tab[0, m]))
+    a = 1 / (2 / np.linalg.norm(q_tab[0, m]) - np.sum(v_tab[0, m] ** 2) / mu)
+    period = 2 * np.pi * np.sqrt(a**3 / mu)
+    # a (1 − e²) = L²/mu
+    relativity = float(6 * np.pi * mu**2 / (_LIGHT * L) ** 2 * CENTURY / period * _ARCSEC)
+    errors, angles = distance * AU_IN_KM, distance / radius * _ARCSEC
+    return Comparison(years, q, errors, angles, difference, *line, relativity)
+
+
+def own_share(run: dict[str, Any], qs: np.ndarray, ps: np.ndarray) -> float:
+    """The integrator's own contribution to ephemeris minus integration [″/century].
+
+    - `run`: arguments of `dvi.integrate`.
+
+    The first few years are integrated again with half the step; for a method of order r the slope
+    of the perihelion then differs by 1 − 2⁻ʳ of the whole error (Richardson). NaN for a time grid
+    that is not uniform, fewer than three saved states, a failed run.
+    """
+    if run["h"] is None:
+        return np.nan
+    every = run["save"].every
+    span = run["h"] * every  # from one saved state to the next
+    count = min(int(_AGAIN / abs(span)), run["num_steps"] // every)
+    if count < 3:
+        return np.nan
+    finer = {"h": run["h"] / 2, "num_steps": 2 * every * count, "save": dvi.Save(every=2 * every)}
+    again = dvi.integrate(**run | finer, throw=False)
+    masses = np.asarray(run["args"]["masses"])[:, None]
+
+    def perihelion(q, p):
+        q, v = (to_ecliptic(x[:, _MERCURY] - x[:, 0]) for x in (q, p / masses))
+        return perihelion_longitude(q, v, float(masses[0, 0] + masses[_MERCURY, 0]))
+
+    whole = perihelion(qs[: count + 1], ps[: count + 1])
+    half = perihelion(np.asarray(again.qs), np.asarray(again.ps))
+    slope, _, _ = _line(span * np.arange(count + 1) / CENTURY, (half - whole) * _ARCSEC)
+    return slope / (1 - 0.5 ** run["method"].order)
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
+    """Slope, intercept and root mean square residual of the least-squares line; NaN for < 3."""
+    good = np.isfinite(y)
+    if good.sum() < 3:
+        return np.nan, np.nan, np.nan
+    slope, intercept = np.polyfit(x[good], y[good], 1)
+    residual = y[good] - slope * x[good] - intercept
+    return float(slope), float(intercept), float(np.sqrt(np.mean(residual**2)))
+
+
+def conserved() -> dict[str, Any]:
+    """Observables of every run of the solar system: all that is conserved, and its drift."""
+    return {**OBSERVABLES, **{f"{name}_drift": dvi.MaxDrift(f) for name, f in OBSERVABLES.items()}}
+
+
+def report(report: Report, c: Comparison, always: dict[str, Observed], share: float) -> None:
+    """Add the comparison to a report: contents, tables, notes."""
+    largest = {name: always[f"{name}_drift"].summary()["relative"] for name in OBSERVABLES}
+    errors = {
+        name: {
+            "largest_km": np.nanmax(c.errors[:, i], initial=0.0),
+            "last_km": c.errors[-1, i],
+            "largest_arcsec": np.nanmax(c.angles[:, i], initial=0.0),
+        }
+        for i, name in enumerate(BODIES)
+        if i > 0
+    }
+    report.contents["solar_system"] = {
+        "years": float(c.years[-1]),
+        "position_error": errors,
+        "largest_relative_change": largest,
+        "mercury_perihelion": {
+            "ephemeris_minus_integration_arcsec_per_century": c.slope,
+            "integrators_share_arcsec_per_century": share,
+            "scatter_arcsec": c.scatter,
+            "general_relativity_arcsec_per_century": c.relativity,
+        },
+    }
+    report.tables += [_conserved_table(c, always, largest), _position_table(errors)]
+    if np.isfinite(c.slope):
+        report.notes += _notes(c, share)
+
+
+def _conserved_table(c: Comparison, always: dict[str, Observed], largest: dict[str, Any]) -> Table:
+    along = np.unique(np.linspace(0, len(c.years) - 1, 11).round().astype(int))
+    changes = [np.abs(always[name].change()) for name in OBSERVABLES]
+    rows = [[f"{c.years[k]:.1f}", *(f"{change[k]:.1e}" for change in changes)] for k in along]
+    rows.append(["largest, every step", *(f"{x:.1e}" for x in largest.values())])
+    columns = ["years", *(name.replace("_", " ") for name in OBSERVABLES)]
+    return Table("Conserved: relative change (linear momentum: of Σ|p|)", columns, rows)
+
+
+def _position_table(errors: dict[str, Any]) -> Table:
+    rows = [[name, *(f"{x:.3g}" for x in error.values())] for name, error in errors.items()]
+    columns = ["planet", "largest [km]", "last [km]", "largest, from the Sun [″]"]
+    return Table("Heliocentric position compared with DE421", columns, rows)
+
+
+def _notes(c: Comparison, share: float) -> list[str]:
+    notes = [
+        f"Mercury's perihelion, ephemeris minus integration: {c.slope:.2f}″ per century (scatter "
+        f"about the line {c.scatter:.2f}″); general relativity contributes {c.relativity:.2f}″."
+    ]
+    if np.isfinite(share):
+        own = f"The integrator contributes {share:.2f}″ per century, measured with half the step."
+        if abs(share) > 0.02 * c.relativity:
+            own += " That is too much to measure relativity: take a smaller h."
+        notes.append(own)
+    return notes
+
+
+def pictures(
+    c: Comparison, always: dict[str, Observed], run: dict[str, Any]
+) -> dict[str, Callable[[], Any]]:
+    """File name → function that draws: orbits, the comparison, conserved quantities."""
+    series = {name.replace("_", " "): np.abs(always[name].change()) for name in OBSERVABLES}
+    title = f"Ten bodies with {type(run['method']).__name__}"
+    if run["h"] is not None:
+        title += f", h = {run['h']:g} day"
+    line = (c.perihelion, c.slope, c.intercept)
+    return {
+        "orbits.png": lambda: plot.planet_orbits(c.heliocentric[:, 1:], BODIES[1:]),
+        "ephemeris.png": lambda: plot.ephemeris_comparison(
+            c.years, c.errors[:, 1:], BODIES[1:], *line
+        ),
+        "invariants.png": lambda: plot.conserved(c.years, series, "years since the start", title),
+    }

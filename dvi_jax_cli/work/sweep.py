@@ -1,0 +1,265 @@
+"""A sweep from a TOML file; the state of a store."""
+
+import dataclasses
+import json
+import math
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import dvi_jax as dvi
+from dvi_jax.sweep.bar import shown as shown_bar
+from dvi_jax.sweep.variables import RESERVED
+
+from .._errors import InputError
+from .._show import Table
+from .output import Report, watched
+from .schema import SweepFile
+from .sweep_problem import sweep_problem
+from .system import Source
+from .table import read_file
+
+_MOST = 10_000_000
+"""Numbers up to which results are read again for the table at the end."""
+
+_NOT_OURS = ("config", "config_sha256", "Conventions", "coordinates", "dvi_jax_sweep")
+"""Attributes of a store that say how to read it, not where it comes from."""
+
+
+def sweep_file(
+    path: str | Path,
+    store: str | Path | None = None,
+    resume: bool = False,
+    threads: int | None = None,
+    progress: bool | Callable[[dvi.SweepProgress], None] | None = None,
+) -> Report:
+    """The sweep that a TOML file describes, saved in a store.
+
+    - `path`: the file; its keys are in `SweepFile` and in the documentation.
+    - `store`: directory to write to instead of the file's ``output.store``; either is relative to
+      the working directory. It must not exist, or be empty, unless
+    - `resume`: continue with the store there; begin where there is none.
+    - `threads`, `progress`: as for `dvi.sweep`.
+
+    **Raises** `InputError` for bad input, nothing is written then; `StoreMismatch`
+    for a store of another sweep, `StoreError` or `OSError` for one that cannot be written;
+    `SweepInterrupted` after Ctrl-C.
+    """
+    path = Path(path)
+    file, _ = read_file(path, SweepFile)
+    folder = Path(store or file.output.store or f"results/{path.stem}.zarr")
+    _check_folder(folder, "--store" if store is not None else "output.store", resume)
+    source, arguments = sweep_problem(file, path.parent)
+    found, last = watched(
+        lambda report: dvi.sweep(**arguments, store=folder, threads=threads, progress=report),
+        shown_bar(progress),
+        lambda error: _misfit(path, source, error),
+    )
+    return _finished(found, last)
+
+
+def sweep_cost(path: str | Path) -> Report:
+    """What the sweep of a TOML file would take, and larger ones: the summary has a table. One task
+    is computed and timed for it, and nothing is written.
+
+    **Raises** `InputError` for bad input.
+    """
+    path = Path(path)
+    file, _ = read_file(path, SweepFile)
+    source, arguments = sweep_problem(file, path.parent)
+    try:
+        cost = dvi.sweep_cost(**arguments)
+    except Exception as error:
+        raise _misfit(path, source, error) from error
+    contents = dataclasses.asdict(cost) | {"seconds": cost.seconds()}
+    return Report(contents, summary=f"{cost}\n\n{cost.table()}")
+
+
+def _misfit(path: Path, source: Source, error: Exception) -> InputError:
+    allowed = "axes, functions, state and args that fit one another"
+    return source.misfit(str(path), "swept", error, allowed)
+
+
+def _check_folder(folder: Path, key: str, resume: bool) -> None:
+    """Fail early if the path holds other data, or this sweep without --resume."""
+    try:
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return
+        result = dvi.open_sweep(folder)
+    except (dvi.StoreError, OSError) as error:
+        seen = f"{folder} exists, and is not the store of a sweep ({error})"
+        raise InputError(key, seen, "a new directory") from None
+    except ValueError as error:  # a name that no directory can have
+        raise InputError(key, f"{folder}: {error}", "a new directory") from None
+    if not resume:
+        done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
+        allowed = "--resume to continue it, or another directory, with --store PATH"
+        raise InputError(key, f"{folder} exists already: {done}", allowed)
+
+
+def _finished(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
+    counts = result.status_counts()
+    contents = {
+        "store": str(result.path),
+        "dims": result.dims,
+        "tasks": {"done": last.tasks_done, "all": last.num_tasks},
+        "trajectories": counts,
+        "seconds": last.seconds,
+        "steps_per_second": last.rate,
+    }
+    tables = [_status_table(counts)]
+    observed = _observed(result)
+    if observed:
+        contents["observed"] = observed
+        tables.append(_observed_table(observed))
+    speed = f"{last.seconds:.1f} s (compilation included), {last.rate:.3g} steps/s"
+    summary = (
+        f"{last.num_lanes} trajectories in {last.num_tasks} tasks; "
+        f"{speed if last.rate else 'nothing was left to do'}; in {result.path}"
+    )
+    return Report(contents, tables, summary=summary)
+
+
+def _observed(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
+    """Name → least, median and largest over the successful trajectories. Empty where there is
+    nothing to say, or too much to read."""
+    data = result.to_xarray()
+    names = [str(n) for n in data.data_vars if str(n).split(".")[0] not in RESERVED]
+    if not names or sum(data[name].size for name in names) > _MOST:
+        return {}
+    good = result["status"] == 0
+    found = {}
+    for name in names:
+        values = data[name].values[good]
+        if np.iscomplexobj(values):
+            name, values = f"|{name}|", np.abs(values)
+        values = values[np.isfinite(values)]
+        if values.size:
+            of = {"min": np.min, "median": np.median, "max": np.max}
+            found[name] = {word: float(f(values)) for word, f in of.items()}
+    return found
+
+
+def _observed_table(observed: dict[str, dict[str, float]]) -> Table:
+    rows = [[name, *(f"{x:.6g}" for x in of.values())] for name, of in observed.items()]
+    title = "Observables of the successful trajectories"
+    return Table(title, ["name", "min", "median", "max"], rows)
+
+
+def _status_table(counts: dict[str, int]) -> Table:
+    total = sum(counts.values())
+    rows = [[name, str(n), f"{100 * n / total:.4g} %"] for name, n in counts.items()]
+    return Table("How the trajectories ended", ["status", "trajectories", "share"], rows)
+
+
+# Stores
+
+
+def _opened(store: str | Path) -> dvi.SweepResult:
+    try:
+        return dvi.open_sweep(store)
+    except dvi.StoreError as error:
+        raise InputError("STORE", str(error), "the directory of a sweep") from None
+
+
+def sweep_status(store: str | Path) -> Report:
+    """How far a sweep is, from the records of its store; others may be working on it.
+
+    **Raises** `InputError` where there is no store.
+    """
+    result = _opened(store)
+    steps = _steps(result)
+    statuses: Counter[str] = Counter()
+    done, lanes, work, spans = 0, 0, 0, []
+    for record in result.records():
+        done += 1
+        statuses.update(record["statuses"])
+        lanes += (here := math.prod(record["size"]))
+        work += here * steps(record["start"])
+        spans.append((record["finished"] - record["seconds"], record["finished"]))
+    seconds, left = _covered(spans), math.prod(result.dims.values()) - lanes
+    rate = lanes / seconds if seconds else 0.0
+    contents = {
+        "store": str(result.path),
+        "dims": result.dims,
+        "tasks": {"done": done, "left": result.num_tasks - done, "all": result.num_tasks},
+        "trajectories": ({"not_computed": left} if left else {}) | dict(statuses),
+        "seconds": seconds,
+        "trajectories_per_second": rate,
+        "steps_per_second": None if math.isnan(work) else work / seconds if seconds else 0.0,
+        "seconds_left": left / rate if rate else None,
+        "bytes": sum(_sizes(Path(store))),
+        "provenance": {k: v for k, v in result.attributes.items() if k not in _NOT_OURS},
+    }
+    about = [[name, str(value)] for name, value in contents["provenance"].items()]
+    tables = [
+        _status_table(contents["trajectories"]),
+        Table("Provenance", ["what", "value"], about),
+    ]
+    return Report(contents, tables, summary=_status_summary(contents))
+
+
+def _status_summary(contents: dict[str, Any]) -> str:
+    tasks, left = contents["tasks"], contents["seconds_left"]
+    grid = " × ".join(f"{name} {n}" for name, n in contents["dims"].items())
+    speed = contents["steps_per_second"]
+    rest = f", {tasks['left']} left" + (f" (about {left:.3g} s)" if left else "")
+    return (
+        f"{contents['store']}: {grid}; {tasks['done']} of {tasks['all']} tasks done"
+        f"{rest if tasks['left'] else ''}; {contents['trajectories_per_second']:.3g} "
+        f"trajectories/s{'' if speed is None else f', {speed:.3g} steps/s'}; "
+        f"{contents['bytes'] / 1e6:.3g} MB"
+    )
+
+
+def _steps(result: dvi.SweepResult) -> Callable[[list[int]], float]:
+    """The number of steps of the task whose box begins at given indices; NaN where unknown."""
+    config = json.loads(result.attributes["config"])
+    steps = config["num_steps"]
+    if not isinstance(steps, dict):
+        return lambda _: math.nan if steps is None else steps
+    coordinates, dim = result.to_xarray().coords, steps["axis"]
+    values = coordinates["num_steps" if "num_steps" in coordinates else dim].values
+    place = list(result.dims).index(dim)
+    return lambda start: values[start[place]]
+
+
+def _covered(spans: list[tuple[float, float]]) -> float:
+    """Seconds in which some task was being done: pauses between runs do not count."""
+    total, until = 0.0, -math.inf
+    for begin, end in sorted(spans):
+        total += max(0.0, end - max(begin, until))
+        until = max(until, end)
+    return total
+
+
+def _sizes(folder: Path) -> Iterator[int]:
+    for root, _, names in os.walk(folder):
+        for name in names:
+            try:
+                yield os.stat(Path(root, name)).st_size
+            except FileNotFoundError:  # a temporary file of a process that is working on it
+                continue
+
+
+def verify_store(store: str | Path, progress: Callable[[int, int], None] | None = None) -> Report:
+    """Read everything in a store again; tasks that are bad are open again after this.
+
+    **Raises** `InputError` where there is no store, `OSError` where it cannot be changed.
+    """
+    found = _opened(store).verify(progress)
+    contents = {"store": str(store), **found._asdict()}
+    summary = f"{store}: {found.sound} tasks are sound, {len(found.bad)} bad, {found.todo} to do"
+    report = Report(contents, summary=summary)
+    if found.bad:
+        rows = [[str(number), wrong] for number, wrong in found.bad.items()]
+        report.tables.append(Table("Bad tasks", ["task", "error"], rows))
+        report.message = (
+            "bad tasks were found; they will be computed again. To repair the store, run the sweep "
+            "again with --resume."
+        )
+    return report

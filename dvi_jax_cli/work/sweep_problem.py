@@ -1,0 +1,170 @@
+"""The arguments of `dvi.sweep` that a TOML file describes."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dvi_jax as dvi
+
+from .._errors import InputError
+from .axis import AN_AXIS, Axis, at, axes_in
+from .expressions import parse_method
+from .observables import read_observables
+from .schema import NormalStart, Pair, Start, SweepFile
+from .system import Source, find_source
+
+_STARTS = {
+    "halton": dvi.starts.Halton,
+    "random": dvi.starts.Random,
+    "normal": dvi.starts.Normal,
+    "energy_shell": dvi.starts.EnergyShell,
+}
+
+
+def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]]:
+    """The source of the system, and the arguments of `dvi.sweep` except for the store.
+
+    **Raises** `InputError`.
+    """
+    source = find_source(file, folder)
+    lattice, h, steps = source.times(file)
+    save = dvi.Save(final=True) if file.save == "final" else None
+    if file.save is not None and file.save != "final":
+        save = dvi.Save(every=file.save.every)
+    arguments = {
+        "system": source.system,
+        "h": _for_sweep("h", h),
+        "num_steps": _for_sweep("steps", steps),
+        "t0": _for_sweep("t0", file.t0),
+        "epsilon": _for_sweep("epsilon", file.epsilon),
+        "args": _parameters(source.args),
+        "method": _methods(file.method),
+        "lattice": lattice,
+        "save": save,
+        "observe": _observe(file, source),
+        "lanes_per_task": file.output.lanes_per_task,
+    } | _initial_conditions(file, source)
+    if not any(_varies(x) for x in arguments.values()):
+        allowed = "an axis for some number, or [start]; for one trajectory there is dvi-jax run"
+        raise InputError("epsilon", "nothing varies, neither this nor another number", allowed)
+    return source, arguments
+
+
+def _varies(argument: Any) -> bool:
+    kinds = (dvi.Axis, dvi.starts.Starts)
+    leaves = jax.tree.leaves(argument, is_leaf=lambda x: isinstance(x, kinds))
+    return any(isinstance(x, kinds) for x in leaves)
+
+
+# Axes
+
+
+def _for_sweep(key: str, value: Any) -> Any:
+    """A value with its axes as those of `dvi.sweep`; one without a name has that of the key."""
+    if isinstance(value, list):
+        return [_for_sweep(f"{key}[{i}]", part) for i, part in enumerate(value)]
+    if not isinstance(value, Axis):
+        return value
+    return _axis(key, value, value.all)
+
+
+def _axis(key: str, given: Axis, values: Any) -> dvi.Axis:
+    try:
+        return dvi.Axis(given.axis or key.rpartition(".")[2], values, given.units)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{key}.{given.kind}", str(error), AN_AXIS) from None
+
+
+def _parameters(value: Any, key: str = "args") -> Any:
+    """The parameters; an array with axes in it becomes an axis of arrays."""
+    if isinstance(value, dict):
+        return {name: _parameters(inner, f"{key}.{name}") for name, inner in value.items()}
+    axes = axes_in(value) if isinstance(value, list) else []
+    if not axes:
+        return _for_sweep(key, value)
+    if len({(axis.axis, len(axis.all)) for axis in axes}) != 1:
+        seen = ", ".join(f"{axis.axis} with {len(axis.all)} values" for axis in axes)
+        raise InputError(key, f"axes {seen} in one array", "axes of one name and length")
+    arrays = [np.asarray(at(value, k), float) for k in range(len(axes[0].all))]
+    return _axis(key, axes[0], np.stack(arrays))
+
+
+def _methods(given: Any) -> Any:
+    if isinstance(given, str):
+        return parse_method(given)
+    if isinstance(given, list):
+        return dvi.Axis("method", [parse_method(text) for text in given])
+    return _axis("method", given, [parse_method(text) for text in given.all])
+
+
+def _observe(file: SweepFile, source: Source) -> dict[str, Any] | None:
+    """The observables; one without a reduction is that of the last step."""
+    found = read_observables(file.observables, source)
+    if not found and file.save is None:
+        allowed = 'an observable at least, or save = "final"'
+        raise InputError("observables", "nothing would be saved", allowed)
+    reduced = {n: f if isinstance(f, dvi.Reduction) else dvi.Last(f) for n, f in found.items()}
+    return reduced or None
+
+
+# Initial conditions
+
+
+def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
+    """`start`, or `q0` and `p0`, checked for one of the trajectories at least."""
+    if file.start is None:
+        q0, p0 = source.state
+        _check(source, {"q0": q0, "p0": p0, "args": source.args})
+        return {"q0": _for_sweep("state.q0", q0), "p0": _for_sweep("state.p0", p0)}
+    start = _start(file.start, source)
+    t0, args = at(file.t0, 0), at(source.args, 0)
+    try:
+        q0, p0 = (np.asarray(x) for x in start.at(jnp.zeros((), jnp.int32), t0, args))
+    except Exception as error:  # whatever a user's H raises
+        allowed = "an H (t, q, p, args) that fits the box and args"
+        raise InputError("start", source.reported(error), allowed) from error
+    source.check_start(q0, p0, args)
+    return {"start": start}
+
+
+def _check(source: Source, given: dict[str, Any]) -> None:
+    """Reject states of which neither the first nor the last can be started from; a single one is a
+    trajectory that fails, which is a result."""
+
+    def check(which: int) -> None:
+        found = at(given, which)
+        q0, p0 = (np.asarray(found[name], float) for name in ("q0", "p0"))
+        source.check_start(q0, p0, found["args"])
+
+    try:
+        check(0)
+    except InputError:
+        check(-1)
+
+
+def _start(given: Start, source: Source) -> dvi.starts.Starts:
+    options = {name: getattr(given, name) for name in given.model_fields_set - {"kind"}}
+    for name, value in options.items():
+        if isinstance(value, Pair):
+            options[name] = (value.q, value.p)
+    if isinstance(given, NormalStart):
+        for name in ("q0", "p0"):
+            if name not in options:
+                options[name] = _centre(name, source)
+    if "H" in options:
+        options["H"] = source.loader.load("start.H", options["H"])
+    try:
+        return _STARTS[given.kind](**options)
+    except (TypeError, ValueError) as error:
+        raise InputError("start", str(error), f"keys that fit kind = {given.kind}") from None
+
+
+def _centre(name: str, source: Source) -> np.ndarray:
+    """The system's own q0 or p0, about which states are normally distributed."""
+    if source.problem is None:
+        allowed = NormalStart.model_fields[name].description or ""
+        raise InputError(f"start.{name}", "the key is missing", allowed)
+    return np.asarray(getattr(source.problem, name), float)

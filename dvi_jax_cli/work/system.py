@@ -1,0 +1,168 @@
+"""The system of a TOML file, its parameters and state, and the times of the steps."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import dvi_jax as dvi
+from dvi_jax import systems
+from dvi_jax.engine.signature import accepts
+from dvi_jax.systems.solar_system import EphemerisMissing, julian_date
+
+from .._errors import InputError, one_of, shown
+from .loader import Loader, in_one_line
+from .schema import RunFile, SweepFile, SystemFile, Times
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a TOML file says of the system.
+
+    - `problem`: the library's record, or that of a user's file; None for a `dvi.System` alone.
+    - `jd`: the Julian date of the start of the solar system, if an ephemeris gives it.
+    """
+
+    file: SystemFile
+    loader: Loader
+    problem: systems.Problem | None
+    system: dvi.System
+    jd: float | None
+
+    @property
+    def name(self) -> str:
+        """The name of the system."""
+        return self.problem.name if self.problem is not None else self.file.system
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The units of t, q and p, where they are known."""
+        return dict(self.problem.units) if self.problem is not None else {}
+
+    def misfit(self, key: str, what: str, error: BaseException, allowed: str) -> InputError:
+        """The error of input that does not fit, such as "kepler cannot be integrated: …"."""
+        return InputError(key, f"{self.name} cannot be {what}: {self.reported(error)}", allowed)
+
+    def reported(self, error: BaseException) -> str:
+        """An exception in one line, with its place in the user's files."""
+        return in_one_line(error, *self.loader.modules)
+
+    @cached_property
+    def args(self) -> Any:
+        """The parameters of the system with those of the file in their place."""
+        given, problem = self.file.args, self.problem
+        known = problem.args if problem is not None else None
+        if given is None or problem is None:
+            return known if given is None else given
+        if not isinstance(known, dict):
+            without = (
+                f"{problem.name} has no parameters" if known is None else "args is not a table"
+            )
+            raise InputError("args", shown(given), f"nothing: {without}")
+        for name, value in given.items():
+            if name not in known:
+                raise InputError(f"args.{name}", "there is no such parameter", one_of(known, name))
+            if isinstance(value, dict) and not isinstance(known[name], dict):
+                allowed = "a number or an array; in a sweep also an axis"
+                raise InputError(f"args.{name}", shown(value), allowed)
+        return {**known, **given}
+
+    @cached_property
+    def state(self) -> tuple[Any, Any]:
+        """(q0, p0) of the file, or else of the system."""
+        return self.array("q0"), self.array("p0")
+
+    def array(self, name: str) -> Any:
+        """q0 or p0 of the file, or else of the system."""
+        given = getattr(self.file.state, name)
+        if given is not None:
+            return given
+        known = getattr(self.problem, name, None)
+        if known is None:
+            allowed = "an array of numbers; this system has none"
+            raise InputError(f"state.{name}", "the key is missing", allowed)
+        return np.asarray(known, float)
+
+    def check_start(self, q0: Any, p0: Any, args: Any) -> None:
+        """Reject an initial condition that the system cannot start from."""
+        if np.shape(q0) != np.shape(p0):
+            allowed = f"the shape of q0, {np.shape(q0)}: a momentum for each q"
+            raise InputError("state.p0", f"shape {np.shape(p0)}", allowed)
+        if self.problem is None or self.problem.check is None:
+            return
+        try:
+            self.problem.check(q0, p0, args)
+        except systems.ParameterError as error:
+            raise InputError("args", str(error), "args that fit the system") from None
+        except ValueError as error:
+            raise InputError(
+                "state", str(error), "a start that the system can go on from"
+            ) from None
+
+    @property
+    def h(self) -> Any:
+        """The step size of the file, or else of the system."""
+        h = self.file.h if self.file.h is not None else getattr(self.problem, "h", None)
+        if h is None:
+            raise InputError("h", "the key is missing", "a number; this system has none of its own")
+        return h
+
+    def times(self, file: RunFile | SweepFile) -> tuple[dvi.Lattice, Any, Any]:
+        """The time grid, h and the number of steps, as `dvi.integrate` takes them."""
+        if isinstance(file.lattice, Times):
+            return dvi.Given(file.lattice.times), None, None
+        h = self.h
+        if file.steps is None:
+            raise InputError("steps", "the key is missing", "a positive whole number")
+        return dvi.Uniform(), h, file.steps
+
+
+def find_source(file: SystemFile, folder: Path) -> Source:
+    """The system of a TOML file; files that it names are in `folder`.
+
+    **Raises** `InputError`.
+    """
+    loader = Loader(folder)
+    if file.state.date is not None and file.system != "solar_system":
+        allowed = "q0 and p0; a date only with system = solar_system"
+        raise InputError("state.date", shown(file.state.date), allowed)
+    if ":" not in file.system:
+        return _of_the_library(file, loader)
+    made = _of_a_file(file.system, loader)
+    if isinstance(made, dvi.System):
+        return Source(file, loader, None, made, None)
+    if isinstance(made, systems.Problem):
+        return Source(file, loader, made, made.system, None)
+    allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
+    raise InputError("system", f"{file.system!r} is {type(made).__name__}", allowed)
+
+
+def _of_a_file(text: str, loader: Loader) -> Any:
+    made = loader.load("system", text)
+    if not callable(made) or isinstance(made, type | dvi.System) or not accepts(made, 0):
+        return made
+    try:
+        return made()
+    except (Exception, SystemExit) as error:
+        seen = f"{text!r} failed: {in_one_line(error, *loader.modules)}"
+        raise InputError("system", seen, "a function that returns a system") from error
+
+
+def _of_the_library(file: SystemFile, loader: Loader) -> Source:
+    name, date = file.system, file.state.date
+    if name not in systems.LIBRARY:
+        allowed = f'{one_of(systems.LIBRARY, name)}; or "file.py:name"'
+        raise InputError("system", repr(name), allowed)
+    try:
+        if name == "solar_system" and file.state.q0 is None:
+            jd = julian_date("1900-01-01" if date is None else date)
+            problem = systems.solar_system(jd)
+        else:
+            jd, problem = None, systems.LIBRARY[name]()
+    except EphemerisMissing as error:
+        raise InputError("system", f"{name!r}: {error}", "an installed ephemeris") from None
+    except ValueError as error:
+        raise InputError("state.date", str(error), "a day that the ephemeris covers") from None
+    return Source(file, loader, problem, problem.system, jd)

@@ -1,0 +1,97 @@
+"""The checks as functions for tests of one's own: what they raise, return and accept."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import problem
+from test_docs import examples
+
+import dvi_jax as dvi
+from dvi_jax import testing
+from dvi_jax.testing import METHODS, altered, check_method, check_order, check_reversible
+
+EXTENDING = Path(__file__).parents[1] / "docs" / "extending.md"
+
+
+def test_every_check_is_a_function_with_a_remedy():
+    functions = [f for name, f in vars(testing).items() if name.startswith("check_")]
+    functions.remove(check_method)
+    checks = testing.CHECKS.values()
+    assert {" ".join(f.__doc__.split()) for f in functions} == {check.says for check in checks}
+    assert all(check.remedy.endswith(".") for check in checks)
+
+
+def test_a_failure_says_what_was_measured_what_is_required_and_what_to_do():
+    method = altered(dvi.TypeII(), is_symmetric=True)
+    with pytest.raises(AssertionError) as raised:
+        check_reversible(method)
+    claim, measured, what, remedy = str(raised.value).splitlines()
+    assert claim == "Altered does not have properties that it claims"
+    assert measured.startswith("reversal: measured 0.0")
+    assert "required ≤ 1e-12" in measured
+    assert what.startswith("  What is measured: max |z − z0| after ten steps")
+    assert remedy.startswith("  What to do: Make the step its own adjoint")
+    with pytest.raises(AssertionError, match=r"reversal: measured"):
+        check_method(method, ["symplecticity", "reversal"])
+
+
+def test_a_property_that_is_not_claimed_is_measured_and_returned():
+    found = check_method(METHODS["TypeII"], ["reversal", "symplecticity"])
+    assert list(found) == ["reversal", "symplecticity"]
+    assert found["reversal"].verdict == "not claimed"
+    assert found["reversal"].value > 1e-3
+    assert found["symplecticity"].value < 1e-12
+
+
+def test_another_problem_takes_the_place_of_the_own_one():
+    ours, theirs = check_reversible(dvi.Strang()), check_reversible(dvi.TypeII(), problem("kepler"))
+    assert ours.passed
+    assert theirs.value != check_reversible(dvi.TypeII()).value
+
+
+def test_an_order_is_measured_on_its_own_problem():
+    with pytest.raises(AssertionError, match=r"order: measured 1(\.\d*)?, required 2 ± 0.2"):
+        check_order(altered(dvi.TypeII(), order=2))
+    with pytest.raises(ValueError, match="order is measured on its own problem"):
+        check_order(dvi.TypeII(), problem("double_pendulum"))
+
+
+def test_an_identity_is_not_taken_for_a_step_with_an_inverse():
+    def stay(method, equations, interval, q, p):
+        return q, p, method.step(equations, interval, q, p)[2]
+
+    with pytest.raises(AssertionError, match="moved the state by 0 only"):
+        testing.check_inverse(altered(dvi.Strang(), stay, stay))
+
+
+@pytest.mark.parametrize(("checks", "error"), [(["symmetry"], ValueError), ("order", TypeError)])
+def test_unknown_checks_are_refused(checks, error):
+    with pytest.raises(error, match="check"):
+        check_method(dvi.Strang(), checks)
+
+
+def test_symplectic_defect():
+    assert testing.symplectic_defect(np.eye(4)) == 0
+    assert testing.symplectic_defect(np.diag([2.0, 1.0])) == 1
+
+
+def test_importing_the_package_imports_no_checks():
+    code = "import sys, dvi_jax; print({'pytest', 'dvi_jax.testing'} & set(sys.modules))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout == "set()\n"
+
+
+@pytest.mark.slow
+def test_the_documented_test_file_passes(tmp_path):
+    """The code of the page as a test file: a test for each check, and one of its own."""
+    path = tmp_path / "test_mine.py"
+    path.write_text(examples(EXTENDING)[0], encoding="utf-8")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", str(path)]
+    out = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=tmp_path, timeout=500
+    )
+    assert out.returncode == 0, out.stdout[-3000:]
+    assert f"{len(testing.CHECKS) + 1} passed" in out.stdout
