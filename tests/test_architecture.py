@@ -12,7 +12,7 @@ import dvi_jax as dvi
 
 ROOT = Path(dvi.__file__).parent
 FLOORS = [
-    ["_types", "_results"],
+    ["_types", "_results", "_checks"],
     ["_precision", "_progress", "_memory", "_files"],
     ["engine"],
     ["_system", "_solution"],

@@ -1,0 +1,79 @@
+"""Checks of arguments: each returns the argument, or says what was seen and what is allowed."""
+
+import math
+import numbers
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+
+def whole(name: str, value: Any, least: int = 1, most: int | None = None, hint: str = "") -> int:
+    """A whole number from `least` to `most` (None: any).
+
+    `True` is none, though Python counts it as 1. **Raises** `ValueError`.
+    """
+    fits = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not fits or value < least or (most is not None and value > most):
+        last = "on" if most is None else f"to {most}"
+        raise ValueError(
+            f"{name} must be a whole number from {least} {last}, got {value!r}.{_more(hint)}"
+        )
+    return int(value)
+
+
+def positive(name: str, value: Any, zero: bool = False, hint: str = "") -> float:
+    """A positive and finite number; `zero`: or 0. **Raises** `ValueError`."""
+    fits = _is_number(value) and math.isfinite(value)
+    if not fits or value < 0 or (value == 0 and not zero):
+        kind = "finite number, not negative" if zero else "positive and finite number"
+        raise ValueError(f"{name} must be a {kind}, got {value!r}.{_more(hint)}")
+    return float(value)
+
+
+def finite(name: str, value: Any, hint: str = "") -> float:
+    """A finite number. **Raises** `ValueError`."""
+    if not _is_number(value) or not math.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, got {value!r}.{_more(hint)}")
+    return float(value)
+
+
+def one_of(name: str, value: Any, known: Iterable[Any], hint: str = "") -> Any:
+    """One of the known values. **Raises** `ValueError`."""
+    known = list(known)
+    if not any(value is one or (type(value) is type(one) and value == one) for one in known):
+        these = ", ".join(map(repr, known))
+        raise ValueError(f"{name} must be one of {these}, got {value!r}.{_more(hint)}")
+    return value
+
+
+def instance(name: str, value: Any, kind: Any, called: str, hint: str = "") -> Any:
+    """An instance of a class (or of one of several), which the message calls `called`.
+
+    **Raises** `TypeError`, which asks about parentheses where the class itself was given.
+    """
+    if not isinstance(value, kind):
+        seen = f"the class {value.__name__}" if isinstance(value, type) else f"{value!r:.200}"
+        missing = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
+        raise TypeError(f"{name} must be {called}, got {seen}{missing}.{_more(hint)}")
+    return value
+
+
+def function(name: str, value: Any, arguments: str = "", hint: str = "") -> Callable[..., Any]:
+    """A function; `arguments`: of what, such as "(t, q, p, args)". **Raises** `TypeError`."""
+    if not callable(value):
+        of = f" {arguments}" if arguments else ""
+        raise TypeError(f"{name} must be a function{of}, got {value!r:.200}.{_more(hint)}")
+    return value
+
+
+def _is_number(value: Any) -> bool:
+    """Whether Python or NumPy counts it as a real number; an array of one number as well."""
+    if isinstance(value, np.ndarray) or hasattr(value, "__jax_array__") or hasattr(value, "aval"):
+        value = np.asarray(value)
+        return value.ndim == 0 and value.dtype.kind in "iuf"
+    return isinstance(value, numbers.Real | np.number) and not isinstance(value, bool)
+
+
+def _more(hint: str) -> str:
+    return f" {hint}" if hint else ""
