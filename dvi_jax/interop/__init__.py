@@ -7,8 +7,8 @@ it, when it is called; without it there is an `ImportError` with the line that i
 from .diffrax_side import (
     diffrax_solver as diffrax_solver,
     diffrax_term as diffrax_term,
-    vector_field as vector_field,
 )
+from .fields import vector_field as vector_field
 from .labelled import to_inference_data as to_inference_data, to_xarray as to_xarray
 from .rebound_side import (
     ReboundProblem as ReboundProblem,

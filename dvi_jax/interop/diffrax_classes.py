@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 import dvi_jax as dvi
 
-from .diffrax_side import as_pair, vector_field
+from .fields import as_pair, vector_field
 
 
 class DiscreteTerm(diffrax.AbstractTerm):

@@ -5,14 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from ._problem import Problem
-from .n_body import n_body
+from .n_body import EIGHT_MOMENTA, EIGHT_POSITIONS, n_body
 
 PERIOD = 6.32591398
 """Time after which each body is back at its place, as printed with the start."""
-
-_PLACE, _SPEED = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
-POSITIONS = np.array([_PLACE, -_PLACE, np.zeros(2)])
-MOMENTA = np.array([-_SPEED / 2, -_SPEED / 2, _SPEED])
 
 
 def figure_eight() -> Problem:
@@ -24,5 +20,5 @@ def figure_eight() -> Problem:
     **Source** Chenciner & Montgomery 2000, *Ann. Math.* 152, 881; digits by C. Simó, printed
     there.
     """
-    problem = n_body(np.ones(3), POSITIONS, MOMENTA, h=PERIOD / 1000)
+    problem = n_body(np.ones(3), EIGHT_POSITIONS, EIGHT_MOMENTA, h=PERIOD / 1000)
     return replace(problem, name="figure_eight")

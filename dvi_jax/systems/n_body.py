@@ -11,6 +11,11 @@ from ..discover.generators import Generator
 from ..discover.library import rotation, scaling, space_translation, time_translation
 from ._problem import Problem, check_finite, number, parameter
 
+_PLACE, _SPEED = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
+EIGHT_POSITIONS = np.array([_PLACE, -_PLACE, np.zeros(2)])
+EIGHT_MOMENTA = np.array([-_SPEED / 2, -_SPEED / 2, _SPEED])
+"""The start of the figure eight: `figure_eight`."""
+
 
 def hamiltonian(t0, t1, q0, p1, args):
     r"""Newtonian N-body Hamiltonian.
@@ -158,9 +163,7 @@ def n_body(
     if any(given) and not all(given):
         raise TypeError("n_body takes masses, q0 and p0 together, or none of them.")
     if masses is None or q0 is None or p0 is None:
-        from .figure_eight import MOMENTA, POSITIONS  # which is made by this function
-
-        masses, q0, p0 = np.ones(3), POSITIONS, MOMENTA
+        masses, q0, p0 = np.ones(3), EIGHT_POSITIONS, EIGHT_MOMENTA
     args = {"masses": np.asarray(masses, float), "G": number({"G": G}, "G")}
     check_bodies(q0, p0, args)
     return Problem(

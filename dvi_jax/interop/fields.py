@@ -1,0 +1,82 @@
+"""The vector field that a discrete map discretises."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import dvi_jax as dvi
+
+from ..engine.quantities import refuse_unit_or_mask
+from .extras import system_of
+
+
+def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], Any]:
+    r"""The continuous limit h → 0 of a system, as ``f(t, y, args)`` with ``y = (q, p)``.
+
+        q̇ = ∂H/∂p,    ṗ = −∂H/∂q + ε W,      H(t, q, p) = H_D(t, t, q, p) + ε H1_D(t, t, q, p)
+
+    with W taken at (t, t, q, p): what `GaussLegendre` and `RungeKutta4` integrate, and what the map
+    of every H_D tends to that is continuous at t1 = t0. It is for comparisons,
+    ``diffrax.ODETerm(interop.vector_field(system))``; the map itself comes from H_D, not from it.
+
+    - `system`: a `System`, or a problem of the library. `epsilon`: strength of the disturbance.
+
+    **Returns** a function of t [time], (q, p) and args, whose value (q̇, ṗ) has their shapes
+    [unit of q / time, unit of p / time]. It can be compiled, batched and differentiated.
+
+    **Raises** `TypeError` for what is no system, and when called with a y that is no pair.
+
+    **Accuracy** round-off. ``dvi.from_lagrangian`` divides by t1 − t0 and has no H_D(t, t, …): its
+    field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
+    """
+    system = system_of(system, "vector_field")
+    refuse_unit_or_mask("epsilon", epsilon)
+    warn_without_effect(system, epsilon)
+
+    def field(t, y, args):
+        q, p = as_pair(y)
+        t = jnp.asarray(t, q.dtype)
+        strength = jnp.asarray(epsilon, q.dtype)
+        position, momentum = jax.grad(system.hamiltonian, argnums=(2, 3))(
+            t, t, q, p, strength, args
+        )
+        force = system.disturbing_force(t, t, q, p, strength, args)
+        rates = momentum, -position + jnp.asarray(force, q.dtype)
+        return type(y)(rates) if isinstance(y, list) else rates
+
+    return field
+
+
+def as_pair(y: Any) -> tuple[Any, Any]:
+    """A state (q, p) as two arrays of one shape.
+
+    **Raises** `TypeError` for another structure, `ValueError` for two shapes.
+    """
+    if not (isinstance(y, tuple | list) and len(y) == 2):
+        raise TypeError(
+            f"the state must be a pair y0=(q0, p0), got {type(y).__name__}: the map has to know "
+            "positions from momenta."
+        )
+    q, p = (jnp.asarray(x) for x in y)
+    if q.shape != p.shape:
+        raise ValueError(f"q and p must have one shape, got {q.shape} and {p.shape}.")
+    return q, p
+
+
+def warn_without_effect(system: dvi.System, epsilon: Any) -> None:
+    """As `integrate` warns, where the value is known."""
+    if system.force is not None or system.perturbation is not None or system.slow_time:
+        return
+    try:
+        value = float(epsilon)
+    except (TypeError, jax.errors.ConcretizationTypeError):  # it stands for values to come
+        return
+    if value != 0:
+        warnings.warn(
+            f"epsilon = {value:g} has no effect: the system has neither a force nor a "
+            "perturbation.",
+            stacklevel=3,
+        )
