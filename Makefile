@@ -7,12 +7,13 @@ PYTHON ?= python3
 VENV ?= .venv
 OUT ?= paper-out
 JOBS ?= 2
+PART ?= 1
 BIN = $(VENV)/bin
 READY = $(VENV)/ready
 
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help paper notebooks docs test test-fast lint types format lock clean
+.PHONY: help paper notebooks docs test test-all test-part test-fast lint types format lock clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -30,13 +31,19 @@ docs: $(READY)
 	$(BIN)/python -m sphinx -W --keep-going -q -j auto -b html docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
 
-## make test        all tests
+## make test        every part of the package at least once, in about five minutes
 test: $(READY)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --durations=20
+
+## make test-all    all tests, long ones included
+test-all: $(READY)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "slow or not slow" --durations=40
 
-## make test-fast   the tests that are not marked slow (what plain pytest runs)
-test-fast: $(READY)
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+## make test-part   one of four parts of the long tests (PART=1 to 4)
+test-part: $(READY)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m slow --part $(PART)/4 --durations=20
+
+test-fast: test
 
 ## make lint        style and formatting
 lint: $(READY)

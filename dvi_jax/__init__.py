@@ -1,5 +1,7 @@
 """Differentiable variational integrators for disturbed Hamiltonian systems."""
 
+from typing import TYPE_CHECKING
+
 from lanewise import Layout as Layout
 
 from ._adapters import (
@@ -34,6 +36,7 @@ from ._discretise import discretise as discretise
 from ._energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
 from ._integrate import integrate as integrate
 from ._integrator import Integrator as Integrator
+from ._namespaces import names as __dir__  # noqa: F401
 from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._reversible import Reversible as Reversible
 from ._solution import Save as Save, Solution as Solution
@@ -181,6 +184,21 @@ from .sweep import (
     sweep as sweep,
     sweep_cost as sweep_cost,
 )
+
+if TYPE_CHECKING:  # a type checker is to report names that are not there
+    from . import (
+        certify as certify,
+        fit as fitting,  # noqa: F401
+        interop as interop,
+        paper as paper,
+        plot as plot,
+        run as run,
+        sweep as sweeps,  # noqa: F401
+        systems as systems,
+        testing as testing,
+    )
+else:
+    from ._namespaces import namespace as __getattr__  # noqa: F401
 
 generators = _library
 __version__ = "0.1.0"

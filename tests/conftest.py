@@ -2,6 +2,7 @@
 
 import gc
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 import compilation
@@ -68,13 +69,39 @@ SECONDS = {
 """Processor seconds of the files that take longest, measured once; others follow by their tests."""
 
 
+def in_parts(tests: Mapping[str, int], parts: int) -> list[list[str]]:
+    """Files in parts that take about as long, given how many tests each has."""
+    seconds = {file: SECONDS.get(file, count / 2) for file, count in tests.items()}
+    found, totals = [[] for _ in range(parts)], [0.0] * parts
+    for file in sorted(seconds, key=lambda file: (-seconds[file], file)):
+        smallest = totals.index(min(totals))
+        found[smallest].append(file)
+        totals[smallest] += seconds[file]
+    return found
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--part",
+        metavar="I/N",
+        help="part I of N of the slow tests, whole files each, and no other",
+    )
+
+
 def pytest_configure(config):
     """xdist would begin with the files of many tests, and one worker end alone with a long file."""
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
 
 
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     """Files that take long before those that do not, so that all workers end at one time."""
+    if chosen := config.getoption("--part"):
+        part, parts = map(int, chosen.split("/"))
+        slow = [item for item in items if item.get_closest_marker("slow")]
+        files = in_parts(Counter(item.path.stem for item in slow), parts)[part % parts]
+        left_out = [item for item in items if item not in slow or item.path.stem not in files]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in slow if item.path.stem in files]
     tests = Counter(item.path for item in items)
     items.sort(key=lambda item: (-SECONDS.get(item.path.stem, 0), -tests[item.path]))

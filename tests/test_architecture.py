@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import conftest
 import pytest
 
 import dvi_jax as dvi
@@ -27,7 +28,7 @@ FLOORS = [
     ["discover"],
     ["sweep", "fit"],
     ["dynamics"],
-    ["_aliases"],
+    ["_aliases", "_namespaces"],
     ["__init__", "systems", "plot", "symmetry", "invariants"],
     ["testing"],
     ["paper", "certify"],
@@ -221,7 +222,14 @@ def test_importing_the_package_does_not_import_pydantic():
 
 def test_door_has_no_logic():
     tree = ast.parse((ROOT / "__init__.py").read_text())
-    assert all(isinstance(n, ast.ImportFrom | ast.Expr | ast.Assign) for n in tree.body)
+    nodes = [
+        inner
+        for node in tree.body
+        for inner in (node.body + node.orelse if isinstance(node, ast.If) else [node])
+    ]
+    assert all(isinstance(n, ast.ImportFrom | ast.Expr | ast.Assign) for n in nodes)
+    tests = [ast.unparse(node.test) for node in tree.body if isinstance(node, ast.If)]
+    assert tests == ["TYPE_CHECKING"]
 
 
 PUBLIC = """
@@ -255,3 +263,31 @@ ForceLibrary identify Identification NetworkForce
 @pytest.mark.parametrize("name", PUBLIC.split())
 def test_public_name_is_documented(name):
     assert getattr(dvi, name).__doc__
+
+
+def test_packages_are_attributes_in_a_fresh_process():
+    """They are imported when they are used, and not before."""
+    code = """
+import sys, dvi_jax as dvi
+from dvi_jax import _namespaces
+assert not any(f"dvi_jax.{n}" in sys.modules for n in ("plot", "systems", "interop", "testing"))
+for name, package in _namespaces.NAMESPACES.items():
+    assert name in dir(dvi), name
+    assert getattr(dvi, name) is sys.modules[f"dvi_jax.{package}"], name
+assert dvi.fitting.Prior is dvi.Prior and callable(dvi.fit) and callable(dvi.sweep)
+try:
+    dvi.plots
+except AttributeError as error:
+    assert "no attribute 'plots'" in str(error), error
+else:
+    raise AssertionError
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_file_of_long_tests_is_in_one_part():
+    files = dict.fromkeys(sorted(conftest.SECONDS), 3) | {f"test_new_{i}": i for i in range(20)}
+    parts = conftest.in_parts(files, 4)
+    assert sorted(file for part in parts for file in part) == sorted(files)
+    seconds = [sum(conftest.SECONDS.get(file, 0) for file in part) for part in parts]
+    assert max(seconds) < 1.3 * min(seconds)
