@@ -67,6 +67,11 @@ def test_a_small_program_passes():
     [
         ("SYSTEM,", "dvi.System(lambda *at: H(*at) * (1 + 1e-11 * (form == 'auto'))),", "numbers"),
         ("num_steps=3", "num_steps=3, stop=STOP if form == 'auto' else NEVER", "status"),
+        (
+            "num_steps=3",
+            "num_steps=3, observe=lambda *a: (1 if form == 'auto' else -1) / (a[3][0] * 0)",
+            "infinities",
+        ),
         ("SYSTEM, q,", "SYSTEM, q + (0.0 if form == 'auto' else jnp.nan),", "status"),
     ],
 )
