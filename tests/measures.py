@@ -99,7 +99,7 @@ def _imports(root: Path, trees: dict[Path, ast.Module]) -> dict[str, set[str]]:
     found: dict[str, set[str]] = defaultdict(set)
     for name, path in names.items():
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        for node in _run_nodes(trees[path]):
+        for node in run_nodes(trees[path]):
             for target in _targets(node, package):
                 while target and target not in names:
                     target = target.rpartition(".")[0]
@@ -113,12 +113,13 @@ def _module(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def _run_nodes(node: ast.AST) -> Iterator[ast.AST]:
+def run_nodes(node: ast.AST) -> Iterator[ast.AST]:
+    """All parts of the code that are run, not those for type checkers only."""
     yield node
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
             continue
-        yield from _run_nodes(child)
+        yield from run_nodes(child)
 
 
 def _targets(node: ast.AST, package: str) -> Iterable[str]:
@@ -203,8 +204,8 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 50_950,
-    "raise statements": 915,
+    "lines": 51_000,
+    "raise statements": 916,
     COMMENTS: 1.3,
     f"files of more than {LONGEST_FILE} lines": 11,
     f"functions with more than {MOST_PARAMETERS} parameters": 28,

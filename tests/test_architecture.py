@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import conftest
+import measures
 import pytest
 
 import dvi_jax as dvi
@@ -48,7 +49,7 @@ def room_of(path: Path) -> str:
 def imported_rooms(path: Path):
     """(room, name of what is imported) for every import of the package by the file."""
     package = ("dvi_jax", *path.relative_to(ROOT).with_suffix("").parts[:-1])
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in measures.run_nodes(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
             target = [*base, *(node.module or "").split(".")] if node.module else list(base)

@@ -1,5 +1,7 @@
 """The code gets no larger, and imports have no circles."""
 
+import re
+
 import measures
 import pytest
 
@@ -58,3 +60,14 @@ def test_limits_are_compared_with_their_numbers():
     assert [text.split(":")[0] for text in measures.exceeded(spoiled)] == [
         "lines", measures.COMMENTS, "circles of imports"
     ]  # fmt: skip
+
+
+def test_the_picture_of_the_layers_is_that_of_the_imports():
+    """Names in the order of their height; `python tests/measures.py --picture` draws it again."""
+    text = (measures.ROOT / "docs" / "pictures" / "layers.svg").read_text()
+    drawn = re.findall(r"<text[^>]*>([^<]*)</text>", text)
+    layers = measures.layers()
+    assert drawn == [name for y, row in enumerate(layers) for name in (str(y), *row)]
+    assert layers[0][-1] == "lanewise"
+    heights = {name: y for y, row in enumerate(layers) for name in row}
+    assert heights["methods"] < heights["_integrate"] < heights["fit"] < heights["interop"]
