@@ -528,3 +528,24 @@ def test_the_strength_of_the_disturbance_does_not_matter(strength):
     assert np.max([s.residuals for s in symmetries]) < ROUND_OFF
     turning = next(str(s) for s in symmetries if "0.05" in str(s))
     assert f"ε ({strength / 2:.6g} q)" in turning
+
+
+def test_other_samples_compile_nothing():
+    """What was compiled for one set of samples serves another, far from it."""
+    compiled = []
+
+    def listen(event, seconds, **_):
+        compiled.append(event) if event.endswith("backend_compile_duration") else None
+
+    rng = np.random.default_rng(0)
+    basis = dvi.Polynomials(1, constant=True)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    for search, options in ((dvi.discover_invariants, {}), (dvi.find_symmetries, {"time": False})):
+        counts = []
+        for middle in (10.0, 20.0):
+            samples = middle + rng.uniform(-1, 1, (2, 60, 2))
+            before = len(compiled)
+            search(FREE, basis, h=0.1, samples=samples, **options)
+            counts.append(len(compiled) - before)
+        assert counts[0] > 0
+        assert counts[1] == 0

@@ -86,6 +86,19 @@ class BoundBasis(eqx.Module):
             )
         return self.function(q, p, jnp.asarray(t, float))
 
+    def unnamed(self) -> "BoundBasis":
+        """The same functions without names, which contain the point about which they are taken: so
+        what was compiled for one set of samples serves another."""
+
+        def is_basis(x):
+            return isinstance(x, BoundBasis)
+
+        def without(x):
+            return x.unnamed() if is_basis(x) else x
+
+        function = jax.tree.map(without, self.function, is_leaf=is_basis)
+        return dataclasses.replace(self, function=function, names=("",) * self.size)
+
     def formula(self, coefficients: Any, digits: int = 6, drop: float = 1e-9) -> str:
         """The combination with these coefficients as text; tiny ones (relative) are left out."""
         c = np.asarray(coefficients, float)

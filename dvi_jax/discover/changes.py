@@ -39,6 +39,10 @@ class Stepped(NamedTuple):
     method: Method
     basis: BoundBasis
 
+    def unnamed(self) -> "Stepped":
+        """For compiled functions: see `BoundBasis.unnamed`."""
+        return self._replace(basis=self.basis.unnamed())
+
 
 class Changes(NamedTuple):
     """At S samples, for B functions.
@@ -74,7 +78,7 @@ class Changes(NamedTuple):
 
 def changes_at(stepped: Stepped, order: int, samples: Samples) -> Changes:
     """Without a check of anything."""
-    found = [np.asarray(x) for x in batched_changes(stepped, order, samples)]
+    found = [np.asarray(x) for x in batched_changes(stepped.unnamed(), order, samples)]
     values, terms, volume, good, slopes, move, blur = found
     finite = [np.isfinite(x.reshape(len(good), -1)).all(axis=1) for x in found]
     with np.errstate(all="ignore"):
@@ -91,7 +95,7 @@ def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
     basis = stepped.basis
     found = changes_at(stepped, order, samples)
     if not found.good.all():
-        require_steps(np.asarray(batched_changes(stepped, order, samples)[3]), samples)
+        require_steps(np.asarray(batched_changes(stepped.unnamed(), order, samples)[3]), samples)
     check_finite(basis, found.values)
     bad = ~np.isfinite(found.terms)
     if bad.any():

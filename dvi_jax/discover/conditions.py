@@ -151,4 +151,4 @@ def _on_samples(basis, samples):
 
 def values_at(basis: BoundBasis, samples: Samples) -> np.ndarray:
     """The functions at the samples, shape (S, size)."""
-    return np.asarray(_on_samples(basis, samples))
+    return np.asarray(_on_samples(basis.unnamed(), samples))

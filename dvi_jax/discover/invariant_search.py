@@ -308,7 +308,8 @@ class _Search:
         simplest = cleaned(span.simplest(series)) / self.sizes
         typical, scale = jnp.asarray(self.typical), jnp.asarray(self.scale)
         given = jnp.asarray(simplest)
-        exact = bool(is_exact(self.stepped, given, typical, scale, self._some()))
+        at = self._some()
+        exact = bool(is_exact(self.stepped.unnamed(), given, typical, scale, at))
         if exact or representative == "simplest":
             return simplest, exact
         return cleaned(span.least(series)) / self.sizes, exact

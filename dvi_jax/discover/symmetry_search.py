@@ -141,9 +141,10 @@ def find_symmetries(
         check_finite(one, values)
         check_basis(one, typical_sizes(values)[1][:, None] * values)
 
+    functions = bound.unnamed(), gauge_basis.unnamed()
+
     def conditions(shifts, at=samples, step=h, order=order):
-        step = jnp.asarray(step)
-        found = at_samples(equations, step, bound, gauge_basis, order, at, shifts)
+        found = at_samples(equations, jnp.asarray(step), *functions, order, at, shifts)
         return Conditions(*map(np.asarray, found))
 
     shifts = later(h)
@@ -212,8 +213,11 @@ def _enlarged(basis: AbstractBasis, shape: tuple[int, ...]) -> AbstractBasis:
                 return raised(basis.first) * basis.second
         return basis * Polynomials(1, variables, constant=True)
 
-    clock = Basis({TIME[0]: lambda q, p, t: t})
-    return Polynomials(2, variables) + clock + raised(basis)
+    return Polynomials(2, variables) + _CLOCK + raised(basis)
+
+
+# One object, made once: with a new function in each search, each would compile its programs again.
+_CLOCK = Basis({TIME[0]: lambda q, p, t: t})
 
 
 class _Chosen(eqx.Module):
