@@ -169,12 +169,7 @@ def frequencies(
 
 
 def frequency_diffusion(
-    ts: Any,
-    signal: Any = None,
-    *,
-    count: int = 4,
-    window: int = 2,
-    throw: bool = True,
+    ts: Any, signal: Any = None, *, count: int = 4, window: int = 2, throw: bool = True
 ) -> FrequencyDiffusion:
     r"""How far the leading frequency moves from the first half of a signal to the second.
 

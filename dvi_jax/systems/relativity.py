@@ -14,7 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .n_body import hamiltonian
+from .n_body import hamiltonian, masses_of
 from .solar_system import AU_IN_KM
 
 SPEED_OF_LIGHT = 299792.458 * 86400 / AU_IN_KM
@@ -162,13 +162,8 @@ def hamiltonian_with_oblateness(t0, t1, q0, p1, args):
 
 
 def _masses(q, args):
-    """Masses as an array, and GM of the Sun; the check is that of `n_body.hamiltonian`."""
-    masses = jnp.asarray(args["masses"], q.dtype)
-    if q.ndim != 2 or masses.shape != q.shape[:1]:
-        raise ValueError(
-            "the N-body system needs q0 of shape (bodies, dim) and masses of shape (bodies,); "
-            f"got q0 {q.shape} and masses {masses.shape}."
-        )
+    """Masses as an array, and GM of the Sun."""
+    masses = masses_of(q, args)
     return masses, args.get("G", 1.0) * masses[0]
 
 
