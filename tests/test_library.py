@@ -445,8 +445,8 @@ def test_starts_of_another_shape_are_refused(name):
 @pytest.mark.parametrize(
     ("name", "change", "said"),
     [
-        ("pendulum", {"omega": 0.0}, "omega must be a positive and finite number, got 0.0"),
-        ("pendulum", {"omega": math.nan}, "omega must be a positive and finite number, got nan"),
+        ("pendulum", {"omega": 0.0}, "omega must be a positive.*got 0.0"),
+        ("pendulum", {"omega": math.nan}, "omega must be a positive.*got nan"),
         ("duffing", {"beta": -1.0}, "beta must be a positive"),
         ("slow_oscillator", {"depth": 1.5}, "depth must be between -1 and 1, got 1.5"),
         ("lorentz_pendulum", {"depth": math.nan}, "depth must be a finite number, got nan"),
@@ -460,19 +460,19 @@ def test_starts_of_another_shape_are_refused(name):
         ("uniform_field", {"E": [0.1]}, r"E must have shape \(3,\), got \(1,\)"),
         ("dipole_field", {"radius": -1.0}, "radius must be a positive"),
         ("rigid_body", {"I3": 4.0}, "at most the sum of the others"),
-        ("spinning_top", {"A": math.inf}, "A must be a positive and finite number, got inf"),
-        ("kepler", {"K": 0.0}, "K must be a positive and finite number, got 0.0"),
+        ("spinning_top", {"A": math.inf}, "A must be a positive.*got inf"),
+        ("kepler", {"K": 0.0}, "K must be a positive.*got 0.0"),
         ("magnetic_mirror", {"charge": 0.0}, "charge is 0: the particle does not gyrate"),
         ("magnetic_mirror", {"B0": 0.0}, "B0 is 0: the particle does not gyrate"),
-        ("magnetic_mirror", {"mass": math.inf}, "mass must be a positive and finite number, got inf"),
-        ("magnetic_mirror", {"length": math.inf}, "length must be a positive and finite number, got inf"),
+        ("magnetic_mirror", {"mass": math.inf}, "mass must be a positive.*got inf"),
+        ("magnetic_mirror", {"length": math.inf}, "length must be a positive.*got inf"),
         ("dipole_field", {"B0": 0.0}, "B0 is 0: the particle does not gyrate"),
         ("polar_motion", {"mean": [0.1]}, r"mean must have shape \(2,\), got \(1,\)"),
         ("polar_motion", {"drift": [0.1]}, r"drift must have shape \(2,\), got \(1,\)"),
         ("polar_motion", {"prograde": 0.1}, r"prograde must have shape \(2,\), got \(\)"),
         ("polar_motion", {"retrograde": [0.1, math.nan]}, "retrograde must be finite"),
-        ("polar_motion", {"period": math.inf}, "period must be a positive and finite number, got inf"),
-        ("stiff_fput", {"omega": 0.0}, "omega must be a positive and finite number, got 0.0"),
+        ("polar_motion", {"period": math.inf}, "period must be a positive.*got inf"),
+        ("stiff_fput", {"omega": 0.0}, "omega must be a positive.*got 0.0"),
     ],
 )
 def test_parameters_that_cannot_be_are_refused(name, change, said):
@@ -506,7 +506,7 @@ def test_every_parameter_must_be_there_and_be_a_number(name):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: systems.stiff_fput(omega=0.0), "omega must be a positive and finite number, got 0.0"),
+        (lambda: systems.stiff_fput(omega=0.0), "omega must be a positive.*got 0.0"),
         (lambda: systems.stiff_fput(-1), "m must be a whole number from 1 on, got -1.*m springs"),
         (lambda: systems.fput(-1), "n must be a whole number from 1 on, got -1.*row of particles"),
         (lambda: systems.fput(alpha=math.nan), "alpha must be a finite number, got nan"),
@@ -515,7 +515,10 @@ def test_every_parameter_must_be_there_and_be_a_number(name):
             "n must be a whole number from 3 on, got -1.*at least three particles",
         ),
         (lambda: systems.nls_lattice(2.5), "got 2.5.*ring of at least three sites"),
-        (lambda: systems.n_body(np.ones(2), np.eye(2), np.eye(2), G=math.nan), "G must be a finite number"),
+        (
+            lambda: systems.n_body(np.ones(2), np.eye(2), np.eye(2), G=math.nan),
+            "G must be a finite",
+        ),
     ],
 )
 def test_systems_that_cannot_be_made_say_why(make, said):
@@ -535,7 +538,7 @@ def test_julian_dates_may_be_numbers_of_numpy():
     ("name", "q0", "p0", "said"),
     [
         ("relativistic_kepler", [0.0, 0.0], [0.0, 1.0], "on top of the centre"),
-        ("two_centres", [0.0, 0.0, -0.5], [0.0, 1.0, 0.0], r"on top of the second centre at \[0.0, 0.0, -0.5"),
+        ("two_centres", [0.0, 0.0, -0.5], [0.0, 1.0, 0.0], r"second centre at \[0.0, 0.0, -0.5"),
         ("hill", [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], "on top of the small body"),
         ("dipole_field", [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], "on top of the dipole"),
         ("rigid_body", [0.0, 0.0, 0.0], [1.0, 1.0, 0.5], "singular"),
@@ -1230,10 +1233,10 @@ def test_the_table_in_the_documentation_says_the_same(name):
     [
         (
             lambda: systems.magnetic_mirror(length=-1.0),
-            "length must be a positive and finite number, got -1",
+            "length must be a positive.*got -1",
         ),
-        (lambda: systems.magnetic_mirror(distance=np.inf), "distance must be a finite number, got inf"),
-        (lambda: systems.dipole_field(radius=0.0), "radius must be a positive and finite number, got 0"),
+        (lambda: systems.magnetic_mirror(distance=np.inf), "distance must be a finite.*got inf"),
+        (lambda: systems.dipole_field(radius=0.0), "radius must be a positive.*got 0"),
     ],
 )
 def test_fields_that_cannot_be_made(make, message):

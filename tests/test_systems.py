@@ -565,7 +565,7 @@ def test_starts_of_another_shape_are_refused(name, shape, said):
 def test_parameters_that_cannot_be_are_refused():
     mirror = systems.magnetic_mirror()
     for key in ("mass", "length"):
-        with pytest.raises(ValueError, match=f"{key} must be a positive and finite number, got -1.0"):
+        with pytest.raises(ValueError, match=f"{key} must be a positive.*got -1.0"):
             mirror.check(mirror.q0, mirror.p0, mirror.args | {key: -1.0})
     with pytest.raises(ValueError, match="at least three particles"):
         systems.toda(2)
