@@ -47,20 +47,17 @@ def orientation(q, p):
     """
     (body, spin, node), (L, G, K) = q, p
 
-    def about_z(c, s):
-        one, zero = jnp.ones_like(c), jnp.zeros_like(c)
-        return jnp.stack(
-            [jnp.stack([c, -s, zero]), jnp.stack([s, c, zero]), jnp.stack([zero, zero, one])]
-        )
+    one, zero = jnp.ones_like(G), jnp.zeros_like(G)
+
+    def about_z(angle):
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        return jnp.stack([c, -s, zero, s, c, zero, zero, zero, one]).reshape(3, 3)
 
     def about_x(c):
-        s, one, zero = jnp.sqrt(1 - c**2), jnp.ones_like(c), jnp.zeros_like(c)
-        return jnp.stack(
-            [jnp.stack([one, zero, zero]), jnp.stack([zero, c, -s]), jnp.stack([zero, s, c])]
-        )
+        s = jnp.sqrt(1 - c**2)
+        return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3)
 
-    turns = [about_z(jnp.cos(a), jnp.sin(a)) for a in (node, spin, body)]
-    return turns[0] @ about_x(K / G) @ turns[1] @ about_x(L / G) @ turns[2]
+    return about_z(node) @ about_x(K / G) @ about_z(spin) @ about_x(L / G) @ about_z(body)
 
 
 energy = at_end(hamiltonian)
