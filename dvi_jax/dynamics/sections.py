@@ -376,11 +376,8 @@ def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
 def _raise_on_failure(found: PoincareSection, wanted: int, num_steps: int) -> PoincareSection:
     fine = found.result == SECTION_RESULTS.successful
     if is_traced(fine):
-        return eqx.error_if(
-            found, ~jnp.all(fine),
-            "a section was not crossed as often as was asked for: with throw=False read the "
-            "status of each orbit.",
-        )  # fmt: skip
+        said = "a section was crossed too rarely: with throw=False read the status of each orbit."
+        return eqx.error_if(found, ~jnp.all(fine), said)
     bad = np.flatnonzero(~np.asarray(fine))
     if not bad.size:
         return found

@@ -162,12 +162,10 @@ def tori_of(
     """Of every trajectory the torus, and the code of its status; `soft`: a line in doubt counts."""
     n, count = omega.shape[-2:]
     M = math.prod(omega.shape[:-2])
-    rows = zip(
-        omega.reshape(M, n, count), A.reshape(M, n, count), code.reshape(M, n),
-        resolution.reshape(M, n), strict=True,
-    )  # fmt: skip
+    lines = (x.reshape(M, n, count) for x in (omega, A))
+    signals = (x.reshape(M, n) for x in (code, resolution))
     tori, codes = [], []
-    for nu, a, status, width in rows:
+    for nu, a, status, width in zip(*lines, *signals, strict=True):
         silent = status == CODE["no_signal"]
         hard = (status > 0) & (status <= len(WITHOUT_NUMBERS)) & ~silent
         if hard.any() or silent.all():
@@ -292,10 +290,10 @@ def combinations_up_to(num: int, order: int) -> np.ndarray:
     table = np.zeros((1, 0), int)
     for _ in range(num):
         left = order - np.abs(table).sum(axis=1)
-        table = np.concatenate([
-            np.column_stack([table[left >= abs(k)], np.full((left >= abs(k)).sum(), k)])
-            for k in range(-order, order + 1)
-        ])  # fmt: skip
+        fits = {k: left >= abs(k) for k in range(-order, order + 1)}
+        table = np.concatenate(
+            [np.column_stack([table[fit], np.full(fit.sum(), k)]) for k, fit in fits.items()]
+        )
     size = np.abs(table)
     return table[
         np.argsort(size.sum(axis=1) + size.max(axis=1, initial=0) / (order + 1), kind="stable")

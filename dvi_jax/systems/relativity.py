@@ -26,11 +26,8 @@ SUN_RADIUS = 696000 / AU_IN_KM
 SUN_J2 = 2e-7
 """Quadrupole moment of the Sun, the value of DE421; helioseismology gives 2.2e-7."""
 
-SUN_POLE = np.array([
-    np.cos(np.deg2rad(63.87)) * np.cos(np.deg2rad(286.13)),
-    np.cos(np.deg2rad(63.87)) * np.sin(np.deg2rad(286.13)),
-    np.sin(np.deg2rad(63.87)),
-])  # fmt: skip
+_RA, _DEC = np.deg2rad(286.13), np.deg2rad(63.87)
+SUN_POLE = np.array([np.cos(_DEC) * np.cos(_RA), np.cos(_DEC) * np.sin(_RA), np.sin(_DEC)])
 """North pole of the Sun's rotation on the axes of the ICRF: RA 286.13°, dec 63.87° (IAU WGCCRE;
 Archinal et al. 2018). A unit vector."""
 
