@@ -253,12 +253,7 @@ def test_a_control_that_passes_is_told(monkeypatch):
         (dvi.TypeII(), None, TypeError, "give the method a name"),
         ({"mine": dvi.TypeII}, None, TypeError, "'mine' must be a method such as"),
         ({"m": altered(dvi.TypeII(), order="2")}, None, TypeError, "order of 'm' must be a num"),
-        (
-            {"m": altered(dvi.TypeII(), order=0)},
-            None,
-            ValueError,
-            "order of 'm' must be a pos",
-        ),
+        ({"m": altered(dvi.TypeII(), order=0)}, None, ValueError, "order of 'm' must be positive"),
     ],
 )
 def test_bad_input(methods, checks, error, said):

@@ -1,5 +1,6 @@
 """Every method under every check, and whether every check can fail."""
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -7,7 +8,6 @@ from typing import Any
 
 import dvi_jax as dvi
 
-from .._checks import instance, positive
 from ..testing import CHECKS, CONTROLS, METHODS, Candidate, Control, Measured
 from ..testing.check import chosen, require_double_precision
 from ..testing.problems import COUPLED, FORCED, reference
@@ -126,9 +126,13 @@ def _named(methods: Any) -> dict[str, dvi.Method]:
         own = " A method of your own: certify({name: method})."
         return {name: METHODS[name] for name in chosen("method", methods, METHODS, own)}
     for name, method in methods.items():
-        instance(repr(name), method, dvi.Method, "a method such as dvi.TypeII()")
-        called = f"the order of {name!r}"
-        positive(called, instance(called, method.order, int | float, "a number"))
+        if not isinstance(method, dvi.Method):
+            raise TypeError(f"{name!r} must be a method such as dvi.TypeII(), got {method!r}.")
+        order = method.order
+        if isinstance(order, bool) or not isinstance(order, int | float):
+            raise TypeError(f"the order of {name!r} must be a number, got {order!r}.")
+        if not (math.isfinite(order) and order > 0):
+            raise ValueError(f"the order of {name!r} must be positive, got {order!r}.")
     if not methods:
         raise ValueError("no method was given: certify({}) would certify nothing.")
     return {str(name): method for name, method in methods.items()}

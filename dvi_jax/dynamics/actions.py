@@ -125,7 +125,7 @@ def actions(
     search = search_of(signal.shape[-2], num, guess, order, None, 1e-3)
     signal, scales, size = _balanced(signal)
     lines, raw = analyse(ts, signal, settings, eps, 1)
-    raw = Raw(*map(np.asarray, raw))
+    raw = Raw(*map(np.asarray, raw))  # pyright: ignore[reportArgumentType]
     omega, A = np.asarray(lines.frequencies), np.asarray(lines.amplitudes)
     resolution = np.asarray(lines.resolution)
     tori, codes = tori_of(omega, A, raw.code, resolution, search, soft=False)

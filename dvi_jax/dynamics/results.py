@@ -1,5 +1,6 @@
 """How an analysis of frequencies, or of the crossings of a section, ended."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._results import RESULTS, status_code as code_of
+from .._results import RESULTS, status_code
 
 
 class FREQUENCY_RESULTS(eqx.Enumeration):
@@ -107,14 +108,15 @@ CODE = {name: i for i, name in enumerate(NAMES)}
 WITHOUT_NUMBERS = NAMES[1:6]
 """Statuses that leave no line."""
 
+code_of: Callable[[Any], Array] = status_code
+"""The place of a status in `NAMES`, for each signal of a batch."""
+
 
 class WithStatus(eqx.Module):
-    """A result that carries a status."""
-
-    result: eqx.AbstractVar[Any]
+    """Base of results with a field `result`, their status."""
 
     @property
-    def status(self) -> Any:
+    def status(self: Any) -> Any:
         """The name of `result`, such as "successful"; an array of names for a batch."""
         return name_of(self.result)
 

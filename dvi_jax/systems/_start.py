@@ -45,7 +45,7 @@ class Start:
             return
         q, p = np.asarray(q0, float), np.asarray(p0, float)
         for what, at in self.singular.items():
-            point = at(args) if callable(at) else at
+            point: Any = at(args) if callable(at) else at
             if (q == point).all():
                 raise ValueError(
                     f"q0 is on top of {what} at {list(point)}: the system is singular there."
