@@ -11,7 +11,7 @@ from scipy import special
 import dvi_jax as dvi
 from dvi_jax import systems
 from dvi_jax.dynamics import FrequencyError, actions, frequencies, fundamental_frequencies
-from dvi_jax.dynamics.actions import combinations_up_to
+from dvi_jax.dynamics.torus import combinations_up_to
 
 N = 2048
 
@@ -346,17 +346,21 @@ def test_a_line_that_is_no_combination_is_told():
     ("give", "error", "words"),
     [
         (lambda: actions(TS, np.cos(TS)), TypeError, "the complex signal q − i p"),
-        (lambda: actions(TS, np.exp(1j * TS), leftover=0), ValueError, "positive number, got 0"),
-        (lambda: actions(TS, np.exp(1j * TS), num=0), ValueError, "must be positive, got 0"),
+        (lambda: actions(TS, np.exp(1j * TS), leftover=0), ValueError, "finite number, got 0"),
+        (lambda: actions(TS, np.exp(1j * TS), num=0), ValueError, "from 1 on, got 0"),
         (lambda: fundamental_frequencies(TS), TypeError, "what dvi.frequencies returned"),
-        (lambda: fundamental_frequencies(planted((1.0, 1)), order=0), ValueError, "positive int"),
+        (lambda: fundamental_frequencies(planted((1.0, 1)), order=0), ValueError, "from 1 on"),
         (lambda: fundamental_frequencies(planted((1.0, 1)), guess=[np.nan]), ValueError, "finite"),
         (lambda: fundamental_frequencies(planted((1.0, 1)), tolerance=0), ValueError, "positive"),
-        (lambda: fundamental_frequencies(planted((1.0, 1)), threshold=2), ValueError, "a share"),
+        (lambda: fundamental_frequencies(planted((1.0, 1)), threshold=2), ValueError, "a fraction"),
         (lambda: fundamental_frequencies(planted((1.0, 1)), tolerance="a"), ValueError, "got 'a'"),
-        (lambda: fundamental_frequencies(planted((1.0, 1)), threshold="a"), ValueError, "a share"),
+        (
+            lambda: fundamental_frequencies(planted((1.0, 1)), threshold="a"),
+            ValueError,
+            "a fraction",
+        ),
         (lambda: fundamental_frequencies(planted((1.0, 1)), guess="a"), ValueError, "finite.*'a'"),
-        (lambda: actions(TS, np.exp(1j * TS), leftover="a"), ValueError, "positive number, got 'a"),
+        (lambda: actions(TS, np.exp(1j * TS), leftover="a"), ValueError, "finite number, got 'a"),
         (lambda: actions(TS, np.zeros((0, 256), complex), count=4), ValueError, "at least one deg"),
         (lambda: jax.jit(lambda z: actions(TS, z))(TS + 0j), ValueError, "not under jit"),
     ],

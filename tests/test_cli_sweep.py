@@ -430,7 +430,7 @@ REFUSED = [
     (KEPLER + "[state]\nq0 = [{values = [1.0], axis = 'x'}]", "state.p0: shape (2,)", "(1,)"),
     (
         KEPLER + "[state]\nq0 = {values = [[0, 0], [0, 0]], axis = 'x'}",
-        "state: the body is on top of the centre",
+        "state: q0 is on top of the centre",
         "start",
     ),
     (KEPLER + "[args]\nK = {linspce = [1, 2, 3]}", "args.K: {'linspce'", "in a sweep also an axis"),
@@ -468,7 +468,7 @@ REFUSED = [
     (HALTON + BOX + "[state]\nq0 = [0, 1]", "state.q0: given together with [start]", "[start]"),
     (
         HALTON + "low = {q = [0], p = [0]}\nhigh = {q = [1], p = [1]}",
-        "state: the Kepler problem here is in the plane",
+        "state: the Kepler problem is in the plane",
         "start",
     ),
     (

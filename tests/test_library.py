@@ -445,34 +445,34 @@ def test_starts_of_another_shape_are_refused(name):
 @pytest.mark.parametrize(
     ("name", "change", "said"),
     [
-        ("pendulum", {"omega": 0.0}, "omega must be positive and finite, got 0.0"),
-        ("pendulum", {"omega": math.nan}, "omega must be positive and finite, got nan"),
-        ("duffing", {"beta": -1.0}, "beta must be positive"),
+        ("pendulum", {"omega": 0.0}, "omega must be a positive.*got 0.0"),
+        ("pendulum", {"omega": math.nan}, "omega must be a positive.*got nan"),
+        ("duffing", {"beta": -1.0}, "beta must be a positive"),
         ("slow_oscillator", {"depth": 1.5}, "depth must be between -1 and 1, got 1.5"),
-        ("lorentz_pendulum", {"depth": math.nan}, "depth must be between -1 and 1"),
-        ("double_pendulum", {"m2": -1.0}, "m2 must be positive"),
+        ("lorentz_pendulum", {"depth": math.nan}, "depth must be a finite number, got nan"),
+        ("double_pendulum", {"m2": -1.0}, "m2 must be a positive"),
         ("relativistic_kepler", {"c": 0.5}, "falls into the centre"),
         ("oblate_kepler", {"R": 9000.0}, "inside the planet"),
-        ("two_centres", {"d": 0.0}, "d must be positive"),
+        ("two_centres", {"d": 0.0}, "d must be a positive"),
         ("restricted_three_body", {"mu": 0.7}, "0 < mu ≤ 1/2; got 0.7"),
-        ("lotka_volterra", {"alpha": -0.1}, "alpha must be positive"),
+        ("lotka_volterra", {"alpha": -0.1}, "alpha must be a positive"),
         ("uniform_field", {"B": 0.0}, "does not gyrate"),
         ("uniform_field", {"E": [0.1]}, r"E must have shape \(3,\), got \(1,\)"),
-        ("dipole_field", {"radius": -1.0}, "radius must be positive"),
+        ("dipole_field", {"radius": -1.0}, "radius must be a positive"),
         ("rigid_body", {"I3": 4.0}, "at most the sum of the others"),
-        ("spinning_top", {"A": math.inf}, "A must be positive and finite, got inf"),
-        ("kepler", {"K": 0.0}, "K must be positive and finite, got 0.0"),
+        ("spinning_top", {"A": math.inf}, "A must be a positive.*got inf"),
+        ("kepler", {"K": 0.0}, "K must be a positive.*got 0.0"),
         ("magnetic_mirror", {"charge": 0.0}, "charge is 0: the particle does not gyrate"),
         ("magnetic_mirror", {"B0": 0.0}, "B0 is 0: the particle does not gyrate"),
-        ("magnetic_mirror", {"mass": math.inf}, "mass must be positive and finite, got inf"),
-        ("magnetic_mirror", {"length": math.inf}, "length must be positive and finite, got inf"),
+        ("magnetic_mirror", {"mass": math.inf}, "mass must be a positive.*got inf"),
+        ("magnetic_mirror", {"length": math.inf}, "length must be a positive.*got inf"),
         ("dipole_field", {"B0": 0.0}, "B0 is 0: the particle does not gyrate"),
         ("polar_motion", {"mean": [0.1]}, r"mean must have shape \(2,\), got \(1,\)"),
         ("polar_motion", {"drift": [0.1]}, r"drift must have shape \(2,\), got \(1,\)"),
         ("polar_motion", {"prograde": 0.1}, r"prograde must have shape \(2,\), got \(\)"),
         ("polar_motion", {"retrograde": [0.1, math.nan]}, "retrograde must be finite"),
-        ("polar_motion", {"period": math.inf}, "period must be positive and finite, got inf"),
-        ("stiff_fput", {"omega": 0.0}, "omega must be positive and finite, got 0.0"),
+        ("polar_motion", {"period": math.inf}, "period must be a positive.*got inf"),
+        ("stiff_fput", {"omega": 0.0}, "omega must be a positive.*got 0.0"),
     ],
 )
 def test_parameters_that_cannot_be_are_refused(name, change, said):
@@ -506,16 +506,19 @@ def test_every_parameter_must_be_there_and_be_a_number(name):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: systems.stiff_fput(omega=0.0), "omega must be positive and finite, got 0.0"),
-        (lambda: systems.stiff_fput(-1), "m springs: m must be a whole number ≥ 1, got -1"),
-        (lambda: systems.fput(-1), "row of particles.*n must be a whole number ≥ 1, got -1"),
-        (lambda: systems.fput(alpha=math.nan), "alpha must be finite, got nan"),
+        (lambda: systems.stiff_fput(omega=0.0), "omega must be a positive.*got 0.0"),
+        (lambda: systems.stiff_fput(-1), "m must be a whole number from 1 on, got -1.*m springs"),
+        (lambda: systems.fput(-1), "n must be a whole number from 1 on, got -1.*row of particles"),
+        (lambda: systems.fput(alpha=math.nan), "alpha must be a finite number, got nan"),
         (
             lambda: systems.toda(-1),
-            "at least three particles: n must be a whole number ≥ 3, got -1",
+            "n must be a whole number from 3 on, got -1.*at least three particles",
         ),
-        (lambda: systems.nls_lattice(2.5), "ring of at least three sites.*got 2.5"),
-        (lambda: systems.n_body(np.ones(2), np.eye(2), np.eye(2), G=math.nan), "G must be finite"),
+        (lambda: systems.nls_lattice(2.5), "got 2.5.*ring of at least three sites"),
+        (
+            lambda: systems.n_body(np.ones(2), np.eye(2), np.eye(2), G=math.nan),
+            "G must be a finite",
+        ),
     ],
 )
 def test_systems_that_cannot_be_made_say_why(make, said):
@@ -527,7 +530,7 @@ def test_julian_dates_may_be_numbers_of_numpy():
     day = float(julian_date("2000-01-01"))
     assert julian_date(np.int64(2451545)) == day + 0.5
     assert julian_date(np.float32(2451545)) == day + 0.5
-    with pytest.raises(ValueError, match="calendar day or a Julian date, got True"):
+    with pytest.raises(ValueError, match=r"got True\. Give a calendar day or"):
         julian_date(True)
 
 
@@ -535,7 +538,7 @@ def test_julian_dates_may_be_numbers_of_numpy():
     ("name", "q0", "p0", "said"),
     [
         ("relativistic_kepler", [0.0, 0.0], [0.0, 1.0], "on top of the centre"),
-        ("two_centres", [0.0, 0.0, -0.5], [0.0, 1.0, 0.0], r"on top of the centre at \[0, 0, -0.5"),
+        ("two_centres", [0.0, 0.0, -0.5], [0.0, 1.0, 0.0], r"second centre at \[0.0, 0.0, -0.5"),
         ("hill", [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], "on top of the small body"),
         ("dipole_field", [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], "on top of the dipole"),
         ("rigid_body", [0.0, 0.0, 0.0], [1.0, 1.0, 0.5], "singular"),
@@ -1230,10 +1233,10 @@ def test_the_table_in_the_documentation_says_the_same(name):
     [
         (
             lambda: systems.magnetic_mirror(length=-1.0),
-            "length must be positive and finite, got -1",
+            "length must be a positive.*got -1",
         ),
-        (lambda: systems.magnetic_mirror(distance=np.inf), "distance must be finite, got inf"),
-        (lambda: systems.dipole_field(radius=0.0), "radius must be positive and finite, got 0"),
+        (lambda: systems.magnetic_mirror(distance=np.inf), "distance must be a finite.*got inf"),
+        (lambda: systems.dipole_field(radius=0.0), "radius must be a positive.*got 0"),
     ],
 )
 def test_fields_that_cannot_be_made(make, message):

@@ -336,5 +336,5 @@ def test_start_is_the_measured_one(measured):
 def test_other_starts_are_refused():
     with pytest.raises(ValueError, match="the pole is one point"):
         PROBLEM.check([0.1, 0.2], [0.1, 0.2], ARGS)
-    with pytest.raises(ValueError, match=r"period must be positive and finite, got -433\.0"):
+    with pytest.raises(ValueError, match=r"period must be a positive.*got -433\.0"):
         PROBLEM.check(PROBLEM.q0, PROBLEM.p0, ARGS | {"period": -433.0})

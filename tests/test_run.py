@@ -210,7 +210,7 @@ REFUSED = [
     (KEPLER + 'steps = 5\n[args]\nK = "one"', "args.K: 'one' (text)", "numbers"),
     (
         KEPLER + "steps = 5\n[args]\nK = [1.0, 2.0]",
-        "args: K must be one real number, got an array of shape (2,)",
+        "args: K must be a positive and finite number, got ",
         "args that fit",
     ),
     (KEPLER + "steps = 5\n[observables]\n'../x' = 'energy'", "the name '../x'", "without /"),

@@ -547,7 +547,7 @@ def test_bodies_of_the_figure_eight_take_each_others_places():
         ("toda", (2,), r"at least three particles.*got q0 of shape \(2,\)"),
         ("toda", (3, 2), r"at least three particles"),
         ("fput", (2, 4), r"row of particles.*got q0 of shape \(2, 4\)"),
-        ("stiff_fput", (3,), r"shape \(2, m\); got q0 of shape \(3,\)"),
+        ("stiff_fput", (3,), r"shape \(2, n\), n ≥ 1; got q0 of shape \(3,\)"),
         ("perturbed_pendulum", (2,), r"one pendulum.*got q0 of shape \(2,\)"),
         ("magnetic_mirror", (2,), r"one particle in space.*got q0 of shape \(2,\)"),
         ("figure_eight", (3,), r"shape \(bodies, 2\) or \(bodies, 3\)"),
@@ -565,7 +565,7 @@ def test_starts_of_another_shape_are_refused(name, shape, said):
 def test_parameters_that_cannot_be_are_refused():
     mirror = systems.magnetic_mirror()
     for key in ("mass", "length"):
-        with pytest.raises(ValueError, match=f"{key} must be positive and finite, got -1.0"):
+        with pytest.raises(ValueError, match=f"{key} must be a positive.*got -1.0"):
             mirror.check(mirror.q0, mirror.p0, mirror.args | {key: -1.0})
     with pytest.raises(ValueError, match="at least three particles"):
         systems.toda(2)

@@ -1,19 +1,18 @@
 """Tools of a dynamicist: what trajectories say of the motion."""
 
-from .actions import (
-    Actions as Actions,
-    FundamentalFrequencies as FundamentalFrequencies,
-    actions as actions,
-    fundamental_frequencies as fundamental_frequencies,
-)
+from .actions import Actions as Actions, actions as actions
 from .frequencies import (
     Frequencies as Frequencies,
     FrequencyDiffusion as FrequencyDiffusion,
     frequencies as frequencies,
     frequency_diffusion as frequency_diffusion,
 )
-from .results import FREQUENCY_RESULTS as FREQUENCY_RESULTS, FrequencyError as FrequencyError
-from .section_results import SECTION_RESULTS as SECTION_RESULTS, SectionError as SectionError
+from .results import (
+    FREQUENCY_RESULTS as FREQUENCY_RESULTS,
+    SECTION_RESULTS as SECTION_RESULTS,
+    FrequencyError as FrequencyError,
+    SectionError as SectionError,
+)
 from .sections import (
     PoincareSection as PoincareSection,
     Return as Return,
@@ -23,3 +22,7 @@ from .sections import (
     stroboscope as stroboscope,
 )
 from .tangent import tangent_map as tangent_map
+from .torus import (
+    FundamentalFrequencies as FundamentalFrequencies,
+    fundamental_frequencies as fundamental_frequencies,
+)

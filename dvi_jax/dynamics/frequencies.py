@@ -12,6 +12,7 @@ from jaxtyping import Array, Complex, Float
 
 from lanewise.jaxapi import is_traced, x64_enabled
 
+from .._checks import one_of, whole
 from .._precision import refuse_double_without_x64
 from .._solution import Solution
 from ..engine.quantities import refuse_unit_or_mask
@@ -20,8 +21,8 @@ from .results import (
     CODE,
     FREQUENCY_RESULTS,
     WITHOUT_NUMBERS,
+    WithStatus,
     code_of,
-    name_of,
     raise_on_failure,
     with_code,
 )
@@ -30,7 +31,7 @@ _FEWEST = 32
 """Samples below which there is no window to speak of."""
 
 
-class Frequencies(eqx.Module):
+class Frequencies(WithStatus):
     r"""Lines of a signal, strongest first.
 
         z(t) ≈ c + Σ_k A_k e^{iω_k t}          (complex)
@@ -58,11 +59,6 @@ class Frequencies(eqx.Module):
     is_real: bool = eqx.field(static=True, default=False)
     state_axes: int = eqx.field(static=True, default=0)
 
-    @property
-    def status(self) -> Any:
-        """The name of `result`, such as "successful"; an array of names for a batch."""
-        return name_of(self.result)
-
     def evaluate(self, ts: Any) -> Array:
         """The constant and the sum of the lines at times `ts` of any shape (*times).
 
@@ -82,7 +78,7 @@ class Frequencies(eqx.Module):
         return z.real if self.is_real else z
 
 
-class FrequencyDiffusion(eqx.Module):
+class FrequencyDiffusion(WithStatus):
     """Change of the leading frequency between the two halves of a signal.
 
     - `first`, `second`: the frequency in each half [rad per unit of time].
@@ -96,11 +92,6 @@ class FrequencyDiffusion(eqx.Module):
     second: Float[Array, "*batch"]
     rate: Float[Array, "*batch"]
     result: FREQUENCY_RESULTS
-
-    @property
-    def status(self) -> Any:
-        """The name of `result`; an array of names for a batch."""
-        return name_of(self.result)
 
 
 def frequencies(
@@ -169,12 +160,7 @@ def frequencies(
 
 
 def frequency_diffusion(
-    ts: Any,
-    signal: Any = None,
-    *,
-    count: int = 4,
-    window: int = 2,
-    throw: bool = True,
+    ts: Any, signal: Any = None, *, count: int = 4, window: int = 2, throw: bool = True
 ) -> FrequencyDiffusion:
     r"""How far the leading frequency moves from the first half of a signal to the second.
 
@@ -241,15 +227,12 @@ class Raw(NamedTuple):
 
 
 def settings_of(count: Any, window: Any, refine: Any) -> Settings:
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise ValueError(f"count, the number of lines, must be a positive integer, got {count!r}.")
-    if isinstance(window, bool) or not isinstance(window, int | np.integer) or not 0 <= window <= 5:
-        raise ValueError(
-            f"window, the power of Hann's window, must be an integer from 0 to 5, got {window!r}."
-        )
-    if not isinstance(refine, bool | np.bool_):
-        raise ValueError(f"refine must be True or False, got {refine!r}.")
-    return Settings(int(count), int(window), bool(refine))
+    refine = refine.item() if isinstance(refine, np.bool_) else refine
+    return Settings(
+        whole("count", count, hint="It is the number of lines."),
+        whole("window", window, 0, 5, hint="It is the power of Hann's window."),
+        one_of("refine", refine, (True, False)),
+    )
 
 
 def check_count(settings: Settings, signal: Array) -> None:

@@ -89,11 +89,8 @@ def _moments(grid: _Grid, weighted: Array, s: Array) -> Array:
     outer = jnp.exp(-1j * a[:, None] * s[None, :])[:, None, :]
     x = a[:, None]
     m0, m1, m2 = (sums * outer).transpose(1, 0, 2)
-    return jnp.stack([
-        jnp.sum(m0, axis=0),
-        jnp.sum(x * m0 + m1, axis=0),
-        jnp.sum(x**2 * m0 + 2 * x * m1 + m2, axis=0),
-    ])  # fmt: skip
+    moments = (m0, x * m0 + m1, x**2 * m0 + 2 * x * m1 + m2)
+    return jnp.stack([jnp.sum(m, axis=0) for m in moments])
 
 
 def _synthesis(grid: _Grid, s: Array, amplitudes: Array) -> Array:

@@ -1,5 +1,6 @@
-"""How an analysis of the frequencies of a signal ended."""
+"""How an analysis of frequencies, or of the crossings of a section, ended."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -7,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+
+from .._results import RESULTS, status_code
 
 
 class FREQUENCY_RESULTS(eqx.Enumeration):
@@ -68,10 +71,36 @@ class FREQUENCY_RESULTS(eqx.Enumeration):
     )
 
 
+class SECTION_RESULTS(eqx.Enumeration):
+    """Status of the crossings of one orbit; ``dvi.SECTION_RESULTS[found.result]`` is the text."""
+
+    successful = ""
+    never_crossed = (
+        "The orbit never crossed the section. Likely causes: (a) g(t, q, p, args) has one sign all "
+        "along it: take a surface that the orbit meets; (b) the direction is the other one: try "
+        "direction=0; (c) too few steps; (d) steps so long that g turns twice within one; (e) all "
+        "crossings were skipped: a smaller skip."
+    )
+    too_few_crossings = (
+        "The orbit crossed the section fewer times than was asked for; what is missing is NaN. "
+        "Take more steps, or ask for fewer crossings."
+    )
+    stopped = (
+        "The condition of dvi.Stop was met before there were enough crossings; what is missing is "
+        "NaN."
+    )
+    failed = (
+        "The trajectory failed or escaped before there were enough crossings; what is missing is "
+        "NaN. Its own status is in `run`."
+    )
+
+
 NAMES = (
     "successful", "not_finite", "irregular_times", "no_signal", "window_too_short", "aliased",
     "unresolved", "not_converged", "not_quasi_periodic", "resonant",
 )  # fmt: skip
+
+SECTION_NAMES = ("successful", "never_crossed", "too_few_crossings", "stopped", "failed")
 
 CODE = {name: i for i, name in enumerate(NAMES)}
 """The place of a status in `NAMES`."""
@@ -79,30 +108,41 @@ CODE = {name: i for i, name in enumerate(NAMES)}
 WITHOUT_NUMBERS = NAMES[1:6]
 """Statuses that leave no line."""
 
-
-def with_code(code: Array) -> FREQUENCY_RESULTS:
-    """The status at a place in `NAMES`, for each lane of a batch."""
-    code = jnp.asarray(code)
-    if code.ndim:  # an enumeration is selected one lane at a time
-        return jax.vmap(with_code)(code)
-    result = FREQUENCY_RESULTS.successful
-    for i, name in enumerate(NAMES):
-        result = FREQUENCY_RESULTS.where(code == i, getattr(FREQUENCY_RESULTS, name), result)
-    return result
+code_of: Callable[[Any], Array] = status_code
+"""The place of a status in `NAMES`, for each signal of a batch."""
 
 
-def code_of(result: FREQUENCY_RESULTS) -> Array:
-    """The place of a status in `NAMES`, for each lane of a batch."""
-    code = jnp.zeros(jnp.shape(result == FREQUENCY_RESULTS.successful), jnp.int32)
-    for i, name in enumerate(NAMES):
-        code = jnp.where(result == getattr(FREQUENCY_RESULTS, name), i, code)
-    return code
+class WithStatus(eqx.Module):
+    """Base of results with a field `result`, their status."""
+
+    @property
+    def status(self: Any) -> Any:
+        """The name of `result`, such as "successful"; an array of names for a batch."""
+        return name_of(self.result)
 
 
-def name_of(result: FREQUENCY_RESULTS) -> Any:
+def with_code(code: Any) -> FREQUENCY_RESULTS:
+    """The status at a place in `NAMES`, or a batch of them."""
+    _, structure = jax.tree.flatten(FREQUENCY_RESULTS.successful)
+    return jax.tree.unflatten(structure, [jnp.asarray(code, jnp.int32)])
+
+
+def name_of(result: FREQUENCY_RESULTS | SECTION_RESULTS) -> Any:
     """The short name of a status, or an array of names for a batch."""
-    names = np.array(NAMES)[np.asarray(code_of(result))]
+    known = NAMES if isinstance(result, FREQUENCY_RESULTS) else SECTION_NAMES
+    names = np.array(known)[np.asarray(code_of(result))]
     return str(names) if names.ndim == 0 else names
+
+
+def judge(count: Array, wanted: int, run: RESULTS) -> SECTION_RESULTS:
+    """The status of an orbit with so many crossings of those wanted."""
+    result = SECTION_RESULTS.where(
+        count == 0, SECTION_RESULTS.never_crossed, SECTION_RESULTS.too_few_crossings
+    )
+    result = SECTION_RESULTS.where(run == RESULTS.stopped, SECTION_RESULTS.stopped, result)
+    ended_well = (run == RESULTS.successful) | (run == RESULTS.stopped)
+    result = SECTION_RESULTS.where(ended_well, result, SECTION_RESULTS.failed)
+    return SECTION_RESULTS.where(count >= wanted, SECTION_RESULTS.successful, result)
 
 
 class FrequencyError(RuntimeError):
@@ -116,20 +156,27 @@ class FrequencyError(RuntimeError):
         self.found = found
 
 
+class SectionError(RuntimeError):
+    """Raised with ``throw=True`` when an orbit has another status than `successful`.
+
+    `found` holds all crossings that there were, with the statuses.
+    """
+
+    def __init__(self, message: str, found: object = None):
+        super().__init__(message)
+        self.found = found
+
+
 def raise_on_failure(found: Any) -> Any:
     """`found`, or a `FrequencyError` that names the first signal with another status."""
-    fine = found.result == FREQUENCY_RESULTS.successful
     if found.result.is_traced():
-        return found.result.error_if(found, ~fine)
-    fine = np.asarray(fine)
-    if fine.all():
+        return found.result.error_if(found, found.result != FREQUENCY_RESULTS.successful)
+    bad = np.asarray(found.result != FREQUENCY_RESULTS.successful)
+    if not bad.any():
         return found
-    code = np.asarray(code_of(found.result))
-    where = tuple(int(i) for i in np.argwhere(~fine)[0])
-    which = (
-        f"{(~fine).sum()} of {fine.size} signals; the first is number {where}: " if where else ""
-    )
-    name = NAMES[int(code[where])]
+    where = tuple(int(i) for i in np.argwhere(bad)[0])
+    which = f"{bad.sum()} of {bad.size} signals; the first is number {where}: " if where else ""
+    name = str(np.asarray(found.status)[where])
     raise FrequencyError(
         f"{which}{name}. {FREQUENCY_RESULTS[getattr(FREQUENCY_RESULTS, name)]} With throw=False "
         "what was found is returned with its statuses; here it is the `found` attribute of this "

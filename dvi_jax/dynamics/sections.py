@@ -15,6 +15,7 @@ from lanewise import Layout
 from lanewise.jaxapi import is_traced
 
 from .._arithmetic import Arithmetic
+from .._checks import finite, positive, whole
 from .._integrate import as_parameter, as_scalar, integrate, start_state
 from .._integrator import Integrator, chosen
 from .._results import RESULTS, status_name
@@ -25,10 +26,10 @@ from ..engine.newton import RootSolver
 from ..methods import Method
 from ..observe import Section, Stop
 from ..sweep import Axis
-from .section_results import SECTION_RESULTS, SectionError, judge, name_of
+from .results import SECTION_RESULTS, SectionError, WithStatus, judge
 
 
-class PoincareSection(eqx.Module):
+class PoincareSection(WithStatus):
     """Where orbits crossed a section.
 
     - `ts`, `qs`, `ps`: times and states, shapes (orbits, crossings), (orbits, crossings, …); NaN
@@ -46,11 +47,6 @@ class PoincareSection(eqx.Module):
     result: SECTION_RESULTS
     run: RESULTS
     epsilon: Array
-
-    @property
-    def status(self) -> Any:
-        """The name of the status of each orbit, such as "successful"."""
-        return name_of(self.result)
 
 
 class _Settings(eqx.Module):
@@ -183,8 +179,8 @@ def poincare_section(
     integrator = chosen(
         integrator, method=method, root_finder=newton, arithmetic=arithmetic, layout=layout
     )
-    section, steps = _section(g, direction, crossings, skip), _positive("num_steps", num_steps)
-    settings = _Settings(system, section, integrator, stop, steps)
+    section = Section(g, direction, whole("crossings", crossings), skip)
+    settings = _Settings(system, section, integrator, stop, whole("num_steps", num_steps))
     epsilon, args, varied = _varied(epsilon, args)
     for name, length in varied.items():
         if length != q.shape[0]:
@@ -250,8 +246,8 @@ def bifurcation(
     integrator = chosen(
         integrator, method=method, root_finder=newton, arithmetic=arithmetic, layout=layout
     )
-    section, steps = _section(g, direction, crossings, skip), _positive("num_steps", num_steps)
-    settings = _Settings(system, section, integrator, stop, steps)
+    section = Section(g, direction, whole("crossings", crossings), skip)
+    settings = _Settings(system, section, integrator, stop, whole("num_steps", num_steps))
     epsilon, args, varied = _varied(epsilon, args)
     lengths = set(varied.values())
     if len(lengths) != 1 or 0 in lengths:
@@ -280,10 +276,8 @@ def stroboscope(period: float, phase: float = 0.0) -> Callable[..., Any]:
 
     **Raises** `ValueError` for a period that is not positive, or a phase that is not finite.
     """
-    if not (math.isfinite(period) and period > 0):
-        raise ValueError(f"the period of a stroboscope must be a positive time, got {period!r}.")
-    if not math.isfinite(phase):
-        raise ValueError(f"the phase of a stroboscope must be a time, got {phase!r}.")
+    positive("the period of a stroboscope", period)
+    finite("the phase of a stroboscope", phase)
 
     def g(t, q, p, args):
         return jnp.sin(2 * math.pi * ((t - phase) / period))
@@ -291,18 +285,13 @@ def stroboscope(period: float, phase: float = 0.0) -> Callable[..., Any]:
     return g
 
 
-class Return(eqx.Module):
+class Return(WithStatus):
     """A point of a section after one return: its time and state, and a `SECTION_RESULTS`."""
 
     t: Scalar
     q: State
     p: State
     result: SECTION_RESULTS
-
-    @property
-    def status(self) -> Any:
-        """The name of the status."""
-        return name_of(self.result)
 
 
 class ReturnMap(eqx.Module):
@@ -337,8 +326,8 @@ class ReturnMap(eqx.Module):
     def __check_init__(self):
         check_system(self.system)
         chosen(self.integrator, method=self.method, root_finder=self.newton)
-        Section(self.g, self.direction, _positive("returns", self.returns))
-        _positive("num_steps", self.num_steps)
+        Section(self.g, self.direction, whole("returns", self.returns))
+        whole("num_steps", self.num_steps)
 
     def __call__(
         self, q: Any, p: Any, t0: Any = 0.0, epsilon: Any = 0.0, args: Args = None
@@ -350,16 +339,6 @@ class ReturnMap(eqx.Module):
         crossed: Any = sol.observed
         result = judge(crossed.count, self.returns, sol.result)
         return Return(crossed.ts[-1], crossed.qs[-1], crossed.ps[-1], result)
-
-
-def _section(g: Any, direction: int, crossings: Any, skip: int) -> Section:
-    return Section(g, direction, _positive("crossings", crossings), skip)
-
-
-def _positive(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ValueError(f"{name} must be a positive whole number, got {value!r}.")
-    return int(value)
 
 
 def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
@@ -397,11 +376,8 @@ def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
 def _raise_on_failure(found: PoincareSection, wanted: int, num_steps: int) -> PoincareSection:
     fine = found.result == SECTION_RESULTS.successful
     if is_traced(fine):
-        return eqx.error_if(
-            found, ~jnp.all(fine),
-            "a section was not crossed as often as was asked for: with throw=False read the "
-            "status of each orbit.",
-        )  # fmt: skip
+        said = "a section was crossed too rarely: with throw=False read the status of each orbit."
+        return eqx.error_if(found, ~jnp.all(fine), said)
     bad = np.flatnonzero(~np.asarray(fine))
     if not bad.size:
         return found

@@ -9,11 +9,7 @@ from ._deviations import (
     Pushed as Pushed,
     TangentMap as TangentMap,
 )
-from ._kept import (
-    Crossings as Crossings,
-    RequestedTimes as RequestedTimes,
-    Section as Section,
-)
+from ._kept import Crossings as Crossings, RequestedTimes as RequestedTimes, Section as Section
 from ._reductions import (
     Last as Last,
     MaxDrift as MaxDrift,

@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from lanewise.jaxapi import is_traced
 
+from .._checks import whole
 from .._types import Scalar
 from ._reductions import Reduction
 
@@ -86,6 +87,70 @@ def _whole(value: Any) -> Any:
     return int(value) if isinstance(value, np.integer) else value
 
 
+class _Framed(Deviations):
+    """Base of those that carry an orthonormal frame, the first part of their memory.
+
+    A subclass has the fields `seed`, of the first frame, and `scale`, a pair of units.
+    """
+
+    def __check_init__(self: Any):
+        whole(f"seed of {type(self).__name__}", self.seed, 0)
+        if not isinstance(self.scale, tuple | list) or len(self.scale) != 2:
+            raise TypeError(
+                f"scale of {type(self).__name__} must be a pair (unit of q, unit of p), got "
+                f"{self.scale!r}."
+            )
+        for which, unit in zip("qp", self.scale, strict=True):
+            if any(is_traced(x) for x in jax.tree.leaves(unit)):
+                continue
+            try:
+                good = np.isrealobj(unit) and np.all(np.isfinite(unit) & (np.asarray(unit) > 0))
+            except TypeError:
+                good = False
+            if not good:
+                raise ValueError(
+                    f"the scale of {which} in {type(self).__name__} must be a positive number, or "
+                    f"an array of them like {which}; got {unit!r}."
+                )
+
+    def vectors(self, memory):
+        units = self._units(memory[0])
+        return memory[0] if units is None else memory[0] * units
+
+    def _measured(self, vectors: Array) -> Array:
+        """Vectors of the state in the units of `scale`."""
+        units = self._units(vectors)
+        return vectors if units is None else vectors / units
+
+    def _first_frame(self: Any, value: Array, count: int | None) -> Array:
+        """Orthonormal vectors, the same for every trajectory, shape (count, 2N)."""
+        size = value.shape[0]
+        if count is not None and count > size:
+            raise ValueError(
+                f"{type(self).__name__} is to follow {count} deviation vectors, but a state of "
+                f"{size} components has only {size} directions: ask for at most {size}."
+            )
+        random = np.random.default_rng(self.seed).standard_normal((size, size))
+        frame = np.linalg.qr(random)[0][: size if count is None else count]
+        return jnp.asarray(frame, value.dtype)
+
+    def _units(self: Any, like: Array) -> Array | None:
+        """The unit of each component of (q, p), shape (1, 2N); None where all are 1."""
+        if all(isinstance(unit, float) and unit == 1.0 for unit in self.scale):
+            return None
+        size = like.shape[-1] // 2
+        parts = []
+        for which, unit in zip("qp", self.scale, strict=True):
+            unit = jnp.asarray(unit, like.dtype).ravel()
+            if unit.size not in (1, size):
+                raise ValueError(
+                    f"the scale of {which} in {type(self).__name__} must be a number or an array "
+                    f"of {size} numbers, like {which}; got {unit.size}."
+                )
+            parts.append(jnp.broadcast_to(unit, (size,)))
+        return jnp.concatenate(parts)[None, :]
+
+
 class TangentMap(Deviations):
     r"""Observable: the derivative of the whole run, ∂(q_K, p_K)/∂(q_0, p_0), shape (2N, 2N).
 
@@ -109,7 +174,7 @@ class TangentMap(Deviations):
         return memory.T
 
 
-class LyapunovSpectrum(Deviations):
+class LyapunovSpectrum(_Framed):
     r"""Observable: the Lyapunov exponents λ_1, λ_2, … [1/time], shape (count,).
 
         λ_i = (1/|t|) Σ_k ln R_ii^(k),        M_k Q_{k−1} = Q_k R^(k)
@@ -136,19 +201,16 @@ class LyapunovSpectrum(Deviations):
     scale: Any = (1.0, 1.0)
 
     def __check_init__(self):
-        _check_count(self, self.count, 1)
-        _check_frame(self)
+        if self.count is not None:
+            whole("count of LyapunovSpectrum", self.count)
 
     def start(self, value):
-        frame = _first_frame(self, value, self.count)
+        frame = self._first_frame(value, self.count)
         return frame, _no_sum(frame.shape[:1], value.dtype), _no_sum((), value.dtype)
-
-    def vectors(self, memory):
-        return _in_units(self, memory[0])
 
     def update(self, memory, k, t, value):
         _, sums, time = memory
-        frame, R = _gram_schmidt(_measured(self, value.vectors))
+        frame, R = _gram_schmidt(self._measured(value.vectors))
         return frame, sums.plus(jnp.log(_diagonal(R))), time.plus(value.h)
 
     def finish(self, memory):
@@ -156,7 +218,7 @@ class LyapunovSpectrum(Deviations):
         return sums.value / jnp.abs(time.value)
 
 
-class MEGNO(Deviations):
+class MEGNO(_Framed):
     r"""Observable: the mean exponential growth of nearby orbits ⟨Y⟩, a number.
 
         Y(t) = (2/t) ∫ (|ẇ|/|w|) s ds,        ⟨Y⟩(t) = (1/t) ∫ Y ds
@@ -188,20 +250,14 @@ class MEGNO(Deviations):
     seed: int = eqx.field(static=True, default=0)
     scale: Any = (1.0, 1.0)
 
-    def __check_init__(self):
-        _check_frame(self)
-
     def start(self, value):
         zero = jnp.zeros((), value.dtype)
         weighted, area, time = (_no_sum((), value.dtype) for _ in range(3))
-        return _first_frame(self, value, 1), weighted, zero, area, time
-
-    def vectors(self, memory):
-        return _in_units(self, memory[0])
+        return self._first_frame(value, 1), weighted, zero, area, time
 
     def update(self, memory, k, t, value):
         _, weighted, before, area, time = memory
-        vector = _measured(self, value.vectors)
+        vector = self._measured(value.vectors)
         square = jnp.sum(vector**2)
         weighted = weighted.plus(jnp.log(square) * (time.value + value.h / 2))
         time = time.plus(value.h)
@@ -214,7 +270,7 @@ class MEGNO(Deviations):
         return area.value / time.value
 
 
-class GALI(Deviations):
+class GALI(_Framed):
     r"""Observable: the generalised alignment indices GALI_2, …, GALI_k, shape (k − 1,).
 
         GALI_j = |ŵ_1 ∧ … ∧ ŵ_j|
@@ -238,21 +294,17 @@ class GALI(Deviations):
     log10: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        _check_count(self, self.k, 2)
-        _check_frame(self)
+        whole("k of GALI", self.k, 2, hint="It is the number of deviation vectors.")
 
     def start(self, value):
-        frame = _first_frame(self, value, self.k)
+        frame = self._first_frame(value, self.k)
         return frame, jnp.eye(self.k, dtype=value.dtype), _no_sum((self.k,), value.dtype)
-
-    def vectors(self, memory):
-        return _in_units(self, memory[0])
 
     def update(self, memory, k, t, value):
         # The unit vectors are Q·(columns of C). Their part off the first j − 1 directions is
         # C_jj = exp(logs_j), which soon is nothing beside the others but must not be lost.
         _, columns, logs = memory
-        frame, R = _gram_schmidt(_measured(self, value.vectors))
+        frame, R = _gram_schmidt(self._measured(value.vectors))
         columns = jnp.sum(R[:, :, None] * columns[None, :, :], axis=1)
         shrink = lax.rsqrt(jnp.sum(columns**2, axis=0))
         return frame, columns * shrink[None, :], logs.plus(jnp.log(_diagonal(R) * shrink))
@@ -262,7 +314,7 @@ class GALI(Deviations):
         return logs / math.log(10) if self.log10 else jnp.exp(logs)
 
 
-class SALI(Deviations):
+class SALI(_Framed):
     r"""Observable: the smaller alignment index, a number.
 
         SALI = min(|ŵ_1 + ŵ_2|, |ŵ_1 − ŵ_2|)
@@ -280,18 +332,12 @@ class SALI(Deviations):
     scale: Any = (1.0, 1.0)
     log10: bool = eqx.field(static=True, default=False)
 
-    def __check_init__(self):
-        _check_frame(self)
-
     @property
     def _pair(self) -> GALI:
         return GALI(2, self.seed, self.scale, log10=True)
 
     def start(self, value):
         return self._pair.start(value)
-
-    def vectors(self, memory):
-        return self._pair.vectors(memory)
 
     def update(self, memory, k, t, value):
         return self._pair.update(memory, k, t, value)
@@ -347,79 +393,3 @@ def _diagonal(R: Array) -> Array:
     return (
         jnp.stack([R[i, i] for i in range(R.shape[0])]) if R.shape[0] <= _FEW else jnp.diagonal(R)
     )
-
-
-def _first_frame(of: Any, value: Array, count: int | None) -> Array:
-    """Orthonormal vectors, the same for every trajectory, shape (count, 2N)."""
-    size = value.shape[0]
-    if count is not None and count > size:
-        raise ValueError(
-            f"{type(of).__name__} is to follow {count} deviation vectors, but a state of {size} "
-            f"components has only {size} directions: ask for at most {size}."
-        )
-    random = np.random.default_rng(of.seed).standard_normal((size, size))
-    frame = np.linalg.qr(random)[0][: size if count is None else count]
-    return jnp.asarray(frame, value.dtype)
-
-
-def _units(of: Any, like: Array) -> Array:
-    """The unit of each component of (q, p)."""
-    size = like.shape[-1] // 2
-    parts = []
-    for which, unit in zip("qp", of.scale, strict=True):
-        unit = jnp.asarray(unit, like.dtype).ravel()
-        if unit.size not in (1, size):
-            raise ValueError(
-                f"the scale of {which} in {type(of).__name__} must be a number or an array of "
-                f"{size} numbers, like {which}; got {unit.size}."
-            )
-        parts.append(jnp.broadcast_to(unit, (size,)))
-    return jnp.concatenate(parts)
-
-
-def _has_units(of: Any) -> bool:
-    return not all(isinstance(unit, float) and unit == 1.0 for unit in of.scale)
-
-
-def _in_units(of: Any, vectors: Array) -> Array:
-    """Measured vectors in the units of the state."""
-    return vectors * _units(of, vectors)[None, :] if _has_units(of) else vectors
-
-
-def _measured(of: Any, vectors: Array) -> Array:
-    """Vectors of the state as they are measured."""
-    return vectors / _units(of, vectors)[None, :] if _has_units(of) else vectors
-
-
-def _check_count(of: Any, count: Any, least: int) -> None:
-    if count is None and least == 1:
-        return
-    if isinstance(count, bool) or not isinstance(count, int) or count < least:
-        raise ValueError(
-            f"{type(of).__name__} needs a whole number of at least {least} deviation "
-            f"vector{'s' if least > 1 else ''}, got {count!r}."
-        )
-
-
-def _check_frame(of: Any) -> None:
-    seed = of.seed
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ValueError(
-            f"seed of {type(of).__name__} must be a whole number from 0 on, got {seed!r}."
-        )
-    if not isinstance(of.scale, tuple | list) or len(of.scale) != 2:
-        raise TypeError(
-            f"scale of {type(of).__name__} must be a pair (unit of q, unit of p), got {of.scale!r}."
-        )
-    for which, unit in zip("qp", of.scale, strict=True):
-        if any(is_traced(x) for x in jax.tree.leaves(unit)):
-            continue
-        try:
-            good = np.all(np.isfinite(unit) & (np.real_if_close(unit) > 0)) and np.isrealobj(unit)
-        except TypeError:
-            good = False
-        if not good:
-            raise ValueError(
-                f"the scale of {which} in {type(of).__name__} must be a positive number, or an "
-                f"array of them like {which}; got {unit!r}."
-            )

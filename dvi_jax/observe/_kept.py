@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._checks import one_of, whole
 from .._types import Args, Scalar, State
 from ..engine.signature import accepts
 from ._reductions import Reduction
@@ -150,22 +151,14 @@ class Section(KeptSteps):
     def __init__(
         self, g: Callable[..., Any], direction: int = 0, max_crossings: int = 1000, skip: int = 0
     ):
-        self.g, self.direction = g, direction
-        self.capacity, self.skip = (
-            int(n) if isinstance(n, np.integer) else n for n in (max_crossings, skip)
-        )
+        self.g = g
+        self.direction = direction.item() if isinstance(direction, np.integer) else direction
+        self.capacity = whole("max_crossings", max_crossings)
+        self.skip = whole("skip", skip, 0, hint="It is a number of crossings.")
 
     def __check_init__(self):
         check_event(self.g, "Section")
-        if self.direction not in (-1, 0, 1):
-            raise ValueError(
-                f"direction must be 1 (g grows), -1 (g falls) or 0 (both), got {self.direction!r}."
-            )
-        n = self.capacity
-        if isinstance(n, bool) or not isinstance(n, int) or n < 1:
-            raise ValueError(f"max_crossings must be a positive integer, got {n!r}.")
-        if isinstance(self.skip, bool) or not isinstance(self.skip, int) or self.skip < 0:
-            raise ValueError(f"skip must be a whole number of crossings, got {self.skip!r}.")
+        one_of("direction", self.direction, (1, -1, 0), "1: g grows, -1: it falls, 0: both.")
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
         before, after = event(self.g, t0, q0, p0, args), event(self.g, t1, q1, p1, args)

@@ -177,8 +177,7 @@ def long_run_errors(m: Measurements) -> Any:
 
 
 @_figure(
-    "fig5",
-    "The adiabatic invariant (50) on the paper's mesh, and with the mesh out of the way.",
+    "fig5", "The adiabatic invariant (50) on the paper's mesh, and with the mesh out of the way."
 )
 def adiabatic_50(m: Measurements) -> Any:
     """Figure 5: the adiabatic invariant (50) with time."""
@@ -209,8 +208,7 @@ def adiabatic_50(m: Measurements) -> Any:
 
 
 @_figure(
-    "crossover",
-    "RK4 run until its energy error has passed the band of the variational method.",
+    "crossover", "RK4 run until its energy error has passed the band of the variational method."
 )
 def rk4_crossover(m: Measurements) -> Any:
     """When RK4's energy error passes the variational band."""
@@ -270,8 +268,7 @@ def sweep_34(m: Measurements) -> Any:
 
 
 @_figure(
-    "sweep_49_50",
-    "Range of (49) and (50) over ε and h; as h → 0 the drift beyond that of ε = 0.",
+    "sweep_49_50", "Range of (49) and (50) over ε and h; as h → 0 the drift beyond that of ε = 0."
 )
 def sweep_50(m: Measurements) -> Any:
     """Range of (49) and (50) over ε and h."""
@@ -314,10 +311,7 @@ def sweep_50(m: Measurements) -> Any:
         look = _look(i) | {"marker": MARKERS[i]}
         right.loglog(sweep.hs, sweep.spread_50[:, i], **look, label=f"(50), ε = {epsilon:g}")
     right.loglog(
-        sweep.hs,
-        np.max(sweep.relative_49, axis=1),
-        "kP:",
-        label="(49), relative, largest over ε",
+        sweep.hs, np.max(sweep.relative_49, axis=1), "kP:", label="(49), relative, largest over ε"
     )
     reference = sweep.spread_50[0, 0] * sweep.hs / sweep.hs[0] / 2.5
     right.loglog(sweep.hs, reference, color=GREY, linewidth=0.9, label="in proportion to h")

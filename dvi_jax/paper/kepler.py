@@ -21,10 +21,7 @@ def _turned(v):
     return jnp.stack([-v[1], v[0]])
 
 
-_TURN: Any = {
-    "xi": lambda t, q, p, args: _turned(q),
-    "eta": lambda t, q, p, args: _turned(p),
-}
+_TURN: Any = {"xi": lambda t, q, p, args: _turned(q), "eta": lambda t, q, p, args: _turned(p)}
 
 ROTATION = dvi.Generator(**_TURN)
 """The rotation (40); its series in ε, (46), has it twice."""

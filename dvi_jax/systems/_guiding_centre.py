@@ -20,7 +20,7 @@ twisted, a term −(μ0 v∥/Ω) b·(∇ × b) comes on top, which does not gyra
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,10 +40,44 @@ def parts(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> tuple[Any,
     return strength, b, along, v - along * b
 
 
-def magnetic_moment(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> Any:
-    """μ0 = m v⊥²/(2|B|), B taken at the particle [energy / field]."""
-    strength, _, _, across = parts(q, mv, field, args)
-    return args["mass"] * jnp.sum(across**2) / (2 * strength)
+class ChargedParticle(NamedTuple):
+    """What follows from the field of a particle of ``args["charge"]`` and ``args["mass"]``.
+
+    - `A`, `B`: functions (q, args) → vector potential and magnetic field, shape (3,).
+    """
+
+    A: Callable[[Any, Any], Any]
+    B: Callable[[Any, Any], Any]
+
+    def kinetic_momentum(self, q, p, args):
+        """m v = p − e A(q): shape (3,)."""
+        return p - args["charge"] * self.A(q, args)
+
+    def hamiltonian(self, t0, t1, q0, p1, args):
+        """H_D = |p1 − e A(q0)|²/(2m), with canonical momenta p = mv + eA: not separable."""
+        return jnp.sum(self.kinetic_momentum(q0, p1, args) ** 2) / (2 * args["mass"])
+
+    def magnetic_moment(self, t0, t1, q0, p0, q1, p1, args):
+        """μ0 = m v⊥²/(2|B|) at t1, B taken at the particle: the first adiabatic invariant.
+
+        In each turn it oscillates by the order of gyroradius over the length of the field.
+        """
+        strength, _, _, across = parts(q1, *self._at(q1, p1, args), args)
+        return args["mass"] * jnp.sum(across**2) / (2 * strength)
+
+    def corrected_moment(self, t0, t1, q0, p0, q1, p1, args):
+        """μ0 + μ1 at t1, which oscillates by the second order in gyroradius over the length."""
+        return self.magnetic_moment(t0, t1, q0, p0, q1, p1, args) + first_correction(
+            q1, *self._at(q1, p1, args), args
+        )
+
+    def centre(self, q, p, args):
+        """The guiding centre q − ρ, shape (3,)."""
+        mv, B = self.kinetic_momentum(q, p, args), self.B(q, args)
+        return q - jnp.cross(B, mv) / (args["charge"] * jnp.sum(B**2))
+
+    def _at(self, q, p, args):
+        return self.kinetic_momentum(q, p, args), lambda q: self.B(q, args)
 
 
 def first_correction(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> Any:
@@ -70,12 +104,6 @@ def first_correction(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) ->
         + m * along**2 * jnp.sum(rho * curvature) / strength
         - m * along * shear / (4 * strength * gyration)
     )
-
-
-def centre(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> Any:
-    """The guiding centre q − ρ, shape (3,)."""
-    B = field(q)
-    return q - jnp.cross(B, mv) / (args["charge"] * jnp.sum(B**2))
 
 
 def bounce_action(

@@ -1,23 +1,20 @@
 """What the library knows of a system besides its equations."""
 
 import functools
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from numbers import Integral
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .._system import System
 from ..discover.generators import Generator
+from ._start import check_shape
 
-
-class ParameterError(ValueError):
-    """A parameter in args that cannot be meant."""
+DIMENSIONLESS = {"q": "1", "p": "1", "t": "1", "energy": "1"}
+"""Units of a dimensionless system."""
 
 
 @dataclass(frozen=True)
@@ -160,107 +157,16 @@ def over_times(
     return decorate
 
 
-def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], wanted: str) -> None:
-    """Refuse q0 and p0 that are not of one shape for which `fits` holds.
+def at_end(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
+    """The observable `energy` of a Hamiltonian."""
 
-    **Raises** `ValueError` with `wanted`, a sentence that says which shapes there are, and the
-    shapes seen.
-    """
-    q, p = np.shape(q0), np.shape(p0)
-    if q != p or not fits(q):
-        raise ValueError(f"{wanted}; got q0 of shape {q} and p0 of shape {p}.")
+    def energy(t0, t1, q0, p0, q1, p1, args):
+        """H(t1, q1, p1) at the end of the step: the energy of the continuous system."""
+        return hamiltonian(t1, t1, q1, p1, args)
 
-
-def number(args: Any, name: str) -> float:
-    """The parameter of this name.
-
-    **Raises** `ParameterError` where it is missing, or anything but one real number.
-    """
-    value = parameter(args, name)
-    try:
-        seen = np.asarray(value)
-    except ValueError:  # a ragged list
-        seen = np.asarray(None)
-    if seen.shape != () or seen.dtype.kind not in "iuf":
-        what = f"an array of shape {seen.shape}" if seen.shape else repr(value)
-        raise ParameterError(f"{name} must be one real number, got {what}.")
-    return float(seen)
+    return energy
 
 
-def parameter(args: Any, name: str) -> Any:
-    """The parameter of this name, whatever it is.
-
-    **Raises** `ParameterError` where it is missing, with those that are there.
-    """
-    if not isinstance(args, Mapping) or name not in args:
-        there = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
-        raise ParameterError(
-            f"the parameter {name} is missing: args must be a dict that has {name!r}; "
-            f"got {f'one with {there}' if there else repr(args)}."
-        )
-    return args[name]
-
-
-def check_finite(args: Any, *names: str) -> None:
-    """Refuse parameters of these names that are not finite numbers.
-
-    **Raises** `ParameterError` with the name and the value.
-    """
-    for name in names:
-        if not math.isfinite(value := number(args, name)):
-            raise ParameterError(f"{name} must be finite, got {value}.")
-
-
-def check_positive(args: Any, *names: str) -> None:
-    """Refuse parameters of these names that are not positive and finite numbers.
-
-    **Raises** `ParameterError` with the name and the value.
-    """
-    for name in names:
-        if not ((value := number(args, name)) > 0 and math.isfinite(value)):
-            raise ParameterError(f"{name} must be positive and finite, got {value}.")
-
-
-def check_nonzero(args: Any, without: str, *names: str) -> None:
-    """Refuse parameters of these names that are zero or not finite.
-
-    - `without`: what there is none of at zero, a sentence.
-
-    **Raises** `ParameterError` with the name, the value and that sentence.
-    """
-    check_finite(args, *names)
-    for name in names:
-        if number(args, name) == 0:
-            raise ParameterError(f"{name} is 0: {without}")
-
-
-def check_vector(args: Any, size: int, *names: str) -> None:
-    """Refuse parameters of these names that are not `size` finite numbers.
-
-    **Raises** `ParameterError` with the name and the shape or the value.
-    """
-    for name in names:
-        given = parameter(args, name)
-        try:
-            value = np.asarray(given, float)
-        except (TypeError, ValueError) as error:
-            raise ParameterError(f"{name} must be {size} numbers: {error}") from None
-        if value.shape != (size,):
-            raise ParameterError(f"{name} must have shape ({size},), got {value.shape}.")
-        if not np.isfinite(value).all():
-            raise ParameterError(f"{name} must be finite, got {value}.")
-
-
-def check_count(name: str, count: Any, least: int, wanted: str) -> None:
-    """Refuse a number of things that is not whole, or below `least`.
-
-    **Raises** `ValueError` with `wanted`, a sentence that says what there has to be, and the count.
-    """
-    if isinstance(count, bool) or not isinstance(count, Integral) or count < least:
-        raise ValueError(f"{wanted}: {name} must be a whole number ≥ {least}, got {count!r}.")
-
-
-def distance(square: Any) -> Any:
-    """√ of a sum of squares; its derivative at zero, where there is none, is put down as zero."""
-    away = square > 0
-    return jnp.where(away, jnp.sqrt(jnp.where(away, square, 1.0)), 0.0 * square)
+def named(*observables: Callable[..., Any]) -> dict[str, Callable[..., Any]]:
+    """Observables by the names of their functions."""
+    return {getattr(f, "function", f).__name__: f for f in observables}

@@ -6,7 +6,8 @@ import numpy as np
 from .._system import System
 from ..discover.library import rotation, time_translation
 from . import _guiding_centre as guiding_centre
-from ._problem import Adiabatic, Problem, check_nonzero, check_positive, check_shape
+from ._problem import Adiabatic, Problem, at_end, named
+from ._start import Start, gyrates, positive
 
 
 def vector_potential(q, args):
@@ -23,38 +24,15 @@ def magnetic_field(q, args):
     return args["B0"] * args["radius"] ** 3 / r2**2.5 * (axis - 3 * q[2] * q)
 
 
-def kinetic_momentum(q, p, args):
-    """m v = p − e A(q): shape (3,)."""
-    return p - args["charge"] * vector_potential(q, args)
-
-
-def hamiltonian(t0, t1, q0, p1, args):
-    """H_D = |p1 − e A(q0)|²/(2m), with canonical momenta p = mv + eA: not separable."""
-    return jnp.sum(kinetic_momentum(q0, p1, args) ** 2) / (2 * args["mass"])
-
-
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """m|v|²/2 at t1: the continuous energy."""
-    return hamiltonian(t0, t1, q1, p1, args)
+_particle = guiding_centre.ChargedParticle(vector_potential, magnetic_field)
+kinetic_momentum, hamiltonian = _particle.kinetic_momentum, _particle.hamiltonian
+magnetic_moment, corrected_moment = _particle.magnetic_moment, _particle.corrected_moment
+energy = at_end(hamiltonian)
 
 
 def stoermer_integral(t0, t1, q0, p0, q1, p1, args):
     """p_φ = x p_y − y p_x at t1: Störmer's integral, which turns about the axis keep."""
     return q1[0] * p1[1] - q1[1] * p1[0]
-
-
-def magnetic_moment(t0, t1, q0, p0, q1, p1, args):
-    """μ0 = m v⊥²/(2|B|) at t1, B taken at the particle: the first adiabatic invariant."""
-    return guiding_centre.magnetic_moment(
-        q1, kinetic_momentum(q1, p1, args), lambda q: magnetic_field(q, args), args
-    )
-
-
-def corrected_moment(t0, t1, q0, p0, q1, p1, args):
-    """μ0 + μ1 at t1, which wavers by the second order in gyroradius over R: `_guiding_centre`."""
-    return magnetic_moment(t0, t1, q0, p0, q1, p1, args) + guiding_centre.first_correction(
-        q1, kinetic_momentum(q1, p1, args), lambda q: magnetic_field(q, args), args
-    )
 
 
 def bounce_action(t0, t1, q0, p0, q1, p1, args):
@@ -69,7 +47,7 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
     **Source** Northrop 1963, *The Adiabatic Motion of Charged Particles*, 3.
     """
     m, mv = args["mass"], kinetic_momentum(q1, p1, args)
-    centre = guiding_centre.centre(q1, mv, lambda q: magnetic_field(q, args), args)
+    centre = _particle.centre(q1, p1, args)
     L = jnp.sum(centre**2) ** 1.5 / jnp.sum(centre[:2] ** 2)
     at_equator = jnp.abs(args["B0"]) * (args["radius"] / L) ** 3
 
@@ -84,21 +62,12 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
     return guiding_centre.bounce_action(strength, arc, jnp.pi / 2, E, mu, m)
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not in space, or at the dipole, no field, or a mass ≤ 0.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (3,),
-        "the dipole field holds one particle in space: q0 and p0 of shape (3,)",
-    )
-    check_positive(args, "mass", "radius")
-    check_nonzero(args, "the particle does not gyrate. Take another system.", "charge", "B0")
-    if not np.asarray(q0, float).any():
-        raise ValueError("the particle is on top of the dipole, q0 = [0, 0, 0].")
+check_start = Start(
+    "the dipole field holds one particle in space",
+    (3,),
+    {"mass": positive, "radius": positive, "charge": gyrates, "B0": gyrates},
+    singular={"the dipole": (0, 0, 0)},
+)
 
 
 def dipole_field(radius: float = 50.0) -> Problem:
@@ -115,9 +84,9 @@ def dipole_field(radius: float = 50.0) -> Problem:
     **Source** Störmer 1907, *Arch. Sci. Phys. Nat.* 24, 5; Northrop 1963, *The Adiabatic Motion of
     Charged Particles*; field, start and step are ours.
     """
-    check_positive({"radius": radius}, "radius")
-    args = {"charge": 1.0, "mass": 1.0, "B0": 1.0, "radius": float(radius)}
-    q0, v0 = np.array([float(radius), 0.0, 0.0]), np.array([0.6, -0.8, 1.0])
+    radius = positive("radius", radius)
+    args = {"charge": 1.0, "mass": 1.0, "B0": 1.0, "radius": radius}
+    q0, v0 = np.array([radius, 0.0, 0.0]), np.array([0.6, -0.8, 1.0])
     A = np.array([0.0, -args["B0"] * args["radius"], 0.0])  # `vector_potential` there
     return Problem(
         name="dipole_field",
@@ -126,13 +95,9 @@ def dipole_field(radius: float = 50.0) -> Problem:
         p0=args["mass"] * v0 + args["charge"] * A,
         h=0.1,
         args=args,
-        observables={
-            "energy": energy,
-            "stoermer_integral": stoermer_integral,
-            "magnetic_moment": magnetic_moment,
-            "corrected_moment": corrected_moment,
-            "bounce_action": bounce_action,
-        },
+        observables=named(
+            energy, stoermer_integral, magnetic_moment, corrected_moment, bounce_action
+        ),
         units={"q": "1", "p": "1", "t": "1/gyrofrequency", "energy": "1"},
         source="Störmer 1907, Arch. Sci. Phys. Nat. 24, 5; Northrop 1963",
         check=check_start,

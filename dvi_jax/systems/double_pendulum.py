@@ -5,7 +5,8 @@ import numpy as np
 
 from .._system import System
 from ..discover.library import time_translation
-from ._problem import Problem, check_finite, check_positive, check_shape
+from ._problem import Problem, at_end, named
+from ._start import Start, finite, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -24,9 +25,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return kinetic - (m1 + m2) * g * l1 * jnp.cos(a) - m2 * g * l2 * jnp.cos(b)
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """The energy at t1."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
@@ -34,19 +33,11 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     return jnp.sum(p1)
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not two angles, or masses and lengths that are not positive.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (2,),
-        "the double pendulum is two angles: q0 and p0 of shape (2,)",
-    )
-    check_positive(args, "m1", "m2", "l1", "l2")
-    check_finite(args, "g")
+check_start = Start(
+    "the double pendulum is two angles",
+    (2,),
+    {"m1": positive, "m2": positive, "l1": positive, "l2": positive, "g": finite},
+)
 
 
 def double_pendulum() -> Problem:
@@ -62,7 +53,7 @@ def double_pendulum() -> Problem:
         p0=np.zeros(2),
         h=0.005,
         args={"m1": 1.0, "m2": 1.0, "l1": 1.0, "l2": 1.0, "g": 9.81},
-        observables={"energy": energy, "angular_momentum": angular_momentum},
+        observables=named(energy, angular_momentum),
         units={"q": "rad", "p": "kg m²/s", "t": "s", "energy": "J"},
         source="Landau & Lifshitz 1976, Mechanics, §5, Problem 1",
         check=check_start,

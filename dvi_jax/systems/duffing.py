@@ -6,7 +6,8 @@ import numpy as np
 from .._system import System
 from ..discover.library import time_translation
 from ._elliptic import first_kind, jacobi
-from ._problem import Problem, check_finite, check_positive, check_shape, over_times
+from ._problem import DIMENSIONLESS, Problem, at_end, named, over_times
+from ._start import Start, finite, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -19,9 +20,7 @@ def friction_and_drive(t0, t1, q0, p1, args):
     return -args["delta"] * p1 + args["gamma"] * jnp.cos(args["omega"] * t0)
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """p²/2 + α q²/2 + β q⁴/4 at t1: the continuous energy."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 @over_times((1,))
@@ -63,19 +62,12 @@ def exact(t, q0, p0, args):
     return q, p
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not one q and one p, or a β that lets it run away.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (1,),
-        "Duffing's oscillator has one degree of freedom: q0 and p0 of shape (1,)",
-    )
-    check_positive(args, "beta")
-    check_finite(args, "alpha", "delta", "gamma", "omega")
+check_start = Start(
+    "Duffing's oscillator has one degree of freedom",
+    (1,),
+    # with β ≤ 0 it runs away
+    {"beta": positive, "alpha": finite, "delta": finite, "gamma": finite, "omega": finite},
+)
 
 
 def duffing() -> Problem:
@@ -94,8 +86,8 @@ def duffing() -> Problem:
         p0=np.array([0.2]),
         h=0.1,
         args={"alpha": -1.0, "beta": 1.0, "delta": 0.3, "gamma": 0.5, "omega": 1.2},
-        observables={"energy": energy},
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        observables=named(energy),
+        units=DIMENSIONLESS,
         source="Guckenheimer & Holmes 1983, Nonlinear Oscillations, 2.2",
         check=check_start,
         parameters={

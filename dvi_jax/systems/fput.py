@@ -3,9 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 
+from .._checks import whole
 from .._system import System
 from ..discover.library import time_translation
-from ._problem import Problem, check_count, check_finite, check_shape
+from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ._start import Start, finite
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -21,9 +23,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     )
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """The energy at t1."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def frequencies(n):
@@ -45,18 +45,11 @@ def mode_energies(t0, t1, q0, p0, q1, p1, args):
     return ((to_modes @ p1) ** 2 + (w * (to_modes @ q1)) ** 2) / 2
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not a row of particles, or α or β that is not finite.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: len(shape) == 1 and shape[0] >= 1,
-        "the FPUT chain is a row of particles between two walls: q0 and p0 of shape (n,)",
-    )
-    check_finite(args, "alpha", "beta")
+check_start = Start(
+    "the FPUT chain is a row of particles between two walls",
+    (None,),
+    {"alpha": finite, "beta": finite},
+)
 
 
 def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
@@ -72,9 +65,8 @@ def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
     **Source** Fermi, Pasta & Ulam (and Tsingou) 1955, *Studies of nonlinear problems I*, Los
     Alamos report LA-1940.
     """
-    check_count("n", n, 1, "the FPUT chain is a row of particles between two walls")
-    springs = {"alpha": alpha, "beta": beta}
-    check_finite(springs, *springs)
+    n = whole("n", n, hint="The FPUT chain is a row of particles between two walls.")
+    args = {"alpha": finite("alpha", alpha), "beta": finite("beta", beta)}
     q0 = np.sin(np.pi * np.arange(1, n + 1) / (n + 1))
     return Problem(
         name="fput",
@@ -82,9 +74,9 @@ def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
         q0=q0,
         p0=np.zeros(n),
         h=0.2,
-        args={"alpha": float(alpha), "beta": float(beta)},
-        observables={"energy": energy, "mode_energies": mode_energies},
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        args=args,
+        observables=named(energy, mode_energies),
+        units=DIMENSIONLESS,
         source="Fermi, Pasta & Ulam 1955, Los Alamos report LA-1940",
         check=check_start,
         parameters={

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 
 from .._system import System
 from ..discover.library import time_translation
-from ._problem import Problem, check_shape
+from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ._start import Start
 
 ESCAPE_ENERGY = 1 / 6
 """Energy of the three saddles of the potential: orbits below it that start inside stay there."""
@@ -16,19 +17,10 @@ def hamiltonian(t0, t1, q0, p1, args):
     return (jnp.sum(p1**2) + jnp.sum(q0**2)) / 2 + x**2 * y - y**3 / 3
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """|p|²/2 + |q|²/2 + x² y − y³/3 at t1: the continuous energy."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not in the plane, with a `ValueError`."""
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (2,),
-        "the Hénon–Heiles system is in the plane: q0 and p0 of shape (2,)",
-    )
+check_start = Start("the Hénon–Heiles system is in the plane", (2,))
 
 
 def henon_heiles() -> Problem:
@@ -47,8 +39,8 @@ def henon_heiles() -> Problem:
         q0=[0.0, y],
         p0=[px, py],
         h=0.1,
-        observables={"energy": energy},
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        observables=named(energy),
+        units=DIMENSIONLESS,
         source="Hénon & Heiles 1964, Astron. J. 69, 73",
         check=check_start,
         invariants=("energy",),

@@ -5,7 +5,9 @@ import numpy as np
 
 from .._system import System
 from ..discover.library import time_translation
-from ._problem import Problem, check_shape
+from ._problem import Problem, at_end, named
+from ._start import Start
+from .kepler import angular_momentum
 from .restricted_three_body import velocity
 
 LAGRANGE_DISTANCE = 3 ** (-1 / 3)
@@ -25,9 +27,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 - (x * p1[1] - y * p1[0]) + tide - 1 / r
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """H at t1, minus one half of `jacobi_constant`."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def jacobi_constant(t0, t1, q0, p0, q1, p1, args):
@@ -36,21 +36,9 @@ def jacobi_constant(t0, t1, q0, p0, q1, p1, args):
     return 3 * q1[0] ** 2 - q1[2] ** 2 + 2 / r - jnp.sum(v**2)
 
 
-def angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """x p_y − y p_x at t1, about the small body; the tide does not keep it."""
-    return q1[0] * p1[1] - q1[1] * p1[0]
-
-
-def check_start(q0, p0, args):
-    """Refuse a start that is not in space, or on the small body, with a `ValueError`."""
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (3,),
-        "Hill's problem has one body in space: q0 and p0 of shape (3,)",
-    )
-    if not np.asarray(q0, float).any():
-        raise ValueError("the satellite is on top of the small body, q0 = [0, 0, 0].")
+check_start = Start(
+    "Hill's problem has one body in space", (3,), singular={"the small body": (0, 0, 0)}
+)
 
 
 def hill() -> Problem:
@@ -70,11 +58,7 @@ def hill() -> Problem:
         q0=np.array([x, 0.0, 0.0]),
         p0=np.array([0.0, 0.95 * speed + x, 0.3 * speed]),
         h=0.005,
-        observables={
-            "energy": energy,
-            "jacobi_constant": jacobi_constant,
-            "angular_momentum": angular_momentum,
-        },
+        observables=named(energy, jacobi_constant, angular_momentum),
         units={
             "q": "(m/M)^(1/3) distances of the bodies",
             "p": "1",

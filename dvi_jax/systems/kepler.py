@@ -1,12 +1,12 @@
 """The Kepler problem in the plane, disturbed by −εq."""
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from .._system import System
 from ..discover.library import rotation, scaling, time_translation
-from ._problem import Problem, check_positive, check_shape, over_times
+from ._problem import DIMENSIONLESS, Problem, at_end, named, over_times
+from ._start import Start, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -19,9 +19,7 @@ def linear_force(t0, t1, q0, p1, args):
     return -q0
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """|p|²/2 − K²/|q| at t1: the continuous energy."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def mixed_energy(t0, t1, q0, p0, q1, p1, args):
@@ -30,7 +28,7 @@ def mixed_energy(t0, t1, q0, p0, q1, p1, args):
 
 
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """L = q_x p_y − q_y p_x at t1, the paper's (42)."""
+    """L = x p_y − y p_x at t1, the paper's (42)."""
     return q1[0] * p1[1] - q1[1] * p1[0]
 
 
@@ -76,21 +74,12 @@ def _first_guess(mean, ec, es):
     return M + 0.85 * e * jnp.sign(jnp.sin(M)) - E0
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not in the plane, or at the centre, or a K that is not positive.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (2,),
-        "the Kepler problem here is in the plane (for more dimensions or bodies take the system "
-        "n_body): q0 and p0 of shape (2,)",
-    )
-    check_positive(args, "K")
-    if not np.asarray(q0, float).any():
-        raise ValueError("the body is on top of the centre, q0 = [0, 0]: the force is infinite.")
+check_start = Start(
+    "the Kepler problem is in the plane (for more dimensions or bodies take the system n_body)",
+    (2,),
+    {"K": positive},
+    singular={"the centre": (0, 0)},
+)
 
 
 def kepler() -> Problem:
@@ -102,17 +91,11 @@ def kepler() -> Problem:
         p0=[-1.0, -0.6],
         h=0.1,
         args={"K": 1.0},
-        observables={
-            "energy": energy,
-            "mixed_energy": mixed_energy,
-            "angular_momentum": angular_momentum,
-        },
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        observables=named(energy, mixed_energy, angular_momentum),
+        units=DIMENSIONLESS,
         source="the paper, Section 5.2",
         check=check_start,
-        parameters={
-            "K": "root of the strength of attraction, K² = GM [length^(3/2)/time]",
-        },
+        parameters={"K": "root of the strength of attraction, K² = GM [length^(3/2)/time]"},
         invariants=("energy", "angular_momentum"),
         symmetries={
             "time": time_translation(),

@@ -5,7 +5,8 @@ import numpy as np
 
 from .._system import System
 from ._elliptic import swing
-from ._problem import Adiabatic, InSlowTime, Problem, check_positive, check_shape, number
+from ._problem import Adiabatic, InSlowTime, Problem, at_end, named
+from ._start import Start, between, positive
 from .pendulum import exact as of_pendulum
 
 
@@ -23,9 +24,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / (2 * m * string**2) - m * g * string * jnp.sum(jnp.cos(q0))
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """p²/(2 m l²) − m g l cos q with l = l(τ1) at the end of the step; t1 is the slow time τ1."""
-    return hamiltonian(t1, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def action(t0, t1, q0, p0, q1, p1, args):
@@ -57,20 +56,11 @@ def exact(t, q0, p0, args):
     return q, inertia * rate
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not one angle and one momentum, or a string without length.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (1,),
-        "Lorentz's pendulum is one angle: q0 and p0 of shape (1,)",
-    )
-    check_positive(args, "mass", "g", "length")
-    if not abs(depth := number(args, "depth")) < 1:
-        raise ValueError(f"depth must be between -1 and 1, got {depth}.")
+check_start = Start(
+    "Lorentz's pendulum is one angle",
+    (1,),
+    {"mass": positive, "g": positive, "length": positive, "depth": between(-1, 1)},
+)
 
 
 def lorentz_pendulum() -> Problem:
@@ -89,11 +79,7 @@ def lorentz_pendulum() -> Problem:
         p0=np.array([0.0]),
         h=0.02,
         args={"mass": 1.0, "g": 9.81, "length": 1.0, "depth": 0.3},
-        observables={
-            "energy": InSlowTime(energy),
-            "action": InSlowTime(action),
-            "small_swing_action": InSlowTime(small_swing_action),
-        },
+        observables=named(InSlowTime(energy), InSlowTime(action), InSlowTime(small_swing_action)),
         units={"q": "rad", "p": "kg m²/s", "t": "s", "energy": "J"},
         source="Langevin & de Broglie 1912, La théorie du rayonnement et les quanta, p. 450",
         check=check_start,

@@ -11,7 +11,8 @@ import numpy as np
 
 from .._system import System
 from ..discover.library import time_translation
-from ._problem import Problem, check_positive, check_shape
+from ._problem import Problem, at_end, named
+from ._start import Start, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -20,9 +21,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(alpha * p1 - beta * jnp.exp(p1) + gamma * q0 - delta * jnp.exp(q0))
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """α ln y − β y + γ ln x − δ x at t1: Volterra's constant."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def populations(t0, t1, q0, p0, q1, p1, args):
@@ -54,18 +53,11 @@ def equilibrium(args):
     return args["gamma"] / args["delta"], args["alpha"] / args["beta"]
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not one of each, or rates that are not positive.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (1,),
-        "prey and predators are one logarithm each: q0 and p0 of shape (1,)",
-    )
-    check_positive(args, "alpha", "beta", "gamma", "delta")
+check_start = Start(
+    "prey and predators are one logarithm each",
+    (1,),
+    {"alpha": positive, "beta": positive, "gamma": positive, "delta": positive},
+)
 
 
 def lotka_volterra() -> Problem:
@@ -86,7 +78,7 @@ def lotka_volterra() -> Problem:
         p0=p0,
         h=0.05,
         args={"alpha": 0.55, "beta": 0.028, "gamma": 0.84, "delta": 0.026},
-        observables={"energy": energy, "populations": populations},
+        observables=named(energy, populations),
         units={"q": "ln(thousands)", "p": "ln(thousands)", "t": "year", "energy": "1/year"},
         source="Volterra 1926, Mem. Acad. Lincei Roma 2, 31; Hairer, Lubich & Wanner 2006, I.1.1",
         check=check_start,

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 from .._system import System
 from ..discover.library import rotation, time_translation
 from . import _guiding_centre as guiding_centre
-from ._problem import Adiabatic, Problem, check_finite, check_nonzero, check_positive, check_shape
+from ._problem import DIMENSIONLESS, Adiabatic, Problem, at_end, named
+from ._start import Start, finite, gyrates, positive
 
 
 def vector_potential(q, args):
@@ -29,41 +30,15 @@ def magnetic_field(q, args):
     return args["B0"] * jnp.stack([-x * z / square, -y * z / square, 1 + z**2 / square])
 
 
-def kinetic_momentum(q, p, args):
-    """m v = p − e A(q): shape (3,)."""
-    return p - args["charge"] * vector_potential(q, args)
-
-
-def hamiltonian(t0, t1, q0, p1, args):
-    """H_D = |p1 − e A(q0)|²/(2m), with canonical momenta p = mv + eA: not separable."""
-    return jnp.sum(kinetic_momentum(q0, p1, args) ** 2) / (2 * args["mass"])
-
-
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """m|v|²/2 at t1: the continuous energy."""
-    return hamiltonian(t0, t1, q1, p1, args)
+_particle = guiding_centre.ChargedParticle(vector_potential, magnetic_field)
+kinetic_momentum, hamiltonian = _particle.kinetic_momentum, _particle.hamiltonian
+magnetic_moment, corrected_moment = _particle.magnetic_moment, _particle.corrected_moment
+energy = at_end(hamiltonian)
 
 
 def canonical_angular_momentum(t0, t1, q0, p0, q1, p1, args):
     """p_φ = x p_y − y p_x at t1, which turns about the axis keep."""
     return q1[0] * p1[1] - q1[1] * p1[0]
-
-
-def magnetic_moment(t0, t1, q0, p0, q1, p1, args):
-    """μ = m v⊥²/(2|B|) at t1, B taken at the particle: the adiabatic invariant.
-
-    It wavers in each turn by the order of gyroradius over ℓ, and does not drift.
-    """
-    return guiding_centre.magnetic_moment(
-        q1, kinetic_momentum(q1, p1, args), lambda q: magnetic_field(q, args), args
-    )
-
-
-def corrected_moment(t0, t1, q0, p0, q1, p1, args):
-    """μ + μ1 at t1, which wavers by the second order in gyroradius over ℓ: `_guiding_centre`."""
-    return magnetic_moment(t0, t1, q0, p0, q1, p1, args) + guiding_centre.first_correction(
-        q1, kinetic_momentum(q1, p1, args), lambda q: magnetic_field(q, args), args
-    )
 
 
 def bounce_action(t0, t1, q0, p0, q1, p1, args):
@@ -75,8 +50,8 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
     `corrected_moment`. Near the axis 2πmℓ (E − μ|B0|)/√(2mμ|B0|). Zero where the particle mirrors
     in the middle. Not differentiable. **Source** Northrop 1963, 3.
     """
-    m, mv, length = args["mass"], kinetic_momentum(q1, p1, args), args["length"]
-    x, y, z = guiding_centre.centre(q1, mv, lambda q: magnetic_field(q, args), args)
+    m, length = args["mass"], args["length"]
+    x, y, z = _particle.centre(q1, p1, args)
     a = (x**2 + y**2) * (1 + (z / length) ** 2) / length**2
     E = energy(t0, t1, q0, p0, q1, p1, args)
     mu = corrected_moment(t0, t1, q0, p0, q1, p1, args)
@@ -92,19 +67,11 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
     return guiding_centre.bounce_action(strength, arc, far, E, mu, m)
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not in space, no field, or a mass or length that is not positive.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (3,),
-        "the magnetic mirror holds one particle in space: q0 and p0 of shape (3,)",
-    )
-    check_positive(args, "mass", "length")
-    check_nonzero(args, "the particle does not gyrate. Take another system.", "charge", "B0")
+check_start = Start(
+    "the magnetic mirror holds one particle in space",
+    (3,),
+    {"mass": positive, "length": positive, "charge": gyrates, "B0": gyrates},
+)
 
 
 def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
@@ -123,9 +90,7 @@ def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
     **Source** equations and adiabatic invariant: Northrop 1963, *The Adiabatic Motion of Charged
     Particles*.
     """
-    given = {"length": length, "distance": distance}
-    check_positive(given, "length")
-    check_finite(given, "distance")
+    length, distance = positive("length", length), finite("distance", distance)
     x, vy, vz = distance + 1, -1.0, 0.8
     return Problem(
         name="magnetic_mirror",
@@ -133,15 +98,11 @@ def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
         q0=[x, 0.0, 0.0],
         p0=[0.0, vy + x / 2, vz],  # A = (0, x/2, 0) there
         h=0.1,
-        args={"charge": 1.0, "mass": 1.0, "B0": 1.0, "length": float(length)},
-        observables={
-            "energy": energy,
-            "canonical_angular_momentum": canonical_angular_momentum,
-            "magnetic_moment": magnetic_moment,
-            "corrected_moment": corrected_moment,
-            "bounce_action": bounce_action,
-        },
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        args={"charge": 1.0, "mass": 1.0, "B0": 1.0, "length": length},
+        observables=named(
+            energy, canonical_angular_momentum, magnetic_moment, corrected_moment, bounce_action
+        ),
+        units=DIMENSIONLESS,
         source="our own choice of field; Northrop 1963, The Adiabatic Motion of Charged Particles",
         check=check_start,
         parameters={

@@ -9,7 +9,8 @@ import numpy as np
 from .._system import System
 from ..discover.generators import Generator
 from ..discover.library import rotation, scaling, space_translation, time_translation
-from ._problem import Problem, check_finite, number, parameter
+from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ._start import check_parameter, finite, parameter
 
 _PLACE, _SPEED = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
 EIGHT_POSITIONS = np.array([_PLACE, -_PLACE, np.zeros(2)])
@@ -31,12 +32,7 @@ def hamiltonian(t0, t1, q0, p1, args):
 
     **Raises** `ValueError` when the shapes of q0 and masses do not agree.
     """
-    masses = jnp.asarray(args["masses"], q0.dtype)
-    if q0.ndim != 2 or masses.shape != q0.shape[:1]:
-        raise ValueError(
-            "the N-body system needs q0 of shape (bodies, dim) and masses of shape (bodies,); "
-            f"got q0 {q0.shape} and masses {masses.shape}."
-        )
+    masses = masses_of(q0, args)
     kinetic = jnp.sum(jnp.sum(p1**2, axis=-1) / masses) / 2
     # Every pair twice, and a body with itself at distance 1 but with weight 0: dense arrays
     # that one kernel can run through, where a list of pairs would gather and scatter.
@@ -47,9 +43,18 @@ def hamiltonian(t0, t1, q0, p1, args):
     return kinetic - args.get("G", 1.0) * jnp.sum(weight / distance) / 2
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """Kinetic plus potential energy at t1 [mass length² / time²]."""
-    return hamiltonian(t0, t1, q1, p1, args)
+def masses_of(q, args):
+    """The masses as an array. **Raises** `ValueError` where q has not as many bodies."""
+    masses = jnp.asarray(args["masses"], q.dtype)
+    if q.ndim != 2 or masses.shape != q.shape[:1]:
+        raise ValueError(
+            "the N-body system needs q0 of shape (bodies, dim) and masses of shape (bodies,); "
+            f"got q0 {q.shape} and masses {masses.shape}."
+        )
+    return masses
+
+
+energy = at_end(hamiltonian)
 
 
 def linear_momentum(t0, t1, q0, p0, q1, p1, args):
@@ -64,11 +69,7 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     return jnp.sum(jnp.cross(q1, p1), axis=0)
 
 
-OBSERVABLES = {
-    "energy": energy,
-    "linear_momentum": linear_momentum,
-    "angular_momentum": angular_momentum,
-}
+OBSERVABLES = named(energy, linear_momentum, angular_momentum)
 
 
 def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None) -> None:
@@ -84,7 +85,7 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     q, p = np.asarray(q0, float), np.asarray(p0, float)
     masses = np.asarray(parameter(args, "masses"), float)
     if "G" in args:
-        check_finite(args, "G")
+        check_parameter(args, "G", finite)
     if q.ndim != 2 or q.shape[-1] not in (2, 3) or p.shape != q.shape:
         raise ValueError(
             "q0 and p0 of N bodies must both have shape (bodies, 2) or (bodies, 3); got "
@@ -164,7 +165,7 @@ def n_body(
         raise TypeError("n_body takes masses, q0 and p0 together, or none of them.")
     if masses is None or q0 is None or p0 is None:
         masses, q0, p0 = np.ones(3), EIGHT_POSITIONS, EIGHT_MOMENTA
-    args = {"masses": np.asarray(masses, float), "G": number({"G": G}, "G")}
+    args = {"masses": np.asarray(masses, float), "G": finite("G", G)}
     check_bodies(q0, p0, args)
     return Problem(
         name="n_body",
@@ -174,7 +175,7 @@ def n_body(
         h=h,
         args=args,
         observables=OBSERVABLES,
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        units=DIMENSIONLESS,
         source="Chenciner & Montgomery 2000, Ann. Math. 152, 881 (the figure eight)",
         check=check_bodies,
         parameters=PARAMETERS,

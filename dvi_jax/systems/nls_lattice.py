@@ -9,9 +9,11 @@ in a bracket of its own only, and is not here.)
 import jax.numpy as jnp
 import numpy as np
 
+from .._checks import whole
 from .._system import System
 from ..discover.library import time_translation
-from ._problem import Problem, check_count, check_finite, check_shape
+from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ._start import Start, finite
 from .oscillator import PHASE
 
 
@@ -24,9 +26,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(args["kappa"] / 2 * steps - args["gamma"] / 8 * (q0**2 + p1**2) ** 2)
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """The energy at t1."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def norm(t0, t1, q0, p0, q1, p1, args):
@@ -61,18 +61,12 @@ def plane_wave(t, n, mode, amplitude, args):
     return np.sqrt(2) * amplitude * jnp.cos(angle), np.sqrt(2) * amplitude * jnp.sin(angle)
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not a ring of three sites or more, or κ or γ that is not finite.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: len(shape) == 1 and shape[0] >= 3,
-        "the lattice is a ring of at least three sites: q0 and p0 of shape (n,), n ≥ 3",
-    )
-    check_finite(args, "kappa", "gamma")
+check_start = Start(
+    "the lattice is a ring of at least three sites",
+    (None,),
+    {"kappa": finite, "gamma": finite},
+    least=3,
+)
 
 
 def nls_lattice(n: int = 8) -> Problem:
@@ -84,7 +78,7 @@ def nls_lattice(n: int = 8) -> Problem:
 
     **Source** Kevrekidis 2009, *The Discrete Nonlinear Schrödinger Equation*.
     """
-    check_count("n", n, 3, "the lattice is a ring of at least three sites")
+    n = whole("n", n, 3, hint="The lattice is a ring of at least three sites.")
     site = np.arange(n) - n / 2
     size, phase = 1 / np.cosh(site / 1.5), 0.5 * site
     q0, p0 = size * np.cos(phase), size * np.sin(phase)
@@ -95,8 +89,8 @@ def nls_lattice(n: int = 8) -> Problem:
         p0=p0,
         h=0.02,
         args={"kappa": 1.0, "gamma": 1.0},
-        observables={"energy": energy, "norm": norm, "densities": densities},
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        observables=named(energy, norm, densities),
+        units=DIMENSIONLESS,
         source="Kevrekidis 2009, The Discrete Nonlinear Schrödinger Equation",
         check=check_start,
         parameters={

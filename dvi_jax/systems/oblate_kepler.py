@@ -5,7 +5,8 @@ import numpy as np
 
 from .._system import System
 from ..discover.library import rotation, time_translation
-from ._problem import Problem, check_finite, check_positive, check_shape
+from ._problem import Problem, at_end, named
+from ._start import Start, finite, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -19,9 +20,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 - args["mu"] / r * (1 - bulge)
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """The energy at t1."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def axial_angular_momentum(t0, t1, q0, p0, q1, p1, args):
@@ -75,22 +74,17 @@ def secular_rates(a, e, i, args):
     return -1.5 * size * jnp.cos(i), 0.75 * size * (5 * jnp.cos(i) ** 2 - 1)
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not in space, or inside the planet.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (3,),
-        "the satellite is one point in space: q0 and p0 of shape (3,)",
-    )
-    check_positive(args, "mu", "R")
-    check_finite(args, "J2")
-    r = float(np.linalg.norm(np.asarray(q0, float)))
-    if r < args["R"]:
+def _outside(q, p, args):
+    if (r := float(np.linalg.norm(q))) < args["R"]:
         raise ValueError(f"the satellite starts at r = {r}, inside the planet of R = {args['R']}.")
+
+
+check_start = Start(
+    "the satellite is one point in space",
+    (3,),
+    {"mu": positive, "R": positive, "J2": finite},
+    also=_outside,
+)
 
 
 def oblate_kepler() -> Problem:
@@ -111,12 +105,7 @@ def oblate_kepler() -> Problem:
         p0=speed * np.array([0.0, np.cos(i), np.sin(i)]),
         h=10.0,
         args={"mu": mu, "R": 6378.1363, "J2": 1.0826267e-3},
-        observables={
-            "energy": energy,
-            "axial_angular_momentum": axial_angular_momentum,
-            "angular_momentum": angular_momentum,
-            "osculating_elements": osculating_elements,
-        },
+        observables=named(energy, axial_angular_momentum, angular_momentum, osculating_elements),
         units={"q": "km", "p": "km/s", "t": "s", "energy": "km²/s²"},
         source="Kozai 1959, Astron. J. 64, 367; EGM96",
         check=check_start,

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 from .._system import System
 from ..discover.generators import Generator
 from ..discover.library import scaling, time_translation
-from ._problem import Problem, check_shape, over_times
+from ._problem import Problem, at_end, named, over_times
+from ._start import Start
 
 PHASE = Generator(xi=lambda t, q, p, args: p, eta=lambda t, q, p, args: -q)
 """The turn of the phase plane, ξ = p, η = −q: the flow of the oscillator itself."""
@@ -21,9 +22,7 @@ def linear_force(t0, t1, q0, p1, args):
     return -q0
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """(|p|² + |q|²)/2 at t1: the continuous energy."""
-    return (jnp.sum(p1**2) + jnp.sum(q1**2)) / 2
+energy = at_end(hamiltonian)
 
 
 def mixed_energy(t0, t1, q0, p0, q1, p1, args):
@@ -49,9 +48,7 @@ def exact(t, q0, p0, args):
     return q0 * c + p0 * s, p0 * c - q0 * s
 
 
-def check_start(q0, p0, args):
-    """Refuse q0 and p0 of different shapes, with a `ValueError`."""
-    check_shape(q0, p0, lambda shape: True, "the oscillator takes q0 and p0 of one shape, any")
+check_start = Start("the oscillator is of any dimension", None)
 
 
 def oscillator() -> Problem:
@@ -62,11 +59,7 @@ def oscillator() -> Problem:
         q0=[0.01],
         p0=[0.01],
         h=0.1,
-        observables={
-            "energy": energy,
-            "mixed_energy": mixed_energy,
-            "map_invariant": map_invariant,
-        },
+        observables=named(energy, mixed_energy, map_invariant),
         units={"q": "1", "p": "1", "t": "1/ω", "energy": "1"},
         source="the paper, Section 5.1",
         check=check_start,

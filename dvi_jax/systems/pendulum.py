@@ -6,7 +6,8 @@ import numpy as np
 from .._system import System
 from ..discover.library import time_translation
 from ._elliptic import complete, first_kind, jacobi, swing
-from ._problem import Problem, check_positive, check_shape, over_times
+from ._problem import Problem, at_end, named, over_times
+from ._start import Start, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -19,9 +20,7 @@ def friction(t0, t1, q0, p1, args):
     return -p1
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """p²/2 − ω² cos q at t1: the continuous energy."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def modulus(q, p, args):
@@ -85,15 +84,7 @@ def exact(t, q0, p0, args):
     return q + 0 * m, p + 0 * m
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not one angle and one momentum, or a frequency that is not positive.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0, p0, lambda shape: shape == (1,), "the pendulum is one angle: q0 and p0 of shape (1,)"
-    )
-    check_positive(args, "omega")
+check_start = Start("the pendulum is one angle", (1,), {"omega": positive})
 
 
 def pendulum() -> Problem:
@@ -111,7 +102,7 @@ def pendulum() -> Problem:
         p0=np.array([1.0]),
         h=0.1,
         args={"omega": 1.0},
-        observables={"energy": energy, "action": action},
+        observables=named(energy, action),
         units={"q": "rad", "p": "1", "t": "1", "energy": "1"},
         source="Whittaker 1937, Analytical Dynamics, §44",
         check=check_start,

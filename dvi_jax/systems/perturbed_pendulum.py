@@ -4,7 +4,8 @@ import jax.numpy as jnp
 
 from .._system import System
 from ..discover.library import time_translation
-from ._problem import Problem, check_shape
+from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ._start import Start
 from .pendulum import exact as of_pendulum
 
 
@@ -18,9 +19,7 @@ def coupling(t0, t1, q0, p1, args):
     return -jnp.sum(q0 * p1) * jnp.sin(t0)
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """p²/2 − cos q at t1: the energy of the pendulum alone."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def exact(t, q0, p0, args):
@@ -28,14 +27,7 @@ def exact(t, q0, p0, args):
     return of_pendulum(t, q0, p0, {"omega": 1.0})
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not one angle and one momentum, with a `ValueError`."""
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (1,),
-        "the perturbed pendulum is one pendulum: q0 and p0 of shape (1,)",
-    )
+check_start = Start("the perturbed pendulum is one pendulum", (1,))
 
 
 def perturbed_pendulum() -> Problem:
@@ -52,8 +44,8 @@ def perturbed_pendulum() -> Problem:
         q0=[0.5],
         p0=[0.3],
         h=0.1,
-        observables={"energy": energy},
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        observables=named(energy),
+        units=DIMENSIONLESS,
         source="our own choice",
         check=check_start,
         invariants=("energy",),

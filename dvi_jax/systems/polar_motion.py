@@ -25,7 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ._problem import Problem, check_finite, check_positive, check_shape, check_vector, over_times
+from ._problem import Problem, named, over_times
+from ._start import Start, finite, positive, vector
 from .solar_system import installed_file
 
 REFERENCE = 51544.0
@@ -185,20 +186,12 @@ def free_amplitude(t0, t1, q0, p0, q1, p1, args):
     return jnp.sqrt(jnp.sum((q1 - x) ** 2 + (p1 - y) ** 2))
 
 
-def check_start(q0: Any, p0: Any, args: Any) -> None:
-    """Refuse a start that is not one pole, or parameters that are none: period ≤ 0, no pair.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (1,),
-        "the pole is one point: q0 (its x) and p0 (its y) of shape (1,)",
-    )
-    check_positive(args, "period")
-    check_finite(args, "inverse_Q")
-    check_vector(args, 2, "prograde", "retrograde", "mean", "drift")
+check_start = Start(
+    "the pole is one point, its x and its y",
+    (1,),
+    {"period": positive, "inverse_Q": finite}
+    | dict.fromkeys(("prograde", "retrograde", "mean", "drift"), vector(2)),
+)
 
 
 def polar_motion() -> Problem:
@@ -241,7 +234,7 @@ def polar_motion() -> Problem:
             "mean": np.array([0.0550, 0.3205]),
             "drift": np.array([0.001677, 0.003460]),
         },
-        observables={"amplitude": amplitude, "free_amplitude": free_amplitude},
+        observables=named(amplitude, free_amplitude),
         units={"q": "arcsec", "p": "arcsec", "t": "day", "energy": "arcsec²/day"},
         source="Wilson & Vicente 1990; Nastula & Gross 2015; IERS Conventions 2010; finals2000A",
         check=check_start,

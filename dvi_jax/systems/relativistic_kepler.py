@@ -5,7 +5,8 @@ import numpy as np
 
 from .._system import System
 from ..discover.library import rotation, time_translation
-from ._problem import Problem, check_positive, check_shape
+from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ._start import Start, positive
 from .kepler import angular_momentum
 
 
@@ -17,9 +18,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return kinetic - args["K"] ** 2 / jnp.sqrt(jnp.sum(q0**2))
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """√(c⁴ + c²|p|²) − c² − K²/|q| at t1: the continuous energy without that at rest."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def precession(q, p, args):
@@ -58,27 +57,22 @@ def perihelion_angle(t0, t1, q0, p0, q1, p1, args):
     return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not in the plane, or at the centre, or that falls into it.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (2,),
-        "the relativistic Kepler problem is in the plane: q0 and p0 of shape (2,)",
-    )
-    check_positive(args, "K", "c")
-    q, p = np.asarray(q0, float), np.asarray(p0, float)
-    if not q.any():
-        raise ValueError("the body is on top of the centre, q0 = [0, 0]: the force is infinite.")
+def _misses_the_centre(q, p, args):
     L = q[0] * p[1] - q[1] * p[0]
     if abs(L) * args["c"] <= args["K"] ** 2:
         raise ValueError(
             f"the angular momentum {L} is at most K²/c = {args['K'] ** 2 / args['c']} in size: the "
             "orbit falls into the centre. Give it more, or a larger c."
         )
+
+
+check_start = Start(
+    "the relativistic Kepler problem is in the plane",
+    (2,),
+    {"K": positive, "c": positive},
+    singular={"the centre": (0, 0)},
+    also=_misses_the_centre,
+)
 
 
 def relativistic_kepler() -> Problem:
@@ -96,12 +90,8 @@ def relativistic_kepler() -> Problem:
         p0=np.array([0.0, 1.5]),
         h=0.02,
         args={"K": 1.0, "c": 10.0},
-        observables={
-            "energy": energy,
-            "angular_momentum": angular_momentum,
-            "perihelion_angle": perihelion_angle,
-        },
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        observables=named(energy, angular_momentum, perihelion_angle),
+        units=DIMENSIONLESS,
         source="Sommerfeld 1916, Ann. Phys. 356, 1",
         check=check_start,
         parameters={

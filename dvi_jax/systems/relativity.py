@@ -14,7 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .n_body import hamiltonian
+from .n_body import hamiltonian, masses_of
 from .solar_system import AU_IN_KM
 
 SPEED_OF_LIGHT = 299792.458 * 86400 / AU_IN_KM
@@ -26,11 +26,8 @@ SUN_RADIUS = 696000 / AU_IN_KM
 SUN_J2 = 2e-7
 """Quadrupole moment of the Sun, the value of DE421; helioseismology gives 2.2e-7."""
 
-SUN_POLE = np.array([
-    np.cos(np.deg2rad(63.87)) * np.cos(np.deg2rad(286.13)),
-    np.cos(np.deg2rad(63.87)) * np.sin(np.deg2rad(286.13)),
-    np.sin(np.deg2rad(63.87)),
-])  # fmt: skip
+_RA, _DEC = np.deg2rad(286.13), np.deg2rad(63.87)
+SUN_POLE = np.array([np.cos(_DEC) * np.cos(_RA), np.cos(_DEC) * np.sin(_RA), np.sin(_DEC)])
 """North pole of the Sun's rotation on the axes of the ICRF: RA 286.13°, dec 63.87° (IAU WGCCRE;
 Archinal et al. 2018). A unit vector."""
 
@@ -162,13 +159,8 @@ def hamiltonian_with_oblateness(t0, t1, q0, p1, args):
 
 
 def _masses(q, args):
-    """Masses as an array, and GM of the Sun; the check is that of `n_body.hamiltonian`."""
-    masses = jnp.asarray(args["masses"], q.dtype)
-    if q.ndim != 2 or masses.shape != q.shape[:1]:
-        raise ValueError(
-            "the N-body system needs q0 of shape (bodies, dim) and masses of shape (bodies,); "
-            f"got q0 {q.shape} and masses {masses.shape}."
-        )
+    """Masses as an array, and GM of the Sun."""
+    masses = masses_of(q, args)
     return masses, args.get("G", 1.0) * masses[0]
 
 

@@ -5,7 +5,9 @@ import numpy as np
 
 from .._system import System
 from ..discover.library import time_translation
-from ._problem import Problem, check_shape, number
+from ._problem import Problem, at_end, named
+from ._start import Start, finite
+from .kepler import angular_momentum
 
 EARTH_MOON = 0.012150585
 """Mass of the Moon over that of Earth and Moon (JPL DE405: Earth/Moon = 81.30056)."""
@@ -30,20 +32,13 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 - (x * p1[1] - y * p1[0]) + potential(q0, args["mu"])
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """H at t1, minus one half of `jacobi_constant`."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def jacobi_constant(t0, t1, q0, p0, q1, p1, args):
     """C = x² + y² + 2(1 − μ)/r1 + 2μ/r2 − |v|² at t1, without the μ(1 − μ) that some add."""
     v = velocity(q1, p1)
     return q1[0] ** 2 + q1[1] ** 2 - 2 * potential(q1, args["mu"]) - jnp.sum(v**2)
-
-
-def angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """x p_y − y p_x at t1, of the third body in a frame that does not turn; it is not kept."""
-    return q1[0] * p1[1] - q1[1] * p1[0]
 
 
 def velocity(q, p):
@@ -54,6 +49,13 @@ def velocity(q, p):
 def momentum(q, v):
     """p = v + ẑ × q of a velocity in the turning frame."""
     return v - jnp.stack([q[1], -q[0], jnp.zeros_like(q[2])])
+
+
+def _mass_fraction(name, mu):
+    if not 0 < finite(name, mu) <= 0.5:
+        raise ValueError(
+            f"{name} is the smaller body's fraction of the mass of both, 0 < mu ≤ 1/2; got {mu}."
+        )
 
 
 def lagrange_points(mu):
@@ -67,8 +69,7 @@ def lagrange_points(mu):
     by bisection to the last digits. **Raises** `ValueError` for μ outside 0 < μ ≤ 1/2.
     **Source** Szebehely 1967, *Theory of Orbits*, 4.
     """
-    mu = float(mu)
-    _check_mu(mu)
+    _mass_fraction("mu", mu := float(mu))
 
     def pull(x):
         a, b = x + mu, x - 1 + mu
@@ -87,29 +88,15 @@ def lagrange_points(mu):
     return np.array([*line, [0.5 - mu, side, 0.0], [0.5 - mu, -side, 0.0]])
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not in space, or on a body, or a μ that is none.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (3,),
-        "the restricted problem has one body in space: q0 and p0 of shape (3,)",
-    )
-    mu, q = number(args, "mu"), np.asarray(q0, float)
-    _check_mu(mu)
-    for x in (-mu, 1 - mu):
-        if not (q - [x, 0.0, 0.0]).any():
-            raise ValueError(f"the start is on top of the body at [{x}, 0, 0].")
-
-
-def _check_mu(mu):
-    if not 0 < mu <= 0.5:
-        raise ValueError(
-            f"mu is the share of the smaller body in the mass of both, 0 < mu ≤ 1/2; got {mu}."
-        )
+check_start = Start(
+    "the restricted problem has one body in space",
+    (3,),
+    {"mu": _mass_fraction},
+    singular={
+        "the large body": lambda args: (-args["mu"], 0.0, 0.0),
+        "the small body": lambda args: (1 - args["mu"], 0.0, 0.0),
+    },
+)
 
 
 def restricted_three_body() -> Problem:
@@ -128,11 +115,7 @@ def restricted_three_body() -> Problem:
         p0=np.array([-q0[1], q0[0], 0.0]),  # at rest in the turning frame
         h=0.02,
         args={"mu": EARTH_MOON},
-        observables={
-            "energy": energy,
-            "jacobi_constant": jacobi_constant,
-            "angular_momentum": angular_momentum,
-        },
+        observables=named(energy, jacobi_constant, angular_momentum),
         units={"q": "distance of the bodies", "p": "1", "t": "period/2π", "energy": "1"},
         source="Szebehely 1967, Theory of Orbits, 1 and 4",
         check=check_start,

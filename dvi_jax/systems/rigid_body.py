@@ -20,7 +20,8 @@ from .._system import System
 from ..discover.generators import Generator
 from ..discover.library import scaling, space_translation, time_translation
 from ._elliptic import first_kind, jacobi, third_kind
-from ._problem import Problem, check_positive, check_shape, over_times
+from ._problem import Problem, at_end, named, over_times
+from ._start import Start, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -46,25 +47,20 @@ def orientation(q, p):
     """
     (body, spin, node), (L, G, K) = q, p
 
-    def about_z(c, s):
-        one, zero = jnp.ones_like(c), jnp.zeros_like(c)
-        return jnp.stack(
-            [jnp.stack([c, -s, zero]), jnp.stack([s, c, zero]), jnp.stack([zero, zero, one])]
-        )
+    one, zero = jnp.ones_like(G), jnp.zeros_like(G)
+
+    def about_z(angle):
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        return jnp.stack([c, -s, zero, s, c, zero, zero, zero, one]).reshape(3, 3)
 
     def about_x(c):
-        s, one, zero = jnp.sqrt(1 - c**2), jnp.ones_like(c), jnp.zeros_like(c)
-        return jnp.stack(
-            [jnp.stack([one, zero, zero]), jnp.stack([zero, c, -s]), jnp.stack([zero, s, c])]
-        )
+        s = jnp.sqrt(1 - c**2)
+        return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3)
 
-    turns = [about_z(jnp.cos(a), jnp.sin(a)) for a in (node, spin, body)]
-    return turns[0] @ about_x(K / G) @ turns[1] @ about_x(L / G) @ turns[2]
+    return about_z(node) @ about_x(K / G) @ about_z(spin) @ about_x(L / G) @ about_z(body)
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """The energy of rotation at t1."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
@@ -130,27 +126,24 @@ def exact(t, q0, p0, args):
     return q + 0 * m, p + 0 * m  # all of it or nothing
 
 
-def check_start(q0, p0, args):
-    """Refuse a start of another shape, momenta beyond G, or moments that no body has.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (3,),
-        "the rigid body has angles (l, g, k) and momenta (L, G, K): q0 and p0 of shape (3,)",
-    )
-    check_positive(args, "I1", "I2", "I3")
+def _possible(q, p, args):
     moments = [args["I1"], args["I2"], args["I3"]]
     if 2 * max(moments) > sum(moments):
         raise ValueError(f"each moment of inertia is at most the sum of the others, got {moments}.")
-    L, G, K = np.asarray(p0, float)
+    L, G, K = p
     if not (abs(L) < G and abs(K) <= G):
         raise ValueError(
             f"the parts L and K of the angular momentum must be smaller than its size G, got "
             f"L = {L}, G = {G}, K = {K}; at L = ±G the angles are singular."
         )
+
+
+check_start = Start(
+    "the rigid body has angles (l, g, k) and momenta (L, G, K)",
+    (3,),
+    {"I1": positive, "I2": positive, "I3": positive},
+    also=_possible,
+)
 
 
 def rigid_body() -> Problem:
@@ -168,11 +161,7 @@ def rigid_body() -> Problem:
         p0=np.array([0.1, 1.0, 0.6]),
         h=0.05,
         args={"I1": 1.0, "I2": 2.0, "I3": 2.5},
-        observables={
-            "energy": energy,
-            "angular_momentum": angular_momentum,
-            "body_angular_momentum": body_angular_momentum,
-        },
+        observables=named(energy, angular_momentum, body_angular_momentum),
         units={"q": "rad", "p": "1", "t": "1", "energy": "1"},
         source="Deprit 1967, Am. J. Phys. 35, 424; Landau & Lifshitz 1976, Mechanics, §37",
         check=check_start,

@@ -5,7 +5,8 @@ import numpy as np
 
 from .._system import System
 from ..discover.library import scaling
-from ._problem import Adiabatic, InSlowTime, Problem, check_shape, number
+from ._problem import DIMENSIONLESS, Adiabatic, InSlowTime, Problem, at_end, named
+from ._start import Start, between
 from .oscillator import exact as of_oscillator
 
 
@@ -19,9 +20,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return (jnp.sum(p1**2) + frequency(t0, args) ** 2 * jnp.sum(q0**2)) / 2
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """(p² + ω(τ1)² q²)/2 at the end of the step; t1 is the slow time τ1."""
-    return hamiltonian(t1, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def action(t0, t1, q0, p0, q1, p1, args):
@@ -34,19 +33,9 @@ def exact(t, q0, p0, args):
     return of_oscillator(t, q0, p0, args)
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not one q and one p, or a frequency that changes its sign.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (1,),
-        "the slow oscillator has one degree of freedom: q0 and p0 of shape (1,)",
-    )
-    if not abs(depth := number(args, "depth")) < 1:
-        raise ValueError(f"depth must be between -1 and 1, got {depth}.")
+check_start = Start(
+    "the slow oscillator has one degree of freedom", (1,), {"depth": between(-1, 1)}
+)
 
 
 def slow_oscillator() -> Problem:
@@ -65,8 +54,8 @@ def slow_oscillator() -> Problem:
         p0=np.array([0.3]),
         h=0.1,
         args={"depth": 0.3},
-        observables={"energy": InSlowTime(energy), "action": InSlowTime(action)},
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        observables=named(InSlowTime(energy), InSlowTime(action)),
+        units=DIMENSIONLESS,
         source="Ehrenfest 1916, Ann. Phys. 356, 327; Arnold 1989, §52",
         check=check_start,
         parameters={"depth": "relative change of the frequency [1]"},

@@ -7,12 +7,12 @@ asteroids add is left out, and is what a comparison with the ephemeris shows.
 import datetime
 from functools import cache
 from importlib.util import find_spec
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .._checks import finite
 from .._system import System
 from ._problem import Problem
 from .n_body import INVARIANTS, OBSERVABLES, check_bodies, hamiltonian, symmetries
@@ -81,10 +81,8 @@ def julian_date(date: str | datetime.date | float) -> float:
         raise ValueError(f"date must be a day without a time of day, got {date}.")
     if isinstance(date, datetime.date):
         jd = date.toordinal() + 1721424.5
-    elif isinstance(date, Real) and not isinstance(date, bool):
-        jd = float(date)
     else:
-        raise ValueError(f"date must be a calendar day or a Julian date, got {date!r}.")
+        jd = finite("date", date, hint="Give a calendar day or a Julian date.")
     check_covered(jd)
     return jd
 

@@ -6,7 +6,8 @@ import numpy as np
 from .._system import System
 from ..discover.library import space_translation, time_translation
 from ._elliptic import first_kind, jacobi, third_kind
-from ._problem import Problem, check_positive, check_shape, over_times
+from ._problem import Problem, at_end, named, over_times
+from ._start import Start, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -23,9 +24,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return turning + (p1[0] - p1[2] * c) ** 2 / (2 * A * s**2) + args["w"] * c
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """The energy at t1."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def vertical_momentum(t0, t1, q0, p0, q1, p1, args):
@@ -149,23 +148,19 @@ def exact(t, q0, p0, args):
     return q + 0 * m, p + 0 * m  # all of it or nothing
 
 
-def check_start(q0, p0, args):
-    """Refuse a start of another shape, an upright top, or moments that no body has.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (3,),
-        "the top has Euler's angles (φ, θ, ψ): q0 and p0 of shape (3,)",
-    )
-    check_positive(args, "A", "C", "w")
-    if not 0 < float(np.asarray(q0, float)[1]) < np.pi:
+def _leans(q, p, args):
+    if not 0 < q[1] < np.pi:
         raise ValueError(
-            f"θ must lie between 0 and π, got {np.asarray(q0, float)[1]}: Euler's angles are "
-            "singular where the axis is vertical."
+            f"θ must lie between 0 and π, got {q[1]}: Euler's angles are singular on the vertical."
         )
+
+
+check_start = Start(
+    "the top has Euler's angles (φ, θ, ψ)",
+    (3,),
+    {"A": positive, "C": positive, "w": positive},
+    also=_leans,
+)
 
 
 def spinning_top() -> Problem:
@@ -183,12 +178,7 @@ def spinning_top() -> Problem:
         p0=np.array([2.4, 0.1, 2.5]),
         h=0.02,
         args={"A": 1.0, "C": 0.5, "w": 1.0},
-        observables={
-            "energy": energy,
-            "vertical_momentum": vertical_momentum,
-            "axial_momentum": axial_momentum,
-            "height": height,
-        },
+        observables=named(energy, vertical_momentum, axial_momentum, height),
         units={"q": "rad", "p": "1", "t": "1", "energy": "1"},
         source="Goldstein, Poole & Safko 2002, Classical Mechanics, 5.7",
         check=check_start,

@@ -3,9 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 
+from .._checks import whole
 from .._system import System
 from ..discover.library import time_translation
-from ._problem import Adiabatic, Problem, check_count, check_positive, check_shape
+from ._problem import DIMENSIONLESS, Adiabatic, Problem, at_end, named
+from ._start import Start, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -21,9 +23,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 + args["omega"] ** 2 * jnp.sum(y**2) / 2 + jnp.sum(soft**4) / 4
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """The energy at t1."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def stiff_energies(t0, t1, q0, p0, q1, p1, args):
@@ -36,18 +36,9 @@ def oscillatory_energy(t0, t1, q0, p0, q1, p1, args):
     return jnp.sum(stiff_energies(t0, t1, q0, p0, q1, p1, args))
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not a pair of rows, or an ω that is not positive.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: len(shape) == 2 and shape[0] == 2 and shape[1] >= 1,
-        "the stiff FPUT chain has centres and lengths of m springs: q0 and p0 of shape (2, m)",
-    )
-    check_positive(args, "omega")
+check_start = Start(
+    "the stiff FPUT chain has centres and lengths of m springs", (2, None), {"omega": positive}
+)
 
 
 def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
@@ -58,8 +49,8 @@ def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
     **Source** Galgani, Giorgilli, Martinoli & Vanzini 1992, *Physica D* 59, 334; Hairer, Lubich
     & Wanner 2006, *Geometric Numerical Integration*, I.5.1 and XIII.2.1, whose start this is.
     """
-    check_count("m", m, 1, "the stiff FPUT chain has centres and lengths of m springs")
-    check_positive({"omega": omega}, "omega")
+    m = whole("m", m, hint="The stiff FPUT chain has centres and lengths of m springs.")
+    omega = positive("omega", omega)
     q0, p0 = np.zeros((2, 2, m))
     q0[:, 0], p0[:, 0] = (1.0, 1 / omega), (1.0, 1.0)
     return Problem(
@@ -68,13 +59,9 @@ def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
         q0=q0,
         p0=p0,
         h=0.5 / omega,
-        args={"omega": float(omega)},
-        observables={
-            "energy": energy,
-            "stiff_energies": stiff_energies,
-            "oscillatory_energy": oscillatory_energy,
-        },
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        args={"omega": omega},
+        observables=named(energy, stiff_energies, oscillatory_energy),
+        units=DIMENSIONLESS,
         source="Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, I.5.1",
         check=check_start,
         parameters={"omega": "frequency of the stiff springs [1/time]"},

@@ -3,9 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 
+from .._checks import whole
 from .._system import System
 from ..discover.library import space_translation, time_translation
-from ._problem import Problem, check_count, check_shape
+from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ._start import Start
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -30,9 +32,7 @@ def lax_matrix(q, p):
     return upper + upper.T - jnp.diag(p) / 2
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """Σ p_i²/2 + Σ exp(q_i − q_{i+1}) at t1: the continuous energy."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def total_momentum(t0, t1, q0, p0, q1, p1, args):
@@ -55,14 +55,7 @@ def lax_eigenvalues(t0, t1, q0, p0, q1, p1, args):
     return jnp.linalg.eigvalsh(lax_matrix(q1, p1))
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not a row of three particles or more, with a `ValueError`."""
-    check_shape(
-        q0,
-        p0,
-        lambda shape: len(shape) == 1 and shape[0] >= 3,
-        "the periodic Toda lattice needs at least three particles: q0 and p0 of shape (n,), n ≥ 3",
-    )
+check_start = Start("the periodic Toda lattice needs at least three particles", (None,), least=3)
 
 
 def toda(n: int = 5) -> Problem:
@@ -75,7 +68,7 @@ def toda(n: int = 5) -> Problem:
     **Source** Toda 1967, *J. Phys. Soc. Japan* 22, 431; integrals: Hénon 1974, *Phys. Rev. B* 9,
     1921, and Flaschka 1974, 1924.
     """
-    check_count("n", n, 3, "the periodic Toda lattice needs at least three particles")
+    n = whole("n", n, 3, hint="The periodic Toda lattice needs at least three particles.")
     angle = 2 * np.pi * np.arange(n) / n
     q0, p0 = np.zeros(n), 0.1 + np.cos(angle) + np.sin(2 * angle) / 2
     return Problem(
@@ -84,13 +77,8 @@ def toda(n: int = 5) -> Problem:
         q0=q0,
         p0=p0,
         h=0.1,
-        observables={
-            "energy": energy,
-            "total_momentum": total_momentum,
-            "lax_traces": lax_traces,
-            "lax_eigenvalues": lax_eigenvalues,
-        },
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        observables=named(energy, total_momentum, lax_traces, lax_eigenvalues),
+        units=DIMENSIONLESS,
         source="Toda 1967, J. Phys. Soc. Japan 22, 431; Flaschka 1974, Phys. Rev. B 9, 1924",
         check=check_start,
         invariants=("energy", "total_momentum", "lax_traces", "lax_eigenvalues"),

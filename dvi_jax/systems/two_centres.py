@@ -5,7 +5,9 @@ import numpy as np
 
 from .._system import System
 from ..discover.library import rotation, time_translation
-from ._problem import Problem, check_finite, check_positive, check_shape
+from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ._start import Start, finite, positive
+from .oblate_kepler import axial_angular_momentum
 
 
 def distances(q, args):
@@ -21,14 +23,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 - args["mu1"] / r1 - args["mu2"] / r2
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """The energy at t1."""
-    return hamiltonian(t0, t1, q1, p1, args)
-
-
-def axial_angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """L_z = x p_y − y p_x at t1, about the line through the centres."""
-    return q1[0] * p1[1] - q1[1] * p1[0]
+energy = at_end(hamiltonian)
 
 
 def euler_integral(t0, t1, q0, p0, q1, p1, args):
@@ -50,22 +45,15 @@ def angular_momentum_squared(t0, t1, q0, p0, q1, p1, args):
     return jnp.sum(jnp.cross(q1, p1) ** 2)
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not in space, or on a centre, with a `ValueError`."""
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (3,),
-        "the problem of two centres is in space: q0 and p0 of shape (3,)",
-    )
-    check_positive(args, "d")
-    check_finite(args, "mu1", "mu2")
-    q = np.asarray(q0, float)
-    for z in (args["d"], -args["d"]):
-        if not (q - [0.0, 0.0, z]).any():
-            raise ValueError(
-                f"the body is on top of the centre at [0, 0, {z}]: the force is infinite."
-            )
+check_start = Start(
+    "the problem of two centres is in space",
+    (3,),
+    {"d": positive, "mu1": finite, "mu2": finite},
+    singular={
+        "the first centre": lambda args: (0.0, 0.0, args["d"]),
+        "the second centre": lambda args: (0.0, 0.0, -args["d"]),
+    },
+)
 
 
 def two_centres() -> Problem:
@@ -81,13 +69,8 @@ def two_centres() -> Problem:
         p0=np.array([0.1, 0.6, 0.5]),
         h=0.02,
         args={"mu1": 1.0, "mu2": 0.6, "d": 0.5},
-        observables={
-            "energy": energy,
-            "axial_angular_momentum": axial_angular_momentum,
-            "euler_integral": euler_integral,
-            "angular_momentum_squared": angular_momentum_squared,
-        },
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        observables=named(energy, axial_angular_momentum, euler_integral, angular_momentum_squared),
+        units=DIMENSIONLESS,
         source="Whittaker 1937, Analytical Dynamics, §53; Erikson & Hill 1949, Phys. Rev. 75, 29",
         check=check_start,
         parameters={

@@ -6,7 +6,8 @@ import numpy as np
 from .._system import System
 from ..discover.generators import Generator
 from ..discover.library import time_translation
-from ._problem import Problem, check_nonzero, check_positive, check_shape, check_vector, over_times
+from ._problem import Problem, at_end, named, over_times
+from ._start import Start, gyrates, positive, vector
 
 
 def vector_potential(q, args):
@@ -25,9 +26,7 @@ def hamiltonian(t0, t1, q0, p1, args):
     return kinetic - args["charge"] * jnp.sum(jnp.asarray(args["E"], q0.dtype) * q0)
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    """m|v|²/2 − e E·q at t1."""
-    return hamiltonian(t0, t1, q1, p1, args)
+energy = at_end(hamiltonian)
 
 
 def drift(args):
@@ -90,20 +89,11 @@ def exact(t, q0, p0, args):
     return jnp.stack([x, y, z]), p
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not in space, fields that are none, or a mass that is not positive.
-
-    **Raises** `ValueError`.
-    """
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (3,),
-        "the field holds one particle in space: q0 and p0 of shape (3,)",
-    )
-    check_positive(args, "mass")
-    check_vector(args, 3, "E")
-    check_nonzero(args, "the particle does not gyrate. Take another system.", "charge", "B")
+check_start = Start(
+    "the field holds one particle in space",
+    (3,),
+    {"mass": positive, "E": vector(3), "charge": gyrates, "B": gyrates},
+)
 
 
 def uniform_field() -> Problem:
@@ -121,12 +111,7 @@ def uniform_field() -> Problem:
         p0=np.array([0.0, -0.5, 0.2]),
         h=0.1,
         args={"charge": 1.0, "mass": 1.0, "B": 1.0, "E": np.array([0.1, 0.0, 0.0])},
-        observables={
-            "energy": energy,
-            "magnetic_moment": magnetic_moment,
-            "pseudomomentum": pseudomomentum,
-            "kinetic_energy": kinetic_energy,
-        },
+        observables=named(energy, magnetic_moment, pseudomomentum, kinetic_energy),
         units={"q": "1", "p": "1", "t": "1/gyrofrequency", "energy": "1"},
         source="Jackson 1999, Classical Electrodynamics, 12.2–12.3",
         check=check_start,

@@ -5,7 +5,8 @@ import numpy as np
 
 from .._system import System
 from ..discover.library import scaling, time_translation
-from ._problem import Problem, check_shape, distance
+from ._problem import DIMENSIONLESS, Problem, named
+from ._start import Start
 from .oscillator import PHASE, energy, exact, hamiltonian
 
 
@@ -19,7 +20,9 @@ def amplitude(t0, t1, q0, p0, q1, p1, args):
 
     Its gradient at the origin, a corner, is put down as zero.
     """
-    return distance(jnp.sum(q1**2) + jnp.sum(p1**2))
+    square = jnp.sum(q1**2) + jnp.sum(p1**2)
+    away = square > 0
+    return jnp.where(away, jnp.sqrt(jnp.where(away, square, 1.0)), 0.0 * square)
 
 
 def averaged_amplitude(t, epsilon, start):
@@ -34,14 +37,7 @@ def averaged_amplitude(t, epsilon, start):
     return 2 / jnp.sqrt(1 + (4 / start**2 - 1) * jnp.exp(-epsilon * jnp.asarray(t)))
 
 
-def check_start(q0, p0, args):
-    """Refuse a start that is not one q and one p, with a `ValueError`."""
-    check_shape(
-        q0,
-        p0,
-        lambda shape: shape == (1,),
-        "Van der Pol's oscillator has one degree of freedom: q0 and p0 of shape (1,)",
-    )
+check_start = Start("Van der Pol's oscillator has one degree of freedom", (1,))
 
 
 def van_der_pol() -> Problem:
@@ -58,8 +54,8 @@ def van_der_pol() -> Problem:
         q0=np.array([0.5]),
         p0=np.array([0.0]),
         h=0.1,
-        observables={"energy": energy, "amplitude": amplitude},
-        units={"q": "1", "p": "1", "t": "1", "energy": "1"},
+        observables=named(energy, amplitude),
+        units=DIMENSIONLESS,
         source="van der Pol 1926, Phil. Mag. 2, 978",
         check=check_start,
         invariants=("energy", "amplitude"),

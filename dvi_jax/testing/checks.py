@@ -217,10 +217,7 @@ def check_gradient(candidate: Candidate) -> Measured:
     return at_most(error[worst], 1e-6, detail=f"worst in {worst}")
 
 
-@check(
-    "modes",
-    "Let `inverse` undo the step to round-off: `Reversible` rebuilds states with it.",
-)
+@check("modes", "Let `inverse` undo the step to round-off: `Reversible` rebuilds states with it.")
 def check_modes(candidate: Candidate) -> Measured:
     """Worst relative difference of a derivative by `Direct`, `Checkpointed` and `Reversible` from
     that by forward mode. At most 1e-10."""
