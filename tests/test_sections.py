@@ -1,6 +1,7 @@
 """Poincaré sections of many orbits, return maps, bifurcation diagrams."""
 
 import functools
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -467,3 +468,17 @@ def test_a_branch_goes_on_after_an_orbit_that_escapes():
     )  # fmt: skip
     assert list(found.status) == ["successful", "failed", "successful"]
     assert np.isfinite(found.qs[2]).all()
+
+
+def test_a_default_that_has_changed_is_said():
+    q, p = starts(2)
+    settings = {"h": 0.1, "num_steps": 40}
+    with pytest.warns(FutureWarning, match=r"used Strang\(\) by default"):
+        dvi.poincare_section(HENON.system, q, p, plane, **settings)
+    with pytest.warns(FutureWarning, match=r"dvi\.Strang\(\) for the results of earlier"):
+        dvi.ReturnMap(HENON.system, plane, **settings)
+    made = dvi.System(dvi.discretise(lambda t, q, p, args: hamiltonian(t, t, q, p, args), order=1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dvi.poincare_section(HENON.system, q, p, plane, **settings, method=dvi.TypeII())
+        dvi.ReturnMap(made, plane, **settings)

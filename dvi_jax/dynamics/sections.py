@@ -1,6 +1,7 @@
 """Poincaré sections, return maps, and what becomes of them as ε grows."""
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -17,13 +18,13 @@ from lanewise.jaxapi import is_traced
 from .._arithmetic import Arithmetic
 from .._checks import finite, positive, whole
 from .._integrate import as_parameter, as_scalar, integrate, start_state
-from .._integrator import Integrator, chosen
+from .._integrator import Integrator, chosen, default_method
 from .._results import RESULTS, status_name
 from .._solution import Save
 from .._system import System, check_system
 from .._types import Args, Scalar, State
 from ..engine.newton import RootSolver
-from ..methods import Method
+from ..methods import Method, Strang
 from ..observe import Section, Stop
 from ..sweep import Axis
 from .results import SECTION_RESULTS, SectionError, WithStatus, judge
@@ -47,6 +48,20 @@ class PoincareSection(WithStatus):
     result: SECTION_RESULTS
     run: RESULTS
     epsilon: Array
+
+
+def _chosen(system: System, integrator: Integrator | None, **given: Any) -> Integrator:
+    """As `chosen`, with a warning where the default is another one than it was."""
+    found = chosen(integrator, **given)
+    if found.method is None and not isinstance(default_method(system), Strang):
+        warnings.warn(
+            "sections used Strang() by default, and now use the default of integrate, which is "
+            "TypeII() for this system. Give method=: dvi.Strang() for the results of earlier "
+            "versions, dvi.TypeII() for the map of H_D itself.",
+            FutureWarning,
+            stacklevel=3,
+        )
+    return found
 
 
 class _Settings(eqx.Module):
@@ -176,8 +191,8 @@ def poincare_section(
             f"q0 and p0 must have the orbits in front, (orbits, …); got shape {q.shape}. Give a "
             "single start as q0[None], p0[None]."
         )
-    integrator = chosen(
-        integrator, method=method, root_finder=newton, arithmetic=arithmetic, layout=layout
+    integrator = _chosen(
+        system, integrator, method=method, root_finder=newton, arithmetic=arithmetic, layout=layout
     )
     section = Section(g, direction, whole("crossings", crossings), skip)
     settings = _Settings(system, section, integrator, stop, whole("num_steps", num_steps))
@@ -243,8 +258,8 @@ def bifurcation(
     """
     check_system(system)
     q, p = start_state(q0, p0)
-    integrator = chosen(
-        integrator, method=method, root_finder=newton, arithmetic=arithmetic, layout=layout
+    integrator = _chosen(
+        system, integrator, method=method, root_finder=newton, arithmetic=arithmetic, layout=layout
     )
     section = Section(g, direction, whole("crossings", crossings), skip)
     settings = _Settings(system, section, integrator, stop, whole("num_steps", num_steps))
@@ -325,7 +340,7 @@ class ReturnMap(eqx.Module):
 
     def __check_init__(self):
         check_system(self.system)
-        chosen(self.integrator, method=self.method, root_finder=self.newton)
+        _chosen(self.system, self.integrator, method=self.method, root_finder=self.newton)
         Section(self.g, self.direction, whole("returns", self.returns))
         whole("num_steps", self.num_steps)
 
