@@ -10,7 +10,8 @@ import numpy as np
 from .._results import STATUS_NAMES
 from .plan import Plan
 from .sinks import Memory
-from .store import STATUS, Store, StoreError, Verification, about_variable
+from .layout import STATUS, about_variable
+from .store import Store, StoreError, Verification
 
 
 class SweepResult:
@@ -74,11 +75,9 @@ class SweepResult:
         if isinstance(self._source, Memory):
             counts += np.bincount(self._source.arrays[STATUS].ravel() + 1, minlength=len(counts))
         else:
-            for number in self._source.done():
-                record = self._source.record(number)
-                if record is not None:
-                    for name, count in record["statuses"].items():
-                        counts[STATUS_NAMES.index(name) + 1] += count
+            for record in self.records():
+                for name, count in record["statuses"].items():
+                    counts[STATUS_NAMES.index(name) + 1] += count
             counts[0] = self._plan.lanes - counts[1:].sum()
         names = ("not_computed", *STATUS_NAMES)
         return {name: int(n) for name, n in zip(names, counts, strict=True) if n}

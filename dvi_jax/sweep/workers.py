@@ -22,7 +22,7 @@ from ..engine.threads import processors
 from .plan import Task
 from .program import Program
 from .sinks import Sink
-from .store import STATUS
+from .layout import STATUS
 
 _PATIENCE = 0.2
 """Seconds between two looks at tasks that another process works on, and at an interrupt."""
