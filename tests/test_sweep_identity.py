@@ -10,7 +10,7 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax.sweep import claims, layout
-from dvi_jax.sweep._sweep import _DEFAULTS, make_sweep, prepare
+from dvi_jax.sweep._sweep import make_sweep, prepare
 from dvi_jax.sweep.identity import description, differences, digest
 
 Q = np.asarray([0.5])
@@ -22,7 +22,7 @@ def oscillator(k=1.0):
 
 def identity(system=None, q0=Q, p0=Q, **kw):
     kw = {"h": 0.1, "num_steps": 5, "t0": [0.0, 1.0], "save": dvi.Save(final=True)} | kw
-    made = make_sweep(system or oscillator(), q0, p0, **_DEFAULTS | kw)
+    made = make_sweep(system or oscillator(), q0, p0, **kw)
     program, found, programs = prepare(made, None)
     return description(made, program.plan, found, programs)
 

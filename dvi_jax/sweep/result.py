@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from .._results import STATUS_NAMES
+from .layout import STATUS, about_variable
 from .plan import Plan
 from .sinks import Memory
-from .layout import STATUS, about_variable
 from .store import Store, StoreError, Verification
 
 
