@@ -809,7 +809,7 @@ def test_a_guess_may_be_given_or_refused(regular):
     energy = dvi.Observations(REGULAR, np.ones(60), lambda t, q, p, a: q[0] ** 2, sigma=1.0, t0=0.0)
     with pytest.raises(ValueError, match=r'"positions" or of the "state"'):
         dvi.fit(MODEL, energy, START, shooting=dvi.MultipleShooting(6, guess="data"))
-    with pytest.raises(ValueError, match="segments must be at least 2"):
+    with pytest.raises(ValueError, match="segments must be a whole number from 2 on"):
         dvi.MultipleShooting(1)
 
 

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._checks import fraction, instance, whole
 from ._fit import fit
 from .losses import LeastSquares, Likelihood, Loss
-from .observations import Observations
+from .observations import Data
 from .parameters import make_space
 from .posterior import Posterior
 from .result import FitResult, with_error
@@ -149,7 +150,7 @@ class Samples:
 
 def sample(
     model: Callable[..., Any],
-    data: Observations | list[Observations] | tuple[Observations, ...],
+    data: Data,
     params: PyTree,
     *,
     bounds: PyTree = None,
@@ -195,8 +196,13 @@ def sample(
     al. 2013, *Bayesian Data Analysis*, 11.4.
     """
     numpyro = _numpyro()
-    _check_counts(num_samples, num_warmup, chains, seed, max_tree_depth)
-    _check_others(target_accept, progress)
+    whole("num_samples", num_samples, 4)
+    whole("num_warmup", num_warmup, 0)
+    whole("chains", chains)
+    whole("seed", seed, 0)
+    whole("max_tree_depth", max_tree_depth)
+    fraction("target_accept", target_accept)
+    instance("progress", progress, bool | None, "True, False or None")
     posterior = Posterior(
         model, data, params, bounds=bounds, priors=priors, loss=loss, gradient=gradient
     )
@@ -249,21 +255,6 @@ def _numpyro() -> Any:
             "(dvi.Posterior does not, for a sampler of your own.)"
         ) from None
     return numpyro
-
-
-def _check_counts(num_samples, num_warmup, chains, seed, max_tree_depth) -> None:
-    least = {"num_samples": 4, "num_warmup": 0, "chains": 1, "seed": 0, "max_tree_depth": 1}
-    given = (num_samples, num_warmup, chains, seed, max_tree_depth)
-    for (name, low), value in zip(least.items(), given, strict=True):
-        if isinstance(value, bool) or not isinstance(value, int) or value < low:
-            raise ValueError(f"{name} must be an integer, at least {low}, got {value!r}.")
-
-
-def _check_others(target_accept: Any, progress: Any) -> None:
-    if not (isinstance(target_accept, int | float) and 0 < target_accept < 1):
-        raise ValueError(f"target_accept must lie between 0 and 1, got {target_accept!r}.")
-    if not (progress is None or isinstance(progress, bool)):
-        raise TypeError(f"progress must be True, False or None, got {progress!r}.")
 
 
 def _shows(progress: bool | None) -> bool:

@@ -159,6 +159,11 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: boo
 
     **Raises** `TypeError` or `ValueError` for a model that returns something else.
     """
+    if not callable(model):
+        raise TypeError(
+            "model must be a dvi.Model or a function of the parameters that returns the arguments "
+            f"of dvi.integrate, got {model!r}."
+        )
     if isinstance(model, Model):
         found = model(params, arc if many else None)
     else:

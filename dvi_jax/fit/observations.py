@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -162,6 +162,10 @@ class Observations:
                 L = np.linalg.cholesky(C[np.ix_(good, good)])
                 found[i][np.ix_(good, good)] = np.linalg.solve(L, np.eye(len(L)))
         return found
+
+
+Data: TypeAlias = Observations | list[Observations] | tuple[Observations, ...]
+"""One arc, or several."""
 
 
 def as_arcs(data: Any) -> tuple[list[Observations], bool]:

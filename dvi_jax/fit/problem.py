@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._checks import instance
 from .._results import RESULTS, status_name
 from .._system import check_system
 from ..engine.reads import Reads, reads
@@ -154,16 +155,8 @@ class Problem:
         priors: PyTree = None,
         loss: Loss | Likelihood = LeastSquares(),
     ):
-        if not callable(model):
-            raise TypeError(
-                "model must be a dvi.Model or a function of the parameters that returns the "
-                f"arguments of dvi.integrate, got {model!r}."
-            )
-        if not isinstance(loss, Loss | Likelihood):
-            raise TypeError(
-                f"loss must be a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or "
-                f"dvi.Likelihood(f), got {loss!r}."
-            )
+        known = "a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or dvi.Likelihood(f)"
+        instance("loss", loss, Loss | Likelihood, known)
         self.given, self.loss = arcs, loss
         self.arcs = arcs = [arc.ordered() for arc in arcs]
         self.space, self.start = make_space(params, bounds, priors)
