@@ -14,7 +14,7 @@ from .._results import RESULTS, status_name
 from .._system import check_system
 from ..engine.reads import Reads, reads
 from .losses import LeastSquares, Likelihood, Loss
-from .model import Group, Model, check_observable, make_groups, predict, specification
+from .model import Group, Model, check_observable, make_groups, predict, specification, weighed
 from .observations import Observations
 from .optimise import Evaluation
 from .parameters import Space, make_space
@@ -210,11 +210,6 @@ class Problem:
         """`Core.whitened`."""
         return _whitened(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
 
-    def residuals(self, u: Any, horizon: Any = np.inf) -> Array:
-        """`Core.residuals`."""
-        rows, _ = self.whitened(u, horizon)
-        return self.core.root_rows(jnp.asarray(u), rows)
-
     def hessian(self, u: Any) -> Array:
         """Exact second derivatives of the loss, (n, n), forward over reverse."""
         return _hessian(self.core, jnp.asarray(u))
@@ -347,5 +342,4 @@ def _within(group: Any, horizon: Any) -> Array:
 def _whiten(group: Any, found: Array, keep: Array) -> Array:
     # First where, then subtract: a trajectory that fails after the horizon leaves no NaN behind.
     off = jnp.where(keep, found - jnp.asarray(group.values), 0.0)
-    whiten = jnp.asarray(group.whiten)
-    return off * whiten if whiten.ndim == 3 else jnp.einsum("anij,anj->ani", whiten, off)
+    return weighed(off, jnp.asarray(group.whiten))

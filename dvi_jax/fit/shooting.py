@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._checks import fraction, whole
 from .._integrate import integrate
 from .._solution import Save
-from .model import make_group, predict
+from .model import make_group, predict, weighed
 from .observations import Observations
 from .optimise import Evaluation
 from .problem import Problem
@@ -173,7 +173,7 @@ class Segments:
         p = jnp.where(first, jnp.asarray(spec["p0"], float), node[self.half :].reshape(self.shape))
         found, (q1, p1), _ = predict({**spec, "q0": q, "p0": p}, t0, ts, pick, self.group)
         off = jnp.where(seen, found - values, 0.0)
-        r = off * whiten if whiten.ndim == 2 else jnp.einsum("nij,nj->ni", whiten, off)
+        r = weighed(off, whiten)
         return problem.core.root(r).ravel(), jnp.concatenate([q1.ravel(), p1.ravel()]) / self.orbit
 
     def _all(self, w: Array):
