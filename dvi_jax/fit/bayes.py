@@ -19,7 +19,6 @@ from .observations import Data
 from .parameters import make_space
 from .posterior import Posterior
 from .result import FitResult, with_error
-from .results import FIT_RESULTS
 from .uncertainty import correlations
 
 _R_HAT = 1.01
@@ -209,11 +208,10 @@ def sample(
     notes: list[str] = []
     if start is None:
         known = posterior._problem.has_errors or isinstance(loss, Likelihood)
-        start = fit(
-            model, data, params, bounds=bounds, priors=priors if known else None, loss=loss,
-            check_curvature=False, progress=False, throw=False,
-        )  # fmt: skip
-    if isinstance(start, FitResult) and not bool(start.result == FIT_RESULTS.converged):
+        of_fit = {"bounds": bounds, "priors": priors if known else None, "loss": loss}
+        quiet = {"check_curvature": False, "progress": False, "throw": False}
+        start = fit(model, data, params, **of_fit, **quiet)
+    if isinstance(start, FitResult) and start.status != "converged":
         notes.append(f"the fit that the chains start from did not converge: {start.status}.")
     mode, root = posterior.laplace(_start_of(posterior, start, bounds, priors))
     centre, L = jnp.asarray(mode), jnp.asarray(root)
@@ -224,10 +222,9 @@ def sample(
     kernel = numpyro.infer.NUTS(
         potential_fn=in_z, target_accept_prob=target_accept, max_tree_depth=max_tree_depth
     )
-    mcmc = numpyro.infer.MCMC(
-        kernel, num_warmup=num_warmup, num_samples=num_samples, num_chains=chains,
-        chain_method="vectorized", progress_bar=_shows(progress),
-    )  # fmt: skip
+    counts = {"num_warmup": num_warmup, "num_samples": num_samples, "num_chains": chains}
+    shows = sys.stderr.isatty() if progress is None else progress
+    mcmc = numpyro.infer.MCMC(kernel, **counts, chain_method="vectorized", progress_bar=shows)
     begin = _starts(in_z, chains, posterior.size, seed)
     with jax.numpy_rank_promotion("allow"):  # numpyro's own arithmetic
         mcmc.run(
@@ -255,10 +252,6 @@ def _numpyro() -> Any:
             "(dvi.Posterior does not, for a sampler of your own.)"
         ) from None
     return numpyro
-
-
-def _shows(progress: bool | None) -> bool:
-    return sys.stderr.isatty() if progress is None else progress
 
 
 def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -> np.ndarray:
@@ -321,9 +314,8 @@ def _collect(
 
 def _doubts(found: Samples, longest: int) -> list[str]:
     notes = []
-    worst = sorted((n for n, r in found.r_hat.items() if not r <= _R_HAT),
-                   key=lambda n: -np.nan_to_num(found.r_hat[n], nan=np.inf))  # fmt: skip
-    if worst:
+    off = {n: np.nan_to_num(r, nan=np.inf) for n, r in found.r_hat.items() if not r <= _R_HAT}
+    if worst := sorted(off, key=lambda n: -off[n]):
         shown = ", ".join(f"{n} {found.r_hat[n]:.3f}" for n in worst[:4])
         notes.append(
             f"the chains do not agree: R̂ is above {_R_HAT} for {len(worst)} of {len(found.names)} "

@@ -123,10 +123,9 @@ class Elimination:
 
     def _minimum(self, u: np.ndarray, keep: np.ndarray):
         degrees = self.problem.count - int(keep.sum())
-        return self.stage.run(
-            u, np.inf, stage=0, max_steps=_REFIT, tolerance=_PRECISE, degrees=degrees,
-            extra=jnp.asarray(keep), watch=lambda record, position: None,
-        )  # fmt: skip
+        of_stage: dict[str, Any] = {"stage": 0, "max_steps": _REFIT, "watch": lambda *_: None}
+        of_stage |= {"tolerance": _PRECISE, "degrees": degrees, "extra": jnp.asarray(keep)}
+        return self.stage.run(u, np.inf, **of_stage)
 
     def _of_data(self, found: Evaluation) -> np.ndarray:
         """The Jacobian without the guard of the coefficients."""

@@ -75,7 +75,7 @@ class Identification:
         width = max((len(name) for name in self.terms), default=0)
         for name, c, s in zip(self.terms, self.coefficients, self.sigma, strict=True):
             lines.append(f"  {name:{width}}  {with_error(float(c), float(s))}")
-        lines += self._path_in_words()
+        lines.append(self._path_in_words())
         for name, others in self.alternatives.items():
             these = ", ".join(f"{other} (criterion {rise:+.2g})" for other, rise in others)
             lines.append(f"not unique: in place of {name} the data allow {these}")
@@ -89,16 +89,12 @@ class Identification:
 
     __repr__ = __str__
 
-    def _path_in_words(self) -> list[str]:
+    def _path_in_words(self) -> str:
         """Where the criterion was least, and what the next removal would have cost."""
         at = next(i for i, step in enumerate(self.path) if step.terms == self.terms)
-        words = [
-            f"criterion {self.path[0].criterion:.6g} with all, {self.path[at].criterion:.6g} here"
-        ]
-        if at + 1 < len(self.path):
-            after = self.path[at + 1]
-            words[0] += f", {after.criterion:.6g} without {after.removed}"
-        return words
+        all_terms, here, *after = self.path[0], *self.path[at : at + 2]
+        words = f"criterion {all_terms.criterion:.6g} with all, {here.criterion:.6g} here"
+        return words + "".join(f", {a.criterion:.6g} without {a.removed}" for a in after)
 
 
 def identify(
@@ -162,53 +158,45 @@ def identify(
     params = {} if params is None else params
     _check_input(library, params, bounds, priors, loss, penalty)
     arcs, many = as_arcs(data)
-    common: dict[str, Any] = {
-        "bounds": bounds, "priors": priors, "loss": loss, "tolerance": tolerance,
-        "check_units": check_units,
-        "progress": progress,
-    }  # fmt: skip
     whole = _extended(model, library, many, params)
     start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
     weighed = [_with_errors(arc) for arc in arcs]
     guard = _guard(Problem(whole, weighed, many, start, bounds=bounds, loss=loss), library)
-    held = {**common, "priors": {**(priors or {}), KEY: guard}}
-    full = None
+    held = {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
+    common: dict[str, Any] = {"tolerance": tolerance, "max_steps": max_steps}
+    common |= {"check_units": check_units, "progress": progress}
+    first = {**common, **held, "shooting": shooting, "check_curvature": False, "throw": False}
+    full: Any = None
     for through in (horizons, None):
         # What fits the beginning may run away later; without a force nothing does.
-        full = fit(
-            whole, weighed if many else weighed[0], start, shooting=shooting, horizons=through,
-            max_steps=max_steps, check_curvature=False, throw=False, **held,
-        )  # fmt: skip
-        if not bool(full.result == FIT_RESULTS.not_finite):
+        full = fit(whole, weighed if many else weighed[0], start, horizons=through, **first)
+        if full.status != "not_finite":
             break
-    assert full is not None
-    if bool(full.result == FIT_RESULTS.not_finite):
+    else:
         raise FitError(f"the fit of all candidates failed. {FIT_RESULTS[full.result]}", full)
-    problem = Problem(
-        whole, weighed, many, full.params, bounds=bounds, priors=held["priors"], loss=loss
-    )
+    problem = Problem(whole, weighed, many, full.params, **held)
     search = Elimination(problem, library, penalty, arcs[0].has_errors)
     search.eliminate()
     terms = search.terms
     best: Any = problem.space.to_params(problem.space.to_x(jnp.asarray(search.best)))
     params = {**best, KEY: {name: best[KEY][name] for name in terms}}
-    found = None
+    found, c, sigma = None, np.zeros(0), np.zeros(0)
     if terms or set(params) != {KEY}:
-        # With the terms that are left, through the front door: errors, residuals, statuses.
-        found = fit(
-            whole, data, params, horizons=None, check_curvature=check_curvature, throw=throw,
-            max_steps=max_steps, **common,
-        )  # fmt: skip
-    c, sigma = _numbers(found, terms)
-    given = found.params if found is not None else params
-    spec = whole.known({k: v for k, v in given.items() if k != KEY}, 0)
+        # With the terms that are left, by `fit` itself: errors, residuals, statuses.
+        common |= {"bounds": bounds, "priors": priors, "loss": loss, "horizons": None}
+        found = fit(whole, data, params, **common, check_curvature=check_curvature, throw=throw)
+        params = found.params
+    if terms:
+        assert found is not None
+        at = [found.names.index(f"{KEY}.{name}") for name in terms]
+        c, sigma = found.x[at], found.sigma[at]
+    spec = whole.known({k: v for k, v in params.items() if k != KEY}, 0)
     system = spec["system"]
     if terms:
         system = with_force(system, library.only(terms).with_coefficients(c))
-    return Identification(
-        terms, c, sigma, system, spec["epsilon"], search.path, search.penalty,
-        search.alternatives(), search.undetermined, found, full,
-    )  # fmt: skip
+    force = terms, c, sigma, system, spec["epsilon"]
+    about = search.path, search.penalty, search.alternatives(), search.undetermined
+    return Identification(*force, *about, found, full)
 
 
 def _check_input(library: Any, params: Any, bounds: Any, priors: Any, loss: Any, penalty: Any):
@@ -295,9 +283,7 @@ def _guard(problem: Problem, library: ForceLibrary) -> dict[str, Prior]:
     where = places(problem, library)
     u = problem.space.to_u(problem.start)
     J = np.asarray(problem.evaluate(u).jacobian)[: -problem.size, where]
-    values = [arc.whitening() * np.nan_to_num(arc.values.reshape(len(arc.ts), -1)) if
-              arc.covariance is None else np.ones((1, 1)) for arc in problem.arcs]  # fmt: skip
-    size = max(float(np.sqrt(np.mean(v**2))) for v in values)
+    size = max(float(np.sqrt(np.mean(_in_errors(arc) ** 2))) for arc in problem.arcs)
     effect = np.sqrt(np.mean(J**2, axis=0))
     # No finite effect: no candidate of this kind, of which the fit itself will tell.
     good = np.isfinite(effect) & (effect > 0) & (size > 0)
@@ -305,9 +291,8 @@ def _guard(problem: Problem, library: ForceLibrary) -> dict[str, Prior]:
     return {name: Prior(0.0, float(x)) for name, x in zip(library.names, sigma, strict=True)}
 
 
-def _numbers(found: FitResult | None, terms: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients of the terms and their standard errors."""
-    if found is None or not terms:
-        return np.zeros(0), np.zeros(0)
-    at = np.array([found.names.index(f"{KEY}.{name}") for name in terms])
-    return found.x[at], found.sigma[at]
+def _in_errors(arc: Observations) -> np.ndarray:
+    """Values over their standard errors; 1 where these are covariances."""
+    if arc.covariance is not None:
+        return np.ones((1, 1))
+    return arc.whitening() * np.nan_to_num(arc.values.reshape(len(arc.ts), -1))

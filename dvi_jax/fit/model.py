@@ -227,12 +227,7 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
         key = (arc.function, arc.values.shape[1:], arc.covariance is not None, size, spec["h"])
         kinds.setdefault(key, []).append(i)
     return [
-        make_group(
-            those,
-            [arcs[i] for i in those],
-            specs[those[0]],
-            max(steps[i] for i in those),
-        )
+        make_group(those, [arcs[i] for i in those], specs[those[0]], max(steps[i] for i in those))
         for those in kinds.values()
     ]
 

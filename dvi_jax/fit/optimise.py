@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -202,12 +202,10 @@ class LeastSquaresStage:
             elif rejected >= _HOPELESS or (rejected >= 3 and moved <= least):
                 flat = _undamped(best, scale) <= max(_FLAT * spread, least)
                 status = "converged" if flat else "stalled"
-            position = Position(
-                stage, horizon, done, base, scale, np.asarray(z), _leaves(state), _leaves(extra),
-                (rejected, last, still), status,
-            )  # fmt: skip
+            at = replace(at, done=done, z=np.asarray(z), status=status)
+            at.leaves, at.extra, at.memory = _leaves(state), _leaves(extra), (rejected, last, still)
             in_sigma = moved / spread if spread else 0.0
-            watch(Record(stage, horizon, loss, in_sigma, accepted, u), position)
+            watch(Record(stage, horizon, loss, in_sigma, accepted, u), at)
         return u, best, getattr(FIT_RESULTS, status or "max_steps_reached")
 
 
@@ -306,11 +304,9 @@ class ScalarStage:
                     status = "converged"
                 elif rejected >= _HOPELESS_LINE:
                     status = "stalled"
-            position = Position(
-                stage, horizon, done, np.asarray(base), np.asarray(size), np.asarray(z),
-                _leaves(state), [], (last, still, rejected), status,
-            )  # fmt: skip
-            watch(Record(stage, horizon, loss * self.per, moved, bool(moved > 0), x), position)
+            at = replace(at, done=done, z=np.asarray(z), status=status)
+            at.leaves, at.memory = _leaves(state), (last, still, rejected)
+            watch(Record(stage, horizon, loss * self.per, moved, bool(moved > 0), x), at)
         usual = "steps_done" if is_optax else "max_steps_reached"
         return np.asarray(base + size * z), getattr(FIT_RESULTS, status or usual)
 

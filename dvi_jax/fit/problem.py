@@ -52,10 +52,8 @@ class Core(eqx.Module):
             return found, result
 
         pick = None if group.pick is None else jnp.asarray(group.pick)[which]
-        return jax.vmap(one, in_axes=(0, 0, 0, None if pick is None else 0))(
-            jnp.asarray(group.arcs)[which], jnp.asarray(group.t0)[which],
-            jnp.asarray(group.ts)[which], pick,
-        )  # fmt: skip
+        of_arcs = (jnp.asarray(x)[which] for x in (group.arcs, group.t0, group.ts))
+        return jax.vmap(one, in_axes=(0, 0, 0, None if pick is None else 0))(*of_arcs, pick)
 
     def whitened(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
         """Residuals predicted − observed in standard errors, (A, N, K) for each group, zero for
@@ -276,9 +274,9 @@ class Problem:
                 f"factor of {data / largest:.3g}. Are they in the same units? If this is "
                 "intended, use check_units=False."
             )
-        group, size = next((g, s) for (g, _), s in zip(pairs, own, strict=True)
-                           if (s >= _UNITS * data).any())  # fmt: skip
-        a, row = np.argwhere(size >= _UNITS * data)[0]
+        large, each = _UNITS * data, zip(self.groups, own, strict=True)
+        group, size = next((g, s) for g, s in each if (s >= large).any())
+        a, row = np.argwhere(size >= large)[0]
         arc = int(group.arcs[a])
         raise ValueError(
             f"{about}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g} (at its start, "

@@ -150,10 +150,8 @@ class Segments:
         elif guess == "data":
             found = from_data(arc, spec, times)
         else:
-            sol = integrate(
-                **{**spec, "t0": arc.t0, "num_steps": self.steps * len(times)},
-                save=Save(every=self.steps), throw=False,
-            )  # fmt: skip
+            steps = {"num_steps": self.steps * len(times), "save": Save(every=self.steps)}
+            sol = integrate(**{**spec, **steps, "t0": arc.t0, "throw": False})
             flat = (np.asarray(x[:-1]).reshape(len(times), -1) for x in (sol.qs, sol.ps))
             found = np.concatenate(list(flat), axis=1)
         if not np.isfinite(found).all():

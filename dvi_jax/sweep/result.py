@@ -110,21 +110,17 @@ class SweepResult:
         are not done are masked."""
         import xarray as xr
 
-        data, units = {}, json.loads(self.attributes.get("units", "{}"))
-        if isinstance(self._source, Memory):
-            for name, v in self._source.variables.items():
-                dims = (*self.dims, *v.dims)
-                data[name] = (dims, self._source.arrays[name], about_variable(name, units))
-        else:
-            from .lazy import masked
+        from .lazy import masked
 
-            for name, v in self._source.variables.items():
-                dims = (*self.dims, *v.dims)
+        data, units = {}, json.loads(self.attributes.get("units", "{}"))
+        for name, v in self._source.variables.items():
+            dims, about = (*self.dims, *v.dims), about_variable(name, units)
+            if isinstance(self._source, Memory):
+                data[name] = xr.Variable(dims, self._source.arrays[name], about)
+            else:
                 chunks = dict(zip(dims, (*self._plan.chunk, *v.shape), strict=True))
-                data[name] = xr.Variable(
-                    dims, masked(self._source, name), about_variable(name, units),
-                    {"preferred_chunks": chunks},
-                )  # fmt: skip
+                array = masked(self._source, name)
+                data[name] = xr.Variable(dims, array, about, {"preferred_chunks": chunks})
         coords = {
             name: xr.Variable(dims, values, about)
             for name, (dims, values, about) in self._coordinates.items()
