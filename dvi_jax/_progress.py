@@ -52,7 +52,8 @@ def bar_of(
         behind = (TextColumn(f"{{task.fields[{text}]}}") for text in texts)
         first = TextColumn("{task.description}"), BarColumn()
         with Progress(*first, *behind, console=console) as shown:
-            task = shown.add_task(name, total=None, **dict.fromkeys(texts, ""))
+            empty: dict[str, Any] = dict.fromkeys(texts, "")
+            task = shown.add_task(name, total=None, **empty)
             yield lambda progress: shown.update(task, **columns(progress))
 
     return bar

@@ -209,7 +209,7 @@ def sample(
     if start is None:
         known = posterior._problem.has_errors or isinstance(loss, Likelihood)
         of_fit = {"bounds": bounds, "priors": priors if known else None, "loss": loss}
-        quiet = {"check_curvature": False, "progress": False, "throw": False}
+        quiet: dict[str, Any] = {"check_curvature": False, "progress": False, "throw": False}
         start = fit(model, data, params, **of_fit, **quiet)
     if isinstance(start, FitResult) and start.status != "converged":
         notes.append(f"the fit that the chains start from did not converge: {start.status}.")

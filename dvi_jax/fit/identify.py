@@ -179,18 +179,18 @@ def identify(
     search.eliminate()
     terms = search.terms
     best: Any = problem.space.to_params(problem.space.to_x(jnp.asarray(search.best)))
-    params = {**best, KEY: {name: best[KEY][name] for name in terms}}
+    given: Any = {**best, KEY: {name: best[KEY][name] for name in terms}}
     found, c, sigma = None, np.zeros(0), np.zeros(0)
-    if terms or set(params) != {KEY}:
+    if terms or set(given) != {KEY}:
         # With the terms that are left, by `fit` itself: errors, residuals, statuses.
         common |= {"bounds": bounds, "priors": priors, "loss": loss, "horizons": None}
-        found = fit(whole, data, params, **common, check_curvature=check_curvature, throw=throw)
-        params = found.params
+        found = fit(whole, data, given, **common, check_curvature=check_curvature, throw=throw)
+        given = found.params
     if terms:
         assert found is not None
         at = [found.names.index(f"{KEY}.{name}") for name in terms]
         c, sigma = found.x[at], found.sigma[at]
-    spec = whole.known({k: v for k, v in params.items() if k != KEY}, 0)
+    spec = whole.known({k: v for k, v in given.items() if k != KEY}, 0)
     system = spec["system"]
     if terms:
         system = with_force(system, library.only(terms).with_coefficients(c))

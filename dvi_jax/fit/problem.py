@@ -52,8 +52,8 @@ class Core(eqx.Module):
             return found, result
 
         pick = None if group.pick is None else jnp.asarray(group.pick)[which]
-        of_arcs = (jnp.asarray(x)[which] for x in (group.arcs, group.t0, group.ts))
-        return jax.vmap(one, in_axes=(0, 0, 0, None if pick is None else 0))(*of_arcs, pick)
+        i, t0, ts = (jnp.asarray(x)[which] for x in (group.arcs, group.t0, group.ts))
+        return jax.vmap(one, in_axes=(0, 0, 0, None if pick is None else 0))(i, t0, ts, pick)
 
     def whitened(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
         """Residuals predicted − observed in standard errors, (A, N, K) for each group, zero for

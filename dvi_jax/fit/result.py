@@ -217,7 +217,9 @@ class FitResult:
                 f"the fit in {path} has the parameters {about['names'][:5]}…, not "
                 f"{space.names[:5]}…."
             )
-        by_arc = {n: [arrays[f"{n}.{i}"] for i in range(about["arcs"])] for n in _BY_ARC}
+        by_arc: dict[str, Any] = {
+            n: [arrays[f"{n}.{i}"] for i in range(about["arcs"])] for n in _BY_ARC
+        }
         return cls(
             params=space.to_params(jnp.asarray(arrays["x"])),
             x=arrays["x"],

@@ -58,9 +58,9 @@ class SweepCost:
         """The same with another number of trajectories, in tasks of the same size."""
         factor = lanes / self.lanes
         tasks = max(1, -(-int(lanes) // self.lanes_per_task))
-        steps, bytes, files = self.steps * factor, self.bytes * factor, tasks * (self.variables + 1)
-        changed = {"steps": int(steps), "bytes": int(bytes), "files": files, "tasks": tasks}
-        return dataclasses.replace(self, dims={}, lanes=int(lanes), **changed)
+        changed = {"steps": int(self.steps * factor), "bytes": int(self.bytes * factor)}
+        changed |= {"lanes": int(lanes), "tasks": tasks, "files": tasks * (self.variables + 1)}
+        return dataclasses.replace(self, dims={}, **changed)
 
     def table(
         self, lanes: Sequence[float] = (1e6, 1e9, 1e12), workers: Sequence[int] = (1, 64, 4096)
