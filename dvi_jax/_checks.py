@@ -31,6 +31,13 @@ def positive(name: str, value: Any, zero: bool = False, hint: str = "") -> float
     return float(value)
 
 
+def fraction(name: str, value: Any) -> float:
+    """A number between 0 and 1, both excluded. **Raises** `ValueError`."""
+    if not _is_number(value) or not 0 < value < 1:
+        raise ValueError(f"{name} must lie between 0 and 1, got {value!r}.")
+    return float(value)
+
+
 def finite(name: str, value: Any, hint: str = "") -> float:
     """A finite number. **Raises** `ValueError`."""
     if not _is_number(value) or not math.isfinite(value):

@@ -21,3 +21,12 @@ def refuse_double_without_x64(name: str, dtype: Any) -> None:
             'precision: put\n    jax.config.update("jax_enable_x64", True)\nbefore the first '
             f"array is made. If float32 is meant, say so: {name} as jnp.float32."
         )
+
+
+def require_double(what: str) -> None:
+    """**Raises** `ValueError` in a process that computes in float32: `what` needs more."""
+    if not x64_enabled():
+        raise ValueError(
+            f'{what} needs double precision: put\n    jax.config.update("jax_enable_x64", True)\n'
+            "before the first array is made."
+        )

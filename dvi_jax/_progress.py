@@ -1,7 +1,7 @@
 """Who is told how far a long call is: the user's function, a bar, or nobody."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
@@ -35,3 +35,25 @@ def told(
     if progress is None and not (console.is_terminal or console.is_jupyter):
         return nullcontext(None)
     return bar(console)
+
+
+def bar_of(
+    name: str, texts: Sequence[str], columns: Callable[[T], dict[str, Any]]
+) -> Callable[[Any], AbstractContextManager[Callable[[T], None]]]:
+    """A bar for `told`, followed by texts.
+
+    - `columns`: of a progress: what rich's ``Progress.update`` takes, `texts` among it.
+    """
+
+    @contextmanager
+    def bar(console: Any) -> Iterator[Callable[[T], None]]:
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        behind = (TextColumn(f"{{task.fields[{text}]}}") for text in texts)
+        first = TextColumn("{task.description}"), BarColumn()
+        with Progress(*first, *behind, console=console) as shown:
+            empty: dict[str, Any] = dict.fromkeys(texts, "")
+            task = shown.add_task(name, total=None, **empty)
+            yield lambda progress: shown.update(task, **columns(progress))
+
+    return bar

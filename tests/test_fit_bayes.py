@@ -419,7 +419,7 @@ ONE = dvi.Observations([0.0], np.zeros((1, 1)), sigma=0.1)
             ValueError,
             "and the size of the errors, cannot follow from 2",
         ),
-        (lambda: dvi.Posterior(LINE, ONE, PAIR, gradient="both"), ValueError, '"reverse" or'),
+        (lambda: dvi.Posterior(LINE, ONE, PAIR, gradient="both"), ValueError, "'forward', got"),
         (lambda: dvi.Posterior(LINE, np.ones(3), PAIR), TypeError, "dvi.Observations"),
         (
             lambda: dvi.Posterior(LINE, on_a_line(None), PAIR, loss=dvi.SoftL1()),
@@ -429,7 +429,7 @@ ONE = dvi.Observations([0.0], np.zeros((1, 1)), sigma=0.1)
         (
             lambda: dvi.sample(LINE, on_a_line(), PAIR, num_samples=2),
             ValueError,
-            "num_samples must be an integer, at least 4, got 2",
+            "num_samples must be a whole number from 4 on, got 2",
         ),
         (lambda: dvi.sample(LINE, on_a_line(), PAIR, chains=0), ValueError, "chains must be"),
         (

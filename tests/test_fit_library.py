@@ -234,7 +234,7 @@ Q, P = jnp.array([0.7]), jnp.array([0.1])
 @pytest.mark.parametrize(
     ("make", "error", "match"),
     [
-        (lambda: dvi.ForceLibrary([Q]), TypeError, "takes a dict"),
+        (lambda: dvi.ForceLibrary([Q]), TypeError, "must be a dict"),
         (lambda: dvi.ForceLibrary({}), ValueError, "at least one"),
         (lambda: dvi.ForceLibrary({1: H_D}), TypeError, "must be a string"),
         (lambda: dvi.ForceLibrary({"f": lambda q: q}), TypeError, "'f' must be a function"),
@@ -272,7 +272,7 @@ FORCED = dvi.System(H_D, force=lambda t0, t1, q, p, args: -q)
         ({"params": {"coefficients": 0.0}}, ValueError, "follow from the library"),
         ({"params": [1.0]}, TypeError, "must be a dict"),
         ({"params": {"epsilon": 0.1}}, ValueError, "only their product"),
-        ({"penalty": 0.0}, ValueError, "penalty must be positive|positive number"),
+        ({"penalty": 0.0}, ValueError, "penalty must be a positive"),
         ({"loss": dvi.Likelihood(lambda *a: 0.0)}, TypeError, "by residuals"),
         ({"model": 3}, TypeError, "model must be"),
         ({"model": dvi.Model(FORCED, h=H, q0=[1.0], p0=[0.0])}, ValueError, "epsilon = 0"),

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax.sweep import store as stores
-from dvi_jax.sweep._sweep import _DEFAULTS, make_sweep, prepare
+from dvi_jax.sweep import claims, layout
+from dvi_jax.sweep._sweep import make_sweep, prepare
 from dvi_jax.sweep.identity import description, differences, digest
 
 Q = np.asarray([0.5])
@@ -22,7 +22,7 @@ def oscillator(k=1.0):
 
 def identity(system=None, q0=Q, p0=Q, **kw):
     kw = {"h": 0.1, "num_steps": 5, "t0": [0.0, 1.0], "save": dvi.Save(final=True)} | kw
-    made = make_sweep(system or oscillator(), q0, p0, **_DEFAULTS | kw)
+    made = make_sweep(system or oscillator(), q0, p0, **kw)
     program, found, programs = prepare(made, None)
     return description(made, program.plan, found, programs)
 
@@ -235,7 +235,7 @@ def test_a_file_system_without_locks(tmp_path, monkeypatch):
     def lockf(*_):
         raise OSError(errno.ENOSYS, "Function not implemented")
 
-    monkeypatch.setattr(stores.fcntl, "lockf", lockf)
+    monkeypatch.setattr(claims.fcntl, "lockf", lockf)
     with pytest.warns(UserWarning, match="tasks cannot be claimed here"):
         assert small(tmp_path / "s.zarr").is_complete
 
@@ -255,8 +255,8 @@ def test_places(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_sizes_without_divisors_are_not_crumbled():
-    variable = stores.Variable("float64", (30,), ("x",))
-    inner = stores._layout((32749,), variable)["chunks"]
-    assert np.prod(inner) * 8 > stores._CHUNK_BYTES / 16
-    inner = stores._layout((2**15, 4), variable)["chunks"]
-    assert np.prod(inner) * 8 <= stores._CHUNK_BYTES
+    variable = layout.Variable("float64", (30,), ("x",))
+    inner = layout.layout((32749,), variable)["chunks"]
+    assert np.prod(inner) * 8 > layout.CHUNK_BYTES / 16
+    inner = layout.layout((2**15, 4), variable)["chunks"]
+    assert np.prod(inner) * 8 <= layout.CHUNK_BYTES

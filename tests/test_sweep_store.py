@@ -23,7 +23,7 @@ import xarray as xr
 from sweep_child import sweep
 
 import dvi_jax as dvi
-from dvi_jax.sweep import store as stores
+from dvi_jax.sweep import claims, store as stores
 from dvi_jax.sweep.identity import digest
 from dvi_jax.sweep.store import Store
 
@@ -492,10 +492,10 @@ def test_a_store_of_another_format(copy):
 
 def test_claims_exclude_threads_and_end_with_the_context(tmp_path):
     file = tmp_path / "claims"
-    with stores._claim(file, 3) as first, stores._claim(file, 3) as again, \
-            stores._claim(file, 4) as other:  # fmt: skip
+    claim = claims.claim
+    with claim(file, 3) as first, claim(file, 3) as again, claim(file, 4) as other:
         assert (first, again, other) == (True, False, True)
-    with stores._claim(file, 3) as later:
+    with claim(file, 3) as later:
         assert later
 
 

@@ -2,11 +2,7 @@
 
 from ._fit import fit as fit
 from .bayes import Samples as Samples, sample as sample
-from .identify import (
-    Identification as Identification,
-    Removal as Removal,
-    identify as identify,
-)
+from .identify import Identification as Identification, Removal as Removal, identify as identify
 from .library import ForceLibrary as ForceLibrary
 from .losses import (
     Cauchy as Cauchy,

@@ -1,4 +1,4 @@
-"""The front door: parameters of a model from observations."""
+"""`fit`: parameters of a model from observations."""
 
 import os
 import time
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import PyTree
 
-from lanewise.jaxapi import x64_enabled
-
+from .._checks import fraction, instance, whole
+from .._precision import require_double
 from .losses import LeastSquares, Likelihood, Loss
-from .observations import Observations, as_arcs
+from .observations import Data, as_arcs
 from .outcome import result_of
 from .problem import Problem
 from .progress import FitProgress, shown
@@ -26,7 +26,7 @@ from .stages import MANY, by_gradient, in_segments, least_squares
 
 def fit(
     model: Callable[..., Any],
-    data: Observations | list[Observations] | tuple[Observations, ...],
+    data: Data,
     params: PyTree,
     *,
     bounds: PyTree = None,
@@ -103,28 +103,24 @@ def fit(
     ```
     """
     began = time.monotonic()
-    if not x64_enabled():
-        raise ValueError(
-            'a fit needs double precision: put\n    jax.config.update("jax_enable_x64", True)\n'
-            "before the first array is made."
-        )
+    require_double("a fit")
     arcs, many = as_arcs(data)
     problem = Problem(model, arcs, many, params, bounds=bounds, priors=priors, loss=loss)
-    if not isinstance(shooting, SingleShooting | MultipleShooting):
-        raise TypeError(
-            f"shooting must be a dvi.SingleShooting() or a dvi.MultipleShooting(n): {shooting!r}."
-        )
-    steps = 2000 if max_steps is None else max_steps
+    kinds = SingleShooting | MultipleShooting
+    instance("shooting", shooting, kinds, "a dvi.SingleShooting() or a dvi.MultipleShooting(n)")
+    if max_steps is not None:
+        whole("max_steps", max_steps)
+    fraction("tolerance", tolerance)
     is_residuals = isinstance(problem.loss, Loss)
-    enough = steps if isinstance(steps, int) else 2000
-    solver = solver_for(optimiser, is_residuals, problem.size > MANY, enough)
-    is_optax = goes_by_optax(solver)
-    is_vector = is_gauss_newton(solver)
+    solver = solver_for(optimiser, is_residuals, problem.size > MANY, max_steps or 2000)
+    is_optax, is_vector = goes_by_optax(solver), is_gauss_newton(solver)
     if not is_optax:
         problem.check_count()
-    if max_steps is None:
-        max_steps = 2000 if is_optax else 200
-    _check_options(max_steps, tolerance, batch, is_optax)
+    max_steps = max_steps or (2000 if is_optax else 200)
+    if batch is not None:
+        whole("batch", batch)
+        if not is_optax:
+            raise ValueError("batch is for a stochastic optimiser, such as optax.adam(1e-3).")
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError("multiple shooting goes with least squares and their solvers alone.")
     wanted = _horizons(horizons)
@@ -150,19 +146,6 @@ def fit(
         "with its status; here it is the `fit` attribute of this error.",
         found,
     )
-
-
-def _check_options(max_steps: Any, tolerance: Any, batch: Any, is_optax: bool) -> None:
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-        raise ValueError(f"max_steps must be a positive integer, got {max_steps!r}.")
-    if not (isinstance(tolerance, int | float) and 0 < tolerance < 1):
-        raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance!r}.")
-    if batch is None:
-        return
-    if not is_optax:
-        raise ValueError("batch goes with a stochastic optimiser: optimiser=optax.adam(1e-3), say.")
-    if isinstance(batch, bool) or not isinstance(batch, int) or batch < 1:
-        raise ValueError(f"batch must be a positive integer, got {batch!r}.")
 
 
 def _horizons(horizons: Any) -> list[float] | None:

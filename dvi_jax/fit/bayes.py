@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._checks import fraction, instance, whole
 from ._fit import fit
 from .losses import LeastSquares, Likelihood, Loss
-from .observations import Observations
+from .observations import Data
 from .parameters import make_space
 from .posterior import Posterior
 from .result import FitResult, with_error
-from .results import FIT_RESULTS
 from .uncertainty import correlations
 
 _R_HAT = 1.01
@@ -149,7 +149,7 @@ class Samples:
 
 def sample(
     model: Callable[..., Any],
-    data: Observations | list[Observations] | tuple[Observations, ...],
+    data: Data,
     params: PyTree,
     *,
     bounds: PyTree = None,
@@ -195,19 +195,23 @@ def sample(
     al. 2013, *Bayesian Data Analysis*, 11.4.
     """
     numpyro = _numpyro()
-    _check_counts(num_samples, num_warmup, chains, seed, max_tree_depth)
-    _check_others(target_accept, progress)
+    whole("num_samples", num_samples, 4)
+    whole("num_warmup", num_warmup, 0)
+    whole("chains", chains)
+    whole("seed", seed, 0)
+    whole("max_tree_depth", max_tree_depth)
+    fraction("target_accept", target_accept)
+    instance("progress", progress, bool | None, "True, False or None")
     posterior = Posterior(
         model, data, params, bounds=bounds, priors=priors, loss=loss, gradient=gradient
     )
     notes: list[str] = []
     if start is None:
         known = posterior._problem.has_errors or isinstance(loss, Likelihood)
-        start = fit(
-            model, data, params, bounds=bounds, priors=priors if known else None, loss=loss,
-            check_curvature=False, progress=False, throw=False,
-        )  # fmt: skip
-    if isinstance(start, FitResult) and not bool(start.result == FIT_RESULTS.converged):
+        of_fit = {"bounds": bounds, "priors": priors if known else None, "loss": loss}
+        quiet: dict[str, Any] = {"check_curvature": False, "progress": False, "throw": False}
+        start = fit(model, data, params, **of_fit, **quiet)
+    if isinstance(start, FitResult) and start.status != "converged":
         notes.append(f"the fit that the chains start from did not converge: {start.status}.")
     mode, root = posterior.laplace(_start_of(posterior, start, bounds, priors))
     centre, L = jnp.asarray(mode), jnp.asarray(root)
@@ -218,10 +222,9 @@ def sample(
     kernel = numpyro.infer.NUTS(
         potential_fn=in_z, target_accept_prob=target_accept, max_tree_depth=max_tree_depth
     )
-    mcmc = numpyro.infer.MCMC(
-        kernel, num_warmup=num_warmup, num_samples=num_samples, num_chains=chains,
-        chain_method="vectorized", progress_bar=_shows(progress),
-    )  # fmt: skip
+    counts = {"num_warmup": num_warmup, "num_samples": num_samples, "num_chains": chains}
+    shows = sys.stderr.isatty() if progress is None else progress
+    mcmc = numpyro.infer.MCMC(kernel, **counts, chain_method="vectorized", progress_bar=shows)
     begin = _starts(in_z, chains, posterior.size, seed)
     with jax.numpy_rank_promotion("allow"):  # numpyro's own arithmetic
         mcmc.run(
@@ -249,25 +252,6 @@ def _numpyro() -> Any:
             "(dvi.Posterior does not, for a sampler of your own.)"
         ) from None
     return numpyro
-
-
-def _check_counts(num_samples, num_warmup, chains, seed, max_tree_depth) -> None:
-    least = {"num_samples": 4, "num_warmup": 0, "chains": 1, "seed": 0, "max_tree_depth": 1}
-    given = (num_samples, num_warmup, chains, seed, max_tree_depth)
-    for (name, low), value in zip(least.items(), given, strict=True):
-        if isinstance(value, bool) or not isinstance(value, int) or value < low:
-            raise ValueError(f"{name} must be an integer, at least {low}, got {value!r}.")
-
-
-def _check_others(target_accept: Any, progress: Any) -> None:
-    if not (isinstance(target_accept, int | float) and 0 < target_accept < 1):
-        raise ValueError(f"target_accept must lie between 0 and 1, got {target_accept!r}.")
-    if not (progress is None or isinstance(progress, bool)):
-        raise TypeError(f"progress must be True, False or None, got {progress!r}.")
-
-
-def _shows(progress: bool | None) -> bool:
-    return sys.stderr.isatty() if progress is None else progress
 
 
 def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -> np.ndarray:
@@ -330,9 +314,8 @@ def _collect(
 
 def _doubts(found: Samples, longest: int) -> list[str]:
     notes = []
-    worst = sorted((n for n, r in found.r_hat.items() if not r <= _R_HAT),
-                   key=lambda n: -np.nan_to_num(found.r_hat[n], nan=np.inf))  # fmt: skip
-    if worst:
+    off = {n: np.nan_to_num(r, nan=np.inf) for n, r in found.r_hat.items() if not r <= _R_HAT}
+    if worst := sorted(off, key=lambda n: -off[n]):
         shown = ", ".join(f"{n} {found.r_hat[n]:.3f}" for n in worst[:4])
         notes.append(
             f"the chains do not agree: R̂ is above {_R_HAT} for {len(worst)} of {len(found.names)} "

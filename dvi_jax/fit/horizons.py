@@ -1,8 +1,8 @@
-"""How much of the arcs a stage of a fit looks at."""
+"""Fitting horizon of each stage of a fit."""
 
 import numpy as np
 
-from .model import Group
+from .model import Group, weighed
 from .problem import Problem
 
 _FURTHER = 1.02
@@ -27,13 +27,14 @@ def suitable_horizon(problem: Problem, rows: list[np.ndarray], at_least: float =
 
     Infinite stands for everything.
     """
+
+    def seen(of_groups):
+        pairs = zip(of_groups, problem.groups, strict=True)
+        return np.concatenate([np.broadcast_to(x, g.seen.shape)[g.seen] for x, g in pairs])
+
     full, shortest = full_horizon(problem), np.inf
-    scatter = np.concatenate([_scatter(g)[g.seen] for g in problem.groups])
-    allowed = _OFF * np.sqrt(np.mean(scatter**2))
-    since = np.concatenate([np.broadcast_to(_since(g)[..., None], g.seen.shape)[g.seen]
-                            for g in problem.groups])  # fmt: skip
-    misfit = np.concatenate([np.asarray(r)[g.seen]
-                             for r, g in zip(rows, problem.groups, strict=True)])  # fmt: skip
+    allowed = _OFF * np.sqrt(np.mean(seen(map(_scatter, problem.groups)) ** 2))
+    since, misfit = seen(_since(g)[..., None] for g in problem.groups), seen(rows)
     enough = 2 * max(problem.size - problem.space.count_of_priors, 1)
     horizon = full
     while horizon > at_least:
@@ -58,7 +59,4 @@ def _scatter(group: Group) -> np.ndarray:
     """Observed values minus their mean over the arc, in standard errors, (A, N, K)."""
     count = np.maximum(group.seen.sum(axis=1, keepdims=True), 1)
     mean = np.where(group.seen, group.values, 0).sum(axis=1, keepdims=True) / count
-    off = np.where(group.seen, group.values - mean, 0.0)
-    if group.whiten.ndim == 3:
-        return off * group.whiten
-    return np.einsum("anij,anj->ani", group.whiten, off)
+    return weighed(np.where(group.seen, group.values - mean, 0.0), group.whiten)

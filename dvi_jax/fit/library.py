@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._checks import instance, one_of, whole
 from .._system import System
 from .._types import Args, Scalar, State
 from ..engine.signature import accepts
@@ -44,16 +45,12 @@ class ForceLibrary(eqx.Module):
     def __init__(
         self, candidates: Mapping[str, Callable[..., Any]], coefficients: Any = None
     ) -> None:
-        if not isinstance(candidates, Mapping):
-            raise TypeError(
-                "dvi.ForceLibrary takes a dict {name: function (t0, t1, q0, p1, args)}, got "
-                f"{type(candidates).__name__}."
-            )
+        a_dict = "a dict {name: function (t0, t1, q0, p1, args)}"
+        instance("the candidates of a dvi.ForceLibrary", candidates, Mapping, a_dict)
         if not candidates:
             raise ValueError("dvi.ForceLibrary needs at least one candidate.")
         for name, function in candidates.items():
-            if not isinstance(name, str):
-                raise TypeError(f"the name of a candidate must be a string, got {name!r}.")
+            instance("the name of a candidate", name, str, "a string")
             if not (callable(function) and accepts(function, 5)):
                 raise TypeError(
                     f"the candidate {name!r} must be a function (t0, t1, q0, p1, args), got "
@@ -81,11 +78,8 @@ class ForceLibrary(eqx.Module):
 
         **Raises** `ValueError` for anything that cannot be meant.
         """
-        for what, value in (("degree", degree), ("n", n)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{what} must be a positive integer, got {value!r}.")
-        if variables not in ("q", "p", "qp"):
-            raise ValueError(f'variables must be "q", "p" or "qp", got {variables!r}.')
+        degree, n = whole("degree", degree), whole("n", n)
+        one_of("variables", variables, ("q", "p", "qp"))
         places = [(v, i) for v in variables for i in range(n)]
         found = {}
         for total in range(0 if constant else 1, degree + 1):

@@ -8,6 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._checks import positive
+
 
 class Loss(eqx.Module):
     r"""Base of the losses ½ Σ ρ(r²) of whitened residuals r.
@@ -27,14 +29,6 @@ class LeastSquares(Loss):
         return r
 
 
-def _check_scale(scale: Any) -> None:
-    if not (isinstance(scale, int | float) and scale > 0):
-        raise ValueError(
-            f"the scale of a robust loss must be a positive number of standard errors, "
-            f"got {scale!r}."
-        )
-
-
 class SoftL1(Loss):
     """ρ(s) = 2 k² (√(1 + s/k²) − 1): like s up to k standard errors, then like 2 k √s.
 
@@ -44,7 +38,7 @@ class SoftL1(Loss):
     scale: float = 1.5
 
     def __check_init__(self):
-        _check_scale(self.scale)
+        positive("scale", self.scale, hint="It counts standard errors.")
 
     def root(self, r):
         s = (r / self.scale) ** 2
@@ -60,7 +54,7 @@ class Cauchy(Loss):
     scale: float = 2.4
 
     def __check_init__(self):
-        _check_scale(self.scale)
+        positive("scale", self.scale, hint="It counts standard errors.")
 
     def root(self, r):
         s = (r / self.scale) ** 2

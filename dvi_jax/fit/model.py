@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 
 from lanewise.jaxapi import is_traced
 
+from .._checks import instance
 from .._integrate import as_parameter, integrate, start_state
 from .._integrator import Integrator
 from .._results import RESULTS
@@ -25,6 +26,10 @@ from .observations import Observations
 _WASTE = 2_000_000
 """Steps beyond the ends of shorter arcs that are taken rather than compiling another program."""
 
+_OPTIONS = (
+    *("method", "lattice", "newton", "adjoint", "arithmetic", "layout", "integrator"),
+    "num_steps",
+)
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
 _OWN = ("num_steps", "save", "observe", "throw", "progress", "stop", "t0")
 """What `fit` sets itself."""
@@ -64,17 +69,12 @@ class Model(eqx.Module):
         args: PyTree = None,
         **options: Any,
     ):
-        if not isinstance(system, System):
-            raise TypeError(f"system must be a dvi.System, got {system!r}.")
-        known = (
-            *("method", "lattice", "newton", "adjoint", "arithmetic", "layout"),
-            *("integrator", "num_steps"),
-        )
+        instance("system", system, System, "a dvi.System")
         for name in options:
-            if name not in known:
+            if name not in _OPTIONS:
                 raise TypeError(
-                    f"dvi.Model takes no {name!r}: options are {', '.join(known)}; what is saved "
-                    "and observed follows from the data."
+                    f"dvi.Model takes no {name!r}: options are {', '.join(_OPTIONS)}; what is "
+                    "saved and observed follows from the data."
                 )
         fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
         # Arrays, so that another value needs no other compilation.
@@ -154,11 +154,21 @@ class Group(eqx.Module):
     block: int = eqx.field(static=True)
 
 
+def weighed(off: Any, whiten: Any) -> Any:
+    """Residuals in standard errors: by those, or by matrices L⁻¹ of covariances L Lᵀ."""
+    return off * whiten if whiten.ndim == off.ndim else jnp.einsum("...ij,...j->...i", whiten, off)
+
+
 def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: bool) -> dict:
     """What the model says `integrate` shall do for an arc, checked.
 
     **Raises** `TypeError` or `ValueError` for a model that returns something else.
     """
+    if not callable(model):
+        raise TypeError(
+            "model must be a dvi.Model or a function of the parameters that returns the arguments "
+            f"of dvi.integrate, got {model!r}."
+        )
     if isinstance(model, Model):
         found = model(params, arc if many else None)
     else:
@@ -217,12 +227,7 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
         key = (arc.function, arc.values.shape[1:], arc.covariance is not None, size, spec["h"])
         kinds.setdefault(key, []).append(i)
     return [
-        make_group(
-            those,
-            [arcs[i] for i in those],
-            specs[those[0]],
-            max(steps[i] for i in those),
-        )
+        make_group(those, [arcs[i] for i in those], specs[those[0]], max(steps[i] for i in those))
         for those in kinds.values()
     ]
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._checks import function, one_of, positive, whole
 from .._types import Args, Scalar, State
 
 
@@ -78,22 +79,16 @@ class NetworkForce(eqx.Module):
         scale_p: float = 1.0,
         initial: float = 0.3,
     ):
-        for name, value in (("n", n), ("width", width), ("depth", depth)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a positive integer, got {value!r}.")
-        for name, value in (("scale_q", scale_q), ("scale_p", scale_p), ("initial", initial)):
-            if not (isinstance(value, int | float) and 0 < value < np.inf):
-                raise ValueError(f"{name} must be a positive number, got {value!r}.")
-        if damping_of not in ("q", "qp"):
-            raise ValueError(f'damping_of must be "q" or "qp", got {damping_of!r}.')
+        for name, value in (("width", width), ("depth", depth)):
+            whole(name, value)
         if not (conservative or dissipative):
             raise ValueError("conservative and dissipative are both False: no force is left.")
-        for name, value in (("activation", activation), ("velocity", velocity or _momentum)):
-            if not callable(value):
-                raise TypeError(f"{name} must be a function, got {value!r}.")
-        self.n, self.damping_of = n, damping_of
-        self.scale_q, self.scale_p = float(scale_q), float(scale_p)
-        self.velocity = _momentum if velocity is None else velocity
+        self.n = whole("n", n)
+        self.damping_of = one_of("damping_of", damping_of, ("q", "qp"))
+        self.scale_q, self.scale_p = positive("scale_q", scale_q), positive("scale_p", scale_p)
+        self.velocity = function("velocity", _momentum if velocity is None else velocity)
+        function("activation", activation)
+        initial = positive("initial", initial)
         one, two = jax.random.split(key)
         self.potential_net = self.damping_net = None
         if conservative:

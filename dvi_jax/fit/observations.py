@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
 
+from .._checks import instance
 from ..engine.quantities import refuse_unit_or_mask
 from ..engine.signature import accepts
 
@@ -69,15 +70,13 @@ class Observations:
     t0: float | None = None
 
     def __post_init__(self):
-        ts = _real("ts", self.ts)
         values = self.values
         if np.ma.is_masked(values):  # what is masked is missing
             values = np.ma.filled(values.astype(float), np.nan)
-        values = _real("values", values)
-        known = (
+        ts, values = _real("ts", self.ts), _real("values", values)
+        if not (
             self.observe in NAMED if isinstance(self.observe, str) else accepts_four(self.observe)
-        )
-        if not known:
+        ):
             raise TypeError(
                 'observe must be "positions", "momenta", "state" or a function (t, q, p, args) of '
                 f"a state, got {self.observe!r}."
@@ -91,12 +90,12 @@ class Observations:
             )
         _check_times(ts)
         if np.isinf(values).any():
-            where = np.argwhere(np.isinf(values))[0].tolist()
+            where = _first(np.isinf(values))
             raise ValueError(
                 f"values is infinite at index {where}. A missing component is given as NaN."
             )
         if np.isnan(values).all():
-            raise ValueError("all values are NaN, which stands for missing: nothing was observed.")
+            raise ValueError("all values are NaN, which means missing: nothing was observed.")
         t0 = float(ts[0]) if self.t0 is None else _number("t0", self.t0)
         if ts.min() < t0 < ts.max():
             raise ValueError(
@@ -104,15 +103,15 @@ class Observations:
                 f"({ts.min():.17g} to {ts.max():.17g}). All must be on one side of it: move t0, or "
                 "give the observations before t0 as a second arc, with h < 0."
             )
-        if self.sigma is not None and self.covariance is not None:
-            raise ValueError("give sigma or covariance, not both.")
-        for name, value in (("ts", ts), ("values", values), ("t0", t0)):
-            object.__setattr__(self, name, value)
+        checked: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
         if self.sigma is not None:
-            object.__setattr__(self, "sigma", _sigma(self.sigma, values))
+            checked["sigma"] = _sigma(self.sigma, values)
         if self.covariance is not None:
-            covariance = _real("covariance", self.covariance)
-            object.__setattr__(self, "covariance", _check_covariance(covariance, values))
+            if self.sigma is not None:
+                raise ValueError("give sigma or covariance, not both.")
+            checked["covariance"] = _covariance(_real("covariance", self.covariance), values)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
 
     @property
     def function(self) -> Callable[..., Any]:
@@ -164,6 +163,10 @@ class Observations:
         return found
 
 
+Data: TypeAlias = Observations | list[Observations] | tuple[Observations, ...]
+"""One arc, or several."""
+
+
 def as_arcs(data: Any) -> tuple[list[Observations], bool]:
     """The arcs, and whether they were given as a list.
 
@@ -172,15 +175,11 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
     """
     if isinstance(data, Observations):
         return [data], False
-    if not isinstance(data, list | tuple):
-        raise TypeError(
-            f"data must be a dvi.Observations or a list of them, one for each arc, got {data!r}."
-        )
+    instance("data", data, list | tuple, "a dvi.Observations or a list of them, one for each arc")
     if not data:
         raise ValueError("data is an empty list: there is nothing to fit.")
     for i, arc in enumerate(data):
-        if not isinstance(arc, Observations):
-            raise TypeError(f"data[{i}] must be a dvi.Observations, got {arc!r}.")
+        instance(f"data[{i}]", arc, Observations, "a dvi.Observations")
     if len({arc.has_errors for arc in data}) > 1:
         without = next(i for i, arc in enumerate(data) if not arc.has_errors)
         raise ValueError(
@@ -206,6 +205,11 @@ def _number(name: str, value: Any) -> float:
     if found.shape != () or not np.isfinite(found):
         raise ValueError(f"{name} must be one finite number, got {value!r}.")
     return float(found)
+
+
+def _first(where: np.ndarray) -> list[int]:
+    """The first index at which an array is true."""
+    return np.argwhere(where)[0].tolist()
 
 
 def _check_times(ts: np.ndarray) -> None:
@@ -235,53 +239,53 @@ def _check_times(ts: np.ndarray) -> None:
 def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
     sigma = _real("sigma", sigma)
     try:
-        full = np.broadcast_to(sigma, values.shape)
+        full = np.array(np.broadcast_to(sigma, values.shape))
     except ValueError:
         raise ValueError(
             f"sigma of shape {sigma.shape} does not broadcast to values of shape {values.shape}. "
             "For one error at each time give shape (N, 1, ...)."
         ) from None
-    bad = ~(np.isfinite(full) & (full > 0)) & ~np.isnan(values)
+    seen = ~np.isnan(values)
+    bad = ~(np.isfinite(full) & (full > 0)) & seen
     if bad.any():
-        i = np.argwhere(bad)[0].tolist()
         raise ValueError(
-            f"sigma is {full[tuple(i)]} for the value at index {i}: standard errors must be "
-            "positive and finite. A value that is not to count is given as NaN; one that is known "
-            "exactly belongs into the model."
+            f"sigma is {full[bad][0]} for the value at index {_first(bad)}: standard errors must "
+            "be positive and finite. A value that is not to count is given as NaN; one that is "
+            "known exactly belongs into the model."
         )
     size = np.nanmax(np.abs(values)) or 1.0
-    overflow = ~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & ~np.isnan(values)
-    if overflow.any():
-        i = np.argwhere(overflow)[0].tolist()
+    bad = ~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & seen
+    if bad.any():
         raise ValueError(
-            f"sigma is {full[tuple(i)]:g} for the value at index {i}, and the values are up to "
-            f"{size:.3g}: squares of their ratio are beyond the range of double precision. Give "
-            "the standard errors in the units of the values."
+            f"sigma is {full[bad][0]:g} for the value at index {_first(bad)}, and the values are "
+            f"up to {size:.3g}: squares of their ratio are beyond the range of double precision. "
+            "Give the standard errors in the units of the values."
         )
-    return np.array(full)
+    return full
 
 
-def _check_covariance(C: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _covariance(C: np.ndarray, values: np.ndarray) -> np.ndarray:
     n, k = len(values), int(np.prod(values.shape[1:], dtype=int))
     if C.shape not in ((k, k), (n, k, k)):
         raise ValueError(
             f"covariance must have shape {(k, k)} or {(n, k, k)} for values of shape "
             f"{values.shape}, got {C.shape}."
         )
-    full = np.broadcast_to(C, (n, k, k))
-    scale = np.sqrt(np.abs(np.einsum("nii->ni", full)))
+    full = np.array(np.broadcast_to(C, (n, k, k)))
+    variance = np.einsum("nii->ni", full)
+    scale = np.sqrt(np.abs(variance))
     skew = np.abs(full - full.swapaxes(1, 2)).max(axis=(1, 2))
-    asymmetric = skew > 1e-10 * (scale.max(axis=1) ** 2 + np.finfo(float).tiny)
-    if asymmetric.any() or not np.isfinite(full).all():
-        i = int(np.argmax(asymmetric | ~np.isfinite(full).all(axis=(1, 2))))
+    bad = ~(skew <= 1e-10 * (scale.max(axis=1) ** 2 + np.finfo(float).tiny))  # or NaN
+    if bad.any():
+        i = int(np.argmax(bad))
         raise ValueError(
             f"the covariance of observation {i} is not symmetric and finite: {full[i]}"
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         unit = full / (scale[:, :, None] * scale[:, None, :])
-    good = np.isfinite(unit).all(axis=(1, 2))
+    good = np.isfinite(unit).all(axis=(1, 2)) & (variance > 0).all(axis=1)
     smallest = np.linalg.eigvalsh(np.where(good[:, None, None], unit, np.eye(k)))[:, 0]
-    bad = ~good | (smallest <= 1e-14) | (np.einsum("nii->ni", full) <= 0).any(axis=1)
+    bad = ~good | (smallest <= 1e-14)
     if bad.any():
         i = int(np.argmax(bad))
         raise ValueError(
@@ -289,4 +293,4 @@ def _check_covariance(C: np.ndarray, values: np.ndarray) -> np.ndarray:
             f"its correlations {smallest[i]:.3g}): {full[i].tolist()}. A combination that is known "
             "exactly belongs into the model; an error of zero cannot be weighed."
         )
-    return np.array(full)
+    return full

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -164,19 +164,16 @@ class LeastSquaresStage:
                 return u, best, FIT_RESULTS.not_finite
             length = np.linalg.norm(np.asarray(best.jacobian), axis=0)
             scale = np.where(length > 0, _STIFFNESS / np.where(length > 0, length, 1.0), 1.0)
-            base, z, done = np.asarray(u), jnp.zeros(len(u)), 0
-            state = _begin(self._solver, *best.jacobian.shape)
-            trial = best
+            at = Position(stage, horizon, 0, np.asarray(u), scale, np.zeros(len(u)))
+            at.memory = (0, np.inf, 0)
+            state, trial = _begin(self._solver, *best.jacobian.shape), best
         else:
-            base, scale, done = resume.base, resume.scale, resume.done
-            z = jnp.asarray(resume.z)
-            u = base + scale * resume.z
-            best = self.at(base + scale * np.asarray(z), horizon, extra)
-            state = _with_leaves(_begin(self._solver, *best.jacobian.shape), resume.leaves)
+            at, u = resume, resume.base + resume.scale * resume.z
+            best, trial = self.at(u, horizon, extra), None
+            state = _with_leaves(_begin(self._solver, *best.jacobian.shape), at.leaves)
             _check_same(best.residual, state.f_info.residual)
-            trial = None
-        rejected, last, still = (0, np.inf, 0) if resume is None else resume.memory
-        status = "" if resume is None else resume.status
+        base, scale, done, z, status = at.base, at.scale, at.done, jnp.asarray(at.z), at.status
+        rejected, last, still = at.memory
         while not status and done < max_steps:
             if trial is None:
                 trial = self.at(base + scale * np.asarray(state.y_eval), horizon, extra)
@@ -205,12 +202,10 @@ class LeastSquaresStage:
             elif rejected >= _HOPELESS or (rejected >= 3 and moved <= least):
                 flat = _undamped(best, scale) <= max(_FLAT * spread, least)
                 status = "converged" if flat else "stalled"
-            position = Position(
-                stage, horizon, done, base, scale, np.asarray(z), _leaves(state), _leaves(extra),
-                (rejected, last, still), status,
-            )  # fmt: skip
+            at = replace(at, done=done, z=np.asarray(z), status=status)
+            at.leaves, at.extra, at.memory = _leaves(state), _leaves(extra), (rejected, last, still)
             in_sigma = moved / spread if spread else 0.0
-            watch(Record(stage, horizon, loss, in_sigma, accepted, u), position)
+            watch(Record(stage, horizon, loss, in_sigma, accepted, u), at)
         return u, best, getattr(FIT_RESULTS, status or "max_steps_reached")
 
 
@@ -272,14 +267,13 @@ class ScalarStage:
         else when the loss of a step changed by less than tolerance² (in −log likelihood), three
         times running.
         """
-        base = jnp.asarray(u if resume is None else resume.base)
-        size = jnp.asarray(scale if resume is None else resume.scale)
-        z = jnp.zeros(len(u)) if resume is None else jnp.asarray(resume.z)
-        done = 0 if resume is None else resume.done
+        begin = Position(stage, horizon, 0, u, scale, np.zeros(len(u)), memory=(np.inf, 0, 0))
+        at = begin if resume is None else resume
+        base, size, z = (jnp.asarray(x) for x in (at.base, at.scale, at.z))
+        done = at.done
 
         def known(step):
-            extra = None if choose is None else choose(step)
-            return _Known(base, size, jnp.asarray(horizon), extra)
+            return _Known(base, size, jnp.asarray(horizon), choose and choose(step))
 
         struct = jax.ShapeDtypeStruct((), jnp.result_type(float))
         function = _scalar_function(self.core, self.per)
@@ -290,8 +284,7 @@ class ScalarStage:
         if resume is not None:
             state = _with_leaves(state, resume.leaves)
         is_optax = goes_by_optax(self.solver)
-        last, still, rejected = (np.inf, 0, 0) if resume is None else resume.memory
-        status = "" if resume is None else resume.status
+        (last, still, rejected), status = at.memory, at.status
         while not status and done < max_steps:
             old = z
             z, state, ended = _descend(self.solver, self.core, self.per, z, known(done), state)
@@ -311,11 +304,9 @@ class ScalarStage:
                     status = "converged"
                 elif rejected >= _HOPELESS_LINE:
                     status = "stalled"
-            position = Position(
-                stage, horizon, done, np.asarray(base), np.asarray(size), np.asarray(z),
-                _leaves(state), [], (last, still, rejected), status,
-            )  # fmt: skip
-            watch(Record(stage, horizon, loss * self.per, moved, bool(moved > 0), x), position)
+            at = replace(at, done=done, z=np.asarray(z), status=status)
+            at.leaves, at.memory = _leaves(state), (last, still, rejected)
+            watch(Record(stage, horizon, loss * self.per, moved, bool(moved > 0), x), at)
         usual = "steps_done" if is_optax else "max_steps_reached"
         return np.asarray(base + size * z), getattr(FIT_RESULTS, status or usual)
 

@@ -1,9 +1,8 @@
 """Parameters as one vector: their names, bounds and priors."""
 
-import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -158,13 +157,14 @@ def make_space(
             f"params holds no number that could be fitted: {params!r}. Give starting values as "
             "floats or floating-point arrays."
         )
-    names, shapes = [], []
+    names, shapes, leaves = [], [], {}
     for path, leaf in paths:
         name, shape = _name(path), np.shape(leaf)
         refuse_unit_or_mask(f"the parameter {name}", leaf)
         if np.iscomplexobj(leaf):
             raise TypeError(f"the parameter {name} is complex: write its parts.")
         places = ("" if not shape else f"[{', '.join(map(str, i))}]" for i in np.ndindex(shape))
+        leaves[name] = _Leaf(len(names), shape)
         names += [name + place for place in places]
         shapes.append(shape)
     if len(set(names)) < len(names):
@@ -176,106 +176,88 @@ def make_space(
         raise ValueError(
             f"the parameter {names[i]} starts at {start[i]}: every start must be a finite number."
         )
-    made = _Limits(names)
-    made.walk(params, bounds, Bounds, "bounds", made.bound)
-    made.walk(params, priors, Prior, "priors", made.prior)
-    made.check_start(start)
+    lower, upper = _limits(bounds, names, leaves)
+    mean, weight = _priors(priors, names, leaves)
+    outside = ~((start > lower) & (start < upper))
+    if outside.any():
+        i = int(np.argmax(outside))
+        raise ValueError(
+            f"the parameter {names[i]} starts at {start[i]}, which is not between its bounds "
+            f"{lower[i]} and {upper[i]}."
+        )
     space = Space(
-        lower=jnp.asarray(made.lower), upper=jnp.asarray(made.upper),
-        prior_mean=jnp.asarray(made.mean), prior_weight=jnp.asarray(made.weight), rest=rest,
-        names=tuple(names), shapes=tuple(shapes), tree=tree,
-        below=tuple(np.isfinite(made.lower).tolist()),
-        above=tuple(np.isfinite(made.upper).tolist()),
-    )  # fmt: skip
+        lower=jnp.asarray(lower),
+        upper=jnp.asarray(upper),
+        prior_mean=jnp.asarray(mean),
+        prior_weight=jnp.asarray(weight),
+        rest=rest,
+        names=tuple(names),
+        shapes=tuple(shapes),
+        tree=tree,
+        below=tuple(np.isfinite(lower).tolist()),
+        above=tuple(np.isfinite(upper).tolist()),
+    )
     return space, start
 
 
-class _Limits:
-    """Bounds and priors of named numbers, as they are read from pytrees."""
+class _Leaf(NamedTuple):
+    """A fitted array: where its numbers begin in x, and its shape."""
 
-    def __init__(self, names: list[str]):
-        self.names, n = names, len(names)
-        self.lower, self.upper = np.full(n, -np.inf), np.full(n, np.inf)
-        self.mean, self.weight = np.zeros(n), np.zeros(n)
+    begin: int
+    shape: tuple[int, ...]
 
-    def walk(self, params, given, kind, called, take: Callable[..., None]) -> None:
-        """Call `take` with the numbers that each leaf of `given` is about."""
-        if given is None:
-            return
 
-        def down(given, below, path):
-            if given is None:
-                return
-            if isinstance(given, kind):
-                found = [i for i, n in enumerate(self.names) if _is_under(n, path)]
-                if not found:
-                    raise ValueError(f"{called} are given for {path or 'params'}, not a number.")
-                take(given, np.array(found), np.shape(below), path or "the parameters")
-                return
-            if isinstance(given, Mapping) and isinstance(below, Mapping):
-                for key, value in given.items():
-                    if key not in below:
-                        raise ValueError(
-                            f"{called} are given for {key!r}, but the parameters are "
-                            f"{', '.join(map(repr, below))}."
-                        )
-                    down(value, below[key], f"{path}.{key}" if path else str(key))
-                return
-            if dataclasses.is_dataclass(given) and type(given) is type(below):
-                for part in dataclasses.fields(given):
-                    name = f"{path}.{part.name}" if path else part.name
-                    down(getattr(given, part.name), getattr(below, part.name), name)
-                return
-            pairs = _pairs(given, below)
-            if pairs:
-                for i, (value, under) in enumerate(pairs):
-                    down(value, under, f"{path}[{i}]")
-                return
-            raise TypeError(
-                f"{called} must be made like the parameters, with dvi.{kind.__name__}(...) or None "
-                f"in place of numbers; at {path or 'the top'} it holds {given!r}."
-            )
+def _limits(bounds: PyTree, names: list[str], leaves: Mapping[str, _Leaf]):
+    """Lower and upper limit of each number."""
+    lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    for given, name, where, shape in _given(bounds, Bounds, "bounds", leaves):
+        for side, limit, value in (("lower", lower, given.lower), ("upper", upper, given.upper)):
+            if value is not None:
+                limit[where] = _spread(value, where, shape, f"{side} of {name}")
+    bad = ~(lower < upper)
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ValueError(
+            f"the bounds of {names[i]} are {lower[i]} and {upper[i]}: the lower one must be less."
+        )
+    return lower, upper
 
-        down(given, params, "")
 
-    def bound(self, bounds: Bounds, where, shape, name) -> None:
-        for side, of, empty in (("lower", self.lower, -np.inf), ("upper", self.upper, np.inf)):
-            value = getattr(bounds, side)
-            of[where] = _spread(
-                empty if value is None else value, where, shape, f"{side} of {name}"
-            )
-        bad = ~(self.lower[where] < self.upper[where])
-        if bad.any():
-            i = where[np.argmax(bad)]
-            raise ValueError(
-                f"the bounds of {self.names[i]} are {self.lower[i]} and {self.upper[i]}: the lower "
-                "one must be less."
-            )
-
-    def prior(self, prior: Prior, where, shape, name) -> None:
-        sigma = _spread(prior.sigma, where, shape, f"sigma of {name}")
-        mean = _spread(prior.mean, where, shape, f"mean of {name}")
+def _priors(priors: PyTree, names: list[str], leaves: Mapping[str, _Leaf]):
+    """Mean and 1/sigma of each number, 0 without a prior."""
+    mean, weight = np.zeros(len(names)), np.zeros(len(names))
+    for given, name, where, shape in _given(priors, Prior, "priors", leaves):
+        sigma = _spread(given.sigma, where, shape, f"sigma of {name}")
+        mean[where] = _spread(given.mean, where, shape, f"mean of {name}")
         if not ((sigma > 0).all() and np.isfinite(sigma).all() and np.isfinite(mean).all()):
             raise ValueError(
-                f"the prior of {name} needs a finite mean and a positive sigma, got {prior}."
+                f"the prior of {name} needs a finite mean and a positive sigma, got {given}."
             )
-        self.mean[where], self.weight[where] = mean, 1 / sigma
+        weight[where] = 1 / sigma
+    return mean, weight
 
-    def check_start(self, start: np.ndarray) -> None:
-        """Refuse a start that is not between the bounds."""
-        outside = ~((start > self.lower) & (start < self.upper))
-        if outside.any():
-            i = int(np.argmax(outside))
+
+def _given(
+    tree: PyTree, kind: type, called: str, leaves: Mapping[str, _Leaf]
+) -> Iterator[tuple[Any, str, np.ndarray, tuple[int, ...]]]:
+    """The bounds or priors in a pytree: each with its name, the numbers below it, and their shape
+    if they are one array."""
+    for path, given in jax.tree_util.tree_leaves_with_path(tree):
+        name = _name(path)
+        if not isinstance(given, kind):
+            raise TypeError(
+                f"{called} must be made like the parameters, with dvi.{kind.__name__}(...) or None "
+                f"in place of numbers; at {name} it holds {given!r}."
+            )
+        below = [leaf for key, leaf in leaves.items() if not path or _is_under(key, name)]
+        if not below:
             raise ValueError(
-                f"the parameter {self.names[i]} starts at {start[i]}, which is not between "
-                f"its bounds {self.lower[i]} and {self.upper[i]}."
+                f"{called} are given for {name!r}, which is no fitted parameter; these are "
+                f"{', '.join(map(repr, leaves))}."
             )
-
-
-def _pairs(a: Any, b: Any) -> list[tuple[Any, Any]]:
-    """Entries of two lists or tuples of one length; none of anything else."""
-    lists = isinstance(a, list | tuple) and isinstance(b, list | tuple)
-    return list(zip(a, b, strict=True)) if lists and len(a) == len(b) else []
+        each = [leaf.begin + np.arange(np.prod(leaf.shape, dtype=int)) for leaf in below]
+        shape = leaves[name].shape if name in leaves else ()
+        yield given, name, np.concatenate(each), shape
 
 
 def _spread(value: Any, where: np.ndarray, shape: tuple[int, ...], called: str) -> np.ndarray:
@@ -292,7 +274,7 @@ def _spread(value: Any, where: np.ndarray, shape: tuple[int, ...], called: str) 
 
 
 def _is_under(name: str, path: str) -> bool:
-    return not path or name == path or name.startswith((path + "[", path + "."))
+    return name == path or name.startswith((path + "[", path + "."))
 
 
 def _name(path: tuple[Any, ...]) -> str:

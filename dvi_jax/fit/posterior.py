@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lanewise.jaxapi import x64_enabled
-
+from .._checks import one_of
+from .._precision import require_double
 from .losses import LeastSquares, Likelihood, Loss
-from .observations import Observations, as_arcs
+from .observations import Data, as_arcs
 from .parameters import Space, make_space
 from .problem import Problem
 from .stages import MANY
@@ -55,7 +55,7 @@ class Posterior:
     def __init__(
         self,
         model: Callable[..., Any],
-        data: Observations | list[Observations] | tuple[Observations, ...],
+        data: Data,
         params: PyTree,
         *,
         bounds: PyTree = None,
@@ -63,13 +63,8 @@ class Posterior:
         loss: Loss | Likelihood = LeastSquares(),
         gradient: str = "reverse",
     ):
-        if not x64_enabled():
-            raise ValueError(
-                "a posterior needs double precision: put\n"
-                '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
-            )
-        if gradient not in ("reverse", "forward"):
-            raise ValueError(f'gradient must be "reverse" or "forward", got {gradient!r}.')
+        require_double("a posterior")
+        one_of("gradient", gradient, ("reverse", "forward"))
         arcs, many = as_arcs(data)
         # Priors are added here, so that they go with errors of unknown size as well.
         self._problem = Problem(model, arcs, many, params, bounds=bounds, loss=loss)

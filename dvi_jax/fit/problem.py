@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._checks import instance
 from .._results import RESULTS, status_name
 from .._system import check_system
 from ..engine.reads import Reads, reads
 from .losses import LeastSquares, Likelihood, Loss
-from .model import Group, Model, check_observable, make_groups, predict, specification
+from .model import Group, Model, check_observable, make_groups, predict, specification, weighed
 from .observations import Observations
 from .optimise import Evaluation
 from .parameters import Space, make_space
@@ -51,10 +52,8 @@ class Core(eqx.Module):
             return found, result
 
         pick = None if group.pick is None else jnp.asarray(group.pick)[which]
-        return jax.vmap(one, in_axes=(0, 0, 0, None if pick is None else 0))(
-            jnp.asarray(group.arcs)[which], jnp.asarray(group.t0)[which],
-            jnp.asarray(group.ts)[which], pick,
-        )  # fmt: skip
+        i, t0, ts = (jnp.asarray(x)[which] for x in (group.arcs, group.t0, group.ts))
+        return jax.vmap(one, in_axes=(0, 0, 0, None if pick is None else 0))(i, t0, ts, pick)
 
     def whitened(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
         """Residuals predicted − observed in standard errors, (A, N, K) for each group, zero for
@@ -154,16 +153,8 @@ class Problem:
         priors: PyTree = None,
         loss: Loss | Likelihood = LeastSquares(),
     ):
-        if not callable(model):
-            raise TypeError(
-                "model must be a dvi.Model or a function of the parameters that returns the "
-                f"arguments of dvi.integrate, got {model!r}."
-            )
-        if not isinstance(loss, Loss | Likelihood):
-            raise TypeError(
-                f"loss must be a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or "
-                f"dvi.Likelihood(f), got {loss!r}."
-            )
+        known = "a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or dvi.Likelihood(f)"
+        instance("loss", loss, Loss | Likelihood, known)
         self.given, self.loss = arcs, loss
         self.arcs = arcs = [arc.ordered() for arc in arcs]
         self.space, self.start = make_space(params, bounds, priors)
@@ -216,11 +207,6 @@ class Problem:
     def whitened(self, u: Any, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
         """`Core.whitened`."""
         return _whitened(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
-
-    def residuals(self, u: Any, horizon: Any = np.inf) -> Array:
-        """`Core.residuals`."""
-        rows, _ = self.whitened(u, horizon)
-        return self.core.root_rows(jnp.asarray(u), rows)
 
     def hessian(self, u: Any) -> Array:
         """Exact second derivatives of the loss, (n, n), forward over reverse."""
@@ -288,9 +274,9 @@ class Problem:
                 f"factor of {data / largest:.3g}. Are they in the same units? If this is "
                 "intended, use check_units=False."
             )
-        group, size = next((g, s) for (g, _), s in zip(pairs, own, strict=True)
-                           if (s >= _UNITS * data).any())  # fmt: skip
-        a, row = np.argwhere(size >= _UNITS * data)[0]
+        large, each = _UNITS * data, zip(self.groups, own, strict=True)
+        group, size = next((g, s) for g, s in each if (s >= large).any())
+        a, row = np.argwhere(size >= large)[0]
         arc = int(group.arcs[a])
         raise ValueError(
             f"{about}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g} (at its start, "
@@ -354,5 +340,4 @@ def _within(group: Any, horizon: Any) -> Array:
 def _whiten(group: Any, found: Array, keep: Array) -> Array:
     # First where, then subtract: a trajectory that fails after the horizon leaves no NaN behind.
     off = jnp.where(keep, found - jnp.asarray(group.values), 0.0)
-    whiten = jnp.asarray(group.whiten)
-    return off * whiten if whiten.ndim == 3 else jnp.einsum("anij,anj->ani", whiten, off)
+    return weighed(off, jnp.asarray(group.whiten))

@@ -1,13 +1,11 @@
 """What a fit shows while it runs."""
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from .._progress import told
+from .._progress import bar_of, told
 
 
 @dataclass(frozen=True)
@@ -25,32 +23,18 @@ class FitProgress:
     seconds: float
 
 
-def shown(
-    progress: bool | Callable[[FitProgress], None] | None,
-) -> AbstractContextManager[Callable[[FitProgress], None] | None]:
-    """A context whose value takes the progress: the user's function, a bar's, or None."""
-    return told(progress, _bar)
+def _columns(p: FitProgress) -> dict[str, Any]:
+    first = [f"{n} {v:.7g}" for n, v in zip(p.names[:3], p.x[:3], strict=True)]
+    return {
+        "description": f"fit, stage {p.stage + 1}",
+        "total": p.max_steps,
+        "completed": p.step,
+        "steps": f"{p.step}/{p.max_steps}",
+        "loss": f"loss {p.loss:.5g}",
+        "params": ", ".join(first + ["…"] * (len(p.names) > 3)),
+    }
 
 
-@contextmanager
-def _bar(console: Any) -> Iterator[Callable[[FitProgress], None]]:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
-    texts = ("{task.description}", "{task.fields[loss]}", "{task.fields[params]}")
-    first, *others = (TextColumn(t) for t in texts)
-    with Progress(first, BarColumn(), MofNCompleteColumn(), *others, console=console) as bar:
-        task = bar.add_task("fit", total=None, loss="", params="")
-
-        def show(p: FitProgress) -> None:
-            values = zip(p.names[:3], p.x[:3], strict=True)
-            bar.update(
-                task,
-                description=f"fit, stage {p.stage + 1}",
-                total=p.max_steps,
-                completed=p.step,
-                loss=f"loss {p.loss:.5g}",
-                params=", ".join(f"{n} {v:.7g}" for n, v in values)
-                + (", …" if len(p.names) > 3 else ""),
-            )
-
-        yield show
+def shown(progress: Any) -> Any:
+    """A context whose value takes a `FitProgress`: the user's function, a bar's, or None."""
+    return told(progress, bar_of("fit", ("steps", "loss", "params"), _columns))

@@ -17,6 +17,13 @@ from .uncertainty import correlations
 
 _FORMAT = 1
 
+_PLAIN = (
+    *("names", "loss", "degrees_of_freedom", "num_observed", "has_errors", "undetermined"),
+    *("at_bounds", "trajectories", "seconds", "prior_chi2"),
+)
+_BY_ARC = ("ts", "observed", "predicted", "whitened", "errors")
+"""Fields that a file has as JSON, and those that are a list of arrays."""
+
 _LITTLE = 0.1
 """Fraction of the variance below which a model is reported as little better than a constant."""
 
@@ -176,17 +183,11 @@ class FitResult:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything but functions into one file (.npz), atomically."""
-        about: dict[str, Any] = {
-            "names": self.names, "result": self.status, "loss": self.loss,
-            "degrees_of_freedom": self.degrees_of_freedom, "num_observed": self.num_observed,
-            "has_errors": self.has_errors, "undetermined": self.undetermined,
-            "at_bounds": self.at_bounds, "trajectories": self.trajectories,
-            "seconds": self.seconds, "prior_chi2": self.prior_chi2,
-            "arcs": len(self.ts), "shape": _shape_of(self.params),
-        }  # fmt: skip
+        about = {name: getattr(self, name) for name in _PLAIN}
+        about |= {"result": self.status, "arcs": len(self.ts), "shape": _shape_of(self.params)}
         arrays = {"x": self.x, "covariance": self.covariance, "values": self.singular_values}
         arrays |= {f"history.{name}": value for name, value in self.history.items()}
-        for name in ("ts", "observed", "predicted", "whitened", "errors"):
+        for name in _BY_ARC:
             arrays |= {f"{name}.{i}": a for i, a in enumerate(getattr(self, name))}
         if self.curvature is not None:
             arrays["curvature"] = self.curvature
@@ -209,32 +210,27 @@ class FitResult:
                     "these parameters hold more than numbers: FitResult.load(path, params) with a "
                     "pytree like the fitted one."
                 )
-            like = jax.tree.map(np.array, about["shape"], is_leaf=lambda x: isinstance(x, list))
-        else:
-            like = params
-        space, _ = make_space(like)
+            params = jax.tree.map(np.array, about["shape"], is_leaf=lambda x: isinstance(x, list))
+        space, _ = make_space(params)
         if list(space.names) != about["names"]:
             raise ValueError(
                 f"the fit in {path} has the parameters {about['names'][:5]}…, not "
                 f"{space.names[:5]}…."
             )
-        many = range(about["arcs"])
-        history = {k[8:]: v for k, v in arrays.items() if k.startswith("history.")}
-        lists = {
-            name: [arrays[f"{name}.{i}"] for i in many]
-            for name in ("ts", "observed", "predicted", "whitened", "errors")
+        by_arc: dict[str, Any] = {
+            n: [arrays[f"{n}.{i}"] for i in range(about["arcs"])] for n in _BY_ARC
         }
         return cls(
             params=space.to_params(jnp.asarray(arrays["x"])),
-            x=arrays["x"], names=about["names"], covariance=arrays["covariance"],
-            history=history, result=getattr(FIT_RESULTS, _known(about["result"])), **lists,
-            loss=about["loss"], degrees_of_freedom=about["degrees_of_freedom"],
-            num_observed=about["num_observed"], has_errors=about["has_errors"],
-            undetermined=about["undetermined"], singular_values=arrays["values"],
-            curvature=arrays.get("curvature"), at_bounds=about["at_bounds"],
-            trajectories=about["trajectories"], seconds=about["seconds"],
-            prior_chi2=about["prior_chi2"],
-        )  # fmt: skip
+            x=arrays["x"],
+            covariance=arrays["covariance"],
+            history={k[8:]: v for k, v in arrays.items() if k.startswith("history.")},
+            result=getattr(FIT_RESULTS, _known(about["result"])),
+            singular_values=arrays["values"],
+            curvature=arrays.get("curvature"),
+            **{name: about[name] for name in _PLAIN},
+            **by_arc,
+        )
 
 
 def _known(name: str) -> str:

@@ -22,7 +22,12 @@ from .progress import FitProgress
 _EVERY = 5.0
 """Seconds between checkpoints."""
 
-_FORMAT = 1
+_FORMAT = 2
+
+_VECTORS = ("base", "scale", "z")
+_LISTS = ("leaves", "extra")
+_COLUMNS = ("stage", "horizon", "loss", "step", "accepted", "x")
+"""What a checkpoint has of `Position` and of each `Record` as arrays."""
 
 
 class Run:
@@ -43,12 +48,14 @@ class Run:
         self.records: list[Record] = []
         self.resume: Position | None = None
         self._saved = time.monotonic()
-        if checkpoint is not None and not Path(checkpoint).parent.is_dir():
-            raise FileNotFoundError(f"there is no directory for the checkpoint {checkpoint}.")
-        if checkpoint is not None and Path(checkpoint).is_dir():
-            raise IsADirectoryError(f"checkpoint must be a file, {checkpoint} is a directory.")
-        if checkpoint is not None and Path(checkpoint).exists():
-            self.resume, self.records = _read_checkpoint(checkpoint, identity)
+        if checkpoint is not None:
+            file = Path(checkpoint)
+            if not file.parent.is_dir():
+                raise FileNotFoundError(f"there is no directory for the checkpoint {file}.")
+            if file.is_dir():
+                raise IsADirectoryError(f"checkpoint must be a file, {file} is a directory.")
+            if file.exists():
+                self.resume, self.records = _read_checkpoint(file, identity)
 
     @property
     def left(self) -> int:
@@ -76,18 +83,14 @@ class Run:
                 )
             self._saved = time.monotonic()
         if self._show is not None:
-            self._show(
-                FitProgress(
-                    len(self.records), self.max_steps, record.stage, record.horizon, record.loss,
-                    x, list(self.problem.space.names), time.monotonic() - self.began,
-                )
-            )  # fmt: skip
+            of_step = len(self.records), self.max_steps, record.stage, record.horizon, record.loss
+            names, seconds = list(self.problem.space.names), time.monotonic() - self.began
+            self._show(FitProgress(*of_step, x, names, seconds))
 
     def history(self) -> dict[str, np.ndarray]:
         """The records as arrays."""
-        names = ("stage", "horizon", "loss", "step", "accepted")
-        found = {name: np.array([getattr(r, name) for r in self.records]) for name in names}
-        return {**found, "x": np.array([r.x for r in self.records]).reshape(-1, self.problem.size)}
+        found = {name: np.array([getattr(r, name) for r in self.records]) for name in _COLUMNS}
+        return {**found, "x": found["x"].reshape(-1, self.problem.size)}
 
 
 def identity(problem: Problem, u: np.ndarray, *of: Any) -> str:
@@ -106,16 +109,12 @@ def identity(problem: Problem, u: np.ndarray, *of: Any) -> str:
 
 
 def _write_checkpoint(path: Any, identity: str, at: Position, records: list[Record]) -> None:
-    arrays = {"base": at.base, "scale": at.scale, "z": at.z}
-    arrays |= {f"leaf.{i}": x for i, x in enumerate(at.leaves)}
-    arrays |= {f"extra.{i}": np.asarray(x) for i, x in enumerate(at.extra)}
-    for name in ("stage", "horizon", "loss", "step", "accepted", "x"):
-        arrays[f"record.{name}"] = np.array([getattr(r, name) for r in records])
-    about = {
-        "identity": identity, "stage": at.stage, "horizon": at.horizon,
-        "done": at.done, "memory": list(at.memory), "status": at.status,
-        "leaves": len(at.leaves), "extra": len(at.extra),
-    }  # fmt: skip
+    about = {"identity": identity, **vars(at)}
+    arrays = {name: about.pop(name) for name in _VECTORS}
+    for name in _LISTS:
+        arrays |= {f"{name}.{i}": np.asarray(x) for i, x in enumerate(about[name])}
+        about[name] = len(about[name])
+    arrays |= {f"record.{n}": np.array([getattr(r, n) for r in records]) for n in _COLUMNS}
     publish_npz(path, _FORMAT, about, arrays)
 
 
@@ -124,17 +123,17 @@ def _read_checkpoint(path: Any, identity: str) -> tuple[Position, list[Record]]:
     if about.get("identity") != identity:
         raise ValueError(
             f"the checkpoint {path} is of another fit (data, parameters, their start or settings "
-            "differ). Give another file, or remove this one to begin anew."
+            "differ). Give another file, or remove this one to begin again."
         )
     position = Position(
-        about["stage"], about["horizon"], about["done"], arrays["base"], arrays["scale"],
-        arrays["z"], [arrays[f"leaf.{i}"] for i in range(about["leaves"])],
-        [arrays[f"extra.{i}"] for i in range(about["extra"])],
-        tuple(about["memory"]), about["status"],
-    )  # fmt: skip
-    columns = [arrays[f"record.{n}"] for n in ("stage", "horizon", "loss", "step", "accepted", "x")]
-    records = [
-        Record(int(s), float(h), float(value), float(step), bool(a), x)
-        for s, h, value, step, a, x in zip(*columns, strict=True)
+        *(about[name] for name in ("stage", "horizon", "done")),
+        *(arrays[name] for name in _VECTORS),
+        *([arrays[f"{name}.{i}"] for i in range(about[name])] for name in _LISTS),
+        memory=tuple(about["memory"]),
+        status=about["status"],
+    )
+    columns = [arrays[f"record.{n}"] for n in _COLUMNS]
+    return position, [
+        Record(int(s), float(h), float(loss), float(step), bool(a), x)
+        for s, h, loss, step, a, x in zip(*columns, strict=True)
     ]
-    return position, records

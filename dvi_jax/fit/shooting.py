@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._checks import fraction, whole
 from .._integrate import integrate
 from .._solution import Save
-from .model import make_group, predict
+from .model import make_group, predict, weighed
 from .observations import Observations
 from .optimise import Evaluation
 from .problem import Problem
@@ -47,12 +48,8 @@ class MultipleShooting:
     tolerance: float = 1e-9
 
     def __post_init__(self):
-        if isinstance(self.segments, bool) or not isinstance(self.segments, int):
-            raise TypeError(f"segments must be an integer, got {self.segments!r}.")
-        if self.segments < 2:
-            raise ValueError(f"segments must be at least 2, got {self.segments}.")
-        if not 0 < self.tolerance < 1:
-            raise ValueError(f"tolerance must lie between 0 and 1, got {self.tolerance!r}.")
+        whole("segments", self.segments, 2)
+        fraction("tolerance", self.tolerance)
         if not (self.guess in (None, "data", "model") or callable(self.guess)):
             raise TypeError(
                 f'guess must be "data", "model", a function t → (q, p) or None, got {self.guess!r}.'
@@ -153,10 +150,8 @@ class Segments:
         elif guess == "data":
             found = from_data(arc, spec, times)
         else:
-            sol = integrate(
-                **{**spec, "t0": arc.t0, "num_steps": self.steps * len(times)},
-                save=Save(every=self.steps), throw=False,
-            )  # fmt: skip
+            steps = {"num_steps": self.steps * len(times), "save": Save(every=self.steps)}
+            sol = integrate(**{**spec, **steps, "t0": arc.t0, "throw": False})
             flat = (np.asarray(x[:-1]).reshape(len(times), -1) for x in (sol.qs, sol.ps))
             found = np.concatenate(list(flat), axis=1)
         if not np.isfinite(found).all():
@@ -176,7 +171,7 @@ class Segments:
         p = jnp.where(first, jnp.asarray(spec["p0"], float), node[self.half :].reshape(self.shape))
         found, (q1, p1), _ = predict({**spec, "q0": q, "p0": p}, t0, ts, pick, self.group)
         off = jnp.where(seen, found - values, 0.0)
-        r = off * whiten if whiten.ndim == 2 else jnp.einsum("nij,nj->ni", whiten, off)
+        r = weighed(off, whiten)
         return problem.core.root(r).ravel(), jnp.concatenate([q1.ravel(), p1.ravel()]) / self.orbit
 
     def _all(self, w: Array):
@@ -208,34 +203,33 @@ class Segments:
         del horizon
         root, multipliers = extra  # √ρ, λ
         (r, ends), (Jr, Je) = self._all(w)
-        n, width = self.n, 2 * self.half
-        count, rows = r.shape
+        n, u = self.n, w[: self.n]
         inner = np.flatnonzero(self.next_of >= 0)
         gaps = self._gaps(w, ends)
-        prior, prior_slope = self.problem.core.prior_rows, jax.jacfwd(self.problem.core.prior_rows)
-        residual = jnp.concatenate(
-            [
-                r.ravel(),
-                prior(w[:n]),
-                (root * gaps + multipliers.reshape(gaps.shape) / root).ravel(),
-            ]
-        )
-        J = jnp.zeros((residual.size, self.size))
-        J = J.at[: count * rows, :n].set(Jr[..., :n].reshape(-1, n))
-        later = np.flatnonzero(self.node_of >= 0)
-        at = lambda k: n + self.node_of[k][:, None] * width + np.arange(width)  # noqa: E731
-        row = later[:, None] * rows + np.arange(rows)
-        J = J.at[row[:, :, None], at(later)[:, None, :]].set(Jr[later, :, n:])
-        J = J.at[count * rows + np.arange(n)[:, None], np.arange(n)].set(prior_slope(w[:n]))
-        base = count * rows + n
-        row = base + np.arange(len(inner))[:, None] * width + np.arange(width)
-        J = J.at[row[:, :, None], np.arange(n)].set(root * Je[inner][..., :n])
-        has = np.flatnonzero(self.node_of[inner] >= 0)
-        J = J.at[row[has][:, :, None], at(inner[has])[:, None, :]].set(
-            root * Je[inner[has]][..., n:]
-        )
-        to = n + self.next_of[inner][:, None] * width + np.arange(width)
-        return Evaluation(residual, J.at[row, to].set(-root / self.orbit[None]), gaps.ravel())
+        prior = self.problem.core.prior_rows
+        tied = root * gaps + multipliers.reshape(gaps.shape) / root
+        residual = jnp.concatenate([r.ravel(), prior(u), tied.ravel()])
+        # The end of a segment depends on its own start, a gap on the next start as well.
+        J_tied = root * self._in_place(Je[inner], inner)
+        gap, part = np.arange(len(inner))[:, None], np.arange(2 * self.half)
+        to = n + self.next_of[inner][:, None] * 2 * self.half + part
+        J_tied = J_tied.at[gap, part, to].add(-root / self.orbit[None])
+        J_prior = jnp.zeros((n, self.size)).at[:, :n].set(jax.jacfwd(prior)(u))
+        J_data = self._in_place(Jr, np.arange(len(r)))
+        blocks = (J_data, J_prior, J_tied)
+        J = jnp.concatenate([x.reshape(-1, self.size) for x in blocks])
+        return Evaluation(residual, J, gaps.ravel())
+
+    def _in_place(self, J: Array, segments: np.ndarray) -> Array:
+        """Derivatives (S, R, n + 2 half) of some segments in (u, own start) as ones in w."""
+        width = 2 * self.half
+        # The start of an arc's first segment is no unknown: its columns go behind w, and off.
+        node = np.where(self.node_of < 0, self.num_nodes, self.node_of)[segments]
+        own = self.n + node[:, None] * width + np.arange(width)
+        columns = np.hstack([np.tile(np.arange(self.n), (len(own), 1)), own])
+        s, rows = np.arange(J.shape[0])[:, None, None], np.arange(J.shape[1])[:, None]
+        wide = jnp.zeros((*J.shape[:2], self.size + width))
+        return wide.at[s, rows, columns[:, None, :]].set(J)[..., : self.size]
 
 
 def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.ndarray:

@@ -57,11 +57,13 @@ def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units
     while True:
         is_last = horizon == np.inf
         u, found, status = stage.run(
-            u, horizon, stage=number, max_steps=_steps(run, is_last, resume),
+            u,
+            horizon,
             tolerance=run.tolerance if is_last else max(1e-2, run.tolerance),
-            degrees=problem.degrees_of_freedom, resume=resume, watch=run.watch,
+            degrees=problem.degrees_of_freedom,
             first=None if whole is None else _up_to(problem, whole, horizon),
-        )  # fmt: skip
+            **_settings(run, number, resume, None if is_last else _BEFORE_LAST),
+        )
         resume = None
         if is_last or status == FIT_RESULTS.not_finite:
             return Minimum(u, status, found.jacobian, None, found.aux if is_last else None)
@@ -72,10 +74,14 @@ def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units
         horizon = _next(problem, wanted, number, whole.aux[0], 2 * horizon * (1 - 1e-9))
 
 
-def _steps(run: Run, is_last: bool, resume: Position | None) -> int:
-    """How many steps a stage may take, those before it was resumed included."""
+def _settings(run: Run, number: int, resume: Position | None, most: int | None) -> dict[str, Any]:
+    """What every kind of stage takes; `most`: its steps, those before it was resumed included, if
+    it is not the last."""
     done = 0 if resume is None else resume.done
-    return done + run.left if is_last else min(max(_BEFORE_LAST, done), done + run.left)
+    steps = done + run.left
+    if most is not None:
+        steps = min(max(most, done), steps)
+    return {"stage": number, "max_steps": steps, "resume": resume, "watch": run.watch}
 
 
 def _next(problem: Problem, wanted: Any, number: int, rows: list[Array], at_least: float) -> float:
@@ -99,6 +105,7 @@ def by_gradient(run: Run, u: np.ndarray, solver: Any, wanted, batch, seed: int, 
     # Per value, so that a learning rate means the same for any amount of data.
     stage = ScalarStage(problem.core, float(problem.count) if is_optax else 1.0, solver)
     choose = None if batch is None else _draw(problem, batch, seed)
+    short = run.max_steps // 8 if is_optax else _BEFORE_LAST
     resume = run.take_resume()
     if resume is None:
         rows, known = problem.whitened(u)
@@ -109,13 +116,9 @@ def by_gradient(run: Run, u: np.ndarray, solver: Any, wanted, batch, seed: int, 
         number, horizon, scale = resume.stage, resume.horizon, resume.scale
     while True:
         is_last = horizon == np.inf
-        some = run.max_steps // 8 if is_optax else _BEFORE_LAST
-        done = 0 if resume is None else resume.done
-        u, status = stage.run(
-            u, horizon, stage=number, tolerance=run.tolerance, scale=scale, choose=choose,
-            max_steps=done + run.left if is_last else min(max(some, done), done + run.left),
-            resume=resume, watch=run.watch,
-        )  # fmt: skip
+        settings = _settings(run, number, resume, None if is_last else short)
+        settings |= {"tolerance": run.tolerance, "scale": scale, "choose": choose}
+        u, status = stage.run(u, horizon, **settings)
         resume = None
         rows, known = problem.whitened(u)
         if is_last or status == FIT_RESULTS.not_finite:
@@ -178,12 +181,10 @@ def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any) -> Min
     else:
         number, (root, multipliers) = resume.stage, (float(resume.extra[0]), resume.extra[1])
     while True:
-        done = 0 if resume is None else resume.done
-        w, found, status = stage.run(
-            w, np.inf, stage=number, max_steps=min(max(_IN_SEGMENTS, done), done + run.left),
-            tolerance=run.tolerance, degrees=max(problem.degrees_of_freedom, 1),
-            extra=(jnp.asarray(root), jnp.asarray(multipliers)), resume=resume, watch=run.watch,
-        )  # fmt: skip
+        settings = _settings(run, number, resume, _IN_SEGMENTS)
+        settings |= {"tolerance": run.tolerance, "degrees": max(problem.degrees_of_freedom, 1)}
+        extra = jnp.asarray(root), jnp.asarray(multipliers)
+        w, found, status = stage.run(w, np.inf, extra=extra, **settings)
         resume = None
         if status == FIT_RESULTS.not_finite:
             break

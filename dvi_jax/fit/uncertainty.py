@@ -78,6 +78,6 @@ def in_words(direction: np.ndarray, names: list[str], most: int = 4) -> str:
 
 def null_space(C: np.ndarray) -> np.ndarray:
     """Orthonormal basis of the directions d with C d = 0, shape (n, n − rank)."""
-    _, s, Vt = np.linalg.svd(C, full_matrices=True)
-    rank = int((s > 1e-12 * s.max(initial=0.0)).sum())
-    return Vt[rank:].T
+    from scipy.linalg import null_space  # here, so that importing the package does not import it
+
+    return null_space(C, rcond=1e-12)

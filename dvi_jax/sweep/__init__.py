@@ -1,11 +1,7 @@
 """Many trajectories: grids of ε × initial conditions × parameters, kept and resumed."""
 
 from . import starts as starts
-from ._sweep import (
-    SweepInterrupted as SweepInterrupted,
-    sweep as sweep,
-    sweep_cost as sweep_cost,
-)
+from ._sweep import SweepInterrupted as SweepInterrupted, sweep as sweep, sweep_cost as sweep_cost
 from .axes import Axis as Axis
 from .cluster import ClusterError as ClusterError
 from .cost import SweepCost as SweepCost

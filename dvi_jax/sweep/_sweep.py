@@ -1,6 +1,5 @@
-"""The front door for many trajectories."""
+"""`sweep` and `sweep_cost`: from arguments to a grid, its tasks and its result."""
 
-import inspect
 import json
 import os
 from collections.abc import Callable, Mapping
@@ -13,6 +12,7 @@ from lanewise import Layout
 from lanewise.jaxapi import x64_enabled
 
 from .._arithmetic import Arithmetic
+from .._checks import instance, whole
 from .._integrator import Integrator, chosen
 from .._memory import machine_memory
 from .._solution import Save
@@ -140,30 +140,22 @@ def sweep(
     if units is not None:
         _check_units(units, found)
         about["units"] = json.dumps(dict(units))
-    config = description(made, program.plan, found, programs)
-    if not (store is None or isinstance(store, str | os.PathLike)):
-        raise TypeError(f"store must be the path of a directory or None, got {store!r}.")
     if client is not None and not hasattr(client, "submit"):
         raise TypeError(f"client must be a distributed.Client, got {client!r}.")
-    if threads is not None and client is not None:
-        raise ValueError(
-            "threads are those of this process: with a client its workers have theirs."
-        )
-    if threads is not None and (
-        isinstance(threads, bool) or not isinstance(threads, int) or threads < 1
-    ):
-        raise ValueError(f"threads must be a positive whole number or None, got {threads!r}.")
+    if threads is not None:
+        whole("threads", threads)
+        if client is not None:
+            raise ValueError("threads are of this process: with a client its workers have theirs.")
+    config = description(made, program.plan, found, programs)
     if store is None:
         _check_memory(program.plan.lanes * sum(v.bytes for v in found.values()))
         sink: Any = Memory(program.plan, found)
-        result = SweepResult(
-            sink,
-            coordinates,
-            {**about, "config": json.dumps(config), "config_sha256": digest(config)},
-        )
+        about |= {"config": json.dumps(config), "config_sha256": digest(config)}
     else:
+        instance("store", store, str | os.PathLike, "the path of a directory or None")
         sink = Store.open_or_make(store, config, found, coordinates, about)
-        result = SweepResult(sink, coordinates, sink.attributes)
+        about = sink.attributes
+    result = SweepResult(sink, coordinates, about)
     with shown(progress) as report:
         if client is not None:
             from .cluster import run_on
@@ -171,8 +163,12 @@ def sweep(
             is_whole = run_on(client, made, program.plan, sink, report)
         else:
             is_whole = run_here(program, sink, threads, report)
-        if not is_whole:
-            raise SweepInterrupted(_interrupted(result), result)
+    if not is_whole:
+        done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
+        where = "; they are the `result` of this exception."
+        if store is not None:
+            where = f" and kept in {result.path}; the same call goes on from there."
+        raise SweepInterrupted(f"interrupted: {done}{where}", result)
     return result
 
 
@@ -191,20 +187,11 @@ def sweep_cost(
 
     **Returns** a `SweepCost`. **Raises** as `sweep` for input that cannot be meant.
     """
-    for name in _OF_RUNNING:
+    for name in ("store", "client", "threads", "progress", "units"):
         settings.pop(name, None)
-    made = make_sweep(system, q0, p0, **_DEFAULTS | settings)
+    made = make_sweep(system, q0, p0, **settings)
     program, found, _ = prepare(made, lanes_per_task)
     return cost(made, program.plan, found)
-
-
-_OF_RUNNING = ("store", "client", "threads", "progress", "units")
-
-_DEFAULTS = {
-    name: parameter.default
-    for name, parameter in inspect.signature(sweep).parameters.items()
-    if name not in ("system", "q0", "p0", "lanes_per_task", *_OF_RUNNING)
-}
 
 
 def _check_units(units: Any, found: Mapping[str, Any]) -> None:
@@ -216,59 +203,82 @@ def _check_units(units: Any, found: Mapping[str, Any]) -> None:
         )
 
 
-def _interrupted(result: SweepResult) -> str:
-    done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
-    if result.path is None:
-        return f"interrupted: {done}; they are the `result` of this exception."
-    return f"interrupted: {done} and kept in {result.path}; the same call goes on from there."
-
-
-def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_steps: Any,
-               **rest: Any) -> Sweep:  # fmt: skip
-    """The sweep that these arguments describe; refuses what cannot be meant."""
+def make_sweep(
+    system: Any,
+    q0: Any,
+    p0: Any,
+    *,
+    start: Any = None,
+    h: Any = None,
+    num_steps: Any = None,
+    t0: Any = 0.0,
+    epsilon: Any = 0.0,
+    args: Any = None,
+    method: Any = None,
+    integrator: Integrator | None = None,
+    newton: RootSolver | None = None,
+    save: Save | None = None,
+    observe: Any = None,
+    stop: Stop | None = None,
+    **of_integrator: Any,
+) -> Sweep:
+    """The sweep that these arguments of `sweep` describe, checked."""
     check_system(system)
-    inputs = {name: as_axis(name, _number(rest.pop(name))) for name in ("epsilon", "h", "t0")}
-    inputs["args"] = rest.pop("args")
-    if start is None:
-        if q0 is None or p0 is None:
-            raise ValueError("give q0 and p0, or start=dvi.starts.Random(...) or another of those.")
-        inputs |= {"q0": q0, "p0": p0}
-    elif q0 is not None or p0 is not None:
-        raise ValueError("give q0 and p0 or a start, not both.")
-    elif not isinstance(start, Starts):
-        raise TypeError(
-            f"start must be one of dvi.starts, such as Random(...), got {start!r}. States of your "
-            'own are q0=dvi.Axis("start", ...), p0=dvi.Axis("start", ...).'
-        )
-    if rest["observe"] is None and rest["save"] is None:
+    given = {"epsilon": epsilon, "h": h, "t0": t0}
+    inputs = {name: as_axis(name, _number(value)) for name, value in given.items()}
+    inputs |= {"args": args, **_states(q0, p0, start)}
+    if observe is None and save is None:
         raise ValueError(
             "nothing would be kept: give observe={...}, or save=dvi.Save(final=True) for the last "
             "states."
         )
     varied = is_axis(method) or isinstance(method, list | tuple)
-    integrator = chosen(
-        rest.pop("integrator"),
-        **{"root_finder": rest.pop("newton"), "method": None if varied else method},
-        **{name: rest.pop(name) for name in ("lattice", "arithmetic", "layout")},
-    )
-    rest |= {
+    of_integrator |= {"root_finder": newton, "method": None if varied else method}
+    integrator = chosen(integrator, **of_integrator)
+    method = _static("method", method if varied else integrator.method_for(system), Method)
+    num_steps = _static("num_steps", num_steps, int | np.integer)
+    leaves = leaves_with_axes(inputs)
+    compiled = [
+        (x.name, len(x), where)
+        for where, x in (("method", method), ("num_steps", num_steps))
+        if is_axis(x)
+    ]
+    axes = [*compiled, *((leaf.axis.name, len(leaf.axis), leaf.name) for leaf in leaves)]
+    if start is not None:
+        Axis(start.name, [0])  # raises for a name that is no identifier
+        if start.name in (name for name, *_ in axes):
+            raise ValueError(f"the name {start.name!r} of the start is that of an axis too.")
+        axes.append((start.name, start.count, "start"))
+    dims = lengths(axes)
+    _check_dims(dims)
+    _check_steps(num_steps, integrator.lattice, inputs)
+    options = {
+        "save": save,
+        "observe": observe,
+        "stop": stop,
         "lattice": integrator.lattice,
         "newton": integrator.root_finder,
         "arithmetic": integrator.arithmetic,
         "layout": integrator.layout,
     }
-    method = _static("method", method if varied else integrator.method_for(system), Method)
-    num_steps = _static("num_steps", num_steps, int | np.integer)
-    leaves = leaves_with_axes(inputs)
-    in_front = [
-        (x.name, len(x), where)
-        for where, x in (("method", method), ("num_steps", num_steps))
-        if is_axis(x)
-    ]
-    axes = [*in_front, *((leaf.axis.name, len(leaf.axis), leaf.name) for leaf in leaves)]
-    if start is not None:
-        axes.append((start.name, start.count, "start"))
-    dims = lengths(axes)
+    count = len({name for name, *_ in compiled})
+    return Sweep(system, inputs, start, method, num_steps, options, dims, count)
+
+
+def _states(q0: Any, p0: Any, start: Any) -> dict[str, Any]:
+    """q0 and p0, unless they come from a `start`."""
+    if start is None:
+        if q0 is None or p0 is None:
+            raise ValueError("give q0 and p0, or start=dvi.starts.Random(...) or another of those.")
+        return {"q0": q0, "p0": p0}
+    if q0 is not None or p0 is not None:
+        raise ValueError("give q0 and p0 or a start, not both.")
+    hint = 'States of your own are q0=dvi.Axis("start", ...), p0=dvi.Axis("start", ...).'
+    instance("start", start, Starts, "one of dvi.starts, such as Random(...)", hint)
+    return {}
+
+
+def _check_dims(dims: Mapping[str, int]) -> None:
     if taken := [name for name in dims if name in RESERVED]:
         raise ValueError(
             f"the axis {taken[0]!r} has a name that the result needs for something else "
@@ -279,11 +289,15 @@ def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_st
             'nothing varies: give an array for epsilon or h, a dvi.Axis("name", values) anywhere, '
             "or a start. For one trajectory there is dvi.integrate."
         )
-    if start is not None and start.name in dict.fromkeys(name for name, *_ in axes[:-1]):
-        raise ValueError(f"the name {start.name!r} of the start is that of an axis too.")
-    if start is not None:
-        Axis(start.name, [0])  # refuses what is no name
-    if isinstance(rest["lattice"], Given):
+    if not x64_enabled() and max(dims.values()) >= 2**31:
+        raise ValueError(
+            "more than 2³¹ values along one axis are counted with 64 bits: put\n"
+            '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
+        )
+
+
+def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) -> None:
+    if isinstance(lattice, Given):
         if num_steps is not None:
             raise ValueError("the times of dvi.Given are the steps: leave num_steps out.")
         if any(is_axis(inputs[name]) for name in ("h", "t0")):
@@ -292,13 +306,6 @@ def make_sweep(system: Any, q0: Any, p0: Any, *, start: Any, method: Any, num_st
         raise ValueError("num_steps is missing: how many steps each trajectory takes.")
     elif any(n < 1 for n in (num_steps.values if is_axis(num_steps) else [num_steps])):
         raise ValueError(f"num_steps must be at least 1, got {num_steps!r}.")
-    if not x64_enabled() and max(dims.values()) >= 2**31:
-        raise ValueError(
-            "more than 2³¹ values along one axis are counted with 64 bits: put\n"
-            '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
-        )
-    compiled = len({name for name, *_ in in_front})
-    return Sweep(system, inputs, start, method, num_steps, rest, dims, compiled)
 
 
 def _number(value: Any) -> Any:
@@ -321,10 +328,8 @@ def prepare(made: Sweep, lanes_per_task: int | None) -> tuple[Program, dict[str,
     """The program of a sweep, cut into tasks, the variables of its result, and the jaxprs."""
     shapes, programs = traced(made)
     found = variables(made, shapes)
-    plan = make_plan(
-        made.dims, made.compiled, made.most_steps, sum(v.bytes for v in found.values()),
-        lanes_per_task,
-    )  # fmt: skip
+    size = sum(v.bytes for v in found.values())
+    plan = make_plan(made.dims, made.compiled, made.most_steps, size, lanes_per_task)
     return Program(made, plan), found, programs
 
 
@@ -358,13 +363,10 @@ def coordinates_of(made: Sweep) -> dict[str, Any]:
 
 def _starts(made: Sweep) -> list[np.ndarray]:
     """All starts, where they do not depend on what else varies."""
-    start = made.start
-    assert start is not None
-    varies = any(is_axis(x) for x in jax.tree.leaves(
-        (made.inputs["t0"], made.inputs["args"]), is_leaf=is_axis))  # fmt: skip
-    if varies:
+    start, of = made.start, (made.inputs["t0"], made.inputs["args"])
+    if start is None or any(map(is_axis, jax.tree.leaves(of, is_leaf=is_axis))):
         return []
-    at = jax.jit(jax.vmap(lambda i: start.at(i, made.inputs["t0"], made.inputs["args"])))
+    at = jax.jit(jax.vmap(lambda i: start.at(i, *of)))
     return [np.asarray(x) for x in at(np.arange(start.count))]
 
 

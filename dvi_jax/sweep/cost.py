@@ -58,15 +58,12 @@ class SweepCost:
         """The same with another number of trajectories, in tasks of the same size."""
         factor = lanes / self.lanes
         tasks = max(1, -(-int(lanes) // self.lanes_per_task))
-        return dataclasses.replace(
-            self, dims={}, lanes=int(lanes), steps=int(self.steps * factor), tasks=tasks,
-            bytes=int(self.bytes * factor), files=tasks * (self.variables + 1),
-        )  # fmt: skip
+        changed = {"steps": int(self.steps * factor), "bytes": int(self.bytes * factor)}
+        changed |= {"lanes": int(lanes), "tasks": tasks, "files": tasks * (self.variables + 1)}
+        return dataclasses.replace(self, dims={}, **changed)
 
     def table(
-        self,
-        lanes: Sequence[float] = (1e6, 1e9, 1e12),
-        workers: Sequence[int] = (1, 64, 4096),
+        self, lanes: Sequence[float] = (1e6, 1e9, 1e12), workers: Sequence[int] = (1, 64, 4096)
     ) -> str:
         """Markdown: time and room for other numbers of trajectories and workers."""
         each = [self, *(self.scaled(n) for n in lanes if n != self.lanes)]

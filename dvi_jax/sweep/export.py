@@ -37,28 +37,26 @@ def to_netcdf(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force:
     """Write a dataset of a sweep as NetCDF 4, one box of its grid at a time."""
     with _whole_or_not(path, force, "h5netcdf", "export") as temporary:
         import h5netcdf
+        import h5py
 
         with h5netcdf.File(temporary, "w") as file:
             file.dimensions = dict(dataset.sizes)
             for key, value in dataset.attrs.items():
                 file.attrs[key] = value
             for name, variable in dataset.variables.items():
-                text = variable.dtype.kind == "U"
-                array = file.create_variable(
-                    name, variable.dims, _text() if text else variable.dtype
-                )
+                dtype = h5py.string_dtype() if _is_text(variable) else variable.dtype
+                array = file.create_variable(name, variable.dims, dtype)
                 for key, value in variable.attrs.items():
                     array.attrs[key] = value
             for name in dataset.coords:
                 values = dataset[name].values
-                file.variables[name][...] = values.astype(object) if values.dtype.kind == "U" \
-                    else values  # fmt: skip
+                file.variables[name][...] = values.astype(object) if _is_text(values) else values
             beside = [n for n in dataset.coords if n not in dataset.sizes]
             for name in dataset.data_vars:
+                dims = set(dataset[name].dims)
                 if beside:
-                    file.variables[name].attrs["coordinates"] = " ".join(
-                        n for n in beside if set(dataset[n].dims) <= set(dataset[name].dims)
-                    ) or " "  # fmt: skip
+                    its = " ".join(n for n in beside if set(dataset[n].dims) <= dims)
+                    file.variables[name].attrs["coordinates"] = its or " "
             for box in boxes:
                 for name in dataset.data_vars:
                     part = dataset[name].isel(box)
@@ -66,10 +64,8 @@ def to_netcdf(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force:
                     file.variables[name][where] = part.values
 
 
-def _text() -> Any:
-    import h5py
-
-    return h5py.string_dtype()
+def _is_text(x: Any) -> bool:
+    return x.dtype.kind == "U"
 
 
 def to_parquet(dataset: Any, boxes: Iterator[dict[str, slice]], path: Any, force: bool) -> None:
@@ -104,9 +100,9 @@ def _columns(part: Any, grid: list[str]) -> dict[str, np.ndarray]:
         wanted = {d: part.sizes[d] for d in (*grid, *own)}
         values = variable.to_base_variable().set_dims(wanted).transpose(*wanted).values
         values = np.ascontiguousarray(values).reshape(np.prod(shape, dtype=int), -1)
-        names = [name] if not own else [
-            "_".join((name, *map(str, k))) for k in np.ndindex(*(part.sizes[d] for d in own))
-        ]  # fmt: skip
+        # np.ndindex() without dimensions of its own: the name alone
+        each = np.ndindex(*(part.sizes[d] for d in own))
+        names = ["_".join((name, *map(str, k))) for k in each]
         for column, entries in zip(names, values.T, strict=True):
             parts = {column: entries}
             if np.iscomplexobj(entries):

@@ -48,10 +48,7 @@ _SIGNATURES = {
 
 
 def description(
-    sweep: Sweep,
-    plan: Plan,
-    variables: Mapping[str, Variable],
-    programs: Sequence[ClosedJaxpr],
+    sweep: Sweep, plan: Plan, variables: Mapping[str, Variable], programs: Sequence[ClosedJaxpr]
 ) -> dict[str, Any]:
     """Everything that the numbers depend on, as JSON: one entry for each argument, so that it can
     be said which differs, and `program`, which sees all that any function does.
@@ -82,10 +79,11 @@ def description(
 
 def _example(sweep: Sweep) -> tuple[Any, Any, Any]:
     """(q0, args, t0) of the first trajectory; of the starts only shape and type matter."""
-    first = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf.values[0]) if is_axis(leaf) else leaf,
-        dict(sweep.inputs), is_leaf=is_axis,
-    )  # fmt: skip
+
+    def begin(leaf):
+        return jnp.asarray(leaf.values[0]) if is_axis(leaf) else leaf
+
+    first = jax.tree.map(begin, dict(sweep.inputs), is_leaf=is_axis)
     if sweep.start is None:
         q0 = jnp.asarray(stacked(first["q0"]))
     else:

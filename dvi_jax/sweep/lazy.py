@@ -50,9 +50,7 @@ class _Masked(BackendArray):
             box = tuple(w[i] for w, i in zip(rows, inside, strict=True))
             to = np.ix_(*inside, *(np.arange(len(b)) for b in behind))
             found[to] = self.store.read(self.name, number, (*box, *behind))
-        scalar = tuple(0 if np.ndim(k) == 0 and not isinstance(k, slice) else slice(None)
-                       for k in key)  # fmt: skip
-        return found[scalar]
+        return found[tuple(0 if isinstance(k, int | np.integer) else slice(None) for k in key)]
 
 
 def _boxes(places: list[np.ndarray]) -> Iterator[tuple[int, ...]]:

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._checks import whole
+
 WORK = 2**28
 """Trajectory steps that one task should have: some tenths of a second."""
 
@@ -81,28 +83,17 @@ class Plan:
     def task(self, number: int) -> Task:
         if not 0 <= number < self.num_tasks:
             raise IndexError(f"there is no task {number}: the sweep has {self.num_tasks}.")
-        return Task(number, *self._box(number))
-
-    def _box(self, number: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        which = self.place(number)
-        start = tuple(k * c for k, c in zip(which, self.chunk, strict=True))
+        start = tuple(k * c for k, c in zip(self.place(number), self.chunk, strict=True))
         size = tuple(min(c, n - a) for c, n, a in zip(self.chunk, self.shape, start, strict=True))
-        return start, size
+        return Task(number, start, size)
 
     def place(self, number: int) -> tuple[int, ...]:
         """The box of a task, counted along each dimension."""
-        which = []
-        for count in reversed(self.counts):
-            number, k = divmod(number, count)
-            which.append(k)
-        return tuple(reversed(which))
+        return tuple(int(k) for k in np.unravel_index(number, self.counts))
 
     def number(self, place: Sequence[int]) -> int:
         """The task in a box, the inverse of `place`."""
-        number = 0
-        for k, count in zip(place, self.counts, strict=True):
-            number = number * count + k
-        return number
+        return int(np.ravel_multi_index(tuple(place), self.counts))
 
     def todo(self, done: Container[int]) -> Iterator[int]:
         """The numbers of the other tasks, made when they are needed: there may be 10⁹ of them."""
@@ -134,10 +125,8 @@ def make_plan(
         many = -(-MANY // max(math.prod(list(dims.values())[:compiled]), 1))
         lanes = min(lanes, max(fewest, -(-total // many)))
         lanes = max(1, min(lanes, BYTES // max(bytes_per_lane, 1)))
-    elif isinstance(lanes, bool) or not isinstance(lanes, int | np.integer) or lanes < 1:
-        raise ValueError(f"lanes_per_task must be a positive whole number or None, got {lanes!r}.")
+    room = whole("lanes_per_task", lanes)
     chunk: list[int] = []
-    room = int(lanes)
     for n in reversed(list(dims.values())[compiled:]):
         boxes = -(-n // min(n, max(room, 1)))
         size = -(-n // boxes)  # boxes as equal as can be

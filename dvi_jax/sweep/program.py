@@ -103,11 +103,8 @@ class Lanes(eqx.Module):
             q0, p0 = self.start.at(number, t0, inputs["args"])
         save = self.options["save"]
         options = {**self.options, "save": save or Save(final=True)}
-        solution = integrate(
-            self.system, q0, p0, **inputs, **options,
-            method=self.method, num_steps=self.num_steps, throw=False,
-        )  # fmt: skip
-        return outputs(solution, save is not None)
+        options |= {"method": self.method, "num_steps": self.num_steps, "throw": False}
+        return outputs(integrate(self.system, q0, p0, **inputs, **options), save is not None)
 
 
 def lanes_of(sweep: Sweep, task_start: tuple[int, ...], values: Any) -> Lanes:

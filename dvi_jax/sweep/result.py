@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from .._results import STATUS_NAMES
+from .layout import STATUS, about_variable
 from .plan import Plan
 from .sinks import Memory
-from .store import STATUS, Store, StoreError, Verification, about_variable
+from .store import Store, StoreError, Verification
 
 
 class SweepResult:
@@ -74,11 +75,9 @@ class SweepResult:
         if isinstance(self._source, Memory):
             counts += np.bincount(self._source.arrays[STATUS].ravel() + 1, minlength=len(counts))
         else:
-            for number in self._source.done():
-                record = self._source.record(number)
-                if record is not None:
-                    for name, count in record["statuses"].items():
-                        counts[STATUS_NAMES.index(name) + 1] += count
+            for record in self.records():
+                for name, count in record["statuses"].items():
+                    counts[STATUS_NAMES.index(name) + 1] += count
             counts[0] = self._plan.lanes - counts[1:].sum()
         names = ("not_computed", *STATUS_NAMES)
         return {name: int(n) for name, n in zip(names, counts, strict=True) if n}
@@ -111,21 +110,17 @@ class SweepResult:
         are not done are masked."""
         import xarray as xr
 
-        data, units = {}, json.loads(self.attributes.get("units", "{}"))
-        if isinstance(self._source, Memory):
-            for name, v in self._source.variables.items():
-                dims = (*self.dims, *v.dims)
-                data[name] = (dims, self._source.arrays[name], about_variable(name, units))
-        else:
-            from .lazy import masked
+        from .lazy import masked
 
-            for name, v in self._source.variables.items():
-                dims = (*self.dims, *v.dims)
+        data, units = {}, json.loads(self.attributes.get("units", "{}"))
+        for name, v in self._source.variables.items():
+            dims, about = (*self.dims, *v.dims), about_variable(name, units)
+            if isinstance(self._source, Memory):
+                data[name] = xr.Variable(dims, self._source.arrays[name], about)
+            else:
                 chunks = dict(zip(dims, (*self._plan.chunk, *v.shape), strict=True))
-                data[name] = xr.Variable(
-                    dims, masked(self._source, name), about_variable(name, units),
-                    {"preferred_chunks": chunks},
-                )  # fmt: skip
+                array = masked(self._source, name)
+                data[name] = xr.Variable(dims, array, about, {"preferred_chunks": chunks})
         coords = {
             name: xr.Variable(dims, values, about)
             for name, (dims, values, about) in self._coordinates.items()

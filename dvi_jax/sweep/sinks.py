@@ -3,12 +3,27 @@
 import abc
 import contextlib
 from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .plan import Plan, Task
 from .variables import Variable
+
+
+class StoreError(Exception):
+    """A store that cannot be used: the message says why, and what to do."""
+
+
+@contextlib.contextmanager
+def as_store_error(path: Path, what: str, then: str = "") -> Iterator[None]:
+    """What the system says of a file or directory, as a `StoreError`: `what` failed, what `then`
+    to do."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(f"{path}: {what}: {error.strerror or error}.{then}") from error
 
 
 class Sink(abc.ABC):
@@ -47,9 +62,8 @@ class Memory(Sink):
     def is_done(self, number):
         return number in self._done
 
-    @contextlib.contextmanager
-    def claimed(self, task) -> Iterator[bool]:
-        yield True
+    def claimed(self, task):
+        return contextlib.nullcontext(True)
 
     def commit(self, task, results, facts):
         for name, x in results.items():

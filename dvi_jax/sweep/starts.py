@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .._checks import finite, function, whole
 from .._types import Args, Scalar
 from ..engine.bracket import bracketed_root
 
@@ -42,47 +43,47 @@ def _box(low: Any, high: Any, of: str) -> tuple[np.ndarray, np.ndarray, tuple[in
     for which, pair in (("low", low), ("high", high)):
         if not isinstance(pair, tuple | list) or len(pair) != 2:
             raise TypeError(f"{which} of {of} must be a pair (q, p) of arrays, got {pair!r}.")
-        q, p = (np.asarray(x, float) for x in pair)
-        if q.shape != p.shape:
-            raise ValueError(
-                f"{which} of {of}: q has shape {q.shape} and p {p.shape}; they need one."
-            )
-        if not (np.isfinite(q).all() and np.isfinite(p).all()):
+        ends += [np.asarray(x, float) for x in pair]
+        if not all(np.isfinite(x).all() for x in ends):
             raise ValueError(f"{which} of {of} must be finite, got {pair!r}.")
-        ends.append((np.concatenate([q.ravel(), p.ravel()]), q.shape))
-    (a, shape), (b, other) = ends
-    if shape != other:
-        raise ValueError(f"low of {of} has shape {shape} and high {other}; they need one.")
+    shapes = [x.shape for x in ends]
+    if len(set(shapes)) > 1:
+        raise ValueError(
+            f"low and high of {of} must be pairs (q, p) of one shape, got {shapes[:2]} and "
+            f"{shapes[2:]}."
+        )
+    a, b = np.ravel(ends[:2]), np.ravel(ends[2:])
     if (a > b).any():
         raise ValueError(f"low of {of} must not lie above high, got {low!r} and {high!r}.")
-    return a, b, shape
+    return a, b, shapes[0]
 
 
-def _count(value: Any, of: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ValueError(f"count of {of} must be a positive whole number, got {value!r}.")
-    return int(value)
+class _Seeded(Starts):
+    """What the generators here have in common."""
+
+    count: int = eqx.field(static=True)
+    shape: tuple[int, ...] = eqx.field(static=True)
+    seed: int = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    def __init__(self, count: int, shape: tuple[int, ...], seed: int, name: str):
+        of = type(self).__name__
+        self.count, self.shape = whole(f"count of {of}", count), shape
+        self.seed, self.name = whole(f"seed of {of}", seed, 0, 2**32 - 1), name
+
+    def key(self, index: Array) -> Array:
+        """A random key for each index, also above 2³²."""
+        index = jnp.asarray(index)
+        key = jax.random.fold_in(jax.random.key(self.seed), index & 0x7FFFFFFF)
+        return jax.random.fold_in(key, index >> 31)
+
+    def state(self, flat: Array) -> tuple[Array, Array]:
+        """(q, p) from all their numbers."""
+        q, p = jnp.split(flat, 2)
+        return q.reshape(self.shape), p.reshape(self.shape)
 
 
-def _seed(value: Any, of: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value < 2**32:
-        raise ValueError(f"seed of {of} must be a whole number from 0 to 2³² − 1, got {value!r}.")
-    return int(value)
-
-
-def _state(flat: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
-    q, p = jnp.split(flat, 2)
-    return q.reshape(shape), p.reshape(shape)
-
-
-def _key(seed: int, index: Array) -> Array:
-    """A random key for each index, also above 2³²."""
-    index = jnp.asarray(index)
-    key = jax.random.fold_in(jax.random.key(seed), index & 0x7FFFFFFF)
-    return jax.random.fold_in(key, index >> 31)
-
-
-class InBox(Starts):
+class InBox(_Seeded):
     """Base of starts in a box: points of the unit cube, stretched.
 
     - `count`: how many. `low`, `high`: corners of the box, pairs (q, p).
@@ -90,18 +91,13 @@ class InBox(Starts):
     - `name`: of the dimension in the result.
     """
 
-    count: int = eqx.field(static=True)
     low: tuple[float, ...] = eqx.field(static=True)
     high: tuple[float, ...] = eqx.field(static=True)
-    shape: tuple[int, ...] = eqx.field(static=True)
-    seed: int = eqx.field(static=True)
-    name: str = eqx.field(static=True)
 
     def __init__(self, count: int, low: Any, high: Any, seed: int = 0, name: str = "start"):
-        of = type(self).__name__
-        a, b, self.shape = _box(low, high, of)
+        a, b, shape = _box(low, high, type(self).__name__)
         self.low, self.high = tuple(a.tolist()), tuple(b.tolist())
-        self.count, self.seed, self.name = _count(count, of), _seed(seed, of), name
+        super().__init__(count, shape, seed, name)
 
     @abc.abstractmethod
     def in_unit_cube(self, index: Array, like: Array) -> Array:
@@ -109,7 +105,7 @@ class InBox(Starts):
 
     def at(self, index, t0, args):
         low, high = jnp.asarray(self.low), jnp.asarray(self.high)
-        return _state(low + (high - low) * self.in_unit_cube(index, low), self.shape)
+        return self.state(low + (high - low) * self.in_unit_cube(index, low))
 
 
 class Random(InBox):
@@ -121,7 +117,7 @@ class Random(InBox):
     """
 
     def in_unit_cube(self, index, like):
-        return jax.random.uniform(_key(self.seed, index), like.shape, like.dtype)
+        return jax.random.uniform(self.key(index), like.shape, like.dtype)
 
 
 class Halton(InBox):
@@ -148,7 +144,7 @@ class Halton(InBox):
         return u
 
 
-class Normal(Starts):
+class Normal(_Seeded):
     """Starts scattered about one state with independent normal errors.
 
     - `count`: how many. `q0`, `p0`: the state in the middle.
@@ -156,31 +152,25 @@ class Normal(Starts):
     - `seed`, `name`: as for `Random`.
     """
 
-    count: int = eqx.field(static=True)
     middle: tuple[float, ...] = eqx.field(static=True)
     sigma: tuple[float, ...] = eqx.field(static=True)
-    shape: tuple[int, ...] = eqx.field(static=True)
-    seed: int = eqx.field(static=True)
-    name: str = eqx.field(static=True)
 
     def __init__(
         self, count: int, q0: Any, p0: Any, sigma: Any, seed: int = 0, name: str = "start"
     ):
-        middle, _, self.shape = _box((q0, p0), (q0, p0), "Normal")
+        middle, _, shape = _box((q0, p0), (q0, p0), "Normal")
         if not isinstance(sigma, tuple | list) or len(sigma) != 2:
             raise TypeError(f"sigma of Normal must be a pair (of q, of p), got {sigma!r}.")
-        spread = np.concatenate(
-            [np.broadcast_to(np.asarray(s, float), self.shape).ravel() for s in sigma]
-        )
+        spread = np.ravel([np.broadcast_to(np.asarray(s, float), shape) for s in sigma])
         if not (np.isfinite(spread).all() and (spread >= 0).all()):
             raise ValueError(f"sigma of Normal must be finite and not negative, got {sigma!r}.")
         self.middle, self.sigma = tuple(middle.tolist()), tuple(spread.tolist())
-        self.count, self.seed, self.name = _count(count, "Normal"), _seed(seed, "Normal"), name
+        super().__init__(count, shape, seed, name)
 
     def at(self, index, t0, args):
         middle, sigma = jnp.asarray(self.middle), jnp.asarray(self.sigma)
-        z = jax.random.normal(_key(self.seed, index), middle.shape, middle.dtype)
-        return _state(middle + sigma * z, self.shape)
+        z = jax.random.normal(self.key(index), middle.shape, middle.dtype)
+        return self.state(middle + sigma * z)
 
 
 def _radical_inverse(index: Array, base: int, largest: int, dtype: Any) -> Array:
@@ -203,7 +193,7 @@ def _primes(count: int) -> list[int]:
     return found
 
 
-class EnergyShell(Starts):
+class EnergyShell(_Seeded):
     r"""Random starts on the surface H(t0, q, p, args) = energy.
 
     q is drawn uniformly from a box and a direction d of p from the sphere; then p = λ d with the
@@ -217,14 +207,10 @@ class EnergyShell(Starts):
     - `seed`, `name`: as for `Random`.
     """
 
-    count: int = eqx.field(static=True)
     H: Callable[..., Any]
     energy: float = eqx.field(static=True)
     low: tuple[float, ...] = eqx.field(static=True)
     high: tuple[float, ...] = eqx.field(static=True)
-    shape: tuple[int, ...] = eqx.field(static=True)
-    seed: int = eqx.field(static=True)
-    name: str = eqx.field(static=True)
 
     def __init__(
         self,
@@ -236,20 +222,16 @@ class EnergyShell(Starts):
         seed: int = 0,
         name: str = "start",
     ):
-        if not callable(H):
-            raise TypeError(f"H of EnergyShell must be a function (t, q, p, args), got {H!r}.")
-        a, b, self.shape = _box((low, low), (high, high), "EnergyShell")
+        self.H = function("H of EnergyShell", H, "(t, q, p, args)")
+        a, b, shape = _box((low, low), (high, high), "EnergyShell")
         n = len(a) // 2
         self.low, self.high = tuple(a[:n].tolist()), tuple(b[:n].tolist())
-        self.energy = float(energy)
-        if not math.isfinite(self.energy):
-            raise ValueError(f"energy of EnergyShell must be finite, got {energy!r}.")
-        self.count, self.seed = _count(count, "EnergyShell"), _seed(seed, "EnergyShell")
-        self.H, self.name = H, name
+        self.energy = finite("energy of EnergyShell", energy)
+        super().__init__(count, shape, seed, name)
 
     def at(self, index, t0, args):
         low, high = jnp.asarray(self.low), jnp.asarray(self.high)
-        key = _key(self.seed, index)
+        key = self.key(index)
 
         def draw(k):
             of_q, of_p = jax.random.split(jax.random.fold_in(key, k))

@@ -9,12 +9,8 @@ leaves done tasks whole and the others to be done again.
 import contextlib
 import errno
 import json
-import math
 import os
-import shutil
-import threading
 import time
-import uuid
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping
@@ -23,34 +19,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._files import TEMPORARY, publish, sync
+from .._files import TEMPORARY, publish
 from .._results import STATUS_NAMES
+from .claims import claim
 from .identity import FORMAT, differences, digest
+from .layout import STATUS, TASKS, make, shard, storable
 from .plan import Plan, Task
-from .sinks import Sink
-from .variables import ARRAY_NAMES, Variable, is_array_name
+from .sinks import Sink, StoreError as StoreError, as_store_error
+from .variables import Variable
 
-try:
-    import fcntl
-except ImportError:  # Windows: processes there do not divide a sweep between them
-    fcntl = None
-
-TASKS, CLAIMS = ".tasks", ".claims"
-_CHUNK_BYTES = 2**22
-"""Of an inner chunk of a shard: what is read at least to see one number."""
-
+CLAIMS = ".claims"
 _RESTORE = (
     "Restore the file from a backup, or copy it from a store that the same call of dvi.sweep makes "
     "elsewhere: that call may be stopped as soon as its progress is shown. The results are in the "
     "arrays beside the file."
 )
-
-STATUS = "status"
-"""The variable whose shard is published after the others."""
-
-
-class StoreError(Exception):
-    """A store that cannot be used: the message says why, and what to do."""
 
 
 class StoreMismatch(StoreError, ValueError):
@@ -99,7 +82,17 @@ class Store(Sink):
         path = _located(path)
         try:
             attributes = json.loads((path / "zarr.json").read_text())["attributes"]
-            found = attributes["dvi_jax_sweep"]
+            if not (path / TASKS).is_dir():
+                raise StoreError(
+                    f"{path}: the directory {TASKS}, with the records of tasks, is missing: was "
+                    "the store copied without the names that begin with a point?"
+                )
+            if (found := attributes["dvi_jax_sweep"]) != FORMAT:
+                raise StoreError(
+                    f"{path}: the store has format {found}, this version reads {FORMAT}: use the "
+                    f"version that made it ({attributes.get('dvi-jax', 'unknown')})."
+                )
+            store = cls(path, attributes)
         except FileNotFoundError:
             lost = f" The file was lost. {_RESTORE}" if (path / TASKS).is_dir() else ""
             raise StoreError(f"{path}: there is no sweep here (no zarr.json).{lost}") from None
@@ -108,25 +101,10 @@ class Store(Sink):
                 f"{path}: zarr.json cannot be read ({error.strerror or error}): look after its "
                 "permissions and the disk."
             ) from None
-        except (ValueError, KeyError, TypeError) as error:
-            raise StoreError(
-                f"{path}: zarr.json cannot be read as that of a sweep ({error!r}). {_RESTORE}"
-            ) from None
-        if not (path / TASKS).is_dir():
-            raise StoreError(
-                f"{path}: the directory {TASKS}, with the records of tasks, is missing: was the "
-                "store copied without the names that begin with a point?"
-            )
-        if found != FORMAT:
-            raise StoreError(
-                f"{path}: the store has format {found}, this version reads {FORMAT}: use the "
-                f"version that made it ({attributes.get('dvi-jax', 'unknown')})."
-            )
-        try:
-            store = cls(path, attributes)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(
-                f"{path}: zarr.json is damaged or was edited ({error!r}). {_RESTORE}"
+                f"{path}: zarr.json cannot be read as that of a sweep ({error!r}): it is damaged "
+                f"or was edited. {_RESTORE}"
             ) from None
         for name in store.variables:
             store.array(name)
@@ -153,7 +131,7 @@ class Store(Sink):
                     f"{path}: exists, and is no sweep: give a path that does not exist yet."
                 )
         else:
-            _make(path, config, variables, coordinates, attributes)
+            make(path, config, variables, coordinates, attributes)
         store = cls.open(path)
         if store.sha != digest(config):
             differing = differences(store.config, config)
@@ -249,14 +227,12 @@ class Store(Sink):
             try:
                 self._coordinate(name)
             except StoreError:
-                try:
-                    with zarr.config.set({"array.write_empty_chunks": True}):
-                        group: Any = zarr.open_group(self.path, mode="r+", zarr_format=3)
-                        group[name][...] = _storable(values)
-                except OSError as error:
-                    raise StoreError(
-                        f"{self.path}: the coordinate {name!r} cannot be written again: {error}."
-                    ) from error
+                with (
+                    as_store_error(self.path, f"the coordinate {name!r} cannot be written again"),
+                    zarr.config.set({"array.write_empty_chunks": True}),
+                ):
+                    group: Any = zarr.open_group(self.path, mode="r+", zarr_format=3)
+                    group[name][...] = storable(values)
 
     # --- tasks --------------------------------------------------------------------------------
 
@@ -288,7 +264,7 @@ class Store(Sink):
         except OSError:
             return None
         body, _, checksum = text.rstrip(b"\n").rpartition(b"\n")
-        if checksum != f"{zlib.crc32(body):08x}".encode():
+        if checksum != _crc32(body).encode():
             return None
         try:
             found, task = json.loads(body), self.plan.task(number)
@@ -332,7 +308,7 @@ class Store(Sink):
 
     @contextlib.contextmanager
     def claimed(self, task) -> Iterator[bool]:
-        with _claim(self.path / CLAIMS, task.number) as mine:
+        with claim(self.path / CLAIMS, task.number) as mine:
             yield mine and not self.is_done(task.number)
 
     def shard_path(self, name: str, number: int) -> Path:
@@ -341,20 +317,17 @@ class Store(Sink):
         return self.path.joinpath(name, "c", *(str(k) for k in (*place, *own)))
 
     def commit(self, task, results, facts):
-        try:
+        what = f"task {task.number} cannot be written"
+        then = " What was finished before is kept; once there is room, the same call goes on."
+        with as_store_error(self.path, what, then):
             self._commit(task, results, facts)
-        except OSError as error:
-            raise StoreError(
-                f"{self.path}: task {task.number} cannot be written: {error.strerror or error}. "
-                "What was finished before is kept; once there is room, the same call goes on."
-            ) from error
 
     def _commit(self, task: Task, results: Mapping[str, np.ndarray], facts: Mapping) -> None:
         shards = {}
         for name in sorted(results, key=lambda n: n == STATUS):
-            content = self.shard(name, task, results[name])
+            content = shard(self.plan, self.variables[name], task, results[name])
             publish(self.shard_path(name, task.number), content)
-            shards[name] = {"bytes": len(content), "crc32": f"{zlib.crc32(content):08x}"}
+            shards[name] = {"bytes": len(content), "crc32": _crc32(content)}
         record = {
             "task": task.number,
             "start": task.start,
@@ -364,23 +337,7 @@ class Store(Sink):
             **facts,
         }
         body = json.dumps(record).encode()
-        publish(self.record_path(task.number), body + f"\n{zlib.crc32(body):08x}\n".encode())
-
-    def shard(self, name: str, task: Task, values: np.ndarray) -> bytes:
-        """The bytes of one shard, made in memory."""
-        import zarr
-        from zarr.storage import MemoryStore
-
-        variable = self.variables[name]
-        files: dict[str, Any] = {}
-        array = zarr.create_array(
-            MemoryStore(files),
-            shape=(*self.plan.chunk, *variable.shape),
-            **_layout(self.plan.chunk, variable),
-        )
-        array[tuple(slice(n) for n in task.size)] = values
-        (content,) = (x for key, x in files.items() if key.startswith("c/"))
-        return content.to_bytes()
+        publish(self.record_path(task.number), body + f"\n{_crc32(body)}\n".encode())
 
     # --- looking after it ---------------------------------------------------------------------
 
@@ -404,7 +361,6 @@ class Store(Sink):
         record = self._written(number)
         if record is None:
             return "the record is damaged"
-        task = self.plan.task(number)
         for name in self.variables:
             known = record["shards"][name]
             try:
@@ -413,23 +369,18 @@ class Store(Sink):
                 return f"the shard of {name} cannot be read ({error.strerror})"
             if len(content) != known["bytes"]:
                 return f"the shard of {name} has {len(content)} bytes"
-            if f"{zlib.crc32(content):08x}" != known["crc32"]:
+            # Of the whole file: the codecs do not see that a shard is another task's.
+            if _crc32(content) != known["crc32"]:
                 return f"the shard of {name} has another checksum"
-            try:
-                self.read(name, number, task.box)
-            except StoreError as error:
-                return f"the shard of {name} cannot be decoded ({error.__cause__!r})"
         return ""
 
     def _clear_away(self) -> None:
         """Remove what processes that died had begun to write: files older than any write takes."""
         before = time.time() - 3600
-        for root, _, names in os.walk(self.path):
-            for name in names:
-                file = Path(root, name)
-                with contextlib.suppress(OSError):
-                    if name.endswith(TEMPORARY) and file.stat().st_mtime < before:
-                        file.unlink()
+        for file in self.path.rglob(f"*{TEMPORARY}"):
+            with contextlib.suppress(OSError):
+                if file.stat().st_mtime < before:
+                    file.unlink()
 
 
 def _located(path: str | os.PathLike) -> Path:
@@ -449,164 +400,5 @@ def _located(path: str | os.PathLike) -> Path:
     return found
 
 
-# --- claims -------------------------------------------------------------------------------------
-
-_lock = threading.Lock()
-_handles: dict[Path, int] = {}
-_mine: set[tuple[Path, int]] = set()
-
-
-def _lock_byte(file: Path, number: int) -> bool:
-    """Whether this process could lock a byte. True, with a warning, where the file system has no
-    locks: tasks may then be done twice, in the same bits."""
-    if fcntl is None:
-        return True
-    # Never closed: a process that closes a file lets go of all its locks on it.
-    if file not in _handles:
-        try:
-            _handles[file] = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise StoreError(f"{file}: cannot be opened ({error.strerror or error}).") from error
-    try:
-        fcntl.lockf(_handles[file], fcntl.LOCK_EX | fcntl.LOCK_NB, 1, number)
-    except OSError as error:
-        if error.errno in (errno.EACCES, errno.EAGAIN):  # it is another's
-            return False
-        warnings.warn(
-            f"{file.parent}: tasks cannot be claimed here ({error.strerror or error}): several "
-            "processes on this store may do the same tasks.",
-            stacklevel=2,
-        )
-    return True
-
-
-@contextlib.contextmanager
-def _claim(file: Path, number: int) -> Iterator[bool]:
-    """Whether nobody else holds this number. Processes keep one byte of a file locked, which the
-    system lets go when they die; threads of one process see each other in `_mine`."""
-    key = (file.resolve(), number)
-    with _lock:
-        if key in _mine:
-            mine = False
-        else:
-            mine = _lock_byte(key[0], number)
-        if mine:
-            _mine.add(key)
-    try:
-        yield mine
-    finally:
-        if mine:
-            with _lock:
-                _mine.discard(key)
-                if fcntl is not None and key[0] in _handles:
-                    with contextlib.suppress(OSError):
-                        fcntl.lockf(_handles[key[0]], fcntl.LOCK_UN, 1, number)
-
-
-# --- making -------------------------------------------------------------------------------------
-
-
-def _layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
-    """What zarr is told of an array: a task is a shard, in it chunks of some megabytes."""
-    from zarr import codecs
-
-    shard = (*chunk, *variable.shape)
-    inner = list(shard)
-    size = math.prod(shard) * np.dtype(variable.dtype).itemsize
-    for i, n in enumerate(shard):
-        divisors = (d for d in range(1, n + 1) if n % d == 0)
-        parts = next(d for d in divisors if d == n or size / d <= _CHUNK_BYTES)
-        if size / parts < _CHUNK_BYTES / 16 and i + 1 < len(shard):
-            continue  # a prime, say: crumbs would take long to write
-        inner[i] = n // parts
-        size //= parts
-        if size <= _CHUNK_BYTES:
-            break
-    return {
-        "dtype": variable.dtype,
-        "shards": shard,
-        "chunks": tuple(inner),
-        "compressors": [codecs.ZstdCodec(level=1), codecs.Crc32cCodec()],
-        "fill_value": variable.fill,
-        "config": {"write_empty_chunks": True},
-    }
-
-
-def _make(path, config, variables, coordinates, attributes) -> None:
-    """Make a store under another name and rename it: it appears whole or not at all."""
-    import zarr
-    from zarr import codecs
-
-    if bad := [name for name in (*coordinates, *variables) if not is_array_name(name)]:
-        raise ValueError(
-            f"{bad[0]!r} cannot be the name of an array in a store: {ARRAY_NAMES}. The name comes "
-            "from a key of args or from an observable: rename it."
-        )
-    plan = Plan(dict(config["dims"]), tuple(config["chunk"]))
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        group = zarr.create_group(
-            temporary,
-            attributes={
-                "Conventions": "CF-1.11",
-                "dvi_jax_sweep": FORMAT,
-                "config": json.dumps(config),
-                "config_sha256": digest(config),
-                **attributes,
-            },
-        )
-        for name, (dims, values, about) in coordinates.items():
-            group.create_array(
-                name, data=_storable(values), chunks=values.shape, dimension_names=dims,
-                attributes=about, compressors=[codecs.ZstdCodec(), codecs.Crc32cCodec()],
-                config={"write_empty_chunks": True},
-            )  # fmt: skip
-        for name, v in variables.items():
-            group.create_array(
-                name,
-                shape=(*plan.shape, *v.shape),
-                dimension_names=(*plan.dims, *v.dims),
-                attributes=about_variable(name, json.loads(attributes.get("units", "{}"))),
-                **_layout(plan.chunk, v),
-            )
-        (temporary / TASKS).mkdir()
-        with warnings.catch_warnings():  # of the format: readers without it list the directory
-            warnings.simplefilter("ignore")
-            zarr.consolidate_metadata(temporary)
-        for root, _, names in os.walk(temporary):
-            for name in names:
-                handle = os.open(Path(root, name), os.O_RDONLY)
-                os.fsync(handle)
-                os.close(handle)
-        try:
-            os.rename(temporary, path)
-        except OSError:  # another process was faster, or the directory holds something
-            if not (path / "zarr.json").exists():
-                raise
-        sync(path.parent)
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be made: {error}.") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _storable(values: np.ndarray) -> np.ndarray:
-    """Names of methods with a type for text of any length, which zarr has; numbers as they are."""
-    return values.astype(np.dtypes.StringDType()) if values.dtype.kind == "U" else values
-
-
-def about_variable(name: str, units: Mapping[str, str]) -> dict[str, Any]:
-    """The attributes of a variable; `units` are those of all that have some."""
-    if name == STATUS:
-        return {
-            "long_name": "how each trajectory ended",
-            "flag_values": [-1, *range(len(STATUS_NAMES))],
-            "flag_meanings": " ".join(("not_computed", *STATUS_NAMES)),
-        }
-    known = {
-        "failed_step": "number of the failing step from 0, or -1",
-        "residual": "largest relative residual of an implicit solve",
-    }
-    found = {"long_name": known[name]} if name in known else {}
-    return {**found, "units": units[name]} if name in units else found
+def _crc32(content: bytes) -> str:
+    return f"{zlib.crc32(content):08x}"

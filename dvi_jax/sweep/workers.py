@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import platform
 import signal
 import threading
 import time
@@ -19,10 +20,10 @@ from lanewise.jaxapi import x64_enabled
 
 from .._results import STATUS_NAMES
 from ..engine.threads import processors
+from .layout import STATUS
 from .plan import Task
 from .program import Program
 from .sinks import Sink
-from .store import STATUS
 
 _PATIENCE = 0.2
 """Seconds between two looks at tasks that another process works on, and at an interrupt."""
@@ -107,7 +108,7 @@ def compute(
         "statuses": {STATUS_NAMES[c]: int(n) for c, n in zip(codes, counts, strict=True)},
         "seconds": round(time.monotonic() - began, 3),
         "finished": time.time(),
-        "host": os.uname().nodename if hasattr(os, "uname") else "",
+        "host": platform.node(),
         "pid": os.getpid(),
         "device": device.device_kind,
     }

@@ -1,0 +1,68 @@
+"""Which worker does a task: one byte of a file is locked for each task that somebody does."""
+
+import contextlib
+import errno
+import os
+import threading
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from .sinks import as_store_error
+
+fcntl: Any = None
+with contextlib.suppress(ImportError):  # Windows: processes there do not divide a sweep
+    import fcntl
+
+_lock = threading.Lock()
+_handles: dict[Path, int] = {}
+"""Never closed: a process that closes a file releases all its locks on it."""
+
+_mine: set[tuple[Path, int]] = set()
+
+
+@contextlib.contextmanager
+def claim(file: Path, number: int) -> Iterator[bool]:
+    """Whether nobody else holds this number, for as long as the context lasts.
+
+    The system releases the locks of a process that dies; threads of one process see each other in
+    `_mine`.
+    """
+    key = (file.resolve(), number)
+    with _lock:
+        mine = key not in _mine and _lock_byte(*key)
+        if mine:
+            _mine.add(key)
+    try:
+        yield mine
+    finally:
+        if mine:
+            with _lock, contextlib.suppress(OSError):
+                _mine.discard(key)
+                if key[0] in _handles:
+                    fcntl.lockf(_handles[key[0]], fcntl.LOCK_UN, 1, number)
+
+
+def _lock_byte(file: Path, number: int) -> bool:
+    """Whether this process could lock a byte. True, with a warning, where the file system has no
+    locks: tasks may then be done twice, in the same bits.
+
+    **Raises** `StoreError` for a file that cannot be opened.
+    """
+    if fcntl is None:
+        return True
+    if file not in _handles:
+        with as_store_error(file, "cannot be opened"):
+            _handles[file] = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        fcntl.lockf(_handles[file], fcntl.LOCK_EX | fcntl.LOCK_NB, 1, number)
+    except OSError as error:
+        if error.errno in (errno.EACCES, errno.EAGAIN):  # it is another's
+            return False
+        warnings.warn(
+            f"{file.parent}: tasks cannot be claimed here ({error.strerror or error}): several "
+            "processes on this store may do the same tasks.",
+            stacklevel=2,
+        )
+    return True
