@@ -159,7 +159,7 @@ def test_a_section_does_not_depend_on_the_sense_of_the_run():
     """Backwards from where a run has come to, its own crossings, in reverse."""
     settings = {"h": 0.05, "num_steps": 1200, "crossings": 6, "method": dvi.Strang()}
     q, p = starts(1)
-    there = dvi.poincare_section(HENON.system, q, p, plane, **settings, throw=False)
+    there = dvi.poincare_section(HENON.system, q, p, plane, **settings)
     end = dvi.integrate(
         HENON.system, q[0], p[0], h=0.05, num_steps=850, method=dvi.Strang(),
         save=dvi.Save(final=True),
