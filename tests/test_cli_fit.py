@@ -305,7 +305,7 @@ REFUSED = [
     ('"args.k"]', '"args.K"]', "parameters: 'args.K'", "did you mean args.k?"),
     ('"args.k"]', '"epsilon"]', "is listed twice", "each name once"),
     ('["epsilon", "args.k"]', "[]", "parameters: []", "an array of names"),
-    ('parameters = ["epsilon", "args.k"]', "", "parameters: the key is missing", "epsilon, q0, p0"),
+    ('parameters = ["epsilon", "args.k"]', "", "parameters: the key is missing", '"epsilon", "q0"'),
     ("seen.csv", "sen.csv", "data.file: there is no file", "a CSV or npz file"),
     ('file = "seen.csv"', "", "data.file: the key is missing", "the path"),
     ("sigma = 0.01", "sigma = 0.0", "data.sigma: 0.0", "a positive number"),
