@@ -6,13 +6,13 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from ._errors import InputError
 from ._help import Command, shown_examples, unwrapped
+from ._names import VERSION
 from ._show import Bar, print_error, print_json, print_tables, stderr, stdout
 
 FAILED = 1
@@ -22,23 +22,16 @@ AGAIN = "On the command line: the same with --resume continues from what is done
 CODES = {"bad input": BAD_INPUT, "failed": FAILED, "interrupted": INTERRUPTED, "fault": FAILED}
 """Kind of an error → exit code."""
 
-_OUTPUT = "Output"
-Json = Annotated[
-    bool,
-    typer.Option(
-        "--json", help="One JSON object on stdout, nothing else there.", rich_help_panel=_OUTPUT
-    ),
-]
-Verbose = Annotated[
-    bool,
-    typer.Option(
-        "--verbose", "-v", help="Say on stderr what is done, with what.", rich_help_panel=_OUTPUT
-    ),
-]
-Debug = Annotated[
-    bool,
-    typer.Option("--debug", help="Show the whole traceback of an error.", rich_help_panel=_OUTPUT),
-]
+
+def _flag(*names: str, help: str) -> Any:
+    return Annotated[bool, typer.Option(*names, help=help, rich_help_panel="Output")]
+
+
+_COMMON = {
+    "as_json": _flag("--json", help="One JSON object on stdout, nothing else there."),
+    "verbose": _flag("--verbose", "-v", help="Report on stderr what is done, with what."),
+    "debug": _flag("--debug", help="Show the whole traceback of an error."),
+}
 
 
 class Session:
@@ -69,7 +62,7 @@ class Session:
         jax.monitoring.register_event_duration_secs_listener(self._heard)
         devices = jax.local_devices()
         self.note(
-            f"dvi-jax {version()}, jax {jax.__version__}, Python {sys.version.split()[0]}; "
+            f"dvi-jax {VERSION}, jax {jax.__version__}, Python {sys.version.split()[0]}; "
             f"{len(devices)} × {devices[0].device_kind} ({devices[0].platform}); double precision"
         )
 
@@ -145,31 +138,14 @@ def _known(module: str, *names: str) -> tuple[type, ...]:
 
 def fault(error: BaseException, traced: bool = False) -> str:
     """The message for an unexpected exception; `traced`: below its traceback."""
-    text = str(error).strip() or "(without a message)"
-    lines = text.splitlines()
+    lines = str(error).strip().splitlines() or ["(without a message)"]
     if len(lines) > 12:
-        text = "\n".join([*lines[:12], f"… ({len(lines) - 12} more lines)"])
-    how = (
-        "Please report it, with the traceback above."
-        if traced
-        else "The same command with --debug shows where it comes from; please report it with that."
-    )
-    kind = type(error).__name__
-    return f"this is a fault of dvi_jax, not of your input.\n{kind}: {text}\n{how}"
-
-
-def version() -> str:
-    """The version of the package, installed or beside this one, without importing it."""
-    source = Path(__file__).parent.parent / "dvi_jax" / "__init__.py"
-    try:
-        for line in source.read_text(encoding="utf-8").splitlines():
-            if line.startswith("__version__"):
-                return line.split('"')[1]
-    except (OSError, IndexError):
-        pass
-    from importlib.metadata import version
-
-    return version("dvi-jax")
+        lines[12:] = [f"… ({len(lines) - 12} more lines)"]
+    how = "The same command with --debug shows where it comes from; please report it with that."
+    if traced:
+        how = "Please report it, with the traceback above."
+    text = "\n".join([f"{type(error).__name__}: {lines[0]}", *lines[1:], how])
+    return f"this is a fault of dvi_jax, not of your input.\n{text}"
 
 
 def command(
@@ -183,11 +159,10 @@ def command(
     """
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
-        own = list(inspect.signature(function).parameters.values())[1:]
         kind = inspect.Parameter.KEYWORD_ONLY
+        own = list(inspect.signature(function).parameters.values())[1:]
         common = [
-            inspect.Parameter(word, kind, default=False, annotation=annotation)
-            for word, annotation in (("as_json", Json), ("verbose", Verbose), ("debug", Debug))
+            inspect.Parameter(n, kind, default=False, annotation=a) for n, a in _COMMON.items()
         ]
 
         @functools.wraps(function)

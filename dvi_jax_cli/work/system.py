@@ -54,11 +54,12 @@ class Source:
     def args(self) -> Any:
         """The parameters of the system with those of the file in their place."""
         given, problem = self.file.args, self.problem
-        names: Any = problem.args if problem is not None else None
+        names = problem.args if problem is not None else None
         if given is None or problem is None:
             return names if given is None else given
-        without = f"{problem.name} has no parameters" if names is None else "args is not a table"
-        require(isinstance(names, dict), "args", shown(given), f"nothing: {without}")
+        if not isinstance(names, dict):
+            why = f"{problem.name} has no parameters" if names is None else "args is not a table"
+            raise InputError("args", shown(given), f"nothing: {why}")
         for name, value in given.items():
             known(f"args.{name}", name, names, seen="there is no such parameter")
             fits = isinstance(names[name], dict) or not isinstance(value, dict)
@@ -118,7 +119,7 @@ def find_source(file: SystemFile, folder: Path) -> Source:
     require(date is None or name == "solar_system", "state.date", shown(date), allowed)
     if ":" not in name:
         return _of_the_library(file, loader)
-    made: Any = loader.load("system", name)
+    made = loader.load("system", name)
     if callable(made) and not isinstance(made, type | dvi.System) and accepts(made, 0):
         try:
             made = made()
@@ -127,10 +128,10 @@ def find_source(file: SystemFile, folder: Path) -> Source:
             raise InputError("system", seen, "a function that returns a system") from error
     if isinstance(made, systems.Problem):
         return Source(file, loader, made, made.system)
+    if isinstance(made, dvi.System):
+        return Source(file, loader, None, made)
     allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
-    seen = f"{name!r} is {type(made).__name__}"
-    require(isinstance(made, dvi.System), "system", seen, allowed)
-    return Source(file, loader, None, made)
+    raise InputError("system", f"{name!r} is {type(made).__name__}", allowed)
 
 
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:
