@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
-from ._errors import InputError, one_of
+from ._errors import InputError, known, require
 from ._group import CHECKING, app
 from ._names import CHECKS, METHODS, WORKLOADS, completer
 from ._runs import Force
 from ._session import FAILED, Session, command
-from ._show import stderr, stdout
+from ._show import console
 
 
 @command(app, "paper", CHECKING)
@@ -34,7 +34,7 @@ def paper(
     from dvi_jax.paper import reproduce
 
     try:
-        done = reproduce(out, force, stderr() if session.as_json else stdout())
+        done = reproduce(out, force, console(stderr=session.as_json))
     except (FileExistsError, NotADirectoryError, PermissionError) as error:
         raise InputError("--out", str(error), "a new directory, or --force") from None
     verdicts = json.loads((done.out / "verdicts.json").read_text(encoding="utf-8"))
@@ -74,8 +74,8 @@ def certify(
     session.unwritten = "the certificate cannot be written"
     from dvi_jax.certify import QUICK, certify, page_for
 
-    if quick and method:
-        raise InputError("--quick", "given together with --method", "one of the two")
+    is_single = not (quick and method)
+    require(is_single, "--quick", "given together with --method", "one of the two")
     try:
         page = None if out is None else page_for(out)
         with session.bar("certifying") as bar:
@@ -134,8 +134,7 @@ def bench(
     """
     wanted = list(row or WORKLOADS)
     for name in wanted:
-        if name not in WORKLOADS:
-            raise InputError("--row", repr(name), one_of(WORKLOADS, name))
+        known("--row", name, WORKLOADS)
     session.start_jax()
     from .work.bench import measure, tables
 

@@ -13,7 +13,7 @@ import typer
 from ._errors import InputError
 from ._help import Command, shown_examples, unwrapped
 from ._names import VERSION
-from ._show import Bar, print_error, print_json, print_tables, stderr, stdout
+from ._show import Bar, console, print_error, print_json, print_tables
 
 FAILED = 1
 BAD_INPUT = 2
@@ -73,17 +73,17 @@ class Session:
     def note(self, text: str) -> None:
         """A line on stderr, with --verbose."""
         if self.verbose:
-            stderr().print(text, markup=False, soft_wrap=True, style="dim")
+            console(stderr=True).print(text, markup=False, soft_wrap=True, style="dim")
 
     def line(self, text: str, style: str | None = None) -> None:
         """A line for the reader, without --json."""
         if not self.as_json:
-            stdout().print(text, markup=False, soft_wrap=True, style=style)
+            console().print(text, markup=False, soft_wrap=True, style=style)
 
     def tables(self, tables: Iterable[Any], words: bool = False) -> None:
         """Tables for the reader, without --json."""
         if not self.as_json:
-            print_tables(stdout(), tables, words)
+            print_tables(tables, words)
 
     def bar(self, doing: str) -> Bar:
         """A progress bar, on stderr."""

@@ -6,16 +6,12 @@ import re
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    WithJsonSchema,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, WithJsonSchema, model_validator
 from pydantic.json_schema import models_json_schema
 from typing_extensions import TypeAliasType
 
 from .._errors import known, one_of, require, shown
+from .._names import FILES as KINDS
 from .axis import AN_AXIS, Axis, AxisName, StateOrAxis, SweepParameter, number_or_axis
 from .table import (
     MISSING,
@@ -56,12 +52,9 @@ TIMES = "at least two times, all increasing or all decreasing"
 
 # The system, its state and its parameters
 
-
 Date = Annotated[
     Any,
-    check(
-        lambda day: isinstance(day, str | int | float | datetime.date) and not isinstance(day, bool)
-    ),
+    check(lambda day: type(day) in (str, int, float, datetime.date, datetime.datetime)),
     WithJsonSchema({"type": ["string", "number"]}),
 ]
 Parameter = TypeAliasType(
@@ -410,9 +403,8 @@ class DiscoverFile(SystemFile):
     output: Output = Output()
 
 
-FILES: dict[str, type[Table]] = {
-    "run": RunFile, "sweep": SweepFile, "fit": FitFile, "discover": DiscoverFile,
-}  # fmt: skip
+_MODELS = (RunFile, SweepFile, FitFile, DiscoverFile)
+FILES: dict[str, type[Table]] = dict(zip(KINDS, _MODELS, strict=True))
 """Kind of file → its model."""
 
 
