@@ -30,7 +30,6 @@ def paper(
         dvi-jax paper                    figures, tables, verdicts in ./paper-out
         dvi-jax paper --out DIR --json   the verdicts on stdout as well
     """
-    session.start_jax()
     from dvi_jax.paper import reproduce
 
     try:
@@ -70,7 +69,6 @@ def certify(
         dvi-jax certify --method Strang --check order --check energy
         dvi-jax certify --out docs/certificate.md
     """
-    session.start_jax()
     session.unwritten = "the certificate cannot be written"
     from dvi_jax.certify import QUICK, certify, page_for
 
@@ -135,7 +133,6 @@ def bench(
     wanted = list(row or WORKLOADS)
     for name in wanted:
         known("--row", name, WORKLOADS)
-    session.start_jax()
     from .work.bench import measure, tables
 
     with session.bar("timing") as bar:
@@ -148,7 +145,7 @@ def bench(
     session.finish(found, f"the two sides differ: {', '.join(wrong)}" if wrong else "")
 
 
-@command(app, "info", CHECKING)
+@command(app, "info", CHECKING, jax=False)
 def info(session: Session) -> None:
     """Versions, devices, precision, flags, extras: what to send along with a question.
 

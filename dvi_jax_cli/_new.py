@@ -20,7 +20,7 @@ _RESERVED = {"con", "prn", "aux", "nul", *(f"{x}{i}" for x in ("com", "lpt") for
 """Names of devices on Windows."""
 
 
-@command(app, "new", START)
+@command(app, "new", START, jax=False)
 def new(
     session: Session,
     name: Annotated[

@@ -28,7 +28,6 @@ def systems(
         dvi-jax systems kepler           equations, parameters, what is conserved
         dvi-jax systems kepler --json    the same for programs
     """
-    session.start_jax()
     from .work.library import library_tables
 
     heading, tables = library_tables(name)
@@ -39,7 +38,7 @@ def systems(
     session.finish({"name": name, "about": heading, "tables": rows})
 
 
-@command(app, "schema", START)
+@command(app, "schema", START, jax=False)
 def schema(
     session: Session,
     kind: Annotated[

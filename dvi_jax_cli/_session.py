@@ -149,13 +149,13 @@ def fault(error: BaseException, traced: bool = False) -> str:
 
 
 def command(
-    group: typer.Typer, name: str, panel: str | None = None
+    group: typer.Typer, name: str, panel: str | None = None, jax: bool = True
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A command of a group: a function of a `Session` and of its own arguments and options.
 
     It gets --json, --verbose and --debug. Its docstring is the help; the lines below "Examples" are
     shown as they are. An exception is shown in one block and becomes an exit code; with --debug it
-    is raised.
+    is raised. `jax`: whether it needs JAX, which is then set up before it begins.
     """
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
@@ -169,6 +169,8 @@ def command(
         def call(as_json: bool, verbose: bool, debug: bool, **given: Any) -> None:
             session = Session(as_json, verbose, debug)
             try:
+                if jax:
+                    session.start_jax()
                 function(session, **given)
                 sys.stdout.flush()  # a pipe that is closed is to be met here
             except (typer.Exit, typer.Abort):
