@@ -11,7 +11,7 @@ from ._group import CHECKING, app
 from ._names import CHECKS, METHODS, WORKLOADS, completer
 from ._runs import Force
 from ._session import FAILED, Session, command
-from ._show import console
+from ._show import console, progress_bar
 
 
 @command(app, "paper", CHECKING)
@@ -76,8 +76,8 @@ def certify(
     require(is_single, "--quick", "given together with --method", "one of the two")
     try:
         page = None if out is None else page_for(out)
-        with session.bar("certifying") as bar:
-            certificate = certify(QUICK if quick else method or None, check or None, bar.show)
+        with progress_bar("certifying") as bar:
+            certificate = certify(QUICK if quick else method or None, check or None, bar)
     except (ValueError, TypeError) as error:
         allowed = "names as in dvi-jax certify --help, and a page that can be written"
         raise InputError("certify", str(error), allowed) from error
@@ -135,8 +135,8 @@ def bench(
         known("--row", name, WORKLOADS)
     from .work.bench import measure, tables
 
-    with session.bar("timing") as bar:
-        found = measure(wanted, rounds, bar.show, session.note)
+    with progress_bar("timing") as bar:
+        found = measure(wanted, rounds, bar, session.note)
     about, speeds = tables(found)
     session.tables([about], words=True)
     session.tables([speeds])

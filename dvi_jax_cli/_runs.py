@@ -8,6 +8,7 @@ from typer.core import TyperGroup
 
 from ._group import INVERSE, RUNS, app
 from ._session import AGAIN, Session, command
+from ._show import progress_bar
 
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML file.")]
 Force = Annotated[
@@ -48,8 +49,8 @@ def run(session: Session, config: Config, out: Out = None, force: Force = False)
     from .work.run import run_file
 
     session.note(f"reading {config}")
-    with session.bar("integrating") as bar:
-        report = run_file(config, out=out, force=force, progress=bar.show)
+    with progress_bar("integrating") as bar:
+        report = run_file(config, out=out, force=force, progress=bar)
     session.finish_report(report)
 
 
@@ -134,8 +135,8 @@ def sweep_verify(session: Session, store: StorePath) -> None:
     session.unwritten = "the bad tasks cannot be marked as not done"
     from .work.sweep import verify_store
 
-    with session.bar("verifying") as bar:
-        report = verify_store(store, bar.show)
+    with progress_bar("verifying") as bar:
+        report = verify_store(store, bar)
     session.finish_report(report)
 
 
@@ -186,6 +187,6 @@ def discover(session: Session, config: Config, out: Out = None, force: Force = F
     from .work.discover import discover_file
 
     session.note(f"reading {config}")
-    with session.bar("discovering") as bar:
-        report = discover_file(config, out=out, force=force, progress=bar.show)
+    with progress_bar("discovering") as bar:
+        report = discover_file(config, out=out, force=force, progress=bar)
     session.finish_report(report)

@@ -13,7 +13,7 @@ import typer
 from ._errors import InputError
 from ._help import Command, shown_examples, unwrapped
 from ._names import VERSION
-from ._show import Bar, console, print_error, print_json, print_tables
+from ._show import console, print_error, print_json, print_tables
 
 FAILED = 1
 BAD_INPUT = 2
@@ -84,10 +84,6 @@ class Session:
         """Tables for the reader, without --json."""
         if not self.as_json:
             print_tables(tables, words)
-
-    def bar(self, doing: str) -> Bar:
-        """A progress bar, on stderr."""
-        return Bar(doing)
 
     def finish(self, contents: Mapping[str, Any], failed: str = "") -> None:
         """End a command: with --json its object, with `failed` an error."""

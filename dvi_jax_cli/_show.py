@@ -3,7 +3,8 @@
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 
@@ -71,24 +72,12 @@ def print_tables(tables: Iterable[Any], words: bool = False) -> None:
         out.print(grid)
 
 
-class Bar:
-    """A progress bar on stderr that appears with the first call, if that is a terminal."""
+@contextmanager
+def progress_bar(doing: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on stderr, if that is a terminal: a function of the parts done and of all."""
+    from rich.progress import Progress
 
-    def __init__(self, doing: str):
-        from rich.progress import Progress
-
-        out = console(stderr=True)
-        self.progress = Progress(console=out, transient=True, disable=not out.is_terminal)
-        self.task = self.progress.add_task(doing, total=None)
-
-    def __enter__(self) -> "Bar":
-        return self
-
-    def show(self, done: int, total: int) -> None:
-        """Show that `done` parts of `total` are done."""
-        self.progress.start()
-        self.progress.update(self.task, completed=done, total=total)
-
-    def __exit__(self, *_: object) -> None:
-        if self.progress.live.is_started:
-            self.progress.stop()
+    out = console(stderr=True)
+    with Progress(console=out, transient=True, disable=not out.is_terminal) as bar:
+        task = bar.add_task(doing, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -89,28 +89,18 @@ def run_arguments(file: RunFile, source: Source) -> dict[str, Any]:
     """
     (q0, p0), args = source.state, source.args
     source.check_start(q0, p0, args)
-    lattice, h, steps = source.times(file)
+    method, save = parse_method(file.method), dvi.Save(every=file.output.every, final=True)
+    run = {"system": source.system, "q0": q0, "p0": p0, "args": args, "method": method}
+    run |= {"save": save, **source.times(file)}
     if source.jd is not None:  # a run that is compared with the ephemeris must not leave it
-        ts = lattice.ts if isinstance(lattice, dvi.Given) else (0.0, h * steps)
+        ts = file.lattice.times if run["h"] is None else (0.0, run["h"] * run["num_steps"])
         span = float(ts[-1] - ts[0])
         try:
             check_covered(source.jd + span)
         except ValueError as error:
             seen = f"the run ends {span:g} days after its start: {error}"
             raise InputError("steps", seen, "fewer steps, a smaller h, or another date") from None
-    return {
-        "system": source.system,
-        "q0": q0,
-        "p0": p0,
-        "h": h,
-        "num_steps": steps,
-        "t0": file.t0,
-        "epsilon": file.epsilon,
-        "args": args,
-        "method": parse_method(file.method),
-        "lattice": lattice,
-        "save": dvi.Save(every=file.output.every, final=True),
-    }
+    return run
 
 
 def _results(found: dvi.Solution, own: dict[str, Observed], seconds: float) -> dict[str, Any]:

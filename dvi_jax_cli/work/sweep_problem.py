@@ -24,6 +24,9 @@ _STARTS = {
     "energy_shell": dvi.starts.EnergyShell,
 }
 
+_KEYS = {"num_steps": "steps"}
+"""Argument of `dvi.sweep` → key of the file, where they differ."""
+
 
 def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]]:
     """The source of the system, and the arguments of `dvi.sweep` except for the store.
@@ -31,22 +34,20 @@ def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]
     **Raises** `InputError`.
     """
     source = find_source(file, folder)
-    lattice, h, steps = source.times(file)
+    times = source.times(file)
     every = getattr(file.save, "every", None)  # None of "final"
     save = dvi.Save(every=every) if every else dvi.Save(final=True)
     arguments = {
         "system": source.system,
-        "h": _for_sweep("h", h),
-        "num_steps": _for_sweep("steps", steps),
-        "t0": _for_sweep("t0", file.t0),
-        "epsilon": _for_sweep("epsilon", file.epsilon),
+        "lattice": times.pop("lattice"),
         "args": _parameters(source.args),
         "method": _methods(file.method),
-        "lattice": lattice,
         "save": None if file.save is None else save,
         "observe": _observe(file, source),
         "lanes_per_task": file.output.lanes_per_task,
-    } | _initial_conditions(file, source)
+    }
+    arguments |= {name: _for_sweep(_KEYS.get(name, name), value) for name, value in times.items()}
+    arguments |= _initial_conditions(file, source)
     seen = "nothing varies, neither this nor another number"
     allowed = "an axis for some number, or [start]; for one trajectory there is dvi-jax run"
     require(any(_varies(x) for x in arguments.values()), "epsilon", seen, allowed)

@@ -100,13 +100,14 @@ class Source:
         require(h is not None, "h", MISSING, "a number; this system has none of its own")
         return h
 
-    def times(self, file: RunFile | SweepFile) -> tuple[dvi.Lattice, Any, Any]:
-        """The time grid, h and the number of steps, as `dvi.integrate` takes them."""
+    def times(self, file: RunFile | SweepFile) -> dict[str, Any]:
+        """The arguments of `dvi.integrate` that set the times of the steps."""
         if isinstance(file.lattice, Times):
-            return dvi.Given(file.lattice.times), None, None
-        h = self.h
-        require(file.steps is not None, "steps", MISSING, COUNT)
-        return dvi.Uniform(), h, file.steps
+            grid = {"lattice": dvi.Given(file.lattice.times), "h": None, "num_steps": None}
+        else:
+            grid = {"lattice": dvi.Uniform(), "h": self.h, "num_steps": file.steps}
+            require(file.steps is not None, "steps", MISSING, COUNT)
+        return grid | {"t0": file.t0, "epsilon": file.epsilon}
 
 
 def find_source(file: SystemFile, folder: Path) -> Source:
