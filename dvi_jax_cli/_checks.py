@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
-from ._errors import InputError, one_of
+from ._errors import InputError, known, require
 from ._group import CHECKING, app
 from ._names import CHECKS, METHODS, WORKLOADS, completer
 from ._runs import Force
 from ._session import FAILED, Session, command
-from ._show import stderr, stdout
+from ._show import console, progress_bar
 
 
 @command(app, "paper", CHECKING)
@@ -30,11 +30,10 @@ def paper(
         dvi-jax paper                    figures, tables, verdicts in ./paper-out
         dvi-jax paper --out DIR --json   the verdicts on stdout as well
     """
-    session.start_jax()
     from dvi_jax.paper import reproduce
 
     try:
-        done = reproduce(out, force, stderr() if session.as_json else stdout())
+        done = reproduce(out, force, console(stderr=session.as_json))
     except (FileExistsError, NotADirectoryError, PermissionError) as error:
         raise InputError("--out", str(error), "a new directory, or --force") from None
     verdicts = json.loads((done.out / "verdicts.json").read_text(encoding="utf-8"))
@@ -70,16 +69,15 @@ def certify(
         dvi-jax certify --method Strang --check order --check energy
         dvi-jax certify --out docs/certificate.md
     """
-    session.start_jax()
     session.unwritten = "the certificate cannot be written"
     from dvi_jax.certify import QUICK, certify, page_for
 
-    if quick and method:
-        raise InputError("--quick", "given together with --method", "one of the two")
+    is_single = not (quick and method)
+    require(is_single, "--quick", "given together with --method", "one of the two")
     try:
         page = None if out is None else page_for(out)
-        with session.bar("certifying") as bar:
-            certificate = certify(QUICK if quick else method or None, check or None, bar.show)
+        with progress_bar("certifying") as bar:
+            certificate = certify(QUICK if quick else method or None, check or None, bar)
     except (ValueError, TypeError) as error:
         allowed = "names as in dvi-jax certify --help, and a page that can be written"
         raise InputError("certify", str(error), allowed) from error
@@ -134,13 +132,11 @@ def bench(
     """
     wanted = list(row or WORKLOADS)
     for name in wanted:
-        if name not in WORKLOADS:
-            raise InputError("--row", repr(name), one_of(WORKLOADS, name))
-    session.start_jax()
+        known("--row", name, WORKLOADS)
     from .work.bench import measure, tables
 
-    with session.bar("timing") as bar:
-        found = measure(wanted, rounds, bar.show, session.note)
+    with progress_bar("timing") as bar:
+        found = measure(wanted, rounds, bar, session.note)
     about, speeds = tables(found)
     session.tables([about], words=True)
     session.tables([speeds])
@@ -149,7 +145,7 @@ def bench(
     session.finish(found, f"the two sides differ: {', '.join(wrong)}" if wrong else "")
 
 
-@command(app, "info", CHECKING)
+@command(app, "info", CHECKING, jax=False)
 def info(session: Session) -> None:
     """Versions, devices, precision, flags, extras: what to send along with a question.
 

@@ -9,7 +9,8 @@ from typer.core import TyperGroup
 
 from ._errors import nearest
 from ._help import WithExamples, shown_examples
-from ._session import BAD_INPUT, INTERRUPTED, version
+from ._names import VERSION
+from ._session import BAD_INPUT, INTERRUPTED
 from ._show import print_error
 
 _USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
@@ -80,7 +81,7 @@ RUNS, INVERSE, CHECKING, START = "Trajectories", "From data", "Checks", "Start"
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"dvi-jax {version()}")
+        typer.echo(f"dvi-jax {VERSION}")
         raise typer.Exit
 
 

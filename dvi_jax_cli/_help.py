@@ -5,7 +5,7 @@ from typing import Any
 
 from typer.core import TyperCommand
 
-from ._show import stdout
+from ._show import console
 
 
 def unwrapped(text: str) -> str:
@@ -31,7 +31,7 @@ class WithExamples:
         finally:
             self.epilog = text
         if text:
-            stdout().print(text, markup=False, soft_wrap=True)
+            console().print(text, markup=False, soft_wrap=True)
 
 
 class Command(WithExamples, TyperCommand):

@@ -1,34 +1,28 @@
-"""Names that a shell completes, listed here since reading them from the package imports JAX.
+"""Names that a shell completes, read from the source of the package: importing it imports JAX.
 
 `tests/test_cli.py` compares them with the package.
 """
 
+import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-SYSTEMS = (
-    "oscillator", "duffing", "van_der_pol", "slow_oscillator", "pendulum", "perturbed_pendulum",
-    "lorentz_pendulum", "double_pendulum", "kepler", "relativistic_kepler", "oblate_kepler",
-    "two_centres", "restricted_three_body", "hill", "n_body", "figure_eight", "solar_system",
-    "henon_heiles", "toda", "fput", "stiff_fput", "nls_lattice", "uniform_field",
-    "magnetic_mirror", "dipole_field", "rigid_body", "spinning_top", "polar_motion",
-    "lotka_volterra",
-)  # fmt: skip
+
+def _found(file: str, pattern: str) -> tuple[str, ...]:
+    source = Path(__file__).parent.parent / "dvi_jax" / file
+    return tuple(re.findall(pattern, source.read_text(encoding="utf-8"), re.MULTILINE))
+
+
+VERSION = _found("__init__.py", r'^__version__ = "(.*)"')[0]
+
+SYSTEMS = _found("systems/__init__.py", r'^    "(\w+)": \w+,$')
 """Systems of the library."""
 
-METHODS = (
-    "TypeII", "Adjoint", "Strang", "StrangOfAdjoint", "Composition2", "TripleOfStrang",
-    "Yoshida4", "Yoshida6", "Yoshida8", "Suzuki4", "BlanesMoan4", "BlanesMoan6", "McLachlan4",
-    "McLachlan6", "McLachlan8", "KahanLi6", "KahanLi8", "GaussLegendre1", "GaussLegendre2",
-    "GaussLegendre3", "GaussLegendre4", "LobattoIIIAIIIB2", "LobattoIIIAIIIB3",
-    "LobattoIIIAIIIB4", "RungeKutta4",
-)  # fmt: skip
+METHODS = _found("testing/registry.py", r'^    "(\w+)": ')
 """Methods that are certified, as `dvi-jax certify --method` takes them."""
 
-CHECKS = (
-    "order", "forced-order", "symplecticity", "reversal", "adjoint", "energy", "momentum",
-    "gradient", "modes", "jit", "vmap", "failure", "traces",
-)  # fmt: skip
+CHECKS = _found("testing/checks.py", r'^@check\(\s*"([\w-]+)"')
 """Checks of a certificate, as `dvi-jax certify --check` takes them."""
 
 FILES = ("run", "sweep", "fit", "discover")

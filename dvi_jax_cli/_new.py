@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ._errors import InputError, one_of
+from ._errors import known, require
 from ._group import START, app
 from ._names import SYSTEMS, completer
 from ._session import Session, command
@@ -20,7 +20,7 @@ _RESERVED = {"con", "prn", "aux", "nul", *(f"{x}{i}" for x in ("com", "lpt") for
 """Names of devices on Windows."""
 
 
-@command(app, "new", START)
+@command(app, "new", START, jax=False)
 def new(
     session: Session,
     name: Annotated[
@@ -60,13 +60,13 @@ def new(
 
 def _check(name: Path, system: str | None) -> None:
     last = name.name
-    if not _NAME.fullmatch(last) or last.split(".")[0].lower() in _RESERVED or last[-1] in " .":
-        allowed = "letters and digits first, then also . _ - and spaces"
-        raise InputError("NAME", repr(str(name)), allowed)
-    if name.exists() or name.is_symlink():
-        raise InputError("NAME", f"{name} exists already", "a new directory")
-    if system is not None and system not in SYSTEMS:
-        raise InputError("--system", repr(system), one_of(SYSTEMS, system))
+    fits = _NAME.fullmatch(last) and last.split(".")[0].lower() not in _RESERVED
+    allowed = "letters and digits first, then also . _ - and spaces"
+    require(fits and last[-1] not in " .", "NAME", repr(str(name)), allowed)
+    is_new = not (name.exists() or name.is_symlink())
+    require(is_new, "NAME", f"{name} exists already", "a new directory")
+    if system is not None:
+        known("--system", system, SYSTEMS)
 
 
 def _files(kind: str, words: dict[str, str]) -> Any:
@@ -86,19 +86,12 @@ def notebook(script: str) -> dict[str, Any]:
     for i, part in enumerate(re.split(r"^# %%", script, flags=re.MULTILINE)[1:]):
         head, _, body = part.partition("\n")
         body = body.strip("\n")
-        cell: dict[str, Any] = {"id": f"cell-{i}", "metadata": {}}
+        kind: dict[str, Any] = {"cell_type": "code", "execution_count": None, "outputs": []}
         if "[markdown]" in head:
-            body = re.sub(r"^# ?", "", body, flags=re.MULTILINE)
-            cell |= {"cell_type": "markdown"}
-        else:
-            cell |= {"cell_type": "code", "execution_count": None, "outputs": []}
-        cells.append(cell | {"source": body.splitlines(keepends=True)})
-    return {
-        "cells": cells,
-        "metadata": {
-            "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
-            "language_info": {"name": "python", "version": sys.version.split()[0]},
-        },
-        "nbformat": 4,
-        "nbformat_minor": 5,
-    }
+            kind, body = {"cell_type": "markdown"}, re.sub(r"^# ?", "", body, flags=re.MULTILINE)
+        source = body.splitlines(keepends=True)
+        cells.append({"id": f"cell-{i}", "metadata": {}, **kind, "source": source})
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    language = {"name": "python", "version": sys.version.split()[0]}
+    about = {"kernelspec": kernel, "language_info": language}
+    return {"cells": cells, "metadata": about, "nbformat": 4, "nbformat_minor": 5}

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from ._errors import InputError, one_of
+from ._errors import known
 from ._group import START, app
 from ._names import FILES, SYSTEMS, completer
 from ._session import Session, command
@@ -28,7 +28,6 @@ def systems(
         dvi-jax systems kepler           equations, parameters, what is conserved
         dvi-jax systems kepler --json    the same for programs
     """
-    session.start_jax()
     from .work.library import library_tables
 
     heading, tables = library_tables(name)
@@ -39,7 +38,7 @@ def systems(
     session.finish({"name": name, "about": heading, "tables": rows})
 
 
-@command(app, "schema", START)
+@command(app, "schema", START, jax=False)
 def schema(
     session: Session,
     kind: Annotated[
@@ -59,8 +58,8 @@ def schema(
         dvi-jax schema sweep                    keys, types and ranges of a sweep file
         dvi-jax schema run > run.schema.json    for an editor
     """
-    if kind is not None and kind not in FILES:
-        raise InputError("KIND", repr(kind), one_of(FILES, kind))
+    if kind is not None:
+        known("KIND", kind, FILES)
     from .work.schema import json_schema
 
     print_json(json_schema(kind))

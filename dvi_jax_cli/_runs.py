@@ -1,12 +1,14 @@
-"""Commands of one TOML file: run, fit, discover."""
+"""Commands that work on a TOML file: run, sweep, fit, discover; sweep status, sweep verify."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from ._group import INVERSE, RUNS, app
 from ._session import AGAIN, Session, command
+from ._show import progress_bar
 
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML file.")]
 Force = Annotated[
@@ -14,8 +16,23 @@ Force = Annotated[
 ]
 Out = Annotated[Path | None, typer.Option(help="Directory for the results, instead of output.dir.")]
 Resume = Annotated[
-    bool, typer.Option("--resume", help="Continue from the checkpoint of an interrupted fit.")
+    bool,
+    typer.Option("--resume", help="Continue with what an interrupted call has saved, if it has."),
 ]
+StorePath = Annotated[Path, typer.Argument(metavar="STORE", help="Directory of a sweep.")]
+Store = Annotated[
+    Path | None, typer.Option(help="Directory for the results, instead of output.store.")
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Threads; one for each processor or GPU if not given.", show_default=False
+    ),
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Show tasks, bytes and seconds only.")]
+
+
+# One trajectory
 
 
 @command(app, "run", RUNS)
@@ -29,13 +46,101 @@ def run(session: Session, config: Config, out: Out = None, force: Force = False)
         dvi-jax run run.toml --out results/again --force
         dvi-jax run run.toml --json | jq .results
     """
-    session.start_jax()
     from .work.run import run_file
 
     session.note(f"reading {config}")
-    with session.bar("integrating") as bar:
-        report = run_file(config, out=out, force=force, progress=bar.show)
+    with progress_bar("integrating") as bar:
+        report = run_file(config, out=out, force=force, progress=bar)
     session.finish_report(report)
+
+
+# Many trajectories
+
+
+class _RunFirst(TyperGroup):
+    """Commands; `run` is the one where none is named."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put `run` in front of other arguments."""
+        if args and args[0] not in (*self.commands, "--help"):
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
+
+
+sweeps = typer.Typer(
+    cls=_RunFirst,
+    no_args_is_help=True,
+    subcommand_metavar="CONFIG | status STORE | verify STORE",
+    rich_markup_mode="rich",
+    help="Many trajectories: run the sweep of a TOML file, show the state of its store, verify it.",
+)
+app.add_typer(sweeps, name="sweep", rich_help_panel=RUNS)
+
+
+@command(sweeps, "run")
+def sweep_run(
+    session: Session,
+    config: Config,
+    store: Store = None,
+    resume: Resume = False,
+    threads: Threads = None,
+    dry_run: DryRun = False,
+) -> None:
+    """Run the sweep of a TOML file; `sweep CONFIG` is short for this.
+
+    Each task is in the store once it is done. After an interruption --resume continues from there.
+
+    Exit code 0: done; trajectories that fail are results, and are counted in a table. 1: failed,
+    such as by a full disk. 2: bad input, or a store of another sweep. 130: Ctrl-C.
+
+    Examples
+        dvi-jax sweep sweep.toml --dry-run      tasks, bytes and seconds that it would take
+        dvi-jax sweep sweep.toml
+        dvi-jax sweep sweep.toml --resume       continues, or begins
+    """
+    session.stopped, session.hint = "before anything was done", AGAIN
+    from .work.sweep import sweep_cost, sweep_file
+
+    session.note(f"reading {config}")
+    report = sweep_cost(config) if dry_run else sweep_file(config, store, resume, threads)
+    session.finish_report(report)
+
+
+@command(sweeps, "status", jax=False)
+def sweep_status(session: Session, store: StorePath) -> None:
+    """Show the state of a sweep: tasks, trajectories, rate, size, provenance.
+
+    It may be running meanwhile. Exit code 0: done. 2: there is no store.
+
+    Examples
+        dvi-jax sweep status results/sweep.zarr
+    """
+    from .work.sweep import sweep_status
+
+    session.finish_report(sweep_status(store))
+
+
+@command(sweeps, "verify", jax=False)
+def sweep_verify(session: Session, store: StorePath) -> None:
+    """Read everything in a store again: checksums, and whether it can be decoded.
+
+    Bad tasks are marked as not done; the sweep with --resume computes them again, to the same bits.
+
+    Exit code 0: everything is correct. 1: something was bad, or cannot be read. 2: there is no
+    store.
+
+    Examples
+        dvi-jax sweep verify results/sweep.zarr
+    """
+    session.unwritten = "the bad tasks cannot be marked as not done"
+    from .work.sweep import verify_store
+
+    with progress_bar("verifying") as bar:
+        report = verify_store(store, bar)
+    session.finish_report(report)
+
+
+# From data
 
 
 @command(app, "fit", INVERSE)
@@ -59,7 +164,6 @@ def fit(
         dvi-jax fit fit.toml --resume      continues from its checkpoint, or begins
         dvi-jax fit fit.toml --json | jq .parameters
     """
-    session.start_jax()
     session.stopped = "by Ctrl-C; there is a checkpoint if the fit had run for some seconds"
     session.hint = AGAIN
     from .work.fit import fit_file
@@ -80,10 +184,9 @@ def discover(session: Session, config: Config, out: Out = None, force: Force = F
         dvi-jax discover discover.toml
         dvi-jax discover discover.toml --json | jq '.invariants[].formula'
     """
-    session.start_jax()
     from .work.discover import discover_file
 
     session.note(f"reading {config}")
-    with session.bar("discovering") as bar:
-        report = discover_file(config, out=out, force=force, progress=bar.show)
+    with progress_bar("discovering") as bar:
+        report = discover_file(config, out=out, force=force, progress=bar)
     session.finish_report(report)

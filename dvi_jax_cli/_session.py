@@ -6,14 +6,14 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from ._errors import InputError
 from ._help import Command, shown_examples, unwrapped
-from ._show import Bar, print_error, print_json, print_tables, stderr, stdout
+from ._names import VERSION
+from ._show import console, print_error, print_json, print_tables
 
 FAILED = 1
 BAD_INPUT = 2
@@ -22,23 +22,16 @@ AGAIN = "On the command line: the same with --resume continues from what is done
 CODES = {"bad input": BAD_INPUT, "failed": FAILED, "interrupted": INTERRUPTED, "fault": FAILED}
 """Kind of an error → exit code."""
 
-_OUTPUT = "Output"
-Json = Annotated[
-    bool,
-    typer.Option(
-        "--json", help="One JSON object on stdout, nothing else there.", rich_help_panel=_OUTPUT
-    ),
-]
-Verbose = Annotated[
-    bool,
-    typer.Option(
-        "--verbose", "-v", help="Say on stderr what is done, with what.", rich_help_panel=_OUTPUT
-    ),
-]
-Debug = Annotated[
-    bool,
-    typer.Option("--debug", help="Show the whole traceback of an error.", rich_help_panel=_OUTPUT),
-]
+
+def _flag(*names: str, help: str) -> Any:
+    return Annotated[bool, typer.Option(*names, help=help, rich_help_panel="Output")]
+
+
+_COMMON = {
+    "as_json": _flag("--json", help="One JSON object on stdout, nothing else there."),
+    "verbose": _flag("--verbose", "-v", help="Report on stderr what is done, with what."),
+    "debug": _flag("--debug", help="Show the whole traceback of an error."),
+}
 
 
 class Session:
@@ -69,7 +62,7 @@ class Session:
         jax.monitoring.register_event_duration_secs_listener(self._heard)
         devices = jax.local_devices()
         self.note(
-            f"dvi-jax {version()}, jax {jax.__version__}, Python {sys.version.split()[0]}; "
+            f"dvi-jax {VERSION}, jax {jax.__version__}, Python {sys.version.split()[0]}; "
             f"{len(devices)} × {devices[0].device_kind} ({devices[0].platform}); double precision"
         )
 
@@ -80,21 +73,17 @@ class Session:
     def note(self, text: str) -> None:
         """A line on stderr, with --verbose."""
         if self.verbose:
-            stderr().print(text, markup=False, soft_wrap=True, style="dim")
+            console(stderr=True).print(text, markup=False, soft_wrap=True, style="dim")
 
     def line(self, text: str, style: str | None = None) -> None:
         """A line for the reader, without --json."""
         if not self.as_json:
-            stdout().print(text, markup=False, soft_wrap=True, style=style)
+            console().print(text, markup=False, soft_wrap=True, style=style)
 
     def tables(self, tables: Iterable[Any], words: bool = False) -> None:
         """Tables for the reader, without --json."""
         if not self.as_json:
-            print_tables(stdout(), tables, words)
-
-    def bar(self, doing: str) -> Bar:
-        """A progress bar, on stderr."""
-        return Bar(doing)
+            print_tables(tables, words)
 
     def finish(self, contents: Mapping[str, Any], failed: str = "") -> None:
         """End a command: with --json its object, with `failed` an error."""
@@ -145,55 +134,39 @@ def _known(module: str, *names: str) -> tuple[type, ...]:
 
 def fault(error: BaseException, traced: bool = False) -> str:
     """The message for an unexpected exception; `traced`: below its traceback."""
-    text = str(error).strip() or "(without a message)"
-    lines = text.splitlines()
+    lines = str(error).strip().splitlines() or ["(without a message)"]
     if len(lines) > 12:
-        text = "\n".join([*lines[:12], f"… ({len(lines) - 12} more lines)"])
-    how = (
-        "Please report it, with the traceback above."
-        if traced
-        else "The same command with --debug shows where it comes from; please report it with that."
-    )
-    kind = type(error).__name__
-    return f"this is a fault of dvi_jax, not of your input.\n{kind}: {text}\n{how}"
-
-
-def version() -> str:
-    """The version of the package, installed or beside this one, without importing it."""
-    source = Path(__file__).parent.parent / "dvi_jax" / "__init__.py"
-    try:
-        for line in source.read_text(encoding="utf-8").splitlines():
-            if line.startswith("__version__"):
-                return line.split('"')[1]
-    except (OSError, IndexError):
-        pass
-    from importlib.metadata import version
-
-    return version("dvi-jax")
+        lines[12:] = [f"… ({len(lines) - 12} more lines)"]
+    how = "The same command with --debug shows where it comes from; please report it with that."
+    if traced:
+        how = "Please report it, with the traceback above."
+    text = "\n".join([f"{type(error).__name__}: {lines[0]}", *lines[1:], how])
+    return f"this is a fault of dvi_jax, not of your input.\n{text}"
 
 
 def command(
-    group: typer.Typer, name: str, panel: str | None = None
+    group: typer.Typer, name: str, panel: str | None = None, jax: bool = True
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A command of a group: a function of a `Session` and of its own arguments and options.
 
     It gets --json, --verbose and --debug. Its docstring is the help; the lines below "Examples" are
     shown as they are. An exception is shown in one block and becomes an exit code; with --debug it
-    is raised.
+    is raised. `jax`: whether it needs JAX, which is then set up before it begins.
     """
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
-        own = list(inspect.signature(function).parameters.values())[1:]
         kind = inspect.Parameter.KEYWORD_ONLY
+        own = list(inspect.signature(function).parameters.values())[1:]
         common = [
-            inspect.Parameter(word, kind, default=False, annotation=annotation)
-            for word, annotation in (("as_json", Json), ("verbose", Verbose), ("debug", Debug))
+            inspect.Parameter(n, kind, default=False, annotation=a) for n, a in _COMMON.items()
         ]
 
         @functools.wraps(function)
         def call(as_json: bool, verbose: bool, debug: bool, **given: Any) -> None:
             session = Session(as_json, verbose, debug)
             try:
+                if jax:
+                    session.start_jax()
                 function(session, **given)
                 sys.stdout.flush()  # a pipe that is closed is to be met here
             except (typer.Exit, typer.Abort):

@@ -3,7 +3,8 @@
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 
@@ -15,18 +16,11 @@ class Table(NamedTuple):
     rows: list[list[str]]
 
 
-def stdout() -> Any:
-    """A console of standard output: no control codes without a terminal or with NO_COLOR."""
+def console(stderr: bool = False) -> Any:
+    """Standard output or error: no control codes without a terminal or with NO_COLOR."""
     from rich.console import Console
 
-    return Console(highlight=False)
-
-
-def stderr() -> Any:
-    """A console of standard error."""
-    from rich.console import Console
-
-    return Console(stderr=True, highlight=False)
+    return Console(stderr=stderr, highlight=False)
 
 
 def json_types(value: Any, not_finite: Callable[[float], Any] = lambda x: None) -> Any:
@@ -58,48 +52,32 @@ def print_error(kind: str, message: str, as_json: bool = False) -> None:
         return
     from rich.text import Text
 
-    stderr().print(Text.assemble((f"{kind}: ", "bold red"), message), soft_wrap=True)
+    console(stderr=True).print(Text.assemble((f"{kind}: ", "bold red"), message), soft_wrap=True)
 
 
-def print_tables(console: Any, tables: Iterable[Any], words: bool = False) -> None:
+def print_tables(tables: Iterable[Any], words: bool = False) -> None:
     """Tables; columns of numbers, all but the first, are aligned right unless they are `words`."""
     from rich.markup import escape
     from rich.table import Table as Grid
 
+    out = console()
     for table in tables:
-        console.print(table.title, style="bold", markup=False, soft_wrap=True)
+        out.print(table.title, style="bold", markup=False, soft_wrap=True)
         grid = Grid()
         for i, column in enumerate(table.columns):
             side = "left" if words or i == 0 else "right"
             grid.add_column(escape(column), justify=side, overflow="fold")
         for row in table.rows:
-            grid.add_row(*(escape(cell) for cell in row))
-        console.print(grid)
+            grid.add_row(*map(escape, row))
+        out.print(grid)
 
 
-class Bar:
-    """A progress bar on stderr that appears with the first call, if that is a terminal."""
+@contextmanager
+def progress_bar(doing: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on stderr, if that is a terminal: a function of the parts done and of all."""
+    from rich.progress import Progress
 
-    def __init__(self, doing: str):
-        self.doing = doing
-
-    def __enter__(self) -> "Bar":
-        self.progress = None
-        return self
-
-    def show(self, done: int, total: int) -> None:
-        """Show that `done` parts of `total` are done."""
-        from rich.progress import Progress
-
-        if self.progress is None:
-            console = stderr()
-            self.progress = Progress(
-                console=console, transient=True, disable=not console.is_terminal
-            )
-            self.progress.start()
-            self.task = self.progress.add_task(self.doing, total=total)
-        self.progress.update(self.task, completed=done)
-
-    def __exit__(self, *_: object) -> None:
-        if self.progress is not None:
-            self.progress.stop()
+    out = console(stderr=True)
+    with Progress(console=out, transient=True, disable=not out.is_terminal) as bar:
+        task = bar.add_task(doing, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

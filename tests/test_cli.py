@@ -20,7 +20,7 @@ import dvi_jax_cli._names as names
 from dvi_jax import certify, systems
 from dvi_jax_cli import app
 from dvi_jax_cli._new import notebook
-from dvi_jax_cli._session import CODES, Session, version
+from dvi_jax_cli._session import CODES, Session
 
 ROOT = Path(dvi.__file__).parent.parent
 COMMANDS = [
@@ -192,7 +192,7 @@ def test_names_that_complete_are_those_that_there_are():
         project = tomllib.load(file)["project"]
     extras = set(project["optional-dependencies"]) - {"test", "docs", "peers"}
     assert set(names.EXTRAS) == extras
-    assert version() == dvi.__version__
+    assert dvi.__version__ == names.VERSION
 
 
 # Output for programs, and errors

@@ -1,10 +1,10 @@
 """A short benchmark: four workloads and named references that take the same steps."""
 
+import importlib.util
 import math
 import os
 import platform
 import random
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
@@ -15,7 +15,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from .._session import version
+from .._names import VERSION
 from .._show import Table
 
 H = 0.05
@@ -108,48 +108,45 @@ def _numpy_gauss(q, p, steps: int):
 
 # The rows
 
+_START = np.array([1.0, 0.0]), np.array([0.0, 1.1])
+_STEPS = 20_000
+
 
 def _single() -> Row:
-    steps = 20_000
-    q, p = np.array([1.0, 0.0]), np.array([0.0, 1.1])
-    run = jax.jit(_last(_KEPLER, dvi.TypeII(), steps))
-    references = [Side("Python floats", lambda: _python_loop(q, p, steps), steps)]
-    references += _diffrax(q, p, steps)
-    what = f"one orbit, {steps} steps of TypeII; reference: the same map on Python's floats and, "
+    run = jax.jit(_last(_KEPLER, dvi.TypeII(), _STEPS))
+    references = [Side("Python floats", lambda: _python_loop(*_START, _STEPS), _STEPS)]
+    if importlib.util.find_spec("diffrax"):
+        references.append(Side("diffrax", _diffrax(), _STEPS))
+    what = f"one orbit, {_STEPS} steps of TypeII; reference: the same map on Python's floats and, "
     what += "where it is installed, in diffrax (SemiImplicitEuler)"
-    return Row("single", what, Side("", lambda: run(q, p), steps), references, 1e-6)
+    return Row("single", what, Side("", lambda: run(*_START), _STEPS), references, 1e-6)
 
 
-def _diffrax(q: np.ndarray, p: np.ndarray, steps: int) -> list[Side]:
-    """Semi-implicit Euler of diffrax, which is this map; nothing where it is not installed."""
-    try:
-        import diffrax
-    except ImportError:
-        return []
-
-    def pull(t, q, args):
-        return -q / jnp.sqrt(q @ q) ** 3 - EPSILON * q
-
-    def drift(t, p, args):
-        return p
+def _diffrax() -> Callable[[], Any]:
+    """Semi-implicit Euler of diffrax, which is this map."""
+    import diffrax
 
     # Its first part goes first: momenta with the old positions, positions with the new momenta.
-    terms = diffrax.ODETerm(pull), diffrax.ODETerm(drift)
+    terms = (
+        diffrax.ODETerm(lambda t, q, args: -q / jnp.sqrt(q @ q) ** 3 - EPSILON * q),
+        diffrax.ODETerm(lambda t, p, args: p),
+    )
+    method, end = diffrax.SemiImplicitEuler(), _STEPS * H
 
     @jax.jit
     def run(q, p):
-        found = diffrax.diffeqsolve(
-            terms, diffrax.SemiImplicitEuler(), 0.0, steps * H, H, (p, q), max_steps=steps + 8
-        )
+        found = diffrax.diffeqsolve(terms, method, 0.0, end, H, (p, q), max_steps=_STEPS + 8)
         momenta, positions = cast(Any, found.ys)
         return positions[-1], momenta[-1]
 
-    return [Side("diffrax", lambda: run(q, p), steps)]
+    return lambda: run(*_START)
 
 
 def _batch() -> Row:
-    steps = 500
-    q, p = _orbits()
+    steps, random = 500, np.random.default_rng(0)
+    angle, speed = random.uniform(0, 2 * np.pi, LANES), random.uniform(0.9, 1.15, LANES)
+    q = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    p = speed[:, None] * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
     run = jax.jit(jax.vmap(_last(_KEPLER, dvi.TypeII(), steps)))
     reference = Side("NumPy", lambda: _numpy_loop(q, p, steps), LANES * steps)
     what = f"{LANES} orbits by vmap, {steps} steps of TypeII; reference: the same in NumPy"
@@ -167,18 +164,16 @@ def _implicit() -> Row:
 
 
 def _gradient() -> Row:
-    steps = 20_000
-    q, p = np.array([1.0, 0.0]), np.array([0.0, 1.1])
-    last = _last(_KEPLER, dvi.TypeII(), steps)
+    last = _last(_KEPLER, dvi.TypeII(), _STEPS)
 
     def size(q, p):
         q1, p1 = last(q, p)
         return q1 @ q1 + p1 @ p1
 
     forward, gradient = jax.jit(size), jax.jit(jax.grad(size, argnums=(0, 1)))
-    what = f"gradient by the start, {steps} steps of TypeII; reference: the final state alone"
-    reference = Side("forward pass", lambda: forward(q, p), steps)
-    return Row("gradient", what, Side("", lambda: gradient(q, p), steps), [reference], None)
+    what = f"gradient by the start, {_STEPS} steps of TypeII; reference: the final state alone"
+    reference = Side("forward pass", lambda: forward(*_START), _STEPS)
+    return Row("gradient", what, Side("", lambda: gradient(*_START), _STEPS), [reference], None)
 
 
 _ROWS = {"single": _single, "batch": _batch, "implicit": _implicit, "gradient": _gradient}
@@ -186,23 +181,13 @@ _ROWS = {"single": _single, "batch": _batch, "implicit": _implicit, "gradient": 
 
 def _last(system: dvi.System, method: dvi.Method, steps: int, epsilon: float = EPSILON):
     """(q0, p0) → last state, by `dvi.integrate`."""
+    options: dict[str, Any] = {"h": H, "num_steps": steps, "epsilon": epsilon, "method": method}
 
     def run(q0, p0):
-        found = dvi.integrate(
-            system, q0, p0, h=H, num_steps=steps, epsilon=epsilon, method=method,
-            save=dvi.Save(final=True), throw=False,
-        )  # fmt: skip
+        found = dvi.integrate(system, q0, p0, save=dvi.Save(final=True), throw=False, **options)
         return found.qs[-1], found.ps[-1]
 
     return run
-
-
-def _orbits() -> tuple[np.ndarray, np.ndarray]:
-    random = np.random.default_rng(0)
-    angle = random.uniform(0, 2 * np.pi, LANES)
-    speed = random.uniform(0.9, 1.15, LANES)
-    q = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return q, speed[:, None] * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
 
 
 # Measuring
@@ -222,10 +207,10 @@ def measure(
         note(f"{name}: {row.what}")
         rows += _timed(row, rounds)
     progress(len(names), len(names))
+    machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} processors"
     return {
-        "machine": f"{platform.processor() or platform.machine()}, {os.cpu_count()} processors, "
-        f"JAX on {jax.local_devices()[0].device_kind}",
-        "versions": {"dvi-jax": version(), "jax": jax.__version__, "numpy": np.__version__},
+        "machine": f"{machine}, JAX on {jax.local_devices()[0].device_kind}",
+        "versions": {"dvi-jax": VERSION, "jax": jax.__version__, "numpy": np.__version__},
         "setting": _SETTING,
         "rounds": rounds,
         "rows": rows,
@@ -233,40 +218,41 @@ def measure(
 
 
 def _timed(row: Row, rounds: int) -> list[dict[str, Any]]:
-    sides = [row.own, *row.references]
-    first, ends = [], []
-    for side in sides:  # compilation and results
-        began = time.perf_counter()
-        ends.append(jax.tree.map(np.asarray, jax.block_until_ready(side.call())))
-        first.append(time.perf_counter() - began)
+    sides, shuffled = [row.own, *row.references], random.Random(0)
+    # The first call of each compiles, and gives the results that are compared.
+    first, ends = zip(*(_call(side) for side in sides), strict=True)
     seconds = np.zeros((rounds, len(sides)))
     order = list(range(len(sides)))
-    shuffled = random.Random(0)
     for k in range(rounds):
         shuffled.shuffle(order)
         for i in order:
-            began = time.perf_counter()
-            jax.block_until_ready(sides[i].call())
-            seconds[k, i] = time.perf_counter() - began
-    found = []
+            seconds[k, i], _ = _call(sides[i])
+    typical, found = np.median(seconds, axis=0), []
     for i, side in enumerate(sides[1:], 1):
         ratios = (row.own.steps / seconds[:, 0]) / (side.steps / seconds[:, i])
-        low, _, high = statistics.quantiles(ratios.tolist(), n=4)
+        low, middle, high = np.quantile(ratios, [0.25, 0.5, 0.75], method="weibull").tolist()
         differ = None if row.tolerance is None else _difference(ends[0], ends[i])
-        agrees = differ is None or (row.tolerance is not None and differ <= row.tolerance)
-        found.append({
+        measured = {
             "row": row.name,
             "what": row.what,
             "reference": side.name,
-            "steps_per_second": row.own.steps / float(np.median(seconds[:, 0])),
-            "reference_steps_per_second": side.steps / float(np.median(seconds[:, i])),
-            "ratio": float(np.median(ratios)),
+            "steps_per_second": row.own.steps / typical[0],
+            "reference_steps_per_second": side.steps / typical[i],
+            "ratio": middle,
             "quartiles": [low, high],
-            "compilation_seconds": max(0.0, first[0] - float(np.median(seconds[:, 0]))),
+            "compilation_seconds": max(0.0, first[0] - typical[0]),
             "largest_difference": differ,
-            "agrees": agrees,
-        })  # fmt: skip
+            "agrees": differ is None or bool(differ <= (row.tolerance or 0.0)),
+        }
+        found.append(measured)
     return found
+
+
+def _call(side: Side) -> tuple[float, Any]:
+    """Seconds of a call, and its result."""
+    began = time.perf_counter()
+    result = jax.block_until_ready(side.call())
+    return time.perf_counter() - began, result
 
 
 def _difference(a: Any, b: Any) -> float:
@@ -277,21 +263,13 @@ def _difference(a: Any, b: Any) -> float:
 
 def tables(found: dict[str, Any]) -> list[Table]:
     """The measurements as tables."""
-    rows = [
-        [
-            r["row"], r["reference"], f"{r['steps_per_second']:.3g}",
-            f"{r['reference_steps_per_second']:.3g}",
-            f"{r['ratio']:.3g}", f"{r['quartiles'][0]:.3g} … {r['quartiles'][1]:.3g}",
-            f"{r['compilation_seconds']:.1f} s",
-        ]
-        for r in found["rows"]
-    ]  # fmt: skip
+    names, rows = ("steps_per_second", "reference_steps_per_second", "ratio"), []
+    for r in found["rows"]:
+        speeds = [f"{r[name]:.3g}" for name in names]
+        quartiles = " … ".join(f"{x:.3g}" for x in r["quartiles"])
+        compiling = f"{r['compilation_seconds']:.1f} s"
+        rows.append([r["row"], r["reference"], *speeds, quartiles, compiling])
     about = [[name, what] for name, what in {r["row"]: r["what"] for r in found["rows"]}.items()]
-    return [
-        Table("Workloads", ["row", "what it is"], about),
-        Table(
-            f"Speed and references, {found['rounds']} rounds (ratio above 1: dvi_jax is faster)",
-            ["row", "reference", "steps/s", "theirs", "ratio", "quartiles", "compiling"],
-            rows,
-        ),
-    ]
+    title = f"Speed and references, {found['rounds']} rounds (ratio above 1: dvi_jax is faster)"
+    columns = ["row", "reference", "steps/s", "theirs", "ratio", "quartiles", "compiling"]
+    return [Table("Workloads", ["row", "what it is"], about), Table(title, columns, rows)]

@@ -11,13 +11,12 @@ import numpy as np
 import dvi_jax as dvi
 from dvi_jax import plot
 
-from .._errors import InputError, shown
+from .._errors import InputError, require, shown
 from .._show import Table
 from .expressions import parse_basis, parse_method
-from .output import Output, Report, output_for, provenance
-from .schema import BASIS, BOX, DiscoverFile, Pair
+from .output import Report, opened
+from .schema import DiscoverFile, Pair
 from .system import Source, find_source
-from .table import read_file
 
 WRITTEN = ("discovery.npz", "invariants.json", "drifts.png")
 """Every file that a discovery may write; with `force` these are replaced and nothing else."""
@@ -57,10 +56,8 @@ def discover_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    path = Path(path)
-    file, raw = read_file(path, DiscoverFile)
-    output = output_for(path, out, file.output.dir, WRITTEN, force)
-    search = make_search(file, path.parent)
+    file, output = opened("discover", Path(path), out, WRITTEN, force)
+    search = make_search(file, Path(path).parent)
     report = progress if progress is not None else lambda done, parts: None
     with output.reserved():
         began = time.perf_counter()
@@ -71,9 +68,22 @@ def discover_file(
             orders.append(_drift(search, file, series))
             report(1 + len(orders), 1 + found.count)
         seconds = time.perf_counter() - began
-    about = provenance("discover", path, raw)
     with output.writing():
-        return _write(about, search, found, orders, seconds, output, file.output.plots)
+        found.save(output.path("discovery.npz"))
+        contents = output.about | _contents(search, found, orders) | {"seconds": seconds}
+        output.write_json("invariants.json", contents)
+        if orders and file.output.plots:
+            labels = {f"invariant {i + 1}": order for i, order in enumerate(orders)}
+            expected = [None if exact else found.order + 1 for exact in found.exact]
+            output.draw({"drifts.png": lambda: plot.drift_orders(labels, expected)})
+    return Report(
+        contents,
+        _tables(contents),
+        str(found).splitlines(),
+        f"{seconds:.1f} s (compilation included)",
+        folder=output.folder,
+        files=output.files,
+    )
 
 
 # The search
@@ -87,8 +97,6 @@ def make_search(file: DiscoverFile, folder: Path) -> Search:
     source = find_source(file, folder)
     arguments = {"system": source.system, "args": source.args, "h": float(source.h), "t0": file.t0}
     low, high, shape = _box(file, source)
-    if file.basis is None:
-        raise InputError("basis", "the key is missing", BASIS)
     basis = parse_basis(file.basis, source.loader)
     try:
         size = basis.for_shape(shape).size
@@ -96,48 +104,38 @@ def make_search(file: DiscoverFile, folder: Path) -> Search:
         allowed = f"a basis for a q of shape {shape}"
         raise InputError("basis", source.reported(error), allowed) from None
     count = file.samples.count or max(_LEAST, _FOR_EACH * size)
-    if count < 2 * size:
-        allowed = f"{2 * size} at least: twice the {size} functions"
-        raise InputError("samples.count", shown(count), allowed)
+    allowed = f"{2 * size} at least: twice the {size} functions"
+    require(count >= 2 * size, "samples.count", shown(count), allowed)
     random = np.random.default_rng(file.samples.seed)
-    states = _uniform(random, low, high, count)
-    span = file.samples.times
+
+    def uniform(count: int) -> State:
+        q, p = (random.uniform(a, b, (count, *shape)) for a, b in zip(low, high, strict=True))
+        return q, p
+
+    states, span = uniform(count), file.samples.times
     times = np.full(count, file.t0) if span is None else random.uniform(span[0], span[1], count)
     arguments |= {"basis": basis, "order": file.order, "samples": (*states, times)}
     arguments |= {"method": parse_method(file.method), "tolerance": file.tolerance}
     arguments |= {"representative": file.representative}
-    return Search(source, arguments, _uniform(random, low, high, file.drift.starts))
-
-
-def _uniform(random: np.random.Generator, low: State, high: State, count: int) -> State:
-    q, p = (random.uniform(a, b, (count, *a.shape)) for a, b in zip(low, high, strict=True))
-    return q, p
+    return Search(source, arguments, uniform(file.drift.starts))
 
 
 def _box(file: DiscoverFile, source: Source) -> tuple[State, State, tuple[int, ...]]:
-    """The corners of the box, and the shape of q."""
-    given = {name: getattr(file.samples, name) for name in ("low", "high")}
-    for name, corner in given.items():
-        if corner is None:
-            raise InputError(f"samples.{name}", "the key is missing", f"a corner of the box, {BOX}")
-    shape = _shape(file, source, [x for c in given.values() for x in (c.q, c.p)])
-    low, high = (_corner(name, corner, shape) for name, corner in given.items())
-    if not all((a < b).all() for a, b in zip(low, high, strict=True)):
-        allowed = "low < high everywhere"
-        raise InputError("samples.low", "it is not below samples.high", allowed)
-    return low, high, shape
-
-
-def _shape(file: DiscoverFile, source: Source, corners: list[Any]) -> tuple[int, ...]:
-    """The shape of q: that of the system's start, or of the corners of the box."""
+    """The corners of the box, and the shape of q: that of the system's start, or of the corners."""
+    corners = {"low": file.samples.low, "high": file.samples.high}
     if source.problem is not None or file.state.q0 is not None:
-        return np.shape(source.array("q0"))
-    shapes = {np.shape(x) for x in corners} - {()}
-    if len(shapes) != 1:
+        shape = np.shape(source.array("q0"))
+    else:
+        shapes = {np.shape(x) for corner in corners.values() for x in (corner.q, corner.p)} - {()}
         seen = f"shapes {', '.join(map(str, sorted(shapes))) or 'of numbers alone'}"
         allowed = "arrays of the one shape of q in low and high"
-        raise InputError("samples.low", seen, allowed)
-    return shapes.pop()
+        require(len(shapes) == 1, "samples.low", seen, allowed)
+        shape = shapes.pop()
+    low, high = (_corner(name, corner, shape) for name, corner in corners.items())
+    is_below = all((a < b).all() for a, b in zip(low, high, strict=True))
+    allowed = "low < high everywhere"
+    require(is_below, "samples.low", "it is not below samples.high", allowed)
+    return low, high, shape
 
 
 def _corner(name: str, corner: Pair, shape: tuple[int, ...]) -> State:
@@ -160,28 +158,16 @@ def _discovered(search: Search) -> dvi.Discovery:
 
 
 def _drift(search: Search, file: DiscoverFile, series: Any) -> dvi.DriftOrder:
-    names = ("h", "t0", "args", "method")
-    settings: dict[str, Any] = {name: search.arguments[name] for name in names}
-    return dvi.drift_order(
-        search.source.system, series, *search.starts, epsilons=file.drift.epsilons,
-        num_steps=file.drift.steps, batched=True, **settings,
-    )  # fmt: skip
+    settings = {name: search.arguments[name] for name in ("h", "t0", "args", "method")}
+    settings |= {"epsilons": file.drift.epsilons, "num_steps": file.drift.steps, "batched": True}
+    return dvi.drift_order(search.source.system, series, *search.starts, **settings)
 
 
 # Results
 
 
-def _write(
-    about: dict[str, Any],
-    search: Search,
-    found: dvi.Discovery,
-    orders: list[dvi.DriftOrder],
-    seconds: float,
-    output: Output,
-    plots: bool,
-) -> Report:
-    found.save(output.folder / "discovery.npz")
-    contents = about | {
+def _contents(search: Search, found: dvi.Discovery, orders: list[dvi.DriftOrder]) -> dict[str, Any]:
+    return {
         "functions": list(found.basis.names),
         "order": found.order,
         "survivors": found.survivors,
@@ -192,36 +178,19 @@ def _write(
         "invariants": [_invariant(found, orders, i) for i in range(found.count)],
         "dependent": [str(series) for series in found.dependent_invariants],
         "lost": [str(law) for law in found.obstructions],
-        "seconds": seconds,
     }
-    output.write_json("invariants.json", contents)
-    report = Report(contents, _tables(contents), str(found).splitlines(), folder=output.folder)
-    report.files = ["discovery.npz", "invariants.json"]
-    report.summary = f"{seconds:.1f} s (compilation included)"
-    if orders and plots:
-        labels = {f"invariant {i + 1}": order for i, order in enumerate(orders)}
-        expected = [None if exact else found.order + 1 for exact in found.exact]
-        pictures = {"drifts.png": lambda: plot.drift_orders(labels, expected)}
-        report.files += output.draw(pictures)
-    return report
 
 
 def _invariant(found: dvi.Discovery, orders: list[dvi.DriftOrder], i: int) -> dict[str, Any]:
-    invariant = {
-        "formula": str(found.invariants[i]),
-        "coefficients": found.coefficients[i],
-        "residuals": found.residuals[i],
-        "exact": found.exact[i],
-        "reach": found.reach[i],
-    }
+    names = ("coefficients", "residuals", "exact", "reach")
+    invariant = {"formula": str(found.invariants[i])}
+    invariant |= {name: getattr(found, name)[i] for name in names}
     if not orders:
         return invariant
-    order = orders[i]
-    names = ("epsilons", "drifts", "used", "excluded", "floor", "floor_cause", "slope", "interval",
-             "resolved", "model")  # fmt: skip
-    drift = {name: getattr(order, name) for name in names}
-    counts = {"starts": len(order.kept), "starts_kept": int(order.kept.sum())}
-    return invariant | {"drift": drift | counts}
+    names = ("epsilons", "drifts", "used", "excluded", "floor", "floor_cause", "slope", "interval")
+    drift = {name: getattr(orders[i], name) for name in (*names, "resolved", "model")}
+    kept = orders[i].kept
+    return invariant | {"drift": drift | {"starts": len(kept), "starts_kept": int(kept.sum())}}
 
 
 def _tables(contents: dict[str, Any]) -> list[Table]:

@@ -32,10 +32,7 @@ class Expressions:
     allowed: str = ""
 
     def read(self, text: str) -> Any:
-        """The object that a text describes.
-
-        **Raises** `InputError`.
-        """
+        """The object that a text describes. **Raises** `InputError`."""
         try:
             made = self._made(ast.parse(text.strip(), mode="eval").body)
         except InputError:
@@ -98,10 +95,8 @@ def parse_basis(text: str, loader: Loader) -> Any:
 
     **Raises** `InputError`.
     """
-    bases = public(AbstractBasis, dvi.Basis)
-    reader = Expressions(
-        "basis", AbstractBasis, bases, ', their sums and products; or "file.py:name"'
-    )
+    allowed = ', their sums and products; or "file.py:name"'
+    reader = Expressions("basis", AbstractBasis, public(AbstractBasis, dvi.Basis), allowed)
     if ".py:" not in text:
         return reader.read(text)
     made = loader.load("basis", text)

@@ -1,6 +1,6 @@
 """One fit: read, fit, write."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,18 +13,13 @@ from dvi_jax import plot
 from dvi_jax.fit.progress import shown as shown_bar
 from dvi_jax.fit.result import little_explained, numbers_in_words
 
-from .._errors import InputError
 from .._show import Table
 from .fit_problem import FitProblem, fit_problem
-from .output import Output, Report, output_for, provenance, watched
-from .schema import FitFile
-from .table import read_file
+from .output import Report, opened, watched
 
 CHECKPOINT = "checkpoint.npz"
-WRITTEN = (
-    "fit.npz", "fit.json", "trajectory.npz", CHECKPOINT,
-    "data.png", "residuals.png", "parameters.png", "learning.png",
-)  # fmt: skip
+_IMAGES = ("data.png", "residuals.png", "parameters.png", "learning.png")
+WRITTEN = ("fit.npz", "fit.json", "trajectory.npz", CHECKPOINT, *_IMAGES)
 """Every file that a fit may write; with `force` these are replaced and nothing else."""
 
 _MOST = 20_000
@@ -56,50 +51,39 @@ def fit_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    path = Path(path)
-    file, raw = read_file(path, FitFile)
-    problem = fit_problem(file, path.parent)
-    output = output_for(path, out, file.output.dir, WRITTEN, force or resume)
+    file, output = opened("fit", Path(path), out, WRITTEN, force or resume)
+    problem = fit_problem(file, Path(path).parent)
+    checkpoint = output.folder / CHECKPOINT
+    arguments = problem.options | {"checkpoint": checkpoint, "throw": False}
+    allowed = "functions, start, args and data that fit one another"
     with output.reserved():  # a checkpoint remains after an error
         if not resume:
-            (output.folder / CHECKPOINT).unlink(missing_ok=True)
-        found = _fitted(problem, output.folder / CHECKPOINT, progress)
+            checkpoint.unlink(missing_ok=True)
+        found, _ = watched(
+            lambda report: dvi.fit(
+                problem.model, problem.data, problem.params, progress=report, **arguments
+            ),
+            shown_bar(progress),
+            lambda error: problem.source.misfit("fit", "fitted", error, allowed),
+        )
     with output.writing(keep=CHECKPOINT):
-        return _write(problem, provenance("fit", path, raw), found, output, file.output.plots)
-
-
-def _fitted(problem: FitProblem, checkpoint: Path, progress: Any) -> dvi.FitResult:
-    def work(report: Callable[[Any], None]) -> dvi.FitResult:
-        return dvi.fit(
-            problem.model, problem.data, problem.params, **problem.options,
-            checkpoint=checkpoint, progress=report, throw=False,
-        )  # fmt: skip
-
-    def misfit(error: Exception) -> InputError:
-        allowed = "functions, start, args and data that fit one another"
-        return problem.source.misfit("fit", "fitted", error, allowed)
-
-    return watched(work, shown_bar(progress), misfit)[0]
-
-
-def _write(
-    problem: FitProblem, about: dict[str, Any], found: dvi.FitResult, output: Output, plots: bool
-) -> Report:
-    found.save(output.folder / "fit.npz")
-    trajectory, status = _trajectory(problem, found)
-    np.savez(output.folder / "trajectory.npz", **trajectory)
-    contents = about | _contents(problem, found) | {"trajectory": status}
-    output.write_json("fit.json", contents)
-    report = Report(contents, _tables(found, contents), _notes(found), folder=output.folder)
-    report.message = _failure(found, status)
-    report.files = ["fit.npz", "trajectory.npz", "fit.json"]
-    steps = len(found.history["loss"])
-    report.summary = (
-        f"{found.status} after {steps} steps, {found.seconds:.1f} s (compilation included)"
+        found.save(output.path("fit.npz"))
+        trajectory, status = _trajectory(problem, found)
+        output.write_arrays("trajectory.npz", trajectory)
+        contents = output.about | _contents(problem, found) | {"trajectory": status}
+        output.write_json("fit.json", contents)
+        if file.output.plots:
+            output.draw(_pictures(problem, found))
+    steps = f"{contents['steps']} steps, {found.seconds:.1f} s (compilation included)"
+    return Report(
+        contents,
+        _tables(found, contents),
+        _notes(found),
+        summary=f"{found.status} after {steps}",
+        message=_failure(found, contents),
+        folder=output.folder,
+        files=output.files,
     )
-    if plots:  # after the numbers: a picture that fails costs no result
-        report.files += output.draw(_pictures(found, problem.columns))
-    return report
 
 
 def _trajectory(problem: FitProblem, found: dvi.FitResult) -> tuple[dict[str, Any], str]:
@@ -147,38 +131,31 @@ def _tables(found: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
     rows = [[name, words, f"{known['start']:.6g}"] for (name, known), words in values]
     tables = [Table("Parameters, ± standard error", ["name", "value", "start"], rows)]
     if len(found.names) > 1:
-        tables.append(_correlation_table(found))
-    residuals = contents["residuals"]
+        tables.append(_correlation_table(found.names, found.correlations))
+    has, residuals = found.has_errors, contents["residuals"]
     rows = [
         ["values", str(found.num_observed)],
         ["values missing", str(contents["missing"])],
         ["degrees of freedom", str(found.degrees_of_freedom)],
         ["rms [units of the data]", f"{found.rms:.4g}"],
         ["variance explained [%]", f"{100 * found.explained:.4g}"],
+        ["chi²", f"{found.chi2:.6g}" if has else ""],
+        ["chi² of the priors", f"{found.prior_chi2:.4g}" if has and found.prior_chi2 else ""],
+        ["reduced chi²", f"{found.reduced_chi2:.4g}" if has else ""],
+        ["largest [standard errors]", f"{residuals['largest']:.3g}" if has else ""],
+        ["correlation of neighbours", f"{residuals['lag_one']:.3f}"],
     ]
-    if found.has_errors:
-        rows.append(["chi²", f"{found.chi2:.6g}"])
-        if found.prior_chi2:
-            rows.append(["chi² of the priors", f"{found.prior_chi2:.4g}"])
-        rows.append(["reduced chi²", f"{found.reduced_chi2:.4g}"])
-        rows.append(["largest [standard errors]", f"{residuals['largest']:.3g}"])
-    rows.append(["correlation of neighbours", f"{residuals['lag_one']:.3f}"])
-    return [*tables, Table("Residuals", ["", "value"], rows)]
+    return [*tables, Table("Residuals", ["", "value"], [row for row in rows if row[1]])]
 
 
-def _correlation_table(found: dvi.FitResult) -> Table:
-    matrix, names = found.correlations, found.names
-    if len(names) <= _MATRIX:
-        rows = [
-            [name, *(f"{matrix[i, j]:.2f}" if j < i else "" for j in range(len(names) - 1))]
-            for i, name in enumerate(names)
-            if i
-        ]
-        return Table("Correlations", ["", *names[:-1]], rows)
-    pairs = [(i, j) for i in range(len(names)) for j in range(i)]
-    strongest = sorted(pairs, key=lambda ij: -np.nan_to_num(abs(matrix[ij]), nan=-1))[:10]
-    rows = [[names[i], names[j], f"{matrix[i, j]:.3f}"] for i, j in strongest]
-    return Table("Strongest correlations", ["of", "and", "value"], rows)
+def _correlation_table(names: list[str], matrix: np.ndarray) -> Table:
+    below = [(i, j) for i in range(len(names)) for j in range(i)]
+    if len(names) > _MATRIX:
+        strongest = sorted(below, key=lambda ij: -np.nan_to_num(abs(matrix[ij]), nan=-1))[:10]
+        rows = [[names[i], names[j], f"{matrix[i, j]:.3f}"] for i, j in strongest]
+        return Table("Strongest correlations", ["of", "and", "value"], rows)
+    rows = [[name, *(f"{x:.2f}" for x in matrix[i, :i])] for i, name in enumerate(names)]
+    return Table("Correlations", ["", *names[:-1]], rows[1:])
 
 
 def _notes(found: dvi.FitResult) -> list[str]:
@@ -206,22 +183,22 @@ def _notes(found: dvi.FitResult) -> list[str]:
     return notes
 
 
-def _failure(found: dvi.FitResult, status: str) -> str:
+def _failure(found: dvi.FitResult, contents: dict[str, Any]) -> str:
     if found.status != "converged":
         return (
-            f"the fit did not converge ({found.status} after {len(found.history['loss'])} steps). "
-            f"{dvi.FIT_RESULTS[found.result]}\nIts results so far have been written."
+            f"the fit did not converge ({found.status} after {contents['steps']} steps). "
+            f"{contents['message']}\nIts results so far have been written."
         )
-    if status != "successful":
-        return f"the fitted trajectory fails ({status}). The results have been written."
-    return ""
+    status = contents["trajectory"]
+    failed = f"the fitted trajectory fails ({status}). The results have been written."
+    return "" if status == "successful" else failed
 
 
-def _pictures(found: dvi.FitResult, columns: Sequence[str]) -> dict[str, Callable[[], Any]]:
+def _pictures(problem: FitProblem, found: dvi.FitResult) -> dict[str, Callable[[], Any]]:
     """File name → function that draws, for the pictures that this fit can have."""
     pictures: dict[str, Callable[[], Any]] = {
-        "data.png": partial(plot.fit_against_data, found, names=columns),
-        "residuals.png": partial(plot.fit_residuals, found, names=columns),
+        "data.png": partial(plot.fit_against_data, found, names=problem.columns),
+        "residuals.png": partial(plot.fit_residuals, found, names=problem.columns),
         "learning.png": partial(plot.learning_curve, found),
     }
     known = [n for n, s in zip(found.names, found.sigma, strict=True) if 0 < s < np.inf]

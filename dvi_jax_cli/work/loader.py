@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from .._errors import InputError, one_of, reason, shown
+from .._errors import InputError, one_of, reason, require, shown
 
 _ALLOWED = '"file.py:name", a Python file in the folder of the TOML file and a name in it'
 
@@ -28,22 +28,20 @@ class Loader:
         running the file fails: with the line that failed.
         """
         file, _, name = text.rpartition(":")
-        if os.path.isabs(file) or ".." in Path(file).parts:
-            raise InputError(key, f"{shown(text)} leaves the folder of the TOML file", _ALLOWED)
+        leaves = os.path.isabs(file) or ".." in Path(file).parts
+        require(not leaves, key, f"{shown(text)} leaves the folder of the TOML file", _ALLOWED)
         try:
             path = (self.folder / file).resolve()
             is_file = path.is_file()
         except (OSError, ValueError) as error:  # a name that no file can have
             raise InputError(key, f"{shown(text)}: {reason(error)}", _ALLOWED) from None
-        if not is_file:
-            raise InputError(key, f"{text!r}: there is no file {path}", _ALLOWED)
+        require(is_file, key, f"{text!r}: there is no file {path}", _ALLOWED)
         if path not in self.modules:
             self.modules[path] = self._run(key, text, path)
         module = self.modules[path]
-        if not hasattr(module, name):
-            names = [n for n in vars(module) if not n.startswith("_")]
-            allowed = f"a name in that file: {one_of(names, name)}"
-            raise InputError(key, f"{file} has no {name!r}", allowed)
+        names = [n for n in vars(module) if not n.startswith("_")]
+        allowed = f"a name in that file: {one_of(names, name)}"
+        require(hasattr(module, name), key, f"{file} has no {name!r}", allowed)
         return getattr(module, name)
 
     def _run(self, key: str, text: str, path: Path) -> Any:
@@ -71,10 +69,12 @@ def in_one_line(error: BaseException, *files: Path) -> str:
     places = traceback.extract_tb(error.__traceback__)
     inside = [p for p in places if Path(p.filename) in files]
     where = f" ({Path(inside[-1].filename).name}, line {inside[-1].lineno})" if inside else ""
-    errors = jax.errors
-    if isinstance(error, errors.ConcretizationTypeError | errors.TracerArrayConversionError):
-        return (
-            f"{kind}{where}: the arguments of a function are placeholders while it is compiled; "
-            "write it with jax.numpy in place of math and numpy, jnp.where in place of if"
+    text = str(error)
+    if isinstance(
+        error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError
+    ):
+        text = (
+            "the arguments of a function are placeholders while it is compiled; write it with "
+            "jax.numpy in place of math and numpy, jnp.where in place of if"
         )
-    return f"{kind}: {error}{where}"
+    return f"{kind}: {text}{where}"

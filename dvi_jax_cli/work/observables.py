@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
+from dvi_jax.engine.signature import accepts
 from dvi_jax.systems.n_body import linear_momentum
 
-from .._errors import InputError, one_of
+from .._errors import InputError, known, require
 from .expressions import Expressions, public
 from .system import Source
 
@@ -24,49 +25,37 @@ def read_observables(given: dict[str, str] | None, source: Source) -> dict[str, 
 
     **Raises** `InputError`.
     """
-    known = dict(source.problem.observables) if source.problem is not None else {}
+    own = dict(source.problem.observables) if source.problem is not None else {}
     if given is None:
-        return {**known, **{f"{name}_drift": dvi.MaxDrift(f) for name, f in known.items()}}
-    return {n: _observable(f"observables.{n}", text, known, source) for n, text in given.items()}
+        return {**own, **{f"{name}_drift": dvi.MaxDrift(f) for name, f in own.items()}}
+    return {n: _observable(f"observables.{n}", text, own, source) for n, text in given.items()}
 
 
-def _observable(key: str, text: str, known: dict[str, Callable], source: Source) -> Any:
+def _observable(key: str, text: str, names: dict[str, Callable], source: Source) -> Any:
     indicators = public(dvi.Deviations)
     reductions = public(dvi.Reduction, dvi.Deviations, *indicators.values())
-    inner, wrap = text.strip(), None
+    inner, wrap = text.strip(), lambda function: function
     if found := re.fullmatch(r"(\w+)\((.*)\)", inner):
         if found[1] in indicators:  # as it is written in Python, such as GALI(4, log10=True)
             example = "; with numbers alone, as in LyapunovSpectrum(2) or MEGNO()"
             return Expressions(key, dvi.Deviations, indicators, example).read(inner)
-        if found[1] not in reductions:
-            names = one_of([*reductions, *indicators], found[1])
-            raise InputError(key, repr(text), f"a reduction: {names}")
+        known(key, found[1], [*reductions, *indicators], "a reduction: {}", repr(text))
         wrap, inner = reductions[found[1]], found[2].strip()
     if ":" in inner:
-        function = _function(key, inner, source)
-    elif inner in known:
-        function = known[inner]
-    else:
-        calls = ", ".join(f"{name}()" for name in indicators)
-        allowed = f'{one_of(known, inner)}; or "file.py:name"; alone or in {", ".join(reductions)}'
-        raise InputError(key, repr(inner), f"{allowed}; or {calls}")
-    return wrap(function) if wrap is not None else function
+        return wrap(_function(key, inner, source))
+    calls = ", ".join(f"{name}()" for name in indicators)
+    allowed = f'{{}}; or "file.py:name"; alone or in {", ".join(reductions)}; or {calls}'
+    known(key, inner, names, allowed, repr(inner))
+    return wrap(names[inner])
 
 
 def _function(key: str, text: str, source: Source) -> Any:
     function = source.loader.load(key, text)
-    if not callable(function):
-        raise InputError(key, f"{text!r} is {type(function).__name__}", _A_FUNCTION)
-    if hasattr(function, "bind"):  # an energy, which is called with the system
-        return function
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):  # a builtin without a signature
-        return function
-    try:
-        signature.bind(*range(7))
-    except TypeError:
-        raise InputError(key, f"{text!r} takes {signature}", _A_FUNCTION) from None
+    seen = f"{text!r} is {type(function).__name__}"
+    require(callable(function), key, seen, _A_FUNCTION)
+    # An energy has `bind` and is called with the system.
+    if not hasattr(function, "bind") and not accepts(function, 7):
+        raise InputError(key, f"{text!r} takes {inspect.signature(function)}", _A_FUNCTION)
     return function
 
 
@@ -99,15 +88,15 @@ class Observed:
 
     def summary(self) -> dict[str, Any]:
         """The entry of the report."""
-        if not self.reduction:
+        if self.reduction:
+            found = {"reduction": self.reduction, "value": self.values}
+            if self.reduction in ("MaxDrift", "Range"):
+                found["relative"] = float(np.linalg.norm(self.values)) / self.scale
+        else:
             change = np.abs(self.change())
             largest = np.max(change, where=np.isfinite(change), initial=-np.inf)
             found = {"start": self.start, "end": self.values[-1]}
             found["largest_saved_change"] = float(largest) if largest >= 0 else np.nan
-            return found | {"scale": self.scale}
-        found = {"reduction": self.reduction, "value": self.values}
-        if self.reduction in ("MaxDrift", "Range"):
-            found["relative"] = float(np.linalg.norm(self.values)) / self.scale
         return found | {"scale": self.scale}
 
 
@@ -123,20 +112,16 @@ def observe(
     t0 = jnp.asarray(run["t0"], q0.dtype)
     found = {}
     for name, observable in observables.items():
-        is_reduced = isinstance(observable, dvi.Reduction)
-        function: Any = observable.function if is_reduced else observable
+        reduction = type(observable).__name__ if isinstance(observable, dvi.Reduction) else ""
+        function: Any = observable.function if reduction else observable
         if hasattr(function, "bind"):  # it requires the system and ε of the run
             function = function.bind(run["system"], run["epsilon"])
         start = np.asarray(function(t0, t0, q0, p0, q0, p0, run["args"]))  # a step of length zero
         scale = float(np.linalg.norm(start))
         if function is linear_momentum:
             scale = float(np.linalg.norm(run["p0"], axis=-1).sum())
-        if not np.isfinite(scale) or scale == 0:
-            scale = 1.0
-        reached = np.asarray(values[name])
-        if not is_reduced:
-            reached = np.concatenate([start[None], reached])
-        found[name] = Observed(
-            start, reached, scale, type(observable).__name__ if is_reduced else ""
-        )
+        scale = scale if np.isfinite(scale) and scale else 1.0
+        saved = np.asarray(values[name])
+        saved = saved if reduction else np.concatenate([start[None], saved])
+        found[name] = Observed(start, saved, scale, reduction)
     return found

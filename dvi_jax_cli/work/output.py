@@ -2,18 +2,22 @@
 
 import json
 import platform
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import dvi_jax as dvi
 from dvi_jax import plot
 
-from .._errors import InputError, reason
+from .._errors import InputError, reason, require
 from .._show import Table, json_types
+from .schema import FILES
+from .table import read_file
 
 
 @dataclass
@@ -39,17 +43,20 @@ class Report:
         return not self.message
 
 
-@dataclass(frozen=True)
+@dataclass
 class Output:
     """The directory of the results: `folder`, and the key or option that names it.
 
     - `force`: whether files of earlier results, those in `names`, may be replaced.
+    - `about`: what describes the work. `files`: the names of the files that have been written.
     """
 
     folder: Path
     key: str
     names: tuple[str, ...]
     force: bool = False
+    about: dict[str, Any] = field(default_factory=dict)
+    files: list[str] = field(default_factory=list)
 
     @contextmanager
     def reserved(self) -> Iterator[None]:
@@ -57,30 +64,23 @@ class Output:
 
         **Raises** `InputError` where it cannot be made, or has files.
         """
-        is_new = self._make()
+        allowed = "a directory that does not exist or is empty; with --force, one to write into"
+        folder = self.folder
+        try:
+            is_new = not folder.exists()
+            if is_new:
+                folder.mkdir(parents=True)
+            is_free = not folder.is_dir() or self.force or not any(folder.iterdir())
+        except (OSError, ValueError) as error:
+            raise InputError(self.key, f"{folder}: {reason(error)}", allowed) from None
+        require(folder.is_dir(), self.key, f"{folder} is not a directory", allowed)
+        require(is_free, self.key, f"{folder} exists and is not empty", allowed)
         try:
             yield
         except BaseException:
-            if is_new and not any(self.folder.iterdir()):
-                self.folder.rmdir()
+            if is_new and not any(folder.iterdir()):
+                folder.rmdir()
             raise
-
-    def _make(self) -> bool:
-        allowed = "a directory that does not exist or is empty; with --force, one to write into"
-        seen, folder = "", self.folder
-        try:
-            if not folder.exists():
-                folder.mkdir(parents=True)
-                return True
-            if not folder.is_dir():
-                seen = f"{folder} is not a directory"
-            elif any(folder.iterdir()) and not self.force:
-                seen = f"{folder} exists and is not empty"
-        except (OSError, ValueError) as error:
-            seen = f"{folder}: {reason(error)}"
-        if seen:
-            raise InputError(self.key, seen, allowed)
-        return False
 
     @contextmanager
     def writing(self, keep: str = "") -> Iterator[None]:
@@ -106,18 +106,45 @@ class Output:
                 "The last file may be incomplete; the same with --force writes all of them again"
             ) from None
 
+    def path(self, name: str) -> Path:
+        """The path of a file that is about to be written."""
+        self.files.append(name)
+        return self.folder / name
+
+    def write_arrays(self, name: str, arrays: dict[str, Any]) -> None:
+        """An npz file."""
+        np.savez(self.path(name), **arrays)
+
     def write_json(self, name: str, contents: dict[str, Any]) -> None:
         """A JSON file; numbers that are not finite are texts, to stay visible."""
         plain = json_types(contents, str)
         text = json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
-        (self.folder / name).write_text(text + "\n", encoding="utf-8")
+        self.path(name).write_text(text + "\n", encoding="utf-8")
 
-    def draw(self, pictures: dict[str, Any]) -> Iterable[str]:
-        """Write pictures, file name → function that returns axes, and return their names."""
+    def draw(self, pictures: dict[str, Callable[[], Any]]) -> None:
+        """Pictures, file name → function that returns axes; after the numbers, so that a picture
+        that fails loses no result."""
         with plot.style():
             for name, draw in pictures.items():
-                plot.save(draw(), self.folder / name)
-        return pictures
+                plot.save(draw(), self.path(name))
+
+
+def opened(
+    kind: str, path: Path, out: str | Path | None, names: tuple[str, ...], force: bool
+) -> tuple[Any, Output]:
+    """The values of a TOML file, and the directory of the results: of the option --out, or of the
+    file, or one named after the file.
+
+    **Raises** `InputError`.
+    """
+    model: Any = FILES[kind]
+    file, raw = read_file(path, model)
+    versions = {name: version(name) for name in ("dvi-jax", "jax", "jaxlib", "numpy")}
+    versions["python"] = platform.python_version()
+    about = {kind: str(path), "config": raw, "versions": versions}
+    key = "--out" if out is not None else "output.dir"
+    folder = Path(out or file.output.dir or f"results/{path.stem}")
+    return file, Output(folder, key, names, force, about)
 
 
 def watched(
@@ -146,21 +173,3 @@ def watched(
             if last:
                 raise
             raise misfit(error) from error
-
-
-def output_for(
-    path: Path, out: str | Path | None, given: str | None, names: tuple[str, ...], force: bool
-) -> Output:
-    """The directory of the option --out, or of the file, or one named after the file."""
-    key = "--out" if out is not None else "output.dir"
-    return Output(Path(out or given or f"results/{path.stem}"), key, names, force)
-
-
-def provenance(kind: str, path: Path, raw: dict[str, Any]) -> dict[str, Any]:
-    """The file as it is, and the versions that it was run with."""
-    versions = {name: version(name) for name in ("dvi-jax", "jax", "jaxlib", "numpy")}
-    return {
-        kind: str(path),
-        "config": raw,
-        "versions": versions | {"python": platform.python_version()},
-    }

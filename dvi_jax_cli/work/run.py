@@ -17,15 +17,12 @@ from .._show import Table
 from . import solar
 from .expressions import parse_method
 from .observables import Observed, observe, read_observables
-from .output import Output, Report, output_for, provenance
+from .output import Report, opened
 from .schema import RunFile
 from .system import Source, find_source
-from .table import read_file
 
-WRITTEN = (
-    "trajectory.npz", "report.json",
-    "invariants.png", "trajectory.png", "orbits.png", "ephemeris.png",
-)  # fmt: skip
+_IMAGES = ("invariants.png", "trajectory.png", "orbits.png", "ephemeris.png")
+WRITTEN = ("trajectory.npz", "report.json", *_IMAGES)
 """Every file that a run may write; with `force` these are replaced and nothing else."""
 
 
@@ -48,28 +45,40 @@ def run_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    path = Path(path)
-    file, raw = read_file(path, RunFile)
-    output = output_for(path, out, file.output.dir, WRITTEN, force)
+    file, output = opened("run", Path(path), out, WRITTEN, force)
     with output.reserved():
-        source = find_source(file, path.parent)
+        source = find_source(file, Path(path).parent)
         run = run_arguments(file, source)
-        observables = {
-            "own": read_observables(file.observables, source),
-            "always": {} if source.jd is None else solar.conserved(),
-        }
+        observe_own = read_observables(file.observables, source)
+        always = {} if source.jd is None else solar.conserved()
         began = time.perf_counter()
-        solution = _integrate(source, run, observables, progress)
+        asked = {"own": observe_own, "always": always}
+        try:
+            found = dvi.integrate(**run, observe=asked, throw=False, progress=progress)
+            jax.block_until_ready(found)
+        except Exception as error:  # also whatever a user's function raises while it is traced
+            allowed = "functions, state and args that fit one another"
+            raise source.misfit("system", "integrated", error, allowed) from error
         seconds = time.perf_counter() - began
-    observed = {
-        part: observe(run, observables[part], solution.observed[part]) for part in observables
-    }
-    contents = provenance("run", path, raw) | _results(solution, observed["own"], seconds)
-    report = Report(contents, message=_failure(contents["status"]), folder=output.folder)
     with output.writing():
-        _write(report, output, source, run, solution, observed, file.output.plots)
-    stats = contents["stats"]
-    report.summary = f"{stats['num_steps']} steps in {seconds:.1f} s (compilation included)"
+        own = observe(run, observe_own, found.observed["own"])
+        contents = output.about | _results(found, own, seconds)
+        arrays = {name: np.asarray(getattr(found, name)) for name in ("ts", "qs", "ps", "hs")}
+        values = {f"observed/{name}": np.asarray(found.observed["own"][name]) for name in own}
+        output.write_arrays("trajectory.npz", arrays | values)
+        report = Report(contents, [_table(own)] if own else [], folder=output.folder)
+        ts, qs, ps, _ = arrays.values()
+        if source.jd is None:
+            pictures = _pictures(source, ts, qs, ps, own)
+        else:
+            observed = observe(run, always, found.observed["always"])
+            pictures = solar.report(report, source.jd + (ts - ts[0]), qs, ps, run, observed)
+        output.write_json("report.json", contents)
+        if file.output.plots:
+            output.draw(pictures)
+    report.files, report.message = output.files, _failure(contents["status"])
+    steps = contents["stats"]["num_steps"]
+    report.summary = f"{steps} steps in {seconds:.1f} s (compilation included)"
     return report
 
 
@@ -80,52 +89,32 @@ def run_arguments(file: RunFile, source: Source) -> dict[str, Any]:
     """
     (q0, p0), args = source.state, source.args
     source.check_start(q0, p0, args)
-    lattice, h, steps = source.times(file)
-    if source.jd is not None:
-        _check_dates(source.jd, lattice, h, steps)
-    return {
-        "system": source.system, "q0": q0, "p0": p0, "h": h, "num_steps": steps, "t0": file.t0,
-        "epsilon": file.epsilon, "args": args, "method": parse_method(file.method),
-        "lattice": lattice, "save": dvi.Save(every=file.output.every, final=True),
-    }  # fmt: skip
+    method, save = parse_method(file.method), dvi.Save(every=file.output.every, final=True)
+    run = {"system": source.system, "q0": q0, "p0": p0, "args": args, "method": method}
+    run |= {"save": save, **source.times(file)}
+    if source.jd is not None:  # a run that is compared with the ephemeris must not leave it
+        ts = file.lattice.times if run["h"] is None else (0.0, run["h"] * run["num_steps"])
+        span = float(ts[-1] - ts[0])
+        try:
+            check_covered(source.jd + span)
+        except ValueError as error:
+            seen = f"the run ends {span:g} days after its start: {error}"
+            raise InputError("steps", seen, "fewer steps, a smaller h, or another date") from None
+    return run
 
 
-def _check_dates(jd: float, lattice: dvi.Lattice, h: Any, steps: Any) -> None:
-    """Reject, before the work, a run that leaves the ephemeris that it is compared with."""
-    ts = lattice.ts if isinstance(lattice, dvi.Given) else (0.0, h * steps)
-    span = float(ts[-1] - ts[0])
-    try:
-        check_covered(jd + span)
-    except ValueError as error:
-        seen = f"the run ends {span:g} days after its start: {error}"
-        raise InputError("steps", seen, "fewer steps, a smaller h, or another date") from None
-
-
-def _integrate(
-    source: Source, run: dict[str, Any], observables: dict[str, Any], progress: Any
-) -> dvi.Solution:
-    try:
-        solution = dvi.integrate(**run, observe=observables, throw=False, progress=progress)
-        return jax.block_until_ready(solution)
-    except Exception as error:  # also whatever a user's function raises while it is traced
-        allowed = "functions, state and args that fit one another"
-        raise source.misfit("system", "integrated", error, allowed) from error
-
-
-def _results(
-    solution: dvi.Solution, observed: dict[str, Observed], seconds: float
-) -> dict[str, Any]:
-    stats = {name: np.asarray(value) for name, value in solution.stats.items()}
+def _results(found: dvi.Solution, own: dict[str, Observed], seconds: float) -> dict[str, Any]:
+    stats = {name: np.asarray(value) for name, value in found.stats.items()}
     return {
         "status": {
-            "result": solution.status,
-            "message": dvi.RESULTS[solution.result],
+            "result": found.status,
+            "message": dvi.RESULTS[found.result],
             "failed_step": int(stats["failed_step"]),
             "failed_residual": float(stats["failed_residual"]),
             "num_steps": int(stats["num_steps"]),
         },
-        "stats": stats | {"seconds": seconds, "saved": len(solution.ts)},
-        "results": {name: found.summary() for name, found in observed.items()},
+        "stats": stats | {"seconds": seconds, "saved": len(found.ts)},
+        "results": {name: observed.summary() for name, observed in own.items()},
     }
 
 
@@ -139,36 +128,6 @@ def _failure(status: dict[str, Any]) -> str:
     )
 
 
-def _write(
-    report: Report,
-    output: Output,
-    source: Source,
-    run: dict[str, Any],
-    solution: dvi.Solution,
-    observed: dict[str, dict[str, Observed]],
-    plots: bool,
-) -> None:
-    own, always = observed["own"], observed["always"]
-    arrays = {name: np.asarray(getattr(solution, name)) for name in ("ts", "qs", "ps", "hs")}
-    values = {f"observed/{name}": np.asarray(solution.observed["own"][name]) for name in own}
-    saved: Any = arrays | values
-    np.savez(output.folder / "trajectory.npz", **saved)
-    ts, qs, ps, _ = arrays.values()
-    if own:
-        report.tables.append(_table(own))
-    if source.jd is None:
-        pictures = _pictures(source, ts, qs, ps, own)
-    else:
-        found = solar.compare(source.jd + (ts - ts[0]), qs, ps, np.asarray(run["args"]["masses"]))
-        share = solar.own_share(run, qs, ps)
-        solar.report(report, found, always, share)
-        pictures = solar.pictures(found, always, run)
-    output.write_json("report.json", report.contents)
-    report.files += ["trajectory.npz", "report.json"]
-    if plots:  # after the numbers: a picture that fails costs no result
-        report.files += output.draw(pictures)
-
-
 def _table(observed: dict[str, Observed]) -> Table:
     rows = []
     for name, found in observed.items():
@@ -179,11 +138,8 @@ def _table(observed: dict[str, Observed]) -> Table:
         else:
             change = f"{s['largest_saved_change']:.2e}"
             rows.append([name, "", _number(s["start"]), _number(s["end"]), change])
-    return Table(
-        "Observables (changes: relative, where the start is not zero)",
-        ["name", "reduction", "start", "end or value", "change"],
-        rows,
-    )
+    title = "Observables (changes: relative, where the start is not zero)"
+    return Table(title, ["name", "reduction", "start", "end or value", "change"], rows)
 
 
 def _number(value: Any, most: int = 0) -> str:
@@ -200,19 +156,16 @@ def _pictures(
     source: Source, ts: np.ndarray, qs: np.ndarray, ps: np.ndarray, observed: dict[str, Observed]
 ) -> dict[str, Any]:
     """File name → function that draws: the trajectory, and the changes of the observables."""
-    unit = source.units.get("t", "")
+    unit, title = source.units.get("t", ""), source.name.replace("_", " ")
     time = "t" if unit in ("", "1") else f"t [{unit}]"
-    position, momentum = source.units.get("q"), source.units.get("p")
-    title = source.name.replace("_", " ")
-    drawn = {"trajectory.png": lambda: plot.trajectory(ts, qs, ps, time, position, momentum, title)}
-    series = {_label(n, found): found.change() for n, found in observed.items()
-              if not found.reduction}  # fmt: skip
+    units = source.units.get("q"), source.units.get("p")
+    drawn = {"trajectory.png": lambda: plot.trajectory(ts, qs, ps, time, *units, title)}
+    series = {}
+    for name, found in observed.items():
+        if not found.reduction:
+            size = "" if found.values.ndim == 1 else "size of "
+            kind = "relative change" if found.is_relative else "change"
+            series[f"{name.replace('_', ' ')}\n{size}{kind}"] = found.change()
     if series:
         drawn["invariants.png"] = lambda: plot.changes(ts, series, time, f"{title}: observables")
     return drawn
-
-
-def _label(name: str, found: Observed) -> str:
-    size = "" if found.values.ndim == 1 else "size of "
-    kind = "relative change" if found.is_relative else "change"
-    return f"{name.replace('_', ' ')}\n{size}{kind}"

@@ -6,19 +6,15 @@ import re
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    PlainValidator,
-    WithJsonSchema,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, WithJsonSchema, model_validator
 from pydantic.json_schema import models_json_schema
 from typing_extensions import TypeAliasType
 
-from .._errors import InputError, one_of, shown
+from .._errors import known, one_of, require, shown
+from .._names import FILES as KINDS
 from .axis import AN_AXIS, Axis, AxisName, StateOrAxis, SweepParameter, number_or_axis
 from .table import (
+    MISSING,
     Array,
     Count,
     Fraction,
@@ -44,13 +40,10 @@ COUNT = "a positive whole number"
 FINITE = "a finite number"
 FRACTION = "a number between 0 and 1"
 FILE = '"file.py:name"'
-SYSTEM = f"the name of a system in the library, or {FILE}"
-DATE = 'a day such as "1900-01-01" or a Julian date; for solar_system alone'
 ARGS = "a table of numbers, booleans, arrays of numbers, or tables of these"
 METHOD = 'text such as "TypeII", "Strang" or "Yoshida(4)"'
 STEP_SIZE = "a finite number that is not zero (negative runs backwards)"
 BOOLEAN = "true or false"
-BASIS = f'text such as "Polynomials(4)", "Polynomials(2) + Radial((-1,))", or {FILE} of a basis'
 BOX = "{q = […], p = […]}: numbers, or arrays of the shape of q"
 NEW_DIRECTORY = "the path of a directory that does not exist yet"
 OR_AXIS = f"; or an axis, {AN_AXIS}"
@@ -59,14 +52,11 @@ TIMES = "at least two times, all increasing or all decreasing"
 
 # The system, its state and its parameters
 
-
-def _date(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, str | int | float | datetime.date):
-        raise ValueError
-    return value
-
-
-Date = Annotated[Any, PlainValidator(_date), WithJsonSchema({"type": ["string", "number"]})]
+Date = Annotated[
+    Any,
+    check(lambda day: type(day) in (str, int, float, datetime.date, datetime.datetime)),
+    WithJsonSchema({"type": ["string", "number"]}),
+]
 Parameter = TypeAliasType(
     "Parameter", union(boolean=bool, number=Scalar, array=Array, table=dict[str, "Parameter"])
 )
@@ -77,19 +67,21 @@ class State(Table):
 
     q0: Array | None = key(None, ARRAY)
     p0: Array | None = key(None, ARRAY)
-    date: Date | None = key(None, DATE)
+    date: Date | None = key(
+        None, 'a day such as "1900-01-01" or a Julian date; for solar_system alone'
+    )
 
     @model_validator(mode="after")
     def _date_or_arrays(self) -> Any:
-        if self.date is not None and (self.q0 is not None or self.p0 is not None):
-            raise InputError("date", "given together with q0 or p0", "date, or q0 and p0")
+        fits = self.date is None or (self.q0 is None and self.p0 is None)
+        require(fits, "date", "given together with q0 or p0", "date, or q0 and p0")
         return self
 
 
 class SystemFile(Table):
     """The common keys of the files of run, fit and discover."""
 
-    system: Text = key(..., SYSTEM)
+    system: Text = key(..., f"the name of a system in the library, or {FILE}")
     state: State = State()
     args: dict[str, Parameter] | None = key(None, ARGS)
     t0: Number = key(0.0, FINITE)
@@ -119,10 +111,9 @@ class Times(Table):
 
 
 def _check_names(observables: dict[str, str]) -> dict[str, str]:
+    allowed = "a name without / and \\, because it becomes the name of a file in an archive"
     for name in observables:
-        if re.search(r"[/\\\x00-\x1f]", name):
-            allowed = "a name without / and \\, for it becomes the name of a file in an archive"
-            raise InputError("", f"the name {name!r}", allowed)
+        require(not re.search(r"[/\\\x00-\x1f]", name), "", f"the name {name!r}", allowed)
     return observables
 
 
@@ -141,10 +132,10 @@ class Integration(Table):
         given: Any = self  # of a run or of a sweep, with h, steps and t0
         if isinstance(self.lattice, Times):
             for name in ("h", "steps"):
-                if (value := getattr(given, name)) is not None:
-                    raise InputError(name, shown(value), "nothing: lattice.times sets the steps")
-            if given.t0 not in (0.0, self.lattice.times[0]):
-                raise InputError("t0", shown(given.t0), "nothing: lattice.times has the start")
+                value, allowed = getattr(given, name), "nothing: lattice.times sets the steps"
+                require(value is None, name, shown(value), allowed)
+            fits = given.t0 in (0.0, self.lattice.times[0])
+            require(fits, "t0", shown(given.t0), "nothing: lattice.times has the start")
         return self
 
 
@@ -213,25 +204,20 @@ class EnergyShellStart(_Start):
 
 
 Start = BoxStart | NormalStart | EnergyShellStart
-_START_TAGS = {"halton": "box", "random": "box", "normal": "normal", "energy_shell": "energy_shell"}
+_STARTS: dict[str, type[_Start]] = {
+    "halton": BoxStart,
+    "random": BoxStart,
+    "normal": NormalStart,
+    "energy_shell": EnergyShellStart,
+}
 
 
-def _check_kind(start: Any) -> Any:
-    if not isinstance(start, dict):
-        raise InputError("", shown(start), f"a table with kind = {one_of(_START_TAGS)}")
-    if (kind := start.get("kind")) not in _START_TAGS:
-        seen = "the key is missing" if kind is None else repr(kind)
-        raise InputError("kind", seen, one_of(_START_TAGS, str(kind)))
-    return start
-
-
-AnyStart = Annotated[
-    union(
-        lambda start: f"<{_START_TAGS[start['kind']]}>",
-        box=BoxStart, normal=NormalStart, energy_shell=EnergyShellStart,
-    ),
-    BeforeValidator(_check_kind),
-]  # fmt: skip
+def _read_start(given: Any) -> Any:
+    """The kind of generated initial conditions decides which other keys there are."""
+    kind = given.get("kind") if isinstance(given, dict) else given
+    require(isinstance(given, dict), "", shown(given), f"a table with kind = {one_of(_STARTS)}")
+    known("kind", str(kind), _STARTS, seen=MISSING if kind is None else repr(kind))
+    return _STARTS[str(kind)].model_validate(given)
 
 
 class SaveEvery(Table):
@@ -255,7 +241,9 @@ class SweepFile(SystemFile, Integration):
     """Many trajectories: the keys of a run with axes in the place of numbers."""
 
     state: SweepState = SweepState()
-    start: AnyStart | None = key(None, "initial conditions that are generated")
+    start: Annotated[Start, BeforeValidator(_read_start)] | None = key(
+        None, "initial conditions that are generated"
+    )
     args: dict[str, SweepParameter] | None = key(
         None, f"{ARGS}; a number may be an axis, {AN_AXIS}"
     )
@@ -276,9 +264,8 @@ class SweepFile(SystemFile, Integration):
     @model_validator(mode="after")
     def _start_or_state(self) -> Any:
         for name in ("q0", "p0", "date"):
-            if self.start is not None and getattr(self.state, name) is not None:
-                seen = "given together with [start]"
-                raise InputError(f"state.{name}", seen, "[state] or [start]")
+            fits = self.start is None or getattr(self.state, name) is None
+            require(fits, f"state.{name}", "given together with [start]", "[state] or [start]")
         return self
 
 
@@ -316,7 +303,7 @@ Sigma = union(
 class Data(Table):
     """The observations."""
 
-    file: Text | None = key(None, "the path of a CSV or npz file, from the folder of this one")
+    file: Text = key(..., "the path of a CSV or npz file, from the folder of this one")
     time: Text = key("t", "the name of the column with the times")
     columns: Many[Text] | None = key(
         None, "an array of names of columns; all but time and sigma if not given"
@@ -353,16 +340,14 @@ class FitFile(SystemFile):
         None, f"{FINITE}: the time of [state]; that of the first observation if not given"
     )
     epsilon: Number = key(0.0, FINITE)
-    parameters: Many[Text] | None = key(
-        None, 'an array of names: "epsilon", "q0", "p0", "args.NAME"'
-    )
+    parameters: Many[Text] = key(..., 'an array of names: "epsilon", "q0", "p0", "args.NAME"')
     bounds: Annotated[dict[str, Bounds], AfterValidator(_flat)] = key(
         {}, "[lower, upper], numbers or arrays; -inf, inf for none"
     )
     priors: Annotated[dict[str, Priors], AfterValidator(_flat)] = key(
         {}, "[mean, standard error], numbers or arrays"
     )
-    data: Data = Data()
+    data: Data = key(..., "[data], a table with the observations")
     options: Options = Options()
     output: Output = Output()
 
@@ -374,8 +359,8 @@ class Samples(Table):
     """The box that samples are taken from."""
 
     count: Count | None = key(None, f"{COUNT}; not given: four for each function")
-    low: Pair | None = key(None, BOX)
-    high: Pair | None = key(None, BOX)
+    low: Pair = key(..., f"a corner of the box, {BOX}")
+    high: Pair = key(..., f"a corner of the box, {BOX}")
     times: Annotated[Two[Number], check(lambda span: span[0] < span[1])] | None = key(
         None, "[first, last]: times of the samples, all at t0 if not given"
     )
@@ -406,18 +391,20 @@ class Drift(Table):
 class DiscoverFile(SystemFile):
     """What a map conserves."""
 
-    basis: Text | None = key(None, BASIS)
+    basis: Text = key(
+        ...,
+        f'text such as "Polynomials(4)", "Polynomials(2) + Radial((-1,))", or {FILE} of a basis',
+    )
     order: Whole = key(1, SEED)
     tolerance: Fraction | None = key(None, f"{FRACTION}; not given: exact invariants alone")
     representative: Literal["least", "simplest"] = key("least", '"least" or "simplest"')
-    samples: Samples = Samples()
+    samples: Samples = key(..., "[samples], a table with the box of the samples")
     drift: Drift = Drift()
     output: Output = Output()
 
 
-FILES: dict[str, type[Table]] = {
-    "run": RunFile, "sweep": SweepFile, "fit": FitFile, "discover": DiscoverFile,
-}  # fmt: skip
+_MODELS = (RunFile, SweepFile, FitFile, DiscoverFile)
+FILES: dict[str, type[Table]] = dict(zip(KINDS, _MODELS, strict=True))
 """Kind of file → its model."""
 
 

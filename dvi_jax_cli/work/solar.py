@@ -83,7 +83,6 @@ def compare(jd: np.ndarray, qs: np.ndarray, ps: np.ndarray, masses: np.ndarray) 
     integrated = perihelion_longitude(q[:, m], v[:, m], masses[0] + masses[m])
     difference = (tabulated - integrated) * _ARCSEC
     years = (jd - jd[0]) / 365.25
-    line = _line(years / 100, difference)
 
     L = np.linalg.norm(np.cross(q_tab[0, m], v_tab[0, m]))
     a = 1 / (2 / np.linalg.norm(q_tab[0, m]) - np.sum(v_tab[0, m] ** 2) / mu)
@@ -91,6 +90,7 @@ def compare(jd: np.ndarray, qs: np.ndarray, ps: np.ndarray, masses: np.ndarray) 
     # a (1 − e²) = L²/mu
     relativity = float(6 * np.pi * mu**2 / (_LIGHT * L) ** 2 * CENTURY / period * _ARCSEC)
     errors, angles = distance * AU_IN_KM, distance / radius * _ARCSEC
+    line = _line(years / 100, difference)
     return Comparison(years, q, errors, angles, difference, *line, relativity)
 
 
@@ -139,9 +139,24 @@ def conserved() -> dict[str, Any]:
     return {**OBSERVABLES, **{f"{name}_drift": dvi.MaxDrift(f) for name, f in OBSERVABLES.items()}}
 
 
-def report(report: Report, c: Comparison, always: dict[str, Observed], share: float) -> None:
-    """Add the comparison to a report: contents, tables, notes."""
-    largest = {name: always[f"{name}_drift"].summary()["relative"] for name in OBSERVABLES}
+def report(
+    report: Report,
+    jd: np.ndarray,
+    qs: np.ndarray,
+    ps: np.ndarray,
+    run: dict[str, Any],
+    observed: dict[str, Observed],
+) -> dict[str, Callable[[], Any]]:
+    """Add the comparison to a report: contents, tables, notes.
+
+    - `jd`, `qs`, `ps`: the saved states, as for `compare`. `run`: the arguments of `dvi.integrate`.
+    - `observed`: those of `conserved`.
+
+    **Returns** file name → function that draws: orbits, the comparison, conserved quantities.
+    """
+    c = compare(jd, qs, ps, np.asarray(run["args"]["masses"]))
+    share = own_share(run, qs, ps)
+    largest = {name: observed[f"{name}_drift"].summary()["relative"] for name in OBSERVABLES}
     errors = {
         name: {
             "largest_km": np.nanmax(c.errors[:, i], initial=0.0),
@@ -162,52 +177,33 @@ def report(report: Report, c: Comparison, always: dict[str, Observed], share: fl
             "general_relativity_arcsec_per_century": c.relativity,
         },
     }
-    report.tables += [_conserved_table(c, always, largest), _position_table(errors)]
-    if np.isfinite(c.slope):
-        report.notes += _notes(c, share)
-
-
-def _conserved_table(c: Comparison, always: dict[str, Observed], largest: dict[str, Any]) -> Table:
+    changes = {name.replace("_", " "): np.abs(observed[name].change()) for name in OBSERVABLES}
     along = np.unique(np.linspace(0, len(c.years) - 1, 11).round().astype(int))
-    changes = [np.abs(always[name].change()) for name in OBSERVABLES]
-    rows = [[f"{c.years[k]:.1f}", *(f"{change[k]:.1e}" for change in changes)] for k in along]
+    rows = [[f"{c.years[k]:.1f}", *(f"{x[k]:.1e}" for x in changes.values())] for k in along]
     rows.append(["largest, every step", *(f"{x:.1e}" for x in largest.values())])
-    columns = ["years", *(name.replace("_", " ") for name in OBSERVABLES)]
-    return Table("Conserved: relative change (linear momentum: of Σ|p|)", columns, rows)
-
-
-def _position_table(errors: dict[str, Any]) -> Table:
+    title = "Conserved: relative change (linear momentum: of Σ|p|)"
+    report.tables.append(Table(title, ["years", *changes], rows))
     rows = [[name, *(f"{x:.3g}" for x in error.values())] for name, error in errors.items()]
     columns = ["planet", "largest [km]", "last [km]", "largest, from the Sun [″]"]
-    return Table("Heliocentric position compared with DE421", columns, rows)
-
-
-def _notes(c: Comparison, share: float) -> list[str]:
-    notes = [
-        f"Mercury's perihelion, ephemeris minus integration: {c.slope:.2f}″ per century (scatter "
-        f"about the line {c.scatter:.2f}″); general relativity contributes {c.relativity:.2f}″."
-    ]
-    if np.isfinite(share):
-        own = f"The integrator contributes {share:.2f}″ per century, measured with half the step."
+    report.tables.append(Table("Heliocentric position compared with DE421", columns, rows))
+    if np.isfinite(c.slope):
+        report.notes.append(
+            f"Mercury's perihelion, ephemeris minus integration: {c.slope:.2f}″ per century "
+            f"(scatter about the line {c.scatter:.2f}″); general relativity contributes "
+            f"{c.relativity:.2f}″."
+        )
+    if np.isfinite(c.slope) and np.isfinite(share):
+        note = f"The integrator contributes {share:.2f}″ per century, measured with half the step."
         if abs(share) > 0.02 * c.relativity:
-            own += " That is too much to measure relativity: take a smaller h."
-        notes.append(own)
-    return notes
-
-
-def pictures(
-    c: Comparison, always: dict[str, Observed], run: dict[str, Any]
-) -> dict[str, Callable[[], Any]]:
-    """File name → function that draws: orbits, the comparison, conserved quantities."""
-    series = {name.replace("_", " "): np.abs(always[name].change()) for name in OBSERVABLES}
+            note += " That is too much to measure relativity: take a smaller h."
+        report.notes.append(note)
     title = f"Ten bodies with {type(run['method']).__name__}"
-    if run["h"] is not None:
-        title += f", h = {run['h']:g} day"
+    title += f", h = {run['h']:g} day" if run["h"] is not None else ""
     line = (c.perihelion, c.slope, c.intercept)
     return {
         "orbits.png": lambda: plot.planet_orbits(c.heliocentric[:, 1:], BODIES[1:]),
         "ephemeris.png": lambda: plot.ephemeris_comparison(
             c.years, c.errors[:, 1:], BODIES[1:], *line
         ),
-        "invariants.png": lambda: plot.conserved(c.years, series, "years since the start", title),
+        "invariants.png": lambda: plot.conserved(c.years, changes, "years since the start", title),
     }

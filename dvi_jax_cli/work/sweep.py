@@ -7,7 +7,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,12 +14,11 @@ import dvi_jax as dvi
 from dvi_jax.sweep.bar import shown as shown_bar
 from dvi_jax.sweep.variables import RESERVED
 
-from .._errors import InputError
+from .._errors import InputError, require
 from .._show import Table
 from .output import Report, watched
 from .schema import SweepFile
 from .sweep_problem import sweep_problem
-from .system import Source
 from .table import read_file
 
 _MOST = 10_000_000
@@ -28,6 +26,8 @@ _MOST = 10_000_000
 
 _NOT_OURS = ("config", "config_sha256", "Conventions", "coordinates", "dvi_jax_sweep")
 """Attributes of a store that say how to read it, not where it comes from."""
+
+_ALLOWED = "axes, functions, state and args that fit one another"
 
 
 def sweep_file(
@@ -57,7 +57,7 @@ def sweep_file(
     found, last = watched(
         lambda report: dvi.sweep(**arguments, store=folder, threads=threads, progress=report),
         shown_bar(progress),
-        lambda error: _misfit(path, source, error),
+        lambda error: source.misfit(str(path), "swept", error, _ALLOWED),
     )
     return _finished(found, last)
 
@@ -68,20 +68,14 @@ def sweep_cost(path: str | Path) -> Report:
 
     **Raises** `InputError` for bad input.
     """
-    path = Path(path)
-    file, _ = read_file(path, SweepFile)
-    source, arguments = sweep_problem(file, path.parent)
+    file, _ = read_file(Path(path), SweepFile)
+    source, arguments = sweep_problem(file, Path(path).parent)
     try:
         cost = dvi.sweep_cost(**arguments)
     except Exception as error:
-        raise _misfit(path, source, error) from error
+        raise source.misfit(str(path), "swept", error, _ALLOWED) from error
     contents = dataclasses.asdict(cost) | {"seconds": cost.seconds()}
     return Report(contents, summary=f"{cost}\n\n{cost.table()}")
-
-
-def _misfit(path: Path, source: Source, error: Exception) -> InputError:
-    allowed = "axes, functions, state and args that fit one another"
-    return source.misfit(str(path), "swept", error, allowed)
 
 
 def _check_folder(folder: Path, key: str, resume: bool) -> None:
@@ -95,14 +89,13 @@ def _check_folder(folder: Path, key: str, resume: bool) -> None:
         raise InputError(key, seen, "a new directory") from None
     except ValueError as error:  # a name that no directory can have
         raise InputError(key, f"{folder}: {error}", "a new directory") from None
-    if not resume:
-        done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
-        allowed = "--resume to continue it, or another directory, with --store PATH"
-        raise InputError(key, f"{folder} exists already: {done}", allowed)
+    done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
+    allowed = "--resume to continue it, or another directory, with --store PATH"
+    require(resume, key, f"{folder} exists already: {done}", allowed)
 
 
 def _finished(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
-    counts = result.status_counts()
+    counts, observed = result.status_counts(), _observed(result)
     contents = {
         "store": str(result.path),
         "dims": result.dims,
@@ -110,12 +103,12 @@ def _finished(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
         "trajectories": counts,
         "seconds": last.seconds,
         "steps_per_second": last.rate,
-    }
+    } | ({"observed": observed} if observed else {})
     tables = [_status_table(counts)]
-    observed = _observed(result)
     if observed:
-        contents["observed"] = observed
-        tables.append(_observed_table(observed))
+        rows = [[name, *(f"{x:.6g}" for x in of.values())] for name, of in observed.items()]
+        title = "Observables of the successful trajectories"
+        tables.append(Table(title, ["name", "min", "median", "max"], rows))
     speed = f"{last.seconds:.1f} s (compilation included), {last.rate:.3g} steps/s"
     summary = (
         f"{last.num_lanes} trajectories in {last.num_tasks} tasks; "
@@ -144,12 +137,6 @@ def _observed(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
     return found
 
 
-def _observed_table(observed: dict[str, dict[str, float]]) -> Table:
-    rows = [[name, *(f"{x:.6g}" for x in of.values())] for name, of in observed.items()]
-    title = "Observables of the successful trajectories"
-    return Table(title, ["name", "min", "median", "max"], rows)
-
-
 def _status_table(counts: dict[str, int]) -> Table:
     total = sum(counts.values())
     rows = [[name, str(n), f"{100 * n / total:.4g} %"] for name, n in counts.items()]
@@ -172,17 +159,14 @@ def sweep_status(store: str | Path) -> Report:
     **Raises** `InputError` where there is no store.
     """
     result = _opened(store)
-    steps = _steps(result)
-    statuses: Counter[str] = Counter()
-    done, lanes, work, spans = 0, 0, 0, []
-    for record in result.records():
-        done += 1
-        statuses.update(record["statuses"])
-        lanes += (here := math.prod(record["size"]))
-        work += here * steps(record["start"])
-        spans.append((record["finished"] - record["seconds"], record["finished"]))
-    seconds, left = _covered(spans), math.prod(result.dims.values()) - lanes
-    rate = lanes / seconds if seconds else 0.0
+    steps, records = _steps(result), list(result.records())
+    statuses = sum((Counter(record["statuses"]) for record in records), Counter())
+    sizes = [math.prod(record["size"]) for record in records]
+    work = sum(n * steps(record["start"]) for n, record in zip(sizes, records, strict=True))
+    seconds = _covered([(r["finished"] - r["seconds"], r["finished"]) for r in records])
+    done, lanes, whole = len(records), sum(sizes), math.prod(result.dims.values())
+    left, rate = whole - lanes, lanes / seconds if seconds else 0.0
+    speed = None if math.isnan(work) else work / seconds if seconds else 0.0
     contents = {
         "store": str(result.path),
         "dims": result.dims,
@@ -190,29 +174,21 @@ def sweep_status(store: str | Path) -> Report:
         "trajectories": ({"not_computed": left} if left else {}) | dict(statuses),
         "seconds": seconds,
         "trajectories_per_second": rate,
-        "steps_per_second": None if math.isnan(work) else work / seconds if seconds else 0.0,
+        "steps_per_second": speed,
         "seconds_left": left / rate if rate else None,
         "bytes": sum(_sizes(Path(store))),
         "provenance": {k: v for k, v in result.attributes.items() if k not in _NOT_OURS},
     }
     about = [[name, str(value)] for name, value in contents["provenance"].items()]
-    tables = [
-        _status_table(contents["trajectories"]),
-        Table("Provenance", ["what", "value"], about),
-    ]
-    return Report(contents, tables, summary=_status_summary(contents))
-
-
-def _status_summary(contents: dict[str, Any]) -> str:
-    tasks, left = contents["tasks"], contents["seconds_left"]
-    grid = " × ".join(f"{name} {n}" for name, n in contents["dims"].items())
-    speed = contents["steps_per_second"]
-    rest = f", {tasks['left']} left" + (f" (about {left:.3g} s)" if left else "")
-    return (
-        f"{contents['store']}: {grid}; {tasks['done']} of {tasks['all']} tasks done"
-        f"{rest if tasks['left'] else ''}; {contents['trajectories_per_second']:.3g} "
-        f"trajectories/s{'' if speed is None else f', {speed:.3g} steps/s'}; "
-        f"{contents['bytes'] / 1e6:.3g} MB"
+    grid = " × ".join(f"{name} {n}" for name, n in result.dims.items())
+    more = f", {result.num_tasks - done} left" if done < result.num_tasks else ""
+    more += f" (about {left / rate:.3g} s)" if left and rate else ""
+    return Report(
+        contents,
+        [_status_table(contents["trajectories"]), Table("Provenance", ["what", "value"], about)],
+        summary=f"{result.path}: {grid}; {done} of {result.num_tasks} tasks done{more}; "
+        f"{rate:.3g} trajectories/s{'' if speed is None else f', {speed:.3g} steps/s'}; "
+        f"{contents['bytes'] / 1e6:.3g} MB",
     )
 
 

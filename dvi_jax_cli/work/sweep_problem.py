@@ -9,12 +9,13 @@ import numpy as np
 
 import dvi_jax as dvi
 
-from .._errors import InputError
+from .._errors import InputError, require
 from .axis import AN_AXIS, Axis, at, axes_in
 from .expressions import parse_method
 from .observables import read_observables
-from .schema import NormalStart, Pair, Start, SweepFile
+from .schema import ARRAY, NormalStart, Pair, Start, SweepFile
 from .system import Source, find_source
+from .table import MISSING
 
 _STARTS = {
     "halton": dvi.starts.Halton,
@@ -23,6 +24,9 @@ _STARTS = {
     "energy_shell": dvi.starts.EnergyShell,
 }
 
+_KEYS = {"num_steps": "steps"}
+"""Argument of `dvi.sweep` → key of the file, where they differ."""
+
 
 def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]]:
     """The source of the system, and the arguments of `dvi.sweep` except for the store.
@@ -30,26 +34,23 @@ def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]
     **Raises** `InputError`.
     """
     source = find_source(file, folder)
-    lattice, h, steps = source.times(file)
-    save = dvi.Save(final=True) if file.save == "final" else None
-    if file.save is not None and file.save != "final":
-        save = dvi.Save(every=file.save.every)
+    times = source.times(file)
+    every = getattr(file.save, "every", None)  # None of "final"
+    save = dvi.Save(every=every) if every else dvi.Save(final=True)
     arguments = {
         "system": source.system,
-        "h": _for_sweep("h", h),
-        "num_steps": _for_sweep("steps", steps),
-        "t0": _for_sweep("t0", file.t0),
-        "epsilon": _for_sweep("epsilon", file.epsilon),
+        "lattice": times.pop("lattice"),
         "args": _parameters(source.args),
         "method": _methods(file.method),
-        "lattice": lattice,
-        "save": save,
+        "save": None if file.save is None else save,
         "observe": _observe(file, source),
         "lanes_per_task": file.output.lanes_per_task,
-    } | _initial_conditions(file, source)
-    if not any(_varies(x) for x in arguments.values()):
-        allowed = "an axis for some number, or [start]; for one trajectory there is dvi-jax run"
-        raise InputError("epsilon", "nothing varies, neither this nor another number", allowed)
+    }
+    arguments |= {name: _for_sweep(_KEYS.get(name, name), value) for name, value in times.items()}
+    arguments |= _initial_conditions(file, source)
+    seen = "nothing varies, neither this nor another number"
+    allowed = "an axis for some number, or [start]; for one trajectory there is dvi-jax run"
+    require(any(_varies(x) for x in arguments.values()), "epsilon", seen, allowed)
     return source, arguments
 
 
@@ -85,9 +86,9 @@ def _parameters(value: Any, key: str = "args") -> Any:
     axes = axes_in(value) if isinstance(value, list) else []
     if not axes:
         return _for_sweep(key, value)
-    if len({(axis.axis, len(axis.all)) for axis in axes}) != 1:
-        seen = ", ".join(f"{axis.axis} with {len(axis.all)} values" for axis in axes)
-        raise InputError(key, f"axes {seen} in one array", "axes of one name and length")
+    seen = [f"{axis.axis} with {len(axis.all)} values" for axis in axes]
+    allowed = "axes of one name and length"
+    require(len({*seen}) == 1, key, f"axes {', '.join(seen)} in one array", allowed)
     arrays = [np.asarray(at(value, k), float) for k in range(len(axes[0].all))]
     return _axis(key, axes[0], np.stack(arrays))
 
@@ -103,9 +104,8 @@ def _methods(given: Any) -> Any:
 def _observe(file: SweepFile, source: Source) -> dict[str, Any] | None:
     """The observables; one without a reduction is that of the last step."""
     found = read_observables(file.observables, source)
-    if not found and file.save is None:
-        allowed = 'an observable at least, or save = "final"'
-        raise InputError("observables", "nothing would be saved", allowed)
+    fits, allowed = found or file.save is not None, 'an observable at least, or save = "final"'
+    require(fits, "observables", "nothing would be saved", allowed)
     reduced = {n: f if isinstance(f, dvi.Reduction) else dvi.Last(f) for n, f in found.items()}
     return reduced or None
 
@@ -117,7 +117,10 @@ def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
     """`start`, or `q0` and `p0`, checked for one of the trajectories at least."""
     if file.start is None:
         q0, p0 = source.state
-        _check(source, {"q0": q0, "p0": p0, "args": source.args})
+        try:
+            _check(source, q0, p0, 0)
+        except InputError:  # a single one is a trajectory that fails, which is a result
+            _check(source, q0, p0, -1)
         return {"q0": _for_sweep("state.q0", q0), "p0": _for_sweep("state.p0", p0)}
     start = _start(file.start, source)
     t0, args = at(file.t0, 0), at(source.args, 0)
@@ -130,19 +133,10 @@ def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
     return {"start": start}
 
 
-def _check(source: Source, given: dict[str, Any]) -> None:
-    """Reject states of which neither the first nor the last can be started from; a single one is a
-    trajectory that fails, which is a result."""
-
-    def check(which: int) -> None:
-        found = at(given, which)
-        q0, p0 = (np.asarray(found[name], float) for name in ("q0", "p0"))
-        source.check_start(q0, p0, found["args"])
-
-    try:
-        check(0)
-    except InputError:
-        check(-1)
+def _check(source: Source, q0: Any, p0: Any, which: int) -> None:
+    """Reject a state of which the first trajectory, or the last, cannot start."""
+    q0, p0 = (np.asarray(at(x, which), float) for x in (q0, p0))
+    source.check_start(q0, p0, at(source.args, which))
 
 
 def _start(given: Start, source: Source) -> dvi.starts.Starts:
@@ -150,21 +144,13 @@ def _start(given: Start, source: Source) -> dvi.starts.Starts:
     for name, value in options.items():
         if isinstance(value, Pair):
             options[name] = (value.q, value.p)
-    if isinstance(given, NormalStart):
-        for name in ("q0", "p0"):
-            if name not in options:
-                options[name] = _centre(name, source)
+    if isinstance(given, NormalStart):  # by default about the system's own state
+        for name in {"q0", "p0"} - options.keys():
+            require(source.problem, f"start.{name}", MISSING, ARRAY)
+            options[name] = np.asarray(getattr(source.problem, name), float)
     if "H" in options:
         options["H"] = source.loader.load("start.H", options["H"])
     try:
         return _STARTS[given.kind](**options)
     except (TypeError, ValueError) as error:
         raise InputError("start", str(error), f"keys that fit kind = {given.kind}") from None
-
-
-def _centre(name: str, source: Source) -> np.ndarray:
-    """The system's own q0 or p0, about which states are normally distributed."""
-    if source.problem is None:
-        allowed = NormalStart.model_fields[name].description or ""
-        raise InputError(f"start.{name}", "the key is missing", allowed)
-    return np.asarray(getattr(source.problem, name), float)

@@ -12,9 +12,10 @@ from dvi_jax import systems
 from dvi_jax.engine.signature import accepts
 from dvi_jax.systems.solar_system import EphemerisMissing, julian_date
 
-from .._errors import InputError, one_of, shown
+from .._errors import InputError, known, require, shown
 from .loader import Loader, in_one_line
-from .schema import RunFile, SweepFile, SystemFile, Times
+from .schema import COUNT, RunFile, SweepFile, SystemFile, Times
+from .table import MISSING
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Source:
     loader: Loader
     problem: systems.Problem | None
     system: dvi.System
-    jd: float | None
+    jd: float | None = None
 
     @property
     def name(self) -> str:
@@ -53,21 +54,18 @@ class Source:
     def args(self) -> Any:
         """The parameters of the system with those of the file in their place."""
         given, problem = self.file.args, self.problem
-        known = problem.args if problem is not None else None
+        names = problem.args if problem is not None else None
         if given is None or problem is None:
-            return known if given is None else given
-        if not isinstance(known, dict):
-            without = (
-                f"{problem.name} has no parameters" if known is None else "args is not a table"
-            )
-            raise InputError("args", shown(given), f"nothing: {without}")
+            return names if given is None else given
+        if not isinstance(names, dict):
+            why = f"{problem.name} has no parameters" if names is None else "args is not a table"
+            raise InputError("args", shown(given), f"nothing: {why}")
         for name, value in given.items():
-            if name not in known:
-                raise InputError(f"args.{name}", "there is no such parameter", one_of(known, name))
-            if isinstance(value, dict) and not isinstance(known[name], dict):
-                allowed = "a number or an array; in a sweep also an axis"
-                raise InputError(f"args.{name}", shown(value), allowed)
-        return {**known, **given}
+            known(f"args.{name}", name, names, seen="there is no such parameter")
+            fits = isinstance(names[name], dict) or not isinstance(value, dict)
+            allowed = "a number or an array; in a sweep also an axis"
+            require(fits, f"args.{name}", shown(value), allowed)
+        return {**names, **given}
 
     @cached_property
     def state(self) -> tuple[Any, Any]:
@@ -76,20 +74,15 @@ class Source:
 
     def array(self, name: str) -> Any:
         """q0 or p0 of the file, or else of the system."""
-        given = getattr(self.file.state, name)
-        if given is not None:
-            return given
-        known = getattr(self.problem, name, None)
-        if known is None:
-            allowed = "an array of numbers; this system has none"
-            raise InputError(f"state.{name}", "the key is missing", allowed)
-        return np.asarray(known, float)
+        given, own = getattr(self.file.state, name), getattr(self.problem, name, None)
+        fits = given is not None or own is not None
+        require(fits, f"state.{name}", MISSING, "an array of numbers; this system has none")
+        return given if given is not None else np.asarray(own, float)
 
     def check_start(self, q0: Any, p0: Any, args: Any) -> None:
         """Reject an initial condition that the system cannot start from."""
-        if np.shape(q0) != np.shape(p0):
-            allowed = f"the shape of q0, {np.shape(q0)}: a momentum for each q"
-            raise InputError("state.p0", f"shape {np.shape(p0)}", allowed)
+        allowed = f"the shape of q0, {np.shape(q0)}: a momentum for each q"
+        require(np.shape(q0) == np.shape(p0), "state.p0", f"shape {np.shape(p0)}", allowed)
         if self.problem is None or self.problem.check is None:
             return
         try:
@@ -97,26 +90,24 @@ class Source:
         except systems.ParameterError as error:
             raise InputError("args", str(error), "args that fit the system") from None
         except ValueError as error:
-            raise InputError(
-                "state", str(error), "a start that the system can go on from"
-            ) from None
+            allowed = "a start from which the system can continue"
+            raise InputError("state", str(error), allowed) from None
 
     @property
     def h(self) -> Any:
         """The step size of the file, or else of the system."""
         h = self.file.h if self.file.h is not None else getattr(self.problem, "h", None)
-        if h is None:
-            raise InputError("h", "the key is missing", "a number; this system has none of its own")
+        require(h is not None, "h", MISSING, "a number; this system has none of its own")
         return h
 
-    def times(self, file: RunFile | SweepFile) -> tuple[dvi.Lattice, Any, Any]:
-        """The time grid, h and the number of steps, as `dvi.integrate` takes them."""
+    def times(self, file: RunFile | SweepFile) -> dict[str, Any]:
+        """The arguments of `dvi.integrate` that set the times of the steps."""
         if isinstance(file.lattice, Times):
-            return dvi.Given(file.lattice.times), None, None
-        h = self.h
-        if file.steps is None:
-            raise InputError("steps", "the key is missing", "a positive whole number")
-        return dvi.Uniform(), h, file.steps
+            grid = {"lattice": dvi.Given(file.lattice.times), "h": None, "num_steps": None}
+        else:
+            grid = {"lattice": dvi.Uniform(), "h": self.h, "num_steps": file.steps}
+            require(file.steps is not None, "steps", MISSING, COUNT)
+        return grid | {"t0": file.t0, "epsilon": file.epsilon}
 
 
 def find_source(file: SystemFile, folder: Path) -> Source:
@@ -124,43 +115,35 @@ def find_source(file: SystemFile, folder: Path) -> Source:
 
     **Raises** `InputError`.
     """
-    loader = Loader(folder)
-    if file.state.date is not None and file.system != "solar_system":
-        allowed = "q0 and p0; a date only with system = solar_system"
-        raise InputError("state.date", shown(file.state.date), allowed)
-    if ":" not in file.system:
+    loader, name, date = Loader(folder), file.system, file.state.date
+    allowed = "q0 and p0; a date only with system = solar_system"
+    require(date is None or name == "solar_system", "state.date", shown(date), allowed)
+    if ":" not in name:
         return _of_the_library(file, loader)
-    made = _of_a_file(file.system, loader)
-    if isinstance(made, dvi.System):
-        return Source(file, loader, None, made, None)
+    made = loader.load("system", name)
+    if callable(made) and not isinstance(made, type | dvi.System) and accepts(made, 0):
+        try:
+            made = made()
+        except (Exception, SystemExit) as error:
+            seen = f"{name!r} failed: {in_one_line(error, *loader.modules)}"
+            raise InputError("system", seen, "a function that returns a system") from error
     if isinstance(made, systems.Problem):
-        return Source(file, loader, made, made.system, None)
+        return Source(file, loader, made, made.system)
+    if isinstance(made, dvi.System):
+        return Source(file, loader, None, made)
     allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
-    raise InputError("system", f"{file.system!r} is {type(made).__name__}", allowed)
-
-
-def _of_a_file(text: str, loader: Loader) -> Any:
-    made = loader.load("system", text)
-    if not callable(made) or isinstance(made, type | dvi.System) or not accepts(made, 0):
-        return made
-    try:
-        return made()
-    except (Exception, SystemExit) as error:
-        seen = f"{text!r} failed: {in_one_line(error, *loader.modules)}"
-        raise InputError("system", seen, "a function that returns a system") from error
+    raise InputError("system", f"{name!r} is {type(made).__name__}", allowed)
 
 
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:
-    name, date = file.system, file.state.date
-    if name not in systems.LIBRARY:
-        allowed = f'{one_of(systems.LIBRARY, name)}; or "file.py:name"'
-        raise InputError("system", repr(name), allowed)
+    name, date, jd = file.system, file.state.date, None
+    known("system", name, systems.LIBRARY, '{}; or "file.py:name"')
     try:
         if name == "solar_system" and file.state.q0 is None:
             jd = julian_date("1900-01-01" if date is None else date)
             problem = systems.solar_system(jd)
         else:
-            jd, problem = None, systems.LIBRARY[name]()
+            problem = systems.LIBRARY[name]()
     except EphemerisMissing as error:
         raise InputError("system", f"{name!r}: {error}", "an installed ephemeris") from None
     except ValueError as error:

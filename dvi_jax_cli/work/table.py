@@ -3,7 +3,7 @@
 
 import math
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union
@@ -23,7 +23,9 @@ from pydantic import (
 from pydantic.json_schema import GenerateJsonSchema
 from typing_extensions import TypeAliasType
 
-from .._errors import InputError, one_of, shown
+from .._errors import InputError, InputErrors, one_of, shown
+
+MISSING = "the key is missing"
 
 
 def key(default: Any, allowed: str) -> Any:
@@ -40,37 +42,39 @@ class Table(BaseModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _name_the_key(cls, given: Any, read: Callable[[Any], Any]) -> Any:
-        names = cls.model_fields
-        if not isinstance(given, dict):
-            raise InputError("", shown(given), f"a table with the keys {one_of(names)}")
-        for name in given:
-            if name not in names:
-                raise InputError(name, "there is no such key", one_of(names, name))
+    def _name_the_keys(cls, given: Any, read: Callable[[Any], Any]) -> Any:
         try:
             return read(given)
         except ValidationError as error:
-            raise cls.first_error(error) from None
+            raise InputErrors([e for one in error.errors() for e in cls._errors(one)]) from None
 
     @classmethod
-    def first_error(cls, error: ValidationError) -> InputError:
-        """The first error of pydantic with the key, relative to this table, and what it allows."""
-        first = error.errors()[0]
-        place, inner = first["loc"], first.get("ctx", {}).get("error")
+    def _errors(cls, found: Any) -> Iterator[InputError]:
+        """An error of pydantic as errors with the key, relative to this table."""
+        place, inner = found["loc"], found.get("ctx", {}).get("error")
         if isinstance(inner, InputError):  # of a table within this one, or of a validator
-            return InputError(path(place, inner.key), inner.seen, inner.allowed)
-        seen = "the key is missing" if first["type"] == "missing" else shown(first["input"])
-        return InputError(path(place), seen, cls.model_fields[str(place[0])].description or "")
+            for one in getattr(inner, "found", [inner]):
+                yield InputError(path(place, one.key), one.seen, one.allowed)
+        elif not place:
+            seen, names = shown(found["input"]), one_of(cls.model_fields)
+            yield InputError("", seen, f"a table with the keys {names}")
+        elif found["type"] == "extra_forbidden":
+            names = one_of(cls.model_fields, str(place[-1]))
+            yield InputError(path(place), "there is no such key", names)
+        else:
+            seen = MISSING if found["type"] == "missing" else shown(found["input"])
+            allowed = cls.model_fields[str(place[0])].description
+            yield InputError(path(place), seen, allowed or "")
 
 
-_TAGS: set[str] = set()
+_TAGS = {""}
 """Tags of the types of unions, which pydantic adds to the place of an error."""
 
 
 def path(place: tuple[int | str, ...], inner: str = "") -> str:
     """A key with its path, such as ``state.q0[1].axis``, without the tags of a `union`."""
     whole = ""
-    for part in (*place, *([inner] if inner else [])):
+    for part in (*place, inner):
         if isinstance(part, int):
             whole += f"[{part}]"
         elif part not in _TAGS:
@@ -98,7 +102,8 @@ def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
     try:
         return model.model_validate(raw), raw
     except ValidationError as error:
-        raise model.first_error(error) from None
+        context: Any = error.errors()[0].get("ctx")
+        raise context["error"] from None
 
 
 class JsonSchema(GenerateJsonSchema):

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # {{title}}
 #
-# The system `{{system}}` of the library: one trajectory, and what it keeps.
+# The system `{{system}}` of the library: one trajectory, and what it conserves.
 
 # %%
 import jax
@@ -15,17 +15,11 @@ problem = systems.LIBRARY["{{system}}"]()
 print(problem)
 
 # %%
+settings = {"h": problem.h, "args": problem.args, "method": dvi.TypeII(), "epsilon": 0.0}
+drifts = {name: dvi.MaxDrift(f) for name, f in problem.observables.items()}
+start, save = (problem.q0, problem.p0), dvi.Save(every=10)
 solution = dvi.integrate(
-    problem.system,
-    problem.q0,
-    problem.p0,
-    h=problem.h,
-    num_steps=2000,
-    epsilon=0.0,
-    args=problem.args,
-    method=dvi.TypeII(),
-    save=dvi.Save(every=10),
-    observe={name: dvi.MaxDrift(f) for name, f in problem.observables.items()},
+    problem.system, *start, num_steps=2000, save=save, observe=drifts, **settings
 )
 print(solution.status, solution.observed)
 

@@ -1,7 +1,7 @@
-"""A weight on a spring in the plane, which hardens a little: a system of one's own to begin with.
+"""A weight on a spring in the plane whose stiffness grows a little with its length.
 
-Replace the functions by your own; each is plain JAX. The files beside this one name what is here
-as "system.py:system", "system.py:energy".
+Replace the functions by your own; each is plain JAX. The TOML files refer to the objects of this
+file as "system.py:system", "system.py:energy".
 """
 
 import jax.numpy as jnp
@@ -18,9 +18,9 @@ def H_D(t0, t1, q0, p1, args):
 
 
 def W(t0, t1, q0, p1, args):
-    """The disturbing force that epsilon multiplies: the spring hardens, −|q|² q.
+    """The perturbing force, which epsilon multiplies: −|q|² q, a stiffer spring.
 
-    For friction write -p1; a disturbance that is a potential can be System(..., perturbation=).
+    For friction write -p1; a perturbation with a potential can be System(..., perturbation=).
     """
     return -jnp.sum(q0**2) * q0
 
@@ -30,11 +30,11 @@ system = dvi.System(H_D, force=W)
 
 # An observable is a function of one step, of both its ends.
 def energy(t0, t1, q0, p0, q1, p1, args):
-    """The energy at the end of the step, without the disturbance [J]."""
+    """The energy at the end of the step, without the perturbation [J]."""
     return p1 @ p1 / (2 * args["mass"]) + args["stiffness"] * (q1 @ q1) / 2
 
 
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """q × p [kg m²/s]: kept to round-off, as nothing here has a direction of its own."""
-    (x, y), (u, v) = q1, p1  # q1[2] would be q1[1], without a word: JAX stays inside of an array
+    """q × p [kg m²/s]: conserved to round-off, because the system has no preferred direction."""
+    (x, y), (u, v) = q1, p1  # JAX clips an index: q1[2] would be q1[1], without an error
     return x * v - y * u
