@@ -14,6 +14,7 @@ import lanewise
 from lanewise.dependence import depends_on
 
 from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
+from .engine.names import both_names
 from .engine.newton import Newton, Vector, find_root
 from .engine.signature import accepts
 
@@ -105,6 +106,7 @@ class _VelocityForce(eqx.Module):
         return self.F(t0, t1, q0, v, args)
 
 
+@both_names
 def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., Any]:
     r"""The Hamiltonian of a Lagrangian, discrete or continuous, by the Legendre transform.
 
@@ -145,6 +147,7 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
     return _DiscreteLegendreTransform(L, newton) if discrete else _LegendreTransform(L, newton)
 
 
+@both_names
 def from_lagrangian(L_d: Callable[..., Any], newton: Newton = Newton()) -> HamiltonianFn:
     r"""The discrete Hamiltonian of a discrete Lagrangian, the type I generating function.
 
@@ -199,6 +202,7 @@ def from_lagrangian(L_d: Callable[..., Any], newton: Newton = Newton()) -> Hamil
     return _FromLagrangian(L_d, newton)
 
 
+@both_names
 def from_type_iii(H_minus: Callable[..., Any], newton: Newton = Newton()) -> HamiltonianFn:
     r"""The discrete Hamiltonian, type II, of a type III one.
 

@@ -15,12 +15,14 @@ from lanewise import Layout
 from lanewise.jaxapi import is_traced
 
 from .._arithmetic import Arithmetic
-from .._integrate import as_parameter, as_scalar, integrate, start_state
+from .._inputs import as_parameter, as_scalar, start_state
+from .._integrate import integrate
 from .._integrator import Integrator, chosen
 from .._results import RESULTS, status_name
 from .._solution import Save
 from .._system import System, check_system
 from .._types import Args, Scalar, State
+from ..engine.names import both_names
 from ..engine.newton import RootSolver
 from ..methods import Method
 from ..observe import Section, Stop
@@ -118,6 +120,7 @@ def _one_after_another(settings: _Settings, start, h, epsilon, args, count: int)
     return lax.scan(one, start, jnp.arange(count))[1]
 
 
+@both_names
 def poincare_section(
     system: System,
     q0: Any,
@@ -206,6 +209,7 @@ def poincare_section(
     return _raise_on_failure(found, crossings, num_steps) if throw else found
 
 
+@both_names
 def bifurcation(
     system: System,
     q0: Any,
@@ -305,6 +309,7 @@ class Return(eqx.Module):
         return name_of(self.result)
 
 
+@both_names
 class ReturnMap(eqx.Module):
     r"""The map of a section g(t, q, p, args) = 0 onto itself.
 

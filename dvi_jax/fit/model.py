@@ -12,7 +12,8 @@ from jaxtyping import Array, PyTree
 
 from lanewise.jaxapi import is_traced
 
-from .._integrate import as_parameter, integrate, start_state
+from .._inputs import as_parameter, start_state
+from .._integrate import integrate
 from .._integrator import Integrator
 from .._results import RESULTS
 from .._solution import Save
@@ -36,7 +37,7 @@ class Model(eqx.Module):
     - `system`: a `System`. `h`: the step size [time]. `q0`, `p0`, `epsilon`, `args`: as in
       `integrate`; what is among the parameters may be left out here. When `data` is a list of
       arcs, q0 and p0 have one row for each arc, here and among the parameters.
-    - `options`: further arguments of `integrate`: `method`, `lattice`, `newton`, `adjoint`,
+    - `options`: further arguments of `integrate`: `method`, `lattice`, `root_finder`, `adjoint`,
       `arithmetic`, `layout`, or an `integrator` in place of them; for a lattice that is not
       `Uniform` also `num_steps`.
 
@@ -67,7 +68,7 @@ class Model(eqx.Module):
         if not isinstance(system, System):
             raise TypeError(f"system must be a dvi.System, got {system!r}.")
         known = (
-            *("method", "lattice", "newton", "adjoint", "arithmetic", "layout"),
+            *("method", "lattice", "newton", "root_finder", "adjoint", "arithmetic", "layout"),
             *("integrator", "num_steps"),
         )
         for name in options:

@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from ._base import Method
-from ._composition import CompositionMethod, check_base, check_order
+from ._composition import CompositionMethod, check_order
 from ._type_ii import TypeII
 
 _A = {
@@ -53,7 +53,6 @@ class BlanesMoan(CompositionMethod):
 
     def __check_init__(self):
         check_order("BlanesMoan", self.order, tuple(_A))
-        check_base(self.base)
 
     def fractions(self):
         a, b = _A[self.order], _B[self.order]

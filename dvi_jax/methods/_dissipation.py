@@ -9,26 +9,10 @@ import numpy as np
 
 from .._step import Equations
 from .._types import Interval, State
-from ._adjoint import Adjoint
 from ._base import Method
-from ._composition import CompositionMethod
 
 _STRONG = 0.3
 """Damping over the longest part backwards from which on there is a warning."""
-
-
-def substeps(method: Method) -> tuple[float, ...]:
-    """The fractions of a step over which the map of the system, or its adjoint, is applied."""
-    if isinstance(method, Adjoint):
-        return substeps(method.method)
-    if isinstance(method, CompositionMethod):
-        return tuple(c * part for c in method.fractions() for part in substeps(method.base))
-    return (1.0,)
-
-
-def goes_backwards(method: Method) -> bool:
-    """Whether a part of a step goes backwards in time."""
-    return min(substeps(method)) < 0
 
 
 def warn_of_dissipation(
@@ -45,7 +29,7 @@ def warn_of_dissipation(
     All values known, not traced. One evaluation of a Jacobian, and none for a method without
     negative parts or a system without a force.
     """
-    backwards = -min(substeps(method))
+    backwards = -min(method.substeps())
     if backwards <= 0 or equations.system.force is None:
         return
     damping = float(_damping(equations, interval, q0, p0))

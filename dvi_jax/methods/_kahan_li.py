@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from ._base import Method
-from ._composition import CompositionMethod, check_base, check_order, of_strang
+from ._composition import CompositionMethod, check_order, of_strang
 from ._type_ii import TypeII
 
 _OUTER = {
@@ -54,7 +54,6 @@ class KahanLi(CompositionMethod):
 
     def __check_init__(self):
         check_order("KahanLi", self.order, tuple(_OUTER))
-        check_base(self.base)
 
     def fractions(self):
         return of_strang(_OUTER[self.order])

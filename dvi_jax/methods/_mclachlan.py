@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from ._base import Method
-from ._composition import CompositionMethod, check_base, check_order, of_strang
+from ._composition import CompositionMethod, check_order, of_strang
 from ._type_ii import TypeII
 
 _ROOT = 19.0**0.5
@@ -56,7 +56,6 @@ class McLachlan(CompositionMethod):
 
     def __check_init__(self):
         check_order("McLachlan", self.order, (4, *_OUTER))
-        check_base(self.base)
 
     def fractions(self):
         if self.order == 4:

@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from ._base import Method
-from ._composition import CompositionMethod, check_base, check_order, of_strang
+from ._composition import CompositionMethod, check_order, of_strang
 from ._type_ii import TypeII
 
 _GAMMA = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
@@ -33,7 +33,6 @@ class Suzuki(CompositionMethod):
 
     def __check_init__(self):
         check_order("Suzuki", self.order, (4,))
-        check_base(self.base)
 
     def fractions(self):
         return of_strang((_GAMMA, _GAMMA))

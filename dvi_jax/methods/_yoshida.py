@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from ._base import Method
-from ._composition import CompositionMethod, check_base, check_order, of_strang
+from ._composition import CompositionMethod, check_order, of_strang
 from ._type_ii import TypeII
 
 _OUTER = {
@@ -52,7 +52,6 @@ class Yoshida(CompositionMethod):
 
     def __check_init__(self):
         check_order("Yoshida", self.order, tuple(_OUTER))
-        check_base(self.base)
 
     def fractions(self):
         return of_strang(_OUTER[self.order])
