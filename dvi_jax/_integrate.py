@@ -169,8 +169,7 @@ def integrate(
         task = dataclasses.replace(task, observe=observed)
     traced = any(is_traced(x) for x in jax.tree.leaves((task, q0, p0)))
     if not traced:
-        first = task.interval(jnp.asarray(0, jnp.int32))
-        warn_of_dissipation(method, task.equations, first, q0, p0)
+        warn_of_dissipation(method, task.equations, task.first_interval, q0, p0)
     if progress is None:
         solution = _whole(task, plan, asked.observe, q0, p0, integrator.adjoint, layout)
     elif traced:
@@ -259,7 +258,7 @@ def _as_solution(
     """What a run has left behind, as its user sees it."""
     carry, saved, reduced, defect = outcome
     curve = Curve.of(task.method, task.equations, layout)
-    first = task.interval(jnp.asarray(0, jnp.int32))
+    first = task.first_interval()
     safe = Start(first.t0, first.t1, first.t1, q0, p0)
     _, reductions = task.observables()
     values: list[Any] = [

@@ -52,6 +52,10 @@ class Task(eqx.Module):
         """
         return self._in_precision(self.lattice.interval(self.t0, self.h, k))
 
+    def first_interval(self) -> Interval:
+        """The interval of step 0."""
+        return self.interval(jnp.asarray(0, jnp.int32))
+
     def next_interval(self, carry: "Carry") -> tuple[Interval, Any, RESULTS | None]:
         """The interval of the next step, what the lattice remembers then, and if there is one."""
         place = Place(self.t0, self.h, carry.k, carry.q, carry.p)
@@ -205,7 +209,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     result = RESULTS.where(finite, RESULTS.successful, RESULTS.not_finite)
     usable = task.lattice.is_usable(task.t0, task.h)
     result = RESULTS.where(usable, result, RESULTS.bad_step_size)
-    interval = task.interval(jnp.asarray(0, jnp.int32))
+    interval = task.first_interval()
 
     def zero_value(reduction):
         step = StepTaken(interval.t0, interval.t1, q0, p0, q0, p0)

@@ -13,7 +13,7 @@ from ._checks import whole
 from ._inputs import as_times
 from ._results import RESULTS, status_name
 from ._types import State
-from .engine.signature import accepts
+from .engine.signature import check_takes
 
 
 def _times(ts: Any) -> Any:
@@ -58,11 +58,8 @@ class Save(eqx.Module):
     def __check_init__(self):
         if self.every is not None:
             whole("every of Save", self.every)
-        if self.clock is not None and not (callable(self.clock) and accepts(self.clock, 4)):
-            raise TypeError(
-                "the clock of Save(ts=..., clock=...) must be a function (t, q, p, args) → scalar, "
-                f"got {self.clock!r}."
-            )
+        if self.clock is not None:
+            check_takes("the clock of Save", self.clock, "(t, q, p, args)")
         if self.ts is None:
             if self.clock is not None:
                 raise ValueError("a clock needs times to be saved at: Save(ts=..., clock=...).")

@@ -1,4 +1,4 @@
-"""The way from the public call to the user's H_D is short: few frames of the package in few files."""
+"""From the public call to the user's H_D there are few frames of the package, in few files."""
 
 import traceback
 from pathlib import Path

@@ -281,7 +281,7 @@ def test_orders_that_do_not_exist_are_refused():
         dvi.Strang(base=dvi.RungeKutta4())
     with pytest.raises(ValueError, match="no inverse step"):
         dvi.Adjoint(dvi.RungeKutta4())
-    with pytest.raises(TypeError, match="takes a method"):
+    with pytest.raises(TypeError, match="method must be a method"):
         dvi.Adjoint(dvi.TypeII)
 
 

@@ -15,7 +15,7 @@ from .._solution import Save, Solution
 from .._system import System
 from .._types import Args, Bindable, Scalar, State
 from ..engine.rounding import one_by_one
-from ..engine.signature import accepts
+from ..engine.signature import check_takes
 from ..observe import (
     Crossings,
     Deviations,
@@ -71,11 +71,7 @@ class TimeTransformed(Uniform):
     speed: Callable[..., Any]
 
     def __check_init__(self):
-        if not callable(self.speed) or not accepts(self.speed, 4):
-            raise TypeError(
-                f"the speed of TimeTransformed must be a function (t, q, p, args) → positive "
-                f"scalar, got {self.speed!r}."
-            )
+        check_takes("the speed of TimeTransformed", self.speed, "(t, q, p, args)")
 
     def transform(self, run):
         """The run in extended phase space, in the time σ from 0 on."""

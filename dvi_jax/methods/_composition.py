@@ -5,7 +5,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
@@ -36,6 +36,8 @@ class CompositionMethod(Method):
 
     base: eqx.AbstractVar[Method]
 
+    orders: ClassVar[Sequence[int]] = ()
+    """Those that there are coefficients of, where they are in a table."""
     is_invertible: ClassVar[bool] = True
 
     if TYPE_CHECKING:  # there the abstract variable would stay an argument of every subclass
@@ -51,6 +53,14 @@ class CompositionMethod(Method):
         """c₁, c₂, …: the map takes the odd ones, its adjoint the even ones; they sum to 1."""
 
     def __check_init__(self):
+        if self.orders and self.order not in self.orders:
+            *most, last = self.orders
+            which = f"orders {', '.join(map(str, most))} and {last}" if most else f"order {last}"
+            raise ValueError(
+                f"{type(self).__name__} knows {which}, got {self.order!r}. For order 2 use "
+                "dvi.Strang(); for coefficients of your own, dvi.Composition(coefficients, "
+                "order=...)."
+            )
         check_invertible("base", self.base)
 
     def substeps(self) -> tuple[float, ...]:
@@ -135,17 +145,6 @@ def of_strang(outer: Sequence[float]) -> tuple[float, ...]:
     """
     middle = 1.0 - 2.0 * math.fsum(outer)
     return tuple(c / 2 for c in (*outer, middle, *outer[::-1]) for _ in range(2))
-
-
-def check_order(name: str, order: Any, known: Sequence[int]) -> None:
-    """Refuse an order of which there are no coefficients."""
-    if order not in known:
-        *most, last = known
-        which = f"orders {', '.join(map(str, most))} and {last}" if most else f"order {last}"
-        raise ValueError(
-            f"{name} knows {which}, got {order!r}. For order 2 use dvi.Strang(); for "
-            "coefficients of your own, dvi.Composition(coefficients, order=...)."
-        )
 
 
 def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:

@@ -1,6 +1,7 @@
 """A warning where a method goes backwards in time against strong dissipation."""
 
 import warnings
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -16,7 +17,11 @@ _STRONG = 0.3
 
 
 def warn_of_dissipation(
-    method: Method, equations: Equations, interval: Interval, q0: State, p0: State
+    method: Method,
+    equations: Equations,
+    first_interval: Callable[[], Interval],
+    q0: State,
+    p0: State,
 ) -> None:
     r"""A warning when a part that goes backwards meets strong dissipation at the start.
 
@@ -32,6 +37,7 @@ def warn_of_dissipation(
     backwards = -min(method.substeps())
     if backwards <= 0 or equations.system.force is None:
         return
+    interval = first_interval()
     damping = float(_damping(equations, interval, q0, p0))
     growth = backwards * float(interval.h) * damping
     if growth > _STRONG and np.isfinite(growth):
