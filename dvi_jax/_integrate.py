@@ -151,25 +151,27 @@ def integrate(
     instance("save", save, Save, "a dvi.Save(...)")
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
     q0, p0 = start_state(q0, p0)
-    t0, h, num_steps = lattice.prepare(t0, h, num_steps)
+    # By the class, here and below: a bound method of an equinox module takes 20 µs to make.
+    kind = type(lattice)
+    t0, h, num_steps = kind.prepare(lattice, t0, h, num_steps)
     t0 = as_scalar("t0", t0, q0.dtype)
     h = as_scalar("h", h, q0.dtype, zero_allowed=False)
     epsilon = as_scalar("epsilon", epsilon, q0.dtype)
     args = jax.tree.map(as_parameter, args)
-    # By the class: a bound method of an equinox module takes 20 µs to make.
     System.check_shapes(system, t0, q0, p0, epsilon, args)
     given = Run(system, t0, q0, p0, epsilon, args, observe, save, stop)
-    asked, undo = lattice.transform(given)
-    lattice.check(method, integrator.arithmetic)
+    asked, undo = kind.transform(lattice, given)
+    kind.check(lattice, method, integrator.arithmetic)
     task, q0, p0 = _task(asked, integrator, method, h)
     plan = make_plan(save, num_steps)
-    _check_memory(asked, plan, task, q0, p0, layout)
+    leaves = jax.tree.leaves((task, q0, p0))
+    _check_memory(save, plan, q0, check_observe(task, q0, p0), leaves, layout)
+    traced = any(is_traced(x) for x in leaves)
+    if not traced and asked.system.force is not None:
+        warn_of_dissipation(method, task.equations, task.first_interval, q0, p0)
     if save.ts is not None:
         observed = requested_times(asked.save, task, num_steps)
         task = dataclasses.replace(task, observe=observed)
-    traced = any(is_traced(x) for x in jax.tree.leaves((task, q0, p0)))
-    if not traced:
-        warn_of_dissipation(method, task.equations, task.first_interval, q0, p0)
     if progress is None:
         solution = _whole(task, plan, asked.observe, q0, p0, integrator.adjoint, layout)
     elif traced:
@@ -348,11 +350,12 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     )
 
 
-def _check_memory(asked: Run, plan: Plan, task: Task, q0: Array, p0: Array, layout: Layout) -> None:
-    """Refuse observables that are none, and results that no memory can hold."""
-    beside, memory = check_observe(task, q0, p0), results_memory()
-    ts, leaves = asked.save.ts, jax.tree.leaves((task, q0, p0))
-    saved = plan.num_blocks + 1 + plan.save_tail if ts is None else ts.shape[0]
+def _check_memory(
+    save: Save, plan: Plan, q0: Array, beside: int, leaves: list[Any], layout: Layout
+) -> None:
+    """Refuse results that no memory can hold; `beside`: bytes of observables at a save point."""
+    memory = results_memory()
+    saved = plan.num_blocks + 1 + plan.save_tail if save.ts is None else save.ts.shape[0]
     each = (2 * q0.size + 2) * q0.dtype.itemsize + beside  # q, p, t and h
     count, is_compiled = batch_size(leaves)
     if memory is None or count * saved * each <= memory:

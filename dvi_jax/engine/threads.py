@@ -19,7 +19,7 @@ def over_threads(
     the process; `lanewise.set_threads` limits their number. This older name stays for programs that
     call it.
 
-    **Arguments** `function`: a function of arrays. `threads`, `in_axes`, `out_axes`: without effect.
+    **Arguments** `function`: a function of arrays. The others have no effect.
 
     **Raises** `TypeError` if `function` cannot be called or `threads` is not an integer or None,
     `ValueError` if `threads` is not positive.

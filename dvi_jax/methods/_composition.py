@@ -64,7 +64,8 @@ class CompositionMethod(Method):
         check_invertible("base", self.base)
 
     def substeps(self) -> tuple[float, ...]:
-        return tuple(c * part for c in self.fractions() for part in self.base.substeps())
+        parts = self.base.substeps()
+        return tuple(c * part for c in self.fractions() for part in parts)
 
     def is_made_of_the_map(self) -> bool:
         return self.base.is_made_of_the_map()

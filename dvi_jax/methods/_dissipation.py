@@ -31,11 +31,11 @@ def warn_of_dissipation(
     as accurate as the triple jump, with γ the largest −∂(εW_i)/∂p_i at (q0, p0). Compositions of
     `TypeII` of order above 2 all have such parts.
 
-    All values known, not traced. One evaluation of a Jacobian, and none for a method without
-    negative parts or a system without a force.
+    All values known, not traced; the system has a force. One evaluation of a Jacobian, and none for
+    a method without negative parts.
     """
     backwards = -min(method.substeps())
-    if backwards <= 0 or equations.system.force is None:
+    if backwards <= 0:
         return
     interval = first_interval()
     damping = float(_damping(equations, interval, q0, p0))
