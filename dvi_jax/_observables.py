@@ -25,7 +25,8 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
         if isinstance(leaf, type) and issubclass(leaf, Reduction | Running):
             raise TypeError(
                 f"observe holds the class {leaf.__name__}: give it what it is to reduce, as in "
-                f"dvi.MaxDrift(function), a function {_STEP}, or dvi.Running(dvi.MEGNO())."
+                f"dvi.MaxDrift(function), a function {_STEP}, dvi.MEGNO() or "
+                "dvi.Running(dvi.MEGNO())."
             )
         if not is_observable(leaf):
             raise TypeError(
