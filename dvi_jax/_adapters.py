@@ -14,8 +14,9 @@ import lanewise
 from lanewise.dependence import depends_on
 
 from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
+from .engine.names import both_names
 from .engine.newton import Newton, Vector, find_root
-from .engine.signature import accepts
+from .engine.signature import accepts, check_takes
 
 _NEAR = 1e-4
 """Part of the first defect at which the damped search hands over to Newton's method."""
@@ -105,6 +106,7 @@ class _VelocityForce(eqx.Module):
         return self.F(t0, t1, q0, v, args)
 
 
+@both_names
 def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., Any]:
     r"""The Hamiltonian of a Lagrangian, discrete or continuous, by the Legendre transform.
 
@@ -145,6 +147,7 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
     return _DiscreteLegendreTransform(L, newton) if discrete else _LegendreTransform(L, newton)
 
 
+@both_names
 def from_lagrangian(L_d: Callable[..., Any], newton: Newton = Newton()) -> HamiltonianFn:
     r"""The discrete Hamiltonian of a discrete Lagrangian, the type I generating function.
 
@@ -195,10 +198,11 @@ def from_lagrangian(L_d: Callable[..., Any], newton: Newton = Newton()) -> Hamil
     # 0.541 0.5403
     ```
     """
-    _require(L_d, "L_d", "(t0, t1, q0, q1, args)")
+    check_takes("L_d", L_d, "(t0, t1, q0, q1, args)")
     return _FromLagrangian(L_d, newton)
 
 
+@both_names
 def from_type_iii(H_minus: Callable[..., Any], newton: Newton = Newton()) -> HamiltonianFn:
     r"""The discrete Hamiltonian, type II, of a type III one.
 
@@ -233,7 +237,7 @@ def from_type_iii(H_minus: Callable[..., Any], newton: Newton = Newton()) -> Ham
     **Source** Leok & Zhang 2011, *IMA J. Numer. Anal.* 31, 1497 (types II and III); the form of
     H_D: our own, by way of L_d = p0·(q1 − q0) − h H⁻ = p1·(q1 − q0) − h H_D.
     """
-    _require(H_minus, "H_minus", "(t0, t1, q1, p0, args)")
+    check_takes("H_minus", H_minus, "(t0, t1, q1, p0, args)")
     return _FromTypeIII(H_minus, newton)
 
 
@@ -257,8 +261,8 @@ def velocity_force(H_D: HamiltonianFn, F: Callable[..., Any]) -> ForceFn:
 
     **Source** (12); Marsden & West 2001, 3.2.1.
     """
-    _require(H_D, "H_D", "(t0, t1, q0, p1, args)")
-    _require(F, "F", "(t0, t1, q0, v, args)")
+    check_takes("H_D", H_D, "(t0, t1, q0, p1, args)")
+    check_takes("F", F, "(t0, t1, q0, v, args)")
     return _VelocityForce(H_D, F)
 
 
@@ -372,9 +376,3 @@ def _described(function: Any) -> str:
         return f"{function.__name__}{inspect.signature(function)}"
     except (AttributeError, TypeError, ValueError):
         return repr(function)
-
-
-def _require(function: Any, name: str, arguments: str) -> None:
-    """Refuse what is no function of five arguments."""
-    if not (callable(function) and accepts(function, 5)):
-        raise TypeError(f"{name} must be a function {arguments}, got {_described(function)}.")

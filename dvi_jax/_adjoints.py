@@ -2,40 +2,28 @@
 
 import abc
 import math
-from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 import lanewise
 from lanewise import Layout
 
+from ._checks import whole
 from ._rollout import (
-    Carry,
     Loop,
+    Outcome,
     Plan,
-    Saved,
     Task,
     adds_start_outside,
-    counted_scan,
-    reduce,
+    outcome,
     run,
     start,
     with_start,
-    with_tail,
 )
 from ._types import State
-
-
-class Outcome(NamedTuple):
-    """A trajectory as it leaves the scan: last carry, saved states with the start in front, reduced
-    observables, and the largest miss of a state that was rebuilt, if it was asked for."""
-
-    carry: Carry
-    saved: Saved
-    reduced: list[Any]
-    round_trip_defect: jax.Array | None = None
 
 
 class AbstractAdjoint(eqx.Module):
@@ -56,21 +44,15 @@ def _direct_rollout(
     task: Task, plan: Plan, q0: State, p0: State, loop: Loop, layout: Layout
 ) -> Outcome:
     arrays, rest = eqx.partition(task, eqx.is_array)
-    outside = adds_start_outside(plan)
-
-    def outcome(task, ran, *of):
-        carry, saved, tail = ran
-        kept = with_tail(plan, saved, tail)
-        if not outside:
-            kept = with_start(kept, *of)
-        return Outcome(carry, kept, reduce(task, carry))
 
     def forward(arrays, q0, p0):
         task = eqx.combine(arrays, rest)
-        return outcome(task, run(task, plan, start(task, q0, p0), loop), q0, p0)
+        return outcome(task, plan, run(task, plan, start(task, q0, p0), loop), q0, p0)
 
     result = lanewise.call(forward, arrays, q0, p0, layout=layout)
-    return result._replace(saved=with_start(result.saved, q0, p0)) if outside else result
+    if adds_start_outside(plan):
+        return result._replace(saved=with_start(result.saved, q0, p0))
+    return result
 
 
 class Direct(AbstractAdjoint):
@@ -80,7 +62,7 @@ class Direct(AbstractAdjoint):
     """
 
     def rollout(self, task, plan, q0, p0, layout=Layout()):
-        return _direct_rollout(task, plan, q0, p0, counted_scan, layout)
+        return _direct_rollout(task, plan, q0, p0, lax.scan, layout)
 
 
 class Checkpointed(AbstractAdjoint):
@@ -95,33 +77,25 @@ class Checkpointed(AbstractAdjoint):
     segments: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if self.segments is not None and (
-            isinstance(self.segments, bool)
-            or not isinstance(self.segments, int)
-            or self.segments < 1
-        ):
-            raise ValueError(f"segments must be a positive integer, got {self.segments!r}.")
+        if self.segments is not None:
+            whole("segments", self.segments)
 
     def rollout(self, task, plan, q0, p0, layout=Layout()):
         return _direct_rollout(task, plan, q0, p0, self._loop, layout)
 
-    def _loop(self, body, carry, first, stride, count):
+    def _loop(self, body, carry, _, count):
         segments = min(self.segments or math.isqrt(count), count)
         size = count // max(segments, 1)
         if size < 2:
-            return counted_scan(body, carry, first, stride, count)
-        whole = size * segments
+            return lax.scan(body, carry, None, count)
 
         def segment(length):
-            @jax.checkpoint
-            def scan(carry, k):
-                return counted_scan(body, carry, k, stride, length)
+            return jax.checkpoint(lambda carry, _: lax.scan(body, carry, None, length))
 
-            return scan
-
-        carry, ys = counted_scan(segment(size), carry, first, stride * size, segments)
-        ys = jax.tree.map(lambda y: y.reshape(whole, *y.shape[2:]), ys)
-        if whole < count:
-            carry, rest = segment(count - whole)(carry, first + stride * whole)
+        carry, ys = lax.scan(segment(size), carry, None, segments)
+        ys = jax.tree.map(lambda y: y.reshape(-1, *y.shape[2:]), ys)
+        left = count - size * segments
+        if left:
+            carry, rest = segment(left)(carry, None)
             ys = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), ys, rest)
         return carry, ys

@@ -1,44 +1,43 @@
 """How a state is kept from step to step: rounded, with what rounding loses, or on a grid."""
 
-import abc
 import dataclasses
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 
-from ._step import Equations, StepInfo, to_grid
+from ._step import Equations, to_grid
 from ._types import Interval, State
-from .methods import Adjoint, Method, TypeII
-from .methods._composition import CompositionMethod
+from .methods import Method
 
 
 class Arithmetic(eqx.Module):
-    """Base of the ways to keep a state from step to step."""
+    """Base of the ways to keep a state from step to step; what is here keeps it as it is."""
 
-    @abc.abstractmethod
+    undoes_steps: ClassVar[bool] = False
+    """Whether steps are undone bit for bit, so that none may need a solve."""
+
     def prepare(
         self, method: Method, equations: Equations, interval: Interval, q0: State, p0: State
     ) -> tuple[Equations, State, State]:
         """The equations and the start as this arithmetic has them, or an error: once per run."""
+        return equations, q0, p0
 
-    @abc.abstractmethod
     def start(self, q0: State, p0: State) -> Any:
         """What is remembered beside the state, before the first step."""
+        return None
 
-    @abc.abstractmethod
-    def step(
-        self,
-        method: Method,
-        equations: Equations,
-        interval: Interval,
-        q0: State,
-        p0: State,
-        memory: Any,
-    ) -> tuple[State, State, Any, StepInfo]:
-        """One step of `method`: the state, what is remembered beside it, and the status."""
+    def enter(
+        self, equations: Equations, q0: State, p0: State, memory: Any
+    ) -> tuple[Equations, State, State]:
+        """The equations and the state that a step of the method begins with."""
+        return equations, q0, p0
+
+    def leave(self, q0: State, p0: State, x1: State, y1: State) -> tuple[State, State, Any]:
+        """The state after the step, which led to (x1, y1), and what is remembered beside it."""
+        return x1, y1, None
 
 
 class FloatingPoint(Arithmetic):
@@ -47,16 +46,6 @@ class FloatingPoint(Arithmetic):
     What the map keeps then makes a random walk, of about 1e-16 √N of its size after N steps in
     float64.
     """
-
-    def prepare(self, method, equations, interval, q0, p0):
-        return equations, q0, p0
-
-    def start(self, q0, p0):
-        return None
-
-    def step(self, method, equations, interval, q0, p0, memory):
-        q1, p1, info = method.step(equations, interval, q0, p0)
-        return q1, p1, memory, info
 
 
 class Compensated(Arithmetic):
@@ -78,18 +67,16 @@ class Compensated(Arithmetic):
     2, 4.2.2. For symplectic methods: Hairer, Lubich & Wanner 2006, VIII.5.
     """
 
-    def prepare(self, method, equations, interval, q0, p0):
-        return equations, q0, p0
-
     def start(self, q0, p0):
         return jnp.zeros_like(q0), jnp.zeros_like(p0)
 
-    def step(self, method, equations, interval, q0, p0, memory):
-        here = dataclasses.replace(equations, origin=(q0, p0))
-        x, y, info = method.step(here, interval, *memory)
-        q1, lost_q = _exact_sum(q0, x)
-        p1, lost_p = _exact_sum(p0, y)
-        return q1, p1, lax.stop_gradient((lost_q, lost_p)), info
+    def enter(self, equations, q0, p0, memory):
+        return dataclasses.replace(equations, origin=(q0, p0)), *memory
+
+    def leave(self, q0, p0, x1, y1):
+        q1, lost_q = _exact_sum(q0, x1)
+        p1, lost_p = _exact_sum(p0, y1)
+        return q1, p1, lax.stop_gradient((lost_q, lost_p))
 
 
 class FixedPoint(Arithmetic):
@@ -128,6 +115,8 @@ class FixedPoint(Arithmetic):
 
     quantum: float = eqx.field(static=True)
 
+    undoes_steps: ClassVar[bool] = True
+
     def __check_init__(self):
         quantum = self.quantum
         is_number = isinstance(quantum, int | float) and not isinstance(quantum, bool)
@@ -143,7 +132,7 @@ class FixedPoint(Arithmetic):
             )
 
     def prepare(self, method, equations, interval, q0, p0):
-        if not _is_made_of_the_map(method):
+        if not method.is_made_of_the_map():
             raise ValueError(
                 f"FixedPoint needs a method that is made of the map (12)–(13) and its adjoint; "
                 f"{method!r} is not. Take dvi.Strang(), dvi.Yoshida(4) or another composition, "
@@ -167,13 +156,6 @@ class FixedPoint(Arithmetic):
         equations = dataclasses.replace(equations, quantum=self.quantum)
         return equations, _start_on_grid(q0, self.quantum), _start_on_grid(p0, self.quantum)
 
-    def start(self, q0, p0):
-        return None
-
-    def step(self, method, equations, interval, q0, p0, memory):
-        q1, p1, info = method.step(equations, interval, q0, p0)
-        return q1, p1, memory, info
-
 
 def _exact_sum(a: State, b: State) -> tuple[State, State]:
     """(s, e) with s = fl(a + b) and s + e = a + b exactly, whichever is larger."""
@@ -185,11 +167,3 @@ def _exact_sum(a: State, b: State) -> tuple[State, State]:
 def _start_on_grid(x: State, quantum: float) -> State:
     x = to_grid(x, quantum)
     return jnp.where(x == 0, jnp.zeros_like(x), x)  # −0 would come back as +0
-
-
-def _is_made_of_the_map(method: Method) -> bool:
-    if isinstance(method, Adjoint):
-        return _is_made_of_the_map(method.method)
-    if isinstance(method, CompositionMethod):
-        return _is_made_of_the_map(method.base)
-    return isinstance(method, TypeII)

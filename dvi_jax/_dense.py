@@ -8,16 +8,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lanewise import Layout
 
+from ._rollout import Task
+from ._solution import Save
 from ._step import Equations
 from ._types import Interval, Scalar, State
 from .engine.bracket import bracketed_root
 from .engine.rounding import each, one_by_one
 from .methods import Method
-from .observe import Crossings, Section, Stop, Stopped
+from .observe import Crossings, Reduction, Section, Stop, Stopped, is_observable
 from .observe._kept import RequestedTimes, Start, event, from_rows, shown
 
 Point = tuple[Scalar, State, State]
@@ -58,6 +60,32 @@ class Curve(eqx.Module):
         at_zero = event(g, start.t0, start.q0, start.p0, args)
         theta = bracketed_root(at, zero, at_zero, one, at(one), exists)
         return self.point(start, theta)
+
+
+def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes, PyTree]:
+    """What is observed along the run when states are saved at requested times: no observables that
+    stand alone, which are evaluated at those times afterwards."""
+    if task.has_running_values:
+        raise ValueError(
+            "Running tells a reduction at lattice points, and Save(ts=...) asks for other times: "
+            "take save=dvi.Save(every=m)."
+        )
+    kept = jax.tree.map(
+        lambda f: f if isinstance(f, Reduction) else None, task.observe, is_leaf=is_observable
+    )
+    ts = jnp.asarray(save.ts, task.t0.dtype)
+    due = lax.stop_gradient(ts)
+    if save.clock is None and not task.lattice.has_memory and num_steps > 0:
+        eps = jnp.finfo(ts.dtype).eps
+        end = task.interval(jnp.asarray(num_steps - 1, jnp.int32)).t1
+        for known in (task.t0, end):  # N·(T/N) need not be T to the last digit
+            size = jnp.maximum(jnp.abs(task.t0), jnp.abs(known))
+            near = jnp.abs(ts - known) <= 16 * eps * size
+            ts = jnp.where(near, ts + lax.stop_gradient(known - ts), ts)
+        # Nor is t0 + k h, compiled in a loop, the same to the last digit as it is here.
+        slack = 4 * eps * (jnp.abs(task.t0) + jnp.abs(ts))
+        due = lax.stop_gradient(ts - jnp.where(end >= task.t0, slack, -slack))
+    return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), kept
 
 
 def crossings(curve: Curve, section: Section, kept: tuple[Array, Array], safe: Start) -> Crossings:

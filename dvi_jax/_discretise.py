@@ -1,6 +1,5 @@
 """From a continuous Hamiltonian to a discrete one."""
 
-import inspect
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._types import Args, HamiltonianFn, Scalar, State
+from .engine.signature import check_takes
 
 
 class _LeftRule(eqx.Module):
@@ -54,6 +54,12 @@ class _ActionRule(eqx.Module):
             ps = p1[None] + h * jnp.tensordot(b[None] - a, p_falls, 1)
         pq = jnp.sum(((ps - p1[None]) * q_rates).reshape(len(c), -1), axis=1)
         return jnp.dot(b, energy(times, qs, ps, args) - pq)
+
+
+_DISCRETE = (
+    "A discrete Hamiltonian H_D(t0, t1, q0, p1, args) needs no discretise: give it to dvi.System "
+    "directly."
+)
 
 
 def is_first_order(H_D: Any) -> bool:
@@ -121,26 +127,7 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
     # 0.60009
     ```
     """
-    if not callable(H):
-        raise TypeError(f"H must be a function (t, q, p, args), got {H!r}.")
-    try:
-        signature = inspect.signature(H)
-    except (TypeError, ValueError):
-        signature = None
-    if signature is not None:
-        try:
-            signature.bind(*range(4))
-        except TypeError as error:
-            raise TypeError(
-                "H must take four positional arguments (t, q, p, args); "
-                f"{getattr(H, '__name__', type(H).__name__)}{signature} does not: {error}."
-                + (
-                    " A discrete Hamiltonian H_D(t0, t1, q0, p1, args) needs no discretise: give "
-                    "it to dvi.System directly."
-                    if len(signature.parameters) == 5
-                    else ""
-                )
-            ) from None
+    check_takes("H", H, "(t, q, p, args)", {5: _DISCRETE})
     if isinstance(order, bool) or order not in (1, *_RULES):
         raise ValueError(
             f"discretise knows order 1 (the paper's rule), 2, 3 and 4, got order={order!r}. For a "

@@ -17,23 +17,21 @@ from lanewise import Layout
 from lanewise.jaxapi import batch_size, is_traced, manual_axes
 from lanewise.primitive import generates
 
-from ._adjoints import AbstractAdjoint, Outcome
-from ._arithmetic import Arithmetic, FixedPoint
-from ._dense import Curve, at_times, crossings, stopped
-from ._extended import run_extended
+from ._adjoints import AbstractAdjoint
+from ._arithmetic import Arithmetic
+from ._checks import instance
+from ._dense import Curve, at_times, crossings, requested_times, stopped
+from ._inputs import as_parameter, as_scalar, start_state
 from ._integrator import Integrator, chosen
 from ._memory import results_memory
-from ._precision import refuse_double_without_x64
+from ._observables import check_observe, observed
 from ._results import RESULTS, IntegrationError, status_code, status_name
-from ._reversible import Reversible
 from ._rollout import (
+    Outcome,
     Plan,
     StepTaken,
     Task,
-    counted_scan,
-    is_observable,
     make_plan,
-    observed,
     reduce,
     run,
     start,
@@ -45,15 +43,12 @@ from ._step import Equations
 from ._system import System, check_system
 from ._types import Interval
 from .engine.newton import RootSolver, over
-from .engine.quantities import refuse_unit_or_mask
 from .engine.reads import reads
 from .engine.rounding import each
-from .lattices import Lattice, TimeTransformed, Variational
-from .methods import Method, TypeII, goes_backwards, warn_of_dissipation
-from .observe import Deviations, Range, Reduction, RequestedTimes, Running, Section, Stop
+from .lattices import Lattice, Run
+from .methods import Method, warn_of_dissipation
+from .observe import RequestedTimes, Section, Stop
 from .observe._kept import Start
-
-_STEP = "(t0, t1, q0, p0, q1, p1, args)"
 
 _PIECES = 100
 """Pieces that a run with progress is cut into."""
@@ -75,6 +70,7 @@ def integrate(
     observe: PyTree = None,
     adjoint: AbstractAdjoint | None = None,
     newton: RootSolver | None = None,
+    root_finder: RootSolver | None = None,
     arithmetic: Arithmetic | None = None,
     layout: Layout | None = None,
     integrator: Integrator | None = None,
@@ -108,8 +104,8 @@ def integrate(
     - `layout`: how the arithmetic is laid out, see `Layout`.
     - `stop`: a `Stop`, where the run ends early (a collision, an escape); or None.
     - `adjoint`: how reverse-mode gradients go, see `Reversible`, `Checkpointed`, `Direct`.
-    - `newton`: how implicit steps are solved: `PicardThenNewton`, `Newton`, `SimplifiedNewton`,
-      `Picard`.
+    - `root_finder`, or `newton`: how implicit steps are solved: `PicardThenNewton`, `Newton`,
+      `SimplifiedNewton`, `Picard`.
     - `arithmetic`: how the state is kept: `FloatingPoint`; for long runs `Compensated`, or
       `FixedPoint`, whose explicit steps go back bit for bit.
     - `integrator`: an `Integrator` in place of method, lattice, adjoint, newton, arithmetic and
@@ -148,87 +144,81 @@ def integrate(
     """
     check_system(system)
     integrator = chosen(
-        integrator, method=method, lattice=lattice, adjoint=adjoint, root_finder=newton,
-        arithmetic=arithmetic, layout=layout,
+        integrator, method=method, lattice=lattice, adjoint=adjoint, newton=newton,
+        root_finder=root_finder, arithmetic=arithmetic, layout=layout,
     )  # fmt: skip
-    method, lattice, adjoint = integrator.method_for(system), integrator.lattice, integrator.adjoint
-    newton, arithmetic, layout = integrator.root_finder, integrator.arithmetic, integrator.layout
-    if not isinstance(save, Save):
-        hint = " (is a pair of parentheses missing?)" if isinstance(save, type) else ""
-        raise TypeError(f"save must be a Save, got {save!r}{hint}.")
-    if not (stop is None or isinstance(stop, Stop)):
-        raise TypeError(f"stop must be a dvi.Stop(g), got {stop!r}.")
-
+    method, lattice, layout = integrator.method_for(system), integrator.lattice, integrator.layout
+    instance("save", save, Save, "a dvi.Save(...)")
+    instance("stop", stop, Stop | None, "a dvi.Stop(g)")
     q0, p0 = start_state(q0, p0)
-    t0, h, num_steps = lattice.prepare(t0, h, num_steps)
+    # By the class, here and below: a bound method of an equinox module takes 20 µs to make.
+    kind = type(lattice)
+    t0, h, num_steps = kind.prepare(lattice, t0, h, num_steps)
     t0 = as_scalar("t0", t0, q0.dtype)
     h = as_scalar("h", h, q0.dtype, zero_allowed=False)
     epsilon = as_scalar("epsilon", epsilon, q0.dtype)
     args = jax.tree.map(as_parameter, args)
-    # By the class: a bound method of an equinox module takes 20 µs to make.
     System.check_shapes(system, t0, q0, p0, epsilon, args)
-    if isinstance(lattice, TimeTransformed):
-        return run_extended(
-            integrate, system, lattice, q0, p0, t0, epsilon, args, observe, is_observable, h=h,
-            num_steps=num_steps, method=method, save=save, adjoint=adjoint, newton=newton,
-            arithmetic=arithmetic, layout=layout, stop=stop, throw=throw, progress=progress,
-        )  # fmt: skip
-    if isinstance(lattice, Variational) and not isinstance(method, TypeII):
+    given = Run(system, t0, q0, p0, epsilon, args, observe, save, stop)
+    asked, undo = kind.transform(lattice, given)
+    kind.check(lattice, method, integrator.arithmetic)
+    task, q0, p0 = _task(asked, integrator, method, h)
+    plan = make_plan(save, num_steps)
+    leaves = jax.tree.leaves((task, q0, p0))
+    _check_memory(save, plan, q0, check_observe(task, q0, p0), leaves, layout)
+    traced = any(is_traced(x) for x in leaves)
+    if not traced and asked.system.force is not None:
+        warn_of_dissipation(method, task.equations, task.first_interval, q0, p0)
+    if save.ts is not None:
+        observed = requested_times(asked.save, task, num_steps)
+        task = dataclasses.replace(task, observe=observed)
+    if progress is None:
+        solution = _whole(task, plan, asked.observe, q0, p0, integrator.adjoint, layout)
+    elif traced:
+        raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
+    elif getattr(integrator.adjoint, "report_defect", False):
         raise ValueError(
-            f"the lattice Variational() goes with method=dvi.TypeII() only, got {method!r}: (14) "
-            "is the variation of that map's action. For a higher order take an H_D of higher "
-            "order, dvi.discretise(H, order=2)."
+            "report_defect=True cannot be reported with progress: leave one of them out."
         )
-    if isinstance(lattice, Variational) and isinstance(arithmetic, FixedPoint):
-        raise ValueError(
-            "the steps of Variational() are solved for, and a solve cannot be undone bit for bit: "
-            "take arithmetic=dvi.Compensated(), or another lattice."
-        )
-    equations = Equations(system, epsilon, args, newton)
+    else:
+        outcome = _in_pieces(task, plan, q0, p0, progress, layout)
+        solution = _solution(task, plan, asked.observe, outcome, q0, p0, layout)
+    solution = undo(solution)
+    return _raise_on_failure(solution, task) if throw else solution
+
+
+def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[Task, Array, Array]:
+    """The trajectory that is asked for, and its start as the arithmetic has it."""
+    system, epsilon = run.system, run.epsilon
     is_disturbed = system.force is not None or system.perturbation is not None
     if not (is_disturbed or system.slow_time or is_traced(epsilon)) and float(epsilon) != 0:
         warnings.warn(
             f"epsilon = {float(epsilon):g} has no effect: the system has neither a force nor a "
             "perturbation.",
-            stacklevel=2,
+            stacklevel=3,
         )
-    equations, q0, p0 = arithmetic.prepare(method, equations, Interval(t0, t0 + h, h), q0, p0)
-    seen = reads(observe, stop, lattice)
-    task = Task(equations, method, lattice, observe, t0, h, arithmetic, stop, seen)
-    beside = _check_observe(task, q0, p0)
-    plan = make_plan(save, num_steps)
-    leaves = jax.tree.leaves((task, q0, p0))
-    _check_memory(save, plan, q0, beside, leaves, layout)
-    if save.ts is not None:
-        task = eqx.tree_at(
-            lambda task: task.observe, task, _with_times(save, task, num_steps),
-            is_leaf=lambda x: x is None,
-        )  # fmt: skip
-    traced = any(is_traced(x) for x in leaves)
-    if not traced and system.force is not None and goes_backwards(method):
-        first = task.interval(jnp.asarray(0, jnp.int32))
-        warn_of_dissipation(method, equations, first, q0, p0)
-    if progress is None:
-        solution = _whole(task, plan, observe, q0, p0, num_steps, adjoint, layout)
-        return _raise_on_failure(solution, task) if throw else solution
-    if traced:
-        raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
-    if isinstance(adjoint, Reversible) and adjoint.report_defect:
-        raise ValueError(
-            "report_defect=True cannot be reported with progress: leave one of them out."
-        )
-    outcome = _in_pieces(task, plan, q0, p0, num_steps, progress, layout)
-    solution = _solution(task, observe, outcome, q0, p0, num_steps, layout)
-    return _raise_on_failure(solution, task) if throw else solution
+    lattice, arithmetic = integrator.lattice, integrator.arithmetic
+    equations, q0, p0 = arithmetic.prepare(
+        method,
+        Equations(system, epsilon, run.args, integrator.root_finder),
+        Interval(run.t0, run.t0 + h, h),
+        run.q0,
+        run.p0,
+    )
+    seen = reads(run.observe, run.stop, lattice)
+    return (
+        Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop, seen),
+        q0,
+        p0,
+    )
 
 
 @eqx.filter_jit
 def _whole(
-    task: Task, plan: Plan, observe: PyTree, q0, p0, num_steps: int, adjoint: AbstractAdjoint,
-    layout: Layout,
-) -> Solution:  # fmt: skip
+    task: Task, plan: Plan, observe: PyTree, q0, p0, adjoint: AbstractAdjoint, layout: Layout
+) -> Solution:
     outcome = adjoint.rollout(task, plan, q0, p0, layout)
-    return _as_solution(task, observe, outcome, q0, p0, num_steps, layout)
+    return _as_solution(task, plan, observe, outcome, q0, p0, layout)
 
 
 @eqx.filter_jit
@@ -237,70 +227,40 @@ def _begin(task: Task, q0, p0):
 
 
 @eqx.filter_jit
-def _piece(task: Task, plan: Plan, carry, first, layout: Layout):
+def _piece(task: Task, plan: Plan, carry, layout: Layout):
     arrays, rest = eqx.partition(task, eqx.is_array)
 
-    def piece(arrays, carry, first):
-        task = eqx.combine(arrays, rest)
-        carry, saved, tail = run(task, plan, carry, counted_scan, first=first)
+    def piece(arrays, carry):
+        carry, saved, tail = run(eqx.combine(arrays, rest), plan, carry, lax.scan)
         return carry, with_tail(plan, saved, tail)
 
-    return lanewise.call(piece, arrays, carry, first, layout=layout)
+    return lanewise.call(piece, arrays, carry, layout=layout)
 
 
-def _in_pieces(task: Task, plan: Plan, q0, p0, num_steps, progress, layout) -> Outcome:
+def _in_pieces(task: Task, plan: Plan, q0, p0, progress, layout) -> Outcome:
     """The same scan as `_whole`, cut between save points, with a call after each piece."""
     blocks = max(1, -(-plan.num_blocks // _PIECES))
-    carry, done, parts = _begin(task, q0, p0), 0, []
-    while True:
+    carry, done, parts, is_last = _begin(task, q0, p0), 0, [], False
+    while not is_last:
         count = min(blocks, plan.num_blocks - done)
-        is_last = done + count >= plan.num_blocks
+        done += count
+        is_last = done >= plan.num_blocks
         tail = (plan.tail, plan.save_tail) if is_last else (0, False)
-        first = jnp.asarray(done * plan.block, jnp.int32)
-        carry, saved = _piece(task, Plan(count, plan.block, *tail), carry, first, layout)
+        carry, saved = _piece(task, Plan(count, plan.block, *tail), carry, layout)
         jax.block_until_ready(carry)
         parts.append(saved)
-        done += count
-        progress(num_steps if is_last else done * plan.block, num_steps)
-        if is_last:
-            break
+        progress(plan.num_steps if is_last else done * plan.block, plan.num_steps)
     saved = jax.tree.map(lambda *xs: jnp.concatenate(xs), *parts)
     return Outcome(carry, with_start(saved, q0, p0), reduce(task, carry))
 
 
-def _with_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes, PyTree]:
-    """What is observed along the run when states are saved at requested times: no observables that
-    stand alone, which are evaluated at those times afterwards."""
-    if task.has_running_values:
-        raise ValueError(
-            "Running tells a reduction at lattice points, and Save(ts=...) asks for other times: "
-            "take save=dvi.Save(every=m)."
-        )
-    kept = jax.tree.map(
-        lambda f: f if isinstance(f, Reduction) else None, task.observe, is_leaf=is_observable
-    )
-    ts = jnp.asarray(save.ts, task.t0.dtype)
-    due = lax.stop_gradient(ts)
-    if save.clock is None and not task.lattice.has_memory and num_steps > 0:
-        eps = jnp.finfo(ts.dtype).eps
-        end = task.interval(jnp.asarray(num_steps - 1, jnp.int32)).t1
-        for known in (task.t0, end):  # N·(T/N) need not be T to the last digit
-            size = jnp.maximum(jnp.abs(task.t0), jnp.abs(known))
-            near = jnp.abs(ts - known) <= 16 * eps * size
-            ts = jnp.where(near, ts + lax.stop_gradient(known - ts), ts)
-        # Nor is t0 + k h, compiled in a loop, the same to the last digit as it is here.
-        slack = 4 * eps * (jnp.abs(task.t0) + jnp.abs(ts))
-        due = lax.stop_gradient(ts - jnp.where(end >= task.t0, slack, -slack))
-    return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), kept
-
-
 def _as_solution(
-    task: Task, observe: PyTree, outcome: Outcome, q0, p0, num_steps: int, layout: Layout
+    task: Task, plan: Plan, observe: PyTree, outcome: Outcome, q0, p0, layout: Layout
 ) -> Solution:
     """What a run has left behind, as its user sees it."""
     carry, saved, reduced, defect = outcome
     curve = Curve.of(task.method, task.equations, layout)
-    first = task.interval(jnp.asarray(0, jnp.int32))
+    first = task.first_interval()
     safe = Start(first.t0, first.t1, first.t1, q0, p0)
     _, reductions = task.observables()
     values: list[Any] = [
@@ -329,7 +289,7 @@ def _as_solution(
         observed=observed(observe, alone, values),
         result=result,
         stats={
-            "num_steps": num_steps,
+            "num_steps": plan.num_steps,
             "newton_iterations": carry.iterations,
             "max_residual": over(*carry.residual),
             "failed_step": carry.failed_step,
@@ -411,167 +371,3 @@ def _check_memory(
         + (", and dvi.sweep(store=...) writes results of many trajectories to disk." if batch
            else ".")
     )  # fmt: skip
-
-
-def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
-    """A start as real arrays of one shape and precision, or an error that says what is wrong."""
-    q, p = _real_array("q0", q0), _real_array("p0", p0)
-    if q.shape != p.shape:
-        raise ValueError(
-            f"q0 and p0 must have one shape, got q0 {q.shape} and p0 {p.shape}. Each position "
-            "needs its momentum."
-        )
-    if q.size == 0:
-        raise ValueError(f"q0 is empty (shape {q.shape}): there is nothing to integrate.")
-    if q.dtype != p.dtype:
-        dtype = jnp.result_type(q.dtype, p.dtype)
-        q, p = q.astype(dtype), p.astype(dtype)
-    if q.dtype.itemsize < 4:
-        raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype}: too few digits.")
-    return q, p
-
-
-def _real_array(name: str, value: Any) -> Array:
-    if isinstance(value, list | tuple) and any(is_traced(x) for x in jax.tree.leaves(value)):
-        value = jnp.asarray(value)
-    if isinstance(value, jax.Array) and is_traced(value):
-        kind = value.dtype
-    else:
-        # In NumPy: under jit, jax.numpy would give tracers even for values that are known.
-        value = _as_numpy(name, value)
-        kind = value.dtype
-        refuse_double_without_x64(name, kind)
-    if kind.kind == "c":
-        raise TypeError(
-            f"{name} must be real, got dtype {kind}. Write a complex variable as its real and "
-            "imaginary parts (a canonical pair, up to a factor)."
-        )
-    if not _is_real(kind):
-        raise TypeError(f"{name} must be a real array, got dtype {kind}.")
-    if isinstance(value, np.ndarray) and not np.isfinite(value).all():
-        where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
-        raise ValueError(
-            f"{name} holds a value that is not finite at index {list(where)}: {value[where]}. "
-            "Every component of the start must be a number."
-        )
-    array = jnp.asarray(value)
-    return array.astype(jnp.result_type(float)) if kind.kind in "iu" else array
-
-
-def _is_real(dtype: Any) -> bool:
-    """Whether numbers of this type are real; NumPy does not know those of two bytes."""
-    return dtype.kind in "fiu" or jnp.issubdtype(dtype, jnp.floating)
-
-
-def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
-    """A number of this precision, or an error that names it."""
-    known = None if is_traced(value) else _as_numpy(name, value)
-    if isinstance(value, np.ndarray | np.generic) and value.dtype == np.float64:
-        refuse_double_without_x64(name, value.dtype)
-    kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
-    if not _is_real(kind):
-        raise TypeError(f"{name} must be a real number, got {value!r}.")
-    if shape != ():
-        raise ValueError(
-            f"{name} must be one number, got shape {shape}. For several values use "
-            f"jax.vmap over {name}" + (", or lattice=dvi.Given(ts)." if name == "h" else ".")
-        )
-    if known is not None and not np.isfinite(known):
-        raise ValueError(f"{name} must be finite, got {known}.")
-    if known is not None and not zero_allowed and known == 0:
-        raise ValueError(
-            f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
-            "or a negative one (backward)."
-        )
-    return jnp.asarray(value, dtype) if known is None else jnp.asarray(known.astype(dtype))
-
-
-def _as_numpy(name: str, value: Any) -> np.ndarray:
-    refuse_unit_or_mask(name, value)
-    try:
-        return np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be made of real numbers, got {value!r} ({error}).") from None
-
-
-def as_parameter(leaf: Any) -> Any:
-    """A leaf of args: floats become arrays, so that a new value needs no new compilation."""
-    if isinstance(leaf, np.ndarray | np.generic):
-        refuse_unit_or_mask("args", leaf)
-        leaf = np.asarray(leaf)
-        refuse_double_without_x64("args", leaf.dtype)
-        if leaf.dtype.kind in "OMm":
-            raise TypeError(f"args holds an array of dtype {leaf.dtype}: numbers are needed.")
-        return jnp.asarray(leaf)
-    if not isinstance(leaf, jax.Array):
-        try:
-            hash(leaf)
-        except TypeError:
-            raise TypeError(
-                f"args holds a {type(leaf).__name__}, which is neither an array nor hashable: "
-                f"{leaf!r:.80}. Give arrays and numbers, in dicts, lists and tuples."
-            ) from None
-    return jnp.asarray(leaf) if isinstance(leaf, float) else leaf
-
-
-def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> None:
-    """Refuse deviation vectors along steps whose derivative is not that of the method alone."""
-    name = type(leaf).__name__
-    if task.lattice.has_memory:
-        raise ValueError(
-            f"{name} needs steps whose size does not depend on the state, and those of "
-            f"{task.lattice!r} do: take lattice=dvi.Uniform() or dvi.Given(ts)."
-        )
-    eqx.filter_eval_shape(leaf.start, jnp.zeros(2 * q0.size, q0.dtype))  # counts and units
-
-
-def _check_observe(task: Task, q0: Array, p0: Array) -> int:
-    """Refuse observables that are not functions of a step with an array for a value.
-
-    **Returns** the bytes of those that stand alone, at one save point.
-    """
-    size = 0
-    for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
-        if isinstance(leaf, type) and issubclass(leaf, Deviations | Running):
-            raise TypeError(
-                f"observe holds the class {leaf.__name__}: give it what it takes, as in "
-                "dvi.MEGNO() or dvi.Running(dvi.MEGNO())."
-            )
-        if isinstance(leaf, type) and issubclass(leaf, Reduction):
-            raise TypeError(
-                f"observe holds the class {leaf.__name__}: give it what it is to reduce, "
-                f"dvi.{leaf.__name__}(function), a function {_STEP}."
-            )
-        if not is_observable(leaf):
-            raise TypeError(
-                f"observe must be a pytree of functions {_STEP} or "
-                f"reductions such as dvi.MaxDrift(function); it holds {leaf!r}."
-            )
-        if isinstance(leaf, Running):
-            leaf = leaf.reduction
-        if isinstance(leaf, Deviations):
-            _check_deviations(leaf, task, q0, p0)
-            continue
-        function = leaf.function if isinstance(leaf, Reduction) else leaf
-        called = getattr(function, "__name__", type(function).__name__)
-        if not callable(function):
-            raise TypeError(f"{type(leaf).__name__} takes a function {_STEP}, got {function!r}.")
-        t0, bound = task.t0, task.bound(function)
-        try:
-            out = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, task.args)
-        except Exception as error:
-            error.add_note(f"(in the observable {called}, called with {_STEP})")
-            raise
-        if not hasattr(out, "shape") and not isinstance(out, int | float):
-            raise TypeError(
-                f"an observable {_STEP} must return one array; "
-                f"{called} returned {type(out).__name__}."
-            )
-        if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
-            raise TypeError(
-                f"Range compares values, which complex numbers have no order for; {called} returns "
-                "them. Take the real and imaginary parts, or the absolute value."
-            )
-        if not isinstance(leaf, Reduction):
-            size += int(np.prod(np.shape(out), dtype=int)) * jnp.result_type(out).itemsize
-    return size

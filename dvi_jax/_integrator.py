@@ -8,21 +8,25 @@ from lanewise import Layout
 
 from ._adjoints import AbstractAdjoint
 from ._arithmetic import Arithmetic, FloatingPoint
+from ._checks import instance
 from ._discretise import is_first_order
 from ._reversible import Reversible
 from ._system import System
+from .engine.names import both_names
 from .engine.newton import RootSolver
 from .engine.picard import PicardThenNewton
 from .lattices import Lattice, Uniform
 from .methods import Method, Strang, TypeII
 
 
+@both_names
 class Integrator(eqx.Module):
     """How to integrate: the keywords of `integrate` that say nothing about the problem.
 
     - `method`: see `integrate`. None: the map that the user wrote, `TypeII()`; for a system with
       `discretise(H, order=1)`, whose own map is of order one, `Strang()`.
-    - `root_finder`: how implicit steps are solved, `newton` of `integrate`.
+    - `root_finder`: how implicit steps are solved. Here, and in every function that takes one of
+      the two names, `newton` is another name of it; both at once are a `TypeError`.
     - `lattice`: the time grid. `arithmetic`: how the state is represented.
     - `layout`: machine code or arrays. `adjoint`: how reverse-mode gradients are computed.
 
@@ -54,15 +58,10 @@ class Integrator(eqx.Module):
     adjoint: AbstractAdjoint = Reversible()
 
     def __check_init__(self):
-        for name, kind in _KINDS:
+        for name, kind in _KINDS.items():
             value = getattr(self, name)
-            if isinstance(value, kind) or (name == "method" and value is None):
-                continue
-            hint = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
-            if kind is RootSolver:
-                name = "newton"
-                hint += "; take dvi.Newton(), dvi.SimplifiedNewton(), dvi.Picard() or leave it out"
-            raise TypeError(f"{name} must be a {kind.__name__}, got {value!r}{hint}.")
+            if name != "method" or value is not None:
+                instance(name, value, kind, f"a {kind.__name__}", _HINTS.get(name, ""))
 
     @property
     def newton(self) -> RootSolver:
@@ -74,14 +73,15 @@ class Integrator(eqx.Module):
         return default_method(system) if self.method is None else self.method
 
 
-_KINDS = (
-    ("method", Method),
-    ("lattice", Lattice),
-    ("adjoint", AbstractAdjoint),
-    ("root_finder", RootSolver),
-    ("arithmetic", Arithmetic),
-    ("layout", Layout),
-)
+_KINDS = {
+    "method": Method,
+    "lattice": Lattice,
+    "adjoint": AbstractAdjoint,
+    "root_finder": RootSolver,
+    "arithmetic": Arithmetic,
+    "layout": Layout,
+}
+_HINTS = {"root_finder": "Take dvi.Newton(), dvi.SimplifiedNewton() or dvi.Picard()."}
 
 _DEFAULT = Integrator()
 
@@ -100,8 +100,7 @@ def chosen(integrator: Integrator | None, **given: Any) -> Integrator:
     given = {name: value for name, value in given.items() if value is not None}
     if integrator is None:
         return Integrator(**given) if given else _DEFAULT
-    if not isinstance(integrator, Integrator):
-        raise TypeError(f"integrator must be a dvi.Integrator(...), got {integrator!r}.")
+    instance("integrator", integrator, Integrator, "a dvi.Integrator(...)")
     if given:
         names = ", ".join("newton" if name == "root_finder" else name for name in given)
         raise ValueError(
@@ -114,7 +113,7 @@ def chosen(integrator: Integrator | None, **given: Any) -> Integrator:
 def only(integrator: Integrator, function: str, *used: str) -> Integrator:
     """The integrator, after refusing fields that a function does not use and that differ from the
     defaults."""
-    for name, _ in _KINDS:
+    for name in _KINDS:
         value, default = getattr(integrator, name), getattr(_DEFAULT, name)
         if name not in used and not eqx.tree_equal(value, default):
             raise ValueError(

@@ -5,6 +5,8 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
+from ._checks import instance
+
 T = TypeVar("T")
 
 
@@ -22,8 +24,7 @@ def told(
     """
     if callable(progress):
         return nullcontext(progress)
-    if not (progress is None or isinstance(progress, bool)):
-        raise TypeError(f"progress must be True, False, None or a function, got {progress!r}.")
+    instance("progress", progress, bool | None, "True, False, None or a function")
     if progress is False:
         return nullcontext(None)
     from rich.console import Console

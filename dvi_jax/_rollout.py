@@ -20,28 +20,12 @@ from .engine.newton import no_residual, worse
 from .engine.reads import Reads
 from .lattices import Lattice, Place
 from .methods import Method
-from .observe import Deviations, Pushed, Reduction, Running, Stop
+from .observe import Deviations, Pushed, Reduction, Running, Stop, is_observable
 from .observe._kept import Start, as_row, event
 
-Loop = Callable[[Callable, Any, Array, int, int], tuple[Any, Any]]
-"""``(body, carry, first, stride, count) -> (carry, ys)``: `body(carry, k)` for k = first, first +
-stride, … `count` times. How gradients flow back through it is its own."""
-
-
-def counted_scan(
-    body: Callable, carry: Any, first: Array, stride: int, count: int, reverse: bool = False
-) -> tuple[Any, Any]:
-    """The plain `Loop`. The number of the step is carried: an array of them would grow."""
-    if reverse:
-        first, stride = first + stride * (count - 1), -stride
-
-    def counted(state, _):
-        k, carry = state
-        carry, y = body(carry, k)
-        return (k + stride, carry), y
-
-    (_, carry), ys = lax.scan(counted, (jnp.asarray(first, jnp.int32), carry), None, count)
-    return carry, ys
+Loop = Callable[[Callable, Any, None, int], tuple[Any, Any]]
+"""``(body, carry, None, count) -> (carry, ys)``, as `lax.scan`, which is the plain one. How
+gradients flow back through it is its own."""
 
 
 class Task(eqx.Module):
@@ -68,9 +52,13 @@ class Task(eqx.Module):
         """
         return self._in_precision(self.lattice.interval(self.t0, self.h, k))
 
-    def next_interval(self, carry: "Carry", k: Array) -> tuple[Interval, Any, RESULTS | None]:
-        """The interval of step k, what the lattice remembers after it, and if there is one."""
-        place = Place(self.t0, self.h, k, carry.q, carry.p)
+    def first_interval(self) -> Interval:
+        """The interval of step 0."""
+        return self.interval(jnp.asarray(0, jnp.int32))
+
+    def next_interval(self, carry: "Carry") -> tuple[Interval, Any, RESULTS | None]:
+        """The interval of the next step, what the lattice remembers then, and if there is one."""
+        place = Place(self.t0, self.h, carry.k, carry.q, carry.p)
         interval, memory, result = self.lattice.next(carry.lattice, self.equations, place)
         return self._in_precision(interval), memory, result
 
@@ -119,8 +107,9 @@ class Task(eqx.Module):
 
 
 class Carry(NamedTuple):
-    """What goes from step to step."""
+    """What goes from step to step; k is the number of the next one."""
 
+    k: Int[Array, ""]
     q: State
     p: State
     lattice: Any
@@ -172,6 +161,16 @@ class Saved(NamedTuple):
     inner: Any = None
 
 
+class Outcome(NamedTuple):
+    """A trajectory as it leaves the scan: last carry, saved states with the start in front, reduced
+    observables, and the largest miss of a state that was rebuilt, if it was asked for."""
+
+    carry: Carry
+    saved: Saved
+    reduced: list[Any]
+    round_trip_defect: Array | None = None
+
+
 class Plan(NamedTuple):
     """Steps as blocks of `block` steps with a save after each, then a tail. Static."""
 
@@ -183,10 +182,6 @@ class Plan(NamedTuple):
     @property
     def num_steps(self) -> int:
         return self.num_blocks * self.block + self.tail
-
-
-def is_observable(x: Any) -> bool:
-    return isinstance(x, Reduction | Running) or callable(x)
 
 
 def make_plan(save: Save, num_steps: int) -> Plan:
@@ -214,7 +209,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     result = RESULTS.where(finite, RESULTS.successful, RESULTS.not_finite)
     usable = task.lattice.is_usable(task.t0, task.h)
     result = RESULTS.where(usable, result, RESULTS.bad_step_size)
-    interval = task.interval(jnp.asarray(0, jnp.int32))
+    interval = task.first_interval()
 
     def zero_value(reduction):
         step = StepTaken(interval.t0, interval.t1, q0, p0, q0, p0)
@@ -229,30 +224,32 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         result = RESULTS.where(over, RESULTS.stopped, result)
         stop = as_row(over, Start(task.t0, interval.t1, interval.t1, q0, p0))
     good = result == RESULTS.successful
+    zero = jnp.asarray(0, jnp.int32)
     return Carry(
-        _or_nan(good, q0),
-        _or_nan(good, p0),
-        task.lattice.begin(task.t0, task.h),
-        result,
-        jnp.where(failed, jnp.asarray(0, jnp.int32), jnp.asarray(-1, jnp.int32)),
-        no_residual(real),
-        jnp.asarray(0, jnp.int32),
-        no_residual(real),
-        [r.start(zero_value(r)) for r in reductions],
-        task.arithmetic.start(q0, p0),
-        stop,
+        k=zero,
+        q=_or_nan(good, q0),
+        p=_or_nan(good, p0),
+        lattice=task.lattice.begin(task.t0, task.h),
+        result=result,
+        failed_step=jnp.where(failed, zero, -1),
+        failed_residual=no_residual(real),
+        iterations=zero,
+        residual=no_residual(real),
+        reductions=[r.start(zero_value(r)) for r in reductions],
+        beside=task.arithmetic.start(q0, p0),
+        stop=stop,
     )
 
 
-def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, StepTaken]:
-    """Step k of the trajectory, its status and its reductions."""
-    interval, memory, exists = task.next_interval(carry, k)
+def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
+    """The next step of the trajectory, its status and its reductions."""
+    interval, memory, exists = task.next_interval(carry)
 
     def advance(q, p):
-        q1, p1, *rest = task.arithmetic.step(
-            task.method, task.equations, interval, q, p, carry.beside
-        )
-        return (q1, p1), rest
+        here, *relative = task.arithmetic.enter(task.equations, q, p, carry.beside)
+        q1, p1, info = task.method.step(here, interval, *relative)
+        q1, p1, beside = task.arithmetic.leave(q, p, q1, p1)
+        return (q1, p1), (beside, info)
 
     if task.has_deviations:
         (q1, p1), push, (beside, info) = jax.linearize(advance, carry.q, carry.p, has_aux=True)
@@ -262,41 +259,36 @@ def take_step(task: Task, carry: Carry, k: Array) -> tuple[Carry, Interval, Step
     result, stop = _stop(task, carry, interval, q1, p1, result)
     # What has failed before stays NaN, so that this step is not good either.
     good = result == RESULTS.successful
-    q1, p1, result, failed_step, failed_residual = _noted(
-        carry, k, q1, p1, result, good, info.residual
-    )
+    residual = lax.stop_gradient(info.residual)
+    q1, p1, result, failed_step, failed_residual = _noted(carry, q1, p1, result, good, residual)
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
-    reduced = _reduced(task, carry, k, taken, push, interval.h)
+    reduced = _reduced(task, carry, taken, push, interval.h)
     if stop is not None:  # what is reduced covers the steps before
         over = result == RESULTS.stopped
         reduced = jax.tree.map(lambda a, b: jnp.where(over, b, a), reduced, carry.reductions)
     was_good = carry.result == RESULTS.successful
-    residual = lax.stop_gradient(info.residual)
-    return (
-        Carry(
-            q1,
-            p1,
-            jax.tree.map(lambda new, old: jnp.where(good, new, old), memory, carry.lattice),
-            result,
-            failed_step,
-            failed_residual,
-            carry.iterations + jnp.where(was_good, info.iterations, 0),
-            worse(carry.residual, residual, good),
-            reduced,
-            beside,
-            stop,
-        ),
-        interval,
-        taken,
+    carry = Carry(
+        k=carry.k + 1,
+        q=q1,
+        p=p1,
+        lattice=jax.tree.map(lambda new, old: jnp.where(good, new, old), memory, carry.lattice),
+        result=result,
+        failed_step=failed_step,
+        failed_residual=failed_residual,
+        iterations=carry.iterations + jnp.where(was_good, info.iterations, 0),
+        residual=worse(carry.residual, residual, good),
+        reductions=reduced,
+        beside=beside,
+        stop=stop,
     )
+    return carry, interval, taken
 
 
 def _noted(
-    carry: Carry, k: Array, q1: State, p1: State, result: RESULTS, good: Array, residual: Array
+    carry: Carry, q1: State, p1: State, result: RESULTS, good: Array, residual: Array
 ) -> tuple[State, State, RESULTS, Array, Array]:
-    """State, status, failed step and its residual after step k, where that is the first step that
-    is not good. The branch keeps this work out of steps in which nothing fails."""
-    residual = lax.stop_gradient(residual)
+    """State, status, failed step and its residual after a step, where it is the first that is not
+    good. The branch keeps this work out of steps in which nothing fails."""
 
     def note():
         first = ~good & (carry.result == RESULTS.successful)
@@ -306,7 +298,7 @@ def _noted(
             _or_nan(good, q1),
             _or_nan(good, p1),
             first_failure(carry.result, result),
-            jnp.where(fails, k, carry.failed_step),
+            jnp.where(fails, carry.k, carry.failed_step),
             jnp.where(fails, residual, carry.failed_residual),
         )
 
@@ -317,9 +309,9 @@ def _noted(
 
 
 def _reduced(
-    task: Task, carry: Carry, k: Array, taken: StepTaken, push: Callable | None, h: Scalar
+    task: Task, carry: Carry, taken: StepTaken, push: Callable | None, h: Scalar
 ) -> list[Any]:
-    """The memories of the reductions after step k, whose derivative is `push`."""
+    """The memories of the reductions after a step, whose derivative is `push`."""
     _, reductions = task.observables()
 
     def value(r: Reduction, memory: Any) -> Any:
@@ -329,7 +321,7 @@ def _reduced(
         return taken.number(task.bound(r.function), task.args)
 
     return [
-        r.update(so_far, k, taken.t1, value(r, so_far))
+        r.update(so_far, carry.k, taken.t1, value(r, so_far))
         for r, so_far in zip(reductions, carry.reductions, strict=True)
     ]
 
@@ -358,21 +350,14 @@ def _stop(
 
 
 def run(
-    task: Task,
-    plan: Plan,
-    carry: Carry,
-    loop: Loop,
-    inner_loop: Loop | None = None,
-    first: int | Array = 0,
+    task: Task, plan: Plan, carry: Carry, loop: Loop, inner_loop: Loop | None = None
 ) -> tuple[Carry, Saved, Saved | None]:
-    """All steps of `plan` from step number `first`: the carry, what was saved, and the tail.
+    """All steps of `plan`: the carry, what was saved, and the tail.
 
     `loop` scans over the blocks and `inner_loop` (the same if None) over the steps of one. The
     tail is the end of the steps after the last block, None where there are none.
     """
     inner_loop = loop if inner_loop is None else inner_loop
-    first = jnp.asarray(first, jnp.int32)
-
     alone, _ = task.observables()
     has_memory = task.lattice.has_memory
 
@@ -380,32 +365,40 @@ def run(
         """What a save point needs of the last step besides the carry."""
         return interval if has_memory else None, (taken.q0, taken.p0) if alone else None
 
-    def body(state, k):
-        carry, interval, taken = take_step(task, state[0], k)
+    def body(state, _):
+        carry, interval, taken = take_step(task, state[0])
         return (carry, last_of(carry, interval, taken)), None
 
-    def steps(carry, k, count):
-        """`count` steps from number k, and the last of them as it is saved."""
-        inner, last = None, k + (count - 1)
-        interval = task.interval(last)
+    def steps(carry, _, count=plan.block):
+        """The next `count` steps, and the last of them as it is saved."""
+        inner, interval = None, task.interval(carry.k + (count - 1))
         if count == 1:
-            carry, interval, taken = take_step(task, carry, k)
+            carry, interval, taken = take_step(task, carry)
         else:
             before = last_of(carry, interval, StepTaken(*interval[:2], *[carry.q, carry.p] * 2))
-            (carry, (now, before)), inner = inner_loop(body, (carry, before), k, 1, count)
+            (carry, (now, before)), inner = inner_loop(body, (carry, before), None, count)
             interval = now if has_memory else interval
             q0, p0 = before if alone else (carry.q, carry.p)
             taken = StepTaken(interval.t0, interval.t1, q0, p0, carry.q, carry.p)
         observed = task.at_save(carry, taken)
         return carry, Saved(interval.t1, interval.h, carry.q, carry.p, observed, inner)
 
-    carry, saved = loop(
-        lambda c, k: steps(c, k, plan.block), carry, first, plan.block, plan.num_blocks
-    )
+    carry, saved = loop(steps, carry, None, plan.num_blocks)
     if not plan.tail:
         return carry, saved, None
-    carry, tail = steps(carry, first + plan.num_blocks * plan.block, plan.tail)
+    carry, tail = steps(carry, None, plan.tail)
     return carry, saved, tail
+
+
+def outcome(
+    task: Task, plan: Plan, ran: tuple[Carry, Saved, Saved | None], q0: State, p0: State
+) -> Outcome:
+    """What `run` gave, with the start in front unless `adds_start_outside`."""
+    carry, saved, tail = ran
+    saved = with_tail(plan, saved, tail)
+    if not adds_start_outside(plan):
+        saved = with_start(saved, q0, p0)
+    return Outcome(carry, saved, reduce(task, carry))
 
 
 def reduce(task: Task, carry: Carry) -> list[Any]:
@@ -436,20 +429,6 @@ def with_start(saved: Saved, q0: State, p0: State) -> Saved:
     """What was saved, the states from the start on."""
     q, p = (jnp.concatenate([a[None], b]) for a, b in ((q0, saved.q), (p0, saved.p)))
     return saved._replace(q=q, p=p)
-
-
-def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
-    """The pytree `observe` with every observable replaced by its values."""
-    values, lone = iter(reduced), iter(alone)
-
-    def value(f):
-        if isinstance(f, Reduction):
-            return next(values)
-        if isinstance(f, Running):  # its last value is the last of its rows
-            next(values)
-        return next(lone)
-
-    return jax.tree.map(value, observe, is_leaf=is_observable)
 
 
 def _or_nan(good, x):

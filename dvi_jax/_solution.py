@@ -4,28 +4,20 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from lanewise.jaxapi import is_traced
 
-from ._precision import refuse_double_without_x64
+from ._checks import whole
+from ._inputs import as_times
 from ._results import RESULTS, status_name
 from ._types import State
-from .engine.quantities import refuse_unit_or_mask
-from .engine.signature import accepts
+from .engine.signature import check_takes
 
 
-def _as_times(ts: Any) -> Any:
-    if ts is None or is_traced(ts):
-        return ts
-    refuse_unit_or_mask("ts", ts)
-    ts = np.asarray(ts)
-    refuse_double_without_x64("ts", ts.dtype)
-    if not (np.issubdtype(ts.dtype, np.floating) or np.issubdtype(ts.dtype, np.integer)):
-        raise TypeError(f"Save(ts=...) needs real times, got dtype {ts.dtype}.")
-    return jnp.asarray(ts, jnp.result_type(float) if ts.dtype.kind == "i" else ts.dtype)
+def _times(ts: Any) -> Any:
+    return None if ts is None else as_times("Save(ts=...)", ts)
 
 
 class Save(eqx.Module):
@@ -60,19 +52,14 @@ class Save(eqx.Module):
 
     every: int | None = eqx.field(static=True, default=None)
     final: bool = eqx.field(static=True, default=False)
-    ts: Float[Array, " times"] | None = eqx.field(default=None, converter=_as_times)
+    ts: Float[Array, " times"] | None = eqx.field(default=None, converter=_times)
     clock: Callable[..., Any] | None = None
 
     def __check_init__(self):
-        if self.every is not None and (
-            isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1
-        ):
-            raise ValueError(f"Save(every=m) needs a positive integer, got {self.every!r}.")
-        if self.clock is not None and not (callable(self.clock) and accepts(self.clock, 4)):
-            raise TypeError(
-                "the clock of Save(ts=..., clock=...) must be a function (t, q, p, args) → scalar, "
-                f"got {self.clock!r}."
-            )
+        if self.every is not None:
+            whole("every of Save", self.every)
+        if self.clock is not None:
+            check_takes("the clock of Save", self.clock, "(t, q, p, args)")
         if self.ts is None:
             if self.clock is not None:
                 raise ValueError("a clock needs times to be saved at: Save(ts=..., clock=...).")

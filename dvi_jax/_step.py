@@ -1,6 +1,7 @@
 """One step of the map (12)–(13), its inverse, and its adjoint."""
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,15 +14,7 @@ from lanewise.dependence import depends_on
 from ._results import RESULTS, first_failure
 from ._system import System
 from ._types import Args, Interval, Scalar, State
-from .engine.newton import (
-    Known,
-    Newton,
-    RootInfo,
-    RootSolver,
-    find_root,
-    no_residual,
-    worse,
-)
+from .engine.newton import Known, Newton, RootInfo, RootSolver, find_root, no_residual, worse
 from .engine.rounding import one_by_one
 
 
@@ -44,10 +37,8 @@ class StepInfo(NamedTuple):
 
 def no_step_yet(like: State) -> StepInfo:
     """The information that `StepInfo.then` starts from."""
-    real = jnp.finfo(like.dtype).dtype
-    zero = jnp.asarray(0, jnp.int32)
     good = RESULTS.where(jnp.asarray(True), RESULTS.successful, RESULTS.not_finite)
-    return StepInfo(good, zero, no_residual(real))
+    return StepInfo(good, *no_solve(like)[:2])
 
 
 class Equations(eqx.Module):
@@ -77,19 +68,17 @@ class Equations(eqx.Module):
 
     def momentum_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
-        q0, p1 = self.absolute(q0, p1)
-        at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
+        at = (self.system, *interval[:2], *self.absolute(q0, p1), self.epsilon, self.args)
         if self.quantum is None:
-            return _momentum_rate(self.system, *at)
-        return one_by_one(_momentum_rate, self.system, *at)
+            return _momentum_rate(*at)
+        return one_by_one(_momentum_rate, *at)
 
     def position_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """∂H_D/∂p1 at (t0, t1, q0, p1): the right side of (12)."""
-        q0, p1 = self.absolute(q0, p1)
-        at = (interval.t0, interval.t1, q0, p1, self.epsilon, self.args)
+        at = (self.system, *interval[:2], *self.absolute(q0, p1), self.epsilon, self.args)
         if self.quantum is None:
-            return _position_rate(self.system, *at)
-        return one_by_one(_position_rate, self.system, *at)
+            return _position_rate(*at)
+        return one_by_one(_position_rate, *at)
 
     def step_is_explicit(self, interval: Interval, like: State) -> bool:
         """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""
@@ -136,15 +125,10 @@ def step(
     p1 = p0 + h (−∂H_D/∂q0 + εW)(t0, t1, q0, p1)      solved for p1 where p1 enters
     q1 = q0 + h ∂H_D/∂p1 (t0, t1, q0, p1)
     """
-    p1, info = _increment(
-        lambda p1: equations.momentum_rate(interval, q0, p1),
-        p0,
-        interval.h,
-        equations,
-        known=equations.absolute(q0, p0)[1],
-        explicit=equations.step_is_explicit(interval, q0),
-    )
-    q1 = q0 + equations.increment(interval.h, equations.position_rate(interval, q0, p1))
+    h, force = interval.h, functools.partial(equations.momentum_rate, interval, q0)
+    p1 = p0 + equations.increment(h, force(p0))
+    p1, info = _solved(force, h, p0, p1, equations, equations.absolute(q0, p0)[1])
+    q1 = q0 + equations.increment(h, equations.position_rate(interval, q0, p1))
     return q1, p1, judge(info, q1, p1, equations.quantum)
 
 
@@ -156,14 +140,9 @@ def inverse_step(
     q0 = q1 − h ∂H_D/∂p1 (t0, t1, q0, p1)             solved for q0 where q0 enters
     p0 = p1 − h (−∂H_D/∂q0 + εW)(t0, t1, q0, p1)
     """
-    q0, info = _increment(
-        lambda q0: equations.position_rate(interval, q0, p1),
-        q1,
-        -interval.h,
-        equations,
-        known=equations.absolute(q1, p1)[0],
-        explicit=equations.inverse_is_explicit(interval, q1),
-    )
+    h, velocity = -interval.h, functools.partial(equations.position_rate, interval, p1=p1)
+    q0 = q1 + equations.increment(h, velocity(q1))
+    q0, info = _solved(velocity, h, q1, q0, equations, equations.absolute(q1, p1)[0])
     p0 = p1 - equations.increment(interval.h, equations.momentum_rate(interval, q0, p1))
     return q0, p0, judge(info, q0, p0, equations.quantum)
 
@@ -179,24 +158,29 @@ def adjoint_step(
     return inverse_step(equations, interval.reversed(), q0, p0)
 
 
-def _increment(rate, x0, h, equations, known, explicit) -> tuple[State, RootInfo]:
-    """x1 = x0 + h rate(x1), by one evaluation if `rate` ignores x1, else as a root.
+def no_solve(like: State) -> RootInfo:
+    """What is said of a solve where none is needed."""
+    real = jnp.finfo(like.dtype).dtype
+    return RootInfo(jnp.asarray(0, jnp.int32), no_residual(real), jnp.asarray(True))
+
+
+def _solved(
+    rate: Callable, h: Scalar, x0: State, guess: State, equations: Equations, known: State
+) -> tuple[State, RootInfo]:
+    """x1 = x0 + h rate(x1) near `guess`, which it is where `rate` ignores x1.
 
     `known` is x0 with the origin, by which the accuracy of a solve is measured.
     """
-    guess = x0 + equations.increment(h, rate(x0))
-    if explicit:
-        real = jnp.finfo(x0.dtype).dtype
-        return guess, RootInfo(jnp.asarray(0, jnp.int32), no_residual(real), jnp.asarray(True))
-    shape = x0.shape
+    if not depends_on(rate, 0, x0):
+        return guess, no_solve(x0)
     start = x0.ravel()
 
     def residual(x1):
-        return x1 - start - h * rate(x1.reshape(shape)).ravel()
+        return x1 - start - h * rate(x1.reshape(x0.shape)).ravel()
 
     represented = jnp.maximum(jnp.abs(x0), jnp.abs(guess)).ravel()
     x1, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton, represented)
-    return x1.reshape(shape), info
+    return x1.reshape(x0.shape), info
 
 
 def judge(info: RootInfo, q: State, p: State, quantum: float | None = None) -> StepInfo:

@@ -1,6 +1,5 @@
 """What the user writes: a discrete Hamiltonian, a disturbing force, a perturbation."""
 
-import inspect
 import weakref
 from collections.abc import Callable
 from typing import Any
@@ -9,10 +8,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ._checks import instance
 from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
 from .engine.reads import Reads, changed, reads
+from .engine.signature import check_takes
 
 _NAMES = "(t0, t1, q0, p1, args)"
+_CONTINUOUS = "A continuous Hamiltonian H(t, q, p, args) goes through dvi.discretise(H) first."
 
 
 class System(eqx.Module):
@@ -70,13 +72,11 @@ class System(eqx.Module):
         vars(self)["reads"] = _read_by(self)
 
     def __check_init__(self):
-        _require_five_arguments(self.H_D, "H_D")
-        if self.force is not None:
-            _require_five_arguments(self.force, "force")
-        if self.perturbation is not None:
-            _require_five_arguments(self.perturbation, "perturbation")
-        if not isinstance(self.slow_time, bool):
-            raise TypeError(f"slow_time must be True or False, got {self.slow_time!r}.")
+        for name in ("H_D", "force", "perturbation"):
+            function = getattr(self, name)
+            if function is not None or name == "H_D":
+                check_takes(name, function, _NAMES, {4: _CONTINUOUS})
+        instance("slow_time", self.slow_time, bool, "True or False")
         functions = (self.H_D, self.perturbation)
         if self.slow_time and any(getattr(f, "step_is_from_times", False) for f in functions):
             raise ValueError(
@@ -206,25 +206,3 @@ def _traced_output(
             f"{'None (is a return missing?)' if out is None else type(out).__name__}."
         )
     return seen.setdefault(kinds, jax.ShapeDtypeStruct(out.shape, out.dtype))
-
-
-def _require_five_arguments(function: object, name: str) -> None:
-    if not callable(function):
-        raise TypeError(f"{name} must be a function {_NAMES}, got {function!r}.")
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):  # builtins without a signature: tracing will tell
-        return
-    try:
-        signature.bind(*range(5))
-    except TypeError as error:
-        called = getattr(function, "__name__", type(function).__name__)
-        raise TypeError(
-            f"{name} must take five positional arguments {_NAMES}; "
-            f"{called}{signature} does not: {error}."
-            + (
-                " A continuous Hamiltonian H(t, q, p, args) goes through dvi.discretise(H) first."
-                if len(signature.parameters) == 4
-                else ""
-            )
-        ) from None

@@ -204,10 +204,10 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 51_000,
-    "raise statements": 916,
+    "lines": 49_950,
+    "raise statements": 740,
     COMMENTS: 1.3,
-    f"files of more than {LONGEST_FILE} lines": 11,
+    f"files of more than {LONGEST_FILE} lines": 5,
     f"functions with more than {MOST_PARAMETERS} parameters": 28,
     "circles of imports": 0,
 }

@@ -428,11 +428,11 @@ def test_bad_input_is_refused():
         dvi.legendre(either)
     with pytest.raises(TypeError, match=r"L must be .* got 3\.0, which takes neither"):
         dvi.legendre(3.0)
-    with pytest.raises(TypeError, match=r"L_d must be a function .* got curved"):
+    with pytest.raises(TypeError, match=r"L_d must take five .* curved"):
         dvi.from_lagrangian(curved)
-    with pytest.raises(TypeError, match="H_minus must be a function"):
+    with pytest.raises(TypeError, match="H_minus must take five"):
         dvi.from_type_iii(curved)
-    with pytest.raises(TypeError, match="F must be a function"):
+    with pytest.raises(TypeError, match="F must take five"):
         dvi.velocity_force(backwards, curved)
     for adapt, name in [
         (dvi.legendre, "L_D"),

@@ -276,7 +276,7 @@ def test_a_force_that_is_not_finite_is_told():
 
 @pytest.mark.parametrize("stages", [0, 9, -1, 1.5, 2.0, True, None, "2"])
 def test_other_numbers_of_stages_are_refused(stages):
-    with pytest.raises(ValueError, match="stages must be an integer from 1 to 8"):
+    with pytest.raises(ValueError, match="stages must be a whole number from 1 to 8"):
         dvi.GaussLegendre(stages)
 
 

@@ -1,11 +1,13 @@
 """One object for how to integrate, in every function that runs trajectories."""
 
+import inspect
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax import systems
+from dvi_jax import interop, systems
 
 PENDULUM = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - jnp.sum(jnp.cos(q)))
 CONTINUOUS = dvi.System(dvi.discretise(lambda t, q, p, args: p @ p / 2 - jnp.sum(jnp.cos(q))))
@@ -74,6 +76,87 @@ def test_all_fields_are_used():
         PENDULUM, [0.5], [0.1], integrator=dvi.Integrator(lattice=dvi.Given(ts))
     ).ts
     np.testing.assert_array_equal(times, ts)
+
+
+def implicit(t0, t1, q, p, args):
+    return p @ p / 2 - jnp.sum(jnp.cos(q)) + 0.1 * p @ q
+
+
+def lagrangian(t0, t1, q0, v, args):
+    return jnp.sum(jnp.cosh(v)) - q0 @ q0 / 2
+
+
+def action(t0, t1, q0, q1, args):
+    return (t1 - t0) * lagrangian(t0, t1, q0, (q1 - q0) / (t1 - t0), args)
+
+
+def value_of(H_D):
+    return H_D(0.0, 0.1, jnp.array([0.3]), jnp.array([0.2]), None)
+
+
+LEFT = jnp.array([[0.5], [0.2]]), jnp.array([[0.1], [0.3]])
+NAMED = {
+    **CALLS,
+    "Integrator": lambda **how: last(integrator=dvi.Integrator(**how)),
+    "bifurcation": lambda **how: dvi.bifurcation(
+        PENDULUM, np.array([0.5]), np.array([0.1]), crossing, h=0.1, num_steps=200, crossings=2,
+        direction=0, skip=0, epsilon=dvi.Axis("strength", [0.0]), **how,
+    ).qs,
+    "drift_surface": lambda **how: dvi.drift_surface(
+        dvi.System(PENDULUM.H_D, force=lambda t0, t1, q, p, args: -(q**3)), velocity, [0.4], [0.1],
+        epsilons=[0.01, 0.02, 0.04], hs=[0.05, 0.1], duration=2.0, **how,
+    ).drifts,
+    "find_symmetries": lambda **how: dvi.find_symmetries(
+        PENDULUM, dvi.Polynomials(1), h=0.1, samples=SAMPLES, time=False, **how
+    ).singular_values,
+    "solution_pairs": lambda **how: dvi.solution_pairs(
+        dvi.System(implicit), h=0.1, samples=LEFT, **how
+    )[1].q,
+    "legendre": lambda **how: value_of(dvi.legendre(lagrangian, **how)),
+    "from_lagrangian": lambda **how: value_of(dvi.from_lagrangian(action, **how)),
+    "from_type_iii": lambda **how: value_of(dvi.from_type_iii(
+        lambda t0, t1, q1, p0, args: p0 @ p0 / 2 - jnp.sum(jnp.cos(q1)), **how
+    )),
+    "solve_ivp": lambda **how: interop.solve_ivp(
+        dvi.System(implicit), (0.0, 1.0), [0.5, 0.1], h=0.1, **how
+    ).y,
+}  # fmt: skip
+"""Every public function with the keyword `newton`; `diffrax_solver` needs diffrax."""
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_root_finder_and_newton_are_one_keyword(name):
+    call, solver = NAMED[name], dvi.Newton(max_steps=30)
+    one, other = (np.asarray(call(**{key: solver})) for key in ("root_finder", "newton"))
+    np.testing.assert_array_equal(one, other)
+    with pytest.raises(TypeError, match="are one keyword: give one"):
+        call(root_finder=solver, newton=solver)
+    with pytest.raises((TypeError, AttributeError)):
+        call(root_finder="a word")
+
+
+def test_diffrax_solver_takes_both_names():
+    pytest.importorskip("diffrax")
+    solver = dvi.Newton(max_steps=30)
+    assert interop.diffrax_solver(root_finder=solver) == interop.diffrax_solver(newton=solver)
+
+
+def test_no_function_with_newton_is_left_out():
+    public = [getattr(dvi, name) for name in dir(dvi) if not name.startswith("_")]
+    public += [interop.solve_ivp, interop.diffrax_solver]
+    found = {
+        f.__name__
+        for f in public
+        if callable(f) and _has_newton(f) and f not in (dvi.Equations, dvi.PicardThenNewton)
+    }
+    assert found | {"Integrator", "Model", "diffrax_solver"} == {*NAMED, "diffrax_solver"}
+
+
+def _has_newton(f) -> bool:
+    try:
+        return "newton" in inspect.signature(f).parameters
+    except (TypeError, ValueError):
+        return False
 
 
 @pytest.mark.parametrize(

@@ -365,5 +365,5 @@ def test_status_iterations_and_residual_are_reported():
 
 @pytest.mark.parametrize("stages", [0, 1, 7, -1, 2.5, 2.0, True, None, "2"])
 def test_other_numbers_of_stages_are_refused(stages):
-    with pytest.raises(ValueError, match="stages must be an integer from 2 to 6"):
+    with pytest.raises(ValueError, match="stages must be a whole number from 2 to 6"):
         dvi.LobattoIIIAIIIB(stages)

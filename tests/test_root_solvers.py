@@ -564,12 +564,12 @@ def test_settings_that_cannot_work_are_refused(kind, bad):
 
 
 def test_the_default_refuses_other_kinds():
-    with pytest.raises(ValueError, match="newton_up_to must be an integer"):
+    with pytest.raises(ValueError, match="newton_up_to must be a whole number"):
         PicardThenNewton(newton_up_to=-1)
     with pytest.raises(TypeError, match="picard must be a dvi"):
         PicardThenNewton(picard=Newton())
     with pytest.raises(
-        TypeError, match=r"newton must be a RootSolver, got 'picard'; take .*Picard"
+        TypeError, match=r"root_finder must be a RootSolver, got 'picard'. Take .*Picard"
     ):
         dvi.integrate(CHAIN, *box(2), h=0.1, num_steps=1, newton="picard")
     with pytest.raises(TypeError, match="is a pair of parentheses missing"):

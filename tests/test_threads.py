@@ -74,10 +74,10 @@ def test_an_error_is_raised():
 @pytest.mark.parametrize(
     ("threads", "error", "match"),
     [
-        (0, ValueError, "at least 1, got 0"),
-        (-2, ValueError, "at least 1, got -2"),
+        (0, ValueError, "whole number from 1 on, got 0"),
+        (-2, ValueError, "whole number from 1 on, got -2"),
         (1.5, TypeError, "positive integer or None, got 1.5"),
-        (True, TypeError, "positive integer or None, got True"),
+        (True, ValueError, "whole number from 1 on, got True"),
     ],
 )
 def test_an_invalid_number_of_threads_is_refused(threads, error, match):
@@ -86,5 +86,5 @@ def test_an_invalid_number_of_threads_is_refused(threads, error, match):
 
 
 def test_something_that_is_no_function_is_refused():
-    with pytest.raises(TypeError, match="takes a function"):
+    with pytest.raises(TypeError, match="takes must be a function"):
         dvi.over_threads(jnp.ones(3))  # pyright: ignore[reportArgumentType]

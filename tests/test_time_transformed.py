@@ -217,8 +217,8 @@ def test_what_cannot_be_meant_is_refused(speed, observe, says):
             lattice=dvi.TimeTransformed(speed),
             observe=observe,
         )
-    for wrong in (0.5, lambda t, q, p: 1.0):
-        with pytest.raises(TypeError, match="must be a function"):
+    for wrong, says in ((0.5, "must be a function"), (lambda t, q, p: 1.0, "must take four")):
+        with pytest.raises(TypeError, match=says):
             dvi.TimeTransformed(wrong)
 
 

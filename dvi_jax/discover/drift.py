@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._integrate import as_parameter, as_scalar, integrate, start_state
+from .._inputs import as_parameter, as_scalar, start_state
+from .._integrate import integrate
 from .._integrator import Integrator, chosen
 from .._results import status_name
 from .._solution import Save
 from .._system import System, check_system
 from .._types import Args
+from ..engine.names import both_names
 from ..engine.newton import RootSolver
 from ..engine.reads import Reads, reads
 from ..methods import Method
@@ -234,6 +236,7 @@ class DriftSurface(NamedTuple):
         return "\n".join(lines + _starts_left_out(kept, statuses))
 
 
+@both_names
 def drift_order(
     system: System,
     invariant: Callable[..., Any],
@@ -307,6 +310,7 @@ def drift_order(
     return _order(epsilons, lanes, _kept(lanes.good))
 
 
+@both_names
 def drift_surface(
     system: System,
     invariant: Callable[..., Any] | Sequence[Callable[..., Any]],

@@ -10,6 +10,7 @@ from .._integrator import Integrator
 from .._step import Equations
 from .._system import System, check_system
 from .._types import Args
+from ..engine.names import both_names
 from ..engine.newton import RootSolver
 from ..methods import Method
 from .basis import AbstractBasis, bind_basis, check_step_size
@@ -46,6 +47,7 @@ _ROUND_OFF = 1e-12
 """Changes below this need not be smaller."""
 
 
+@both_names
 def discover_invariants(
     system: System,
     basis: AbstractBasis,

@@ -14,6 +14,7 @@ from .._results import RESULTS
 from .._step import Equations, step
 from .._system import System, check_system
 from .._types import Args, Interval
+from ..engine.names import both_names
 from ..engine.newton import Newton, RootSolver
 from ..methods import Method
 from .basis import BoundBasis, check_step_size
@@ -245,6 +246,7 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
     return float(singular[0] / singular[-1])
 
 
+@both_names
 def solution_pairs(
     system: System,
     *,

@@ -11,6 +11,7 @@ from .._integrator import Integrator
 from .._step import Equations
 from .._system import System, check_system
 from .._types import Args
+from ..engine.names import both_names
 from ..engine.newton import RootSolver
 from .basis import AbstractBasis, Basis, BoundBasis, Product, Sum, bind_basis, check_step_size
 from .conditions import Conditions, at_samples, require_finite, require_times, values_at
@@ -40,6 +41,7 @@ _NO_STEP = 1e-13
 """A step that moves the samples by less than this share of their spread is rounding."""
 
 
+@both_names
 def find_symmetries(
     system: System,
     basis: AbstractBasis,

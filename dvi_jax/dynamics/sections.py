@@ -17,12 +17,14 @@ from lanewise.jaxapi import is_traced
 
 from .._arithmetic import Arithmetic
 from .._checks import finite, positive, whole
-from .._integrate import as_parameter, as_scalar, integrate, start_state
+from .._inputs import as_parameter, as_scalar, start_state
+from .._integrate import integrate
 from .._integrator import Integrator, chosen, default_method
 from .._results import RESULTS, status_name
 from .._solution import Save
 from .._system import System, check_system
 from .._types import Args, Scalar, State
+from ..engine.names import both_names
 from ..engine.newton import RootSolver
 from ..methods import Method, Strang
 from ..observe import Section, Stop
@@ -129,6 +131,7 @@ def _one_after_another(settings: _Settings, start, h, epsilon, args, count: int)
     return lax.scan(one, start, jnp.arange(count))[1]
 
 
+@both_names
 def poincare_section(
     system: System,
     q0: Any,
@@ -217,6 +220,7 @@ def poincare_section(
     return _raise_on_failure(found, crossings, num_steps) if throw else found
 
 
+@both_names
 def bifurcation(
     system: System,
     q0: Any,
@@ -309,6 +313,7 @@ class Return(WithStatus):
     result: SECTION_RESULTS
 
 
+@both_names
 class ReturnMap(eqx.Module):
     r"""The map of a section g(t, q, p, args) = 0 onto itself.
 

@@ -9,12 +9,14 @@ from .._integrate import integrate
 from .._integrator import Integrator, chosen
 from .._solution import Save
 from .._system import System
+from ..engine.names import both_names
 from ..engine.newton import RootSolver
 from ..lattices import Given, Lattice
 from ..methods import Method
 from ..observe import TangentMap
 
 
+@both_names
 def tangent_map(
     system: System,
     q0: Any,

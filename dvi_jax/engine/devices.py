@@ -7,6 +7,8 @@ import jax
 import numpy as np
 from jax.sharding import AxisType, PartitionSpec
 
+from .._checks import function as check_function, instance, whole
+
 LANES = "lanes"
 """The name of the axis of devices."""
 
@@ -35,13 +37,11 @@ def over_devices(
     **Raises** `ValueError` for numbers of lanes that the devices do not divide; `TypeError` for
     something that is no function.
     """
-    if not callable(function):
-        raise TypeError(f"over_devices takes a function, e.g. jax.vmap(one), got {function!r}.")
+    check_function("what over_devices takes", function, hint="jax.vmap(one), for example.")
     chosen = np.asarray(jax.devices() if devices is None else list(devices))
     if chosen.size == 0:
         raise ValueError("over_devices needs at least one device.")
-    if isinstance(out_axes, bool) or not isinstance(out_axes, int) or out_axes < 0:
-        raise ValueError(f"out_axes must be a whole number from 0 up, got {out_axes!r}.")
+    whole("out_axes", out_axes, least=0)
     mesh = jax.sharding.Mesh(chosen, (LANES,), axis_types=(AxisType.Auto,))
 
     def call(*args: Any) -> Any:
@@ -51,8 +51,8 @@ def over_devices(
                 f"in_axes has {len(each)} entries for {len(args)} arguments: give one for each, or "
                 "one number for all."
             )
-        if wrong := [a for a in each if not (a is None or isinstance(a, int))]:
-            raise TypeError(f"an axis of lanes is a whole number or None, got {wrong[0]!r}.")
+        for axis in each:
+            instance("an axis of lanes", axis, int | None, "a whole number or None")
         specs = tuple(
             jax.tree.map(lambda x, axis=axis: _spec(x, axis, chosen.size), argument)
             for argument, axis in zip(args, each, strict=True)

@@ -3,7 +3,6 @@
 import abc
 import functools
 from collections.abc import Callable
-from numbers import Real
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,6 +12,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
 import lanewise
+
+from .._checks import positive, whole
 
 Vector = Inexact[Array, " n"]
 Function = Callable[[Vector], Vector]
@@ -59,13 +60,10 @@ class RootSolver(eqx.Module):
 
 def check_settings(rtol: float | None, atol: float, max_steps: int) -> None:
     """Refuse settings by which no iteration could stop, with a `ValueError`."""
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int):
-        raise ValueError(f"max_steps must be an integer of at least 1, got {max_steps!r}.")
-    if max_steps < 1:
-        raise ValueError(f"max_steps must be at least 1, got {max_steps}.")
+    whole("max_steps", max_steps)
     for name, value in (("rtol", rtol), ("atol", atol)):
-        if value is not None and not (isinstance(value, Real) and 0 <= value < float("inf")):
-            raise ValueError(f"{name} must be a finite number, not negative, got {value!r}.")
+        if value is not None:
+            positive(name, value, zero=True)
     if rtol == 0 and atol == 0:
         raise ValueError("rtol and atol are both zero: no iteration could ever stop.")
 

@@ -6,6 +6,7 @@ from jax import lax
 
 import lanewise
 
+from .._checks import instance, whole
 from .contraction import Contraction, contract
 from .newton import Found, Function, Newton, RootSolver, Scales, Vector
 
@@ -70,13 +71,10 @@ class PicardThenNewton(RootSolver):
     newton: Newton = Newton()
 
     def __check_init__(self):
-        n = self.newton_up_to
-        if n is not None and (isinstance(n, bool) or not isinstance(n, int) or n < 0):
-            raise ValueError(f"newton_up_to must be an integer of at least 0 or None, got {n!r}.")
-        for name, kind in (("picard", Picard), ("newton", Newton)):
-            value = getattr(self, name)
-            if not isinstance(value, kind):
-                raise TypeError(f"{name} must be a dvi.{kind.__name__}(...), got {value!r}.")
+        if self.newton_up_to is not None:
+            whole("newton_up_to", self.newton_up_to, least=0)
+        instance("picard", self.picard, Picard, "a dvi.Picard(...)")
+        instance("newton", self.newton, Newton, "a dvi.Newton(...)")
 
     def _is_few(self, n: int) -> bool:
         return n <= (_FEW if self.newton_up_to is None else self.newton_up_to)

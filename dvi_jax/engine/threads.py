@@ -4,6 +4,8 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from .._checks import function as check_function, instance, whole
+
 
 def over_threads(
     function: Callable[..., Any],
@@ -13,17 +15,11 @@ def over_threads(
 ) -> Callable[..., Any]:
     """`function` itself: a batch of trajectories uses all cores without it.
 
-    It cut a batch into pieces, one for each thread, when a compiled loop over steps ran on one
-    core. Now ``jax.jit(jax.vmap(one))`` divides a batch among the threads that XLA has for the
-    processors of the process. The function stays for programs that call it.
+    ``jax.jit(jax.vmap(one))`` divides a batch among the threads that XLA has for the processors of
+    the process; `lanewise.set_threads` limits their number. This older name stays for programs that
+    call it.
 
-    **Arguments**
-
-    - `function`: a function of arrays, for example ``jax.jit(jax.vmap(one))``.
-    - `threads`, `in_axes`, `out_axes`: have no effect any more; `lanewise.set_threads` limits the
-      number of threads.
-
-    **Returns** a function that calls `function` with the same arguments.
+    **Arguments** `function`: a function of arrays. The others have no effect.
 
     **Raises** `TypeError` if `function` cannot be called or `threads` is not an integer or None,
     `ValueError` if `threads` is not positive.
@@ -39,15 +35,10 @@ def over_threads(
     # (64, 2)
     ```
     """
-    if not callable(function):
-        raise TypeError(
-            f"over_threads takes a function, e.g. jax.jit(jax.vmap(one)), got {function!r}."
-        )
+    check_function("what over_threads takes", function, hint="jax.jit(jax.vmap(one)), for example.")
     if threads is not None:
-        if isinstance(threads, bool) or not isinstance(threads, int):
-            raise TypeError(f"threads must be a positive integer or None, got {threads!r}.")
-        if threads < 1:
-            raise ValueError(f"threads must be at least 1, got {threads}.")
+        instance("threads", threads, int, "a positive integer or None")
+        whole("threads", threads)
 
     def call(*args: Any) -> Any:
         return function(*args)

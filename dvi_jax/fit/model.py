@@ -13,7 +13,8 @@ from jaxtyping import Array, PyTree
 from lanewise.jaxapi import is_traced
 
 from .._checks import instance
-from .._integrate import as_parameter, integrate, start_state
+from .._inputs import as_parameter, start_state
+from .._integrate import integrate
 from .._integrator import Integrator
 from .._results import RESULTS
 from .._solution import Save
@@ -26,9 +27,8 @@ from .observations import Observations
 _WASTE = 2_000_000
 """Steps beyond the ends of shorter arcs that are taken rather than compiling another program."""
 
-_OPTIONS = (
-    *("method", "lattice", "newton", "adjoint", "arithmetic", "layout", "integrator"),
-    "num_steps",
+_OPTIONS = tuple(
+    "method lattice newton root_finder adjoint arithmetic layout integrator num_steps".split()
 )
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
 _OWN = ("num_steps", "save", "observe", "throw", "progress", "stop", "t0")
@@ -41,7 +41,7 @@ class Model(eqx.Module):
     - `system`: a `System`. `h`: the step size [time]. `q0`, `p0`, `epsilon`, `args`: as in
       `integrate`; what is among the parameters may be left out here. When `data` is a list of
       arcs, q0 and p0 have one row for each arc, here and among the parameters.
-    - `options`: further arguments of `integrate`: `method`, `lattice`, `newton`, `adjoint`,
+    - `options`: further arguments of `integrate`: `method`, `lattice`, `root_finder`, `adjoint`,
       `arithmetic`, `layout`, or an `integrator` in place of them; for a lattice that is not
       `Uniform` also `num_steps`.
 

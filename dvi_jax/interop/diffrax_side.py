@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 import dvi_jax as dvi
 
+from ..engine.names import both_names
 from ..engine.quantities import refuse_unit_or_mask
 from .extras import needed, system_of
 from .fields import warn_without_effect
@@ -34,6 +35,7 @@ def diffrax_term(system: Any, epsilon: Any = 0.0) -> "DiscreteTerm":
     return DiscreteTerm(system, jnp.asarray(epsilon, float))
 
 
+@both_names
 def diffrax_solver(
     method: dvi.Method = dvi.TypeII(), newton: dvi.RootSolver = dvi.PicardThenNewton()
 ) -> "DiscreteMap":

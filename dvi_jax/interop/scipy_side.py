@@ -11,6 +11,7 @@ import numpy as np
 
 import dvi_jax as dvi
 
+from ..engine.names import both_names
 from ..engine.quantities import refuse_unit_or_mask
 from ..systems import Problem
 from .extras import needed, system_of
@@ -56,6 +57,7 @@ class _Event(NamedTuple):
     direction: int
 
 
+@both_names
 def solve_ivp(
     system: Any,
     t_span: Any,

@@ -1,14 +1,21 @@
 """What every lattice is: the interval of step k."""
 
 import abc
+import operator
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Int
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PyTree
 
+from .._checks import whole
 from .._results import RESULTS
+from .._solution import Save, Solution
 from .._step import Equations
-from .._types import Interval, Scalar, State
+from .._system import System
+from .._types import Args, Interval, Scalar, State
+from ..observe import Stop
 
 
 class Place(NamedTuple):
@@ -19,6 +26,20 @@ class Place(NamedTuple):
     k: Int[Array, ""]
     q: State
     p: State
+
+
+class Run(NamedTuple):
+    """What is integrated: a system from a start, what is observed and saved, and where it ends."""
+
+    system: System
+    t0: Scalar
+    q0: State
+    p0: State
+    epsilon: Scalar
+    args: Args
+    observe: PyTree
+    save: Save
+    stop: Stop | None
 
 
 class Lattice(eqx.Module):
@@ -39,6 +60,13 @@ class Lattice(eqx.Module):
     def interval(self, t0: Scalar, h: Scalar, k: Int[Array, ""]) -> Interval:
         """The interval of step k = 0, 1, … (with a memory: of step 0)."""
 
+    def check(self, method: Any, arithmetic: Any) -> None:
+        """Refuse a method or an arithmetic that these steps cannot be taken with."""
+
+    def transform(self, run: Run) -> tuple[Run, Callable[[Solution], Solution]]:
+        """The run in the variables that steps are taken in, and what takes its solution back."""
+        return run, lambda solution: solution
+
     def begin(self, t0: Scalar, h: Scalar) -> Any:
         """The memory before the first step."""
         return None
@@ -58,29 +86,33 @@ class Lattice(eqx.Module):
         """Whether every step size is finite, non-zero and of one sign."""
 
 
-MAX_STEPS = 2**31 - 1
+class StepSizes(Lattice):
+    """Base of the lattices that take the size of a step, the first at least, and their number."""
+
+    def prepare(self, t0, h, num_steps):
+        missing = [name for name, x in (("h", h), ("num_steps", num_steps)) if x is None]
+        if missing:
+            raise TypeError(
+                f"a {type(self).__name__} lattice needs h and num_steps; {' and '.join(missing)} "
+                "is missing."
+            )
+        return t0, h, check_num_steps(num_steps)
+
+    def is_usable(self, t0, h):
+        return jnp.isfinite(t0) & jnp.isfinite(h) & (h != 0)
 
 
 def check_num_steps(num_steps: object) -> int:
-    """`num_steps` as an int, after refusing what cannot count steps."""
-    if hasattr(num_steps, "__index__") and not isinstance(num_steps, bool):
-        try:
-            count = num_steps.__index__()  # pyright: ignore[reportAttributeAccessIssue]
-        except Exception:
-            count = None
-        if count is not None:
-            if count < 0:
-                raise ValueError(
-                    f"num_steps must not be negative, got {count}. To go backwards in time give "
-                    "a negative h."
-                )
-            if count >= MAX_STEPS:
-                raise ValueError(
-                    f"num_steps must be below 2³¹ (steps are counted in 32 bits), got {count}. Run "
-                    "in pieces, each from the end of the one before."
-                )
-            return count
-    raise TypeError(
-        f"num_steps must be a Python integer (it sets array shapes), got {num_steps!r}. Under jit "
-        "mark it static."
-    )
+    """`num_steps` as an int, after refusing what cannot count steps (in 32 bits)."""
+    try:
+        count = None if isinstance(num_steps, bool) else operator.index(num_steps)  # pyright: ignore
+    except Exception:  # a traced number, say
+        count = None
+    if count is None:
+        raise TypeError(
+            f"num_steps must be a Python integer (it sets array shapes), got {num_steps!r}. Under "
+            "jit mark it static."
+        )
+    hint = "To go backwards in time give a negative h; run more steps in pieces, each from the "
+    hint += "end of the one before."
+    return whole("num_steps", count, 0, 2**31 - 2, hint)

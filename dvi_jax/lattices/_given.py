@@ -7,24 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lanewise.jaxapi import is_traced, x64_enabled
+from lanewise.jaxapi import is_traced
 
-from .._precision import refuse_double_without_x64
+from .._inputs import as_times
 from .._types import Interval
-from ..engine.quantities import refuse_unit_or_mask
 from ._base import Lattice, check_num_steps
 
 
-def _as_times(ts: Any) -> Array:
-    if not is_traced(ts):
-        refuse_unit_or_mask("ts", ts)
-        ts = np.asarray(ts)
-        if np.issubdtype(ts.dtype, np.integer):
-            ts = ts.astype(np.float64 if x64_enabled() else np.float32)
-        refuse_double_without_x64("ts", ts.dtype)
-    if not jnp.issubdtype(ts.dtype, jnp.floating):
-        raise TypeError(f"Given(ts) needs real times, got dtype {ts.dtype}.")
-    return jnp.asarray(ts)
+def _times(ts: Any) -> Array:
+    return as_times("Given(ts)", ts)
 
 
 class Given(Lattice):
@@ -40,7 +31,7 @@ class Given(Lattice):
     finite or not strictly monotonic (a traced `ts` gives the status `bad_step_size` instead).
     """
 
-    ts: Float[Array, " times"] = eqx.field(converter=_as_times)
+    ts: Float[Array, " times"] = eqx.field(converter=_times)
 
     def __check_init__(self):
         if self.ts.ndim != 1 or self.ts.shape[0] < 1:

@@ -1,9 +1,33 @@
-"""Steps that adapt by a transformation of the time."""
+"""Steps that adapt by a transformation of the time, in extended phase space."""
 
 from collections.abc import Callable
 from typing import Any
 
-from ..engine.signature import accepts
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from lanewise.jaxapi import is_traced
+
+from .._inputs import start_state
+from .._solution import Save, Solution
+from .._system import System
+from .._types import Args, Bindable, Scalar, State
+from ..engine.rounding import one_by_one
+from ..engine.signature import check_takes
+from ..observe import (
+    Crossings,
+    Deviations,
+    Reduction,
+    Running,
+    Section,
+    Stop,
+    Stopped,
+    Trend,
+    is_observable,
+)
+from ._base import Run
 from ._uniform import Uniform
 
 
@@ -47,8 +71,159 @@ class TimeTransformed(Uniform):
     speed: Callable[..., Any]
 
     def __check_init__(self):
-        if not callable(self.speed) or not accepts(self.speed, 4):
-            raise TypeError(
-                f"the speed of TimeTransformed must be a function (t, q, p, args) → positive "
-                f"scalar, got {self.speed!r}."
+        check_takes("the speed of TimeTransformed", self.speed, "(t, q, p, args)")
+
+    def transform(self, run):
+        """The run in extended phase space, in the time σ from 0 on."""
+        extended = Extended(run.system, self.speed, run.epsilon, run.q0.shape)
+        _check_speed(self.speed, run.t0, run.q0, run.p0, run.args)
+        q0, p0 = start_state(*extended.start(run.t0, run.q0, run.p0, run.args))
+        observe = jax.tree.map(extended.seen, run.observe, is_leaf=is_observable)
+        save, stop = run.save, run.stop
+        if save.ts is not None:
+            save = Save(ts=save.ts, clock=_SeenPoint(save.clock or _own_time, extended))
+        if stop is not None:
+            stop = Stop(_SeenPoint(stop.g, extended))
+        has_force = run.system.force is not None
+        return Run(
+            system=extended.as_system(),
+            t0=jnp.zeros_like(run.t0),
+            q0=q0,
+            p0=p0,
+            epsilon=(jnp.ones_like if has_force else jnp.zeros_like)(run.epsilon),
+            args=run.args,
+            observe=(observe, _time_gained),
+            save=save,
+            stop=stop,
+        ), extended.undo
+
+
+class Extended(eqx.Module):
+    """The transformed problem of `TimeTransformed`.
+
+    Positions are (q, t) and momenta (p, p_t), flattened, shape (n + 1,).
+    """
+
+    system: System
+    speed: Callable[..., Any]
+    epsilon: Scalar
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def start(self, t: Scalar, q: State, p: State, args: Args) -> tuple[Array, Array]:
+        """The extended state, on K = 0."""
+        energy = one_by_one(_energy, self.system, t, q, p, self.epsilon, args)
+        return jnp.append(q.ravel(), t), jnp.append(p.ravel(), -energy)
+
+    def parts(self, position: Array, momentum: Array) -> tuple[State, State, Scalar, Scalar]:
+        """(q, p, t, p_t); leading axes stay in front."""
+        lead = position.shape[:-1]
+        q = position[..., :-1].reshape(*lead, *self.shape)
+        p = momentum[..., :-1].reshape(*lead, *self.shape)
+        return q, p, position[..., -1], momentum[..., -1]
+
+    def hamiltonian(self, s0, s1, position, momentum, args):
+        """K = g (H + p_t)."""
+        del s0, s1
+        q, p, t, pt = self.parts(position, momentum)
+        H = self.system.hamiltonian(t, t, q, p, self.epsilon, args)
+        return jnp.asarray(self.speed(t, q, p, args), H.dtype) * (H + pt)
+
+    def force(self, s0, s1, position, momentum, args):
+        """(g εW, −g εW·∂H/∂p)."""
+        del s0, s1
+        q, p, t, _ = self.parts(position, momentum)
+        at = (t, t, q, p, self.epsilon, args)
+        W = self.system.disturbing_force(*at)
+        power = jnp.sum(W * jax.grad(self.system.hamiltonian, argnums=3)(*at))
+        return self.speed(t, q, p, args) * jnp.append(W.ravel(), -power)
+
+    def as_system(self) -> System:
+        """K and its force as a `System`, to be run at ε = 1."""
+        return System(self.hamiltonian, None if self.system.force is None else self.force)
+
+    def seen(self, observable: Any) -> Any:
+        """An observable of the user's on steps of the extended problem."""
+        if not is_observable(observable):
+            return observable  # refused by name further on
+        if isinstance(observable, Running):
+            return Running(self.seen(observable.reduction))
+        if isinstance(observable, Trend):
+            raise ValueError(
+                "a Trend over a TimeTransformed lattice would be a slope in its fictitious time: "
+                "observe the function alone and fit a line to it over solution.ts."
             )
+        if isinstance(observable, Deviations):
+            raise ValueError(
+                f"{type(observable).__name__} needs steps whose size does not depend on the state, "
+                "and those of a TimeTransformed lattice do: take lattice=dvi.Uniform() or "
+                "dvi.Given(ts)."
+            )
+        if isinstance(observable, Section):
+            return eqx.tree_at(lambda s: s.g, observable, _SeenPoint(observable.g, self))
+        if isinstance(observable, Reduction):
+            return eqx.tree_at(lambda r: r.function, observable, self.seen(observable.function))
+        if isinstance(observable, Bindable):
+            observable = observable.bind(self.system, self.epsilon)
+        return _Seen(observable, self)
+
+    def undo(self, solution: Solution) -> Solution:
+        """A solution of the extended problem as one of the problem that was given."""
+
+        def told(found):
+            if isinstance(found, Crossings):
+                q, p, t, _ = self.parts(found.qs, found.ps)
+                return Crossings(t, q, p, found.count)
+            return found
+
+        q, p, t, _ = self.parts(solution.qs, solution.ps)
+        observed, hs = solution.observed
+        observed = jax.tree.map(told, observed, is_leaf=lambda x: isinstance(x, Crossings))
+        stop = solution.stop
+        if stop is not None:
+            own = self.parts(stop.q, stop.p)
+            stop = Stopped(own[2], *own[:2])
+        return Solution(t, q, p, hs, observed, solution.result, solution.stats, stop)
+
+
+def _energy(system: System, t: Scalar, q: State, p: State, epsilon: Scalar, args: Args) -> Scalar:
+    return system.hamiltonian(t, t, q, p, epsilon, args)
+
+
+class _Seen(eqx.Module):
+    """An observable of the user's on steps of the extended problem."""
+
+    function: Callable[..., Any]
+    extended: Extended
+
+    def __call__(self, s0, s1, position0, momentum0, position1, momentum1, args):
+        q0, p0, t0, _ = self.extended.parts(position0, momentum0)
+        q1, p1, t1, _ = self.extended.parts(position1, momentum1)
+        return self.function(t0, t1, q0, p0, q1, p1, args)
+
+
+class _SeenPoint(eqx.Module):
+    """A function ``(t, q, p, args)`` of the user's at points of the extended problem."""
+
+    function: Callable[..., Any]
+    extended: Extended
+
+    def __call__(self, s, position, momentum, args):
+        q, p, t, _ = self.extended.parts(position, momentum)
+        return self.function(t, q, p, args)
+
+
+def _own_time(t, q, p, args):
+    return t
+
+
+def _time_gained(s0, s1, position0, momentum0, position1, momentum1, args):
+    return position1[-1] - position0[-1]
+
+
+def _check_speed(speed, t0, q0, p0, args) -> None:
+    value = jnp.asarray(speed(t0, q0, p0, args))
+    if value.shape != () or (not is_traced(value) and not float(value) > 0):
+        raise ValueError(
+            "the speed of TimeTransformed must be a positive scalar; at the start it is "
+            f"{value if value.shape == () else f'an array of shape {value.shape}'}."
+        )

@@ -11,13 +11,14 @@ from jaxtyping import Array, Int
 
 import lanewise
 
+from .._checks import one_of
 from .._energies import disturbing_work, incoming_energy, outgoing_energy
 from .._results import RESULTS
 from .._step import Equations, step
 from .._system import System
 from .._types import Args, Interval, Scalar, State
 from ..engine.bracket import bracketed_root, divide
-from ._base import Lattice, check_num_steps
+from ._base import StepSizes
 
 Policy = Literal["stop", "hold", "minimise"]
 
@@ -39,7 +40,7 @@ class Memory(NamedTuple):
     defect: Scalar  # largest |E⁺ − E⁻ − εW·Δq| so far [energy]
 
 
-class Variational(Lattice):
+class Variational(StepSizes):
     r"""The lattice of the discrete variational principle: the step h solves equation (14), mended,
 
         E⁺_k − E⁻_k = εW_k·(q_{k+1} − q_k),      E⁺ = H_D − h ∂H_D/∂t0,   E⁻ = H_D + h ∂H_D/∂t1
@@ -84,11 +85,7 @@ class Variational(Lattice):
     has_memory: ClassVar[bool] = True
 
     def __check_init__(self):
-        if self.on_no_root not in get_args(Policy):
-            raise ValueError(
-                f"on_no_root must be one of {', '.join(map(repr, get_args(Policy)))}, got "
-                f"{self.on_no_root!r}."
-            )
+        one_of("on_no_root", self.on_no_root, get_args(Policy))
         if not (isinstance(self.reach, int | float) and 1 < self.reach < float("inf")):
             raise ValueError(
                 f"reach must be a number above 1 (how many times larger or smaller than the one "
@@ -104,20 +101,21 @@ class Variational(Lattice):
                 f"as multiples of the first, such as (1e-3, 1e3); got {self.bounds!r}."
             )
 
-    def prepare(self, t0, h, num_steps):
-        if h is None or num_steps is None:
-            missing = " and ".join(n for n, v in (("h", h), ("num_steps", num_steps)) if v is None)
-            raise TypeError(
-                f"a variational lattice needs h, its first step, and num_steps; {missing} is "
-                "missing."
+    def check(self, method, arithmetic):
+        if method.step is not step:
+            raise ValueError(
+                f"the lattice Variational() goes with method=dvi.TypeII() only, got {method!r}: "
+                "(14) is the variation of that map's action. For a higher order take an H_D of "
+                "higher order, dvi.discretise(H, order=2)."
             )
-        return t0, h, check_num_steps(num_steps)
+        if arithmetic.undoes_steps:
+            raise ValueError(
+                "the steps of Variational() are solved for, and a solve cannot be undone bit for "
+                "bit: take arithmetic=dvi.Compensated(), or another lattice."
+            )
 
     def interval(self, t0, h, k):
         return Interval(t0, t0 + h, h)
-
-    def is_usable(self, t0, h):
-        return jnp.isfinite(t0) & jnp.isfinite(h) & (h != 0)
 
     def begin(self, t0, h):
         zero = jnp.zeros_like(h)

@@ -4,10 +4,7 @@ from ._adjoint import Adjoint as Adjoint
 from ._base import Method as Method
 from ._blanes_moan import BlanesMoan as BlanesMoan
 from ._composition import Composition as Composition
-from ._dissipation import (
-    goes_backwards as goes_backwards,
-    warn_of_dissipation as warn_of_dissipation,
-)
+from ._dissipation import warn_of_dissipation as warn_of_dissipation
 from ._gauss_legendre import GaussLegendre as GaussLegendre
 from ._kahan_li import KahanLi as KahanLi
 from ._lobatto_pair import LobattoIIIAIIIB as LobattoIIIAIIIB

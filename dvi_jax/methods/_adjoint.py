@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import equinox as eqx
 
-from ._base import Method
+from ._base import Method, check_invertible
 from ._type_ii import TypeII
 
 
@@ -23,13 +23,7 @@ class Adjoint(Method):
     is_invertible: ClassVar[bool] = True
 
     def __check_init__(self):
-        if not isinstance(self.method, Method):
-            raise TypeError(f"Adjoint takes a method such as dvi.TypeII(), got {self.method!r}.")
-        if not self.method.is_invertible:
-            raise ValueError(
-                f"{self.method!r} has no inverse step, so it has no adjoint here: take a "
-                "variational method."
-            )
+        check_invertible("method", self.method)
 
     @property
     def order(self) -> int:
@@ -45,6 +39,12 @@ class Adjoint(Method):
     def is_symplectic(self) -> bool:
         """Whether the method is."""
         return self.method.is_symplectic
+
+    def substeps(self) -> tuple[float, ...]:
+        return self.method.substeps()
+
+    def is_made_of_the_map(self) -> bool:
+        return self.method.is_made_of_the_map()
 
     def step(self, equations, interval, q0, p0):
         return self.method.inverse(equations, interval.reversed(), q0, p0)

@@ -1,11 +1,13 @@
 """What every method is: a step, its inverse where there is one, and what is promised of it."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .._checks import instance
 from .._step import Equations, StepInfo
 from .._system import System
 from .._types import Args, Interval, State
@@ -39,6 +41,14 @@ class Method(eqx.Module):
     def inverse_needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
         """Whether `inverse` is."""
 
+    def substeps(self) -> tuple[float, ...]:
+        """The fractions of a step over which its maps go; those below 0 go backwards in time."""
+        return (1.0,)
+
+    def is_made_of_the_map(self) -> bool:
+        """Whether a step is made of the map (12)–(13) and its adjoint alone."""
+        return False
+
     def is_explicit(self, system: System, q: State | None = None, args: Args = None) -> bool:
         """Whether a step of this method on `system` needs no solve; read from the jaxpr.
 
@@ -63,3 +73,12 @@ class Method(eqx.Module):
                 "Give an example: is_explicit(system, q=jnp.zeros(shape), args=...)."
             ) from error
         return found[0]
+
+
+def check_invertible(name: str, method: Any) -> None:
+    """Refuse what is no method, or has no inverse step to make an adjoint of."""
+    instance(name, method, Method, "a method such as dvi.TypeII()")
+    if not method.is_invertible:
+        raise ValueError(
+            f"{method!r} has no inverse step, so it has no adjoint: take a variational method."
+        )

@@ -1,11 +1,12 @@
 """Blanes and Moan's optimised compositions of the map with its adjoint."""
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
 
 from ._base import Method
-from ._composition import CompositionMethod, check_base, check_order
+from ._composition import CompositionMethod
 from ._type_ii import TypeII
 
 _A = {
@@ -49,11 +50,8 @@ class BlanesMoan(CompositionMethod):
     order: int = eqx.field(static=True, default=4)
     base: Method = eqx.field(default_factory=TypeII)
 
+    orders: ClassVar[Sequence[int]] = tuple(_A)
     is_symmetric: ClassVar[bool] = True
-
-    def __check_init__(self):
-        check_order("BlanesMoan", self.order, tuple(_A))
-        check_base(self.base)
 
     def fractions(self):
         a, b = _A[self.order], _B[self.order]

@@ -1,14 +1,32 @@
-"""What the methods of collocation share: their integrals, the continuous rates, the check of s."""
+"""What the methods of collocation share: a base, their integrals, the continuous rates."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial import legendre
 
 from .._step import Equations
 from .._types import Interval, Scalar, State
+from ._base import Method
+
+
+class Collocation(Method):
+    """Base of the symmetric methods whose s stages are solved for together."""
+
+    stages: eqx.AbstractVar[int]
+
+    is_symmetric: ClassVar[bool] = True
+    is_symplectic: ClassVar[bool] = True
+    is_invertible: ClassVar[bool] = True
+
+    def inverse(self, equations, interval, q1, p1):
+        return self.step(equations, interval.reversed(), q1, p1)
+
+    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
+        return self.needs_no_solve(equations, interval, q)
 
 
 def integrals(x: np.ndarray, b: np.ndarray, degree: int) -> np.ndarray:
@@ -42,13 +60,3 @@ def continuous_rates(equations: Equations, like: Scalar) -> tuple[Callable, Call
         return equations.momentum_rate(at(t), q, p)
 
     return position_rate, momentum_rate
-
-
-def check_stages(stages: Any, least: int, most: int, order: str) -> None:
-    """Refuse a number of stages that there is no table of."""
-    whole = isinstance(stages, int) and not isinstance(stages, bool)
-    if not whole or not least <= stages <= most:
-        raise ValueError(
-            f"stages must be an integer from {least} to {most} (the order is {order}), "
-            f"got {stages!r}."
-        )

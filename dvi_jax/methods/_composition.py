@@ -1,17 +1,20 @@
 """Compositions of the map with its adjoint."""
 
 import abc
+import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from .._checks import whole
 from .._step import no_step_yet
-from ._base import Method
+from ._base import Method, check_invertible
 from ._order_conditions import order_defects
 from ._type_ii import TypeII
 
@@ -33,6 +36,8 @@ class CompositionMethod(Method):
 
     base: eqx.AbstractVar[Method]
 
+    orders: ClassVar[Sequence[int]] = ()
+    """Those that there are coefficients of, where they are in a table."""
     is_invertible: ClassVar[bool] = True
 
     if TYPE_CHECKING:  # there the abstract variable would stay an argument of every subclass
@@ -47,55 +52,66 @@ class CompositionMethod(Method):
     def fractions(self) -> tuple[float, ...]:
         """c₁, c₂, …: the map takes the odd ones, its adjoint the even ones; they sum to 1."""
 
+    def __check_init__(self):
+        if self.orders and self.order not in self.orders:
+            *most, last = self.orders
+            which = f"orders {', '.join(map(str, most))} and {last}" if most else f"order {last}"
+            raise ValueError(
+                f"{type(self).__name__} knows {which}, got {self.order!r}. For order 2 use "
+                "dvi.Strang(); for coefficients of your own, dvi.Composition(coefficients, "
+                "order=...)."
+            )
+        check_invertible("base", self.base)
+
+    def substeps(self) -> tuple[float, ...]:
+        parts = self.base.substeps()
+        return tuple(c * part for c in self.fractions() for part in parts)
+
+    def is_made_of_the_map(self) -> bool:
+        return self.base.is_made_of_the_map()
+
     @property
     def has_negative_substeps(self) -> bool:
         """Whether some part goes backwards in time, where a dissipative force makes motion grow."""
-        inner = isinstance(self.base, CompositionMethod) and self.base.has_negative_substeps
-        return inner or any(c < 0 for c in self.fractions())
+        return min(self.substeps()) < 0
 
     def step(self, equations, interval, q0, p0):
-        def single(state, part):
-            q, p, info = state
-            q, p, one = self.base.step(equations, part, q, p)
-            return q, p, info.then(one)
-
         def pair(state, parts):
-            # the map on the first part, then its adjoint on the second
-            q, p, info = single(state, parts[0])
-            q, p, two = self.base.inverse(equations, parts[1].reversed(), q, p)
-            return q, p, info.then(two)
+            """The map on the first part, then its adjoint on the second."""
+            q, p, info = state
+            q, p, first = self.base.step(equations, parts[0], q, p)
+            q, p, second = self.base.inverse(equations, parts[1].reversed(), q, p)
+            return q, p, info.then(first).then(second)
 
-        state = (q0, p0, no_step_yet(q0))
         pairs, rest = self._parts(interval)
-        state = _each(pair, state, pairs)
-        return single(state, rest) if rest is not None else state
+        q, p, info = _in_turn(pair, pairs)((q0, p0, no_step_yet(q0)))
+        if rest is None:
+            return q, p, info
+        q, p, last = self.base.step(equations, rest, q, p)
+        return q, p, info.then(last)
 
     def inverse(self, equations, interval, q1, p1):
-        def single(state, part):
-            q, p, info = state
-            q, p, one = self.base.inverse(equations, part, q, p)
-            return q, p, info.then(one)
-
         def pair(state, parts):
             q, p, info = state
-            q, p, one = self.base.step(equations, parts[1].reversed(), q, p)
-            return single((q, p, info.then(one)), parts[0])
+            q, p, second = self.base.step(equations, parts[1].reversed(), q, p)
+            q, p, first = self.base.inverse(equations, parts[0], q, p)
+            return q, p, info.then(second).then(first)
 
-        state = (q1, p1, no_step_yet(q1))
         pairs, rest = self._parts(interval)
+        q, p, info = q1, p1, no_step_yet(q1)
         if rest is not None:
-            state = single(state, rest)
-        return _each(pair, state, pairs[::-1])
+            q, p, last = self.base.inverse(equations, rest, q, p)
+            info = info.then(last)
+        return _in_turn(pair, pairs[::-1])((q, p, info))
 
     def _parts(self, interval):
         """The interval cut into pairs of parts, and the part that is left when they are odd."""
         fractions = self.fractions()
-        start, parts = 0.0, []
-        for i, c in enumerate(fractions):
-            end = 1.0 if i + 1 == len(fractions) else start + c
-            part = interval.part(start, end)
-            parts.append(part._replace(h=c * interval.h))
-            start = end
+        ends = [0.0, *itertools.accumulate(fractions[:-1]), 1.0]
+        parts = [
+            interval.part(start, end)._replace(h=c * interval.h)
+            for c, start, end in zip(fractions, ends[:-1], ends[1:], strict=True)
+        ]
         pairs = list(zip(parts[0::2], parts[1::2], strict=False))
         return pairs, parts[-1] if len(parts) % 2 else None
 
@@ -107,19 +123,19 @@ class CompositionMethod(Method):
         return self.needs_no_solve(equations, interval, q)
 
 
-def _each(body: Callable, state: Any, pairs: list) -> Any:
-    """`body` on each pair in turn, by a scan.
+def _in_turn(body: Callable, pairs: list) -> Callable:
+    """state → state after `body` on each pair in turn, by a scan.
 
     Written out, several pairs make a loop over steps that is too large to be compiled as one piece:
     one trajectory of order 4 then takes five times as long (a batch a seventh less), and twice as
     long to compile.
     """
-    if len(pairs) <= 1:
-        for parts in pairs:
-            state = body(state, parts)
-        return state
+    if len(pairs) == 1:
+        return functools.partial(body, parts=pairs[0])
+    if not pairs:
+        return lambda state: state
     stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *pairs)
-    return lax.scan(lambda s, parts: (body(s, parts), None), state, stacked)[0]
+    return lambda state: lax.scan(lambda s, parts: (body(s, parts), None), state, stacked)[0]
 
 
 def of_strang(outer: Sequence[float]) -> tuple[float, ...]:
@@ -130,28 +146,6 @@ def of_strang(outer: Sequence[float]) -> tuple[float, ...]:
     """
     middle = 1.0 - 2.0 * math.fsum(outer)
     return tuple(c / 2 for c in (*outer, middle, *outer[::-1]) for _ in range(2))
-
-
-def check_base(base: Any) -> None:
-    """Refuse a base that is no method, or that has no inverse to make the adjoint of."""
-    if not isinstance(base, Method):
-        raise TypeError(f"base must be a method such as dvi.TypeII(), got {base!r}.")
-    if not base.is_invertible:
-        raise ValueError(
-            f"{base!r} has no inverse step, so it has no adjoint to be composed with: take a "
-            "variational method."
-        )
-
-
-def check_order(name: str, order: Any, known: Sequence[int]) -> None:
-    """Refuse an order of which there are no coefficients."""
-    if order not in known:
-        *most, last = known
-        which = f"orders {', '.join(map(str, most))} and {last}" if most else f"order {last}"
-        raise ValueError(
-            f"{name} knows {which}, got {order!r}. For order 2 use dvi.Strang(); for "
-            "coefficients of your own, dvi.Composition(coefficients, order=...)."
-        )
 
 
 def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
@@ -203,17 +197,14 @@ class Composition(CompositionMethod):
 
     def __check_init__(self):
         c, order, base = self.coefficients, self.order, self.base
+        check_invertible("base", base)
         if not c or not all(math.isfinite(x) for x in c) or abs(math.fsum(c) - 1) > 1e-12:
             raise ValueError(
                 "the coefficients of a composition must be finite and sum to 1 (consistency); "
                 f"got {c}" + (f", which sum to {math.fsum(c)!r}." if c else ".")
             )
-        check_base(base)
-        if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= _MOST_CHECKED:
-            raise ValueError(
-                f"order must be an integer from 1 to {_MOST_CHECKED} (the conditions of higher "
-                f"orders are not checked), got {order!r}."
-            )
+        hint = "The conditions of higher orders are not checked."
+        whole("order", order, most=_MOST_CHECKED, hint=hint)
         defects = order_defects(c, order, base.order, base.is_symmetric)
         found = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
         if found < order:

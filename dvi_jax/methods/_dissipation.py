@@ -1,6 +1,7 @@
 """A warning where a method goes backwards in time against strong dissipation."""
 
 import warnings
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -9,30 +10,18 @@ import numpy as np
 
 from .._step import Equations
 from .._types import Interval, State
-from ._adjoint import Adjoint
 from ._base import Method
-from ._composition import CompositionMethod
 
 _STRONG = 0.3
 """Damping over the longest part backwards from which on there is a warning."""
 
 
-def substeps(method: Method) -> tuple[float, ...]:
-    """The fractions of a step over which the map of the system, or its adjoint, is applied."""
-    if isinstance(method, Adjoint):
-        return substeps(method.method)
-    if isinstance(method, CompositionMethod):
-        return tuple(c * part for c in method.fractions() for part in substeps(method.base))
-    return (1.0,)
-
-
-def goes_backwards(method: Method) -> bool:
-    """Whether a part of a step goes backwards in time."""
-    return min(substeps(method)) < 0
-
-
 def warn_of_dissipation(
-    method: Method, equations: Equations, interval: Interval, q0: State, p0: State
+    method: Method,
+    equations: Equations,
+    first_interval: Callable[[], Interval],
+    q0: State,
+    p0: State,
 ) -> None:
     r"""A warning when a part that goes backwards meets strong dissipation at the start.
 
@@ -42,12 +31,13 @@ def warn_of_dissipation(
     as accurate as the triple jump, with γ the largest −∂(εW_i)/∂p_i at (q0, p0). Compositions of
     `TypeII` of order above 2 all have such parts.
 
-    All values known, not traced. One evaluation of a Jacobian, and none for a method without
-    negative parts or a system without a force.
+    All values known, not traced; the system has a force. One evaluation of a Jacobian, and none for
+    a method without negative parts.
     """
-    backwards = -min(substeps(method))
-    if backwards <= 0 or equations.system.force is None:
+    backwards = -min(method.substeps())
+    if backwards <= 0:
         return
+    interval = first_interval()
     damping = float(_damping(equations, interval, q0, p0))
     growth = backwards * float(interval.h) * damping
     if growth > _STRONG and np.isfinite(growth):

@@ -1,7 +1,6 @@
 """The Gauss–Legendre collocation methods."""
 
 import functools
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -9,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial import legendre
 
+from .._checks import whole
 from .._step import judge
 from ..engine.newton import find_root
-from ._base import Method
-from ._collocation import check_stages, continuous_rates, integrals
+from ._collocation import Collocation, continuous_rates, integrals
 
 _MOST_STAGES = 8
 """Order 16: up to there the conditions of order are tested."""
@@ -31,7 +30,7 @@ def _table(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (x + 1) / 2, b, integrals(x, b, stages)
 
 
-class GaussLegendre(Method):
+class GaussLegendre(Collocation):
     r"""The Gauss–Legendre method of s stages, of order 2s, on the continuous equations.
 
         q̇ = ∂H/∂p,   ṗ = −∂H/∂q + εW     with H(t, q, p) = H_D(t, t, q, p)
@@ -68,12 +67,8 @@ class GaussLegendre(Method):
 
     stages: int = eqx.field(static=True, default=2)
 
-    is_symmetric: ClassVar[bool] = True
-    is_symplectic: ClassVar[bool] = True
-    is_invertible: ClassVar[bool] = True
-
     def __check_init__(self):
-        check_stages(self.stages, 1, _MOST_STAGES, "twice that")
+        whole("stages", self.stages, 1, _MOST_STAGES, hint="The order is twice that.")
 
     @property
     def order(self) -> int:
@@ -108,11 +103,5 @@ class GaussLegendre(Method):
         q1, p1 = advanced(b, x.reshape(all_at_start.shape))
         return q1, p1, judge(info, q1, p1)
 
-    def inverse(self, equations, interval, q1, p1):
-        return self.step(equations, interval.reversed(), q1, p1)
-
     def needs_no_solve(self, equations, interval, q) -> bool:
-        return False
-
-    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
         return False

@@ -1,7 +1,7 @@
 """The partitioned pair of Lobatto IIIA and IIIB methods."""
 
 import functools
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,10 +10,10 @@ import numpy as np
 from jax import lax
 from numpy.polynomial import legendre
 
-from .._step import judge
-from ..engine.newton import RootInfo, find_root, no_residual
-from ._base import Method
-from ._collocation import check_stages, continuous_rates, integrals
+from .._checks import whole
+from .._step import judge, no_solve
+from ..engine.newton import find_root
+from ._collocation import Collocation, continuous_rates, integrals
 
 _MOST_STAGES = 6
 """Order 10: up to there the conditions of order are tested."""
@@ -61,7 +61,7 @@ def _table(stages: int) -> _Table:
     return _Table((x + 1) / 2, b, a, b * (1 - ratio.T), last)
 
 
-class LobattoIIIAIIIB(Method):
+class LobattoIIIAIIIB(Collocation):
     r"""The partitioned Lobatto IIIA–IIIB pair of s stages, of order 2s − 2.
 
         q̇ = ∂H/∂p,   ṗ = −∂H/∂q + εW     with H(t, q, p) = H_D(t, t, q, p)
@@ -108,12 +108,8 @@ class LobattoIIIAIIIB(Method):
 
     stages: int = eqx.field(static=True, default=2)
 
-    is_symmetric: ClassVar[bool] = True
-    is_symplectic: ClassVar[bool] = True
-    is_invertible: ClassVar[bool] = True
-
     def __check_init__(self):
-        check_stages(self.stages, 2, _MOST_STAGES, "twice that less two")
+        whole("stages", self.stages, 2, _MOST_STAGES, hint="The order is twice that less two.")
 
     @property
     def order(self) -> int:
@@ -157,11 +153,7 @@ class LobattoIIIAIIIB(Method):
         start = tuple(jnp.broadcast_to(z, (s, *z.shape)) for z in (q0, p0))
         if self.needs_no_solve(equations, interval, q0):  # one sweep finds P_1 = P_2
             x = unknowns(*sweep(0, start))
-            info = RootInfo(
-                jnp.asarray(0, jnp.int32),
-                no_residual(jnp.finfo(q0.dtype).dtype),
-                jnp.asarray(True),
-            )
+            info = no_solve(q0)
         else:
             guess = lax.fori_loop(0, _SWEEPS, sweep, lax.stop_gradient(start))
             known = (jnp.broadcast_to(z, (s, *z.shape)) for z in equations.absolute(q0, p0))
@@ -172,14 +164,6 @@ class LobattoIIIAIIIB(Method):
         q1, p1 = Q[-1], p0 + h * jnp.tensordot(b, forces(times, Q, P), 1)
         return q1, p1, judge(info, q1, p1)
 
-    def inverse(self, equations, interval, q1, p1):
-        return self.step(equations, interval.reversed(), q1, p1)
-
     def needs_no_solve(self, equations, interval, q) -> bool:
-        separable = equations.step_is_explicit(interval, q) and equations.inverse_is_explicit(
-            interval, q
-        )
-        return self.stages == 2 and separable
-
-    def inverse_needs_no_solve(self, equations, interval, q) -> bool:
-        return self.needs_no_solve(equations, interval, q)
+        parts = equations.step_is_explicit, equations.inverse_is_explicit
+        return self.stages == 2 and all(is_explicit(interval, q) for is_explicit in parts)

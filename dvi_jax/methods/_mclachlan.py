@@ -1,11 +1,12 @@
 """McLachlan's optimised compositions."""
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
 
 from ._base import Method
-from ._composition import CompositionMethod, check_base, check_order, of_strang
+from ._composition import CompositionMethod, of_strang
 from ._type_ii import TypeII
 
 _ROOT = 19.0**0.5
@@ -52,11 +53,8 @@ class McLachlan(CompositionMethod):
     order: int = eqx.field(static=True, default=4)
     base: Method = eqx.field(default_factory=TypeII)
 
+    orders: ClassVar[Sequence[int]] = (4, *_OUTER)
     is_symmetric: ClassVar[bool] = True
-
-    def __check_init__(self):
-        check_order("McLachlan", self.order, (4, *_OUTER))
-        check_base(self.base)
 
     def fractions(self):
         if self.order == 4:

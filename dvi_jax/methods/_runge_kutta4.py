@@ -2,12 +2,9 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
-
-from .._results import RESULTS
-from .._step import no_step_yet
-from .._types import Interval
+from .._step import judge, no_solve
 from ._base import Method
+from ._collocation import continuous_rates
 
 
 class RungeKutta4(Method):
@@ -30,12 +27,10 @@ class RungeKutta4(Method):
         t0, t1, h = interval
         middle = t0 + h / 2
 
+        velocity, force = continuous_rates(equations, h)
+
         def field(t, q, p):
-            now = Interval(t, t, jnp.zeros_like(h))
-            return (
-                equations.position_rate(now, q, p),
-                equations.momentum_rate(now, q, p),
-            )
+            return velocity(t, q, p), force(t, q, p)
 
         kq1, kp1 = field(t0, q0, p0)
         kq2, kp2 = field(middle, q0 + h / 2 * kq1, p0 + h / 2 * kp1)
@@ -43,9 +38,7 @@ class RungeKutta4(Method):
         kq4, kp4 = field(t1, q0 + h * kq3, p0 + h * kp3)
         q1 = q0 + h / 6 * (kq1 + 2 * kq2 + 2 * kq3 + kq4)
         p1 = p0 + h / 6 * (kp1 + 2 * kp2 + 2 * kp3 + kp4)
-        finite = jnp.all(jnp.isfinite(q1)) & jnp.all(jnp.isfinite(p1))
-        result = RESULTS.where(finite, RESULTS.successful, RESULTS.not_finite)
-        return q1, p1, no_step_yet(q1)._replace(result=result)
+        return q1, p1, judge(no_solve(q1), q1, p1)
 
     def inverse(self, equations, interval, q1, p1):
         raise TypeError(

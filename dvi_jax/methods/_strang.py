@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from ._base import Method
-from ._composition import CompositionMethod, check_base
+from ._composition import CompositionMethod
 from ._type_ii import TypeII
 
 
@@ -25,9 +25,6 @@ class Strang(CompositionMethod):
 
     order: ClassVar[int] = 2
     is_symmetric: ClassVar[bool] = True
-
-    def __check_init__(self):
-        check_base(self.base)
 
     def fractions(self):
         return (0.5, 0.5)

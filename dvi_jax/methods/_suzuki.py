@@ -1,11 +1,12 @@
 """Suzuki's fractal composition of Strang's method."""
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
 
 from ._base import Method
-from ._composition import CompositionMethod, check_base, check_order, of_strang
+from ._composition import CompositionMethod, of_strang
 from ._type_ii import TypeII
 
 _GAMMA = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
@@ -29,11 +30,8 @@ class Suzuki(CompositionMethod):
     order: int = eqx.field(static=True, default=4)
     base: Method = eqx.field(default_factory=TypeII)
 
+    orders: ClassVar[Sequence[int]] = (4,)
     is_symmetric: ClassVar[bool] = True
-
-    def __check_init__(self):
-        check_order("Suzuki", self.order, (4,))
-        check_base(self.base)
 
     def fractions(self):
         return of_strang((_GAMMA, _GAMMA))

@@ -23,11 +23,11 @@ class TypeII(Method):
     is_symplectic: ClassVar[bool] = True
     is_invertible: ClassVar[bool] = True
 
-    def step(self, equations, interval, q0, p0):
-        return step(equations, interval, q0, p0)
+    step = staticmethod(step)  # pyright: ignore[reportAssignmentType]
+    inverse = staticmethod(inverse_step)  # pyright: ignore[reportAssignmentType]
 
-    def inverse(self, equations, interval, q1, p1):
-        return inverse_step(equations, interval, q1, p1)
+    def is_made_of_the_map(self) -> bool:
+        return True
 
     def needs_no_solve(self, equations, interval, q):
         return equations.step_is_explicit(interval, q)

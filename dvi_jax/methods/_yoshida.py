@@ -1,11 +1,12 @@
 """Yoshida's compositions of Strang's method."""
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
 
 from ._base import Method
-from ._composition import CompositionMethod, check_base, check_order, of_strang
+from ._composition import CompositionMethod, of_strang
 from ._type_ii import TypeII
 
 _OUTER = {
@@ -48,11 +49,8 @@ class Yoshida(CompositionMethod):
     order: int = eqx.field(static=True, default=4)
     base: Method = eqx.field(default_factory=TypeII)
 
+    orders: ClassVar[Sequence[int]] = tuple(_OUTER)
     is_symmetric: ClassVar[bool] = True
-
-    def __check_init__(self):
-        check_order("Yoshida", self.order, tuple(_OUTER))
-        check_base(self.base)
 
     def fractions(self):
         return of_strang(_OUTER[self.order])

@@ -18,5 +18,6 @@ from ._reductions import (
     Reduction as Reduction,
     Running as Running,
     Trend as Trend,
+    is_observable as is_observable,
 )
 from ._stop import Stop as Stop, Stopped as Stopped

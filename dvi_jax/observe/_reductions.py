@@ -215,3 +215,8 @@ class Running(eqx.Module):
                 "Running takes a reduction with a value at any time, such as dvi.MEGNO() or "
                 f"dvi.Mean(f), got {self.reduction!r}."
             )
+
+
+def is_observable(x: Any) -> bool:
+    """Whether x is a leaf of `observe`: a reduction, or a function."""
+    return isinstance(x, Reduction | Running) or callable(x)

@@ -17,6 +17,7 @@ from .._integrator import Integrator, chosen
 from .._memory import machine_memory
 from .._solution import Save
 from .._system import System, check_system
+from ..engine.names import both_names
 from ..engine.newton import RootSolver
 from ..lattices import Given, Lattice
 from ..methods import Method
@@ -49,6 +50,7 @@ class SweepInterrupted(KeyboardInterrupt):
         self.result = result
 
 
+@both_names
 def sweep(
     system: System,
     q0: Any = None,

@@ -8,8 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._rollout import is_observable
-from ..observe import Reduction
+from ..observe import Reduction, is_observable
 from .axes import place
 from .program import Sweep
 

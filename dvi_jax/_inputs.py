@@ -1,0 +1,127 @@
+"""What `integrate` is given, as arrays of one precision, or an error that says what is wrong."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from lanewise.jaxapi import is_traced
+
+from ._precision import refuse_double_without_x64
+from .engine.quantities import refuse_unit_or_mask
+
+
+def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
+    """A start as real arrays of one shape and precision, or an error that says what is wrong."""
+    q, p = _real_array("q0", q0), _real_array("p0", p0)
+    if q.shape != p.shape:
+        raise ValueError(
+            f"q0 and p0 must have one shape, got q0 {q.shape} and p0 {p.shape}. Each position "
+            "needs its momentum."
+        )
+    if q.size == 0:
+        raise ValueError(f"q0 is empty (shape {q.shape}): there is nothing to integrate.")
+    if q.dtype != p.dtype:
+        dtype = jnp.result_type(q.dtype, p.dtype)
+        q, p = q.astype(dtype), p.astype(dtype)
+    if q.dtype.itemsize < 4:
+        raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype}: too few digits.")
+    return q, p
+
+
+def as_times(of: str, ts: Any) -> Array:
+    """Times as an array of real numbers; `of`: what takes them."""
+    if not is_traced(ts):
+        refuse_unit_or_mask("ts", ts)
+        ts = np.asarray(ts)
+        refuse_double_without_x64("ts", ts.dtype)
+    if jnp.issubdtype(ts.dtype, jnp.integer):
+        ts = ts.astype(jnp.result_type(float))
+    if not jnp.issubdtype(ts.dtype, jnp.floating):
+        raise TypeError(f"{of} needs real times, got dtype {ts.dtype}.")
+    return jnp.asarray(ts)
+
+
+def _real_array(name: str, value: Any) -> Array:
+    if isinstance(value, list | tuple) and any(is_traced(x) for x in jax.tree.leaves(value)):
+        value = jnp.asarray(value)
+    if isinstance(value, jax.Array) and is_traced(value):
+        kind = value.dtype
+    else:
+        # In NumPy: under jit, jax.numpy would give tracers even for values that are known.
+        value = _as_numpy(name, value)
+        kind = value.dtype
+        refuse_double_without_x64(name, kind)
+    if kind.kind == "c":
+        raise TypeError(
+            f"{name} must be real, got dtype {kind}. Write a complex variable as its real and "
+            "imaginary parts (a canonical pair, up to a factor)."
+        )
+    if not _is_real(kind):
+        raise TypeError(f"{name} must be a real array, got dtype {kind}.")
+    if isinstance(value, np.ndarray) and not np.isfinite(value).all():
+        where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
+        raise ValueError(
+            f"{name} holds a value that is not finite at index {list(where)}: {value[where]}. "
+            "Every component of the start must be a number."
+        )
+    array = jnp.asarray(value)
+    return array.astype(jnp.result_type(float)) if kind.kind in "iu" else array
+
+
+def _is_real(dtype: Any) -> bool:
+    """Whether numbers of this type are real; NumPy does not know those of two bytes."""
+    return dtype.kind in "fiu" or jnp.issubdtype(dtype, jnp.floating)
+
+
+def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
+    """A number of this precision, or an error that names it."""
+    known = None if is_traced(value) else _as_numpy(name, value)
+    if isinstance(value, np.ndarray | np.generic) and value.dtype == np.float64:
+        refuse_double_without_x64(name, value.dtype)
+    kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
+    if not _is_real(kind):
+        raise TypeError(f"{name} must be a real number, got {value!r}.")
+    if shape != ():
+        raise ValueError(
+            f"{name} must be one number, got shape {shape}. For several values use "
+            f"jax.vmap over {name}" + (", or lattice=dvi.Given(ts)." if name == "h" else ".")
+        )
+    if known is not None and not np.isfinite(known):
+        raise ValueError(f"{name} must be finite, got {known}.")
+    if known is not None and not zero_allowed and known == 0:
+        raise ValueError(
+            f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
+            "or a negative one (backward)."
+        )
+    return jnp.asarray(value, dtype) if known is None else jnp.asarray(known.astype(dtype))
+
+
+def _as_numpy(name: str, value: Any) -> np.ndarray:
+    refuse_unit_or_mask(name, value)
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be made of real numbers, got {value!r} ({error}).") from None
+
+
+def as_parameter(leaf: Any) -> Any:
+    """A leaf of args: floats become arrays, so that a new value needs no new compilation."""
+    if isinstance(leaf, np.ndarray | np.generic):
+        refuse_unit_or_mask("args", leaf)
+        leaf = np.asarray(leaf)
+        refuse_double_without_x64("args", leaf.dtype)
+        if leaf.dtype.kind in "OMm":
+            raise TypeError(f"args holds an array of dtype {leaf.dtype}: numbers are needed.")
+        return jnp.asarray(leaf)
+    if not isinstance(leaf, jax.Array):
+        try:
+            hash(leaf)
+        except TypeError:
+            raise TypeError(
+                f"args holds a {type(leaf).__name__}, which is neither an array nor hashable: "
+                f"{leaf!r:.80}. Give arrays and numbers, in dicts, lists and tuples."
+            ) from None
+    return jnp.asarray(leaf) if isinstance(leaf, float) else leaf

@@ -1,0 +1,87 @@
+"""What is observed: refused where it is no function of a step, and put back into its pytree."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from ._checks import function as check_function
+from ._rollout import Task
+from .observe import Deviations, Range, Reduction, Running, is_observable
+
+_STEP = "(t0, t1, q0, p0, q1, p1, args)"
+
+
+def check_observe(task: Task, q0: Array, p0: Array) -> int:
+    """Refuse observables that are not functions of a step with an array for a value.
+
+    **Returns** the bytes of those that stand alone, at one save point.
+    """
+    size = 0
+    for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
+        if isinstance(leaf, type) and issubclass(leaf, Reduction | Running):
+            raise TypeError(
+                f"observe holds the class {leaf.__name__}: give it what it is to reduce, as in "
+                f"dvi.MaxDrift(function), a function {_STEP}, dvi.MEGNO() or "
+                "dvi.Running(dvi.MEGNO())."
+            )
+        if not is_observable(leaf):
+            raise TypeError(
+                f"observe must be a pytree of functions {_STEP} or "
+                f"reductions such as dvi.MaxDrift(function); it holds {leaf!r}."
+            )
+        if isinstance(leaf, Running):
+            leaf = leaf.reduction
+        if isinstance(leaf, Deviations):
+            _check_deviations(leaf, task, q0, p0)
+            continue
+        function = leaf.function if isinstance(leaf, Reduction) else leaf
+        called = getattr(function, "__name__", type(function).__name__)
+        check_function(f"what {type(leaf).__name__} takes", function, _STEP)
+        t0, bound = task.t0, task.bound(function)
+        try:
+            out = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, task.args)
+        except Exception as error:
+            error.add_note(f"(in the observable {called}, called with {_STEP})")
+            raise
+        if not hasattr(out, "shape") and not isinstance(out, int | float):
+            raise TypeError(
+                f"an observable {_STEP} must return one array; "
+                f"{called} returned {type(out).__name__}."
+            )
+        if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
+            raise TypeError(
+                f"Range compares values, which complex numbers have no order for; {called} returns "
+                "them. Take the real and imaginary parts, or the absolute value."
+            )
+        if not isinstance(leaf, Reduction):
+            size += int(np.prod(np.shape(out), dtype=int)) * jnp.result_type(out).itemsize
+    return size
+
+
+def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> None:
+    """Refuse deviation vectors along steps whose derivative is not that of the method alone."""
+    name = type(leaf).__name__
+    if task.lattice.has_memory:
+        raise ValueError(
+            f"{name} needs steps whose size does not depend on the state, and those of "
+            f"{task.lattice!r} do: take lattice=dvi.Uniform() or dvi.Given(ts)."
+        )
+    eqx.filter_eval_shape(leaf.start, jnp.zeros(2 * q0.size, q0.dtype))  # counts and units
+
+
+def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
+    """The pytree `observe` with every observable replaced by its values."""
+    values, lone = iter(reduced), iter(alone)
+
+    def value(f):
+        if isinstance(f, Reduction):
+            return next(values)
+        if isinstance(f, Running):  # its last value is the last of its rows
+            next(values)
+        return next(lone)
+
+    return jax.tree.map(value, observe, is_leaf=is_observable)

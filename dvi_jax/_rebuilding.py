@@ -1,0 +1,310 @@
+"""The reverse pass of `Reversible`: states rebuilt by inverse steps, and cotangents along them."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+import lanewise
+
+from ._arithmetic import FloatingPoint
+from ._results import RESULTS
+from ._rollout import Plan, Saved, StepTaken, Task, adds_start_outside, piece_length
+from ._types import State
+from .engine.newton import Known, RootSolver
+from .methods import TypeII
+
+LOOKS = 16
+"""Steps back between two looks at how large the components are."""
+
+
+class Smooth(NamedTuple):
+    """The outputs of a trajectory that have derivatives."""
+
+    q: State
+    p: State
+    saved: Saved
+    reduced: list[Any]
+
+
+def states_of(saved: Saved) -> Saved:
+    """What the reverse pass reads of what was saved."""
+    return saved._replace(t=None, h=None, observed=[])
+
+
+class _Pieces(NamedTuple):
+    """Pieces of `size` steps each between two states that are known, in order from step `first`."""
+
+    starts: tuple[State, State]
+    ends: tuple[State, State]
+    first: Array
+    size: int
+
+    def over(self, step: Callable, state: Any, reverse: bool = False) -> Any:
+        """``state = step(state, k, start, end)`` for each piece, from step number k."""
+        count = len(self.starts[0])
+        if count == 1:
+            return step(state, self.first, _row(self.starts, 0), _row(self.ends, 0))
+        k, stride = self.first, self.size
+        if reverse:
+            k, stride = k + (count - 1) * stride, -stride
+
+        def one(carry, x):
+            k, state = carry
+            return (k + stride, step(state, k, *x)), None
+
+        (_, state), _ = lax.scan(one, (k, state), (self.starts, self.ends), reverse=reverse)
+        return state
+
+
+def _row(states: tuple[State, State], i: int) -> tuple[State, State]:
+    return states[0][i], states[1][i]
+
+
+def _pieces(known_start, saved: Saved, first, count: int, every: int) -> list[_Pieces]:
+    """The `count` steps to a save point, cut at the states kept on the way, the last piece with the
+    others where it is as long: what is done to a piece is compiled for each length."""
+    inner = saved.inner
+    kept = 0 if inner is None else len(inner[0])
+    size = piece_length(count, every) if kept else count
+    parts = [known_start[0][None], known_start[1][None]], inner, [saved.q[None], saved.p[None]]
+    known = [jnp.concatenate(x) for x in zip(*(p for p in parts if p is not None), strict=True)]
+    starts, ends = (known[0][:-1], known[1][:-1]), (known[0][1:], known[1][1:])
+    rest = count - kept * size
+    if rest == size:
+        return [_Pieces(starts, ends, first, size)]
+
+    def some(which: slice, first, size):
+        start, end = ((q[which], p[which]) for q, p in (starts, ends))
+        return _Pieces(start, end, first, size)
+
+    return [some(slice(-1), first, size), some(slice(-1, None), first + kept * size, rest)]
+
+
+def _rebuilt(
+    task: Task,
+    end,
+    first,
+    count: int,
+    known_start,
+    allowed: float,
+    along: Callable | None = None,
+    sums: Any = None,
+):
+    """The states from `end` back over `count` steps, by inverse steps.
+
+    Given are the `sums` that ``along(k, after, before, sums)`` has made of each step on the way, by
+    how much of its size each component misses `known_start`, and whether all solves went well.
+    """
+    group = largest_divisor(count, LOOKS)
+
+    def undo(state, _):
+        k, after, sums, solved = state
+        q, p, info = task.method.inverse(task.equations, task.interval(k), *after)
+        if along is not None:
+            sums = along(k, after, (q, p), sums)
+        return (k - 1, (q, p), sums, solved & (info.result == RESULTS.successful)), None
+
+    def undo_group(state, _):
+        state, sizes = state
+        state, _ = lax.scan(undo, state, None, group)
+        return (state, _largest(sizes, state[1])), None
+
+    begin = ((first + (count - 1), end, sums, jnp.asarray(True)), _largest(end, end))
+    ((_, state, sums, solved), sizes), _ = lax.scan(undo_group, begin, None, count // group)
+    misses = [
+        _miss(a, b, size, allowed).ravel()
+        for a, b, size in zip(state, known_start, sizes, strict=True)
+    ]
+    return sums, jnp.concatenate(misses), solved
+
+
+def round_trip_defect(
+    task: Task, plan: Plan, every: int, allowed: float, start_state, saved: Saved, tail
+) -> Array:
+    """The largest miss of a rebuilt state at a checkpoint; ∞ where an inverse step went wrong."""
+
+    def of_piece(size):
+        def of(worst, k, start, end):
+            _, misses, solved = _rebuilt(task, end, k, size, start, allowed)
+            return jnp.maximum(worst, jnp.where(solved, jnp.max(misses, initial=0.0), jnp.inf))
+
+        return of
+
+    def of_block(worst, start, saved, first, count):
+        for pieces in _pieces(start, saved, first, count, every):
+            worst = pieces.over(of_piece(pieces.size), worst)
+        return worst
+
+    def block(carry, saved):
+        k, start, worst = carry
+        worst = of_block(worst, start, saved, k, plan.block)
+        return (k + plan.block, (saved.q, saved.p), worst), None
+
+    begin = (jnp.asarray(0, jnp.int32), start_state, jnp.zeros((), start_state[0].dtype))
+    (k, start, worst), _ = lax.scan(block, begin, saved)
+    return worst if tail is None else of_block(worst, start, tail, k, plan.tail)
+
+
+def pull_back(
+    fixed, plan: Plan, every: int, allowed: float, inputs, known, cotangent: Smooth
+) -> tuple[Any, Array, Array]:
+    """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start.
+
+    Its settings are `every`, the steps between checkpoints, and `allowed`, the largest miss there.
+    """
+    theta, q_start, p_start = inputs
+    memories, saved, tail = known
+    task: Task = eqx.combine(theta, fixed)
+    _, reductions = task.observables()
+    newton = task.equations.newton
+    assert isinstance(newton, RootSolver)
+
+    def local_step(theta, q0, p0, k, p1):
+        task: Task = eqx.combine(theta, fixed)
+        alone, reductions = task.observables()
+        interval = task.interval(k)
+        if isinstance(task.method, TypeII) and isinstance(task.arithmetic, FloatingPoint):
+            # What (13) is to be solved for is where we come from.
+            solver = Known(p1.ravel(), newton)
+        else:
+            solver = newton
+        equations = dataclasses.replace(task.equations, newton=solver)
+        q1, p1, _ = task.method.step(equations, interval, q0, p0)
+        taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
+        values = [taken.value(f, task.args) for f in alone]
+        reduced = [taken.number(task.bound(r.function), task.args) for r in reductions]
+        return (q1, p1, interval.t1), eqx.filter(values, eqx.is_inexact_array), reduced
+
+    def pull_through(k, after, before, sums, is_last, at_save):
+        """The cotangents before step k, from the states before and after it."""
+        p1, (grad, (cq, cp)) = after[1], sums
+        ((_, _, t1), _, values), pull = jax.vjp(
+            lambda theta, q, p: local_step(theta, q, p, k, p1), theta, *before
+        )
+        at_end = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
+        ct, seeds = jnp.zeros_like(t1), []
+        for r, memory, c, value in zip(
+            reductions, memories, cotangent.reduced, values, strict=True
+        ):
+            of_t, of_value = r.pull(memory, c, k, t1, value)
+            ct = ct + of_t
+            seeds.append(of_value.astype(value.dtype))
+        of_theta, cq, cp = pull(((cq, cp, ct), at_end, seeds))
+        return jax.tree.map(jnp.add, grad, of_theta), (cq, cp)
+
+    def undo_steps(known_start, end, first, count, last, at_save, grad, cot):
+        """`count` steps back from the exact state `end`, checked against `known_start`.
+
+        By inverse steps; where a trajectory then misses the start, through the steps again from
+        there, their states stored.
+        """
+
+        def along(k, after, before, sums):
+            return pull_through(k, after, before, sums, k == last, at_save)
+
+        out, misses, solved = _rebuilt(
+            task, end, first, count, known_start, allowed, along, (grad, cot)
+        )
+        fine = solved & jnp.all(misses <= allowed)
+
+        def stored(known_start, end, first, last, at_save, grad, cot):
+            def forward(state, _):
+                k, before = state
+                q, p, _ = task.method.step(task.equations, task.interval(k), *before)
+                return (k + 1, (q, p)), before
+
+            _, states = lax.scan(forward, (first, known_start), None, count)
+
+            def back(state, before):
+                k, after, sums = state
+                sums = pull_through(k, after, before, sums, k == last, at_save)
+                return (k - 1, before, sums), None
+
+            begin = (first + count - 1, end, (grad, cot))
+            (_, _, sums), _ = lax.scan(back, begin, states, reverse=True)
+            return sums
+
+        def mend(out):
+            again = stored(known_start, end, first, last, at_save, grad, cot)
+            return jax.tree.map(lambda a, b: jnp.where(missing, a, b), again, out)
+
+        # Where the trajectory itself has failed there is nothing to mend: NaN, not a number.
+        missing = ~fine & _all_finite(known_start) & _all_finite(end)
+        return lax.cond(lanewise.on_any(missing), mend, lambda out: out, tuple(out))
+
+    def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):
+        last = first + count - 1
+        cot = (cot[0] + at_save.q, cot[1] + at_save.p)
+        _, pull_times = jax.vjp(lambda theta: _end_of(eqx.combine(theta, fixed), last), theta)
+        grad = jax.tree.map(jnp.add, grad, *pull_times((at_save.t, at_save.h)))
+        at_save = at_save.observed
+        sums = grad, cot
+        for pieces in reversed(_pieces(known_start, saved, first, count, every)):
+
+            def undo(sums, k, start, end, size=pieces.size):
+                return undo_steps(start, end, k, size, last, at_save, *sums)
+
+            sums = pieces.over(undo, sums, reverse=True)
+        return sums
+
+    start_state = (q_start, p_start)
+    ends = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start_state, (saved.q, saved.p))
+    grad = jax.tree.map(jnp.zeros_like, theta)
+    cot = (cotangent.q, cotangent.p)
+    rows = cotangent.saved
+    of_start = None
+    if not adds_start_outside(plan):
+        of_start, rows = (rows.q[0], rows.p[0]), rows._replace(q=rows.q[1:], p=rows.p[1:])
+    if tail is not None:
+        at_save = jax.tree.map(lambda x: _last_row(x, plan.save_tail), rows)
+        newest = jax.tree.map(lambda x: x[-1], ends)
+        k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
+        grad, cot = undo_block(newest, tail, k, plan.tail, at_save, grad, cot)
+
+    def block(state, x):
+        k, grad, cot = state
+        known_start, saved, at_save = x
+        k = k - plan.block
+        return (k, *undo_block(known_start, saved, k, plan.block, at_save, grad, cot)), None
+
+    starts = jax.tree.map(lambda x: x[:-1], ends)
+    rows = jax.tree.map(lambda x: x[: plan.num_blocks], rows)
+    k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
+    (_, grad, cot), _ = lax.scan(block, (k, grad, cot), (starts, saved, rows), reverse=True)
+    of_q, of_p = cot if of_start is None else map(jnp.add, cot, of_start)
+    return grad, of_q, of_p
+
+
+def largest_divisor(n: int, most: int) -> int:
+    return next(d for d in range(min(n, most), 0, -1) if n % d == 0) if n else 1
+
+
+def _end_of(task: Task, k: Array) -> tuple[Array, Array]:
+    """Time and step size at the end of step k."""
+    interval = task.interval(k)
+    return interval.t1, interval.h
+
+
+def _last_row(x, is_there: bool):
+    return x[-1] if is_there else jnp.zeros(x.shape[1:], x.dtype)
+
+
+def _largest(sizes, state):
+    return jax.tree.map(lambda s, x: jnp.maximum(jnp.abs(s), jnp.abs(x)), sizes, state)
+
+
+def _miss(a, b, size, allowed):
+    """By how much of its size each component of a misses b. To the size is added that of which
+    `allowed` is round-off of the largest component."""
+    round_off = 64 * jnp.finfo(a.dtype).eps * jnp.max(size, initial=0.0)
+    return jnp.abs(a - b) / (size + (round_off / allowed + jnp.finfo(a.dtype).tiny))
+
+
+def _all_finite(state) -> Array:
+    return jnp.all(jnp.isfinite(state[0])) & jnp.all(jnp.isfinite(state[1]))
