@@ -27,8 +27,9 @@ from .observations import Observations
 _WASTE = 2_000_000
 """Steps beyond the ends of shorter arcs that are taken rather than compiling another program."""
 
-_OPTIONS = tuple(
-    "method lattice newton root_finder adjoint arithmetic layout integrator num_steps".split()
+_OPTIONS = (
+    *("method", "lattice", "newton", "root_finder", "adjoint", "arithmetic", "layout"),
+    *("integrator", "num_steps"),
 )
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
 _OWN = ("num_steps", "save", "observe", "throw", "progress", "stop", "t0")
