@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import dvi_jax as dvi
 
 from ..engine.quantities import refuse_unit_or_mask
-from .extras import needed, system_of
+from .extras import expect, needed, system_of
 
 if TYPE_CHECKING:
     from .diffrax_classes import DiscreteMap, DiscreteTerm
@@ -35,19 +35,14 @@ def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], A
     **Accuracy** round-off. ``dvi.from_lagrangian`` divides by t1 − t0 and has no H_D(t, t, …): its
     field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
     """
-    system = system_of(system, "vector_field")
-    refuse_unit_or_mask("epsilon", epsilon)
-    _warn_without_effect(system, epsilon)
+    system = _checked(system, epsilon)
 
     def field(t, y, args):
         q, p = as_pair(y)
-        t = jnp.asarray(t, q.dtype)
-        strength = jnp.asarray(epsilon, q.dtype)
-        position, momentum = jax.grad(system.hamiltonian, argnums=(2, 3))(
-            t, t, q, p, strength, args
-        )
-        force = system.disturbing_force(t, t, q, p, strength, args)
-        rates = momentum, -position + jnp.asarray(force, q.dtype)
+        t, strength = (jnp.asarray(x, q.dtype) for x in (t, epsilon))
+        at = t, t, q, p, strength, args
+        position, momentum = jax.grad(system.hamiltonian, argnums=(2, 3))(*at)
+        rates = momentum, -position + jnp.asarray(system.disturbing_force(*at), q.dtype)
         return type(y)(rates) if isinstance(y, list) else rates
 
     return field
@@ -69,20 +64,19 @@ def as_pair(y: Any) -> tuple[Any, Any]:
     return q, p
 
 
-def _warn_without_effect(system: dvi.System, epsilon: Any) -> None:
-    """As `integrate` warns, where the value is known."""
-    if system.force is not None or system.perturbation is not None or system.slow_time:
-        return
+def _checked(system: Any, epsilon: Any) -> dvi.System:
+    """The system; warns, as `integrate` does, where ε has no effect and its value is known."""
+    system = system_of(system)
+    refuse_unit_or_mask("epsilon", epsilon)
     try:
         value = float(epsilon)
     except (TypeError, jax.errors.ConcretizationTypeError):  # it stands for values to come
-        return
-    if value != 0:
-        warnings.warn(
-            f"epsilon = {value:g} has no effect: the system has neither a force nor a "
-            "perturbation.",
-            stacklevel=3,
-        )
+        value = 0.0
+    used = system.force is not None or system.perturbation is not None or system.slow_time
+    if value != 0 and not used:
+        text = f"epsilon = {value:g} has no effect: the system has no force and no perturbation."
+        warnings.warn(text, stacklevel=3)
+    return system
 
 
 def diffrax_term(system: Any, epsilon: Any = 0.0) -> "DiscreteTerm":
@@ -99,10 +93,7 @@ def diffrax_term(system: Any, epsilon: Any = 0.0) -> "DiscreteTerm":
     needed("diffrax", "interop.diffrax_term")
     from .diffrax_classes import DiscreteTerm
 
-    system = system_of(system, "diffrax_term")
-    refuse_unit_or_mask("epsilon", epsilon)
-    _warn_without_effect(system, epsilon)
-    return DiscreteTerm(system, jnp.asarray(epsilon, float))
+    return DiscreteTerm(_checked(system, epsilon), jnp.asarray(epsilon, float))
 
 
 def diffrax_solver(
@@ -136,11 +127,8 @@ def diffrax_solver(
 
     **Raises** `ImportError` without diffrax; `TypeError` for what is no method or root solver.
     """
-    if not isinstance(method, dvi.Method) or not isinstance(newton, dvi.RootSolver):
-        raise TypeError(
-            "diffrax_solver takes method=, such as dvi.Strang(), and newton=, such as "
-            f"dvi.Newton(); got {method!r} and {newton!r}."
-        )
+    expect("method", method, dvi.Method, "a method such as dvi.Strang()")
+    expect("newton", newton, dvi.RootSolver, "a root solver such as dvi.Newton()")
     needed("diffrax", "interop.diffrax_solver")
     from .diffrax_classes import DiscreteMap
 

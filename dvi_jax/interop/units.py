@@ -11,10 +11,9 @@ import numpy as np
 import dvi_jax as dvi
 
 from ..systems import Problem
-from .extras import needed, system_of
+from .extras import expect, needed, system_of
 
 _POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
-_BY = "interop.UnitSystem"
 
 
 class UnitSystem:
@@ -48,34 +47,33 @@ class UnitSystem:
         p: Any = "momentum",
         args: Mapping[str, Any] | None = None,
     ):
-        u = needed("astropy.units", _BY)
-        given = {"length": length, "time": time, "mass": mass}
-        bases = {}
-        for kind, like in (("length", u.m), ("time", u.s), ("mass", u.kg)):
-            unit = bases[kind] = _unit(u, kind, given[kind])
+        u = needed("astropy.units", "interop.UnitSystem")
+        bases = []
+        given = ("length", length, u.m), ("time", time, u.s), ("mass", mass, u.kg)
+        for kind, what, like in given:
+            unit = _unit(u, kind, what)
             if not unit.is_equivalent(like):
                 raise ValueError(
                     f"{kind} must be a unit of {kind} such as {like}, got {unit} "
                     f"({unit.physical_type})."
                 )
-        L, T, M = bases.values()
-        words = {
-            "length": L, "angle": u.rad, "momentum": M * L / T, "velocity": L / T,
-            "angular momentum": M * L**2 / T, "specific angular momentum": L**2 / T,
-            "dimensionless": u.dimensionless_unscaled,
-        }  # fmt: skip
+            bases.append(unit)
+        L, T, M = bases
+        words = {"length": L, "angle": u.rad, "momentum": M * L / T, "velocity": L / T}
+        words |= {"angular momentum": M * L**2 / T, "specific angular momentum": L**2 / T}
+        words["dimensionless"] = u.dimensionless_unscaled
         others = [u.rad, u.A, u.K, u.mol, u.cd]
 
         def coherent(name: str, what: Any) -> Any:
-            unit = words[what] if isinstance(what, str) and what in words else _unit(u, name, what)
+            unit = words.get(what) if isinstance(what, str) else None
+            unit = _unit(u, name, what) if unit is None else unit
             try:
                 parts = unit.decompose(bases=[L, T, M, *others])
                 return u.CompositeUnit(1.0, parts.bases, parts.powers)
             except (AttributeError, u.UnitConversionError):  # °C, magnitudes, photons
                 raise ValueError(
                     f"{name} cannot be in {unit}, which no factor takes to length, time, mass, "
-                    "angle, current, temperature (K), amount and luminous intensity: convert it "
-                    "before this door."
+                    "angle, current, temperature (K), amount and luminous intensity: convert it."
                 ) from None
 
         named = {name: coherent(name, unit) for name, unit in (args or {}).items()}
@@ -92,25 +90,22 @@ class UnitSystem:
 
         **Raises** `ValueError` for a problem whose units are words, such as "period/2π".
         """
-        u = needed("astropy.units", _BY)
-        if not isinstance(problem, Problem):
-            raise TypeError(f"UnitSystem.of takes a problem, got {type(problem).__name__}.")
-        read = {name: _read(u, problem.units.get(name, "?")) for name in ("q", "p", "t")}
-        if None in read.values():
-            bad = next(name for name, unit in read.items() if unit is None)
+        u = needed("astropy.units", "interop.UnitSystem")
+        expect("problem", problem, Problem, "a problem of dvi_jax.systems")
+        texts = {name: problem.units.get(name, "?") for name in ("q", "p", "t")}
+        read = {name: _read(u, text) for name, text in texts.items()}
+        if bad := [name for name, unit in read.items() if unit is None]:
             raise ValueError(
-                f"{problem.name} measures {bad} in {problem.units.get(bad, '?')!r}, which is no "
-                "unit of astropy: give its numbers to dvi.integrate, or say units=UnitSystem(...)."
+                f"{problem.name} measures {bad[0]} in {texts[bad[0]]!r}, which is no unit of "
+                "astropy: give its numbers to dvi.integrate, or say units=UnitSystem(...)."
             )
-        args = {}
-        for name, meaning in problem.parameters.items():
-            bracket = re.search(r"\[([^\]]*)\]\s*$", meaning)
-            unit = _read(u, bracket[1]) if bracket else None
-            if unit is not None and unit != u.dimensionless_unscaled:
-                args[name] = unit
-        found = cls.__new__(cls)
-        found._set(read["q"], read["p"], read["t"], args)
-        return found
+        brackets = {n: re.search(r"\[([^\]]*)\]\s*$", m) for n, m in problem.parameters.items()}
+        args = {name: _read(u, found[1]) for name, found in brackets.items() if found}
+        one = u.dimensionless_unscaled
+        args = {name: unit for name, unit in args.items() if unit is not None and unit != one}
+        system = cls.__new__(cls)
+        system._set(read["q"], read["p"], read["t"], args)
+        return system
 
     def __repr__(self) -> str:
         of_args = "".join(f", {name} [{unit}]" for name, unit in self.args.items())
@@ -191,48 +186,30 @@ def integrate(
     """
     u = needed("astropy.units", "interop.integrate")
     problem = system if isinstance(system, Problem) else None
-    system = system_of(system, "interop.integrate")
+    system = system_of(system)
     own = _own(problem, required=units is None) if problem is not None else None
-    if units is None:
-        if own is None:
-            raise TypeError(
-                "a dvi.System does not say what its numbers are: give units=interop.UnitSystem("
-                "length=u.au, time=u.day, mass=u.Msun, args={...})."
-            )
-        units = own
-    if not isinstance(units, UnitSystem):
-        raise TypeError(f"units must be an interop.UnitSystem, got {units!r}.")
+    called = "interop.UnitSystem(length=u.au, time=u.day, mass=u.Msun, args={...})"
+    taken: UnitSystem = expect("units", own if units is None else units, UnitSystem, called)
     save, lattice = options.get("save"), options.get("lattice")
     if getattr(save, "ts", None) is not None or isinstance(lattice, dvi.Given):
         raise TypeError(
             "dvi.Save(ts=...) and dvi.Given(ts) hold times without a unit: give ts= a quantity in "
             "place of the first; for the second call dvi.integrate on numbers."
         )
+    if ts is not None and save is not None:
+        raise TypeError("ts= says which states are saved: leave save out.")
     if ts is not None:
-        if save is not None:
-            raise TypeError("ts= says which states are kept: leave save out.")
-        options["save"] = dvi.Save(ts=_number(u, "ts", ts, units.t))
-    q0, p0, args = _filled(u, problem, own, units, q0, p0, args)
-    q, p = (
-        _number(u, name, x, unit) for name, x, unit in (("q0", q0, units.q), ("p0", p0, units.p))
-    )
-    numbers = _arguments(u, args, units)
-    sol = dvi.integrate(
-        system,
-        q,
-        p,
-        h=_number(u, "h", h, units.t),
-        num_steps=num_steps,
-        t0=0.0 if t0 is None else _number(u, "t0", t0, units.t),
-        epsilon=_number(u, "epsilon", epsilon, u.dimensionless_unscaled),
-        args=numbers,
-        **options,
-    )
-    with_unit = [
-        u.Quantity(np.asarray(x), unit)
-        for x, unit in ((sol.ts, units.t), (sol.qs, units.q), (sol.ps, units.p), (sol.hs, units.t))
-    ]
-    return UnitSolution(*with_unit, observed=sol.observed, units=units, solution=sol)
+        options["save"] = dvi.Save(ts=_number(u, "ts", ts, taken.t))
+    q0, p0, args = _filled(u, problem, own, q0, p0, args)
+    given = ("q0", q0, taken.q), ("p0", p0, taken.p), ("h", h, taken.t)
+    given += (("epsilon", epsilon, u.dimensionless_unscaled),)
+    given += () if t0 is None else (("t0", t0, taken.t),)
+    numbers = {name: _number(u, name, x, unit) for name, x, unit in given}
+    numbers |= {"args": _arguments(u, args, taken), "num_steps": num_steps}
+    sol = dvi.integrate(system, **numbers, **options)
+    arrays = (sol.ts, taken.t), (sol.qs, taken.q), (sol.ps, taken.p), (sol.hs, taken.t)
+    with_unit = [u.Quantity(np.asarray(x), unit) for x, unit in arrays]
+    return UnitSolution(*with_unit, observed=sol.observed, units=taken, solution=sol)
 
 
 def _own(problem: Problem, required: bool) -> UnitSystem | None:
@@ -246,34 +223,26 @@ def _own(problem: Problem, required: bool) -> UnitSystem | None:
 
 
 def _filled(
-    u: Any, problem: Problem | None, own: UnitSystem | None, units: UnitSystem,
-    q0: Any, p0: Any, args: Any,
-) -> tuple[Any, Any, Any]:  # fmt: skip
+    u: Any, problem: Problem | None, own: UnitSystem | None, q0: Any, p0: Any, args: Any
+) -> tuple[Any, Any, Any]:
     """Start and args with what a problem has in the place of what was left out: as quantities."""
     if problem is None:
         return q0, p0, args
     known = problem.args
-    if isinstance(known, Mapping) and (args is None or isinstance(args, Mapping)):
-        for name in args or {}:
-            if name not in known:
-                raise ValueError(
-                    f"args has {name!r}, and {problem.name} has no such parameter; it has "
-                    f"{', '.join(known)}."
-                )
-    elif args is not None and known is not None:
-        raise TypeError(
-            f"args of {problem.name} is a mapping from name to value, got {type(args).__name__}."
-        )
+    if args is not None and known is not None:
+        expect(f"args of {problem.name}", args, Mapping, "a mapping from name to value")
+        if unknown := [name for name in args if name not in known]:
+            raise ValueError(
+                f"args has {unknown[0]!r}, and {problem.name} has no such parameter; it has "
+                f"{', '.join(known)}."
+            )
     if own is None:  # its numbers have no unit that is known here
         return q0, p0, args
     q0 = u.Quantity(problem.q0, own.q) if q0 is None else q0
     p0 = u.Quantity(problem.p0, own.p) if p0 is None else p0
     if isinstance(known, Mapping):
-        rest = {
-            name: u.Quantity(value, own.args[name]) if name in own.args else value
-            for name, value in known.items()
-        }
-        args = {**rest, **(args or {})}
+        of_args = {n: u.Quantity(v, own.args[n]) if n in own.args else v for n, v in known.items()}
+        args = of_args | dict(args or {})
     return q0, p0, args
 
 
@@ -324,7 +293,7 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
             return value
         seen = "is missing" if value is None else f"= {value!r} has no unit"
         raise TypeError(
-            f"{name} {seen}: everything that has a unit must say so at this door, such as "
+            f"{name} {seen}: everything that has a unit must say so here, such as "
             f"{name.split()[-1]} * u.Unit({str(unit)!r}) or another unit of that kind."
         )
     try:

@@ -6,9 +6,11 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.lines import Line2D
 
+from .._checks import instance
 from .style import GREY, HATCH, PALE, SHADES, figure_of
 
 _PIECE = 20_000
@@ -27,15 +29,12 @@ def canvas(
     if ax is None:
         figure = plt.figure(figsize=size, layout="constrained")
         return figure.add_subplot(projection="3d" if space else None), True
-    if not hasattr(ax, "transAxes"):
-        raise TypeError(f"ax must be the matplotlib Axes to draw on, got {type(ax).__name__}.")
-    if space and ax.name != "3d":
+    instance("ax", ax, Axes, "the matplotlib Axes to draw on")
+    if space != (ax.name == "3d"):
         raise ValueError(
-            'an orbit in space needs axes in space: figure.add_subplot(projection="3d"); or choose '
-            "two coordinates, coordinates=(0, 1)."
+            'an orbit in space needs axes in space, figure.add_subplot(projection="3d"), one in '
+            f'the plane (coordinates=(0, 1), say) axes without a projection: got "{ax.name}".'
         )
-    if ax.name == "3d" and not space:
-        raise ValueError("a picture in the plane was given axes in space: leave out projection.")
     return ax, False
 
 
@@ -60,11 +59,12 @@ def given(axes: Any, count: int, what: str) -> list[Any]:
     return found
 
 
-def check_labels(labels: Any, count: int, what: str) -> None:
-    """Raise `ValueError` unless there are `count` labels, or None."""
+def labels_of(labels: Any, count: int, what: str) -> list[str]:
+    """`count` labels, empty ones for None. **Raises** `ValueError` for another number of them."""
     if labels is not None and (isinstance(labels, str) or len(labels) != count):
         names = 1 if isinstance(labels, str) else len(labels)
         raise ValueError(f"labels has {names} names for {count} {what}: give a list of them.")
+    return [""] * count if labels is None else [str(label) for label in labels]
 
 
 # --- legends and colours ------------------------------------------------------------------------
