@@ -322,8 +322,8 @@ MANY = made(names=[f"a{i}" for i in range(13)], x=np.ones(13), covariance=np.eye
         (lambda: plot.fit_residuals(BARE), TypeError, "must be a FitResult.*whitened"),
         (lambda: plot.fit_residuals(made(), arcs=1), ValueError, "arcs must be .* 0 to 0, got 1"),
         (lambda: plot.fit_residuals(made(), component="q"), ValueError, "component must be .*'q'"),
-        (lambda: plot.fit_residuals(made(), names=["x"]), ValueError, "names must be 2"),
-        (lambda: plot.fit_against_data(made(), names="xy"), ValueError, "names must be 2"),
+        (lambda: plot.fit_residuals(made(), names=["x"]), ValueError, "1 names for 2"),
+        (lambda: plot.fit_against_data(made(), names="xy"), ValueError, "1 names for 2"),
         (lambda: plot.fit_residuals(made(), arcs=[]), ValueError, "arcs is empty: .*at least one"),
         (
             lambda: plot.fit_residuals(made(), axes=plt.subplots(1, 3)[1]),

@@ -520,7 +520,7 @@ def test_choices_that_are_not_there_are_named():
         (two, {"centre": [1.0]}, r"shape \(2,\)"),
         (two, {"colour": [1.0]}, "one orbit"),
         (bodies, {"bodies": [3]}, "from 0 to 2"),
-        (bodies, {"names": ["A"]}, "1 entries for 3 bodies"),
+        (bodies, {"names": ["A"]}, "1 names for 3 bodies"),
         (arrays(2, n=2), {"names": ["A", "B"]}, r"2 orbits.*labels="),
     ]:
         with pytest.raises(ValueError, match=match):

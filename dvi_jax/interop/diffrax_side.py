@@ -109,21 +109,21 @@ def diffrax_solver(
 
     - `method`: any `Method`. `newton`: how implicit steps are solved.
 
-    **Terms**: `diffrax_term` alone. A `diffrax.ODETerm` has no H_D and is refused by diffrax.
+    **Terms**: `diffrax_term` alone; diffrax rejects a `diffrax.ODETerm`, which has no H_D.
 
-    **Step sizes**: ``diffrax.ConstantStepSize()`` or ``diffrax.StepTo(ts)``. There is no estimate
-    of the error, so that diffrax refuses its adaptive controllers: a step that depends on the state
-    would break the structure; see ``dvi.TimeTransformed``.
+    **Step sizes**: ``diffrax.ConstantStepSize()`` or ``diffrax.StepTo(ts)``. A step that depends on
+    the state would break the structure (see ``dvi.TimeTransformed``): there is no error estimate,
+    and diffrax rejects its adaptive controllers.
 
     **Dense output** (``SaveAt(ts=…)``, ``SaveAt(dense=True)``, events): the cubic with the values
-    and slopes of the continuous limit at both ends of a step, of error O(h⁴) beside the method's,
-    and not symplectic. For states at times of the method's own order take ``dvi.Save(ts=...)``.
+    and slopes of the continuous limit at both ends of a step, of error O(h⁴) in addition to the
+    method's, and not symplectic. ``dvi.Save(ts=...)`` has the method's own order.
 
     **Failures**: `not_converged` becomes diffrax's `nonlinear_max_steps_reached`, `not_finite` its
     `nonfinite`, any other its `nonlinear_divergence`; with ``throw=True`` diffrax raises.
 
-    **Gradients**: by diffrax's `RecursiveCheckpointAdjoint`, `DirectAdjoint` and `ForwardMode`,
-    those of the discrete map. `BacksolveAdjoint` solves an equation of its own and is refused.
+    **Gradients**: by `RecursiveCheckpointAdjoint`, `DirectAdjoint` and `ForwardMode`, those of the
+    discrete map. `BacksolveAdjoint` solves another equation and is rejected.
 
     **Raises** `ImportError` without diffrax; `TypeError` for what is no method or root solver.
     """

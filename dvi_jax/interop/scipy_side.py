@@ -66,7 +66,7 @@ def solve_ivp(
     newton: dvi.RootSolver | None = None,
     **unsupported: Any,
 ) -> Any:
-    r"""One trajectory, asked for and told as by `scipy.integrate.solve_ivp`.
+    r"""One trajectory with the arguments and the results of `scipy.integrate.solve_ivp`.
 
         y = (q, p) in one vector,    the map of method on t0, t0 + h', …, t1,   h' = (t1 − t0)/N
 
@@ -75,28 +75,25 @@ def solve_ivp(
     - `system`: a `System` in place of SciPy's right side; or a problem of the library, whose args
       are taken where `args` is left out.
     - `t_span`: (t0, t1); t1 < t0 runs backwards. `y0`: q0 and p0, raveled, one after the other; the
-      run has its precision.
+      run has its precision. `shape`: of q, where it is more than a vector, such as (bodies, 3).
     - `method`: a `Method`, or its name in ``testing.METHODS``, such as ``"KahanLi8"``.
-    - `t_eval`: times to be told, in order and within t_span; all lattice points where left out.
+    - `t_eval`: times of the output, in order and within t_span; all lattice points where left out.
       Between lattice points it is the step of the method to that time.
     - `h`: the longest step [time]. `epsilon`, `args`, `newton`: as for ``dvi.integrate``.
     - `events`: one function or several, ``event(t, y)`` or ``event(t, y, args)`` → scalar, written
       with jax.numpy, with SciPy's attributes `terminal` (False, True, or a number of crossings) and
-      `direction` (positive, negative, 0). Two crossings within one step are not seen, and a
-      start on the surface is none. A terminal event cuts what is told, not what is computed: the
-      run goes on to t1 (``dvi.Stop`` ends it).
-    - `shape`: of q, where it is more than a vector: (bodies, 3); that of a problem's q0.
+      `direction` (positive, negative, 0). Two crossings within one step are not seen, and a zero at
+      t0 is none. A terminal event cuts the output, not the computation (``dvi.Stop`` ends it).
 
     **Returns** SciPy's `OptimizeResult` (the base of its OdeResult) with `t`, shape (points,); `y`,
     shape (2n, points); `t_events`, `y_events`, lists, or None without events; `status`, 0 at t1, 1
     at a terminal event, −1 for a failure; `message`, `success`; `sol` None; and ours: `h` = h',
-    `num_steps`, `newton_iterations`, `solution` (the `Solution` behind it). A failure is told and
-    not raised, as in SciPy: `t` and `y` end before it. There is no `nfev`: the right side is
-    not a function that is called a number of times.
+    `num_steps`, `newton_iterations`, `solution` (the `Solution`). A failure raises no error, as in
+    SciPy: `t` and `y` end before it. There is no `nfev`.
 
     **Raises** `TypeError` for arguments of SciPy's that have no meaning on a fixed lattice (rtol,
-    …), each with its reason, and as ``dvi.integrate``; `ValueError` for t_span, t_eval, y0 and h
-    that cannot be meant.
+    …), each with its reason, and as ``dvi.integrate``; `ValueError` for invalid t_span, t_eval, y0
+    and h.
 
     **Accuracy** the order of the method in h. Values are NumPy's: nothing can be differentiated
     through it; take ``dvi.integrate`` for that.

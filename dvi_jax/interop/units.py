@@ -1,7 +1,8 @@
-"""A front door for quantities with units; behind it, numbers."""
+"""Integration of quantities with units."""
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,14 +24,13 @@ class UnitSystem:
     left between them: an H_D that is right in any such system is right in this one.
 
     - `length`, `time`, `mass`: units of astropy, or their names.
-    - `q`, `p`: what positions and momenta are: ``"length"``, ``"angle"``; ``"momentum"``,
-      ``"velocity"`` (unit mass), ``"angular momentum"``, ``"specific angular momentum"``;
-      ``"dimensionless"``; or any unit of that kind.
+    - `q`, `p`: ``"length"``, ``"angle"``; ``"momentum"``, ``"velocity"`` (unit mass), ``"angular
+      momentum"``, ``"specific angular momentum"``; ``"dimensionless"``; or any unit of that kind.
     - `args`: name of a parameter → some unit of its kind, ``{"mu": u.m**3 / u.s**2}``; of nested
-      ones by path, ``"planet.mass"``; a name goes for all that is below it. What is not named is a
-      number without a unit.
+      ones by path, ``"planet.mass"``; a name applies to all that is below it. Others are numbers
+      without a unit.
 
-    It has the units `q`, `p`, `t`, `energy` (p q/t) and `args` of the numbers. `UnitSystem.of`
+    Its `q`, `p`, `t`, `energy` (p q/t) and `args` are the units of the numbers. `UnitSystem.of`
     reads those of a problem of the library.
 
     **Raises** `ImportError` without astropy; `ValueError` for a unit of another kind than length,
@@ -85,8 +85,7 @@ class UnitSystem:
 
     @classmethod
     def of(cls, problem: Problem) -> "UnitSystem":
-        """The units that a problem of the library is written in, read from its `units` and from
-        the brackets of its `parameters`.
+        """The units of a problem of the library: its `units`, and the brackets of `parameters`.
 
         **Raises** `ValueError` for a problem whose units are words, such as "period/2π".
         """
@@ -118,7 +117,7 @@ class UnitSolution:
 
     - `ts`, `qs`, `ps`, `hs`: as of a `Solution`, quantities of astropy.
     - `observed`: numbers in `units`: an energy is ``observed["energy"] * sol.units.energy``.
-    - `units`: the `UnitSystem`. `solution`: the `Solution` behind it, all in numbers.
+    - `units`: the `UnitSystem`. `solution`: the `Solution` in numbers.
     """
 
     ts: Any
@@ -161,33 +160,34 @@ def integrate(
 ) -> UnitSolution:
     r"""One trajectory, from quantities of astropy to quantities of astropy.
 
-    At the door every quantity becomes a number in `units`; the run is that of ``dvi.integrate``,
-    and what comes out of it is given its unit. H_D, W, observables, `Stop` and `Section` see plain
-    numbers, in `units`.
+    Every quantity becomes a number in `units`, ``dvi.integrate`` runs, and its output is given its
+    unit. H_D, W, observables, `Stop` and `Section` receive plain numbers, in `units`.
 
-    - `system`: a `System`; or a problem of the library, whose start and parameters stand in for
-      what is left out, in its own units, which are taken where `units` is left out too.
-    - `q0`, `p0`: quantities of the shape of the start. `h`, `t0` (zero when left out): times.
-    - `num_steps`, and `options`: as for ``dvi.integrate``.
-    - `units`: the `UnitSystem` behind the door.
+    - `system`: a `System`; or a problem of the library, whose initial condition and parameters
+      replace what is left out, in its own units, which are taken where `units` is left out too.
+    - `q0`, `p0`: quantities of the shape of the state. `h`, `t0` (zero when left out): times.
+    - `num_steps`, and `options`: as for ``dvi.integrate``. `units`: the `UnitSystem`.
     - `epsilon`: a number. `args`: pytree; a quantity where `units` names a unit, else a number.
-    - `ts`: times at which states are kept, for ``dvi.Save(ts=...)``, as a quantity.
+    - `ts`: times at which states are saved, for ``dvi.Save(ts=...)``, as a quantity.
 
     **Returns** a `UnitSolution`.
 
     **Raises** `TypeError` for a number where a unit is needed, `ValueError` for a quantity of
-    another kind, with what was seen and what is allowed, for masked values, for parameters that the
-    problem has not, and where `units` and `args` have different names; and as ``dvi.integrate``.
-    `ImportError` without astropy.
+    another kind, for masked values, for parameters that the problem does not have, and where
+    `units` and `args` have different names; and as ``dvi.integrate``. `ImportError` without
+    astropy.
 
     **Accuracy** one rounding for each number that is converted; the same orbit in two systems of
-    units agrees to round-off. Nothing here can be traced: quantities are values. For `jax.grad`,
+    units agrees to round-off. Quantities are values that cannot be traced: for `jax.grad`,
     `jax.jit` and `jax.vmap` call ``dvi.integrate`` on numbers in one system of units.
     """
     u = needed("astropy.units", "interop.integrate")
     problem = system if isinstance(system, Problem) else None
     system = system_of(system)
-    own = _own(problem, required=units is None) if problem is not None else None
+    own = None
+    if problem is not None:  # units that are words will do where others are given
+        with suppress(*[] if units is None else [ValueError]):
+            own = UnitSystem.of(problem)
     called = "interop.UnitSystem(length=u.au, time=u.day, mass=u.Msun, args={...})"
     taken: UnitSystem = expect("units", own if units is None else units, UnitSystem, called)
     save, lattice = options.get("save"), options.get("lattice")
@@ -210,16 +210,6 @@ def integrate(
     arrays = (sol.ts, taken.t), (sol.qs, taken.q), (sol.ps, taken.p), (sol.hs, taken.t)
     with_unit = [u.Quantity(np.asarray(x), unit) for x, unit in arrays]
     return UnitSolution(*with_unit, observed=sol.observed, units=taken, solution=sol)
-
-
-def _own(problem: Problem, required: bool) -> UnitSystem | None:
-    """The units of a problem; None for one whose units are words, unless they are `required`."""
-    try:
-        return UnitSystem.of(problem)
-    except ValueError:
-        if required:
-            raise
-        return None
 
 
 def _filled(

@@ -59,12 +59,12 @@ def given(axes: Any, count: int, what: str) -> list[Any]:
     return found
 
 
-def labels_of(labels: Any, count: int, what: str) -> list[str]:
+def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[str]:
     """`count` labels, empty ones for None. **Raises** `ValueError` for another number of them."""
-    if labels is not None and (isinstance(labels, str) or len(labels) != count):
-        names = 1 if isinstance(labels, str) else len(labels)
-        raise ValueError(f"labels has {names} names for {count} {what}: give a list of them.")
-    return [""] * count if labels is None else [str(label) for label in labels]
+    found = [""] * count if labels is None else [labels] if isinstance(labels, str) else labels
+    if len(found) != count or isinstance(labels, str):
+        raise ValueError(f"{name} has {len(found)} names for {count} {what}: give a list of them.")
+    return [str(label) for label in found]
 
 
 # --- legends and colours ------------------------------------------------------------------------
@@ -78,10 +78,9 @@ def legend(axis: Any, new: bool, extra: Iterable[Any] = (), labelled: bool = Tru
     - `extra`: entries after those of the labelled artists: artists, or texts without a mark.
     """
     handles = axis.get_legend_handles_labels()[0] if labelled else []
-    handles += [
-        Line2D([], [], linestyle="none", label=one) if isinstance(one, str) else one
-        for one in extra
-    ]
+    for one in extra:
+        text = isinstance(one, str)
+        handles.append(Line2D([], [], linestyle="none", label=one) if text else one)
     if not handles:
         return None
     if not new:
@@ -107,9 +106,8 @@ def interval(
     """(low, high, `extend` of a colour bar) of a linear colour scale, never of zero length."""
     known = values[np.isfinite(values)]
     if limits is None:
-        low, high = np.percentile(known, percentiles).tolist() if known.size else (0.0, 1.0)
-    else:
-        low, high = (float(v) for v in limits)
+        limits = np.percentile(known, percentiles) if known.size else (0.0, 1.0)
+    low, high = (float(v) for v in limits)
     if high <= low:
         low, high = low - 0.5, high + 0.5
     return low, high, extend(known, low, high)

@@ -116,7 +116,7 @@ def animate(
     if beside == "phase_portrait":
         scene.mark_phase(figure.add_subplot(grid[1]), orbits, dof, units)
     elif beside == "invariants":
-        scene.mark_invariants(figure, grid[1], orbits, values, change, log, units)
+        scene.mark_invariants(grid[1], orbits, values, change, log, units)
     scene.show(len(times) - 1)
     canvas.draw()  # the layout of the fullest frame is that of all
     figure.set_layout_engine("none")
@@ -254,11 +254,14 @@ class _Scene:
         self.moving.append(move)
 
     def mark_invariants(
-        self, figure: Any, cell: Any, orbits: Any, values: Any, change: str, log: bool, units: Any
+        self, cell: Any, orbits: Any, values: Any, change: str, log: bool, units: Any
     ) -> None:
         """Quantities along time with a line at the moment."""
+        figure = self.axis.figure
         inner = cell.subgridspec(series.panels_of(orbits, values, log), 1)
-        axes = list(inner.subplots(sharex=True, squeeze=False).flat)
+        axes: list[Any] = []
+        for i in range(inner.nrows):
+            axes.append(figure.add_subplot(inner[i], sharex=axes[0] if axes else None))
         series.invariants(orbits, values, change=change, log=log, units=units, ax=axes)
         lines = [axis.axvline(self.times[0], color="#000000", linewidth=1) for axis in axes]
 

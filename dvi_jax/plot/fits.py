@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
 
-from .axes import at_edge, canvas, counted, given, legend
+from .axes import at_edge, canvas, counted, given, labels_of, legend
 from .states import chosen
 from .style import COLOURS, GREY, MARKERS, in_style
 
@@ -49,7 +49,8 @@ def fit_residuals(
     size = 1.0 if fit.has_errors else math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
     rows = {i: np.asarray(fit.whitened[i]) / (size or 1.0) for i in numbers}
     components = max(r.shape[1] for r in rows.values())
-    kept, named = chosen("component", component, components), _named(names, components)
+    kept = chosen("component", component, components)
+    named = labels_of(names, components, "components", "names")
     panels, single = [[i] for i in numbers], len(numbers) <= _PANELS
     panels, new = panels if single else [numbers], axes is None
     axes = _residual_axes(axes, len(panels))
@@ -75,7 +76,10 @@ def fit_residuals(
     axes[(len(panels) - 1) // 2].set_ylabel(f"observed − predicted\n[{unit}]")
     axes[len(panels) - 1].set_xlabel("time t")
     if (single or len(numbers) == 1) and 1 < len(kept) <= len(COLOURS):
-        handles = [Line2D([], [], markeredgewidth=0, label=named[k], **_dot(k)) for k in kept]
+        handles = [
+            Line2D([], [], markeredgewidth=0, label=named[k] or f"component {k}", **_dot(k))
+            for k in kept
+        ]
         if new:
             look: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "columnspacing": 1.0}
             look |= {"handletextpad": 0.1, "borderaxespad": 0.1, "ncols": min(len(kept), 4)}
@@ -126,15 +130,6 @@ def _draw_distribution(axis: Any, r: np.ndarray, furthest: float) -> None:
     axis.set_xlabel("count")
 
 
-def _named(names: Sequence[str] | None, components: int) -> list[str]:
-    """A name for each component."""
-    if names is None:
-        return [f"component {k}" for k in range(components)]
-    if isinstance(names, str) or len(names) != components:
-        raise ValueError(f"names must be {components}, one for each component, got {names!r}.")
-    return [str(name) for name in names]
-
-
 # --- data and model -----------------------------------------------------------------------------
 
 
@@ -168,7 +163,8 @@ def fit_against_data(
     ts = np.asarray(fit.ts[arc])
     seen, model = (np.asarray(x[arc]).reshape(len(ts), -1) for x in (fit.observed, fit.predicted))
     components = seen.shape[1]
-    kept, named = chosen("component", component, components), _named(names, components)
+    kept = chosen("component", component, components)
+    named = labels_of(names, components, "components", "names")
     if component is None and len(kept) > len(COLOURS):
         raise ValueError(
             f"{len(kept)} components are too many for one picture: choose some, "
@@ -186,7 +182,8 @@ def fit_against_data(
     ax, new = canvas(ax, (7.0, 4.0))
     order, curves = np.argsort(fine), curves.reshape(len(fine), -1)
     for k in kept:
-        name = f"{named[k]}: " if components > 1 or names is not None else ""
+        name = named[k] or (f"component {k}" if components > 1 else "")
+        name += ": " if name else ""
         look = _dot(k, 4 if len(ts) < 200 else 2) | {"markerfacecolor": "white", "capsize": 0}
         line = {"color": look["color"], "linewidth": 1.1, "label": f"{name}fit"}
         ax.plot(fine[order], curves[order, k], **line)

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from .._checks import positive, whole
-from .axes import canvas, legend, path, stack
+from .axes import canvas, labels_of, legend, path, stack
 from .states import (
     Lane,
     Looks,
@@ -311,9 +311,7 @@ def view_of(lanes: Sequence[Lane], coordinates: Any, bodies: Any, centre: Any, n
                 f"{count if many else 'none'}, or a point of shape {(dim,)}, got {centre!r}."
             )
         view = view._replace(mark=point[list(axes)])
-    if names is not None and (isinstance(names, str) or len(names) != len(drawn)):
-        raise ValueError(f"names has {len(names)} entries for {len(drawn)} bodies.")
-    return view._replace(bodies=drawn, names=[*(names or [""] * len(drawn))])
+    return view._replace(bodies=drawn, names=labels_of(names, len(drawn), "bodies", "names"))
 
 
 def label_view(axis: Any, view: View, units: Mapping[str, str]) -> None:

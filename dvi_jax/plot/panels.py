@@ -51,10 +51,6 @@ class Grid(NamedTuple):
     def bins(self) -> dict[str, Any]:
         return {place.dim: place.bins for place in self.places}
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(len(place.centres) for place in self.places)
-
 
 def arrange(
     data: Any,
@@ -80,11 +76,11 @@ def arrange(
     over = (over,) if isinstance(over, str) else tuple(over)
     roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in over}}
     taken: dict[str, str] = {}
-    for role, name in roles.items():
-        dim = name if name is None else dim_of(data, name)
+    named = {role: dim_of(data, name) for role, name in roles.items() if name is not None}
+    for role, dim in named.items():
         if dim in taken:
             raise ValueError(f"{role} and {taken[dim]} are both along {dim!r}: name another.")
-        taken |= {dim: role} if dim is not None else {}
+        taken[dim] = role
     made = made or {}
     gone = [dim_of(data, name) for name, stand_in in made.items() if stand_in is None]
     left = [str(d) for d in data.dims if d not in taken and d not in gone]

@@ -82,13 +82,12 @@ def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
         costs, errors = (np.asarray(x, float) for x in pair)
     except (TypeError, ValueError):
         raise ValueError(f"{name!r} must be (costs, errors), two arrays, got {pair!r}.") from None
-    if costs.ndim != 1 or costs.shape != errors.shape or not len(costs):
+    positive = bool((np.isfinite(costs) & (costs > 0)).all())
+    if costs.ndim != 1 or costs.shape != errors.shape or not len(costs) or not positive:
         raise ValueError(
-            f"{name!r} must have costs and errors of one shape (runs,), got {costs.shape} and "
-            f"{errors.shape}."
+            f"{name!r} must have costs and errors of one shape (runs,), and the costs must be "
+            f"positive: got {costs.shape} and {errors.shape}, costs {costs}."
         )
-    if not (np.isfinite(costs) & (costs > 0)).all():
-        raise ValueError(f"the costs of {name!r} must be positive: got {costs}.")
     order = np.argsort(costs, kind="stable")
     return costs[order], np.abs(errors[order])
 

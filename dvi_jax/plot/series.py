@@ -112,16 +112,14 @@ def invariants(
         axis.set_ylabel(label, fontsize=9 if count > 1 else None)
         if log:
             axis.set_yscale("log")
-            if change == "relative" and axis.get_ylim()[0] < _NEAR_ROUNDING:
-                _rounding(axis)
+        if log and change == "relative" and axis.get_ylim()[0] < _NEAR_ROUNDING:
+            _rounding(axis)
     _finish(axes, named("time t", units.get("t")), title)
     looks.colour_bar(axes, colour_label)
-    from_zero = [
-        f"{one.name}: {one.from_zero} of {len(ts)} orbits start at 0"
-        for one in series
-        if one.from_zero
-    ]
-    notes = [*looks.entries(), *counted({"values exactly 0": zeros}), *from_zero]
+    notes = [*looks.entries(), *counted({"values exactly 0": zeros})]
+    for one in series:
+        texts = counted({f"of {len(ts)} orbits start at 0": one.from_zero})
+        notes += [f"{one.name}: {text}" for text in texts]
     legend(axes[0], new, notes + troubles(lanes))
     return axes[0] if count == 1 else np.asarray(axes)
 

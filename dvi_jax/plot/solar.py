@@ -73,7 +73,7 @@ def ephemeris_comparison(
         left, right = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
         below = figure.add_subplot(grid[1, 1], sharex=right)
     else:
-        left, right, below = given(ax, 3, "for the errors, the perihelion and what its line leaves")
+        left, right, below = given(ax, 3, "for the errors, the perihelion and its residual")
     for i, name in enumerate(names):
         x, y = _upper_envelope(years, errors[:, i])
         look: Any = {"color": COLOURS[i % len(COLOURS)], "linewidth": 1.3, "marker": MARKERS[i]}
