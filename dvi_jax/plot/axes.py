@@ -59,6 +59,13 @@ def given(axes: Any, count: int, what: str) -> list[Any]:
     return found
 
 
+def check_shapes(fits: Any, wanted: str, **arrays: np.ndarray) -> None:
+    """**Raises** `ValueError` with what is wanted and with the shapes, unless they fit."""
+    if not fits:
+        got = ", ".join(f"{name} of shape {x.shape}" for name, x in arrays.items())
+        raise ValueError(f"{wanted}: got {got}.")
+
+
 def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[str]:
     """`count` labels, empty ones for None. **Raises** `ValueError` for another number of them."""
     found = [""] * count if labels is None else [labels] if isinstance(labels, str) else labels

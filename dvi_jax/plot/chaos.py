@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._checks import one_of
-from .axes import canvas, counted, guide, labels_of, legend
+from .axes import canvas, check_shapes, counted, guide, labels_of, legend
 from .series import draw_series
 from .states import looks_of
 from .style import GREY, in_style, named, signed
@@ -121,11 +121,11 @@ def _lines_of(ts: Any, values: Any) -> tuple[list[tuple[np.ndarray, np.ndarray, 
     t, v = np.asarray(getattr(ts, "ts", ts)), np.asarray(values)
     n, several = t.shape[-1] if t.ndim else 0, t.ndim > 1
     numbers = v.dtype.kind in "iuf" and v.ndim and n and v.shape[-1] in (n, n - 1)
-    if not numbers or (several and t.shape[:-1] != v.shape[: t.ndim - 1]):
-        raise ValueError(
-            f"an indicator has one number for each time or step, shape (..., {n}) or (..., "
-            f"{n - 1}): got ts of shape {t.shape} and values of shape {v.shape}."
-        )
+    fits = numbers and not (several and t.shape[:-1] != v.shape[: t.ndim - 1])
+    wanted = (
+        f"an indicator has one number for each time or step, shape (..., {n}) or (..., {n - 1})"
+    )
+    check_shapes(fits, wanted, ts=t, values=v)
     start = t[..., 0] if n > v.shape[-1] else np.zeros(t.shape[:-1])
     t = t[..., n - v.shape[-1] :]
     if several:

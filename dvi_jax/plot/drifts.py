@@ -14,6 +14,7 @@ from .axes import (
     canvas,
     cell_edges,
     cells,
+    check_shapes,
     counted,
     flat_cells,
     guide,
@@ -62,10 +63,9 @@ def balance(
         )
     given = {"ts": ts, "drift": drift, **causes}
     arrays = {name: np.asarray(x, float) for name, x in given.items()}
-    shapes = {name: x.shape for name, x in arrays.items()}
+    fits = np.shape(ts) == (np.size(ts),) and len({x.shape for x in arrays.values()}) == 1
+    check_shapes(fits, "a balance has one number of each kind a step, shape (S,)", **arrays)
     t, rate = arrays.pop("ts"), arrays.pop("drift")
-    if t.ndim != 1 or not len(t) or len(set(shapes.values())) > 1:
-        raise ValueError(f"balance takes one number of each kind a step, shape (S,), got {shapes}.")
     if cumulative:  # the sum over the steps before each time
         rate, *summed = (
             np.append(0.0, np.cumsum(x[:-1] * np.diff(t))) for x in (rate, *arrays.values())

@@ -168,15 +168,16 @@ def _tracks(
     if math.prod(one_shape(lanes)) == 1 and coordinates is None and names is None:
         if any(lane.ps is None for lane in lanes):
             raise TypeError("a film of one degree of freedom needs momenta: (ts, qs, ps).")
-        planes = [list(lane.plane((0,) * len(lane.shape))) for lane in lanes]
-        rows = zip(range(len(lanes)), planes, looks_of(len(lanes)).colours, lanes, strict=True)
-        return [_Track(i, plane, colour, lane.label) for i, plane, colour, lane in rows], None
+        place, colours = (0,) * len(lanes[0].shape), looks_of(len(lanes)).colours
+        return [
+            _Track(i, list(lane.plane(place)), colours[i], lane.label)
+            for i, lane in enumerate(lanes)
+        ], None
     view = view_of(lanes, coordinates, bodies, centre, names)
-    numbers = {id(lane): i for i, lane in enumerate(lanes)}
     colours = looks_of(len(lanes) if len(lanes) > 1 else len(view.bodies)).colours
     return [
-        _Track(numbers[id(lane)], view.of(lane.qs, k), colours[i], name)
-        for lane, k, i, name in view.lines(lanes)
+        _Track(i, view.of(lanes[i].qs, k), colours[colour], name)
+        for i, k, colour, name in view.lines(lanes)
     ], view
 
 
@@ -338,6 +339,8 @@ class _GifWriter(AbstractMovieWriter):
         self.frames.append(drawn.quantize(palette=self.palette, dither=_PLAIN))
 
     def finish(self) -> None:
+        if not self.frames:  # the first could not be drawn
+            return
         first, *others = self.frames
         delays = self.delays.astype(int).tolist()
         look = {"save_all": True, "append_images": others, "duration": delays, "loop": 0}

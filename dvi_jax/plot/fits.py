@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
 
-from .axes import at_edge, canvas, counted, given, labels_of, legend
+from .axes import at_edge, canvas, check_shapes, counted, given, labels_of, legend
 from .states import chosen
 from .style import COLOURS, GREY, MARKERS, in_style
 
@@ -171,11 +171,11 @@ def fit_against_data(
             f"component={kept[:3]}, say."
         )
     fine, curves = (np.asarray(x, float) for x in ((ts, model) if curve is None else curve))
-    if fine.ndim != 1 or curves.shape[:1] != fine.shape or curves[:1].size != components:
-        raise ValueError(
-            f"curve must be (times, values) of shapes (T,) and (T, ...) with {components} "
-            f"components, got {fine.shape} and {curves.shape}."
-        )
+    wanted = (
+        f"curve must be (times, values), shapes (T,) and (T, ...), with {components} components"
+    )
+    fits = fine.ndim == 1 and curves.shape[:1] == fine.shape and curves[:1].size == components
+    check_shapes(fits, wanted, times=fine, values=curves)
     found = math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
     errors = np.asarray(fit.errors[arc]).reshape(seen.shape) if fit.has_errors else found
     errors = np.broadcast_to(errors, seen.shape)

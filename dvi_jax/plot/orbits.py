@@ -1,6 +1,5 @@
 """Pictures of states: phase portraits, orbits in the plane and in space."""
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -238,8 +237,9 @@ def orbit(
         raise ValueError("colour distinguishes orbits of a batch, and there is one orbit.")
     looks = looks_of(len(lanes) if len(lanes) > 1 else len(view.bodies), colour)
     axis, new = canvas(ax, (5.4, 5.0), len(view.coordinates) == 3)
-    for lane, k, i, name in view.lines(lanes):
-        _draw_orbit(axis, lane._replace(label=name), view.of(lane.qs, k), looks, i, dots)
+    for i, k, colour_number, name in view.lines(lanes):
+        lane = lanes[i]._replace(label=name)
+        _draw_orbit(axis, lane, view.of(lane.qs, k), looks, colour_number, dots)
     if view.mark is not None:
         axis.plot(*([x] for x in view.mark), label=view.mark_name, **STAR)
     label_view(axis, view, units or {})
@@ -270,14 +270,14 @@ class View(NamedTuple):
             x = x - qs[:, self.about]
         return [x[:, c] for c in self.coordinates]
 
-    def lines(self, lanes: Sequence[Lane]) -> Iterator[tuple[Lane, int, int, str]]:
-        """(orbit, number of the drawn body, number of the colour, name) of every line.
+    def lines(self, lanes: Sequence[Lane]) -> Iterator[tuple[int, int, int, str]]:
+        """(number of the orbit, of the drawn body, of the colour; name) of every line.
 
         A colour is an orbit of a batch, else a body.
         """
         several = len(lanes) > 1
-        for (i, lane), k in itertools.product(enumerate(lanes), range(len(self.bodies))):
-            yield lane, k, i if several else k, self.names[k] or (lane.label if k == 0 else "")
+        for i, k in np.ndindex(len(lanes), len(self.bodies)):
+            yield i, k, i if several else k, self.names[k] or (lanes[i].label if k == 0 else "")
 
 
 def view_of(lanes: Sequence[Lane], coordinates: Any, bodies: Any, centre: Any, names: Any) -> View:

@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgba_array
 
 from .._checks import whole
 from .._results import status_name
-from .axes import at_edge, canvas, counted, labels_of, legend
+from .axes import at_edge, canvas, check_shapes, counted, labels_of, legend
 from .states import component, looks_of
 from .style import COLOURS, GREY, in_style
 
@@ -158,11 +158,9 @@ def _points_of(crossings: Any) -> _Points:
         )
     ((one, status),) = found
     qs, ps, ts = (np.asarray(v) for v in (one.qs, one.ps, one.ts))
-    if ts.ndim == 0 or qs.shape[: ts.ndim] != ts.shape or qs.shape != ps.shape:
-        raise ValueError(
-            "crossings must have ts of shape (..., room) and qs, ps of shape (..., room, *state), "
-            f"got {ts.shape}, {qs.shape} and {ps.shape}."
-        )
+    fits = ts.ndim and qs.shape[: ts.ndim] == ts.shape and qs.shape == ps.shape
+    wanted = "crossings have ts of shape (..., room) and qs, ps of shape (..., room, *state)"
+    check_shapes(fits, wanted, ts=ts, qs=qs, ps=ps)
     *lead, room = ts.shape
     shape = (math.prod(lead), room, *(qs.shape[ts.ndim :] or (1,)))
     counts, reasons = np.ravel(np.asarray(one.count)), status
@@ -248,11 +246,9 @@ def bifurcation(
         values = np.asarray(crossings, float)
         there, failed, notes = np.isfinite(values), np.zeros(len(values), bool), []
         label = y if isinstance(y, str) and y != "q[-1]" else ""
-    if parameter.ndim != 1 or values.ndim != 2 or len(values) != len(parameter):
-        raise ValueError(
-            f"bifurcation takes a parameter of shape (runs,) and crossings of as many runs, got "
-            f"{parameter.shape} and {values.shape[:1]} runs."
-        )
+    wanted = "a bifurcation has a parameter of shape (runs,) and crossings of as many runs"
+    fits = parameter.ndim == 1 and values.ndim == 2 and len(values) == len(parameter)
+    check_shapes(fits, wanted, parameter=parameter, crossings=values)
     skip = whole("skip", skip, 0)
     if log and not (parameter > 0).all():
         raise ValueError("a logarithmic axis takes positive parameters: leave out log=True.")

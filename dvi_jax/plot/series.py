@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._checks import one_of
-from .axes import canvas, counted, envelope, labels_of, legend, stack
+from .axes import canvas, check_shapes, counted, envelope, labels_of, legend, stack
 from .states import each_state, lanes_of, looks_of, troubles
 from .style import COLOURS, CROSS, DASHES, GREY, in_style, named
 
@@ -199,11 +199,10 @@ def _of_every_orbit(name: str, v: Any, orbits: Any, lanes: Sequence[Any]) -> lis
         return [np.asarray(x) for x in v]
     ts = np.asarray(orbits[0] if isinstance(orbits, tuple) else getattr(orbits, "ts", orbits))
     v, (*lead, n) = np.asarray(v), ts.shape
-    if v.shape[: ts.ndim] not in ((*lead, n), (*lead, n - 1)):
-        raise ValueError(
-            f"{name!r} must have one value for each time, shape {(*lead, n)}, or for each step, "
-            f"{(*lead, n - 1)}, and possibly more axes after these; got {v.shape}."
-        )
+    shapes = (*lead, n), (*lead, n - 1)
+    wanted = f"{name!r} must have one value for each time, shape {shapes[0]}, or for each step, "
+    wanted += f"{shapes[1]}, and possibly more axes after these"
+    check_shapes(v.shape[: ts.ndim] in shapes, wanted, values=v)
     return list(v.reshape(-1, *v.shape[len(lead) :]))
 
 
@@ -319,9 +318,6 @@ def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any
 
 def _pair(ts: Any, values: Any, label: str) -> tuple[np.ndarray, np.ndarray]:
     t, v = np.asarray(ts), np.asarray(values)
-    if t.ndim != 1 or v.shape != t.shape:
-        raise ValueError(
-            f"{label!r} must have one number for each time, shape (S,): got ts of shape {t.shape} "
-            f"and values of shape {v.shape}."
-        )
+    wanted = f"{label!r} must have one number for each time, shape (S,)"
+    check_shapes(t.ndim == 1 and v.shape == t.shape, wanted, ts=t, values=v)
     return t, v

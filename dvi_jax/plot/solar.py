@@ -7,7 +7,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from .axes import given, legend, stack
+from .axes import check_shapes, given, legend, stack
 from .style import COLOURS, MARKERS, STAR, in_style
 
 
@@ -20,11 +20,9 @@ def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
     **Returns** the `Axes`, shape (2,).
     """
     positions = np.asarray(positions)
-    if positions.ndim != 3 or positions.shape[1:] != (len(names), 3):
-        raise ValueError(
-            f"planet_orbits takes positions of shape (times, {len(names)}, 3), one for each name, "
-            f"got {positions.shape}."
-        )
+    wanted = f"planets have positions of shape (times, {len(names)}, 3), one for each name"
+    fits = positions.ndim == 3 and positions.shape[1:] == (len(names), 3)
+    check_shapes(fits, wanted, positions=positions)
     axes, new = stack(ax, 2, "inner and outer planets", (9.6, 5.4), ncols=2)
     groups = range(len(names))[:4], range(len(names))[4:]
     mark: Any = {"markersize": 7, "markeredgecolor": "black", "markeredgewidth": 0.7}

@@ -8,7 +8,16 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.patches import Patch
 
-from .axes import canvas, cell_edges, cells, counted, interval, labels_of, legend
+from .axes import (
+    canvas,
+    cell_edges,
+    cells,
+    check_shapes,
+    counted,
+    interval,
+    labels_of,
+    legend,
+)
 from .states import looks_of
 from .style import COLOURS, DASHES, GREY, HATCH, MARKERS, PALE, SHADES, in_style, named, signed
 
@@ -46,11 +55,9 @@ def spectrum(
             raise TypeError("spectrum takes frequencies and amplitudes, or what has both.")
         frequencies, amplitudes = frequencies.frequencies, frequencies.amplitudes
     w, A = np.asarray(frequencies), np.abs(np.asarray(amplitudes))
-    if w.shape != A.shape or w.ndim == 0 or w.size == 0 or w.dtype.kind not in "iuf":
-        raise ValueError(
-            f"spectrum takes real frequencies and amplitudes of one shape (count,) or (signals, "
-            f"count), got {w.shape} of {w.dtype} and {A.shape}."
-        )
+    wanted = f"real frequencies ({w.dtype}) and amplitudes have one shape, (..., count)"
+    fits = w.shape == A.shape and w.ndim and w.size and w.dtype.kind in "iuf"
+    check_shapes(fits, wanted, frequencies=w, amplitudes=A)
     w, A = w.reshape(-1, w.shape[-1]), A.reshape(-1, A.shape[-1])
     names, colours = labels_of(labels, len(w), "signals"), looks_of(len(w)).colours
     units, markers = units or {}, itertools.cycle(MARKERS)
@@ -104,14 +111,10 @@ def frequency_map(
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     D = None if diffusion is None else np.asarray(diffusion, float)
-    shapes = {"x": x.shape, "y": y.shape} | ({} if D is None else {"diffusion": D.shape})
+    arrays = {"x": x, "y": y} | ({} if D is None else {"diffusion": D})
     on_grid = D is not None and x.ndim == y.ndim == 1 and D.shape == (len(x), len(y))
-    if not on_grid and len(set(shapes.values())) > 1:
-        got = ", ".join(f"{name} of shape {shape}" for name, shape in shapes.items())
-        raise ValueError(
-            "frequency_map takes x, y and diffusion of one shape, or diffusion of shape (len(x), "
-            f"len(y)): got {got}."
-        )
+    wanted = "x, y and diffusion have one shape, or diffusion has the shape (len(x), len(y))"
+    check_shapes(on_grid or len({a.shape for a in arrays.values()}) == 1, wanted, **arrays)
     if on_grid and len(resonances):
         raise ValueError(
             "a resonance is a line among frequencies, and x and y are coordinates of starts here: "

@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 
 from .._checks import whole
-from .axes import counted, interval, labels_of
+from .axes import check_shapes, counted, interval, labels_of
 from .style import COLOURS, CROSS, DASHES, PALE, SHADES, named
 
 _GOOD = ("", "successful", "stopped")
@@ -99,15 +99,14 @@ def _lanes_of_one(one: Any) -> list[Lane]:
         raise TypeError(f"orbits must be real numbers, got an array of {bad[0]}.")
     if ts.ndim and states[0].shape == ts.shape:  # a state that is one number
         states = [x[..., None] for x in states]
-    shapes = [x.shape for x in states]
-    fits = shapes[0][: ts.ndim] == ts.shape and len(shapes[0]) > ts.ndim and len(set(shapes)) == 1
-    if not fits or not ts.ndim or not ts.shape[-1]:
-        raise ValueError(
-            "orbits must be ts of shape (..., S), qs and ps of shape (..., S, n) or (..., S, "
-            f"bodies, dim), with the same axes in front: got {ts.shape}, "
-            f"{' and '.join(map(str, shapes))}. Times that a batch shares: np.broadcast_to(ts, "
-            "(batch, S))."
-        )
+    fits = all(x.shape[: ts.ndim] == ts.shape and x.ndim > ts.ndim for x in states)
+    wanted = (
+        "orbits must be ts of shape (..., S), qs and ps of shape (..., S, n) or (..., S, bodies, "
+        "dim), with the same axes in front (times that a batch shares: np.broadcast_to(ts, "
+        "(batch, S)))"
+    )
+    fits = fits and ts.ndim and ts.shape[-1] and len({x.shape for x in states}) == 1
+    check_shapes(fits, wanted, ts=ts, **dict(zip(("qs", "ps"), states, strict=False)))
     lead, last = ts.shape[:-1], (math.prod(ts.shape[:-1]), ts.shape[-1])
     names = np.broadcast_to(np.asarray(getattr(one, "status", ""), object), lead).ravel()
     qs, ps = [
