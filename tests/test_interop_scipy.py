@@ -236,7 +236,7 @@ def test_an_event_keeps_values_of_its_own():
     for c, states in zip((0.0, 0.3), found.y_events, strict=True):
         np.testing.assert_allclose(states[:, 0], [c], rtol=0, atol=1e-9)
     named = [lambda t, y, args: y, lambda t, y, args=None: y, lambda t, y, *args: y]
-    assert [_event(e).g.with_args for e in [*closures, *named]] == [False] * 2 + [True] * 3
+    assert [_event(e).with_args for e in [*closures, *named]] == [False] * 2 + [True] * 3
 
 
 def test_habits_of_numpy_and_units():

@@ -210,7 +210,7 @@ def test_a_mistyped_name_lets_no_bare_number_through():
         weights([1, 2] * u.kg, k=5.0, kinds={"kk": u.N / u.m})
     with pytest.raises(ValueError, match=r"'J22', and oblate_kepler has no such.*mu, R, J2"):
         interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args={"J22": 0.0})
-    with pytest.raises(TypeError, match="mapping from name to value, got list"):
+    with pytest.raises(TypeError, match="mapping from name to value; got list"):
         interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args=[0.0])
 
 

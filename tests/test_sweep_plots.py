@@ -501,7 +501,7 @@ THREE = xr.DataArray(np.ones((2, 3, 4)), dims=("a", "b", "c"), name="v")
         (lambda: plot.sweep_map(THREE[0], pixels=3), ValueError, "pixels must be"),
         (lambda: plot.sweep_map(THREE[0], limits=(2, 1)), ValueError, "two rising numbers"),
         (lambda: plot.sweep_map(-THREE[0], log=True), ValueError, "no place for the 12 pixels"),
-        (lambda: plot.sweep_map(np.ones(3)), TypeError, "takes an xarray.DataArray.*ndarray"),
+        (lambda: plot.sweep_map(np.ones(3)), TypeError, "must be an xarray.DataArray"),
         (lambda: plot.sweep_map(with_status()), TypeError, "one variable.*drift, status"),
         (lambda: plot.sweep_map(THREE[0] + 1j), TypeError, "real numbers, got .* complex128"),
         (
@@ -522,7 +522,7 @@ THREE = xr.DataArray(np.ones((2, 3, 4)), dims=("a", "b", "c"), name="v")
         (lambda: plot.failure_map(drift().to_dataset()), ValueError, "has no status: .*drift"),
         (lambda: plot.failure_map(drift()), ValueError, "flag_values and flag_meanings"),
         (lambda: plot.slope_map(drift(), "h"), ValueError, "no dimension 'h'"),
-        (lambda: plot.slope_map(THREE, "a"), ValueError, "'a' has no values to take a slope"),
+        (lambda: plot.slope_map(THREE, "a"), ValueError, "'a' has no numbers to take a slope"),
         (lambda: plot.slope_map(drift(), facet="epsilon"), ValueError, "nothing of it for a facet"),
         (lambda: plot.slope_map(drift()[:1]), ValueError, "two or more positive values"),
         (

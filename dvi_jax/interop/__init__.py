@@ -1,7 +1,7 @@
-"""Good company: diffrax, REBOUND, SciPy, astropy and ArviZ beside the package.
+"""Interoperability with diffrax, REBOUND, SciPy, astropy and ArviZ.
 
-A leaf: ``from dvi_jax import interop``. The other package is imported by the function that needs
-it, when it is called; without it there is an `ImportError` with the line that installs it.
+``from dvi_jax import interop``. A function imports the other package when it is called; without it
+there is an `ImportError` with the line that installs it.
 """
 
 from .diffrax_side import (

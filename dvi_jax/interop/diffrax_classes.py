@@ -49,12 +49,11 @@ class DiscreteMap(diffrax.AbstractSolver):
         del solver_state, made_jump
         q0, p0 = y0
         term, direction = unwrapped(terms)
-        # One step by the front door: the arithmetic and the verdict are those of `integrate`.
-        taken = dvi.integrate(
-            term.system, q0, p0, t0=direction * t0, h=direction * (t1 - t0), num_steps=1,
-            epsilon=term.epsilon, args=args, method=self.method, newton=self.newton,
-            save=dvi.Save(final=True), adjoint=dvi.Direct(), throw=False,
-        )  # fmt: skip
+        # One step of `integrate`, whose arithmetic and status it therefore has.
+        step = {"t0": direction * t0, "h": direction * (t1 - t0), "num_steps": 1, "args": args}
+        how: Any = {"method": self.method, "newton": self.newton, "adjoint": dvi.Direct()}
+        how |= {"epsilon": term.epsilon, "save": dvi.Save(final=True), "throw": False}
+        taken = dvi.integrate(term.system, q0, p0, **step, **how)
         y1 = type(y0)((taken.qs[-1], taken.ps[-1]))  # a pair, of diffrax's kind: tuple or list
         slopes = {
             name: terms.prod(terms.vf(t, y, args), terms.contr(t0, t1))
@@ -67,8 +66,10 @@ class DiscreteMap(diffrax.AbstractSolver):
 
 
 def unwrapped(terms: Any) -> tuple[DiscreteTerm, Any]:
-    """The term itself and the direction of time, 1 or −1: diffrax always runs forwards, through a
-    wrapper that tells the term −t where t1 < t0."""
+    """The term itself and the direction of time, 1 or −1.
+
+    diffrax always runs forwards, through a wrapper that gives the term −t where t1 < t0.
+    """
     if isinstance(terms, DiscreteTerm):
         return terms, 1
     return terms.term, terms.direction

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import dvi_jax as dvi
 
 from ..engine.names import both_names
-from ..engine.quantities import refuse_unit_or_mask
-from .extras import needed, system_of
-from .fields import warn_without_effect
+from .extras import expect, needed
+from .fields import checked
 
 if TYPE_CHECKING:
     from .diffrax_classes import DiscreteMap, DiscreteTerm
@@ -29,10 +28,7 @@ def diffrax_term(system: Any, epsilon: Any = 0.0) -> "DiscreteTerm":
     needed("diffrax", "interop.diffrax_term")
     from .diffrax_classes import DiscreteTerm
 
-    system = system_of(system, "diffrax_term")
-    refuse_unit_or_mask("epsilon", epsilon)
-    warn_without_effect(system, epsilon)
-    return DiscreteTerm(system, jnp.asarray(epsilon, float))
+    return DiscreteTerm(checked(system, epsilon), jnp.asarray(epsilon, float))
 
 
 @both_names
@@ -49,29 +45,26 @@ def diffrax_solver(
 
     - `method`: any `Method`. `newton`: how implicit steps are solved.
 
-    **Terms**: `diffrax_term` alone. A `diffrax.ODETerm` has no H_D and is refused by diffrax.
+    **Terms**: `diffrax_term` alone; diffrax rejects a `diffrax.ODETerm`, which has no H_D.
 
-    **Step sizes**: ``diffrax.ConstantStepSize()`` or ``diffrax.StepTo(ts)``. There is no estimate
-    of the error, so that diffrax refuses its adaptive controllers: a step that depends on the state
-    would break the structure; see ``dvi.TimeTransformed``.
+    **Step sizes**: ``diffrax.ConstantStepSize()`` or ``diffrax.StepTo(ts)``. A step that depends on
+    the state would break the structure (see ``dvi.TimeTransformed``): there is no error estimate,
+    and diffrax rejects its adaptive controllers.
 
     **Dense output** (``SaveAt(ts=…)``, ``SaveAt(dense=True)``, events): the cubic with the values
-    and slopes of the continuous limit at both ends of a step, of error O(h⁴) beside the method's,
-    and not symplectic. For states at times of the method's own order take ``dvi.Save(ts=...)``.
+    and slopes of the continuous limit at both ends of a step, of error O(h⁴) in addition to the
+    method's, and not symplectic. ``dvi.Save(ts=...)`` has the method's own order.
 
     **Failures**: `not_converged` becomes diffrax's `nonlinear_max_steps_reached`, `not_finite` its
     `nonfinite`, any other its `nonlinear_divergence`; with ``throw=True`` diffrax raises.
 
-    **Gradients**: by diffrax's `RecursiveCheckpointAdjoint`, `DirectAdjoint` and `ForwardMode`,
-    those of the discrete map. `BacksolveAdjoint` solves an equation of its own and is refused.
+    **Gradients**: by `RecursiveCheckpointAdjoint`, `DirectAdjoint` and `ForwardMode`, those of the
+    discrete map. `BacksolveAdjoint` solves another equation and is rejected.
 
     **Raises** `ImportError` without diffrax; `TypeError` for what is no method or root solver.
     """
-    if not isinstance(method, dvi.Method) or not isinstance(newton, dvi.RootSolver):
-        raise TypeError(
-            "diffrax_solver takes method=, such as dvi.Strang(), and newton=, such as "
-            f"dvi.Newton(); got {method!r} and {newton!r}."
-        )
+    expect("method", method, dvi.Method, "a method such as dvi.Strang()")
+    expect("newton", newton, dvi.RootSolver, "a root solver such as dvi.Newton()")
     needed("diffrax", "interop.diffrax_solver")
     from .diffrax_classes import DiscreteMap
 

@@ -25,17 +25,28 @@ def needed(package: str, by: str) -> Any:
         ) from None
 
 
-def system_of(what: Any, by: str) -> dvi.System:
+def expect(name: str, value: Any, kind: Any, called: str) -> Any:
+    """The value, an instance of a class that the message calls `called`.
+
+    **Raises** `TypeError` for anything else.
+    """
+    if not isinstance(value, kind):
+        seen = value.__name__ if isinstance(value, type) else f"{value!r:.100}"
+        raise TypeError(f"{name} must be {called}; got {type(value).__name__}: {seen}")
+    return value
+
+
+def system_of(what: Any) -> dvi.System:
     """The `System` that is meant by a `System` or a `Problem`.
 
     **Raises** `TypeError` for anything else.
     """
     if isinstance(what, Problem):
         return what.system
-    if isinstance(what, dvi.System):
-        return what
-    raise TypeError(
-        f"{by} takes a dvi.System or a problem of dvi_jax.systems, got {type(what).__name__}. "
-        "Wrap a discrete Hamiltonian, dvi.System(H_D, force=W), or a continuous one, "
-        "dvi.System(dvi.discretise(H))."
+    return expect(
+        "system",
+        what,
+        dvi.System,
+        "a dvi.System or a problem of dvi_jax.systems: wrap a discrete Hamiltonian, "
+        "dvi.System(H_D, force=W), or a continuous one, dvi.System(dvi.discretise(H))",
     )

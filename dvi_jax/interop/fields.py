@@ -32,19 +32,14 @@ def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], A
     **Accuracy** round-off. ``dvi.from_lagrangian`` divides by t1 − t0 and has no H_D(t, t, …): its
     field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
     """
-    system = system_of(system, "vector_field")
-    refuse_unit_or_mask("epsilon", epsilon)
-    warn_without_effect(system, epsilon)
+    system = checked(system, epsilon)
 
     def field(t, y, args):
         q, p = as_pair(y)
-        t = jnp.asarray(t, q.dtype)
-        strength = jnp.asarray(epsilon, q.dtype)
-        position, momentum = jax.grad(system.hamiltonian, argnums=(2, 3))(
-            t, t, q, p, strength, args
-        )
-        force = system.disturbing_force(t, t, q, p, strength, args)
-        rates = momentum, -position + jnp.asarray(force, q.dtype)
+        t, strength = (jnp.asarray(x, q.dtype) for x in (t, epsilon))
+        at = t, t, q, p, strength, args
+        position, momentum = jax.grad(system.hamiltonian, argnums=(2, 3))(*at)
+        rates = momentum, -position + jnp.asarray(system.disturbing_force(*at), q.dtype)
         return type(y)(rates) if isinstance(y, list) else rates
 
     return field
@@ -66,17 +61,16 @@ def as_pair(y: Any) -> tuple[Any, Any]:
     return q, p
 
 
-def warn_without_effect(system: dvi.System, epsilon: Any) -> None:
-    """As `integrate` warns, where the value is known."""
-    if system.force is not None or system.perturbation is not None or system.slow_time:
-        return
+def checked(system: Any, epsilon: Any) -> dvi.System:
+    """The system; warns, as `integrate` does, where ε has no effect and its value is known."""
+    system = system_of(system)
+    refuse_unit_or_mask("epsilon", epsilon)
     try:
         value = float(epsilon)
     except (TypeError, jax.errors.ConcretizationTypeError):  # it stands for values to come
-        return
-    if value != 0:
-        warnings.warn(
-            f"epsilon = {value:g} has no effect: the system has neither a force nor a "
-            "perturbation.",
-            stacklevel=3,
-        )
+        value = 0.0
+    used = system.force is not None or system.perturbation is not None or system.slow_time
+    if value != 0 and not used:
+        text = f"epsilon = {value:g} has no effect: the system has no force and no perturbation."
+        warnings.warn(text, stacklevel=3)
+    return system

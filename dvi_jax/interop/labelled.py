@@ -1,7 +1,7 @@
 """Results with labels: datasets of xarray, and what ArviZ takes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,13 +10,11 @@ import numpy as np
 import dvi_jax as dvi
 
 from ..engine.quantities import refuse_unit_or_mask
-from .extras import needed
+from .extras import expect, needed
 
-_STATUSES = (
-    "successful", "not_converged", "not_finite", "bad_step_size", "no_root", "out_of_range",
-    "stopped", "not_reached",
-)  # fmt: skip
-"""Names of `RESULTS`, by the number that stands for each in a dataset, as in that of a sweep."""
+_STATUSES = ("successful", "not_converged", "not_finite", "bad_step_size")
+_STATUSES += ("no_root", "out_of_range", "stopped", "not_reached")
+"""Names of `RESULTS`, by the number of each in a dataset, as in that of a sweep."""
 
 _TAKEN = ("t", "q", "p", "h", "status", "time", "save", "step")
 
@@ -60,66 +58,66 @@ def to_xarray(
     fit, an `observe` of another structure, and names that are taken; `TypeError` for what is no
     solution, and for coords with units (say them in `units`).
     """
-    if not isinstance(solution, dvi.Solution):
-        raise TypeError(
-            f"to_xarray takes a dvi.Solution, got {type(solution).__name__}. (A sweep has its own, "
-            "result.to_xarray(); of a UnitSolution take .solution, and units=.)"
-        )
     import xarray as xr
 
+    hint = "(a sweep has its own to_xarray(); of a UnitSolution take .solution, and units=)"
+    expect("solution", solution, dvi.Solution, f"a dvi.Solution {hint}")
     dims = (dims,) if isinstance(dims, str) else tuple(dims)
     if solution.result.is_traced():
         raise TypeError("to_xarray takes values: call it outside of jit, vmap and grad.")
     ts, hs = np.asarray(solution.ts), np.asarray(solution.hs)
-    _check_dims(dims, ts.shape)
-    lead, count = ts.shape[: len(dims)], ts.shape[-1]
+    *batch, count = ts.shape
+    if len(dims) != len(batch):
+        raise ValueError(
+            f"the batch has {len(batch)} dimensions, of sizes {batch}, and dims names {len(dims)}: "
+            f"{dims}. Name each, in the order of the vmaps from the outermost."
+        )
+    if taken := [d for d in dims if d in _TAKEN or dims.count(d) > 1]:
+        raise ValueError(f"the dimension {taken[0]!r} has a name that is taken: give it another.")
     rows = ts.reshape(-1, count)
     alike = bool(np.isfinite(rows).all() and (rows == rows[:1]).all())
     at, index = ("time", rows[0]) if alike else ("save", np.arange(count))
     step = at if hs.shape[-1] == count else "step"
     of_state, labels = _components(components, np.shape(solution.qs)[len(dims) + 1 :])
     found: dict[str, Any] = {} if alike else {"t": ((*dims, at), ts)}
-    found["q"] = ((*dims, at, *of_state), np.asarray(solution.qs))
-    found["p"] = ((*dims, at, *of_state), np.asarray(solution.ps))
+    state = ("q", solution.qs), ("p", solution.ps)
+    found |= {name: ((*dims, at, *of_state), np.asarray(x)) for name, x in state}
     found["h"] = ((*dims, step), hs)
-    for name, value, per_step in _observed(solution.observed, observe):
+
+    def add(name: str, axes: Sequence[str], value: Any) -> None:
         if name in found or name.partition(".")[0] in _TAKEN:
-            _taken(name)
+            raise ValueError(f"the observable {name!r} has a name that is taken: give it another.")
+        found[name] = ((*dims, *axes), np.asarray(value))
+
+    for name, value, per_step in _observed(solution.observed, observe):
         own = value.shape[len(dims) :]
         if per_step and own[:1] != hs.shape[-1:]:
             raise ValueError(
                 f"observe says that {name!r} has a value for each of {hs.shape[-1]} steps, and its "
                 f"shape is {own}: give the observe that integrate was given."
             )
-        front = (step,) if per_step else ()
-        found[name] = ((*dims, *front, *_own(name, own[len(front) :])), value)
-    found["status"] = (dims, _codes(solution.result, lead), {
-        "flag_values": np.arange(len(_STATUSES), dtype=np.int8),
-        "flag_meanings": " ".join(_STATUSES),
-    })  # fmt: skip
+        front = [step] * per_step
+        add(name, [*front, *_own(name, own[len(front) :])], value)
+    flags: dict[str, Any] = {"flag_values": np.arange(len(_STATUSES), dtype=np.int8)}
+    flags |= {"flag_meanings": " ".join(_STATUSES)}
+    found["status"] = (dims, _codes(solution.result), flags)
     for name, value in solution.stats.items():
-        _check_free(name, found)
         if name != "num_steps":
-            value = np.asarray(value)
-            found[name] = ((*dims, *_own(name, value.shape[len(lead) :])), value)
-    if solution.stop is not None:
-        for name, value in zip("tqp", solution.stop, strict=True):
-            own = () if name == "t" else of_state
-            _check_free(f"stop_{name}", found)
-            found[f"stop_{name}"] = ((*dims, *own), np.asarray(value))
+            add(name, _own(name, np.shape(value)[len(batch) :]), value)
+    for name, value in zip("tqp", solution.stop or (), strict=False):
+        add(f"stop_{name}", [] if name == "t" else of_state, value)
     for name, values in (coords or {}).items():
         refuse_unit_or_mask(f"coords {name}", values)
     along = {at: index, **labels, **(coords or {})}
     if step == "step":
         along["step"] = np.arange(1, count)
-    data = xr.Dataset(found, along, {
-        "software": f"dvi_jax {dvi.__version__}",
-        "num_steps": int(np.ravel(solution.stats["num_steps"])[0]),
-        **{name: _attribute(value) for name, value in (attrs or {}).items()},
-    })  # fmt: skip
+    about: dict[str, Any] = {"software": f"dvi_jax {dvi.__version__}"}
+    about |= {"num_steps": int(np.ravel(solution.stats["num_steps"])[0])}
+    about |= {name: _attribute(value) for name, value in (attrs or {}).items()}
+    data = xr.Dataset(found, along, about)
+    alike_in = {"t": ("t", "time", "h", "stop_t"), "q": ("q", "stop_q"), "p": ("p", "stop_p")}
     for name, text in (units or {}).items():
-        for known in {"t": ("t", "time", "h", "stop_t"), "q": ("q", "stop_q"),
-                      "p": ("p", "stop_p")}.get(name, (name,)):  # fmt: skip
+        for known in alike_in.get(name, (name,)):
             if known in data.variables:
                 data[known].attrs["units"] = text
     return data
@@ -142,14 +140,14 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
 
     **Raises** `ImportError` without arviz and arviz-base; `TypeError` for what is no `Samples`.
     """
-    if not isinstance(samples, dvi.Samples):
-        raise TypeError(
-            f"to_inference_data takes what dvi.sample returns, got {type(samples).__name__}. "
-            "(Trajectories: interop.to_xarray.)"
-        )
-    old = _old_arviz()
     import xarray as xr
 
+    hint = "(of trajectories take interop.to_xarray)"
+    expect("samples", samples, dvi.Samples, f"what dvi.sample returns {hint}")
+    try:
+        arviz = needed("arviz", "interop.to_inference_data")
+    except ImportError:
+        arviz = needed("arviz_base", "interop.to_inference_data")
     tree = samples.to_xarray()
     groups = {name: tree[name].to_dataset() for name in tree.children}
     steps = np.asarray(samples.steps)
@@ -159,56 +157,21 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
     )
     if observed is not None:
         many = list(observed) if isinstance(observed, list | tuple) else [observed]
-        seen: dict[str, Any] = {}
-        where: dict[str, Any] = {}
+        seen, where = {}, {}
         for i, arc in enumerate(many):
-            if not isinstance(arc, dvi.Observations):
-                raise TypeError(f"observed takes dvi.Observations, got {type(arc).__name__}.")
+            expect("observed", arc, dvi.Observations, "dvi.Observations, or a list of these")
             end = "" if len(many) == 1 else f"_{i}"
             values, own = np.asarray(arc.values), f"values{end}"
             seen[own] = ((f"ts{end}", *_own(own, values.shape[1:])), values)
             where[f"ts{end}"] = np.asarray(arc.ts)
         groups["observed_data"] = xr.Dataset(seen, where)
-    about = {
-        "inference_library": "dvi_jax",
-        "inference_library_version": dvi.__version__,
-        "sampler": "NUTS of numpyro",
-        "status": samples.status,
-    }
+    about = {"inference_library": "dvi_jax", "inference_library_version": dvi.__version__}
+    about |= {"sampler": "NUTS of numpyro", "status": samples.status}
     for group in groups.values():
         group.attrs.update(about)
-    return old.InferenceData(**groups) if old is not None else xr.DataTree.from_dict(groups)
-
-
-def _old_arviz() -> Any:
-    """The module arviz where it is of version 0.x; None where trees are taken."""
-    try:
-        arviz = needed("arviz", "interop.to_inference_data")
-    except ImportError:
-        needed("arviz_base", "interop.to_inference_data")
-        return None
-    return arviz if hasattr(arviz, "InferenceData") else None
-
-
-def _check_free(name: str, found: Mapping[str, Any]) -> None:
-    """Refuse an observable that has the name of what a solution tells of itself."""
-    if name in found:
-        _taken(name)
-
-
-def _taken(name: str) -> NoReturn:
-    raise ValueError(f"the observable {name!r} has a name that is taken: give it another.")
-
-
-def _check_dims(dims: tuple[str, ...], shape: tuple[int, ...]) -> None:
-    batch = shape[:-1]
-    if len(dims) != len(batch):
-        raise ValueError(
-            f"the batch has {len(batch)} dimensions, of sizes {batch}, and dims names {len(dims)}: "
-            f"{dims}. Name each, in the order of the vmaps from the outermost."
-        )
-    if taken := [d for d in dims if d in _TAKEN or dims.count(d) > 1]:
-        raise ValueError(f"the dimension {taken[0]!r} has a name that is taken: give it another.")
+    if hasattr(arviz, "InferenceData"):  # version 0.x, later ones take trees
+        return arviz.InferenceData(**groups)
+    return xr.DataTree.from_dict(groups)
 
 
 def _components(
@@ -240,52 +203,33 @@ def _observed(observed: Any, observe: Any) -> list[tuple[str, np.ndarray, bool]]
     def is_observable(x: Any) -> bool:
         return callable(x) or isinstance(x, dvi.Reduction | dvi.Running)
 
-    if observe is None:
-        flags = jax.tree.map(lambda _: False, observed)
-    else:
-        try:
-            flags = jax.tree.map(
-                lambda f, of: jax.tree.map(lambda _: not isinstance(f, dvi.Reduction), of),
-                observe, observed, is_leaf=is_observable,
-            )  # fmt: skip
-        except ValueError as error:
-            raise ValueError(
-                f"observe is not what this solution was observed by: {error}."
-            ) from None
+    def flags_of(f: Any, found: Any) -> Any:
+        return jax.tree.map(lambda _: f is not None and not isinstance(f, dvi.Reduction), found)
+
+    try:
+        flags = (
+            flags_of(None, observed)
+            if observe is None
+            else jax.tree.map(flags_of, observe, observed, is_leaf=is_observable)
+        )
+    except ValueError as error:
+        raise ValueError(f"observe is not what this solution was observed by: {error}.") from None
     arrays = jax.tree.leaves_with_path(observed, is_leaf=eqx.is_array)
-    per_step = jax.tree.leaves(flags)
-    names = [".".join(_word(k) for k in path) for path, _ in arrays]
+    names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in arrays]
     names = [f"observed.{n}".rstrip(".") if not n or n[0].isdigit() else n for n in names]
-    return [
-        (name, np.asarray(x), flag)
-        for name, (_, x), flag in zip(names, arrays, per_step, strict=True)
-    ]
+    rows = zip(names, arrays, jax.tree.leaves(flags), strict=True)
+    return [(name, np.asarray(x), flag) for name, (_, x), flag in rows]
 
 
-def _word(key: Any) -> str:
-    """One step of a path in a pytree, as text."""
-    for field in ("key", "name", "idx"):
-        if hasattr(key, field):
-            return str(getattr(key, field))
-    return str(key)
-
-
-def _codes(result: Any, lead: tuple[int, ...]) -> np.ndarray:
-    codes = np.zeros(lead, np.int8)
-    for i, name in enumerate(_STATUSES):
-        codes = np.where(np.asarray(result == getattr(dvi.RESULTS, name)), np.int8(i), codes)
-    return codes.astype(np.int8)
+def _codes(result: Any) -> np.ndarray:
+    """The status of each trajectory as its number in `_STATUSES`."""
+    each = [np.asarray(result == getattr(dvi.RESULTS, name)) for name in _STATUSES]
+    return np.argmax(each, axis=0).astype(np.int8)
 
 
 def _attribute(value: Any) -> Any:
     """A value that a file can keep as an attribute."""
-    if isinstance(value, bool):
-        return str(value)
-    if isinstance(value, str | int | float | np.number):
+    if isinstance(value, str | int | float | np.number) and not isinstance(value, bool):
         return value
-    if isinstance(value, Mapping | list | tuple):
-        return str(value)
-    array = np.asarray(value) if hasattr(value, "shape") else None
-    return (
-        array if array is not None and array.ndim <= 1 and array.dtype.kind in "if" else str(value)
-    )
+    array = np.asarray(value) if hasattr(value, "shape") else np.asarray(None)
+    return array if array.ndim <= 1 and array.dtype.kind in "if" else str(value)

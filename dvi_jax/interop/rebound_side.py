@@ -22,7 +22,7 @@ from ..systems.n_body import (
     linear_momentum,
     symmetries,
 )
-from .extras import needed
+from .extras import expect, needed
 
 _NEWTONIAN = ("basic", "compensated", "jacobi", "mercurius", "trace")
 """Modules for gravity that evaluate Newton's law in full, whichever way they order the sums."""
@@ -40,12 +40,12 @@ _TURNED_ON = {
 }
 """What changes a simulation and is no number of a body; name of the field → how to say so."""
 
-_ASTROPY = {
-    "msun": "Msun", "msolar": "Msun", "solarmass": "Msun", "sunmass": "Msun", "mearth": "Mearth",
-    "mjupiter": "Mjup", "aus": "au", "parsec": "pc", "hr": "h", "d": "day", "days": "day",
-    "year": "yr", "years": "yr", "yrs": "yr", "jyr": "yr", "gram": "g", "kyr": "kyr", "myr": "Myr",
-    "gyr": "Gyr",
-}  # fmt: skip
+_ASTROPY = {"mearth": "Mearth", "mjupiter": "Mjup", "aus": "au", "parsec": "pc", "hr": "h"}
+_ASTROPY |= dict.fromkeys(("msun", "msolar", "solarmass", "sunmass"), "Msun")
+_ASTROPY |= dict.fromkeys(("year", "years", "yrs", "jyr"), "yr") | dict.fromkeys(
+    ("d", "days"), "day"
+)
+_ASTROPY |= {"gram": "g", "kyr": "kyr", "myr": "Myr", "gyr": "Gyr"}
 """REBOUND's names of units → the usual ones; the others are the same."""
 
 
@@ -132,26 +132,23 @@ def from_rebound(
         raise ValueError(
             f"snapshot={snapshot} goes with the path of a file, not with a simulation."
         )
-    if not isinstance(simulation, rebound.Simulation):
-        raise TypeError(
-            "from_rebound takes a rebound.Simulation or the path of a file, got "
-            f"{type(simulation).__name__}" + (
-                ": take one of its snapshots, archive[i]."
-                if isinstance(simulation, rebound.Simulationarchive) else "."
-            )
-        )  # fmt: skip
+    called = "a rebound.Simulation (of an archive one snapshot, archive[i]), or the path of a file"
+    expect("simulation", simulation, rebound.Simulation, called)
     _refuse_what_would_be_lost(simulation)
-    _refuse_not_finite(simulation)
-    bodies = list(simulation.particles)
-    masses = _with_mass(simulation, np.array([b.m for b in bodies], float), massless)
-    q = np.array([[b.x, b.y, b.z] for b in bodies], float).reshape(-1, 3)
-    v = np.array([[b.vx, b.vy, b.vz] for b in bodies], float).reshape(-1, 3)
+    numbers = {k: float(getattr(simulation, k)) for k in ("t", "dt", "G", "softening")}
+    _refuse_not_finite("the simulation", numbers)
+    names = tuple(_name(b) for b in simulation.particles)
+    texts = [str(name or f"body {i}") for i, name in enumerate(names)]
+    fields = ("m", "x", "y", "z", "vx", "vy", "vz", "r")
+    rows = np.array([[getattr(b, k) for k in fields] for b in simulation.particles], float)
+    for text, row in zip(texts, rows, strict=True):
+        _refuse_not_finite(text, dict(zip(fields, row, strict=True)))
+    masses = _with_mass(simulation, rows[:, 0], massless)
+    q, v = rows[:, 1:4].copy(), rows[:, 4:7].copy()
     p = masses[:, None] * v
-    names = tuple(_name(b) for b in bodies)
-    args: dict[str, Any] = {"masses": masses, "G": float(simulation.G)}
-    check_bodies(q, p, args, [str(n or f"body {i}") for i, n in enumerate(names)])
-    softening = float(simulation.softening)
-    if softening:
+    args: dict[str, Any] = {"masses": masses, "G": numbers["G"]}
+    check_bodies(q, p, args, texts)
+    if softening := numbers["softening"]:
         args["softening"] = softening
     function = softened_hamiltonian if softening else hamiltonian
 
@@ -159,31 +156,20 @@ def from_rebound(
         return function(t0, t1, q1, p1, args)
 
     units, parameters = _texts(_units(simulation))
-    about = {} if softening else {"invariants": INVARIANTS, "symmetries": symmetries(3)}
-    return ReboundProblem(
-        name="rebound",
-        system=dvi.System(function),
-        q0=q,
-        p0=p,
-        h=float(simulation.dt),
-        args=args,
-        observables={
-            "energy": energy,
-            "linear_momentum": linear_momentum,
-            "angular_momentum": angular_momentum,
-        },
-        units=units,
-        source="a simulation of REBOUND",
-        check=check_bodies,
-        parameters={name: parameters.get(name, "b [length]") for name in args},
-        t0=float(simulation.t),
-        names=names,
-        velocities=v,
-        radii=np.array([b.r for b in bodies], float),
-        integrator=str(simulation.integrator),
-        rebound_units=_units(simulation),
-        **about,
+    about: dict[str, Any] = (
+        {} if softening else {"invariants": INVARIANTS, "symmetries": symmetries(3)}
     )
+    about |= {"units": units, "source": "a simulation of REBOUND", "check": check_bodies}
+    about |= {"parameters": {name: parameters.get(name, "b [length]") for name in args}}
+    about["observables"] = {
+        "energy": energy,
+        "linear_momentum": linear_momentum,
+        "angular_momentum": angular_momentum,
+    }
+    theirs = {"names": names, "velocities": v, "radii": rows[:, 7], "t0": numbers["t"]}
+    theirs |= {"integrator": str(simulation.integrator), "rebound_units": _units(simulation)}
+    state = {"q0": q, "p0": p, "h": numbers["dt"], "args": args}
+    return ReboundProblem("rebound", dvi.System(function), **state, **about, **theirs)
 
 
 def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) -> Any:
@@ -204,8 +190,7 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     `ImportError` without rebound.
     """
     rebound = needed("rebound", "interop.to_rebound")
-    if not isinstance(problem, Problem):
-        raise TypeError(f"to_rebound takes a problem, got {type(problem).__name__}.")
+    expect("problem", problem, Problem, "a problem of dvi_jax.systems or of from_rebound")
     system, args = problem.system, problem.args
     known = system.H_D in (hamiltonian, softened_hamiltonian) and isinstance(args, Mapping)
     if not known or system.force is not None or system.perturbation is not None:
@@ -216,34 +201,35 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     if (q is None) != (p is None):
         raise TypeError("a state is q and p together, or neither of them.")
     masses = np.asarray(args["masses"], float)
-    of_problem = q is None
+    theirs = problem if isinstance(problem, ReboundProblem) else None
+    velocities = theirs.velocities if theirs is not None and q is None else None
     refuse_unit_or_mask("q", q)
     refuse_unit_or_mask("p", p)
-    q, p = (np.asarray(x, float) for x in ((problem.q0, problem.p0) if of_problem else (q, p)))
+    q, p = (np.asarray(x, float) for x in ((problem.q0, problem.p0) if q is None else (q, p)))
+    t = float(t if t is not None else theirs.t0 if theirs is not None else 0.0)
     check_bodies(q, p, args)
-    for name, values in (("q", q), ("p", p), ("t", 0.0 if t is None else float(t))):
+    for name, values in (("q", q), ("p", p), ("t", t)):
         if not np.isfinite(values).all():
             raise ValueError(
                 f"{name} holds values that are not finite: a run that failed has NaN from its "
                 "failing step on; take a state before it."
             )
     v = p / masses[:, None]
-    if isinstance(problem, ReboundProblem) and of_problem and problem.velocities is not None:
-        known = np.asarray(problem.velocities, float)
-        if np.array_equal(p, masses[:, None] * known):  # p0 or the masses may have been replaced
-            v = known
+    if velocities is not None and np.array_equal(p, masses[:, None] * np.asarray(velocities)):
+        v = np.asarray(velocities, float)  # neither p0 nor the masses have been replaced
     if q.shape[1] == 2:
         q, v = (np.column_stack([x, np.zeros(len(x))]) for x in (q, v))
-    imported = isinstance(problem, ReboundProblem)
     simulation = rebound.Simulation()
-    if imported and problem.rebound_units:
-        simulation.units = problem.rebound_units
+    if theirs is not None and theirs.rebound_units:
+        simulation.units = theirs.rebound_units
     simulation.G = float(args.get("G", 1.0))  # after the units, which set it to their own
     simulation.softening = float(args.get("softening", 0.0))
     simulation.dt = float(problem.h)
-    simulation.t = float((problem.t0 if imported else 0.0) if t is None else t)
-    names = problem.names if imported and problem.names else (None,) * len(masses)
-    radii = np.zeros(len(masses)) if not imported or problem.radii is None else problem.radii
+    simulation.t = t
+    names, radii = (None,) * len(masses), np.zeros(len(masses))
+    if theirs is not None:
+        names = theirs.names or names
+        radii = radii if theirs.radii is None else theirs.radii
     for mass, (x, y, z), (vx, vy, vz), r, name in zip(masses, q, v, radii, names, strict=True):
         label = {} if name is None else {"name" if isinstance(name, str) else "hash": name}
         simulation.add(m=mass, x=x, y=y, z=z, vx=vx, vy=vy, vz=vz, r=r, **label)
@@ -251,26 +237,23 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
 
 
 def _refuse_what_would_be_lost(sim: Any) -> None:
-    own = (
-        {"_N_odes": 1} if str(sim.integrator) == "bs" else {}
-    )  # the bodies' own, of that integrator
+    of_bodies = {"_N_odes": 1} if str(sim.integrator) == "bs" else {}  # its own equations
     found = [
         text
         for field, text in _TURNED_ON.items()
-        if (getattr(sim, field, None) or 0) != own.get(field, 0)
+        if (getattr(sim, field, None) or 0) != of_bodies.get(field, 0)
     ]
-    for field, allowed in (("boundary", ("none",)), ("collision", ("none",))):
+    settings = (("boundary", ("none",)), ("collision", ("none",)), ("gravity", _NEWTONIAN))
+    for field, allowed in settings:
         if (value := getattr(sim, field)) not in allowed:
-            found.append(f"{field} = {value!r}")
-    if sim.gravity not in _NEWTONIAN:
-        found.append(f"gravity = {sim.gravity!r}: Newton's law between all pairs is meant here")
+            found.append(f"{field} = {value!r}, which must be one of {', '.join(allowed)}")
     if str(sim.integrator) == "sei":
         found.append("the shearing sheet (integrator sei): see the system hill")
     if found:
         raise ValueError(
             "this simulation has more than bodies that attract one another, and it would be lost: "
-            + "; ".join(found)
-            + ". Turn it off in REBOUND (sim.copy() leaves callbacks out) if it is not meant."
+            f"{'; '.join(found)}. Turn it off in REBOUND (sim.copy() leaves callbacks out) if it "
+            "is not meant."
         )
     if not sim.is_synchronized:
         raise ValueError("the simulation is in the middle of a step: call sim.synchronize() first.")
@@ -278,18 +261,14 @@ def _refuse_what_would_be_lost(sim: Any) -> None:
         raise ValueError("the simulation has no bodies.")
 
 
-def _refuse_not_finite(sim: Any) -> None:
+def _refuse_not_finite(whose: str, numbers: Mapping[str, Any]) -> None:
     """Refuse NaN and infinite numbers in what is taken from a simulation."""
-    for name in ("t", "dt", "G", "softening"):
-        if not np.isfinite(value := getattr(sim, name)):
-            raise ValueError(f"{name} of the simulation is {value}: it must be a finite number.")
-    for i, body in enumerate(sim.particles):
-        for name in ("m", "x", "y", "z", "vx", "vy", "vz", "r"):
-            if not np.isfinite(value := getattr(body, name)):
-                raise ValueError(
-                    f"{name} of {_name(body) or f'body {i}'} is {value}: it must be a finite "
-                    "number. A simulation that failed has NaN: take a snapshot before it."
-                )
+    for name, value in numbers.items():
+        if not np.isfinite(value):
+            raise ValueError(
+                f"{name} of {whose} is {value}: it must be a finite number. A simulation that "
+                "failed has NaN: take a snapshot before it."
+            )
 
 
 def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarray:
@@ -335,14 +314,7 @@ def _texts(units: tuple[str, ...]) -> tuple[dict[str, str], dict[str, str]]:
     if not units:
         return {"q": "1", "p": "1", "t": "1", "energy": "1"}, dict(PARAMETERS)
     length, time, mass = (_ASTROPY.get(name, name) for name in units)
-    of_state = {
-        "q": length,
-        "p": f"{mass} {length}/{time}",
-        "t": time,
-        "energy": f"{mass} {length}²/{time}²",
-    }
-    return of_state, {
-        "masses": f"of the bodies [{mass}]",
-        "G": f"gravity [{length}³/({mass} {time}²)]",
-        "softening": f"b [{length}]",
-    }
+    of_state = {"q": length, "p": f"{mass} {length}/{time}", "t": time}
+    of_state["energy"] = f"{mass} {length}²/{time}²"
+    parameters = {"masses": f"of the bodies [{mass}]", "softening": f"b [{length}]"}
+    return of_state, parameters | {"G": f"gravity [{length}³/({mass} {time}²)]"}

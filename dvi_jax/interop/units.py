@@ -1,7 +1,8 @@
-"""A front door for quantities with units; behind it, numbers."""
+"""Integration of quantities with units."""
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,10 +12,9 @@ import numpy as np
 import dvi_jax as dvi
 
 from ..systems import Problem
-from .extras import needed, system_of
+from .extras import expect, needed, system_of
 
 _POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
-_BY = "interop.UnitSystem"
 
 
 class UnitSystem:
@@ -24,14 +24,13 @@ class UnitSystem:
     left between them: an H_D that is right in any such system is right in this one.
 
     - `length`, `time`, `mass`: units of astropy, or their names.
-    - `q`, `p`: what positions and momenta are: ``"length"``, ``"angle"``; ``"momentum"``,
-      ``"velocity"`` (unit mass), ``"angular momentum"``, ``"specific angular momentum"``;
-      ``"dimensionless"``; or any unit of that kind.
+    - `q`, `p`: ``"length"``, ``"angle"``; ``"momentum"``, ``"velocity"`` (unit mass), ``"angular
+      momentum"``, ``"specific angular momentum"``; ``"dimensionless"``; or any unit of that kind.
     - `args`: name of a parameter → some unit of its kind, ``{"mu": u.m**3 / u.s**2}``; of nested
-      ones by path, ``"planet.mass"``; a name goes for all that is below it. What is not named is a
-      number without a unit.
+      ones by path, ``"planet.mass"``; a name applies to all that is below it. Others are numbers
+      without a unit.
 
-    It has the units `q`, `p`, `t`, `energy` (p q/t) and `args` of the numbers. `UnitSystem.of`
+    Its `q`, `p`, `t`, `energy` (p q/t) and `args` are the units of the numbers. `UnitSystem.of`
     reads those of a problem of the library.
 
     **Raises** `ImportError` without astropy; `ValueError` for a unit of another kind than length,
@@ -48,34 +47,33 @@ class UnitSystem:
         p: Any = "momentum",
         args: Mapping[str, Any] | None = None,
     ):
-        u = needed("astropy.units", _BY)
-        given = {"length": length, "time": time, "mass": mass}
-        bases = {}
-        for kind, like in (("length", u.m), ("time", u.s), ("mass", u.kg)):
-            unit = bases[kind] = _unit(u, kind, given[kind])
+        u = needed("astropy.units", "interop.UnitSystem")
+        bases = []
+        given = ("length", length, u.m), ("time", time, u.s), ("mass", mass, u.kg)
+        for kind, what, like in given:
+            unit = _unit(u, kind, what)
             if not unit.is_equivalent(like):
                 raise ValueError(
                     f"{kind} must be a unit of {kind} such as {like}, got {unit} "
                     f"({unit.physical_type})."
                 )
-        L, T, M = bases.values()
-        words = {
-            "length": L, "angle": u.rad, "momentum": M * L / T, "velocity": L / T,
-            "angular momentum": M * L**2 / T, "specific angular momentum": L**2 / T,
-            "dimensionless": u.dimensionless_unscaled,
-        }  # fmt: skip
+            bases.append(unit)
+        L, T, M = bases
+        words = {"length": L, "angle": u.rad, "momentum": M * L / T, "velocity": L / T}
+        words |= {"angular momentum": M * L**2 / T, "specific angular momentum": L**2 / T}
+        words["dimensionless"] = u.dimensionless_unscaled
         others = [u.rad, u.A, u.K, u.mol, u.cd]
 
         def coherent(name: str, what: Any) -> Any:
-            unit = words[what] if isinstance(what, str) and what in words else _unit(u, name, what)
+            unit = words.get(what) if isinstance(what, str) else None
+            unit = _unit(u, name, what) if unit is None else unit
             try:
                 parts = unit.decompose(bases=[L, T, M, *others])
                 return u.CompositeUnit(1.0, parts.bases, parts.powers)
             except (AttributeError, u.UnitConversionError):  # °C, magnitudes, photons
                 raise ValueError(
                     f"{name} cannot be in {unit}, which no factor takes to length, time, mass, "
-                    "angle, current, temperature (K), amount and luminous intensity: convert it "
-                    "before this door."
+                    "angle, current, temperature (K), amount and luminous intensity: convert it."
                 ) from None
 
         named = {name: coherent(name, unit) for name, unit in (args or {}).items()}
@@ -87,30 +85,26 @@ class UnitSystem:
 
     @classmethod
     def of(cls, problem: Problem) -> "UnitSystem":
-        """The units that a problem of the library is written in, read from its `units` and from
-        the brackets of its `parameters`.
+        """The units of a problem of the library: its `units`, and the brackets of `parameters`.
 
         **Raises** `ValueError` for a problem whose units are words, such as "period/2π".
         """
-        u = needed("astropy.units", _BY)
-        if not isinstance(problem, Problem):
-            raise TypeError(f"UnitSystem.of takes a problem, got {type(problem).__name__}.")
-        read = {name: _read(u, problem.units.get(name, "?")) for name in ("q", "p", "t")}
-        if None in read.values():
-            bad = next(name for name, unit in read.items() if unit is None)
+        u = needed("astropy.units", "interop.UnitSystem")
+        expect("problem", problem, Problem, "a problem of dvi_jax.systems")
+        texts = {name: problem.units.get(name, "?") for name in ("q", "p", "t")}
+        read = {name: _read(u, text) for name, text in texts.items()}
+        if bad := [name for name, unit in read.items() if unit is None]:
             raise ValueError(
-                f"{problem.name} measures {bad} in {problem.units.get(bad, '?')!r}, which is no "
-                "unit of astropy: give its numbers to dvi.integrate, or say units=UnitSystem(...)."
+                f"{problem.name} measures {bad[0]} in {texts[bad[0]]!r}, which is no unit of "
+                "astropy: give its numbers to dvi.integrate, or say units=UnitSystem(...)."
             )
-        args = {}
-        for name, meaning in problem.parameters.items():
-            bracket = re.search(r"\[([^\]]*)\]\s*$", meaning)
-            unit = _read(u, bracket[1]) if bracket else None
-            if unit is not None and unit != u.dimensionless_unscaled:
-                args[name] = unit
-        found = cls.__new__(cls)
-        found._set(read["q"], read["p"], read["t"], args)
-        return found
+        brackets = {n: re.search(r"\[([^\]]*)\]\s*$", m) for n, m in problem.parameters.items()}
+        args = {name: _read(u, found[1]) for name, found in brackets.items() if found}
+        one = u.dimensionless_unscaled
+        args = {name: unit for name, unit in args.items() if unit is not None and unit != one}
+        system = cls.__new__(cls)
+        system._set(read["q"], read["p"], read["t"], args)
+        return system
 
     def __repr__(self) -> str:
         of_args = "".join(f", {name} [{unit}]" for name, unit in self.args.items())
@@ -123,7 +117,7 @@ class UnitSolution:
 
     - `ts`, `qs`, `ps`, `hs`: as of a `Solution`, quantities of astropy.
     - `observed`: numbers in `units`: an energy is ``observed["energy"] * sol.units.energy``.
-    - `units`: the `UnitSystem`. `solution`: the `Solution` behind it, all in numbers.
+    - `units`: the `UnitSystem`. `solution`: the `Solution` in numbers.
     """
 
     ts: Any
@@ -166,114 +160,79 @@ def integrate(
 ) -> UnitSolution:
     r"""One trajectory, from quantities of astropy to quantities of astropy.
 
-    At the door every quantity becomes a number in `units`; the run is that of ``dvi.integrate``,
-    and what comes out of it is given its unit. H_D, W, observables, `Stop` and `Section` see plain
-    numbers, in `units`.
+    Every quantity becomes a number in `units`, ``dvi.integrate`` runs, and its output is given its
+    unit. H_D, W, observables, `Stop` and `Section` receive plain numbers, in `units`.
 
-    - `system`: a `System`; or a problem of the library, whose start and parameters stand in for
-      what is left out, in its own units, which are taken where `units` is left out too.
-    - `q0`, `p0`: quantities of the shape of the start. `h`, `t0` (zero when left out): times.
-    - `num_steps`, and `options`: as for ``dvi.integrate``.
-    - `units`: the `UnitSystem` behind the door.
+    - `system`: a `System`; or a problem of the library, whose initial condition and parameters
+      replace what is left out, in its own units, which are taken where `units` is left out too.
+    - `q0`, `p0`: quantities of the shape of the state. `h`, `t0` (zero when left out): times.
+    - `num_steps`, and `options`: as for ``dvi.integrate``. `units`: the `UnitSystem`.
     - `epsilon`: a number. `args`: pytree; a quantity where `units` names a unit, else a number.
-    - `ts`: times at which states are kept, for ``dvi.Save(ts=...)``, as a quantity.
+    - `ts`: times at which states are saved, for ``dvi.Save(ts=...)``, as a quantity.
 
     **Returns** a `UnitSolution`.
 
     **Raises** `TypeError` for a number where a unit is needed, `ValueError` for a quantity of
-    another kind, with what was seen and what is allowed, for masked values, for parameters that the
-    problem has not, and where `units` and `args` have different names; and as ``dvi.integrate``.
-    `ImportError` without astropy.
+    another kind, for masked values, for parameters that the problem does not have, and where
+    `units` and `args` have different names; and as ``dvi.integrate``. `ImportError` without
+    astropy.
 
     **Accuracy** one rounding for each number that is converted; the same orbit in two systems of
-    units agrees to round-off. Nothing here can be traced: quantities are values. For `jax.grad`,
+    units agrees to round-off. Quantities are values that cannot be traced: for `jax.grad`,
     `jax.jit` and `jax.vmap` call ``dvi.integrate`` on numbers in one system of units.
     """
     u = needed("astropy.units", "interop.integrate")
     problem = system if isinstance(system, Problem) else None
-    system = system_of(system, "interop.integrate")
-    own = _own(problem, required=units is None) if problem is not None else None
-    if units is None:
-        if own is None:
-            raise TypeError(
-                "a dvi.System does not say what its numbers are: give units=interop.UnitSystem("
-                "length=u.au, time=u.day, mass=u.Msun, args={...})."
-            )
-        units = own
-    if not isinstance(units, UnitSystem):
-        raise TypeError(f"units must be an interop.UnitSystem, got {units!r}.")
+    system = system_of(system)
+    own = None
+    if problem is not None:  # units that are words will do where others are given
+        with suppress(*[] if units is None else [ValueError]):
+            own = UnitSystem.of(problem)
+    called = "interop.UnitSystem(length=u.au, time=u.day, mass=u.Msun, args={...})"
+    taken: UnitSystem = expect("units", own if units is None else units, UnitSystem, called)
     save, lattice = options.get("save"), options.get("lattice")
     if getattr(save, "ts", None) is not None or isinstance(lattice, dvi.Given):
         raise TypeError(
             "dvi.Save(ts=...) and dvi.Given(ts) hold times without a unit: give ts= a quantity in "
             "place of the first; for the second call dvi.integrate on numbers."
         )
+    if ts is not None and save is not None:
+        raise TypeError("ts= says which states are saved: leave save out.")
     if ts is not None:
-        if save is not None:
-            raise TypeError("ts= says which states are kept: leave save out.")
-        options["save"] = dvi.Save(ts=_number(u, "ts", ts, units.t))
-    q0, p0, args = _filled(u, problem, own, units, q0, p0, args)
-    q, p = (
-        _number(u, name, x, unit) for name, x, unit in (("q0", q0, units.q), ("p0", p0, units.p))
-    )
-    numbers = _arguments(u, args, units)
-    sol = dvi.integrate(
-        system,
-        q,
-        p,
-        h=_number(u, "h", h, units.t),
-        num_steps=num_steps,
-        t0=0.0 if t0 is None else _number(u, "t0", t0, units.t),
-        epsilon=_number(u, "epsilon", epsilon, u.dimensionless_unscaled),
-        args=numbers,
-        **options,
-    )
-    with_unit = [
-        u.Quantity(np.asarray(x), unit)
-        for x, unit in ((sol.ts, units.t), (sol.qs, units.q), (sol.ps, units.p), (sol.hs, units.t))
-    ]
-    return UnitSolution(*with_unit, observed=sol.observed, units=units, solution=sol)
-
-
-def _own(problem: Problem, required: bool) -> UnitSystem | None:
-    """The units of a problem; None for one whose units are words, unless they are `required`."""
-    try:
-        return UnitSystem.of(problem)
-    except ValueError:
-        if required:
-            raise
-        return None
+        options["save"] = dvi.Save(ts=_number(u, "ts", ts, taken.t))
+    q0, p0, args = _filled(u, problem, own, q0, p0, args)
+    given = ("q0", q0, taken.q), ("p0", p0, taken.p), ("h", h, taken.t)
+    given += (("epsilon", epsilon, u.dimensionless_unscaled),)
+    given += () if t0 is None else (("t0", t0, taken.t),)
+    numbers = {name: _number(u, name, x, unit) for name, x, unit in given}
+    numbers |= {"args": _arguments(u, args, taken), "num_steps": num_steps}
+    sol = dvi.integrate(system, **numbers, **options)
+    arrays = (sol.ts, taken.t), (sol.qs, taken.q), (sol.ps, taken.p), (sol.hs, taken.t)
+    with_unit = [u.Quantity(np.asarray(x), unit) for x, unit in arrays]
+    return UnitSolution(*with_unit, observed=sol.observed, units=taken, solution=sol)
 
 
 def _filled(
-    u: Any, problem: Problem | None, own: UnitSystem | None, units: UnitSystem,
-    q0: Any, p0: Any, args: Any,
-) -> tuple[Any, Any, Any]:  # fmt: skip
+    u: Any, problem: Problem | None, own: UnitSystem | None, q0: Any, p0: Any, args: Any
+) -> tuple[Any, Any, Any]:
     """Start and args with what a problem has in the place of what was left out: as quantities."""
     if problem is None:
         return q0, p0, args
     known = problem.args
-    if isinstance(known, Mapping) and (args is None or isinstance(args, Mapping)):
-        for name in args or {}:
-            if name not in known:
-                raise ValueError(
-                    f"args has {name!r}, and {problem.name} has no such parameter; it has "
-                    f"{', '.join(known)}."
-                )
-    elif args is not None and known is not None:
-        raise TypeError(
-            f"args of {problem.name} is a mapping from name to value, got {type(args).__name__}."
-        )
+    if args is not None and known is not None:
+        expect(f"args of {problem.name}", args, Mapping, "a mapping from name to value")
+        if unknown := [name for name in args if name not in known]:
+            raise ValueError(
+                f"args has {unknown[0]!r}, and {problem.name} has no such parameter; it has "
+                f"{', '.join(known)}."
+            )
     if own is None:  # its numbers have no unit that is known here
         return q0, p0, args
     q0 = u.Quantity(problem.q0, own.q) if q0 is None else q0
     p0 = u.Quantity(problem.p0, own.p) if p0 is None else p0
     if isinstance(known, Mapping):
-        rest = {
-            name: u.Quantity(value, own.args[name]) if name in own.args else value
-            for name, value in known.items()
-        }
-        args = {**rest, **(args or {})}
+        of_args = {n: u.Quantity(v, own.args[n]) if n in own.args else v for n, v in known.items()}
+        args = of_args | dict(args or {})
     return q0, p0, args
 
 
@@ -324,7 +283,7 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
             return value
         seen = "is missing" if value is None else f"= {value!r} has no unit"
         raise TypeError(
-            f"{name} {seen}: everything that has a unit must say so at this door, such as "
+            f"{name} {seen}: everything that has a unit must say so here, such as "
             f"{name.split()[-1]} * u.Unit({str(unit)!r}) or another unit of that kind."
         )
     try:

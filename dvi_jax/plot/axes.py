@@ -6,9 +6,11 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.lines import Line2D
 
+from .._checks import instance
 from .style import GREY, HATCH, PALE, SHADES, figure_of
 
 _PIECE = 20_000
@@ -27,15 +29,12 @@ def canvas(
     if ax is None:
         figure = plt.figure(figsize=size, layout="constrained")
         return figure.add_subplot(projection="3d" if space else None), True
-    if not hasattr(ax, "transAxes"):
-        raise TypeError(f"ax must be the matplotlib Axes to draw on, got {type(ax).__name__}.")
-    if space and ax.name != "3d":
+    instance("ax", ax, Axes, "the matplotlib Axes to draw on")
+    if space != (ax.name == "3d"):
         raise ValueError(
-            'an orbit in space needs axes in space: figure.add_subplot(projection="3d"); or choose '
-            "two coordinates, coordinates=(0, 1)."
+            'an orbit in space needs axes in space, figure.add_subplot(projection="3d"), one in '
+            f'the plane (coordinates=(0, 1), say) axes without a projection: got "{ax.name}".'
         )
-    if ax.name == "3d" and not space:
-        raise ValueError("a picture in the plane was given axes in space: leave out projection.")
     return ax, False
 
 
@@ -60,11 +59,19 @@ def given(axes: Any, count: int, what: str) -> list[Any]:
     return found
 
 
-def check_labels(labels: Any, count: int, what: str) -> None:
-    """Raise `ValueError` unless there are `count` labels, or None."""
-    if labels is not None and (isinstance(labels, str) or len(labels) != count):
-        names = 1 if isinstance(labels, str) else len(labels)
-        raise ValueError(f"labels has {names} names for {count} {what}: give a list of them.")
+def check_shapes(fits: Any, wanted: str, **arrays: np.ndarray) -> None:
+    """**Raises** `ValueError` with what is wanted and with the shapes, unless they fit."""
+    if not fits:
+        got = ", ".join(f"{name} of shape {x.shape}" for name, x in arrays.items())
+        raise ValueError(f"{wanted}: got {got}.")
+
+
+def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[str]:
+    """`count` labels, empty ones for None. **Raises** `ValueError` for another number of them."""
+    found = [""] * count if labels is None else [labels] if isinstance(labels, str) else labels
+    if len(found) != count or isinstance(labels, str):
+        raise ValueError(f"{name} has {len(found)} names for {count} {what}: give a list of them.")
+    return [str(label) for label in found]
 
 
 # --- legends and colours ------------------------------------------------------------------------
@@ -78,10 +85,9 @@ def legend(axis: Any, new: bool, extra: Iterable[Any] = (), labelled: bool = Tru
     - `extra`: entries after those of the labelled artists: artists, or texts without a mark.
     """
     handles = axis.get_legend_handles_labels()[0] if labelled else []
-    handles += [
-        Line2D([], [], linestyle="none", label=one) if isinstance(one, str) else one
-        for one in extra
-    ]
+    for one in extra:
+        text = isinstance(one, str)
+        handles.append(Line2D([], [], linestyle="none", label=one) if text else one)
     if not handles:
         return None
     if not new:
@@ -107,9 +113,8 @@ def interval(
     """(low, high, `extend` of a colour bar) of a linear colour scale, never of zero length."""
     known = values[np.isfinite(values)]
     if limits is None:
-        low, high = np.percentile(known, percentiles).tolist() if known.size else (0.0, 1.0)
-    else:
-        low, high = (float(v) for v in limits)
+        limits = np.percentile(known, percentiles) if known.size else (0.0, 1.0)
+    low, high = (float(v) for v in limits)
     if high <= low:
         low, high = low - 0.5, high + 0.5
     return low, high, extend(known, low, high)

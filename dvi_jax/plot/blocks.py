@@ -42,9 +42,7 @@ class Bins(NamedTuple):
 
     def pixels(self, chosen: Any) -> np.ndarray:
         """The pixel of each point of a selection."""
-        points = np.arange(self.size)[chosen] if self.order is not None else chosen
-        if isinstance(points, slice):
-            points = np.arange(*points.indices(self.size))
+        points = np.arange(*chosen.indices(self.size)) if isinstance(chosen, slice) else chosen
         if self.order is not None:
             points = np.argsort(self.order)[points]
         return np.searchsorted(self.starts, points, side="right") - 1
@@ -96,62 +94,55 @@ def reduced(
     **Raises** `ValueError` for a median if one pixel is larger than a block.
     """
     shape, points = tuple(len(b.starts) for b in bins.values()), 0
-    nothing = 0.0 if reduce == "mean" else np.nan
-    values, counts = np.full(shape, nothing), np.zeros(shape, np.int64)
+    values = np.full(math.prod(shape), 0.0 if reduce == "mean" else np.nan)
+    counts = np.zeros(values.size, np.int64)
     for pixels, block in blocks(data, bins, lines, whole=reduce == "median"):
         finite = np.isfinite(block)
         points += block.size
-        where, found = _by_pixel(pixels, finite.sum(0), np.add)
-        counts[where] += found
-        block = np.where(finite, block, nothing)
-        if reduce == "median":
-            _set_medians(values, pixels, block)
+        where, found = pixels[finite], block[finite]
+        counts += np.bincount(where, minlength=counts.size)
+        if reduce == "median":  # every pixel lies in one block
+            order = np.lexsort((found, where))
+            there, first, n = np.unique(where[order], return_index=True, return_counts=True)
+            middles = order[first + (n - 1) // 2], order[first + n // 2]
+            values[there] = sum(found[middle] for middle in middles) / 2
         else:
-            combine = _COMBINE[reduce]
-            where, found = _by_pixel(pixels, combine.reduce(block, axis=0), combine)
-            values[where] = combine(values[where], found)
+            _COMBINE[reduce].at(values, where, found)
     if reduce == "mean":
         values = values / np.where(counts, counts, np.nan)
-    return Picture(values, points - int(counts.sum()), points)
+    return Picture(values.reshape(shape), points - int(counts.sum()), points)
 
 
 def count_codes(data: Any, bins: Mapping[str, Bins], codes: Sequence[int]) -> np.ndarray:
     """How often each code occurs in each pixel, shape (codes, *pixels); read block by block."""
     shape = tuple(len(b.starts) for b in bins.values())
-    counts = np.zeros((len(codes), *shape), np.int64)
+    counts = np.zeros((len(codes), math.prod(shape)), np.int64)
     for pixels, block in blocks(data, bins):
-        for i, code in enumerate(codes):
-            where, sums = _by_pixel(pixels, (block == code).sum(0), np.add)
-            counts[i][where] += sums
-    return counts
+        for count, code in zip(counts, codes, strict=True):
+            count += np.bincount(pixels[block == code], minlength=count.size)
+    return counts.reshape(len(codes), *shape)
 
 
 def blocks(
     data: Any, bins: Mapping[str, Bins], lines: Lines | None = None, whole: bool = False
-) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
-    """(pixels of the points along each binned dimension, block of shape (rest, *points)).
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(number of the pixel of each point, the points), both of shape (rest, *points).
 
     - `whole`: every pixel lies in one block, as a median needs it.
     """
-    dims = tuple(bins)
+    shape = [len(b.starts) for b in bins.values()]
     for selection in _selections(data, bins, lines, whole):
-        block = np.asarray(data.variable.isel(selection).values)
+        block = data.variable.isel(selection).values
         names = list(data.dims)
-        pixels = {d: bins[d].pixels(selection[d]) for d in dims if not _is(lines, d)}
         if lines is not None:
             block = lines.function(np.moveaxis(block, names.index(lines.dim), 0))
-            names.remove(lines.dim)
-            names.insert(0, lines.dim)
-            if lines.keeps:
-                pixels[lines.dim] = bins[lines.dim].pixels(slice(None))
-        rest = [i for i, d in enumerate(names) if d not in dims]
-        block = block.transpose(*rest, *(names.index(d) for d in dims))
-        shape = block.shape[len(rest) :]
-        yield [pixels[d] for d in dims], block.reshape(-1, *shape)
-
-
-def _is(lines: Lines | None, dim: str) -> bool:
-    return lines is not None and lines.dim == dim
+            names = [lines.dim, *(d for d in names if d != lines.dim)]
+            selection = selection | {lines.dim: slice(None)}
+        rest = [i for i, d in enumerate(names) if d not in bins]
+        block = block.transpose(*rest, *(names.index(d) for d in bins))
+        block = block.reshape(-1, *block.shape[len(rest) :])
+        places = np.ix_(*(b.pixels(selection[d]) for d, b in bins.items()))
+        yield np.broadcast_to(np.ravel_multi_index(places, shape), block.shape), block
 
 
 def _selections(
@@ -160,10 +151,16 @@ def _selections(
     """Selections of one block each: whole chunks if they are known, last dimension first."""
     parts: dict[str, list[Any]] = {}
     sizes = dict(zip(data.dims, data.shape, strict=True))
-    together = {d for d in sizes if _is(lines, d) or (whole and d not in bins)}
+    together = {d for d in sizes if whole and d not in bins}
+    together |= set() if lines is None else {lines.dim}
     room = max(1, BLOCK // math.prod(sizes[d] for d in together))
-    if whole:
-        _check_pixel(sizes, bins, together)
+    pixel = math.prod(b.most for d, b in bins.items() if d not in together)
+    pixel *= math.prod(sizes[d] for d in together)
+    if whole and pixel > BLOCK:
+        raise ValueError(
+            f"a median needs all {pixel} numbers of a pixel at a time, and {BLOCK} are read at a "
+            "time: take reduce='mean' or 'max', more pixels, or a part of the data."
+        )
     chunk = {d: 1 for d in sizes if d not in together}
     known = data.encoding.get("preferred_chunks") or {}
     if all(isinstance(known.get(d), int) for d in chunk):
@@ -175,7 +172,10 @@ def _selections(
         if d in together:
             parts[d] = [slice(0, sizes[d])]
         elif whole:
-            parts[d], room = _whole_pixels(bins[d], room)
+            of, count = bins[d], len(bins[d].starts)
+            step = min(count, max(1, room // of.most))
+            parts[d] = [of.points(i, min(i + step, count)) for i in range(0, count, step)]
+            room //= of.most * step
         else:
             chunks = min(-(-sizes[d] // chunk[d]), max(room, 1))
             step = chunks * chunk[d]
@@ -183,43 +183,3 @@ def _selections(
             room //= chunks
     for chosen in itertools.product(*(parts[d] for d in data.dims)):
         yield dict(zip(data.dims, chosen, strict=True))
-
-
-def _whole_pixels(bins: Bins, room: int) -> tuple[list[Any], int]:
-    """The points of as many whole pixels as fit, a part at a time, and the size that remains."""
-    count = len(bins.starts)
-    step = min(count, max(1, room // bins.most))
-    parts = [bins.points(i, min(i + step, count)) for i in range(0, count, step)]
-    return parts, room // (bins.most * step)
-
-
-def _check_pixel(sizes: Mapping[str, int], bins: Mapping[str, Bins], together: set[str]) -> None:
-    needed = math.prod(b.most for d, b in bins.items() if d not in together)
-    needed *= math.prod(sizes[d] for d in together)
-    if needed > BLOCK:
-        raise ValueError(
-            f"a median needs all {needed} numbers of a pixel at a time, and {BLOCK} are read at a "
-            "time: take reduce='mean' or 'max', more pixels, or a part of the data."
-        )
-
-
-def _set_medians(values: np.ndarray, pixels: list[np.ndarray], block: np.ndarray) -> None:
-    """Medians of the pixels that lie in a block, each of them as a whole."""
-    each = [[(k, np.flatnonzero(p == k)) for k in np.unique(p)] for p in pixels]
-    for chosen in itertools.product(*each):
-        part = block[np.ix_(np.arange(len(block)), *(inside for _, inside in chosen))]
-        if not np.isnan(part).all():
-            values[tuple(k for k, _ in chosen)] = np.nanmedian(part)
-
-
-def _by_pixel(pixels: list[np.ndarray], values: np.ndarray, combine: Any) -> tuple[Any, np.ndarray]:
-    """(index of the pixels that have points, values of shape `points` combined to them)."""
-    met = []
-    for axis, numbers in enumerate(pixels):
-        if (np.diff(numbers) < 0).any():
-            order = np.argsort(numbers, kind="stable")
-            values, numbers = np.take(values, order, axis), numbers[order]
-        first = np.flatnonzero(np.diff(numbers, prepend=-1))
-        values = combine.reduceat(values, first, axis=axis)
-        met.append(numbers[first])
-    return np.ix_(*met), values

@@ -1,11 +1,13 @@
 """Pictures of indicators of chaos along time."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .axes import canvas, check_labels, counted, guide, legend
+from .._checks import one_of
+from .axes import canvas, check_shapes, counted, guide, labels_of, legend
 from .series import draw_series
 from .states import looks_of
 from .style import GREY, in_style, named, signed
@@ -21,7 +23,8 @@ class _Kind(NamedTuple):
     slope: float | None = None
 
 
-_KINDS = {
+_KINDS: dict[str | None, _Kind] = {
+    None: _Kind("indicator", False, False),
     "megno": _Kind("MEGNO ⟨Y⟩", True, False, level=2.0),
     "lyapunov": _Kind("finite-time Lyapunov exponent", True, True, slope=-1.0),
     "sali": _Kind("SALI", True, True),
@@ -66,31 +69,26 @@ def indicator(
 
     **Raises** `ValueError` for an unknown kind and for shapes that do not fit.
     """
-    if kind is not None and kind not in _KINDS:
-        raise ValueError(f"kind must be one of {', '.join(_KINDS)}, or None, got {kind!r}.")
-    about, units = _KINDS.get(kind or "", _Kind("indicator", False, False)), units or {}
+    about, units = _KINDS[one_of("kind", kind, _KINDS)], units or {}
     if slope is not None:
         about = about._replace(xlog=True, ylog=True, slope=slope)
     lines, names = _lines_of(ts, values)
-    labels = labels or None  # an empty list means no labels
-    check_labels(labels, len(lines), "lines")
-    names = list(labels or names or [""] * len(lines))
+    names = labels_of(labels or names or None, len(lines), "lines")
     looks = looks_of(len(lines), colour)
     axis, new = canvas(ax)
-    lost: dict[str, int] = {}
+    lost: Counter[str] = Counter()
     drawn, shifted = [], False
     for i, (t, v, start) in enumerate(lines):
         start = start if t0 is None else float(t0)
         shifted |= about.xlog and (start != 0 or bool((t < 0).any()))
         t = np.abs(t - start) if about.xlog else t
-        look = {"color": looks.colours[i], "linestyle": looks.dashes[i], "linewidth": 1.2}
         at_start = (t == 0) & np.isfinite(v) & about.xlog
         t, v = t[~at_start], v[~at_start]
         v = np.where(np.isfinite(t), v, np.nan)
-        counts = draw_series(axis, t, v, str(names[i]), about.ylog, **look)
-        low = counts.pop("are exactly 0", 0) + counts.pop("are below 0", 0)
-        counts |= {"at the start, t = t$_0$": int(at_start.sum()), "are not positive": low}
-        lost = {text: n + lost.get(text, 0) for text, n in counts.items()}
+        counts = draw_series(axis, t, v, names[i], about.ylog, **looks.line(i, 1.2))
+        lost["are no numbers"] += counts["are no numbers"]
+        lost["at the start, t = t$_0$"] += int(at_start.sum())
+        lost["are not positive"] += counts.get("are exactly 0", 0) + counts.get("are below 0", 0)
         drawn.append((t, v))
     axis.set(xscale="log" if about.xlog else "linear", yscale="log" if about.ylog else "linear")
     if about.level is not None:
@@ -113,31 +111,29 @@ def _lines_of(ts: Any, values: Any) -> tuple[list[tuple[np.ndarray, np.ndarray, 
     The start is the time before the values where `ts` have one more than there are values, else 0.
     """
     if isinstance(values, Mapping):
-        lines, names = [], []
-        for name, v in values.items():
-            found, _ = _lines_of(ts, v)
-            lines += found
-            names += (
-                [name] if len(found) == 1 else [f"{name} {i}" for i in range(1, len(found) + 1)]
-            )
-        return lines, names
+        found = {name: _lines_of(ts, v)[0] for name, v in values.items()}
+        names = [
+            name if len(some) == 1 else f"{name} {i}"
+            for name, some in found.items()
+            for i in range(1, len(some) + 1)
+        ]
+        return [line for some in found.values() for line in some], names
     t, v = np.asarray(getattr(ts, "ts", ts)), np.asarray(values)
-    n = t.shape[-1] if t.ndim else 0
-    if v.dtype.kind not in "iuf" or not v.ndim or n == 0 or v.shape[-1] not in (n, n - 1):
-        raise ValueError(
-            f"an indicator has one number for each time or step, shape (..., {n}) or (..., "
-            f"{n - 1}): got ts of shape {t.shape} and values of shape {v.shape}."
-        )
+    n, several = t.shape[-1] if t.ndim else 0, t.ndim > 1
+    numbers = v.dtype.kind in "iuf" and v.ndim and n and v.shape[-1] in (n, n - 1)
+    fits = numbers and not (several and t.shape[:-1] != v.shape[: t.ndim - 1])
+    wanted = (
+        f"an indicator has one number for each time or step, shape (..., {n}) or (..., {n - 1})"
+    )
+    check_shapes(fits, wanted, ts=t, values=v)
     start = t[..., 0] if n > v.shape[-1] else np.zeros(t.shape[:-1])
     t = t[..., n - v.shape[-1] :]
-    if t.ndim > 1 and t.shape[:-1] != v.shape[: t.ndim - 1]:
-        raise ValueError(f"ts of shape {t.shape} do not go with values of shape {v.shape}.")
-    if t.ndim > 1:
-        start = start.reshape(*start.shape, *(1,) * (v.ndim - t.ndim))
-        t = t.reshape(*t.shape[:-1], *(1,) * (v.ndim - t.ndim), t.shape[-1])
-    t, start = np.broadcast_to(t, v.shape), np.broadcast_to(start, v.shape[:-1])
-    rows = (t.reshape(-1, t.shape[-1]), v.reshape(-1, v.shape[-1]), start.ravel().tolist())
-    return list(zip(*rows, strict=True)), []
+    if several:
+        inner = (1,) * (v.ndim - t.ndim)
+        start, t = start.reshape(*start.shape, *inner), t.reshape(*t.shape[:-1], *inner, -1)
+    start = np.broadcast_to(start, v.shape[:-1]).ravel().tolist()
+    rows = (x.reshape(-1, v.shape[-1]) for x in (np.broadcast_to(t, v.shape), v))
+    return list(zip(*rows, start, strict=True)), []
 
 
 def _guide(axis: Any, lines: Sequence[tuple[np.ndarray, np.ndarray]], slope: float) -> None:
@@ -146,6 +142,5 @@ def _guide(axis: Any, lines: Sequence[tuple[np.ndarray, np.ndarray]], slope: flo
     good = [(t[here], v[here]) for t, v, here in positive if here.any()]
     if good:
         value, first = max((v[0], t[0]) for t, v in good)
-        guide(
-            axis, (first, max(t[-1] for t, _ in good)), value, slope, label=f"slope {signed(slope)}"
-        )
+        last = max(t[-1] for t, _ in good)
+        guide(axis, (first, last), value, slope, label=f"slope {signed(slope)}")

@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.patches import Ellipse
 
-from .axes import canvas
+from .._checks import instance
+from .axes import given
 from .fits import check_fit
 from .style import COLOURS, GREY, in_style, signed
 
@@ -67,23 +68,22 @@ def fit_corner(
     **Raises** `TypeError` for what is no fit; `ValueError` for one without a covariance,
     parameters that the data do not determine, and names that are not there.
     """
-    check_fit(fit, "fit_corner", "names", "x", "covariance")
+    check_fit(fit, "names", "x", "covariance")
     numbers, values = _of_parameters(fit, params)
     C = np.asarray(fit.covariance)[np.ix_(numbers, numbers)]
     scales = [
-        _scale(fit.names[i], float(values[i]), float(np.sqrt(C[k, k])))
-        for k, i in enumerate(numbers)
+        _scale(fit.names[i], float(values[i]), math.sqrt(C[k, k])) for k, i in enumerate(numbers)
     ]
-    draws = None if samples is None else _draws(samples, [s.name for s in scales])
+    draws = [None] * len(scales)
+    if samples is not None:
+        draws = _draws(samples, [scale.name for scale in scales])
     axes = _corner_axes(axes, len(scales))
     for i, j in np.ndindex(axes.shape):
         axis = axes[i, j]
         if i == j:
-            _draw_marginal(axis, scales[i], None if draws is None else draws[i])
+            _draw_marginal(axis, scales[i], draws[i])
         elif i > j:
-            pair = C[np.ix_([j, i], [j, i])]
-            two = None if draws is None else (draws[j], draws[i])
-            _draw_pair(axis, scales[j], scales[i], pair, two)
+            _draw_pair(axis, scales[j], scales[i], C[np.ix_([j, i], [j, i])], draws[j], draws[i])
         else:
             _draw_correlation(axis, C[i, j] / (scales[i].sigma * scales[j].sigma))
         _dress_corner(axis, i, j, scales)
@@ -102,35 +102,25 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
             "the fit has no covariance to draw: it had too many parameters for a Jacobian, ended "
             "at a failure, or the data determine none of its parameters."
         )
-    if isinstance(params, str):
-        params = [params]
     if params is None and len(names) > _PARAMETERS:
         some = f"params={names[:3]}"
         raise ValueError(f"{len(names)} parameters are too many for one picture: choose, {some}.")
-    params = names if params is None else params
-    for name in params:
-        if name not in names:
-            raise ValueError(f"no parameter is called {name!r}: there are {', '.join(names)}.")
-        if name not in known:
-            raise ValueError(
-                f"the data do not determine {name}; those that have a variance: params={known}."
-            )
-    if len(set(params)) < len(params) or len(params) == 0:
-        raise ValueError(f"params must be different names, one or more, got {list(params)}.")
+    params = names if params is None else [params] if isinstance(params, str) else [*params]
+    if len(set(params)) < len(params) or not params or not {*params} <= {*names}:
+        raise ValueError(f"params must be different names of {names}, one or more, got {params}.")
+    if unknown := [name for name in params if name not in known]:
+        raise ValueError(
+            f"the data do not determine {unknown[0]}; those that have a variance: params={known}."
+        )
     return [names.index(n) for n in params], values
 
 
 def _draws(samples: Any, names: list[str]) -> list[np.ndarray]:
     """Draws of each of the names, flat."""
     found = getattr(samples, "samples", samples)
-    if not isinstance(found, Mapping):
-        raise TypeError(
-            "samples must be a dvi.Samples or a dict of names with arrays of draws, got "
-            f"{type(samples).__name__}."
-        )
-    for name in names:
-        if name not in found:
-            raise ValueError(f"samples has no {name!r}: there are {', '.join(map(str, found))}.")
+    instance("samples", found, Mapping, "a dvi.Samples or a dict of names with arrays of draws")
+    if missing := [name for name in names if name not in found]:
+        raise ValueError(f"samples has no {missing[0]!r}: there are {', '.join(map(str, found))}.")
     flat = [np.ravel(np.asarray(found[n], float)) for n in names]
     if len({len(f) for f in flat}) > 1:
         raise ValueError("samples must hold the same number of draws for each name.")
@@ -142,17 +132,14 @@ def _scale(name: str, value: float, sigma: float) -> _Scale:
     near = abs(value) < 30 * sigma
     exponent = math.floor(math.log10(_WIDE * sigma + (abs(value) if near else 0.0)))
     exponent = 0 if -2 <= exponent <= 2 else exponent
-    unit = "" if exponent == 0 else f"\n[$10^{{{exponent}}}$]"
-    if near:
-        return _Scale(name, value, sigma, 0.0, 10.0**exponent, name + unit)
-    place = math.floor(math.log10(sigma)) - 1  # that of the last digit that is worth writing
-    zero, size = round(value, -place), math.floor(math.log10(abs(value)))
-    plain = f"{zero:.{max(0, -place)}f}"
-    text = plain if -4 <= size <= 6 else f"{zero:.{max(0, size - place)}e}"
-    sign = "−" if zero >= 0 else "+"
-    return _Scale(
-        name, value, sigma, zero, 10.0**exponent, f"{name} {sign} {text.lstrip('-')}{unit}"
-    )
+    zero, label = 0.0, name
+    if not near:
+        place = math.floor(math.log10(sigma)) - 1  # that of the last digit that is worth writing
+        zero, size = round(value, -place), math.floor(math.log10(abs(value)))
+        form = f".{max(0, -place)}f" if -4 <= size <= 6 else f".{max(0, size - place)}e"
+        label += f" {'−' if zero >= 0 else '+'} {abs(zero):{form}}"
+    label += "" if exponent == 0 else f"\n[$10^{{{exponent}}}$]"
+    return _Scale(name, value, sigma, zero, 10.0**exponent, label)
 
 
 def _corner_axes(axes: Any, n: int) -> np.ndarray:
@@ -160,8 +147,7 @@ def _corner_axes(axes: Any, n: int) -> np.ndarray:
         side = 1.3 + max(1.7, 1.9 - 0.05 * n) * n
         return plt.subplots(n, n, figsize=(side, side), squeeze=False, layout="constrained")[1]
     found = np.asarray(axes, object)
-    for axis in found.flat:
-        canvas(axis)
+    given(found, found.size, "")  # all of them are axes
     if found.shape != (n, n):
         raise ValueError(f"axes must have shape {(n, n)} for {n} parameters, not {found.shape}.")
     return found
@@ -181,23 +167,22 @@ def _draw_marginal(axis: Any, scale: _Scale, draws: np.ndarray | None) -> None:
 
 
 def _draw_pair(
-    axis: Any, x: _Scale, y: _Scale, C: np.ndarray, draws: tuple[np.ndarray, np.ndarray] | None
+    axis: Any, x: _Scale, y: _Scale, C: np.ndarray, xs: np.ndarray | None, ys: np.ndarray | None
 ) -> None:
     """Ellipses of one pair of parameters over its draws."""
-    units = np.array([x.unit, y.unit])
     centre = (x(x.value), y(y.value))
-    if draws is not None:
-        look: Any = {"color": "#8c8c8c", "alpha": min(1.0, 600 / len(draws[0])), "zorder": 1}
+    if xs is not None and ys is not None:
+        look: Any = {"color": "#8c8c8c", "alpha": min(1.0, 600 / len(xs)), "zorder": 1}
         look |= {"markersize": 2.5, "markeredgewidth": 0, "rasterized": True}
-        axis.plot(x(draws[0]), y(draws[1]), ".", **look)
+        axis.plot(x(xs), y(ys), ".", **look)
+    units = np.array([x.unit, y.unit])
     # Half axes of dᵀC⁻¹d = 1 along the eigenvectors, in the units of the panel.
-    values, vectors = np.linalg.eigh(C / np.outer(units, units))
+    values, vectors = np.linalg.eigh(C / (units * units[:, None]))
     angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
     look = {"angle": angle, "fill": False, "edgecolor": COLOURS[0], "zorder": 3}
     for size, linewidth, dash in ((1, 1.6, "-"), (2, 1.0, "--")):
-        width, height = 2 * size * np.sqrt(np.maximum(values[::-1], 0.0))
-        lines = {"linewidth": linewidth, "linestyle": dash}
-        axis.add_patch(Ellipse(centre, width, height, **look, **lines))
+        sides = 2 * size * np.sqrt(np.maximum(values[::-1], 0.0))
+        axis.add_patch(Ellipse(centre, *sides, linewidth=linewidth, linestyle=dash, **look))
     axis.plot(*centre, "+", color=COLOURS[1], markersize=7, markeredgewidth=1.6, zorder=4)
 
 
@@ -236,8 +221,6 @@ def _with_error(x: float, sigma: float) -> str:
     """``1.00063 ± 0.00002``, with two digits of the error."""
     digits = 1 - math.floor(math.log10(sigma))
     size = math.floor(math.log10(abs(x))) if x else 0
-    if 0 <= digits <= 7 and size <= 6:
-        text = f"{x:.{digits}f} ± {sigma:.{digits}f}"
-    else:
-        text = f"{x:.{max(size + digits, 1)}e} ± {sigma:.1e}"
-    return text.replace("-", "−")
+    fixed = 0 <= digits <= 7 and size <= 6
+    forms = (f".{digits}f",) * 2 if fixed else (f".{max(size + digits, 1)}e", ".1e")
+    return f"{signed(x, forms[0])} ± {signed(sigma, forms[1])}"

@@ -14,6 +14,8 @@ from .axes import (
     canvas,
     cell_edges,
     cells,
+    check_shapes,
+    counted,
     flat_cells,
     guide,
     legend,
@@ -52,46 +54,6 @@ def balance(
 
     **Raises** `TypeError` without drift or causes, `ValueError` for shapes that do not fit.
     """
-    t, rate, shares = _of_balance(ts, drift, causes)
-    if cumulative:
-        rate, shares = _summed(t, rate), {name: _summed(t, v) for name, v in shares.items()}
-    ratios = {"height_ratios": (3, 1)}
-    what = "the stack and what is left"
-    (top, bottom), new = stack(ax, 2, what, (6.4, 4.6), sharex=True, gridspec_kw=ratios)
-    up = down = np.zeros(len(t))
-    # Hatches distinguish the areas in print without colours.
-    looks = zip(itertools.cycle(COLOURS[:-1]), itertools.cycle(_HATCHES))
-    for (label, values), (colour, hatch) in zip(shares.items(), looks, strict=False):
-        look = {"facecolor": colour, "hatch": hatch, "edgecolor": "#ffffff", "linewidth": 0}
-        higher, lower = up + np.maximum(values, 0), down + np.minimum(values, 0)
-        top.fill_between(t, up, higher, label=label, **look)
-        top.fill_between(t, lower, down, **look)
-        up, down = higher, lower
-    top.plot(t, rate, color="#000000", linewidth=0.9, label="drift")
-    left = rate - sum(shares.values(), np.zeros(len(t)))
-    bottom.plot(t, left, color="#000000", linewidth=0.7)
-    top.axhline(0, color="#000000", linewidth=0.5)
-    what = "change" if cumulative else "rate of change"
-    top.set(ylabel=named(what, unit), title=title)
-    bottom.set(xlabel=time, ylabel="drift − sum")
-    legend(top, new)
-    top.figure.align_ylabels([top, bottom])
-    return np.asarray([top, bottom])
-
-
-def _summed(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Σ rate · step over the steps before each time."""
-    return np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(t))])
-
-
-_HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++++")
-_CAUSES = ("symmetry", "work", "lattice")
-
-
-def _of_balance(
-    ts: Any, drift: Any, causes: Mapping[str, Any] | None
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """(times, rate, label → share), checked."""
     if all(hasattr(ts, name) for name in ("ts", "drift", *_CAUSES)):
         causes = {name: getattr(ts, name) for name in _CAUSES} if causes is None else causes
         ts, drift = ts.ts, ts.drift if drift is None else drift
@@ -99,12 +61,41 @@ def _of_balance(
         raise TypeError(
             "balance takes what dvi.noether_balance returns, or times, the drift and its causes."
         )
-    t, rate = np.asarray(ts, float), np.asarray(drift, float)
-    shares = {name: np.asarray(v, float) for name, v in causes.items()}
-    shapes = {"ts": t.shape, "drift": rate.shape, **{n: v.shape for n, v in shares.items()}}
-    if t.ndim != 1 or not len(t) or len(set(shapes.values())) > 1:
-        raise ValueError(f"balance takes one number of each kind a step, shape (S,), got {shapes}.")
-    return t, rate, shares
+    given = {"ts": ts, "drift": drift, **causes}
+    arrays = {name: np.asarray(x, float) for name, x in given.items()}
+    fits = np.shape(ts) == (np.size(ts),) and len({x.shape for x in arrays.values()}) == 1
+    check_shapes(fits, "a balance has one number of each kind a step, shape (S,)", **arrays)
+    t, rate = arrays.pop("ts"), arrays.pop("drift")
+    if cumulative:  # the sum over the steps before each time
+        rate, *summed = (
+            np.append(0.0, np.cumsum(x[:-1] * np.diff(t))) for x in (rate, *arrays.values())
+        )
+        arrays = dict(zip(arrays, summed, strict=True))
+    ratios = {"height_ratios": (3, 1)}
+    what = "the stack and what is left"
+    (top, bottom), new = stack(ax, 2, what, (6.4, 4.6), sharex=True, gridspec_kw=ratios)
+    up = down = np.zeros(len(t))
+    # Hatches distinguish the areas in print without colours.
+    looks = itertools.cycle(zip(COLOURS[:-1], _HATCHES, strict=True))
+    for (label, values), (colour, hatch) in zip(arrays.items(), looks, strict=False):
+        look = {"facecolor": colour, "hatch": hatch, "edgecolor": "#ffffff", "linewidth": 0}
+        higher, lower = up + np.maximum(values, 0), down + np.minimum(values, 0)
+        top.fill_between(t, up, higher, label=label, **look)
+        top.fill_between(t, lower, down, **look)
+        up, down = higher, lower
+    top.plot(t, rate, color="#000000", linewidth=0.9, label="drift")
+    left = rate - sum(arrays.values(), np.zeros(len(t)))
+    bottom.plot(t, left, color="#000000", linewidth=0.7)
+    top.axhline(0, color="#000000", linewidth=0.5)
+    top.set(ylabel=named("change" if cumulative else "rate of change", unit), title=title)
+    bottom.set(xlabel=time, ylabel="drift − sum")
+    legend(top, new)
+    top.figure.align_ylabels([top, bottom])
+    return np.asarray([top, bottom])
+
+
+_HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++++")
+_CAUSES = ("symmetry", "work", "lattice")
 
 
 @in_style
@@ -135,7 +126,9 @@ def drift_orders(
             raise TypeError(
                 f"drift_orders draws what dvi.drift_order returned, got {order!r:.60} for {label}."
             )
-    slopes = _one_each(promised, len(results))
+    slopes = [*promised] if isinstance(promised, Sequence) else [promised] * len(results)
+    if len(slopes) != len(results):
+        raise ValueError(f"promised has {len(slopes)} orders for {len(results)} results.")
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
     looks = zip(results.items(), slopes, itertools.cycle(COLOURS), itertools.cycle(MARKERS))
@@ -158,10 +151,11 @@ def drift_orders(
     if promised is not None:
         dashed: Any = {"color": GREY, "linestyle": "--", "linewidth": 1}
         extra.append(Line2D([], [], label="slope promised", **dashed))
+    marks: Any = {"color": "#444444", "linestyle": "none"}
     if excluded:
-        hollow: Any = {"marker": "o", "markerfacecolor": "white", "linestyle": "none"}
-        extra.append(Line2D([], [], color="#444444", label="excluded from the fit", **hollow))
-    extra.append(Line2D([], [], color="#444444", label="at ε = 0", **_BAR))
+        look: Any = {"marker": "o", "markerfacecolor": "white", **marks}
+        extra.append(Line2D([], [], label="excluded from the fit", **look))
+    extra.append(Line2D([], [], label="at ε = 0", **marks | _BAR))
     extra += without_place_entries(lost, total, ("drifts failed", "drifts are exactly 0"))
     legend(axis, new, extra)
     return axis
@@ -229,13 +223,12 @@ def _draw_drifts(axis: Any, surface: DriftSurface, edges: Any) -> list[Any]:
     i, j = np.nonzero(~surface.used & ~failed)
     if len(i):
         look: Any = {"color": "black", "markerfacecolor": "white", "markersize": 4}
-        look |= {"markeredgewidth": 0.8, "linestyle": "none", "marker": "o"}
-        label = "excluded from the fit"
-        entries += axis.plot(surface.epsilons[i], surface.hs[j], label=label, **look)
-    if zero.any():
-        entries.append(Patch(color=ZERO, label=f"{zero.sum()} of {drifts.size} exactly 0"))
-    if failed.any():
-        entries.append(Patch(label=f"{failed.sum()} of {drifts.size} failed", **HATCH))
+        look |= {"markeredgewidth": 0.8, "label": "excluded from the fit"}
+        entries += axis.plot(surface.epsilons[i], surface.hs[j], "o", **look)
+    black: Any = {"color": ZERO}
+    for where, text, patch in ((zero, "exactly 0", black), (failed, "failed", HATCH)):
+        counts = counted({f"of {drifts.size} {text}": where.sum()})
+        entries += [Patch(label=label, **patch) for label in counts]
     return entries
 
 
@@ -255,8 +248,10 @@ def _draw_orders_in_epsilon(axis: Any, surface: DriftSurface, promised: float | 
             axis.errorbar(surface.hs[here], y, yerr=bars, fmt="o", **look)
     if promised is not None:
         axis.axhline(promised, color=GREY, linewidth=1, linestyle="--", label="promised")
-        least, most = [promised - 0.1, *(low[measured] - 0.05)], [promised + 0.1]
-        axis.set_ylim(min(least), max([*most, *(high[measured] + 0.05)]))
+        axis.set_ylim(
+            np.min(low[measured] - 0.05, initial=promised - 0.1),
+            np.max(high[measured] + 0.05, initial=promised + 0.1),
+        )
     look = {"rotation": 90, "ha": "center", "va": "bottom", "fontsize": 8, "color": "#555555"}
     for value in surface.hs[~measured]:
         axis.annotate("no order", (value, 0.02), xycoords=("data", "axes fraction"), **look)
@@ -271,10 +266,3 @@ def _slope_text(order: DriftOrder) -> str:
     half = (high - low) / 2
     digits = 3 if not half > 0 else int(np.clip(1 - np.floor(np.log10(half)), 3, 6))
     return f"slope {order.slope:.{digits}f} ± {half:.{digits}f}"
-
-
-def _one_each(value: Any, count: int) -> list[float | None]:
-    values: list[float | None] = [value] * count if not isinstance(value, Sequence) else [*value]
-    if len(values) != count:
-        raise ValueError(f"promised has {len(values)} orders for {count} results.")
-    return values

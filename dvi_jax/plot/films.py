@@ -1,13 +1,12 @@
 """Films of orbits: GIF by Pillow, which comes with matplotlib, MP4 by ffmpeg, if it is there."""
 
-import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.animation import FFMpegWriter, writers
+from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, writers
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
@@ -15,13 +14,13 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from PIL import Image
 
+from .._checks import one_of, positive
 from . import series
 from .axes import legend
-from .orbits import View, check_names, label_plane, label_view, phase_portrait, view_of
-from .states import Lane, cross, lanes_of, looks_of, one_shape, troubles
+from .orbits import View, label_plane, label_view, phase_portrait, view_of
+from .states import Lane, lanes_of, looks_of, one_shape, place_in, troubles
 from .style import CROSS, STAR, in_style
 
-_SUFFIXES = (".gif", ".mp4")
 _FASTEST_GIF = 50
 """Frames a second: viewers slow down a GIF with shorter delays than 2/100 s."""
 
@@ -36,6 +35,9 @@ _GHOSTS = 12
 
 _DOT: dict[str, Any] = {"marker": "o", "linestyle": "none", "markersize": 6}
 _DOT |= {"markeredgecolor": "black", "markeredgewidth": 0.6}
+
+
+_PLAIN = Image.Dither.NONE
 
 
 class _Track(NamedTuple):
@@ -92,13 +94,14 @@ def animate(
     than 2²⁸ pixels, and as `orbit` does; `RuntimeError` for an MP4 without ffmpeg.
     """
     path = Path(path)
+    is_gif = path.suffix.lower() == ".gif"
     _check_film(path, seconds, fps, tail, beside)
-    lanes = lanes_of(orbits, "animate", labels, momenta=False)
+    lanes = lanes_of(orbits, labels, momenta=False)
     tracks, view = _tracks(lanes, coordinates, bodies, centre, names)
     times = _moments(lanes, seconds * fps)
     width, height = size or ((9.6, 4.6) if beside else (5.0, 4.8))
     pixels = round(width * dpi) * round(height * dpi)
-    if path.suffix.lower() == ".gif" and pixels * len(times) > _MOST_BYTES:
+    if is_gif and pixels * len(times) > _MOST_BYTES:
         raise ValueError(
             f"a GIF of {len(times)} frames of {pixels} pixels is too large to be held, and to be "
             "shown anywhere: take fewer seconds, a lower fps, a smaller size or dpi, or .mp4."
@@ -113,35 +116,45 @@ def animate(
     if beside == "phase_portrait":
         scene.mark_phase(figure.add_subplot(grid[1]), orbits, dof, units)
     elif beside == "invariants":
-        scene.mark_invariants(figure, grid[1], orbits, values, change, log, units)
+        scene.mark_invariants(grid[1], orbits, values, change, log, units)
     scene.show(len(times) - 1)
     canvas.draw()  # the layout of the fullest frame is that of all
     figure.set_layout_engine("none")
     part = path.with_name(f".{path.stem}.part{path.suffix.lower()}")
-    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    rate: Any = len(times) / seconds
+    writer = _GifWriter(scene, seconds) if is_gif else FFMpegWriter(rate)
     try:
-        write(part, scene, canvas, seconds, progress or (lambda done, total: None))
+        write(writer, scene, part, progress)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
     return path
 
 
+def write(writer: AbstractMovieWriter, scene: "_Scene", path: Path, progress: Any) -> None:
+    """Every frame of a scene, in a file."""
+    figure, count = scene.axis.figure, len(scene.times)
+    with writer.saving(figure, str(path), figure.dpi):
+        for frame in range(count):
+            scene.show(frame)
+            writer.grab_frame()
+            if progress is not None:
+                progress(frame + 1, count)
+
+
 def _check_film(path: Path, seconds: float, fps: float, tail: float, beside: Any) -> None:
     suffix = path.suffix.lower()
-    if suffix not in _SUFFIXES:
+    if suffix not in (".gif", ".mp4"):
         raise ValueError(f"a film is a .gif or an .mp4, got {path.name!r}.")
     if not path.parent.is_dir():
         raise ValueError(f"the folder of the film is not there: {path.parent}.")
-    for name, value in (("seconds", seconds), ("fps", fps)):
-        if not 0 < value < math.inf:
-            raise ValueError(f"{name} must be a positive number, got {value!r}.")
+    positive("seconds", seconds)
+    positive("fps", fps)
+    one_of("beside", beside, (None, "phase_portrait", "invariants"))
     if not 0 <= tail <= 1:
         raise ValueError(f"tail must be a share from 0 to 1, got {tail!r}.")
     if suffix == ".gif" and fps > _FASTEST_GIF:
         raise ValueError(f"a GIF shows at most {_FASTEST_GIF} frames a second, got fps={fps:g}.")
-    if beside not in (None, "phase_portrait", "invariants"):
-        raise ValueError(f'beside must be "phase_portrait" or "invariants", got {beside!r}.')
     if suffix == ".mp4" and not writers.is_available("ffmpeg"):
         raise RuntimeError(
             "an .mp4 is written by ffmpeg, which is not found: install it (apt, brew or conda "
@@ -152,38 +165,31 @@ def _check_film(path: Path, seconds: float, fps: float, tail: float, beside: Any
 def _tracks(
     lanes: Sequence[Lane], coordinates: Any, bodies: Any, centre: Any, names: Any
 ) -> tuple[list[_Track], View | None]:
-    shape = one_shape(lanes, "animate")
-    check_names(lanes, shape, names)
-    if math.prod(shape) == 1 and coordinates is None:
-        looks, tracks = looks_of(len(lanes)), []
-        for i, lane in enumerate(lanes):
-            if lane.ps is None:
-                raise TypeError("a film of one degree of freedom needs momenta: (ts, qs, ps).")
-            pair = [lane.qs.reshape(-1), lane.ps.reshape(-1)]
-            tracks.append(_Track(i, pair, looks.colours[i], lane.label))
-        return tracks, None
-    view = view_of(shape, coordinates, bodies, centre, names)
-    several = len(lanes) > 1
-    looks = looks_of(len(lanes) if several else len(view.bodies))
-    tracks = []
-    for (i, lane), k in itertools.product(enumerate(lanes), range(len(view.bodies))):
-        name = view.names[k] if not several else lane.label if k == 0 else ""
-        colour = looks.colours[i if several else k]
-        tracks.append(_Track(i, view.of(lane.qs, k), colour, name))
-    return tracks, view
+    if math.prod(one_shape(lanes)) == 1 and coordinates is None and names is None:
+        if any(lane.ps is None for lane in lanes):
+            raise TypeError("a film of one degree of freedom needs momenta: (ts, qs, ps).")
+        place, colours = (0,) * len(lanes[0].shape), looks_of(len(lanes)).colours
+        return [
+            _Track(i, list(lane.plane(place)), colours[i], lane.label)
+            for i, lane in enumerate(lanes)
+        ], None
+    view = view_of(lanes, coordinates, bodies, centre, names)
+    colours = looks_of(len(lanes) if len(lanes) > 1 else len(view.bodies)).colours
+    return [
+        _Track(i, view.of(lanes[i].qs, k), colours[colour], name)
+        for i, k, colour, name in view.lines(lanes)
+    ], view
 
 
 def _moments(lanes: Sequence[Lane], frames: float) -> np.ndarray:
     """Times of the frames, evenly from the first to the last that there is."""
     known = [lane.ts[lane.there] for lane in lanes if lane.there.any()]
     if not known:
-        raise ValueError("animate: no orbit has a state that is finite.")
+        raise ValueError("no orbit has a state that is finite.")
     count = max(2, min(round(frames), max(len(t) for t in known)))
     ends = np.array([[t[0], t[-1]] for t in known])
-    forward = (ends[:, 1] >= ends[:, 0]).all()
-    first = ends.min() if forward else ends.max()
-    last = ends.max() if forward else ends.min()
-    return np.linspace(first, last, count)
+    times = np.linspace(ends.min(), ends.max(), count)
+    return times if (ends[:, 1] >= ends[:, 0]).all() else times[::-1]
 
 
 class _Scene:
@@ -196,30 +202,27 @@ class _Scene:
         self.length = tail * abs(times[-1] - times[0])
         self.sign = 1.0 if times[-1] >= times[0] else -1.0
         # Each orbit until its last state.
-        self.last = [lane.ended for lane in lanes]
-        ends = zip(lanes, self.last, strict=True)
-        self.clock = [self.sign * lane.ts[: n + 1] for lane, n in ends]
-        longest = max(len(c) for c in self.clock)
-        self.stride = max(1, math.ceil(tail * longest / _TAIL))
+        self.clock = [self.sign * lane.ts[: lane.ended + 1] for lane in lanes]
+        self.stride = max(1, math.ceil(tail * max(map(len, self.clock)) / _TAIL))
         self.heads: list[Any] = []
         self.tails: list[Any] = []
         self.crosses: list[Any] = []
-        self.moving: list[Callable[[int, float], None]] = []
+        self.moving: list[Callable[[float], None]] = []
 
     def prepare(self, view: View | None, units: Mapping[str, str], title: str) -> None:
         """Draw what does not move, and one head, tail and cross for each track."""
-        axis, space = self.axis, self.axis.name == "3d"
+        axis = self.axis
         pale = {"color": "#cccccc", "linewidth": 0.6, "zorder": 0.8}
         pale["alpha"] = 1.0 if len(self.tracks) <= _GHOSTS else 0.0
         for track in self.tracks:
             axis.plot(*track.coordinates, **pale)
             start = [[float(x[0])] for x in track.coordinates]
             nothing = [np.tile(np.ravel(start), (2, 1))]
-            if space:
-                self.tails.append(axis.add_collection3d(Line3DCollection(nothing)))
+            if axis.name == "3d":
+                self.tails.append(axis.add_collection3d(Line3DCollection(nothing, linewidths=1.6)))
             else:
-                self.tails.append(axis.add_collection(LineCollection(nothing), autolim=False))
-            self.tails[-1].set_linewidth(1.6)
+                tail = LineCollection(nothing, linewidths=1.6)
+                self.tails.append(axis.add_collection(tail, autolim=False))
             look = {"color": track.colour, "label": track.name or None, "zorder": 4}
             self.heads += axis.plot(*start, **_DOT, **look)
             self.crosses += axis.plot(*start, linestyle="none", zorder=5, **CROSS)
@@ -229,7 +232,7 @@ class _Scene:
             if view.mark is not None:
                 axis.plot(*([x] for x in view.mark), zorder=3, **STAR)
             label_view(axis, view, units)
-        legend(axis, True, [cross(text) for text in troubles(self.lanes)])
+        legend(axis, True, troubles(self.lanes))
         axis.set_title(title)
         step = abs(self.times[-1] - self.times[0]) / len(self.times)
         digits = int(np.clip(np.ceil(-np.log10(step)), 0, 12)) if step > 0 else 0
@@ -239,33 +242,31 @@ class _Scene:
     def mark_phase(self, axis: Any, orbits: Any, dof: Any, units: Any) -> None:
         """A phase portrait with a dot at the moment."""
         shape = self.lanes[0].shape
-        dof = (0,) * len(shape) if dof is None else dof
-        phase_portrait(orbits, dof=dof, units=units, ax=axis)
-        place = (dof,) if isinstance(dof, int) else tuple(dof)
+        place = (0,) * len(shape) if dof is None else place_in(shape, dof)
+        phase_portrait(orbits, dof=place, units=units, ax=axis)
         colours = looks_of(len(self.lanes)).colours
         dots = [axis.plot([], [], color=c, zorder=5, **_DOT)[0] for c in colours]
 
-        def move(lane: int, t: float) -> None:
-            k, one = self._now(lane, t), self.lanes[lane]
-            assert one.ps is not None
-            q, p = ([one.qs[(k, *place)]], [one.ps[(k, *place)]]) if k >= 0 else ([], [])
-            dots[lane].set_data(q, p)
+        def move(t: float) -> None:
+            for i, (dot, lane) in enumerate(zip(dots, self.lanes, strict=True)):
+                k = self._now(i, t)
+                dot.set_data(*([x[k]] if k >= 0 else [] for x in lane.plane(place)))
 
         self.moving.append(move)
 
     def mark_invariants(
-        self, figure: Any, cell: Any, orbits: Any, values: Any, change: str, log: bool, units: Any
+        self, cell: Any, orbits: Any, values: Any, change: str, log: bool, units: Any
     ) -> None:
         """Quantities along time with a line at the moment."""
-        count = series.panels_of(orbits, values, log)
-        inner = cell.subgridspec(count, 1)
+        figure = self.axis.figure
+        inner = cell.subgridspec(series.panels_of(orbits, values, log), 1)
         axes: list[Any] = []
-        for i in range(count):
+        for i in range(inner.nrows):
             axes.append(figure.add_subplot(inner[i], sharex=axes[0] if axes else None))
         series.invariants(orbits, values, change=change, log=log, units=units, ax=axes)
         lines = [axis.axvline(self.times[0], color="#000000", linewidth=1) for axis in axes]
 
-        def move(lane: int, t: float) -> None:
+        def move(t: float) -> None:
             for line in lines:
                 line.set_xdata([t, t])
 
@@ -281,13 +282,12 @@ class _Scene:
         for i, track in enumerate(self.tracks):
             self._show_track(i, track, t)
         for move in self.moving:
-            for lane in range(len(self.lanes)):
-                move(lane, t)
+            move(t)
         self.axis.set_title(self.clock_text.format(t), loc="right", fontweight="normal")
 
     def _show_track(self, i: int, track: _Track, t: float) -> None:
-        now, last = self._now(track.lane, t), self.last[track.lane]
-        clock = self.clock[track.lane]
+        now, clock = self._now(track.lane, t), self.clock[track.lane]
+        last = len(clock) - 1
         first = int(np.searchsorted(clock, self.sign * t - self.length)) if len(clock) else 0
         # The same states in every frame, so that a tail of few does not flicker.
         places = np.arange(first, now + 1)
@@ -310,48 +310,43 @@ def _put(line: Any, coordinates: Sequence[Any]) -> None:
     (line.set_data if len(coordinates) == 2 else line.set_data_3d)(*coordinates)
 
 
-# --- files --------------------------------------------------------------------------------------
+class _GifWriter(AbstractMovieWriter):
+    """A GIF with one palette for all frames, in which colours do not flicker.
 
+    Its delays are whole hundredths of a second, and their sum is `seconds`.
+    """
 
-def _write_gif(path: Path, scene: _Scene, canvas: Any, seconds: float, progress: Any) -> None:
-    def drawn() -> Any:
-        canvas.draw()
-        return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-
-    count = len(scene.times)
-    # One palette for all, or colours would flicker: from frames that have what there is.
-    few = np.unique(np.linspace(0, count - 1, 4).astype(int))
-    samples = []
-    for frame in few:
-        scene.show(frame)
-        samples.append(np.asarray(drawn()))
-    palette = Image.fromarray(np.concatenate(samples)).quantize(256, dither=Image.Dither.NONE)
-    colours = np.asarray(palette.getpalette()).reshape(-1, 3)
-    colours[colours.min(1) >= 248] = 255  # paper stays white
-    palette.putpalette(colours.ravel().tolist())
-    palette.load()
-
-    def frames() -> Iterator[Any]:
-        for frame in range(count):
+    def __init__(self, scene: _Scene, seconds: float):
+        super().__init__()
+        count = len(scene.times)
+        self.delays = 10 * np.diff(np.round(100 * seconds * np.arange(count + 1) / count))
+        samples = []  # frames that together have what there is
+        for frame in np.unique(np.linspace(0, count - 1, 4).astype(int)):
             scene.show(frame)
-            yield drawn().quantize(palette=palette, dither=Image.Dither.NONE)
-            progress(frame + 1, count)
+            samples.append(np.asarray(_drawn(scene.axis.figure)))
+        self.palette = Image.fromarray(np.concatenate(samples)).quantize(256, dither=_PLAIN)
+        colours = np.asarray(self.palette.getpalette()).reshape(-1, 3)
+        colours[colours.min(1) >= 248] = 255  # paper stays white
+        self.palette.putpalette(colours.ravel().tolist())
+        self.palette.load()
 
-    # Delays are whole hundredths of a second, and their sum is `seconds`.
-    ends = np.round(100 * seconds * np.arange(count + 1) / count)
-    delays = [int(10 * d) for d in np.diff(ends)]
-    images = frames()
-    next(images).save(
-        path, format="GIF", save_all=True, append_images=images, duration=delays, loop=0
-    )
+    def setup(self, fig: Any, outfile: Any, dpi: float | None = None) -> None:
+        self.fig, self.outfile, self.dpi = fig, outfile, dpi or fig.dpi
+        self.frames: list[Any] = []
+
+    def grab_frame(self, **savefig_kwargs: Any) -> None:
+        drawn = _drawn(self.fig)
+        self.frames.append(drawn.quantize(palette=self.palette, dither=_PLAIN))
+
+    def finish(self) -> None:
+        if not self.frames:  # the first could not be drawn
+            return
+        first, *others = self.frames
+        delays = self.delays.astype(int).tolist()
+        look = {"save_all": True, "append_images": others, "duration": delays, "loop": 0}
+        first.save(self.outfile, format="GIF", **look)
 
 
-def _write_mp4(path: Path, scene: _Scene, canvas: Any, seconds: float, progress: Any) -> None:
-    count, figure = len(scene.times), canvas.figure
-    rate: Any = count / seconds
-    writer = FFMpegWriter(fps=rate)
-    with writer.saving(figure, str(path), figure.dpi):
-        for frame in range(count):
-            scene.show(frame)
-            writer.grab_frame()
-            progress(frame + 1, count)
+def _drawn(figure: Any) -> Any:
+    figure.canvas.draw()
+    return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())

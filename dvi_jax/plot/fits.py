@@ -9,14 +9,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
 
-from .axes import at_edge, canvas, counted, given, legend
+from .axes import at_edge, canvas, check_shapes, counted, given, labels_of, legend
+from .states import chosen
 from .style import COLOURS, GREY, MARKERS, in_style
 
 _PANELS = 6
 """Arcs up to which each has a panel of its own."""
-
-_LINES = ((1, "--"), (3, ":"))
-"""Standard errors that are marked, and how."""
 
 # --- residuals ----------------------------------------------------------------------------------
 
@@ -46,38 +44,48 @@ def fit_residuals(
     **Raises** `TypeError` for what is no fit; `ValueError` for arcs or components that are not
     there, and another number of axes or names.
     """
-    check_fit(fit, "fit_residuals", "whitened", "ts", "chi2", "degrees_of_freedom")
-    numbers = _chosen(arcs, len(fit.whitened), "arc")
+    check_fit(fit, "whitened", "ts", "chi2", "degrees_of_freedom")
+    numbers = chosen("arcs", arcs, len(fit.whitened))
     size = 1.0 if fit.has_errors else math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
     rows = {i: np.asarray(fit.whitened[i]) / (size or 1.0) for i in numbers}
     components = max(r.shape[1] for r in rows.values())
-    kept, named = _chosen(component, components, "component"), _named(names, components)
-    panels = [[i] for i in numbers] if len(numbers) <= _PANELS else [numbers]
-    new = axes is None
+    kept = chosen("component", component, components)
+    named = labels_of(names, components, "components", "names")
+    panels, single = [[i] for i in numbers], len(numbers) <= _PANELS
+    panels, new = panels if single else [numbers], axes is None
     axes = _residual_axes(axes, len(panels))
+    every = np.concatenate(
+        [r[:, [k for k in kept if k < r.shape[1]]].ravel() for r in rows.values()]
+    )
+    known = every[np.isfinite(every)]
+    furthest = 1.08 * max(3.5, np.abs(known).max(initial=0.0))
     for axis, those in zip(axes, panels, strict=False):
-        for i in those:
-            _draw_residuals(axis, fit.ts[i], rows[i], kept, None if len(those) == 1 else i)
+        for i, k in itertools.product(those, kept):
+            if k < rows[i].shape[1]:
+                look = _dot(k if len(those) == 1 else i, 3.5 if len(fit.ts[i]) < 400 else 1.8)
+                axis.plot(fit.ts[i], rows[i][:, k], **look, markeredgewidth=0, alpha=0.85)
         if len(panels) > 1:
             axis.set_title(f"arc {those[0]}", fontsize=9.5)
-        _lines(axis)
-    every = np.concatenate([_only(r, kept).ravel() for r in rows.values()])
-    total = every.size
-    every = every[np.isfinite(every)]
-    furthest = 1.08 * max(3.5, np.abs(every).max(initial=0.0))
-    _draw_distribution(axes[-1], every, furthest)
-    if lost := total - every.size:
-        axes[-1].set_xlabel(f"count\n{lost} of {total}\nno number")
-    unit = "standard errors" if fit.has_errors else f"s = {size:.3g}"
-    label = f"observed − predicted\n[{unit}]"
-    for axis in axes[:-1]:
-        axis.set_ylim(-furthest, furthest)
+        _lines(axis, furthest)
         if furthest < 5:
             axis.set_yticks([-3, -1, 1, 3])
-    axes[(len(panels) - 1) // 2].set_ylabel(label)
+    _draw_distribution(axes[-1], known, furthest)
+    if lost := every.size - known.size:
+        axes[-1].set_xlabel(f"count\n{lost} of {every.size}\nno number")
+    unit = "standard errors" if fit.has_errors else f"s = {size:.3g}"
+    axes[(len(panels) - 1) // 2].set_ylabel(f"observed − predicted\n[{unit}]")
     axes[len(panels) - 1].set_xlabel("time t")
-    if not any(len(those) > 1 for those in panels) and 1 < len(kept) <= len(COLOURS):
-        _legend_of_components(axes[0], {k: named[k] for k in kept}, new)
+    if (single or len(numbers) == 1) and 1 < len(kept) <= len(COLOURS):
+        handles = [
+            Line2D([], [], markeredgewidth=0, label=named[k] or f"component {k}", **_dot(k))
+            for k in kept
+        ]
+        if new:
+            look: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "columnspacing": 1.0}
+            look |= {"handletextpad": 0.1, "borderaxespad": 0.1, "ncols": min(len(kept), 4)}
+            axes[0].legend(handles=handles, **look)
+        else:
+            legend(axes[0], new, handles, labelled=False)
     return np.asarray(axes)
 
 
@@ -87,33 +95,26 @@ def _residual_axes(axes: Sequence[Any] | None, count: int) -> list[Any]:
         return given(axes, count + 1, "one for each panel and one for the distribution")
     figure = plt.figure(figsize=(7.4, 2.6 + 0.9 * (count - 1) + 0.6), layout="constrained")
     grid = figure.add_gridspec(count, 2, width_ratios=(5, 1))
-    first = figure.add_subplot(grid[0, 0])
-    panels = [first] + [figure.add_subplot(grid[i, 0], sharey=first) for i in range(1, count)]
-    for axis in panels:
-        axis.grid(axis="y", visible=False)
+    panels: list[Any] = []
+    for i in range(count):
+        panels.append(figure.add_subplot(grid[i, 0], sharey=panels[0] if panels else None))
+        panels[-1].grid(axis="y", visible=False)
     beside = figure.add_subplot(grid[:, 1])
     beside.tick_params(labelleft=count > 1)
     return [*panels, beside]
 
 
-def _draw_residuals(axis: Any, ts: Any, r: np.ndarray, kept: list[int], arc: int | None) -> None:
-    size = 3.5 if len(ts) < 400 else 1.8
-    for k in (k for k in kept if k < r.shape[1]):
-        look = _dot(k if arc is None else arc)
-        axis.plot(ts, r[:, k], **look, markersize=size, markeredgewidth=0, alpha=0.85)
-
-
-def _dot(number: int) -> dict[str, Any]:
+def _dot(number: int, size: float | None = None) -> dict[str, Any]:
     """Marker and colour of a component or of an arc."""
     look = {"marker": MARKERS[number % len(MARKERS)], "color": COLOURS[number % len(COLOURS)]}
-    return look | {"linestyle": "none"}
+    return look | {"linestyle": "none", "markersize": size}
 
 
-def _lines(axis: Any) -> None:
-    axis.axhline(0, color=GREY, linewidth=0.8)
-    for at, dash in _LINES:
-        for sign in (-1, 1):
-            axis.axhline(sign * at, color=GREY, linewidth=0.8, linestyle=dash)
+def _lines(axis: Any, furthest: float) -> None:
+    """Lines at 0, ±1 and ±3 standard errors."""
+    for at, dash in ((0, "-"), (-1, "--"), (1, "--"), (-3, ":"), (3, ":")):
+        axis.axhline(at, color=GREY, linewidth=0.8, linestyle=dash)
+    axis.set_ylim(-furthest, furthest)
 
 
 def _draw_distribution(axis: Any, r: np.ndarray, furthest: float) -> None:
@@ -124,29 +125,9 @@ def _draw_distribution(axis: Any, r: np.ndarray, furthest: float) -> None:
     y = np.linspace(-furthest, furthest, 200)
     density = np.exp(-(y**2) / 2) / np.sqrt(2 * np.pi) * r.size * (bins[1] - bins[0])
     axis.plot(density, y, color="#000000", linewidth=1.1)
-    _lines(axis)
-    axis.set_ylim(-furthest, furthest)
+    _lines(axis, furthest)
     axis.grid(visible=False)
     axis.set_xlabel("count")
-
-
-def _named(names: Sequence[str] | None, components: int) -> list[str]:
-    """A name for each component."""
-    if names is None:
-        return [f"component {k}" for k in range(components)]
-    if isinstance(names, str) or len(names) != components:
-        raise ValueError(f"names must be {components}, one for each component, got {names!r}.")
-    return [str(name) for name in names]
-
-
-def _legend_of_components(axis: Any, names: dict[int, str], new: bool) -> None:
-    handles = [Line2D([], [], markeredgewidth=0, label=n, **_dot(k)) for k, n in names.items()]
-    if not new:
-        legend(axis, new, handles, labelled=False)
-        return
-    look: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
-    look |= {"handletextpad": 0.1, "borderaxespad": 0.1, "columnspacing": 1.0}
-    axis.legend(handles=handles, ncols=min(len(names), 4), **look)
 
 
 # --- data and model -----------------------------------------------------------------------------
@@ -177,44 +158,41 @@ def fit_against_data(
     **Raises** `TypeError` for what is no fit; `ValueError` for an arc or a component that is not
     there, a curve of another shape, or another number of names.
     """
-    check_fit(fit, "fit_against_data", "ts", "observed", "predicted", "errors")
-    (arc,) = _chosen(arc, len(fit.ts), "arc")
+    check_fit(fit, "ts", "observed", "predicted", "errors")
+    (arc,) = chosen("arc", arc, len(fit.ts))
     ts = np.asarray(fit.ts[arc])
     seen, model = (np.asarray(x[arc]).reshape(len(ts), -1) for x in (fit.observed, fit.predicted))
-    kept, named = _chosen(component, seen.shape[1], "component"), _named(names, seen.shape[1])
+    components = seen.shape[1]
+    kept = chosen("component", component, components)
+    named = labels_of(names, components, "components", "names")
     if component is None and len(kept) > len(COLOURS):
         raise ValueError(
             f"{len(kept)} components are too many for one picture: choose some, "
             f"component={kept[:3]}, say."
         )
-    fine = (ts, model) if curve is None else _curve(curve, seen.shape[1])
+    fine, curves = (np.asarray(x, float) for x in ((ts, model) if curve is None else curve))
+    wanted = (
+        f"curve must be (times, values), shapes (T,) and (T, ...), with {components} components"
+    )
+    fits = fine.ndim == 1 and curves.shape[:1] == fine.shape and curves[:1].size == components
+    check_shapes(fits, wanted, times=fine, values=curves)
     found = math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
     errors = np.asarray(fit.errors[arc]).reshape(seen.shape) if fit.has_errors else found
     errors = np.broadcast_to(errors, seen.shape)
     ax, new = canvas(ax, (7.0, 4.0))
-    order = np.argsort(fine[0])
+    order, curves = np.argsort(fine), curves.reshape(len(fine), -1)
     for k in kept:
-        colour = COLOURS[k % len(COLOURS)]
-        name = f"{named[k]}: " if seen.shape[1] > 1 or names is not None else ""
-        curve_look = {"color": colour, "linewidth": 1.1, "label": f"{name}fit"}
-        ax.plot(fine[0][order], fine[1][order, k], **curve_look)
-        look = {**_dot(k), "markersize": 4 if len(ts) < 200 else 2, "markerfacecolor": "white"}
-        look |= {"capsize": 0, "elinewidth": 0.9, "label": f"{name}observed"}
+        name = named[k] or (f"component {k}" if components > 1 else "")
+        name += ": " if name else ""
+        look = _dot(k, 4 if len(ts) < 200 else 2) | {"markerfacecolor": "white", "capsize": 0}
+        line = {"color": look["color"], "linewidth": 1.1, "label": f"{name}fit"}
+        ax.plot(fine[order], curves[order, k], **line)
+        look |= {"elinewidth": 0.9, "label": f"{name}observed"}
         ax.errorbar(ts, seen[:, k], yerr=errors[:, k], **look)
     title = f"arc {arc}" if len(fit.ts) > 1 else ""
     ax.set(xlabel="time t", ylabel="observed value", title=title)
     legend(ax, new)
     return ax
-
-
-def _curve(curve: Any, components: int) -> tuple[np.ndarray, np.ndarray]:
-    ts, values = (np.asarray(x, float) for x in curve)
-    if ts.ndim != 1 or values.shape[:1] != ts.shape or values[:1].size != components:
-        raise ValueError(
-            f"curve must be (times, values) of shapes (T,) and (T, ...) with {components} "
-            f"components, got {ts.shape} and {values.shape}."
-        )
-    return ts, values.reshape(len(ts), -1)
 
 
 # --- how it went --------------------------------------------------------------------------------
@@ -234,10 +212,9 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
 
     **Raises** `TypeError` for what is no fit; `ValueError` for one that took no step.
     """
-    check_fit(fit, "learning_curve", "history")
-    stage, loss, accepted, horizon = (
-        np.asarray(fit.history[n]) for n in ("stage", "loss", "accepted", "horizon")
-    )
+    check_fit(fit, "history")
+    columns = ("stage", "loss", "accepted", "horizon")
+    stage, loss, accepted, horizon = (np.asarray(fit.history[name]) for name in columns)
     if loss.size == 0:
         raise ValueError("the fit took no step: there is no history to draw.")
     ax, new = canvas(ax)
@@ -272,28 +249,10 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
 # --- what is taken ------------------------------------------------------------------------------
 
 
-def check_fit(fit: Any, who: str, *needs: str) -> None:
+def check_fit(fit: Any, *needs: str) -> None:
     lacking = [name for name in needs if not hasattr(fit, name)]
     if lacking:
         raise TypeError(
-            f"{who} takes a FitResult, as dvi.fit returns it, got {type(fit).__name__} without "
+            f"fit must be a FitResult, as dvi.fit returns it, got {type(fit).__name__} without "
             f"{', '.join(lacking)}."
         )
-
-
-def _chosen(which: Any, count: int, called: str) -> list[int]:
-    """Numbers below `count`: all for None."""
-    if which is None:
-        return list(range(count))
-    chosen = [which] if np.ndim(which) == 0 else list(which)
-    for i in chosen:
-        is_whole = isinstance(i, int | np.integer) and not isinstance(i, bool)
-        if not is_whole or not 0 <= i < count:
-            raise ValueError(f"there is no {called} {i!r}: they are numbered 0 to {count - 1}.")
-    if not chosen:
-        raise ValueError(f"choose at least one {called}.")
-    return [int(i) for i in chosen]
-
-
-def _only(r: np.ndarray, kept: list[int]) -> np.ndarray:
-    return r[:, [k for k in kept if k < r.shape[1]]]

@@ -1,8 +1,7 @@
 """Pictures of states: phase portraits, orbits in the plane and in space."""
 
-import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,8 +10,19 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from .axes import canvas, legend, path, stack
-from .states import Lane, Looks, cross, lanes_of, looks_of, one_shape, place_in, subscript, troubles
+from .._checks import positive, whole
+from .axes import canvas, labels_of, legend, path, stack
+from .states import (
+    Lane,
+    Looks,
+    chosen,
+    lanes_of,
+    looks_of,
+    one_shape,
+    place_in,
+    subscript,
+    troubles,
+)
 from .style import COLOURS, CROSS, DASHES, MARKS, STAR, START, in_style, named
 
 _PANELS = 6
@@ -67,26 +77,21 @@ def phase_portrait(
     **Raises** `TypeError` for what are no orbits, `ValueError` for shapes and components that do
     not fit.
     """
-    what = "phase_portrait"
-    lanes = lanes_of(orbits, what, labels)
-    shape, units = one_shape(lanes, what), units or {}
-    places = _places(shape, dof, what)
+    lanes = lanes_of(orbits, labels)
+    shape, units = one_shape(lanes), units or {}
+    places = _places(shape, dof)
     looks = looks_of(len(lanes), colour)
     columns, height = min(3, len(places)), 4.0 if len(places) <= 3 else 6.8
     size = (5.2, 4.4) if len(places) == 1 else (1.2 + 3.4 * columns, height)
     axes, new = stack(ax, len(places), "one for each degree of freedom", size, ncols=columns)
     for axis, place in zip(axes, places, strict=True):
-        at = (slice(None), *place)
         for i, lane in enumerate(lanes):
-            assert lane.ps is not None
-            q, p = lane.qs[at], lane.ps[at]
-            _draw_orbit(axis, lane, _folded(q, p, period), looks, i, dots)
+            _draw_orbit(axis, lane, _folded(*lane.plane(place), period), looks, i, dots)
         label_plane(axis, place, shape, units)
         if period is not None:
             axis.set_xlim(-period / 2, period / 2)
             if math.isclose(period, 2 * math.pi):
-                quarters = np.arange(-2, 3)
-                axis.set_xticks(quarters * math.pi / 2, ["−π", "−π/2", "0", "π/2", "π"])
+                axis.set_xticks(np.arange(-2, 3) * math.pi / 2, ["−π", "−π/2", "0", "π/2", "π"])
         if hamiltonian is not None:
             _level_lines(axis, hamiltonian, lanes[0], place, levels)
     axes[0].set_title(title)
@@ -101,28 +106,26 @@ def label_plane(axis: Any, place: Any, shape: tuple[int, ...], units: Mapping[st
     axis.set_ylabel(named(subscript("p", place, shape), units.get("p")))
 
 
-def _places(shape: tuple[int, ...], dof: Any, what: str) -> list[tuple[int, ...]]:
-    if dof is None:
-        count = math.prod(shape)
-        if count > _PANELS:
-            raise ValueError(
-                f"{what}: there are {count} degrees of freedom and room for {_PANELS} panels: name "
-                f"some, dof=[{'0, 1' if len(shape) == 1 else '(0, 0), (0, 1)'}]."
-            )
-        return list(np.ndindex(shape))
-    chosen = dof if isinstance(dof, list) else [dof]
-    if not chosen:
-        raise ValueError(f"{what}: dof is empty, there is nothing to draw.")
-    return [place_in(shape, one, what) for one in chosen]
+def _places(shape: tuple[int, ...], dof: Any) -> list[tuple[int, ...]]:
+    places = list(np.ndindex(shape))
+    if dof is not None:
+        places = [place_in(shape, one) for one in (dof if isinstance(dof, list) else [dof])]
+    elif len(places) > _PANELS:
+        some = "0, 1" if len(shape) == 1 else "(0, 0), (0, 1)"
+        raise ValueError(
+            f"there are {len(places)} degrees of freedom and room for {_PANELS} panels: name some, "
+            f"dof=[{some}]."
+        )
+    if not places:
+        raise ValueError("dof is empty, there is nothing to draw.")
+    return places
 
 
 def _folded(q: np.ndarray, p: np.ndarray, period: float | None) -> tuple[np.ndarray, np.ndarray]:
     """An angle within one period, with a gap where it goes round."""
     if period is None:
         return q, p
-    if not period > 0:
-        raise ValueError(f"period must be positive, got {period!r}.")
-    turns = np.round(q / period)
+    turns = np.round(q / positive("period", period))
     round_again = np.flatnonzero(np.diff(turns) != 0) + 1
     q = np.insert(q - period * turns, round_again, np.nan)
     return q, np.insert(p.astype(float), round_again, np.nan)
@@ -132,15 +135,12 @@ def _draw_orbit(
     axis: Any, lane: Lane, xy: Sequence[np.ndarray], looks: Looks, i: int, dots: bool
 ) -> None:
     """A line with a circle at its start, and a cross at its end if that came too early."""
-    look: dict[str, Any] = {"color": looks.colours[i], "label": lane.label or None}
-    n = len(xy[0])
+    look, n = looks.line(i, 1.0) | {"label": lane.label or None}, len(xy[0])
     if dots:
         look |= {"linestyle": "none", "marker": "o", "markeredgewidth": 0}
-        size = 2.2 if n < 3000 else 0.9
-        axis.plot(*xy, markersize=size, rasterized=n > 5000, **look)
+        axis.plot(*xy, markersize=2.2 if n < 3000 else 0.9, rasterized=n > 5000, **look)
     else:
-        look |= {"linestyle": looks.dashes[i], "linewidth": 1.0} | _marks(looks, i, n)
-        path(axis, *xy, **look)
+        path(axis, *xy, **look, **_marks(looks, i, n))
     if len(looks.colours) <= len(COLOURS):
         axis.plot(*(x[:1] for x in xy), color=looks.colours[i], zorder=3, **START)
     if lane.trouble:
@@ -163,14 +163,10 @@ def _finish(
 ) -> None:
     """The bar of colours and the legend of a picture of orbits."""
     looks.colour_bar(axes, label)
-    handles: list[Any] = []
-    if len(lanes) <= len(COLOURS):
-        handles.append(Line2D([], [], color="#444444", label="start", **START))
-    if levels:
-        handles.append(Line2D([], [], color="#a8a8a8", linewidth=0.8, label="levels of H"))
-    handles += looks.entries()
-    handles += [cross(text) for text in troubles(lanes)]
-    legend(axes[0], new, handles)
+    start = Line2D([], [], color="#444444", label="start", **START)
+    level = Line2D([], [], color="#a8a8a8", linewidth=0.8, label="levels of H")
+    handles = [start] * (len(lanes) <= len(COLOURS)) + [level] * levels
+    legend(axes[0], new, [*handles, *looks.entries(), *troubles(lanes)])
 
 
 def _level_lines(
@@ -179,10 +175,10 @@ def _level_lines(
     """Level lines over the whole panel, as far as the orbits made it."""
     x, y = (np.linspace(low, high, _MESH) for low, high in (axis.get_xlim(), axis.get_ylim()))
     assert lane.ps is not None
-    q, p = lane.qs[0].astype(float), lane.ps[0].astype(float)
+    q, p = (jnp.asarray(state[0], float) for state in (lane.qs, lane.ps))
 
     def value(a, b):
-        return hamiltonian(jnp.asarray(q).at[place].set(a), jnp.asarray(p).at[place].set(b))
+        return hamiltonian(q.at[place].set(a), p.at[place].set(b))
 
     H = np.asarray(jax.jit(jax.vmap(jax.vmap(value, (0, None)), (None, 0)))(x, y))
     if H.shape != (_MESH, _MESH):
@@ -190,11 +186,10 @@ def _level_lines(
             "hamiltonian must be a function (q, p) → number of one state, it returned shape "
             f"{H.shape[2:]}."
         )
-    limits = axis.get_xlim(), axis.get_ylim()
+    axis.autoscale(False)
     if np.isfinite(H).any():
         look: dict[str, Any] = {"colors": "#a8a8a8", "linewidths": 0.7, "linestyles": "-"}
         axis.contour(x, y, np.ma.masked_invalid(H), levels, zorder=0.9, **look)
-    axis.set(xlim=limits[0], ylim=limits[1])
 
 
 # --- orbits -------------------------------------------------------------------------------------
@@ -236,22 +231,15 @@ def orbit(
     **Raises** `TypeError` for what are no orbits, `ValueError` for one coordinate, for bodies and
     coordinates that are not there, for names in a batch, and for axes of another dimension.
     """
-    lanes = lanes_of(orbits, "orbit", labels, momenta=False)
-    shape = one_shape(lanes, "orbit")
-    check_names(lanes, shape, names)
-    view = view_of(shape, coordinates, bodies, centre, names)
-    several = len(lanes) > 1
-    looks = looks_of(len(lanes) if several else len(view.bodies), colour if several else None)
-    if colour is not None and not several:
+    lanes = lanes_of(orbits, labels, momenta=False)
+    view = view_of(lanes, coordinates, bodies, centre, names)
+    if colour is not None and len(lanes) == 1:
         raise ValueError("colour distinguishes orbits of a batch, and there is one orbit.")
-    space = len(view.coordinates) == 3
-    axis, new = canvas(ax, (5.4, 5.0), space)
-    for (i, lane), (k, _) in itertools.product(enumerate(lanes), enumerate(view.bodies)):
-        if not several:
-            lane = lane._replace(label=view.names[k] or (lane.label if k == 0 else ""))
-        elif k:
-            lane = lane._replace(label="")
-        _draw_orbit(axis, lane, view.of(lane.qs, k), looks, i if several else k, dots)
+    looks = looks_of(len(lanes) if len(lanes) > 1 else len(view.bodies), colour)
+    axis, new = canvas(ax, (5.4, 5.0), len(view.coordinates) == 3)
+    for i, k, colour_number, name in view.lines(lanes):
+        lane = lanes[i]._replace(label=name)
+        _draw_orbit(axis, lane, view.of(lane.qs, k), looks, colour_number, dots)
     if view.mark is not None:
         axis.plot(*([x] for x in view.mark), label=view.mark_name, **STAR)
     label_view(axis, view, units or {})
@@ -271,9 +259,9 @@ class View(NamedTuple):
     bodies: list[int]
     names: list[str]
     many: bool
-    about: int | None
-    mark: np.ndarray | None
-    mark_name: str
+    about: int | None = None
+    mark: np.ndarray | None = None
+    mark_name: str = "centre"
 
     def of(self, qs: np.ndarray, k: int) -> list[np.ndarray]:
         """Coordinates of drawn body number k, shape (S,) each."""
@@ -282,90 +270,75 @@ class View(NamedTuple):
             x = x - qs[:, self.about]
         return [x[:, c] for c in self.coordinates]
 
+    def lines(self, lanes: Sequence[Lane]) -> Iterator[tuple[int, int, int, str]]:
+        """(number of the orbit, of the drawn body, of the colour; name) of every line.
 
-def view_of(shape: tuple[int, ...], coordinates: Any, bodies: Any, centre: Any, names: Any) -> View:
-    """The checked choice of what is drawn of states of a shape."""
+        A colour is an orbit of a batch, else a body.
+        """
+        several = len(lanes) > 1
+        for i, k in np.ndindex(len(lanes), len(self.bodies)):
+            yield i, k, i if several else k, self.names[k] or (lanes[i].label if k == 0 else "")
+
+
+def view_of(lanes: Sequence[Lane], coordinates: Any, bodies: Any, centre: Any, names: Any) -> View:
+    """The checked choice of what is drawn of orbits."""
+    shape = one_shape(lanes)
+    if names is not None and (len(lanes) > 1 or math.prod(shape) == 1):
+        raise ValueError(
+            f"names are of bodies of one orbit, and there are {len(lanes)} orbits of states of "
+            f"shape {shape}: name the orbits, labels=[...], or draw one of them."
+        )
     if len(shape) not in (1, 2):
         raise ValueError(f"orbit draws states of shape (n,) or (bodies, dim), got {shape}.")
-    many, count = len(shape) == 2, shape[0] if len(shape) == 2 else 1
-    coordinates = _coordinates(shape[-1], coordinates)
-    chosen = list(range(count)) if bodies is None else [int(b) for b in bodies]
-    if not chosen or not all(0 <= b < count for b in chosen):
-        raise ValueError(f"bodies must be numbers from 0 to {count - 1}, got {bodies!r}.")
-    about, mark, mark_name = None, None, "centre"
-    if isinstance(centre, int | np.integer) and not isinstance(centre, bool):
-        if not many or not 0 <= centre < count:
-            raise ValueError(f"centre is no body of a state of shape {shape}: got {centre!r}.")
-        about, mark, mark_name = int(centre), np.zeros(len(coordinates)), f"body {centre + 1}"
-        if bodies is None:
-            chosen = [b for b in chosen if b != about]
+    many, dim, count = len(shape) == 2, shape[-1], shape[0] if len(shape) == 2 else 1
+    axes = tuple(chosen("coordinates", coordinates, dim))
+    if len(axes) not in (2, 3):
+        raise ValueError(
+            f"an orbit has two or three coordinates, there are {len(axes)} of {dim}: name some, "
+            "coordinates=(0, 1); phase_portrait draws a single one."
+        )
+    drawn = chosen("bodies", bodies, count)
+    view = View(axes, drawn, [], many)
+    if isinstance(centre, int | np.integer) and many:
+        about = whole("centre", centre, 0, count - 1)
+        view = view._replace(about=about, mark=np.zeros(len(axes)), mark_name=f"body {about + 1}")
+        drawn = [b for b in drawn if b != about] if bodies is None else drawn
     elif centre is not None:
         point = np.asarray(centre, float)
-        if point.shape != shape[-1:]:
+        if point.shape != (dim,):
             raise ValueError(
-                f"centre must be the number of a body or a point of shape {shape[-1:]}, got shape "
-                f"{point.shape}."
+                "centre must be the number of a body, of which there are "
+                f"{count if many else 'none'}, or a point of shape {(dim,)}, got {centre!r}."
             )
-        mark = point[list(coordinates)]
-    if names is not None and (isinstance(names, str) or len(names) != len(chosen)):
-        raise ValueError(f"names has {len(names)} entries for {len(chosen)} bodies.")
-    names = [*(names or [""] * len(chosen))]
-    return View(coordinates, chosen, names, many, about, mark, mark_name)
-
-
-def _coordinates(dim: int, chosen: Any) -> tuple[int, ...]:
-    """Two or three numbers of coordinates, all of them for None."""
-    if chosen is None and dim not in (2, 3):
-        other = "phase_portrait draws it" if dim == 1 else "name some, coordinates=(0, 1)"
-        raise ValueError(f"an orbit has two or three coordinates, there are {dim}: {other}.")
-    found = tuple(range(dim) if chosen is None else chosen)
-    fits = all(isinstance(c, int | np.integer) and 0 <= c < dim for c in found)
-    if len(found) not in (2, 3) or not fits:
-        raise ValueError(
-            f"coordinates must be two or three numbers from 0 to {dim - 1}, got {found!r}."
-        )
-    return found
-
-
-def check_names(lanes: Sequence[Lane], shape: tuple[int, ...], names: Any) -> None:
-    """Refuse names of bodies where a colour is an orbit."""
-    if names is not None and len(lanes) > 1:
-        raise ValueError(
-            f"names are of bodies of one orbit, and there are {len(lanes)} orbits, which have "
-            "a colour each: name these, labels=[...], or draw one orbit."
-        )
-    if names is not None and math.prod(shape) == 1:
-        raise ValueError("names are of bodies, and the state is one number: take labels=[...].")
+        view = view._replace(mark=point[list(axes)])
+    return view._replace(bodies=drawn, names=labels_of(names, len(drawn), "bodies", "names"))
 
 
 def label_view(axis: Any, view: View, units: Mapping[str, str]) -> None:
     """Names of the axes, and one scale for all."""
-    letters = "xyz" if view.many else None
     for which, c in zip("xyz", view.coordinates, strict=False):
-        name = letters[c] if letters else subscript("q", (c,), (2,))
+        name = "xyz"[c] if view.many else subscript("q", (c,), (2,))
         if view.about is not None:
             name += f" − {name}$_{{{view.about + 1}}}$"
-        getattr(axis, f"set_{which}label")(named(name, units.get("q")))
+        axis.set(**{f"{which}label": named(name, units.get("q"))})
     if len(view.coordinates) == 3:
-        sides = _widen(axis)
-        # One scale for all axes, and a smaller box, so that the labels fit into the figure.
-        axis.set_box_aspect(sides, zoom=0.84)
-        axis.zaxis.labelpad = 9
+        _widen(axis)
     else:
         axis.set_aspect("equal", adjustable="datalim")
 
 
-def _widen(axis: Any) -> list[float]:
-    """Room about an orbit that is much narrower than long, for numbers; the sides of the box."""
-    sides = {which: np.ptp(getattr(axis, f"get_{which}lim")()) for which in "xyz"}
-    longest = max(sides.values())
-    for which, side in sides.items():
-        wanted = max(side, _NARROW * longest)
-        middle = np.mean(getattr(axis, f"get_{which}lim")())
-        getattr(axis, f"set_{which}lim")(middle - wanted / 2, middle + wanted / 2)
-        bins = int(np.clip(round(6 * wanted / longest), 3, 6))
+def _widen(axis: Any) -> None:
+    """One scale for all axes in space, with room about an orbit much narrower than long."""
+    limits = np.asarray([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()])
+    wide = np.ptp(limits, axis=1)
+    sides = np.maximum(wide, _NARROW * wide.max())
+    for which, middle, side in zip("xyz", limits.mean(1), sides, strict=True):
+        axis.set(**{f"{which}lim": (middle - side / 2, middle + side / 2)})
+        bins = int(np.clip(round(6 * side / wide.max()), 3, 6))
         getattr(axis, f"{which}axis").set_major_locator(MaxNLocator(bins))
-    return [max(float(side), _NARROW * float(longest)) for side in sides.values()]
+    # A smaller box, so that the labels fit into the figure.
+    axis.set_box_aspect(sides, zoom=0.84)
+    axis.zaxis.labelpad = 9
 
 
 # --- what a run shows ---------------------------------------------------------------------------
@@ -393,29 +366,25 @@ def trajectory(
 
     **Returns** the `Axes`.
     """
-    lanes = lanes_of(ts if qs is None else (ts, qs, ps), "trajectory")
+    lanes = lanes_of(ts if qs is None else (ts, qs, ps))
     if len(lanes) > 1:
         raise ValueError(
             f"trajectory draws one orbit, got {len(lanes)}: see phase_portrait and orbit."
         )
-    (lane,) = lanes
-    assert lane.ps is not None
-    units = {"q": position or "", "p": momentum or ""}
-    arrays, shape = (lane.ts, lane.qs, lane.ps), lane.shape
+    t, q, p = lanes[0][:3]
+    assert p is not None
+    units, shape = {"q": position or "", "p": momentum or ""}, q.shape[1:]
     if math.prod(shape) == 1:
-        if shape != (1,):
-            arrays = (lane.ts, *(x.reshape(-1, 1) for x in (lane.qs, lane.ps)))
-        return phase_portrait(arrays, dots=True, units=units, title=title, ax=ax)
+        one = t, q.reshape(-1, 1), p.reshape(-1, 1)
+        return phase_portrait(one, dots=True, units=units, title=title, ax=ax)
     if shape == (2,) or (len(shape) == 2 and shape[-1] in (2, 3)):
-        return orbit(arrays[:2], (0, 1), units=units, title=title, ax=ax)
+        return orbit((t, q), (0, 1), units=units, title=title, ax=ax)
     axis, new = canvas(ax, (6.4, 4.2))
-    flat = lane.qs.reshape(len(lane.ts), -1)
-    for i in range(flat.shape[1]):
+    flat = q.reshape(len(t), -1)
+    for i, values in enumerate(flat.T):
         look: Any = {"color": COLOURS[i % len(COLOURS)], "linestyle": DASHES[i % len(DASHES)]}
-        path(axis, lane.ts, flat[:, i], linewidth=1, label=f"q$_{{{i + 1}}}$", **look)
+        label = f"q$_{{{i + 1}}}$" if flat.shape[1] <= 12 else None
+        path(axis, t, values, linewidth=1, label=label, **look)
     axis.set(xlabel=time, ylabel=named("q", position), title=title)
-    if flat.shape[1] > 12:
-        for line in axis.lines:
-            line.set_label(None)
-    legend(axis, new, [cross(text) for text in troubles(lanes)])
+    legend(axis, new, troubles(lanes))
     return axis

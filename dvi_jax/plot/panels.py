@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogFormatterMathtext, LogLocator
 
+from .._checks import instance
 from .axes import at_edge, canvas, cells, extend, flat_cells, stack
 from .places import Place, dim_of, find_place, label_of, names_of
 from .style import COLOURS, GREY, HATCH, NO_NUMBER, SHADES, ZERO
@@ -50,10 +51,6 @@ class Grid(NamedTuple):
     def bins(self) -> dict[str, Any]:
         return {place.dim: place.bins for place in self.places}
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(len(place.centres) for place in self.places)
-
 
 def arrange(
     data: Any,
@@ -74,23 +71,20 @@ def arrange(
     width, height = _two(pixels)
     if not (width >= 1 and height >= 1):
         raise ValueError(f"pixels must be (width, height), two positive numbers, got {pixels!r}.")
-    made = made or {}
     if empty := [str(d) for d, n in data.sizes.items() if n == 0]:
         raise ValueError(f"there is nothing to draw: {', '.join(empty)} has no values.")
     over = (over,) if isinstance(over, str) else tuple(over)
     roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in over}}
     taken: dict[str, str] = {}
-    for role, name in roles.items():
-        if name is None:
-            continue
-        dim = dim_of(data, name)
+    named = {role: dim_of(data, name) for role, name in roles.items() if name is not None}
+    for role, dim in named.items():
         if dim in taken:
             raise ValueError(f"{role} and {taken[dim]} are both along {dim!r}: name another.")
         taken[dim] = role
+    made = made or {}
     gone = [dim_of(data, name) for name, stand_in in made.items() if stand_in is None]
-    free = [str(d) for d in data.dims if d not in taken and d not in gone]
-    single = [d for d in free if data.sizes[d] == 1]
-    free = [d for d in free if d not in single]
+    left = [str(d) for d in data.dims if d not in taken and d not in gone]
+    free = [d for d in left if data.sizes[d] > 1]
     if x is None:
         x, y = (free.pop(0), y) if free else (y, None)
     if y is None and free:
@@ -98,24 +92,20 @@ def arrange(
     if x is None:
         raise ValueError("there is nothing to draw: no dimension has more than one value.")
     if free:
-        raise ValueError(_too_many(data, x, y, free))
-    data = data.isel(dict.fromkeys(single, 0))
-    places = {}
-    for name, size in ((x, int(width)), (y, int(height))):
+        raise ValueError(
+            f"a map has two dimensions, {x!r} and {y!r} here; {', '.join(map(repr, free))} "
+            f"{'is' if len(free) == 1 else 'are'} left of {names_of(data)}. Select one value, "
+            f"data.isel({free[0]}=0), reduce them, over={free[0]!r}, or draw one map each, "
+            f"facet={free[0]!r}."
+        )
+    data = data.isel({d: 0 for d in left if data.sizes[d] == 1})
+    places: list[Any] = [None, None]
+    for i, (name, size) in enumerate(((x, width), (y, height))):
         if name is not None:
             stand_in = made.get(name)
-            places[name] = find_place(data if stand_in is None else stand_in, name, size)
-    over = tuple(dim_of(data, name) for name in over)
-    return Grid(_panels(data, facet), places[x], None if y is None else places[y], over)
-
-
-def _too_many(data: Any, x: str, y: str | None, free: list[str]) -> str:
-    first = free[0]
-    return (
-        f"a map has two dimensions, {x!r} and {y!r} here; {', '.join(map(repr, free))} "
-        f"{'is' if len(free) == 1 else 'are'} left of {names_of(data)}. Select one value, "
-        f"data.isel({first}=0), reduce them, over={first!r}, or draw one map each, facet={first!r}."
-    )
+            places[i] = find_place(data if stand_in is None else stand_in, name, int(size))
+    dims = tuple(dim_of(data, name) for name in over)
+    return Grid(_panels(data, facet), places[0], places[1], dims)
 
 
 def _two(values: Any) -> tuple[float, float]:
@@ -138,30 +128,23 @@ def _panels(data: Any, facet: str | None) -> list[tuple[str, Any]]:
             f"select some, data.isel({dim}=slice(None, None, {-(-count // _MOST_PANELS)}))."
         )
     coordinate = data.coords.get(facet)
-    label = label_of(coordinate, facet)
-    name, _, units = label.partition(" [")
+    name, _, units = label_of(coordinate, facet).partition(" [")
     values = np.arange(count) if coordinate is None else coordinate.values
     texts = [f"{v:.4g}" if np.issubdtype(type(v), np.number) else str(v) for v in values]
     tail = f" {units.rstrip(']')}" if units else ""
     return [(f"{name} = {t}{tail}", data.isel({dim: i})) for i, t in enumerate(texts)]
 
 
-def checked_array(data: Any, what: str) -> Any:
+def checked_array(data: Any) -> Any:
     """A `DataArray` of numbers, or an error that shows how to get one."""
     import xarray as xr
 
+    hint = 'Take one variable of a Dataset, such as result.to_xarray()["drift"].'
     if isinstance(data, xr.Dataset):
-        raise TypeError(
-            f"{what} takes one variable of a Dataset, data[name]: there are "
-            f"{', '.join(map(str, data.data_vars))}."
-        )
-    if not isinstance(data, xr.DataArray):
-        raise TypeError(
-            f'{what} takes an xarray.DataArray, such as result.to_xarray()["drift"], got '
-            f"{type(data).__name__}."
-        )
+        hint += f" There are {', '.join(map(str, data.data_vars))}."
+    instance("data", data, xr.DataArray, "an xarray.DataArray", hint)
     if data.dtype.kind not in "biuf":
-        raise TypeError(f"{what} takes real numbers, got an array of {data.dtype}.")
+        raise TypeError(f"data must be real numbers, got an array of {data.dtype}.")
     return data
 
 
@@ -191,21 +174,19 @@ def finish(axes: Sequence[Any], grid: Grid) -> None:
             _dress(axis, "y", grid.y)
         if title:
             axis.set_title(title)
-        below = axis.get_subplotspec()
-        if len(axes) > 1 and below is not None:
-            columns = below.get_gridspec().ncols
-            axis.tick_params(labelbottom=i + columns >= len(axes))
-            axis.set_xlabel(axis.get_xlabel() if i + columns >= len(axes) else "")
+        if len(axes) > 1:
+            columns = axis.get_subplotspec().get_gridspec().ncols
+            last = i + columns >= len(axes)
+            axis.tick_params(labelbottom=last)
+            axis.set_xlabel(axis.get_xlabel() if last else "")
             axis.set_ylabel(axis.get_ylabel() if i % columns == 0 else "")
 
 
 def _dress(axis: Any, which: str, place: Place) -> None:
-    set_ = {name: getattr(axis, f"set_{which}{name}") for name in ("scale", "lim", "label")}
-    ticks = getattr(axis, f"set_{which}ticks")
+    ticks, limits = getattr(axis, f"set_{which}ticks"), tuple(place.edges[[0, -1]])
     if place.log:
-        set_["scale"]("log")
-    set_["lim"](*place.edges[[0, -1]])
-    set_["label"](place.label)
+        axis.set(**{f"{which}scale": "log"})
+    axis.set(**{f"{which}lim": limits, f"{which}label": place.label})
     if place.names is not None:
         positions, texts = place.names
         long = which == "x" and sum(map(len, texts)) > 60
@@ -217,8 +198,7 @@ def _dress(axis: Any, which: str, place: Place) -> None:
             [t for t in LogLocator(subs=subs).tick_values(low, high) if low <= t <= high]
             for subs in ((1.0,), tuple(range(2, 10)))
         )
-        texts = [LogFormatterMathtext()(t) for t in major]
-        ticks([place.zero, *major], ["0", *texts])
+        ticks([place.zero, *major], ["0", *map(LogFormatterMathtext(), major)])
         ticks(minor, minor=True, labels=[""] * len(minor))
 
 

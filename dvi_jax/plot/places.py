@@ -41,15 +41,15 @@ def find_place(data: Any, name: str, pixels: int) -> Place:
     """
     dim = dim_of(data, name)
     size = data.sizes[dim]
-    if name not in data.coords:
-        return _counted(dim, label_of(None, name), make_bins(size, pixels))
-    coordinate = data.coords[name]
-    values, label = coordinate.values, label_of(coordinate, name)
-    if not _has_places(values):
-        place = _counted(dim, label, make_bins(size, pixels))
-        every = -(-size // _MOST_NAMES)
-        texts = [_short(v) for v in values[::every]]
-        return place._replace(names=(np.arange(size)[::every], texts))
+    values, label = None, label_of(None, name)
+    if name in data.coords:  # of others xarray would make 0, 1, 2, … of any length
+        values, label = data.coords[name].values, label_of(data.coords[name], name)
+    if values is None or not _has_places(values):
+        bins, every = make_bins(size, pixels), -(-size // _MOST_NAMES)
+        edges = bins.ends - 0.5
+        texts = None if values is None else [_short(v) for v in values[::every]]
+        names = None if texts is None else (np.arange(0, size, every), texts)
+        return Place(dim, label, bins, edges, (edges[1:] + edges[:-1]) / 2, names=names)
     rising = bool((np.diff(values) > 0).all())
     order = None if rising else np.argsort(values, kind="stable")
     bins = make_bins(size, pixels, order)
@@ -108,14 +108,8 @@ def _unevenness(x: np.ndarray) -> float:
 
 def _has_places(values: np.ndarray) -> bool:
     """Whether these are numbers, finite and all different."""
-    if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
-        return False
-    return len(np.unique(values)) == len(values)
-
-
-def _counted(dim: str, label: str, bins: Bins) -> Place:
-    edges = bins.ends - 0.5
-    return Place(dim, label, bins, edges, (edges[1:] + edges[:-1]) / 2)
+    numbers = values.dtype.kind in "iuf" and bool(np.isfinite(values).all())
+    return numbers and len(np.unique(values)) == len(values)
 
 
 def _short(value: Any) -> str:

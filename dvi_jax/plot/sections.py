@@ -1,21 +1,21 @@
 """Pictures of Poincaré sections: points of many orbits, and how they change with ε."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.colors import to_rgba
+from matplotlib.colors import to_rgba_array
 
+from .._checks import whole
 from .._results import status_name
-from .axes import at_edge, canvas, check_labels, counted, legend
+from .axes import at_edge, canvas, check_shapes, counted, labels_of, legend
 from .states import component, looks_of
 from .style import COLOURS, GREY, in_style
 
 _MANY = 3000
 """Points from which a picture has pixels of them in a file of vectors."""
-
 
 _GOOD = ("", "successful", "stopped", "never_crossed", "too_few_crossings")
 """Statuses of orbits whose states are valid: all but "failed"."""
@@ -35,23 +35,20 @@ class _Points(NamedTuple):
     reasons: np.ndarray
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        return self.qs.shape[2:]
-
-    @property
     def there(self) -> np.ndarray:
         """Which rows are crossings, shape (orbits, room)."""
-        return np.asarray(np.isfinite(self.qs).reshape(*self.qs.shape[:2], -1).all(-1))
+        return np.all(np.isfinite(self.qs), axis=tuple(range(2, self.qs.ndim)))
 
     @property
     def failed(self) -> np.ndarray:
         """Which orbits failed, shape (orbits,)."""
         return np.isin(self.statuses, _GOOD, invert=True)
 
-    def along(self, function: Any) -> np.ndarray:
-        """A coordinate of every row, shape (orbits, room)."""
-        flat = (x.reshape(-1, *self.shape) for x in (self.qs, self.ps))
-        return np.asarray(function(*flat), float).reshape(self.qs.shape[:2])
+    def along(self, which: Any, units: Mapping[str, str]) -> tuple[np.ndarray, str]:
+        """A coordinate of every row, shape (orbits, room), and its label."""
+        get, label = component(which, self.qs.shape[2:], units)
+        flat = (x.reshape(-1, *x.shape[2:]) for x in (self.qs, self.ps))
+        return np.asarray(get(*flat), float).reshape(self.qs.shape[:2]), label
 
 
 @in_style
@@ -92,161 +89,118 @@ def section(
     **Raises** `TypeError` for what are no crossings, `ValueError` for components that are not
     there, and another number of colours or names.
     """
-    points, units = _points_of(crossings, "section"), units or {}
-    get_x, x_label = component(x, points.shape, units, "section")
-    get_y, y_label = component(y, points.shape, units, "section")
-    there = points.there
-    count = len(there)
+    points, units = _points_of(crossings), units or {}
+    xs, x_label = points.along(x, units)
+    ys, y_label = points.along(y, units)
+    count = len(xs)
     looks = looks_of(count, colour, limits)
-    check_labels(labels, count, "orbits")
+    names = labels_of(labels, count, "orbits")
     axis, new = canvas(ax, (5.8, 4.8))
     axis.set(xlabel=x_label, ylabel=y_label, title=title)
-    far = np.zeros(0, bool)
-    if not there.any():
-        _say_empty(axis)
-    else:
-        xs, ys = points.along(get_x), points.along(get_y)
-        look = _dots(int(there.sum()), size)
-        failed = _leaves_limits(points)
-        if colour is None and count <= len(COLOURS):
-            for i in range(count):
-                name = None if labels is None else str(labels[i])
-                with _limits_kept(axis, bool(failed[i])):
-                    xy = xs[i][there[i]], ys[i][there[i]]
-                    axis.scatter(*xy, color=looks.colours[i], label=name, **look)
-        else:
-            # Orbits with neighbouring initial states have similar colours.
-            shades = np.asarray([to_rgba(c) for c in looks.colours])
-            _scatter(axis, xs, ys, there, failed, shades, look)
-        far = _beyond(axis, xs, ys)[there & failed[:, None]]
+    # Orbits with neighbouring initial states have similar colours.
+    colours = to_rgba_array(looks.colours)
+    single = names if colour is None and count <= len(COLOURS) else None
+    far = _draw(axis, xs, ys, points.there, points.failed, colours, size, single)
     looks.colour_bar([axis], colour_label)
-    found = legend(axis, new, [*looks.entries(), *_notes(points), *_far(far)])
+    found = legend(axis, new, [*looks.entries(), *_notes(points), *far])
     for handle in found.legend_handles if found else ():
         if hasattr(handle, "set_sizes"):
             handle.set_sizes([25])
     return axis
 
 
-def _leaves_limits(points: _Points) -> np.ndarray:
-    """Which orbits do not set the limits of the axes: failed ones, unless there are no others."""
-    others = points.there.any(1) & ~points.failed
-    return points.failed & others.any()
+def _draw(
+    axis: Any,
+    x: np.ndarray,
+    y: np.ndarray,
+    there: np.ndarray,
+    failed: np.ndarray,
+    colours: np.ndarray,
+    size: float | None,
+    names: Sequence[str] | None = None,
+) -> list[str]:
+    """The points of every orbit in its colour, with `names` an artist for each orbit.
 
-
-def _scatter(
-    axis: Any, x: np.ndarray, y: np.ndarray, there: Any, failed: Any, colours: Any, look: Any
-) -> None:
-    """The points of every orbit in its colour; those of failed ones do not set the limits."""
-    for failing in (False, True):
-        rows = there & (failed == failing)[:, None]
-        if rows.any():
-            with _limits_kept(axis, failing):
-                axis.scatter(x[rows], y[rows], c=np.repeat(colours, rows.sum(1), axis=0), **look)
-
-
-@contextmanager
-def _limits_kept(axis: Any, kept: bool) -> Iterator[None]:
-    """The limits of the data stay as they are, whatever is drawn inside."""
-    before = axis.dataLim.get_points().copy()
-    yield
-    if kept:
-        axis.dataLim.set_points(before)
-        axis.autoscale_view()
-
-
-def _beyond(axis: Any, xs: np.ndarray, ys: np.ndarray) -> np.ndarray:
-    """Which points lie outside the picture."""
+    Points of failed orbits do not set the limits of the axes, unless there are no others; returns
+    the legend text that counts those outside.
+    """
+    if not there.any():
+        look = {"ha": "center", "va": "center", "color": "#555555"}
+        axis.text(0.5, 0.5, "no orbit crossed the section", transform=axis.transAxes, **look)
+        axis.set(xticks=[], yticks=[])
+        return []
+    failed = failed & (there.any(1) & ~failed).any()
+    total = int(there.sum())
+    across = float(np.clip(150 / math.sqrt(total), 0.5, 2.5)) if size is None else size
+    look: Any = {"s": across**2, "linewidths": 0, "rasterized": total > _MANY}
+    for k, group in enumerate(np.eye(len(x), dtype=bool) if names else (~failed, failed)):
+        rows = there & group[:, None]
+        if names or rows.any():
+            label, each = (names[k] or None, 1) if names else (None, rows.sum(1)[group])
+            before = axis.dataLim.get_points().copy()
+            shown = np.repeat(colours[group], each, axis=0)
+            axis.scatter(x[rows], y[rows], color=shown, label=label, **look)
+            if failed[group].any():
+                axis.dataLim.set_points(before)
+                axis.autoscale_view()
     (left, right), (low, high) = sorted(axis.get_xlim()), sorted(axis.get_ylim())
-    return ~((xs >= left) & (xs <= right) & (ys >= low) & (ys <= high))
-
-
-def _far(beyond: np.ndarray) -> list[str]:
-    """Legend text that counts crossings of failed orbits outside the picture."""
+    beyond = ~((x >= left) & (x <= right) & (y >= low) & (y <= high))[there & failed[:, None]]
     text = f"of {len(beyond)} crossings of failed orbits lie outside the picture"
     return counted({text: beyond.sum()})
 
 
-def _dots(count: int, size: float | None) -> dict[str, Any]:
-    """How so many points look: smaller the more there are."""
-    across = size if size is not None else float(np.clip(150 / math.sqrt(count), 0.5, 2.5))
-    return {"s": across**2, "linewidths": 0, "rasterized": count > _MANY}
-
-
-def _points_of(crossings: Any, what: str) -> _Points:
+def _points_of(crossings: Any) -> _Points:
     found = _crossings_in(crossings)
     if len(found) != 1:
         raise TypeError(
-            f"{what} takes the Crossings of a dvi.Section, solution.observed, "
+            "crossings must be the Crossings of a dvi.Section, solution.observed, "
             + (f"and there are {len(found)}: name one." if found else f"got {crossings!r:.60}.")
         )
     ((one, status),) = found
     qs, ps, ts = (np.asarray(v) for v in (one.qs, one.ps, one.ts))
-    if ts.ndim == 0 or qs.shape[: ts.ndim] != ts.shape or qs.shape != ps.shape:
-        raise ValueError(
-            f"{what} takes crossings with ts of shape (..., room) and qs, ps of shape (..., room, "
-            f"*state), got {ts.shape}, {qs.shape} and {ps.shape}."
-        )
-    if qs.ndim == ts.ndim:
-        qs, ps = qs[..., None], ps[..., None]
-    shape = (math.prod(ts.shape[:-1]), *qs.shape[ts.ndim - 1 :])
-    counts = np.ravel(np.asarray(one.count))
-    reasons: Any = status
+    fits = ts.ndim and qs.shape[: ts.ndim] == ts.shape and qs.shape == ps.shape
+    wanted = "crossings have ts of shape (..., room) and qs, ps of shape (..., room, *state)"
+    check_shapes(fits, wanted, ts=ts, qs=qs, ps=ps)
+    *lead, room = ts.shape
+    shape = (math.prod(lead), room, *(qs.shape[ts.ndim :] or (1,)))
+    counts, reasons = np.ravel(np.asarray(one.count)), status
     if hasattr(one, "status"):  # a PoincareSection, which stops at this number
-        counts = np.minimum(counts, ts.shape[-1])
-        status = one.status
-        reasons = status_name(one.run) if hasattr(one, "run") else ""
-    statuses, reasons = (
-        np.broadcast_to(np.asarray(x, object), ts.shape[:-1]).ravel().astype(str)
-        for x in (status, reasons)
-    )
-    return _Points(qs.reshape(shape), ps.reshape(shape), counts, statuses, reasons)
+        counts = np.minimum(counts, room)
+        status, reasons = one.status, status_name(one.run) if hasattr(one, "run") else ""
+    texts = [
+        np.broadcast_to(np.asarray(x, object), lead).ravel().astype(str) for x in (status, reasons)
+    ]
+    return _Points(qs.reshape(shape), ps.reshape(shape), counts, *texts)
 
 
 def _crossings_in(tree: Any, status: Any = "") -> list[tuple[Any, Any]]:
     """Every `Crossings` of a solution or of its observables, with the status of the solution."""
     if all(hasattr(tree, name) for name in ("ts", "qs", "ps")):
-        if _is_count(tree):
+        if hasattr(tree, "count") and not callable(tree.count):
             return [(tree, status)]
-        return _crossings_in(getattr(tree, "observed", None), getattr(tree, "status", ""))
+        tree, status = [getattr(tree, "observed", None)], getattr(tree, "status", "")
     parts = tree.values() if isinstance(tree, Mapping) else tree
     if isinstance(tree, Mapping | list | tuple):
         return [c for v in parts for c in _crossings_in(v, status)]
     return []
 
 
-def _is_count(tree: Any) -> bool:
-    return hasattr(tree, "count") and not callable(tree.count)
-
-
 def _notes(points: _Points) -> list[str]:
     """Legend texts on orbits with too many, too few or no crossings, and on failed ones."""
-    total, room, failed = len(points.counts), points.qs.shape[1], points.failed
-    over = int(np.sum(points.counts > room))
-    none = int(np.sum((points.counts == 0) & ~failed & (points.statuses != "stopped")))
-    unknown = int(np.sum(~np.isfinite(points.counts) & ~failed))
-    few, stopped = (int(np.sum(points.statuses == s)) for s in ("too_few_crossings", "stopped"))
-    texts = []
-    if few:
-        texts.append(f"{few} of {total} orbits crossed less often than the {room} times asked for")
-    if stopped:
-        texts.append(f"{stopped} of {total} orbits stopped")
+    counts, statuses, failed = points.counts, points.statuses, points.failed
+    total, room = points.qs.shape[:2]
+    none = int(np.sum((counts == 0) & ~failed & (statuses != "stopped")))
     reasons = np.where(np.isin(points.reasons, _GOOD), "", points.reasons)[failed].tolist()
-    for reason in dict.fromkeys(reasons):
-        why = f": {reason.replace('_', ' ')}" if reason else ""
-        texts.append(f"{reasons.count(reason)} of {total} orbits failed{why}")
-    if over:
-        texts.append(f"{over} of {total} orbits crossed more often than the {room} times kept")
-    if none and none < total:
-        texts.append(f"{none} of {total} orbits did not cross")
-    if unknown:
-        texts.append(f"{unknown} of {total} orbits have no count of crossings")
-    return texts
-
-
-def _say_empty(axis: Any) -> None:
-    look = {"ha": "center", "va": "center", "color": "#555555"}
-    axis.text(0.5, 0.5, "no orbit crossed the section", transform=axis.transAxes, **look)
-    axis.set(xticks=[], yticks=[])
+    why = {f": {r.replace('_', ' ')}" if r else "": n for r, n in Counter(reasons).items()}
+    texts = {
+        f"crossed less often than the {room} times asked for": statuses == "too_few_crossings",
+        "stopped": statuses == "stopped",
+        **{f"failed{reason}": n for reason, n in why.items()},
+        f"crossed more often than the {room} times kept": counts > room,
+        "did not cross": none if none < total else 0,
+        "have no count of crossings": ~np.isfinite(counts) & ~failed,
+    }
+    return counted({f"of {total} orbits {text}": np.sum(n) for text, n in texts.items()})
 
 
 @in_style
@@ -282,51 +236,35 @@ def bifurcation(
     logarithmic axis.
     """
     parameter = np.asarray(parameter, float)
-    numbers = np.asarray(crossings) if _is_numeric(crossings) else None
-    if numbers is not None:
-        values, failed = numbers.astype(float), np.zeros(len(numbers), bool)
-        label = "" if y == "q[-1]" else y if isinstance(y, str) else ""
-        notes: list[str] = []
+    if any(hasattr(crossings, name) for name in ("qs", "observed")) or isinstance(
+        crossings, Mapping | tuple
+    ):
+        points = _points_of(crossings)
+        values, label = points.along(y, units or {})
+        there, failed, notes = points.there, points.failed, _notes(points)
     else:
-        points = _points_of(crossings, "bifurcation")
-        get, label = component(y, points.shape, units or {}, "bifurcation")
-        values = np.where(points.there, points.along(get), np.nan)
-        notes, failed = _notes(points), _leaves_limits(points)
-    if parameter.ndim != 1 or values.ndim != 2 or len(values) != len(parameter):
-        raise ValueError(
-            f"bifurcation takes a parameter of shape (runs,) and crossings of as many runs, got "
-            f"{parameter.shape} and {values.shape[:1]} runs."
-        )
-    if isinstance(skip, bool) or not isinstance(skip, int) or skip < 0:
-        raise ValueError(f"skip must be a number of crossings from 0, got {skip!r}.")
+        values = np.asarray(crossings, float)
+        there, failed, notes = np.isfinite(values), np.zeros(len(values), bool), []
+        label = y if isinstance(y, str) and y != "q[-1]" else ""
+    wanted = "a bifurcation has a parameter of shape (runs,) and crossings of as many runs"
+    fits = parameter.ndim == 1 and values.ndim == 2 and len(values) == len(parameter)
+    check_shapes(fits, wanted, parameter=parameter, crossings=values)
+    skip = whole("skip", skip, 0)
     if log and not (parameter > 0).all():
         raise ValueError("a logarithmic axis takes positive parameters: leave out log=True.")
-    values = values[:, skip:]
+    values, there = values[:, skip:], (there & np.isfinite(values))[:, skip:]
     x = np.broadcast_to(parameter[:, None], values.shape)
-    there = np.isfinite(values)
     axis, new = canvas(ax, (6.8, 4.4))
     axis.set(xlabel=name, ylabel=label, title=title)
-    if there.any():
-        look = _dots(int(there.sum()), size)
-        failed = failed & (there.any(1) & ~failed).any()  # those left after the first
-        black = np.tile(to_rgba("#000000"), (len(values), 1))
-        _scatter(axis, x, values, there, failed, black, look)
-        if log:
-            axis.set_xscale("log")
-        notes += _far(_beyond(axis, x, values)[there & failed[:, None]])
-        silent = int(np.sum(~there.any(1)))
-        if silent:
-            text = f"{silent} of {len(values)} runs have no crossing"
-            text += f" after the first {skip}" if skip else ""
-            notes = [n for n in notes if "did not cross" not in n] + [text]
-            at_edge(axis, parameter[~there.any(1)], "|", color=GREY)
-    else:
-        _say_empty(axis)
+    if log:
+        axis.set_xscale("log")
+    black = np.tile((0.0, 0.0, 0.0, 1.0), (len(values), 1))
+    notes += _draw(axis, x, values, there, failed, black, size)
+    silent = ~there.any(1)
+    if silent.any() and not silent.all():
+        text = f"{silent.sum()} of {len(values)} runs have no crossing"
+        text += f" after the first {skip}" if skip else ""
+        notes = [n for n in notes if "did not cross" not in n] + [text]
+        at_edge(axis, parameter[silent], "|", color=GREY)
     legend(axis, new, notes)
     return axis
-
-
-def _is_numeric(x: Any) -> bool:
-    return (
-        not hasattr(x, "qs") and not isinstance(x, Mapping | tuple) and not hasattr(x, "observed")
-    )

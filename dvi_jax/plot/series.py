@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .axes import canvas, check_labels, counted, envelope, legend, stack
-from .states import Looks, cross, each_state, lanes_of, looks_of, troubles
+from .._checks import one_of
+from .axes import canvas, check_shapes, counted, envelope, labels_of, legend, stack
+from .states import each_state, lanes_of, looks_of, troubles
 from .style import COLOURS, CROSS, DASHES, GREY, in_style, named
 
-_CHANGES = ("relative", "absolute", "value")
+_KINDS = {"relative": "relative change", "absolute": "change", "value": ""}
 _PANELS = 12
 
 _NEAR_ROUNDING = 1e-12
@@ -85,10 +86,9 @@ def invariants(
     fit, and for relative changes of what always starts at 0 (an orbit of a batch is left out, and
     named in the legend).
     """
-    if change not in _CHANGES:
-        raise ValueError(f"change must be one of {', '.join(_CHANGES)}, got {change!r}.")
+    one_of("change", change, _KINDS)
     units = units or {}
-    ts, lanes = _times(orbits, labels)
+    ts, names, lanes = _times(orbits, labels)
     watched = _watched(orbits, values, lanes)
     series = [_changed(name, ts, v, change, log) for name, v in watched.items()]
     count = _count_of_panels(len(series), len(ts), log)
@@ -100,36 +100,40 @@ def invariants(
     size = (6.4, 4.2) if count == 1 else (6.4, 1.4 + 1.45 * count)
     axes, new = stack(ax, count, "one for each quantity", size, sharex=True)
     looks = looks_of(len(series) if together else len(ts), None if together else colour)
-    names = [lane.label for lane in lanes] if lanes else list(labels or [""] * len(ts))
     zeros = 0
     for i, one in enumerate(series):
         axis = axes[0 if together else i]
         for k, (t, v) in enumerate(zip(one.ts, one.values, strict=True)):
             name = one.name if together else names[k] if i == 0 else ""
-            _draw_change(axis, t, v, name, log, looks, i if together else k)
+            _draw_change(axis, t, v, name, log, looks.line(i if together else k, 1.1))
             # The first value is the reference and therefore 0.
             zeros += int(np.sum(v[1:] == 0)) if log else 0
         label = _name_of_axis("" if together else one.name, change, log, one.size, units)
         axis.set_ylabel(label, fontsize=9 if count > 1 else None)
         if log:
             axis.set_yscale("log")
-            if change == "relative" and axis.get_ylim()[0] < _NEAR_ROUNDING:
-                _rounding(axis)
-    axes[0].set_title(title)
-    axes[-1].set_xlabel(named("time t", units.get("t")))
-    axes[0].figure.align_ylabels(axes)
+        if log and change == "relative" and axis.get_ylim()[0] < _NEAR_ROUNDING:
+            _rounding(axis)
+    _finish(axes, named("time t", units.get("t")), title)
     looks.colour_bar(axes, colour_label)
-    extra = [*looks.entries(), *counted({"values exactly 0": zeros})]
+    notes = [*looks.entries(), *counted({"values exactly 0": zeros})]
     for one in series:
-        if one.from_zero:
-            extra.append(f"{one.name}: {one.from_zero} of {len(ts)} orbits start at 0")
-    legend(axes[0], new, extra + [cross(text) for text in troubles(lanes)])
+        texts = counted({f"of {len(ts)} orbits start at 0": one.from_zero})
+        notes += [f"{one.name}: {text}" for text in texts]
+    legend(axes[0], new, notes + troubles(lanes))
     return axes[0] if count == 1 else np.asarray(axes)
+
+
+def _finish(axes: Sequence[Any], time: str, title: str) -> None:
+    """Title, name of the times, and aligned names of the y axes."""
+    axes[0].set_title(title)
+    axes[-1].set_xlabel(time)
+    axes[0].figure.align_ylabels(axes)
 
 
 def panels_of(orbits: Any, values: Mapping[str, Any] | None, log: bool) -> int:
     """How many panels `invariants` draws."""
-    ts, lanes = _times(orbits, None)
+    ts, _, lanes = _times(orbits, None)
     return _count_of_panels(len(_watched(orbits, values, lanes)), len(ts), log)
 
 
@@ -137,19 +141,20 @@ def _count_of_panels(quantities: int, orbits: int, log: bool) -> int:
     return 1 if log and orbits == 1 else quantities
 
 
-def _times(orbits: Any, labels: Sequence[str] | None) -> tuple[list[np.ndarray], list[Any]]:
-    """Times of every orbit, and the orbits themselves if there are states."""
+def _times(
+    orbits: Any, labels: Sequence[str] | None
+) -> tuple[list[np.ndarray], list[str], list[Any]]:
+    """Times and labels of every orbit, and the orbits themselves if there are states."""
     if isinstance(orbits, list | tuple) or hasattr(orbits, "qs"):
-        lanes = lanes_of(orbits, "invariants", labels, momenta=False)
-        return [lane.ts for lane in lanes], lanes
+        lanes = lanes_of(orbits, labels, momenta=False)
+        return [lane.ts for lane in lanes], [lane.label for lane in lanes], lanes
     ts = np.asarray(getattr(orbits, "ts", orbits))
     if ts.dtype.kind not in "iuf" or ts.ndim == 0:
         raise TypeError(
             f"invariants takes a Solution, or times of shape (S,) with values, got {orbits!r}."
         )
     ts = ts.reshape(-1, ts.shape[-1])
-    check_labels(labels, len(ts), "orbits")
-    return list(ts), []
+    return list(ts), labels_of(labels, len(ts), "orbits"), []
 
 
 def _watched(
@@ -157,15 +162,11 @@ def _watched(
 ) -> dict[str, list[np.ndarray]]:
     """Name → the values of every orbit, one array each."""
     if values is None and isinstance(orbits, list):  # each may be a batch
-        found = [_observed(one) for one in orbits]
+        pairs = [(one, _observed(one)) for one in orbits]
+        shared = [n for n in pairs[0][1] if all(n in observed for _, observed in pairs)]
         values = {
-            name: [
-                v
-                for one, observed in zip(orbits, found, strict=True)
-                for v in _of_every_orbit(name, observed[name], one, ())
-            ]
-            for name in found[0]
-            if all(name in observed for observed in found)
+            n: [v for one, seen in pairs for v in _of_every_orbit(n, seen[n], one, ())]
+            for n in shared
         }
     elif values is None:
         values = _observed(orbits)
@@ -182,29 +183,26 @@ def _observed(one: Any) -> dict[str, Any]:
             "invariants draws the observables of integrate(..., observe={'energy': f}), or "
             "values={'energy': numbers or a function (q, p)}: there is neither."
         )
-    lead, n = np.shape(one.ts)[:-1], np.shape(one.ts)[-1]
-    shapes = (*lead, n), (*lead, n - 1)
-    arrays = {name: v for name, v in observed.items() if hasattr(v, "shape")}
-    return {name: v for name, v in arrays.items() if np.shape(v)[: len(lead) + 1] in shapes}
+    *lead, n = np.shape(one.ts)
+    shapes, front = ((*lead, n), (*lead, n - 1)), len(lead) + 1
+    return {k: v for k, v in observed.items() if hasattr(v, "shape") and v.shape[:front] in shapes}
 
 
 def _of_every_orbit(name: str, v: Any, orbits: Any, lanes: Sequence[Any]) -> list[np.ndarray]:
     if callable(v):
         if any(lane.ps is None for lane in lanes) or not lanes:
             raise TypeError(f"{name!r} is a function (q, p): it takes a Solution, or (ts, qs, ps).")
-        return [each_state(v, lane.qs, lane.ps, "invariants") for lane in lanes]
+        return [each_state(v, lane.qs, lane.ps) for lane in lanes]
     if isinstance(orbits, list):
         if not isinstance(v, list) or len(v) != len(lanes):
             raise ValueError(f"{name!r} must be a list of numbers, one array for each solution.")
         return [np.asarray(x) for x in v]
     ts = np.asarray(orbits[0] if isinstance(orbits, tuple) else getattr(orbits, "ts", orbits))
-    v = np.asarray(v)
-    lead, n = ts.shape[:-1], ts.shape[-1]
-    if v.shape[: ts.ndim] not in ((*lead, n), (*lead, n - 1)):
-        raise ValueError(
-            f"{name!r} must have one value for each time, shape {(*lead, n)}, or for each step, "
-            f"{(*lead, n - 1)}, and possibly more axes after these; got {v.shape}."
-        )
+    v, (*lead, n) = np.asarray(v), ts.shape
+    shapes = (*lead, n), (*lead, n - 1)
+    wanted = f"{name!r} must have one value for each time, shape {shapes[0]}, or for each step, "
+    wanted += f"{shapes[1]}, and possibly more axes after these"
+    check_shapes(v.shape[: ts.ndim] in shapes, wanted, values=v)
     return list(v.reshape(-1, *v.shape[len(lead) :]))
 
 
@@ -224,7 +222,7 @@ def _changed(
         if change == "relative":
             size = np.linalg.norm(first)
             from_zero += int(size == 0)
-            v = v / size if size else np.full(len(v), np.nan)
+            v = v / (size or np.nan)
         times.append(t[len(t) - len(v) :])
         found.append(np.abs(v) if log else v)
     if from_zero and from_zero == len(ts):
@@ -235,11 +233,8 @@ def _changed(
     return _Series(name, times, found, vector, from_zero)
 
 
-def _draw_change(
-    axis: Any, t: np.ndarray, v: np.ndarray, name: str, log: bool, looks: Looks, k: int
-) -> None:
+def _draw_change(axis: Any, t: Any, v: np.ndarray, name: str, log: bool, look: Any) -> None:
     """One orbit's line, with a cross where its values end too early."""
-    look = {"color": looks.colours[k], "linestyle": looks.dashes[k], "linewidth": 1.1}
     draw_series(axis, t, v, name.replace("_", " "), log, **look)
     finite = np.flatnonzero(np.isfinite(v))
     if finite.size and finite[-1] < len(v) - 1 and not (log and v[finite[-1]] == 0):
@@ -247,7 +242,7 @@ def _draw_change(
 
 
 def _name_of_axis(name: str, change: str, log: bool, vector: bool, units: Mapping[str, str]) -> str:
-    kind = {"relative": "relative change", "absolute": "change", "value": ""}[change]
+    kind = _KINDS[change]
     if log or vector:
         kind = f"size of {kind}" if kind else "size"
     unit = units.get(name) if change != "relative" else None
@@ -280,16 +275,15 @@ def changes(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any =
     """
     size = (6.4, 1.2 + 1.35 * len(series))
     axes, _ = stack(ax, len(series), "one for each quantity", size, sharex=True)
-    for i, (axis, (label, values)) in enumerate(zip(axes, series.items(), strict=True)):
+    colours = itertools.cycle(COLOURS)
+    for axis, colour, (label, values) in zip(axes, colours, series.items(), strict=False):
         t, v = _pair(ts, values, label)
-        lost = draw_series(axis, t, v, "", color=COLOURS[i % len(COLOURS)], linewidth=1.1)
+        lost = draw_series(axis, t, v, "", color=colour, linewidth=1.1)
         axis.set_ylabel(label, fontsize=9)
         look = {"ha": "right", "va": "top", "fontsize": 8, "color": "#555555"}
         for text in counted({f"of {len(v)} {what}": n for what, n in lost.items()}):
             axis.text(0.99, 0.95, text, transform=axis.transAxes, **look)
-    axes[0].set_title(title)
-    axes[-1].set_xlabel(time)
-    axes[0].figure.align_ylabels(axes)
+    _finish(axes, time, title)
     return np.asarray(axes)
 
 
@@ -307,12 +301,13 @@ def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any
     axis, new = canvas(ax)
     axis.set_yscale("log")
     notes: list[str] = []
-    looks = zip(itertools.cycle(COLOURS), itertools.cycle(DASHES))
+    looks = itertools.cycle(zip(COLOURS, DASHES, strict=True))
     for (label, values), (colour, dash) in zip(series.items(), looks, strict=False):
         # The change at the start is 0 by definition and is left out.
         t, v = (x[1:] for x in _pair(ts, values, label))
         lost = draw_series(axis, t, v, label, True, color=colour, linestyle=dash, linewidth=0.9)
-        notes += [f"{label}: {n} of {len(v)} {what}" for what, n in lost.items() if n]
+        texts = counted({f"of {len(v)} {what}": n for what, n in lost.items()})
+        notes += [f"{label}: {text}" for text in texts]
     _rounding(axis)
     axis.set(xlabel=time, ylabel="relative change since the start", title=title)
     found = legend(axis, new, notes)
@@ -323,9 +318,6 @@ def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any
 
 def _pair(ts: Any, values: Any, label: str) -> tuple[np.ndarray, np.ndarray]:
     t, v = np.asarray(ts), np.asarray(values)
-    if t.ndim != 1 or v.shape != t.shape:
-        raise ValueError(
-            f"{label!r} must have one number for each time, shape (S,): got ts of shape {t.shape} "
-            f"and values of shape {v.shape}."
-        )
+    wanted = f"{label!r} must have one number for each time, shape (S,)"
+    check_shapes(t.ndim == 1 and v.shape == t.shape, wanted, ts=t, values=v)
     return t, v

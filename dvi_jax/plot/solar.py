@@ -1,12 +1,13 @@
 """Pictures of the solar system and of its comparison with an ephemeris."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from .axes import given, legend, stack
+from .axes import check_shapes, given, legend, stack
 from .style import COLOURS, MARKERS, STAR, in_style
 
 
@@ -19,21 +20,17 @@ def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
     **Returns** the `Axes`, shape (2,).
     """
     positions = np.asarray(positions)
-    if positions.ndim != 3 or positions.shape[1:] != (len(names), 3):
-        raise ValueError(
-            f"planet_orbits takes positions of shape (times, {len(names)}, 3), one for each name, "
-            f"got {positions.shape}."
-        )
+    wanted = f"planets have positions of shape (times, {len(names)}, 3), one for each name"
+    fits = positions.ndim == 3 and positions.shape[1:] == (len(names), 3)
+    check_shapes(fits, wanted, positions=positions)
     axes, new = stack(ax, 2, "inner and outer planets", (9.6, 5.4), ncols=2)
-    groups = (range(min(4, len(names))), range(min(4, len(names)), len(names)))
+    groups = range(len(names))[:4], range(len(names))[4:]
+    mark: Any = {"markersize": 7, "markeredgecolor": "black", "markeredgewidth": 0.7}
     for axis, group, title in zip(axes, groups, ("Inner planets", "Outer planets"), strict=True):
-        for i in group:
+        for i, colour, marker in zip(group, itertools.cycle(COLOURS), MARKERS, strict=False):
             x, y = positions[:, i, 0], positions[:, i, 1]
-            colour = COLOURS[(i - group[0]) % len(COLOURS)]
             axis.plot(x, y, ".", markersize=1, color=colour, alpha=0.35, rasterized=True)
-            look: Any = {"color": colour, "marker": MARKERS[i - group[0]], "linestyle": "none"}
-            look |= {"markersize": 7, "markeredgecolor": "black", "markeredgewidth": 0.7}
-            axis.plot(x[:1], y[:1], label=names[i], **look)
+            axis.plot(x[:1], y[:1], marker, color=colour, label=names[i], **mark)
         axis.plot(0, 0, **STAR)
         axis.set(xlabel="x [au]", ylabel="y [au]", title=title)
         axis.set_aspect("equal", adjustable="datalim")
@@ -74,17 +71,14 @@ def ephemeris_comparison(
         left, right = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
         below = figure.add_subplot(grid[1, 1], sharex=right)
     else:
-        left, right, below = given(ax, 3, "for the errors, the perihelion and what its line leaves")
+        left, right, below = given(ax, 3, "for the errors, the perihelion and its residual")
     for i, name in enumerate(names):
         x, y = _upper_envelope(years, errors[:, i])
         look: Any = {"color": COLOURS[i % len(COLOURS)], "linewidth": 1.3, "marker": MARKERS[i]}
         look |= {"linestyle": "-" if i < len(COLOURS) else "--"}
         left.semilogy(x, y, markevery=(i * 2 % 12, 12), label=name, **look)
-    left.set(
-        xlabel="years since the start",
-        ylabel="distance from the ephemeris [km]",
-        title="Heliocentric position, integration − DE421",
-    )
+    left.set(xlabel="years since the start", ylabel="distance from the ephemeris [km]")
+    left.set_title("Heliocentric position, integration − DE421")
     if ax is None:
         left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
     else:
@@ -96,10 +90,8 @@ def ephemeris_comparison(
         right.plot(years, line, label=f"line: {slope:.2f}″ per century", **look)
         below.plot(years, perihelion - line, color=COLOURS[0], linewidth=0.5)
         below.axhline(0, **look)
-    right.set(
-        ylabel="ϖ(DE421) − ϖ(integration) [″]",
-        title="Mercury's perihelion, DE421 − integration",
-    )
+    right.set_title("Mercury's perihelion, DE421 − integration")
+    right.set_ylabel("ϖ(DE421) − ϖ(integration) [″]")
     right.legend(loc="best", markerscale=3)
     right.tick_params(labelbottom=False)
     below.set(xlabel="years since the start", ylabel="minus the line [″]")
@@ -109,7 +101,5 @@ def ephemeris_comparison(
 
 def _upper_envelope(x: np.ndarray, y: np.ndarray, pieces: int = 100) -> tuple[Any, Any]:
     """Largest value in each of about a hundred pieces: a readable line."""
-    if len(x) <= 2 * pieces:
-        return x[1:], y[1:]
-    parts = np.array_split(np.arange(1, len(x)), pieces)
-    return np.array([x[part[-1]] for part in parts]), np.array([y[part].max() for part in parts])
+    parts = np.array_split(np.arange(1, len(x)), pieces if len(x) > 2 * pieces else len(x) - 1)
+    return x[[part[-1] for part in parts]], [y[part].max() for part in parts]

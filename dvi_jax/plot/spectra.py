@@ -8,7 +8,16 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.patches import Patch
 
-from .axes import canvas, cell_edges, cells, check_labels, counted, interval, legend
+from .axes import (
+    canvas,
+    cell_edges,
+    cells,
+    check_shapes,
+    counted,
+    interval,
+    labels_of,
+    legend,
+)
 from .states import looks_of
 from .style import COLOURS, DASHES, GREY, HATCH, MARKERS, PALE, SHADES, in_style, named, signed
 
@@ -46,22 +55,19 @@ def spectrum(
             raise TypeError("spectrum takes frequencies and amplitudes, or what has both.")
         frequencies, amplitudes = frequencies.frequencies, frequencies.amplitudes
     w, A = np.asarray(frequencies), np.abs(np.asarray(amplitudes))
-    if w.shape != A.shape or w.ndim == 0 or w.size == 0 or w.dtype.kind not in "iuf":
-        raise ValueError(
-            f"spectrum takes real frequencies and amplitudes of one shape (count,) or (signals, "
-            f"count), got {w.shape} of {w.dtype} and {A.shape}."
-        )
+    wanted = f"real frequencies ({w.dtype}) and amplitudes have one shape, (..., count)"
+    fits = w.shape == A.shape and w.ndim and w.size and w.dtype.kind in "iuf"
+    check_shapes(fits, wanted, frequencies=w, amplitudes=A)
     w, A = w.reshape(-1, w.shape[-1]), A.reshape(-1, A.shape[-1])
-    check_labels(labels, len(w), "signals")
-    looks, units = looks_of(len(w)), units or {}
+    names, colours = labels_of(labels, len(w), "signals"), looks_of(len(w)).colours
+    units, markers = units or {}, itertools.cycle(MARKERS)
     there = np.isfinite(w) & np.isfinite(A) & ((A > 0) | (not log))
     axis, new = canvas(ax)
-    least = A[there].min() if there.any() else 1.0
-    floor = least / 3 if log else 0.0
-    for i, (x, y, good) in enumerate(zip(w, A, there, strict=True)):
-        look = {"color": looks.colours[i], "label": None if labels is None else str(labels[i])}
-        axis.vlines(x[good], floor, y[good], color=looks.colours[i], linewidth=1.3)
-        axis.plot(x[good], y[good], MARKERS[i % len(MARKERS)], **look)
+    floor = A[there].min() / 3 if log and there.any() else 0.0
+    rows = zip(w, A, there, colours, markers, names, strict=False)
+    for x, y, good, colour, marker, name in rows:
+        axis.vlines(x[good], floor, y[good], color=colour, linewidth=1.3)
+        axis.plot(x[good], y[good], marker, color=colour, label=name or None)
     if log:
         axis.set_yscale("log")
     if there.any():
@@ -105,13 +111,10 @@ def frequency_map(
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     D = None if diffusion is None else np.asarray(diffusion, float)
+    arrays = {"x": x, "y": y} | ({} if D is None else {"diffusion": D})
     on_grid = D is not None and x.ndim == y.ndim == 1 and D.shape == (len(x), len(y))
-    if not on_grid and (x.shape != y.shape or (D is not None and D.shape != x.shape)):
-        shape = "" if D is None else f" and diffusion of shape {D.shape}"
-        raise ValueError(
-            "frequency_map takes x, y and diffusion of one shape, or diffusion of shape (len(x), "
-            f"len(y)): got x of shape {x.shape}, y of shape {y.shape}{shape}."
-        )
+    wanted = "x, y and diffusion have one shape, or diffusion has the shape (len(x), len(y))"
+    check_shapes(on_grid or len({a.shape for a in arrays.values()}) == 1, wanted, **arrays)
     if on_grid and len(resonances):
         raise ValueError(
             "a resonance is a line among frequencies, and x and y are coordinates of starts here: "
@@ -119,13 +122,13 @@ def frequency_map(
             f"{(len(x), len(y))}."
         )
     axis, new = canvas(ax, (6.0, 4.8))
-    if on_grid:
-        assert D is not None
-        drawn, extra = _draw_plane(axis, x, y, D, limits)
-    else:
-        drawn, extra = _draw_points(axis, x, y, D, limits)
-    if drawn is not None:
-        axis.figure.colorbar(drawn[0], ax=axis, label=diffusion_label, extend=drawn[1])
+    low, high, beyond = (0.0, 1.0, "neither")
+    if D is not None:
+        shown = D if on_grid else D[np.isfinite(x) & np.isfinite(y)]
+        low, high, beyond = interval(shown, limits, _PERCENTILES)
+    drawn, extra = (_draw_plane if on_grid else _draw_points)(axis, x, y, D, Normalize(low, high))
+    if D is not None:
+        axis.figure.colorbar(drawn, ax=axis, label=diffusion_label, extend=beyond)
     _draw_resonances(axis, resonances)
     names = names or (("x", "y") if on_grid else ("ω$_1$", "ω$_2$"))
     axis.set(xlabel=names[0], ylabel=names[1], title=title)
@@ -133,73 +136,55 @@ def frequency_map(
     return axis
 
 
-def _draw_plane(
-    axis: Any, x: np.ndarray, y: np.ndarray, D: np.ndarray, limits: Any
-) -> tuple[Any, list[Any]]:
-    """Cells over a plane of initial conditions; ((cells, ends of the bar), legend entries)."""
+def _draw_plane(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, list[Any]]:
+    """(cells over a plane of initial conditions, legend entries)."""
     for name, values in (("x", x), ("y", y)):
         if not (np.diff(values) > 0).all() or not np.isfinite(values).all():
             raise ValueError(f"the coordinates {name} of a grid of starts must rise.")
-    low, high, beyond = interval(D, limits, _PERCENTILES)
-    mesh = cells(axis, cell_edges(x), cell_edges(y), D.T, Normalize(low, high), SHADES)
+    mesh = cells(axis, cell_edges(x), cell_edges(y), D.T, norm, SHADES)
     texts = counted({f"of {D.size} starts without a value": np.sum(~np.isfinite(D))})
-    return (mesh, beyond), [Patch(label=text, **HATCH) for text in texts]
+    return mesh, [Patch(label=text, **HATCH) for text in texts]
 
 
-def _draw_points(
-    axis: Any, x: np.ndarray, y: np.ndarray, D: np.ndarray | None, limits: Any
-) -> tuple[Any, list[Any]]:
-    """A point for each orbit; ((points, ends of the bar) or None, legend entries)."""
+def _draw_points(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, list[Any]]:
+    """(a point for each orbit, legend entries)."""
     there = np.isfinite(x) & np.isfinite(y)
-    count = int(there.sum())
-    size = float(np.clip(3000 / max(count, 1), 2, 16))
-    look: Any = {"s": size, "linewidths": 0, "rasterized": count > 3000}
-    drawn = None
-    if D is None:
-        axis.scatter(x[there], y[there], color=COLOURS[0], **look)
-    else:
-        known, grey = there & np.isfinite(D), there & ~np.isfinite(D)
-        low, high, beyond = interval(D[there], limits, _PERCENTILES)
-        norm = Normalize(low, high)
-        drawn = axis.scatter(x[known], y[known], c=D[known], norm=norm, cmap=SHADES, **look), beyond
-        if grey.any():
-            label = f"{grey.sum()} orbits without a diffusion"
-            axis.scatter(x[grey], y[grey], color=PALE, label=label, **look)
+    known = there if D is None else there & np.isfinite(D)
+    grey, count = there & ~known, int(there.sum())
+    look: Any = {"s": float(np.clip(3000 / max(count, 1), 2, 16)), "linewidths": 0}
+    look["rasterized"] = count > 3000
+    shown = {"color": COLOURS[0]} if D is None else {"c": D[known], "norm": norm, "cmap": SHADES}
+    drawn = axis.scatter(x[known], y[known], **shown, **look)
+    if grey.any():
+        label = f"{grey.sum()} orbits without a diffusion"
+        axis.scatter(x[grey], y[grey], color=PALE, label=label, **look)
     return drawn, counted({f"of {there.size} orbits have no frequencies": np.sum(~there)})
 
 
 def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, int]]) -> None:
-    limits = axis.get_xlim(), axis.get_ylim()
+    """Lines ax + by = 0 with their numbers where they leave the picture.
+
+    That is at the top or at the right, else inside of the left, without which are numbers of the
+    axis. A line leaves at two edges, so that is all.
+    """
+    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    axis.autoscale(False)
     for k in resonances:
         if tuple(k) == (0, 0) or len(k) != 2:
             raise ValueError(f"a resonance is two integers that are not both 0, got {k!r}.")
         a, b = k
-        # Through the origin, along (b, −a).
         axis.axline((0, 0), (b, -a), color=GREY, linewidth=0.8, linestyle="--", zorder=0.9)
-        _name_resonance(axis, (a, b), limits)
-    axis.set(xlim=limits[0], ylim=limits[1])
-
-
-def _name_resonance(axis: Any, k: tuple[int, int], limits: Any) -> None:
-    """Its numbers where the line leaves the picture: at the top or at the right, else inside of the
-    left, without which are numbers of the axis. It leaves at two edges, so that is all."""
-    (left, right), (low, high) = limits
-    a, b = k
-
-    def crossed(level: float, slope: tuple[int, int], within: tuple[float, float]) -> float | None:
-        at = -slope[1] * level / slope[0] if slope[0] else None
-        return at if at is not None and min(within) <= at <= max(within) else None
-
-    top = crossed(high, (a, b), (left, right))
-    at_right, at_left = (crossed(x, (b, a), (low, high)) for x in (right, left))
-    if top is not None:
-        place, how, off = (top, high), {"ha": "center", "va": "bottom"}, (0, 2)
-    elif at_right is not None:
-        place, how, off = (right, at_right), {"ha": "left", "va": "center"}, (2, 0)
-    elif at_left is not None:
-        place, how, off = (left, at_left), {"ha": "left", "va": "center"}, (3, 0)
-    else:
-        return
-    look = {"fontsize": 8, "color": "#555555", "annotation_clip": False} | how
-    name = f"({signed(a)}, {signed(b)})"
-    axis.annotate(name, place, xytext=off, textcoords="offset points", **look)
+        places = [((-b * high / a, high), "center", "bottom", (0, 2))] if a else []
+        if b:
+            places += [((right, -a * right / b), "left", "center", (2, 0))]
+            places += [((left, -a * left / b), "left", "center", (3, 0))]
+        inside = (
+            place
+            for place in places
+            if min(left, right) <= place[0][0] <= max(left, right)
+            and min(low, high) <= place[0][1] <= max(low, high)
+        )
+        for at, horizontal, vertical, off in itertools.islice(inside, 1):
+            look: Any = {"fontsize": 8, "color": "#555555", "annotation_clip": False}
+            look |= {"ha": horizontal, "va": vertical, "textcoords": "offset points"}
+            axis.annotate(f"({signed(a)}, {signed(b)})", at, xytext=off, **look)

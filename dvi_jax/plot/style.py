@@ -93,7 +93,13 @@ def save(drawn: Any, path: str | Path) -> Path:
     **Raises** `TypeError` for anything else, `ValueError` for axes of several figures.
     """
     path = Path(path)
-    figure = _figure_to_save(drawn)
+    axes = np.ravel(np.asarray(drawn, object)).tolist()
+    if not axes or not all(hasattr(axis, "figure") for axis in axes):
+        raise TypeError(f"save takes a figure or axes, as the plots return them, got {drawn!r}.")
+    figures = {figure_of(axis) for axis in axes}  # of a figure it is the figure
+    if len(figures) > 1:
+        raise ValueError(f"these axes belong to {len(figures)} figures: save one at a time.")
+    figure = figures.pop()
     figure.savefig(path)
     plt.close(figure)
     return path
@@ -105,18 +111,6 @@ def figure_of(axis: Any) -> Any:
     while figure.figure is not figure:
         figure = figure.figure
     return figure
-
-
-def _figure_to_save(drawn: Any) -> Any:
-    if hasattr(drawn, "savefig"):
-        return drawn
-    axes = list(np.ravel(np.asarray(drawn, object)))
-    if not axes or not all(hasattr(axis, "figure") for axis in axes):
-        raise TypeError(f"save takes a figure or axes, as the plots return them, got {drawn!r}.")
-    figures = {figure_of(axis) for axis in axes}
-    if len(figures) > 1:
-        raise ValueError(f"these axes belong to {len(figures)} figures: save one at a time.")
-    return figures.pop()
 
 
 def signed(value: float, form: str = "g") -> str:

@@ -4,13 +4,14 @@ Each takes `xarray` data as `to_xarray` gives them, and returns the `Axes`, one 
 `facet`. Data that lie in a store are read one block at a time: a grid of any size can be drawn.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.colors import BoundaryNorm, ListedColormap
 
+from .._checks import one_of
 from . import panels
 from .axes import flat_cells, legend
 from .blocks import REDUCTIONS, Lines, Picture, count_codes, reduced
@@ -35,6 +36,27 @@ _STATUS_COLOURS = {
     "not_reached": COLOURS[2],
 }
 """One colour for each status in all pictures, so that they can be compared."""
+
+
+class _Statuses(NamedTuple):
+    """How the trajectories of each panel ended: codes, rising, with their names.
+
+    - `counts`: for each panel how often each occurs in each pixel, shape (codes, *pixels).
+    """
+
+    codes: list[int]
+    names: list[str]
+    counts: list[np.ndarray]
+
+    @property
+    def open(self) -> np.ndarray:
+        """Which statuses say that nothing is computed."""
+        return np.asarray([name == _OPEN for name in self.names])
+
+    @property
+    def bad(self) -> np.ndarray:
+        """Which statuses are failures."""
+        return np.asarray([name not in (*_GOOD, _OPEN) for name in self.names])
 
 
 @in_style
@@ -71,15 +93,16 @@ def sweep_map(
     **Raises** `TypeError` for what is no array of numbers; `ValueError` for dimensions that are not
     there or too many, a median of more numbers than are read at a time, and other invalid input.
     """
-    data = panels.checked_array(data, "sweep_map")
-    _check_reduce(reduce, REDUCTIONS)
+    data = panels.checked_array(data)
+    one_of("reduce", reduce, REDUCTIONS)
     grid = panels.arrange(data, x, y, facet, over, pixels)
     label = label_of(data, data.name or "value")
-    if _is_reduced(grid, data):
+    fewer = any(len(place.centres) < place.bins.size for place in grid.places)
+    if fewer or any(data.sizes[d] > 1 for d in grid.over):
         label = f"{REDUCTIONS[reduce]} {label}"
     pictures = [reduced(panel, grid.bins, reduce) for _, panel in grid.panels]
-    opens = None if status is None else _open_cells(status, grid, facet)
-    return _draw(grid, pictures, label, log, limits, ax, opens, "no number")
+    found = None if status is None else _count_beside(status, grid, facet)
+    return _draw(grid, pictures, label, log, limits, ax, found, "no number")
 
 
 @in_style
@@ -114,8 +137,8 @@ def slope_map(
     """
     import xarray as xr
 
-    data = panels.checked_array(data, "slope_map")
-    _check_reduce(reduce, REDUCTIONS)
+    data = panels.checked_array(data)
+    one_of("reduce", reduce, REDUCTIONS)
     dim = dim_of(data, along)
     values, order = _positive(data, along)
     others = [over] if isinstance(over, str) else list(over)
@@ -125,12 +148,16 @@ def slope_map(
     local = local or along in (x, y)
     made: dict[str, Any] = {along: None}
     if local:
+        if along not in (x, y) and None not in (x, y):
+            raise ValueError(
+                f"local slopes are along {along!r}: name it as x or y, or leave one out."
+            )
         if along not in (x, y):
-            x, y = _with_along(along, x, y)
+            x, y = (along, y) if x is None else (x, along)
         middle = np.sqrt(values[1:] * values[:-1])
         about = data.coords[along].attrs
         made = {along: xr.DataArray(middle, dims=[dim], coords={along: (dim, middle, about)})}
-    make = partial(_local_slopes if local else _fitted_slopes, np.log(values), order, floor)
+    make = partial(_slopes, np.log(values), order, floor, local)
     grid = panels.arrange(data, x, y, facet, over, pixels, made)
     lines = Lines(dim, make, local)
     pictures = [reduced(panel, grid.bins, reduce, lines) for _, panel in grid.panels]
@@ -166,22 +193,37 @@ def failure_map(
     **Raises** `TypeError` or `ValueError` for data without a status, and as `sweep_map`.
     """
     status = _status_of(data)
-    _check_reduce(reduce, ("any", "fraction"))
-    codes, names = _flags(status)
+    one_of("reduce", reduce, ("any", "fraction"))
     grid = panels.arrange(status, x, y, facet, over, pixels)
-    counts = [count_codes(panel, grid.bins, codes) for _, panel in grid.panels]
+    found = _count(status, grid, (panel for _, panel in grid.panels))
+    codes, names = found.codes, found.names
     if reduce == "fraction":
-        pictures = [_failed_share(c, names) for c in counts]
+        pictures = []
+        for c in found.counts:
+            computed = c[~found.open].sum(0)
+            values = c[found.bad].sum(0) / np.where(computed, computed, np.nan)
+            pictures.append(Picture(values, int(c[found.open].sum()), int(c.sum())))
         label = "share of trajectories that failed"
         return _draw(grid, pictures, label, False, (0, 1), ax, None, "not computed")
     axes = panels.make_axes(grid, ax, 1.9 if grid.y is None else None)
-    for axis, count in zip(axes, counts, strict=True):
-        _draw_statuses(axis, grid, _shown(count, codes, names), codes, names)
+    colours = [_STATUS_COLOURS.get(n, COLOURS[i % len(COLOURS)]) for i, n in enumerate(names)]
+    norm = BoundaryNorm([*(c - 0.5 for c in codes), codes[-1] + 0.5], len(codes))
+    for axis, c in zip(axes, found.counts, strict=True):
+        # Its commonest failure, else its commonest status.
+        failures = c * found.bad.reshape(-1, *(1,) * (c.ndim - 1))
+        commonest = np.where(failures.any(0), failures.argmax(0), c.argmax(0))
+        shown, edges = np.asarray(codes)[commonest], [place.edges for place in grid.places]
+        if grid.y is None:  # a strip
+            shown, edges = shown[None], [np.asarray([0.0, 1.0]), *edges]
+            axis.set_yticks([])
+        panels.frame(axis)
+        look: Any = {"cmap": ListedColormap(colours), "norm": norm, "rasterized": True}
+        axis.pcolormesh(edges[1], edges[0], shown, **look)
     panels.finish(axes, grid)
-    total = np.sum([c.reshape(len(codes), -1).sum(1) for c in counts], axis=0)
+    total = np.sum([c.reshape(len(codes), -1).sum(1) for c in found.counts], axis=0)
     entries = [
-        flag(_colour(name, i), f"{name.replace('_', ' ')}: {share(int(n), int(total.sum()))}")
-        for i, (name, n) in enumerate(zip(names, total, strict=True))
+        flag(colour, f"{name.replace('_', ' ')}: {share(int(n), int(total.sum()))}")
+        for colour, name, n in zip(colours, names, total, strict=True)
         if n
     ]
     legend(axes[0], ax is None, entries, labelled=False)
@@ -198,7 +240,7 @@ def _draw(
     log: bool | None,
     limits: Any,
     ax: Any,
-    opens: tuple[list[np.ndarray], float] | None,
+    found: _Statuses | None,
     what: str,
 ) -> Any:
     """Numbers in their colours, with a bar and a legend of what has none."""
@@ -207,15 +249,17 @@ def _draw(
     mesh = None
     for i, (axis, picture) in enumerate(zip(axes, pictures, strict=True)):
         mesh = panels.draw_values(axis, grid, picture.values, scale)
-        if opens is not None and grid.y is not None:
-            where = opens[0][i] & np.isnan(picture.values)
+        if found is not None and grid.y is not None:
+            nothing = found.counts[i][~found.open].sum(0) == 0
+            where = nothing & np.isnan(picture.values)
             flat_cells(axis, grid.x.edges, grid.y.edges, where, NOT_COMPUTED)
     panels.finish(axes, grid)
     panels.colour_bar(axes, mesh, scale, label)
     points = sum(p.points for p in pictures)
     counts = {NO_NUMBER: sum(p.missing for p in pictures)}
-    if opens is not None:
-        counts[NOT_COMPUTED] = round(opens[1] * points)
+    if found is not None:
+        share_open = sum(c[found.open].sum() for c in found.counts) / np.sum(found.counts)
+        counts[NOT_COMPUTED] = round(share_open * points)
         counts[NO_NUMBER] -= counts[NOT_COMPUTED]
     names, line = {NO_NUMBER: what, NOT_COMPUTED: "not computed"}, grid.y is None
     entries = [
@@ -229,64 +273,40 @@ def _draw(
     return axes[0] if len(grid.panels) == 1 and not grid.panels[0][0] else np.asarray(axes)
 
 
-def _check_reduce(reduce: Any, known: Any) -> None:
-    if reduce not in known:
-        raise ValueError(f"reduce must be one of {', '.join(map(repr, known))}, got {reduce!r}.")
-
-
-def _with_along(along: str, x: str | None, y: str | None) -> tuple[str, str | None]:
-    """x and y, with the dimension of the slopes for the one that is free."""
-    if x is not None and y is not None:
-        raise ValueError(f"local slopes are along {along!r}: name it as x or y, or leave one out.")
-    return (along, y) if x is None else (x, along)
-
-
-def _is_reduced(grid: Grid, data: Any) -> bool:
-    fewer = any(len(p.centres) < p.bins.size for p in grid.places)
-    return fewer or any(data.sizes[d] > 1 for d in grid.over)
-
-
 def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
     """(positive values of a coordinate, rising; their places along the dimension)."""
-    if along not in data.coords:
+    if along not in data.coords or data.coords[along].dtype.kind not in "iuf":
         raise ValueError(
-            f"{along!r} has no values to take a slope along; choose one of {names_of(data)}."
+            f"{along!r} has no numbers to take a slope along; choose one of {names_of(data)}."
         )
     values = data.coords[along].values
-    if values.dtype.kind not in "iuf":
-        raise ValueError(f"{along!r} has no numbers to take a slope along: {values.dtype}.")
     order = np.argsort(values, kind="stable")
     order = order[np.isfinite(values[order]) & (values[order] > 0)]
-    if len(np.unique(values[order])) < max(2, len(order)):
+    different = len(np.unique(values[order]))
+    if different < max(2, len(order)):
         raise ValueError(
             f"a slope along {along!r} needs two or more positive values, all different: it has "
-            f"{len(order)} positive ones, {len(np.unique(values[order]))} of them different."
+            f"{len(order)} positive ones, {different} of them different."
         )
     return np.asarray(values[order], float), order
 
 
-def _logs(order: np.ndarray, floor: float, lines: np.ndarray) -> np.ndarray:
-    """Logarithms of what lies above the floor, NaN elsewhere."""
+def _slopes(
+    x: np.ndarray, order: np.ndarray, floor: float, local: bool, lines: np.ndarray
+) -> np.ndarray:
+    """Slopes along the first axis of what lies above the floor: between neighbours, (n − 1, ...).
+
+    Not `local`: Σ (x − x̄) y / Σ (x − x̄)² over the numbers that are there, shape (1, ...).
+    """
     lines = np.asarray(lines[order], float)
-    good = np.isfinite(lines) & (lines > max(floor, 0.0))
-    return np.log(np.where(good, lines, np.nan))
-
-
-def _fitted_slopes(x: np.ndarray, order: np.ndarray, floor: float, lines: np.ndarray) -> np.ndarray:
-    """Σ (x − x̄) y / Σ (x − x̄)² over the numbers that are there, shape (1, ...)."""
-    y = _logs(order, floor, lines)
-    there = ~np.isnan(y)
-    x = x.reshape(-1, *(1 for _ in y.shape[1:]))
+    there = np.isfinite(lines) & (lines > max(floor, 0.0))
+    y, x = np.log(np.where(there, lines, np.nan)), x.reshape(-1, *(1,) * (lines.ndim - 1))
+    if local:
+        return np.diff(y, axis=0) / np.diff(x, axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         from_mean = np.where(there, x - (there * x).sum(0) / there.sum(0), 0.0)
         slopes = (from_mean * np.where(there, y, 0.0)).sum(0) / (from_mean**2).sum(0)
     return np.where(there.sum(0) > 1, slopes, np.nan)[None]
-
-
-def _local_slopes(x: np.ndarray, order: np.ndarray, floor: float, lines: np.ndarray) -> np.ndarray:
-    """Slopes between neighbours, shape (n − 1, ...)."""
-    y = _logs(order, floor, lines)
-    return np.diff(y, axis=0) / np.diff(x).reshape(-1, *(1 for _ in y.shape[1:]))
 
 
 # --- statuses -----------------------------------------------------------------------------------
@@ -300,75 +320,32 @@ def _status_of(data: Any) -> Any:
             held = ", ".join(map(str, data.data_vars))
             raise ValueError(f"the Dataset has no status: it contains {held}.")
         data = data["status"]
-    return panels.checked_array(data, "failure_map")
+    return panels.checked_array(data)
 
 
-def _flags(status: Any) -> tuple[list[int], list[str]]:
-    """(codes, names) of the statuses, rising."""
+def _count(status: Any, grid: Grid, panels: Iterable[Any]) -> _Statuses:
+    """The statuses in the pixels of a map."""
     values, meanings = (status.attrs.get(name) for name in ("flag_values", "flag_meanings"))
     if values is None or meanings is None or len(values) != len(meanings.split()):
         raise ValueError(
             "the status needs the attributes flag_values and flag_meanings, one name for each "
             "value, as to_xarray() of a sweep gives them."
         )
-    pairs = sorted(zip((int(v) for v in values), meanings.split(), strict=True))
-    return [code for code, _ in pairs], [name for _, name in pairs]
+    codes, names = zip(*sorted(zip(map(int, values), meanings.split(), strict=True)), strict=True)
+    counts = [count_codes(panel, grid.bins, codes) for panel in panels]
+    return _Statuses(list(codes), list(names), counts)
 
 
-def _open_cells(status: Any, grid: Grid, facet: str | None) -> tuple[list[np.ndarray], float]:
-    """(for each panel: pixels of which nothing is computed; share of trajectories that are not)."""
+def _count_beside(status: Any, grid: Grid, facet: str | None) -> _Statuses:
+    """The statuses in the pixels of a map of other numbers."""
     status = _status_of(status)
-    codes, names = _flags(status)
-    wanted = [*grid.bins] + ([dim_of(status, facet)] if facet is not None else [])
-    others = [str(d) for d in status.dims if d not in [*wanted, *grid.over] and status.sizes[d] > 1]
+    along = [] if facet is None else [dim_of(status, facet)]
+    wanted = [*grid.bins, *along]
+    others = [d for d in status.dims if d not in (*wanted, *grid.over) and status.sizes[d] > 1]
     if others or any(d not in status.dims for d in wanted):
         raise ValueError(
             f"the status has the dimensions {names_of(status)}; those of the map are "
             f"{', '.join(wanted)}: select the same of both."
         )
-    found, not_computed, points = [], 0, 0
-    is_open = np.asarray([name == _OPEN for name in names])
-    for i in range(len(grid.panels)):
-        panel = status if facet is None else status.isel({dim_of(status, facet): i})
-        counts = count_codes(panel, grid.bins, codes)
-        found.append(counts[~is_open].sum(0) == 0)
-        not_computed, points = not_computed + counts[is_open].sum(), points + counts.sum()
-    return found, float(not_computed / points)
-
-
-def _is_bad(names: list[str]) -> np.ndarray:
-    """Which statuses are failures."""
-    return np.asarray([name not in (*_GOOD, _OPEN) for name in names])
-
-
-def _shown(counts: np.ndarray, codes: list[int], names: list[str]) -> np.ndarray:
-    """The code of each pixel: its commonest failure, else its commonest status."""
-    failures = counts * _is_bad(names).reshape(-1, *(1 for _ in counts.shape[1:]))
-    commonest = np.where(failures.any(0), failures.argmax(0), counts.argmax(0))
-    return np.asarray(codes)[commonest]
-
-
-def _failed_share(counts: np.ndarray, names: list[str]) -> Picture:
-    is_open = np.asarray([name == _OPEN for name in names])
-    computed = counts[~is_open].sum(0)
-    values = counts[_is_bad(names)].sum(0) / np.where(computed, computed, np.nan)
-    return Picture(values, int(counts[is_open].sum()), int(counts.sum()))
-
-
-def _draw_statuses(
-    axis: Any, grid: Grid, shown: np.ndarray, codes: list[int], names: list[str]
-) -> None:
-    """Statuses as cells; of one dimension a strip."""
-    panels.frame(axis)
-    if grid.y is None:
-        y, shown = np.asarray([0.0, 1.0]), shown[None]
-        axis.set_yticks([])
-    else:
-        y = grid.y.edges
-    colours = ListedColormap([_colour(name, i) for i, name in enumerate(names)])
-    norm = BoundaryNorm([*(c - 0.5 for c in codes), codes[-1] + 0.5], len(codes))
-    axis.pcolormesh(grid.x.edges, y, shown, cmap=colours, norm=norm, rasterized=True)
-
-
-def _colour(name: str, place: int) -> str:
-    return _STATUS_COLOURS.get(name, COLOURS[place % len(COLOURS)])
+    selections = (dict.fromkeys(along, i) for i in range(len(grid.panels)))
+    return _count(status, grid, (status.isel(one) for one in selections))
