@@ -721,7 +721,7 @@ def test_what_is_no_basis_no_step_or_no_observable_is_refused():
     for search in (dvi.discover_invariants, dvi.find_symmetries):
         with pytest.raises(TypeError, match="Wrap the discrete"):
             search(H_D, dvi.Polynomials(2), h=0.1, samples=samples)
-        with pytest.raises(TypeError, match="newton must be"):
+        with pytest.raises(TypeError, match="root_finder must be"):
             search(SPRING, dvi.Polynomials(2), h=0.1, samples=samples, newton=5)
     with pytest.raises(ValueError, match=r"states of shape \(1,\); got q of shape \(2,\)"):
         found("spring", 4, 2).evaluate([0.1, 0.2], [0.3, 0.4], 0.1)
