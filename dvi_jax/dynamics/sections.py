@@ -61,7 +61,7 @@ def _chosen(system: System, integrator: Integrator | None, **given: Any) -> Inte
             "TypeII() for this system. Give method=: dvi.Strang() for the results of earlier "
             "versions, dvi.TypeII() for the map of H_D itself.",
             FutureWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     return found
 
