@@ -81,7 +81,14 @@ _KINDS = {
     "arithmetic": Arithmetic,
     "layout": Layout,
 }
-_HINTS = {"root_finder": "Take dvi.Newton(), dvi.SimplifiedNewton() or dvi.Picard()."}
+_HINTS = {
+    "method": "Take one such as dvi.Strang().",
+    "lattice": "Take dvi.Uniform(), dvi.Given(ts), dvi.TimeTransformed(g) or dvi.Variational().",
+    "adjoint": "Take dvi.Reversible(), dvi.Checkpointed() or dvi.Direct().",
+    "root_finder": "Take dvi.Newton(), dvi.SimplifiedNewton() or dvi.Picard().",
+    "arithmetic": "Take dvi.FloatingPoint(), dvi.Compensated() or dvi.FixedPoint(quantum).",
+    "layout": 'Take dvi.Layout() or dvi.Layout(form="arrays").',
+}
 
 _DEFAULT = Integrator()
 

@@ -5,7 +5,7 @@ Pictures of fits, and of the planets beside an ephemeris, are in examples of the
 Run: python examples/gallery.py [DIRECTORY for the pictures] [NAME of a picture ...]
 """
 
-import sys
+import argparse
 import time
 from pathlib import Path
 
@@ -395,12 +395,16 @@ PICTURES = [
 
 def main():
     """Draw all pictures, or those that are named."""
-    out = Path(sys.argv[1] if len(sys.argv) > 1 else "gallery")
     names = {f.__name__: f for f in PICTURES}
-    if unknown := [name for name in sys.argv[2:] if name not in names]:
-        sys.exit(f"no picture is called {', '.join(unknown)}: there are {', '.join(names)}.")
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("directory", type=Path, nargs="?", default="gallery")
+    parser.add_argument("pictures", nargs="*", help=f"of {', '.join(names)}; all if left out")
+    given = parser.parse_args()
+    out, chosen = given.directory, given.pictures
+    if unknown := [name for name in chosen if name not in names]:
+        parser.error(f"no picture is called {', '.join(unknown)}: there are {', '.join(names)}.")
     out.mkdir(parents=True, exist_ok=True)
-    for name in sys.argv[2:] or names:
+    for name in chosen or names:
         start = time.perf_counter()
         files = names[name](out)
         for file in [files] if isinstance(files, Path) else files:

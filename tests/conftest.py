@@ -1,6 +1,7 @@
 """Double precision, no silent rank promotion, run-time checked annotations; long files first."""
 
 import gc
+import re
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -80,6 +81,16 @@ def in_parts(tests: Mapping[str, int], parts: int) -> list[list[str]]:
     return found
 
 
+def part_of(text: str) -> tuple[int, int]:
+    """I and N of "I/N"."""
+    found = re.fullmatch(r"(\d+)/(\d+)", text)
+    if not found or not 1 <= int(found[1]) <= int(found[2]):
+        raise pytest.UsageError(
+            f"--part must be I/N with I from 1 to N, such as 1/4, got {text!r}."
+        )
+    return int(found[1]), int(found[2])
+
+
 def pytest_addoption(parser):
     parser.addoption(
         "--part",
@@ -97,9 +108,9 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(config, items):
     """Files that take long before those that do not, so that all workers end at one time."""
     if chosen := config.getoption("--part"):
-        part, parts = map(int, chosen.split("/"))
+        part, parts = part_of(chosen)
         slow = [item for item in items if item.get_closest_marker("slow")]
-        files = in_parts(Counter(item.path.stem for item in slow), parts)[part % parts]
+        files = in_parts(Counter(item.path.stem for item in slow), parts)[part - 1]
         left_out = [item for item in items if item not in slow or item.path.stem not in files]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in slow if item.path.stem in files]

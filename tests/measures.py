@@ -204,8 +204,8 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 49_420,
-    "raise statements": 685,
+    "lines": 49_400,
+    "raise statements": 680,
     COMMENTS: 1.3,
     f"files of more than {LONGEST_FILE} lines": 5,
     f"functions with more than {MOST_PARAMETERS} parameters": 28,

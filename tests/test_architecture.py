@@ -287,6 +287,13 @@ else:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_a_part_that_is_none_is_refused():
+    assert conftest.part_of("3/4") == (3, 4)
+    for text in ("0/4", "5/4", "x/4", "2"):
+        with pytest.raises(pytest.UsageError, match="such as 1/4, got"):
+            conftest.part_of(text)
+
+
 def test_every_file_of_long_tests_is_in_one_part():
     files = dict.fromkeys(sorted(conftest.SECONDS), 3) | {f"test_new_{i}": i for i in range(20)}
     parts = conftest.in_parts(files, 4)

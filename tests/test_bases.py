@@ -81,7 +81,7 @@ def test_functions_of_time_are_told_from_others():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: dvi.Chebyshev(0, "q"), "count must be a positive integer"),
+        (lambda: dvi.Chebyshev(0, "q"), "count must be a whole number from 1 on"),
         (lambda: dvi.Chebyshev(3, "q", domain=(1, 1)), "a < b"),
         (lambda: dvi.Chebyshev(3, "x").for_shape(()), "no component 'x'"),
         (lambda: dvi.Trigonometric(2, "q", period=0.0), "period must be positive"),

@@ -549,7 +549,7 @@ def test_series_differentiates_batches_and_refuses_to_guess():
         ({"samples": (np.ones((50, 1)), np.ones((50, 2)))}, "one shape"),
         ({"samples": (np.full((50, 1), np.nan), np.ones((50, 1)))}, "not finite"),
         ({"samples": 100}, "pair"),
-        ({"order": -1}, "at least 0"),
+        ({"order": -1}, "from 0 on"),
         ({"tolerance": 2.0}, "between 0 and 1"),
         ({"basis": dvi.Chebyshev(3, "t")}, "all samples are of one time"),
         ({"samples": (*box(1, 60), np.zeros(50))}, "times of 60 samples"),

@@ -243,12 +243,12 @@ def test_states_of_any_shape_and_precision_batches_and_gradients():
 
 @pytest.mark.parametrize("order", [-1, 1.0, True, None])
 def test_order_is_refused(order):
-    with pytest.raises(ValueError, match="order must be an integer of at least 0"):
+    with pytest.raises(ValueError, match="order must be a whole number from 0 on"):
         dvi.ShadowHamiltonian(order)
 
 
 def test_bad_input_is_refused():
-    with pytest.raises(TypeError, match=r"must be a dvi\.System or None, got function"):
+    with pytest.raises(TypeError, match=r"must be a dvi\.System or None, got <function"):
         dvi.ShadowHamiltonian(1, pendulum)
     for h in (0.0, np.nan, [0.1, 0.2]):
         with pytest.raises(ValueError, match="one finite step size"):

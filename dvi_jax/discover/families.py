@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from .._checks import whole
 from .basis import About, AbstractBasis, BoundBasis
 
 TIME = ("t", "τ")
@@ -50,11 +51,6 @@ def _power(name: str, k: int) -> str:
     return name if k == 1 else name + str(k).translate(_RAISED)
 
 
-def _positive(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(f"{name} must be a positive integer, got {value!r}.")
-
-
 _MOST = 10_000
 """Monomials of a basis: its samples and singular values are dense matrices of this width."""
 
@@ -76,7 +72,7 @@ class Polynomials(AbstractBasis):
     constant: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        _positive("degree", self.degree)
+        whole("degree", self.degree)
 
     def for_shape(self, shape):
         chosen = coordinate_names(shape) if self.variables is None else self.variables
@@ -173,7 +169,7 @@ class Chebyshev(AbstractBasis):
     domain: tuple[float, float] = eqx.field(static=True, converter=_pair, default=(-1.0, 1.0))
 
     def __check_init__(self):
-        _positive("count", self.count)
+        whole("count", self.count)
         ends = np.asarray(self.domain, float)
         if ends.shape != (2,) or not np.isfinite(ends).all() or not ends[0] < ends[1]:
             raise ValueError(f"domain must be two numbers (a, b), a < b, got {self.domain!r}.")
@@ -218,7 +214,7 @@ class Trigonometric(AbstractBasis):
     constant: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        _positive("count", self.count)
+        whole("count", self.count)
         if not 0 < self.period < np.inf:
             raise ValueError(f"period must be positive and finite, got {self.period!r}.")
 

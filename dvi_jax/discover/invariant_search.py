@@ -1,11 +1,11 @@
 """Adiabatic invariants found as a null space on the map that is actually iterated."""
 
-import operator
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from .._checks import whole
 from .._integrator import Integrator
 from .._step import Equations
 from .._system import System, check_system
@@ -367,12 +367,7 @@ class _Search:
 
 
 def _check_options(order: Any, tolerance: Any, representative: Any) -> int:
-    try:
-        number = -1 if isinstance(order, bool) else operator.index(order)
-    except TypeError:
-        number = -1
-    if number < 0:
-        raise ValueError(f"order must be an integer of at least 0, got {order!r}.")
+    number = whole("order", order, least=0)
     is_number = isinstance(tolerance, float | np.floating)
     if tolerance is not None and not (is_number and 0 < tolerance < 1):
         raise ValueError(

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from lanewise.dependence import depends_on
 from lanewise.jaxapi import is_traced
 
+from .._checks import instance, whole
 from .._precision import refuse_double_without_x64
 from .._system import System
 from .._types import Args, Scalar, State
@@ -85,14 +86,10 @@ class ShadowHamiltonian(eqx.Module):
     h: Any = None
 
     def __check_init__(self):
-        order = self.order
-        if isinstance(order, bool) or not isinstance(order, int) or order < 0:
-            raise ValueError(f"order must be an integer of at least 0, got {order!r}.")
-        if self.system is not None and not isinstance(self.system, System):
-            raise TypeError(
-                f"system must be a dvi.System or None, got {type(self.system).__name__}. Wrap the "
-                "discrete Hamiltonian: dvi.System(H_D)."
-            )
+        whole("order", self.order, least=0)
+        if self.system is not None:
+            hint = "Wrap the discrete Hamiltonian: dvi.System(H_D)."
+            instance("system", self.system, System, "a dvi.System or None", hint)
         if self.h is None or is_traced(self.h):
             return
         if np.shape(self.h) != () or not np.isfinite(self.h) or self.h == 0:

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from .._checks import whole
 from .._integrator import Integrator
 from .._step import Equations
 from .._system import System, check_system
@@ -115,8 +116,7 @@ def find_symmetries(
     #   ξ_q1 = q2, ξ_q2 = −q1, η_p1 = p2, η_p2 = −p1…
     ```
     """
-    if isinstance(order, bool) or not isinstance(order, int) or order < 0:
-        raise ValueError(f"order must be an integer of at least 0, got {order!r}.")
+    order = whole("order", order, least=0)
     if tolerance is not None and not 0 < tolerance < 1:
         raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance!r}.")
     check_system(system)
