@@ -11,7 +11,7 @@ import numpy as np
 def whole(name: str, value: Any, least: int = 1, most: int | None = None, hint: str = "") -> int:
     """A whole number from `least` to `most` (None: any).
 
-    `True` is none, though Python counts it as 1. **Raises** `ValueError`.
+    `True` and `False` are not accepted. **Raises** `ValueError`.
     """
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not fits or value < least or (most is not None and value > most):

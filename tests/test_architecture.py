@@ -287,7 +287,7 @@ else:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_a_part_that_is_none_is_refused():
+def test_an_invalid_part_is_refused():
     assert conftest.part_of("3/4") == (3, 4)
     for text in ("0/4", "5/4", "x/4", "2"):
         with pytest.raises(pytest.UsageError, match="such as 1/4, got"):

@@ -470,7 +470,7 @@ def test_a_branch_goes_on_after_an_orbit_that_escapes():
     assert np.isfinite(found.qs[2]).all()
 
 
-def test_a_default_that_has_changed_is_said():
+def test_a_changed_default_method_gives_a_warning():
     q, p = starts(2)
     settings = {"h": 0.1, "num_steps": 80}
     with pytest.warns(FutureWarning, match=r"used Strang\(\) by default"):

@@ -87,8 +87,8 @@ class BoundBasis(eqx.Module):
         return self.function(q, p, jnp.asarray(t, float))
 
     def unnamed(self) -> "BoundBasis":
-        """The same functions without names, which contain the point about which they are taken: so
-        what was compiled for one set of samples serves another."""
+        """The same functions without names. Names contain the centre of the samples; without them,
+        programs that were compiled for one set of samples are used for another."""
 
         def is_basis(x):
             return isinstance(x, BoundBasis)
