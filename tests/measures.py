@@ -204,7 +204,7 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 49_400,
+    "lines": 49_420,
     "raise statements": 680,
     COMMENTS: 1.3,
     f"files of more than {LONGEST_FILE} lines": 5,

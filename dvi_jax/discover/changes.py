@@ -64,12 +64,11 @@ class Changes(NamedTuple):
 
     def at(self, some: np.ndarray) -> "Changes":
         """Of some of the samples."""
-        motion = Motion(*(x[some] for x in self.motion))
         return Changes(
             values=self.values[some],
             terms=self.terms[some],
             volume=self.volume[some],
-            motion=motion,
+            motion=self.motion.at(some),
             slopes=self.slopes[some],
             moved=self.moved[some],
             good=self.good[some],

@@ -267,7 +267,7 @@ class _Search:
         self.judge, self.judge_fitted = (
             Judge(in_units.at(some), calm[some], self.scale, digits[some]) for some in (~fit, fit)
         )
-        of_fit = changes.terms[fit, 0], changes.at(fit).motion, self.values
+        of_fit = changes.terms[fit, 0], changes.motion.at(fit), self.values
         self.fewest = Fewest(basis.complexity, self.rms, *of_fit)
 
     @property
