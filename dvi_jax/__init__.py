@@ -1,5 +1,6 @@
-"""Differentiable variational integrators for disturbed Hamiltonian systems."""
+"""Differentiable variational integrators for perturbed Hamiltonian systems."""
 
+import sys
 from typing import TYPE_CHECKING
 
 from lanewise import Layout as Layout
@@ -14,18 +15,6 @@ from ._adjoints import (
     Checkpointed as Checkpointed,
     Direct as Direct,
 )
-from ._aliases import (
-    RK4 as RK4,
-    Chord as Chord,
-    Event as Event,
-    Leapfrog as Leapfrog,
-    LinearTrend as LinearTrend,
-    PeakToPeak as PeakToPeak,
-    SaveAt as SaveAt,
-    StormerVerlet as StormerVerlet,
-    SymplecticEuler as SymplecticEuler,
-    naff as naff,
-)
 from ._arithmetic import (
     Arithmetic as Arithmetic,
     Compensated as Compensated,
@@ -36,98 +25,18 @@ from ._discretise import discretise as discretise
 from ._energies import incoming_energy as incoming_energy, outgoing_energy as outgoing_energy
 from ._integrate import integrate as integrate
 from ._integrator import Integrator as Integrator
-from ._namespaces import names as __dir__  # noqa: F401
 from ._results import RESULTS as RESULTS, IntegrationError as IntegrationError
 from ._reversible import Reversible as Reversible
 from ._solution import Save as Save, Solution as Solution
 from ._step import Equations as Equations, StepInfo as StepInfo
 from ._system import System as System
 from ._types import Interval as Interval
-from .discover import (
-    AdiabaticInvariant as AdiabaticInvariant,
-    Balance as Balance,
-    Basis as Basis,
-    Chebyshev as Chebyshev,
-    Discovery as Discovery,
-    DriftLaw as DriftLaw,
-    DriftOrder as DriftOrder,
-    DriftSurface as DriftSurface,
-    Generator as Generator,
-    InvariantSeries as InvariantSeries,
-    LatticePoint as LatticePoint,
-    Polynomials as Polynomials,
-    Radial as Radial,
-    ShadowHamiltonian as ShadowHamiltonian,
-    Symmetries as Symmetries,
-    Symmetry as Symmetry,
-    Trigonometric as Trigonometric,
-    conformal_factor as conformal_factor,
-    determining_residual as determining_residual,
-    discover_invariants as discover_invariants,
-    discrete_equations as discrete_equations,
-    drift_order as drift_order,
-    drift_surface as drift_surface,
-    find_symmetries as find_symmetries,
-    lattice_defect as lattice_defect,
-    library as _library,
-    noether_balance as noether_balance,
-    noether_identity as noether_identity,
-    prolong as prolong,
-    random_pairs as random_pairs,
-    solution_pairs as solution_pairs,
-    solve_gauge as solve_gauge,
-)
-from .dynamics import (
-    FREQUENCY_RESULTS as FREQUENCY_RESULTS,
-    SECTION_RESULTS as SECTION_RESULTS,
-    Actions as Actions,
-    Frequencies as Frequencies,
-    FrequencyDiffusion as FrequencyDiffusion,
-    FrequencyError as FrequencyError,
-    FundamentalFrequencies as FundamentalFrequencies,
-    PoincareSection as PoincareSection,
-    Return as Return,
-    ReturnMap as ReturnMap,
-    SectionError as SectionError,
-    actions as actions,
-    bifurcation as bifurcation,
-    frequencies as frequencies,
-    frequency_diffusion as frequency_diffusion,
-    fundamental_frequencies as fundamental_frequencies,
-    poincare_section as poincare_section,
-    stroboscope as stroboscope,
-    tangent_map as tangent_map,
-)
 from .engine.cpu import configure_cpu as configure_cpu
 from .engine.devices import over_devices as over_devices
 from .engine.newton import Newton as Newton, RootSolver as RootSolver
 from .engine.picard import Picard as Picard, PicardThenNewton as PicardThenNewton
 from .engine.simplified import SimplifiedNewton as SimplifiedNewton
 from .engine.threads import over_threads as over_threads
-from .fit import (
-    FIT_RESULTS as FIT_RESULTS,
-    Bounds as Bounds,
-    Cauchy as Cauchy,
-    FitError as FitError,
-    FitProgress as FitProgress,
-    FitResult as FitResult,
-    ForceLibrary as ForceLibrary,
-    Identification as Identification,
-    LeastSquares as LeastSquares,
-    Likelihood as Likelihood,
-    Model as Model,
-    MultipleShooting as MultipleShooting,
-    NetworkForce as NetworkForce,
-    Observations as Observations,
-    Posterior as Posterior,
-    Prior as Prior,
-    Samples as Samples,
-    SingleShooting as SingleShooting,
-    SoftL1 as SoftL1,
-    fit as fit,
-    identify as identify,
-    sample as sample,
-)
 from .lattices import (
     Given as Given,
     Lattice as Lattice,
@@ -170,35 +79,120 @@ from .observe import (
     TangentMap as TangentMap,
     Trend as Trend,
 )
-from .sweep import (
-    Axis as Axis,
-    ClusterError as ClusterError,
-    StoreError as StoreError,
-    StoreMismatch as StoreMismatch,
-    SweepCost as SweepCost,
-    SweepInterrupted as SweepInterrupted,
-    SweepProgress as SweepProgress,
-    SweepResult as SweepResult,
-    open_sweep as open_sweep,
-    starts as starts,
-    sweep as sweep,
-    sweep_cost as sweep_cost,
-)
 
-if TYPE_CHECKING:  # a type checker is to report names that are not there
+if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
     from . import (
         certify as certify,
-        fit as fitting,  # noqa: F401
+        fit as _fit,
         interop as interop,
         paper as paper,
         plot as plot,
         run as run,
-        sweep as sweeps,  # noqa: F401
+        sweep as _sweep,
         systems as systems,
         testing as testing,
     )
-else:
-    from ._namespaces import namespace as __getattr__  # noqa: F401
+    from .discover import (
+        AdiabaticInvariant as AdiabaticInvariant,
+        Balance as Balance,
+        Basis as Basis,
+        Chebyshev as Chebyshev,
+        Discovery as Discovery,
+        DriftLaw as DriftLaw,
+        DriftOrder as DriftOrder,
+        DriftSurface as DriftSurface,
+        Generator as Generator,
+        InvariantSeries as InvariantSeries,
+        LatticePoint as LatticePoint,
+        Polynomials as Polynomials,
+        Radial as Radial,
+        ShadowHamiltonian as ShadowHamiltonian,
+        Symmetries as Symmetries,
+        Symmetry as Symmetry,
+        Trigonometric as Trigonometric,
+        conformal_factor as conformal_factor,
+        determining_residual as determining_residual,
+        discover_invariants as discover_invariants,
+        discrete_equations as discrete_equations,
+        drift_order as drift_order,
+        drift_surface as drift_surface,
+        find_symmetries as find_symmetries,
+        lattice_defect as lattice_defect,
+        library as _library,
+        noether_balance as noether_balance,
+        noether_identity as noether_identity,
+        prolong as prolong,
+        random_pairs as random_pairs,
+        solution_pairs as solution_pairs,
+        solve_gauge as solve_gauge,
+    )
+    from .dynamics import (
+        FREQUENCY_RESULTS as FREQUENCY_RESULTS,
+        SECTION_RESULTS as SECTION_RESULTS,
+        Actions as Actions,
+        Frequencies as Frequencies,
+        FrequencyDiffusion as FrequencyDiffusion,
+        FrequencyError as FrequencyError,
+        FundamentalFrequencies as FundamentalFrequencies,
+        PoincareSection as PoincareSection,
+        Return as Return,
+        ReturnMap as ReturnMap,
+        SectionError as SectionError,
+        actions as actions,
+        bifurcation as bifurcation,
+        frequencies as frequencies,
+        frequency_diffusion as frequency_diffusion,
+        fundamental_frequencies as fundamental_frequencies,
+        poincare_section as poincare_section,
+        stroboscope as stroboscope,
+        tangent_map as tangent_map,
+    )
+    from .fit import (
+        FIT_RESULTS as FIT_RESULTS,
+        Bounds as Bounds,
+        Cauchy as Cauchy,
+        FitError as FitError,
+        FitProgress as FitProgress,
+        FitResult as FitResult,
+        ForceLibrary as ForceLibrary,
+        Identification as Identification,
+        LeastSquares as LeastSquares,
+        Likelihood as Likelihood,
+        Model as Model,
+        MultipleShooting as MultipleShooting,
+        NetworkForce as NetworkForce,
+        Observations as Observations,
+        Posterior as Posterior,
+        Prior as Prior,
+        Samples as Samples,
+        SingleShooting as SingleShooting,
+        SoftL1 as SoftL1,
+        fit as fit,
+        identify as identify,
+        sample as sample,
+    )
+    from .sweep import (
+        Axis as Axis,
+        ClusterError as ClusterError,
+        StoreError as StoreError,
+        StoreMismatch as StoreMismatch,
+        SweepCost as SweepCost,
+        SweepInterrupted as SweepInterrupted,
+        SweepProgress as SweepProgress,
+        SweepResult as SweepResult,
+        open_sweep as open_sweep,
+        starts as starts,
+        sweep as sweep,
+        sweep_cost as sweep_cost,
+    )
 
-generators = _library
+    fitting, sweeps, generators = _fit, _sweep, _library
+    SymplecticEuler, StormerVerlet, Leapfrog, RK4 = TypeII, Strang, Strang, RungeKutta4
+    Chord, SaveAt, Event, naff = SimplifiedNewton, Save, Stop, frequencies
+    LinearTrend, PeakToPeak = Trend, Range
+else:
+    from ._namespaces import Package
+
+    sys.modules[__name__].__class__ = Package
+
 __version__ = "0.1.0"

@@ -1,25 +1,115 @@
-"""Packages of `dvi_jax` as attributes, imported when they are first used."""
+"""Public names of `dvi_jax` that are imported when they are first used."""
 
 import importlib
 import sys
 from types import ModuleType
 
 NAMESPACES = {
-    **{name: name for name in ("certify", "interop", "paper", "plot", "run", "systems", "testing")},
+    **{
+        name: name
+        for name in (
+            *("methods", "lattices", "observe", "discover", "dynamics"),
+            *("systems", "plot", "interop", "testing", "paper", "certify", "run"),
+        )
+    },
     # The functions `dvi.sweep` and `dvi.fit` have the names of their packages.
     "fitting": "fit",
     "sweeps": "sweep",
+    "generators": "discover.library",
+    "starts": "sweep.starts",
 }
-"""Attribute of `dvi_jax` → the package that it stands for."""
+"""Attribute of `dvi_jax` → the package that it is."""
 
+HOMES = {
+    "discover": (
+        *("AdiabaticInvariant", "Balance", "Basis", "Chebyshev", "Discovery", "DriftLaw"),
+        *("DriftOrder", "DriftSurface", "Generator", "InvariantSeries", "LatticePoint"),
+        *("Polynomials", "Radial", "ShadowHamiltonian", "Symmetries", "Symmetry", "Trigonometric"),
+        *("conformal_factor", "determining_residual", "discover_invariants"),
+        *("discrete_equations", "drift_order", "drift_surface", "find_symmetries"),
+        *("lattice_defect", "noether_balance", "noether_identity", "prolong", "random_pairs"),
+        *("solution_pairs", "solve_gauge"),
+    ),
+    "dynamics": (
+        *("FREQUENCY_RESULTS", "SECTION_RESULTS", "Actions", "Frequencies", "FrequencyDiffusion"),
+        *("FrequencyError", "FundamentalFrequencies", "PoincareSection", "Return", "ReturnMap"),
+        *("SectionError", "actions", "bifurcation", "frequencies", "frequency_diffusion"),
+        *("fundamental_frequencies", "poincare_section", "stroboscope", "tangent_map"),
+    ),
+    "fit": (
+        *("FIT_RESULTS", "Bounds", "Cauchy", "FitError", "FitProgress", "FitResult"),
+        *("ForceLibrary", "Identification", "LeastSquares", "Likelihood", "Model"),
+        *("MultipleShooting", "NetworkForce", "Observations", "Posterior", "Prior", "Samples"),
+        *("SingleShooting", "SoftL1", "fit", "identify", "sample"),
+    ),
+    "sweep": (
+        *("Axis", "ClusterError", "StoreError", "StoreMismatch", "SweepCost"),
+        *("SweepInterrupted", "SweepProgress", "SweepResult", "open_sweep", "sweep"),
+        "sweep_cost",
+    ),
+}
+"""Package → names of `dvi_jax` that are imported from it at their first use."""
 
-def namespace(name: str) -> ModuleType:
-    """`dvi_jax.__getattr__`. **Raises** `AttributeError` for a name that is not there."""
-    if name not in NAMESPACES:
-        raise AttributeError(f"module 'dvi_jax' has no attribute {name!r}", name=name)
-    return importlib.import_module(f"dvi_jax.{NAMESPACES[name]}")
+LAZY = {name: package for package, names in HOMES.items() for name in names}
+"""Name of `dvi_jax` → the package that has it."""
+
+ALIASES = {
+    "Chord": "SimplifiedNewton",
+    "Event": "Stop",
+    "Leapfrog": "Strang",
+    "LinearTrend": "Trend",
+    "PeakToPeak": "Range",
+    "RK4": "RungeKutta4",
+    "SaveAt": "Save",
+    "StormerVerlet": "Strang",
+    "SymplecticEuler": "TypeII",
+    "naff": "frequencies",
+}
+"""Other names of public objects: terms of the field and of other packages. The table in
+docs/migration.md lists them."""
+
+SHORT = (
+    *("System", "discretise", "from_lagrangian", "velocity_force"),
+    *("integrate", "Integrator", "Save", "Solution", "RESULTS", "IntegrationError"),
+    *("TypeII", "SymplecticEuler", "Strang", "StormerVerlet", "Yoshida", "GaussLegendre"),
+    *("Uniform", "TimeTransformed", "Variational", "Compensated", "FixedPoint"),
+    *("Newton", "SimplifiedNewton", "Picard", "Reversible", "Checkpointed"),
+    *("MaxDrift", "Range", "Trend", "Mean", "Section", "Stop"),
+    *("discover_invariants", "find_symmetries", "drift_order", "Polynomials", "ShadowHamiltonian"),
+    *("sweep", "Axis", "open_sweep", "fit", "Observations"),
+    *("poincare_section", "frequencies", "tangent_map"),
+    *("over_threads", "over_devices"),
+)
+"""Names that `dir(dvi_jax)` lists next to the namespaces. All other names are listed in their
+namespace; each is also an attribute of `dvi_jax`."""
 
 
 def names() -> list[str]:
-    """`dvi_jax.__dir__`."""
-    return sorted({*vars(sys.modules["dvi_jax"]), *NAMESPACES})
+    """All names of `dvi_jax` that are objects, aliases left out."""
+    package = sys.modules["dvi_jax"]
+    known = {n for n, thing in vars(package).items() if not isinstance(thing, ModuleType)}
+    return sorted(n for n in {*known, *LAZY} - {*ALIASES} if not n.startswith("_"))
+
+
+class Package(ModuleType):
+    """Class of the module `dvi_jax`."""
+
+    def __getattr__(self, name: str):
+        if name in NAMESPACES:
+            return importlib.import_module(f"{self.__name__}.{NAMESPACES[name]}")
+        if name in ALIASES:
+            found = getattr(self, ALIASES[name])
+        elif name in LAZY:
+            found = getattr(importlib.import_module(f"{self.__name__}.{LAZY[name]}"), name)
+        else:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}", name=name)
+        setattr(self, name, found)
+        return found
+
+    def __setattr__(self, name: str, value: object) -> None:
+        # An import of the package `dvi_jax.fit` would hide the function `dvi_jax.fit`.
+        if not (isinstance(value, ModuleType) and name in NAMESPACES.values() and name in LAZY):
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*SHORT, *NAMESPACES, "__version__", "__doc__", "__file__", "__path__"})

@@ -11,6 +11,7 @@ import measures
 import pytest
 
 import dvi_jax as dvi
+from dvi_jax import _namespaces
 
 ROOT = Path(dvi.__file__).parent
 FLOORS = [
@@ -30,7 +31,7 @@ FLOORS = [
     ["discover"],
     ["sweep", "fit"],
     ["dynamics"],
-    ["_aliases", "_namespaces"],
+    ["_namespaces"],
     ["__init__", "systems", "plot", "symmetry", "invariants"],
     ["testing"],
     ["paper", "certify"],
@@ -229,7 +230,7 @@ def test_door_has_no_logic():
         for node in tree.body
         for inner in (node.body + node.orelse if isinstance(node, ast.If) else [node])
     ]
-    assert all(isinstance(n, ast.ImportFrom | ast.Expr | ast.Assign) for n in nodes)
+    assert all(isinstance(n, ast.Import | ast.ImportFrom | ast.Expr | ast.Assign) for n in nodes)
     tests = [ast.unparse(node.test) for node in tree.body if isinstance(node, ast.If)]
     assert tests == ["TYPE_CHECKING"]
 
@@ -276,6 +277,7 @@ assert not any(f"dvi_jax.{n}" in sys.modules for n in ("plot", "systems", "inter
 for name, package in _namespaces.NAMESPACES.items():
     assert name in dir(dvi), name
     assert getattr(dvi, name) is sys.modules[f"dvi_jax.{package}"], name
+from dvi_jax.fit import Model  # the package has the name of the function
 assert dvi.fitting.Prior is dvi.Prior and callable(dvi.fit) and callable(dvi.sweep)
 try:
     dvi.plots
@@ -285,6 +287,26 @@ else:
     raise AssertionError
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_type_checkers_and_programs_see_the_same_names():
+    """`__init__.py` lists for type checkers what `_namespaces` imports at the first use."""
+    tree = ast.parse((ROOT / "__init__.py").read_text())
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    listed = {
+        node.module: {alias.asname for alias in node.names}
+        for node in block.body
+        if isinstance(node, ast.ImportFrom) and node.module
+    }
+    namespaces = {"_library", "starts"}
+    assert {home: names - namespaces for home, names in listed.items()} == {
+        home: set(names) for home, names in _namespaces.HOMES.items()
+    }
+    for name in _namespaces.names():
+        assert getattr(dvi, name) is not None
+    short = [name for name in dir(dvi) if name in {*_namespaces.names(), *_namespaces.ALIASES}]
+    assert sorted(_namespaces.SHORT) == short
+    assert len(short) <= 50
 
 
 def test_an_invalid_part_is_refused():

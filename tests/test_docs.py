@@ -186,11 +186,10 @@ def test_links_resolve(site, tmp_path):
 @pytest.mark.slow
 def test_every_public_name_has_an_entry(site):
     import dvi_jax as dvi
-    from dvi_jax._aliases import ALIASES  # listed in docs/migration.md
+    from dvi_jax import _namespaces
 
     text = "".join(p.read_text(encoding="utf-8") for p in (site / "reference").glob("*.html"))
-    names = [n for n, x in vars(dvi).items() if not n.startswith("_") and callable(x)]
-    names = [n for n in names if n not in ALIASES]
+    names = [n for n in _namespaces.names() if callable(getattr(dvi, n))]
     assert len(names) > 120
     assert [n for n in names if f'id="dvi_jax.{n}"' not in text] == []
 

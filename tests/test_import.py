@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import dvi_jax as dvi
-from dvi_jax._aliases import ALIASES
+from dvi_jax._namespaces import ALIASES
 
 LATER = (
     "optax", "optimistix", "lineax", "matplotlib", "scipy", "xarray", "zarr", "rich", "typer",
@@ -38,6 +38,6 @@ def test_every_alias_is_listed_and_means_its_name():
         for aliases, meant in rows
         for alias in re.findall(r"`dvi\.(\w+)`", aliases)
     }
-    assert listed.keys() == ALIASES.keys()
-    for alias, name in listed.items():
-        assert getattr(dvi, alias) is ALIASES[alias] is getattr(dvi, name)
+    assert listed == ALIASES
+    for alias, name in ALIASES.items():
+        assert getattr(dvi, alias) is getattr(dvi, name)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax import interop, systems
+from dvi_jax import _namespaces, interop, systems
 
 PENDULUM = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - jnp.sum(jnp.cos(q)))
 CONTINUOUS = dvi.System(dvi.discretise(lambda t, q, p, args: p @ p / 2 - jnp.sum(jnp.cos(q))))
@@ -142,7 +142,7 @@ def test_diffrax_solver_takes_both_names():
 
 
 def test_no_function_with_newton_is_left_out():
-    public = [getattr(dvi, name) for name in dir(dvi) if not name.startswith("_")]
+    public = [getattr(dvi, name) for name in _namespaces.names()]
     public += [interop.solve_ivp, interop.diffrax_solver]
     found = {
         f.__name__

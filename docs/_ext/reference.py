@@ -23,7 +23,7 @@ from sphinx.util.docutils import SphinxDirective
 
 import dvi_jax
 import lanewise
-from dvi_jax._aliases import ALIASES
+from dvi_jax._namespaces import names
 from dvi_jax.paper.equations import EQUATIONS
 
 PAGES = {
@@ -62,13 +62,13 @@ OWN = ("dvi_jax", "lanewise")
 
 def public(module: types.ModuleType) -> dict[str, Any]:
     """Public names of a module that are our own, in alphabetical order, without aliases."""
+    listed = names() if module is dvi_jax else vars(module)
+    things = {name: getattr(module, name) for name in listed if not name.startswith("_")}
     own = {
         name: thing
-        for name, thing in vars(module).items()
-        if not name.startswith("_")
-        and (inspect.isclass(thing) or inspect.isfunction(thing))
+        for name, thing in things.items()
+        if (inspect.isclass(thing) or inspect.isfunction(thing))
         and thing.__module__.startswith(OWN)
-        and not (module is dvi_jax and name in ALIASES)
     }
     return dict(sorted(own.items(), key=lambda item: item[0].lower()))
 
