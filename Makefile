@@ -13,7 +13,7 @@ READY = $(VENV)/ready
 
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help paper notebooks docs test test-all test-part test-fast lint types format lock clean
+.PHONY: help paper notebooks docs dist test test-all test-part test-fast lint types format lock clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -30,6 +30,15 @@ notebooks: $(READY)
 docs: $(READY)
 	$(BIN)/python -m sphinx -W --keep-going -q -j auto -b html docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
+
+## make dist        source archive and wheel in ./dist; the README's code runs where only the wheel is
+dist: $(READY)
+	rm -rf dist
+	$(BIN)/uv build -q --no-build-isolation --python $(BIN)/python --out-dir dist
+	$(BIN)/uv venv -q --python $(BIN)/python dist/venv
+	$(BIN)/uv pip install -q --python dist/venv/bin/python --constraint requirements.lock.txt dist/*.whl
+	sed -n '/^```python$$/,/^```$$/{/^```/!p}' README.md > dist/readme.py
+	cd dist && MPLBACKEND=Agg venv/bin/python -P readme.py
 
 ## make test        every part of the package at least once, in about five minutes
 test: $(READY)
