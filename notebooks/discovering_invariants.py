@@ -1,15 +1,15 @@
 # %% [markdown]
 # # Discovering invariants
 #
-# Given a system, what does it keep, exactly or to some order in $\varepsilon$? No symmetry is told.
-# The question is one of linear algebra: with functions $\varphi(q, p)$, the map $\Phi_\varepsilon$
-# of one step and the Taylor coefficients $A_m$ of $\varphi \circ \Phi_\varepsilon - \varphi$ in
-# $\varepsilon$ at random samples, the series $I = \sum_m \varepsilon^m c_m \cdot \varphi$ is an
-# invariant of order $z$ where
+# Which quantities does a given system conserve, exactly or to some order in $\varepsilon$? The
+# search needs no symmetry as input. It is a problem of linear algebra: with functions $\varphi(q,
+# p)$, the map $\Phi_\varepsilon$ of one step and the Taylor coefficients $A_m$ of $\varphi \circ
+# \Phi_\varepsilon - \varphi$ in $\varepsilon$ at random samples, the series $I = \sum_m
+# \varepsilon^m c_m \cdot \varphi$ is an invariant of order $z$ where
 #
 # $$\sum_{m \le k} A_{k-m}\, c_m = 0, \qquad k = 0 \dots z:$$
 #
-# a null space. A quarter of the samples is held out and judges. Then a long run decides.
+# a null space. A quarter of the samples is held out for validation. A long run is the final test.
 
 # %%
 import jax
@@ -36,8 +36,8 @@ def oscillator(t0, t1, q0, p1, args):
 # %% [markdown]
 # ## An invariant for every order
 #
-# The cubic spring of the [quick start](quick_start.ipynb). An invariant of order $z$ must drift
-# with $\varepsilon^{z+1}$, over 10 000 steps.
+# The system is the cubic spring of the [quick start](quick_start.ipynb). The drift of an invariant
+# of order $z$ over 10 000 steps must scale as $\varepsilon^{z+1}$.
 
 # %%
 cubic = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: -(q0**3))
@@ -48,7 +48,7 @@ for z in range(3):
         cubic, found.invariants[0], [0.4], [0.3],
         epsilons=np.geomspace(2e-3, 0.2, 6), h=0.1, num_steps=10_000,
     )  # fmt: skip
-    print(f"z = {z}: slope {orders[f'order {z}'].slope:.2f}, promised {z + 1}")
+    print(f"z = {z}: slope {orders[f'order {z}'].slope:.2f}, expected {z + 1}")
     assert abs(orders[f"order {z}"].limit - (z + 1)) < 0.1
 
 # %%
@@ -56,24 +56,24 @@ axis = plot.drift_orders(orders, promised=[1, 2, 3], title="A cubic spring, 10 0
 plt.show()
 
 # %% [markdown]
-# The bars at the left are what is left at $\varepsilon = 0$, round-off.
+# The bars at the left are the drift at $\varepsilon = 0$, which is round-off.
 #
-# ## Where there is none
+# ## No invariant
 #
-# Van der Pol's force $(1 - q^2)\,p$ pumps small swings and damps large ones. There is no invariant
-# of first order, and the answer must be "none", with the reason.
+# Van der Pol's force $(1 - q^2)\,p$ amplifies small oscillations and damps large ones. There is no
+# invariant of first order, and the report must say so and give the reason.
 
 # %%
 van_der_pol = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: (1 - q0**2) * p1)
 none = dvi.discover_invariants(van_der_pol, dvi.Polynomials(6), 1, h=0.1, samples=box(1, 400))
 law = none.obstructions[0]
-print("functions of the basis kept to order 0, to order 1:", none.survivors)
+print("independent functions conserved to order 0, to order 1:", none.survivors)
 print(law)
 assert len(none.invariants) == 0
 
 # %% [markdown]
-# The law of the loss has a point at rest, the limit cycle. Is it there? Two runs, one from within
-# and one from without, must end on it.
+# The law of the drift has a fixed point, the limit cycle. Two runs, one from inside and one from
+# outside, must end on it.
 
 # %%
 runs = [
@@ -87,26 +87,27 @@ def I_0(q, p):
 
 at_end = [float(np.mean(I_0(sol.qs[-628:, 0], sol.ps[-628:, 0]))) for sol in runs]
 at_rest = float(law.rest[0])
-print(f"at rest at I = {at_rest:.3f} (order 1); the runs end at {at_end[0]:.3f}, {at_end[1]:.3f}")
+print(f"fixed point I = {at_rest:.3f} (order 1); the runs end at {at_end[0]:.3f}, {at_end[1]:.3f}")
 assert np.allclose(at_end, at_rest, rtol=0.01)
 
 # %%
 with plot.style():
     figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.2), dpi=90)
-    for sol, name in zip(runs, ["from within", "from without"], strict=True):
+    for sol, name in zip(runs, ["from inside", "from outside"], strict=True):
         left.plot(sol.qs[:, 0], sol.ps[:, 0], lw=0.4, label=name)
         right.plot(sol.ts, I_0(sol.qs[:, 0], sol.ps[:, 0]), lw=1, label=name)
-    right.axhline(at_rest, color="0.3", ls="--", lw=1, label="at rest, by the law")
+    right.axhline(at_rest, color="0.3", ls="--", lw=1, label="fixed point of the law")
     left.set(xlabel="q", ylabel="p", aspect="equal", title="van der Pol, ε = 0.05")
-    right.set(xlabel="time t", ylabel="I", title="The leading part is lost")
+    right.set(xlabel="time t", ylabel="I", title="Leading-order term")
     right.legend()
 plt.show()
 
 # %% [markdown]
-# ## How many, out of how many
+# ## Number of invariants per order
 #
-# The isotropic oscillator in the plane keeps four quadratic forms, three of them independent.
-# Hénon and Heiles' disturbance $\varepsilon (x^2 y - y^3/3)$ takes some away, at second order only.
+# The isotropic oscillator in the plane conserves four quadratic forms, three of them independent.
+# The perturbation of Hénon and Heiles, $\varepsilon (x^2 y - y^3/3)$, removes some of them, at
+# second order.
 
 # %%
 henon_heiles = dvi.System(
@@ -116,23 +117,25 @@ henon_heiles = dvi.System(
 found = dvi.discover_invariants(
     henon_heiles, dvi.Polynomials(4), 2, h=0.1, samples=box(2, 400), representative="simplest"
 )
-print("leading parts that survive order 0, 1, 2:", found.survivors)
+print("number of leading-order terms at order 0, 1, 2:", found.survivors)
 for series in found.invariants:
     print(series.formula(4).split(" + … (")[0].split(" + ε ")[0], "+ …")
 assert found.survivors == (13, 4, 2)
 
 # %% [markdown]
-# Thirteen, because nine products of the quadratic forms are of degree four and in the basis. These
-# would need corrections of degree five, which are not in it: four are left. Two survive the second
-# order, the angular momentum and the energy, each with its corrections. Nothing is said of the
-# orders beyond: that this motion becomes chaotic says that the former is not kept at all of them.
+# There are thirteen at order 0, because nine products of the quadratic forms have degree four and
+# are in the basis. Their corrections would have degree five, which is not in the basis: four
+# remain. Two have corrections of second order, the angular momentum and the energy. This is no
+# statement about higher orders: the motion becomes chaotic, so the first one is not conserved at
+# all orders.
 
 # %% [markdown]
-# ## A trap, and how it is seen
+# ## A basis that is too small
 #
-# A basis that is too small for the truth gives no invariant, not a wrong one. Kepler's problem in
-# polynomials alone has only the angular momentum; with $1/r$ a map of second order keeps energy and
-# Laplace–Runge–Lenz vector approximately, and says how well.
+# If the basis cannot represent an invariant, the search does not find it, but does not report a
+# wrong one. For Kepler's problem and polynomials only the angular momentum is found. With $1/r$ in
+# the basis, a map of second order conserves the energy and the Laplace–Runge–Lenz vector
+# approximately, and the report says how well.
 
 # %%
 kepler = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - 1 / jnp.sqrt(q0 @ q0))
@@ -150,15 +153,15 @@ for name, basis, tolerance in [("polynomials", small, None), ("with 1/r", large,
         kepler, basis, h=0.02, samples=samples, method=dvi.Strang(), tolerance=tolerance
     )
     values = ", ".join(f"{x:.0e}" for x in kept[name].singular_values[-5:])
-    print(f"{name}: {kept[name].survivors[0]} kept; smallest singular values {values}")
+    print(f"{name}: {kept[name].survivors[0]} conserved; smallest singular values {values}")
 print(kept["polynomials"].invariants[0].formula(3))
 assert kept["polynomials"].survivors[0] == 1
 assert kept["with 1/r"].survivors[0] == 4
 
 # %% [markdown]
-# ## What next
+# ## Next steps
 #
-# - A system with a slow time, `dvi.System(..., slow_time=True)`, takes samples (qs, ps, taus): the
-#   slow oscillator in `examples/what_is_conserved.py` gives its discrete action.
-# - `dvi.find_symmetries` finds the generators, `dvi.noether_balance` says why something drifts.
-# - Where it ends: [limits](limits.ipynb).
+# - A system with a slow time, `dvi.System(..., slow_time=True)`, needs samples (qs, ps, taus): for
+#   the slow oscillator in `examples/what_is_conserved.py` the search finds the discrete action.
+# - `dvi.find_symmetries` finds generators; `dvi.noether_balance` measures the causes of a drift.
+# - Systems without adiabatic invariants: [limits](limits.ipynb).

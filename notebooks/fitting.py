@@ -1,17 +1,16 @@
 # %% [markdown]
-# # Fitting ε: how strong is the disturbance?
+# # Fit ε to data
 #
-# A disturbed system is observed, with noise. How large is $\varepsilon$, how well is that known,
-# and do the data ask for a disturbance at all? `dvi.fit` differentiates the discrete trajectory
-# itself, so that the answer belongs to the integrator that is used.
+# A perturbed system is observed with noise. How large is $\varepsilon$, what is its error, and do
+# the data require a perturbation at all? `dvi.fit` differentiates the discrete trajectory.
 #
-# The example has a known truth, an oscillator with weak friction,
+# The example has a known solution, an oscillator with weak friction,
 #
 # $$H = \tfrac12 p^2 + \tfrac12 k q^2, \qquad \dot p = -kq - \varepsilon p, \qquad
 # k = 1.3,\ \varepsilon = 0.02 ,$$
 #
-# seen 60 times within 30 units of time, with errors of 0.01. The data are made from the exact
-# solution, not from the model.
+# observed 60 times within 30 units of time, with errors of 0.01. The data are generated from the
+# exact solution, not from the model.
 
 # %%
 import jax
@@ -28,7 +27,7 @@ ts = np.linspace(0.5, 30, 60)
 
 
 def observed(seed, epsilon=EPSILON):
-    """Positions of the oscillator that is let go at q = 1, with noise."""
+    """Positions of the oscillator released at q = 1, with noise."""
     rate = np.sqrt(K - epsilon**2 / 4)
     wave = np.cos(rate * ts) + epsilon / (2 * rate) * np.sin(rate * ts)
     noise = SIGMA * np.random.default_rng(seed).normal(size=len(ts))
@@ -39,8 +38,8 @@ def observed(seed, epsilon=EPSILON):
 # %% [markdown]
 # ## The fit
 #
-# `Model` holds what is known, the last argument of `fit` what is not, with values to begin from:
-# $\varepsilon = 0$ assumes no disturbance.
+# `Model` contains the known quantities. The last argument of `fit` contains the unknown ones, with
+# their initial guesses: $\varepsilon = 0$ means no perturbation.
 
 
 # %%
@@ -61,17 +60,17 @@ for name, x, sigma in zip(found.names, found.x, found.sigma, strict=True):
 print(f"{found.status}, reduced chi² = {found.reduced_chi2:.2f}")
 
 # %% [markdown]
-# The line joins what is predicted at the times of observation.
+# The line joins the predictions at the times of observation.
 
 # %%
 axis = plot.fit_against_data(found)
 plt.show()
 
 # %% [markdown]
-# ## Are the errors honest?
+# ## Are the errors correct?
 #
-# Thirty times other noise: the estimates must scatter about the truth by what the fit says. The
-# second fit of a kind needs no compilation.
+# For thirty noise realisations the standard deviation of the estimates must agree with the error
+# that the fit reports. Only the first fit needs compilation.
 
 # %%
 epsilon_at = found.names.index("epsilon")
@@ -80,23 +79,24 @@ estimates = np.array([fit.x[epsilon_at] for fit in fits])
 sigmas = np.array([fit.sigma[epsilon_at] for fit in fits])
 pulls = (estimates - EPSILON) / sigmas
 print(
-    f"ε: mean {estimates.mean():.5f}, scatter {estimates.std(ddof=1):.5f}, said {sigmas.mean():.5f}"
+    f"ε: mean {estimates.mean():.5f}, standard deviation {estimates.std(ddof=1):.5f}, "
+    f"reported {sigmas.mean():.5f}"
 )
-print(f"(estimate − truth)/sigma: mean {pulls.mean():.2f}, scatter {pulls.std(ddof=1):.2f}")
+print(f"(estimate − true value)/sigma: mean {pulls.mean():.2f}, std {pulls.std(ddof=1):.2f}")
 
 assert all(fit.status == "converged" for fit in fits)
 assert abs(pulls.mean()) < 3 / np.sqrt(30)
 assert 0.7 < pulls.std(ddof=1) < 1.3
 
 # %% [markdown]
-# ## Do the data ask for it?
+# ## Do the data require the friction?
 #
-# The control is the same fit without friction. Its $\chi^2$ must say that it does not do. And where
-# there is none to be found, the fit must find none.
+# The control is the same fit without friction, whose $\chi^2$ must be too large. For data without
+# friction, the fit must find none.
 
 # %%
-undisturbed = {"q0": np.array([0.9]), "args": {"k": 1.2}}
-without = dvi.fit(model, observed(0), undisturbed, progress=False, check_curvature=False)
+unperturbed = {"q0": np.array([0.9]), "args": {"k": 1.2}}
+without = dvi.fit(model, observed(0), unperturbed, progress=False, check_curvature=False)
 print(f"without friction: reduced chi² = {without.reduced_chi2:.1f}")
 
 none = dvi.fit(model, observed(0, epsilon=0.0), guess, progress=False)
@@ -109,10 +109,10 @@ assert abs(none.x[epsilon_at]) < 3 * none.sigma[epsilon_at]
 # %% [markdown]
 # ## Which force is it?
 #
-# Suppose that the law is not known. `identify` fits the coefficients of many candidate terms to the
-# trajectory and removes what the data do not ask for. Candidates are the monomials
-# $q^i p^j$ up to degree 3; positions and momenta are seen now. The truth is $-\varepsilon p$ alone.
-# The criterion is $\chi^2$ and a price for every term: the smaller the better.
+# Suppose that the law is unknown. `identify` fits the coefficients of many candidate terms to the
+# trajectory and removes the terms that the data do not support. Candidates are the monomials
+# $q^i p^j$ up to degree 3; positions and momenta are observed. The true force is $-\varepsilon p$.
+# The criterion is $\chi^2$ plus a penalty for each term; smaller is better.
 
 # %%
 times = np.linspace(0.25, 30, 120)
@@ -135,7 +135,9 @@ assert abs(named.coefficients[0] + EPSILON) < 3 * named.sigma[0]
 with plot.style():
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
     left.hist(pulls, bins=np.arange(-3.5, 3.6, 0.5), color=plot.COLOURS[0], alpha=0.8)
-    left.set(xlabel="(estimate − truth)/sigma", ylabel="fits", title="Thirty noises")
+    left.set(
+        xlabel="(estimate − true value)/sigma", ylabel="fits", title="Thirty noise realisations"
+    )
     for name, fit in {"with friction": found, "without": without}.items():
         right.plot(ts, fit.whitened[0], ".-", lw=0.7, label=f"{name}: {fit.reduced_chi2:.2f}")
     right.set(xlabel="time t", ylabel="residual over sigma", title="Residuals, reduced χ²")
@@ -143,10 +145,10 @@ with plot.style():
 plt.show()
 
 # %% [markdown]
-# ## What next
+# ## Next steps
 #
-# - Real data, with errors that are not honest: [general relativity](general_relativity.ipynb) and
+# - Real data, with systematic errors: [general relativity](general_relativity.ipynb) and
 #   the [Chandler wobble](polar_motion.ipynb).
-# - `bounds`, `priors`, losses against outliers, several arcs, `MultipleShooting` for chaotic ones.
-# - `dvi.NetworkForce`: a potential and a damping by networks, where no library of terms is at hand.
-# - `dvi.sample`: the whole distribution in place of a $\pm$.
+# - `bounds`, `priors`, losses for outliers, several arcs, `MultipleShooting` for chaotic arcs.
+# - `dvi.NetworkForce`: a potential and a damping given by networks.
+# - `dvi.sample`: the posterior distribution in place of a $\pm$.

@@ -1,17 +1,17 @@
 # %% [markdown]
 # # General relativity from the ephemeris
 #
-# Sun and planets move by Newton's law, and a disturbance $\varepsilon$ times the Sun's relativity
-# is added,
+# The Sun and the planets move according to Newton's law, with a perturbing force: $\varepsilon$
+# times the relativity of the Sun,
 #
 # $$\dot p = -\frac{\partial H}{\partial q} + \varepsilon\, W_{\rm PN}(q, p).$$
 #
-# How large an $\varepsilon$ do the positions of Mercury in JPL's ephemeris DE421 ask for? DE421 is
-# itself an integration with relativity, fitted to observations: what is asked is whether its
-# relativity is found again, as $\varepsilon = 1$. The fit is not told: it begins at 0.
+# Which $\varepsilon$ fits the positions of Mercury in JPL's ephemeris DE421? DE421 is itself an
+# integration with relativity, fitted to observations, so the expected result is
+# $\varepsilon = 1$. The initial guess of the fit is 0.
 #
-# Needs the ephemeris: `pip install "dvi-jax[ephemeris]"`. As a command, with pictures of what is
-# left: `python examples/general_relativity.py`.
+# The notebook needs the ephemeris: `pip install "dvi-jax[ephemeris]"`. A program that also draws
+# the residuals is `python examples/general_relativity.py`.
 
 # %%
 import jax
@@ -32,8 +32,8 @@ YEARS = 5  # a century takes minutes, and is in docs/general-relativity.md
 # %% [markdown]
 # ## The data
 #
-# Heliocentric positions of Mercury every ten days from 1900 on. No errors are given: what model and
-# ephemeris differ by is found from the residuals.
+# Heliocentric positions of Mercury every ten days from 1900 on. No errors are given: the size of
+# the differences between model and ephemeris is estimated from the residuals.
 
 # %%
 START, MERCURY = julian_date("1900-01-01"), 1
@@ -51,9 +51,9 @@ print(len(days), "positions")
 # %% [markdown]
 # ## The model
 #
-# `post_newtonian_force` is the disturbance $W$, and $\varepsilon$ its strength. All bodies start
-# where the ephemeris has them; what Mercury's start is to be moved by is fitted with $\varepsilon$,
-# in au and au/day.
+# `post_newtonian_force` is the perturbing force $W$, and $\varepsilon$ its strength. The initial
+# states are those of the ephemeris; corrections of Mercury's initial state, in au and au/day, are
+# fitted together with $\varepsilon$.
 
 # %%
 system = dvi.System(hamiltonian_with_oblateness, force=post_newtonian_force)
@@ -91,7 +91,7 @@ def fitted(model, params):
 # %% [markdown]
 # ## Two fits: Newton alone, and with relativity
 #
-# Both have the Sun's oblateness, $J_2 = 2 \times 10^{-7}$, which turns the perihelion, too.
+# Both include the oblateness of the Sun, $J_2 = 2 \times 10^{-7}$, which also turns the perihelion.
 
 # %%
 still = np.zeros(6)
@@ -111,16 +111,17 @@ for name, fit in fits.items():
 fit = fits["with relativity"]
 epsilon, formal = fit.x[0], fit.sigma[0]
 lag = float(np.mean(fit.statistics()["lag_one"]))
-print(f"ε = {epsilon:.5f}, formal ± {formal:.0e}; neighbouring residuals correlate by {lag:.2f}")
+print(f"ε = {epsilon:.5f}, formal ± {formal:.0e}; correlation of neighbouring residuals {lag:.2f}")
 
 assert abs(epsilon - 1) < 1e-4
 assert rms(fits["Newton alone"]) > 1000 * rms(fit)  # the control: the data do ask for it
 assert lag > 0.5  # so that the formal error is much too small
 
 # %% [markdown]
-# The ± is formal, as if residuals were independent. They are not: what is left are slow waves, so
-# that the true error of $\varepsilon$ is many times larger. Leave the oblate Sun out, `"J2": 0.0`,
-# and its share of the turn goes into $\varepsilon$: 1.0006, over a century as well.
+# The error (±) is formal and assumes independent residuals. The residuals are slow waves, so the
+# true error of $\varepsilon$ is many times larger. Without the oblateness of the Sun, `"J2": 0.0`,
+# its contribution to the rotation of the perihelion is included in $\varepsilon$: 1.0006, also over
+# a century.
 
 # %%
 with plot.style():
@@ -128,12 +129,13 @@ with plot.style():
     for (name, fit), mark in zip(fits.items(), "os", strict=True):
         off = np.linalg.norm(fit.residuals[0], axis=1) * AU_IN_KM * 1e3
         axis.semilogy(1900 + days / 365.25, off, mark, ms=2, label=f"{name}: {rms(fit):.2g} m")
-    axis.set(xlabel="year", ylabel="distance from DE421 [m]", title="What each fit leaves")
+    axis.set(xlabel="year", ylabel="distance from DE421 [m]", title="Residuals of the fits")
     figure.legend(loc="outside lower center", ncols=2, markerscale=3)
 plt.show()
 
 # %% [markdown]
-# ## What next
+# ## Next steps
 #
-# - `YEARS = 100`, and what is left then: `docs/general-relativity.md`.
-# - Another body, another disturbance: `dvi_jax.systems.relativity` has the Hamiltonian form, too.
+# - `YEARS = 100`, and its residuals: `docs/general-relativity.md`.
+# - Another body, or another perturbation: `dvi_jax.systems.relativity` also has the Hamiltonian
+#   form.

@@ -1,13 +1,12 @@
 # %% [markdown]
 # # GPU: devices, batches, precision
 #
-# How does one put a batch of trajectories on a GPU, and what does single precision cost, at which a
-# GPU is fastest? This notebook runs on whatever device JAX finds. The outputs that are kept here
-# are those of a CPU.
+# How do you run a batch of trajectories on a GPU, and which accuracy is lost in single precision?
+# This notebook runs on any device that JAX finds. The stored outputs are those of a CPU.
 #
-# **What is known and what is not.** On a GPU a batch is compiled by XLA as any JAX program: a scan
-# over the steps under `vmap`. The package has not been run on a GPU, and no speed on one has been
-# measured; see `docs/gpu.md`.
+# **Not tested on a GPU.** On a GPU XLA compiles a batch as any JAX program: a scan over the steps
+# under `vmap`. The package has not been run on a GPU, and its speed there has not been measured;
+# see `docs/gpu.md`.
 
 # %%
 import jax
@@ -24,15 +23,15 @@ device = jax.devices()[0]
 print("platform:", device.platform)
 
 # %% [markdown]
-# `JAX_PLATFORMS=cpu` or `cuda` in the environment chooses before Python starts; for an NVIDIA GPU
-# install `dvi-jax[cuda12]`. Within a program `jax.default_device` chooses for a block, and an array
-# that was put somewhere with `jax.device_put` is computed with there.
+# `JAX_PLATFORMS=cpu` or `cuda` in the environment selects the device before Python starts. For an
+# NVIDIA GPU install `dvi-jax[cuda12]`. In a program, `jax.default_device` selects the device for a
+# block, and computations with an array run on the device of the array (`jax.device_put`).
 #
 # ## A batch
 #
-# One trajectory alone is a chain of small operations that waits for itself; a GPU wants many. So
-# the function of one trajectory is mapped over starts: `vmap`, then `jit`. `Save(final=True)` and
-# observables that are reduced on the way keep memory from growing with the number of steps.
+# One trajectory is a sequence of small dependent operations; a GPU needs many trajectories.
+# Therefore the function of one trajectory is mapped over initial conditions: `vmap`, then `jit`.
+# With `Save(final=True)` and reductions, memory does not grow with the number of steps.
 
 
 # %%
@@ -71,9 +70,8 @@ print(
 assert float(drift.max()) < 1e-12
 
 # %% [markdown]
-# Several devices: `dvi.over_devices(jax.vmap(one))` divides the lanes between them, `dvi.sweep`
-# hands its tasks to all of them and loses nothing when one is lost. With one device the result is
-# the same, bit by bit.
+# Several devices: `dvi.over_devices(jax.vmap(one))` divides the trajectories between them;
+# `dvi.sweep` distributes tasks to all of them. With one device the result is identical bit for bit.
 
 # %%
 divided = jax.jit(dvi.over_devices(jax.vmap(one)))
@@ -81,29 +79,29 @@ assert np.array_equal(divided(q0, p0)[0], q)
 print(len(jax.devices()), "device")
 
 # %% [markdown]
-# ## Two forms of the arithmetic
+# ## Two ways to compile
 #
-# `Layout()` chooses by itself: arrays as they were written on a GPU, and on a CPU components (every
-# array element a number of its own) for batches of 100 000 trajectories × steps or more. The
-# numbers are the same to round-off. Eight trajectories, twenty steps:
+# With `Layout()`, the default, a run is compiled to machine code on a CPU, and by XLA on a GPU.
+# `Layout(form="arrays")` uses XLA everywhere. The results agree to round-off. Eight trajectories,
+# twenty steps:
 
 # %%
 few = q0[:8], p0[:8]
 numbers = {}
-for form in ("components", "arrays"):
+for form in ("auto", "arrays"):
     layout = dvi.Layout(form=form, width=4)
     run = jax.jit(jax.vmap(lambda q, p, layout=layout: one(q, p, layout, num_steps=20)))
     numbers[form] = np.asarray(run(*few)[0])
-worst = np.abs(numbers["components"] - numbers["arrays"]).max()
-print(f"components and arrays agree to {worst:.0e}")
+worst = np.abs(numbers["auto"] - numbers["arrays"]).max()
+print(f"machine code and XLA agree to {worst:.0e}")
 assert worst < 1e-14
 
 # %% [markdown]
-# ## What single precision costs
+# ## Single precision
 #
-# GPUs for graphics compute in float32 many times faster than in float64. A float64 array with x64
-# off is refused; float32 is taken when it is asked for, by the type of the start. The angular
-# momentum is exact for this map, so that all of its drift is round-off: how does it grow?
+# Graphics GPUs compute in float32 many times faster than in float64. float64 input with x64
+# switched off raises an error; float32 is used if the initial state has this type. This map
+# conserves the angular momentum exactly, so its drift is round-off. How does it grow?
 
 # %%
 marks = np.unique(np.geomspace(10, 200_000, 40).astype(int))
@@ -152,12 +150,12 @@ with plot.style():
 plt.show()
 
 # %% [markdown]
-# In float32 the drift is that of float64 times the ratio of the units in the last place, some
-# $5 \times 10^8$. `Compensated()` carries what a sum loses, for a few operations more. After
-# 200 000 steps plain float32 has lost $2 \times 10^{-5}$ of an invariant that is exact: an
-# adiabatic one that drifts by less cannot be measured with it, which is why the package asks for
-# float64 unless told otherwise.
+# In float32 the drift is larger by the ratio of the rounding units, about $5 \times 10^8$.
+# `Compensated()` adds the rounding errors of sums back, for a few operations more. After 200 000
+# steps an exact invariant has changed by $2 \times 10^{-5}$ in plain float32. An adiabatic
+# invariant with a smaller drift cannot be measured with it; therefore the package requires float64
+# by default.
 #
-# ## What next
+# ## Next steps
 #
-# - On a device: run this notebook there, and compare the printed numbers with those kept here.
+# - Run this notebook on a GPU, and compare the printed numbers with those stored here.

@@ -1,18 +1,18 @@
 # %% [markdown]
-# # The magnetic moment: why a magnetic bottle holds
+# # The magnetic moment in a magnetic mirror
 #
-# A charged particle gyrates about a field line. Where the field grows along the line, it is turned
-# back, as if it had met a mirror: the aurora and fusion machines live by that. The reason is an
+# A charged particle gyrates around a field line. If the field increases along the line, the
+# particle is reflected, for example in the Earth's field and in mirror machines. The reason is an
 # adiabatic invariant, the magnetic moment
 #
 # $$\mu_0 = \frac{m v_\perp^2}{2 B},$$
 #
-# with the gyroradius over the length of the field as the small number. Three questions: how well is
-# $\mu_0$ kept, can it be corrected, and does the particle turn where $\mu$ says?
+# with the small parameter gyroradius / field scale length. Three questions: how well is $\mu_0$
+# conserved, can it be corrected, and is the particle reflected where $\mu$ predicts?
 #
 # The system is `systems.magnetic_mirror`, $H = |p - eA(q)|^2/2m$ with
-# $B = B_0 (1 + z^2/\ell^2)$ on the axis. Gyroradius and gyrofrequency are 1 in the middle, so that
-# $1/\ell$ is the small number. The kinetic energy mixes $q$ and $p$: each step is implicit.
+# $B = B_0 (1 + z^2/\ell^2)$ on the axis. Gyroradius and gyrofrequency are 1 at the centre, so
+# $1/\ell$ is the small parameter. The kinetic energy mixes $q$ and $p$: each step is implicit.
 
 # %%
 import jax
@@ -28,8 +28,8 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## The motion
 #
-# The guiding centre is put at $\ell/2$ off the axis, the time is some two bounces, the method
-# Gauss' of order 4.
+# The guiding centre is at a distance $\ell/2$ from the axis, the run covers about two bounces, and
+# the method is that of Gauss of order 4.
 
 
 # %%
@@ -58,25 +58,27 @@ with plot.style():
     for name, key in {"μ₀": "magnetic_moment", "μ₀ + μ₁": "corrected_moment"}.items():
         values = np.asarray(sol.observed[key])
         right.plot(sol.ts[1:], values / values[0], lw=0.8, label=name)
-    right.set(xlabel="time [gyrofrequency⁻¹]", ylabel="over its first value", title="The moment")
+    right.set(
+        xlabel="time [gyrofrequency⁻¹]", ylabel="value / initial value", title="Magnetic moment"
+    )
     right.set_ylim(None, 1.009)
     right.legend(loc="upper right", ncols=2)
 plt.show()
 
 # %% [markdown]
-# ## How well
+# ## Conservation
 #
-# Two things are exact and say that the integration is good: the canonical angular momentum, by the
-# symmetry of the field, which the method keeps to round-off; and the energy, to the method's order.
-# The moment wavers with the gyration. With its first correction $\mu_1$ (for fields with
-# $b \cdot (\nabla \times b) = 0$) what wavers is of second order, and so is the *bounce action*
+# Two quantities check the integration: the method conserves the canonical angular momentum, which
+# follows from the symmetry of the field, to round-off, and the energy to the order of the method.
+# The moment oscillates at the gyrofrequency. With its first correction $\mu_1$ (for fields with
+# $b \cdot (\nabla \times b) = 0$) the amplitude is of second order. So is the *bounce action*
 # $J = \oint p_\parallel\, ds$ along the field line, the second adiabatic invariant.
 
 # %%
 keys = ["magnetic_moment", "corrected_moment", "bounce_action"]
 table = np.array([[wavers(run.observed[key]) for run in runs] for key in keys])
 slopes = [-np.polyfit(np.log(lengths), np.log(row), 1)[0] for row in table]
-print(f"{'range over mean, ℓ =':22}", *(f"{length:9.0f}" for length in lengths), "   power of 1/ℓ")
+print(f"{'range / mean, ℓ =':22}", *(f"{length:9.0f}" for length in lengths), "   power of 1/ℓ")
 for key, row, slope in zip(keys, table, slopes, strict=True):
     print(f"{key:22}", *(f"{x:9.2e}" for x in row), f"{slope:12.2f}")
 exact = max(wavers(run.observed["canonical_angular_momentum"]) for run in runs)
@@ -90,10 +92,10 @@ assert exact < 1e-13
 assert energy < 2e-6
 
 # %% [markdown]
-# ## Where it turns
+# ## The mirror point
 #
-# At the mirror point all of the energy is in the gyration, $E = \mu B$. The largest field along the
-# orbit, times $\mu$, must be $E$.
+# At the mirror point the whole energy is in the gyration, $E = \mu B$. The largest field along the
+# orbit, multiplied by $\mu$, must be $E$.
 
 
 # %%
@@ -110,15 +112,14 @@ def field_at_turn(run, length):
 for run, length in zip(runs, lengths, strict=True):
     predicted = np.mean(run.observed["energy"]) / np.mean(run.observed["corrected_moment"])
     seen = field_at_turn(run, length)
-    print(f"ℓ = {length:3.0f}: turns at B = {seen:.3f}, predicted E/μ = {predicted:.3f}")
+    print(f"ℓ = {length:3.0f}: reflected at B = {seen:.3f}, predicted E/μ = {predicted:.3f}")
     assert abs(seen / predicted - 1) < 1 / length
 
 # %% [markdown]
-# ## What is not kept
+# ## Controls
 #
-# Two controls. The energy of the gyration alone, $m v_\perp^2/2 = \mu B$, changes by as much as the
-# field does, however small $1/\ell$ is. And where the field changes within a gyroradius, $\mu$ is
-# no invariant.
+# The energy of the gyration alone, $m v_\perp^2/2 = \mu B$, changes as much as the field, for any
+# $1/\ell$. And if the field changes within a gyroradius, $\mu$ is not an invariant.
 
 # %%
 gyration = []
@@ -128,8 +129,8 @@ for run, length in zip(runs, lengths, strict=True):
     gyration.append(wavers(np.asarray(run.observed["magnetic_moment"]) * B))
 slope = -np.polyfit(np.log(lengths), np.log(gyration), 1)[0]
 short = bounces(2.0)
-print(f"energy of the gyration: range over mean {np.round(gyration, 2)}, (1/ℓ)^{slope:.2f}")
-print(f"ℓ = 2: the moment's range over its mean is {wavers(short.observed['magnetic_moment']):.2f}")
+print(f"energy of the gyration: range / mean {np.round(gyration, 2)}, (1/ℓ)^{slope:.2f}")
+print(f"ℓ = 2: range / mean of the moment is {wavers(short.observed['magnetic_moment']):.2f}")
 assert abs(slope) < 0.1
 assert wavers(short.observed["magnetic_moment"]) > 0.5
 
@@ -139,16 +140,16 @@ with plot.style():
     names = ["μ₀", "μ₀ + μ₁", "bounce action"]
     for i, (name, row, slope) in enumerate(zip(names, table, slopes, strict=True)):
         axis.loglog(1 / lengths, row, "os^"[i] + "-", label=f"{name}: slope {slope:.2f}")
-    axis.loglog(1 / lengths, gyration, "x--", color="0.5", label="m v⊥²/2: no invariant")
-    axis.set(xlabel="gyroradius over ℓ", ylabel="range over mean")
-    axis.set_title("How much each wavers")
+    axis.loglog(1 / lengths, gyration, "x--", color="0.5", label="m v⊥²/2: not an invariant")
+    axis.set(xlabel="gyroradius / ℓ", ylabel="range / mean")
+    axis.set_title("Amplitude of the oscillation")
     figure.legend(loc="outside lower center", ncols=2)
 plt.show()
 
 # %% [markdown]
-# ## What next
+# ## Next steps
 #
 # - `systems.dipole_field`: the same in the Earth's field, Störmer's problem.
-# - `dvi.discover_invariants` finds $\mu$ without being told, in a field with a weak gradient:
-#   `magnetic_moment()` in `examples/what_is_conserved.py`.
-# - How $\mu$ is lost for good when $\ell$ is not large: give many starts to `dvi.sweep` and map it.
+# - `dvi.discover_invariants` finds $\mu$ in a field with a weak gradient: `magnetic_moment()` in
+#   `examples/what_is_conserved.py`.
+# - For small $\ell$, $\mu$ is lost: use `dvi.sweep` with many initial conditions to map where.

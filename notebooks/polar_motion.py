@@ -1,14 +1,14 @@
 # %% [markdown]
 # # The Chandler wobble from measured poles
 #
-# The Earth's pole of rotation goes about the crust in some 433 days, is damped, and driven once a
-# year. In $q = x,$ $p = y$ of the pole that is a damped and driven oscillator, whose disturbance
-# has the strength $\varepsilon = 1$. Four arcs of eight years share period, damping and driving;
-# each has a start of its own. How long is the period, how strong the damping, and how well is
-# either known?
+# The Earth's pole of rotation moves around a mean position in about 433 days. The motion is damped,
+# and driven with a period of one year. In $q = x,$ $p = y$ of the pole this is a damped and driven
+# oscillator, whose perturbation has the strength $\varepsilon = 1$. Four arcs of eight years share
+# period, damping and driving; each has its own initial state. What are the period and the damping,
+# and what are their errors?
 #
-# Needs the extra `ephemeris`, which brings the measured poles: `pip install "dvi-jax[ephemeris]"`.
-# As a command: `python examples/polar_motion.py`.
+# The notebook needs the extra `ephemeris`, which contains the measured poles: `pip install
+# "dvi-jax[ephemeris]"`. As a command: `python examples/polar_motion.py`.
 
 # %%
 import jax
@@ -27,8 +27,8 @@ YEARS = 8  # length of an arc
 # %% [markdown]
 # ## The data
 #
-# Published errors are far below what the model leaves out (atmosphere, ocean), so none are given
-# and all values weigh alike.
+# Published errors are much smaller than the effects that the model neglects (atmosphere, ocean).
+# Therefore no errors are given, and all values have the same weight.
 
 # %%
 pole = read_polar_motion()
@@ -42,8 +42,8 @@ print(len(arcs), "arcs,", sum(arc.values.size for arc in arcs), "values")
 # %% [markdown]
 # ## The fit
 #
-# With $\varepsilon = 1$ the disturbance is the Earth's. Parameters under `args` are common; `q0`
-# and `p0` have a row for each arc.
+# With $\varepsilon = 1$ the perturbation is that of the Earth. Parameters in `args` are common to
+# all arcs; `q0` and `p0` have one row per arc.
 
 # %%
 problem = polar_motion()
@@ -58,15 +58,15 @@ def fitted(arcs, args):
 
 fit = fitted(arcs, problem.args)
 lag = fit.statistics()["lag_one"]
-print(f"{fit.status}; {1e3 * fit.rms:.2f} mas rms; neighbouring residuals correlate by", end=" ")
+print(f"{fit.status}; {1e3 * fit.rms:.2f} mas rms; correlation of neighbouring residuals", end=" ")
 print(f"{np.mean(lag):.2f}")
 assert fit.rms < 0.05  # arcsec
 
 # %% [markdown]
-# ## How well is it known?
+# ## Errors
 #
-# The formal errors take residuals for white noise. They are not: noise excites the wobble itself,
-# and neighbours are alike for months. Leaving out each arc in turn gives honest errors.
+# The formal errors assume white noise. The noise excites the wobble itself, so residuals are
+# correlated over months. Leaving out one arc at a time (jackknife) gives realistic errors.
 
 # %%
 at = [fit.names.index(name) for name in ("args.period", "args.inverse_Q")]
@@ -85,9 +85,9 @@ assert np.all(error > 8 * fit.sigma[at])  # formal errors are far too small
 assert abs(inverse_Q) < 2 * error[1]  # 1/Q is not told from 0
 
 # %% [markdown]
-# Grey: measured; blue, upper panels: fitted; below, x in blue and y in orange. The period agrees
-# with the literature, 433.0 ± 1.1 days. 1/Q is less than its error from zero: these data do not
-# determine Q.
+# Grey: measured. Blue in the upper panels: fitted. Lower panel: x in blue, y in orange. The period
+# agrees with the literature, 433.0 ± 1.1 days. 1/Q differs from zero by less than its error: these
+# data do not determine Q.
 
 # %%
 with plot.style():
@@ -100,12 +100,11 @@ with plot.style():
             off = 1e3 * (seen - found)[:, i]
             axes[2].plot(2000 + t / YEAR, off, lw=0.8, color=plot.COLOURS[i])
     axes[0].set_title("The pole, measured and fitted")
-    axes[2].set(xlabel="year", ylabel="residuals [mas]", title="What is left of x and y")
+    axes[2].set(xlabel="year", ylabel="residuals [mas]", title="Residuals of x and y")
 plt.show()
 
 # %% [markdown]
-# ## What next
+# ## Next steps
 #
-# - Longer or shorter arcs, `YEARS = 4`: what becomes of the residuals, and of the jackknife's
-#   errors?
-# - The step does not matter here, the noise does: try `h=10.0`.
+# - Longer or shorter arcs, `YEARS = 4`: how do the residuals and the jackknife errors change?
+# - The error of the step is smaller than the noise: try `h=10.0`.

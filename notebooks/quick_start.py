@@ -1,16 +1,16 @@
 # %% [markdown]
-# # Quick start: an adiabatic invariant in a dozen lines, verified
+# # Quick start: find an adiabatic invariant and verify it
 #
-# A mass on a spring is disturbed by a weak force that is not linear,
+# A mass on a spring is perturbed by a weak nonlinear force,
 #
 # $$H = \tfrac12\,(p^2 + q^2), \qquad \dot p = -q - \varepsilon q^3 .$$
 #
-# Its energy $H$ is no longer kept: it changes by $O(\varepsilon)$. Is there something else, near
-# the energy, that changes less? Such a quantity, $I = I_0 + \varepsilon I_1,$ whose change stays
-# $O(\varepsilon^2)$ over a long time, is an *adiabatic invariant of first order*.
+# Its energy $H$ is not conserved: it changes by $O(\varepsilon)$. Is there a quantity close to the
+# energy that changes less? A quantity $I = I_0 + \varepsilon I_1$ whose change stays
+# $O(\varepsilon^2)$ over a long time is an *adiabatic invariant of first order*.
 #
-# `dvi_jax` iterates a map, the variational integrator, in place of the differential equation. So
-# the question is asked of the map: what does *it* keep, at the step size that is used?
+# `dvi_jax` iterates a map, the variational integrator, in place of the differential equation. The
+# question is therefore which quantities the *map* conserves, at the step that is used.
 
 # %%
 import jax
@@ -24,12 +24,12 @@ jax.config.update("jax_enable_x64", True)  # invariants need double precision
 
 
 # %% [markdown]
-# ## A dozen lines
+# ## Define, discover, verify
 #
-# A discrete Hamiltonian and a force, as plain functions of one step: `q0` is the position at its
-# beginning, `p1` the momentum at its end. `discover_invariants` looks for the series in the
-# polynomials up to degree 8, from random samples; `drift_order` measures the power of
-# $\varepsilon$ in its largest change along 5000 steps.
+# The discrete Hamiltonian and the force are functions of one step: `q0` is the position at its
+# beginning, `p1` the momentum at its end. `discover_invariants` searches the polynomials up to
+# degree 8 with random samples. `drift_order` measures how the largest change along 5000 steps
+# scales with $\varepsilon$.
 
 
 # %%
@@ -53,23 +53,23 @@ print("I =", invariant.formula(4))
 print(order)
 
 # %% [markdown]
-# That is the answer: $I_0 = (q^2 - h\,qp + p^2)/2$, the energy *of the map* at $h = 0.1$, and a
-# correction of fourth degree, and the drift goes with $\varepsilon^2$.
+# The result is $I_0 = (q^2 - h\,qp + p^2)/2$, the energy *of the map* at $h = 0.1$, with a
+# correction of degree four. The drift scales as $\varepsilon^2$.
 
 # %%
 assert abs(order.slope - 2) < 0.02
 
 
 # %% [markdown]
-# ## What does not pass
+# ## Controls
 #
-# A check that everything passes is none. The energy itself must fail, for two reasons: the force
-# disturbs it at first order, and the map does not keep it even at $\varepsilon = 0$. And $I_0$
-# without its correction must fail for the first reason alone.
+# A check is meaningful only if something fails it. The energy must fail for two reasons: the force
+# changes it at first order, and the map does not conserve it even at $\varepsilon = 0$. $I_0$
+# without its correction must fail for the first reason only.
 
 
 # %%
-def energy(t0, t1, q0, p0, q1, p1, args):  # observables see one step, both ends of it
+def energy(t0, t1, q0, p0, q1, p1, args):  # an observable is a function of one step
     return (p1 @ p1 + q1 @ q1) / 2
 
 
@@ -86,7 +86,7 @@ orders = {
 for name, measured in orders.items():
     print(f"{name}: at ε = 0 it changes by {measured.floor:.1e}, slope {measured.slope:.3f}")
 
-assert np.isnan(orders["energy"].slope)  # the mesh hides what ε does
+assert np.isnan(orders["energy"].slope)  # the discretisation hides the effect of ε
 assert abs(orders["I₀ alone"].slope - 1) < 0.05
 
 # %%
@@ -94,10 +94,10 @@ axis = plot.drift_orders(orders, promised=[None, 1, 2], title="Largest change in
 plt.show()
 
 # %% [markdown]
-# Hollow points do not stand above what the mesh does at $\varepsilon = 0$; nothing about
-# $\varepsilon$ can be read from them, so no slope is given for the energy.
+# Open symbols are at the level of the drift at $\varepsilon = 0$. They contain no information about
+# $\varepsilon$, so no slope is given for the energy.
 #
-# The same in time, at $\varepsilon = 0.1$:
+# The same quantities against time, for $\varepsilon = 0.1$:
 
 # %%
 sol = dvi.integrate(
@@ -114,10 +114,10 @@ with plot.style():
 plt.show()
 
 # %% [markdown]
-# ## What next
+# ## Next steps
 #
-# - Ask for `order=2` or 3: the slope becomes 3 or 4 ([discovering
+# - Use `order=2` or 3: the slope becomes 3 or 4 ([discovering
 #   invariants](discovering_invariants.ipynb)).
-# - Put your own $H$ and force in ([your own system](your_own_system.ipynb)).
-# - Take a force with friction, `-p1`: no adiabatic invariant exists, and the report says why
+# - Use your own $H$ and force ([your own system](your_own_system.ipynb)).
+# - Use a force with friction, `-p1`: no adiabatic invariant exists, and the report gives the reason
 #   ([limits](limits.ipynb)).

@@ -1,13 +1,12 @@
 # %% [markdown]
 # # Sweeps: many trajectories at once
 #
-# How does the drift of an invariant depend on the disturbance, and on where the orbit starts? One
-# trajectory does not tell. `dvi.sweep` runs a whole grid, labels the results, gives a status to
-# each trajectory and keeps in a store what is done.
+# How does the drift of an invariant depend on the perturbation and on the initial condition? This
+# needs many trajectories. `dvi.sweep` runs a whole grid, labels the results, gives each trajectory
+# a status and stores finished results on disk.
 #
-# The system is Kepler's, in the plane, disturbed by the central force $-\varepsilon q$. At which
-# power of $\varepsilon$ do energy $H$ and angular momentum $L$ drift, on the mesh, and which orbits
-# fail?
+# The system is Kepler's problem in the plane, perturbed by the central force $-\varepsilon q$. With
+# which power of $\varepsilon$ do energy $H$ and angular momentum $L$ drift, and which orbits fail?
 
 # %%
 import tempfile
@@ -23,14 +22,14 @@ from dvi_jax import plot, systems
 jax.config.update("jax_enable_x64", True)
 
 kepler = systems.kepler()
-folder = tempfile.TemporaryDirectory()  # give a lasting place to results that matter
+folder = tempfile.TemporaryDirectory()  # for results that you need later, use a permanent folder
 
 # %% [markdown]
 # ## A grid
 #
-# Wherever `integrate` takes a number, `sweep` takes an axis: here 20 strengths and 32 momenta at
-# the start, 640 trajectories of Gauss' method of order 6. Of 800 steps each only two numbers are
-# kept: the largest drifts, found on the way.
+# Any number that `integrate` accepts can be an axis of `sweep`: here 20 strengths and 32 initial
+# momenta, 640 trajectories with Gauss' method of order 6. Of the 800 steps of each trajectory only
+# two numbers are stored: the largest drifts, computed during the run.
 
 # %%
 asked = {
@@ -41,7 +40,7 @@ asked = {
     "num_steps": 800,
     "args": kepler.args,
     "method": dvi.GaussLegendre(3),
-    "progress": False,  # True for a bar
+    "progress": False,  # True shows a progress bar
     "observe": {
         "energy_drift": dvi.MaxDrift(kepler.observables["energy"]),
         "momentum_drift": dvi.MaxDrift(kepler.observables["angular_momentum"]),
@@ -53,37 +52,39 @@ data = result.to_xarray()
 print(dict(data.sizes), result.status_counts())
 
 # %% [markdown]
-# A trajectory that fails costs its own result and no other: the momenta near $-0.25$ fall so close
-# to the centre that the equations of a step of this size have no solution to be found. They are
-# counted, hatched in the picture, and left out where statistics are made.
+# A failed trajectory affects only its own entry: orbits with momenta close to $-0.25$ come so close
+# to the centre that the equations of a step of this size are not solved. They are counted, hatched
+# in the plot, and excluded from statistics.
 
 # %%
-data.p_x.attrs["long_name"] = "momentum p$_x$ at the start"
+data.p_x.attrs["long_name"] = "initial momentum p$_x$"
 data.energy_drift.attrs["long_name"] = "largest drift of the energy"
 with plot.style():
-    plot.sweep_map(data.energy_drift, x="epsilon", limits=(1e-5, 1)).set_title("Drift")
+    plot.sweep_map(data.energy_drift, x="epsilon", limits=(1e-5, 1)).set_title(
+        "Drift of the energy"
+    )
     plt.show()
     order_of = plot.slope_map(data.energy_drift, "epsilon", x="epsilon", limits=(0, 2))
-    order_of.set_title("Its order in ε")
+    order_of.set_title("Order of the drift in ε")
     plt.show()
-    plot.failure_map(data).set_title("How runs end")
+    plot.failure_map(data).set_title("Status of the runs")
     plt.show()
 
 # %% [markdown]
 # ## Numbers
 #
-# The energy drifts with the first power of $\varepsilon$ as long as that is small. Where the orbit
-# falls close to the centre the mesh does more than $\varepsilon$: the local slope is noise, the
-# checkerboard in the picture, and a line through the median has a slope near 0. The angular
-# momentum must not drift at all: the force has no torque, and a symplectic Runge–Kutta method keeps
-# quadratic invariants.
+# The drift of the energy is proportional to $\varepsilon$ for small $\varepsilon$. For orbits that
+# come close to the centre the error of the discretisation is larger than the effect of
+# $\varepsilon$: the local slope is noise, the checkerboard in the plot, and a line through the
+# median has a slope close to 0. The angular momentum must not drift at all: the force has no
+# torque, and a symplectic Runge–Kutta method conserves quadratic invariants.
 
 # %%
 good = data.where(data.status == 0)
 
 
 def order(drift, epsilons):
-    """Power of ε in the median over starts."""
+    """Power of ε in the median over initial momenta."""
     return np.polyfit(np.log(epsilons), np.log(drift.median("p_x")), 1)[0]
 
 
@@ -102,12 +103,11 @@ assert largest < 1e-11
 assert 0 < share < 0.2
 
 # %% [markdown]
-# ## Done is done
+# ## Repeat and resume
 #
-# The store belongs to this sweep. The same call finds everything done, and computes nothing; had it
-# been killed half-way, it would go on with what is missing. So it gives the same bits. And a single
-# trajectory of the sweep is the one that `integrate` gives by itself: another program, which agrees
-# to round-off.
+# The store belongs to this sweep. The same call finds all results and computes nothing; after an
+# interruption it would compute the missing ones. The results are identical bit for bit. A single
+# trajectory of the sweep agrees to round-off with that of `integrate`, which is another program.
 
 # %%
 again = dvi.sweep(kepler.system, **asked, store=store)
@@ -124,7 +124,7 @@ print(f"in the sweep {in_sweep:.12f}, alone {float(alone.observed['energy_drift'
 assert abs(in_sweep / float(alone.observed["energy_drift"]) - 1) < 1e-10
 
 # %% [markdown]
-# The control: another sweep must not be taken for it. One number is changed, and the store refuses.
+# Control: the store of another sweep must be rejected. One number is changed:
 
 # %%
 try:
@@ -132,16 +132,16 @@ try:
 except dvi.StoreMismatch as refusal:
     print(*str(refusal).splitlines()[1:2])
 else:
-    raise AssertionError("a sweep with another step was taken for the same")
+    raise AssertionError("a sweep with another step was accepted")
 
 # %%
 folder.cleanup()
 
 # %% [markdown]
-# ## What next
+# ## Next steps
 #
-# - `start=dvi.starts.Halton(count, low, high)`: starts that are made on the device, $10^{12}$ of
-#   them need no memory.
-# - `dvi-jax sweep examples/sweep.toml`: the same from a file.
-# - `dvi.sweep_cost(...)`: what a large one will take, measured on one task.
-# - Many machines: `client=` takes a Dask cluster.
+# - `start=dvi.starts.Halton(count, low, high)`: initial conditions that are generated on the
+#   device; $10^{12}$ of them need no memory.
+# - `dvi-jax sweep examples/sweep.toml`: a sweep from a file.
+# - `dvi.sweep_cost(...)`: time and memory of a large sweep, measured on one task.
+# - Many machines: pass a Dask client as `client=`.

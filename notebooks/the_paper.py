@@ -1,16 +1,16 @@
 # %% [markdown]
-# # The paper: what it claims, and what is measured
+# # The paper: claims and measurements
 #
 # The package grew from "Preservation of adiabatic invariants for disturbed Hamiltonian systems
-# under variational discretization". Its discrete equations, mended where signs slipped, are
+# under variational discretization". Its discrete equations, with corrected signs, are
 #
 # $$q_1 = q_0 + h\,\frac{\partial H_D}{\partial p_1}, \qquad
 # p_1 = p_0 - h\,\frac{\partial H_D}{\partial q_0} + h\,\varepsilon W, \tag{12, 13}$$
 #
-# and from a generator of symmetry $(\xi_0, \xi)$ with gauge $G$ they lead to the adiabatic
-# invariant $I_z = \sum_{m \le z} \varepsilon^m (\xi_m \cdot p - \xi_{0m} E^- + G_m)$ of (29). Do
-# the numbers of its examples come out? This notebook measures five claims with public calls;
-# `dvi-jax paper` measures all, and writes a table of verdicts.
+# A generator of a symmetry $(\xi_0, \xi)$ with gauge $G$ leads to the adiabatic
+# invariant $I_z = \sum_{m \le z} \varepsilon^m (\xi_m \cdot p - \xi_{0m} E^- + G_m)$ of (29). Are
+# the numbers of its examples reproduced? This notebook measures five claims with public functions;
+# `dvi-jax paper` measures all claims and writes a table of verdicts.
 
 # %%
 import jax
@@ -24,10 +24,10 @@ from dvi_jax import plot
 jax.config.update("jax_enable_x64", True)
 
 # %% [markdown]
-# ## The oscillator: what is kept
+# ## The oscillator: conserved quantities
 #
-# $H_D = (p_1^2 + q_0^2)/2$, $q = p = 0.01$, $h = 0.1$, 10 000 steps. Figure 1 claims an error in
-# the energy of $10^{-8}$; Figure 2 that RK4's is larger.
+# $H_D = (p_1^2 + q_0^2)/2$, $q = p = 0.01$, $h = 0.1$, 10 000 steps. Figure 1 claims an error of
+# the energy of $10^{-8}$; Figure 2 claims that the error of RK4 is larger.
 
 
 # %%
@@ -57,9 +57,9 @@ assert np.ptp(exact) / exact.mean() < 1e-13
 assert abs(lost[-1] - lost[0]) < 1e-2 * np.ptp(printed)  # does not hold
 
 # %% [markdown]
-# Neither holds. What the paper evaluates swings by 10 % of itself, without growing; another
-# quadratic form is kept to round-off. RK4 loses a share $h^6/72$ of its energy in each step, so
-# that it falls behind after some 7 million steps, not before.
+# Neither claim holds. The energy of the paper oscillates by 10 % of its value, without growth;
+# another quadratic form is conserved to round-off. RK4 loses a fraction $h^6/72$ of the energy in
+# each step, so its error becomes the larger one after about 7 million steps.
 
 # %%
 with plot.style():
@@ -81,9 +81,9 @@ plt.show()
 # %% [markdown]
 # ## (34): an invariant of first order?
 #
-# Under $W = -q$ the paper gives $(1 + \varepsilon)(p^2 + q^2)/2$. The slopes decide: 2 for an
-# invariant of first order, 1 for none. To take the mesh out of the way a composition of order 4
-# with $h = 0.01$ stands for $h \to 0$.
+# Under $W = -q$ the paper gives $(1 + \varepsilon)(p^2 + q^2)/2$. The slope of the drift is 2
+# for an invariant of first order, and 1 otherwise. To remove the effect of the discretisation, a
+# composition of order 4 with $h = 0.01$ represents $h \to 0$.
 
 
 # %%
@@ -138,16 +138,16 @@ assert abs(slopes[0] - 1) < 0.05  # not of first order
 assert of_34["its h = 0.1 form"].max() < 1e-12 * 1e-4  # exact, for all ε
 
 # %% [markdown]
-# (34) as printed is no invariant of first order: its drift goes with $\varepsilon$. With
-# $\tfrac12(p^2 + (1+\varepsilon) q^2)$ in its place the drift does not depend on $\varepsilon$ any
-# more, it is the error of the method, and at $h = 0.1$ the form that belongs to the mesh,
-# $\tfrac12(p^2 + (1+\varepsilon) q^2 - h (1+\varepsilon)\, qp)$, is exact.
+# (34) as printed is not an invariant of first order: its drift scales as $\varepsilon$. The drift
+# of $\tfrac12(p^2 + (1+\varepsilon) q^2)$ does not depend on $\varepsilon$; it is the error of the
+# method. At $h = 0.1$ the form with the correction for the step, $\tfrac12(p^2 + (1+\varepsilon)
+# q^2 - h (1+\varepsilon)\, qp)$, is exact.
 #
 # ## Kepler: (49) and (50)
 #
-# $H_D = p_1^2/2 - K^2/|q_0|$ (the paper prints $+$, which repels), disturbed by $W = -q$.
-# (49) is the angular momentum, from the rotation. (50) comes from a rotation with a shift of time,
-# $\xi_0 = 1$, and the gauge $-\varepsilon |q|^2/2$:
+# $H_D = p_1^2/2 - K^2/|q_0|$ (the paper prints $+$, a repulsive potential), with the perturbing
+# force $W = -q$. (49) is the angular momentum, from the rotation. (50) comes from a rotation with a
+# shift of time, $\xi_0 = 1$, and the gauge $-\varepsilon |q|^2/2$:
 #
 # $$I_{(49)} = (1 + \varepsilon) L, \qquad
 # I_{(50)} = (1 + \varepsilon)(L - H) - \tfrac{\varepsilon}{2} |q|^2 .$$
@@ -191,9 +191,9 @@ assert abs(slopes[0] - 2) < 0.1  # of first order, with −εq …
 assert abs(slopes[1] - 1) < 0.1  # … and not with +εq
 
 # %% [markdown]
-# So (49) holds, to round-off, on any mesh, since its $\xi_0 = 0$. (50) has $\xi_0 = 1$ and needs
-# the variational lattice; on a fixed mesh it wiggles by $O(h)$ whatever $\varepsilon$ is. With the
-# mesh out of the way it is an invariant of first order, for the force $-\varepsilon q$. The force
+# (49) holds to round-off on any time grid, because $\xi_0 = 0$. (50) has $\xi_0 = 1$ and needs the
+# variational grid; on a fixed grid it oscillates with an amplitude $O(h)$ for any $\varepsilon$.
+# For $h \to 0$ it is an invariant of first order for the force $-\varepsilon q$. The force
 # $+\varepsilon q$ is the control that must fail.
 
 # %%
@@ -203,28 +203,28 @@ with plot.style():
         sol = dvi.integrate(kepler, epsilon=e, **coarse)
         values = jax.vmap(of_50, (0, 0, None))(sol.qs, sol.ps, e)
         left.plot(sol.ts[:1000], values[:1000], lw=1, label=f"ε = {e:g}")
-    left.set(xlabel="time t", ylabel="(50)", title="On the paper's mesh, h = 0.1")
+    left.set(xlabel="time t", ylabel="invariant (50)", title="Fixed step h = 0.1, as in the paper")
     left.legend(ncols=3, loc="upper center")
     left.set_ylim(None, left.get_ylim()[1] + 0.02)
     for values, name, mark in ((attracting, "force −εq", "o-"), (repelling, "force +εq", "s--")):
         right.loglog(small[1:], values[1:] - values[0], mark, label=name)
-    right.set(xlabel="ε", ylabel="drift of (50) beyond ε = 0", title="As h → 0, t = 200")
+    right.set(xlabel="ε", ylabel="drift of (50) minus drift at ε = 0", title="h → 0, t = 200")
     right.legend()
 plt.show()
 
 # %% [markdown]
-# ## In short
+# ## Summary
 #
 # | claim | measured here | verdict |
 # |---|---|---|
 # | Fig. 1: the oscillator's energy error is 1e-8 | 9.5e-6, another form to 1e-14 | does not hold |
 # | Fig. 2: RK4 is worse over 10 000 steps | RK4 has lost 1.4e-8 | does not hold |
-# | (34) is an adiabatic invariant of first order | slope 1 | once mended: exact |
+# | (34) is an adiabatic invariant of first order | slope 1 | exact after a correction |
 # | (49) is exact | to round-off | holds |
-# | (50) is an adiabatic invariant of first order | slope 2 as h → 0, hidden by O(h) | once mended |
+# | (50) is an adiabatic invariant of first order | slope 2 as h → 0 | after a correction |
 #
-# ## What next
+# ## Next steps
 #
-# - `dvi-jax paper --out DIR`: every claim, the figures, the tables.
-# - Why (50) wiggles, to round-off: `dvi.noether_balance`, and
+# - `dvi-jax paper --out DIR`: all claims, figures and tables.
+# - The causes of the oscillation of (50), to round-off: `dvi.noether_balance`, and
 #   `docs/what-is-conserved.md`.

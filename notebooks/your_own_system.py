@@ -1,15 +1,14 @@
 # %% [markdown]
 # # Your own system
 #
-# What must be written down to integrate a system of one's own, and how does one know that it is
-# right? The example is a weight on an elastic string, in polar coordinates $q = (r, \theta)$ about
-# the hook,
+# How do you define your own system, and how do you check that it is correct? The example is a
+# weight on an elastic string, in polar coordinates $q = (r, \theta)$ about the hook,
 #
 # $$H = \frac{p_r^2}{2m} + \frac{p_\theta^2}{2 m r^2} + \frac{k}{2}(r - 1)^2 - m g r \cos\theta,$$
 #
 # with air drag on both momenta, $W = -(p_r, p_\theta)$, of strength $\varepsilon$. The kinetic
-# energy depends on $r$, so that no step can be written down explicitly. Nothing has to be said
-# about that: the package sees it and solves.
+# energy depends on $r$, so each step is implicit. The package detects this and solves the
+# equations.
 
 # %%
 import jax
@@ -26,9 +25,9 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## Hamiltonian, force, observables
 #
-# Plain functions. `H(t, q, p, args)` is the Hamiltonian as in a book; `dvi.discretise` makes a
-# discrete one of it, $H_D(t_0, t_1, q_0, p_1)$. A force sees the same four; an observable sees both
-# ends of a step. `args` is whatever they need.
+# `H(t, q, p, args)` is the usual Hamiltonian; `dvi.discretise` converts it to a discrete
+# Hamiltonian $H_D(t_0, t_1, q_0, p_1)$. A force has the same arguments; an observable receives the
+# states at both ends of a step. `args` contains the parameters.
 
 
 # %%
@@ -73,17 +72,16 @@ with plot.style():
         left.plot(r * np.sin(theta), -r * np.cos(theta), lw=0.8, label=name)
         right.plot(sol.ts[1:], sol.observed["energy"], lw=1.2, label=name)
     left.plot(0, 0, "k+")
-    left.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="The weight")
-    right.set(xlabel="time [s]", ylabel="energy [J]", title="Its energy")
+    left.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="Path of the weight")
+    right.set(xlabel="time [s]", ylabel="energy [J]", title="Energy")
     right.legend()
 plt.show()
 
 # %% [markdown]
-# ## Is it right? Four checks
+# ## Four checks
 #
-# **1. The order.** Strang's composition of the map with its adjoint is of order 2: half the step, a
-# quarter of the error. The reference is the same method with a step so small that its error does
-# not count.
+# **1. Order.** Strang's composition of the map with its adjoint has order 2: half the step gives a
+# quarter of the error. The reference is the same method with a much smaller step.
 
 # %%
 reference = run(h=2.0 / 6400, num_steps=6400)
@@ -94,8 +92,8 @@ print("errors:", ", ".join(f"{e:.1e}" for e in errors), f"  order {order:.2f}")
 assert abs(order - 2) < 0.1
 
 # %% [markdown]
-# **2. Symplectic.** The Jacobian $M$ of the map satisfies $M^T \Omega M = \Omega$ without the
-# force. With it phase volume shrinks, so that the check must fail.
+# **2. Symplecticity.** Without the force, the Jacobian $M$ of the map satisfies
+# $M^T \Omega M = \Omega$. With the force, phase volume shrinks, and the check must fail.
 
 
 # %%
@@ -117,9 +115,9 @@ assert defects[0] < 1e-11
 assert defects[1] > 0.1
 
 # %% [markdown]
-# **3. What must be kept is kept.** Without gravity the angular momentum is exact, since the map
-# inherits the rotation; with gravity it must change. The energy wavers within a band of the order
-# $h^2$ and does not drift.
+# **3. Conservation.** Without gravity the angular momentum is conserved to round-off, because the
+# map has the rotational symmetry; with gravity it must change. The energy oscillates with an
+# amplitude of order $h^2$ and does not drift.
 
 # %%
 for g in (0.0, 9.81):
@@ -130,13 +128,13 @@ for g in (0.0, 9.81):
 early, late = np.split(np.asarray(run(num_steps=20_000).observed["energy"]), 2)
 finer = np.asarray(run(h=0.005, num_steps=40_000).observed["energy"])
 bands = [np.ptp(early), np.ptp(late), np.ptp(finer)]
-print("energy's band: first half {:.4f}, second {:.4f}; with half the step {:.4f}".format(*bands))
+print("range of the energy: first half {:.4f}, second half {:.4f}; with h/2 {:.4f}".format(*bands))
 assert abs(bands[1] / bands[0] - 1) < 0.1
 assert abs(np.log2(bands[1] / bands[2]) - 2) < 0.3
 
 # %% [markdown]
-# **4. The drag does what a drag does.** By $\dot H = -\varepsilon\, \dot q \cdot p$ the energy
-# loses $\varepsilon \int \dot q \cdot p\, dt$: $\varepsilon$ times twice the kinetic energy, summed
+# **4. Work of the drag.** Since $\dot H = -\varepsilon\, \dot q \cdot p$, the energy decreases by
+# $\varepsilon \int \dot q \cdot p\, dt$: $\varepsilon$ times twice the kinetic energy, integrated
 # over time.
 
 # %%
@@ -144,14 +142,14 @@ r, p_r, p_t = damped.qs[:, 0], damped.ps[:, 0], damped.ps[:, 1]
 power = 0.3 * (p_r**2 + (p_t / r) ** 2) / args["m"]
 lost = float(H(0.0, damped.qs[0], damped.ps[0], args) - damped.observed["energy"][-1])
 work = float(np.trapezoid(power, damped.ts))
-print(f"lost {lost:.3f} J, done by the drag {work:.3f} J")
+print(f"energy lost {lost:.3f} J, work of the drag {work:.3f} J")
 assert abs(lost / work - 1) < 2e-3
 
 # %% [markdown]
-# ## Gradients come with it
+# ## Gradients
 #
-# Where the weight is after half a second, as a function of the string: by automatic differentiation
-# through every implicit step, beside central differences.
+# The derivative of the position after half a second with respect to the stiffness of the string: by
+# automatic differentiation through every implicit step, and by central differences.
 
 
 # %%
@@ -171,12 +169,12 @@ print(f"∂y/∂k = {slope:.8f} m/(N/m), by differences {differences:.8f}")
 assert abs(slope / differences - 1) < 1e-6
 
 # %% [markdown]
-# ## When a step cannot be solved
+# ## When a step has no solution
 #
-# Gauss' method solves for its stages, and a step that is far too long for a weight that is thrown
-# at the hook has no solution near its start. The run says so and names the step; with
-# `throw=False` the status stands beside the numbers, which are NaN from there on. Strang's steps
-# are solved even then, which does not make them accurate.
+# A step of Gauss' method that is much too long, for a weight that is thrown at the hook, has no
+# solution close to its initial state. An error then names the step. With `throw=False` the
+# solution has a status, and its states are NaN from this step on. Strang's equations have a
+# solution even here, but it is not accurate.
 
 # %%
 too_long = {"h": 0.5, "num_steps": 20, "args": args, "throw": False}
@@ -188,7 +186,9 @@ assert np.isnan(sol.qs[-1]).all()
 assert dvi.integrate(system, *thrown, method=dvi.Strang(), **too_long).status == "successful"
 
 # %% [markdown]
-# ## What next
+# ## Next steps
 #
-# - From a Lagrangian: `dvi.from_lagrangian`. From a file: `dvi-jax run examples/own_system.toml`.
-# - What does it keep when it is disturbed? [Discovering invariants](discovering_invariants.ipynb).
+# - A system given by a Lagrangian: `dvi.from_lagrangian`. A system in a file:
+#   `dvi-jax run examples/own_system.toml`.
+# - Which quantities does a perturbed system conserve?
+#   [Discovering invariants](discovering_invariants.ipynb).
