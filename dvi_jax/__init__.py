@@ -191,8 +191,8 @@ if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
     Chord, SaveAt, Event, naff = SimplifiedNewton, Save, Stop, frequencies
     LinearTrend, PeakToPeak = Trend, Range
 else:
-    from ._namespaces import Package
+    from ._namespaces import Package as _Package
 
-    sys.modules[__name__].__class__ = Package
+    sys.modules[__name__].__class__ = _Package
 
 __version__ = "0.1.0"

@@ -268,7 +268,7 @@ def test_docstrings_are_taken_literally_and_defaults_told(extensions):
     assert reference.literally("E⁻_k and `a_b`, Φ*_h\n\n    x_1 *") == (
         r"E⁻\_k and `a_b`, Φ\*\_h" + "\n\n    x_1 *"
     )
-    assert reference.signature(dvi.Adjoint) == "(method=TypeII())"
+    assert reference.signature(dvi.Adjoint) == "(method: Method = TypeII())"
 
 
 BROWSER = next(

@@ -10,7 +10,7 @@ import inspect
 import math
 import re
 import types
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -23,27 +23,27 @@ from sphinx.util.docutils import SphinxDirective
 
 import dvi_jax
 import lanewise
-from dvi_jax._namespaces import names
+from dvi_jax._namespaces import SHORT, names
 from dvi_jax.paper.equations import EQUATIONS
 
 PAGES = {
     "integration": ("Systems and integration", "dvi_jax"),
     "methods": ("Methods", "dvi_jax.methods"),
-    "lattices": ("Lattices", "dvi_jax.lattices"),
+    "lattices": ("Time grids", "dvi_jax.lattices"),
     "solvers": ("Root solvers, layout, devices", "dvi_jax.engine"),
     "observables": ("Observables and reductions", "dvi_jax.observe"),
     "discovery": ("Symmetries and invariants", "dvi_jax.discover"),
     "sweeps": ("Sweeps", "dvi_jax.sweep"),
-    "fitting": ("Fitting", "dvi_jax.fit"),
-    "dynamics": ("Order, chaos, frequencies", "dvi_jax.dynamics"),
+    "fitting": ("Fits", "dvi_jax.fit"),
+    "dynamics": ("Sections, frequencies, actions", "dvi_jax.dynamics"),
 }
 """Page → title, and the package whose public names are on it."""
 
 MODULES = {
     "generators": ("Generators of common symmetries", "generators"),
-    "starts": ("Starts of a sweep", "starts"),
+    "starts": ("Initial conditions of a sweep", "starts"),
     "systems": ("Library of systems", "systems"),
-    "plot": ("Pictures", "plot"),
+    "plot": ("Plots", "plot"),
     "interop": ("Other packages", "interop"),
 }
 """Page → title, and the public module that it documents."""
@@ -104,15 +104,26 @@ def _members(module: types.ModuleType) -> Iterator[tuple[str, Any]]:
             yield name, thing
 
 
+def _type(annotation: Any) -> Any:
+    """The name of a type as a reader writes it; nothing for `Any` and for long ones."""
+    empty = inspect.Parameter.empty
+    if annotation is empty or annotation is Any:
+        return empty
+    text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    text = re.sub(r"\b(?:[a-z_]\w*\.)+(?=[A-Z])", "", text)  # names without their modules
+    text = re.sub(r"\b(?:Float|Int|Bool|Shaped|Num|Inexact)\[[^]]*\]", "Array", text)
+    return empty if text == "Any" or len(text) > 40 or "<" in text else _Shown(text)
+
+
 def signature(thing: Any) -> str:
-    """`(a, *, b=1)`: names and defaults; what they are the docstring says, in words."""
+    """`(a, *, b=1)`: names, types and defaults; the docstring explains them."""
     try:
         found = inspect.signature(thing)
     except (TypeError, ValueError):
         return "()"
     made = _made_defaults(thing)
     plain = [
-        p.replace(annotation=p.empty, default=_default(made.get(name, p.default)))
+        p.replace(annotation=_type(p.annotation), default=_default(made.get(name, p.default)))
         for name, p in found.parameters.items()
         if name not in ("self", "cls") and not name.startswith("_")
     ]
@@ -221,23 +232,47 @@ def _entry(full: str, shown: str, thing: Any) -> str:
     return "\n".join([*lines, ":::::", ""])
 
 
+def _rank(item: tuple[str, tuple[str, Any]]) -> tuple[int, str]:
+    """Names that `dir(dvi_jax)` lists first, then the others, then errors and statuses."""
+    _, (shown, thing) = item
+    name = shown.rpartition(".")[2]
+    is_status = inspect.isclass(thing) and (
+        issubclass(thing, BaseException) or hasattr(thing, "_name_to_item")
+    )
+    if name in SHORT and not is_status:
+        return SHORT.index(name), ""
+    return len(SHORT) + is_status, name.lower()
+
+
+def _summary(thing: Any) -> str:
+    """First sentence of a docstring, for tables."""
+    if _statuses(thing) if inspect.isclass(thing) else False:
+        return "Statuses and their messages."
+    text = (inspect.getdoc(thing) or "").split("\n\n")[0]
+    return literally(" ".join(text.split())).replace("|", r"\|")
+
+
+def _table(listed: Iterable[tuple[str, Any]]) -> list[str]:
+    rows = [f"| `{shown}` | {_summary(thing)} |" for shown, thing in listed]
+    return ["| name | summary |", "| --- | --- |", *rows, ""]
+
+
 def write(folder: Path) -> None:
-    """The pages of the reference, as Markdown; a page that did not change is left as it is."""
+    """The pages of the reference, as Markdown; a page that did not change is not written again."""
     folder.mkdir(parents=True, exist_ok=True)
-    found = entries()
+    found = {page: dict(sorted(things.items(), key=_rank)) for page, things in entries().items()}
     pages = {}
     for page, title in TITLES.items():
         if not found[page]:
             continue
-        listed = ", ".join(f"`{shown}`" for shown, _ in found[page].values())
-        parts = [f"# {title}", "", listed, ""]
+        parts = [f"# {title}", "", *_table(found[page].values())]
         parts += [_entry(full, *rest) for full, rest in found[page].items()]
         pages[page] = "\n".join(parts)
     index = [
         "# Reference",
         "",
-        "Every public class and function, from its docstring. In the examples, which are run, "
-        "these are known:",
+        "Every public class and function, from its docstring. The names that are used most are "
+        "first on each page. The examples run after these lines:",
         "",
         "```python",
         "import jax, jax.numpy as jnp, numpy as np",
@@ -249,9 +284,7 @@ def write(folder: Path) -> None:
     ]
     index += ["```{toctree}", ":hidden:", "", *pages, "```", ""]
     for page in pages:
-        title = TITLES[page]
-        listed = ", ".join(f"`{shown}`" for shown, _ in found[page].values())
-        index += [f"**[{title}]({page}.md).** {listed}", ""]
+        index += [f"## [{TITLES[page]}]({page}.md)", "", *_table(found[page].values())]
     pages["index"] = "\n".join(index)
     for page, text in pages.items():
         path = folder / f"{page}.md"

@@ -1,0 +1,118 @@
+"""Phrases that a reader has to decode, and where they occur.
+
+    python tests/language.py            list every occurrence
+    python tests/language.py --count    numbers per phrase
+
+Each phrase below was in the texts once; the right column is what to write. Searched are docstrings,
+comments and string literals with a space of Python files, and Markdown outside of code blocks.
+"""
+
+import argparse
+import ast
+import collections
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+PHRASES = {
+    r"\bdisturb(?:ed|ing|s|ance|ances)?\b": "perturbed, perturbing, perturbation",
+    r"\bundisturbed\b": "unperturbed",
+    r"\bwaver(?:s|ed|ing)?\b|\bwiggl(?:e|es|ed|ing)\b|\bswings\b": "oscillates, oscillation",
+    r"\bgoes (?:as|with)\b|\bgo as\b|\bgrows as the\b": "scales as",
+    r"\b(?:is|are|was|be|been|being) told\b|\btold (?:by|from|apart)\b|\btells?\b": "reports, returns, distinguishes",
+    r"\bask(?:s|ed|ing)? (?:for|of|again)\b|\bis asked\b|\bwhat is asked\b": "requires, requested",
+    r"\bstands?\b": "is stored, is listed, is next to",
+    r"\bwhat is left\b|\bwhat is kept\b|\bwhat (?:it|a map|the map) keeps\b": "residual; conserved quantities, output",
+    r"\bmended\b|\bmends?\b": "corrected",
+    r"\bfoils?\b": "reference method",
+    r"\bon trust\b|\bwith care\b|\bkeeps no books\b": "unchecked, checked, deferred check",
+    r"\bhouse\b|\bfront door\b|\bthe door\b|\bfloors?\b|\bin the company\b|\bof company\b": "package, layer, public API",
+    r"\bleading parts?\b|\bsurvivors\b(?!`)": "leading-order term, number of invariants per order",
+    r"\bfunctions of one another\b": "functionally dependent",
+    r"\bnoises\b": "noise realisations",
+    r"\bdear\b|\banew\b": "expensive, again",
+    r"\bcannot be meant\b|\bis meant\b|\bmay be meant\b": "is invalid, means",
+    r"\bnought\b|\bis none\b|\bare none\b|\bthere is none\b": "zero, does not exist",
+    r"\bas it should be\b|\bin no wise\b|\bof its own accord\b": "correct, not, automatically",
+    r"\bbeside\b": "next to, compared with, and",
+    r"\ba look\b|\blooked at\b|\bis seen\b|\bare seen\b": "check, checked, detected",
+    r"\bwhat comes back\b|\bcomes back\b": "result, returns",
+    r"\bto and fro\b|\bthere and back\b|\bthe other way about\b": "in both directions",
+    r"\bneither here nor there\b|\bworth knowing\b|\bin hand\b": "notes, in progress",
+    r"\bhands? (?:it|them|over|out|back)\b|\bhanded\b": "pass, passes, receives",
+    r"\bat hand\b": "available",
+    r"\bof its own\b|\bof their own\b|\bof one's own\b": "its own, separate, user-defined",
+    r"\bby itself\b|\bby themselves\b": "automatically, alone",
+    r"\bno (?:number|root|invariant|method|solver|function) (?:at all )?(?:is|was) (?:one|none)\b": "is not a",
+}
+"""Phrase → what to write."""
+
+
+def strings_and_comments(text: str) -> Iterator[tuple[int, str]]:
+    """(line, text) of docstrings, comments and string literals that contain a space."""
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT and "noqa" not in token.string:
+            yield token.start[0], token.string
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
+            yield node.lineno, node.value
+
+
+def prose(text: str) -> Iterator[tuple[int, str]]:
+    """(line, text) of Markdown outside of code."""
+    fenced = False
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.lstrip().startswith("```"):
+            fenced = not fenced
+        elif not fenced and not line.startswith("    "):
+            yield number, re.sub(r"`[^`]*`", "", line)
+
+
+def found(path: Path, phrases: dict[str, str] = PHRASES) -> list[tuple[int, str, str]]:
+    """(line, words, what to write) of every occurrence in a file."""
+    text = path.read_text(encoding="utf-8")
+    parts = strings_and_comments(text) if path.suffix == ".py" else prose(text)
+    return [
+        (line + part.count("\n", 0, match.start()), match[0], instead)
+        for line, part in parts
+        for phrase, instead in phrases.items()
+        for match in re.finditer(
+            phrase, re.sub(r"``?[^`\n]*``?", lambda m: "_" * len(m[0]), part), re.I
+        )
+    ]
+
+
+def files() -> list[Path]:
+    """Files whose words users read."""
+    folders = ("dvi_jax", "dvi_jax_cli", "lanewise", "examples", "notebooks", "benchmarks", "tests")
+    python = [p for folder in folders for p in sorted((ROOT / folder).rglob("*.py"))]
+    pages = [
+        p for p in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")] if p.name != "CHANGELOG.md"
+    ]
+    return [p for p in python + pages if p.name not in ("language.py", "test_language.py")]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--count", action="store_true", help="numbers per phrase")
+    parser.add_argument("paths", nargs="*", type=Path, help="files (default: all)")
+    options = parser.parse_args()
+    counts = collections.Counter()
+    for path in options.paths or files():
+        for line, words, instead in found(path):
+            counts[words.lower()] += 1
+            if not options.count:
+                print(
+                    f"{path.relative_to(ROOT) if path.is_absolute() else path}:{line}: {words!r}: {instead}"
+                )
+    if options.count:
+        for words, number in counts.most_common():
+            print(f"{number:5} {words}")
+
+
+if __name__ == "__main__":
+    main()
