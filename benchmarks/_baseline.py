@@ -15,7 +15,7 @@ import numpy as np
 SOURCE = Path(__file__).with_name("baseline.c")
 FLAGS = ["-O3", "-ffast-math", "-fPIC"]
 TUNED = [["-march=native"], ["-mcpu=native"], []]
-"""What tells a compiler to use all that this processor has: the first that it understands."""
+"""Options that select this processor; the first one that the compiler accepts is used."""
 
 VECTOR_MATH = [["-DHAVE_LIBMVEC", "-lmvec"], ["-UHAVE_LIBMVEC"]]
 """With glibc's vectorised sin and cos where they are; else one lane at a time."""
@@ -44,7 +44,7 @@ class Run(NamedTuple):
 
 
 class Baseline:
-    """baseline.c as a shared library, built at once in a folder that goes with the object.
+    """baseline.c as a shared library, built in a folder that is removed with the object.
 
     **Raises** `NoCompilerError` if neither $CC nor gcc, cc, clang on the PATH compiles it.
     """

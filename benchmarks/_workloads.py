@@ -138,7 +138,7 @@ WORKLOADS = {
     "web10": _implicit("web10", web, 10, 0.3),
     "bodies": _bodies(),
 }
-"""By name. `kernel` is the same name where there is one kernel, and empty where there is none."""
+"""By name. `kernel` is the name of the C kernel, empty for workloads without one."""
 
 
 def run_of(w: Workload, steps: int, *, save=None, observe=None, epsilon=EPSILON, **settings):

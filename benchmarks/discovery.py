@@ -72,7 +72,7 @@ def measure():
     print(f"after compilation: median {statistics.median(ours):.3f} s of {ROUNDS}")
     ratio = statistics.median(a / b for a, b in zip(ours, theirs, strict=True))
     print(f"over dense singular values alone ({rows} × {matrix.shape[1]}): ratio {ratio:.2f}")
-    print(f"survivors {found.survivors}, largest residual {found.residuals.max():.1e}")
+    print(f"invariants per order {found.survivors}, largest residual {found.residuals.max():.1e}")
 
 
 def compared(folder, rounds=3):

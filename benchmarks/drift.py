@@ -10,7 +10,7 @@ Predictions, written down before this file was run (from a trial at 2 000 steps)
 1. Peak memory at 20 000 steps is within 10 MB of that at 2 000 (a saved trajectory would need
    4160 × 18 000 × 16 B = 1.2 GB more).
 2. `drift_order` takes 2 to 4 times as long as the reference: it carries a status, a residual and
-   the last step beside the state.
+   the last step together with the state.
 3. Drifts agree to 1e-13, and the slope is 1 to within 0.02.
 
 Run: python benchmarks/drift.py
@@ -94,7 +94,7 @@ def seconds(function, num_steps):
 
 
 def main():
-    """Print the three results beside the predictions."""
+    """Print the three results and the predictions."""
     memory = [peak_memory(n) for n in NUM_STEPS]
     for n, used in zip(NUM_STEPS, memory, strict=True):
         print(f"peak memory at {n:6d} steps: {used:7.1f} MB")

@@ -1,4 +1,4 @@
-"""Figures of indicators, sections, frequencies and adiabatic moments, beside what is asked of them.
+"""Figures of indicators, sections, frequencies and adiabatic moments, and their required values.
 
     python benchmarks/dynamics.py [--quick] [--check]
 
@@ -79,7 +79,7 @@ def tangent() -> Iterator[Row]:
 
 
 def moment() -> Iterator[Row]:
-    """The waver of μ0 and μ0 + μ1 in a mirror, as a power of the gyroradius over its length."""
+    """Oscillation of μ0 and μ0 + μ1 in a mirror, as a power of gyroradius / scale length."""
     lengths, seen = (20.0, 40.0, 80.0), []
     for length in lengths:
         made = systems.magnetic_mirror(length, length / 2)
@@ -92,7 +92,7 @@ def moment() -> Iterator[Row]:
     slopes = np.polyfit(np.log(lengths), np.log(seen), 1)[0]
     for name, slope, power in zip(("μ0", "μ0 + μ1"), -slopes, (1, 2), strict=True):
         yield (
-            f"power of the waver of {name}",
+            f"power of the oscillation of {name}",
             f"{slope:.2f}",
             f"{power} ± 0.15",
             (abs(slope - power) < 0.15),

@@ -1,4 +1,4 @@
-"""Seconds until a user can go on: `import dvi_jax`, `dvi-jax --help`, beside `import jax`.
+"""Seconds of `import dvi_jax` and `dvi-jax --help`, compared with `import jax`.
 
     python benchmarks/import_time.py [--rounds 7] [--check]
 
@@ -29,7 +29,7 @@ ROWS = {
 
 
 def seconds(arguments: list[str], cache: str) -> tuple[float, float, float]:
-    """(what is asked, wall, processor) of one process that has to succeed."""
+    """(measured quantity, wall, processor) of one process that must succeed."""
     env = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     env |= {"PYTHONPYCACHEPREFIX": cache, "JAX_PLATFORMS": "cpu"}
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()

@@ -1,10 +1,10 @@
-"""What indicators of chaos cost beside a plain run, and MEGNO beside hand-written C.
+"""Cost of chaos indicators relative to a plain run, and of MEGNO relative to hand-written C.
 
     python benchmarks/indicators.py [--lanes 256] [--steps 20000] [--rounds 7]
 
 The system is that of Hénon and Heiles under the leapfrog. Ratios of processor times, medians of
 rounds in random order in one process; one thread does the work in each. The C code has the
-variational equations by hand, lane beside lane for the compiler to vectorise; its numbers are ours
+variational equations by hand, vectorised by the compiler over trajectories; its numbers are ours
 to 1e-9, which is checked first.
 """
 

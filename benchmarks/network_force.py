@@ -1,4 +1,4 @@
-"""A network force inside the integrator beside networks under Runge–Kutta, outside their arc.
+"""A network force in the integrator, compared with networks in Runge–Kutta, outside their arc.
 
     python benchmarks/network_force.py [--seeds 5] [--first-seed 10] [--steps 80] [--out DIR]
 
@@ -12,11 +12,11 @@ an amplitude inside that of the training:
 - `RK4, general`: nothing is known; (q̇, ṗ) is a network of (q, p), under RK4.
 
 All have about the same number of parameters, the same data, start, step h, prior, horizons and
-number of steps of optimistix's Levenberg–Marquardt in the same scaled variables; of several initial
-weights each takes those with the least loss on the training data, and the foils may choose between
-two activations as well. The general network has less to start from; the second foil has as much as
-ours, but for the structure. The length of the arc, ours' activation and the number of restarts were
-chosen on noise of the seeds 0 to 4; the table is of others.
+number of steps of optimistix's Levenberg–Marquardt in the same scaled variables. Of several initial
+weights each takes those with the least training loss; the reference models also choose between two
+activations. The general network has less prior knowledge; the second reference has the same as the
+first model, except the structure. The length of the arc, the activation of the first model and the
+number of restarts were chosen with noise of the seeds 0 to 4; the table uses other seeds.
 """
 
 import argparse
@@ -65,7 +65,7 @@ def runge_kutta(field, x0, h, num_steps, substeps=1):
 
 @functools.cache
 def truth(start, num_steps):
-    """The orbit that is observed: asked for by every fit, and a loop that would compile anew."""
+    """The observed orbit, cached because every fit uses it."""
     return np.asarray(runge_kutta(slope, jnp.array(start), H, num_steps, substeps=10))
 
 
@@ -113,7 +113,7 @@ def run_ours(network, start, num_steps):
     return jnp.concatenate([sol.qs, sol.ps], axis=1)
 
 
-# ---- the foils
+# ---- the reference models
 
 
 class General(eqx.Module):

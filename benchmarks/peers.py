@@ -1,12 +1,12 @@
-"""Other packages beside hand-written C and this one, on the same problems, one thread each.
+"""Speed of other packages and this one relative to hand-written C, on one thread.
 
     pip install "dvi-jax[peers]"; python benchmarks/peers.py [--peers PATTERN] [--out DIR]
 
-Three tasks, undisturbed (ε = 0): a batch of Kepler orbits, one Kepler orbit, a batch of implicit
-chains of two masses. Peers that can run the very map (12)–(13) do so, step for step (diffrax's
-SemiImplicitEuler for Kepler, numba). The others cover the same span of time in their own way, which
-is told: fixed steps of the same size, or steps to a tolerance. A ratio to them is a time for that
-span, not for equal accuracy; for that see work_precision.py.
+Three tasks, unperturbed (ε = 0): a batch of Kepler orbits, one Kepler orbit, a batch of implicit
+chains of two masses. Peers that can run the map (12)–(13) take the same steps (diffrax's
+SemiImplicitEuler for Kepler, numba). The others cover the same time with fixed steps of the same
+size, or with steps to a tolerance, as printed. Their ratio is for the same time, not for equal
+accuracy; for that see work_precision.py.
 
 A peer is timed only after it has agreed with C over one unit of time in steps of 0.001: to 1e-12
 if it runs the same map, else to FIRST_ORDER times the step, which is the error of the map itself.
@@ -378,7 +378,7 @@ def agreement(peer: Peer, baseline: Baseline) -> tuple[float, float]:
 
 
 def c_run(baseline: Baseline, w: Workload, q0, p0, h: float, steps: int):
-    """The C side of a task, undisturbed."""
+    """The C side of a task, unperturbed."""
     if w.is_explicit:
         return baseline.final(w.kernel, q0, p0, h=h, steps=steps, epsilon=0.0)
     iterations, _ = baseline.iterations_needed(w.kernel, q0, p0, h=h, steps=steps, epsilon=0.0)
@@ -432,7 +432,7 @@ def line(r: dict[str, Any]) -> str:
 
 def main(words: list[str] | None = None) -> int:
     """Compare, print, write; the exit status."""
-    parser = argparse.ArgumentParser(description="Other packages beside hand-written C.")
+    parser = argparse.ArgumentParser(description="Other packages compared with hand-written C.")
     parser.add_argument("--peers", default="*", help="only packages of this name (*, ?)")
     parser.add_argument("--rounds", type=int, default=9, help="of each at most (default 9)")
     parser.add_argument("--budget", type=float, default=6.0, help="seconds of each (default 6)")

@@ -1,4 +1,4 @@
-"""Which root solver is fast where: time per step of each of them beside Newton's method.
+"""Time per step of each root solver, relative to Newton's method.
 
     python benchmarks/root_solvers.py [--rows PATTERN] [--rounds N] [--out FILE]
 
@@ -200,7 +200,7 @@ def runner(row: Row, solver: dvi.RootSolver, args: Any):
 
 
 def measure(name: str, row: Row, clock: Clock) -> dict[str, Any]:
-    """Ratios of time to Newton's, and what else is worth knowing."""
+    """Ratios of time to Newton's method, and iterations."""
     args = systems.n_body().args if name.startswith("figure") else None
     calls = [runner(row, solver, args) for solver in SOLVERS.values()]
     outs = [jax.tree.map(np.asarray, call()) for call in calls]

@@ -1,11 +1,11 @@
-"""What a sweep costs beside the bare kernel, in time and in memory, and how Dask workers scale.
+"""Cost of a sweep relative to the bare kernel, in time and in memory, and scaling of Dask workers.
 
     python benchmarks/sweep.py rate [--lanes 1000000] [--steps 10000] [--rounds 3]
     python benchmarks/sweep.py dask [--tasks 128]
     python benchmarks/sweep.py cost
 
-rate: trajectories of the disturbed Kepler problem with three streamed invariants, written to a
-store, on all cores; beside it the bare kernel, the same reductions of the same states without
+rate: trajectories of the perturbed Kepler problem with three streamed invariants, written to a
+store, on all cores; for comparison the bare kernel, the same reductions of the same states without
 sweep, store or starts: `jax.jit(jax.vmap(one))` on 2¹⁷ of these trajectories, its time scaled
 to their number. Both once in each round, in random order, in one process; the sweep compiles in a
 round before. The largest memory is that of the process, over all rounds.

@@ -4,7 +4,7 @@
 
 Both sides run once in each round, in random order; the median of the ratios is shown, with the
 quartiles. They give the same bits, which is checked. Other work on the machine shows up as a
-smaller ratio: run it when there is none.
+smaller ratio: run it without other load.
 """
 
 import argparse

@@ -549,7 +549,7 @@ def envelope(points, of):
 
 
 def guide(ax, points, order):
-    """A dotted line of the slope of the order, beside the last points of that order."""
+    """A dotted line of the slope of the order, next to the last points of that order."""
     mine = [p for p in points if p.order == order and 1e-9 < p.error < 1e-1]
     if not mine:
         return

@@ -39,7 +39,7 @@ myst_heading_anchors = 3
 myst_links_external_new_tab = True
 suppress_warnings = ["myst-nb.unknown_mime_type"]
 
-# MathJax lies beside the pages: they are read without a network too.
+# MathJax is in the folder of the pages, which can be read without a network.
 mathjax_path = "mathjax/tex-svg-full.js"
 mathjax3_config = {"svg": {"fontCache": "global"}, "options": {"enableMenu": False}}
 

@@ -1,8 +1,8 @@
-"""General relativity from a century of Mercury: how large a disturbance the ephemeris asks for.
+"""General relativity from a century of Mercury: a fit of its strength ε to an ephemeris.
 
-Sun and planets move by Newton's law and a disturbance ε times the Sun's relativity. Fitted are ε
-and the start of Mercury, to its positions in JPL's DE421: without the disturbance, with it, and
-with an oblate Sun. ε comes out as 1.
+Sun and planets move by Newton's law and a perturbing force, ε times the Sun's relativity. ε and the
+initial state of Mercury are fitted to its positions in JPL's DE421: without the perturbation, with
+it, and with an oblate Sun. The expected result is ε = 1.
 
 Run: python examples/general_relativity.py [--out DIR] [--conservative] [--years N]
      [--method NAME(ORDER)] [--step DAYS]
@@ -193,14 +193,14 @@ def table(found, years):
     lines.append(f"{'DE421':14} {'':>22} {'':>10} {tabulated:23.3f}")
     gain = found[1].advance - found[0].advance
     lines.append(
-        f"The disturbance turns Mercury's perihelion by {gain:.3f}″ per century; textbook: "
+        f"The perturbation turns Mercury's perihelion by {gain:.3f}″ per century; textbook: "
         f"{TEXTBOOK}″."
     )
     r = found[-1].off
     lag = np.sum(r[1:] * r[:-1]) / np.sum(r**2)
     lines.append(
-        f"What is left is systematic (neighbours correlate by {lag:.2f}): ± is formal, for errors "
-        "that are\nindependent, and much too small."
+        f"The residuals are systematic (correlation of neighbours {lag:.2f}): ± is formal, for\n"
+        "independent errors, and much too small."
     )
     return "\n".join(lines)
 
@@ -226,7 +226,7 @@ def draw(found):
         d.loglog(*spectrum(last[:, i]), lw=0.8, color=plot.COLOURS[colour], label=name)
     d.axvline(EARTH_1_4, color="0.5", lw=0.8, ls=":")
     d.text(EARTH_1_4 * 1.15, 20, "Earth 1 : 4", color="0.3", va="center", fontsize=9)
-    d.set(title="What is left, oblate Sun", xlabel="period [day]", ylabel="amplitude [m]")
+    d.set(title="Residuals with an oblate Sun", xlabel="period [day]", ylabel="amplitude [m]")
     d.set(ylim=(1e-2, 1e2), xlim=(20, 4e4))
     d.legend(loc="upper left", ncols=3, handlelength=1.2, columnspacing=1.0)
     return figure

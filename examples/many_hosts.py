@@ -2,7 +2,7 @@
 
     python examples/many_hosts.py --launch 2
 
-The strength ε of the disturbance is fitted to the mean of a cloud of Kepler orbits by gradient
+The strength ε of the perturbation is fitted to the mean of a cloud of Kepler orbits by gradient
 descent. The mean is over all trajectories, so that hosts cannot work on their own: they run one
 program, `dvi.over_devices`, with the trajectories divided between them. When a host is lost the
 others cannot go on either; the launcher then starts all of them again, and they continue from the

@@ -1,8 +1,8 @@
-"""The two panels of README's picture: energy errors of three methods, and invariants that were found.
+"""The picture of README: energy errors of three methods, and invariants that were found.
 
 Left: Kepler's problem with eccentricity 0.3, a million steps of 1/100 of a period.
-Right: the oscillator H = (p² + q²)/2 with the perturbing force −εq³. Invariants of orders 0, 1 and 2
-are discovered on the map; each drifts as a higher power of ε.
+Right: the oscillator H = (p² + q²)/2 with the perturbing force −εq³. Invariants of orders 0,
+1 and 2 are discovered on the map; the drift of each scales as a higher power of ε.
 
 Run: python examples/overview.py [FILE]
 """

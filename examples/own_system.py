@@ -1,4 +1,4 @@
-"""A system of one's own: the double pendulum, which no explicit method can split."""
+"""A user-defined system: the double pendulum, whose steps are implicit."""
 
 import jax.numpy as jnp
 
@@ -23,7 +23,7 @@ def hamiltonian(t, q, p, args):
 
 
 def friction(t0, t1, q0, p1, args):
-    """W: the disturbing force, here −p at both joints. `epsilon` is its strength [1/time]."""
+    """W: the perturbing force, here −p at both joints. `epsilon` is its strength [1/time]."""
     return -p1
 
 

@@ -108,7 +108,7 @@ def report(fit, knife):
 
 
 def draw(fit, knife):
-    """Data and fit of the arcs, residuals, and period and 1/Q beside the literature."""
+    """Data and fit of the arcs, residuals, and period and 1/Q compared with the literature."""
     figure = plt.figure(figsize=(10, 6.6))
     left, right = figure.subfigures(1, 2, width_ratios=[2.3, 1])
     rows = left.subplots(3, 1, sharex=True)

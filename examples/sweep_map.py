@@ -1,4 +1,4 @@
-"""Maps of a sweep: how far the energy of the disturbed Kepler problem drifts, over ε and the start.
+"""Maps of a sweep: energy drift of the perturbed Kepler problem over ε and initial momentum.
 
 Run: python examples/sweep_map.py [DIRECTORY for the picture]
 """
@@ -19,7 +19,7 @@ mpl.use("Agg")
 
 
 def measured():
-    """The largest drift of the energy for 36 disturbances × 44 momenta at the start.
+    """The largest drift of the energy for 36 perturbation strengths × 44 initial momenta.
 
     Gauss' method of order 4 has an equation to solve in each step. The smaller the momentum, the
     nearer the body comes to the centre, and there it finds no solution with a step of this size.

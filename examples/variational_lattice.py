@@ -140,7 +140,7 @@ def damped_oscillator(out):
 
 
 def balance():
-    """What is left of (14) on a damped, driven pendulum, on this lattice and on equal steps."""
+    """Residual of (14) for a damped, driven pendulum, on this time grid and with equal steps."""
     system = dvi.System(
         lambda t0, t1, q0, p1, args: jnp.sum(p1**2) / 2 - jnp.sum(jnp.cos(q0)),
         force=lambda t0, t1, q0, p1, args: -p1 + jnp.cos(t0),
@@ -161,7 +161,7 @@ def balance():
 
 
 def limits(out):
-    """Where (14) loses its root, and how its conditioning goes with the order of H_D."""
+    """Where (14) loses its root, and how its conditioning depends on the order of H_D."""
     oscillator = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2)
     for start in (([1.0], [0.5]), ([0.4], [0.7])):
         sol = dvi.integrate(

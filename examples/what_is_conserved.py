@@ -174,7 +174,10 @@ def slow_oscillator(out):
         ("discrete energy / ω", energy / w),
     ):
         off = leading * (leading @ J) / (leading @ leading) - J
-        print(f"  leading part against {name}: {np.linalg.norm(off) / np.linalg.norm(J):.1e}")
+        print(
+            f"  leading-order term and {name} differ by "
+            f"{np.linalg.norm(off) / np.linalg.norm(J):.1e}"
+        )
     epsilon = 2e-4
     run = dvi.integrate(
         system,

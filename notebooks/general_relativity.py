@@ -114,7 +114,7 @@ lag = float(np.mean(fit.statistics()["lag_one"]))
 print(f"ε = {epsilon:.5f}, formal ± {formal:.0e}; correlation of neighbouring residuals {lag:.2f}")
 
 assert abs(epsilon - 1) < 1e-4
-assert rms(fits["Newton alone"]) > 1000 * rms(fit)  # the control: the data do ask for it
+assert rms(fits["Newton alone"]) > 1000 * rms(fit)  # control: the data require relativity
 assert lag > 0.5  # so that the formal error is much too small
 
 # %% [markdown]

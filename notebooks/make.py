@@ -1,7 +1,7 @@
-"""Make the notebooks from the percent sources beside them, or check the ones that are there.
+"""Make the notebooks from their percent sources, or check the existing ones.
 
     python notebooks/make.py [NAME ...]           write NAME.ipynb, executed; without names all
-    python notebooks/make.py --check [NAME ...]   execute anew, compare, write nothing
+    python notebooks/make.py --check [NAME ...]   execute again, compare, write nothing
 
 A notebook holds what a fresh run gives: cells of the source, outputs, and nothing that changes from
 run to run (times, identifiers, names of machines). Exit status 1 where something is wrong.
@@ -148,7 +148,7 @@ def _pixels(encoded: str) -> str:
     return base64.b64encode(b"".join(kept)).decode("ascii")
 
 
-# --- what is looked at --------------------------------------------------------------------------
+# --- what is checked ---------------------------------------------------------------------------
 
 
 def faults(name: str, book: Any = None) -> list[str]:
@@ -279,7 +279,7 @@ def made(name: str, check: bool) -> list[str]:
 
 
 def main() -> int:
-    """Make or check what was asked for, a line each."""
+    """Make or check the requested notebooks, with one line each."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="notebooks; without names all")
     parser.add_argument("--check", action="store_true", help="compare and write nothing")
@@ -294,7 +294,7 @@ def main() -> int:
         total += (seconds := time.perf_counter() - began)
         path = HERE / f"{name}.ipynb"
         size = f"{path.stat().st_size / 1000:4.0f} kB" if path.exists() else "       "
-        print(f"{seconds:6.1f} s  {size}  {'as it should be' if not wrong else 'wrong:'}")
+        print(f"{seconds:6.1f} s  {size}  {'correct' if not wrong else 'wrong:'}")
         for line in wrong:
             print(f"    {line}")
         status |= bool(wrong)

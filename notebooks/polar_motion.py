@@ -82,7 +82,7 @@ for name, k in (("period [day]", 0), ("1/Q", 1)):
 period, inverse_Q = fit.x[at]
 assert abs(period - 433.0) < 2 * error[0]  # Wilson & Vicente 1990: 433.0 ± 1.1
 assert np.all(error > 8 * fit.sigma[at])  # formal errors are far too small
-assert abs(inverse_Q) < 2 * error[1]  # 1/Q is not told from 0
+assert abs(inverse_Q) < 2 * error[1]  # 1/Q is not different from 0
 
 # %% [markdown]
 # Grey: measured. Blue in the upper panels: fitted. Lower panel: x in blue, y in orange. The period

@@ -70,7 +70,7 @@ with plot.style():
         "RK4's energy": np.abs(lost / lost[0] - 1)[1:],
         "(p² + q² − hqp)/2": np.abs(exact / exact[0] - 1)[1:],
     }
-    blocks = N // 100  # the largest of a hundred steps: an error that swings is a smear
+    blocks = N // 100  # the largest of a hundred steps, because the error oscillates
     for name, values in shown.items():
         crests = values[: 100 * blocks].reshape(blocks, 100).max(axis=1)
         axis.semilogy(t[50:-1:100], crests, label=name)

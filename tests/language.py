@@ -19,18 +19,18 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 PHRASES = {
-    r"\bdisturb(?:ed|ing|s|ance|ances)?\b": "perturbed, perturbing, perturbation",
+    r"(?<!\*)\bdisturb(?:ed|ing|s|ance|ances)?\b(?!\*| Hamiltonian\s+systems\s+under)": "perturbed, perturbing, perturbation",
     r"\bundisturbed\b": "unperturbed",
     r"\bwaver(?:s|ed|ing)?\b|\bwiggl(?:e|es|ed|ing)\b|\bswings\b": "oscillates, oscillation",
     r"\bgoes (?:as|with)\b|\bgo as\b|\bgrows as the\b": "scales as",
     r"\b(?:is|are|was|be|been|being) told\b|\btold (?:by|from|apart)\b|\btells?\b": "reports, returns, distinguishes",
     r"\bask(?:s|ed|ing)? (?:for|of|again)\b|\bis asked\b|\bwhat is asked\b": "requires, requested",
-    r"\bstands?\b": "is stored, is listed, is next to",
-    r"\bwhat is left\b|\bwhat is kept\b|\bwhat (?:it|a map|the map) keeps\b": "residual; conserved quantities, output",
+    r"\bstands?\b(?! for| in for)": "is stored, is listed, is next to",
+    r"\bwhat is left\b(?! out| to\b)|\bwhat is kept\b|\bwhat (?:it|a map|the map) keeps\b": "residual; conserved quantities, output",
     r"\bmended\b|\bmends?\b": "corrected",
     r"\bfoils?\b": "reference method",
     r"\bon trust\b|\bwith care\b|\bkeeps no books\b": "unchecked, checked, deferred check",
-    r"\bhouse\b|\bfront door\b|\bthe door\b|\bfloors?\b|\bin the company\b|\bof company\b": "package, layer, public API",
+    r"\bhouse\b|\bfront door\b|\bthe door\b|\bin the company\b|\bof company\b": "package, layer, public API",
     r"\bleading parts?\b|\bsurvivors\b(?!`)": "leading-order term, number of invariants per order",
     r"\bfunctions of one another\b": "functionally dependent",
     r"\bnoises\b": "noise realisations",
@@ -45,8 +45,7 @@ PHRASES = {
     r"\bneither here nor there\b|\bworth knowing\b|\bin hand\b": "notes, in progress",
     r"\bhands? (?:it|them|over|out|back)\b|\bhanded\b": "pass, passes, receives",
     r"\bat hand\b": "available",
-    r"\bof its own\b|\bof their own\b|\bof one's own\b": "its own, separate, user-defined",
-    r"\bby itself\b|\bby themselves\b": "automatically, alone",
+    r"\bof one's own\b": "user-defined",
     r"\bno (?:number|root|invariant|method|solver|function) (?:at all )?(?:is|was) (?:one|none)\b": "is not a",
 }
 """Phrase → what to write."""

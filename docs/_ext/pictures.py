@@ -8,7 +8,7 @@ from docutils import nodes
 from sphinx.transforms.post_transforms import SphinxPostTransform
 
 WIDE = 1.75
-"""Width over height from which a picture has panels beside one another."""
+"""Width over height from which a picture has several panels in a row."""
 LARGE = 1000
 """Pixels of width from which it has, whatever its height."""
 

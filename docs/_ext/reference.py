@@ -134,7 +134,7 @@ def signature(thing: Any) -> str:
 
 
 def _made_defaults(thing: Any) -> dict[str, Any]:
-    """Defaults that each instance of a class makes anew, of which a signature knows nothing."""
+    """Defaults of fields with a factory, which a signature does not show."""
     fields = dataclasses.fields(thing) if dataclasses.is_dataclass(thing) else ()
     missing = dataclasses.MISSING
     return {f.name: f.default_factory() for f in fields if f.default_factory is not missing}
@@ -205,9 +205,7 @@ def _statuses(thing: Any) -> str:
     items = getattr(thing, "_name_to_item", None)
     if not items:
         return ""
-    rows = [
-        f"| `{name}` | {str(thing[item]) or 'as it should be'} |" for name, item in items.items()
-    ]
+    rows = [f"| `{name}` | {str(thing[item]) or 'no error'} |" for name, item in items.items()]
     return "\n".join(["| status | message |", "| --- | --- |", *rows, ""])
 
 

@@ -1,6 +1,6 @@
 """Small typography of running text: q_{k+1} and ε^2 are set as such, numbers are not torn apart.
 
-Pages and docstrings are read as text too, so that formulas in a line stand there in characters.
+Pages and docstrings are read as text too, so formulas in a line are written in characters.
 What is searched for, and what another builder shows, stays the text as it was written.
 """
 
@@ -35,7 +35,7 @@ def is_code(text: str) -> bool:
 
 
 class typeset(nodes.inline):
-    """A piece of text beside the HTML that it becomes."""
+    """A piece of text and its HTML."""
 
 
 def as_html(text: str) -> str | None:
