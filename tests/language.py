@@ -10,6 +10,7 @@ comments and string literals with a space of Python files, and Markdown outside 
 import argparse
 import ast
 import collections
+import functools
 import io
 import re
 import tokenize
@@ -73,17 +74,24 @@ def prose(text: str) -> Iterator[tuple[int, str]]:
             yield number, re.sub(r"`[^`]*`", "", line)
 
 
+@functools.cache
+def _one(phrases: tuple[str, ...]) -> re.Pattern:
+    """One expression with a group for each phrase."""
+    return re.compile("|".join(f"({phrase})" for phrase in phrases), re.I)
+
+
 def found(path: Path, phrases: dict[str, str] = PHRASES) -> list[tuple[int, str, str]]:
     """(line, words, what to write) of every occurrence in a file."""
     text = path.read_text(encoding="utf-8")
     parts = strings_and_comments(text) if path.suffix == ".py" else prose(text)
     return [
-        (line + part.count("\n", 0, match.start()), match[0], instead)
-        for line, part in parts
-        for phrase, instead in phrases.items()
-        for match in re.finditer(
-            phrase, re.sub(r"``?[^`\n]*``?", lambda m: "_" * len(m[0]), part), re.I
+        (
+            line + part.count("\n", 0, match.start()),
+            match[0],
+            list(phrases.values())[match.lastindex - 1],
         )
+        for line, part in parts
+        for match in _one(tuple(phrases)).finditer(CODE.sub(lambda m: "_" * len(m[0]), part))
     ]
 
 
@@ -107,9 +115,7 @@ def main() -> None:
         for line, words, instead in found(path):
             counts[words.lower()] += 1
             if not options.count:
-                print(
-                    f"{path.relative_to(ROOT) if path.is_absolute() else path}:{line}: {words!r}: {instead}"
-                )
+                print(f"{path}:{line}: {words!r}: {instead}")
     if options.count:
         for words, number in counts.most_common():
             print(f"{number:5} {words}")
