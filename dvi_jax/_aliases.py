@@ -1,4 +1,4 @@
-"""Other names of public objects: the terms of the field, and of other packages."""
+"""Other names of public objects: standard terms, and names in other packages."""
 
 from ._solution import Save as SaveAt
 from .dynamics import frequencies as naff

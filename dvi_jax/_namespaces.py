@@ -1,4 +1,4 @@
-"""Packages of `dvi_jax` as attributes, imported when they are first used."""
+"""Packages of `dvi_jax` as attributes, imported at their first use."""
 
 import importlib
 import sys
@@ -14,7 +14,7 @@ NAMESPACES = {
 
 
 def namespace(name: str) -> ModuleType:
-    """`dvi_jax.__getattr__`. **Raises** `AttributeError` for a name that is not there."""
+    """`dvi_jax.__getattr__`. **Raises** `AttributeError` for an unknown name."""
     if name not in NAMESPACES:
         raise AttributeError(f"module 'dvi_jax' has no attribute {name!r}", name=name)
     return importlib.import_module(f"dvi_jax.{NAMESPACES[name]}")
