@@ -90,6 +90,7 @@ class _FromTypeIII(eqx.Module):
             fall, v = jax.grad(energy, argnums=(0, 1))(q1, p0)
             return jnp.stack([v, -fall])
 
+        # A fixed-point form, x = rates(x): its Jacobian is near the identity for small h.
         def residual(x):
             return x - rates(*ends(*x.reshape(shape))).ravel()
 
@@ -140,6 +141,7 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
 
     **Source** the paper, (36); Marsden & West 2001, *Acta Numerica* 10, 357, 1.4.
     """
+    # By the number of arguments alone; a function that takes four and five cannot be classified.
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
         raise TypeError(
@@ -315,8 +317,10 @@ def _velocity(
     def slope(v):
         return jax.grad(L)(v, *parameters)
 
+    # The matrix ∂²L/∂v² of a Lagrangian that is quadratic in v does not depend on v. Found from the
+    # jaxpr, because then also ∂H_D/∂p1 of a separable system is seen to be independent of q0.
     rest = jnp.zeros_like(p)
-    if not depends_on(jax.jacfwd(slope), 0, rest):  # quadratic in v
+    if not depends_on(jax.jacfwd(slope), 0, rest):
         return lanewise.solve(jax.jacfwd(slope)(rest), p - slope(rest))
     start = _start(slope, p, rest)
     # Where v is small next to terms of p that cancel, its scale is that of their round-off.
@@ -354,6 +358,7 @@ def _start(slope: Callable[[Vector], Vector], p: Vector, rest: Vector) -> Vector
         tried = v - part * lanewise.solve(jax.jacfwd(defect)(v), defect(v))
         new = size(tried)
         gain = new < left  # false for NaN, beyond the domain of L
+        # Doubled after a success, so that the search ends with full Newton steps.
         part = jnp.where(gain, jnp.minimum(2 * part, 1), part / 2)
         return jnp.where(gain, tried, v), jnp.where(gain, new, left), part, trials + 1
 

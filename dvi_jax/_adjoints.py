@@ -12,17 +12,7 @@ import lanewise
 from lanewise import Layout
 
 from ._checks import whole
-from ._rollout import (
-    Loop,
-    Outcome,
-    Plan,
-    Task,
-    adds_start_outside,
-    outcome,
-    run,
-    start,
-    with_start,
-)
+from ._rollout import Loop, Outcome, Plan, Task, adds_start_outside, outcome, run, start, with_start
 from ._types import State
 
 

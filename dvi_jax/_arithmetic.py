@@ -76,6 +76,7 @@ class Compensated(Arithmetic):
     def start(self, q0, p0):
         return jnp.zeros_like(q0), jnp.zeros_like(p0)
 
+    # The origin changes in every step: the increments stay small next to it all along.
     def enter(self, equations, q0, p0, memory):
         return dataclasses.replace(equations, origin=(q0, p0)), *memory
 
@@ -131,6 +132,7 @@ class FixedPoint(Arithmetic):
             raise ValueError(
                 f"quantum must be a positive power of two such as 2.0**-40, got {quantum!r}."
             )
+        # A power of two: multiplication by it and by its reciprocal is exact, and so are sums.
         mantissa, exponent = math.frexp(quantum)
         if mantissa != 0.5:
             raise ValueError(

@@ -12,6 +12,7 @@ from ._types import Args, HamiltonianFn, Scalar, State
 from .engine.signature import check_takes
 
 
+# A module and not a closure: `is_first_order` recognises it.
 class _LeftRule(eqx.Module):
     H: Callable[..., Any]
 
@@ -22,11 +23,7 @@ class _LeftRule(eqx.Module):
 
 _MIDPOINT = ((0.5,), (1.0,), ((0.5,),))
 _ROOT = 3.0**0.5 / 6
-_TWO_POINTS = (
-    (0.5 - _ROOT, 0.5 + _ROOT),
-    (0.5, 0.5),
-    ((0.25, 0.25 - _ROOT), (0.25 + _ROOT, 0.25)),
-)
+_TWO_POINTS = ((0.5 - _ROOT, 0.5 + _ROOT), (0.5, 0.5), ((0.25, 0.25 - _ROOT), (0.25 + _ROOT, 0.25)))
 # By order: Gauss nodes c, weights b and integrals a of collocation, and the number of passes. Two
 # passes would suffice for order 4 (the error of a curve enters a stationary value squared), but
 # then terms of h⁵ exceed that of h⁴ at usual steps.
@@ -42,7 +39,7 @@ class _ActionRule(eqx.Module):
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:
         table, passes = _RULES[self.order]
-        c, b, a = (np.asarray(part, p1.dtype) for part in table)
+        c, b, a = (np.asarray(part, p1.dtype) for part in table)  # no promotion of float32
         h = t1 - t0
         each_node = (0, 0, 0, None)
         energy = jax.vmap(self.H, in_axes=each_node)

@@ -44,6 +44,7 @@ def incoming_energy(
 
 
 def _energy(end: int, system: System, h: Any, at: tuple[Any, ...]) -> Scalar:
+    # Value and slope from one evaluation: an H_D may contain a solve.
     value, slope = jax.value_and_grad(system.hamiltonian, argnums=end)(*at)
     h = at[1] - at[0] if h is None else h
     return value + h * slope if end else value - h * slope

@@ -148,6 +148,7 @@ def integrate(
         integrator, method=method, lattice=lattice, adjoint=adjoint, newton=newton,
         root_finder=root_finder, arithmetic=arithmetic, layout=layout,
     )  # fmt: skip
+    # Here and not in `Integrator`: the default method depends on the system.
     method, lattice, layout = integrator.method_for(system), integrator.lattice, integrator.layout
     instance("save", save, Save, "a dvi.Save(...)")
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
@@ -159,6 +160,8 @@ def integrate(
     h = as_scalar("h", h, q0.dtype, zero_allowed=False)
     epsilon = as_scalar("epsilon", epsilon, q0.dtype)
     args = jax.tree.map(as_parameter, args)
+    # Before anything is compiled: an error in a function of the user would otherwise come from
+    # within many frames of tracing.
     System.check_shapes(system, t0, q0, p0, epsilon, args)
     # From here on `system`, `q0`, … may be those of another problem with other variables, whose
     # solution `undo` transforms back.
@@ -168,12 +171,15 @@ def integrate(
     task, q0, p0 = _task(asked, integrator, method, h)
     plan = make_plan(save, num_steps)
     leaves = jax.tree.leaves((task, q0, p0))
+    # An allocation that fails ends the process, or makes the machine swap.
     _check_memory(save, plan, q0, check_observe(task, q0, p0), leaves, layout)
     traced = any(is_traced(x) for x in leaves)
     # The warning needs the damping as a number, which is not known of traced values.
     if not traced and asked.system.force is not None:
         warn_of_dissipation(method, task.equations, task.first_interval, q0, p0)
     if save.ts is not None:
+        # The run itself saves nothing at these times: it stores the steps that contain them, and
+        # `_as_solution` evaluates the method between their ends.
         observed = requested_times(asked.save, task, num_steps)
         task = dataclasses.replace(task, observe=observed)
     if progress is None:
@@ -225,6 +231,8 @@ def _whole(
     return _as_solution(task, plan, observe, outcome, q0, p0, layout)
 
 
+# The parts of a run with progress. Each is compiled for itself; the carry between them has all that
+# a step depends on, so that the numbers are those of one run.
 @eqx.filter_jit
 def _begin(task: Task, q0, p0):
     return start(task, q0, p0)
@@ -243,6 +251,7 @@ def _piece(task: Task, plan: Plan, carry, layout: Layout):
 
 def _in_pieces(task: Task, plan: Plan, q0, p0, progress, layout) -> Outcome:
     """The same run as `_whole`, in pieces between save points, with a report after each."""
+    # Whole blocks, and as many in each piece (the last one may have fewer): one program serves all.
     blocks = max(1, -(-plan.num_blocks // _PIECES))
     carry, done, parts, is_last = _begin(task, q0, p0), 0, [], False
     while not is_last:
@@ -277,7 +286,7 @@ def _as_solution(
     if reductions and isinstance(reductions[0], RequestedTimes):
         reached, starts, (ts, qs, ps) = at_times(curve, reductions[0], values[0], safe)
         if reductions[0].clock is None:
-            ts = reductions[0].ts  # also those that were not reached
+            ts = reductions[0].ts  # also the times that were not reached
         missed = (result == RESULTS.successful) & ~jnp.all(reached)
         result = RESULTS.where(missed, RESULTS.not_reached, result)
         values, hs = values[1:], ts - starts.t0
@@ -318,6 +327,8 @@ _solution = eqx.filter_jit(_as_solution)
 def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     result = solution.result
     if is_traced(status_code(result)):
+        # The status is known when the compiled program runs: only an error of equinox can report
+        # it, without the solution up to the failure.
         fine = (result == RESULTS.successful) | (result == RESULTS.stopped)
         arrays, rest = eqx.partition(solution, eqx.is_array)
         if not manual_axes(*jax.tree.leaves(arrays)):

@@ -81,10 +81,7 @@ _FIELDS = {
     ),
     "adjoint": (AbstractAdjoint, "dvi.Reversible(), dvi.Checkpointed() or dvi.Direct()"),
     "root_finder": (RootSolver, "dvi.Newton(), dvi.SimplifiedNewton() or dvi.Picard()"),
-    "arithmetic": (
-        Arithmetic,
-        "dvi.FloatingPoint(), dvi.Compensated() or dvi.FixedPoint(quantum)",
-    ),
+    "arithmetic": (Arithmetic, "dvi.FloatingPoint(), dvi.Compensated() or dvi.FixedPoint(quantum)"),
     "layout": (Layout, 'dvi.Layout() or dvi.Layout(form="arrays")'),
 }
 

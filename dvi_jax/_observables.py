@@ -43,6 +43,7 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
         try:
             out = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, task.args)
         except Exception as error:
+            # The error itself stays: its type and traceback show the line of the user.
             error.add_note(f"(in the observable {called}, called with {_STEP})")
             raise
         if not hasattr(out, "shape") and not isinstance(out, int | float):

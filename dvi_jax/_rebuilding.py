@@ -100,8 +100,10 @@ def _rebuilt(
     `known_start`, and whether all solves succeeded."""
     group = largest_divisor(count, LOOKS)
 
+    # Cotangents go along in the same loop: states are needed once, and none is stored.
     def undo(state, _):
         k, after, sums, solved = state
+        # Without the memory of the arithmetic, whose effect is below the accepted difference.
         q, p, info = task.method.inverse(task.equations, task.interval(k), *after)
         if along is not None:
             sums = along(k, after, (q, p), sums)
@@ -185,6 +187,7 @@ def pull_back(
         ((_, _, t1), _, values), pull = jax.vjp(
             lambda theta, q, p: local_step(theta, q, p, k, p1), theta, *before
         )
+        # Functions are observed at save points only, which the last step of a block ends at.
         at_end = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
         ct, seeds = jnp.zeros_like(t1), []
         for r, memory, c, value in zip(
@@ -250,6 +253,7 @@ def pull_back(
             sums = pieces.over(undo, sums, reverse=True)
         return sums
 
+    # Each block begins where the one before ended; saved states are exact, not reconstructed.
     start_state = (q_start, p_start)
     ends = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start_state, (saved.q, saved.p))
     grad = jax.tree.map(jnp.zeros_like, theta)

@@ -155,6 +155,7 @@ class Reversible(AbstractAdjoint):
             return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
 
         smooth, (carry, saved, tail, counts) = trajectory(inputs, whole)
+        # In the forward pass: a reverse pass cannot return a number besides the cotangents.
         rebuilt = None
         if self.report_defect:
 
@@ -168,6 +169,7 @@ class Reversible(AbstractAdjoint):
         kept = eqx.combine(smooth.saved, counts)
         if adds_start_outside(plan):
             kept = with_start(kept, q0, p0)
+        # The differentiable outputs take the place of their copies in the carry, which have none.
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), kept, smooth.reduced, rebuilt)
 
     def _inner_loop(self, body, state, _, count):

@@ -71,6 +71,7 @@ class Task(eqx.Module):
     def at_save(self, carry: "Carry", taken: "StepTaken | None") -> list[Any]:
         """The values of functions without a reduction and the running values of reductions, in tree
         order, at a save point after the step `taken`."""
+        # A running value is NaN after a failure: the reduction still has that of the steps before.
         memories, values = iter(carry.reductions), []
         for f in self._leaves():
             if isinstance(f, Running):
@@ -180,6 +181,7 @@ class Plan(NamedTuple):
 def make_plan(save: Save, num_steps: int) -> Plan:
     every = save.every
     if every is None:
+        # Without `every` a run that saves its end only is one block. A block has at least one step.
         keeps_end_alone = save.final or save.ts is not None
         every = max(num_steps, 1) if keeps_end_alone else 1
     num_blocks, tail = divmod(num_steps, every)
@@ -209,6 +211,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
 
     _, reductions = task.observables()
     failed = result != RESULTS.successful
+    # A start that meets the condition of a Stop already has no step at all.
     stop = None
     if task.stop is not None:
         over = ~failed & (event(task.stop.g, task.t0, q0, p0, task.args) >= 0)
@@ -266,6 +269,7 @@ def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
         k=carry.k + 1,
         q=q1,
         p=p1,
+        # The memory of the last good step, for the report: that of a failed one may be NaN.
         lattice=jax.tree.map(lambda new, old: jnp.where(good, new, old), memory, carry.lattice),
         result=result,
         failed_step=failed_step,
@@ -324,6 +328,7 @@ def _reduced(
 def _pushed(push: Callable, vectors: Array, taken: StepTaken, h: Scalar) -> Pushed:
     """Deviation vectors (δq, δp), the rows of `vectors`, after the step; NaN if it has failed."""
 
+    # Vectors are flat, so that observers of deviations need not know the shape of a state.
     def of(vector):
         dq, dp = (x.reshape(taken.q0.shape) for x in jnp.split(vector, 2))
         return jnp.concatenate([x.ravel() for x in push(dq, dp)])
@@ -379,6 +384,7 @@ def run(
         return carry, Saved(interval.t1, interval.h, carry.q, carry.p, observed, inner)
 
     carry, saved = loop(steps, carry, None, plan.num_blocks)
+    # The tail is outside of the scan, whose rows all have the same number of steps.
     if not plan.tail:
         return carry, saved, None
     carry, tail = steps(carry, None, plan.tail)

@@ -16,6 +16,7 @@ from ._types import State
 from .engine.signature import check_takes
 
 
+# The times are an array, not static: they may be traced, and new times need no new compilation.
 def _times(ts: Any) -> Any:
     return None if ts is None else as_times("Save(ts=...)", ts)
 
@@ -76,6 +77,7 @@ class Save(eqx.Module):
             )
         if not is_traced(self.ts):
             steps = np.diff(np.asarray(self.ts))
+            # In order, since a step finds its times by bisection. Traced ones are sorted in a run.
             ordered = bool((steps >= 0).all() or (steps <= 0).all())
             if not (ordered and np.isfinite(np.asarray(self.ts)).all()):
                 raise ValueError(

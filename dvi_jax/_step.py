@@ -69,6 +69,8 @@ class Equations(eqx.Module):
     def momentum_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
         at = (self.system, *interval[:2], *self.absolute(q0, p1), self.epsilon, self.args)
+        # With a quantum the last bits decide where a rate is rounded to: compiled separately they
+        # are the same forwards and backwards.
         if self.quantum is None:
             return _momentum_rate(*at)
         return one_by_one(_momentum_rate, *at)
@@ -179,6 +181,8 @@ def _solved(
     def residual(x1):
         return x1 - start - h * rate(x1.reshape(x0.shape)).ravel()
 
+    # A small increment next to an origin has its own round-off, smaller than that of the whole
+    # coordinate in `known`: both ends of the step as they are represented.
     represented = jnp.maximum(jnp.abs(x0), jnp.abs(guess)).ravel()
     x1, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton, represented)
     return x1.reshape(x0.shape), info
@@ -193,5 +197,6 @@ def judge(info: RootInfo, q: State, p: State, quantum: float | None = None) -> S
         largest = quantum * 2.0 ** (jnp.finfo(q.dtype).nmant + 1)
         fits = jnp.all(jnp.abs(q) <= largest) & jnp.all(jnp.abs(p) <= largest)
         result = RESULTS.where(fits, result, RESULTS.out_of_range)
+    # Last, because NaN makes a solve fail as well, and is the reason that helps the user.
     result = RESULTS.where(finite, result, RESULTS.not_finite)
     return StepInfo(result, info.iterations, info.residual)

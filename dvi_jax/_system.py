@@ -94,7 +94,7 @@ class System(eqx.Module):
         H = self.H_D(s0, s1, q0, p1, args)
         if self.perturbation is not None:
             H = H + epsilon * self.perturbation(s0, s1, q0, p1, args)
-        return jnp.asarray(H, p1.dtype)
+        return jnp.asarray(H, p1.dtype)  # also where args are in double and the state is not
 
     def disturbing_force(
         self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
@@ -188,6 +188,7 @@ def _traced_output(
             return seen[kinds]
     except TypeError:  # a function or an argument without a hash: it is traced in every call
         seen = {}
+    # Traced, not called: at a start in a singularity a value would be NaN, its shape is the same.
     before = reads(function)
     try:
         out = eqx.filter_eval_shape(function, t, t, q, p, args)

@@ -43,6 +43,7 @@ def over_devices(
     if chosen.size == 0:
         raise ValueError("over_devices needs at least one device.")
     whole("out_axes", out_axes, least=0)
+    # Auto: shardings of arguments outside are left to JAX, and need not be declared.
     mesh = jax.sharding.Mesh(chosen, (LANES,), axis_types=(AxisType.Auto,))
 
     def call(*args: Any) -> Any:

@@ -40,7 +40,7 @@ class Picard(Contraction):
     """
 
     def correction(self, F, x0):
-        return F
+        return F  # F(x) = x − (right side): subtracting it is the fixed-point iteration
 
     def solve_tangent(self, linear, rhs):
         return _without_matrix(self, linear, rhs)

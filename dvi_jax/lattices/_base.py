@@ -73,6 +73,7 @@ class Lattice(eqx.Module):
         """The memory before the first step."""
         return None
 
+    # The status is None, not `successful`, where steps always exist: no loop has to carry it.
     def next(
         self, memory: Any, equations: Equations, place: Place
     ) -> tuple[Interval, Any, RESULTS | None]:

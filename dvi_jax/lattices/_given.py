@@ -66,6 +66,7 @@ class Given(Lattice):
         start, end = self.ts[k], self.ts[k + 1]
         return Interval(start, end, end - start)
 
+    # Known times have been checked in `__check_init__`; of traced ones this becomes the status.
     def is_usable(self, t0, h):
         steps = jnp.diff(self.ts)
         return jnp.all(jnp.isfinite(self.ts)) & (jnp.all(steps > 0) | jnp.all(steps < 0))

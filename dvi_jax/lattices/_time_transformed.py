@@ -74,11 +74,14 @@ class TimeTransformed(Uniform):
 
     def transform(self, run):
         """The run in extended phase space, in the time σ from 0 on."""
+        # K contains ε: for the extended problem it is a parameter like any other, which may be
+        # traced and differentiated.
         extended = Extended(run.system, self.speed, run.epsilon, run.q0.shape)
         _check_speed(self.speed, run.t0, run.q0, run.p0, run.args)
         q0, p0 = start_state(*extended.start(run.t0, run.q0, run.p0, run.args))
         observe = jax.tree.map(extended.seen, run.observe, is_leaf=is_observable)
         save, stop = run.save, run.stop
+        # Requested times are those of t, which here is a coordinate: a clock reads it.
         if save.ts is not None:
             save = Save(ts=save.ts, clock=_SeenPoint(save.clock or _own_time, extended))
         if stop is not None:
@@ -92,7 +95,7 @@ class TimeTransformed(Uniform):
             # ε is inside of K and its force. Zero without a force: an ε that has no effect warns.
             epsilon=(jnp.ones_like if has_force else jnp.zeros_like)(run.epsilon),
             args=run.args,
-            observe=(observe, _time_gained),
+            observe=(observe, _time_gained),  # the second gives ``solution.hs``
             save=save,
             stop=stop,
         ), extended.undo
@@ -122,7 +125,7 @@ class Extended(eqx.Module):
 
     def hamiltonian(self, s0, s1, position, momentum, args):
         """K = g (H + p_t)."""
-        del s0, s1
+        del s0, s1  # K is autonomous, also where H depends on time: t is a coordinate
         q, p, t, pt = self.parts(position, momentum)
         H = self.system.hamiltonian(t, t, q, p, self.epsilon, args)
         return jnp.asarray(self.speed(t, q, p, args), H.dtype) * (H + pt)
@@ -133,6 +136,7 @@ class Extended(eqx.Module):
         q, p, t, _ = self.parts(position, momentum)
         at = (t, t, q, p, self.epsilon, args)
         W = self.system.disturbing_force(*at)
+        # p_t balances the power of the force, so that K stays 0 although the energy changes.
         power = jnp.sum(W * jax.grad(self.system.hamiltonian, argnums=3)(*at))
         return self.speed(t, q, p, args) * jnp.append(W.ravel(), -power)
 
@@ -217,6 +221,7 @@ def _time_gained(s0, s1, position0, momentum0, position1, momentum1, args):
 
 
 def _check_speed(speed, t0, q0, p0, args) -> None:
+    # At the start only: later on a speed that is not positive stops the time, and the run with it.
     value = jnp.asarray(speed(t0, q0, p0, args))
     if value.shape != () or (not is_traced(value) and not float(value) > 0):
         raise ValueError(

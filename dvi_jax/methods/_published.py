@@ -60,6 +60,7 @@ class Yoshida(Published):
     """
 
     tables: ClassVar[Tables] = {
+        # The real root of 2γ³ + (1 − 2γ)³ = 0, by which the leading error vanishes.
         4: of_strang(1.0 / (2.0 - 2.0 ** (1.0 / 3.0))),
         6: of_strang(0.78451361047755726382, 0.23557321335935813368, -1.17767998417887100695),
         8: of_strang(
@@ -74,6 +75,7 @@ class Yoshida(Published):
     }
 
 
+# So that the leading error, proportional to Σγ³, vanishes: 4γ³ + (1 − 4γ)³ = 0.
 _GAMMA = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 
 
@@ -115,7 +117,8 @@ class McLachlan(Published):
     """
 
     tables: ClassVar[Tables] = {
-        # Pairs of the map and its adjoint, a pair in each line.
+        # Pairs of the map and its adjoint, a pair in each line. By formulas, since the coefficients
+        # are algebraic numbers.
         4: (
             *((14 - _ROOT) / 108, (146 + 5 * _ROOT) / 540),
             *((-23 - 20 * _ROOT) / 270, (-2 + 10 * _ROOT) / 135),
