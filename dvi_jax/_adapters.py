@@ -19,12 +19,14 @@ from .engine.newton import Newton, Vector, find_root
 from .engine.signature import accepts, check_takes
 
 _NEAR = 1e-4
-"""Part of the first defect at which the damped search hands over to Newton's method."""
+"""Fraction of the initial defect at which the damped search ends and Newton's method begins."""
 
 _MOST_TRIALS = 100
-"""Trials of the damped search, halvings counted."""
+"""Maximum number of trials of the damped search, halvings included."""
 
 
+# The Hamiltonians below are modules, not closures: their fields are compared, so that one that is
+# made again needs no new compilation, and `reads` finds the user's functions in them.
 class _LegendreTransform(eqx.Module):
     """H(t, q, p, args) = p·v − L(t, q, v, args), for `discretise`."""
 
@@ -57,6 +59,7 @@ class _FromLagrangian(eqx.Module):
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:
         h = t1 - t0
 
+        # The unknown is v, not q1: it stays of order one as h → 0.
         def action_rate(v):
             return self.L_d(t0, t1, q0, q0 + h * v, args) / h
 
@@ -87,6 +90,7 @@ class _FromTypeIII(eqx.Module):
             fall, v = jax.grad(energy, argnums=(0, 1))(q1, p0)
             return jnp.stack([v, -fall])
 
+        # A fixed-point form, x = rates(x): its Jacobian is near the identity for small h.
         def residual(x):
             return x - rates(*ends(*x.reshape(shape))).ravel()
 
@@ -112,8 +116,8 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
 
         p1 = ∂L_D/∂v (t0, t1, q0, v),    H_D(t0, t1, q0, p1) = p1·v − L_D,    v = (q1 − q0)/h
 
-    solved for v, inside and to round-off, at each evaluation. A continuous L(t, q, v, args) gives
-    in the same way H(t, q, p, args), which `discretise` takes. ∂H_D/∂p1 is that v.
+    Each evaluation solves for v, to round-off. A continuous L(t, q, v, args) gives in the same way
+    H(t, q, p, args) for `discretise`. ∂H_D/∂p1 is that v.
 
     **Arguments**
 
@@ -125,18 +129,19 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
     four a function ``(t, q, p, args)`` → scalar for `discretise`; [energy].
 
     **Raises** `TypeError` for a function that takes neither four nor five arguments, or both (with
-    defaults or ``*rest``); `ValueError` for one that returns no scalar.
+    defaults or ``*rest``); `ValueError` for one that does not return a scalar.
 
     **Accuracy** round-off; derivatives to any order are those of the implicit function theorem, in
-    q0, p1, t and args. Only regular Lagrangians, ∂²L/∂v² invertible, smooth at v = 0 too. Where L
-    is read from its jaxpr to be quadratic in v, one linear solve is exact, and what is separable
-    stays explicit. Else Newton's method starts from the v of the quadratic part at v = 0, with
-    steps halved while they lead nowhere better (a speed limit is kept that way). Where no v is
-    found H_D is NaN or infinite, and the status of the step says so: a Lagrangian linear in v ends
-    as `not_finite`.
+    q0, p1, t and args. Only for regular Lagrangians, with ∂²L/∂v² invertible, that are smooth at
+    v = 0. If L is quadratic in v, which is read from its jaxpr, one linear solve is exact, and a
+    separable system stays explicit. Otherwise Newton's method starts from the v of the quadratic
+    part at v = 0, with steps halved until they reduce the defect (so that no speed limit of L is
+    exceeded). Where no v is found H_D is NaN or infinite, and the status of the step reports it: a
+    Lagrangian linear in v gives `not_finite`.
 
     **Source** the paper, (36); Marsden & West 2001, *Acta Numerica* 10, 357, 1.4.
     """
+    # By the number of arguments alone; a function that takes four and five cannot be classified.
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
         raise TypeError(
@@ -155,15 +160,15 @@ def from_lagrangian(L_d: Callable[..., Any], newton: Newton = Newton()) -> Hamil
 
         H_D(t0, t1, q0, p1) = [p1·(q1 − q0) − L_d(t0, t1, q0, q1)] / h,    h = t1 − t0
 
-    with q1 solved from the second equation at each evaluation (where the bracket is stationary in
-    q1). The map (12)–(13) of H_D is that of L_d, and its solutions satisfy the discrete
-    Euler–Lagrange equations, with a force
+    where each evaluation solves the second equation for q1, at which the bracket is stationary. The
+    map (12)–(13) of H_D is that of L_d, and its solutions satisfy the discrete Euler–Lagrange
+    equations, with a force
 
         ∂L_d/∂q1 (q_{k−1}, q_k) + ∂L_d/∂q0 (q_k, q_{k+1}) + h ε W_k = 0.
 
-    In the words of forced discrete Lagrangians W is the left discrete force, f_d⁻ = hεW and
-    f_d⁺ = 0. A right force f_d⁺(q_{k−1}, q_k) belongs to the step before: it is no W of this step.
-    `velocity_force` takes a force on v, or on q1 = q0 + hv.
+    In terms of forced discrete Lagrangians W is the left discrete force, f_d⁻ = hεW and f_d⁺ = 0.
+    A right force f_d⁺(q_{k−1}, q_k) belongs to the step before and cannot be a W of this step.
+    `velocity_force` converts a force on v, or on q1 = q0 + hv.
 
     The trapezoidal L_d = h/2 [L(q0, v) + L(q1, v)], v = (q1 − q0)/h, is Störmer–Verlet (`Strang`)
     for L = |v|²/2 − V(q); the midpoint L_d = h L((q0 + q1)/2, v) is `GaussLegendre(1)`.
@@ -177,11 +182,12 @@ def from_lagrangian(L_d: Callable[..., Any], newton: Newton = Newton()) -> Hamil
     **Returns** a function ``(t0, t1, q0, p1, args)`` → scalar [energy], for `System`.
 
     **Raises** `TypeError` for a function that does not take the five arguments, `ValueError` for
-    one that returns no scalar. `System` refuses it with `slow_time`, where t1 − t0 is not h.
+    one that does not return a scalar, and in `System` with `slow_time`, where t1 − t0 is not h.
 
-    **Accuracy** as `legendre`, of L_d(q0, q0 + hv)/h in v. The step is taken from t1 − t0 and loses
-    digits late in a long run. There is no H_D(t, t, …): methods on the continuous equations
-    (`RungeKutta4`, `GaussLegendre`, `LobattoIIIAIIIB`) end as `not_finite` on the first step.
+    **Accuracy** as `legendre`, of L_d(q0, q0 + hv)/h in v. The step is computed as t1 − t0, which
+    loses digits late in a long run. H_D(t, t, …) does not exist: methods on the continuous
+    equations (`RungeKutta4`, `GaussLegendre`, `LobattoIIIAIIIB`) end with `not_finite` on the first
+    step.
 
     **Source** Marsden & West 2001, *Acta Numerica* 10, 357, 1.5 and 3.2 (forces); Hairer, Lubich &
     Wanner 2006, *Geometric Numerical Integration*, VI.5 and VI.6.
@@ -216,9 +222,9 @@ def from_type_iii(H_minus: Callable[..., Any], newton: Newton = Newton()) -> Ham
         H_D(t0, t1, q0, p1) = H⁻(t0, t1, q0 + hv, p1 − hf) + h f·v,    h = t1 − t0
 
     where it is stationary in v and f, that is v = ∂H⁻/∂p0 = (q1 − q0)/h and
-    f = −∂H⁻/∂q1 = (p1 − p0)/h; both are solved for at each evaluation. Without a force it is the
-    map of ``Adjoint(TypeII())`` on H_D(t0, t1, q0, p1) = H⁻(t1, t0, q0, p1), which needs no inner
-    solve: take that where the map is all that is wanted, this for the tools that work on H_D.
+    f = −∂H⁻/∂q1 = (p1 − p0)/h; each evaluation solves for both. Without a force it is the map of
+    ``Adjoint(TypeII())`` on H_D(t0, t1, q0, p1) = H⁻(t1, t0, q0, p1), which needs no inner solve:
+    use that for the map alone, and this function for tools that work on H_D.
 
     **Arguments**
 
@@ -228,21 +234,21 @@ def from_type_iii(H_minus: Callable[..., Any], newton: Newton = Newton()) -> Ham
     **Returns** a function ``(t0, t1, q0, p1, args)`` → scalar [energy], for `System`.
 
     **Raises** `TypeError` for a function that does not take the five arguments, `ValueError` for
-    one that returns no scalar. `System` refuses it with `slow_time`, where t1 − t0 is not h.
+    one that does not return a scalar, and in `System` with `slow_time`, where t1 − t0 is not h.
 
     **Accuracy** round-off; derivatives to any order are those of the implicit function theorem. The
-    step is taken from t1 − t0 and loses digits late in a long run. A solve that fails gives NaN,
-    and the status of the step says so.
+    step is computed as t1 − t0, which loses digits late in a long run. A solve that fails gives
+    NaN, and the status of the step reports it.
 
     **Source** Leok & Zhang 2011, *IMA J. Numer. Anal.* 31, 1497 (types II and III); the form of
-    H_D: our own, by way of L_d = p0·(q1 − q0) − h H⁻ = p1·(q1 − q0) − h H_D.
+    H_D: our own, from L_d = p0·(q1 − q0) − h H⁻ = p1·(q1 − q0) − h H_D.
     """
     check_takes("H_minus", H_minus, "(t0, t1, q1, p0, args)")
     return _FromTypeIII(H_minus, newton)
 
 
 def velocity_force(H_D: HamiltonianFn, F: Callable[..., Any]) -> ForceFn:
-    r"""The disturbing force W on (q0, p1) of a force F on (q0, v).
+    r"""The perturbing force W(q0, p1) of a force F(q0, v).
 
         W(t0, t1, q0, p1) = F(t0, t1, q0, v),    v = ∂H_D/∂p1 = (q1 − q0)/h
 
@@ -250,7 +256,7 @@ def velocity_force(H_D: HamiltonianFn, F: Callable[..., Any]) -> ForceFn:
 
     **Arguments**
 
-    - `H_D`: the discrete Hamiltonian of the same `System`; a perturbation there is not in v.
+    - `H_D`: the discrete Hamiltonian of the same `System`; v does not include its perturbation.
     - `F`: function ``(t0, t1, q0, v, args)`` → array like q0 [energy / unit of q].
 
     **Returns** a function ``(t0, t1, q0, p1, args)`` → array like q0, for `System`.
@@ -269,17 +275,15 @@ def velocity_force(H_D: HamiltonianFn, F: Callable[..., Any]) -> ForceFn:
 def _transformed(
     L: Callable[[State], Any], p: State, newton: Newton, name: str, scale: State | None = None
 ) -> Scalar:
-    """p·v − L(v) at the v with ∂L/∂v = p; NaN where none is found.
-
-    `scale` is a size of v beside which its round-off is measured: q0/h where v is a difference of
-    positions.
-    """
+    """p·v − L(v) at the v with ∂L/∂v = p; NaN where none is found. `scale`: a scale of the
+    round-off of v, q0/h where v is a difference of positions."""
     what = "an action" if name.startswith("L_d") else "an energy"
 
     def lagrangian(v):
         return _require_scalar(L(v.reshape(p.shape)), name, p.shape, what)
 
     known = p.ravel()
+    # A custom derivative may not close over traced values: they become arguments.
     free, closed_over = jax.closure_convert(lagrangian, known)
     scale = jnp.zeros_like(known) if scale is None else scale.ravel()
     return _stationary(free, newton, known, closed_over, scale)
@@ -296,7 +300,8 @@ def _stationary(
 
 @_stationary.defjvp
 def _(L, newton, inputs, changes):
-    # being stationary in v the value changes as if v stayed; v itself is implicit to any order
+    # The value is stationary in v: its first derivative is that at constant v. Higher ones follow,
+    # since v itself has derivatives by the implicit function theorem.
     v = _velocity(L, newton, *inputs)
 
     def value(p, parameters):
@@ -308,16 +313,17 @@ def _(L, newton, inputs, changes):
 def _velocity(
     L: Callable[..., Scalar], newton: Newton, p: Vector, parameters: list, scale: Vector
 ) -> Vector:
-    """The v with ∂L/∂v (v, *parameters) = p; NaN where none is found."""
 
     def slope(v):
         return jax.grad(L)(v, *parameters)
 
+    # The matrix ∂²L/∂v² of a Lagrangian that is quadratic in v does not depend on v. Found from the
+    # jaxpr, because then also ∂H_D/∂p1 of a separable system is seen to be independent of q0.
     rest = jnp.zeros_like(p)
-    if not depends_on(jax.jacfwd(slope), 0, rest):  # quadratic in v
+    if not depends_on(jax.jacfwd(slope), 0, rest):
         return lanewise.solve(jax.jacfwd(slope)(rest), p - slope(rest))
     start = _start(slope, p, rest)
-    # where v is small beside the terms of p that cancel, their round-off is its scale
+    # Where v is small next to terms of p that cancel, its scale is that of their round-off.
     of_terms = lanewise.solve(jax.jacfwd(slope)(start), p)
     scale = jnp.maximum(jnp.abs(scale), jnp.abs(start) + jnp.abs(of_terms))
     return _root(lambda v: slope(v) - p, start, scale, newton)
@@ -326,16 +332,14 @@ def _velocity(
 def _root(
     residual: Callable[[Vector], Vector], guess: Vector, scale: Vector, newton: Newton
 ) -> Vector:
-    """The root near `guess`, NaN where Newton's method finds none: there is no status in an H_D."""
     x, info = find_root(residual, guess, scale, newton)
+    # An H_D has no status: NaN reports a failure, from which the step gets its status.
     return jnp.where(info.converged, x, jnp.nan)
 
 
 def _start(slope: Callable[[Vector], Vector], p: Vector, rest: Vector) -> Vector:
-    """A v with slope(v) near p: Newton's method from rest, a step halved while it gains nothing.
-
-    No derivative is taken of it: a root does not depend on where the search began.
-    """
+    """A v with slope(v) near p, by Newton's method with step halving, from rest."""
+    # Without derivatives: a root does not depend on the start of the search.
     free, closed_over = jax.closure_convert(slope, rest)
     closed_over, p = lax.stop_gradient((closed_over, p))
 
@@ -353,7 +357,8 @@ def _start(slope: Callable[[Vector], Vector], p: Vector, rest: Vector) -> Vector
         v, left, part, trials = state
         tried = v - part * lanewise.solve(jax.jacfwd(defect)(v), defect(v))
         new = size(tried)
-        gain = new < left  # false for NaN
+        gain = new < left  # false for NaN, beyond the domain of L
+        # Doubled after a success, so that the search ends with full Newton steps.
         part = jnp.where(gain, jnp.minimum(2 * part, 1), part / 2)
         return jnp.where(gain, tried, v), jnp.where(gain, new, left), part, trials + 1
 

@@ -1,4 +1,4 @@
-"""How gradients flow back through a trajectory."""
+"""Ways to differentiate a trajectory in reverse mode."""
 
 import abc
 import math
@@ -12,37 +12,28 @@ import lanewise
 from lanewise import Layout
 
 from ._checks import whole
-from ._rollout import (
-    Loop,
-    Outcome,
-    Plan,
-    Task,
-    adds_start_outside,
-    outcome,
-    run,
-    start,
-    with_start,
-)
+from ._rollout import Loop, Outcome, Plan, Task, adds_start_outside, outcome, run, start, with_start
 from ._types import State
 
 
 class AbstractAdjoint(eqx.Module):
     """Base of the ways to differentiate a trajectory.
 
-    All of them give the same derivative, that of the discrete map, to round-off; they
-    differ in memory and time.
+    All of them give the same derivative, that of the discrete map, to round-off; they differ in
+    memory and time.
     """
 
     @abc.abstractmethod
     def rollout(
         self, task: Task, plan: Plan, q0: State, p0: State, layout: Layout = Layout()
     ) -> Outcome:
-        """The whole trajectory, differentiable in this adjoint's way."""
+        """The whole trajectory, differentiable in this way."""
 
 
 def _direct_rollout(
     task: Task, plan: Plan, q0: State, p0: State, loop: Loop, layout: Layout
 ) -> Outcome:
+    # Only arrays may be arguments of a compiled function; the rest of a task is static.
     arrays, rest = eqx.partition(task, eqx.is_array)
 
     def forward(arrays, q0, p0):
@@ -56,9 +47,10 @@ def _direct_rollout(
 
 
 class Direct(AbstractAdjoint):
-    """Forward and reverse mode straight through the scan.
+    """Forward and reverse mode through the scan itself.
 
-    Reverse mode stores what each step needs: memory grows with num_steps; good for short runs.
+    Reverse mode stores intermediate values of each step: memory grows with num_steps. For short
+    runs.
     """
 
     def rollout(self, task, plan, q0, p0, layout=Layout()):
@@ -68,10 +60,10 @@ class Direct(AbstractAdjoint):
 class Checkpointed(AbstractAdjoint):
     """Reverse mode with recomputation: memory grows as √num_steps, for one more forward pass.
 
-    - `segments`: pieces that a scan is cut into; None means about √(number of steps).
+    - `segments`: number of pieces of a scan; None means about √(number of steps).
 
-    Forward mode costs what it costs with `Direct`. Works for every method and any
-    dynamics, chaotic or dissipative.
+    Forward mode costs the same as with `Direct`. Works for every method and any dynamics, chaotic
+    or dissipative.
     """
 
     segments: int | None = eqx.field(static=True, default=None)
@@ -84,9 +76,11 @@ class Checkpointed(AbstractAdjoint):
         return _direct_rollout(task, plan, q0, p0, self._loop, layout)
 
     def _loop(self, body, carry, _, count):
+        # √count segments of √count steps: the memory is that of the segment starts and of the
+        # steps of one segment, whose sum is then smallest.
         segments = min(self.segments or math.isqrt(count), count)
         size = count // max(segments, 1)
-        if size < 2:
+        if size < 2:  # nothing would be recomputed
             return lax.scan(body, carry, None, count)
 
         def segment(length):

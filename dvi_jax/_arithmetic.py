@@ -1,4 +1,4 @@
-"""How a state is kept from step to step: rounded, with what rounding loses, or on a grid."""
+"""Representations of a state: rounded, with the rounding error, or on a grid."""
 
 import dataclasses
 import math
@@ -14,54 +14,60 @@ from .methods import Method
 
 
 class Arithmetic(eqx.Module):
-    """Base of the ways to keep a state from step to step; what is here keeps it as it is."""
+    """Base of the representations of a state between steps. The defaults change nothing."""
 
     undoes_steps: ClassVar[bool] = False
     """Whether steps are undone bit for bit, so that none may need a solve."""
 
+    is_plain: ClassVar[bool] = False
+    """Whether a step of the method begins and ends with the state itself."""
+
     def prepare(
         self, method: Method, equations: Equations, interval: Interval, q0: State, p0: State
     ) -> tuple[Equations, State, State]:
-        """The equations and the start as this arithmetic has them, or an error: once per run."""
+        """The equations and the start in this representation, once per run. **Raises**
+        `ValueError` for a method or equations that it does not support."""
         return equations, q0, p0
 
     def start(self, q0: State, p0: State) -> Any:
-        """What is remembered beside the state, before the first step."""
+        """The memory next to the state, before the first step."""
         return None
 
     def enter(
         self, equations: Equations, q0: State, p0: State, memory: Any
     ) -> tuple[Equations, State, State]:
-        """The equations and the state that a step of the method begins with."""
+        """The equations and the state with which a step of the method begins."""
         return equations, q0, p0
 
     def leave(self, q0: State, p0: State, x1: State, y1: State) -> tuple[State, State, Any]:
-        """The state after the step, which led to (x1, y1), and what is remembered beside it."""
+        """The state after a step from (q0, p0), whose result is (x1, y1), and the memory."""
         return x1, y1, None
 
 
 class FloatingPoint(Arithmetic):
     """Plain floating point: each step rounds the state (default).
 
-    What the map keeps then makes a random walk, of about 1e-16 √N of its size after N steps in
-    float64.
+    Invariants of the map then perform a random walk, with a relative size of about 1e-16 √N after N
+    steps in float64.
     """
+
+    is_plain: ClassVar[bool] = True
 
 
 class Compensated(Arithmetic):
-    r"""Compensated summation: what rounding takes from the state is kept and given back.
+    r"""Compensated summation: the rounding error of the state is stored and added again.
 
     The state is q + e, with q = fl(q + e) and e below round-off of q. A step of the method runs in
-    coordinates x relative to q, where no digits of an increment are lost beside a large q,
+    coordinates x relative to q, where no digits of an increment are lost next to a large q,
 
         x0 = e,   x0 → x1 by the method,   q ← fl(q + x1),   e ← (q_before − q) + x1   exactly,
 
-    and so for p. What is left is the rounding of the increments themselves, h times smaller: still
-    a random walk, if h is no short fraction. With h = 0.05 or 0.1 roundings repeat and add up; take
-    a power of two. Any method, explicit or not, forced or not.
+    and likewise for p. The rounding of the increments remains, h times smaller: still a random
+    walk, unless h is a short decimal fraction. With h = 0.05 or 0.1 rounding errors repeat and add
+    up; choose a power of two. Works with every method, explicit or implicit, forced or not.
 
-    What is saved and observed is q without e. Derivatives are those of the map: e has none. The
-    rebuilding of `Reversible` leaves e out.
+    Saved and observed values are q without e. Derivatives are those of the map; e has none. The
+    reconstruction of `Reversible` omits e.
 
     **Source** Kahan 1965; Møller 1965. The exact sum: Knuth, *The Art of Computer Programming*
     2, 4.2.2. For symplectic methods: Hairer, Lubich & Wanner 2006, VIII.5.
@@ -70,40 +76,42 @@ class Compensated(Arithmetic):
     def start(self, q0, p0):
         return jnp.zeros_like(q0), jnp.zeros_like(p0)
 
+    # The origin changes in every step: the increments stay small next to it all along.
     def enter(self, equations, q0, p0, memory):
         return dataclasses.replace(equations, origin=(q0, p0)), *memory
 
     def leave(self, q0, p0, x1, y1):
         q1, lost_q = _exact_sum(q0, x1)
         p1, lost_p = _exact_sum(p0, y1)
+        # In exact arithmetic the errors are zero, and so are their derivatives.
         return q1, p1, lax.stop_gradient((lost_q, lost_p))
 
 
 class FixedPoint(Arithmetic):
-    r"""Fixed point: the state moves on a grid, by steps that can be undone bit for bit.
+    r"""Fixed point: the state moves on a grid, in steps that can be undone bit for bit.
 
-    Positions and momenta are whole multiples of `quantum`, and so is each change of them,
+    Positions and momenta are integer multiples of `quantum`, and so is each change of them,
 
         p1 = p0 + [h (−∂H_D/∂q0 + εW)(t0, t1, q0)],    q1 = q0 + [h ∂H_D/∂p1 (t0, t1, p1)],
 
-    [x] being the multiple nearest to x (half to even, so that [−x] = −[x]). Sums are then exact,
-    and a step and its inverse undo each other without any rounding; so do steps by h and −h of a
-    symmetric method. The map is one to one on the grid.
+    [x] is the multiple nearest to x (half to even, so that [−x] = −[x]). Sums are then exact, and a
+    step and its inverse undo each other without rounding; so do steps by h and −h of a symmetric
+    method. The map is one to one on the grid.
 
-    What it takes is that a rate has the same bits whenever it is evaluated at one point. So each of
-    its operations is rounded by itself: a compiler joins a product and a sum into one operation
-    (FMA), or not, by what stands around. (What is left in arrays, sorting or products of large
-    matrices, is not covered: run back to see.) Where the force depends on time, the times forth and
-    back must be the same numbers: h a power of two, t0 a multiple of it, and parts of a step
-    likewise (`TypeII`, `Adjoint`, `Strang`).
+    A rate must have the same bits in every evaluation at the same point. Therefore each of its
+    operations is rounded separately: a compiler may contract a product and a sum into one operation
+    (FMA), or not, depending on the surrounding code. (Operations that stay in arrays, sorting or
+    products of large matrices, are not covered: integrate backwards to check.) Where the force
+    depends on time, the times in both directions must be the same numbers: h a power of two, t0 a
+    multiple of it, and substeps likewise (`TypeII`, `Adjoint`, `Strang`).
 
     **Arguments**
 
     - `quantum`: a power of two [unit of q, and of p], 2.0**-40 for instance. In float64 |q| and |p|
-      must stay below 2⁵³ quanta, in float32 below 2²⁴; the status is else `out_of_range`.
+      must stay below 2⁵³ quanta, in float32 below 2²⁴; otherwise the status is `out_of_range`.
 
     The start is rounded to the grid. The system must be separable, so that no step needs a solve,
-    and the method made of the map: `TypeII`, `Adjoint`, `Strang` and the compositions.
+    and the method composed of the map: `TypeII`, `Adjoint`, `Strang` and the compositions.
 
     Derivatives are those of the map without rounding: [·] has slope 1.
 
@@ -124,6 +132,7 @@ class FixedPoint(Arithmetic):
             raise ValueError(
                 f"quantum must be a positive power of two such as 2.0**-40, got {quantum!r}."
             )
+        # A power of two: multiplication by it and by its reciprocal is exact, and so are sums.
         mantissa, exponent = math.frexp(quantum)
         if mantissa != 0.5:
             raise ValueError(
@@ -135,7 +144,7 @@ class FixedPoint(Arithmetic):
         if not method.is_made_of_the_map():
             raise ValueError(
                 f"FixedPoint needs a method that is made of the map (12)–(13) and its adjoint; "
-                f"{method!r} is not. Take dvi.Strang(), dvi.Yoshida(4) or another composition, "
+                f"{method!r} is not. Use dvi.Strang(), dvi.Yoshida(4) or another composition, "
                 "or arithmetic=dvi.Compensated(), which works with every method."
             )
         if not (
@@ -144,21 +153,24 @@ class FixedPoint(Arithmetic):
         ):
             raise ValueError(
                 "FixedPoint needs steps without a solve, forwards and backwards: here p1 enters "
-                "∂H_D/∂q0 or the force, or q0 enters ∂H_D/∂p1. Take a separable H_D = T(p1) + "
+                "∂H_D/∂q0 or the force, or q0 enters ∂H_D/∂p1. Use a separable H_D = T(p1) + "
                 "V(q0) with a force of q0 and t alone, or arithmetic=dvi.Compensated()."
             )
+        # Both the quantum and its reciprocal, by which a state is multiplied, must be normal.
         smallest, largest = jnp.finfo(q0.dtype).tiny, 1 / jnp.finfo(q0.dtype).tiny
         if not smallest <= self.quantum <= largest:
             raise ValueError(
-                f"quantum = {self.quantum!r} is no normal number of {q0.dtype}: take one between "
-                f"{smallest:.1e} and {largest:.1e}."
+                f"quantum = {self.quantum!r} is not a normal number of {q0.dtype}: choose one "
+                f"between {smallest:.1e} and {largest:.1e}."
             )
         equations = dataclasses.replace(equations, quantum=self.quantum)
         return equations, _start_on_grid(q0, self.quantum), _start_on_grid(p0, self.quantum)
 
 
 def _exact_sum(a: State, b: State) -> tuple[State, State]:
-    """(s, e) with s = fl(a + b) and s + e = a + b exactly, whichever is larger."""
+    """(s, e) with s = fl(a + b) and s + e = a + b exactly."""
+    # Knuth's six operations, not Dekker's three, which require |a| ≥ |b|: an increment may be
+    # larger than a coordinate near zero. No compiler here reassociates floating-point sums.
     s = a + b
     b_seen = s - a
     return s, (a - (s - b_seen)) + (b - b_seen)

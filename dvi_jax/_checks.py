@@ -1,4 +1,4 @@
-"""Checks of arguments: each returns the argument, or says what was seen and what is allowed."""
+"""Checks of arguments: each returns the argument or raises an error that names what is allowed."""
 
 import math
 import numbers
@@ -9,10 +9,7 @@ import numpy as np
 
 
 def whole(name: str, value: Any, least: int = 1, most: int | None = None, hint: str = "") -> int:
-    """A whole number from `least` to `most` (None: any).
-
-    `True` and `False` are not accepted. **Raises** `ValueError`.
-    """
+    """A whole number from `least` to `most` (None: any), not a bool. **Raises** `ValueError`."""
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not fits or value < least or (most is not None and value > most):
         last = "on" if most is None else f"to {most}"
@@ -48,6 +45,7 @@ def finite(name: str, value: Any, hint: str = "") -> float:
 def one_of(name: str, value: Any, known: Iterable[Any], hint: str = "") -> Any:
     """One of the known values. **Raises** `ValueError`."""
     known = list(known)
+    # By type as well: True == 1, and an array has no truth value.
     if not any(value is one or (type(value) is type(one) and value == one) for one in known):
         these = ", ".join(map(repr, known))
         raise ValueError(f"{name} must be one of {these}, got {value!r}.{_more(hint)}")
@@ -55,11 +53,12 @@ def one_of(name: str, value: Any, known: Iterable[Any], hint: str = "") -> Any:
 
 
 def instance(name: str, value: Any, kind: Any, called: str, hint: str = "") -> Any:
-    """An instance of a class (or of one of several), which the message calls `called`.
+    """An instance of a class (or of one of several); `called` is its name in the message.
 
-    **Raises** `TypeError`, which asks about parentheses where the class itself was given.
+    **Raises** `TypeError`.
     """
     if not isinstance(value, kind):
+        # The class in place of an object is the usual mistake: dvi.Strang for dvi.Strang().
         seen = f"the class {value.__name__}" if isinstance(value, type) else f"{value!r:.200}"
         missing = " (is a pair of parentheses missing?)" if isinstance(value, type) else ""
         raise TypeError(f"{name} must be {called}, got {seen}{missing}.{_more(hint)}")
@@ -75,7 +74,8 @@ def function(name: str, value: Any, arguments: str = "", hint: str = "") -> Call
 
 
 def _is_number(value: Any) -> bool:
-    """Whether Python or NumPy counts it as a real number; an array of one number as well."""
+    """Whether it is a real number of Python, NumPy or JAX, or an array of one."""
+    # Arrays of JAX, traced or not, by their attributes: this file does not import JAX.
     if isinstance(value, np.ndarray) or hasattr(value, "__jax_array__") or hasattr(value, "aval"):
         value = np.asarray(value)
         return value.ndim == 0 and value.dtype.kind in "iuf"

@@ -1,4 +1,4 @@
-"""The trajectory inside of its steps: crossings, requested times, the point where it stopped."""
+"""The trajectory between the points of its time grid: crossings, requested times, end points."""
 
 import dataclasses
 from collections.abc import Callable
@@ -27,10 +27,10 @@ Point = tuple[Scalar, State, State]
 
 
 class Curve(eqx.Module):
-    """The curve that a method draws inside of a step, Φ_{θh}(q0, p0) for 0 ≤ θ ≤ 1.
+    """The curve Φ_{θh}(q0, p0), 0 ≤ θ ≤ 1, of a method between the ends of a step."""
 
-    It is of the method's own order, and ends where the step ends.
-    """
+    # A substep of the method itself, not an interpolation: it has the order of the method, and its
+    # end is the end of the step.
 
     method: Method
     equations: Equations
@@ -38,7 +38,7 @@ class Curve(eqx.Module):
 
     @classmethod
     def of(cls, method: Method, equations: Equations, layout: Layout) -> "Curve":
-        # On a grid of its own the curve would be a staircase: between lattice points it is smooth.
+        # In fixed point the curve would be a staircase, on which no root can be found.
         return cls(method, dataclasses.replace(equations, quantum=None), layout)
 
     def point(self, start: Start, theta: Scalar) -> Point:
@@ -49,8 +49,7 @@ class Curve(eqx.Module):
         return t, q, p
 
     def where(self, g: Callable[..., Any], start: Start, exists: Array) -> Point:
-        """The point of the step where g(t, q, p, args) = 0, or its end if nothing `exists`."""
-
+        """The point of the step where g(t, q, p, args) = 0, or its end if none `exists`."""
         args = self.equations.args
 
         def at(theta):
@@ -63,13 +62,14 @@ class Curve(eqx.Module):
 
 
 def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTimes, PyTree]:
-    """What is observed along the run when states are saved at requested times: no observables that
-    stand alone, which are evaluated at those times afterwards."""
+    """The observables of a run that saves states at requested times: the steps of those times, and
+    all reductions."""
     if task.has_running_values:
         raise ValueError(
-            "Running tells a reduction at lattice points, and Save(ts=...) asks for other times: "
-            "take save=dvi.Save(every=m)."
+            "Running gives a reduction at grid points, and Save(ts=...) requests other times: "
+            "use save=dvi.Save(every=m)."
         )
+    # Functions that are not reductions are evaluated at the requested times, after the run.
     kept = jax.tree.map(
         lambda f: f if isinstance(f, Reduction) else None, task.observe, is_leaf=is_observable
     )
@@ -78,32 +78,36 @@ def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTi
     if save.clock is None and not task.lattice.has_memory and num_steps > 0:
         eps = jnp.finfo(ts.dtype).eps
         end = task.interval(jnp.asarray(num_steps - 1, jnp.int32)).t1
-        for known in (task.t0, end):  # N·(T/N) need not be T to the last digit
+        # N·(T/N) may differ from T in the last digit: a request at an end of the run is moved to
+        # it, so that it is not outside. The derivative is that of the requested time.
+        for known in (task.t0, end):
             size = jnp.maximum(jnp.abs(task.t0), jnp.abs(known))
             near = jnp.abs(ts - known) <= 16 * eps * size
             ts = jnp.where(near, ts + lax.stop_gradient(known - ts), ts)
-        # Nor is t0 + k h, compiled in a loop, the same to the last digit as it is here.
+        # Likewise t0 + k h, compiled in a loop, may differ in the last digit from its value here.
         slack = 4 * eps * (jnp.abs(task.t0) + jnp.abs(ts))
         due = lax.stop_gradient(ts - jnp.where(end >= task.t0, slack, -slack))
     return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), kept
 
 
 def crossings(curve: Curve, section: Section, kept: tuple[Array, Array], safe: Start) -> Crossings:
-    """The crossings in the steps that a section has kept. `safe` is any step that can be taken."""
+    """The crossings in the steps that a section has stored. `safe` is any step that exists."""
     rows, count = kept
     exists, starts = _steps(rows, safe)
-    found = each(
-        lambda given, *row: given[0].where(given[1].g, *row), (curve, section), starts, exists,
-        layout=curve.layout,
-    )  # fmt: skip
+    found = each(_crossing, (curve, section.g), starts, exists, layout=curve.layout)
     ts, qs, ps = _or_nan(exists, found)
     return Crossings(ts, qs, ps, count.astype(jnp.int32))
+
+
+def _crossing(given: tuple[Curve, Callable], start: Start, exists: Array) -> Point:
+    curve, g = given
+    return curve.where(g, start, exists)
 
 
 def at_times(
     curve: Curve, requested: RequestedTimes, kept: tuple[Array, Array], safe: Start
 ) -> tuple[Array, Start, Point]:
-    """For each requested time: if it was reached, the step that it lies in, and the point there."""
+    """For each requested time: is it reached, the step that contains it, and the point there."""
     exists, starts = _steps(kept[0], safe)
     given = (curve, requested.clock)
     began = each(_shown, given, starts, layout=curve.layout)
@@ -120,7 +124,7 @@ def at_times(
             time = jnp.where(is_start, _just_after(time, start), time)
         point, is_shown = one_by_one(_within, given, start, time, reached, layout=curve.layout)
         known = (safe.t0, safe.q0, safe.p0)
-        if requested.clock is None:  # the start to the bit, with the slope of the curve
+        if requested.clock is None:  # the value of the start to the bit, the slope of the curve
             known = jax.tree.map(lambda a, b: a + lax.stop_gradient(b - a), point, known)
         point = jax.tree.map(lambda a, b: jnp.where(is_start, b, a), point, known)
         found = (reached & is_shown) | is_start
@@ -130,13 +134,13 @@ def at_times(
 
 
 def _shown(given, start: Start) -> Scalar:
-    """What the clock shows where a step begins."""
+    """The value of the clock at the start of a step."""
     curve, clock = given
     return shown(clock, start.t0, start.q0, start.p0, curve.equations.args)
 
 
 def _within(given, start: Start, time: Scalar, reached: Array) -> tuple[Point, Array]:
-    """The point of the step at a requested time, and if the clock shows that time there."""
+    """The point of the step at a requested time, and whether the clock shows that time there."""
     curve, clock = given
     if clock is None:
         theta = (time - start.t0) / (start.t1 - start.t0)
@@ -147,7 +151,7 @@ def _within(given, start: Start, time: Scalar, reached: Array) -> tuple[Point, A
         return shown(clock, t, q, p, args) - time
 
     t, q, p = curve.where(late, start, reached)
-    # A clock that jumps, or turns, has passed the value without showing it.
+    # A clock that jumps has passed the value without showing it; so has one that is not monotonic.
     missed = jnp.abs(shown(clock, t, q, p, args) - time)
     span = jnp.abs(start.until - _shown(given, start))
     close = jnp.sqrt(jnp.finfo(start.q0.dtype).eps)
@@ -155,31 +159,26 @@ def _within(given, start: Start, time: Scalar, reached: Array) -> tuple[Point, A
 
 
 def _just_after(time: Scalar, start: Start) -> Scalar:
-    """A time a little inside of the step, moving as `time` does: an H_D may divide by its step."""
+    """A time slightly later than `time`, with the same derivative."""
+    # At the start of the run the substep would have h = 0, and an H_D may divide by t1 − t0.
     part = jnp.finfo(start.q0.dtype).eps ** 0.4
     return time + lax.stop_gradient(part * (start.t1 - start.t0))
 
 
 def stopped(curve: Curve, stop: Stop, row: Array, safe: Start) -> Stopped:
-    """Where g = 0 in the step that a run stopped in; its start if g ≥ 0 already there."""
+    """The point g = 0 in the last step of a run; the start of that step if g ≥ 0 there already."""
     exists, start = _steps(row, safe)
     began = (start.t0, start.q0, start.p0)
-    args = curve.equations.args
-    at_start = one_by_one(_event, stop, began, args, layout=curve.layout) >= 0
-    point = one_by_one(
-        lambda curve, stop, *row: curve.where(stop.g, *row), curve, stop, start, exists & ~at_start,
-        layout=curve.layout,
-    )  # fmt: skip
+    at_start = one_by_one(event, stop.g, *began, curve.equations.args, layout=curve.layout) >= 0
+    given = (curve, stop.g)
+    point = one_by_one(_crossing, given, start, exists & ~at_start, layout=curve.layout)
     point = jax.tree.map(lambda a, b: jnp.where(at_start, b, a), point, began)
     return Stopped(*_or_nan(exists, point))
 
 
-def _event(stop: Stop, point: Point, args) -> Scalar:
-    return event(stop.g, *point, args)
-
-
 def _steps(rows: Array, safe: Start) -> tuple[Array, Start]:
-    """The steps in the rows, the safe one where a row is empty."""
+    """The steps in the rows, and the safe one for an empty row."""
+    # Points are computed for empty rows as well, in a batch: from NaN the derivative would be NaN.
     exists, starts = from_rows(rows, safe.q0.shape)
 
     def filled(x, substitute):

@@ -12,6 +12,7 @@ from ._types import Args, HamiltonianFn, Scalar, State
 from .engine.signature import check_takes
 
 
+# A module and not a closure: `is_first_order` recognises it.
 class _LeftRule(eqx.Module):
     H: Callable[..., Any]
 
@@ -22,24 +23,23 @@ class _LeftRule(eqx.Module):
 
 _MIDPOINT = ((0.5,), (1.0,), ((0.5,),))
 _ROOT = 3.0**0.5 / 6
-_TWO_POINTS = (
-    (0.5 - _ROOT, 0.5 + _ROOT),
-    (0.5, 0.5),
-    ((0.25, 0.25 - _ROOT), (0.25 + _ROOT, 0.25)),
-)
+_TWO_POINTS = ((0.5 - _ROOT, 0.5 + _ROOT), (0.5, 0.5), ((0.25, 0.25 - _ROOT), (0.25 + _ROOT, 0.25)))
+# By order: Gauss nodes c, weights b and integrals a of collocation, and the number of passes. Two
+# passes would suffice for order 4 (the error of a curve enters a stationary value squared), but
+# then terms of h⁵ exceed that of h⁴ at usual steps.
 _RULES = {2: (_MIDPOINT, 1), 3: (_TWO_POINTS, 1), 4: (_TWO_POINTS, 3)}
-"""By order: Gauss nodes c, weights b and integrals a of collocation; how many passes."""
 
 
 class _ActionRule(eqx.Module):
     H: Callable[..., Any]
     order: int = eqx.field(static=True)
 
-    step_is_from_times: ClassVar[bool] = True  # h is t1 − t0: not in a slow time, says `System`
+    # h is t1 − t0, which is not the step in a slow time: `System` raises an error for that.
+    step_is_from_times: ClassVar[bool] = True
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> Scalar:
         table, passes = _RULES[self.order]
-        c, b, a = (np.asarray(part, p1.dtype) for part in table)
+        c, b, a = (np.asarray(part, p1.dtype) for part in table)  # no promotion of float32
         h = t1 - t0
         each_node = (0, 0, 0, None)
         energy = jax.vmap(self.H, in_axes=each_node)
@@ -57,13 +57,13 @@ class _ActionRule(eqx.Module):
 
 
 _DISCRETE = (
-    "A discrete Hamiltonian H_D(t0, t1, q0, p1, args) needs no discretise: give it to dvi.System "
+    "A discrete Hamiltonian H_D(t0, t1, q0, p1, args) needs no discretise: pass it to dvi.System "
     "directly."
 )
 
 
 def is_first_order(H_D: Any) -> bool:
-    """Whether a discrete Hamiltonian is a continuous one taken at (t0, q0, p1)."""
+    """Whether a discrete Hamiltonian is a continuous one, evaluated at (t0, q0, p1)."""
     return isinstance(H_D, _LeftRule)
 
 
@@ -79,21 +79,19 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
 
         H_D = ∫₀¹ [H(t0 + σh, q, p) − (p − p1)·q'/h] dσ,    h = t1 − t0
 
-    Orders 2, 3 and 4 put the first Picard iterates of the solution into it,
+    Orders 2, 3 and 4 evaluate it on the first Picard iterates of the solution,
 
         q ← q0 + h ∫₀^σ ∂H/∂p,    p ← p1 + h ∫_σ¹ ∂H/∂q    from q = q0, p = p1,
 
     with the integrals at Gauss nodes: one node and one pass (order 2), two nodes and one pass
-    (order 3), two nodes and three passes (order 4). The value being stationary, the error of a
-    curve enters squared, so that two passes would do for order 4; but then terms of h⁵ outweigh
-    that of h⁴ at usual steps. Without a limit on the passes order 4 is the Gauss method of two
-    stages.
+    (order 3), two nodes and three passes (order 4; the limit of many passes is the Gauss method of
+    two stages).
 
-    Whatever r, the map is symplectic, being that of one H_D, and every tool for H_D applies; what
-    H is invariant under (translations, rotations and other linear maps of q) H_D is invariant
-    under. Orders 2 to 4 couple q0 and p1 even where H is separable, so that each step needs a
-    solve: for a separable H a composition (`Yoshida`, `BlanesMoan`, `KahanLi`) is cheaper.
-    `Strang` on order 3 has order 4.
+    For every r the map is symplectic, as the map of one H_D, and every tool for H_D applies. H_D is
+    invariant under all translations, rotations and other linear maps of q under which H is. Orders
+    2 to 4 couple q0 and p1 even where H is separable, so that each step needs a solve: for a
+    separable H a composition (`Yoshida`, `BlanesMoan`, `KahanLi`) is cheaper. `Strang` on order 3
+    has order 4.
 
     **Arguments**
 
@@ -105,10 +103,10 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
     **Raises** `TypeError` for a function that does not take the four arguments,
     `ValueError` for any other order.
 
-    **Accuracy** H_D − H_{D,exact} = O(h^r). A force or a perturbation of `System` is taken as it is
-    written, at (q0, p1) say, and adds an error O(εh): put a perturbation into H through args, and
-    compose a forced map. Orders 2 to 4 take h from t1 − t0: it loses digits late in a long run, and
-    with `slow_time` it is not the step, so `System` refuses that.
+    **Accuracy** H_D − H_{D,exact} = O(h^r). A force or a perturbation of `System` is not changed,
+    and adds an error O(εh) if it is evaluated at (q0, p1): put a perturbation into H through args,
+    and compose a forced map. Orders 2 to 4 compute h as t1 − t0, which loses digits late in a long
+    run. With `slow_time` it is not the step, and `System` raises an error.
 
     **Source** order 1: the paper, (36)–(37) and the text before (32). The action: Leok & Zhang
     2011, *IMA J. Numer. Anal.* 31, 1497 (type II). Picard iterates in it: our own. The first r
@@ -130,7 +128,7 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
     check_takes("H", H, "(t, q, p, args)", {5: _DISCRETE})
     if isinstance(order, bool) or order not in (1, *_RULES):
         raise ValueError(
-            f"discretise knows order 1 (the paper's rule), 2, 3 and 4, got order={order!r}. For a "
+            f"discretise has order 1 (the paper's rule), 2, 3 and 4, got order={order!r}. For a "
             "higher order compose the map: method=dvi.Strang() (order 2), dvi.KahanLi(8)."
         )
     return _LeftRule(H) if order == 1 else _ActionRule(H, order)

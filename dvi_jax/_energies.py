@@ -1,4 +1,4 @@
-"""The energies that a step takes in and gives out: what the lattice equation (14) balances."""
+"""The energies at both ends of a step, which the lattice equation (14) balances."""
 
 from typing import Any
 
@@ -19,12 +19,11 @@ def outgoing_energy(
     args: Args = None,
     h: Any = None,
 ) -> Scalar:
-    """E⁺ = H_D − h ∂H_D/∂t0 of the step from t0 to t1 [energy], as it leaves its first point.
+    """E⁺ = H_D − h ∂H_D/∂t0 of the step from t0 to t1 [energy], at its first point.
 
-    `h` is t1 − t0 when left out; give it where that difference has lost digits.
+    `h` is t1 − t0 by default; pass it where that difference has lost digits.
     """
-    value, slope = jax.value_and_grad(system.hamiltonian)(t0, t1, q0, p1, epsilon, args)
-    return value - (t1 - t0 if h is None else h) * slope
+    return _energy(0, system, h, (t0, t1, q0, p1, epsilon, args))
 
 
 def incoming_energy(
@@ -37,12 +36,18 @@ def incoming_energy(
     args: Args = None,
     h: Any = None,
 ) -> Scalar:
-    """E⁻ = H_D + h ∂H_D/∂t1 of the step from t0 to t1 [energy], as it reaches its second point.
+    """E⁻ = H_D + h ∂H_D/∂t1 of the step from t0 to t1 [energy], at its second point.
 
-    `h` is t1 − t0 when left out; give it where that difference has lost digits.
+    `h` is t1 − t0 by default; pass it where that difference has lost digits.
     """
-    value, slope = jax.value_and_grad(system.hamiltonian, argnums=1)(t0, t1, q0, p1, epsilon, args)
-    return value + (t1 - t0 if h is None else h) * slope
+    return _energy(1, system, h, (t0, t1, q0, p1, epsilon, args))
+
+
+def _energy(end: int, system: System, h: Any, at: tuple[Any, ...]) -> Scalar:
+    # Value and slope from one evaluation: an H_D may contain a solve.
+    value, slope = jax.value_and_grad(system.hamiltonian, argnums=end)(*at)
+    h = at[1] - at[0] if h is None else h
+    return value + h * slope if end else value - h * slope
 
 
 def disturbing_work(
@@ -55,5 +60,5 @@ def disturbing_work(
     epsilon: Any = 0.0,
     args: Args = None,
 ) -> Scalar:
-    """εW(t0, t1, q0, p1)·(q1 − q0), the work of the disturbance on a step [energy]."""
+    """εW(t0, t1, q0, p1)·(q1 − q0), the work of the perturbing force on a step [energy]."""
     return jnp.sum(system.disturbing_force(t0, t1, q0, p1, epsilon, args) * (q1 - q0))

@@ -12,17 +12,21 @@ from typing import Any
 import numpy as np
 
 TEMPORARY = ".tmp"
-"""How names of files end that are not whole yet."""
+"""Suffix of files that are still being written."""
 
 
 def publish(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, on the disk once this returns."""
+    """Write a file whole or not at all; it is on the disk once this returns."""
+    # Under another name in the same folder, then renamed: only within one file system is a rename
+    # atomic. The name is unique, because several processes may write one file.
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
     made = _make_folders(path.parent)
     try:
         with open(temporary, "wb") as file:
             file.write(content)
             file.flush()
+            # Without it a rename may reach the disk before the content: an empty file after a
+            # power failure.
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
@@ -34,19 +38,19 @@ def publish(path: Path, content: bytes) -> None:
 
 
 def _make_folders(folder: Path) -> list[Path]:
-    """Make a folder and those above it; the folders that have new entries and must be synced."""
+    """Make a folder and its parents; the folders that have new entries, to be synced."""
     missing = []
     while not folder.exists():
         missing.append(folder)
         folder = folder.parent
     for new in reversed(missing):
-        new.mkdir(exist_ok=True)
+        new.mkdir(exist_ok=True)  # another process may have been faster
     return [new.parent for new in missing]
 
 
 def sync(folder: Path) -> None:
-    """Have the entries of a folder on the disk once this returns."""
-    if os.name == "nt":
+    """Write the entries of a folder to the disk."""
+    if os.name == "nt":  # where folders cannot be opened
         return
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -62,8 +66,8 @@ def publish_npz(
 
     - `form`: number of the format, which `read_npz` compares.
 
-    **Raises** `FileNotFoundError` where there is no directory for it, `OSError` for a file that
-    cannot be written; one that was there before is unchanged.
+    **Raises** `FileNotFoundError` without a directory for it, `OSError` for a file that cannot be
+    written; an older file of that name is then unchanged.
     """
     path, content = Path(path), io.BytesIO()
     header = {"format": form, "holds": sorted(arrays), **about}
@@ -80,7 +84,7 @@ def publish_npz(
 def read_npz(
     path: str | os.PathLike[str], form: int, what: str
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of such a file; `what` says what it holds.
+    """Header and arrays of a file of `publish_npz`; `what` names its content in messages.
 
     **Raises** `FileNotFoundError`; `ValueError` for a damaged or another file, or another format.
     """
@@ -88,6 +92,7 @@ def read_npz(
     if not path.is_file():
         raise FileNotFoundError(f"there is no {what} at {path}.")
     try:
+        # Without pickles: loading one would execute code from the file.
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         about = json.loads(str(arrays.pop("about")))
@@ -95,7 +100,7 @@ def read_npz(
         # The directory of a zip file has no checksum: a flipped bit there can hide an array.
         if set(about.get("holds", arrays)) != set(arrays):
             raise ValueError("it lacks an array")
-    except Exception as error:  # whatever zip and NumPy say of bytes that they cannot take
+    except Exception as error:  # zipfile and NumPy raise many types for damaged bytes
         raise ValueError(
             f"{path} is no {what} of this package, or is damaged ({error}): restore it from a "
             "backup, or remove it and compute it again."

@@ -1,4 +1,4 @@
-"""What `integrate` is given, as arrays of one precision, or an error that says what is wrong."""
+"""The arguments of `integrate` as arrays of one precision."""
 
 from typing import Any
 
@@ -14,7 +14,8 @@ from .engine.quantities import refuse_unit_or_mask
 
 
 def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
-    """A start as real arrays of one shape and precision, or an error that says what is wrong."""
+    """Initial conditions as real arrays of one shape and precision. **Raises** `ValueError` or
+    `TypeError`."""
     q, p = _real_array("q0", q0), _real_array("p0", p0)
     if q.shape != p.shape:
         raise ValueError(
@@ -32,7 +33,7 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
 
 
 def as_times(of: str, ts: Any) -> Array:
-    """Times as an array of real numbers; `of`: what takes them."""
+    """Times as an array of real numbers; `of`: the name of the call in messages."""
     if not is_traced(ts):
         refuse_unit_or_mask("ts", ts)
         ts = np.asarray(ts)
@@ -61,24 +62,25 @@ def _real_array(name: str, value: Any) -> Array:
         )
     if not _is_real(kind):
         raise TypeError(f"{name} must be a real array, got dtype {kind}.")
+    # A traced value that is not finite becomes the status of its trajectory.
     if isinstance(value, np.ndarray) and not np.isfinite(value).all():
         where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
         raise ValueError(
             f"{name} holds a value that is not finite at index {list(where)}: {value[where]}. "
-            "Every component of the start must be a number."
+            "Every component of the initial conditions must be a number."
         )
     array = jnp.asarray(value)
     return array.astype(jnp.result_type(float)) if kind.kind in "iu" else array
 
 
 def _is_real(dtype: Any) -> bool:
-    """Whether numbers of this type are real; NumPy does not know those of two bytes."""
-    return dtype.kind in "fiu" or jnp.issubdtype(dtype, jnp.floating)
+    return dtype.kind in "fiu" or jnp.issubdtype(dtype, jnp.floating)  # bfloat16 has the kind "V"
 
 
 def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> Array:
-    """A number of this precision, or an error that names it."""
+    """A number of this precision. **Raises** `ValueError` or `TypeError` with its name."""
     known = None if is_traced(value) else _as_numpy(name, value)
+    # Not for a Python float, which has no precision of its own and takes that of the state.
     if isinstance(value, np.ndarray | np.generic) and value.dtype == np.float64:
         refuse_double_without_x64(name, value.dtype)
     kind, shape = (value.dtype, value.shape) if known is None else (known.dtype, known.shape)
@@ -96,6 +98,7 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
             f"{name} must not be zero: no step would advance time. Give a positive h (forward) "
             "or a negative one (backward)."
         )
+    # Cast in NumPy: each operation of JAX on a known number would cost some ten microseconds.
     return jnp.asarray(value, dtype) if known is None else jnp.asarray(known.astype(dtype))
 
 
@@ -108,15 +111,16 @@ def _as_numpy(name: str, value: Any) -> np.ndarray:
 
 
 def as_parameter(leaf: Any) -> Any:
-    """A leaf of args: floats become arrays, so that a new value needs no new compilation."""
+    """A leaf of args as an argument of a compiled program."""
     if isinstance(leaf, np.ndarray | np.generic):
         refuse_unit_or_mask("args", leaf)
         leaf = np.asarray(leaf)
         refuse_double_without_x64("args", leaf.dtype)
         if leaf.dtype.kind in "OMm":
-            raise TypeError(f"args holds an array of dtype {leaf.dtype}: numbers are needed.")
+            raise TypeError(f"args holds an array of dtype {leaf.dtype}: numbers are required.")
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
+        # What is not an array is static: compiled programs are looked up by its hash.
         try:
             hash(leaf)
         except TypeError:
@@ -124,4 +128,5 @@ def as_parameter(leaf: Any) -> Any:
                 f"args holds a {type(leaf).__name__}, which is neither an array nor hashable: "
                 f"{leaf!r:.80}. Give arrays and numbers, in dicts, lists and tuples."
             ) from None
+    # A float becomes an array: a new value needs no new compilation, and has a derivative.
     return jnp.asarray(leaf) if isinstance(leaf, float) else leaf

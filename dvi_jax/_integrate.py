@@ -1,4 +1,4 @@
-"""The front door: one trajectory."""
+"""`integrate`, the function that computes one trajectory."""
 
 import dataclasses
 import warnings
@@ -51,7 +51,7 @@ from .observe import RequestedTimes, Section, Stop
 from .observe._kept import Start
 
 _PIECES = 100
-"""Pieces that a run with progress is cut into."""
+"""Maximum number of progress reports of a run."""
 
 
 def integrate(
@@ -78,7 +78,7 @@ def integrate(
     throw: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Solution:
-    r"""One trajectory of a disturbed discrete Hamiltonian system.
+    r"""One trajectory of a perturbed discrete Hamiltonian system.
 
     Iterates the map of `method`, by default (see `Integrator`) the paper's (12)–(13),
 
@@ -87,47 +87,48 @@ def integrate(
     **Arguments**
 
     - `system`: a `System`.
-    - `q0`, `p0`: start, real arrays of one shape (any: ``(n,)``, ``(bodies, 3)``).
-    - `h`: step size [time], not 0; negative runs backwards. `num_steps`: how many; static.
-    - `t0`: time of the start. `epsilon`: strength of the disturbance.
-    - `args`: pytree handed to H_D, W and the observables.
+    - `q0`, `p0`: initial conditions, real arrays of one shape (any: ``(n,)``, ``(bodies, 3)``).
+    - `h`: step size [time], not 0; negative to integrate backwards. `num_steps`: number of steps;
+      static.
+    - `t0`: initial time. `epsilon`: strength of the perturbation.
+    - `args`: pytree that H_D, W and the observables receive.
     - `method`: `TypeII`, `Adjoint`, `Strang`, the compositions `Yoshida`, `Suzuki`, `BlanesMoan`,
       `McLachlan`, `KahanLi`, `Composition`; `GaussLegendre`, `LobattoIIIAIIIB`; `RungeKutta4`.
-    - `lattice`: `Uniform()`; `Given(ts)`, which replaces h, num_steps and t0;
-      `TimeTransformed(g)`, whose steps adapt, and h is in its fictitious time; or
-      `Variational()`, whose steps solve (14), and h is the first of them.
-    - `save`: which states are kept, see `Save`.
+    - `lattice`: the time grid: `Uniform()`; `Given(ts)`, which replaces h, num_steps and t0;
+      `TimeTransformed(g)`, with adaptive steps and h in its fictitious time; or `Variational()`,
+      whose steps solve (14), and h is the first of them.
+    - `save`: the states to save, see `Save`.
     - `observe`: pytree of observables, functions of one step
-      ``(t0, t1, q0, p0, q1, p1, args)`` → array. Alone, one is evaluated on the steps that end at
+      ``(t0, t1, q0, p0, q1, p1, args)`` → array. A function is evaluated on the steps that end at
       a save point; in `MaxDrift`, `Range`, `Trend`, `Mean`, `Last` it is reduced over every step
       in constant memory. A `Section` finds the crossings of a surface.
-    - `layout`: how the arithmetic is laid out, see `Layout`.
-    - `stop`: a `Stop`, where the run ends early (a collision, an escape); or None.
-    - `adjoint`: how reverse-mode gradients go, see `Reversible`, `Checkpointed`, `Direct`.
-    - `root_finder`, or `newton`: how implicit steps are solved: `PicardThenNewton`, `Newton`,
+    - `layout`: machine code or arrays, see `Layout`.
+    - `stop`: a `Stop`, the condition of an early end (a collision, an escape); or None.
+    - `adjoint`: the computation of reverse-mode gradients: `Reversible`, `Checkpointed`, `Direct`.
+    - `root_finder`, or `newton`: the solver of implicit steps: `PicardThenNewton`, `Newton`,
       `SimplifiedNewton`, `Picard`.
-    - `arithmetic`: how the state is kept: `FloatingPoint`; for long runs `Compensated`, or
-      `FixedPoint`, whose explicit steps go back bit for bit.
+    - `arithmetic`: the representation of the state: `FloatingPoint`; for long runs `Compensated`,
+      or `FixedPoint`, whose explicit steps can be undone bit for bit.
     - `integrator`: an `Integrator` in place of method, lattice, adjoint, newton, arithmetic and
       layout.
-    - `throw`: raise if the trajectory fails; otherwise read ``solution.result``.
+    - `throw`: raise an error if the trajectory fails; otherwise read ``solution.result``.
     - `progress`: called as ``progress(steps_done, num_steps)`` at save points, at most about a
-      hundred times during the run, which then goes in pieces (same numbers, bit for bit). Not
-      under jit, vmap or grad.
+      hundred times during the run. The numbers are the same, bit for bit. Not under jit, vmap or
+      grad.
 
     h, t0, epsilon, args, q0, p0 and the times of `Given` are traced: they may be batched by
-    `vmap` and differentiated by `grad` and `jvp`. The arithmetic is in the precision of q0, p0.
+    `vmap` and differentiated by `grad` and `jvp`. The precision is that of q0 and p0.
 
-    **Returns** a `Solution`; time is the first axis of what it saved.
+    **Returns** a `Solution`; time is the first axis of its saved values.
 
-    **Raises** `ValueError` or `TypeError` for input that cannot be meant (shapes, types, values),
-    and for results that need more memory than there is;
+    **Raises** `ValueError` or `TypeError` for invalid input (shapes, types, values), and for
+    results that need more memory than there is;
     `IntegrationError` when the trajectory fails and `throw` is True, with the status, the step
     and the residual (inside jit or vmap an equinox runtime error with the status).
 
-    **Accuracy** order of the method in h. Symplectic methods keep the map's own invariants
-    to round-off and energy to O(h^order) without drift. Gradients are those of the discrete
-    map, by the implicit function theorem through each solve.
+    **Accuracy** order of the method in h. Symplectic methods conserve the invariants of the map to
+    round-off and energy to O(h^order) without drift. Gradients are those of the discrete map, by
+    the implicit function theorem through each solve.
 
     **Example**
 
@@ -147,29 +148,38 @@ def integrate(
         integrator, method=method, lattice=lattice, adjoint=adjoint, newton=newton,
         root_finder=root_finder, arithmetic=arithmetic, layout=layout,
     )  # fmt: skip
+    # Here and not in `Integrator`: the default method depends on the system.
     method, lattice, layout = integrator.method_for(system), integrator.lattice, integrator.layout
     instance("save", save, Save, "a dvi.Save(...)")
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
     q0, p0 = start_state(q0, p0)
-    # By the class, here and below: a bound method of an equinox module takes 20 µs to make.
+    # By the class, here and below: equinox takes 20 µs to make a bound method of a module.
     kind = type(lattice)
     t0, h, num_steps = kind.prepare(lattice, t0, h, num_steps)
     t0 = as_scalar("t0", t0, q0.dtype)
     h = as_scalar("h", h, q0.dtype, zero_allowed=False)
     epsilon = as_scalar("epsilon", epsilon, q0.dtype)
     args = jax.tree.map(as_parameter, args)
+    # Before anything is compiled: an error in a function of the user would otherwise come from
+    # within many frames of tracing.
     System.check_shapes(system, t0, q0, p0, epsilon, args)
+    # From here on `system`, `q0`, … may be those of another problem with other variables, whose
+    # solution `undo` transforms back.
     given = Run(system, t0, q0, p0, epsilon, args, observe, save, stop)
     asked, undo = kind.transform(lattice, given)
     kind.check(lattice, method, integrator.arithmetic)
     task, q0, p0 = _task(asked, integrator, method, h)
     plan = make_plan(save, num_steps)
     leaves = jax.tree.leaves((task, q0, p0))
+    # An allocation that fails ends the process, or makes the machine swap.
     _check_memory(save, plan, q0, check_observe(task, q0, p0), leaves, layout)
     traced = any(is_traced(x) for x in leaves)
+    # The warning needs the damping as a number, which is not known of traced values.
     if not traced and asked.system.force is not None:
         warn_of_dissipation(method, task.equations, task.first_interval, q0, p0)
     if save.ts is not None:
+        # The run itself saves nothing at these times: it stores the steps that contain them, and
+        # `_as_solution` evaluates the method between their ends.
         observed = requested_times(asked.save, task, num_steps)
         task = dataclasses.replace(task, observe=observed)
     if progress is None:
@@ -177,9 +187,7 @@ def integrate(
     elif traced:
         raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
     elif getattr(integrator.adjoint, "report_defect", False):
-        raise ValueError(
-            "report_defect=True cannot be reported with progress: leave one of them out."
-        )
+        raise ValueError("report_defect=True and progress exclude each other: leave one out.")
     else:
         outcome = _in_pieces(task, plan, q0, p0, progress, layout)
         solution = _solution(task, plan, asked.observe, outcome, q0, p0, layout)
@@ -188,7 +196,7 @@ def integrate(
 
 
 def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[Task, Array, Array]:
-    """The trajectory that is asked for, and its start as the arithmetic has it."""
+    """The trajectory to compute, and its initial state in the representation of the arithmetic."""
     system, epsilon = run.system, run.epsilon
     is_disturbed = system.force is not None or system.perturbation is not None
     if not (is_disturbed or system.slow_time or is_traced(epsilon)) and float(epsilon) != 0:
@@ -205,6 +213,7 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
         run.q0,
         run.p0,
     )
+    # A part of the key of compiled programs: with another value one is compiled again.
     seen = reads(run.observe, run.stop, lattice)
     return (
         Task(equations, method, lattice, run.observe, run.t0, h, arithmetic, run.stop, seen),
@@ -213,6 +222,7 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
     )
 
 
+# Compiled here, not by the user: a call without jax.jit takes one program, that of its shapes.
 @eqx.filter_jit
 def _whole(
     task: Task, plan: Plan, observe: PyTree, q0, p0, adjoint: AbstractAdjoint, layout: Layout
@@ -221,6 +231,8 @@ def _whole(
     return _as_solution(task, plan, observe, outcome, q0, p0, layout)
 
 
+# The parts of a run with progress. Each is compiled for itself; the carry between them has all that
+# a step depends on, so that the numbers are those of one run.
 @eqx.filter_jit
 def _begin(task: Task, q0, p0):
     return start(task, q0, p0)
@@ -238,7 +250,8 @@ def _piece(task: Task, plan: Plan, carry, layout: Layout):
 
 
 def _in_pieces(task: Task, plan: Plan, q0, p0, progress, layout) -> Outcome:
-    """The same scan as `_whole`, cut between save points, with a call after each piece."""
+    """The same run as `_whole`, in pieces between save points, with a report after each."""
+    # Whole blocks, and as many in each piece (the last one may have fewer): one program serves all.
     blocks = max(1, -(-plan.num_blocks // _PIECES))
     carry, done, parts, is_last = _begin(task, q0, p0), 0, [], False
     while not is_last:
@@ -247,6 +260,7 @@ def _in_pieces(task: Task, plan: Plan, q0, p0, progress, layout) -> Outcome:
         is_last = done >= plan.num_blocks
         tail = (plan.tail, plan.save_tail) if is_last else (0, False)
         carry, saved = _piece(task, Plan(count, plan.block, *tail), carry, layout)
+        # JAX computes asynchronously: without waiting all reports would come at the beginning.
         jax.block_until_ready(carry)
         parts.append(saved)
         progress(plan.num_steps if is_last else done * plan.block, plan.num_steps)
@@ -257,10 +271,11 @@ def _in_pieces(task: Task, plan: Plan, q0, p0, progress, layout) -> Outcome:
 def _as_solution(
     task: Task, plan: Plan, observe: PyTree, outcome: Outcome, q0, p0, layout: Layout
 ) -> Solution:
-    """What a run has left behind, as its user sees it."""
+    """The public `Solution` of a run."""
     carry, saved, reduced, defect = outcome
     curve = Curve.of(task.method, task.equations, layout)
     first = task.first_interval()
+    # The first step stands in where a batch element has none to look into: its numbers are finite.
     safe = Start(first.t0, first.t1, first.t1, q0, p0)
     _, reductions = task.observables()
     values: list[Any] = [
@@ -271,7 +286,7 @@ def _as_solution(
     if reductions and isinstance(reductions[0], RequestedTimes):
         reached, starts, (ts, qs, ps) = at_times(curve, reductions[0], values[0], safe)
         if reductions[0].clock is None:
-            ts = reductions[0].ts  # also those that were not reached
+            ts = reductions[0].ts  # also the times that were not reached
         missed = (result == RESULTS.successful) & ~jnp.all(reached)
         result = RESULTS.where(missed, RESULTS.not_reached, result)
         values, hs = values[1:], ts - starts.t0
@@ -312,6 +327,8 @@ _solution = eqx.filter_jit(_as_solution)
 def _raise_on_failure(solution: Solution, task: Task) -> Solution:
     result = solution.result
     if is_traced(status_code(result)):
+        # The status is known when the compiled program runs: only an error of equinox can report
+        # it, without the solution up to the failure.
         fine = (result == RESULTS.successful) | (result == RESULTS.stopped)
         arrays, rest = eqx.partition(solution, eqx.is_array)
         if not manual_axes(*jax.tree.leaves(arrays)):
@@ -324,8 +341,8 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
         return eqx.combine(checked, rest)
     if status_name(result) in ("successful", "stopped"):
         return solution
-    kept = "With throw=False the solution up to there is returned with its status; here it is the "
-    kept += "`solution` attribute of this error."
+    kept = "With throw=False the solution up to there is returned with its status; the attribute "
+    kept += "`solution` of this error has it as well."
     if bool(result == RESULTS.not_reached):
         missed = np.isnan(np.asarray(solution.qs)).reshape(len(solution.ts), -1).any(1)
         first = float(solution.ts[missed.argmax()])
@@ -353,21 +370,22 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
 def _check_memory(
     save: Save, plan: Plan, q0: Array, beside: int, leaves: list[Any], layout: Layout
 ) -> None:
-    """Refuse results that no memory can hold; `beside`: bytes of observables at a save point."""
+    """**Raises** `ValueError` for results that no memory can hold; `beside`: bytes of observables
+    at a save point."""
     memory = results_memory()
     saved = plan.num_blocks + 1 + plan.save_tail if save.ts is None else save.ts.shape[0]
     each = (2 * q0.size + 2) * q0.dtype.itemsize + beside  # q, p, t and h
     count, is_compiled = batch_size(leaves)
     if memory is None or count * saved * each <= memory:
         return
+    # XLA does not compute results that the function around this one does not use.
     if is_compiled and (layout.form == "arrays" or not generates()):
-        return  # XLA does not compute results that the function around this one does not use
+        return
     batch = f" of each of {count} trajectories" if count > 1 else ""
+    disk = ", and dvi.sweep(store=...) writes results of many trajectories to disk" if batch else ""
     raise ValueError(
         f"the results need {count * saved * each / 2**30:.3g} GiB of memory ({saved} saved states"
         f"{batch}), and there are {memory / 2**30:.3g} GiB. Save fewer states: "
         "save=dvi.Save(every=m), dvi.Save(final=True) or dvi.Save(ts=times). A reduction such as "
-        "dvi.MaxDrift(function) observes every step in constant memory"
-        + (", and dvi.sweep(store=...) writes results of many trajectories to disk." if batch
-           else ".")
-    )  # fmt: skip
+        f"dvi.MaxDrift(function) observes every step in constant memory{disk}."
+    )

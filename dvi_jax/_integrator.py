@@ -1,4 +1,4 @@
-"""How to integrate, as one object that every function that runs trajectories accepts."""
+"""The options of an integration as one object, for every function that runs trajectories."""
 
 from typing import Any
 
@@ -21,20 +21,20 @@ from .methods import Method, Strang, TypeII
 
 @both_names
 class Integrator(eqx.Module):
-    """How to integrate: the keywords of `integrate` that say nothing about the problem.
+    """The options of an integration: the keywords of `integrate` that are not the problem itself.
 
     - `method`: see `integrate`. None: the map that the user wrote, `TypeII()`; for a system with
-      `discretise(H, order=1)`, whose own map is of order one, `Strang()`.
-    - `root_finder`: how implicit steps are solved. Here, and in every function that takes one of
-      the two names, `newton` is another name of it; both at once are a `TypeError`.
-    - `lattice`: the time grid. `arithmetic`: how the state is represented.
-    - `layout`: machine code or arrays. `adjoint`: how reverse-mode gradients are computed.
+      `discretise(H, order=1)`, whose map has order one, `Strang()`.
+    - `root_finder`: the solver of implicit steps. Here, and in every function that takes one of the
+      two names, `newton` is another name of it; both at once raise a `TypeError`.
+    - `lattice`: the time grid. `arithmetic`: the representation of the state.
+    - `layout`: machine code or arrays. `adjoint`: the computation of reverse-mode gradients.
 
     `integrate`, `sweep`, `Model` (for `fit`), `poincare_section`, `bifurcation`, `ReturnMap`,
     `tangent_map`, `drift_order`, `drift_surface`, `discover_invariants`, `find_symmetries` and
-    `solution_pairs` accept it as `integrator=`. The last three examine one step, and refuse fields
-    without an effect there that are not the defaults. `sweep` computes no gradients and does not
-    use `adjoint`.
+    `solution_pairs` accept it as `integrator=`. The last three examine one step; they raise an
+    error for fields without an effect there that are not the defaults. `sweep` computes no
+    gradients and does not use `adjoint`.
 
     **Raises** `TypeError` for a field of another type.
 
@@ -58,10 +58,10 @@ class Integrator(eqx.Module):
     adjoint: AbstractAdjoint = Reversible()
 
     def __check_init__(self):
-        for name, kind in _KINDS.items():
+        for name, (kind, hint) in _FIELDS.items():
             value = getattr(self, name)
             if name != "method" or value is not None:
-                instance(name, value, kind, f"a {kind.__name__}", _HINTS.get(name, ""))
+                instance(name, value, kind, f"a {kind.__name__}", f"Take {hint}.")
 
     @property
     def newton(self) -> RootSolver:
@@ -73,29 +73,26 @@ class Integrator(eqx.Module):
         return default_method(system) if self.method is None else self.method
 
 
-_KINDS = {
-    "method": Method,
-    "lattice": Lattice,
-    "adjoint": AbstractAdjoint,
-    "root_finder": RootSolver,
-    "arithmetic": Arithmetic,
-    "layout": Layout,
-}
-_HINTS = {
-    "method": "Take one such as dvi.Strang().",
-    "lattice": "Take dvi.Uniform(), dvi.Given(ts), dvi.TimeTransformed(g) or dvi.Variational().",
-    "adjoint": "Take dvi.Reversible(), dvi.Checkpointed() or dvi.Direct().",
-    "root_finder": "Take dvi.Newton(), dvi.SimplifiedNewton() or dvi.Picard().",
-    "arithmetic": "Take dvi.FloatingPoint(), dvi.Compensated() or dvi.FixedPoint(quantum).",
-    "layout": 'Take dvi.Layout() or dvi.Layout(form="arrays").',
+_FIELDS = {
+    "method": (Method, "one such as dvi.Strang()"),
+    "lattice": (
+        Lattice,
+        "dvi.Uniform(), dvi.Given(ts), dvi.TimeTransformed(g) or dvi.Variational()",
+    ),
+    "adjoint": (AbstractAdjoint, "dvi.Reversible(), dvi.Checkpointed() or dvi.Direct()"),
+    "root_finder": (RootSolver, "dvi.Newton(), dvi.SimplifiedNewton() or dvi.Picard()"),
+    "arithmetic": (Arithmetic, "dvi.FloatingPoint(), dvi.Compensated() or dvi.FixedPoint(quantum)"),
+    "layout": (Layout, 'dvi.Layout() or dvi.Layout(form="arrays")'),
 }
 
+# Made once: a new one in every call would take some microseconds for its checks.
 _DEFAULT = Integrator()
 
 
 def default_method(system: System) -> Method:
-    """The map that the user wrote; Strang's composition of a map that is only of order one because
-    it was made from a continuous Hamiltonian."""
+    """The method of a run without `method`."""
+    # A map of order one that `discretise` made was not chosen by the user, and Strang's composition
+    # of it has order two. A map that the user wrote stays as it is.
     return Strang() if is_first_order(system.H_D) else TypeII()
 
 
@@ -118,9 +115,9 @@ def chosen(integrator: Integrator | None, **given: Any) -> Integrator:
 
 
 def only(integrator: Integrator, function: str, *used: str) -> Integrator:
-    """The integrator, after refusing fields that a function does not use and that differ from the
-    defaults."""
-    for name in _KINDS:
+    """The integrator. **Raises** `ValueError` for a field that the function does not use and that
+    differs from the default."""
+    for name in _FIELDS:
         value, default = getattr(integrator, name), getattr(_DEFAULT, name)
         if name not in used and not eqx.tree_equal(value, default):
             raise ValueError(

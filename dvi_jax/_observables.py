@@ -1,4 +1,4 @@
-"""What is observed: refused where it is no function of a step, and put back into its pytree."""
+"""Observables: checks before a run, and their values in the pytree of the user after it."""
 
 from typing import Any
 
@@ -16,16 +16,14 @@ _STEP = "(t0, t1, q0, p0, q1, p1, args)"
 
 
 def check_observe(task: Task, q0: Array, p0: Array) -> int:
-    """Refuse observables that are not functions of a step with an array for a value.
-
-    **Returns** the bytes of those that stand alone, at one save point.
-    """
+    """**Raises** `TypeError` or `ValueError` for observables that are not functions of a step with
+    an array as value. **Returns** the bytes of those without a reduction, at one save point."""
     size = 0
     for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
         if isinstance(leaf, type) and issubclass(leaf, Reduction | Running):
             raise TypeError(
-                f"observe holds the class {leaf.__name__}: give it what it is to reduce, as in "
-                f"dvi.MaxDrift(function), a function {_STEP}, dvi.MEGNO() or "
+                f"observe holds the class {leaf.__name__}: make an object of it, as in "
+                f"dvi.MaxDrift(function) with a function {_STEP}, dvi.MEGNO() or "
                 "dvi.Running(dvi.MEGNO())."
             )
         if not is_observable(leaf):
@@ -40,11 +38,12 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
             continue
         function = leaf.function if isinstance(leaf, Reduction) else leaf
         called = getattr(function, "__name__", type(function).__name__)
-        check_function(f"what {type(leaf).__name__} takes", function, _STEP)
+        check_function(f"the argument of {type(leaf).__name__}", function, _STEP)
         t0, bound = task.t0, task.bound(function)
         try:
             out = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, task.args)
         except Exception as error:
+            # The error itself stays: its type and traceback show the line of the user.
             error.add_note(f"(in the observable {called}, called with {_STEP})")
             raise
         if not hasattr(out, "shape") and not isinstance(out, int | float):
@@ -54,7 +53,7 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
             )
         if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
             raise TypeError(
-                f"Range compares values, which complex numbers have no order for; {called} returns "
+                f"Range compares values, and complex numbers have no order; {called} returns "
                 "them. Take the real and imaginary parts, or the absolute value."
             )
         if not isinstance(leaf, Reduction):
@@ -63,8 +62,8 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
 
 
 def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> None:
-    """Refuse deviation vectors along steps whose derivative is not that of the method alone."""
     name = type(leaf).__name__
+    # The derivative of a step is taken at a fixed h; the derivative of h would be missing.
     if task.lattice.has_memory:
         raise ValueError(
             f"{name} needs steps whose size does not depend on the state, and those of "
@@ -80,7 +79,7 @@ def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
     def value(f):
         if isinstance(f, Reduction):
             return next(values)
-        if isinstance(f, Running):  # its last value is the last of its rows
+        if isinstance(f, Running):  # its final value is the last of its rows, and not needed
             next(values)
         return next(lone)
 

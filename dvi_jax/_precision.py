@@ -1,4 +1,4 @@
-"""Double precision must be requested: it is never switched on for the user."""
+"""Checks for double precision, which only the user can enable in JAX."""
 
 from typing import Any
 
@@ -8,18 +8,19 @@ from lanewise.jaxapi import x64_enabled
 
 
 def refuse_double_without_x64(name: str, dtype: Any) -> None:
-    """Refuse a float64 input called `name` in a process that computes in float32, and one of more
-    than double precision anywhere."""
+    """**Raises** `TypeError` for a float64 input in a process that computes in float32, and for one
+    of more than double precision."""
+    # JAX would round both without a warning, and invariants with them.
     if np.issubdtype(dtype, np.inexact) and np.finfo(dtype).eps < np.finfo(np.float64).eps:
         raise TypeError(
-            f"{name} is {np.dtype(dtype)}, and JAX has no numbers beyond double precision: give "
+            f"{name} is {np.dtype(dtype)}, and JAX has no numbers beyond double precision: use "
             f"np.asarray({name}, np.float64), which rounds them."
         )
     if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():
         raise TypeError(
             f"{name} is float64, but this process computes in float32. Invariants need double "
             'precision: put\n    jax.config.update("jax_enable_x64", True)\nbefore the first '
-            f"array is made. If float32 is meant, say so: {name} as jnp.float32."
+            f"array is made. To compute in float32, pass {name} as jnp.float32."
         )
 
 

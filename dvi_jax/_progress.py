@@ -1,4 +1,4 @@
-"""Who is told how far a long call is: the user's function, a bar, or nobody."""
+"""Progress reports of long calls: to a function of the user, to a progress bar, or none."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -14,11 +14,11 @@ def told(
     progress: bool | Callable[[T], None] | None,
     bar: Callable[[Any], AbstractContextManager[Callable[[T], None]]],
 ) -> AbstractContextManager[Callable[[T], None] | None]:
-    """A context whose value takes the progress, or is None where nobody wants it.
+    """A context whose value is a function that receives the progress, or None for no reports.
 
-    - `progress`: a function, which is taken; True, a bar; False, nothing; None, a bar where there
-      is a terminal, or a notebook that has ipywidgets.
-    - `bar`: a console of rich's → a context that shows.
+    - `progress`: a function, which is used; True, a bar; False, no reports; None, a bar in a
+      terminal, or in a notebook that has ipywidgets.
+    - `bar`: a console of rich → a context that shows a bar.
 
     **Raises** `TypeError` for anything else.
     """
@@ -27,11 +27,11 @@ def told(
     instance("progress", progress, bool | None, "True, False, None or a function")
     if progress is False:
         return nullcontext(None)
-    from rich.console import Console
+    from rich.console import Console  # not needed by `import dvi_jax`, whose time it would add to
 
     console = Console(stderr=True)
     if console.is_jupyter and find_spec("ipywidgets") is None:
-        # Rich would warn at each line; and Jupyter says FORCE_COLOR, but shows no bar that moves.
+        # Rich would warn at each line. Jupyter sets FORCE_COLOR, but cannot show a moving bar.
         console = Console(stderr=True, force_jupyter=False, force_terminal=False)
     if progress is None and not (console.is_terminal or console.is_jupyter):
         return nullcontext(None)
@@ -41,10 +41,8 @@ def told(
 def bar_of(
     name: str, texts: Sequence[str], columns: Callable[[T], dict[str, Any]]
 ) -> Callable[[Any], AbstractContextManager[Callable[[T], None]]]:
-    """A bar for `told`, followed by texts.
-
-    - `columns`: of a progress: what rich's ``Progress.update`` takes, `texts` among it.
-    """
+    """A bar for `told`, followed by texts. `columns`: progress → keywords of rich's
+    ``Progress.update``, `texts` among them."""
 
     @contextmanager
     def bar(console: Any) -> Iterator[Callable[[T], None]]:

@@ -1,4 +1,4 @@
-"""The reverse pass of `Reversible`: states rebuilt by inverse steps, and cotangents along them."""
+"""The reverse pass of `Reversible`: states by inverse steps, and cotangents along them."""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,19 +12,18 @@ from jaxtyping import Array
 
 import lanewise
 
-from ._arithmetic import FloatingPoint
 from ._results import RESULTS
 from ._rollout import Plan, Saved, StepTaken, Task, adds_start_outside, piece_length
 from ._types import State
 from .engine.newton import Known, RootSolver
-from .methods import TypeII
 
+# Steps back between two updates of the sizes of the components, relative to which differences are
+# measured. An update in every step would take a noticeable part of the time of an explicit one.
 LOOKS = 16
-"""Steps back between two looks at how large the components are."""
 
 
 class Smooth(NamedTuple):
-    """The outputs of a trajectory that have derivatives."""
+    """The differentiable outputs of a trajectory."""
 
     q: State
     p: State
@@ -33,12 +32,12 @@ class Smooth(NamedTuple):
 
 
 def states_of(saved: Saved) -> Saved:
-    """What the reverse pass reads of what was saved."""
+    """The saved values that the reverse pass reads."""
     return saved._replace(t=None, h=None, observed=[])
 
 
 class _Pieces(NamedTuple):
-    """Pieces of `size` steps each between two states that are known, in order from step `first`."""
+    """Pieces of `size` steps each between two known states, in order from step `first`."""
 
     starts: tuple[State, State]
     ends: tuple[State, State]
@@ -48,7 +47,7 @@ class _Pieces(NamedTuple):
     def over(self, step: Callable, state: Any, reverse: bool = False) -> Any:
         """``state = step(state, k, start, end)`` for each piece, from step number k."""
         count = len(self.starts[0])
-        if count == 1:
+        if count == 1:  # without a loop around one piece, which would be compiled
             return step(state, self.first, _row(self.starts, 0), _row(self.ends, 0))
         k, stride = self.first, self.size
         if reverse:
@@ -67,8 +66,7 @@ def _row(states: tuple[State, State], i: int) -> tuple[State, State]:
 
 
 def _pieces(known_start, saved: Saved, first, count: int, every: int) -> list[_Pieces]:
-    """The `count` steps to a save point, cut at the states kept on the way, the last piece with the
-    others where it is as long: what is done to a piece is compiled for each length."""
+    """The `count` steps to a save point, divided at the checkpoints in between."""
     inner = saved.inner
     kept = 0 if inner is None else len(inner[0])
     size = piece_length(count, every) if kept else count
@@ -76,6 +74,7 @@ def _pieces(known_start, saved: Saved, first, count: int, every: int) -> list[_P
     known = [jnp.concatenate(x) for x in zip(*(p for p in parts if p is not None), strict=True)]
     starts, ends = (known[0][:-1], known[1][:-1]), (known[0][1:], known[1][1:])
     rest = count - kept * size
+    # The code for a piece is compiled for each length: the last piece joins the others if it can.
     if rest == size:
         return [_Pieces(starts, ends, first, size)]
 
@@ -96,15 +95,15 @@ def _rebuilt(
     along: Callable | None = None,
     sums: Any = None,
 ):
-    """The states from `end` back over `count` steps, by inverse steps.
-
-    Given are the `sums` that ``along(k, after, before, sums)`` has made of each step on the way, by
-    how much of its size each component misses `known_start`, and whether all solves went well.
-    """
+    """The states from `end` back over `count` steps, by inverse steps: the `sums` that
+    ``along(k, after, before, sums)`` accumulates, the relative difference of each component from
+    `known_start`, and whether all solves succeeded."""
     group = largest_divisor(count, LOOKS)
 
+    # Cotangents go along in the same loop: states are needed once, and none is stored.
     def undo(state, _):
         k, after, sums, solved = state
+        # Without the memory of the arithmetic, whose effect is below the accepted difference.
         q, p, info = task.method.inverse(task.equations, task.interval(k), *after)
         if along is not None:
             sums = along(k, after, (q, p), sums)
@@ -127,7 +126,8 @@ def _rebuilt(
 def round_trip_defect(
     task: Task, plan: Plan, every: int, allowed: float, start_state, saved: Saved, tail
 ) -> Array:
-    """The largest miss of a rebuilt state at a checkpoint; ∞ where an inverse step went wrong."""
+    """The largest difference of a reconstructed state at a checkpoint; ∞ where an inverse step
+    failed."""
 
     def of_piece(size):
         def of(worst, k, start, end):
@@ -156,7 +156,7 @@ def pull_back(
 ) -> tuple[Any, Array, Array]:
     """Lᵀ·cotangent: the reverse pass of `Reversible`, from the end of a trajectory to its start.
 
-    Its settings are `every`, the steps between checkpoints, and `allowed`, the largest miss there.
+    `every`: steps between checkpoints. `allowed`: the largest relative difference there.
     """
     theta, q_start, p_start = inputs
     memories, saved, tail = known
@@ -169,11 +169,9 @@ def pull_back(
         task: Task = eqx.combine(theta, fixed)
         alone, reductions = task.observables()
         interval = task.interval(k)
-        if isinstance(task.method, TypeII) and isinstance(task.arithmetic, FloatingPoint):
-            # What (13) is to be solved for is where we come from.
-            solver = Known(p1.ravel(), newton)
-        else:
-            solver = newton
+        # The unknown of (13) is the state after the step, which is known here: no solve.
+        known_root = task.method.is_the_map and task.arithmetic.is_plain
+        solver = Known(p1.ravel(), newton) if known_root else newton
         equations = dataclasses.replace(task.equations, newton=solver)
         q1, p1, _ = task.method.step(equations, interval, q0, p0)
         taken = StepTaken(interval.t0, interval.t1, q0, p0, q1, p1)
@@ -184,9 +182,12 @@ def pull_back(
     def pull_through(k, after, before, sums, is_last, at_save):
         """The cotangents before step k, from the states before and after it."""
         p1, (grad, (cq, cp)) = after[1], sums
+        # The step is linearised at the reconstructed state: one more forward evaluation per step
+        # takes the place of stored intermediate values.
         ((_, _, t1), _, values), pull = jax.vjp(
             lambda theta, q, p: local_step(theta, q, p, k, p1), theta, *before
         )
+        # Functions are observed at save points only, which the last step of a block ends at.
         at_end = jax.tree.map(lambda c: jnp.where(is_last, c, jnp.zeros_like(c)), at_save)
         ct, seeds = jnp.zeros_like(t1), []
         for r, memory, c, value in zip(
@@ -199,11 +200,8 @@ def pull_back(
         return jax.tree.map(jnp.add, grad, of_theta), (cq, cp)
 
     def undo_steps(known_start, end, first, count, last, at_save, grad, cot):
-        """`count` steps back from the exact state `end`, checked against `known_start`.
-
-        By inverse steps; where a trajectory then misses the start, through the steps again from
-        there, their states stored.
-        """
+        """`count` steps back from the exact state `end`, by inverse steps. Where these miss
+        `known_start`, by the steps from there, computed again and stored."""
 
         def along(k, after, before, sums):
             return pull_through(k, after, before, sums, k == last, at_save)
@@ -230,17 +228,19 @@ def pull_back(
             (_, _, sums), _ = lax.scan(back, begin, states, reverse=True)
             return sums
 
-        def mend(out):
+        def corrected(out):
             again = stored(known_start, end, first, last, at_save, grad, cot)
             return jax.tree.map(lambda a, b: jnp.where(missing, a, b), again, out)
 
-        # Where the trajectory itself has failed there is nothing to mend: NaN, not a number.
+        # Not for a trajectory that has failed itself: its gradient is NaN, and a batch must not
+        # wait for the steps of one whose result is known.
         missing = ~fine & _all_finite(known_start) & _all_finite(end)
-        return lax.cond(lanewise.on_any(missing), mend, lambda out: out, tuple(out))
+        return lax.cond(lanewise.on_any(missing), corrected, lambda out: out, tuple(out))
 
     def undo_block(known_start, saved: Saved, first, count, at_save, grad, cot):
         last = first + count - 1
         cot = (cot[0] + at_save.q, cot[1] + at_save.p)
+        # Saved times and steps depend on h and t0 directly, not through the state.
         _, pull_times = jax.vjp(lambda theta: _end_of(eqx.combine(theta, fixed), last), theta)
         grad = jax.tree.map(jnp.add, grad, *pull_times((at_save.t, at_save.h)))
         at_save = at_save.observed
@@ -253,6 +253,7 @@ def pull_back(
             sums = pieces.over(undo, sums, reverse=True)
         return sums
 
+    # Each block begins where the one before ended; saved states are exact, not reconstructed.
     start_state = (q_start, p_start)
     ends = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start_state, (saved.q, saved.p))
     grad = jax.tree.map(jnp.zeros_like, theta)
@@ -300,8 +301,9 @@ def _largest(sizes, state):
 
 
 def _miss(a, b, size, allowed):
-    """By how much of its size each component of a misses b. To the size is added that of which
-    `allowed` is round-off of the largest component."""
+    """The difference of each component of a from b, relative to its size."""
+    # A small component inherits round-off of the largest one, which is no fault of the inverse
+    # steps. The size is increased so that this round-off is just accepted.
     round_off = 64 * jnp.finfo(a.dtype).eps * jnp.max(size, initial=0.0)
     return jnp.abs(a - b) / (size + (round_off / allowed + jnp.finfo(a.dtype).tiny))
 

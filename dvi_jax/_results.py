@@ -1,4 +1,4 @@
-"""How a trajectory ended: one status for each, carried beside its numbers."""
+"""The status of a trajectory, one for each element of a batch."""
 
 from typing import Any
 
@@ -11,10 +11,10 @@ from jaxtyping import Array
 class RESULTS(eqx.Enumeration):
     """Status of one trajectory.
 
-    Along a trajectory the first status that is not `successful` stays. Within one step
-    `not_finite` goes before `not_converged`: a solve that met NaN did not merely run
-    out of iterations. Compare with ``sol.result == dvi.RESULTS.successful`` (an array of
-    booleans for a batch); ``dvi.RESULTS[sol.result]`` is the text.
+    The first status of a trajectory that is not `successful` stays. Within one step `not_finite`
+    has precedence over `not_converged`, since NaN in a solve is more than a lack of iterations.
+    Compare with ``sol.result == dvi.RESULTS.successful`` (an array of booleans for a batch);
+    ``dvi.RESULTS[sol.result]`` is the text.
     """
 
     successful = ""
@@ -56,6 +56,7 @@ class RESULTS(eqx.Enumeration):
     )
 
 
+# In the order of the class, which numbers them. A new status goes to the end: stores have numbers.
 STATUS_NAMES = (
     "successful",
     "not_converged",
@@ -75,20 +76,20 @@ def status_name(result: RESULTS) -> Any:
 
 
 def status_code(result: RESULTS) -> Array:
-    """The place of a status in `STATUS_NAMES`, for each trajectory of a batch."""
-    (code,) = jax.tree.leaves(result)  # numbered in the order of the class
+    """The index of a status in `STATUS_NAMES`, for each trajectory of a batch."""
+    (code,) = jax.tree.leaves(result)
     return code
 
 
 def first_failure(earlier: RESULTS, later: RESULTS) -> RESULTS:
-    """The status to keep when `later` follows `earlier`: whichever failed first."""
+    """The combined status when `later` follows `earlier`: the first failure."""
     return RESULTS.where(earlier == RESULTS.successful, later, earlier)
 
 
 class IntegrationError(RuntimeError):
     """Raised by `integrate` with ``throw=True`` when a trajectory failed.
 
-    `solution` holds everything up to the failing step, with its status and statistics.
+    `solution` contains everything before the failing step, with its status and statistics.
     """
 
     def __init__(self, message: str, solution: object = None):

@@ -1,4 +1,4 @@
-"""Gradients that flow back along states which are rebuilt, not stored."""
+"""Reverse-mode gradients along reconstructed states."""
 
 import functools
 
@@ -29,34 +29,34 @@ from ._rollout import (
 
 
 class Reversible(AbstractAdjoint):
-    r"""Reverse mode that rebuilds the states by the inverse step instead of storing them.
+    r"""Reverse mode that reconstructs the states by the inverse step instead of storing them.
 
     Going backwards from λ_{k+1}, the state before the step is Φ_h⁻¹(q_{k+1}, p_{k+1}) and
 
         λ_k = (∂Φ_h/∂(q_k, p_k))ᵀ λ_{k+1},     dL/dθ += (∂Φ_h/∂θ)ᵀ λ_{k+1}.
 
-    Memory does not grow with num_steps but for one state about every `checkpoint_every` steps, from
-    which the rebuilding starts afresh: it amplifies round-off on chaotic or dissipative arcs.
-    Where a rebuilt component misses the stored one by more than `max_defect` of its own size
-    (None means 1e-6 in float64 and 1e-3 in float32; where that is round-off of the largest
-    component, by more than this), or an inverse step has no solution, the lane goes from that
-    checkpoint once more, its states stored: slower, and right for any dynamics. With
-    `report_defect` the solution gives the largest of these misses, in
-    ``stats["round_trip_defect"]`` (relative, ∞ where an inverse step has no solution), for as much
-    time as the states take to be rebuilt.
+    Memory does not grow with num_steps, except for one state about every `checkpoint_every` steps,
+    from which the reconstruction restarts: it amplifies round-off on chaotic or dissipative arcs.
+    Where a reconstructed component differs from the stored one by more than `max_defect` of its
+    size (None means 1e-6 in float64 and 1e-3 in float32; more where that is round-off of the
+    largest component), or an inverse step has no solution, the steps of the trajectory from that
+    checkpoint are computed again and their states stored: slower, and correct for any dynamics.
+    With `report_defect` the solution has the largest of these differences, in
+    ``stats["round_trip_defect"]`` (relative, ∞ where an inverse step has no solution). It takes as
+    much time as the reconstruction of the states.
 
-    The gradient of a trajectory that has failed is NaN. That of one that a loss does not look at is
-    0, failed or not, so that it spoils no parameter that lanes share: a loss takes
+    The gradient of a trajectory that has failed is NaN. The gradient of one that the loss does not
+    use is 0, failed or not, so that it does not affect parameters that a batch shares: a loss takes
     ``jnp.where(ok, q, 0.0)``, ok of ``sol.result == dvi.RESULTS.successful``, before it computes.
 
     Forward mode (`jvp`) and higher derivatives go through the scan as with `Direct`. A method
     without an inverse (`RungeKutta4`), a `Variational` lattice, a run with a `Stop`, with deviation
-    vectors (`LyapunovSpectrum` and its like) or with `Running` values, and a system or observable
-    that *closes over* a value being differentiated (better: hand it over in args), are
-    differentiated as by `Checkpointed`.
+    vectors (such as `LyapunovSpectrum`) or with `Running` values, and a system or observable that
+    *closes over* a value being differentiated (better: pass it in args), are differentiated as by
+    `Checkpointed`.
 
     **Raises** `ValueError` for settings that are not positive, and for `report_defect` where no
-    states are rebuilt.
+    states are reconstructed.
 
     **Source** our own combination; reversible backpropagation: Maclaurin, Duvenaud & Adams 2015.
     """
@@ -72,12 +72,12 @@ class Reversible(AbstractAdjoint):
         instance("report_defect", self.report_defect, bool, "True or False")
 
     def allowed(self, dtype) -> float:
-        """The largest miss that is let pass."""
+        """The largest relative difference that is accepted."""
         return self.max_defect or (1e-6 if jnp.dtype(dtype).itemsize >= 8 else 1e-3)
 
     def rollout(self, task, plan, q0, p0, layout=Layout()):
         theta, others = eqx.partition(task, eqx.is_inexact_array)
-        # Whole numbers and truth values may be traced as well: inputs without a derivative.
+        # Integers and booleans may be traced as well: inputs without a derivative.
         whole, fixed = eqx.partition(others, eqx.is_array)
 
         @jax.jit  # so that its uses below share one trace, and one trace of its derivative
@@ -91,15 +91,15 @@ class Reversible(AbstractAdjoint):
 
         inputs, every, allowed = (theta, q0, p0), self.checkpoint_every, self.allowed(q0.dtype)
         why = _why_not(task, inputs, whole)
-        # A value that is being differentiated or batched and that a function closes over is no
-        # input of the trajectory: a derivative written for its inputs would miss it.
+        # A traced value that a function closes over is not an input of the trajectory: a custom
+        # derivative with respect to the inputs would miss it.
         if not why and any(map(is_traced, jax.make_jaxpr(forward)(inputs, whole).consts)):
-            why = "a function of the run closes over a traced value (hand it over in args)"
+            why = "a function of the run closes over a traced value (pass it in args)"
         if why:
             if self.report_defect:
                 raise ValueError(
-                    f"report_defect=True asks how well states are rebuilt, but none are: {why}. "
-                    "Leave it out: gradients go by dvi.Checkpointed() here."
+                    f"report_defect=True requires states that are reconstructed, but none are: "
+                    f"{why}. Leave it out: gradients are those of dvi.Checkpointed() here."
                 )
             return Checkpointed().rollout(task, plan, q0, p0, layout)
 
@@ -109,15 +109,16 @@ class Reversible(AbstractAdjoint):
 
         @functools.partial(trajectory.defjvp, symbolic_zeros=True)
         def _(primals, tangents):
-            # The tangent is L·dx with L the derivative: forward mode runs L along the scan, reverse
-            # mode runs Lᵀ on rebuilt states.
+            # The tangent is L·dx with L the derivative: forward mode applies L along the scan,
+            # reverse mode applies Lᵀ along reconstructed states. It is a linear map with its own
+            # transpose, not a custom_vjp, under which forward mode would be impossible.
             (inputs, whole), (change, _) = primals, tangents
             smooth, trace = trajectory(inputs, whole)
-            # By inputs that do not move nothing is differentiated.
+            # Inputs with a tangent of zero are constants: no derivative is computed for them.
             moves = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), change)
             moving, still = eqx.partition(inputs, moves)
             change = eqx.filter(change, moves)
-            # No more than that: what nothing reads need not be computed on the way.
+            # Only the values that the reverse pass reads: the others need not be computed.
             carry, saved, tail, _ = trace
             known = carry.reductions, states_of(saved), None if tail is None else states_of(tail)
 
@@ -144,15 +145,17 @@ class Reversible(AbstractAdjoint):
 
             def pull(residuals, v):
                 out = lanewise.call(back, *residuals, v, layout=layout)
-                # From a lane that nothing asks for nothing flows back, though it has failed.
-                asked = jnp.any(jnp.stack([jnp.any(x != 0) for x in jax.tree.leaves(v)]))
-                return jax.tree.map(lambda x: jnp.where(asked, x, 0), out)
+                # A failed trajectory that the loss does not use: zero, although the states along
+                # which the cotangent zero would be transported are NaN.
+                used = jnp.any(jnp.stack([jnp.any(x != 0) for x in jax.tree.leaves(v)]))
+                return jax.tree.map(lambda x: jnp.where(used, x, 0), out)
 
             residuals = moving, still, whole, known
             moved = linear_map(push, pull, definition, residuals, change)
             return (smooth, trace), (moved, jax.tree.map(_no_tangent, trace))
 
         smooth, (carry, saved, tail, counts) = trajectory(inputs, whole)
+        # In the forward pass: a reverse pass cannot return a number besides the cotangents.
         rebuilt = None
         if self.report_defect:
 
@@ -166,12 +169,13 @@ class Reversible(AbstractAdjoint):
         kept = eqx.combine(smooth.saved, counts)
         if adds_start_outside(plan):
             kept = with_start(kept, q0, p0)
+        # The differentiable outputs take the place of their copies in the carry, which have none.
         return Outcome(carry._replace(q=smooth.q, p=smooth.p), kept, smooth.reduced, rebuilt)
 
     def _inner_loop(self, body, state, _, count):
-        """A scan over the steps of a block that keeps the state every `checkpoint_every` steps."""
+        """A scan over the steps of a block that stores a state every `checkpoint_every` steps."""
         size = piece_length(count, self.checkpoint_every)
-        segments = (count - 1) // size  # the end of the block is kept anyway
+        segments = (count - 1) // size  # the end of the block is saved anyway
         if segments == 0:
             return lax.scan(body, state, None, count)
 
@@ -194,17 +198,17 @@ def _no_tangent(x):
 
 
 def _why_not(task: Task, *inputs) -> str | None:
-    """Why no states of this run can be rebuilt, None if they can."""
+    """Why no states of this run can be reconstructed; None if they can."""
     if not task.method.is_invertible:
         return f"{type(task.method).__name__} has no inverse step"
     if task.lattice.has_memory:
         return f"the steps of {type(task.lattice).__name__} depend on those before"
     if task.stop is not None:
-        return "a run with a Stop ends in the midst"
+        return "a run with a Stop may end before its last step"
     if task.has_deviations:
         return "deviation vectors cannot be followed backwards"
     if task.has_running_values:
-        return "running values of reductions are not rebuilt"
+        return "running values of reductions are not reconstructed"
     if manual_axes(*jax.tree.leaves(inputs)):
         return "the run is inside of jax.shard_map with check_vma=True"
     return None

@@ -1,4 +1,4 @@
-"""Many steps: the scan over a lattice, with status, saved states and observables."""
+"""The loop over the steps of a time grid, with status, saved states and observables."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -24,12 +24,11 @@ from .observe import Deviations, Pushed, Reduction, Running, Stop, is_observable
 from .observe._kept import Start, as_row, event
 
 Loop = Callable[[Callable, Any, None, int], tuple[Any, Any]]
-"""``(body, carry, None, count) -> (carry, ys)``, as `lax.scan`, which is the plain one. How
-gradients flow back through it is its own."""
+"""``(body, carry, None, count) -> (carry, ys)``: `lax.scan`, or one with another derivative."""
 
 
 class Task(eqx.Module):
-    """All that stays the same along a trajectory."""
+    """The constants of a trajectory."""
 
     equations: Equations
     method: Method
@@ -46,10 +45,7 @@ class Task(eqx.Module):
         return self.equations.args
 
     def interval(self, k: Int[Array, ""]) -> Interval:
-        """The interval of step k, in the precision of the state (that of h).
-
-        A lattice with a memory knows only that of the first step: see `next_interval`.
-        """
+        """The interval of step k; of a lattice with a memory, of the first step only."""
         return self._in_precision(self.lattice.interval(self.t0, self.h, k))
 
     def first_interval(self) -> Interval:
@@ -57,23 +53,25 @@ class Task(eqx.Module):
         return self.interval(jnp.asarray(0, jnp.int32))
 
     def next_interval(self, carry: "Carry") -> tuple[Interval, Any, RESULTS | None]:
-        """The interval of the next step, what the lattice remembers then, and if there is one."""
+        """The interval of the next step, the memory of the lattice after it, and its status."""
         place = Place(self.t0, self.h, carry.k, carry.q, carry.p)
         interval, memory, result = self.lattice.next(carry.lattice, self.equations, place)
         return self._in_precision(interval), memory, result
 
     def _in_precision(self, interval: Interval) -> Interval:
+        # The times of a user may be float64 where the state is float32, which sets the precision.
         return Interval(*(x.astype(self.h.dtype) for x in interval))
 
     def observables(self) -> tuple[list[Callable], list[Reduction]]:
-        """The functions that stand alone, and the reductions, in tree order."""
+        """The functions without a reduction, and the reductions, in tree order."""
         alone = [self.bound(f) for f in self._leaves() if not isinstance(f, Reduction | Running)]
         found = [f.reduction if isinstance(f, Running) else f for f in self._leaves()]
         return alone, [f for f in found if isinstance(f, Reduction)]
 
     def at_save(self, carry: "Carry", taken: "StepTaken | None") -> list[Any]:
-        """What is observed at a save point, after the step taken (None where nobody asks for it):
-        values of functions that stand alone and running values of reductions, in tree order."""
+        """The values of functions without a reduction and the running values of reductions, in tree
+        order, at a save point after the step `taken`."""
+        # A running value is NaN after a failure: the reduction still has that of the steps before.
         memories, values = iter(carry.reductions), []
         for f in self._leaves():
             if isinstance(f, Running):
@@ -91,7 +89,7 @@ class Task(eqx.Module):
 
     @property
     def has_running_values(self) -> bool:
-        """Whether a reduction is told at every save point."""
+        """Whether a reduction has a value at every save point."""
         return any(isinstance(f, Running) for f in self._leaves())
 
     @property
@@ -100,14 +98,14 @@ class Task(eqx.Module):
         return any(isinstance(r, Deviations) for r in self.observables()[1])
 
     def bound(self, observable: Callable) -> Callable:
-        """The observable, told the system and ε if it asks for them."""
+        """The observable, bound to the system and ε if it requires them."""
         if isinstance(observable, Bindable):
             return observable.bind(self.equations.system, self.equations.epsilon)
         return observable
 
 
 class Carry(NamedTuple):
-    """What goes from step to step; k is the number of the next one."""
+    """State between steps; k is the number of the next one."""
 
     k: Int[Array, ""]
     q: State
@@ -119,12 +117,12 @@ class Carry(NamedTuple):
     iterations: Int[Array, ""]
     residual: Float[Array, "2"]
     reductions: list[Any]
-    beside: Any = None  # what the arithmetic remembers
-    stop: Any = None  # with a `Stop`: the step it ended, as a row
+    beside: Any = None  # memory of the arithmetic
+    stop: Any = None  # with a `Stop`: the last step, as a row
 
 
 class StepTaken(NamedTuple):
-    """One step as an observable sees it."""
+    """One step, the arguments of an observable."""
 
     t0: Scalar
     t1: Scalar
@@ -137,33 +135,29 @@ class StepTaken(NamedTuple):
         return jnp.asarray(observable(*self, args))
 
     def number(self, observable: Callable, args: Args) -> Array:
-        """The value for a reduction: whole numbers and truth values count as real numbers."""
+        """The value for a reduction, as real numbers also if it is integer or boolean."""
         value = self.value(observable, args)
         if not jnp.issubdtype(value.dtype, jnp.inexact):
             value = value.astype(self.q1.dtype)
-        # Rounded, and no product that is contracted with the reduction's difference: equal values
-        # have the drift zero.
+        # The barrier keeps a product in the value from being contracted (FMA) with the difference
+        # in a reduction: equal values would then have a drift of one rounding error.
         return lax.optimization_barrier(value)
 
 
 class Saved(NamedTuple):
-    """What is kept of a step at a save point.
-
-    `inner` is what the scan over the steps since the save point before has returned besides its
-    carry (checkpoints, for a reversible gradient; else None).
-    """
+    """The saved values of a step."""
 
     t: Array
     h: Array
     q: Array
     p: Array
     observed: list[Any]
-    inner: Any = None
+    inner: Any = None  # checkpoints since the save point before, for a reversible gradient
 
 
 class Outcome(NamedTuple):
-    """A trajectory as it leaves the scan: last carry, saved states with the start in front, reduced
-    observables, and the largest miss of a state that was rebuilt, if it was asked for."""
+    """Result of the loop: last carry, saved states with the start in front, reduced observables,
+    and the largest error of a reconstructed state if it was requested."""
 
     carry: Carry
     saved: Saved
@@ -187,6 +181,7 @@ class Plan(NamedTuple):
 def make_plan(save: Save, num_steps: int) -> Plan:
     every = save.every
     if every is None:
+        # Without `every` a run that saves its end only is one block. A block has at least one step.
         keeps_end_alone = save.final or save.ts is not None
         every = max(num_steps, 1) if keeps_end_alone else 1
     num_blocks, tail = divmod(num_steps, every)
@@ -194,10 +189,8 @@ def make_plan(save: Save, num_steps: int) -> Plan:
 
 
 def piece_length(count: int, every: int) -> int:
-    """Into pieces of how many steps `count` of them are cut: about `every`, the last not longer.
-
-    Pieces of one length are taken if there are any near: their loop is known to the compiler.
-    """
+    """The length, about `every`, of the pieces of `count` steps."""
+    # A divisor of `count`, if there is one near: with pieces of one length one loop is compiled.
     lengths = range(min(3 * every // 2, count), every // 2, -1)
     return next((n for n in lengths if count % n == 0), every)
 
@@ -218,12 +211,14 @@ def start(task: Task, q0: State, p0: State) -> Carry:
 
     _, reductions = task.observables()
     failed = result != RESULTS.successful
+    # A start that meets the condition of a Stop already has no step at all.
     stop = None
     if task.stop is not None:
         over = ~failed & (event(task.stop.g, task.t0, q0, p0, task.args) >= 0)
         result = RESULTS.where(over, RESULTS.stopped, result)
         stop = as_row(over, Start(task.t0, interval.t1, interval.t1, q0, p0))
     good = result == RESULTS.successful
+    # A typed zero: the carry of a scan must not change its type, and a Python integer would.
     zero = jnp.asarray(0, jnp.int32)
     return Carry(
         k=zero,
@@ -252,18 +247,21 @@ def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
         return (q1, p1), (beside, info)
 
     if task.has_deviations:
+        # One linearisation serves all deviation vectors of all reductions.
         (q1, p1), push, (beside, info) = jax.linearize(advance, carry.q, carry.p, has_aux=True)
     else:
         ((q1, p1), (beside, info)), push = advance(carry.q, carry.p), None
     result = info.result if exists is None else first_failure(exists, info.result)
     result, stop = _stop(task, carry, interval, q1, p1, result)
-    # What has failed before stays NaN, so that this step is not good either.
+    # After a failure the state is NaN, so that no later step is good: the test of one step is
+    # enough, and the loop needs no flag.
     good = result == RESULTS.successful
     residual = lax.stop_gradient(info.residual)
     q1, p1, result, failed_step, failed_residual = _noted(carry, q1, p1, result, good, residual)
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
     reduced = _reduced(task, carry, taken, push, interval.h)
-    if stop is not None:  # what is reduced covers the steps before
+    if stop is not None:
+        # Reductions cover the steps before the one in which the run stopped.
         over = result == RESULTS.stopped
         reduced = jax.tree.map(lambda a, b: jnp.where(over, b, a), reduced, carry.reductions)
     was_good = carry.result == RESULTS.successful
@@ -271,6 +269,7 @@ def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
         k=carry.k + 1,
         q=q1,
         p=p1,
+        # The memory of the last good step, for the report: that of a failed one may be NaN.
         lattice=jax.tree.map(lambda new, old: jnp.where(good, new, old), memory, carry.lattice),
         result=result,
         failed_step=failed_step,
@@ -287,14 +286,13 @@ def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
 def _noted(
     carry: Carry, q1: State, p1: State, result: RESULTS, good: Array, residual: Array
 ) -> tuple[State, State, RESULTS, Array, Array]:
-    """State, status, failed step and its residual after a step, where it is the first that is not
-    good. The branch keeps this work out of steps in which nothing fails."""
+    """State, status, failed step and its residual after a step."""
 
     def note():
         first = ~good & (carry.result == RESULTS.successful)
         fails = first & (result != RESULTS.stopped)
         return (
-            # A state after a failed step is no answer: NaN keeps it from being taken for one.
+            # The state after a failed step is not a result: as NaN it cannot be mistaken for one.
             _or_nan(good, q1),
             _or_nan(good, p1),
             first_failure(carry.result, result),
@@ -305,13 +303,14 @@ def _noted(
     def keep():
         return q1, p1, carry.result, carry.failed_step, carry.failed_residual
 
+    # The branch keeps this work out of steps in which nothing fails, which is nearly every step.
     return lax.cond(lanewise.on_any(~good), note, keep)
 
 
 def _reduced(
     task: Task, carry: Carry, taken: StepTaken, push: Callable | None, h: Scalar
 ) -> list[Any]:
-    """The memories of the reductions after a step, whose derivative is `push`."""
+    """The memories of the reductions after a step with the derivative `push`."""
     _, reductions = task.observables()
 
     def value(r: Reduction, memory: Any) -> Any:
@@ -327,8 +326,9 @@ def _reduced(
 
 
 def _pushed(push: Callable, vectors: Array, taken: StepTaken, h: Scalar) -> Pushed:
-    """Deviation vectors (δq, δp), one in each row, after the step; NaN if it has failed."""
+    """Deviation vectors (δq, δp), the rows of `vectors`, after the step; NaN if it has failed."""
 
+    # Vectors are flat, so that observers of deviations need not know the shape of a state.
     def of(vector):
         dq, dp = (x.reshape(taken.q0.shape) for x in jnp.split(vector, 2))
         return jnp.concatenate([x.ravel() for x in push(dq, dp)])
@@ -340,7 +340,7 @@ def _pushed(push: Callable, vectors: Array, taken: StepTaken, h: Scalar) -> Push
 def _stop(
     task: Task, carry: Carry, interval: Interval, q1: State, p1: State, result: RESULTS
 ) -> tuple[RESULTS, Any]:
-    """The status and the step noted, after the step that a `Stop` ends the run with."""
+    """The status and the stored row, after a step that may meet the condition of a `Stop`."""
     if task.stop is None:
         return result, None
     met = event(task.stop.g, interval.t1, q1, p1, task.args) >= 0
@@ -352,17 +352,17 @@ def _stop(
 def run(
     task: Task, plan: Plan, carry: Carry, loop: Loop, inner_loop: Loop | None = None
 ) -> tuple[Carry, Saved, Saved | None]:
-    """All steps of `plan`: the carry, what was saved, and the tail.
+    """All steps of `plan`: the carry, the saved values of the blocks, those of the tail (or None).
 
-    `loop` scans over the blocks and `inner_loop` (the same if None) over the steps of one. The
-    tail is the end of the steps after the last block, None where there are none.
+    `loop` runs over the blocks, `inner_loop` (the same if None) over the steps of one block.
     """
     inner_loop = loop if inner_loop is None else inner_loop
     alone, _ = task.observables()
     has_memory = task.lattice.has_memory
 
     def last_of(carry, interval, taken):
-        """What a save point needs of the last step besides the carry."""
+        # The values of the last step that a save point needs and the carry does not have. Without
+        # them the loop has fewer numbers to carry.
         return interval if has_memory else None, (taken.q0, taken.p0) if alone else None
 
     def body(state, _):
@@ -370,9 +370,9 @@ def run(
         return (carry, last_of(carry, interval, taken)), None
 
     def steps(carry, _, count=plan.block):
-        """The next `count` steps, and the last of them as it is saved."""
+        """The next `count` steps, and the saved values of the last of them."""
         inner, interval = None, task.interval(carry.k + (count - 1))
-        if count == 1:
+        if count == 1:  # a loop around one step would take time to compile
             carry, interval, taken = take_step(task, carry)
         else:
             before = last_of(carry, interval, StepTaken(*interval[:2], *[carry.q, carry.p] * 2))
@@ -384,6 +384,7 @@ def run(
         return carry, Saved(interval.t1, interval.h, carry.q, carry.p, observed, inner)
 
     carry, saved = loop(steps, carry, None, plan.num_blocks)
+    # The tail is outside of the scan, whose rows all have the same number of steps.
     if not plan.tail:
         return carry, saved, None
     carry, tail = steps(carry, None, plan.tail)
@@ -393,7 +394,7 @@ def run(
 def outcome(
     task: Task, plan: Plan, ran: tuple[Carry, Saved, Saved | None], q0: State, p0: State
 ) -> Outcome:
-    """What `run` gave, with the start in front unless `adds_start_outside`."""
+    """The result of `run`, with the start in front unless `adds_start_outside`."""
     carry, saved, tail = ran
     saved = with_tail(plan, saved, tail)
     if not adds_start_outside(plan):
@@ -408,7 +409,7 @@ def reduce(task: Task, carry: Carry) -> list[Any]:
 
 
 def with_tail(plan: Plan, saved: Saved, tail: Saved | None) -> Saved:
-    """What was saved, the end of the tail included where it is asked for."""
+    """The saved values, those of the end of the tail included if the plan saves it."""
     saved = saved._replace(inner=None)
     if tail is None or not plan.save_tail:
         return saved
@@ -417,16 +418,14 @@ def with_tail(plan: Plan, saved: Saved, tail: Saved | None) -> Saved:
 
 
 def adds_start_outside(plan: Plan) -> bool:
-    """Whether the start is put in front of the saved states after the compiled run, not in it.
-
-    Of few states the start is a large part, which a user who reads the last one does not want
-    written; of many it is a small part, and adding it afterwards would copy them all.
-    """
+    """Whether the start is added to the saved states after the compiled run, not in it."""
+    # Among few states the start is a large fraction, which need not be written for a user who reads
+    # the last state only. Among many it is a small fraction, and adding it later copies them all.
     return plan.num_blocks <= 4
 
 
 def with_start(saved: Saved, q0: State, p0: State) -> Saved:
-    """What was saved, the states from the start on."""
+    """The saved values, the states with the start in front."""
     q, p = (jnp.concatenate([a[None], b]) for a, b in ((q0, saved.q), (p0, saved.p)))
     return saved._replace(q=q, p=p)
 

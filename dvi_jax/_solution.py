@@ -1,4 +1,4 @@
-"""What `integrate` returns, and what it is asked to save."""
+"""The result of `integrate`, and the choice of the states that it saves."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,26 +16,28 @@ from ._types import State
 from .engine.signature import check_takes
 
 
+# The times are an array, not static: they may be traced, and new times need no new compilation.
 def _times(ts: Any) -> Any:
     return None if ts is None else as_times("Save(ts=...)", ts)
 
 
 class Save(eqx.Module):
-    """Which states are kept; the start always is, but with `ts`.
+    """The states that a run saves. The start is always one of them, except with `ts`.
 
     - ``Save(every=m)``: the states after m, 2m, 3m, … steps.
     - ``Save(final=True)``: the state after the last step; together with `every`, also when
-      num_steps is no multiple of it.
+      num_steps is not a multiple of it.
     - ``Save()``: every state.
-    - ``Save(ts=times)``: the states at these times and no others, in the order in which the run
-      meets them. Between lattice points it is the step of the method to that time, so that its
-      order is the method's. Times outside of the run give NaN and the status `not_reached`.
-      What the map keeps at step h is kept at lattice points alone, not at the end of such a part.
+    - ``Save(ts=times)``: the states at these times and no others, in the order of the run. Between
+      grid points it is a shorter step of the method to that time, which has the order of the
+      method. Times outside of the run give NaN and the status `not_reached`. Invariants of the map
+      at step h are conserved at grid points only, not at the end of a shorter step.
       With ``clock=f``, a function ``(t, q, p, args)`` → scalar that grows along the trajectory, an
       angle for instance, `ts` are values of it.
 
-    **Raises** `ValueError` for an `every` that is not a positive integer, for `ts` beside another
-    choice, and for times that are not one-dimensional, finite, in ascending or descending order.
+    **Raises** `ValueError` for an `every` that is not a positive integer, for `ts` together with
+    another choice, and for times that are not one-dimensional, finite, in ascending or descending
+    order.
 
     **Example**
 
@@ -62,12 +64,12 @@ class Save(eqx.Module):
             check_takes("the clock of Save", self.clock, "(t, q, p, args)")
         if self.ts is None:
             if self.clock is not None:
-                raise ValueError("a clock needs times to be saved at: Save(ts=..., clock=...).")
+                raise ValueError("a clock requires times: Save(ts=..., clock=...).")
             return
         if self.every is not None or self.final:
             raise ValueError(
-                "Save(ts=...) saves at those times alone: leave out every and final, or add the "
-                "times that they would give."
+                "Save(ts=...) saves at those times only: leave out every and final, or add their "
+                "times to ts."
             )
         if self.ts.ndim != 1 or self.ts.shape[0] == 0:
             raise ValueError(
@@ -75,6 +77,7 @@ class Save(eqx.Module):
             )
         if not is_traced(self.ts):
             steps = np.diff(np.asarray(self.ts))
+            # In order, since a step finds its times by bisection. Traced ones are sorted in a run.
             ordered = bool((steps >= 0).all() or (steps <= 0).all())
             if not (ordered and np.isfinite(np.asarray(self.ts)).all()):
                 raise ValueError(
@@ -86,23 +89,23 @@ class Save(eqx.Module):
 class Solution(eqx.Module):
     """A computed trajectory.
 
-    - `ts`: saved times, shape (S,); ``ts[0]`` is t0, but with ``Save(ts=...)``.
+    - `ts`: saved times, shape (S,); ``ts[0]`` is t0, except with ``Save(ts=...)``.
     - `qs`, `ps`: saved positions and momenta, shape (S, *q0.shape).
-    - `hs`: size of the step that ended at each saved time but the first, shape (S − 1,).
-      With ``Save(ts=...)`` the first time is like the others: `hs` and what stands alone in
-      `observed` have shape (S, …), and belong to the part of a step that ends at each time (at t0
-      of no length).
-    - `observed`: the pytree given as `observe`; an observable alone becomes its values on the
-      steps that ended at ``ts[1:]``, shape (S − 1, …); a reduction becomes one value over all
-      steps.
-    - `result`: the status, one of `RESULTS`. From the failing step on states and observables
-      are NaN.
-    - `stop`: where a run with a `Stop` ended, a `Stopped` (t, q, p), NaN if it did not; else None.
-    - `stats`: `num_steps`; `newton_iterations` (total); `max_residual` (largest last
-      correction of a solve relative to its scale); `failed_step` (number of the failing step from
-      0, or −1) and `failed_residual` (its last correction, likewise, or 0).
+    - `hs`: size of the step that ended at each saved time except the first, shape (S − 1,).
+      With ``Save(ts=...)`` the first time is like the others: `hs` and the values of functions in
+      `observed` have shape (S, …), and belong to the shorter step that ends at each time (of size
+      zero at t0).
+    - `observed`: the pytree given as `observe`; a function is replaced by its values on the steps
+      that ended at ``ts[1:]``, shape (S − 1, …), a reduction by one value over all steps.
+    - `result`: the status, one of `RESULTS`. From the failing step on states and observables are
+      NaN.
+    - `stop`: the end (t, q, p) of a run with a `Stop`, a `Stopped`, NaN if it did not stop; else
+      None.
+    - `stats`: `num_steps`; `newton_iterations` (total); `max_residual` (largest last correction of
+      a solve relative to its scale); `failed_step` (number of the failing step from 0, or −1) and
+      `failed_residual` (its last correction, likewise, or 0).
 
-    Under `vmap` every field has the batch axis in front.
+    Under `vmap` the first axis of every field is the batch.
     """
 
     ts: Float[Array, "..."]

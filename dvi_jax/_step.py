@@ -19,8 +19,7 @@ from .engine.rounding import one_by_one
 
 
 class StepInfo(NamedTuple):
-    """Status of a step, iterations spent, and the largest component of the last correction with the
-    scale that it is measured by."""
+    """Status of a step, number of iterations, and (largest last correction, its scale)."""
 
     result: RESULTS
     iterations: Int[Array, ""]
@@ -36,17 +35,18 @@ class StepInfo(NamedTuple):
 
 
 def no_step_yet(like: State) -> StepInfo:
-    """The information that `StepInfo.then` starts from."""
+    """The neutral element of `StepInfo.then`."""
+    # A status that is an array, as in the carry of a scan; `RESULTS.successful` itself is static.
     good = RESULTS.where(jnp.asarray(True), RESULTS.successful, RESULTS.not_finite)
     return StepInfo(good, *no_solve(like)[:2])
 
 
 class Equations(eqx.Module):
-    """The discrete equations of a system at one ε and one set of args, ready to be stepped.
+    """The discrete equations of a system for one ε and one set of args.
 
-    `newton` says how their implicit part is solved. Where there is an `origin`, positions and
-    momenta are told relative to it; where there is a `quantum`, an explicit step changes the state
-    by whole multiples of it, and a rate has the same bits wherever it is evaluated.
+    `newton` is the solver of their implicit part. With an `origin` positions and momenta are
+    relative to it; with a `quantum` an explicit step changes the state by integer multiples of it,
+    and a rate has the same bits in every evaluation.
     """
 
     system: System
@@ -57,7 +57,7 @@ class Equations(eqx.Module):
     quantum: float | None = eqx.field(static=True, default=None)
 
     def absolute(self, q: State, p: State) -> tuple[State, State]:
-        """(q, p) as the system knows them, the origin included."""
+        """(q, p) in the coordinates of the system, the origin added."""
         if self.origin is None:
             return q, p
         return self.origin[0] + q, self.origin[1] + p
@@ -69,6 +69,8 @@ class Equations(eqx.Module):
     def momentum_rate(self, interval: Interval, q0: State, p1: State) -> State:
         """−∂H_D/∂q0 + εW at (t0, t1, q0, p1): the right side of (13)."""
         at = (self.system, *interval[:2], *self.absolute(q0, p1), self.epsilon, self.args)
+        # With a quantum the last bits decide where a rate is rounded to: compiled separately they
+        # are the same forwards and backwards.
         if self.quantum is None:
             return _momentum_rate(*at)
         return one_by_one(_momentum_rate, *at)
@@ -82,6 +84,7 @@ class Equations(eqx.Module):
 
     def step_is_explicit(self, interval: Interval, like: State) -> bool:
         """Whether p1 enters neither ∂H_D/∂q0 nor W, so that (13) needs no solve."""
+        # Read from the jaxpr: a value-dependent test could not run under jit.
         return not depends_on(lambda p1: self.momentum_rate(interval, like, p1), 0, like)
 
     def inverse_is_explicit(self, interval: Interval, like: State) -> bool:
@@ -89,8 +92,8 @@ class Equations(eqx.Module):
         return not depends_on(lambda q0: self.position_rate(interval, q0, like), 0, like)
 
 
-# Jitted, so that the many places which a rollout takes them from share one trace of the user's
-# functions, and of their derivatives.
+# Jitted, so that all calls in a rollout share one trace of the user's functions and of their
+# derivatives.
 
 
 @eqx.filter_jit
@@ -108,12 +111,13 @@ def _position_rate(system: System, *at) -> State:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def to_grid(x: State, quantum: float) -> State:
-    """The multiple of `quantum`, a power of two, nearest to x (half to even); its slope is 1."""
+    """The multiple of `quantum`, a power of two, nearest to x (half to even)."""
     return jnp.round(x * (1 / quantum)) * quantum
 
 
 @to_grid.defjvp
 def _(quantum, primals, tangents):
+    # Slope 1, that of the map without rounding; the slope of a staircase is zero.
     return to_grid(*primals, quantum), tangents[0]
 
 
@@ -126,6 +130,7 @@ def step(
     q1 = q0 + h ∂H_D/∂p1 (t0, t1, q0, p1)
     """
     h, force = interval.h, functools.partial(equations.momentum_rate, interval, q0)
+    # The result where p1 does not enter, and otherwise the guess, with an error O(h²).
     p1 = p0 + equations.increment(h, force(p0))
     p1, info = _solved(force, h, p0, p1, equations, equations.absolute(q0, p0)[1])
     q1 = q0 + equations.increment(h, equations.position_rate(interval, q0, p1))
@@ -152,14 +157,14 @@ def adjoint_step(
 ) -> tuple[State, State, StepInfo]:
     """The adjoint Φ*_h = (Φ_{−h})⁻¹: (q0, p0) at t0 → (q1, p1) at t1.
 
-    It is the inverse of the step that walks the interval backwards; H_D and W are
-    evaluated at (t1, t0, q1, p0).
+    It is the inverse of the step over the reversed interval; H_D and W are evaluated at
+    (t1, t0, q1, p0).
     """
     return inverse_step(equations, interval.reversed(), q0, p0)
 
 
 def no_solve(like: State) -> RootInfo:
-    """What is said of a solve where none is needed."""
+    """The information on a solve where none is needed."""
     real = jnp.finfo(like.dtype).dtype
     return RootInfo(jnp.asarray(0, jnp.int32), no_residual(real), jnp.asarray(True))
 
@@ -167,10 +172,8 @@ def no_solve(like: State) -> RootInfo:
 def _solved(
     rate: Callable, h: Scalar, x0: State, guess: State, equations: Equations, known: State
 ) -> tuple[State, RootInfo]:
-    """x1 = x0 + h rate(x1) near `guess`, which it is where `rate` ignores x1.
-
-    `known` is x0 with the origin, by which the accuracy of a solve is measured.
-    """
+    """x1 = x0 + h rate(x1) near `guess`, which is x1 if `rate` does not depend on x1; `known` is x0
+    with the origin, the scale of the accuracy."""
     if not depends_on(rate, 0, x0):
         return guess, no_solve(x0)
     start = x0.ravel()
@@ -178,21 +181,22 @@ def _solved(
     def residual(x1):
         return x1 - start - h * rate(x1.reshape(x0.shape)).ravel()
 
+    # A small increment next to an origin has its own round-off, smaller than that of the whole
+    # coordinate in `known`: both ends of the step as they are represented.
     represented = jnp.maximum(jnp.abs(x0), jnp.abs(guess)).ravel()
     x1, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton, represented)
     return x1.reshape(x0.shape), info
 
 
 def judge(info: RootInfo, q: State, p: State, quantum: float | None = None) -> StepInfo:
-    """What became of a step: its solve, and whether the state that it led to is finite.
-
-    With a quantum, also whether that state is small enough for sums to be exact.
-    """
+    """The status of a step, from its solve and from the state after it."""
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(p))
     result = RESULTS.where(info.converged, RESULTS.successful, RESULTS.not_converged)
     if quantum is not None:
+        # Larger multiples of the quantum are not all representable: sums would round.
         largest = quantum * 2.0 ** (jnp.finfo(q.dtype).nmant + 1)
         fits = jnp.all(jnp.abs(q) <= largest) & jnp.all(jnp.abs(p) <= largest)
         result = RESULTS.where(fits, result, RESULTS.out_of_range)
+    # Last, because NaN makes a solve fail as well, and is the reason that helps the user.
     result = RESULTS.where(finite, result, RESULTS.not_finite)
     return StepInfo(result, info.iterations, info.residual)

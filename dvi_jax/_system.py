@@ -1,4 +1,4 @@
-"""What the user writes: a discrete Hamiltonian, a disturbing force, a perturbation."""
+"""The problem of the user: a discrete Hamiltonian, a perturbing force, a perturbation."""
 
 import weakref
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from .engine.reads import Reads, changed, reads
 from .engine.signature import check_takes
 
 _NAMES = "(t0, t1, q0, p1, args)"
-_CONTINUOUS = "A continuous Hamiltonian H(t, q, p, args) goes through dvi.discretise(H) first."
+_CONTINUOUS = "Make a discrete Hamiltonian of a continuous H(t, q, p, args) by dvi.discretise(H)."
 
 
 class System(eqx.Module):
-    r"""A disturbed discrete Hamiltonian system.
+    r"""A perturbed discrete Hamiltonian system (*disturbed* in the paper).
 
-    The discrete Hamiltonian is ``H_D + epsilon * perturbation`` and the disturbing force
+    The discrete Hamiltonian is ``H_D + epsilon * perturbation`` and the perturbing force
     ``epsilon * force``; the map they define is (12)–(13) of the paper:
 
         q1 = q0 + h ∂H_D/∂p1,        p1 = p0 − h ∂H_D/∂q0 + h ε W(t0, t1, q0, p1).
@@ -30,22 +30,22 @@ class System(eqx.Module):
     - `H_D`: function ``(t0, t1, q0, p1, args)`` → scalar [energy].
     - `force`: W, function of the same arguments → array like q0 [energy / unit of q]; or None.
     - `perturbation`: H1_D, function of the same arguments → scalar [energy]; or None.
-      ``epsilon * H1_D`` is added to H_D: a disturbance that derives from a Hamiltonian.
+      ``epsilon * H1_D`` is added to H_D: a perturbation that derives from a Hamiltonian.
     - `slow_time`: if True all three functions receive the slow times ``epsilon * t0`` and
       ``epsilon * t1`` in place of t0 and t1.
 
-    q0 and p1 are arrays of one shape, whichever was given to `integrate`. `args` is
-    any pytree; what of it is an array or a float is differentiable.
+    q0 and p1 are arrays of one shape, the one given to `integrate`. `args` is any pytree; its
+    arrays and floats are differentiable.
 
-    Values that the functions read from outside (globals, closures, ``self.k``) are those of the
-    moment when the system is made. If they change, runs of this system raise `ValueError`: make a
-    new system, or pass such values in `args`.
+    Values that the functions read from outside (globals, closures, ``self.k``) are those at the
+    time when the system is made. If they change, runs of this system raise `ValueError`: make a new
+    system, or pass such values in `args`.
 
-    **Raises** `TypeError` when a function is not callable or cannot take the five arguments.
+    **Raises** `TypeError` when a function is not callable or does not take the five arguments.
 
     **Source** H_D: type II generating function S = p1·q0 + h H_D (Marsden & West 2001,
-    *Discrete mechanics and variational integrators*; Leok & Zhang 2011). Disturbance: the
-    paper, (6)–(13).
+    *Discrete mechanics and variational integrators*; Leok & Zhang 2011). Perturbations: the paper,
+    (6)–(13).
 
     **Example**
 
@@ -69,6 +69,7 @@ class System(eqx.Module):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)  # a module is frozen
+        # A copy or an unpickled system has other objects: marks by identity would all differ.
         vars(self)["reads"] = _read_by(self)
 
     def __check_init__(self):
@@ -80,7 +81,7 @@ class System(eqx.Module):
         functions = (self.H_D, self.perturbation)
         if self.slow_time and any(getattr(f, "step_is_from_times", False) for f in functions):
             raise ValueError(
-                "dvi.discretise(H, order) of order 2 and up, dvi.from_lagrangian and "
+                "dvi.discretise(H, order) of order 2 and higher, dvi.from_lagrangian and "
                 "dvi.from_type_iii take the step from t1 − t0, which is not the step in a slow "
                 "time: use order=1, and compose the map for a higher order."
             )
@@ -93,7 +94,7 @@ class System(eqx.Module):
         H = self.H_D(s0, s1, q0, p1, args)
         if self.perturbation is not None:
             H = H + epsilon * self.perturbation(s0, s1, q0, p1, args)
-        return jnp.asarray(H, p1.dtype)
+        return jnp.asarray(H, p1.dtype)  # also where args are in double and the state is not
 
     def disturbing_force(
         self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
@@ -109,50 +110,51 @@ class System(eqx.Module):
         return (epsilon * t0, epsilon * t1) if self.slow_time else (t0, t1)
 
     def check_shapes(self, t: Scalar, q: State, p: State, epsilon: Scalar, args: Args) -> None:
-        """Refuse functions whose values have the wrong shape or type, by tracing them once for
-        each combination of shapes and types."""
+        """**Raises** `ValueError` or `TypeError` for functions whose values have the wrong shape or
+        type."""
         leaves, tree = jax.tree.flatten((t, q, p, args))
+        # A function is traced once for each combination of shapes, types and values that it reads.
         kinds = (
             self.reads,
             tree,
             *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves),
         )
-        for name, function in (("H_D", self.H_D), ("perturbation", self.perturbation)):
-            if function is not None:
-                out = _traced_output(function, name, kinds, t, q, p, args)
-                if out.shape != () or not jnp.issubdtype(out.dtype, jnp.floating):
-                    raise ValueError(
-                        f"{name}{_NAMES} must return a real scalar (an energy); for q0 of shape "
-                        f"{q.shape} it returned shape {out.shape}, dtype {out.dtype}. "
-                        + (
-                            "Reduce it, e.g. with jnp.sum."
-                            if out.shape
-                            else "Take the real part if that is what is meant."
-                        )
-                    )
-        if self.force is not None:
-            out = _traced_output(self.force, "force", kinds, t, q, p, args)
-            if out.shape != q.shape or not jnp.issubdtype(out.dtype, jnp.floating):
-                raise ValueError(
-                    f"force{_NAMES} must return a real array shaped like q0, {q.shape}; it "
-                    f"returned shape {out.shape}, dtype {out.dtype}."
-                )
+        scalar = "a real scalar (an energy)"
+        for name, function, shape, expected in (
+            ("H_D", self.H_D, (), scalar),
+            ("perturbation", self.perturbation, (), scalar),
+            ("force", self.force, q.shape, f"a real array shaped like q0, {q.shape}"),
+        ):
+            if function is None:
+                continue
+            out = _traced_output(function, name, kinds, t, q, p, args)
+            if out.shape == shape and jnp.issubdtype(out.dtype, jnp.floating):
+                continue
+            hint = "" if shape else "Take the real part, if it is the energy."
+            if out.shape and not shape:
+                hint = "Reduce it, e.g. with jnp.sum."
+            raise ValueError(
+                f"{name}{_NAMES} must return {expected}; for q0 of shape {q.shape} it returned "
+                f"shape {out.shape}, dtype {out.dtype}. {hint}".rstrip()
+            )
 
 
 def _read_by(system: System) -> Reads:
     functions = (system.H_D, system.force, system.perturbation)
+    # A counter of calls, for instance, changes with every trace, and no program depends on it.
     ignored = {name for f in functions for name in _changed_by_tracing(f)}
     return tuple(item for item in reads(*functions) if item[0] not in ignored)
 
 
 def check_system(system: Any) -> None:
-    """Refuse what is no `System`, and a system whose functions read something that has changed
-    since it was made: programs that are compiled already have the old value."""
+    """**Raises** `TypeError` for an object that is not a `System`, `ValueError` for a system whose
+    functions read a value that has changed since it was made."""
     if not isinstance(system, System):
         hint = "Wrap the discrete Hamiltonian: dvi.System(H_D, force=W)."
         if isinstance(getattr(system, "system", None), System):
             hint = "Take the system of a problem of the library: problem.system."
         raise TypeError(f"system must be a dvi.System, got {type(system).__name__}. {hint}")
+    # Programs that are compiled already would compute with the old value.
     now = _read_by(system)
     names = changed(system.reads, now) if now != system.reads else []
     if names:
@@ -162,18 +164,18 @@ def check_system(system: Any) -> None:
         )
 
 
+# Weak, so that functions and the arrays in their closures can be deleted.
 _SEEN: weakref.WeakKeyDictionary[Callable, dict] = weakref.WeakKeyDictionary()
-"""What functions returned, by the shapes and types that they were given."""
-
+"""Function → kinds of arguments → output."""
 
 _CHANGED_BY_TRACING: weakref.WeakKeyDictionary[Callable, frozenset] = weakref.WeakKeyDictionary()
-"""Names of what functions change themselves; no program depends on it."""
+"""Function → names of the values that it changes itself."""
 
 
 def _changed_by_tracing(function: Callable | None) -> frozenset[str]:
     try:
         return _CHANGED_BY_TRACING.get(function, frozenset()) if function else frozenset()
-    except TypeError:  # a function that cannot be looked up
+    except TypeError:  # a function without a hash or a weak reference
         return frozenset()
 
 
@@ -184,8 +186,9 @@ def _traced_output(
         seen = _SEEN.setdefault(function, {})
         if kinds in seen:
             return seen[kinds]
-    except TypeError:  # a function or an argument that cannot be looked up
+    except TypeError:  # a function or an argument without a hash: it is traced in every call
         seen = {}
+    # Traced, not called: at a start in a singularity a value would be NaN, its shape is the same.
     before = reads(function)
     try:
         out = eqx.filter_eval_shape(function, t, t, q, p, args)

@@ -1,4 +1,4 @@
-"""Names for the arrays and functions that pass between the rooms."""
+"""Types of arrays and functions that all modules share."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
@@ -17,23 +17,23 @@ ForceFn: TypeAlias = Callable[..., Any]
 
 
 class Interval(NamedTuple):
-    """One mesh interval: its ends and its length.
+    """One interval of the time grid: its ends and its length."""
 
-    `h` travels beside `t1 - t0` because late in a run the difference of two large times
-    has lost digits that an exact invariant would show.
-    """
+    # h is stored although it is t1 − t0: late in a run the difference of two large times has lost
+    # digits, which an exact invariant would show.
 
     t0: Scalar
     t1: Scalar
     h: Scalar
 
     def reversed(self) -> "Interval":
-        """The same interval walked from its end to its start."""
+        """The same interval from its end to its start."""
         return Interval(self.t1, self.t0, -self.h)
 
     def part(self, start: float, end: float) -> "Interval":
-        """The piece between the fractions `start` and `end` of this interval."""
-        length = self.t1 - self.t0  # not h where t is a slow time
+        """The part between the fractions `start` and `end` of this interval."""
+        length = self.t1 - self.t0  # differs from h where t is a slow time
+        # The ends stay bit for bit, so that the substeps of a composition join.
         t0 = self.t0 + start * length if start != 0 else self.t0
         t1 = self.t0 + end * length if end != 1 else self.t1
         return Interval(t0, t1, (end - start) * self.h)
@@ -41,6 +41,6 @@ class Interval(NamedTuple):
 
 @runtime_checkable
 class Bindable(Protocol):
-    """An observable that has to know the system and ε of the run it watches."""
+    """An observable that requires the system and ε of the run."""
 
     def bind(self, system: Any, epsilon: Any) -> Callable[..., Any]: ...

@@ -1,4 +1,4 @@
-"""Small linear solves, Newton, and dependence read from the jaxpr."""
+"""Small linear solves, linear maps with a transpose, and dependence read from the jaxpr."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import lanewise
-from dvi_jax.engine.newton import Newton, find_root
 from lanewise.dependence import depends_on
 from lanewise.jaxapi import linear_map
 from lanewise.linear import IN_A_LOOP
@@ -36,7 +35,7 @@ def test_solve_pivots(solve, n):
     A = np.eye(n)[::-1].copy() + 1e-30 * np.eye(n)
     b = np.arange(1.0, n + 1)
     np.testing.assert_allclose(SOLVE[solve](A, b), b[::-1], rtol=1e-14)
-    assert not np.allclose(_eliminate_without_pivoting(A, b), b[::-1])  # what pivoting saves from
+    assert not np.allclose(_eliminate_without_pivoting(A, b), b[::-1])  # as without it
 
 
 def _eliminate_without_pivoting(A, b):
@@ -61,7 +60,7 @@ def test_singular_matrix_gives_no_number(solve):
 
 @pytest.mark.parametrize("n", [4, 5, IN_A_LOOP, IN_A_LOOP + 1])
 def test_batched_linear_systems_call_lapack_only_above_the_limit(n):
-    """Its calls for batches may wait for one another for ever (on a CPU, compiled by XLA)."""
+    """Calls of LAPACK for a batch may deadlock (on a CPU, compiled by XLA)."""
 
     def has_lapack(function):
         text = jax.jit(function).lower(jnp.ones((3, n, n)), jnp.ones((3, n))).as_text()
@@ -84,86 +83,6 @@ def test_batched_linear_systems_are_solved_with_exchanges_of_rows(n):
     slopes = jax.vmap(jax.grad(lambda A, b: jnp.sum(lanewise.solve(A, b)), 1))(A, b)
     ones = np.linalg.solve(np.swapaxes(A, 1, 2), np.ones((40, n, 1)))[..., 0]
     np.testing.assert_allclose(slopes, ones, rtol=1e-6)
-
-
-@pytest.mark.parametrize("n", [2, 5])
-def test_batched_newton_calls_no_lapack(n):
-
-    def one(x):
-        return jnp.sum(
-            find_root(lambda y: y + 0.1 * jnp.sin(y) * jnp.sum(y) - x, x, x, Newton())[0]
-        )
-
-    def has_lapack(batch):
-        text = jax.jit(batch).lower(jnp.ones((3, n))).as_text()
-        return "getrf" in text or "trsm" in text
-
-    for f in (one, jax.grad(one)):
-        assert not has_lapack(jax.vmap(f))
-        assert not has_lapack(lanewise.batched(f))
-
-
-def test_newton_finds_the_root_to_round_off_and_counts():
-    root, info = find_root(lambda x: x**3 - 2, jnp.array([1.5]), jnp.array([2.0]), Newton())
-    assert abs(float(root[0]) - 2 ** (1 / 3)) < 4e-16
-    assert bool(info.converged)
-    assert 2 <= int(info.iterations) <= 4
-    # The last correction is the root's error times the factor by which corrections shrink.
-    worst, scale = map(float, info.residual)
-    assert scale == 2
-    assert worst < 1e-10
-
-
-def test_newton_says_when_there_is_no_root():
-    _, info = find_root(lambda x: x**2 + 1, jnp.array([0.3]), jnp.array([1.0]), Newton())
-    assert not bool(info.converged)
-    assert int(info.iterations) == 20
-
-
-def test_newton_stops_at_nan_at_once():
-    _, info = find_root(jnp.log, jnp.array([-1.0]), jnp.array([1.0]), Newton())
-    assert not bool(info.converged)
-    assert int(info.iterations) <= 2
-
-
-def test_a_slow_lane_does_not_change_its_neighbours():
-    def solve(a):
-        x, info = find_root(
-            lambda x: x + a * jnp.sin(3 * x) - 1, jnp.ones(1), jnp.ones(1), Newton()
-        )
-        return x[0], info.iterations
-
-    a = jnp.array([0.0, 0.1, 0.3, 5.0])
-    together = jax.jit(jax.vmap(solve))(a)
-    alone = [jax.jit(solve)(x) for x in a]
-    # One lane and a batch are different programs: equal up to a rounding.
-    np.testing.assert_allclose(together[0][:3], [x for x, _ in alone[:3]], rtol=4e-16)
-    np.testing.assert_array_equal(together[1][:3], [k for _, k in alone[:3]])
-
-
-@pytest.mark.slow
-def test_root_derivatives_are_those_of_the_implicit_function():
-    def root(a):
-        return find_root(lambda x: x**3 - a, jnp.array([1.0]), jnp.array([1.0]), Newton())[0][0]
-
-    a = 2.0
-    np.testing.assert_allclose(jax.grad(root)(a), a ** (-2 / 3) / 3, rtol=1e-14)
-    np.testing.assert_allclose(jax.jacfwd(root)(a), a ** (-2 / 3) / 3, rtol=1e-14)
-    np.testing.assert_allclose(jax.hessian(root)(a), -2 / 9 * a ** (-5 / 3), rtol=1e-13)
-
-
-def test_no_iteration_is_differentiated():
-    def root(a):
-        return find_root(lambda x: x**3 - a, jnp.array([1.0]), jnp.array([1.0]), Newton())[0][0]
-
-    # Reverse mode through a while loop would raise; one loop, the forward solve, is there.
-    assert str(jax.make_jaxpr(jax.grad(root))(2.0)).count(" while[") == 1
-
-
-@pytest.mark.parametrize("bad", [{"rtol": -1.0}, {"rtol": 0.0}, {"max_steps": 0}, {"atol": np.inf}])
-def test_newton_refuses_settings_that_cannot_work(bad):
-    with pytest.raises(ValueError, match=r"must be|both zero"):
-        Newton(**bad)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +137,7 @@ def _mapped(a, x, marks, definition=_scaled):
     return linear_map(push, pull, definition, (a, jnp.asarray(0)), x)
 
 
-def test_a_linear_map_goes_by_its_own_transpose():
+def test_a_linear_map_uses_its_own_transpose():
     """Forward, reverse, second derivatives, batched or not; against the map itself."""
     x, w = jnp.array([0.3, -1.2]), jnp.array([1.0, -2.0, 0.5])
     marks: list = []
@@ -245,7 +164,7 @@ def test_a_linear_map_goes_by_its_own_transpose():
             np.testing.assert_allclose(
                 jax.vmap(found, axes)(*args), jax.vmap(expected, axes)(*args), rtol=1e-13
             )
-    assert marks  # the transpose that was given is the one that is used
+    assert marks  # the given transpose is used
 
 
 def test_derivatives_of_a_linear_map_are_those_of_its_definition():
@@ -258,7 +177,7 @@ def test_derivatives_of_a_linear_map_are_those_of_its_definition():
     assert abs(float(of(lambda r, x: _scaled((2 * r[0], None), x))) - np.cos(0.7) * 7) > 0.1
 
 
-def test_what_on_any_takes():
+def test_arguments_of_on_any():
     with pytest.raises(TypeError, match="one truth value"):
         lanewise.on_any(jnp.array([1.5, 2.0]))
     with pytest.raises(TypeError, match="rare"):

@@ -1,4 +1,4 @@
-"""One object for how to integrate, in every function that runs trajectories."""
+"""`Integrator`, the options of a run as one object, in every function that runs trajectories."""
 
 import inspect
 
@@ -17,6 +17,9 @@ START = {"q0": [0.5], "p0": [0.1], "h": 0.1}
 SAMPLES = np.random.default_rng(0).uniform(-1, 1, (2, 60, 1))
 
 
+FORCED = dvi.System(PENDULUM.H_D, force=lambda t0, t1, q, p, args: -(q**3))
+
+
 def crossing(t, q, p, args):
     return p[0]
 
@@ -29,31 +32,48 @@ def last(**how):
     return dvi.integrate(PENDULUM, **START, num_steps=20, **how).qs[-1]
 
 
+def sweep(**how):
+    axis, run = dvi.Axis("angle", [0.3, 0.4]), {"h": 0.1, "num_steps": 20, "progress": False}
+    save = dvi.Save(final=True)
+    return dvi.sweep(PENDULUM, [axis], [0.1], save=save, **run, **how).to_xarray().q
+
+
+SECTION = {"h": 0.1, "num_steps": 200, "crossings": 2, "direction": 0}
+START_OF_SECTION = np.array([[0.5]]), np.array([[0.1]])
+DRIFT = {"epsilons": [0.01, 0.02, 0.04]}
+SAMPLED = {"h": 0.1, "samples": SAMPLES}
+
+
+def poincare(system=PENDULUM, **how):
+    return dvi.poincare_section(system, *START_OF_SECTION, crossing, **SECTION, **how).qs
+
+
+def return_map(**how):
+    return dvi.ReturnMap(PENDULUM, crossing, 0.1, 200, **how)(jnp.array([0.5]), jnp.array([0.0])).q
+
+
+def drift_order(**how):
+    run = {"h": 0.1, "num_steps": 50, **DRIFT}
+    return dvi.drift_order(FORCED, velocity, [0.4], [0.1], **run, **how).drifts
+
+
+def invariants(**how):
+    system = systems.oscillator().system
+    return dvi.discover_invariants(system, dvi.Polynomials(2), **SAMPLED, **how).coefficients
+
+
 CALLS = {
     "integrate": last,
-    "sweep": lambda **how: dvi.sweep(
-        PENDULUM, [dvi.Axis("angle", [0.3, 0.4])], [0.1], h=0.1, num_steps=20,
-        save=dvi.Save(final=True), progress=False, **how,
-    ).to_xarray().q,
-    "poincare_section": lambda **how: dvi.poincare_section(
-        PENDULUM, np.array([[0.5]]), np.array([[0.1]]), crossing, h=0.1, num_steps=200,
-        crossings=2, direction=0, **how,
-    ).qs,
-    "ReturnMap": lambda **how: dvi.ReturnMap(PENDULUM, crossing, 0.1, 200, **how)(
-        jnp.array([0.5]), jnp.array([0.0])
-    ).q,
+    "sweep": sweep,
+    "poincare_section": poincare,
+    "ReturnMap": return_map,
     "tangent_map": lambda **how: dvi.tangent_map(PENDULUM, **START, num_steps=20, **how),
-    "drift_order": lambda **how: dvi.drift_order(
-        dvi.System(PENDULUM.H_D, force=lambda t0, t1, q, p, args: -(q**3)), velocity, [0.4], [0.1],
-        epsilons=[0.01, 0.02, 0.04], h=0.1, num_steps=50, **how,
-    ).drifts,
-    "discover_invariants": lambda **how: dvi.discover_invariants(
-        systems.oscillator().system, dvi.Polynomials(2), h=0.1, samples=SAMPLES, **how
-    ).coefficients,
-    "Model": lambda **how: dvi.integrate(
-        **dvi.Model(PENDULUM, **START, **how)({}), num_steps=20
-    ).qs,
-}  # fmt: skip
+    "drift_order": drift_order,
+    "discover_invariants": invariants,
+    "Model": lambda **how: (
+        dvi.integrate(**dvi.Model(PENDULUM, **START, **how)({}), num_steps=20).qs
+    ),
+}
 
 
 @pytest.mark.parametrize("name", CALLS)
@@ -72,10 +92,8 @@ def test_all_fields_are_used():
     one = dvi.Integrator(dvi.Strang(), dvi.Newton(), arithmetic=dvi.Compensated())
     assert last(integrator=one) == last(**how)
     ts = np.linspace(0, 1, 11)
-    times = dvi.integrate(
-        PENDULUM, [0.5], [0.1], integrator=dvi.Integrator(lattice=dvi.Given(ts))
-    ).ts
-    np.testing.assert_array_equal(times, ts)
+    given = dvi.Integrator(lattice=dvi.Given(ts))
+    np.testing.assert_array_equal(dvi.integrate(PENDULUM, [0.5], [0.1], integrator=given).ts, ts)
 
 
 def implicit(t0, t1, q, p, args):
@@ -95,32 +113,40 @@ def value_of(H_D):
 
 
 LEFT = jnp.array([[0.5], [0.2]]), jnp.array([[0.1], [0.3]])
+
+
+def bifurcation(**how):
+    run = {"skip": 0, "epsilon": dvi.Axis("strength", [0.0]), **SECTION}
+    return dvi.bifurcation(PENDULUM, *map(np.array, ([0.5], [0.1])), crossing, **run, **how).qs
+
+
+def drift_surface(**how):
+    run = {"hs": [0.05, 0.1], "duration": 2.0, **DRIFT}
+    return dvi.drift_surface(FORCED, velocity, [0.4], [0.1], **run, **how).drifts
+
+
+def symmetries(**how):
+    basis = dvi.Polynomials(1)
+    return dvi.find_symmetries(PENDULUM, basis, **SAMPLED, time=False, **how).singular_values
+
+
+def type_iii(t0, t1, q1, p0, args):
+    return p0 @ p0 / 2 - jnp.sum(jnp.cos(q1))
+
+
+IMPLICIT = dvi.System(implicit)
 NAMED = {
     **CALLS,
     "Integrator": lambda **how: last(integrator=dvi.Integrator(**how)),
-    "bifurcation": lambda **how: dvi.bifurcation(
-        PENDULUM, np.array([0.5]), np.array([0.1]), crossing, h=0.1, num_steps=200, crossings=2,
-        direction=0, skip=0, epsilon=dvi.Axis("strength", [0.0]), **how,
-    ).qs,
-    "drift_surface": lambda **how: dvi.drift_surface(
-        dvi.System(PENDULUM.H_D, force=lambda t0, t1, q, p, args: -(q**3)), velocity, [0.4], [0.1],
-        epsilons=[0.01, 0.02, 0.04], hs=[0.05, 0.1], duration=2.0, **how,
-    ).drifts,
-    "find_symmetries": lambda **how: dvi.find_symmetries(
-        PENDULUM, dvi.Polynomials(1), h=0.1, samples=SAMPLES, time=False, **how
-    ).singular_values,
-    "solution_pairs": lambda **how: dvi.solution_pairs(
-        dvi.System(implicit), h=0.1, samples=LEFT, **how
-    )[1].q,
+    "bifurcation": bifurcation,
+    "drift_surface": drift_surface,
+    "find_symmetries": symmetries,
+    "solution_pairs": lambda **how: dvi.solution_pairs(IMPLICIT, h=0.1, samples=LEFT, **how)[1].q,
     "legendre": lambda **how: value_of(dvi.legendre(lagrangian, **how)),
     "from_lagrangian": lambda **how: value_of(dvi.from_lagrangian(action, **how)),
-    "from_type_iii": lambda **how: value_of(dvi.from_type_iii(
-        lambda t0, t1, q1, p0, args: p0 @ p0 / 2 - jnp.sum(jnp.cos(q1)), **how
-    )),
-    "solve_ivp": lambda **how: interop.solve_ivp(
-        dvi.System(implicit), (0.0, 1.0), [0.5, 0.1], h=0.1, **how
-    ).y,
-}  # fmt: skip
+    "from_type_iii": lambda **how: value_of(dvi.from_type_iii(type_iii, **how)),
+    "solve_ivp": lambda **how: interop.solve_ivp(IMPLICIT, (0, 1.0), [0.5, 0.1], h=0.1, **how).y,
+}
 """Every public function with the keyword `newton`; `diffrax_solver` needs diffrax."""
 
 
@@ -141,7 +167,7 @@ def test_diffrax_solver_takes_both_names():
     assert interop.diffrax_solver(root_finder=solver) == interop.diffrax_solver(newton=solver)
 
 
-def test_no_function_with_newton_is_left_out():
+def test_no_function_with_newton_is_missing_here():
     public = [getattr(dvi, name) for name in _namespaces.names()]
     public += [interop.solve_ivp, interop.diffrax_solver]
     found = {
@@ -167,32 +193,25 @@ def _has_newton(f) -> bool:
         ({"method": dvi.Strang}, TypeError, "a pair of parentheses missing"),
     ],
 )
-def test_wrong_integrators_are_refused(how, error, message):
+def test_invalid_integrators_are_rejected(how, error, message):
     with pytest.raises(error, match=message):
         last(**how)
 
 
-def test_fields_without_effect_are_refused():
+def test_fields_without_effect_are_rejected():
     with pytest.raises(ValueError, match="discover_invariants does not use arithmetic"):
-        CALLS["discover_invariants"](integrator=ACCURATE)
+        invariants(integrator=ACCURATE)
     with pytest.raises(ValueError, match="find_symmetries does not use method"):
-        dvi.find_symmetries(
-            PENDULUM, dvi.Polynomials(1), h=0.1, samples=SAMPLES, integrator=STRANG, time=False
-        )
+        symmetries(integrator=STRANG)
 
 
 def test_one_default_for_every_function():
     """The map of H_D as it is written; Strang's of one that `discretise` made with order 1."""
     for system, method in ((PENDULUM, dvi.TypeII()), (CONTINUOUS, dvi.Strang())):
-        runs = [
-            dvi.integrate(system, **START, num_steps=200, observe=section, **how).observed
-            for section in (dvi.Section(crossing, 0, 2),)
-            for how in ({}, {"method": method})
-        ]
-        np.testing.assert_array_equal(runs[0].qs, runs[1].qs)
-        found = dvi.poincare_section(
-            system, np.array([[0.5]]), np.array([[0.1]]), crossing, h=0.1, num_steps=200,
-            crossings=2, direction=0,
-        )  # fmt: skip
-        np.testing.assert_array_equal(found.qs[0], runs[0].qs)
+        run = {"num_steps": 200, "observe": dvi.Section(crossing, 0, 2), **START}
+        default = dvi.integrate(system, **run).observed.qs
+        np.testing.assert_array_equal(
+            dvi.integrate(system, method=method, **run).observed.qs, default
+        )
+        np.testing.assert_array_equal(poincare(system)[0], default)
     assert last() == last(method=dvi.TypeII())

@@ -27,16 +27,9 @@ def weighted(t0, t1, q0, p0, q1, p1, a):
 
 def test_a_swept_argument_that_only_an_observable_uses():
     weights = np.linspace(1.0, 2.0, 6)
-    found = dvi.sweep(
-        KEPLER,
-        Q0,
-        P0,
-        args=dvi.Axis("a", weights),
-        h=0.05,
-        num_steps=5,
-        observe={"drift": dvi.MaxDrift(kinetic), "last": dvi.Last(weighted)},
-        progress=False,
-    )
+    observe = {"drift": dvi.MaxDrift(kinetic), "last": dvi.Last(weighted)}
+    how = {"h": 0.05, "num_steps": 5, "observe": observe, "progress": False}
+    found = dvi.sweep(KEPLER, Q0, P0, args=dvi.Axis("a", weights), **how)
     np.testing.assert_allclose(found["last"], weights * found["last"][0], rtol=1e-14)
     assert np.all(found["drift"] == found["drift"][0])
 
@@ -58,58 +51,64 @@ def test_an_observable_of_one_trajectory(settings):
 # --- products in another order left the range of the numbers -----------------------------------
 
 
-def final_momenta(system, q, p, args, h, num_steps, stop=None):
+def final_momenta(system, q, p, args, h, stop=None):
     def one(q, p, args):
         run = {"epsilon": 1.0, "args": args, "stop": stop, "save": FINAL, "throw": False}
-        found = dvi.integrate(system, q, p, h=h, num_steps=num_steps, **run)
+        found = dvi.integrate(system, q, p, h=h, num_steps=10, **run)
         return found.ps[-1], found.result == dvi.RESULTS.successful
 
-    return jax.jit(jax.vmap(one, in_axes=(0, 0, None)))(q, p, args)
+    found, successful = jax.jit(jax.vmap(one, in_axes=(0, 0, None)))(q, p, args)
+    assert successful.all()
+    return found
+
+
+def by_hand(force, q, p, h, mass):
+    """The momenta after ten steps, in double precision."""
+    for _ in range(10):
+        p = p + h * force(q)
+        q = q + h * p / mass
+    return p
+
+
+def kinetic_energy(t0, t1, q, p, a):
+    return jnp.sum(p * (p / (2 * a["m"])))
 
 
 def test_a_product_that_would_underflow_in_another_order():
     """An atom in a light field, in SI units and float32: hbar·(c3·|E|²), hbar·c3 subnormal."""
     hbar, c3, mass, h = 1.05e-34, 1e-8, 1.4e-25, 1e-9
-    system = dvi.System(
-        lambda t0, t1, q, p, a: jnp.sum(p * (p / (2 * a["m"]))),
-        force=lambda t0, t1, q, p, a: (
-            a["hbar"] * (a["c3"] * jnp.square(3.1622777e9 * jnp.cos(8e6 * q)))
-        ),
-    )
+
+    def light(t0, t1, q, p, a):
+        return a["hbar"] * (a["c3"] * jnp.square(3.1622777e9 * jnp.cos(8e6 * q)))
+
     q = np.linspace(0, 1e-7, 9, dtype=np.float32)[:, None]
     args = {k: np.float32(v) for k, v in {"m": mass, "hbar": hbar, "c3": c3}.items()}
-    found, successful = final_momenta(system, q, 0 * q, args, h, 10)
+    found = final_momenta(dvi.System(kinetic_energy, force=light), q, 0 * q, args, h)
     assert np.float32(hbar) * np.float32(c3) < np.finfo(np.float32).tiny
-    position, momentum = q.astype(float), np.zeros(q.shape)
-    for _ in range(10):
-        momentum = momentum + h * hbar * c3 * 1e19 * np.cos(8e6 * position) ** 2
-        position = position + h * momentum / mass
-    np.testing.assert_allclose(found, momentum, rtol=1e-4)
-    assert successful.all()
+    expected = by_hand(
+        lambda q: hbar * c3 * 1e19 * np.cos(8e6 * q) ** 2, q.astype(float), 0.0, h, mass
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("stop", [None, dvi.Stop(lambda t, q, p, a: jnp.linalg.norm(q) - 1e13)])
 def test_a_product_that_would_overflow_in_another_order(stop):
     """Sun and Earth in SI units and float32: m·(M·…), while m·M is infinite."""
-    G, M, m = 6.674e-11, 2e30, 6e24
-    system = dvi.System(
-        lambda t0, t1, q, p, a: jnp.sum(p * (p / (2 * a["m"]))),
-        force=lambda t0, t1, q, p, a: (
-            -a["m"] * (a["M"] * (a["G"] * (q / jnp.linalg.norm(q) / jnp.sum(jnp.square(q)))))
-        ),
-    )
-    q = np.tile(np.float32([1.5e11, 0]), (9, 1))
-    p = np.tile(np.float32([0, m * 3e4]), (9, 1))
+    G, M, m, h = 6.674e-11, 2e30, 6e24, 36000.0
+
+    def gravity(t0, t1, q, p, a):
+        r = jnp.linalg.norm(q)
+        return -a["m"] * (a["M"] * (a["G"] * (q / r / jnp.sum(jnp.square(q)))))
+
+    q, p = np.array([1.5e11, 0]), np.array([0, m * 3e4])
     args = {k: np.float32(v) for k, v in {"G": G, "M": M, "m": m}.items()}
-    found, successful = final_momenta(system, q, p, args, np.float32(36000.0), 10, stop)
+    starts = (np.tile(np.float32(x), (9, 1)) for x in (q, p))
+    system = dvi.System(kinetic_energy, force=gravity)
+    found = final_momenta(system, *starts, args, np.float32(h), stop)
     with np.errstate(over="ignore"):
         assert np.isinf(np.float32(m) * np.float32(M))
-    position, momentum = np.array([1.5e11, 0]), np.array([0, m * 3e4])
-    for _ in range(10):
-        momentum = momentum - 36000 * G * M * m * position / np.linalg.norm(position) ** 3
-        position = position + 36000 * momentum / m
-    np.testing.assert_allclose(found, np.tile(momentum, (9, 1)), rtol=1e-5)
-    assert successful.all()
+    expected = by_hand(lambda q: -G * M * m * q / np.linalg.norm(q) ** 3, q, p, h, m)
+    np.testing.assert_allclose(found, np.tile(expected, (9, 1)), rtol=1e-5)
 
 
 # --- other faults --------------------------------------------------------------------------------
@@ -183,27 +182,28 @@ def test_products_of_the_stages_of_gauss():
     and no step converged."""
     system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + p[1] * jnp.prod(q))
 
+    how = {"h": 0.1, "num_steps": 3, "method": dvi.GaussLegendre(2)}
+
     def end(layout):
-        sol = dvi.integrate(
-            system, jnp.array([0.5, 0.3]), jnp.array([0.3, -0.4]), h=0.1, num_steps=3,
-            method=dvi.GaussLegendre(2), layout=layout,
-        )  # fmt: skip
-        return sol.qs
+        return dvi.integrate(system, [0.5, 0.3], [0.3, -0.4], layout=layout, **how).qs
 
     np.testing.assert_allclose(end(dvi.Layout()), end(dvi.Layout(form="arrays")), rtol=1e-13)
 
 
-@pytest.mark.parametrize("observe", ["times", "crossings", "stop"])
-def test_points_inside_of_steps_have_the_same_bits(observe):
-    """XLA computed them, which rounds otherwise in its vectors than in what is left over."""
+SEEN = {
+    "times": {
+        "save": dvi.Save(ts=np.linspace(0.01, 0.39, 6)),
+        "observe": lambda t0, t1, q0, p0, q, p, args: jnp.arctan(q[0]),
+    },
+    "crossings": {"observe": dvi.Section(lambda t, q, p, args: q[0] - 0.5, max_crossings=2)},
+    "stop": {"stop": dvi.Stop(lambda t, q, p, args: jnp.sin(q[0]) - 0.5)},
+}
+
+
+@pytest.mark.parametrize("seen", SEEN.values(), ids=SEEN)
+def test_points_inside_of_steps_have_the_same_bits(seen):
+    """XLA computed them, which rounds differently in its vectors than in the remainder."""
     system = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + q[0] * jnp.arctan(q[1]))
-    axis = dvi.Section(lambda t, q, p, args: q[0] - 0.5, max_crossings=2)
-    seen = {
-        "times": {"save": dvi.Save(ts=np.linspace(0.01, 0.39, 6)),
-                  "observe": lambda t0, t1, q0, p0, q, p, args: jnp.arctan(q[0])},
-        "crossings": {"observe": axis},
-        "stop": {"stop": dvi.Stop(lambda t, q, p, args: jnp.sin(q[0]) - 0.5)},
-    }[observe]  # fmt: skip
 
     def one(q):
         p = jnp.array([1.0, 0.3])

@@ -1,10 +1,11 @@
-"""What a user may write, and what is refused with which words."""
+"""Systems that a user may write, and the messages for others; the shared checks of arguments."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import dvi_jax as dvi
+from dvi_jax import _checks
 
 
 def H(t0, t1, q0, p1, args):
@@ -16,16 +17,6 @@ def run(system, q0=(0.1, 0.2), p0=(0.3, 0.4), **kwargs):
     return dvi.integrate(system, q0, p0, **{"h": 0.1, "num_steps": 2, **kwargs})
 
 
-def test_four_arguments_are_sent_to_discretise():
-    with pytest.raises(TypeError, match=r"five positional arguments.*dvi.discretise"):
-        dvi.System(lambda t, q, p, args: 0.0)
-
-
-def test_five_arguments_are_sent_past_discretise():
-    with pytest.raises(TypeError, match=r"four positional arguments.*dvi.System directly"):
-        dvi.discretise(H)
-
-
 @pytest.mark.parametrize("name", ["H_D", "force", "perturbation"])
 def test_each_function_is_checked_and_named(name):
     with pytest.raises(TypeError, match=f"{name} must take five"):
@@ -34,24 +25,29 @@ def test_each_function_is_checked_and_named(name):
         dvi.System(**{"H_D": H, name: 3.0})
 
 
-def test_H_D_must_be_a_scalar():
-    system = dvi.System(lambda t0, t1, q0, p1, args: p1**2)
-    with pytest.raises(ValueError, match=r"H_D.*real scalar.*shape \(2,\).*jnp.sum"):
-        run(system)
+def test_the_number_of_arguments_decides_about_discretise():
+    with pytest.raises(TypeError, match=r"five positional arguments.*dvi.discretise"):
+        dvi.System(lambda t, q, p, args: 0.0)
+    with pytest.raises(TypeError, match=r"four positional arguments.*dvi.System directly"):
+        dvi.discretise(H)
 
 
-def test_H_D_must_return():
-    with pytest.raises(TypeError, match="return missing"):
-        run(dvi.System(lambda t0, t1, q0, p1, args: None))
+@pytest.mark.parametrize(
+    ("functions", "error", "message"),
+    [
+        ({"H_D": lambda t0, t1, q0, p1, args: p1**2}, ValueError,
+         r"H_D.*real scalar.*shape \(2,\).*jnp.sum"),
+        ({"H_D": lambda t0, t1, q0, p1, args: None}, TypeError, "return missing"),
+        ({"H_D": H, "force": lambda t0, t1, q0, p1, args: q0[0]}, ValueError,
+         r"force.*shaped like q0, \(2,\).*shape \(\)"),
+    ],
+)  # fmt: skip
+def test_values_of_another_shape_are_rejected(functions, error, message):
+    with pytest.raises(error, match=message):
+        run(dvi.System(**functions))
 
 
-def test_force_must_look_like_q():
-    system = dvi.System(H, force=lambda t0, t1, q0, p1, args: q0[0])
-    with pytest.raises(ValueError, match=r"force.*shaped like q0, \(2,\).*shape \(\)"):
-        run(system)
-
-
-def test_discretise_is_the_papers_rule():
+def test_discretise_is_the_rule_of_the_paper():
     def continuous(t, q, p, args):
         return (1 + t) * jnp.sum(p**2) / 2 + args * jnp.sum(q**4)
 
@@ -60,7 +56,7 @@ def test_discretise_is_the_papers_rule():
     assert H_D(0.5, 0.6, q, p, 2.0) == continuous(0.5, q, p, 2.0)
 
 
-def test_perturbation_is_a_hamiltonian_disturbance():
+def test_a_perturbation_acts_as_the_force_of_its_gradient():
     """ε·H1 with H1 = |q|²/2 is the force W = −q."""
     by_force = dvi.System(H, force=lambda t0, t1, q0, p1, args: -q0)
     by_energy = dvi.System(H, perturbation=lambda t0, t1, q0, p1, args: jnp.sum(q0**2) / 2)
@@ -79,10 +75,44 @@ def test_slow_time_reaches_the_functions():
     np.testing.assert_allclose(slow.ps[1], np.array([0.3, 0.4]) + kick, rtol=1e-14)
 
 
-def test_linear_algebra_of_the_system():
+def test_methods_of_a_system():
     """System functions themselves, for those who build on them."""
     system = dvi.System(H, force=lambda t0, t1, q0, p1, args: -q0)
     q, p = jnp.array([1.0]), jnp.array([2.0])
     t = jnp.asarray(0.0)
     assert float(system.hamiltonian(t, t, q, p, jnp.asarray(0.1), None)) == 2.5
     np.testing.assert_allclose(system.disturbing_force(t, t, q, p, jnp.asarray(0.1), None), [-0.1])
+
+
+# --- checks of arguments -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("check", "good", "bad"),
+    [
+        (lambda x: _checks.whole("n", x), (1, np.int64(3)), (0, -1, 1.0, True, "2", None, np.nan)),
+        (lambda x: _checks.whole("n", x, 0, 5), (0, 5), (6, -1)),
+        (lambda x: _checks.positive("x", x), (0.5, 3, np.float32(1)), (0, -1.0, np.inf, np.nan)),
+        (lambda x: _checks.positive("x", x, zero=True), (0, 2.0), (-1e-300, "1", None, True)),
+        (lambda x: _checks.positive("x", x), (jnp.float32(2), np.array(1.0)), (np.ones(2), 1j)),
+        (lambda x: _checks.finite("x", x), (-2, 0.0), (np.inf, "0", None, [1.0])),
+        (lambda x: _checks.one_of("x", x, ["a", None]), ("a", None), ("b", 0, ["a"])),
+    ],
+)
+def test_checks_of_values(check, good, bad):
+    for value in good:
+        assert check(value) == value
+    for value in bad:
+        with pytest.raises(ValueError, match=r"^[nx] must be .*, got "):
+            check(value)
+
+
+def test_checks_of_types():
+    method = dvi.TypeII()
+    assert _checks.instance("method", method, dvi.Method, "a dvi.Method") is method
+    with pytest.raises(TypeError, match=r"method must be a dvi.Method, got 'Strang'\. Take one"):
+        _checks.instance("method", "Strang", dvi.Method, "a dvi.Method", "Take one.")
+    with pytest.raises(TypeError, match=r"got the class TypeII .is a pair of parentheses missing"):
+        _checks.instance("method", dvi.TypeII, dvi.Method, "a dvi.Method")
+    with pytest.raises(TypeError, match=r"f must be a function \(t, q\), got 3\."):
+        _checks.function("f", 3, "(t, q)")

@@ -1,4 +1,4 @@
-"""Steps that adapt by a transformation of the time."""
+"""Adaptive steps by a transformation of time."""
 
 import jax
 import jax.numpy as jnp
@@ -40,18 +40,15 @@ def fictitious_period(e, power):
     return 2 * np.pi * np.mean((1 - e * np.cos(E)) ** (1 - power))
 
 
+FINAL = dvi.Save(final=True)
+
+
 def kepler(steps, periods, e=0.9, speed=radius_32, power=1.5, **settings):
-    given = {
-        "h": 2 * np.pi / steps,
-        "num_steps": steps * periods,
-        "method": dvi.Strang(),
-        "save": dvi.Save(final=True),
-        **settings,
-    }
+    given = {"h": 2 * np.pi / steps, "num_steps": steps * periods, "method": dvi.Strang()}
     if speed is not None:
         given["h"] = fictitious_period(e, power) / steps
         given["lattice"] = dvi.TimeTransformed(speed)
-    return dvi.integrate(KEPLER, *start(e), **given)
+    return dvi.integrate(KEPLER, *start(e), **given, **{"save": FINAL, **settings})
 
 
 def worst(observe, *args, **settings):
@@ -60,20 +57,14 @@ def worst(observe, *args, **settings):
 
 @pytest.mark.parametrize(
     ("e", "periods", "few", "many"),
-    [
-        (0.9, 10, 200, 4000),
-        (0.9, 100, 200, 4000),
-        (0.99, 10, 400, 200_000),
-    ],
+    [(0.9, 10, 200, 4000), (0.9, 100, 200, 4000), (0.99, 10, 400, 200_000)],
 )
 @pytest.mark.slow
 def test_eccentric_orbits_need_far_fewer_steps(e, periods, few, many):
-    """A twentieth of the steps of the uniform mesh, and still a smaller error in energy."""
+    """A twentieth of the steps of the uniform grid, and still a smaller error in energy."""
     transformed = worst(energy, few, periods, e=e)
     uniform = worst(energy, many, periods, e=e, speed=None)
-    assert transformed < uniform
-    # what it is compared with is in its range of convergence
-    assert uniform < 0.02
+    assert transformed < uniform < 0.02  # the uniform grid is in its range of convergence
     assert worst(energy, few, periods, e=e, speed=None) > 10 * transformed
 
 
@@ -106,56 +97,39 @@ def test_momentum_stays_exact_under_a_speed_that_is_invariant_too():
     assert tilted > 1e-4
 
 
-@pytest.mark.slow
-def test_a_constant_speed_is_a_uniform_mesh():
-    """Also with a force and an explicit time; the step is then g h."""
-    given = {"num_steps": 50, "epsilon": 0.2, "t0": 0.3, "observe": momentum_like}
-    for method in (dvi.TypeII(), dvi.Strang()):
-        plain = dvi.integrate(DRIVEN, [0.4, 0.1], [0.3, -0.2], h=0.1, method=method, **given)
-        slowed = dvi.integrate(
-            DRIVEN,
-            [0.4, 0.1],
-            [0.3, -0.2],
-            h=0.05,
-            lattice=dvi.TimeTransformed(lambda t, q, p, args: 2.0),
-            method=method,
-            **given,
-        )
-        for a, b in (
-            (plain.ts, slowed.ts),
-            (plain.qs, slowed.qs),
-            (plain.ps, slowed.ps),
-            (plain.hs, slowed.hs),
-            (plain.observed, slowed.observed),
-        ):
-            np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
-
-
 def momentum_like(t0, t1, q0, p0, q1, p1, args):
     return t1 * q1[0] * p0[1] - t0 * q0[1]
 
 
 @pytest.mark.slow
-def test_a_forced_system_converges_in_other_steps_to_the_same_motion():
+@pytest.mark.parametrize("method", [dvi.TypeII(), dvi.Strang()])
+def test_a_constant_speed_is_a_uniform_grid(method):
+    """Also with a force and an explicit time; the step is then g h."""
+    given = {"num_steps": 50, "epsilon": 0.2, "t0": 0.3, "observe": momentum_like, "method": method}
+
+    def run(h, lattice):
+        sol = dvi.integrate(DRIVEN, [0.4, 0.1], [0.3, -0.2], h=h, lattice=lattice, **given)
+        return sol.ts, sol.qs, sol.ps, sol.hs, sol.observed
+
+    plain = run(0.1, dvi.Uniform())
+    slowed = run(0.05, dvi.TimeTransformed(lambda t, q, p, args: 2.0))
+    for a, b in zip(plain, slowed, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_forced_system_converges_with_other_steps_to_the_same_motion():
     def speed(t, q, p, args):
         return 1 / (1 + args["b"] * (q @ q))
 
-    fine = dvi.integrate(
-        DRIVEN, [0.8], [0.3], h=1e-3, num_steps=4000, epsilon=0.3, method=dvi.Yoshida(4)
-    )
+    def run(h, num_steps, **how):
+        given = {"h": h, "num_steps": num_steps, "epsilon": 0.3, "args": {"b": 0.5}}
+        return dvi.integrate(DRIVEN, [0.8], [0.3], **given, **how)
+
+    fine = run(1e-3, 4000, method=dvi.Yoshida(4))
     errors = []
     for n in (40, 80, 160):
-        sol = dvi.integrate(
-            DRIVEN,
-            [0.8],
-            [0.3],
-            h=4.0 / n,
-            num_steps=n,
-            epsilon=0.3,
-            args={"b": 0.5},
-            method=dvi.Strang(),
-            lattice=dvi.TimeTransformed(speed),
-        )
+        sol = run(4.0 / n, n, method=dvi.Strang(), lattice=dvi.TimeTransformed(speed))
         t, q = np.asarray(sol.ts), np.asarray(sol.qs)[:, 0]
         assert t[-1] < 4
         assert np.ptp(sol.hs) > 0.1 * np.max(sol.hs)
@@ -168,33 +142,21 @@ def test_a_forced_system_converges_in_other_steps_to_the_same_motion():
 @pytest.mark.slow
 def test_gradients_batches_and_statuses_go_through():
     def last(e):
-        sol = dvi.integrate(
-            KEPLER,
-            jnp.stack([1 - e, 0.0 * e]),
-            jnp.stack([0.0 * e, jnp.sqrt((1 + e) / (1 - e))]),
-            h=0.1,
-            num_steps=30,
-            lattice=dvi.TimeTransformed(radius),
-            save=dvi.Save(final=True),
-        )
+        q = jnp.stack([1 - e, 0.0 * e])
+        p = jnp.stack([0.0 * e, jnp.sqrt((1 + e) / (1 - e))])
+        how = {"h": 0.1, "num_steps": 30, "lattice": dvi.TimeTransformed(radius), "save": FINAL}
+        sol = dvi.integrate(KEPLER, q, p, **how)
         return sol.qs[-1, 0] + sol.ts[-1]
 
-    e = jnp.asarray(0.5)
+    e, step = jnp.asarray(0.5), 1e-5
     slope = jax.grad(last)(e)
-    step = 1e-5
     expected = (last(e + step) - last(e - step)) / (2 * step)
     assert slope == pytest.approx(float(expected), rel=1e-7)
     assert jax.jvp(last, (e,), (jnp.ones(()),))[1] == pytest.approx(float(slope), rel=1e-9)
     batch = jax.vmap(last)(jnp.array([0.3, 0.5]))
     assert batch[1] == pytest.approx(float(last(e)), rel=1e-12)
-    failing = dvi.integrate(
-        KEPLER,
-        *start(0.9),
-        h=50.0,
-        num_steps=20,
-        lattice=dvi.TimeTransformed(radius),
-        throw=False,
-    )
+    how = {"h": 50.0, "num_steps": 20, "lattice": dvi.TimeTransformed(radius), "throw": False}
+    failing = dvi.integrate(KEPLER, *start(0.9), **how)
     assert failing.status != "successful"
     assert np.isnan(failing.qs[-1]).all()
 
@@ -207,16 +169,10 @@ def test_gradients_batches_and_statuses_go_through():
         (radius, dvi.Trend(energy), "fictitious time"),
     ],
 )
-def test_what_cannot_be_meant_is_refused(speed, observe, says):
+def test_invalid_speeds_and_observables_are_rejected(speed, observe, says):
+    how = {"h": 0.1, "num_steps": 3, "lattice": dvi.TimeTransformed(speed), "observe": observe}
     with pytest.raises(ValueError, match=says):
-        dvi.integrate(
-            KEPLER,
-            *start(0.5),
-            h=0.1,
-            num_steps=3,
-            lattice=dvi.TimeTransformed(speed),
-            observe=observe,
-        )
+        dvi.integrate(KEPLER, *start(0.5), **how)
     for wrong, says in ((0.5, "must be a function"), (lambda t, q, p: 1.0, "must take four")):
         with pytest.raises(TypeError, match=says):
             dvi.TimeTransformed(wrong)

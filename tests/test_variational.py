@@ -1,4 +1,4 @@
-"""Steps that the lattice equation chooses: exact balance of energy, where there is a root."""
+"""Steps that solve the lattice equation: exact balance of energy, where there is a root."""
 
 import functools
 
@@ -39,11 +39,12 @@ def midpoint_velocity(t0, t1, q0, p1):
 DAMPED = dvi.System(midpoint, force=lambda t0, t1, q0, p1, args: -midpoint_velocity(t0, t1, q0, p1))
 
 
+ARGS = KEPLER.args
+
+
 def kepler(h, steps, policy="stop", **settings):
-    return dvi.integrate(
-        KEPLER.system, KEPLER.q0, KEPLER.p0, h=h, num_steps=steps, args=KEPLER.args, throw=False,
-        **{"lattice": dvi.Variational(policy), **settings},
-    )  # fmt: skip
+    given = {"args": ARGS, "throw": False, "lattice": dvi.Variational(policy), **settings}
+    return dvi.integrate(KEPLER.system, KEPLER.q0, KEPLER.p0, h=h, num_steps=steps, **given)
 
 
 def defects(system, solution, epsilon):
@@ -85,11 +86,10 @@ def test_energy_is_in_balance_with_the_work_of_a_force(system, epsilon):
 
 
 @pytest.mark.slow
-def test_balance_law_has_no_part_of_the_lattice():
-    """(31): with ξ0 = 1 energy changes by nothing but the work of the disturbance."""
-    sol = dvi.integrate(
-        PENDULUM, [0.3], [0.9], h=0.02, num_steps=25, epsilon=0.1, lattice=dvi.Variational()
-    )
+def test_balance_law_has_no_term_of_the_lattice():
+    """(31): with ξ0 = 1 energy changes by nothing but the work of the force."""
+    how = {"h": 0.02, "num_steps": 25, "epsilon": 0.1, "lattice": dvi.Variational()}
+    sol = dvi.integrate(PENDULUM, [0.3], [0.9], **how)
     time = dvi.generators.time_translation()
     balance = dvi.noether_balance(PENDULUM, [time], [None], sol, epsilon=0.1)
     assert np.max(np.abs(balance.lattice)) <= 1e-12
@@ -108,7 +108,7 @@ def test_policies_where_there_is_no_root():
 
     def defect(sol):
         points = list(zip(sol.ts[k - 1 :], sol.qs[k - 1 :], sol.ps[k - 1 :], strict=True))[:3]
-        r = dvi.lattice_defect(KEPLER.system, points, args=KEPLER.args)
+        r = dvi.lattice_defect(KEPLER.system, points, args=ARGS)
         return abs(float(r * (points[2][0] - points[1][0])))
 
     assert 1e-6 < defect(least) < defect(hold)
@@ -120,21 +120,16 @@ def test_minimum_is_one():
     """Steps a little to both sides of the one taken leave a larger defect."""
     k = 77
     least = kepler(0.1, k + 1, "minimise")
-    before = (least.ts[k - 1], least.qs[k - 1], least.ps[k - 1])
-    here = (least.ts[k], least.qs[k], least.ps[k])
+    before, here = ((least.ts[i], least.qs[i], least.ps[i]) for i in (k - 1, k))
 
     def defect(h):
-        one = dvi.integrate(
-            KEPLER.system, here[1], here[2], h=h, num_steps=1, t0=here[0], args=KEPLER.args
-        )
+        how = {"h": h, "num_steps": 1, "t0": here[0], "args": ARGS}
+        one = dvi.integrate(KEPLER.system, here[1], here[2], **how)
         after = (one.ts[1], one.qs[1], one.ps[1])
         return abs(float(h * dvi.lattice_defect(KEPLER.system, (before, here, after), args=ARGS)))
 
     h = float(least.hs[k])
     assert defect(h) < min(defect(0.99 * h), defect(1.01 * h))
-
-
-ARGS = KEPLER.args
 
 
 @pytest.mark.slow
@@ -150,31 +145,23 @@ def test_backwards_and_bounded():
 
 
 @pytest.mark.slow
-def test_free_motion_keeps_its_step():
-    """E⁺ does not depend on h there: every h is a root."""
+def test_free_motion_keeps_its_step_and_implicit_systems_work():
+    """Of free motion E⁺ does not depend on h: every h is a root."""
     free = dvi.System(lambda t0, t1, q, p, args: jnp.sum(p**2) / 2)
     sol = dvi.integrate(free, [0.1], [0.7], h=0.3, num_steps=50, lattice=dvi.Variational())
     np.testing.assert_array_equal(sol.hs, 0.3)
-
-
-@pytest.mark.slow
-def test_implicit_system():
     sol = dvi.integrate(IMPLICIT, [0.3], [0.4], h=0.05, num_steps=10, lattice=dvi.Variational())
     assert int(sol.stats["newton_iterations"]) > 0
     assert np.max(np.abs(defects(IMPLICIT, sol, 0.0))) <= 2e-15
 
 
 @pytest.mark.slow
-def test_a_lane_without_a_root_leaves_its_neighbours_alone():
-    def run(h):
-        return kepler(h, 90)
-
+def test_a_trajectory_without_a_root_leaves_others_unchanged():
     hs = jnp.asarray([0.1, 0.02, 0.05])
-    batch = jax.vmap(run)(hs)
+    batch = jax.vmap(lambda h: kepler(h, 90))(hs)
     assert list(batch.status) == ["no_root", "successful", "successful"]
     for i in (1, 2):
-        alone = run(hs[i])
-        np.testing.assert_allclose(batch.qs[i], alone.qs, rtol=1e-9)
+        np.testing.assert_allclose(batch.qs[i], kepler(hs[i], 90).qs, rtol=1e-9)
     assert np.isfinite(np.asarray(batch.qs[1:])).all()
     assert np.isnan(np.asarray(batch.qs[0, -1])).all()
 
@@ -182,9 +169,8 @@ def test_a_lane_without_a_root_leaves_its_neighbours_alone():
 def ends(x, lattice, adjoint):
     """A number that the end state, its time and all steps enter."""
     q, p, h, epsilon = x
-    sol = dvi.integrate(
-        PENDULUM, q, p, h=h, num_steps=12, epsilon=epsilon, lattice=lattice, adjoint=adjoint
-    )
+    how = {"h": h, "num_steps": 12, "epsilon": epsilon, "lattice": lattice, "adjoint": adjoint}
+    sol = dvi.integrate(PENDULUM, q, p, **how)
     return jnp.sum(sol.qs[-1] ** 2) + jnp.sum(sol.ps) + jnp.sum(sol.ts**2) + jnp.sum(sol.hs**3)
 
 
@@ -204,9 +190,10 @@ def test_steps_that_are_solved_for_have_the_same_bits_in_a_batch():
         force=lambda t0, t1, q, p, args: -p * (q @ q),
     )
 
+    how = {"epsilon": 0.1, "h": 0.1, "num_steps": 5, "throw": False, "lattice": dvi.Variational()}
+
     def one(q, p):
-        sol = dvi.integrate(system, q, p, epsilon=0.1, h=0.1, num_steps=5, throw=False,
-                            lattice=dvi.Variational())  # fmt: skip
+        sol = dvi.integrate(system, q, p, **how)
         return sol.ts, sol.qs, sol.ps
 
     q, p = np.random.default_rng(1).normal(size=(2, 9, 2))
@@ -239,10 +226,8 @@ def test_gradient_through_a_step_that_minimises():
     oscillator = dvi.System(lambda t0, t1, q, p, args: (jnp.sum(p**2) + jnp.sum(q**2)) / 2)
 
     def run(h, policy="minimise"):
-        return dvi.integrate(
-            oscillator, [1.0], [0.5], h=h, num_steps=6, lattice=dvi.Variational(policy),
-            throw=False,
-        )  # fmt: skip
+        how = {"num_steps": 6, "lattice": dvi.Variational(policy), "throw": False}
+        return dvi.integrate(oscillator, [1.0], [0.5], h=h, **how)
 
     def value(h):
         sol = run(h)
@@ -257,10 +242,9 @@ def test_gradient_through_a_step_that_minimises():
 
 
 def damped(h, steps, c):
-    return dvi.integrate(
-        DAMPED, [1.0], [0.5], h=h, num_steps=steps, epsilon=c, throw=False,
-        lattice=dvi.Variational(), observe=dvi.LatticeCondition(),
-    )  # fmt: skip
+    how = {"epsilon": c, "throw": False, "observe": dvi.LatticeCondition()}
+    lattice = dvi.Variational()
+    return dvi.integrate(DAMPED, [1.0], [0.5], h=h, num_steps=steps, lattice=lattice, **how)
 
 
 @pytest.mark.slow
@@ -289,26 +273,31 @@ def test_condition_number_of_the_midpoint_rule():
 @pytest.mark.slow
 def test_progress_changes_nothing():
     calls = []
-    told = kepler(0.1, 60, progress=lambda done, of: calls.append(done))
+    reported = kepler(0.1, 60, progress=lambda done, of: calls.append(done))
     assert calls[-1] == 60
-    np.testing.assert_array_equal(told.ts, kepler(0.1, 60).ts)
+    np.testing.assert_array_equal(reported.ts, kepler(0.1, 60).ts)
 
 
-def test_what_cannot_be_meant_is_refused():
-    with pytest.raises(ValueError, match="on_no_root must be one of 'stop', 'hold', 'minimise'"):
-        dvi.Variational("halve")
-    with pytest.raises(ValueError, match="reach must be a number above 1"):
-        dvi.Variational(reach=1.0)
-    with pytest.raises(ValueError, match="bounds must be two positive numbers around 1"):
-        dvi.Variational(bounds=(2.0, 3.0))
-    with pytest.raises(ValueError, match=r"method=dvi\.TypeII\(\) only"):
-        kepler(0.1, 3, method=dvi.Strang())
-    with pytest.raises(ValueError, match="a solve cannot be undone bit for bit"):
-        kepler(0.1, 3, arithmetic=dvi.FixedPoint(2.0**-40))
-    with pytest.raises(TypeError, match="needs h and num_steps; h is missing"):
-        kepler(None, 3)
-    with pytest.raises(dvi.IntegrationError, match=r"last h = 3\.07.*no root near the last step"):
-        dvi.integrate(
-            KEPLER.system, KEPLER.q0, KEPLER.p0, h=0.1, num_steps=80, args=ARGS,
-            lattice=dvi.Variational(),
-        )  # fmt: skip
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: dvi.Variational("halve"), ValueError, "on_no_root must be one of 'stop', 'hold'"),
+        (lambda: dvi.Variational(reach=1.0), ValueError, "reach must be a number above 1"),
+        (lambda: dvi.Variational(bounds=(2.0, 3.0)), ValueError, "two positive numbers around 1"),
+        (lambda: kepler(0.1, 3, method=dvi.Strang()), ValueError, r"method=dvi\.TypeII\(\) only"),
+        (
+            lambda: kepler(0.1, 3, arithmetic=dvi.FixedPoint(2.0**-40)),
+            ValueError,
+            "a solve cannot be undone bit for bit",
+        ),
+        (lambda: kepler(None, 3), TypeError, "needs h and num_steps; h is missing"),
+        (
+            lambda: kepler(0.1, 80, throw=True),
+            dvi.IntegrationError,
+            r"last h = 3\.07.*no root near the last step",
+        ),
+    ],
+)
+def test_invalid_lattices_and_runs_without_a_root_raise(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

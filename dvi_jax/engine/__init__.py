@@ -1,1 +1,1 @@
-"""How the arithmetic is laid out; nothing in this room knows of mechanics."""
+"""Numerical methods without mechanics: root solvers, devices, checks of functions."""

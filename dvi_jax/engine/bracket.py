@@ -12,23 +12,24 @@ Number = Float[Array, ""]
 Function = Callable[[Number], Number]
 
 _MOST = 100
-"""Evaluations after which a search ends where it is."""
+"""Maximum number of evaluations of a search."""
 
 
 def bracketed_root(
     function: Function, a: Number, at_a: Number, b: Number, at_b: Number, exists: Bool[Array, ""]
 ) -> Number:
-    """The root of `function` between a and b, where it has the values `at_a` and `at_b`.
+    """The root of `function` between a and b, where it has the values `at_a` and `at_b`; b, without
+    a derivative, where none `exists`.
 
-    To the last digit, by false position (Illinois) with a halving every third time. Where
-    `exists` is false the answer is b and has no derivative; `function` should be finite there
-    nevertheless, or a reverse-mode derivative has NaN to multiply by zero.
-
-    The derivative with respect to what `function` closes over is that of the implicit function
+    To the last digit, by false position (Illinois) with bisection in every third iteration. The
+    derivative with respect to values that `function` closes over is that of the implicit function
     theorem, to any order.
     """
+    # The root does not depend on the ends of the bracket: no derivative of theirs enters it.
     a, at_a, b, at_b = lax.stop_gradient((a, at_a, b, at_b))
 
+    # `function` has to be finite even where no root exists: reverse mode multiplies the branch that
+    # is not taken by zero, and NaN times zero is NaN.
     def equation(x):
         return jnp.where(exists, function(x), x - b)
 
@@ -44,8 +45,8 @@ def divide(linear: Function, rhs: Number) -> Number:
 
 
 def _false_position(f: Function, a, fa, b, fb, wanted) -> Number:
-    # Values that were computed elsewhere may have the other sign where they are round-off: without
-    # a change of sign the root is the end where the function is smaller.
+    # The values at the ends may come from another program, and have another sign where they are
+    # round-off: without a change of sign the root is the end where the function is smaller.
     apart_in_sign = jnp.sign(fa) * jnp.sign(fb) <= 0
     is_at_a = ~apart_in_sign & (jnp.abs(fa) < jnp.abs(fb))
     b, fb = jnp.where(is_at_a, a, b), jnp.where(is_at_a, fa, fb)
@@ -59,10 +60,13 @@ def _false_position(f: Function, a, fa, b, fb, wanted) -> Number:
     def narrow(state):
         a, fa, b, fb, n = state
         secant = b - fb * (b - a) / (fb - fa)
-        # Every third point is the middle one, so that the interval shrinks whatever f does.
+        # Every third point is the midpoint, so that the interval shrinks for every f. A secant
+        # through two equal values is infinite or NaN: the midpoint as well.
         c = jnp.where(jnp.isfinite(secant) & (n % 3 != 2), secant, (a + b) / 2)
         fc = f(c)
         crosses = jnp.sign(fc) * jnp.sign(fb) <= 0
+        # An end that stays has its value halved (Illinois): plain false position would approach
+        # the root from one side only, linearly.
         a, fa = jnp.where(crosses, b, a), jnp.where(crosses, fb, fa / 2)
         return a, fa, c, fc, n + 1
 

@@ -1,4 +1,4 @@
-"""Iterations that converge linearly, to round-off: when to stop, and when to give up."""
+"""Stopping rules of iterations that converge linearly, to round-off."""
 
 import abc
 from collections.abc import Callable
@@ -9,19 +9,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .newton import (
-    Found,
-    Function,
-    RootSolver,
-    Scales,
-    Vector,
-    check_settings,
-    largest,
-)
+from .newton import Found, Function, RootSolver, Scales, Vector, check_settings, largest
 
 
 class _Verdict(NamedTuple):
-    """Of each component: whether it is good, or nothing but round-off; the error that is left."""
+    """For each component: is it good, is it only round-off, and its estimated error."""
 
     good: Bool[Array, " n"]
     round_off: Bool[Array, " n"]
@@ -37,25 +29,25 @@ def _verdict(
     rtol: float | None,
     atol: float,
 ) -> _Verdict:
-    """On x, after so many iterations from x0, by its last two corrections δ_{k−1}, δ_k.
-
-    If a component shrinks by θ = δ_k / δ_{k−1} from one correction to the next, those that are
-    not made any more add up to δ_k θ/(1 − θ). A component is good once that is below `rtol` of its
-    scale, or the correction itself is, or turns but a last digit; or if it is nothing but
-    round-off, its own or that of larger components: small, and no longer, or soon, shrinking.
-    """
+    """The verdict on x after some iterations from x0, from the last corrections δ_{k−1}, δ_k."""
     eps = float(jnp.finfo(x.dtype).eps)
     before, last = corrections
     scale = jnp.maximum(scales.start, jnp.abs(x))
     allowed = (eps / 16 if rtol is None else rtol) * scale + atol
+    # With corrections that shrink by θ = δ_k / δ_{k−1} the sum of all further ones is
+    # δ_k θ/(1 − θ), which is the error of x.
     shrinks = last < before
     rest = last * (last / jnp.where(shrinks, before - last, 1))
     error = jnp.minimum(last, jnp.where(shrinks, rest, jnp.inf))
+    # A correction of one unit in the last place cannot be improved on.
     settled = (error <= allowed) | (last <= eps * scale)
-    # As fast as by a factor of 8 an iteration, of which seven go from a thousandth to round-off.
+    # Convergence by a factor of 8 or more in each iteration: seven of them lead from a thousandth
+    # to round-off.
     factor = jnp.exp2(-3.0 * jnp.minimum(iterations - 1, 7)).astype(x.dtype)
     was_fast = last <= factor * jnp.abs(x - x0)
     at_rest = (last <= 4 * eps * scale) & (was_fast | (last >= 0.5 * before))
+    # A small component that is coupled to large ones inherits their round-off. It never settles
+    # relative to its own size, and is good once it no longer shrinks.
     round_off = last <= 64 * eps * scale + 4 * eps * largest(scale)
     return _Verdict(settled | at_rest | (round_off & (last >= before)), round_off, error)
 
@@ -69,11 +61,10 @@ def contract(
     max_steps: int,
     slowest: float = float("inf"),
 ) -> Found:
-    """x ← x − correction(x) from x0 until it is good to round-off, or is given up.
+    """x ← x − correction(x) from x0 until it is good to round-off, or the iteration is stopped.
 
-    That is after `max_steps`, for a number that is not finite, or once a correction, each
-    component by its scale, is larger than `slowest` times the one before. Of the residual an
-    estimate is given, the error that is left: the Jacobian is near the identity, or divided by.
+    It is stopped after `max_steps`, for a number that is not finite, or once a correction, relative
+    to the scales, exceeds `slowest` times the one before.
     """
 
     def proceed(state):
@@ -86,19 +77,23 @@ def contract(
         x, last = found.x - step, jnp.abs(step)
         k = found.iterations + 1
         good, round_off, error = _verdict(x, x0, scales, (before, last), k, rtol, atol)
-        # Round-off of many components goes up and down, each in its own time: once is enough.
+        # Round-off of many components fluctuates: all of them are rarely good in one iteration. A
+        # component that was good and is round-off still counts as good.
         good = good | (was_good & round_off)
         scale = jnp.maximum(scales.start, jnp.abs(x))
         safe = jnp.where(scale > 0, scale, 1)
         is_slow = largest(last / safe) > slowest * largest(before / safe)
-        # Compiled for a batch, the largest of numbers may leave NaN out: no test rests on that.
+        # Compiled for a batch, the maximum may ignore NaN: no decision may depend on NaN in it.
         slow = (k > 1) & is_slow & jnp.any(~(good | round_off))
         goes_on = jnp.all(jnp.isfinite(last)) & ~slow
+        # The estimated error stands for the residual: the Jacobian is near the identity, or the
+        # correction has been divided by it.
         residual = jnp.stack([largest(error), largest(scale)])
         return last, good, Found(x, k, residual, jnp.all(good)), goes_on
 
     no = jnp.asarray(False)
-    unknown = jnp.full_like(x0, jnp.nan)  # no comparison with it is true
+    # There is no correction before the first one: every comparison with NaN is false.
+    unknown = jnp.full_like(x0, jnp.nan)
     start = Found(x0, jnp.asarray(0, jnp.int32), jnp.stack([unknown[0]] * 2), no)
     state = (unknown, jnp.zeros(x0.shape, bool), start, ~no)
     return lax.while_loop(proceed, improve, state)[2]
@@ -116,7 +111,7 @@ class Contraction(RootSolver):
 
     @abc.abstractmethod
     def correction(self, F: Function, x0: Vector) -> Callable[[Vector], Vector]:
-        """x → its correction, all that depends on the guess x0 alone computed now."""
+        """x → its correction. Values that depend on the guess x0 only are computed once, here."""
 
     def solve(self, F, x0, scales):
         correction = self.correction(F, x0)

@@ -1,4 +1,4 @@
-"""What the CPU compiler of XLA is to be told for loops over lanes."""
+"""Flags of XLA's CPU compiler for loops over trajectories."""
 
 import os
 
@@ -11,19 +11,19 @@ _FLAGS = {
 
 
 def configure_cpu() -> None:
-    """Have this process compile loops for speed: call it before the first computation with JAX.
+    """Set flags by which this process compiles loops for speed; before the first use of JAX.
 
     It adds to the environment variable XLA_FLAGS, which JAX reads once, when it starts:
 
-    - ``--xla_cpu_prefer_vector_width=512``: vectors as wide as the processor has;
+    - ``--xla_cpu_prefer_vector_width=512``: the widest vectors of the processor;
     - ``--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000``: a loop of
       any size is compiled as one piece, its state in registers, rather than operation by operation.
 
-    They hold for everything that the process compiles. Most programs gain some ten per cent or
-    nothing, since loops of arithmetic alone are one function already: see `docs/speed.md`. Numbers
-    may differ in the last digit. What XLA_FLAGS sets already is left as it is.
+    The flags affect everything that the process compiles. Most programs gain ten per cent or
+    nothing, since loops of arithmetic are one function already: see `docs/speed.md`. Numbers may
+    differ in the last digit. Flags that XLA_FLAGS already has are not changed.
 
-    **Raises** `RuntimeError` when JAX has started already: the flags would not be read any more.
+    **Raises** `RuntimeError` when JAX has started already, and would not read the flags.
     """
     if backends_are_initialized():
         raise RuntimeError(

@@ -1,4 +1,4 @@
-"""A batch as one array program over several devices, of one machine or of many."""
+"""A batch as one array program over several devices, on one host or on many."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,29 +19,31 @@ def over_devices(
     in_axes: int | Sequence[int | None] | None = 0,
     out_axes: int = 0,
 ) -> Callable[..., Any]:
-    """The batched `function` with its lanes divided between devices, as one array program.
+    """The batched `function` with its batch divided between devices, as one array program.
 
-    ``jax.jit(dvi.over_devices(jax.vmap(one)))(q0, p0)`` gives what ``jax.jit(jax.vmap(one))(q0,
-    p0)`` does, each device computing its part of the lanes. It is differentiated and compiled like
-    any function: for a mean over all trajectories and its gradient, say. Under
-    `jax.distributed.initialize` the devices are those of all hosts, which run the same program.
-    Independent trajectories are better off with `sweep`, which loses nothing when a host is lost.
+    ``jax.jit(dvi.over_devices(jax.vmap(one)))(q0, p0)`` returns the same as
+    ``jax.jit(jax.vmap(one))(q0, p0)``; each device computes its part of the batch. It can be
+    differentiated and compiled like any function: for a mean over all trajectories and its
+    gradient, for instance. Under `jax.distributed.initialize` the devices are those of all hosts,
+    which run the same program. For independent trajectories use `sweep`, which loses nothing when a
+    host fails.
 
     **Arguments**
 
-    - `function`: batched, with lanes that do not depend on each other.
+    - `function`: batched, with elements that do not depend on each other.
     - `devices`: None means all of `jax.devices()`.
-    - `in_axes`: the axis of lanes of all arguments, or of each; None where one has no lanes.
-    - `out_axes`: that of every output array.
+    - `in_axes`: the batch axis of all arguments, or of each; None for an argument without one.
+    - `out_axes`: the batch axis of every output array.
 
-    **Raises** `ValueError` for numbers of lanes that the devices do not divide; `TypeError` for
-    something that is no function.
+    **Raises** `ValueError` for a batch that the number of devices does not divide; `TypeError` for
+    an object that is not a function.
     """
     check_function("what over_devices takes", function, hint="jax.vmap(one), for example.")
     chosen = np.asarray(jax.devices() if devices is None else list(devices))
     if chosen.size == 0:
         raise ValueError("over_devices needs at least one device.")
     whole("out_axes", out_axes, least=0)
+    # Auto: shardings of arguments outside are left to JAX, and need not be declared.
     mesh = jax.sharding.Mesh(chosen, (LANES,), axis_types=(AxisType.Auto,))
 
     def call(*args: Any) -> Any:
@@ -52,12 +54,13 @@ def over_devices(
                 "one number for all."
             )
         for axis in each:
-            instance("an axis of lanes", axis, int | None, "a whole number or None")
+            instance("a batch axis", axis, int | None, "a whole number or None")
         specs = tuple(
             jax.tree.map(lambda x, axis=axis: _spec(x, axis, chosen.size), argument)
             for argument, axis in zip(args, each, strict=True)
         )
         out = PartitionSpec(*(None,) * out_axes, LANES)
+        # With check_vma=True there would be no reversible gradient, see `_reversible`.
         mapped = jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=out, check_vma=False)
         return mapped(*args)
 
@@ -70,12 +73,12 @@ def _spec(x: Any, axis: int | None, count: int) -> PartitionSpec:
     shape = np.shape(x)
     if not -len(shape) <= axis < len(shape):
         raise ValueError(
-            f"in_axes says that lanes are along axis {axis}, but an argument has shape {shape}: "
-            "give None for arguments without lanes."
+            f"in_axes says that the batch is along axis {axis}, but an argument has shape {shape}: "
+            "give None for arguments without a batch axis."
         )
     if shape[axis] % count:
         raise ValueError(
-            f"{shape[axis]} lanes (shape {shape}, axis {axis}) cannot be divided between {count} "
-            "devices: take a multiple of them, or fewer devices."
+            f"{shape[axis]} trajectories (shape {shape}, axis {axis}) cannot be divided between "
+            f"{count} devices: use a multiple of {count}, or fewer devices."
         )
     return PartitionSpec(*(None,) * (axis % len(shape)), LANES)

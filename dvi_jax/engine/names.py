@@ -11,13 +11,10 @@ _NAMES = {"newton", "root_finder"}
 
 
 def both_names(function: F) -> F:
-    """The same function or class, which takes how implicit steps are solved by either of its names:
-    `root_finder`, as the field of `Integrator` is called, and `newton`. Its signature, with one of
-    them, is unchanged.
-
-    **Raises** `TypeError`, when it is called, for both names at once.
-    """
+    """The same function or class, which accepts the solver of implicit steps as `root_finder` and
+    as `newton`; a call with both **raises** `TypeError`. The signature shows one of them."""
     if isinstance(function, type):
+        # In place: `isinstance` and pickles refer to this class, not to a subclass of it.
         function.__init__ = both_names(function.__init__)
         return function  # pyright: ignore[reportReturnType]
     own, *more = _NAMES & set(inspect.signature(function).parameters)

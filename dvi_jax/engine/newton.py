@@ -1,4 +1,4 @@
-"""Roots of small systems of equations: what solvers have in common, and Newton's method."""
+"""Roots of small systems of equations: the base of the solvers, and Newton's method."""
 
 import abc
 import functools
@@ -20,10 +20,10 @@ Function = Callable[[Vector], Vector]
 
 
 class Scales(NamedTuple):
-    """By what the accuracy of each unknown is measured, beside its own size; not negative.
+    """Scales of the convergence test, per unknown and not negative, next to its own size.
 
-    `known` is the size of the known value that it starts from, and `start` the size of that value
-    as it is represented: the same but for states that are told relative to an origin.
+    `known` is the size of the known value that it starts from, `start` the size of that value as it
+    is represented. They differ for states relative to an origin only.
     """
 
     known: Vector
@@ -31,21 +31,22 @@ class Scales(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a solver gives: x, the iterations made, the largest component of the last correction and
-    the scale that it is measured by, and whether the iteration has converged."""
+    """Result of a solver: x, iterations, (largest component of the last correction, its scale), and
+    whether the iteration has converged."""
 
     x: Vector
     iterations: Int[Array, ""]
+    # A pair, not their quotient: it is compared without a division, see `worse`.
     residual: Float[Array, "2"]
     converged: Bool[Array, ""]
 
 
 class RootSolver(eqx.Module):
-    """Base of the methods for the implicit part of a step, F(x) = 0: what `newton=` takes.
+    """Base of the methods for the implicit part of a step, F(x) = 0: the type of `newton=`.
 
-    F has a Jacobian near the identity, the nearer the smaller h is; a guess is at hand. All
-    methods find the root to round-off and have the same derivatives, those of the implicit
-    function, to any order; they differ in what an iteration costs and in how many there are.
+    The Jacobian of F tends to the identity as h → 0, and a guess is known. All methods find the
+    root to round-off and have the same derivatives, those of the implicit function, to any order;
+    they differ in the cost and the number of iterations.
     """
 
     @abc.abstractmethod
@@ -59,7 +60,7 @@ class RootSolver(eqx.Module):
 
 
 def check_settings(rtol: float | None, atol: float, max_steps: int) -> None:
-    """Refuse settings by which no iteration could stop, with a `ValueError`."""
+    """**Raises** `ValueError` for settings with which no iteration could stop."""
     whole("max_steps", max_steps)
     for name, value in (("rtol", rtol), ("atol", atol)):
         if value is not None:
@@ -69,17 +70,17 @@ def check_settings(rtol: float | None, atol: float, max_steps: int) -> None:
 
 
 class Newton(RootSolver):
-    """Newton's method with several corrections for each Jacobian J = ∂F/∂x(x), which autodiff
-    gives: two, and a third where two are not enough (up to 16 unknowns),
+    """Newton's method with several corrections for each Jacobian J = ∂F/∂x(x) of autodiff: two, and
+    a third where two are not enough (up to 16 unknowns),
 
         x ← x − J⁻¹ F(x),    x ← x − J⁻¹ F(x),    (x ← x − J⁻¹ F(x)).
 
-    The last two of them, δ and δ', show how fast they shrink, by |δ'|/|δ|. The iteration stops once
-    δ' times that factor is below round-off in each component, relative to the larger of its known
-    and unknown value; or, for components that are nothing but round-off of larger ones, once they
-    are as small as the round-off of those and shrink no more. So the root is accurate to round-off
-    also where J is not the derivative of F; the iteration then takes longer. Convergence is of
-    order 3 or 4.
+    The ratio |δ'|/|δ| of the last two corrections estimates the rate of convergence. The iteration
+    stops once δ' times that rate is below round-off in each component, relative to the larger of
+    its known and unknown value; or, for components that are only round-off of larger ones, once
+    they are as small as that round-off and no longer shrink. So the root is accurate to round-off
+    also where J is not the derivative of F; the iteration is then longer. Convergence is of order 3
+    or 4.
 
     **Arguments**
 
@@ -108,9 +109,8 @@ class Newton(RootSolver):
             return ~state.converged & state.finite & (state.iterations < self.max_steps)
 
         def corrected(x):
-            """x after two corrections with one Jacobian, or three where two are not enough; the
-            last is left out where it is larger than the one before. The size of each component of
-            the last, its scale, and the largest of the one before and of the last."""
+            """(x, |last correction| and its scale per component, maxima of the last two
+            corrections) after two corrections with one Jacobian, or three."""
             value, jacobian = value_and_jacobian(F, x)
             first = lanewise.solve(jacobian, value)
             x = x - first
@@ -118,6 +118,8 @@ class Newton(RootSolver):
             before, worst = _largest_of(jnp.abs(first)), _largest_of(jnp.abs(second))
             scale = _larger(known, jnp.abs(x))
             shrinks = worst < before
+            # worst²/before is the next correction. Only where it would be above round-off is a
+            # third evaluation of F worth its time.
             left = shrinks & (worst * worst > eps / 16 * before * _least_of(scale))
 
             def another():
@@ -130,26 +132,27 @@ class Newton(RootSolver):
                 asked = lanewise.on_any(left, rare=x0.size > _FIRST_APART)
                 x, last, before = lax.cond(asked, another, lambda: (x, second, before))
             worst = _largest_of(jnp.abs(last))
+            # A last correction that is larger than the one before is round-off, or divergence.
             x = jnp.where(worst > before, x, x - last)
             return x, jnp.abs(last), _larger(known, jnp.abs(x)), before, worst
 
         def is_root(second, scale, before, worst):
             if by_rate:
-                # With one Jacobian corrections shrink linearly, and have been seen to, by a factor
-                # of worst/before: what is left is that much of the last one.
+                # With one Jacobian corrections shrink linearly, here by worst/before: the error
+                # is that fraction of the last one. Written as products, since a division by
+                # `before` may be one by zero.
                 bound = (eps / 16 * before) * scale
-                in_range = (bound > tiny) & (bound < jnp.inf)  # else the products say nothing
+                # Beyond the range of normal numbers the comparison of products is meaningless.
+                in_range = (bound > tiny) & (bound < jnp.inf)
                 left = in_range & (second * worst <= bound)
-                settled = jnp.all(left | (second <= 4 * eps * scale))
-            else:
-                settled = jnp.all(second <= (self.rtol or 0.0) * scale + self.atol)
-            return settled
+                return jnp.all(left | (second <= 4 * eps * scale))
+            return jnp.all(second <= (self.rtol or 0.0) * scale + self.atol)
 
         def improve(state: _Iterate):
             x, second, scale, before, worst = corrected(state.x)
             settled, size = is_root(second, scale, before, worst), _largest_of(scale)
-            # A component that is all round-off of the others never settles by its own measure: it
-            # is enough that it is small beside them and shrinks no more.
+            # A component that is only round-off of the others never settles relative to its own
+            # size: it is enough that it is small next to them and no longer shrinks.
             rtol = 4096 * eps if by_rate else self.rtol or 0.0
             small = worst <= rtol * size + self.atol
             stalled = small & ((worst >= 0.5 * before) | (worst >= 0.5 * state.error[0]))
@@ -161,8 +164,8 @@ class Newton(RootSolver):
         yes, unknown = jnp.asarray(True), jnp.full((2,), jnp.nan, x0.dtype)
         start = _Iterate(x0, unknown, yes, ~yes, jnp.asarray(0, jnp.int32))
         if x0.size <= _FIRST_APART:
-            # Nearly all steps need one Jacobian: the first turn is made in front of the loop, where
-            # no trajectory waits for another.
+            # Nearly all steps need one Jacobian: the first iteration is in front of the loop, where
+            # no trajectory of a batch waits for another.
             x, second, scale, before, worst = corrected(x0)
             error = jnp.stack([worst, _largest_of(scale)])
             settled = is_root(second, scale, before, worst)
@@ -176,23 +179,22 @@ class Newton(RootSolver):
 
 
 _FIRST_APART = 4
-"""Unknowns up to which the first turn of Newton's loop is written out in front of it."""
-
+"""Unknowns up to which the first iteration is written out in front of Newton's loop. Of larger
+systems the second copy of the elimination would double the code to compile."""
 
 _THIRD_UP_TO = 16
-"""Unknowns up to which a third correction is made; of larger systems a second Jacobian is rare."""
+"""Unknowns up to which a third correction is made; larger systems rarely need a second Jacobian."""
 
 
 class Known(eqx.Module):
-    """A root that is known already: nothing is solved for but its derivative, as by `solver`."""
+    """A root that is already known: only its derivative is solved for, by `solver`."""
 
     root: Vector
     solver: RootSolver = Newton()
 
 
 class RootInfo(NamedTuple):
-    """How a solve went: iterations made, the largest component of the last correction and the scale
-    that it is measured by, and whether the iteration has converged."""
+    """A `Found` without x."""
 
     iterations: Int[Array, ""]
     residual: Float[Array, "2"]
@@ -200,7 +202,7 @@ class RootInfo(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """x after some iterations, the last correction's largest component and its scale, verdicts."""
+    """The state of Newton's loop; `error` is as `Found.residual`."""
 
     x: Vector
     error: Float[Array, "2"]
@@ -218,11 +220,11 @@ def find_root(
 ) -> tuple[Vector, RootInfo]:
     """Root x of function(x) = 0 near `guess`, and how it was found.
 
-    The derivative of x with respect to anything that `function` closes over is that of the
-    implicit function theorem, dx = −(∂F/∂x)⁻¹ dF, in forward and reverse mode and to any
-    order: the iteration itself is never differentiated. `known` and `start` (`known` if left out)
-    set the scales for the tolerances beside x itself, see `Scales`.
+    The derivative of x with respect to values that `function` closes over is that of the implicit
+    function theorem, dx = −(∂F/∂x)⁻¹ dF, in forward and reverse mode and to any order. `known` and
+    `start` (`known` if left out) are the `Scales` of the tolerances.
     """
+    # Scales decide when to stop, and no iteration is differentiated: no derivative of theirs.
     known = lax.stop_gradient(jnp.abs(known))
     start = known if start is None else lax.stop_gradient(jnp.abs(start))
     scales = Scales(known, start)
@@ -230,8 +232,7 @@ def find_root(
 
     def solve(F, x0):
         if isinstance(solver, Known):
-            nothing = jnp.zeros(2, x0.dtype)
-            return solver.root, (jnp.int32(1), nothing, jnp.asarray(True))
+            return solver.root, (jnp.int32(1), jnp.zeros(2, x0.dtype), jnp.asarray(True))
         x, *how = used.solve(F, x0, scales)
         return x, how
 
@@ -248,8 +249,9 @@ def largest(x: Vector) -> Float[Array, ""]:
     return jnp.max(jnp.abs(x), initial=0.0)
 
 
+# Of few numbers a chain of comparisons, which is faster in generated code than a reduction. A NaN
+# among them may be ignored, so that no decision rests on one.
 def _largest_of(x: Vector) -> Float[Array, ""]:
-    """The largest of numbers that are not negative; a NaN among them may be left out."""
     if x.size > 16:
         return jnp.max(x, initial=0.0)
     return functools.reduce(lambda a, b: jnp.where(a > b, a, b), [x[i] for i in range(x.size)])
@@ -268,16 +270,17 @@ def _larger(a: Vector, b: Vector) -> Vector:
 def worse(
     a: Float[Array, "2"], b: Float[Array, "2"], counts: Bool[Array, ""] | bool = True
 ) -> Float[Array, "2"]:
-    """The larger of two quotients, each given as (numerator, denominator); a, if b is NaN or does
-    not count."""
+    """The larger of two quotients (numerator, denominator); a if b is NaN or does not count."""
+    # Cross-multiplied: one division at the end of a run in place of one in every step.
     return jnp.where(counts & (b[0] * a[1] > a[0] * b[1]), b, a)
 
 
 def no_residual(dtype) -> Float[Array, "2"]:
-    """The quotient 0 that `worse` begins with."""
+    """The quotient 0, the initial value for `worse`."""
     return jnp.asarray([0.0, 1.0], dtype)
 
 
 def over(size: Float[Array, ""], scale: Float[Array, ""]) -> Float[Array, ""]:
-    """size / scale, or size itself where there is no scale."""
+    """size / scale, or size itself where the scale is zero."""
+    # The inner `where` keeps the derivative finite: 0/0 in the branch not taken would give NaN.
     return jnp.where(scale > 0, size / jnp.where(scale > 0, scale, 1), size)

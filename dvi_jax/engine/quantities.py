@@ -1,4 +1,4 @@
-"""Numbers with units and masked numbers are refused: an array would drop the unit or mask."""
+"""A check for numbers with units and masked numbers."""
 
 from typing import Any
 
@@ -6,10 +6,9 @@ import numpy as np
 
 
 def refuse_unit_or_mask(name: str, value: Any) -> None:
-    """Refuse a quantity of astropy or pint called `name`, and an array with masked numbers.
-
-    **Raises** `TypeError` for a unit, `ValueError` for a mask.
-    """
+    """**Raises** `TypeError` for a quantity of astropy or pint, `ValueError` for an array with
+    masked numbers."""
+    # Both are accepted by np.asarray, which drops the unit or the mask without a warning.
     if np.ma.is_masked(value):
         where = np.argwhere(np.ma.getmaskarray(value))[0].tolist()
         raise ValueError(
@@ -24,7 +23,7 @@ def refuse_unit_or_mask(name: str, value: Any) -> None:
         unit = getattr(value, "units", None)
     if unit is not None:
         raise TypeError(
-            f"{name} has the unit {str(unit) or '1'!r}, and numbers are taken here: it would be "
-            "lost. dvi_jax.interop.integrate(..., units=...) takes quantities of astropy and "
-            "converts them; or divide by the unit that the run is in."
+            f"{name} has the unit {str(unit) or '1'!r}, which would be lost: numbers without units "
+            "are required here. dvi_jax.interop.integrate(..., units=...) accepts quantities of "
+            "astropy and converts them; or divide by the unit of the run."
         )

@@ -1,7 +1,6 @@
-"""Values that a user's function reads from outside: globals, closures, attributes of its object.
+"""Values that a user's function reads from outside: globals, closures, attributes of its object."""
 
-They become constants of a compiled program, which must not be used again once they have changed.
-"""
+# They become constants of a compiled program, which must not be used again once they have changed.
 
 import contextlib
 import functools
@@ -16,13 +15,12 @@ import jax
 import numpy as np
 
 Reads = tuple[tuple[str, Any], ...]
-"""Names and what identifies their values; it can be compared and hashed."""
+"""Names, each with a mark that identifies its value and can be compared and hashed."""
 
+# The comparison is made at every call, so that its time is limited: large NumPy arrays are compared
+# in some entries, long lists and dictionaries in the first ones.
 _MOST_BYTES = 1 << 20
-"""Of larger NumPy arrays only some entries are compared."""
-
 _MOST_ENTRIES = 1000
-"""Of longer lists and dictionaries only the first entries are compared."""
 
 _LIBRARIES = frozenset(["jax", "jaxlib", "numpy", "scipy", "equinox", "lanewise", "dvi_jax"])
 
@@ -30,7 +28,9 @@ _SIMPLE = (bool, int, float, complex, str, bytes, type(None), np.generic)
 
 
 class _Same:
-    """An object that is compared by identity, and lives as long as it is compared with."""
+    """An object that is compared by identity."""
+
+    # It holds the object, since the id of one that is deleted may be given to another.
 
     def __init__(self, value: Any):
         self.value = value
@@ -46,13 +46,13 @@ class _Same:
 
 
 def reads(*values: Any) -> Reads:
-    """What the functions among `values`, and in pytrees and modules of them, read from outside.
+    """The values that functions read from outside: those in `values`, in pytrees and in modules.
 
-    - Numbers, strings, tuples, lists, dictionaries and NumPy arrays are compared by value (of
-      arrays above 1 MiB and of lists above 1000 entries only a part), other objects by identity.
-    - Of an object the attributes are compared whose names occur in the function.
-    - Functions that are called are followed where they belong to no library. What a `jax.jit` of
-      the user's has compiled, files, and values that are computed by a call are not seen.
+    - Numbers, strings, tuples, lists, dictionaries and NumPy arrays are compared by value (arrays
+      above 1 MiB and lists above 1000 entries in part), other objects by identity.
+    - Attributes of an object are compared if their names occur in the function.
+    - Functions that are called are followed unless they belong to a library. Programs that
+      `jax.jit` has compiled for the user, files, and results of calls are not seen.
     """
     reader = _Reader()
     for value in values:
@@ -76,7 +76,8 @@ def _shown(mark: Any) -> str:
 
 
 def _functions(value: Any) -> Iterator[Callable]:
-    """The functions in a pytree, a module, or a container; arrays in it are arguments, not read."""
+    """The functions in a pytree, a module, or a container."""
+    # Arrays in a module are arguments of a compiled program, not constants: they may change.
     if isinstance(value, eqx.Module):
         for inner in vars(value).values():
             yield from _functions(inner)
@@ -93,21 +94,21 @@ def _functions(value: Any) -> Iterator[Callable]:
 
 
 class _Reader:
-    """Notes what functions read, in `found`."""
+    """Collects in `found` the values that functions read."""
 
     def __init__(self):
         self.found: dict[str, Any] = {}
         self.visited: dict[Any, Any] = {}
 
     def is_new(self, thing: Any, names: tuple[str, ...] = ()) -> bool:
-        """Whether this is the first visit; the thing is held, so that no other gets its id."""
+        """Whether this is the first visit."""
         key = id(thing), names
         new = key not in self.visited
-        self.visited[key] = thing
+        self.visited[key] = thing  # held, so that no other object gets its id
         return new
 
     def follow(self, function: Any) -> None:
-        """Note what a function reads, and those that it calls."""
+        """Collect the values that a function reads, and those that it calls."""
         if not self.is_new(function):
             return
         if isinstance(function, functools.partial):
@@ -143,7 +144,7 @@ class _Reader:
                     self.note(name, outside[name], names)
 
     def note(self, name: str, value: Any, names: tuple[str, ...]) -> None:
-        """Note one value and what it leads to; `names` are those in the code that reads it."""
+        """Collect one value and what it refers to; `names` are those in the code that reads it."""
         if isinstance(value, types.ModuleType):
             if not _is_of_a_library(value.__name__):
                 self.note_attributes(name, value, names)
@@ -169,13 +170,13 @@ class _Reader:
                 self.follow(value)
 
     def note_attributes(self, name: str, value: Any, names: tuple[str, ...]) -> None:
-        """Note the attributes of these names: of the object itself, of its class, and what its
-        methods and properties read."""
+        """Collect attributes of an object or of its class, and what methods and properties read."""
         own = getattr(value, "__dict__", {})
         for attribute in names if self.is_new(value, names) else ():
             if attribute in own:
                 self.note(f"{name}.{attribute}", own[attribute], names)
                 continue
+            # Statically: the property of a user may compute for long, or raise.
             of_class = inspect.getattr_static(type(value), attribute, None)
             method = of_class.fget if isinstance(of_class, property) else of_class
             if isinstance(method, types.FunctionType):
@@ -191,7 +192,7 @@ class _Reader:
 
 
 def _digest(array: np.ndarray) -> Any:
-    if array.dtype.hasobject:
+    if array.dtype.hasobject:  # its bytes are addresses
         return _Same(array)
     if array.nbytes > _MOST_BYTES:
         array = array.reshape(-1)[:: array.nbytes // _MOST_BYTES + 1]
@@ -200,7 +201,7 @@ def _digest(array: np.ndarray) -> Any:
 
 @functools.lru_cache(maxsize=4096)
 def _names(code: types.CodeType) -> tuple[str, ...]:
-    """The names of globals and attributes in a function and in those inside of it."""
+    """The names of globals and attributes in a function and in the functions inside it."""
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
     return tuple(dict.fromkeys([*code.co_names, *(n for c in inner for n in _names(c))]))
 

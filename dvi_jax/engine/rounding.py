@@ -1,9 +1,8 @@
-"""A function whose numbers have the same bits wherever it is evaluated.
+"""Functions whose results have the same bits wherever they are evaluated."""
 
-A compiler may join a product and a sum into one operation that rounds once (FMA), or not, depending
-on what stands around them: the same function then has other bits in another program. Machine code
-of `lanewise` does not depend on its surroundings.
-"""
+# A compiler may contract a product and a sum into one operation that rounds once (FMA), or not,
+# depending on the surrounding code: the same function then has other bits in another program.
+# Machine code of `lanewise` does not depend on the surrounding code.
 
 from collections.abc import Callable
 from typing import Any
@@ -17,15 +16,17 @@ import lanewise
 def one_by_one(
     function: Callable[..., Any], *args: Any, layout: lanewise.Layout = lanewise.Layout()
 ) -> Any:
-    """``function(*args)``, compiled by itself: nothing in it is joined with operations outside,
-    within a run or elsewhere. It takes pytrees, and returns a pytree of arrays."""
+    """``function(*args)`` of pytrees, compiled separately, so that no operation in it is joined
+    with one outside. It must return a pytree of arrays."""
     arrays, rest = eqx.partition(args, eqx.is_array)
     return lanewise.call(lambda arrays: function(*eqx.combine(arrays, rest)), arrays, layout=layout)
 
 
 def each(
-    function: Callable[..., Any], given: Any, *rows: Any,
+    function: Callable[..., Any],
+    given: Any,
+    *rows: Any,
     layout: lanewise.Layout = lanewise.Layout(),
-) -> Any:  # fmt: skip
-    """``function(given, *row)`` for every row, with the bits that it has for one row alone."""
+) -> Any:
+    """``function(given, *row)`` for every row, with the bits of a call for one row alone."""
     return jax.vmap(lambda *row: one_by_one(function, given, *row, layout=layout))(*rows)

@@ -1,4 +1,4 @@
-"""What a function can be called with, and the refusal of one that cannot."""
+"""Checks of the number of arguments of a function."""
 
 import inspect
 from collections.abc import Callable
@@ -8,12 +8,12 @@ from .._checks import function as check_function
 
 
 def accepts(function: Callable[..., Any], count: int) -> bool:
-    """Whether `function` takes `count` positional arguments; True where nobody can tell."""
+    """Whether `function` takes `count` positional arguments; True where that is not known."""
     try:
         inspect.signature(function).bind(*range(count))
     except TypeError:
         return False
-    except ValueError:  # a builtin without a signature: calling it will tell
+    except ValueError:  # a builtin without a signature: the call itself raises if it does not
         return True
     return True
 
@@ -21,12 +21,8 @@ def accepts(function: Callable[..., Any], count: int) -> bool:
 def check_takes(
     name: str, function: Any, arguments: str, hints: dict[int, str] | None = None
 ) -> None:
-    """Refuse what is no function of these positional arguments, such as "(t, q, p, args)".
-
-    - `hints`: what to do with a function of another number of arguments.
-
-    **Raises** `TypeError`.
-    """
+    """**Raises** `TypeError` for an object that is not a function of these positional arguments,
+    such as "(t, q, p, args)"; `hints`: advice for functions of another number of arguments."""
     check_function(name, function, arguments)
     count = arguments.count(",") + 1
     if accepts(function, count):

@@ -1,9 +1,8 @@
-"""Newton's method with one Jacobian a step."""
+"""Newton's method with one Jacobian per step."""
 
 from collections.abc import Callable
 
 import jax.numpy as jnp
-from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import Array, Inexact
 
 import lanewise
@@ -15,22 +14,14 @@ from .newton import Vector, value_and_jacobian
 class SimplifiedNewton(Contraction):
     """Simplified Newton iteration, x ← x − J⁻¹ F(x), J = ∂F/∂x at the guess.
 
-    The Jacobian, for many unknowns the most expensive part of Newton's method, is computed once a
+    The Jacobian, for many unknowns the most expensive part of Newton's method, is computed once per
     step, and factorised once if there are more than 64 unknowns. Convergence is linear, with a
     factor of about the relative change of the Jacobian from the guess to the root, O(h²) for the
-    type II map. Unlike Picard's it may converge where h times the derivative of the rate is larger
-    than one, unless that derivative changes much.
+    type II map. Unlike `Picard` it may converge where h times the derivative of the rate is larger
+    than one, unless that derivative changes strongly.
 
-    Stops as `Picard` does, by the error that the linear convergence leaves; same arguments. Its
-    derivatives are Newton's: the Jacobian at the root.
-
-    **Arguments**
-
-    - `rtol`: relative tolerance of the error; None means 1/16 of the unit of round-off.
-    - `atol`: absolute tolerance [unit of the unknown].
-    - `max_steps`: iterations after which the status becomes `not_converged`.
-
-    **Raises** `ValueError` for tolerances that are negative or both zero, or fewer than one step.
+    The stopping rule, the arguments and the errors are those of `Picard`. Derivatives are those of
+    `Newton`, by the Jacobian at the root.
 
     **Source** Hairer & Wanner 1996, *Solving ODEs II*, IV.8.
     """
@@ -45,16 +36,15 @@ class SimplifiedNewton(Contraction):
 
 
 def factorised(A: Inexact[Array, "n n"]) -> Callable[[Vector], Vector]:
-    """b → the solution of A x = b, all that depends on A alone computed now.
-
-    Small systems are eliminated again for each b: generated code does that in fewer operations than
-    it takes to find the inverse once.
-    """
+    """b → the solution of A x = b. A large A is factorised once, here."""
     if A.shape[0] > _ELIMINATED:
+        from jax.scipy.linalg import lu_factor, lu_solve  # few runs need it: a part of import time
+
         factors = lu_factor(A)
         return lambda b: lu_solve(factors, b)
     return lambda b: lanewise.solve(A, b)
 
 
+# Smaller systems are eliminated again for each b: generated code needs fewer operations for that
+# than for finding the inverse once.
 _ELIMINATED = 64
-"""Unknowns up to which a system is eliminated again for each right-hand side."""

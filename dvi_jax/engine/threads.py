@@ -1,4 +1,4 @@
-"""The processors of this process, and the older name for a batch on all of them."""
+"""The processors of this process, and an older function for a batch on all of them."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -13,10 +13,10 @@ def over_threads(
     in_axes: int | Sequence[int | None] | None = 0,
     out_axes: int = 0,
 ) -> Callable[..., Any]:
-    """`function` itself: a batch of trajectories uses all cores without it.
+    """`function` unchanged: a batch of trajectories uses all cores without this function.
 
     ``jax.jit(jax.vmap(one))`` divides a batch among the threads that XLA has for the processors of
-    the process; `lanewise.set_threads` limits their number. This older name stays for programs that
+    the process; `lanewise.set_threads` limits their number. This function remains for programs that
     call it.
 
     **Arguments** `function`: a function of arrays. The others have no effect.
@@ -47,7 +47,8 @@ def over_threads(
 
 
 def processors() -> int:
-    """How many processors this process may use."""
+    """The number of processors that this process may use."""
+    # A container or `taskset` may allow fewer than the machine has; only Linux reports that.
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Where t1 comes from: one file for each lattice, over one abstract base."""
+"""Time grids, here called lattices: one file for each, over one abstract base."""
 
 from ._base import Lattice as Lattice, Place as Place, Run as Run
 from ._given import Given as Given

@@ -1,4 +1,4 @@
-"""What every lattice is: the interval of step k."""
+"""The base of all lattices (time grids): the interval of step k."""
 
 import abc
 import operator
@@ -19,7 +19,7 @@ from ..observe import Stop
 
 
 class Place(NamedTuple):
-    """Where a trajectory stands before step k: the state, and the step and time it began with."""
+    """A trajectory before step k: the time and the step of its start, k, and the state."""
 
     t0: Scalar
     h: Scalar
@@ -29,7 +29,7 @@ class Place(NamedTuple):
 
 
 class Run(NamedTuple):
-    """What is integrated: a system from a start, what is observed and saved, and where it ends."""
+    """A run: a system with initial conditions, observables, saved states and an end."""
 
     system: System
     t0: Scalar
@@ -45,32 +45,35 @@ class Run(NamedTuple):
 class Lattice(eqx.Module):
     """Base of all lattices.
 
-    Most know every interval beforehand, by `interval`. One that finds its steps along the way says
-    ``has_memory = True``: its `next` chooses the interval from the state and from a memory that
-    `begin` makes.
+    Most know every interval in advance, by `interval`. A lattice that chooses its steps during the
+    run sets ``has_memory = True``: its `next` computes the interval from the state and from a
+    memory that `begin` makes.
     """
 
+    # Not decided from `next`: runs on lattices without a memory have loops without one, and states
+    # that can be rebuilt backwards.
     has_memory: ClassVar[bool] = False
 
     @abc.abstractmethod
     def prepare(self, t0: Any, h: Any, num_steps: Any) -> tuple[Any, Any, int]:
-        """(t0, h, num_steps) with defaults filled in, after refusing what does not fit."""
+        """(t0, h, num_steps) with defaults filled in. **Raises** for values that do not fit."""
 
     @abc.abstractmethod
     def interval(self, t0: Scalar, h: Scalar, k: Int[Array, ""]) -> Interval:
         """The interval of step k = 0, 1, … (with a memory: of step 0)."""
 
     def check(self, method: Any, arithmetic: Any) -> None:
-        """Refuse a method or an arithmetic that these steps cannot be taken with."""
+        """**Raises** `ValueError` for a method or an arithmetic that does not fit these steps."""
 
     def transform(self, run: Run) -> tuple[Run, Callable[[Solution], Solution]]:
-        """The run in the variables that steps are taken in, and what takes its solution back."""
+        """The run in the variables of the steps, and the inverse transformation of a solution."""
         return run, lambda solution: solution
 
     def begin(self, t0: Scalar, h: Scalar) -> Any:
         """The memory before the first step."""
         return None
 
+    # The status is None, not `successful`, where steps always exist: no loop has to carry it.
     def next(
         self, memory: Any, equations: Equations, place: Place
     ) -> tuple[Interval, Any, RESULTS | None]:
@@ -78,7 +81,7 @@ class Lattice(eqx.Module):
         return self.interval(place.t0, place.h, place.k), memory, None
 
     def report(self, memory: Any) -> dict[str, Any]:
-        """What there is to say of the lattice at the end, for ``solution.stats``."""
+        """Statistics of the lattice at the end, for ``solution.stats``."""
         return {}
 
     @abc.abstractmethod
@@ -87,7 +90,7 @@ class Lattice(eqx.Module):
 
 
 class StepSizes(Lattice):
-    """Base of the lattices that take the size of a step, the first at least, and their number."""
+    """Base of the lattices with a given step size, at least of the first step, and their number."""
 
     def prepare(self, t0, h, num_steps):
         missing = [name for name, x in (("h", h), ("num_steps", num_steps)) if x is None]
@@ -103,10 +106,10 @@ class StepSizes(Lattice):
 
 
 def check_num_steps(num_steps: object) -> int:
-    """`num_steps` as an int, after refusing what cannot count steps (in 32 bits)."""
+    """`num_steps` as an int. **Raises** `TypeError` or `ValueError`."""
     try:
         count = None if isinstance(num_steps, bool) else operator.index(num_steps)  # pyright: ignore
-    except Exception:  # a traced number, say
+    except Exception:  # JAX raises an error of its own for a traced number
         count = None
     if count is None:
         raise TypeError(
@@ -115,4 +118,4 @@ def check_num_steps(num_steps: object) -> int:
         )
     hint = "To go backwards in time give a negative h; run more steps in pieces, each from the "
     hint += "end of the one before."
-    return whole("num_steps", count, 0, 2**31 - 2, hint)
+    return whole("num_steps", count, 0, 2**31 - 2, hint)  # steps are counted in 32 bits

@@ -19,16 +19,16 @@ def _times(ts: Any) -> Array:
 
 
 class Given(Lattice):
-    """The lattice of the given times t_0, t_1, …, t_N.
+    """The time grid with the given times t_0, t_1, …, t_N.
 
     **Arguments**
 
     - `ts`: times, shape (N+1,), strictly increasing or strictly decreasing; differentiable.
 
-    `integrate` then takes t0, h and num_steps from it, and refuses values that contradict it.
+    `integrate` then takes t0, h and num_steps from it, and rejects values that contradict it.
 
-    **Raises** `ValueError` for another shape, fewer than one time, or times that are not
-    finite or not strictly monotonic (a traced `ts` gives the status `bad_step_size` instead).
+    **Raises** `ValueError` for another shape, fewer than one time, or times that are not finite or
+    not strictly monotonic (a traced `ts` gives the status `bad_step_size` instead).
     """
 
     ts: Float[Array, " times"] = eqx.field(converter=_times)
@@ -60,12 +60,13 @@ class Given(Lattice):
                 f"num_steps={num_steps} contradicts Given(ts), whose {available + 1} times make "
                 f"{available} steps. Leave num_steps out, or cut ts."
             )
-        return self.ts[0], 1.0, available
+        return self.ts[0], 1.0, available  # any h: the steps do not depend on it
 
     def interval(self, t0, h, k):
         start, end = self.ts[k], self.ts[k + 1]
         return Interval(start, end, end - start)
 
+    # Known times have been checked in `__check_init__`; of traced ones this becomes the status.
     def is_usable(self, t0, h):
         steps = jnp.diff(self.ts)
         return jnp.all(jnp.isfinite(self.ts)) & (jnp.all(steps > 0) | jnp.all(steps < 0))

@@ -1,4 +1,4 @@
-"""Steps that adapt by a transformation of the time, in extended phase space."""
+"""Adaptive steps by a transformation of time, in extended phase space."""
 
 from collections.abc import Callable
 from typing import Any
@@ -38,20 +38,19 @@ class TimeTransformed(Uniform):
 
         K(q, t; p, p_t) = g(t, q, p) (H(t, q, p) + p_t),    p_t = −H at the start,
 
-    with t as a position and p_t its momentum, and on K = 0 it is that of H in other steps. So
-    the method, whatever it is, keeps its structure in the extended phase space, which choosing
-    the step at every step would destroy. H is H_D at t1 = t0; a force W becomes g W for p and
-    −g W·∂H/∂p for p_t.
+    with t as a position and p_t its momentum. On K = 0 it is a trajectory of H with other steps.
+    Every method keeps its structure in the extended phase space; a step size that is chosen at each
+    step would destroy it. H is H_D at t1 = t0; a force W becomes g W for p and −g W·∂H/∂p for p_t.
 
-    **Arguments** `speed`: g, function ``(t, q, p, args)`` → positive scalar; with Kepler's problem
-    for example |q|, or |q|^{3/2}.
+    **Arguments** `speed`: g, function ``(t, q, p, args)`` → positive scalar; for Kepler's problem
+    |q| or |q|^{3/2}, for example.
 
-    `integrate` then takes `h` as the step of σ [time / unit of g], and num_steps of them;
-    ``solution.hs`` are the steps of t. Observables see t. K couples q and p even where H_D
-    is separable: every step needs a solve. On the map K is kept up to O(h^order), not exactly.
+    `integrate` then interprets `h` as the step of σ [time / unit of g], and takes num_steps of
+    them; ``solution.hs`` are the steps of t. Observables receive t. K couples q and p even where
+    H_D is separable: every step needs a solve. The map conserves K up to O(h^order), not exactly.
 
-    **Raises** `TypeError` for a speed that is no function, and in `integrate` `ValueError` for
-    one that is not a positive scalar at the start, and for a `Trend`, whose times are the method's.
+    **Raises** `TypeError` for a speed that is not a function, and in `integrate` `ValueError` for
+    one that is not a positive scalar at the start, and for a `Trend`, whose time would be σ.
 
     **Source** Hairer 1997, *Appl. Numer. Math.* 25, 219; Reich 1999, *SIAM J. Numer. Anal.* 36,
     1549; Hairer, Lubich & Wanner 2006, VIII.2.1.
@@ -75,34 +74,36 @@ class TimeTransformed(Uniform):
 
     def transform(self, run):
         """The run in extended phase space, in the time σ from 0 on."""
+        # K contains ε: for the extended problem it is a parameter like any other, which may be
+        # traced and differentiated.
         extended = Extended(run.system, self.speed, run.epsilon, run.q0.shape)
         _check_speed(self.speed, run.t0, run.q0, run.p0, run.args)
         q0, p0 = start_state(*extended.start(run.t0, run.q0, run.p0, run.args))
         observe = jax.tree.map(extended.seen, run.observe, is_leaf=is_observable)
         save, stop = run.save, run.stop
+        # Requested times are those of t, which here is a coordinate: a clock reads it.
         if save.ts is not None:
             save = Save(ts=save.ts, clock=_SeenPoint(save.clock or _own_time, extended))
         if stop is not None:
             stop = Stop(_SeenPoint(stop.g, extended))
         has_force = run.system.force is not None
         return Run(
-            system=extended.as_system(),
+            system=System(extended.hamiltonian, extended.force if has_force else None),
             t0=jnp.zeros_like(run.t0),
             q0=q0,
             p0=p0,
+            # ε is inside of K and its force. Zero without a force: an ε that has no effect warns.
             epsilon=(jnp.ones_like if has_force else jnp.zeros_like)(run.epsilon),
             args=run.args,
-            observe=(observe, _time_gained),
+            observe=(observe, _time_gained),  # the second gives ``solution.hs``
             save=save,
             stop=stop,
         ), extended.undo
 
 
 class Extended(eqx.Module):
-    """The transformed problem of `TimeTransformed`.
-
-    Positions are (q, t) and momenta (p, p_t), flattened, shape (n + 1,).
-    """
+    """The transformed problem of `TimeTransformed`: positions (q, t) and momenta (p, p_t), each
+    flattened to shape (n + 1,)."""
 
     system: System
     speed: Callable[..., Any]
@@ -111,6 +112,7 @@ class Extended(eqx.Module):
 
     def start(self, t: Scalar, q: State, p: State, args: Args) -> tuple[Array, Array]:
         """The extended state, on K = 0."""
+        # Compiled separately: p_t then has the same bits alone and in a batch.
         energy = one_by_one(_energy, self.system, t, q, p, self.epsilon, args)
         return jnp.append(q.ravel(), t), jnp.append(p.ravel(), -energy)
 
@@ -123,7 +125,7 @@ class Extended(eqx.Module):
 
     def hamiltonian(self, s0, s1, position, momentum, args):
         """K = g (H + p_t)."""
-        del s0, s1
+        del s0, s1  # K is autonomous, also where H depends on time: t is a coordinate
         q, p, t, pt = self.parts(position, momentum)
         H = self.system.hamiltonian(t, t, q, p, self.epsilon, args)
         return jnp.asarray(self.speed(t, q, p, args), H.dtype) * (H + pt)
@@ -134,17 +136,14 @@ class Extended(eqx.Module):
         q, p, t, _ = self.parts(position, momentum)
         at = (t, t, q, p, self.epsilon, args)
         W = self.system.disturbing_force(*at)
+        # p_t balances the power of the force, so that K stays 0 although the energy changes.
         power = jnp.sum(W * jax.grad(self.system.hamiltonian, argnums=3)(*at))
         return self.speed(t, q, p, args) * jnp.append(W.ravel(), -power)
 
-    def as_system(self) -> System:
-        """K and its force as a `System`, to be run at ε = 1."""
-        return System(self.hamiltonian, None if self.system.force is None else self.force)
-
     def seen(self, observable: Any) -> Any:
-        """An observable of the user's on steps of the extended problem."""
+        """An observable of the user, evaluated on steps of the extended problem."""
         if not is_observable(observable):
-            return observable  # refused by name further on
+            return observable  # `check_observe` raises for it, and names it
         if isinstance(observable, Running):
             return Running(self.seen(observable.reduction))
         if isinstance(observable, Trend):
@@ -162,14 +161,15 @@ class Extended(eqx.Module):
             return eqx.tree_at(lambda s: s.g, observable, _SeenPoint(observable.g, self))
         if isinstance(observable, Reduction):
             return eqx.tree_at(lambda r: r.function, observable, self.seen(observable.function))
+        # Bound here: later it would be bound to the extended system, which the user does not know.
         if isinstance(observable, Bindable):
             observable = observable.bind(self.system, self.epsilon)
         return _Seen(observable, self)
 
     def undo(self, solution: Solution) -> Solution:
-        """A solution of the extended problem as one of the problem that was given."""
+        """A solution of the extended problem as one of the original problem."""
 
-        def told(found):
+        def original(found):
             if isinstance(found, Crossings):
                 q, p, t, _ = self.parts(found.qs, found.ps)
                 return Crossings(t, q, p, found.count)
@@ -177,7 +177,7 @@ class Extended(eqx.Module):
 
         q, p, t, _ = self.parts(solution.qs, solution.ps)
         observed, hs = solution.observed
-        observed = jax.tree.map(told, observed, is_leaf=lambda x: isinstance(x, Crossings))
+        observed = jax.tree.map(original, observed, is_leaf=lambda x: isinstance(x, Crossings))
         stop = solution.stop
         if stop is not None:
             own = self.parts(stop.q, stop.p)
@@ -190,7 +190,7 @@ def _energy(system: System, t: Scalar, q: State, p: State, epsilon: Scalar, args
 
 
 class _Seen(eqx.Module):
-    """An observable of the user's on steps of the extended problem."""
+    """An observable of the user on steps of the extended problem."""
 
     function: Callable[..., Any]
     extended: Extended
@@ -202,7 +202,7 @@ class _Seen(eqx.Module):
 
 
 class _SeenPoint(eqx.Module):
-    """A function ``(t, q, p, args)`` of the user's at points of the extended problem."""
+    """A function ``(t, q, p, args)`` of the user at points of the extended problem."""
 
     function: Callable[..., Any]
     extended: Extended
@@ -221,6 +221,7 @@ def _time_gained(s0, s1, position0, momentum0, position1, momentum1, args):
 
 
 def _check_speed(speed, t0, q0, p0, args) -> None:
+    # At the start only: later on a speed that is not positive stops the time, and the run with it.
     value = jnp.asarray(speed(t0, q0, p0, args))
     if value.shape != () or (not is_traced(value) and not float(value) > 0):
         raise ValueError(

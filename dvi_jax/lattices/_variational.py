@@ -1,4 +1,4 @@
-"""Steps that the lattice equation (14) chooses."""
+"""Steps that solve the lattice equation (14)."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
@@ -23,15 +23,16 @@ from ._base import StepSizes
 Policy = Literal["stop", "hold", "minimise"]
 
 _CELLS = 16
-"""Cells to each side of the last h that are searched for a change of sign."""
+"""Cells on each side of the last h that are searched for a change of sign."""
 
 _GOLDEN = 0.6180339887498949
+# Each step shortens the interval by that factor, 40 of them to 4e-9 ≈ √ε: the values near a minimum
+# are equal to rounding within that distance, so that more steps would find nothing better.
 _GOLDEN_STEPS = 40
-"""After so many the interval is 4e-9 of what it was: √ε, all that a minimum can be told to."""
 
 
 class Memory(NamedTuple):
-    """What the lattice equation carries from step to step."""
+    """State of the lattice equation between steps."""
 
     t: Scalar  # where the next step begins
     h: Scalar  # size of the last step
@@ -41,41 +42,41 @@ class Memory(NamedTuple):
 
 
 class Variational(StepSizes):
-    r"""The lattice of the discrete variational principle: the step h solves equation (14), mended,
+    r"""The lattice of the discrete variational principle: h solves equation (14), corrected,
 
         E⁺_k − E⁻_k = εW_k·(q_{k+1} − q_k),      E⁺ = H_D − h ∂H_D/∂t0,   E⁻ = H_D + h ∂H_D/∂t1
 
-    together with (12) and (13): stationarity of the discrete action in t_k. Where it holds energy
-    is in exact balance with the discrete work of the disturbance: for an autonomous H_D without a
-    force H_D(q_k, p_{k+1}) is the same number on every step. The first step is the h given to
-    `integrate`; each further one is the root nearest to the step before it, of the same sign and
-    within `reach` and `bounds`.
+    together with (12) and (13): stationarity of the discrete action in t_k. Where it holds, the
+    energy is in exact balance with the discrete work of the perturbing force: for an autonomous H_D
+    without a force H_D(q_k, p_{k+1}) is the same number on every step. The first step is the h
+    given to `integrate`; each further one is the root nearest to the step before it, of the same
+    sign and within `reach` and `bounds`.
 
     **Arguments**
 
-    - `on_no_root`: what to do where no h in reach balances the energy. ``"stop"``: end with the
-      status `no_root`. ``"hold"``: repeat the last h. ``"minimise"``: take the h in reach with the
-      smallest defect. The balance then starts afresh from the energy of that step.
-    - `reach`: how many times larger or smaller than the step before it a step may be.
-    - `bounds`: the smallest and the largest step allowed, as multiples of the first. Roots may pile
-      up at h = 0, where time would stand still, or run away.
+    - `on_no_root`: the policy where no h in reach balances the energy. ``"stop"``: end with the
+      status `no_root`. ``"hold"``: repeat the last h. ``"minimise"``: use the h in reach with the
+      smallest defect. The balance then restarts from the energy of that step.
+    - `reach`: largest ratio between a step and the one before it, in both directions.
+    - `bounds`: the smallest and the largest step allowed, as multiples of the first. Without them
+      steps may tend to 0, where time stops, or to infinity.
 
-    ``solution.stats`` has ``lattice_misses``, the steps that had no root, and ``lattice_defect``,
-    the largest |E⁺ − E⁻ − εW·Δq| [energy] with them. For `TypeII` only, whose equations these are;
-    of higher order through ``dvi.discretise(H, order=r)``. Gradients are those of the equations,
-    by the implicit function theorem; `Reversible` works as `Checkpointed`, because a step cannot
-    be undone without the one before it.
+    ``solution.stats`` has ``lattice_misses``, the number of steps without a root, and
+    ``lattice_defect``, the largest |E⁺ − E⁻ − εW·Δq| [energy], those steps included. For `TypeII`
+    only, since these are its equations; of higher order with ``dvi.discretise(H, order=r)``.
+    Gradients are those of the equations, by the implicit function theorem; `Reversible` works as
+    `Checkpointed`, because a step cannot be undone without the one before it.
 
-    **Limits** There is no root near turning points and apsides for an H_D of first order, and
-    the higher the order the flatter E⁺ is in h: its condition number (`LatticeCondition`) grows
-    as h^{−order}, and h is uncertain by as many units of round-off. Where E⁺ does not depend on
-    h at all (free motion) the last h is kept. Not symplectic on a fixed lattice: steps depend on
-    the state. `TimeTransformed` adapts without any of this.
+    **Limits** For an H_D of first order there is no root near turning points and apsides. The
+    higher the order, the flatter is E⁺ as a function of h: its condition number
+    (`LatticeCondition`) scales as h^{−order}, and h is uncertain by as many units of round-off.
+    Where E⁺ does not depend on h (free motion) the last h is repeated. The map is not symplectic on
+    a fixed grid, since steps depend on the state. `TimeTransformed` has none of these limits.
 
     **Raises** `ValueError` for another policy or a reach not above 1.
 
-    **Source** the paper's (5), (11) and (14), whose signs (11) has right; Kane, Marsden & Ortiz
-    1999, *J. Math. Phys.* 40, 3353 (symplectic-energy-momentum integrators, and their failures).
+    **Source** the paper's (5), (11) and (14), with the signs of (11); Kane, Marsden & Ortiz 1999,
+    *J. Math. Phys.* 40, 3353 (symplectic-energy-momentum integrators, and their failures).
     """
 
     on_no_root: Policy = eqx.field(static=True, default="stop")
@@ -88,8 +89,8 @@ class Variational(StepSizes):
         one_of("on_no_root", self.on_no_root, get_args(Policy))
         if not (isinstance(self.reach, int | float) and 1 < self.reach < float("inf")):
             raise ValueError(
-                f"reach must be a number above 1 (how many times larger or smaller than the one "
-                f"before a step may be), got {self.reach!r}."
+                "reach must be a number above 1 (the largest ratio between a step and the one "
+                f"before it), got {self.reach!r}."
             )
         try:
             smallest, largest = map(float, self.bounds)
@@ -102,16 +103,16 @@ class Variational(StepSizes):
             )
 
     def check(self, method, arithmetic):
-        if method.step is not step:
+        if not method.is_the_map:
             raise ValueError(
-                f"the lattice Variational() goes with method=dvi.TypeII() only, got {method!r}: "
-                "(14) is the variation of that map's action. For a higher order take an H_D of "
+                f"the lattice Variational() requires method=dvi.TypeII() only, got {method!r}: "
+                "(14) is the variation of that map's action. For a higher order use an H_D of "
                 "higher order, dvi.discretise(H, order=2)."
             )
         if arithmetic.undoes_steps:
             raise ValueError(
                 "the steps of Variational() are solved for, and a solve cannot be undone bit for "
-                "bit: take arithmetic=dvi.Compensated(), or another lattice."
+                "bit: use arithmetic=dvi.Compensated(), or another lattice."
             )
 
     def interval(self, t0, h, k):
@@ -128,6 +129,8 @@ class Variational(StepSizes):
         def residual(h):
             return energies(h).imbalance(memory.energy)
 
+        # The first step has no energy to balance. It is chosen by `where`, after the search: a
+        # branch would be evaluated for every trajectory of a batch anyway.
         first = place.k == 0
         scale = jnp.abs(memory.energy) + energies(memory.h).size
         candidates = memory.h * self._factors(memory.h / place.h)
@@ -155,25 +158,26 @@ class Variational(StepSizes):
         }
 
     def _factors(self, grown: Scalar) -> Array:
-        """What the last step, `grown` times the first, may be multiplied with: 1 in the middle."""
+        """Candidate ratios to the last step, which is `grown` times the first; 1 in the middle."""
         smallest, largest = (jnp.asarray(b, grown.dtype) / grown for b in self.bounds)
         low = jnp.clip(smallest, 1 / self.reach, 1)
         high = jnp.clip(largest, 1, self.reach)
+        # A geometric grid: cells are narrow near the last step, where the root usually is.
         powers = jnp.linspace(0.0, 1.0, _CELLS + 1, dtype=grown.dtype)
         factors = jnp.concatenate([(low**powers)[:0:-1], high**powers])
         return lax.stop_gradient(factors)
 
     def _choose(self, residual: Callable, hs: Array, scale: Scalar) -> tuple[Scalar, Array]:
-        """Of the candidates `hs`, the last step in the middle, the one nearest to a root by it.
-
-        Returns the root, or what the policy takes, and whether it is one.
-        """
+        """The root nearest to the last step, the middle one of `hs`, or the h of the policy; and
+        whether it is a root."""
         last = hs[_CELLS]
         fixed = lax.stop_gradient(hs)
+        # One candidate after the other: each may need a solve of its own, of another length.
         values = lax.stop_gradient(lax.map(residual, fixed))
+        # The energy does not depend on h beyond round-off: every h is a root.
         flat = jnp.all(jnp.abs(values) <= 8 * jnp.finfo(hs.dtype).eps * scale)
 
-        # Cell i is [hs[i], hs[i + 1]]; NaN, where (13) has no solution, is no change of sign.
+        # Cell i is [hs[i], hs[i + 1]]. NaN, where (13) has no solution, is not a change of sign.
         changes = (jnp.sign(values[:-1]) * jnp.sign(values[1:]) <= 0) & (jnp.diff(fixed) != 0)
         slopes = jnp.diff(values) / jnp.diff(fixed)
         crossing = fixed[:-1] - jnp.where(slopes == 0, 0, values[:-1] / slopes)
@@ -186,27 +190,28 @@ class Variational(StepSizes):
             wanted = ~flat & ~has_root
             h = jnp.where(wanted, _least(residual, hs, values, wanted), h)
         found = has_root | flat
+        # A step of NaN ends the run, also with a policy that would go on.
         lost = jnp.all(jnp.isnan(values)) | (~found & (self.on_no_root == "stop"))
         return jnp.where(lost, jnp.nan, h), found
 
 
 class LatticeCondition(eqx.Module):
-    r"""Observable: the condition number of the lattice equation (14) in h, on the step seen.
+    r"""Observable: the condition number of the lattice equation (14) in h, for each step.
 
         κ = (|E⁺| + |E⁻| + |εW·Δq|) / |h ∂(E⁺ − εW·Δq)/∂h|        along (12)–(13) from (q0, p0)
 
-    A relative error δ in the energies moves h by κδ of itself: at κ = 1e13 the sizes of steps that
-    `Variational` chooses have three digits in float64. Infinite where the energy has no slope, at
-    the folds beyond which there is no root.
+    A relative error δ in the energies changes h by the relative amount κδ: at κ = 1e13 the step
+    sizes of `Variational` have three digits in float64. Infinite where the energy has zero slope,
+    at the folds beyond which there is no root.
 
-    **Arguments** `system`, `epsilon`: those of the run, which tells them where they are left out.
+    **Arguments** `system`, `epsilon`: those of the run, which sets them where they are left out.
     """
 
     system: System | None = None
     epsilon: Any = 0.0
 
     def bind(self, system: System, epsilon: Any) -> "LatticeCondition":
-        """The same for this system and strength of the disturbance."""
+        """The same observable for this system and strength ε."""
         return LatticeCondition(system, epsilon)
 
     def __call__(
@@ -229,7 +234,7 @@ class LatticeCondition(eqx.Module):
 
 
 class _Energies(NamedTuple):
-    """E⁺, E⁻ and εW·Δq of one step, and the size of the terms that they are made of [energy]."""
+    """E⁺, E⁻ and εW·Δq of one step, and the sum of their magnitudes [energy]."""
 
     leaving: Scalar
     arriving: Scalar
@@ -242,7 +247,7 @@ class _Energies(NamedTuple):
 
 
 def _energies(equations: Equations, t: Scalar, h: Scalar, q: State, p: State) -> _Energies:
-    """Those of the step (12)–(13) of size h from (q, p) at t; NaN where it has no solution."""
+    """The energies of the step (12)–(13) of size h from (q, p) at t; NaN without a solution."""
     interval = Interval(t, t + h, h)
     q1, p1, info = step(equations, interval, q, p)
     p1 = jnp.where(info.result == RESULTS.successful, p1, jnp.nan)
@@ -253,7 +258,7 @@ def _energies(equations: Equations, t: Scalar, h: Scalar, q: State, p: State) ->
 
 
 def _least(residual: Callable, hs: Array, values: Array, wanted: Array) -> Scalar:
-    """The h with the smallest |residual| about the best of `hs`; an end of `hs` if that is it."""
+    """The h with the smallest |residual| near the best of `hs`; an end of `hs` if that is it."""
     fixed = lax.stop_gradient(hs)
     best = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, jnp.abs(values)))
     inside = wanted & (best > 0) & (best + 1 < hs.size)
@@ -262,6 +267,7 @@ def _least(residual: Callable, hs: Array, values: Array, wanted: Array) -> Scala
         a, b = fixed[jnp.maximum(best - 1, 0)], fixed[jnp.minimum(best + 1, hs.size - 1)]
         return jnp.where(inside, _golden_section(lambda h: jnp.abs(residual(h)), a, b), h), ()
 
+    # The derivative of a minimum is that of the root of the slope; of an end, that of the end.
     def stationary(h):
         return jnp.where(inside, jax.grad(residual)(h), h - hs[best])
 

@@ -27,17 +27,17 @@ class Adjoint(Method):
 
     @property
     def order(self) -> int:
-        """That of the method."""
+        """The order of the method."""
         return self.method.order
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the method is, which is then its own adjoint."""
+        """Whether the method is symmetric, and so its own adjoint."""
         return self.method.is_symmetric
 
     @property
     def is_symplectic(self) -> bool:
-        """Whether the method is."""
+        """Whether the method is symplectic."""
         return self.method.is_symplectic
 
     def substeps(self) -> tuple[float, ...]:
@@ -47,6 +47,8 @@ class Adjoint(Method):
         return self.method.is_made_of_the_map()
 
     def step(self, equations, interval, q0, p0):
+        # (Φ_{−h})⁻¹: the inverse of the step that goes from t1 to t0. H_D and W see the times in
+        # that order, which matters where they depend on them.
         return self.method.inverse(equations, interval.reversed(), q0, p0)
 
     def inverse(self, equations, interval, q1, p1):

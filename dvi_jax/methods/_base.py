@@ -1,7 +1,7 @@
-"""What every method is: a step, its inverse where there is one, and what is promised of it."""
+"""The base of all methods: a step, its inverse, and the properties that tests verify."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -14,12 +14,15 @@ from .._types import Args, Interval, State
 
 
 class Method(eqx.Module):
-    """Base of all methods. A final subclass names its order and properties and writes `step`."""
+    """Base of all methods. A subclass declares its order and properties and implements `step`."""
 
     order: eqx.AbstractVar[int]
     is_symmetric: eqx.AbstractVar[bool]
     is_symplectic: eqx.AbstractVar[bool]
     is_invertible: eqx.AbstractVar[bool]
+
+    is_the_map: ClassVar[bool] = False
+    """Whether `step` is the map (12)–(13) itself, whose only unknown is p1."""
 
     @abc.abstractmethod
     def step(
@@ -31,35 +34,35 @@ class Method(eqx.Module):
     def inverse(
         self, equations: Equations, interval: Interval, q1: State, p1: State
     ) -> tuple[State, State, StepInfo]:
-        """(q1, p1) at interval.t1 → (q0, p0) at interval.t0: what `step` came from."""
+        """(q1, p1) at interval.t1 → (q0, p0) at interval.t0: the state that `step` maps to it."""
 
     @abc.abstractmethod
     def needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
-        """Whether `step` is explicit for these equations; `Equations` has the parts to ask."""
+        """Whether `step` is explicit for these equations; see `Equations.step_is_explicit`."""
 
     @abc.abstractmethod
     def inverse_needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
-        """Whether `inverse` is."""
+        """Whether `inverse` is explicit for these equations."""
 
     def substeps(self) -> tuple[float, ...]:
-        """The fractions of a step over which its maps go; those below 0 go backwards in time."""
+        """The lengths of the substeps as fractions of h; negative ones go backwards in time."""
         return (1.0,)
 
     def is_made_of_the_map(self) -> bool:
-        """Whether a step is made of the map (12)–(13) and its adjoint alone."""
+        """Whether a step consists of the map (12)–(13) and its adjoint alone."""
         return False
 
     def is_explicit(self, system: System, q: State | None = None, args: Args = None) -> bool:
         """Whether a step of this method on `system` needs no solve; read from the jaxpr.
 
-        `q` is an example position (values do not matter, the shape does; two components if
-        left out), `args` example parameters for systems that need some.
+        `q` is an example position (only its shape matters; two components by default), `args`
+        example parameters for systems that need some.
         """
-        if q is None:
-            q = jnp.zeros(2)
+        q = jnp.zeros(2) if q is None else q
         scalar = jax.ShapeDtypeStruct((), q.dtype)
         found: list[bool] = []
 
+        # Traced, not evaluated: at zeros a potential may be singular, and nothing is compiled.
         def probe(t0, t1, q, epsilon):
             equations = Equations(system, epsilon, args)
             found.append(self.needs_no_solve(equations, Interval(t0, t1, t1), q))
@@ -76,9 +79,10 @@ class Method(eqx.Module):
 
 
 def check_invertible(name: str, method: Any) -> None:
-    """Refuse what is no method, or has no inverse step to make an adjoint of."""
+    """**Raises** `TypeError` for an object of another type, `ValueError` without an inverse step,
+    from which an adjoint is made."""
     instance(name, method, Method, "a method such as dvi.TypeII()")
     if not method.is_invertible:
         raise ValueError(
-            f"{method!r} has no inverse step, so it has no adjoint: take a variational method."
+            f"{method!r} has no inverse step, so it has no adjoint: use a variational method."
         )

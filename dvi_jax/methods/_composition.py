@@ -18,11 +18,11 @@ from ._base import Method, check_invertible
 from ._order_conditions import order_defects
 from ._type_ii import TypeII
 
+# The conditions of order n have 2^(n − 1) words: above order 12 the check takes longer than a run.
 _MOST_CHECKED = 12
-"""Highest order whose conditions are checked: 2^(order − 1) words of that degree."""
 
+# Coefficients that are printed to 12 digits should pass as well.
 _DEFECT = 1e-11
-"""Largest defect of an order condition that passes: coefficients printed to 12 digits do."""
 
 
 class CompositionMethod(Method):
@@ -30,17 +30,16 @@ class CompositionMethod(Method):
 
         Ψ_h = … ∘ Φ*_{c₄h} ∘ Φ_{c₃h} ∘ Φ*_{c₂h} ∘ Φ_{c₁h}        (c₁ acts first)
 
-    The inverse undoes the parts in the opposite order. Φ is any invertible method, forced and
-    implicit ones too; a part with negative c goes backwards in time.
+    The inverse undoes the substeps in the opposite order. Φ is any invertible method, forced and
+    implicit ones too; a substep with negative c goes backwards in time.
     """
 
     base: eqx.AbstractVar[Method]
 
-    orders: ClassVar[Sequence[int]] = ()
-    """Those that there are coefficients of, where they are in a table."""
     is_invertible: ClassVar[bool] = True
 
-    if TYPE_CHECKING:  # there the abstract variable would stay an argument of every subclass
+    # A type checker would require an abstract variable as an argument of every subclass.
+    if TYPE_CHECKING:
         is_symplectic: ClassVar[bool]
     else:
 
@@ -53,14 +52,6 @@ class CompositionMethod(Method):
         """c₁, c₂, …: the map takes the odd ones, its adjoint the even ones; they sum to 1."""
 
     def __check_init__(self):
-        if self.orders and self.order not in self.orders:
-            *most, last = self.orders
-            which = f"orders {', '.join(map(str, most))} and {last}" if most else f"order {last}"
-            raise ValueError(
-                f"{type(self).__name__} knows {which}, got {self.order!r}. For order 2 use "
-                "dvi.Strang(); for coefficients of your own, dvi.Composition(coefficients, "
-                "order=...)."
-            )
         check_invertible("base", self.base)
 
     def substeps(self) -> tuple[float, ...]:
@@ -72,13 +63,13 @@ class CompositionMethod(Method):
 
     @property
     def has_negative_substeps(self) -> bool:
-        """Whether some part goes backwards in time, where a dissipative force makes motion grow."""
+        """Whether a substep goes backwards in time, where a dissipative force increases motion."""
         return min(self.substeps()) < 0
 
     def step(self, equations, interval, q0, p0):
         def pair(state, parts):
-            """The map on the first part, then its adjoint on the second."""
             q, p, info = state
+            # The adjoint of a step is the inverse of the step with −h: no method writes it itself.
             q, p, first = self.base.step(equations, parts[0], q, p)
             q, p, second = self.base.inverse(equations, parts[1].reversed(), q, p)
             return q, p, info.then(first).then(second)
@@ -105,9 +96,11 @@ class CompositionMethod(Method):
         return _in_turn(pair, pairs[::-1])((q, p, info))
 
     def _parts(self, interval):
-        """The interval cut into pairs of parts, and the part that is left when they are odd."""
+        """The substeps in pairs, and the last one if their number is odd."""
         fractions = self.fractions()
+        # The last end is 1 by definition; the sum of the fractions is 1 only to round-off.
         ends = [0.0, *itertools.accumulate(fractions[:-1]), 1.0]
+        # h is c h, not a difference of ends, in which digits cancel: invariants would show it.
         parts = [
             interval.part(start, end)._replace(h=c * interval.h)
             for c, start, end in zip(fractions, ends[:-1], ends[1:], strict=True)
@@ -124,12 +117,10 @@ class CompositionMethod(Method):
 
 
 def _in_turn(body: Callable, pairs: list) -> Callable:
-    """state → state after `body` on each pair in turn, by a scan.
-
-    Written out, several pairs make a loop over steps that is too large to be compiled as one piece:
-    one trajectory of order 4 then takes five times as long (a batch a seventh less), and twice as
-    long to compile.
-    """
+    """state → state after `body` on each pair in turn."""
+    # By a scan: written out, several pairs make a loop over steps that is too large to be compiled
+    # as one piece. One trajectory of order 4 then takes five times as long (a batch a seventh
+    # less), and twice as long to compile.
     if len(pairs) == 1:
         return functools.partial(body, parts=pairs[0])
     if not pairs:
@@ -138,12 +129,9 @@ def _in_turn(body: Callable, pairs: list) -> Callable:
     return lambda state: lax.scan(lambda s, parts: (body(s, parts), None), state, stacked)[0]
 
 
-def of_strang(outer: Sequence[float]) -> tuple[float, ...]:
-    """The fractions of S_{γ₁h} ∘ … ∘ S_{γ_sh}, s odd and γ symmetric, S = `Strang`.
-
-    `outer` are γ₁, …, up to but not with the middle one, which makes the sum 1. Each S_{γh} is
-    the map and its adjoint, over γh/2 each.
-    """
+def of_strang(*outer: float) -> tuple[float, ...]:
+    """The fractions of S_{γ₁h} ∘ … ∘ S_{γ_sh}, S = `Strang`, from γ₁, … before the middle one."""
+    # Consistency (Σγ = 1) holds to the last digit if the middle one is computed, not printed.
     middle = 1.0 - 2.0 * math.fsum(outer)
     return tuple(c / 2 for c in (*outer, middle, *outer[::-1]) for _ in range(2))
 
@@ -153,20 +141,20 @@ def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
         return tuple(float(c) for c in values)
     except (TypeError, ValueError):
         raise TypeError(
-            f"the coefficients of a composition are a sequence of numbers, got {values!r}."
+            f"the coefficients of a composition must be a sequence of numbers, got {values!r}."
         ) from None
 
 
 class Composition(CompositionMethod):
-    r"""A composition of a map with its adjoint, with coefficients of the user's.
+    r"""A composition of a map with its adjoint, with coefficients that the user gives.
 
         Ψ_h = … ∘ Φ*_{c₄h} ∘ Φ_{c₃h} ∘ Φ*_{c₂h} ∘ Φ_{c₁h}        (c₁ acts first)
 
     **Arguments**
 
     - `coefficients`: c₁, c₂, … summing to 1; the map at odd places, its adjoint at even ones.
-    - `order`: the order that is claimed for them, at most 12; its conditions are checked, to
-      1e-11 of the terms that cancel.
+    - `order`: the order that they have, at most 12. The order conditions are checked, to 1e-11 of
+      the terms that cancel.
     - `base`: Φ, any method with an inverse; `TypeII` when left out. A base of higher order, or a
       symmetric one, has fewer conditions to meet.
 
@@ -175,8 +163,8 @@ class Composition(CompositionMethod):
 
     **Raises** `ValueError` when the coefficients are empty, not finite, or do not sum to 1 (to
     1e-12), when they do not have the order claimed (the order that they have is named), and for a
-    base without an inverse; `TypeError` for a base that is no method and
-    for coefficients that are no numbers.
+    base without an inverse; `TypeError` for a base that is not a method and for coefficients that
+    are not numbers.
 
     **Source** Hairer, Lubich & Wanner 2006, *Geometric Numerical Integration*, II.4 (4.6), V.3;
     the conditions: `order_defects`.
@@ -184,7 +172,7 @@ class Composition(CompositionMethod):
     **Example**
 
     ```python
-    mine = dvi.Composition((0.2, 0.3, 0.3, 0.2), order=2)    # in turn the adjoint and the map
+    mine = dvi.Composition((0.2, 0.3, 0.3, 0.2), order=2)    # the map and its adjoint alternate
     sol = dvi.integrate(systems.oscillator().system, [1.0], [0.0], h=0.1, num_steps=63, method=mine)
     print(mine.order, mine.is_symmetric)
     # 2 True
@@ -197,7 +185,7 @@ class Composition(CompositionMethod):
 
     def __check_init__(self):
         c, order, base = self.coefficients, self.order, self.base
-        check_invertible("base", base)
+        check_invertible("base", base)  # the defects below depend on the base
         if not c or not all(math.isfinite(x) for x in c) or abs(math.fsum(c) - 1) > 1e-12:
             raise ValueError(
                 "the coefficients of a composition must be finite and sum to 1 (consistency); "

@@ -12,8 +12,9 @@ from .._step import Equations
 from .._types import Interval, State
 from ._base import Method
 
+# Measured on a damped oscillator: from here on `Strang` with the same work is as accurate as the
+# triple jump. At 1 the map is singular.
 _STRONG = 0.3
-"""Damping over the longest part backwards from which on there is a warning."""
 
 
 def warn_of_dissipation(
@@ -23,29 +24,26 @@ def warn_of_dissipation(
     q0: State,
     p0: State,
 ) -> None:
-    r"""A warning when a part that goes backwards meets strong dissipation at the start.
+    r"""A warning when a substep that goes backwards in time meets strong dissipation at the start.
 
-    Over a part of length ch with c < 0 a force εW = −γp makes p grow, as 1/(1 + cγh), which is
-    infinite at −cγh = 1; the other parts take that back, but the errors grow with it. The warning
-    comes from −cγh = 0.3 on, where (measured on a damped oscillator) `Strang` with the same work is
-    as accurate as the triple jump, with γ the largest −∂(εW_i)/∂p_i at (q0, p0). Compositions of
-    `TypeII` of order above 2 all have such parts.
+    Over a substep ch with c < 0 a force εW = −γp amplifies p by 1/(1 + cγh), which is infinite at
+    −cγh = 1. The other substeps reverse that, but the errors grow with it. γ is the largest
+    −∂(εW_i)/∂p_i at (q0, p0). Compositions of `TypeII` of order above 2 all have such substeps.
 
-    All values known, not traced; the system has a force. One evaluation of a Jacobian, and none for
-    a method without negative parts.
+    All values must be known, not traced, and the system must have a force.
     """
     backwards = -min(method.substeps())
-    if backwards <= 0:
+    if backwards <= 0:  # without a substep backwards not even the Jacobian is evaluated
         return
     interval = first_interval()
     damping = float(_damping(equations, interval, q0, p0))
     growth = backwards * float(interval.h) * damping
     if growth > _STRONG and np.isfinite(growth):
         warnings.warn(
-            f"{type(method).__name__} goes backwards by {backwards:.2g} of a step, and over that "
-            f"the force damps (there: drives) by {growth:.3g} at the start, a rate of "
-            f"{damping:.3g} per unit of time. The map breaks down at 1, and from {_STRONG} on its "
-            "order is worth little: take a smaller h, or dvi.Strang(), which never goes "
+            f"{type(method).__name__} goes backwards by {backwards:.2g} of a step, where a damping "
+            f"force drives. At the start the damping rate is {damping:.3g} per unit of time, times "
+            f"that substep {growth:.3g}. The map is singular at 1, and above {_STRONG} no more "
+            "accurate than one of order 2: use a smaller h, or dvi.Strang(), which never goes "
             "backwards.",
             stacklevel=3,
         )

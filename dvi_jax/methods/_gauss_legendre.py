@@ -13,18 +13,15 @@ from .._step import judge
 from ..engine.newton import find_root
 from ._collocation import Collocation, continuous_rates, integrals
 
+# Order 16: the order conditions are tested up to there.
 _MOST_STAGES = 8
-"""Order 16: up to there the conditions of order are tested."""
 
 
 @functools.cache
 def _table(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    r"""Nodes c (s,), weights b (s,) and a (s, s), a_ij = ∫₀^{c_i} ℓ_j, in double precision.
-
-    x = 2c − 1 are the zeros of the Legendre polynomial P_s, so that the sum in `integrals`
-    telescopes in b_i a_ij + b_j a_ji = b_i b_j, the condition of symplecticity, which then holds
-    to round-off.
-    """
+    r"""Nodes c (s,), weights b (s,) and a (s, s), a_ij = ∫₀^{c_i} ℓ_j, in double precision."""
+    # x = 2c − 1 are the zeros of P_s. Therefore the sum in `integrals` telescopes in
+    # b_i a_ij + b_j a_ji = b_i b_j, the condition of symplecticity, which holds to round-off.
     x, weights = legendre.leggauss(stages)
     b = weights / 2
     return (x + 1) / 2, b, integrals(x, b, stages)
@@ -39,23 +36,24 @@ class GaussLegendre(Collocation):
         P_i = p0 + h Σ_j a_ij (−∂H/∂q + εW)(t_j, Q_j, P_j)
         q1 = q0 + h Σ_j b_j ∂H/∂p,    p1 = p0 + h Σ_j b_j (−∂H/∂q + εW)
 
-    The energy, a perturbation and the force are taken on the diagonal t0 = t1, as `RungeKutta4`
-    takes them; c, b, a are the nodes, weights and integrals of Gauss quadrature. One stage is the
-    implicit midpoint rule. Symmetric; without a force symplectic, and every quadratic invariant,
-    qᵀBp for instance, is kept to round-off. Without a force it is the type II variational map
-    (12)–(13) of another discrete Hamiltonian, the value that is stationary in P_i and V_i of
+    The energy, a perturbation and the force are evaluated on the diagonal t0 = t1, as in
+    `RungeKutta4`; c, b, a are the nodes, weights and integrals of Gauss quadrature. One stage is
+    the implicit midpoint rule. Symmetric; without a force symplectic, and every quadratic
+    invariant, qᵀBp for instance, is conserved to round-off. Without a force it is the type II
+    variational map (12)–(13) of another discrete Hamiltonian, the value that is stationary in P_i
+    and V_i of
 
         Σ_i b_i [H(t_i, Q_i, P_i) − (P_i − p1)·V_i],    Q_i = q0 + h Σ_j a_ij V_j
 
     Each step solves for all stages at once by `newton`, 2 s n real unknowns for q of n
-    components, separable or not: the price of a high order without parts backwards in time.
+    components, separable or not: the cost of a high order without substeps backwards in time.
 
     **Arguments**
 
     - `stages`: s, from 1 to 8.
 
-    **Raises** `ValueError` for any other number of stages. A solve that fails is told by the
-    status of the step.
+    **Raises** `ValueError` for any other number of stages. The status of the step reports a solve
+    that fails.
 
     **Accuracy** order 2s with a force too, which may depend on p and on time. The coefficients
     hold to round-off.
@@ -96,7 +94,10 @@ class GaussLegendre(Collocation):
         def residual(x):
             return x - advanced(a, x.reshape(all_at_start.shape)).ravel()
 
+        # One fixed-point sweep: for one more evaluation of the rates the guess is good to O(h²).
         guess = advanced(a, all_at_start)
+        # The accuracy of a solve is relative to the whole state, also where increments relative to
+        # an origin are solved for, as in compensated summation.
         known = jnp.broadcast_to(jnp.stack(equations.absolute(q0, p0)), all_at_start.shape)
         represented = jnp.maximum(jnp.abs(all_at_start), jnp.abs(guess)).ravel()
         x, info = find_root(residual, guess.ravel(), known.ravel(), equations.newton, represented)

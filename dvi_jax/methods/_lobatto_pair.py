@@ -15,11 +15,11 @@ from .._step import judge, no_solve
 from ..engine.newton import find_root
 from ._collocation import Collocation, continuous_rates, integrals
 
+# Order 10: the order conditions are tested up to there.
 _MOST_STAGES = 6
-"""Order 10: up to there the conditions of order are tested."""
 
+# Fixed-point sweeps before Newton's method. They save about one of its three iterations.
 _SWEEPS = 3
-"""Fixed-point sweeps before Newton's method: they save it about one iteration of three."""
 
 
 class _Table(NamedTuple):
@@ -40,8 +40,7 @@ def _table(stages: int) -> _Table:
 
         â_ij = b_j (1 − a_ji / b_i),
 
-    whose first column is b_1 and last column zero. The P_i lie on a polynomial of degree s − 2, so
-    the last follows from the others: P_s = Σ_{i<s} last_i P_i.
+    whose first column is b_1 and last column zero.
 
     **Source** Hairer & Wanner 1996, *Solving ODEs II*, IV.5; Hairer, Lubich & Wanner 2006, II.1.4.
     """
@@ -49,12 +48,17 @@ def _table(stages: int) -> _Table:
     top[-1] = 1  # P_{s−1}
     slope = legendre.legder(top)
     inner = legendre.legroots(slope)
+    # `legroots` has errors of some units of round-off; one Newton step removes them.
     inner = inner - legendre.legval(inner, slope) / legendre.legval(inner, legendre.legder(slope))
     x = np.array([-1.0, *inner, 1.0])
-    x = (x - x[::-1]) / 2  # the nodes are symmetric: so to the last digit
+    # Symmetric to the last digit, because the reversal of a step depends on it.
+    x = (x - x[::-1]) / 2
     b = 1 / (stages * (stages - 1) * legendre.legval(x, top) ** 2)
     a = integrals(x, b, stages - 1)
-    ratio = integrals(x, np.ones(stages), stages - 1)  # a_ij / b_j
+    # a_ij / b_j, not a divided by b: the division would round a second time.
+    ratio = integrals(x, np.ones(stages), stages - 1)
+    # The P_i lie on a polynomial of degree s − 2, so that P_s = Σ_{i<s} last_i P_i: one unknown
+    # less to solve for.
     known = x[:-1]
     apart = known[:, None] - known + np.eye(stages - 1)
     last = np.prod(1 - known + np.diag(known), axis=1) / np.prod(apart, axis=1)
@@ -70,11 +74,11 @@ class LobattoIIIAIIIB(Collocation):
         P_i = p0 + h Σ_j â_ij (−∂H/∂q + εW)(t_j, Q_j, P_j)
         q1 = q0 + h Σ_j b_j ∂H/∂p,    p1 = p0 + h Σ_j b_j (−∂H/∂q + εW)
 
-    The energy, a perturbation and the force are taken on the diagonal t0 = t1, as `GaussLegendre`
-    takes them; c, b and a are the nodes, weights and integrals of Lobatto quadrature (IIIA), and
-    â_{ij} = b_j (1 − a_{ji} / b_i) (IIIB). Q_1 = q0 and Q_s = q1. Symmetric; without a force
+    The energy, a perturbation and the force are evaluated on the diagonal t0 = t1, as in
+    `GaussLegendre`; c, b and a are the nodes, weights and integrals of Lobatto quadrature (IIIA),
+    and â_{ij} = b_j (1 − a_{ji} / b_i) (IIIB). Q_1 = q0 and Q_s = q1. Symmetric; without a force
     symplectic, and every invariant that is bilinear in q and p, angular momentum for instance, is
-    kept to round-off. Without a force it is the type II variational map (12)–(13) of another
+    conserved to round-off. Without a force it is the type II variational map (12)–(13) of another
     discrete Hamiltonian, the value that is stationary in P_i and V_i of
 
         Σ_i b_i [H(t_i, Q_i, P_i) − (P_i − p1)·V_i],    Q_i = q0 + h Σ_j a_ij V_j,
@@ -83,8 +87,8 @@ class LobattoIIIAIIIB(Collocation):
     variational integrator of that quadrature of ∫L dt.
 
     Two stages are the generalised leapfrog, Störmer–Verlet (kick, drift, kick) for a separable H:
-    the map of `Strang` wherever H_D and W take no t1, and `Strang` has the smaller solves. Between
-    the ends the pair does what a composition of high order does, without parts backwards in time.
+    the map of `Strang` wherever H_D and W do not depend on t1, and `Strang` has the smaller solves.
+    More stages give the order of a composition, without substeps backwards in time.
 
     Each step solves for the stages at once by Newton's method: (s − 1) n real unknowns for q of n
     components where q does not enter ∂H/∂p, a force in p and t included, and 2 (s − 1) n where it
@@ -95,8 +99,8 @@ class LobattoIIIAIIIB(Collocation):
 
     - `stages`: s, from 2 to 6.
 
-    **Raises** `ValueError` for any other number of stages. A solve that fails is told by the
-    status of the step.
+    **Raises** `ValueError` for any other number of stages. The status of the step reports a solve
+    that fails.
 
     **Accuracy** order 2s − 2 with a force too, which may depend on p and on time. The coefficients
     hold to round-off.
@@ -122,7 +126,8 @@ class LobattoIIIAIIIB(Collocation):
         b, a, a_hat, last = (jnp.asarray(part, q0.dtype) for part in table[1:])
         times = t0 + jnp.asarray(table.c, t0.dtype) * (t1 - t0)
         velocities, forces = map(jax.vmap, continuous_rates(equations, h))
-        momenta_suffice = equations.inverse_is_explicit(interval, q0)  # q is not in ∂H/∂p
+        # Where q does not enter ∂H/∂p the Q follow from the P, which halves the unknowns.
+        momenta_suffice = equations.inverse_is_explicit(interval, q0)
 
         def positions(Q, P):
             return q0[None] + h * jnp.tensordot(a, velocities(times, Q, P), 1)

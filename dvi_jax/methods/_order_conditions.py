@@ -38,6 +38,7 @@ def order_defects(
     if base_is_symmetric:
         letters = [k for k in letters if k % 2 == 1]
     words = _words(order, letters)
+    # The product of two series is a convolution: a word is cut in two at every place.
     product = {word: float(word == ()) for word in words}
     for c, sign in zip(coefficients, itertools.cycle((1, -1))):
         factor = {word: _in_exponential(word, c, sign) for word in words}
@@ -67,5 +68,6 @@ def _words(degree: int, letters: list[int]) -> list[Word]:
 
 def _in_exponential(word: Word, c: float, sign: int) -> float:
     """Coefficient of a word in exp(Σ_k sign^{k−1} c^k X_k)."""
+    # A word of n letters occurs once in the n-th power of the exponent, which is divided by n!.
     degree = sum(word)
     return sign ** (degree - len(word)) * c**degree / math.factorial(len(word))

@@ -1,4 +1,4 @@
-"""The classical Runge–Kutta method, the paper's foil."""
+"""The classical Runge–Kutta method, a non-symplectic reference method."""
 
 from typing import ClassVar
 
@@ -12,8 +12,8 @@ class RungeKutta4(Method):
 
         q̇ = ∂H/∂p,   ṗ = −∂H/∂q + εW     with H(t, q, p) = H_D(t, t, q, p)
 
-    Neither symplectic nor symmetric: the paper's foil (Figures 2 and 4). It has no inverse
-    in closed form, so it cannot be composed with its adjoint.
+    Neither symplectic nor symmetric: the paper's reference method (Figures 2 and 4). Its inverse
+    has no closed form, so it cannot be composed with its adjoint.
 
     **Source** Kutta 1901; Hairer, Nørsett & Wanner 1993, *Solving ODEs I*, table II.1.2.
     """
@@ -41,6 +41,7 @@ class RungeKutta4(Method):
         return q1, p1, judge(no_solve(q1), q1, p1)
 
     def inverse(self, equations, interval, q1, p1):
+        # Callers check `is_invertible` first; only code of a user gets here.
         raise TypeError(
             "RungeKutta4 has no inverse step in closed form, so it has no adjoint and no "
             "reversible gradient: use a variational method, or adjoint=dvi.Checkpointed()."

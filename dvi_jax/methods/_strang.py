@@ -12,9 +12,9 @@ from ._type_ii import TypeII
 class Strang(CompositionMethod):
     r"""The symmetric second-order composition Φ*_{h/2} ∘ Φ_{h/2}.
 
-    For a separable H_D this is velocity Verlet (kick–drift–kick); in general the map solves
-    for p and the adjoint for q. ``Strang(base=Adjoint())`` is the other way about, position Verlet
-    (drift–kick–drift): on planets its error in energy is half as large.
+    For a separable H_D this is velocity Verlet (kick–drift–kick); in general the map solves for p
+    and the adjoint for q. ``Strang(base=Adjoint())`` is the opposite order, position Verlet
+    (drift–kick–drift): on planetary orbits its energy error is half as large.
 
     **Arguments** `base`: Φ, any method with an inverse, here and in the other compositions.
 
