@@ -1,8 +1,10 @@
 """Checks of arguments: each returns the argument or raises an error that names what is allowed."""
 
+import difflib
+import inspect
 import math
 import numbers
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -71,6 +73,37 @@ def function(name: str, value: Any, arguments: str = "", hint: str = "") -> Call
         of = f" {arguments}" if arguments else ""
         raise TypeError(f"{name} must be a function{of}, got {value!r:.200}.{_more(hint)}")
     return value
+
+
+SYNONYMS = {
+    **dict.fromkeys(("dt", "dt0", "step", "step_size", "stepsize"), "h"),
+    **dict.fromkeys(("n_steps", "nsteps", "steps", "n", "N", "max_steps"), "num_steps"),
+    **dict.fromkeys(("eps", "strength"), "epsilon"),
+    **dict.fromkeys(("solver", "scheme", "stepper"), "method"),
+    **dict.fromkeys(("tf", "t_end", "t_final", "tmax", "t_span"), "t1"),
+    **dict.fromkeys(("parameters", "params", "p"), "args"),
+    **dict.fromkeys(("observables", "observable"), "observe"),
+    "saveat": "save",
+    "event": "stop",
+    "events": "stop",
+    "grid": "lattice",
+}
+"""Names of arguments in other packages → the name here."""
+
+
+def refuse_unknown(name: str, function: Callable[..., Any], unknown: Mapping[str, Any]) -> None:
+    """**Raises** `TypeError` for keywords that the function does not have, with the one meant."""
+    for keyword in unknown:
+        known = [
+            k for k, p in inspect.signature(function).parameters.items() if p.kind != p.VAR_KEYWORD
+        ]
+        close = difflib.get_close_matches(keyword, known, 1, 0.6)
+        meant = SYNONYMS.get(keyword) if SYNONYMS.get(keyword) in known else None
+        meant = meant or (close[0] if close else None)
+        hint = f" Did you mean {meant!r}?" if meant else f" It has {', '.join(known)}."
+        if keyword in ("rtol", "atol", "tolerance"):
+            hint = f" Steps are fixed: choose h; {keyword} has no meaning."
+        raise TypeError(f"{name} has no argument {keyword!r}.{hint}")
 
 
 def _is_number(value: Any) -> bool:

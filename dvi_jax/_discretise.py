@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._types import Args, HamiltonianFn, Scalar, State
-from .engine.signature import check_takes
+from .engine.signature import check_takes, warn_of_exchanged
 
 
 # A module and not a closure: `is_first_order` recognises it.
@@ -126,6 +126,7 @@ def discretise(H: Callable[..., Any], order: int = 1) -> HamiltonianFn:
     ```
     """
     check_takes("H", H, "(t, q, p, args)", {5: _DISCRETE})
+    warn_of_exchanged("H", H, "(t, q, p, args)")
     if isinstance(order, bool) or order not in (1, *_RULES):
         raise ValueError(
             f"discretise has order 1 (the paper's rule), 2, 3 and 4, got order={order!r}. For a "

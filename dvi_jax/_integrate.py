@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Never
 
 import equinox as eqx
 import jax
@@ -19,12 +19,13 @@ from lanewise.primitive import generates
 
 from ._adjoints import AbstractAdjoint
 from ._arithmetic import Arithmetic
-from ._checks import instance
+from ._checks import instance, refuse_unknown
 from ._dense import Curve, at_times, crossings, requested_times, stopped
 from ._inputs import as_parameter, as_scalar, start_state
 from ._integrator import Integrator, chosen
 from ._memory import results_memory
-from ._observables import check_observe, observed
+from ._observables import check_observe, observed, with_initial_values
+from ._progress import bar_of, told
 from ._results import RESULTS, IntegrationError, status_code, status_name
 from ._rollout import (
     Outcome,
@@ -40,14 +41,14 @@ from ._rollout import (
 )
 from ._solution import Save, Solution
 from ._step import Equations
-from ._system import System, check_system
+from ._system import System, check_system, of_problem
 from ._types import Interval
 from .engine.newton import RootSolver, over
 from .engine.reads import reads
 from .engine.rounding import each
 from .lattices import Lattice, Run
 from .methods import Method, warn_of_dissipation
-from .observe import RequestedTimes, Section, Stop
+from .observe import OfState, RequestedTimes, Section, Stop, is_observable, of_steps
 from .observe._kept import Start
 
 _PIECES = 100
@@ -55,16 +56,18 @@ _PIECES = 100
 
 
 def integrate(
-    system: System,
-    q0: Any,
-    p0: Any,
+    system: Any,
+    q0: Any = None,
+    p0: Any = None,
     *,
     h: Any = None,
     num_steps: int | None = None,
     t0: Any = 0.0,
-    epsilon: Any = 0.0,
+    t1: Any = None,
+    duration: Any = None,
+    epsilon: Any = None,
     args: PyTree = None,
-    method: Method | None = None,
+    method: Method | str | None = None,
     lattice: Lattice | None = None,
     save: Save = Save(),
     observe: PyTree = None,
@@ -76,7 +79,8 @@ def integrate(
     integrator: Integrator | None = None,
     stop: Stop | None = None,
     throw: bool = True,
-    progress: Callable[[int, int], None] | None = None,
+    progress: bool | Callable[[int, int], None] | None = None,
+    **unknown: Never,
 ) -> Solution:
     r"""One trajectory of a perturbed discrete Hamiltonian system.
 
@@ -86,22 +90,27 @@ def integrate(
 
     **Arguments**
 
-    - `system`: a `System`.
+    - `system`: a `System`; or a problem of the library, such as ``systems.kepler()``, which has
+      defaults for q0, p0, h and args.
     - `q0`, `p0`: initial conditions, real arrays of one shape (any: ``(n,)``, ``(bodies, 3)``).
     - `h`: step size [time], not 0; negative to integrate backwards. `num_steps`: number of steps;
-      static.
-    - `t0`: initial time. `epsilon`: strength of the perturbation.
+      static. In place of it, with equal steps: `t1`, the final time, or `duration`, t1 − t0; both
+      are multiples of h, and static.
+    - `t0`: initial time. `epsilon`: strength of the perturbation. A system with a force or a
+      perturbation needs it (0.0: the unperturbed motion).
     - `args`: pytree that H_D, W and the observables receive.
-    - `method`: `TypeII`, `Adjoint`, `Strang`, the compositions `Yoshida`, `Suzuki`, `BlanesMoan`,
-      `McLachlan`, `KahanLi`, `Composition`; `GaussLegendre`, `LobattoIIIAIIIB`; `RungeKutta4`.
+    - `method`: an object, or its name such as "strang" or "KahanLi8": `TypeII`, `Adjoint`,
+      `Strang`, the compositions `Yoshida`, `Suzuki`, `BlanesMoan`, `McLachlan`, `KahanLi`,
+      `Composition`; `GaussLegendre`, `LobattoIIIAIIIB`; `RungeKutta4`.
     - `lattice`: the time grid: `Uniform()`; `Given(ts)`, which replaces h, num_steps and t0;
       `TimeTransformed(g)`, with adaptive steps and h in its fictitious time; or `Variational()`,
       whose steps solve (14), and h is the first of them.
     - `save`: the states to save, see `Save`.
-    - `observe`: pytree of observables, functions of one step
-      ``(t0, t1, q0, p0, q1, p1, args)`` → array. A function is evaluated on the steps that end at
-      a save point; in `MaxDrift`, `Range`, `Trend`, `Mean`, `Last` it is reduced over every step
-      in constant memory. A `Section` finds the crossings of a surface.
+    - `observe`: pytree of observables → array: functions ``(q, p)`` or ``(t, q, p, args)`` of the
+      state, or ``(t0, t1, q0, p0, q1, p1, args)`` of a step. A function of the state is evaluated
+      at every saved state, one of a step on the steps that end at a saved state; in `MaxDrift`,
+      `Range`, `Trend`, `Mean`, `Last` it is reduced over every step in constant memory. A
+      `Section` finds the crossings of a surface.
     - `layout`: machine code or arrays, see `Layout`.
     - `stop`: a `Stop`, the condition of an early end (a collision, an escape); or None.
     - `adjoint`: the computation of reverse-mode gradients: `Reversible`, `Checkpointed`, `Direct`.
@@ -112,9 +121,9 @@ def integrate(
     - `integrator`: an `Integrator` in place of method, lattice, adjoint, newton, arithmetic and
       layout.
     - `throw`: raise an error if the trajectory fails; otherwise read ``solution.result``.
-    - `progress`: called as ``progress(steps_done, num_steps)`` at save points, at most about a
-      hundred times during the run. The numbers are the same, bit for bit. Not under jit, vmap or
-      grad.
+    - `progress`: True shows a progress bar. A function is called as
+      ``progress(steps_done, num_steps)`` at save points, at most about a hundred times during the
+      run. The numbers are the same, bit for bit. Not under jit, vmap or grad.
 
     h, t0, epsilon, args, q0, p0 and the times of `Given` are traced: they may be batched by
     `vmap` and differentiated by `grad` and `jvp`. The precision is that of q0 and p0.
@@ -143,6 +152,8 @@ def integrate(
     # 0.0633
     ```
     """
+    refuse_unknown("integrate", integrate, unknown)
+    system, q0, p0, h, args = of_problem(system, q0, p0, h, args)
     check_system(system)
     integrator = chosen(
         integrator, method=method, lattice=lattice, adjoint=adjoint, newton=newton,
@@ -150,15 +161,18 @@ def integrate(
     )  # fmt: skip
     # Here and not in `Integrator`: the default method depends on the system.
     method, lattice, layout = integrator.method_for(system), integrator.lattice, integrator.layout
-    instance("save", save, Save, "a dvi.Save(...)")
+    instance("save", save, Save, "a dvi.Save(...)", _save_hint(save))
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
     q0, p0 = start_state(q0, p0)
+    observe = of_steps(observe)
     # By the class, here and below: equinox takes 20 µs to make a bound method of a module.
     kind = type(lattice)
+    if t1 is not None or duration is not None:
+        num_steps = kind.steps_to(lattice, t0, h, num_steps, t1, duration)
     t0, h, num_steps = kind.prepare(lattice, t0, h, num_steps)
     t0 = as_scalar("t0", t0, q0.dtype)
     h = as_scalar("h", h, q0.dtype, zero_allowed=False)
-    epsilon = as_scalar("epsilon", epsilon, q0.dtype)
+    epsilon = as_scalar("epsilon", System.strength(system, epsilon), q0.dtype)
     args = jax.tree.map(as_parameter, args)
     # Before anything is compiled: an error in a function of the user would otherwise come from
     # within many frames of tracing.
@@ -182,17 +196,41 @@ def integrate(
         # `_as_solution` evaluates the method between their ends.
         observed = requested_times(asked.save, task, num_steps)
         task = dataclasses.replace(task, observe=observed)
-    if progress is None:
+    if progress is None or progress is False:
         solution = _whole(task, plan, asked.observe, q0, p0, integrator.adjoint, layout)
     elif traced:
         raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
     elif getattr(integrator.adjoint, "report_defect", False):
         raise ValueError("report_defect=True and progress exclude each other: leave one out.")
     else:
-        outcome = _in_pieces(task, plan, q0, p0, progress, layout)
+        with told(progress, _BAR) as report:
+            told_of = report if callable(progress) else lambda *done: report(done)
+            outcome = _in_pieces(task, plan, q0, p0, told_of, layout)
         solution = _solution(task, plan, asked.observe, outcome, q0, p0, layout)
     solution = undo(solution)
+    watched = jax.tree.leaves(observe, is_leaf=is_observable)
+    if save.ts is None and any(isinstance(f, OfState) for f in watched):
+        solution = _with_initial_values(solution, given, layout)
     return _raise_on_failure(solution, task) if throw else solution
+
+
+@eqx.filter_jit
+def _with_initial_values(solution: Solution, given: Run, layout: Layout) -> Solution:
+    values = with_initial_values(given.observe, solution.observed, given, layout)
+    return dataclasses.replace(solution, observed=values)
+
+
+_BAR = bar_of(
+    "integrate",
+    ("steps",),
+    lambda done: {"completed": done[0], "total": done[1], "steps": f"{done[0]} of {done[1]} steps"},
+)
+
+
+def _save_hint(save: Any) -> str:
+    if isinstance(save, int):
+        return f"Take dvi.Save(every={save})."
+    return "Take dvi.Save(final=True)." if save == "final" else ""
 
 
 def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[Task, Array, Array]:

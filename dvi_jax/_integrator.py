@@ -16,7 +16,7 @@ from .engine.names import both_names
 from .engine.newton import RootSolver
 from .engine.picard import PicardThenNewton
 from .lattices import Lattice, Uniform
-from .methods import Method, Strang, TypeII
+from .methods import Method, Strang, TypeII, as_method
 
 
 @both_names
@@ -50,7 +50,7 @@ class Integrator(eqx.Module):
     ```
     """
 
-    method: Method | None = None
+    method: Method | None = eqx.field(default=None, converter=as_method)
     root_finder: RootSolver = PicardThenNewton()
     lattice: Lattice = Uniform()
     arithmetic: Arithmetic = FloatingPoint()

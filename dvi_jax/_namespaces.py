@@ -1,5 +1,6 @@
 """Public names of `dvi_jax` that are imported when they are first used."""
 
+import difflib
 import importlib
 import sys
 from types import ModuleType
@@ -91,6 +92,27 @@ def names() -> list[str]:
     return sorted(n for n in {*known, *LAZY} - {*ALIASES} if not n.startswith("_"))
 
 
+_MEANT = {
+    "discretize": "discretise",
+    "Verlet": "StormerVerlet",
+    "VelocityVerlet": "StormerVerlet",
+    "odeint": "integrate",
+    "solve": "integrate",
+    "simulate": "integrate",
+    "diffeqsolve": "integrate",
+    "TimeGrid": "Uniform",
+}
+"""Names in other packages → the name here."""
+
+
+def _hint(name: str) -> str:
+    if name in _MEANT:
+        return f" Did you mean {_MEANT[name]!r}?"
+    known = {*names(), *ALIASES, *NAMESPACES}
+    close = difflib.get_close_matches(name, known, 1, 0.7)
+    return f" Did you mean {close[0]!r}?" if close else ""
+
+
 class Package(ModuleType):
     """Class of the module `dvi_jax`."""
 
@@ -102,7 +124,9 @@ class Package(ModuleType):
         elif name in LAZY:
             found = getattr(importlib.import_module(f"{self.__name__}.{LAZY[name]}"), name)
         else:
-            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}", name=name)
+            raise AttributeError(
+                f"module {self.__name__!r} has no attribute {name!r}.{_hint(name)}", name=name
+            )
         setattr(self, name, found)
         return found
 

@@ -8,11 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+import lanewise
+from lanewise import Layout
+
 from ._checks import function as check_function
 from ._rollout import Task
-from .observe import Deviations, Range, Reduction, Running, is_observable
-
-_STEP = "(t0, t1, q0, p0, q1, p1, args)"
+from .engine.signature import tracing_note
+from .lattices import Run
+from .observe import FORMS, Deviations, OfState, Range, Reduction, Running, is_observable
 
 
 def check_observe(task: Task, q0: Array, p0: Array) -> int:
@@ -23,12 +26,12 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
         if isinstance(leaf, type) and issubclass(leaf, Reduction | Running):
             raise TypeError(
                 f"observe holds the class {leaf.__name__}: make an object of it, as in "
-                f"dvi.MaxDrift(function) with a function {_STEP}, dvi.MEGNO() or "
+                f"dvi.MaxDrift(function) with a function of {FORMS}, dvi.MEGNO() or "
                 "dvi.Running(dvi.MEGNO())."
             )
         if not is_observable(leaf):
             raise TypeError(
-                f"observe must be a pytree of functions {_STEP} or "
+                f"observe must be a pytree of functions of {FORMS}, or of "
                 f"reductions such as dvi.MaxDrift(function); it holds {leaf!r}."
             )
         if isinstance(leaf, Running):
@@ -38,18 +41,18 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
             continue
         function = leaf.function if isinstance(leaf, Reduction) else leaf
         called = getattr(function, "__name__", type(function).__name__)
-        check_function(f"the argument of {type(leaf).__name__}", function, _STEP)
+        check_function(f"the argument of {type(leaf).__name__}", function, FORMS)
         t0, bound = task.t0, task.bound(function)
         try:
             out = eqx.filter_eval_shape(bound, t0, t0, q0, p0, q0, p0, task.args)
         except Exception as error:
             # The error itself stays: its type and traceback show the line of the user.
-            error.add_note(f"(in the observable {called}, called with {_STEP})")
+            error.add_note(f"(in the observable {called}, with the arguments {FORMS})")
+            error.add_note(tracing_note(called, error))
             raise
         if not hasattr(out, "shape") and not isinstance(out, int | float):
             raise TypeError(
-                f"an observable {_STEP} must return one array; "
-                f"{called} returned {type(out).__name__}."
+                f"an observable must return one array; {called} returned {type(out).__name__}."
             )
         if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
             raise TypeError(
@@ -84,3 +87,18 @@ def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
         return next(lone)
 
     return jax.tree.map(value, observe, is_leaf=is_observable)
+
+
+def with_initial_values(observe: PyTree, found: PyTree, run: Run, layout: Layout) -> PyTree:
+    """The values of functions of the state, with that at the initial state as their first row."""
+
+    def value(f, values):
+        if not isinstance(f, OfState):
+            return values
+        first = lanewise.call(
+            lambda t, q, p, args: jnp.asarray(f(t, t, q, p, q, p, args)),
+            run.t0, run.q0, run.p0, run.args, layout=layout,
+        )  # fmt: skip
+        return jnp.concatenate([first[None].astype(values.dtype), values])
+
+    return jax.tree.map(value, observe, found, is_leaf=is_observable)

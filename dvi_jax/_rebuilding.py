@@ -13,9 +13,18 @@ from jaxtyping import Array
 import lanewise
 
 from ._results import RESULTS
-from ._rollout import Plan, Saved, StepTaken, Task, adds_start_outside, piece_length
+from ._rollout import (
+    Plan,
+    Saved,
+    StepTaken,
+    Task,
+    adds_start_outside,
+    number_of,
+    piece_length,
+)
 from ._types import State
 from .engine.newton import Known, RootSolver
+from .observe import has_initial_value
 
 # Steps back between two updates of the sizes of the components, relative to which differences are
 # measured. An update in every step would take a noticeable part of the time of an explicit one.
@@ -193,7 +202,7 @@ def pull_back(
         for r, memory, c, value in zip(
             reductions, memories, cotangent.reduced, values, strict=True
         ):
-            of_t, of_value = r.pull(memory, c, k, t1, value)
+            of_t, of_value = r.pull(memory, c, number_of(r, k), t1, value)
             ct = ct + of_t
             seeds.append(of_value.astype(value.dtype))
         of_theta, cq, cp = pull(((cq, cp, ct), at_end, seeds))
@@ -279,7 +288,35 @@ def pull_back(
     k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
     (_, grad, cot), _ = lax.scan(block, (k, grad, cot), (starts, saved, rows), reverse=True)
     of_q, of_p = cot if of_start is None else map(jnp.add, cot, of_start)
-    return grad, of_q, of_p
+    return _through_initial(fixed, inputs, memories, cotangent.reduced, (grad, of_q, of_p))
+
+
+def _through_initial(fixed, inputs, memories, cotangents, sums) -> tuple[Any, Array, Array]:
+    """The cotangents, with those of the values of reductions at the initial state."""
+
+    def initial(theta, q0, p0):
+        task: Task = eqx.combine(theta, fixed)
+        t0 = task.first_interval().t0
+        taken = StepTaken(t0, t0, q0, p0, q0, p0)
+        _, reductions = task.observables()
+        known = [r for r in reductions if has_initial_value(r.function)]
+        return t0, [taken.number(task.bound(r.function), task.args) for r in known]
+
+    _, reductions = eqx.combine(inputs[0], fixed).observables()
+    of_state = [
+        (r, memory, c)
+        for r, memory, c in zip(reductions, memories, cotangents, strict=True)
+        if has_initial_value(r.function)
+    ]
+    if not of_state:
+        return sums
+    (t0, values), pull = jax.vjp(initial, *inputs)
+    ct, seeds = jnp.zeros_like(t0), []
+    for (r, memory, c), value in zip(of_state, values, strict=True):
+        of_t, of_value = r.pull(memory, c, jnp.asarray(0, jnp.int32), t0, value)
+        ct = ct + of_t
+        seeds.append(of_value.astype(value.dtype))
+    return jax.tree.map(jnp.add, sums, pull((ct, seeds)))
 
 
 def largest_divisor(n: int, most: int) -> int:

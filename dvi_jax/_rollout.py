@@ -20,7 +20,15 @@ from .engine.newton import no_residual, worse
 from .engine.reads import Reads
 from .lattices import Lattice, Place
 from .methods import Method
-from .observe import Deviations, Pushed, Reduction, Running, Stop, is_observable
+from .observe import (
+    Deviations,
+    Pushed,
+    Reduction,
+    Running,
+    Stop,
+    has_initial_value,
+    is_observable,
+)
 from .observe._kept import Start, as_row, event
 
 Loop = Callable[[Callable, Any, None, int], tuple[Any, Any]]
@@ -209,6 +217,15 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         like = eqx.filter_eval_shape(step.number, task.bound(reduction.function), task.args)
         return jnp.zeros(like.shape, like.dtype)
 
+    def memory(reduction):
+        """Before the first step: the value of a function of the state is known."""
+        begun = reduction.start(zero_value(reduction))
+        if not has_initial_value(reduction.function):
+            return begun
+        step = StepTaken(interval.t0, interval.t0, q0, p0, q0, p0)
+        value = step.number(task.bound(reduction.function), task.args)
+        return reduction.update(begun, jnp.asarray(0, jnp.int32), interval.t0, value)
+
     _, reductions = task.observables()
     failed = result != RESULTS.successful
     # A start that meets the condition of a Stop already has no step at all.
@@ -230,7 +247,7 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         failed_residual=no_residual(real),
         iterations=zero,
         residual=no_residual(real),
-        reductions=[r.start(zero_value(r)) for r in reductions],
+        reductions=[memory(r) for r in reductions],
         beside=task.arithmetic.start(q0, p0),
         stop=stop,
     )
@@ -320,9 +337,14 @@ def _reduced(
         return taken.number(task.bound(r.function), task.args)
 
     return [
-        r.update(so_far, carry.k, taken.t1, value(r, so_far))
+        r.update(so_far, number_of(r, carry.k), taken.t1, value(r, so_far))
         for r, so_far in zip(reductions, carry.reductions, strict=True)
     ]
+
+
+def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:
+    """Number of the value at the end of step k; number 0 is the initial state if it has one."""
+    return k + 1 if has_initial_value(reduction.function) else k
 
 
 def _pushed(push: Callable, vectors: Array, taken: StepTaken, h: Scalar) -> Pushed:

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -95,8 +97,9 @@ class Solution(eqx.Module):
       With ``Save(ts=...)`` the first time is like the others: `hs` and the values of functions in
       `observed` have shape (S, …), and belong to the shorter step that ends at each time (of size
       zero at t0).
-    - `observed`: the pytree given as `observe`; a function is replaced by its values on the steps
-      that ended at ``ts[1:]``, shape (S − 1, …), a reduction by one value over all steps.
+    - `observed`: the pytree given as `observe`; a function of the state is replaced by its values
+      at ``ts``, shape (S, …), one of a step by its values on the steps that ended at ``ts[1:]``,
+      shape (S − 1, …), a reduction by one value over all steps.
     - `result`: the status, one of `RESULTS`. From the failing step on states and observables are
       NaN.
     - `stop`: the end (t, q, p) of a run with a `Stop`, a `Stopped`, NaN if it did not stop; else
@@ -121,3 +124,60 @@ class Solution(eqx.Module):
     def status(self) -> Any:
         """The name of `result`, such as "successful"; an array of names for a batch."""
         return status_name(self.result)
+
+    @property
+    def t_final(self) -> Array:
+        """The last saved time, shape (*batch,)."""
+        return self.ts[..., -1]
+
+    @property
+    def q_final(self) -> Array:
+        """The last saved positions, shape (*batch, *q0.shape)."""
+        return jnp.take(self.qs, -1, axis=self.ts.ndim - 1)
+
+    @property
+    def p_final(self) -> Array:
+        """The last saved momenta, shape (*batch, *q0.shape)."""
+        return jnp.take(self.ps, -1, axis=self.ts.ndim - 1)
+
+    def __getattr__(self, name: str) -> Any:
+        # Called for names that do not exist only.
+        meant = _OTHER_NAMES.get(name)
+        hint = f" The {meant}." if meant else ""
+        raise AttributeError(f"a Solution has no attribute {name!r}.{hint}", name=name, obj=self)
+
+    def __repr__(self) -> str:
+        """Status, size and last state in words; the shapes under jit."""
+        if any(is_traced(x) for x in jax.tree.leaves((self.ts, self.qs, self.result))):
+            return f"Solution(ts={eqx.tree_pformat(self.ts)}, qs={eqx.tree_pformat(self.qs)}, …)"
+        *batch, saved = self.ts.shape
+        names = np.atleast_1d(np.asarray(self.status, dtype=str))
+        counts = {str(name): int((names == name).sum()) for name in np.unique(names)}
+        status = ", ".join(f"{n} {s}" for s, n in counts.items()) if batch else str(self.status)
+        many = f"{' × '.join(map(str, batch))} trajectories, " if batch else ""
+        shape = self.qs.shape[len(batch) + 1 :]
+        t = np.asarray(self.ts).reshape(-1, saved)[0]
+        lines = [
+            f"Solution: {many}{status}; {self.stats['num_steps']} steps, {saved} saved states of "
+            f"shape {shape}, t = {t[0]:g} … {t[-1]:g}"
+        ]
+        if not batch:
+            short = {"precision": 6, "threshold": 12, "separator": ", "}
+            lines.append(f"  q_final = {np.array2string(np.asarray(self.q_final), **short)}")
+            lines.append(f"  p_final = {np.array2string(np.asarray(self.p_final), **short)}")
+        if self.observed is not None:
+            lines.append(f"  observed = {eqx.tree_pformat(self.observed)}")
+        return "\n".join(lines)
+
+
+_OTHER_NAMES = {
+    **dict.fromkeys(
+        ("q", "x", "positions", "coordinates"), "positions are qs, the last ones q_final"
+    ),
+    **dict.fromkeys(("p", "v", "momenta"), "momenta are ps, the last ones p_final"),
+    **dict.fromkeys(("t", "times", "time"), "times are ts"),
+    **dict.fromkeys(("y", "ys", "states", "state"), "states are qs and ps"),
+    **dict.fromkeys(("success", "converged"), 'status is "successful" for a run without a failure'),
+    **dict.fromkeys(("observables", "observe"), "values of observables are observed"),
+}
+"""Names in other packages → where it is here."""

@@ -8,10 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ._checks import instance
+from ._checks import finite, instance
 from ._types import Args, ForceFn, HamiltonianFn, Scalar, State
+from .engine.indices import out_of_bounds
 from .engine.reads import Reads, changed, reads
-from .engine.signature import check_takes
+from .engine.signature import check_takes, tracing_note, warn_of_exchanged
 
 _NAMES = "(t0, t1, q0, p1, args)"
 _CONTINUOUS = "Make a discrete Hamiltonian of a continuous H(t, q, p, args) by dvi.discretise(H)."
@@ -33,6 +34,8 @@ class System(eqx.Module):
       ``epsilon * H1_D`` is added to H_D: a perturbation that derives from a Hamiltonian.
     - `slow_time`: if True all three functions receive the slow times ``epsilon * t0`` and
       ``epsilon * t1`` in place of t0 and t1.
+    - `epsilon`: strength of the perturbation in runs without ``epsilon=``. None: each run of a
+      system with a force, a perturbation or a slow time must give it. Systems of the library: 0.
 
     q0 and p1 are arrays of one shape, the one given to `integrate`. `args` is any pytree; its
     arrays and floats are differentiable.
@@ -42,6 +45,7 @@ class System(eqx.Module):
     system, or pass such values in `args`.
 
     **Raises** `TypeError` when a function is not callable or does not take the five arguments.
+    **Warns** when the names of the arguments suggest that p and q are exchanged.
 
     **Source** H_D: type II generating function S = p1·q0 + h H_D (Marsden & West 2001,
     *Discrete mechanics and variational integrators*; Leok & Zhang 2011). Perturbations: the paper,
@@ -62,6 +66,7 @@ class System(eqx.Module):
     force: ForceFn | None = None
     perturbation: HamiltonianFn | None = None
     slow_time: bool = eqx.field(static=True, default=False)
+    epsilon: float | None = eqx.field(static=True, default=None)
     reads: Reads = eqx.field(static=True, init=False, repr=False)
 
     def __post_init__(self):
@@ -77,7 +82,10 @@ class System(eqx.Module):
             function = getattr(self, name)
             if function is not None or name == "H_D":
                 check_takes(name, function, _NAMES, {4: _CONTINUOUS})
+                warn_of_exchanged(name, function, _NAMES)
         instance("slow_time", self.slow_time, bool, "True or False")
+        if self.epsilon is not None:
+            finite("epsilon of a System", self.epsilon)
         functions = (self.H_D, self.perturbation)
         if self.slow_time and any(getattr(f, "step_is_from_times", False) for f in functions):
             raise ValueError(
@@ -85,6 +93,26 @@ class System(eqx.Module):
                 "dvi.from_type_iii take the step from t1 − t0, which is not the step in a slow "
                 "time: use order=1, and compose the map for a higher order."
             )
+
+    def strength(self, epsilon: Any) -> Any:
+        """ε of a run: the one given, else the default of the system, else 0 for a system that does
+        not depend on it. **Raises** `ValueError` if a perturbed system has none."""
+        if epsilon is not None:
+            return epsilon
+        if self.epsilon is not None:
+            return self.epsilon
+        parts = {
+            "a force": self.force is not None,
+            "a perturbation": self.perturbation is not None,
+            "a slow time": self.slow_time,
+        }
+        if any(parts.values()):
+            has = " and ".join(name for name, is_there in parts.items() if is_there)
+            raise ValueError(
+                f"the system has {has}, and epsilon, its strength, is not given: pass epsilon=... "
+                "(epsilon=0.0 for the unperturbed motion, 1.0 if the strength is in the functions)."
+            )
+        return 0.0
 
     def hamiltonian(
         self, t0: Scalar, t1: Scalar, q0: State, p1: State, epsilon: Scalar, args: Args
@@ -146,6 +174,21 @@ def _read_by(system: System) -> Reads:
     return tuple(item for item in reads(*functions) if item[0] not in ignored)
 
 
+def of_problem(system: Any, q0: Any, p0: Any, h: Any, args: Any) -> tuple[Any, ...]:
+    """System, initial state, step and args of a call that may have a problem of the library, which
+    has defaults. **Raises** `TypeError` for a system without an initial state."""
+    if isinstance(getattr(system, "system", None), System):
+        problem, system = system, system.system
+        defaults = (("q0", q0), ("p0", p0), ("h", h), ("args", args))
+        q0, p0, h, args = (getattr(problem, n) if x is None else x for n, x in defaults)
+    elif isinstance(system, System) and (q0 is None or p0 is None):
+        raise TypeError(
+            f"the initial state is missing: {'q0' if q0 is None else 'p0'} is not given. Call "
+            "integrate(system, q0, p0, ...)."
+        )
+    return system, q0, p0, h, args
+
+
 def check_system(system: Any) -> None:
     """**Raises** `TypeError` for an object that is not a `System`, `ValueError` for a system whose
     functions read a value that has changed since it was made."""
@@ -191,10 +234,23 @@ def _traced_output(
     # Traced, not called: at a start in a singularity a value would be NaN, its shape is the same.
     before = reads(function)
     try:
-        out = eqx.filter_eval_shape(function, t, t, q, p, args)
+        traced, *out = eqx.filter_make_jaxpr(function)(t, t, q, p, args)
     except Exception as error:
         error.add_note(f"(in {name}{_NAMES}, called with q0 of shape {q.shape} and args={args!r})")
+        error.add_note(tracing_note(name, error))
+        if q.ndim > 1:
+            error.add_note(
+                f"{name} receives the whole q0. If its first axis is a batch of initial states, "
+                "write the function of one state and use jax.vmap."
+            )
         raise
+    # JAX moves such an index to the end of the array, so that the result would be wrong silently.
+    for index, size in out_of_bounds(traced):
+        raise IndexError(
+            f"{name}{_NAMES} uses the index {index}, which is out of bounds for an axis with "
+            f"{size} entries (q0 and p1 have shape {q.shape})."
+        )
+    out = eqx.combine(*out)
     after = reads(function)
     if after != before:  # such as a counter of calls
         marks = dict(before)

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
+
+from lanewise.jaxapi import ClosedJaxpr, Literal
 
 SMALL = 64
 """Entries of the largest array of indices that is followed."""
@@ -43,7 +44,7 @@ def out_of_bounds(traced: ClosedJaxpr) -> Iterator[tuple[int, int]]:
             sizes, shape = equation.params["slice_sizes"], equation.invars[0].aval.shape
             for start, size, length in zip(inputs[1:], sizes, shape, strict=True):
                 if start is not None and not 0 <= start <= length - size:
-                    yield int(start), length
+                    yield int(start if start >= 0 else start - length), length
         elif name == "gather" and inputs[1] is not None:
             axes = equation.params["dimension_numbers"].start_index_map
             shape = equation.invars[0].aval.shape

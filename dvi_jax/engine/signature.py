@@ -1,8 +1,11 @@
 """Checks of the number of arguments of a function."""
 
 import inspect
+import warnings
 from collections.abc import Callable
 from typing import Any
+
+import jax
 
 from .._checks import function as check_function
 
@@ -37,3 +40,47 @@ def check_takes(
 
 
 _WORDS = {4: "four", 5: "five"}
+
+
+def signature_of(function: Callable[..., Any]) -> str:
+    """Name and arguments of a function, for messages."""
+    name = getattr(function, "__name__", type(function).__name__)
+    try:
+        return f"{name}{inspect.signature(function)}"
+    except (TypeError, ValueError):
+        return name
+
+
+def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -> None:
+    """Warn if the names of the arguments suggest that the function takes p before q."""
+    try:
+        taken = list(inspect.signature(function).parameters)
+    except (TypeError, ValueError):
+        return
+    expected = arguments.strip("()").split(", ")
+    q, p = (next(i for i, x in enumerate(expected) if x[0] == letter) for letter in "qp")
+    if p < len(taken) and taken[q][:1].lower() == "p" and taken[p][:1].lower() == "q":
+        warnings.warn(
+            f"{name} has the arguments ({', '.join(taken)}), and is called with {arguments}: the "
+            "positions come before the momenta. Is the order of p and q wrong?",
+            stacklevel=5,
+        )
+
+
+def tracing_note(name: str, error: Exception) -> str:
+    """What to do about an error in a function of the user that JAX traces."""
+    if isinstance(error, jax.errors.TracerBoolConversionError):
+        return (
+            f"{name} is traced by JAX, so no number decides an if or a while: use "
+            "jnp.where(condition, a, b), jax.lax.cond or jax.lax.while_loop."
+        )
+    if isinstance(
+        error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError
+    ):
+        return (
+            f"{name} is traced by JAX: use jnp.cos, jnp.sqrt, … in place of np.cos, math.cos, "
+            "float() or int()."
+        )
+    if isinstance(error, TypeError) and "NoneType" in str(error):
+        return f"If {name} uses args: no args were given (args=None); pass args=..."
+    return f"{name} is traced by JAX: it must consist of functions of jax.numpy."

@@ -58,6 +58,13 @@ class Lattice(eqx.Module):
     def prepare(self, t0: Any, h: Any, num_steps: Any) -> tuple[Any, Any, int]:
         """(t0, h, num_steps) with defaults filled in. **Raises** for values that do not fit."""
 
+    def steps_to(self, t0: Any, h: Any, num_steps: Any, t1: Any, duration: Any) -> int:
+        """Number of steps to the time t1, or over a duration. **Raises** `ValueError`."""
+        raise ValueError(
+            f"t1 and duration need equal steps, and the lattice is {self!r}: give num_steps, or "
+            "use save=dvi.Save(ts=[t1])."
+        )
+
     @abc.abstractmethod
     def interval(self, t0: Scalar, h: Scalar, k: Int[Array, ""]) -> Interval:
         """The interval of step k = 0, 1, … (with a memory: of step 0)."""
@@ -107,6 +114,8 @@ class StepSizes(Lattice):
 
 def check_num_steps(num_steps: object) -> int:
     """`num_steps` as an int. **Raises** `TypeError` or `ValueError`."""
+    if isinstance(num_steps, float) and num_steps.is_integer():
+        num_steps = int(num_steps)
     try:
         count = None if isinstance(num_steps, bool) else operator.index(num_steps)  # pyright: ignore
     except Exception:  # JAX raises an error of its own for a traced number

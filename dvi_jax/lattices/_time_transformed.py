@@ -25,6 +25,7 @@ from ..observe import (
     Stop,
     Stopped,
     Trend,
+    has_initial_value,
     is_observable,
 )
 from ._base import Run
@@ -194,6 +195,10 @@ class _Seen(eqx.Module):
 
     function: Callable[..., Any]
     extended: Extended
+
+    @property
+    def is_of_state(self) -> bool:
+        return has_initial_value(self.function)
 
     def __call__(self, s0, s1, position0, momentum0, position1, momentum1, args):
         q0, p0, t0, _ = self.extended.parts(position0, momentum0)

@@ -1,5 +1,7 @@
 """Equal steps."""
 
+import math
+
 import jax.numpy as jnp
 
 from .._types import Interval
@@ -8,6 +10,33 @@ from ._base import StepSizes
 
 class Uniform(StepSizes):
     """The uniform time grid t_k = t0 + k h. h < 0 runs backwards in time."""
+
+    def steps_to(self, t0, h, num_steps, t1, duration):
+        given = {"num_steps": num_steps, "t1": t1, "duration": duration}
+        names = [name for name, value in given.items() if value is not None]
+        if len(names) > 1:
+            raise ValueError(f"{' and '.join(names)} are given: give one of them.")
+        try:
+            length = float(duration) if t1 is None else float(t1) - float(t0)
+            steps = length / float(h)
+        except TypeError:
+            raise TypeError(
+                f"{names[0]} needs numbers for t0, h and {names[0]} (they set array shapes), got "
+                f"t0={t0!r}, h={h!r}, {names[0]}={given[names[0]]!r}. Under jit give num_steps."
+            ) from None
+        count = round(steps) if math.isfinite(steps) else -1
+        if count < 0:
+            raise ValueError(
+                f"{names[0]}={given[names[0]]!r} is not reached from t0={t0!r} with h={h!r}: a "
+                "negative h runs backwards."
+            )
+        if abs(steps - count) > 1e-9 * max(1, count):
+            raise ValueError(
+                f"{names[0]}={given[names[0]]!r} is not a multiple of h={h!r} away from t0 "
+                f"({steps:.6g} steps, not a whole number). Use h={length / max(1, count)!r}, or "
+                "save=dvi.Save(ts=[...]) for a time between two steps."
+            )
+        return count
 
     def interval(self, t0, h, k):
         # From k, not as a running sum: times carry no accumulated round-off.

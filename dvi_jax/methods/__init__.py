@@ -6,6 +6,7 @@ from ._composition import Composition as Composition
 from ._dissipation import warn_of_dissipation as warn_of_dissipation
 from ._gauss_legendre import GaussLegendre as GaussLegendre
 from ._lobatto_pair import LobattoIIIAIIIB as LobattoIIIAIIIB
+from ._names import as_method as as_method
 from ._published import (
     BlanesMoan as BlanesMoan,
     KahanLi as KahanLi,

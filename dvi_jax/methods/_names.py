@@ -2,15 +2,18 @@
 
 import difflib
 import re
+from typing import Any
 
-from ._base import Method
 
-
-def method_named(text: str) -> Method:
+def as_method(given: Any) -> Any:
     """The method with a name: "strang", "leapfrog", "rk4", "KahanLi8", "yoshida(4)".
 
-    Capital letters, spaces, hyphens and underscores make no difference. **Raises** `ValueError`.
+    Capital letters, spaces, hyphens and underscores make no difference. What is not text is
+    returned. **Raises** `ValueError`.
     """
+    if not isinstance(given, str):
+        return given
+    text = given
     from .. import methods as m  # the package that this file is a part of
 
     plain = {
@@ -46,7 +49,7 @@ def method_named(text: str) -> Method:
     close = difflib.get_close_matches(key, known, 1, 0.5)
     meant = f" Did you mean {known[close[0]]!r}?" if close else ""
     raise ValueError(
-        f"method {text!r} is not known.{meant} Allowed are {', '.join(plain)}; and, with an order or "
-        f"a number of stages such as 'Yoshida4', {', '.join(with_number)}; and objects such as "
+        f"method {text!r} is not known.{meant} Allowed are {', '.join(plain)}; with an order or a "
+        f"number of stages, as in 'Yoshida4', {', '.join(with_number)}; and objects such as "
         "dvi.Strang()."
     )

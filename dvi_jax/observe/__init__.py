@@ -20,4 +20,10 @@ from ._reductions import (
     Trend as Trend,
     is_observable as is_observable,
 )
+from ._states import (
+    FORMS as FORMS,
+    OfState as OfState,
+    has_initial_value as has_initial_value,
+    of_steps as of_steps,
+)
 from ._stop import Stop as Stop, Stopped as Stopped

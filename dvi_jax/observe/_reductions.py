@@ -45,9 +45,12 @@ class Reduction(eqx.Module):
 
 
 class MaxDrift(Reduction):
-    """Largest distance from the first value: max_k |f_k − f_1|, elementwise.
+    """Largest distance from the first value, max_k |f_k − f_0|, elementwise.
 
-    `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
+    f_0 is the value at the initial state; for a function of a step, that on the first step.
+
+    - `function`: an observable, see `integrate`.
+    - `relative`: whether the distance is divided by |f_0|.
 
     **Example**
 
@@ -62,6 +65,7 @@ class MaxDrift(Reduction):
     """
 
     function: Callable[..., Any]
+    relative: bool = eqx.field(static=True, default=False)
 
     def start(self, value):
         return value, jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
@@ -75,12 +79,16 @@ class MaxDrift(Reduction):
         return first, jnp.where(larger, far, farthest), jnp.where(larger, k, at)
 
     def finish(self, memory):
-        return jnp.abs(memory[1])
+        first, farthest, _ = memory
+        return jnp.abs(farthest / first) if self.relative else jnp.abs(farthest)
 
     def pull(self, memory, cotangent, k, t, value):
-        _, farthest, at = memory
+        first, farthest, at = memory
         sign = jnp.sign(farthest)
         slope = jnp.where(k == at, sign, 0) - jnp.where(k == 0, sign, 0)
+        if self.relative:
+            of_first = jnp.abs(farthest) * jnp.sign(first) / first**2
+            slope = slope / jnp.abs(first) - jnp.where(k == 0, of_first, 0)
         return jnp.zeros_like(t), cotangent * slope
 
 

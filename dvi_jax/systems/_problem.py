@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
@@ -83,6 +83,8 @@ class Problem:
     exact_epsilon: float = 0.0
 
     def __post_init__(self):
+        if self.system.epsilon is None:  # what is known is known of the unperturbed motion
+            object.__setattr__(self, "system", replace(self.system, epsilon=0.0))
         known = set(self.args or ()) if isinstance(self.args, Mapping | None) else set()
         for what, names, allowed, of in (
             ("invariants", self.invariants, set(self.observables), "observables"),

@@ -1,0 +1,61 @@
+"""Observables of a state, (q, p) or (t, q, p, args), as functions of a step."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+from jaxtyping import PyTree
+
+from ..engine.signature import accepts, signature_of
+from ._reductions import Reduction, Running, is_observable
+
+FORMS = "(q, p), (t, q, p, args) or (t0, t1, q0, p0, q1, p1, args)"
+"""Arguments that an observable can have."""
+
+
+class OfState(eqx.Module):
+    """A function of the state at the end of a step. Such a function has a value at the initial
+    state, too."""
+
+    function: Callable[..., Any]
+    takes_time: bool = eqx.field(static=True)
+
+    def __call__(self, t0, t1, q0, p0, q1, p1, args):
+        return self.function(t1, q1, p1, args) if self.takes_time else self.function(q1, p1)
+
+    @property
+    def __name__(self) -> str:
+        return getattr(self.function, "__name__", type(self.function).__name__)
+
+
+def has_initial_value(function: Any) -> bool:
+    """Whether an observable is a function of the state, and not of a step."""
+    return isinstance(function, OfState) or getattr(function, "is_of_state", False)
+
+
+def of_steps(observe: PyTree) -> PyTree:
+    """The observables with those of a state as functions of a step.
+
+    **Raises** `TypeError` for a function with another number of arguments.
+    """
+    return jax.tree.map(_of_step, observe, is_leaf=is_observable)
+
+
+def _of_step(leaf: Any) -> Any:
+    if isinstance(leaf, Running):
+        return Running(_of_step(leaf.reduction))
+    if isinstance(leaf, Reduction):
+        function = getattr(leaf, "function", None)
+        converted = _of_step(function)
+        if converted is function or not isinstance(converted, OfState):
+            return leaf
+        return eqx.tree_at(lambda r: r.function, leaf, converted)
+    if not callable(leaf) or isinstance(leaf, type) or accepts(leaf, 7):
+        return leaf
+    for count in (4, 2):
+        if accepts(leaf, count):
+            return OfState(leaf, count == 4)
+    raise TypeError(
+        f"an observable must have the arguments {FORMS}; {signature_of(leaf)} has others."
+    )
