@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax import systems
+from dvi_jax import _namespaces, systems
 
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.S | re.M)
 
 EXAMPLES = {
-    name: BLOCK.findall(inspect.getdoc(thing) or "")
-    for name, thing in sorted(vars(dvi).items())
-    if not name.startswith("_") and (inspect.isclass(thing) or inspect.isfunction(thing))
+    name: BLOCK.findall(inspect.getdoc(getattr(dvi, name)) or "")
+    for name in _namespaces.names()
+    if inspect.isclass(getattr(dvi, name)) or inspect.isfunction(getattr(dvi, name))
 }
 EXAMPLES = {name: blocks for name, blocks in EXAMPLES.items() if blocks}
 

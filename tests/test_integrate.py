@@ -18,7 +18,7 @@ def H(t0, t1, q0, p1, args):
     return (jnp.sum(p1**2) + jnp.sum(q0**2)) / 2
 
 
-OSCILLATOR = dvi.System(H, force=lambda t0, t1, q0, p1, args: -q0)
+OSCILLATOR = dvi.System(H, force=lambda t0, t1, q0, p1, args: -q0, epsilon=0.0)
 NON_SEPARABLE = dvi.System(non_separable)
 START = ([0.3, 0.1], [0.4, -0.2])
 FINAL = dvi.Save(final=True)

@@ -1,0 +1,100 @@
+"""Observables of the state: (q, p) and (t, q, p, args), with their values at the initial state."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+
+SYSTEM = dvi.System(
+    lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - args * jnp.sum(jnp.cos(q0)),
+    force=lambda t0, t1, q0, p1, args: -p1,
+)
+REDUCTIONS = {
+    "MaxDrift": lambda f, t: np.abs(f - f[0]).max(),
+    "Range": lambda f, t: np.ptp(f),
+    "Mean": lambda f, t: f.mean(),
+    "Last": lambda f, t: f[-1],
+    "Trend": lambda f, t: np.polyfit(t, f, 1)[0],
+}
+
+
+def energy(q, p):
+    return p @ p / 2 - jnp.sum(jnp.cos(q))
+
+
+def run(q=1.0, mu=1.0, epsilon=0.1, **how):
+    how = {"h": 0.1, "num_steps": 12, **how}
+    return dvi.integrate(SYSTEM, [q], [0.3], epsilon=epsilon, args=mu, **how)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    sol = run()
+    return sol, np.asarray(jax.vmap(energy)(sol.qs, sol.ps))
+
+
+def test_reductions_begin_at_the_initial_state(plain):
+    sol, E = plain
+    observe = {name: getattr(dvi, name)(energy) for name in REDUCTIONS}
+    found = run(observe=observe | {"relative": dvi.MaxDrift(energy, relative=True)}).observed
+    for name, of in REDUCTIONS.items():
+        assert found[name] == pytest.approx(of(E, np.asarray(sol.ts)), rel=1e-12), name
+    assert found["relative"] == pytest.approx(np.abs(E / E[0] - 1).max(), rel=1e-12)
+    # Control: a function of a step has no value before the first step.
+    of_step = run(observe=dvi.MaxDrift(lambda t0, t1, q0, p0, q1, p1, args: energy(q1, p1)))
+    assert of_step.observed == pytest.approx(np.abs(E[1:] - E[1]).max(), rel=1e-12)
+    assert abs(of_step.observed / found["MaxDrift"] - 1) > 1e-3
+
+
+def test_values_have_a_row_for_each_saved_state(plain):
+    sol, E = plain
+    observe = {"E": energy, "t": lambda t, q, p, args: t * args, "step": lambda *step: step[1]}
+    found = run(observe=observe, mu=2.0).observed
+    assert found["E"].shape == found["t"].shape == (13,)
+    assert found["step"].shape == (12,)
+    np.testing.assert_allclose(found["t"], 2 * sol.ts, rtol=1e-15)
+    every = run(observe=energy, save=dvi.Save(every=4))
+    np.testing.assert_allclose(every.observed, E[::4], rtol=1e-14)
+    at_times = run(observe=energy, save=dvi.Save(ts=[0.1, 0.25]))
+    assert at_times.observed.shape == (2,)
+    batch = jax.vmap(lambda q: run(q, observe=energy).observed)(jnp.array([1.0, 0.5]))
+    np.testing.assert_allclose(batch[0], E, rtol=1e-14)
+
+
+def test_time_transformed_runs_have_them_too():
+    lattice = dvi.TimeTransformed(lambda t, q, p, args: 1 + q[0] ** 2)
+    observe = {"E": energy, "drift": dvi.MaxDrift(energy), "t": lambda t, q, p, args: t}
+    sol = run(lattice=lattice, observe=observe)
+    E = np.asarray(jax.vmap(energy)(sol.qs, sol.ps))
+    np.testing.assert_allclose(sol.observed["E"], E, rtol=1e-14)
+    np.testing.assert_allclose(sol.observed["t"], sol.ts, rtol=1e-14)
+    assert sol.observed["drift"] == pytest.approx(np.abs(E - E[0]).max(), rel=1e-12)
+
+
+def loss(x, adjoint):
+    observe = {name: getattr(dvi, name)(energy) for name in REDUCTIONS}
+    observe |= {"relative": dvi.MaxDrift(energy, relative=True), "E": energy}
+    found = run(x[0], x[1], x[2], observe=observe, adjoint=adjoint, throw=False).observed
+    return sum((i + 1) * jnp.sum(v) for i, v in enumerate(jax.tree.leaves(found)))
+
+
+def test_gradients_go_through_the_initial_value():
+    x = jnp.array([1.0, 1.2, 0.1])
+    forward = jax.jacfwd(loss)(x, dvi.Direct())
+    for adjoint in (dvi.Reversible(), dvi.Checkpointed()):
+        np.testing.assert_allclose(jax.grad(loss)(x, adjoint), forward, rtol=1e-10)
+    step = 1e-5 * jnp.eye(3)
+    differences = [(loss(x + d, dvi.Direct()) - loss(x - d, dvi.Direct())) / 2e-5 for d in step]
+    np.testing.assert_allclose(forward, differences, rtol=1e-7)
+
+
+def test_a_solution_reads_well():
+    text = repr(run(observe=energy))
+    assert "Solution: successful; 12 steps, 13 saved states of shape (1,), t = 0 … 1.2" in text
+    assert "q_final" in text
+    batch = jax.vmap(lambda q: run(q, throw=False))(jnp.array([1.0, 0.5]))
+    assert "2 trajectories, 2 successful" in repr(batch)
+    assert batch.q_final.shape == (2, 1)
+    assert batch.t_final.shape == (2,)
