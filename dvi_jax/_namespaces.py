@@ -4,6 +4,7 @@ import importlib
 import sys
 from types import ModuleType
 
+# Together they import matplotlib, pydantic and other libraries, which most programs do not need.
 NAMESPACES = {
     **{name: name for name in ("certify", "interop", "paper", "plot", "run", "systems", "testing")},
     # The functions `dvi.sweep` and `dvi.fit` have the names of their packages.
