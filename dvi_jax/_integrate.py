@@ -155,10 +155,9 @@ def integrate(
     refuse_unknown("integrate", integrate, unknown)
     system, q0, p0, h, args = of_problem(system, q0, p0, h, args)
     check_system(system)
-    integrator = chosen(
-        integrator, method=method, lattice=lattice, adjoint=adjoint, newton=newton,
-        root_finder=root_finder, arithmetic=arithmetic, layout=layout,
-    )  # fmt: skip
+    options = {"method": method, "lattice": lattice, "adjoint": adjoint, "newton": newton}
+    options |= {"root_finder": root_finder, "arithmetic": arithmetic, "layout": layout}
+    integrator = chosen(integrator, **options)
     # Here and not in `Integrator`: the default method depends on the system.
     method, lattice, layout = integrator.method_for(system), integrator.lattice, integrator.layout
     instance("save", save, Save, "a dvi.Save(...)", _save_hint(save))
@@ -371,11 +370,12 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
         arrays, rest = eqx.partition(solution, eqx.is_array)
         if not manual_axes(*jax.tree.leaves(arrays)):
             return result.error_if(solution, ~fine)
+
         # In jax.shard_map the branches of error_if differ in type: form it for one device.
-        checked = lanewise.call(
-            lambda result, arrays, fine: result.error_if(arrays, ~fine),
-            result, arrays, fine, layout=Layout(form="arrays"),
-        )  # fmt: skip
+        def check(result, arrays, fine):
+            return result.error_if(arrays, ~fine)
+
+        checked = lanewise.call(check, result, arrays, fine, layout=Layout(form="arrays"))
         return eqx.combine(checked, rest)
     if status_name(result) in ("successful", "stopped"):
         return solution

@@ -117,6 +117,7 @@ def chosen(integrator: Integrator | None, **given: Any) -> Integrator:
 def only(integrator: Integrator, function: str, *used: str) -> Integrator:
     """The integrator. **Raises** `ValueError` for a field that the function does not use and that
     differs from the default."""
+    # Otherwise an option without effect would be ignored without a word.
     for name in _FIELDS:
         value, default = getattr(integrator, name), getattr(_DEFAULT, name)
         if name not in used and not eqx.tree_equal(value, default):

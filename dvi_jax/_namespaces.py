@@ -5,6 +5,7 @@ import importlib
 import sys
 from types import ModuleType
 
+# Together they import matplotlib, pydantic and other libraries, which most programs do not need.
 NAMESPACES = {
     **{
         name: name

@@ -71,6 +71,7 @@ STATUS_NAMES = (
 
 def status_name(result: RESULTS) -> Any:
     """The short name of a status, or an array of names for a batch."""
+    # On the host: JAX has no arrays of strings.
     code = np.asarray(status_code(result))
     return STATUS_NAMES[int(code)] if code.ndim == 0 else np.array(STATUS_NAMES)[code]
 

@@ -14,7 +14,7 @@ from lanewise.dependence import depends_on
 from ._results import RESULTS, first_failure
 from ._system import System
 from ._types import Args, Interval, Scalar, State
-from .engine.newton import Known, Newton, RootInfo, RootSolver, find_root, no_residual, worse
+from .engine.newton import Found, Known, Newton, RootSolver, find_root, no_residual, worse
 from .engine.rounding import one_by_one
 
 
@@ -38,7 +38,7 @@ def no_step_yet(like: State) -> StepInfo:
     """The neutral element of `StepInfo.then`."""
     # A status that is an array, as in the carry of a scan; `RESULTS.successful` itself is static.
     good = RESULTS.where(jnp.asarray(True), RESULTS.successful, RESULTS.not_finite)
-    return StepInfo(good, *no_solve(like)[:2])
+    return StepInfo(good, *no_solve(like)[1:3])
 
 
 class Equations(eqx.Module):
@@ -163,15 +163,15 @@ def adjoint_step(
     return inverse_step(equations, interval.reversed(), q0, p0)
 
 
-def no_solve(like: State) -> RootInfo:
-    """The information on a solve where none is needed."""
-    real = jnp.finfo(like.dtype).dtype
-    return RootInfo(jnp.asarray(0, jnp.int32), no_residual(real), jnp.asarray(True))
+def no_solve(x: State) -> Found:
+    """The information on x where no solve is needed."""
+    real = jnp.finfo(x.dtype).dtype
+    return Found(x, jnp.asarray(0, jnp.int32), no_residual(real), jnp.asarray(True))
 
 
 def _solved(
     rate: Callable, h: Scalar, x0: State, guess: State, equations: Equations, known: State
-) -> tuple[State, RootInfo]:
+) -> tuple[State, Found]:
     """x1 = x0 + h rate(x1) near `guess`, which is x1 if `rate` does not depend on x1; `known` is x0
     with the origin, the scale of the accuracy."""
     if not depends_on(rate, 0, x0):
@@ -188,7 +188,7 @@ def _solved(
     return x1.reshape(x0.shape), info
 
 
-def judge(info: RootInfo, q: State, p: State, quantum: float | None = None) -> StepInfo:
+def judge(info: Found, q: State, p: State, quantum: float | None = None) -> StepInfo:
     """The status of a step, from its solve and from the state after it."""
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(p))
     result = RESULTS.where(info.converged, RESULTS.successful, RESULTS.not_converged)

@@ -39,6 +39,7 @@ class Interval(NamedTuple):
         return Interval(t0, t1, (end - start) * self.h)
 
 
+# A protocol, not a base class: an observable may be any object of the user with this method.
 @runtime_checkable
 class Bindable(Protocol):
     """An observable that requires the system and ε of the run."""

@@ -131,9 +131,11 @@ def test_map_is_symplectic_and_its_adjoint_undoes_it(order):
     assert np.max(np.abs(advance(there, 0.7, -0.2) - z)) > 1e-6  # it is not symmetric
 
 
-@pytest.mark.parametrize(("order", "flattening"), [(2, 0.0), (4, 0.0), (2, 0.01)])
+@pytest.mark.parametrize(
+    ("order", "flattening", "steps"), [(2, 0.0, 500), (4, 0.0, 500), (2, 0.01, 50)]
+)
 @pytest.mark.slow
-def test_angular_momentum_is_conserved_unless_the_body_is_flattened(order, flattening):
+def test_angular_momentum_is_conserved_unless_the_body_is_flattened(order, flattening, steps):
     def H(t, q, p, args):
         return kepler(t, q, p, args) + flattening * q[0] ** 2
 
@@ -142,7 +144,7 @@ def test_angular_momentum_is_conserved_unless_the_body_is_flattened(order, flatt
 
     system, how = dvi.System(dvi.discretise(H, order=order)), {"save": dvi.Save(final=True)}
     spread = dvi.integrate(
-        system, *CASES["kepler"][1:], h=0.1, num_steps=500, observe=dvi.Range(L), **how
+        system, *CASES["kepler"][1:], h=0.1, num_steps=steps, observe=dvi.Range(L), **how
     ).observed
     assert (spread > 1e-3) if flattening else (spread <= 1e-13)
 

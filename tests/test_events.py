@@ -333,7 +333,7 @@ def test_what_cannot_be_meant_is_refused():
         dvi.Save(ts=[0.1, 0.3, 0.2])
     with pytest.raises(ValueError, match="one-dimensional"):
         dvi.Save(ts=0.1)
-    with pytest.raises(ValueError, match="a clock needs times"):
+    with pytest.raises(ValueError, match="a clock requires times"):
         dvi.Save(clock=on_axis)
     with pytest.raises(TypeError, match="the clock of Save"):
         dvi.Save(ts=[0.1], clock=3)

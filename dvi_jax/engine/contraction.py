@@ -2,7 +2,6 @@
 
 import abc
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,14 +9,6 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .newton import Found, Function, RootSolver, Scales, Vector, check_settings, largest
-
-
-class _Verdict(NamedTuple):
-    """For each component: is it good, is it only round-off, and its estimated error."""
-
-    good: Bool[Array, " n"]
-    round_off: Bool[Array, " n"]
-    error: Float[Array, " n"]
 
 
 def _verdict(
@@ -28,8 +19,9 @@ def _verdict(
     iterations: Int[Array, ""],
     rtol: float | None,
     atol: float,
-) -> _Verdict:
-    """The verdict on x after some iterations from x0, from the last corrections δ_{k−1}, δ_k."""
+) -> tuple[Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]:
+    """For each component of x after some iterations from x0: is it good, is it only round-off, and
+    its estimated error, from the last corrections δ_{k−1}, δ_k."""
     eps = float(jnp.finfo(x.dtype).eps)
     before, last = corrections
     scale = jnp.maximum(scales.start, jnp.abs(x))
@@ -49,7 +41,7 @@ def _verdict(
     # A small component that is coupled to large ones inherits their round-off. It never settles
     # relative to its own size, and is good once it no longer shrinks.
     round_off = last <= 64 * eps * scale + 4 * eps * largest(scale)
-    return _Verdict(settled | at_rest | (round_off & (last >= before)), round_off, error)
+    return settled | at_rest | (round_off & (last >= before)), round_off, error
 
 
 def contract(

@@ -193,14 +193,6 @@ class Known(eqx.Module):
     solver: RootSolver = Newton()
 
 
-class RootInfo(NamedTuple):
-    """A `Found` without x."""
-
-    iterations: Int[Array, ""]
-    residual: Float[Array, "2"]
-    converged: Bool[Array, ""]
-
-
 class _Iterate(NamedTuple):
     """The state of Newton's loop; `error` is as `Found.residual`."""
 
@@ -217,7 +209,7 @@ def find_root(
     known: Vector,
     solver: RootSolver | Known,
     start: Vector | None = None,
-) -> tuple[Vector, RootInfo]:
+) -> tuple[Vector, Found]:
     """Root x of function(x) = 0 near `guess`, and how it was found.
 
     The derivative of x with respect to values that `function` closes over is that of the implicit
@@ -237,7 +229,7 @@ def find_root(
         return x, how
 
     root, how = lanewise.implicit_root(function, guess, solve, used.solve_tangent)
-    return root, RootInfo(*how)
+    return root, Found(root, *how)
 
 
 def value_and_jacobian(F: Function, x: Vector) -> tuple[Vector, Array]:

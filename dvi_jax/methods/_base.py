@@ -44,6 +44,7 @@ class Method(eqx.Module):
     def inverse_needs_no_solve(self, equations: Equations, interval: Interval, q: State) -> bool:
         """Whether `inverse` is explicit for these equations."""
 
+    # Known without equations: a warning about substeps backwards comes before anything is compiled.
     def substeps(self) -> tuple[float, ...]:
         """The lengths of the substeps as fractions of h; negative ones go backwards in time."""
         return (1.0,)
