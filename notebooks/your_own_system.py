@@ -26,8 +26,8 @@ jax.config.update("jax_enable_x64", True)
 # ## Hamiltonian, force, observables
 #
 # `H(t, q, p, args)` is the usual Hamiltonian; `dvi.discretise` converts it to a discrete
-# Hamiltonian $H_D(t_0, t_1, q_0, p_1)$. A force has the same arguments; an observable receives the
-# states at both ends of a step. `args` contains the parameters.
+# Hamiltonian $H_D(t_0, t_1, q_0, p_1)$. A force has the same arguments. An observable is a function of
+# $(q, p)$ or of $(t, q, p, args)$. `args` contains the parameters.
 
 
 # %%
@@ -41,12 +41,8 @@ def drag(t0, t1, q0, p1, args):
     return -p1
 
 
-def energy(t0, t1, q0, p0, q1, p1, args):
-    return H(t1, q1, p1, args)
-
-
-def angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    return p1[1]
+def angular_momentum(q, p):
+    return p[1]
 
 
 system = dvi.System(dvi.discretise(H), force=drag)
@@ -57,7 +53,7 @@ q0, p0 = [1.4, 1.0], [0.0, 1.0]
 def run(h=0.01, num_steps=1000, epsilon=0.0, args=args, method=dvi.Strang()):
     return dvi.integrate(
         system, q0, p0, h=h, num_steps=num_steps, epsilon=epsilon, args=args, method=method,
-        observe={"energy": energy, "angular momentum": angular_momentum},
+        observe={"energy": H, "angular momentum": angular_momentum},
     )  # fmt: skip
 
 
@@ -70,7 +66,7 @@ with plot.style():
     for sol, name in ((free, "ε = 0"), (damped, "ε = 0.3")):
         r, theta = np.asarray(sol.qs).T
         left.plot(r * np.sin(theta), -r * np.cos(theta), lw=0.8, label=name)
-        right.plot(sol.ts[1:], sol.observed["energy"], lw=1.2, label=name)
+        right.plot(sol.ts, sol.observed["energy"], lw=1.2, label=name)
     left.plot(0, 0, "k+")
     left.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="Path of the weight")
     right.set(xlabel="time [s]", ylabel="energy [J]", title="Energy")
@@ -125,7 +121,7 @@ for g in (0.0, 9.81):
     print(f"g = {g}: angular momentum changes by {np.ptp(momentum):.1e}")
     assert (np.ptp(momentum) < 1e-12) == (g == 0.0)
 
-early, late = np.split(np.asarray(run(num_steps=20_000).observed["energy"]), 2)
+early, late = np.array_split(np.asarray(run(num_steps=20_000).observed["energy"]), 2)
 finer = np.asarray(run(h=0.005, num_steps=40_000).observed["energy"])
 bands = [np.ptp(early), np.ptp(late), np.ptp(finer)]
 print("range of the energy: first half {:.4f}, second half {:.4f}; with h/2 {:.4f}".format(*bands))
@@ -140,10 +136,32 @@ assert abs(np.log2(bands[1] / bands[2]) - 2) < 0.3
 # %%
 r, p_r, p_t = damped.qs[:, 0], damped.ps[:, 0], damped.ps[:, 1]
 power = 0.3 * (p_r**2 + (p_t / r) ** 2) / args["m"]
-lost = float(H(0.0, damped.qs[0], damped.ps[0], args) - damped.observed["energy"][-1])
+lost = float(damped.observed["energy"][0] - damped.observed["energy"][-1])
 work = float(np.trapezoid(power, damped.ts))
 print(f"energy lost {lost:.3f} J, work of the drag {work:.3f} J")
 assert abs(lost / work - 1) < 2e-3
+
+# %% [markdown]
+# ## Forces that depend on the velocity
+#
+# A force law is often given for the velocity, for example quadratic drag $F = -|v|\, v$.
+# `dvi.velocity_force` converts it to a function of $(q, p)$ by $v = \partial H_D / \partial p$. In
+# these coordinates $v = (\dot r, \dot\theta)$, and the force on $\theta$ is a torque.
+
+
+# %%
+def quadratic_drag(t0, t1, q0, v, args):
+    speed = jnp.sqrt(v[0] ** 2 + (q0[0] * v[1]) ** 2)
+    return -speed * v * jnp.array([1.0, q0[0] ** 2])
+
+
+H_D = dvi.discretise(H)
+with_drag = dvi.System(H_D, force=dvi.velocity_force(H_D, quadratic_drag))
+sol = dvi.integrate(
+    with_drag, q0, p0, h=0.01, num_steps=1000, epsilon=0.1, args=args, method="strang", observe=H
+)
+print(f"energy: {sol.observed[0]:.2f} J at the beginning, {sol.observed[-1]:.2f} J at the end")
+assert sol.observed[-1] < sol.observed[0]
 
 # %% [markdown]
 # ## Gradients
