@@ -40,7 +40,7 @@ def minus_q(t0, t1, q0, p1, args):
 
 
 h, N = 0.1, 10_000
-free = dvi.System(oscillator, force=minus_q)
+free = dvi.System(oscillator, force=minus_q, epsilon=0.0)
 start = {"q0": [0.01], "p0": [0.01], "h": h, "num_steps": N}
 sol, rk4 = dvi.integrate(free, **start), dvi.integrate(free, **start, method=dvi.RungeKutta4())
 q, p = np.asarray(sol.qs)[:, 0], np.asarray(sol.ps)[:, 0]

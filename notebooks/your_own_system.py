@@ -173,8 +173,8 @@ assert sol.observed[-1] < sol.observed[0]
 # %%
 def height(k):
     sol = dvi.integrate(
-        system, q0, p0, h=0.01, num_steps=50, args=args | {"k": k}, method=dvi.Strang(),
-        save=dvi.Save(final=True),
+        system, q0, p0, h=0.01, num_steps=50, epsilon=0.0, args=args | {"k": k},
+        method=dvi.Strang(), save=dvi.Save(final=True),
     )  # fmt: skip
     return -sol.qs[-1, 0] * jnp.cos(sol.qs[-1, 1])
 
@@ -195,7 +195,7 @@ assert abs(slope / differences - 1) < 1e-6
 # solution even here, but it is not accurate.
 
 # %%
-too_long = {"h": 0.5, "num_steps": 20, "args": args, "throw": False}
+too_long = {"h": 0.5, "num_steps": 20, "epsilon": 0.0, "args": args, "throw": False}
 thrown = [0.1, 1.0], [-3.0, 2.0]
 sol = dvi.integrate(system, *thrown, method=dvi.GaussLegendre(2), **too_long)
 print(sol.status, "at step", int(sol.stats["failed_step"]))
