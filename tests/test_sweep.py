@@ -17,8 +17,8 @@ from dvi_jax import starts
 from dvi_jax.sweep import _sweep
 from dvi_jax.sweep.cost import span
 from dvi_jax.sweep.plan import Plan, make_plan
-from dvi_jax.sweep.sinks import Memory
 from dvi_jax.sweep.starts import _radical_inverse
+from dvi_jax.sweep.store import Memory
 
 
 def hamiltonian(t0, t1, q0, p1, args):
