@@ -1,6 +1,7 @@
 """What a store knows of its sweep: every difference that changes numbers, and no other."""
 
 import errno
+import inspect
 
 import equinox as eqx
 import jax
@@ -10,10 +11,11 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax.sweep import claims, layout
-from dvi_jax.sweep._sweep import make_sweep, prepare
+from dvi_jax.sweep._sweep import prepare
 from dvi_jax.sweep.identity import description, differences, digest
 
 Q = np.asarray([0.5])
+DEFAULTS = {name: p.default for name, p in inspect.signature(dvi.sweep).parameters.items()}
 
 
 def oscillator(k=1.0):
@@ -22,9 +24,8 @@ def oscillator(k=1.0):
 
 def identity(system=None, q0=Q, p0=Q, **kw):
     kw = {"h": 0.1, "num_steps": 5, "t0": [0.0, 1.0], "save": dvi.Save(final=True)} | kw
-    made = make_sweep(system or oscillator(), q0, p0, **kw)
-    program, found, programs = prepare(made, None)
-    return description(made, program.plan, found, programs)
+    program, found, programs = prepare(system or oscillator(), q0, p0, DEFAULTS | kw)
+    return description(program.sweep, program.plan, found, programs)
 
 
 class Spring(eqx.Module):

@@ -1,4 +1,4 @@
-"""Functions that pass keywords on to another one, which need not repeat them."""
+"""Keywords that a function passes on to another one, and need not repeat one by one."""
 
 import functools
 import inspect
@@ -6,6 +6,14 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+INTEGRATOR = "method lattice newton arithmetic layout integrator"
+"""Keywords of functions that run trajectories which `chosen` turns into one `Integrator`."""
+
+
+def taken(keywords: dict[str, Any], names: str) -> dict[str, Any]:
+    """Remove these keywords, separated by blanks, from those of a call, and return them."""
+    return {name: keywords.pop(name) for name in names.split()}
 
 
 def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -> Callable[[F], F]:
@@ -27,14 +35,15 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -
 
     def decorate(function: F) -> F:
         signature = inspect.signature(function)
-        *own, _ = signature.parameters.values()
+        *own, _ = signature.parameters.values()  # without **keywords
         passed = [p for p in listed if p.name not in signature.parameters]
         defaults = {p.name: p.default for p in passed}
-        allowed = {*defaults, *(p.name for p in own)}
+        shown = sorted([*passed, *own], key=lambda p: p.kind)
 
         @functools.wraps(function)
         def call(*args: Any, **given: Any) -> Any:
-            if unknown := [name for name in given if name not in allowed]:
+            known = call.__dict__["__signature__"].parameters
+            if unknown := [name for name in given if name not in known]:
                 raise TypeError(
                     f"{function.__name__}() got an unexpected keyword argument {unknown[0]!r}"
                 )
@@ -45,7 +54,7 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -
                 )
             return function(*args, **given)
 
-        call.__dict__["__signature__"] = signature.replace(parameters=[*own, *passed])
+        call.__dict__["__signature__"] = signature.replace(parameters=shown)
         return call  # pyright: ignore[reportReturnType]
 
     return decorate

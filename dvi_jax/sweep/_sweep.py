@@ -15,7 +15,7 @@ from .._integrate import integrate
 from .._integrator import chosen
 from .._memory import machine_memory
 from .._system import System, check_system
-from ..engine.keywords import with_keywords_of
+from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
 from ..engine.names import both_names
 from ..lattices import Given, Lattice
 from ..methods import Method
@@ -37,10 +37,6 @@ _SHARE = 0.5
 _MANY_STARTS = 100_000
 """Number of initial conditions up to which they are written into the result."""
 
-_OF_INTEGRATE = (
-    "h num_steps t0 epsilon args method lattice observe newton arithmetic layout integrator stop"
-)
-
 
 class SweepInterrupted(KeyboardInterrupt):
     """Ctrl-C during a sweep. `result` has the finished tasks, as has the store if there is one."""
@@ -51,7 +47,9 @@ class SweepInterrupted(KeyboardInterrupt):
 
 
 @both_names
-@with_keywords_of(integrate, _OF_INTEGRATE, start=None, save=None)
+@with_keywords_of(
+    integrate, f"h num_steps t0 epsilon args {INTEGRATOR} observe stop", start=None, save=None
+)
 def sweep(
     system: System,
     q0: Any = None,
@@ -204,16 +202,13 @@ def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
             "nothing to store: pass observe={...}, or save=dvi.Save(final=True) to store the final "
             "states."
         )
-    method, start = given["method"], given["start"]
-    varied = is_axis(method) or isinstance(method, list | tuple)
-    integrator = chosen(
-        given["integrator"],
-        method=None if varied else method,
-        root_finder=given["newton"],
-        **{name: given[name] for name in ("lattice", "arithmetic", "layout")},
-    )
-    # Not "method", which has another meaning in xarray's sel.
+    start, of_integrator = given["start"], taken(dict(given), INTEGRATOR)
+    method = of_integrator["method"]
+    if varied := is_axis(method) or isinstance(method, list | tuple):
+        of_integrator["method"] = None
+    integrator = chosen(**of_integrator)
     method = method if varied else integrator.method_for(system)
+    # Not "method", which has another meaning in xarray's sel.
     method = _static("method", "integrator", method, Method, "a dvi.Method")
     steps = given["num_steps"]
     num_steps = _static("num_steps", "num_steps", steps, int | np.integer, "a whole number")
