@@ -11,7 +11,7 @@ from jaxtyping import Array
 from lanewise.jaxapi import is_traced
 
 from .._checks import positive
-from .frequencies import Frequencies, Raw, analyse, check_count, settings_of, signals_of
+from .frequencies import Frequencies, analyse, check_count, settings_of, signals_of
 from .lines import EPS
 from .results import CODE, FREQUENCY_RESULTS, WITHOUT_NUMBERS, WithStatus, raise_on_failure
 from .torus import FundamentalFrequencies, gathered, search_of, tori_of
@@ -120,14 +120,15 @@ def actions(
     search = search_of(signal.shape[-2], num, guess, order, None, 1e-3)
     signal, scales, size = _balanced(signal)
     lines, raw = analyse(ts, signal, settings, eps, 1)
-    raw = Raw(*map(np.asarray, raw))  # pyright: ignore[reportArgumentType]
-    omega, A = np.asarray(lines.frequencies), np.asarray(lines.amplitudes)
-    resolution = np.asarray(lines.resolution)
-    tori, codes = tori_of(omega, A, raw.code, resolution, search, soft=False)
+    omega, A, resolution, every_A, code = map(
+        np.asarray,
+        (lines.frequencies, lines.amplitudes, lines.resolution, raw.amplitudes, raw.code),
+    )
+    tori, codes = tori_of(omega, A, code, resolution, search, soft=False)
 
     n = omega.shape[-2]
     power = np.where(np.isfinite(omega), np.abs(A) ** 2, 0.0).reshape(len(tori), n, count)
-    in_doubt = np.abs(raw.amplitudes.reshape(power.shape)) ** 2
+    in_doubt = np.abs(every_A.reshape(power.shape)) ** 2
     in_doubt = np.where(power > 0, 0.0, np.where(np.isfinite(in_doubt), in_doubt, 0.0))
     size = np.asarray(size).reshape(len(tori), n)
     left = np.nan_to_num(np.asarray(lines.residual)).reshape(len(tori), n) ** 2

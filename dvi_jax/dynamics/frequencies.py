@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from .._checks import one_of, whole
 from .._precision import refuse_double_without_x64
 from .._solution import Solution
 from ..engine.quantities import refuse_unit_or_mask
-from .lines import EPS, Settings, lines_of
+from .lines import EPS, Lines, Settings, lines_of
 from .results import (
     CODE,
     FREQUENCY_RESULTS,
@@ -190,40 +190,19 @@ def frequency_diffusion(
     times = times.reshape(2, *(1,) * (halves.ndim - times.ndim), *times.shape[1:])
     check_count(settings, halves)
     _, raw = analyse(times, halves, settings, eps)
-    first = raw.frequencies[0, ..., 0]
+    omega, first = raw.s, raw.s[0, ..., 0]
     size = jnp.abs(raw.amplitudes)
     strong = size[1] >= 0.5 * size[0, ..., :1]
-    away = jnp.where(strong, jnp.abs(raw.frequencies[1] - first[..., None]), jnp.inf)
+    away = jnp.where(strong, jnp.abs(omega[1] - first[..., None]), jnp.inf)
     best = jnp.argmin(away, axis=-1)[..., None]
     best = jnp.where(jnp.any(strong, axis=-1)[..., None], best, 0)
-    second = jnp.take_along_axis(raw.frequencies[1], best, axis=-1)[..., 0]
+    second = jnp.take_along_axis(omega[1], best, axis=-1)[..., 0]
     rate = jnp.log10(jnp.maximum(jnp.abs((second - first) / first), EPS))
     code = jnp.where(raw.code < len(WITHOUT_NUMBERS) + 1, raw.code, 0)
     code = jnp.where(code[0] != 0, code[0], code[1])
     first, second, rate = (jnp.where(code == 0, x, jnp.nan) for x in (first, second, rate))
     of = FrequencyDiffusion(first, second, rate, with_code(code))
     return raise_on_failure(of) if throw else of
-
-
-class Signals(NamedTuple):
-    """Times (…, N) and signals (*batch, *state, N) in double precision.
-
-    `eps`: relative spacing of the floating point numbers in which the times were given;
-    `state_axes`: number of axes before the last that belong to one trajectory.
-    """
-
-    ts: Array
-    signal: Array
-    eps: float
-    state_axes: int
-
-
-class Raw(NamedTuple):
-    """All lines, also the unresolved ones, and the codes of the statuses."""
-
-    frequencies: Array
-    amplitudes: Array
-    code: Array
 
 
 def settings_of(count: Any, window: Any, refine: Any) -> Settings:
@@ -244,8 +223,10 @@ def check_count(settings: Settings, signal: Array) -> None:
         )
 
 
-def signals_of(ts: Any, signal: Any) -> Signals:
-    """Times and signals, checked; the signals of a `Solution` are q − i p."""
+def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
+    """Times (…, N) and signals (*batch, *state, N) in double precision; the relative spacing of the
+    floating point numbers in which the times were given; the number of axes of the state. The
+    signals of a `Solution` are q − i p."""
     state_axes = None
     if isinstance(ts, Solution) == (signal is not None):
         raise ValueError(
@@ -287,7 +268,7 @@ def signals_of(ts: Any, signal: Any) -> Signals:
                 f"the longest {steps.max():.17g}. Save with dvi.Save(every=m) on the lattice "
                 f"dvi.Uniform(), without final=True.{coarse}"
             )
-    return Signals(ts, signal, eps, min(signal.ndim - 1, 1) if state_axes is None else state_axes)
+    return ts, signal, eps, min(signal.ndim - 1, 1) if state_axes is None else state_axes
 
 
 def _real_times(name: str, value: Any) -> Array:
@@ -339,8 +320,8 @@ def _unevenness(ts: Array, eps: Any) -> Array:
 
 def analyse(
     ts: Array, signal: Array, settings: Settings, eps: float = EPS, state_axes: int = 0
-) -> tuple[Frequencies, Raw]:
-    """The lines of every signal: the resolved ones, and all."""
+) -> tuple[Frequencies, Lines]:
+    """The resolved lines of every signal; and all lines, with frequencies in place of s."""
     lead, N = signal.shape[:-1], signal.shape[-1]
     flat = (math.prod(lead), N)  # so that all shapes of a batch share one program
     ts = jnp.broadcast_to(ts, signal.shape).reshape(flat)
@@ -350,8 +331,10 @@ def analyse(
 
 
 @eqx.filter_jit
-def _analysed(ts: Array, signal: Array, settings: Settings, eps: Array) -> tuple[Frequencies, Raw]:
-    """Of signals (M, N) at times (M, N)."""
+def _analysed(
+    ts: Array, signal: Array, settings: Settings, eps: Array
+) -> tuple[Frequencies, Lines]:
+    """`analyse` for signals (M, N) at times (M, N)."""
     h, centre, _ = _lattice(ts)
     N = signal.shape[-1]
     lines = jax.vmap(lambda z: lines_of(z, settings))(signal)
@@ -366,7 +349,6 @@ def _analysed(ts: Array, signal: Array, settings: Settings, eps: Array) -> tuple
     if not jnp.iscomplexobj(signal):
         back = (h < 0)[..., None]  # Re A e^{iωt} = Re Ā e^{−iωt}
         omega, A = jnp.where(back, -omega, omega), 2 * jnp.where(back, jnp.conj(A), A)
-    raw = Raw(omega, A, code)
     hard = (code > 0) & (code <= len(WITHOUT_NUMBERS))
     sure = lines.sure & ~hard[..., None]
     found = Frequencies(
@@ -378,4 +360,4 @@ def _analysed(ts: Array, signal: Array, settings: Settings, eps: Array) -> tuple
         result=with_code(code),
         is_real=not jnp.iscomplexobj(signal),
     )
-    return found, raw
+    return found, lines._replace(s=omega, amplitudes=A, code=code)

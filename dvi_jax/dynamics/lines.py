@@ -1,5 +1,6 @@
 """The lines of one signal: maxima of its windowed transform, and least squares of all of them."""
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -74,10 +75,8 @@ def _grid(N: int, window: int) -> _Grid:
 
 def _hann(window: int) -> np.ndarray:
     """Fourier coefficients of (1 + cos πu)^window over their mean, from −window to window."""
-    coefficients = np.array([1.0])
-    for _ in range(2 * window):
-        coefficients = np.convolve(coefficients, [1.0, 1.0])
-    return coefficients / coefficients[window]
+    binomials = np.array([math.comb(2 * window, k) for k in range(2 * window + 1)], float)
+    return binomials / binomials[window]
 
 
 def _moments(grid: _Grid, weighted: Array, s: Array) -> Array:

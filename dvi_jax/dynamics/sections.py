@@ -91,17 +91,22 @@ class _Settings(eqx.Module):
 
 
 def _settings(
-    system: System, section: Section, num_steps: Any, keywords: dict[str, Any], warn: bool = True
+    system: System,
+    section: Section,
+    num_steps: Any,
+    keywords: dict[str, Any],
+    level: int | None = 5,
 ) -> _Settings:
+    """`level`: of the user's frame, for a warning; None: no warning."""
     integrator = chosen(**taken(keywords, INTEGRATOR))
     has_default = integrator.method is None and not isinstance(default_method(system), Strang)
-    if warn and has_default:
+    if has_default and level is not None:
         warnings.warn(
             "sections used Strang() by default, and now use the default of integrate, which is "
             "TypeII() for this system. Give method=: dvi.Strang() for the results of earlier "
             "versions, dvi.TypeII() for the map of H_D itself.",
             FutureWarning,
-            stacklevel=5,  # the line of the user, for functions and for `ReturnMap`
+            stacklevel=level,
         )
     num_steps = whole("num_steps", num_steps)
     return _Settings(system, section, integrator, keywords.pop("stop", None), num_steps)
@@ -324,19 +329,19 @@ class ReturnMap(eqx.Module):
 
     def __check_init__(self):
         check_system(self.system)
-        self._settings(warn=True)
+        self._settings(6)
 
-    def _settings(self, warn: bool) -> _Settings:
+    def _settings(self, level: int | None) -> _Settings:
         section = Section(self.g, self.direction, whole("returns", self.returns))
         given = dict.fromkeys(INTEGRATOR.split()) | {
             name: getattr(self, name) for name in ("method", "newton", "integrator")
         }
-        return _settings(self.system, section, self.num_steps, given, warn)
+        return _settings(self.system, section, self.num_steps, given, level)
 
     def __call__(
         self, q: Any, p: Any, t0: Any = 0.0, epsilon: Any = 0.0, args: Args = None
     ) -> Return:
-        sol = self._settings(warn=False).run((t0, q, p), self.h, epsilon, args)
+        sol = self._settings(None).run((t0, q, p), self.h, epsilon, args)
         crossed: Any = sol.observed
         result = judge(crossed.count, self.returns, sol.result)
         return Return(crossed.ts[-1], crossed.qs[-1], crossed.ps[-1], result)

@@ -19,7 +19,7 @@ from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
 from ..engine.names import both_names
 from ..lattices import Given, Lattice
 from ..methods import Method
-from .axes import Axis, as_axis, is_axis, leaves_with_axes, lengths
+from .axes import Axis, as_axis, axes_in, is_axis, lengths
 from .bar import shown
 from .cost import SweepCost, cost
 from .identity import description, digest, provenance
@@ -129,7 +129,14 @@ def sweep(
             raise ValueError("threads are those of this process: leave them out with a client.")
     config = description(made, program.plan, found, programs)
     if store is None:
-        _check_memory(program.plan.lanes * sum(v.bytes for v in found.values()))
+        needed = program.plan.lanes * sum(v.bytes for v in found.values())
+        there = machine_memory() or 8 * 2**30
+        if needed > _SHARE * there:
+            raise ValueError(
+                f"the results need {needed / 2**30:.1f} GiB of memory, and this machine has "
+                f"{there / 2**30:.1f} GiB: give store=..., a directory; then only one task at a "
+                "time is in memory."
+            )
         sink = Memory(program.plan, found)
         about |= {"config": json.dumps(config), "config_sha256": digest(config)}
     else:
@@ -148,7 +155,7 @@ def sweep(
         done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
         where = "; they are the `result` of this exception."
         if store is not None:
-            where = f" and stored in {result.path}; the same call goes on from there."
+            where = f" and kept in {result.path}; the same call goes on from there."
         raise SweepInterrupted(f"interrupted: {done}{where}", result)
     return result
 
@@ -203,21 +210,19 @@ def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
             "states."
         )
     start, of_integrator = given["start"], taken(dict(given), INTEGRATOR)
-    method = of_integrator["method"]
-    if varied := is_axis(method) or isinstance(method, list | tuple):
-        of_integrator["method"] = None
-    integrator = chosen(**of_integrator)
-    method = method if varied else integrator.method_for(system)
-    # Not "method", which has another meaning in xarray's sel.
-    method = _static("method", "integrator", method, Method, "a dvi.Method")
-    steps = given["num_steps"]
-    num_steps = _static("num_steps", "num_steps", steps, int | np.integer, "a whole number")
+    # The name of the axis is not "method", which has another meaning in xarray's sel.
+    method = _as_axis_of_list("integrator", of_integrator.pop("method"))
+    num_steps = _as_axis_of_list("num_steps", given["num_steps"])
+    integrator = chosen(**of_integrator, method=None if is_axis(method) else method)
+    for x in method.values if is_axis(method) else ():
+        instance(f"each value of the axis {method.name!r} of method", x, Method, "a dvi.Method")
+    method = method if is_axis(method) else integrator.method_for(system)
     compiled = [
         (x.name, len(x), where)
         for where, x in (("method", method), ("num_steps", num_steps))
         if is_axis(x)
     ]
-    axes = [*compiled, *((x.axis.name, len(x.axis), x.name) for x in leaves_with_axes(inputs))]
+    axes = [*compiled, *((x.name, len(x), where) for where, x in axes_in(inputs))]
     if start is not None:
         Axis(start.name, [0])  # raises for a name that is not an identifier
         if start.name in (name for name, *_ in axes):
@@ -249,9 +254,9 @@ def _states(q0: Any, p0: Any, start: Any) -> dict[str, Any]:
 
 
 def _check_dims(dims: Mapping[str, int]) -> None:
-    if taken := [name for name in dims if name in RESERVED]:
+    if bad := [name for name in dims if name in RESERVED]:
         raise ValueError(
-            f"the axis {taken[0]!r} has a reserved name ({', '.join(RESERVED)}): rename it."
+            f"the axis {bad[0]!r} has a name that is reserved ({', '.join(RESERVED)}): rename it."
         )
     if not dims:
         raise ValueError(
@@ -279,13 +284,8 @@ def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) ->
             whole("num_steps", n)
 
 
-def _static(of: str, name: str, value: Any, kind: Any, called: str) -> Any:
-    """One value, or an axis of values each of which is compiled."""
-    if isinstance(value, list | tuple):
-        value = Axis(name, value)
-    for x in value.values if is_axis(value) else ():
-        instance(f"each value of the axis {value.name!r} of {of}", x, kind, called)
-    return value
+def _as_axis_of_list(name: str, value: Any) -> Any:
+    return Axis(name, value) if isinstance(value, list | tuple) else value
 
 
 def coordinates_of(made: Sweep) -> dict[str, Any]:
@@ -298,8 +298,8 @@ def coordinates_of(made: Sweep) -> dict[str, Any]:
         along[made.method.name]["method"] = names, ""
     if is_axis(made.num_steps):
         along[made.num_steps.name]["num_steps"] = np.asarray(made.num_steps.values), "steps"
-    for leaf in leaves_with_axes(made.inputs):
-        along[leaf.axis.name][leaf.name] = leaf.axis.values, leaf.axis.units
+    for where, axis in axes_in(made.inputs):
+        along[axis.name][where] = axis.values, axis.units
     for dim, arguments in along.items():
         rows = [name for name, (values, _) in arguments.items() if values.ndim == 1]
         main = dim if dim in rows else rows[0] if len(rows) == 1 else None
@@ -316,13 +316,3 @@ def coordinates_of(made: Sweep) -> dict[str, Any]:
         for name, x in zip(("q0", "p0"), map(np.asarray, states), strict=True):
             found[name] = ((start.name, *own_dims("component", x.shape[1:])), x, {})
     return found
-
-
-def _check_memory(needed: int) -> None:
-    there = machine_memory() or 8 * 2**30
-    if needed > _SHARE * there:
-        raise ValueError(
-            f"the results need {needed / 2**30:.1f} GiB of memory, and this machine has "
-            f"{there / 2**30:.1f} GiB: give store=..., a directory, of which one task at a time is "
-            "in memory."
-        )

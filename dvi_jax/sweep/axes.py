@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -81,13 +81,6 @@ def _check(of: str, values: np.ndarray) -> None:
         raise ValueError(f"{of} contains {values[where]} at index {list(where)}.")
 
 
-class Leaf(NamedTuple):
-    """One argument that an axis replaces: its name and the axis."""
-
-    name: str
-    axis: Axis
-
-
 def is_axis(x: Any) -> bool:
     return isinstance(x, Axis)
 
@@ -105,7 +98,7 @@ def as_axis(name: str, value: Any) -> Any:
     return Axis(name, value)
 
 
-def leaves_with_axes(arguments: Mapping[str, Any]) -> list[Leaf]:
+def axes_in(arguments: Mapping[str, Any]) -> list[tuple[str, Axis]]:
     """Every axis in the arguments with the name of its place: ``epsilon``, ``args.K``, ``q0.1``."""
     found = []
     for name, argument in arguments.items():
@@ -117,7 +110,7 @@ def leaves_with_axes(arguments: Mapping[str, Any]) -> list[Leaf]:
                 seen = type(axis.values[0]).__name__
                 raise TypeError(f"{where} takes numbers, but its axis {axis.name!r} holds {seen}.")
             refuse_double_without_x64(f"the axis {axis.name!r}", axis.values.dtype)
-            found.append(Leaf(where, axis))
+            found.append((where, axis))
     return found
 
 

@@ -114,15 +114,6 @@ class _TaskError(Exception):
     """An error that a task raised, to distinguish it from those of the cluster."""
 
 
-class _Job:
-    """A sweep on a worker, between tasks."""
-
-    def __init__(self, pickled: bytes):
-        _start_jax()
-        self.sweep, self.plan, self.path, self.sha, self.x64 = pickle.loads(pickled)
-        self.program = Program(self.sweep, self.plan)
-
-
 def _start_jax() -> None:
     """Start JAX in a worker with as many threads as the worker has.
 
@@ -144,25 +135,32 @@ def _start_jax() -> None:
         del os.environ["NPROC"]
 
 
+@functools.lru_cache(maxsize=1)
+def _job(pickled: bytes) -> tuple[Program, str | None, str | None, bool]:
+    """The last sweep of a worker: its program, the path and hash of its store, and x64."""
+    _start_jax()
+    sweep, plan, *others = pickle.loads(pickled)
+    return Program(sweep, plan), *others
+
+
 _lock = threading.Lock()
-_job = functools.lru_cache(maxsize=1)(_Job)
 
 
 def _task(pickled: bytes, number: int) -> tuple[Any, dict[str, int]]:
     """On a worker: compute a task and commit it if there is a store. Its results, if there is no
     store, and its statuses."""
     with _lock:  # threads of a worker share one job
-        job = _job(pickled)
-    task, device = job.plan.task(number), jax.local_devices()[0]
-    with jax.enable_x64(job.x64):
-        if job.path is None:
-            results, facts = compute(job.program, task, device)
+        program, path, sha, x64 = _job(pickled)
+    task, device = program.plan.task(number), jax.local_devices()[0]
+    with jax.enable_x64(x64):
+        if path is None:
+            results, facts = compute(program, task, device)
             return results, facts["statuses"]
-        store = Store.open(job.path)
-        if store.sha != job.sha:
-            raise StoreError(f"{job.path}: a worker sees another sweep there than the client does.")
+        store = Store.open(path)
+        if store.sha != sha:
+            raise StoreError(f"{path}: a worker sees another sweep there than the client does.")
         known = store.record(number)
         if known is None:
-            results, known = compute(job.program, task, device)
+            results, known = compute(program, task, device)
             store.commit(task, results, known)
         return None, known["statuses"]

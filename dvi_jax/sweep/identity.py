@@ -23,7 +23,7 @@ from lanewise.extent import functions_in
 from lanewise.jaxapi import ClosedJaxpr, bodies, is_traced
 
 from ..engine.signature import accepts
-from .axes import is_axis, leaves_with_axes
+from .axes import axes_in, is_axis
 from .plan import Plan
 from .program import Sweep, stacked
 from .variables import Variable
@@ -58,7 +58,7 @@ def description(
     """
     q0, args, t0 = _example(sweep)
     known = Describer(jnp.asarray(t0, q0.dtype), q0, args)
-    axes = {leaf.name: leaf.axis.name for leaf in leaves_with_axes(dict(sweep.inputs))}
+    axes = {where: axis.name for where, axis in axes_in(sweep.inputs)}
     return {
         "format": FORMAT,
         "system": known(sweep.system),

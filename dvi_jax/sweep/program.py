@@ -48,7 +48,7 @@ class Sweep:
         return list(self.dims)[self.compiled :]
 
     def value(self, which: Any, start: tuple[int, ...]) -> Any:
-        """The method, or the number of steps, of the task that begins there."""
+        """The method, or the number of steps, of the task that begins at this index."""
         if not is_axis(which):
             return which
         value = which.values[start[list(self.dims).index(which.name)]]
@@ -153,8 +153,7 @@ def _batch(lanes: Lanes, chunk: tuple[int, ...], begin: Any, last: Any) -> dict[
     return jax.vmap(lanes.one)(tuple(inside), tuple(index))
 
 
-_filter_jit: Any = eqx.filter_jit  # its annotations leave out what goes on to jax.jit
-_compiled = _filter_jit(_batch)
+_compiled: Any = eqx.filter_jit(_batch)
 
 
 def stacked(state: Any) -> Any:

@@ -85,9 +85,7 @@ class _Seeded(Starts):
 class InBox(_Seeded):
     """Base class of initial conditions in a box: scaled points of the unit cube.
 
-    - `count`: number of initial conditions. `low`, `high`: corners of the box, pairs (q, p).
-    - `seed`: initial condition i of a seed is always the same, for any count.
-    - `name`: of the dimension in the result.
+    - `count`, `low`, `high`, `seed`, `name`: as for `Random`.
     """
 
     low: tuple[float, ...] = eqx.field(static=True)

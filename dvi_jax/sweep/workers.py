@@ -4,12 +4,12 @@ import contextlib
 import math
 import os
 import platform
+import queue
 import signal
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Collection, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Collection, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,7 @@ from .program import Program
 from .store import Memory, Store
 
 _PAUSE = 0.2
-"""Seconds between two checks of tasks that another process computes, and of an interrupt."""
+"""Seconds between two checks of tasks that another process computes."""
 
 _BEHIND = 2
 """Tasks for each thread that may wait to be written."""
@@ -120,44 +120,6 @@ def default_threads() -> int:
     return processors() if devices[0].platform == "cpu" else len(devices)
 
 
-class Queue:
-    """The tasks to compute, and those that another process computes and may leave unfinished."""
-
-    def __init__(
-        self, todo: Iterator[int], sink: Memory | Store, done_elsewhere: Callable[[int], None]
-    ):
-        self.sink, self.done_elsewhere = sink, done_elsewhere
-        self.stop = threading.Event()
-        self._todo, self._open_again, self._theirs = todo, deque(), deque()
-        self._lock = threading.Lock()
-
-    def put_off(self, number: int) -> None:
-        """Another process has claimed this task."""
-        with self._lock:
-            self._theirs.append(number)
-
-    def __iter__(self) -> Iterator[int]:
-        """Numbers of tasks until all are done or it is stopped; for several threads at a time."""
-        while not self.stop.is_set():
-            with self._lock:
-                number = self._open_again.popleft() if self._open_again else next(self._todo, None)
-                if number is None and not self._theirs:
-                    return
-            if number is not None:
-                yield number
-            elif not self.stop.wait(_PAUSE):
-                self._check_others()
-
-    def _check_others(self) -> None:
-        done = []
-        with self._lock:
-            for _ in range(len(self._theirs)):
-                number = self._theirs.popleft()
-                (done if self.sink.is_done(number) else self._open_again).append(number)
-        for number in done:
-            self.done_elsewhere(number)
-
-
 def run_here(
     program: Program,
     sink: Memory | Store,
@@ -169,11 +131,13 @@ def run_here(
     a task or of its writing, once the other threads have ended."""
     plan, before = program.plan, set(sink.done())
     counter = Counter(program, before, report)
-    queue = Queue(plan.todo(before), sink, lambda number: counter.add(plan.task(number), {}))
     devices, x64 = jax.local_devices(), x64_enabled()
     count = threads or default_threads()
+    free: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    for i in range(count):
+        free.put(devices[i % len(devices)])
     places = threading.Semaphore(_BEHIND * count)
-    writer = ThreadPoolExecutor(2, "write")
+    stop, interrupted = threading.Event(), threading.Event()
     errors: list[BaseException] = []
 
     @contextlib.contextmanager
@@ -181,8 +145,18 @@ def run_here(
         try:
             yield
         except BaseException as error:
-            queue.stop.set()
+            stop.set()
             errors.append(error)
+
+    def compute_one(task: Task, device: Any, claim: contextlib.ExitStack) -> None:
+        try:
+            # enable_x64 may be a context of the caller, which threads do not inherit.
+            with stopping_on_errors(), claim, jax.enable_x64(x64):
+                results, facts = compute(program, task, device)
+                places.acquire()
+                writer.submit(write, task, results, facts, claim.pop_all())
+        finally:
+            free.put(device)
 
     def write(task: Task, results: Any, facts: Any, claim: contextlib.ExitStack) -> None:
         with stopping_on_errors():
@@ -193,38 +167,35 @@ def run_here(
             finally:
                 places.release()
 
-    def work(device: Any) -> None:
-        # enable_x64 may be a context of the caller, which threads do not inherit.
-        with stopping_on_errors(), jax.enable_x64(x64):
-            for number in queue:
-                task = plan.task(number)
-                with contextlib.ExitStack() as claim:
-                    if not claim.enter_context(sink.claimed(task)):
-                        queue.put_off(number)
-                        continue
-                    results, facts = compute(program, task, device)
-                    places.acquire()
-                    passed_on = claim.pop_all()
-                writer.submit(write, task, results, facts, passed_on)
+    def submit(numbers: Iterable[int]) -> list[int]:
+        """Those that another process computes, and may leave unfinished, are returned."""
+        theirs = []
+        for number in numbers:
+            task, device, claim = plan.task(number), free.get(), contextlib.ExitStack()
+            if stop.is_set():
+                break
+            if claim.enter_context(sink.claimed(task)):
+                pool.submit(compute_one, task, device, claim)
+                continue
+            claim.close()
+            free.put(device)
+            if sink.is_done(number):
+                counter.add(task, {})
+            else:
+                theirs.append(number)
+        return theirs
 
-    interrupted = threading.Event()
     with (
-        _instead_of_interrupt(interrupted, queue.stop),
-        writer,
+        _instead_of_interrupt(interrupted, stop),
+        ThreadPoolExecutor(2, "write") as writer,
         ThreadPoolExecutor(count, "sweep") as pool,
     ):
-        running = [pool.submit(work, devices[i % len(devices)]) for i in range(count)]
         try:
-            while running:
-                try:
-                    running = wait(running, timeout=_PAUSE).not_done
-                except KeyboardInterrupt:  # raised by another handler than Python's
-                    if interrupted.is_set():
-                        raise
-                    interrupted.set()
-                    queue.stop.set()
-        finally:
-            queue.stop.set()  # so that an exception does not wait for the end of the sweep
+            theirs = submit(plan.todo(before))
+            while theirs and not stop.wait(_PAUSE):
+                theirs = submit(theirs)
+        except KeyboardInterrupt:  # raised by another handler than Python's
+            interrupted.set()
     if errors:
         raise errors[0]
     return not interrupted.is_set()
