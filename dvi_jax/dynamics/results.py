@@ -95,11 +95,9 @@ class SECTION_RESULTS(eqx.Enumeration):
     )
 
 
-def _names(results: Any) -> tuple[str, ...]:
-    return tuple(name for name in vars(results)["_name_to_item"])
-
-
-NAMES, SECTION_NAMES = map(_names, (FREQUENCY_RESULTS, SECTION_RESULTS))
+NAMES, SECTION_NAMES = (
+    tuple(vars(results)["_name_to_item"]) for results in (FREQUENCY_RESULTS, SECTION_RESULTS)
+)
 
 CODE = {name: i for i, name in enumerate(NAMES)}
 """The index of a status in `NAMES`."""

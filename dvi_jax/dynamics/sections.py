@@ -26,7 +26,7 @@ from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
 from ..engine.names import both_names
 from ..engine.newton import RootSolver
 from ..methods import Method, Strang
-from ..observe import Section, Stop
+from ..observe import Section
 from ..sweep import Axis
 from .results import AS_ATTRIBUTE, SECTION_RESULTS, SectionError, WithStatus, judge
 
@@ -52,37 +52,19 @@ class PoincareSection(WithStatus):
 
 
 class _Settings(eqx.Module):
-    """What all orbits of a section have in common."""
+    """What all orbits of a section have in common; `options` are keywords of `integrate`."""
 
     system: System
     section: Section
-    integrator: Integrator
-    stop: Stop | None
-    num_steps: int = eqx.field(static=True)
+    options: dict[str, Any]
 
-    def run(self, start: tuple[Any, Any, Any], h, epsilon, args):
-        """A run from (t0, q0, p0) with its crossings and its last state."""
+    def orbit(self, start: tuple[Any, Any, Any], h, epsilon, args):
+        """The crossings of one orbit from (t0, q0, p0), and the time and state at its end."""
         t0, q0, p0 = start
-        return integrate(
-            self.system,
-            q0,
-            p0,
-            h=h,
-            num_steps=self.num_steps,
-            t0=t0,
-            epsilon=epsilon,
-            args=args,
-            integrator=self.integrator,
-            stop=self.stop,
-            observe=self.section,
-            save=Save(final=True),
-            throw=False,
-        )
-
-    def orbit(self, start, h, epsilon, args):
-        """The crossings of one orbit, and the time and state at its end."""
-        sol = self.run(start, h, epsilon, args)
-        crossed = sol.observed
+        options = {"observe": self.section, "save": Save(final=True), "throw": False}
+        options |= {"t0": t0, "h": h, "epsilon": epsilon, "args": args, **self.options}
+        sol = integrate(self.system, q0, p0, **options)
+        crossed: Any = sol.observed
         result = judge(crossed.count, self.section.capacity, sol.result)
         found = PoincareSection(
             crossed.ts, crossed.qs, crossed.ps, crossed.count, result, sol.result, epsilon
@@ -108,8 +90,8 @@ def _settings(
             FutureWarning,
             stacklevel=level,
         )
-    num_steps = whole("num_steps", num_steps)
-    return _Settings(system, section, integrator, keywords.pop("stop", None), num_steps)
+    options = {"integrator": integrator, "num_steps": whole("num_steps", num_steps)}
+    return _Settings(system, section, options | {"stop": keywords.pop("stop", None)})
 
 
 class _Varied(eqx.Module):
@@ -341,10 +323,8 @@ class ReturnMap(eqx.Module):
     def __call__(
         self, q: Any, p: Any, t0: Any = 0.0, epsilon: Any = 0.0, args: Args = None
     ) -> Return:
-        sol = self._settings(None).run((t0, q, p), self.h, epsilon, args)
-        crossed: Any = sol.observed
-        result = judge(crossed.count, self.returns, sol.result)
-        return Return(crossed.ts[-1], crossed.qs[-1], crossed.ps[-1], result)
+        found, _ = self._settings(None).orbit((t0, q, p), self.h, epsilon, args)
+        return Return(found.ts[-1], found.qs[-1], found.ps[-1], found.result)
 
 
 def _is_axis(x: Any) -> bool:
@@ -387,9 +367,10 @@ def _raise_on_failure(found: PoincareSection, settings: _Settings) -> PoincareSe
     i, names = int(bad[0]), np.atleast_1d(found.status)
     text = SECTION_RESULTS[getattr(SECTION_RESULTS, str(names[i]))]
     own = str(np.atleast_1d(status_name(found.run))[i])
+    wanted, num_steps = settings.section.capacity, settings.options["num_steps"]
     raise SectionError(
-        f"{bad.size} of {len(names)} orbits did not cross the section {settings.section.capacity} "
-        f"times in {settings.num_steps} steps; the first is orbit {i}, with {int(found.count[i])} "
-        f"crossings: {names[i]} (run: {own}). {text} {AS_ATTRIBUTE}",
+        f"{bad.size} of {len(names)} orbits did not cross the section {wanted} times in "
+        f"{num_steps} steps; the first is orbit {i}, with {int(found.count[i])} crossings: "
+        f"{names[i]} (run: {own}). {text} {AS_ATTRIBUTE}",
         found,
     )

@@ -211,7 +211,7 @@ def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
         )
     start, of_integrator = given["start"], taken(dict(given), INTEGRATOR)
     # The name of the axis is not "method", which has another meaning in xarray's sel.
-    method = _as_axis_of_list("integrator", of_integrator.pop("method"))
+    method: Any = _as_axis_of_list("integrator", of_integrator.pop("method"))
     num_steps = _as_axis_of_list("num_steps", given["num_steps"])
     integrator = chosen(**of_integrator, method=None if is_axis(method) else method)
     for x in method.values if is_axis(method) else ():

@@ -1,4 +1,4 @@
-"""Axes: what a sweep varies, and where it stands in the arguments."""
+"""Axes: what a sweep varies, and its place in the arguments."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The grid of a sweep, and how it is cut into tasks."""
+"""The grid of a sweep and its division into tasks."""
 
 import math
 from collections.abc import Container, Iterator, Mapping, Sequence
