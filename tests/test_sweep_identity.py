@@ -1,6 +1,7 @@
-"""What a store knows of its sweep: every difference that changes numbers, and no other."""
+"""The description of a sweep: every difference that changes numbers changes it, and no other."""
 
 import errno
+import inspect
 
 import equinox as eqx
 import jax
@@ -10,10 +11,11 @@ import pytest
 
 import dvi_jax as dvi
 from dvi_jax.sweep import claims, layout
-from dvi_jax.sweep._sweep import make_sweep, prepare
+from dvi_jax.sweep._sweep import prepare
 from dvi_jax.sweep.identity import description, differences, digest
 
 Q = np.asarray([0.5])
+DEFAULTS = {name: p.default for name, p in inspect.signature(dvi.sweep).parameters.items()}
 
 
 def oscillator(k=1.0):
@@ -22,13 +24,12 @@ def oscillator(k=1.0):
 
 def identity(system=None, q0=Q, p0=Q, **kw):
     kw = {"h": 0.1, "num_steps": 5, "t0": [0.0, 1.0], "save": dvi.Save(final=True)} | kw
-    made = make_sweep(system or oscillator(), q0, p0, **kw)
-    program, found, programs = prepare(made, None)
-    return description(made, program.plan, found, programs)
+    program, found, programs = prepare(system or oscillator(), q0, p0, DEFAULTS | kw)
+    return description(program.sweep, program.plan, found, programs)
 
 
 class Spring(eqx.Module):
-    """Functions as an object, of which the code differs."""
+    """A function as an object."""
 
     k: float
     power: int = eqx.field(static=True, default=2)
@@ -48,7 +49,7 @@ def spring_in_closure(c):
 
 
 class Constant(dvi.starts.Starts):
-    """Starts of a user's own."""
+    """Initial conditions defined by a user."""
 
     value: float
     count: int = 4
@@ -63,7 +64,7 @@ SCALE = {"of starts": 1.0}
 
 @jax.tree_util.register_pytree_node_class
 class Parameters:
-    """args that are no dictionary."""
+    """args that are not a dictionary."""
 
     def __init__(self, k):
         self.k = k
@@ -131,15 +132,14 @@ DIFFERENT = {
 
 @pytest.mark.filterwarnings("ignore:epsilon = ")
 @pytest.mark.parametrize("what", DIFFERENT)
-def test_a_difference_is_seen(what):
+def test_what_changes_numbers_changes_the_description(what):
     a, b = (identity(**kw) for kw in DIFFERENT[what])
     assert digest(a) != digest(b)
     assert differences(a, b)
-    again = identity(**DIFFERENT[what][0])
-    assert digest(again) == digest(a)
+    assert digest(identity(**DIFFERENT[what][0])) == digest(a)
 
 
-def test_the_code_of_starts_is_seen(monkeypatch):
+def test_the_code_of_generated_initial_conditions_is_part_of_it(monkeypatch):
     kw = {"q0": None, "p0": None, "start": Constant(1.0)}
     before = identity(**kw)
     monkeypatch.setitem(SCALE, "of starts", 2.0)
@@ -149,19 +149,19 @@ def test_the_code_of_starts_is_seen(monkeypatch):
 
 
 SAME = {
-    "another function that does the same": [{"system": oscillator()}, {"system": oscillator()}],
-    "numbers of NumPy's": [{"h": 0.1, "epsilon": 0}, {"h": np.float64(0.1), "epsilon": 0.0}],
-    "a tuple": [{"observe": {"x": position}}, {"observe": {"x": lambda *a: a[4][0]}}],
+    "another function with the same result": [{"system": oscillator()}, {"system": oscillator()}],
+    "numbers of NumPy": [{"h": 0.1, "epsilon": 0}, {"h": np.float64(0.1), "epsilon": 0.0}],
+    "a lambda": [{"observe": {"x": position}}, {"observe": {"x": lambda *a: a[4][0]}}],
 }
 
 
 @pytest.mark.parametrize("what", SAME)
-def test_what_is_the_same_is_the_same(what):
+def test_what_does_not_change_numbers_does_not_change_it(what):
     a, b = (identity(**kw) for kw in SAME[what])
     assert differences(a, b) == []
 
 
-# --- names, and what cannot be meant -------------------------------------------------------------
+# --- names and invalid arguments ------------------------------------------------------------------
 
 
 def observed(**observe):
@@ -178,20 +178,23 @@ def observed(**observe):
         (
             {"t0": 0.0, "h": dvi.Axis("step", [0.1, 0.05]), "num_steps": dvi.Axis("step", [4, 8]),
              **observed(h=dvi.Last(position))},
-            "has the name of what varies",
+            "'h' has the name of an axis or argument",
         ),
-        ({"num_steps": 0}, "at least 1"),
-        ({"lattice": dvi.Given([0.0, 0.1]), "h": None, "num_steps": None}, "replace h and t0"),
+        ({"num_steps": 0}, "from 1 on, got 0"),
+        ({"lattice": dvi.Given([0.0, 0.1]), "h": None, "num_steps": None}, "replace h, t0 and num"),
+        ({"lattice": dvi.Given([0.0, 0.1]), "t0": 0.0, "epsilon": [0.0, 0.1]}, "replace h, t0"),
+        ({"start": dvi.starts.Random(4, ([0.0], [0.0]), ([1.0], [1.0]))}, "give either q0 and p0"),
+        ({"q0": None, "p0": None, "start": Constant(1.0, name="t0")}, "also that of an axis"),
         ({"q0": None, "p0": None, "start": Constant(1.0, name="a/b")}, "identifier"),
     ],
 )  # fmt: skip
-def test_refused(settings, said):
+def test_invalid_arguments(settings, said):
     kw = {"h": 0.1, "num_steps": 5, "t0": [0.0, 1.0], "save": dvi.Save(final=True)} | settings
     with pytest.raises(ValueError, match=said):
         dvi.sweep(oscillator(), kw.pop("q0", Q), kw.pop("p0", Q), **kw)
 
 
-def test_whole_numbers_without_a_sign(tmp_path):
+def test_unsigned_integers_and_unknown_names(tmp_path):
     observe = {"count": lambda *a: jnp.uint8(3), "x": dvi.Last(position)}
     found = dvi.sweep(oscillator(), Q, Q, h=0.1, num_steps=2, t0=[0.0, 1.0], observe=observe,
                       store=tmp_path / "s.zarr")  # fmt: skip
@@ -203,7 +206,7 @@ def test_whole_numbers_without_a_sign(tmp_path):
 
 
 @pytest.mark.slow
-def test_starts_know_the_time_of_a_given_lattice():
+def test_generated_initial_conditions_have_the_first_time_of_a_given_lattice():
     def H(t, q, p, args):
         return p @ p / 2 + 0.1 * t
 
@@ -240,7 +243,7 @@ def test_a_file_system_without_locks(tmp_path, monkeypatch):
         assert small(tmp_path / "s.zarr").is_complete
 
 
-def test_places(tmp_path, monkeypatch):
+def test_links_and_relative_paths(tmp_path, monkeypatch):
     (tmp_path / "there").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "there")
     found = small(tmp_path / "link")
@@ -254,7 +257,7 @@ def test_places(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_sizes_without_divisors_are_not_crumbled():
+def test_lengths_without_divisors_do_not_give_tiny_chunks():
     variable = layout.Variable("float64", (30,), ("x",))
     inner = layout.layout((32749,), variable)["chunks"]
     assert np.prod(inner) * 8 > layout.CHUNK_BYTES / 16

@@ -1,4 +1,4 @@
-"""Actions of quasi-periodic motion, from its lines."""
+"""Actions of quasi-periodic motion, from the lines of its frequency analysis."""
 
 import math
 from typing import Any
@@ -11,14 +11,13 @@ from jaxtyping import Array
 from lanewise.jaxapi import is_traced
 
 from .._checks import positive
-from .._solution import Solution
-from .frequencies import Frequencies, Raw, analyse, check_count, settings_of, signals_of
+from .frequencies import Frequencies, analyse, check_count, settings_of, signals_of
 from .lines import EPS
 from .results import CODE, FREQUENCY_RESULTS, WITHOUT_NUMBERS, WithStatus, raise_on_failure
 from .torus import FundamentalFrequencies, gathered, search_of, tori_of
 
 _STILL = 64 * EPS
-"""A q or p whose spread is below this share of its size is constant, but for round-off."""
+"""A q or p of which the spread is below this fraction of its size is constant to round-off."""
 
 
 class Actions(WithStatus):
@@ -26,16 +25,16 @@ class Actions(WithStatus):
 
     - `actions`: J_a [units of p·q], shape (num,); `frequencies`: ω_a, shape (num,), in the same
       order. NaN where the status is not `successful`.
-    - `errors`: an estimate of what the lines that were not found, or are no combinations, would
-      add to each action, shape (num,).
-    - `residual`: root of the mean square of what is left over of q_j/s_j − i s_j p_j, over
-      2 rms q_j rms p_j; the largest of the degrees of freedom.
+    - `errors`: estimated contribution to each action of lines that were not found or are not
+      combinations, shape (num,).
+    - `residual`: rms of the residual of q_j/s_j − i s_j p_j, divided by (2 rms q_j rms p_j)^½; the
+      largest of the degrees of freedom.
     - `scales`: s_j [units of (q/p)^½], shape (n,).
     - `torus`: the `FundamentalFrequencies`; `lines`: the `Frequencies` of each q_j/s_j − i s_j p_j,
       shape (n, count).
     - `result`: the status, one of `FREQUENCY_RESULTS`.
 
-    Axes of a batch stand in front.
+    The first axes are those of a batch.
     """
 
     actions: np.ndarray
@@ -68,71 +67,68 @@ def actions(
         J_a = ½ Σ_j Σ_k k_a |z_{j,k}|²
 
     over the lines k·ω of every degree of freedom. For H = ω(q² + p²)/2 that is J = (q² + p²)/2 and
-    H = ωJ. J belongs to the frequencies beside it: for ω' = Mω, J' = M⁻ᵀ J. So that neither the
-    lines found nor their errors depend on the units, z_j is taken as q_j/s_j − i s_j p_j, which is
-    canonical and leaves J as it is; s_{j}² = rms Δ²q_j / rms Δ²p_j, of second differences: they
-    weigh the weak lines of high frequency, on which the accuracy depends. s_j = 1 where q_j or p_j
-    is constant.
+    H = ωJ. J depends on the basis of frequencies: for ω' = Mω, J' = M⁻ᵀ J. So that neither the
+    lines nor their errors depend on the units, z_j = q_j/s_j − i s_j p_j is analysed, which is
+    canonical and does not change J; s_{j}² = rms Δ²q_j / rms Δ²p_j. Second differences give more
+    weight to the weak lines of high frequency, on which the accuracy depends. s_j = 1 where q_j or
+    p_j is constant.
 
     **Arguments**
 
     - `ts`: a `Solution`; or times, shape (N,), with `signal`: q_j − i p_j of canonical q and p,
-      shape (*batch, n, N), or (N,) for one degree of freedom. A trajectory fills a torus that can
-      be contracted in phase space: an angle that rotates is no sum of lines.
+      shape (*batch, n, N), or (N,) for one degree of freedom. The torus must be contractible in
+      phase space: a rotating angle is not a sum of lines.
     - `count`: lines for each degree of freedom; `window`: see `frequencies`.
     - `num`, `guess`, `order`: see `fundamental_frequencies`.
-    - `leftover`: root of the mean square of what is no combination of num frequencies, over
-      2 rms q_j rms p_j (about their means; it is 2J of an oscillator), from which on the motion is
-      not quasi-periodic. The same in all units.
+    - `leftover`: largest `residual` of quasi-periodic motion: rms of the part of the signal that is
+      not a combination of the num frequencies, divided by (2 rms q_j rms p_j)^½ (about their means;
+      for an oscillator 2 rms q rms p = 2J). It does not depend on units.
     - `throw`: raise if a trajectory has another status than `successful`.
 
-    The Fourier transforms run on the device, the rest on the host: not under jit or vmap.
+    The Fourier transforms run on the device, the rest on the CPU: not under jit or vmap.
 
     **Returns** an `Actions`.
 
     **Raises** as `frequencies` and `fundamental_frequencies`; `TypeError` for a real signal.
 
-    **Accuracy** the square of the residual, times the order k of what is left over: `errors`. The
-    lines of a smooth torus fall off exponentially, so that more lines help fast. An action whose
-    error is as large as ½Σ|k_a||z|², or as the largest of the actions, makes the status
-    `not_quasi_periodic`; one that is small because its lines cancel is given with its error.
+    **Accuracy** the square of the residual, times the order k of the remaining lines: `errors`. The
+    lines of a smooth torus decrease exponentially, so that a larger `count` helps fast. The status
+    is `not_quasi_periodic` if the error of an action is as large as ½Σ|k_a||z|² or as the largest
+    action; an action that is small because its lines cancel is returned with its error.
 
     **Source** our own, from the definition; compare Binney & Spergel 1984, *Mon. Not. R. Astron.
     Soc.* 206, 159, and Laskar 1999, in *Hamiltonian Systems with Three or More Degrees of
     Freedom*, 134.
     """
     settings = settings_of(count, window, True)
-    if isinstance(ts, Solution):
-        ts, signal, eps, axes = signals_of(ts, signal)
-        lead, N = signal.shape[: signal.ndim - 1 - axes], signal.shape[-1]
-        signal = signal.reshape(*lead, math.prod(signal.shape[len(lead) : -1]), N)
-        if ts.ndim > 1:
-            ts = ts.reshape(*lead, 1, N)
-    else:
-        ts, signal, eps, _ = signals_of(ts, signal)
+    ts, signal, eps, axes = signals_of(ts, signal)
     if not jnp.iscomplexobj(signal):
         raise TypeError(
             "actions need q and p of every degree of freedom: the complex signal q − i p, shape "
             "(n, N), or a Solution; got a real one."
         )
     if is_traced(signal) or is_traced(ts):
-        raise ValueError("actions are found on the host: not under jit or vmap. Give the batch.")
-    if signal.ndim == 1:
-        signal = signal[None]
+        raise ValueError("actions run on the CPU, not under jit or vmap: give the whole batch.")
+    # One axis for all degrees of freedom of a trajectory.
+    lead, N = signal.shape[: signal.ndim - 1 - axes], signal.shape[-1]
+    signal = signal.reshape(*lead, math.prod(signal.shape[len(lead) : -1]), N)
+    if ts.ndim > 1 and axes != 1:
+        ts = ts.reshape(*lead, 1, N)
     check_count(settings, signal)
     if leftover != math.inf:
         leftover = positive("leftover", leftover)
     search = search_of(signal.shape[-2], num, guess, order, None, 1e-3)
     signal, scales, size = _balanced(signal)
     lines, raw = analyse(ts, signal, settings, eps, 1)
-    raw = Raw(*map(np.asarray, raw))  # pyright: ignore[reportArgumentType]
-    omega, A = np.asarray(lines.frequencies), np.asarray(lines.amplitudes)
-    resolution = np.asarray(lines.resolution)
-    tori, codes = tori_of(omega, A, raw.code, resolution, search, soft=False)
+    omega, A, resolution, every_A, code = map(
+        np.asarray,
+        (lines.frequencies, lines.amplitudes, lines.resolution, raw.amplitudes, raw.code),
+    )
+    tori, codes = tori_of(omega, A, code, resolution, search, soft=False)
 
-    lead, n = omega.shape[:-2], omega.shape[-2]
+    n = omega.shape[-2]
     power = np.where(np.isfinite(omega), np.abs(A) ** 2, 0.0).reshape(len(tori), n, count)
-    in_doubt = np.abs(raw.amplitudes.reshape(power.shape)) ** 2
+    in_doubt = np.abs(every_A.reshape(power.shape)) ** 2
     in_doubt = np.where(power > 0, 0.0, np.where(np.isfinite(in_doubt), in_doubt, 0.0))
     size = np.asarray(size).reshape(len(tori), n)
     left = np.nan_to_num(np.asarray(lines.residual)).reshape(len(tori), n) ** 2
@@ -175,7 +171,7 @@ def actions(
 
 @eqx.filter_jit
 def _balanced(signal: Array) -> tuple[Array, Array, Array]:
-    """q/s − i s p of every q − i p, with s, and 2 rms q rms p, 0 where one of them is constant."""
+    """q/s − i s p for each q − i p, with s, and 2 rms q rms p, or 0 if one of them is constant."""
 
     def sizes(x):
         largest = jnp.max(jnp.abs(x), axis=-1)

@@ -1,8 +1,8 @@
-"""Frequency analysis: the lines of a quasi-periodic signal, after Laskar."""
+"""Frequency analysis (NAFF): the lines of a quasi-periodic signal, after Laskar."""
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from .._checks import one_of, whole
 from .._precision import refuse_double_without_x64
 from .._solution import Solution
 from ..engine.quantities import refuse_unit_or_mask
-from .lines import EPS, Settings, lines_of
+from .lines import EPS, Lines, Settings, lines_of
 from .results import (
     CODE,
     FREQUENCY_RESULTS,
@@ -28,7 +28,7 @@ from .results import (
 )
 
 _FEWEST = 32
-"""Samples below which there is no window to speak of."""
+"""Least number of samples of a signal."""
 
 
 class Frequencies(WithStatus):
@@ -38,16 +38,16 @@ class Frequencies(WithStatus):
         x(t) ≈ c + Re Σ_k A_k e^{iω_k t}       (real, ω_k > 0)
 
     - `frequencies`: ω_k [rad per unit of time], shape (count,); `amplitudes`: A_k, complex, units
-      of the signal, shape (count,). NaN for lines that are not there, or in doubt: not to be told.
+      of the signal, shape (count,). NaN for missing or unresolved lines.
     - `constant`: c, complex (its imaginary part is 0 for a real signal).
-    - `residual`: root mean square, in the window, of what all lines that are there leave over that
-      of z − c. Those in doubt are among them, so that it is not the rest of `evaluate`.
+    - `residual`: root mean square, in the window, of z minus all lines, divided by that of z − c.
+      Unresolved lines are included, so that it is not the error of `evaluate`.
     - `resolution`: 2π/T [rad per unit of time].
     - `result`: the status, one of `FREQUENCY_RESULTS`.
-    - `is_real`: of a real signal; `state_axes`: how many axes belong to the degrees of freedom of
-      one trajectory. Both static.
+    - `is_real`: whether the signal is real; `state_axes`: number of axes of the degrees of freedom
+      of one trajectory. Both static.
 
-    Axes of a batch, then those of the degrees of freedom, stand in front: (*batch, *state, count).
+    The first axes are those of a batch, then of the degrees of freedom: (*batch, *state, count).
     """
 
     frequencies: Float[Array, "*batch count"]
@@ -62,9 +62,9 @@ class Frequencies(WithStatus):
     def evaluate(self, ts: Any) -> Array:
         """The constant and the sum of the lines at times `ts` of any shape (*times).
 
-        Shape (*batch, *times): every signal at every time; for times of its own for each signal
-        of a batch, ``jax.vmap(lambda f, t: f.evaluate(t))(found, ts)``. NaN where a line is in
-        doubt or the status leaves no numbers; the constant alone where there is no line at all.
+        Shape (*batch, *times): every signal at every time; for different times of each signal of a
+        batch, ``jax.vmap(lambda f, t: f.evaluate(t))(found, ts)``. NaN where a line is unresolved
+        or the status leaves no numbers; the constant alone if there is no line.
         """
         ts = _real_times("ts", ts)
         times, batch = ts.reshape(-1), self.constant.shape
@@ -73,8 +73,8 @@ class Frequencies(WithStatus):
         phases = omega[..., :, None] * jnp.expand_dims(times, tuple(range(omega.ndim)))
         z = self.constant[..., None] + jnp.sum(A[..., :, None] * jnp.exp(1j * phases), axis=-2)
         code = code_of(self.result)
-        told = (code == CODE["successful"]) | (code == CODE["no_signal"])
-        z = jnp.where(told[..., None], z, jnp.nan).reshape(*batch, *ts.shape)
+        known = (code == CODE["successful"]) | (code == CODE["no_signal"])
+        z = jnp.where(known[..., None], z, jnp.nan).reshape(*batch, *ts.shape)
         return z.real if self.is_real else z
 
 
@@ -82,10 +82,10 @@ class FrequencyDiffusion(WithStatus):
     """Change of the leading frequency between the two halves of a signal.
 
     - `first`, `second`: the frequency in each half [rad per unit of time].
-    - `rate`: log10 |Δω/ω|; not below log10 of the spacing of floating point numbers, −15.7.
-    - `result`: the status, one of `FREQUENCY_RESULTS`; NaN above where it is not `successful`.
+    - `rate`: log10 |Δω/ω|, at least log10 of the spacing of floating point numbers, −15.7.
+    - `result`: the status, one of `FREQUENCY_RESULTS`; the numbers are NaN unless `successful`.
 
-    Axes of a batch and of degrees of freedom stand in front.
+    The first axes are those of a batch, then of the degrees of freedom.
     """
 
     first: Float[Array, "*batch"]
@@ -103,44 +103,44 @@ def frequencies(
     refine: bool = True,
     throw: bool = True,
 ) -> Frequencies:
-    r"""The lines of a signal that is sampled at uniform times.
+    r"""Frequency analysis (NAFF) of a signal that is sampled at uniform times.
 
-    One line after the other is found as the maximum over σ of
+    Lines are found one by one, as the maximum over σ of
 
         |⟨r, e^{iσt}⟩|,   ⟨f, g⟩ = Σ_n χ(t_n) f(t_n) ḡ(t_n) / N,   χ ∝ (1 + cos πu)^window
 
-    with r what the lines before have left over and u from −1 to 1 over the window. A fast Fourier
-    transform gives the start, Newton's method the maximum; then *all* amplitudes, and with
-    ``refine=True`` all frequencies, are those of least squares in ⟨·,·⟩, by Gauss–Newton: near
-    lines do not bias one another. A constant is always among what is fitted.
+    where r is the residual of the lines before and u goes from −1 to 1 over the window. A fast
+    Fourier transform gives the initial guess, Newton's method the maximum. Then all amplitudes, and
+    with ``refine=True`` all frequencies, are fitted by least squares in ⟨·,·⟩ (Gauss–Newton), so
+    that near lines do not bias each other. A constant is always fitted with them.
 
     **Arguments**
 
     - `ts`: times, shape (N,), uniform to their rounding, ascending or not, N ≥ 32; or (*batch, N).
-      Or a `Solution`: then the signal of each degree of freedom is q_j − i p_j, for which
-      H = (q² + p²)/2 turns at +1, shape (*batch, *state, N).
-    - `signal`: shape (*batch, N), complex or real. A real one has lines at ω > 0 alone. Of more
-      than one axis, the last but one counts the degrees of freedom of a trajectory (`state_axes`).
-    - `count`: lines to look for, 3·count < N (6·count < N if real); static.
+      Or a `Solution`: then the signal of each degree of freedom is q_j − i p_j, shape
+      (*batch, *state, N), in which H = (q² + p²)/2 has the frequency +1.
+    - `signal`: shape (*batch, N), complex or real. A real one has lines at ω > 0 only. If there are
+      several axes, the last but one is that of the degrees of freedom (`state_axes`).
+    - `count`: number of lines, 3·count < N (6·count < N if real); static.
     - `window`: power of Hann's window, 0 to 5; static. A line that is not among the `count` biases
-      the others by a share T^−(2·window+2) of it.
-    - `refine`: fit all frequencies together at the end, as said; False is Laskar's procedure.
+      the others by T^−(2·window+2), relative to its amplitude.
+    - `refine`: fit all frequencies together at the end; False is Laskar's procedure.
     - `throw`: raise if a signal has another status than `successful`.
 
     It may be compiled by `jit`, batched by `vmap`, and differentiated.
 
     **Returns** a `Frequencies`.
 
-    **Raises** `ValueError` for times that are not uniform, and shapes, counts and windows that
-    cannot be meant; `TypeError` where only single precision is at hand; `FrequencyError` when a
-    signal has no `successful` status and `throw` is True (inside jit an equinox runtime error).
+    **Raises** `ValueError` for times that are not uniform and invalid shapes, counts and windows;
+    `TypeError` if x64 is off; `FrequencyError` when a signal is not `successful` and `throw` is
+    True (inside jit an equinox runtime error).
 
-    **Accuracy** round-off, below 1e-13 ω for 2048 samples, for a signal of no more than `count`
-    lines that are further apart than the resolution; see `docs/frequencies.md`. float32 is computed
-    in float64, at the times of the lattice that fits the rounded ones best.
+    **Accuracy** round-off, below 1e-13 ω for 2048 samples, for a signal of at most `count` lines
+    that are further apart than the resolution; see `docs/frequencies.md`. float32 signals are
+    analysed in float64, at the uniform times that fit the rounded ones best.
 
     **Source** Laskar 1990, *Icarus* 88, 266; 1993, *Physica D* 67, 257; 2003, arXiv:math/0305364.
-    Joint refinement by least squares: our own, in the place of the corrections of Šidlichovský &
+    Joint refinement by least squares: our own, in place of the corrections of Šidlichovský &
     Nesvorný 1996, *Celest. Mech. Dyn. Astron.* 65, 137.
 
     **Example**
@@ -162,19 +162,19 @@ def frequencies(
 def frequency_diffusion(
     ts: Any, signal: Any = None, *, count: int = 4, window: int = 2, throw: bool = True
 ) -> FrequencyDiffusion:
-    r"""How far the leading frequency moves from the first half of a signal to the second.
+    r"""Change of the leading frequency between the two halves of a signal (frequency diffusion).
 
         log10 |ω(second half) − ω(first half)| / |ω(first half)|
 
-    Near the level of the method, T^−(2·window+2) or that of the integrator, on a torus; orders of
-    magnitude above it where the motion is chaotic. In the second half the line is taken that is
-    nearest to the leading one of the first half, among those of at least half its amplitude.
+    On a torus this is near the error of the method, T^−(2·window+2), or that of the integrator; for
+    chaotic motion it is greater by orders of magnitude. In the second half the line is taken that
+    is nearest to the leading one of the first half, among those of at least half its amplitude.
 
     **Arguments** `ts`, `signal`, `window`, `throw` as for `frequencies`; `count` lines are fitted
     in each half, so that the others do not bias the leading one.
 
-    **Returns** a `FrequencyDiffusion`. A chaotic signal whose weaker lines are not to be told
-    apart still has a leading frequency in each half: its status is `successful`.
+    **Returns** a `FrequencyDiffusion`. The status of a chaotic signal of which only weaker lines
+    are unresolved is `successful`, since it has a leading frequency in each half.
 
     **Raises** as `frequencies`.
 
@@ -190,40 +190,19 @@ def frequency_diffusion(
     times = times.reshape(2, *(1,) * (halves.ndim - times.ndim), *times.shape[1:])
     check_count(settings, halves)
     _, raw = analyse(times, halves, settings, eps)
-    first = raw.frequencies[0, ..., 0]
+    omega, first = raw.s, raw.s[0, ..., 0]
     size = jnp.abs(raw.amplitudes)
     strong = size[1] >= 0.5 * size[0, ..., :1]
-    away = jnp.where(strong, jnp.abs(raw.frequencies[1] - first[..., None]), jnp.inf)
+    away = jnp.where(strong, jnp.abs(omega[1] - first[..., None]), jnp.inf)
     best = jnp.argmin(away, axis=-1)[..., None]
     best = jnp.where(jnp.any(strong, axis=-1)[..., None], best, 0)
-    second = jnp.take_along_axis(raw.frequencies[1], best, axis=-1)[..., 0]
+    second = jnp.take_along_axis(omega[1], best, axis=-1)[..., 0]
     rate = jnp.log10(jnp.maximum(jnp.abs((second - first) / first), EPS))
     code = jnp.where(raw.code < len(WITHOUT_NUMBERS) + 1, raw.code, 0)
     code = jnp.where(code[0] != 0, code[0], code[1])
     first, second, rate = (jnp.where(code == 0, x, jnp.nan) for x in (first, second, rate))
     of = FrequencyDiffusion(first, second, rate, with_code(code))
     return raise_on_failure(of) if throw else of
-
-
-class Signals(NamedTuple):
-    """Times (…, N) and signals (*batch, *state, N) in double precision.
-
-    `eps` is the spacing of the floating point numbers as which the times came, over them;
-    `state_axes` how many axes before the last belong to one trajectory.
-    """
-
-    ts: Array
-    signal: Array
-    eps: float
-    state_axes: int
-
-
-class Raw(NamedTuple):
-    """Lines with those that are in doubt, and the codes of the statuses."""
-
-    frequencies: Array
-    amplitudes: Array
-    code: Array
 
 
 def settings_of(count: Any, window: Any, refine: Any) -> Settings:
@@ -239,42 +218,39 @@ def check_count(settings: Settings, signal: Array) -> None:
     unknowns = 3 * settings.lines * (1 if jnp.iscomplexobj(signal) else 2)
     if unknowns >= signal.shape[-1]:
         raise ValueError(
-            f"count = {settings.lines} lines have {unknowns} unknowns, which {signal.shape[-1]} "
-            "samples do not determine: take a smaller count or more samples."
+            f"count = {settings.lines} lines have {unknowns} unknowns, too many for "
+            f"{signal.shape[-1]} samples: take a smaller count or more samples."
         )
 
 
-def signals_of(ts: Any, signal: Any) -> Signals:
-    """Times and signals, checked; of a `Solution` q − i p."""
+def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
+    """Times (…, N) and signals (*batch, *state, N) in double precision; the relative spacing of the
+    floating point numbers in which the times were given; the number of axes of the state. The
+    signals of a `Solution` are q − i p."""
     state_axes = None
+    if isinstance(ts, Solution) == (signal is not None):
+        raise ValueError(
+            "give times and a signal, or a Solution alone, which has its own signal, q − i p."
+        )
     if isinstance(ts, Solution):
-        if signal is not None:
-            raise ValueError("a Solution brings its own signal, q − i p: leave the other one out.")
-        solution, lead = ts, ts.ts.ndim - 1
-        state_axes = solution.qs.ndim - solution.ts.ndim
-        z = _double("the trajectory", solution.qs) - 1j * _double("the trajectory", solution.ps)
-        signal, ts = jnp.moveaxis(z, lead, -1), solution.ts
-        ts = ts.reshape(*ts.shape[:-1], *(1,) * (signal.ndim - ts.ndim), ts.shape[-1])
-    elif signal is None:
-        raise ValueError("frequencies(ts, signal) needs a signal, or a Solution in place of both.")
+        qs, ps = (_double("the trajectory", x) for x in (ts.qs, ts.ps))
+        state_axes = qs.ndim - ts.ts.ndim
+        signal, ts = jnp.moveaxis(qs - 1j * ps, ts.ts.ndim - 1, -1), ts.ts
+        ts = ts.reshape(*ts.shape[:-1], *(1,) * state_axes, ts.shape[-1])
     dtype: Any = getattr(ts, "dtype", np.dtype(float))
     eps = float(np.finfo(dtype).eps) if dtype.kind == "f" else EPS
     ts, signal = _real_times("ts", ts), _double("signal", signal)
     if signal.ndim == 0 or ts.ndim == 0 or ts.shape[-1] != signal.shape[-1]:
         raise ValueError(
             f"ts and signal must have one length along their last axis, got shapes {ts.shape} and "
-            f"{signal.shape}. Of trajectories saved as (N, n), give signal.T."
+            f"{signal.shape}. For trajectories saved as (N, n) give signal.T."
         )
-    if ts.ndim > 1:
-        try:
-            fits = np.broadcast_shapes(ts.shape, signal.shape) == signal.shape
-        except ValueError:
-            fits = False
-        if not fits or ts.ndim > signal.ndim:
-            raise ValueError(
-                f"times of shape {ts.shape} do not go with signals of shape {signal.shape}: give "
-                "one row of times, or one for each signal."
-            )
+    sizes = zip(ts.shape[::-1], signal.shape[::-1], strict=False)
+    if ts.ndim > signal.ndim or any(n not in (1, size) for n, size in sizes):
+        raise ValueError(
+            f"times of shape {ts.shape} do not match signals of shape {signal.shape}: give one "
+            "row of times, or one for each signal."
+        )
     if signal.shape[-1] < _FEWEST:
         raise ValueError(
             f"a frequency needs at least {_FEWEST} samples, got {signal.shape[-1]}: save more "
@@ -282,7 +258,7 @@ def signals_of(ts: Any, signal: Any) -> Signals:
         )
     if not is_traced(ts):
         rows = np.asarray(ts).reshape(-1, ts.shape[-1])
-        rows = rows[np.isfinite(rows).all(axis=1)]  # times that failed are a matter of statuses
+        rows = rows[np.isfinite(rows).all(axis=1)]  # other rows get a status
         uneven = np.asarray(_unevenness(jnp.asarray(rows), eps)) if len(rows) else np.zeros(1)
         if not (uneven <= 1).all():
             steps = np.diff(rows[uneven.argmax()])
@@ -292,7 +268,7 @@ def signals_of(ts: Any, signal: Any) -> Signals:
                 f"the longest {steps.max():.17g}. Save with dvi.Save(every=m) on the lattice "
                 f"dvi.Uniform(), without final=True.{coarse}"
             )
-    return Signals(ts, signal, eps, min(signal.ndim - 1, 1) if state_axes is None else state_axes)
+    return ts, signal, eps, min(signal.ndim - 1, 1) if state_axes is None else state_axes
 
 
 def _real_times(name: str, value: Any) -> Array:
@@ -318,12 +294,12 @@ def _double(name: str, value: Any) -> Array:
 
 
 def _lattice(ts: Array) -> tuple[Array, Array, Array]:
-    """Spacing and centre of the uniform lattice of least squares, and how far times are from it."""
+    """Spacing and centre of the best uniform times, and the largest deviation from them."""
     N = ts.shape[-1]
     n = np.arange(N).reshape((1,) * (ts.ndim - 1) + (N,)) - (N - 1) / 2
     h = (ts[..., -1:] - ts[..., :1]) / (N - 1)
     centre = (ts[..., -1:] + ts[..., :1]) / 2
-    off = ts - centre - h * n  # small, so that the corrections keep all digits
+    off = ts - centre - h * n  # small, so that the corrections have all digits
     change = jnp.sum(off * n, axis=-1, keepdims=True) * (12 / (N * (N**2 - 1)))
     shift = jnp.mean(off, axis=-1, keepdims=True)
     away = jnp.max(jnp.abs(off - shift - change * n), axis=-1)
@@ -331,10 +307,10 @@ def _lattice(ts: Array) -> tuple[Array, Array, Array]:
 
 
 def _unevenness(ts: Array, eps: Any) -> Array:
-    """Largest deviation from a uniform lattice over what is allowed; NaN for no lattice at all.
+    """Largest deviation from uniform times over the tolerance; NaN if all times are equal.
 
-    Allowed are running sums in double precision, the rounding of each time to numbers of spacing
-    `eps`, and never more than an eighth of a step.
+    The tolerance covers running sums in double precision and the rounding of each time to numbers
+    of spacing `eps`; it is at most an eighth of a step.
     """
     h, _, away = _lattice(ts)
     size = jnp.max(jnp.abs(ts), axis=-1)
@@ -344,10 +320,10 @@ def _unevenness(ts: Array, eps: Any) -> Array:
 
 def analyse(
     ts: Array, signal: Array, settings: Settings, eps: float = EPS, state_axes: int = 0
-) -> tuple[Frequencies, Raw]:
-    """The lines of every signal: those that are sure, and all."""
+) -> tuple[Frequencies, Lines]:
+    """The resolved lines of every signal; and all lines, with frequencies in place of s."""
     lead, N = signal.shape[:-1], signal.shape[-1]
-    flat = (math.prod(lead), N)  # one program for all shapes of a batch
+    flat = (math.prod(lead), N)  # so that all shapes of a batch share one program
     ts = jnp.broadcast_to(ts, signal.shape).reshape(flat)
     of = _analysed(ts, signal.reshape(flat), settings, jnp.asarray(eps))
     found, raw = jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), of)
@@ -355,8 +331,10 @@ def analyse(
 
 
 @eqx.filter_jit
-def _analysed(ts: Array, signal: Array, settings: Settings, eps: Array) -> tuple[Frequencies, Raw]:
-    """Of signals (M, N) at times (M, N)."""
+def _analysed(
+    ts: Array, signal: Array, settings: Settings, eps: Array
+) -> tuple[Frequencies, Lines]:
+    """`analyse` for signals (M, N) at times (M, N)."""
     h, centre, _ = _lattice(ts)
     N = signal.shape[-1]
     lines = jax.vmap(lambda z: lines_of(z, settings))(signal)
@@ -371,7 +349,6 @@ def _analysed(ts: Array, signal: Array, settings: Settings, eps: Array) -> tuple
     if not jnp.iscomplexobj(signal):
         back = (h < 0)[..., None]  # Re A e^{iωt} = Re Ā e^{−iωt}
         omega, A = jnp.where(back, -omega, omega), 2 * jnp.where(back, jnp.conj(A), A)
-    raw = Raw(omega, A, code)
     hard = (code > 0) & (code <= len(WITHOUT_NUMBERS))
     sure = lines.sure & ~hard[..., None]
     found = Frequencies(
@@ -383,4 +360,4 @@ def _analysed(ts: Array, signal: Array, settings: Settings, eps: Array) -> tuple
         result=with_code(code),
         is_real=not jnp.iscomplexobj(signal),
     )
-    return found, raw
+    return found, lines._replace(s=omega, amplitudes=A, code=code)

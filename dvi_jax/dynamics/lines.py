@@ -1,5 +1,6 @@
 """The lines of one signal: maxima of its windowed transform, and least squares of all of them."""
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -13,23 +14,23 @@ EPS = float(np.finfo(np.float64).eps)
 
 _ASCENT, _EACH, _LAST = 4, 3, 4
 """Newton steps to the maximum of an amplitude; Gauss–Newton steps after each line, and rounds of
-them after the last. Both double the digits, from some hundredths of the resolution on."""
+them after the last. Both converge quadratically below some hundredths of the resolution."""
 
 _FLOOR = 256 * EPS
-"""A line below this share of the largest value of the signal is round-off of its samples."""
+"""A line below this fraction of the largest value of the signal is round-off of its samples."""
 
 _ECHO = 1e-9
-"""A line within the resolution of one stronger by this ratio is what round-off left of that."""
+"""A line weaker by this factor than another one within the resolution is round-off of that one."""
 
 _RIDGE = 1e-13
-"""Added to a diagonal of ones: lines that fall together leave no room for a negative pivot."""
+"""Added to a diagonal of ones, so that lines which coincide do not give a negative pivot."""
 
 _SETTLED = 1e-2
-"""Last correction to a frequency, over the resolution, up to which it is taken as found."""
+"""Last correction to a frequency, over the resolution, up to which it counts as converged."""
 
 
 class Settings(NamedTuple):
-    """What is static of an analysis."""
+    """The static arguments of an analysis."""
 
     lines: int
     window: int
@@ -74,10 +75,8 @@ def _grid(N: int, window: int) -> _Grid:
 
 def _hann(window: int) -> np.ndarray:
     """Fourier coefficients of (1 + cos πu)^window over their mean, from −window to window."""
-    coefficients = np.array([1.0])
-    for _ in range(2 * window):
-        coefficients = np.convolve(coefficients, [1.0, 1.0])
-    return coefficients / coefficients[window]
+    binomials = np.array([math.comb(2 * window, k) for k in range(2 * window + 1)], float)
+    return binomials / binomials[window]
 
 
 def _moments(grid: _Grid, weighted: Array, s: Array) -> Array:
@@ -119,7 +118,7 @@ def _kernel(grid: _Grid, d: Array) -> tuple[Array, Array, Array]:
 
 
 def _sinc(x: Array) -> tuple[Array, Array, Array]:
-    """Of sin x / x the value and two derivatives, by their series where they cancel."""
+    """sin x / x and its first two derivatives, by a series where the closed forms cancel."""
     near = jnp.abs(x) < 1.0
     far = jnp.where(near, 1.0, x)
     S = jnp.sin(far) / far
@@ -204,7 +203,7 @@ def lines_of(z: Array, settings: Settings) -> Lines:
 
 
 def _strongest(grid: _Grid, r: Array, is_real: bool) -> tuple[Array, Array]:
-    """Place and amplitude of the largest maximum of |⟨r, e^{isy}⟩|."""
+    """Position and amplitude of the largest maximum of |⟨r, e^{isy}⟩|."""
     N, p = grid.N, grid.window
     weighted = jnp.asarray(grid.weights * r)
     size = jnp.abs(jnp.fft.fft(weighted.reshape(-1)[:N]))
@@ -231,9 +230,9 @@ def _strongest(grid: _Grid, r: Array, is_real: bool) -> tuple[Array, Array]:
 
 
 def _is_line(grid: _Grid, r: Array, new: Array, size: Array, s: Array, A: Array, there: Array):
-    """Whether a maximum stands above white noise and above round-off.
+    """Whether a maximum exceeds white noise and round-off.
 
-    Of N values of noise the largest |⟨r, e^{isy}⟩|² is about ln N times its mean, which is the
+    The largest |⟨r, e^{isy}⟩|² of N values of noise is about ln N times its mean, which is the
     variance of r times mean(χ²)/N.
     """
     variance = jnp.sum(grid.weights * jnp.abs(r) ** 2)
@@ -242,12 +241,12 @@ def _is_line(grid: _Grid, r: Array, new: Array, size: Array, s: Array, A: Array,
 
 
 def _least(at: Array, s: Array, A: Array, there: Array) -> Array:
-    """What a line at `at` must have to be more than round-off of the lines beside it.
+    """The least amplitude at `at` that is not round-off of near lines.
 
-    One that was fitted before its neighbour had settled ends below this, and is taken out.
+    A line that was fitted before a near one had converged ends below this, and is removed.
     """
-    beside = there[None, :] & (jnp.abs(s[None, :] - at[:, None]) < np.pi)
-    stronger = jnp.where(beside, jnp.abs(A)[None, :], 0.0)
+    near = there[None, :] & (jnp.abs(s[None, :] - at[:, None]) < np.pi)
+    stronger = jnp.where(near, jnp.abs(A)[None, :], 0.0)
     return jnp.maximum(_ECHO * jnp.max(stronger, axis=1), _FLOOR)
 
 
@@ -260,7 +259,7 @@ def _correction(grid, s, A, rest, there, with_frequencies: bool, damping):
 
         G_0 c + i G_1 g = r_0,      Im(G_1 c) + Re(G_2) g = Im r_1
 
-    are solved for g first. The damping is of g alone: without frequencies the problem is linear.
+    are solved for g first. Only g is damped: for fixed frequencies the problem is linear.
     """
     length, K = jnp.abs(A), s.shape[0]
     unit = jnp.where(length > 0, A / jnp.where(length > 0, length, 1.0), 1.0)
@@ -288,8 +287,8 @@ def _correction(grid, s, A, rest, there, with_frequencies: bool, damping):
 def _solved(M: Array, B: Array) -> Array:
     """M⁻¹ B of a positive definite M, by elimination without pivots.
 
-    A batch of small systems goes through together. LAPACK takes them one by one, each with the
-    threads that it finds: a hundred times slower where these have to wait for one another.
+    A batch of small systems is solved together. LAPACK solves them one by one with several threads
+    each, which is a hundred times slower where the threads wait for each other.
     """
     K = M.shape[0]
 
@@ -301,9 +300,9 @@ def _solved(M: Array, B: Array) -> Array:
 
 
 def _fitted(grid, blocks, s, A, there, with_frequencies: bool):
-    """A few steps of least squares, more and more damped where one does not make the rest less.
+    """A few steps of least squares, with more damping if a step does not reduce the residual.
 
-    Returns s, A, what they leave over, and the last undamped step in s.
+    Returns s, A, the residual, and the last undamped step in s.
     """
 
     def of(s, A):

@@ -1,4 +1,4 @@
-"""Poincaré sections, return maps, and what becomes of them as ε grows."""
+"""Poincaré sections, return maps, bifurcation diagrams."""
 
 import math
 import warnings
@@ -10,12 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
-from lanewise import Layout
 from lanewise.jaxapi import is_traced
 
-from .._arithmetic import Arithmetic
 from .._checks import finite, positive, whole
 from .._inputs import as_parameter, as_scalar, start_state
 from .._integrate import integrate
@@ -24,22 +22,23 @@ from .._results import RESULTS, status_name
 from .._solution import Save
 from .._system import System, check_system
 from .._types import Args, Scalar, State
+from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
 from ..engine.names import both_names
 from ..engine.newton import RootSolver
 from ..methods import Method, Strang
-from ..observe import Section, Stop
+from ..observe import Section
 from ..sweep import Axis
-from .results import SECTION_RESULTS, SectionError, WithStatus, judge
+from .results import AS_ATTRIBUTE, SECTION_RESULTS, SectionError, WithStatus, judge
 
 
 class PoincareSection(WithStatus):
-    """Where orbits crossed a section.
+    """Crossings of a section by orbits.
 
     - `ts`, `qs`, `ps`: times and states, shapes (orbits, crossings), (orbits, crossings, …); NaN
-      where there was none.
-    - `count`: how many crossings each orbit had after those skipped, shape (orbits,).
-    - `result`: a `SECTION_RESULTS` for each orbit, `status` its name. `run`: how the trajectory
-      itself ended.
+      for missing crossings.
+    - `count`: number of crossings of each orbit after those skipped, shape (orbits,).
+    - `result`: a `SECTION_RESULTS` for each orbit, `status` its name. `run`: status of the
+      trajectory itself.
     - `epsilon`: of each orbit, shape (orbits,).
     """
 
@@ -52,46 +51,47 @@ class PoincareSection(WithStatus):
     epsilon: Array
 
 
-def _chosen(system: System, integrator: Integrator | None, **given: Any) -> Integrator:
-    """As `chosen`, with a warning where the default is another one than it was."""
-    found = chosen(integrator, **given)
-    if found.method is None and not isinstance(default_method(system), Strang):
-        warnings.warn(
-            "sections used Strang() by default, and now use the default of integrate, which is "
-            "TypeII() for this system. Give method=: dvi.Strang() for the results of earlier "
-            "versions, dvi.TypeII() for the map of H_D itself.",
-            FutureWarning,
-            stacklevel=4,
-        )
-    return found
-
-
 class _Settings(eqx.Module):
-    """What orbits of a section have in common."""
+    """What all orbits of a section have in common; `options` are keywords of `integrate`."""
 
     system: System
     section: Section
-    integrator: Integrator
-    stop: Stop | None
-    num_steps: int = eqx.field(static=True)
+    options: dict[str, Any]
 
-    def run(self, q, p, h, t0, epsilon, args):
-        """A run with its crossings and its last state."""
-        return integrate(
-            self.system, q, p, h=h, num_steps=self.num_steps, t0=t0, epsilon=epsilon, args=args,
-            integrator=self.integrator, stop=self.stop, observe=self.section,
-            save=Save(final=True), throw=False,
-        )  # fmt: skip
-
-    def orbit(self, q, p, h, t0, epsilon, args):
-        """The crossings of one orbit, and the state and time that it ends with."""
-        sol = self.run(q, p, h, t0, epsilon, args)
-        crossed = sol.observed
+    def orbit(self, start: tuple[Any, Any, Any], h, epsilon, args):
+        """The crossings of one orbit from (t0, q0, p0), and the time and state at its end."""
+        t0, q0, p0 = start
+        options = {"observe": self.section, "save": Save(final=True), "throw": False}
+        options |= {"t0": t0, "h": h, "epsilon": epsilon, "args": args, **self.options}
+        sol = integrate(self.system, q0, p0, **options)
+        crossed: Any = sol.observed
         result = judge(crossed.count, self.section.capacity, sol.result)
         found = PoincareSection(
             crossed.ts, crossed.qs, crossed.ps, crossed.count, result, sol.result, epsilon
         )
         return found, (sol.ts[-1], sol.qs[-1], sol.ps[-1])
+
+
+def _settings(
+    system: System,
+    section: Section,
+    num_steps: Any,
+    keywords: dict[str, Any],
+    level: int | None = 5,
+) -> _Settings:
+    """`level`: of the user's frame, for a warning; None: no warning."""
+    integrator = chosen(**taken(keywords, INTEGRATOR))
+    has_default = integrator.method is None and not isinstance(default_method(system), Strang)
+    if has_default and level is not None:
+        warnings.warn(
+            "sections used Strang() by default, and now use the default of integrate, which is "
+            "TypeII() for this system. Give method=: dvi.Strang() for the results of earlier "
+            "versions, dvi.TypeII() for the map of H_D itself.",
+            FutureWarning,
+            stacklevel=level,
+        )
+    options = {"integrator": integrator, "num_steps": whole("num_steps", num_steps)}
+    return _Settings(system, section, options | {"stop": keywords.pop("stop", None)})
 
 
 class _Varied(eqx.Module):
@@ -101,7 +101,7 @@ class _Varied(eqx.Module):
 
 
 def _of_orbit(tree: Any, i: Array) -> Any:
-    """What belongs to orbit i."""
+    """The values of orbit i."""
 
     def is_varied(x):
         return isinstance(x, _Varied)
@@ -111,20 +111,16 @@ def _of_orbit(tree: Any, i: Array) -> Any:
 
 @eqx.filter_jit
 def _orbits(settings: _Settings, start, h, epsilon, args, count: int) -> PoincareSection:
-    def one(i):
-        t, q, p = _of_orbit(start, i)
-        return settings.orbit(q, p, h, t, _of_orbit(epsilon, i), _of_orbit(args, i))[0]
-
-    return jax.vmap(one)(jnp.arange(count))
+    given = (start, h, epsilon, args)
+    return jax.vmap(lambda i: settings.orbit(*_of_orbit(given, i))[0])(jnp.arange(count))
 
 
 @eqx.filter_jit
 def _one_after_another(settings: _Settings, start, h, epsilon, args, count: int) -> PoincareSection:
-    """Each orbit from the state that the one before has ended in; from the start if it failed."""
+    """Each orbit from the final state of the one before; from the start if that one failed."""
 
     def one(state, i):
-        t, q, p = state
-        found, end = settings.orbit(q, p, h, t, _of_orbit(epsilon, i), _of_orbit(args, i))
+        found, end = settings.orbit(state, *_of_orbit((h, epsilon, args), i))
         good = found.run == RESULTS.successful
         return jax.tree.map(lambda a, b: jnp.where(good, a, b), end, start), found
 
@@ -132,6 +128,7 @@ def _one_after_another(settings: _Settings, start, h, epsilon, args, count: int)
 
 
 @both_names
+@with_keywords_of(integrate, f"t0 epsilon args {INTEGRATOR} stop throw")
 def poincare_section(
     system: System,
     q0: Any,
@@ -143,37 +140,28 @@ def poincare_section(
     crossings: int = 1000,
     direction: int = 1,
     skip: int = 0,
-    t0: Any = 0.0,
-    epsilon: Any = 0.0,
-    args: PyTree = None,
-    method: Method | None = None,
-    newton: RootSolver | None = None,
-    arithmetic: Arithmetic | None = None,
-    layout: Layout | None = None,
-    integrator: Integrator | None = None,
-    stop: Stop | None = None,
-    throw: bool = True,
+    **keywords: Any,
 ) -> PoincareSection:
-    r"""Where many orbits cross the surface g(t, q, p, args) = 0.
+    r"""Poincaré section: crossings of the surface g(t, q, p, args) = 0 by many orbits.
 
-    All of them together, on the device; each crossing is solved for to round-off, on the curve of
-    the method, see `Section`. For one orbit, or with other observables, observe a `Section`; for
-    grids that outgrow the memory, do so under `sweep`.
+    All orbits are computed together, on the device; each crossing is solved for to round-off, on
+    the curve of the method, see `Section`. For one orbit, or with other observables, observe a
+    `Section`; for grids that exceed the memory, do so in a `sweep`.
 
     **Arguments** as for `integrate`, and
 
-    - `q0`, `p0`: starts, the orbits in front: shape (orbits, …).
-    - `g`, `direction`, `skip`: see `Section`; `crossings`: how many are wanted of each orbit.
-    - `epsilon`: a number, or one for each orbit; so may be what in `args` is a `dvi.Axis`.
+    - `q0`, `p0`: initial conditions, with the orbits along the first axis: shape (orbits, …).
+    - `g`, `direction`, `skip`: see `Section`; `crossings`: number of crossings for each orbit.
+    - `epsilon`: a number, or one for each orbit; so may be a `dvi.Axis` in `args`.
     - `stop`: where an orbit ends, an escape for instance.
-    - `throw`: raise where an orbit has not as many crossings; otherwise read ``.status``.
+    - `throw`: raise if an orbit has fewer crossings; otherwise read ``.status``.
 
     **Returns** a `PoincareSection`.
 
-    **Raises** `ValueError` or `TypeError` for input that cannot be meant; `SectionError`, with what
-    was found, when `throw` and a section is never crossed, too rarely, or an orbit escapes.
+    **Raises** `ValueError` or `TypeError` for invalid input; `SectionError`, with the result, when
+    `throw` and an orbit crosses the section never or too rarely, or escapes.
 
-    **Source** Poincaré 1892; the crossing inside of a step: our own, compare Hénon 1982,
+    **Source** Poincaré 1892; the crossing inside a step: our own, compare Hénon 1982,
     *Physica D* 5, 412.
 
     **Example**
@@ -191,70 +179,57 @@ def poincare_section(
     q, p = start_state(q0, p0)
     if q.ndim == 0 or q.shape[0] == 0:
         raise ValueError(
-            f"q0 and p0 must have the orbits in front, (orbits, …); got shape {q.shape}. Give a "
-            "single start as q0[None], p0[None]."
+            f"q0 and p0 must have the orbits along the first axis, (orbits, …); got shape "
+            f"{q.shape}. Give a single initial condition as q0[None], p0[None]."
         )
-    integrator = _chosen(
-        system, integrator, method=method, root_finder=newton, arithmetic=arithmetic, layout=layout
-    )
     section = Section(g, direction, whole("crossings", crossings), skip)
-    settings = _Settings(system, section, integrator, stop, whole("num_steps", num_steps))
-    epsilon, args, varied = _varied(epsilon, args)
+    settings = _settings(system, section, num_steps, keywords)
+    epsilon, args, varied = _varied(keywords["epsilon"], keywords["args"])
     for name, length in varied.items():
         if length != q.shape[0]:
             raise ValueError(
                 f"{name} must be one number or one for each of the {q.shape[0]} orbits, got "
                 f"{length}."
             )
-    start = (as_scalar("t0", t0, q.dtype), _Varied(q), _Varied(p))
+    start = (as_scalar("t0", keywords["t0"], q.dtype), _Varied(q), _Varied(p))
     h = as_scalar("h", h, q.dtype, zero_allowed=False)
     try:
         found = _orbits(settings, start, h, epsilon, args, q.shape[0])
     except Exception as error:
         if any("called with q0 of shape" in note for note in getattr(error, "__notes__", ())):
             error.add_note(
-                f"(q0 and p0 have the orbits in front: of shape {q.shape} they are {q.shape[0]} "
-                f"orbits of q0 of shape {q.shape[1:]}. Give a single start as q0[None], p0[None].)"
+                f"(q0 and p0 have the orbits along the first axis: shape {q.shape} means "
+                f"{q.shape[0]} orbits with q0 of shape {q.shape[1:]}. Give a single start as "
+                "q0[None], p0[None].)"
             )
         raise
-    return _raise_on_failure(found, crossings, num_steps) if throw else found
+    return _raise_on_failure(found, settings) if keywords["throw"] else found
 
 
 @both_names
+@with_keywords_of(poincare_section)
 def bifurcation(
     system: System,
     q0: Any,
     p0: Any,
     g: Callable[..., Any],
     *,
-    epsilon: Any = 0.0,
-    h: Any,
-    num_steps: int,
     crossings: int = 100,
     skip: int = 100,
-    direction: int = 1,
     follow: bool = False,
-    t0: Any = 0.0,
-    args: PyTree = None,
-    method: Method | None = None,
-    newton: RootSolver | None = None,
-    arithmetic: Arithmetic | None = None,
-    layout: Layout | None = None,
-    integrator: Integrator | None = None,
-    stop: Stop | None = None,
-    throw: bool = True,
+    **keywords: Any,
 ) -> PoincareSection:
-    """What a section shows, after a transient, for each of many ε: a bifurcation diagram.
+    """Bifurcation diagram: section points after a transient, for many values of ε.
 
-    **Arguments** as for `poincare_section`, with one start (q0, p0), and
+    **Arguments** as for `poincare_section`, with one initial condition (q0, p0), and
 
-    - `epsilon`: values, in the order in which they are to be followed. Or another parameter: a
-      `dvi.Axis` in `args`, beside one ε or as many.
-    - `skip`: crossings of the transient; `crossings`: those kept after it.
-    - `follow`: False: every ε from the same start, all of them together. True: each from the state
-      that the run before ended in, so that a branch is followed as far as it is stable; up and
-      down (``epsilon[::-1]``) then show hysteresis. After a run that failed it begins anew from the
-      start.
+    - `epsilon`: values, in the order in which they are followed. Or another parameter: a
+      `dvi.Axis` in `args`, with one ε or as many.
+    - `skip`: crossings of the transient; `crossings`: those stored after it.
+    - `follow`: False: every ε from the same initial condition, all of them together. True: each
+      from the final state of the run before, so that a branch is followed as far as it is stable;
+      up and down (``epsilon[::-1]``) then show hysteresis. After a run that failed it begins again
+      from the initial condition.
 
     **Returns** a `PoincareSection`, an orbit for each ε.
 
@@ -262,36 +237,27 @@ def bifurcation(
     """
     check_system(system)
     q, p = start_state(q0, p0)
-    integrator = _chosen(
-        system, integrator, method=method, root_finder=newton, arithmetic=arithmetic, layout=layout
-    )
-    section = Section(g, direction, whole("crossings", crossings), skip)
-    settings = _Settings(system, section, integrator, stop, whole("num_steps", num_steps))
-    epsilon, args, varied = _varied(epsilon, args)
+    section = Section(g, keywords["direction"], whole("crossings", crossings), skip)
+    settings = _settings(system, section, keywords["num_steps"], keywords)
+    epsilon, args, varied = _varied(keywords["epsilon"], keywords["args"])
     lengths = set(varied.values())
     if len(lengths) != 1 or 0 in lengths:
         raise ValueError(
             "a bifurcation diagram needs something that varies: epsilon as a one-dimensional array "
-            "of values, or a dvi.Axis in args; several go together and must be equally long. Got "
+            "of values, or a dvi.Axis in args; several vary together and must have one length. Got "
             f"{varied if varied else 'one number for each'}."
         )
-    start = (as_scalar("t0", t0, q.dtype), q, p)
-    go = _one_after_another if follow else _orbits
-    found = go(
-        settings,
-        start,
-        as_scalar("h", h, q.dtype, zero_allowed=False),
-        epsilon,
-        args,
-        lengths.pop(),
-    )
-    return _raise_on_failure(found, crossings, num_steps) if throw else found
+    start = (as_scalar("t0", keywords["t0"], q.dtype), q, p)
+    h = as_scalar("h", keywords["h"], q.dtype, zero_allowed=False)
+    compute = _one_after_another if follow else _orbits
+    found = compute(settings, start, h, epsilon, args, lengths.pop())
+    return _raise_on_failure(found, settings) if keywords["throw"] else found
 
 
 def stroboscope(period: float, phase: float = 0.0) -> Callable[..., Any]:
-    """The surface t = phase + k·period, for a section of a driven system with direction 1.
+    """Stroboscopic section of a driven system: the surface t = phase + k·period, direction 1.
 
-    g = sin(2π(t − phase)/period), which grows with time there.
+    g = sin(2π(t − phase)/period), which increases with time there.
 
     **Raises** `ValueError` for a period that is not positive, or a phase that is not finite.
     """
@@ -315,22 +281,22 @@ class Return(WithStatus):
 
 @both_names
 class ReturnMap(eqx.Module):
-    r"""The map of a section g(t, q, p, args) = 0 onto itself.
+    r"""Poincaré map: the map of a section g(t, q, p, args) = 0 onto itself.
 
     ``section_map(q, p, t0=0.0, epsilon=0.0, args=None)`` → `Return`.
 
-    A function of JAX arrays: `jax.jacfwd` of it is the derivative of the return map, the change of
-    the return time included, `vmap` takes many points, `lax.scan` iterates. A point on the section
-    is not its own return.
+    A function of JAX arrays: `jax.jacfwd` gives the derivative of the return map, which includes
+    the change of the return time, `vmap` takes many points, `lax.scan` iterates. A point on the
+    section is not its own return.
 
     **Arguments** `system`, `g`, `direction`, `method`, `newton` and `integrator` as for
     `poincare_section`;
 
-    - `h`, `num_steps`: steps that are taken at most, and always.
+    - `h`, `num_steps`: size and number of the steps, which are always all computed.
     - `returns`: which return, 1 for the first.
 
-    The status is `never_crossed` or `too_few_crossings` where it does not come back within the
-    steps, `failed` where the trajectory fails; the state is then NaN.
+    The status is `never_crossed` or `too_few_crossings` if the orbit does not return within the
+    steps, `failed` if the trajectory fails; the state is then NaN.
     """
 
     system: System
@@ -345,69 +311,66 @@ class ReturnMap(eqx.Module):
 
     def __check_init__(self):
         check_system(self.system)
-        _chosen(self.system, self.integrator, method=self.method, root_finder=self.newton)
-        Section(self.g, self.direction, whole("returns", self.returns))
-        whole("num_steps", self.num_steps)
+        self._settings(6)
+
+    def _settings(self, level: int | None) -> _Settings:
+        section = Section(self.g, self.direction, whole("returns", self.returns))
+        given = dict.fromkeys(INTEGRATOR.split()) | {
+            name: getattr(self, name) for name in ("method", "newton", "integrator")
+        }
+        return _settings(self.system, section, self.num_steps, given, level)
 
     def __call__(
         self, q: Any, p: Any, t0: Any = 0.0, epsilon: Any = 0.0, args: Args = None
     ) -> Return:
-        section = Section(self.g, self.direction, self.returns)
-        integrator = chosen(self.integrator, method=self.method, root_finder=self.newton)
-        settings = _Settings(self.system, section, integrator, None, self.num_steps)
-        sol = settings.run(q, p, self.h, t0, epsilon, args)
-        crossed: Any = sol.observed
-        result = judge(crossed.count, self.returns, sol.result)
-        return Return(crossed.ts[-1], crossed.qs[-1], crossed.ps[-1], result)
+        found, _ = self._settings(None).orbit((t0, q, p), self.h, epsilon, args)
+        return Return(found.ts[-1], found.qs[-1], found.ps[-1], found.result)
+
+
+def _is_axis(x: Any) -> bool:
+    return isinstance(x, Axis)
 
 
 def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
-    """ε and args with `_Varied` for what there is one of for each orbit, and how many there are."""
+    """ε and args with a `_Varied` for what differs between orbits, and the lengths of those."""
     found = {}
 
     def known(name: str, x: Any) -> Any:
-        values = x.values if isinstance(x, Axis) else x
-        values = np.asarray(values) if isinstance(x, Axis) or name == "epsilon" else None
-        if values is None or values.ndim == 0:
+        if np.ndim(x) == 0:
             return as_parameter(x)
-        if values.ndim != 1:
+        if np.ndim(x) != 1:
             raise ValueError(
-                f"{name} must be a number or a one-dimensional array, got shape {values.shape}."
+                f"{name} must be a number or a one-dimensional array, got shape {np.shape(x)}."
             )
-        if not np.isfinite(values).all():
-            raise ValueError(f"{name} must be finite, got {values}.")
-        found[name] = len(values)
-        return _Varied(jnp.asarray(values))
+        if not is_traced(x) and not np.isfinite(x).all():
+            raise ValueError(f"{name} must be finite, got {x}.")
+        found[name] = len(x)
+        return _Varied(jnp.asarray(x))
 
-    def is_axis(x):
-        return isinstance(x, Axis)
-
-    if not is_traced(epsilon):
-        epsilon = known("epsilon", epsilon)
-    elif jnp.ndim(epsilon) == 1:
-        found["epsilon"] = epsilon.shape[0]
-        epsilon = _Varied(epsilon)
+    epsilon = known("epsilon", epsilon.values if _is_axis(epsilon) else epsilon)
     args = jax.tree.map(
-        lambda x: known(x.name, x) if is_axis(x) else as_parameter(x), args, is_leaf=is_axis
+        lambda x: known(x.name, x.values) if _is_axis(x) else as_parameter(x),
+        args,
+        is_leaf=_is_axis,
     )
     return epsilon, args, found
 
 
-def _raise_on_failure(found: PoincareSection, wanted: int, num_steps: int) -> PoincareSection:
+def _raise_on_failure(found: PoincareSection, settings: _Settings) -> PoincareSection:
     fine = found.result == SECTION_RESULTS.successful
     if is_traced(fine):
-        said = "a section was crossed too rarely: with throw=False read the status of each orbit."
-        return eqx.error_if(found, ~jnp.all(fine), said)
+        message = "an orbit has too few crossings: with throw=False read the status of each orbit."
+        return eqx.error_if(found, ~jnp.all(fine), message)
     bad = np.flatnonzero(~np.asarray(fine))
     if not bad.size:
         return found
     i, names = int(bad[0]), np.atleast_1d(found.status)
     text = SECTION_RESULTS[getattr(SECTION_RESULTS, str(names[i]))]
     own = str(np.atleast_1d(status_name(found.run))[i])
+    wanted, num_steps = settings.section.capacity, settings.options["num_steps"]
     raise SectionError(
         f"{bad.size} of {len(names)} orbits did not cross the section {wanted} times in "
         f"{num_steps} steps; the first is orbit {i}, with {int(found.count[i])} crossings: "
-        f"{names[i]} (run: {own}). {text} With throw=False what was found is returned with its "
-        "statuses; here it is the `found` attribute of this error.",
+        f"{names[i]} (run: {own}). {text} {AS_ATTRIBUTE}",
         found,
     )

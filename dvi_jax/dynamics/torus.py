@@ -1,4 +1,4 @@
-"""Fundamental frequencies: the integer combinations that the lines of a torus are."""
+"""Fundamental frequencies of a torus: its lines are their integer combinations."""
 
 import functools
 import itertools
@@ -9,7 +9,7 @@ import numpy as np
 
 from lanewise.jaxapi import is_traced
 
-from .._checks import instance, positive, whole
+from .._checks import finite, instance, positive, whole
 from .frequencies import Frequencies
 from .results import (
     CODE,
@@ -21,30 +21,30 @@ from .results import (
     with_code,
 )
 
-_SHARE = 1e-2
-"""Tolerance of a combination, over the resolution."""
+_TOLERANCE = 1e-2
+"""Default tolerance of a combination, over the resolution."""
 
 _ORDERS = {1: 64, 2: 20, 3: 12, 4: 8, 5: 6}
-"""Largest Σ|k_a| by the number of frequencies; 5 for more: some thousand combinations each."""
+"""Default order by the number of frequencies, 5 for more: some thousand combinations each."""
 
 _SUBSETS = 300
-"""Choices of lines that are tried as a basis."""
+"""Sets of lines that are tried as a basis."""
 
 
 class FundamentalFrequencies(WithStatus):
-    r"""Independent frequencies and the combinations k·ω that the lines are.
+    r"""Independent frequencies ω, and the lines as their integer combinations k·ω.
 
-    - `frequencies`: ω [rad per unit of time], shape (num,); NaN where there are fewer.
+    - `frequencies`: ω [rad per unit of time], shape (num,); NaN if there are fewer.
     - `combinations`: k of every line, integers, shape (n, count, num); zeros where there is no
-      line, or none of the combinations. The n degrees of freedom are those of the state, flattened.
-    - `misfits`: line − k·ω [rad per unit of time], shape (n, count); to the nearest combination
-      where none is within the tolerance, NaN where there is no line.
+      line or no combination matches. n counts the degrees of freedom, all axes of the state.
+    - `misfits`: line − k·ω [rad per unit of time], shape (n, count); for the nearest combination
+      if none is within the tolerance, NaN where there is no line.
     - `matched`: whether it is within the tolerance, shape (n, count).
-    - `unexplained`: share of Σ|A|² in lines that are no combinations, each degree of freedom by
-      itself, the largest of them.
+    - `unexplained`: fraction of Σ|A|² in lines that are not combinations; the largest of the
+      degrees of freedom.
     - `result`: the status, one of `FREQUENCY_RESULTS`.
 
-    Axes of a batch stand in front.
+    The first axes are those of a batch.
     """
 
     frequencies: np.ndarray
@@ -65,48 +65,49 @@ def fundamental_frequencies(
     threshold: float = 1e-3,
     throw: bool = True,
 ) -> FundamentalFrequencies:
-    r"""The independent frequencies of a torus, of whose integer combinations all lines are made.
+    r"""The independent frequencies of a torus, such that all lines are integer combinations.
 
         ω_line = k·ω,    k integers, Σ|k_a| ≤ order
 
-    As a basis the leading lines of the degrees of freedom are tried, then the strongest lines
-    that are no combinations of those before, then other choices among the strong lines; the one
-    that leaves the fewest strong lines unexplained, with the smallest k, is kept. ω is then that
-    of least squares over all lines that are combinations, weighted by their amplitudes. A basis
-    is one of many: ω' = Mω with an integer M of determinant ±1 is another.
+    The sets tried as a basis are the leading lines of the degrees of freedom, then the strongest
+    lines that are not combinations of stronger ones, then other sets of strong lines. The result is
+    the one that leaves the fewest strong lines unexplained, with the smallest k. ω is then fitted
+    by least squares to all lines that are combinations, weighted by their amplitudes. A basis is
+    not unique: ω' = Mω with an integer M of determinant ±1 is another.
 
     **Arguments**
 
-    - `lines`: what `frequencies` returned, shape (*batch, *state, count): each entry of the batch
-      is a trajectory, the n entries of its state are its degrees of freedom. A `Solution` brings
-      both; of signals that were given as arrays the last axis before count is the state, and what
-      `vmap` adds is batch. To take one trajectory out, index the axes of the batch alone.
-    - `num`: how many frequencies there are, by default n. Fewer for a chain whose centre of mass
-      moves freely, or a degenerate system.
+    - `lines`: the result of `frequencies`, shape (*batch, *state, count): each entry of the batch
+      is a trajectory, the n entries of its state are its degrees of freedom. For a `Solution` both
+      are known; for signals given as arrays the last axis before count is the state, and axes
+      added by `vmap` are batch. To select one trajectory, index the axes of the batch only.
+    - `num`: number of frequencies, by default n. Fewer for a chain whose centre of mass moves
+      freely, or a degenerate system.
     - `guess`: frequencies, shape (num,), good to half the resolution, to be used as the basis.
     - `order`: largest Σ|k_a|; by default 64, 20, 12, 8, 6 for num = 1 … 5, then 5.
     - `tolerance`: of line − k·ω [rad per unit of time]; by default a hundredth of the resolution.
-    - `threshold`: amplitude, over that of the leading line of its degree of freedom, from which
-      on a line counts as strong: it can be part of a basis, and has to be a combination.
+    - `threshold`: least amplitude of a strong line, over that of the leading line of its degree of
+      freedom. Strong lines can be part of a basis, and must be combinations.
     - `throw`: raise if a trajectory has another status than `successful`.
 
-    On the host, in NumPy: not under jit or vmap.
+    It runs on the CPU, in NumPy: not under jit or vmap.
 
     **Returns** a `FundamentalFrequencies`, with the status `resonant` if there are fewer than num
-    independent frequencies, `not_quasi_periodic` if a strong line is no combination, or the status
-    of a degree of freedom whose analysis failed; one without signal only adds no lines.
+    independent frequencies, `not_quasi_periodic` if a strong line is not a combination, or the
+    status of a degree of freedom whose analysis failed. One with `no_signal` has no lines, and does
+    not change the status.
 
-    **Raises** `ValueError` for arguments that cannot be meant; `FrequencyError` if `throw` is True.
+    **Raises** `ValueError` for invalid arguments; `FrequencyError` if `throw` is True.
 
     **Source** the procedure of Laskar 1990, *Icarus* 88, 266, with our own choice of a basis.
     """
     hint = "dvi.fundamental_frequencies(dvi.frequencies(solution))."
-    instance("lines", lines, Frequencies, "what dvi.frequencies returned", hint)
+    instance("lines", lines, Frequencies, "a result of dvi.frequencies", hint)
     if is_traced(lines.frequencies):
-        raise ValueError("integer combinations are found on the host: not under jit or vmap.")
+        raise ValueError("integer combinations are found on the CPU, not under jit or vmap.")
     omega, A = np.asarray(lines.frequencies), np.asarray(lines.amplitudes)
     code, resolution = np.asarray(code_of(lines.result)), np.asarray(lines.resolution)
-    axes = min(lines.state_axes, omega.ndim - 1)  # of a single degree of freedom, taken out
+    axes = min(lines.state_axes, omega.ndim - 1)  # fewer if one degree of freedom was selected
     lead, state = omega.shape[: omega.ndim - 1 - axes], omega.shape[omega.ndim - 1 - axes : -1]
     shape = (*lead, math.prod(state))
     omega, A = (x.reshape(*shape, x.shape[-1]) for x in (omega, A))
@@ -118,7 +119,7 @@ def fundamental_frequencies(
 
 
 class Search(NamedTuple):
-    """What is asked for, and the combinations that are tried, the simplest first."""
+    """Number of frequencies and limits of the search."""
 
     num: int
     order: int
@@ -139,15 +140,12 @@ def search_of(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshol
     if n == 0:
         raise ValueError("a torus needs at least one degree of freedom, got lines of none.")
     if guess is not None:
-        try:
-            guess = np.atleast_1d(np.asarray(guess, float))
-        except (TypeError, ValueError):
-            raise ValueError(f"guess must hold finite frequencies, got {guess!r}.") from None
+        guess = np.array([finite("each frequency of guess", x) for x in np.atleast_1d(guess)])
     if num is None:
         num = n if guess is None else len(guess)
     num = whole("num", num, hint="It is the number of frequencies.")
-    if guess is not None and (guess.shape != (num,) or not np.isfinite(guess).all()):
-        raise ValueError(f"guess must hold {num} finite frequencies, got {guess}.")
+    if guess is not None and len(guess) != num:
+        raise ValueError(f"guess must hold num = {num} frequencies, got {guess}.")
     order = _ORDERS.get(num, 5) if order is None else whole("order", order, hint="It is Σ|k|.")
     tolerance = None if tolerance is None else positive("tolerance", tolerance)
     fraction = "It is a fraction of the leading amplitude."
@@ -159,7 +157,10 @@ def search_of(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshol
 def tori_of(
     omega, A, code, resolution, search: Search, soft: bool
 ) -> tuple[list[_Torus], np.ndarray]:
-    """Of every trajectory the torus, and the code of its status; `soft`: a line in doubt counts."""
+    """The torus of every trajectory, and the code of its status.
+
+    `soft`: the status of an analysis with unresolved lines is that of the torus too.
+    """
     n, count = omega.shape[-2:]
     M = math.prod(omega.shape[:-2])
     lines = (x.reshape(M, n, count) for x in (omega, A))
@@ -172,7 +173,7 @@ def tori_of(
             tori.append(_nothing(n, count, search.num))
             codes.append(status[hard][0] if hard.any() else CODE["no_signal"])
             continue
-        tolerance = _SHARE * width.max() if search.tolerance is None else search.tolerance
+        tolerance = _TOLERANCE * width.max() if search.tolerance is None else search.tolerance
         torus, problem = _torus(nu, np.abs(a), width.max(), tolerance, search)
         doubt = status[(status != 0) & ~silent]
         tori.append(torus)
@@ -187,7 +188,7 @@ def _nothing(n: int, count: int, num: int) -> _Torus:
 
 
 def _torus(nu, size, resolution, tolerance, search: Search) -> tuple[_Torus, str]:
-    """The best basis, with every line in it, and the name of the status."""
+    """The torus with the best basis, and the name of its status."""
     n, count = nu.shape
     there = np.isfinite(nu)
     lead = np.nanmax(np.where(there, size, 0.0), axis=1, keepdims=True)
@@ -204,7 +205,7 @@ def _torus(nu, size, resolution, tolerance, search: Search) -> tuple[_Torus, str
         ):
             best, best_score = basis, score
         if best_score[0] == 0 and len(basis) < search.num:
-            break  # all lines are explained by fewer
+            break  # fewer frequencies explain all lines
     known = np.where(there, nu, np.inf)
     lattice = combinations_up_to(len(best), search.order)
     k, misfit, matched = _match(best, known.ravel(), tolerance, lattice)
@@ -227,7 +228,7 @@ def _torus(nu, size, resolution, tolerance, search: Search) -> tuple[_Torus, str
 
 
 def _bases(nu, strong, resolution, tolerance, search: Search):
-    """Choices of frequencies to count in, the most natural first."""
+    """Sets of frequencies that may be a basis, the most natural first."""
     num, order = search.num, search.order
     if search.guess is not None:
         low = combinations_up_to(num, 4)
@@ -262,7 +263,7 @@ def _independent(basis: np.ndarray, tolerance: float, order: int) -> bool:
 
 
 def _fitted(basis, lines, weight, tolerance, order):
-    """Least squares of the basis over the lines that are its combinations, twice."""
+    """Fit the basis to the lines that are its combinations, by least squares, twice."""
     lattice = combinations_up_to(len(basis), order)
     for _ in range(2):
         k, _, matched = _match(basis, lines, tolerance, lattice)
@@ -305,7 +306,7 @@ def gathered(
 ) -> FundamentalFrequencies:
     """The tori of a batch of lines of this shape, (*batch, n, count)."""
     lead, n, count = shape[:-2], *shape[-2:]
-    some = tori or [_nothing(n, count, num)]  # an empty batch has shapes and types too
+    some = tori or [_nothing(n, count, num)]  # for the shapes and types of an empty batch
     parts = (np.stack(part)[: len(tori)] for part in zip(*some, strict=True))
     parts = (x.reshape((*lead, *x.shape[1:])) for x in parts)
     return FundamentalFrequencies(*parts, result=with_code(codes.reshape(lead)))

@@ -1,4 +1,4 @@
-"""Many trajectories: grids of ε × initial conditions × parameters, kept and resumed."""
+"""Many trajectories: grids of ε × initial conditions × parameters, stored and resumed."""
 
 from . import starts as starts
 from ._sweep import SweepInterrupted as SweepInterrupted, sweep as sweep, sweep_cost as sweep_cost

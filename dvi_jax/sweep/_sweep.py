@@ -8,42 +8,38 @@ from typing import Any
 import jax
 import numpy as np
 
-from lanewise import Layout
 from lanewise.jaxapi import x64_enabled
 
-from .._arithmetic import Arithmetic
 from .._checks import instance, whole
-from .._integrator import Integrator, chosen
+from .._integrate import integrate
+from .._integrator import chosen
 from .._memory import machine_memory
-from .._solution import Save
 from .._system import System, check_system
+from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
 from ..engine.names import both_names
-from ..engine.newton import RootSolver
 from ..lattices import Given, Lattice
 from ..methods import Method
-from ..observe import Stop
-from .axes import Axis, as_axis, is_axis, leaves_with_axes, lengths
+from .axes import Axis, as_axis, axes_in, is_axis, lengths
 from .bar import shown
 from .cost import SweepCost, cost
 from .identity import description, digest, provenance
 from .plan import make_plan
 from .program import Program, Sweep, traced
 from .result import SweepResult
-from .sinks import Memory
 from .starts import Starts
-from .store import Store
+from .store import Memory, Store
 from .variables import RESERVED, check_names, own_dims, variables
 from .workers import SweepProgress, run_here
 
 _SHARE = 0.5
-"""Of the memory of the machine, for results that are kept there."""
+"""Fraction of the memory of the machine that results in memory may take."""
 
 _MANY_STARTS = 100_000
-"""Starts up to which they are written into the result."""
+"""Number of initial conditions up to which they are written into the result."""
 
 
 class SweepInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a sweep: what was finished is in `result`, and in the store if there is one."""
+    """Ctrl-C during a sweep. `result` has the finished tasks, as has the store if there is one."""
 
     def __init__(self, message: str, result: SweepResult):
         super().__init__(message)
@@ -51,71 +47,59 @@ class SweepInterrupted(KeyboardInterrupt):
 
 
 @both_names
+@with_keywords_of(
+    integrate, f"h num_steps t0 epsilon args {INTEGRATOR} observe stop", start=None, save=None
+)
 def sweep(
     system: System,
     q0: Any = None,
     p0: Any = None,
     *,
-    start: Starts | None = None,
-    h: Any = None,
-    num_steps: Any = None,
-    t0: Any = 0.0,
-    epsilon: Any = 0.0,
-    args: Any = None,
-    method: Any = None,
-    lattice: Lattice | None = None,
-    save: Save | None = None,
-    observe: Any = None,
     units: Mapping[str, str] | None = None,
-    newton: RootSolver | None = None,
-    arithmetic: Arithmetic | None = None,
-    layout: Layout | None = None,
-    integrator: Integrator | None = None,
-    stop: Stop | None = None,
     store: str | os.PathLike | None = None,
     client: Any = None,
     threads: int | None = None,
     lanes_per_task: int | None = None,
     progress: bool | Callable[[SweepProgress], None] | None = None,
+    **settings: Any,
 ) -> SweepResult:
     """Trajectories over a grid of ε, initial conditions, parameters, steps and methods.
 
     ``dvi.sweep(system, q0, p0, epsilon=np.geomspace(1e-4, 1e-1, 20), h=0.1, num_steps=10_000,
     observe={"drift": dvi.MaxDrift(energy)}).to_xarray()`` is a labelled array of 20 drifts.
 
-    The grid is cut into tasks of one shape, which run on all processors or GPUs of this machine.
-    Results do not depend on how many there are, nor on when a run was interrupted: not in one bit.
+    The grid is divided into tasks of one shape, which run on all processors or GPUs of this
+    machine. Results are bit-for-bit independent of the number of workers and of interruptions.
 
     **What varies.** Any number in epsilon, h, t0, q0, p0 and args may be an `Axis`; for epsilon, h
-    and t0 a one-dimensional array is one, of that name. Axes of different names make a grid, of one
-    name they go together. `start` generates initial conditions: `Random`, `Halton`, `Normal`,
-    `EnergyShell` in `dvi.starts`. An `Axis` of a list may stand for `method` (or simply the list;
-    the dimension is then "integrator") and for `num_steps`, e.g. together with h; each value is
-    compiled.
+    and t0 a one-dimensional array is an axis of that name. Axes of different names make a grid,
+    those of one name vary together. `start` generates initial conditions: `Random`, `Halton`,
+    `Normal`, `EnergyShell` in `dvi.starts`. `method` and `num_steps` may be an `Axis` of a list, or
+    simply a list (for `method` the dimension is then "integrator"); each value is compiled.
 
     **Arguments** otherwise as for `integrate`, and
 
-    - `observe`: pytree of observables and reductions. `save`: which states are kept; None: none.
+    - `observe`: pytree of observables and reductions. `save`: which states are stored; None: none.
     - `units`: of observables (and of t, q, p), name → text, for labels; those of a store are given
       when it is made.
-    - `store`: a directory. Each task is written there when it is done; the same call again goes on
-      where a former one ended, however it ended. Several processes may work on one store. Without
-      one the results stay in memory.
-    - `client`: a `distributed.Client`: its workers compute the tasks, and write them where there is
-      a store, which all of them must see under the same path.
+    - `store`: a directory. Each task is written there when it is done; the same call again resumes
+      an interrupted sweep. Several processes may work on one store. Without one the results stay
+      in memory.
+    - `client`: a `distributed.Client`: its workers compute the tasks. If there is a store they
+      write them there; all of them must see it under the same path.
     - `threads`: of this process; None: one for each processor, or GPU.
     - `lanes_per_task`: trajectories at a time; None: chosen from the number of steps.
-    - `progress`: True or False for a bar; a function of a `SweepProgress`; None: a bar where
-      somebody looks.
+    - `progress`: True or False for a bar; a function of a `SweepProgress`; None: a bar if stderr is
+      a terminal.
 
-    A trajectory that fails has a status and NaN, and its neighbours are as they were.
+    Failed trajectories are NaN with a status; other trajectories are unaffected.
 
     **Returns** a `SweepResult`.
 
-    **Raises** `ValueError` or `TypeError` for input that cannot be meant; `StoreMismatch` for a
-    store of another sweep, with what differs, and `StoreError` for one that cannot be used;
-    `ClusterError` for a cluster that is lost;
-    `SweepInterrupted`, a `KeyboardInterrupt`, after Ctrl-C, with what was finished.
+    **Raises** `ValueError` or `TypeError` for invalid input; `StoreMismatch` for a store of another
+    sweep, with the differences, and `StoreError` for one that cannot be used; `ClusterError` for a
+    cluster that is lost; `SweepInterrupted`, a `KeyboardInterrupt`, after Ctrl-C, with the finished
+    tasks.
 
     **Example**
 
@@ -128,17 +112,12 @@ def sweep(
     # {'epsilon': 3, 'p_x': 2} {'successful': 6}
     ```
     """
-    made = make_sweep(
-        system, q0, p0, start=start, h=h, num_steps=num_steps, t0=t0, epsilon=epsilon, args=args,
-        method=method, lattice=lattice, save=save, observe=observe, newton=newton,
-        arithmetic=arithmetic, layout=layout, integrator=integrator, stop=stop,
-    )  # fmt: skip
-    program, found, programs = prepare(made, lanes_per_task)
-    coordinates = coordinates_of(made)
+    program, found, programs = prepare(system, q0, p0, settings, lanes_per_task)
+    made, coordinates = program.sweep, coordinates_of(program.sweep)
     check_names(made.dims, found, coordinates)
     about: dict[str, Any] = provenance()
-    if beside := [name for name in coordinates if name not in made.dims]:
-        about["coordinates"] = " ".join(beside)  # what a reader by CF looks for
+    if auxiliary := [name for name in coordinates if name not in made.dims]:
+        about["coordinates"] = " ".join(auxiliary)  # the attribute of the CF conventions
     if units is not None:
         _check_units(units, found)
         about["units"] = json.dumps(dict(units))
@@ -147,16 +126,23 @@ def sweep(
     if threads is not None:
         whole("threads", threads)
         if client is not None:
-            raise ValueError("threads are of this process: with a client its workers have theirs.")
+            raise ValueError("threads are those of this process: leave them out with a client.")
     config = description(made, program.plan, found, programs)
     if store is None:
-        _check_memory(program.plan.lanes * sum(v.bytes for v in found.values()))
-        sink: Any = Memory(program.plan, found)
+        needed = program.plan.lanes * sum(v.bytes for v in found.values())
+        there = machine_memory() or 8 * 2**30
+        if needed > _SHARE * there:
+            raise ValueError(
+                f"the results need {needed / 2**30:.1f} GiB of memory, and this machine has "
+                f"{there / 2**30:.1f} GiB: give store=..., a directory; then only one task at a "
+                "time is in memory."
+            )
+        sink = Memory(program.plan, found)
         about |= {"config": json.dumps(config), "config_sha256": digest(config)}
     else:
         instance("store", store, str | os.PathLike, "the path of a directory or None")
         sink = Store.open_or_make(store, config, found, coordinates, about)
-        about = sink.attributes
+        about = dict(sink.attributes)
     result = SweepResult(sink, coordinates, about)
     with shown(progress) as report:
         if client is not None:
@@ -174,26 +160,19 @@ def sweep(
     return result
 
 
-def sweep_cost(
-    system: System,
-    q0: Any = None,
-    p0: Any = None,
-    *,
-    lanes_per_task: int | None = None,
-    **settings: Any,
-) -> SweepCost:
-    """What `sweep` would take with these arguments: tasks, bytes, seconds; with tables for larger
-    ones. One task for each method and number of steps is computed for it and timed.
+@both_names
+@with_keywords_of(sweep)
+def sweep_cost(system: System, q0: Any = None, p0: Any = None, **settings: Any) -> SweepCost:
+    """Estimate the cost of a `sweep` with these arguments: tasks, bytes, seconds; with tables for
+    larger ones. One task for each method and number of steps is computed for it and timed.
 
-    **Arguments** as for `sweep`; `store`, `client`, `threads` and `progress` are not needed.
+    **Arguments** as for `sweep`; `store`, `client`, `threads`, `progress` and `units` have no
+    effect.
 
-    **Returns** a `SweepCost`. **Raises** as `sweep` for input that cannot be meant.
+    **Returns** a `SweepCost`. **Raises** as `sweep` for invalid input.
     """
-    for name in ("store", "client", "threads", "progress", "units"):
-        settings.pop(name, None)
-    made = make_sweep(system, q0, p0, **settings)
-    program, found, _ = prepare(made, lanes_per_task)
-    return cost(made, program.plan, found)
+    program, found, _ = prepare(system, q0, p0, settings, settings["lanes_per_task"])
+    return cost(program.sweep, program.plan, found)
 
 
 def _check_units(units: Any, found: Mapping[str, Any]) -> None:
@@ -201,90 +180,83 @@ def _check_units(units: Any, found: Mapping[str, Any]) -> None:
         raise TypeError(f'units must be a table such as {{"drift": "J"}}, got {units!r}.')
     if unknown := [name for name in units if name not in found]:
         raise ValueError(
-            f"units are given for {unknown[0]!r}, which is none of the results: {', '.join(found)}."
+            f"units are given for {unknown[0]!r}, which is not a result. Results are "
+            f"{', '.join(found)}."
         )
 
 
-def make_sweep(
-    system: Any,
-    q0: Any,
-    p0: Any,
-    *,
-    start: Any = None,
-    h: Any = None,
-    num_steps: Any = None,
-    t0: Any = 0.0,
-    epsilon: Any = 0.0,
-    args: Any = None,
-    method: Any = None,
-    integrator: Integrator | None = None,
-    newton: RootSolver | None = None,
-    save: Save | None = None,
-    observe: Any = None,
-    stop: Stop | None = None,
-    **of_integrator: Any,
-) -> Sweep:
-    """The sweep that these arguments of `sweep` describe, checked."""
+def prepare(
+    system: Any, q0: Any, p0: Any, settings: dict[str, Any], lanes_per_task: int | None = None
+) -> tuple[Program, dict[str, Any], list[Any]]:
+    """The program of the sweep that these arguments describe, divided into tasks, the variables of
+    its result, and the jaxprs."""
+    made = _make_sweep(system, q0, p0, settings)
+    shapes, programs = traced(made)
+    found = variables(made, shapes)
+    size = sum(v.bytes for v in found.values())
+    plan = make_plan(made.dims, made.compiled, made.most_steps, size, lanes_per_task)
+    return Program(made, plan), found, programs
+
+
+def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
     check_system(system)
-    given = {"epsilon": epsilon, "h": h, "t0": t0}
-    inputs = {name: as_axis(name, _number(value)) for name, value in given.items()}
-    inputs |= {"args": args, **_states(q0, p0, start)}
-    if observe is None and save is None:
+    # Integers would make a program of their own.
+    numbers = {n: float(x) if type(x := given[n]) is int else x for n in ("epsilon", "h", "t0")}
+    inputs = {name: as_axis(name, value) for name, value in numbers.items()}
+    inputs |= {"args": given["args"], **_states(q0, p0, given["start"])}
+    if given["observe"] is None and given["save"] is None:
         raise ValueError(
-            "nothing would be kept: give observe={...}, or save=dvi.Save(final=True) for the last "
+            "nothing to store: pass observe={...}, or save=dvi.Save(final=True) to store the final "
             "states."
         )
-    varied = is_axis(method) or isinstance(method, list | tuple)
-    of_integrator |= {"root_finder": newton, "method": None if varied else method}
-    integrator = chosen(integrator, **of_integrator)
-    method = _static("method", method if varied else integrator.method_for(system), Method)
-    num_steps = _static("num_steps", num_steps, int | np.integer)
-    leaves = leaves_with_axes(inputs)
+    start, of_integrator = given["start"], taken(dict(given), INTEGRATOR)
+    # The name of the axis is not "method", which has another meaning in xarray's sel.
+    method: Any = _as_axis_of_list("integrator", of_integrator.pop("method"))
+    num_steps = _as_axis_of_list("num_steps", given["num_steps"])
+    integrator = chosen(**of_integrator, method=None if is_axis(method) else method)
+    for x in method.values if is_axis(method) else ():
+        instance(f"each value of the axis {method.name!r} of method", x, Method, "a dvi.Method")
+    method = method if is_axis(method) else integrator.method_for(system)
     compiled = [
         (x.name, len(x), where)
         for where, x in (("method", method), ("num_steps", num_steps))
         if is_axis(x)
     ]
-    axes = [*compiled, *((leaf.axis.name, len(leaf.axis), leaf.name) for leaf in leaves)]
+    axes = [*compiled, *((x.name, len(x), where) for where, x in axes_in(inputs))]
     if start is not None:
-        Axis(start.name, [0])  # raises for a name that is no identifier
+        Axis(start.name, [0])  # raises for a name that is not an identifier
         if start.name in (name for name, *_ in axes):
-            raise ValueError(f"the name {start.name!r} of the start is that of an axis too.")
+            raise ValueError(f"the name {start.name!r} of the start is also that of an axis.")
         axes.append((start.name, start.count, "start"))
     dims = lengths(axes)
     _check_dims(dims)
     _check_steps(num_steps, integrator.lattice, inputs)
-    options = {
-        "save": save,
-        "observe": observe,
-        "stop": stop,
+    options = {name: given[name] for name in ("save", "observe", "stop")} | {
         "lattice": integrator.lattice,
         "newton": integrator.root_finder,
         "arithmetic": integrator.arithmetic,
         "layout": integrator.layout,
     }
-    count = len({name for name, *_ in compiled})
-    return Sweep(system, inputs, start, method, num_steps, options, dims, count)
+    separate = len({name for name, *_ in compiled})
+    return Sweep(system, inputs, start, method, num_steps, options, dims, separate)
 
 
 def _states(q0: Any, p0: Any, start: Any) -> dict[str, Any]:
     """q0 and p0, unless they come from a `start`."""
-    if start is None:
-        if q0 is None or p0 is None:
-            raise ValueError("give q0 and p0, or start=dvi.starts.Random(...) or another of those.")
+    if start is not None:
+        hint = 'For your own states use q0=dvi.Axis("start", ...), p0=dvi.Axis("start", ...).'
+        instance("start", start, Starts, "one of dvi.starts, such as Random(...)", hint)
+        if q0 is None and p0 is None:
+            return {}
+    elif q0 is not None and p0 is not None:
         return {"q0": q0, "p0": p0}
-    if q0 is not None or p0 is not None:
-        raise ValueError("give q0 and p0 or a start, not both.")
-    hint = 'States of your own are q0=dvi.Axis("start", ...), p0=dvi.Axis("start", ...).'
-    instance("start", start, Starts, "one of dvi.starts, such as Random(...)", hint)
-    return {}
+    raise ValueError("give either q0 and p0, or start=dvi.starts.Random(...) or another of those.")
 
 
 def _check_dims(dims: Mapping[str, int]) -> None:
-    if taken := [name for name in dims if name in RESERVED]:
+    if bad := [name for name in dims if name in RESERVED]:
         raise ValueError(
-            f"the axis {taken[0]!r} has a name that the result needs for something else "
-            f"({', '.join(RESERVED)}): give it another."
+            f"the axis {bad[0]!r} has a name that is reserved ({', '.join(RESERVED)}): rename it."
         )
     if not dims:
         raise ValueError(
@@ -293,51 +265,32 @@ def _check_dims(dims: Mapping[str, int]) -> None:
         )
     if not x64_enabled() and max(dims.values()) >= 2**31:
         raise ValueError(
-            "more than 2³¹ values along one axis are counted with 64 bits: put\n"
+            "more than 2³¹ values along one axis need 64-bit indices: put\n"
             '    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
         )
 
 
 def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) -> None:
     if isinstance(lattice, Given):
-        if num_steps is not None:
-            raise ValueError("the times of dvi.Given are the steps: leave num_steps out.")
-        if any(is_axis(inputs[name]) for name in ("h", "t0")):
-            raise ValueError("the times of dvi.Given replace h and t0: there is no axis of them.")
+        if num_steps is not None or any(is_axis(inputs[name]) for name in ("h", "t0")):
+            raise ValueError(
+                "the times of dvi.Given replace h, t0 and num_steps: leave them out. They cannot "
+                "be axes."
+            )
     elif num_steps is None:
-        raise ValueError("num_steps is missing: how many steps each trajectory takes.")
-    elif any(n < 1 for n in (num_steps.values if is_axis(num_steps) else [num_steps])):
-        raise ValueError(f"num_steps must be at least 1, got {num_steps!r}.")
+        raise ValueError("num_steps is missing: the number of steps of each trajectory.")
+    else:
+        for n in num_steps.values if is_axis(num_steps) else [num_steps]:
+            whole("num_steps", n)
 
 
-def _number(value: Any) -> Any:
-    """A whole number of Python's as the number that it is."""
-    return float(value) if type(value) is int else value
-
-
-def _static(name: str, value: Any, kind: Any) -> Any:
-    """One value, or an axis of values that are compiled one by one."""
-    if isinstance(value, list | tuple):
-        # Not "method", which xarray's sel takes for something else.
-        value = Axis({"method": "integrator"}.get(name, name), value)
-    for x in value.values if is_axis(value) else ():
-        if isinstance(x, bool) or not isinstance(x, kind):
-            raise TypeError(f"the axis {value.name!r} of {name} holds {x!r}, which is none.")
-    return value
-
-
-def prepare(made: Sweep, lanes_per_task: int | None) -> tuple[Program, dict[str, Any], list[Any]]:
-    """The program of a sweep, cut into tasks, the variables of its result, and the jaxprs."""
-    shapes, programs = traced(made)
-    found = variables(made, shapes)
-    size = sum(v.bytes for v in found.values())
-    plan = make_plan(made.dims, made.compiled, made.most_steps, size, lanes_per_task)
-    return Program(made, plan), found, programs
+def _as_axis_of_list(name: str, value: Any) -> Any:
+    return Axis(name, value) if isinstance(value, list | tuple) else value
 
 
 def coordinates_of(made: Sweep) -> dict[str, Any]:
-    """name → (dims, values, attributes). Where one argument alone runs along a dimension, its
-    values are the dimension's; else they stand beside it under the argument's name."""
+    """name → (dims, values, attributes). If only one argument varies along a dimension, its values
+    are those of the dimension; otherwise each argument is a coordinate of its own name."""
     found: dict[str, Any] = {}
     along: dict[str, dict[str, tuple[np.ndarray, str]]] = {dim: {} for dim in made.dims}
     if is_axis(made.method):
@@ -345,8 +298,8 @@ def coordinates_of(made: Sweep) -> dict[str, Any]:
         along[made.method.name]["method"] = names, ""
     if is_axis(made.num_steps):
         along[made.num_steps.name]["num_steps"] = np.asarray(made.num_steps.values), "steps"
-    for leaf in leaves_with_axes(made.inputs):
-        along[leaf.axis.name][leaf.name] = leaf.axis.values, leaf.axis.units
+    for where, axis in axes_in(made.inputs):
+        along[axis.name][where] = axis.values, axis.units
     for dim, arguments in along.items():
         rows = [name for name, (values, _) in arguments.items() if values.ndim == 1]
         main = dim if dim in rows else rows[0] if len(rows) == 1 else None
@@ -356,27 +309,10 @@ def coordinates_of(made: Sweep) -> dict[str, Any]:
             own = own_dims("component" if name in ("q0", "p0") else f"{name}_dim", values.shape[1:])
             about = {"units": units} if units else {}
             found[dim if name == main else name] = ((dim, *own), values, about)
-    if made.start is not None and made.start.count <= _MANY_STARTS:
-        states = _starts(made)
-        for name, x in zip(("q0", "p0"), states, strict=False):  # none where they vary
-            found[name] = ((made.start.name, *own_dims("component", x.shape[1:])), x, {})
-    return found
-
-
-def _starts(made: Sweep) -> list[np.ndarray]:
-    """All starts, where they do not depend on what else varies."""
     start, of = made.start, (made.inputs["t0"], made.inputs["args"])
-    if start is None or any(map(is_axis, jax.tree.leaves(of, is_leaf=is_axis))):
-        return []
-    at = jax.jit(jax.vmap(lambda i: start.at(i, *of)))
-    return [np.asarray(x) for x in at(np.arange(start.count))]
-
-
-def _check_memory(needed: int) -> None:
-    there = machine_memory() or 8 * 2**30
-    if needed > _SHARE * there:
-        raise ValueError(
-            f"the results need {needed / 2**30:.1f} GiB of memory, and this machine has "
-            f"{there / 2**30:.1f} GiB: give store=..., a directory, of which one task at a time is "
-            "in memory."
-        )
+    vary = any(map(is_axis, jax.tree.leaves(of, is_leaf=is_axis)))  # with another axis
+    if start is not None and start.count <= _MANY_STARTS and not vary:
+        states = jax.jit(jax.vmap(lambda i: start.at(i, *of)))(np.arange(start.count))
+        for name, x in zip(("q0", "p0"), map(np.asarray, states), strict=True):
+            found[name] = ((start.name, *own_dims("component", x.shape[1:])), x, {})
+    return found

@@ -20,5 +20,5 @@ def _columns(p: SweepProgress) -> dict[str, Any]:
 
 
 def shown(progress: Any) -> Any:
-    """A context whose value takes a `SweepProgress`: the user's function, a bar's, or None."""
+    """A context whose value is called with a `SweepProgress`, or is None."""
     return told(progress, bar_of("sweep", ("done", "rate", "failed", "left"), _columns))

@@ -1,4 +1,4 @@
-"""Which worker does a task: one byte of a file is locked for each task that somebody does."""
+"""Claims of tasks: while a process computes a task, it locks one byte of a file."""
 
 import contextlib
 import errno
@@ -9,16 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from .sinks import as_store_error
+from .layout import as_store_error
 
 fcntl: Any = None
-with contextlib.suppress(ImportError):  # Windows: processes there do not divide a sweep
+with contextlib.suppress(ImportError):  # on Windows processes do not share the tasks of a sweep
     import fcntl
 
 _lock = threading.Lock()
+# Never closed: a process that closes a file releases all its locks on it.
 _handles: dict[Path, int] = {}
-"""Never closed: a process that closes a file releases all its locks on it."""
-
+# The locks are those of a process; its threads see each other's claims here.
 _mine: set[tuple[Path, int]] = set()
 
 
@@ -26,8 +26,7 @@ _mine: set[tuple[Path, int]] = set()
 def claim(file: Path, number: int) -> Iterator[bool]:
     """Whether nobody else holds this number, for as long as the context lasts.
 
-    The system releases the locks of a process that dies; threads of one process see each other in
-    `_mine`.
+    The operating system releases the locks of a process that dies.
     """
     key = (file.resolve(), number)
     with _lock:
@@ -46,10 +45,7 @@ def claim(file: Path, number: int) -> Iterator[bool]:
 
 def _lock_byte(file: Path, number: int) -> bool:
     """Whether this process could lock a byte. True, with a warning, where the file system has no
-    locks: tasks may then be done twice, in the same bits.
-
-    **Raises** `StoreError` for a file that cannot be opened.
-    """
+    locks: tasks may then be computed twice, with the same bits."""
     if fcntl is None:
         return True
     if file not in _handles:
@@ -58,11 +54,11 @@ def _lock_byte(file: Path, number: int) -> bool:
     try:
         fcntl.lockf(_handles[file], fcntl.LOCK_EX | fcntl.LOCK_NB, 1, number)
     except OSError as error:
-        if error.errno in (errno.EACCES, errno.EAGAIN):  # it is another's
+        if error.errno in (errno.EACCES, errno.EAGAIN):  # another process holds it
             return False
         warnings.warn(
             f"{file.parent}: tasks cannot be claimed here ({error.strerror or error}): several "
-            "processes on this store may do the same tasks.",
+            "processes on this store may compute the same tasks.",
             stacklevel=2,
         )
     return True

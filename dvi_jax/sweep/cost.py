@@ -1,11 +1,10 @@
-"""What a sweep will take: tasks, bytes and seconds, from one task that is computed."""
+"""Estimates of tasks, bytes and seconds of a sweep, from one task that is computed."""
 
 import dataclasses
+import math
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
-
-import numpy as np
 
 from .plan import Plan
 from .program import Program, Sweep
@@ -13,22 +12,22 @@ from .variables import Variable
 from .workers import default_threads
 
 SECONDS_TO_COMMIT = 0.02
-"""To write a task, at least: files are forced to the disk one after the other. The directory of a
-cluster may take longer."""
+"""Time to write a task, at least: files are forced to the disk one after the other. The directory
+of a cluster may take longer."""
 
 LONG = 2.0
-"""Seconds of a task from which on one more measurement is not worth the waiting."""
+"""Seconds of a task above which it is not measured a third time."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SweepCost:
-    """What a sweep takes.
+    """Estimated cost of a sweep.
 
     - `dims`: of the grid. `lanes`: trajectories. `steps`: of all trajectories together.
-    - `tasks`, `lanes_per_task`: pieces that are computed, written and lost together.
+    - `tasks`, `lanes_per_task`: units of work, whose trajectories are computed and stored together.
     - `bytes`: of the results, before compression. `files`: of a store.
     - `seconds_per_step`: of one trajectory, on one core or GPU, measured (the mean over methods).
-    - `compilation`: seconds until the first task was there, less those of computing it.
+    - `compilation`: seconds until the first task was done, less the time of computing it.
     - `seconds_per_task`: of the one measured. `cores`: that this process would use.
     """
 
@@ -46,16 +45,16 @@ class SweepCost:
     cores: int
 
     def seconds(self, workers: int | None = None) -> float:
-        """Until the last task is done on so many cores (or GPUs), those of this machine if None.
+        """Time until the last task is done on so many cores or GPUs; None: those of this machine.
 
-        Tasks go round in turns: ⌈tasks/workers⌉ of them one after the other, and compilation once.
+        The time of ⌈tasks/workers⌉ tasks, one after the other, and of one compilation.
         """
         workers = workers or self.cores
         each = max(self.steps * self.seconds_per_step / self.tasks, SECONDS_TO_COMMIT)
         return self.compilation + -(-self.tasks // workers) * each
 
     def scaled(self, lanes: float) -> "SweepCost":
-        """The same with another number of trajectories, in tasks of the same size."""
+        """The cost of another number of trajectories, in tasks of the same size."""
         factor = lanes / self.lanes
         tasks = max(1, -(-int(lanes) // self.lanes_per_task))
         changed = {"steps": int(self.steps * factor), "bytes": int(self.bytes * factor)}
@@ -65,20 +64,12 @@ class SweepCost:
     def table(
         self, lanes: Sequence[float] = (1e6, 1e9, 1e12), workers: Sequence[int] = (1, 64, 4096)
     ) -> str:
-        """Markdown: time and room for other numbers of trajectories and workers."""
-        each = [self, *(self.scaled(n) for n in lanes if n != self.lanes)]
-        cores = ("1 worker" if n == 1 else f"{n} workers" for n in workers)
-        head = ["trajectories", "tasks", "results", *cores]
-        rows = [
-            [
-                f"{c.lanes:.3g}",
-                f"{c.tasks:.3g}",
-                size(c.bytes),
-                *(span(c.seconds(n)) for n in workers),
-            ]
-            for c in each
-        ]
-        lines = [head, ["---"] * len(head), *rows]
+        """Time and disk space for other numbers of trajectories and workers, as Markdown."""
+        cores = ["1 worker" if n == 1 else f"{n} workers" for n in workers]
+        lines = [["trajectories", "tasks", "results", *cores], ["---"] * (3 + len(cores))]
+        for c in (self, *(self.scaled(n) for n in lanes if n != self.lanes)):
+            times = (span(c.seconds(n)) for n in workers)
+            lines.append([f"{c.lanes:.3g}", f"{c.tasks:.3g}", size(c.bytes), *times])
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
     def __str__(self) -> str:
@@ -96,7 +87,7 @@ class SweepCost:
 def cost(sweep: Sweep, plan: Plan, variables: Mapping[str, Variable]) -> SweepCost:
     """Compute the first task of each method and number of steps twice or more, and extrapolate."""
     program = Program(sweep, plan)
-    per_value = plan.num_tasks // max(int(np.prod(plan.counts[: sweep.compiled])), 1)
+    per_value = plan.num_tasks // math.prod(plan.counts[: sweep.compiled])
     firsts, again, steps = [], [], 0
     for number in range(0, plan.num_tasks, per_value):
         task = plan.task(number)
@@ -105,17 +96,16 @@ def cost(sweep: Sweep, plan: Plan, variables: Mapping[str, Variable]) -> SweepCo
         if again[-1] < LONG:
             again[-1] = min(again[-1], _seconds(program, task))
         steps += program.steps(task)
-    lanes = plan.lanes_per_task
     return SweepCost(
         dims=dict(plan.dims),
         lanes=plan.lanes,
         steps=plan.lanes // len(again) * steps,
         tasks=plan.num_tasks,
-        lanes_per_task=lanes,
+        lanes_per_task=plan.lanes_per_task,
         bytes=plan.lanes * sum(v.bytes for v in variables.values()),
         files=plan.num_tasks * (len(variables) + 1),
         variables=len(variables),
-        seconds_per_step=sum(again) / (lanes * steps),
+        seconds_per_step=sum(again) / (plan.lanes_per_task * steps),
         seconds_per_task=sum(again) / len(again),
         compilation=max(0.0, sum(firsts) - sum(again)),
         cores=default_threads(),
@@ -137,14 +127,13 @@ def size(number: float) -> str:
     return f"{number:.3g} PiB"
 
 
+_UNITS = (("years", 365.25 * 86400, 2), ("days", 86400, 2), ("h", 3600, 1.5), ("min", 60, 1.5))
+"""Units of time: name, seconds, and the least number of them that is written in this unit."""
+
+
 def span(seconds: float) -> str:
     """A time in words."""
-    for unit, length, least in (
-        ("years", 365.25 * 86400, 2),
-        ("days", 86400, 2),
-        ("h", 3600, 1.5),
-        ("min", 60, 1.5),
-    ):
+    for unit, length, least in _UNITS:
         if seconds >= least * length:
             return f"{seconds / length:.3g} {unit}"
     return f"{seconds:.2g} s"

@@ -1,4 +1,4 @@
-"""What a sweep is, in words and hashes: two sweeps of one description give the same numbers."""
+"""The description of a sweep as JSON and hashes: equal descriptions give equal numbers."""
 
 import dataclasses
 import datetime
@@ -23,20 +23,20 @@ from lanewise.extent import functions_in
 from lanewise.jaxapi import ClosedJaxpr, bodies, is_traced
 
 from ..engine.signature import accepts
-from .axes import is_axis, leaves_with_axes
+from .axes import axes_in, is_axis
 from .plan import Plan
 from .program import Sweep, stacked
 from .variables import Variable
 
 FORMAT = 1
-"""Of the store: raised when a store of an older one cannot be read any more."""
+"""Of the store: a greater number when stores of this format cannot be read any more."""
 
 PROGRAM = "program"
 
-_ADDRESS = re.compile(r" at 0x[0-9a-f]+")
+# In the text of a jaxpr or an object: what differs between processes or terminals.
+_VOLATILE = re.compile(r" at 0x[0-9a-f]+|\x1b\[[0-9;]*m")
 
-_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-
+# Arguments of the functions that users write, by their number.
 _SIGNATURES = {
     5: lambda t, x, args: (t, t, x, x, args),
     7: lambda t, x, args: (t, t, x, x, x, x, args),
@@ -44,22 +44,21 @@ _SIGNATURES = {
     3: lambda t, x, args: (x, x, args),
     2: lambda t, x, args: (x, x),
 }
-"""Arguments of the functions that users write, by how many they are."""
 
 
 def description(
     sweep: Sweep, plan: Plan, variables: Mapping[str, Variable], programs: Sequence[ClosedJaxpr]
 ) -> dict[str, Any]:
-    """Everything that the numbers depend on, as JSON: one entry for each argument, so that it can
-    be said which differs, and `program`, which sees all that any function does.
+    """Everything that the numbers depend on, as JSON.
 
-    Functions stand there as the hash of what they compute (their jaxpr, with its constants), so
-    that renaming a variable changes nothing and changing a number in them does. What a callback to
-    Python computes is not seen.
+    There is one entry for each argument, so that a message can say which one differs, and
+    `program`, the hash of all that is computed. A function is described by the hash of its jaxpr
+    with its constants: it changes with a number in the function, not with the name of a variable.
+    The computation of a callback to Python is not seen.
     """
     q0, args, t0 = _example(sweep)
     known = Describer(jnp.asarray(t0, q0.dtype), q0, args)
-    axes = {leaf.name: leaf.axis.name for leaf in leaves_with_axes(dict(sweep.inputs))}
+    axes = {where: axis.name for where, axis in axes_in(sweep.inputs)}
     return {
         "format": FORMAT,
         "system": known(sweep.system),
@@ -78,12 +77,12 @@ def description(
 
 
 def _example(sweep: Sweep) -> tuple[Any, Any, Any]:
-    """(q0, args, t0) of the first trajectory; of the starts only shape and type matter."""
-
-    def begin(leaf):
-        return jnp.asarray(leaf.values[0]) if is_axis(leaf) else leaf
-
-    first = jax.tree.map(begin, dict(sweep.inputs), is_leaf=is_axis)
+    """(q0, args, t0) of the first trajectory; of q0 only shape and type matter."""
+    first = jax.tree.map(
+        lambda x: jnp.asarray(x.values[0]) if is_axis(x) else x,
+        dict(sweep.inputs),
+        is_leaf=is_axis,
+    )
     if sweep.start is None:
         q0 = jnp.asarray(stacked(first["q0"]))
     else:
@@ -107,11 +106,8 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     keys = [key for key in sorted({*a, *b}) if a.get(key) != b.get(key)]
     if keys == [PROGRAM]:
         return [f"{PROGRAM}: a function, or a part of the packages, computes something else"]
-    return [
-        f"{key}: {_short(a.get(key))} there, {_short(b.get(key))} now"
-        for key in keys
-        if key != PROGRAM
-    ]
+    pairs = {key: (_short(a.get(key)), _short(b.get(key))) for key in keys if key != PROGRAM}
+    return [f"{key}: {there} there, {now} now" for key, (there, now) in pairs.items()]
 
 
 def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
@@ -130,7 +126,7 @@ def _short(value: Any) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Describer:
-    """Describes arguments; functions are traced with a time, a state and args like these."""
+    """Describes arguments; functions are traced with this time, state and args."""
 
     t: Any
     state: Any
@@ -158,52 +154,49 @@ class Describer:
             return x.__qualname__
         if callable(x):
             return self.function(x)
-        return {"is": type(x).__qualname__, "repr": _ADDRESS.sub("", repr(x))}
+        return {"is": type(x).__qualname__, "repr": _VOLATILE.sub("", repr(x))}
 
     def function(self, f: Callable[..., Any]) -> str:
         """The hash of what a function computes, or of its code where it cannot be traced alone."""
-        first = [n for n in _SIGNATURES if n == _required(f)]
-        for count in (*first, *(n for n in _SIGNATURES if n not in first)):
-            arguments = _SIGNATURES[count]
+        required = _required(f)
+        for count in sorted(_SIGNATURES, key=lambda n: n != required):
             if not accepts(f, count):
                 continue
             try:
-                given = arguments(self.t, self.state, self.args)
+                given = _SIGNATURES[count](self.t, self.state, self.args)
                 dynamic, static = eqx.partition(given, eqx.is_array)
                 traced = jax.make_jaxpr(lambda d, s=static: f(*eqx.combine(d, s)))(dynamic)
-            except Exception:  # not of this kind: what is wrong with it `integrate` will say
+            except Exception:  # another kind of function; `integrate` reports errors in it
                 continue
             return f"computes {_hash(traced)}"
-        return f"code {hashlib.sha256(_code(f)).hexdigest()[:16]}"
+        try:
+            code = inspect.getsource(f)
+        except (OSError, TypeError):
+            code = _VOLATILE.sub("", repr(f))
+        return f"code {hashlib.sha256(code.encode()).hexdigest()[:16]}"
 
 
 def _required(f: Callable[..., Any]) -> int:
-    """How many arguments have no default; others are a way to give a function its constants."""
+    """Number of arguments without default; constants of a function are often defaults."""
     try:
         parameters = inspect.signature(f).parameters.values()
     except (TypeError, ValueError):
         return -1
-    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(p.kind in positional and p.default is p.empty for p in parameters)
+    return sum(p.kind <= p.POSITIONAL_OR_KEYWORD and p.default is p.empty for p in parameters)
 
 
 def _hash(closed: ClosedJaxpr) -> str:
     hashed = hashlib.sha256()
     for part in _parts(closed):
-        hashed.update(_text(part.jaxpr).encode())
+        hashed.update(_VOLATILE.sub("", str(part.jaxpr)).encode())
         for constant in part.consts:
             if not is_traced(constant):
                 hashed.update(json.dumps(_of_array(np.asarray(constant))).encode())
     return hashed.hexdigest()[:16]
 
 
-def _text(jaxpr: Any) -> str:
-    """A jaxpr in words that are the same everywhere: no colours, no addresses."""
-    return _COLOUR.sub("", _ADDRESS.sub("", str(jaxpr)))
-
-
 def _parts(closed: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
-    """A jaxpr, and those inside of its loops and calls, with the constants that they hold."""
+    """A jaxpr and those inside its loops and calls."""
     yield closed
     for eqn in closed.jaxpr.eqns:
         for body in (*bodies(eqn), *functions_in(eqn)):
@@ -217,15 +210,8 @@ def _of_array(x: np.ndarray) -> Any:
     return {"dtype": x.dtype.name, "shape": list(x.shape), "sha256": hashed}
 
 
-def _code(f: Callable[..., Any]) -> bytes:
-    try:
-        return inspect.getsource(f).encode()
-    except (OSError, TypeError):
-        return _ADDRESS.sub("", repr(f)).encode()
-
-
 def provenance() -> dict[str, Any]:
-    """Where, when and with what: for the attributes of a result."""
+    """Time, machine and versions, for the attributes of a result."""
     devices = jax.local_devices()
     found = {
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -245,12 +231,13 @@ def provenance() -> dict[str, Any]:
 
 
 def _git_revision() -> str:
-    """The commit of the working directory, with "+" where files differ from it; or nothing."""
+    """The commit of the working directory, with "+" if files differ from it; or nothing."""
+    commands = (["git", "rev-parse", "HEAD"], ["git", "status", "--porcelain", "-uno"])
     try:
-        asked = [
-            subprocess.run(["git", *words], capture_output=True, text=True, timeout=5, check=True)
-            for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "-uno"])
-        ]
+        head, changes = (
+            subprocess.run(words, capture_output=True, text=True, timeout=5, check=True).stdout
+            for words in commands
+        )
     except (OSError, subprocess.SubprocessError):
         return ""
-    return asked[0].stdout.strip() + ("+" if asked[1].stdout.strip() else "")
+    return head.strip() + ("+" if changes.strip() else "")

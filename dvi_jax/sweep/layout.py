@@ -1,12 +1,13 @@
-"""How a sweep is laid out on disk: the arrays of a store in zarr, their names and attributes."""
+"""A sweep on disk: the arrays of a store in zarr, their names and attributes."""
 
+import contextlib
 import json
 import math
 import os
 import shutil
 import uuid
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +17,33 @@ from .._files import TEMPORARY, sync
 from .._results import STATUS_NAMES
 from .identity import FORMAT, digest
 from .plan import Plan, Task
-from .sinks import as_store_error
 from .variables import ARRAY_NAMES, Variable, is_array_name
 
 TASKS = ".tasks"
 """The directory of the records of tasks."""
 
 STATUS = "status"
-"""The variable whose shard is published after the others."""
+"""The variable of which the shard is written last."""
 
 CHUNK_BYTES = 2**22
-"""Of an inner chunk of a shard: what is read at least to see one number."""
+"""Size of an inner chunk of a shard: the least that is read to see one number."""
+
+
+class StoreError(Exception):
+    """A store that cannot be used: the message says why, and what to do."""
+
+
+@contextlib.contextmanager
+def as_store_error(path: Path, what: str, then: str = "") -> Iterator[None]:
+    """Turn an error of the operating system into a `StoreError`: `what` failed, `then` do this."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(f"{path}: {what}: {error.strerror or error}.{then}") from error
 
 
 def layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
-    """What zarr is told of an array: a task is a shard, in it chunks of some megabytes."""
+    """The options of zarr for an array: a shard for each task, in it chunks of some megabytes."""
     from zarr import codecs
 
     shard = (*chunk, *variable.shape)
@@ -39,8 +52,9 @@ def layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
     for i, n in enumerate(shard):
         divisors = (d for d in range(1, n + 1) if n % d == 0)
         parts = next(d for d in divisors if d == n or size / d <= CHUNK_BYTES)
+        # A prime length, for example, would give tiny chunks, which take long to write.
         if size / parts < CHUNK_BYTES / 16 and i + 1 < len(shard):
-            continue  # a prime, say: crumbs would take long to write
+            continue
         inner[i] = n // parts
         size //= parts
         if size <= CHUNK_BYTES:
@@ -56,7 +70,7 @@ def layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
 
 
 def shard(plan: Plan, variable: Variable, task: Task, values: np.ndarray) -> bytes:
-    """The bytes of one shard, made in memory."""
+    """The bytes of one shard, made in memory so that they can be written in one piece."""
     import zarr
     from zarr.storage import MemoryStore
 
@@ -75,35 +89,27 @@ def make(
     coordinates: Mapping[str, Any],
     attributes: Mapping[str, Any],
 ) -> None:
-    """Make a store under another name and rename it: it appears whole or not at all.
-
-    **Raises** `ValueError` for names that no file can have; `StoreError`.
-    """
+    """Make a store under another name and rename it: it appears as a whole or not at all."""
     if bad := [name for name in (*coordinates, *variables) if not is_array_name(name)]:
         raise ValueError(
             f"{bad[0]!r} cannot be the name of an array in a store: {ARRAY_NAMES}. The name comes "
             "from a key of args or from an observable: rename it."
         )
     plan = Plan(dict(config["dims"]), tuple(config["chunk"]))
-    about = {
-        "Conventions": "CF-1.11",
-        "dvi_jax_sweep": FORMAT,
-        "config": json.dumps(config),
-        "config_sha256": digest(config),
-        **attributes,
-    }
+    about = {"Conventions": "CF-1.11", "dvi_jax_sweep": FORMAT, "config": json.dumps(config)}
+    about |= {"config_sha256": digest(config), **attributes}
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
     try:
         with as_store_error(path, "cannot be made"):
             path.parent.mkdir(parents=True, exist_ok=True)
             _write_arrays(temporary, plan, variables, coordinates, about)
             (temporary / TASKS).mkdir()
-            for file in temporary.rglob("*"):
-                if file.is_file():
-                    sync(file)
+            for file in filter(Path.is_file, temporary.rglob("*")):
+                sync(file)
             try:
                 os.rename(temporary, path)
-            except OSError:  # another process was faster, or the directory holds something
+            except OSError:
+                # Another process may have made it meanwhile; otherwise this is an error.
                 if not (path / "zarr.json").exists():
                     raise
             sync(path.parent)
@@ -112,7 +118,7 @@ def make(
 
 
 def _write_arrays(folder: Path, plan: Plan, variables, coordinates, attributes) -> None:
-    """The coordinates with their values, the variables without any."""
+    """The coordinates with their values, the variables without values."""
     import zarr
     from zarr import codecs
 
@@ -136,27 +142,27 @@ def _write_arrays(folder: Path, plan: Plan, variables, coordinates, attributes) 
             attributes=about_variable(name, units),
             **layout(plan.chunk, v),
         )
-    with warnings.catch_warnings():  # of the format: readers without it list the directory
+    with warnings.catch_warnings():  # zarr warns that this is not yet a part of the format
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(folder)
 
 
 def storable(values: np.ndarray) -> np.ndarray:
-    """Names of methods with a type for text of any length, which zarr has; numbers as they are."""
+    """Text as a type of any length, which zarr has; numbers unchanged."""
     return values.astype(np.dtypes.StringDType()) if values.dtype.kind == "U" else values
 
 
+_ABOUT = {
+    STATUS: {
+        "long_name": "how each trajectory ended",
+        "flag_values": [-1, *range(len(STATUS_NAMES))],
+        "flag_meanings": " ".join(("not_computed", *STATUS_NAMES)),
+    },
+    "failed_step": {"long_name": "number of the failing step from 0, or -1"},
+    "residual": {"long_name": "largest relative residual of an implicit solve"},
+}
+
+
 def about_variable(name: str, units: Mapping[str, str]) -> dict[str, Any]:
-    """The attributes of a variable; `units` are those of all that have some."""
-    if name == STATUS:
-        return {
-            "long_name": "how each trajectory ended",
-            "flag_values": [-1, *range(len(STATUS_NAMES))],
-            "flag_meanings": " ".join(("not_computed", *STATUS_NAMES)),
-        }
-    known = {
-        "failed_step": "number of the failing step from 0, or -1",
-        "residual": "largest relative residual of an implicit solve",
-    }
-    found = {"long_name": known[name]} if name in known else {}
-    return {**found, "units": units[name]} if name in units else found
+    """The attributes of a variable; `units`: those of all variables that have units."""
+    return _ABOUT.get(name, {}) | ({"units": units[name]} if name in units else {})

@@ -1,6 +1,6 @@
-"""Arrays of a store that are read when they are asked for, without what is not done."""
+"""Arrays of a store that are read on demand, with unfinished tasks masked."""
 
-from collections.abc import Iterator
+import itertools
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,7 @@ def masked(store: Store, name: str) -> Any:
 class _Masked(BackendArray):
     """An array of which shards without a record count as not computed.
 
-    A shard that is there without its record belongs to a task that was cut off while its results
-    were being written.
+    Such a shard belongs to a task that was interrupted while its results were being written.
     """
 
     def __init__(self, store: Store, name: str):
@@ -34,27 +33,19 @@ class _Masked(BackendArray):
 
     def _get(self, key: tuple[Any, ...]) -> np.ndarray:
         plan, fill = self.store.plan, self.store.variables[self.name].fill
-        own = len(plan.shape)
         wanted = [
             np.arange(*k.indices(n)) if isinstance(k, slice) else np.atleast_1d(k)
             for k, n in zip(key, self.shape, strict=True)
         ]
-        rows, behind = wanted[:own], wanted[own:]
+        rows, own = wanted[: len(plan.shape)], wanted[len(plan.shape) :]
         found = np.full([len(w) for w in wanted], fill, self.dtype)
-        places = [w // c for w, c in zip(rows, plan.chunk, strict=True)]
-        for place in _boxes(places):
-            inside = [np.flatnonzero(p == k) for p, k in zip(places, place, strict=True)]
+        boxes = [w // c for w, c in zip(rows, plan.chunk, strict=True)]
+        for place in itertools.product(*map(np.unique, boxes)):
             number = plan.number(place)
             if self.store.record(number) is None:
                 continue
-            box = tuple(w[i] for w, i in zip(rows, inside, strict=True))
-            to = np.ix_(*inside, *(np.arange(len(b)) for b in behind))
-            found[to] = self.store.read(self.name, number, (*box, *behind))
+            inside = [np.flatnonzero(b == k) for b, k in zip(boxes, place, strict=True)]
+            box = (w[i] for w, i in zip(rows, inside, strict=True))
+            to = np.ix_(*inside, *(np.arange(len(w)) for w in own))
+            found[to] = self.store.read(self.name, number, (*box, *own))
         return found[tuple(0 if isinstance(k, int | np.integer) else slice(None) for k in key)]
-
-
-def _boxes(places: list[np.ndarray]) -> Iterator[tuple[int, ...]]:
-    """Every box that some wanted entry lies in."""
-    each = [np.unique(p) for p in places]
-    for k in np.ndindex(*(len(e) for e in each)):
-        yield tuple(int(e[i]) for e, i in zip(each, k, strict=True))

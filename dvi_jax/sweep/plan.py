@@ -1,4 +1,4 @@
-"""The grid of a sweep, and how it is cut into tasks."""
+"""The grid of a sweep and its division into tasks."""
 
 import math
 from collections.abc import Container, Iterator, Mapping, Sequence
@@ -9,17 +9,12 @@ import numpy as np
 
 from .._checks import whole
 
-WORK = 2**28
-"""Trajectory steps that one task should have: some tenths of a second."""
+WORK, SMALLEST_WORK = 2**28, 2**22
+"""Trajectory steps of one task: some tenths of a second of work; and the least number for which a
+task is made smaller so that there are more of them."""
 
-SMALLEST_WORK = 2**22
-"""Trajectory steps below which a task is not cut further to have many of them."""
-
-FEWEST, MOST = 256, 2**17
-"""Trajectories of one task."""
-
-MANY = 32
-"""Tasks that a sweep should have at least, if they are worth it."""
+FEWEST, MOST, MANY = 256, 2**17, 32
+"""Trajectories of one task, at least and at most; tasks of a sweep, at least."""
 
 BYTES = 2**26
 """Results of one task, at most (one trajectory may have more)."""
@@ -45,18 +40,18 @@ class Task(NamedTuple):
 class Plan:
     """A grid with named dimensions in boxes of one shape, `chunk`; each is one task.
 
-    The last box along a dimension may be smaller. Programs are compiled for a whole one, whatever
-    runs them: results do not depend on how many devices there are.
+    The last box along a dimension may be smaller. Programs are nevertheless compiled for a full
+    box, so that results do not depend on the number of devices.
     """
 
     dims: Mapping[str, int]
     chunk: tuple[int, ...]
 
     def __post_init__(self):
-        lengths = (*self.dims.values(), *self.chunk)
-        is_whole = all(isinstance(n, int | np.integer) and n >= 1 for n in lengths)
-        if not is_whole or len(self.dims) != len(self.chunk):
-            raise ValueError(f"no grid of lengths {self.dims} can have tasks of {self.chunk}.")
+        for name, n in (*self.dims.items(), *(("chunk", n) for n in self.chunk)):
+            whole(name, n)
+        if len(self.dims) != len(self.chunk):
+            raise ValueError(f"a grid {dict(self.dims)} cannot have tasks of {self.chunk}.")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -64,7 +59,7 @@ class Plan:
 
     @property
     def lanes(self) -> int:
-        """Trajectories in all."""
+        """Number of trajectories."""
         return math.prod(self.shape)
 
     @property
@@ -81,8 +76,6 @@ class Plan:
         return math.prod(self.counts)
 
     def task(self, number: int) -> Task:
-        if not 0 <= number < self.num_tasks:
-            raise IndexError(f"there is no task {number}: the sweep has {self.num_tasks}.")
         start = tuple(k * c for k, c in zip(self.place(number), self.chunk, strict=True))
         size = tuple(min(c, n - a) for c, n, a in zip(self.chunk, self.shape, start, strict=True))
         return Task(number, start, size)
@@ -96,7 +89,7 @@ class Plan:
         return int(np.ravel_multi_index(tuple(place), self.counts))
 
     def todo(self, done: Container[int]) -> Iterator[int]:
-        """The numbers of the other tasks, made when they are needed: there may be 10⁹ of them."""
+        """The numbers of the other tasks, as an iterator: there may be 10⁹ of them."""
         return (i for i in range(self.num_tasks) if i not in done)
 
     def tasks(self) -> Iterator[Task]:
@@ -112,30 +105,27 @@ def make_plan(
 ) -> Plan:
     """A plan for a grid.
 
-    - `compiled`: how many dimensions in front are compiled one value at a time.
+    - `compiled`: number of leading dimensions of which each value is compiled separately.
     - `steps`: of one trajectory. `bytes_per_lane`: of its results.
-    - `lanes`: trajectories of one task at most; None: chosen from the two.
-
-    **Raises** `ValueError` for `lanes` that is not a positive whole number.
+    - `lanes`: trajectories of one task at most; None: chosen from `steps` and `bytes_per_lane`.
     """
-    total = math.prod(list(dims.values())[compiled:])
+    separate, grid = (
+        list(dims.values())[part] for part in (slice(compiled), slice(compiled, None))
+    )
     if lanes is None:
-        lanes = min(max(_power_of_two(WORK // max(steps, 1)), FEWEST), MOST)
-        fewest = max(FEWEST, SMALLEST_WORK // max(steps, 1))
-        many = -(-MANY // max(math.prod(list(dims.values())[:compiled]), 1))
-        lanes = min(lanes, max(fewest, -(-total // many)))
+        steps = max(steps, 1)
+        power_of_two = 1 << max((WORK // steps).bit_length() - 1, 0)
+        many = -(-MANY // math.prod(separate))
+        fewest = max(FEWEST, SMALLEST_WORK // steps)
+        lanes = min(max(power_of_two, FEWEST), MOST, max(fewest, -(-math.prod(grid) // many)))
         lanes = max(1, min(lanes, BYTES // max(bytes_per_lane, 1)))
-    room = whole("lanes_per_task", lanes)
+    free = whole("lanes_per_task", lanes)
     chunk: list[int] = []
-    for n in reversed(list(dims.values())[compiled:]):
-        boxes = -(-n // min(n, max(room, 1)))
-        size = -(-n // boxes)  # boxes as equal as can be
+    for n in reversed(grid):
+        boxes = -(-n // min(n, free))
+        size = -(-n // boxes)  # boxes as equal as possible
         if boxes > 1 and size > 64:
-            size = min(-(-size // 64) * 64, n, room)  # of whole vectors
+            size = min(-(-size // 64) * 64, n, free)  # whole vectors of the processor
         chunk.append(size)
-        room = room // size if boxes == 1 else 1
-    return Plan(dict(dims), (*(1 for _ in range(compiled)), *reversed(chunk)))
-
-
-def _power_of_two(n: int) -> int:
-    return 1 << max(n.bit_length() - 1, 0)
+        free = free // size if boxes == 1 else 1
+    return Plan(dict(dims), (*(1 for _ in separate), *reversed(chunk)))

@@ -1,5 +1,7 @@
 """The compiled function that computes one task."""
 
+import collections
+import contextlib
 import dataclasses
 import functools
 import threading
@@ -15,7 +17,7 @@ from lanewise.jaxapi import ClosedJaxpr, x64_enabled
 
 from .._integrate import integrate
 from .._results import status_code
-from .._solution import Save, Solution
+from .._solution import Save
 from ..engine.reads import Reads, reads
 from ..lattices import Given
 from .axes import is_axis, place
@@ -25,10 +27,10 @@ from .starts import Starts
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sweep:
-    """All that defines a sweep: what `integrate` takes, with axes in it.
+    """What defines a sweep: the arguments of `integrate`, with axes in them.
 
     - `inputs`: h, t0, epsilon, args, and q0, p0 unless there is a `start`.
-    - `options`: what else `integrate` takes. `method` and `num_steps` may be an `Axis`.
+    - `options`: the other arguments. `method` and `num_steps` may be an `Axis`.
     """
 
     system: Any
@@ -42,11 +44,11 @@ class Sweep:
 
     @property
     def of_grid(self) -> list[str]:
-        """The dimensions that are not compiled one value at a time."""
+        """The dimensions of which the values are not compiled separately."""
         return list(self.dims)[self.compiled :]
 
     def value(self, which: Any, start: tuple[int, ...]) -> Any:
-        """The method, or the number of steps, of the task that begins there."""
+        """The method, or the number of steps, of the task that begins at this index."""
         if not is_axis(which):
             return which
         value = which.values[start[list(self.dims).index(which.name)]]
@@ -55,10 +57,9 @@ class Sweep:
     @property
     def most_steps(self) -> int:
         n = self.num_steps
-        steps = max(int(v) for v in n.values) if is_axis(n) else n
-        if steps is None:
-            steps = len(self.options["lattice"].ts) - 1
-        return steps
+        if n is None:
+            return len(self.options["lattice"].ts) - 1
+        return max(int(v) for v in n.values) if is_axis(n) else n
 
 
 class Rows(eqx.Module):
@@ -73,9 +74,9 @@ def _is_rows(x: Any) -> bool:
 
 
 class Lanes(eqx.Module):
-    """What the trajectories of a task have in common, as one pytree: `Rows` in the inputs vary.
+    """The trajectories of a task as one pytree: `Rows` in the inputs differ between them.
 
-    - `names`: the dimensions of the task. Its method and number of steps are one each.
+    - `names`: the dimensions of the task. It has one method and one number of steps.
     """
 
     system: Any
@@ -88,8 +89,8 @@ class Lanes(eqx.Module):
     reads: Reads = eqx.field(static=True)
 
     def one(self, inside: tuple[Any, ...], index: tuple[Any, ...]) -> dict[str, Any]:
-        """One trajectory: the variables of its result. For each dimension `inside` is its index in
-        the task, `index` that in the whole sweep."""
+        """The variables of one trajectory. `inside`: its index along each dimension of the task;
+        `index`: that in the whole sweep."""
         where = dict(zip(self.names, inside, strict=True))
         inputs = jax.tree.map(
             lambda x: x.values[where[x.name]] if _is_rows(x) else x, self.inputs, is_leaf=_is_rows
@@ -104,11 +105,20 @@ class Lanes(eqx.Module):
         save = self.options["save"]
         options = {**self.options, "save": save or Save(final=True)}
         options |= {"method": self.method, "num_steps": self.num_steps, "throw": False}
-        return outputs(integrate(self.system, q0, p0, **inputs, **options), save is not None)
+        solution = integrate(self.system, q0, p0, **inputs, **options)
+        leaves = jax.tree.leaves_with_path(solution.observed)
+        found = {place(path) or "observed": value for path, value in leaves}
+        if save is not None:
+            found |= {"t": solution.ts, "q": solution.qs, "p": solution.ps}
+        return found | {
+            "status": status_code(solution.result).astype(jnp.int8),
+            "failed_step": solution.stats["failed_step"],
+            "residual": solution.stats["max_residual"],
+        }
 
 
 def lanes_of(sweep: Sweep, task_start: tuple[int, ...], values: Any) -> Lanes:
-    """The trajectories of the task that begins there; `values` makes Rows of an axis."""
+    """The trajectories of the task that begins at this index; `values`: the rows of an axis."""
 
     def known(leaf: Any) -> Any:
         if not is_axis(leaf):
@@ -130,7 +140,8 @@ def lanes_of(sweep: Sweep, task_start: tuple[int, ...], values: Any) -> Lanes:
 
 
 def _batch(lanes: Lanes, chunk: tuple[int, ...], begin: Any, last: Any) -> dict[str, Any]:
-    """All lanes of a task, in the order of its box; lanes beyond its end are those at the end."""
+    """All trajectories of a task, in the order of its box. Those beyond the end of the grid repeat
+    the last one, so that every task has the shape for which the program is compiled."""
     if not chunk:
         return jax.tree.map(lambda x: x[None], lanes.one((), ()))
     count = stride = int(np.prod(chunk, dtype=int))
@@ -142,8 +153,7 @@ def _batch(lanes: Lanes, chunk: tuple[int, ...], begin: Any, last: Any) -> dict[
     return jax.vmap(lanes.one)(tuple(inside), tuple(index))
 
 
-_filter_jit: Any = eqx.filter_jit  # its annotations leave out what goes on to jax.jit
-_compiled = _filter_jit(_batch)
+_compiled: Any = eqx.filter_jit(_batch)
 
 
 def stacked(state: Any) -> Any:
@@ -153,27 +163,13 @@ def stacked(state: Any) -> Any:
     return jnp.stack([jnp.asarray(stacked(x), jnp.result_type(float)) for x in state])
 
 
-def outputs(solution: Solution, with_states: bool) -> dict[str, Any]:
-    found = {
-        place(path) or "observed": value
-        for path, value in jax.tree.leaves_with_path(solution.observed)
-    }
-    if with_states:
-        found |= {"t": solution.ts, "q": solution.qs, "p": solution.ps}
-    return found | {
-        "status": status_code(solution.result).astype(jnp.int8),
-        "failed_step": solution.stats["failed_step"],
-        "residual": solution.stats["max_residual"],
-    }
-
-
 class Program:
-    """Computes tasks of a sweep; a function is compiled once, by the thread that needs it first."""
+    """Computes tasks of a sweep."""
 
     def __init__(self, sweep: Sweep, plan: Plan):
         self.sweep, self.plan = sweep, plan
-        self._ready: dict[Any, tuple[threading.Lock, list[bool]]] = {}
-        self._lock = threading.Lock()
+        self._locks: dict[Any, threading.Lock] = collections.defaultdict(threading.Lock)
+        self._compiled: set[Any] = set()
 
     def __call__(self, task: Task, device: Any = None) -> dict[str, np.ndarray]:
         """The variables of a task, each of shape (*task.size, …), computed on a device."""
@@ -187,65 +183,46 @@ class Program:
             return np.concatenate([values, *[values[-1:]] * (chunk[k] - size[k])])
 
         lanes = lanes_of(sweep, task.start, rows)
-        numbers = jax.tree.map(  # not compiled in: another h needs no other program
+        numbers = jax.tree.map(  # as arrays: another h then needs no other program
             lambda x: np.asarray(x) if isinstance(x, float | np.generic) else x, lanes.inputs
         )
         lanes = dataclasses.replace(lanes, inputs=numbers)
         begin = np.asarray(task.start[first:], np.int64 if x64_enabled() else np.int32)
         last = begin + np.asarray(size, begin.dtype) - 1
-        with jax.default_device(device):
-            found = self._call((task.start[:first], device), lanes, chunk, begin, last)
+        program = (task.start[:first], device)
+        # One thread compiles; the others wait for it, and compile nothing.
+        free = program in self._compiled
+        with jax.default_device(device), contextlib.nullcontext() if free else self._locks[program]:
+            found = jax.block_until_ready(_compiled(lanes, chunk, begin, last))
+        self._compiled.add(program)
         cut = tuple(slice(n) for n in size)
-        results = {}
-        for name, x in found.items():
-            own = x.shape[1:]
-            box = np.asarray(x).reshape((*chunk, *own))[cut]
-            results[name] = box.reshape((*task.size, *own))
-        return results
+        boxes = {n: np.asarray(x).reshape((*chunk, *x.shape[1:]))[cut] for n, x in found.items()}
+        return {n: x.reshape((*task.size, *x.shape[len(size) :])) for n, x in boxes.items()}
 
     def steps(self, task: Task) -> int:
         """Of each trajectory of a task."""
         steps = self.sweep.value(self.sweep.num_steps, task.start)
         return self.sweep.most_steps if steps is None else steps
 
-    def _call(self, which: Any, *inputs: Any) -> Any:
-        function = _compiled
-        with self._lock:
-            first, ready = self._ready.setdefault(which, (threading.Lock(), []))
-        if not ready:
-            with first:
-                found = jax.block_until_ready(function(*inputs))
-                ready.append(True)
-            return found
-        return function(*inputs)
-
 
 def traced(sweep: Sweep) -> tuple[dict[str, Any], list[ClosedJaxpr]]:
-    """Shape and dtype of the variables of one trajectory, traced, not computed; and the programs
-    of one, for each method and number of steps.
-
-    **Raises** `ValueError` where they differ between methods or numbers of steps.
-    """
+    """Shape and dtype of the variables of one trajectory, by tracing; and its program for each
+    method and number of steps."""
     found: dict[str, Any] = {}
-    programs = []
+    programs, kinds = [], set()
     zeros = tuple(np.zeros((), np.int32) for _ in sweep.of_grid)
     for which in np.ndindex(*list(sweep.dims.values())[: sweep.compiled]):
         start = (*(int(k) for k in which), *(0 for _ in sweep.of_grid))
         lanes = lanes_of(sweep, start, lambda axis: jnp.asarray(axis.values[:1]))
-        one = functools.partial(_one, lanes)
+        one = functools.partial(Lanes.one, lanes)
         program, out = jax.make_jaxpr(one, return_shape=True)(zeros, zeros)
         programs.append(program)
-        if found and {k: (v.shape, v.dtype) for k, v in out.items()} != {
-            k: (v.shape, v.dtype) for k, v in found.items()
-        }:
+        kinds.add(tuple((name, x.shape, x.dtype) for name, x in out.items()))
+        if len(kinds) > 1:
             raise ValueError(
                 "the results of all values of method and num_steps must have one shape: with "
-                "several num_steps keep the final state alone, save=dvi.Save(final=True), or "
-                "times, Save(ts=...)."
+                "several num_steps save the final state only, save=dvi.Save(final=True), or "
+                "given times, save=dvi.Save(ts=...)."
             )
         found = out
     return found, programs
-
-
-def _one(lanes: Lanes, inside: Any, index: Any) -> dict[str, Any]:
-    return lanes.one(inside, index)

@@ -1,4 +1,4 @@
-"""What a sweep returns: labelled arrays, in memory or in a store, with a status for each number."""
+"""The result of a sweep: labelled arrays, in memory or in a store, with a status for each entry."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -9,9 +9,7 @@ import numpy as np
 
 from .._results import STATUS_NAMES
 from .layout import STATUS, about_variable
-from .plan import Plan
-from .sinks import Memory
-from .store import Store, StoreError, Verification
+from .store import Memory, Store, StoreError, Verification
 
 
 class SweepResult:
@@ -19,20 +17,17 @@ class SweepResult:
 
     - `dims`: name → length of the dimensions.
     - `path`: of the store, or None.
-    - `num_tasks`, `tasks_done`: pieces of the grid, and how many of them have been computed.
-    - ``result["energy_drift"]``: one variable as a NumPy array, all of it.
-    - `to_xarray()`: the labelled whole.
+    - `num_tasks`, `tasks_done`: number of tasks of the grid, and of those that are done.
+    - ``result["energy_drift"]``: one variable as a NumPy array.
+    - `to_xarray()`: all of it with labels.
 
-    What has not been computed is NaN (−1 in whole numbers), with the status −1.
+    Entries that have not been computed are NaN (−1 in whole numbers) and have the status −1.
     """
 
     def __init__(self, source: Memory | Store, coordinates: Mapping[str, Any], attributes: Any):
         self._source, self._coordinates = source, dict(coordinates)
+        self._plan = source.plan
         self.attributes = dict(attributes)
-
-    @property
-    def _plan(self) -> Plan:
-        return self._source.plan
 
     @property
     def dims(self) -> dict[str, int]:
@@ -46,12 +41,12 @@ class SweepResult:
 
     @property
     def num_tasks(self) -> int:
-        """Into how many tasks the grid is cut."""
+        """Number of tasks of the grid."""
         return self._plan.num_tasks
 
     @property
     def tasks_done(self) -> int:
-        """How many of them have their results; of a store all records are read."""
+        """Number of tasks whose results are there; all records of a store are read for it."""
         return len(self._source.done())
 
     @property
@@ -60,42 +55,40 @@ class SweepResult:
         return self.tasks_done == self.num_tasks
 
     def __getitem__(self, name: str) -> np.ndarray:
-        names = (*self._source.variables, *self._coordinates)
-        if name not in names:
-            raise KeyError(f"{name!r}: there are {', '.join(names)}.")
         if name in self._coordinates:
             return self._coordinates[name][1]
+        if name not in self._source.variables:
+            known = ", ".join((*self._source.variables, *self._coordinates))
+            raise KeyError(f"{name!r}: there are {known}.")
         if isinstance(self._source, Memory):
             return self._source.arrays[name]
         return self.to_xarray()[name].values
 
     def status_counts(self) -> dict[str, int]:
-        """How many trajectories ended with each status, read task by task."""
-        counts = np.zeros(len(STATUS_NAMES) + 1, int)
+        """Number of trajectories with each status, counted task by task."""
+        names = ("not_computed", *STATUS_NAMES)
+        counts = dict.fromkeys(names, 0)
         if isinstance(self._source, Memory):
-            counts += np.bincount(self._source.arrays[STATUS].ravel() + 1, minlength=len(counts))
+            codes, numbers = np.unique(self._source.arrays[STATUS], return_counts=True)
+            counts |= {names[c + 1]: int(n) for c, n in zip(codes, numbers, strict=True)}
         else:
             for record in self.records():
                 for name, count in record["statuses"].items():
-                    counts[STATUS_NAMES.index(name) + 1] += count
-            counts[0] = self._plan.lanes - counts[1:].sum()
-        names = ("not_computed", *STATUS_NAMES)
-        return {name: int(n) for name, n in zip(names, counts, strict=True) if n}
+                    counts[name] += count
+            counts["not_computed"] = self._plan.lanes - sum(counts.values())
+        return {name: n for name, n in counts.items() if n}
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """What a store has on record of each task that is done: `task`, `start` and `size` of its
-        box, `statuses`, `seconds` that it took and when it was `finished`, `host`, `pid`, `device`.
-        """
+        """The record of each finished task of a store: `task`, `start` and `size` of its box,
+        `statuses`, the `seconds` of its computation, when it was `finished`, `host`, `pid`,
+        `device`."""
         if isinstance(self._source, Store):
-            for number in self._source.done():
-                record = self._source.record(number)
-                if record is not None:
-                    yield record
+            yield from filter(None, map(self._source.record, self._source.done()))
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> Verification:
-        """Read all of a store again and compare it with the checksums in its records.
+        """Read the whole store again and compare it with the checksums in its records.
 
-        Tasks that are not sound are open again: the next run computes them anew. `progress` is
+        Tasks that are damaged count as not done: the next run computes them again. `progress` is
         called as ``progress(tasks_read, tasks)``.
 
         **Raises** `StoreError` for results that are in memory.
@@ -105,9 +98,8 @@ class SweepResult:
         return self._source.verify(progress)
 
     def to_xarray(self) -> Any:
-        """The result as an `xarray.Dataset`: dimensions with their values, units, and where and how
-        it was made in the attributes. Of a store nothing is read before it is asked for; tasks that
-        are not done are masked."""
+        """The result as an `xarray.Dataset`: dimensions with their values, units, and in the
+        attributes how it was made. A store is read on demand; unfinished tasks are masked."""
         import xarray as xr
 
         from .lazy import masked
@@ -121,15 +113,12 @@ class SweepResult:
                 chunks = dict(zip(dims, (*self._plan.chunk, *v.shape), strict=True))
                 array = masked(self._source, name)
                 data[name] = xr.Variable(dims, array, about, {"preferred_chunks": chunks})
-        coords = {
-            name: xr.Variable(dims, values, about)
-            for name, (dims, values, about) in self._coordinates.items()
-        }
+        coords = {name: xr.Variable(*c) for name, c in self._coordinates.items()}
         about = {k: v for k, v in self.attributes.items() if k != "coordinates"}
         return xr.Dataset(data, coords, about)
 
     def to_netcdf(self, path: Any, force: bool = False) -> None:
-        """Write all of it to a NetCDF 4 file, task by task: memory is that of one task.
+        """Write a NetCDF 4 file, task by task, so that only one task is in memory.
 
         Needs the extra `export`. **Raises** `FileExistsError` for a file that is there, unless
         `force`; `ImportError` without h5netcdf.
@@ -139,8 +128,8 @@ class SweepResult:
         to_netcdf(self.to_xarray(), self._boxes(), path, force)
 
     def to_parquet(self, path: Any, force: bool = False) -> None:
-        """Write a Parquet table, one row a trajectory: the values of its axes, its results, the
-        name of its status. Task by task: each is a row group.
+        """Write a Parquet table with one row for each trajectory: the values of its axes, its
+        results, the name of its status. Each task is a row group.
 
         Needs the extra `export`. **Raises** as `to_netcdf`.
         """
@@ -149,7 +138,6 @@ class SweepResult:
         to_parquet(self.to_xarray(), self._boxes(), path, force)
 
     def _boxes(self) -> Iterator[dict[str, slice]]:
-        """The parts of the grid that the tasks are."""
         return (dict(zip(self.dims, t.box, strict=True)) for t in self._plan.tasks())
 
     def __repr__(self) -> str:
@@ -161,7 +149,7 @@ class SweepResult:
 
 
 def open_sweep(path: Any) -> SweepResult:
-    """The results in a store, finished or not, while others still write to it or not.
+    """The results in a store, which may be unfinished and still be written by other processes.
 
     **Raises** `StoreError` where there is none.
     """

@@ -1,4 +1,4 @@
-"""Initial conditions that are made where they are needed: start number i of a sweep."""
+"""Initial conditions that are generated on demand: number i of a sweep as a function of i."""
 
 import abc
 import math
@@ -17,16 +17,16 @@ from .._types import Args, Scalar
 from ..engine.bracket import bracketed_root
 
 _TRIES = 64
-"""Points that are tried for one start on an energy shell."""
+"""Points that are tried for one initial condition on an energy shell."""
 
 _DOUBLINGS = 100
 
 
 class Starts(eqx.Module):
-    """Base of the generators of initial conditions: `count` starts, made from their number.
+    """Base class of generated initial conditions: number i is a function of the index i.
 
-    None of them is stored, so that there may be any number. A subclass defines `at`; its fields are
-    what the starts depend on. In the result they are the dimension `name`.
+    They are not stored, so that there may be any number. A subclass defines `at`; its fields are
+    what the initial conditions depend on. In the result they are the dimension `name`.
     """
 
     count: eqx.AbstractVar[int]
@@ -34,32 +34,31 @@ class Starts(eqx.Module):
 
     @abc.abstractmethod
     def at(self, index: Array, t0: Scalar, args: Args) -> tuple[Array, Array]:
-        """Start number `index` as (q0, p0). It is traced: a function of JAX arrays."""
+        """Initial condition number `index` as (q0, p0). It is traced: a function of JAX arrays."""
 
 
-def _box(low: Any, high: Any, of: str) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Flat ends of a box in (q, p), and the shape of q."""
-    ends = []
-    for which, pair in (("low", low), ("high", high)):
+def _box(of: str, **ends: Any) -> tuple[list[tuple[float, ...]], tuple[int, ...]]:
+    """Pairs (q, p) as flat tuples of numbers, and the shape of q. The first must not exceed the
+    last."""
+    arrays = []
+    for which, pair in ends.items():
         if not isinstance(pair, tuple | list) or len(pair) != 2:
             raise TypeError(f"{which} of {of} must be a pair (q, p) of arrays, got {pair!r}.")
-        ends += [np.asarray(x, float) for x in pair]
-        if not all(np.isfinite(x).all() for x in ends):
+        arrays += [np.asarray(x, float) for x in pair]
+        if not all(np.isfinite(x).all() for x in arrays):
             raise ValueError(f"{which} of {of} must be finite, got {pair!r}.")
-    shapes = [x.shape for x in ends]
+    shapes = [x.shape for x in arrays]
     if len(set(shapes)) > 1:
-        raise ValueError(
-            f"low and high of {of} must be pairs (q, p) of one shape, got {shapes[:2]} and "
-            f"{shapes[2:]}."
-        )
-    a, b = np.ravel(ends[:2]), np.ravel(ends[2:])
-    if (a > b).any():
-        raise ValueError(f"low of {of} must not lie above high, got {low!r} and {high!r}.")
-    return a, b, shapes[0]
+        names = " and ".join(ends)
+        raise ValueError(f"{names} of {of} must be pairs (q, p) of one shape, got {shapes}.")
+    flat = [np.ravel(arrays[i : i + 2]) for i in range(0, len(arrays), 2)]
+    if (flat[0] > flat[-1]).any():
+        raise ValueError(f"low of {of} must not lie above high, got {ends}.")
+    return [tuple(x.tolist()) for x in flat], shapes[0]
 
 
 class _Seeded(Starts):
-    """What the generators here have in common."""
+    """Base class of the generators here."""
 
     count: int = eqx.field(static=True)
     shape: tuple[int, ...] = eqx.field(static=True)
@@ -84,24 +83,21 @@ class _Seeded(Starts):
 
 
 class InBox(_Seeded):
-    """Base of starts in a box: points of the unit cube, stretched.
+    """Base class of initial conditions in a box: scaled points of the unit cube.
 
-    - `count`: how many. `low`, `high`: corners of the box, pairs (q, p).
-    - `seed`: start i of a seed is always the same, whatever the count.
-    - `name`: of the dimension in the result.
+    - `count`, `low`, `high`, `seed`, `name`: as for `Random`.
     """
 
     low: tuple[float, ...] = eqx.field(static=True)
     high: tuple[float, ...] = eqx.field(static=True)
 
     def __init__(self, count: int, low: Any, high: Any, seed: int = 0, name: str = "start"):
-        a, b, shape = _box(low, high, type(self).__name__)
-        self.low, self.high = tuple(a.tolist()), tuple(b.tolist())
+        (self.low, self.high), shape = _box(type(self).__name__, low=low, high=high)
         super().__init__(count, shape, seed, name)
 
     @abc.abstractmethod
     def in_unit_cube(self, index: Array, like: Array) -> Array:
-        """Point number `index`, an array like this one of numbers from 0 to 1."""
+        """Point number `index`: numbers from 0 to 1, in the shape and precision of `like`."""
 
     def at(self, index, t0, args):
         low, high = jnp.asarray(self.low), jnp.asarray(self.high)
@@ -109,10 +105,10 @@ class InBox(_Seeded):
 
 
 class Random(InBox):
-    """Starts drawn uniformly from a box, independently.
+    """Independent initial conditions, uniformly distributed in a box.
 
-    - `count`: how many. `low`, `high`: corners of the box, pairs (q, p).
-    - `seed`: start i of a seed is always the same, whatever the count.
+    - `count`: number of initial conditions. `low`, `high`: corners of the box, pairs (q, p).
+    - `seed`: initial condition i of a seed is always the same, for any count.
     - `name`: of the dimension in the result.
     """
 
@@ -121,33 +117,33 @@ class Random(InBox):
 
 
 class Halton(InBox):
-    """Starts that fill a box evenly: Halton's sequence in the first primes, shifted at random.
+    """Initial conditions that fill a box evenly: Halton's sequence with a random shift.
 
-    The error of a mean over them falls nearly as 1/count in few dimensions, where that of `Random`
-    falls as 1/√count. The shift (modulo one) depends on `seed`, and makes the mean unbiased.
+    The bases are the first primes. The error of a mean decreases nearly as 1/count in few
+    dimensions, that of `Random` as 1/√count. The shift (modulo one) depends on `seed`, and makes
+    the mean unbiased.
 
-    - `count`: how many. `low`, `high`: corners of the box, pairs (q, p). A component whose ends are
-      the same takes no prime.
-    - `seed`, `name`: as for `Random`.
+    - `count`, `low`, `high`, `seed`, `name`: as for `Random`. Fixed components (low = high) do not
+      use a dimension of the sequence.
 
     **Source** Halton 1960, Numer. Math. 2, 84; the shift: Cranley & Patterson 1976, SIAM J. Numer.
     Anal. 13, 904.
     """
 
     def in_unit_cube(self, index, like):
-        moves = [i for i, (a, b) in enumerate(zip(self.low, self.high, strict=True)) if a != b]
-        shift = np.random.default_rng(self.seed).random(len(moves))
+        free = [i for i, (a, b) in enumerate(zip(self.low, self.high, strict=True)) if a != b]
+        shift = np.random.default_rng(self.seed).random(len(free))
         u = jnp.zeros_like(like)
-        for i, base, s in zip(moves, _primes(len(moves)), shift, strict=True):
+        for i, base, s in zip(free, _primes(len(free)), shift, strict=True):
             x = _radical_inverse(index + 1, base, self.count + 1, like.dtype) + s
             u = u.at[i].set(jnp.where(x >= 1, x - 1, x))
         return u
 
 
 class Normal(_Seeded):
-    """Starts scattered about one state with independent normal errors.
+    """Normally distributed initial conditions, with independent components.
 
-    - `count`: how many. `q0`, `p0`: the state in the middle.
+    - `count`: number of initial conditions. `q0`, `p0`: their mean.
     - `sigma`: standard deviations, a pair (of q, of p) of numbers or arrays of that shape.
     - `seed`, `name`: as for `Random`.
     """
@@ -158,13 +154,12 @@ class Normal(_Seeded):
     def __init__(
         self, count: int, q0: Any, p0: Any, sigma: Any, seed: int = 0, name: str = "start"
     ):
-        middle, _, shape = _box((q0, p0), (q0, p0), "Normal")
-        if not isinstance(sigma, tuple | list) or len(sigma) != 2:
-            raise TypeError(f"sigma of Normal must be a pair (of q, of p), got {sigma!r}.")
-        spread = np.ravel([np.broadcast_to(np.asarray(s, float), shape) for s in sigma])
-        if not (np.isfinite(spread).all() and (spread >= 0).all()):
-            raise ValueError(f"sigma of Normal must be finite and not negative, got {sigma!r}.")
-        self.middle, self.sigma = tuple(middle.tolist()), tuple(spread.tolist())
+        (self.middle,), shape = _box("Normal", **{"(q0, p0)": (q0, p0)})
+        if isinstance(sigma, tuple | list) and len(sigma) == 2:
+            sigma = [np.broadcast_to(np.asarray(s, float), shape) for s in sigma]
+        (self.sigma,), _ = _box("Normal", sigma=sigma)
+        if min(self.sigma, default=0) < 0:
+            raise ValueError(f"sigma of Normal must not be negative, got {sigma!r}.")
         super().__init__(count, shape, seed, name)
 
     def at(self, index, t0, args):
@@ -194,16 +189,16 @@ def _primes(count: int) -> list[int]:
 
 
 class EnergyShell(_Seeded):
-    r"""Random starts on the surface H(t0, q, p, args) = energy.
+    r"""Random initial conditions on the surface H(t0, q, p, args) = energy.
 
     q is drawn uniformly from a box and a direction d of p from the sphere; then p = λ d with the
     λ > 0 for which H(t0, q, λ d, args) = energy, to the last digit. Points with H(t0, q, 0, args) ≥
-    energy are drawn again, up to 64 times; a start that finds none is NaN and its lane has the
-    status `not_finite`. H should grow along λ, as kinetic energies do. This is not the
-    microcanonical measure: weigh by |dλ/dE| λ^(n−1) for that.
+    energy are redrawn up to 64 times; if no other is found the trajectory is NaN with the status
+    `not_finite`. H should grow with λ, as kinetic energies do. The distribution is not the
+    microcanonical measure; for that weight the points by |dλ/dE| λ^(n−1).
 
-    - `count`: how many. `H`: function ``(t, q, p, args)`` → scalar.
-    - `energy`: the value of H. `low`, `high`: ends of the box in q.
+    - `count`: number of initial conditions. `H`: function ``(t, q, p, args)`` → scalar.
+    - `energy`: the value of H. `low`, `high`: corners of the box in q.
     - `seed`, `name`: as for `Random`.
     """
 
@@ -223,9 +218,8 @@ class EnergyShell(_Seeded):
         name: str = "start",
     ):
         self.H = function("H of EnergyShell", H, "(t, q, p, args)")
-        a, b, shape = _box((low, low), (high, high), "EnergyShell")
-        n = len(a) // 2
-        self.low, self.high = tuple(a[:n].tolist()), tuple(b[:n].tolist())
+        ends, shape = _box("EnergyShell", low=(low, low), high=(high, high))
+        self.low, self.high = (x[: len(x) // 2] for x in ends)
         self.energy = finite("energy of EnergyShell", energy)
         super().__init__(count, shape, seed, name)
 

@@ -1,9 +1,9 @@
-"""A sweep on disk: labelled arrays in zarr, and a record of every task that is done.
+"""Where the results of a sweep go: arrays in memory, or a directory with arrays in zarr.
 
-Each task has one shard in each array. A shard is written under another name, forced to the disk and
-renamed; then the task's record is, which names the shards with their sizes and checksums. A task
-is done when its record is there, and the shards that it names: whatever dies, at whatever moment,
-leaves done tasks whole and the others to be done again.
+In a store each task has one shard in each array. A shard is written under another name, forced to
+the disk and renamed. The task's record, which has the sizes and checksums of its shards, follows in
+the same way. A task is done when its record and the shards listed there exist. If a process dies,
+at any moment, finished tasks are therefore whole and the others are computed again.
 """
 
 import contextlib
@@ -23,21 +23,20 @@ from .._files import TEMPORARY, publish
 from .._results import STATUS_NAMES
 from .claims import claim
 from .identity import FORMAT, differences, digest
-from .layout import STATUS, TASKS, make, shard, storable
+from .layout import STATUS, TASKS, StoreError as StoreError, as_store_error, make, shard, storable
 from .plan import Plan, Task
-from .sinks import Sink, StoreError as StoreError, as_store_error
 from .variables import Variable
 
 CLAIMS = ".claims"
 _RESTORE = (
     "Restore the file from a backup, or copy it from a store that the same call of dvi.sweep makes "
     "elsewhere: that call may be stopped as soon as its progress is shown. The results are in the "
-    "arrays beside the file."
+    "arrays next to the file."
 )
 
 
 class StoreMismatch(StoreError, ValueError):
-    """A store that holds another sweep; `differing` names what differs."""
+    """A store of another sweep; `differing` lists the differences."""
 
     def __init__(self, message: str, differing: list[str]):
         super().__init__(message)
@@ -45,25 +44,49 @@ class StoreMismatch(StoreError, ValueError):
 
 
 class Verification(NamedTuple):
-    """What `verify` found: tasks that are sound, bad ones (number → what is wrong; they are open
-    again), and how many are left to do."""
+    """Result of `verify`: number of sound tasks; bad ones (number → damage), which count as not
+    computed from then on; number of tasks that have to be computed."""
 
     sound: int
     bad: dict[int, str]
     todo: int
 
 
-class Store(Sink):
+class Memory:
+    """Results as arrays of the whole grid in memory."""
+
+    def __init__(self, plan: Plan, variables: Mapping[str, Variable]):
+        self.plan, self.variables = plan, dict(variables)
+        self.arrays = {
+            name: np.full((*plan.shape, *v.shape), v.fill, v.dtype) for name, v in variables.items()
+        }
+        self._done: set[int] = set()
+
+    def done(self):
+        return set(self._done)
+
+    def is_done(self, number: int) -> bool:
+        return number in self._done
+
+    def claimed(self, task: Task) -> contextlib.AbstractContextManager[bool]:
+        return contextlib.nullcontext(True)
+
+    def commit(self, task: Task, results: Mapping[str, np.ndarray], facts: Mapping) -> None:
+        for name, x in results.items():
+            self.arrays[name][task.box] = x
+        self._done.add(task.number)
+
+
+class Store:
     """The directory of a sweep."""
 
     def __init__(self, path: Path, attributes: Mapping[str, Any]):
-        self.path = path
-        self.attributes = attributes
+        self.path, self.attributes = path, attributes
         self.config = json.loads(attributes["config"])
         self.sha = attributes["config_sha256"]
         if digest(self.config) != self.sha:
             raise ValueError("the configuration does not have its checksum")
-        dict(json.loads(attributes.get("units", "{}")))  # what is wrong is raised here
+        dict(json.loads(attributes.get("units", "{}")))  # raises what is wrong with the units
         self.plan = Plan(dict(self.config["dims"]), tuple(self.config["chunk"]))
         self.variables = {
             name: Variable(dtype, tuple(shape), tuple(dims))
@@ -75,11 +98,8 @@ class Store(Sink):
 
     @classmethod
     def open(cls, path: str | os.PathLike) -> "Store":
-        """The store in a directory.
-
-        **Raises** `StoreError` where there is none, or none that this version can read.
-        """
-        path = _located(path)
+        """The store in a directory. **Raises** `StoreError`."""
+        path = _resolved(path)
         try:
             attributes = json.loads((path / "zarr.json").read_text())["attributes"]
             if not (path / TASKS).is_dir():
@@ -98,13 +118,13 @@ class Store(Sink):
             raise StoreError(f"{path}: there is no sweep here (no zarr.json).{lost}") from None
         except OSError as error:
             raise StoreError(
-                f"{path}: zarr.json cannot be read ({error.strerror or error}): look after its "
+                f"{path}: zarr.json cannot be read ({error.strerror or error}): check its "
                 "permissions and the disk."
             ) from None
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(
-                f"{path}: zarr.json cannot be read as that of a sweep ({error!r}): it is damaged "
-                f"or was edited. {_RESTORE}"
+                f"{path}: zarr.json is not that of a sweep ({error!r}): it is damaged or was "
+                f"edited. {_RESTORE}"
             ) from None
         for name in store.variables:
             store.array(name)
@@ -119,25 +139,17 @@ class Store(Sink):
         coordinates: Mapping[str, Any],
         attributes: Mapping[str, Any],
     ) -> "Store":
-        """The store of this very sweep in a directory, made if there is nothing there.
-
-        **Raises** `StoreMismatch` if it holds another sweep; `StoreError` for a directory that
-        holds something else, or cannot be written.
-        """
-        path = _located(path)
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            if not any((path / name).exists() for name in ("zarr.json", TASKS)):
-                raise StoreError(
-                    f"{path}: exists, and is no sweep: give a path that does not exist yet."
-                )
-        else:
+        """The store of exactly this sweep, made if nothing is there. **Raises** `StoreError`."""
+        path = _resolved(path)
+        if not path.exists() or (path.is_dir() and not any(path.iterdir())):
             make(path, config, variables, coordinates, attributes)
+        elif not any((path / name).exists() for name in ("zarr.json", TASKS)):
+            raise StoreError(f"{path} exists but is not a sweep store: choose a new path.")
         store = cls.open(path)
         if store.sha != digest(config):
-            differing = differences(store.config, config)
-            made = store.attributes
+            made, differing = store.attributes, differences(store.config, config)
             raise StoreMismatch(
-                f"{path} holds another sweep. Different are:\n  " + "\n  ".join(differing) + "\n"
+                f"{path} holds another sweep. Differences:\n  " + "\n  ".join(differing) + "\n"
                 f"(made {made.get('created')} with dvi-jax {made.get('dvi-jax')}, jax "
                 f"{made.get('jax')}). Give another store, or the arguments of that one.",
                 differing,
@@ -153,64 +165,54 @@ class Store(Sink):
     # --- arrays -------------------------------------------------------------------------------
 
     def array(self, name: str) -> Any:
-        """The zarr array of one variable.
-
-        **Raises** `StoreError` where the store does not describe it as its configuration does.
-        """
+        """The zarr array of a variable. **Raises** `StoreError` where it is not as configured."""
         if name in self._arrays:
             return self._arrays[name]
         variable = self.variables[name]
-        shape, dtype = (*self.plan.shape, *variable.shape), np.dtype(variable.dtype)
+        expected = (*self.plan.shape, *variable.shape), np.dtype(variable.dtype)
         try:
-            found: Any = self._group()[name]
-            if (found.shape, found.dtype) == (shape, dtype):
-                self._arrays[name] = found
-                return found
-            seen = f"shape {found.shape} and dtype {found.dtype}, not {shape} and {dtype}"
-        except Exception as error:  # whatever zarr says of metadata that are no longer its own
-            seen = repr(error)
-        raise StoreError(
-            f"{self.path}: zarr.json does not describe the array {name!r} of this sweep ({seen}). "
-            f"It is damaged or was edited. {_RESTORE}"
-        )
+            found = self._group()[name]
+            seen = found.shape, found.dtype
+        except Exception as error:  # zarr has many errors for damaged metadata
+            found, seen = None, repr(error)
+        if seen != expected:
+            raise StoreError(
+                f"{self.path}: zarr.json does not describe the array {name!r} of this sweep "
+                f"({seen}, not {expected}). It is damaged or was edited. {_RESTORE}"
+            )
+        self._arrays[name] = found
+        return found
 
     def read(self, name: str, number: int, where: tuple[Any, ...]) -> np.ndarray:
-        """A part of a variable that lies in one task.
-
-        **Raises** `StoreError` with the file for one that cannot be decoded.
-        """
+        """A part of a variable that lies in one task. **Raises** `StoreError` if it is damaged."""
+        array = self.array(name)
         try:
-            return self.array(name).get_orthogonal_selection(where)
-        except StoreError:
-            raise
-        except Exception as error:  # whatever a codec says of bytes that it cannot take
+            return array.get_orthogonal_selection(where)
+        except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
                 f"{self.shard_path(name, number)}: is damaged ({error}). Open its task again with "
                 "dvi.open_sweep(path).verify(); then the same call of dvi.sweep computes it."
             ) from error
 
     def coordinates(self) -> dict[str, Any]:
-        """name → (dims, values, attributes) of all coordinates.
-
-        **Raises** `StoreError` for one that is missing or damaged.
-        """
+        """name → (dims, values, attributes) of all coordinates. **Raises** `StoreError`."""
         names = [name for name, _ in self._group().arrays() if name not in self.variables]
         return {name: self._coordinate(name) for name in names}
 
-    def _group(self) -> Any:
+    def _group(self, mode: Any = "r") -> Any:
         import zarr
 
-        return zarr.open_group(self.path, mode="r", zarr_format=3)
+        return zarr.open_group(self.path, mode=mode, zarr_format=3)
 
     def _coordinate(self, name: str) -> tuple[Any, np.ndarray, dict[str, Any]]:
         try:
-            array: Any = self._group()[name]
-            # One chunk. Of a chunk that is not there zarr would say that it is full of zeros.
+            array = self._group()[name]
+            # There is one chunk. zarr would read a missing chunk as zeros.
             file = self.path.joinpath(name, "c", *("0" for _ in array.shape))
             if not file.exists():
                 raise FileNotFoundError(errno.ENOENT, "no such file", str(file))
-            values: Any = array[:]
-        except Exception as error:  # whatever a codec says of bytes that it cannot take
+            values = array[:]
+        except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
                 f"{self.path}: the coordinate {name!r} cannot be read ({error}). The same call of "
                 "dvi.sweep writes it again."
@@ -231,34 +233,24 @@ class Store(Sink):
                     as_store_error(self.path, f"the coordinate {name!r} cannot be written again"),
                     zarr.config.set({"array.write_empty_chunks": True}),
                 ):
-                    group: Any = zarr.open_group(self.path, mode="r+", zarr_format=3)
-                    group[name][...] = storable(values)
+                    self._group("r+")[name][...] = storable(values)
 
     # --- tasks --------------------------------------------------------------------------------
 
     def record_path(self, number: int) -> Path:
         return self.path / TASKS / f"{number // 1000:06d}" / f"{number:09d}.json"
 
-    def record(self, number: int) -> dict[str, Any] | None:
-        """What was committed of a task that is done. None: it has no record, a damaged one, or one
-        that names a shard which is not there in full."""
-        found = self._written(number)
-        return found if found is not None and self._lacking(number, found) is None else None
+    def shard_path(self, name: str, number: int) -> Path:
+        place = (*self.plan.place(number), *(0 for _ in self.variables[name].shape))
+        return self.path.joinpath(name, "c", *map(str, place))
 
-    def _lacking(self, number: int, record: Mapping[str, Any]) -> Path | None:
-        """The first shard of a task that is missing or has another size than its record says."""
-        for name in self.variables:
-            file = self.shard_path(name, number)
-            try:
-                is_there = file.stat().st_size == record["shards"][name]["bytes"]
-            except OSError:
-                is_there = False
-            if not is_there:
-                return file
-        return None
+    def record(self, number: int) -> dict[str, Any] | None:
+        """The record of a task that is done, else None."""
+        found = self._written(number)
+        return None if found is None or self._damage(number, found, size_only=True) else found
 
     def _written(self, number: int) -> dict[str, Any] | None:
-        """The record of a task as it was written; None if there is none or it is damaged."""
+        """The record of a task as it was written; None if it is missing or damaged."""
         try:
             text = self.record_path(number).read_bytes()
         except OSError:
@@ -266,136 +258,112 @@ class Store(Sink):
         body, _, checksum = text.rstrip(b"\n").rpartition(b"\n")
         if checksum != _crc32(body).encode():
             return None
-        try:
+        try:  # it may have been edited, together with its checksum
             found, task = json.loads(body), self.plan.task(number)
-            counts = found["statuses"]
+            expected = self._head(task)
+            counts, shards = found["statuses"], found["shards"]
             is_of_task = (
-                (found["config_sha256"], found["task"]) == (self.sha, number)
-                and (tuple(found["start"]), tuple(found["size"])) == (task.start, task.size)
-                and all(
-                    found["shards"][name].keys() >= {"bytes", "crc32"} for name in self.variables
-                )
+                {key: found[key] for key in expected} == expected
+                and all(shards[name].keys() >= {"bytes", "crc32"} for name in self.variables)
                 and counts.keys() <= set(STATUS_NAMES)
                 and sum(counts.values()) == task.lanes
             )
-        except (AttributeError, KeyError, TypeError, ValueError):  # edited, with its checksum
+        except (AttributeError, KeyError, TypeError, ValueError):
             return None
         return found if is_of_task else None
 
+    def _head(self, task: Task) -> dict[str, Any]:
+        start, size = list(task.start), list(task.size)
+        return {"task": task.number, "start": start, "size": size, "config_sha256": self.sha}
+
+    def _damage(self, number: int, record: Mapping, size_only: bool) -> tuple[Path, str] | None:
+        """The first shard of a task that differs from its record, and how."""
+        for name in self.variables:
+            file, known = self.shard_path(name, number), record["shards"][name]
+            try:
+                size = file.stat().st_size
+                content = b"" if size_only else file.read_bytes()
+            except OSError as error:
+                return file, f"the shard of {name} cannot be read ({error.strerror})"
+            if size != known["bytes"]:
+                return file, f"the shard of {name} has {size} bytes"
+            # Of the whole file: the codecs would accept the shard of another task.
+            if not size_only and _crc32(content) != known["crc32"]:
+                return file, f"the shard of {name} has another checksum"
+        return None
+
     def _records(self) -> dict[int, Path]:
-        """Number of a task → the file of its record. Other files, such as those that macOS leaves
-        beside each file, are nobody's record."""
+        """Number of a task → the file of its record. Other files, such as those that macOS creates
+        next to each file, are ignored."""
         named = (f for f in (self.path / TASKS).glob("*/*.json") if f.stem.isdecimal())
-        found = {int(f.stem): f for f in named}
-        mine = (i for i in sorted(found) if i < self.plan.num_tasks)
-        return {i: found[i] for i in mine if found[i] == self.record_path(i)}
+        found = sorted((int(f.stem), f) for f in named)
+        return {i: f for i, f in found if i < self.plan.num_tasks and f == self.record_path(i)}
 
     def done(self):
         """The numbers of finished tasks, in order. Warns of those that have lost a file."""
-        written = ((i, self._written(i)) for i in self._records())
-        lacking = {i: self._lacking(i, found) for i, found in written if found is not None}
-        if lost := [file for file in lacking.values() if file is not None]:
+        written = {i: self._written(i) for i in self._records()}
+        found = {i: self._damage(i, x, size_only=True) for i, x in written.items() if x is not None}
+        if lost := [damage[0] for damage in found.values() if damage]:
             warnings.warn(
                 f"{self.path}: {len(lost)} of the finished tasks lack a file (missing or of "
                 f"another size: {lost[0]}). They count as not computed; the same call of "
                 "dvi.sweep computes them again.",
                 stacklevel=2,
             )
-        return [i for i, file in lacking.items() if file is None]
+        return [i for i, damage in found.items() if not damage]
 
-    def is_done(self, number):
+    def is_done(self, number: int) -> bool:
         return self.record(number) is not None
 
     @contextlib.contextmanager
-    def claimed(self, task) -> Iterator[bool]:
+    def claimed(self, task: Task) -> Iterator[bool]:
         with claim(self.path / CLAIMS, task.number) as mine:
             yield mine and not self.is_done(task.number)
 
-    def shard_path(self, name: str, number: int) -> Path:
-        place = self.plan.place(number)
-        own = (0,) * len(self.variables[name].shape)
-        return self.path.joinpath(name, "c", *(str(k) for k in (*place, *own)))
-
-    def commit(self, task, results, facts):
+    def commit(self, task: Task, results: Mapping[str, np.ndarray], facts: Mapping) -> None:
+        """Write the results of a task; it is done once this returns."""
         what = f"task {task.number} cannot be written"
-        then = " What was finished before is kept; once there is room, the same call goes on."
-        with as_store_error(self.path, what, then):
-            self._commit(task, results, facts)
-
-    def _commit(self, task: Task, results: Mapping[str, np.ndarray], facts: Mapping) -> None:
+        then = " Finished tasks are not lost; once there is free space, the same call goes on."
         shards = {}
-        for name in sorted(results, key=lambda n: n == STATUS):
-            content = shard(self.plan, self.variables[name], task, results[name])
-            publish(self.shard_path(name, task.number), content)
-            shards[name] = {"bytes": len(content), "crc32": _crc32(content)}
-        record = {
-            "task": task.number,
-            "start": task.start,
-            "size": task.size,
-            "shards": shards,
-            "config_sha256": self.sha,
-            **facts,
-        }
-        body = json.dumps(record).encode()
-        publish(self.record_path(task.number), body + f"\n{_crc32(body)}\n".encode())
-
-    # --- looking after it ---------------------------------------------------------------------
+        with as_store_error(self.path, what, then):
+            for name in sorted(results, key=lambda n: n == STATUS):
+                content = shard(self.plan, self.variables[name], task, results[name])
+                publish(self.shard_path(name, task.number), content)
+                shards[name] = {"bytes": len(content), "crc32": _crc32(content)}
+            body = json.dumps({**self._head(task), "shards": shards, **facts}).encode()
+            publish(self.record_path(task.number), body + f"\n{_crc32(body)}\n".encode())
 
     def verify(self, progress: Any = None) -> Verification:
-        """Read every shard of every task that is done, and compare it with its record. The records
-        of bad ones are taken away, so that the next run does these tasks again."""
+        """Compare every shard of every finished task with its record. Records of bad tasks are
+        removed, so that the next run computes these tasks again."""
         bad: dict[int, str] = {}
         files = self._records()
         for n, (number, file) in enumerate(files.items()):
-            wrong = self._what_is_wrong(number)
-            if wrong:
-                bad[number] = wrong
+            record = self._written(number)
+            damage = None if record is None else self._damage(number, record, size_only=False)
+            if record is None or damage:
+                bad[number] = damage[1] if damage else "the record is damaged"
                 file.unlink()
             if progress is not None:
                 progress(n + 1, len(files))
-        self._clear_away()
-        sound = len(files) - len(bad)
-        return Verification(sound, bad, self.plan.num_tasks - sound)
-
-    def _what_is_wrong(self, number: int) -> str:
-        record = self._written(number)
-        if record is None:
-            return "the record is damaged"
-        for name in self.variables:
-            known = record["shards"][name]
-            try:
-                content = self.shard_path(name, number).read_bytes()
-            except OSError as error:
-                return f"the shard of {name} cannot be read ({error.strerror})"
-            if len(content) != known["bytes"]:
-                return f"the shard of {name} has {len(content)} bytes"
-            # Of the whole file: the codecs do not see that a shard is another task's.
-            if _crc32(content) != known["crc32"]:
-                return f"the shard of {name} has another checksum"
-        return ""
-
-    def _clear_away(self) -> None:
-        """Remove what processes that died had begun to write: files older than any write takes."""
+        # Files that processes which died had begun to write; no write takes an hour.
         before = time.time() - 3600
         for file in self.path.rglob(f"*{TEMPORARY}"):
             with contextlib.suppress(OSError):
                 if file.stat().st_mtime < before:
                     file.unlink()
+        sound = len(files) - len(bad)
+        return Verification(sound, bad, self.plan.num_tasks - sound)
 
 
-def _located(path: str | os.PathLike) -> Path:
-    """A path in full.
-
-    **Raises** `StoreError` for one that no directory can have.
-    """
+def _resolved(path: str | os.PathLike) -> Path:
     try:
         found = Path(path).resolve()
         found.exists()
     except (OSError, ValueError, RuntimeError) as error:
-        why = getattr(error, "strerror", None) or error
         raise StoreError(
-            f"{os.fspath(path)!r:.80}: cannot be the path of a store ({why}): give the path of a "
-            "directory."
+            f"{os.fspath(path)!r:.80}: cannot be the path of a store "
+            f"({getattr(error, 'strerror', None) or error}): give the path of a directory."
         ) from None
     return found
 

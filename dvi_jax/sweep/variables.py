@@ -20,12 +20,12 @@ ARRAY_NAMES = (
 )
 
 RESERVED = ("status", "failed_step", "residual", "t", "q", "p", "save", "q0", "p0")
-"""Names in a result that are not the user's to give."""
+"""Names that the result itself uses."""
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One array of a result: dtype and, behind the dimensions of the grid, its own."""
+    """One array of a result: dtype and, after the dimensions of the grid, its own."""
 
     dtype: str
     shape: tuple[int, ...] = ()
@@ -38,7 +38,7 @@ class Variable:
 
     @property
     def fill(self) -> Any:
-        """What stands where nothing has been computed."""
+        """The value of entries that have not been computed."""
         dtype = np.dtype(self.dtype)
         if dtype.kind == "u":
             return int(np.iinfo(dtype).max)
@@ -46,38 +46,33 @@ class Variable:
 
 
 def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
-    """The arrays of a result, with names for their own dimensions.
-
-    **Raises** `ValueError` for an observable with a name that is taken, `TypeError` for one that
-    is not real or complex.
-    """
-    given = [
-        place(path) or "observed"
-        for path, _ in jax.tree.leaves_with_path(sweep.options["observe"], is_leaf=is_observable)
-    ]
-    if twice := [n for n in given if given.count(n) > 1]:
-        raise ValueError(f"two observables have the name {twice[0]!r}: give one of them another.")
-    if bad := [n for n in given if not is_array_name(n)]:
-        raise ValueError(f"the observable {bad[0]!r}: {ARRAY_NAMES}.")
-    taken = [n for n in given if n.split(".")[0] in RESERVED or n in sweep.dims]
-    if taken:
-        raise ValueError(
-            f"the observable {taken[0]!r} has a name that the result needs for something else "
-            f"({', '.join(dict.fromkeys((*RESERVED, *sweep.dims)))}): give it another."
-        )
+    """The arrays of a result, with names for their own dimensions."""
+    leaves = jax.tree.leaves_with_path(sweep.options["observe"], is_leaf=is_observable)
+    observables = [(place(path) or "observed", f) for path, f in leaves]
+    given = [name for name, _ in observables]
+    taken = (*RESERVED, *(d for d in sweep.dims if d not in RESERVED))
+    for name in given:
+        if given.count(name) > 1:
+            raise ValueError(f"two observables have the name {name!r}: rename one of them.")
+        if not is_array_name(name):
+            raise ValueError(f"the observable {name!r} cannot have this name: {ARRAY_NAMES}.")
+        if name in taken or name.split(".")[0] in RESERVED:
+            raise ValueError(
+                f"the observable {name!r} has a name that is reserved ({', '.join(taken)}): rename "
+                "it."
+            )
+    # Observables that are not reduced have a row for each step that ends at a save point: one less
+    # than states, except for `Save(ts=...)`.
+    save = sweep.options["save"]
+    rows = "save" if save is not None and save.ts is not None else "saved_step"
+    first = {name: rows for name, f in observables if not isinstance(f, Reduction)}
+    first |= dict.fromkeys("tqp", "save")
     found = {}
-    alone = _alone(sweep)
     for name, x in shapes.items():
-        dims: list[str] = []
-        rest = x.shape
-        if name in ("t", "q", "p"):
-            dims, rest = ["save"], rest[1:]
-        elif name in alone:
-            dims, rest = [alone[name]], rest[1:]
-        if name in ("q", "p"):
-            dims += own_dims("component", rest)
-        else:
-            dims += own_dims(f"{name}_dim", rest)
+        own = x.shape[1:] if name in first else x.shape
+        dims = own_dims("component" if name in ("q", "p") else f"{name}_dim", own)
+        if name in first:
+            dims.insert(0, first[name])
         dtype = np.dtype(x.dtype)
         if dtype.kind not in "iufbc":
             raise TypeError(f"the observable {name!r} has dtype {dtype}: it must be a number.")
@@ -96,24 +91,16 @@ def check_names(
     """Refuse names that would mean two things in one result."""
     own = {d for v in variables.values() for d in v.dims}
     own |= {d for of, *_ in coordinates.values() for d in of if d not in dims}
-    if taken := [name for name in dims if name in own]:
-        raise ValueError(
-            f"the axis {taken[0]!r} has the name of a dimension of the results: give it another."
-        )
-    if taken := [name for name in variables if name in coordinates or name in own]:
-        raise ValueError(
-            f"the observable {taken[0]!r} has the name of what varies in the sweep: give it "
-            "another."
-        )
-
-
-def _alone(sweep: Sweep) -> dict[str, str]:
-    """The observables that stand alone, and the dimension of their rows: steps that end at a save
-    point, one less than states but for ``Save(ts=...)``."""
-    save = sweep.options["save"]
-    rows = "save" if save is not None and save.ts is not None else "saved_step"
-    leaves = jax.tree.leaves_with_path(sweep.options["observe"], is_leaf=is_observable)
-    return {place(path) or "observed": rows for path, f in leaves if not isinstance(f, Reduction)}
+    for what, names, taken in (
+        ("the axis {!r} has the name of a dimension of the results", dims, own),
+        (
+            "the observable {!r} has the name of an axis or argument",
+            variables,
+            {*own, *coordinates},
+        ),
+    ):
+        if both := [name for name in names if name in taken]:
+            raise ValueError(f"{what.format(both[0])}: rename it.")
 
 
 def own_dims(name: str, shape: tuple[int, ...]) -> list[str]:

@@ -1,16 +1,16 @@
-"""Tasks on the devices of this process: one thread a core or a GPU, results kept as they come."""
+"""Tasks on the devices of this process: one thread for each core or GPU."""
 
 import contextlib
+import math
 import os
 import platform
+import queue
 import signal
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Collection, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Collection, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from math import nan
 from typing import Any
 
 import jax
@@ -23,10 +23,10 @@ from ..engine.threads import processors
 from .layout import STATUS
 from .plan import Task
 from .program import Program
-from .sinks import Sink
+from .store import Memory, Store
 
-_PATIENCE = 0.2
-"""Seconds between two looks at tasks that another process works on, and at an interrupt."""
+_PAUSE = 0.2
+"""Seconds between two checks of tasks that another process computes."""
 
 _BEHIND = 2
 """Tasks for each thread that may wait to be written."""
@@ -36,13 +36,13 @@ GOOD = ("successful", "stopped")
 
 @dataclass(frozen=True)
 class SweepProgress:
-    """How far a sweep is.
+    """Progress of a sweep.
 
     - `tasks_done`, `num_tasks`, `lanes_done`, `num_lanes`: tasks and trajectories, those of earlier
       runs included.
     - `failed`: trajectories of this run with a status other than successful or stopped.
-    - `rate`: trajectory steps a second, of this run. `seconds`: since it began. `seconds_left`:
-      estimated from the trajectories done; NaN before there are any.
+    - `rate`: trajectory steps per second in this run. `seconds`: since it began. `seconds_left`:
+      estimated from the finished trajectories; NaN before there are any.
     """
 
     tasks_done: int
@@ -56,19 +56,18 @@ class SweepProgress:
 
 
 class Counter:
-    """Counts tasks and tells a callback."""
+    """Counts tasks and calls `report`. `before`: the tasks that were finished earlier."""
 
     def __init__(
         self, program: Program, before: Collection[int], report: Callable[..., None] | None
     ):
-        """`before`: the tasks that were done earlier."""
         self.program, self.report = program, report
         self.plan, self.began = program.plan, time.monotonic()
         self.before = len(before)
         self.lanes_before = sum(self.plan.task(i).lanes for i in before)
         self.done, self.lanes, self.steps, self.failed = 0, 0, 0, 0
         self._lock = threading.Lock()
-        self._tell()
+        self._report()
 
     def add(self, task: Task, statuses: dict[str, int]) -> None:
         with self._lock:
@@ -76,9 +75,9 @@ class Counter:
             self.lanes += task.lanes
             self.steps += task.lanes * self.program.steps(task)
             self.failed += sum(n for name, n in statuses.items() if name not in GOOD)
-            self._tell()
+            self._report()
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         if self.report is None:
             return
         seconds = time.monotonic() - self.began
@@ -92,7 +91,7 @@ class Counter:
                 failed=self.failed,
                 rate=self.steps / seconds if seconds > 0 else 0.0,
                 seconds=seconds,
-                seconds_left=seconds * (todo / self.lanes - 1) if self.lanes else nan,
+                seconds_left=seconds * (todo / self.lanes - 1) if self.lanes else math.nan,
             )
         )
 
@@ -100,8 +99,8 @@ class Counter:
 def compute(
     program: Program, task: Task, device: Any
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The results of a task and what its record says about them."""
-    began = time.monotonic()  # the clock of the machine may be set back meanwhile
+    """The results of a task and the facts for its record."""
+    began = time.monotonic()  # not time.time(): the clock of the machine may be set back meanwhile
     results = program(task, device)
     codes, counts = np.unique(results[STATUS], return_counts=True)
     facts = {
@@ -121,110 +120,82 @@ def default_threads() -> int:
     return processors() if devices[0].platform == "cpu" else len(devices)
 
 
-class Queue:
-    """The tasks to do, and those that another process works on and may leave undone."""
-
-    def __init__(self, todo: Iterator[int], sink: Sink, done_elsewhere: Callable[[int], None]):
-        self.sink, self.done_elsewhere = sink, done_elsewhere
-        self.stop = threading.Event()
-        self._todo, self._open_again, self._theirs = todo, deque(), deque()
-        self._lock = threading.Lock()
-
-    def put_off(self, number: int) -> None:
-        """Another process has claimed it."""
-        with self._lock:
-            self._theirs.append(number)
-
-    def __iter__(self) -> Iterator[int]:
-        """Numbers of tasks until all are done or it is stopped; several threads may ask."""
-        while not self.stop.is_set():
-            with self._lock:
-                number = self._open_again.popleft() if self._open_again else next(self._todo, None)
-                if number is None and not self._theirs:
-                    return
-            if number is not None:
-                yield number
-            elif not self.stop.wait(_PATIENCE):
-                self._look_again()
-
-    def _look_again(self) -> None:
-        done = []
-        with self._lock:
-            for _ in range(len(self._theirs)):
-                number = self._theirs.popleft()
-                (done if self.sink.is_done(number) else self._open_again).append(number)
-        for number in done:
-            self.done_elsewhere(number)
-
-
 def run_here(
     program: Program,
-    sink: Sink,
+    sink: Memory | Store,
     threads: int | None,
     report: Callable[[SweepProgress], None] | None,
 ) -> bool:
-    """Do the tasks that `sink` lacks, on all local devices. False: interrupted by Ctrl-C, once the
-    tasks that were being computed had been kept.
-
-    **Raises** whatever a task or its writing raises, once the other threads have ended.
-    """
-    before = set(sink.done())
+    """Compute the tasks that `sink` lacks, on all local devices. False: it was interrupted by
+    Ctrl-C; the tasks that were being computed then have been stored. **Raises** the first error of
+    a task or of its writing, once the other threads have ended."""
+    plan, before = program.plan, set(sink.done())
     counter = Counter(program, before, report)
-    todo = program.plan.todo(before)
-    queue = Queue(todo, sink, lambda number: counter.add(program.plan.task(number), {}))
     devices, x64 = jax.local_devices(), x64_enabled()
     count = threads or default_threads()
-    room = threading.Semaphore(_BEHIND * count)
-    writer = ThreadPoolExecutor(2, "write")
+    free: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    for i in range(count):
+        free.put(devices[i % len(devices)])
+    places = threading.Semaphore(_BEHIND * count)
+    stop, interrupted = threading.Event(), threading.Event()
     errors: list[BaseException] = []
 
-    def keep(task: Task, results: Any, facts: Any, claim: contextlib.ExitStack) -> None:
+    @contextlib.contextmanager
+    def stopping_on_errors() -> Iterator[None]:
         try:
-            with claim:
-                sink.commit(task, results, facts)
-            counter.add(task, facts["statuses"])
+            yield
         except BaseException as error:
-            queue.stop.set()
+            stop.set()
             errors.append(error)
+
+    def compute_one(task: Task, device: Any, claim: contextlib.ExitStack) -> None:
+        try:
+            # enable_x64 may be a context of the caller, which threads do not inherit.
+            with stopping_on_errors(), claim, jax.enable_x64(x64):
+                results, facts = compute(program, task, device)
+                places.acquire()
+                writer.submit(write, task, results, facts, claim.pop_all())
         finally:
-            room.release()
+            free.put(device)
 
-    def work(device: Any) -> None:
-        try:
-            with jax.enable_x64(x64):  # a context of the caller's, which threads do not inherit
-                for number in queue:
-                    task = program.plan.task(number)
-                    with contextlib.ExitStack() as claim:
-                        if not claim.enter_context(sink.claimed(task)):
-                            queue.put_off(number)
-                            continue
-                        results, facts = compute(program, task, device)
-                        room.acquire()
-                        passed_on = claim.pop_all()
-                    writer.submit(keep, task, results, facts, passed_on)
-        except BaseException as error:
-            queue.stop.set()
-            errors.append(error)
+    def write(task: Task, results: Any, facts: Any, claim: contextlib.ExitStack) -> None:
+        with stopping_on_errors():
+            try:
+                with claim:
+                    sink.commit(task, results, facts)
+                counter.add(task, facts["statuses"])
+            finally:
+                places.release()
 
-    interrupted = threading.Event()
+    def submit(numbers: Iterable[int]) -> list[int]:
+        """Those that another process computes, and may leave unfinished, are returned."""
+        theirs = []
+        for number in numbers:
+            task, device, claim = plan.task(number), free.get(), contextlib.ExitStack()
+            if stop.is_set():
+                break
+            if claim.enter_context(sink.claimed(task)):
+                pool.submit(compute_one, task, device, claim)
+                continue
+            claim.close()
+            free.put(device)
+            if sink.is_done(number):
+                counter.add(task, {})
+            else:
+                theirs.append(number)
+        return theirs
+
     with (
-        _instead_of_interrupt(interrupted, queue.stop),
-        writer,
+        _instead_of_interrupt(interrupted, stop),
+        ThreadPoolExecutor(2, "write") as writer,
         ThreadPoolExecutor(count, "sweep") as pool,
     ):
-        running = [pool.submit(work, devices[i % len(devices)]) for i in range(count)]
         try:
-            while True:
-                try:
-                    if not wait(running, timeout=_PATIENCE).not_done:
-                        break
-                except KeyboardInterrupt:  # another handler than Python's raised it
-                    if interrupted.is_set():
-                        raise
-                    interrupted.set()
-                    queue.stop.set()
-        finally:
-            queue.stop.set()  # whatever is raised here must not wait for all of the sweep
+            theirs = submit(plan.todo(before))
+            while theirs and not stop.wait(_PAUSE):
+                theirs = submit(theirs)
+        except KeyboardInterrupt:  # raised by another handler than Python's
+            interrupted.set()
     if errors:
         raise errors[0]
     return not interrupted.is_set()
@@ -232,7 +203,7 @@ def run_here(
 
 @contextlib.contextmanager
 def _instead_of_interrupt(*events: threading.Event) -> Iterator[None]:
-    """Have the first Ctrl-C set these events. The exception that Python raises instead can meet any
+    """The first Ctrl-C sets these events. The exception that Python raises instead can occur at any
     line, and is lost in some, such as a callback of the garbage collector."""
     in_main = threading.current_thread() is threading.main_thread()
     before: Any = signal.getsignal(signal.SIGINT)
