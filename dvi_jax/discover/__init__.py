@@ -16,8 +16,6 @@ from .determining import (
     discrete_equations as discrete_equations,
 )
 from .drift import (
-    DriftOrder as DriftOrder,
-    DriftSurface as DriftSurface,
     drift_order as drift_order,
     drift_surface as drift_surface,
 )
@@ -50,6 +48,10 @@ from .noether import (
 )
 from .obstructions import (
     DriftLaw as DriftLaw,
+)
+from .orders import (
+    DriftOrder as DriftOrder,
+    DriftSurface as DriftSurface,
 )
 from .sampling import (
     random_pairs as random_pairs,

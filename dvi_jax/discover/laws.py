@@ -7,11 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+# Relative error of a drift that is always assumed: no law is more accurate than this.
 _LEAST_SCATTER = 1e-3
-"""Relative error of a drift that is always assumed: no law is more accurate than this."""
-
-_DIP = 1e-3
-"""Smallest factor by which a difference of two powers is reduced where they are equal."""
+_DIP = 1e-3  # Smallest factor by which a difference of two powers is reduced where they are equal
 
 
 def _no_shape(u: np.ndarray, size: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
@@ -103,16 +101,14 @@ def names() -> list[str]:
 
 _MARGIN = np.log(3.0)
 _BEYOND = np.log(1e4)
+# Cells of the centre x_c in three regions of ε, where ε_max is the largest one measured: up to 3
+# ε_max; from there to 10⁴ ε_max, where the correction is 10⁻⁴ for k = 1; up to ε_max.
 _COUNTS = np.array([40, 20, 40])
-"""Cells of the centre x_c in three regions of ε, where ε_max is the largest one measured: up to
-3 ε_max; from there to 10⁴ ε_max, where the correction is 10⁻⁴ for k = 1; up to ε_max."""
-_WITHIN = 0.6
-"""Probability that the centre is below 3 ε_max, for laws where it may be above ε_max."""
+_WITHIN = 0.6  # Probability that the centre is below 3 ε_max, for laws where it may be above ε_max
 _LEVELS = 7
-_REFINED = 100
-"""At each level this many cells, the most probable ones, are divided by four."""
+_REFINED = 100  # At each level this many cells, the most probable ones, are divided by four
+# A cell is left out if the logarithm of its probability is this much below the largest one.
 _NEGLIGIBLE = 12.0
-"""A cell is left out if the logarithm of its probability is this much below the largest one."""
 
 
 class _Cells(NamedTuple):

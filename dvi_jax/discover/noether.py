@@ -11,8 +11,7 @@ from .._system import System
 from .._types import Args, Scalar
 from .generators import Generator, LatticePoint, prolong
 
-Gauge = Callable[..., Any]
-"""``G(t, q, p, args)`` → scalar [action] at a lattice point."""
+Gauge = Callable[..., Any]  # ``G(t, q, p, args)`` → scalar [action] at a lattice point
 
 
 def lattice_defect(

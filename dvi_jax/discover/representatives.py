@@ -6,8 +6,7 @@ import numpy as np
 
 from .basis import BoundBasis
 from .echelon import reduced, reduction
-from .null_series import SeriesSpace
-from .nullspace import orthonormal_range, singular_vectors
+from .nullspace import SeriesSpace, orthonormal_range, singular_vectors
 from .sampling import Samples, spread
 
 
