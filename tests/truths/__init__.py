@@ -71,12 +71,13 @@ class Case(NamedTuple):
 
 
 def case(where: tuple, truth: Any = (), sought: str = "invariants", **more: Any) -> Case:
-    """A case; `where`: system, basis and samples; `truth`: one or several; invariants may be
-    formulas as text. What is no field is an option of the search."""
+    """A case; `where`: system, basis, samples and the step size if it is not 0.1; `truth`: one or
+    several; invariants may be formulas as text. What is no field is an option of the search."""
     several = truth if isinstance(truth, Iterable) and not isinstance(truth, str) else (truth,)
     several = tuple(formula(x) if isinstance(x, str) else x for x in several)
     fields = {name: more.pop(name) for name in Case._fields if name in more}
-    return Case(sought, *where, several, more, **fields)
+    system, basis, samples, *h = where
+    return Case(sought, system, basis, samples, several, more, *h, **fields)
 
 
 symmetry = functools.partial(case, sought="symmetries")

@@ -3,35 +3,15 @@
 Where no truth is given the changes of the basis have full rank: checked in 60 digits.
 """
 
+# ruff: noqa: F403, F405 (the vocabulary of the tables is `maps`)
+
 import numpy as np
 
 import dvi_jax as dvi
 
 from . import case, named
 from .chaotic import standard
-from .maps import (
-    BIQUADRATIC,
-    CENTRAL,
-    ENERGIES,
-    HENON,
-    ISOTROPIC,
-    KEPLER,
-    MCMILLAN,
-    OSCILLATOR,
-    QUADRATICS,
-    QUARTIC,
-    E,
-    L,
-    box,
-    energies,
-    functions,
-    poly,
-    separable,
-    shell,
-    sized,
-    system,
-    trig,
-)
+from .maps import *
 
 
 def half_precision(samples):
@@ -109,11 +89,11 @@ _BASES = {
     ),
     "oscillator, polynomials of degree 10": case((OSCILLATOR, poly(10), box(1, 200)), E),
     "McMillan's map, polynomials of degree 9": case(
-        (MCMILLAN, poly(9), box(1, 200)), BIQUADRATIC, h=1.0
+        (MCMILLAN, poly(9), box(1, 200), 1.0), BIQUADRATIC
     ),
-    "quartic oscillator, polynomials of degree 10": case((QUARTIC, poly(10), box(1, 200)), h=0.5),
+    "quartic oscillator, polynomials of degree 10": case((QUARTIC, poly(10), box(1, 200), 0.5)),
     "McMillan's map in products of Chebyshev polynomials": case(
-        (MCMILLAN, CHEBYSHEV, box(1, 100, -2.0, 2.0)), BIQUADRATIC, h=1.0
+        (MCMILLAN, CHEBYSHEV, box(1, 100, -2.0, 2.0), 1.0), BIQUADRATIC
     ),
     # p is conserved, and three of the four are functions of it
     "functions of momentum alone on a twist map": case(
@@ -144,10 +124,10 @@ _BASES = {
     "positions alone": case((OSCILLATOR, poly(5, ["q"]), box(1, 60))),
     # the map conserves p² + q² − h q p, and the basis has no q p
     "the energy of the flow alone": case(
-        (OSCILLATOR, functions("q @ q + p @ p", "q1", "p1"), box(1, 40)), h=1e-4
+        (OSCILLATOR, functions("q @ q + p @ p", "q1", "p1"), box(1, 40), 1e-4)
     ),
     "the energy of the flow alone, in one function": case(
-        (OSCILLATOR, functions("q @ q + p @ p"), box(1, 40)), h=1e-4
+        (OSCILLATOR, functions("q @ q + p @ p"), box(1, 40), 1e-4)
     ),
     "powers of the radius for Kepler's problem": case(
         (KEPLER, poly(2) + dvi.Radial((-3, -2, -1, 1, 3)), shell(2, 100)), L
@@ -171,7 +151,7 @@ _BASES = {
 }
 _FEW = {
     f"{name}, as few samples as are allowed": case(
-        (system, basis, samples), truth, h=h, points=points
+        (system, basis, samples, h), truth, points=points
     )
     for name, system, basis, samples, points, truth, h in (
         ("oscillator", OSCILLATOR, poly(4), box(1, 28), box(1, 60), (E,), 0.1),
@@ -194,11 +174,11 @@ _WHERE = {
     "oscillator, 5000 samples": case((OSCILLATOR, poly(4), box(1, 5000)), E, points=box(1, 100)),
     # samples are points, and rounded ones are points too
     "McMillan's map, samples in float32": case(
-        (MCMILLAN, poly(4), half_precision(box(1, 100))), BIQUADRATIC, h=1.0
+        (MCMILLAN, poly(4), half_precision(box(1, 100)), 1.0), BIQUADRATIC
     ),
     "Kepler, samples in float32": case((KEPLER, ENERGIES, half_precision(shell(2, 100))), L),
     "oscillator, samples on a grid": case((OSCILLATOR, poly(6), grid(12)), E),
-    "Hénon's map, samples on a grid": case((HENON, poly(6), grid(12)), h=1.0),
+    "Hénon's map, samples on a grid": case((HENON, poly(6), grid(12), 1.0)),
     "central force, samples on a coarse grid": case((CENTRAL, poly(2), grid(4, 2)), L),
     # what one step conserves from a generic curve
     "oscillator, samples on a curve": case((OSCILLATOR, poly(2), curve), E, points=box(1, 60)),
@@ -214,18 +194,21 @@ _WHERE = {
         points=box(1, 60),
     ),
     "McMillan's map, samples on ten orbits": case(
-        (MCMILLAN, poly(4), orbits(lambda rng: rng.uniform(-1, 1, (2, 10, 1)), of_mcmillan, 20)),
+        (
+            MCMILLAN,
+            poly(4),
+            orbits(lambda rng: rng.uniform(-1, 1, (2, 10, 1)), of_mcmillan, 20),
+            1.0,
+        ),
         BIQUADRATIC,
-        h=1.0,
     ),
     "oscillator, each sample four times": case((OSCILLATOR, poly(4), repeated(box(1, 40), 4)), E),
     "McMillan's map, samples in one quadrant": case(
-        (MCMILLAN, poly(4), box(1, 100, 0.2, 2.0)), BIQUADRATIC, h=1.0
+        (MCMILLAN, poly(4), box(1, 100, 0.2, 2.0), 1.0), BIQUADRATIC
     ),
     "McMillan's map, samples of a Cauchy distribution": case(
-        (MCMILLAN, poly(4), lambda rng: tuple(rng.standard_cauchy((2, 150, 1)))),
+        (MCMILLAN, poly(4), lambda rng: tuple(rng.standard_cauchy((2, 150, 1))), 1.0),
         BIQUADRATIC,
-        h=1.0,
         points=box(1, 100),
     ),
     "oscillator, some samples at rest in the equilibrium": case(
@@ -235,6 +218,6 @@ _WHERE = {
         (OSCILLATOR, poly(2), box(1, 60, -1e-8, 1e-8)), E
     ),
     # the map is nearly a shear there; p changes by 1e-12 h, which is 1e-8 of p
-    "quartic oscillator, a box of 1e-4": case((QUARTIC, poly(2), box(1, 60, -1e-4, 1e-4)), h=1.0),
+    "quartic oscillator, a box of 1e-4": case((QUARTIC, poly(2), box(1, 60, -1e-4, 1e-4), 1.0)),
 }
 CASES = (*named("bases", _BASES), *named("few samples", _FEW), *named("samples", _WHERE))

@@ -4,27 +4,15 @@ Where no truth is given the changes of the basis have full rank but for function
 in 60 digits.
 """
 
+# ruff: noqa: F403, F405 (the vocabulary of the tables is `maps`)
+
 import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
 
 from . import case, named
-from .maps import (
-    FREE,
-    OSCILLATOR,
-    QUADRATICS,
-    VARYING,
-    E,
-    L,
-    box,
-    functions,
-    poly,
-    separable,
-    system,
-    timed,
-    trig,
-)
+from .maps import *
 
 
 def orbit_of_force(omega, h, amplitude=1.0):
@@ -178,6 +166,6 @@ _CASES = {
         (OSCILLATOR, poly(4), timed(box(1, 80), -1e6, 1e6)), E
     ),
     # q₊ + q₋ = (a + δt)/q + b/q²: integrable, and without an invariant
-    "discrete Painlevé I": case((PAINLEVE, poly(4), timed(POSITIVE)), h=1.0),
+    "discrete Painlevé I": case((PAINLEVE, poly(4), timed(POSITIVE), 1.0)),
 }
 CASES = named("time dependent", _CASES)

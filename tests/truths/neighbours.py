@@ -3,6 +3,8 @@
 What is not in a truth is not conserved: checked in 60 digits.
 """
 
+# ruff: noqa: F403, F405 (the vocabulary of the tables is `maps`)
+
 import dvi_jax as dvi
 
 from . import case, named
@@ -17,25 +19,7 @@ from .integrable import (
     toda,
     toda_basis,
 )
-from .maps import (
-    ENERGIES,
-    KEPLER,
-    MCMILLAN,
-    PENDULUM,
-    QUARTIC,
-    TWO_VECTORS,
-    L,
-    additive,
-    box,
-    energies,
-    functions,
-    poly,
-    separable,
-    shell,
-    spring,
-    system,
-    trig,
-)
+from .maps import *
 
 PENDULUM_BASIS = poly(3, ["p"]) + trig(2, "q") + poly(1, ["p"]) * trig(1, "q")
 CHAIN_BASIS = functions(
@@ -52,14 +36,14 @@ _CASES = {
                 separable(f"sum(q**2 - 0.7 * log(1 + q**2) + {size} * q**4 / 4)"),
                 poly(4),
                 box(1, 120),
-            ),
-            h=1.0,
+                1.0,
+            )
         )
         for size in (1e-2, 1e-4, 1e-6, 1e-8)
     },
     # q₊ + q₋ = 1.4 q/(1 + q⁴) is not of the form of Quispel, Roberts & Thompson
     "McMillan's map with another exponent": case(
-        (additive(lambda q: 1.4 * q / (1 + q**4)), poly(6), box(1, 120)), h=1.0
+        (additive(lambda q: 1.4 * q / (1 + q**4)), poly(6), box(1, 120), 1.0)
     ),
     # β differs between numerator and denominator by 0.001
     "symmetric QRT map with one coefficient changed": case(
@@ -67,22 +51,22 @@ _CASES = {
             additive(lambda q: -(0.501 * q**2 - 1.2 * q + 0.3) / (q**2 + 0.5 * q + 2)),
             poly(4),
             box(1, 120),
-        ),
-        h=1.0,
+            1.0,
+        )
     ),
     # D(y) has a term 0.01 y that the other curve has not
     "asymmetric QRT map with one coefficient changed": case(
-        (asymmetric(0.8, 0.3, 1.5, -0.4, change=0.01), poly(4), box(1, 120)), h=1.0
+        (asymmetric(0.8, 0.3, 1.5, -0.4, change=0.01), poly(4), box(1, 120), 1.0)
     ),
     "Lyness' map with another exponent": case(
-        (lyness(2.0, power=1.01), EXPONENTIALS, box(1, 80)), h=1.0
+        (lyness(2.0, power=1.01), EXPONENTIALS, box(1, 80), 1.0)
     ),
     "Suris' trigonometric map with one coefficient changed": case(
-        (suris(0.4, other=1.02), WAVES + poly(2), box(1, 100, -3.0, 3.0)), h=1.0
+        (suris(0.4, other=1.02), WAVES + poly(2), box(1, 100, -3.0, 3.0), 1.0)
     ),
     # e^{1.05 u} in place of e^u: the total momentum remains
     "discrete Toda lattice with another exponent": case(
-        (toda(0.5, steepness=1.05), toda_basis(0.5, 3), box(3, 100)), "sum(p)", h=0.5
+        (toda(0.5, steepness=1.05), toda_basis(0.5, 3), box(3, 100), 0.5), "sum(p)"
     ),
     # the flow is integrable, the map of Strang's method is not: the total momentum remains
     "Toda chain by Strang's method": case(
@@ -96,18 +80,18 @@ _CASES = {
     ),
     # central, so that L is conserved
     "radial McMillan map with a quartic term": case(
-        (garnier(0.7, 0.7, change=0.01), poly(4), box(2, 150)), L, h=1.0
+        (garnier(0.7, 0.7, change=0.01), poly(4), box(2, 150), 1.0), L
     ),
     "Garnier's system with a quartic term": case(
-        (garnier(0.9, 0.5, change=0.01), poly(4), box(2, 150)), h=1.0
+        (garnier(0.9, 0.5, change=0.01), poly(4), box(2, 150), 1.0)
     ),
     # without the denominator of the integrable discretisation
     "Duffing oscillator by symplectic Euler": case(
-        (separable("sum(q**2 / 2 + q**4 / 4)"), poly(6), box(1, 120)), h=0.25
+        (separable("sum(q**2 / 2 + q**4 / 4)"), poly(6), box(1, 120), 0.25)
     ),
     # the denominator is made for h = 0.25, and the step is 0.26
     "integrable discrete Duffing oscillator at another step": case(
-        (duffing(1.0, 0.5, 0.25), poly(4), box(1, 120)), h=0.26
+        (duffing(1.0, 0.5, 0.25), poly(4), box(1, 120), 0.26)
     ),
     **{
         f"central force with an anisotropy of {size:g}": case(
@@ -121,20 +105,20 @@ _CASES = {
     ),
     # the cubic invariant needs the resonance
     "resonance 1:2 of the map, detuned by 0.001": case(
-        (spring(0.5, 1.751), poly(3), box(2, 120)), energies(1.0, 0.5, 1.751), h=1.0
+        (spring(0.5, 1.751), poly(3), box(2, 120), 1.0), energies(1.0, 0.5, 1.751)
     ),
     # the map turns by 2 arcsin(hω/2) in each step, so that frequencies 1 and 2 are detuned by
     # O(h²)
     **{
         f"resonance 1:2 of the flow at h = {h:g}": case(
-            (spring(1.0, 4.0), poly(3), box(2, 120)), energies(h, 1.0, 4.0), h=h
+            (spring(1.0, 4.0), poly(3), box(2, 120), h), energies(h, 1.0, 4.0)
         )
         for h in (0.1, 1e-3)
     },
     # angular momentum is exact; the energy changes in a step by O(h^{r+1}), r = 1, 2, 4, 4
     **{
         f"Kepler with its energy in the basis, {name}, h = {h:g}": case(
-            (KEPLER, ENERGIES, shell(2, 100)), L, h=h, method=method
+            (KEPLER, ENERGIES, shell(2, 100), h), L, method=method
         )
         for name, method, h in (
             ("symplectic Euler", dvi.TypeII(), 0.01),
@@ -146,7 +130,7 @@ _CASES = {
     # the map of a method is not the flow
     **{
         f"pendulum with its energy in the basis, {name}": case(
-            (PENDULUM, PENDULUM_BASIS, box(1, 80, -3.0, 3.0)), h=h, method=method
+            (PENDULUM, PENDULUM_BASIS, box(1, 80, -3.0, 3.0), h), method=method
         )
         for name, method, h in (
             ("symplectic Euler", dvi.TypeII(), 0.001),
@@ -156,7 +140,7 @@ _CASES = {
     },
     # a Gauss method conserves quadratic invariants, not quartic ones
     "quartic oscillator with its energy in the basis, midpoint rule": case(
-        (QUARTIC, poly(4), box(1, 120)), h=0.05, method=dvi.GaussLegendre(1)
+        (QUARTIC, poly(4), box(1, 120), 0.05), method=dvi.GaussLegendre(1)
     ),
     # H = N²: conserved by the Gauss methods, not by H_D(q0, p1) = N²
     "function of an action by the type II map": case(
@@ -176,8 +160,12 @@ _CASES = {
     ),
     # standard map with K = 1e-5: p changes
     "twist map with a weak kick": case(
-        (separable("-1e-5 * sum(cos(q))"), poly(3, ["p"]) + trig(2, "q"), box(1, 80, -3.0, 3.0)),
-        h=1.0,
+        (
+            separable("-1e-5 * sum(cos(q))"),
+            poly(3, ["p"]) + trig(2, "q"),
+            box(1, 80, -3.0, 3.0),
+            1.0,
+        )
     ),
     # a force of (q − 0.9)³ for q > 0.9, where few samples lie
     "oscillator that stiffens beyond the samples' middle": case(
@@ -185,18 +173,18 @@ _CASES = {
     ),
     # a composition of integrable maps of different steps is not integrable
     "McMillan's map by Yoshida's method": case(
-        (MCMILLAN, poly(4) + functions("1 / (1 + q1**2)"), box(1, 100)), h=1.0, method=YOSHIDA
+        (MCMILLAN, poly(4) + functions("1 / (1 + q1**2)"), box(1, 100), 1.0), method=YOSHIDA
     ),
     # the invariant has 1/(1 + q²), which no polynomial is
     "McMillan's map by Strang's method in polynomials": case(
-        (MCMILLAN, poly(6), box(1, 100)), h=1.0, method=STRANG
+        (MCMILLAN, poly(6), box(1, 100), 1.0), method=STRANG
     ),
     # the quartic invariant needs the resonance
     "resonance 1:3 of the map, detuned by 1e-5": case(
-        (spring(0.5, 3.12501), DETUNED, box(2, 100)), energies(1.0, 0.5, 3.12501), h=1.0
+        (spring(0.5, 3.12501), DETUNED, box(2, 100), 1.0), energies(1.0, 0.5, 3.12501)
     ),
     # a type II map has the symmetries that are linear in q: of the three quadratic invariants of
     # the flow q·p remains, that of q → λq, p → p/λ
-    "free top by two vectors, type II": case((TWO_VECTORS, poly(2), box(3, 70)), "q @ p", h=0.2),
+    "free top by two vectors, type II": case((TWO_VECTORS, poly(2), box(3, 70), 0.2), "q @ p"),
 }
 CASES = named("neighbours", _CASES)

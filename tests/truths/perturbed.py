@@ -4,24 +4,12 @@ All maps are of type II with the step `H` = 0.1, unless a case says otherwise. F
 functions that `exact_series` evaluates too: its `Count` confirms `truth` and `survivors`.
 """
 
+# ruff: noqa: F403, F405 (the vocabulary of the tables is `maps`)
+
 import numpy as np
 
 from . import case, named
-from .maps import (
-    ANGULAR,
-    ENERGIES,
-    MOMENTA,
-    L,
-    box,
-    functions,
-    moved,
-    poly,
-    sized,
-    system,
-    timed,
-    trig,
-    with_outliers,
-)
+from .maps import *
 
 H = 0.1
 

@@ -6,6 +6,8 @@ variational follows from their Hamiltonians, which it counts too, and for those 
 the weight of the action: a scaling is variational if it leaves p·dq and H dt as they are.
 """
 
+# ruff: noqa: F403, F405 (the vocabulary of the tables is `maps`)
+
 import numpy as np
 from exact_series import vector
 
@@ -20,7 +22,7 @@ from dvi_jax.discover.library import (
 )
 
 from . import gauge, named, symmetry
-from .maps import box, formula, moved, poly, system, timed, with_outliers
+from .maps import *
 from .perturbed import (
     FREE,
     KEPLER,
