@@ -461,13 +461,12 @@ class Symmetries:
         rows = []  # (component, function): a list of 2n Series
         for j in components:
             for here, later in zip(before, after, strict=True):
-                if j == 0:
-                    change = later - here
-                    rows.append([jacobian[2 * n][i] * here + jacobian[2 * n + 1][i] * change
-                                 for i in range(2 * n)])  # fmt: skip
+                row = [x * here for x in jacobian[j - 1 if j else 2 * n]]
+                if j:
+                    row[j - 1] = row[j - 1] - later
                 else:
-                    rows.append([jacobian[j - 1][i] * here - (later if i == j - 1 else 0)
-                                 for i in range(2 * n)])  # fmt: skip
+                    row = [x + y * (later - here) for x, y in zip(row, jacobian[-1], strict=True)]
+                rows.append(row)
         terms = np.array([[x.c[:K] for x in row] for row in rows])  # (unknown, 2n, K, points)
         terms = terms.transpose(2, 1, 3, 0).reshape(K, -1, len(rows))
         slopes = [[f(*_at(flat, j, delta, n)).c[K] for f in functions] for j in range(2 * n)]

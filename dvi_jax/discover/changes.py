@@ -28,15 +28,15 @@ from .sampling import (
 )
 from .taylor import taylor_coefficients
 
-# A series that changes by less, of what functions change by, at large ε is no expansion.
+# A series whose relative change at large ε is smaller is exact and not an expansion.
 _EXACT = 1e-12
-# The ε at which that is tried, in units of that at which the disturbance is as large as H_D.
+# The ε at which that is tried, in units of that at which the perturbation is as large as H_D.
 _TRIED = (0.5, -0.3)
 _EXACT_STEPS = 100  # Steps over which it is tried
 
 
 class Stepped(NamedTuple):
-    """The map of one step of a method, and functions of which the change is asked."""
+    """The map of one step of a method, and functions whose change is computed."""
 
     equations: Equations
     h: Any

@@ -20,7 +20,7 @@ from .taylor import taylor_coefficients
 class Conditions(NamedTuple):
     """Conditions at S samples, as Taylor coefficients in ε up to z; C components, B functions.
 
-    What comes from the first and from the second point is kept apart, in the axis of length 2. A
+    Contributions of the first and of the second point are separate, in the axis of length 2. A
     row of Noether's identity is its value, or a derivative by a component of q1 or p0.
     """
 

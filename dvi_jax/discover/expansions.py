@@ -10,9 +10,9 @@ from .judging import CLEARLY, Judge
 from .motion import ROUNDING, coefficient_errors
 from .sampling import SMALL, UNSEEN, Samples, nonlinearity
 
-# Sizes of the samples, about their middle, on which an exact invariant is kept alike.
+# Sizes of the samples, about their middle, on which an exact invariant is conserved too.
 _LARGER = (2.0, 4.0, 8.0)
-# Relative size of the larger step at which what a small step conserves is looked for.
+# Relative size of the larger step at which the number of invariants is counted again.
 _MODERATE = 0.03
 
 # Nonlinearity of the map on larger samples, and how many times larger they are at most.
@@ -113,8 +113,8 @@ class Larger(NamedTuple):
         if np.isnan(self.factor):
             other = "a larger h" if step else "samples that spread wider"
             return (
-                f"{small}, and no larger one can be tried: what is conserved cannot be told from "
-                f"{what}; take {other}"
+                f"{small}, and no larger one can be tried: an invariant cannot be distinguished "
+                f"from {what}; take {other}"
             )
         where = "at a step {} times as large" if step else "on samples {} times as far from it"
         made = " (or H_D is made for this h)" if step else ""

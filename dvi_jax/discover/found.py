@@ -161,7 +161,7 @@ class Discovery(eqx.Module):
         if self.undecided > 0:
             reasons.append(
                 f"{self.undecided} combinations of the functions change in a step by less than "
-                "1000 times their rounding, or by hardly more than it: whether they are kept "
+                "1000 times their rounding, or by hardly more than it: whether they are conserved "
                 "cannot be decided in this arithmetic; take another h, samples that spread wider, "
                 "or an origin among them"
             )

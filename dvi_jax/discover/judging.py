@@ -74,7 +74,7 @@ class Fewest:
         self.kept: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
 
     def up_to(self, level: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """What is kept by the functions up to a complexity: columns of coefficients, and values."""
+        """Invariants in the functions up to a complexity: columns of coefficients, and values."""
         some = self.complexity <= level
         R = triangle(self.values[:, some] / self.rms[some]) / np.sqrt(len(self.values))
         if len(R) < np.sum(some) or np.linalg.cond(R) > 1 / RANK**2:

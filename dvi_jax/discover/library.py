@@ -104,7 +104,7 @@ def bracket(first: Generator, second: Generator) -> Generator:
 
         [X, Y]^c = X(Y^c) − Y(X^c)    for each component c of (ξ0, ξ, η)
 
-    **Raises** `TypeError` for what is no `Generator`. **Source** Olver 1993, Section 1.3.
+    **Raises** `TypeError` for anything but a `Generator`. **Source** Olver 1993, Section 1.3.
     """
     for name, generator in (("first", first), ("second", second)):
         _checks.instance(name, generator, Generator, "a Generator")

@@ -9,8 +9,8 @@ from .nullspace import HELD_OUT, NULL, series_changes, singular_vectors, triangl
 # A null vector that changes by less than this share of what its slopes predict, but by more than
 # rounding, may be an invariant or not.
 UNCLEAR = 1e-6
-ROUNDING = 1e-12  # Rows are weighted so that their rounding is below this; `NULL` stands above it
-_RESOLVED = 1e-3  # Rounding may be this share of a change that can be told from none
+ROUNDING = 1e-12  # Rows are weighted so that their rounding is below this; `NULL` is above it
+_RESOLVED = 1e-3  # Rounding may be this share of a change that counts as not zero
 _COEFFICIENTS = 1e-15  # Errors of the coefficients of a null vector, relative to its length
 # Samples at which functions are so many times larger than at three quarters of them count less.
 _RARE = 100.0
@@ -60,7 +60,7 @@ class Motion(NamedTuple):
 
     def weights(self) -> np.ndarray:
         """For rows of changes, shape (S,): what functions typically change by becomes 1, where
-        that stands far enough above rounding, so that no sample with a large step decides alone."""
+        that is far enough above rounding, so that no sample with a large step decides alone."""
         typical = np.sqrt(np.sum(self.changes**2, axis=(1, 2)))
         rounding = np.sqrt(np.sum(self.rounding**2, axis=1))
         return 1 / np.maximum(np.maximum(typical, rounding / ROUNDING), np.finfo(float).tiny)

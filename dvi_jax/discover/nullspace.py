@@ -157,14 +157,14 @@ def series_spaces(
 ) -> list[SeriesSpace]:
     """The null spaces of the Toeplitz matrices of order 0, 1, … as series.
 
-    A vector with a small first block is no series unless it is null for the size of that block:
+    A vector with a small first block is not a series unless it is null for the size of that block:
     candidates are judged again. Those of an order have to lie among those of the order before.
 
     - `fitted`: weighted rows of A_0 … A_z, shape (rows, z + 1, size).
     - `judge`: (leading, shifts) → those combinations of them that are null by the measure of the
       search, on samples that were not fitted too, and how many are unclear.
     - `tolerance`: see `null_space`.
-    - `trivial`: a first block that is no series, shape (size,): that of a constant.
+    - `trivial`: a first block to leave out, shape (size,): that of a constant.
     """
     size = fitted.shape[2]
     spaces: list[SeriesSpace] = []

@@ -49,8 +49,8 @@ UNSEEN = 1e-11  # A relative step below this is not known to three digits, becau
 # what changes by less than rounding may be conserved, or an expansion in the step or about the
 # samples.
 SMALL = 1e-2
-# A sample that is farther from the median than this many typical distances does not tell how wide
-# the others spread.
+# A sample that is farther from the median than this many typical distances does not count in the
+# spread of the others.
 _FAR = 100.0
 # Polynomials are taken about the middle of the samples where they would lose so much by rounding
 # about the origin.

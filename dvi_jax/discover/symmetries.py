@@ -22,7 +22,7 @@ class Symmetry(eqx.Module):
 
     - `generators`: X_m, one for each order: for `prolong`, `determining_residual`, …
     - `is_variational`: whether Noether's identity closes with a gauge; else it is a conformal
-      symmetry only, as far as the gauge basis can tell.
+      symmetry only, within this gauge basis.
     - `gauges`: G_m, one for each order; None where it is not variational.
     - `residuals`: shape (z + 1,): the largest residual of the determining equations at each order
       in ε on held-out samples, relative to what a vector field with these slopes typically leaves
@@ -31,12 +31,12 @@ class Symmetry(eqx.Module):
     - `identity_residuals`: shape (z + 1,): the same of Noether's identity and of its derivatives
       off the solutions; where it is not variational, with the best gauge in the basis.
     - `is_dependent`: whether X_0 is a combination of those listed before it with invariants of
-      the undisturbed map for coefficients.
+      the unperturbed map for coefficients.
     - `is_symplectic`: whether every order is locally a Hamiltonian vector field (and ξ0 = 0).
       If it is symplectic but not variational, a larger gauge basis may close the identity.
-    - `coefficients`: shape (z + 1, components, basis size), components ξ0 (if looked for), those
+    - `coefficients`: shape (z + 1, components, basis size), components ξ0 (if sought), those
       of ξ, those of η, named in `names`.
-    - `scale`: 1 over the ε at which the disturbance is as large as the rest.
+    - `scale`: 1 over the ε at which the perturbation is as large as the rest.
     - `sizes`: shape (components, basis size): size of a term with coefficient 1 on the samples;
       `gauge_sizes`: the same for the gauges. Formulas leave out terms below 1e-9 of the largest.
     """
@@ -127,7 +127,7 @@ class Symmetries(eqx.Module):
     - `survivors`: for m = 0 … order, how many leading parts X_0 go on to order m.
     - `singular_values`: of all conditions, descending, relative to the largest; `gap`: the ratio
       at which they were cut (large is clear, below 1e3 is not).
-    - `null`: below this relative size a singular value is zero, as far as rounding lets one tell.
+    - `null`: below this relative size a singular value is zero, within rounding.
     - `refused`: null vectors of the training samples that failed on the held-out ones.
     - `undecided`: how many vector fields change in the steps by hardly more than rounding, so that
       whether they are symmetries cannot be decided in double precision.

@@ -84,7 +84,7 @@ class Search:
         of_identity = np.hypot(self._size(identity), np.linalg.norm(gauge[:, 0], axis=(1, 2)))
         identity = identity / of_identity.reshape(-1, 1, 1, 1, 1, 1)
         gauge = gauge / of_identity.reshape(-1, 1, 1, 1)
-        # ε in the unit in which the disturbance is as large as the rest
+        # ε in the unit in which the perturbation is as large as the rest
         sums = self.weights * self._orthonormal(determining)
         self.scale = epsilon_scale(rows_of(sums[fit]))
         determining, identity = (in_units_of(self.scale, x) for x in (determining, identity))
@@ -395,8 +395,8 @@ def _motion(raw: Conditions, jacobian: np.ndarray, lost: float) -> FieldMotion:
     places = raw.points[:, 0]
     slopes = raw.slopes[:, 0].swapaxes(1, 2)
     changes = slopes * np.diff(places, axis=1)[:, 0, :, None]
-    before, second, both = (np.linalg.norm(x, axis=1) for x in (
-        jacobian[:, :, 0], jacobian[:, :, 1], jacobian.sum(axis=2)))  # fmt: skip
+    parts = jacobian[:, :, 0], jacobian[:, :, 1], jacobian.sum(axis=2)
+    before, second, both = (np.linalg.norm(x, axis=1) for x in parts)
     # φ(z0) and φ(z1), each with the last digit of the point where it is taken
     blur = np.einsum("sdb,sd->sb", np.abs(slopes), np.sum(np.abs(places), axis=1))
     sizes = before[..., None] * np.abs(values)[:, None]

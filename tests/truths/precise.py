@@ -83,9 +83,9 @@ _BINARY = {
     "atan2": np.frompyfunc(mpmath.atan2, 2, 1),
 } | {name: getattr(operator, name) for name in ("gt", "lt", "ge", "le", "eq", "ne")}
 _MOVING = {
-    "reshape", "squeeze", "expand_dims", "transpose", "rev", "broadcast_in_dim", "concatenate",
-    "split", "stack", "slice", "dynamic_slice", "pad", "gather", "iota", "select_n",
-}  # fmt: skip
+    *("reshape", "squeeze", "expand_dims", "transpose", "rev", "broadcast_in_dim", "iota"),
+    *("concatenate", "split", "stack", "slice", "dynamic_slice", "pad", "gather", "select_n"),
+}
 
 
 def _evaluate(jaxpr, consts, *inputs):
@@ -133,9 +133,10 @@ def _made(eqn, x) -> list:
 
 def _indices(eqn, x) -> list:
     """Operands that are integers or truth values, as JAX takes them; None for the others."""
-    kinds = [atom.aval.dtype for atom in eqn.invars]
-    return [jnp.asarray(np.array(v.tolist(), k)) if k.kind in "iub" else None
-            for v, k in zip(x, kinds, strict=True)]  # fmt: skip
+    def given(value, kind):
+        return jnp.asarray(np.array(value.tolist(), kind)) if kind.kind in "iub" else None
+
+    return [given(v, atom.aval.dtype) for v, atom in zip(x, eqn.invars, strict=True)]
 
 
 def _moved(eqn, x) -> list:
@@ -255,8 +256,8 @@ class Step:
         c = [(x + 1) / 2 for x in sorted(nodes)]
         powers = mpmath.matrix([[x**k for x in c] for k in range(stages)])
         b = mpmath.lu_solve(powers, mpmath.matrix([mpf(1) / (k + 1) for k in range(stages)]))
-        a = [mpmath.lu_solve(powers, mpmath.matrix([x ** (k + 1) / (k + 1) for k in range(stages)]))
-             for x in c]  # fmt: skip
+        moments = ([x ** (k + 1) / (k + 1) for k in range(stages)] for x in c)
+        a = [mpmath.lu_solve(powers, mpmath.matrix(moment)) for moment in moments]
         z0 = np.concatenate([q.ravel(), p.ravel()])
         n = q.size
 
@@ -416,8 +417,8 @@ def main() -> int:
         except Exception as error:
             good, text = False, f"{type(error).__name__}: {str(error)[:300]}"
         bad += not good
-        print(f"{'ok ' if good else 'BAD'} {case.name}: {text} ({time.time() - start:.1f} s)",
-              flush=True)  # fmt: skip
+        head = f"{'ok ' if good else 'BAD'} {case.name}"
+        print(f"{head}: {text} ({time.time() - start:.1f} s)", flush=True)
     return int(bad > 0)
 
 
