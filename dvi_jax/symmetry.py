@@ -1,30 +1,4 @@
-"""An older name of the part of `dvi_jax.discover` that deals with symmetries."""
+"""An older name of `dvi_jax.discover`, for its part about symmetries."""
 
-from .discover import (
-    AbstractBasis as AbstractBasis,
-    AdiabaticInvariant as AdiabaticInvariant,
-    Basis as Basis,
-    BasisGauge as BasisGauge,
-    BoundBasis as BoundBasis,
-    Chebyshev as Chebyshev,
-    ConformalFactor as ConformalFactor,
-    GaugeSolution as GaugeSolution,
-    Generator as Generator,
-    LatticePoint as LatticePoint,
-    Polynomials as Polynomials,
-    Radial as Radial,
-    Symmetries as Symmetries,
-    Symmetry as Symmetry,
-    Trigonometric as Trigonometric,
-    conformal_factor as conformal_factor,
-    determining_residual as determining_residual,
-    discrete_equations as discrete_equations,
-    find_symmetries as find_symmetries,
-    lattice_defect as lattice_defect,
-    library as library,
-    noether_identity as noether_identity,
-    prolong as prolong,
-    random_pairs as random_pairs,
-    solution_pairs as solution_pairs,
-    solve_gauge as solve_gauge,
-)
+from .discover import *  # noqa: F403
+from .discover import library as library

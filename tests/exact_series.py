@@ -25,31 +25,44 @@ FLOAT_RANK = 1e-10
 """Singular values below this share of the largest are zero in double precision."""
 
 
-def cos(x: Any) -> Any:
-    """Of a number of JAX, or of this module."""
-    return x.cos() if hasattr(x, "cos") else jnp.cos(x)
+def _of_either(name: str):
+    """A function of a number of JAX, or of this module."""
+    return lambda x: getattr(x, name)() if isinstance(x, Number) else getattr(jnp, name)(x)
 
 
-def sin(x: Any) -> Any:
-    """Of a number of JAX, or of this module."""
-    return x.sin() if hasattr(x, "sin") else jnp.sin(x)
-
-
-def log(x: Any) -> Any:
-    """Of a number of JAX, or of this module."""
-    return x.log() if hasattr(x, "log") else jnp.log(x)
+cos, sin, log = map(_of_either, ("cos", "sin", "log"))
 
 
 def vector(*components: Any) -> Any:
     """An array of these components, of JAX or of numbers of this module."""
-    if any(isinstance(x, Dual | Series) for x in components):
-        out = np.empty(len(components), object)
-        out[:] = components
-        return out
+    if any(isinstance(x, Number) for x in components):
+        return objects(components)
     return jnp.stack(components)
 
 
-class Series:
+class Number:
+    """What follows from `of`, a sum, a product, −x and powers."""
+
+    def __sub__(self, other):
+        return NotImplemented if self.above(other) else self + -self.of(other)
+
+    def __rsub__(self, other):
+        return self.of(other) + -self
+
+    def __truediv__(self, other):
+        return NotImplemented if self.above(other) else self * self.of(other) ** -1
+
+    def __rtruediv__(self, other):
+        return self.of(other) * self**-1
+
+    def __radd__(self, other):
+        return self + other
+
+    def __rmul__(self, other):
+        return self * other
+
+
+class Series(Number):
     """Σ ε^m c_m, cut off after ε^z, at many points: `c` of shape (z + 1, points).
 
     `prime`: integers modulo it, or None for double precision.
@@ -57,6 +70,11 @@ class Series:
 
     def __init__(self, c: np.ndarray, prime: int | None):
         self.c, self.prime = c, prime
+
+    @staticmethod
+    def above(other) -> bool:
+        """Whether the other one does the operation."""
+        return isinstance(other, Dual | np.ndarray)
 
     def of(self, value: Any) -> "Series":
         """A series, also of a constant. A float counts as the decimal number that it prints."""
@@ -74,19 +92,13 @@ class Series:
         return Series(c if self.prime is None else c % self.prime, self.prime)
 
     def __add__(self, other):
-        return NotImplemented if _above(other) else self.made(self.c + self.of(other).c)
-
-    def __sub__(self, other):
-        return NotImplemented if _above(other) else self.made(self.c - self.of(other).c)
-
-    def __rsub__(self, other):
-        return self.of(other) - self
+        return NotImplemented if self.above(other) else self.made(self.c + self.of(other).c)
 
     def __neg__(self):
         return self.made(-self.c)
 
     def __mul__(self, other):
-        if _above(other):
+        if self.above(other):
             return NotImplemented
         a, b = self.c, self.of(other).c
         out = np.zeros_like(a)
@@ -94,14 +106,6 @@ class Series:
             for m in range(k + 1):
                 out[k] = self.made(out[k] + self.made(a[m] * b[k - m]).c).c
         return self.made(out)
-
-    __radd__, __rmul__ = __add__, __mul__
-
-    def __truediv__(self, other):
-        return NotImplemented if _above(other) else self * self.of(other).inverse()
-
-    def __rtruediv__(self, other):
-        return self.of(other) * self.inverse()
 
     def inverse(self) -> "Series":
         first = np.zeros_like(self.c)
@@ -137,56 +141,45 @@ class Series:
             raise ValueError("this function has no value modulo a prime")
         first, rest = self.c[0], self.c.copy()
         rest[0] = 0
-        out, power, factorial = self.of(0), self.of(1), 1.0
+        out, power = self.of(0), self.of(1)
         for k in range(len(self.c)):
-            factorial *= max(k, 1)
             scaled = np.zeros_like(self.c)
-            scaled[0] = derivative(first, k) / factorial
+            scaled[0] = derivative(first, k) / math.factorial(k)
             out, power = out + power * Series(scaled, None), power * Series(rest, None)
         return out
 
 
-class Dual:
+class Dual(Number):
     """value + slope δ with δ² = 0: the derivative of a function of a Series."""
 
     def __init__(self, value: Series, slope: Any):
         self.value, self.slope = value, slope
 
-    def _of(self, other):
+    @staticmethod
+    def above(other) -> bool:
+        return isinstance(other, np.ndarray)
+
+    def of(self, other):
         return other if isinstance(other, Dual) else Dual(self.value.of(other), self.value.of(0))
 
     def __add__(self, other):
-        if isinstance(other, np.ndarray):
+        if self.above(other):
             return NotImplemented
-        other = self._of(other)
+        other = self.of(other)
         return Dual(self.value + other.value, self.slope + other.slope)
 
     def __neg__(self):
         return Dual(-self.value, -self.slope)
 
-    def __sub__(self, other):
-        return self + -self._of(other)
-
-    def __rsub__(self, other):
-        return self._of(other) - self
-
     def __mul__(self, other):
-        if isinstance(other, np.ndarray):
+        if self.above(other):
             return NotImplemented
-        other = self._of(other)
+        other = self.of(other)
         return Dual(self.value * other.value, self.value * other.slope + self.slope * other.value)
-
-    __radd__, __rmul__ = __add__, __mul__
-
-    def __truediv__(self, other):
-        return self * self._of(other) ** -1
-
-    def __rtruediv__(self, other):
-        return self._of(other) / self
 
     def __pow__(self, power):
         if power == 0:
-            return self._of(1)
+            return self.of(1)
         return Dual(self.value**power, self.value ** (power - 1) * self.slope * power)
 
     def cos(self):
@@ -197,10 +190,6 @@ class Dual:
 
     def log(self):
         return Dual(self.value.log(), self.slope / self.value)
-
-
-def _above(other) -> bool:
-    return isinstance(other, Dual | np.ndarray)
 
 
 def _power(x: np.ndarray, power: int, prime: int) -> np.ndarray:
@@ -280,7 +269,7 @@ def functions_of(basis: Any, n: int) -> list:
         case dvi.Radial():
             return [lambda q, p, t, k=k: (q @ q) ** (k / 2) for k in basis.powers]
         case dvi.Basis():
-            return [_timed(f) for f in basis.functions]
+            return [_of_time(f) for f in basis.functions]
     raise TypeError(f"no functions of {basis!r}")
 
 
@@ -298,10 +287,37 @@ def _product(t, factors):
     return out
 
 
-def _timed(function):
-    if function.__code__.co_argcount - len(function.__defaults__ or ()) == 3:
-        return function
-    return lambda q, p, t: function(q, p)
+def _of_time(function):
+    return function if function.__code__.co_argcount == 3 else lambda q, p, t: function(q, p)
+
+
+def toeplitz(terms: np.ndarray, z: int) -> np.ndarray:
+    """[A_0; A_1 A_0; …] up to A_z, from terms of shape (z + 1, rows, columns)."""
+    _, rows, columns = terms.shape
+    blocks = np.zeros((z + 1, rows, z + 1, columns), terms.dtype)
+    for k in range(z + 1):
+        for m in range(k + 1):
+            blocks[k, :, m] = terms[k - m]
+    return blocks.reshape((z + 1) * rows, (z + 1) * columns)
+
+
+def _start(samples, modular, points, powers):
+    """q, p and t as series with so many powers of ε, at the samples or, modulo a prime, anywhere;
+    and a function that makes a series with one coefficient."""
+    rng, zero = np.random.default_rng(0), np.zeros((powers, points), np.int64 if modular else float)
+    qs, ps = (np.reshape(x, (len(x), -1)) for x in samples[:2])
+    ts = samples[2] if len(samples) == 3 else np.zeros(len(qs))
+
+    def number(values, power=0):
+        c = zero.copy()
+        c[power] = values
+        return Series(c, PRIME if modular else None)
+
+    def start(values):
+        return number(rng.integers(1, PRIME, points) if modular else values[:points])
+
+    q, p = (objects([start(x) for x in values.T]) for values in (qs, ps))
+    return q, p, start(ts), number
 
 
 def rref(matrix: np.ndarray, prime: int) -> tuple[np.ndarray, list[int]]:
@@ -361,45 +377,30 @@ class Count:
     def __init__(self, system, basis, order, h, samples, modular=True):
         """`samples`: points (qs, ps) or (qs, ps, ts), of which only the shape is used in exact
         arithmetic."""
-        qs, ps = (np.reshape(x, (len(x), -1)) for x in samples[:2])
-        ts = samples[2] if len(samples) == 3 else np.zeros(len(qs))
-        functions, rng = functions_of(basis, qs.shape[1]), np.random.default_rng(0)
+        n = int(np.prod(np.shape(samples[0])[1:]))
+        functions = functions_of(basis, n)
         size, self.prime = len(functions), PRIME if modular else None
-        points = 2 * size + 10 if modular else len(qs)
-        zero = np.zeros((order + 1, points), np.int64 if modular else float)
-
-        def number(values):
-            c = zero.copy()
-            c[0] = rng.integers(1, PRIME, points) if modular else values
-            return Series(c, self.prime)
-
-        q, p = (objects([number(x) for x in values.T]) for values in (qs, ps))
-        t = number(ts)
-        epsilon = Series(zero.copy(), self.prime)
-        if order:
-            epsilon.c[1] = 1
-        there = step(system, h, epsilon, q, p, t)
+        points = 2 * size + 10 if modular else len(samples[0])
+        q, p, t, number = _start(samples, modular, points, order + 1)
+        there = step(system, h, number(1, 1) if order else number(0), q, p, t)
         before = np.stack([f(q, p, t).c for f in functions], axis=-1)
         after = np.stack([f(*there).c for f in functions], axis=-1)
         self.values, terms = before[0], after - before
         if modular:
             terms %= PRIME
-        self.point, self.size, self.spaces = (q, p, t), size, []
+        self.point = q, p, t
         ones = null_columns(np.column_stack([self.values, np.ones_like(t.c[0])]), self.prime)
         constants = ones[:size]
-        for z in range(order + 1):
-            blocks = np.zeros((z + 1, points, z + 1, size), terms.dtype)
-            for k in range(z + 1):
-                for m in range(k + 1):
-                    blocks[k, :, m] = terms[k - m]
-            null = null_columns(blocks.reshape((z + 1) * points, -1), self.prime)[:size]
-            self.spaces.append(np.column_stack([null, constants]))
+        self.spaces = [
+            np.column_stack([null_columns(toeplitz(terms, z), self.prime)[:size], constants])
+            for z in range(order + 1)
+        ]
         self.survivors = tuple(
             rank_of(x, self.prime) - rank_of(constants, self.prime) for x in self.spaces
         )
 
     def reaches(self, function) -> int:
-        values = function(*self.point[: function.__code__.co_argcount]).c[0]
+        values = function(*self.point).c[0]
         if self.prime is None:
             values = values / np.linalg.norm(values)
         matrix = np.column_stack([self.values, np.ones_like(values), values])
@@ -432,24 +433,12 @@ class Symmetries:
 
     def __init__(self, system, basis, order, h, samples, time, modular=True):
         shape = np.shape(samples[0])[1:]
-        qs, ps = (np.reshape(x, (len(x), -1)) for x in samples[:2])
-        ts = samples[2] if len(samples) == 3 else np.zeros(len(qs))
-        n, rng, K = qs.shape[1], np.random.default_rng(0), order + 1
+        n, K = int(np.prod(shape)), order + 1
         functions = functions_of(basis, n)
         self.prime, size = PRIME if modular else None, len(functions)
-        points = min(len(qs), 2 * (2 * n + 1) * size // n + 10)
-        zero = np.zeros((2 * K, points), np.int64 if modular else float)
-
-        def number(values, power=0):
-            c = zero.copy()
-            c[power] = values
-            return Series(c, self.prime)
-
-        def start(values):
-            return number(rng.integers(1, PRIME, points) if modular else values[:points])
-
-        q, p = (objects([start(x) for x in values.T]) for values in (qs, ps))
-        t, epsilon, delta = start(ts), number(1.0, 1) if order else number(0.0), number(1.0, K)
+        points = min(len(samples[0]), 2 * (2 * n + 1) * size // n + 10)
+        q, p, t, number = _start(samples, modular, points, 2 * K)
+        epsilon, delta = number(1.0, 1) if order else number(0.0), number(1.0, K)
         flat = [*q, *p, t, number(0.0).of(h)]
         shaped = _shaped(system, shape)
 
@@ -472,25 +461,19 @@ class Symmetries:
         rows = []  # (component, function): a list of 2n Series
         for j in components:
             for here, later in zip(before, after, strict=True):
-                if j == 0:
-                    change = later - here
-                    rows.append([jacobian[2 * n][i] * here + jacobian[2 * n + 1][i] * change
-                                 for i in range(2 * n)])  # fmt: skip
+                row = [x * here for x in jacobian[j - 1 if j else 2 * n]]
+                if j:
+                    row[j - 1] = row[j - 1] - later
                 else:
-                    rows.append([jacobian[j - 1][i] * here - (later if i == j - 1 else 0)
-                                 for i in range(2 * n)])  # fmt: skip
+                    row = [x + y * (later - here) for x, y in zip(row, jacobian[-1], strict=True)]
+                rows.append(row)
         terms = np.array([[x.c[:K] for x in row] for row in rows])  # (unknown, 2n, K, points)
-        terms = np.moveaxis(terms, (0, 2), (3, 1)).transpose(0, 2, 1, 3)
-        terms = terms.reshape(-1, K, len(rows))
+        terms = terms.transpose(2, 1, 3, 0).reshape(K, -1, len(rows))
         slopes = [[f(*_at(flat, j, delta, n)).c[K] for f in functions] for j in range(2 * n)]
         curl = self._curl(np.array(slopes), list(components), n, size)
         self.survivors, self.hamiltonian = (), 0
         for z in range(K):
-            matrix = np.zeros((z + 1, len(terms), z + 1, len(rows)), terms.dtype)
-            for k in range(z + 1):
-                for m in range(k + 1):
-                    matrix[k, :, m] = terms[:, k - m]
-            matrix = matrix.reshape((z + 1) * len(terms), -1)
+            matrix = toeplitz(terms, z)
             null = null_columns(matrix, self.prime)[: len(rows)]
             self.survivors += (rank_of(null, self.prime),)
             if z == order:

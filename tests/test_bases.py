@@ -29,8 +29,6 @@ def test_bases_add_and_multiply():
     assert basis.size == 9
     q, p = np.array([3.0, 4.0]), np.array([5.0, 7.0])
     np.testing.assert_allclose(basis(q, p)[:3], [0.2, 0.6, 0.8])
-    with pytest.raises(ValueError, match="at least one"):
-        dvi.Basis([])
 
 
 def test_chebyshev_polynomials_are_those_of_numpy():
@@ -68,7 +66,7 @@ def test_formulas_read_well():
     assert basis.formula([0.0, 0.0, 0.0]) == "0"
 
 
-def test_functions_of_time_are_told_from_others():
+def test_functions_of_time_are_recognised():
     timed = dvi.Basis({"q t": lambda q, p, t: q * t}).for_shape(())
     plain = dvi.Basis({"q": lambda q, p: q}).for_shape(())
     assert (timed.uses_time, plain.uses_time) == (True, False)
@@ -79,26 +77,24 @@ def test_functions_of_time_are_told_from_others():
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "error", "says"),
     [
-        (lambda: dvi.Chebyshev(0, "q"), "count must be a whole number from 1 on"),
-        (lambda: dvi.Chebyshev(3, "q", domain=(1, 1)), "a < b"),
-        (lambda: dvi.Chebyshev(3, "x").for_shape(()), "no component 'x'"),
-        (lambda: dvi.Trigonometric(2, "q", period=0.0), "period must be positive"),
-        (lambda: dvi.Radial([0.5]), "list of integers"),
+        (lambda: dvi.Chebyshev(0, "q"), ValueError, "count must be a whole number from 1 on"),
+        (lambda: dvi.Chebyshev(3, "q", domain=(1, 1)), ValueError, "a < b"),
+        (lambda: dvi.Chebyshev(3, "x").for_shape(()), ValueError, "no component 'x'"),
+        (lambda: dvi.Trigonometric(2, "q", period=0.0), ValueError, "period must be positive"),
+        (lambda: dvi.Radial([0.5]), ValueError, "list of integers"),
+        (lambda: dvi.Basis([]), ValueError, "at least one"),
+        (lambda: dvi.Basis([lambda q: q]), TypeError, "must take"),
+        (lambda: dvi.Basis([3.0]), TypeError, "must be a function"),
     ],
 )
-def test_bad_families_are_refused(make, says):
-    with pytest.raises(ValueError, match=says):
+def test_bad_families_are_refused(make, error, says):
+    with pytest.raises(error, match=says):
         make()
 
 
-def test_functions_with_other_arguments_are_refused():
-    with pytest.raises(TypeError, match="must take"):
-        dvi.Basis([lambda q: q])
-
-
-def test_a_basis_that_no_machine_can_search_is_refused_at_once():
+def test_a_basis_that_is_too_large_to_search_is_refused_at_once():
     with pytest.raises(ValueError, match=r"Polynomials\(400\) of 4 variables are 1.09e\+09 mono"):
         dvi.Polynomials(400).for_shape((2,))
     assert len(dvi.Polynomials(19).for_shape((2,)).names) == 8854  # just below the limit

@@ -37,19 +37,10 @@ def terms_of(H_D, order, t=0.0, q=Q, p=P):
 def drifts(system, observe, hs, q0, p0, **options):
     """The largest drift of each observable at every step size, arrays (len(hs),)."""
 
-    def run(h):
-        return dvi.integrate(
-            system,
-            q0,
-            p0,
-            h=h,
-            num_steps=2000,
-            save=dvi.Save(final=True),
-            observe=jax.tree.map(dvi.MaxDrift, observe, is_leaf=callable),
-            **options,
-        ).observed
-
-    return jax.jit(jax.vmap(run))(jnp.asarray(hs))
+    observe = jax.tree.map(dvi.MaxDrift, observe, is_leaf=callable)
+    run = {"num_steps": 2000, "save": dvi.Save(final=True), "observe": observe, **options}
+    of = lambda h: dvi.integrate(system, q0, p0, h=h, **run).observed  # noqa: E731
+    return jax.jit(jax.vmap(of))(jnp.asarray(hs))
 
 
 @pytest.mark.slow
@@ -189,13 +180,13 @@ def quartic(t0, t1, q0, p1, args):
 
 
 @pytest.mark.slow
-def test_perturbation_takes_part_with_the_epsilon_of_the_run():
+def test_perturbation_is_included_with_the_epsilon_of_the_run():
     perturbed = dvi.System(oscillator, perturbation=quartic)
     cubic_force = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: -(q0**3))
     run = {"q0": [0.6], "p0": [0.2], "epsilon": 0.3}
     alone, folded = dvi.ShadowHamiltonian(1), dvi.ShadowHamiltonian(1, perturbed)
     by_perturbation = drifts(perturbed, alone, [0.05], **run)
-    # The force −εq³ is the same disturbance, but only the user knows that it is a gradient.
+    # The force −εq³ is the same perturbation, but only the user knows that it is a gradient.
     by_force = drifts(cubic_force, [alone, folded], [0.05], **run)
     assert by_force[1] < 1e-4
     assert by_force[0] > 1e-3
@@ -210,7 +201,7 @@ def test_slow_time_goes_slowly():
 
 
 def test_a_composed_method_has_another_one():
-    """Negative control: Strang's map keeps energy to O(h²), and not the shadow of one step."""
+    """Negative control: Strang's map conserves energy to O(h²), not the shadow of one step."""
     shadow, hs = dvi.ShadowHamiltonian(1), 0.1 / 2 ** np.arange(3)
     found = drifts(dvi.System(pendulum), shadow, hs, [1.3], [0.5], method=dvi.Strang())
     assert measured_orders(found, 2, 1e-13)[-1] == pytest.approx(1, abs=0.1)
@@ -263,7 +254,6 @@ def test_bad_input_is_refused():
 
 
 def test_doubles_are_refused_where_floats_are_computed():
+    shadow, point = dvi.ShadowHamiltonian(1, dvi.System(pendulum)), np.array([0.1])
     with jax.enable_x64(False), pytest.raises(TypeError, match="jax_enable_x64"):
-        dvi.ShadowHamiltonian(1, dvi.System(pendulum)).evaluate(
-            0.0, np.array([0.1]), np.array([0.2]), 0.1
-        )
+        shadow.evaluate(0.0, point, point, 0.1)

@@ -1,4 +1,4 @@
-"""Why an invariant drifts: the three causes, step by step."""
+"""The three causes of the drift of an invariant, step by step."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -20,9 +20,9 @@ class Balance(NamedTuple):
 
     - `ts`: start of each step (the first step has no incoming energy and is left out).
     - `drift`: (I_{k+1} − I_k)/h, the sum of the other three to round-off.
-    - `symmetry`: Σ ε^m N_m, what Noether's identities leave.
-    - `work`: ε^{z+1} W·(ξ_z − Dq ξ0_z), what the disturbance does.
-    - `lattice`: −Σ ε^m ξ0_m r, what a mesh does that does not obey the energy equation.
+    - `symmetry`: Σ ε^m N_m, the residuals of Noether's identities.
+    - `work`: ε^{z+1} W·(ξ_z − Dq ξ0_z), the work of the perturbing force.
+    - `lattice`: −Σ ε^m ξ0_m r, from a mesh that violates the energy equation.
     """
 
     ts: Float[Array, " steps"]
@@ -50,8 +50,8 @@ def noether_balance(
 
         D(I_z) = Σ_m ε^m N_m + ε^{z+1} W·(ξ_z − Dq ξ0_z) − Σ_m ε^m ξ0_m r
 
-    It holds on every mesh, for any generators and gauges, right or wrong: so every drift is
-    told apart into the symmetry's defect, the work of the disturbance and the lattice's defect.
+    It holds on every mesh, for any generators and gauges: every drift is the sum of the violation
+    of the symmetry, the work of the perturbing force and the lattice defect.
 
     **Arguments**
 
@@ -61,7 +61,7 @@ def noether_balance(
 
     **Returns** a `Balance`.
 
-    **Raises** `ValueError` when the solution has not every state saved, or fewer than two steps.
+    **Raises** `ValueError` for a solution without every state, or with fewer than two steps.
 
     **Source** our own; (31) of the paper is the case where the identities hold on the lattice
     of (14).
@@ -73,10 +73,10 @@ def noether_balance(
     wind = dvi.System(kepler.system.H_D, force=lambda t0, t1, q0, p1, args: jnp.array([1.0, 0.0]))
     sol = dvi.integrate(wind, kepler.q0, kepler.p0, args=kepler.args, h=0.1, num_steps=50,
                         epsilon=0.01)
-    told = dvi.noether_balance(wind, [dvi.generators.rotation()], [None], sol, epsilon=0.01,
-                               args=kepler.args)
-    sides = told.drift, told.symmetry + told.work + told.lattice
-    print(bool(np.allclose(*sides, atol=1e-13)), f"{float(np.abs(told.drift).max()):.2f}")
+    b = dvi.noether_balance(wind, [dvi.generators.rotation()], [None], sol, epsilon=0.01,
+                            args=kepler.args)
+    sides = b.drift, b.symmetry + b.work + b.lattice
+    print(bool(np.allclose(*sides, atol=1e-13)), f"{float(np.abs(b.drift).max()):.2f}")
     # True 0.03
     ```
     """
@@ -119,7 +119,7 @@ def _balance(system, invariant: AdiabaticInvariant, points: LatticePoint, args) 
             symmetry += epsilon**m * N
             lattice -= epsilon**m * generator(here, args).t * r
         last = generators[-1](here, args)
-        # ε W is what the system gives; the power of ε left over is z.
+        # The system gives ε W; the other factor is ε^z.
         force = system.disturbing_force(here.t, after.t, here.q, after.p, epsilon, args)
         virtual = last.q - (after.q - here.q) / h * last.t
         work = epsilon ** (len(generators) - 1) * jnp.sum(force * virtual)

@@ -1,4 +1,4 @@
-"""Bases of functions of a lattice point, in which symmetries and invariants are looked for."""
+"""Bases of functions of a lattice point, in which symmetries and invariants are sought."""
 
 import abc
 import dataclasses
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._checks import function, instance
 from .._types import Scalar, State
 
 
@@ -36,17 +37,14 @@ class AbstractBasis(eqx.Module):
 
 
 def bind_basis(basis: Any, shape: tuple[int, ...]) -> "BoundBasis":
-    """`basis.for_shape(shape)`, after refusing what is no basis with a `TypeError`."""
-    if not isinstance(basis, AbstractBasis):
-        raise TypeError(
-            "basis must be a basis such as dvi.Polynomials(4), dvi.Basis([f, g]), or a sum or "
-            f"product of them; got {basis!r}."
-        )
+    """`basis.for_shape(shape)`, or a `TypeError` for any other object."""
+    known = "a basis such as dvi.Polynomials(4), dvi.Basis([f, g]), or a sum or product of them"
+    instance("basis", basis, AbstractBasis, known)
     return dataclasses.replace(basis.for_shape(shape), shape=shape)
 
 
 def check_step_size(h: Any) -> float:
-    """h as a number, after refusing zero (a step that goes nowhere keeps everything)."""
+    """h as a number other than zero: with h = 0 every function would be conserved."""
     try:
         number = np.nan if isinstance(h, str | bool) else float(h)
     except (TypeError, ValueError):
@@ -102,21 +100,8 @@ class BoundBasis(eqx.Module):
     def formula(self, coefficients: Any, digits: int = 6, drop: float = 1e-9) -> str:
         """The combination with these coefficients as text; tiny ones (relative) are left out."""
         c = np.asarray(coefficients, float)
-        largest = np.max(np.abs(c), initial=0.0)
-        terms = [
-            (value, name)
-            for value, name in zip(c, self.names, strict=True)
-            if abs(value) > drop * largest
-        ]
-        if not terms:
-            return "0"
-        text = ""
-        for value, name in terms:
-            sign = "−" if value < 0 else "+"
-            size = f"{abs(value):.{digits}g}"
-            term = size if name == "1" else name if size == "1" else f"{size} {name}"
-            text += f" {sign} {term}" if text else (f"−{term}" if value < 0 else term)
-        return text
+        shown = np.abs(c) > drop * np.max(np.abs(c), initial=0.0)
+        return linear_text(np.where(shown, c, 0), self.names, digits)
 
     def about(self, middle: np.ndarray, exactly: bool = False) -> "tuple[BoundBasis, np.ndarray]":
         """Functions ψ of z − middle that span the same space, and N with ψ = N φ + constants.
@@ -125,10 +110,28 @@ class BoundBasis(eqx.Module):
           functions stay as they are.
         - `exactly`: only if no constants are left over.
         """
-        found = _about(self.function, middle)
+        found = self.moved(middle)
         if found is None or (exactly and not found.closed):
             return self, np.eye(self.size)
         return dataclasses.replace(self, function=found.function, names=found.names), found.matrix
+
+    def moved(self, middle: np.ndarray) -> "About | None":
+        """The same as `About`; None where all functions stay as they are."""
+        about = getattr(self.function, "about", None)
+        return None if about is None else about(middle)
+
+
+def linear_text(coefficients: np.ndarray, names: Sequence[str], digits: int = 6) -> str:
+    """A linear combination as text, without what has the coefficient 0; the name "1" is implied."""
+    text = ""
+    for value, name in zip(coefficients, names, strict=True):
+        if value == 0:
+            continue
+        size = f"{abs(value):.{digits}g}"
+        term = size if name == "1" else name if size == "1" else f"{size} {name}"
+        sign = "−" if value < 0 else "+"
+        text += f" {sign} {term}" if text else term if value > 0 else f"−{term}"
+    return text or "0"
 
 
 class About(NamedTuple):
@@ -140,34 +143,15 @@ class About(NamedTuple):
     closed: bool
 
 
-def _about(function: Any, middle: np.ndarray) -> About | None:
-    """As `BoundBasis.about`; None where all functions stay as they are."""
-    if isinstance(function, BoundBasis):
-        function = function.function
-    return function.about(middle) if hasattr(function, "about") else None
-
-
-def _parts_about(parts: "tuple[BoundBasis, BoundBasis]", middle: np.ndarray, exactly: bool):
-    """Of both parts of a sum or product; None where both stay as they are."""
-    found = [_about(part, middle) for part in parts]
-    found = [None if exactly and one and not one.closed else one for one in found]
-    if found[0] is None and found[1] is None:
-        return None
-    return [
-        one or About(part.function, part.names, np.eye(part.size), True)
-        for one, part in zip(found, parts, strict=True)
-    ]
-
-
 class Basis(AbstractBasis):
-    """Functions of the user's.
+    """Functions given by the user.
 
     - `functions`: a list of functions ``(q, p)`` or ``(q, p, t)`` → scalar, or a dict with their
       names as keys.
-    - `complexity`: the complexity that they count for (see `BoundBasis`), default 1.
+    - `complexity`: of each of them, see `BoundBasis`; default 1.
 
-    **Raises** `ValueError` when there is none, `TypeError` for what is not callable or takes
-    other arguments.
+    **Raises** `ValueError` for an empty list, `TypeError` for what is not callable or takes other
+    arguments.
     """
 
     functions: tuple[Callable[..., Any], ...]
@@ -182,21 +166,20 @@ class Basis(AbstractBasis):
         if isinstance(functions, dict):
             named = dict(functions)
         else:
-            named = {_name(function, i): function for i, function in enumerate(tuple(functions))}
+            named = {_name(each, i): each for i, each in enumerate(tuple(functions))}
         if not named:
             raise ValueError("a basis needs at least one function (q, p) → scalar, got none.")
-        for name, function in named.items():
-            if not callable(function):
-                raise TypeError(f"basis function {name!r} must be callable, got {function!r}.")
-            if not (_takes(function, 2) or _takes(function, 3)):
+        for name, each in named.items():
+            function(f"basis function {name!r}", each, "(q, p) or (q, p, t)")
+            if not (_takes(each, 2) or _takes(each, 3)):
                 raise TypeError(f"basis function {name!r} must take (q, p) or (q, p, t).")
         self.functions, self.names = tuple(named.values()), tuple(named)
         self.complexity = complexity
 
     def for_shape(self, shape):
         timed = tuple(not _takes(f, 2) for f in self.functions)
-        for name, function, with_time in zip(self.names, self.functions, timed, strict=True):
-            _require_real_scalar(name, function, with_time, shape)
+        for name, each, with_time in zip(self.names, self.functions, timed, strict=True):
+            _require_real_scalar(name, each, with_time, shape)
         complexity = (self.complexity,) * len(self.names)
         return BoundBasis(_Values(self.functions, timed), self.names, complexity, any(timed))
 
@@ -206,13 +189,13 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
         inspect.signature(function).bind(*range(count))
     except TypeError:
         return False
-    except ValueError:  # a builtin without a signature: calling it will tell
+    except ValueError:  # a builtin without a signature
         return count == 2
     return True
 
 
 def _require_real_scalar(name, function, timed: bool, shape) -> None:
-    """Refuse a function whose value is no real scalar, by tracing it once."""
+    """Reject a function whose value is not a real scalar, by tracing it once."""
     state, time = (jax.ShapeDtypeStruct(s, jnp.result_type(float)) for s in (shape, ()))
     try:
         out = eqx.filter_eval_shape(function, state, state, *([time] if timed else []))
@@ -251,40 +234,7 @@ class Sum(AbstractBasis):
     second: AbstractBasis
 
     def for_shape(self, shape):
-        a, b = self.first.for_shape(shape), self.second.for_shape(shape)
-        return BoundBasis(
-            _Both(a, b),
-            _names_of_sum(a.names, b.names),
-            a.complexity + b.complexity,
-            a.uses_time or b.uses_time,
-        )
-
-
-def _names_of_sum(a: tuple[str, ...], b: tuple[str, ...]) -> tuple[str, ...]:
-    return a + tuple(name + "′" if name in a else name for name in b)
-
-
-def _with(basis: BoundBasis, moved: About) -> BoundBasis:
-    return dataclasses.replace(basis, function=moved.function, names=moved.names)
-
-
-class _Both(eqx.Module):
-    first: BoundBasis
-    second: BoundBasis
-
-    def __call__(self, q, p, t):
-        return jnp.concatenate([self.first(q, p, t), self.second(q, p, t)])
-
-    def about(self, middle: np.ndarray) -> About | None:
-        parts = _parts_about((self.first, self.second), middle, exactly=False)
-        if parts is None:
-            return None
-        a, b = parts
-        matrix = np.zeros((self.first.size + self.second.size,) * 2)
-        matrix[: self.first.size, : self.first.size] = a.matrix
-        matrix[self.first.size :, self.first.size :] = b.matrix
-        moved = _Both(_with(self.first, a), _with(self.second, b))
-        return About(moved, _names_of_sum(a.names, b.names), matrix, a.closed and b.closed)
+        return _pair(self, shape, multiplied=False)
 
 
 class Product(AbstractBasis):
@@ -294,35 +244,54 @@ class Product(AbstractBasis):
     second: AbstractBasis
 
     def for_shape(self, shape):
-        a, b = self.first.for_shape(shape), self.second.for_shape(shape)
-        names = _names_of_product(a.names, b.names)
-        pairs = itertools.product(a.complexity, b.complexity)
-        complexity = tuple(c + d for c, d in pairs)
-        return BoundBasis(_Products(a, b), names, complexity, a.uses_time or b.uses_time)
+        return _pair(self, shape, multiplied=True)
 
 
-class _Products(eqx.Module):
+def _pair(basis: Sum | Product, shape: tuple[int, ...], multiplied: bool) -> BoundBasis:
+    a, b = basis.first.for_shape(shape), basis.second.for_shape(shape)
+    complexity = a.complexity + b.complexity
+    if multiplied:
+        complexity = tuple(c + d for c, d in itertools.product(a.complexity, b.complexity))
+    names = _names_of_pair(a.names, b.names, multiplied)
+    return BoundBasis(_Pair(a, b, multiplied), names, complexity, a.uses_time or b.uses_time)
+
+
+class _Pair(eqx.Module):
     first: BoundBasis
     second: BoundBasis
+    multiplied: bool = eqx.field(static=True)
 
     def __call__(self, q, p, t):
-        return jnp.outer(self.first(q, p, t), self.second(q, p, t)).ravel()
+        a, b = self.first(q, p, t), self.second(q, p, t)
+        return jnp.outer(a, b).ravel() if self.multiplied else jnp.concatenate([a, b])
 
     def about(self, middle: np.ndarray) -> About | None:
-        # A constant that is left over would be multiplied by functions.
-        parts = _parts_about((self.first, self.second), middle, exactly=True)
-        if parts is None:
+        parts = self.first, self.second
+        found = [part.moved(middle) for part in parts]
+        if self.multiplied:
+            # A constant that remains of one part would be multiplied by functions of the other.
+            found = [one if one and one.closed else None for one in found]
+        if found[0] is None and found[1] is None:
             return None
-        a, b = parts
-        moved = _Products(_with(self.first, a), _with(self.second, b))
-        return About(moved, _names_of_product(a.names, b.names), np.kron(a.matrix, b.matrix), True)
+        a, b = (
+            one or About(part.function, part.names, np.eye(part.size), True)
+            for one, part in zip(found, parts, strict=True)
+        )
+        first, second = (
+            dataclasses.replace(part, function=one.function, names=one.names)
+            for one, part in zip((a, b), parts, strict=True)
+        )
+        matrix = np.kron(a.matrix, b.matrix)
+        if not self.multiplied:
+            none = np.zeros((first.size, second.size))
+            matrix = np.block([[a.matrix, none], [none.T, b.matrix]])
+        names = _names_of_pair(a.names, b.names, self.multiplied)
+        moved = _Pair(first, second, self.multiplied)
+        return About(moved, names, matrix, a.closed and b.closed)
 
 
-def _names_of_product(a: tuple[str, ...], b: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(_product_name(m, n) for m, n in itertools.product(a, b))
-
-
-def _product_name(a: str, b: str) -> str:
-    if a == "1" or b == "1":
-        return b if a == "1" else a
-    return f"{a} {b}"
+def _names_of_pair(a: tuple[str, ...], b: tuple[str, ...], multiplied: bool) -> tuple[str, ...]:
+    if not multiplied:
+        return a + tuple(name + "′" if name in a else name for name in b)
+    words = ([w for w in pair if w != "1"] for pair in itertools.product(a, b))
+    return tuple(" ".join(pair) or "1" for pair in words)

@@ -18,21 +18,25 @@ from .._types import Interval
 from ..methods import Method
 from .basis import BoundBasis
 from .motion import Motion
-from .sampling import Samples, check_finite, later, relative_step, require_steps
+from .sampling import (
+    Samples,
+    check_finite,
+    later,
+    relative_step,
+    require_finite,
+    require_steps,
+)
 from .taylor import taylor_coefficients
 
+# A series whose relative change at large ε is smaller is exact and not an expansion.
 _EXACT = 1e-12
-"""A series that changes by less, of what functions change by, at large ε is no expansion."""
-
+# The ε at which that is tried, in units of that at which the perturbation is as large as H_D.
 _TRIED = (0.5, -0.3)
-"""The ε at which that is tried, in units of that at which the disturbance is as large as H_D."""
-
-_EXACT_STEPS = 100
-"""Steps over which it is tried."""
+_EXACT_STEPS = 100  # Steps over which it is tried
 
 
 class Stepped(NamedTuple):
-    """The map of one step of a method, and functions of which the change is asked."""
+    """The map of one step of a method, and functions whose change is computed."""
 
     equations: Equations
     h: Any
@@ -64,19 +68,12 @@ class Changes(NamedTuple):
 
     def at(self, some: np.ndarray) -> "Changes":
         """Of some of the samples."""
-        return Changes(
-            values=self.values[some],
-            terms=self.terms[some],
-            volume=self.volume[some],
-            motion=self.motion.at(some),
-            slopes=self.slopes[some],
-            moved=self.moved[some],
-            good=self.good[some],
-        )
+        arrays = {name: x[some] for name, x in self._asdict().items() if name != "motion"}
+        return Changes(motion=self.motion.at(some), **arrays)
 
 
 def changes_at(stepped: Stepped, order: int, samples: Samples) -> Changes:
-    """Without a check of anything."""
+    """Unchecked."""
     found = [np.asarray(x) for x in batched_changes(stepped.unnamed(), order, samples)]
     values, terms, volume, good, slopes, move, blur = found
     finite = [np.isfinite(x.reshape(len(good), -1)).all(axis=1) for x in found]
@@ -90,36 +87,22 @@ def changes_at(stepped: Stepped, order: int, samples: Samples) -> Changes:
 
 
 def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
-    """After refusing steps that fail, what is not finite, and a time that is not sampled."""
-    basis = stepped.basis
-    found = changes_at(stepped, order, samples)
+    """The same, or an error for steps that fail, numbers that are not finite, and a time that is
+    not sampled."""
+    names, found = stepped.basis.names, changes_at(stepped, order, samples)
     if not found.good.all():
         require_steps(np.asarray(batched_changes(stepped.unnamed(), order, samples)[3]), samples)
-    check_finite(basis, found.values)
-    bad = ~np.isfinite(found.terms)
-    if bad.any():
-        i, m, j = np.argwhere(bad)[0]
+    check_finite(stepped.basis, found.values)
+
+    def change(m, j):
         what = "changes by" if m == 0 else f"has in order {m} of ε"
-        raise ValueError(
-            f"what the basis function {basis.names[j]!r} {what} in a step is not finite at "
-            f"{int(bad.any(axis=(1, 2)).sum())} of {len(bad)} samples (first: number {i}): H_D, "
-            "the force or the function is singular there or where the step leads. Keep the "
-            "samples off the singularity."
-        )
-    bad = np.asarray(~np.isfinite(found.slopes).all(axis=2))
-    if bad.any():
-        i, j = np.argwhere(bad)[0]
-        raise ValueError(
-            f"the derivatives of the basis function {basis.names[j]!r} are not finite at "
-            f"{int(bad[:, j].sum())} of {len(bad)} samples (first: number {i}): keep the samples "
-            "off its singularity."
-        )
-    if not found.good.all():
-        raise ValueError(
-            f"the derivative of the map is not finite at {int(np.sum(~found.good))} of {len(bad)} "
-            f"samples (first: number {int(np.argmin(found.good))}): keep them off singularities of "
-            "H_D and the force."
-        )
+        return f"what the basis function {names[j]!r} {what} in a step"
+
+    singular = "H_D, the force or the function is singular there or where the step leads"
+    require_finite(found.terms, change, f"{singular}; keep the samples off the singularity")
+    require_finite(found.slopes, lambda j, i: f"the derivative of the basis function {names[j]!r}")
+    hint = "keep them off singularities of H_D and the force"
+    require_finite(np.where(found.good, 0, np.nan), lambda: "the derivative of the map", hint)
     if np.ptp(samples.t) == 0 and _may_depend_on_time(stepped.equations, samples):
         _require_no_time(stepped, order, samples, found)
     return found
@@ -171,8 +154,8 @@ def _map(stepped: Stepped, epsilon: Array) -> Any:
 
 @eqx.filter_jit
 def batched_changes(stepped: Stepped, order: int, samples):
-    """Values of the basis, Taylor coefficients in ε of their changes and of log |det DΦ_ε| (but
-    its order 0, which is left at 0).
+    """Values of the basis, Taylor coefficients in ε of their changes and of log |det DΦ_ε| (its
+    order 0 is 0 here).
 
     Shapes (S, B), (S, z + 1, B), (S, z + 1); whether the steps succeed, (S,); slopes of the
     functions, (S, B, 2n + 1); z1 − z, and what z1 and z − z1 are rounded by in units of the last
@@ -226,10 +209,10 @@ def batched_changes(stepped: Stepped, order: int, samples):
 
 
 @eqx.filter_jit
-def is_exact(stepped: Stepped, series, typical, scale, samples):
-    """Whether Σ ε^m c_m·φ is kept over many steps at ε that are not small."""
-
-    basis = stepped.basis
+def is_exact(stepped: Stepped, series, sizes, samples):
+    """Whether Σ ε^m c_m·φ is conserved over many steps at ε that are not small; `sizes`: a typical
+    change in a step, and the unit of 1/ε."""
+    (typical, scale), basis = sizes, stepped.basis
 
     def at(epsilon):
         c = epsilon ** jnp.arange(series.shape[0]) @ series

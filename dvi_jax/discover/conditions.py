@@ -13,14 +13,14 @@ from .._types import Interval
 from .basis import BoundBasis
 from .determining import discrete_equations
 from .generators import LatticePoint
-from .sampling import Samples
+from .sampling import Samples, require_finite
 from .taylor import taylor_coefficients
 
 
 class Conditions(NamedTuple):
     """Conditions at S samples, as Taylor coefficients in ε up to z; C components, B functions.
 
-    What comes from the first and from the second point is kept apart, in the axis of length 2. A
+    Contributions of the first and of the second point are separate, in the axis of length 2. A
     row of Noether's identity is its value, or a derivative by a component of q1 or p0.
     """
 
@@ -115,21 +115,19 @@ def at_samples(equations, h, basis, gauge_basis, order, samples, later) -> Condi
     return jax.vmap(at_point)(*map(jnp.asarray, samples))
 
 
-def require_finite(raw: Conditions) -> None:
-    """Refuse conditions that are not finite: at the samples, or where the step leads."""
-    kinds = (("determining equations", raw.determining), ("Noether identity", raw.identity))
-    for name, terms in (*kinds, ("gauge basis", raw.gauge)):
-        good = np.isfinite(terms).reshape(len(terms), -1).all(axis=1)
-        if not good.all():
-            raise ValueError(
-                f"the {name} is not finite at {int(np.sum(~good))} of {len(good)} samples (first: "
-                f"number {int(np.argmin(good))}): H_D or the functions are singular there, or "
-                "where a step leads from there. Keep the samples off the singularity."
-            )
+def require_finite_conditions(raw: Conditions) -> None:
+    """Reject conditions that are not finite: at the samples, or where the step leads."""
+    hint = (
+        "H_D or the functions are singular there, or where a step leads from there; keep the "
+        "samples off the singularity"
+    )
+    require_finite(raw.determining, lambda *_: "the left side of a determining equation", hint)
+    require_finite(raw.identity, lambda *_: "Noether's identity", hint)
+    require_finite(raw.gauge, lambda *_: "the gauge basis", hint)
 
 
 def require_times(raw: Conditions, samples: Samples, h: float, shift: float) -> None:
-    """Refuse samples of one time for equations that depend on it; `shift`: see `later`."""
+    """Reject samples of one time for equations that depend on it; `shift`: see `later`."""
     size = abs(h) * np.max(np.abs(raw.clock)) + np.finfo(float).tiny
     # (q1 − q0)/h is rounded by the last digits of q1 and of t1 − t0, which is h at a later time.
     largest = max(np.max(np.abs(x)) for x in (samples.q, samples.p))

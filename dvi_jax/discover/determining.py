@@ -52,7 +52,7 @@ def determining_residual(
 
     `factor` is Λ; without it the result is pr X̃(F) alone, which vanishes at the points of a
     solution exactly when the generator is a symmetry. The pair need not lie on a solution:
-    conformal invariance, with its Λ, is asked of all points.
+    conformal invariance, with its Λ, is a condition at all points.
 
     **Source** the paper, (17) and (24).
     """
@@ -64,10 +64,10 @@ class ConformalFactor(NamedTuple):
     """What `conformal_factor` found.
 
     - `factor`: Λ, shape (2n, 2n); with ``pointwise=True`` one for each sample, (S, 2n, 2n).
-    - `residual`: the largest |pr X̃(F) − Λ F| over the samples, relative to the largest size of
-      the terms that pr X̃(F) is a sum of. Round-off: Λ exists; of order one: it does not.
-    - `condition`: of the problem that Λ is solved from; infinite when the samples determine none
-      (pairs on a solution, or too much alike). 1 with ``pointwise=True``.
+    - `residual`: the largest |pr X̃(F) − Λ F| over the samples, relative to the largest term of
+      the sum pr X̃(F). Round-off: Λ exists; of order one: it does not.
+    - `condition`: of the least-squares problem of Λ; infinite when the samples do not determine it
+      (pairs on a solution, or too similar). 1 with ``pointwise=True``.
     """
 
     factor: Float[Array, "... 2n 2n"]
@@ -79,7 +79,7 @@ class ConformalFactor(NamedTuple):
         """Whether the generator is a conformal invariance at the samples.
 
         That is, residual ≤ √eps and condition ≤ 1/√eps, eps the relative precision (2.2e-16 in
-        float64). Whatever is not finite is none.
+        float64). Values that are not finite are not conformal.
         """
         tolerance = jnp.sqrt(jnp.finfo(self.factor.dtype).eps)
         return (self.residual <= tolerance) & (self.condition <= 1 / tolerance)
@@ -111,8 +111,7 @@ def conformal_factor(
     **Arguments** `generators`: one, or a series in ε, order 0 first; `first`, `second`: points
     with a leading sample axis (S, …).
 
-    **Returns** `factor`, Λ; `residual`, relative: round-off where Λ exists, of order one where it
-    does not; `condition` of the problem that it is solved from.
+    **Returns** a `ConformalFactor`.
 
     **Raises** `ValueError` for fewer than 2n pairs where Λ is constant.
 
@@ -138,7 +137,7 @@ def _constant(system, generators, first, second, epsilon, args) -> ConformalFact
 
     values, changes, of_values, of_changes = jax.vmap(at_sample)(first, second)
     factor = jnp.linalg.lstsq(values, changes)[0].T
-    # The columns in units of their terms: F that is only the round-off of these is no sample.
+    # The columns in units of their terms: an F that is only their round-off determines nothing.
     units = jnp.max(of_values, axis=0, keepdims=True)
     singular = jnp.linalg.svd(values / jnp.where(units > 0, units, 1), compute_uv=False)
     condition = jnp.sqrt(len(values)) / singular[-1]
@@ -159,7 +158,7 @@ def _pointwise(system, generators, first, second, epsilon, args) -> ConformalFac
 
 
 def _relative(left, sizes):
-    """The largest of what is left over the largest of its terms."""
+    """The largest residual over the largest of its terms."""
     largest = jnp.max(sizes)
     return jnp.max(jnp.abs(left)) / jnp.where(largest > 0, largest, 1)
 

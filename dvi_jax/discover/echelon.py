@@ -35,7 +35,7 @@ def echelon(
         j = int(np.argmax(shares))
         if shares[j] > above:
             eliminate(row, j)
-    while work.size and np.max(np.abs(work)) > nothing:  # what is left had no clear pivot
+    while work.size and np.max(np.abs(work)) > nothing:  # columns without a clear pivot
         row, j = np.unravel_index(np.argmax(np.abs(work)), work.shape)
         eliminate(int(row), int(j))
     return pivots, np.stack(out, axis=1) if out else columns[:, :0]
@@ -44,7 +44,7 @@ def echelon(
 def reduced(columns: np.ndarray, complexity: np.ndarray, above: float = RANK) -> np.ndarray:
     """The same span with a reduced echelon in the leading part: each column alone in its pivot.
 
-    `columns` may go on below the leading part; what is done to it is done to all of a column.
+    `columns` may have more rows below the leading part, which are combined in the same way.
     """
     pivots, _ = echelon(columns[: len(complexity)], complexity, above)
     pivots = pivots[::-1]  # simplest first

@@ -10,23 +10,17 @@ from .judging import CLEARLY, Judge
 from .motion import ROUNDING, coefficient_errors
 from .sampling import SMALL, UNSEEN, Samples, nonlinearity
 
+# Sizes of the samples, about their middle, on which an exact invariant is conserved too.
 _LARGER = (2.0, 4.0, 8.0)
-"""Sizes of the samples, about their middle, on which an exact invariant is kept alike."""
-
+# Relative size of the larger step at which the number of invariants is counted again.
 _MODERATE = 0.03
-"""Relative size of the larger step at which what a small step conserves is looked for."""
 
+# Nonlinearity of the map on larger samples, and how many times larger they are at most.
 _CURVED, _WIDEST = 0.3, 1e3
-"""Nonlinearity of the map on larger samples, and how many times larger they are at most."""
-
-_LINEAR = 1e-9
-"""A map that differs by less from a linear one may be linear."""
-
+_LINEAR = 1e-9  # A map that differs by less from a linear one may be linear
+# A map that moves nothing, to rounding, at a step so many times larger moves nothing at all.
 _LAST = 1e30
-"""A map that moves nothing, to rounding, at a step so many times larger moves nothing at all."""
-
-_HARDLY = 2.0
-"""A step, or samples, larger by a smaller factor say nothing new."""
+_HARDLY = 2.0  # A step, or samples, larger by a smaller factor say nothing new
 
 
 def powers_of_size(
@@ -38,12 +32,11 @@ def powers_of_size(
     orthonormal: np.ndarray,
 ) -> np.ndarray:
     """The power of the samples' size by which changes grow, shape (count,): 0 for an invariant that
-    is conserved on samples several times as large, as an expansion about their middle is not; NaN
+    is conserved on samples several times as large (an expansion about their middle is not); NaN
     where the map or a function is not defined there.
 
-    - `most`: the changes on the samples themselves; `sizes`: of the functions there, (count,).
-    - `orthonormal`: combinations of the functions that are orthonormal there, as columns; zero if
-      coefficients count as exact.
+    `most`: the changes on the samples themselves; `sizes`: of the functions there, (count,);
+    `orthonormal`: orthonormal combinations of them, as columns, or 0 if coefficients are exact.
     """
     if len(coefficients) == 0:
         return np.zeros(0)
@@ -81,11 +74,8 @@ def growth(
     good: np.ndarray,
     changes: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """The powers of the size by which changes grow, see `powers_of_size`.
-
-    - `most`: changes on the samples themselves, shape (count,); `changes`: those on some of the
-      larger ones. `which`, `good`: the size of each larger sample, and whether it can be used.
-    """
+    """See `powers_of_size`; `changes`: those on some of the larger samples; `which`, `good`: the
+    size of each larger sample, and whether it can be used."""
     rows, sizes = [most], [1.0]
     for k, factor in enumerate(_LARGER):
         some = good & (which == k)
@@ -123,8 +113,8 @@ class Larger(NamedTuple):
         if np.isnan(self.factor):
             other = "a larger h" if step else "samples that spread wider"
             return (
-                f"{small}, and no larger one can be tried: what is conserved cannot be told from "
-                f"{what}; take {other}"
+                f"{small}, and no larger one can be tried: an invariant cannot be distinguished "
+                f"from {what}; take {other}"
             )
         where = "at a step {} times as large" if step else "on samples {} times as far from it"
         made = " (or H_D is made for this h)" if step else ""
@@ -134,15 +124,24 @@ class Larger(NamedTuple):
         )
 
 
+def grown(what: str, power: float) -> list[str]:
+    """The line of a report on a power that is not 0; `what`: "changes grow"."""
+    if not power > 0:
+        return []
+    return [
+        f"      not exact: with the size of the samples {what} as its power {power:.2g}, as those "
+        "of an expansion about their middle do"
+    ]
+
+
 def at_larger_step(
     h: float, relative: Callable[[float], float], count: Callable[[float], int | None]
 ) -> tuple[Larger, ...]:
-    """How many are conserved at a larger step; empty where the step is not small.
+    """How many are conserved at a larger step; empty where the step is not small, so that an
+    expansion in h would be seen.
 
-    At a small step an expansion in h is conserved as well as rounding lets one tell.
-
-    - `relative`: `relative_step` at a step; `count`: how many are conserved, None where the map is
-      not defined there.
+    `relative`: `relative_step` at a step; `count`: how many are conserved, None where the map is
+    not defined there.
     """
     seen, moved = 1.0, relative(h)
     while moved < UNSEEN:  # or the map moves nothing at any step
@@ -162,10 +161,7 @@ def in_larger_box(
     count: Callable[[Samples], int | None],
 ) -> tuple[Larger, ...]:
     """How many are conserved on samples that spread wider; empty where a map is not nearly linear
-    on those given, or linear on all.
-
-    `moved`: z1 − z of samples; `count`: how many are conserved on them, or None.
-    """
+    on those given, or linear on all. `moved`: z1 − z of samples."""
     near = nonlinearity(samples, moved(samples))
     if near >= SMALL:
         return ()

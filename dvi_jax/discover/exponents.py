@@ -1,20 +1,14 @@
 """The exponent of a power law for ε → 0, with its uncertainty, from measured points."""
 
-import functools
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .laws import Fits, fits_of_laws, lines, names
 
-ENOUGH = 3
-"""Points that a slope needs: two points always lie on a line."""
-
-_RESOLVED = 0.3
-"""An order is resolved when half of its 95 % interval is at most this."""
-
-_CURVED = 0.05
-"""A straight line is rejected when its probability is below this."""
+ENOUGH = 3  # Points that a slope needs: two points always lie on a line
+_RESOLVED = 0.3  # An order is resolved when half of its 95 % interval is at most this
+_CURVED = 0.05  # A straight line is rejected when its probability is below this
 
 
 class Exponent(NamedTuple):
@@ -192,14 +186,9 @@ def resolving_range(
     return (float(low), float(high)) if high >= 3 * low else (np.nan, np.nan)
 
 
-_FLAT = 0.5
-"""Below this slope a run of points at the smallest ε is a plateau."""
-
-_FLAT_SPAN = np.sqrt(10)
-"""Ratio of largest to smallest ε that such a run must have at least."""
-
-_FLAT_RISE = 10
-"""Ratio of largest to smallest drift that such a run has at most."""
+_FLAT = 0.5  # Below this slope a run of points at the smallest ε is a plateau
+_FLAT_SPAN = np.sqrt(10)  # Ratio of largest to smallest ε that such a run must have at least
+_FLAT_RISE = 10  # Ratio of largest to smallest drift that such a run has at most
 
 
 def plateau_level(epsilons: np.ndarray, drifts: np.ndarray) -> float:
@@ -232,45 +221,26 @@ def line_interval(slope: float, stderr: float, points: int) -> tuple[float, floa
     return slope - half, slope + half
 
 
-@functools.cache
 def student_t(freedom: int) -> float:
-    """The t with P(|T| < t) = 95 %, for T of Student's distribution; by bisection."""
-    low, high = 0.0, 20.0
-    for _ in range(80):
-        middle = (low + high) / 2
-        below = _student_cdf(np.array(middle), freedom) < 0.975
-        low, high = (middle, high) if below else (low, middle)
-    return low
+    """The t with P(|T| < t) = 95 %, for T of Student's distribution."""
+    from scipy import special  # here, so that importing the package does not import SciPy
 
-
-# --- Student's distribution ------------------------------------------
+    return float(special.stdtrit(freedom, 0.975))
 
 
 def _quantiles(fits: Fits, freedom: int, levels: np.ndarray) -> np.ndarray:
     """Where the weighted sum of Student's distributions has the values `levels`; by bisection."""
+    from scipy import special
+
     reach = 15 * fits.stderrs
     low = np.full(len(levels), (fits.slopes - reach).min())
     high = np.full(len(levels), (fits.slopes + reach).max())
     for _ in range(36):
         middle = (low + high) / 2
         t = (middle[:, None] - fits.slopes) / fits.stderrs
-        below = _student_cdf(t, freedom) @ fits.weights < levels
+        below = special.stdtr(freedom, t) @ fits.weights < levels
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     return (low + high) / 2
-
-
-def _student_cdf(t: np.ndarray, freedom: int) -> np.ndarray:
-    """P(T < t) of Student's distribution; Abramowitz & Stegun, 26.7.3 and 26.7.4."""
-    angle = np.arctan(t / np.sqrt(freedom))
-    sine, cosine = np.sin(angle), np.cos(angle)
-    odd = freedom % 2
-    term = cosine if odd else np.ones_like(angle)
-    total = term if freedom > 1 else np.zeros_like(angle)
-    for k in range(2 + odd, freedom - 1, 2):
-        term = term * cosine**2 * (k - 1) / k
-        total = total + term
-    inside = 2 / np.pi * (angle + sine * total) if odd else sine * total
-    return (1 + inside) / 2
 
 
 def _checked(epsilons: Any, drifts: Any, floor: float) -> tuple[np.ndarray, np.ndarray]:

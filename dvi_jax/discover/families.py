@@ -12,9 +12,7 @@ import numpy as np
 from .._checks import whole
 from .basis import About, AbstractBasis, BoundBasis
 
-TIME = ("t", "τ")
-"""Names of the time, which is the slow time of a system with ``slow_time=True``."""
-
+TIME = ("t", "τ")  # Names of the time, which is the slow time of a system with ``slow_time=True``
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -27,7 +25,7 @@ def coordinate_names(shape: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def _places(variables: Sequence[str], shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Where the named variables stand in (q, p, t) flattened."""
+    """Places of the named variables in (q, p, t) flattened."""
     every = coordinate_names(shape)
     unknown = [v for v in variables if v not in every + TIME]
     if unknown:
@@ -41,18 +39,29 @@ def _at(places: tuple[int, ...], q: Any, p: Any, t: Any) -> Any:
     return jnp.concatenate([jnp.ravel(q), jnp.ravel(p), jnp.ravel(t)])[np.array(places)]
 
 
+class _OfComponents(eqx.Module):
+    """The functions of a family at some components of (q, p, t)."""
+
+    family: Any
+    places: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, q, p, t):
+        return self.family.values(_at(self.places, q, p, t))
+
+
 def _names(values: Any) -> tuple[str, ...] | None:
     if values is None:
         return None
     return (values,) if isinstance(values, str) else tuple(values)
 
 
-def _power(name: str, k: int) -> str:
+def raised(name: str, k: int) -> str:
+    """The k-th power of a name, k ≥ 1."""
     return name if k == 1 else name + str(k).translate(_RAISED)
 
 
+# Monomials of a basis: its samples and singular values are dense matrices of this width.
 _MOST = 10_000
-"""Monomials of a basis: its samples and singular values are dense matrices of this width."""
 
 
 class Polynomials(AbstractBasis):
@@ -64,7 +73,7 @@ class Polynomials(AbstractBasis):
     - `constant`: whether 1 is among them (for generators, and for products with other bases).
 
     **Raises** `ValueError` for a degree that is not a positive integer, names that the state does
-    not have, or more than 10 000 monomials, whose null space no machine would find.
+    not have, or more than 10 000 monomials (the null space would be too expensive).
     """
 
     degree: int = eqx.field(static=True)
@@ -100,20 +109,25 @@ class Polynomials(AbstractBasis):
 
 def _monomial(factors: Sequence[str]) -> str:
     counted = [(name, factors.count(name)) for name in dict.fromkeys(factors)]
-    return " ".join(_power(name, k) for name, k in counted) or "1"
+    return " ".join(raised(name, k) for name, k in counted) or "1"
 
 
 class _Monomials(eqx.Module):
     places: tuple[int, ...] = eqx.field(static=True)
     exponents: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
+    variables: tuple[str, ...] = eqx.field(static=True)
     middle: Any = None
+
+    @property
+    def counts(self) -> np.ndarray:
+        """The power of each variable in each monomial."""
+        return np.array([[c.count(i) for i in range(len(self.places))] for c in self.exponents])
 
     def __call__(self, q, p, t):
         flat = _at(self.places, q, p, t)
         if self.middle is not None:
             flat = flat - self.middle
-        counts = np.array([[c.count(i) for i in range(len(self.places))] for c in self.exponents])
+        counts = self.counts
         powers = [jnp.ones_like(flat)]
         for _ in range(int(counts.max())):
             powers.append(powers[-1] * flat)
@@ -128,24 +142,26 @@ class _Monomials(eqx.Module):
             return None
         place = {c: i for i, c in enumerate(self.exponents)}
         matrix = np.zeros((len(place), len(place)))
-        for row, factors in enumerate(self.exponents):
-            counts = [factors.count(i) for i in range(len(self.places))]
-            for kept in itertools.product(*(range(k + 1) if m else (k,) for k, m in
-                                            zip(counts, shift, strict=True))):  # fmt: skip
+        for row, counts in enumerate(self.counts.tolist()):
+            lower = (range(k + 1) if m else (k,) for k, m in zip(counts, shift, strict=True))
+            for kept in itertools.product(*lower):
                 column = place.get(tuple(i for i, j in enumerate(kept) for _ in range(j)))
                 if column is not None:
                     terms = zip(counts, kept, shift, strict=True)
-                    matrix[row, column] = math.prod(math.comb(k, j) * (-m) ** (k - j)
-                                                    for k, j, m in terms)  # fmt: skip
-        words = [
-            v
-            if m == 0
-            else f"({v} {'−' if m > 0 else '+'} {np.format_float_positional(abs(m), trim='-')})"
-            for v, m in zip(self.names, shift, strict=True)
-        ]
+                    factors = (math.comb(k, j) * (-m) ** (k - j) for k, j, m in terms)
+                    matrix[row, column] = math.prod(factors)
+        words = [_distance(v, m) for v, m in zip(self.variables, shift, strict=True)]
         names = tuple(_monomial([words[i] for i in c]) for c in self.exponents)
-        moved = _Monomials(self.places, self.exponents, self.names, shift)
+        moved = _Monomials(self.places, self.exponents, self.variables, shift)
         return About(moved, names, matrix, () in place)
+
+
+def _distance(variable: str, middle: float) -> str:
+    """The name of a variable less the middle, such as "(q − 3)"."""
+    if middle == 0:
+        return variable
+    sign = "−" if middle > 0 else "+"
+    return f"({variable} {sign} {np.format_float_positional(abs(middle), trim='-')})"
 
 
 def _pair(ends: Any) -> Any:
@@ -177,21 +193,16 @@ class Chebyshev(AbstractBasis):
     def for_shape(self, shape):
         names = ("1", *(f"T{k}({self.variable})" for k in range(1, self.count)))
         return BoundBasis(
-            _ChebyshevValues(_places([self.variable], shape), self.count, self.domain),
+            _OfComponents(self, _places([self.variable], shape)),
             names,
             tuple(range(self.count)),
             self.variable in TIME,
         )
 
-
-class _ChebyshevValues(eqx.Module):
-    places: tuple[int, ...] = eqx.field(static=True)
-    count: int = eqx.field(static=True)
-    domain: tuple[float, float] = eqx.field(static=True)
-
-    def __call__(self, q, p, t):
+    def values(self, x):
+        """T_0 … T_{count−1}, by their recursion."""
         a, b = self.domain
-        x = (2 * _at(self.places, q, p, t)[0] - a - b) / (b - a)
+        x = (2 * x[0] - a - b) / (b - a)
         values = [jnp.ones_like(x), x]
         for _ in range(self.count - 2):
             values.append(2 * x * values[-1] - values[-2])
@@ -227,23 +238,23 @@ class Trigonometric(AbstractBasis):
         if self.constant:
             names, complexity = ["1", *names], [0, *complexity]
         return BoundBasis(
-            _Waves(_places([self.variable], shape), self.count, omega, self.constant),
+            _OfComponents(self, _places([self.variable], shape)),
             tuple(names),
             tuple(complexity),
             self.variable in TIME,
         )
 
-
-class _Waves(eqx.Module):
-    places: tuple[int, ...] = eqx.field(static=True)
-    count: int = eqx.field(static=True)
-    omega: float = eqx.field(static=True)
-    constant: bool = eqx.field(static=True)
-
-    def __call__(self, q, p, t):
-        x = self.omega * jnp.arange(1, self.count + 1) * _at(self.places, q, p, t)[0]
+    def values(self, x):
+        """1 if it is among them, then cos and sin of each multiple."""
+        x = 2 * np.pi / self.period * jnp.arange(1, self.count + 1) * x[0]
         waves = jnp.stack([jnp.cos(x), jnp.sin(x)], axis=1).ravel()
         return jnp.append(1.0, waves) if self.constant else waves
+
+
+def _of_radius(k: int) -> str:
+    if k == 0:
+        return "1"
+    return raised("r", k) if k > 0 else f"1/{raised('r', -k)}"
 
 
 class Radial(AbstractBasis):
@@ -268,21 +279,14 @@ class Radial(AbstractBasis):
     def for_shape(self, shape):
         names = coordinate_names(shape)
         chosen = names[: len(names) // 2] if self.variables is None else self.variables
-        words = ["1" if k == 0 else _power("r", k) if k > 0 else f"1/{_power('r', -k)}"
-                 for k in self.powers]  # fmt: skip
         return BoundBasis(
-            _RadialValues(_places(chosen, shape), self.powers),
-            tuple(words),
+            _OfComponents(self, _places(chosen, shape)),
+            tuple(_of_radius(k) for k in self.powers),
             tuple(abs(k) for k in self.powers),
             any(v in TIME for v in chosen),
         )
 
-
-class _RadialValues(eqx.Module):
-    places: tuple[int, ...] = eqx.field(static=True)
-    powers: tuple[int, ...] = eqx.field(static=True)
-
-    def __call__(self, q, p, t):
-        x = _at(self.places, q, p, t)
+    def values(self, x):
+        """r^k for each power."""
         r = jnp.sqrt(jnp.sum(x**2))
         return jnp.stack([r**k for k in self.powers])

@@ -1,5 +1,6 @@
 """What discovery returns: the invariants, what is lost, and a report; saved and loaded."""
 
+import dataclasses
 import os
 from typing import Any
 
@@ -13,63 +14,69 @@ from .._files import publish_npz, read_npz
 from .._precision import refuse_double_without_x64
 from .._types import State
 from .basis import AbstractBasis, BoundBasis, bind_basis
-from .expansions import Larger
+from .expansions import Larger, grown
 from .nullspace import CLEAR
 from .obstructions import DriftLaw
 from .sampling import Samples
 from .series import InvariantSeries
 
-_ILL = 1e8
-"""Condition number of a basis from which on formulas have lost half of their digits."""
+_ILL = 1e8  # Condition number of a basis from which on formulas have lost half of their digits
 
 
 class Discovery(eqx.Module):
     """What `discover_invariants` found.
 
+    The invariants:
+
     - `coefficients`: shape (count, order + 1, basis size), of the independent invariants, the
       simplest first; count may be 0. `dependent`: the same for the others in the span, which
-      are functions of them (on the samples, as far as differentials say).
-    - `exact`: for each independent invariant, whether it is kept at ε that are not small, to
+      are functions of them (on the samples, as far as differentials show).
+    - `exact`: for each independent invariant, whether it is conserved at ε that are not small, to
       round-off over many steps; not tried (False) at order 0.
     - `leading_parts`: shape (families, basis size): a basis, orthonormal on the samples, of the
       order-0 parts of *all* invariants in the span.
     - `survivors`: for m = 0 … order, how many leading parts have an invariant of order m
-      (a constant is none).
+      (a constant does not count).
+    - `reach`: shape (count,): the ε at which corrections are as large as the leading part; the
+      series is of use far below it. Infinite without corrections.
+    - `obstructions`: a `DriftLaw` for each leading part that is lost at order 1, 2, …
+
+    How reliable they are:
+
     - `singular_values`: of the whole system, descending, relative to the changes that the slopes
       of the functions predict (with a tolerance, to the largest value); `gap`: the ratio at which
-      they were cut (large is clear, below 1e3 is not). `refused`: null vectors of the fitted
+      they were cut (large is clear, below 1e3 is not). `refused`: null vectors of the training
       samples that change by more than rounding by their own measure, or that a lower order
-      refuses.
+      rejects.
     - `residuals`: shape (count, order + 1), on held-out points: the largest change over one
       step at each order in ε · `scale`, relative to what the slopes of the leading part predict,
-      |∇I|·|Δz|, or to its spread over the samples where that is less. `typical_residuals`: what
-      half of the points, and 95 % of them, stay below, shape (count, order + 1, 2).
-      `dependent_residuals`: as `residuals`.
+      |∇I|·|Δz|, or to its spread over the samples where that is less. `typical_residuals`: their
+      median and 95 % quantile, shape (count, order + 1, 2). `dependent_residuals`: as `residuals`.
     - `undecided`: how many combinations of the functions change in the steps by less than 1000
       times their rounding, or are null and change by more than rounding and less than 1e-6 of what
-      their slopes predict, so that it cannot be decided whether they are kept. `impossible`:
-      whether as many independent invariants were found as there are coordinates, with a tolerance
-      or as expansions, though the map moves; none is then reported.
+      their slopes predict: whether they are conserved cannot be decided. `impossible`: whether as
+      many independent invariants were found as there are coordinates, with a tolerance or as
+      expansions, though the map moves; none is then reported.
     - `larger`: how many are conserved at a larger step or on samples that spread wider, where those
       given are so small that expansions are conserved as well; see `Larger`.
     - `powers`: shape (count,), at order 0: the power of the size of the samples by which the
       changes in a step grow. 0 is an exact invariant; an expansion about the middle of the
       samples, cut off, has another power. NaN where it was not tried.
-    - `reach`: shape (count,): the ε at which corrections are as large as the leading part; the
-      series is of use far below it. Infinite without corrections.
-    - `obstructions`: a `DriftLaw` for each leading part that is lost at order 1, 2, …
+    - `condition`: of `inner` on the samples, each function scaled to one size.
+
+    The functions:
+
     - `basis`: φ, with `names`. `middle`: m, of z = (q, p, t), shape (2n + 1,). Where it is not
       zero, the samples lie so far from the origin that polynomials lose digits there; they are
       then taken about m: functions `inner` = `to_basis` @ φ + constants, with
       `inner_coefficients` and `inner_dependent`. Formulas, values and laws are of those; values
       differ from those of `coefficients` by a constant.
-    - `sizes`: shape (order + 1, basis size), what a coefficient of 1 amounts to on the samples, of
-      `inner`. `condition`: of `inner` there, each function scaled to one size.
-    - `scale`: 1 over the ε at which the disturbance changes a step as much as H_D does.
+    - `sizes`: shape (order + 1, basis size): size of a term with coefficient 1 on the samples, of
+      `inner`. `scale`: 1 over the ε at which the perturbation changes a step as much as H_D does.
     - `slow_time`: of the system. `tolerance`: None, or that of approximate invariants.
 
-    On resonant or integrable systems the null space is large; on chaotic ones near-null vectors
-    appear that are none. Held-out residuals and `drift_order` on a long run decide.
+    On resonant or integrable systems the null space is large; on chaotic ones spurious near-null
+    vectors appear. Held-out residuals and `drift_order` on a long run decide.
     """
 
     inner_coefficients: Array
@@ -121,7 +128,7 @@ class Discovery(eqx.Module):
 
     @property
     def order(self) -> int:
-        """z, the order that was asked for."""
+        """z, the requested order."""
         return len(self.survivors) - 1
 
     @property
@@ -141,30 +148,30 @@ class Discovery(eqx.Module):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the answer is not to be relied on, each with what would help; empty if it is."""
-        told = []
+        """Why the answer is not reliable, each with what would help; empty if it is."""
+        reasons = []
         if self.survivors[0] and self.gap < CLEAR:
-            told.append("the gap is not clear: let drift_order on a long run decide")
+            reasons.append("the gap is not clear: let drift_order on a long run decide")
         if self.impossible:
-            told.append(
+            reasons.append(
                 "as many independent invariants as coordinates were found, which is impossible "
                 "for a map that moves: none is reported; take a smaller tolerance, or samples "
                 "where functions change clearly in a step"
             )
         if self.undecided > 0:
-            told.append(
+            reasons.append(
                 f"{self.undecided} combinations of the functions change in a step by less than "
-                "1000 times their rounding, or by hardly more than it: whether they are kept "
+                "1000 times their rounding, or by hardly more than it: whether they are conserved "
                 "cannot be decided in this arithmetic; take another h, samples that spread wider, "
                 "or an origin among them"
             )
-        told += filter(None, (other.warning(self.survivors[0]) for other in self.larger))
+        reasons += filter(None, (other.warning(self.survivors[0]) for other in self.larger))
         if self.condition > _ILL:
-            told.append(
+            reasons.append(
                 f"the basis is ill-conditioned on the samples ({self.condition:.0e}): formulas "
                 "are not reliable; shift and scale the coordinates"
             )
-        return tuple(told)
+        return tuple(reasons)
 
     def evaluate(self, q: State, p: State, epsilon: Any, t: Any = 0.0) -> Array:
         """The values of the independent invariants at a point, shape (count,)."""
@@ -177,23 +184,10 @@ class Discovery(eqx.Module):
             {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in law._asdict().items()}
             for law in self.obstructions
         ]
-        about = {
-            "names": self.basis.names,
-            "exact": self.exact,
-            "survivors": self.survivors,
-            "gap": self.gap,
-            "refused": self.refused,
-            "undecided": self.undecided,
-            "impossible": self.impossible,
-            "larger": self.larger,
-            "condition": self.condition,
-            "scale": self.scale,
-            "shape": self.shape,
-            "slow_time": self.slow_time,
-            "tolerance": self.tolerance,
-            "obstructions": laws,
-        }
-        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        plain, names = _fields()
+        about = {name: getattr(self, name) for name in plain}
+        about |= {"names": self.basis.names, "obstructions": laws}
+        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in names}
         arrays |= {f"probe_{name}": x for name, x in self.probe._asdict().items()}
         arrays["probe_values"] = _probed(self.basis, self.probe)
         publish_npz(path, _FORMAT, about, arrays)
@@ -202,19 +196,19 @@ class Discovery(eqx.Module):
     def load(cls, path: str | os.PathLike[str], basis: AbstractBasis) -> "Discovery":
         """Read what `save` wrote; `basis` is the one that was searched (its names are compared).
 
-        **Raises** `FileNotFoundError` where there is none, `ValueError` for a file of something
-        else, or another basis.
+        **Raises** `FileNotFoundError` where there is no such file, `ValueError` for a file of
+        something else, or another basis.
         """
         refuse_double_without_x64("a Discovery", np.float64)
         about, found = read_npz(path, _FORMAT, "discovery")
+        plain, names = _fields()
         try:
-            arrays: dict[str, Any] = {name: found[name] for name in _ARRAYS}
+            arrays: dict[str, Any] = {name: found[name] for name in names}
             probe = Samples(*(found[f"probe_{name}"] for name in Samples._fields))
             values = found["probe_values"]
         except KeyError as error:
-            raise ValueError(f"{os.fspath(path)} is no file that Discovery.save wrote.") from error
-        shape = tuple(about["shape"])
-        bound = bind_basis(basis, shape)
+            raise ValueError(f"Discovery.save did not write {os.fspath(path)}.") from error
+        bound = bind_basis(basis, tuple(about["shape"]))
         inner, to_basis = bound.about(arrays["middle"])
         if list(bound.names) != about["names"]:
             raise ValueError(
@@ -228,29 +222,16 @@ class Discovery(eqx.Module):
                 f"the basis given has the names of that of {os.fspath(path)} and other values: "
                 f"{bound.names[int(np.argmax(differs.any(axis=0)))]!r} differs."
             )
-        laws = tuple(_law(law) for law in about["obstructions"])
         for name in ("inner_coefficients", "inner_dependent"):
             arrays[name] = jnp.asarray(arrays[name])
-        return cls(
-            exact=tuple(about["exact"]),
-            survivors=tuple(about["survivors"]),
-            gap=about["gap"],
-            refused=about["refused"],
-            undecided=about["undecided"],
-            impossible=about["impossible"],
-            larger=tuple(Larger(*x) for x in about.get("larger", ())),
-            condition=about["condition"],
-            scale=about["scale"],
-            obstructions=laws,
-            basis=bound,
-            inner=inner,
-            to_basis=to_basis,
-            probe=probe,
-            shape=shape,
-            slow_time=about["slow_time"],
-            tolerance=about["tolerance"],
-            **arrays,
-        )
+        given = {k: tuple(v) if isinstance(v, list) else v for k, v in about.items() if k in plain}
+        given["larger"] = tuple(Larger(*x) for x in about.get("larger", ()))
+        laws: list[dict[str, Any]] = [
+            {k: np.array(v) if isinstance(v, list) else v for k, v in law.items()}
+            for law in about["obstructions"]
+        ]
+        given["obstructions"] = tuple(DriftLaw(**law) for law in laws)
+        return cls(basis=bound, inner=inner, to_basis=to_basis, probe=probe, **given, **arrays)
 
     def __str__(self) -> str:
         kind = "independent" if self.tolerance is None else "independent approximate"
@@ -278,62 +259,42 @@ class Discovery(eqx.Module):
                 "their own slopes or a lower order decide (chaos, too few samples, or too large a "
                 "tolerance)"
             )
-        for series, residual, typical, exact, reach, power in zip(
-            self.invariants, self.residuals, self.typical_residuals, self.exact, self.reach,
-            self.powers, strict=True,
-        ):  # fmt: skip
-            lines.append(f"  I = {series.formula(_SHOWN, drop, digits)}")
-            told = ", exact at every ε tried" if exact else ""
-            if np.isfinite(reach) and not exact:
-                told = f"; corrections are as large as the leading part at ε = {reach:.2g}"
-            half, most = np.max(typical, axis=0)
-            lines.append(
+        for i, series in enumerate(self.invariants):
+            note = ", exact at every ε tried" if self.exact[i] else ""
+            if np.isfinite(self.reach[i]) and not self.exact[i]:
+                note = f"; corrections are as large as the leading part at ε = {self.reach[i]:.2g}"
+            half, most = np.max(self.typical_residuals[i], axis=0)
+            lines += [
+                f"  I = {series.formula(_SHOWN, drop, digits)}",
                 f"      changes in a step on held-out samples: median {half:.1e}, 95 % below "
-                f"{most:.1e}, largest {np.max(residual):.1e} of what its slopes predict{told}"
-            )
-            if power > 0:
-                lines.append(
-                    f"      not exact: with the size of the samples changes grow as its power "
-                    f"{power:.2g}, as those of an expansion about their middle do"
-                )
+                f"{most:.1e}, largest {np.max(self.residuals[i]):.1e} of what its slopes predict"
+                f"{note}",
+                *grown("changes grow", self.powers[i]),
+            ]
         if len(self.dependent):
             lines.append(f"  functions of them, as differentials say: {len(self.dependent)}")
             for series in self.dependent_invariants[:3]:
                 lines.append(f"      {series.formula(_SHOWN, drop, digits)}")
-        told = [law for law in self.obstructions if law.kind != "unexplained"]
-        lines += [f"  {law}" for law in told[:_LAWS]]
-        if len(told) > _LAWS:
-            lines.append(f"  {len(told) - _LAWS} more lost, each by such a law")
+        laws = [law for law in self.obstructions if law.kind != "unexplained"]
+        lines += [f"  {law}" for law in laws[:_LAWS]]
+        if len(laws) > _LAWS:
+            lines.append(f"  {len(laws) - _LAWS} more lost, each by such a law")
         lost = self.survivors[0] - self.survivors[-1]
-        if len(told) < lost:
+        if len(laws) < lost:
             lines.append(
-                f"  {lost - len(told)} more lost, by a drift that is no function of what order 0 "
-                "keeps in this basis: it may be too small"
+                f"  {lost - len(laws)} more lost, by a drift that is not a function of what order "
+                "0 conserves in this basis: it may be too small"
             )
         return "\n".join(lines)
 
 
-def _law(values: dict[str, Any]) -> DriftLaw:
-    """A law as `Discovery.save` wrote it."""
-    fields: dict[str, Any] = {
-        k: np.array(v) if isinstance(v, list) else v for k, v in values.items()
-    }
-    return DriftLaw(**fields)
+def _fields() -> tuple[list[str], list[str]]:
+    """Names of the fields that are plain values in a file, and of those that are arrays."""
+    apart = ("obstructions", "basis", "inner", "to_basis", "probe")
+    fields = [f for f in dataclasses.fields(Discovery) if f.name not in apart]
+    plain = [f.name for f in fields if f.metadata.get("static")]
+    return plain, [f.name for f in fields if f.name not in plain]
 
-
-_ARRAYS = (
-    "inner_coefficients",
-    "inner_dependent",
-    "middle",
-    "leading_parts",
-    "singular_values",
-    "residuals",
-    "typical_residuals",
-    "dependent_residuals",
-    "powers",
-    "reach",
-    "sizes",
-)
 
 _FORMAT = 2
 
@@ -343,8 +304,5 @@ def _probed(basis: BoundBasis, probe: Samples) -> np.ndarray:
     return np.asarray(jax.vmap(basis)(*map(jnp.asarray, probe)))
 
 
-_SHOWN = 12
-"""Terms of a formula in a report; ``str`` of a series shows all."""
-
-_LAWS = 4
-"""Drift laws in a report."""
+_SHOWN = 12  # Terms of a formula in a report; ``str`` of a series shows all
+_LAWS = 4  # Drift laws in a report

@@ -18,7 +18,7 @@ from .basis import AbstractBasis, BoundBasis, bind_basis, check_step_size
 from .echelon import reduction
 from .generators import Generator, LatticePoint
 from .noether import noether_identity
-from .null_series import series_changes, solve_series
+from .nullspace import series_changes, solve_series
 from .sampling import (
     as_samples,
     relative_step,
@@ -28,18 +28,18 @@ from .sampling import (
 )
 from .taylor import taylor_coefficients
 
-_ROUNDINGS = 64.0
-"""An identity below so many roundings of its terms is zero."""
-
-_HIDDEN = 1e-6
-"""Where rounding makes a larger residual, it does not decide whether a gauge exists."""
-
+_ROUNDINGS = 64.0  # An identity below so many roundings of its terms is zero
+_HIDDEN = 1e-6  # Where rounding makes a larger residual, it does not decide whether a gauge exists
+# A sample is compared with itself where the identity is so many times larger than at 75 %.
 _STRONG = 100.0
-"""A sample is compared with itself where the identity is so many times larger than at 75 %."""
 
 
 class BasisGauge(eqx.Module):
-    """A gauge G(t, q, p, args) = g·φ(q, p, t); as a formula: `str`."""
+    """A function c·φ(q, p, t) of a basis, as a gauge G(t, q, p, args) or as a component of a
+    generator; as a formula: `str`.
+
+    - `coefficients`: c, shape (basis size,), or (*q.shape, basis size) for ξ and η.
+    """
 
     basis: BoundBasis
     coefficients: Array
@@ -60,8 +60,8 @@ class GaugeSolution(eqx.Module):
       gauge at each order in ε, relative to the identity without gauges (or to its terms if that
       is zero). Rounding: a gauge exists, and the identity closes to that order; of order one: no
       gauge in this basis closes it.
-    - `rounding`: the residual that rounding alone makes at order 0. Where it is above 1e-6, whether
-      the identity closes cannot be decided (`warnings`).
+    - `rounding`: the residual that rounding alone makes at order 0. Above 1e-6, whether the
+      identity closes cannot be decided (`warnings`).
     """
 
     gauges: tuple[BasisGauge, ...]
@@ -106,7 +106,7 @@ def solve_gauge(
     t0: float = 0.0,
     args: Args = None,
 ) -> GaugeSolution:
-    r"""The gauge functions that close Noether's identities on the disturbed map, by least squares.
+    r"""Least-squares gauge functions that close Noether's identities on the perturbed map.
 
     With Φ_ε the map (12)–(13), the sum Σ_m ε^m N_m of the identities (28) has to vanish on
     (q, p) → Φ_ε(q, p) up to O(ε^{z+1}). Powers of ε are collected *after* the map is put in:
@@ -114,21 +114,19 @@ def solve_gauge(
         n_k + (1/h) Σ_{m≤k} A_{k−m} g_m = 0    for k = 0 … z
 
     with n_k the Taylor coefficients of the sum without gauges and A_k those of φ(Φ_ε) − φ.
-    (Taken order by order with the undisturbed map, as (28) is printed, terms are lost: (34)
-    fails by it.)
+    (Order by order with the unperturbed map, as (28) is printed, terms are lost: (34) therefore
+    fails.)
 
     On the solutions every generator with ξ0 = 0 has the gauge −ξ·p, whose invariant is 0: where
-    the basis holds it, look at the invariant and not at the residual alone. `find_symmetries`
-    tells such generators from those that lead to an invariant.
+    the basis contains it, look at the invariant and not at the residual alone. `find_symmetries`
+    distinguishes such generators from those that lead to an invariant.
 
-    **Arguments** `generators`: the series, order 0 first; `basis`: φ(q, p), where the gauges are
-    looked for; `h`, `t0`, `args`: of the step; `samples`: (qs, ps) at t0, shapes (S, *q.shape),
-    or (qs, ps, ts) with the times of the samples, shape (S,); a quarter of them held out.
+    **Arguments** `generators`: the series, order 0 first; `basis`: φ(q, p) of the gauges; `h`,
+    `t0`, `args`: of the step; `samples`: (qs, ps) at t0, shapes (S, *q.shape), or (qs, ps, ts)
+    with the times of the samples, shape (S,); a quarter of them is held out. No sample counts
+    more than another, however large the identity is there.
 
-    **Returns** a `GaugeSolution`: `gauges`, functions for `AdiabaticInvariant`, one for each order;
-    their `coefficients` in the basis; `residuals` of the identity at each order on held-out points;
-    and `warnings` where rounding hides the answer. No sample counts more than another, however
-    large the identity is there.
+    **Returns** a `GaugeSolution`.
 
     **Raises** `ValueError` for samples of unequal shapes, too few of them, or where the step fails.
 
@@ -160,7 +158,7 @@ def solve_gauge(
 
     rows = changes / scale[:, None, None]
     g, free = solve_series(rows[~held], -n[~held] / scale[~held, None])
-    # What is left free is invariants, which may be added to any gauge: the simplest is taken.
+    # Invariants may be added to any gauge: the simplest sum is taken.
     g = reduction(free, np.tile(bound.complexity, order + 1), size)(g)
     left = series_changes(rows, g[:, None])[held, :, 0] + n[held] / scale[held, None]
     g = g.reshape(order + 1, size)
@@ -173,8 +171,8 @@ def solve_gauge(
 
 
 def _scale(n: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """What the residual of each sample is divided by, shape (S,): the largest identity without
-    gauges, or its own where that is far larger than at nearly all samples.
+    """Scale of the residual of each sample, shape (S,): the largest identity without gauges, or
+    its own where that is far larger than at nearly all samples.
 
     `n`: the identity without gauges; `sizes`: of its terms before they cancel.
     """
@@ -182,6 +180,50 @@ def _scale(n: np.ndarray, sizes: np.ndarray) -> np.ndarray:
         n = sizes  # the identity closes by itself: n is rounding
     usual = n <= _STRONG * np.quantile(n, 0.75)
     return np.maximum(np.where(usual, np.max(n[usual], initial=0.0), n), np.finfo(float).tiny)
+
+
+@eqx.filter_jit
+def _identity_terms(equations, h, generators, basis, samples):
+    """Taylor coefficients in ε of [Σ ε^m N_m without gauges, φ(Φ_ε) − φ], (S, z + 1, 1 + B); the
+    sizes of the terms of N_m at ε = 0 before they cancel, one for each component of the generator
+    at both points, (S,); z1 − z, (S, 2n); and whether the steps succeed, (S,)."""
+    zero, orders = jnp.zeros(()), range(len(generators))
+
+    def at_point(q, p, t):
+        interval = Interval(t, t + h, jnp.asarray(h, float))
+        first = LatticePoint(interval.t0, q, p)
+
+        def stepped(epsilon):
+            here = Equations(equations.system, epsilon, equations.args, Newton())
+            q1, p1, info = step(here, interval, q, p)
+            return LatticePoint(interval.t1, q1, p1), info.result == RESULTS.successful
+
+        def identities(epsilon, second, series):
+            given = equations.system, series, [None for _ in orders]
+            rest = first, second, epsilon, equations.args
+            return [noether_identity(*given, m, *rest) for m in orders]
+
+        def of(epsilon):
+            second, _ = stepped(epsilon)
+            of_order = identities(epsilon, second, generators)
+            total = sum(epsilon**m * N for m, N in enumerate(of_order))
+            change = basis(second.q, second.p, second.t) - basis(q, p, first.t)
+            return jnp.append(total, change)
+
+        second, good = stepped(zero)
+
+        def in_parts(weights):
+            """The identities of all orders at ε = 0, linear in weights of the components."""
+            weighted = [_weighted(g, first, w) for g, w in zip(generators, weights, strict=True)]
+            return jnp.stack(identities(0.0, second, weighted))
+
+        parts = jax.jacfwd(in_parts)(jnp.ones((len(generators), 2, 1 + 2 * q.size)))
+        size = jnp.max(jnp.sum(jnp.abs(parts), axis=(1, 2, 3)))
+        terms = taylor_coefficients(of, zero, len(generators) - 1)
+        moved = jnp.concatenate([(second.q - q).ravel(), (second.p - p).ravel()])
+        return terms, size, moved, good
+
+    return jax.vmap(at_point)(*samples)
 
 
 def _weighted(generator: Generator, first: LatticePoint, weights: Array) -> Generator:
@@ -197,53 +239,3 @@ def _weighted(generator: Generator, first: LatticePoint, weights: Array) -> Gene
         return function
 
     return Generator(*map(component, range(3)))
-
-
-@eqx.filter_jit
-def _identity_terms(equations, h, generators, basis, samples):
-    """Taylor coefficients in ε of [Σ ε^m N_m without gauges, φ(Φ_ε) − φ], (S, z + 1, 1 + B); the
-    sizes of the terms of N_m at ε = 0 before they cancel, one for each component of the generator
-    at both points, (S,); z1 − z, (S, 2n); and whether the steps succeed, (S,)."""
-    nothing = [None] * len(generators)
-
-    def at_point(q, p, t):
-        interval = Interval(t, t + h, jnp.asarray(h, float))
-
-        def of(epsilon):
-            here = Equations(equations.system, epsilon, equations.args, Newton())
-            q1, p1, _ = step(here, interval, q, p)
-            first, second = LatticePoint(interval.t0, q, p), LatticePoint(interval.t1, q1, p1)
-            total = sum(
-                epsilon**m
-                * noether_identity(
-                    here.system, generators, nothing, m, first, second, epsilon, here.args
-                )
-                for m in range(len(generators))
-            )
-            return jnp.append(total, basis(q1, p1, interval.t1) - basis(q, p, interval.t0))
-
-        def in_parts(weights):
-            """The identities of all orders at ε = 0, linear in weights of the components."""
-            here = Equations(equations.system, jnp.zeros(()), equations.args, Newton())
-            q1, p1, _ = step(here, interval, q, p)
-            first, second = LatticePoint(interval.t0, q, p), LatticePoint(interval.t1, q1, p1)
-            weighted = [_weighted(g, first, weights[m]) for m, g in enumerate(generators)]
-            return jnp.stack(
-                [
-                    noether_identity(
-                        here.system, weighted, nothing, m, first, second, 0.0, here.args
-                    )
-                    for m in range(len(generators))
-                ]
-            )
-
-        parts = jax.jacfwd(in_parts)(jnp.ones((len(generators), 2, 1 + 2 * q.size)))
-        size = jnp.max(jnp.sum(jnp.abs(parts), axis=(1, 2, 3)))
-        terms = taylor_coefficients(of, jnp.zeros(()), len(generators) - 1)
-        q1, p1, info = step(
-            Equations(equations.system, jnp.zeros(()), equations.args, Newton()), interval, q, p
-        )
-        moved = jnp.concatenate([(q1 - q).ravel(), (p1 - p).ravel()])
-        return terms, size, moved, info.result == RESULTS.successful
-
-    return jax.vmap(at_point)(*samples)

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .._checks import function
 from .._types import Args, Scalar, State
 
 
@@ -24,8 +25,8 @@ class Generator(eqx.Module):
     - `xi0`: ξ0, function ``(t, q, p, args)`` → scalar [time].
     - `xi`: ξ, function of the same → array like q. `eta`: η → array like p.
 
-    None stands for zero. A series in ε, (18)–(20) of the paper, is a list of generators, order
-    0 first. Generators add, subtract, and multiply with numbers.
+    None means zero. A series in ε, (18)–(20) of the paper, is a list of generators, order 0 first.
+    Generators add, subtract, and multiply with numbers.
     """
 
     __array_ufunc__: ClassVar[None] = None  # NumPy numbers leave the product to __rmul__
@@ -35,22 +36,19 @@ class Generator(eqx.Module):
     eta: Callable[..., Any] | None = None
 
     def __check_init__(self):
-        for name in ("xi0", "xi", "eta"):
-            function = getattr(self, name)
-            if function is not None and not callable(function):
-                raise TypeError(
-                    f"{name} must be a function (t, q, p, args) or None, got {function!r}."
-                )
+        for name in _COMPONENTS:
+            if getattr(self, name) is not None:
+                function(name, getattr(self, name), "(t, q, p, args)", "None stands for zero.")
 
     def __call__(self, point: LatticePoint, args: Args = None) -> LatticePoint:
         """(ξ0, ξ, η) at the point, shaped like (t, q, p)."""
         t, q, p = (jnp.asarray(x) for x in point)
         values = []
-        for name, like in (("xi0", t), ("xi", q), ("eta", p)):
-            function = getattr(self, name)
+        for name, like in zip(_COMPONENTS, (t, q, p), strict=True):
+            component = getattr(self, name)
             value = jnp.zeros_like(like)
-            if function is not None:
-                value = jnp.asarray(function(t, q, p, args), like.dtype)
+            if component is not None:
+                value = jnp.asarray(component(t, q, p, args), like.dtype)
                 if value.shape != like.shape:
                     raise ValueError(
                         f"{name} must have shape {like.shape} at q of shape {q.shape}; it has "
@@ -62,14 +60,15 @@ class Generator(eqx.Module):
     def __add__(self, other: "Generator") -> "Generator":
         if not isinstance(other, Generator):
             return NotImplemented
-        pairs = ((getattr(self, name), getattr(other, name)) for name in ("xi0", "xi", "eta"))
-        return Generator(*(a if b is None else b if a is None else _Total(a, b) for a, b in pairs))
+        pairs = ((getattr(self, name), getattr(other, name)) for name in _COMPONENTS)
+        sums = (b if a is None else a if b is None else eqx.Partial(_sum, a, b) for a, b in pairs)
+        return Generator(*sums)
 
     def __mul__(self, number: Any) -> "Generator":
         if callable(number) or jnp.shape(number) != ():
             return NotImplemented
-        functions = (self.xi0, self.xi, self.eta)
-        return Generator(*(None if f is None else _Multiple(f, number) for f in functions))
+        parts = (getattr(self, name) for name in _COMPONENTS)
+        return Generator(*(None if f is None else eqx.Partial(_multiple, f, number) for f in parts))
 
     def __rmul__(self, number: Any) -> "Generator":
         return self * number
@@ -81,20 +80,15 @@ class Generator(eqx.Module):
         return self + -other if isinstance(other, Generator) else NotImplemented
 
 
-class _Total(eqx.Module):
-    first: Callable[..., Any]
-    second: Callable[..., Any]
-
-    def __call__(self, t, q, p, args):
-        return self.first(t, q, p, args) + self.second(t, q, p, args)
+_COMPONENTS = ("xi0", "xi", "eta")
 
 
-class _Multiple(eqx.Module):
-    function: Callable[..., Any]
-    number: Any
+def _sum(first, second, *at):
+    return first(*at) + second(*at)
 
-    def __call__(self, t, q, p, args):
-        return self.number * self.function(t, q, p, args)
+
+def _multiple(component, number, *at):
+    return number * component(*at)
 
 
 def prolong(

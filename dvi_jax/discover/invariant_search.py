@@ -1,26 +1,28 @@
-"""Adiabatic invariants found as a null space on the map that is actually iterated."""
+"""Adiabatic invariants as the null space of a linear system on the iterated map."""
 
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import whole
-from .._integrator import Integrator
+from .._checks import fraction, one_of, whole
 from .._step import Equations
 from .._system import System, check_system
-from .._types import Args
-from ..engine.names import both_names
-from ..engine.newton import RootSolver
-from ..methods import Method
 from .basis import AbstractBasis, bind_basis, check_step_size
 from .changes import Changes, Stepped, changes_at, checked_changes, is_exact
 from .expansions import Larger, at_larger_step, in_larger_box, powers_of_size
 from .found import Discovery
 from .judging import CLEARLY, Fewest, Judge, cleaned, reach
 from .motion import UNCLEAR, coefficient_errors, conserved, typical_sizes
-from .null_series import compress, epsilon_scale, in_units_of, series_spaces
-from .nullspace import RANK, singular_vectors, triangle
+from .nullspace import (
+    RANK,
+    compress,
+    epsilon_scale,
+    in_units_of,
+    series_spaces,
+    singular_vectors,
+    triangle,
+)
 from .obstructions import drift_laws
 from .representatives import Span
 from .sampling import (
@@ -34,20 +36,13 @@ from .sampling import (
     require_time,
 )
 
+# Coefficients are known up to this share of the largest, over the gap in singular values.
 _FUZZY = 30.0
-"""Coefficients are known up to this share of the largest, over the gap in singular values."""
-
-_FUZZIEST = 1e-3
-"""No larger shares than this are taken for errors of others."""
-
-_AS_GOOD = 10.0
-"""An invariant with fewer terms may change by so many times more."""
-
-_ROUND_OFF = 1e-12
-"""Changes below this need not be smaller."""
+_FUZZIEST = 1e-3  # No larger shares than this are taken for errors of others
+_AS_GOOD = 10.0  # An invariant with fewer terms may change by so many times more
+_ROUND_OFF = 1e-12  # Changes below this need not be smaller
 
 
-@both_names
 def discover_invariants(
     system: System,
     basis: AbstractBasis,
@@ -55,13 +50,9 @@ def discover_invariants(
     *,
     h: float,
     samples: Any,
-    t0: float = 0.0,
-    args: Args = None,
-    method: Method | None = None,
-    newton: RootSolver | None = None,
-    integrator: Integrator | None = None,
     tolerance: float | None = None,
     representative: Literal["least", "simplest"] = "least",
+    **how: Any,
 ) -> Discovery:
     r"""The adiabatic invariants of order z that a basis can express, on the iterated map itself.
 
@@ -80,26 +71,26 @@ def discover_invariants(
     **Arguments**
 
     - `basis`: for example ``Polynomials(6)``, ``Basis([f, g])``, sums and products of bases.
-    - `order`: z ≥ 0. `h`: step size [time]. `method`, `newton`, `integrator`: as for
-      `integrate`; only the map of one step is used.
+    - `order`: z ≥ 0. `h`: step size [time].
     - `samples`: (qs, ps) at t0, shapes (S, *q.shape), or (qs, ps, ts) with times of shape (S,):
       points of the domain of interest; a quarter is held out. At least twice as many as
       functions in the basis.
     - `tolerance`: for *approximate* invariants: singular values up to that share of the largest
-      count as zero. What a method of order r keeps up to O(h^r), such as the energy, has
-      singular values and residuals that shrink as h^r.
-      None: only what is below 1e-11.
-    - `representative`: an invariant of order z is free by ε times any other. "least" takes the
-      corrections that are smallest on the samples (the convention of averaging: no part along
-      what order 0 keeps), unless the simplest ones are exact; "simplest" takes those of simple
-      functions, which tend to drift less and to read better.
+      count as zero. What a method of order r conserves up to O(h^r), such as the energy, has
+      singular values and residuals that shrink as h^r. None: only what is below 1e-11.
+    - `representative`: an invariant of order z is unique only up to ε times any other invariant.
+      "least" takes the corrections that are smallest on the samples (the convention of averaging:
+      no component along what order 0 conserves), unless the simplest ones are exact; "simplest"
+      takes those of simple functions, which tend to drift less and are easier to read.
+    - the keywords `t0`, `args`, `method`, `root_finder` (or `newton`), `integrator`: as for
+      `integrate`; only the map of one step is used.
 
     **Returns** a `Discovery`; print it for a report.
 
     **Raises** `ValueError` for too few samples, samples or basis functions that are not
     finite there, a step that fails there, a basis that is rank-deficient on them, a basis or a
-    map of time with samples of one time, a tolerance that is none, or h = 0; `TypeError` for
-    what is no system, basis, method or Newton, and for samples without x64.
+    map of time with samples of one time, a tolerance outside (0, 1), or h = 0; `TypeError` for
+    anything but a system, basis, method or root finder, and for samples without x64.
 
     **Accuracy** round-off of the singular values, times the conditioning of the basis; Taylor
     coefficients by nested forward autodiff, through implicit steps.
@@ -119,65 +110,48 @@ def discover_invariants(
     ```
     """
     check_system(system)
-    method, newton = map_of("discover_invariants", system, integrator, method, newton)
-    samples = as_samples(samples, t0)
-    order = _check_options(order, tolerance, representative)
+    one_step = map_of("discover_invariants", system, **how)
+    samples = as_samples(samples, one_step.t0)
+    order = whole("order", order, least=0)
+    if tolerance is not None:
+        tolerance = fraction("tolerance", tolerance)
+    one_of("representative", representative, ("least", "simplest"))
     bound, h = bind_basis(basis, samples.q.shape[1:]), check_step_size(h)
     require_enough(samples, bound.size)
     require_time(bound, samples)
     q, p, t = (jnp.asarray(x[0]) for x in samples)
-    system.check_shapes(t, q, p, jnp.zeros(()), args)
-    equations = Equations(system, jnp.zeros(()), args, newton)
+    system.check_shapes(t, q, p, jnp.zeros(()), one_step.args)
+    equations = Equations(system, jnp.zeros(()), one_step.args, one_step.root_finder)
     at = middle(samples, max(bound.complexity))
     inner, to_basis = bound.about(at)
-    stepped = Stepped(equations, np.asarray(h), method, inner)
+    stepped = Stepped(equations, np.asarray(h), one_step.method, inner)
     changes = checked_changes(stepped, order, samples)
-    found = _Search(stepped, changes, samples, order, tolerance)
-    # Null vectors are known up to a share of about 1 / gap.
-    fuzzy = min(_FUZZY / found.gap, _FUZZIEST) if tolerance is None else np.sqrt(tolerance)
-    chosen = found.chosen(max(RANK, fuzzy), representative)
-    if tolerance is None and chosen.refused and fuzzy > RANK:
-        chosen = min(found.chosen(RANK, representative), chosen, key=lambda x: x.refused)
+    found = Search(stepped, changes, samples, order, tolerance)
+    chosen = found.best(representative)
     coefficients, dependent, exact = chosen.coefficients, chosen.dependent, chosen.exact
     refused = found.spaces[-1].refused + chosen.refused
-    known = found.spaces[0].leading.shape[1] if order else len(coefficients) + len(dependent)
-    known += found.constant is not None
+    known = found.count if order else len(coefficients) + len(dependent)
     larger: tuple[Larger, ...] = ()
-    if tolerance is None and known > (found.constant is not None):
-
-        def at_step(step, at=samples):
-            other = stepped._replace(h=np.asarray(step))
-            changes = changes_at(other, 0, at)
-            if not changes.good.all():
-                return None
-            return _Search(other, changes, at, 0, None).spaces[0].leading.shape[1]
-
-        def moved(at):
-            here = changes if at is samples else changes_at(stepped, 0, at)
-            return here.moved[:, :-1]
-
-        def relative(step):
-            other = stepped._replace(h=np.asarray(step))
-            here = changes if step == h else changes_at(other, 0, samples)
-            return relative_step(samples, here.moved[:, :-1])
-
-        larger = at_larger_step(h, relative, at_step)
-        if order == 0:
-            larger += in_larger_box(samples, moved, lambda at: at_step(h, at))
+    if tolerance is None and known:
+        larger = _at_larger(stepped, changes, samples, order)
+    known += found.constant is not None
     judge = found.judge
     typical_residuals = np.stack([judge.quantiles(coefficients, x) for x in (0.5, 0.95)], axis=-1)
     powers = np.full(len(coefficients), np.nan)
     if order == 0 and tolerance is None:
         # Where fewer are conserved in a larger box, growth is not from errors of coefficients.
-        count = found.spaces[0].leading.shape[1]
-        doubted = any(x.kind == "box" and x.conserved < count for x in larger)
+        doubted = any(x.kind == "box" and x.conserved < found.count for x in larger)
         powers = powers_of_size(
-            stepped, coefficients, samples, typical_residuals[:, 0, 1],
-            found.judge_fitted.sizes(coefficients), found.orthonormal * (not doubted),
-        )  # fmt: skip
+            stepped,
+            coefficients,
+            samples,
+            typical_residuals[:, 0, 1],
+            found.judge_fitted.sizes(coefficients),
+            found.orthonormal * (not doubted),
+        )
     everything = len(coefficients) == 2 * samples.q[0].size and not bound.uses_time
     everything = everything and not system.slow_time and bool(np.any(changes.motion.changes))
-    # The orbits of a map that keeps that much are finite sets of points, or periods of functions.
+    # If so many are conserved each orbit is a finite set of points, or functions are periodic.
     impossible = everything and not (powers == 0).all()
     if impossible:
         refused, exact = refused + len(coefficients) + len(dependent), ()
@@ -208,11 +182,35 @@ def discover_invariants(
         sizes=found.sizes,
         condition=found.condition,
         scale=found.scale,
-        probe=Samples(*(x[:3] for x in samples)),
+        probe=samples.at(slice(3)),
         shape=samples.q.shape[1:],
         slow_time=system.slow_time,
         tolerance=tolerance,
     )
+
+
+def _at_larger(
+    stepped: Stepped, changes: Changes, samples: Samples, order: int
+) -> tuple[Larger, ...]:
+    """How many are conserved at a larger step and, at order 0, in a larger box."""
+    h = float(stepped.h)
+
+    def changes_of(step, at):
+        if step == h and at is samples:
+            return changes
+        return changes_at(stepped._replace(h=np.asarray(step)), 0, at)
+
+    def count(step, at=samples):
+        found = changes_at(stepped._replace(h=np.asarray(step)), 0, at)
+        return Search(stepped, found, at, 0, None).count if found.good.all() else None
+
+    def moved(at, step=h):
+        return changes_of(step, at).moved[:, :-1]
+
+    larger = at_larger_step(h, lambda step: relative_step(samples, moved(samples, step)), count)
+    if order == 0:
+        larger += in_larger_box(samples, moved, lambda at: count(h, at))
+    return larger
 
 
 class _Chosen(NamedTuple):
@@ -227,14 +225,14 @@ class _Chosen(NamedTuple):
     blur: float
 
 
-class _Search:
+class Search:
     """The null space of a search, in functions that are orthonormal on the fitted samples:
     singular values then measure functions, not their scaling."""
 
     def __init__(self, stepped: Stepped, changes: Changes, samples: Samples, order, tolerance):
         self.stepped, self.order, self.tolerance = stepped, order, tolerance
         basis, fit = stepped.basis, ~samples.held_out
-        self.basis, self.fitted = basis, Samples(*(x[fit] for x in samples))
+        self.basis, self.fitted = basis, samples.at(fit)
         self.rms, calm = typical_sizes(changes.values)
         self.fitted_values = changes.values[fit]
         self.values = calm[fit, None] * self.fitted_values
@@ -249,17 +247,15 @@ class _Search:
         terms = in_units_of(self.scale, terms)
         self.sizes = self.rms / self.scale ** np.arange(order + 1)[:, None]
         self.slopes = changes.slopes[fit, :, :-1]
-        constant = _shares_of_constant(self.rms, self.values, calm[fit], self.slopes)
-        self.constant = constant
+        self.constant = _shares_of_constant(self.rms, self.values, calm[fit], self.slopes)
         self.weights, self.rows = weights[fit], weights[fit, None, None] * terms[fit]
 
         def judge(leading, shifts):
             leading, unclear = conserved(leading, terms, self.motion, tolerance)
             return leading, shifts, unclear
 
-        trivial = None if constant is None else self.R @ constant
-        fitted = compress(self.rows)
-        self.spaces = series_spaces(fitted, judge, tolerance, 1.0, trivial=trivial)
+        trivial = None if self.constant is None else self.R @ self.constant
+        self.spaces = series_spaces(compress(self.rows), judge, tolerance, trivial)
         step = triangle(calm[fit, None] * terms[fit, 0]) / np.sqrt(len(self.values))
         self.typical = np.linalg.norm(step, 2) or 1.0
         in_units = changes._replace(terms=in_units_of(self.scale, changes.terms))
@@ -271,6 +267,11 @@ class _Search:
         self.fewest = Fewest(basis.complexity, self.rms, *of_fit)
 
     @property
+    def count(self) -> int:
+        """How many are conserved at order 0."""
+        return self.spaces[0].leading.shape[1]
+
+    @property
     def gap(self) -> float:
         return self.spaces[-1].gap
 
@@ -280,6 +281,17 @@ class _Search:
         leading = self.spaces[-1].leading[: self.basis.size]
         return (np.linalg.solve(self.R, leading) / self.rms[:, None]).T
 
+    def best(self, representative: str) -> _Chosen:
+        """The choice by which fewer series are rejected."""
+        # Null vectors are known up to a share of about 1 / gap.
+        fuzzy = min(_FUZZY / self.gap, _FUZZIEST)
+        if self.tolerance is not None:
+            return self.chosen(max(RANK, np.sqrt(self.tolerance)), representative)
+        chosen = self.chosen(max(RANK, fuzzy), representative)
+        if chosen.refused and fuzzy > RANK:
+            chosen = min(self.chosen(RANK, representative), chosen, key=lambda x: x.refused)
+        return chosen
+
     def chosen(self, blur: float, representative: str) -> _Chosen:
         """One series for each leading part, in functions of the basis; `blur`: see `Span`."""
         span = Span(self.basis, self.rms, self.R, self.spaces[-1], blur, self.constant)
@@ -288,8 +300,7 @@ class _Search:
         size = self.order + 1, self.basis.size
 
         def those(independent):
-            kept = [pick for pick, f in zip(picked, found.independent, strict=True)
-                    if f == independent]  # fmt: skip
+            kept = [x for x, f in zip(picked, found.independent, strict=True) if f == independent]
             series = [_normalised(c, self.rms) for c, _ in kept]
             return np.array(series).reshape(-1, *size), np.array([e for _, e in kept], bool)
 
@@ -308,10 +319,10 @@ class _Search:
         if self.order == 0:
             return self._of_order_0(series[0], span.blur)[None] / self.sizes, False
         simplest = cleaned(span.simplest(series)) / self.sizes
-        typical, scale = jnp.asarray(self.typical), jnp.asarray(self.scale)
-        given = jnp.asarray(simplest)
-        at = self._some()
-        exact = bool(is_exact(self.stepped.unnamed(), given, typical, scale, at))
+        given, *sizes = map(jnp.asarray, (simplest, self.typical, self.scale))
+        some = slice(None, None, max(1, len(self.fitted.q) // 100))
+        at = self.fitted.at(some)
+        exact = bool(is_exact(self.stepped.unnamed(), given, sizes, at))
         if exact or representative == "simplest":
             return simplest, exact
         return cleaned(span.least(series)) / self.sizes, exact
@@ -346,37 +357,8 @@ class _Search:
 
     def laws(self, volume: np.ndarray, slow_time: bool, blur: float):
         """The `DriftLaw` of each leading part that is lost."""
-        return drift_laws(
-            self.basis,
-            self.rms,
-            self.R,
-            self.rows,
-            self.fitted_values,
-            self.weights[:, None],
-            self.spaces,
-            np.max(np.abs(in_units_of(self.scale, volume)), axis=0),
-            self.scale,
-            slow_time,
-            blur,
-        )
-
-    def _some(self) -> Samples:
-        """At most about a hundred of the fitted samples."""
-        some = slice(None, None, max(1, len(self.fitted.q) // 100))
-        return Samples(*(x[some] for x in self.fitted))
-
-
-def _check_options(order: Any, tolerance: Any, representative: Any) -> int:
-    number = whole("order", order, least=0)
-    is_number = isinstance(tolerance, float | np.floating)
-    if tolerance is not None and not (is_number and 0 < tolerance < 1):
-        raise ValueError(
-            "tolerance must be None or a number between 0 and 1 (a share of the largest singular "
-            f"value), got {tolerance!r}."
-        )
-    if representative not in ("least", "simplest"):
-        raise ValueError(f"representative must be 'least' or 'simplest', got {representative!r}.")
-    return number
+        volume = np.max(np.abs(in_units_of(self.scale, volume)), axis=0)
+        return drift_laws(self, volume, slow_time, blur)
 
 
 def _shares_of_constant(rms, values, calm, slopes) -> np.ndarray | None:

@@ -8,19 +8,15 @@ from .changes import Changes
 from .motion import Motion, relative_changes
 from .nullspace import RANK, null_space, triangle
 
-CLEARLY = 1e-9
-"""Changes of an invariant, by the measure of `Motion`, for nearly all samples."""
-
+CLEARLY = 1e-9  # Changes of an invariant, by the measure of `Motion`, for nearly all samples
+# Two functions whose difference is this share of them are one, with and without errors.
 _SAME = 1e-3
-"""Two functions whose difference is this share of them are one, with and without errors."""
-
-_ROUND_OFF = 1e-13
-"""Shares below this of the largest are not there."""
+_ROUND_OFF = 1e-13  # Shares below this of the largest are not there
 
 
 class Judge(NamedTuple):
-    """Samples that judge: what functions change by there, in units of ε · `scale`, weights of the
-    samples, shape (S,), and `coefficient_errors` of functions of size one, shape (S,)."""
+    """Changes of the functions at some samples in units of ε · `scale`, their weights, (S,), and
+    `coefficient_errors` of functions of size one, (S,)."""
 
     changes: Changes
     calm: np.ndarray
@@ -69,9 +65,8 @@ class Judge(NamedTuple):
 
 
 class Fewest:
-    """Invariants of order 0 solved for again, to more digits, in the functions up to the lowest
-    complexity that hold them: of functions that one does not need the coefficients are errors only.
-    """
+    """Invariants of order 0 found again, to more digits, in the functions up to the lowest
+    complexity that represent them: coefficients of all others are only errors."""
 
     def __init__(self, complexity, rms, changes, motion, values):
         self.complexity, self.rms = np.array(complexity), rms
@@ -79,7 +74,7 @@ class Fewest:
         self.kept: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
 
     def up_to(self, level: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """What is kept by the functions up to a complexity: columns of coefficients, and values."""
+        """Invariants in the functions up to a complexity: columns of coefficients, and values."""
         some = self.complexity <= level
         R = triangle(self.values[:, some] / self.rms[some]) / np.sqrt(len(self.values))
         if len(R) < np.sum(some) or np.linalg.cond(R) > 1 / RANK**2:

@@ -7,36 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+# Relative error of a drift that is always assumed: no law is more accurate than this.
 _LEAST_SCATTER = 1e-3
-"""Relative error of a drift that is always assumed: no law is more accurate than this."""
-
-_DIP = 1e-3
-"""Smallest factor by which a difference of two powers is reduced where they are equal."""
-
-
-def _no_shape(u: np.ndarray, size: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
-    return np.zeros_like(u)
-
-
-def _sum(u: np.ndarray, size: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
-    """The factor (1 + e^{pu})^{k/p}, logarithm; p = k sharpness. Two powers, k apart."""
-    return _knee(u, size, size * sharpness)
-
-
-def _saturation(u: np.ndarray, size: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
-    return -_knee(u, size, sharpness)
-
-
-def _difference(u: np.ndarray, size: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
-    return np.log(np.abs(1 - _exp(size * u)) + _DIP)
-
-
-def _resonance(u: np.ndarray, size: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
-    return size / (1 + (sharpness * u) ** 2)
+_DIP = 1e-3  # Smallest factor by which a difference of two powers is reduced where they are equal
 
 
 def _knee(u: np.ndarray, k: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """0 for u → −∞, k u for u → ∞."""
+    """The factor (1 + e^{pu})^{k/p}, logarithm: 0 for u → −∞, k u for u → ∞."""
     return k / p * np.log1p(_exp(p * u))
 
 
@@ -64,10 +41,10 @@ class _Law(NamedTuple):
 
 
 _LAWS = (
-    _Law("power", _no_shape, 0.43),
+    _Law("power", lambda u, k, p: np.zeros_like(u), 0.43),
     _Law(
         "sum of two powers",
-        _sum,
+        lambda u, k, p: _knee(u, k, k * p),  # two powers, k apart
         0.29,
         sizes=((1, 0.35), (2, 0.2), (3, 0.1)),
         ranges=((0.4, 2, 0.23), (2, 4, 0.12)),
@@ -75,16 +52,21 @@ _LAWS = (
     ),
     _Law(
         "saturation",
-        _saturation,
+        lambda u, k, p: -_knee(u, k, p),
         0.17,
         sizes=((1, 0.2), (2, 0.15), (3, 0.1), (4, 0.1)),
         ranges=((0.3, 1.5, 0.25), (1.5, 4, 0.2)),
         sharpnesses=((1, 0.4), (2, 0.4), (4, 0.2)),
     ),
-    _Law("difference of two powers", _difference, 0.06, sizes=((1, 0.7), (2, 0.3))),
+    _Law(
+        "difference of two powers",
+        lambda u, k, p: np.log(np.abs(1 - _exp(k * u)) + _DIP),
+        0.06,
+        sizes=((1, 0.7), (2, 0.3)),
+    ),
     _Law(
         "resonance",
-        _resonance,
+        lambda u, k, p: k / (1 + (p * u) ** 2),
         0.05,
         ranges=((-4, -0.5, 0.4), (0.5, 2.5, 0.4), (2.5, 6, 0.2)),
         sharpnesses=((1, 0.3), (2, 0.4), (5, 0.3)),
@@ -103,16 +85,14 @@ def names() -> list[str]:
 
 _MARGIN = np.log(3.0)
 _BEYOND = np.log(1e4)
+# Cells of the centre x_c in three regions of ε, where ε_max is the largest one measured: up to 3
+# ε_max; from there to 10⁴ ε_max, where the correction is 10⁻⁴ for k = 1; up to ε_max.
 _COUNTS = np.array([40, 20, 40])
-"""Cells of the centre x_c in three regions of ε, where ε_max is the largest one measured: up to
-3 ε_max; from there to 10⁴ ε_max, where the correction is 10⁻⁴ for k = 1; up to ε_max."""
-_WITHIN = 0.6
-"""Probability that the centre is below 3 ε_max, for laws where it may be above ε_max."""
+_WITHIN = 0.6  # Probability that the centre is below 3 ε_max, for laws where it may be above ε_max
 _LEVELS = 7
-_REFINED = 100
-"""At each level this many cells, the most probable ones, are divided by four."""
+_REFINED = 100  # At each level this many cells, the most probable ones, are divided by four
+# A cell is left out if the logarithm of its probability is this much below the largest one.
 _NEGLIGIBLE = 12.0
-"""A cell is left out if the logarithm of its probability is this much below the largest one."""
 
 
 class _Cells(NamedTuple):
@@ -172,10 +152,8 @@ def fits_of_laws(x: np.ndarray, drifts: np.ndarray, floor: float) -> Fits:
     keep = weights > 1e-4 * weights.max()
     dx = x - x.mean()
     stderrs = np.sqrt(squares / (len(x) - 2) / (dx @ dx))
-    return Fits(
-        cells.laws[keep], cells.centres[keep], slopes[keep], stderrs[keep],
-        weights[keep] / weights[keep].sum(),
-    )  # fmt: skip
+    weights = weights[keep] / weights[keep].sum()
+    return Fits(cells.laws[keep], cells.centres[keep], slopes[keep], stderrs[keep], weights)
 
 
 def _floor_parts(share: float) -> list[tuple[float, float]]:
@@ -233,10 +211,9 @@ def _first_cells(x: np.ndarray) -> _Cells:
     starts = np.array([low, high + _MARGIN, low])
     widths = (np.array([high + _MARGIN, high + _BEYOND, high]) - starts) / _COUNTS
     regions = regions.astype(int)
-    return _Cells(
-        laws.astype(int), starts[regions] + (numbers + 0.5) * widths[regions],
-        np.where(laws > 0, widths[regions], 0.0), sizes, size_widths, sharpnesses, density,
-    )  # fmt: skip
+    centres = starts[regions] + (numbers + 0.5) * widths[regions]
+    widths = np.where(laws > 0, widths[regions], 0.0)
+    return _Cells(laws.astype(int), centres, widths, sizes, size_widths, sharpnesses, density)
 
 
 @functools.cache

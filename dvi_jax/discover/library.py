@@ -1,4 +1,4 @@
-"""Generators that everybody needs: shifts, rotations, scalings, boosts, Hamiltonian flows.
+"""Common generators: shifts, rotations, scalings, boosts, Hamiltonian flows.
 
 They add, subtract, and multiply with numbers: ``rotation(0, 1) + 2 * time_translation()``.
 """
@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._types import Args, Scalar, State
+from .. import _checks
+from .._types import State
 from .generators import Generator, LatticePoint
 
 
@@ -31,7 +32,7 @@ def space_translation(direction: Any) -> Generator:
     that does not fit q. **Source** Hydon 2014, *Difference Equations by Differential Equation
     Methods*.
     """
-    return Generator(xi=_Constant(_direction(direction)))
+    return Generator(xi=eqx.Partial(_constant, _direction(direction)))
 
 
 def rotation(i: int = 0, j: int = 1) -> Generator:
@@ -46,7 +47,7 @@ def rotation(i: int = 0, j: int = 1) -> Generator:
     axes = (i, j)
     if any(isinstance(a, bool) or not isinstance(a, int) or a < 0 for a in axes) or i == j:
         raise ValueError(f"a rotation needs two different axes i, j ≥ 0, got {i!r} and {j!r}.")
-    return Generator(xi=_Turned(1, i, j), eta=_Turned(2, i, j))
+    return Generator(xi=eqx.Partial(_turned, 1, i, j), eta=eqx.Partial(_turned, 2, i, j))
 
 
 def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
@@ -64,7 +65,7 @@ def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
     if not (a.any() or b.any() or c.any()):
         raise ValueError("a scaling needs a weight other than zero.")
     weights = enumerate((a, b, c))
-    return Generator(*(_Scaled(i, w) if w.any() else None for i, w in weights))
+    return Generator(*(eqx.Partial(_scaled, i, w) if w.any() else None for i, w in weights))
 
 
 def boost(direction: Any, mass: Any = 1.0) -> Generator:
@@ -81,7 +82,7 @@ def boost(direction: Any, mass: Any = 1.0) -> Generator:
     if not (masses > 0).all():
         raise ValueError(f"masses must be positive, got {mass!r}.")
     v = _direction(direction)
-    return Generator(xi=_Boosted(v, None), eta=_Boosted(v, masses))
+    return Generator(xi=eqx.Partial(_boosted, v, None), eta=eqx.Partial(_boosted, v, masses))
 
 
 def hamiltonian_flow(function: Callable[..., Any]) -> Generator:
@@ -92,9 +93,10 @@ def hamiltonian_flow(function: Callable[..., Any]) -> Generator:
 
     **Raises** `TypeError` for what is not callable. **Source** Olver 1993, Chapter 6.
     """
-    if not callable(function):
-        raise TypeError(f"K must be a function (t, q, p, args) → scalar, got {function!r}.")
-    return Generator(xi=_Slope(function, 2, 1.0), eta=_Slope(function, 1, -1.0))
+    _checks.function("K", function, "(t, q, p, args) → scalar")
+    return Generator(
+        xi=eqx.Partial(_slope, function, 2, 1.0), eta=eqx.Partial(_slope, function, 1, -1.0)
+    )
 
 
 def bracket(first: Generator, second: Generator) -> Generator:
@@ -102,88 +104,57 @@ def bracket(first: Generator, second: Generator) -> Generator:
 
         [X, Y]^c = X(Y^c) − Y(X^c)    for each component c of (ξ0, ξ, η)
 
-    **Raises** `TypeError` for what is no `Generator`. **Source** Olver 1993, Section 1.3.
+    **Raises** `TypeError` for anything but a `Generator`. **Source** Olver 1993, Section 1.3.
     """
-    for generator in (first, second):
-        if not isinstance(generator, Generator):
-            raise TypeError(f"a bracket is of two Generators, got {generator!r}.")
-    return Generator(*(_Bracket(first, second, place) for place in range(3)))
+    for name, generator in (("first", first), ("second", second)):
+        _checks.instance(name, generator, Generator, "a Generator")
+    return Generator(*(eqx.Partial(_bracket, first, second, place) for place in range(3)))
 
 
 def _one(t, q, p, args):
     return 1.0
 
 
-class _Constant(eqx.Module):
-    value: np.ndarray
-
-    def __call__(self, t, q, p, args):
-        return _fitted("direction", self.value, q)
+def _constant(value, t, q, p, args):
+    return _fitted("direction", value, q)
 
 
-class _Turned(eqx.Module):
+def _turned(place, i, j, t, q, p, args):
     """The vector at `place` of (t, q, p), turned by a right angle in the plane of two axes."""
-
-    place: int = eqx.field(static=True)
-    i: int = eqx.field(static=True)
-    j: int = eqx.field(static=True)
-
-    def __call__(self, t, q, p, args):
-        v = (t, q, p)[self.place]
-        if v.ndim == 0 or v.shape[-1] <= max(self.i, self.j):
-            raise ValueError(
-                f"rotation({self.i}, {self.j}) needs q whose last axis has at least "
-                f"{max(self.i, self.j) + 1} components; q has shape {q.shape}."
-            )
-        turned = jnp.zeros_like(v).at[..., self.i].set(-v[..., self.j])
-        return turned.at[..., self.j].set(v[..., self.i])
+    v = (t, q, p)[place]
+    if v.ndim == 0 or v.shape[-1] <= max(i, j):
+        raise ValueError(
+            f"rotation({i}, {j}) needs q whose last axis has at least {max(i, j) + 1} components; "
+            f"q has shape {q.shape}."
+        )
+    return jnp.zeros_like(v).at[..., i].set(-v[..., j]).at[..., j].set(v[..., i])
 
 
-class _Scaled(eqx.Module):
-    place: int = eqx.field(static=True)
-    weight: np.ndarray
-
-    def __call__(self, t, q, p, args):
-        value = (t, q, p)[self.place]
-        return value * _fitted("weight", self.weight, value)
+def _scaled(place, weight, t, q, p, args):
+    value = (t, q, p)[place]
+    return value * _fitted("weight", weight, value)
 
 
-class _Boosted(eqx.Module):
-    direction: np.ndarray
-    mass: np.ndarray | None
-
-    def __call__(self, t, q, p, args):
-        v = _fitted("direction", self.direction, q)
-        if self.mass is None:
-            return t * v
-        mass = self.mass
-        if mass.ndim == 1 and q.ndim == 2 and len(mass) == len(q):
-            mass = mass[:, None]  # one for each body
-        return _fitted("mass", mass, q) * v
+def _boosted(direction, mass, t, q, p, args):
+    v = _fitted("direction", direction, q)
+    if mass is None:
+        return t * v
+    if mass.ndim == 1 and q.ndim == 2 and len(mass) == len(q):
+        mass = mass[:, None]  # one for each body
+    return _fitted("mass", mass, q) * v
 
 
-class _Slope(eqx.Module):
-    function: Callable[..., Any]
-    argnum: int = eqx.field(static=True)
-    sign: float = eqx.field(static=True)
-
-    def __call__(self, t, q, p, args):
-        return self.sign * jax.grad(self.function, argnums=self.argnum)(t, q, p, args)
+def _slope(function, argnum, sign, t, q, p, args):
+    return sign * jax.grad(function, argnums=argnum)(t, q, p, args)
 
 
-class _Bracket(eqx.Module):
-    first: Generator
-    second: Generator
-    place: int = eqx.field(static=True)
+def _bracket(first, second, place, t, q, p, args):
+    point = LatticePoint(t, q, p)
 
-    def __call__(self, t: Scalar, q: State, p: State, args: Args) -> Array:
-        point = LatticePoint(t, q, p)
+    def derivative(along, of):
+        return jax.jvp(lambda at: of(at, args)[place], (point,), (along(point, args),))[1]
 
-        def derivative(along, of):
-            component = lambda at: of(at, args)[self.place]  # noqa: E731
-            return jax.jvp(component, (point,), (along(point, args),))[1]
-
-        return derivative(self.first, self.second) - derivative(self.second, self.first)
+    return derivative(first, second) - derivative(second, first)
 
 
 def _finite(name: str, value: Any) -> np.ndarray:

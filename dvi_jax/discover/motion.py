@@ -4,32 +4,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .null_series import series_changes
-from .nullspace import HELD_OUT, NULL, singular_vectors, triangle
+from .nullspace import HELD_OUT, NULL, series_changes, singular_vectors, triangle
 
+# A null vector that changes by less than this share of what its slopes predict, but by more than
+# rounding, may be an invariant or not.
 UNCLEAR = 1e-6
-"""A null vector that changes by less than this share of what its slopes predict, but by more than
-rounding, may be an invariant or not."""
-
-ROUNDING = 1e-12
-"""Rows are weighted so that their rounding is below this; `NULL` stands above it."""
-
-_RESOLVED = 1e-3
-"""Rounding may be this share of a change that can be told from none."""
-
-_COEFFICIENTS = 1e-15
-"""Errors of the coefficients of a null vector, relative to its length."""
-
+ROUNDING = 1e-12  # Rows are weighted so that their rounding is below this; `NULL` is above it
+_RESOLVED = 1e-3  # Rounding may be this share of a change that counts as not zero
+_COEFFICIENTS = 1e-15  # Errors of the coefficients of a null vector, relative to its length
+# Samples at which functions are so many times larger than at three quarters of them count less.
 _RARE = 100.0
-"""Samples at which functions are so many times larger than at three quarters of them count less."""
 
 
 def typical_sizes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How large functions are on samples, root mean square, shape (size,), and weights of the
-    samples, shape (S,): 1, and less where functions are larger than at nearly all others.
-
-    `values`: shape (S, size).
-    """
+    """Root mean squares of functions on samples, shape (size,), and weights of the samples, (S,):
+    1, and less where functions are larger than at nearly all others. `values`: (S, size)."""
     units = np.median(np.abs(values), axis=0)
     units = np.where(units > 0, units, np.max(np.abs(values), axis=0))
     units = np.where(units > 0, units, 1.0)
@@ -71,7 +60,7 @@ class Motion(NamedTuple):
 
     def weights(self) -> np.ndarray:
         """For rows of changes, shape (S,): what functions typically change by becomes 1, where
-        that stands far enough above rounding, so that no sample with a large step decides alone."""
+        that is far enough above rounding, so that no sample with a large step decides alone."""
         typical = np.sqrt(np.sum(self.changes**2, axis=(1, 2)))
         rounding = np.sqrt(np.sum(self.rounding**2, axis=1))
         return 1 / np.maximum(np.maximum(typical, rounding / ROUNDING), np.finfo(float).tiny)
@@ -178,8 +167,7 @@ def conserved(
     what its own slopes predict, sample by sample; and how many are unclear.
 
     - `leading`: series as columns, shape ((m + 1) · size, count), leading parts orthonormal.
-    - `terms`: A_0 … A_z at all samples, without weights, shape (S, z + 1, size), or for fields
-      (S, z + 1, rows, size); `motion`: what the functions change by there.
+    - `terms`: A_0 … A_z at all samples, shape (S, z + 1, size), for fields (S, z + 1, rows, size).
     """
     count, size = leading.shape[1], terms.shape[-1]
     if count == 0:
@@ -208,11 +196,8 @@ def relative_changes(
     spread: float,
     digits: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """What one series changes by at each order, by the measure of `conserved`: shape (S, z + 1).
-
-    `terms`: (S, z + 1, size), or for fields (S, z + 1, rows, size); `series`: (z + 1, size);
-    `spread`: of its leading part; `digits`: errors of its coefficients, see `coefficient_errors`.
-    """
+    """The change of one series, shape (z + 1, size), at each order, by the measure of `conserved`:
+    shape (S, z + 1). `spread`: of its leading part; `digits`: see `coefficient_errors`."""
     own = motion.of(series[:1].T)
     own = own._replace(rounding=own.rounding + np.reshape(digits, (-1, 1))).at_most(spread)
     changes = series_changes(terms, series.reshape(-1, 1))[..., 0]

@@ -11,8 +11,7 @@ from .._system import System
 from .._types import Args, Scalar
 from .generators import Generator, LatticePoint, prolong
 
-Gauge = Callable[..., Any]
-"""``G(t, q, p, args)`` → scalar [action] at a lattice point."""
+Gauge = Callable[..., Any]  # ``G(t, q, p, args)`` → scalar [action] at a lattice point
 
 
 def lattice_defect(
@@ -25,10 +24,10 @@ def lattice_defect(
 
         r = (E⁺_k − E⁻_k − εW_k·(q_{k+1} − q_k)) / h_k
 
-    Zero when the lattice obeys (14); on a fixed mesh it is what energy is not conserved by.
-    `points`: three (t, q, p) in the order of time.
+    Zero when the lattice obeys (14); on a fixed mesh the energy changes by it. `points`: three
+    (t, q, p) in the order of time.
 
-    **Source** the paper's (11) and (14) with the signs mended: (14) prints −H_{D,k−1} and
+    **Source** the paper's (11) and (14) with corrected signs: (14) prints −H_{D,k−1} and
     differentiates it in t_{k−1}; stationarity in t_k gives the form above.
     """
     (t_, q_, _), (t0, q0, p0), (t1, q1, p1) = points
@@ -53,7 +52,7 @@ def noether_identity(
         N_m = pr X_m(S)/h + W·(ξ_{m−1} − Dq ξ0_{m−1}) + D G_m,    S = p1·(q1 − q0) − h H_D
 
     with D f = (f_{k+1} − f_k)/h and no W term for m = 0. It has to vanish on the solutions of the
-    *disturbed* map for `AdiabaticInvariant` to be one.
+    *perturbed* map for `AdiabaticInvariant` to be invariant.
 
     **Arguments** `generators`, `gauges`: the series, order 0 first (a gauge None is zero);
     `order`: m; `first`, `second`: the points (t0, q0, p0) and (t1, q1, p1).
@@ -94,11 +93,11 @@ class AdiabaticInvariant(eqx.Module):
     - `generators`, `gauges`: one for each order, order 0 first; z is their number less one. A
       gauge G is a function ``(t, q, p, args)`` → scalar [action], or None for zero.
 
-    Whether it *is* invariant to that order is for `noether_identity` to say.
+    `noether_identity` shows whether it *is* invariant to that order.
 
-    **Raises** `ValueError` when there are not as many generators as gauges, or none.
+    **Raises** `ValueError` for different numbers of generators and gauges, or none.
 
-    **Source** the paper, (26) (with its η·p mended to ξ·p) and (29).
+    **Source** the paper, (26) (with its η·p corrected to ξ·p) and (29).
 
     **Example**
 
@@ -131,7 +130,7 @@ class AdiabaticInvariant(eqx.Module):
         return len(self.gauges) - 1
 
     def bind(self, system: System, epsilon: Any) -> "AdiabaticInvariant":
-        """The same invariant for this system and strength of the disturbance."""
+        """The same invariant for this system and strength of the perturbation."""
         return AdiabaticInvariant(self.generators, self.gauges, system, epsilon)
 
     def __call__(self, t0, t1, q0, p0, q1, p1, args):

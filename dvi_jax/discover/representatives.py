@@ -1,4 +1,4 @@
-"""Which series stands for an invariant: independent leading parts, and their corrections."""
+"""The series that represents an invariant: independent leading parts and their corrections."""
 
 from typing import NamedTuple
 
@@ -6,8 +6,7 @@ import numpy as np
 
 from .basis import BoundBasis
 from .echelon import reduced, reduction
-from .null_series import SeriesSpace
-from .nullspace import orthonormal_range, singular_vectors
+from .nullspace import SeriesSpace, orthonormal_range, singular_vectors
 from .sampling import Samples, spread
 
 
@@ -98,7 +97,7 @@ class Span:
         return simplify(series.reshape(-1)).reshape(series.shape)
 
     def least(self, series: np.ndarray) -> np.ndarray:
-        """The corrections that are smallest on the samples: none along what is kept anyway."""
+        """The corrections that are smallest on the samples: orthogonal to what may be added."""
         columns = (self.R @ series[..., None])[..., 0].reshape(-1)
         basis = orthonormal_range(self.space.shifts)
         columns = columns - basis @ (basis.T @ columns)

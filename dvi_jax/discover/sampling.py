@@ -1,5 +1,6 @@
 """Sampled points, at which symmetries and invariants are tested."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,6 +29,10 @@ class Samples(NamedTuple):
     p: np.ndarray
     t: np.ndarray
 
+    def at(self, some: Any) -> "Samples":
+        """Some of the samples."""
+        return Samples(*(x[some] for x in self))
+
     @property
     def held_out(self) -> np.ndarray:
         """Which points are not fitted but judge the fit: a quarter, at random, always the same."""
@@ -36,24 +41,20 @@ class Samples(NamedTuple):
         return held
 
 
+# Shifts of time, in steps, at which a map that does not depend on it is the same.
 _LATER = (37.3, 1000.7)
-"""Shifts of time, in steps, at which a map that does not depend on it is the same."""
-
-UNSEEN = 1e-11
-"""A relative step below this is not known to three digits, because of rounding."""
-
+UNSEEN = 1e-11  # A relative step below this is not known to three digits, because of rounding
+# A step that moves the samples by less than this share of their spread is small, and so are
+# samples on which a map differs from a linear one by less than this share of how much it varies:
+# what changes by less than rounding may be conserved, or an expansion in the step or about the
+# samples.
 SMALL = 1e-2
-"""A step that moves the samples by less than this share of their spread is small, and so are
-samples on which a map differs from a linear one by less than this share of how much it varies: what
-changes by less than rounding may be conserved, or an expansion in the step or about the samples."""
-
+# A sample that is farther from the median than this many typical distances does not count in the
+# spread of the others.
 _FAR = 100.0
-"""A sample that is farther from the median than this many typical distances does not tell how wide
-the others spread."""
-
+# Polynomials are taken about the middle of the samples where they would lose so much by rounding
+# about the origin.
 _LOST = 1e5
-"""Polynomials are taken about the middle of the samples where they would lose so much by rounding
-about the origin."""
 
 
 def spread(values: np.ndarray) -> float:
@@ -67,21 +68,21 @@ def spread(values: np.ndarray) -> float:
     return size if size > 0 else 1.0
 
 
-def relative_step(samples: Samples, moved: np.ndarray) -> float:
-    """How far a step moves the samples, as a share of how much they spread; the median.
+def spreads(samples: Samples) -> np.ndarray:
+    """The spread of q and of p, for each component of (q, p): shape (2n,)."""
+    return np.repeat([spread(samples.q), spread(samples.p)], samples.q[0].size)
 
-    `moved`: z1 − z of (q, p), shape (S, 2n).
-    """
-    n = moved.shape[1] // 2
-    sizes = np.repeat([spread(samples.q), spread(samples.p)], n)
-    return float(np.median(np.max(np.abs(moved) / sizes, axis=1)))
+
+def relative_step(samples: Samples, moved: np.ndarray) -> float:
+    """Median distance by which a step moves the samples, as a share of their spread; `moved`:
+    z1 − z of (q, p), shape (S, 2n)."""
+    return float(np.median(np.max(np.abs(moved) / spreads(samples), axis=1)))
 
 
 def nonlinearity(samples: Samples, moved: np.ndarray) -> float:
-    """How far a map is from a linear one on the samples, as a share of how much it varies; the
-    median. `moved`: as for `relative_step`."""
-    n = moved.shape[1] // 2
-    sizes = np.repeat([spread(samples.q), spread(samples.p)], n)
+    """Median distance of a map from a linear one, as a share of how much it varies on the samples;
+    `moved`: as for `relative_step`."""
+    sizes = spreads(samples)
     z = np.concatenate([x.reshape(len(x), -1) for x in samples[:2]], axis=1)
     z = np.column_stack([(z - np.median(z, axis=0)) / sizes, np.ones(len(z))])
     moved = moved / sizes
@@ -102,11 +103,8 @@ def rounding(samples: Samples) -> float:
 
 
 def middle(samples: Samples, degree: int) -> np.ndarray:
-    """Where polynomials of a degree are taken about: m of z = (q, p, t), shape (2n + 1,).
-
-    m_i = 0 where the origin is as good; else the median of z_i, rounded to about as much as the
-    samples spread.
-    """
+    """The centre m of polynomials of a degree, of z = (q, p, t), shape (2n + 1,): m_i = 0 where the
+    origin is as good, else the median of z_i, rounded to about as much as the samples spread."""
     z = [x.reshape(len(samples.q), -1) for x in (samples.q, samples.p, samples.t)]
     z = np.concatenate(z, axis=1)
     out = np.zeros(z.shape[1])
@@ -120,12 +118,12 @@ def middle(samples: Samples, degree: int) -> np.ndarray:
 
 
 def as_samples(samples: Any, t0: float = 0.0) -> Samples:
-    """(qs, ps) at the time t0, or (qs, ps, ts), after refusing what cannot be sampled points."""
+    """(qs, ps) at the time t0, or (qs, ps, ts), after rejecting what cannot be sampled points."""
     if not x64_enabled():
         raise TypeError(
-            "this process computes in float32, and what is conserved can be told in double "
-            'precision only, whatever the type of the samples: put\n    jax.config.update("'
-            'jax_enable_x64", True)\nbefore the first array is made.'
+            "this process computes in float32, and a search needs double precision, whatever the "
+            'type of the samples: put\n    jax.config.update("jax_enable_x64", True)\nbefore the '
+            "first array is made."
         )
     if isinstance(samples, Samples):
         return samples
@@ -151,34 +149,51 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
     return Samples(q, p, t)
 
 
+class Map(NamedTuple):
+    """The map of one step that a search examines."""
+
+    t0: Any
+    args: Args
+    method: Method
+    root_finder: RootSolver
+
+
+@both_names
 def map_of(
     function: str,
     system: System,
-    integrator: Integrator | None,
-    method: Method | None,
-    newton: RootSolver | None,
-) -> tuple[Method, RootSolver]:
-    """The method and the root finder of the map that a search examines: by default Newton's
-    iteration, through which Taylor coefficients in ε are exact."""
+    t0: Any = 0.0,
+    args: Args = None,
+    method: Method | None = None,
+    newton: RootSolver | None = None,
+    integrator: Integrator | None = None,
+    used: tuple[str, ...] = ("method", "root_finder"),
+) -> Map:
+    """The map from the keywords of a search; other keywords are a `TypeError`.
+
+    By default by Newton's iteration, through which Taylor coefficients in ε are exact.
+    """
     if integrator is None and newton is None:
         newton = Newton()
-    found = chosen(integrator, method=method, root_finder=newton)
-    only(found, function, "method", "root_finder")
-    return found.method_for(system), found.root_finder
+    found = only(chosen(integrator, method=method, root_finder=newton), function, *used)
+    return Map(t0, args, found.method_for(system), found.root_finder)
 
 
-def root_finder_of(
-    function: str, integrator: Integrator | None, newton: RootSolver | None
-) -> RootSolver:
+@both_names
+def type_2_map_of(
+    function: str,
+    system: System,
+    t0: Any = 0.0,
+    args: Args = None,
+    newton: RootSolver | None = None,
+    integrator: Integrator | None = None,
+) -> Map:
     """The same where the map is the paper's, of `TypeII()`."""
-    if integrator is None and newton is None:
-        newton = Newton()
-    found = chosen(integrator, root_finder=newton)
-    return only(found, function, "root_finder").root_finder
+    return map_of(function, system, t0, args, None, newton, integrator, used=("root_finder",))
 
 
 def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None:
-    """Refuse fewer samples than determine `unknowns`, with `conditions` from each one."""
+    """Reject fewer samples than determine `unknowns`, with `conditions` from each one."""
     needed = int(np.ceil(2 * unknowns / conditions))
     if len(samples.q) < needed:
         raise ValueError(
@@ -188,7 +203,7 @@ def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None
 
 
 def require_time(basis: BoundBasis, samples: Samples) -> None:
-    """Refuse a basis with functions of time when all samples are of one time."""
+    """Reject a basis with functions of time when all samples are of one time."""
     if basis.uses_time and np.ptp(samples.t) == 0:
         raise ValueError(
             "the basis has functions of time, and all samples are of one time: give samples=(qs, "
@@ -197,7 +212,7 @@ def require_time(basis: BoundBasis, samples: Samples) -> None:
 
 
 def require_steps(good: Any, samples: Samples) -> None:
-    """Refuse samples at which the map's step failed."""
+    """Reject samples at which the map's step failed."""
     good = np.asarray(good)
     if not good.all():
         i = int(np.argmin(good))
@@ -208,19 +223,30 @@ def require_steps(good: Any, samples: Samples) -> None:
         )
 
 
-def check_finite(basis: BoundBasis, values: np.ndarray) -> None:
-    """Refuse functions that are not finite on the samples; `values`: (S, size)."""
+def require_finite(
+    values: np.ndarray,
+    what: Callable[..., str],
+    hint: str = "keep the samples off its singularity",
+) -> None:
+    """Reject values, shape (S, …), that are not finite; `what`: their name from the indices that
+    follow the sample."""
     bad = ~np.isfinite(values)
     if bad.any():
-        i, j = np.argwhere(bad)[0]
+        i, *index = np.argwhere(bad)[0]
+        count = int(bad.reshape(len(bad), -1).any(axis=1).sum())
         raise ValueError(
-            f"the basis function {basis.names[j]!r} is not finite at {int(bad[:, j].sum())} of "
-            f"{len(values)} samples (first: number {i}): keep the samples off its singularity."
+            f"{what(*index)} is not finite at {count} of {len(bad)} samples (first: number {i}): "
+            f"{hint}."
         )
 
 
+def check_finite(basis: BoundBasis, values: np.ndarray) -> None:
+    """Reject functions that are not finite on the samples; `values`: (S, size)."""
+    require_finite(values, lambda j: f"the basis function {basis.names[j]!r}")
+
+
 def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
-    """Refuse functions that are not finite on the samples, or dependent; `values`: (S, size).
+    """Reject functions that are not finite on the samples, or dependent; `values`: (S, size).
 
     Returns the condition number of the functions, each scaled to one size.
     """
@@ -246,32 +272,24 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
     return float(singular[0] / singular[-1])
 
 
-@both_names
 def solution_pairs(
-    system: System,
-    *,
-    h: float,
-    samples: Any,
-    epsilon: Any = 0.0,
-    t0: float = 0.0,
-    args: Args = None,
-    newton: RootSolver | None = None,
-    integrator: Integrator | None = None,
+    system: System, *, h: float, samples: Any, epsilon: Any = 0.0, **how: Any
 ) -> tuple[LatticePoint, LatticePoint]:
     r"""Pairs of lattice points on solutions: each sample, and where one step of the map takes it.
 
     For `determining_residual` under ``vmap``: it vanishes on them for a symmetry.
 
     **Arguments** `samples`: (qs, ps) at t0, shapes (S, *q.shape), or (qs, ps, ts) with their
-    times, shape (S,); `h`: step size [time]; `epsilon`, `args`, `newton`: as for `integrate`.
+    times, shape (S,); `h`: step size [time]; `epsilon`, and the keywords `t0`, `args`,
+    `root_finder` (or `newton`), `integrator`: as for `integrate`.
 
     **Returns** two points with a leading axis of length S. **Raises** `ValueError` for samples
     of unequal shapes or not finite, h = 0, or a step that fails on them.
     """
-    samples, h = as_samples(samples, t0), check_step_size(h)
     check_system(system)
-    newton = root_finder_of("solution_pairs", integrator, newton)
-    equations = Equations(system, jnp.asarray(epsilon, float), args, newton)
+    one_step = type_2_map_of("solution_pairs", system, **how)
+    samples, h = as_samples(samples, one_step.t0), check_step_size(h)
+    equations = Equations(system, jnp.asarray(epsilon, float), one_step.args, one_step.root_finder)
     first, second, good = _stepped(equations, jnp.asarray(h), samples)
     require_steps(good, samples)
     return first, second
@@ -292,7 +310,7 @@ def random_pairs(
 ) -> tuple[LatticePoint, LatticePoint]:
     """Pairs of lattice points off the solutions: each sample, and another one at random.
 
-    For `conformal_factor`, whose Λ is asked of all points. The second point is at t + h.
+    For `conformal_factor`, whose Λ holds at all points. The second point is at t + h.
 
     **Arguments** `samples`: as for `solution_pairs`, at least two; `seed`: of the random order.
 

@@ -1,5 +1,6 @@
 """A series in ε of combinations of basis functions: what discovery returns, as an observable."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -11,9 +12,8 @@ from jaxtyping import Array, Float
 from .._system import System
 from .._types import Scalar, State
 from .basis import BoundBasis
+from .families import raised
 from .generators import Generator
-
-_POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class InvariantSeries(eqx.Module):
@@ -21,10 +21,10 @@ class InvariantSeries(eqx.Module):
 
     - `coefficients`: c, shape (order + 1, basis size). `basis`: φ.
     - `slow_time`: whether φ is a function of the slow time τ = εt in place of t.
-    - `sizes`: shape of `coefficients`: what a coefficient of 1 amounts to where the series was
-      found, by which terms of a formula are left out; None counts all alike.
+    - `sizes`: shape of `coefficients`: size of a term with coefficient 1 on the samples of the
+      search, by which terms of a formula are left out; None: all have the same size.
 
-    Give it to `integrate` as it is; there it is bound to the run's ε. As a formula: `str`.
+    Give it to `integrate` as it is: the run binds it to its ε. As a formula: `str`.
     """
 
     basis: BoundBasis
@@ -61,9 +61,9 @@ class InvariantSeries(eqx.Module):
     def generators(self) -> list[Generator]:
         r"""The symplectic gradient, one generator for each order: ξ_m = ∂I_m/∂p, η_m = −∂I_m/∂q.
 
-        Noether's theorem walked backwards. Where the map is symplectic (no force but a
-        gradient), the series of an invariant satisfies the determining equations (24) on the
-        solutions, to the order of the invariant: see `determining_residual`. Not to be had for
+        The converse of Noether's theorem. Where the map is symplectic (no force but a gradient),
+        the series of an invariant satisfies the determining equations (24) on the solutions, to
+        the order of the invariant: see `determining_residual`. **Raises** `ValueError` for
         functions of the slow time.
         """
         if self.slow_time and self.basis.uses_time:
@@ -78,17 +78,22 @@ class InvariantSeries(eqx.Module):
     def formula(self, terms: int | None = None, drop: float = 1e-9, digits: int = 6) -> str:
         """The series as text: at each order at most so many terms, all above a share `drop`.
 
-        How many are left out is said, unless they are round-off.
+        The number of terms left out is printed, unless they are round-off.
         """
         c = np.asarray(self.coefficients)
         shares = np.abs(c if self.sizes is None else c * np.asarray(self.sizes))
-        text = shortened(self.basis, c[0], shares[0], terms, drop, digits)
-        for m in range(1, len(c)):
-            if np.max(shares[m]) > 1e-9 * np.max(shares):
-                power = "ε" if m == 1 else f"ε{m}".translate(_POWERS)
-                part = shortened(self.basis, c[m], shares[m], terms, drop, digits)
-                text += f" + {power} ({part})"
-        return text
+        return in_powers_of_epsilon(
+            shortened(self.basis, block, share, terms, drop, digits)
+            if m == 0 or np.max(share) > 1e-9 * np.max(shares)
+            else ""
+            for m, (block, share) in enumerate(zip(c, shares, strict=True))
+        )
+
+
+def in_powers_of_epsilon(texts: Iterable[str]) -> str:
+    """c_0 + ε (c_1) + … from the texts of the orders; empty ones are left out."""
+    parts = [f"{raised('ε', m)} ({text})" if m else text for m, text in enumerate(texts) if text]
+    return " + ".join(parts) or "0"
 
 
 def shortened(

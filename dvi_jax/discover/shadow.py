@@ -1,4 +1,4 @@
-"""The shadow Hamiltonian: what the map keeps in place of the energy."""
+"""The shadow Hamiltonian, which the map conserves in place of the energy."""
 
 from collections.abc import Callable
 from typing import Any
@@ -25,15 +25,15 @@ class ShadowHamiltonian(eqx.Module):
 
         H̃(t, q, p; h) = H̃_0 + h H̃_1 + … + h^r H̃_r,    r = order
 
-    is the Hamiltonian whose flow over h *is*, as a power series in h, the undisturbed map of
+    is the Hamiltonian whose flow over h *is*, as a power series in h, the unperturbed map of
     `TypeII`. Hence H̃_0 = H_D(t, t, q, p) and H̃_1 = ∂H_D/∂t1 − (∂H̃_0/∂t + ∂H̃_0/∂q·∂H̃_0/∂p)/2.
-    For an H_D that depends on time at most through t1 − t0 it is kept to O(h^{order+1}), for very
-    long times, where energy swings by O(h); where H_D depends on time H̃ changes as an energy
-    does. The full series diverges in general.
+    For an H_D that depends on time at most through t1 − t0 it is conserved to O(h^{order+1}), for
+    very long times, where the energy oscillates with amplitude O(h); where H_D depends on time H̃
+    changes as an energy does. The full series diverges in general.
 
-    It is an observable: give it to `integrate` as it is, alone or in a reduction. There it is
-    bound to the system and ε of the run, and taken at the end of each step. Elsewhere call
-    `evaluate` or `terms`.
+    It is an observable: give it to `integrate` as it is, alone or in a reduction. The run binds it
+    to its system and ε, and evaluates it at the end of each step. Elsewhere call `evaluate` or
+    `terms`.
 
     **Arguments**
 
@@ -46,17 +46,17 @@ class ShadowHamiltonian(eqx.Module):
     **What it does not cover**
 
     - A force W has no Hamiltonian and is left out: H̃ then drifts by the work of W. If W = −∂V/∂q0
-      with V(t0, t1, q0), the disturbed map is the one of H_D + εV, so give
+      with V(t0, t1, q0), the perturbed map is that of H_D + εV, so give
       ``ShadowHamiltonian(order, System(H_D, perturbation=V))``.
     - `Adjoint`, `Strang`, all compositions and `RungeKutta4` are other maps, with other
-      modified Hamiltonians or none. An observable is not told the method: it is for you to use
-      this one with `TypeII` only.
-    - On a lattice whose steps differ each step has an H̃ of its own, and none of them is kept.
+      modified Hamiltonians or none. An observable does not know the method: use this one with
+      `TypeII` only.
+    - On a lattice with unequal steps each step has its own H̃, and none of them is conserved.
     - H_D has to be smooth, in t1 also at t1 = t0 (a division by t1 − t0 gives NaN).
 
     **Raises** `ValueError` for an order that is not an integer of at least 0, a step size that is
     zero or not finite, q and p of different shapes, or when no system is known; `TypeError`
-    for a system that is none, or float64 in a process that computes in float32.
+    for anything but a `System`, or float64 in a process that computes in float32.
 
     **Accuracy** round-off, which grows with the term: relative 1e-13 for H̃_3, 1e-10 for H̃_6.
     Nested forward mode: the time to compile about doubles with each order (at order 4 a second or
@@ -98,7 +98,7 @@ class ShadowHamiltonian(eqx.Module):
             )
 
     def bind(self, system: System, epsilon: Any) -> "ShadowHamiltonian":
-        """The same for this system and ε; a system or ε given at the start stays."""
+        """The same for this system and ε; a system or ε given before stays."""
         return ShadowHamiltonian(
             self.order,
             system if self.system is None else self.system,

@@ -4,33 +4,17 @@ from collections.abc import Iterator
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array
 
 from .basis import BoundBasis
-from .expansions import Larger
+from .expansions import Larger, grown
 from .gauge import BasisGauge
 from .generators import Generator
 from .noether import AdiabaticInvariant
-from .null_series import in_units_of
-from .nullspace import CLEAR
+from .nullspace import CLEAR, in_units_of
+from .series import in_powers_of_epsilon
 
-_COARSE = 1e-5
-"""A search that cannot see terms of this relative size says so."""
-
-_RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-class BasisComponent(eqx.Module):
-    """A component of a generator, c·φ(q, p, t): function ``(t, q, p, args)`` → array.
-
-    - `coefficients`: c, shape (basis size,) for ξ0, (*q.shape, basis size) for ξ and η.
-    """
-
-    basis: BoundBasis
-    coefficients: Array
-
-    def __call__(self, t, q, p, args):
-        return self.coefficients @ self.basis(q, p, t)
+_COARSE = 1e-5  # A search that cannot see terms of this relative size says so
+_ROUND_OFF = 1e-9  # Terms of a formula below this share of the largest are left out
 
 
 class Symmetry(eqx.Module):
@@ -38,7 +22,7 @@ class Symmetry(eqx.Module):
 
     - `generators`: X_m, one for each order: for `prolong`, `determining_residual`, …
     - `is_variational`: whether Noether's identity closes with a gauge; else it is a conformal
-      symmetry only, as far as the gauge basis can tell.
+      symmetry only, within this gauge basis.
     - `gauges`: G_m, one for each order; None where it is not variational.
     - `residuals`: shape (z + 1,): the largest residual of the determining equations at each order
       in ε on held-out samples, relative to what a vector field with these slopes typically leaves
@@ -47,13 +31,13 @@ class Symmetry(eqx.Module):
     - `identity_residuals`: shape (z + 1,): the same of Noether's identity and of its derivatives
       off the solutions; where it is not variational, with the best gauge in the basis.
     - `is_dependent`: whether X_0 is a combination of those listed before it with invariants of
-      the undisturbed map for coefficients.
+      the unperturbed map for coefficients.
     - `is_symplectic`: whether every order is locally a Hamiltonian vector field (and ξ0 = 0).
-      If it is and yet not variational, a larger gauge basis may close the identity.
-    - `coefficients`: shape (z + 1, components, basis size), components ξ0 (if looked for), those
+      If it is symplectic but not variational, a larger gauge basis may close the identity.
+    - `coefficients`: shape (z + 1, components, basis size), components ξ0 (if sought), those
       of ξ, those of η, named in `names`.
-    - `scale`: 1 over the ε at which the disturbance is as large as the rest.
-    - `sizes`: shape (components, basis size), what a coefficient of 1 amounts to on the samples;
+    - `scale`: 1 over the ε at which the perturbation is as large as the rest.
+    - `sizes`: shape (components, basis size): size of a term with coefficient 1 on the samples;
       `gauge_sizes`: the same for the gauges. Formulas leave out terms below 1e-9 of the largest.
     """
 
@@ -90,16 +74,50 @@ class Symmetry(eqx.Module):
         return AdiabaticInvariant(list(self.generators), list(self.gauges))
 
     def __str__(self) -> str:
-        shares = np.abs(in_units_of(self.scale, self.coefficients, axis=0))
-        shares = shares if self.sizes is None else shares * self.sizes
-        largest = np.max(shares, initial=0.0)
-        c = np.where(shares > 1e-9 * largest, self.coefficients, 0.0)
-        parts = [
-            f"{name} = {_series(self.basis, c[:, i])}"
-            for i, name in enumerate(self.names)
-            if c[:, i].any()
-        ]
+        shares = _shares(self.coefficients, self.scale, self.sizes)
+        c = np.where(shares > _ROUND_OFF * np.max(shares, initial=0.0), self.coefficients, 0.0)
+        parts = (
+            f"{n} = {_series(self.basis, x)}"
+            for n, x in zip(self.names, c.swapaxes(0, 1), strict=True)
+            if x.any()
+        )
         return ", ".join(parts) or "0"
+
+    def report(self) -> list[str]:
+        """The symmetry, its kind, residuals and gauge, as lines of text."""
+        kind = "variational" if self.is_variational else "conformal only"
+        mark = ", dependent" if self.is_dependent else ""
+        half, most = np.max(self.typical_residuals, axis=0)
+        lines = [
+            f"  {self}",
+            f"      {kind}{mark}; residuals on held-out samples: median {half:.1e}, 95 % below "
+            f"{most:.1e}, largest {np.max(self.residuals):.1e}; of Noether's identity "
+            f"{np.max(self.identity_residuals):.1e}",
+        ]
+        if self.gauges is not None:
+            gauges = np.stack([np.asarray(g.coefficients) for g in self.gauges])
+            shares = _shares(gauges, self.scale, self.gauge_sizes)
+            others = _shares(self.coefficients, self.scale, self.sizes)
+            largest = max(np.max(shares, initial=0.0), np.max(others))
+            gauges = np.where(shares > _ROUND_OFF * largest, gauges, 0.0)
+            lines.append(f"      gauge G = {_series(self.gauges[0].basis, gauges)}")
+            if self.moves_time:
+                lines.append("      ξ0 is not zero: on a fixed mesh its invariant may move by O(h)")
+        elif self.is_symplectic:
+            lines.append("      its flow is symplectic: the gauge basis may be too small")
+        return lines
+
+
+def _shares(coefficients: np.ndarray, scale: float, sizes: np.ndarray | None) -> np.ndarray:
+    shares = np.abs(in_units_of(scale, coefficients, axis=0))
+    return shares if sizes is None else shares * sizes
+
+
+def _series(basis: BoundBasis, coefficients: np.ndarray) -> str:
+    """c_0·φ + ε (c_1·φ) + … as text; orders that are zero are left out."""
+    return in_powers_of_epsilon(
+        basis.formula(block, drop=0.0) if block.any() else "" for block in coefficients
+    )
 
 
 class Symmetries(eqx.Module):
@@ -109,8 +127,8 @@ class Symmetries(eqx.Module):
     - `survivors`: for m = 0 … order, how many leading parts X_0 go on to order m.
     - `singular_values`: of all conditions, descending, relative to the largest; `gap`: the ratio
       at which they were cut (large is clear, below 1e3 is not).
-    - `null`: below this relative size a singular value is zero, as far as rounding lets one tell.
-    - `refused`: null vectors of the fitted samples that failed on the held-out ones.
+    - `null`: below this relative size a singular value is zero, within rounding.
+    - `refused`: null vectors of the training samples that failed on the held-out ones.
     - `undecided`: how many vector fields change in the steps by hardly more than rounding, so that
       whether they are symmetries cannot be decided in double precision.
     - `powers`: shape (count,), at order 0: the power of the size of the samples by which the
@@ -151,7 +169,7 @@ class Symmetries(eqx.Module):
 
     @property
     def order(self) -> int:
-        """z, the order that was asked for."""
+        """z, the requested order."""
         return len(self.survivors) - 1
 
     @property
@@ -161,24 +179,24 @@ class Symmetries(eqx.Module):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the answer is not to be relied on, each with what would help; empty if it is."""
-        told = []
+        """Why the answer is not reliable, each with what would help; empty if it is."""
+        reasons = []
         if self.survivors[0] and self.gap < CLEAR:
-            told.append("the gap is not clear: take more samples, or others")
+            reasons.append("the gap is not clear: take more samples, or others")
         if self.undecided:
-            told.append(
+            reasons.append(
                 f"{self.undecided} vector fields change in a step by hardly more than rounding: "
                 "whether they are symmetries cannot be decided in this arithmetic; take another "
                 "h, samples that spread wider, or an origin among them"
             )
         if self.null > _COARSE:
-            told.append(
+            reasons.append(
                 f"what breaks a symmetry by less than {self.null:.0e} cannot be decided in this "
                 "arithmetic: the step is small, the samples lie far from the origin, or the "
                 "tolerance is large"
             )
-        told += filter(None, (other.warning(self.survivors[0]) for other in self.larger))
-        return tuple(told)
+        reasons += filter(None, (other.warning(self.survivors[0]) for other in self.larger))
+        return tuple(reasons)
 
     def __len__(self) -> int:
         return self.count
@@ -201,12 +219,7 @@ class Symmetries(eqx.Module):
         if not count and self.survivors[0]:
             lines.append("  what order 0 has does not go on: a lower order, or a larger basis?")
         for symmetry, power in zip(self.found, self.powers, strict=True):
-            lines += _described(symmetry)
-            if power > 0:
-                lines.append(
-                    f"      not exact: with the size of the samples residuals grow as its power "
-                    f"{power:.2g}, as those of an expansion about their middle do"
-                )
+            lines += [*symmetry.report(), *grown("residuals grow", power)]
         dependent = sum(s.is_dependent for s in self.found)
         if dependent:
             lines.append(
@@ -220,41 +233,3 @@ class Symmetries(eqx.Module):
                 "tolerance)"
             )
         return "\n".join(lines)
-
-
-def _described(symmetry: Symmetry) -> list[str]:
-    kind = "variational" if symmetry.is_variational else "conformal only"
-    mark = ", dependent" if symmetry.is_dependent else ""
-    half, most = np.max(symmetry.typical_residuals, axis=0)
-    lines = [
-        f"  {symmetry}",
-        f"      {kind}{mark}; residuals on held-out samples: median {half:.1e}, 95 % below "
-        f"{most:.1e}, largest {np.max(symmetry.residuals):.1e}; of Noether's identity "
-        f"{np.max(symmetry.identity_residuals):.1e}",
-    ]
-    if symmetry.gauges is not None:
-        gauges = np.stack([np.asarray(g.coefficients) for g in symmetry.gauges])
-        shares, others = (
-            np.abs(in_units_of(symmetry.scale, x, axis=0)) for x in (gauges, symmetry.coefficients)
-        )
-        if symmetry.sizes is not None and symmetry.gauge_sizes is not None:
-            shares, others = shares * symmetry.gauge_sizes, others * symmetry.sizes
-        size = max(np.max(shares, initial=0.0), np.max(others))
-        gauges = np.where(shares > 1e-9 * size, gauges, 0.0)
-        lines.append(f"      gauge G = {_series(symmetry.gauges[0].basis, gauges)}")
-        if symmetry.moves_time:
-            lines.append("      ξ0 is not zero: on a fixed mesh its invariant may move by O(h)")
-    elif symmetry.is_symplectic:
-        lines.append("      its flow is symplectic: the gauge basis may be too small")
-    return lines
-
-
-def _series(basis: BoundBasis, coefficients: np.ndarray) -> str:
-    """c_0·φ + ε (c_1·φ) + … as text; orders that are zero left out."""
-    parts = []
-    for m, block in enumerate(coefficients):
-        power = "ε" if m == 1 else "ε" + str(m).translate(_RAISED)
-        if block.any():
-            text = basis.formula(block, drop=0.0)
-            parts.append(f"{power} ({text})" if m else text)
-    return " + ".join(parts) or "0"

@@ -1,4 +1,4 @@
-"""Symmetries found as a null space of the determining equations on the iterated map."""
+"""Symmetries as the null space of the determining equations on the iterated map."""
 
 from dataclasses import replace
 from typing import Any
@@ -7,15 +7,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import whole
-from .._integrator import Integrator
+from .._checks import fraction, whole
 from .._step import Equations
 from .._system import System, check_system
-from .._types import Args
-from ..engine.names import both_names
-from ..engine.newton import RootSolver
 from .basis import AbstractBasis, Basis, BoundBasis, Product, Sum, bind_basis, check_step_size
-from .conditions import Conditions, at_samples, require_finite, require_times, values_at
+from .conditions import Conditions, at_samples, require_finite_conditions, require_times, values_at
 from .expansions import at_larger_step, enlarged, in_larger_box
 from .families import TIME, Polynomials, coordinate_names
 from .motion import typical_sizes
@@ -32,17 +28,16 @@ from .sampling import (
     require_enough,
     require_steps,
     require_time,
-    root_finder_of,
-    spread,
+    spreads,
+    type_2_map_of,
 )
 from .symmetries import Symmetries
 from .symmetry_series import Search, rows_of
 
+# A step that moves the samples by less than this share of their spread is rounding.
 _NO_STEP = 1e-13
-"""A step that moves the samples by less than this share of their spread is rounding."""
 
 
-@both_names
 def find_symmetries(
     system: System,
     basis: AbstractBasis,
@@ -52,13 +47,10 @@ def find_symmetries(
     samples: Any,
     gauges: AbstractBasis | None = None,
     time: bool = True,
-    t0: float = 0.0,
-    args: Args = None,
-    newton: RootSolver | None = None,
-    integrator: Integrator | None = None,
     tolerance: float | None = None,
+    **how: Any,
 ) -> Symmetries:
-    r"""The symmetries of order z of the disturbed discrete equations that a basis can express.
+    r"""The symmetries of order z of the perturbed discrete equations that a basis can express.
 
     Every component of every X_m, m = 0 … z, is a combination of the basis functions φ(q, p, t).
     With Φ_ε the map (12)–(13), the determining equations
@@ -67,41 +59,42 @@ def find_symmetries(
 
     are linear in its coefficients; their Taylor coefficients in ε at sampled points z = (q, p)
     are a block-Toeplitz system, whose null space is found by singular values (the basis made
-    orthonormal on the samples first). On F = 0 that is all there is to ask: a smooth pointwise
-    conformal factor exists exactly then (see `conformal_factor`).
+    orthonormal on the samples first). On F = 0 this condition is sufficient: a smooth pointwise
+    conformal factor then exists (see `conformal_factor`).
 
     A symmetry is variational when a gauge closes Noether's identity. On the solutions *any* X
-    with ξ0 = 0 closes it, by G = −ξ·p; what tells is that the identity Σ ε^m N_m closes together
-    with its first derivatives off the solutions, by q1 and p0 (so that it is variational up to a
-    trivial symmetry). For ξ0 = 0 that says: X is the Hamiltonian vector field of its invariant
+    with ξ0 = 0 closes it, by G = −ξ·p; the criterion is that the identity Σ ε^m N_m and its first
+    derivatives with respect to q1 and p0 vanish off the solutions (then X is variational up to a
+    trivial symmetry). For ξ0 = 0 that means: X is the Hamiltonian vector field of its invariant
     ξ·p + G. The others are conformal only.
 
     **Arguments**
 
     - `basis`: with constants for translations: ``Polynomials(2, constant=True)``.
-    - `order`: z ≥ 0. `h`: step size [time]. `t0`, `args`, `newton`, `integrator`: as
-      for `integrate`; the map is that of `TypeII()`.
+    - `order`: z ≥ 0. `h`: step size [time].
     - `samples`: (qs, ps) at t0, shapes (S, *q.shape), points of the domain of interest, or (qs,
       ps, ts) with their times, shape (S,), where basis or system depend on t. A quarter is held
       out.
-    - `gauges`: basis of the gauges; None for one that holds φ times 1 and each coordinate, all
-      quadratic polynomials, and t.
-    - `time`: whether to look for ξ0 too. Where it depends on the point it changes h.
+    - `gauges`: basis of the gauges; None for φ times 1 and each coordinate, all quadratic
+      polynomials, and t.
+    - `time`: whether ξ0 is sought too. Where it depends on the point it changes h.
     - `tolerance`: relative singular value below which a vector is null; None for those below the
-      widest gap, at most 1e-11 of what vector fields typically leave of the equations, or rounding.
+      widest gap, at most 1e-11 of the typical residual of vector fields, or rounding.
+    - the keywords `t0`, `args`, `root_finder` (or `newton`), `integrator`: as for `integrate`; the
+      map is that of `TypeII()`.
 
     **Returns** `Symmetries`; print it for a report. t in the basis is the time, also of a system
     with ``slow_time=True``.
 
     **Raises** `ValueError` for too few samples, samples or functions that are not finite, a step
     that fails on them, a basis that is rank-deficient on them, samples of one time where basis or
-    system depend on t, an order or tolerance that is none, or h = 0; `TypeError` for what is no
-    basis.
+    system depend on t, an order below 0, a tolerance outside (0, 1), or h = 0; `TypeError` for
+    anything but a basis.
 
     **Accuracy** round-off of the singular values, times the conditioning of the basis; Taylor
     coefficients by nested forward autodiff, through implicit steps.
 
-    **Source** the paper's (17), (24) and (28), collected in ε on the disturbed map; the null
+    **Source** the paper's (17), (24) and (28), collected in ε on the perturbed map; the null
     space and the test off the solutions are our own (trivial symmetries: Olver 1993, Section
     5.1; symmetries of difference equations: Hydon 2014).
 
@@ -117,11 +110,11 @@ def find_symmetries(
     ```
     """
     order = whole("order", order, least=0)
-    if tolerance is not None and not 0 < tolerance < 1:
-        raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance!r}.")
+    if tolerance is not None:
+        tolerance = fraction("tolerance", tolerance)
     check_system(system)
-    newton = root_finder_of("find_symmetries", integrator, newton)
-    samples, h = as_samples(samples, t0), check_step_size(h)
+    one_step = type_2_map_of("find_symmetries", system, **how)
+    samples, h = as_samples(samples, one_step.t0), check_step_size(h)
     shape = samples.q.shape[1:]
     bound = bind_basis(basis, shape)
     require_time(bound, samples)
@@ -131,13 +124,12 @@ def find_symmetries(
     if gauges is not None:
         require_time(gauge_basis, samples)
     n = int(np.prod(shape, dtype=int))
-    components = 2 * n + bool(time)
-    require_enough(samples, components * bound.size, 2 * n)
+    require_enough(samples, (2 * n + bool(time)) * bound.size, 2 * n)
     require_enough(samples, gauge_basis.size, 1 + 2 * n)
 
     q, p, t = (jnp.asarray(x[0]) for x in samples)
-    system.check_shapes(t, q, p, jnp.zeros(()), args)
-    equations = Equations(system, jnp.zeros(()), args, newton)
+    system.check_shapes(t, q, p, jnp.zeros(()), one_step.args)
+    equations = Equations(system, jnp.zeros(()), one_step.args, one_step.root_finder)
     for one in (bound, gauge_basis) if gauges is not None else (bound,):
         values = values_at(one, samples)
         check_finite(one, values)
@@ -152,7 +144,7 @@ def find_symmetries(
     shifts = later(h)
     raw = conditions(shifts)
     require_steps(raw.good[:, 0] == 1, samples)
-    require_finite(raw)
+    require_finite_conditions(raw)
     relative = relative_step(samples, _moved(raw))
     if relative < _NO_STEP:
         raise ValueError(
@@ -163,7 +155,8 @@ def find_symmetries(
         shifts = later(h, relative)
         raw = conditions(shifts)
     require_times(raw, samples, h, shifts[-1])
-    independent, raw, places = _independent_gauges(gauge_basis, raw, samples, h)
+    independent, places = _independent_gauges(gauge_basis, raw, samples, h)
+    raw = raw._replace(gauge=raw.gauge[..., places])
     kind = bool(time), bound, independent, tolerance
     search = Search(raw, samples, h, *kind)
     found = search.result()
@@ -180,12 +173,11 @@ def find_symmetries(
     def moved(at):
         return _moved(raw if at is samples else conditions(shifts, at))
 
-    def step_at(step):
-        return (
-            relative if step == h else relative_step(samples, _moved(conditions(shifts, step=step)))
-        )
+    def relative_at(step):
+        moved = _moved(raw if step == h else conditions(shifts, step=step))
+        return relative_step(samples, moved)
 
-    powers, larger = found.powers, at_larger_step(h, step_at, count)
+    powers, larger = found.powers, at_larger_step(h, relative_at, count)
     if order == 0:
         at, which = enlarged(samples)
         powers = search.powers(found, conditions(shifts, at), which)
@@ -231,11 +223,10 @@ class _Chosen(eqx.Module):
 
 
 def _independent_gauges(basis: BoundBasis, raw: Conditions, samples: Samples, h: float):
-    """The gauge functions without constants and those that depend on simpler ones; the conditions
-    of those; and their places."""
+    """The gauge functions without constants and those that depend on simpler ones, and their
+    places."""
     fit = ~samples.held_out
-    n = samples.q[0].size
-    units = np.repeat([abs(h), spread(samples.q), spread(samples.p)], [1, n, n])
+    units = np.append(abs(h), spreads(samples))
     typical = typical_sizes(values_at(basis, samples))[0]
     rows = raw.gauge[fit, 0] * units[:, None] / np.where(typical > 0, typical, abs(h))
     length = np.linalg.norm(rows, axis=(1, 2), keepdims=True)
@@ -252,12 +243,11 @@ def _independent_gauges(basis: BoundBasis, raw: Conditions, samples: Samples, h:
         if np.linalg.norm(rest) > 1e-9:
             taken.append(int(j))
             done = np.column_stack([done, rest / np.linalg.norm(rest)])
-    places = sorted(taken)
+    places = np.array(sorted(taken), int)
     chosen = BoundBasis(
-        _Chosen(basis, tuple(places)),
+        _Chosen(basis, tuple(places.tolist())),
         tuple(basis.names[j] for j in places),
         tuple(basis.complexity[j] for j in places),
         basis.uses_time,
     )
-    chosen_places = np.array(places, int)
-    return chosen, raw._replace(gauge=raw.gauge[..., chosen_places]), chosen_places
+    return chosen, places

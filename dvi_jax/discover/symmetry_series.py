@@ -19,37 +19,30 @@ from .motion import (
     relative_changes,
     typical_sizes,
 )
-from .null_series import (
-    SeriesSpace,
-    compress,
-    epsilon_scale,
-    in_units_of,
-    series_changes,
-    series_spaces,
-    solve_series,
-    toeplitz,
-)
 from .nullspace import (
     HELD_OUT,
     NULL,
     RANK,
+    SeriesSpace,
     by_leading,
+    compress,
+    epsilon_scale,
+    in_units_of,
     null_space,
     orthonormal_range,
+    series_changes,
+    series_spaces,
     singular_vectors,
+    solve_series,
+    toeplitz,
     triangle,
 )
 from .sampling import rounding, spread
-from .symmetries import BasisComponent, Symmetries, Symmetry
+from .symmetries import Symmetries, Symmetry
 
-_NEARLY = 1e-8
-"""Noether's identity has to close to this at least."""
-
-_LEAST = 1e-4
-"""Terms of a sample are at least this fraction of the median of all samples."""
-
-_TINY = 1e-12
-"""Coefficients whose share of a generator is below this are round-off."""
+_NEARLY = 1e-8  # Noether's identity has to close to this at least
+_LEAST = 1e-4  # Terms of a sample are at least this fraction of the median of all samples
+_TINY = 1e-12  # Coefficients whose share of a generator is below this are round-off
 
 
 class Search:
@@ -91,7 +84,7 @@ class Search:
         of_identity = np.hypot(self._size(identity), np.linalg.norm(gauge[:, 0], axis=(1, 2)))
         identity = identity / of_identity.reshape(-1, 1, 1, 1, 1, 1)
         gauge = gauge / of_identity.reshape(-1, 1, 1, 1)
-        # ε in the unit in which the disturbance is as large as the rest
+        # ε in the unit in which the perturbation is as large as the rest
         sums = self.weights * self._orthonormal(determining)
         self.scale = epsilon_scale(rows_of(sums[fit]))
         determining, identity = (in_units_of(self.scale, x) for x in (determining, identity))
@@ -131,7 +124,7 @@ class Search:
             return kept, np.vstack([np.zeros((self.size, later.shape[1])), later]), unclear
 
         fitted = compress(rows_of((self.weights * rows)[~self.held]))
-        return series_spaces(fitted, judge, self.tolerance, 1.0)
+        return series_spaces(fitted, judge, self.tolerance)
 
     def result(self) -> Symmetries:
         """The symmetries, in as few functions as can be."""
@@ -322,9 +315,10 @@ class Search:
         n = int(np.prod(self.shape, dtype=int))
         xi0 = c[0] if len(c) > 2 * n else np.zeros(self.basis.size)
         xi, eta = (x.reshape(*self.shape, -1) for x in (c[-2 * n : -n], c[-n:]))
-        parts = (BasisComponent(self.basis, jnp.asarray(x)) if x.any() else None
-                 for x in (xi0, xi, eta))  # fmt: skip
-        return Generator(*parts)
+        parts = (xi0, xi, eta)
+        return Generator(
+            *(BasisGauge(self.basis, jnp.asarray(x)) if x.any() else None for x in parts)
+        )
 
     def _sums(self, terms, c) -> np.ndarray:
         """Σ_m terms_{k−m} c_m, shape (S, z + 1, rows)."""
@@ -401,8 +395,8 @@ def _motion(raw: Conditions, jacobian: np.ndarray, lost: float) -> FieldMotion:
     places = raw.points[:, 0]
     slopes = raw.slopes[:, 0].swapaxes(1, 2)
     changes = slopes * np.diff(places, axis=1)[:, 0, :, None]
-    before, second, both = (np.linalg.norm(x, axis=1) for x in (
-        jacobian[:, :, 0], jacobian[:, :, 1], jacobian.sum(axis=2)))  # fmt: skip
+    parts = jacobian[:, :, 0], jacobian[:, :, 1], jacobian.sum(axis=2)
+    before, second, both = (np.linalg.norm(x, axis=1) for x in parts)
     # φ(z0) and φ(z1), each with the last digit of the point where it is taken
     blur = np.einsum("sdb,sd->sb", np.abs(slopes), np.sum(np.abs(places), axis=1))
     sizes = before[..., None] * np.abs(values)[:, None]
