@@ -9,8 +9,9 @@ began. The numbers are the same to the bit in both.
 from collections.abc import Sequence
 from typing import Any
 
+from .builder import Builder
 from .extent import operation_count
-from .ir import Builder, Num
+from .ir import Num
 from .jaxapi import Jaxpr, bodies
 
 
@@ -127,8 +128,7 @@ class Assumed:
         return before
 
 
-_LONGEST = 300
-"""A round with more operations is written once, with all branches."""
+_LONGEST = 300  # a round with more operations is written once, with all branches
 
 
 def may_assume(jaxpr: Jaxpr) -> bool:

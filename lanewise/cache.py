@@ -17,8 +17,7 @@ from typing import Any
 
 VARIABLE = "DVI_JAX_CACHE"
 
-LARGEST = 256 * 2**20
-"""Bytes that the folder may hold."""
+LARGEST = 256 * 2**20  # bytes that the folder may hold
 
 _MARK = b"lanewise"
 

@@ -136,6 +136,7 @@ def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
     return x
 
 
+# Applied number by number; an operand without axes goes with each number of the others.
 ELEMENTWISE: dict[str, Callable] = {
     "add": _add,
     "add_any": _add,
@@ -187,4 +188,3 @@ ELEMENTWISE: dict[str, Callable] = {
         )
     },
 }  # fmt: skip
-"""Applied number by number; an operand without axes goes with each number of the others."""

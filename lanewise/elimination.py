@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .ir import Builder, Num, Unsupported
+from .builder import Builder
+from .ir import Num, Unsupported
 from .memory import Buffer, load, store
 from .values import MADE, Entries, Value
 
@@ -13,8 +14,7 @@ if TYPE_CHECKING:
     from .components import Evaluator
 
 
-_LARGEST_FACTOR = 8.0
-"""Of a row that is subtracted from another without an exchange."""
+_LARGEST_FACTOR = 8.0  # of a row that is subtracted from another without an exchange
 
 
 def linear_solve(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:

@@ -8,12 +8,11 @@ from jax.typing import ArrayLike
 
 from .jaxapi import primitive
 
-WRITTEN_OUT = 4
-"""Systems up to this size are eliminated number by number in XLA too."""
+WRITTEN_OUT = 4  # systems up to this size are eliminated number by number in XLA too
 
+# Batches of systems up to this size are eliminated column by column on a CPU: LAPACK's calls for
+# batches share the threads of XLA, and may wait for ever for a thread that waits for them.
 IN_A_LOOP = 64
-"""Batches of systems up to this size are eliminated column by column on a CPU: LAPACK's calls for
-batches share the threads of XLA, and may wait for ever for a thread that waits for them."""
 
 
 def solve(A: Array, b: Array) -> Array:

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from .ir import TYPES, Builder, Num, Unsupported
+from .builder import Builder
+from .ir import TYPES, Num, Unsupported
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,6 +27,10 @@ class Piece:
     reason: str | None
     is_call: bool
 
+    @property
+    def is_left_to_xla(self) -> bool:
+        return self.reason is not None and not self.is_call
+
 
 def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> list[Piece]:
     """The pieces of a function, in the order in which they are computed.

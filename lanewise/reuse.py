@@ -9,11 +9,10 @@ from typing import Any
 
 from .ir import Num
 
+# Operations worth carrying; calls of elementary functions are too.
 _COSTLY = frozenset(["sqrt", "div"])
-"""Operations worth carrying; calls of elementary functions are too."""
 
-_MOST = 8
-"""Numbers that are carried over."""
+_MOST = 8  # numbers that are carried over
 
 
 def carried_over(before: Sequence[Num], after: Sequence[Num]) -> list[tuple[Num, Num]]:

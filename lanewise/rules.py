@@ -35,6 +35,7 @@ def _reshape(x, *, new_sizes, dimensions):
     return (x if dimensions is None else np.transpose(x, dimensions)).reshape(new_sizes)
 
 
+# One array seen with other axes or strides; an array in memory stays where it is.
 VIEWS: dict[str, Callable] = {
     "broadcast_in_dim": _broadcast_in_dim,
     "squeeze": lambda x, *, dimensions: np.squeeze(x, tuple(dimensions)),
@@ -45,7 +46,6 @@ VIEWS: dict[str, Callable] = {
     "split": _split,
     "unstack": _unstack,
 }
-"""One array seen with other axes or strides; an array in memory stays where it is."""
 
 
 def _pad(x, fill, *, padding_config):
@@ -67,6 +67,7 @@ def _pad(x, fill, *, padding_config):
     return canvas[tuple(cut)]
 
 
+# The same on arrays of entries, and those that make a new array.
 MOVES: dict[str, Callable] = {
     **VIEWS,
     "reshape": _reshape,
@@ -75,7 +76,6 @@ MOVES: dict[str, Callable] = {
     "concatenate": lambda *xs, dimension: np.concatenate(xs, axis=dimension),
     "pad": _pad,
 }
-"""The same on arrays of entries, and those that make a new array."""
 
 
 def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -94,6 +94,7 @@ def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.nd
 
 _ABOUT_DEVICES = frozenset(["sharding", "out_sharding"])
 
+# Calls of one jaxpr whose inputs and outputs are those of the equation.
 CALLS = frozenset(
     [
         "jit",
@@ -111,8 +112,8 @@ CALLS = frozenset(
         "remat2",
     ]
 )
-"""Calls of one jaxpr whose inputs and outputs are those of the equation."""
 
+# Taken from the first entry to the last, by this operation of two.
 REDUCTIONS = {
     "reduce_sum": "add",
     "reduce_prod": "mul",
@@ -122,7 +123,6 @@ REDUCTIONS = {
     "reduce_or": "or",
     "reduce_xor": "xor",
 }
-"""Taken from the first entry to the last, by this operation of two."""
 
+# Running reductions along one axis.
 CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
-"""Running reductions along one axis."""

@@ -10,12 +10,11 @@ from jax import Array, lax
 
 from .ir import Unsupported
 
+# Larger matrices are left to XLA, which calls LAPACK; so are stacks that cost more operations than
+# one matrix of this size.
 MOST_UNKNOWNS = 12
-"""Larger matrices are left to XLA, which calls LAPACK; so are stacks that cost more operations than
-one matrix of this size."""
 
-MOST_SORTED = 16
-"""Longer arrays are sorted by XLA."""
+MOST_SORTED = 16  # longer arrays are sorted by XLA
 
 
 def _square(x: Array, name: str) -> int:
@@ -166,6 +165,7 @@ def platform_index(*, platforms: Sequence, **_) -> Array:
     return jnp.int32(next(i for i, p in enumerate(names) if "cpu" in p))
 
 
+# function(*arrays, **parameters of the equation) → the equation's results.
 WRITTEN: dict[str, Callable] = {
     "lu": _of_each_matrix(lu),
     "triangular_solve": _of_each_matrix(triangular_solve),
@@ -176,4 +176,3 @@ WRITTEN: dict[str, Callable] = {
     "le_to": lambda x, y: _ordered(x) <= _ordered(y),
     "platform_index": platform_index,
 }
-"""function(*arrays, **parameters of the equation) → the equation's results."""
