@@ -116,8 +116,13 @@ class Case:
 
 
 def check(text: str, alone: bool = True) -> str:
-    """Check a program, also one trajectory `alone`, which takes a compilation of its own. Returns what was compared; raises `AssertionError` for a difference, and
-    `Ill` where dvi_jax refuses the program with an error of its own."""
+    """Check a program. Returns what was compared.
+
+    `alone`: also one trajectory by itself, which takes a compilation more.
+
+    **Raises** `AssertionError` for a difference, and `Ill` where dvi_jax refuses the program with
+    an error of its own.
+    """
     case = Case(load(text))
     try:  # of traced numbers: a start of NaN is refused where it is known
         case.one()

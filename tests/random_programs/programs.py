@@ -228,7 +228,7 @@ def programs(draw):
         leaves = ["q[0] * 1.0", *(x for x in leaves if "p[" not in x and x != "q[0]")]
         kinetics = kinetics[:1]
     # Most programs are small: the time of a program is that of its compilation.
-    depth = draw(st.sampled_from([1, 2, 3]))
+    depth = draw(st.sampled_from([1, 1, 2, 3]))
     one, small = (expressions(leaves, n, smooth, d) for d in (depth, depth - 1))
     kinetic = draw(st.sampled_from(kinetics))
     H = f"{kinetic} + {draw(one)}"
