@@ -54,16 +54,22 @@ class Assumed:
         """A truth value is taken for false on all trajectories."""
         b = self.b
         if x.known is not None:
+            # It is true on every trajectory: the round without branches would always be repeated.
             if x.known:
                 raise NotAssumable
         elif x.op == "or" and x.dtype == "bool":
+            # Part by part, so that a test of finiteness among them joins the others in one sum.
             for part in x.args:
                 self.never(part)
         elif x.op == "not" and x.args[0].op == "and":
+            # not (a and b) = not a or not b.
             for part in x.args[0].args:
                 self.never(b.invert(part))
         elif x.op == "not" and x.args[0].op == "finite":
+            # Not tested in the round: often the state after the last round shows that they were
+            # finite.
             self.finite += b.finite_terms(x.args[0])
+        # The same test may decide several branches; once is enough.
         elif all(x.serial != other.serial for other in self.failures):
             self.failures.append(x)
 
@@ -71,6 +77,7 @@ class Assumed:
         """The least over all trajectories of ``where(flag, 0, 1)``, the flag taken for false."""
         if x.known is not None:
             return x
+        # Only the form that `on_any` writes; another integer could decide anything.
         if x.op != "select" or not all(a.known is not None for a in x.args[1:]):
             raise NotAssumable
         flag, yes, no = x.args
@@ -94,12 +101,14 @@ class Assumed:
             targets = terms | {before[i].serial for i in chosen}
             return targets <= b.shown(targets, [after[i] for i in chosen])
 
+        # A number that is known while the code is written cannot become infinite.
         chosen = [i for i, x in enumerate(after) if x.is_float and x.known is None]
         chosen = [i for i in chosen if b.shown(terms, [after[i]])]
         for i in tuple(chosen):  # as few as possible
             fewer = [j for j in chosen if j != i]
             if is_enough(fewer):
                 chosen = fewer
+        # Else the state may look finite at the end although a number was not: test in every round.
         if is_enough(chosen):
             self.at_the_end = chosen
         else:
@@ -112,6 +121,7 @@ class Assumed:
         b = self.b
         if not self.failures:
             return before
+        # One reduction over the trajectories of the block for all failures of a round.
         total = self.failures[0]
         for x in self.failures[1:]:
             total = b.logic("or", total, x)
@@ -128,6 +138,8 @@ class Assumed:
         return before
 
 
+# Two versions of a long round cost more time to compile, and more of the instruction cache, than
+# the branches take.
 _LONGEST = 300  # a round with more operations is written once, with all branches
 
 
@@ -139,6 +151,7 @@ def may_assume(jaxpr: Jaxpr) -> bool:
 def _asks(jaxpr: Jaxpr) -> bool:
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
+        # Branches that are often taken would make the round be repeated nearly always.
         if name == "least_over_lanes" and eqn.params["rare"]:
             return True
         if name not in ("scan", "while", "cond") and any(_asks(x.jaxpr) for x in bodies(eqn)):

@@ -13,6 +13,7 @@ class Builder(Arithmetic):
         """Whether a truth value is true on a trajectory of the block, as a scalar i1."""
         if not a.vec:
             return self.ref(a, 0, False)
+        # The sum over the vectors is NaN if one of them is, so that one comparison is enough.
         if a.op == "not" and a.args[0].op == "finite":  # one comparison for the block
             (zero,) = a.args[0].args
             t, total = self.type(zero.dtype, True), zero.names[0]
@@ -26,6 +27,7 @@ class Builder(Arithmetic):
             total = self.new(f"or {t} {total}, {other}")
         if self.W == 1:
             return total
+        # A mask as an integer compiles to one test of a register; a reduction by `or` does not.
         bits = self.new(f"bitcast {t} {total} to i{self.W}")
         return self.new(f"icmp ne i{self.W} {bits}, 0")
 
@@ -60,6 +62,8 @@ class Builder(Arithmetic):
         """
         before = [self.refs(c, v) for c, v in zip(carry, vec, strict=True)]
         entered_from, front = self.block, len(self.lines)
+        # head: phis and the test; inner: a round, which goes back to head; end: after the last
+        # round.
         head, inner, end = self.label(), self.label(), self.label()
         self.emit(f"br label %{head}")
         self.begin(head)
@@ -73,6 +77,8 @@ class Builder(Arithmetic):
         self.emit(f"br i1 {going}, label %{inner}, label %{end}")
         self.begin(inner)
         after = body(phis, counter)
+        # `vec` comes from the dependence of the jaxpr. A number that varies in a scalar would lose
+        # the values of all trajectories but one.
         assert not any(a.vec and not v for a, v in zip(after, vec, strict=True)), (
             "a carry that varies"
         )
@@ -96,6 +102,8 @@ class Builder(Arithmetic):
         first_lines = []
         if carried_over is not None:
             pairs = carried_over(phis, after)
+            # The number of the first round is computed before the loop, from the numbers that enter
+            # it.
             instead = {
                 p.serial: self.made(old, p.dtype, v)
                 for p, old, v in zip(phis, before, vec, strict=True)
@@ -122,6 +130,7 @@ class Builder(Arithmetic):
         found = instead.get(x.serial)
         if found is None:
             args = [self.made_again(a, instead) for a in x.args]
+            # A closed-off number is a name for another one and has no instruction of its own.
             if x.op == "same":
                 found = args[0]
             else:
@@ -147,6 +156,7 @@ class Builder(Arithmetic):
             self.scopes.append({})
             names.append([self.refs(x, v) for x, v in zip(run(), vec, strict=True)])
             self.scopes.pop()
+            # A branch may contain loops and branches: it ends in another block than it began with.
             ends.append(self.block)
             self.emit(f"br label %{end}")
         self.begin(end)

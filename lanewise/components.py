@@ -56,6 +56,7 @@ class Evaluator:
         wanted: Sequence[Buffer | None] | None = None,
     ) -> list[Value]:
         """The outputs. `wanted` says where outputs should be written if they are in memory."""
+        # From the variables of the jaxpr to their values.
         known: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
         known.update(zip(jaxpr.invars, values, strict=True))
         places = _places(jaxpr, wanted or [None] * len(jaxpr.outvars))
@@ -65,6 +66,8 @@ class Evaluator:
                 return self.constant(np.asarray(atom.val, atom.aval.dtype))  # pyright: ignore[reportAttributeAccessIssue]
             return known[atom]
 
+        # One call gives the sine and the cosine of a number, and costs little more than one of
+        # them.
         both = _sines_and_cosines(jaxpr)
         for eqn in jaxpr.eqns:
             inputs = [read(v) for v in eqn.invars]
@@ -72,6 +75,8 @@ class Evaluator:
                 known[eqn.outvars[0]] = self.sine_or_cosine(eqn, inputs[0])
                 continue
             outputs = self.equation(eqn, inputs, [places.get(v) for v in eqn.outvars])
+            # What is linear in unit vectors is a derivative: its zeros stay zeros, also times
+            # infinity.
             if eqn.primitive.name not in _ENDS and any(v.is_tangent for v in inputs):
                 outputs = [self.as_tangent(v) for v in outputs]
             known.update(zip(eqn.outvars, outputs, strict=True))
@@ -116,6 +121,7 @@ class Evaluator:
         rule = ELEMENTWISE.get(name)
         if rule is not None:
             return [self._elementwise(eqn, values, rule)]
+        # Last, because tracing takes longer than a look at the tables.
         written = WRITTEN.get(name)
         if written is not None:
             body = jax.make_jaxpr(functools.partial(written, **eqn.params))
@@ -162,6 +168,7 @@ class Evaluator:
         if value.buffer is not None:
             return value.buffer
         assert value.entries is not None
+        # Known numbers go into the module once, and no instruction writes them.
         known = value.known()
         if known is not None:
             return self.kernel.constant(known)
@@ -189,6 +196,7 @@ class Evaluator:
             return
         source = value.buffer
         assert source is not None
+        # Few elements are moved one by one; a loop would cost more instructions.
         if value.size <= 16:
             for i in np.ndindex(value.shape):
                 store(self.b, place, load(self.b, source, source.at(i)), place.at(i))
@@ -264,6 +272,8 @@ class Evaluator:
     def _elementwise(self, eqn: Any, values: list[Value], rule: Callable) -> Value:
         (out,) = eqn.outvars
         shape, params = out.aval.shape, eqn.params
+        # Long arrays in a loop over their elements: otherwise the code would be as long as the
+        # array.
         if not all(v.is_small for v in values) or math.prod(shape) > MADE:
             return self._in_a_loop(eqn, values, rule)
         operands = [np.broadcast_to(self.entries(v), shape) for v in values]
@@ -319,10 +329,13 @@ class Evaluator:
     def agreed(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         """The least of an integer over the trajectories of a block."""
         b, x = self.b, self.entries(values[0])[()]
+        # Not reduced over the block: the assumption is checked after some rounds.
         if self.assumed is not None and eqn.params["rare"]:
             return [self.value([self.assumed.least(x)], eqn.outvars[0].aval)]
         if not x.vec:
             return values
+        # The block runs a branch that some trajectory nearly always needs. Results do not depend on
+        # it, because each trajectory selects its own.
         if not eqn.params["rare"]:  # one of several trajectories nearly always needs it
             return [self.value([taken_for(b, 0, x.dtype)], eqn.outvars[0].aval)]
         t, full = b.type(x.dtype, True), b.suffix(x.dtype, True)
@@ -372,6 +385,8 @@ def _places(jaxpr: Jaxpr, wanted: Sequence[Buffer | None]) -> dict[Any, Buffer]:
             places.setdefault(v, place)
     if not places:
         return places
+    # Backwards, from the outputs: an array that is joined from parts is written part by part to
+    # where the whole is wanted, without a copy.
     for eqn in reversed(jaxpr.eqns):
         place = places.get(eqn.outvars[0]) if len(eqn.outvars) == 1 else None
         if place is None:

@@ -40,6 +40,7 @@ _ANSWERS: weakref.WeakKeyDictionary[Jaxpr, dict] = weakref.WeakKeyDictionary()
 
 
 def _reached_outputs(jaxpr: Jaxpr, reached_inputs: Sequence[bool], ends: frozenset[str]) -> Any:
+    # Equations come in the order of their dependence: one pass is enough.
     reached = {v for v, r in zip(jaxpr.invars, reached_inputs, strict=True) if r}
 
     def is_reached(atom: Any) -> bool:
@@ -69,6 +70,7 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
         def scanned(carry):
             return reached_outputs(params["jaxpr"].jaxpr, [*fixed, *carry, *xs], ends)
 
+        # What reaches one part of the carry in a round may reach another part in the next.
         carry = fixed_point(lambda carry: scanned(carry)[:count], carry)
         return [*carry, *scanned(carry)[count:]]
     if name == "while":
@@ -78,10 +80,12 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
         def after(carry):
             (test,) = reached_outputs(params["cond_jaxpr"].jaxpr, [*of_test, *carry], ends)
             body = reached_outputs(params["body_jaxpr"].jaxpr, [*of_body, *carry], ends)
+            # If the number of rounds is reached, so is everything that the rounds compute.
             return [test or r for r in body]
 
         return fixed_point(after, inputs[first + second :])
     if name == "cond":
+        # The choice of the branch alone decides about all outputs.
         if inputs[0]:
             return [True] * len(eqn.outvars)
         per_branch = [reached_outputs(b.jaxpr, inputs[1:], ends) for b in params["branches"]]
@@ -106,6 +110,7 @@ def _called_jaxpr(eqn: Any) -> Jaxpr | None:
     """
     if eqn.primitive.name == "lanewise":
         return eqn.params["program"].traced.all_inputs.jaxpr
+    # With two bodies (a function and its derivative) it is not certain which one is run.
     bodies = list(jaxprs_in_params(eqn.params))
     if len(bodies) != 1:
         return None

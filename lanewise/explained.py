@@ -85,6 +85,7 @@ def explain(
     ```
     """
     leaves, tree = jax.tree.flatten(args)
+    # Arrays: a number of Python would be traced with a weak type, which a batch does not have.
     leaves = [jnp.asarray(x) for x in leaves]
 
     def flat(*leaves):
@@ -122,6 +123,8 @@ def _parts(program: Any, batch: int) -> list[Part]:
                 parts += _parts(Program(Traced(piece.closed), program.layout), batch)
         return parts or [Part(str(reason))]
     ir = handler.module_text(text, module.W * module.U)
+    # Registers that do not suffice show in moves to and from the stack; their number says whether a
+    # block has too many vectors.
     assembly = machine.assembly(ir)
     spills = len(re.findall(r"\bv?mov[a-z0-9]*\s+.*\((?:%rsp|sp)\)", assembly))
     return [Part(None, module.b.operations, module.W, module.U, module.scratch_bytes, spills, ir)]

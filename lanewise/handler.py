@@ -274,6 +274,7 @@ finish:
 # The functions in XLA's table follow its size, extension, version (24 bytes) and internal table.
 _SCHEDULE, _COUNT = (48 + 8 * place for place in (11, 12))
 
+# Several threads of Python may trace and compile at once; a name may be registered once only.
 _lock = threading.RLock()
 _targets: dict[str, str] = {}
 
@@ -335,6 +336,7 @@ def registered(text: str) -> str:
         if key not in _targets:
             run = runtime().get_function_address("lanewise_run")
             name = f"lanewise_{key[:32]}"
+            # One engine holds all modules, so that each needs a name of its own.
             text = text.replace("@lanewise_handler", f"@{name}")
             engine = machine.loaded(text, {"lanewise_run": run})
             address = engine.get_function_address(name)
@@ -344,6 +346,7 @@ def registered(text: str) -> str:
 
 
 def _capsule(address: int) -> Any:
+    # The form in which JAX takes the address of a handler.
     new = ctypes.pythonapi.PyCapsule_New
     new.restype = ctypes.py_object
     new.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]

@@ -100,6 +100,10 @@ class Writer:
         self.lines.append(f"  {name} = {instruction}")
         return name
 
+    def pointer(self, item: str, base: str, by: str | int) -> str:
+        """The pointer that is `by` items further."""
+        return self.new(f"getelementptr {item}, ptr {base}, i64 {by}") if by != 0 else base
+
     def label(self) -> str:
         return f"L{next(self._names)}"
 

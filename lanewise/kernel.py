@@ -42,6 +42,7 @@ class Module:
 
     def parameter(self, value: int) -> Num:
         """A whole number that is an input of the machine code: another one needs no new code."""
+        # So a run of other length, or with longer arrays, finds its code in the cache.
         name = f"%par{len(self.values)}"
         self.values.append(int(value))
         return self.b.made([name], "int64", False)
@@ -170,10 +171,12 @@ class Module:
             b.emit(f"%rp{i} = getelementptr ptr, ptr %rets, i64 {i}")
             b.emit(f"%r{i} = load ptr, ptr %rp{i}")
             results.append((f"%r{i}", v.aval))
+        # Before the loop over blocks, so that they are read once.
         strides = [self._lane_stride(a) for _, a, o in operands if o]
         strides_out = [self._lane_stride(a) for _, a in results]
         evaluator = Evaluator(b, self)
         shared = {}
+        # Operands that all trajectories share are read once, before the loop over blocks.
         for i, (pointer, aval, o) in enumerate(operands):
             if not o:
                 buffer = Buffer(
@@ -282,6 +285,7 @@ def _function_text(
 ) -> tuple[str, frozenset[str], tuple[str, ...]]:
     """An elementary function of vectors of `width`, with what it declares."""
     inner = Module(width, 1)
+    # A module of its own: its numbers and scopes do not mix with those of the caller.
     closed = _traced(name, count)
     b = inner.b
     args = [b.made([f"%x{i}"], "float64", True) for i in range(count)]

@@ -28,6 +28,7 @@ def solve(A: Array, b: Array) -> Array:
             f"A must have shape (n, n) and b shape (n,), got {A.shape} and {b.shape}. For several "
             "systems use jax.vmap or lanewise.batched."
         )
+    # It makes the solution differentiable any number of times by solving with the same matrix.
     return lax.custom_linear_solve(
         lambda x: A @ x,
         b,
@@ -40,6 +41,7 @@ def _in_arrays(A: ArrayLike, b: ArrayLike) -> Array:
     """The solutions of systems with the shapes (..., n, n) and (..., n)."""
     A, b = jnp.asarray(A), jnp.asarray(b)
     n, lapack = b.shape[-1], _on_each(jnp.linalg.solve)
+    # A loop over columns, or a call of LAPACK, takes longer than so few operations.
     if n <= WRITTEN_OUT:
         return _on_each(by_elimination)(A, b)
     if b.ndim == 1 or n > IN_A_LOOP:
@@ -99,6 +101,7 @@ def _column_by_column(A: Array, b: Array) -> Array:
 def _in_batches(arrays, axes):
     """More systems at once: their axis goes in front, of length 1 for what they share."""
     moved = [
+        # One matrix for several right-hand sides stays one: its elimination is shared.
         jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(jnp.asarray(x), axis, 0)
         for x, axis in zip(arrays, axes, strict=True)
     ]

@@ -115,6 +115,7 @@ def while_loop(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> l
     (per_lane,) = reached_outputs(test.jaxpr, [*lanes_of_test, *on], AGREED)
     numbers, vec, back = _carried(e, carry, on)
     parts = math.prod(shape)
+    # The condition has the leading axes of each array of the carry.
     part = [i * parts // v.size for v in carry for i in range(v.size)]  # of which a number is
 
     def goes_on(numbers: Sequence[Num]) -> list[Num]:
@@ -123,11 +124,13 @@ def while_loop(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> l
     def step(numbers: Sequence[Num]) -> list[Num]:
         return _numbers_of(e, e.closed(body, [*of_body, *back(numbers)]))
 
+    # In a round on assumptions: a loop that starts at all is the rare case.
     if per_lane and e.assumed is not None:
         for going in goes_on(numbers):
             e.assumed.never(going)
         return back([e.b.unrelated(x) for x in numbers])
     with e.assuming(None):
+        # Trajectories that have finished keep their values, and the block goes on.
         if per_lane or shape:
             return back(_masked(e, numbers, vec, per_lane, part, goes_on, step))
 
@@ -182,6 +185,7 @@ def _branches(e: "Evaluator", eqn: Any, which: Num, operands: list[Value]) -> li
     if which.dtype == "bool":
         which = b.convert(which, "int32")
     flags = [v.has_lanes() for v in operands]
+    # A result varies if the choice does, or if it does in one of the branches.
     per_branch = [reached_outputs(x.jaxpr, flags, AGREED) for x in branches]
     on = [which.vec or any(x) for x in zip(*per_branch, strict=True)]
     avals = [v.aval for v in eqn.outvars]
@@ -191,11 +195,14 @@ def _branches(e: "Evaluator", eqn: Any, which: Num, operands: list[Value]) -> li
     def run(branch):
         return lambda: _numbers_of(e, e.closed(branch, operands))
 
+    # XLA clamps the index to the branches that exist.
     last = len(branches) - 1
     takes = []  # whether a branch is taken; the first and the last beyond their index too
     for i in range(len(branches)):
         op = "le" if i == 0 else "ge" if i == last else "eq"
         takes.append(b.compare(op, which, b.known(i, which.dtype)))
+    # The same branch on all trajectories: jump. Else run all branches that some trajectory takes,
+    # and let each trajectory select its own result.
     if not which.vec:
         results = _one_of(e, takes, [run(x) for x in branches], vec, dtypes)
     else:

@@ -44,13 +44,16 @@ def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> 
     groups = [_Group()]
     for eqn in jaxpr.eqns:
         why = None
+        # Trying takes a trace and an evaluation: only where the name and the types do not tell.
         if not _is_simple(eqn):
             why = reason(_function_of([eqn], eqn.outvars, jaxpr, known)[0])
+        # A function that is called, with a loop in it, is cut in turn.
         if why is not None and eqn.primitive.name in CALLS and _has_loop(eqn):
             groups += [_Group([eqn], why, is_call=True), _Group()]
             continue
         loops = why is None and _has_loop(eqn)
         group = groups[-1]
+        # A loop that can be compiled does not share a piece with what cannot.
         if (loops and group.reason is not None) or (why is not None and group.loops):
             group = _Group()
             groups.append(group)
@@ -59,6 +62,7 @@ def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> 
         group.reason = group.reason or why
     found: list[Piece] = []
     needed = {v for v in jaxpr.outvars if not isinstance(v, Literal)}
+    # Backwards: what a piece has to give is what later ones read.
     for group in reversed(groups):
         writes = [v for eqn in group.eqns for v in eqn.outvars if v in needed]
         if not writes:
@@ -70,6 +74,7 @@ def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> 
             (part,) = bodies(eqns[0])
             reads, writes = eqns[0].invars, eqns[0].outvars
             needed |= {v for v in reads if not isinstance(v, Literal)}
+        # Without a loop XLA is as fast, and a call less is made.
         why = group.reason or (None if group.loops else "no loop in it")
         found.append(Piece(part, tuple(reads), tuple(writes), why, group.is_call))
     return found[::-1]

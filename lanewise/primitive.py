@@ -17,6 +17,7 @@ from .extent import carried, operation_count
 from .ir import Unsupported
 from .jaxapi import (
     ClosedJaxpr,
+    batch_in_front,
     drops_outputs,
     has_derivative,
     linear_map,
@@ -84,6 +85,7 @@ def call(function: Callable, *args: Any, layout: Layout = AUTO) -> Any:
     too.
     """
     leaves, tree = jax.tree.flatten(args)
+    # Traced here, for one trajectory: `vmap` outside only reaches the primitive.
     traced = Traced.of(function, leaves, tree)
     program = Program(traced, layout)
     # What is traced outside and closed over is an input like the others.
@@ -186,6 +188,7 @@ def _on_cpu(*operands, program: Program, lanes: int | None, on: tuple[bool, ...]
     try:
         name, params = compiled(program, on, lanes)
     except Unsupported as reason:
+        # This is for developers of the compiler; users have `explain`.
         if os.environ.get("LANEWISE_LOG"):
             print("left to XLA:", reason, flush=True)
         found = pieces_of(program, lanes or 1) if lanes != 0 else []
@@ -234,6 +237,8 @@ def compiled(
         raise Unsupported("a batch of no trajectories")
     module, text = kernel_of(program, on, 1 if lanes is None else lanes, vectors)
     name = handler.registered(handler.module_text(text, module.W * module.U))
+    # Decides whether threads are worth while: operations of a block, times rounds of its longest
+    # loop.
     cost = max(module.b.operations * max([1, *module.values]), 1)
     outs = program.traced.closed.out_avals
     sizes = [a.size * a.dtype.itemsize for a in outs]
@@ -247,6 +252,7 @@ def kernel_of(
     if program.layout.form == "arrays":
         raise Unsupported('the layout has form="arrays"')
     closed = program.traced.all_inputs
+    # Counted before code is written, which would take minutes for the largest functions.
     count = operation_count(closed.jaxpr)
     if count > MOST_OPERATIONS:
         raise Unsupported(f"a function of {count} operations")
@@ -266,11 +272,14 @@ def kernel_of(
 def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
     """(W, U): numbers in a vector, vectors in a block, for so many trajectories."""
     width = machine.width() if width is None else width
+    # A block has no more trajectories than the batch: the last block could not end with the last
+    # one.
     while width > lanes:
         width //= 2
     vectors = 1
     if lanes >= most * width:
         return width, most
+    # A power of two here, so that batches of different small sizes share code.
     while 2 * vectors <= most and 2 * vectors * width <= lanes:
         vectors *= 2
     return width, vectors
@@ -278,6 +287,8 @@ def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
 
 def vectors_for(carried: int, operations: int) -> int:
     """Vectors in a block: enough to hide latency, few enough that the state stays in registers."""
+    # A short step has few independent operations: several vectors hide the latency of its
+    # divisions. A long one has many, and more vectors would need more registers than there are.
     if operations < 150:
         return max(1, min(8, 32 // max(carried, 1)))
     if operations < 800 and carried <= 12:
@@ -298,14 +309,11 @@ _through_xla.shape_of = _shape_of  # pyright: ignore[reportFunctionMemberAccess]
 def _batched(operands, axes, *, program: Program, lanes: int | None, on: tuple[bool, ...]):
     """One more axis of trajectories: all of them become one."""
     batched = [axis is not None for axis in axes]
-    moved = [
-        x if axis is None else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(operands, axes, strict=True)
-    ]
-    (size,) = {x.shape[0] for x, b in zip(moved, batched, strict=True) if b}
+    size, moved, _ = batch_in_front(operands, axes)
     if lanes is None:
         outs = _lanewise.bind(*moved, program=program, lanes=size, on=tuple(batched))
         return outs, [0] * len(outs)
+    # One batch of all trajectories: nested batches need no rule of their own.
     merged = [_merge(x, b, o, size, lanes) for x, b, o in zip(moved, batched, on, strict=True)]
     either = tuple(b or o for b, o in zip(batched, on, strict=True))
     outs = _lanewise.bind(*merged, program=program, lanes=size * lanes, on=either)
@@ -329,6 +337,7 @@ def _derivative(primals, changes: dict[int, Any], **params):
     def is_real(x: Any) -> bool:
         return jnp.issubdtype(x.dtype, jnp.inexact)
 
+    # Outside of `jax.shard_map` JAX's own rules do everything.
     if not manual_axes(*primals, *moving):
         of = functools.partial(moved, primals)
         outs, tangents = jax.jvp(of, [primals[i] for i in changes], moving)
@@ -356,6 +365,7 @@ has_derivative(_lanewise, _derivative)
 
 def _eagerly(*operands, **params):
     """Outside of `jit`: as under it, where that is not switched off."""
+    # A user who switches compilation off wants to see the operations of the function.
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return _through_xla(*operands, **params)
     key = tuple(sorted(params.items(), key=lambda item: item[0]))

@@ -61,6 +61,7 @@ def dot(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Val
     (of_a, of_c), (batch_a, batch_c) = eqn.params["dimension_numbers"]
     dtype = str(out.aval.dtype)
     same = a.dtype == dtype and c.dtype == dtype and dtype != "bool"
+    # As `preferred_element_type` requires it.
     wider = dtype == "float64" and {a.dtype, c.dtype} <= {"float64", "float32"}
     if not (same or wider):
         raise Unsupported(f"a product of {a.dtype} and {c.dtype} arrays")
@@ -72,6 +73,8 @@ def dot(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Val
     results = []
     for rows, columns in zip(x, y, strict=True):
         for row, column in ((row, column) for row in rows for column in columns):
+            # A zero of the structure, which vanishes: the first term needs no addition. The sum
+            # over nothing is a zero like any other: times NaN it is NaN.
             total = e.b.known(0, dtype, structural=contracted > 0)
             for u, v in zip(row, column, strict=True):
                 u, v = e.b.convert(u, dtype), e.b.convert(v, dtype)

@@ -39,6 +39,8 @@ class Waiting:
         apart = all(r.lane not in (None, 1) and r.dtype != "bool" for r in results)
         in_order = all(r.strides == contiguous(r.shape) for r in results)
         width = sum(math.prod(r.shape[1:]) for r in results)
+        # Wide rows fill cache lines by themselves, and the memory for waiting would not stay in the
+        # cache.
         if evaluator.b.W == 1 or not (apart and in_order and 0 < width <= 8):
             return None
         count = 32 if width <= 2 else 16 if width <= 4 else 8
@@ -68,6 +70,7 @@ class Waiting:
             b.loop([start], [False], lambda state, _: b.less(state[0], stop), row)
             return []
 
+        # The last portion may be shorter; its rows are written one by one.
         is_whole = b.compare("eq", b.sub(stop, start), count)
         b.branch(b.ref(is_whole, 0, False), whole, some, [], [])
 
@@ -89,6 +92,7 @@ class Rounds:
         """What is carried after all rounds of a loop with this body."""
         e, b = self.e, self.e.b
         with e.assuming(None):
+            # What the attempt has written is removed if an assumption turns out to be impossible.
             if self.length > 1 and may_assume(jaxpr):
                 mark = b.mark()
                 try:
@@ -140,7 +144,10 @@ class Rounds:
         if self.waiting is not None:
             size = b.known(self.waiting.count, "int64")
         else:
+            # Portions of equal length: a last one of few rounds would be checked as often as a full
+            # one.
             size = e.kernel.parameter(-(-self.length // -(-self.length // _PORTION)))
+        # Memory for a copy of the state, from which a portion is repeated.
         aside = [e.kernel.scratch((), x.dtype, v).base for x, v in zip(numbers, vec, strict=True)]
         changed: list[bool] = []
 

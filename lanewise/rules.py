@@ -85,6 +85,7 @@ def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.nd
     elsewhere.
     """
     rule, params = MOVES[name], {k: v for k, v in params.items() if k not in _ABOUT_DEVICES}
+    # A later release of JAX may add a parameter: better no code than wrong code.
     unknown = params.keys() - inspect.signature(rule).parameters.keys()
     if unknown:
         raise Unsupported(f"{name} with {', '.join(sorted(unknown))}")
@@ -92,6 +93,7 @@ def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.nd
     return out if isinstance(out, tuple) else (out,)
 
 
+# They say where an array is, not which number is where.
 _ABOUT_DEVICES = frozenset(["sharding", "out_sharding"])
 
 # Calls of one jaxpr whose inputs and outputs are those of the equation.

@@ -46,6 +46,7 @@ class Value:
         if self.entries is not None:
             return any(x.vec for x in self.entries.flat)
         assert self.buffer is not None
+        # Shared memory at an index that varies gives numbers that vary.
         moving = any(isinstance(x, Num) and x.vec for x in self.buffer.offset)
         return self.buffer.lane is not None or moving
 
@@ -62,6 +63,7 @@ class Value:
 def objects(entries: Sequence[Any], shape: Sequence[int]) -> Entries:
     """An object array of these entries, in row-major order."""
     flat = np.empty(len(entries), object)
+    # Not np.array(entries): it would look for sequences in them.
     for i, entry in enumerate(entries):
         flat[i] = entry
     return flat.reshape(tuple(shape))

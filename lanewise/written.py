@@ -48,6 +48,7 @@ def lu(a: Array, **_) -> tuple[Array, Array, Array]:
     rows = [[a[i, j] for j in range(n)] for i in range(n)]
     order, pivots = [jnp.int32(i) for i in range(n)], []
     for c in range(n):
+        # Exchanges are selections: the pivot differs between trajectories.
         best, pivot = jnp.abs(rows[c][c]), jnp.int32(c)
         for i in range(c + 1, n):
             larger = jnp.abs(rows[i][c]) > best
@@ -64,6 +65,7 @@ def lu(a: Array, **_) -> tuple[Array, Array, Array]:
             order[c], order[i] = lax.select(here, second, first), lax.select(here, first, second)
         for i in range(c + 1, n):
             factor = rows[i][c] / rows[c][c]
+            # As LAPACK: a column of zeros is left as it is.
             rows[i][c] = lax.select(rows[c][c] == 0, rows[i][c], factor)
             for j in range(c + 1, n):
                 rows[i][j] = rows[i][j] - rows[i][c] * rows[c][j]
@@ -119,6 +121,7 @@ def sort(*arrays: Array, dimension: int, num_keys: int, **_) -> list[Array]:
     if n > MOST_SORTED:
         raise Unsupported(f"sort of {n} numbers")
     items = [[lax.index_in_dim(x, i, dimension, False) for x in arrays] for i in range(n)]
+    # Exchanges at fixed places, whatever the numbers are: odd and even neighbours in turn.
     for turn in range(n):
         for i in range(turn % 2, n - 1, 2):
             a, b = items[i], items[i + 1]
@@ -130,6 +133,7 @@ def sort(*arrays: Array, dimension: int, num_keys: int, **_) -> list[Array]:
 
 def _before(x: Sequence[Array], y: Sequence[Array]) -> Array:
     """Whether x comes before y and not at one place with it; −0 equals 0, NaN is last."""
+    # From the last key to the first, which decides unless it is equal.
     before = jnp.zeros(x[0].shape, bool)
     for a, b in reversed(list(zip(x, y, strict=True))):
         both_nan = (a != a) & (b != b)
@@ -152,8 +156,10 @@ def nextafter(x: Array, y: Array) -> Array:
     kind = jnp.dtype(f"int{8 * x.dtype.itemsize}")
     bits = lax.bitcast_convert_type(x, kind)
     away = (x < y) == (x > 0)
+    # Neighbouring floats have neighbouring bits, in order of their size.
     moved = lax.bitcast_convert_type(bits + lax.select(away, kind.type(1), kind.type(-1)), x.dtype)
     least = lax.bitcast_convert_type(jnp.ones((), kind), x.dtype)
+    # 0 and −0 are one number with two patterns of bits.
     moved = lax.select(x == 0, lax.select(y > 0, least, -least), moved)
     moved = lax.select(x == y, y, moved)
     return lax.select((x != x) | (y != y), x + y, moved)

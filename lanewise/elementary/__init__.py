@@ -30,8 +30,8 @@ all coefficients again.
 
 The errors hold whether or not a compiler contracts a product and a sum into a fused multiply-add:
 a product that must be exact has few enough bits. Sums must not be reassociated. XLA does this with
-constants, (x + c) − d = x + (c − d), which the functions avoid. They are right for subnormal numbers
-too, but XLA runs all code on a CPU with subnormal numbers replaced by 0; generated code as well.
+constants, (x + c) − d = x + (c − d), which the functions avoid. They are right for subnormal
+numbers too; XLA runs all code on a CPU, generated code as well, with these replaced by zero.
 """
 
 from collections.abc import Callable

@@ -142,6 +142,7 @@ def _sines(r: Array, y: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]
 
 def _sine(s: Array, c: Array, bits: Array, x: Array) -> Array:
     """sin x from sin and cos of the reduced argument: s, c, −s, −c for k = 0, 1, 2, 3 mod 4."""
+    # An odd quadrant exchanges sine and cosine; the second bit of k is the sign.
     value = lax.select((bits & np.int64(1)) != 0, c, s)
     return float_of(bits_of(value) ^ (((bits << 62) ^ bits_of(x)) & SIGN))
 
@@ -183,6 +184,8 @@ def tan(x: Array) -> Array:
     is_odd = (bits & np.int64(1)) != 0
     above, d_above = lax.select(is_odd, c, s), lax.select(is_odd, dc, ds)
     below, d_below = lax.select(is_odd, s, c), lax.select(is_odd, ds, dc)
+    # Without the rounding errors of both, which enter in first order, the quotient has a larger
+    # error.
     quotient = above / below
     value = quotient + (d_above - quotient * d_below) / below
     return float_of(bits_of(value) ^ (((bits << 63) ^ bits_of(x)) & SIGN))
@@ -194,6 +197,7 @@ def _angle(y: Array, x: Real) -> Array:
     In the first octant, n ≤ d,  atan(n/d) = atan c + atan t,  t = (n − c d)/(d + c n), with
     c = 0, 1/2 or 1, so that |t| ≤ 0.3; in the second π/2 − atan(d/n).
     """
+    # Each angle in the first octant, where the series converges fast.
     is_steep = y > x
     n, d = where(is_steep, x, y), where(is_steep, y, x)
     low, high = n < 0.3 * d, n > 0.8345 * d
@@ -221,6 +225,7 @@ def atan(x: Array) -> Array:
 def atan2(y: Array, x: Array) -> Array:
     """Angle of the point (x, y), in [−π, π]."""
     n, d = lax.abs(y), lax.abs(x)
+    # n − c d and d + c n must neither overflow nor lose digits.
     larger = where(n > d, n, d)
     is_ordinary = (larger < 2.0**1000) & (larger > 2.0**-900)
 
@@ -242,6 +247,8 @@ def atan2(y: Array, x: Array) -> Array:
 def _arc(size: Array) -> tuple[Array, Array, Array]:
     """(size > 1/2, s, d): s + d = asin(size), or asin √((1 − size)/2) for size > 1/2."""
     is_steep = size > 0.5
+    # Near 1 the slope of asin is infinite; asin x = π/2 − 2 asin √((1 − x)/2) moves the argument
+    # away.
     half = 0.5 * (1.0 - size)
     z = where(is_steep, half, size * size)
     s = where(is_steep, lax.sqrt(half), size)

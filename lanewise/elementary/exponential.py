@@ -55,6 +55,7 @@ def scaled(value: Array, bits: Array) -> Array:
 
 def scaled_twice(value: Array, bits: Array) -> Array:
     """`value` 2^k for |k| ≤ 2000, with one rounding at the end if the result is subnormal."""
+    # In two steps, because 2^k itself may be outside of the range.
     half = shift_right(bits, 1)  # k/2 in the last bits; those above are shifted out
     return (value * _power_of_two(half)) * _power_of_two(bits - half)
 
@@ -137,6 +138,7 @@ def _exp_half(size: Array) -> Array:
 def sinh(x: Array) -> Array:
     """Hyperbolic sine: with t = e^|x| − 1, (t + t/(t + 1))/2."""
     size = lax.abs(x)
+    # From e^x − 1 and not from e^x, which would cancel for small x.
     t, dt = fast_two_sum(*_expm1_terms(size))
     n, dn = two_sum(t, np.float64(1.0))
     quotient = t / n

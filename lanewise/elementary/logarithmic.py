@@ -44,6 +44,7 @@ def _log_sum(x: Array, e: Array | None = None, shift: float = 0.0) -> Array:
 
     and 1/(1 + f) = (1 − s)/(1 + s) by the first terms of its series.
     """
+    # m near 1 on both sides, so that k log 2 and log m do not cancel.
     k, m = _normalised(x)
     k = k + shift if shift else k
     f = m - 1.0
@@ -206,6 +207,7 @@ def _pow_extreme(x: Array, y: Array) -> Array:
     value = where(is_limit, where(is_0 ^ (y < 0.0), 0.0, math.inf), value)
     is_integer = lax.floor(y) == y
     half = 0.5 * y
+    # A negative x to an odd power is negative; to a power that is no integer it is NaN.
     is_odd = is_integer & (lax.floor(half) != half)
     value = where(is_odd & (bits_of(x) < 0), -value, value)
     value = where((x < 0.0) & ~(is_limit | is_integer), math.nan, value)
@@ -254,6 +256,7 @@ def cbrt(x: Array) -> Array:
         v = m * where(j > 0.5, where(j > 1.5, 4.0, 2.0), 1.0)
         start = where(j > 0.5, where(j > 1.5, 4.0 ** (-1 / 3), 2.0 ** (-1 / 3)), 1.0)
         y = polynomial(m, tables.CBRT) * start
+        # One step of third order takes the 14 bits of the polynomial to some 40.
         h = 1.0 - (v * y) * (y * y)
         y = y + y * h * (1 / 3 + 2 / 9 * h)
         square = y * y
