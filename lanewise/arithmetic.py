@@ -84,14 +84,13 @@ class Arithmetic(Writer):
                 return self.neg(self.mul(x.args[0], y))
         return self._commute("mul", a, b, "fmul")
 
-    def _factors(self, x: Num) -> tuple[Num, ...] | None:
+    def _factors(self, x: Num) -> tuple[Num, Num] | None:
         """The factors of a number that is a product, or the negative of one."""
-        if x.op == "mul":
-            return x.args
-        if x.op == "neg" and x.args[0].op == "mul":
-            a, b = x.args[0].args
-            return self.neg(a), b
-        return None
+        product = x.args[0] if x.op == "neg" else x
+        if product.op != "mul":
+            return None
+        a, b = product.args
+        return (a, b) if product is x else (self.neg(a), b)
 
     def _joined_factors(self, c: Num, x: Num) -> tuple[Num, Num] | None:
         """(c·d, y) for c and x = d·y with c and d known, where c·(d·y) = (c·d)·y to the bit and no

@@ -1,9 +1,9 @@
 """Loops that are first run on the assumption that no rare branch is needed.
 
-A step that looks every time whether something has failed spends much of its time on looking. So
-some steps are run without: what would have been looked at is collected, and where one trajectory of
-the block should have taken a branch, those steps are run again with all branches, from where they
-began. The numbers are the same to the bit in both.
+A step that tests each time whether something has failed spends much of its time on tests. So some
+steps are run without branches, and their conditions are collected. If one trajectory of the block
+should have taken a branch, these steps are repeated with all branches from the same state. The
+numbers are the same to the bit in both.
 """
 
 from collections.abc import Sequence
@@ -16,12 +16,13 @@ from .jaxapi import Jaxpr, bodies
 
 
 class NotAssumable(Exception):
-    """Something stands in the way of running a loop without its branches."""
+    """A loop that cannot be run without its branches."""
 
 
 def taken_for(b: Builder, value: int, dtype: str) -> Num:
-    """A number whose value decides a branch while the code is written. The results of that branch
-    are marked as results of a branch, so that they have the same bits as in the full version."""
+    """A number whose assumed value decides a branch while the code is written."""
+    # Not a known number: the results of the branch are marked as results of a branch, so that they
+    # have the same bits as in the version with all branches.
     return b.made([str(int(value))], dtype, False, "taken for", (b.known(value, dtype),))
 
 
@@ -51,7 +52,7 @@ class Assumed:
         self.at_the_end: list[int] = []
 
     def never(self, x: Num) -> None:
-        """A truth value is taken for false on all trajectories."""
+        """Assume that a truth value is false on all trajectories."""
         b = self.b
         if x.known is not None:
             # It is true on every trajectory: the round without branches would always be repeated.
@@ -87,7 +88,7 @@ class Assumed:
             self.never(self.b.invert(flag))
         return taken_for(self.b, max(yes.known, no.known), x.dtype)
 
-    def leave_to_the_end(self, before: Sequence[Num], after: Sequence[Num]) -> None:
+    def defer(self, before: Sequence[Num], after: Sequence[Num]) -> None:
         """Find numbers that need a check after the last round only.
 
         If such a number is finite after a round, then so are all numbers that must be finite in
@@ -128,7 +129,7 @@ class Assumed:
         return b.logic("or", before, b.made([b.any(total)], "bool", False))
 
     def wrong_at_the_end(self, before: Num, numbers: Sequence[Num]) -> Num:
-        """The same after the last round, with the checks that were left to it."""
+        """The same after the last round, with the checks that were deferred to it."""
         b = self.b
         for dtype in ("float32", "float64"):
             some = [numbers[i] for i in self.at_the_end if numbers[i].dtype == dtype]

@@ -29,7 +29,7 @@ def key(*parts: Any) -> str:
 
 
 def folder() -> Path | None:
-    """Where machine code is kept, None where it is not."""
+    """The folder of machine code, None if the cache is switched off."""
     named = os.environ.get(VARIABLE, "").strip()
     if named.lower() in ("off", "0", "no", "false"):
         return None
@@ -53,7 +53,7 @@ def _is_safe(path: Path) -> bool:
 
 
 def read(name: str) -> bytes | None:
-    """The code under a name, None if there is none, or none that can be trusted."""
+    """The code under a name, None if there is none, or if its file or folder is not safe."""
     where = folder()
     if where is None:
         return None
@@ -82,7 +82,7 @@ def _checksum(name: str, code: bytes) -> bytes:
 
 
 def write(name: str, code: bytes) -> None:
-    """Keep the code under a name, if that can be done."""
+    """Store the code under a name, if the folder can be written and is safe."""
     where = folder()
     if where is None:
         return

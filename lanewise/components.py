@@ -121,7 +121,7 @@ class Evaluator:
         rule = ELEMENTWISE.get(name)
         if rule is not None:
             return [self._elementwise(eqn, values, rule)]
-        # Last, because tracing takes longer than a look at the tables.
+        # Last, because tracing takes longer than the tables above.
         written = WRITTEN.get(name)
         if written is not None:
             body = jax.make_jaxpr(functools.partial(written, **eqn.params))
@@ -419,7 +419,7 @@ def _sines_and_cosines(jaxpr: Jaxpr) -> set[int]:
     return {eqn for _, x, eqn in taken if x in sines & cosines}
 
 
-# What uses a Jacobian up: its result is no tangent any more.
+# Linear solves: the result of one is a change of the state and not a derivative any more.
 _ENDS = frozenset(["custom_linear_solve", "eliminate"])
 
 _SPECIAL: dict[str, Callable] = {

@@ -1,4 +1,4 @@
-"""What becomes of a function: operations, vectors, blocks, and what is left to XLA."""
+"""How a function is compiled: operations, vectors, blocks, and the parts that XLA computes."""
 
 import dataclasses
 import re
@@ -20,7 +20,7 @@ from .traced import Traced
 class Part:
     """One call that is compiled as a whole.
 
-    - `reason`: why it is left to XLA, None where machine code is generated.
+    - `reason`: why XLA computes it, None where machine code is generated.
     - `operations`: on numbers of one trajectory, loops counted once; a fused multiply-add is one.
     - `width`, `vectors`: numbers in a vector, vectors in a block.
     - `scratch`: bytes of a block for rows that are not results.
@@ -110,7 +110,7 @@ def _calls(jaxpr: Any) -> list[Any]:
 
 
 def _parts(program: Any, batch: int) -> list[Part]:
-    """What becomes of a program; its pieces where it is not compiled as a whole."""
+    """How a program is compiled; its pieces if it is not compiled as a whole."""
     count = len(program.traced.all_inputs.jaxpr.invars)
     try:
         module, text = kernel_of(program, [True] * count, batch)

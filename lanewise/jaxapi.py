@@ -20,13 +20,13 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 
 def is_traced(x: object) -> bool:
-    """Whether `x` stands for a value that is not known yet (inside jit, vmap, grad, …)."""
+    """Whether the value of `x` is not known yet (inside jit, vmap, grad, …)."""
     return isinstance(x, Tracer)
 
 
 def batch_size(values: Iterable[Any]) -> tuple[int, bool]:
-    """How many elements the batches of `vmap` have that these values stand for, all together; and
-    whether the values are those of a function that is compiled, around which there may be more."""
+    """The number of elements of all batches of `vmap` around these values; and whether they are
+    values of a function that is compiled, around which there may be more batches."""
     sizes: dict[Any, int] = {}
     is_compiled = False
     for x in values:
@@ -50,7 +50,7 @@ def x64_enabled() -> bool:
 
 def backends_are_initialized() -> bool:
     """Whether JAX has started, and read its environment variables."""
-    from jax._src import xla_bridge  # no public name tells
+    from jax._src import xla_bridge  # there is no public name
 
     return xla_bridge.backends_are_initialized()
 
@@ -68,7 +68,7 @@ def bodies(eqn: Any) -> Iterator[ClosedJaxpr]:
 
 
 def _expanded(eqn: Any) -> ClosedJaxpr:
-    """What an equation stands for that is itself no operation yet."""
+    """The jaxpr of an equation that is expanded late."""
     which = eqn.params["_prim"]
 
     def function(*leaves):
@@ -180,7 +180,7 @@ def drops_outputs(of: Primitive, without: Callable) -> None:
 def has_derivative(of: Primitive, rule: Callable) -> None:
     """Give a primitive of several outputs a derivative: ``rule(primals, changes, **params)`` →
     (outputs, their changes), where `changes` has those of the operands that change, by position,
-    and None stands for an output that does not."""
+    and None for an output that does not change."""
 
     def both(primals, tangents, **params):
         changes = {i: t for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)}

@@ -20,8 +20,8 @@ def solve(A: Array, b: Array) -> Array:
 
     Linear in b and differentiable in both. In machine code this is Gaussian elimination in which
     zeros by the structure of A stay zeros (a band stays a band); rows are exchanged on those
-    trajectories where a pivot is small beside the numbers below it. A singular matrix gives
-    infinities or NaN, for the caller's status to report.
+    trajectories where a pivot is small compared with the numbers below it. A singular matrix gives
+    infinities or NaN, which the caller has to check.
     """
     if A.ndim != 2 or A.shape[0] != A.shape[1] or b.shape != A.shape[:1]:
         raise ValueError(

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .components import Evaluator
 
 
-# Primitives whose result is the same on all trajectories, whatever goes in.
+# Primitives whose result is the same on all trajectories, even if the operands differ.
 AGREED = frozenset(["least_over_lanes"])
 
 
@@ -51,7 +51,7 @@ def scan(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Va
     jaxpr, row_avals = body.jaxpr, [v.aval for v in eqn.outvars[num_carry:]]
     if length == 0:
         return [*carry, *(Value(a.shape, a.dtype, np.empty(a.shape, object)) for a in row_avals)]
-    # What a round hands on as it came is no part of the state: it stays a constant, or a scalar.
+    # A carry that no round changes is not carried: it stays a constant, or a scalar.
     carry_in = jaxpr.invars[num_consts : num_consts + num_carry]
     moves = [o is not i for o, i in zip(jaxpr.outvars[:num_carry], carry_in, strict=True)]
 

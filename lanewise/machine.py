@@ -103,7 +103,7 @@ def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
         code = object_code(ir)
         cache.write(key, code)
     engine = _engine()
-    # An empty module with the key as its name makes the engine ask its object cache for the code.
+    # An empty module with the key as its name makes the engine read the code from its object cache.
     empty = llvm.parse_assembly("")
     empty.name = key
     _codes[key] = code

@@ -347,7 +347,7 @@ def _shuffled(b: Builder, x: str, length: int, order: Sequence[int], item: str) 
 
 
 def transposed(b: Builder, source: Buffer, target: Buffer) -> None:
-    """Copy all elements of `source`, whose vectors lie in memory as such, to the first ones of
+    """Copy all elements of `source`, whose vectors are contiguous, to the first ones of
     `target`, where those of one trajectory are neighbours. The size is a multiple of the width."""
     item, W = TYPES[source.dtype], b.W
     moving, fixed = _offset(b, target, 0)

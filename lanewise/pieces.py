@@ -35,8 +35,8 @@ class Piece:
 def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> list[Piece]:
     """The pieces of a function, in the order in which they are computed.
 
-    `reason` tells why no code can be generated for a function, None if it can. A loop, a branch or
-    a linear solve is never cut: it is in one piece with all that it calls. Code is generated for
+    `reason` returns why no code can be generated for a function, None if it can be. A loop, a branch
+    or a linear solve is never cut: it is in one piece with all that it calls. Code is generated for
     pieces with a loop; what is between them goes with the piece before it.
     """
     jaxpr = closed.jaxpr
@@ -44,7 +44,7 @@ def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> 
     groups = [_Group()]
     for eqn in jaxpr.eqns:
         why = None
-        # Trying takes a trace and an evaluation: only where the name and the types do not tell.
+        # An attempt takes a trace and an evaluation: only if names and types do not decide it.
         if not _is_simple(eqn):
             why = reason(_function_of([eqn], eqn.outvars, jaxpr, known)[0])
         # A function that is called, with a loop in it, is cut in turn.

@@ -1,4 +1,4 @@
-"""The primitive: a function of one trajectory, whose batch under `vmap` becomes machine code."""
+"""The primitive of JAX for a function of one trajectory; under `vmap` it becomes machine code."""
 
 import dataclasses
 import functools
@@ -237,8 +237,8 @@ def compiled(
         raise Unsupported("a batch of no trajectories")
     module, text = kernel_of(program, on, 1 if lanes is None else lanes, vectors)
     name = handler.registered(handler.module_text(text, module.W * module.U))
-    # Decides whether threads are worth while: operations of a block, times rounds of its longest
-    # loop.
+    # The operations of a block, times the rounds of its longest loop: with few of them the threads of
+    # XLA's pool would take longer to start than to work.
     cost = max(module.b.operations * max([1, *module.values]), 1)
     outs = program.traced.closed.out_avals
     sizes = [a.size * a.dtype.itemsize for a in outs]
@@ -326,7 +326,7 @@ lower_on("cpu", _lanewise, _on_cpu)
 
 
 def _derivative(primals, changes: dict[int, Any], **params):
-    """The derivative of what the program stands for, computed by XLA."""
+    """The derivative of the function, computed by XLA."""
     moving = list(changes.values())
     function = _in_jax(**params)
 
@@ -389,7 +389,7 @@ drops_outputs(_lanewise, _without)
 
 
 def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> Any:
-    """Two axes of trajectories in front as one; one that is missing is filled with copies."""
+    """Join two leading axes of trajectories; the array is repeated along a missing one."""
     if not (has_outer or has_inner):
         return x
     if not has_outer:

@@ -35,7 +35,7 @@ class Waiting:
 
     @classmethod
     def of(cls, evaluator: "Evaluator", results: Sequence[Buffer], length: int) -> "Waiting | None":
-        """For results of a loop with `length` rounds, if it is worth while."""
+        """For results of a loop with `length` rounds, None where waiting saves no time."""
         apart = all(r.lane not in (None, 1) and r.dtype != "bool" for r in results)
         in_order = all(r.strides == contiguous(r.shape) for r in results)
         width = sum(math.prod(r.shape[1:]) for r in results)
@@ -158,7 +158,7 @@ class Rounds:
                 k, failed, *before = state
                 with e.assuming(found):
                     after = self.round_of(before, k, start)
-                found.leave_to_the_end(before, after)
+                found.defer(before, after)
                 changed.extend(x is not y for x, y in zip(before, after, strict=True))
                 return [b.add(k, b.known(1, "int64")), found.wrong(failed), *after]
 

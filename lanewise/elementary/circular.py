@@ -98,7 +98,7 @@ def _reduced_huge(size: Array, *_: Array) -> tuple[Array, Array, Array]:
     high, low = (columns[4] << 32) | columns[3], (columns[2] << 32) | columns[1]
     k = shift_right(high + np.int64(2**61), 62)
 
-    # The fraction as a signed number of 126 bits; −1 − x stands for −x, an error of 2^−126.
+    # The fraction as a signed number of 126 bits. −x is computed as −1 − x: an error of 2^−126.
     high, low = (high << 2) | shift_right(low, 62), low << 2
     sign = high & SIGN
     is_negative = lax.neg(shift_right(high, 63))

@@ -207,7 +207,7 @@ def _pow_extreme(x: Array, y: Array) -> Array:
     value = where(is_limit, where(is_0 ^ (y < 0.0), 0.0, math.inf), value)
     is_integer = lax.floor(y) == y
     half = 0.5 * y
-    # A negative x to an odd power is negative; to a power that is no integer it is NaN.
+    # A negative x to an odd power is negative; to a power that is not an integer it is NaN.
     is_odd = is_integer & (lax.floor(half) != half)
     value = where(is_odd & (bits_of(x) < 0), -value, value)
     value = where((x < 0.0) & ~(is_limit | is_integer), math.nan, value)
