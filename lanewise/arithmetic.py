@@ -111,6 +111,7 @@ class Arithmetic(Writer):
         return (self.known(both, x.dtype), y) if two and normal else None
 
     def fma(self, a: Num, b: Num, c: Num) -> Num:
+        # fma(−a, b, c) has one instruction, whatever operand the sign belongs to.
         if a.op == "neg" and b.op == "neg":
             a, b = a.args[0], b.args[0]
         elif b.op == "neg":
@@ -264,6 +265,7 @@ class Arithmetic(Writer):
             return yes if which.known else no
         if yes is no or yes.key == no.key:
             return no
+        # The same choice as one that may have been made: it is found again by its key.
         if which.op == "not":
             return self.select(which.args[0], no, yes)
         if yes.dtype == "bool":

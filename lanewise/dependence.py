@@ -13,8 +13,8 @@ def depends_on(function: Callable[..., Any], argnum: int, *args: Any) -> bool:
     """Whether any output of ``function(*args)`` can depend on the values in ``args[argnum]``.
 
     A value may depend on another one with a derivative of zero: sign(p) depends on p. The result is
-    True where it is not certain, as for primitives whose body is unknown. `args` are arrays or shape
-    structs: only shapes and types matter.
+    True where it is not certain, as for primitives whose body is unknown. `args` are arrays or
+    shape structs: only shapes and types matter.
     """
     before = len(jax.tree.leaves(args[:argnum]))
     count = len(jax.tree.leaves(args[argnum]))

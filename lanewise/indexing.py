@@ -75,6 +75,7 @@ def _pick(e: "Evaluator", value: Value, index: Num) -> Num:
     b = e.b
     if index.known is not None and value.entries is not None:
         return value.entries.flat[int(index.known)]
+    # Selections among a few numbers in registers take less time than a way through memory.
     if value.entries is not None and value.size <= 8:
         result = value.entries.flat[0]
         for i in range(1, value.size):
@@ -215,6 +216,7 @@ def scatter(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list
             if "clip" not in mode:
                 inside = b.logic("and", inside, b.compare("eq", clipped, start))
             moving[d] = clipped
+        # An update that is known to lie outside writes no code.
         if inside.known is not None and not inside.known:
             continue
         for i in np.ndindex(value.shape):

@@ -96,7 +96,7 @@ class Writer:
         return f"%v{next(self._names)}"
 
     def new(self, instruction: str) -> str:
-        name = self.name()
+        name = f"%v{next(self._names)}"
         self.lines.append(f"  {name} = {instruction}")
         return name
 
@@ -169,6 +169,7 @@ class Writer:
 
     def unrelated(self, x: Num) -> Num:
         """The number treated as a result of a loop: not even a constant is known any more."""
+        # Integers stay known: they decide indices and branches, and have no rounding.
         if x.known is None or not x.is_float:
             return self.opaque(x)
         return self.made([literal(x.known, x.dtype)], x.dtype, False)
@@ -201,20 +202,22 @@ class Writer:
 
     def op(self, op: str, args: Sequence[Num], dtype: str, write: Callable[..., str]) -> Num:
         """The number made by the instruction ``write(type of the operands, *names)``."""
-
-        def make() -> Num:
-            vec = any(a.vec for a in args)
-            t = self.type(args[0].dtype, vec)
-            self.operations += 1
-            names = [
-                self.new(write(t, *(self.ref(a, u, vec) for a in args)))
-                for u in range(self.U if vec else 1)
-            ]
-            made = self.made(names, dtype, vec, op, tuple(args))
-            made.write = write
-            return made
-
-        return self.once((op, dtype, *(a.key for a in args)), make)
+        # Most of the time of the compiler is spent here: no further function is called.
+        key = (op, dtype, *(a.key for a in args))
+        found = self.find(key)
+        if found is not None:
+            return found
+        vec = any(a.vec for a in args)
+        t = self.type(args[0].dtype, vec)
+        self.operations += 1
+        names = [
+            self.new(write(t, *(self.ref(a, u, vec) for a in args)))
+            for u in range(self.U if vec else 1)
+        ]
+        made = self.made(names, dtype, vec, op, tuple(args))
+        made.write = write
+        self.note(key, made)
+        return made
 
     def instruction(self, word: str, args: Sequence[Num], op: str = "") -> Num:
         """The number made by an instruction of one word, of numbers of one type."""

@@ -35,9 +35,9 @@ class Piece:
 def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> list[Piece]:
     """The pieces of a function, in the order in which they are computed.
 
-    `reason` returns why no code can be generated for a function, None if it can be. A loop, a branch
-    or a linear solve is never cut: it is in one piece with all that it calls. Code is generated for
-    pieces with a loop; what is between them goes with the piece before it.
+    `reason` returns why no code can be generated for a function, None if it can be. A loop, a
+    branch or a linear solve is never cut: it is in one piece with all that it calls. Code is
+    generated for pieces with a loop; what is between them goes with the piece before it.
     """
     jaxpr = closed.jaxpr
     known = dict(zip(jaxpr.constvars, closed.consts, strict=True))

@@ -237,8 +237,8 @@ def compiled(
         raise Unsupported("a batch of no trajectories")
     module, text = kernel_of(program, on, 1 if lanes is None else lanes, vectors)
     name = handler.registered(handler.module_text(text, module.W * module.U))
-    # The operations of a block, times the rounds of its longest loop: with few of them the threads of
-    # XLA's pool would take longer to start than to work.
+    # The operations of a block, times the rounds of its longest loop: with few of them the threads
+    # of XLA's pool would take longer to start than to work.
     cost = max(module.b.operations * max([1, *module.values]), 1)
     outs = program.traced.closed.out_avals
     sizes = [a.size * a.dtype.itemsize for a in outs]
