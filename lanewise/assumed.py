@@ -1,26 +1,28 @@
 """Loops that are first run on the assumption that no rare branch is needed.
 
-A step that looks every time whether something has failed spends much of its time on looking. So
-some steps are run without: what would have been looked at is collected, and where one trajectory of
-the block should have taken a branch, those steps are run again with all branches, from where they
-began. The numbers are the same to the bit in both.
+A step that tests each time whether something has failed spends much of its time on tests. So some
+steps are run without branches, and their conditions are collected. If one trajectory of the block
+should have taken a branch, these steps are repeated with all branches from the same state. The
+numbers are the same to the bit in both.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
+from .builder import Builder
 from .extent import operation_count
-from .ir import Builder, Num
+from .ir import Num
 from .jaxapi import Jaxpr, bodies
 
 
 class NotAssumable(Exception):
-    """Something stands in the way of running a loop without its branches."""
+    """A loop that cannot be run without its branches."""
 
 
 def taken_for(b: Builder, value: int, dtype: str) -> Num:
-    """A number whose value decides a branch while the code is written. The results of that branch
-    are marked as results of a branch, so that they have the same bits as in the full version."""
+    """A number whose assumed value decides a branch while the code is written."""
+    # Not a known number: the results of the branch are marked as results of a branch, so that they
+    # have the same bits as in the version with all branches.
     return b.made([str(int(value))], dtype, False, "taken for", (b.known(value, dtype),))
 
 
@@ -50,19 +52,25 @@ class Assumed:
         self.at_the_end: list[int] = []
 
     def never(self, x: Num) -> None:
-        """A truth value is taken for false on all trajectories."""
+        """Assume that a truth value is false on all trajectories."""
         b = self.b
         if x.known is not None:
+            # It is true on every trajectory: the round without branches would always be repeated.
             if x.known:
                 raise NotAssumable
         elif x.op == "or" and x.dtype == "bool":
+            # Part by part, so that a test of finiteness among them joins the others in one sum.
             for part in x.args:
                 self.never(part)
         elif x.op == "not" and x.args[0].op == "and":
+            # not (a and b) = not a or not b.
             for part in x.args[0].args:
                 self.never(b.invert(part))
         elif x.op == "not" and x.args[0].op == "finite":
+            # Not tested in the round: often the state after the last round shows that they were
+            # finite.
             self.finite += b.finite_terms(x.args[0])
+        # The same test may decide several branches; once is enough.
         elif all(x.serial != other.serial for other in self.failures):
             self.failures.append(x)
 
@@ -70,6 +78,7 @@ class Assumed:
         """The least over all trajectories of ``where(flag, 0, 1)``, the flag taken for false."""
         if x.known is not None:
             return x
+        # Only the form that `on_any` writes; another integer could decide anything.
         if x.op != "select" or not all(a.known is not None for a in x.args[1:]):
             raise NotAssumable
         flag, yes, no = x.args
@@ -79,7 +88,7 @@ class Assumed:
             self.never(self.b.invert(flag))
         return taken_for(self.b, max(yes.known, no.known), x.dtype)
 
-    def leave_to_the_end(self, before: Sequence[Num], after: Sequence[Num]) -> None:
+    def defer(self, before: Sequence[Num], after: Sequence[Num]) -> None:
         """Find numbers that need a check after the last round only.
 
         If such a number is finite after a round, then so are all numbers that must be finite in
@@ -93,12 +102,14 @@ class Assumed:
             targets = terms | {before[i].serial for i in chosen}
             return targets <= b.shown(targets, [after[i] for i in chosen])
 
+        # A number that is known while the code is written cannot become infinite.
         chosen = [i for i, x in enumerate(after) if x.is_float and x.known is None]
         chosen = [i for i in chosen if b.shown(terms, [after[i]])]
         for i in tuple(chosen):  # as few as possible
             fewer = [j for j in chosen if j != i]
             if is_enough(fewer):
                 chosen = fewer
+        # Else the state may look finite at the end although a number was not: test in every round.
         if is_enough(chosen):
             self.at_the_end = chosen
         else:
@@ -111,13 +122,14 @@ class Assumed:
         b = self.b
         if not self.failures:
             return before
+        # One reduction over the trajectories of the block for all failures of a round.
         total = self.failures[0]
         for x in self.failures[1:]:
             total = b.logic("or", total, x)
         return b.logic("or", before, b.made([b.any(total)], "bool", False))
 
     def wrong_at_the_end(self, before: Num, numbers: Sequence[Num]) -> Num:
-        """The same after the last round, with the checks that were left to it."""
+        """The same after the last round, with the checks that were deferred to it."""
         b = self.b
         for dtype in ("float32", "float64"):
             some = [numbers[i] for i in self.at_the_end if numbers[i].dtype == dtype]
@@ -127,8 +139,9 @@ class Assumed:
         return before
 
 
-_LONGEST = 300
-"""A round with more operations is written once, with all branches."""
+# Two versions of a long round cost more time to compile, and more of the instruction cache, than
+# the branches take.
+_LONGEST = 300  # a round with more operations is written once, with all branches
 
 
 def may_assume(jaxpr: Jaxpr) -> bool:
@@ -139,6 +152,7 @@ def may_assume(jaxpr: Jaxpr) -> bool:
 def _asks(jaxpr: Jaxpr) -> bool:
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
+        # Branches that are often taken would make the round be repeated nearly always.
         if name == "least_over_lanes" and eqn.params["rare"]:
             return True
         if name not in ("scan", "while", "cond") and any(_asks(x.jaxpr) for x in bodies(eqn)):

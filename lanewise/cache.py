@@ -17,9 +17,9 @@ from typing import Any
 
 VARIABLE = "DVI_JAX_CACHE"
 
-LARGEST = 256 * 2**20
-"""Bytes that the folder may hold."""
+LARGEST = 256 * 2**20  # bytes that the folder may hold
 
+# The first bytes of each file: other files in a folder that the user named are not taken for code.
 _MARK = b"lanewise"
 
 
@@ -29,7 +29,7 @@ def key(*parts: Any) -> str:
 
 
 def folder() -> Path | None:
-    """Where machine code is kept, None where it is not."""
+    """The folder of machine code, None if the cache is switched off."""
     named = os.environ.get(VARIABLE, "").strip()
     if named.lower() in ("off", "0", "no", "false"):
         return None
@@ -47,12 +47,13 @@ def _is_safe(path: Path) -> bool:
     status = path.stat()
     if not hasattr(os, "getuid"):
         return True
+    # Anybody who can write to the folder could make this process run any code.
     others = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not others
 
 
 def read(name: str) -> bytes | None:
-    """The code under a name, None if there is none, or none that can be trusted."""
+    """The code under a name, None if there is none, or if its file or folder is not safe."""
     where = folder()
     if where is None:
         return None
@@ -61,6 +62,7 @@ def read(name: str) -> bytes | None:
         if not _is_safe(where):
             return None
         with path.open("rb") as file:
+            # A file in a safe folder may still have been moved there by somebody else.
             if hasattr(os, "getuid") and os.fstat(file.fileno()).st_uid != os.getuid():
                 return None
             content = file.read()
@@ -80,7 +82,7 @@ def _checksum(name: str, code: bytes) -> bytes:
 
 
 def write(name: str, code: bytes) -> None:
-    """Keep the code under a name, if that can be done."""
+    """Store the code under a name, if the folder can be written and is safe."""
     where = folder()
     if where is None:
         return
@@ -88,6 +90,7 @@ def write(name: str, code: bytes) -> None:
         where.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not _is_safe(where):
             return
+        # Renaming is atomic: another process reads the whole file or none.
         handle, made = tempfile.mkstemp(prefix=".new-", dir=where)
         try:
             with os.fdopen(handle, "wb") as file:
@@ -109,6 +112,7 @@ def _bound(where: Path) -> None:
     total = sum(size for _, size, _ in files)
     if total <= LARGEST:
         return
+    # Far below the limit, so that not each new file starts a search.
     for _, size, path in sorted(files):
         with contextlib.suppress(OSError):
             os.unlink(path)

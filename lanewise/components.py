@@ -4,29 +4,32 @@ import contextlib
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
-from . import elimination, indexing, loops
+from . import elimination, indexing, loops, reductions
 from .assumed import Assumed, taken_for
+from .builder import Builder
 from .elementwise import ELEMENTWISE
-from .ir import TYPES, Builder, Num, Unsupported
+from .ir import TYPES, Num, Unsupported
 from .jaxapi import ClosedJaxpr, Jaxpr, Literal, bodies
 from .memory import Buffer, load, load_row, store, store_row
 from .rules import CALLS, CUMULATIVE, MOVES, REDUCTIONS, VIEWS, moved
-from .values import MADE, SMALL, Entries, Kernel, Value, objects
+from .values import MADE, SMALL, Entries, Value, objects
 from .written import WRITTEN
 
-MOST_OPERATIONS = 60_000
-"""More operations than this are left to XLA, loops counted once."""
+if TYPE_CHECKING:
+    from .kernel import Module
+
+MOST_OPERATIONS = 60_000  # more operations than this are left to XLA, loops counted once
 
 
 class Evaluator:
     """One evaluation: numbers go through `b`, memory comes from `kernel`."""
 
-    def __init__(self, b: Builder, kernel: Kernel):
+    def __init__(self, b: Builder, kernel: "Module"):
         self.b, self.kernel = b, kernel
         self.assumed: Assumed | None = None
 
@@ -53,6 +56,7 @@ class Evaluator:
         wanted: Sequence[Buffer | None] | None = None,
     ) -> list[Value]:
         """The outputs. `wanted` says where outputs should be written if they are in memory."""
+        # From the variables of the jaxpr to their values.
         known: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
         known.update(zip(jaxpr.invars, values, strict=True))
         places = _places(jaxpr, wanted or [None] * len(jaxpr.outvars))
@@ -62,14 +66,17 @@ class Evaluator:
                 return self.constant(np.asarray(atom.val, atom.aval.dtype))  # pyright: ignore[reportAttributeAccessIssue]
             return known[atom]
 
+        # One call gives the sine and the cosine of a number, and costs little more than one of
+        # them.
         both = _sines_and_cosines(jaxpr)
         for eqn in jaxpr.eqns:
             inputs = [read(v) for v in eqn.invars]
             if id(eqn) in both:
-                outputs = [self.sine_or_cosine(eqn, inputs[0])]
-                known.update(zip(eqn.outvars, outputs, strict=True))
+                known[eqn.outvars[0]] = self.sine_or_cosine(eqn, inputs[0])
                 continue
             outputs = self.equation(eqn, inputs, [places.get(v) for v in eqn.outvars])
+            # What is linear in unit vectors is a derivative: its zeros stay zeros, also times
+            # infinity.
             if eqn.primitive.name not in _ENDS and any(v.is_tangent for v in inputs):
                 outputs = [self.as_tangent(v) for v in outputs]
             known.update(zip(eqn.outvars, outputs, strict=True))
@@ -106,14 +113,15 @@ class Evaluator:
         if name == "concatenate" and any(v.entries is None for v in values):
             return [self._joined(eqn, values, places[0])]
         if name in MOVES:
-            return self._outputs(eqn, moved(name, eqn.params, *(self.entries(v) for v in values)))
-        if name in REDUCTIONS:
-            return [self._reduce(eqn, values[0])]
-        if name in CUMULATIVE:
-            return [self._accumulate(eqn, values[0])]
+            entries = moved(name, eqn.params, *(self.entries(v) for v in values))
+            return [
+                Value(v.aval.shape, v.aval.dtype, np.asarray(x, object))
+                for v, x in zip(eqn.outvars, entries, strict=True)
+            ]
         rule = ELEMENTWISE.get(name)
         if rule is not None:
             return [self._elementwise(eqn, values, rule)]
+        # Last, because tracing takes longer than the tables above.
         written = WRITTEN.get(name)
         if written is not None:
             body = jax.make_jaxpr(functools.partial(written, **eqn.params))
@@ -131,15 +139,13 @@ class Evaluator:
 
     def unrelated(self, value: Value) -> Value:
         """The same numbers, treated as results of a loop or a branch."""
-        new = [self.b.unrelated(x) for x in self.entries(value).flat]
-        return Value(value.shape, value.dtype, objects(new, value.shape))
+        return self.value([self.b.unrelated(x) for x in self.entries(value).flat], value)
 
     def closed_off(self, value: Value) -> Value:
         """The same numbers, of which it is not known how they were made."""
         if value.entries is None:
             return value
-        new = objects([self.b.opaque(x) for x in value.entries.flat], value.shape)
-        return Value(value.shape, value.dtype, new)
+        return self.value([self.b.opaque(x) for x in value.entries.flat], value)
 
     # --- values --------------------------------------------------------------------------------
 
@@ -151,19 +157,18 @@ class Evaluator:
         assert buffer is not None
         if value.size > most:
             raise Unsupported(f"an array of {value.size} elements, which is not taken apart")
-        key = ("entries", id(value))
-        found = self.b.find(key)
-        if found is None:
-            found = objects(load_row(self.b, buffer), value.shape)
-            self.b.note(key, found)
-            self.b.note(("kept", id(value)), value)  # so that no other value gets its id
-        return found
+
+        def make() -> tuple[Value, Entries]:  # the value as well, so that no other one gets its id
+            return value, objects(load_row(self.b, buffer), value.shape)
+
+        return self.b.once(("entries", id(value)), make)[1]
 
     def in_memory(self, value: Value) -> Buffer:
         """Where an array is in memory, written there if it was not."""
         if value.buffer is not None:
             return value.buffer
         assert value.entries is not None
+        # Known numbers go into the module once, and no instruction writes them.
         known = value.known()
         if known is not None:
             return self.kernel.constant(known)
@@ -191,14 +196,15 @@ class Evaluator:
             return
         source = value.buffer
         assert source is not None
+        # Few elements are moved one by one; a loop would cost more instructions.
         if value.size <= 16:
             for i in np.ndindex(value.shape):
                 store(self.b, place, load(self.b, source, source.at(i)), place.at(i))
             return
 
         def copy(index: Num) -> None:
-            a, c = source.row(self.b, index), place.row(self.b, index)
-            self.write(Value(a.shape, value.dtype, buffer=a), c)
+            row = Value.in_memory(source.row(self.b, index))
+            self.write(row, place.row(self.b, index))
 
         self.count(value.shape[0], copy)
 
@@ -215,12 +221,6 @@ class Evaluator:
 
         b.loop([], [], test, inner, count=True)
 
-    def _outputs(self, eqn: Any, entries: Sequence[np.ndarray]) -> list[Value]:
-        return [
-            Value(v.aval.shape, v.aval.dtype, np.asarray(e, object))
-            for v, e in zip(eqn.outvars, entries, strict=True)
-        ]
-
     def value(self, entries: Sequence[Num], like: Any) -> Value:
         return Value(like.shape, like.dtype, objects(list(entries), like.shape))
 
@@ -228,15 +228,12 @@ class Evaluator:
         """A value that is linear in unit vectors: its zeros are zeros by structure."""
         if value.entries is None:
             return value
-        b = self.b
-        new = objects(
-            [
-                b.known(0, x.dtype, structural=True) if x.is_float and x.is_known_as(0) else x
-                for x in value.entries.flat
-            ],
-            value.shape,
-        )
-        out = Value(value.shape, value.dtype, new)
+
+        def marked(x: Num) -> Num:
+            is_zero = x.is_float and x.is_known_as(0)
+            return self.b.known(0, x.dtype, structural=True) if is_zero else x
+
+        out = self.value([marked(x) for x in value.entries.flat], value)
         out.is_tangent = True
         return out
 
@@ -254,12 +251,10 @@ class Evaluator:
                 value.buffer.seen(lambda x, i=i: moved(name, params, x)[i])
                 for i in range(len(eqn.outvars))
             ]
-        if any(x is None for x in buffers):
-            raise Unsupported(f"{eqn.primitive.name} of an array in memory")
-        return [
-            Value(v.aval.shape, v.aval.dtype, buffer=x)
-            for v, x in zip(eqn.outvars, buffers, strict=True)
-        ]
+        found = [Value.in_memory(x) for x in buffers if x is not None]
+        if len(found) < len(buffers):
+            raise Unsupported(f"{name} of an array in memory")
+        return found
 
     def _joined(self, eqn: Any, values: list[Value], place: Buffer | None) -> Value:
         """Arrays one after the other, in memory."""
@@ -270,13 +265,15 @@ class Evaluator:
             place = self.kernel.scratch(out.aval.shape, str(out.aval.dtype), on)
         for value, part in zip(values, _parts(place, axis, [v.shape for v in values]), strict=True):
             self.write(value, part)
-        return Value(out.aval.shape, out.aval.dtype, buffer=place)
+        return Value.in_memory(place)
 
     # --- arithmetic ------------------------------------------------------------------------------
 
     def _elementwise(self, eqn: Any, values: list[Value], rule: Callable) -> Value:
         (out,) = eqn.outvars
         shape, params = out.aval.shape, eqn.params
+        # Long arrays in a loop over their elements: otherwise the code would be as long as the
+        # array.
         if not all(v.is_small for v in values) or math.prod(shape) > MADE:
             return self._in_a_loop(eqn, values, rule)
         operands = [np.broadcast_to(self.entries(v), shape) for v in values]
@@ -305,7 +302,7 @@ class Evaluator:
             )
 
         one(sources, place)
-        return Value(shape, out.aval.dtype, buffer=place)
+        return Value.in_memory(place)
 
     def combine(self, op: str, a: Num, b: Num) -> Num:
         """An operation of two, by name."""
@@ -317,63 +314,6 @@ class Evaluator:
         if op in ("max", "min"):
             return builder.maximum(a, b, "gt" if op == "max" else "lt")
         return builder.logic(op, a, b)
-
-    def _reduce(self, eqn: Any, value: Value) -> Value:
-        (out,) = eqn.outvars
-        op, axes = REDUCTIONS[eqn.primitive.name], tuple(eqn.params["axes"])
-        if value.size == 0:
-            empty = np.empty((0, out.aval.size), value.dtype)
-            with np.errstate(all="ignore"):
-                neutral = _NEUTRAL[op](value.dtype)
-            return self.constant(np.full(out.aval.shape, neutral, empty.dtype))
-        rows = np.moveaxis(self.entries(value), axes, range(len(axes)))
-        rows = rows.reshape((-1, out.aval.size))
-        totals = list(rows[0])
-        for row in rows[1:]:
-            totals = [self.combine(op, a, c) for a, c in zip(totals, row, strict=True)]
-        return self.value(totals, out.aval)
-
-    def _accumulate(self, eqn: Any, value: Value) -> Value:
-        (out,) = eqn.outvars
-        axis, reverse = eqn.params["axis"], eqn.params["reverse"]
-        if value.size == 0:
-            return value
-        op = CUMULATIVE[eqn.primitive.name]
-        front = np.moveaxis(self.entries(value), axis, 0)
-        rows = front.reshape((front.shape[0], -1))
-        rows = rows[::-1] if reverse else rows
-        done = [list(rows[0])]
-        for row in rows[1:]:
-            done.append([self.combine(op, a, c) for a, c in zip(done[-1], row, strict=True)])
-        flat = [entry for row in (done[::-1] if reverse else done) for entry in row]
-        return Value(
-            out.aval.shape, out.aval.dtype, np.moveaxis(objects(flat, front.shape), 0, axis)
-        )
-
-    def dot(self, eqn: Any, values: list[Value], _) -> list[Value]:
-        a, c = values
-        (out,) = eqn.outvars
-        (of_a, of_c), (batch_a, batch_c) = eqn.params["dimension_numbers"]
-        dtype = str(out.aval.dtype)
-        same = a.dtype == dtype and c.dtype == dtype and dtype != "bool"
-        wider = dtype == "float64" and {a.dtype, c.dtype} <= {"float64", "float32"}
-        if not (same or wider):
-            raise Unsupported(f"a product of {a.dtype} and {c.dtype} arrays")
-        contracted = math.prod(a.shape[i] for i in of_a)
-        if out.aval.size * contracted > 8 * MADE:
-            raise Unsupported(f"a product of {out.aval.size * contracted} terms")
-        x = _as_stack_of_matrices(self.entries(a), batch_a, of_a)
-        y = _as_stack_of_matrices(self.entries(c), batch_c, of_c)
-        results = []
-        for rows, columns in zip(x, y, strict=True):
-            for row in rows:
-                for column in columns:
-                    total = self.b.known(0, dtype, structural=contracted > 0)
-                    for u, v in zip(row, column, strict=True):
-                        u, v = self.b.convert(u, dtype), self.b.convert(v, dtype)
-                        total = self.b.add(total, self.b.mul(u, v))
-                    results.append(total)
-        return [self.value(results, out.aval)]
 
     # --- branches that are rarely taken ----------------------------------------------------------
 
@@ -389,10 +329,13 @@ class Evaluator:
     def agreed(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         """The least of an integer over the trajectories of a block."""
         b, x = self.b, self.entries(values[0])[()]
+        # Not reduced over the block: the assumption is checked after some rounds.
         if self.assumed is not None and eqn.params["rare"]:
             return [self.value([self.assumed.least(x)], eqn.outvars[0].aval)]
         if not x.vec:
             return values
+        # The block runs a branch that some trajectory nearly always needs. Results do not depend on
+        # it, because each trajectory selects its own.
         if not eqn.params["rare"]:  # one of several trajectories nearly always needs it
             return [self.value([taken_for(b, 0, x.dtype)], eqn.outvars[0].aval)]
         t, full = b.type(x.dtype, True), b.suffix(x.dtype, True)
@@ -412,26 +355,6 @@ class Evaluator:
 
     def same(self, eqn: Any, values: list[Value], places: list) -> list[Value]:
         return values
-
-
-_NEUTRAL: dict[str, Callable[[str], Any]] = {
-    "add": lambda dtype: np.zeros((), dtype),
-    "mul": lambda dtype: np.ones((), dtype),
-    "max": lambda dtype: _limit(dtype, "min"),
-    "min": lambda dtype: _limit(dtype, "max"),
-    "and": lambda dtype: np.invert(np.zeros((), dtype)),
-    "or": lambda dtype: np.zeros((), dtype),
-    "xor": lambda dtype: np.zeros((), dtype),
-}
-"""What a reduction of nothing gives."""
-
-
-def _limit(dtype: str, which: str) -> Any:
-    if dtype == "bool":
-        return which == "max"
-    if np.issubdtype(dtype, np.floating):
-        return np.inf if which == "max" else -np.inf
-    return getattr(np.iinfo(dtype), which)
 
 
 def _row_of(b: Builder, x: Any, index: Num) -> Any:
@@ -462,6 +385,8 @@ def _places(jaxpr: Jaxpr, wanted: Sequence[Buffer | None]) -> dict[Any, Buffer]:
             places.setdefault(v, place)
     if not places:
         return places
+    # Backwards, from the outputs: an array that is joined from parts is written part by part to
+    # where the whole is wanted, without a copy.
     for eqn in reversed(jaxpr.eqns):
         place = places.get(eqn.outvars[0]) if len(eqn.outvars) == 1 else None
         if place is None:
@@ -483,13 +408,6 @@ def _places(jaxpr: Jaxpr, wanted: Sequence[Buffer | None]) -> dict[Any, Buffer]:
     return places
 
 
-def _as_stack_of_matrices(x, batch: Sequence[int], contracted: Sequence[int]) -> np.ndarray:
-    """x as (batch, free, contracted)."""
-    free = [i for i in range(x.ndim) if i not in (*batch, *contracted)]
-    sizes = [math.prod(x.shape[i] for i in axes) for axes in (batch, free, contracted)]
-    return np.transpose(x, (*batch, *free, *contracted)).reshape(sizes)
-
-
 def _sines_and_cosines(jaxpr: Jaxpr) -> set[int]:
     """The equations that are the sine or the cosine of a variable of which both are taken."""
     taken = [
@@ -501,8 +419,8 @@ def _sines_and_cosines(jaxpr: Jaxpr) -> set[int]:
     return {eqn for _, x, eqn in taken if x in sines & cosines}
 
 
+# Linear solves: the result of one is a change of the state and not a derivative any more.
 _ENDS = frozenset(["custom_linear_solve", "eliminate"])
-"""What uses a Jacobian up: its result is no tangent any more."""
 
 _SPECIAL: dict[str, Callable] = {
     "scan": loops.scan,
@@ -512,21 +430,17 @@ _SPECIAL: dict[str, Callable] = {
     "unit_vectors": elimination.unit_vectors,
     "least_over_lanes": Evaluator.agreed,
     "eliminate": elimination.eliminate,
-    "dot_general": Evaluator.dot,
+    "dot_general": reductions.dot,
+    **dict.fromkeys(REDUCTIONS, reductions.reduced),
+    **dict.fromkeys(CUMULATIVE, reductions.accumulated),
     "iota": indexing.iota,
     **dict.fromkeys(["empty", "empty2"], indexing.empty),
     "optimization_barrier": Evaluator.rounded,
-    **dict.fromkeys(
-        ["reshard", "sharding_constraint", "mesh_cast"], Evaluator.same
-    ),
+    **dict.fromkeys(["reshard", "sharding_constraint", "mesh_cast"], Evaluator.same),
     "argmax": indexing.argument_of,
     "argmin": indexing.argument_of,
     "dynamic_slice": indexing.dynamic_slice,
     "dynamic_update_slice": indexing.dynamic_update_slice,
     "gather": indexing.gather,
-    **dict.fromkeys(
-        ["scatter", "scatter-add", "scatter_add", "scatter-sub", "scatter_mul", "scatter-mul",
-         "scatter_max", "scatter-max", "scatter_min", "scatter-min"],
-        indexing.scatter,
-    ),
-}  # fmt: skip
+    **dict.fromkeys(indexing.SCATTERS, indexing.scatter),
+}

@@ -12,9 +12,9 @@ from .jaxapi import Jaxpr, Literal, jaxprs_in_params, scan_counts
 def depends_on(function: Callable[..., Any], argnum: int, *args: Any) -> bool:
     """Whether any output of ``function(*args)`` can depend on the values in ``args[argnum]``.
 
-    Dependence of values is meant, not a non-zero derivative: sign(p) depends on p. The
-    answer errs on the side of True, through primitives that are not looked into.
-    `args` are arrays or shape structs (only shapes and types matter).
+    A value may depend on another one with a derivative of zero: sign(p) depends on p. The result is
+    True where it is not certain, as for primitives whose body is unknown. `args` are arrays or
+    shape structs: only shapes and types matter.
     """
     before = len(jax.tree.leaves(args[:argnum]))
     count = len(jax.tree.leaves(args[argnum]))
@@ -31,7 +31,7 @@ def reached_outputs(
     Nothing is reached through the primitives named in `ends`.
     """
     known, question = _ANSWERS.setdefault(jaxpr, {}), (tuple(reached_inputs), ends)
-    if question not in known:  # loops in loops ask the same many times
+    if question not in known:  # nested loops need the same result many times
         known[question] = _reached_outputs(jaxpr, *question)
     return list(known[question])
 
@@ -40,6 +40,7 @@ _ANSWERS: weakref.WeakKeyDictionary[Jaxpr, dict] = weakref.WeakKeyDictionary()
 
 
 def _reached_outputs(jaxpr: Jaxpr, reached_inputs: Sequence[bool], ends: frozenset[str]) -> Any:
+    # Equations come in the order of their dependence: one pass is enough.
     reached = {v for v, r in zip(jaxpr.invars, reached_inputs, strict=True) if r}
 
     def is_reached(atom: Any) -> bool:
@@ -69,6 +70,7 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
         def scanned(carry):
             return reached_outputs(params["jaxpr"].jaxpr, [*fixed, *carry, *xs], ends)
 
+        # What reaches one part of the carry in a round may reach another part in the next.
         carry = fixed_point(lambda carry: scanned(carry)[:count], carry)
         return [*carry, *scanned(carry)[count:]]
     if name == "while":
@@ -78,10 +80,12 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
         def after(carry):
             (test,) = reached_outputs(params["cond_jaxpr"].jaxpr, [*of_test, *carry], ends)
             body = reached_outputs(params["body_jaxpr"].jaxpr, [*of_body, *carry], ends)
+            # If the number of rounds is reached, so is everything that the rounds compute.
             return [test or r for r in body]
 
         return fixed_point(after, inputs[first + second :])
     if name == "cond":
+        # The choice of the branch alone decides about all outputs.
         if inputs[0]:
             return [True] * len(eqn.outvars)
         per_branch = [reached_outputs(b.jaxpr, inputs[1:], ends) for b in params["branches"]]
@@ -100,12 +104,11 @@ def fixed_point(after: Callable[[list[bool]], list[bool]], marks: list[bool]) ->
 
 
 def _called_jaxpr(eqn: Any) -> Jaxpr | None:
-    """The body of a call whose inputs and outputs match the equation's one by one, if it is one.
-
-    (jit, custom_jvp, custom_vjp, checkpoint and their like, and `lanewise.call`.)
-    """
+    """The body of a call (jit, checkpoint, `lanewise.call`, …) with the inputs and outputs of the
+    equation; None for other equations."""
     if eqn.primitive.name == "lanewise":
         return eqn.params["program"].traced.all_inputs.jaxpr
+    # With two bodies (a function and its derivative) it is not certain which one is run.
     bodies = list(jaxprs_in_params(eqn.params))
     if len(bodies) != 1:
         return None

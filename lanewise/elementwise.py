@@ -38,6 +38,7 @@ def _select(e: "Evaluator", _: Any, which: Num, *cases: Num) -> Num:
         if taken is not None:
             return b.unrelated(cases[int(taken)])
         return b.select(which, cases[1], cases[0])
+    # Indices outside select the first or the last case, as in XLA.
     result = cases[-1]
     for i in reversed(range(len(cases) - 1)):
         result = b.select(b.compare("le", which, b.known(i, which.dtype)), cases[i], result)
@@ -52,40 +53,39 @@ def _sign(e: "Evaluator", _: Any, x: Num) -> Num:
     b, zero = e.b, e.b.known(0, x.dtype)
     if x.dtype.startswith("u"):
         return b.select(b.compare("eq", x, zero), zero, b.known(1, x.dtype))
+    # x itself where it is neither: NaN stays NaN and −0 stays −0.
     one = b.select(b.compare("gt", x, zero), b.known(1, x.dtype), x)
     return b.select(b.compare("lt", x, zero), b.known(-1, x.dtype), one)
 
 
-def _rounded(e: "Evaluator", params: dict, x: Num) -> Num:
-    if not x.is_float:
-        return x
-    away = int(params["rounding_method"]) == 0
-    if x.known is not None and not away:
-        return e.b.known(np.rint(x.known), x.dtype)
-    return e.b.intrinsic("round" if away else "roundeven", (x,))
+def _integral(name: str, function: Callable | None) -> Callable:
+    """Rounding to an integer by a function of NumPy, if it has one, and LLVM's of that name."""
 
-
-def _integral(name: str, function: Callable) -> Callable:
     def rule(e: "Evaluator", _: Any, x: Num) -> Num:
         if not x.is_float:
             return x
-        if x.known is not None:
+        if x.known is not None and function is not None:
             return e.b.known(function(x.known), x.dtype)
         return e.b.intrinsic(name, (x,))
 
     return rule
 
 
-def _power(e: "Evaluator", params: dict, x: Num) -> Num:
-    return e.b.power(x, params["y"])
+def _rounded(e: "Evaluator", params: dict, x: Num) -> Num:
+    # NumPy has no function that rounds halves away from zero.
+    away = int(params["rounding_method"]) == 0
+    rule = _integral("round", None) if away else _integral("roundeven", np.rint)
+    return rule(e, params, x)
 
 
 def _pow(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
     if y.known is not None and x.is_float:
         if not y.is_float or float(y.known).is_integer():
             n = int(y.known)
+            # More products would have larger errors than the function.
             if abs(n) <= 64:
                 return e.b.power(x, n)
+        # A root and few products: 1/r³ of a force takes a small part of the operations of pow.
         elif abs(2 * float(y.known)) <= 7 and float(2 * y.known).is_integer():
             name = f"half_integer_power {int(2 * float(y.known))}"
             return _elementary(name)(e, {}, x)
@@ -99,6 +99,7 @@ def _elementary(name: str) -> Callable:
         if not xs[0].is_float:
             raise Unsupported(f"{name} of {xs[0].dtype}")
         if xs[0].dtype == "float32":
+            # Own functions for float32 would be faster, and one more set to test.
             wide = e.kernel.elementary(name, [e.b.convert(x, "float64") for x in xs])
             return e.b.convert(wide, "float32")
         return e.kernel.elementary(name, xs)
@@ -110,23 +111,20 @@ def _one(e: "Evaluator", like: Num) -> Num:
     return e.b.known(1, like.dtype)
 
 
-def _convert(e: "Evaluator", params: dict, x: Num) -> Num:
-    return e.b.convert(x, str(np.dtype(params["new_dtype"])))
-
-
 def _bitcast(e: "Evaluator", params: dict, x: Num) -> Num:
     new = np.dtype(params["new_dtype"])
+    # Other sizes change the shape of the array, which a rule for one number cannot.
     if new.itemsize != np.dtype(x.dtype).itemsize or "bool" in (x.dtype, str(new)):
         raise Unsupported(f"the bits of {x.dtype} as {new}")
     return e.b.bitcast(x, str(new))
 
 
-def _add(e: "Evaluator", _: Any, a: Num, b: Num) -> Num:
-    return e.combine("add", a, b)
+def _combined(op: str) -> Callable:
+    return lambda e, _, a, b: e.combine(op, a, b)
 
 
-def _mul(e: "Evaluator", _: Any, a: Num, b: Num) -> Num:
-    return e.combine("mul", a, b)
+def _same(e: "Evaluator", _: Any, x: Num) -> Num:
+    return x
 
 
 def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
@@ -136,41 +134,33 @@ def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
     return x
 
 
+# Applied number by number; an operand without axes goes with each number of the others.
 ELEMENTWISE: dict[str, Callable] = {
-    "add": _add,
-    "add_any": _add,
+    **{op: _combined(op) for op in ("add", "mul", "max", "min")},
+    "add_any": _combined("add"),
     "sub": _binary("sub"),
-    "mul": _mul,
     "div": _binary("div"),
     "rem": _binary("rem"),
     "neg": lambda e, _, x: e.b.neg(x),
     "abs": lambda e, _, x: e.b.abs(x),
     "sign": _sign,
-    "max": lambda e, _, a, b: e.combine("max", a, b),
-    "min": lambda e, _, a, b: e.combine("min", a, b),
     "clamp": _clamp,
     "select_n": _select,
     "sqrt": lambda e, _, x: e.b.sqrt(x),
     "rsqrt": lambda e, _, x: e.b.div(_one(e, x), e.b.sqrt(x)),
     "square": lambda e, _, x: e.b.mul(x, x),
     "one_minus_square": lambda e, _, x: e.b.sub(_one(e, x), e.b.mul(x, x)),
-    "integer_pow": _power,
+    "integer_pow": lambda e, params, x: e.b.power(x, params["y"]),
     "pow": _pow,
     "floor": _integral("floor", np.floor),
     "ceil": _integral("ceil", np.ceil),
     "round": _rounded,
     "is_finite": lambda e, _, x: e.b.is_finite(x),
-    "convert_element_type": _convert,
+    "convert_element_type": lambda e, params, x: e.b.convert(x, str(np.dtype(params["new_dtype"]))),
     "bitcast_convert_type": _bitcast,
     "reduce_precision": _reduced_precision,
-    "copy": lambda e, _, x: x,
-    "copy_p": lambda e, _, x: x,
-    "stop_gradient": lambda e, _, x: x,
-    "real": lambda e, _, x: x,
-    "conj": lambda e, _, x: x,
-    "and": lambda e, _, a, b: e.b.logic("and", a, b),
-    "or": lambda e, _, a, b: e.b.logic("or", a, b),
-    "xor": lambda e, _, a, b: e.b.logic("xor", a, b),
+    **dict.fromkeys(["copy", "copy_p", "stop_gradient", "real", "conj"], _same),
+    **{op: (lambda e, _, a, b, op=op: e.b.logic(op, a, b)) for op in ("and", "or", "xor")},
     "not": lambda e, _, x: e.b.invert(x),
     "eq": _equal,
     **{op: _compared(op) for op in ("ne", "lt", "le", "gt", "ge")},
@@ -187,4 +177,3 @@ ELEMENTWISE: dict[str, Callable] = {
         )
     },
 }  # fmt: skip
-"""Applied number by number; an operand without axes goes with each number of the others."""

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .ir import Builder, Num, Unsupported
+from .builder import Builder
+from .ir import Num, Unsupported
 from .memory import Buffer, load, store
 from .values import MADE, Entries, Value
 
@@ -13,8 +14,9 @@ if TYPE_CHECKING:
     from .components import Evaluator
 
 
-_LARGEST_FACTOR = 8.0
-"""Of a row that is subtracted from another without an exchange."""
+# Rows are exchanged if a factor is larger: without exchanges errors grow with the factors, and each
+# exchange costs a branch.
+_LARGEST_FACTOR = 8.0  # of a row that is subtracted from another without an exchange
 
 
 def linear_solve(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
@@ -43,14 +45,17 @@ def _one(e: "Evaluator", matrix: Entries, vector: Entries) -> list[Num]:
     rows = [[*row, x] for row, x in zip(matrix, vector, strict=True)]
     numbers = [x for row in rows for x in row]
     vec = any(x.vec for x in numbers)
+    # Solved without exchanges first: their selections would take more operations than the solution.
     found, weak = solved(b, [list(r) for r in rows])
     if weak.known is not None and not weak.known:
         return found
     if e.assumed is not None:
         e.assumed.never(weak)
+        # As results of a branch, so that the bits are those of the version with branches.
         return [b.unrelated(x) for x in found]
 
     def exchanged() -> list[Num]:
+        # Only where it is needed: other trajectories of the block keep their numbers to the bit.
         others = e.kernel.exchanged(numbers, vec)
         return [b.select(weak, x, y) for x, y in zip(others, found, strict=True)]
 
@@ -66,6 +71,7 @@ def solved(b: Builder, rows: list[list[Num]]) -> tuple[list[Num], Num]:
     for c in range(n):
         one_over = b.div(b.known(1, dtype, structural=True), rows[c][c])
         for i in range(c + 1, n):
+            # A zero of the structure stays: a band costs as many operations as it has numbers.
             if rows[i][c].is_known_as(0):
                 continue
             factor = b.mul(rows[i][c], one_over)
@@ -74,6 +80,7 @@ def solved(b: Builder, rows: list[list[Num]]) -> tuple[list[Num], Num]:
             weak = b.logic("or", weak, b.invert(fine))
             for j in range(c + 1, n + 1):
                 rows[i][j] = b.sub(rows[i][j], b.mul(factor, rows[c][j]))
+        # The back substitution multiplies: a division takes as long as ten products.
         rows[c][c] = one_over
     x: list[Any] = [None] * n
     for i in reversed(range(n)):

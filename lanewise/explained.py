@@ -1,4 +1,4 @@
-"""What becomes of a function: operations, vectors, blocks, and what is left to XLA."""
+"""How a function is compiled: operations, vectors, blocks, and the parts that XLA computes."""
 
 import dataclasses
 import re
@@ -12,14 +12,15 @@ from . import handler, machine
 from .extent import functions_in
 from .ir import Unsupported
 from .jaxapi import jaxprs_in_params
-from .primitive import AUTO, Layout, kernel_of, pieces_of, program_of, program_of_jaxpr
+from .primitive import AUTO, Layout, Program, kernel_of, pieces_of
+from .traced import Traced
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
     """One call that is compiled as a whole.
 
-    - `reason`: why it is left to XLA, None where machine code is generated.
+    - `reason`: why XLA computes it, None where machine code is generated.
     - `operations`: on numbers of one trajectory, loops counted once; a fused multiply-add is one.
     - `width`, `vectors`: numbers in a vector, vectors in a block.
     - `scratch`: bytes of a block for rows that are not results.
@@ -84,15 +85,15 @@ def explain(
     ```
     """
     leaves, tree = jax.tree.flatten(args)
+    # Arrays: a number of Python would be traced with a weak type, which a batch does not have.
     leaves = [jnp.asarray(x) for x in leaves]
 
     def flat(*leaves):
         return jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
 
     closed = jax.make_jaxpr(flat)(*leaves)
-    programs = _calls(closed.jaxpr)
-    if not programs:
-        programs = [program_of(flat, leaves, layout)]
+    # Without a call in it, the function is explained as if it were called.
+    programs = _calls(closed.jaxpr) or [Program(Traced(closed), layout)]
     return Explanation(tuple(part for program in programs for part in _parts(program, batch)))
 
 
@@ -109,23 +110,21 @@ def _calls(jaxpr: Any) -> list[Any]:
 
 
 def _parts(program: Any, batch: int) -> list[Part]:
-    """What becomes of a program; its pieces where it is not compiled as a whole."""
+    """How a program is compiled; its pieces if it is not compiled as a whole."""
     count = len(program.traced.all_inputs.jaxpr.invars)
     try:
         module, text = kernel_of(program, [True] * count, batch)
     except Unsupported as reason:
-        found = pieces_of(program, batch)
-        if not any(piece.reason is None or piece.is_call for piece in found):
-            return [Part(reason=str(reason))]
-        return [part for piece in found for part in _of_piece(piece, program.layout, batch)]
+        parts = []
+        for piece in pieces_of(program, batch):
+            if piece.is_left_to_xla:
+                parts.append(Part(piece.reason))
+            else:
+                parts += _parts(Program(Traced(piece.closed), program.layout), batch)
+        return parts or [Part(str(reason))]
     ir = handler.module_text(text, module.W * module.U)
+    # Registers that do not suffice show in moves to and from the stack; their number says whether a
+    # block has too many vectors.
     assembly = machine.assembly(ir)
     spills = len(re.findall(r"\bv?mov[a-z0-9]*\s+.*\((?:%rsp|sp)\)", assembly))
-    part = Part(None, module.b.operations, module.W, module.U, module.scratch_bytes, spills, ir)
-    return [part]
-
-
-def _of_piece(piece: Any, layout: Layout, batch: int) -> list[Part]:
-    if piece.reason is not None and not piece.is_call:
-        return [Part(reason=piece.reason)]
-    return _parts(program_of_jaxpr(piece.closed, layout), batch)
+    return [Part(None, module.b.operations, module.W, module.U, module.scratch_bytes, spills, ir)]

@@ -23,6 +23,7 @@ def carried(jaxpr: Any) -> int:
         if eqn.primitive.name == "scan":
             _, count = scan_counts(eqn.params)
             state = [v.aval for v in eqn.outvars[:count]]
+            # Large arrays stay in memory and take no register; integers are few.
             most = max(most, sum(a.size for a in state if a.size <= 64 and a.dtype.kind == "f"))
     return most
 
@@ -33,6 +34,7 @@ def operation_count(jaxpr: Any) -> int:
     for eqn in jaxpr.eqns:
         inside = (*bodies(eqn), *functions_in(eqn))
         if eqn.primitive.name == "custom_linear_solve":
+            # Of its four functions only this one is run.
             inside = (eqn.params["jaxprs"].solve,)
         inner = [operation_count(b.jaxpr) for b in inside]
         if inner:
@@ -41,6 +43,7 @@ def operation_count(jaxpr: Any) -> int:
         size = max((v.aval.size for v in eqn.outvars), default=0)
         if eqn.primitive.name == "dot_general":
             (contracted, _), _ = eqn.params["dimension_numbers"]
+            # One fused multiply-add for each term.
             size *= int(np.prod([eqn.invars[0].aval.shape[i] for i in contracted]))
         elif eqn.primitive.name.startswith("reduce_"):
             size = eqn.invars[0].aval.size

@@ -8,7 +8,11 @@ somebody has begun. A task that starts later finds nothing to do: all that it re
 that the last user frees.
 """
 
+import ctypes
 import functools
+import hashlib
+import itertools
+import re
 import sys
 import threading
 from typing import Any
@@ -86,18 +90,12 @@ define internal void @work(ptr %job) {
 entry:
   %next = getelementptr i8, ptr %job, i64 8
   %done = getelementptr i8, ptr %job, i64 16
-  %blocks.at = getelementptr i8, ptr %job, i64 24
-  %blocks = load i64, ptr %blocks.at
-  %chunk.at = getelementptr i8, ptr %job, i64 32
-  %chunk = load i64, ptr %chunk.at
-  %kernel.at = getelementptr i8, ptr %job, i64 40
-  %kernel = load ptr, ptr %kernel.at
-  %params.at = getelementptr i8, ptr %job, i64 48
-  %params = load ptr, ptr %params.at
-  %args.at = getelementptr i8, ptr %job, i64 56
-  %args = load ptr, ptr %args.at
-  %rets.at = getelementptr i8, ptr %job, i64 64
-  %rets = load ptr, ptr %rets.at
+  %blocks = load i64, i8 %job[24]
+  %chunk = load i64, i8 %job[32]
+  %kernel = load ptr, i8 %job[40]
+  %params = load ptr, i8 %job[48]
+  %args = load ptr, i8 %job[56]
+  %rets = load ptr, i8 %job[64]
   br label %claim
 claim:
   %first = atomicrmw add ptr %next, i64 %chunk acq_rel
@@ -129,12 +127,9 @@ head:
   %more = icmp slt i64 %i, %count
   br i1 %more, label %body, label %over
 body:
-  %at = getelementptr ptr, ptr %from, i64 %i
-  %buffer = load ptr, ptr %at
-  %data.at = getelementptr i8, ptr %buffer, i64 24
-  %data = load ptr, ptr %data.at
-  %into = getelementptr ptr, ptr %to, i64 %i
-  store ptr %data, ptr %into
+  %buffer = load ptr, ptr %from[%i]
+  %data = load ptr, i8 %buffer[24]
+  store ptr %data, ptr %to[%i]
   %i.next = add i64 %i, 1
   br label %head
 over:
@@ -145,26 +140,17 @@ define ptr @lanewise_run(ptr %frame, ptr %kernel, i64 %block) {
 entry:
   %seen = alloca i64
   %ask = alloca [4 x i64]
-  %api.at = getelementptr i8, ptr %frame, i64 16
-  %api = load ptr, ptr %api.at
-  %ctx.at = getelementptr i8, ptr %frame, i64 24
-  %ctx = load ptr, ptr %ctx.at
-  %nargs.at = getelementptr i8, ptr %frame, i64 56
-  %nargs = load i64, ptr %nargs.at
-  %args.at = getelementptr i8, ptr %frame, i64 72
-  %args = load ptr, ptr %args.at
-  %nrets.at = getelementptr i8, ptr %frame, i64 96
-  %nrets = load i64, ptr %nrets.at
-  %rets.at = getelementptr i8, ptr %frame, i64 112
-  %rets = load ptr, ptr %rets.at
-  %attrs.at = getelementptr i8, ptr %frame, i64 160
-  %attrs = load ptr, ptr %attrs.at
+  %api = load ptr, i8 %frame[16]
+  %ctx = load ptr, i8 %frame[24]
+  %nargs = load i64, i8 %frame[56]
+  %args = load ptr, i8 %frame[72]
+  %nrets = load i64, i8 %frame[96]
+  %rets = load ptr, i8 %frame[112]
+  %attrs = load ptr, i8 %frame[160]
   %attr = load ptr, ptr %attrs
-  %params.at = getelementptr i8, ptr %attr, i64 16
-  %params = load ptr, ptr %params.at
+  %params = load ptr, i8 %attr[16]
   %lanes = load i64, ptr %params
-  %cost.at = getelementptr i64, ptr %params, i64 1
-  %cost = load i64, ptr %cost.at
+  %cost = load i64, i64 %params[1]
 
   %count = add i64 %nargs, %nrets
   %bytes0 = mul i64 %count, 8
@@ -181,10 +167,8 @@ next.result:
   %n.more = icmp slt i64 %n, %nrets
   br i1 %n.more, label %one.result, label %ready.to.run
 one.result:
-  %result.at = getelementptr ptr, ptr %r, i64 %n
-  %result = load ptr, ptr %result.at
-  %size.of = getelementptr i64, ptr %sizes, i64 %n
-  %size.each = load i64, ptr %size.of
+  %result = load ptr, ptr %r[%n]
+  %size.each = load i64, i64 %sizes[%n]
   %size.all = mul i64 %size.each, %lanes
   call void @large_pages(ptr %result, i64 %size.all)
   %n.next = add i64 %n, 1
@@ -211,14 +195,10 @@ alone:
 ask.pool:
   store i64 1, ptr %seen
   store i64 32, ptr %ask
-  %ask1 = getelementptr i64, ptr %ask, i64 1
-  store ptr null, ptr %ask1
-  %ask2 = getelementptr i64, ptr %ask, i64 2
-  store ptr %ctx, ptr %ask2
-  %ask3 = getelementptr i64, ptr %ask, i64 3
-  store ptr %seen, ptr %ask3
-  %size.at = getelementptr i8, ptr %api, i64 COUNT
-  %size = load ptr, ptr %size.at
+  store ptr null, i64 %ask[1]
+  store ptr %ctx, i64 %ask[2]
+  store ptr %seen, i64 %ask[3]
+  %size = load ptr, i8 %api[COUNT]
   %error = call ptr %size(ptr %ask)
   %failed = icmp ne ptr %error, null
   %pool0 = load i64, ptr %seen
@@ -237,24 +217,16 @@ ask.pool:
   %chunk = udiv i64 %parts.less, %parts
 
   store i64 %threads, ptr %job                 ; every task has one share, the caller another
-  %j1 = getelementptr i8, ptr %job, i64 8
-  store i64 0, ptr %j1
-  %j2 = getelementptr i8, ptr %job, i64 16
-  store i64 0, ptr %j2
-  %j3 = getelementptr i8, ptr %job, i64 24
-  store i64 %blocks, ptr %j3
-  %j4 = getelementptr i8, ptr %job, i64 32
-  store i64 %chunk, ptr %j4
-  %j5 = getelementptr i8, ptr %job, i64 40
-  store ptr %kernel, ptr %j5
-  %j6 = getelementptr i8, ptr %job, i64 48
-  store ptr %params, ptr %j6
-  %j7 = getelementptr i8, ptr %job, i64 56
-  store ptr %a, ptr %j7
-  %j8 = getelementptr i8, ptr %job, i64 64
-  store ptr %r, ptr %j8
-  %schedule.at = getelementptr i8, ptr %api, i64 SCHEDULE
-  %schedule = load ptr, ptr %schedule.at
+  store i64 0, i8 %job[8]
+  %done = getelementptr i8, ptr %job, i64 16
+  store i64 0, ptr %done
+  store i64 %blocks, i8 %job[24]
+  store i64 %chunk, i8 %job[32]
+  store ptr %kernel, i8 %job[40]
+  store ptr %params, i8 %job[48]
+  store ptr %a, i8 %job[56]
+  store ptr %r, i8 %job[64]
+  %schedule = load ptr, i8 %api[SCHEDULE]
   br label %next.task
 next.task:
   %t = phi i64 [1, %ask.pool], [%t.next, %scheduled]
@@ -263,14 +235,10 @@ next.task:
 one.task:
   %plan = alloca [5 x i64]
   store i64 40, ptr %plan
-  %plan1 = getelementptr i64, ptr %plan, i64 1
-  store ptr null, ptr %plan1
-  %plan2 = getelementptr i64, ptr %plan, i64 2
-  store ptr %ctx, ptr %plan2
-  %plan3 = getelementptr i64, ptr %plan, i64 3
-  store ptr @task, ptr %plan3
-  %plan4 = getelementptr i64, ptr %plan, i64 4
-  store ptr %job, ptr %plan4
+  store ptr null, i64 %plan[1]
+  store ptr %ctx, i64 %plan[2]
+  store ptr @task, i64 %plan[3]
+  store ptr %job, i64 %plan[4]
   %refused = call ptr %schedule(ptr %plan)
   %is.refused = icmp ne ptr %refused, null
   br i1 %is.refused, label %give.back, label %scheduled
@@ -285,7 +253,7 @@ own:
   br label %wait
 wait:
   %spins = phi i64 [0, %own], [%spins.next, %again]
-  %so.far = load atomic i64, ptr %j2 acquire, align 8
+  %so.far = load atomic i64, ptr %done acquire, align 8
   %ready = icmp sge i64 %so.far, %blocks
   br i1 %ready, label %finish, label %not.yet
 not.yet:
@@ -303,18 +271,34 @@ finish:
 }
 """
 
-_FIRST_FUNCTION = 48
-"""Offset of the first function in XLA's table: size, extension, version (24), internal table."""
-_SCHEDULE = _FIRST_FUNCTION + 8 * 11
-_COUNT = _FIRST_FUNCTION + 8 * 12
+# The functions in XLA's table follow its size, extension, version (24 bytes) and internal table.
+_SCHEDULE, _COUNT = (48 + 8 * place for place in (11, 12))
 
+# Several threads of Python may trace and compile at once; a name may be registered once only.
 _lock = threading.RLock()
 _targets: dict[str, str] = {}
 
 
+_PLACE = re.compile(r"^(.*(?:load|store) .*), (i8|i64|ptr) (%[\w.]+)\[(%?[\w.]+)\]$", re.MULTILINE)
+
+
+def _addressed(text: str) -> str:
+    """Operands of the form ``i8 %pointer[24]``, which LLVM has not, as pointers."""
+    names = itertools.count()
+
+    def expanded(found: re.Match) -> str:
+        instruction, item, base, index = found.groups()
+        at = f"%at{next(names)}"
+        pointer = f"  {at} = getelementptr {item}, ptr {base}, i64 {index}"
+        return f"{pointer}\n{instruction}, ptr {at}"
+
+    return _PLACE.sub(expanded, text)
+
+
 @functools.cache
 def runtime() -> Any:
-    text = _RUNTIME.replace("SCHEDULE", str(_SCHEDULE)).replace("COUNT", str(_COUNT))
+    """The machine code that all kernels share."""
+    text = _addressed(_RUNTIME).replace("SCHEDULE", str(_SCHEDULE)).replace("COUNT", str(_COUNT))
     # Only Linux knows the request. Below 32 MiB the C library hands out memory that it has had
     # before, where the request costs more than it brings.
     text = text.replace("LARGE", str(32 * 2**20 if sys.platform == "linux" else 2**63 - 1))
@@ -327,17 +311,16 @@ def set_threads(count: int) -> None:
         raise TypeError(f"the number of threads must be an integer, got {count!r}.")
     if count < 0:
         raise ValueError(f"the number of threads must be at least 1, or 0 for all; got {count}.")
-    import ctypes
-
-    address = runtime().get_global_value_address("lanewise_threads")
-    ctypes.c_int64.from_address(address).value = count
+    _threads().value = count
 
 
 def get_threads() -> int:
-    import ctypes
+    """The number that was set last."""
+    return _threads().value
 
-    address = runtime().get_global_value_address("lanewise_threads")
-    return ctypes.c_int64.from_address(address).value
+
+def _threads() -> ctypes.c_int64:
+    return ctypes.c_int64.from_address(runtime().get_global_value_address("lanewise_threads"))
 
 
 def module_text(kernel: str, block: int) -> str:
@@ -348,13 +331,12 @@ def module_text(kernel: str, block: int) -> str:
 
 def registered(text: str) -> str:
     """The name by which XLA calls a module's handler, compiled and registered if it was not."""
-    import hashlib
-
     key = hashlib.sha256(text.encode()).hexdigest()
     with _lock:
         if key not in _targets:
             run = runtime().get_function_address("lanewise_run")
             name = f"lanewise_{key[:32]}"
+            # One engine holds all modules, so that each needs a name of its own.
             text = text.replace("@lanewise_handler", f"@{name}")
             engine = machine.loaded(text, {"lanewise_run": run})
             address = engine.get_function_address(name)
@@ -364,11 +346,8 @@ def registered(text: str) -> str:
 
 
 def _capsule(address: int) -> Any:
-    import ctypes
-
+    # The form in which JAX takes the address of a handler.
     new = ctypes.pythonapi.PyCapsule_New
-    new.restype, new.argtypes = (
-        ctypes.py_object,
-        [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p],
-    )
+    new.restype = ctypes.py_object
+    new.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
     return new(address, None, None)

@@ -4,10 +4,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 
-from .jaxapi import ClosedJaxpr, has_derivative, jaxpr_as_fun, primitive
+from .jaxapi import ClosedJaxpr, batch_in_front, has_derivative, jaxpr_as_fun, primitive
 from .traced import Traced
 
 
@@ -41,11 +40,14 @@ def implicit_root(
         trees.append(tree)
         return [x, *leaves]
 
+    # What the equation closes over becomes operands, so that derivatives by it are found.
     operands = [*equation.outer, guess]
     search = Traced.of(found, operands, jax.tree.structure(tuple(operands)))
     rest = _Rest(
         lambda *at: jaxpr_as_fun(equation.all_inputs)(*at)[0],
         lambda *at: _divided(equation.all_inputs, divide, *at),
+        # These come first among the operands. They do not change the root: it has no derivative by
+        # them.
         len(search.outer),
     )
     x, *how = _root.bind(*search.outer, *operands, search=search.all_inputs, rest=rest)
@@ -72,11 +74,9 @@ def _searched(*operands: Array, search: ClosedJaxpr, rest: _Rest) -> list[Array]
 
 
 def _batched(operands, axes, *, search: ClosedJaxpr, rest: _Rest):
-    (size,) = {x.shape[a] for x, a in zip(operands, axes, strict=True) if a is not None}
-    on = [None if a is None else 0 for a in axes]
-    operands = [
-        x if a is None else jnp.moveaxis(x, a, 0) for x, a in zip(operands, axes, strict=True)
-    ]
+    size, operands, on = batch_in_front(operands, axes)
+    # The batch is formed now: a derivative that is taken later finds functions of a batch, in which
+    # `lax.cond` has become a selection.
     new = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(search), on, axis_size=size))(*operands)
     consts = on[rest.own : -1]
     of = _Rest(
@@ -91,6 +91,7 @@ def _batched(operands, axes, *, search: ClosedJaxpr, rest: _Rest):
 def _derivative(primals, changes: dict[int, Array], *, search: ClosedJaxpr, rest: _Rest):
     outs = _root.bind(*primals, search=search, rest=rest)
     x, consts = outs[0], primals[rest.own : -1]
+    # Changes of the guess and of what the search alone uses are left out.
     moves = [i for i in range(len(consts)) if i + rest.own in changes]
     if not moves:
         return outs, [None] * len(outs)

@@ -5,12 +5,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .builder import Builder
 from .ir import Num, Unsupported
 from .memory import contiguous, load
 from .values import MADE, Value
 
 if TYPE_CHECKING:
     from .components import Evaluator
+
+
+# What is done to an element and its update, by the primitive; releases of JAX differ in the names.
+SCATTERS = {
+    "scatter": None,
+    **{f"scatter{mark}{op}": op for op in ("add", "sub", "mul", "max", "min") for mark in "-_"},
+}
 
 
 def iota(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
@@ -49,14 +57,17 @@ def argument_of(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> 
     return [e.value(results, out.aval)]
 
 
-def _index(e: "Evaluator", x: Num) -> Num:
-    return e.b.convert(x, "int64")
-
-
-def _clipped(e: "Evaluator", x: Num, most: int) -> Num:
-    b = e.b
-    low = b.maximum(x, b.known(0, "int64"))
+def _clipped(b: Builder, x: Num, most: int) -> Num:
+    """The index of type int64 that is nearest to x, 0 ≤ index ≤ most."""
+    low = b.maximum(b.convert(x, "int64"), b.known(0, "int64"))
     return b.maximum(low, b.known(most, "int64"), "lt")
+
+
+def _starts(e: "Evaluator", starts: list[Value], shape: Any, sizes: Any) -> list[Num]:
+    """Where a part of `sizes` begins in an array of `shape`, inside of it."""
+    return [
+        _clipped(e.b, e.entries(s)[()], n - m) for s, n, m in zip(starts, shape, sizes, strict=True)
+    ]
 
 
 def _pick(e: "Evaluator", value: Value, index: Num) -> Num:
@@ -64,6 +75,7 @@ def _pick(e: "Evaluator", value: Value, index: Num) -> Num:
     b = e.b
     if index.known is not None and value.entries is not None:
         return value.entries.flat[int(index.known)]
+    # Selections among a few numbers in registers take less time than a way through memory.
     if value.entries is not None and value.size <= 8:
         result = value.entries.flat[0]
         for i in range(1, value.size):
@@ -78,10 +90,7 @@ def dynamic_slice(e: "Evaluator", eqn: Any, values: list[Value], places: list) -
     value, *starts = values
     (out,) = eqn.outvars
     b, sizes = e.b, eqn.params["slice_sizes"]
-    at = [
-        _clipped(e, _index(e, e.entries(s)[()]), n - m)
-        for s, n, m in zip(starts, value.shape, sizes, strict=True)
-    ]
+    at = _starts(e, starts, value.shape, sizes)
     if value.entries is None and not value.is_small:
         buffer = value.buffer
         assert buffer is not None
@@ -106,22 +115,21 @@ def dynamic_update_slice(
 ) -> list[Value]:
     value, update, *starts = values
     b = e.b
-    at = [
-        _clipped(e, _index(e, e.entries(s)[()]), n - m)
-        for s, n, m in zip(starts, value.shape, update.shape, strict=True)
-    ]
+    at = _starts(e, starts, value.shape, update.shape)
     entries = e.entries(value).copy()
     if value.size * update.size > MADE:
         raise Unsupported(f"an update at a traced index of {value.size} elements")
     news = e.entries(update)
     for i in np.ndindex(value.shape):
         for k in np.ndindex(update.shape):
-            if any(not 0 <= x - y <= n - m for x, y, n, m in
-                   zip(i, k, value.shape, update.shape, strict=True)):  # fmt: skip
+            # The start that puts element k of the update to place i; none may lie outside.
+            first = [x - y for x, y in zip(i, k, strict=True)]
+            limits = zip(first, value.shape, update.shape, strict=True)
+            if not all(0 <= x <= n - m for x, n, m in limits):
                 continue
             here = b.known(True, "bool")
-            for start, x, y in zip(at, i, k, strict=True):
-                here = b.logic("and", here, b.compare("eq", start, b.known(x - y, "int64")))
+            for start, x in zip(at, first, strict=True):
+                here = b.logic("and", here, b.compare("eq", start, b.known(x, "int64")))
             entries[i] = b.select(here, news[k], entries[i])
     return [Value(value.shape, value.dtype, entries)]
 
@@ -142,23 +150,19 @@ def gather(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[
         small.entries = e.entries(value)
     fill = params["fill_value"]
     if fill is None:
-        fill = np.nan if np.issubdtype(value.dtype, np.floating) else (
-            True if value.dtype == "bool" else
-            np.iinfo(value.dtype).min if np.issubdtype(value.dtype, np.signedinteger)
-            else np.iinfo(value.dtype).max
-        )  # fmt: skip
+        fill = _default_fill(value.dtype)
     results = []
     for o in np.ndindex(*shape):
         where = tuple(o[d] for d in batch)
         total, inside = b.known(0, "int64"), b.known(True, "bool")
         for d, offset in zip(window, (o[d] for d in dims.offset_dims), strict=True):
             total = b.add(total, b.known(offset * strides[d], "int64"))
-        for d, k in zip(dims.operand_batching_dims, dims.start_indices_batching_dims,
-                        strict=True):  # fmt: skip
+        batching = dims.operand_batching_dims, dims.start_indices_batching_dims
+        for d, k in zip(*batching, strict=True):
             total = b.add(total, b.known(where[k] * strides[d], "int64"))
         for j, d in enumerate(dims.start_index_map):
-            start, most = _index(e, starts[(*where, j)]), value.shape[d] - sizes[d]
-            clipped = _clipped(e, start, most)
+            start = b.convert(starts[(*where, j)], "int64")
+            clipped = _clipped(b, start, value.shape[d] - sizes[d])
             if "fill" in mode.lower():
                 inside = b.logic("and", inside, b.compare("eq", clipped, start))
             total = b.add(total, b.mul(clipped, b.known(strides[d], "int64")))
@@ -167,14 +171,20 @@ def gather(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[
     return [e.value(results, out.aval)]
 
 
+def _default_fill(dtype: str) -> Any:
+    """What JAX puts in place of elements outside of an array."""
+    if np.issubdtype(dtype, np.floating):
+        return np.nan
+    if dtype == "bool":
+        return True
+    return np.iinfo(dtype).min if np.issubdtype(dtype, np.signedinteger) else np.iinfo(dtype).max
+
+
 def scatter(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
     value, indices, updates = values
     b, params = e.b, eqn.params
     dims, mode = params["dimension_numbers"], str(params["mode"]).lower()
-    op = {"scatter": None, "scatter-add": "add", "scatter_add": "add", "scatter-sub": "sub",
-          "scatter_mul": "mul", "scatter-mul": "mul", "scatter_max": "max",
-          "scatter-max": "max", "scatter_min": "min", "scatter-min": "min",
-          }[eqn.primitive.name]  # fmt: skip
+    op = SCATTERS[eqn.primitive.name]
     entries, news = e.entries(value).copy(), e.entries(updates)
     starts = e.entries(indices)
     inserted = (*dims.inserted_window_dims, *dims.operand_batching_dims)
@@ -196,16 +206,17 @@ def scatter(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list
         fixed = dict.fromkeys(range(len(value.shape)), 0)
         for d, offset in zip(window, (k[d] for d in dims.update_window_dims), strict=True):
             fixed[d] = offset
-        for d, j in zip(dims.operand_batching_dims, dims.scatter_indices_batching_dims,
-                        strict=True):  # fmt: skip
+        batching = dims.operand_batching_dims, dims.scatter_indices_batching_dims
+        for d, j in zip(*batching, strict=True):
             fixed[d] = where[j]
         moving, inside = {}, b.known(True, "bool")
         for j, d in enumerate(dims.scatter_dims_to_operand_dims):
-            start, most = _index(e, starts[(*where, j)]), value.shape[d] - sizes[d]
-            clipped = _clipped(e, start, most)
+            start = b.convert(starts[(*where, j)], "int64")
+            clipped = _clipped(b, start, value.shape[d] - sizes[d])
             if "clip" not in mode:
                 inside = b.logic("and", inside, b.compare("eq", clipped, start))
             moving[d] = clipped
+        # An update that is known to lie outside writes no code.
         if inside.known is not None and not inside.known:
             continue
         for i in np.ndindex(value.shape):

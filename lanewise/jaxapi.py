@@ -7,42 +7,26 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray, Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun, jaxprs_in_params
+from jax.extend.core import (
+    ClosedJaxpr as ClosedJaxpr,
+    Jaxpr as Jaxpr,
+    Literal as Literal,
+    Primitive,
+    jaxpr_as_fun as jaxpr_as_fun,
+    jaxprs_in_params as jaxprs_in_params,
+)
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import NamedSharding, PartitionSpec
 
-__all__ = [
-    "ClosedJaxpr",
-    "Jaxpr",
-    "Literal",
-    "backends_are_initialized",
-    "batch_size",
-    "bodies",
-    "drops_outputs",
-    "has_derivative",
-    "is_traced",
-    "jaxpr_as_fun",
-    "jaxprs_in_params",
-    "linear_map",
-    "lower_on",
-    "manual_axes",
-    "primitive",
-    "scan_counts",
-    "with_equal_axes",
-    "without_manual_axes",
-    "without_outputs",
-    "x64_enabled",
-]
-
 
 def is_traced(x: object) -> bool:
-    """Whether `x` stands for a value that is not known yet (inside jit, vmap, grad, …)."""
+    """Whether the value of `x` is not known yet (inside jit, vmap, grad, …)."""
     return isinstance(x, Tracer)
 
 
 def batch_size(values: Iterable[Any]) -> tuple[int, bool]:
-    """How many elements the batches of `vmap` have that these values stand for, all together; and
-    whether the values are those of a function that is compiled, around which there may be more."""
+    """The number of elements of all batches of `vmap` around these values; and whether they are
+    values of a function that is compiled, around which there may be more batches."""
     sizes: dict[Any, int] = {}
     is_compiled = False
     for x in values:
@@ -66,7 +50,7 @@ def x64_enabled() -> bool:
 
 def backends_are_initialized() -> bool:
     """Whether JAX has started, and read its environment variables."""
-    from jax._src import xla_bridge  # no public name tells
+    from jax._src import xla_bridge  # there is no public name
 
     return xla_bridge.backends_are_initialized()
 
@@ -84,7 +68,7 @@ def bodies(eqn: Any) -> Iterator[ClosedJaxpr]:
 
 
 def _expanded(eqn: Any) -> ClosedJaxpr:
-    """What an equation stands for that is itself no operation yet."""
+    """The jaxpr of an equation that is expanded late."""
     which = eqn.params["_prim"]
 
     def function(*leaves):
@@ -163,6 +147,15 @@ def primitive(
     return new
 
 
+def batch_in_front(arrays: Sequence[Any], axes: Sequence[Any]) -> tuple[int, list, list]:
+    """The number of elements of a batch, the arrays with its axis in front, and whether they have
+    it: 0 or None, as `jax.vmap` takes it."""
+    pairs = list(zip(arrays, axes, strict=True))
+    (size,) = {x.shape[a] for x, a in pairs if a is not None}
+    moved = [x if a is None else jnp.moveaxis(x, a, 0) for x, a in pairs]
+    return size, moved, [None if a is None else 0 for a in axes]
+
+
 def lower_on(platform: str, of: Primitive, function: Callable) -> None:
     """Have a primitive of several outputs compiled for `platform` as what `function` does."""
     mlir.register_lowering(of, _lowered(function, True), platform=platform)
@@ -173,10 +166,12 @@ def drops_outputs(of: Primitive, without: Callable) -> None:
 
     def rule(used: list[bool], *more: Any):
         eqn = more[-1]  # newer releases put something in between
+        # JAX drops the equation then.
         if not any(used):
             return [False] * len(eqn.invars), None
         outvars = [v for v, u in zip(eqn.outvars, used, strict=True) if u]
         new = eqn.replace(outvars=outvars, params=without(eqn.params, used))
+        # All inputs stay: which of them are needed would take a further trace.
         return [True] * len(eqn.invars), new
 
     partial_eval.dce_rules[of] = rule
@@ -185,7 +180,7 @@ def drops_outputs(of: Primitive, without: Callable) -> None:
 def has_derivative(of: Primitive, rule: Callable) -> None:
     """Give a primitive of several outputs a derivative: ``rule(primals, changes, **params)`` →
     (outputs, their changes), where `changes` has those of the operands that change, by position,
-    and None stands for an output that does not."""
+    and None for an output that does not change."""
 
     def both(primals, tangents, **params):
         changes = {i: t for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)}
@@ -211,6 +206,7 @@ def linear_map(push: Callable, pull: Callable, definition: Callable, residuals: 
     `definition` is the same function as `push` in operations that JAX can transpose: derivatives by
     the residuals are taken of it, so that neither `push` nor `pull` need have any.
     """
+    # Residuals first, then the vector: only its part of the operands is transposed.
     known, known_tree = jax.tree.flatten(residuals)
     leaves, tree = jax.tree.flatten(x)
     trees: list[Any] = []
@@ -246,13 +242,11 @@ def _pushed(*arrays, functions: _Linear, count: int) -> list[Any]:
 
 
 def _linear_batched(arrays, axes, *, functions: _Linear, count: int):
-    pairs = list(zip(arrays, axes, strict=True))
-    (size,) = {x.shape[a] for x, a in pairs if a is not None}
-    moved = [x if a is None else jnp.moveaxis(x, a, 0) for x, a in pairs]
-    own = [None if a is None else 0 for a in axes[:count]]
+    size, moved, on = batch_in_front(arrays, axes)
+    own = on[:count]
     vector = [
-        jnp.broadcast_to(x, (size, *x.shape)) if a is None else x
-        for x, a in zip(moved[count:], axes[count:], strict=True)
+        jnp.broadcast_to(x, (size, *x.shape)) if o is None else x
+        for x, o in zip(moved[count:], on[count:], strict=True)
     ]
 
     def all_of(function: Callable) -> Callable:
@@ -284,8 +278,10 @@ def _linear_derivative(primals, tangents, *, functions: _Linear, count: int):
     outs = _linear.bind(*primals, functions=functions, count=count)
     known, x = primals[:count], primals[count:]
     change = [ad.instantiate_zeros(t) for t in tangents[count:]]
+    # Linear in x: the map of the change.
     total = _linear.bind(*known, *change, functions=functions, count=count)
     moves = [i for i, t in enumerate(tangents[:count]) if not isinstance(t, ad.Zero)]
+    # By the residuals the map is not linear; its definition is differentiated there.
     if moves:
 
         def of(*moving):
@@ -313,6 +309,7 @@ def _abstract(function: Callable, avals: Any, params: dict[str, Any]) -> Any:
         out = shape_of(*shapes, **params)
     else:
         out = jax.eval_shape(lambda *a: function(*a, **params), *shapes)
+    # Inside of `jax.shard_map` the types of results have to say along which axes they vary.
     axes = manual_axes(*avals)
     if not axes:
         return jax.tree.map(lambda x: ShapedArray(x.shape, x.dtype), out)

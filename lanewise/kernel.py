@@ -1,9 +1,8 @@
 """A function of one trajectory as the LLVM IR of a kernel for blocks of them."""
 
 import functools
-import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -11,23 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import elementary
+from .builder import Builder
 from .components import Evaluator
 from .elimination import with_exchanges
-from .ir import TYPES, Builder, Num, Unsupported, literal
+from .ir import TYPES, Num, Unsupported, literal
 from .jaxapi import ClosedJaxpr
 from .memory import Buffer, contiguous, load, load_row, store, stored_type
-from .values import SMALL, Kernel, Value, objects
+from .values import SMALL, Value, objects
 
+# Parameters in front of a kernel's own: trajectories, cost of a block; and for each result the
+# bytes of one trajectory.
 HEAD = 2
-"""Parameters in front of a kernel's own: trajectories, cost of a block; and for each result the
-bytes of one trajectory."""
 
-LARGEST_SCRATCH = 64 * 2**20
-"""Bytes that a block may take for rows which are not results."""
+LARGEST_SCRATCH = 64 * 2**20  # bytes that a block may take for rows which are not results
 
 
-class Module(Kernel):
-    """One LLVM module: a kernel, the elementary functions that it calls, its constants."""
+class Module:
+    """One LLVM module: a kernel, the functions that it calls, its constants."""
 
     def __init__(self, width: int, vectors: int):
         self.W, self.U = width, vectors
@@ -37,14 +36,13 @@ class Module(Kernel):
         self.functions: dict[tuple[str, bool], str] = {}
         self.declared: set[str] = set()
         self.scratch_bytes = 0
-        self.lanes: dict[str, str] = {}
         self._constants: dict[bytes, str] = {}
-        self._names = itertools.count()
 
-    # --- what an evaluation asks for -----------------------------------------------------------
+    # --- what an evaluation needs --------------------------------------------------------------
 
     def parameter(self, value: int) -> Num:
         """A whole number that is an input of the machine code: another one needs no new code."""
+        # So a run of other length, or with longer arrays, finds its code in the cache.
         name = f"%par{len(self.values)}"
         self.values.append(int(value))
         return self.b.made([name], "int64", False)
@@ -55,6 +53,7 @@ class Module(Kernel):
         size = int(np.prod(shape, dtype=np.int64))
         block = self.W * self.U if on else each
         start = self.scratch_bytes
+        # Whole cache lines, so that no vector lies in two of them.
         self.scratch_bytes += (size * block * 8 + 63) // 64 * 64
         if self.scratch_bytes > LARGEST_SCRATCH:
             raise Unsupported(f"{self.scratch_bytes} bytes of rows that are not results")
@@ -91,35 +90,35 @@ class Module(Kernel):
         if all(x is not None for x in known):
             return self.b.known(_at_known(name, tuple(float(x) for x in known)), "float64")
         called = self._function(name, len(args), vec)
-        return self.b.op(
-            f"call {name}", args, "float64",
-            lambda t, *x: f"call {t} {called}({', '.join(f'{t} {y}' for y in x)})",
-        )  # fmt: skip
+
+        def write(t: str, *names: str) -> str:
+            return f"call {t} {called}({', '.join(f'{t} {x}' for x in names)})"
+
+        return self.b.op(f"call {name}", args, "float64", write)
 
     def sincos(self, x: Num) -> tuple[Num, Num]:
         """sin x and cos x in one call."""
         b = self.b
         if x.known is not None:
             return self.elementary("sin", [x]), self.elementary("cos", [x])
-        found = b.find(("sincos", x.serial))
-        if found is None:
+
+        def make() -> tuple[Num, ...]:
             called, t = self._function("sincos", 1, x.vec), b.type("float64", x.vec)
             pair = f"{{{t}, {t}}}"
             calls = [b.new(f"call {pair} {called}({t} {name})") for name in x.names]
             b.operations += 2
-            sine, cosine = (
+            return tuple(
                 b.made([b.new(f"extractvalue {pair} {c}, {i}") for c in calls], "float64", x.vec)
                 for i in range(2)
             )
-            found = sine, cosine
-            b.note(("sincos", x.serial), found)
-        return found
+
+        return b.once(("sincos", x.serial), make)
 
     def _function(self, name: str, count: int, vec: bool) -> str:
         wide = vec and self.W > 1
         called = f"@{name.replace(' ', '_').replace('-', 'm')}_{'v' if wide else 's'}"
         if (name, wide) not in self.functions:
-            self.functions[name, wide] = ""
+            self.functions[name, wide] = ""  # its place: a function comes after those it calls
             text, declared, constants = _function_text(name, count, self.W if wide else 1, called)
             self.functions[name, wide] = text
             self.declared |= declared
@@ -162,7 +161,6 @@ class Module(Kernel):
         for v in (*jaxpr.invars, *jaxpr.outvars):
             if str(v.aval.dtype) not in TYPES:
                 raise Unsupported(f"an argument or result of type {v.aval.dtype}")
-        lanes = "%lanes"
         operands = []
         for i, (v, o) in enumerate(zip(jaxpr.invars, on, strict=True)):
             b.emit(f"%ap{i} = getelementptr ptr, ptr %args, i64 {i}")
@@ -173,10 +171,12 @@ class Module(Kernel):
             b.emit(f"%rp{i} = getelementptr ptr, ptr %rets, i64 {i}")
             b.emit(f"%r{i} = load ptr, ptr %rp{i}")
             results.append((f"%r{i}", v.aval))
+        # Before the loop over blocks, so that they are read once.
         strides = [self._lane_stride(a) for _, a, o in operands if o]
         strides_out = [self._lane_stride(a) for _, a in results]
         evaluator = Evaluator(b, self)
         shared = {}
+        # Operands that all trajectories share are read once, before the loop over blocks.
         for i, (pointer, aval, o) in enumerate(operands):
             if not o:
                 buffer = Buffer(
@@ -189,7 +189,8 @@ class Module(Kernel):
         def block(_, i):
             first = b.new(f"add i64 %first, {i}")
             start = b.new(f"mul i64 {first}, {self.W * self.U}")
-            # The last block ends with the last trajectory, and computes some of them again.
+            # The last block ends with the last trajectory, and computes some of them again: there
+            # is no code for a remainder, which could have other bits.
             fits = b.new(f"icmp slt i64 {start}, %last.start")
             start = b.new(f"select i1 {fits}, i64 {start}, i64 %last.start")
             own, of = iter(strides), []
@@ -212,7 +213,7 @@ class Module(Kernel):
         prologue = [
             "  %lanes = load i64, ptr %params",
             "  %count = sub i64 %last, %first",
-            f"  %last.start = sub i64 {lanes}, {self.W * self.U}",
+            f"  %last.start = sub i64 %lanes, {self.W * self.U}",
         ]
         for i in range(len(self.values)):
             prologue += [
@@ -221,6 +222,7 @@ class Module(Kernel):
             ]
         epilogue = []
         if self.scratch_bytes:
+            # Not from the stack: that of a thread of XLA's pool may be small.
             b.declared |= {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
             size = self.scratch_bytes + 64
             prologue += [
@@ -234,11 +236,11 @@ class Module(Kernel):
         body = "\n".join([*prologue, *b.lines, *epilogue, "  ret void"])
         declared = "\n".join(sorted(self.declared | b.declared))
         functions = "\n".join(self.functions.values())
-        return (
-            "\n".join(self.globals) + "\n" + declared + "\n" + functions
-            + "\ndefine internal void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, "
-            + "i64 %first, i64 %last) alignstack(64) align 64 {\nentry:\n" + body + "\n}\n"
-        )  # fmt: skip
+        head = (
+            "define internal void @lanewise_kernel(ptr %args, ptr %rets, ptr %params, "
+            "i64 %first, i64 %last) alignstack(64) align 64 {\nentry:"
+        )
+        return "\n".join(["\n".join(self.globals), declared, functions, head, body, "}\n"])
 
     def _lane_stride(self, aval: Any) -> int | str:
         """The distance between trajectories in elements; that of long arrays is an input."""
@@ -263,17 +265,18 @@ class Module(Kernel):
         return value
 
 
+def _elementary(name: str) -> Callable:
+    """An elementary function of scalars by name; that of a power has its argument in the name."""
+    if name.startswith("half_integer_power"):
+        return elementary.half_integer_power(int(name.split()[1]))
+    return elementary.sincos if name == "sincos" else elementary.FUNCTIONS[name]
+
+
 @functools.cache
 def _traced(name: str, count: int) -> ClosedJaxpr:
     """An elementary function as a jaxpr of scalars."""
-    if name.startswith("half_integer_power"):
-        function = elementary.half_integer_power(int(name.split()[1]))
-    elif name == "sincos":
-        function = elementary.sincos
-    else:
-        function = elementary.FUNCTIONS[name]
     with jax.enable_x64(True):
-        return jax.make_jaxpr(function)(*[jnp.zeros((), jnp.float64)] * count)
+        return jax.make_jaxpr(_elementary(name))(*[jnp.zeros((), jnp.float64)] * count)
 
 
 @functools.cache
@@ -282,15 +285,12 @@ def _function_text(
 ) -> tuple[str, frozenset[str], tuple[str, ...]]:
     """An elementary function of vectors of `width`, with what it declares."""
     inner = Module(width, 1)
+    # A module of its own: its numbers and scopes do not mix with those of the caller.
     closed = _traced(name, count)
     b = inner.b
     args = [b.made([f"%x{i}"], "float64", True) for i in range(count)]
     evaluator = Evaluator(b, inner)
-    values = []
-    for x in args:
-        entries = np.empty((), object)
-        entries[()] = x
-        values.append(Value((), "float64", entries))
+    values = [Value((), "float64", objects([x], ())) for x in args]
     outs = evaluator.closed(closed, values)
     t = result_type = b.type("float64", True)
     results = [b.ref(evaluator.entries(out)[()], 0, True) for out in outs]
@@ -328,9 +328,5 @@ def _exchange_text(n: int, dtype: str, width: int, called: str) -> tuple[str, fr
 @functools.lru_cache(maxsize=4096)
 def _at_known(name: str, args: tuple[float, ...]) -> float:
     """The value at arguments that are known while the code is made, by XLA."""
-    if name.startswith("half_integer_power"):
-        function = elementary.half_integer_power(int(name.split()[1]))
-    else:
-        function = elementary.FUNCTIONS[name]
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        return float(function(*(jnp.asarray(x, jnp.float64) for x in args)))
+        return float(_elementary(name)(*(jnp.asarray(x, jnp.float64) for x in args)))

@@ -8,12 +8,11 @@ from jax.typing import ArrayLike
 
 from .jaxapi import primitive
 
-WRITTEN_OUT = 4
-"""Systems up to this size are eliminated number by number in XLA too."""
+WRITTEN_OUT = 4  # systems up to this size are eliminated number by number in XLA too
 
+# Batches of systems up to this size are eliminated column by column on a CPU: LAPACK's calls for
+# batches share the threads of XLA, and may wait for ever for a thread that waits for them.
 IN_A_LOOP = 64
-"""Batches of systems up to this size are eliminated column by column on a CPU: LAPACK's calls for
-batches share the threads of XLA, and may wait for ever for a thread that waits for them."""
 
 
 def solve(A: Array, b: Array) -> Array:
@@ -21,14 +20,15 @@ def solve(A: Array, b: Array) -> Array:
 
     Linear in b and differentiable in both. In machine code this is Gaussian elimination in which
     zeros by the structure of A stay zeros (a band stays a band); rows are exchanged on those
-    trajectories where a pivot is small beside the numbers below it. A singular matrix gives
-    infinities or NaN, for the caller's status to report.
+    trajectories where a pivot is small compared with the numbers below it. A singular matrix gives
+    infinities or NaN, which the caller has to check.
     """
     if A.ndim != 2 or A.shape[0] != A.shape[1] or b.shape != A.shape[:1]:
         raise ValueError(
             f"A must have shape (n, n) and b shape (n,), got {A.shape} and {b.shape}. For several "
             "systems use jax.vmap or lanewise.batched."
         )
+    # It makes the solution differentiable any number of times by solving with the same matrix.
     return lax.custom_linear_solve(
         lambda x: A @ x,
         b,
@@ -41,6 +41,7 @@ def _in_arrays(A: ArrayLike, b: ArrayLike) -> Array:
     """The solutions of systems with the shapes (..., n, n) and (..., n)."""
     A, b = jnp.asarray(A), jnp.asarray(b)
     n, lapack = b.shape[-1], _on_each(jnp.linalg.solve)
+    # A loop over columns, or a call of LAPACK, takes longer than so few operations.
     if n <= WRITTEN_OUT:
         return _on_each(by_elimination)(A, b)
     if b.ndim == 1 or n > IN_A_LOOP:
@@ -100,6 +101,7 @@ def _column_by_column(A: Array, b: Array) -> Array:
 def _in_batches(arrays, axes):
     """More systems at once: their axis goes in front, of length 1 for what they share."""
     moved = [
+        # One matrix for several right-hand sides stays one: its elimination is shared.
         jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(jnp.asarray(x), axis, 0)
         for x, axis in zip(arrays, axes, strict=True)
     ]

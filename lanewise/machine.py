@@ -5,37 +5,34 @@ from typing import Any
 
 from . import cache
 
-try:
-    import llvmlite
-    import llvmlite.binding as llvm
-except ImportError as error:  # not on every platform: `started` says so, and all goes through XLA
-    llvmlite: Any = None
-    llvm: Any = None
-    _missing: ImportError | None = error
-else:
-    _missing = None
-
+# Part of the name of each file in the cache: increase it with each change of what machine code
+# expects of the process around it, or processes would load code that does not fit.
 FORMAT = 3
-"""Goes up with each change of what the machine code expects of the process around it."""
 
 
 @functools.cache
-def started() -> None:
-    """Start LLVM, once.
+def started() -> Any:
+    """The module `llvmlite.binding`, with LLVM started.
 
     **Raises** `ImportError` where llvmlite is not installed.
     """
-    if _missing is not None:
-        raise _missing
+    # Imported at the first use: it takes 0.09 s, and programs that generate no code need none.
+    try:
+        import llvmlite.binding as llvm
+    except ImportError as error:
+        raise ImportError(f"{error}; machine code needs it: pip install llvmlite") from error
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
+    return llvm
 
 
 @functools.cache
 def host() -> tuple[str, str]:
     """(name, features) of the processor, as LLVM calls them."""
+    llvm = started()
     features = llvm.get_host_cpu_features().flatten()
     if "+avx512f" in features.split(","):
+        # LLVM prefers half of a register on some processors with AVX-512; our vectors fill it.
         features += ",-prefer-256-bit"
     return llvm.get_host_cpu_name(), features
 
@@ -52,7 +49,7 @@ def width() -> int:
 @functools.cache
 def target_machine(triple: str | None = None, cpu: str | None = None, features: str | None = None):
     """LLVM's view of a machine, by default of this one."""
-    started()
+    llvm = started()
     if triple is None:
         target, (cpu, features) = llvm.Target.from_default_triple(), host()
     else:
@@ -63,33 +60,29 @@ def target_machine(triple: str | None = None, cpu: str | None = None, features: 
     )
 
 
-def _optimised(module: Any, machine: Any) -> None:
-    """The passes that pay for code which is written number by number: no vectoriser, no unrolling,
-    nothing that may change an operation."""
+def _optimised(ir: str, machine: Any) -> Any:
+    """A module after the passes that pay for code which is written number by number."""
+    llvm = started()
+    module = llvm.parse_assembly(ir)
+    module.verify()
+    module.triple, module.data_layout = machine.triple, str(machine.target_data)
+    # No vectoriser, for the code consists of vectors, and no unrolling, for it fills the cache.
     options = llvm.create_pipeline_tuning_options(speed_level=2)
     options.slp_vectorization = options.loop_vectorization = options.loop_unrolling = False
     builder = llvm.create_pass_builder(machine, options)
     builder.getModulePassManager().run(module, builder)
+    return module
 
 
 def object_code(ir: str, machine: Any = None) -> bytes:
-    """The object file of a module."""
+    """The object file of a module, by default for the processor of this process."""
     machine = target_machine() if machine is None else machine
-    module = llvm.parse_assembly(ir)
-    module.verify()
-    module.triple = machine.triple
-    module.data_layout = str(machine.target_data)
-    _optimised(module, machine)
-    return machine.emit_object(module)
+    return machine.emit_object(_optimised(ir, machine))
 
 
 def assembly(ir: str) -> str:
     """The machine code of a module in the assembler's language."""
-    machine = target_machine()
-    module = llvm.parse_assembly(ir)
-    module.verify()
-    _optimised(module, machine)
-    return machine.emit_assembly(module)
+    return target_machine().emit_assembly(_optimised(ir, target_machine()))
 
 
 def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
@@ -98,7 +91,9 @@ def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
     One engine holds the code of all modules, which must define different names; JAX may call it as
     long as the process lives.
     """
-    started()
+    import llvmlite
+
+    llvm = started()
     for name, address in (symbols or {}).items():
         llvm.add_symbol(name, address)
     cpu, features = host()
@@ -108,6 +103,7 @@ def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
         code = object_code(ir)
         cache.write(key, code)
     engine = _engine()
+    # An empty module with the key as its name makes the engine read the code from its object cache.
     empty = llvm.parse_assembly("")
     empty.name = key
     _codes[key] = code
@@ -119,21 +115,17 @@ def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
     return engine
 
 
-_codes: dict[str, bytes] = {}
-"""The code of a module that is being added to the engine, by the module's name."""
+_codes: dict[str, bytes] = {}  # of modules that are being added to the engine, by their names
 
 
 @functools.cache
 def _engine() -> Any:
+    llvm, (cpu, features) = started(), host()
     first = llvm.parse_assembly("define internal void @nothing() { ret void }")
-    engine = llvm.create_mcjit_compiler(first, _own_machine())
-    engine.set_object_cache(None, lambda module: _codes.get(module.name))
-    return engine
-
-
-def _own_machine() -> Any:
-    """An engine takes the machine that it is given for itself."""
-    cpu, features = host()
-    return llvm.Target.from_default_triple().create_target_machine(
+    # A machine of its own: an engine takes possession of the one that it gets.
+    machine = llvm.Target.from_default_triple().create_target_machine(
         cpu=cpu, features=features, opt=2, reloc="pic", codemodel="jitdefault", jit=True
     )
+    engine = llvm.create_mcjit_compiler(first, machine)
+    engine.set_object_cache(None, lambda module: _codes.get(module.name))
+    return engine

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from .ir import TYPES, Builder, Num, Unsupported
+from .builder import Builder
+from .ir import TYPES, Num, Unsupported
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,8 +56,8 @@ class Buffer:
         """The same elements in row-major order with other axes, if strides can say that."""
         if not self.is_contiguous:
             return None
-        step = next((s for s, n in zip(self.strides[::-1], self.shape[::-1], strict=True)
-                     if n > 1), 1)  # fmt: skip
+        long = [s for s, n in zip(self.strides, self.shape, strict=True) if n > 1]
+        step = long[-1] if long else 1  # the stride of an axis of length 1 may be anything
         return dataclasses.replace(self, shape=tuple(shape), strides=contiguous(shape, step))
 
     def seen(self, view: Any) -> "Buffer | None":
@@ -97,6 +98,7 @@ def stored_type(dtype: str) -> str:
 
 def _offset(b: Builder, buffer: Buffer, by: Num | int) -> tuple[Num, int]:
     """The offset as (a number, a constant)."""
+    # Constants are added while the code is written; the rest is one addition in it.
     total, fixed = b.known(0, "int64"), 0
     for part in (*buffer.offset, by):
         if isinstance(part, int):
@@ -112,6 +114,7 @@ def load(b: Builder, buffer: Buffer, by: Num | int = 0) -> Num:
     """The element at `by` elements from the start."""
     item = stored_type(buffer.dtype)
     moving, fixed = _offset(b, buffer, by)
+    # Shared memory at a shared index: one number for all trajectories.
     if buffer.lane is None and not moving.vec:
         where = _moved(b, buffer.base[0], moving, fixed, item)
         return _from_memory(b, b.made([_load(b, item, where)], buffer.dtype, False))
@@ -119,6 +122,7 @@ def load(b: Builder, buffer: Buffer, by: Num | int = 0) -> Num:
     for u in range(b.U):
         if b.W > 1 and buffer.lane == 1 and not moving.vec:
             where = _moved(b, buffer.base[u], moving, fixed, item)
+            # Neighbours in memory are neighbours in the vector.
             names.append(_load(b, f"<{b.W} x {item}>", where, item))
             continue
         ones = [_load(b, item, at) for at in _pointers(b, buffer, u, moving, fixed, item)]
@@ -136,6 +140,7 @@ def store(b: Builder, buffer: Buffer, x: Num, by: Num | int = 0) -> None:
     moving, fixed = _offset(b, buffer, by)
     if buffer.lane is None:
         if x.vec or moving.vec:
+            # Which trajectory wrote last would decide.
             raise Unsupported("writing to an array that all trajectories share")
         where = _moved(b, buffer.base[0], moving, fixed, item)
         _store(b, item, _to_memory(b, x, 0, False), where)
@@ -155,10 +160,8 @@ def store(b: Builder, buffer: Buffer, x: Num, by: Num | int = 0) -> None:
 
 def _moved(b: Builder, base: str, moving: Num, fixed: int, item: str) -> str:
     """A pointer moved by so many elements."""
-    where = base
-    if moving.known is None:
-        where = b.new(f"getelementptr {item}, ptr {where}, i64 {moving.names[0]}")
-    return b.new(f"getelementptr {item}, ptr {where}, i64 {fixed}") if fixed else where
+    where = b.pointer(item, base, moving.names[0] if moving.known is None else 0)
+    return b.pointer(item, where, fixed)
 
 
 def _pointers(
@@ -178,20 +181,14 @@ def _pointers(
         if b.W > 1:
             one = b.new(f"extractelement <{b.W} x i64> {index}, i64 {i}")
         at = base if buffer.lane is None else _lane_pointer(b, base, i, buffer.lane, item)
-        yield b.new(f"getelementptr {item}, ptr {at}, i64 {one}")
+        yield b.pointer(item, at, one)
 
 
 def _lane_pointer(b: Builder, base: str, i: int, lane: int | str, item: str) -> str:
-    if i == 0:
-        return base
-    if isinstance(lane, int):
-        return b.new(f"getelementptr {item}, ptr {base}, i64 {i * lane}")
-    key = ("lane", lane, i)
-    by = b.find(key)
-    if by is None:
-        by = b.new(f"mul i64 {lane}, {i}")
-        b.note(key, by)
-    return b.new(f"getelementptr {item}, ptr {base}, i64 {by}")
+    if i == 0 or isinstance(lane, int):
+        return b.pointer(item, base, i and i * lane)
+    by = b.once(("lane", lane, i), lambda: b.new(f"mul i64 {lane}, {i}"))
+    return b.pointer(item, base, by)
 
 
 def _load(b: Builder, what: str, where: str, item: str = "") -> str:
@@ -210,6 +207,7 @@ def _from_memory(b: Builder, x: Num) -> Num:
     """Truth values take a byte each in memory."""
     if x.dtype != "bool":
         return x
+    # Any byte but 0 counts as true.
     t = f"<{b.W} x i8>" if x.vec and b.W > 1 else "i8"
     zero = "zeroinitializer" if x.vec and b.W > 1 else "0"
     return b.made([b.new(f"icmp ne {t} {n}, {zero}") for n in x.names], "bool", x.vec)
@@ -255,6 +253,8 @@ def store_row(b: Builder, buffer: Buffer, numbers: Sequence[Num]) -> None:
             _store_lanes(b, buffer, where, fixed + first, vectors, item)
 
 
+# A piece of four is loaded by one instruction for each trajectory, and its transposition takes few
+# shuffles; longer rows are cut.
 _LONGEST_PIECE = 4
 
 
@@ -264,6 +264,7 @@ def _pieces(size: int, lane: Any) -> list[tuple[int, int]]:
         return [(0, size)]
     pieces, first = [], 0
     while first < size:
+        # Vectors of other lengths are taken apart by LLVM, slowly.
         count = next(c for c in (4, 2, 1) if c <= size - first)
         pieces.append((first, count))
         first += count
@@ -279,16 +280,13 @@ def _is_row(b: Builder, buffer: Buffer) -> bool:
 
 
 def _start_of_row(b: Builder, buffer: Buffer, u: int, moving: Num, item: str) -> str:
-    if moving.known is not None:
-        return buffer.base[u]
-    return b.new(f"getelementptr {item}, ptr {buffer.base[u]}, i64 {moving.names[0]}")
+    return b.pointer(item, buffer.base[u], moving.names[0] if moving.known is None else 0)
 
 
 def _load_lanes(b: Builder, buffer: Buffer, where: str, first: int, count: int, item: str) -> str:
     """One vector with `count` neighbours of each trajectory, one trajectory after the other."""
     assert buffer.lane is not None
-    if first:
-        where = b.new(f"getelementptr {item}, ptr {where}, i64 {first}")
+    where = b.pointer(item, where, first)
     if buffer.lane == count:
         whole = f"<{b.W * count} x {item}>"
         return b.new(f"load {whole}, ptr {where}, align {_bytes(item)}")
@@ -304,9 +302,7 @@ def _store_lanes(
 ) -> None:
     """Write one vector for each of some neighbours."""
     assert buffer.lane is not None
-    count = len(vectors)
-    if first:
-        where = b.new(f"getelementptr {item}, ptr {where}, i64 {first}")
+    count, where = len(vectors), b.pointer(item, where, first)
     joined = _joined(b, vectors, b.W, item)
     if buffer.lane == count:
         order = [j * b.W + i for i in range(b.W) for j in range(count)]
@@ -327,16 +323,18 @@ def _picked(b: Builder, joined: str, j: int, count: int, item: str) -> str:
 def _joined(b: Builder, parts: list[str], length: int, item: str) -> str:
     """Vectors of one length, one after the other."""
     parts = list(parts)
+    # A shuffle joins two vectors of one length: fill up to a power of two.
     missing = (1 << (len(parts) - 1).bit_length()) - len(parts)
     wanted = len(parts) * length
     parts += ["poison"] * missing
     while len(parts) > 1:
         t, order = f"<{length} x {item}>", ", ".join(f"i32 {k}" for k in range(2 * length))
         parts = [
-            "poison" if x == y == "poison" else
             b.new(f"shufflevector {t} {x}, {t} {y}, <{2 * length} x i32> <{order}>")
+            if x != "poison"
+            else x
             for x, y in zip(parts[::2], parts[1::2], strict=True)
-        ]  # fmt: skip
+        ]
         length *= 2
     return parts[0] if length == wanted else _shuffled(b, parts[0], length, range(wanted), item)
 
@@ -349,13 +347,11 @@ def _shuffled(b: Builder, x: str, length: int, order: Sequence[int], item: str) 
 
 
 def transposed(b: Builder, source: Buffer, target: Buffer) -> None:
-    """Copy all elements of `source`, whose vectors lie in memory as such, to the first ones of
+    """Copy all elements of `source`, whose vectors are contiguous, to the first ones of
     `target`, where those of one trajectory are neighbours. The size is a multiple of the width."""
     item, W = TYPES[source.dtype], b.W
     moving, fixed = _offset(b, target, 0)
-    start = _start_of_row(b, target, 0, moving, item)
-    if fixed:
-        start = b.new(f"getelementptr {item}, ptr {start}, i64 {fixed}")
+    start = b.pointer(item, _start_of_row(b, target, 0, moving, item), fixed)
     lane = target.lane
     assert lane is not None
     block = b.U * W  # the vectors of one element
@@ -363,24 +359,22 @@ def transposed(b: Builder, source: Buffer, target: Buffer) -> None:
 
     def of_vector(_, u: str) -> list[Num]:
         first = b.new(f"mul i64 {u}, {W}")
-        mine = b.new(f"getelementptr {item}, ptr {source.base[0]}, i64 {first}")
-        by = b.new(f"mul i64 {u}, {by_vector}")
-        yours = b.new(f"getelementptr {item}, ptr {start}, i64 {by}")
+        mine = b.pointer(item, source.base[0], first)
+        yours = b.pointer(item, start, b.new(f"mul i64 {u}, {by_vector}"))
 
         def square(_, c: str) -> list[Num]:
-            at = b.new(f"mul i64 {c}, {W * block}")
-            at = b.new(f"getelementptr {item}, ptr {mine}, i64 {at}")
+            at = b.pointer(item, mine, b.new(f"mul i64 {c}, {W * block}"))
             vectors = []
             for j in range(W):
                 where = b.new(f"getelementptr {item}, ptr {at}, i64 {j * block}")
                 vectors.append(b.new(f"load <{W} x {item}>, ptr {where}, align {_bytes(item)}"))
-            to = b.new(f"mul i64 {c}, {W}")
-            to = b.new(f"getelementptr {item}, ptr {yours}, i64 {to}")
+            to = b.pointer(item, yours, b.new(f"mul i64 {c}, {W}"))
             for i, row in enumerate(_square_transposed(b, vectors, item)):
                 where = _lane_pointer(b, to, i, lane, item)
                 b.emit(f"store <{W} x {item}> {row}, ptr {where}, align {_bytes(item)}")
             return []
 
+        # Squares of W elements of W trajectories: each is transposed in registers.
         squares = source.size // W
         b.loop([], [], lambda _, c: b.new(f"icmp slt i64 {c}, {squares}"), square, count=True)
         return []

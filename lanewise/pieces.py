@@ -27,26 +27,33 @@ class Piece:
     reason: str | None
     is_call: bool
 
+    @property
+    def is_left_to_xla(self) -> bool:
+        return self.reason is not None and not self.is_call
+
 
 def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> list[Piece]:
     """The pieces of a function, in the order in which they are computed.
 
-    `reason` tells why no code can be generated for a function, None if it can. A loop, a branch or
-    a linear solve is never cut: it is in one piece with all that it calls. Code is generated for
-    pieces with a loop; what is between them goes with the piece before it.
+    `reason` returns why no code can be generated for a function, None if it can be. A loop, a
+    branch or a linear solve is never cut: it is in one piece with all that it calls. Code is
+    generated for pieces with a loop; what is between them goes with the piece before it.
     """
     jaxpr = closed.jaxpr
     known = dict(zip(jaxpr.constvars, closed.consts, strict=True))
     groups = [_Group()]
     for eqn in jaxpr.eqns:
         why = None
+        # An attempt takes a trace and an evaluation: only if names and types do not decide it.
         if not _is_simple(eqn):
             why = reason(_function_of([eqn], eqn.outvars, jaxpr, known)[0])
+        # A function that is called, with a loop in it, is cut in turn.
         if why is not None and eqn.primitive.name in CALLS and _has_loop(eqn):
             groups += [_Group([eqn], why, is_call=True), _Group()]
             continue
         loops = why is None and _has_loop(eqn)
         group = groups[-1]
+        # A loop that can be compiled does not share a piece with what cannot.
         if (loops and group.reason is not None) or (why is not None and group.loops):
             group = _Group()
             groups.append(group)
@@ -55,6 +62,7 @@ def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> 
         group.reason = group.reason or why
     found: list[Piece] = []
     needed = {v for v in jaxpr.outvars if not isinstance(v, Literal)}
+    # Backwards: what a piece has to give is what later ones read.
     for group in reversed(groups):
         writes = [v for eqn in group.eqns for v in eqn.outvars if v in needed]
         if not writes:
@@ -66,6 +74,7 @@ def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> 
             (part,) = bodies(eqns[0])
             reads, writes = eqns[0].invars, eqns[0].outvars
             needed |= {v for v in reads if not isinstance(v, Literal)}
+        # Without a loop XLA is as fast, and a call less is made.
         why = group.reason or (None if group.loops else "no loop in it")
         found.append(Piece(part, tuple(reads), tuple(writes), why, group.is_call))
     return found[::-1]

@@ -1,4 +1,4 @@
-"""The primitive: a function of one trajectory, whose batch under `vmap` becomes machine code."""
+"""The primitive of JAX for a function of one trajectory; under `vmap` it becomes machine code."""
 
 import dataclasses
 import functools
@@ -17,6 +17,7 @@ from .extent import carried, operation_count
 from .ir import Unsupported
 from .jaxapi import (
     ClosedJaxpr,
+    batch_in_front,
     drops_outputs,
     has_derivative,
     linear_map,
@@ -31,8 +32,7 @@ from .traced import Traced
 
 FORMS = ("auto", "components", "arrays", "kernel")
 
-SWITCH = "LANEWISE"
-"""The variable that switches the generator off: ``LANEWISE=off``."""
+SWITCH = "LANEWISE"  # the variable that switches the generator off: ``LANEWISE=off``
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,8 +85,9 @@ def call(function: Callable, *args: Any, layout: Layout = AUTO) -> Any:
     too.
     """
     leaves, tree = jax.tree.flatten(args)
+    # Traced here, for one trajectory: `vmap` outside only reaches the primitive.
     traced = Traced.of(function, leaves, tree)
-    program = _Program(traced, layout)
+    program = Program(traced, layout)
     # What is traced outside and closed over is an input like the others.
     operands = [*traced.outer, *leaves]
     on = (False,) * len(operands)
@@ -154,28 +155,22 @@ def _can_start() -> bool:
     return True
 
 
-class _Program:
+# Compared by identity: JAX takes two calls of one program for the same, and hashes its parameters.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Program:
     """What a call computes, and how that is compiled."""
 
-    def __init__(self, traced: Traced, layout: Layout):
-        self.traced, self.layout = traced, layout
+    traced: Traced
+    layout: Layout = AUTO
 
-    def giving(self, used: list[bool]) -> "_Program":
-        """The program that gives some of the outputs only."""
-        return _Program(self.traced.giving(used), self.layout)
-
-
-def program_of_jaxpr(closed: ClosedJaxpr, layout: Layout) -> _Program:
-    """The program of a jaxpr that closes over nothing that is traced."""
-    return _Program(Traced(closed), layout)
+    def shape_of(self, lanes: int | None) -> list[Any]:
+        """The shapes and types of the outputs for a batch."""
+        front = () if lanes is None else (lanes,)
+        avals = self.traced.closed.out_avals
+        return [jax.ShapeDtypeStruct((*front, *a.shape), a.dtype) for a in avals]
 
 
-def program_of(function: Callable, leaves: Sequence[Any], layout: Layout) -> _Program:
-    """The program of a function of arrays, as `call` makes it."""
-    return _Program(Traced.of(function, leaves, jax.tree.structure(tuple(leaves))), layout)
-
-
-def _in_jax(program: _Program, lanes: int | None, on: tuple[bool, ...]) -> Callable:
+def _in_jax(program: Program, lanes: int | None, on: tuple[bool, ...]) -> Callable:
     """The program as a function of JAX: the batch in front of operands where `on`, and of all
     outputs."""
     if lanes is None:
@@ -183,43 +178,41 @@ def _in_jax(program: _Program, lanes: int | None, on: tuple[bool, ...]) -> Calla
     return jax.vmap(program.traced, [0 if o else None for o in on], 0, axis_size=lanes)
 
 
-def _through_xla(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]):
+def _through_xla(*operands, program: Program, lanes: int | None, on: tuple[bool, ...]):
     """The program as XLA compiles it."""
     return _in_jax(program, lanes, on)(*operands)
 
 
-def _on_cpu(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]):
+def _on_cpu(*operands, program: Program, lanes: int | None, on: tuple[bool, ...]):
     """The program as machine code, through XLA where none can be generated."""
     try:
         name, params = compiled(program, on, lanes)
     except Unsupported as reason:
+        # This is for developers of the compiler; users have `explain`.
         if os.environ.get("LANEWISE_LOG"):
             print("left to XLA:", reason, flush=True)
         found = pieces_of(program, lanes or 1) if lanes != 0 else []
-        if not any(piece.reason is None or piece.is_call for piece in found):
+        if not found:
             return _through_xla(*operands, program=program, lanes=lanes, on=on)
 
         def run(piece: Piece, *arrays: Any, on: tuple[bool, ...]) -> list[Any]:
-            part = program_of_jaxpr(piece.closed, program.layout)
-            to_xla = piece.reason is not None and not piece.is_call
-            compute = _through_xla if to_xla else _lanewise.bind
+            part = Program(Traced(piece.closed), program.layout)
+            compute = _through_xla if piece.is_left_to_xla else _lanewise.bind
             return compute(*arrays, program=part, lanes=lanes, on=on)
 
         return in_pieces(found, program.traced.all_inputs, operands, lanes, on, run)
-    front = () if lanes is None else (lanes,)
-    avals = program.traced.closed.out_avals
-    like = [jax.ShapeDtypeStruct((*front, *a.shape), a.dtype) for a in avals]
-    return list(jax.ffi.ffi_call(name, like)(*operands, params=params))
+    call_handler = jax.ffi.ffi_call(name, program.shape_of(lanes))
+    return list(call_handler(*operands, params=params))
 
 
-def pieces_of(program: _Program, lanes: int) -> list[Piece]:
-    """What becomes of a program for which no code is generated as a whole."""
+def pieces_of(program: Program, lanes: int) -> list[Piece]:
+    """The pieces of a program that is not compiled as a whole; none if XLA computes all of it."""
     if program.layout.form == "arrays" or not generates():
         return []
 
     def reason(closed: ClosedJaxpr) -> str | None:
         try:
-            part = program_of_jaxpr(closed, program.layout)
+            part = Program(Traced(closed), program.layout)
             kernel_of(part, [True] * len(closed.jaxpr.invars), lanes)
         except Unsupported as why:
             return str(why)
@@ -227,15 +220,16 @@ def pieces_of(program: _Program, lanes: int) -> list[Piece]:
 
     found = pieces(program.traced.all_inputs, reason)
     # One piece is all of it, and too large as a whole: it cannot be cut any further.
-    return [] if len(found) == 1 and not found[0].is_call else found
+    is_whole = len(found) == 1 and not found[0].is_call
+    return [] if is_whole or all(piece.is_left_to_xla for piece in found) else found
 
 
 def compiled(
-    program: _Program, on: Sequence[bool], lanes: int | None, vectors: int | None = None
+    program: Program, on: Sequence[bool], lanes: int | None, vectors: int | None = None
 ) -> tuple[str, np.ndarray]:
     """The name of the handler that computes a program for a batch, and its parameters.
 
-    **Raises** `Unsupported` where no code is generated, with what stands in the way.
+    **Raises** `Unsupported` where no code is generated, with the reason.
     """
     if not generates():
         raise Unsupported("no machine code is generated in this process")
@@ -243,6 +237,8 @@ def compiled(
         raise Unsupported("a batch of no trajectories")
     module, text = kernel_of(program, on, 1 if lanes is None else lanes, vectors)
     name = handler.registered(handler.module_text(text, module.W * module.U))
+    # The operations of a block, times the rounds of its longest loop: with few of them the threads
+    # of XLA's pool would take longer to start than to work.
     cost = max(module.b.operations * max([1, *module.values]), 1)
     outs = program.traced.closed.out_avals
     sizes = [a.size * a.dtype.itemsize for a in outs]
@@ -250,12 +246,13 @@ def compiled(
 
 
 def kernel_of(
-    program: _Program, on: Sequence[bool], lanes: int, vectors: int | None = None
+    program: Program, on: Sequence[bool], lanes: int, vectors: int | None = None
 ) -> tuple[Module, str]:
     """The module of a program for so many trajectories, and its text."""
     if program.layout.form == "arrays":
         raise Unsupported('the layout has form="arrays"')
     closed = program.traced.all_inputs
+    # Counted before code is written, which would take minutes for the largest functions.
     count = operation_count(closed.jaxpr)
     if count > MOST_OPERATIONS:
         raise Unsupported(f"a function of {count} operations")
@@ -275,11 +272,14 @@ def kernel_of(
 def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
     """(W, U): numbers in a vector, vectors in a block, for so many trajectories."""
     width = machine.width() if width is None else width
+    # A block has no more trajectories than the batch: the last block could not end with the last
+    # one.
     while width > lanes:
         width //= 2
     vectors = 1
     if lanes >= most * width:
         return width, most
+    # A power of two here, so that batches of different small sizes share code.
     while 2 * vectors <= most and 2 * vectors * width <= lanes:
         vectors *= 2
     return width, vectors
@@ -287,6 +287,8 @@ def variant(lanes: int, most: int, width: int | None = None) -> tuple[int, int]:
 
 def vectors_for(carried: int, operations: int) -> int:
     """Vectors in a block: enough to hide latency, few enough that the state stays in registers."""
+    # A short step has few independent operations: several vectors hide the latency of its
+    # divisions. A long one has many, and more vectors would need more registers than there are.
     if operations < 150:
         return max(1, min(8, 32 // max(carried, 1)))
     if operations < 800 and carried <= 12:
@@ -296,27 +298,22 @@ def vectors_for(carried: int, operations: int) -> int:
     return 2 if operations < 4000 and carried <= 12 else 1
 
 
-def _shape_of(*operands, program: _Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
-    front = () if lanes is None else (lanes,)
-    avals = program.traced.closed.out_avals
-    return [jax.ShapeDtypeStruct((*front, *a.shape), a.dtype) for a in avals]
+def _shape_of(*operands, program: Program, lanes: int | None, on: tuple[bool, ...]) -> list[Any]:
+    return program.shape_of(lanes)
 
 
+# The shapes are known: JAX need not trace the function again to find them.
 _through_xla.shape_of = _shape_of  # pyright: ignore[reportFunctionMemberAccess]
 
 
-def _batched(operands, axes, *, program: _Program, lanes: int | None, on: tuple[bool, ...]):
+def _batched(operands, axes, *, program: Program, lanes: int | None, on: tuple[bool, ...]):
     """One more axis of trajectories: all of them become one."""
     batched = [axis is not None for axis in axes]
-    moved = [
-        x if axis is None else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(operands, axes, strict=True)
-    ]
-    (size,) = {x.shape[0] for x, b in zip(moved, batched, strict=True) if b}
+    size, moved, _ = batch_in_front(operands, axes)
     if lanes is None:
-        flags = tuple(batched)
-        outs = _lanewise.bind(*moved, program=program, lanes=size, on=flags)
+        outs = _lanewise.bind(*moved, program=program, lanes=size, on=tuple(batched))
         return outs, [0] * len(outs)
+    # One batch of all trajectories: nested batches need no rule of their own.
     merged = [_merge(x, b, o, size, lanes) for x, b, o in zip(moved, batched, on, strict=True)]
     either = tuple(b or o for b, o in zip(batched, on, strict=True))
     outs = _lanewise.bind(*merged, program=program, lanes=size * lanes, on=either)
@@ -329,8 +326,7 @@ lower_on("cpu", _lanewise, _on_cpu)
 
 
 def _derivative(primals, changes: dict[int, Any], **params):
-    """The derivative of what the program stands for, computed by XLA."""
-
+    """The derivative of the function, computed by XLA."""
     moving = list(changes.values())
     function = _in_jax(**params)
 
@@ -341,6 +337,7 @@ def _derivative(primals, changes: dict[int, Any], **params):
     def is_real(x: Any) -> bool:
         return jnp.issubdtype(x.dtype, jnp.inexact)
 
+    # Outside of `jax.shard_map` JAX's own rules do everything.
     if not manual_axes(*primals, *moving):
         of = functools.partial(moved, primals)
         outs, tangents = jax.jvp(of, [primals[i] for i in changes], moving)
@@ -368,6 +365,7 @@ has_derivative(_lanewise, _derivative)
 
 def _eagerly(*operands, **params):
     """Outside of `jit`: as under it, where that is not switched off."""
+    # A user who switches compilation off wants to see the operations of the function.
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return _through_xla(*operands, **params)
     key = tuple(sorted(params.items(), key=lambda item: item[0]))
@@ -383,14 +381,15 @@ _lanewise.def_impl(_eagerly)
 
 
 def _without(params: dict[str, Any], used: list[bool]) -> dict[str, Any]:
-    return dict(params, program=params["program"].giving(used))
+    program = params["program"]
+    return dict(params, program=Program(program.traced.giving(used), program.layout))
 
 
 drops_outputs(_lanewise, _without)
 
 
 def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> Any:
-    """Two axes of trajectories in front as one; one that is missing is filled with copies."""
+    """Join two leading axes of trajectories; the array is repeated along a missing one."""
     if not (has_outer or has_inner):
         return x
     if not has_outer:
@@ -398,6 +397,3 @@ def _merge(x: Any, has_outer: bool, has_inner: bool, size: int, lanes: int) -> A
     elif not has_inner:
         x = jnp.broadcast_to(x[:, None], (size, lanes, *x.shape[1:]))
     return x.reshape(size * lanes, *x.shape[2:])
-
-
-__all__ = ["Layout", "batched", "call"]

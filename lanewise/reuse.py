@@ -9,11 +9,10 @@ from typing import Any
 
 from .ir import Num
 
+# Operations worth carrying; calls of elementary functions are too.
 _COSTLY = frozenset(["sqrt", "div"])
-"""Operations worth carrying; calls of elementary functions are too."""
 
-_MOST = 8
-"""Numbers that are carried over."""
+_MOST = 8  # numbers that are carried over
 
 
 def carried_over(before: Sequence[Num], after: Sequence[Num]) -> list[tuple[Num, Num]]:
@@ -22,6 +21,7 @@ def carried_over(before: Sequence[Num], after: Sequence[Num]) -> list[tuple[Num,
     place = {x.serial: i for i, x in enumerate(before)}
     new_place = {x.serial: i for i, x in enumerate(after) if x.known is None and x.op}
     names: dict[Any, int] = {}
+    # The same names for both, so that equal forms have equal keys.
     first, second = _Forms(place, min(place), names), _Forms(new_place, min(place), names)
     seen = _all_of(after)
     ends = {}
@@ -32,12 +32,14 @@ def carried_over(before: Sequence[Num], after: Sequence[Num]) -> list[tuple[Num,
     pairs, found = [], set()
     for x in seen:
         form = first.of(x)
+        # A number that is the same on all trajectories is cheap.
         if form in ends and _is_costly(x) and x.vec and x.write and ends[form].vec:
             pairs.append((x, ends[form]))
             found.add(x.serial)
     # What is needed by others that are carried over only, need not be.
     needed = {a.serial for z in seen if z.serial not in found for a in z.args}
     pairs = [(x, y) for x, y in pairs if x.serial in needed]
+    # More of them would need more registers than the state leaves.
     return pairs if len(pairs) <= _MOST else []
 
 
@@ -80,6 +82,7 @@ class _Forms:
             return self._named("state", self.place[x.serial])
         if x.serial < self.inside:
             return self._named("outside", x.serial)
+        # A result of a loop or a branch: nothing is known of how it was made.
         if x.write is None and x.op != "same":
             return None
         if x.serial not in self.forms:

@@ -35,6 +35,7 @@ def _reshape(x, *, new_sizes, dimensions):
     return (x if dimensions is None else np.transpose(x, dimensions)).reshape(new_sizes)
 
 
+# One array seen with other axes or strides; an array in memory stays where it is.
 VIEWS: dict[str, Callable] = {
     "broadcast_in_dim": _broadcast_in_dim,
     "squeeze": lambda x, *, dimensions: np.squeeze(x, tuple(dimensions)),
@@ -45,7 +46,6 @@ VIEWS: dict[str, Callable] = {
     "split": _split,
     "unstack": _unstack,
 }
-"""One array seen with other axes or strides; an array in memory stays where it is."""
 
 
 def _pad(x, fill, *, padding_config):
@@ -67,6 +67,7 @@ def _pad(x, fill, *, padding_config):
     return canvas[tuple(cut)]
 
 
+# The same on arrays of entries, and those that make a new array.
 MOVES: dict[str, Callable] = {
     **VIEWS,
     "reshape": _reshape,
@@ -75,7 +76,6 @@ MOVES: dict[str, Callable] = {
     "concatenate": lambda *xs, dimension: np.concatenate(xs, axis=dimension),
     "pad": _pad,
 }
-"""The same on arrays of entries, and those that make a new array."""
 
 
 def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -85,6 +85,7 @@ def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.nd
     elsewhere.
     """
     rule, params = MOVES[name], {k: v for k, v in params.items() if k not in _ABOUT_DEVICES}
+    # A later release of JAX may add a parameter: better no code than wrong code.
     unknown = params.keys() - inspect.signature(rule).parameters.keys()
     if unknown:
         raise Unsupported(f"{name} with {', '.join(sorted(unknown))}")
@@ -92,8 +93,10 @@ def moved(name: str, params: dict[str, Any], *arrays: np.ndarray) -> tuple[np.nd
     return out if isinstance(out, tuple) else (out,)
 
 
+# They say where an array is, not which number is where.
 _ABOUT_DEVICES = frozenset(["sharding", "out_sharding"])
 
+# Calls of one jaxpr whose inputs and outputs are those of the equation.
 CALLS = frozenset(
     [
         "jit",
@@ -111,8 +114,8 @@ CALLS = frozenset(
         "remat2",
     ]
 )
-"""Calls of one jaxpr whose inputs and outputs are those of the equation."""
 
+# Taken from the first entry to the last, by this operation of two.
 REDUCTIONS = {
     "reduce_sum": "add",
     "reduce_prod": "mul",
@@ -122,7 +125,6 @@ REDUCTIONS = {
     "reduce_or": "or",
     "reduce_xor": "xor",
 }
-"""Taken from the first entry to the last, by this operation of two."""
 
+# Running reductions along one axis.
 CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
-"""Running reductions along one axis."""

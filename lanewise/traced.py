@@ -20,6 +20,7 @@ class Traced:
 
     @classmethod
     def of(cls, function: Callable, leaves: Sequence[Any], tree: Any) -> "Traced":
+        # The structure of the result is known only once the function has run.
         trees: list[Any] = []
 
         def flat(*leaves):
@@ -27,6 +28,7 @@ class Traced:
             trees.append(out_tree)
             return out
 
+        # Traced for one device: its own constants need not vary along the axes of a mesh.
         return cls(jax.make_jaxpr(flat)(*map(without_manual_axes, leaves)), trees[-1])
 
     @functools.cached_property
@@ -50,6 +52,7 @@ class Traced:
         if not self.outer:
             return self.closed
         traced = [is_traced(c) for c in consts]
+        # Constants whose values are known stay constants, which may be folded.
         front = [v for v, t in zip(jaxpr.constvars, traced, strict=True) if t]
         known = [(v, c) for v, c, t in zip(jaxpr.constvars, consts, traced, strict=True) if not t]
         new = jaxpr.replace(

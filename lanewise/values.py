@@ -13,12 +13,10 @@ Entries = Any
 """An array of `Num`, with dtype object: the types of NumPy cannot say so."""
 
 
-SMALL = 128
-"""Arrays of up to so many elements are numbers of their own; larger ones stay in memory."""
+SMALL = 128  # arrays of up to so many elements are numbers of their own; larger ones stay in memory
 
 
-MADE = 4096
-"""Arrays made of numbers (a Jacobian) may have so many."""
+MADE = 4096  # arrays made of numbers (a Jacobian) may have so many
 
 
 class Value:
@@ -32,6 +30,10 @@ class Value:
         self.buffer = buffer
         self.is_tangent = False
 
+    @classmethod
+    def in_memory(cls, buffer: Buffer) -> "Value":
+        return cls(buffer.shape, buffer.dtype, buffer=buffer)
+
     @property
     def size(self) -> int:
         return math.prod(self.shape)
@@ -44,6 +46,7 @@ class Value:
         if self.entries is not None:
             return any(x.vec for x in self.entries.flat)
         assert self.buffer is not None
+        # Shared memory at an index that varies gives numbers that vary.
         moving = any(isinstance(x, Num) and x.vec for x in self.buffer.offset)
         return self.buffer.lane is not None or moving
 
@@ -60,28 +63,7 @@ class Value:
 def objects(entries: Sequence[Any], shape: Sequence[int]) -> Entries:
     """An object array of these entries, in row-major order."""
     flat = np.empty(len(entries), object)
+    # Not np.array(entries): it would look for sequences in them.
     for i, entry in enumerate(entries):
         flat[i] = entry
     return flat.reshape(tuple(shape))
-
-
-class Kernel:
-    """What an evaluation needs of the function around it; see `machine`."""
-
-    def scratch(self, shape: Sequence[int], dtype: str, on: bool) -> Buffer:
-        raise NotImplementedError
-
-    def constant(self, array: np.ndarray) -> Buffer:
-        raise NotImplementedError
-
-    def parameter(self, value: int) -> Num:
-        raise NotImplementedError
-
-    def elementary(self, name: str, args: Sequence[Num]) -> Num:
-        raise NotImplementedError
-
-    def sincos(self, x: Num) -> tuple[Num, Num]:
-        raise NotImplementedError
-
-    def exchanged(self, numbers: Sequence[Num], vec: bool) -> list[Num]:
-        raise NotImplementedError

@@ -10,12 +10,11 @@ from jax import Array, lax
 
 from .ir import Unsupported
 
+# Larger matrices are left to XLA, which calls LAPACK; so are stacks that cost more operations than
+# one matrix of this size.
 MOST_UNKNOWNS = 12
-"""Larger matrices are left to XLA, which calls LAPACK; so are stacks that cost more operations than
-one matrix of this size."""
 
-MOST_SORTED = 16
-"""Longer arrays are sorted by XLA."""
+MOST_SORTED = 16  # longer arrays are sorted by XLA
 
 
 def _square(x: Array, name: str) -> int:
@@ -49,6 +48,7 @@ def lu(a: Array, **_) -> tuple[Array, Array, Array]:
     rows = [[a[i, j] for j in range(n)] for i in range(n)]
     order, pivots = [jnp.int32(i) for i in range(n)], []
     for c in range(n):
+        # Exchanges are selections: the pivot differs between trajectories.
         best, pivot = jnp.abs(rows[c][c]), jnp.int32(c)
         for i in range(c + 1, n):
             larger = jnp.abs(rows[i][c]) > best
@@ -65,6 +65,7 @@ def lu(a: Array, **_) -> tuple[Array, Array, Array]:
             order[c], order[i] = lax.select(here, second, first), lax.select(here, first, second)
         for i in range(c + 1, n):
             factor = rows[i][c] / rows[c][c]
+            # As LAPACK: a column of zeros is left as it is.
             rows[i][c] = lax.select(rows[c][c] == 0, rows[i][c], factor)
             for j in range(c + 1, n):
                 rows[i][j] = rows[i][j] - rows[i][c] * rows[c][j]
@@ -120,6 +121,7 @@ def sort(*arrays: Array, dimension: int, num_keys: int, **_) -> list[Array]:
     if n > MOST_SORTED:
         raise Unsupported(f"sort of {n} numbers")
     items = [[lax.index_in_dim(x, i, dimension, False) for x in arrays] for i in range(n)]
+    # Exchanges at fixed places, whatever the numbers are: odd and even neighbours in turn.
     for turn in range(n):
         for i in range(turn % 2, n - 1, 2):
             a, b = items[i], items[i + 1]
@@ -131,6 +133,7 @@ def sort(*arrays: Array, dimension: int, num_keys: int, **_) -> list[Array]:
 
 def _before(x: Sequence[Array], y: Sequence[Array]) -> Array:
     """Whether x comes before y and not at one place with it; −0 equals 0, NaN is last."""
+    # From the last key to the first, which decides unless it is equal.
     before = jnp.zeros(x[0].shape, bool)
     for a, b in reversed(list(zip(x, y, strict=True))):
         both_nan = (a != a) & (b != b)
@@ -153,8 +156,10 @@ def nextafter(x: Array, y: Array) -> Array:
     kind = jnp.dtype(f"int{8 * x.dtype.itemsize}")
     bits = lax.bitcast_convert_type(x, kind)
     away = (x < y) == (x > 0)
+    # Neighbouring floats have neighbouring bits, in order of their size.
     moved = lax.bitcast_convert_type(bits + lax.select(away, kind.type(1), kind.type(-1)), x.dtype)
     least = lax.bitcast_convert_type(jnp.ones((), kind), x.dtype)
+    # 0 and −0 are one number with two patterns of bits.
     moved = lax.select(x == 0, lax.select(y > 0, least, -least), moved)
     moved = lax.select(x == y, y, moved)
     return lax.select((x != x) | (y != y), x + y, moved)
@@ -166,6 +171,7 @@ def platform_index(*, platforms: Sequence, **_) -> Array:
     return jnp.int32(next(i for i, p in enumerate(names) if "cpu" in p))
 
 
+# function(*arrays, **parameters of the equation) → the equation's results.
 WRITTEN: dict[str, Callable] = {
     "lu": _of_each_matrix(lu),
     "triangular_solve": _of_each_matrix(triangular_solve),
@@ -176,4 +182,3 @@ WRITTEN: dict[str, Callable] = {
     "le_to": lambda x, y: _ordered(x) <= _ordered(y),
     "platform_index": platform_index,
 }
-"""function(*arrays, **parameters of the equation) → the equation's results."""

@@ -38,58 +38,40 @@ SMOOTH = True
 
 def searched(tmp_path, count, seed):
     command = [sys.executable, search.__file__, "--count", str(count), "--seed", str(seed)]
-    done = subprocess.run(
-        [*command, "--out", str(tmp_path)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=550,
-    )
+    command += ["--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=550)
     assert done.returncode == 0, done.stdout
-    return sum(int(line.split()[0]) for line in done.stdout.splitlines() if "of 5 traj" in line)
+    return [line for line in done.stdout.splitlines() if "of 5 traj" in line]
 
 
-def test_60_programs(tmp_path):
-    assert searched(tmp_path, 60, 20) > 50
-
-
-@pytest.mark.slow
-def test_60_more_programs(tmp_path):
-    assert searched(tmp_path, 60, 100) > 50
+@pytest.mark.parametrize("seed", [20, pytest.param(100, marks=pytest.mark.slow)])
+def test_60_programs(tmp_path, seed):
+    checked = searched(tmp_path, 60, seed)
+    assert sum(int(line.split()[0]) for line in checked) > 50
+    assert any("gradient" in line and "no gradient" not in line for line in checked)
 
 
 def test_a_small_program_passes():
     assert check(SMALL) == "2 of 2 trajectories, a gradient"
 
 
+SIGN = "(1 if form == 'auto' else -1)"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("SYSTEM,", "dvi.System(lambda *at: H(*at) * (1 + 1e-11 * (form == 'auto'))),", "numbers"),
-        ("num_steps=3", "num_steps=3, stop=STOP if form == 'auto' else NEVER", "status"),
-        (
-            "num_steps=3",
-            "num_steps=3, observe=lambda *a: (1 if form == 'auto' else -1) / (a[3][0] * 0)",
-            "infinities",
-        ),
+        ("h=0.1", f"h=0.1, stop=dvi.Stop(lambda t, q, p, a: t - 4.5 + 4.35 * {SIGN})", "status"),
+        ("h=0.1", f"h=0.1, observe=lambda *a: {SIGN} / (a[3][0] * 0)", "infinities"),
         ("SYSTEM, q,", "SYSTEM, q + (0.0 if form == 'auto' else jnp.nan),", "status"),
+        ("h=0.1", "h=0.1, observe=lambda t0, t1, q0, p0, q, p, a: bent(q[0])", "gradient"),
     ],
 )
 def test_differences_are_found(old, new, message):
-    """Controls: a map that differs between machine code and arrays is a failure."""
-    stops = (
-        "STOP = dvi.Stop(lambda t, q, p, a: t - 0.15)\n"
-        "NEVER = dvi.Stop(lambda t, q, p, a: t - 9.0)\n\n\ndef run("
-    )
+    """Controls: a map that differs between machine code and arrays, and a wrong derivative."""
     with pytest.raises(AssertionError, match=message):
-        check(SMALL.replace(old, new).replace("def run(", stops))
-
-
-def test_a_wrong_gradient_is_found():
-    observed = "observe=lambda t0, t1, q0, p0, q, p, a: bent(q[0]), num_steps=3"
-    text = SMALL.replace("num_steps=3", observed)
-    with pytest.raises(AssertionError, match="gradient"):
-        check(text)
+        check(SMALL.replace(old, new))
 
 
 def test_bits_that_depend_on_the_place_are_found():
@@ -98,42 +80,39 @@ def test_bits_that_depend_on_the_place_are_found():
     found = jax.tree.map(np.array, case.batch(start))
     found["states"][1][0] = np.nextafter(found["states"][1][0], 9.0)
     with pytest.raises(AssertionError, match="bits at another place"):
-        _same_bits_elsewhere(case, start, found)
+        _same_bits_elsewhere(case, start, found, alone=True)
 
 
-def test_a_crash_is_reported_and_the_search_goes_on(tmp_path, monkeypatch, capsys):
-    """A child process that dies is a failure with its program, and the next portion is run."""
-    dying = tmp_path / "dying.py"
-    dying.write_text(
-        "import os, pathlib, sys\n"
-        "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1])\n"
-        "seed = int(sys.argv[sys.argv.index('--seed') + 1])\n"
-        "(out / 'current.py').write_text('the program')\n"
-        "os.abort() if seed == 5 else print('count: 50 programs')\n"
-    )
-    monkeypatch.setattr(search, "__file__", str(dying))
-    assert search.search(100, 1.0, 5, tmp_path / "out") == 1
-    assert (tmp_path / "out" / "crash_5.py").read_text() == "the program"
-    assert "100 programs, 1 failures" in capsys.readouterr().out
+CHILD = """
+import os, pathlib, sys, time
+out = pathlib.Path(sys.argv[sys.argv.index("--out") + 1])
+seed = int(sys.argv[sys.argv.index("--seed") + 1])
+(out / "current.py").write_text("the program")
+{} if seed == 5 else print("count: 60 programs")
+"""
 
 
-def test_a_program_without_an_end_is_reported(tmp_path, monkeypatch, capsys):
-    stuck = tmp_path / "stuck.py"
-    stuck.write_text(
-        "import pathlib, sys, time\n"
-        "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1])\n"
-        "(out / 'current.py').write_text('the program')\n"
-        "time.sleep(100)\n"
-    )
-    monkeypatch.setattr(search, "__file__", str(stuck))
+@pytest.mark.parametrize(
+    ("fails", "message"),
+    [("os.abort()", "exit status -6"), ("time.sleep(100)", "no end of a program after 1 s")],
+)
+def test_a_child_that_dies_or_does_not_end_is_reported(
+    tmp_path, monkeypatch, capsys, fails, message
+):
+    """It is a failure with its program, and the search goes on with the next portion."""
+    child = tmp_path / "child.py"
+    child.write_text(CHILD.format(fails))
+    monkeypatch.setattr(search, "__file__", str(child))
     monkeypatch.setattr(search, "LONGEST", 1)
-    assert search.search(50, 1.0, 7, tmp_path / "out") == 1
-    assert (tmp_path / "out" / "crash_7.py").read_text() == "the program"
-    assert "no end of a program after 1 s" in capsys.readouterr().out
+    assert search.search(120, 1.0, 5, tmp_path / "out") == 1
+    assert (tmp_path / "out" / "crash_5.py").read_text() == "the program"
+    said = capsys.readouterr().out
+    assert message in said
+    assert "120 programs, 1 failures" in said
 
 
 def test_a_failure_is_shrunk_to_a_script(tmp_path, monkeypatch, capsys):
-    def fail(text):
+    def fail(text, alone):
         assert "jnp" not in text, "a control"
 
     monkeypatch.setattr(checks, "check", fail)

@@ -1,4 +1,4 @@
-"""Batches use all cores: the same numbers on any number of threads, and the older name for that."""
+"""Batches on several threads: the same numbers on any number of them; the older name for that."""
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +23,7 @@ def starts(lanes, axis=0):
 
 
 def assert_same(found, expected):
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_array_equal(a, b)
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 @pytest.fixture
@@ -49,42 +48,30 @@ def test_threads_change_no_number(set_threads, lanes, threads):
 
 @pytest.mark.parametrize("threads", [None, 1, 3])
 def test_the_older_name_changes_no_number(threads):
-    q, p = starts(7)
-    batch = jax.jit(jax.vmap(one))
-    assert_same(dvi.over_threads(batch, threads)(q, p), batch(q, p))
-
-
-def test_lanes_along_other_axes_and_arguments_without():
+    """Also along other axes, and with arguments without one."""
+    axes = {"in_axes": (1, 1, None), "out_axes": -1}
     q, p = starts(5, axis=1)
-    batch = jax.jit(jax.vmap(one, in_axes=(1, 1, None), out_axes=-1))
-    threads = dvi.over_threads(batch, 2, in_axes=(1, 1, None), out_axes=-1)
-    found = threads(q, p, 2.0)
+    batch = jax.jit(jax.vmap(one, **axes))
+    found = dvi.over_threads(batch, threads, **axes)(q, p, 2.0)
     assert found["qs"].shape == (STEPS + 1, 2, 5)
     assert_same(found, batch(q, p, 2.0))
 
 
-def test_an_error_is_raised():
-    def function(x):
-        raise RuntimeError("no")
-
-    with pytest.raises(RuntimeError, match="no"):
-        dvi.over_threads(function, 2)(jnp.arange(6.0))
+def test_an_error_of_the_function_is_raised():
+    with pytest.raises(ZeroDivisionError):
+        dvi.over_threads(lambda x: 1 / 0, 2)(jnp.arange(6.0))
 
 
 @pytest.mark.parametrize(
-    ("threads", "error", "match"),
+    ("function", "threads", "error", "match"),
     [
-        (0, ValueError, "whole number from 1 on, got 0"),
-        (-2, ValueError, "whole number from 1 on, got -2"),
-        (1.5, TypeError, "positive integer or None, got 1.5"),
-        (True, ValueError, "whole number from 1 on, got True"),
+        (jnp.sin, 0, ValueError, "whole number from 1 on, got 0"),
+        (jnp.sin, -2, ValueError, "whole number from 1 on, got -2"),
+        (jnp.sin, 1.5, TypeError, "positive integer or None, got 1.5"),
+        (jnp.sin, True, ValueError, "whole number from 1 on, got True"),
+        (jnp.ones(3), None, TypeError, "takes must be a function"),
     ],
 )
-def test_an_invalid_number_of_threads_is_refused(threads, error, match):
+def test_invalid_arguments_are_rejected(function, threads, error, match):
     with pytest.raises(error, match=match):
-        dvi.over_threads(lambda *x: x, threads)
-
-
-def test_something_that_is_no_function_is_refused():
-    with pytest.raises(TypeError, match="takes must be a function"):
-        dvi.over_threads(jnp.ones(3))  # pyright: ignore[reportArgumentType]
+        dvi.over_threads(function, threads)

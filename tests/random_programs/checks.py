@@ -7,6 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jax.extend.core import jaxpr_as_fun
 
 import dvi_jax as dvi
 import lanewise
@@ -50,15 +52,30 @@ class Case:
         self.axes = {k: None if k in shared else 0 for k in self.start}
         self.rng = np.random.default_rng(seed)
 
-    def one(self, start: dict[str, Any], form: str = "auto") -> dict[str, Any]:
+    def traced(self, start: dict[str, Any], form: str = "auto") -> dict[str, Any]:
         return _numbers(self.run(start["q"], start["p"], start["epsilon"], start["args"], form))
 
     @functools.cache  # noqa: B019
+    def one(self, form: str = "auto") -> Callable:
+        """The run of one trajectory, traced once: a trace takes as long as a compilation."""
+        of = functools.partial(self.traced, form=form)
+        jaxpr, shapes = jax.make_jaxpr(of, return_shape=True)(self.lane(0))
+        tree = jax.tree.structure(shapes)
+        return lambda start: tree.unflatten(jaxpr_as_fun(jaxpr)(*jax.tree.leaves(start)))
+
+    @functools.cache  # noqa: B019
     def compiled(self, form: str) -> Callable:
-        # XLA's reference is compiled without its optimisations, in two thirds of the time.
-        options = {"xla_backend_optimization_level": 0} if form == "arrays" else None
-        of = jax.vmap(lambda s: self.one(s, form), in_axes=(self.axes,))
-        return jax.jit(of, compiler_options=options)
+        one = self.one(form)
+        if form == "auto":
+            return jax.jit(jax.vmap(one, in_axes=(self.axes,)))
+
+        def each(start: dict[str, Any]) -> dict[str, Any]:
+            own = {k: x for k, x in start.items() if self.axes[k] == 0}
+            return lax.map(lambda mine: one({**start, **mine}), own)
+
+        # The reference: one trajectory after the other takes less time to compile than a batch,
+        # and so does code that is not optimised.
+        return jax.jit(each, compiler_options={"xla_backend_optimization_level": 0})
 
     def batch(self, start: dict[str, Any], form: str = "auto") -> dict[str, Any]:
         return jax.tree.map(np.asarray, self.compiled(form)(start))
@@ -98,12 +115,17 @@ class Case:
         }
 
 
-def check(text: str, gradient: bool = True) -> str:
-    """Check a program. Returns what was compared; raises `AssertionError` for a difference, and
-    `Ill` where dvi_jax refuses the program with an error of its own."""
+def check(text: str, alone: bool = True) -> str:
+    """Check a program. Returns what was compared.
+
+    `alone`: also one trajectory by itself, which takes a compilation more.
+
+    **Raises** `AssertionError` for a difference, and `Ill` where dvi_jax refuses the program with
+    an error of its own.
+    """
     case = Case(load(text))
     try:  # of traced numbers: a start of NaN is refused where it is known
-        jax.eval_shape(case.one, case.lane(0))
+        case.one()
     except (ValueError, TypeError, ArithmeticError) as error:
         raise Ill(str(error)) from error
     start = case.copies(COPIES)
@@ -117,11 +139,11 @@ def check(text: str, gradient: bool = True) -> str:
     rounding = np.finfo(np.float32 if "float32" in text else np.float64).eps
     compared = _compare(found, expected, count, rounding)
     try:
-        _same_bits_elsewhere(case, start, found)
+        _same_bits_elsewhere(case, start, found, alone)
     except AssertionError:  # what is too large to be compiled has no equal bits
-        if "left to XLA: a function of" not in str(lanewise.explain(case.one, case.lane(0))):
+        if "left to XLA: a function of" not in str(lanewise.explain(case.one(), case.lane(0))):
             raise
-    if gradient and case.smooth:
+    if case.smooth:
         compared += _compare_gradient(case)
     return compared
 
@@ -189,41 +211,51 @@ def _spread(copies: np.ndarray) -> np.ndarray:
         return np.max(np.where(np.isfinite(copies), np.abs(copies - copies[0]), 0.0), axis=0)
 
 
-def _same_bits_elsewhere(case: Case, start: dict[str, Any], found: dict[str, Any]) -> None:
-    """A trajectory alone, and at another place of the batch, has the same bits."""
+def _same_bits_elsewhere(
+    case: Case, start: dict[str, Any], found: dict[str, Any], alone: bool
+) -> None:
+    """A trajectory at another place of the batch, and alone, has the same bits."""
     turned = {
         k: x if case.axes[k] is None else jax.tree.map(lambda y: y[::-1].copy(), x)
         for k, x in start.items()
     }
     for a, b in zip(_rows(case.batch(turned)), _rows(found), strict=True):
         assert np.array_equal(a[::-1], b, equal_nan=a.dtype.kind == "f"), "bits at another place"
-    alone = jax.tree.map(np.asarray, jax.jit(case.one)(case.lane(0)))
-    for a, b in zip(_rows(alone), _rows(found), strict=True):
+    one = jax.tree.map(np.asarray, jax.jit(case.one())(case.lane(0))) if alone else None
+    for a, b in zip(_rows(one), _rows(found), strict=True) if alone else ():
         assert np.array_equal(a, b[0], equal_nan=a.dtype.kind == "f"), "bits of one alone"
 
 
-def _loss(solution: Any) -> Any:
-    """NaN for a trajectory that fails, though it may be after all that is saved."""
-    numbers = [solution.qs, solution.ps, *jax.tree.leaves(solution.observed)]
-    total = sum(jnp.sum(jnp.tanh(x)) for x in numbers)
-    fine = [solution.result == kind for kind in (dvi.RESULTS.successful, dvi.RESULTS.stopped)]
-    return jnp.where(fine[0] | fine[1], total, jnp.nan)
+def _loss(numbers: dict[str, Any], xp: Any) -> Any:
+    """Of one trajectory; NaN if it fails, though it may be after all that is saved."""
+    _, qs, ps, observed, _ = numbers["states"]
+    total = sum(xp.sum(xp.tanh(x)) for x in [qs, ps, *jax.tree.leaves(observed)])
+    fine = [numbers["status"] == dvi._results.status_code(kind)
+            for kind in (dvi.RESULTS.successful, dvi.RESULTS.stopped)]  # fmt: skip
+    return xp.where(fine[0] | fine[1], total, xp.nan)
 
 
 def _compare_gradient(case: Case) -> str:
     """The gradient by the start of one trajectory against central differences."""
     start = case.lane(0)
-
-    def loss(q):
-        return _loss(case.run(q, start["p"], start["epsilon"], start["args"]))
-
     q = jnp.asarray(start["q"])
-    value, slope = map(np.asarray, jax.jit(jax.value_and_grad(loss))(q))
+    loss = jax.value_and_grad(lambda q: _loss(case.traced({**start, "q": q}), jnp))
+    value, slope = map(np.asarray, jax.jit(loss)(q))
     if not np.isfinite(value):
         return ", no gradient of a trajectory that fails"
     deltas = [3e-4, 1e-4, 3e-5, 1e-5]
     points = np.stack([q + s * d * e for d in deltas for e in np.eye(q.size) for s in (1, -1)])
-    values = np.asarray(jax.jit(jax.vmap(loss))(points)).reshape(len(deltas), q.size, 2)
+    # A batch of the size of that of the copies needs no further compilation.
+    lanes = len(case.start["q"]) * (1 + COPIES)
+    assert len(points) <= lanes
+    batch = {
+        name: x if case.axes[name] is None
+        else jax.tree.map(lambda y: np.broadcast_to(y, (lanes, *y.shape)), start[name])
+        for name, x in case.start.items()
+    }  # fmt: skip
+    found = case.batch({**batch, "q": np.resize(points, (lanes, q.size))})
+    values = [_loss(jax.tree.map(lambda x, i=i: x[i], found), np) for i in range(len(points))]
+    values = np.reshape(values, (len(deltas), q.size, 2))
     slopes = (values[..., 0] - values[..., 1]) / (2 * np.array(deltas)[:, None])
     # The difference of two neighbours estimates the error of a difference.
     errors = np.abs(np.diff(slopes, axis=0)) + 1e-16 / np.array(deltas[1:])[:, None]

@@ -56,6 +56,7 @@ class Program:
     settings: str
     start: str
     smooth: bool
+    width: int | None
 
     @property
     def text(self) -> str:
@@ -78,7 +79,7 @@ STOP = {stop}
 def run(q, p, epsilon, args, form="auto"):
     return dvi.integrate(
         SYSTEM, q, p, epsilon=epsilon, args=args, stop=STOP, throw=False,
-        layout=dvi.Layout(form=form), {self.settings},
+        layout=dvi.Layout(form=form, width={self.width}), {self.settings},
     )
 
 
@@ -130,7 +131,7 @@ VECTORS_OTHER = [
 
 
 @st.composite
-def expressions(draw, leaves, n, smooth, depth=3):
+def expressions(draw, leaves, n, smooth, depth):
     """The text of a number made of the leaves."""
     kind = draw(st.integers(0, 5 if depth else 1))
     if kind <= 1:
@@ -216,23 +217,25 @@ def _array(values, dtype):
 
 @st.composite
 def programs(draw):
-    n = draw(st.integers(1, 3))
+    n = draw(st.sampled_from([1, 1, 2, 3]))
     smooth = draw(st.booleans())
     dtype = draw(st.sampled_from(["float64", "float64", "float64", "float32"]))
     state = [f"{x}[{i}]" for x in "qp" for i in range(n)]
     leaves = [*state, "t0", "args['k']", "args['more']['c'][0]"]
-    one = expressions(leaves, n, smooth)
     chosen = draw(settings())
     kinetics = ["p @ p / 2", "p @ p / 2 * (1.0 + 0.1 * q @ q)", "0.0 * p[0]"]
     if "FixedPoint" in chosen:  # no step may need a solve
-        of_q = ["q[0] * 1.0", *(x for x in leaves if "p[" not in x and x != "q[0]")]
-        one, kinetics = expressions(of_q, n, smooth), kinetics[:1]
+        leaves = ["q[0] * 1.0", *(x for x in leaves if "p[" not in x and x != "q[0]")]
+        kinetics = kinetics[:1]
+    # Most programs are small: the time of a program is that of its compilation.
+    depth = draw(st.sampled_from([1, 1, 2, 3]))
+    one, small = (expressions(leaves, n, smooth, d) for d in (depth, depth - 1))
     kinetic = draw(st.sampled_from(kinetics))
     H = f"{kinetic} + {draw(one)}"
     W = None
     if draw(st.booleans()):
-        W = f"jnp.stack([{', '.join(f'q[0] * 0 + {draw(one)}' for _ in range(n))}])"
-    observable = draw(expressions(state, n, smooth, 2))
+        W = f"jnp.stack([{', '.join(f'q[0] * 0 + {draw(small)}' for _ in range(n))}])"
+    observable = draw(expressions(state, n, smooth, depth - 1))
     stop = None
     if draw(st.integers(0, 4)) == 0:
         stop = draw(expressions(["q[0]", "p[0]", "t"], n, smooth, 1)) + " - 1.0"
@@ -253,8 +256,10 @@ def programs(draw):
         f"{numbers(n, 'p')},\n    'epsilon': {epsilon}[..., 0],\n    'args': {{'k': {k}[..., 0], "
         f"'more': {{'c': {c}, 'none': None}}}},\n}}"
     )
-    # A gradient takes longer to compile than all the rest: of one program in six.
+    # A gradient takes longer to compile than all the rest: of one program in eight.
     smooth = smooth and stop is None and dtype == "float64" and "Variational" not in chosen
     # FixedPoint has the slope of the map without rounding.
-    smooth = smooth and "FixedPoint" not in chosen and draw(st.integers(0, 1)) == 0
-    return Program(n, dtype, H, W, observable, stop, chosen, start, smooth)
+    smooth = smooth and "FixedPoint" not in chosen and draw(st.integers(0, 2)) == 0
+    # One vector in a block compiles in less time than several, which one program in three has.
+    width = draw(st.sampled_from([8, 8, None]))
+    return Program(n, dtype, H, W, observable, stop, chosen, start, smooth, width)

@@ -1,0 +1,171 @@
+"""A builder of LLVM IR: operations, loops and branches for one block of trajectories."""
+
+from collections.abc import Callable, Sequence
+
+from .arithmetic import Arithmetic
+from .ir import Num
+
+
+class Builder(Arithmetic):
+    """The body of one function."""
+
+    def any(self, a: Num) -> str:
+        """Whether a truth value is true on a trajectory of the block, as a scalar i1."""
+        if not a.vec:
+            return self.ref(a, 0, False)
+        # The sum over the vectors is NaN if one of them is, so that one comparison is enough.
+        if a.op == "not" and a.args[0].op == "finite":  # one comparison for the block
+            (zero,) = a.args[0].args
+            t, total = self.type(zero.dtype, True), zero.names[0]
+            for other in zero.names[1:]:
+                total = self.new(f"fadd {t} {total}, {other}")
+            bits = self.new(f"fcmp uno {t} {total}, {total}")
+            a = self.made([bits], "bool", True)
+        t = self.type("bool", True)
+        total = a.names[0]
+        for other in a.names[1:]:
+            total = self.new(f"or {t} {total}, {other}")
+        if self.W == 1:
+            return total
+        # A mask as an integer compiles to one test of a register; a reduction by `or` does not.
+        bits = self.new(f"bitcast {t} {total} to i{self.W}")
+        return self.new(f"icmp ne i{self.W} {bits}, 0")
+
+    # Numbers that wait in memory while a loop runs. Without "volatile" the optimiser would keep
+    # them in registers, which the loop needs.
+
+    def set_aside(self, x: Num, to: Sequence[str], vec: bool) -> list[str]:
+        """The lines that write a number of a carry to one pointer for each vector."""
+        t = self.type(x.dtype, vec)
+        return [
+            f"  store volatile {t} {name}, ptr {at}" for name, at in zip(x.names, to, strict=True)
+        ]
+
+    def taken_back(self, x: Num, at: Sequence[str], vec: bool) -> Num:
+        """The number that was set aside there."""
+        t = self.type(x.dtype, vec)
+        return self.made([self.new(f"load volatile {t}, ptr {p}") for p in at], x.dtype, vec)
+
+    def loop(
+        self,
+        carry: Sequence[Num],
+        vec: Sequence[bool],
+        test: Callable[[list[Num], str], str],
+        body: Callable[[list[Num], str], list[Num]],
+        count: bool = False,
+        carried_over: Callable[..., list[tuple[Num, Num]]] | None = None,
+    ) -> list[Num]:
+        """The carry once ``test(carry, i)``, the name of an i1, is false; `i` counts if `count`.
+
+        `carried_over(carry before a round, carry after it)` finds pairs (x, y) where y is what x
+        will be in the next round; x is then not computed but carried.
+        """
+        before = [self.refs(c, v) for c, v in zip(carry, vec, strict=True)]
+        entered_from, front = self.block, len(self.lines)
+        # head: phis and the test; inner: a round, which goes back to head; end: after the last
+        # round.
+        head, inner, end = self.label(), self.label(), self.label()
+        self.emit(f"br label %{head}")
+        self.begin(head)
+        phis, place = [], len(self.lines)
+        for c, v in zip(carry, vec, strict=True):
+            names = [self.name() for _ in range(self.U if v else 1)]
+            phis.append(self.made(names, c.dtype, v))
+        counter = self.name() if count else ""
+        self.scopes.append({})
+        going = test(phis, counter)
+        self.emit(f"br i1 {going}, label %{inner}, label %{end}")
+        self.begin(inner)
+        after = body(phis, counter)
+        # `vec` comes from the dependence of the jaxpr. A number that varies in a scalar would lose
+        # the values of all trajectories but one.
+        assert not any(a.vec and not v for a, v in zip(after, vec, strict=True)), (
+            "a carry that varies"
+        )
+        again = [self.refs(a, v) for a, v in zip(after, vec, strict=True)]
+        following = self.new(f"add nuw nsw i64 {counter}, 1") if count else ""
+        self.scopes.pop()
+        left_from = self.block
+        self.emit(f"br label %{head}")
+
+        def phi(name: str, t: str, old: str, new: str) -> str:
+            return f"  {name} = phi {t} [{old}, %{entered_from}], [{new}, %{left_from}]"
+
+        # What a number is after a round is known only now: its line is put in above.
+        lines = [
+            phi(name, self.type(p.dtype, v), old, new)
+            for p, olds, news, v in zip(phis, before, again, vec, strict=True)
+            for name, old, new in zip(p.names, olds, news, strict=True)
+        ]
+        if count:
+            lines.append(phi(counter, "i64", "0", following))
+        first_lines = []
+        if carried_over is not None:
+            pairs = carried_over(phis, after)
+            # The number of the first round is computed before the loop, from the numbers that enter
+            # it.
+            instead = {
+                p.serial: self.made(old, p.dtype, v)
+                for p, old, v in zip(phis, before, vec, strict=True)
+            }
+            count_before = len(self.lines)
+            firsts = [self.made_again(x, instead) for x, _ in pairs]
+            first_lines = self.lines[count_before:]
+            del self.lines[count_before:]
+            for (x, y), first in zip(pairs, firsts, strict=True):
+                for u, name in enumerate(x.names):
+                    own = (line.startswith(f"  {name} = ") for line in self.lines[place:])
+                    del self.lines[place + list(own).index(True)]
+                    old = self.ref(first, u, True)
+                    lines.append(phi(name, self.type(x.dtype, True), old, y.names[u]))
+        self.lines[place:place] = lines
+        self.lines[front:front] = first_lines
+        self.begin(end)
+        return phis
+
+    def made_again(self, x: Num, instead: dict[int, Num]) -> Num:
+        """The number x with other numbers in place of some that it is made of."""
+        if x.known is not None or (not x.op and x.serial not in instead):
+            return x
+        found = instead.get(x.serial)
+        if found is None:
+            args = [self.made_again(a, instead) for a in x.args]
+            # A closed-off number is a name for another one and has no instruction of its own.
+            if x.op == "same":
+                found = args[0]
+            else:
+                assert x.write is not None
+                found = self.op(x.op, args, x.dtype, x.write)
+            instead[x.serial] = found
+        return found
+
+    def branch(
+        self,
+        condition: str,
+        yes: Callable[[], list[Num]],
+        no: Callable[[], list[Num]],
+        vec: Sequence[bool],
+        dtypes: Sequence[str],
+    ) -> list[Num]:
+        """The numbers of one branch or of the other; only that one is run."""
+        labels, end = (self.label(), self.label()), self.label()
+        self.emit(f"br i1 {condition}, label %{labels[0]}, label %{labels[1]}")
+        ends, names = [], []
+        for label, run in zip(labels, (yes, no), strict=True):
+            self.begin(label)
+            self.scopes.append({})
+            names.append([self.refs(x, v) for x, v in zip(run(), vec, strict=True)])
+            self.scopes.pop()
+            # A branch may contain loops and branches: it ends in another block than it began with.
+            ends.append(self.block)
+            self.emit(f"br label %{end}")
+        self.begin(end)
+        results = []
+        for v, dtype, *both in zip(vec, dtypes, *names, strict=True):
+            t = self.type(dtype, v)
+            phis = [
+                self.new(f"phi {t} [{a}, %{ends[0]}], [{b}, %{ends[1]}]")
+                for a, b in zip(*both, strict=True)
+            ]
+            results.append(self.made(phis, dtype, v))
+        return results
