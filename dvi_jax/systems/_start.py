@@ -18,16 +18,15 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True)
 class Start:
-    """A check of initial conditions: a function of (q0, p0, args).
+    """A check of initial conditions and parameters: a function of (q0, p0, args).
 
     - `system`: the system in words, for messages.
-    - `shape`: of q0 and of p0, None in place of a number that may be anything from `least` on; None
-      for any shape.
+    - `shape`: of q0 and of p0, with None for any number from `least` on; None for any shape.
     - `parameters`: name in args → check of its value.
-    - `singular`: what is at a singular point, in words → the point, or a function of args.
-    - `also`: a further check, function of q0, p0 (arrays of NumPy) and args.
+    - `singular`: name of a singular point → the point, or a function of args.
+    - `also`: a further check, function of q0, p0 (NumPy arrays) and args.
 
-    **Raises** `ValueError` with what was seen, for a parameter a `ParameterError`.
+    **Raises** `ValueError` that shows what was seen; `ParameterError` for a parameter.
     """
 
     system: str
@@ -38,7 +37,7 @@ class Start:
     least: int = 1
 
     def __call__(self, q0: Any, p0: Any, args: Any) -> None:
-        check_shape(q0, p0, self._fits, self._wanted)
+        check_shape(q0, p0, self._fits, f"{self.system}: q0 and p0 of {self._wanted}")
         for name, check in self.parameters.items():
             check_parameter(args, name, check)
         if not (self.singular or self.also):
@@ -54,40 +53,30 @@ class Start:
             self.also(q, p, args)
 
     def _fits(self, seen: tuple[int, ...]) -> bool:
-        return self.shape is None or (
-            len(seen) == len(self.shape)
-            and all(
-                n >= self.least if m is None else n == m
-                for n, m in zip(seen, self.shape, strict=True)
-            )
+        if self.shape is None:
+            return True
+        pairs = zip(seen, self.shape, strict=False)
+        return len(seen) == len(self.shape) and all(
+            n >= self.least if m is None else n == m for n, m in pairs
         )
 
     @property
     def _wanted(self) -> str:
         if self.shape is None:
-            return f"{self.system}: q0 and p0 of one shape, any"
-        text = str(self.shape).replace("None", "n")
-        return f"{self.system}: q0 and p0 of shape {text}" + (
-            f", n ≥ {self.least}" if None in self.shape else ""
-        )
+            return "one shape, any"
+        range_of_n = f", n ≥ {self.least}" if None in self.shape else ""
+        return f"shape {self.shape}{range_of_n}".replace("None", "n")
 
 
 def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], wanted: str) -> None:
-    """Require q0 and p0 of one shape for which `fits` holds.
-
-    **Raises** `ValueError` with `wanted`, a sentence that says which shapes there are, and the
-    shapes seen.
-    """
+    """Require q0 and p0 of one shape for which `fits` holds; `wanted`: these shapes, a sentence."""
     q, p = np.shape(q0), np.shape(p0)
     if q != p or not fits(q):
         raise ValueError(f"{wanted}; got q0 of shape {q} and p0 of shape {p}.")
 
 
 def parameter(args: Any, name: str) -> Any:
-    """The parameter of this name.
-
-    **Raises** `ParameterError` where it is missing, with those that are there.
-    """
+    """The parameter of this name. **Raises** `ParameterError`, with the names that args has."""
     if not isinstance(args, Mapping) or name not in args:
         there = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
         raise ParameterError(
@@ -106,18 +95,10 @@ def check_parameter(args: Any, name: str, check: Check) -> None:
         raise ParameterError(str(error)) from None
 
 
-def nonzero(without: str) -> Check:
-    """A check for a finite number that is not zero; `without`: the effect of zero, a sentence."""
-
-    def check(name: str, value: Any) -> None:
-        if finite(name, value) == 0:
-            raise ValueError(f"{name} is 0: {without}")
-
-    return check
-
-
-gyrates = nonzero("the particle does not gyrate. Take another system.")
-"""A check for a charge or a field."""
+def gyrates(name: str, value: Any) -> None:
+    """A check for the charge of a particle or the strength of a magnetic field."""
+    if finite(name, value) == 0:
+        raise ValueError(f"{name} is 0: the particle does not gyrate. Take another system.")
 
 
 def between(low: float, high: float) -> Check:

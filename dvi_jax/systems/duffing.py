@@ -4,10 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..discover.library import time_translation
 from ._elliptic import first_kind, jacobi
-from ._problem import DIMENSIONLESS, Problem, at_end, named, over_times
-from ._start import Start, finite, positive
+from ._problem import Parameter, Problem, library_problem, over_times
+from ._start import Start, finite
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -18,9 +17,6 @@ def hamiltonian(t0, t1, q0, p1, args):
 def friction_and_drive(t0, t1, q0, p1, args):
     """W = −δ p1 + γ cos(ω t0)."""
     return -args["delta"] * p1 + args["gamma"] * jnp.cos(args["omega"] * t0)
-
-
-energy = at_end(hamiltonian)
 
 
 @over_times((1,))
@@ -62,14 +58,6 @@ def exact(t, q0, p0, args):
     return q, p
 
 
-check_start = Start(
-    "Duffing's oscillator has one degree of freedom",
-    (1,),
-    # with β ≤ 0 it runs away
-    {"beta": positive, "alpha": finite, "delta": finite, "gamma": finite, "omega": finite},
-)
-
-
 def duffing() -> Problem:
     """H = p²/2 + αq²/2 + βq⁴/4 with the force ε(−δp + γ cos ωt), in the left of two wells.
 
@@ -79,25 +67,22 @@ def duffing() -> Problem:
     **Source** Guckenheimer & Holmes 1983, *Nonlinear Oscillations*, 2.2; Kovacic & Brennan 2011,
     *The Duffing Equation*.
     """
-    return Problem(
+    return library_problem(
+        System(hamiltonian, force=friction_and_drive),
+        Start("Duffing's oscillator has one degree of freedom", (1,)),
         name="duffing",
-        system=System(hamiltonian, force=friction_and_drive),
         q0=np.array([-1.2]),
         p0=np.array([0.2]),
         h=0.1,
-        args={"alpha": -1.0, "beta": 1.0, "delta": 0.3, "gamma": 0.5, "omega": 1.2},
-        observables=named(energy),
-        units=DIMENSIONLESS,
-        source="Guckenheimer & Holmes 1983, Nonlinear Oscillations, 2.2",
-        check=check_start,
         parameters={
-            "alpha": "linear part of the spring, negative for two wells [1/time²]",
-            "beta": "cubic part of the spring, positive [1/(length² time²)]",
-            "delta": "friction at ε = 1 [1/time]",
-            "gamma": "amplitude of the drive at ε = 1 [length/time²]",
-            "omega": "frequency of the drive [1/time]",
+            "alpha": Parameter(
+                -1.0, "linear part of the spring, negative for two wells [1/time²]", finite
+            ),
+            "beta": Parameter(1.0, "cubic part of the spring, positive [1/(length² time²)]"),
+            "delta": Parameter(0.3, "friction at ε = 1 [1/time]", finite),
+            "gamma": Parameter(0.5, "amplitude of the drive at ε = 1 [length/time²]", finite),
+            "omega": Parameter(1.2, "frequency of the drive [1/time]", finite),
         },
-        invariants=("energy",),
-        symmetries={"time": time_translation()},
+        source="Guckenheimer & Holmes 1983, Nonlinear Oscillations, 2.2",
         exact=exact,
     )

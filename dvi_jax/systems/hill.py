@@ -4,8 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..discover.library import time_translation
-from ._problem import Problem, at_end, named
+from ._problem import Problem, library_problem
 from ._start import Start
 from .kepler import angular_momentum
 from .restricted_three_body import velocity
@@ -27,18 +26,10 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 - (x * p1[1] - y * p1[0]) + tide - 1 / r
 
 
-energy = at_end(hamiltonian)
-
-
 def jacobi_constant(t0, t1, q0, p0, q1, p1, args):
     """Γ = 3x² − z² + 2/r − |v|² at t1; below 3^(4/3) there is a way out past L1 and L2."""
     v, r = velocity(q1, p1), jnp.sqrt(jnp.sum(q1**2))
     return 3 * q1[0] ** 2 - q1[2] ** 2 + 2 / r - jnp.sum(v**2)
-
-
-check_start = Start(
-    "Hill's problem has one body in space", (3,), singular={"the small body": (0, 0, 0)}
-)
 
 
 def hill() -> Problem:
@@ -52,13 +43,14 @@ def hill() -> Problem:
     in Hénon 1969, *Astron. Astrophys.* 1, 223.
     """
     x, speed = 0.23, 0.23**-0.5
-    return Problem(
+    return library_problem(
+        System(hamiltonian),
+        Start("Hill's problem has one body in space", (3,), singular={"the small body": (0, 0, 0)}),
         name="hill",
-        system=System(hamiltonian),
         q0=np.array([x, 0.0, 0.0]),
         p0=np.array([0.0, 0.95 * speed + x, 0.3 * speed]),
         h=0.005,
-        observables=named(energy, jacobi_constant, angular_momentum),
+        observables=[jacobi_constant, angular_momentum],
         units={
             "q": "(m/M)^(1/3) distances of the bodies",
             "p": "1",
@@ -66,7 +58,5 @@ def hill() -> Problem:
             "energy": "1",
         },
         source="Hill 1878, Am. J. Math. 1, 5; Hénon 1969, Astron. Astrophys. 1, 223",
-        check=check_start,
-        invariants=("energy", "jacobi_constant"),
-        symmetries={"time": time_translation()},
+        invariants=("jacobi_constant",),
     )

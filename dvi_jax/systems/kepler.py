@@ -4,9 +4,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._system import System
-from ..discover.library import rotation, scaling, time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named, over_times
-from ._start import Start, positive
+from ..discover.library import rotation, scaling
+from ._problem import Parameter, Problem, library_problem, over_times
+from ._start import Start
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -17,9 +17,6 @@ def hamiltonian(t0, t1, q0, p1, args):
 def linear_force(t0, t1, q0, p1, args):
     """W = −q0 (the paper, before (44))."""
     return -q0
-
-
-energy = at_end(hamiltonian)
 
 
 def mixed_energy(t0, t1, q0, p0, q1, p1, args):
@@ -74,33 +71,25 @@ def _first_guess(mean, ec, es):
     return M + 0.85 * e * jnp.sign(jnp.sin(M)) - E0
 
 
-check_start = Start(
-    "the Kepler problem is in the plane (for more dimensions or bodies take the system n_body)",
-    (2,),
-    {"K": positive},
-    singular={"the centre": (0, 0)},
-)
-
-
 def kepler() -> Problem:
     """The paper's Kepler problem with its start and h = 0.1; dimensionless, K = 1."""
-    return Problem(
+    return library_problem(
+        System(hamiltonian, force=linear_force),
+        Start(
+            "the Kepler problem is in the plane (for more dimensions or bodies take n_body)",
+            (2,),
+            singular={"the centre": (0, 0)},
+        ),
         name="kepler",
-        system=System(hamiltonian, force=linear_force),
         q0=[0.0, 1.2],
         p0=[-1.0, -0.6],
         h=0.1,
-        args={"K": 1.0},
-        observables=named(energy, mixed_energy, angular_momentum),
-        units=DIMENSIONLESS,
-        source="the paper, Section 5.2",
-        check=check_start,
-        parameters={"K": "root of the strength of attraction, K² = GM [length^(3/2)/time]"},
-        invariants=("energy", "angular_momentum"),
-        symmetries={
-            "time": time_translation(),
-            "rotation": rotation(),
-            "scaling": scaling(q=1.0, p=-0.5, t=1.5),
+        parameters={
+            "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]"),
         },
+        observables=[mixed_energy, angular_momentum],
+        source="the paper, Section 5.2",
+        invariants=("angular_momentum",),
+        symmetries={"rotation": rotation(), "scaling": scaling(q=1.0, p=-0.5, t=1.5)},
         exact=exact,
     )

@@ -5,8 +5,8 @@ import numpy as np
 
 from .._system import System
 from ._elliptic import swing
-from ._problem import Adiabatic, InSlowTime, Problem, at_end, named
-from ._start import Start, between, positive
+from ._problem import Adiabatic, InSlowTime, Parameter, Problem, at_end, library_problem
+from ._start import Start, between
 from .pendulum import exact as of_pendulum
 
 
@@ -56,13 +56,6 @@ def exact(t, q0, p0, args):
     return q, inertia * rate
 
 
-check_start = Start(
-    "Lorentz's pendulum is one angle",
-    (1,),
-    {"mass": positive, "g": positive, "length": positive, "depth": between(-1, 1)},
-)
-
-
 def lorentz_pendulum() -> Problem:
     """The pendulum of one metre and one kilogram, l = l0 (1 + d sin εt), swinging to 1 rad.
 
@@ -72,23 +65,23 @@ def lorentz_pendulum() -> Problem:
     **Source** Solvay congress 1911 (Langevin & de Broglie 1912, *La théorie du rayonnement et les
     quanta*, p. 450); action: Landau & Lifshitz 1976, *Mechanics*, §49.
     """
-    return Problem(
+    return library_problem(
+        System(hamiltonian, slow_time=True),
+        Start("Lorentz's pendulum is one angle", (1,)),
         name="lorentz_pendulum",
-        system=System(hamiltonian, slow_time=True),
         q0=np.array([1.0]),
         p0=np.array([0.0]),
         h=0.02,
-        args={"mass": 1.0, "g": 9.81, "length": 1.0, "depth": 0.3},
-        observables=named(InSlowTime(energy), InSlowTime(action), InSlowTime(small_swing_action)),
+        parameters={
+            "mass": Parameter(1.0, "of the bob [kg]"),
+            "g": Parameter(9.81, "gravity [m/s²]"),
+            "length": Parameter(1.0, "mean length of the string [m]"),
+            "depth": Parameter(0.3, "relative change of the length [1]", between(-1, 1)),
+        },
+        observables=[InSlowTime(energy), InSlowTime(action), InSlowTime(small_swing_action)],
+        autonomous=False,
         units={"q": "rad", "p": "kg m²/s", "t": "s", "energy": "J"},
         source="Langevin & de Broglie 1912, La théorie du rayonnement et les quanta, p. 450",
-        check=check_start,
-        parameters={
-            "mass": "of the bob [kg]",
-            "g": "gravity [m/s²]",
-            "length": "mean length of the string [m]",
-            "depth": "relative change of the length [1]",
-        },
         invariants=("energy", "action", "small_swing_action"),
         adiabatic={"action": Adiabatic("rate of the change over the frequency", 1)},
         exact=exact,

@@ -10,18 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..discover.library import time_translation
-from ._problem import Problem, at_end, named
-from ._start import Start, positive
+from ._problem import Parameter, Problem, library_problem
+from ._start import Start
 
 
 def hamiltonian(t0, t1, q0, p1, args):
     """H_D = α p1 − β exp p1 + γ q0 − δ exp q0; separable."""
     alpha, beta, gamma, delta = (args[name] for name in ("alpha", "beta", "gamma", "delta"))
     return jnp.sum(alpha * p1 - beta * jnp.exp(p1) + gamma * q0 - delta * jnp.exp(q0))
-
-
-energy = at_end(hamiltonian)
 
 
 def populations(t0, t1, q0, p0, q1, p1, args):
@@ -53,13 +49,6 @@ def equilibrium(args):
     return args["gamma"] / args["delta"], args["alpha"] / args["beta"]
 
 
-check_start = Start(
-    "prey and predators are one logarithm each",
-    (1,),
-    {"alpha": positive, "beta": positive, "gamma": positive, "delta": positive},
-)
-
-
 def lotka_volterra() -> Problem:
     """Hares and lynxes of the Hudson's Bay Company, in thousands and years.
 
@@ -71,23 +60,20 @@ def lotka_volterra() -> Problem:
     2, 31; canonical form: Hairer, Lubich & Wanner 2006, I.1.1 and VII.2.
     """
     q0, p0 = from_populations([33.9], [5.9])
-    return Problem(
+    return library_problem(
+        System(hamiltonian),
+        Start("prey and predators are one logarithm each", (1,)),
         name="lotka_volterra",
-        system=System(hamiltonian),
         q0=q0,
         p0=p0,
         h=0.05,
-        args={"alpha": 0.55, "beta": 0.028, "gamma": 0.84, "delta": 0.026},
-        observables=named(energy, populations),
+        parameters={
+            "alpha": Parameter(0.55, "growth of prey [1/year]"),
+            "beta": Parameter(0.028, "prey eaten, for each predator [1/(year thousand)]"),
+            "gamma": Parameter(0.84, "death of predators [1/year]"),
+            "delta": Parameter(0.026, "growth of predators, for each prey [1/(year thousand)]"),
+        },
+        observables=[populations],
         units={"q": "ln(thousands)", "p": "ln(thousands)", "t": "year", "energy": "1/year"},
         source="Volterra 1926, Mem. Acad. Lincei Roma 2, 31; Hairer, Lubich & Wanner 2006, I.1.1",
-        check=check_start,
-        parameters={
-            "alpha": "growth of prey [1/year]",
-            "beta": "prey eaten, for each predator [1/(year thousand)]",
-            "gamma": "death of predators [1/year]",
-            "delta": "growth of predators, for each prey [1/(year thousand)]",
-        },
-        invariants=("energy",),
-        symmetries={"time": time_translation()},
     )

@@ -11,8 +11,7 @@ import numpy as np
 
 from .._checks import whole
 from .._system import System
-from ..discover.library import time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ._problem import Parameter, Problem, library_problem
 from ._start import Start, finite
 from .oscillator import PHASE
 
@@ -24,9 +23,6 @@ def hamiltonian(t0, t1, q0, p1, args):
     """
     steps = (q0 - jnp.roll(q0, -1)) ** 2 + (p1 - jnp.roll(p1, -1)) ** 2
     return jnp.sum(args["kappa"] / 2 * steps - args["gamma"] / 8 * (q0**2 + p1**2) ** 2)
-
-
-energy = at_end(hamiltonian)
 
 
 def norm(t0, t1, q0, p0, q1, p1, args):
@@ -61,14 +57,6 @@ def plane_wave(t, n, mode, amplitude, args):
     return np.sqrt(2) * amplitude * jnp.cos(angle), np.sqrt(2) * amplitude * jnp.sin(angle)
 
 
-check_start = Start(
-    "the lattice is a ring of at least three sites",
-    (None,),
-    {"kappa": finite, "gamma": finite},
-    least=3,
-)
-
-
 def nls_lattice(n: int = 8) -> Problem:
     """A hump on a ring of n sites that attracts itself, and moves; dimensionless.
 
@@ -82,22 +70,21 @@ def nls_lattice(n: int = 8) -> Problem:
     site = np.arange(n) - n / 2
     size, phase = 1 / np.cosh(site / 1.5), 0.5 * site
     q0, p0 = size * np.cos(phase), size * np.sin(phase)
-    return Problem(
+    return library_problem(
+        System(hamiltonian),
+        Start("the lattice is a ring of at least three sites", (None,), least=3),
         name="nls_lattice",
-        system=System(hamiltonian),
         q0=q0,
         p0=p0,
         h=0.02,
-        args={"kappa": 1.0, "gamma": 1.0},
-        observables=named(energy, norm, densities),
-        units=DIMENSIONLESS,
-        source="Kevrekidis 2009, The Discrete Nonlinear Schrödinger Equation",
-        check=check_start,
         parameters={
-            "kappa": "coupling of neighbours [1/time]",
-            "gamma": "attraction on a site, negative for repulsion [1/time]",
+            "kappa": Parameter(1.0, "coupling of neighbours [1/time]", finite),
+            "gamma": Parameter(
+                1.0, "attraction on a site, negative for repulsion [1/time]", finite
+            ),
         },
-        invariants=("energy", "norm"),
-        symmetries={"time": time_translation()},
+        observables=[norm, densities],
+        source="Kevrekidis 2009, The Discrete Nonlinear Schrödinger Equation",
+        invariants=("norm",),
         flow_symmetries={"phase": PHASE},
     )

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 
 from .._system import System
 from ..discover.generators import Generator
-from ..discover.library import scaling, time_translation
-from ._problem import Problem, at_end, named, over_times
+from ..discover.library import scaling
+from ._problem import Problem, at_end, library_problem, over_times
 from ._start import Start
 
 PHASE = Generator(xi=lambda t, q, p, args: p, eta=lambda t, q, p, args: -q)
@@ -48,23 +48,19 @@ def exact(t, q0, p0, args):
     return q0 * c + p0 * s, p0 * c - q0 * s
 
 
-check_start = Start("the oscillator is of any dimension", None)
-
-
 def oscillator() -> Problem:
     """The paper's oscillator with its start (0.01, 0.01) and h = 0.1; dimensionless."""
-    return Problem(
+    return library_problem(
+        System(hamiltonian, force=linear_force),
+        Start("the oscillator is of any dimension", None),
         name="oscillator",
-        system=System(hamiltonian, force=linear_force),
         q0=[0.01],
         p0=[0.01],
         h=0.1,
-        observables=named(energy, mixed_energy, map_invariant),
+        observables=[mixed_energy, map_invariant],
         units={"q": "1", "p": "1", "t": "1/ω", "energy": "1"},
         source="the paper, Section 5.1",
-        check=check_start,
-        invariants=("energy",),
-        symmetries={"time": time_translation(), "scaling": scaling()},
+        symmetries={"scaling": scaling()},
         flow_symmetries={"phase": PHASE},
         exact=exact,
     )

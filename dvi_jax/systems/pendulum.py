@@ -4,10 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..discover.library import time_translation
 from ._elliptic import complete, first_kind, jacobi, swing
-from ._problem import Problem, at_end, named, over_times
-from ._start import Start, positive
+from ._problem import Parameter, Problem, library_problem, over_times
+from ._start import Start
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -18,9 +17,6 @@ def hamiltonian(t0, t1, q0, p1, args):
 def friction(t0, t1, q0, p1, args):
     """W = −p1: a friction εp."""
     return -p1
-
-
-energy = at_end(hamiltonian)
 
 
 def modulus(q, p, args):
@@ -84,9 +80,6 @@ def exact(t, q0, p0, args):
     return q + 0 * m, p + 0 * m
 
 
-check_start = Start("the pendulum is one angle", (1,), {"omega": positive})
-
-
 def pendulum() -> Problem:
     """H = p²/2 − ω² cos q with the friction −εp, swinging to 2.0 rad; dimensionless.
 
@@ -95,19 +88,19 @@ def pendulum() -> Problem:
     **Source** Whittaker 1937, *A Treatise on the Analytical Dynamics of Particles and Rigid
     Bodies*, §44.
     """
-    return Problem(
+    return library_problem(
+        System(hamiltonian, force=friction),
+        Start("the pendulum is one angle", (1,)),
         name="pendulum",
-        system=System(hamiltonian, force=friction),
         q0=np.array([1.5]),
         p0=np.array([1.0]),
         h=0.1,
-        args={"omega": 1.0},
-        observables=named(energy, action),
+        parameters={
+            "omega": Parameter(1.0, "frequency of small swings [1/time]"),
+        },
+        observables=[action],
         units={"q": "rad", "p": "1", "t": "1", "energy": "1"},
         source="Whittaker 1937, Analytical Dynamics, §44",
-        check=check_start,
-        parameters={"omega": "frequency of small swings [1/time]"},
-        invariants=("energy", "action"),
-        symmetries={"time": time_translation()},
+        invariants=("action",),
         exact=exact,
     )

@@ -3,8 +3,7 @@
 import jax.numpy as jnp
 
 from .._system import System
-from ..discover.library import time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ._problem import Problem, library_problem
 from ._start import Start
 from .pendulum import exact as of_pendulum
 
@@ -19,15 +18,9 @@ def coupling(t0, t1, q0, p1, args):
     return -jnp.sum(q0 * p1) * jnp.sin(t0)
 
 
-energy = at_end(hamiltonian)
-
-
 def exact(t, q0, p0, args):
     """The pendulum alone at times t, ε = 0: see `pendulum.exact`."""
     return of_pendulum(t, q0, p0, {"omega": 1.0})
-
-
-check_start = Start("the perturbed pendulum is one pendulum", (1,))
 
 
 def perturbed_pendulum() -> Problem:
@@ -38,17 +31,13 @@ def perturbed_pendulum() -> Problem:
 
     **Source** the pendulum: any text; the disturbance is a test problem with all three couplings.
     """
-    return Problem(
+    return library_problem(
+        System(hamiltonian, perturbation=coupling),
+        Start("the perturbed pendulum is one pendulum", (1,)),
         name="perturbed_pendulum",
-        system=System(hamiltonian, perturbation=coupling),
         q0=[0.5],
         p0=[0.3],
         h=0.1,
-        observables=named(energy),
-        units=DIMENSIONLESS,
         source="our own choice",
-        check=check_start,
-        invariants=("energy",),
-        symmetries={"time": time_translation()},
         exact=exact,
     )

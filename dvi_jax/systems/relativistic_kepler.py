@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..discover.library import rotation, time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
-from ._start import Start, positive
+from ..discover.library import rotation
+from ._problem import Parameter, Problem, at_end, library_problem
+from ._start import Start
 from .kepler import angular_momentum
 
 
@@ -66,15 +66,6 @@ def _misses_the_centre(q, p, args):
         )
 
 
-check_start = Start(
-    "the relativistic Kepler problem is in the plane",
-    (2,),
-    {"K": positive, "c": positive},
-    singular={"the centre": (0, 0)},
-    also=_misses_the_centre,
-)
-
-
 def relativistic_kepler() -> Problem:
     """The start at perihelion of an ellipse of e ≈ 0.35 with K = 1, c = 10; dimensionless.
 
@@ -83,21 +74,24 @@ def relativistic_kepler() -> Problem:
 
     **Source** Sommerfeld 1916, *Ann. Phys.* 356, 1.
     """
-    return Problem(
+    return library_problem(
+        System(hamiltonian),
+        Start(
+            "the relativistic Kepler problem is in the plane",
+            (2,),
+            singular={"the centre": (0, 0)},
+            also=_misses_the_centre,
+        ),
         name="relativistic_kepler",
-        system=System(hamiltonian),
         q0=np.array([0.6, 0.0]),
         p0=np.array([0.0, 1.5]),
         h=0.02,
-        args={"K": 1.0, "c": 10.0},
-        observables=named(energy, angular_momentum, perihelion_angle),
-        units=DIMENSIONLESS,
-        source="Sommerfeld 1916, Ann. Phys. 356, 1",
-        check=check_start,
         parameters={
-            "K": "root of the strength of attraction, K² = GM [length^(3/2)/time]",
-            "c": "speed of light [length/time]",
+            "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]"),
+            "c": Parameter(10.0, "speed of light [length/time]"),
         },
-        invariants=("energy", "angular_momentum"),
-        symmetries={"time": time_translation(), "rotation": rotation()},
+        observables=[angular_momentum, perihelion_angle],
+        source="Sommerfeld 1916, Ann. Phys. 356, 1",
+        invariants=("angular_momentum",),
+        symmetries={"rotation": rotation()},
     )

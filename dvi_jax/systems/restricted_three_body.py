@@ -4,8 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..discover.library import time_translation
-from ._problem import Problem, at_end, named
+from ._problem import Parameter, Problem, library_problem
 from ._start import Start, finite
 from .kepler import angular_momentum
 
@@ -30,9 +29,6 @@ def hamiltonian(t0, t1, q0, p1, args):
     """
     x, y, _ = q0
     return jnp.sum(p1**2) / 2 - (x * p1[1] - y * p1[0]) + potential(q0, args["mu"])
-
-
-energy = at_end(hamiltonian)
 
 
 def jacobi_constant(t0, t1, q0, p0, q1, p1, args):
@@ -88,17 +84,6 @@ def lagrange_points(mu):
     return np.array([*line, [0.5 - mu, side, 0.0], [0.5 - mu, -side, 0.0]])
 
 
-check_start = Start(
-    "the restricted problem has one body in space",
-    (3,),
-    {"mu": _mass_fraction},
-    singular={
-        "the large body": lambda args: (-args["mu"], 0.0, 0.0),
-        "the small body": lambda args: (1 - args["mu"], 0.0, 0.0),
-    },
-)
-
-
 def restricted_three_body() -> Problem:
     """A body near L4 of Earth and Moon, about which it goes to and fro, in and out of the plane.
 
@@ -108,18 +93,29 @@ def restricted_three_body() -> Problem:
     **Source** Szebehely 1967, *Theory of Orbits*, 1 and 4.
     """
     q0 = lagrange_points(EARTH_MOON)[3] + [0.01, 0.0, 0.02]
-    return Problem(
+    return library_problem(
+        System(hamiltonian),
+        Start(
+            "the restricted problem has one body in space",
+            (3,),
+            singular={
+                "the large body": lambda args: (-args["mu"], 0.0, 0.0),
+                "the small body": lambda args: (1 - args["mu"], 0.0, 0.0),
+            },
+        ),
         name="restricted_three_body",
-        system=System(hamiltonian),
         q0=q0,
-        p0=np.array([-q0[1], q0[0], 0.0]),  # at rest in the turning frame
+        p0=np.array([-q0[1], q0[0], 0.0]),
         h=0.02,
-        args={"mu": EARTH_MOON},
-        observables=named(energy, jacobi_constant, angular_momentum),
+        parameters={
+            "mu": Parameter(
+                EARTH_MOON,
+                "share of the small body in the mass of both, at most 1/2 [1]",
+                _mass_fraction,
+            ),
+        },
+        observables=[jacobi_constant, angular_momentum],
         units={"q": "distance of the bodies", "p": "1", "t": "period/2π", "energy": "1"},
         source="Szebehely 1967, Theory of Orbits, 1 and 4",
-        check=check_start,
-        parameters={"mu": "share of the small body in the mass of both, at most 1/2 [1]"},
-        invariants=("energy", "jacobi_constant"),
-        symmetries={"time": time_translation()},
+        invariants=("jacobi_constant",),
     )

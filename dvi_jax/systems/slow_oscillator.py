@@ -5,7 +5,7 @@ import numpy as np
 
 from .._system import System
 from ..discover.library import scaling
-from ._problem import DIMENSIONLESS, Adiabatic, InSlowTime, Problem, at_end, named
+from ._problem import Adiabatic, InSlowTime, Parameter, Problem, at_end, library_problem
 from ._start import Start, between
 from .oscillator import exact as of_oscillator
 
@@ -33,11 +33,6 @@ def exact(t, q0, p0, args):
     return of_oscillator(t, q0, p0, args)
 
 
-check_start = Start(
-    "the slow oscillator has one degree of freedom", (1,), {"depth": between(-1, 1)}
-)
-
-
 def slow_oscillator() -> Problem:
     """H = (p² + ω(εt)² q²)/2, ω = 1 + 0.3 sin εt: its energy goes with ω, E/ω wavers by O(ε).
 
@@ -47,18 +42,19 @@ def slow_oscillator() -> Problem:
     **Source** Ehrenfest 1916, *Ann. Phys.* 356, 327; Arnold 1989, *Mathematical Methods of
     Classical Mechanics*, §52.
     """
-    return Problem(
+    return library_problem(
+        System(hamiltonian, slow_time=True),
+        Start("the slow oscillator has one degree of freedom", (1,)),
         name="slow_oscillator",
-        system=System(hamiltonian, slow_time=True),
         q0=np.array([0.4]),
         p0=np.array([0.3]),
         h=0.1,
-        args={"depth": 0.3},
-        observables=named(InSlowTime(energy), InSlowTime(action)),
-        units=DIMENSIONLESS,
+        parameters={
+            "depth": Parameter(0.3, "relative change of the frequency [1]", between(-1, 1)),
+        },
+        observables=[InSlowTime(energy), InSlowTime(action)],
+        autonomous=False,
         source="Ehrenfest 1916, Ann. Phys. 356, 327; Arnold 1989, §52",
-        check=check_start,
-        parameters={"depth": "relative change of the frequency [1]"},
         invariants=("energy", "action"),
         adiabatic={"action": Adiabatic("rate of the change over the frequency", 1)},
         symmetries={"scaling": scaling()},

@@ -5,8 +5,8 @@ import numpy as np
 
 from .._checks import whole
 from .._system import System
-from ..discover.library import space_translation, time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
+from ..discover.library import space_translation
+from ._problem import Problem, library_problem
 from ._start import Start
 
 
@@ -32,9 +32,6 @@ def lax_matrix(q, p):
     return upper + upper.T - jnp.diag(p) / 2
 
 
-energy = at_end(hamiltonian)
-
-
 def total_momentum(t0, t1, q0, p0, q1, p1, args):
     """Σ p_i at t1."""
     return jnp.sum(p1)
@@ -55,9 +52,6 @@ def lax_eigenvalues(t0, t1, q0, p0, q1, p1, args):
     return jnp.linalg.eigvalsh(lax_matrix(q1, p1))
 
 
-check_start = Start("the periodic Toda lattice needs at least three particles", (None,), least=3)
-
-
 def toda(n: int = 5) -> Problem:
     """The Toda lattice of n particles at equal distances, in waves of two lengths; dimensionless.
 
@@ -71,16 +65,15 @@ def toda(n: int = 5) -> Problem:
     n = whole("n", n, 3, hint="The periodic Toda lattice needs at least three particles.")
     angle = 2 * np.pi * np.arange(n) / n
     q0, p0 = np.zeros(n), 0.1 + np.cos(angle) + np.sin(2 * angle) / 2
-    return Problem(
+    return library_problem(
+        System(hamiltonian),
+        Start("the periodic Toda lattice needs at least three particles", (None,), least=3),
         name="toda",
-        system=System(hamiltonian),
         q0=q0,
         p0=p0,
         h=0.1,
-        observables=named(energy, total_momentum, lax_traces, lax_eigenvalues),
-        units=DIMENSIONLESS,
+        observables=[total_momentum, lax_traces, lax_eigenvalues],
         source="Toda 1967, J. Phys. Soc. Japan 22, 431; Flaschka 1974, Phys. Rev. B 9, 1924",
-        check=check_start,
-        invariants=("energy", "total_momentum", "lax_traces", "lax_eigenvalues"),
-        symmetries={"time": time_translation(), "translation": space_translation(np.ones(n))},
+        invariants=("total_momentum", "lax_traces", "lax_eigenvalues"),
+        symmetries={"translation": space_translation(np.ones(n))},
     )

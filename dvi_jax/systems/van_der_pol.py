@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
-from ..discover.library import scaling, time_translation
-from ._problem import DIMENSIONLESS, Problem, named
+from ..discover.library import scaling
+from ._problem import Problem, library_problem
 from ._start import Start
-from .oscillator import PHASE, energy, exact, hamiltonian
+from .oscillator import PHASE, exact, hamiltonian
 
 
 def feedback(t0, t1, q0, p1, args):
@@ -37,9 +37,6 @@ def averaged_amplitude(t, epsilon, start):
     return 2 / jnp.sqrt(1 + (4 / start**2 - 1) * jnp.exp(-epsilon * jnp.asarray(t)))
 
 
-check_start = Start("Van der Pol's oscillator has one degree of freedom", (1,))
-
-
 def van_der_pol() -> Problem:
     """H = (p² + q²)/2 with the force ε(1 − q²)p; dimensionless.
 
@@ -48,18 +45,17 @@ def van_der_pol() -> Problem:
 
     **Source** van der Pol 1926, *Phil. Mag.* 2, 978.
     """
-    return Problem(
+    return library_problem(
+        System(hamiltonian, force=feedback),
+        Start("Van der Pol's oscillator has one degree of freedom", (1,)),
         name="van_der_pol",
-        system=System(hamiltonian, force=feedback),
         q0=np.array([0.5]),
         p0=np.array([0.0]),
         h=0.1,
-        observables=named(energy, amplitude),
-        units=DIMENSIONLESS,
+        observables=[amplitude],
         source="van der Pol 1926, Phil. Mag. 2, 978",
-        check=check_start,
-        invariants=("energy", "amplitude"),
-        symmetries={"time": time_translation(), "scaling": scaling()},
+        invariants=("amplitude",),
+        symmetries={"scaling": scaling()},
         flow_symmetries={"phase": PHASE},
         exact=exact,
     )
