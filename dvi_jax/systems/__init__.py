@@ -4,8 +4,12 @@ Each is a function without obligatory arguments that returns a `Problem`, and a 
 by which run files name it and `tests/test_library.py` tests it.
 """
 
-from ._problem import Adiabatic as Adiabatic, InSlowTime as InSlowTime, Problem as Problem
-from ._start import ParameterError as ParameterError
+from ._problem import (
+    Adiabatic as Adiabatic,
+    InSlowTime as InSlowTime,
+    ParameterError as ParameterError,
+    Problem as Problem,
+)
 from .dipole_field import dipole_field as dipole_field
 from .double_pendulum import double_pendulum as double_pendulum
 from .duffing import duffing as duffing

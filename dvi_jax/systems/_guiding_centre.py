@@ -7,8 +7,8 @@ and the position on the gyration ρ = b × v⊥/Ω, the moment μ0 = m v⊥²/(2
     κ = (b·∇)b
 
 (the other terms cancel by div B = 0). With dρ/dt = v⊥, dv⊥/dt = Ωu and du/dt = −Ωv⊥ to leading
-order, each of the three is the derivative of a function that oscillates with the gyration. Minus the
-sum of these functions is
+order, each of the three is the derivative of a function that oscillates with the gyration. Minus
+the sum of these functions is
 
     μ1 = (μ0/B) ρ·∇B + (m v∥²/B) ρ·κ − (m v∥/(4BΩ)) (v⊥u + uv⊥):∇b,
 
@@ -27,8 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._problem import Adiabatic, Parameter, Problem
-from ._start import gyrates
+from ._problem import Adiabatic, Parameter, Problem, gyrates
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _HALVINGS = 54

@@ -1,4 +1,4 @@
-"""A system of the library with its parameters and its known properties."""
+"""A system of the library: parameters, initial conditions, known properties, and checks of them."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -8,12 +8,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from .._checks import positive
+from .._checks import finite as finite, positive as positive
 from .._system import System
 from ..discover.generators import Generator
 from ..discover.library import time_translation
-from ._start import Check, Start, check_shape
 
 DIMENSIONLESS = {"q": "1", "p": "1", "t": "1", "energy": "1"}
 """Units of a dimensionless system."""
@@ -96,6 +96,125 @@ class Problem:
                 )
 
 
+Check = Callable[[str, Any], Any]
+"""Function of a parameter's name and value that raises `ValueError`."""
+
+
+class ParameterError(ValueError):
+    """An invalid parameter in args."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """A check of initial conditions and parameters: a function of (q0, p0, args).
+
+    - `system`: the system in words, for messages.
+    - `shape`: of q0 and of p0, with None for any number from `least` on; None for any shape.
+    - `parameters`: name in args → check of its value.
+    - `singular`: name of a singular point → the point, or a function of args.
+    - `also`: a further check, function of q0, p0 (NumPy arrays) and args.
+
+    **Raises** `ValueError` that shows what was seen; `ParameterError` for a parameter.
+    """
+
+    system: str
+    shape: tuple[int | None, ...] | None
+    parameters: Mapping[str, Check] = field(default_factory=dict)
+    singular: Mapping[str, Any] = field(default_factory=dict)
+    also: Callable[[Any, Any, Any], None] | None = None
+    least: int = 1
+
+    def __call__(self, q0: Any, p0: Any, args: Any) -> None:
+        check_shape(q0, p0, self._fits, f"{self.system}: q0 and p0 of {self._wanted}")
+        for name, check in self.parameters.items():
+            check_parameter(args, name, check)
+        if not (self.singular or self.also):
+            return
+        q, p = np.asarray(q0, float), np.asarray(p0, float)
+        for what, at in self.singular.items():
+            point: Any = at(args) if callable(at) else at
+            if (q == point).all():
+                raise ValueError(
+                    f"q0 is on top of {what} at {list(point)}: the system is singular there."
+                )
+        if self.also is not None:
+            self.also(q, p, args)
+
+    def _fits(self, seen: tuple[int, ...]) -> bool:
+        if self.shape is None:
+            return True
+        pairs = zip(seen, self.shape, strict=False)
+        return len(seen) == len(self.shape) and all(
+            n >= self.least if m is None else n == m for n, m in pairs
+        )
+
+    @property
+    def _wanted(self) -> str:
+        if self.shape is None:
+            return "one shape, any"
+        range_of_n = f", n ≥ {self.least}" if None in self.shape else ""
+        return f"shape {self.shape}{range_of_n}".replace("None", "n")
+
+
+def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], wanted: str) -> None:
+    """Require q0 and p0 of one shape for which `fits` holds; `wanted`: these shapes, a sentence."""
+    q, p = np.shape(q0), np.shape(p0)
+    if q != p or not fits(q):
+        raise ValueError(f"{wanted}; got q0 of shape {q} and p0 of shape {p}.")
+
+
+def parameter(args: Any, name: str) -> Any:
+    """The parameter of this name. **Raises** `ParameterError`, with the names that args has."""
+    if not isinstance(args, Mapping) or name not in args:
+        there = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
+        raise ParameterError(
+            f"the parameter {name} is missing: args must be a dict that has {name!r}; "
+            f"got {f'one with {there}' if there else repr(args)}."
+        )
+    return args[name]
+
+
+def check_parameter(args: Any, name: str, check: Check) -> None:
+    """Apply a check to the parameter of this name. **Raises** `ParameterError`."""
+    value = parameter(args, name)
+    try:
+        check(name, value)
+    except ValueError as error:
+        raise ParameterError(str(error)) from None
+
+
+def gyrates(name: str, value: Any) -> None:
+    """A check for the charge of a particle or the strength of a magnetic field."""
+    if finite(name, value) == 0:
+        raise ValueError(f"{name} is 0: the particle does not gyrate. Take another system.")
+
+
+def between(low: float, high: float) -> Check:
+    """A check for a number in the open interval."""
+
+    def check(name: str, value: Any) -> None:
+        if not low < finite(name, value) < high:
+            raise ValueError(f"{name} must be between {low} and {high}, got {value}.")
+
+    return check
+
+
+def vector(size: int) -> Check:
+    """A check for `size` finite numbers."""
+
+    def check(name: str, given: Any) -> None:
+        try:
+            value = np.asarray(given, float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name} must be {size} numbers: {error}") from None
+        if value.shape != (size,):
+            raise ValueError(f"{name} must have shape ({size},), got {value.shape}.")
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} must be finite, got {value}.")
+
+    return check
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A parameter of a library system: its value, its meaning with [unit], its check."""
@@ -106,33 +225,37 @@ class Parameter:
 
 
 def library_problem(
-    system: System,
+    hamiltonian: Callable[..., Any],
     start: Start,
     parameters: Mapping[str, Parameter] | None = None,
     observables: Sequence[Callable[..., Any]] = (),
+    force: Callable[..., Any] | None = None,
+    perturbation: Callable[..., Any] | None = None,
     autonomous: bool = True,
+    slow_time: bool = False,
     **fields: Any,
 ) -> Problem:
     """A `Problem` of the library.
 
     - `start`: check of initial conditions; those of `parameters` are added to it.
     - `autonomous`: whether H is independent of time at ε = 0. The energy is then an observable and
-      an invariant, and the translation in time a symmetry.
+      an invariant, and the translation in time a symmetry, though not one of `slow_time`.
+    - `slow_time`: whether the times of the Hamiltonian and of the observables are ε times t.
     - `fields`: the other fields of `Problem`.
     """
-    parameters = parameters or {}
+    parameters, fields = parameters or {}, {"units": DIMENSIONLESS, **fields}
     if autonomous:
-        observables = (at_end(system.H_D), *observables)
+        observables = (at_end(hamiltonian), *observables)
         fields["invariants"] = ("energy", *fields.get("invariants", ()))
+    if autonomous and not slow_time:
         fields["symmetries"] = {"time": time_translation(), **fields.get("symmetries", {})}
-    checks = {name: parameter.check for name, parameter in parameters.items()}
     return Problem(
-        system=system,
-        args={name: parameter.value for name, parameter in parameters.items()} or None,
-        check=replace(start, parameters=checks),
-        parameters={name: parameter.meaning for name, parameter in parameters.items()},
-        observables={getattr(f, "function", f).__name__: f for f in observables},
-        **{"units": DIMENSIONLESS, **fields},
+        system=System(hamiltonian, force, perturbation, slow_time),
+        args={name: one.value for name, one in parameters.items()} or None,
+        check=replace(start, parameters={name: one.check for name, one in parameters.items()}),
+        parameters={name: one.meaning for name, one in parameters.items()},
+        observables={f.__name__: InSlowTime(f) if slow_time else f for f in observables},
+        **fields,
     )
 
 

@@ -3,11 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
 from ..discover.library import rotation
 from . import _guiding_centre as guiding_centre
-from ._problem import Parameter, Problem, library_problem
-from ._start import Start, gyrates, positive
+from ._problem import Parameter, Problem, Start, gyrates, library_problem, positive
 
 
 def vector_potential(q, args):
@@ -41,7 +39,7 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
 
     along the field line r = L cos² λ of the guiding centre q − b × v/Ω, with
     B = |B0| (R/L)³ √(1 + 3 sin² λ)/cos⁶ λ, ds = L cos λ √(1 + 3 sin² λ) dλ and μ the
-    `corrected_moment`. Zero where the particle mirrors at the equator. Not differentiable.
+    `corrected_moment`. Zero where the mirror point is at the equator. Not differentiable.
 
     **Source** Northrop 1963, *The Adiabatic Motion of Charged Particles*, 3.
     """
@@ -67,8 +65,8 @@ def dipole_field(radius: float = 50.0) -> Problem:
     Dimensionless: e = m = B0 = 1, so that gyrofrequency and gyroradius at the start are 1; it
     starts at the equator at r ≈ R with its velocity at 45° to the field.
 
-    - `radius`: R over the gyroradius. In units of Störmer's length only the initial conditions depend
-      on it.
+    - `radius`: R over the gyroradius. In units of Störmer's length it appears only in the initial
+      conditions.
 
     **Raises** `ValueError` for a radius that is not positive.
 
@@ -78,7 +76,7 @@ def dipole_field(radius: float = 50.0) -> Problem:
     radius = positive("radius", radius)
     v0, A = np.array([0.6, -0.8, 1.0]), np.array([0.0, -radius, 0.0])  # `vector_potential` at q0
     return library_problem(
-        System(hamiltonian),
+        hamiltonian,
         Start(
             "the dipole field holds one particle in space", (3,), singular={"the dipole": (0, 0, 0)}
         ),

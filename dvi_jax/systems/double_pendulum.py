@@ -1,11 +1,9 @@
-"""Two pendulums, one hung from the other."""
+"""Two pendulums, the second attached to the bob of the first."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ._problem import Parameter, Problem, library_problem
-from ._start import Start, finite
+from ._problem import Parameter, Problem, Start, finite, library_problem
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -25,18 +23,18 @@ def hamiltonian(t0, t1, q0, p1, args):
 
 
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """P1 + P2 at t1: the angular momentum about the hinge, kept where g = 0 only."""
+    """P1 + P2 at t1: the angular momentum about the hinge, conserved for g = 0 only."""
     return jnp.sum(p1)
 
 
 def double_pendulum() -> Problem:
-    """Two bobs of 1 kg on rods of 1 m, let go at 90° and 60° from the vertical: chaotic.
+    """Two bobs of 1 kg on rods of 1 m, at rest at 90° and 60° from the vertical: chaotic.
 
-    **Source** Landau & Lifshitz 1976, *Mechanics*, §5, Problem 1; the Legendre transform and the
-    start are ours.
+    **Source** Landau & Lifshitz 1976, *Mechanics*, §5, Problem 1; the Legendre transform and
+    the initial conditions are ours.
     """
     return library_problem(
-        System(hamiltonian),
+        hamiltonian,
         Start("the double pendulum is two angles", (2,)),
         name="double_pendulum",
         q0=np.array([np.pi / 2, np.pi / 3]),

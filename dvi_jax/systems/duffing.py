@@ -1,12 +1,10 @@
-"""Duffing's oscillator: a spring with a cubic term, disturbed by friction and a periodic drive."""
+"""Duffing's oscillator: a spring with a cubic term; friction and a periodic drive perturb it."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
 from ._elliptic import first_kind, jacobi
-from ._problem import Parameter, Problem, library_problem, over_times
-from ._start import Start, finite
+from ._problem import Parameter, Problem, Start, finite, library_problem, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -21,23 +19,20 @@ def friction_and_drive(t0, t1, q0, p1, args):
 
 @over_times((1,))
 def exact(t, q0, p0, args):
-    r"""The state at times t of an oscillator at (q0, p0) at t = 0, without disturbance, β > 0.
+    r"""The state at times t without perturbation, for β > 0.
 
-        E > 0:  q = A cn(λt + u | m),  λ² = α + βA²,  m = βA²/(2λ²)      (over the hill, if any)
+        E > 0:  q = A cn(λt + u | m),  λ² = α + βA²,  m = βA²/(2λ²)      (over the barrier, if any)
         E < 0:  q = ±A dn(λt + u | m),  λ² = βA²/2,    m = 2 + 2α/(βA²)   (in one of two wells)
 
     with A the largest distance, A² = (−α + s)/β, s² = α² + 4βE = (α + βq²)² + 2βp², and p = dq/dt.
-
-    - `t`: times, any shape. `q0`, `p0`: shape (1,). Returns q, p of shape t.shape + (1,).
-
-    At E = 0 with α < 0, on the separatrix, and at rest at the origin it is NaN. It carries
-    gradients elsewhere, but for the very bottom of a well, where s = 0 has a cusp: NaN.
+    NaN at E = 0 with α < 0 (separatrix), and at rest at the origin. Differentiable elsewhere,
+    except at the bottom of a well, where s = 0 has a cusp: NaN.
     **Source** Kovacic & Brennan (eds.) 2011, *The Duffing Equation*, Chapter 4.
     """
     alpha, beta = args["alpha"], args["beta"]
     E = hamiltonian(0.0, 0.0, q0, p0, args)
     E = jnp.where(E == 0, jnp.nan, E)
-    # s² as a sum of squares: α² + 4βE loses its digits near the bottom of a well
+    # s² as a sum of squares: α² + 4βE cancels near the bottom of a well
     slope = alpha + beta * q0**2
     over, root = E > 0, jnp.sqrt(slope**2 + 2 * beta * p0**2) + 0 * E
     # 4E/(α + root) is (root − α)/β without its cancellation, for α > 0
@@ -61,20 +56,20 @@ def exact(t, q0, p0, args):
 def duffing() -> Problem:
     """H = p²/2 + αq²/2 + βq⁴/4 with the force ε(−δp + γ cos ωt), in the left of two wells.
 
-    Dimensionless. α = −1, β = 1, δ = 0.3, ω = 1.2: with ε = 1 and γ = 0.5 the motion is chaotic,
-    with γ = 0.2 it stays in a well. Without disturbance it swings within one well.
+    Dimensionless. α = −1, β = 1, δ = 0.3, ω = 1.2: with ε = 1 the motion is chaotic for γ = 0.5 and
+    stays in a well for γ = 0.2. Without perturbation it oscillates in one well.
 
     **Source** Guckenheimer & Holmes 1983, *Nonlinear Oscillations*, 2.2; Kovacic & Brennan 2011,
     *The Duffing Equation*.
     """
     return library_problem(
-        System(hamiltonian, force=friction_and_drive),
+        hamiltonian,
         Start("Duffing's oscillator has one degree of freedom", (1,)),
         name="duffing",
         q0=np.array([-1.2]),
         p0=np.array([0.2]),
         h=0.1,
-        parameters={
+        parameters={  # with β ≤ 0 the motion is unbounded
             "alpha": Parameter(
                 -1.0, "linear part of the spring, negative for two wells [1/time²]", finite
             ),
@@ -83,6 +78,7 @@ def duffing() -> Problem:
             "gamma": Parameter(0.5, "amplitude of the drive at ε = 1 [length/time²]", finite),
             "omega": Parameter(1.2, "frequency of the drive [1/time]", finite),
         },
+        force=friction_and_drive,
         source="Guckenheimer & Holmes 1983, Nonlinear Oscillations, 2.2",
         exact=exact,
     )

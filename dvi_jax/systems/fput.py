@@ -4,9 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import whole
-from .._system import System
-from ._problem import Parameter, Problem, library_problem
-from ._start import Start, finite
+from ._problem import Parameter, Problem, Start, finite, library_problem
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -57,7 +55,7 @@ def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
     n = whole("n", n, hint="The FPUT chain is a row of particles between two walls.")
     alpha, beta = finite("alpha", alpha), finite("beta", beta)
     return library_problem(
-        System(hamiltonian),
+        hamiltonian,
         Start("the FPUT chain is a row of particles between two walls", (None,)),
         name="fput",
         q0=np.sin(np.pi * np.arange(1, n + 1) / (n + 1)),

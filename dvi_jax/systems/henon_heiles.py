@@ -1,13 +1,11 @@
-"""Hénon and Heiles' star in the plane of a galaxy."""
+"""The star of Hénon and Heiles in the potential of a galaxy."""
 
 import jax.numpy as jnp
 
-from .._system import System
-from ._problem import Problem, library_problem
-from ._start import Start
+from ._problem import Problem, Start, library_problem
 
 ESCAPE_ENERGY = 1 / 6
-"""Energy of the three saddles of the potential: orbits below it that start inside stay there."""
+"""Energy of the three saddles of the potential: orbits of less energy between them are bounded."""
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -19,7 +17,7 @@ def hamiltonian(t0, t1, q0, p1, args):
 def henon_heiles() -> Problem:
     """The Hénon–Heiles system on a regular orbit of energy 1/12; dimensionless.
 
-    Half the energy of escape: most orbits there are regular, and at 1/8 many are chaotic. Start
+    Half the escape energy: most orbits are regular; at 1/8 many are chaotic. Initial conditions
     and step are ours.
 
     **Source** Hénon & Heiles 1964, *Astron. J.* 69, 73.
@@ -27,7 +25,7 @@ def henon_heiles() -> Problem:
     y, py = 0.1, 0.2
     px = (2 * (1 / 12) - py**2 - y**2 + 2 * y**3 / 3) ** 0.5  # at x = 0, for energy 1/12
     return library_problem(
-        System(hamiltonian),
+        hamiltonian,
         Start("the Hénon–Heiles system is in the plane", (2,)),
         name="henon_heiles",
         q0=[0.0, y],

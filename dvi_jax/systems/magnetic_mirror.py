@@ -2,11 +2,9 @@
 
 import jax.numpy as jnp
 
-from .._system import System
 from ..discover.library import rotation
 from . import _guiding_centre as guiding_centre
-from ._problem import Parameter, Problem, at_end, library_problem
-from ._start import Start, finite, gyrates, positive
+from ._problem import Parameter, Problem, Start, at_end, finite, gyrates, library_problem, positive
 
 
 def vector_potential(q, args):
@@ -84,7 +82,7 @@ def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
     length, distance = positive("length", length), finite("distance", distance)
     x, vy, vz = distance + 1, -1.0, 0.8
     return library_problem(
-        System(hamiltonian),
+        hamiltonian,
         Start("the magnetic mirror holds one particle in space", (3,)),
         name="magnetic_mirror",
         q0=[x, 0.0, 0.0],

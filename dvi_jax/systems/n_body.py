@@ -9,8 +9,7 @@ import numpy as np
 from .._system import System
 from ..discover.generators import Generator
 from ..discover.library import rotation, scaling, space_translation, time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end
-from ._start import check_parameter, finite, parameter
+from ._problem import DIMENSIONLESS, Problem, at_end, check_parameter, finite, parameter
 
 _PLACE, _SPEED = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
 EIGHT_POSITIONS = np.array([_PLACE, -_PLACE, np.zeros(2)])

@@ -3,10 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
 from ..discover.library import rotation
-from ._problem import Parameter, Problem, library_problem
-from ._start import Start, finite
+from ._problem import Parameter, Problem, Start, finite, library_problem
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -21,12 +19,12 @@ def hamiltonian(t0, t1, q0, p1, args):
 
 
 def axial_angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """L_z = x p_y − y p_x at t1, which turns about the planet's axis keep."""
+    """L_z = x p_y − y p_x at t1, conserved by symmetry about the planet's axis."""
     return q1[0] * p1[1] - q1[1] * p1[0]
 
 
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """q × p at t1, shape (3,): it goes round the axis, and is not kept."""
+    """q × p at t1, shape (3,), which precesses about the axis."""
     return jnp.cross(q1, p1)
 
 
@@ -37,7 +35,7 @@ def elements(q, p, mu):
         ω = angle from the node (cos Ω, sin Ω, 0) to e about L
 
     q [length], p [length/time]: shape (3,). Returns shape (5,), angles [rad] between −π and π;
-    the node means nothing at i = 0, nor ω at e = 0.
+    the node is undefined at i = 0, and ω at e = 0.
 
     **Source** Murray & Dermott 1999, *Solar System Dynamics*, 2.8.
     """
@@ -79,8 +77,8 @@ def _outside(q, p, args):
 def oblate_kepler() -> Problem:
     """A satellite of the Earth of a = 8000 km, e = 0.1 and i = 50°, at perigee on the node.
 
-    km, s and unit mass: p is the velocity. Node and perigee move by `secular_rates`, −3.0° and
-    +2.5° a day. Start and step are ours.
+    km, s and unit mass: p is the velocity. Node and perigee precess by `secular_rates`, −3.0° and
+    +2.5° per day. Initial conditions and step are ours.
 
     **Source** Kozai 1959, *Astron. J.* 64, 367; μ, R and J2: EGM96 (Lemoine et al. 1998,
     NASA/TP-1998-206861).
@@ -88,7 +86,7 @@ def oblate_kepler() -> Problem:
     mu, a, e, i = 398600.4415, 8000.0, 0.1, np.deg2rad(50)
     speed = np.sqrt(mu / a * (1 + e) / (1 - e))
     return library_problem(
-        System(hamiltonian),
+        hamiltonian,
         Start("the satellite is one point in space", (3,), also=_outside),
         name="oblate_kepler",
         q0=np.array([a * (1 - e), 0.0, 0.0]),

@@ -24,9 +24,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ._problem import Parameter, Problem, library_problem, over_times
-from ._start import Start, finite, vector
+from ._problem import Parameter, Problem, Start, finite, library_problem, over_times, vector
 from .solar_system import installed_file
 
 REFERENCE = 51544.0
@@ -219,7 +217,7 @@ def polar_motion() -> Problem:
     fit to 1976–2008. Review: Gross 2015, *Treatise on Geophysics*, 2nd ed., 3.09.
     """
     return library_problem(
-        System(hamiltonian, force=damping, perturbation=disturbance),
+        hamiltonian,
         Start("the pole is one point, its x and its y", (1,)),
         name="polar_motion",
         q0=[0.043301],
@@ -237,6 +235,8 @@ def polar_motion() -> Problem:
                 0.001677, 0.003460, "of the mean pole (x, y) in a year [arcsec/365.25 day]"
             ),
         },
+        force=damping,
+        perturbation=disturbance,
         observables=[amplitude, free_amplitude],
         autonomous=False,
         units={"q": "arcsec", "p": "arcsec", "t": "day", "energy": "arcsec²/day"},

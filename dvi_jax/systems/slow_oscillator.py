@@ -3,10 +3,16 @@
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
 from ..discover.library import scaling
-from ._problem import Adiabatic, InSlowTime, Parameter, Problem, at_end, library_problem
-from ._start import Start, between
+from ._problem import (
+    Adiabatic,
+    Parameter,
+    Problem,
+    Start,
+    at_end,
+    between,
+    library_problem,
+)
 from .oscillator import exact as of_oscillator
 
 
@@ -29,21 +35,21 @@ def action(t0, t1, q0, p0, q1, p1, args):
 
 
 def exact(t, q0, p0, args):
-    """The state at times t at ε = 0, where ω = 1 for ever; t.shape + q0.shape."""
+    """The state at times t at ε = 0, where ω = 1."""
     return of_oscillator(t, q0, p0, args)
 
 
 def slow_oscillator() -> Problem:
-    """H = (p² + ω(εt)² q²)/2, ω = 1 + 0.3 sin εt: its energy goes with ω, E/ω wavers by O(ε).
+    """H = (p² + ω(εt)² q²)/2, ω = 1 + 0.3 sin εt: E is proportional to ω, E/ω oscillates by O(ε).
 
-    Dimensionless. A step map keeps its own action instead, which differs by O(h): see "What is
-    conserved". Start and step are ours.
+    Dimensionless. A step map conserves an action of its own, which differs by O(h): see "What is
+    conserved". Initial conditions and step are ours.
 
     **Source** Ehrenfest 1916, *Ann. Phys.* 356, 327; Arnold 1989, *Mathematical Methods of
     Classical Mechanics*, §52.
     """
     return library_problem(
-        System(hamiltonian, slow_time=True),
+        hamiltonian,
         Start("the slow oscillator has one degree of freedom", (1,)),
         name="slow_oscillator",
         q0=np.array([0.4]),
@@ -52,10 +58,10 @@ def slow_oscillator() -> Problem:
         parameters={
             "depth": Parameter(0.3, "relative change of the frequency [1]", between(-1, 1)),
         },
-        observables=[InSlowTime(energy), InSlowTime(action)],
-        autonomous=False,
+        slow_time=True,
+        observables=[action],
         source="Ehrenfest 1916, Ann. Phys. 356, 327; Arnold 1989, §52",
-        invariants=("energy", "action"),
+        invariants=("action",),
         adiabatic={"action": Adiabatic("rate of the change over the frequency", 1)},
         symmetries={"scaling": scaling()},
         exact=exact,

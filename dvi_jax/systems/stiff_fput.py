@@ -4,9 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import whole
-from .._system import System
-from ._problem import Adiabatic, Parameter, Problem, library_problem
-from ._start import Start, positive
+from ._problem import Adiabatic, Parameter, Problem, Start, library_problem, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -45,7 +43,7 @@ def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
     q0, p0 = np.zeros((2, 2, m))
     q0[:, 0], p0[:, 0] = (1.0, 1 / omega), (1.0, 1.0)
     return library_problem(
-        System(hamiltonian),
+        hamiltonian,
         Start("the stiff FPUT chain has centres and lengths of m springs", (2, None)),
         name="stiff_fput",
         q0=q0,

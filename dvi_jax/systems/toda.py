@@ -1,13 +1,11 @@
-"""The periodic Toda lattice, a chain of particles with as many integrals as it has particles."""
+"""The periodic Toda lattice, a chain of particles that is integrable."""
 
 import jax.numpy as jnp
 import numpy as np
 
 from .._checks import whole
-from .._system import System
 from ..discover.library import space_translation
-from ._problem import Problem, library_problem
-from ._start import Start
+from ._problem import Problem, Start, library_problem
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -16,7 +14,7 @@ def hamiltonian(t0, t1, q0, p1, args):
 
 
 def lax_matrix(q, p):
-    r"""Flaschka's symmetric matrix L, whose eigenvalues the flow keeps.
+    r"""Flaschka's symmetric matrix L, whose eigenvalues are conserved.
 
         L_ii = b_i,    L_{i,i+1} = L_{i+1,i} = a_i,    L_{1n} = L_{n1} = a_n
 
@@ -53,9 +51,9 @@ def lax_eigenvalues(t0, t1, q0, p0, q1, p1, args):
 
 
 def toda(n: int = 5) -> Problem:
-    """The Toda lattice of n particles at equal distances, in waves of two lengths; dimensionless.
+    """The Toda lattice of n particles at equal distances, with two waves; dimensionless.
 
-    It moves as a whole at a speed of 0.1. Start and step are ours.
+    The mean velocity is 0.1. Initial conditions and step are ours.
 
     **Raises** `ValueError` for fewer than three particles.
 
@@ -66,7 +64,7 @@ def toda(n: int = 5) -> Problem:
     angle = 2 * np.pi * np.arange(n) / n
     q0, p0 = np.zeros(n), 0.1 + np.cos(angle) + np.sin(2 * angle) / 2
     return library_problem(
-        System(hamiltonian),
+        hamiltonian,
         Start("the periodic Toda lattice needs at least three particles", (None,), least=3),
         name="toda",
         q0=q0,

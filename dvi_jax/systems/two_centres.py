@@ -1,12 +1,10 @@
-"""Euler's problem: a body attracted by two centres that stand still, in space."""
+"""Euler's problem: a body attracted by two fixed centres, in space."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
 from ..discover.library import rotation
-from ._problem import Parameter, Problem, library_problem
-from ._start import Start, finite
+from ._problem import Parameter, Problem, Start, finite, library_problem
 from .oblate_kepler import axial_angular_momentum
 
 
@@ -38,18 +36,18 @@ def euler_integral(t0, t1, q0, p0, q1, p1, args):
 
 
 def angular_momentum_squared(t0, t1, q0, p0, q1, p1, args):
-    """|q × p|² at t1, which one centre would keep and two do not."""
+    """|q × p|² at t1, conserved by one centre but not by two."""
     return jnp.sum(jnp.cross(q1, p1) ** 2)
 
 
 def two_centres() -> Problem:
-    """An orbit about both of two unequal centres; dimensionless. Start and step are ours.
+    """An orbit about two unequal centres; dimensionless. Initial conditions and step are ours.
 
     **Source** Euler 1760; Whittaker 1937, *Analytical Dynamics*, §53; Erikson & Hill 1949, *Phys.
     Rev.* 75, 29.
     """
     return library_problem(
-        System(hamiltonian),
+        hamiltonian,
         Start(
             "the problem of two centres is in space",
             (3,),

@@ -3,10 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
 from ..discover.generators import Generator
-from ._problem import Parameter, Problem, library_problem, over_times
-from ._start import Start, gyrates, vector
+from ._problem import Parameter, Problem, Start, gyrates, library_problem, over_times, vector
 
 
 def vector_potential(q, args):
@@ -32,7 +30,7 @@ def drift(args):
 
 
 def magnetic_moment(t0, t1, q0, p0, q1, p1, args):
-    """m |v⊥ − E × B/B²|²/(2B) at t1: here exactly kept."""
+    """m |v⊥ − E × B/B²|²/(2B) at t1: exactly conserved in a uniform field."""
     turning = kinetic_momentum(q1, p1, args) / args["mass"] - drift(args).astype(q1.dtype)
     return args["mass"] * jnp.sum(turning[:2] ** 2) / (2 * args["B"])
 
@@ -43,14 +41,14 @@ def kinetic_energy(t0, t1, q0, p0, q1, p1, args):
 
 
 def pseudomomentum(t0, t1, q0, p0, q1, p1, args):
-    """K = p + e B × q/2 − e E t1 at t1, shape (3,): what the magnetic translations keep."""
+    """K = p + e B × q/2 − e E t1 at t1, shape (3,), conserved by magnetic translations."""
     half = args["charge"] * args["B"] / 2
     turned = jnp.stack([-q1[1], q1[0], jnp.zeros_like(q1[2])])
     return p1 + half * turned - args["charge"] * jnp.asarray(args["E"], q1.dtype) * t1
 
 
 def _translation(axis):
-    """ξ = a, η = e B × a/2: a shift in space, and of A what it takes."""
+    """ξ = a, η = e B × a/2: a translation with the change of gauge that A needs."""
     a = np.eye(3)[axis]
 
     def push(t, q, p, args):
@@ -61,12 +59,10 @@ def _translation(axis):
 
 @over_times((3,))
 def exact(t, q0, p0, args):
-    r"""The particle at times t of one that is at (q0, p0) at t = 0, with w = v⊥ − E × B/B²:
+    r"""The state at times t, with w = v⊥ − E × B/B²:
 
         w(t) = w cos Ωt + (w × ẑ) sin Ωt,    z = z0 + v_z t + e E_z t²/(2m),    Ω = eB/m
         q⊥ = q⊥0 + (E × B/B²) t + [w sin Ωt + (w × ẑ)(1 − cos Ωt)]/Ω
-
-    - `t`: times, any shape. `q0`, `p0`: shape (3,). Returns q, p of shape t.shape + (3,).
 
     **Source** Jackson 1999, *Classical Electrodynamics*, 12.2–12.3.
     """
@@ -86,15 +82,15 @@ def exact(t, q0, p0, args):
 
 
 def uniform_field() -> Problem:
-    """A particle that gyrates about B = ẑ and drifts across it and E = 0.1 x̂; dimensionless.
+    """A particle that gyrates about B = ẑ and drifts across B and E = 0.1 x̂; dimensionless.
 
-    e = m = B = 1: gyrofrequency 1. Start and step are ours.
+    e = m = B = 1: gyrofrequency 1. Initial conditions and step are ours.
 
     **Source** Jackson 1999, *Classical Electrodynamics*, 12.2–12.3; pseudomomentum: Johnson &
     Lippmann 1949, *Phys. Rev.* 76, 828.
     """
     return library_problem(
-        System(hamiltonian),
+        hamiltonian,
         Start("the field holds one particle in space", (3,)),
         name="uniform_field",
         q0=np.array([1.0, 0.0, 0.0]),
