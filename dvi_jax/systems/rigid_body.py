@@ -5,7 +5,7 @@ r"""A free rigid body in the canonical variables of Serret and Andoyer.
 G is the magnitude of the angular momentum, K its component along the fixed z axis, L that along
 the third principal axis of the body; k is the longitude of the angular momentum, l the angle of
 rotation about the third axis. g is the angle, in the plane normal to the angular momentum, from the
-fixed xy plane to the plane of the first two principal axes. On the principal axes the angular momentum is
+fixed xy plane to the plane of the first two principal axes. The angular momentum in the body is
 
     M = (√(G² − L²) sin l, √(G² − L²) cos l, L).
 
