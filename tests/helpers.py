@@ -126,3 +126,9 @@ def measured_orders(errors, ratio, floor):
     assert keep.sum() >= 3, f"fewer than three points above round-off: {errors}"
     errors = errors[keep]
     return np.log(errors[:-1] / errors[1:]) / np.log(ratio)
+
+
+def run_problem(made, num_steps, **options):
+    """`integrate` from a `Problem` of the library; `options` take the place of its fields."""
+    own = {"q0": made.q0, "p0": made.p0, "h": made.h, "args": made.args}
+    return dvi.integrate(made.system, num_steps=num_steps, **(own | options))
