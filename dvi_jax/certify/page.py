@@ -1,4 +1,4 @@
-"""The certificate as text: tables for the terminal, a page for the documentation."""
+"""The certificate as text: tables for the terminal, a Markdown page."""
 
 import math
 import platform
@@ -29,17 +29,18 @@ def page_for(out: Path) -> Path:
     """
     out = Path(out)
     page = out if out.suffix == ".md" and not out.is_dir() else out / "certificate.md"
-    where = f"--out: {page}"
-    allowed = "allowed: a .md file that is new or a certificate, or a directory for one."
+    fault = ""
     if out.exists() and not out.is_dir() and page != out:
-        raise ValueError(f"--out: {out} is neither a directory nor a .md file\n  {allowed}")
-    if page.exists():
+        fault = f"{out} is neither a directory nor a .md file"
+    elif page.exists():
         try:
             first = page.read_text(encoding="utf-8").partition("\n")[0]
+            fault = "" if first == TITLE else f"{page} exists and is not a certificate"
         except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"{where} cannot be read: {error}\n  {allowed}") from None
-        if first != TITLE:
-            raise ValueError(f"{where} exists and is no certificate\n  {allowed}")
+            fault = f"{page} cannot be read: {error}"
+    if fault:
+        allowed = "a .md file that is new or a certificate, or a directory for one."
+        raise ValueError(f"--out: {fault}\n  allowed: {allowed}")
     return page
 
 
@@ -58,16 +59,14 @@ def tables(
 ) -> list[Table]:
     """The methods under each group of checks, then the controls."""
     made = []
-    for title, names in GROUPS.items():
-        names = [n for n in names if all(n in row for row in rows.values())]
+    for title, group in GROUPS.items():
+        names = [n for n in group if all(n in row for row in rows.values())]
+        columns = {"method": list(rows)}
+        if "order" in names:
+            columns["promises"] = [promises(methods[name]) for name in rows]
+        columns |= {n: [cell(n, row[n]) for row in rows.values()] for n in names}
         if names:
-            body = [
-                [name, *([promises(methods[name])] if "order" in names else [])]
-                + [cell(n, row[n]) for n in names]
-                for name, row in rows.items()
-            ]
-            promised = ["promises"] if "order" in names else []
-            made.append(Table(title, ["method", *promised, *names], body))
+            made.append(Table(title, list(columns), list(zip(*columns.values(), strict=True))))
     if controls:
         caught = {True: "caught", False: "MISSED"}
         body = [
@@ -156,9 +155,7 @@ def markdown(
 
 
 def _as_markdown(table: Table) -> str:
-    def line(cells: Sequence[str]) -> str:
-        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
+    rows = [table.columns, ["---"] * len(table.columns), *table.rows]
     return "\n".join(
-        [line(table.columns), line(["---"] * len(table.columns)), *map(line, table.rows)]
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows
     )
