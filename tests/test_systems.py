@@ -31,6 +31,10 @@ slow = pytest.mark.slow
 END = dvi.Save(final=True)
 
 
+def start_of(made):
+    return jnp.asarray(made.q0, float), jnp.asarray(made.p0, float)
+
+
 def drifts(made, method, h, num_steps):
     """Name → largest change over the steps."""
     observe = {name: dvi.MaxDrift(f) for name, f in made.observables.items()}
@@ -124,15 +128,6 @@ def test_henon_heiles_starts_below_the_energy_of_escape():
         assert float(H(saddle, rest)) == pytest.approx(ESCAPE_ENERGY, abs=1e-15)
 
 
-@slow
-def test_the_energy_of_henon_heiles_is_bounded():
-    made = problem("henon_heiles")
-    short, long = (float(drifts(made, dvi.Strang(), 0.1, n)["energy"]) for n in (2000, 50_000))
-    assert short <= long < 1.05 * short < 3e-4
-    lost = [float(drifts(made, dvi.RungeKutta4(), 0.3, n)["energy"]) for n in (2000, 8000)]
-    assert lost[1] > 3 * lost[0]
-
-
 @pytest.mark.parametrize("n", [3, pytest.param(5, marks=slow)])
 def test_lax_traces_are_in_involution(n):
     """Poisson brackets of all pairs at a random state; with another function they are not zero."""
@@ -216,19 +211,15 @@ def test_energy_comes_back_to_the_first_mode():
 
 
 @slow
-def test_stiff_springs_exchange_their_energy_and_conserve_the_sum():
-    """I = Σ I_i oscillates by O(1/ω) over a time in which the I_i are exchanged."""
-    ranges, single = [], []
-    for omega in (50.0, 100.0):
-        made = systems.stiff_fput(omega=omega)
-        options = {"method": dvi.Strang(), "save": dvi.Save(every=25), "observe": made.observables}
-        seen = run_problem(made, 100_000, h=0.1 / omega, **options).observed
-        ranges.append(np.ptp(seen["oscillatory_energy"]))
-        single.append(np.asarray(seen["stiff_energies"]))
-    assert ranges[0] < 0.15
-    assert 0.4 < ranges[1] / ranges[0] < 0.6
-    assert single[0][:, 0].min() < 0.02  # all of it leaves the first spring
-    assert single[0][:, 2].max() > 0.95  # and arrives at the third
+def test_stiff_springs_exchange_their_energy():
+    """While their sum oscillates by O(1/ω): see the adiabatic invariants below."""
+    made = problem("stiff_fput")
+    options = {"method": dvi.Strang(), "save": dvi.Save(every=25), "observe": made.observables}
+    seen = run_problem(made, 100_000, h=0.002, **options).observed
+    single = np.asarray(seen["stiff_energies"])
+    assert np.ptp(seen["oscillatory_energy"]) < 0.15
+    assert single[:, 0].min() < 0.02  # all of it leaves the first spring
+    assert single[:, 2].max() > 0.95  # and arrives at the third
 
 
 @pytest.mark.parametrize(("mode", "growth"), [(0, np.sqrt(0.28)), (3, 0.0)])
@@ -469,28 +460,6 @@ def test_the_field_is_the_curl_of_the_potential_and_has_no_sources():
     assert abs(np.trace(np.asarray(jax.jacfwd(magnetic_field)(q, args)))) < 1e-15
 
 
-@slow
-def test_the_particle_bounces_and_its_moment_is_bounded():
-    """It turns where |B| is E/μ; μ oscillates by O(gyroradius/ℓ) and does not drift."""
-    made, amplitudes = problem("magnetic_mirror"), []
-    options = {"method": dvi.GaussLegendre(2), "observe": made.observables}
-    for length in (20.0, 40.0):
-        args = made.args | {"length": length}
-        sol = run_problem(made, 40_000, h=0.1, args=args, save=dvi.Save(every=5), **options)
-        z, mu = np.asarray(sol.qs)[:, 2], np.asarray(sol.observed["magnetic_moment"])
-        assert np.sum(np.diff(z > 0)) > 20  # bounces
-        assert abs(z.max() / (0.8 * length) - 1) < 0.02
-        assert abs(z.min() / z.max() + 1) < 1e-3
-        quarters = np.array_split(mu, 4)
-        ranges, means = np.ptp(quarters, axis=1), np.mean(quarters, axis=1)
-        assert ranges.max() < 1.03 * ranges.min()
-        assert np.ptp(means) < 1e-4 * mu.mean()
-        assert np.ptp(sol.observed["energy"]) < 1e-5
-        amplitudes.append(np.ptp(mu) / mu.mean())
-    assert 0.005 < amplitudes[0] < 0.02
-    assert amplitudes[1] < 0.6 * amplitudes[0]
-
-
 @pytest.mark.parametrize("method", [dvi.TypeII(), dvi.Strang(), dvi.GaussLegendre(3)])
 @slow
 def test_variational_maps_conserve_canonical_angular_momentum(method):
@@ -637,5 +606,11 @@ def test_the_bounce_action_is_the_integral_over_a_bounce(made, time):
     rate, z = np.asarray(jax.jit(jax.vmap(along))(sol.qs, sol.ps)), np.asarray(sol.qs)[:, 2]
     up = np.flatnonzero((z[:-1] <= 0) & (z[1:] > 0))
     assert len(up) >= 2
+    strength = jnp.linalg.norm(module.magnetic_field(sol.qs[z.argmax()], made.args))
+    energy, moment = (
+        made.observables[name](0, 0, *start_of(made), *start_of(made), made.args)
+        for name in ("energy", "corrected_moment")
+    )
+    assert float(strength * moment / energy) == pytest.approx(1, rel=0.03)  # the mirror point
     added, formula = np.sum(rate[up[0] : up[1]]) * 0.05, np.mean(sol.observed)
     assert abs(added / formula - 1) < 5e-3  # a third less, as for 2/3 of it, would be seen

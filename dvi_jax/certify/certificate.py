@@ -50,7 +50,7 @@ class Certificate:
         good = len(self.rows) - len({method for method, _, _ in self.failures})
         caught = len(self.controls) - len(self.missed)
         return (
-            f"methods: {good} of {len(self.rows)} keep what they promise\n"
+            f"methods: {good} of {len(self.rows)} have the properties that they claim\n"
             f"controls: {caught} of {len(self.controls)} caught"
         )
 
