@@ -29,12 +29,17 @@ from dvi_jax.systems.solar_system import EphemerisMissing
 from dvi_jax.systems.van_der_pol import amplitude
 
 NAMES = list(systems.LIBRARY)
-QUICK = ("duffing", "kepler")
+QUICK = {"duffing", "kepler"}
 """Those whose runs by `integrate` are in every run of the tests; the rest are marked slow."""
-FEW = [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in NAMES]
-ALIKE = ("figure_eight", "solar_system", "perturbed_pendulum", "lorentz_pendulum", "van_der_pol")
-"""Those that go by the functions of another system."""
-MOST = [pytest.param(n, marks=pytest.mark.slow) if n in ALIKE else n for n in NAMES]
+ALIKE = {"figure_eight", "solar_system", "perturbed_pendulum", "lorentz_pendulum", "van_der_pol"}
+"""Those with functions of another system."""
+MOST = set(NAMES) - ALIKE
+slow = pytest.mark.slow
+
+
+def listed(names, quick):
+    """Parameters of a test: names, marked slow if they are not quick."""
+    return [pytest.param(name, marks=() if name in quick else slow) for name in names]
 
 
 @functools.cache
@@ -87,8 +92,7 @@ def nearby(name, seed):
 
 
 def test_every_system_has_a_derivation():
-    missing = sorted(set(NAMES) ^ set(DERIVATIONS))
-    assert not missing, f"systems.LIBRARY and tests/derivations.py do not agree on {missing}"
+    assert set(NAMES) == set(DERIVATIONS)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -134,19 +138,14 @@ def flow(name):
     return times, run.y.T.reshape(-1, 2, *q0.shape)
 
 
-def observables(name):
-    """Those of the problem, told ε = 0 if they are in slow time."""
+@functools.cache
+def watched(name):
+    """Observables (at ε = 0) along states, which are sheared by a little for a control."""
     made = problem(name)
-    return {
+    known = {
         key: f.bind(made.system, 0.0) if isinstance(f, systems.InSlowTime) else f
         for key, f in made.observables.items()
     }
-
-
-@functools.cache
-def watched(name):
-    """Observables along states, of the states as they are and sheared by a little (control)."""
-    made, known = problem(name), observables(name)
 
     @jax.jit
     def along(ts, states, shear):
@@ -165,7 +164,7 @@ def watched(name):
     return along
 
 
-@pytest.mark.parametrize("name", MOST)
+@pytest.mark.parametrize("name", listed(NAMES, MOST))
 def test_declared_invariants_are_all_that_the_flow_conserves(name):
     """They are constant, and not along sheared states; other observables, if not adiabatic, change.
 
@@ -199,13 +198,8 @@ CONSTANT_BETWEEN = {("relativistic_kepler", "perihelion_angle")}
 EXACT = [n for n in NAMES if n != "solar_system" and problem(n).exact is not None]
 
 
-def only_exact(names):
-    """Of the names, marked slow or not, those of systems with an exact solution."""
-    return [n for n in names if (n if isinstance(n, str) else n.values[0]) in EXACT]
-
-
-@pytest.mark.parametrize("name", only_exact(MOST))
-@pytest.mark.slow
+@pytest.mark.parametrize("name", EXACT)
+@slow
 def test_exact_solutions_are_those_of_the_flow(name):
     made = problem(name)
     ts, states = flow(name)
@@ -248,8 +242,8 @@ STRETCH = {"rigid_body": 8.0, "solar_system": 32.0, "polar_motion": 30.0}
 """Steps that are large enough for an error to be seen, in default steps; 2 elsewhere."""
 
 
-@pytest.mark.parametrize("name", FEW)
-@pytest.mark.slow
+@pytest.mark.parametrize("name", listed(NAMES, QUICK))
+@slow
 def test_invariants_of_a_run_converge_with_its_order(name):
     """Drifts of declared invariants fall as h⁴ until they are round-off."""
     made = problem(name)
@@ -268,7 +262,7 @@ def energy_size(name):
     return float(np.max(np.abs(p)) * max(np.max(np.abs(q)), 1.0))
 
 
-@pytest.mark.parametrize("name", only_exact(FEW))
+@pytest.mark.parametrize("name", listed(EXACT, QUICK))
 def test_runs_converge_to_the_exact_solution(name):
     made = problem(name)
     ts, *runs = two_runs(name)
@@ -334,9 +328,7 @@ SYMMETRIC = [
 ]
 
 
-@pytest.mark.parametrize(
-    "name", [n for n in MOST if (n if isinstance(n, str) else n.values[0]) in SYMMETRIC]
-)
+@pytest.mark.parametrize("name", listed(SYMMETRIC, MOST))
 def test_declared_symmetries_solve_the_determining_equations(name):
     made, of = problem(name), residuals(name)
     t, q, p, _ = nearby(name, 5)
@@ -364,7 +356,7 @@ def test_a_system_without_a_declared_symmetry_has_a_reason():
 # 4. Defaults
 
 
-@pytest.mark.parametrize("name", FEW)
+@pytest.mark.parametrize("name", listed(NAMES, QUICK))
 def test_defaults_run_and_their_energy_is_bounded(name):
     """The paper's map, 1000 steps of the default size: the energy wavers and does not run away."""
     made = problem(name)
@@ -554,7 +546,7 @@ def test_an_observable_in_slow_time_asks_for_epsilon():
     assert float(action.bind(None, 0.5)(*at)) == pytest.approx((1 + w**2) / 2 / w, rel=1e-14)
 
 
-@pytest.mark.slow
+@slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_run_file_names_it(name, tmp_path):
     made = problem(name)
@@ -569,7 +561,7 @@ def test_a_run_file_names_it(name, tmp_path):
 # Elliptic functions, and exact solutions in every regime
 
 
-@pytest.mark.slow
+@slow
 def test_elliptic_integrals_and_functions_are_those_of_scipy():
     rng = np.random.default_rng(0)
     m = np.r_[0.0, rng.uniform(0, 1, 60), 1 - 1e-6]
@@ -583,7 +575,7 @@ def test_elliptic_integrals_and_functions_are_those_of_scipy():
     np.testing.assert_allclose(swing(1e-12) / 1e-12, np.pi / 4, rtol=1e-12)
 
 
-@pytest.mark.slow
+@slow
 def test_integrals_of_the_third_kind_are_those_of_scipy():
     """Of either sign of n, to 1 − n = 1e-12 and n = −1e8; beside another n."""
     rng = np.random.default_rng(1)
@@ -644,10 +636,7 @@ REGIMES = {  # all q0, all p0
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["pendulum", "duffing", *(pytest.param(n, marks=pytest.mark.slow) for n in list(REGIMES)[2:])],
-)
+@pytest.mark.parametrize("name", listed(REGIMES, {"pendulum", "duffing"}))
 def test_exact_solutions_solve_the_equations_in_every_regime(name):
     """They have the initial conditions, and the derivative in time of the equations."""
     made, rates = problem(name), functions(name)
@@ -701,7 +690,7 @@ LONG = [  # name, q0, p0, time, largest difference from DOP853, whose own error 
 
 
 @pytest.mark.parametrize(("name", "q0", "p0", "time", "most"), LONG)
-@pytest.mark.slow
+@slow
 def test_exact_solutions_hold_at_long_times_and_near_singularities(name, q0, p0, time, most):
     """A quadrature with few nodes for the whole time would lose φ, ψ and g."""
     made, rates, ts = problem(name), functions(name), time * np.array([0.11, 0.5, 1.0])
@@ -718,7 +707,7 @@ def test_exact_solutions_hold_at_long_times_and_near_singularities(name, q0, p0,
     assert off < most < 0.1 * late
 
 
-@pytest.mark.slow
+@slow
 def test_duffing_swings_harmonically_at_the_bottom_of_a_well():
     """q = −1 − δ cos √2 t + O(δ²) from a distance δ, and rest at the bottom itself."""
     made, ts = problem("duffing"), np.array([0.0, 1.0, 2.0, 5.0])
@@ -730,7 +719,7 @@ def test_duffing_swings_harmonically_at_the_bottom_of_a_well():
     assert np.max(np.abs(p[:, 0] - 1e-9 * np.sin(ts))) > 1e-10  # another frequency
 
 
-@pytest.mark.slow
+@slow
 def test_the_pendulum_carries_gradients_at_rest():
     """Those of the linear oscillator. So do action, integrals and Van der Pol's amplitude."""
     at_rest, made, t = jnp.zeros(1), problem("pendulum"), 1.7
@@ -751,7 +740,7 @@ def test_the_pendulum_carries_gradients_at_rest():
     assert float(of_amplitude(jnp.ones(1), 2 * jnp.ones(1))[0]) == pytest.approx(5**-0.5)
 
 
-@pytest.mark.slow
+@slow
 def test_kepler_carries_gradients_on_a_circle():
     """Beside central differences of the fourth order; and it is symplectic."""
     made, circle = problem("kepler"), jnp.array([1.0, 0.0, 0.0, 1.0])

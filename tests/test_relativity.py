@@ -146,7 +146,7 @@ def per_turn(qs, vs, turn):
     passage = CubicSpline(np.arange(len(r)), np.sum(r * v, axis=1))
     at = passage.roots(extrapolate=False)
     at = at[passage(at, 1) > 0]
-    node, peri = np.asarray(jax.vmap(elements, (0, 0, None))(r, v, 1.0)).T[3:]
+    node, peri = elements(r, v, 1.0, np).T[3:]
     angles = CubicSpline(np.arange(len(r)), np.unwrap([node, peri]), axis=1)(at)
     return (angles[:, -1] - angles[:, 0]) / (len(at) - 1)
 

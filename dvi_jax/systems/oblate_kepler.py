@@ -1,5 +1,7 @@
 """A satellite of an oblate planet: the Kepler problem in space with J2."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -28,25 +30,29 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     return jnp.cross(q1, p1)
 
 
-def elements(q, p, mu):
+def elements(q, p, mu, xp: Any = jnp):
     r"""Osculating semi-major axis, eccentricity, inclination, node and argument of perigee.
 
         L = q × p,    e = p × L/μ − q/r,    cos i = L_z/|L|,    Ω = atan2(L_x, −L_y),
         ω = angle from the node (cos Ω, sin Ω, 0) to e about L
 
-    q [length], p [length/time]: shape (3,). Returns shape (5,), angles [rad] between −π and π;
-    the node is undefined at i = 0, and ω at e = 0.
+    q [length], p [length/time]: shape (…, 3). Returns shape (…, 5), angles [rad] between −π and π;
+    the node is undefined at i = 0, and ω at e = 0. `xp`: the array module, jnp or np.
 
     **Source** Murray & Dermott 1999, *Solar System Dynamics*, 2.8.
     """
-    r, L = jnp.sqrt(jnp.sum(q**2)), jnp.cross(q, p)
-    size = jnp.sqrt(jnp.sum(L**2))
-    e = jnp.cross(p, L) / mu - q / r
-    a = 1 / (2 / r - jnp.sum(p**2) / mu)
-    node = jnp.arctan2(L[0], -L[1])
-    to_node = jnp.stack([jnp.cos(node), jnp.sin(node), jnp.zeros_like(node)])
-    perigee = jnp.arctan2(jnp.sum(jnp.cross(to_node, e) * L) / size, jnp.sum(to_node * e))
-    return jnp.stack([a, jnp.sqrt(jnp.sum(e**2)), jnp.arccos(L[2] / size), node, perigee])
+
+    def length(x):
+        return xp.sqrt(xp.sum(x**2, axis=-1))
+
+    L = xp.cross(q, p)
+    e = xp.cross(p, L) / mu - q / length(q)[..., None]
+    a = 1 / (2 / length(q) - xp.sum(p**2, axis=-1) / mu)
+    node = xp.arctan2(L[..., 0], -L[..., 1])
+    to_node = xp.stack([xp.cos(node), xp.sin(node), xp.zeros_like(node)], axis=-1)
+    across = xp.sum(xp.cross(to_node, e) * L, axis=-1) / length(L)
+    perigee = xp.arctan2(across, xp.sum(to_node * e, axis=-1))
+    return xp.stack([a, length(e), xp.arccos(L[..., 2] / length(L)), node, perigee], axis=-1)
 
 
 def osculating_elements(t0, t1, q0, p0, q1, p1, args):

@@ -16,6 +16,7 @@ import numpy as np
 from .._checks import finite
 from ._problem import Problem
 from .n_body import check_bodies, n_body
+from .oblate_kepler import elements
 
 _BODIES = {
     "Sun": (10, 2.959122082855911e-4),
@@ -138,27 +139,15 @@ def to_ecliptic(vectors: Any) -> np.ndarray:
 
 
 def perihelion_longitude(q: Any, v: Any, mu: float) -> np.ndarray:
-    r"""Longitude of perihelion of the osculating orbit, ϖ = Ω + ω [rad].
-
-        L = q × v,    e = v × L / mu − q / |q|,    Ω = atan2(L_x, −L_y),
-        ω = angle from the node (cos Ω, sin Ω, 0) to e about L
+    """Longitude of perihelion of the osculating orbit, ϖ = Ω + ω of `oblate_kepler.elements` [rad].
 
     - `q`, `v`: heliocentric position [au] and velocity [au/day] on ecliptic axes, shape
       (times, 3). `mu`: GM of the Sun plus that of the planet [au³/day²].
 
     Returns shape (times,), continuous in time (unwrapped).
-
-    **Source** Murray & Dermott 1999, *Solar System Dynamics*, 2.8; e is the
-    Laplace–Runge–Lenz vector over mu.
     """
-    q, v = np.asarray(q, float), np.asarray(v, float)
-    L = np.cross(q, v)
-    e = np.cross(v, L) / mu - q / np.linalg.norm(q, axis=-1, keepdims=True)
-    node = np.arctan2(L[..., 0], -L[..., 1])
-    to_node = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=-1)
-    normal = L / np.linalg.norm(L, axis=-1, keepdims=True)
-    across = np.sum(np.cross(to_node, e) * normal, axis=-1)
-    return np.unwrap(node + np.arctan2(across, np.sum(to_node * e, axis=-1)))
+    of = elements(np.asarray(q, float), np.asarray(v, float), mu, np)
+    return np.unwrap(of[..., 3] + of[..., 4])
 
 
 def check_start(q0: Any, p0: Any, args: Any) -> None:
