@@ -111,7 +111,7 @@ def adiabatic_34(m: Measurements, figure: Any, axes: Any) -> None:
 @_figure(
     "fig4",
     "Phase diagrams, coloured by time. The + is the centre of attraction.",
-    "Figure 4   Undisturbed Kepler orbit, h = 0.1, 100 000 steps",
+    "Figure 4   Unperturbed Kepler orbit, h = 0.1, 100 000 steps",
     (9.6, 4.9),
     sharey=True,
 )
@@ -253,7 +253,7 @@ def sweep_34(m: Measurements, figure: Any, axes: Any) -> None:
         look = _look(i) | {"marker": MARKERS[i]}
         axes.loglog(x, y, **look, label=f"{label}:  exponent {slope(x, y):.2f}")
     axes.legend(loc="upper left")
-    axes.set(xlabel="strength of the disturbance ε", ylim=(1e-15, 1e6))
+    axes.set(xlabel="strength of the perturbation ε", ylim=(1e-15, 1e6))
     axes.set_ylabel("range over the run, relative")
 
 
@@ -282,7 +282,7 @@ def sweep_50(m: Measurements, figure: Any, axes: Any) -> None:
     text = "error of the order-4 method: the drift of\n(1+ε)L − H − ε|q|²/2 for every ε"
     look = {"ha": "right", "va": "top", "fontsize": 8.5, "color": GREY}
     left.text(0.1, small.literal[0] / 1.4, text, **look)
-    left.set(title="(50) against ε", xlabel="strength of the disturbance ε", ylim=(1e-10, 300))
+    left.set(title="(50) against ε", xlabel="strength of the perturbation ε", ylim=(1e-10, 300))
     left.set_ylabel("range (fixed mesh), drift (h → 0)")
     left.legend(fontsize=8.5, ncols=2, loc="upper center", columnspacing=1)
     for i, epsilon in enumerate(sweep.epsilons):

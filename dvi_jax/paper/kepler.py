@@ -87,7 +87,7 @@ class SmallStepSweep:
 
 @dataclass(frozen=True)
 class LongRun:
-    """10⁵ steps of one method at the paper's h = 0.1, undisturbed.
+    """10⁵ steps of one method at the paper's h = 0.1, ε = 0.
 
     `qs` (N, 2); `energy_errors` (N,) relative; `momentum_errors` (N,) absolute;
     `apocentre_radii` (R,): where the orbit crosses the direction in which the exact orbit has

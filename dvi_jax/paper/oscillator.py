@@ -72,7 +72,7 @@ class Crossover:
 class SmallStep:
     """(34) as h → 0: order-4 composition, h = 0.01, t = 200.
 
-    `epsilons` (E,); ranges (E,) relative to the undisturbed energy of the start, of (34) as
+    `epsilons` (E,); ranges (E,) relative to the initial energy at ε = 0, of (34) as
     printed and of (p² + (1+ε)q²)/2.
     """
 

@@ -1,4 +1,4 @@
-"""What a reproduction leaves on disk: verdicts as JSON, Markdown and HTML, and tables as CSV."""
+"""Files of a reproduction: verdicts as JSON, Markdown and HTML, and tables as CSV."""
 
 import base64
 import csv
