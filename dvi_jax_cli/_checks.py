@@ -58,11 +58,11 @@ def certify(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="One method of each kind only.")] = False,
 ) -> None:
-    """Measure what the methods promise: order, structure, long runs, gradients, compilation.
+    """Measure what the methods claim: order, structure, long runs, gradients, compilation.
 
-    Each check is also shown to catch a method that is broken on purpose (the controls).
+    Each check is also shown to find the defect of a broken method (the controls).
 
-    Exit code 0: all promises kept, all controls caught. 1: not so. 2: bad input.
+    Exit code 0: all claims hold, all controls are caught. 1: otherwise. 2: bad input.
 
     Examples
         dvi-jax certify --quick

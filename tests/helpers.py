@@ -4,10 +4,12 @@ All methods are in `dvi_jax.testing.METHODS`: being listed there, a new one is c
 """
 
 import functools
+from importlib.util import find_spec
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import dvi_jax as dvi
 from dvi_jax import systems, testing
@@ -126,3 +128,15 @@ def measured_orders(errors, ratio, floor):
     assert keep.sum() >= 3, f"fewer than three points above round-off: {errors}"
     errors = errors[keep]
     return np.log(errors[:-1] / errors[1:]) / np.log(ratio)
+
+
+def run_problem(made, num_steps, **options):
+    """`integrate` from a `Problem` of the library; `options` take the place of its fields."""
+    own = {"q0": made.q0, "p0": made.p0, "h": made.h, "args": made.args}
+    return dvi.integrate(made.system, num_steps=num_steps, **(own | options))
+
+
+needs_ephemeris = pytest.mark.skipif(
+    find_spec("jplephem") is None or find_spec("skyfield_data") is None,
+    reason="the ephemeris is not installed",
+)

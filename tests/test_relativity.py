@@ -1,17 +1,19 @@
 """Relativity and the oblate Sun: equations by hand, and the orbits they turn."""
 
+import dataclasses
 import functools
-import importlib.util
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import needs_ephemeris, run_problem
 from scipy.interpolate import CubicSpline
 
 import dvi_jax as dvi
 from dvi_jax.systems import solar_system
 from dvi_jax.systems.n_body import hamiltonian
+from dvi_jax.systems.oblate_kepler import elements
 from dvi_jax.systems.relativity import (
     SPEED_OF_LIGHT,
     SUN_J2,
@@ -27,7 +29,7 @@ from dvi_jax.systems.relativity import (
 from dvi_jax.systems.solar_system import BODIES, GM, to_ecliptic
 from dvi_jax_cli.work.solar import compare
 
-LIGHT = 1e-12  # mass of a planet here: what goes with m/M is then below what is measured
+LIGHT = 1e-12  # mass of a planet here: effects of order m/M are then below the tolerances
 TURN = 2 * np.pi
 
 
@@ -58,25 +60,21 @@ V = np.array([[0.05, 0.02, -0.03], [-0.4, 0.9, 0.2], [-0.6, -0.3, 0.25]])
 
 def acceleration(q, v, c2, quadratic=4.0):
     """a(r, v) of relativity about body 0, by hand, shape (bodies − 1, 3)."""
-    mu, out = G * MASSES[0], []
-    for i in (1, 2):
-        r, u = q[i] - q[0], v[i] - v[0]
-        d = np.linalg.norm(r)
-        out.append(mu / (c2 * d**3) * ((quadratic * mu / d - u @ u) * r + 4 * np.dot(r, u) * u))
-    return np.array(out)
+    mu, r, u = G * MASSES[0], q[1:] - q[0], v[1:] - v[0]
+    d = np.linalg.norm(r, axis=1, keepdims=True)
+    uu, ru = (np.sum(x * u, axis=1, keepdims=True) for x in (u, r))
+    return mu / (c2 * d**3) * ((quadratic * mu / d - uu) * r + 4 * ru * u)
 
 
 def test_force_is_mass_times_acceleration():
-    args = {"masses": MASSES, "G": G, "c": 7.0}
-    force = post_newtonian_force(0.0, 0.0, jnp.asarray(Q), MASSES[:, None] * V, args)
+    args = {"masses": MASSES, "G": G}
+    at = (0.0, 0.0, jnp.asarray(Q), MASSES[:, None] * V)
+    force = post_newtonian_force(*at, args | {"c": 7.0})
     np.testing.assert_array_equal(force[0], 0)
-    by_hand = MASSES[1:, None] * acceleration(Q, V, 49.0)
+    by_hand, wrong = (MASSES[1:, None] * acceleration(Q, V, 49.0, x) for x in (4.0, 3.0))
     np.testing.assert_allclose(force[1:], by_hand, rtol=1e-13)
-    wrong = MASSES[1:, None] * acceleration(Q, V, 49.0, quadratic=3.0)
     assert not np.allclose(force[1:], wrong, rtol=1e-2, atol=0)
-    default = post_newtonian_force(
-        0.0, 0.0, jnp.asarray(Q), MASSES[:, None] * V, {"masses": MASSES, "G": G}
-    )
+    default = post_newtonian_force(*at, args)
     np.testing.assert_allclose(default * SPEED_OF_LIGHT**2, force * 49.0, rtol=1e-13)
 
 
@@ -106,13 +104,8 @@ def test_hamiltonian_accelerates_as_the_force_does():
         rate, second = map(np.asarray, of_hamilton(q, momenta_from_velocities(Q, V, args), args))
         naive = np.asarray(of_hamilton(q, MASSES[:, None] * V, args)[0])
         felt = second[1:] - second[0] - newton
-        off = (
-            rate - V,
-            felt - acceleration(Q, V, c2),
-            naive - V,
-            felt - acceleration(Q, V, c2, quadratic=3.0),
-        )
-        left.append([np.abs(x).max() for x in off])
+        right, wrong = (felt - acceleration(Q, V, c2, x) for x in (4.0, 3.0))
+        left.append([np.abs(x).max() for x in (rate - V, right, naive - V, wrong)])
     orders = np.log2(np.divide(left[:-1], left[1:]))
     np.testing.assert_allclose(orders, [[2, 2, 1, 1]] * 2, atol=0.1)
 
@@ -144,26 +137,17 @@ def start(e, inclination, node, turn):
 
 
 def per_turn(qs, vs, turn):
-    """How far node and argument of pericentre go from one pericentre to the next [rad].
+    """Advance of node and argument of pericentre per revolution [rad].
 
     The elements of the osculating orbits at the first and the last pericentre, r·v = 0, where the
-    vector of Laplace and r point the same way whatever disturbs; splines through the steps.
+    Laplace vector and r are parallel for every perturbation; splines through the steps.
     """
-    r, v = (np.asarray(x)[:, 1] - np.asarray(x)[:, 0] for x in (qs, vs))
-    r, v = r @ turn, v @ turn
-    rv = np.sum(r * v, axis=1)
-    step = np.arange(len(rv))
-    passage = CubicSpline(step, rv)
+    r, v = ((np.asarray(x)[:, 1] - np.asarray(x)[:, 0]) @ turn for x in (qs, vs))
+    passage = CubicSpline(np.arange(len(r)), np.sum(r * v, axis=1))
     at = passage.roots(extrapolate=False)
     at = at[passage(at, 1) > 0]
-    L = np.cross(r, v)
-    ecc = np.cross(v, L) - r / np.linalg.norm(r, axis=1, keepdims=True)
-    node = np.arctan2(L[:, 0], -L[:, 1])
-    to_node = np.stack([np.cos(node), np.sin(node), 0 * node], axis=1)
-    normal = L / np.linalg.norm(L, axis=1, keepdims=True)
-    across = np.sum(np.cross(to_node, ecc) * normal, axis=1)
-    peri = np.arctan2(across, np.sum(to_node * ecc, axis=1))
-    angles = CubicSpline(step, np.unwrap([node, peri]), axis=1)(at)
+    node, peri = elements(r, v, 1.0, np).T[3:]
+    angles = CubicSpline(np.arange(len(r)), np.unwrap([node, peri]), axis=1)(at)
     return (angles[:, -1] - angles[:, 0]) / (len(at) - 1)
 
 
@@ -189,19 +173,13 @@ def relativistic(form):
     ]
     p0 = ([m * v0] * 3 if form == "force" else own) + [m * v0] * 3
 
+    options = {"h": TURN / 120, "num_steps": 605, "method": dvi.GaussLegendre(3)}
+    options |= {"args": {"masses": MERCURY_LIKE, "c": 100.0}}
+
     @jax.jit
     @jax.vmap
     def run(epsilon, p0):
-        sol = dvi.integrate(
-            system,
-            q0,
-            p0,
-            h=TURN / 120,
-            num_steps=605,
-            epsilon=epsilon,
-            args={"masses": MERCURY_LIKE, "c": 100.0},
-            method=dvi.GaussLegendre(3),
-        )
+        sol = dvi.integrate(system, q0, p0, epsilon=epsilon, **options)
         return sol.qs, sol.ps / m[None]
 
     return [np.asarray(x) for x in run(jnp.array(STRENGTHS * 2), jnp.stack(p0))]
@@ -215,7 +193,7 @@ def test_perihelion_advances_as_einstein_says(form):
     expected = 6 * np.pi * 1e-4 / (1 - ECCENTRICITY**2)
     once, half, none = turned[:, 1]
     assert once == pytest.approx(expected, rel=2e-3)
-    # What is left, some 4e-4, is the next order in 1/c²; extrapolation takes it away.
+    # The residual, some 4e-4, is the next order in 1/c²; extrapolation removes it.
     assert 4 * half - once == pytest.approx(expected, rel=2e-6)
     assert np.abs(turned[:, 0]).max() < 1e-11  # the plane stays
     assert abs(none) < 6e-10  # negative control: Newton; 4e-10 is the method's, of order h⁶
@@ -237,6 +215,7 @@ def test_both_forms_are_one_orbit():
 
 # The oblate Sun
 
+OBLATE = dvi.System(hamiltonian_with_oblateness)
 POLE = np.array([0.3, -0.5, 0.8])
 J2_R2 = 1e-4
 
@@ -251,25 +230,22 @@ def axes(pole):
 
 def test_oblateness_is_minus_gm_j2_p2():
     args = {"masses": MASSES, "G": G, "J2": 0.02, "R": 0.4, "pole": 5 * POLE}
-    by_hand = 0.0
-    for i in (1, 2):
-        r = Q[i] - Q[0]
-        d = np.linalg.norm(r)
-        s = r @ POLE / (d * np.linalg.norm(POLE))
-        by_hand += G * MASSES[0] * MASSES[i] / d * 0.02 * (0.4 / d) ** 2 * (3 * s**2 - 1) / 2
+    r = Q[1:] - Q[0]
+    d = np.linalg.norm(r, axis=1)
+    s = r @ POLE / (d * np.linalg.norm(POLE))
+    by_hand = G * MASSES[0] * np.sum(MASSES[1:] / d * 0.02 * (0.4 / d) ** 2 * (3 * s**2 - 1) / 2)
     assert float(oblateness(jnp.asarray(Q), args)) == pytest.approx(by_hand, rel=1e-14)
     # A ring of matter about the equator, by summation: it attracts more in its plane.
     angle, side = TURN * np.arange(400) / 400, axes(POLE)
     ring = 0.01 * (np.cos(angle)[:, None] * side[:, 0] + np.sin(angle)[:, None] * side[:, 1])
-    far = np.stack([np.zeros(3), 0.6 * side[:, 0] + 0.9 * side[:, 2]])
-    for where in (far, np.stack([np.zeros(3), side[:, 1]]), np.stack([np.zeros(3), side[:, 2]])):
-        whole = -np.mean(1 / np.linalg.norm(where[1] - ring, axis=1))
-        beyond = whole + 1 / np.linalg.norm(where[1])
+    for where in (0.6 * side[:, 0] + 0.9 * side[:, 2], side[:, 1], side[:, 2]):
+        beyond = 1 / np.linalg.norm(where) - np.mean(1 / np.linalg.norm(where - ring, axis=1))
         # A ring of radius s has J2 R² = s²/2.
         mine = {"masses": np.ones(2), "J2": 0.5, "R": 0.01, "pole": POLE}
-        assert float(oblateness(jnp.asarray(where), mine)) == pytest.approx(beyond, rel=1e-3)
+        q = jnp.asarray(np.stack([np.zeros(3), where]))
+        assert float(oblateness(q, mine)) == pytest.approx(beyond, rel=1e-3)
         mine["pole"] = np.sum(side, axis=1)
-        assert float(oblateness(jnp.asarray(where), mine)) != pytest.approx(beyond, rel=0.1)
+        assert float(oblateness(q, mine)) != pytest.approx(beyond, rel=0.1)
 
 
 def test_defaults_are_the_suns_and_no_j2_is_newton():
@@ -290,24 +266,18 @@ def oblate(inclination):
     turn = axes(POLE)
     q0, v0 = start(ECCENTRICITY, inclination, 0.7, turn)
     m = jnp.asarray(MERCURY_LIKE[:, None])
+    options = {"h": TURN / 200, "num_steps": 2020, "method": dvi.KahanLi(8)}
 
     def run(j2):
-        sol = dvi.integrate(
-            dvi.System(hamiltonian_with_oblateness),
-            q0,
-            m * v0,
-            h=TURN / 200,
-            num_steps=2020,
-            args={"masses": MERCURY_LIKE, "J2": j2, "R": 0.1, "pole": POLE},
-            method=dvi.KahanLi(8),
-        )
+        args = {"masses": MERCURY_LIKE, "J2": j2, "R": 0.1, "pole": POLE}
+        sol = dvi.integrate(OBLATE, q0, m * v0, args=args, **options)
         return sol.qs, sol.ps / m[None]
 
     runs = jax.jit(jax.vmap(run))(100 * J2_R2 * jnp.array([1.0, 0.5, 0.0, -1.0]))
     return np.array([per_turn(q, v, turn) for q, v in zip(*map(np.asarray, runs), strict=True)])
 
 
-@pytest.mark.parametrize("inclination", [0.4, 1.3])  # below and above 63.4°, where ω stands
+@pytest.mark.parametrize("inclination", [0.4, 1.3])  # below and above 63.4°, where ω is constant
 def test_oblateness_turns_node_and_pericentre(inclination):
     ci = np.cos(inclination)
     p2 = (1 - ECCENTRICITY**2) ** 2
@@ -315,7 +285,7 @@ def test_oblateness_turns_node_and_pericentre(inclination):
     once, half, none, prolate = oblate(inclination)
     assert np.sign(expected[1]) == (1 if inclination < 1 else -1)
     np.testing.assert_allclose(once, expected, rtol=5e-3)
-    np.testing.assert_allclose(4 * half - once, expected, rtol=2e-6)  # the next order taken away
+    np.testing.assert_allclose(4 * half - once, expected, rtol=2e-6)  # without the next order
     np.testing.assert_allclose(none, 0, atol=1e-10)  # negative controls
     np.testing.assert_allclose(prolate, -expected, rtol=5e-3)
 
@@ -325,17 +295,11 @@ def test_a_run_is_differentiable_in_j2():
     q0, v0 = start(ECCENTRICITY, 0.4, 0.7, axes(POLE))
 
     def where(J2):
-        sol = dvi.integrate(
-            dvi.System(hamiltonian_with_oblateness),
-            q0,
-            MERCURY_LIKE[:, None] * v0,
-            h=0.05,
-            num_steps=20,
-            args={"masses": MERCURY_LIKE, "J2": J2, "R": 0.1, "pole": POLE},
-            method=dvi.TypeII(),
-            save=dvi.Save(final=True),
-        )
-        return sol.qs[-1, 1, 2]
+        args = {"masses": MERCURY_LIKE, "J2": J2, "R": 0.1, "pole": POLE}
+        options = {"h": 0.05, "num_steps": 20, "method": dvi.TypeII()}
+        return dvi.integrate(OBLATE, q0, MERCURY_LIKE[:, None] * v0, args=args, **options).qs[
+            -1, 1, 2
+        ]
 
     # One program for values and slope; centred differences: error s² and rounding 1e-16/s.
     both, s = jax.jit(lambda J2: jax.jvp(where, (J2,), (1.0,))), 1e-4
@@ -347,33 +311,22 @@ def test_a_run_is_differentiable_in_j2():
 # The planets
 
 
+@needs_ephemeris
 @pytest.mark.slow
 def test_mercury_follows_the_ephemeris():
-    """Ten years: what `n_body` lacks of DE421, 43″ a century and 2500 km, is here."""
-    pytest.importorskip("jplephem")
-    if importlib.util.find_spec("skyfield_data") is None:
-        pytest.skip("the ephemeris is not installed")
-    problem = solar_system("1900-01-01")
-    system = dvi.System(hamiltonian_with_oblateness, force=post_newtonian_force)
+    """Ten years: relativity and oblateness are what `n_body` lacks of DE421, 43″ a century."""
+    made = solar_system("1900-01-01")
+    made = dataclasses.replace(made, system=dvi.System(OBLATE.H_D, force=post_newtonian_force))
+    options = {"h": 0.5, "method": dvi.GaussLegendre(3), "save": dvi.Save(every=10)}
 
     def beside(J2):
-        sol = dvi.integrate(
-            system,
-            problem.q0,
-            problem.p0,
-            h=0.5,
-            num_steps=7200,
-            epsilon=1.0,
-            args=problem.args | {"J2": J2},
-            method=dvi.GaussLegendre(3),
-            save=dvi.Save(every=10),
-        )
+        sol = run_problem(made, 7200, epsilon=1.0, args=made.args | {"J2": J2}, **options)
         jd = 2415020.5 + np.asarray(sol.ts)
         seen = compare(jd, np.asarray(sol.qs), np.asarray(sol.ps), GM)
         return seen.slope, seen.errors.max(axis=0)
 
     slope, errors = beside(SUN_J2)
-    # The method's own share, of order h⁶, is −0.0037″ a century.
+    # The error of the method, of order h⁶, is −0.0037″ a century.
     assert slope == pytest.approx(-0.0025, abs=2e-3)
     assert (errors[[BODIES.index("Mercury"), BODIES.index("Venus")]] < [0.5, 1.5]).all()  # km
     # Negative control: the round Sun lacks 0.025″.

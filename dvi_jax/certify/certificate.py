@@ -19,7 +19,7 @@ _WORKERS = 2
 
 @dataclass(frozen=True)
 class Certificate:
-    """What was measured.
+    """The measurements of `certify`.
 
     - `methods`: name → method. `rows`: name → check → `Measured`.
     - `controls`: the broken methods, each with the result of the check that must find its defect.
@@ -36,7 +36,7 @@ class Certificate:
 
     @property
     def missed(self) -> list[Control]:
-        """The controls without a number that fails (an exception is not one)."""
+        """The controls without a measured number that fails (an exception is not one)."""
         return [control for control, measured in self.controls if measured.verdict != "FAIL"]
 
     @property
@@ -50,7 +50,7 @@ class Certificate:
         good = len(self.rows) - len({method for method, _, _ in self.failures})
         caught = len(self.controls) - len(self.missed)
         return (
-            f"methods: {good} of {len(self.rows)} keep what they promise\n"
+            f"methods: {good} of {len(self.rows)} have the properties that they claim\n"
             f"controls: {caught} of {len(self.controls)} caught"
         )
 
@@ -58,12 +58,10 @@ class Certificate:
         """The tables, as text."""
         return tables(self.methods, self.rows, self.controls)
 
-    def markdown(self) -> str:
-        """The page of the documentation."""
+    def __str__(self) -> str:
         return markdown(self.tables(), self.summary, self.failures)
 
-    def __str__(self) -> str:
-        return self.markdown()
+    markdown = __str__
 
 
 def certify(
@@ -75,14 +73,14 @@ def certify(
 
     **Arguments**
 
-    - `methods`: name → `Method`, your own for instance; or names of `METHODS`; None for all those.
+    - `methods`: name → `Method`, such as your own; or names of `METHODS`; None for all of these.
     - `checks`: names of `CHECKS`; None for all.
     - `progress`: called as ``progress(done, total)`` after each method and each control.
 
     **Returns** a `Certificate`; ``print`` it, or read `ok`, `failures`, `rows`.
 
     **Raises** `ValueError` for an unknown name, for no name at all, and where x64 is off;
-    `TypeError` for what is not a method. An exception that a method raises is a failure of the
+    `TypeError` for an object that is not a method. An exception of a method is a failure of the
     check that called it.
 
     **Accuracy** the bounds are those of double precision. All methods of the package take about
@@ -101,21 +99,20 @@ def certify(
         candidate = Candidate(method)
         return {name: CHECKS[name](candidate) for name in names}
 
-    work = [(method, names) for method in named.values()]
-    work += [(control.method, [control.check]) for control in controls]
     pool = ThreadPoolExecutor(_WORKERS)
     try:
-        futures = [pool.submit(row, *each) for each in work]
+        rows = {name: pool.submit(row, method, names) for name, method in named.items()}
+        tried = [(c, pool.submit(row, c.method, [c.check])) for c in controls]
+        futures = [*rows.values(), *(future for _, future in tried)]
         for done, future in enumerate(as_completed(futures), 1):
             future.result()
             if progress is not None:
                 progress(done, len(futures))
-        found = [future.result() for future in futures]
     finally:
         pool.shutdown(cancel_futures=True)
-    rows = dict(zip(named, found, strict=False))
-    outcomes = [x[c.check] for c, x in zip(controls, found[len(named) :], strict=True)]
-    return Certificate(named, rows, tuple(zip(controls, outcomes, strict=True)))
+    measured = {name: future.result() for name, future in rows.items()}
+    outcomes = tuple((c, future.result()[c.check]) for c, future in tried)
+    return Certificate(named, measured, outcomes)
 
 
 def _named(methods: Any) -> dict[str, dvi.Method]:

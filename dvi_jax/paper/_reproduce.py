@@ -23,7 +23,7 @@ _COLOUR = {Verdict.HOLDS: "green", Verdict.MENDED: "yellow", Verdict.FAILS: "red
 
 @dataclass(frozen=True)
 class Reproduction:
-    """What `reproduce` found: the folder it wrote, the measurements, the judged claims."""
+    """Result of `reproduce`: its folder, the measurements, the claims with verdicts."""
 
     out: Path
     measurements: Measurements
@@ -31,18 +31,16 @@ class Reproduction:
 
 
 def reproduce(out: Path | str, force: bool = False, console: Console | None = None) -> Reproduction:
-    """The paper's figures, sweeps and verdicts, measured now and written to a folder.
+    """The paper's figures, sweeps and verdicts, measured and written to a folder.
 
-    Everything is computed in double precision on the CPU, whatever the process is set to.
+    All results are computed in double precision on the CPU, for every setting of the process.
 
     **Arguments**
 
-    - `out`: the folder; made if missing. Gets ``verdicts.json``, ``verdicts.md``,
-      ``verdicts.html`` (self-contained), ``figures/*.png`` and ``tables/*.csv``.
+    - `out`: the folder, created if missing: ``verdicts.json``, ``verdicts.md``, ``verdicts.html``
+      (self-contained), ``figures/*.png`` and ``tables/*.csv``.
     - `force`: write into a folder that is not empty; other files in it stay.
-    - `console`: rich console for the progress and the summary; by default standard output.
-
-    **Returns** a `Reproduction`.
+    - `console`: rich console for progress and summary; by default standard output.
 
     **Raises** `FileExistsError` when `out` is a folder that is not empty and `force` is not set;
     `NotADirectoryError` when it is a file.
@@ -50,13 +48,12 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
     **Source** the paper, Section 5; the verdicts' criteria are ours.
     """
     out = Path(out)
-    # Refused before the work, not after it.
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(f"{out} is a file; the reproduction needs a folder to write to.")
     if out.exists() and any(out.iterdir()) and not force:
         raise FileExistsError(
-            f"{out} is not empty, and nothing in it is overwritten unasked. Choose another "
-            "folder, or set force (--force) to write into this one."
+            f"{out} is not empty. Choose another folder, or set force (--force) to overwrite the "
+            "files of an earlier reproduction in it; other files stay."
         )
     out.mkdir(parents=True, exist_ok=True)
     console = Console() if console is None else console
@@ -67,8 +64,8 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
     seconds = time.perf_counter() - began
 
     figures, tables = out / "figures", out / "tables"
-    for folder in (figures, tables):
-        folder.mkdir(exist_ok=True)
+    figures.mkdir(exist_ok=True)
+    tables.mkdir(exist_ok=True)
     with console.status("drawing") as status:
         for i, path in enumerate(draw(measurements, figures), start=1):
             status.update(f"drawing: {path.name} ({i} of {len(FIGURES)})")
@@ -88,7 +85,7 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
     console.print(f"{counts(claims)}; {time.perf_counter() - began:.0f} s.")
     unexpected = [claim.key for claim in claims if not claim.is_expected]
     if unexpected:
-        console.print(f"[bold]Not as on record:[/bold] {', '.join(unexpected)}.")
+        console.print(f"[bold]Other verdicts than on record:[/bold] {', '.join(unexpected)}.")
     console.print(f"Written to {out}: open verdicts.html.", soft_wrap=True)
     return Reproduction(out, measurements, claims)
 
@@ -97,26 +94,22 @@ def _summary(claims: list[Claim]) -> Table:
     table = Table(
         title="The paper's claims, measured", title_justify="left", box=SIMPLE_HEAD, expand=True
     )
-    table.add_column("where", ratio=2)
-    table.add_column("the paper says", ratio=4)
-    table.add_column("measured now", ratio=4)
+    for name, ratio in (("where", 2), ("the paper says", 4), ("measured now", 4)):
+        table.add_column(name, ratio=ratio)
     table.add_column("verdict", no_wrap=True)
     for claim in claims:
         verdict = claim.verdict
-        # What decided: the failing check of the print, or its first if none fails.
-        told = next((c for c in claim.printed if not c.passes), claim.printed[0])
-        table.add_row(
-            claim.where,
-            claim.says,
-            f"{told.what}: {pretty(told.value)}",
-            f"[{_COLOUR[verdict]}]{MARKS[verdict]} {verdict.value}[/]",
-        )
+        # The decisive check: the failing one of the printed claim, or its first if none fails.
+        check = next((c for c in claim.printed if not c.passes), claim.printed[0])
+        measured = f"{check.what}: {pretty(check.value)}"
+        judged = f"[{_COLOUR[verdict]}]{MARKS[verdict]} {verdict.value}[/]"
+        table.add_row(claim.where, claim.says, measured, judged)
     return table
 
 
 def _on_cpu() -> Any:
-    """JAX computing on the CPU: the runs are long and narrow, which an accelerator is slow at."""
+    """JAX on the CPU: the runs are long, of few trajectories, which an accelerator is slow at."""
     try:
         return jax.default_device(jax.local_devices(backend="cpu")[0])
-    except RuntimeError:  # a process that was told to see no CPU device
+    except RuntimeError:  # a process without a CPU device
         return contextlib.nullcontext()

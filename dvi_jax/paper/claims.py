@@ -1,7 +1,4 @@
-"""The paper's claims, each with a verdict that is computed from what was measured.
-
-The claims are rows of `claims.toml`, whose first lines say how they are judged.
-"""
+"""The paper's claims, rows of `claims.toml`, with verdicts computed from the measurements."""
 
 import math
 import tomllib
@@ -15,7 +12,7 @@ from .values import numbers
 
 
 class Verdict(Enum):
-    """What became of a claim."""
+    """The outcome of the checks of a claim."""
 
     HOLDS = "holds"
     MENDED = "holds once mended"
@@ -34,7 +31,7 @@ def pretty(value: float) -> str:
 
 @dataclass(frozen=True)
 class Check:
-    """A measured number and the band in which it has to lie, bounds included; NaN never does."""
+    """A measured number and its allowed band, bounds included; NaN is never in it."""
 
     what: str
     value: float
@@ -54,7 +51,7 @@ class Check:
     def band(self) -> str:
         if self.low == math.inf:
             return "none"
-        if math.isinf(self.low) or self.low == 0:  # sizes: 0 is no bound
+        if math.isinf(self.low) or self.low == 0:  # an absolute value: 0 is not a bound
             return f"≤ {pretty(self.high)}"
         if math.isinf(self.high):
             return f"≥ {pretty(self.low)}"
@@ -63,11 +60,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim and how it is judged: a row of `claims.toml` with its numbers.
-
-    `why` explains the verdict `on_record`; when a measurement leads elsewhere, the row says so in
-    place of it.
-    """
+    """A row of `claims.toml` with its numbers; `why` explains the verdict `on_record`."""
 
     key: str
     where: str
@@ -95,8 +88,8 @@ class Claim:
         if self.is_expected:
             return self.why
         return (
-            f"Unexpected: on record is “{self.on_record.value}”. Something has changed, in the "
-            "package or in what it runs on; compare the numbers with their bands."
+            f"Unexpected: the verdict on record is “{self.on_record.value}”. The package or its "
+            "dependencies have changed; compare the numbers with their bands."
         )
 
 
@@ -104,25 +97,15 @@ def judge(measurements: Measurements) -> list[Claim]:
     """All claims of the paper, judged on these measurements."""
     values = numbers(measurements)
     rows = tomllib.loads(Path(__file__).with_name("claims.toml").read_text(encoding="utf-8"))
-    return [_judged(row, values) for row in rows["claim"]]
 
+    def claim(row: dict[str, Any]) -> Claim:
+        checks = {
+            part: tuple(
+                Check(what, values[name], *map(float, bounds))
+                for what, name, *bounds in row.get(part, ())
+            )
+            for part in ("printed", "mended", "also")
+        }
+        return Claim(**{**row, **checks, "on_record": Verdict(row["on_record"])})
 
-def _judged(row: dict[str, Any], values: dict[str, Any]) -> Claim:
-    """A row with the numbers that it names."""
-
-    def checks(part):
-        return tuple(
-            Check(what, values[name], *map(float, bounds))
-            for what, name, *bounds in row.get(part, ())
-        )
-
-    return Claim(
-        key=row["key"],
-        where=row["where"],
-        says=row["says"],
-        printed=checks("printed"),
-        mended=checks("mended"),
-        also=checks("also"),
-        on_record=Verdict(row["on_record"]),
-        why=row["why"],
-    )
+    return [claim(row) for row in rows["claim"]]

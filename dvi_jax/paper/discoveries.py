@@ -17,7 +17,7 @@ H = 0.1
 
 
 def discoveries(tick: Tick) -> dict[str, Any]:
-    """What discovery, gauge solving and drift measurement find; nothing of it is put in by hand."""
+    """Results of discovery, gauge solving and drift measurement, without prior knowledge."""
     rng = np.random.default_rng(0)
     found = _on_oscillator(rng, lambda part: tick(0.5 * part))
     return found | _on_kepler(rng, lambda part: tick(0.5 + 0.5 * part))
@@ -28,8 +28,8 @@ def _on_oscillator(rng, tick: Tick) -> dict[str, Any]:
 
     `oscillator`: the invariant of order 1 that is found in quadratics, as text; `oscillator_off`:
     distance of its coefficients from those of (p² + (1+ε)q² − h(1+ε)qp)/2; `oscillator_residual`:
-    held-out; `oscillator_exact`: 1 when it is kept at any ε. `gauge_34_left_0`, `_1`: what the best
-    gauges in polynomials of degree 4 leave of the identities of order 0 and 1 for (34), relative.
+    held-out; `oscillator_exact`: 1 when it is conserved at any ε. `gauge_34_left_0`, `_1`: relative
+    residuals of the identities of order 0 and 1 for (34) with the best gauges of degree 4.
     `drift_34_exponent`: exponent in ε of the drift of (1+ε)(p² + q²)/2 as h → 0.
     """
     spring = systems.oscillator()

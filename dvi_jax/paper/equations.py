@@ -4,16 +4,11 @@ import pkgutil
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 
 @dataclass(frozen=True)
 class Equation:
-    """One numbered equation.
-
-    `number`; `what` it says; `code`: dotted names of what implements it; `note`: how the print
-    differs from what is right, empty where it does not.
-    """
+    """A numbered equation; `code`: names of its implementation; `note`: error of the print."""
 
     number: int
     what: str
@@ -40,9 +35,5 @@ EQUATIONS = _read()
 """All fifty, in order."""
 
 
-def resolve(name: str) -> Any:
-    """The object of a dotted name.
-
-    **Raises** `ModuleNotFoundError` or `AttributeError` when there is none.
-    """
-    return pkgutil.resolve_name(name)
+resolve = pkgutil.resolve_name
+"""Dotted name → object. Raises `ModuleNotFoundError` or `AttributeError` for an invalid name."""

@@ -10,7 +10,7 @@ from . import discoveries, kepler, oscillator, theory
 
 @dataclass(frozen=True)
 class Measurements:
-    """Everything that was measured; figures, tables and verdicts are made from this alone."""
+    """All measured data; figures, tables and verdicts are made from it."""
 
     fixed_mesh: oscillator.FixedMesh
     crossover: oscillator.Crossover
@@ -18,8 +18,8 @@ class Measurements:
     mesh_sweep: kepler.MeshSweep
     small_step_sweep: kepler.SmallStepSweep
     long_runs: dict[str, kepler.LongRun]
-    repulsion: kepler.Repulsion
-    variational_mesh: kepler.VariationalMesh
+    repulsion: dict[str, float]
+    variational_mesh: dict[str, float]
     limits: dict[str, float]
     symmetries: dict[str, float]
     identities: dict[str, float]
@@ -40,12 +40,11 @@ EXPERIMENTS = {
     "identities": ("Noether identities", theory.identities),
     "discoveries": ("discovery of invariants", discoveries.discoveries),
 }
-"""Field of `Measurements` → what the progress bar calls it, and the function that measures it."""
+"""Field of `Measurements` → label of its progress bar, and function that measures it."""
 
 
 def measure(console) -> Measurements:
     """All `Measurements`, with a progress bar for each experiment on the given rich console."""
-    results = {}
     columns = (
         TextColumn("{task.description:<26}"),
         BarColumn(bar_width=24),
@@ -57,9 +56,11 @@ def measure(console) -> Measurements:
             key: progress.add_task(name, total=1.0, start=False)
             for key, (name, _) in EXPERIMENTS.items()
         }
-        for key, (_, experiment) in EXPERIMENTS.items():
-            task = tasks[key]
-            progress.start_task(task)
-            results[key] = experiment(lambda part, task=task: progress.update(task, completed=part))
-            progress.update(task, completed=1.0)
-    return Measurements(**results)
+
+        def done(key):
+            progress.start_task(tasks[key])
+            found = EXPERIMENTS[key][1](lambda part: progress.update(tasks[key], completed=part))
+            progress.update(tasks[key], completed=1.0)
+            return found
+
+        return Measurements(**{key: done(key) for key in EXPERIMENTS})

@@ -1,6 +1,7 @@
 """Measurements on the Kepler problem: Figures 4 and 5, the sweeps of (49) and (50)."""
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import dvi_jax as dvi
 from dvi_jax import systems
 
-from .numbers import Tick, largest, over, relative_spread, run, slope, spread
+from .numbers import Tick, largest, relative_spread, run, slope
 
 DURATION = 200.0
 """Time over which ranges and drifts are taken; about five revolutions."""
@@ -45,7 +46,7 @@ class MeshSweep:
     """(42), (43), (49) and (50) by the variational map, t = 200, over h and ε.
 
     `hs` (H,), `epsilons` (E,) with 0 first. Ranges (H, E): `spread_50`; `relative_49`, relative
-    to the start. ε = 0 is (43) and (42). `ts`, `values_50` (E, N): the run at the first h.
+    to the initial value. ε = 0 is (43) and (42). `ts`, `values_50` (E, N): the run at the first h.
     """
 
     hs: np.ndarray
@@ -61,9 +62,9 @@ class SmallStepSweep:
     """(50) as h → 0: order-4 composition, h = 0.01, t = 200, against ε.
 
     Largest distances from the first value (E,), ε = 0 first: `attracting` for the force −εq,
-    `repelling` for +εq (NaN where the orbit is torn open), `literal` for
-    (1+ε)L − H − ε|q|²/2 under −εq, which is what ξ0 = 1 of (47) gives. `ts`, `values` (E, N):
-    (50) along the runs under −εq.
+    `repelling` for +εq (NaN where the orbit becomes unbound), `literal` for
+    (1+ε)L − H − ε|q|²/2 under −εq, the invariant for ξ0 = 1 of (47). `ts`, `values` (E, N): (50)
+    along the runs under −εq.
     """
 
     h: float
@@ -75,7 +76,7 @@ class SmallStepSweep:
     values: np.ndarray
 
     def beyond_zero(self, drifts: np.ndarray) -> np.ndarray:
-        """Drift less that of ε = 0, which is the error of the method, not of the invariant."""
+        """Drift minus that of ε = 0, which is the error of the method, not of the invariant."""
         return drifts[1:] - drifts[0]
 
     def exponent(self, drifts: np.ndarray) -> float:
@@ -86,7 +87,7 @@ class SmallStepSweep:
 
 @dataclass(frozen=True)
 class LongRun:
-    """10⁵ steps of one method at the paper's h = 0.1, undisturbed.
+    """10⁵ steps of one method at the paper's h = 0.1, ε = 0.
 
     `qs` (N, 2); `energy_errors` (N,) relative; `momentum_errors` (N,) absolute;
     `apocentre_radii` (R,): where the orbit crosses the direction in which the exact orbit has
@@ -105,33 +106,11 @@ class LongRun:
     @property
     def width(self) -> float:
         """Width of the drawn loop at the apocentre."""
-        return float(spread(self.apocentre_radii))
+        return float(np.ptp(self.apocentre_radii))
 
     def error_at(self, part: float) -> float:
         """Largest relative energy error in the first `part` of the run."""
         return largest(self.energy_errors[: int(part * len(self.energy_errors))])
-
-
-@dataclass(frozen=True)
-class Repulsion:
-    """Distance from the centre for both signs of K²/r: `ts` (N,), `printed`, `mended` (N,)."""
-
-    ts: np.ndarray
-    printed: np.ndarray
-    mended: np.ndarray
-
-
-@dataclass(frozen=True)
-class VariationalMesh:
-    """How long (14), mended, can be solved for real steps: `hs` (first step), `steps`, `times`.
-
-    Infinite where all of the `limit` steps tried could be solved.
-    """
-
-    hs: np.ndarray
-    steps: np.ndarray
-    times: np.ndarray
-    limit: int
 
 
 def mesh_sweep(tick: Tick) -> MeshSweep:
@@ -142,15 +121,13 @@ def mesh_sweep(tick: Tick) -> MeshSweep:
     observe = {"49": INVARIANT_49, "50": INVARIANT_50}
     runs = []
     for i, h in enumerate(hs):
-        steps = round(DURATION / h)
-        runs.append(
-            over(epsilons, lambda e, h=h, n=steps: run(problem, h, n, epsilon=e, observe=observe))
-        )
+        one = functools.partial(run, problem, h, round(DURATION / h), observe=observe)
+        runs.append(jax.vmap(lambda e, one=one: one(epsilon=e))(jnp.asarray(epsilons)))
         tick((i + 1) / len(hs))
     return MeshSweep(
         hs=hs,
         epsilons=epsilons,
-        spread_50=np.stack([spread(run.observed["50"]) for run in runs]),
+        spread_50=np.stack([np.ptp(run.observed["50"], axis=-1) for run in runs]),
         relative_49=np.stack([relative_spread(run.observed["49"]) for run in runs]),
         ts=np.asarray(runs[0].ts)[0, 1:],
         values_50=np.asarray(runs[0].observed["50"]),
@@ -158,12 +135,12 @@ def mesh_sweep(tick: Tick) -> MeshSweep:
 
 
 def small_step_sweep(tick: Tick) -> SmallStepSweep:
-    """The drift of (50) against ε, with the mesh out of the way, for both signs of the force."""
+    """The drift of (50) against ε as h → 0, for both signs of the force."""
     problem = systems.kepler()
     h, epsilons = 0.01, np.array([0.0, 5e-5, 1e-4, 2e-4, 1e-3, 1e-2])
     momentum, energy = problem.observables["angular_momentum"], problem.observables["energy"]
 
-    # The energy is the continuous one: H_{k−1} over a step of six parts would bring O(h) back.
+    # The energy is the continuous one: H_{k−1} over a step of six parts has an error O(h).
     def printed(*step):
         epsilon, q1 = step[-1]["epsilon"], step[4]
         return (1 + epsilon) * (momentum(*step) - energy(*step)) - epsilon * jnp.sum(q1**2) / 2
@@ -178,7 +155,7 @@ def small_step_sweep(tick: Tick) -> SmallStepSweep:
         options |= {"observe": {"values": printed, **drifts}, "save": dvi.Save(every=10)}
         return run(problem, h, round(DURATION / h), method=dvi.Yoshida(4), **options)
 
-    # W = −q: a negative strength is the force +|ε|q, while the formula keeps |ε|.
+    # W = −q: a negative ε is the force +|ε|q, while the formulas have |ε|.
     both = np.concatenate([epsilons, -epsilons])
     runs = jax.vmap(orbit)(jnp.asarray(both), jnp.asarray(np.abs(both)))
     drifts = np.asarray(runs.observed["printed"])
@@ -242,32 +219,36 @@ def _eccentricity_vector(q: np.ndarray, p: np.ndarray) -> np.ndarray:
     return np.hstack([p[:, 1:], -p[:, :1]]) * momentum - q / np.linalg.norm(q, axis=1)[:, None]
 
 
-def repulsion(tick: Tick) -> Repulsion:
-    """The orbit under the printed sign of (37), beside the one under attraction."""
+def repulsion(tick: Tick) -> dict[str, float]:
+    """Largest distance from the centre for the sign of K²/r in (37), and for the opposite one."""
     problem = systems.kepler()
 
     def printed(t0, t1, q0, p1, args):
         return jnp.sum(p1**2) / 2 + args["K"] ** 2 / jnp.sqrt(jnp.sum(q0**2))
 
-    radii = []
-    for system in (dvi.System(printed), problem.system):
+    found = {}
+    for key, system in {"printed": dvi.System(printed), "mended": problem.system}.items():
         one = dataclasses.replace(problem, system=system)
         solution = run(one, problem.h, round(DURATION / problem.h))
-        radii.append(np.linalg.norm(np.asarray(solution.qs), axis=1))
-        tick(len(radii) / 2)
-    return Repulsion(np.asarray(solution.ts), *radii)
+        found[f"distance_{key}"] = float(np.max(np.linalg.norm(np.asarray(solution.qs), axis=1)))
+        tick(len(found) / 2)
+    return found
 
 
-def variational_mesh(tick: Tick) -> VariationalMesh:
-    """How far the steps that (14) asks for stay real, with this H_D of first order, undisturbed."""
-    problem = systems.kepler()
-    limit = 5000
-    ends = []
-    hs = np.array([0.1, 0.01])
-    for i, first in enumerate(hs):
-        solution = run(problem, first, limit, lattice=dvi.Variational(), throw=False)
+def variational_mesh(tick: Tick) -> dict[str, float]:
+    """For how many steps, and until when, (14) has real solutions, from two first steps.
+
+    Infinite where all of 5000 steps are real. H_D is of first order, without perturbation.
+    """
+    problem, ends = systems.kepler(), []
+    for first in (0.1, 0.01):
+        solution = run(problem, first, 5000, lattice=dvi.Variational(), throw=False)
         k = int(solution.stats["failed_step"])
-        ends.append((np.inf, np.inf) if k < 0 else (k, float(solution.ts[k])))
-        tick((i + 1) / len(hs))
-    steps, times = np.array(ends, float).T
-    return VariationalMesh(hs, steps, times, limit)
+        ends.append((np.inf, np.inf) if k < 0 else (float(k), float(solution.ts[k])))
+        tick(len(ends) / 2)
+    (first_steps, first_end), (second_steps, second_end) = ends
+    return {
+        "mesh_fewest_steps": min(first_steps, second_steps),
+        "mesh_end_first": first_end,
+        "mesh_end_second": second_end,
+    }

@@ -2,35 +2,36 @@
 
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
 from dvi_jax import systems
 
-from .numbers import Tick, crossing, over, run
+from .numbers import Tick, crossing, run
 
 SCALING = dvi.Generator(
     xi0=lambda t, q, p, args: jnp.ones_like(t),
     xi=lambda t, q, p, args: q,
     eta=lambda t, q, p, args: p,
 )
-"""The generator of (34) in both orders: a scaling with a shift of time, (33) mended."""
+"""The generator of (34) in both orders: a scaling with a shift of time, (33) corrected."""
 
 STEPS = 10_000
 """Length of the paper's runs in steps."""
 
 EPSILONS = (0.0, 1e-4, 1e-3, 1e-2, 1e-1)
-"""Strengths of the disturbance; the paper does not print its own."""
+"""Strengths of the perturbation; the paper does not print its values."""
 
 
 @dataclass(frozen=True)
 class FixedMesh:
-    """The paper's run at its h = 0.1: 10 000 steps for five strengths of the disturbance.
+    """The paper's run at its h = 0.1: 10 000 steps for five strengths of the perturbation.
 
-    `epsilons` (E,), `ts` (N,), `mixed` (E, N): (p_k² + q_{k−1}²)/2, `exact` (E, N): what the
-    disturbed map keeps, `rk4` (N,): (p² + q²)/2 along RK4 at ε = 0, `energy`: its start.
-    Dimensionless, like all of the paper.
+    `epsilons` (E,), `ts` (N,), `mixed` (E, N): (p_k² + q_{k−1}²)/2, `exact` (E, N): the invariant
+    of the perturbed map, `rk4` (N,): (p² + q²)/2 along RK4 at ε = 0, `energy`: its initial value.
+    Dimensionless, as all quantities of the paper.
     """
 
     h: float
@@ -71,7 +72,7 @@ class Crossover:
 class SmallStep:
     """(34) as h → 0: order-4 composition, h = 0.01, t = 200.
 
-    `epsilons` (E,); ranges (E,) relative to the undisturbed energy of the start, of (34) as
+    `epsilons` (E,); ranges (E,) relative to the initial energy at ε = 0, of (34) as
     printed and of (p² + (1+ε)q²)/2.
     """
 
@@ -91,7 +92,9 @@ def fixed_mesh(tick: Tick) -> FixedMesh:
     problem = systems.oscillator()
     h, epsilons = problem.h, np.array(EPSILONS)
     mixed, energy = problem.observables["mixed_energy"], problem.observables["energy"]
-    variational = over(epsilons, lambda e: run(problem, h, STEPS, epsilon=e, observe=mixed))
+    variational = jax.vmap(lambda e: run(problem, h, STEPS, epsilon=e, observe=mixed))(
+        jnp.asarray(epsilons)
+    )
     tick(0.5)
     rk4 = run(problem, h, STEPS, method=dvi.RungeKutta4(), observe=energy)
     q, p = np.asarray(variational.qs)[..., 0], np.asarray(variational.ps)[..., 0]
@@ -101,7 +104,7 @@ def fixed_mesh(tick: Tick) -> FixedMesh:
         epsilons=epsilons,
         ts=np.asarray(variational.ts)[0, 1:],
         mixed=np.asarray(variational.observed),
-        # The disturbed map is the undisturbed one with stiffness 1 + ε, and so is its invariant.
+        # The perturbed map is the unperturbed one with stiffness 1 + ε, and so is its invariant.
         exact=((p**2 + stiffness * q**2 - h * stiffness * q * p) / 2)[:, 1:],
         rk4=np.asarray(rk4.observed),
         energy=_start(problem),
@@ -109,7 +112,7 @@ def fixed_mesh(tick: Tick) -> FixedMesh:
 
 
 def crossover(tick: Tick) -> Crossover:
-    """RK4 run until its energy error has passed the variational band, for several h."""
+    """RK4 until its energy error exceeds the variational band, for several h."""
     problem = systems.oscillator()
     start, hs = _start(problem), np.array([0.1, 0.2, 0.3, 0.4])
 
@@ -123,11 +126,11 @@ def crossover(tick: Tick) -> Crossover:
             problem, h, num_steps, method=dvi.RungeKutta4(), progress=progress, **options
         ).observed
 
-    bands = np.asarray(over(hs, band))
+    bands = np.asarray(jax.vmap(band)(jnp.asarray(hs)))
     long, every = 7_500_000, 2500
     first = rk4(hs[0], long, every, lambda done, total: tick(0.9 * done / total))
     short, often = 300_000, 20
-    others = over(hs[1:], lambda h: rk4(h, short, often))
+    others = jax.vmap(lambda h: rk4(h, short, often))(jnp.asarray(hs[1:]))
 
     def history(values, every):
         values = np.asarray(values)
@@ -148,7 +151,7 @@ def crossover(tick: Tick) -> Crossover:
 
 
 def small_step(tick: Tick) -> SmallStep:
-    """The drift of (34) and of its corrected form against ε, with the mesh out of the way."""
+    """The drift of (34) and of its corrected form against ε as h → 0."""
     problem = systems.oscillator()
     h, epsilons = 0.01, np.array([1e-4, 2e-4, 1e-3, 1e-2, 1e-1])
 
@@ -164,7 +167,7 @@ def small_step(tick: Tick) -> SmallStep:
         options |= {"method": dvi.Yoshida(4), "save": dvi.Save(final=True)}
         return run(problem, h, round(200 / h), **options).observed
 
-    found, start = over(epsilons, ranges), _start(problem)
+    found, start = jax.vmap(ranges)(jnp.asarray(epsilons)), _start(problem)
     return SmallStep(
         h=h,
         epsilons=epsilons,

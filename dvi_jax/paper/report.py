@@ -1,4 +1,4 @@
-"""What a reproduction leaves on disk: verdicts as JSON, Markdown and HTML, and tables as CSV."""
+"""Files of a reproduction: verdicts as JSON, Markdown and HTML, and tables as CSV."""
 
 import base64
 import csv
@@ -18,21 +18,17 @@ from .claims import Check, Claim, Verdict, pretty
 from .equations import EQUATIONS, Equation
 from .experiments import Measurements
 from .figures import FIGURES
-from .numbers import largest, relative_spread, spread
+from .numbers import largest, relative_spread
 
 MARKS = {Verdict.HOLDS: "✓", Verdict.MENDED: "≈", Verdict.FAILS: "✗"}
-"""A sign beside every colour, so that no verdict hangs on colour alone."""
+"""A sign for each colour, so that verdicts can be read without colours."""
 
 
 def counts(claims: Sequence[Claim]) -> str:
-    """How many claims met each verdict, as one phrase."""
+    """The number of claims with each verdict, as one phrase."""
     number = Counter(claim.verdict for claim in claims)
-    plural = {
-        Verdict.HOLDS: "hold",
-        Verdict.MENDED: "hold once mended",
-        Verdict.FAILS: "do not hold",
-    }
-    parts = ", ".join(f"{number[verdict]} {words}" for verdict, words in plural.items())
+    plural = zip(Verdict, ("hold", "hold once mended", "do not hold"), strict=True)
+    parts = ", ".join(f"{number[verdict]} {words}" for verdict, words in plural)
     return f"{len(claims)} claims: {parts}"
 
 
@@ -82,6 +78,9 @@ def write_markdown(claims: Sequence[Claim], setting: dict[str, Any], path: Path)
         return claim.where, claim.says, checks, verdict, claim.reason
 
     columns = ("where", "the paper says", "measured now", "verdict", "why")
+    equations = [
+        (f"({e.number})", e.what, ", ".join(f"`{c}`" for c in e.code), e.note) for e in EQUATIONS
+    ]
     lines = [
         "# The paper's claims, measured",
         "",
@@ -94,20 +93,14 @@ def write_markdown(claims: Sequence[Claim], setting: dict[str, Any], path: Path)
         *(f"![{text}](figures/{name}.png)\n\n{text}\n" for name, (_, text) in FIGURES.items()),
         "## The numbered equations and the code",
         "",
-        *table(
-            ("equation", "what", "code", "the print, and what is right"),
-            *(
-                (f"({e.number})", e.what, ", ".join(f"`{c}`" for c in e.code), e.note)
-                for e in EQUATIONS
-            ),
-        ),
+        *table(("equation", "what", "code", "the print, and what is right"), *equations),
         "",
     ]
     path.write_text("\n".join(lines), encoding="utf-8")
 
 
 def write_html(claims: Sequence[Claim], setting: dict[str, Any], figures: Path, path: Path) -> None:
-    """One page that needs nothing beside it: verdicts, figures (embedded), equations."""
+    """One self-contained page: verdicts, figures (embedded), equations."""
 
     def row(cells: Iterable[str]) -> str:
         return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
@@ -116,31 +109,25 @@ def write_html(claims: Sequence[Claim], setting: dict[str, Any], figures: Path, 
         kind = claim.verdict.name.lower()
         checks = "".join(f"<li><i>{k}:</i> {_math(text)}</li>" for k, text in _check_texts(claim))
         verdict = f"{MARKS[claim.verdict]} {claim.verdict.value}"
-        return row(
-            (
-                _esc(claim.where),
-                _math(claim.says),
-                f"<ul>{checks}</ul>",
-                f'<span class="verdict {kind}">{verdict}</span>',
-                _math(claim.reason),
-            )
-        ).replace("<td>", '<td class="where">', 1)
+        badge = f'<span class="verdict {kind}">{verdict}</span>'
+        texts = (html.escape(claim.where), _math(claim.says), f"<ul>{checks}</ul>", badge)
+        return row((*texts, _math(claim.reason))).replace("<td>", '<td class="where">', 1)
 
     def picture(name: str, caption: str) -> str:
         data = base64.b64encode((figures / f"{name}.png").read_bytes()).decode()
         return (
-            f'<figure><img alt="{_esc(caption)}" src="data:image/png;base64,{data}">'
+            f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
             f"<figcaption>{_math(caption)}</figcaption></figure>"
         )
 
     def listed(e: Equation) -> str:
-        code = " ".join(f"<code>{_esc(c)}</code>" for c in e.code)
+        code = " ".join(f"<code>{html.escape(c)}</code>" for c in e.code)
         return row((f"({e.number})", _math(e.what), code, _math(e.note)))
 
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
     page = string.Template(template).substitute(
-        summary=_esc(counts(claims)),
-        setting=_esc(_setting_line(setting)),
+        summary=html.escape(counts(claims)),
+        setting=html.escape(_setting_line(setting)),
         claims="\n".join(map(judged, claims)),
         figures="\n".join(picture(name, caption) for name, (_, caption) in FIGURES.items()),
         equations="\n".join(map(listed, EQUATIONS)),
@@ -163,7 +150,7 @@ def write_tables(m: Measurements, folder: Path) -> None:
         "sweep_34_fixed_mesh": {
             "h": mesh.h,
             "epsilon": mesh.epsilons,
-            "range_34_printed": spread(mesh.printed),
+            "range_34_printed": np.ptp(mesh.printed, axis=-1),
             "relative_range_34": relative_spread(mesh.printed),
             "relative_range_exact": relative_spread(mesh.exact),
         },
@@ -203,27 +190,23 @@ def write_tables(m: Measurements, folder: Path) -> None:
 
 
 def _check_texts(claim: Claim) -> list[tuple[str, str]]:
-    """Every number of a claim: the part it belongs to, and what it says."""
-    parts = (("printed", claim.printed), ("mended", claim.mended), ("also", claim.also))
-    return [(label, _check_text(check)) for label, checks in parts for check in checks]
+    """The part (printed, mended, also) and the text of each number of a claim."""
 
+    def text(check: Check) -> str:
+        mark = f" ({'✓' if check.passes else '✗'} required: {check.band})" if check.decides else ""
+        return f"{check.what}: {pretty(check.value)}{mark}"
 
-def _check_text(check: Check) -> str:
-    value = f"{check.what}: {pretty(check.value)}"
-    if not check.decides:
-        return value
-    return f"{value} ({'✓' if check.passes else '✗'} asked for: {check.band})"
+    parts = ("printed", "mended", "also")
+    return [(part, text(check)) for part in parts for check in getattr(claim, part)]
 
 
 def _setting_line(setting: dict[str, Any]) -> str:
     return "; ".join(f"{name} {value}" for name, value in setting.items()) + "."
 
 
-def _esc(text: str) -> str:
-    return html.escape(text, quote=True)
-
-
 def _math(text: str) -> str:
-    """Escaped text with the indices and exponents written as _x, _{…} and ^{…} set as such."""
-    text = re.sub(r"_(?:\{([^}]*)\}|([A-Za-z0-9])(?![A-Za-z0-9]))", r"<sub>\1\2</sub>", _esc(text))
+    """Escaped text with _x, _{…} and ^{…} as subscripts and superscripts."""
+    text = re.sub(
+        r"_(?:\{([^}]*)\}|([A-Za-z0-9])(?![A-Za-z0-9]))", r"<sub>\1\2</sub>", html.escape(text)
+    )
     return re.sub(r"\^(?:\{([^}]*)\}|([A-Za-z0-9])(?![A-Za-z0-9]))", r"<sup>\1\2</sup>", text)

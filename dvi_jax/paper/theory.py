@@ -17,7 +17,7 @@ from .numbers import Tick, largest, run, slope
 from .oscillator import SCALING
 
 EPSILON = 0.01
-"""Strength of the disturbance in the checks that need one value of it."""
+"""Strength of the perturbation in the checks with a single value."""
 
 STEP_SIZES = np.array([0.04, 0.02, 0.01, 0.005])
 
@@ -186,7 +186,7 @@ def identities(tick: Tick) -> dict[str, float]:
     """Noether's identities and the balance law along trajectories; largest absolute values.
 
     Oscillator, relative to its energy: `oscillator_identity_0`, N_0 with the gauge −pq at ε = 0;
-    `…_1`, N_1 of (34) at ε, and `…_1_rest`, what is left of it after q_k(p_{k+1} − q_k) + εq_k².
+    `…_1`, N_1 of (34) at ε, and `…_1_rest`, its difference from q_k(p_{k+1} − q_k) + εq_k².
     Kepler at h = 0.1: `kepler_identity_1`, N_1 of (50), and its exponent in h;
     `kepler_identity_rest`, after −(h/2)|Dq|², at all h. `law_31_gap`: D I − ε²W·(ξ − Dq ξ0) for
     (50), with its exponent in h; `balance_gap`, the same with the causes that (31) leaves out, at

@@ -1,11 +1,15 @@
-"""Systems that are ready to run: equations, parameters with units, a start, what is known.
+"""Systems that are ready to run, with parameters, units, initial conditions, known properties.
 
-Each is a function without obligatory arguments that returns a `Problem`, and a line in `LIBRARY`,
-by which run files name it and `tests/test_library.py` tests it.
+Each is a function without obligatory arguments that returns a `Problem`. Its entry in `LIBRARY`
+gives the name in run files; `tests/test_library.py` tests every entry.
 """
 
-from ._problem import Adiabatic as Adiabatic, InSlowTime as InSlowTime, Problem as Problem
-from ._start import ParameterError as ParameterError
+from ._problem import (
+    Adiabatic as Adiabatic,
+    InSlowTime as InSlowTime,
+    ParameterError as ParameterError,
+    Problem as Problem,
+)
 from .dipole_field import dipole_field as dipole_field
 from .double_pendulum import double_pendulum as double_pendulum
 from .duffing import duffing as duffing
@@ -37,34 +41,16 @@ from .uniform_field import uniform_field as uniform_field
 from .van_der_pol import van_der_pol as van_der_pol
 
 LIBRARY = {
-    "oscillator": oscillator,
-    "duffing": duffing,
-    "van_der_pol": van_der_pol,
-    "slow_oscillator": slow_oscillator,
-    "pendulum": pendulum,
-    "perturbed_pendulum": perturbed_pendulum,
-    "lorentz_pendulum": lorentz_pendulum,
-    "double_pendulum": double_pendulum,
-    "kepler": kepler,
-    "relativistic_kepler": relativistic_kepler,
-    "oblate_kepler": oblate_kepler,
-    "two_centres": two_centres,
-    "restricted_three_body": restricted_three_body,
-    "hill": hill,
-    "n_body": n_body,
-    "figure_eight": figure_eight,
-    "solar_system": solar_system,
-    "henon_heiles": henon_heiles,
-    "toda": toda,
-    "fput": fput,
-    "stiff_fput": stiff_fput,
-    "nls_lattice": nls_lattice,
-    "uniform_field": uniform_field,
-    "magnetic_mirror": magnetic_mirror,
-    "dipole_field": dipole_field,
-    "rigid_body": rigid_body,
-    "spinning_top": spinning_top,
-    "polar_motion": polar_motion,
-    "lotka_volterra": lotka_volterra,
+    function.__name__: function
+    for group in (
+        (oscillator, duffing, van_der_pol, slow_oscillator),
+        (pendulum, perturbed_pendulum, lorentz_pendulum, double_pendulum),
+        (kepler, relativistic_kepler, oblate_kepler, two_centres, restricted_three_body, hill),
+        (n_body, figure_eight, solar_system),
+        (henon_heiles, toda, fput, stiff_fput, nls_lattice),
+        (uniform_field, magnetic_mirror, dipole_field),
+        (rigid_body, spinning_top, polar_motion, lotka_volterra),
+    )
+    for function in group
 }
 """Name → function that makes the `Problem`."""

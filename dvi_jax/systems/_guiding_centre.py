@@ -1,19 +1,20 @@
-r"""The adiabatic invariants of a charge that gyrates fast: moment, first correction, bounces.
+r"""Adiabatic invariants of a fast gyrating charge: moment, its first correction, bounce action.
 
-The units are those of e, m and B: gyrofrequency Ω = eB/m. With b = B/|B|, v∥ = v·b, v⊥ = v − v∥ b
+The gyrofrequency is Ω = eB/m. With b = B/|B|, v∥ = v·b, v⊥ = v − v∥ b
 and the position on the gyration ρ = b × v⊥/Ω, the moment μ0 = m v⊥²/(2|B|) changes as
 
     dμ0/dt = −(μ0/B) v⊥·∇B − (m v∥²/B) v⊥·κ − (m v∥/(2B)) (v⊥v⊥ − uu):∇b,    u = v⊥ × b,
     κ = (b·∇)b
 
-(the rest cancels by div B = 0). With dρ/dt = v⊥, dv⊥/dt = Ωu and du/dt = −Ωv⊥ to leading order,
-each of the three is the derivative of a function that gyrates, so that what takes them away is
+(the other terms cancel by div B = 0). With dρ/dt = v⊥, dv⊥/dt = Ωu and du/dt = −Ωv⊥ to leading
+order, each of the three is the derivative of a function that oscillates with the gyration. Minus
+the sum of these functions is
 
     μ1 = (μ0/B) ρ·∇B + (m v∥²/B) ρ·κ − (m v∥/(4BΩ)) (v⊥u + uv⊥):∇b,
 
-and μ0 + μ1 wavers by the second order in gyroradius over the length of the field. This holds where
-b·(∇ × b) = 0, as in every axisymmetric field without a part about its axis; where the field is
-twisted, a term −(μ0 v∥/Ω) b·(∇ × b) comes on top, which does not gyrate.
+and μ0 + μ1 oscillates with an amplitude of second order in gyroradius over field scale length. This
+requires b·(∇ × b) = 0, as in every axisymmetric field without an azimuthal component. A twisted
+field adds a term −(μ0 v∥/Ω) b·(∇ × b), which does not oscillate.
 
 **Source** derived here; the same terms: Littlejohn 1983, *J. Plasma Phys.* 29, 111; Cary & Brizard
 2009, *Rev. Mod. Phys.* 81, 693.
@@ -26,9 +27,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ._problem import Adiabatic, Parameter, Problem, gyrates
+
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _HALVINGS = 54
 """Of the interval that holds the mirror point: to the last digits."""
+
+PARTICLE = {
+    "charge": Parameter(1.0, "e [charge]", gyrates),
+    "mass": Parameter(1.0, "m [mass]"),
+}
+
+
+def adiabatic(small: str, smaller: Callable[[float], Problem]) -> dict[str, Adiabatic]:
+    """The adiabatic invariants by name; `small`: gyroradius over field scale length, in words."""
+    powers = {"magnetic_moment": 1, "corrected_moment": 2, "bounce_action": 2}
+    return {name: Adiabatic(small, power, smaller) for name, power in powers.items()}
 
 
 def parts(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> tuple[Any, Any, Any, Any]:
@@ -41,7 +55,7 @@ def parts(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) -> tuple[Any,
 
 
 class ChargedParticle(NamedTuple):
-    """What follows from the field of a particle of ``args["charge"]`` and ``args["mass"]``.
+    """A particle of ``args["charge"]`` and ``args["mass"]`` in a magnetic field.
 
     - `A`, `B`: functions (q, args) → vector potential and magnetic field, shape (3,).
     """
@@ -58,15 +72,15 @@ class ChargedParticle(NamedTuple):
         return jnp.sum(self.kinetic_momentum(q0, p1, args) ** 2) / (2 * args["mass"])
 
     def magnetic_moment(self, t0, t1, q0, p0, q1, p1, args):
-        """μ0 = m v⊥²/(2|B|) at t1, B taken at the particle: the first adiabatic invariant.
+        """μ0 = m v⊥²/(2|B|) at t1, with B at the particle: the first adiabatic invariant.
 
-        In each turn it oscillates by the order of gyroradius over the length of the field.
+        It oscillates at the gyrofrequency, by the order of gyroradius over field scale length.
         """
         strength, _, _, across = parts(q1, *self._at(q1, p1, args), args)
         return args["mass"] * jnp.sum(across**2) / (2 * strength)
 
     def corrected_moment(self, t0, t1, q0, p0, q1, p1, args):
-        """μ0 + μ1 at t1, which oscillates by the second order in gyroradius over the length."""
+        """μ0 + μ1 at t1, which oscillates by the second order in gyroradius over scale length."""
         return self.magnetic_moment(t0, t1, q0, p0, q1, p1, args) + first_correction(
             q1, *self._at(q1, p1, args), args
         )
@@ -109,13 +123,13 @@ def first_correction(q: Any, mv: Any, field: Callable[[Any], Any], args: Any) ->
 def bounce_action(
     strength: Callable[[Any], Any], arc: Callable[[Any], Any], far: Any, E: Any, mu: Any, m: Any
 ) -> Any:
-    r"""J = ∮ p∥ ds = 4 ∫_0^{s_m} √(2m (E − μB)) ds along a line that is alike on both sides.
+    r"""J = ∮ p∥ ds = 4 ∫_0^{s_m} √(2m (E − μB)) ds along a line that is symmetric about x = 0.
 
-    - `strength`: |B| as a function of a coordinate x along the line, growing from its middle,
-      x = 0; `arc`: ds/dx. Of any shape. `far`: an x beyond the mirror point, μB = E.
+    - `strength`: |B| as a function of a coordinate x along the line, which increases from x = 0;
+      `arc`: ds/dx. Both take arrays. `far`: an x beyond the mirror point, μB = E.
     - `E`: energy, `mu`: moment, `m`: mass.
 
-    To about 1e-12 of itself; zero where μB > E at the middle. Not differentiable.
+    Relative error about 1e-12; zero where μB > E at x = 0. Not differentiable.
     **Source** Northrop 1963, *The Adiabatic Motion of Charged Particles*, 3.
     """
     limit = E / mu
@@ -128,7 +142,7 @@ def bounce_action(
 
     ends = (jnp.zeros_like(limit), far * jnp.ones_like(limit))
     mirror, _ = jax.lax.fori_loop(0, _HALVINGS, halve, ends)
-    # x = x_m sin θ takes the root at the mirror point away
+    # With x = x_m sin θ the integrand is smooth at the mirror point, where p∥ has a root.
     theta = jnp.asarray(np.pi / 4 * (1 + _NODES), limit.dtype)
     weights = jnp.asarray(np.pi / 4 * _WEIGHTS, limit.dtype)
     x = mirror * jnp.sin(theta)

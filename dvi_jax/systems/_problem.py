@@ -1,17 +1,19 @@
-"""What the library knows of a system besides its equations."""
+"""A system of the library: parameters, initial conditions, known properties, and checks of them."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from .._checks import finite as finite, positive as positive
 from .._system import System
 from ..discover.generators import Generator
-from ._start import check_shape
+from ..discover.library import time_translation
 
 DIMENSIONLESS = {"q": "1", "p": "1", "t": "1", "energy": "1"}
 """Units of a dimensionless system."""
@@ -19,15 +21,13 @@ DIMENSIONLESS = {"q": "1", "p": "1", "t": "1", "energy": "1"}
 
 @dataclass(frozen=True)
 class Adiabatic:
-    """What is known of a quantity that is nearly kept.
+    """Metadata of an adiabatic invariant: it oscillates with amplitude O(small^power).
 
-    Over long times it wavers about a constant by an amount that goes with `small` to the `power`,
-    and does not drift.
+    It has no secular drift.
 
-    - `small`: what is small, in words.
-    - `power`: the power of it that the quantity wavers by.
-    - `smaller`: function of a factor → the `Problem` in which what is small is so many times its
-      size; None where it is ε itself.
+    - `small`: the small parameter, in words. `power`: its power in the amplitude.
+    - `smaller`: function of a factor → the `Problem` whose small parameter is multiplied by it;
+      None where the small parameter is ε itself.
     """
 
     small: str
@@ -37,31 +37,31 @@ class Adiabatic:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A system with parameters, a start, a step size and what is known of it.
+    """A system with parameters, initial conditions, a step size and its known properties.
 
     - `system`: the `System`; its H_D is H by the paper's rule, H_D(t0, t1, q0, p1) = H(t0, q0, p1),
-      but for H the energy of the undisturbed system. `args` its parameters.
-    - `q0`, `p0`, `h`: a start and a step size that suit it.
+      with H the energy of the unperturbed system. `args`: its parameters.
+    - `q0`, `p0`, `h`: initial conditions and a suitable step size.
     - `observables`: name → function of one step ``(t0, t1, q0, p0, q1, p1, args)``.
-    - `units`: what q, p, t and energy are measured in.
-    - `source`: where equations and values come from.
-    - `check`: function ``(q0, p0, args)`` that raises `ValueError` for a start that the system
-      cannot go on from; or None.
+    - `units`: units of q, p, t and energy.
+    - `source`: reference for equations and values.
+    - `check`: function ``(q0, p0, args)`` that raises `ValueError` for invalid initial
+      conditions or parameters; or None.
 
-    What is known, as data, of the differential equations without disturbance (ε = 0):
+    Known properties, of the differential equations without perturbation (ε = 0):
 
     - `parameters`: name in args → meaning [unit].
-    - `invariants`: names of the observables that they keep exactly.
-    - `adiabatic`: name of an observable → an `Adiabatic`, what it is nearly kept by.
+    - `invariants`: names of the observables that are conserved exactly.
+    - `adiabatic`: name of an observable → `Adiabatic`.
     - `symmetries`: name → `Generator` of the discrete equations of the type II map, at every step
-      size; of the differential equations a fortiori.
-    - `flow_symmetries`: name → `Generator` of the differential equations alone, which a step map
-      keeps up to its order.
+      size, and so of the differential equations.
+    - `flow_symmetries`: name → `Generator` of the differential equations alone; a step map has it
+      up to the order of the map.
     - `exact`: function ``(t, q0, p0, args)`` → (q, p), the state at times t [unit of t] of any
-      shape after a start at t = 0, shapes t.shape + q0.shape; or None.
-    - `exact_epsilon`: the ε at which `exact` holds, 0 where it is of the undisturbed system.
+      shape from initial conditions at t = 0, shapes t.shape + q0.shape; or None.
+    - `exact_epsilon`: the ε at which `exact` holds, 0 for the unperturbed system.
 
-    **Raises** `ValueError` for facts about an observable or a parameter that is not there.
+    **Raises** `ValueError` for a property of an observable or a parameter that does not exist.
     """
 
     name: str
@@ -85,28 +85,190 @@ class Problem:
     def __post_init__(self):
         if self.system.epsilon is None:  # what is known is known of the unperturbed motion
             object.__setattr__(self, "system", replace(self.system, epsilon=0.0))
-        known = set(self.args or ()) if isinstance(self.args, Mapping | None) else set()
-        for what, names, allowed, of in (
-            ("invariants", self.invariants, set(self.observables), "observables"),
-            ("adiabatic", self.adiabatic, set(self.observables), "observables"),
-            ("parameters", self.parameters, known, "args"),
+        args = self.args if isinstance(self.args, Mapping) else {}
+        for what, known, kind in (
+            ("invariants", self.observables, "observables"),
+            ("adiabatic", self.observables, "observables"),
+            ("parameters", args, "args"),
         ):
-            for name in names:
-                if name not in allowed:
-                    raise ValueError(
-                        f"{self.name}: {what} names {name!r}, which is none of its {of}: "
-                        f"{', '.join(sorted(allowed)) or 'there are none'}."
-                    )
+            for name in set(getattr(self, what)) - set(known):
+                raise ValueError(
+                    f"{self.name}: {what} names {name!r}, which is not one of its {kind}: "
+                    f"{', '.join(sorted(known)) or 'there are none'}."
+                )
+
+
+Check = Callable[[str, Any], Any]
+"""Function of a parameter's name and value that raises `ValueError`."""
+
+
+class ParameterError(ValueError):
+    """An invalid parameter in args."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """A check of initial conditions and parameters: a function of (q0, p0, args).
+
+    - `system`: the system in words, for messages.
+    - `shape`: of q0 and of p0, with None for any number from `least` on; None for any shape.
+    - `parameters`: name in args → check of its value.
+    - `singular`: name of a singular point → the point, or a function of args.
+    - `also`: a further check, function of q0, p0 (NumPy arrays) and args.
+
+    **Raises** `ValueError` that shows what was seen; `ParameterError` for a parameter.
+    """
+
+    system: str
+    shape: tuple[int | None, ...] | None
+    parameters: Mapping[str, Check] = field(default_factory=dict)
+    singular: Mapping[str, Any] = field(default_factory=dict)
+    also: Callable[[Any, Any, Any], None] | None = None
+    least: int = 1
+
+    def __call__(self, q0: Any, p0: Any, args: Any) -> None:
+        check_shape(q0, p0, self._fits, f"{self.system}: q0 and p0 of {self._wanted}")
+        for name, check in self.parameters.items():
+            check_parameter(args, name, check)
+        if not (self.singular or self.also):
+            return
+        q, p = np.asarray(q0, float), np.asarray(p0, float)
+        for what, at in self.singular.items():
+            point: Any = at(args) if callable(at) else at
+            if (q == point).all():
+                raise ValueError(
+                    f"q0 is on top of {what} at {list(point)}: the system is singular there."
+                )
+        if self.also is not None:
+            self.also(q, p, args)
+
+    def _fits(self, seen: tuple[int, ...]) -> bool:
+        if self.shape is None:
+            return True
+        pairs = zip(seen, self.shape, strict=False)
+        return len(seen) == len(self.shape) and all(
+            n >= self.least if m is None else n == m for n, m in pairs
+        )
+
+    @property
+    def _wanted(self) -> str:
+        if self.shape is None:
+            return "one shape, any"
+        range_of_n = f", n ≥ {self.least}" if None in self.shape else ""
+        return f"shape {self.shape}{range_of_n}".replace("None", "n")
+
+
+def check_shape(q0: Any, p0: Any, fits: Callable[[tuple[int, ...]], bool], wanted: str) -> None:
+    """Require q0 and p0 of one shape for which `fits` holds; `wanted`: these shapes, a sentence."""
+    q, p = np.shape(q0), np.shape(p0)
+    if q != p or not fits(q):
+        raise ValueError(f"{wanted}; got q0 of shape {q} and p0 of shape {p}.")
+
+
+def parameter(args: Any, name: str) -> Any:
+    """The parameter of this name. **Raises** `ParameterError`, with the names that args has."""
+    if not isinstance(args, Mapping) or name not in args:
+        there = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
+        raise ParameterError(
+            f"the parameter {name} is missing: args must be a dict that has {name!r}; "
+            f"got {f'one with {there}' if there else repr(args)}."
+        )
+    return args[name]
+
+
+def check_parameter(args: Any, name: str, check: Check) -> None:
+    """Apply a check to the parameter of this name. **Raises** `ParameterError`."""
+    value = parameter(args, name)
+    try:
+        check(name, value)
+    except ValueError as error:
+        raise ParameterError(str(error)) from None
+
+
+def gyrates(name: str, value: Any) -> None:
+    """A check for the charge of a particle or the strength of a magnetic field."""
+    if finite(name, value) == 0:
+        raise ValueError(f"{name} is 0: the particle does not gyrate. Take another system.")
+
+
+def between(low: float, high: float) -> Check:
+    """A check for a number in the open interval."""
+
+    def check(name: str, value: Any) -> None:
+        if not low < finite(name, value) < high:
+            raise ValueError(f"{name} must be between {low} and {high}, got {value}.")
+
+    return check
+
+
+def vector(size: int) -> Check:
+    """A check for `size` finite numbers."""
+
+    def check(name: str, given: Any) -> None:
+        try:
+            value = np.asarray(given, float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name} must be {size} numbers: {error}") from None
+        if value.shape != (size,):
+            raise ValueError(f"{name} must have shape ({size},), got {value.shape}.")
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} must be finite, got {value}.")
+
+    return check
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a library system: its value, its meaning with [unit], its check."""
+
+    value: Any
+    meaning: str
+    check: Check = positive
+
+
+def library_problem(
+    hamiltonian: Callable[..., Any],
+    start: Start,
+    parameters: Mapping[str, Parameter] | None = None,
+    observables: Sequence[Callable[..., Any]] = (),
+    force: Callable[..., Any] | None = None,
+    perturbation: Callable[..., Any] | None = None,
+    autonomous: bool = True,
+    slow_time: bool = False,
+    **fields: Any,
+) -> Problem:
+    """A `Problem` of the library.
+
+    - `start`: check of initial conditions; those of `parameters` are added to it.
+    - `autonomous`: whether H is independent of time at ε = 0. The energy is then an observable and
+      an invariant, and the translation in time a symmetry, though not one of `slow_time`.
+    - `slow_time`: whether the times of the Hamiltonian and of the observables are ε times t.
+    - `fields`: the other fields of `Problem`.
+    """
+    parameters, fields = parameters or {}, {"units": DIMENSIONLESS, **fields}
+    if autonomous:
+        observables = (at_end(hamiltonian), *observables)
+        fields["invariants"] = ("energy", *fields.get("invariants", ()))
+    if autonomous and not slow_time:
+        fields["symmetries"] = {"time": time_translation(), **fields.get("symmetries", {})}
+    return Problem(
+        system=System(hamiltonian, force, perturbation, slow_time),
+        args={name: one.value for name, one in parameters.items()} or None,
+        check=replace(start, parameters={name: one.check for name, one in parameters.items()}),
+        parameters={name: one.meaning for name, one in parameters.items()},
+        observables={f.__name__: InSlowTime(f) if slow_time else f for f in observables},
+        **fields,
+    )
 
 
 class InSlowTime(eqx.Module):
-    """An observable of a system with ``slow_time=True``, handed ε·t0 and ε·t1 as its times.
+    """An observable of a system with ``slow_time=True``: it receives ε·t0 and ε·t1 as its times.
 
     - `function`: ``(τ0, τ1, q0, p0, q1, p1, args)`` → array, τ = εt.
 
-    `integrate` tells it ε; by hand: ``observable.bind(system, epsilon)(...)``.
+    `integrate` supplies ε; without it: ``observable.bind(system, epsilon)(...)``.
 
-    **Raises** `ValueError` when called before it knows ε.
+    **Raises** `ValueError` when called without ε.
     """
 
     function: Callable[..., Any]
@@ -119,8 +281,8 @@ class InSlowTime(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.epsilon is None:
             raise ValueError(
-                "an observable in slow time has to know ε: call observable.bind(system, epsilon)"
-                "(...), or give it to dvi.integrate(observe=...)."
+                "an observable in slow time needs the value of ε: call "
+                "observable.bind(system, epsilon)(...), or give it to dvi.integrate(observe=...)."
             )
         return self.function(self.epsilon * t0, self.epsilon * t1, q0, p0, q1, p1, args)
 
@@ -130,11 +292,11 @@ def over_times(
 ) -> Callable[[Callable[..., tuple[Any, Any]]], Callable[..., tuple[Any, Any]]]:
     """A decorator that makes the solution at one time a function of times of any shape.
 
-    - `shape`: of q0 and of p0; None where any will do, if only they have the same.
+    - `shape`: of q0 and of p0; None for any shape, the same for both.
 
-    It takes ``(t, q0, p0, args)`` → (q, p), shaped like q0, for a number t, and gives a function of
-    the same arguments, whose results have the shape t.shape + q0.shape and the dtype of the start.
-    That **raises** `ValueError` for a start of another shape.
+    It takes ``(t, q0, p0, args)`` → (q, p) for a number t. The results of the new function have the
+    shape t.shape + q0.shape and the dtype of the initial conditions. It **raises** `ValueError` for
+    initial conditions of another shape.
     """
     wanted = "q0 and p0 of one shape" if shape is None else f"q0 and p0 of shape {shape}"
 
@@ -159,6 +321,7 @@ def over_times(
     return decorate
 
 
+@functools.cache  # observables are compared by identity: another function would compile again
 def at_end(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
     """The observable `energy` of a Hamiltonian."""
 
@@ -167,8 +330,3 @@ def at_end(hamiltonian: Callable[..., Any]) -> Callable[..., Any]:
         return hamiltonian(t1, t1, q1, p1, args)
 
     return energy
-
-
-def named(*observables: Callable[..., Any]) -> dict[str, Callable[..., Any]]:
-    """Observables by the names of their functions."""
-    return {getattr(f, "function", f).__name__: f for f in observables}

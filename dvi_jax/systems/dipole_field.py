@@ -3,11 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.library import rotation, time_translation
+from ..discover.library import rotation
 from . import _guiding_centre as guiding_centre
-from ._problem import Adiabatic, Problem, at_end, named
-from ._start import Start, gyrates, positive
+from ._problem import Parameter, Problem, Start, gyrates, library_problem, positive
 
 
 def vector_potential(q, args):
@@ -27,11 +25,10 @@ def magnetic_field(q, args):
 _particle = guiding_centre.ChargedParticle(vector_potential, magnetic_field)
 kinetic_momentum, hamiltonian = _particle.kinetic_momentum, _particle.hamiltonian
 magnetic_moment, corrected_moment = _particle.magnetic_moment, _particle.corrected_moment
-energy = at_end(hamiltonian)
 
 
 def stoermer_integral(t0, t1, q0, p0, q1, p1, args):
-    """p_φ = x p_y − y p_x at t1: Störmer's integral, which turns about the axis keep."""
+    """p_φ = x p_y − y p_x at t1: Störmer's integral, conserved by rotational symmetry."""
     return q1[0] * p1[1] - q1[1] * p1[0]
 
 
@@ -42,7 +39,7 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
 
     along the field line r = L cos² λ of the guiding centre q − b × v/Ω, with
     B = |B0| (R/L)³ √(1 + 3 sin² λ)/cos⁶ λ, ds = L cos λ √(1 + 3 sin² λ) dλ and μ the
-    `corrected_moment`. Zero where the particle mirrors at the equator. Not differentiable.
+    `corrected_moment`. Zero where the mirror point is at the equator. Not differentiable.
 
     **Source** Northrop 1963, *The Adiabatic Motion of Charged Particles*, 3.
     """
@@ -62,61 +59,44 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
     return guiding_centre.bounce_action(strength, arc, jnp.pi / 2, E, mu, m)
 
 
-check_start = Start(
-    "the dipole field holds one particle in space",
-    (3,),
-    {"mass": positive, "radius": positive, "charge": gyrates, "B0": gyrates},
-    singular={"the dipole": (0, 0, 0)},
-)
-
-
 def dipole_field(radius: float = 50.0) -> Problem:
-    """A trapped particle that gyrates, bounces between north and south, and drifts round.
+    """A trapped particle that gyrates, bounces between north and south, and drifts in longitude.
 
     Dimensionless: e = m = B0 = 1, so that gyrofrequency and gyroradius at the start are 1; it
     starts at the equator at r ≈ R with its velocity at 45° to the field.
 
-    - `radius`: R, over the gyroradius; the equations in units of Störmer's length depend on it by
-      the start alone.
+    - `radius`: R over the gyroradius. In units of Störmer's length it appears only in the initial
+      conditions.
 
     **Raises** `ValueError` for a radius that is not positive.
 
     **Source** Störmer 1907, *Arch. Sci. Phys. Nat.* 24, 5; Northrop 1963, *The Adiabatic Motion of
-    Charged Particles*; field, start and step are ours.
+    Charged Particles*; field, initial conditions and step are ours.
     """
     radius = positive("radius", radius)
-    args = {"charge": 1.0, "mass": 1.0, "B0": 1.0, "radius": radius}
-    q0, v0 = np.array([radius, 0.0, 0.0]), np.array([0.6, -0.8, 1.0])
-    A = np.array([0.0, -args["B0"] * args["radius"], 0.0])  # `vector_potential` there
-    return Problem(
-        name="dipole_field",
-        system=System(hamiltonian),
-        q0=q0,
-        p0=args["mass"] * v0 + args["charge"] * A,
-        h=0.1,
-        args=args,
-        observables=named(
-            energy, stoermer_integral, magnetic_moment, corrected_moment, bounce_action
+    v0, A = np.array([0.6, -0.8, 1.0]), np.array([0.0, -radius, 0.0])  # `vector_potential` at q0
+    return library_problem(
+        hamiltonian,
+        Start(
+            "the dipole field holds one particle in space", (3,), singular={"the dipole": (0, 0, 0)}
         ),
+        name="dipole_field",
+        q0=np.array([radius, 0.0, 0.0]),
+        p0=v0 + A,
+        h=0.1,
+        parameters={
+            **guiding_centre.PARTICLE,
+            "B0": Parameter(
+                1.0, "field at r = radius on the equator [mass/(charge time)]", gyrates
+            ),
+            "radius": Parameter(radius, "R, where the field is B0 [length]"),
+        },
+        observables=[stoermer_integral, magnetic_moment, corrected_moment, bounce_action],
         units={"q": "1", "p": "1", "t": "1/gyrofrequency", "energy": "1"},
         source="Störmer 1907, Arch. Sci. Phys. Nat. 24, 5; Northrop 1963",
-        check=check_start,
-        parameters={
-            "charge": "e [charge]",
-            "mass": "m [mass]",
-            "B0": "field at r = radius on the equator [mass/(charge time)]",
-            "radius": "R, where the field is B0 [length]",
-        },
-        invariants=("energy", "stoermer_integral"),
-        adiabatic={
-            name: Adiabatic(
-                "gyroradius over R", power, smaller=lambda factor: dipole_field(radius / factor)
-            )
-            for name, power in (
-                ("magnetic_moment", 1),
-                ("corrected_moment", 2),
-                ("bounce_action", 2),
-            )
-        },
-        symmetries={"time": time_translation(), "rotation": rotation(0, 1)},
+        invariants=("stoermer_integral",),
+        adiabatic=guiding_centre.adiabatic(
+            "gyroradius over R", lambda factor: dipole_field(radius / factor)
+        ),
+        symmetries={"rotation": rotation(0, 1)},
     )

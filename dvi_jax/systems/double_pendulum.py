@@ -1,12 +1,9 @@
-"""Two pendulums, one hung from the other."""
+"""Two pendulums, the second attached to the bob of the first."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.library import time_translation
-from ._problem import Problem, at_end, named
-from ._start import Start, finite, positive
+from ._problem import Parameter, Problem, Start, finite, library_problem
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -25,45 +22,32 @@ def hamiltonian(t0, t1, q0, p1, args):
     return kinetic - (m1 + m2) * g * l1 * jnp.cos(a) - m2 * g * l2 * jnp.cos(b)
 
 
-energy = at_end(hamiltonian)
-
-
 def angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """P1 + P2 at t1: the angular momentum about the hinge, kept where g = 0 only."""
+    """P1 + P2 at t1: the angular momentum about the hinge, conserved for g = 0 only."""
     return jnp.sum(p1)
 
 
-check_start = Start(
-    "the double pendulum is two angles",
-    (2,),
-    {"m1": positive, "m2": positive, "l1": positive, "l2": positive, "g": finite},
-)
-
-
 def double_pendulum() -> Problem:
-    """Two bobs of 1 kg on rods of 1 m, let go at 90° and 60° from the vertical: chaotic.
+    """Two bobs of 1 kg on rods of 1 m, at rest at 90° and 60° from the vertical: chaotic.
 
-    **Source** Landau & Lifshitz 1976, *Mechanics*, §5, Problem 1; the Legendre transform and the
-    start are ours.
+    **Source** Landau & Lifshitz 1976, *Mechanics*, §5, Problem 1; the Legendre transform and
+    the initial conditions are ours.
     """
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("the double pendulum is two angles", (2,)),
         name="double_pendulum",
-        system=System(hamiltonian),
         q0=np.array([np.pi / 2, np.pi / 3]),
         p0=np.zeros(2),
         h=0.005,
-        args={"m1": 1.0, "m2": 1.0, "l1": 1.0, "l2": 1.0, "g": 9.81},
-        observables=named(energy, angular_momentum),
+        parameters={
+            "m1": Parameter(1.0, "mass of the upper bob [kg]"),
+            "m2": Parameter(1.0, "mass of the lower bob [kg]"),
+            "l1": Parameter(1.0, "length of the upper rod [m]"),
+            "l2": Parameter(1.0, "length of the lower rod [m]"),
+            "g": Parameter(9.81, "gravity [m/s²]", finite),
+        },
+        observables=[angular_momentum],
         units={"q": "rad", "p": "kg m²/s", "t": "s", "energy": "J"},
         source="Landau & Lifshitz 1976, Mechanics, §5, Problem 1",
-        check=check_start,
-        parameters={
-            "m1": "mass of the upper bob [kg]",
-            "m2": "mass of the lower bob [kg]",
-            "l1": "length of the upper rod [m]",
-            "l2": "length of the lower rod [m]",
-            "g": "gravity [m/s²]",
-        },
-        invariants=("energy",),
-        symmetries={"time": time_translation()},
     )

@@ -1,13 +1,10 @@
-"""Duffing's oscillator: a spring with a cubic term, disturbed by friction and a periodic drive."""
+"""Duffing's oscillator: a spring with a cubic term; friction and a periodic drive perturb it."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.library import time_translation
 from ._elliptic import first_kind, jacobi
-from ._problem import DIMENSIONLESS, Problem, at_end, named, over_times
-from ._start import Start, finite, positive
+from ._problem import Parameter, Problem, Start, finite, library_problem, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -20,28 +17,22 @@ def friction_and_drive(t0, t1, q0, p1, args):
     return -args["delta"] * p1 + args["gamma"] * jnp.cos(args["omega"] * t0)
 
 
-energy = at_end(hamiltonian)
-
-
 @over_times((1,))
 def exact(t, q0, p0, args):
-    r"""The state at times t of an oscillator at (q0, p0) at t = 0, without disturbance, β > 0.
+    r"""The state at times t without perturbation, for β > 0.
 
-        E > 0:  q = A cn(λt + u | m),  λ² = α + βA²,  m = βA²/(2λ²)      (over the hill, if any)
+        E > 0:  q = A cn(λt + u | m),  λ² = α + βA²,  m = βA²/(2λ²)      (over the barrier, if any)
         E < 0:  q = ±A dn(λt + u | m),  λ² = βA²/2,    m = 2 + 2α/(βA²)   (in one of two wells)
 
     with A the largest distance, A² = (−α + s)/β, s² = α² + 4βE = (α + βq²)² + 2βp², and p = dq/dt.
-
-    - `t`: times, any shape. `q0`, `p0`: shape (1,). Returns q, p of shape t.shape + (1,).
-
-    At E = 0 with α < 0, on the separatrix, and at rest at the origin it is NaN. It carries
-    gradients elsewhere, but for the very bottom of a well, where s = 0 has a cusp: NaN.
+    NaN at E = 0 with α < 0 (separatrix), and at rest at the origin. Differentiable elsewhere,
+    except at the bottom of a well, where s = 0 has a cusp: NaN.
     **Source** Kovacic & Brennan (eds.) 2011, *The Duffing Equation*, Chapter 4.
     """
     alpha, beta = args["alpha"], args["beta"]
     E = hamiltonian(0.0, 0.0, q0, p0, args)
     E = jnp.where(E == 0, jnp.nan, E)
-    # s² as a sum of squares: α² + 4βE loses its digits near the bottom of a well
+    # s² as a sum of squares: α² + 4βE cancels near the bottom of a well
     slope = alpha + beta * q0**2
     over, root = E > 0, jnp.sqrt(slope**2 + 2 * beta * p0**2) + 0 * E
     # 4E/(α + root) is (root − α)/β without its cancellation, for α > 0
@@ -62,42 +53,32 @@ def exact(t, q0, p0, args):
     return q, p
 
 
-check_start = Start(
-    "Duffing's oscillator has one degree of freedom",
-    (1,),
-    # with β ≤ 0 it runs away
-    {"beta": positive, "alpha": finite, "delta": finite, "gamma": finite, "omega": finite},
-)
-
-
 def duffing() -> Problem:
     """H = p²/2 + αq²/2 + βq⁴/4 with the force ε(−δp + γ cos ωt), in the left of two wells.
 
-    Dimensionless. α = −1, β = 1, δ = 0.3, ω = 1.2: with ε = 1 and γ = 0.5 the motion is chaotic,
-    with γ = 0.2 it stays in a well. Without disturbance it swings within one well.
+    Dimensionless. α = −1, β = 1, δ = 0.3, ω = 1.2: with ε = 1 the motion is chaotic for γ = 0.5 and
+    stays in a well for γ = 0.2. Without perturbation it oscillates in one well.
 
     **Source** Guckenheimer & Holmes 1983, *Nonlinear Oscillations*, 2.2; Kovacic & Brennan 2011,
     *The Duffing Equation*.
     """
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("Duffing's oscillator has one degree of freedom", (1,)),
         name="duffing",
-        system=System(hamiltonian, force=friction_and_drive),
         q0=np.array([-1.2]),
         p0=np.array([0.2]),
         h=0.1,
-        args={"alpha": -1.0, "beta": 1.0, "delta": 0.3, "gamma": 0.5, "omega": 1.2},
-        observables=named(energy),
-        units=DIMENSIONLESS,
-        source="Guckenheimer & Holmes 1983, Nonlinear Oscillations, 2.2",
-        check=check_start,
-        parameters={
-            "alpha": "linear part of the spring, negative for two wells [1/time²]",
-            "beta": "cubic part of the spring, positive [1/(length² time²)]",
-            "delta": "friction at ε = 1 [1/time]",
-            "gamma": "amplitude of the drive at ε = 1 [length/time²]",
-            "omega": "frequency of the drive [1/time]",
+        parameters={  # with β ≤ 0 the motion is unbounded
+            "alpha": Parameter(
+                -1.0, "linear part of the spring, negative for two wells [1/time²]", finite
+            ),
+            "beta": Parameter(1.0, "cubic part of the spring, positive [1/(length² time²)]"),
+            "delta": Parameter(0.3, "friction at ε = 1 [1/time]", finite),
+            "gamma": Parameter(0.5, "amplitude of the drive at ε = 1 [length/time²]", finite),
+            "omega": Parameter(1.2, "frequency of the drive [1/time]", finite),
         },
-        invariants=("energy",),
-        symmetries={"time": time_translation()},
+        force=friction_and_drive,
+        source="Guckenheimer & Holmes 1983, Nonlinear Oscillations, 2.2",
         exact=exact,
     )

@@ -4,10 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import whole
-from .._system import System
-from ..discover.library import time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
-from ._start import Start, finite
+from ._problem import Parameter, Problem, Start, finite, library_problem
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -23,9 +20,6 @@ def hamiltonian(t0, t1, q0, p1, args):
     )
 
 
-energy = at_end(hamiltonian)
-
-
 def frequencies(n):
     """ω_k = 2 sin(πk/(2(n + 1))), k = 1, …, n: those of the linear chain, shape (n,)."""
     return 2 * np.sin(np.pi * np.arange(1, n + 1) / (2 * (n + 1)))
@@ -36,7 +30,7 @@ def mode_energies(t0, t1, q0, p0, q1, p1, args):
 
         E_k = (Ȧ_k² + ω_k² A_k²)/2,    A_k = √(2/(n + 1)) Σ_i q_i sin(πik/(n + 1))
 
-    With α = β = 0 each is kept, and in any case their sum is the energy but for the terms in α, β.
+    With α = β = 0 each is conserved. Their sum is the energy without the terms in α and β.
     """
     n = q1.shape[0]
     i = np.arange(1, n + 1)
@@ -45,20 +39,13 @@ def mode_energies(t0, t1, q0, p0, q1, p1, args):
     return ((to_modes @ p1) ** 2 + (w * (to_modes @ q1)) ** 2) / 2
 
 
-check_start = Start(
-    "the FPUT chain is a row of particles between two walls",
-    (None,),
-    {"alpha": finite, "beta": finite},
-)
-
-
 def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
     """The chain with all its energy in the longest mode; dimensionless.
 
     n = 31 moving particles (32 springs), α = 1/4 and a sine wave of amplitude 1 are those of the
-    report's first figure; the energy is back in the first mode, but for some per cent, at
-    t ≈ 10 000. With a cubic term the energy has no lower bound: waves that are too strong break
-    the chain.
+    report's first figure; all but some per cent of the energy returns to the first mode at
+    t ≈ 10 000. With α ≠ 0 = β the energy has no lower bound: waves that are too strong break the
+    chain.
 
     **Raises** `ValueError` for fewer than one particle, and for α or β that is not finite.
 
@@ -66,23 +53,18 @@ def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
     Alamos report LA-1940.
     """
     n = whole("n", n, hint="The FPUT chain is a row of particles between two walls.")
-    args = {"alpha": finite("alpha", alpha), "beta": finite("beta", beta)}
-    q0 = np.sin(np.pi * np.arange(1, n + 1) / (n + 1))
-    return Problem(
+    alpha, beta = finite("alpha", alpha), finite("beta", beta)
+    return library_problem(
+        hamiltonian,
+        Start("the FPUT chain is a row of particles between two walls", (None,)),
         name="fput",
-        system=System(hamiltonian),
-        q0=q0,
+        q0=np.sin(np.pi * np.arange(1, n + 1) / (n + 1)),
         p0=np.zeros(n),
         h=0.2,
-        args=args,
-        observables=named(energy, mode_energies),
-        units=DIMENSIONLESS,
-        source="Fermi, Pasta & Ulam 1955, Los Alamos report LA-1940",
-        check=check_start,
         parameters={
-            "alpha": "quadratic part of a spring's force [1]",
-            "beta": "cubic part of a spring's force [1]",
+            "alpha": Parameter(alpha, "quadratic part of a spring's force [1]", finite),
+            "beta": Parameter(beta, "cubic part of a spring's force [1]", finite),
         },
-        invariants=("energy",),
-        symmetries={"time": time_translation()},
+        observables=[mode_energies],
+        source="Fermi, Pasta & Ulam 1955, Los Alamos report LA-1940",
     )

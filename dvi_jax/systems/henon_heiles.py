@@ -1,14 +1,11 @@
-"""Hénon and Heiles' star in the plane of a galaxy."""
+"""The star of Hénon and Heiles in the potential of a galaxy."""
 
 import jax.numpy as jnp
 
-from .._system import System
-from ..discover.library import time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
-from ._start import Start
+from ._problem import Problem, Start, library_problem
 
 ESCAPE_ENERGY = 1 / 6
-"""Energy of the three saddles of the potential: orbits below it that start inside stay there."""
+"""Energy of the three saddles of the potential: orbits of less energy between them are bounded."""
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -17,32 +14,22 @@ def hamiltonian(t0, t1, q0, p1, args):
     return (jnp.sum(p1**2) + jnp.sum(q0**2)) / 2 + x**2 * y - y**3 / 3
 
 
-energy = at_end(hamiltonian)
-
-
-check_start = Start("the Hénon–Heiles system is in the plane", (2,))
-
-
 def henon_heiles() -> Problem:
     """The Hénon–Heiles system on a regular orbit of energy 1/12; dimensionless.
 
-    Half the energy of escape: most orbits there are regular, and at 1/8 many are chaotic. Start
+    Half the escape energy: most orbits are regular; at 1/8 many are chaotic. Initial conditions
     and step are ours.
 
     **Source** Hénon & Heiles 1964, *Astron. J.* 69, 73.
     """
     y, py = 0.1, 0.2
     px = (2 * (1 / 12) - py**2 - y**2 + 2 * y**3 / 3) ** 0.5  # at x = 0, for energy 1/12
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("the Hénon–Heiles system is in the plane", (2,)),
         name="henon_heiles",
-        system=System(hamiltonian),
         q0=[0.0, y],
         p0=[px, py],
         h=0.1,
-        observables=named(energy),
-        units=DIMENSIONLESS,
         source="Hénon & Heiles 1964, Astron. J. 69, 73",
-        check=check_start,
-        invariants=("energy",),
-        symmetries={"time": time_translation()},
     )

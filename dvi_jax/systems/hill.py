@@ -1,12 +1,9 @@
-"""Hill's lunar problem: a satellite near a small body that goes about a large one far away."""
+"""Hill's lunar problem: a satellite of a small body that orbits a distant large one."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.library import time_translation
-from ._problem import Problem, at_end, named
-from ._start import Start
+from ._problem import DIMENSIONLESS, Problem, Start, library_problem
 from .kepler import angular_momentum
 from .restricted_three_body import velocity
 
@@ -19,7 +16,7 @@ def hamiltonian(t0, t1, q0, p1, args):
 
         H_D = |p1|²/2 − (x p_y − y p_x) − x² + y²/2 + z²/2 − 1/|q0|,    q0 = (x, y, z)
 
-    x away from the large body, y along the orbit; p = v + ẑ × q.
+    x points away from the large body, y along the orbit; p = v + ẑ × q.
     """
     x, y, z = q0
     tide = -(x**2) + (y**2 + z**2) / 2
@@ -27,46 +24,32 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 - (x * p1[1] - y * p1[0]) + tide - 1 / r
 
 
-energy = at_end(hamiltonian)
-
-
 def jacobi_constant(t0, t1, q0, p0, q1, p1, args):
-    """Γ = 3x² − z² + 2/r − |v|² at t1; below 3^(4/3) there is a way out past L1 and L2."""
+    """Γ = 3x² − z² + 2/r − |v|² at t1; the passages at L1 and L2 are open for Γ < 3^(4/3)."""
     v, r = velocity(q1, p1), jnp.sqrt(jnp.sum(q1**2))
     return 3 * q1[0] ** 2 - q1[2] ** 2 + 2 / r - jnp.sum(v**2)
 
 
-check_start = Start(
-    "Hill's problem has one body in space", (3,), singular={"the small body": (0, 0, 0)}
-)
-
-
 def hill() -> Problem:
-    r"""A satellite that goes about the small body at a third of the distance of L2, inclined.
+    r"""An inclined orbit about the small body at a third of the distance of L2.
 
     Unit of length: (m/M)^(1/3) times the distance of the two bodies of masses M ≫ m; of time: their
-    period over 2π. The limit μ → 0 of `restricted_three_body` with lengths over μ^(1/3). Start and
-    step are ours.
+    period over 2π. The limit μ → 0 of `restricted_three_body` with lengths over μ^(1/3). Initial
+    conditions and step are ours.
 
     **Source** Hill 1878, *Am. J. Math.* 1, 5; Szebehely 1967, *Theory of Orbits*, 10; scaled as
     in Hénon 1969, *Astron. Astrophys.* 1, 223.
     """
     x, speed = 0.23, 0.23**-0.5
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("Hill's problem has one body in space", (3,), singular={"the small body": (0, 0, 0)}),
         name="hill",
-        system=System(hamiltonian),
         q0=np.array([x, 0.0, 0.0]),
         p0=np.array([0.0, 0.95 * speed + x, 0.3 * speed]),
         h=0.005,
-        observables=named(energy, jacobi_constant, angular_momentum),
-        units={
-            "q": "(m/M)^(1/3) distances of the bodies",
-            "p": "1",
-            "t": "period/2π",
-            "energy": "1",
-        },
+        observables=[jacobi_constant, angular_momentum],
+        units=DIMENSIONLESS | {"q": "(m/M)^(1/3) distances of the bodies", "t": "period/2π"},
         source="Hill 1878, Am. J. Math. 1, 5; Hénon 1969, Astron. Astrophys. 1, 223",
-        check=check_start,
-        invariants=("energy", "jacobi_constant"),
-        symmetries={"time": time_translation()},
+        invariants=("jacobi_constant",),
     )

@@ -1,12 +1,10 @@
-"""The Kepler problem in the plane, disturbed by −εq."""
+"""The Kepler problem in the plane with the perturbing force −εq."""
 
 import jax.numpy as jnp
 from jax import lax
 
-from .._system import System
-from ..discover.library import rotation, scaling, time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named, over_times
-from ._start import Start, positive
+from ..discover.library import rotation, scaling
+from ._problem import Parameter, Problem, Start, library_problem, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -17,9 +15,6 @@ def hamiltonian(t0, t1, q0, p1, args):
 def linear_force(t0, t1, q0, p1, args):
     """W = −q0 (the paper, before (44))."""
     return -q0
-
-
-energy = at_end(hamiltonian)
 
 
 def mixed_energy(t0, t1, q0, p0, q1, p1, args):
@@ -34,18 +29,14 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
 
 @over_times((2,))
 def exact(t, q0, p0, args):
-    r"""The body at times t of one on an ellipse that is at (q0, p0) at t = 0, ε = 0.
+    r"""The state at times t on an ellipse at ε = 0.
 
         q = f q0 + g p0,    f = 1 − a (1 − cos x)/r0,  g = t − (x − sin x)/n,    n = K/a^(3/2)
 
-    with x the growth of the eccentric anomaly, n t = x − e cos E0 sin x + e sin E0 (1 − cos x),
-    solved by Newton's method.
-
-    - `t`: times, any shape. `q0`, `p0`: shape (2,). Returns q, p of shape t.shape + (2,).
-
-    NaN for a body that escapes, of energy ≥ 0. Elsewhere, on a circle too, it carries gradients in
-    t, q0, p0 and K. **Source** Danby 1988, *Fundamentals of Celestial
-    Mechanics*, 6.
+    with x the increase of the eccentric anomaly, n t = x − e cos E0 sin x + e sin E0 (1 − cos x),
+    solved by Newton's method. NaN for an unbound orbit, of energy ≥ 0. Elsewhere, also on a circle,
+    differentiable in t, q0, p0 and K.
+    **Source** Danby 1988, *Fundamentals of Celestial Mechanics*, 6.
     """
     mu, r0 = args["K"] ** 2, jnp.sqrt(jnp.sum(q0**2))
     inverse = 2 / r0 - jnp.sum(p0**2) / mu
@@ -55,7 +46,7 @@ def exact(t, q0, p0, args):
     ec, es = 1 - r0 / a, jnp.sum(q0 * p0) / jnp.sqrt(mu * a)
     whole = jnp.round(n * t / (2 * jnp.pi))
     mean = n * t - 2 * jnp.pi * whole
-    # Only the first guess goes by E0 and e themselves, which mean nothing on a circle.
+    # Only the first guess uses E0 and e, which are not differentiable on a circle.
     x = lax.stop_gradient(_first_guess(mean, ec, es))
     for _ in range(12):
         past = x - ec * jnp.sin(x) + es * (1 - jnp.cos(x)) - mean
@@ -67,40 +58,33 @@ def exact(t, q0, p0, args):
 
 
 def _first_guess(mean, ec, es):
-    """Growth of the eccentric anomaly from which Newton's method never fails."""
+    """Increase of the eccentric anomaly from which Newton's method converges."""
     E0, e = jnp.arctan2(es, ec), jnp.sqrt(ec**2 + es**2)
     M = mean + E0 - es
-    # on the side of M where the equation is convex towards its root
+    # On this side of M the equation is convex towards its root.
     return M + 0.85 * e * jnp.sign(jnp.sin(M)) - E0
 
 
-check_start = Start(
-    "the Kepler problem is in the plane (for more dimensions or bodies take the system n_body)",
-    (2,),
-    {"K": positive},
-    singular={"the centre": (0, 0)},
-)
-
-
 def kepler() -> Problem:
-    """The paper's Kepler problem with its start and h = 0.1; dimensionless, K = 1."""
-    return Problem(
+    """The paper's Kepler problem with its initial conditions and h = 0.1; dimensionless, K = 1."""
+    return library_problem(
+        hamiltonian,
+        Start(
+            "the Kepler problem is in the plane (for more dimensions or bodies take n_body)",
+            (2,),
+            singular={"the centre": (0, 0)},
+        ),
         name="kepler",
-        system=System(hamiltonian, force=linear_force),
         q0=[0.0, 1.2],
         p0=[-1.0, -0.6],
         h=0.1,
-        args={"K": 1.0},
-        observables=named(energy, mixed_energy, angular_momentum),
-        units=DIMENSIONLESS,
-        source="the paper, Section 5.2",
-        check=check_start,
-        parameters={"K": "root of the strength of attraction, K² = GM [length^(3/2)/time]"},
-        invariants=("energy", "angular_momentum"),
-        symmetries={
-            "time": time_translation(),
-            "rotation": rotation(),
-            "scaling": scaling(q=1.0, p=-0.5, t=1.5),
+        parameters={
+            "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]"),
         },
+        force=linear_force,
+        observables=[mixed_energy, angular_momentum],
+        source="the paper, Section 5.2",
+        invariants=("angular_momentum",),
+        symmetries={"rotation": rotation(), "scaling": scaling(q=1.0, p=-0.5, t=1.5)},
         exact=exact,
     )

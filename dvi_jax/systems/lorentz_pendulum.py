@@ -1,12 +1,18 @@
-"""A pendulum whose string is slowly drawn in and let out: Lorentz's question at Solvay, 1911."""
+"""A pendulum of slowly changing length: Lorentz's question at the Solvay congress, 1911."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
 from ._elliptic import swing
-from ._problem import Adiabatic, InSlowTime, Problem, at_end, named
-from ._start import Start, between, positive
+from ._problem import (
+    Adiabatic,
+    Parameter,
+    Problem,
+    Start,
+    at_end,
+    between,
+    library_problem,
+)
 from .pendulum import exact as of_pendulum
 
 
@@ -18,7 +24,7 @@ def length(tau, args):
 def hamiltonian(t0, t1, q0, p1, args):
     """H_D = p1²/(2 m l²) − m g l cos q0 with l = l(τ0); the times are slow ones, τ = εt.
 
-    The radial motion of the bob, m l̇²/2, depends on time alone and is left out.
+    The radial energy of the bob, m l̇²/2, depends on time only and is omitted.
     """
     m, g, string = args["mass"], args["g"], length(t0, args)
     return jnp.sum(p1**2) / (2 * m * string**2) - m * g * string * jnp.sum(jnp.cos(q0))
@@ -28,12 +34,12 @@ energy = at_end(hamiltonian)
 
 
 def action(t0, t1, q0, p0, q1, p1, args):
-    r"""The adiabatic invariant at the end of the step, of a swing of any size (m < 1).
+    r"""The adiabatic invariant at the end of the step, for librations of any amplitude (m < 1).
 
         J = ∮ p dq/2π = (8/π) M l √(gl) (E(m) − (1 − m) K(m)),
         m = sin²(q/2) + p²/(4 M² g l³)
 
-    with M the mass and l = l(τ1). For small swings J = (E + M g l)/√(g/l), Lorentz's and
+    with M the mass and l = l(τ1). For small amplitudes J = (E + M g l)/√(g/l), Lorentz's and
     Einstein's E/ν.
     """
     mass, g, string = args["mass"], args["g"], length(t1, args)
@@ -42,54 +48,47 @@ def action(t0, t1, q0, p0, q1, p1, args):
 
 
 def small_swing_action(t0, t1, q0, p0, q1, p1, args):
-    """(E + M g l)/√(g/l) at the end of the step: adiabatic only for swings that are small."""
+    """(E + M g l)/√(g/l) at the end of the step: adiabatic for small amplitudes only."""
     string = length(t1, args)
     above = energy(t0, t1, q0, p0, q1, p1, args) + args["mass"] * args["g"] * string
     return above * jnp.sqrt(string / args["g"])
 
 
 def exact(t, q0, p0, args):
-    """The state at times t at ε = 0, where l = l0 for ever: see `pendulum.exact`."""
+    """The state at times t at ε = 0, where l = l0: see `pendulum.exact`."""
     m, g, string = args["mass"], args["g"], args["length"]
     inertia = m * string**2
     q, rate = of_pendulum(t, q0, jnp.asarray(p0) / inertia, {"omega": jnp.sqrt(g / string)})
     return q, inertia * rate
 
 
-check_start = Start(
-    "Lorentz's pendulum is one angle",
-    (1,),
-    {"mass": positive, "g": positive, "length": positive, "depth": between(-1, 1)},
-)
-
-
 def lorentz_pendulum() -> Problem:
-    """The pendulum of one metre and one kilogram, l = l0 (1 + d sin εt), swinging to 1 rad.
+    """The pendulum of one metre and one kilogram, l = l0 (1 + d sin εt), from rest at 1 rad.
 
-    d = 0.3 (`depth` in args); ε [1/s] is the rate of the phase of that change. Start and step
-    are ours.
+    d = 0.3 (`depth` in args); ε [1/s] is the angular frequency of the change. Initial conditions
+    and step are ours.
 
     **Source** Solvay congress 1911 (Langevin & de Broglie 1912, *La théorie du rayonnement et les
     quanta*, p. 450); action: Landau & Lifshitz 1976, *Mechanics*, §49.
     """
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("Lorentz's pendulum is one angle", (1,)),
         name="lorentz_pendulum",
-        system=System(hamiltonian, slow_time=True),
         q0=np.array([1.0]),
         p0=np.array([0.0]),
         h=0.02,
-        args={"mass": 1.0, "g": 9.81, "length": 1.0, "depth": 0.3},
-        observables=named(InSlowTime(energy), InSlowTime(action), InSlowTime(small_swing_action)),
+        parameters={
+            "mass": Parameter(1.0, "of the bob [kg]"),
+            "g": Parameter(9.81, "gravity [m/s²]"),
+            "length": Parameter(1.0, "mean length of the string [m]"),
+            "depth": Parameter(0.3, "relative change of the length [1]", between(-1, 1)),
+        },
+        slow_time=True,
+        observables=[action, small_swing_action],
         units={"q": "rad", "p": "kg m²/s", "t": "s", "energy": "J"},
         source="Langevin & de Broglie 1912, La théorie du rayonnement et les quanta, p. 450",
-        check=check_start,
-        parameters={
-            "mass": "of the bob [kg]",
-            "g": "gravity [m/s²]",
-            "length": "mean length of the string [m]",
-            "depth": "relative change of the length [1]",
-        },
-        invariants=("energy", "action", "small_swing_action"),
+        invariants=("action", "small_swing_action"),
         adiabatic={"action": Adiabatic("rate of the change over the frequency", 1)},
         exact=exact,
     )

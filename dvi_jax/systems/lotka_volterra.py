@@ -1,18 +1,15 @@
-r"""Prey and predators of Lotka and Volterra, canonical in the logarithms of their numbers.
+r"""Prey and predators of Lotka and Volterra, canonical in logarithmic populations.
 
     dx/dt = x (α − β y),    dy/dt = y (δ x − γ)
 
-In x and y the structure is that of the bracket {x, y} = xy. With q = ln x and p = ln y it is the
-canonical one, and every map here keeps the numbers positive.
+The system is Hamiltonian with the bracket {x, y} = xy, which is canonical in q = ln x and p = ln y.
+Every map then leaves the populations positive.
 """
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.library import time_translation
-from ._problem import Problem, at_end, named
-from ._start import Start, positive
+from ._problem import Parameter, Problem, Start, library_problem
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -21,23 +18,20 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(alpha * p1 - beta * jnp.exp(p1) + gamma * q0 - delta * jnp.exp(q0))
 
 
-energy = at_end(hamiltonian)
-
-
 def populations(t0, t1, q0, p0, q1, p1, args):
-    """Numbers (x, y) of prey and predators at t1, shape (2,) + q.shape."""
+    """Populations (x, y) of prey and predators at t1, shape (2,) + q.shape."""
     return jnp.stack(to_populations(q1, p1))
 
 
 def to_populations(q, p):
-    """Numbers x = exp q of prey and y = exp p of predators; any shapes."""
+    """Populations x = exp q of prey and y = exp p of predators; any shapes."""
     return jnp.exp(jnp.asarray(q)), jnp.exp(jnp.asarray(p))
 
 
 def from_populations(x, y):
-    """q = ln x and p = ln y of numbers of prey and predators, NumPy; any shapes.
+    """q = ln x and p = ln y of populations of prey and predators, NumPy; any shapes.
 
-    **Raises** `ValueError` for numbers that are not positive: none are left, and none come.
+    **Raises** `ValueError` for populations that are not positive.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     for name, number in (("prey", x), ("predators", y)):
@@ -47,47 +41,34 @@ def from_populations(x, y):
 
 
 def equilibrium(args):
-    """Numbers (γ/δ, α/β) at which nothing changes; small swings about it have the period
-    2π/√(αγ).
-    """
+    """The equilibrium (γ/δ, α/β); small oscillations about it have the period 2π/√(αγ)."""
     return args["gamma"] / args["delta"], args["alpha"] / args["beta"]
 
 
-check_start = Start(
-    "prey and predators are one logarithm each",
-    (1,),
-    {"alpha": positive, "beta": positive, "gamma": positive, "delta": positive},
-)
-
-
 def lotka_volterra() -> Problem:
-    """Hares and lynxes of the Hudson's Bay Company, in thousands and years.
+    """Hares and lynxes of the Hudson's Bay Company, in thousands and years; one cycle: 9.9 years.
 
-    Rates and the start of 33.9 and 5.9 thousand are ours, of the size that fits to the pelts of
-    1900–1920 have given (as Carpenter 2018, *Predator–Prey Population Dynamics: the Lotka–Volterra
-    model in Stan*); one cycle takes 9.9 years.
+    Rates and the initial 33.9 and 5.9 thousand are ours, close to fits to the pelts of 1900–1920
+    (Carpenter 2018, *Predator–Prey Population Dynamics: the Lotka–Volterra model in Stan*).
 
     **Source** Lotka 1925, *Elements of Physical Biology*; Volterra 1926, *Mem. Acad. Lincei Roma*
     2, 31; canonical form: Hairer, Lubich & Wanner 2006, I.1.1 and VII.2.
     """
     q0, p0 = from_populations([33.9], [5.9])
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("prey and predators are one logarithm each", (1,)),
         name="lotka_volterra",
-        system=System(hamiltonian),
         q0=q0,
         p0=p0,
         h=0.05,
-        args={"alpha": 0.55, "beta": 0.028, "gamma": 0.84, "delta": 0.026},
-        observables=named(energy, populations),
+        parameters={
+            "alpha": Parameter(0.55, "growth of prey [1/year]"),
+            "beta": Parameter(0.028, "prey eaten, for each predator [1/(year thousand)]"),
+            "gamma": Parameter(0.84, "death of predators [1/year]"),
+            "delta": Parameter(0.026, "growth of predators, for each prey [1/(year thousand)]"),
+        },
+        observables=[populations],
         units={"q": "ln(thousands)", "p": "ln(thousands)", "t": "year", "energy": "1/year"},
         source="Volterra 1926, Mem. Acad. Lincei Roma 2, 31; Hairer, Lubich & Wanner 2006, I.1.1",
-        check=check_start,
-        parameters={
-            "alpha": "growth of prey [1/year]",
-            "beta": "prey eaten, for each predator [1/(year thousand)]",
-            "gamma": "death of predators [1/year]",
-            "delta": "growth of predators, for each prey [1/(year thousand)]",
-        },
-        invariants=("energy",),
-        symmetries={"time": time_translation()},
     )

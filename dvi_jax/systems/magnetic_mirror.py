@@ -2,11 +2,9 @@
 
 import jax.numpy as jnp
 
-from .._system import System
-from ..discover.library import rotation, time_translation
+from ..discover.library import rotation
 from . import _guiding_centre as guiding_centre
-from ._problem import DIMENSIONLESS, Adiabatic, Problem, at_end, named
-from ._start import Start, finite, gyrates, positive
+from ._problem import Parameter, Problem, Start, at_end, finite, gyrates, library_problem, positive
 
 
 def vector_potential(q, args):
@@ -23,7 +21,7 @@ def magnetic_field(q, args):
 
         B = B0 (−x z/ℓ², −y z/ℓ², 1 + z²/ℓ²)
 
-    Its divergence is zero everywhere; its curl is not, so currents flow where the particle is.
+    Its divergence is zero everywhere; its curl is not, so that currents flow where the particle is.
     """
     x, y, z = q
     square = args["length"] ** 2
@@ -37,7 +35,7 @@ energy = at_end(hamiltonian)
 
 
 def canonical_angular_momentum(t0, t1, q0, p0, q1, p1, args):
-    """p_φ = x p_y − y p_x at t1, which turns about the axis keep."""
+    """p_φ = x p_y − y p_x at t1, conserved by the rotational symmetry about the axis."""
     return q1[0] * p1[1] - q1[1] * p1[0]
 
 
@@ -67,23 +65,14 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
     return guiding_centre.bounce_action(strength, arc, far, E, mu, m)
 
 
-check_start = Start(
-    "the magnetic mirror holds one particle in space",
-    (3,),
-    {"mass": positive, "length": positive, "charge": gyrates, "B0": gyrates},
-)
-
-
 def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
     """A particle that bounces in B = B0 (1 + z²/ℓ²) on the axis; dimensionless.
 
     e = m = B0 = 1: gyroradius and gyrofrequency 1 at the start, on the middle plane with its
     guiding centre at (`distance`, 0, 0). With v_{∥} = 0.8 v_{⊥} it turns where |B| is 1.64 times
-    that, near z = 0.8 ℓ. Field, start and step are ours.
+    that, near z = 0.8 ℓ. Field, initial conditions and step are ours.
 
     - `length`: ℓ, and `distance` from the axis, both over the gyroradius.
-
-    - args: `charge` e, `mass` m, `B0`, `length` ℓ.
 
     **Raises** `ValueError` for a length that is not positive, or a distance that is not finite.
 
@@ -92,37 +81,24 @@ def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
     """
     length, distance = positive("length", length), finite("distance", distance)
     x, vy, vz = distance + 1, -1.0, 0.8
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("the magnetic mirror holds one particle in space", (3,)),
         name="magnetic_mirror",
-        system=System(hamiltonian),
         q0=[x, 0.0, 0.0],
         p0=[0.0, vy + x / 2, vz],  # A = (0, x/2, 0) there
         h=0.1,
-        args={"charge": 1.0, "mass": 1.0, "B0": 1.0, "length": length},
-        observables=named(
-            energy, canonical_angular_momentum, magnetic_moment, corrected_moment, bounce_action
-        ),
-        units=DIMENSIONLESS,
-        source="our own choice of field; Northrop 1963, The Adiabatic Motion of Charged Particles",
-        check=check_start,
         parameters={
-            "charge": "e [charge]",
-            "mass": "m [mass]",
-            "B0": "field in the middle [mass/(charge time)]",
-            "length": "ℓ, over which it doubles along the axis [length]",
+            **guiding_centre.PARTICLE,
+            "B0": Parameter(1.0, "field in the middle [mass/(charge time)]", gyrates),
+            "length": Parameter(length, "ℓ, over which it doubles along the axis [length]"),
         },
-        invariants=("energy", "canonical_angular_momentum"),
-        adiabatic={
-            name: Adiabatic(
-                "gyroradius over ℓ",
-                power,
-                smaller=lambda factor: magnetic_mirror(length / factor, distance / factor),
-            )
-            for name, power in (
-                ("magnetic_moment", 1),
-                ("corrected_moment", 2),
-                ("bounce_action", 2),
-            )
-        },
-        symmetries={"time": time_translation(), "rotation": rotation(0, 1)},
+        observables=[canonical_angular_momentum, magnetic_moment, corrected_moment, bounce_action],
+        source="our own choice of field; Northrop 1963, The Adiabatic Motion of Charged Particles",
+        invariants=("canonical_angular_momentum",),
+        adiabatic=guiding_centre.adiabatic(
+            "gyroradius over ℓ",
+            lambda factor: magnetic_mirror(length / factor, distance / factor),
+        ),
+        symmetries={"rotation": rotation(0, 1)},
     )

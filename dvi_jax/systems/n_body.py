@@ -1,6 +1,6 @@
 """Bodies that attract one another by Newton's law."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,13 +9,12 @@ import numpy as np
 from .._system import System
 from ..discover.generators import Generator
 from ..discover.library import rotation, scaling, space_translation, time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
-from ._start import check_parameter, finite, parameter
+from ._problem import DIMENSIONLESS, Problem, at_end, check_parameter, finite, parameter
 
 _PLACE, _SPEED = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
 EIGHT_POSITIONS = np.array([_PLACE, -_PLACE, np.zeros(2)])
 EIGHT_MOMENTA = np.array([-_SPEED / 2, -_SPEED / 2, _SPEED])
-"""The start of the figure eight: `figure_eight`."""
+"""Initial conditions of the figure eight: see `figure_eight`."""
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -28,7 +27,7 @@ def hamiltonian(t0, t1, q0, p1, args):
       GM [length³/time²] and G = 1 momenta and energy carry one factor G more, and the orbits
       are the same.
 
-    Two bodies in one place give −∞ here and NaN in the step, hence the status `not_finite`.
+    Two bodies at one point give −∞ here and NaN in the step, hence the status `not_finite`.
 
     **Raises** `ValueError` when the shapes of q0 and masses do not agree.
     """
@@ -69,18 +68,22 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     return jnp.sum(jnp.cross(q1, p1), axis=0)
 
 
-OBSERVABLES = named(energy, linear_momentum, angular_momentum)
+OBSERVABLES: dict[str, Callable[..., Any]] = {
+    "energy": energy,
+    "linear_momentum": linear_momentum,
+    "angular_momentum": angular_momentum,
+}
 
 
 def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None) -> None:
-    """A start that the N-body Hamiltonian can go on from, or an error that names the bodies.
+    """Require initial conditions that the N-body Hamiltonian is regular at.
 
     Arguments as in `hamiltonian`, with values (not under jit); `names` of the bodies for the
     message, else their indices.
 
     **Raises** `ValueError` for shapes that do not agree, a mass that is not positive (its
-    momentum would fix no velocity), a G that is not finite, and two bodies closer than the rounding
-    of their positions.
+    momentum would determine no velocity), a G that is not finite, and two bodies closer than the
+    rounding of their positions.
     """
     q, p = np.asarray(q0, float), np.asarray(p0, float)
     masses = np.asarray(parameter(args, "masses"), float)
@@ -115,16 +118,16 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
         a, b = int(i[0]), int(j[0])
         raise ValueError(
             f"{called(a)} and {called(b)} are on top of one another, at {q[a].tolist()}: their "
-            "attraction is infinite. Every two bodies must start apart."
+            "attraction is infinite. No two bodies may start at one point."
         )
 
 
 PARAMETERS = {"masses": "of the bodies [mass]", "G": "gravity [length³/(mass time²)]"}
-INVARIANTS = ("energy", "linear_momentum", "angular_momentum")
+INVARIANTS = tuple(OBSERVABLES)
 
 
 def symmetries(dim: int) -> dict[str, Generator]:
-    """Those of Newton and Galilei in `dim` dimensions, and the scaling of Kepler's third law."""
+    """Galilean symmetries in `dim` dimensions, and the scaling of Kepler's third law."""
     axes = "xyz"[:dim]
     found = {"time": time_translation(), "scaling": scaling(q=1.0, p=-0.5, t=1.5)}
     for i, x in enumerate(axes):
@@ -150,21 +153,20 @@ def _boost(direction):
 def n_body(
     masses: Any = None, q0: Any = None, p0: Any = None, h: float = 0.01, G: float = 1.0
 ) -> Problem:
-    """N bodies with the given masses and start; the figure eight of three when left out.
+    """N bodies with the given masses and initial conditions; by default the figure eight of three.
 
     - `masses`: shape (bodies,). `q0`: positions, `p0`: momenta, shape (bodies, 2 or 3).
-    - `h`: a step size that suits the start [time]. `G`: the gravitational constant.
+    - `h`: a suitable step size [time]. `G`: the gravitational constant.
 
-    **Raises** `ValueError` for a start that `check_bodies` refuses, `TypeError` when only some
-    of masses, q0 and p0 are given.
+    **Raises** `ValueError` for initial conditions that `check_bodies` rejects, `TypeError` when
+    only some of masses, q0 and p0 are given.
 
     **Source** figure eight: see `figure_eight`.
     """
-    given = [x is not None for x in (masses, q0, p0)]
-    if any(given) and not all(given):
-        raise TypeError("n_body takes masses, q0 and p0 together, or none of them.")
-    if masses is None or q0 is None or p0 is None:
+    if masses is None and q0 is None and p0 is None:
         masses, q0, p0 = np.ones(3), EIGHT_POSITIONS, EIGHT_MOMENTA
+    if masses is None or q0 is None or p0 is None:
+        raise TypeError("n_body takes masses, q0 and p0 together, or none of them.")
     args = {"masses": np.asarray(masses, float), "G": finite("G", G)}
     check_bodies(q0, p0, args)
     return Problem(

@@ -2,18 +2,15 @@ r"""The discrete nonlinear Schrödinger equation on a ring of sites.
 
     i dψ_n/dt = −κ (ψ_{n+1} − 2ψ_n + ψ_{n−1}) − γ |ψ_n|² ψ_n,    ψ = (q + i p)/√2
 
-q and p, real and imaginary part, are canonical. (The integrable lattice of Ablowitz and Ladik is so
-in a bracket of its own only, and is not here.)
+q and p, real and imaginary part, are canonical. (The integrable lattice of Ablowitz and Ladik is
+canonical in another bracket only.)
 """
 
 import jax.numpy as jnp
 import numpy as np
 
 from .._checks import whole
-from .._system import System
-from ..discover.library import time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
-from ._start import Start, finite
+from ._problem import Parameter, Problem, Start, finite, library_problem
 from .oscillator import PHASE
 
 
@@ -26,16 +23,13 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(args["kappa"] / 2 * steps - args["gamma"] / 8 * (q0**2 + p1**2) ** 2)
 
 
-energy = at_end(hamiltonian)
-
-
 def norm(t0, t1, q0, p0, q1, p1, args):
-    """Σ|ψ_n|² = Σ (q² + p²)/2 at t1: the number of particles, which turns of phase keep."""
+    """Σ|ψ_n|² = Σ (q² + p²)/2 at t1: the number of particles, conserved by phase symmetry."""
     return jnp.sum(q1**2 + p1**2) / 2
 
 
 def densities(t0, t1, q0, p0, q1, p1, args):
-    """|ψ_n|² at t1, shape (n,): how they spread."""
+    """|ψ_n|² at t1, shape (n,)."""
     return (q1**2 + p1**2) / 2
 
 
@@ -46,11 +40,11 @@ def plane_wave(t, n, mode, amplitude, args):
 
     - `t`: times, any shape. Returns q, p of shape t.shape + (n,).
 
-    A modulation of it with wave number Q ≠ 0, a multiple of 2π/n, grows as exp(σt),
+    A modulation with wave number Q ≠ 0, a multiple of 2π/n, grows as exp(σt),
 
         σ² = 4κ cos k sin²(Q/2) (2γa² − 4κ cos k sin²(Q/2)) ,
 
-    where that is positive: for κγ cos k > 0 and |γ|a² > 2|κ cos k| sin²(Q/2); else none grows.
+    where that is positive: for κγ cos k > 0 and |γ|a² > 2|κ cos k| sin²(Q/2).
 
     **Source** Kivshar and Peyrard 1992, Phys. Rev. A 46, 3198; Kevrekidis 2009, *The Discrete
     Nonlinear Schrödinger Equation*.
@@ -61,18 +55,10 @@ def plane_wave(t, n, mode, amplitude, args):
     return np.sqrt(2) * amplitude * jnp.cos(angle), np.sqrt(2) * amplitude * jnp.sin(angle)
 
 
-check_start = Start(
-    "the lattice is a ring of at least three sites",
-    (None,),
-    {"kappa": finite, "gamma": finite},
-    least=3,
-)
-
-
 def nls_lattice(n: int = 8) -> Problem:
-    """A hump on a ring of n sites that attracts itself, and moves; dimensionless.
+    """A moving localised excitation on a focusing ring of n sites; dimensionless.
 
-    κ = γ = 1. Start and step are ours.
+    κ = γ = 1. Initial conditions and step are ours.
 
     **Raises** `ValueError` for fewer than three sites.
 
@@ -82,22 +68,21 @@ def nls_lattice(n: int = 8) -> Problem:
     site = np.arange(n) - n / 2
     size, phase = 1 / np.cosh(site / 1.5), 0.5 * site
     q0, p0 = size * np.cos(phase), size * np.sin(phase)
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("the lattice is a ring of at least three sites", (None,), least=3),
         name="nls_lattice",
-        system=System(hamiltonian),
         q0=q0,
         p0=p0,
         h=0.02,
-        args={"kappa": 1.0, "gamma": 1.0},
-        observables=named(energy, norm, densities),
-        units=DIMENSIONLESS,
-        source="Kevrekidis 2009, The Discrete Nonlinear Schrödinger Equation",
-        check=check_start,
         parameters={
-            "kappa": "coupling of neighbours [1/time]",
-            "gamma": "attraction on a site, negative for repulsion [1/time]",
+            "kappa": Parameter(1.0, "coupling of neighbours [1/time]", finite),
+            "gamma": Parameter(
+                1.0, "attraction on a site, negative for repulsion [1/time]", finite
+            ),
         },
-        invariants=("energy", "norm"),
-        symmetries={"time": time_translation()},
+        observables=[norm, densities],
+        source="Kevrekidis 2009, The Discrete Nonlinear Schrödinger Equation",
+        invariants=("norm",),
         flow_symmetries={"phase": PHASE},
     )

@@ -1,15 +1,13 @@
-"""The simple harmonic oscillator, disturbed by −εq."""
+"""The simple harmonic oscillator with the perturbing force −εq."""
 
 import jax.numpy as jnp
 
-from .._system import System
 from ..discover.generators import Generator
-from ..discover.library import scaling, time_translation
-from ._problem import Problem, at_end, named, over_times
-from ._start import Start
+from ..discover.library import scaling
+from ._problem import Problem, Start, at_end, library_problem, over_times
 
 PHASE = Generator(xi=lambda t, q, p, args: p, eta=lambda t, q, p, args: -q)
-"""The turn of the phase plane, ξ = p, η = −q: the flow of the oscillator itself."""
+"""The rotation of the phase plane, ξ = p, η = −q: the flow of the oscillator."""
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -18,7 +16,7 @@ def hamiltonian(t0, t1, q0, p1, args):
 
 
 def linear_force(t0, t1, q0, p1, args):
-    """W = −q0: the disturbance F(q) = −εq of the paper's Section 5.1 (its text prints εq)."""
+    """W = −q0: the perturbing force F(q) = −εq of the paper's Section 5.1 (printed as εq)."""
     return -q0
 
 
@@ -31,7 +29,7 @@ def mixed_energy(t0, t1, q0, p0, q1, p1, args):
 
 
 def map_invariant(t0, t1, q0, p0, q1, p1, args):
-    """(|p|² + |q|² − h q·p)/2 at t1: what the undisturbed map keeps exactly (h = t1 − t0).
+    """(|p|² + |q|² − h q·p)/2 at t1, an exact invariant of the unperturbed map (h = t1 − t0).
 
     Our own: the map is linear with matrix M, and MᵀSM = S for S = [[1, −h/2], [−h/2, 1]].
     """
@@ -40,31 +38,25 @@ def map_invariant(t0, t1, q0, p0, q1, p1, args):
 
 @over_times()
 def exact(t, q0, p0, args):
-    """The state at times t at ε = 0: (q, p) turned clockwise by t.
-
-    - `t`: times, any shape. `q0`, `p0`: any one shape. Returns q, p of shape t.shape + q0.shape.
-    """
+    """The state at times t at ε = 0: (q, p) rotated clockwise by t; q0 and p0 of any one shape."""
     c, s = jnp.cos(t), jnp.sin(t)
     return q0 * c + p0 * s, p0 * c - q0 * s
 
 
-check_start = Start("the oscillator is of any dimension", None)
-
-
 def oscillator() -> Problem:
-    """The paper's oscillator with its start (0.01, 0.01) and h = 0.1; dimensionless."""
-    return Problem(
+    """The paper's oscillator from q = p = 0.01 with h = 0.1; dimensionless."""
+    return library_problem(
+        hamiltonian,
+        Start("the oscillator is of any dimension", None),
         name="oscillator",
-        system=System(hamiltonian, force=linear_force),
         q0=[0.01],
         p0=[0.01],
         h=0.1,
-        observables=named(energy, mixed_energy, map_invariant),
+        force=linear_force,
+        observables=[mixed_energy, map_invariant],
         units={"q": "1", "p": "1", "t": "1/ω", "energy": "1"},
         source="the paper, Section 5.1",
-        check=check_start,
-        invariants=("energy",),
-        symmetries={"time": time_translation(), "scaling": scaling()},
+        symmetries={"scaling": scaling()},
         flow_symmetries={"phase": PHASE},
         exact=exact,
     )

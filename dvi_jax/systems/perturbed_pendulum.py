@@ -1,11 +1,8 @@
-"""A pendulum disturbed by a Hamiltonian that couples position, momentum and time."""
+"""A pendulum with a Hamiltonian perturbation that couples position, momentum and time."""
 
 import jax.numpy as jnp
 
-from .._system import System
-from ..discover.library import time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
-from ._start import Start
+from ._problem import Problem, Start, library_problem
 from .pendulum import exact as of_pendulum
 
 
@@ -19,36 +16,27 @@ def coupling(t0, t1, q0, p1, args):
     return -jnp.sum(q0 * p1) * jnp.sin(t0)
 
 
-energy = at_end(hamiltonian)
-
-
 def exact(t, q0, p0, args):
-    """The pendulum alone at times t, ε = 0: see `pendulum.exact`."""
+    """The state at times t at ε = 0: see `pendulum.exact`."""
     return of_pendulum(t, q0, p0, {"omega": 1.0})
 
 
-check_start = Start("the perturbed pendulum is one pendulum", (1,))
-
-
 def perturbed_pendulum() -> Problem:
-    """H = p²/2 − cos q − ε q p sin t, librating; dimensionless. Start and step are ours.
+    """H = p²/2 − cos q − ε q p sin t in a libration; dimensionless.
 
-    The disturbance derives from a Hamiltonian, so the map stays symplectic at every ε; it
-    depends on p, so every variational step is implicit.
+    The perturbation is Hamiltonian, so that the map is symplectic at every ε; it depends on p, so
+    that every variational step is implicit. Perturbation, initial conditions and step are ours.
 
-    **Source** the pendulum: any text; the disturbance is a test problem with all three couplings.
+    **Source** the pendulum: any text.
     """
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("the perturbed pendulum is one pendulum", (1,)),
         name="perturbed_pendulum",
-        system=System(hamiltonian, perturbation=coupling),
         q0=[0.5],
         p0=[0.3],
         h=0.1,
-        observables=named(energy),
-        units=DIMENSIONLESS,
+        perturbation=coupling,
         source="our own choice",
-        check=check_start,
-        invariants=("energy",),
-        symmetries={"time": time_translation()},
         exact=exact,
     )

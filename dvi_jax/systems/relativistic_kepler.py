@@ -1,19 +1,17 @@
-"""The Kepler problem with the kinetic energy of special relativity, whose ellipse turns."""
+"""The Kepler problem with the kinetic energy of special relativity: a precessing ellipse."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.library import rotation, time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
-from ._start import Start, positive
+from ..discover.library import rotation
+from ._problem import Parameter, Problem, Start, at_end, library_problem
 from .kepler import angular_momentum
 
 
 def hamiltonian(t0, t1, q0, p1, args):
     """H_D = √(c⁴ + c²|p1|²) − c² − K²/|q0|, unit mass; separable."""
     square = jnp.sum(p1**2)
-    # √(…) − c² without its cancellation
+    # √(…) − c² without cancellation
     kinetic = square / (1 + jnp.sqrt(1 + square / args["c"] ** 2))
     return kinetic - args["K"] ** 2 / jnp.sqrt(jnp.sum(q0**2))
 
@@ -22,13 +20,12 @@ energy = at_end(hamiltonian)
 
 
 def precession(q, p, args):
-    r"""Angle by which the perihelion advances from one to the next, exact [rad], positive in the
-    sense of the motion, whichever that is.
+    r"""Exact advance of the perihelion per revolution [rad], positive in the sense of the motion.
 
         Δ = 2π (1/Γ − 1),    Γ² = 1 − K⁴/(c² L²),    L = q × p
 
     For the orbit 1/r = C (1 + e cos Γ(θ − θ0)). To first order in 1/c² it is πK⁴/(c²L²), a sixth
-    of what general relativity gives. NaN where K² > c L: the orbit then falls into the centre.
+    of the value of general relativity. NaN for K² > c L: the orbit then reaches the centre.
 
     **Source** Sommerfeld 1916, *Ann. Phys.* 356, 1; Landau & Lifshitz, *The Classical Theory of
     Fields*, §39.
@@ -41,11 +38,11 @@ def perihelion_angle(t0, t1, q0, p0, q1, p1, args):
     r"""Direction of the perihelion at t1 [rad], between −π and π, which advances steadily.
 
         The orbit has dr/dθ and 1/r with e cos ψ = 1/(Cr) − 1 and e sin ψ = p_r/(LΓC),
-        ψ = Γ(θ − θ0),  C = K² (E + c²)/(c² L² Γ²);  the perihelion passed last, or the one to
-        come, whichever is nearer, lies at θ0 = θ − ψ/Γ, |ψ| ≤ π
+        ψ = Γ(θ − θ0),  C = K² (E + c²)/(c² L² Γ²);  the nearest perihelion, the last or the
+        next, is at θ0 = θ − ψ/Γ, |ψ| ≤ π
 
-    It is constant but for a jump at each aphelion in the sense of the motion: by `precession` where
-    L > 0, by minus as much where L < 0.
+    Constant except for a jump at each aphelion, by `precession` for L > 0 and by −`precession` for
+    L < 0.
     """
     r = jnp.sqrt(jnp.sum(q1**2))
     L = angular_momentum(t0, t1, q0, p0, q1, p1, args)
@@ -62,42 +59,36 @@ def _misses_the_centre(q, p, args):
     if abs(L) * args["c"] <= args["K"] ** 2:
         raise ValueError(
             f"the angular momentum {L} is at most K²/c = {args['K'] ** 2 / args['c']} in size: the "
-            "orbit falls into the centre. Give it more, or a larger c."
+            "orbit falls into the centre. Take more angular momentum, or a larger c."
         )
 
 
-check_start = Start(
-    "the relativistic Kepler problem is in the plane",
-    (2,),
-    {"K": positive, "c": positive},
-    singular={"the centre": (0, 0)},
-    also=_misses_the_centre,
-)
-
-
 def relativistic_kepler() -> Problem:
-    """The start at perihelion of an ellipse of e ≈ 0.35 with K = 1, c = 10; dimensionless.
+    """An ellipse of e ≈ 0.35 with K = 1, c = 10, from perihelion; dimensionless.
 
-    It turns by 2.2° from perihelion to perihelion. Start and step are ours. General relativity:
+    It precesses by 2.2° per revolution. Initial conditions and step are ours. General relativity:
     `relativity`, with `n_body`.
 
     **Source** Sommerfeld 1916, *Ann. Phys.* 356, 1.
     """
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start(
+            "the relativistic Kepler problem is in the plane",
+            (2,),
+            singular={"the centre": (0, 0)},
+            also=_misses_the_centre,
+        ),
         name="relativistic_kepler",
-        system=System(hamiltonian),
         q0=np.array([0.6, 0.0]),
         p0=np.array([0.0, 1.5]),
         h=0.02,
-        args={"K": 1.0, "c": 10.0},
-        observables=named(energy, angular_momentum, perihelion_angle),
-        units=DIMENSIONLESS,
-        source="Sommerfeld 1916, Ann. Phys. 356, 1",
-        check=check_start,
         parameters={
-            "K": "root of the strength of attraction, K² = GM [length^(3/2)/time]",
-            "c": "speed of light [length/time]",
+            "K": Parameter(1.0, "root of the strength of attraction, K² = GM [length^(3/2)/time]"),
+            "c": Parameter(10.0, "speed of light [length/time]"),
         },
-        invariants=("energy", "angular_momentum"),
-        symmetries={"time": time_translation(), "rotation": rotation()},
+        observables=[angular_momentum, perihelion_angle],
+        source="Sommerfeld 1916, Ann. Phys. 356, 1",
+        invariants=("angular_momentum",),
+        symmetries={"rotation": rotation()},
     )

@@ -1,12 +1,14 @@
-"""The Sun's relativity and oblateness: what the solar system has beyond Newton's points of mass.
-
-Body 0 is the Sun in all of these, and r_i = q_i − q_0. Each adds to the Newtonian `n_body`:
+"""General relativity and oblateness of the Sun, as additions to the Newtonian `n_body`.
 
     dvi.System(hamiltonian, force=post_newtonian_force)
     dvi.System(hamiltonian, perturbation=post_newtonian_hamiltonian)
     dvi.System(hamiltonian_with_oblateness, force=post_newtonian_force)
 
-with ``epsilon=1`` in `integrate`, whose default, 0, switches relativity off.
+with ``epsilon=1`` in `integrate`; its default, 0, switches relativity off. Body 0 is the Sun.
+Everywhere q are positions [length] and p momenta [mass length / time], shape (bodies, dim). `args`
+are those of `n_body.hamiltonian`, and ``"c"`` [length/time], by default `SPEED_OF_LIGHT`. Every
+function **raises** `ValueError` when the shapes of q and masses do not agree, and is differentiable
+in all its arguments.
 """
 
 from typing import Any
@@ -38,17 +40,11 @@ def post_newtonian_force(t0, t1, q0, p1, args):
         W_i = m_i GM / (c² r³) [(4 GM/r − v²) r + 4 (r·v) v],    W_0 = 0
         r = q0_i − q0_0,    v = p1_i/m_i − p1_0/m_0,    GM = G m_0
 
-    - `q0`: positions [length], shape (bodies, dim); `p1`: momenta [mass length / time], which
-      are m times velocity.
-    - `args`: as for `n_body.hamiltonian`, and ``"c"`` [length/time], else `SPEED_OF_LIGHT`.
+    Momenta are m times velocity. Returns shape (bodies, dim) [mass length / time²]. Another
+    ``epsilon`` than 1 is relativity at c/√ε.
 
-    Returns shape (bodies, dim) [mass length / time²]. With ``epsilon=1`` it is relativity, with
-    another it is that at c/√ε. Differentiable in all it is given.
-
-    Neglected: the recoil of the Sun, of order m_i/M of the rest (so total momentum is not kept),
-    the other bodies' own relativity, of the same order, and O(1/c⁴).
-
-    **Raises** `ValueError` when the shapes of q0 and masses do not agree.
+    Neglected: the recoil of the Sun, a fraction m_i/M of the force (so total momentum is not
+    conserved), the relativity of the other bodies, of the same order, and O(1/c⁴).
 
     **Source** the Schwarzschild term in harmonic coordinates, those of the ephemerides: IERS
     Conventions 2010, (10.12) with β = γ = 1; Anderson et al. 1975, *Astrophys. J.* 200, 221.
@@ -67,17 +63,14 @@ def post_newtonian_hamiltonian(t0, t1, q0, p1, args):
         H1 = −Σ_{i>0} (m_i/c²) [v⁴/8 + 3 GM v²/(2r) − GM²/(2r²)]
         r = |q0_i − q0_0|,    v = p1_i/m_i − p1_0/m_0,    GM = G m_0
 
-    Arguments and `args` as for `post_newtonian_force`, of which it is the conservative version;
-    a scalar [mass length² / time²]. It depends on differences alone, so total momentum is kept,
-    the Sun recoils, and the map is symplectic. It is not separable: every step is implicit.
+    The conservative form of `post_newtonian_force`, a scalar [mass length² / time²]. It depends on
+    differences only, so that total momentum is conserved, the Sun recoils, and the map is
+    symplectic. It is not separable: every step is implicit. The acceleration is that of
+    `post_newtonian_force` up to O(1/c⁴) and a fraction m_i/M.
 
-    The canonical momentum is not m times velocity but p/m = V (1 + V²/(2c²) + 3GM/(c² r)) + …:
-    start from `momenta_from_velocities`, read with `velocities_from_momenta`. With p = m V the
-    orbit is another, by 9e-8 of the velocity for Mercury.
-
-    The acceleration is that of `post_newtonian_force` up to O(1/c⁴) and m_i/M of it.
-
-    **Raises** `ValueError` when the shapes of q0 and masses do not agree.
+    The canonical momentum is not m times velocity but p/m = V (1 + V²/(2c²) + 3GM/(c² r)) + …: use
+    `momenta_from_velocities` and `velocities_from_momenta`. Initial momenta p = m V give another
+    orbit, for Mercury by 9e-8 of the velocity.
 
     **Source** the Lagrangian of a test particle about a mass in harmonic coordinates,
     L = V²/2 + GM/r + [V⁴/8 + 3 GM V²/(2r) − GM²/(2r²)]/c² (Landau & Lifshitz, *The Classical Theory
@@ -96,10 +89,9 @@ def momenta_from_velocities(q: Any, v: Any, args: Any):
         p_i = m_i (v_i + w_i),    p_0 = m_0 v_0 − Σ m_i w_i
         w_i = (u²/(2c²) + 3 GM/(c² r)) u,    u = v_i − v_0,    r = |q_i − q_0|
 
-    - `q`: positions [length], `v`: velocities [length/time] in the frame of q, shape
-      (bodies, dim). `args` as for `post_newtonian_force`; with another epsilon than 1, c/√ε.
+    - `v`: velocities [length/time] in the frame of q. For another epsilon than 1, args has c/√ε.
 
-    Total momentum is Σ m v. Right up to O(1/c⁴), as the Hamiltonian is.
+    Total momentum is Σ m v. Errors are O(1/c⁴), as those of the Hamiltonian.
     """
     q, v = jnp.asarray(q), jnp.asarray(v)
     masses, _ = _masses(q, args)
@@ -123,18 +115,17 @@ def oblateness(q, args):
 
         U = Σ_{i>0} G M m_i J2 R² / (2 r³) (3 (r·n)²/r² − 1),    r = q_i − q_0
 
-    An oblate Sun (J2 > 0) attracts more in the plane of its equator, where U < 0. Perihelia in
-    that plane advance, nodes upon it go back.
+    An oblate Sun (J2 > 0) attracts more in its equatorial plane, where U < 0. Perihelia in that
+    plane advance, nodes on it regress.
 
-    - `q`: positions [length], shape (bodies, dim).
-    - `args`: as for `n_body.hamiltonian`, and ``"J2"``; if need be the equatorial radius ``"R"``
-      [length], else `SUN_RADIUS`, and the direction of the pole ``"pole"``, shape (dim,), of any
-      length, else `SUN_POLE`, which is on ICRF axes.
+    - `args`: also ``"J2"``, the equatorial radius ``"R"`` [length], by default `SUN_RADIUS`, and
+      the direction of the pole ``"pole"``, shape (dim,), of any length, by default `SUN_POLE`,
+      which is on ICRF axes.
 
-    Differentiable in J2 and the rest. Total momentum is kept; the Sun's axis stands still, so that
-    of angular momentum only the part along the pole is kept.
+    Total momentum is conserved. The Sun's axis is fixed, so that only the component of angular
+    momentum along the pole is conserved.
 
-    **Raises** `ValueError` when the shapes of q and masses, or of q and the pole, do not agree.
+    **Raises** `ValueError` also when the shapes of q and the pole do not agree.
 
     **Source** potential −(GM/r) [1 − J2 (R/r)² P₂(sin φ)], sin φ = r·n/r: Murray & Dermott 1999,
     *Solar System Dynamics*, 6.11.
@@ -154,7 +145,7 @@ def oblateness(q, args):
 
 
 def hamiltonian_with_oblateness(t0, t1, q0, p1, args):
-    """`n_body.hamiltonian` + `oblateness` of q0, separable; args and errors as for these."""
+    """`n_body.hamiltonian` + `oblateness` of q0; separable."""
     return hamiltonian(t0, t1, q0, p1, args) + oblateness(q0, args)
 
 
@@ -177,7 +168,7 @@ def _length(r):
 
 
 def _added_momenta(q, v, args):
-    """What 1/c² adds to m v: m_i w_i, and −Σ m_i w_i for the Sun."""
+    """The terms in 1/c² of the momenta: m_i w_i, and −Σ m_i w_i for the Sun."""
     masses, mu = _masses(q, args)
     u = _from_sun(v)
     w = (_length(u) ** 2 / 2 + 3 * mu / _length(_from_sun(q))) / _c2(args) * u

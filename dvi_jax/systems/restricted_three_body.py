@@ -1,12 +1,9 @@
-"""The circular restricted problem of three bodies, in the frame that turns with two of them."""
+"""The circular restricted three-body problem in the rotating frame of the two bodies."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.library import time_translation
-from ._problem import Problem, at_end, named
-from ._start import Start, finite
+from ._problem import DIMENSIONLESS, Parameter, Problem, Start, finite, library_problem
 from .kepler import angular_momentum
 
 EARTH_MOON = 0.012150585
@@ -22,32 +19,29 @@ def potential(q, mu):
 
 
 def hamiltonian(t0, t1, q0, p1, args):
-    r"""Energy in the frame that turns about z once in 2π; not separable.
+    r"""Energy in the frame that rotates about z with period 2π; not separable.
 
         H_D = |p1|²/2 − (x p_y − y p_x) − (1 − μ)/r1 − μ/r2,    q0 = (x, y, z)
 
-    with momenta p = v + ẑ × q, the velocity in a frame that does not turn.
+    with momenta p = v + ẑ × q, the velocity in the inertial frame.
     """
     x, y, _ = q0
     return jnp.sum(p1**2) / 2 - (x * p1[1] - y * p1[0]) + potential(q0, args["mu"])
 
 
-energy = at_end(hamiltonian)
-
-
 def jacobi_constant(t0, t1, q0, p0, q1, p1, args):
-    """C = x² + y² + 2(1 − μ)/r1 + 2μ/r2 − |v|² at t1, without the μ(1 − μ) that some add."""
+    """C = x² + y² + 2(1 − μ)/r1 + 2μ/r2 − |v|² at t1, without a constant μ(1 − μ)."""
     v = velocity(q1, p1)
     return q1[0] ** 2 + q1[1] ** 2 - 2 * potential(q1, args["mu"]) - jnp.sum(v**2)
 
 
 def velocity(q, p):
-    """v = p − ẑ × q in the turning frame."""
+    """v = p − ẑ × q in the rotating frame."""
     return p + jnp.stack([q[1], -q[0], jnp.zeros_like(q[2])])
 
 
 def momentum(q, v):
-    """p = v + ẑ × q of a velocity in the turning frame."""
+    """p = v + ẑ × q of a velocity in the rotating frame."""
     return v - jnp.stack([q[1], -q[0], jnp.zeros_like(q[2])])
 
 
@@ -59,10 +53,10 @@ def _mass_fraction(name, mu):
 
 
 def lagrange_points(mu):
-    r"""L1, …, L5, where a body may rest in the turning frame: shape (5, 3), NumPy.
+    r"""The equilibria L1, …, L5 of the rotating frame: shape (5, 3), NumPy.
 
     L1, L2, L3 on the line of the bodies: between them, beyond the small one, beyond the large one;
-    L4 ahead of the small body by 60°, L5 behind. The three are roots of
+    L4 ahead of the small body by 60°, L5 behind. L1 to L3 are roots of
 
         x − (1 − μ)(x + μ)/|x + μ|³ − μ (x − 1 + μ)/|x − 1 + μ|³ = 0
 
@@ -77,49 +71,46 @@ def lagrange_points(mu):
 
     small, large, line = 1 - mu, -mu, []
     for low, high in ((large, small), (small, 2.0), (-2.0, large)):
-        # pull grows from −∞ to ∞ between a body and the next, or infinity
-        while True:
-            x = (low + high) / 2
-            if x in (low, high):
-                break
+        # pull increases from −∞ to ∞ between neighbouring bodies, or a body and infinity
+        while (x := (low + high) / 2) not in (low, high):
             low, high = (x, high) if pull(x) < 0 else (low, x)
         line.append([x, 0.0, 0.0])
     side = 3**0.5 / 2
     return np.array([*line, [0.5 - mu, side, 0.0], [0.5 - mu, -side, 0.0]])
 
 
-check_start = Start(
-    "the restricted problem has one body in space",
-    (3,),
-    {"mu": _mass_fraction},
-    singular={
-        "the large body": lambda args: (-args["mu"], 0.0, 0.0),
-        "the small body": lambda args: (1 - args["mu"], 0.0, 0.0),
-    },
-)
-
-
 def restricted_three_body() -> Problem:
-    """A body near L4 of Earth and Moon, about which it goes to and fro, in and out of the plane.
+    """A libration about L4 of Earth and Moon, also out of their plane.
 
-    Unit of length: the distance of the two bodies; of time: their period over 2π. Start and step
-    are ours.
+    Unit of length: the distance of the two bodies; of time: their period over 2π. Initial
+    conditions and step are ours.
 
     **Source** Szebehely 1967, *Theory of Orbits*, 1 and 4.
     """
     q0 = lagrange_points(EARTH_MOON)[3] + [0.01, 0.0, 0.02]
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start(
+            "the restricted problem has one body in space",
+            (3,),
+            singular={
+                "the large body": lambda args: (-args["mu"], 0.0, 0.0),
+                "the small body": lambda args: (1 - args["mu"], 0.0, 0.0),
+            },
+        ),
         name="restricted_three_body",
-        system=System(hamiltonian),
         q0=q0,
-        p0=np.array([-q0[1], q0[0], 0.0]),  # at rest in the turning frame
+        p0=np.array([-q0[1], q0[0], 0.0]),
         h=0.02,
-        args={"mu": EARTH_MOON},
-        observables=named(energy, jacobi_constant, angular_momentum),
-        units={"q": "distance of the bodies", "p": "1", "t": "period/2π", "energy": "1"},
+        parameters={
+            "mu": Parameter(
+                EARTH_MOON,
+                "share of the small body in the mass of both, at most 1/2 [1]",
+                _mass_fraction,
+            ),
+        },
+        observables=[jacobi_constant, angular_momentum],
+        units=DIMENSIONLESS | {"q": "distance of the bodies", "t": "period/2π"},
         source="Szebehely 1967, Theory of Orbits, 1 and 4",
-        check=check_start,
-        parameters={"mu": "share of the small body in the mass of both, at most 1/2 [1]"},
-        invariants=("energy", "jacobi_constant"),
-        symmetries={"time": time_translation()},
+        invariants=("jacobi_constant",),
     )

@@ -3,10 +3,16 @@
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
 from ..discover.library import scaling
-from ._problem import DIMENSIONLESS, Adiabatic, InSlowTime, Problem, at_end, named
-from ._start import Start, between
+from ._problem import (
+    Adiabatic,
+    Parameter,
+    Problem,
+    Start,
+    at_end,
+    between,
+    library_problem,
+)
 from .oscillator import exact as of_oscillator
 
 
@@ -29,37 +35,33 @@ def action(t0, t1, q0, p0, q1, p1, args):
 
 
 def exact(t, q0, p0, args):
-    """The state at times t at ε = 0, where ω = 1 for ever; t.shape + q0.shape."""
+    """The state at times t at ε = 0, where ω = 1."""
     return of_oscillator(t, q0, p0, args)
 
 
-check_start = Start(
-    "the slow oscillator has one degree of freedom", (1,), {"depth": between(-1, 1)}
-)
-
-
 def slow_oscillator() -> Problem:
-    """H = (p² + ω(εt)² q²)/2, ω = 1 + 0.3 sin εt: its energy goes with ω, E/ω wavers by O(ε).
+    """H = (p² + ω(εt)² q²)/2, ω = 1 + 0.3 sin εt: E is proportional to ω, E/ω oscillates by O(ε).
 
-    Dimensionless. A step map keeps its own action instead, which differs by O(h): see "What is
-    conserved". Start and step are ours.
+    Dimensionless. A step map conserves an action of its own, which differs by O(h): see "What is
+    conserved". Initial conditions and step are ours.
 
     **Source** Ehrenfest 1916, *Ann. Phys.* 356, 327; Arnold 1989, *Mathematical Methods of
     Classical Mechanics*, §52.
     """
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("the slow oscillator has one degree of freedom", (1,)),
         name="slow_oscillator",
-        system=System(hamiltonian, slow_time=True),
         q0=np.array([0.4]),
         p0=np.array([0.3]),
         h=0.1,
-        args={"depth": 0.3},
-        observables=named(InSlowTime(energy), InSlowTime(action)),
-        units=DIMENSIONLESS,
+        parameters={
+            "depth": Parameter(0.3, "relative change of the frequency [1]", between(-1, 1)),
+        },
+        slow_time=True,
+        observables=[action],
         source="Ehrenfest 1916, Ann. Phys. 356, 327; Arnold 1989, §52",
-        check=check_start,
-        parameters={"depth": "relative change of the frequency [1]"},
-        invariants=("energy", "action"),
+        invariants=("action",),
         adiabatic={"action": Adiabatic("rate of the change over the frequency", 1)},
         symmetries={"scaling": scaling()},
         exact=exact,

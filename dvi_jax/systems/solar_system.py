@@ -1,10 +1,11 @@
-"""The Sun and its planets, started from a JPL ephemeris.
+"""The Sun and its planets, with initial conditions from a JPL ephemeris.
 
-Newton's law between ten points of mass; what general relativity, the Sun's oblateness and the
-asteroids add is left out, and is what a comparison with the ephemeris shows.
+Newton's law between ten point masses. General relativity, the Sun's oblateness and the asteroids
+are neglected; a comparison with the ephemeris shows their effect.
 """
 
 import datetime
+from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,23 +14,30 @@ from typing import Any
 import numpy as np
 
 from .._checks import finite
-from .._system import System
 from ._problem import Problem
-from .n_body import INVARIANTS, OBSERVABLES, check_bodies, hamiltonian, symmetries
+from .n_body import check_bodies, n_body
+from .oblate_kepler import elements
 
-BODIES = (
-    "Sun", "Mercury", "Venus", "Earth–Moon", "Mars",
-    "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto",
-)  # fmt: skip
-"""Names, in the order of every array here. Earth–Moon is their barycentre, and so are the
-planets with moons."""
+_BODIES = {
+    "Sun": (10, 2.959122082855911e-4),
+    "Mercury": (1, 4.91254957186794e-11),
+    "Venus": (2, 7.243452332698441e-10),
+    "Earth–Moon": (3, 8.997011408268049e-10),
+    "Mars": (4, 9.54954869562239e-11),
+    "Jupiter": (5, 2.82534584085505e-7),
+    "Saturn": (6, 8.459706073308477e-8),
+    "Uranus": (7, 1.29202482579265e-8),
+    "Neptune": (8, 1.52435910924974e-8),
+    "Pluto": (9, 2.17844105199052e-12),
+}
+"""Name → NAIF number and GM [au³/day²]."""
 
-GM = np.array([
-    2.959122082855911e-4, 4.91254957186794e-11, 7.243452332698441e-10, 8.997011408268049e-10,
-    9.54954869562239e-11, 2.82534584085505e-7, 8.459706073308477e-8, 1.29202482579265e-8,
-    1.52435910924974e-8, 2.17844105199052e-12,
-])  # fmt: skip
-"""G times mass [au³/day²], as used in the making of DE421."""
+BODIES = tuple(_BODIES)
+"""Names, in the order of every array here. Earth–Moon and other planets with moons are barycentres
+of their systems."""
+
+GM = np.array([gm for _, gm in _BODIES.values()])
+"""G times mass [au³/day²], the values with which DE421 was computed."""
 
 AU_IN_KM = 149597870.6996262
 """The astronomical unit of DE421 [km]."""
@@ -37,7 +45,6 @@ AU_IN_KM = 149597870.6996262
 COVERAGE = (2414864.5, 2471184.5)
 """First and last TDB Julian date of DE421: 1899-07-29 and 2053-10-09."""
 
-_CODES = (10, 1, 2, 3, 4, 5, 6, 7, 8, 9)  # NAIF numbers of BODIES
 _OBLIQUITY = np.deg2rad(84381.448 / 3600)  # of the ecliptic at J2000 (IAU 1976)
 _EXTRA = 'pip install "dvi-jax[ephemeris]"'
 
@@ -47,11 +54,11 @@ class EphemerisMissing(ImportError):
 
 
 def installed_file(name: str, what: str) -> Path:
-    """A file of the package skyfield-data; `what` it is, in words. Nothing is fetched.
+    """A file of the package skyfield-data; `what`: its contents, for the message.
 
-    **Raises** `EphemerisMissing` where it is not installed.
+    Nothing is downloaded. **Raises** `EphemerisMissing` where it is not installed.
     """
-    # Looked up, not imported: on import that package warns of the age of its files.
+    # The package is located, not imported: its import warns about the age of its files.
     package = find_spec("skyfield_data")
     if package is None or package.origin is None:
         raise EphemerisMissing(f"{what} is not installed: {_EXTRA}")
@@ -64,7 +71,7 @@ def installed_file(name: str, what: str) -> Path:
 
 
 def julian_date(date: str | datetime.date | float) -> float:
-    """TDB Julian date of a calendar day at 0h, or of a number that is one already [day].
+    """TDB Julian date of a calendar day at 0h [day].
 
     - `date`: ``"1900-01-01"`` (Gregorian), a `datetime.date`, or a Julian date.
 
@@ -88,13 +95,14 @@ def julian_date(date: str | datetime.date | float) -> float:
 
 
 def check_covered(jd: Any) -> None:
-    """Refuse TDB Julian dates outside the ephemeris with a `ValueError`."""
+    """Require TDB Julian dates that the ephemeris covers. **Raises** `ValueError`."""
     first, last = COVERAGE
-    outside = np.atleast_1d(jd)[~((np.atleast_1d(jd) >= first) & (np.atleast_1d(jd) <= last))]
+    jd = np.atleast_1d(jd)
+    outside = jd[~((jd >= first) & (jd <= last))]  # NaN is outside
     if outside.size:
         raise ValueError(
             f"the ephemeris DE421 covers 1899-07-29 to 2053-10-09 (Julian dates {first} to "
-            f"{last}); {outside[0]} lies outside."
+            f"{last}); {outside[0]} is outside."
         )
 
 
@@ -104,8 +112,8 @@ def ephemeris(jd: Any) -> tuple[np.ndarray, np.ndarray]:
     - `jd`: TDB Julian dates [day], shape (times,).
 
     Returns two arrays of shape (times, bodies, 3) on the axes of the ICRF (equator of J2000);
-    velocities are derivatives of the ephemeris's own Chebyshev polynomials. The file is the one
-    in the package skyfield-data; nothing is fetched.
+    velocities are derivatives of the ephemeris's Chebyshev polynomials. The file is the one in the
+    package skyfield-data; nothing is downloaded.
 
     **Raises** `EphemerisMissing` without the extra `ephemeris`; `ValueError` for dates outside
     `COVERAGE`.
@@ -118,40 +126,28 @@ def ephemeris(jd: Any) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"jd must be a one-dimensional array of dates, got shape {jd.shape}.")
     check_covered(jd)
     kernel = _kernel()
-    states = [kernel[0, code].compute_and_differentiate(jd) for code in _CODES]
+    states = [kernel[0, code].compute_and_differentiate(jd) for code, _ in _BODIES.values()]
     q, v = (np.stack([np.asarray(state[i]).T for state in states], axis=1) for i in (0, 1))
     return q / AU_IN_KM, v / AU_IN_KM
 
 
 def to_ecliptic(vectors: Any) -> np.ndarray:
-    """The same vectors on the axes of the ecliptic of J2000 (obliquity 84381.448″)."""
+    """Vectors on ICRF axes, transformed to the ecliptic of J2000 (obliquity 84381.448″)."""
     x, y, z = np.moveaxis(np.asarray(vectors, float), -1, 0)
     c, s = np.cos(_OBLIQUITY), np.sin(_OBLIQUITY)
     return np.stack([x, c * y + s * z, c * z - s * y], axis=-1)
 
 
 def perihelion_longitude(q: Any, v: Any, mu: float) -> np.ndarray:
-    r"""Longitude of perihelion of the osculating orbit, ϖ = Ω + ω [rad].
-
-        L = q × v,    e = v × L / mu − q / |q|,    Ω = atan2(L_x, −L_y),
-        ω = angle from the node (cos Ω, sin Ω, 0) to e about L
+    """Longitude of perihelion of the osculating orbit, ϖ = Ω + ω of `oblate_kepler.elements` [rad].
 
     - `q`, `v`: heliocentric position [au] and velocity [au/day] on ecliptic axes, shape
       (times, 3). `mu`: GM of the Sun plus that of the planet [au³/day²].
 
     Returns shape (times,), continuous in time (unwrapped).
-
-    **Source** Murray & Dermott 1999, *Solar System Dynamics*, 2.8; e is the
-    Laplace–Runge–Lenz vector over mu.
     """
-    q, v = np.asarray(q, float), np.asarray(v, float)
-    L = np.cross(q, v)
-    e = np.cross(v, L) / mu - q / np.linalg.norm(q, axis=-1, keepdims=True)
-    node = np.arctan2(L[..., 0], -L[..., 1])
-    to_node = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=-1)
-    normal = L / np.linalg.norm(L, axis=-1, keepdims=True)
-    across = np.sum(np.cross(to_node, e) * normal, axis=-1)
-    return np.unwrap(node + np.arctan2(across, np.sum(to_node * e, axis=-1)))
+    of = elements(np.asarray(q, float), np.asarray(v, float), mu, np)
+    return np.unwrap(of[..., 3] + of[..., 4])
 
 
 def check_start(q0: Any, p0: Any, args: Any) -> None:
@@ -162,29 +158,22 @@ def check_start(q0: Any, p0: Any, args: Any) -> None:
 def solar_system(date: str | datetime.date | float = "1900-01-01") -> Problem:
     """The ten bodies on a day, barycentric, on the axes of the ICRF.
 
-    - `date`: the day of the start, as for `julian_date`.
+    - `date`: the initial day, as for `julian_date`.
 
-    q [au], t [day] from the start, masses as GM [au³/day²] with G = 1, so that
-    p = GM v [au⁴/day³] and energies are in au⁵/day⁴. The step suits `Yoshida(4)`: h = 1/32 day
-    turns Mercury's perihelion by 0.04″ in a century too much, and that goes with h⁴.
+    q [au], t [day] from that day, masses as GM [au³/day²] with G = 1, so that p = GM v [au⁴/day³]
+    and energies are in au⁵/day⁴. The step suits `Yoshida(4)`: h = 1/32 day advances Mercury's
+    perihelion by 0.04″ per century too much, an error that scales as h⁴.
 
     **Raises** as `ephemeris` and `julian_date`.
     """
-    q, v = ephemeris([julian_date(date)])
-    return Problem(
+    (q,), (v,) = ephemeris([julian_date(date)])
+    return replace(
+        n_body(GM, q, GM[:, None] * v, h=1 / 32),
         name="solar_system",
-        system=System(hamiltonian),
-        q0=q[0],
-        p0=GM[:, None] * v[0],
-        h=1 / 32,
-        args={"masses": GM, "G": 1.0},
-        observables=OBSERVABLES,
         units={"q": "au", "p": "au⁴/day³", "t": "day", "energy": "au⁵/day⁴"},
         source="JPL ephemeris DE421 (Folkner, Williams & Boggs 2009)",
         check=check_start,
         parameters={"masses": "G times mass of the bodies [au³/day²]", "G": "1, it is in GM [1]"},
-        invariants=INVARIANTS,
-        symmetries=symmetries(3),
     )
 
 

@@ -1,13 +1,11 @@
-"""Lagrange's top: a symmetric heavy body on a fixed point, in Euler's angles."""
+"""Lagrange's top: a symmetric heavy body with a fixed point, in Euler's angles."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.library import space_translation, time_translation
+from ..discover.library import space_translation
 from ._elliptic import first_kind, jacobi, third_kind
-from ._problem import Problem, at_end, named, over_times
-from ._start import Start, positive
+from ._problem import Parameter, Problem, Start, library_problem, over_times
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -22,9 +20,6 @@ def hamiltonian(t0, t1, q0, p1, args):
     c, s = jnp.cos(q0[1]), jnp.sin(q0[1])
     turning = p1[1] ** 2 / (2 * A) + p1[2] ** 2 / (2 * C)
     return turning + (p1[0] - p1[2] * c) ** 2 / (2 * A * s**2) + args["w"] * c
-
-
-energy = at_end(hamiltonian)
 
 
 def vertical_momentum(t0, t1, q0, p0, q1, p1, args):
@@ -47,12 +42,13 @@ def steady_precession(theta, p_psi, args):
 
         A cos θ Ω² − p_ψ Ω + w = 0,    p_φ = A sin² θ Ω + p_ψ cos θ
 
-    NaN where p_ψ² < 4 A w cos θ: too slow a top has none. At θ = π/2 the fast one is infinite.
+    NaN for p_ψ² < 4 A w cos θ, where no steady precession exists. The fast one is infinite at
+    θ = π/2.
     **Source** Goldstein, Poole & Safko 2002, *Classical Mechanics*, 5.7.
     """
     lift = args["A"] * jnp.cos(theta)
     root = jnp.sqrt(p_psi**2 - 4 * lift * args["w"])
-    # the slow one without its cancellation
+    # the slow one without cancellation
     larger = p_psi + jnp.where(p_psi < 0, -root, root)
     return jnp.stack([2 * args["w"] / larger, larger / (2 * lift)])
 
@@ -62,8 +58,8 @@ def _turning_points(E, p_phi, p_psi, args):
 
         1 + u1,    1 − u2,    1 + u3
 
-    By the trigonometric formula for three real roots, and Newton's steps in what is returned, so
-    that the first two have all their digits where the axis comes close to the vertical.
+    By the trigonometric formula for three real roots, and Newton's steps in the returned numbers:
+    1 + u1 and 1 − u2 are accurate also where the axis comes close to the vertical.
     """
     A, w = args["A"], args["w"]
     c3, c2 = 2 * w / A, -2 * E / A - (p_psi / A) ** 2
@@ -96,7 +92,7 @@ def _turning_points(E, p_phi, p_psi, args):
 
 @over_times((3,))
 def exact(t, q0, p0, args):
-    r"""The top at times t of one that is at (q0, p0) at t = 0.
+    r"""The state at times t.
 
         cos θ = u1 + (u2 − u1) sn² x,   x = κt + δ,  κ² = w (u3 − u1)/(2A),  m = (u2 − u1)/(u3 − u1)
         A dφ/dt = P₊ + P₋,    A dψ/dt = (A/C − 1) p_ψ + P₊ − P₋,    2 P± = (p_φ ± p_ψ)/(1 ± cos θ)
@@ -104,17 +100,15 @@ def exact(t, q0, p0, args):
     with u_i the roots of (du/dt)² = (2/A)(E′ − wu)(1 − u²) − (p_φ − p_ψ u)²/A², E′ = E − p_ψ²/(2C).
     φ and ψ are integrals of the third kind, of n = (u1 − u2)/(1 + u1) and (u2 − u1)/(1 − u1).
 
-    - `t`: times, any shape. `q0`, `p0`: shape (3,). Returns q, p of shape t.shape + (3,).
-
-    To about 1e-15 of the phases passed and, where the nutation is small, 1e-16/(u2 − u1) besides:
-    u1 and u2 are known no better. NaN where two roots are one, a steady precession (see
-    `steady_precession`) or a sleeping top, and where the axis goes through the vertical, with
-    p_φ = p_ψ and E′ ≥ w above or p_φ = −p_ψ below: Euler's angles jump there.
+    Angles have an error of about 1e-15 times their value, and one of 1e-16/(u2 − u1) by rounding of
+    u1 and u2, which matters for small nutations. NaN for a double root, that is for a steady
+    precession (see `steady_precession`) and a sleeping top; and where the axis passes through the
+    vertical, with p_φ = p_ψ and E′ ≥ w above or p_φ = −p_ψ below: Euler's angles jump there.
     **Source** Whittaker 1937, *Analytical Dynamics*, §71.
     """
     A, C, w = (jnp.asarray(args[name], p0.dtype) for name in ("A", "C", "w"))
     p_phi, p_psi = p0[0], p0[2]
-    above, below = p_phi - p_psi, p_phi + p_psi  # what is left at θ = 0 and π
+    above, below = p_phi - p_psi, p_phi + p_psi  # p_φ − p_ψ cos θ at θ = 0 and π
     s2, c2 = jnp.sin(q0[1] / 2) ** 2, jnp.cos(q0[1] / 2) ** 2
     leaning = (above + 2 * p_psi * s2) ** 2 / (8 * A * s2 * c2)
     E = p0[1] ** 2 / (2 * A) + leaning + w * (c2 - s2)
@@ -123,7 +117,7 @@ def exact(t, q0, p0, args):
     through = ((above == 0) & (w <= E)) | (below == 0)
     spread = jnp.where((spread > 0) & ~through, spread, jnp.nan)
     rate, m = jnp.sqrt(w * (x3 - x1) / (2 * A)), spread / (x3 - x1)
-    # sn² and sn cn of the start give sine and cosine of twice the phase
+    # sn² and sn cn at t = 0 give sine and cosine of twice the phase
     sn2, cn2 = (2 * c2 - x1) / spread, (2 * s2 - v2) / spread
     climb = -jnp.sin(q0[1]) * p0[1] / A
     dn = jnp.sqrt(cn2 + (1 - m) * sn2)
@@ -145,7 +139,7 @@ def exact(t, q0, p0, args):
     climb = 2 * spread * rate * sn * cn * dn
     p_theta = -A * climb / jnp.sqrt(from_top * from_bottom)
     q, p = jnp.stack([phi, theta, psi]), jnp.stack([p_phi, p_theta, p_psi])
-    return q + 0 * m, p + 0 * m  # all of it or nothing
+    return q + 0 * m, p + 0 * m  # NaN in all components if in one
 
 
 def _leans(q, p, args):
@@ -155,41 +149,35 @@ def _leans(q, p, args):
         )
 
 
-check_start = Start(
-    "the top has Euler's angles (φ, θ, ψ)",
-    (3,),
-    {"A": positive, "C": positive, "w": positive},
-    also=_leans,
-)
-
-
 def spinning_top() -> Problem:
-    """A top that leans by 0.6 rad and is let go with a slow push: it precesses and nutates.
+    """A top inclined by 0.6 rad that precesses and nutates.
 
-    Dimensionless: A = w = 1, C = 1/2. Start and step are ours.
+    Dimensionless: A = w = 1, C = 1/2. Initial conditions and step are ours.
 
     **Source** Lagrange 1788, *Méchanique analitique*; Goldstein, Poole & Safko 2002, *Classical
     Mechanics*, 5.7.
     """
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("the top has Euler's angles (φ, θ, ψ)", (3,), also=_leans),
         name="spinning_top",
-        system=System(hamiltonian),
         q0=np.array([0.0, 0.6, 0.0]),
         p0=np.array([2.4, 0.1, 2.5]),
         h=0.02,
-        args={"A": 1.0, "C": 0.5, "w": 1.0},
-        observables=named(energy, vertical_momentum, axial_momentum, height),
+        parameters={
+            "A": Parameter(
+                1.0, "moment of inertia about the fixed point, across the axis [mass length²]"
+            ),
+            "C": Parameter(0.5, "moment of inertia along the axis [mass length²]"),
+            "w": Parameter(
+                1.0, "m g l, the weight times its distance from the fixed point [energy]"
+            ),
+        },
+        observables=[vertical_momentum, axial_momentum, height],
         units={"q": "rad", "p": "1", "t": "1", "energy": "1"},
         source="Goldstein, Poole & Safko 2002, Classical Mechanics, 5.7",
-        check=check_start,
-        parameters={
-            "A": "moment of inertia about the fixed point, across the axis [mass length²]",
-            "C": "moment of inertia along the axis [mass length²]",
-            "w": "m g l, the weight times its distance from the fixed point [energy]",
-        },
-        invariants=("energy", "vertical_momentum", "axial_momentum"),
+        invariants=("vertical_momentum", "axial_momentum"),
         symmetries={
-            "time": time_translation(),
             "turn_about_vertical": space_translation([1.0, 0.0, 0.0]),
             "turn_about_axis": space_translation([0.0, 0.0, 1.0]),
         },

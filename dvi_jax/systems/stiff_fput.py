@@ -4,10 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import whole
-from .._system import System
-from ..discover.library import time_translation
-from ._problem import DIMENSIONLESS, Adiabatic, Problem, at_end, named
-from ._start import Start, positive
+from ._problem import Adiabatic, Parameter, Problem, Start, library_problem, positive
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -23,22 +20,14 @@ def hamiltonian(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 + args["omega"] ** 2 * jnp.sum(y**2) / 2 + jnp.sum(soft**4) / 4
 
 
-energy = at_end(hamiltonian)
-
-
 def stiff_energies(t0, t1, q0, p0, q1, p1, args):
-    """I_i = (ẏ_i² + ω² y_i²)/2 at t1, shape (m,): they change place on times of order ω."""
+    """I_i = (ẏ_i² + ω² y_i²)/2 at t1, shape (m,): they exchange energy on times of order ω."""
     return (p1[1] ** 2 + (args["omega"] * q1[1]) ** 2) / 2
 
 
 def oscillatory_energy(t0, t1, q0, p0, q1, p1, args):
-    """I = Σ_i I_i at t1: an adiabatic invariant, kept to O(1/ω) over very long times."""
+    """I = Σ_i I_i at t1: an adiabatic invariant, constant to O(1/ω) over very long times."""
     return jnp.sum(stiff_energies(t0, t1, q0, p0, q1, p1, args))
-
-
-check_start = Start(
-    "the stiff FPUT chain has centres and lengths of m springs", (2, None), {"omega": positive}
-)
 
 
 def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
@@ -53,23 +42,19 @@ def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
     omega = positive("omega", omega)
     q0, p0 = np.zeros((2, 2, m))
     q0[:, 0], p0[:, 0] = (1.0, 1 / omega), (1.0, 1.0)
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("the stiff FPUT chain has centres and lengths of m springs", (2, None)),
         name="stiff_fput",
-        system=System(hamiltonian),
         q0=q0,
         p0=p0,
         h=0.5 / omega,
-        args={"omega": omega},
-        observables=named(energy, stiff_energies, oscillatory_energy),
-        units=DIMENSIONLESS,
+        parameters={"omega": Parameter(omega, "frequency of the stiff springs [1/time]")},
+        observables=[stiff_energies, oscillatory_energy],
         source="Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, I.5.1",
-        check=check_start,
-        parameters={"omega": "frequency of the stiff springs [1/time]"},
-        invariants=("energy",),
         adiabatic={
             "oscillatory_energy": Adiabatic(
                 "1/ω", 1, smaller=lambda factor: stiff_fput(m, omega / factor)
             )
         },
-        symmetries={"time": time_translation()},
     )

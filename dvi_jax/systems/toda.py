@@ -1,13 +1,11 @@
-"""The periodic Toda lattice, a chain of particles with as many integrals as it has particles."""
+"""The periodic Toda lattice, a chain of particles that is integrable."""
 
 import jax.numpy as jnp
 import numpy as np
 
 from .._checks import whole
-from .._system import System
-from ..discover.library import space_translation, time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
-from ._start import Start
+from ..discover.library import space_translation
+from ._problem import Problem, Start, library_problem
 
 
 def hamiltonian(t0, t1, q0, p1, args):
@@ -16,7 +14,7 @@ def hamiltonian(t0, t1, q0, p1, args):
 
 
 def lax_matrix(q, p):
-    r"""Flaschka's symmetric matrix L, whose eigenvalues the flow keeps.
+    r"""Flaschka's symmetric matrix L, whose eigenvalues are conserved.
 
         L_ii = b_i,    L_{i,i+1} = L_{i+1,i} = a_i,    L_{1n} = L_{n1} = a_n
 
@@ -30,9 +28,6 @@ def lax_matrix(q, p):
     a, after = jnp.exp((q - jnp.roll(q, -1)) / 2) / 2, (np.arange(n) + 1) % n
     upper = jnp.zeros((n, n), q.dtype).at[np.arange(n), after].set(a)
     return upper + upper.T - jnp.diag(p) / 2
-
-
-energy = at_end(hamiltonian)
 
 
 def total_momentum(t0, t1, q0, p0, q1, p1, args):
@@ -55,13 +50,10 @@ def lax_eigenvalues(t0, t1, q0, p0, q1, p1, args):
     return jnp.linalg.eigvalsh(lax_matrix(q1, p1))
 
 
-check_start = Start("the periodic Toda lattice needs at least three particles", (None,), least=3)
-
-
 def toda(n: int = 5) -> Problem:
-    """The Toda lattice of n particles at equal distances, in waves of two lengths; dimensionless.
+    """The Toda lattice of n particles at equal distances, with two waves; dimensionless.
 
-    It moves as a whole at a speed of 0.1. Start and step are ours.
+    The mean velocity is 0.1. Initial conditions and step are ours.
 
     **Raises** `ValueError` for fewer than three particles.
 
@@ -71,16 +63,15 @@ def toda(n: int = 5) -> Problem:
     n = whole("n", n, 3, hint="The periodic Toda lattice needs at least three particles.")
     angle = 2 * np.pi * np.arange(n) / n
     q0, p0 = np.zeros(n), 0.1 + np.cos(angle) + np.sin(2 * angle) / 2
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("the periodic Toda lattice needs at least three particles", (None,), least=3),
         name="toda",
-        system=System(hamiltonian),
         q0=q0,
         p0=p0,
         h=0.1,
-        observables=named(energy, total_momentum, lax_traces, lax_eigenvalues),
-        units=DIMENSIONLESS,
+        observables=[total_momentum, lax_traces, lax_eigenvalues],
         source="Toda 1967, J. Phys. Soc. Japan 22, 431; Flaschka 1974, Phys. Rev. B 9, 1924",
-        check=check_start,
-        invariants=("energy", "total_momentum", "lax_traces", "lax_eigenvalues"),
-        symmetries={"time": time_translation(), "translation": space_translation(np.ones(n))},
+        invariants=("total_momentum", "lax_traces", "lax_eigenvalues"),
+        symmetries={"translation": space_translation(np.ones(n))},
     )

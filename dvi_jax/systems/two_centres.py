@@ -1,12 +1,10 @@
-"""Euler's problem: a body attracted by two centres that stand still, in space."""
+"""Euler's problem: a body attracted by two fixed centres, in space."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.library import rotation, time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, named
-from ._start import Start, finite, positive
+from ..discover.library import rotation
+from ._problem import Parameter, Problem, Start, finite, library_problem
 from .oblate_kepler import axial_angular_momentum
 
 
@@ -21,9 +19,6 @@ def hamiltonian(t0, t1, q0, p1, args):
     """H_D = |p1|²/2 − μ1/r1 − μ2/r2, unit mass; centres at (0, 0, ±d)."""
     r1, r2 = distances(q0, args)
     return jnp.sum(p1**2) / 2 - args["mu1"] / r1 - args["mu2"] / r2
-
-
-energy = at_end(hamiltonian)
 
 
 def euler_integral(t0, t1, q0, p0, q1, p1, args):
@@ -41,43 +36,37 @@ def euler_integral(t0, t1, q0, p0, q1, p1, args):
 
 
 def angular_momentum_squared(t0, t1, q0, p0, q1, p1, args):
-    """|q × p|² at t1, which one centre would keep and two do not."""
+    """|q × p|² at t1, conserved by one centre but not by two."""
     return jnp.sum(jnp.cross(q1, p1) ** 2)
 
 
-check_start = Start(
-    "the problem of two centres is in space",
-    (3,),
-    {"d": positive, "mu1": finite, "mu2": finite},
-    singular={
-        "the first centre": lambda args: (0.0, 0.0, args["d"]),
-        "the second centre": lambda args: (0.0, 0.0, -args["d"]),
-    },
-)
-
-
 def two_centres() -> Problem:
-    """An orbit about both of two unequal centres; dimensionless. Start and step are ours.
+    """An orbit about two unequal centres; dimensionless. Initial conditions and step are ours.
 
     **Source** Euler 1760; Whittaker 1937, *Analytical Dynamics*, §53; Erikson & Hill 1949, *Phys.
     Rev.* 75, 29.
     """
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start(
+            "the problem of two centres is in space",
+            (3,),
+            singular={
+                "the first centre": lambda args: (0.0, 0.0, args["d"]),
+                "the second centre": lambda args: (0.0, 0.0, -args["d"]),
+            },
+        ),
         name="two_centres",
-        system=System(hamiltonian),
         q0=np.array([2.0, 0.0, 0.5]),
         p0=np.array([0.1, 0.6, 0.5]),
         h=0.02,
-        args={"mu1": 1.0, "mu2": 0.6, "d": 0.5},
-        observables=named(energy, axial_angular_momentum, euler_integral, angular_momentum_squared),
-        units=DIMENSIONLESS,
-        source="Whittaker 1937, Analytical Dynamics, §53; Erikson & Hill 1949, Phys. Rev. 75, 29",
-        check=check_start,
         parameters={
-            "mu1": "strength of the centre at z = d [length³/time²]",
-            "mu2": "strength of the centre at z = −d [length³/time²]",
-            "d": "half the distance of the centres [length]",
+            "mu1": Parameter(1.0, "strength of the centre at z = d [length³/time²]", finite),
+            "mu2": Parameter(0.6, "strength of the centre at z = −d [length³/time²]", finite),
+            "d": Parameter(0.5, "half the distance of the centres [length]"),
         },
-        invariants=("energy", "axial_angular_momentum", "euler_integral"),
-        symmetries={"time": time_translation(), "rotation": rotation(0, 1)},
+        observables=[axial_angular_momentum, euler_integral, angular_momentum_squared],
+        source="Whittaker 1937, Analytical Dynamics, §53; Erikson & Hill 1949, Phys. Rev. 75, 29",
+        invariants=("axial_angular_momentum", "euler_integral"),
+        symmetries={"rotation": rotation(0, 1)},
     )

@@ -1,24 +1,22 @@
-"""Van der Pol's oscillator: a harmonic oscillator that is fed when small and damped when large."""
+"""Van der Pol's oscillator: amplified at small and damped at large amplitudes."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._system import System
-from ..discover.library import scaling, time_translation
-from ._problem import DIMENSIONLESS, Problem, named
-from ._start import Start
-from .oscillator import PHASE, energy, exact, hamiltonian
+from ..discover.library import scaling
+from ._problem import Problem, Start, library_problem
+from .oscillator import PHASE, exact, hamiltonian
 
 
 def feedback(t0, t1, q0, p1, args):
-    """W = (1 − q0²) p1, which is not linear in the state and depends on p: an implicit step."""
+    """W = (1 − q0²) p1: nonlinear and dependent on p, so that the step is implicit."""
     return (1 - q0**2) * p1
 
 
 def amplitude(t0, t1, q0, p0, q1, p1, args):
-    """√(q² + p²) at t1: kept at ε = 0, and nearing 2 for small ε > 0.
+    """√(q² + p²) at t1: constant at ε = 0, and approaches 2 for small ε > 0.
 
-    Its gradient at the origin, a corner, is put down as zero.
+    The gradient at the origin, where it does not exist, is set to zero.
     """
     square = jnp.sum(q1**2) + jnp.sum(p1**2)
     away = square > 0
@@ -26,7 +24,7 @@ def amplitude(t0, t1, q0, p0, q1, p1, args):
 
 
 def averaged_amplitude(t, epsilon, start):
-    r"""Amplitude at times t by the averaged equation, right to O(ε) for times up to 1/ε and beyond.
+    r"""Amplitude at times t by the averaged equation, with error O(ε) for times of order 1/ε.
 
         da/dt = (ε/2) a (1 − a²/4),    a(t) = 2/√(1 + (4/a0² − 1) exp(−εt))
 
@@ -37,29 +35,26 @@ def averaged_amplitude(t, epsilon, start):
     return 2 / jnp.sqrt(1 + (4 / start**2 - 1) * jnp.exp(-epsilon * jnp.asarray(t)))
 
 
-check_start = Start("Van der Pol's oscillator has one degree of freedom", (1,))
-
-
 def van_der_pol() -> Problem:
     """H = (p² + q²)/2 with the force ε(1 − q²)p; dimensionless.
 
-    For ε > 0 every start but the origin ends on one cycle, of amplitude 2 for small ε. It is the
-    `oscillator` with another disturbance. Start and step are ours.
+    For ε > 0 every trajectory except the origin approaches one limit cycle, of amplitude 2 for
+    small ε. The unperturbed system is the `oscillator`. Initial conditions and step are ours.
 
     **Source** van der Pol 1926, *Phil. Mag.* 2, 978.
     """
-    return Problem(
+    return library_problem(
+        hamiltonian,
+        Start("Van der Pol's oscillator has one degree of freedom", (1,)),
         name="van_der_pol",
-        system=System(hamiltonian, force=feedback),
         q0=np.array([0.5]),
         p0=np.array([0.0]),
         h=0.1,
-        observables=named(energy, amplitude),
-        units=DIMENSIONLESS,
+        force=feedback,
+        observables=[amplitude],
         source="van der Pol 1926, Phil. Mag. 2, 978",
-        check=check_start,
-        invariants=("energy", "amplitude"),
-        symmetries={"time": time_translation(), "scaling": scaling()},
+        invariants=("amplitude",),
+        symmetries={"scaling": scaling()},
         flow_symmetries={"phase": PHASE},
         exact=exact,
     )

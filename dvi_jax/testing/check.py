@@ -1,4 +1,4 @@
-"""A check: what it measures of a method, its bound, and what to do where it fails."""
+"""A check: a measurement of a method, its bound, and what to do when it fails."""
 
 import difflib
 import math
@@ -21,8 +21,7 @@ class Measured:
     - `value`: the number measured; NaN when nothing could be measured.
     - `allowed`: the bound in words, such as ``"≤ 1e-12"`` or ``"4 ± 0.2"``.
     - `passed`: whether the value meets the bound; never for a value that is NaN.
-    - `claimed`: whether the method claims the property. A property that is not claimed is measured
-      where that is possible, and is not a failure.
+    - `claimed`: whether the method claims the property; if not, a missing property is no failure.
     - `detail`: the points of a fit, the status of a trajectory, and the like.
     """
 
@@ -64,7 +63,7 @@ def not_measured(allowed: str, detail: str, claimed: bool = True) -> Measured:
 
 @dataclass(frozen=True)
 class Check:
-    """A check: its name, what it is in words, how it measures, what to do where it fails."""
+    """A check: its name, description, measurement, and advice when it fails."""
 
     name: str
     says: str
@@ -74,7 +73,7 @@ class Check:
     any_problem: bool
 
     def __call__(self, candidate: Candidate) -> Measured:
-        """What the check measures; an exception that the method raises is a failure."""
+        """The measurement; an exception that the method raises is a failure."""
         try:
             return self.measure(candidate)
         except Exception as error:  # whatever the user's method raises
@@ -87,7 +86,7 @@ CHECKS: dict[str, Check] = {}
 
 
 def check(name: str, remedy: str, digits: str = ".0e", any_problem: bool = False):
-    """Register a measurement under a name; the function becomes one that raises where it fails.
+    """Register a measurement, and turn it into a function that raises when the check fails.
 
     `any_problem`: whether the property can be measured on any problem.
     """
@@ -101,6 +100,7 @@ def check(name: str, remedy: str, digits: str = ".0e", any_problem: bool = False
                 raise ValueError(f"{name} is measured on its own problem: leave `problem` out.")
             return _require(Candidate(method, problem), [name])[name]
 
+        # Not functools.wraps: the signature shown must be that of `required`.
         for attribute in ("__name__", "__qualname__", "__module__", "__doc__"):
             setattr(required, attribute, getattr(measure, attribute))
         return required
@@ -111,14 +111,12 @@ def check(name: str, remedy: str, digits: str = ".0e", any_problem: bool = False
 def check_method(method: dvi.Method, checks: Iterable[str] | None = None) -> dict[str, Measured]:
     """Require that a method has the properties that it claims.
 
-    **Arguments**
-
     - `checks`: names of `CHECKS`; None for all, which takes 15 to 35 seconds.
 
-    **Returns** name → `Measured`, also of what the method does not claim.
+    **Returns** name → `Measured`, also for properties that the method does not claim.
 
-    **Raises** `AssertionError` with what was measured, what is required and what to do, for all
-    checks that fail; `ValueError` for an unknown name, and where x64 is off.
+    **Raises** `AssertionError` with measured and required values and advice, for all checks that
+    fail; `ValueError` for an unknown name, and where x64 is off.
     """
     return _require(Candidate(method), checks)
 
@@ -142,8 +140,8 @@ def require_double_precision() -> None:
     """**Raises** `ValueError` where x64 is off: the bounds are those of double precision."""
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(
-            "methods are measured in double precision, and x64 is off. Turn it on before anything "
-            'else: jax.config.update("jax_enable_x64", True).'
+            "methods are measured in double precision, and x64 is off. Turn it on first: "
+            'jax.config.update("jax_enable_x64", True).'
         )
 
 

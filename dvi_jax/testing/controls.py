@@ -1,12 +1,11 @@
-"""Methods that are broken on purpose: each check has to catch one, or it could not fail."""
+"""Methods with one defect: each check must find one, or it could not fail."""
 
 # Abstract variables of equinox stay arguments of a subclass for pyright, though not at run time.
 # pyright: reportCallIssue=false
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,9 +14,8 @@ import jax.numpy as jnp
 import dvi_jax as dvi
 
 
-@dataclass(frozen=True)
-class Control:
-    """A broken method and the check that must catch it."""
+class Control(NamedTuple):
+    """A broken method and the check that must find its defect."""
 
     name: str
     check: str
@@ -25,7 +23,7 @@ class Control:
 
 
 class Altered(dvi.Method):
-    """Another method, with claims of its own and a step or an inverse in place of its own."""
+    """A method with another step, inverse or claims."""
 
     method: dvi.Method
     order: int = eqx.field(static=True)

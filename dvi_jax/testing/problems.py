@@ -48,19 +48,18 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
     return q1[0] * p1[1] - q1[1] * p1[0]
 
 
-def _problem(name, system, q0, p0) -> Problem:
+def _problem(name, hamiltonian, force, q0, p0) -> Problem:
+    system = dvi.System(hamiltonian, force=force)
     return Problem(name, system, np.array(q0), np.array(p0), h=0.1, args=0.3)
 
 
-_COUPLED = dvi.System(coupled, force=damping)
-
-COUPLED = _problem("coupled", _COUPLED, [0.5, -0.3], [0.2, 0.4])
+COUPLED = _problem("coupled", coupled, damping, [0.5, -0.3], [0.2, 0.4])
 """Two degrees of freedom; every step of every method but the explicit ones solves."""
 
-SINGLE = _problem("coupled", _COUPLED, [0.4], [0.3])
+SINGLE = _problem("coupled", coupled, damping, [0.4], [0.3])
 """The same with one degree of freedom."""
 
-CENTRAL = _problem("central", dvi.System(central, force=modulation), [0.5, 0.1], [0.2, 0.6])
+CENTRAL = _problem("central", central, modulation, [0.5, 0.1], [0.2, 0.6])
 """Separable: compositions of `TypeII` need no solve, so that 100 000 steps are fast."""
 
 
@@ -73,11 +72,9 @@ def inputs(problem: Problem, t0: float = 0.3) -> dict[str, Any]:
 
 def run(problem, method, x, num_steps=1, observe=None, adjoint=_DEFAULT) -> dvi.Solution:
     """The end of a run of `num_steps` steps from the inputs x."""
+    options = {"method": method, "observe": observe, "adjoint": adjoint, "throw": False}
     save = dvi.Save(final=True)
-    return dvi.integrate(
-        problem.system, **x, num_steps=num_steps, method=method, save=save, observe=observe,
-        adjoint=adjoint, throw=False,
-    )  # fmt: skip
+    return dvi.integrate(problem.system, **x, num_steps=num_steps, save=save, **options)
 
 
 def state(solution: dvi.Solution) -> jax.Array:
