@@ -374,7 +374,7 @@ def test_doubts_are_said():
     assert (lost.status, lost.divergences) == ("diverging", 3)
     assert "3 of 2000 draws diverged" in lost.warnings[0]
     assert "diverged" in str(lost)
-    assert "100 % of the paths were cut short" in fake(good, steps=1023).warnings[0]
+    assert "100 % of the paths were truncated" in fake(good, steps=1023).warnings[0]
 
 
 # --- what is refused -----------------------------------------------------------------------------

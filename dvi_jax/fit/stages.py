@@ -60,8 +60,11 @@ def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units
 
     def solve(u, task, whole):
         # All data were evaluated at u; a shorter horizon takes the rows that it needs.
-        first = None if whole is None else _up_to(problem, whole, task.horizon)
-        return stage.run(u, task, problem.degrees_of_freedom, first)
+        if whole is not None:
+            keep = problem.rows_within(task.horizon)
+            r, J, aux = whole
+            whole = Evaluation(jnp.where(keep, r, 0.0), jnp.where(keep[:, None], J, 0.0), aux)
+        return stage.run(u, task, problem.degrees_of_freedom, whole)
 
     cut = FIT_RESULTS.max_steps_reached
     tolerance = max(1e-2, run.tolerance)
@@ -79,10 +82,12 @@ def by_gradient(
     # Per value, so that a learning rate means the same for any amount of data.
     stage = ScalarStage(problem.core, float(problem.count) if optax else 1.0, solver)
     choose = None if batch is None else _draw(problem, batch, seed)
+    scale = np.ones(problem.size)
     if run.resume is not None:
         scale = run.resume.scale
-    else:
-        scale = np.ones(problem.size) if optax else _lengths(problem, u)
+    elif not optax:  # scales of u along which the residuals change by equal amounts
+        J = np.asarray(problem.evaluate(u).jacobian)
+        scale = inverse_or(np.linalg.norm(np.where(np.isfinite(J), J, 0.0), axis=0), 1.0)
 
     def look(u):
         return Evaluation(jnp.zeros(0), jnp.zeros(0), problem.whitened(u))
@@ -141,13 +146,6 @@ def _stages(
     return solve(u, run.task(number, horizon, run.tolerance, None), whole)
 
 
-def _up_to(problem: Problem, whole: Evaluation, horizon: float) -> Evaluation:
-    """The evaluation within a horizon from that with all data."""
-    keep = problem.rows_within(horizon)
-    r, J, aux = whole
-    return Evaluation(jnp.where(keep, r, 0.0), jnp.where(keep[:, None], J, 0.0), aux)
-
-
 # ---- horizons
 
 
@@ -197,12 +195,6 @@ def _scatter(group: Group) -> np.ndarray:
 
 
 # ---- what gradient methods need
-
-
-def _lengths(problem: Problem, u: np.ndarray) -> np.ndarray:
-    """Scales of u along which the residuals change by equal amounts."""
-    J = np.asarray(problem.evaluate(u).jacobian)
-    return inverse_or(np.linalg.norm(np.where(np.isfinite(J), J, 0.0), axis=0), 1.0)
 
 
 def _draw(problem: Problem, batch: int, seed: int) -> Callable[[int], Any]:
