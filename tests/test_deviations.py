@@ -657,7 +657,7 @@ def test_indicators_that_cannot_be_meant(make, error, message):
 @pytest.mark.parametrize(
     ("observe", "options", "message"),
     [
-        (dvi.GALI(5), {}, "5 deviation vectors, .* only 4 directions: ask for at most 4"),
+        (dvi.GALI(5), {}, "5 deviation vectors, .* only 4 directions: take at most 4"),
         (dvi.MEGNO(scale=(np.ones(3), 1.0)), {}, "scale of q .* 2 numbers, like q; got 3"),
         (
             dvi.MEGNO(),
