@@ -6,6 +6,7 @@ import re
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,35 +30,35 @@ _LISTS = ("leaves", "extra")
 """Fields of `Position` that a checkpoint has as arrays; the others are in its header."""
 
 
+@dataclass
 class Run:
     """A fit in progress.
 
-    - `resume`: the position of the checkpoint, until the first stage has continued from it.
+    - `show`: a function of the progress, or None. `began`: when, for the seconds shown.
+    - `checkpoint`: a file or None, recognised by `identity`. `resume`: its position, until the
+      first stage has continued from it.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        max_steps: int,
-        tolerance: float,
-        show: Callable[[FitProgress], None] | None,
-        began: float,
-        checkpoint: str | os.PathLike[str] | None,
-        identity: str,
-    ):
-        self.problem, self.max_steps, self.tolerance = problem, max_steps, tolerance
-        self._show, self.began, self._file, self._identity = show, began, checkpoint, identity
-        self.records: list[Record] = []
-        self.resume: Position | None = None
-        self._saved = time.monotonic()
-        if checkpoint is not None:
-            file = Path(checkpoint)
+    problem: Problem
+    max_steps: int
+    tolerance: float
+    show: Callable[[FitProgress], None] | None
+    began: float
+    checkpoint: str | os.PathLike[str] | None
+    identity: str
+    records: list[Record] = field(default_factory=list)
+    resume: Position | None = None
+    saved: float = field(default_factory=time.monotonic)
+
+    def __post_init__(self):
+        if self.checkpoint is not None:
+            file = Path(self.checkpoint)
             if not file.parent.is_dir():
                 raise FileNotFoundError(f"there is no directory for the checkpoint {file}.")
             if file.is_dir():
                 raise IsADirectoryError(f"checkpoint must be a file, {file} is a directory.")
             if file.exists():
-                self.resume, self.records = _read_checkpoint(file, identity)
+                self.resume, self.records = _read_checkpoint(file, self.identity)
 
     @property
     def left(self) -> int:
@@ -77,20 +78,20 @@ class Run:
         """A step was taken."""
         x = np.asarray(self.problem.space.to_x(jnp.asarray(record.x[: self.problem.size])))
         self.records.append(record._replace(x=x))
-        if self._file is not None and time.monotonic() - self._saved > _EVERY:
+        if self.checkpoint is not None and time.monotonic() - self.saved > _EVERY:
             try:
-                _write_checkpoint(self._file, self._identity, position, self.records)
+                _write_checkpoint(self.checkpoint, self.identity, position, self.records)
             except OSError as error:  # no reason to lose the fit as well
                 warnings.warn(
                     f"the checkpoint cannot be written ({error}). The fit goes on and tries again; "
                     "a checkpoint that was written before is unchanged.",
                     stacklevel=2,
                 )
-            self._saved = time.monotonic()
-        if self._show is not None:
+            self.saved = time.monotonic()
+        if self.show is not None:
             of_step = len(self.records), self.max_steps, record.stage, record.horizon, record.loss
             names, seconds = list(self.problem.space.names), time.monotonic() - self.began
-            self._show(FitProgress(*of_step, x, names, seconds))
+            self.show(FitProgress(*of_step, x, names, seconds))
 
     def history(self) -> dict[str, np.ndarray]:
         """The records as arrays."""

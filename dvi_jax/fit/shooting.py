@@ -101,7 +101,7 @@ class Segments:
             which = np.clip(np.ceil(place - 1e-9).astype(int) - 1, 0, S - 1)
             parts += [_Part(arc, which == s, float(cuts[s]), whitening) for s in range(S)]
         numbers = np.repeat(np.arange(len(arcs)), S)
-        self.group = make_group(list(numbers), parts, spec, self.steps)
+        self.group = make_group(numbers.tolist(), parts, spec, self.steps)
         self.shape = np.shape(spec["q0"])
         self.half = math.prod(self.shape)
         # Segments after the first of an arc start at a node, an unknown state (2 half,).
@@ -158,7 +158,7 @@ class Segments:
         core = self.problem.core
         return specification(core.model, space.to_params(space.to_x(u)), arc, core.many)
 
-    def _segment(self, x: Array, segment: dict[str, Array | None]) -> tuple[Array, Array]:
+    def _segment(self, x: Array, segment: dict[str, Any]) -> tuple[Array, Array]:
         """Residuals of one segment and its end, relative to the orbit, from x = (u, own start)."""
         problem, own = self.problem, x[self.n :]
         spec = self._specification(x[: self.n], segment["arc"])
