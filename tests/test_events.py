@@ -324,7 +324,7 @@ INVALID = [
     (lambda: dvi.Save(ts=[0.1], final=True), ValueError, "leave out every and final"),
     (lambda: dvi.Save(ts=[0.1, 0.3, 0.2]), ValueError, "ascending order"),
     (lambda: dvi.Save(ts=0.1), ValueError, "one-dimensional"),
-    (lambda: dvi.Save(clock=on_axis), ValueError, "a clock needs times"),
+    (lambda: dvi.Save(clock=on_axis), ValueError, "a clock (needs|requires) times"),
     (lambda: dvi.Save(ts=[0.1], clock=3), TypeError, "the clock of Save"),
     (
         lambda: kepler(save=dvi.Save(ts=[0.1], clock=vector)),
