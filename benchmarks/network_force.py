@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
-from dvi_jax.fit.optimise import Evaluation, LeastSquaresStage
+from dvi_jax.fit.optimise import Evaluation, LeastSquaresStage, Task
 from dvi_jax.fit.solvers import levenberg_marquardt
 
 jax.config.update("jax_enable_x64", True)
@@ -184,11 +184,14 @@ def _fit_foil(field, seed, steps):
     for number, horizon in enumerate((*HORIZONS, np.inf)):
         last = horizon == np.inf
         taken = []
-        u, best, _ = stage.run(
-            u, horizon, stage=number, max_steps=left if last else min(IN_STAGE, left),
-            tolerance=1e-4 if last else 1e-2, degrees=values.size,
+        task = Task(
+            number,
+            horizon,
+            max_steps=left if last else min(IN_STAGE, left),
+            tolerance=1e-4 if last else 1e-2,
             watch=lambda record, position: taken.append(record),  # noqa: B023
-        )  # fmt: skip
+        )
+        u, best, _ = stage.run(u, task, values.size)
         left -= len(taken)
     ends = np.cumsum([x.size for x in leaves])[:-1]
     new = [jnp.asarray(x).reshape(s) for x, s in zip(np.split(u, ends), shapes, strict=True)]

@@ -26,8 +26,8 @@ jax.config.update("jax_enable_x64", True)
 # ## Hamiltonian, force, observables
 #
 # `H(t, q, p, args)` is the usual Hamiltonian; `dvi.discretise` converts it to a discrete
-# Hamiltonian $H_D(t_0, t_1, q_0, p_1)$. A force has the same arguments. An observable is a function of
-# $(q, p)$ or of $(t, q, p, args)$. `args` contains the parameters.
+# Hamiltonian $H_D(t_0, t_1, q_0, p_1)$. A force has the same arguments. An observable is a function
+# of $(q, p)$ or of $(t, q, p, args)$. `args` contains the parameters.
 
 
 # %%

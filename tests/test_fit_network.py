@@ -1,4 +1,4 @@
-"""Networks as forces: parts that can be read, damping that never drives, fits of both kinds."""
+"""Networks as forces: potential and damping, and fits by least squares and by gradients."""
 
 import importlib.util
 from pathlib import Path
@@ -82,13 +82,10 @@ def test_parts_are_switched_off_separately():
 
 @pytest.mark.slow
 def test_an_undamped_network_keeps_its_energy_and_damping_loses_it():
-    q, p = [0.8], [0.0]
+    options = {"h": 0.05, "num_steps": 2000, "epsilon": 1.0, "method": dvi.Strang()}
 
     def energies(net):
-        sol = dvi.integrate(
-            dvi.System(H_D, force=net), q, p, h=0.05, num_steps=2000, epsilon=1.0,
-            method=dvi.Strang(),
-        )  # fmt: skip
+        sol = dvi.integrate(dvi.System(H_D, force=net), [0.8], [0.0], **options)
         E = (sol.qs**2 + sol.ps**2).sum(axis=1) / 2 + jax.vmap(net.potential)(sol.qs)
         return np.asarray(E)
 
@@ -101,53 +98,42 @@ def test_an_undamped_network_keeps_its_energy_and_damping_loses_it():
 TRUTH = dvi.System(H_D, force=lambda t0, t1, q, p, args: -0.4 * q**3 - 0.1 * p)
 
 
+KNOWN = {"q0": [1.2], "p0": [0.0], "h": H, "epsilon": 1.0, "method": dvi.Strang()}
+
+
 def observed():
-    sol = dvi.integrate(
-        TRUTH, [1.2], [0.0], h=H, num_steps=40, epsilon=1.0, method=dvi.Strang()
-    )  # fmt: skip
+    sol = dvi.integrate(system=TRUTH, num_steps=40, **KNOWN)
     values = np.concatenate([sol.qs, sol.ps], axis=1)
     values = values + 0.01 * np.random.default_rng(0).normal(size=values.shape)
     return dvi.Observations(np.asarray(sol.ts), values, observe="state", sigma=0.01)
 
 
 def model(net):
-    system = dvi.System(H_D, force=net)
-    return {
-        "system": system,
-        "q0": [1.2],
-        "p0": [0.0],
-        "h": H,
-        "epsilon": 1.0,
-        "method": dvi.Strang(),
-    }
+    return {"system": dvi.System(H_D, force=net), **KNOWN}
+
+
+OPTIONS = {"priors": dvi.Prior(0.0, 1.0), "throw": False, "check_curvature": False}
 
 
 @pytest.mark.slow
-def test_a_network_is_fitted_as_it_stands():
-    data, net = observed(), network(width=4, depth=1)
-    prior = dvi.Prior(0.0, 1.0)
-    least = dvi.fit(
-        model, data, net, priors=prior, horizons=[1.0, 2.0], max_steps=80, throw=False,
-        check_curvature=False,
-    )  # fmt: skip
+def test_a_network_is_fitted_by_least_squares():
+    net = network(width=4, depth=1)
+    least = dvi.fit(model, observed(), net, horizons=[1.0, 2.0], max_steps=80, **OPTIONS)
     assert isinstance(least.params, dvi.NetworkForce)
     assert least.params.velocity is net.velocity
     assert least.params.potential_net.activation is net.potential_net.activation
     assert least.names[0].startswith("potential_net.layers[0].weight")
     assert len(least.x) == net.size
-    before = np.abs(net(0.0, H, jnp.array([1.0]), jnp.array([0.0]), None) + 0.4)
-    after = np.abs(least.params(0.0, H, jnp.array([1.0]), jnp.array([0.0]), None) + 0.4)
-    assert after < before
+    at = (0.0, H, jnp.array([1.0]), jnp.array([0.0]), None)
+    assert np.abs(least.params(*at) + 0.4) < np.abs(net(*at) + 0.4)
     start = least.history["loss"][least.history["horizon"] == np.inf][0]
     assert least.loss < start
 
 
 @pytest.mark.slow
 def test_a_network_is_fitted_by_gradients_too():
-    adam = dvi.fit(
-        model, observed(), network(width=4, depth=1), priors=dvi.Prior(0.0, 1.0), horizons=None,
-        max_steps=150, throw=False, optimiser=optax.adam(1e-2), check_curvature=False,
-    )  # fmt: skip
+    given = {"horizons": None, "max_steps": 150, "optimiser": optax.adam(1e-2), **OPTIONS}
+    adam = dvi.fit(model, observed(), network(width=4, depth=1), **given)
     assert isinstance(adam.params, dvi.NetworkForce)
     assert adam.status == "steps_done"
     assert adam.history["loss"][-1] < adam.history["loss"][0] / 4
@@ -167,7 +153,7 @@ def test_a_network_is_fitted_by_gradients_too():
         ({"velocity": 3}, TypeError, "velocity must be a function"),
     ],
 )
-def test_a_network_refuses_what_cannot_be_meant(change, error, match):
+def test_invalid_networks(change, error, match):
     with pytest.raises(error, match=match):
         network(**change)
 

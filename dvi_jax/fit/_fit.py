@@ -6,22 +6,26 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._checks import fraction, instance, whole
+from .._checks import fraction, instance, one_of, whole
 from .._precision import require_double
 from .losses import LeastSquares, Likelihood, Loss
 from .observations import Data, as_arcs
-from .outcome import result_of
 from .problem import Problem
 from .progress import FitProgress, shown
 from .result import FitResult
 from .results import FIT_RESULTS, FitError
 from .run import Run, identity
 from .shooting import MultipleShooting, Segments, SingleShooting
-from .solvers import goes_by_optax, is_gauss_newton, solver_for
-from .stages import MANY, by_gradient, in_segments, least_squares
+from .solvers import is_gauss_newton, is_optax, solver_for
+from .stages import MANY, Minimum, by_gradient, in_segments, least_squares
+from .uncertainty import Uncertainty, in_words, uncertainty
+
+_FEW = 50
+"""Parameters up to which exact second derivatives are computed."""
 
 
 def fit(
@@ -45,46 +49,45 @@ def fit(
     progress: bool | Callable[[FitProgress], None] | None = None,
     throw: bool = True,
 ) -> FitResult:
-    r"""Parameters of a disturbed system from observed trajectories.
+    r"""Parameters of a perturbed system from observed trajectories.
 
-    Makes ½ Σ ρ(r²) + ½ Σ ((x − mean)/sigma)² small over the parameters x, where r are the
-    predicted minus the observed values in standard errors; derivatives are those of the discrete
-    map.
+    Minimises ½ Σ ρ(r²) + ½ Σ ((x − mean)/sigma)² over the parameters x, where r is predicted minus
+    observed in standard errors. Derivatives are those of the discrete map.
 
     **Arguments**
 
     - `model`: a `Model`, or a function ``(params)`` or ``(params, arc)`` that returns the
       arguments of `integrate` as a dict: system, q0, p0, h, epsilon, args, method, …
     - `data`: `Observations`, or a list of them, one for each arc.
-    - `params`: a pytree with starting values: numbers and floating-point arrays are fitted, what
-      else it holds stays as it is. For a `Model` a dict with keys among q0, p0, epsilon, args.
-    - `bounds`, `priors`: like params, with `Bounds` and `Prior` in place of numbers; entries
-      without one may be left out.
+    - `params`: a pytree with starting values: numbers and floating-point arrays are fitted, other
+      leaves are fixed. For a `Model` a dict with keys among q0, p0, epsilon, args.
+    - `bounds`, `priors`: pytrees like params, with `Bounds` and `Prior` in place of numbers;
+      entries without one may be left out.
     - `loss`: `LeastSquares()`; `SoftL1()`, `Cauchy()` against outliers; `Likelihood(f)`.
     - `shooting`: `SingleShooting()`, or `MultipleShooting(segments)` for long or chaotic arcs.
-    - `optimiser`: None takes Levenberg–Marquardt, for more than 400 parameters Adam, for a
+    - `optimiser`: None uses Levenberg–Marquardt, for more than 400 parameters Adam, for a
       `Likelihood` BFGS; or a solver of optimistix, or a gradient transformation of optax.
     - `max_steps`: in all; None means 200, with optax 2000.
-    - `tolerance`: a fit has converged when the next step would move what is predicted, taken
-      together, by less than this many standard errors.
+    - `tolerance`: a fit has converged when the next step would change the predictions by less than
+      this many standard errors in total.
     - `horizons`: ``"auto"`` fits the beginning of the arcs first where the start is so far off
-      that the end would mislead, and goes on to longer pieces; None takes everything at once; or a
-      list of times since t0 to go through before the whole.
+      that later data would mislead the fit, and extends it step by step; None fits all data at
+      once; or a list of times since t0 to fit up to before all data.
     - `batch`: with optax, how many arcs of each group are drawn for each step; `seed` of the draw.
     - `check_units`: refuse data that differ from the model by orders of magnitude.
     - `check_curvature`: compare the Gauss–Newton errors with exact second derivatives (for up to
       50 parameters).
-    - `checkpoint`: a file that is written every few seconds. The same call goes on from it, with
+    - `checkpoint`: a file that is written every few seconds. The same call continues from it, with
       the same bits as without the interruption, also with more `max_steps`; it is removed when
       the fit has converged.
     - `progress`: True shows a bar, False none, None where there is a terminal; or a function of a
       `FitProgress`.
-    - `throw`: raise `FitError` when the fit does not converge; it holds what was found. Otherwise
+    - `throw`: raise `FitError`, which holds the result, when the fit does not converge. Otherwise
       read ``fit.result``.
 
     **Returns** a `FitResult`.
 
-    **Raises** `ValueError` or `TypeError` for input that cannot be meant; `FitError`.
+    **Raises** `ValueError` or `TypeError` for invalid input; `FitError`.
 
     **Source** Levenberg 1944, Marquardt 1963 (by optimistix); Nocedal & Wright 2006, *Numerical
     Optimization*, chapters 10 and 17; the covariance, Bard 1974, *Nonlinear parameter estimation*.
@@ -111,30 +114,30 @@ def fit(
     if max_steps is not None:
         whole("max_steps", max_steps)
     fraction("tolerance", tolerance)
-    is_residuals = isinstance(problem.loss, Loss)
-    solver = solver_for(optimiser, is_residuals, problem.size > MANY, max_steps or 2000)
-    is_optax, is_vector = goes_by_optax(solver), is_gauss_newton(solver)
-    if not is_optax:
+    has_residuals = isinstance(problem.loss, Loss)
+    solver = solver_for(optimiser, has_residuals, problem.size > MANY, max_steps or 2000)
+    by_optax, is_vector = is_optax(solver), is_gauss_newton(solver)
+    if not by_optax:
         problem.check_count()
-    max_steps = max_steps or (2000 if is_optax else 200)
+    max_steps = max_steps or (2000 if by_optax else 200)
     if batch is not None:
         whole("batch", batch)
-        if not is_optax:
+        if not by_optax:
             raise ValueError("batch is for a stochastic optimiser, such as optax.adam(1e-3).")
     if isinstance(shooting, MultipleShooting) and not is_vector:
-        raise ValueError("multiple shooting goes with least squares and their solvers alone.")
+        raise ValueError("multiple shooting works only with least squares and their solvers.")
     wanted = _horizons(horizons)
     u = problem.space.to_u(problem.start)
     name = identity(problem, u, solver, shooting, wanted, batch, seed, tolerance)
     with shown(progress) as show:
         run = Run(problem, max_steps, tolerance, show, began, checkpoint, name)
         if isinstance(shooting, MultipleShooting):
-            found = in_segments(run, Segments(problem, shooting), u, solver)
+            minimum = in_segments(run, Segments(problem, shooting), u, solver)
         elif is_vector:
-            found = least_squares(run, u, solver, wanted, check_units)
+            minimum = least_squares(run, u, solver, wanted, check_units)
         else:
-            found = by_gradient(run, u, solver, wanted, batch, seed, check_units)
-    found, status = result_of(run, found, check_curvature), found.status
+            minimum = by_gradient(run, u, solver, wanted, check_units, batch, seed)
+    found, status = _result(run, minimum, check_curvature), minimum.status
     fine = bool((status == FIT_RESULTS.converged) | (status == FIT_RESULTS.steps_done))
     if checkpoint is not None and fine:
         Path(checkpoint).unlink(missing_ok=True)
@@ -142,21 +145,81 @@ def fit(
         return found
     raise FitError(
         f"the fit did not converge ({found.status} after {len(run.records)} steps, loss "
-        f"{found.loss:.6g}). {FIT_RESULTS[status]} With throw=False what was found is returned "
-        "with its status; here it is the `fit` attribute of this error.",
+        f"{found.loss:.6g}). {FIT_RESULTS[status]} With throw=False the result is returned with "
+        "its status; here it is the `fit` attribute of this error.",
         found,
     )
 
 
 def _horizons(horizons: Any) -> list[float] | None:
-    """Times to go through; None for those that suit."""
+    """Horizons of the stages; None for those chosen by the misfit."""
     if isinstance(horizons, str):
-        if horizons != "auto":
-            raise ValueError(f'horizons must be "auto", None or a list of times, got {horizons!r}.')
+        one_of("horizons", horizons, ["auto"], "Or give None or a list of times.")
         return None
     if horizons is None:
         return [np.inf]
     found = np.asarray(horizons, float)
     if found.ndim != 1 or not (np.diff(found) > 0).all() or not (found > 0).all():
-        raise ValueError(f"horizons must be growing positive times, got {horizons!r}.")
+        raise ValueError(f"horizons must be increasing positive times, got {horizons!r}.")
     return [*found.tolist(), np.inf]
+
+
+def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
+    """Errors, undetermined directions and residuals at a minimum."""
+    problem, n = run.problem, run.problem.size
+    space, u, has_residuals = problem.space, jnp.asarray(minimum.u), isinstance(problem.loss, Loss)
+    rows, known = minimum.aux or problem.whitened(u)
+    predicted, whitened, trajectories = problem.by_arc(rows, known)
+    x = np.asarray(space.to_x(u))
+    if has_residuals:
+        loss = float(np.sum(np.asarray(problem.core.root_rows(u, rows)) ** 2) / 2)
+    else:
+        loss = float(problem.core.scalar(u))
+    degrees, variance = problem.degrees_of_freedom, 1.0
+    covariance, curvature, lost, values = np.full((n, n), np.nan), None, [], np.zeros(0)
+    if minimum.jacobian is not None and np.isfinite(minimum.jacobian).all():
+        J = np.asarray(minimum.jacobian)
+        about = uncertainty(J, 1.0, minimum.free)
+        degrees += about.undetermined.shape[1]  # undetermined directions take no degree
+        if has_residuals and not problem.has_errors:
+            variance = 2 * loss / degrees if degrees > 0 else np.nan
+        slope, values = space.slope(u), about.singular_values
+        with np.errstate(invalid="ignore"):  # infinite variance of a parameter without effect
+            covariance = variance * about.covariance[:n, :n] * np.outer(slope, slope)
+        lost = about.undetermined[:n].T
+        if check_curvature and minimum.free is None and has_residuals and n <= _FEW:
+            curvature = _curvature_ratio(problem, u, J, about)
+    at_bounds = space.at_bounds(x, np.sqrt(np.diag(covariance)))
+    free = ~np.isin(space.names, at_bounds)  # a parameter at its bound is known: it is there
+    words = [in_words(d, list(space.names)) for d in lost if np.abs(d[free]).max(initial=0) > 1e-6]
+    return FitResult(
+        params=space.to_params(jnp.asarray(x)),
+        x=x,
+        names=list(space.names),
+        covariance=covariance,
+        history=run.history(),
+        result=minimum.status,
+        ts=[arc.ts for arc in problem.given],
+        observed=[arc.values for arc in problem.given],
+        predicted=predicted,
+        whitened=whitened,
+        errors=[arc.errors for arc in problem.given],
+        loss=loss,
+        degrees_of_freedom=degrees,
+        num_observed=problem.count,
+        has_errors=problem.has_errors,
+        undetermined=words,
+        singular_values=values,
+        curvature=curvature,
+        at_bounds=at_bounds,
+        trajectories=trajectories,
+        prior_chi2=float(np.sum(np.asarray(problem.core.prior_rows(u)) ** 2)),
+        seconds=time.monotonic() - run.began,
+    )
+
+
+def _curvature_ratio(problem: Problem, u: Any, J: np.ndarray, about: Uncertainty) -> np.ndarray:
+    """Exact second derivative of the loss along each principal direction over Gauss–Newton's."""
+    D = about.directions[:, : about.directions.shape[1] - about.undetermined.shape[1]]
+    exact = np.asarray(problem.curvature(u, D.T)) if D.shape[1] else np.zeros(0)
+    return exact / np.sum((J @ D) ** 2, axis=0)

@@ -1,4 +1,4 @@
-"""Draws from a posterior, by NUTS."""
+"""Samples of a posterior by NUTS."""
 
 import sys
 import warnings
@@ -25,22 +25,22 @@ _R_HAT = 1.01
 """Largest R̂ of chains that count as mixed (Vehtari et al. 2021)."""
 
 _SATURATED = 0.01
-"""Share of draws whose path may be cut short before it is worth a warning."""
+"""Fraction of draws with a truncated path above which a warning is given."""
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    r"""Draws from a posterior.
+    r"""Samples of a posterior.
 
     - `names`: the n parameters. `x`: draws, shape (chains, draws, n). `params`: the pytree that
       was given, with (chains, draws) in front of the shape of each of its numbers.
-    - `potential`: of the draws, (chains, draws). `diverging`: which followed a path whose energy
-      was lost, (chains, draws). `steps`: leapfrog steps of each path; `acceptance`: mean
+    - `potential`: of the draws, (chains, draws). `diverging`: draws whose path did not conserve its
+      energy, (chains, draws). `steps`: leapfrog steps of each path; `acceptance`: mean
       probability of each chain, (chains,).
     - `r_hat`, `ess`: name → split R̂, 1 for chains that agree, and effective number of draws.
-    - `status`: ``"mixed"``; ``"diverging"``: a few paths were lost, so that a narrow part of the
-      density may be missing; ``"not_mixed"``: some R̂ is above 1.01 or not a number, the draws do
-      not stand for the density yet. `warnings`: in words.
+    - `status`: ``"mixed"``; ``"diverging"``: some paths diverged, so that a narrow part of the
+      density may be missing; ``"not_mixed"``: some R̂ is above 1.01 or NaN, so that the draws do
+      not yet represent the density. `warnings`: the same as text.
     """
 
     names: list[str]
@@ -61,7 +61,7 @@ class Samples:
 
     @property
     def divergences(self) -> int:
-        """How many draws are `diverging`."""
+        """Number of `diverging` draws."""
         return int(self.diverging.sum())
 
     @property
@@ -113,24 +113,22 @@ class Samples:
 
     def to_xarray(self) -> Any:
         """A `DataTree` with groups ``posterior`` and ``sample_stats``, dimensions chain and draw,
-        as ArviZ lays them out."""
+        in the layout of ArviZ."""
         import xarray as xr
 
         dims = ("chain", "draw")
-        posterior = {name: (dims, draws) for name, draws in self.samples.items()}
-        stats = {
-            "diverging": (dims, self.diverging),
-            "lp": (dims, -self.potential),
-            "n_steps": (dims, self.steps),
-        }
+        stats = {"diverging": self.diverging, "lp": -self.potential, "n_steps": self.steps}
         coords = {d: np.arange(n) for d, n in zip(dims, self.x.shape[:2], strict=True)}
-        groups = {"posterior": posterior, "sample_stats": stats}
+        groups = {"posterior": self.samples, "sample_stats": stats}
         return xr.DataTree.from_dict(
-            {name: xr.Dataset(of, coords=coords) for name, of in groups.items()}
+            {
+                group: xr.Dataset({name: (dims, x) for name, x in of.items()}, coords=coords)
+                for group, of in groups.items()
+            }
         )
 
     def to_arviz(self) -> Any:
-        """What the functions of ArviZ take: its `InferenceData`; from ArviZ 1.0 on `to_xarray`.
+        """Input for the functions of ArviZ: its `InferenceData`; from ArviZ 1.0 on `to_xarray`.
 
         **Raises** `ImportError` without arviz.
         """
@@ -139,7 +137,7 @@ class Samples:
         except ImportError:
             raise ImportError(
                 "to_arviz needs arviz: pip install arviz. Without it, print(samples) is a summary "
-                "and to_xarray() holds the draws in the same layout."
+                "and to_xarray() has the draws in the same layout."
             ) from None
         tree = self.to_xarray()
         if int(arviz.__version__.split(".")[0]) >= 1:
@@ -165,36 +163,35 @@ def sample(
     max_tree_depth: int = 10,
     progress: bool | None = None,
 ) -> Samples:
-    r"""Draws from the posterior of parameters, by the No-U-Turn sampler.
+    r"""Samples of the posterior of parameters by the No-U-Turn sampler.
 
     The sampler moves in z, u = mode + L z, where L Lᵀ is the covariance of the normal
-    approximation (`Posterior.laplace`): a well-determined fit is nearly round in z, so that little
-    warm-up is needed. Chains start at draws of that approximation.
+    approximation (`Posterior.laplace`): a well-determined posterior is nearly round in z, and needs
+    little warm-up. Chains start at draws of that approximation.
 
     - `model`, `data`, `params`, `bounds`, `priors`, `loss`, `gradient`: as for `Posterior`.
-    - `num_samples`, `num_warmup`: draws of each chain that are kept, and before them those in
-      which step size and masses adapt. `chains` run side by side; two or more show whether they
-      agree. `seed`: of all of it; the same seed, the same draws.
+    - `num_samples`, `num_warmup`: draws of each chain that are kept, and draws before them in
+      which step size and masses adapt. `chains` are computed together; two or more show whether
+      they agree. `seed`: of all draws; the same seed gives the same draws.
     - `start`: a `FitResult` of these parameters, or a pytree like `params`; None: a fit from
       `params`. A parameter that such a fit left at a bound starts at its value in `params`.
-    - `target_accept`: of the step size; nearer to 1 against divergences. `max_tree_depth`: a path
-      takes at most 2^max_tree_depth steps.
+    - `target_accept`: acceptance for the step size; nearer to 1 against divergences.
+      `max_tree_depth`: a path has at most 2^max_tree_depth steps.
     - `progress`: True shows a bar, False none, None where there is a terminal.
 
-    **Returns** `Samples`. What is doubtful about them is warned of (`UserWarning`) and kept in
-    ``warnings``: chains that do not agree, paths that diverged or were cut short, a start that
-    did not converge.
+    **Returns** `Samples`, with a `UserWarning` and a text in ``warnings`` for chains that do not
+    agree, paths that diverged or were truncated, and a start that did not converge. The standard
+    error of a mean is sigma/√ess.
 
-    **Errors** Those of a mean are sigma/√ess.
-
-    **Raises** `ImportError` without numpyro, which the extra ``bayes`` brings; `ValueError` or
-    `TypeError` for input that cannot be meant, a posterior without an integral, or a start at
-    which the trajectory fails.
+    **Raises** `ImportError` without numpyro, which the extra ``bayes`` installs; `ValueError` or
+    `TypeError` for invalid input, a posterior without an integral, or a start at which the
+    trajectory fails.
 
     **Source** Hoffman & Gelman 2014, *J. Mach. Learn. Res.* 15, 1593 (by numpyro); R̂, Gelman et
     al. 2013, *Bayesian Data Analysis*, 11.4.
     """
     numpyro = _numpyro()
+    counts = {"num_warmup": num_warmup, "num_samples": num_samples, "num_chains": chains}
     whole("num_samples", num_samples, 4)
     whole("num_warmup", num_warmup, 0)
     whole("chains", chains)
@@ -222,7 +219,6 @@ def sample(
     kernel = numpyro.infer.NUTS(
         potential_fn=in_z, target_accept_prob=target_accept, max_tree_depth=max_tree_depth
     )
-    counts = {"num_warmup": num_warmup, "num_samples": num_samples, "num_chains": chains}
     shows = sys.stderr.isatty() if progress is None else progress
     mcmc = numpyro.infer.MCMC(kernel, **counts, chain_method="vectorized", progress_bar=shows)
     begin = _starts(in_z, chains, posterior.size, seed)
@@ -243,13 +239,12 @@ def sample(
 
 def _numpyro() -> Any:
     try:
-        import numpyro
         import numpyro.diagnostics
         import numpyro.infer
     except ImportError:
         raise ImportError(
-            'dvi.sample needs numpyro, which the extra brings: pip install "dvi-jax[bayes]". '
-            "(dvi.Posterior does not, for a sampler of your own.)"
+            'dvi.sample needs numpyro, which an extra installs: pip install "dvi-jax[bayes]". '
+            "(dvi.Posterior does not need it, for a sampler of your own.)"
         ) from None
     return numpyro
 
@@ -257,7 +252,7 @@ def _numpyro() -> Any:
 def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) -> np.ndarray:
     """The free vector of a fit or of a pytree.
 
-    A number that the fit left at a bound, where u is infinite, starts as in the `params` given.
+    A number that the fit left at a bound, where u is infinite, starts as in `params`.
 
     **Raises** `ValueError` for one of other parameters, or a pytree outside of the bounds.
     """
@@ -276,7 +271,7 @@ def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) 
 
 
 def _starts(potential: Callable[[Array], Array], chains: int, size: int, seed: int) -> Array:
-    """Normal draws (chains, size), drawn towards 0 until their density is positive."""
+    """Normal draws (chains, size), halved until their density is positive."""
     z = np.random.default_rng(seed).standard_normal((chains, size))
     look = jax.jit(jax.vmap(potential))
     for _ in range(20):
@@ -290,7 +285,7 @@ def _starts(potential: Callable[[Array], Array], chains: int, size: int, seed: i
 def _collect(
     numpyro: Any, posterior: Posterior, x: Any, about: Any, notes: list[str], longest: int
 ) -> Samples:
-    """Draws with what is to be said of them."""
+    """Draws with their diagnostics."""
     x = np.asarray(x)
     columns = {name: x[..., i] for i, name in enumerate(posterior.names)}
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -320,19 +315,19 @@ def _doubts(found: Samples, longest: int) -> list[str]:
         notes.append(
             f"the chains do not agree: R̂ is above {_R_HAT} for {len(worst)} of {len(found.names)} "
             f"parameters ({shown}). Draw more samples after more warm-up; if it stays, the density "
-            "has several maxima or is not determined: see chains one by one, give priors."
+            "has several maxima or is not determined: look at single chains, or give priors."
         )
     if found.divergences:
         notes.append(
             f"{found.divergences} of {found.diverging.size} draws diverged: a narrow part of the "
-            "density, or one at whose edge trajectories fail, may be missing. Take target_accept "
-            "nearer to 1, a smaller h, or bounds that keep off the edge."
+            "density, or one next to failing trajectories, may be missing. Take target_accept "
+            "nearer to 1, a smaller h, or bounds that exclude failing trajectories."
         )
     cut = float((found.steps >= longest).mean())
     if cut > _SATURATED:
         notes.append(
-            f"{100 * cut:.0f} % of the paths were cut short at {longest} steps: draws are right, "
-            "but correlated. Take more warm-up, or a larger max_tree_depth."
+            f"{100 * cut:.0f} % of the paths were truncated at {longest} steps: the draws are "
+            "right, but correlated. Take more warm-up, or a larger max_tree_depth."
         )
     return notes
 

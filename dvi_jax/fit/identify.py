@@ -1,4 +1,4 @@
-"""Which of many candidates an unknown force is made of."""
+"""Identification of an unknown force among many candidate terms."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -21,33 +21,38 @@ from .parameters import Prior
 from .problem import Problem
 from .result import FitResult, with_error
 from .results import FIT_RESULTS, FitError
-from .shooting import MultipleShooting, SingleShooting
 
 _GUARD = 3.0
-"""Scatters of the data that a single candidate is taken to move predictions by, to first order. A
-prior so wide does nothing to terms that are seen, and holds combinations that are not."""
+"""Width of a prior: the change of the predictions by the candidate alone, to first order, in
+scatters of the data. It hardly affects terms that the data determine, and holds combinations that
+they do not."""
 
 _UNKNOWN = 1e-3
-"""Errors against which that prior is weighed where data have none, in scatters of the data."""
+"""Provisional errors of data without any, in scatters of the data."""
+
+
+_OPTIONS = ("max_steps", "tolerance", "check_units", "progress")
+_OF_FIRST = ("shooting", "horizons")
+"""Options of `fit` for all fits, and for that of all candidates."""
 
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    r"""Terms of an unknown force that data ask for.
+    r"""Terms of an unknown force that the data support.
 
     - `terms`: names of those candidates, in the order of the library; `coefficients` and `sigma`:
-      theirs, with standard errors, shape (k,). The errors are those of the final fit: that the
-      terms were chosen by the same data is not in them.
-    - `system`: the model's `System` with the identified force, numbers included. It belongs to
+      theirs, with standard errors, shape (k,). The errors are those of the final fit; they do not
+      include that the terms were chosen by the same data.
+    - `system`: the model's `System` with the identified force and its coefficients. It belongs to
       the `epsilon` of the model, 1 where that had none.
     - `path`: a `Removal` for each set of candidates that was tried, largest first.
-    - `penalty`: by what a term has to lower the criterion.
-    - `alternatives`: for each term, candidates that may be meant in its place, as pairs (name, by
-      how much the criterion would rise).
-    - `undetermined`: combinations of all the candidates that the data say nothing of, in words.
+    - `penalty`: the minimum decrease of the criterion for a term to be kept.
+    - `alternatives`: for each term, candidates that could replace it, as pairs (name, increase of
+      the criterion).
+    - `undetermined`: combinations of all candidates that the data do not determine, as text.
     - `fit`: the last `FitResult`; None when no term was found and nothing else was fitted.
-    - `full`: the `FitResult` with all candidates, which a wide prior keeps from running away where
-      the data do not determine them; for data without errors with provisional ones.
+    - `full`: the `FitResult` with all candidates. A wide prior holds combinations that the data do
+      not determine; data without errors have provisional ones.
     """
 
     terms: tuple[str, ...]
@@ -68,33 +73,29 @@ class Identification:
         return not self.alternatives
 
     def __str__(self) -> str:
-        count = len(self.full.names)
-        lines = [f"{len(self.terms)} of {len(self.path[0].terms)} candidates"]
+        count, all_terms = len(self.full.names), self.path[0]
+        lines = [f"{len(self.terms)} of {len(all_terms.terms)} candidates"]
         if not self.terms:
-            lines[0] = f"none of {len(self.path[0].terms)} candidates: no force is seen"
+            lines[0] = f"none of {len(all_terms.terms)} candidates: no force is seen"
         width = max((len(name) for name in self.terms), default=0)
         for name, c, s in zip(self.terms, self.coefficients, self.sigma, strict=True):
             lines.append(f"  {name:{width}}  {with_error(float(c), float(s))}")
-        lines.append(self._path_in_words())
+        # Where the criterion is least, and what the next removal costs.
+        at = next(i for i, step in enumerate(self.path) if step.terms == self.terms)
+        here, *after = self.path[at : at + 2]
+        words = f"criterion {all_terms.criterion:.6g} with all, {here.criterion:.6g} here"
+        words += "".join(f", {a.criterion:.6g} without {a.removed}" for a in after)
+        lines.append(words)
         for name, others in self.alternatives.items():
             these = ", ".join(f"{other} (criterion {rise:+.2g})" for other, rise in others)
             lines.append(f"not unique: in place of {name} the data allow {these}")
         lines += [f"not determined among all {count}: {words}" for words in self.undetermined]
         if self.fit is not None:
-            lines.append(
-                f"rms {self.fit.rms:.4g}, {self.fit.num_observed} values"
-                + (f", reduced chi² {self.fit.reduced_chi2:.4g}" if self.fit.has_errors else "")
-            )
+            chi2 = f", reduced chi² {self.fit.reduced_chi2:.4g}" if self.fit.has_errors else ""
+            lines.append(f"rms {self.fit.rms:.4g}, {self.fit.num_observed} values{chi2}")
         return "\n".join(lines)
 
     __repr__ = __str__
-
-    def _path_in_words(self) -> str:
-        """Where the criterion was least, and what the next removal would have cost."""
-        at = next(i for i, step in enumerate(self.path) if step.terms == self.terms)
-        all_terms, here, *after = self.path[0], *self.path[at : at + 2]
-        words = f"criterion {all_terms.criterion:.6g} with all, {here.criterion:.6g} here"
-        return words + "".join(f", {a.criterion:.6g} without {a.removed}" for a in after)
 
 
 def identify(
@@ -106,27 +107,21 @@ def identify(
     bounds: PyTree = None,
     priors: PyTree = None,
     loss: Loss = LeastSquares(),
-    shooting: SingleShooting | MultipleShooting = SingleShooting(),
     penalty: float | None = None,
-    max_steps: int = 200,
-    tolerance: float = 1e-4,
-    horizons: str | list[float] | None = "auto",
-    check_units: bool = True,
-    check_curvature: bool = False,
-    progress: bool | Callable[..., None] | None = None,
     throw: bool = True,
+    **options: Any,
 ) -> Identification:
     r"""The terms of an unknown force, out of a library of candidates, from trajectories.
 
         q1 = q0 + h ∂H_D/∂p1,   p1 = p0 − h ∂H_D/∂q0 + h ε (W + Σ c_i f_i)
 
-    All coefficients are fitted to the trajectories themselves, by `fit`: no derivatives of data
-    are taken. Then the term with the smallest |c|/sigma is taken out and the rest fitted anew from
-    where it stands, again and again, and of the sets so met that with the least
+    All coefficients are fitted to the trajectories themselves, by `fit`: data are not
+    differentiated. Then the term with the smallest |c|/sigma is removed and the rest fitted again
+    from its present values, repeatedly, and of these sets the one with the least
 
         χ² + k λ         (data with errors),      N log(χ²/N) + k λ      (without)
 
-    is taken, k its number of terms, N that of observed values, λ the `penalty`.
+    is the result; k is its number of terms, N that of observed values, λ the `penalty`.
 
     **Arguments**
 
@@ -135,41 +130,40 @@ def identify(
       added; where it has none, epsilon may be left out and is 1. args must be a dict or None.
     - `data`: `Observations`, or a list of them.
     - `library`: a `ForceLibrary` without coefficients.
-    - `params`: a dict of what else is fitted, with starting values, as in `fit`: unknown starts
-      ``{"q0": ..., "p0": ...}``, entries of args. Coefficients start at 0.
-    - `bounds`, `priors`: for params.
-    - `penalty`: λ; None takes log N + 2 log M for M candidates. log N alone is Schwarz's BIC, by
-      which one of twenty idle candidates is kept every few times; 2 log M is for having had M
-      to choose from.
-    - `loss`, `shooting`, `max_steps`, `tolerance`, `horizons`, `check_units`, `check_curvature`,
-      `progress`: as in `fit`. Multiple shooting is for the fit of all candidates; refits, which
-      begin at a minimum, go by single shooting.
+    - `params`: a dict of what else is fitted, with starting values, as in `fit`: unknown initial
+      states ``{"q0": ..., "p0": ...}``, entries of args. Coefficients start at 0.
+    - `bounds`, `priors`: for params. `loss`: as in `fit`, but not a `Likelihood`.
+    - `penalty`: λ; None means log N + 2 log M for M candidates. log N alone is Schwarz's BIC, by
+      which one of twenty idle candidates is often kept; 2 log M accounts for the choice among M.
     - `throw`: raise `FitError` when the last fit does not converge.
+    - `options`: `shooting`, `max_steps`, `tolerance`, `horizons`, `check_units`, `progress` as in
+      `fit`, and `check_curvature` (False if left out). Multiple shooting and horizons are for the
+      fit of all candidates; refits, which begin at a minimum, use single shooting.
 
-    **Returns** an `Identification`. Read its `alternatives` and `undetermined`: candidates that
-    are the same along the observed arcs cannot be told apart by them.
+    **Returns** an `Identification`. Read its `alternatives` and `undetermined`: the data cannot
+    distinguish candidates that are equal along the observed arcs.
 
-    **Raises** `ValueError` or `TypeError` for input that cannot be meant; `FitError`.
+    **Raises** `ValueError` or `TypeError` for invalid input; `FitError`.
 
     **Source** Backward elimination for dynamics: our own, after Brunton, Proctor & Kutz 2016
     (candidates; by derivatives); Schwarz 1978; the term 2 k log M, Foster & George 1994, and
     as a bound of 2 log C(M, k), Chen & Chen 2008.
     """
     params = {} if params is None else params
-    _check_input(library, params, bounds, priors, loss, penalty)
+    _check_input(library, params, bounds, priors, loss, penalty, options)
     arcs, many = as_arcs(data)
     whole = _extended(model, library, many, params)
     start = {**params, KEY: dict.fromkeys(library.names, 0.0)}
     weighed = [_with_errors(arc) for arc in arcs]
     guard = _guard(Problem(whole, weighed, many, start, bounds=bounds, loss=loss), library)
     held = {"bounds": bounds, "priors": {**(priors or {}), KEY: guard}, "loss": loss}
-    common: dict[str, Any] = {"tolerance": tolerance, "max_steps": max_steps}
-    common |= {"check_units": check_units, "progress": progress}
-    first = {**common, **held, "shooting": shooting, "check_curvature": False, "throw": False}
+    common = {name: options[name] for name in _OPTIONS if name in options}
+    first = {name: options[name] for name in _OF_FIRST if name in options}
+    first |= {**common, **held, "check_curvature": False, "throw": False}
     full: Any = None
-    for through in (horizons, None):
-        # What fits the beginning may run away later; without a force nothing does.
-        full = fit(whole, weighed if many else weighed[0], start, horizons=through, **first)
+    for again in ({}, {"horizons": None}):
+        # A fit of the beginning may diverge later; without a force nothing does.
+        full = fit(whole, weighed if many else weighed[0], start, **{**first, **again})
         if full.status != "not_finite":
             break
     else:
@@ -182,31 +176,44 @@ def identify(
     given: Any = {**best, KEY: {name: best[KEY][name] for name in terms}}
     found, c, sigma = None, np.zeros(0), np.zeros(0)
     if terms or set(given) != {KEY}:
-        # With the terms that are left, by `fit` itself: errors, residuals, statuses.
+        # The remaining terms by `fit` itself: errors, residuals, statuses.
         common |= {"bounds": bounds, "priors": priors, "loss": loss, "horizons": None}
-        found = fit(whole, data, given, **common, check_curvature=check_curvature, throw=throw)
+        common |= {"check_curvature": options.get("check_curvature", False), "throw": throw}
+        found = fit(whole, data, given, **common)
         given = found.params
-    if terms:
-        assert found is not None
         at = [found.names.index(f"{KEY}.{name}") for name in terms]
         c, sigma = found.x[at], found.sigma[at]
     spec = whole.known({k: v for k, v in given.items() if k != KEY}, 0)
     system = spec["system"]
     if terms:
         system = with_force(system, library.only(terms).with_coefficients(c))
-    force = terms, c, sigma, system, spec["epsilon"]
-    about = search.path, search.penalty, search.alternatives(), search.undetermined
-    return Identification(*force, *about, found, full)
+    return Identification(
+        terms=terms,
+        coefficients=c,
+        sigma=sigma,
+        system=system,
+        epsilon=spec["epsilon"],
+        path=search.path,
+        penalty=search.penalty,
+        alternatives=search.alternatives(),
+        undetermined=search.undetermined,
+        fit=found,
+        full=full,
+    )
 
 
-def _check_input(library: Any, params: Any, bounds: Any, priors: Any, loss: Any, penalty: Any):
+def _check_input(
+    library: Any, params: Any, bounds: Any, priors: Any, loss: Any, penalty: Any, options: Any
+) -> None:
+    known = (*_OPTIONS, *_OF_FIRST, "check_curvature")
+    for name in options:
+        if name not in known:
+            raise TypeError(f"dvi.identify takes no {name!r}: options are {', '.join(known)}.")
     instance("library", library, ForceLibrary, "a dvi.ForceLibrary")
     if library.coefficients is not None:
-        raise ValueError(
-            "the library has coefficients already: hand over one without, they are what is found."
-        )
-    known = "dvi.LeastSquares(), dvi.SoftL1() or dvi.Cauchy()"
-    instance("loss", loss, Loss, known, "Terms are distinguished from noise by residuals.")
+        raise ValueError("the library has coefficients already: give one without them.")
+    losses = "dvi.LeastSquares(), dvi.SoftL1() or dvi.Cauchy()"
+    instance("loss", loss, Loss, losses, "Terms are distinguished from noise by residuals.")
     for name, given in (("params", params), ("bounds", bounds), ("priors", priors)):
         instance(name, {} if given is None else given, Mapping, "a dict or None")
         if given is not None and KEY in given:
@@ -230,7 +237,7 @@ class _Extended(eqx.Module):
     alone: bool = eqx.field(static=True)
 
     def known(self, params: Mapping[str, Any], arc: Any) -> dict[str, Any]:
-        """What the user's model says, its ε included."""
+        """The specification of the user's model, its ε included."""
         spec = specification(self.model, params, arc, self.many)
         return {**spec, "epsilon": 1.0} if self.alone else spec
 
@@ -247,25 +254,25 @@ class _Extended(eqx.Module):
 def _extended(
     model: Callable[..., Any], library: ForceLibrary, many: bool, params: Mapping[str, Any]
 ) -> _Extended:
-    """The model with the library; refuses one that leaves it no room."""
+    """The model with the library; refuses one to which it cannot be added."""
     spec = specification(model, params, 0, many)
     args, system, epsilon = spec.get("args"), spec["system"], spec.get("epsilon", 0.0)
     if not (args is None or (isinstance(args, Mapping) and KEY not in args)):
         raise TypeError(
-            f"args of the model must be None or a dict without {KEY!r}, into which the "
-            f"coefficients are put, got {args!r}."
+            f"args of the model must be None or a dict without {KEY!r}, to which the coefficients "
+            f"are added, got {args!r}."
         )
-    is_disturbed = system.force is not None or system.perturbation is not None
-    if "epsilon" in params and not is_disturbed:
+    is_perturbed = system.force is not None or system.perturbation is not None
+    if "epsilon" in params and not is_perturbed:
         raise ValueError(
             "epsilon and the coefficients cannot both be fitted: only their product is in the map. "
             "Leave epsilon out of params."
         )
     alone = not np.any(np.asarray(epsilon)) and "epsilon" not in params
-    if alone and is_disturbed:
+    if alone and is_perturbed:
         raise ValueError(
-            "the model has a known disturbance, but epsilon = 0, which would take it and the "
-            "library away: give epsilon."
+            "the model has a known perturbation, but epsilon = 0, which would remove it and the "
+            "library: give epsilon."
         )
     return _Extended(model, library, many, alone)
 
@@ -279,20 +286,19 @@ def _with_errors(arc: Observations) -> Observations:
 
 
 def _guard(problem: Problem, library: ForceLibrary) -> dict[str, Prior]:
-    """A wide prior for each coefficient, by what the candidate does to the predictions."""
+    """A wide prior for each coefficient, by the candidate's effect on the predictions."""
+
+    def in_errors(arc):  # 1 where errors are covariances
+        if arc.covariance is not None:
+            return np.ones((1, 1))
+        return arc.whitening() * np.nan_to_num(arc.values.reshape(len(arc.ts), -1))
+
     where = places(problem, library)
     u = problem.space.to_u(problem.start)
     J = np.asarray(problem.evaluate(u).jacobian)[: -problem.size, where]
-    size = max(float(np.sqrt(np.mean(_in_errors(arc) ** 2))) for arc in problem.arcs)
+    size = max(float(np.sqrt(np.mean(in_errors(arc) ** 2))) for arc in problem.arcs)
     effect = np.sqrt(np.mean(J**2, axis=0))
-    # No finite effect: no candidate of this kind, of which the fit itself will tell.
+    # A candidate without a finite effect gets any prior: the fit itself reports it.
     good = np.isfinite(effect) & (effect > 0) & (size > 0)
     sigma = np.where(good, _GUARD * size / np.where(good, effect, 1.0), 1.0)
     return {name: Prior(0.0, float(x)) for name, x in zip(library.names, sigma, strict=True)}
-
-
-def _in_errors(arc: Observations) -> np.ndarray:
-    """Values over their standard errors; 1 where these are covariances."""
-    if arc.covariance is not None:
-        return np.ones((1, 1))
-    return arc.whitening() * np.nan_to_num(arc.values.reshape(len(arc.ts), -1))

@@ -1,6 +1,7 @@
-"""Candidates for an unknown force."""
+"""Libraries of candidate terms for an unknown force."""
 
 import itertools
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -16,7 +17,7 @@ from .._types import Args, Scalar, State
 from ..engine.signature import accepts
 
 KEY = "coefficients"
-"""Where coefficients stand among args and parameters."""
+"""Key of the coefficients in args and parameters."""
 
 _RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -28,14 +29,14 @@ class ForceLibrary(eqx.Module):
 
     - `candidates`: ``{name: function}``; each function ``(t0, t1, q0, p1, args)`` returns an
       array like q0 [unit of the force, over that of its coefficient].
-    - `coefficients`: c, shape (M,) in the order of the names, for a force with numbers; None (the
-      default) reads them from ``args["coefficients"]``, where they can be fitted.
+    - `coefficients`: c, shape (M,) in the order of the names; None (the default) reads them from
+      ``args["coefficients"]``, where they can be fitted.
 
     The library is a force: ``dvi.System(H_D, force=library)``. Two libraries are added with +.
 
-    **Raises** `TypeError` for what is no dict of such functions; `ValueError` for none, for
-    coefficients of another shape, and when called: for args without coefficients, and a candidate
-    whose value is not shaped like q0.
+    **Raises** `TypeError` if it is not a dict of such functions; `ValueError` for an empty dict and
+    for coefficients of another shape; and when called for args without coefficients, and for a
+    candidate whose value is not shaped like q0.
     """
 
     functions: tuple[Callable[..., Any], ...]
@@ -59,7 +60,7 @@ class ForceLibrary(eqx.Module):
         self.functions, self.names = tuple(candidates.values()), tuple(candidates)
         if coefficients is not None:
             coefficients = jnp.asarray(coefficients, float)
-            _check_shape(coefficients, self.names, "coefficients")
+            self._check_shape(coefficients, "coefficients")
         self.coefficients = coefficients
 
     @classmethod
@@ -69,25 +70,25 @@ class ForceLibrary(eqx.Module):
         r"""All monomials up to a degree, in each of n components.
 
         - `degree`: the largest total degree. `n`: q0 has shape (n,).
-        - `variables`: ``"q"``, ``"p"``, or ``"qp"`` for monomials in both.
-        - `constant`: whether the constant forces are among them.
+        - `variables`: ``"q"``, ``"p"``, or ``"qp"`` for monomials in both. `constant`: add the
+          constant forces.
 
         For one degree of freedom names are ``"q³"``, ``"q² p"``; for more ``"q1 q2 e2"`` is the
         force q1 q2 along the second coordinate. ``monomials(5, 1)`` has 20 candidates,
         ``monomials(2, 2)`` 28, ``monomials(3, 2, "q")`` 18.
 
-        **Raises** `ValueError` for anything that cannot be meant.
+        **Raises** `ValueError` for invalid arguments.
         """
         degree, n = whole("degree", degree), whole("n", n)
         one_of("variables", variables, ("q", "p", "qp"))
         places = [(v, i) for v in variables for i in range(n)]
-        found = {}
-        for total in range(0 if constant else 1, degree + 1):
-            for factors in itertools.combinations_with_replacement(places, total):
-                for k in range(n):
-                    force = _Monomial(factors, k, n)
-                    found[force.name] = force
-        return cls(found)
+        forces = [
+            _Monomial(tuple(Counter(factors).items()), k, n)
+            for total in range(0 if constant else 1, degree + 1)
+            for factors in itertools.combinations_with_replacement(places, total)
+            for k in range(n)
+        ]
+        return cls({force.name: force for force in forces})
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> State:
         """Σ c_i f_i: an array like q0."""
@@ -108,13 +109,21 @@ class ForceLibrary(eqx.Module):
             return self.coefficients
         if not (isinstance(args, Mapping) and KEY in args):
             raise ValueError(
-                f'a dvi.ForceLibrary without numbers reads them from args["{KEY}"]: hand over '
+                f'a dvi.ForceLibrary without coefficients reads them from args["{KEY}"]: give '
                 f'args={{"{KEY}": array of shape ({len(self.names)},)}}, or take '
                 f"library.with_coefficients(...). Got args={args!r}."
             )
         c = jnp.asarray(args[KEY])
-        _check_shape(c, self.names, f'args["{KEY}"]')
+        self._check_shape(c, f'args["{KEY}"]')
         return c
+
+    def _check_shape(self, c: Array, called: str) -> None:
+        if c.shape != (len(self.names),):
+            raise ValueError(
+                f"{called} must have shape ({len(self.names)},), one number for each candidate "
+                f"({', '.join(self.names[:4])}{', …' if len(self.names) > 4 else ''}), got "
+                f"{c.shape}."
+            )
 
     def __len__(self) -> int:
         return len(self.names)
@@ -135,28 +144,29 @@ class ForceLibrary(eqx.Module):
     def only(self, names: Iterable[str]) -> "ForceLibrary":
         """The library of some of the candidates, in the order of this one.
 
-        **Raises** `ValueError` for a name that it does not have.
+        **Raises** `ValueError` for an unknown name.
         """
-        names = tuple(names)
-        self._require(names)
-        kept = {k: f for k, f in self._candidates().items() if k in names}
-        c = self.coefficients
+        names = self._known(names)
         at = np.array([i for i, name in enumerate(self.names) if name in names], int)
-        return ForceLibrary(kept, None if c is None else c[at])
+        c = None if self.coefficients is None else self.coefficients[at]
+        return ForceLibrary({self.names[i]: self.functions[i] for i in at}, c)
 
     def with_coefficients(self, coefficients: Any) -> "ForceLibrary":
-        """The same with numbers: an array in the order of names, or a dict of those not zero."""
+        """The same with coefficients: an array in the order of names, or a dict of the nonzero
+        ones."""
         if isinstance(coefficients, Mapping):
-            self._require(coefficients)
+            self._known(coefficients)
             coefficients = [coefficients.get(name, 0.0) for name in self.names]
         return ForceLibrary(self._candidates(), coefficients)
 
-    def _require(self, names: Iterable[str]) -> None:
-        unknown = [name for name in names if name not in self.names]
-        if unknown:
-            raise ValueError(
-                f"there is no candidate {unknown[0]!r}; there are {', '.join(self.names)}."
-            )
+    def _known(self, names: Iterable[str]) -> tuple[str, ...]:
+        names = tuple(names)
+        for name in names:
+            if name not in self.names:
+                raise ValueError(
+                    f"there is no candidate {name!r}; there are {', '.join(self.names)}."
+                )
+        return names
 
     def _candidates(self) -> dict[str, Callable[..., Any]]:
         return dict(zip(self.names, self.functions, strict=True))
@@ -165,7 +175,7 @@ class ForceLibrary(eqx.Module):
 class _Monomial(eqx.Module):
     """A product of components of q and p along coordinate k."""
 
-    factors: tuple[tuple[str, int], ...] = eqx.field(static=True)
+    powers: tuple[tuple[tuple[str, int], int], ...] = eqx.field(static=True)
     k: int = eqx.field(static=True)
     n: int = eqx.field(static=True)
 
@@ -177,25 +187,22 @@ class _Monomial(eqx.Module):
                 "dvi.ForceLibrary.monomials(degree, n)."
             )
         value = jnp.ones((), q0.dtype)
-        for (v, i), power in self._powers().items():
+        for (v, i), power in self.powers:
             value = value * (q0 if v == "q" else p1)[i] ** power
         return jnp.stack([value if j == self.k else jnp.zeros_like(value) for j in range(self.n)])
-
-    def _powers(self) -> dict[tuple[str, int], int]:
-        return {factor: self.factors.count(factor) for factor in self.factors}
 
     @property
     def name(self) -> str:
         """``q1² p2 e1``."""
         parts = []
-        for (v, i), power in self._powers().items():
+        for (v, i), power in self.powers:
             base = v if self.n == 1 else f"{v}{i + 1}"
             parts.append(base if power == 1 else base + str(power).translate(_RAISED))
         return " ".join([*(parts or ["1"]), *([] if self.n == 1 else [f"e{self.k + 1}"])])
 
 
 class _Sum(eqx.Module):
-    """A force that is known, and one that is not."""
+    """A known force and an unknown one."""
 
     known: Callable[..., Any]
     library: ForceLibrary
@@ -204,14 +211,7 @@ class _Sum(eqx.Module):
         return self.known(t0, t1, q0, p1, args) + self.library(t0, t1, q0, p1, args)
 
 
-def _check_shape(c: Array, names: tuple[str, ...], called: str) -> None:
-    if c.shape != (len(names),):
-        raise ValueError(
-            f"{called} must have shape ({len(names)},), one number for each candidate "
-            f"({', '.join(names[:4])}{', …' if len(names) > 4 else ''}), got {c.shape}."
-        )
-
-
 def with_force(system: System, library: ForceLibrary) -> System:
+    """The system with the library's force added to its own."""
     force = library if system.force is None else _Sum(system.force, library)
     return replace(system, force=force)

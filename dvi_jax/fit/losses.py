@@ -1,4 +1,4 @@
-"""What is made small: functions of the residuals in units of their errors."""
+"""Loss functions: functions of the residuals in units of their standard errors."""
 
 import abc
 from collections.abc import Callable
@@ -14,12 +14,12 @@ from .._checks import positive
 class Loss(eqx.Module):
     r"""Base of the losses ½ Σ ρ(r²) of whitened residuals r.
 
-    Robust ones grow slower than r² for large r, so that outliers pull less.
+    Robust losses grow more slowly than r² for large r, so that outliers have less influence.
     """
 
     @abc.abstractmethod
     def root(self, r: Array) -> Array:
-        """√ρ(r²) with the sign of r, smooth in r: what Gauss–Newton takes for its residual."""
+        """√ρ(r²) with the sign of r, smooth in r: the residual of Gauss–Newton steps."""
 
 
 class LeastSquares(Loss):
@@ -29,7 +29,16 @@ class LeastSquares(Loss):
         return r
 
 
-class SoftL1(Loss):
+class _Robust(Loss):
+    """A loss with a scale, in standard errors."""
+
+    scale: eqx.AbstractVar[float]
+
+    def __check_init__(self):
+        positive("scale", self.scale, hint="It counts standard errors.")
+
+
+class SoftL1(_Robust):
     """ρ(s) = 2 k² (√(1 + s/k²) − 1): like s up to k standard errors, then like 2 k √s.
 
     s is the square of a residual over its standard error, k is `scale`.
@@ -37,15 +46,12 @@ class SoftL1(Loss):
 
     scale: float = 1.5
 
-    def __check_init__(self):
-        positive("scale", self.scale, hint="It counts standard errors.")
-
     def root(self, r):
         s = (r / self.scale) ** 2
         return r * jnp.sqrt(2 / (jnp.sqrt(1 + s) + 1))
 
 
-class Cauchy(Loss):
+class Cauchy(_Robust):
     """ρ(s) = k² log(1 + s/k²): errors with the tails of Cauchy's distribution.
 
     s is the square of a residual over its standard error, k is `scale`.
@@ -53,11 +59,9 @@ class Cauchy(Loss):
 
     scale: float = 2.4
 
-    def __check_init__(self):
-        positive("scale", self.scale, hint="It counts standard errors.")
-
     def root(self, r):
         s = (r / self.scale) ** 2
+        # log1p(s)/s is 0/0 at s = 0, and so is its derivative: the series is used there.
         small = s < 1e-6
         safe = jnp.where(small, 1.0, s)
         ratio = jnp.where(small, 1 - s / 2 + s**2 / 3, jnp.log1p(safe) / safe)
@@ -65,14 +69,12 @@ class Cauchy(Loss):
 
 
 class Likelihood(eqx.Module):
-    """Any likelihood of the observations.
+    """Any likelihood of the observations, whose parameters may include a noise level.
 
     - `negative_log_density`: function ``(predicted, observed, sigma, params)`` → −log of the
-      density for each value, an array of their shape. `observed` and `sigma` have the shape of
-      one arc's values (N, K), flattened in components; sigma is 1 when the data have none.
-      Where a value is missing what it returns is not counted.
-
-    Parameters may be those of the errors themselves, a noise level for instance.
+      density for each value, an array of their shape. `observed` and `sigma` have the shape (N, K)
+      of one arc's values, flattened in components; sigma is 1 for data without errors. Results for
+      missing values are ignored.
     """
 
     negative_log_density: Callable[..., Any]

@@ -1,4 +1,4 @@
-"""The model of an arc: from parameters to what `integrate` is to do, and to predictions."""
+"""The model of an arc: from parameters to the arguments of `integrate`, and to predictions."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -25,7 +25,7 @@ from ..lattices import Uniform
 from .observations import Observations
 
 _WASTE = 2_000_000
-"""Steps beyond the ends of shorter arcs that are taken rather than compiling another program."""
+"""Steps beyond the ends of shorter arcs above which another program is compiled for them."""
 
 _OPTIONS = (
     *("method", "lattice", "newton", "root_finder", "adjoint", "arithmetic", "layout"),
@@ -33,27 +33,27 @@ _OPTIONS = (
 )
 _MAY_BE_FITTED = ("q0", "p0", "epsilon", "args")
 _OWN = ("num_steps", "save", "observe", "throw", "progress", "stop", "t0")
-"""What `fit` sets itself."""
+"""Arguments of `integrate` that `fit` sets itself."""
 
 
 class Model(eqx.Module):
-    """A system with what is known of it; parameters replace or add the rest.
+    """A system with its known quantities; parameters replace them or add the unknown ones.
 
     - `system`: a `System`. `h`: the step size [time]. `q0`, `p0`, `epsilon`, `args`: as in
-      `integrate`; what is among the parameters may be left out here. When `data` is a list of
-      arcs, q0 and p0 have one row for each arc, here and among the parameters.
+      `integrate`; fitted ones may be left out here. When `data` is a list of arcs, q0 and p0 have
+      one row for each arc, here and among the parameters.
     - `options`: further arguments of `integrate`: `method`, `lattice`, `root_finder`, `adjoint`,
       `arithmetic`, `layout`, or an `integrator` in place of them; for a lattice that is not
       `Uniform` also `num_steps`.
 
-    Parameters are a dict with keys among ``"q0"``, ``"p0"``, ``"epsilon"``, ``"args"``; when args
-    are dicts, the entries of the parameters' are put into those given here. For any other
+    Parameters are a dict with keys among ``"q0"``, ``"p0"``, ``"epsilon"``, ``"args"``. When args
+    are dicts here and there, fitted entries are merged into the known ones. For any other
     dependence write the model as a function of the parameters, ``(params)`` or ``(params, arc)``
-    with the number of the arc, that returns the arguments of `integrate` as a dict. All arcs go
-    through one program, so that the number is traced: index JAX arrays with it,
+    with the number of the arc, that returns the arguments of `integrate` as a dict. One program
+    computes all arcs, so that the number is traced: index JAX arrays with it,
     ``jnp.asarray(q0s)[arc]``.
 
-    **Raises** `TypeError` for arguments and parameters that have no such name.
+    **Raises** `TypeError` for unknown arguments and parameters.
     """
 
     fixed: dict[str, Any]
@@ -77,26 +77,26 @@ class Model(eqx.Module):
                     f"dvi.Model takes no {name!r}: options are {', '.join(_OPTIONS)}; what is "
                     "saved and observed follows from the data."
                 )
-        fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
         # Arrays, so that another value needs no other compilation.
+        fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
         self.fixed = jax.tree.map(_as_array, fixed)
         self.rest = {"system": system, "h": check_step_size(h), **options}
 
     def __call__(self, params: Mapping[str, Any], arc: Any = None) -> dict[str, Any]:
         """The arguments of `integrate` for an arc (None: there is one, without rows)."""
+        allowed = ", ".join(_MAY_BE_FITTED)
         if not isinstance(params, Mapping):
             raise TypeError(
-                "the parameters of a dvi.Model are a dict with keys among "
-                f"{', '.join(_MAY_BE_FITTED)}, got {type(params).__name__}. For any other pytree "
-                "write the model as a function (params) that returns the arguments of integrate."
+                f"the parameters of a dvi.Model are a dict with keys among {allowed}, got "
+                f"{type(params).__name__}. For any other pytree write the model as a function "
+                "(params) that returns the arguments of integrate."
             )
         found = dict(self.fixed)
         for name, value in params.items():
             if name not in _MAY_BE_FITTED:
                 raise TypeError(
-                    f"{name!r} is no parameter of a dvi.Model: they are "
-                    f"{', '.join(_MAY_BE_FITTED)}. A parameter of the system goes under args: "
-                    f'{{"args": {{{name!r}: ...}}}}.'
+                    f"{name!r} is not a parameter of a dvi.Model: they are {allowed}. A parameter "
+                    f'of the system goes under args: {{"args": {{{name!r}: ...}}}}.'
                 )
             old = found[name]
             both = isinstance(old, Mapping) and isinstance(value, Mapping)
@@ -127,11 +127,51 @@ def _as_array(x: Any) -> Any:
 
 def _row(name: str, rows: Any, arc: Any) -> Array:
     rows = jnp.asarray(rows)
+    # JAX takes the last row for a number that is too large, without an error.
     if rows.ndim == 0 or (not is_traced(arc) and arc >= len(rows)):
         raise ValueError(
             f"{name} has shape {rows.shape}: data is a list of arcs, so it needs a row for each."
         )
     return rows[arc]
+
+
+def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: bool) -> dict:
+    """The arguments of `integrate` that the model returns for an arc, checked.
+
+    **Raises** `TypeError` or `ValueError` for a model that returns something else.
+    """
+    called = "a dvi.Model or a function of the parameters that returns the arguments of integrate"
+    instance("model", model, Callable, called)
+    if isinstance(model, Model):
+        found = model(params, arc if many else None)
+    else:
+        found = model(params, arc) if accepts(model, 2) else model(params)
+    example = 'dict(system=..., q0=..., p0=..., h=..., epsilon=params["epsilon"])'
+    called = f"a dict of the arguments of dvi.integrate, such as {example}"
+    found = dict(instance("what the model returns", found, Mapping, called))
+    for name in ("system", "q0", "p0", "h"):
+        if found.get(name) is None:
+            raise ValueError(f"the model's arguments of dvi.integrate lack {name!r}.")
+    for name in _OWN:
+        if name in found and not (name == "num_steps" and not _is_uniform(found)):
+            hint = " (Observations(..., t0=...))" if name == "t0" else ""
+            raise ValueError(f"the model must not set {name!r}: it follows from the data{hint}.")
+    if isinstance(found["h"], jax.Array):
+        raise ValueError(
+            "the step size h of the model must be a number such as 0.1, not a parameter nor a JAX "
+            "array: the number of steps to the data follows from it."
+        )
+    return found
+
+
+def _lattice(spec: Mapping[str, Any]) -> Any:
+    integrator = spec.get("integrator") or Integrator()
+    return spec.get("lattice", integrator.lattice)
+
+
+def _is_uniform(spec: Mapping[str, Any]) -> bool:
+    # Not isinstance: the equal steps of TimeTransformed are not equal in time.
+    return type(_lattice(spec)) is Uniform
 
 
 class Group(eqx.Module):
@@ -140,7 +180,7 @@ class Group(eqx.Module):
     Arrays have the arcs in front and are padded to one number of observations N of K components:
     `arcs` (A,), `t0` (A,), `ts` (A, N), `values` and `seen` (A, N, K), `whiten` (A, N, K) or
     (A, N, K, K). Padding is not seen, and has the time of the last observation. `block` and
-    `pick` are how observations are found on the lattice, see `predict`.
+    `pick` say how observations are found on the time grid, see `predict`.
     """
 
     arcs: np.ndarray
@@ -160,70 +200,23 @@ def weighed(off: Any, whiten: Any) -> Any:
     return off * whiten if whiten.ndim == off.ndim else jnp.einsum("...ij,...j->...i", whiten, off)
 
 
-def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: bool) -> dict:
-    """What the model says `integrate` shall do for an arc, checked.
-
-    **Raises** `TypeError` or `ValueError` for a model that returns something else.
-    """
-    if not callable(model):
-        raise TypeError(
-            "model must be a dvi.Model or a function of the parameters that returns the arguments "
-            f"of dvi.integrate, got {model!r}."
-        )
-    if isinstance(model, Model):
-        found = model(params, arc if many else None)
-    else:
-        found = model(params, arc) if accepts(model, 2) else model(params)
-    if not isinstance(found, Mapping):
-        raise TypeError(
-            "the model must return the arguments of dvi.integrate as a dict, such as "
-            'dict(system=..., q0=..., p0=..., h=..., epsilon=params["epsilon"]), got '
-            f"{type(found).__name__}."
-        )
-    found = dict(found)
-    for name in ("system", "q0", "p0", "h"):
-        if found.get(name) is None:
-            raise ValueError(f"the model's arguments of dvi.integrate lack {name!r}.")
-    for name in _OWN:
-        if name in found and not (name == "num_steps" and not _uniform(found)):
-            raise ValueError(
-                f"the model must not set {name!r}: it follows from the data"
-                + (" (Observations(..., t0=...))." if name == "t0" else ".")
-            )
-    if isinstance(found["h"], jax.Array):
-        raise ValueError(
-            "the step size h of the model must be a number such as 0.1, not a parameter nor a JAX "
-            "array: how many steps reach the data follows from it."
-        )
-    return found
-
-
-def _uniform(spec: Mapping[str, Any]) -> bool:
-    # Not isinstance: the equal steps of TimeTransformed are not equal in time.
-    return type(_lattice(spec)) is Uniform
-
-
-def _lattice(spec: Mapping[str, Any]) -> Any:
-    integrator = spec.get("integrator") or Integrator()
-    return spec.get("lattice", integrator.lattice)
-
-
 def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[Group]:
-    """Arcs put together where one compiled program can serve them.
+    """The arcs in groups, each of which one compiled program can compute.
 
-    **Raises** `ValueError` for step sizes that cannot suit the data.
+    **Raises** `ValueError` for step sizes that do not suit the data.
     """
-    kinds: dict[Any, list[int]] = {}
-    steps = [_steps(i, arc, spec) for i, (arc, spec) in enumerate(zip(arcs, specs, strict=True))]
-    spans = [abs((arc.ts[-1] - arc.t0) / spec["h"]) for arc, spec in zip(arcs, specs, strict=True)]
-    if _uniform(specs[0]) and 0 < max(spans) < 0.5:
+    pairs = list(zip(arcs, specs, strict=True))
+    steps = [_steps(i, arc, spec) for i, (arc, spec) in enumerate(pairs)]
+    longest = max(abs((arc.ts[-1] - arc.t0) / spec["h"]) for arc, spec in pairs)
+    if _is_uniform(specs[0]) and 0 < longest < 0.5:
         raise ValueError(
-            f"all observations lie within {max(spans):.3g} steps of h = {specs[0]['h']:g}, less "
+            f"all observations lie within {longest:.3g} steps of h = {specs[0]['h']:g}, less "
             "than half of one. Are the times of the data in the units of h?"
         )
-    # A program each takes seconds to compile; some millions of steps too many do not.
+    # Compiling takes seconds for each program; some millions of steps too many do not.
     apart = len(arcs) * max(steps) - sum(steps) > _WASTE
-    for i, (arc, spec) in enumerate(zip(arcs, specs, strict=True)):
+    kinds: dict[Any, list[int]] = {}
+    for i, (arc, spec) in enumerate(pairs):
         size = math.ceil(math.log2(steps[i])) if apart else 0
         key = (arc.function, arc.values.shape[1:], arc.covariance is not None, size, spec["h"])
         kinds.setdefault(key, []).append(i)
@@ -234,7 +227,7 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
 
 
 def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
-    """How many steps reach the last observation.
+    """Number of steps to the last observation.
 
     **Raises** `ValueError` for an h that does not lead from t0 to the observations.
     """
@@ -250,11 +243,11 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
             "t0 to which the model's q0 and p0 belong (Observations(..., t0=...); the first time "
             "if it was left out)."
         )
-    if not _uniform(spec):
+    if not _is_uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
-                f"on the lattice {_lattice(spec)!r} the model has to say how many steps reach "
-                "the last observation: num_steps."
+                f"on the lattice {_lattice(spec)!r} the model must give num_steps, the number of "
+                "steps to the last observation."
             )
         return spec["num_steps"]
     steps = span / h
@@ -269,26 +262,28 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
 def make_group(
     numbers: list[int], arcs: list[Any], spec: Mapping[str, Any], num_steps: int
 ) -> Group:
-    """One group of arcs (`Observations` or parts of them) that take `num_steps` steps each."""
+    """One group of arcs (`Observations` or parts of them) with `num_steps` steps each."""
     rows = max(len(arc.ts) for arc in arcs)
 
-    def padded(x, fill=0.0):
-        width = [(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1)
-        return np.pad(x, width, mode="constant", constant_values=fill)
+    def stacked(of, **pad):
+        arrays = [np.asarray(of(arc)) for arc in arcs]
+        widths = [[(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1) for x in arrays]
+        return np.stack([np.pad(x, w, **pad) for x, w in zip(arrays, widths, strict=True)])
 
-    ts = np.stack([np.pad(arc.ts, (0, rows - len(arc.ts)), mode="edge") for arc in arcs])
-    flat = [arc.values.reshape(len(arc.ts), -1) for arc in arcs]
-    t0 = np.array([arc.t0 for arc in arcs])
+    def flat(arc):
+        return arc.values.reshape(len(arc.ts), -1)
+
+    ts, t0 = stacked(lambda arc: arc.ts, mode="edge"), np.array([arc.t0 for arc in arcs])
     block, pick = 0, None
-    if _uniform(spec):
+    if _is_uniform(spec):
         block, pick = _blocks((ts - t0[:, None]) / float(spec["h"]), num_steps)
     return Group(
         arcs=np.array(numbers),
         t0=t0,
         ts=ts,
-        values=np.stack([padded(np.nan_to_num(x)) for x in flat]),
-        seen=np.stack([padded(~np.isnan(x), False) for x in flat]),
-        whiten=np.stack([padded(arc.whitening()) for arc in arcs]),
+        values=stacked(lambda arc: np.nan_to_num(flat(arc))),
+        seen=stacked(lambda arc: ~np.isnan(flat(arc))),
+        whiten=stacked(lambda arc: arc.whitening()),
         observe=arcs[0].function,
         num_steps=num_steps,
         block=block,
@@ -297,8 +292,8 @@ def make_group(
 
 
 def _blocks(places: np.ndarray, num_steps: int) -> tuple[int, np.ndarray | None]:
-    """How often states are saved, and which saved state is which observation; None for the latter
-    where observations lie between lattice points, or too irregularly upon them.
+    """Steps between saved states, and which saved state is which observation; None for the latter
+    if observations lie between grid points, or too irregularly on them.
 
     `places` are times in steps from the start, shape (A, N).
     """
@@ -314,24 +309,33 @@ def _blocks(places: np.ndarray, num_steps: int) -> tuple[int, np.ndarray | None]
 def predict(
     spec: dict[str, Any], t0: Array, ts: Array, pick: Array | None, group: Group
 ) -> tuple[Array, tuple[Array, Array], RESULTS]:
-    """What the model says is observed along one arc, shape (N, K), its last state and its status.
+    """Predicted observations along one arc, shape (N, K), the last state and the status.
 
-    On a uniform lattice states are saved every `block` steps. Observations upon them are picked
-    out; others are reached from the saved state before by `block` equal steps of their own, none
-    longer than h. So an observation is that of the method to its order, each step runs in the
-    quick loop, and memory grows with the number of observations, not of steps.
+    On a uniform time grid states are saved every `block` steps. Observations on them are picked;
+    others are reached from the saved state before by `block` equal steps of their own, none longer
+    than h. So an observation has the order of the method, each step runs in the fast loop, and
+    memory grows with the number of observations, not of steps.
     """
     spec = {**spec, "t0": t0, "throw": False}
     if group.block == 0:
         sol = integrate(**spec, save=Save(ts=ts))
-        last = sol.qs[-1], sol.ps[-1]
-        return _observed(group, spec, ts, sol.qs, sol.ps), last, sol.result
-    spec["num_steps"] = group.num_steps
-    sol = integrate(**spec, save=Save(every=group.block, final=True))
-    last = sol.qs[-1], sol.ps[-1]
-    if pick is not None:
-        qs, ps = sol.qs[pick], sol.ps[pick]
-        return _observed(group, spec, ts, qs, ps), last, sol.result
+        qs, ps = sol.qs, sol.ps
+    else:
+        spec["num_steps"] = group.num_steps
+        sol = integrate(**spec, save=Save(every=group.block, final=True))
+        if pick is None:
+            qs, ps = _between(spec, t0, ts, sol, group)
+        else:
+            qs, ps = sol.qs[pick], sol.ps[pick]
+    args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, spec.get("args"))
+    found = jax.vmap(lambda t, q, p: group.observe(t, q, p, args))(ts, qs, ps)
+    return jnp.reshape(found, (len(ts), -1)), (sol.qs[-1], sol.ps[-1]), sol.result
+
+
+def _between(
+    spec: dict[str, Any], t0: Array, ts: Array, sol: Any, group: Group
+) -> tuple[Array, Array]:
+    """States at times between grid points."""
     stride = group.block * float(spec["h"])
     before = jnp.ceil((ts - t0) / stride - 1e-9).astype(int) - 1
     before = jnp.clip(before, 0, group.num_steps // group.block)
@@ -346,18 +350,11 @@ def predict(
 
     qs, ps = jax.vmap(reach)(at, sol.qs[before], sol.ps[before], h)
     wide = none.reshape(-1, *[1] * (qs.ndim - 1))
-    qs, ps = jnp.where(wide, sol.qs[0], qs), jnp.where(wide, sol.ps[0], ps)
-    return _observed(group, spec, ts, qs, ps), last, sol.result
-
-
-def _observed(group: Group, spec: Mapping[str, Any], ts: Array, qs: Array, ps: Array) -> Array:
-    args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, spec.get("args"))
-    found = jax.vmap(lambda t, q, p: group.observe(t, q, p, args))(ts, qs, ps)
-    return jnp.reshape(found, (len(ts), -1))
+    return jnp.where(wide, sol.qs[0], qs), jnp.where(wide, sol.ps[0], ps)
 
 
 def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> None:
-    """Refuse a start and args that `integrate` refuses, and an observable that does not give one
+    """Refuse a start and args that `integrate` refuses, and an observable that does not return one
     value of the shape of the data.
 
     **Raises** `ValueError` with both shapes; errors of the function itself with a note.
@@ -369,10 +366,11 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> None
     except Exception as error:
         error.add_note(f"(in the observe of arc {i}, called with (t, q, p, args))")
         raise
-    shape = getattr(out, "shape", None)
-    if shape != arc.values.shape[1:]:
+    shape, of_one = getattr(out, "shape", None), arc.values.shape[1:]
+    if shape != of_one:
         name = arc.observe if isinstance(arc.observe, str) else "observe"
+        hint = " Give values[:, None]." if of_one == () and shape == (1,) else ""
         raise ValueError(
-            f"arc {i}: values has shape {arc.values.shape}, so one observation has "
-            f"{arc.values.shape[1:]}, but {name} returns {shape} for a state of shape {q.shape}."
+            f"arc {i}: values has shape {arc.values.shape}, so one observation has {of_one}, but "
+            f"{name} returns {shape} for a state of shape {q.shape}.{hint}"
         )

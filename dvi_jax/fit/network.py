@@ -1,4 +1,4 @@
-"""Unknown forces as networks that are made of a potential and of damping."""
+"""Unknown forces as networks of a potential and a damping."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,24 +18,24 @@ def _momentum(q: Any, p: Any) -> Any:
 
 
 class NetworkForce(eqx.Module):
-    r"""A force from networks: one of a potential, one of damping.
+    r"""A force from two networks: a potential and a damping.
 
         W(q, p) = −∇φ(q) − D(q, p) v,     D = L Lᵀ ≥ 0
 
-    so that the second part never does positive work: −vᵀ D v ≤ 0, whatever the parameters are.
+    The second part never does positive work: −vᵀ D v ≤ 0 for all parameters.
 
     - `n`: q and p have shape (n,). `key`: of `jax.random`, for the initial weights.
-    - `width`, `depth`: neurons of a hidden layer, and how many there are of them, in each network.
-    - `conservative`, `dissipative`: which of the parts there are.
+    - `width`, `depth`: neurons of a hidden layer, and number of hidden layers, of each network.
+    - `conservative`, `dissipative`: which of the parts are present.
     - `damping_of`: ``"q"``, or ``"qp"`` for a D that depends on both.
-    - `activation`: a smooth function; the force has its derivative, so that softplus, the default,
-      makes it a network of sigmoids.
-    - `velocity`: function ``(q, p)`` → v, shape (n,): the q̇ = ∂H/∂p with which the power is to be
-      negative. None takes v = p, that of masses 1 and all others up to a positive factor.
+    - `activation`: a smooth function. The force contains its derivative: with softplus, the
+      default, it is a network of sigmoids.
+    - `velocity`: function ``(q, p)`` → v, shape (n,), the q̇ = ∂H/∂p in the work. None means v = p,
+      for masses 1, or any that are equal.
     - `scale_q`, `scale_p`: sizes of q and p: networks receive ``q / scale_q`` and
       ``p / scale_p``.
-    - `initial`: by what the last layers are made smaller to begin with, so that the force is small.
-      Far smaller ones leave the layers before them without effect, which least squares take ill.
+    - `initial`: initial scale of the last layers, so that the force begins small. With much smaller
+      values the earlier layers have no effect, and the least-squares problem is ill-conditioned.
 
     The module is a force, ``dvi.System(H_D, force=network)``, and its own parameters:
 
@@ -43,13 +43,12 @@ class NetworkForce(eqx.Module):
                                      h=0.1, epsilon=1.0)
         fit = dvi.fit(model, data, dvi.NetworkForce(2, key=jax.random.key(0)))
 
-    and then ``fit.params`` is a `NetworkForce`. Up to 400 parameters are fitted by
-    Levenberg–Marquardt, which is far better here than gradient steps: take small networks. `size`
-    counts them. Through the data alone weights are not determined, which is reported as such;
-    the force is.
+    and then ``fit.params`` is a `NetworkForce`. Up to 400 parameters (`size`) are fitted by
+    Levenberg–Marquardt, which is far better here than gradient steps: take small networks. The
+    data determine the force, but not single weights, and the fit reports these as undetermined.
 
-    **Raises** `ValueError` or `TypeError` for what cannot be meant; `ValueError`, when called, for
-    q of another shape.
+    **Raises** `ValueError` or `TypeError` for invalid input; `ValueError`, when called, for q of
+    another shape.
 
     **Source** Our own; potentials by networks, Greydanus, Dzamba & Yosinski 2019; D = L Lᵀ,
     Zhong, Dey & Chakraborty 2020, *Dissipative SymODEN*.
@@ -79,32 +78,30 @@ class NetworkForce(eqx.Module):
         scale_p: float = 1.0,
         initial: float = 0.3,
     ):
-        for name, value in (("width", width), ("depth", depth)):
-            whole(name, value)
         if not (conservative or dissipative):
             raise ValueError("conservative and dissipative are both False: no force is left.")
         self.n = whole("n", n)
         self.damping_of = one_of("damping_of", damping_of, ("q", "qp"))
         self.scale_q, self.scale_p = positive("scale_q", scale_q), positive("scale_p", scale_p)
         self.velocity = function("velocity", _momentum if velocity is None else velocity)
-        function("activation", activation)
+        shape = whole("width", width), whole("depth", depth), function("activation", activation)
         initial = positive("initial", initial)
         one, two = jax.random.split(key)
         self.potential_net = self.damping_net = None
         if conservative:
             # A constant of φ is no force: a bias there would be a parameter without effect.
-            net = eqx.nn.MLP(n, 1, width, depth, activation, use_final_bias=False, key=one)
-            self.potential_net = _last_layer(net, initial)
+            net = eqx.nn.MLP(n, 1, *shape, use_final_bias=False, key=one)
+            self.potential_net = _with_last_layer(net, initial)
         if dissipative:
             inputs = n if damping_of == "q" else 2 * n
-            net = eqx.nn.MLP(inputs, n * (n + 1) // 2, width, depth, activation, key=two)
+            net = eqx.nn.MLP(inputs, n * (n + 1) // 2, *shape, key=two)
             # D is quadratic in L and has no slope at L = 0: it begins at initial² on the diagonal.
-            net = _last_layer(net, initial)
             start = jnp.asarray(initial * np.eye(n)[np.tril_indices(n)])
+            net = _with_last_layer(net, initial)
             self.damping_net = eqx.tree_at(lambda m: m.layers[-1].bias, net, start)
 
     def __call__(self, t0: Scalar, t1: Scalar, q0: State, p1: State, args: Args) -> State:
-        """W(q0, p1): shape (n,), [energy / unit of q]. Times and args have no part in it."""
+        """W(q0, p1): shape (n,), [energy / unit of q]; independent of times and args."""
         del t0, t1, args
         return self.conservative(q0) + self.dissipation(q0, p1)
 
@@ -119,27 +116,23 @@ class NetworkForce(eqx.Module):
 
     def damping(self, q: State, p: State) -> Array:
         """D = L Lᵀ, symmetric and positive semidefinite, shape (n, n)."""
-        q = self._checked(q)
-        if self.damping_net is None:
-            return jnp.zeros((self.n, self.n))
-        L = self._factor(q, self._checked(p))
+        L = self._factor(q, p)
         return L @ L.T
 
     def dissipation(self, q: State, p: State) -> State:
         """−D v, shape (n,)."""
-        q, p = self._checked(q), self._checked(p)
         if self.damping_net is None:
-            return jnp.zeros_like(q)
+            return jnp.zeros_like(self._checked(q))
         L = self._factor(q, p)
         return -L @ (L.T @ self.velocity(q, p))
 
     def power(self, q: State, p: State) -> Scalar:
-        """−vᵀ D v ≤ 0 [energy / time]: what the second part takes out."""
+        """Power of the damping, −vᵀ D v ≤ 0 [energy / time]."""
         return jnp.dot(self.velocity(q, p), self.dissipation(q, p))
 
     @property
     def size(self) -> int:
-        """How many parameters there are."""
+        """Number of parameters."""
         return sum(x.size for x in jax.tree.leaves(eqx.filter(self, eqx.is_inexact_array)))
 
     def _phi(self, q: Array) -> Array:
@@ -149,7 +142,9 @@ class NetworkForce(eqx.Module):
 
     def _factor(self, q: Array, p: Array) -> Array:
         """L, lower triangular."""
-        assert self.damping_net is not None
+        q, p = self._checked(q), self._checked(p)
+        if self.damping_net is None:
+            return jnp.zeros((self.n, self.n), q.dtype)
         x = q / self.scale_q
         if self.damping_of == "qp":
             x = jnp.concatenate([x, p / self.scale_p])
@@ -168,6 +163,6 @@ class NetworkForce(eqx.Module):
         return x
 
 
-def _last_layer(net: eqx.nn.MLP, size: float) -> eqx.nn.MLP:
-    """The same network with a small last layer."""
+def _with_last_layer(net: eqx.nn.MLP, size: float) -> eqx.nn.MLP:
+    """The network with the weights of its last layer times `size`."""
     return eqx.tree_at(lambda m: m.layers[-1].weight, net, replace_fn=lambda w: size * w)

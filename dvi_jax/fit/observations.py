@@ -1,4 +1,4 @@
-"""What was observed: times, values, errors; checked, and laid out for the device."""
+"""Observations: times, values and errors, checked."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -7,33 +7,19 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import instance
+from .._checks import finite, instance
 from ..engine.quantities import refuse_unit_or_mask
 from ..engine.signature import accepts
 
-
-def _positions(t, q, p, args):
-    return q
-
-
-def _momenta(t, q, p, args):
-    return p
-
-
-def _state(t, q, p, args):
-    return jnp.concatenate([jnp.ravel(q), jnp.ravel(p)])
-
-
 _RANGE = (1e-140, 1e140)
-"""Standard errors relative to the largest value of which a sum of squares can be computed."""
+"""Standard errors relative to the largest value for which a sum of squares can be computed."""
 
-NAMED = {"positions": _positions, "momenta": _momenta, "state": _state}
+NAMED: dict[str, Callable[..., Any]] = {
+    "positions": lambda t, q, p, args: q,
+    "momenta": lambda t, q, p, args: p,
+    "state": lambda t, q, p, args: jnp.concatenate([jnp.ravel(q), jnp.ravel(p)]),
+}
 """Observables of a state that have a name."""
-
-
-def accepts_four(function: Any) -> bool:
-    """Whether it can be called with (t, q, p, args)."""
-    return callable(function) and accepts(function, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,24 +28,24 @@ class Observations:
 
     - `ts`: times, shape (N,), ascending or descending, no two equal, and all on one side of t0.
       Either order may be combined with either sign of h; a `FitResult` has the order given here.
-    - `values`: what was observed at them, shape (N, ...); NaN, or a masked number, where a
-      component is missing. Only `values` may be masked.
-    - `observe`: what is observed of a state: ``"positions"`` (q, the default), ``"momenta"`` (p),
+    - `values`: observed values, shape (N, ...); NaN, or a masked number, where a component is
+      missing. Only `values` may be masked.
+    - `observe`: the observable of a state: ``"positions"`` (q, the default), ``"momenta"`` (p),
       ``"state"`` (both in one vector), or a function ``(t, q, p, args)`` that returns an array of
       the shape of one value: a range, an angle, one body of many.
-    - `sigma`: standard errors: one number, or an array that broadcasts to `values`. Left out,
-      all values have the same error and its size is found from the residuals.
+    - `sigma`: standard errors: one number, or an array that broadcasts to `values`. Without them
+      all values have the same error, whose size is estimated from the residuals.
     - `covariance`: instead of sigma, covariances of the K components of one observation in the
       order of ``ravel``: shape (K, K) for all, or (N, K, K).
-    - `t0`: time of the arc's start, where the model's q0 and p0 belong; ``ts[0]`` if left out.
+    - `t0`: time of the arc's start, to which the model's q0 and p0 belong; ``ts[0]`` if left out.
       The sign of the model's h must lead from t0 to the observations.
 
-    Observations of several kinds along the same arc are one `observe` that returns them all, at
-    the union of their times, with NaN for what was not seen.
+    Observations of several kinds along one arc are one `observe` that returns them all, at
+    the union of their times, with NaN for what was not observed.
 
-    **Raises** `ValueError` or `TypeError` for what cannot be meant: times that are not finite,
-    not in order, twice the same or on both sides of t0; values of another shape, infinite, or all
-    missing; errors that are zero, negative or NaN; a covariance that is not positive definite.
+    **Raises** `ValueError` or `TypeError` for invalid input: times that are not finite, not in
+    order, equal or on both sides of t0; values of another shape, infinite, or all missing; errors
+    that are zero, negative or NaN; a covariance that is not positive definite.
     """
 
     ts: Any
@@ -71,12 +57,11 @@ class Observations:
 
     def __post_init__(self):
         values = self.values
-        if np.ma.is_masked(values):  # what is masked is missing
+        if np.ma.is_masked(values):
             values = np.ma.filled(values.astype(float), np.nan)
         ts, values = _real("ts", self.ts), _real("values", values)
-        if not (
-            self.observe in NAMED if isinstance(self.observe, str) else accepts_four(self.observe)
-        ):
+        by_name, of = isinstance(self.observe, str), self.observe
+        if not (of in NAMED if by_name else callable(of) and accepts(of, 4)):
             raise TypeError(
                 'observe must be "positions", "momenta", "state" or a function (t, q, p, args) of '
                 f"a state, got {self.observe!r}."
@@ -89,14 +74,14 @@ class Observations:
                 f"{values.shape}."
             )
         _check_times(ts)
-        if np.isinf(values).any():
-            where = _first(np.isinf(values))
+        if where := _first(np.isinf(values)):
             raise ValueError(
                 f"values is infinite at index {where}. A missing component is given as NaN."
             )
         if np.isnan(values).all():
             raise ValueError("all values are NaN, which means missing: nothing was observed.")
-        t0 = float(ts[0]) if self.t0 is None else _number("t0", self.t0)
+        refuse_unit_or_mask("t0", self.t0)
+        t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():
             raise ValueError(
                 f"t0 = {t0:.17g}, the start of the arc, lies between the times of the observations "
@@ -109,7 +94,7 @@ class Observations:
         if self.covariance is not None:
             if self.sigma is not None:
                 raise ValueError("give sigma or covariance, not both.")
-            checked["covariance"] = _covariance(_real("covariance", self.covariance), values)
+            checked["covariance"] = _covariance(self.covariance, values)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
@@ -122,13 +107,12 @@ class Observations:
         """The same observations in the order in which a run from t0 reaches them."""
         if abs(self.ts[0] - self.t0) <= abs(self.ts[-1] - self.t0):
             return self
-        rows = ("ts", "values", "sigma", "covariance")
-        given = {name: getattr(self, name) for name in rows}
+        given = {name: getattr(self, name) for name in ("ts", "values", "sigma", "covariance")}
         return replace(self, **{n: None if x is None else x[::-1] for n, x in given.items()})
 
     @property
     def components(self) -> int:
-        """How many numbers one observation has."""
+        """Number of components of one observation."""
         return int(np.prod(self.values.shape[1:], dtype=int))
 
     @property
@@ -144,18 +128,17 @@ class Observations:
         return np.full(self.values.shape, np.nan) if self.sigma is None else self.sigma
 
     def whitening(self) -> np.ndarray:
-        """What residuals are multiplied by to be independent with unit variance.
+        """Factors by which residuals become independent with unit variance.
 
-        Shape (N, K), or (N, K, K) for covariances: with those of what was seen, C = L Lᵀ, it
-        is L⁻¹; rows and columns of what is missing are zero.
+        Shape (N, K), or (N, K, K) for covariances: L⁻¹ of C = L Lᵀ of the observed components;
+        rows and columns of missing ones are zero.
         """
         flat = self.values.reshape(len(self.ts), -1)
         seen = ~np.isnan(flat)
         if self.covariance is None:
             sigma = 1.0 if self.sigma is None else self.sigma.reshape(flat.shape)
             return np.where(seen, 1 / np.where(seen, sigma, 1.0), 0.0)
-        k = flat.shape[1]
-        found = np.zeros((len(flat), k, k))
+        found = np.zeros((*flat.shape, flat.shape[1]))
         for i, (C, good) in enumerate(zip(self.covariance, seen, strict=True)):
             if good.any():
                 L = np.linalg.cholesky(C[np.ix_(good, good)])
@@ -180,11 +163,11 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
         raise ValueError("data is an empty list: there is nothing to fit.")
     for i, arc in enumerate(data):
         instance(f"data[{i}]", arc, Observations, "a dvi.Observations")
-    if len({arc.has_errors for arc in data}) > 1:
-        without = next(i for i, arc in enumerate(data) if not arc.has_errors)
+    known = [arc.has_errors for arc in data]
+    if any(known) and not all(known):
         raise ValueError(
-            f"data[{without}] has neither sigma nor covariance while other arcs have: their "
-            "weights would be arbitrary. Give errors for all arcs, or for none."
+            f"data[{known.index(False)}] has neither sigma nor covariance while other arcs have: "
+            "their weights would be arbitrary. Give errors for all arcs, or for none."
         )
     return list(data), True
 
@@ -195,40 +178,33 @@ def _real(name: str, value: Any) -> np.ndarray:
         found = np.asarray(value)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} must be an array of real numbers ({error}).") from None
-    if not (np.issubdtype(found.dtype, np.floating) or np.issubdtype(found.dtype, np.integer)):
+    if found.dtype.kind not in "fiu":
         raise TypeError(f"{name} must be an array of real numbers, got dtype {found.dtype}.")
     return found.astype(float)
 
 
-def _number(name: str, value: Any) -> float:
-    found = _real(name, value)
-    if found.shape != () or not np.isfinite(found):
-        raise ValueError(f"{name} must be one finite number, got {value!r}.")
-    return float(found)
-
-
 def _first(where: np.ndarray) -> list[int]:
-    """The first index at which an array is true."""
-    return np.argwhere(where)[0].tolist()
+    """The first index at which an array is true; empty where there is none."""
+    return np.argwhere(where)[0].tolist() if where.any() else []
 
 
 def _check_times(ts: np.ndarray) -> None:
-    if not np.isfinite(ts).all():
-        i = int(np.argmin(np.isfinite(ts)))
+    if at := _first(~np.isfinite(ts)):
+        [i] = at
         raise ValueError(
             f"ts[{i}] is {ts[i]}: every observation needs its time. Leave out those without one."
         )
     steps = np.diff(ts)
-    if (steps == 0).any():
-        i = int(np.argmax(steps == 0))
+    if at := _first(steps == 0):
+        [i] = at
         raise ValueError(
             f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]:.17g}. Several observations at "
             "one time are one observation with more components (an observe that returns them "
             "all), or their mean with its smaller sigma."
         )
-    if not ((steps > 0).all() or (steps < 0).all()):
-        up = (steps > 0).sum() >= (steps < 0).sum()
-        i = int(np.argmax(steps < 0 if up else steps > 0))
+    is_up = (steps > 0).sum() >= (steps < 0).sum()
+    if at := _first(steps < 0 if is_up else steps > 0):
+        [i] = at
         raise ValueError(
             f"ts is not in order: ts[{i}] = {ts[i]:.17g} is followed by ts[{i + 1}] = "
             f"{ts[i + 1]:.17g}. Sort times and values together: order = np.argsort(ts); "
@@ -246,25 +222,24 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
             "For one error at each time give shape (N, 1, ...)."
         ) from None
     seen = ~np.isnan(values)
-    bad = ~(np.isfinite(full) & (full > 0)) & seen
-    if bad.any():
+    if at := _first(~(np.isfinite(full) & (full > 0)) & seen):
         raise ValueError(
-            f"sigma is {full[bad][0]} for the value at index {_first(bad)}: standard errors must "
-            "be positive and finite. A value that is not to count is given as NaN; one that is "
-            "known exactly belongs into the model."
+            f"sigma is {full[tuple(at)]} for the value at index {at}: standard errors must be "
+            "positive and finite. A value that is to be ignored is given as NaN; put one that is "
+            "known exactly into the model."
         )
     size = np.nanmax(np.abs(values)) or 1.0
-    bad = ~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & seen
-    if bad.any():
+    if at := _first(~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & seen):
         raise ValueError(
-            f"sigma is {full[bad][0]:g} for the value at index {_first(bad)}, and the values are "
-            f"up to {size:.3g}: squares of their ratio are beyond the range of double precision. "
-            "Give the standard errors in the units of the values."
+            f"sigma is {full[tuple(at)]:g} for the value at index {at}, and the values are up to "
+            f"{size:.3g}: squares of their ratio are beyond the range of double precision. Give "
+            "the standard errors in the units of the values."
         )
     return full
 
 
-def _covariance(C: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
+    C = _real("covariance", covariance)
     n, k = len(values), int(np.prod(values.shape[1:], dtype=int))
     if C.shape not in ((k, k), (n, k, k)):
         raise ValueError(
@@ -275,9 +250,9 @@ def _covariance(C: np.ndarray, values: np.ndarray) -> np.ndarray:
     variance = np.einsum("nii->ni", full)
     scale = np.sqrt(np.abs(variance))
     skew = np.abs(full - full.swapaxes(1, 2)).max(axis=(1, 2))
-    bad = ~(skew <= 1e-10 * (scale.max(axis=1) ** 2 + np.finfo(float).tiny))  # or NaN
-    if bad.any():
-        i = int(np.argmax(bad))
+    # The comparison is written so that NaN is refused.
+    if at := _first(~(skew <= 1e-10 * (scale.max(axis=1) ** 2 + np.finfo(float).tiny))):
+        [i] = at
         raise ValueError(
             f"the covariance of observation {i} is not symmetric and finite: {full[i]}"
         )
@@ -285,12 +260,11 @@ def _covariance(C: np.ndarray, values: np.ndarray) -> np.ndarray:
         unit = full / (scale[:, :, None] * scale[:, None, :])
     good = np.isfinite(unit).all(axis=(1, 2)) & (variance > 0).all(axis=1)
     smallest = np.linalg.eigvalsh(np.where(good[:, None, None], unit, np.eye(k)))[:, 0]
-    bad = ~good | (smallest <= 1e-14)
-    if bad.any():
-        i = int(np.argmax(bad))
+    if at := _first(~good | (smallest <= 1e-14)):
+        [i] = at
         raise ValueError(
             f"the covariance of observation {i} is not positive definite (smallest eigenvalue of "
-            f"its correlations {smallest[i]:.3g}): {full[i].tolist()}. A combination that is known "
-            "exactly belongs into the model; an error of zero cannot be weighed."
+            f"its correlations {smallest[i]:.3g}): {full[i].tolist()}. Put a combination that is "
+            "known exactly into the model; an error of zero cannot be weighted."
         )
     return full

@@ -1,8 +1,8 @@
-"""One stage of a fit: an optimiser driven step by step, so that it can be watched and resumed."""
+"""One stage of a fit: an optimiser run step by step, so that it can be watched and resumed."""
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,27 +12,27 @@ import numpy as np
 from jaxtyping import Array
 
 from .results import FIT_RESULTS
-from .solvers import goes_by_optax
+from .solvers import is_optax
+from .uncertainty import inverse_or
 
 _STIFFNESS = 30.0
-"""Length of the columns of the scaled Jacobian. Optimistix damps with 1 to begin with, so that
-this is Marquardt's 1e-3 of the squared columns."""
+"""Length of the columns of the scaled Jacobian. Optimistix begins with a damping of 1, which then
+is Marquardt's 1e-3 of the squared columns."""
 
-_HOPELESS = 12
-"""Rejected steps in a row after which no step is expected to help."""
+_REJECTED = 12
+"""Rejected steps in a row after which no further step is expected to help."""
 
-_HOPELESS_LINE = 40
-"""The same for a line search that halves: it has no scale to begin with."""
+_REJECTED_ON_LINE = 40
+"""The same for a line search that halves: it does not know the scale to begin with."""
 
 _FLAT = 1e-3
-"""Standard errors that an undamped step is worth, below which a loss that no longer falls is a
-minimum, known to its rounding."""
+"""Length of an undamped step in standard errors below which a loss that no longer decreases is at
+its minimum, up to rounding."""
 
 
-@dataclass
-class Record:
-    """One step of an optimiser: of which `stage`, the `loss` (½ Σ r², or the scalar) of the
-    accepted point `x`, the `step` to the next trial in standard errors, whether it was accepted."""
+class Record(NamedTuple):
+    """One step of an optimiser: its `stage`, the `loss` (½ Σ r², or the scalar) of the accepted
+    point `x`, the `step` to the next trial in standard errors, and whether it was accepted."""
 
     stage: int
     horizon: float
@@ -44,8 +44,12 @@ class Record:
 
 @dataclass
 class Position:
-    """Where a stage stands: all that is needed to go on with the same bits. `memory` is of how the
-    last steps went; `status` is that of a stage that has ended, else empty."""
+    """State of a stage after `done` steps: all that is needed to continue with the same bits.
+
+    - `base`, `scale`, `z`: u = base + scale z. `leaves`: numbers of the optimiser's state; `extra`:
+      those of what is minimised. `rejected`, `last`, `still`: rejected steps in a row, the last
+      loss, and steps in a row that hardly changed it. `status`: of a stage that has ended.
+    """
 
     stage: int
     horizon: float
@@ -55,27 +59,47 @@ class Position:
     z: np.ndarray
     leaves: list[np.ndarray] = field(default_factory=list)
     extra: list[np.ndarray] = field(default_factory=list)
-    memory: tuple[float, ...] = ()
+    rejected: int = 0
+    last: float = np.inf
+    still: int = 0
     status: str = ""
 
+    @property
+    def u(self) -> np.ndarray:
+        """The free variables."""
+        return self.base + self.scale * self.z
 
-class _Known(eqx.Module):
-    """Inputs of a compiled step of the scalar loss: where z is counted from and in what."""
 
-    base: Array
-    scale: Array
-    horizon: Array
-    extra: Any = None
+@dataclass(frozen=True)
+class Task:
+    """One stage: its number and horizon, when it ends, and who watches its steps.
+
+    - `max_steps`: those before it was resumed included. `resume`: the position to continue from.
+    """
+
+    stage: int
+    horizon: float
+    max_steps: int
+    tolerance: float
+    watch: Callable[[Record, Position], None] = lambda *_: None
+    resume: Position | None = None
+
+    def begin(self, u: np.ndarray, scale: np.ndarray) -> Position:
+        """The position to continue from, or that before the first step."""
+        new = Position(self.stage, self.horizon, 0, np.asarray(u), scale, np.zeros(len(u)))
+        return self.resume or new
 
 
 class Evaluation(NamedTuple):
-    """Residual vector (R,), its derivative (R, n), and what else was found on the way."""
+    """Residual vector (R,), its derivative (R, n), and what else was computed with them."""
 
     residual: Array
     jacobian: Array
     aux: Any = None
 
 
+# Optimistix differentiates the residual function itself. Here it gets a function whose value and
+# derivative are inputs, so that the one large program, that of both, is called outside of its step.
 @eqx.filter_custom_jvp
 def _residual(z, known):
     return known[0]
@@ -88,12 +112,11 @@ def _(primals, tangents):
 
 
 def _function(z, known):
-    """The residual of optimistix where it asks for it: known there, with its derivative."""
     return _residual(z, known), None
 
 
 def _begin(solver: Any, rows: int, size: int) -> Any:
-    """The state of a solver before its first step; one object, so that a step is compiled once."""
+    """The state of a solver before its first step."""
     try:
         return _kept(solver, rows, size)
     except TypeError:  # a solver that holds arrays has no hash
@@ -106,6 +129,8 @@ def _state(solver: Any, rows: int, size: int) -> Any:
     return solver.init(_function, z, known, {}, shape, None, frozenset())
 
 
+# One object for each solver and shape: a state holds functions, and another one would make the
+# step compile again.
 _kept = functools.lru_cache(maxsize=64)(_state)
 
 
@@ -116,13 +141,12 @@ def _advance(solver: Any, z: Array, known: tuple[Array, Array], state: Any) -> t
 
 
 class LeastSquaresStage:
-    """Gauss–Newton with damping on the residual vector, in scaled variables.
+    """Damped Gauss–Newton on the residual vector, in scaled variables.
 
         u = base + scale z,    the columns of dr/dz have one length at z = 0
 
-    A solver of optimistix asks for the residual once a step, at a point that its state tells
-    beforehand. So the one large program, that of residual and Jacobian, is called here, and the
-    solver's step is a small one.
+    A solver of optimistix needs the residual once in a step, at a point that its state gives
+    beforehand: it is computed here, and the solver's own step is a small program.
 
     - `evaluate`: compiled function ``(u, horizon, extra)`` → `Evaluation`.
     - `solver`: one of optimistix's Gauss–Newton family.
@@ -138,81 +162,84 @@ class LeastSquaresStage:
     def run(
         self,
         u: np.ndarray,
-        horizon: float,
-        *,
-        stage: int,
-        max_steps: int,
-        tolerance: float,
+        task: Task,
         degrees: int,
         first: Evaluation | None = None,
         extra: Any = None,
-        resume: Position | None = None,
-        watch: Callable[[Record, Position], None],
     ) -> tuple[np.ndarray, Evaluation, FIT_RESULTS]:
-        """u at the minimum, what was found there, and the status.
+        """u at the minimum, the evaluation there, and the status.
 
-        - `first`: what is known at u already; `degrees` of freedom; `extra` for `evaluate`.
+        - `degrees` of freedom. `first`: the evaluation at u if it is known. `extra`: for
+          `evaluate`.
 
-        Ends when the step to the next trial moves what is predicted by less than `tolerance`
-        standard errors, the size of which is found from the residuals; or when three steps in a
-        row make Σ r² smaller by less than its square.
+        Ends when the step to the next trial moves the predictions by less than `tolerance`
+        standard errors, whose size is estimated from the residuals; or when three steps in a row
+        decrease Σ r² by less than the square of that.
         """
-        if resume is None:
-            best = self.at(u, horizon, extra) if first is None else first
+        horizon, tolerance = task.horizon, task.tolerance
+        u = u if task.resume is None else task.resume.u
+        best = self.at(u, horizon, extra) if first is None else first
+        trial, state = best, _begin(self._solver, *best.jacobian.shape)
+        if task.resume is None:
             square = best.residual @ best.residual
             if not (np.isfinite(square) and np.isfinite(best.jacobian).all()):
                 return u, best, FIT_RESULTS.not_finite
-            length = np.linalg.norm(np.asarray(best.jacobian), axis=0)
-            scale = np.where(length > 0, _STIFFNESS / np.where(length > 0, length, 1.0), 1.0)
-            at = Position(stage, horizon, 0, np.asarray(u), scale, np.zeros(len(u)))
-            at.memory = (0, np.inf, 0)
-            state, trial = _begin(self._solver, *best.jacobian.shape), best
         else:
-            at, u = resume, resume.base + resume.scale * resume.z
-            best, trial = self.at(u, horizon, extra), None
-            state = _with_leaves(_begin(self._solver, *best.jacobian.shape), at.leaves)
+            trial, state = None, _with_leaves(state, task.resume.leaves)
             _check_same(best.residual, state.f_info.residual)
-        base, scale, done, z, status = at.base, at.scale, at.done, jnp.asarray(at.z), at.status
-        rejected, last, still = at.memory
-        while not status and done < max_steps:
+        length = np.linalg.norm(np.asarray(best.jacobian), axis=0)
+        at = task.begin(u, inverse_or(length, 1.0, _STIFFNESS))
+        base, scale, z = at.base, at.scale, jnp.asarray(at.z)
+        while not at.status and at.done < task.max_steps:
             if trial is None:
                 trial = self.at(base + scale * np.asarray(state.y_eval), horizon, extra)
-            known = trial.residual, trial.jacobian * scale[None]
-            z, state = _advance(self._solver, z, known, state)
-            done += 1
+            z, state = _advance(
+                self._solver, z, (trial.residual, trial.jacobian * scale[None]), state
+            )
             accepted = int(state.num_steps_since_acceptance) == 0
-            best, rejected = (trial, 0) if accepted else (best, rejected + 1)
+            best, at.rejected = (trial, 0) if accepted else (best, at.rejected + 1)
             trial = None
             residual = np.asarray(best.residual)
             loss = float(residual @ residual) / 2
             spread = np.sqrt(2 * loss / max(degrees, 1))
             moved = float(np.linalg.norm(np.asarray(best.jacobian) @ (scale * (state.y_eval - z))))
-            u = base + scale * np.asarray(z)
-            floor = 1e-13 * _STIFFNESS * float(np.linalg.norm(u / scale))
-            least = max(tolerance * spread, floor)
-            if accepted:  # at a bound the free variable goes on for ever, and nothing changes
-                still = still + 1 if last - loss <= (tolerance * spread) ** 2 else 0
-                last = loss
-            ended = still >= 3 or (moved <= least and rejected < 3)
+            at.done, at.z, at.leaves, at.extra = (
+                at.done + 1,
+                np.asarray(z),
+                *map(_leaves, (state, extra)),
+            )
+            u = at.u
+            rounding = 1e-13 * _STIFFNESS * float(np.linalg.norm(u / scale))
+            least = max(tolerance * spread, rounding)
+            if accepted:  # at a bound the free variable grows for ever, and nothing changes
+                at.still = at.still + 1 if at.last - loss <= (tolerance * spread) ** 2 else 0
+                at.last = loss
+            ended = at.still >= 3 or (moved <= least and at.rejected < 3)
             if not np.isfinite(moved):
-                status = "stalled"
+                at.status = "stalled"
             elif ended and _undamped(best, scale) <= least:
-                # A damped step is small for its damping as well.
-                status = "converged"
-            elif rejected >= _HOPELESS or (rejected >= 3 and moved <= least):
+                # A step may be small because of its damping: the undamped one decides.
+                at.status = "converged"
+            elif at.rejected >= _REJECTED or (at.rejected >= 3 and moved <= least):
                 flat = _undamped(best, scale) <= max(_FLAT * spread, least)
-                status = "converged" if flat else "stalled"
-            at = replace(at, done=done, z=np.asarray(z), status=status)
-            at.leaves, at.extra, at.memory = _leaves(state), _leaves(extra), (rejected, last, still)
+                at.status = "converged" if flat else "stalled"
             in_sigma = moved / spread if spread else 0.0
-            watch(Record(stage, horizon, loss, in_sigma, accepted, u), at)
-        return u, best, getattr(FIT_RESULTS, status or "max_steps_reached")
+            task.watch(Record(task.stage, horizon, loss, in_sigma, accepted, u), at)
+        return u, best, getattr(FIT_RESULTS, at.status or "max_steps_reached")
+
+
+class _Known(eqx.Module):
+    """Inputs of a compiled step of the scalar loss: origin and scale of z, and what is summed."""
+
+    base: Array
+    scale: Array
+    horizon: Array
+    extra: Any = None
 
 
 def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
-    """The scalar loss over `per` as optimistix wants it, a function of z and where it is counted
-    from; its derivative by reverse mode, whatever the solver takes: memory flat in the number of
-    steps."""
+    """The scalar loss over `per` for optimistix. Its derivative is by reverse mode, whichever mode
+    the solver uses: memory does not grow with the number of steps."""
 
     def value(z, known):
         return core.scalar(known.base + known.scale * z, known.horizon, known.extra) / per
@@ -251,72 +278,61 @@ class ScalarStage:
     def run(
         self,
         u: np.ndarray,
-        horizon: float,
-        *,
-        stage: int,
-        max_steps: int,
-        tolerance: float,
+        task: Task,
         scale: np.ndarray,
         choose: Callable[[int], Any] | None = None,
-        resume: Position | None = None,
-        watch: Callable[[Record, Position], None],
     ) -> tuple[np.ndarray, FIT_RESULTS]:
         """u at the end, and the status.
 
-        With `choose`, a function of the number of the step → arcs, it ends after `max_steps`;
-        else when the loss of a step changed by less than tolerance² (in −log likelihood), three
-        times running.
+        With optax, or with `choose`, a function of the number of the step → arcs, it ends after
+        `max_steps`; else when the loss (−log likelihood) changed by less than tolerance² in each
+        of three steps.
         """
-        begin = Position(stage, horizon, 0, u, scale, np.zeros(len(u)), memory=(np.inf, 0, 0))
-        at = begin if resume is None else resume
+        at = task.begin(u, scale)
         base, size, z = (jnp.asarray(x) for x in (at.base, at.scale, at.z))
-        done = at.done
 
-        def known(step):
-            return _Known(base, size, jnp.asarray(horizon), choose and choose(step))
+        def known():
+            return _Known(base, size, jnp.asarray(task.horizon), choose and choose(at.done))
 
         struct = jax.ShapeDtypeStruct((), jnp.result_type(float))
         function = _scalar_function(self.core, self.per)
         zero = jnp.zeros(len(u))
-        state = self.solver.init(function, zero, known(0), {}, struct, None, frozenset())
+        state = self.solver.init(function, zero, known(), {}, struct, None, frozenset())
         if not (hasattr(state, "f") or hasattr(state, "f_info")):
-            raise TypeError(f"{type(self.solver).__name__} does not tell the loss of its steps.")
-        if resume is not None:
-            state = _with_leaves(state, resume.leaves)
-        is_optax = goes_by_optax(self.solver)
-        (last, still, rejected), status = at.memory, at.status
-        while not status and done < max_steps:
+            raise TypeError(f"{type(self.solver).__name__} does not report the loss of its steps.")
+        if task.resume is not None:
+            state = _with_leaves(state, at.leaves)
+        fixed_steps = is_optax(self.solver)
+        while not at.status and at.done < task.max_steps:
             old = z
-            z, state, ended = _descend(self.solver, self.core, self.per, z, known(done), state)
-            done += 1
-            loss = float(state.f if is_optax else state.f_info.f)
-            if not np.isfinite(loss) and done == 1:
+            z, state, ended = _descend(self.solver, self.core, self.per, z, known(), state)
+            at.done, at.z, at.leaves = at.done + 1, np.asarray(z), _leaves(state)
+            loss = float(state.f if fixed_steps else state.f_info.f)
+            if not np.isfinite(loss) and at.done == 1:
                 return u, FIT_RESULTS.not_finite
             x, moved = np.asarray(base + size * z), float(np.linalg.norm(z - old))
             if not np.isfinite(x).all():
                 return np.asarray(base + size * old), FIT_RESULTS.not_finite
-            if choose is None and not is_optax:
-                rejected = 0 if moved > 0 else rejected + 1
+            if choose is None and not fixed_steps:
+                at.rejected = 0 if moved > 0 else at.rejected + 1
                 if moved > 0:
-                    still = still + 1 if abs(last - loss) <= tolerance**2 else 0
-                    last = loss
-                if bool(ended) or still >= 3:
-                    status = "converged"
-                elif rejected >= _HOPELESS_LINE:
-                    status = "stalled"
-            at = replace(at, done=done, z=np.asarray(z), status=status)
-            at.leaves, at.memory = _leaves(state), (last, still, rejected)
-            watch(Record(stage, horizon, loss * self.per, moved, bool(moved > 0), x), at)
-        usual = "steps_done" if is_optax else "max_steps_reached"
-        return np.asarray(base + size * z), getattr(FIT_RESULTS, status or usual)
+                    at.still = at.still + 1 if abs(at.last - loss) <= task.tolerance**2 else 0
+                    at.last = loss
+                if bool(ended) or at.still >= 3:
+                    at.status = "converged"
+                elif at.rejected >= _REJECTED_ON_LINE:
+                    at.status = "stalled"
+            loss *= self.per
+            task.watch(Record(task.stage, task.horizon, loss, moved, bool(moved > 0), x), at)
+        usual = "steps_done" if fixed_steps else "max_steps_reached"
+        return np.asarray(base + size * z), getattr(FIT_RESULTS, at.status or usual)
 
 
 def _undamped(at: Evaluation, scale: np.ndarray) -> float:
-    """What the undamped step would move what is predicted by, in standard errors; parameters that
-    have all but lost their effect (at a bound) left out."""
+    """Change of the predictions by the undamped step, in standard errors; parameters that have
+    almost no effect any more (at a bound) are left out."""
     J = np.asarray(at.jacobian) * scale
-    length = np.linalg.norm(J, axis=0)
-    J = J[:, length > 1e-3 * _STIFFNESS]
+    J = J[:, np.linalg.norm(J, axis=0) > 1e-3 * _STIFFNESS]
     if not J.shape[1]:
         return 0.0
     U, s, _ = np.linalg.svd(J / np.linalg.norm(J, axis=0), full_matrices=False)
@@ -328,12 +344,11 @@ def _check_same(now: Array, then: Array) -> None:
     if not np.allclose(now, then, rtol=1e-6, atol=1e-6 * float(np.abs(then).max(initial=0.0))):
         raise ValueError(
             "the checkpoint is of another model: at its parameters this one predicts other values. "
-            "Give another file, or remove it to begin anew."
+            "Give another file, or remove it to start again."
         )
 
 
 def _leaves(state: Any) -> list[np.ndarray]:
-    """The numbers in it."""
     return [np.asarray(x) for x in jax.tree.leaves(eqx.filter(state, eqx.is_array))]
 
 
@@ -341,8 +356,7 @@ def _with_leaves(state: Any, leaves: list[np.ndarray]) -> Any:
     """The same state with other numbers."""
     arrays, rest = eqx.partition(state, eqx.is_array)
     old, tree = jax.tree.flatten(arrays)
-    shapes = [np.shape(x) for x in old]
-    if shapes != [np.shape(x) for x in leaves]:
+    if [np.shape(x) for x in old] != [np.shape(x) for x in leaves]:
         raise ValueError("the checkpoint is of another fit: its optimiser has another state.")
     new = [jnp.asarray(x, o.dtype) for x, o in zip(leaves, old, strict=True)]
     return eqx.combine(jax.tree.unflatten(tree, new), rest)

@@ -1,8 +1,8 @@
 """Parameters as one vector: their names, bounds and priors."""
 
-from collections.abc import Iterator, Mapping
+import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,7 +30,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a parameter beforehand: a normal distribution, independent in components.
+    """Prior knowledge of a parameter: a normal distribution, independent in components.
 
     - `mean`, `sigma`: numbers, or arrays that broadcast to the parameter.
     """
@@ -39,32 +39,19 @@ class Prior:
     sigma: Any
 
 
-def _is_number(path: Any, x: Any) -> bool:
-    """Whether a leaf is fitted: a whole number is unless it is a field of an object, a size."""
-    if isinstance(x, int) and not isinstance(x, bool):
-        return not any(isinstance(key, jax.tree_util.GetAttrKey) for key in path)
-    return bool(eqx.is_inexact_array_like(x))
-
-
 _UNDERFLOW = 1e-150
 """Distance from a bound below which the square of dx/du is zero, and no error is found."""
-
-
-def _gap(bound: Array) -> Array:
-    """Distance of a number next to a bound from it, at least one unit of its round-off."""
-    about = np.finfo(float)
-    return jnp.maximum(about.eps * jnp.abs(bound), about.tiny)
 
 
 class Space(eqx.Module):
     """The parameters of a fit as a vector x of all their numbers, and as a free vector u.
 
-    Numbers and floating-point arrays are fitted; what else the pytree holds (functions, arrays of
-    integers, whole numbers in objects) stays as it is. x obeys the bounds, u has none.
+    x obeys the bounds, u has none.
 
     - `names`: one for each number, such as ``q0[1]``. `lower`, `upper`: bounds of x, infinite
-      where there are none. `prior_mean`, `prior_weight`: of x; the weight is 1/sigma, 0 without a
-      prior.
+      where there are none; `below`, `above`: where there are some.
+    - `prior_mean`, `prior_weight`: of x; the weight is 1/sigma, 0 without a prior.
+    - `rest`: the leaves that are not fitted.
     """
 
     lower: Array
@@ -80,48 +67,49 @@ class Space(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers there are."""
+        """Number of numbers."""
         return len(self.names)
 
     @property
     def count_of_priors(self) -> int:
-        """How many numbers have a prior."""
+        """Number of numbers with a prior."""
         return int((np.asarray(self.prior_weight) > 0).sum())
+
+    @property
+    def _sides(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which numbers have both bounds, a lower one only, and an upper one only."""
+        below, above = np.array(self.below), np.array(self.above)
+        return below & above, below & ~above, above & ~below
 
     def to_params(self, x: Array) -> PyTree:
         """The pytree that holds the numbers x."""
-        ends = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in self.shapes)])
-        leaves = [
-            x[a:b].reshape(shape)
-            for a, b, shape in zip(ends[:-1], ends[1:], self.shapes, strict=True)
-        ]
+        ends = np.cumsum([math.prod(shape) for shape in self.shapes])[:-1]
+        parts = zip(jnp.split(x, ends), self.shapes, strict=True)
+        leaves = [part.reshape(shape) for part, shape in parts]
         return eqx.combine(jax.tree.unflatten(self.tree, leaves), self.rest)
 
     def to_x(self, u: Array) -> Array:
         """x within its bounds from the free vector u."""
-        below, above = np.array(self.below), np.array(self.above)
-        lower, upper = jnp.where(below, self.lower, 0.0), jnp.where(above, self.upper, 0.0)
-        one = jnp.exp(jnp.where(below ^ above, u, 0.0))
-        x = jnp.where(below & above, lower + (upper - lower) * jax.nn.sigmoid(u), u)
-        x = jnp.where(below & ~above, lower + one, x)
-        x = jnp.where(above & ~below, upper - one, x)
+        both, low, high = self._sides
+        # Infinite limits and large u must not reach a branch that is not taken: 0·inf is NaN.
+        lower = jnp.where(both | low, self.lower, 0.0)
+        upper = jnp.where(both | high, self.upper, 0.0)
+        one = jnp.exp(jnp.where(low | high, u, 0.0))
+        x = jnp.where(both, lower + (upper - lower) * jax.nn.sigmoid(u), u)
+        x = jnp.where(low, lower + one, x)
+        x = jnp.where(high, upper - one, x)
         # Rounding must not put x on a bound: there u is infinite. Derivatives stay those of exp.
-        low = jnp.where(below, lower + _gap(lower), -jnp.inf)
-        high = jnp.where(above, upper - _gap(upper), jnp.inf)
-        return x + jax.lax.stop_gradient(jnp.clip(x, low, high) - x)
+        least = jnp.where(both | low, lower + _gap(lower), -jnp.inf)
+        most = jnp.where(both | high, upper - _gap(upper), jnp.inf)
+        return x + jax.lax.stop_gradient(jnp.clip(x, least, most) - x)
 
     def to_u(self, x: Any) -> np.ndarray:
         """The free vector of x."""
-        u, lower, upper = np.array(x, float), np.asarray(self.lower), np.asarray(self.upper)
-        below, above = np.array(self.below), np.array(self.above)
-        i = below & above
-        part = (u[i] - lower[i]) / (upper[i] - lower[i])
-        u[i] = np.log(part) - np.log1p(-part)
-        i = below & ~above
-        u[i] = np.log(u[i] - lower[i])
-        i = above & ~below
-        u[i] = np.log(upper[i] - u[i])
-        return u
+        x, lower, upper = np.asarray(x, float), np.asarray(self.lower), np.asarray(self.upper)
+        with np.errstate(divide="ignore", invalid="ignore"):  # in branches that are not taken
+            part = (x - lower) / (upper - lower)
+            ways = [np.log(part) - np.log1p(-part), np.log(x - lower), np.log(upper - x)]
+        return np.select(self._sides, ways, x)
 
     def in_words(self, x: np.ndarray, most: int = 8) -> str:
         """``args.k = 1.2, epsilon = 0``, the first few numbers."""
@@ -134,12 +122,18 @@ class Space(eqx.Module):
         return np.asarray(jax.jvp(self.to_x, (u,), (jnp.ones_like(u),))[1])
 
     def at_bounds(self, x: np.ndarray, sigma: np.ndarray) -> list[str]:
-        """Names of the numbers that lie within a tenth of their standard error from a bound, or,
-        without a finite error, on it but for rounding."""
+        """Names of the numbers within a tenth of their standard error from a bound, or, without a
+        finite error, on it up to rounding."""
         off = np.minimum(x - np.asarray(self.lower), np.asarray(self.upper) - x)
         reach = np.where(np.isfinite(sigma), 0.1 * sigma, 1e-12 * np.abs(x) + _UNDERFLOW)
         near = np.isfinite(off) & (off <= reach)
         return [name for name, is_near in zip(self.names, near, strict=True) if is_near]
+
+
+def _gap(bound: Array) -> Array:
+    """Distance of a number next to a bound from it, at least one unit of its round-off."""
+    about = np.finfo(float)
+    return jnp.maximum(about.eps * jnp.abs(bound), about.tiny)
 
 
 def make_space(
@@ -157,91 +151,68 @@ def make_space(
             f"params holds no number that could be fitted: {params!r}. Give starting values as "
             "floats or floating-point arrays."
         )
-    names, shapes, leaves = [], [], {}
+    names, places = [], {}
     for path, leaf in paths:
         name, shape = _name(path), np.shape(leaf)
         refuse_unit_or_mask(f"the parameter {name}", leaf)
         if np.iscomplexobj(leaf):
-            raise TypeError(f"the parameter {name} is complex: write its parts.")
-        places = ("" if not shape else f"[{', '.join(map(str, i))}]" for i in np.ndindex(shape))
-        leaves[name] = _Leaf(len(names), shape)
-        names += [name + place for place in places]
-        shapes.append(shape)
+            raise TypeError(f"the parameter {name} is complex: give its real and imaginary parts.")
+        places[name] = len(names) + np.arange(math.prod(shape)).reshape(shape)
+        each = np.ndindex(shape)
+        names += [f"{name}[{', '.join(map(str, i))}]" for i in each] if shape else [name]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"two parameters are called {twice}: give their keys other names.")
-    start = np.concatenate([np.ravel(np.asarray(leaf, float)) for _, leaf in paths])
-    if not np.isfinite(start).all():
-        i = int(np.argmin(np.isfinite(start)))
-        raise ValueError(
-            f"the parameter {names[i]} starts at {start[i]}: every start must be a finite number."
-        )
-    lower, upper = _limits(bounds, names, leaves)
-    mean, weight = _priors(priors, names, leaves)
-    outside = ~((start > lower) & (start < upper))
-    if outside.any():
-        i = int(np.argmax(outside))
-        raise ValueError(
-            f"the parameter {names[i]} starts at {start[i]}, which is not between its bounds "
-            f"{lower[i]} and {upper[i]}."
-        )
+    x = np.concatenate([np.ravel(np.asarray(leaf, float)) for _, leaf in paths])
+    limits, _ = _given(bounds, Bounds, {"lower": -np.inf, "upper": np.inf}, places, len(x))
+    (mean, sigma), has = _given(priors, Prior, {"mean": np.nan, "sigma": np.nan}, places, len(x))
+    lower, upper = limits
+    for bad, text in (
+        (~np.isfinite(x), "the parameter {0} starts at {1}: every start must be a finite number."),
+        (~(lower < upper), "the bounds of {0} are {2} and {3}: the lower one must be less."),
+        (
+            ~((x > lower) & (x < upper)),
+            "the parameter {0} starts at {1}, which is not between its bounds {2} and {3}.",
+        ),
+        (
+            has & ~(np.isfinite(mean) & np.isfinite(sigma) & (sigma > 0)),
+            "the prior of {0} needs a finite mean and a positive sigma, got {4} and {5}.",
+        ),
+    ):
+        if bad.any():
+            i = int(np.argmax(bad))
+            raise ValueError(text.format(names[i], x[i], lower[i], upper[i], mean[i], sigma[i]))
     space = Space(
         lower=jnp.asarray(lower),
         upper=jnp.asarray(upper),
-        prior_mean=jnp.asarray(mean),
-        prior_weight=jnp.asarray(weight),
+        prior_mean=jnp.asarray(np.where(has, mean, 0.0)),
+        prior_weight=jnp.asarray(np.where(has, 1 / np.where(has, sigma, 1.0), 0.0)),
         rest=rest,
         names=tuple(names),
-        shapes=tuple(shapes),
+        shapes=tuple(place.shape for place in places.values()),
         tree=tree,
         below=tuple(np.isfinite(lower).tolist()),
         above=tuple(np.isfinite(upper).tolist()),
     )
-    return space, start
+    return space, x
 
 
-class _Leaf(NamedTuple):
-    """A fitted array: where its numbers begin in x, and its shape."""
-
-    begin: int
-    shape: tuple[int, ...]
-
-
-def _limits(bounds: PyTree, names: list[str], leaves: Mapping[str, _Leaf]):
-    """Lower and upper limit of each number."""
-    lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
-    for given, name, where, shape in _given(bounds, Bounds, "bounds", leaves):
-        for side, limit, value in (("lower", lower, given.lower), ("upper", upper, given.upper)):
-            if value is not None:
-                limit[where] = _spread(value, where, shape, f"{side} of {name}")
-    bad = ~(lower < upper)
-    if bad.any():
-        i = int(np.argmax(bad))
-        raise ValueError(
-            f"the bounds of {names[i]} are {lower[i]} and {upper[i]}: the lower one must be less."
-        )
-    return lower, upper
-
-
-def _priors(priors: PyTree, names: list[str], leaves: Mapping[str, _Leaf]):
-    """Mean and 1/sigma of each number, 0 without a prior."""
-    mean, weight = np.zeros(len(names)), np.zeros(len(names))
-    for given, name, where, shape in _given(priors, Prior, "priors", leaves):
-        sigma = _spread(given.sigma, where, shape, f"sigma of {name}")
-        mean[where] = _spread(given.mean, where, shape, f"mean of {name}")
-        if not ((sigma > 0).all() and np.isfinite(sigma).all() and np.isfinite(mean).all()):
-            raise ValueError(
-                f"the prior of {name} needs a finite mean and a positive sigma, got {given}."
-            )
-        weight[where] = 1 / sigma
-    return mean, weight
+def _is_number(path: Any, x: Any) -> bool:
+    """Whether a leaf is fitted. Whole numbers are, except fields of an object, which are sizes."""
+    if isinstance(x, int) and not isinstance(x, bool):
+        return not any(isinstance(key, jax.tree_util.GetAttrKey) for key in path)
+    return bool(eqx.is_inexact_array_like(x))
 
 
 def _given(
-    tree: PyTree, kind: type, called: str, leaves: Mapping[str, _Leaf]
-) -> Iterator[tuple[Any, str, np.ndarray, tuple[int, ...]]]:
-    """The bounds or priors in a pytree: each with its name, the numbers below it, and their shape
-    if they are one array."""
+    tree: PyTree, kind: type, fields: dict[str, float], places: dict[str, np.ndarray], size: int
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """The fields of the bounds or priors of all numbers, and which numbers have some.
+
+    - `fields`: names with defaults. `places`: where the numbers of each leaf are in x.
+    """
+    found = {name: np.full(size, default) for name, default in fields.items()}
+    has, called = np.zeros(size, bool), {Bounds: "bounds", Prior: "priors"}[kind]
     for path, given in jax.tree_util.tree_leaves_with_path(tree):
         name = _name(path)
         if not isinstance(given, kind):
@@ -249,32 +220,31 @@ def _given(
                 f"{called} must be made like the parameters, with dvi.{kind.__name__}(...) or None "
                 f"in place of numbers; at {name} it holds {given!r}."
             )
-        below = [leaf for key, leaf in leaves.items() if not path or _is_under(key, name)]
+        under = tuple(name + end for end in ("[", "."))
+        below = [k for k in places if not path or k == name or k.startswith(under)]
         if not below:
             raise ValueError(
-                f"{called} are given for {name!r}, which is no fitted parameter; these are "
-                f"{', '.join(map(repr, leaves))}."
+                f"{called} are given for {name!r}, which is not a fitted parameter; these are "
+                f"{', '.join(map(repr, places))}."
             )
-        each = [leaf.begin + np.arange(np.prod(leaf.shape, dtype=int)) for leaf in below]
-        shape = leaves[name].shape if name in leaves else ()
-        yield given, name, np.concatenate(each), shape
+        where = np.concatenate([places[k].ravel() for k in below])
+        has[where] = True
+        for of, numbers in found.items():
+            if (value := getattr(given, of)) is not None:
+                shape = places[name].shape if name in places else ()
+                numbers[where] = _spread(value, len(where), shape, f"{of} of {name}")
+    return list(found.values()), has
 
 
-def _spread(value: Any, where: np.ndarray, shape: tuple[int, ...], called: str) -> np.ndarray:
+def _spread(value: Any, size: int, shape: tuple[int, ...], called: str) -> np.ndarray:
     refuse_unit_or_mask(called, value)
     try:
         value = np.asarray(value, float)
     except (TypeError, ValueError):
         raise TypeError(f"{called} must be a number or an array, got {value!r}.") from None
-    if value.ndim == 0:
-        return np.full(len(where), float(value))
-    if value.shape != shape:
+    if value.ndim and value.shape != shape:
         raise ValueError(f"{called} has shape {value.shape}, the parameter has {shape}.")
-    return value.ravel()
-
-
-def _is_under(name: str, path: str) -> bool:
-    return name == path or name.startswith((path + "[", path + "."))
+    return value.ravel() if value.ndim else np.full(size, float(value))
 
 
 def _name(path: tuple[Any, ...]) -> str:

@@ -1,4 +1,4 @@
-"""What data say of parameters, as a density."""
+"""Posterior density of parameters."""
 
 from collections.abc import Callable
 from typing import Any
@@ -23,30 +23,31 @@ class Posterior:
 
         potential(u) = −log p(data | x) − log p(x) − Σ log |dx/du|,    x = to_x(u),
 
-    up to a constant. With the log-Jacobian of the bounds' transformation, priors are meant in x:
-    uniform between the bounds, times `Prior`. Without either the prior is flat, 1.
+    up to a constant. The last term is the Jacobian of the bounds' transformation, so that priors
+    are densities of x: uniform between the bounds, times `Prior`. Without either the prior is flat.
 
     −log p(data | x) is
 
     - ½ Σ ρ(r²) for data with errors, r predicted minus observed in standard errors;
     - (N/2) log Σ r² for N values without sigma: normal errors of one unknown size s, integrated
       over s with Jeffreys' prior 1/s;
-    - what a `Likelihood` says.
+    - the value of a `Likelihood`.
 
-    Where a trajectory fails the potential is +inf with slope 0: the density is 0 there, no NaN.
+    Where a trajectory fails the potential is +inf with slope 0: the density is 0 there, not NaN.
 
-    - `model`, `data`, `params`, `bounds`, `priors`, `loss`: as for `fit`. Priors go with data
-      without errors too.
-    - `gradient`: ``"reverse"``: through the integrator, for two to four trajectories whatever the
-      number of parameters; ``"forward"``: Jᵀ dU/dr with one tangent for each parameter, exact
-      where rebuilt states would be in doubt. By either, derivatives of any order and both modes.
+    - `model`, `data`, `params`, `bounds`, `priors`, `loss`: as for `fit`; priors are allowed for
+      data without errors too.
+    - `gradient`: ``"reverse"``: through the integrator, at the cost of two to four trajectories
+      for any number of parameters; ``"forward"``: Jᵀ dU/dr with one tangent for each parameter,
+      exact where rebuilt states would be inaccurate. Both give derivatives of any order, by both
+      modes.
 
     It has `names` and `size` of the parameters, and `start`, u at `params`. `potential` can be
     compiled, batched and differentiated, and suits any sampler: ``NUTS(potential_fn=...)`` of
-    numpyro, ``log_density`` for those that take the logarithm.
+    numpyro, ``log_density`` for those that use the logarithm.
 
-    **Raises** `ValueError` or `TypeError` for input that cannot be meant; `ValueError` for fewer
-    values than parameters that neither a prior nor two bounds hold: such a density has no integral.
+    **Raises** `ValueError` or `TypeError` for invalid input; `ValueError` if the values are fewer
+    than the parameters without a prior or two bounds: such a density has no integral.
 
     **Source** Gelman et al. 2013, *Bayesian Data Analysis*, 3.2 and 10; the Jacobian, Stan
     reference manual, "Constraint transforms".
@@ -72,16 +73,11 @@ class Posterior:
         self._space, x = make_space(params, bounds, priors)
         self.names, self.size = list(self._space.names), self._space.size
         self.start = self._space.to_u(x)
-        self._check_count()
-        self._slopes = self._forward if gradient == "forward" else self._reverse
-        self._potential = jax.jit(_guarded(self._value, self._slopes))
-        self._local = jax.jit(self._exact if isinstance(loss, Likelihood) else self._quadratic)
-
-    def _check_count(self) -> None:
-        space, count = self._space, self._problem.count
-        held = (np.asarray(space.prior_weight) > 0) | (np.array(space.below) & space.above)
-        free = int((~held).sum())
-        lost = 0 if self._problem.has_errors or isinstance(self._problem.loss, Likelihood) else 1
+        self._has_density = isinstance(loss, Likelihood)
+        held = np.asarray(self._space.prior_weight) > 0
+        held |= np.array(self._space.below) & self._space.above
+        free, count = int((~held).sum()), self._problem.count
+        lost = not (self._problem.has_errors or self._has_density)
         if count < free + lost:
             raise ValueError(
                 f"{free} parameters without a prior or two bounds"
@@ -89,6 +85,9 @@ class Posterior:
                 + f" cannot follow from {count} observed values: the posterior has no integral. "
                 "Give priors, bounds on both sides, or more observations."
             )
+        self._slopes = self._forward if gradient == "forward" else self._reverse
+        self._potential = jax.jit(_guarded(self._value, self._slopes))
+        self._local = jax.jit(self._exact if self._has_density else self._quadratic)
 
     # ---- the density
 
@@ -112,7 +111,7 @@ class Posterior:
         """The pytree of parameters at u."""
         return self._space.to_params(self._space.to_x(u))
 
-    def _beside(self, u: Array) -> Array:
+    def _log_prior(self, u: Array) -> Array:
         """−log of prior and Jacobian."""
         space = self._space
         off = (space.to_x(u) - space.prior_mean) * space.prior_weight
@@ -123,40 +122,41 @@ class Posterior:
         return square / 2 if self._problem.has_errors else self._problem.count * jnp.log(square) / 2
 
     def _value(self, u: Array) -> Array:
-        if isinstance(self._problem.loss, Likelihood):
-            return self._core.scalar(u) + self._beside(u)
+        if self._has_density:
+            return self._core.scalar(u) + self._log_prior(u)
         r = self._core.residuals(u)
-        return self._misfit(r @ r) + self._beside(u)
+        return self._misfit(r @ r) + self._log_prior(u)
 
     def _reverse(self, u: Array) -> tuple[Array, Array]:
         return jax.value_and_grad(self._value)(u)
 
     def _forward(self, u: Array) -> tuple[Array, Array]:
-        if isinstance(self._problem.loss, Likelihood):
+        if self._has_density:
             slope, value = jax.jacfwd(lambda u: (self._value(u),) * 2, has_aux=True)(u)
             return value, slope
+        value, slope, _ = self._with_jacobian(u)
+        return value, slope
+
+    def _with_jacobian(self, u: Array) -> tuple[Array, Array, Array]:
+        """Potential and slope by the Jacobian, and the Jacobian with a unit weight."""
         r, J, _ = self._core.evaluate(u)
         data, weight = jax.value_and_grad(self._misfit)(r @ r)
-        beside, slope = jax.value_and_grad(self._beside)(u)
-        return data + beside, 2 * weight * (r @ J) + slope
+        prior, slope = jax.value_and_grad(self._log_prior)(u)
+        return data + prior, 2 * weight * (r @ J) + slope, jnp.sqrt(2 * weight) * J
 
     # ---- its normal approximation
 
     def _quadratic(self, u: Array) -> tuple[Array, Array, Array]:
         """Potential, its slope, and A with AᵀA its Gauss–Newton Hessian, priors last."""
-        space = self._space
-        r, J, _ = self._core.evaluate(u)
-        data, weight = jax.value_and_grad(self._misfit)(r @ r)
-        beside, bent = jax.value_and_grad(self._beside)(u)
-        ones = jnp.ones_like(u)
-        slope = jax.jvp(space.to_x, (u,), (ones,))[1]
+        space, ones = self._space, jnp.ones_like(u)
+        value, slope, J = self._with_jacobian(u)
+        stretch = jax.jvp(space.to_x, (u,), (ones,))[1]
         bend = jax.jvp(jax.grad(lambda u: -jnp.sum(log_slope(space, u))), (u,), (ones,))[1]
-        rows = [jnp.diag(space.prior_weight * slope), jnp.diag(jnp.sqrt(bend))]
-        A = jnp.concatenate([jnp.sqrt(2 * weight) * J, *rows])
-        return data + beside, 2 * weight * (r @ J) + bent, A
+        rows = [jnp.diag(space.prior_weight * stretch), jnp.diag(jnp.sqrt(bend))]
+        return value, slope, jnp.concatenate([J, *rows])
 
     def _exact(self, u: Array) -> tuple[Array, Array, Array]:
-        """The same with the Hessian itself, its curvatures taken positive."""
+        """The same with the absolute value of the Hessian itself."""
         value, slope = self._slopes(u)
         H = jax.jacfwd(jax.grad(self._potential))(u)
         values, vectors = jnp.linalg.eigh((H + H.T) / 2)
@@ -165,8 +165,8 @@ class Posterior:
     def laplace(self, u: Any = None, max_steps: int = 50) -> tuple[np.ndarray, np.ndarray]:
         """Mode of the density of u, shape (n,), and L with L Lᵀ its covariance there, (n, n).
 
-        Damped Gauss–Newton steps from u (None: `start`). For more than 400 parameters u itself and
-        the identity.
+        By damped Gauss–Newton steps from u (None: `start`). For more than 400 parameters u itself
+        and the identity.
 
         **Raises** `ValueError` where the density is 0 at u, or a direction of the parameters is
         determined by neither data nor priors.
@@ -190,7 +190,7 @@ class Posterior:
             x = np.asarray(self.to_x(jnp.asarray(u)))
             raise ValueError(
                 f"the posterior density is 0 at the start ({self._space.in_words(x)}): the "
-                "model's trajectory fails, or its misfit is no number. Start from other "
+                "model's trajectory fails, or its misfit is NaN. Start from other "
                 "parameters, or take a smaller h."
             )
 
@@ -220,7 +220,7 @@ class Posterior:
 
 
 def log_slope(space: Space, u: Array) -> Array:
-    """log |dx/du| of each parameter: what the bounds' transformation stretches."""
+    """log |dx/du| of each parameter."""
     below, above = np.array(space.below), np.array(space.above)
     both = below & above
     width = jnp.log(jnp.where(both, space.upper - space.lower, 1.0))

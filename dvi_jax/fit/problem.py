@@ -25,11 +25,11 @@ differ, or the trajectory diverges."""
 
 
 class Core(eqx.Module):
-    """The functions of a fit, with their data as arrays: what is compiled, and compiled once for
-    all fits of one model with data of one shape.
+    """The functions of a fit with their data as arrays, which are compiled once for all fits of one
+    model with data of one shape.
 
-    - `model`, `loss`: as given. `groups`: the data. `space`: the parameters. `many`: whether arcs
-      were given as a list. `reads`: values that functions of the user read from outside.
+    - `many`: whether arcs were given as a list. `reads`: values that functions of the user read
+      from outside.
     """
 
     model: Any
@@ -39,32 +39,24 @@ class Core(eqx.Module):
     many: bool = eqx.field(static=True)
     reads: Reads = eqx.field(static=True)
 
-    def specification(self, params: PyTree, arc: Any) -> dict[str, Any]:
-        """The arguments of `integrate` for an arc."""
-        return specification(self.model, params, arc, self.many)
-
-    def predict(self, params: PyTree, group: Group, arcs: Any = None) -> tuple[Array, RESULTS]:
-        """Predictions (A, N, K) and a status for each arc of a group (or for some of them)."""
-        which = np.arange(len(group.arcs)) if arcs is None else arcs
+    def predict(self, params: PyTree, group: Group) -> tuple[Array, RESULTS]:
+        """Predictions (A, N, K) and a status for each arc of a group."""
 
         def one(arc, t0, ts, pick):
-            found, _, result = predict(self.specification(params, arc), t0, ts, pick, group)
+            spec = specification(self.model, params, arc, self.many)
+            found, _, result = predict(spec, t0, ts, pick, group)
             return found, result
 
-        pick = None if group.pick is None else jnp.asarray(group.pick)[which]
-        i, t0, ts = (jnp.asarray(x)[which] for x in (group.arcs, group.t0, group.ts))
-        return jax.vmap(one, in_axes=(0, 0, 0, None if pick is None else 0))(i, t0, ts, pick)
+        arrays = group.arcs, group.t0, group.ts, group.pick
+        return jax.vmap(one)(*jax.tree.map(jnp.asarray, arrays))
 
     def whitened(self, u: Array, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
         """Residuals predicted − observed in standard errors, (A, N, K) for each group, zero for
-        what is missing or later than `horizon` after the start; and predictions with statuses."""
+        missing values and those later than `horizon` after the start; predictions and statuses."""
         params = self.space.to_params(self.space.to_x(u))
-        rows, known = [], []
-        for group in self.groups:
-            found, result = self.predict(params, group)
-            rows.append(_whiten(group, found, _within(group, horizon)))
-            known.append((found, result))
-        return rows, known
+        known = [self.predict(params, group) for group in self.groups]
+        pairs = zip(self.groups, known, strict=True)
+        return [_whiten(group, found, horizon) for group, (found, _) in pairs], known
 
     def residuals(self, u: Array, horizon: Any = np.inf) -> Array:
         """The vector whose half square is the loss, priors last."""
@@ -75,17 +67,18 @@ class Core(eqx.Module):
         return jnp.concatenate([self.root(r).ravel() for r in rows] + [self.prior_rows(u)])
 
     def root(self, r: Array) -> Array:
-        """What is squared of whitened residuals; for a likelihood they themselves."""
+        """Whitened residuals with the loss ½ r²; for a likelihood unchanged."""
         return self.loss.root(r) if isinstance(self.loss, Loss) else r
 
     def prior_rows(self, u: Array) -> Array:
         """Parameters minus their prior means in prior standard errors, 0 without a prior."""
         return (self.space.to_x(u) - self.space.prior_mean) * self.space.prior_weight
 
-    def evaluate(self, u: Array, horizon: Any = np.inf, extra: Any = None) -> Evaluation:
-        """Residual vector and Jacobian, by forward mode: memory does not grow with the number of
-        steps; and for each group predictions and statuses."""
-        del extra
+    def evaluate(self, u: Array, horizon: Any = np.inf) -> Evaluation:
+        """Residual vector and Jacobian; for each group predictions and statuses.
+
+        By forward mode: memory does not grow with the number of steps.
+        """
 
         def twice(u):
             rows, known = self.whitened(u, horizon)
@@ -98,33 +91,31 @@ class Core(eqx.Module):
     def scalar(self, u: Array, horizon: Any = np.inf, choice: Any = None) -> Array:
         """The loss: ½ Σ ρ(r²), or −log likelihood; −log prior is added.
 
-        With `choice`, for each group indices of arcs, those alone, weighed to stand for all.
+        With `choice`, indices of arcs for each group, of those arcs, weighted to stand for all.
         """
-        x = self.space.to_x(u)
-        params = self.space.to_params(x)
-        total = jnp.sum(((x - self.space.prior_mean) * self.space.prior_weight) ** 2) / 2
-        for i, group in enumerate(self.groups):
-            which = None if choice is None else choice[i]
-            found, _ = self.predict(params, group, which)
-            part = group if which is None else _Part(group, which)
-            keep = _within(part, horizon)
-            weight = 1.0 if which is None else len(group.arcs) / len(which)
+        params = self.space.to_params(self.space.to_x(u))
+        total = jnp.sum(self.prior_rows(u) ** 2) / 2
+        for i, whole in enumerate(self.groups):
+            group, weight = whole, 1.0
+            if choice is not None:
+                group = jax.tree.map(lambda x, i=i: jnp.asarray(x)[choice[i]], whole)
+                weight = len(whole.arcs) / len(choice[i])
+            found, _ = self.predict(params, group)
             if isinstance(self.loss, Likelihood):
-                total = total + weight * self._likelihood(part, found, keep, params)
+                part = self._likelihood(group, found, horizon, params)
             else:
-                total = (
-                    total + weight * jnp.sum(self.loss.root(_whiten(part, found, keep)) ** 2) / 2
-                )
+                part = jnp.sum(self.loss.root(_whiten(group, found, horizon)) ** 2) / 2
+            total = total + weight * part
         return total
 
-    def _likelihood(self, group: Any, found: Array, keep: Array, params: PyTree) -> Array:
-        assert isinstance(self.loss, Likelihood)
+    def _likelihood(self, group: Group, found: Array, horizon: Any, params: PyTree) -> Array:
         if group.whiten.ndim == 4:
             raise ValueError("dvi.Likelihood takes sigma, not covariance, with the observations.")
-        weight = jnp.where(keep, jnp.asarray(group.whiten), 1.0)
-        safe = jnp.where(keep, found, jnp.asarray(group.values))
+        keep, values = within(group, horizon), jnp.asarray(group.values)
+        sigma = 1 / jnp.where(keep, jnp.asarray(group.whiten), 1.0)
+        # Missing values get the observed ones as predictions, so that no NaN reaches the density.
         each = jax.vmap(self.loss.negative_log_density, in_axes=(0, 0, 0, None))(
-            safe, jnp.asarray(group.values), 1 / weight, params
+            jnp.where(keep, found, values), values, sigma, params
         )
         if jnp.shape(each) != jnp.shape(found):
             raise ValueError(
@@ -133,13 +124,51 @@ class Core(eqx.Module):
             )
         return jnp.sum(jnp.where(keep, each, 0.0))
 
+    def hessian(self, u: Array) -> Array:
+        """Exact second derivatives of the loss, (n, n), forward over reverse."""
+        return jax.jacfwd(jax.grad(self.scalar))(u)
+
+    def curvature(self, u: Array, directions: Array) -> Array:
+        """Exact second derivatives of the loss along directions, the rows of an array."""
+
+        def second(d):
+            def loss(t):
+                r = self.residuals(u + t * d)
+                return r @ r / 2
+
+            def slope(t):
+                return jax.jvp(loss, (t,), (1.0,))[1]
+
+            return jax.jvp(slope, (0.0,), (1.0,))[1]
+
+        return jax.vmap(second)(directions)
+
+
+def within(group: Group, horizon: Any) -> Array:
+    """Which values were observed within the horizon, shape (A, N, K)."""
+    since = jnp.abs(jnp.asarray(group.ts) - jnp.asarray(group.t0)[:, None])
+    return jnp.asarray(group.seen) & (since <= horizon)[..., None]
+
+
+def _whiten(group: Group, found: Array, horizon: Any) -> Array:
+    # First where, then subtract: a trajectory that fails after the horizon leaves no NaN behind.
+    off = jnp.where(within(group, horizon), found - jnp.asarray(group.values), 0.0)
+    return weighed(off, jnp.asarray(group.whiten))
+
+
+# Functions of the module: a method of an instance would be compiled again for each fit.
+_evaluate = eqx.filter_jit(Core.evaluate)
+_whitened = eqx.filter_jit(Core.whitened)
+_hessian = eqx.filter_jit(Core.hessian)
+_curvature = eqx.filter_jit(Core.curvature)
+
 
 class Problem:
-    """What is to be fitted, in free variables u.
+    """A fit in free variables u.
 
     - `core`: its functions. `space`: the parameters, `start` their x. `given`: the data as given,
-      `arcs`: in the order of the run, `groups`: as arrays.
-    - `size`: how many free variables there are. `count`: how many values were observed.
+      `arcs`: in the order of time, `specs`: the arguments of `integrate` for each at the start.
+    - `count`: number of observed values.
     """
 
     def __init__(
@@ -161,20 +190,17 @@ class Problem:
         self.size = self.space.size
         self.has_errors = arcs[0].has_errors
         if not self.has_errors and not isinstance(loss, Likelihood):
-            for what, there in (
-                ("priors", self.space.count_of_priors > 0),
-                ("a robust loss", not isinstance(loss, LeastSquares)),
-            ):
-                if there:
-                    raise ValueError(
-                        f"{what} can only be weighed against data with errors: give sigma or "
-                        "covariance with the observations."
-                    )
+            robust = not isinstance(loss, LeastSquares)
+            if self.space.count_of_priors or robust:
+                raise ValueError(
+                    f"{'a robust loss' if robust else 'priors'} can only be weighed against data "
+                    "with errors: give sigma or covariance with the observations."
+                )
         if isinstance(model, Model):
             check_system(model.rest["system"])
         arrays = self.space.to_params(jnp.asarray(self.start))
         if many and isinstance(model, Model):
-            specification(model, arrays, 0, many)  # which says what is missing
+            specification(model, arrays, 0, many)  # which reports what is missing
             model.check_rows(arrays, len(arcs))
         self.specs = [specification(model, arrays, i, many) for i in range(len(arcs))]
         for i, arc in enumerate(arcs):
@@ -192,152 +218,97 @@ class Problem:
     def check_count(self) -> None:
         """**Raises** `ValueError` for fewer observed values than parameters."""
         if self.degrees_of_freedom < 0:
+            priors = self.space.count_of_priors
             raise ValueError(
                 f"{self.size} parameters cannot follow from {self.count} observed values"
-                + (f" and {n} priors" if (n := self.space.count_of_priors) else "")
+                + (f" and {priors} priors" if priors else "")
                 + ". Fit fewer parameters, give priors, or more observations."
             )
 
-    # ---- functions of u, compiled
+    # ---- the functions of `core`, compiled
 
     def evaluate(self, u: Any, horizon: Any = np.inf, extra: Any = None) -> Evaluation:
-        """`Core.evaluate`."""
-        return _evaluate(self.core, jnp.asarray(u), jnp.asarray(horizon, float), extra)
+        """`Core.evaluate`; there is nothing `extra`."""
+        return _evaluate(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
 
     def whitened(self, u: Any, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
         """`Core.whitened`."""
         return _whitened(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
 
     def hessian(self, u: Any) -> Array:
-        """Exact second derivatives of the loss, (n, n), forward over reverse."""
+        """`Core.hessian`."""
         return _hessian(self.core, jnp.asarray(u))
 
     def curvature(self, u: Any, directions: Any) -> Array:
-        """Exact second derivatives of the loss along directions, the rows of an array."""
+        """`Core.curvature`."""
         return _curvature(self.core, jnp.asarray(u), jnp.asarray(directions))
 
     def by_arc(self, rows: list[Any], known: list[Any]) -> tuple[list, list, list[str]]:
         """For each arc predictions (N, ...), observed minus predicted in standard errors (N, K),
         and the status; rows in the order of `given`."""
-        predicted, whitened, names = {}, {}, {}
+        found: list[Any] = [None] * len(self.arcs)
         for group, r, (values, result) in zip(self.groups, rows, known, strict=True):
             status = np.atleast_1d(status_name(result))
             for a, i in enumerate(group.arcs):
                 arc, n = self.arcs[i], len(self.arcs[i].ts)
                 order = slice(None, None, 1 if arc is self.given[i] else -1)
-                predicted[i] = np.asarray(values[a, :n]).reshape(arc.values.shape)[order]
-                whitened[i] = np.where(group.seen[a, :n], -np.asarray(r[a, :n]), np.nan)[order]
-                names[i] = str(status[a])
-        each = range(len(self.arcs))
-        return [predicted[i] for i in each], [whitened[i] for i in each], [names[i] for i in each]
+                predicted = np.asarray(values[a, :n]).reshape(arc.values.shape)[order]
+                whitened = np.where(group.seen[a, :n], -np.asarray(r[a, :n]), np.nan)[order]
+                found[i] = predicted, whitened, str(status[a])
+        predicted, whitened, names = (list(column) for column in zip(*found, strict=True))
+        return predicted, whitened, names
 
     def rows_within(self, horizon: float) -> np.ndarray:
         """Which entries of the residual vector lie within a horizon; priors do."""
-        inside = [np.asarray(_within(g, horizon)).ravel() for g in self.groups]
+        inside = [np.asarray(within(g, horizon)).ravel() for g in self.groups]
         return np.concatenate([*inside, np.ones(self.size, bool)])
 
-    # ---- what stands before a fit
+    # ---- checks of the start
 
     def check_start(self, known: list[Any], check_units: bool = True) -> None:
         """Refuse a start at which the model fails from the first observation on, or whose
-        predictions are of another size than the data.
+        predictions differ in size from the data.
 
         - `known`: predictions and statuses of each group.
         """
+        where = f"at the starting parameters ({self.space.in_words(self.start)}) the model gives "
         for group, (found, result) in zip(self.groups, known, strict=True):
-            found = np.asarray(found)
             names = np.atleast_1d(status_name(result))
             for a, arc in enumerate(group.arcs):
                 first = group.seen[a].any(axis=1).argmax()
-                if not np.isfinite(found[a, first][group.seen[a, first]]).all():
+                if not np.isfinite(np.asarray(found)[a, first][group.seen[a, first]]).all():
                     raise ValueError(
-                        f"at the starting parameters ({self.space.in_words(self.start)}) the model "
-                        f"gives no number for the first observation of arc {arc} (t = "
+                        f"{where}no number for the first observation of arc {arc} (t = "
                         f"{group.ts[a, first]:g}; status {str(names[a])!r}). Start from other "
                         "parameters or take a smaller h."
                     )
         if check_units:
-            self._check_sizes([np.asarray(found) for found, _ in known])
+            self._check_sizes([np.asarray(found) for found, _ in known], where)
 
-    def _check_sizes(self, found: list[np.ndarray]) -> None:
-        """Refuse predictions that are much larger or much smaller than the data."""
+    def _check_sizes(self, found: list[np.ndarray], where: str) -> None:
         pairs = list(zip(self.groups, found, strict=True))
         data = max(float(np.abs(g.values[g.seen]).max()) for g, _ in pairs)
         own = [np.where(g.seen & np.isfinite(f), np.abs(f), 0.0).max(axis=2) for g, f in pairs]
         largest = max(float(size.max()) for size in own)
         if data == 0 or largest == 0 or 1 / _UNITS < data / largest < _UNITS:
             return
-        about = f"at the starting parameters ({self.space.in_words(self.start)}) the model gives "
+        intended = "If this is intended, use check_units=False."
         if largest < data:
             raise ValueError(
-                f"{about}values up to {largest:.3g}, the observed ones are up to {data:.3g}: a "
-                f"factor of {data / largest:.3g}. Are they in the same units? If this is "
-                "intended, use check_units=False."
+                f"{where}values up to {largest:.3g}, the observed ones are up to {data:.3g}: a "
+                f"factor of {data / largest:.3g}. Are they in the same units? {intended}"
             )
         large, each = _UNITS * data, zip(self.groups, own, strict=True)
         group, size = next((g, s) for g, s in each if (s >= large).any())
         a, row = np.argwhere(size >= large)[0]
         arc = int(group.arcs[a])
+        spec, seen = self.specs[arc], self.arcs[arc]
+        q0, p0 = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
+        first = float(jnp.max(jnp.abs(seen.function(seen.t0, q0, p0, spec.get("args")))))
         raise ValueError(
-            f"{about}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g} (at its start, "
-            f"t = {group.t0[a]:g}, {self._at_start(arc):.3g}; largest value {size[a].max():.3g}), "
+            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g} (at its start, "
+            f"t = {group.t0[a]:g}, {first:.3g}; largest value {size[a].max():.3g}), "
             f"the observed ones are up to {data:.3g}. Likely causes: (a) the trajectory diverges "
             "at these parameters: start from others, give bounds, or take a smaller h; (b) model "
-            "and data are not in the same units. If this is intended, use check_units=False."
+            f"and data are not in the same units. {intended}"
         )
-
-    def _at_start(self, arc: int) -> float:
-        """Largest component of what the model predicts at the start of an arc."""
-        spec, data = self.specs[arc], self.arcs[arc]
-        q0, p0 = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
-        return float(jnp.max(jnp.abs(data.function(data.t0, q0, p0, spec.get("args")))))
-
-
-@eqx.filter_jit
-def _evaluate(core: Core, u: Array, horizon: Array, extra: Any) -> Evaluation:
-    return core.evaluate(u, horizon, extra)
-
-
-@eqx.filter_jit
-def _whitened(core: Core, u: Array, horizon: Array) -> tuple[list[Array], list[Any]]:
-    return core.whitened(u, horizon)
-
-
-@eqx.filter_jit
-def _hessian(core: Core, u: Array) -> Array:
-    return jax.jacfwd(jax.grad(core.scalar))(u)
-
-
-@eqx.filter_jit
-def _curvature(core: Core, u: Array, directions: Array) -> Array:
-    def second(d):
-        def loss(t):
-            r = core.residuals(u + t * d)
-            return r @ r / 2
-
-        def slope(t):
-            return jax.jvp(loss, (t,), (1.0,))[1]
-
-        return jax.jvp(slope, (0.0,), (1.0,))[1]
-
-    return jax.vmap(second)(directions)
-
-
-class _Part:
-    """Some arcs of a group."""
-
-    def __init__(self, group: Group, which: Any):
-        for name in ("t0", "ts", "values", "seen", "whiten"):
-            setattr(self, name, jnp.asarray(getattr(group, name))[which])
-
-
-def _within(group: Any, horizon: Any) -> Array:
-    """What was observed within the horizon, shape (A, N, K)."""
-    since = jnp.abs(jnp.asarray(group.ts) - jnp.asarray(group.t0)[:, None])
-    return jnp.asarray(group.seen) & (since <= horizon)[..., None]
-
-
-def _whiten(group: Any, found: Array, keep: Array) -> Array:
-    # First where, then subtract: a trajectory that fails after the horizon leaves no NaN behind.
-    off = jnp.where(keep, found - jnp.asarray(group.values), 0.0)
-    return weighed(off, jnp.asarray(group.whiten))

@@ -1,4 +1,4 @@
-"""What a fit shows while it runs."""
+"""Progress of a fit."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,7 @@ from .._progress import bar_of, told
 
 @dataclass(frozen=True)
 class FitProgress:
-    """Where a fit stands: `step` of the optimiser of at most `max_steps`, the `stage` and its
+    """Progress of a fit: `step` of the optimiser of at most `max_steps`, the `stage` and its
     `horizon`, the `loss`, the parameters `x` with their `names`, `seconds` since the start."""
 
     step: int

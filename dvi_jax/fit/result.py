@@ -1,4 +1,4 @@
-"""What a fit found: parameters, how well they are known, what is left over."""
+"""Result of a fit: parameters, their uncertainty, residuals."""
 
 import os
 from dataclasses import dataclass, field
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from .._checks import one_of
 from .._files import publish_npz, read_npz
 from .parameters import make_space
 from .results import FIT_RESULTS, NAMES, name_of
@@ -33,25 +34,25 @@ class FitResult:
     r"""Parameters fitted to observations.
 
     - `params`: the pytree that was given, with fitted numbers; `x` those n numbers as one vector,
-      `names` what they are called.
+      `names` theirs.
     - `covariance`: of x, shape (n, n), by Gauss–Newton, s² (JᵀJ)⁻¹; for `dvi.Likelihood` the
-      inverse of the Hessian. For robust losses J is that of √ρ, which is within some tens of a
-      percent of the scatter. Infinite for what the data do not determine, NaN for more than 400
-      parameters. s² is 1 when the data have errors, else their variance found from the residuals.
+      inverse of the Hessian. For robust losses J is that of √ρ, accurate to some tens of a percent
+      of the scatter. s² is 1 when the data have errors, else their variance estimated from the
+      residuals. Infinite for what the data do not determine, NaN for more than 400 parameters.
     - `history`: arrays with one entry for each step of the optimiser: `stage`, `horizon`,
       `loss`, `step`, `accepted`, and `x`, shape (steps, n).
     - `result`: how it ended, one of `FIT_RESULTS`; `status` its name.
-    - `ts`, `observed`, `predicted`: lists with an array for each arc, (N,) and (N, ...).
-    - `errors`: standard errors of the data, (N, ...) for each arc, NaN where none were given.
+    - `ts`, `observed`, `predicted`, `errors`: lists with an array for each arc, (N,) and (N, ...);
+      errors are NaN where none were given.
     - `whitened`: observed minus predicted in standard errors, (N, K) for each arc, independent of
-      one another where covariances were given; NaN for what is missing.
-    - `loss`: ½ Σ ρ(r²) + priors; `num_observed`: how many values; `degrees_of_freedom`: values and
-      priors minus parameters, those that are not determined left out.
+      one another where covariances were given; NaN for missing values.
+    - `loss`: ½ Σ ρ(r²) + priors; `num_observed`: number of values; `degrees_of_freedom`: values and
+      priors minus parameters, without those that are not determined.
     - `prior_chi2`: Σ ((x − mean)/sigma)² of the priors.
-    - `undetermined`: directions of the parameters that the data say nothing of, in words.
+    - `undetermined`: parameter combinations that the data do not determine, as text.
     - `singular_values`: of the Jacobian with columns of unit length, largest first.
     - `curvature`: the exact second derivative of the loss along each principal direction over
-      that of Gauss–Newton: near 1 where the errors can be trusted. None if it was not asked for.
+      that of Gauss–Newton: near 1 where the errors are reliable. None if it was not computed.
     - `at_bounds`: names of the parameters that ended at a bound. Their entries of `covariance` are
       those of a free parameter or NaN: the error of such a parameter is not symmetric.
     - `trajectories`: status of each arc's trajectory.
@@ -133,14 +134,14 @@ class FitResult:
 
     @property
     def reduced_chi2(self) -> float:
-        """`chi2` and `prior_chi2` over the degrees of freedom: about 1 where model, errors and
-        priors are right."""
+        """`chi2` and `prior_chi2` over the degrees of freedom: about 1 for right model, errors and
+        priors."""
         total = self.chi2 + self.prior_chi2
         return total / self.degrees_of_freedom if self.degrees_of_freedom else np.nan
 
     def statistics(self) -> dict[str, float]:
-        """Of the whitened residuals: `rms`, `mean`, `largest`, `skewness`, `excess` kurtosis, and
-        `lag_one`, the correlation of neighbours in time, which is about 0 for a right model."""
+        """Statistics of the whitened residuals: `rms`, `mean`, `largest`, `skewness`, `excess`
+        kurtosis, and `lag_one`, the correlation of neighbours in time: 0 for a right model."""
         r = np.concatenate([w[np.isfinite(w)] for w in self.whitened])
         mean, spread = r.mean(), r.std()
         safe = spread if spread > 0 else 1.0
@@ -200,15 +201,15 @@ class FitResult:
         - `params`: a pytree like the fitted one; needed only if it is not made of dicts, lists and
           numbers (a network, whose functions are not in the file).
 
-        **Raises** `FileNotFoundError`, and `ValueError` for a file that is no fit or of another
+        **Raises** `FileNotFoundError`, and `ValueError` for a file that is not a fit or has another
         format, or params of other names.
         """
         about, arrays = read_npz(path, _FORMAT, "fit")
         if params is None:
             if about["shape"] is None:
                 raise ValueError(
-                    "these parameters hold more than numbers: FitResult.load(path, params) with a "
-                    "pytree like the fitted one."
+                    "these parameters hold more than numbers: use FitResult.load(path, params) "
+                    "with a pytree like the fitted one."
                 )
             params = jax.tree.map(np.array, about["shape"], is_leaf=lambda x: isinstance(x, list))
         space, _ = make_space(params)
@@ -225,18 +226,12 @@ class FitResult:
             x=arrays["x"],
             covariance=arrays["covariance"],
             history={k[8:]: v for k, v in arrays.items() if k.startswith("history.")},
-            result=getattr(FIT_RESULTS, _known(about["result"])),
+            result=getattr(FIT_RESULTS, one_of("status of the file", about["result"], NAMES)),
             singular_values=arrays["values"],
             curvature=arrays.get("curvature"),
             **{name: about[name] for name in _PLAIN},
             **by_arc,
         )
-
-
-def _known(name: str) -> str:
-    if name not in NAMES:
-        raise ValueError(f"the file has the unknown status {name!r}: it is of a newer version.")
-    return name
 
 
 def numbers_in_words(found: FitResult) -> list[str]:
@@ -248,11 +243,12 @@ def numbers_in_words(found: FitResult) -> list[str]:
 
 
 def little_explained(found: FitResult) -> str:
-    """The remark on a fit that is little better than a constant; empty for a better one."""
-    part = found.explained
-    if not part < _LITTLE:
+    """The remark on a fit that is hardly better than a constant; empty for a better one."""
+    if not found.explained < _LITTLE:
         return ""
-    than = "no better than constants do" if part <= 0 else "little better than constants do"
+    than = (
+        "no better than constants do" if found.explained <= 0 else "little better than constants do"
+    )
     return (
         f"the model describes the data {than}: this may be a local minimum, or the data are "
         "constants and noise. Start from other parameters."
@@ -278,7 +274,7 @@ def _shape_of(params: PyTree) -> Any:
 
 
 def _is_plain(node: Any) -> bool:
-    """Whether it is arrays and numbers on dicts with names: lists would not be told from arrays."""
+    """Whether it consists of arrays and numbers in dicts; lists could not be told from arrays."""
     if isinstance(node, dict):
         return all(isinstance(k, str) and _is_plain(v) for k, v in node.items())
     return isinstance(node, np.ndarray | np.generic | jax.Array | float | int)

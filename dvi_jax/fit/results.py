@@ -1,4 +1,4 @@
-"""How a fit ended."""
+"""Status of a fit."""
 
 import equinox as eqx
 
@@ -7,11 +7,11 @@ class FIT_RESULTS(eqx.Enumeration):
     """Status of a fit; ``dvi.FIT_RESULTS[fit.result]`` is the text."""
 
     converged = ""
-    steps_done = "The given number of steps was taken; a stochastic optimiser ends no other way."
+    steps_done = "The given number of steps was taken; a stochastic optimiser has no other end."
     max_steps_reached = (
         "The optimiser did not converge within max_steps. Likely causes: (a) it needs more; (b) a "
-        "direction of the parameters that the data do not determine: see the singular directions "
-        "of the result; (c) a start far away: give better starting values, or shorter horizons."
+        "direction of the parameters is not determined by the data: see the singular values of the "
+        "result; (c) the start is far away: give better starting values, or shorter horizons."
     )
     stalled = (
         "No step along the descent makes the loss smaller, though its gradient is not zero. Likely "
@@ -40,7 +40,7 @@ def name_of(result: FIT_RESULTS) -> str:
 
 
 class FitError(RuntimeError):
-    """Raised by `fit` with ``throw=True`` when it did not converge; its `fit` is what was found."""
+    """Raised by `fit` with ``throw=True`` when it did not converge; `fit` is the `FitResult`."""
 
     def __init__(self, message: str, fit: object = None):
         super().__init__(message)

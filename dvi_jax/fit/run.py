@@ -1,4 +1,4 @@
-"""What is common to all stages of a fit: the steps that are left, its history, its file."""
+"""The steps of a fit as they are taken: how many remain, their history, the checkpoint."""
 
 import hashlib
 import os
@@ -6,6 +6,7 @@ import re
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,96 +16,102 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._files import publish_npz, read_npz
-from .optimise import Position, Record
+from .optimise import Position, Record, Task
 from .problem import Problem
 from .progress import FitProgress
 
 _EVERY = 5.0
 """Seconds between checkpoints."""
 
-_FORMAT = 2
+_FORMAT = 3
 
 _VECTORS = ("base", "scale", "z")
 _LISTS = ("leaves", "extra")
-_COLUMNS = ("stage", "horizon", "loss", "step", "accepted", "x")
-"""What a checkpoint has of `Position` and of each `Record` as arrays."""
+"""Fields of `Position` that a checkpoint has as arrays; the others are in its header."""
 
 
+@dataclass
 class Run:
-    """The steps of a fit as they are taken: kept, shown, written to a checkpoint."""
+    """A fit in progress.
 
-    def __init__(
-        self,
-        problem: Problem,
-        max_steps: int,
-        tolerance: float,
-        show: Callable[[FitProgress], None] | None,
-        began: float,
-        checkpoint: str | os.PathLike[str] | None,
-        identity: str,
-    ):
-        self.problem, self.max_steps, self.tolerance = problem, max_steps, tolerance
-        self._show, self.began, self._file, self._identity = show, began, checkpoint, identity
-        self.records: list[Record] = []
-        self.resume: Position | None = None
-        self._saved = time.monotonic()
-        if checkpoint is not None:
-            file = Path(checkpoint)
+    - `show`: a function of the progress, or None. `began`: when, for the seconds shown.
+    - `checkpoint`: a file or None, recognised by `identity`. `resume`: its position, until the
+      first stage has continued from it.
+    """
+
+    problem: Problem
+    max_steps: int
+    tolerance: float
+    show: Callable[[FitProgress], None] | None
+    began: float
+    checkpoint: str | os.PathLike[str] | None
+    identity: str
+    records: list[Record] = field(default_factory=list)
+    resume: Position | None = None
+    saved: float = field(default_factory=time.monotonic)
+
+    def __post_init__(self):
+        if self.checkpoint is not None:
+            file = Path(self.checkpoint)
             if not file.parent.is_dir():
                 raise FileNotFoundError(f"there is no directory for the checkpoint {file}.")
             if file.is_dir():
                 raise IsADirectoryError(f"checkpoint must be a file, {file} is a directory.")
             if file.exists():
-                self.resume, self.records = _read_checkpoint(file, identity)
+                self.resume, self.records = _read_checkpoint(file, self.identity)
 
     @property
     def left(self) -> int:
-        """How many steps may still be taken."""
+        """How many steps remain."""
         return self.max_steps - len(self.records)
 
-    def take_resume(self) -> Position | None:
-        """The position to go on from, once."""
-        found, self.resume = self.resume, None
-        return found
+    def task(self, stage: int, horizon: float, tolerance: float, most: int | None) -> Task:
+        """The next stage, of at most `most` steps, which continues from the checkpoint once."""
+        resume, self.resume = self.resume, None
+        done = 0 if resume is None else resume.done
+        steps = done + self.left
+        if most is not None:
+            steps = min(max(most, done), steps)
+        return Task(stage, horizon, steps, tolerance, self.watch, resume)
 
     def watch(self, record: Record, position: Position) -> None:
         """A step was taken."""
         x = np.asarray(self.problem.space.to_x(jnp.asarray(record.x[: self.problem.size])))
-        record.x = x
-        self.records.append(record)
-        if self._file is not None and time.monotonic() - self._saved > _EVERY:
+        self.records.append(record._replace(x=x))
+        if self.checkpoint is not None and time.monotonic() - self.saved > _EVERY:
             try:
-                _write_checkpoint(self._file, self._identity, position, self.records)
+                _write_checkpoint(self.checkpoint, self.identity, position, self.records)
             except OSError as error:  # no reason to lose the fit as well
                 warnings.warn(
                     f"the checkpoint cannot be written ({error}). The fit goes on and tries again; "
                     "a checkpoint that was written before is unchanged.",
                     stacklevel=2,
                 )
-            self._saved = time.monotonic()
-        if self._show is not None:
+            self.saved = time.monotonic()
+        if self.show is not None:
             of_step = len(self.records), self.max_steps, record.stage, record.horizon, record.loss
             names, seconds = list(self.problem.space.names), time.monotonic() - self.began
-            self._show(FitProgress(*of_step, x, names, seconds))
+            self.show(FitProgress(*of_step, x, names, seconds))
 
     def history(self) -> dict[str, np.ndarray]:
         """The records as arrays."""
-        found = {name: np.array([getattr(r, name) for r in self.records]) for name in _COLUMNS}
+        found = _columns(self.records)
         return {**found, "x": found["x"].reshape(-1, self.problem.size)}
 
 
+def _columns(records: list[Record]) -> dict[str, np.ndarray]:
+    return {name: np.array([getattr(r, name) for r in records]) for name in Record._fields}
+
+
 def identity(problem: Problem, u: np.ndarray, *of: Any) -> str:
-    """What a checkpoint is known by: data, names, start and settings."""
+    """Hash by which a checkpoint is recognised: data, names, start and settings."""
     settings = re.sub(r" at 0x[0-9a-f]+", "", repr((problem.space.names, problem.loss, *of)))
-    digest = hashlib.sha256(settings.encode())
-    digest.update(np.ascontiguousarray(u).tobytes())
-    known = eqx.filter((problem.space, problem.core.model), eqx.is_array_like)
+    groups = [(g.ts, g.values, g.seen, g.whiten, g.t0) for g in problem.groups]
+    steps = [(group.num_steps, group.block) for group in problem.groups]
+    known = eqx.filter((u, problem.space, problem.core.model, groups), eqx.is_array_like)
+    digest = hashlib.sha256((settings + repr(steps)).encode())
     for leaf in jax.tree.leaves(known):
         digest.update(np.ascontiguousarray(leaf).tobytes())
-    for group in problem.groups:
-        for array in (group.ts, group.values, group.seen, group.whiten, group.t0):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        digest.update(repr((group.num_steps, group.block)).encode())
     return digest.hexdigest()
 
 
@@ -114,7 +121,7 @@ def _write_checkpoint(path: Any, identity: str, at: Position, records: list[Reco
     for name in _LISTS:
         arrays |= {f"{name}.{i}": np.asarray(x) for i, x in enumerate(about[name])}
         about[name] = len(about[name])
-    arrays |= {f"record.{n}": np.array([getattr(r, n) for r in records]) for n in _COLUMNS}
+    arrays |= {f"record.{name}": column for name, column in _columns(records).items()}
     publish_npz(path, _FORMAT, about, arrays)
 
 
@@ -123,17 +130,12 @@ def _read_checkpoint(path: Any, identity: str) -> tuple[Position, list[Record]]:
     if about.get("identity") != identity:
         raise ValueError(
             f"the checkpoint {path} is of another fit (data, parameters, their start or settings "
-            "differ). Give another file, or remove this one to begin again."
+            "differ). Give another file, or remove this one to start again."
         )
-    position = Position(
-        *(about[name] for name in ("stage", "horizon", "done")),
-        *(arrays[name] for name in _VECTORS),
-        *([arrays[f"{name}.{i}"] for i in range(about[name])] for name in _LISTS),
-        memory=tuple(about["memory"]),
-        status=about["status"],
-    )
-    columns = [arrays[f"record.{n}"] for n in _COLUMNS]
-    return position, [
-        Record(int(s), float(h), float(loss), float(step), bool(a), x)
-        for s, h, loss, step, a, x in zip(*columns, strict=True)
-    ]
+    known = {name: about[name] for name in Position.__dataclass_fields__ if name in about}
+    known |= {name: arrays[name] for name in _VECTORS}
+    known |= {name: [arrays[f"{name}.{i}"] for i in range(about[name])] for name in _LISTS}
+    # As numbers of Python: records of a continued fit go into the next checkpoint with new ones.
+    *plain, xs = (arrays[f"record.{name}"] for name in Record._fields)
+    rows = zip(*(column.tolist() for column in plain), xs, strict=True)
+    return Position(**known), [Record(*row) for row in rows]

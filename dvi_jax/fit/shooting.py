@@ -1,4 +1,4 @@
-"""Single and multiple shooting: which starts are unknown besides the parameters."""
+"""Single and multiple shooting: arcs as one trajectory, or cut into segments tied together."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._checks import fraction, whole
 from .._integrate import integrate
 from .._solution import Save
-from .model import make_group, predict, weighed
+from .model import make_group, predict, specification, weighed
 from .observations import Observations
 from .optimise import Evaluation
 from .problem import Problem
@@ -26,18 +26,18 @@ class SingleShooting:
 
 @dataclass(frozen=True)
 class MultipleShooting:
-    """Each arc is cut into segments with starts of their own, tied by continuity.
+    """Each arc is cut into segments with initial states of their own, tied by continuity.
 
     - `segments`: how many, at least 2.
-    - `guess`: states at the cuts to begin with: a function ``t`` → (q, p); ``"data"``, by
+    - `guess`: initial guess of the states at the cuts: a function ``t`` → (q, p); ``"data"``, by
       interpolation of the observations, which must be of positions or of the state; or
-      ``"model"``, the trajectory of the starting parameters. None takes ``"data"`` where it can.
-    - `tolerance`: by how much the end of a segment may miss the next start, relative to the size
+      ``"model"``, the trajectory of the starting parameters. None uses ``"data"`` where it can.
+    - `tolerance`: largest gap between the end of a segment and the next start, relative to the size
       of the orbit.
 
     For long or chaotic arcs, where the misfit as a function of the parameters alone has many
-    narrow minima: over a short segment it has none. Continuity is a constraint of the fit, met
-    by an augmented Lagrangian.
+    narrow minima; over a short segment it has none. Continuity is a constraint of the fit,
+    enforced by an augmented Lagrangian.
 
     **Source** Bock 1983, *Recent advances in parameter identification techniques for ODE*;
     Nocedal & Wright 2006, *Numerical Optimization*, 17.3.
@@ -60,13 +60,11 @@ class _Part:
     """The observations of an arc that belong to one segment."""
 
     def __init__(self, arc: Observations, keep: np.ndarray, t0: float, whitening: np.ndarray):
-        if not keep.any():  # a segment without data: one time of no weight
-            self.ts = np.array([t0])
+        if keep.any():
+            self.ts, self.values, self._whitening = arc.ts[keep], arc.values[keep], whitening[keep]
+        else:  # a segment without data: one time of no weight
+            self.ts, self._whitening = np.array([t0]), np.zeros((1, *whitening.shape[1:]))
             self.values = np.full((1, *arc.values.shape[1:]), np.nan)
-            self._whitening = np.zeros((1, *whitening.shape[1:]))
-        else:
-            self.ts, self.values = arc.ts[keep], arc.values[keep]
-            self._whitening = whitening[keep]
         self.t0, self.function = t0, arc.function
 
     def whitening(self) -> np.ndarray:
@@ -85,57 +83,50 @@ class Segments:
 
     def __init__(self, problem: Problem, shooting: MultipleShooting):
         self.problem, self.shooting = problem, shooting
-        space, S = problem.space, shooting.segments
-        spec = problem.specs[0]
+        spec, arcs, S = problem.specs[0], problem.arcs, shooting.segments
         if any(s["h"] != spec["h"] for s in problem.specs) or problem.groups[0].block == 0:
             raise ValueError("multiple shooting needs a uniform lattice, and one h for all arcs.")
-        if len({(a.function, a.values.shape[1:], a.covariance is None) for a in problem.arcs}) > 1:
+        if len({(a.function, a.values.shape[1:], a.covariance is None) for a in arcs}) > 1:
             raise ValueError("multiple shooting needs arcs that observe the same.")
         h = float(spec["h"])
-        steps = max(math.ceil(abs(a.ts[-1] - a.t0) / abs(h) - 1e-9) for a in problem.arcs)
+        steps = max(math.ceil(abs(a.ts[-1] - a.t0) / abs(h) - 1e-9) for a in arcs)
         self.steps = math.ceil(steps / S)
         if self.steps < 1 or steps < S:
             raise ValueError(f"{S} segments of {steps} steps: take fewer segments.")
-        parts, arcs, self.first, cuts = [], [], [], []
-        for i, arc in enumerate(problem.arcs):
+        self.cuts = np.array([[arc.t0 + s * self.steps * h for s in range(S)] for arc in arcs])
+        parts = []
+        for arc, cuts in zip(arcs, self.cuts, strict=True):
             whitening = arc.whitening()
             place = (arc.ts - arc.t0) / (self.steps * h)
             which = np.clip(np.ceil(place - 1e-9).astype(int) - 1, 0, S - 1)
-            for s in range(S):
-                t0 = arc.t0 + s * self.steps * h
-                parts.append(_Part(arc, which == s, t0, whitening))
-                arcs.append(i)
-                self.first.append(s == 0)
-                cuts.append(t0)
-        self.group = make_group(arcs, parts, spec, self.steps)
-        self.cuts = np.reshape(cuts, (len(problem.arcs), S))
+            parts += [_Part(arc, which == s, float(cuts[s]), whitening) for s in range(S)]
+        numbers = np.repeat(np.arange(len(arcs)), S)
+        self.group = make_group(numbers.tolist(), parts, spec, self.steps)
         self.shape = np.shape(spec["q0"])
-        self.half = int(np.prod(self.shape, dtype=int))
-        self.arcs = len(problem.arcs)
-        self.num_nodes = self.arcs * (S - 1)
-        later = ~np.array(self.first)
-        self.node_of = np.where(later, np.cumsum(later) - 1, -1)
-        self.next_of = np.array(
-            [self.node_of[j + 1] if (j + 1) % S else -1 for j in range(len(parts))]
-        )
+        self.half = math.prod(self.shape)
+        # Segments after the first of an arc start at a node, an unknown state (2 half,).
+        self.first = np.tile(np.arange(S) == 0, len(arcs))
+        self.num_nodes = len(arcs) * (S - 1)
+        self.node_of = np.where(self.first, -1, np.cumsum(~self.first) - 1)
+        self.inner = np.flatnonzero(np.tile(np.arange(S) < S - 1, len(arcs)))
+        self.next_of = self.node_of[self.inner + 1]
         self.num_gaps = self.num_nodes * 2 * self.half
-        self.n = space.size
-        self.size = self.n + self.num_nodes * 2 * self.half
+        self.n = problem.size
+        self.size = self.n + self.num_gaps
         self.orbit = np.ones(2 * self.half)
 
     def begin(self, u: np.ndarray) -> np.ndarray:
         """w with the guesses of the segments' starts; sets the size of the orbit."""
-        states = np.stack([self._guess(i, u) for i in range(self.arcs)])  # (A, S, 2 half)
+        each = range(len(self.problem.arcs))
+        states = np.stack([self._guess(i, u) for i in each])  # (A, S, 2 half)
         flat = states.reshape(-1, 2, self.half)
         size = np.maximum(np.abs(flat).max(axis=(0, 2)), np.finfo(float).tiny)
         self.orbit = np.repeat(size, self.half)
         return np.concatenate([u, states[:, 1:].ravel()])
 
     def _guess(self, i: int, u: np.ndarray) -> np.ndarray:
-        guess, arc = self.shooting.guess, self.problem.arcs[i]
-        params = self.problem.space.to_params(self.problem.space.to_x(jnp.asarray(u)))
-        spec = self.problem.core.specification(params, i)
-        times = self.cuts[i]
+        guess, arc, times = self.shooting.guess, self.problem.arcs[i], self.cuts[i]
+        spec = self._specification(jnp.asarray(u), i)
         if guess is None:
             named = arc.observe in ("positions", "state")
             enough = np.isfinite(arc.values.reshape(len(arc.ts), -1)).all(axis=1).sum() >= 4
@@ -152,8 +143,8 @@ class Segments:
         else:
             steps = {"num_steps": self.steps * len(times), "save": Save(every=self.steps)}
             sol = integrate(**{**spec, **steps, "t0": arc.t0, "throw": False})
-            flat = (np.asarray(x[:-1]).reshape(len(times), -1) for x in (sol.qs, sol.ps))
-            found = np.concatenate(list(flat), axis=1)
+            flat = [np.asarray(x[:-1]).reshape(len(times), -1) for x in (sol.qs, sol.ps)]
+            found = np.concatenate(flat, axis=1)
         if not np.isfinite(found).all():
             raise ValueError(
                 f"arc {i}: the guess of the segments' starts is not finite at t = "
@@ -162,57 +153,58 @@ class Segments:
             )
         return found
 
-    def _segment(self, u, node, arc, first, t0, ts, pick, values, seen, whiten):
-        """Whitened residuals (N K,) and the end state (2 half,) of one segment."""
-        problem = self.problem
-        params = problem.space.to_params(problem.space.to_x(u))
-        spec = problem.core.specification(params, arc)
-        q = jnp.where(first, jnp.asarray(spec["q0"], float), node[: self.half].reshape(self.shape))
-        p = jnp.where(first, jnp.asarray(spec["p0"], float), node[self.half :].reshape(self.shape))
-        found, (q1, p1), _ = predict({**spec, "q0": q, "p0": p}, t0, ts, pick, self.group)
-        off = jnp.where(seen, found - values, 0.0)
-        r = weighed(off, whiten)
-        return problem.core.root(r).ravel(), jnp.concatenate([q1.ravel(), p1.ravel()]) / self.orbit
+    def _specification(self, u: Array, arc: Any) -> dict[str, Any]:
+        space = self.problem.space
+        core = self.problem.core
+        return specification(core.model, space.to_params(space.to_x(u)), arc, core.many)
 
-    def _all(self, w: Array):
+    def _segment(self, x: Array, segment: dict[str, Any]) -> tuple[Array, Array]:
+        """Residuals of one segment and its end, relative to the orbit, from x = (u, own start)."""
+        problem, own = self.problem, x[self.n :]
+        spec = self._specification(x[: self.n], segment["arc"])
+        for name, of_node in (("q0", own[: self.half]), ("p0", own[self.half :])):
+            # The first segment of an arc starts where the model says.
+            start = jnp.asarray(spec[name], float)
+            spec[name] = jnp.where(segment["first"], start, of_node.reshape(self.shape))
+        times = segment["t0"], segment["ts"], segment["pick"]
+        found, (q1, p1), _ = predict(spec, *times, self.group)
+        off = jnp.where(segment["seen"], found - segment["values"], 0.0)
+        r = problem.core.root(weighed(off, segment["whiten"])).ravel()
+        return r, jnp.concatenate([q1.ravel(), p1.ravel()]) / self.orbit
+
+    def _all(self, w: Array) -> Any:
         """Residuals and ends of all segments, and their derivatives in (u, own start)."""
-        g, nodes = self.group, w[self.n :].reshape(self.num_nodes, 2 * self.half)
-        own = nodes[np.maximum(self.node_of, 0)]
-        pick = None if g.pick is None else jnp.asarray(g.pick)
-        rest = (g.arcs, np.array(self.first), g.t0, g.ts, pick, g.values, g.seen, g.whiten)
-        rest = [x if x is None else jnp.asarray(x) for x in rest]
-        axes = (None, 0, *(None if x is None else 0 for x in rest))
+        names = ("t0", "ts", "pick", "values", "seen", "whiten")
+        each = {name: getattr(self.group, name) for name in names}
+        each |= {"arc": self.group.arcs, "first": self.first}
+        own = self._nodes(w)[np.maximum(self.node_of, 0)]
 
-        def one(u, node, *rest):
+        def one(node, segment):
             def twice(x):
-                out = self._segment(x[: self.n], x[self.n :], *rest)
-                return out, out
+                return (self._segment(x, segment),) * 2
 
-            return jax.jacfwd(twice, has_aux=True)(jnp.concatenate([u, node]))
+            return jax.jacfwd(twice, has_aux=True)(jnp.concatenate([w[: self.n], node]))
 
-        J, values = jax.vmap(one, in_axes=axes)(w[: self.n], own, *rest)
+        J, values = jax.vmap(one)(own, jax.tree.map(jnp.asarray, each))
         return values, J
 
-    def _gaps(self, w: Array, ends: Array) -> Array:
-        nodes = w[self.n :].reshape(self.num_nodes, 2 * self.half)
-        inner = self.next_of >= 0
-        return ends[inner] - nodes[self.next_of[inner]] / self.orbit[None]
+    def _nodes(self, w: Array) -> Array:
+        return w[self.n :].reshape(self.num_nodes, 2 * self.half)
 
     def evaluate(self, w: Array, horizon: Any, extra: tuple[Array, Array]) -> Evaluation:
-        """The residual vector, its derivative put together from those of the segments, and c."""
+        """The residual vector, its derivative assembled from those of the segments, and c."""
         del horizon
         root, multipliers = extra  # √ρ, λ
         (r, ends), (Jr, Je) = self._all(w)
         n, u = self.n, w[: self.n]
-        inner = np.flatnonzero(self.next_of >= 0)
-        gaps = self._gaps(w, ends)
+        gaps = ends[self.inner] - self._nodes(w)[self.next_of] / self.orbit[None]
         prior = self.problem.core.prior_rows
         tied = root * gaps + multipliers.reshape(gaps.shape) / root
         residual = jnp.concatenate([r.ravel(), prior(u), tied.ravel()])
         # The end of a segment depends on its own start, a gap on the next start as well.
-        J_tied = root * self._in_place(Je[inner], inner)
-        gap, part = np.arange(len(inner))[:, None], np.arange(2 * self.half)
-        to = n + self.next_of[inner][:, None] * 2 * self.half + part
+        J_tied = root * self._in_place(Je[self.inner], self.inner)
+        gap, part = np.arange(len(self.inner))[:, None], np.arange(2 * self.half)
+        to = n + self.next_of[:, None] * 2 * self.half + part
         J_tied = J_tied.at[gap, part, to].add(-root / self.orbit[None])
         J_prior = jnp.zeros((n, self.size)).at[:, :n].set(jax.jacfwd(prior)(u))
         J_data = self._in_place(Jr, np.arange(len(r)))
@@ -223,7 +215,7 @@ class Segments:
     def _in_place(self, J: Array, segments: np.ndarray) -> Array:
         """Derivatives (S, R, n + 2 half) of some segments in (u, own start) as ones in w."""
         width = 2 * self.half
-        # The start of an arc's first segment is no unknown: its columns go behind w, and off.
+        # The start of an arc's first segment is not an unknown: its columns go behind w, and off.
         node = np.where(self.node_of < 0, self.num_nodes, self.node_of)[segments]
         own = self.n + node[:, None] * width + np.arange(width)
         columns = np.hstack([np.tile(np.arange(self.n), (len(own), 1)), own])
@@ -235,7 +227,7 @@ class Segments:
 def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.ndarray:
     """States (T, 2 q.size) at `times` by interpolation of an arc's observations.
 
-    Of positions alone, momenta are those p for which ∂H_D/∂p is the velocity by differences.
+    From positions alone, momenta are those p for which ∂H_D/∂p is the velocity by differences.
 
     **Raises** `ValueError` for an arc that observes something else.
     """

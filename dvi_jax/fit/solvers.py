@@ -1,16 +1,21 @@
-"""Which solver goes through a fit.
+"""Choice of the optimiser of a fit.
 
-The libraries of solvers are imported when a fit is made: an eighth of the time that the package
-would take to import, which most programs never need.
+The libraries of optimisers are imported when a fit is made: they take an eighth of the time to
+import the package, and most programs never need them.
 """
 
 import functools
 from typing import Any
 
+from .._checks import instance
+
 
 @functools.cache
 def levenberg_marquardt() -> Any:
-    """One object, so that all fits share what is compiled for it; `LeastSquaresStage` ends it."""
+    """One object, so that all fits share what is compiled for it.
+
+    Its own tolerances are never met: `LeastSquaresStage` decides when it ends.
+    """
     import optimistix as optx
 
     return optx.LevenbergMarquardt(rtol=1e-14, atol=1e-300)
@@ -24,8 +29,8 @@ def bfgs() -> Any:
     return optx.BFGS(rtol=1e-10, atol=1e-10)
 
 
-def goes_by_optax(solver: Any) -> bool:
-    """Whether its steps are those of a gradient transformation, with no search along them."""
+def is_optax(solver: Any) -> bool:
+    """Whether its steps are those of a gradient transformation, without a line search."""
     import optimistix as optx
 
     return isinstance(solver, optx.OptaxMinimiser)
@@ -39,35 +44,28 @@ def is_gauss_newton(solver: Any) -> bool:
 
 
 def solver_for(optimiser: Any, residuals: bool, many: bool, steps: int) -> Any:
-    """The optimistix solver that is meant, for a loss of `residuals` or not, of `many` parameters
-    or few."""
+    """The optimistix solver for the user's choice.
+
+    - `residuals`: whether the loss has a residual vector. `many`: whether there are too many
+      parameters for a Jacobian. `steps`: how many Adam takes by default.
+    """
     import optax
     import optimistix as optx
 
     if optimiser is None:
-        if many:
-            rate = optax.warmup_cosine_decay_schedule(1e-5, 3e-3, max(steps // 20, 1), steps, 1e-5)
-            optimiser = optax.adam(rate)
-        else:
+        if not many:
             return levenberg_marquardt() if residuals else bfgs()
+        rate = optax.warmup_cosine_decay_schedule(1e-5, 3e-3, max(steps // 20, 1), steps, 1e-5)
+        optimiser = optax.adam(rate)
     if isinstance(optimiser, optax.GradientTransformation):
         return optx.OptaxMinimiser(optimiser, rtol=0.0, atol=0.0)
-    if is_gauss_newton(optimiser):
-        if not residuals:
-            raise ValueError(
-                "dvi.Likelihood has no residual vector: take a minimiser such as "
-                "optimistix.BFGS(rtol=1e-10, atol=1e-10), or leave optimiser out."
-            )
-        return optimiser
-    minimisers = (
-        optx.OptaxMinimiser,
-        optx.AbstractQuasiNewton,
-        optx.AbstractLBFGS,
-        optx.AbstractGradientDescent,
-    )
-    if isinstance(optimiser, minimisers):
-        return optimiser
-    raise TypeError(
-        "optimiser must be None, a least-squares solver or minimiser of optimistix, or a gradient "
-        f"transformation of optax, got {optimiser!r}."
-    )
+    if is_gauss_newton(optimiser) and not residuals:
+        raise ValueError(
+            "dvi.Likelihood has no residual vector: take a minimiser such as "
+            "optimistix.BFGS(rtol=1e-10, atol=1e-10), or leave optimiser out."
+        )
+    minimisers = optx.OptaxMinimiser, optx.AbstractQuasiNewton, optx.AbstractLBFGS
+    known = optx.AbstractGaussNewton, optx.AbstractGradientDescent, *minimisers
+    of_optimistix = "None, a least-squares solver or minimiser of optimistix"
+    called = f"{of_optimistix}, or a gradient transformation of optax"
+    return instance("optimiser", optimiser, known, called)

@@ -1,4 +1,7 @@
-"""From a start to a minimum: stages of growing horizon, or segments tied together."""
+"""From a start to a minimum: stages of growing horizon, or segments tied together.
+
+A stage with a horizon uses only data up to that time after the start of each arc.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -6,21 +9,20 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from .horizons import suitable_horizon
 from .losses import Likelihood
-from .optimise import Evaluation, LeastSquaresStage, Position, ScalarStage
+from .model import Group, weighed
+from .optimise import Evaluation, LeastSquaresStage, ScalarStage
 from .problem import Problem
 from .results import FIT_RESULTS
 from .run import Run
 from .shooting import Segments
-from .solvers import goes_by_optax
-from .uncertainty import null_space
+from .solvers import is_optax
+from .uncertainty import inverse_or, null_space
 
 MANY = 400
-"""Parameters beyond which the default is a gradient method, and no covariance is made: a Jacobian
-costs a trajectory each."""
+"""Parameters beyond which the default is a gradient method without a covariance: each column of a
+Jacobian costs a trajectory."""
 
 _BEFORE_LAST = 15
 """Steps of a stage that is not the last."""
@@ -28,11 +30,21 @@ _BEFORE_LAST = 15
 _IN_SEGMENTS = 40
 """Steps of a stage of multiple shooting."""
 
+_FURTHER = 1.02
+"""Least factor between horizons where trajectories that fail do not let them double."""
+
+_OFF = 0.5
+"""Misfit, relative to the scatter of the data, up to which a fit of all data is expected to find
+the nearest minimum: half of it is a sixth of a period's phase."""
+
 
 class Minimum(NamedTuple):
-    """Where a fit ended: u, how, the Jacobian of the residuals there (or a matrix whose square is
-    the Hessian), a basis of the directions that constraints leave free, and whitened residuals
-    with predictions, as far as they are known."""
+    """Where a fit ended.
+
+    - `u`, `status`. `jacobian` of the residuals there, or a matrix whose square is the Hessian.
+    - `free`: a basis of the directions that constraints leave free. `aux`: whitened residuals, and
+      predictions with statuses, of all data if they are known.
+    """
 
     u: np.ndarray
     status: FIT_RESULTS
@@ -42,109 +54,151 @@ class Minimum(NamedTuple):
 
 
 def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units: bool) -> Minimum:
-    """Stages of growing horizon; u, the Jacobian of the last, and how it ended."""
+    """Stages of growing horizon with a solver for the residual vector."""
     problem = run.problem
     stage = LeastSquaresStage(problem.evaluate, solver)
-    resume = run.take_resume()
-    number, whole = 0, None
-    if resume is None:
-        # Everything is looked at once; a shorter horizon takes the rows that it needs.
-        whole = stage.at(u)
-        problem.check_start(whole.aux[1], check_units)
-        horizon = _next(problem, wanted, 0, whole.aux[0], 0.0)
+
+    def solve(u, task, whole):
+        # All data were evaluated at u; a shorter horizon takes the rows that it needs.
+        if whole is not None:
+            keep = problem.rows_within(task.horizon)
+            r, J, aux = whole
+            whole = Evaluation(jnp.where(keep, r, 0.0), jnp.where(keep[:, None], J, 0.0), aux)
+        return stage.run(u, task, problem.degrees_of_freedom, whole)
+
+    cut = FIT_RESULTS.max_steps_reached
+    tolerance = max(1e-2, run.tolerance)
+    u, found, status = _stages(
+        run, u, wanted, check_units, stage.at, solve, (_BEFORE_LAST, tolerance, cut)
+    )
+    return Minimum(u, status, found.jacobian, None, found.aux)
+
+
+def by_gradient(
+    run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units: bool, batch: Any, seed: int
+) -> Minimum:
+    """The same with a minimiser of the scalar loss."""
+    problem, optax = run.problem, is_optax(solver)
+    # Per value, so that a learning rate means the same for any amount of data.
+    stage = ScalarStage(problem.core, float(problem.count) if optax else 1.0, solver)
+    choose = None if batch is None else _draw(problem, batch, seed)
+    scale = np.ones(problem.size)
+    if run.resume is not None:
+        scale = run.resume.scale
+    elif not optax:  # scales of u along which the residuals change by equal amounts
+        J = np.asarray(problem.evaluate(u).jacobian)
+        scale = inverse_or(np.linalg.norm(np.where(np.isfinite(J), J, 0.0), axis=0), 1.0)
+
+    def look(u):
+        return Evaluation(jnp.zeros(0), jnp.zeros(0), problem.whitened(u))
+
+    def solve(u, task, whole):
+        u, status = stage.run(u, task, scale, choose)
+        return u, look(u), status
+
+    cut = FIT_RESULTS.steps_done if optax else FIT_RESULTS.max_steps_reached
+    short = run.max_steps // 8 if optax else _BEFORE_LAST
+    u, found, status = _stages(
+        run, u, wanted, check_units, look, solve, (short, run.tolerance, cut)
+    )
+    if problem.size > MANY or status == FIT_RESULTS.not_finite:
+        J = None
+    elif isinstance(problem.loss, Likelihood):
+        J = _root_of_hessian(problem, u)
     else:
-        number, horizon = resume.stage, resume.horizon
-    while True:
-        is_last = horizon == np.inf
-        u, found, status = stage.run(
-            u,
-            horizon,
-            tolerance=run.tolerance if is_last else max(1e-2, run.tolerance),
-            degrees=problem.degrees_of_freedom,
-            first=None if whole is None else _up_to(problem, whole, horizon),
-            **_settings(run, number, resume, None if is_last else _BEFORE_LAST),
-        )
-        resume = None
-        if is_last or status == FIT_RESULTS.not_finite:
-            return Minimum(u, status, found.jacobian, None, found.aux if is_last else None)
-        number += 1
-        whole = stage.at(u)
-        if run.left <= 0:  # a piece may have converged, the whole has not
-            return Minimum(u, FIT_RESULTS.max_steps_reached, whole.jacobian, None, whole.aux)
-        horizon = _next(problem, wanted, number, whole.aux[0], 2 * horizon * (1 - 1e-9))
+        J = problem.evaluate(u).jacobian
+    return Minimum(u, status, J, aux=found.aux)
 
 
-def _settings(run: Run, number: int, resume: Position | None, most: int | None) -> dict[str, Any]:
-    """What every kind of stage takes; `most`: its steps, those before it was resumed included, if
-    it is not the last."""
-    done = 0 if resume is None else resume.done
-    steps = done + run.left
-    if most is not None:
-        steps = min(max(most, done), steps)
-    return {"stage": number, "max_steps": steps, "resume": resume, "watch": run.watch}
+def _stages(
+    run: Run,
+    u: np.ndarray,
+    wanted: list[float] | None,
+    check_units: bool,
+    look: Callable[..., Evaluation],
+    solve: Callable[..., tuple[np.ndarray, Evaluation, FIT_RESULTS]],
+    before_last: tuple[int, float, FIT_RESULTS],
+) -> tuple[np.ndarray, Evaluation, FIT_RESULTS]:
+    """Stages up to the one of all data; u, the evaluation there and the status.
+
+    - `look`: u → the evaluation with all data. `solve`: (u, task, that evaluation if it is known) →
+      a stage's u, evaluation and status.
+    - `before_last`: steps and tolerance of a stage that is not the last, and the status of a fit
+      whose steps end there: a piece may have converged, the whole has not.
+    """
+    problem, whole = run.problem, None
+    most, tolerance, cut = before_last
+    if run.resume is None:
+        number, whole = 0, look(u)
+        problem.check_start(whole.aux[1], check_units)
+        horizon = _horizon(problem, wanted, 0, whole.aux[0], 0.0)
+    else:
+        number, horizon = run.resume.stage, run.resume.horizon
+    while horizon < np.inf:
+        task = run.task(number, horizon, tolerance, most)
+        u, found, status = solve(u, task, whole)
+        if status == FIT_RESULTS.not_finite:
+            return u, found._replace(aux=None), status
+        number, whole = number + 1, look(u)
+        if run.left <= 0:
+            return u, whole, cut
+        horizon = _horizon(problem, wanted, number, whole.aux[0], 2 * horizon * (1 - 1e-9))
+    return solve(u, run.task(number, horizon, run.tolerance, None), whole)
 
 
-def _next(problem: Problem, wanted: Any, number: int, rows: list[Array], at_least: float) -> float:
+# ---- horizons
+
+
+def _horizon(
+    problem: Problem, wanted: list[float] | None, number: int, rows: list[Any], at_least: float
+) -> float:
+    """The horizon of a stage; infinite for all data.
+
+    Where none are `wanted`: the longest of full, full/2, full/4, … over which the misfit is small
+    compared with the scatter of the data; where there is none, the shortest with enough data for
+    the parameters, but not beyond the first prediction that is not finite.
+
+    - `rows`: whitened residuals (A, N, K) of each group. `at_least`: a horizon to exceed.
+    """
     if wanted is not None:
         return wanted[min(number, len(wanted) - 1)]
-    return suitable_horizon(problem, [np.asarray(r) for r in rows], at_least)
 
+    def seen(of_groups):
+        pairs = zip(of_groups, problem.groups, strict=True)
+        return np.concatenate([np.broadcast_to(x, g.seen.shape)[g.seen] for x, g in pairs])
 
-def _up_to(problem: Problem, whole: Evaluation, horizon: float) -> Evaluation:
-    """What is known of a horizon from what is known of everything."""
-    keep = problem.rows_within(horizon)
-    r, J, aux = whole
-    return Evaluation(jnp.where(keep, r, 0.0), jnp.where(keep[:, None], J, 0.0), aux)
-
-
-def by_gradient(run: Run, u: np.ndarray, solver: Any, wanted, batch, seed: int, units: bool):
-    """The same by a minimiser of the scalar loss."""
-    problem = run.problem
-    is_optax = goes_by_optax(solver)
-
-    # Per value, so that a learning rate means the same for any amount of data.
-    stage = ScalarStage(problem.core, float(problem.count) if is_optax else 1.0, solver)
-    choose = None if batch is None else _draw(problem, batch, seed)
-    short = run.max_steps // 8 if is_optax else _BEFORE_LAST
-    resume = run.take_resume()
-    if resume is None:
-        rows, known = problem.whitened(u)
-        problem.check_start(known, units)
-        number, horizon = 0, _next(problem, wanted, 0, rows, 0.0)
-        scale = np.ones(problem.size) if is_optax else _lengths(problem, u)
-    else:
-        number, horizon, scale = resume.stage, resume.horizon, resume.scale
-    while True:
-        is_last = horizon == np.inf
-        settings = _settings(run, number, resume, None if is_last else short)
-        settings |= {"tolerance": run.tolerance, "scale": scale, "choose": choose}
-        u, status = stage.run(u, horizon, **settings)
-        resume = None
-        rows, known = problem.whitened(u)
-        if is_last or status == FIT_RESULTS.not_finite:
+    spans = [np.abs(g.ts - g.t0[:, None]) for g in problem.groups]
+    full, shortest = max(float(span.max()) for span in spans), np.inf
+    allowed = _OFF * np.sqrt(np.mean(seen(map(_scatter, problem.groups)) ** 2))
+    since, misfit = seen(span[..., None] for span in spans), seen(map(np.asarray, rows))
+    enough = 2 * max(problem.size - problem.space.count_of_priors, 1)
+    horizon = full
+    while horizon > at_least:
+        inside = since <= horizon * (1 + 1e-12)
+        if inside.sum() < enough:
             break
-        if run.left <= 0:
-            status = FIT_RESULTS.steps_done if is_optax else FIT_RESULTS.max_steps_reached
-            break
-        number += 1
-        horizon = _next(problem, wanted, number, rows, 2 * horizon * (1 - 1e-9))
-    aux = rows, known
-    if problem.size > MANY or status == FIT_RESULTS.not_finite:
-        return Minimum(u, status, aux=aux)
-    if isinstance(problem.loss, Likelihood):
-        return Minimum(u, status, _root_of_hessian(problem, u), aux=aux)
-    return Minimum(u, status, problem.evaluate(u).jacobian, aux=aux)
+        if np.isfinite(misfit[inside]).all() and np.sqrt(np.mean(misfit[inside] ** 2)) <= allowed:
+            return np.inf if horizon == full else horizon
+        shortest = horizon
+        horizon /= 2
+    lost = since[~np.isfinite(misfit)].min(initial=np.inf)
+    if shortest >= lost > _FURTHER * at_least / 2:
+        return lost * (1 - 1e-9)
+    return np.inf if shortest >= full else shortest
 
 
-def _lengths(problem: Problem, u: np.ndarray) -> np.ndarray:
-    """Scales of u in which the residuals change alike."""
-    J = np.asarray(problem.evaluate(u).jacobian)
-    length = np.linalg.norm(np.where(np.isfinite(J), J, 0.0), axis=0)
-    return np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 1.0)
+def _scatter(group: Group) -> np.ndarray:
+    """Observed values minus their mean over the arc, in standard errors, (A, N, K)."""
+    count = np.maximum(group.seen.sum(axis=1, keepdims=True), 1)
+    mean = np.where(group.seen, group.values, 0).sum(axis=1, keepdims=True) / count
+    return weighed(np.where(group.seen, group.values - mean, 0.0), group.whiten)
+
+
+# ---- what gradient methods need
 
 
 def _draw(problem: Problem, batch: int, seed: int) -> Callable[[int], Any]:
-    """Which arcs of each group a step looks at: a function of its number."""
+    """The arcs of each group that a step uses: a function of its number."""
 
     def choose(step):
         random = np.random.default_rng([seed, step])
@@ -166,26 +220,27 @@ def _root_of_hessian(problem: Problem, u: np.ndarray) -> np.ndarray:
     return np.sqrt(np.where(values >= 0, values, np.nan))[:, None] * vectors.T * scale
 
 
+# ---- multiple shooting
+
+
 def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any) -> Minimum:
     """Multiple shooting: Levenberg–Marquardt inside of an augmented Lagrangian."""
-    problem, n, gaps = run.problem, run.problem.size, segments.num_gaps
+    n, gaps, resume = run.problem.size, segments.num_gaps, run.resume
     stage = LeastSquaresStage(eqx.filter_jit(segments.evaluate), solver)
-    resume = run.take_resume()
-    w, found = segments.begin(u), None
+    w = segments.begin(u)
     if resume is None:
-        number, multipliers, root = 0, np.zeros(gaps), 1.0
-        r, _, c = stage.at(w, np.inf, (jnp.asarray(root), jnp.asarray(multipliers)))
+        number, multipliers = 0, np.zeros(gaps)
+        r, _, c = stage.at(w, np.inf, (jnp.asarray(1.0), jnp.asarray(multipliers)))
         # Continuity weighs as much as the data to begin with.
         misfit, size = float(np.linalg.norm(r[: len(r) - gaps])), float(np.linalg.norm(c))
         root = max(misfit / max(size, 1e-2), np.sqrt(len(r)))
     else:
-        number, (root, multipliers) = resume.stage, (float(resume.extra[0]), resume.extra[1])
+        number, root, multipliers = resume.stage, float(resume.extra[0]), resume.extra[1]
+    degrees = max(run.problem.degrees_of_freedom, 1)
     while True:
-        settings = _settings(run, number, resume, _IN_SEGMENTS)
-        settings |= {"tolerance": run.tolerance, "degrees": max(problem.degrees_of_freedom, 1)}
+        task = run.task(number, np.inf, run.tolerance, _IN_SEGMENTS)
         extra = jnp.asarray(root), jnp.asarray(multipliers)
-        w, found, status = stage.run(w, np.inf, extra=extra, **settings)
-        resume = None
+        w, found, status = stage.run(w, task, degrees, extra=extra)
         if status == FIT_RESULTS.not_finite:
             break
         c = np.asarray(found.aux)

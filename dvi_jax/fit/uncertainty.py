@@ -1,23 +1,21 @@
-"""How well parameters are known: covariance, correlations, what the data do not determine."""
+"""Uncertainty of parameters: covariance, correlations, undetermined directions."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 _RANK = 1e-9
 """Singular value of the scaled Jacobian, relative to the largest, below which a direction counts
-as not determined: derivatives are known to some 1e-12."""
+as not determined: derivatives have relative errors of about 1e-12."""
 
 
-@dataclass(frozen=True)
-class Uncertainty:
-    """Covariance of the free variables, and the directions behind it.
+class Uncertainty(NamedTuple):
+    """Covariance of the free variables, and principal directions of the scaled Jacobian.
 
-    - `covariance`: (n, n); infinite for what is not determined.
-    - `directions`: principal directions of the scaled Jacobian, best known first, as columns in
-      u; `singular_values`: theirs.
-    - `undetermined`: those columns of `directions` that the data say nothing of, in scaled
-      variables with unit length, shape (n, count).
+    - `covariance`: (n, n); infinite for parameters that are not determined.
+    - `directions`: columns in u, best determined first; `singular_values`: theirs.
+    - `undetermined`: those directions that the data do not determine, in scaled variables with unit
+      length, shape (n, count).
     """
 
     covariance: np.ndarray
@@ -30,14 +28,13 @@ def uncertainty(J: np.ndarray, variance: float, kept: np.ndarray | None = None) 
     r"""Gauss–Newton covariance s² (JᵀJ)⁻¹ by singular values of J with columns of unit length.
 
     - `J`: derivative of the whitened residuals, (R, n). `variance`: s², 1 for known errors.
-    - `kept`: basis of the directions that constraints leave free, (n, m), or None for all.
+    - `kept`: basis of the directions that satisfy constraints, (n, m), or None for all.
 
-    A parameter that shares in a direction that is not determined has infinite variance.
+    A parameter with a component along an undetermined direction has infinite variance.
     """
     n = J.shape[1]
     Z = np.eye(n) if kept is None else kept
-    length = np.linalg.norm(J, axis=0)
-    scale = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 1.0)
+    scale = inverse_or(np.linalg.norm(J, axis=0), 1.0)
     if kept is not None:  # the same space, orthonormal in scaled variables
         Z = np.linalg.qr(Z / scale[:, None])[0]
     # QR first: the singular values of a small triangle.
@@ -50,10 +47,14 @@ def uncertainty(J: np.ndarray, variance: float, kept: np.ndarray | None = None) 
     covariance = variance * (known @ known.T) * np.outer(scale, scale)
     lost = V[:, ~good]
     share = (np.abs(lost) > 1e-6).any(axis=1)
-    covariance[np.ix_(share, np.ones(n, bool))] = np.nan
-    covariance[np.ix_(np.ones(n, bool), share)] = np.nan
+    covariance[share] = covariance[:, share] = np.nan
     covariance[share, share] = np.inf
     return Uncertainty(covariance, V * scale[:, None], values, lost)
+
+
+def inverse_or(x: np.ndarray, other: float, over: float = 1.0) -> np.ndarray:
+    """over / x where x is positive, `other` elsewhere."""
+    return np.where(x > 0, over / np.where(x > 0, x, 1.0), other)
 
 
 def correlations(covariance: np.ndarray) -> np.ndarray:

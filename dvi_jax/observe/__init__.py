@@ -1,4 +1,4 @@
-"""What is measured along a trajectory while it runs."""
+"""Quantities computed along a trajectory during the run."""
 
 from ._deviations import (
     GALI as GALI,

@@ -1,4 +1,4 @@
-"""Deviation vectors: what the derivative of the steps does to small displacements of the start."""
+"""Deviation vectors: small displacements of the start, mapped by the derivative of the steps."""
 
 import abc
 import math
@@ -18,7 +18,7 @@ from .._types import Scalar
 from ._reductions import Reduction
 
 _FEW = 12
-"""Vectors up to which the Gram–Schmidt process is written out."""
+"""Vectors up to which the Gram–Schmidt process is unrolled: a loop compiles faster for many."""
 
 
 class Pushed(NamedTuple):
@@ -35,13 +35,14 @@ class Pushed(NamedTuple):
 class Deviations(Reduction):
     """Base of the reductions that follow deviation vectors along a trajectory.
 
-    Before each step `vectors` tells which ones there are; the step's derivative is applied to them,
-    the disturbance included, and `update` is given what they have become as a `Pushed` in place of
-    a value. The derivative is that of the discrete map: exact, by autodiff, through implicit
-    solves as well.
+    The derivative of each step is applied to `vectors` of the memory, and `update` receives the
+    result as a `Pushed` in place of a value. It is the derivative of the discrete map, perturbation
+    included: exact, by autodiff, through implicit solves as well. Gradients are those of the steps,
+    so that there is no `combine`.
     """
 
-    if TYPE_CHECKING:  # what a reduction of a function has; here it is the state itself
+    # For a type checker, an abstract variable would be a constructor argument of every subclass.
+    if TYPE_CHECKING:
         function: ClassVar[Any]
     else:
 
@@ -51,19 +52,20 @@ class Deviations(Reduction):
 
     @abc.abstractmethod
     def vectors(self, memory: Any) -> Array:
-        """The vectors that the next step is to push, shape (count, 2N)."""
+        """The vectors before the next step, shape (count, 2N)."""
 
     @abc.abstractmethod
     def update(self, memory: Any, k: Array, t: Scalar, value: Any) -> Any:
         """Memory after step k, which ended at time t; `value` is a `Pushed`."""
 
-    def pull(self, memory, cotangent, k, t, value):
-        raise NotImplementedError("deviation vectors are differentiated through the steps")
+
+def _state(t0, t1, q0, p0, q1, p1, args):
+    return jnp.concatenate([q1.ravel(), p1.ravel()])
 
 
 class _Sum(NamedTuple):
-    """A sum of many small terms, with what rounding has taken from it (Kahan 1965): in float32 a
-    running time would be off by per cents after a million steps."""
+    """A compensated sum (Kahan 1965): in float32 a plain sum of a million steps has an error of per
+    cents."""
 
     value: Array
     excess: Array
@@ -78,17 +80,13 @@ def _no_sum(shape: tuple[int, ...], dtype: Any) -> _Sum:
     return _Sum(jnp.zeros(shape, dtype), jnp.zeros(shape, dtype))
 
 
-def _state(t0, t1, q0, p0, q1, p1, args):
-    return jnp.concatenate([q1.ravel(), p1.ravel()])
-
-
 def _whole(value: Any) -> Any:
-    """A whole number of NumPy's as one of Python's; anything else as it is."""
+    """An integer of NumPy as one of Python, which can be hashed; anything else as it is."""
     return int(value) if isinstance(value, np.integer) else value
 
 
 class _Framed(Deviations):
-    """Base of those that carry an orthonormal frame, the first part of their memory.
+    """Base of indicators with an orthonormal frame, the first part of their memory.
 
     A subclass has the fields `seed`, of the first frame, and `scale`, a pair of units.
     """
@@ -102,7 +100,7 @@ class _Framed(Deviations):
             )
         for which, unit in zip("qp", self.scale, strict=True):
             if any(is_traced(x) for x in jax.tree.leaves(unit)):
-                continue
+                continue  # the value of a tracer is unknown
             try:
                 good = np.isrealobj(unit) and np.all(np.isfinite(unit) & (np.asarray(unit) > 0))
             except TypeError:
@@ -123,13 +121,14 @@ class _Framed(Deviations):
         return vectors if units is None else vectors / units
 
     def _first_frame(self: Any, value: Array, count: int | None) -> Array:
-        """Orthonormal vectors, the same for every trajectory, shape (count, 2N)."""
+        """Random orthonormal vectors, the same for every trajectory, shape (count, 2N)."""
         size = value.shape[0]
         if count is not None and count > size:
             raise ValueError(
-                f"{type(self).__name__} is to follow {count} deviation vectors, but a state of "
-                f"{size} components has only {size} directions: ask for at most {size}."
+                f"{type(self).__name__} has {count} deviation vectors, but a state of {size} "
+                f"components has only {size} directions: take at most {size}."
             )
+        # All `size` vectors are drawn, so that the first ones do not depend on the count.
         random = np.random.default_rng(self.seed).standard_normal((size, size))
         frame = np.linalg.qr(random)[0][: size if count is None else count]
         return jnp.asarray(frame, value.dtype)
@@ -154,11 +153,11 @@ class _Framed(Deviations):
 class TangentMap(Deviations):
     r"""Observable: the derivative of the whole run, ∂(q_K, p_K)/∂(q_0, p_0), shape (2N, 2N).
 
-    The product M_K ⋯ M_1 of the steps' derivatives, in coordinates (q, p) raveled; of no steps the
-    identity. With a symplectic method and ε = 0, or a disturbance that derives from a Hamiltonian,
-    MᵀJM = J. Over a closed orbit it is the monodromy matrix, whose eigenvalues are the Floquet
-    multipliers. On chaotic orbits its columns fall together once e^{λt} nears 1e16, and it
-    overflows in the end: take `LyapunovSpectrum` there.
+    The product M_K ⋯ M_1 of the steps' derivatives, in coordinates (q, p) raveled; the identity
+    without steps. With a symplectic method and ε = 0, or a Hamiltonian perturbation, MᵀJM = J. Over
+    a closed orbit it is the monodromy matrix, whose eigenvalues are the Floquet multipliers. On
+    chaotic orbits its columns become parallel when e^{λt} approaches 1e16, and later it overflows:
+    use `LyapunovSpectrum` there.
     """
 
     def start(self, value):
@@ -179,18 +178,18 @@ class LyapunovSpectrum(_Framed):
 
         λ_i = (1/|t|) Σ_k ln R_ii^(k),        M_k Q_{k−1} = Q_k R^(k)
 
-    An orthonormal frame Q is carried by the derivative of each step and made orthonormal again by
-    the Gram–Schmidt process. In the limit λ_1 ≥ λ_2 ≥ …; near ones may change places before. On a
-    Hamiltonian system they come in pairs ±λ, a pair of zeros for each integral in involution; a
-    linear damping −εp gives pairs that sum to −ε. An exponent that is zero is seen as about
-    (ln t)/t. A run with h < 0 gives the exponents of the motion backwards.
+    The derivative of each step maps an orthonormal frame Q, which the Gram–Schmidt process makes
+    orthonormal again. In the limit λ_1 ≥ λ_2 ≥ …; before it, close ones may be in another order. A
+    Hamiltonian system has pairs ±λ, and a pair of zeros for each integral in involution; with a
+    linear damping −εp pairs sum to −ε. An exponent of zero has a value of about (ln t)/t. A run
+    with h < 0 gives the exponents of the reversed motion.
 
     **Arguments**
 
-    - `count`: how many; None: all 2N of them. The work grows with it.
+    - `count`: number of exponents; None: all 2N. The cost grows with it.
     - `seed`: of the first frame, which is random.
-    - `scale`: (of q, of p): units in which deviations are measured, numbers or arrays like q. In
-      the limit they do not matter.
+    - `scale`: (of q, of p): units of the deviations, numbers or arrays like q, which do not matter
+      in the limit.
 
     **Source** Benettin, Galgani, Giorgilli & Strelcyn 1980, *Meccanica* 15, 9 and 21; Shimada &
     Nagashima 1979.
@@ -209,6 +208,7 @@ class LyapunovSpectrum(_Framed):
         return frame, _no_sum(frame.shape[:1], value.dtype), _no_sum((), value.dtype)
 
     def update(self, memory, k, t, value):
+        # Logarithms are summed, since the growth itself would overflow.
         _, sums, time = memory
         frame, R = _gram_schmidt(self._measured(value.vectors))
         return frame, sums.plus(jnp.log(_diagonal(R))), time.plus(value.h)
@@ -223,10 +223,10 @@ class MEGNO(_Framed):
 
         Y(t) = (2/t) ∫ (|ẇ|/|w|) s ds,        ⟨Y⟩(t) = (1/t) ∫ Y ds
 
-    of one deviation vector w. It tends to 2 on quasi-periodic and on stable periodic orbits, whose
-    neighbours go by other frequencies (to 0 where all have the same one, as in a linear system),
-    and to λt/2 on chaotic ones, λ the largest Lyapunov exponent. A dissipative force that makes w
-    shrink makes it negative. The integrals are sums over the steps, of order 2 in h.
+    of one deviation vector w. It tends to 2 on quasi-periodic and on stable periodic orbits whose
+    neighbours have other frequencies (to 0 if all have the same one, as in a linear system), and to
+    λt/2 on chaotic ones, with the largest Lyapunov exponent λ. It is negative if dissipation makes
+    w shrink. The integrals are sums over the steps, of order 2 in h.
 
     **Arguments** `seed` of the first vector, which is random; `scale` as for `LyapunovSpectrum`.
 
@@ -251,6 +251,7 @@ class MEGNO(_Framed):
     scale: Any = (1.0, 1.0)
 
     def start(self, value):
+        # ∫ (|ẇ|/|w|) s ds is a sum of growths of ln |w| times the midpoint of the step.
         zero = jnp.zeros((), value.dtype)
         weighted, area, time = (_no_sum((), value.dtype) for _ in range(3))
         return self._first_frame(value, 1), weighted, zero, area, time
@@ -276,13 +277,13 @@ class GALI(_Framed):
         GALI_j = |ŵ_1 ∧ … ∧ ŵ_j|
 
     the volume spanned by the first j of k deviation vectors, each of length one. On a chaotic orbit
-    GALI_j falls as exp(−Σ_{i≤j} (λ_1 − λ_i) t); on a torus of n dimensions it stays near a constant
-    for j ≤ n and falls by powers of t above. The vectors are followed as an orthonormal frame and a
-    triangular matrix, so that no digits are lost, down to the smallest number (1e-308), below which
-    stands 0; with ``log10=True`` the logarithm is told, which has no such end.
+    GALI_j decreases as exp(−Σ_{i≤j} (λ_1 − λ_i) t); on a torus of n dimensions it is about constant
+    for j ≤ n and decreases by powers of t above. The vectors are stored as an orthonormal frame and
+    a triangular matrix, which is accurate down to the smallest number (1e-308); below it the value
+    is 0. With ``log10=True`` the value is the logarithm, which has no such limit.
 
-    **Arguments** `k`: vectors, 2 ≤ k ≤ 2N; `seed` of the first ones, which are random and at right
-    angles; `scale` as for `LyapunovSpectrum`.
+    **Arguments** `k`: number of vectors, 2 ≤ k ≤ 2N; `seed` of the first ones, which are random and
+    orthogonal; `scale` as for `LyapunovSpectrum`.
 
     **Source** Skokos, Bountis & Antonopoulos 2007, *Physica D* 231, 30. The triangular matrix: our
     own.
@@ -301,8 +302,8 @@ class GALI(_Framed):
         return frame, jnp.eye(self.k, dtype=value.dtype), _no_sum((self.k,), value.dtype)
 
     def update(self, memory, k, t, value):
-        # The unit vectors are Q·(columns of C). Their part off the first j − 1 directions is
-        # C_jj = exp(logs_j), which soon is nothing beside the others but must not be lost.
+        # The unit vectors are Q·(columns of C). Their part outside of the first j − 1 directions is
+        # C_jj = exp(logs_j), which soon is negligible relative to the others but must not be lost.
         _, columns, logs = memory
         frame, R = _gram_schmidt(self._measured(value.vectors))
         columns = jnp.sum(R[:, :, None] * columns[None, :, :], axis=1)
@@ -319,9 +320,9 @@ class SALI(_Framed):
 
         SALI = min(|ŵ_1 + ŵ_2|, |ŵ_1 − ŵ_2|)
 
-    of two deviation vectors: from √2 it falls as exp(−(λ_1 − λ_2) t) on a chaotic orbit, and stays
-    near a constant on a regular one of two or more degrees of freedom (on a closed curve it falls
-    as 1/t², a map's as well). It is followed as `GALI` is, down to 1e-308.
+    of two deviation vectors: from √2 it decreases as exp(−(λ_1 − λ_2) t) on a chaotic orbit, and is
+    about constant on a regular one of two or more degrees of freedom (on a closed curve, also of a
+    map, it decreases as 1/t²). It is computed like `GALI`, down to 1e-308.
 
     **Arguments** as for `GALI`.
 
@@ -353,9 +354,9 @@ class SALI(_Framed):
 def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
     """(Q, R) with ``vectors[j] = Σ_i R[i, j] Q[i]``, Q orthonormal, R upper triangular, R_jj > 0.
 
-    By the modified process, row by row. The vectors come from an orthonormal frame by one step and
-    are far from dependent.
+    By the modified process, row by row.
     """
+    # Once is enough: the vectors are an orthonormal frame after one step, far from dependent.
     count = vectors.shape[0]
     if count > _FEW:
         return _gram_schmidt_in_a_loop(vectors)
@@ -390,6 +391,6 @@ def _gram_schmidt_in_a_loop(vectors: Array) -> tuple[Array, Array]:
 
 
 def _diagonal(R: Array) -> Array:
-    return (
-        jnp.stack([R[i, i] for i in range(R.shape[0])]) if R.shape[0] <= _FEW else jnp.diagonal(R)
-    )
+    # Single elements of a small matrix stay in registers of the machine code.
+    count = R.shape[0]
+    return jnp.stack([R[i, i] for i in range(count)]) if count <= _FEW else jnp.diagonal(R)

@@ -1,4 +1,4 @@
-"""Steps that are kept along a run, to be looked into afterwards."""
+"""Steps that are recorded during a run and evaluated at its end."""
 
 import abc
 from collections.abc import Callable
@@ -15,11 +15,11 @@ from ..engine.signature import accepts
 from ._reductions import Reduction
 
 _UNLESS_FIRST = 2
-"""In the first place of a row: a step to be kept, but in the first step of a run."""
+"""Row flag: keep this step unless it is the first of the run."""
 
 
 class Start(NamedTuple):
-    """Where a step of a run began, and when it ended: at t1, which is `until` by the clock."""
+    """Start of a step, and its end t1, which is `until` by the clock."""
 
     t0: Scalar
     t1: Scalar
@@ -29,17 +29,18 @@ class Start(NamedTuple):
 
 
 class KeptSteps(Reduction):
-    """Base of the reductions that keep some steps: what they began with, in the order of time.
+    """Base of the reductions that record the starts of some steps, in the order of time.
 
-    `function` gives a row, see `as_row`, whose first number is 1 if it is to be kept, 2 if so but
-    in the first step of the run; the first `skip` of them are passed over. The value in the end is
-    the rows kept, NaN where there were fewer than the capacity, and the number of hits after those
-    skipped.
+    `function` returns a row, see `as_row`. Its first number is 1 for a step to record, 2 for one to
+    record unless it is the first of the run. The first `skip` of them are left out. The result is
+    the rows, NaN where there are fewer than the capacity, and the number of hits after the skipped
+    ones.
     """
 
     has_running_value: ClassVar[bool] = False
 
-    if TYPE_CHECKING:  # there abstract variables would stay arguments of every subclass
+    # For a type checker, abstract variables would be constructor arguments of every subclass.
+    if TYPE_CHECKING:
         capacity: ClassVar[int]
         skip: ClassVar[int]
         function: ClassVar[Callable[..., Any]]
@@ -62,7 +63,8 @@ class KeptSteps(Reduction):
     def update(self, memory, k, t, value):
         rows, steps, count = memory
         hit = (value[0] == 1) | ((value[0] == _UNLESS_FIRST) & (k > 0))
-        place = jnp.where(hit & (count >= 0), count, self.capacity)  # beyond the end: dropped
+        # The count begins at −skip. A place beyond the end is dropped, without a branch.
+        place = jnp.where(hit & (count >= 0), count, self.capacity)
         rows = rows.at[place].set(value, mode="drop")
         return rows, steps.at[place].set(k, mode="drop"), count + jnp.where(hit, 1, 0)
 
@@ -70,11 +72,9 @@ class KeptSteps(Reduction):
         rows, _, count = memory
         return rows, jnp.maximum(count, 0).astype(rows.dtype)
 
-    def pull(self, memory, cotangent, k, t, value):
-        _, steps, _ = memory
-        of_rows, _ = cotangent
-        here = (steps == k)[:, None]
-        return jnp.zeros_like(t), jnp.sum(jnp.where(here, of_rows, 0), axis=0)
+    def combine(self, memory, k, t, value):
+        rows, steps, count = memory
+        return rows + self.change(value[None], (steps == k)[:, None]), steps, count
 
 
 def as_row(hit: Array, start: Start) -> Float[Array, " width"]:
@@ -84,7 +84,7 @@ def as_row(hit: Array, start: Start) -> Float[Array, " width"]:
 
 
 def from_rows(rows: Float[Array, "... width"], shape: tuple[int, ...]) -> tuple[Array, Start]:
-    """Whether there is a step in each row, and the steps, for positions of this shape."""
+    """Which rows hold a step, and the steps, for positions of this shape."""
     lead = rows.shape[:-1]
     q0, p0 = (x.reshape(*lead, *shape) for x in jnp.split(rows[..., 4:], 2, axis=-1))
     return rows[..., 0] >= 1, Start(rows[..., 1], rows[..., 2], rows[..., 3], q0, p0)
@@ -94,9 +94,9 @@ class Crossings(eqx.Module):
     """The points where a trajectory crossed a section, in the order of time.
 
     - `ts`, `qs`, `ps`: times and states, shapes (max_crossings,), (max_crossings, *q0.shape); NaN
-      behind the last one.
-    - `count`: how many there were after the `skip` first ones. Above max_crossings, only the first
-      of these are here.
+      after the last one.
+    - `count`: number of crossings after the first `skip`. If it is above max_crossings, only the
+      first of these are listed.
     """
 
     ts: Array
@@ -108,27 +108,26 @@ class Crossings(eqx.Module):
 class Section(KeptSteps):
     r"""Observable: where the trajectory crosses the surface g(t, q, p, args) = 0 (Poincaré 1892).
 
-    A crossing lies in a step when g changes its sign between its ends. It is then solved for, to
-    round-off, on the curve that the method itself draws inside of the step: Φ_{θh}(q0, p0), 0 < θ
-    ≤ 1. Its error is that of the method, whatever its order. The run only notes the steps in
-    question; they are solved together at the end, on the device.
+    A step contains a crossing when g has different signs at its ends. The crossing is computed to
+    round-off on the curve Φ_{θh}(q0, p0), 0 < θ ≤ 1, of the method inside of the step. So it has
+    the order of the method. The run only records these steps; their equations are solved together
+    at the end, on the device.
 
     **Arguments**
 
-    - `g`: function ``(t, q, p, args)`` → scalar. Of an angle take sin or cos, which do not jump.
-    - `direction`: 1 for crossings where g grows with time, −1 where it falls, 0 for both; the same
-      points for h > 0 and h < 0.
-    - `max_crossings`: room for so many; static.
-    - `skip`: crossings at the beginning that are passed over (a transient); static.
+    - `g`: function ``(t, q, p, args)`` → scalar. For an angle use sin or cos, which do not jump.
+    - `direction`: 1 for crossings where g increases with time, −1 where it decreases, 0 for both;
+      the same points for h > 0 and h < 0.
+    - `max_crossings`: the largest number that is stored; static.
+    - `skip`: number of crossings at the beginning that are left out (a transient); static.
 
     The observed value is a `Crossings`. It is differentiable, the times included, and may be
-    batched. Two crossings within one step are not seen: take steps that g does not turn in. A start
-    on the surface, or so near it as rounding leaves it (1e-6 of a step in float64, 2e-3 in
-    float32), is no crossing; a lattice point on it ends one. A crossing in the step that a `Stop`
-    ends is left out.
+    batched. Two crossings within one step are not detected: the steps must resolve the extrema of
+    g. A start on the surface up to rounding (1e-6 of a step in float64, 2e-3 in float32) is not a
+    crossing; a grid point on it ends one. A crossing in the last step before a `Stop` is left out.
 
-    **Raises** `TypeError` for a g that is no such function, `ValueError` for another direction, a
-    max_crossings below 1, and in `integrate` for a g that is not a scalar.
+    **Raises** `TypeError` for another g, `ValueError` for another direction, a max_crossings below
+    1, and in `integrate` for a g that is not a scalar.
 
     **Example**
 
@@ -158,7 +157,8 @@ class Section(KeptSteps):
 
     def __check_init__(self):
         check_event(self.g, "Section")
-        one_of("direction", self.direction, (1, -1, 0), "1: g grows, -1: it falls, 0: both.")
+        hint = "1: g increases, -1: it decreases, 0: both."
+        one_of("direction", self.direction, (1, -1, 0), hint)
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
         before, after = event(self.g, t0, q0, p0, args), event(self.g, t1, q1, p1, args)
@@ -167,6 +167,7 @@ class Section(KeptSteps):
         hit = up | down
         if self.direction != 0:
             hit = jnp.where(ahead, up, down) if self.direction == 1 else jnp.where(ahead, down, up)
+        # A run that continues from a crossing starts on the surface only up to rounding.
         near = jnp.finfo(before.dtype).eps ** 0.4
         begins_on_it = jnp.abs(before) <= near * jnp.abs(after - before)
         hit = jnp.where(hit & begins_on_it, _UNLESS_FIRST, hit.astype(jnp.int32))
@@ -174,11 +175,10 @@ class Section(KeptSteps):
 
 
 class RequestedTimes(KeptSteps):
-    """The steps that the times of ``Save(ts=...)`` lie in, by t or by a clock of the user's.
+    """The steps that contain the times of ``Save(ts=...)``, by t or by a clock of the user's.
 
-    `due` are the times less what they may be off by rounding: the step in which one is due is the
-    one that reaches it. `ordered` are these in ascending order: a step looks for its own by
-    bisection.
+    `due` are the times minus their possible rounding error: the step in which one is due is the one
+    that reaches it. `ordered` are these in ascending order, for bisection.
     """
 
     ts: Array
@@ -196,11 +196,12 @@ class RequestedTimes(KeptSteps):
         passed, inside = (jnp.searchsorted(self.ordered, x, side="right") for x in (start, end))
         ahead, behind = (jnp.searchsorted(self.ordered, x, side="left") for x in (start, end))
         hit = jnp.where(end >= start, inside > passed, ahead > behind)  # (start, end], [end, start)
+        # A failed step has no curve on which a state could be computed.
         return as_row(hit & jnp.all(jnp.isfinite(q1)), Start(t0, t1, end, q0, p0))
 
 
 def shown(clock: Callable[..., Any] | None, t: Scalar, q: State, p: State, args: Args) -> Scalar:
-    """What a clock shows at a point: the time, where there is none."""
+    """The value of a clock at a point; the time if there is none."""
     return t if clock is None else event(clock, t, q, p, args, "the clock")
 
 
@@ -212,8 +213,8 @@ def event(
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(
             f"{name} (t, q, p, args) must return a real scalar that passes through zero, or "
-            f"through the values asked for; it returned shape {value.shape}, dtype {value.dtype}. "
-            "Of a condition such as |q| > 2 take the difference, |q| − 2."
+            f"through the requested values; it returned shape {value.shape}, dtype {value.dtype}. "
+            "For a condition such as |q| > 2 take the difference, |q| − 2."
         )
     return value.astype(q.dtype)
 

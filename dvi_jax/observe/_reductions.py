@@ -1,11 +1,13 @@
-"""Streamed reductions of an observable: constant memory, whatever the number of steps."""
+"""Streamed reductions of an observable: constant memory for any number of steps."""
 
 import abc
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from .._types import Scalar
@@ -14,9 +16,10 @@ from .._types import Scalar
 class Reduction(eqx.Module):
     """Base of the reductions of an observable ``f(t0, t1, q0, p0, q1, p1, args)`` → array.
 
-    A subclass says how its memory starts from the first value, how it takes in the next
-    one, and what it makes of its memory in the end. `k` counts the steps from 0; the time
-    that belongs to a value is t1, the end of its step.
+    A reduction is four functions. `start` makes its memory, `update` adds the value of the next
+    step, `finish` makes the result of the memory of all steps, and `combine` says how that memory
+    depends on a single step, for gradients by the reversible adjoint. `k` counts the steps from 0;
+    the time t of a value is t1, the end of its step.
     """
 
     function: eqx.AbstractVar[Callable[..., Any]]
@@ -24,7 +27,7 @@ class Reduction(eqx.Module):
 
     @abc.abstractmethod
     def start(self, value: Array) -> Any:
-        """Memory before the first value (`value` only lends its shape and type)."""
+        """Memory before the first value; only the shape and type of `value` matter."""
 
     @abc.abstractmethod
     def update(self, memory: Any, k: Array, t: Scalar, value: Array) -> Any:
@@ -34,17 +37,44 @@ class Reduction(eqx.Module):
     def finish(self, memory: Any) -> Any:
         """The reduced value (real arrays), NaN when there was no step."""
 
-    @abc.abstractmethod
+    def combine(self, memory: Any, k: Array, t: Scalar, value: Array) -> Any:
+        """The memory of all steps as a function of t and value of step k, which is one of them.
+
+        It equals `memory`; only its derivative is used. For a sum it is
+        ``memory + self.change(value)``, for the value of one step, of number `at`,
+        ``memory + self.change(value, k == at)``.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no gradient by dvi.Reversible(): define combine(memory, k, "
+            "t, value), or take adjoint=dvi.Direct()."
+        )
+
+    @staticmethod
+    def change(x: Array, where: Array | None = None) -> Array:
+        """Zero with the derivative of x, for `combine`; a constant zero where `where` is false."""
+        moved = x - lax.stop_gradient(x)
+        return moved if where is None else jnp.where(where, moved, 0)
+
     def pull(
         self, memory: Any, cotangent: Any, k: Array, t: Scalar, value: Array
     ) -> tuple[Array, Array]:
-        """Cotangents of t and of the value at step k, given that of the reduced value.
+        """Cotangents of t and of the value at step k for that of the reduced value."""
 
-        `memory` is the final one: a reversible gradient asks for the steps in any order.
-        """
+        # The reversible adjoint visits the steps in another order and rebuilds their values with
+        # rounding, so that `update` cannot be differentiated: a maximum would be found elsewhere.
+        def reduced(t, value):
+            return self.finish(self.combine(memory, k, t, value))
+
+        return jax.vjp(reduced, t, value)[1](cotangent)
 
 
-class MaxDrift(Reduction):
+class _OfFunction(Reduction):
+    """A reduction whose only field is its observable."""
+
+    function: Callable[..., Any]
+
+
+class MaxDrift(_OfFunction):
     """Largest distance from the first value, max_k |f_k − f_0|, elementwise.
 
     f_0 is the value at the initial state; for a function of a step, that on the first step.
@@ -64,7 +94,6 @@ class MaxDrift(Reduction):
     ```
     """
 
-    function: Callable[..., Any]
     relative: bool = eqx.field(static=True, default=False)
 
     def start(self, value):
@@ -74,7 +103,7 @@ class MaxDrift(Reduction):
         first, farthest, at = memory
         first = jnp.where(k == 0, value, first)
         far = value - first
-        # Written so that NaN, once seen, stays.
+        # A comparison with NaN is false: NaN, once stored, stays.
         larger = (jnp.abs(far) > jnp.abs(farthest)) | jnp.isnan(far) | (k == 0)
         return first, jnp.where(larger, far, farthest), jnp.where(larger, k, at)
 
@@ -82,23 +111,18 @@ class MaxDrift(Reduction):
         first, farthest, _ = memory
         return jnp.abs(farthest / first) if self.relative else jnp.abs(farthest)
 
-    def pull(self, memory, cotangent, k, t, value):
+    def combine(self, memory, k, t, value):
         first, farthest, at = memory
-        sign = jnp.sign(farthest)
-        slope = jnp.where(k == at, sign, 0) - jnp.where(k == 0, sign, 0)
-        if self.relative:
-            of_first = jnp.abs(farthest) * jnp.sign(first) / first**2
-            slope = slope / jnp.abs(first) - jnp.where(k == 0, of_first, 0)
-        return jnp.zeros_like(t), cotangent * slope
+        # By the number of the step: a rebuilt value equals the largest one only up to rounding.
+        of_first = self.change(value, k == 0)
+        return first + of_first, farthest + self.change(value, k == at) - of_first, at
 
 
-class Range(Reduction):
+class Range(_OfFunction):
     """Largest value minus smallest value: max_k f_k − min_k f_k, elementwise.
 
     `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
     """
-
-    function: Callable[..., Any]
 
     def start(self, value):
         nan, at = jnp.full_like(value, jnp.nan), jnp.zeros(value.shape, jnp.int32)
@@ -107,36 +131,31 @@ class Range(Reduction):
     def update(self, memory, k, t, value):
         low, high, at_low, at_high = memory
         failed = jnp.isnan(low) & (k > 0)
+        # The negations are true for a NaN value, which is stored in this way and then stays.
         lower = ((k == 0) | ~(value >= low)) & ~failed
         higher = ((k == 0) | ~(value <= high)) & ~failed
-        return (
-            jnp.where(lower, value, low),
-            jnp.where(higher, value, high),
-            jnp.where(lower, k, at_low),
-            jnp.where(higher, k, at_high),
-        )
+        low, high = jnp.where(lower, value, low), jnp.where(higher, value, high)
+        return low, high, jnp.where(lower, k, at_low), jnp.where(higher, k, at_high)
 
     def finish(self, memory):
         return memory[1] - memory[0]
 
-    def pull(self, memory, cotangent, k, t, value):
-        _, _, at_low, at_high = memory
-        slope = jnp.where(k == at_high, 1.0, 0.0) - jnp.where(k == at_low, 1.0, 0.0)
-        return jnp.zeros_like(t), cotangent * slope
+    def combine(self, memory, k, t, value):
+        low, high, *at = memory
+        low = low + self.change(value, k == at[0])
+        return low, high + self.change(value, k == at[1]), *at
 
 
-class Trend(Reduction):
+class Trend(_OfFunction):
     """Least-squares slope of f against time [unit of f / unit of time], elementwise.
 
         Σ (t_k − t̄)(f_k − f̄) / Σ (t_k − t̄)²
 
-    Means and moments are updated together (Welford 1962), so long runs do not cancel. NaN for
-    fewer than two steps.
+    Means and moments are updated together (Welford 1962), so that digits do not cancel in long
+    runs. NaN for fewer than two steps.
 
     `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
     """
-
-    function: Callable[..., Any]
 
     def start(self, value):
         zero = jnp.zeros_like(value)
@@ -148,48 +167,49 @@ class Trend(Reduction):
         before = t - mean_t
         mean_t = mean_t + before * weight
         mean_f = mean_f + (value - mean_f) * weight
+        # One factor with the old mean and one with the new: exact for the sums about the new mean.
         return mean_t, mean_f, t_t + before * (t - mean_t), t_f + before * (value - mean_f)
 
     def finish(self, memory):
         _, _, t_t, t_f = memory
         return t_f / t_t
 
-    def pull(self, memory, cotangent, k, t, value):
+    def combine(self, memory, k, t, value):
         mean_t, mean_f, t_t, t_f = memory
-        from_t = (value - mean_f - 2 * (t_f / t_t) * (t - mean_t)) / t_t
-        return jnp.sum(cotangent * from_t), cotangent * (t - mean_t) / t_t
+        dt, df = self.change(t), self.change(value)
+        # The means do not contribute: sums of differences from a mean are stationary in it.
+        t_f = t_f + (t - mean_t) * df + (value - mean_f) * dt
+        return mean_t, mean_f, t_t + 2 * (t - mean_t) * dt, t_f
 
 
-class Mean(Reduction):
+class Mean(_OfFunction):
     """Mean over the steps: (1/N) Σ f_k, elementwise.
 
     `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
     """
-
-    function: Callable[..., Any]
 
     def start(self, value):
         return jnp.full_like(value, jnp.nan), jnp.asarray(0, jnp.int32)
 
     def update(self, memory, k, t, value):
         mean, _ = memory
+        # NaN stands for a mean of no step, and must not stay in that of the first.
         mean = jnp.where(k == 0, jnp.zeros_like(mean), mean)
         return mean + (value - mean) * (1 / jnp.asarray(k + 1, value.dtype)), k + 1
 
     def finish(self, memory):
         return memory[0]
 
-    def pull(self, memory, cotangent, k, t, value):
-        return jnp.zeros_like(t), cotangent / jnp.asarray(memory[1], value.dtype)
+    def combine(self, memory, k, t, value):
+        mean, count = memory
+        return mean + self.change(value) / jnp.asarray(count, value.dtype), count
 
 
-class Last(Reduction):
+class Last(_OfFunction):
     """The value at the last step.
 
     `function`: an observable ``(t0, t1, q0, p0, q1, p1, args)`` → array.
     """
-
-    function: Callable[..., Any]
 
     def start(self, value):
         return jnp.full_like(value, jnp.nan), jnp.asarray(0, jnp.int32)
@@ -200,19 +220,20 @@ class Last(Reduction):
     def finish(self, memory):
         return memory[0]
 
-    def pull(self, memory, cotangent, k, t, value):
-        return jnp.zeros_like(t), jnp.where(k == memory[1], cotangent, 0)
+    def combine(self, memory, k, t, value):
+        last, at = memory
+        return last + self.change(value, k == at), at
 
 
 class Running(eqx.Module):
     """The value of a reduction at every save point: over the steps from the start up to there.
 
-    ``dvi.Running(dvi.MEGNO())`` with ``save=dvi.Save(every=m)`` shows how an indicator settles;
-    the values have shape (S − 1, …), like those of an observable that stands alone.
+    ``dvi.Running(dvi.MEGNO())`` with ``save=dvi.Save(every=m)`` shows how an indicator converges;
+    the values have shape (S − 1, …), like those of an observable without a reduction.
 
     **Arguments** `reduction`: any but a `Section`, which has a row for each crossing already.
 
-    **Raises** `TypeError` for what is no such reduction.
+    **Raises** `TypeError` for anything else.
     """
 
     reduction: Reduction

@@ -1,4 +1,4 @@
-"""Where a trajectory ends before its last step."""
+"""Conditions that end a trajectory before its last step."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,17 +12,17 @@ from ._kept import check_event
 class Stop(eqx.Module):
     r"""Ends a trajectory where g(t, q, p, args) reaches zero from below: a collision, an escape.
 
-    ``dvi.Stop(lambda t, q, p, args: 0.1 - jnp.linalg.norm(q))`` for instance ends at |q| = 0.1.
-    The run ends with the first step at whose end g ≥ 0, or before it where g ≥ 0 at the start.
-    Where g = 0 is solved for inside of that step as for `Section`, and told by ``solution.stop``.
-    The status is `stopped`, which is no failure. States after it are NaN, reductions cover the
-    steps before. A g that turns positive and back within one step is not seen. To go on from where
-    a run stopped, take a g that is negative there.
+    ``dvi.Stop(lambda t, q, p, args: 0.1 - jnp.linalg.norm(q))``, for example, ends at |q| = 0.1.
+    The run ends with the first step at whose end g ≥ 0, or before it where g ≥ 0 at the start. The
+    point where g = 0 inside of that step is computed as for `Section`, and returned in
+    ``solution.stop``. The status is `stopped`, which is not a failure. States after it are NaN,
+    reductions cover the steps before. A g that becomes positive and negative again within one step
+    is not detected. To continue from where a run stopped, use a g that is negative there.
 
     **Arguments** `g`: function ``(t, q, p, args)`` → scalar.
 
-    **Raises** `TypeError` for a g that is no such function, and in `integrate` `ValueError` for
-    one that is not a scalar.
+    **Raises** `TypeError` for another g, and in `integrate` `ValueError` for one that is not a
+    scalar.
 
     **Example**
 
@@ -43,7 +43,7 @@ class Stop(eqx.Module):
 
 
 class Stopped(NamedTuple):
-    """Where a trajectory stopped: time and state, NaN if it did not."""
+    """Time and state at which a trajectory stopped, NaN if it did not."""
 
     t: Array
     q: Array
