@@ -36,7 +36,9 @@ def _neutral(op: str, dtype: str) -> Any:
         if np.issubdtype(dtype, np.floating):
             return -np.inf if op == "max" else np.inf
         return np.iinfo(dtype).min if op == "max" else np.iinfo(dtype).max
-    return {"mul": 1, "and": np.invert(np.zeros((), dtype))}.get(op, 0)
+    if op == "and":
+        return np.invert(np.zeros((), dtype))
+    return 1 if op == "mul" else 0
 
 
 def accumulated(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Value]:
