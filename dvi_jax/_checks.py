@@ -4,7 +4,7 @@ import difflib
 import inspect
 import math
 import numbers
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -91,7 +91,7 @@ SYNONYMS = {
 """Names of arguments in other packages → the name here."""
 
 
-def refuse_unknown(name: str, function: Callable[..., Any], unknown: Mapping[str, Any]) -> None:
+def refuse_unknown(name: str, function: Callable[..., Any], unknown: Iterable[str]) -> None:
     """**Raises** `TypeError` for keywords that the function does not have, with the one meant."""
     for keyword in unknown:
         known = [

@@ -2,7 +2,8 @@
 
 import dataclasses
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Never
 
 import equinox as eqx
@@ -202,9 +203,8 @@ def integrate(
     elif getattr(integrator.adjoint, "report_defect", False):
         raise ValueError("report_defect=True and progress exclude each other: leave one out.")
     else:
-        with told(progress, _BAR) as report:
-            told_of = report if callable(progress) else lambda *done: report(done)
-            outcome = _in_pieces(task, plan, q0, p0, told_of, layout)
+        with _reported(progress) as report:
+            outcome = _in_pieces(task, plan, q0, p0, report, layout)
         solution = _solution(task, plan, asked.observe, outcome, q0, p0, layout)
     solution = undo(solution)
     watched = jax.tree.leaves(observe, is_leaf=is_observable)
@@ -219,11 +219,19 @@ def _with_initial_values(solution: Solution, given: Run, layout: Layout) -> Solu
     return dataclasses.replace(solution, observed=values)
 
 
-_BAR = bar_of(
-    "integrate",
-    ("steps",),
-    lambda done: {"completed": done[0], "total": done[1], "steps": f"{done[0]} of {done[1]} steps"},
-)
+def _columns(done: tuple[int, int]) -> dict[str, Any]:
+    return {"completed": done[0], "total": done[1], "steps": f"{done[0]} of {done[1]} steps"}
+
+
+@contextmanager
+def _reported(progress: Any) -> Iterator[Callable[[int, int], Any]]:
+    """A context with the function that receives steps done and steps in all."""
+    if callable(progress):
+        yield progress
+        return
+    with told(progress, bar_of("integrate", ("steps",), _columns)) as report:
+        assert report is not None  # `progress` is True here
+        yield lambda *done: report(done)
 
 
 def _save_hint(save: Any) -> str:

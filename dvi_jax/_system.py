@@ -82,6 +82,7 @@ class System(eqx.Module):
             function = getattr(self, name)
             if function is not None or name == "H_D":
                 check_takes(name, function, _NAMES, {4: _CONTINUOUS})
+            if function is not None:
                 warn_of_exchanged(name, function, _NAMES)
         instance("slow_time", self.slow_time, bool, "True or False")
         if self.epsilon is not None:
@@ -174,14 +175,20 @@ def _read_by(system: System) -> Reads:
     return tuple(item for item in reads(*functions) if item[0] not in ignored)
 
 
-def of_problem(system: Any, q0: Any, p0: Any, h: Any, args: Any) -> tuple[Any, ...]:
+def of_problem(
+    system: Any, q0: Any, p0: Any, h: Any, args: Any, has_start: bool = False
+) -> tuple[Any, ...]:
     """System, initial state, step and args of a call that may have a problem of the library, which
-    has defaults. **Raises** `TypeError` for a system without an initial state."""
+    has defaults. **Raises** `TypeError` for a system without an initial state.
+
+    `has_start`: the call has its initial states in another argument.
+    """
     if isinstance(getattr(system, "system", None), System):
         problem, system = system, system.system
         defaults = (("q0", q0), ("p0", p0), ("h", h), ("args", args))
-        q0, p0, h, args = (getattr(problem, n) if x is None else x for n, x in defaults)
-    elif isinstance(system, System) and (q0 is None or p0 is None):
+        given = (getattr(problem, n) if x is None else x for n, x in defaults)
+        q0, p0, h, args = (None, None, *tuple(given)[2:]) if has_start else given
+    elif isinstance(system, System) and not has_start and (q0 is None or p0 is None):
         raise TypeError(
             f"the initial state is missing: {'q0' if q0 is None else 'p0'} is not given. Call "
             "integrate(system, q0, p0, ...)."

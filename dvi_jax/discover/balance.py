@@ -43,7 +43,7 @@ def noether_balance(
     gauges: Sequence[Gauge | None],
     solution: Solution,
     *,
-    epsilon: Any = 0.0,
+    epsilon: Any = None,
     args: Args = None,
 ) -> Balance:
     r"""The balance law of an adiabatic invariant along a solution of `TypeII`.
@@ -95,7 +95,7 @@ def noether_balance(
         )
     return _balance(
         system,
-        AdiabaticInvariant(generators, gauges, system, jnp.asarray(epsilon)),
+        AdiabaticInvariant(generators, gauges, system, jnp.asarray(system.strength(epsilon))),
         LatticePoint(solution.ts, solution.qs, solution.ps),
         args,
     )

@@ -184,7 +184,7 @@ def poincare_section(
         )
     section = Section(g, direction, whole("crossings", crossings), skip)
     settings = _settings(system, section, num_steps, keywords)
-    epsilon, args, varied = _varied(keywords["epsilon"], keywords["args"])
+    epsilon, args, varied = _varied(system.strength(keywords["epsilon"]), keywords["args"])
     for name, length in varied.items():
         if length != q.shape[0]:
             raise ValueError(
@@ -239,7 +239,7 @@ def bifurcation(
     q, p = start_state(q0, p0)
     section = Section(g, keywords["direction"], whole("crossings", crossings), skip)
     settings = _settings(system, section, keywords["num_steps"], keywords)
-    epsilon, args, varied = _varied(keywords["epsilon"], keywords["args"])
+    epsilon, args, varied = _varied(system.strength(keywords["epsilon"]), keywords["args"])
     lengths = set(varied.values())
     if len(lengths) != 1 or 0 in lengths:
         raise ValueError(
@@ -283,7 +283,7 @@ class Return(WithStatus):
 class ReturnMap(eqx.Module):
     r"""Poincaré map: the map of a section g(t, q, p, args) = 0 onto itself.
 
-    ``section_map(q, p, t0=0.0, epsilon=0.0, args=None)`` → `Return`.
+    ``section_map(q, p, t0=0.0, epsilon=None, args=None)`` → `Return`.
 
     A function of JAX arrays: `jax.jacfwd` gives the derivative of the return map, which includes
     the change of the return time, `vmap` takes many points, `lax.scan` iterates. A point on the
@@ -321,9 +321,11 @@ class ReturnMap(eqx.Module):
         return _settings(self.system, section, self.num_steps, given, level)
 
     def __call__(
-        self, q: Any, p: Any, t0: Any = 0.0, epsilon: Any = 0.0, args: Args = None
+        self, q: Any, p: Any, t0: Any = 0.0, epsilon: Any = None, args: Args = None
     ) -> Return:
-        found, _ = self._settings(None).orbit((t0, q, p), self.h, epsilon, args)
+        found, _ = self._settings(None).orbit(
+            (t0, q, p), self.h, self.system.strength(epsilon), args
+        )
         return Return(found.ts[-1], found.qs[-1], found.ps[-1], found.result)
 
 

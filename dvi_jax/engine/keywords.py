@@ -5,6 +5,8 @@ import inspect
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from .._checks import refuse_unknown
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 INTEGRATOR = "method lattice newton arithmetic layout integrator"
@@ -25,8 +27,7 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -
     The function receives every keyword, with its default if it is not given. `inspect.signature`,
     `help` and the reference list them by name.
 
-    **Raises** `TypeError`, as Python does, when it is called with an unknown keyword or without a
-    necessary one.
+    **Raises** `TypeError` when it is called with an unknown keyword or without a necessary one.
     """
     known = inspect.signature(source).parameters
     kind, empty = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.empty
@@ -44,9 +45,7 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -
         def call(*args: Any, **given: Any) -> Any:
             known = call.__dict__["__signature__"].parameters
             if unknown := [name for name in given if name not in known]:
-                raise TypeError(
-                    f"{function.__name__}() got an unexpected keyword argument {unknown[0]!r}"
-                )
+                refuse_unknown(function.__name__, call, unknown)
             given = {**defaults, **given}
             if missing := [name for name, value in given.items() if value is empty]:
                 raise TypeError(

@@ -66,7 +66,7 @@ class Model(eqx.Module):
         h: float,
         q0: Any = None,
         p0: Any = None,
-        epsilon: Any = 0.0,
+        epsilon: Any = None,
         args: PyTree = None,
         **options: Any,
     ):

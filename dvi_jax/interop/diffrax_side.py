@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .diffrax_classes import DiscreteMap, DiscreteTerm
 
 
-def diffrax_term(system: Any, epsilon: Any = 0.0) -> "DiscreteTerm":
+def diffrax_term(system: Any, epsilon: Any = None) -> "DiscreteTerm":
     """The term of diffrax that carries a system: what `diffrax_solver` steps.
 
     - `system`: a `System`, or a problem of the library, whose args go into ``diffeqsolve(args=)``.
@@ -28,7 +28,8 @@ def diffrax_term(system: Any, epsilon: Any = 0.0) -> "DiscreteTerm":
     needed("diffrax", "interop.diffrax_term")
     from .diffrax_classes import DiscreteTerm
 
-    return DiscreteTerm(checked(system, epsilon), jnp.asarray(epsilon, float))
+    system, epsilon = checked(system, epsilon)
+    return DiscreteTerm(system, jnp.asarray(epsilon, float))
 
 
 @both_names

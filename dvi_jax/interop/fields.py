@@ -13,7 +13,7 @@ from ..engine.quantities import refuse_unit_or_mask
 from .extras import system_of
 
 
-def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], Any]:
+def vector_field(system: Any, epsilon: Any = None) -> Callable[[Any, Any, Any], Any]:
     r"""The continuous limit h → 0 of a system, as ``f(t, y, args)`` with ``y = (q, p)``.
 
         q̇ = ∂H/∂p,    ṗ = −∂H/∂q + ε W,      H(t, q, p) = H_D(t, t, q, p) + ε H1_D(t, t, q, p)
@@ -32,7 +32,7 @@ def vector_field(system: Any, epsilon: Any = 0.0) -> Callable[[Any, Any, Any], A
     **Accuracy** round-off. ``dvi.from_lagrangian`` divides by t1 − t0 and has no H_D(t, t, …): its
     field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
     """
-    system = checked(system, epsilon)
+    system, epsilon = checked(system, epsilon)
 
     def field(t, y, args):
         q, p = as_pair(y)
@@ -61,9 +61,10 @@ def as_pair(y: Any) -> tuple[Any, Any]:
     return q, p
 
 
-def checked(system: Any, epsilon: Any) -> dvi.System:
-    """The system; warns, as `integrate` does, where ε has no effect and its value is known."""
+def checked(system: Any, epsilon: Any) -> tuple[dvi.System, Any]:
+    """The system and ε. Warns, as `integrate` does, if ε is known to have no effect."""
     system = system_of(system)
+    epsilon = system.strength(epsilon)
     refuse_unit_or_mask("epsilon", epsilon)
     try:
         value = float(epsilon)
@@ -73,4 +74,4 @@ def checked(system: Any, epsilon: Any) -> dvi.System:
     if value != 0 and not used:
         text = f"epsilon = {value:g} has no effect: the system has no force and no perturbation."
         warnings.warn(text, stacklevel=3)
-    return system
+    return system, epsilon

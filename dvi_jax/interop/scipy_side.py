@@ -62,7 +62,7 @@ def solve_ivp(
     *,
     h: float,
     args: Any = None,
-    epsilon: Any = 0.0,
+    epsilon: Any = None,
     events: Any = None,
     shape: tuple[int, ...] | None = None,
     newton: dvi.RootSolver | None = None,

@@ -153,7 +153,7 @@ def integrate(
     num_steps: int,
     units: UnitSystem | None = None,
     t0: Any = None,
-    epsilon: Any = 0.0,
+    epsilon: Any = None,
     args: Any = None,
     ts: Any = None,
     **options: Any,

@@ -14,7 +14,7 @@ from .._checks import instance, whole
 from .._integrate import integrate
 from .._integrator import chosen
 from .._memory import machine_memory
-from .._system import System, check_system
+from .._system import System, check_system, of_problem
 from ..engine.keywords import INTEGRATOR, taken, with_keywords_of
 from ..engine.names import both_names
 from ..lattices import Given, Lattice
@@ -199,7 +199,11 @@ def prepare(
 
 
 def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
+    system, q0, p0, given["h"], given["args"] = of_problem(
+        system, q0, p0, given["h"], given["args"], given["start"] is not None
+    )
     check_system(system)
+    given["epsilon"] = system.strength(given["epsilon"])
     # Integers would make a program of their own.
     numbers = {n: float(x) if type(x := given[n]) is int else x for n in ("epsilon", "h", "t0")}
     inputs = {name: as_axis(name, value) for name, value in numbers.items()}
