@@ -14,7 +14,7 @@ from .._checks import positive
 from .frequencies import Frequencies, analyse, check_count, settings_of, signals_of
 from .lines import EPS
 from .results import CODE, FREQUENCY_RESULTS, WITHOUT_NUMBERS, WithStatus, raise_on_failure
-from .torus import FundamentalFrequencies, gathered, search_of, tori_of
+from .torus import FundamentalFrequencies, batched, search_of, tori_of
 
 _STILL = 64 * EPS
 """A q or p of which the spread is below this fraction of its size is constant to round-off."""
@@ -125,19 +125,20 @@ def actions(
         (lines.frequencies, lines.amplitudes, lines.resolution, raw.amplitudes, raw.code),
     )
     tori, codes = tori_of(omega, A, code, resolution, search, soft=False)
+    _, combinations, _, matched, _ = tori
 
     n = omega.shape[-2]
-    power = np.where(np.isfinite(omega), np.abs(A) ** 2, 0.0).reshape(len(tori), n, count)
+    power = np.where(np.isfinite(omega), np.abs(A) ** 2, 0.0).reshape(len(codes), n, count)
     in_doubt = np.abs(every_A.reshape(power.shape)) ** 2
     in_doubt = np.where(power > 0, 0.0, np.where(np.isfinite(in_doubt), in_doubt, 0.0))
-    size = np.asarray(size).reshape(len(tori), n)
-    left = np.nan_to_num(np.asarray(lines.residual)).reshape(len(tori), n) ** 2
-    J, errors = (np.full((len(tori), search.num), np.nan) for _ in range(2))
-    residual = np.full(len(tori), np.nan)
-    for i, torus in enumerate(tori):
+    size = np.asarray(size).reshape(len(codes), n)
+    left = np.nan_to_num(np.asarray(lines.residual)).reshape(len(codes), n) ** 2
+    J, errors = (np.full((len(codes), search.num), np.nan) for _ in range(2))
+    residual = np.full(len(codes), np.nan)
+    for i in range(len(codes)):
         if codes[i] in range(1, len(WITHOUT_NUMBERS) + 1):
             continue
-        used = power[i] * torus.matched
+        used = power[i] * matched[i]
         lost = power[i] - used + in_doubt[i]
         total = (power[i] + in_doubt[i]).sum(axis=1) / np.maximum(1 - left[i], EPS)
         rest = left[i] * total + lost.sum(axis=1)
@@ -146,16 +147,16 @@ def actions(
         if codes[i] in (0, CODE["not_quasi_periodic"]):
             codes[i] = 0 if residual[i] <= leftover else CODE["not_quasi_periodic"]
         if codes[i] == 0:
-            k = torus.combinations
+            k = combinations[i]
             of_lines = np.einsum("jk,jka->a", used, k) / 2
             gross = np.einsum("jk,jka->a", used, np.abs(k)) / 2
-            largest = np.abs(k * torus.matched[..., None]).max(axis=(0, 1)) + 1
+            largest = np.abs(k * matched[i][..., None]).max(axis=(0, 1)) + 1
             estimate = largest * rest.sum() / 2 + 1e-14 * gross
             if (estimate < np.minimum(gross, np.abs(of_lines).max())).all():
                 J[i], errors[i] = of_lines, estimate
             else:
                 codes[i] = CODE["not_quasi_periodic"]
-    torus = gathered(tori, codes, omega.shape, search.num)
+    torus = batched(tori, codes, lead)
     found = Actions(
         actions=J.reshape(*lead, search.num),
         frequencies=np.where(np.isfinite(J.reshape(*lead, search.num)), torus.frequencies, np.nan),

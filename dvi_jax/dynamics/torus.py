@@ -114,7 +114,7 @@ def fundamental_frequencies(
     code, resolution = code.reshape(shape), resolution.reshape(shape)
     search = search_of(omega.shape[-2], num, guess, order, tolerance, threshold)
     tori, codes = tori_of(omega, A, code, resolution, search, soft=True)
-    found = gathered(tori, codes, omega.shape, search.num)
+    found = batched(tori, codes, lead)
     return raise_on_failure(found) if throw else found
 
 
@@ -126,14 +126,6 @@ class Search(NamedTuple):
     tolerance: float | None
     threshold: float
     guess: np.ndarray | None
-
-
-class _Torus(NamedTuple):
-    frequencies: np.ndarray
-    combinations: np.ndarray
-    misfits: np.ndarray
-    matched: np.ndarray
-    unexplained: float
 
 
 def search_of(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshold: Any) -> Search:
@@ -156,8 +148,9 @@ def search_of(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshol
 
 def tori_of(
     omega, A, code, resolution, search: Search, soft: bool
-) -> tuple[list[_Torus], np.ndarray]:
-    """The torus of every trajectory, and the code of its status.
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """The arrays of `FundamentalFrequencies`, each with the trajectories along its first axis, and
+    the codes of their statuses.
 
     `soft`: the status of an analysis with unresolved lines is that of the torus too.
     """
@@ -178,16 +171,25 @@ def tori_of(
         doubt = status[(status != 0) & ~silent]
         tori.append(torus)
         codes.append(doubt[0] if soft and len(doubt) else CODE[problem])
-    return tori, np.array(codes, int)
+    # An empty batch has shapes and types too.
+    some = tori or [_nothing(n, count, search.num)]
+    arrays = [np.stack(x)[: len(tori)] for x in zip(*some, strict=True)]
+    return arrays, np.array(codes, int)
 
 
-def _nothing(n: int, count: int, num: int) -> _Torus:
+def batched(arrays, codes: np.ndarray, lead: tuple[int, ...]) -> FundamentalFrequencies:
+    """The result of `tori_of` with the axes `lead` of a batch."""
+    parts = (x.reshape((*lead, *x.shape[1:])) for x in arrays)
+    return FundamentalFrequencies(*parts, result=with_code(codes.reshape(lead)))
+
+
+def _nothing(n: int, count: int, num: int) -> tuple[Any, ...]:
     none = np.full((n, count), np.nan)
     no = np.zeros((n, count), bool)
-    return _Torus(np.full(num, np.nan), np.zeros((n, count, num), int), none, no, np.nan)
+    return np.full(num, np.nan), np.zeros((n, count, num), int), none, no, np.nan
 
 
-def _torus(nu, size, resolution, tolerance, search: Search) -> tuple[_Torus, str]:
+def _torus(nu, size, resolution, tolerance, search: Search) -> tuple[tuple[Any, ...], str]:
     """The torus with the best basis, and the name of its status."""
     n, count = nu.shape
     there = np.isfinite(nu)
@@ -215,7 +217,7 @@ def _torus(nu, size, resolution, tolerance, search: Search) -> tuple[_Torus, str
     total = np.where(power.sum(axis=1) > 0, power.sum(axis=1), 1.0)
     combinations = np.zeros((len(k), search.num), int)
     combinations[:, : len(best)] = np.where(matched[:, None], k, 0)
-    torus = _Torus(
+    torus = (
         np.append(best, np.full(pad, np.nan)),
         combinations.reshape(n, count, search.num),
         np.where(there, misfit.reshape(n, count), np.nan),
@@ -299,14 +301,3 @@ def combinations_up_to(num: int, order: int) -> np.ndarray:
     return table[
         np.argsort(size.sum(axis=1) + size.max(axis=1, initial=0) / (order + 1), kind="stable")
     ]
-
-
-def gathered(
-    tori: list[_Torus], codes: np.ndarray, shape: tuple[int, ...], num: int
-) -> FundamentalFrequencies:
-    """The tori of a batch of lines of this shape, (*batch, n, count)."""
-    lead, n, count = shape[:-2], *shape[-2:]
-    some = tori or [_nothing(n, count, num)]  # for the shapes and types of an empty batch
-    parts = (np.stack(part)[: len(tori)] for part in zip(*some, strict=True))
-    parts = (x.reshape((*lead, *x.shape[1:])) for x in parts)
-    return FundamentalFrequencies(*parts, result=with_code(codes.reshape(lead)))

@@ -1,6 +1,7 @@
 """Initial conditions that are generated on demand: number i of a sweep as a function of i."""
 
 import abc
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -180,11 +181,8 @@ def _radical_inverse(index: Array, base: int, largest: int, dtype: Any) -> Array
 
 def _primes(count: int) -> list[int]:
     found: list[int] = []
-    n = 2
     while len(found) < count:
-        if all(n % p for p in found):
-            found.append(n)
-        n += 1
+        found.append(next(n for n in itertools.count(2) if all(n % p for p in found)))
     return found
 
 
