@@ -133,6 +133,7 @@ def _made(eqn, x) -> list:
 
 def _indices(eqn, x) -> list:
     """Operands that are integers or truth values, as JAX takes them; None for the others."""
+
     def given(value, kind):
         return jnp.asarray(np.array(value.tolist(), kind)) if kind.kind in "iub" else None
 
