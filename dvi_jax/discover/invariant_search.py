@@ -296,7 +296,9 @@ class Search:
         """One series for each leading part, in functions of the basis; `blur`: see `Span`."""
         span = Span(self.basis, self.rms, self.R, self.spaces[-1], blur, self.constant)
         found = span.representatives(self.fitted, self.slopes)
-        picked = [(*self._picked(span, x, representative), independent) for x, independent in found]
+        picked: list[tuple[np.ndarray, bool, bool]] = []
+        for series, independent in found:
+            picked.append((*self._picked(span, series, representative), independent))
         size = self.order + 1, self.basis.size
 
         def those(independent):
