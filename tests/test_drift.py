@@ -372,23 +372,6 @@ def test_order_and_units_of_the_points_do_not_matter():
         assert other.model == one.model
 
 
-@pytest.mark.parametrize(
-    ("epsilons", "drifts", "floor", "match"),
-    [
-        ([0.1, 0.2], [1.0], 0.0, "one shape"),
-        ([[0.1, 0.2]], [[1.0, 2.0]], 0.0, "one shape"),
-        ([0.1, 0.2, 0.0], [1.0, 2.0, 3.0], 0.0, "epsilons must be positive"),
-        ([0.1, 0.2, 0.3], [1.0, np.nan, 3.0], 0.0, "drifts must be positive"),
-        ([0.1, 0.2, 0.2], [1.0, 2.0, 3.0], 0.0, "distinct"),
-        ([0.1, 0.2, 0.3], [1.0, 2.0, 3.0], 1.0, "floor must be"),
-        ([0.1, 0.2, 0.3], [1.0, 2.0, 3.0], np.nan, "floor must be"),
-    ],
-)
-def test_points_without_an_exponent_are_rejected(epsilons, drifts, floor, match):
-    with pytest.raises(ValueError, match=match):
-        small_epsilon_exponent(epsilons, drifts, floor)
-
-
 def test_a_surface_marks_orders_that_are_not_resolved():
     epsilons = np.geomspace(3e-3, 3e-2, 5)
     noise = np.exp(0.05 * np.random.default_rng(0).standard_normal(5))
@@ -537,7 +520,7 @@ def test_a_surface_shows_zeros_failures_and_limits():
         ({"h": np.float64(0.0)}, "must not be zero"),
         ({"h": [0.1, 0.2]}, "h must be one number"),
         ({"starts": (np.ones((3, 1)), np.ones((2, 1)))}, "one shape"),
-        ({"starts": (0.1, 0.1)}, "first axis of starts"),
+        ({"starts": (0.1, 0.1)}, "first axis of initial conditions"),
         ({"starts": (np.array([[0.1], [np.nan]]), np.ones((2, 1)))}, "not finite at index"),
         ({"observable": lambda t0, t1, q0, p0, q1, p1, args: q1}, "must be a scalar"),
     ],

@@ -109,18 +109,15 @@ def small_epsilon_exponent(epsilons: Any, drifts: Any, floor: float = 0.0) -> Ex
     The crossover ε_c = e^{x_c} lies above the smallest ε by assumption: no measurement excludes
     that another power takes over below it.
 
-    **Arguments** `epsilons`, `drifts`: shape (n,), positive, in any order; all of them are used.
-    `floor`: the drift at ε = 0, smaller than every drift.
+    **Arguments** `epsilons`, `drifts`: shape (n,), positive and finite, all ε distinct, in any
+    order; all of them are used. `floor`: the drift at ε = 0, smaller than every drift.
 
     **Returns** an `Exponent`; NaN with fewer than three points.
-
-    **Raises** `ValueError` for arrays that are not of one shape (n,), values that are not
-    positive and finite, equal epsilons, or a floor that is not below every drift.
 
     **Source** our own; the average over models is that of Hoeting, Madigan, Raftery & Volinsky,
     Stat. Sci. 14 (1999) 382.
     """
-    epsilons, drifts = _checked(epsilons, drifts, floor)
+    epsilons, drifts = np.asarray(epsilons, float), np.asarray(drifts, float)
     if len(epsilons) < ENOUGH:
         nan = np.nan
         return Exponent(
@@ -241,23 +238,3 @@ def _quantiles(fits: Fits, freedom: int, levels: np.ndarray) -> np.ndarray:
         below = special.stdtr(freedom, t) @ fits.weights < levels
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     return (low + high) / 2
-
-
-def _checked(epsilons: Any, drifts: Any, floor: float) -> tuple[np.ndarray, np.ndarray]:
-    epsilons, drifts = np.asarray(epsilons, float), np.asarray(drifts, float)
-    if epsilons.ndim != 1 or epsilons.shape != drifts.shape:
-        raise ValueError(
-            f"epsilons and drifts must have one shape (n,), got {epsilons.shape} and "
-            f"{drifts.shape}."
-        )
-    for name, values in (("epsilons", epsilons), ("drifts", drifts)):
-        if not (np.isfinite(values) & (values > 0)).all():
-            raise ValueError(f"{name} must be positive and finite, got {values.tolist()}.")
-    if len(np.unique(epsilons)) < len(epsilons):
-        raise ValueError(f"epsilons must be distinct, got {epsilons.tolist()}.")
-    if len(drifts) and not 0 <= floor < drifts.min():
-        raise ValueError(
-            f"the floor must be at least 0 and below every drift, got {floor:g} for a smallest "
-            f"drift of {drifts.min():g}."
-        )
-    return epsilons, drifts

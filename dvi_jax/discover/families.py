@@ -49,6 +49,13 @@ class _OfComponents(eqx.Module):
         return self.family.values(_at(self.places, q, p, t))
 
 
+def _bound(family: Any, variables: Sequence[str], shape, names, complexity) -> BoundBasis:
+    """A family of functions of these variables, for states of this shape."""
+    function = _OfComponents(family, _places(variables, shape))
+    timed = any(v in TIME for v in variables)
+    return BoundBasis(function, tuple(names), tuple(complexity), timed)
+
+
 def _names(values: Any) -> tuple[str, ...] | None:
     if values is None:
         return None
@@ -192,12 +199,7 @@ class Chebyshev(AbstractBasis):
 
     def for_shape(self, shape):
         names = ("1", *(f"T{k}({self.variable})" for k in range(1, self.count)))
-        return BoundBasis(
-            _OfComponents(self, _places([self.variable], shape)),
-            names,
-            tuple(range(self.count)),
-            self.variable in TIME,
-        )
+        return _bound(self, [self.variable], shape, names, range(self.count))
 
     def values(self, x):
         """T_0 … T_{count−1}, by their recursion."""
@@ -237,12 +239,7 @@ class Trigonometric(AbstractBasis):
         complexity = [k for k in range(1, self.count + 1) for _ in range(2)]
         if self.constant:
             names, complexity = ["1", *names], [0, *complexity]
-        return BoundBasis(
-            _OfComponents(self, _places([self.variable], shape)),
-            tuple(names),
-            tuple(complexity),
-            self.variable in TIME,
-        )
+        return _bound(self, [self.variable], shape, names, complexity)
 
     def values(self, x):
         """1 if it is among them, then cos and sin of each multiple."""
@@ -271,20 +268,14 @@ class Radial(AbstractBasis):
     variables: tuple[str, ...] | None = eqx.field(static=True, default=None, converter=_names)
 
     def __check_init__(self):
-        if not self.powers or any(
-            isinstance(k, bool) or not isinstance(k, int) for k in self.powers
-        ):
+        whole = all(isinstance(k, int) and not isinstance(k, bool) for k in self.powers)
+        if not self.powers or not whole:
             raise ValueError(f"powers must be a list of integers, got {self.powers!r}.")
 
     def for_shape(self, shape):
         names = coordinate_names(shape)
         chosen = names[: len(names) // 2] if self.variables is None else self.variables
-        return BoundBasis(
-            _OfComponents(self, _places(chosen, shape)),
-            tuple(_of_radius(k) for k in self.powers),
-            tuple(abs(k) for k in self.powers),
-            any(v in TIME for v in chosen),
-        )
+        return _bound(self, chosen, shape, map(_of_radius, self.powers), map(abs, self.powers))
 
     def values(self, x):
         """r^k for each power."""

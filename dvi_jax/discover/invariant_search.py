@@ -296,11 +296,13 @@ class Search:
         """One series for each leading part, in functions of the basis; `blur`: see `Span`."""
         span = Span(self.basis, self.rms, self.R, self.spaces[-1], blur, self.constant)
         found = span.representatives(self.fitted, self.slopes)
-        picked = [self._picked(span, series, representative) for series in found.series]
+        picked: list[tuple[np.ndarray, bool, bool]] = []
+        for series, independent in found:
+            picked.append((*self._picked(span, series, representative), independent))
         size = self.order + 1, self.basis.size
 
         def those(independent):
-            kept = [x for x, f in zip(picked, found.independent, strict=True) if f == independent]
+            kept = [(c, exact) for c, exact, f in picked if f == independent]
             series = [_normalised(c, self.rms) for c, _ in kept]
             return np.array(series).reshape(-1, *size), np.array([e for _, e in kept], bool)
 

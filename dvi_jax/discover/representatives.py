@@ -1,20 +1,11 @@
 """The series that represents an invariant: independent leading parts and their corrections."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from .basis import BoundBasis
 from .echelon import reduced, reduction
 from .nullspace import SeriesSpace, orthonormal_range, singular_vectors
-from .sampling import Samples, spread
-
-
-class Representatives(NamedTuple):
-    """Series of shape (order + 1, basis size), and whether each is independent of those before."""
-
-    series: list[np.ndarray]
-    independent: list[bool]
+from .sampling import Samples, spreads
 
 
 class Span:
@@ -36,24 +27,22 @@ class Span:
         blocks = columns.reshape(self.orders, self.size, -1)
         return np.linalg.solve(self.R, blocks).reshape(columns.shape)
 
-    def representatives(self, samples: Samples, slopes: np.ndarray) -> Representatives:
-        """One series for each leading part, the simplest leading parts first.
+    def representatives(
+        self, samples: Samples, slopes: np.ndarray
+    ) -> list[tuple[np.ndarray, bool]]:
+        """One series, shape (order + 1, size), for each leading part, the simplest first; and
+        whether it is independent of those before it: its differential is, at generic points,
+        outside the span of theirs.
 
         `slopes`: ∂φ/∂(q, p) of the functions at the samples, shape (S, size, 2n).
-
-        A leading part is independent when its differential is, at generic points, outside the
-        span of the differentials of those before it; otherwise it is a function of them.
         """
+        found: list[tuple[np.ndarray, bool]] = []
         if self.space.leading.shape[1] == 0:
-            return Representatives([], [])
+            return found
         some = slice(None, None, max(1, len(samples.q) // 40))
-        gradients = slopes[some]
-        # as fast as (q, p) change over the samples, so that their units do not matter
-        units = np.repeat([spread(samples.q), spread(samples.p)], gradients.shape[2] // 2)
-        gradients = gradients * units / self.rms[:, None]
+        # in units of the spread of (q, p), so that their own units do not matter
+        gradients = slopes[some] * spreads(samples) / self.rms[:, None]
         complexity = np.array(self.basis.complexity)
-        series: list[np.ndarray] = []
-        independent: list[bool] = []
         taken: list[np.ndarray] = []
         done = np.zeros((self.size, 0))
         for level in sorted(set(self.basis.complexity)):
@@ -71,9 +60,9 @@ class Span:
                 grown = self._rank_of([*taken, d / length]) == len(taken) + 1
                 if grown:
                     taken.append(d / length)
-                series.append(self._without_constants(vector.reshape(self.orders, self.size)))
-                independent.append(grown)
-        return Representatives(series, independent)
+                series = self._without_constants(vector.reshape(self.orders, self.size))
+                found.append((series, grown))
+        return found
 
     def _up_to(self, level: int) -> np.ndarray:
         """Series, as shares, whose leading part uses no function above this complexity."""

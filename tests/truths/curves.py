@@ -1,12 +1,9 @@
 """Synthetic drifts with a known order: how often the interval of `drift_order` contains it.
 
-    python tests/truths/curves.py [--seeds N] [--count N]
-
 Pure powers, sums of two powers, saturation, bends and floors, with noise of 0.1 to 20 %, at 4 to 12
 values of ε over one to three decades.
 """
 
-import argparse
 from typing import NamedTuple
 
 import numpy as np
@@ -89,20 +86,3 @@ def measured(seed: int, count: int = 400) -> Measured:
         sums_resolved=float(resolved[kind == "sum"].mean()),
         covered_by_line=float(inside(lines).mean()),
     )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--count", type=int, default=400, help="curves of each seed")
-    options = parser.parse_args()
-    rows = []
-    print("  ".join(("seed", *Measured._fields)))
-    for seed in range(options.seeds):
-        rows.append(measured(seed, options.count))
-        print(f"{seed:4}", *(f"{100 * x:5.1f} %" for x in rows[-1]), sep="  ", flush=True)
-    print("mean", *(f"{100 * x:5.1f} %" for x in np.mean(rows, axis=0)), sep="  ")
-
-
-if __name__ == "__main__":
-    main()
