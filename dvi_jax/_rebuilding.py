@@ -107,7 +107,8 @@ def _rebuilt(
     """The states from `end` back over `count` steps, by inverse steps: the `sums` that
     ``along(k, after, before, sums)`` accumulates, the relative difference of each component from
     `known_start`, and whether all solves succeeded."""
-    group = largest_divisor(count, LOOKS)
+    # A divisor of `count`, so that one loop serves all groups.
+    group = next((d for d in range(min(count, LOOKS), 1, -1) if count % d == 0), 1)
 
     # Cotangents go along in the same loop: states are needed once, and none is stored.
     def undo(state, _):
@@ -250,7 +251,7 @@ def pull_back(
         last = first + count - 1
         cot = (cot[0] + at_save.q, cot[1] + at_save.p)
         # Saved times and steps depend on h and t0 directly, not through the state.
-        _, pull_times = jax.vjp(lambda theta: _end_of(eqx.combine(theta, fixed), last), theta)
+        _, pull_times = jax.vjp(lambda theta: eqx.combine(theta, fixed).interval(last)[1:], theta)
         grad = jax.tree.map(jnp.add, grad, *pull_times((at_save.t, at_save.h)))
         at_save = at_save.observed
         sums = grad, cot
@@ -272,7 +273,10 @@ def pull_back(
     if not adds_start_outside(plan):
         of_start, rows = (rows.q[0], rows.p[0]), rows._replace(q=rows.q[1:], p=rows.p[1:])
     if tail is not None:
-        at_save = jax.tree.map(lambda x: _last_row(x, plan.save_tail), rows)
+        # Without a saved tail nothing is observed at the end of the run: cotangents of zero.
+        at_save = jax.tree.map(
+            lambda x: x[-1] if plan.save_tail else jnp.zeros(x.shape[1:], x.dtype), rows
+        )
         newest = jax.tree.map(lambda x: x[-1], ends)
         k = jnp.asarray(plan.num_blocks * plan.block, jnp.int32)
         grad, cot = undo_block(newest, tail, k, plan.tail, at_save, grad, cot)
@@ -317,20 +321,6 @@ def _through_initial(fixed, inputs, memories, cotangents, sums) -> tuple[Any, Ar
         ct = ct + of_t
         seeds.append(of_value.astype(value.dtype))
     return jax.tree.map(jnp.add, sums, pull((ct, seeds)))
-
-
-def largest_divisor(n: int, most: int) -> int:
-    return next(d for d in range(min(n, most), 0, -1) if n % d == 0) if n else 1
-
-
-def _end_of(task: Task, k: Array) -> tuple[Array, Array]:
-    """Time and step size at the end of step k."""
-    interval = task.interval(k)
-    return interval.t1, interval.h
-
-
-def _last_row(x, is_there: bool):
-    return x[-1] if is_there else jnp.zeros(x.shape[1:], x.dtype)
 
 
 def _largest(sizes, state):

@@ -54,19 +54,13 @@ class Task(eqx.Module):
 
     def interval(self, k: Int[Array, ""]) -> Interval:
         """The interval of step k; of a lattice with a memory, of the first step only."""
-        return self._in_precision(self.lattice.interval(self.t0, self.h, k))
+        return self.in_precision(self.lattice.interval(self.t0, self.h, k))
 
     def first_interval(self) -> Interval:
         """The interval of step 0."""
         return self.interval(jnp.asarray(0, jnp.int32))
 
-    def next_interval(self, carry: "Carry") -> tuple[Interval, Any, RESULTS | None]:
-        """The interval of the next step, the memory of the lattice after it, and its status."""
-        place = Place(self.t0, self.h, carry.k, carry.q, carry.p)
-        interval, memory, result = self.lattice.next(carry.lattice, self.equations, place)
-        return self._in_precision(interval), memory, result
-
-    def _in_precision(self, interval: Interval) -> Interval:
+    def in_precision(self, interval: Interval) -> Interval:
         # The times of a user may be float64 where the state is float32, which sets the precision.
         return Interval(*(x.astype(self.h.dtype) for x in interval))
 
@@ -255,7 +249,9 @@ def start(task: Task, q0: State, p0: State) -> Carry:
 
 def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
     """The next step of the trajectory, its status and its reductions."""
-    interval, memory, exists = task.next_interval(carry)
+    place = Place(task.t0, task.h, carry.k, carry.q, carry.p)
+    interval, memory, exists = task.lattice.next(carry.lattice, task.equations, place)
+    interval = task.in_precision(interval)
 
     def advance(q, p):
         here, *relative = task.arithmetic.enter(task.equations, q, p, carry.beside)

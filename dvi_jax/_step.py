@@ -1,4 +1,4 @@
-"""One step of the map (12)–(13), its inverse, and its adjoint."""
+"""One step of the map (12)–(13), and its inverse."""
 
 import functools
 from collections.abc import Callable
@@ -150,17 +150,6 @@ def inverse_step(
     q0, info = _solved(velocity, h, q1, q0, equations, equations.absolute(q1, p1)[0])
     p0 = p1 - equations.increment(interval.h, equations.momentum_rate(interval, q0, p1))
     return q0, p0, judge(info, q0, p0, equations.quantum)
-
-
-def adjoint_step(
-    equations: Equations, interval: Interval, q0: State, p0: State
-) -> tuple[State, State, StepInfo]:
-    """The adjoint Φ*_h = (Φ_{−h})⁻¹: (q0, p0) at t0 → (q1, p1) at t1.
-
-    It is the inverse of the step over the reversed interval; H_D and W are evaluated at
-    (t1, t0, q1, p0).
-    """
-    return inverse_step(equations, interval.reversed(), q0, p0)
 
 
 def no_solve(x: State) -> Found:

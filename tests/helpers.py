@@ -79,26 +79,14 @@ def covering(first, second, shift=0):
 
 
 def flow(system, method, h, num_steps=1, epsilon=0.0, t0=0.0, args=ARGS, adjoint=dvi.Direct()):
-    """z = (q, p) as one vector → the state after `num_steps` steps, as one vector.
+    """z = (q, p) as one vector → the state after `num_steps` steps, as one vector."""
+    # `Direct` compiles fastest; tests of gradients compare all adjoints.
 
-    `Direct` is compiled soonest; tests of gradients compare all adjoints.
-    """
+    how = {"h": h, "num_steps": num_steps, "t0": t0, "epsilon": epsilon, "args": args}
+    how |= {"method": method, "save": dvi.Save(final=True), "adjoint": adjoint}
 
     def of(z):
-        q, p = jnp.split(z, 2)
-        sol = dvi.integrate(
-            system,
-            q,
-            p,
-            h=h,
-            num_steps=num_steps,
-            t0=t0,
-            epsilon=epsilon,
-            args=args,
-            method=method,
-            save=dvi.Save(final=True),
-            adjoint=adjoint,
-        )
+        sol = dvi.integrate(system, *jnp.split(z, 2), **how)
         return jnp.concatenate([sol.qs[-1], sol.ps[-1]])
 
     return of

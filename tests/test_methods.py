@@ -9,7 +9,7 @@ import pytest
 from helpers import ARGS, IN_EVERY_RUN, SYSTEMS, covering, flow, problem, state
 
 import dvi_jax as dvi
-from dvi_jax._step import Equations, adjoint_step, inverse_step, step
+from dvi_jax._step import Equations, inverse_step, step
 from dvi_jax._types import Interval
 from dvi_jax.methods import warn_of_dissipation
 from dvi_jax.methods._composition import CompositionMethod, of_strang
@@ -143,7 +143,7 @@ def test_adjoint_is_the_inverse_of_the_step_backwards():
     q, p = jnp.asarray(q), jnp.asarray(p)
     equations = Equations(s, jnp.asarray(0.3), ARGS)
     interval = Interval(jnp.asarray(0.2), jnp.asarray(0.3), jnp.asarray(0.1))
-    q1, p1, _ = adjoint_step(equations, interval, q, p)
+    q1, p1, _ = dvi.Adjoint().step(equations, interval, q, p)
     q0, p0, _ = step(equations, interval.reversed(), q1, p1)
     np.testing.assert_allclose(q0, q, atol=1e-14)
     np.testing.assert_allclose(p0, p, atol=1e-14)

@@ -47,8 +47,8 @@ class Adjoint(Method):
         return self.method.is_made_of_the_map()
 
     def step(self, equations, interval, q0, p0):
-        # (Φ_{−h})⁻¹: the inverse of the step that goes from t1 to t0. H_D and W see the times in
-        # that order, which matters where they depend on them.
+        # (Φ_{−h})⁻¹: the inverse of the step that goes from t1 to t0. H_D and W are evaluated at
+        # (t1, t0, q1, p0), which matters where they depend on the times.
         return self.method.inverse(equations, interval.reversed(), q0, p0)
 
     def inverse(self, equations, interval, q1, p1):
