@@ -120,7 +120,7 @@ def test_command_line_imports_the_package_within_its_commands_alone(path):
                 assert node not in tree.body, f"{path.name} imports {name} before it runs"
 
 
-LANEWISE = sorted((ROOT.parent / "lanewise").glob("*.py"))
+LANEWISE = sorted((ROOT.parent / "lanewise").rglob("*.py"))
 MOVING = ("jax._src", "jax.interpreters", "jax.extend", "jax.core")
 """Names of JAX that change between releases."""
 
