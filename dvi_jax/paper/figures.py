@@ -196,7 +196,7 @@ def adiabatic_50(m: Measurements, figure: Any, axes: Any) -> None:
     for k, epsilon in enumerate(small.epsilons):
         for i in np.flatnonzero(sweep.epsilons == epsilon):  # one colour for one ε in both panels
             change = np.abs(small.values[k] - small.values[k, 0])[part]
-            right.semilogy(small.ts[part], change, **_look(i), label=f"ε = {epsilon:g}")
+            right.semilogy(small.ts[part], change, **_look(int(i)), label=f"ε = {epsilon:g}")
     right.set(title=f"as h → 0 (order 4, h = {small.h:g})", xlabel=KEPLER_TIME)
     right.set(ylabel="|change of (50)|  (dimensionless)", ylim=(1e-11, 1))
     right.legend(ncols=2, loc="upper center")
