@@ -41,16 +41,34 @@ from .uniform_field import uniform_field as uniform_field
 from .van_der_pol import van_der_pol as van_der_pol
 
 LIBRARY = {
-    function.__name__: function
-    for group in (
-        (oscillator, duffing, van_der_pol, slow_oscillator),
-        (pendulum, perturbed_pendulum, lorentz_pendulum, double_pendulum),
-        (kepler, relativistic_kepler, oblate_kepler, two_centres, restricted_three_body, hill),
-        (n_body, figure_eight, solar_system),
-        (henon_heiles, toda, fput, stiff_fput, nls_lattice),
-        (uniform_field, magnetic_mirror, dipole_field),
-        (rigid_body, spinning_top, polar_motion, lotka_volterra),
-    )
-    for function in group
+    "oscillator": oscillator,
+    "duffing": duffing,
+    "van_der_pol": van_der_pol,
+    "slow_oscillator": slow_oscillator,
+    "pendulum": pendulum,
+    "perturbed_pendulum": perturbed_pendulum,
+    "lorentz_pendulum": lorentz_pendulum,
+    "double_pendulum": double_pendulum,
+    "kepler": kepler,
+    "relativistic_kepler": relativistic_kepler,
+    "oblate_kepler": oblate_kepler,
+    "two_centres": two_centres,
+    "restricted_three_body": restricted_three_body,
+    "hill": hill,
+    "n_body": n_body,
+    "figure_eight": figure_eight,
+    "solar_system": solar_system,
+    "henon_heiles": henon_heiles,
+    "toda": toda,
+    "fput": fput,
+    "stiff_fput": stiff_fput,
+    "nls_lattice": nls_lattice,
+    "uniform_field": uniform_field,
+    "magnetic_mirror": magnetic_mirror,
+    "dipole_field": dipole_field,
+    "rigid_body": rigid_body,
+    "spinning_top": spinning_top,
+    "polar_motion": polar_motion,
+    "lotka_volterra": lotka_volterra,
 }
 """Name → function that makes the `Problem`."""

@@ -9,7 +9,15 @@ import numpy as np
 from .._system import System
 from ..discover.generators import Generator
 from ..discover.library import rotation, scaling, space_translation, time_translation
-from ._problem import DIMENSIONLESS, Problem, at_end, check_parameter, finite, parameter
+from ._problem import (
+    DIMENSIONLESS,
+    Problem,
+    at_end,
+    check_parameter,
+    check_shape,
+    finite,
+    parameter,
+)
 
 _PLACE, _SPEED = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
 EIGHT_POSITIONS = np.array([_PLACE, -_PLACE, np.zeros(2)])
@@ -89,11 +97,8 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     masses = np.asarray(parameter(args, "masses"), float)
     if "G" in args:
         check_parameter(args, "G", finite)
-    if q.ndim != 2 or q.shape[-1] not in (2, 3) or p.shape != q.shape:
-        raise ValueError(
-            "q0 and p0 of N bodies must both have shape (bodies, 2) or (bodies, 3); got "
-            f"{q.shape} and {p.shape}."
-        )
+    wanted = "q0 and p0 of N bodies must both have shape (bodies, 2) or (bodies, 3)"
+    check_shape(q, p, lambda shape: len(shape) == 2 and shape[1] in (2, 3), wanted)
     if masses.shape != q.shape[:1]:
         raise ValueError(
             f"masses must hold one number for each of the {q.shape[0]} bodies; got shape "
