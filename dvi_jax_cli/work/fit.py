@@ -14,8 +14,9 @@ from dvi_jax.fit.progress import shown as shown_bar
 from dvi_jax.fit.result import little_explained, numbers_in_words
 
 from .._show import Table
-from .fit_problem import FitProblem, fit_problem
-from .output import Report, opened, watched
+from .fit_problem import fit_problem
+from .output import Report, opened, recorded
+from .system import find_source
 
 CHECKPOINT = "checkpoint.npz"
 _IMAGES = ("data.png", "residuals.png", "parameters.png", "learning.png")
@@ -28,6 +29,9 @@ _CORNER = 8
 """Parameters up to which pairs are drawn: the first ones."""
 _MATRIX = 8
 """Parameters up to which the correlations are shown as a matrix; more: the strongest pairs."""
+_AS_THEY_ARE = ("prior_chi2", "rms", "explained", "degrees_of_freedom", "curvature")
+_AS_THEY_ARE += ("undetermined", "at_bounds", "seconds")
+"""Fields of a result that are in the report under their names."""
 
 
 def fit_file(
@@ -51,55 +55,55 @@ def fit_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, output = opened("fit", Path(path), out, WRITTEN, force or resume)
-    problem = fit_problem(file, Path(path).parent)
-    checkpoint = output.folder / CHECKPOINT
-    arguments = problem.options | {"checkpoint": checkpoint, "throw": False}
+    file, report = opened("fit", Path(path), out, WRITTEN, force or resume)
+    source = find_source(file, Path(path).parent)
+    arguments, columns = fit_problem(file, source)
+    checkpoint = report.folder / CHECKPOINT
+    last: list[dvi.FitProgress] = []
     allowed = "functions, start, args and data that fit one another"
-    with output.reserved():  # a checkpoint remains after an error
+    with report.reserved():  # a checkpoint remains after an error
         if not resume:
             checkpoint.unlink(missing_ok=True)
-        found, _ = watched(
-            lambda report: dvi.fit(
-                problem.model, problem.data, problem.params, progress=report, **arguments
-            ),
-            shown_bar(progress),
-            lambda error: problem.source.misfit("fit", "fitted", error, allowed),
-        )
-    with output.writing(keep=CHECKPOINT):
-        found.save(output.path("fit.npz"))
-        trajectory, status = _trajectory(problem, found)
-        output.write_arrays("trajectory.npz", trajectory)
-        contents = output.about | _contents(problem, found) | {"trajectory": status}
-        output.write_json("fit.json", contents)
+        with shown_bar(progress) as show, source.at_work("fit", "fitted", allowed, last):
+            options = {"checkpoint": checkpoint, "throw": False}
+            found = dvi.fit(**arguments, **options, progress=recorded(last, show))
+    with report.writing(keep=CHECKPOINT):
+        found.save(report.path("fit.npz"))
+        trajectory, status = _trajectory(arguments["model"], arguments["data"].ordered(), found)
+        report.write_arrays("trajectory.npz", trajectory)
+        report.contents |= _contents(arguments, found)
+        report.contents |= {"columns": columns, "trajectory": status}
+        report.write_contents("fit.json")
         if file.output.plots:
-            output.draw(_pictures(problem, found))
-    steps = f"{contents['steps']} steps, {found.seconds:.1f} s (compilation included)"
-    return Report(
-        contents,
-        _tables(found, contents),
-        _notes(found),
-        summary=f"{found.status} after {steps}",
-        message=_failure(found, contents),
-        folder=output.folder,
-        files=output.files,
-    )
+            report.draw(_pictures(columns, found))
+    steps = f"{report.contents['steps']} steps"
+    report.tables, report.notes = _tables(found, report.contents), _notes(found)
+    seconds = f"{found.seconds:.1f} s (compilation included)"
+    report.summary = f"{found.status} after {steps}, {seconds}"
+    if found.status != "converged":
+        report.message = (
+            f"the fit did not converge ({found.status} after {steps}). "
+            f"{report.contents['message']}\nIts results so far have been written."
+        )
+    elif status != "successful":
+        report.message = f"the fitted trajectory fails ({status}). The results have been written."
+    return report
 
 
-def _trajectory(problem: FitProblem, found: dvi.FitResult) -> tuple[dict[str, Any], str]:
+def _trajectory(
+    model: dvi.Model, data: dvi.Observations, found: dvi.FitResult
+) -> tuple[dict[str, Any], str]:
     """The fitted trajectory from the start to the last observation, and its status."""
-    spec = problem.model(found.params)
-    t0, h = problem.data.t0, spec["h"]
-    assert t0 is not None
-    steps = max(1, int(np.ceil((problem.data.ordered().ts[-1] - t0) / h - 1e-9)))
+    spec = model(found.params)
+    steps = max(1, int(np.ceil((data.ts[-1] - data.t0) / spec["h"] - 1e-9)))
     save = dvi.Save(every=-(-steps // _MOST), final=True)
-    solution = dvi.integrate(**spec, t0=t0, num_steps=steps, save=save, throw=False)
+    solution = dvi.integrate(**spec, t0=data.t0, num_steps=steps, save=save, throw=False)
     return {n: np.asarray(getattr(solution, n)) for n in ("ts", "qs", "ps")}, solution.status
 
 
-def _contents(problem: FitProblem, found: dvi.FitResult) -> dict[str, Any]:
+def _contents(arguments: dict[str, Any], found: dvi.FitResult) -> dict[str, Any]:
     # The numbers of the start in the order of their names: that of JAX's leaves.
-    start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(problem.params)])
+    start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(arguments["params"])])
     return {
         "status": found.status,
         "message": str(dvi.FIT_RESULTS[found.result]),
@@ -109,20 +113,12 @@ def _contents(problem: FitProblem, found: dvi.FitResult) -> dict[str, Any]:
         },
         "correlations": {"names": found.names, "matrix": found.correlations},
         "chi2": found.chi2 if found.has_errors else None,
-        "prior_chi2": found.prior_chi2,
         "reduced_chi2": found.reduced_chi2 if found.has_errors else None,
-        "rms": found.rms,
-        "explained": found.explained,
         "values": found.num_observed,
-        "missing": int(np.isnan(problem.data.values).sum()),
-        "degrees_of_freedom": found.degrees_of_freedom,
+        "missing": int(np.isnan(arguments["data"].values).sum()),
         "residuals": found.statistics(),
-        "curvature": found.curvature,
-        "undetermined": found.undetermined,
-        "at_bounds": found.at_bounds,
         "steps": len(found.history["loss"]),
-        "seconds": found.seconds,
-        "columns": problem.columns,
+        **{name: getattr(found, name) for name in _AS_THEY_ARE},
     }
 
 
@@ -183,22 +179,11 @@ def _notes(found: dvi.FitResult) -> list[str]:
     return notes
 
 
-def _failure(found: dvi.FitResult, contents: dict[str, Any]) -> str:
-    if found.status != "converged":
-        return (
-            f"the fit did not converge ({found.status} after {contents['steps']} steps). "
-            f"{contents['message']}\nIts results so far have been written."
-        )
-    status = contents["trajectory"]
-    failed = f"the fitted trajectory fails ({status}). The results have been written."
-    return "" if status == "successful" else failed
-
-
-def _pictures(problem: FitProblem, found: dvi.FitResult) -> dict[str, Callable[[], Any]]:
+def _pictures(columns: list[str], found: dvi.FitResult) -> dict[str, Callable[[], Any]]:
     """File name → function that draws, for the pictures that this fit can have."""
     pictures: dict[str, Callable[[], Any]] = {
-        "data.png": partial(plot.fit_against_data, found, names=problem.columns),
-        "residuals.png": partial(plot.fit_residuals, found, names=problem.columns),
+        "data.png": partial(plot.fit_against_data, found, names=columns),
+        "residuals.png": partial(plot.fit_residuals, found, names=columns),
         "learning.png": partial(plot.learning_curve, found),
     }
     known = [n for n, s in zip(found.names, found.sigma, strict=True) if 0 < s < np.inf]

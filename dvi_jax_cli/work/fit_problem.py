@@ -1,57 +1,37 @@
 """The arguments of `dvi.fit` that a TOML file describes."""
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 import dvi_jax as dvi
 
 from .._errors import InputError, known, one_of, require, shown
-from .columns import check_times, column, read_columns
+from .columns import column, read_columns
 from .expressions import parse_method
 from .loader import Loader
 from .schema import Data, FitFile
-from .system import Source, find_source
+from .system import Source
 
 _NAMED = ("positions", "momenta", "state")
 
 
-@dataclass(frozen=True)
-class FitProblem:
-    """The arguments of `dvi.fit`, the names of the columns of the data, and the system's source."""
-
-    model: dvi.Model
-    data: dvi.Observations
-    params: dict[str, Any]
-    options: dict[str, Any]
-    columns: list[str]
-    source: Source
-
-
-def fit_problem(file: FitFile, folder: Path) -> FitProblem:
-    """The arguments of `dvi.fit` from a file whose Python files and data are in `folder`.
+def fit_problem(file: FitFile, source: Source) -> tuple[dict[str, Any], list[str]]:
+    """The arguments of `dvi.fit`, and the names of the columns of the data.
 
     **Raises** `InputError`.
     """
-    source = find_source(file, folder)
-    args, h, (q0, p0) = source.args, float(source.h), source.state
+    q0, p0, args = source.array("q0"), source.array("p0"), source.args
     source.check_start(q0, p0, args)
-    params = _parameters(file, q0, p0, args)
+    start = {"epsilon": file.epsilon, "q0": q0, "p0": p0}
+    params = _parameters(file.parameters, start, args)
+    h, method, options = float(source.h), parse_method(file.method), file.options
     data, columns = _observations(file.data, source.loader, np.shape(q0), file.t0)
-    seen = f"{h:g}, which leads from t0 = {data.t0:g} away from the observations"
-    allowed = f"{-h:g}, or a t0 on the other side of the observations"
-    require((data.ordered().ts[-1] - data.t0) * h >= 0, "h", seen, allowed)
-    values, wanted = np.isfinite(data.values).sum(), sum(map(np.size, jax.tree.leaves(params)))
-    allowed = "at least as many values as parameters, or priors"
-    fits = values >= wanted or file.priors
-    require(fits, "data.file", f"{values} values for {wanted} parameters", allowed)
-    method, options, segments = parse_method(file.method), file.options, file.options.segments
-    start = {"q0": q0, "p0": p0, "epsilon": file.epsilon}
-    model = dvi.Model(source.system, h=h, args=args, method=method, **start)
+    segments = options.segments
     arguments = {
+        "model": dvi.Model(source.system, h=h, args=args, method=method, **start),
+        "data": data,
+        "params": params,
         "bounds": _pairs(file, "bounds", dvi.Bounds),
         "priors": _pairs(file, "priors", dvi.Prior),
         "loss": getattr(dvi, options.loss)(),
@@ -61,25 +41,24 @@ def fit_problem(file: FitFile, folder: Path) -> FitProblem:
         "check_curvature": options.curvature,
         "shooting": dvi.MultipleShooting(segments) if segments else dvi.SingleShooting(),
     }
-    return FitProblem(model, data, params, arguments, columns, source)
+    return arguments, columns
 
 
 # Parameters
 
 
-def _parameters(file: FitFile, q0: Any, p0: Any, args: Any) -> dict[str, Any]:
+def _parameters(names: list[str], start: dict[str, Any], args: Any) -> dict[str, Any]:
     """The parameters; the values of the file, or of the system, are the initial guess."""
     table = args if isinstance(args, dict) else {}
-    values = {"epsilon": file.epsilon, "q0": q0, "p0": p0} | {
+    values = start | {
         f"args.{name}": value
         for name, value in table.items()
         if np.issubdtype(np.asarray(value).dtype, np.number)
     }
-    for name in file.parameters:
+    for name in names:
         known("parameters", name, values)
-        is_single = file.parameters.count(name) == 1
-        require(is_single, "parameters", f"{name!r} is listed twice", "each name once")
-    return _tree({name: np.asarray(values[name], float) for name in file.parameters})
+        require(names.count(name) == 1, "parameters", f"{name!r} is listed twice", "each name once")
+    return _tree({name: np.asarray(values[name], float) for name in names})
 
 
 def _tree(flat: dict[str, Any]) -> dict[str, Any]:
@@ -108,8 +87,10 @@ def _observations(
     """The data, and the names of their columns."""
     columns = read_columns(loader.folder / given.file)
     ts = column(columns, "data.time", given.time)
-    check_times(ts, "data.time", given.time)
-    sigma, used = _sigma(given.sigma, columns)
+    sigma, used = given.sigma, []
+    if isinstance(sigma, list):  # columns that have the standard errors
+        used = sigma
+        sigma = np.stack([column(columns, "data.sigma", name) for name in used], axis=-1)
     names = given.columns or [n for n in columns if n not in (given.time, *used)]
     require(names, "data.columns", "no column remains", f"out of {one_of(columns)}")
     observed = _joined(columns, names, len(ts))
@@ -129,12 +110,13 @@ def _observations(
         sigma = np.broadcast_to(sigma, flat.shape).reshape(observed.shape)
     fits, allowed = len(ts) > 1 or t0 is not None, "two times at least, or t0 before it"
     require(fits, "data.file", "one observation", allowed)
-    is_seen = not np.isnan(observed).all()
-    require(is_seen, "data.columns", "no value in any row", "columns with numbers")
     try:
         return dvi.Observations(ts, observed, observe, sigma=sigma, t0=t0), names
     except (TypeError, ValueError) as error:
-        raise InputError("data", str(error), "observations in the order of time") from None
+        key = "data.time" if str(error).startswith("ts") else "data"
+        allowed = f"finite times in order in the column {given.time}, values that fit observe, "
+        allowed += "positive standard errors"
+        raise InputError(key, str(error), allowed) from None
 
 
 def _observe(text: str, loader: Loader) -> Any:
@@ -153,20 +135,6 @@ def _joined(columns: dict[str, np.ndarray], names: list[str], rows: int) -> np.n
     for part, name in zip(parts, names, strict=True):
         allowed = f"as many as there are times, {rows}"
         require(len(part) == rows, "data.columns", f"{name} has {len(part)} rows", allowed)
-        is_finite = not np.isinf(part).any()
-        require(is_finite, "data.columns", f"{name} has an infinite value", "NaN if missing")
     if len(parts) == 1 and parts[0].ndim > 1:
         return parts[0]
     return np.concatenate([part.reshape(rows, -1) for part in parts], axis=1)
-
-
-def _sigma(given: Any, columns: dict[str, np.ndarray]) -> tuple[Any, list[str]]:
-    """Standard errors, and the columns that have them."""
-    if not isinstance(given, list):
-        return given, []
-    found = [column(columns, "data.sigma", name) for name in given]
-    for name, part in zip(given, found, strict=True):
-        for i in np.flatnonzero(~(part > 0) | ~np.isfinite(part))[:1]:
-            seen = f"row {i + 1} of {name} is {part.ravel()[i]}"
-            raise InputError("data.sigma", seen, "positive standard errors in every row")
-    return np.stack(found, axis=-1), given

@@ -5,7 +5,8 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from dvi_jax.sweep.variables import RESERVED
 
 from .._errors import InputError, require
 from .._show import Table
-from .output import Report, watched
+from .output import Report, recorded
 from .schema import SweepFile
 from .sweep_problem import sweep_problem
 from .table import read_file
@@ -54,12 +55,11 @@ def sweep_file(
     folder = Path(store or file.output.store or f"results/{path.stem}.zarr")
     _check_folder(folder, "--store" if store is not None else "output.store", resume)
     source, arguments = sweep_problem(file, path.parent)
-    found, last = watched(
-        lambda report: dvi.sweep(**arguments, store=folder, threads=threads, progress=report),
-        shown_bar(progress),
-        lambda error: source.misfit(str(path), "swept", error, _ALLOWED),
-    )
-    return _finished(found, last)
+    last: list[dvi.SweepProgress] = []
+    with shown_bar(progress) as show, source.at_work(str(path), "swept", _ALLOWED, last):
+        arguments |= {"store": folder, "threads": threads, "progress": recorded(last, show)}
+        result = dvi.sweep(**arguments)
+    return _finished(result, last[0])
 
 
 def sweep_cost(path: str | Path) -> Report:
@@ -70,10 +70,8 @@ def sweep_cost(path: str | Path) -> Report:
     """
     file, _ = read_file(Path(path), SweepFile)
     source, arguments = sweep_problem(file, Path(path).parent)
-    try:
+    with source.at_work(str(path), "swept", _ALLOWED):
         cost = dvi.sweep_cost(**arguments)
-    except Exception as error:
-        raise source.misfit(str(path), "swept", error, _ALLOWED) from error
     contents = dataclasses.asdict(cost) | {"seconds": cost.seconds()}
     return Report(contents, summary=f"{cost}\n\n{cost.table()}")
 
@@ -96,30 +94,33 @@ def _check_folder(folder: Path, key: str, resume: bool) -> None:
 
 def _finished(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
     counts, observed = result.status_counts(), _observed(result)
-    contents = {
-        "store": str(result.path),
-        "dims": result.dims,
-        "tasks": {"done": last.tasks_done, "all": last.num_tasks},
-        "trajectories": counts,
-        "seconds": last.seconds,
-        "steps_per_second": last.rate,
-    } | ({"observed": observed} if observed else {})
-    tables = [_status_table(counts)]
+    report = Report(
+        {
+            "store": str(result.path),
+            "dims": result.dims,
+            "tasks": {"done": last.tasks_done, "all": last.num_tasks},
+            "trajectories": counts,
+            "seconds": last.seconds,
+            "steps_per_second": last.rate,
+        },
+        [_status_table(counts)],
+    )
     if observed:
+        report.contents["observed"] = observed
         rows = [[name, *(f"{x:.6g}" for x in of.values())] for name, of in observed.items()]
         title = "Observables of the successful trajectories"
-        tables.append(Table(title, ["name", "min", "median", "max"], rows))
+        report.tables.append(Table(title, ["name", "min", "median", "max"], rows))
     speed = f"{last.seconds:.1f} s (compilation included), {last.rate:.3g} steps/s"
-    summary = (
+    report.summary = (
         f"{last.num_lanes} trajectories in {last.num_tasks} tasks; "
-        f"{speed if last.rate else 'nothing was left to do'}; in {result.path}"
+        f"{speed if last.rate else 'all tasks were done already'}; in {result.path}"
     )
-    return Report(contents, tables, summary=summary)
+    return report
 
 
 def _observed(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
-    """Name → least, median and largest over the successful trajectories. Empty where there is
-    nothing to say, or too much to read."""
+    """Name → least, median and largest over the successful trajectories. Empty without observables,
+    and where there is too much to read."""
     data = result.to_xarray()
     names = [str(n) for n in data.data_vars if str(n).split(".")[0] not in RESERVED]
     if not names or sum(data[name].size for name in names) > _MOST:
@@ -140,7 +141,7 @@ def _observed(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
 def _status_table(counts: dict[str, int]) -> Table:
     total = sum(counts.values())
     rows = [[name, str(n), f"{100 * n / total:.4g} %"] for name, n in counts.items()]
-    return Table("How the trajectories ended", ["status", "trajectories", "share"], rows)
+    return Table("How the trajectories ended", ["status", "trajectories", "fraction"], rows)
 
 
 # Stores
@@ -176,7 +177,7 @@ def sweep_status(store: str | Path) -> Report:
         "trajectories_per_second": rate,
         "steps_per_second": speed,
         "seconds_left": left / rate if rate else None,
-        "bytes": sum(_sizes(Path(store))),
+        "bytes": _size(Path(store)),
         "provenance": {k: v for k, v in result.attributes.items() if k not in _NOT_OURS},
     }
     about = [[name, str(value)] for name, value in contents["provenance"].items()]
@@ -213,23 +214,24 @@ def _covered(spans: list[tuple[float, float]]) -> float:
     return total
 
 
-def _sizes(folder: Path) -> Iterator[int]:
+def _size(folder: Path) -> int:
+    """Bytes of all files in a folder."""
+    total = 0
     for root, _, names in os.walk(folder):
         for name in names:
-            try:
-                yield os.stat(Path(root, name)).st_size
-            except FileNotFoundError:  # a temporary file of a process that is working on it
-                continue
+            with suppress(FileNotFoundError):  # a temporary file of a process that is working on it
+                total += os.stat(Path(root, name)).st_size
+    return total
 
 
 def verify_store(store: str | Path, progress: Callable[[int, int], None] | None = None) -> Report:
-    """Read everything in a store again; tasks that are bad are open again after this.
+    """Read everything in a store again; bad tasks are marked as not done.
 
     **Raises** `InputError` where there is no store, `OSError` where it cannot be changed.
     """
     found = _opened(store).verify(progress)
     contents = {"store": str(store), **found._asdict()}
-    summary = f"{store}: {found.sound} tasks are sound, {len(found.bad)} bad, {found.todo} to do"
+    summary = f"{store}: {found.sound} tasks are correct, {len(found.bad)} bad, {found.todo} to do"
     report = Report(contents, summary=summary)
     if found.bad:
         rows = [[str(number), wrong] for number, wrong in found.bad.items()]

@@ -13,16 +13,9 @@ from .._errors import InputError, require
 from .axis import AN_AXIS, Axis, at, axes_in
 from .expressions import parse_method
 from .observables import read_observables
-from .schema import ARRAY, NormalStart, Pair, Start, SweepFile
+from .schema import ARRAY, Pair, SweepFile
 from .system import Source, find_source
 from .table import MISSING
-
-_STARTS = {
-    "halton": dvi.starts.Halton,
-    "random": dvi.starts.Random,
-    "normal": dvi.starts.Normal,
-    "energy_shell": dvi.starts.EnergyShell,
-}
 
 _KEYS = {"num_steps": "steps"}
 """Argument of `dvi.sweep` → key of the file, where they differ."""
@@ -48,16 +41,12 @@ def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]
     }
     arguments |= {name: _for_sweep(_KEYS.get(name, name), value) for name, value in times.items()}
     arguments |= _initial_conditions(file, source)
+    kinds = (dvi.Axis, dvi.starts.Starts)
+    leaves = jax.tree.leaves(arguments, is_leaf=lambda x: isinstance(x, kinds))
     seen = "nothing varies, neither this nor another number"
     allowed = "an axis for some number, or [start]; for one trajectory there is dvi-jax run"
-    require(any(_varies(x) for x in arguments.values()), "epsilon", seen, allowed)
+    require(any(isinstance(x, kinds) for x in leaves), "epsilon", seen, allowed)
     return source, arguments
-
-
-def _varies(argument: Any) -> bool:
-    kinds = (dvi.Axis, dvi.starts.Starts)
-    leaves = jax.tree.leaves(argument, is_leaf=lambda x: isinstance(x, kinds))
-    return any(isinstance(x, kinds) for x in leaves)
 
 
 # Axes
@@ -67,9 +56,7 @@ def _for_sweep(key: str, value: Any) -> Any:
     """A value with its axes as those of `dvi.sweep`; one without a name has that of the key."""
     if isinstance(value, list):
         return [_for_sweep(f"{key}[{i}]", part) for i, part in enumerate(value)]
-    if not isinstance(value, Axis):
-        return value
-    return _axis(key, value, value.all)
+    return _axis(key, value, value.all) if isinstance(value, Axis) else value
 
 
 def _axis(key: str, given: Axis, values: Any) -> dvi.Axis:
@@ -116,7 +103,7 @@ def _observe(file: SweepFile, source: Source) -> dict[str, Any] | None:
 def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
     """`start`, or `q0` and `p0`, checked for one of the trajectories at least."""
     if file.start is None:
-        q0, p0 = source.state
+        q0, p0 = source.array("q0"), source.array("p0")
         try:
             _check(source, q0, p0, 0)
         except InputError:  # a single one is a trajectory that fails, which is a result
@@ -139,18 +126,20 @@ def _check(source: Source, q0: Any, p0: Any, which: int) -> None:
     source.check_start(q0, p0, at(source.args, which))
 
 
-def _start(given: Start, source: Source) -> dvi.starts.Starts:
+def _start(given: Any, source: Source) -> dvi.starts.Starts:
+    """Generated initial conditions; normally distributed ones are by default about the system's."""
     options = {name: getattr(given, name) for name in given.model_fields_set - {"kind"}}
     for name, value in options.items():
         if isinstance(value, Pair):
             options[name] = (value.q, value.p)
-    if isinstance(given, NormalStart):  # by default about the system's own state
-        for name in {"q0", "p0"} - options.keys():
+    for name in ("q0", "p0") if given.kind == "normal" else ():
+        if name not in options:
             require(source.problem, f"start.{name}", MISSING, ARRAY)
             options[name] = np.asarray(getattr(source.problem, name), float)
     if "H" in options:
         options["H"] = source.loader.load("start.H", options["H"])
+    made = getattr(dvi.starts, given.kind.title().replace("_", ""))  # energy_shell → EnergyShell
     try:
-        return _STARTS[given.kind](**options)
+        return made(**options)
     except (TypeError, ValueError) as error:
         raise InputError("start", str(error), f"keys that fit kind = {given.kind}") from None

@@ -2,11 +2,12 @@
 # pyright: reportInvalidTypeForm=false
 
 import math
+import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, get_args
 
 import numpy as np
 from pydantic import (
@@ -23,7 +24,7 @@ from pydantic import (
 from pydantic.json_schema import GenerateJsonSchema
 from typing_extensions import TypeAliasType
 
-from .._errors import InputError, InputErrors, one_of, shown
+from .._errors import InputError, nearest, one_of, shown, toml_type
 
 MISSING = "the key is missing"
 
@@ -40,31 +41,35 @@ class Table(BaseModel):
         extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True
     )
 
+    # Each table converts its own errors, because only here the fields and their descriptions are
+    # known; the table around it then puts its key in front.
     @model_validator(mode="wrap")
     @classmethod
     def _name_the_keys(cls, given: Any, read: Callable[[Any], Any]) -> Any:
         try:
             return read(given)
         except ValidationError as error:
-            raise InputErrors([e for one in error.errors() for e in cls._errors(one)]) from None
+            first, *more = [e for one in error.errors() for e in cls._errors(one)]
+            raise InputError(first.key, first.seen, first.allowed, more) from None
 
     @classmethod
-    def _errors(cls, found: Any) -> Iterator[InputError]:
+    def _errors(cls, found: Any) -> list[InputError]:
         """An error of pydantic as errors with the key, relative to this table."""
-        place, inner = found["loc"], found.get("ctx", {}).get("error")
+        place, kind, context = found["loc"], found["type"], found.get("ctx", {})
+        inner, seen = context.get("error"), shown(found["input"])
         if isinstance(inner, InputError):  # of a table within this one, or of a validator
-            for one in getattr(inner, "found", [inner]):
-                yield InputError(path(place, one.key), one.seen, one.allowed)
-        elif not place:
-            seen, names = shown(found["input"]), one_of(cls.model_fields)
-            yield InputError("", seen, f"a table with the keys {names}")
-        elif found["type"] == "extra_forbidden":
+            return [InputError(path(place, e.key), e.seen, e.allowed) for e in inner.found]
+        if not place:
+            return [InputError("", seen, f"a table with the keys {one_of(cls.model_fields)}")]
+        if kind == "extra_forbidden":
             names = one_of(cls.model_fields, str(place[-1]))
-            yield InputError(path(place), "there is no such key", names)
-        else:
-            seen = MISSING if found["type"] == "missing" else shown(found["input"])
-            allowed = cls.model_fields[str(place[0])].description
-            yield InputError(path(place), seen, allowed or "")
+            return [InputError(path(place), "there is no such key", names)]
+        allowed = cls.model_fields[str(place[0])].description or ""
+        if context.get("discriminator") == "'kind'":  # the key that tells the tables of a union
+            tag, kinds = context.get("tag", ""), context.get("expected_tags", allowed)
+            near = nearest(tag, re.findall(r"\w+", kinds))
+            return [InputError(path(place, "kind"), repr(tag) if tag else MISSING, kinds + near)]
+        return [InputError(path(place), MISSING if kind == "missing" else seen, allowed)]
 
 
 _TAGS = {""}
@@ -101,7 +106,7 @@ def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
         raise InputError(str(file), f"is not TOML: {error}", "https://toml.io") from None
     try:
         return model.model_validate(raw), raw
-    except ValidationError as error:
+    except ValidationError as error:  # pydantic wraps the one of the outermost table
         context: Any = error.errors()[0].get("ctx")
         raise context["error"] from None
 
@@ -128,18 +133,23 @@ class JsonSchema(GenerateJsonSchema):
 # Types of values
 
 
-def type_in_toml(value: Any) -> str:
-    """The tag of a value, by which the types of a union are told apart."""
-    kinds = ((bool, "<boolean>"), (int | float, "<number>"), (str, "<text>"))
-    kinds += ((list, "<array>"), (dict, "<table>"))
-    return next((tag for kind, tag in kinds if isinstance(value, kind)), "<date>")
+def type_tag(value: Any) -> str:
+    """The tag of a value, by which the types of a union are distinguished."""
+    return f"<{toml_type(value).removeprefix('whole ')}>"
 
 
-def union(tag_of: Callable[[Any], str] = type_in_toml, **kinds: Any) -> Any:
+def union(tag_of: Callable[[Any], str] = type_tag, **kinds: Any) -> Any:
     """The union of types: type of a value in TOML, or what `tag_of` returns → type."""
     tagged = [Annotated[kind, Tag(f"<{name}>")] for name, kind in kinds.items()]
     _TAGS.update(f"<{name}>" for name in kinds)
     return Annotated[Union[tuple(tagged)], Discriminator(tag_of)]  # noqa: UP007
+
+
+def union_by_kind(*tables: type[Table]) -> Any:
+    """The union of tables that differ in the values of their key ``kind``."""
+    for table in tables:
+        _TAGS.update(get_args(table.model_fields["kind"].annotation))
+    return Annotated[Union[tables], Discriminator("kind")]  # noqa: UP007
 
 
 def check(is_allowed: Callable[[Any], Any]) -> AfterValidator:
