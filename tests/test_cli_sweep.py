@@ -408,8 +408,7 @@ def test_bad_input(folder, text, seen, allowed):
 
 def test_the_command_line_itself(folder):
     assert "status" in command("sweep", "--help").output
-    path = write(folder, SMALL)
-    for words in ([], [path, "--threads", 0], ["--stor", "x"], ["nowhere.toml"]):
+    for words in ([], [write(folder, SMALL), "--threads", 0], ["--stor", "x"]):
         assert command("sweep", *words).exit_code == 2
     with pytest.raises(InputError, match="there is no such file"):
         command("sweep", "x.toml", "--debug", catch_exceptions=False)

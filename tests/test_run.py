@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from cli import EXAMPLES, command, found, keys_not_in, names, process, read, refuses, write
+from cli import EXAMPLES, command, found, keys_not_in, names, read, refuses, write
 
 import dvi_jax as dvi
 from dvi_jax import systems
@@ -294,15 +294,6 @@ def test_a_failed_trajectory_is_written(folder):
         assert np.isnan(saved["qs"][step + 1 :]).all()
     assert read("out/report.json")["results"]["drift"]["value"] == "nan"
     assert (folder / "out" / "trajectory.png").exists()
-
-
-@pytest.mark.slow
-def test_entry_point_without_traceback(folder):
-    code = "from dvi_jax_cli import main; main()"
-    done = process(code, "run", write(folder, KEPLER + "steps = 0\n"))
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("bad input: steps: 0")
-    assert "Traceback" not in done.stderr
 
 
 def test_the_examples_show_every_key():

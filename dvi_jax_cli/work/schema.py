@@ -12,9 +12,11 @@ from typing_extensions import TypeAliasType
 
 from .._errors import require, shown
 from .._names import FILES as KINDS
-from .axis import AN_AXIS, Axis, AxisName, StateOrAxis, SweepParameter, number_or_axis
 from .table import (
+    AN_AXIS,
     Array,
+    Axis,
+    AxisName,
     Count,
     Fraction,
     JsonSchema,
@@ -23,13 +25,16 @@ from .table import (
     Number,
     NumberOrArray,
     Scalar,
+    StateOrAxis,
     StepSize,
+    SweepParameter,
     Table,
     Text,
     Two,
     Whole,
     check,
     key,
+    number_or_axis,
     type_tag,
     union,
     union_by_kind,

@@ -10,12 +10,11 @@ import numpy as np
 import dvi_jax as dvi
 
 from .._errors import InputError, require
-from .axis import AN_AXIS, Axis, at, axes_in
 from .expressions import parse_method
 from .observables import read_observables
 from .schema import ARRAY, Pair, SweepFile
 from .system import Source, find_source
-from .table import MISSING
+from .table import AN_AXIS, MISSING, Axis, at, axes_in
 
 _KEYS = {"num_steps": "steps"}
 """Argument of `dvi.sweep` → key of the file, where they differ."""
