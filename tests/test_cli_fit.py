@@ -11,7 +11,7 @@ from cli import EXAMPLES, command, found, keys_not_in, names, read, refuses, wri
 
 import dvi_jax as dvi
 from dvi_jax_cli.work.columns import read_columns
-from dvi_jax_cli.work.fit_problem import fit_problem
+from dvi_jax_cli.work.fit import fit_problem
 from dvi_jax_cli.work.schema import FitFile
 from dvi_jax_cli.work.system import find_source
 from dvi_jax_cli.work.table import read_file

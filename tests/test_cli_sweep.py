@@ -18,7 +18,7 @@ from dvi_jax.run import InputError, sweep_file, sweep_status
 from dvi_jax.sweep import store
 from dvi_jax_cli.work.loader import Loader
 from dvi_jax_cli.work.schema import SweepFile
-from dvi_jax_cli.work.sweep_problem import sweep_problem
+from dvi_jax_cli.work.sweep import sweep_problem
 from dvi_jax_cli.work.table import read_file
 
 OWN = """
