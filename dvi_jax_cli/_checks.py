@@ -1,4 +1,4 @@
-"""Commands that check and measure: paper, certify, bench, info."""
+"""Commands that look things up, check and measure: systems, schema, paper, certify, bench, info."""
 
 import json
 from pathlib import Path
@@ -7,11 +7,65 @@ from typing import Annotated
 import typer
 
 from ._errors import InputError, known, require
-from ._group import CHECKING, app
-from ._names import CHECKS, METHODS, WORKLOADS, completer
+from ._group import CHECKING, START, app
+from ._names import CHECKS, FILES, METHODS, SYSTEMS, WORKLOADS, completer
 from ._runs import Force
 from ._session import FAILED, Session, command
-from ._show import console, progress_bar
+from ._show import console, print_json, progress_bar
+
+
+@command(app, "systems", START)
+def systems(
+    session: Session,
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="NAME", help="A system of the library.", **completer(SYSTEMS)),
+    ] = None,
+) -> None:
+    """List the library of systems, or describe one of them.
+
+    Exit code 0: done. 2: there is no such system.
+
+    Examples
+        dvi-jax systems                  all of them
+        dvi-jax systems kepler           equations, parameters, what is conserved
+        dvi-jax systems kepler --json    the same for programs
+    """
+    from .work.library import library_tables
+
+    heading, tables = library_tables(name)
+    if heading:
+        session.line(heading)
+    session.tables(tables, words=True)
+    rows = {t.title: [dict(zip(t.columns, row, strict=True)) for row in t.rows] for t in tables}
+    session.finish({"name": name, "about": heading, "tables": rows})
+
+
+@command(app, "schema", START, jax=False)
+def schema(
+    session: Session,
+    kind: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="KIND",
+            help="run, sweep, fit or discover; a file of any kind if not given.",
+            **completer(FILES),
+        ),
+    ] = None,
+) -> None:
+    """Print the JSON schema of the TOML files, by which an editor completes and checks them.
+
+    Exit code 0: done. 2: there is no such kind of file.
+
+    Examples
+        dvi-jax schema sweep                    keys, types and ranges of a sweep file
+        dvi-jax schema run > run.schema.json    for an editor
+    """
+    if kind is not None:
+        known("KIND", kind, FILES)
+    from .work.schema import json_schema
+
+    print_json(json_schema(kind))
 
 
 @command(app, "paper", CHECKING)
@@ -58,11 +112,11 @@ def certify(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="One method of each kind only.")] = False,
 ) -> None:
-    """Measure what the methods claim: order, structure, long runs, gradients, compilation.
+    """Measure order, structure, long runs, gradients and compilation of the methods.
 
-    Each check is also shown to find the defect of a broken method (the controls).
+    Each check is also applied to a method with a known defect, which it must find (the controls).
 
-    Exit code 0: all claims hold, all controls are caught. 1: otherwise. 2: bad input.
+    Exit code 0: all requirements met, all controls found. 1: not all. 2: bad input.
 
     Examples
         dvi-jax certify --quick
@@ -102,7 +156,7 @@ def certify(
     }
     if certificate.ok or session.as_json:
         session.finish(contents, "" if certificate.ok else certificate.summary)
-    else:  # the summary has said it
+    else:  # the summary is on the screen already
         raise typer.Exit(FAILED)
 
 
@@ -118,11 +172,11 @@ def bench(
     ] = None,
     rounds: Annotated[int, typer.Option(min=3, help="How often each side is timed.")] = 7,
 ) -> None:
-    """How fast this machine is, beside named references in the same process.
+    """Benchmark this machine against reference implementations.
 
     Each workload and its references take the same steps, one after the other in each round, in
     random order. The ratio is steps per second over those of the reference: median and quartiles
-    over the rounds. Compilation is not in it, and is told apart.
+    over the rounds. Compilation is listed separately.
 
     Exit code 0: done. 1: a reference and the package do not agree. 2: bad input.
 
@@ -147,7 +201,7 @@ def bench(
 
 @command(app, "info", CHECKING, jax=False)
 def info(session: Session) -> None:
-    """Versions, devices, precision, flags, extras: what to send along with a question.
+    """Print versions, devices, precision, flags and extras (attach it to bug reports).
 
     Exit code 0: done. 1: JAX cannot be started.
 

@@ -12,23 +12,21 @@ _MOST = 8
 
 
 class InputError(ValueError):
-    """Bad input: the key (or the option), what was seen, what is allowed."""
+    """Bad input: the key (or the option), what was seen, what is allowed.
 
-    def __init__(self, key: str, seen: str, allowed: str):
+    `found`: this error, and after it all others of the same file.
+    """
+
+    def __init__(self, key: str, seen: str, allowed: str, more: Sequence["InputError"] = ()):
         super().__init__(f"{key}: {seen}\n  allowed: {allowed}")
         self.key, self.seen, self.allowed = key, seen, allowed
-
-
-class InputErrors(InputError):
-    """All errors of a file; `key`, `seen` and `allowed` are those of the first."""
-
-    def __init__(self, found: Sequence[InputError]):
-        super().__init__(found[0].key, found[0].seen, found[0].allowed)
-        self.found = found
+        self.found = [self, *more]
 
     def __str__(self) -> str:
-        more = [f"… and {len(self.found) - _MOST} more"] if len(self.found) > _MOST else []
-        return "\n".join([*map(str, self.found[:_MOST]), *more])
+        texts = [str(error.args[0]) for error in self.found[:_MOST]]
+        if len(self.found) > _MOST:
+            texts.append(f"… and {len(self.found) - _MOST} more")
+        return "\n".join(texts)
 
 
 def require(fits: Any, key: str, seen: str, allowed: str) -> None:
@@ -48,13 +46,19 @@ def reason(error: BaseException) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
+def toml_type(value: Any) -> str:
+    """The type of a value in the words of TOML."""
+    types = {bool: "boolean", int: "whole number", float: "number", str: "text"}
+    types |= {list: "array", dict: "table"}
+    return types.get(type(value), type(value).__name__)
+
+
 def shown(value: Any) -> str:
-    """A value, shortened, and its type in the words of TOML."""
-    kinds = ((bool, "a boolean"), (int, "a whole number"), (float, "a number"), (str, "text"))
-    kinds += ((list, "an array"), (dict, "a table"))
-    kind = next((name for t, name in kinds if isinstance(value, t)), type(value).__name__)
+    """A value, shortened, and its type."""
     text = str(value).lower() if isinstance(value, bool) else _SHORT.repr(value)
-    return f"{text} ({kind})"
+    kind = toml_type(value)
+    article = {"array": "an ", "text": ""}.get(kind, "a ")
+    return f"{text} ({article}{kind})"
 
 
 def nearest(seen: str, names: Iterable[str]) -> str:

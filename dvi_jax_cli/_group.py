@@ -8,9 +8,8 @@ import typer
 from typer.core import TyperGroup
 
 from ._errors import nearest
-from ._help import WithExamples, shown_examples
 from ._names import VERSION
-from ._session import BAD_INPUT, INTERRUPTED
+from ._session import BAD_INPUT, INTERRUPTED, WithExamples, shown_examples
 from ._show import print_error
 
 _USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
@@ -38,19 +37,16 @@ class Commands(WithExamples, TyperGroup):
 
 
 def _refuse(error: Any, as_json: bool) -> None:
-    context = error.ctx
+    """Show an error in the arguments, with our own suggestion in place of that of typer."""
     message = re.split(r"\.? Did you mean|\.? \((?:Possible|Did)", error.format_message())[0]
     message = message.rstrip(".")
-    if context is not None:
+    if error.ctx is not None:
+        command = error.ctx.command
+        names = [o for p in command.params for o in p.opts] + list(getattr(command, "commands", ()))
         if seen := re.search(r"No such (?:command|option):? '?([^'\s]+)'?", message):
-            message += nearest(seen[1], _names(context.command))
-        message += f"\n  {context.command_path} --help lists what there is"
+            message += nearest(seen[1], names)
+        message += f"\n  {error.ctx.command_path} --help lists what there is"
     print_error("bad input", message, as_json)
-
-
-def _names(command: Any) -> list[str]:
-    """The options and commands of a command."""
-    return [o for p in command.params for o in p.opts] + list(getattr(command, "commands", ()))
 
 
 app = typer.Typer(

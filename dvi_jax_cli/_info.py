@@ -4,6 +4,7 @@ import importlib.util
 import os
 import platform
 import sys
+from contextlib import suppress
 from importlib import metadata
 from typing import Any
 
@@ -54,11 +55,10 @@ def _version(name: str) -> str | None:
 
 
 def _device(device: Any) -> dict[str, Any]:
-    try:
-        stats = device.memory_stats() or {}
-    except Exception:  # not every backend counts
-        stats = {}
     about = {"id": device.id, "kind": device.device_kind, "platform": device.platform}
+    stats: dict[str, Any] = {}
+    with suppress(Exception):  # not every backend counts
+        stats = device.memory_stats() or {}
     return about | {"bytes": stats.get("bytes_limit"), "bytes_in_use": stats.get("bytes_in_use")}
 
 
@@ -71,17 +71,19 @@ def tables(found: dict[str, Any]) -> list[Table]:
     """What was gathered, for the reader."""
     versions = [[name, v or "not installed"] for name, v in found["versions"].items()]
     versions.append(["python", f"{found['python']} ({found['executable']})"])
-    processors = found["processors"]
-    usable = f", {processors['usable']} usable" if processors["usable"] is not None else ""
-    about = [["platform", found["platform"]], ["processors", f"{processors['machine']}{usable}"]]
+    processors = f"{found['processors']['machine']}"
+    if found["processors"]["usable"] is not None:
+        processors += f", {found['processors']['usable']} usable"
+    about = [["platform", found["platform"]], ["processors", processors]]
     if not found["failed"]:
         on = "on" if found["x64_of_this_process"] else "off, to be turned on"
         about.append(["backend of JAX", found["backend"]])
         about.append(["double precision", f"commands turn it on; in a script: {on}"])
-    devices = [
-        [str(d["id"]), d["kind"], d["platform"], _memory(d["bytes"])]
-        for d in found.get("devices", [])
-    ]
+    devices = []
+    for d in found.get("devices", []):
+        size = d["bytes"]
+        memory = "that of the machine" if size is None else f"{size / 2**30:.1f} GiB"
+        devices.append([str(d["id"]), d["kind"], d["platform"], memory])
     extras = []
     for name, extra in found["extras"].items():
         missing = f"missing: {', '.join(extra['missing'])}" if extra["missing"] else "installed"
@@ -94,7 +96,3 @@ def tables(found: dict[str, Any]) -> list[Table]:
         Table("Extras", ["name", "", "to install it"], extras),
     ]
     return [table for table in every if table.rows]
-
-
-def _memory(size: int | None) -> str:
-    return "that of the machine" if size is None else f"{size / 2**30:.1f} GiB"

@@ -44,8 +44,11 @@ def new(
     """
     session.unwritten = "the project cannot be written"
     _check(name, system)
-    words = {"title": name.name, "system": system or ""}
-    files = dict(_files("own" if system is None else "library", words))
+    templates = resources.files("dvi_jax_cli") / "templates" / ("library" if system else "own")
+    files = {}
+    for file in sorted(filter(lambda file: file.is_file(), templates.iterdir()), key=str):
+        text = file.read_text(encoding="utf-8").replace("{{title}}", name.name)
+        files[file.name] = text.replace("{{system}}", system or "")
     cells = notebook(files["explore.py"])
     files["explore.ipynb"] = json.dumps(cells, indent=1, ensure_ascii=False) + "\n"
     name.mkdir(parents=True)
@@ -67,17 +70,6 @@ def _check(name: Path, system: str | None) -> None:
     require(is_new, "NAME", f"{name} exists already", "a new directory")
     if system is not None:
         known("--system", system, SYSTEMS)
-
-
-def _files(kind: str, words: dict[str, str]) -> Any:
-    """(name, text) of each template, with {{word}} filled in."""
-    for file in sorted((resources.files("dvi_jax_cli") / "templates" / kind).iterdir(), key=str):
-        if not file.is_file():
-            continue
-        text = file.read_text(encoding="utf-8")
-        for word, value in words.items():
-            text = text.replace("{{" + word + "}}", value)
-        yield file.name, text
 
 
 def notebook(script: str) -> dict[str, Any]:

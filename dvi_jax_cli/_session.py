@@ -1,4 +1,4 @@
-"""Common parts of all commands: --json, --verbose, --debug, errors and exit codes."""
+"""Common parts of all commands: help pages, --json, --verbose, --debug, errors, exit codes."""
 
 import functools
 import inspect
@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from ._errors import InputError
-from ._help import Command, shown_examples, unwrapped
 from ._names import VERSION
 from ._show import console, print_error, print_json, print_tables
 
@@ -105,43 +105,34 @@ class Session:
         self.tables(report.tables)
         for note in report.notes:
             self.line(note, style="bold")
-        contents = report.contents
+        contents, summary = report.contents, report.summary
         if report.files:
             contents = {"folder": str(report.folder), "files": report.files, **contents}
-            report.summary += f"; written to {report.folder}: {', '.join(report.files)}"
-        self.line(report.summary)
+            summary += f"; written to {report.folder}: {', '.join(report.files)}"
+        self.line(summary)
         self.finish(contents, report.message)
 
     def kind_and_message(self, error: BaseException) -> tuple[str, str]:
         """The kind of an exception, one of `CODES`, and the message for the reader."""
+        # Those of dvi_jax are found by name, because a command without JAX must not import it.
+        names = {kind.__name__ for kind in type(error).__mro__}
         if isinstance(error, KeyboardInterrupt):
             what = str(error).removeprefix("interrupted: ") or self.stopped
             return "interrupted", "\n".join(filter(None, (what, self.hint)))
-        if isinstance(error, (InputError, *_known("dvi_jax", "StoreMismatch"))):
+        if isinstance(error, InputError) or "StoreMismatch" in names:
             return "bad input", str(error)
-        if isinstance(error, (OSError, *_known("dvi_jax", "StoreError"))):
+        if isinstance(error, OSError) or "StoreError" in names:
             return "failed", "\n".join(filter(None, (f"{self.unwritten}: {error}", self.hint)))
         if isinstance(error, MemoryError):
             return "failed", f"the machine does not have the memory for this: {error}"
-        return "fault", fault(error, self.debug)
-
-
-def _known(module: str, *names: str) -> tuple[type, ...]:
-    """Exceptions of a module, if it has been imported."""
-    found = sys.modules.get(module)
-    return tuple(kind for name in names if isinstance(kind := getattr(found, name, None), type))
-
-
-def fault(error: BaseException, traced: bool = False) -> str:
-    """The message for an unexpected exception; `traced`: below its traceback."""
-    lines = str(error).strip().splitlines() or ["(without a message)"]
-    if len(lines) > 12:
-        lines[12:] = [f"… ({len(lines) - 12} more lines)"]
-    how = "The same command with --debug shows where it comes from; please report it with that."
-    if traced:
-        how = "Please report it, with the traceback above."
-    text = "\n".join([f"{type(error).__name__}: {lines[0]}", *lines[1:], how])
-    return f"this is a fault of dvi_jax, not of your input.\n{text}"
+        lines = str(error).strip().splitlines() or ["(without a message)"]
+        if len(lines) > 12:
+            lines[12:] = [f"… ({len(lines) - 12} more lines)"]
+        how = "The same command with --debug shows where it comes from; please report it with that."
+        if self.debug:
+            how = "Please report it, with the traceback above."
+        text = "\n".join([f"{type(error).__name__}: {lines[0]}", *lines[1:], how])
+        return "fault", f"this is a fault of dvi_jax, not of your input.\n{text}"
 
 
 def command(
@@ -168,7 +159,7 @@ def command(
                 if jax:
                     session.start_jax()
                 function(session, **given)
-                sys.stdout.flush()  # a pipe that is closed is to be met here
+                sys.stdout.flush()  # so that a closed pipe raises here
             except (typer.Exit, typer.Abort):
                 raise
             except BrokenPipeError:
@@ -188,14 +179,37 @@ def command(
         call.__dict__["__signature__"] = inspect.Signature(parameters)
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         text, _, examples = (inspect.getdoc(function) or "").partition("\n\nExamples\n")
+        # Each paragraph in one line: a terminal has another width than this file.
+        text = "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))
         epilog = shown_examples(inspect.cleandoc(examples).splitlines())
-        added = group.command(
-            name, cls=Command, help=unwrapped(text), epilog=epilog, rich_help_panel=panel
-        )
-        added(call)
+        group.command(name, cls=Command, help=text, epilog=epilog, rich_help_panel=panel)(call)
         return function
 
     return register
+
+
+def shown_examples(lines: Iterable[str]) -> str:
+    """The end of a help page: examples, each on a line of its own."""
+    return "\n".join([" Examples", *(f"   {line}" for line in lines)])
+
+
+class WithExamples:
+    """A command whose epilog is shown line by line: Typer's versions differ in how they join it."""
+
+    epilog: str | None
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        text, self.epilog = self.epilog, None
+        try:
+            super().format_help(ctx, formatter)  # type: ignore[misc]
+        finally:
+            self.epilog = text
+        if text:
+            console().print(text, markup=False, soft_wrap=True)
+
+
+class Command(WithExamples, TyperCommand):
+    """A command with examples below its help."""
 
 
 def quiet() -> None:

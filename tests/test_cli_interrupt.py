@@ -1,23 +1,11 @@
-"""Ctrl-C ends every command with exit code 130 and no traceback, wherever it meets the process."""
-
-import os
-import subprocess
-import sys
-from pathlib import Path
+"""Ctrl-C ends every command with exit code 130 and no traceback, also while it is imported."""
 
 import pytest
-
-import dvi_jax as dvi
-
-ROOT = Path(dvi.__file__).parent.parent
+from cli import MAIN, process, write
 
 START = """
 import gc, os, signal, sys, threading
 signal.signal(signal.SIGINT, signal.default_int_handler)  # children of tests may have it ignored
-"""
-MAIN = """
-from dvi_jax_cli import main
-main()
 """
 IN_AN_IMPORT = """
 class Finder:
@@ -35,21 +23,14 @@ def callback(phase, info):
         os.kill(os.getpid(), signal.SIGINT)
 gc.callbacks.append(callback)
 """
-RUN = """
-system = "kepler"
-h = 0.1
-steps = 20
-[output]
-dir = "out"
-plots = false
-"""
+RUN = 'system = "kepler"\nh = 0.1\nsteps = 20\n[output]\ndir = "out"\nplots = false\n'
 
 
-def ended(code, *words, folder):
-    return subprocess.run(
-        [sys.executable, "-c", START + code + MAIN, *words], capture_output=True, text=True,
-        check=False, cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, timeout=30,
-    )  # fmt: skip
+def interrupted(folder, when):
+    done = process(START + when + MAIN, "run", write(folder, RUN), folder=folder)
+    assert done.returncode == 130, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr
 
 
 @pytest.mark.parametrize(
@@ -57,18 +38,11 @@ def ended(code, *words, folder):
 )
 def test_ctrl_c_during_the_imports(module, tmp_path):
     """NumPy is imported by an extension module, which makes an ImportError of any exception."""
-    (tmp_path / "run.toml").write_text(RUN, encoding="utf-8")
-    done = ended(IN_AN_IMPORT.format(module=module), "run", "run.toml", folder=tmp_path)
-    assert done.returncode == 130, done.stderr
-    assert "Traceback" not in done.stderr
-    assert module == "typer" or done.stderr.startswith("interrupted: by Ctrl-C")
-    assert not (tmp_path / "out").exists()
+    message = interrupted(tmp_path, IN_AN_IMPORT.format(module=module))
+    assert module == "typer" or message.startswith("interrupted: by Ctrl-C")
+    assert not (tmp_path / "out").exists(), message
 
 
-def test_ctrl_c_that_the_garbage_collector_swallows(tmp_path):
-    """An exception of its callbacks is only reported: the run went on to its end, exit code 0."""
-    (tmp_path / "run.toml").write_text(RUN, encoding="utf-8")
-    done = ended(IN_THE_GARBAGE_COLLECTOR, "run", "run.toml", folder=tmp_path)
-    assert done.returncode == 130, done.stderr
-    assert done.stderr.startswith("interrupted: by Ctrl-C")
-    assert "Traceback" not in done.stderr
+def test_ctrl_c_in_the_garbage_collector(tmp_path):
+    """Python only reports an exception of its callbacks; without more the run would continue."""
+    assert interrupted(tmp_path, IN_THE_GARBAGE_COLLECTOR).startswith("interrupted: by Ctrl-C")

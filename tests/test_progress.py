@@ -1,4 +1,4 @@
-"""Who is told how far a long call is."""
+"""Which progress of a long call is shown, and where."""
 
 import warnings
 from contextlib import contextmanager
@@ -13,44 +13,37 @@ def bar(console):
     yield ("bar", console)
 
 
-def test_the_users_function_is_taken():
-    with _progress.told(print, bar) as show:
-        assert show is print
+def shown(progress):
+    with _progress.told(progress, bar) as show:
+        return show
 
 
-def test_nobody_is_told_where_nobody_looks():
-    """Standard error of the tests is no terminal; True asks for a bar all the same."""
-    with _progress.told(None, bar) as show:
-        assert show is None
-    with _progress.told(False, bar) as show:
-        assert show is None
-    with _progress.told(True, bar) as show:
-        assert show[0] == "bar"
-
-
-@pytest.mark.parametrize("wrong", [3, "yes"])
-def test_what_is_no_answer_is_refused(wrong):
-    with pytest.raises(TypeError, match="progress must be True, False, None or a function"):
-        _progress.told(wrong, bar)
+def test_who_takes_the_progress():
+    """The user's function; without a terminal, as in these tests, a bar only for True."""
+    assert shown(print) is print
+    assert shown(None) is None
+    assert shown(False) is None
+    assert shown(True)[0] == "bar"
+    for wrong in (3, "yes"):
+        with pytest.raises(TypeError, match="progress must be True, False, None or a function"):
+            shown(wrong)
 
 
 @pytest.mark.parametrize(
-    ("widgets", "by_itself", "asked"), [(None, None, False), (object(), True, True)]
+    ("widgets", "by_itself", "with_true"), [(None, None, False), (object(), True, True)]
 )
-def test_a_notebook_without_widgets_is_spared_their_warnings(
-    monkeypatch, widgets, by_itself, asked
-):
-    """Rich has a bar for notebooks with ipywidgets, and warns of their absence with a path."""
+def test_a_notebook_without_widgets(monkeypatch, widgets, by_itself, with_true):
+    """Rich has a bar for notebooks with ipywidgets, and would warn of their absence."""
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     monkeypatch.setenv("FORCE_COLOR", "1")  # as Jupyter does
     monkeypatch.setattr(_progress, "find_spec", lambda name: widgets)
-    for progress, expected in ((None, by_itself), (True, asked)):
-        with _progress.told(progress, bar) as show:
-            assert (show and show[1].is_jupyter) is expected
+    for progress, expected in ((None, by_itself), (True, with_true)):
+        show = shown(progress)
+        assert (show and show[1].is_jupyter) is expected
 
 
 def test_rich_does_warn_without_widgets():
-    """The control: what is spared is there."""
+    """The control of the test above."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -58,6 +51,6 @@ def test_rich_does_warn_without_widgets():
         pytest.skip("ipywidgets is installed")
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
-        with Progress(console=Console(force_jupyter=True)) as shown:
-            shown.add_task("x")
+        with Progress(console=Console(force_jupyter=True)) as progress:
+            progress.add_task("x")
     assert any("ipywidgets" in str(w.message) for w in seen)

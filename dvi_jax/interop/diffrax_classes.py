@@ -49,7 +49,7 @@ class DiscreteMap(diffrax.AbstractSolver):
         del solver_state, made_jump
         q0, p0 = y0
         term, direction = unwrapped(terms)
-        # One step of `integrate`, whose arithmetic and status it therefore has.
+        # One step of `integrate`, so that its arithmetic and its status are the same.
         step = {"t0": direction * t0, "h": direction * (t1 - t0), "num_steps": 1, "args": args}
         how: Any = {"method": self.method, "newton": self.newton, "adjoint": dvi.Direct()}
         how |= {"epsilon": term.epsilon, "save": dvi.Save(final=True), "throw": False}
@@ -66,24 +66,22 @@ class DiscreteMap(diffrax.AbstractSolver):
 
 
 def unwrapped(terms: Any) -> tuple[DiscreteTerm, Any]:
-    """The term itself and the direction of time, 1 or −1.
-
-    diffrax always runs forwards, through a wrapper that gives the term −t where t1 < t0.
-    """
+    """The term itself and the direction of time, 1 or −1."""
     if isinstance(terms, DiscreteTerm):
         return terms, 1
+    # diffrax always runs forwards, through a wrapper that gives the term −t where t1 < t0.
     return terms.term, terms.direction
 
 
 def promoted(result: dvi.RESULTS) -> Any:
-    """A status of ours as one of diffrax's."""
+    """The status of diffrax for one of ours."""
     theirs: Any = diffrax.RESULTS
+    found: Any = theirs.nonlinear_divergence
     of = {
         "successful": theirs.successful,
         "not_converged": theirs.nonlinear_max_steps_reached,
         "not_finite": getattr(theirs, "nonfinite", theirs.nonlinear_divergence),
     }
-    found: Any = theirs.nonlinear_divergence
     for name, other in of.items():
         found = theirs.where(result == getattr(dvi.RESULTS, name), other, found)
     return found

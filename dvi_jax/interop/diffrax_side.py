@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def diffrax_term(system: Any, epsilon: Any = None) -> "DiscreteTerm":
-    """The term of diffrax that carries a system: what `diffrax_solver` steps.
+    """A system as a term of diffrax, for `diffrax_solver`.
 
     - `system`: a `System`, or a problem of the library, whose args go into ``diffeqsolve(args=)``.
-    - `epsilon`: strength of the disturbance; traced, so that a gradient may be taken in it.
+    - `epsilon`: strength of the perturbation; traced: derivatives with respect to it exist.
 
-    Its vector field is `vector_field`, so that diffrax's own solvers take it too
-    (``diffeqsolve(term, diffrax.Dopri8(), …)``) and solve the continuous limit.
+    Its vector field is `vector_field`: with diffrax's own solvers,
+    ``diffeqsolve(term, diffrax.Dopri8(), …)``, it gives the continuous limit.
 
-    **Raises** `ImportError` without diffrax, `TypeError` for what is no system.
+    **Raises** `ImportError` without diffrax, `TypeError` for another object than a system.
     """
     needed("diffrax", "interop.diffrax_term")
     from .diffrax_classes import DiscreteTerm
@@ -41,8 +41,8 @@ def diffrax_solver(
         diffrax.diffeqsolve(interop.diffrax_term(system, epsilon), interop.diffrax_solver(method),
                             t0, t1, dt0, y0=(q0, p0), args=args)
 
-    Each step of diffrax is the step of `method`, one of ``dvi.integrate``'s, on (t0, t1): its
-    states are those of `integrate` to round-off, of which diffrax's times t0 + h + h + … have some.
+    Each step is one step of `method` by ``dvi.integrate``. The states are those of `integrate` up
+    to the round-off in diffrax's times t0 + h + h + ….
 
     - `method`: any `Method`. `newton`: how implicit steps are solved.
 
@@ -62,7 +62,7 @@ def diffrax_solver(
     **Gradients**: by `RecursiveCheckpointAdjoint`, `DirectAdjoint` and `ForwardMode`, those of the
     discrete map. `BacksolveAdjoint` solves another equation and is rejected.
 
-    **Raises** `ImportError` without diffrax; `TypeError` for what is no method or root solver.
+    **Raises** `ImportError` without diffrax; `TypeError` for another method or root solver.
     """
     expect("method", method, dvi.Method, "a method such as dvi.Strang()")
     expect("newton", newton, dvi.RootSolver, "a root solver such as dvi.Newton()")

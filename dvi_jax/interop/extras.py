@@ -9,27 +9,21 @@ from ..systems import Problem
 
 
 def needed(package: str, by: str) -> Any:
-    """The module `package`, which `by` cannot do without.
-
-    **Raises** `ImportError` with the line that installs it.
-    """
+    """The module `package`. **Raises** `ImportError` with the line that installs it."""
     try:
         return importlib.import_module(package)
     except ImportError as error:
         if error.name not in (None, package, package.partition(".")[0]):
-            raise  # it is there, and something that it needs is not
+            raise  # the package is installed, and something that it needs is not
         raise ImportError(
-            f"{by} needs {package.partition('.')[0]}, which the extra brings: "
+            f"{by} needs {package.partition('.')[0]}, which is in the extra: "
             'pip install "dvi-jax[interop]".',
             name=package,
         ) from None
 
 
 def expect(name: str, value: Any, kind: Any, called: str) -> Any:
-    """The value, an instance of a class that the message calls `called`.
-
-    **Raises** `TypeError` for anything else.
-    """
+    """The value, of a kind that the message calls `called`. **Raises** `TypeError`."""
     if not isinstance(value, kind):
         seen = value.__name__ if isinstance(value, type) else f"{value!r:.100}"
         raise TypeError(f"{name} must be {called}; got {type(value).__name__}: {seen}")
@@ -37,16 +31,7 @@ def expect(name: str, value: Any, kind: Any, called: str) -> Any:
 
 
 def system_of(what: Any) -> dvi.System:
-    """The `System` that is meant by a `System` or a `Problem`.
-
-    **Raises** `TypeError` for anything else.
-    """
-    if isinstance(what, Problem):
-        return what.system
-    return expect(
-        "system",
-        what,
-        dvi.System,
-        "a dvi.System or a problem of dvi_jax.systems: wrap a discrete Hamiltonian, "
-        "dvi.System(H_D, force=W), or a continuous one, dvi.System(dvi.discretise(H))",
-    )
+    """The `System` itself, or that of a `Problem`. **Raises** `TypeError` for anything else."""
+    called = "a dvi.System or a problem of dvi_jax.systems: wrap a discrete Hamiltonian, "
+    called += "dvi.System(H_D, force=W), or a continuous one, dvi.System(dvi.discretise(H))"
+    return expect("system", what.system if isinstance(what, Problem) else what, dvi.System, called)

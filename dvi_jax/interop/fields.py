@@ -18,16 +18,17 @@ def vector_field(system: Any, epsilon: Any = None) -> Callable[[Any, Any, Any], 
 
         q̇ = ∂H/∂p,    ṗ = −∂H/∂q + ε W,      H(t, q, p) = H_D(t, t, q, p) + ε H1_D(t, t, q, p)
 
-    with W taken at (t, t, q, p): what `GaussLegendre` and `RungeKutta4` integrate, and what the map
-    of every H_D tends to that is continuous at t1 = t0. It is for comparisons,
-    ``diffrax.ODETerm(interop.vector_field(system))``; the map itself comes from H_D, not from it.
+    with W taken at (t, t, q, p). `GaussLegendre` and `RungeKutta4` integrate it, and the map of
+    every H_D that is continuous at t1 = t0 tends to it. It is for comparisons, such as
+    ``diffrax.ODETerm(interop.vector_field(system))``; the map itself comes from H_D.
 
-    - `system`: a `System`, or a problem of the library. `epsilon`: strength of the disturbance.
+    - `system`: a `System`, or a problem of the library. `epsilon`: strength of the perturbation.
 
     **Returns** a function of t [time], (q, p) and args, whose value (q̇, ṗ) has their shapes
     [unit of q / time, unit of p / time]. It can be compiled, batched and differentiated.
 
-    **Raises** `TypeError` for what is no system, and when called with a y that is no pair.
+    **Raises** `TypeError` for another object than a system, and, when called, for another y than a
+    pair.
 
     **Accuracy** round-off. ``dvi.from_lagrangian`` divides by t1 − t0 and has no H_D(t, t, …): its
     field is NaN everywhere. With ``slow_time=True`` t is the time itself, and H_D receives εt.
@@ -46,15 +47,9 @@ def vector_field(system: Any, epsilon: Any = None) -> Callable[[Any, Any, Any], 
 
 
 def as_pair(y: Any) -> tuple[Any, Any]:
-    """A state (q, p) as two arrays of one shape.
-
-    **Raises** `TypeError` for another structure, `ValueError` for two shapes.
-    """
+    """A state (q, p) as two arrays of one shape."""
     if not (isinstance(y, tuple | list) and len(y) == 2):
-        raise TypeError(
-            f"the state must be a pair y0=(q0, p0), got {type(y).__name__}: the map has to know "
-            "positions from momenta."
-        )
+        raise TypeError(f"the state must be a pair y0 = (q0, p0), got {type(y).__name__}.")
     q, p = (jnp.asarray(x) for x in y)
     if q.shape != p.shape:
         raise ValueError(f"q and p must have one shape, got {q.shape} and {p.shape}.")
@@ -68,7 +63,7 @@ def checked(system: Any, epsilon: Any) -> tuple[dvi.System, Any]:
     refuse_unit_or_mask("epsilon", epsilon)
     try:
         value = float(epsilon)
-    except (TypeError, jax.errors.ConcretizationTypeError):  # it stands for values to come
+    except (TypeError, jax.errors.ConcretizationTypeError):  # traced: its value is not known
         value = 0.0
     used = system.force is not None or system.perturbation is not None or system.slow_time
     if value != 0 and not used:

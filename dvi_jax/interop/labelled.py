@@ -31,10 +31,10 @@ def to_xarray(
 ) -> Any:
     """A trajectory, or a batch of them, as an `xarray.Dataset`.
 
-    - `solution`: what `integrate` returned; under `vmap`, with the batch in front.
+    - `solution`: the result of `integrate`; under `vmap`, with the batch in front.
     - `dims`: names for the dimensions of the batch, in order; `coords`: name → values along one.
-    - `observe`: what `integrate` was given under that name: it says which observables have one
-      value for each step. Without it none of their dimensions is called "step".
+    - `observe`: the same as for `integrate`, from which follows which observables have one value
+      for each step. Without it none of their dimensions is called "step".
     - `components`: labels along the axes of q and p: ``["x", "y"]`` for one axis, or name → labels
       for each axis, ``{"body": ["Sun", "Jupiter"], "axis": ["x", "y", "z"]}``.
     - `units`: name of a variable → text, such as ``problem.units``; `attrs`: attributes of the
@@ -45,8 +45,8 @@ def to_xarray(
     - ``time`` where all trajectories are saved at the same times, which are its coordinate; else
       ``save``, and the times are a variable `t`;
     - ``component`` or the names in `components`;
-    - ``step`` for what belongs to the step that ended at a saved time: its index is that of the
-      state it ended at (for ``Save(ts=...)`` the dimension of the states itself).
+    - ``step`` for values of the step that ended at a saved time: its index is that of the state at
+      its end (for ``Save(ts=...)`` the dimension of the states itself).
 
     Variables: `q`, `p`, `h`; observables by their place in the pytree, joined by points, one alone
     as ``observed``, the first of a list as ``observed.0``; `status` (int8, with ``flag_values`` and
@@ -55,8 +55,8 @@ def to_xarray(
     ``dataset.to_netcdf(path, engine="h5netcdf")`` writes it (extra ``export``).
 
     **Raises** `ValueError` for a number of `dims` that is not that of the batch, labels that do not
-    fit, an `observe` of another structure, and names that are taken; `TypeError` for what is no
-    solution, and for coords with units (say them in `units`).
+    fit, an `observe` of another structure, and names that are in use; `TypeError` for another
+    object than a solution, and for coords with units (which belong in `units`).
     """
     import xarray as xr
 
@@ -72,8 +72,8 @@ def to_xarray(
             f"the batch has {len(batch)} dimensions, of sizes {batch}, and dims names {len(dims)}: "
             f"{dims}. Name each, in the order of the vmaps from the outermost."
         )
-    if taken := [d for d in dims if d in _TAKEN or dims.count(d) > 1]:
-        raise ValueError(f"the dimension {taken[0]!r} has a name that is taken: give it another.")
+    for name in dims:
+        _check_free("dimension", name, name in _TAKEN or dims.count(name) > 1)
     rows = ts.reshape(-1, count)
     alike = bool(np.isfinite(rows).all() and (rows == rows[:1]).all())
     at, index = ("time", rows[0]) if alike else ("save", np.arange(count))
@@ -85,8 +85,7 @@ def to_xarray(
     found["h"] = ((*dims, step), hs)
 
     def add(name: str, axes: Sequence[str], value: Any) -> None:
-        if name in found or name.partition(".")[0] in _TAKEN:
-            raise ValueError(f"the observable {name!r} has a name that is taken: give it another.")
+        _check_free("observable", name, name in found or name.partition(".")[0] in _TAKEN)
         found[name] = ((*dims, *axes), np.asarray(value))
 
     for name, value, per_step in _observed(solution.observed, observe):
@@ -100,7 +99,8 @@ def to_xarray(
         add(name, [*front, *_own(name, own[len(front) :])], value)
     flags: dict[str, Any] = {"flag_values": np.arange(len(_STATUSES), dtype=np.int8)}
     flags |= {"flag_meanings": " ".join(_STATUSES)}
-    found["status"] = (dims, _codes(solution.result), flags)
+    each = [np.asarray(solution.result == getattr(dvi.RESULTS, name)) for name in _STATUSES]
+    found["status"] = (dims, np.argmax(each, axis=0).astype(np.int8), flags)
     for name, value in solution.stats.items():
         if name != "num_steps":
             add(name, _own(name, np.shape(value)[len(batch) :]), value)
@@ -124,10 +124,10 @@ def to_xarray(
 
 
 def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
-    """What ``dvi.sample`` returned, as ArviZ takes it.
+    """Samples of ``dvi.sample`` as an object of ArviZ.
 
-    - `samples`: a `Samples`. `observed`: the `Observations` it was drawn for, or a list of them;
-      or None.
+    - `samples`: a `Samples`. `observed`: the `Observations` that it was drawn for, or a list of
+      them, or None.
 
     **Returns** ArviZ's `InferenceData` for arviz 0.x; an `xarray.DataTree` for arviz 1.x and
     arviz-base. Groups, dimensions chain and draw:
@@ -138,12 +138,12 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
       the mean of each chain, along chain alone;
     - ``observed_data``, with `observed`: ``values`` (or ``values_0``, … of a list), along ``ts``.
 
-    **Raises** `ImportError` without arviz and arviz-base; `TypeError` for what is no `Samples`.
+    **Raises** `ImportError` without arviz and arviz-base; `TypeError` for another object.
     """
     import xarray as xr
 
     hint = "(of trajectories take interop.to_xarray)"
-    expect("samples", samples, dvi.Samples, f"what dvi.sample returns {hint}")
+    expect("samples", samples, dvi.Samples, f"a result of dvi.sample {hint}")
     try:
         arviz = needed("arviz", "interop.to_inference_data")
     except ImportError:
@@ -174,6 +174,11 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
     return xr.DataTree.from_dict(groups)
 
 
+def _check_free(kind: str, name: str, is_taken: bool) -> None:
+    if is_taken:
+        raise ValueError(f"the {kind} {name!r} has a name that is taken: give it another.")
+
+
 def _components(
     components: Mapping[str, Any] | Sequence[Any] | None, shape: tuple[int, ...]
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -201,30 +206,21 @@ def _observed(observed: Any, observe: Any) -> list[tuple[str, np.ndarray, bool]]
     """Name, values and whether there is one for each step, of every array among the observed."""
 
     def is_observable(x: Any) -> bool:
-        return callable(x) or isinstance(x, dvi.Reduction | dvi.Running)
+        return x is None or callable(x) or isinstance(x, dvi.Reduction | dvi.Running)
 
     def flags_of(f: Any, found: Any) -> Any:
         return jax.tree.map(lambda _: f is not None and not isinstance(f, dvi.Reduction), found)
 
     try:
-        flags = (
-            flags_of(None, observed)
-            if observe is None
-            else jax.tree.map(flags_of, observe, observed, is_leaf=is_observable)
-        )
+        # Without `observe` one None applies to all.
+        flags = jax.tree.map(flags_of, observe, observed, is_leaf=is_observable)
     except ValueError as error:
-        raise ValueError(f"observe is not what this solution was observed by: {error}.") from None
+        raise ValueError(f"observe is not that of this solution: {error}.") from None
     arrays = jax.tree.leaves_with_path(observed, is_leaf=eqx.is_array)
     names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in arrays]
     names = [f"observed.{n}".rstrip(".") if not n or n[0].isdigit() else n for n in names]
     rows = zip(names, arrays, jax.tree.leaves(flags), strict=True)
     return [(name, np.asarray(x), flag) for name, (_, x), flag in rows]
-
-
-def _codes(result: Any) -> np.ndarray:
-    """The status of each trajectory as its number in `_STATUSES`."""
-    each = [np.asarray(result == getattr(dvi.RESULTS, name)) for name in _STATUSES]
-    return np.argmax(each, axis=0).astype(np.int8)
 
 
 def _attribute(value: Any) -> Any:

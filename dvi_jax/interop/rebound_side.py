@@ -1,6 +1,6 @@
 """Simulations of REBOUND as problems of the library, and back."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -38,14 +38,14 @@ _TURNED_ON = {
     "exit_min_distance": "exit_min_distance: take stop=dvi.Stop(g)",
     "N_var": "variational particles: dvi.TangentMap(), dvi.MEGNO() or jax.jvp give derivatives",
 }
-"""What changes a simulation and is no number of a body; name of the field → how to say so."""
+"""What changes a simulation besides its bodies: name of the field → what to do."""
 
-_ASTROPY = {"mearth": "Mearth", "mjupiter": "Mjup", "aus": "au", "parsec": "pc", "hr": "h"}
-_ASTROPY |= dict.fromkeys(("msun", "msolar", "solarmass", "sunmass"), "Msun")
-_ASTROPY |= dict.fromkeys(("year", "years", "yrs", "jyr"), "yr") | dict.fromkeys(
-    ("d", "days"), "day"
-)
-_ASTROPY |= {"gram": "g", "kyr": "kyr", "myr": "Myr", "gyr": "Gyr"}
+_ASTROPY = {
+    **dict.fromkeys(("msun", "msolar", "solarmass", "sunmass"), "Msun"),
+    **dict.fromkeys(("year", "years", "yrs", "jyr"), "yr"),
+    **{"d": "day", "days": "day", "hr": "h", "kyr": "kyr", "myr": "Myr", "gyr": "Gyr"},
+    **{"mearth": "Mearth", "mjupiter": "Mjup", "aus": "au", "parsec": "pc", "gram": "g"},
+}
 """REBOUND's names of units → the usual ones; the others are the same."""
 
 
@@ -66,13 +66,13 @@ def softened_hamiltonian(t0, t1, q0, p1, args):
 
 @dataclass(frozen=True)
 class ReboundProblem(Problem):
-    """A `Problem` of N bodies that was a simulation of REBOUND.
+    """A `Problem` of N bodies from a simulation of REBOUND.
 
-    - `t0`: the time it was at. `h` is its dt, `q0` its positions, `p0` momenta m v.
-    - `names` of the bodies, or their hashes (REBOUND 4), None where there is none.
-    - `velocities`: as they were, shape (bodies, 3); p0 / m may be off by a last digit.
-    - `radii`: of the bodies [length]; nothing here collides.
-    - `integrator`: REBOUND's, by name; ours is chosen by ``method=``.
+    - `t0`: its time. `h` is its dt, `q0` its positions, `p0` the momenta m v.
+    - `names` of the bodies, or their hashes (REBOUND 4), or None.
+    - `velocities`: of the simulation, shape (bodies, 3); p0 / m may differ in the last digit.
+    - `radii`: of the bodies [length]; there are no collisions here.
+    - `integrator`: the name of REBOUND's; ours is chosen by ``method=``.
     - `rebound_units`: its units of length, time and mass, or none.
     """
 
@@ -95,22 +95,21 @@ def from_rebound(
 
     - `simulation`: a ``rebound.Simulation``, or the path of a Simulationarchive, of which
       `snapshot` is taken (−1: the last).
-    - `massless`: the mass [of the simulation] that is given to bodies without any, whose momentum
-      would fix no velocity. They are refused where it is left out. It should be tiny beside the
-      others: orbits change by their ratio, about.
+    - `massless`: the mass [of the simulation] that bodies without mass get, because otherwise their
+      momentum would not determine their velocity. Without it they raise an error. Orbits change by
+      about its ratio to the other masses.
 
     **Returns** a `ReboundProblem`, float64 arrays of shape (bodies, 3) in the simulation's units.
 
         sol = dvi.integrate(problem.system, problem.q0, problem.p0, args=problem.args,
                             t0=problem.t0, h=problem.h, num_steps=1000, method=dvi.KahanLi(8))
 
-    **Raises** `ValueError` for what would be lost otherwise: additional forces and other callbacks
-    (``sim.copy()`` leaves them out, if that is meant), REBOUNDx, boundaries, collisions, gravity
-    that is off, approximate or custom, shear (SEI), variational particles, exit distances, massive
-    test particles, a simulation that is not synchronised, bodies without mass; for numbers that
-    are NaN or infinite; and for a start that the N-body system cannot go on from;
-    `FileNotFoundError` for a path where there is no file; `ImportError` without rebound,
-    `TypeError` for another object.
+    **Raises** `ValueError` for features that cannot be converted: additional forces and other
+    callbacks (``sim.copy()`` leaves them out), REBOUNDx, boundaries, collisions, gravity that is
+    off, approximate or custom, shear (SEI), variational particles, exit distances, massive test
+    particles, a simulation that is not synchronised, bodies without mass; for numbers that are NaN
+    or infinite; and for bodies at one place; `FileNotFoundError` for a path where there is no
+    file; `ImportError` without rebound, `TypeError` for another object.
 
     **Accuracy** q, masses, G and t are the same bits; p0 = m v is rounded. Units: REBOUND's solar
     mass is GM☉/G with its own G, 3e-5 away from others; the numbers stay those of the simulation.
@@ -127,22 +126,20 @@ def from_rebound(
             raise ValueError(
                 f"REBOUND cannot read snapshot {snapshot} of {str(simulation)!r}: {error}"
             ) from None
-        simulation.synchronize()  # it is ours: a snapshot may have been taken between half steps
+        simulation.synchronize()  # a snapshot may have been taken between half steps
     elif snapshot != -1:
         raise ValueError(
             f"snapshot={snapshot} goes with the path of a file, not with a simulation."
         )
     called = "a rebound.Simulation (of an archive one snapshot, archive[i]), or the path of a file"
     expect("simulation", simulation, rebound.Simulation, called)
-    _refuse_what_would_be_lost(simulation)
-    numbers = {k: float(getattr(simulation, k)) for k in ("t", "dt", "G", "softening")}
-    _refuse_not_finite("the simulation", numbers)
+    _check_convertible(simulation)
+    numbers = _finite("the simulation", simulation, ("t", "dt", "G", "softening"))
     names = tuple(_name(b) for b in simulation.particles)
     texts = [str(name or f"body {i}") for i, name in enumerate(names)]
     fields = ("m", "x", "y", "z", "vx", "vy", "vz", "r")
-    rows = np.array([[getattr(b, k) for k in fields] for b in simulation.particles], float)
-    for text, row in zip(texts, rows, strict=True):
-        _refuse_not_finite(text, dict(zip(fields, row, strict=True)))
+    bodies = zip(texts, simulation.particles, strict=True)
+    rows = np.array([list(_finite(text, b, fields).values()) for text, b in bodies])
     masses = _with_mass(simulation, rows[:, 0], massless)
     q, v = rows[:, 1:4].copy(), rows[:, 4:7].copy()
     p = masses[:, None] * v
@@ -156,16 +153,13 @@ def from_rebound(
         return function(t0, t1, q1, p1, args)
 
     units, parameters = _texts(_units(simulation))
-    about: dict[str, Any] = (
-        {} if softening else {"invariants": INVARIANTS, "symmetries": symmetries(3)}
-    )
-    about |= {"units": units, "source": "a simulation of REBOUND", "check": check_bodies}
+    about: dict[str, Any] = {"units": units, "check": check_bodies}
+    about |= {"source": "a simulation of REBOUND"}
     about |= {"parameters": {name: parameters.get(name, "b [length]") for name in args}}
-    about["observables"] = {
-        "energy": energy,
-        "linear_momentum": linear_momentum,
-        "angular_momentum": angular_momentum,
-    }
+    momenta = {"linear_momentum": linear_momentum, "angular_momentum": angular_momentum}
+    about |= {"observables": {"energy": energy, **momenta}}
+    if not softening:
+        about |= {"invariants": INVARIANTS, "symmetries": symmetries(3)}
     theirs = {"names": names, "velocities": v, "radii": rows[:, 7], "t0": numbers["t"]}
     theirs |= {"integrator": str(simulation.integrator), "rebound_units": _units(simulation)}
     state = {"q0": q, "p0": p, "h": numbers["dt"], "args": args}
@@ -175,7 +169,7 @@ def from_rebound(
 def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) -> Any:
     """A simulation of REBOUND with the bodies of a problem, or with another state of them.
 
-    - `problem`: what `from_rebound` gave, or another N-body problem (`n_body`, `solar_system`).
+    - `problem`: a result of `from_rebound`, or another N-body problem (`n_body`, `solar_system`).
     - `q`, `p`: a state, shape (bodies, 2 or 3), such as ``sol.qs[-1], sol.ps[-1]``; the start of
       the problem when left out. `t`: its time.
 
@@ -184,10 +178,9 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     has the same bits, as its `velocities` are stored. Of a state given as q and p the velocities
     p/m are rounded: they differ by up to 2.2e-16, relative, from v in p = m v.
 
-    **Raises** `TypeError` for what is no problem, or one of q and p alone; `ValueError` for a
-    system that is not Newton's N bodies, or that has a force or a perturbation, which REBOUND would
-    not know of, for shapes that do not agree and for values that are not finite;
-    `ImportError` without rebound.
+    **Raises** `TypeError` for another object than a problem, or for only one of q and p;
+    `ValueError` for another system than Newton's N bodies or one with a force or a perturbation,
+    for shapes that do not agree and for values that are not finite; `ImportError` without rebound.
     """
     rebound = needed("rebound", "interop.to_rebound")
     expect("problem", problem, Problem, "a problem of dvi_jax.systems or of from_rebound")
@@ -195,8 +188,8 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     known = system.H_D in (hamiltonian, softened_hamiltonian) and isinstance(args, Mapping)
     if not known or system.force is not None or system.perturbation is not None:
         raise ValueError(
-            f"to_rebound knows Newton's law between N bodies alone; {problem.name} has another "
-            "Hamiltonian, a force or a perturbation, and REBOUND would go on without it."
+            f"to_rebound converts only Newton's law between N bodies; {problem.name} has another "
+            "Hamiltonian, a force or a perturbation, which REBOUND would leave out."
         )
     if (q is None) != (p is None):
         raise TypeError("a state is q and p together, or neither of them.")
@@ -211,7 +204,7 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     for name, values in (("q", q), ("p", p), ("t", t)):
         if not np.isfinite(values).all():
             raise ValueError(
-                f"{name} holds values that are not finite: a run that failed has NaN from its "
+                f"{name} holds values that are not finite. A run that failed has NaN from its "
                 "failing step on; take a state before it."
             )
     v = p / masses[:, None]
@@ -226,17 +219,17 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     simulation.softening = float(args.get("softening", 0.0))
     simulation.dt = float(problem.h)
     simulation.t = t
-    names, radii = (None,) * len(masses), np.zeros(len(masses))
-    if theirs is not None:
-        names = theirs.names or names
-        radii = radii if theirs.radii is None else theirs.radii
+    names = getattr(theirs, "names", None) or (None,) * len(masses)
+    radii = getattr(theirs, "radii", None)
+    radii = np.zeros(len(masses)) if radii is None else radii
     for mass, (x, y, z), (vx, vy, vz), r, name in zip(masses, q, v, radii, names, strict=True):
         label = {} if name is None else {"name" if isinstance(name, str) else "hash": name}
         simulation.add(m=mass, x=x, y=y, z=z, vx=vx, vy=vy, vz=vz, r=r, **label)
     return simulation
 
 
-def _refuse_what_would_be_lost(sim: Any) -> None:
+def _check_convertible(sim: Any) -> None:
+    """Raise an error that names all that a problem of N bodies cannot represent."""
     of_bodies = {"_N_odes": 1} if str(sim.integrator) == "bs" else {}  # its own equations
     found = [
         text
@@ -251,9 +244,8 @@ def _refuse_what_would_be_lost(sim: Any) -> None:
         found.append("the shearing sheet (integrator sei): see the system hill")
     if found:
         raise ValueError(
-            "this simulation has more than bodies that attract one another, and it would be lost: "
-            f"{'; '.join(found)}. Turn it off in REBOUND (sim.copy() leaves callbacks out) if it "
-            "is not meant."
+            "this simulation has features that cannot be converted: "
+            f"{'; '.join(found)}. Turn them off in REBOUND (sim.copy() leaves callbacks out)."
         )
     if not sim.is_synchronized:
         raise ValueError("the simulation is in the middle of a step: call sim.synchronize() first.")
@@ -261,26 +253,28 @@ def _refuse_what_would_be_lost(sim: Any) -> None:
         raise ValueError("the simulation has no bodies.")
 
 
-def _refuse_not_finite(whose: str, numbers: Mapping[str, Any]) -> None:
-    """Refuse NaN and infinite numbers in what is taken from a simulation."""
+def _finite(whose: str, what: Any, fields: Sequence[str]) -> dict[str, float]:
+    """Numbers of a simulation or a body, which must be finite."""
+    numbers = {name: float(getattr(what, name)) for name in fields}
     for name, value in numbers.items():
         if not np.isfinite(value):
             raise ValueError(
                 f"{name} of {whose} is {value}: it must be a finite number. A simulation that "
                 "failed has NaN: take a snapshot before it."
             )
+    return numbers
 
 
 def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarray:
-    """Masses, those that are zero replaced; test particles as REBOUND means them, or refused."""
+    """Masses, those that are zero replaced; massive test particles raise an error."""
     count = int(sim.N_active)
     active = len(masses) if not 0 <= count < len(masses) else count  # −1, 2⁶⁴ − 1: all of them
     heavy = np.flatnonzero(masses[active:]) + active
     if heavy.size and (sim.testparticle_type == 0 or len(masses) - active > 1):
         raise ValueError(
             f"N_active = {active} and body {heavy[0]} behind it has the mass {masses[heavy[0]]:g}: "
-            "REBOUND leaves out some of the attraction between such test particles, which no "
-            "Hamiltonian does. Give them mass 0, or set sim.N_active to all bodies."
+            "REBOUND leaves out some of the attraction between such test particles, so that there "
+            "is no Hamiltonian. Give them mass 0, or set sim.N_active to all bodies."
         )
     empty = masses == 0
     if not empty.any():
@@ -288,8 +282,8 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
     if massless is None:
         raise ValueError(
             f"{empty.sum()} of {len(masses)} bodies have no mass (the first is number "
-            f"{int(np.argmax(empty))}), and p = m v would fix no velocity. Say which tiny mass "
-            f"they are to have: from_rebound(sim, massless={1e-20 * masses.max() or 1e-20:.0e})."
+            f"{int(np.argmax(empty))}), so that p = m v does not determine their velocity. Give "
+            f"them a tiny mass: from_rebound(sim, massless={1e-20 * masses.max() or 1e-20:.0e})."
         )
     if not 0 < massless < np.inf:
         raise ValueError(f"massless must be a positive mass, got {massless!r}.")

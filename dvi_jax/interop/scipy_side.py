@@ -1,4 +1,4 @@
-"""A run in the manner of `scipy.integrate.solve_ivp`."""
+"""One trajectory with the interface of `scipy.integrate.solve_ivp`."""
 
 import inspect
 import math
@@ -16,30 +16,30 @@ from ..engine.quantities import refuse_unit_or_mask
 from ..systems import Problem
 from .extras import needed, system_of
 
-_REFUSED = {
-    **dict.fromkeys(
-        ("rtol", "atol"),
-        "steps are not chosen by an estimate of the error: the lattice is fixed, which conserves "
-        "the invariants. Choose h, and compare with h/2",
-    ),
+_JACOBIAN = "Jacobians of implicit steps come from autodiff"
+_ESTIMATE = (
+    "steps are not chosen by an estimate of the error: the lattice is fixed, which conserves the "
+    "invariants. Choose h, and compare with h/2"
+)
+_REJECTED = {
+    **dict.fromkeys(("rtol", "atol"), _ESTIMATE),
     **dict.fromkeys(("max_step", "min_step", "first_step"), "every step is h"),
-    **dict.fromkeys(
-        ("jac", "jac_sparsity", "lband", "uband"), "Jacobians of implicit steps come from autodiff"
-    ),
+    **dict.fromkeys(("jac", "jac_sparsity", "lband", "uband"), _JACOBIAN),
     "vectorized": "functions are written for one state, and jax.vmap makes a batch",
     "dense_output": "there is no interpolant: request the times, t_eval=, and each is a step of "
     "the method",
 }
+"""Argument of SciPy's → why it has no meaning here."""
 
 _ROOM = 200
-"""Crossings of an event that there is room for at first."""
+"""Crossings of an event that are stored at first; with more the run is repeated."""
 
 
 class _Event(eqx.Module):
-    """event(t, y) or event(t, y, args) of SciPy's manner as g(t, q, p, args).
+    """event(t, y) or event(t, y, args) of SciPy as g(t, q, p, args).
 
-    `terminal`: how many crossings end the run (0: none). Of one event it is the same at every call,
-    so that a run is compiled once.
+    `terminal`: how many crossings end the run (0: none). Static fields, so that the same event at
+    another call compiles nothing.
     """
 
     event: Callable[..., Any] = eqx.field(static=True)
@@ -85,7 +85,8 @@ def solve_ivp(
     - `events`: one function or several, ``event(t, y)`` or ``event(t, y, args)`` → scalar, written
       with jax.numpy, with SciPy's attributes `terminal` (False, True, or a number of crossings) and
       `direction` (positive, negative, 0). Two crossings within one step are not seen, and a zero at
-      t0 is none. A terminal event cuts the output, not the computation (``dvi.Stop`` ends it).
+      t0 does not count. A terminal event truncates the output, not the computation (use
+      ``dvi.Stop`` to end it).
 
     **Returns** SciPy's `OptimizeResult` (the base of its OdeResult) with `t`, shape (points,); `y`,
     shape (2n, points); `t_events`, `y_events`, lists, or None without events; `status`, 0 at t1, 1
@@ -101,7 +102,7 @@ def solve_ivp(
     through it; take ``dvi.integrate`` for that.
     """
     for name in unsupported:
-        reason = _REFUSED.get(name, "SciPy's solve_ivp does not know it either, or it is new")
+        reason = _REJECTED.get(name, "SciPy's solve_ivp does not know it either, or it is new")
         raise TypeError(f"interop.solve_ivp takes no {name}: {reason}.")
     for name, given in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
         refuse_unit_or_mask(name, given)
@@ -116,7 +117,8 @@ def solve_ivp(
     several = events if isinstance(events, list | tuple) else [] if events is None else [events]
     found = [_event(e) for e in several]
     ahead = 1 if t1 > t0 else -1  # SciPy's direction is along the run, that of `Section` in time
-    # The last point of the lattice, t0 + N h', is a rounding beside t1: its state is that at t1.
+    # The last point of the lattice, t0 + N h', differs from t1 by round-off: its state is that at
+    # t1.
     near = 16 * float(np.spacing(max(abs(t0), abs(t1))))
     inside = None if times is None else times[np.abs(times - t1) > near]
     save = dvi.Save() if inside is None else dvi.Save(final=True)
@@ -126,42 +128,42 @@ def solve_ivp(
     how |= {"epsilon": epsilon, "args": args, "method": _method(method), "save": save}
     how |= {} if newton is None else {"newton": newton}
 
-    def run(room: int) -> dvi.Solution:
-        watch = [dvi.Section(e, ahead * e.direction, room) for e in found]
+    def run(crossings: int) -> dvi.Solution:
+        watch = [dvi.Section(e, ahead * e.direction, crossings) for e in found]
         return dvi.integrate(system, q0, p0, observe=[*watch, dvi.Last(_end)], throw=False, **how)
 
     sol = run(_ROOM)
     most = max((int(c.count) for c in sol.observed[:-1]), default=0)
     if most > _ROOM:
         sol = run(most)
-    return bunch(_told(sol, found, t0, t1, num_steps, times, inside))
+    about = {"sol": None, "h": how["h"], "num_steps": num_steps, "solution": sol}
+    about["newton_iterations"] = int(sol.stats["newton_iterations"])
+    return bunch(about | _output(sol, found, ahead, t1, times, inside))
 
 
 def _end(t0, t1, q0, p0, q1, p1, args):
     return jnp.concatenate([jnp.ravel(q1), jnp.ravel(p1)])
 
 
-def _told(
-    sol: Any, events: list[_Event], t0: float, t1: float, num_steps: int, times: Any, inside: Any
+def _output(
+    sol: Any, events: list[_Event], sign: int, t1: float, times: Any, inside: Any
 ) -> dict[str, Any]:
-    """A run as SciPy tells it: cut at a terminal event, or before a failure."""
+    """The output in SciPy's form, truncated at a terminal event, or before a failure."""
     *sections, last = sol.observed
     failed = not bool(sol.result == dvi.RESULTS.successful)
     t, y = np.array(sol.ts), _rows(sol.qs, sol.ps)
     if times is None:
         t[-1] = t1
-    else:  # what was requested, in its precision
+    else:  # the times that were requested, in their precision
         end = np.where(failed, np.nan, np.asarray(last))
         y = np.concatenate([y[: inside.size], end[None]])
         t, y = times, y[np.minimum(np.arange(times.size), inside.size)]
     crossings = [(np.asarray(c.ts), _rows(c.qs, c.ps)) for c in sections]
     crossings = [(ts[np.isfinite(ts)], ys[np.isfinite(ts)]) for ts, ys in crossings]
-    sign = 1.0 if t1 > t0 else -1.0
-    pairs = list(zip(events, crossings, strict=True))
     ends = [
-        (c[0][e.terminal - 1], c[1][e.terminal - 1])
-        for e, c in pairs
-        if 0 < e.terminal <= len(c[0])
+        (ts[e.terminal - 1], ys[e.terminal - 1])
+        for e, (ts, ys) in zip(events, crossings, strict=True)
+        if 0 < e.terminal <= len(ts)
     ]
     good = np.isfinite(y).all(axis=1)
     status, message = 0, "The solver successfully reached the end of the integration interval."
@@ -172,19 +174,19 @@ def _told(
         before = good & (sign * t < sign * end)
         t, y = np.append(t[before], at_end), np.concatenate([y[before], y_end[None][: at_end.size]])
         crossings = [
-            (ts[kept], ys[kept]) for ts, ys in crossings for kept in [sign * ts <= sign * end]
+            (ts[sign * ts <= sign * end], ys[sign * ts <= sign * end]) for ts, ys in crossings
         ]
     elif failed:
         status, message = -1, str(dvi.RESULTS[sol.result])
         t, y = t[good], y[good]
-    about = {"status": status, "message": message, "success": status >= 0, "sol": None}
-    about |= {"t_events": [ts for ts, _ in crossings] if events else None}
-    about |= {"y_events": [ys for _, ys in crossings] if events else None}
-    about |= {"h": (t1 - t0) / num_steps, "num_steps": num_steps, "solution": sol}
-    return about | {
+    return {
         "t": t,
         "y": y.T,
-        "newton_iterations": int(sol.stats["newton_iterations"]),
+        "t_events": [ts for ts, _ in crossings] if events else None,
+        "y_events": [ys for _, ys in crossings] if events else None,
+        "status": status,
+        "message": message,
+        "success": status >= 0,
     }
 
 
@@ -243,9 +245,9 @@ def _method(method: Any) -> dvi.Method:
     if isinstance(method, str) and method in METHODS:
         return METHODS[method]
     raise ValueError(
-        f"method must be a dvi.Method or one of {', '.join(METHODS)}; got {method!r}. SciPy's own "
-        "choose their steps and keep no structure: for those call scipy.integrate.solve_ivp on "
-        "interop.vector_field."
+        f"method must be a dvi.Method or one of {', '.join(METHODS)}; got {method!r}. For SciPy's "
+        "own methods, which choose their steps and conserve no structure, call "
+        "scipy.integrate.solve_ivp on interop.vector_field."
     )
 
 
@@ -263,15 +265,13 @@ def _event(event: Any) -> _Event:
 
 
 def _takes_args(event: Callable[..., Any]) -> bool:
-    """Whether an event is (t, y, args).
-
-    A third parameter with a default is one only if it has that name: ``lambda t, y, c=c: …`` has a
-    value of its own there.
-    """
+    """Whether an event is (t, y, args)."""
     try:
         parameters = list(inspect.signature(event).parameters.values())
         inspect.signature(event).bind(0, 0, 0)
     except (TypeError, ValueError):
         return False
+    # A third parameter with a default is `args` only by name: ``lambda t, y, c=c: …`` has a value
+    # of its own there.
     third = parameters[2] if len(parameters) > 2 else parameters[-1]
     return third.default is inspect.Parameter.empty or third.name == "args"

@@ -18,10 +18,10 @@ _POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 
 
 class UnitSystem:
-    r"""The units that the numbers of a run are in: of q, p, t and of every parameter.
+    """The units of the numbers of a run: of q, p, t and of every parameter.
 
-    All are made of one unit each of length, time and mass (angles in rad), so that no factor is
-    left between them: an H_D that is right in any such system is right in this one.
+    All are products of powers of one unit each of length, time and mass (angles in rad), so that
+    equations between quantities are also equations between the numbers.
 
     - `length`, `time`, `mass`: units of astropy, or their names.
     - `q`, `p`: ``"length"``, ``"angle"``; ``"momentum"``, ``"velocity"`` (unit mass), ``"angular
@@ -48,17 +48,14 @@ class UnitSystem:
         args: Mapping[str, Any] | None = None,
     ):
         u = needed("astropy.units", "interop.UnitSystem")
-        bases = []
-        given = ("length", length, u.m), ("time", time, u.s), ("mass", mass, u.kg)
-        for kind, what, like in given:
-            unit = _unit(u, kind, what)
+        given = {"length": length, "time": time, "mass": mass}
+        bases = L, T, M = [_unit(u, kind, what) for kind, what in given.items()]
+        for kind, unit, like in zip(given, bases, (u.m, u.s, u.kg), strict=True):
             if not unit.is_equivalent(like):
                 raise ValueError(
                     f"{kind} must be a unit of {kind} such as {like}, got {unit} "
                     f"({unit.physical_type})."
                 )
-            bases.append(unit)
-        L, T, M = bases
         words = {"length": L, "angle": u.rad, "momentum": M * L / T, "velocity": L / T}
         words |= {"angular momentum": M * L**2 / T, "specific angular momentum": L**2 / T}
         words["dimensionless"] = u.dimensionless_unscaled
@@ -140,7 +137,7 @@ class UnitSolution:
 
     @property
     def stats(self) -> dict[str, Any]:
-        """As of a `Solution`."""
+        """The statistics of the `Solution`."""
         return self.solution.stats
 
 
@@ -193,11 +190,11 @@ def integrate(
     save, lattice = options.get("save"), options.get("lattice")
     if getattr(save, "ts", None) is not None or isinstance(lattice, dvi.Given):
         raise TypeError(
-            "dvi.Save(ts=...) and dvi.Given(ts) hold times without a unit: give ts= a quantity in "
+            "dvi.Save(ts=...) and dvi.Given(ts) have times without a unit. Give ts= a quantity in "
             "place of the first; for the second call dvi.integrate on numbers."
         )
     if ts is not None and save is not None:
-        raise TypeError("ts= says which states are saved: leave save out.")
+        raise TypeError("ts= sets which states are saved: leave save out.")
     if ts is not None:
         options["save"] = dvi.Save(ts=_number(u, "ts", ts, taken.t))
     q0, p0, args = _filled(u, problem, own, q0, p0, args)
@@ -215,7 +212,7 @@ def integrate(
 def _filled(
     u: Any, problem: Problem | None, own: UnitSystem | None, q0: Any, p0: Any, args: Any
 ) -> tuple[Any, Any, Any]:
-    """Start and args with what a problem has in the place of what was left out: as quantities."""
+    """q0, p0 and args, in which quantities of the problem replace what was left out."""
     if problem is None:
         return q0, p0, args
     known = problem.args
@@ -226,7 +223,7 @@ def _filled(
                 f"args has {unknown[0]!r}, and {problem.name} has no such parameter; it has "
                 f"{', '.join(known)}."
             )
-    if own is None:  # its numbers have no unit that is known here
+    if own is None:  # the units of its numbers are not known
         return q0, p0, args
     q0 = u.Quantity(problem.q0, own.q) if q0 is None else q0
     p0 = u.Quantity(problem.p0, own.p) if p0 is None else p0

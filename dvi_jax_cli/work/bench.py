@@ -20,7 +20,7 @@ from .._show import Table
 
 H = 0.05
 EPSILON = 1e-3
-LANES = 4096
+TRAJECTORIES = 4096
 _SETTING = (
     f"Kepler's problem under the perturbing force −εq, ε = {EPSILON}, h = {H}, double precision; "
     "pendulums for the implicit row"
@@ -28,22 +28,20 @@ _SETTING = (
 _A = np.array([[0.25, 0.25 - math.sqrt(3) / 6], [0.25 + math.sqrt(3) / 6, 0.25]])
 """Butcher's matrix of the Gauss–Legendre method of order 4."""
 
-
-class Side(NamedTuple):
-    """One side of a row: its name, `call` () → final (q, p), steps of all trajectories."""
-
-    name: str
-    call: Callable[[], Any]
-    steps: int
+State = tuple[Any, Any]
 
 
 class Row(NamedTuple):
-    """A workload: the package's side, its references, and how far they may differ."""
+    """A workload: functions of the start that return (q, p), and how far these may differ.
 
-    name: str
+    - `steps`: of all trajectories, the same for the package and for each reference.
+    """
+
     what: str
-    own: Side
-    references: list[Side]
+    start: State
+    steps: int
+    own: Callable[..., Any]
+    references: dict[str, Callable[..., Any]]
     tolerance: float | None
 
 
@@ -66,6 +64,17 @@ _KEPLER = dvi.System(_energy, force=_drag)
 _PENDULUM = dvi.System(dvi.discretise(_pendulum))
 
 
+def _last(system: dvi.System, method: dvi.Method, steps: int, epsilon: float = EPSILON):
+    """(q0, p0) → last state, by `dvi.integrate`."""
+    options: dict[str, Any] = {"h": H, "num_steps": steps, "epsilon": epsilon, "method": method}
+
+    def run(q0, p0):
+        found = dvi.integrate(system, q0, p0, save=dvi.Save(final=True), throw=False, **options)
+        return found.qs[-1], found.ps[-1]
+
+    return run
+
+
 def _python_loop(q, p, steps: int):
     """The type II map of one trajectory, on Python's floats: p1 from q0, then q1 from p1."""
     (x, y), (u, v) = map(float, q), map(float, p)
@@ -78,7 +87,7 @@ def _python_loop(q, p, steps: int):
 
 
 def _numpy_loop(q, p, steps: int):
-    """The same map for many trajectories at once, shape (lanes, 2), in NumPy."""
+    """The same map for many trajectories at once, shape (trajectories, 2), in NumPy."""
     q, p = q.T.copy(), p.T.copy()
     for _ in range(steps):
         r2 = q[0] * q[0] + q[1] * q[1]
@@ -88,41 +97,23 @@ def _numpy_loop(q, p, steps: int):
 
 
 def _numpy_gauss(q, p, steps: int):
-    """Gauss–Legendre of order 4 for many pendulums, shape (lanes, 1): stages by fixed point."""
+    """Gauss–Legendre of order 4 for many pendulums, shape (trajectories, 1): stages by fixed
+    point."""
     q, p = q[:, 0].copy(), p[:, 0].copy()
     force = -np.sin(q) * np.ones((2, 1))
     momenta = force
     for _ in range(steps):
         for _ in range(30):
             momenta = p + H * (_A @ force)
-            positions = q + H * (_A @ momenta)
-            new = -np.sin(positions)
-            done = np.max(np.abs(new - force)) < 1e-15
-            force = new
-            if done:
+            before, force = force, -np.sin(q + H * (_A @ momenta))
+            if np.max(np.abs(force - before)) < 1e-15:
                 break
         q = q + H * (momenta[0] + momenta[1]) / 2
         p = p + H * (force[0] + force[1]) / 2
     return q[:, None], p[:, None]
 
 
-# The rows
-
-_START = np.array([1.0, 0.0]), np.array([0.0, 1.1])
-_STEPS = 20_000
-
-
-def _single() -> Row:
-    run = jax.jit(_last(_KEPLER, dvi.TypeII(), _STEPS))
-    references = [Side("Python floats", lambda: _python_loop(*_START, _STEPS), _STEPS)]
-    if importlib.util.find_spec("diffrax"):
-        references.append(Side("diffrax", _diffrax(), _STEPS))
-    what = f"one orbit, {_STEPS} steps of TypeII; reference: the same map on Python's floats and, "
-    what += "where it is installed, in diffrax (SemiImplicitEuler)"
-    return Row("single", what, Side("", lambda: run(*_START), _STEPS), references, 1e-6)
-
-
-def _diffrax() -> Callable[[], Any]:
+def _diffrax(steps: int) -> Callable[..., Any]:
     """Semi-implicit Euler of diffrax, which is this map."""
     import diffrax
 
@@ -131,36 +122,51 @@ def _diffrax() -> Callable[[], Any]:
         diffrax.ODETerm(lambda t, q, args: -q / jnp.sqrt(q @ q) ** 3 - EPSILON * q),
         diffrax.ODETerm(lambda t, p, args: p),
     )
-    method, end = diffrax.SemiImplicitEuler(), _STEPS * H
+    method, end = diffrax.SemiImplicitEuler(), steps * H
 
     @jax.jit
     def run(q, p):
-        found = diffrax.diffeqsolve(terms, method, 0.0, end, H, (p, q), max_steps=_STEPS + 8)
+        found = diffrax.diffeqsolve(terms, method, 0.0, end, H, (p, q), max_steps=steps + 8)
         momenta, positions = cast(Any, found.ys)
         return positions[-1], momenta[-1]
 
-    return lambda: run(*_START)
+    return run
+
+
+# The rows
+
+_ONE: State = np.array([1.0, 0.0]), np.array([0.0, 1.1])
+_STEPS = 20_000
+
+
+def _single() -> Row:
+    references: dict[str, Any] = {"Python floats": lambda q, p: _python_loop(q, p, _STEPS)}
+    if importlib.util.find_spec("diffrax"):
+        references["diffrax"] = _diffrax(_STEPS)
+    what = f"one orbit, {_STEPS} steps of TypeII; reference: the same map on Python's floats and, "
+    what += "where it is installed, in diffrax (SemiImplicitEuler)"
+    own = jax.jit(_last(_KEPLER, dvi.TypeII(), _STEPS))
+    return Row(what, _ONE, _STEPS, own, references, 1e-6)
 
 
 def _batch() -> Row:
-    steps, random = 500, np.random.default_rng(0)
-    angle, speed = random.uniform(0, 2 * np.pi, LANES), random.uniform(0.9, 1.15, LANES)
+    steps, size, random = 500, TRAJECTORIES, np.random.default_rng(0)
+    angle, speed = random.uniform(0, 2 * np.pi, size), random.uniform(0.9, 1.15, size)
     q = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     p = speed[:, None] * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    run = jax.jit(jax.vmap(_last(_KEPLER, dvi.TypeII(), steps)))
-    reference = Side("NumPy", lambda: _numpy_loop(q, p, steps), LANES * steps)
-    what = f"{LANES} orbits by vmap, {steps} steps of TypeII; reference: the same in NumPy"
-    return Row("batch", what, Side("", lambda: run(q, p), LANES * steps), [reference], 1e-8)
+    own = jax.jit(jax.vmap(_last(_KEPLER, dvi.TypeII(), steps)))
+    references = {"NumPy": lambda q, p: _numpy_loop(q, p, steps)}
+    what = f"{size} orbits by vmap, {steps} steps of TypeII; reference: the same in NumPy"
+    return Row(what, (q, p), size * steps, own, references, 1e-8)
 
 
 def _implicit() -> Row:
-    steps, lanes = 100, LANES // 4
-    q = np.linspace(-1.5, 1.5, lanes)[:, None]
-    p = np.zeros_like(q)
-    run = jax.jit(jax.vmap(_last(_PENDULUM, dvi.GaussLegendre(2), steps, 0.0)))
-    reference = Side("NumPy, fixed point", lambda: _numpy_gauss(q, p, steps), lanes * steps)
-    what = f"{lanes} pendulums by vmap, {steps} steps of GaussLegendre(2); reference: NumPy"
-    return Row("implicit", what, Side("", lambda: run(q, p), lanes * steps), [reference], 1e-9)
+    steps, size = 100, TRAJECTORIES // 4
+    q = np.linspace(-1.5, 1.5, size)[:, None]
+    own = jax.jit(jax.vmap(_last(_PENDULUM, dvi.GaussLegendre(2), steps, 0.0)))
+    references = {"NumPy, fixed point": lambda q, p: _numpy_gauss(q, p, steps)}
+    what = f"{size} pendulums by vmap, {steps} steps of GaussLegendre(2); reference: NumPy"
+    return Row(what, (q, np.zeros_like(q)), size * steps, own, references, 1e-9)
 
 
 def _gradient() -> Row:
@@ -170,24 +176,12 @@ def _gradient() -> Row:
         q1, p1 = last(q, p)
         return q1 @ q1 + p1 @ p1
 
-    forward, gradient = jax.jit(size), jax.jit(jax.grad(size, argnums=(0, 1)))
+    own = jax.jit(jax.grad(size, argnums=(0, 1)))
     what = f"gradient by the start, {_STEPS} steps of TypeII; reference: the final state alone"
-    reference = Side("forward pass", lambda: forward(*_START), _STEPS)
-    return Row("gradient", what, Side("", lambda: gradient(*_START), _STEPS), [reference], None)
+    return Row(what, _ONE, _STEPS, own, {"forward pass": jax.jit(size)}, None)
 
 
-_ROWS = {"single": _single, "batch": _batch, "implicit": _implicit, "gradient": _gradient}
-
-
-def _last(system: dvi.System, method: dvi.Method, steps: int, epsilon: float = EPSILON):
-    """(q0, p0) → last state, by `dvi.integrate`."""
-    options: dict[str, Any] = {"h": H, "num_steps": steps, "epsilon": epsilon, "method": method}
-
-    def run(q0, p0):
-        found = dvi.integrate(system, q0, p0, save=dvi.Save(final=True), throw=False, **options)
-        return found.qs[-1], found.ps[-1]
-
-    return run
+ROWS = {"single": _single, "batch": _batch, "implicit": _implicit, "gradient": _gradient}
 
 
 # Measuring
@@ -203,9 +197,9 @@ def measure(
     rows = []
     for i, name in enumerate(names):
         progress(i, len(names))
-        row = _ROWS[name]()
+        row = ROWS[name]()
         note(f"{name}: {row.what}")
-        rows += _timed(row, rounds)
+        rows += [{"row": name, "what": row.what, **found} for found in _timed(row, rounds)]
     progress(len(names), len(names))
     machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} processors"
     return {
@@ -218,47 +212,43 @@ def measure(
 
 
 def _timed(row: Row, rounds: int) -> list[dict[str, Any]]:
-    sides, shuffled = [row.own, *row.references], random.Random(0)
+    """The package compared with each of the references of a row."""
+
+    def call(side: Callable[..., Any]) -> tuple[float, Any]:
+        began = time.perf_counter()
+        result = jax.block_until_ready(side(*row.start))
+        return time.perf_counter() - began, result
+
+    sides, shuffled = [row.own, *row.references.values()], random.Random(0)
     # The first call of each compiles, and gives the results that are compared.
-    first, ends = zip(*(_call(side) for side in sides), strict=True)
+    first, ends = zip(*map(call, sides), strict=True)
     seconds = np.zeros((rounds, len(sides)))
     order = list(range(len(sides)))
     for k in range(rounds):
         shuffled.shuffle(order)
         for i in order:
-            seconds[k, i], _ = _call(sides[i])
+            seconds[k, i], _ = call(sides[i])
     typical, found = np.median(seconds, axis=0), []
-    for i, side in enumerate(sides[1:], 1):
-        ratios = (row.own.steps / seconds[:, 0]) / (side.steps / seconds[:, i])
+    for i, name in enumerate(row.references, 1):
+        ratios = seconds[:, i] / seconds[:, 0]
         low, middle, high = np.quantile(ratios, [0.25, 0.5, 0.75], method="weibull").tolist()
-        differ = None if row.tolerance is None else _difference(ends[0], ends[i])
-        measured = {
-            "row": row.name,
-            "what": row.what,
-            "reference": side.name,
-            "steps_per_second": row.own.steps / typical[0],
-            "reference_steps_per_second": side.steps / typical[i],
-            "ratio": middle,
-            "quartiles": [low, high],
-            "compilation_seconds": max(0.0, first[0] - typical[0]),
-            "largest_difference": differ,
-            "agrees": differ is None or bool(differ <= (row.tolerance or 0.0)),
-        }
-        found.append(measured)
+        differ = None
+        if row.tolerance is not None:
+            both = zip(ends[0], ends[i], strict=True)
+            differ = float(np.max([np.max(np.abs(x - y)) for x, y in both]))
+        found.append(
+            {
+                "reference": name,
+                "steps_per_second": row.steps / typical[0],
+                "reference_steps_per_second": row.steps / typical[i],
+                "ratio": middle,
+                "quartiles": [low, high],
+                "compilation_seconds": max(0.0, first[0] - typical[0]),
+                "largest_difference": differ,
+                "agrees": differ is None or differ <= row.tolerance,  # NaN does not
+            }
+        )
     return found
-
-
-def _call(side: Side) -> tuple[float, Any]:
-    """Seconds of a call, and its result."""
-    began = time.perf_counter()
-    result = jax.block_until_ready(side.call())
-    return time.perf_counter() - began, result
-
-
-def _difference(a: Any, b: Any) -> float:
-    """The largest difference of two states; infinite where one is not finite."""
-    found = float(np.max([np.max(np.abs(x - y)) for x, y in zip(a, b, strict=True)]))
-    return found if math.isfinite(found) else math.inf
 
 
 def tables(found: dict[str, Any]) -> list[Table]:

@@ -11,10 +11,6 @@ from .._errors import InputError, known, reason, require
 _MISSING = ("", "nan", "na", "null", "none", "-", "--")
 """Cells in which nothing was observed."""
 
-_SEPARATORS = (",", ";", "\t")
-_A_NUMBER = "a finite number; empty, or nan, where nothing was observed"
-_NAMES = "different names, one for each column, such as t, x, y"
-
 
 def read_columns(path: Path, key: str = "data.file") -> dict[str, np.ndarray]:
     """The columns of a file by name: from a CSV each of shape (N,), from an npz of any shape.
@@ -24,12 +20,11 @@ def read_columns(path: Path, key: str = "data.file") -> dict[str, np.ndarray]:
 
     **Raises** `InputError` with the key, and the line and column of a cell that is not a number.
     """
-    allowed = "the path of a CSV or npz file"
     try:
         is_file = path.is_file()
     except (OSError, ValueError) as error:  # a name that no file can have
-        raise InputError(key, reason(error), allowed) from None
-    require(is_file, key, f"there is no file {path}", allowed)
+        raise InputError(key, reason(error), "the path of a CSV or npz file") from None
+    require(is_file, key, f"there is no file {path}", "the path of a CSV or npz file")
     try:
         return _npz(path) if path.suffix == ".npz" else _csv(path, key)
     except InputError:
@@ -50,15 +45,16 @@ def _csv(path: Path, key: str) -> dict[str, np.ndarray]:
     lines = [(i, line) for i, line in enumerate(text.split("\n"), 1) if line.strip()]
     lines = [(f"{path.name}, line {i}", line) for i, line in lines if line.lstrip()[0] != "#"]
     require(lines, key, f"{path} is empty", "a line of names, then lines of numbers")
-    separator = max(_SEPARATORS, key=lines[0][1].count)
+    separator = max(",;\t", key=lines[0][1].count)
     (first, names), *rows = [
         (place, [cell.strip() for cell in next(csv.reader([line], delimiter=separator))])
         for place, line in lines
     ]
+    allowed = "different names, one for each column, such as t, x, y"
     for i, name in enumerate(names):
-        require(not np.isfinite(_number(name)), key, f"{first}: the number {name}", _NAMES)
+        require(not np.isfinite(_number(name)), key, f"{first}: the number {name}", allowed)
         fits = name and name not in names[:i]
-        require(fits, key, f"{first}: the name {name!r} again", _NAMES)
+        require(fits, key, f"{first}: the name {name!r} again", allowed)
     require(rows, key, f"{path} has names and no numbers", "at least one line of numbers")
     for place, cells in rows:
         allowed = f"{len(names)}, one for each of the names {', '.join(names)}"
@@ -66,7 +62,8 @@ def _csv(path: Path, key: str) -> dict[str, np.ndarray]:
     table = np.array([[_number(cell) for cell in cells] for _, cells in rows])
     for i, j in np.argwhere(np.isinf(table))[:1]:
         place, cells = rows[i]
-        raise InputError(key, f"{place}, column {names[j]}: {cells[j]!r}", _A_NUMBER)
+        allowed = "a finite number; empty, or nan, where nothing was observed"
+        raise InputError(key, f"{place}, column {names[j]}: {cells[j]!r}", allowed)
     return dict(zip(names, table.T, strict=True))
 
 
@@ -84,14 +81,3 @@ def column(columns: dict[str, np.ndarray], key: str, name: str) -> np.ndarray:
     """One of the columns. **Raises** `InputError` when there is none of that name."""
     known(key, name, columns, "a column of the file: {}")
     return np.asarray(columns[name], float)
-
-
-def check_times(ts: np.ndarray, key: str, name: str) -> None:
-    """Reject times that are not in order, with the first place where they are not."""
-    require(ts.ndim == 1, key, f"{name} has shape {ts.shape}", "one time for each observation")
-    for i in np.flatnonzero(~np.isfinite(ts))[:1]:
-        raise InputError(key, f"time number {i + 1} in {name} is {ts[i]}", "finite times")
-    direction = 1 if len(ts) == 0 or ts[-1] >= ts[0] else -1
-    for i in np.flatnonzero(np.diff(ts) * direction <= 0)[:1]:
-        seen = f"in {name} the time number {i + 2}, {ts[i + 1]:.17g}, comes after {ts[i]:.17g}"
-        raise InputError(key, seen, "times in order, no two alike")

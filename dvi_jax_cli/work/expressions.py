@@ -22,8 +22,8 @@ def public(base: type, *without: type) -> dict[str, type]:
 class Expressions:
     """Reader of the texts of one key.
 
-    - `kind`: what a text describes. `known`: name → class.
-    - `allowed`: follows the names in an error.
+    - `kind`: what a text describes. `known`: name → class. `allowed`: follows the names in an
+      error.
     """
 
     key: str
@@ -41,6 +41,10 @@ class Expressions:
             raise self.error(f"{text!r}: the syntax is not that of a call") from None
         except (ValueError, TypeError, RecursionError, MemoryError) as error:
             raise self.error(f"{text!r}: {error}") from None
+        return self.checked(made, text)
+
+    def checked(self, made: Any, text: str) -> Any:
+        """What was made, an instance of `kind`."""
         if not isinstance(made, self.kind):
             raise self.error(repr(text))
         return made
@@ -59,7 +63,10 @@ class Expressions:
             case ast.Tuple(elts=items):
                 return tuple(self._made(item) for item in items)
             case ast.BinOp(left=left, op=ast.Add() | ast.Mult() as op, right=right):
-                return self._joined(self._made(left), op, self._made(right))
+                left, right = self._made(left), self._made(right)
+                if not (isinstance(left, self.kind) and isinstance(right, self.kind)):
+                    raise ValueError("numbers are written out, without + and *")
+                return left + right if isinstance(op, ast.Add) else left * right
             case ast.Name(id=name):
                 try:
                     return self._called(name, [], [])
@@ -68,11 +75,6 @@ class Expressions:
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=keywords):
                 return self._called(name, arguments, keywords)
         raise ValueError(f"{ast.unparse(node)!r} is not one of these, a number or a list of them")
-
-    def _joined(self, left: Any, op: ast.operator, right: Any) -> Any:
-        if not (isinstance(left, self.kind) and isinstance(right, self.kind)):
-            raise ValueError("numbers are written out, without + and *")
-        return left + right if isinstance(op, ast.Add) else left * right
 
     def _called(self, name: str, arguments: list[Any], keywords: list[ast.keyword]) -> Any:
         if name not in self.known:
@@ -91,17 +93,11 @@ def parse_method(text: str) -> dvi.Method:
 
 def parse_basis(text: str, loader: Loader) -> Any:
     """The basis that a text such as ``"Polynomials(2) + Radial((-1,))"`` describes, or that a file
-    has under the name in it.
-
-    **Raises** `InputError`.
+    has under the name in it. **Raises** `InputError`.
     """
     allowed = ', their sums and products; or "file.py:name"'
     reader = Expressions("basis", AbstractBasis, public(AbstractBasis, dvi.Basis), allowed)
     if ".py:" not in text:
         return reader.read(text)
     made = loader.load("basis", text)
-    if isinstance(made, list | dict):
-        made = dvi.Basis(made)
-    if not isinstance(made, AbstractBasis):
-        raise reader.error(repr(text))
-    return made
+    return reader.checked(dvi.Basis(made) if isinstance(made, list | dict) else made, text)

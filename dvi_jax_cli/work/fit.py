@@ -13,10 +13,16 @@ from dvi_jax import plot
 from dvi_jax.fit.progress import shown as shown_bar
 from dvi_jax.fit.result import little_explained, numbers_in_words
 
+from .._errors import InputError, known, one_of, require, shown
 from .._show import Table
-from .fit_problem import FitProblem, fit_problem
-from .output import Report, opened, watched
+from .columns import column, read_columns
+from .expressions import parse_method
+from .loader import Loader
+from .output import Report, opened, recorded
+from .schema import Data, FitFile
+from .system import Source, find_source
 
+_NAMED = ("positions", "momenta", "state")
 CHECKPOINT = "checkpoint.npz"
 _IMAGES = ("data.png", "residuals.png", "parameters.png", "learning.png")
 WRITTEN = ("fit.npz", "fit.json", "trajectory.npz", CHECKPOINT, *_IMAGES)
@@ -28,6 +34,9 @@ _CORNER = 8
 """Parameters up to which pairs are drawn: the first ones."""
 _MATRIX = 8
 """Parameters up to which the correlations are shown as a matrix; more: the strongest pairs."""
+_AS_THEY_ARE = ("prior_chi2", "rms", "explained", "degrees_of_freedom", "curvature")
+_AS_THEY_ARE += ("undetermined", "at_bounds", "seconds")
+"""Fields of a result that are in the report under their names."""
 
 
 def fit_file(
@@ -51,55 +60,179 @@ def fit_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, output = opened("fit", Path(path), out, WRITTEN, force or resume)
-    problem = fit_problem(file, Path(path).parent)
-    checkpoint = output.folder / CHECKPOINT
-    arguments = problem.options | {"checkpoint": checkpoint, "throw": False}
+    file, report = opened("fit", Path(path), out, WRITTEN, force or resume)
+    source = find_source(file, Path(path).parent)
+    arguments, columns = fit_problem(file, source)
+    checkpoint = report.folder / CHECKPOINT
+    last: list[dvi.FitProgress] = []
     allowed = "functions, start, args and data that fit one another"
-    with output.reserved():  # a checkpoint remains after an error
+    with report.reserved():  # a checkpoint remains after an error
         if not resume:
             checkpoint.unlink(missing_ok=True)
-        found, _ = watched(
-            lambda report: dvi.fit(
-                problem.model, problem.data, problem.params, progress=report, **arguments
-            ),
-            shown_bar(progress),
-            lambda error: problem.source.misfit("fit", "fitted", error, allowed),
-        )
-    with output.writing(keep=CHECKPOINT):
-        found.save(output.path("fit.npz"))
-        trajectory, status = _trajectory(problem, found)
-        output.write_arrays("trajectory.npz", trajectory)
-        contents = output.about | _contents(problem, found) | {"trajectory": status}
-        output.write_json("fit.json", contents)
+        with shown_bar(progress) as show, source.at_work("fit", "fitted", allowed, last):
+            options = {"checkpoint": checkpoint, "throw": False}
+            found = dvi.fit(**arguments, **options, progress=recorded(last, show))
+    with report.writing(keep=CHECKPOINT):
+        found.save(report.path("fit.npz"))
+        trajectory, status = _trajectory(arguments["model"], arguments["data"].ordered(), found)
+        report.write_arrays("trajectory.npz", trajectory)
+        report.contents |= _contents(arguments, found)
+        report.contents |= {"columns": columns, "trajectory": status}
+        report.write_contents("fit.json")
         if file.output.plots:
-            output.draw(_pictures(problem, found))
-    steps = f"{contents['steps']} steps, {found.seconds:.1f} s (compilation included)"
-    return Report(
-        contents,
-        _tables(found, contents),
-        _notes(found),
-        summary=f"{found.status} after {steps}",
-        message=_failure(found, contents),
-        folder=output.folder,
-        files=output.files,
-    )
+            report.draw(_pictures(columns, found))
+    steps = f"{report.contents['steps']} steps"
+    report.tables, report.notes = _tables(found, report.contents), _notes(found)
+    seconds = f"{found.seconds:.1f} s (compilation included)"
+    report.summary = f"{found.status} after {steps}, {seconds}"
+    if found.status != "converged":
+        report.message = (
+            f"the fit did not converge ({found.status} after {steps}). "
+            f"{report.contents['message']}\nIts results so far have been written."
+        )
+    elif status != "successful":
+        report.message = f"the fitted trajectory fails ({status}). The results have been written."
+    return report
 
 
-def _trajectory(problem: FitProblem, found: dvi.FitResult) -> tuple[dict[str, Any], str]:
+# The arguments of `dvi.fit`
+
+
+def fit_problem(file: FitFile, source: Source) -> tuple[dict[str, Any], list[str]]:
+    """The arguments of `dvi.fit`, and the names of the columns of the data.
+
+    **Raises** `InputError`.
+    """
+    q0, p0, args = source.array("q0"), source.array("p0"), source.args
+    source.check_start(q0, p0, args)
+    start = {"epsilon": file.epsilon, "q0": q0, "p0": p0}
+    params = _parameters(file.parameters, start, args)
+    h, method, options = float(source.h), parse_method(file.method), file.options
+    data, columns = _observations(file.data, source.loader, np.shape(q0), file.t0)
+    segments = options.segments
+    arguments = {
+        "model": dvi.Model(source.system, h=h, args=args, method=method, **start),
+        "data": data,
+        "params": params,
+        "bounds": _pairs(file, "bounds", dvi.Bounds),
+        "priors": _pairs(file, "priors", dvi.Prior),
+        "loss": getattr(dvi, options.loss)(),
+        "horizons": None if options.horizons == "none" else options.horizons,
+        "max_steps": options.max_steps,
+        "tolerance": options.tolerance,
+        "check_curvature": options.curvature,
+        "shooting": dvi.MultipleShooting(segments) if segments else dvi.SingleShooting(),
+    }
+    return arguments, columns
+
+
+def _parameters(names: list[str], start: dict[str, Any], args: Any) -> dict[str, Any]:
+    """The parameters; the values of the file, or of the system, are the initial guess."""
+    table = args if isinstance(args, dict) else {}
+    values = start | {
+        f"args.{name}": value
+        for name, value in table.items()
+        if np.issubdtype(np.asarray(value).dtype, np.number)
+    }
+    for name in names:
+        known("parameters", name, values)
+        require(names.count(name) == 1, "parameters", f"{name!r} is listed twice", "each name once")
+    return _tree({name: np.asarray(values[name], float) for name in names})
+
+
+def _tree(flat: dict[str, Any]) -> dict[str, Any]:
+    """Values by ``q0`` and ``args.NAME`` as a table with a table of args in it."""
+    args = {name.removeprefix("args."): x for name, x in flat.items() if "." in name}
+    tree = {name: x for name, x in flat.items() if "." not in name}
+    return tree | ({"args": args} if args else {})
+
+
+def _pairs(file: FitFile, key: str, kind: Any) -> dict[str, Any] | None:
+    """The pairs of a table in the structure of the parameters."""
+    made = {}
+    for name, pair in getattr(file, key).items():
+        seen = "it is not among the parameters"
+        known(f"{key}.{name}", name, file.parameters, seen=seen)
+        made[name] = kind(*(np.asarray(x, float) if isinstance(x, list) else x for x in pair))
+    return _tree(made) or None
+
+
+def _observations(
+    given: Data, loader: Loader, shape: tuple[int, ...], t0: float | None
+) -> tuple[dvi.Observations, list[str]]:
+    """The data, and the names of their columns."""
+    columns = read_columns(loader.folder / given.file)
+    ts = column(columns, "data.time", given.time)
+    sigma, used = given.sigma, []
+    if isinstance(sigma, list):  # columns that have the standard errors
+        used = sigma
+        sigma = np.stack([column(columns, "data.sigma", name) for name in used], axis=-1)
+    names = given.columns or [n for n in columns if n not in (given.time, *used)]
+    require(names, "data.columns", "no column remains", f"out of {one_of(columns)}")
+    observed = _joined(columns, names, len(ts))
+    observe = _observe(given.observe, loader)
+    if observe in _NAMED:
+        wanted = (2 * int(np.prod(shape)),) if observe == "state" else shape
+        size, needed = observed[0].size, int(np.prod(wanted))
+        seen = f"{size} numbers for each time ({', '.join(names)})"
+        allowed = f"{needed}: the {observe} of a state whose q has shape {shape}"
+        require(size == needed, "data.columns", seen, allowed)
+        observed = observed.reshape(len(observed), *wanted)
+    if sigma is not None and np.ndim(sigma):  # one for all columns, or one for each
+        flat = observed.reshape(len(observed), -1)
+        fits = sigma.shape[-1] in (1, flat.shape[1])
+        allowed = f"one for all, or {len(names)}, one for each column"
+        require(fits, "data.sigma", f"{sigma.shape[-1]} of them", allowed)
+        sigma = np.broadcast_to(sigma, flat.shape).reshape(observed.shape)
+    fits, allowed = len(ts) > 1 or t0 is not None, "two times at least, or t0 before it"
+    require(fits, "data.file", "one observation", allowed)
+    try:
+        return dvi.Observations(ts, observed, observe, sigma=sigma, t0=t0), names
+    except (TypeError, ValueError) as error:
+        key = "data.time" if str(error).startswith("ts") else "data"
+        allowed = f"finite times in order in the column {given.time}, values that fit observe, "
+        allowed += "positive standard errors"
+        raise InputError(key, str(error), allowed) from None
+
+
+def _observe(text: str, loader: Loader) -> Any:
+    """The name of what was observed, or a function of the user's file."""
+    if ":" not in text:
+        known("data.observe", text, _NAMED, '{}; or "file.py:name"')
+        return text
+    function = loader.load("data.observe", text)
+    require(callable(function), "data.observe", shown(text), "a function (t, q, p, args)")
+    return function
+
+
+def _joined(columns: dict[str, np.ndarray], names: list[str], rows: int) -> np.ndarray:
+    """The columns next to one another; one of an npz alone has the shape of q."""
+    parts = [column(columns, "data.columns", name) for name in names]
+    for part, name in zip(parts, names, strict=True):
+        allowed = f"as many as there are times, {rows}"
+        require(len(part) == rows, "data.columns", f"{name} has {len(part)} rows", allowed)
+    if len(parts) == 1 and parts[0].ndim > 1:
+        return parts[0]
+    return np.concatenate([part.reshape(rows, -1) for part in parts], axis=1)
+
+
+# Results
+
+
+def _trajectory(
+    model: dvi.Model, data: dvi.Observations, found: dvi.FitResult
+) -> tuple[dict[str, Any], str]:
     """The fitted trajectory from the start to the last observation, and its status."""
-    spec = problem.model(found.params)
-    t0, h = problem.data.t0, spec["h"]
-    assert t0 is not None
-    steps = max(1, int(np.ceil((problem.data.ordered().ts[-1] - t0) / h - 1e-9)))
+    spec = model(found.params)
+    steps = max(1, int(np.ceil((data.ts[-1] - data.t0) / spec["h"] - 1e-9)))
     save = dvi.Save(every=-(-steps // _MOST), final=True)
-    solution = dvi.integrate(**spec, t0=t0, num_steps=steps, save=save, throw=False)
+    solution = dvi.integrate(**spec, t0=data.t0, num_steps=steps, save=save, throw=False)
     return {n: np.asarray(getattr(solution, n)) for n in ("ts", "qs", "ps")}, solution.status
 
 
-def _contents(problem: FitProblem, found: dvi.FitResult) -> dict[str, Any]:
+def _contents(arguments: dict[str, Any], found: dvi.FitResult) -> dict[str, Any]:
     # The numbers of the start in the order of their names: that of JAX's leaves.
-    start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(problem.params)])
+    start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(arguments["params"])])
     return {
         "status": found.status,
         "message": str(dvi.FIT_RESULTS[found.result]),
@@ -109,26 +242,18 @@ def _contents(problem: FitProblem, found: dvi.FitResult) -> dict[str, Any]:
         },
         "correlations": {"names": found.names, "matrix": found.correlations},
         "chi2": found.chi2 if found.has_errors else None,
-        "prior_chi2": found.prior_chi2,
         "reduced_chi2": found.reduced_chi2 if found.has_errors else None,
-        "rms": found.rms,
-        "explained": found.explained,
         "values": found.num_observed,
-        "missing": int(np.isnan(problem.data.values).sum()),
-        "degrees_of_freedom": found.degrees_of_freedom,
+        "missing": int(np.isnan(arguments["data"].values).sum()),
         "residuals": found.statistics(),
-        "curvature": found.curvature,
-        "undetermined": found.undetermined,
-        "at_bounds": found.at_bounds,
         "steps": len(found.history["loss"]),
-        "seconds": found.seconds,
-        "columns": problem.columns,
+        **{name: getattr(found, name) for name in _AS_THEY_ARE},
     }
 
 
 def _tables(found: dvi.FitResult, contents: dict[str, Any]) -> list[Table]:
     values = zip(contents["parameters"].items(), numbers_in_words(found), strict=True)
-    rows = [[name, words, f"{known['start']:.6g}"] for (name, known), words in values]
+    rows = [[name, words, f"{p['start']:.6g}"] for (name, p), words in values]
     tables = [Table("Parameters, ± standard error", ["name", "value", "start"], rows)]
     if len(found.names) > 1:
         tables.append(_correlation_table(found.names, found.correlations))
@@ -183,25 +308,14 @@ def _notes(found: dvi.FitResult) -> list[str]:
     return notes
 
 
-def _failure(found: dvi.FitResult, contents: dict[str, Any]) -> str:
-    if found.status != "converged":
-        return (
-            f"the fit did not converge ({found.status} after {contents['steps']} steps). "
-            f"{contents['message']}\nIts results so far have been written."
-        )
-    status = contents["trajectory"]
-    failed = f"the fitted trajectory fails ({status}). The results have been written."
-    return "" if status == "successful" else failed
-
-
-def _pictures(problem: FitProblem, found: dvi.FitResult) -> dict[str, Callable[[], Any]]:
+def _pictures(columns: list[str], found: dvi.FitResult) -> dict[str, Callable[[], Any]]:
     """File name → function that draws, for the pictures that this fit can have."""
     pictures: dict[str, Callable[[], Any]] = {
-        "data.png": partial(plot.fit_against_data, found, names=problem.columns),
-        "residuals.png": partial(plot.fit_residuals, found, names=problem.columns),
+        "data.png": partial(plot.fit_against_data, found, names=columns),
+        "residuals.png": partial(plot.fit_residuals, found, names=columns),
         "learning.png": partial(plot.learning_curve, found),
     }
-    known = [n for n, s in zip(found.names, found.sigma, strict=True) if 0 < s < np.inf]
-    if len(known) > 1:
-        pictures["parameters.png"] = partial(plot.fit_corner, found, known[:_CORNER])
+    finite = [n for n, s in zip(found.names, found.sigma, strict=True) if 0 < s < np.inf]
+    if len(finite) > 1:
+        pictures["parameters.png"] = partial(plot.fit_corner, found, finite[:_CORNER])
     return pictures

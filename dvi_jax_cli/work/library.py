@@ -32,8 +32,9 @@ def library_tables(name: str | None = None) -> tuple[str, list[Table]]:
     for what in ("force", "perturbation"):
         if (function := getattr(problem.system, what)) is not None:
             heading += f"\nPerturbation ε·{what}: {_first_line(function)}"
-    meanings, observables = problem.parameters, problem.observables.items()
-    args = [[k, _short(x), meanings.get(k, "")] for k, x in (problem.args or {}).items()]
+    meanings, args = problem.parameters, problem.args or {}
+    args = [[key, _short(x), meanings.get(key, "")] for key, x in args.items()]
+    observables = problem.observables.items()
     observed = [[key, _conserved(problem, key), _first_line(f)] for key, f in observables]
     symmetries = [[key, "of the map and of the flow"] for key in problem.symmetries]
     symmetries += [[key, "of the flow"] for key in problem.flow_symmetries]

@@ -42,21 +42,17 @@ def _observable(key: str, text: str, names: dict[str, Callable], source: Source)
         known(key, found[1], [*reductions, *indicators], "a reduction: {}", repr(text))
         wrap, inner = reductions[found[1]], found[2].strip()
     if ":" in inner:
-        return wrap(_function(key, inner, source))
+        function = source.loader.load(key, inner)
+        seen = f"{inner!r} is {type(function).__name__}"
+        require(callable(function), key, seen, _A_FUNCTION)
+        # An energy has `bind` and is called with the system.
+        if not hasattr(function, "bind") and not accepts(function, 7):
+            raise InputError(key, f"{inner!r} takes {inspect.signature(function)}", _A_FUNCTION)
+        return wrap(function)
     calls = ", ".join(f"{name}()" for name in indicators)
     allowed = f'{{}}; or "file.py:name"; alone or in {", ".join(reductions)}; or {calls}'
     known(key, inner, names, allowed, repr(inner))
     return wrap(names[inner])
-
-
-def _function(key: str, text: str, source: Source) -> Any:
-    function = source.loader.load(key, text)
-    seen = f"{text!r} is {type(function).__name__}"
-    require(callable(function), key, seen, _A_FUNCTION)
-    # An energy has `bind` and is called with the system.
-    if not hasattr(function, "bind") and not accepts(function, 7):
-        raise InputError(key, f"{text!r} takes {inspect.signature(function)}", _A_FUNCTION)
-    return function
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,7 @@ class Observed:
 
     - `start`: its value at the start. `values`: at the saved times, the start first, shape
       (S, …), for one without a reduction; else the reduced value.
-    - `scale`: size that changes are divided by; 1 where the start gives none.
+    - `scale`: size that changes are divided by; 1 where the start value is zero or not finite.
     - `reduction`: name of the reduction, or "".
     """
 

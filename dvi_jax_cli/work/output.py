@@ -1,9 +1,9 @@
-"""The directory of results, what describes them, and the report for the reader."""
+"""The report of the work, and the directory of its results."""
 
 import json
 import platform
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-import dvi_jax as dvi
 from dvi_jax import plot
 
 from .._errors import InputError, reason, require
@@ -29,7 +28,7 @@ class Report:
     - `message`: why the work failed, or "". `folder`, `files`: where the results are.
     """
 
-    contents: dict[str, Any]
+    contents: dict[str, Any] = field(default_factory=dict)
     tables: list[Table] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     summary: str = ""
@@ -43,20 +42,17 @@ class Report:
         return not self.message
 
 
-@dataclass
-class Output:
-    """The directory of the results: `folder`, and the key or option that names it.
+@dataclass(kw_only=True)
+class Output(Report):
+    """A report with files in `folder`.
 
-    - `force`: whether files of earlier results, those in `names`, may be replaced.
-    - `about`: what describes the work. `files`: the names of the files that have been written.
+    - `key`: the key or option that names the folder.
+    - `names`: every file that may be written; these are replaced with `force`, and no other.
     """
 
-    folder: Path
     key: str
     names: tuple[str, ...]
     force: bool = False
-    about: dict[str, Any] = field(default_factory=dict)
-    files: list[str] = field(default_factory=list)
 
     @contextmanager
     def reserved(self) -> Iterator[None]:
@@ -65,20 +61,20 @@ class Output:
         **Raises** `InputError` where it cannot be made, or has files.
         """
         allowed = "a directory that does not exist or is empty; with --force, one to write into"
-        folder = self.folder
+        folder, is_new = self.folder, False
         try:
-            is_new = not folder.exists()
-            if is_new:
-                folder.mkdir(parents=True)
-            is_free = not folder.is_dir() or self.force or not any(folder.iterdir())
-        except (OSError, ValueError) as error:
-            raise InputError(self.key, f"{folder}: {reason(error)}", allowed) from None
-        require(folder.is_dir(), self.key, f"{folder} is not a directory", allowed)
-        require(is_free, self.key, f"{folder} exists and is not empty", allowed)
-        try:
+            try:
+                is_new = not folder.exists()
+                if is_new:
+                    folder.mkdir(parents=True)
+                is_free = not folder.is_dir() or self.force or not any(folder.iterdir())
+            except (OSError, ValueError) as error:
+                raise InputError(self.key, f"{folder}: {reason(error)}", allowed) from None
+            require(folder.is_dir(), self.key, f"{folder} is not a directory", allowed)
+            require(is_free, self.key, f"{folder} exists and is not empty", allowed)
             yield
-        except BaseException:
-            if is_new and not any(folder.iterdir()):
+        except BaseException:  # Ctrl-C may come on any line, also right after mkdir
+            if is_new and folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
             raise
 
@@ -115,9 +111,9 @@ class Output:
         """An npz file."""
         np.savez(self.path(name), **arrays)
 
-    def write_json(self, name: str, contents: dict[str, Any]) -> None:
-        """A JSON file; numbers that are not finite are texts, to stay visible."""
-        plain = json_types(contents, str)
+    def write_contents(self, name: str) -> None:
+        """The contents as a JSON file; numbers that are not finite are texts, to stay visible."""
+        plain = json_types(self.contents, str)
         text = json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
         self.path(name).write_text(text + "\n", encoding="utf-8")
 
@@ -144,32 +140,15 @@ def opened(
     about = {kind: str(path), "config": raw, "versions": versions}
     key = "--out" if out is not None else "output.dir"
     folder = Path(out or file.output.dir or f"results/{path.stem}")
-    return file, Output(folder, key, names, force, about)
+    return file, Output(about, folder=folder, key=key, names=names, force=force)
 
 
-def watched(
-    work: Callable[[Callable[[Any], None]], Any],
-    bar: AbstractContextManager[Callable[[Any], None] | None],
-    misfit: Callable[[Exception], InputError],
-) -> tuple[Any, Any]:
-    """What `work` returns, which is called with a function that takes its progress, and the last
-    progress.
+def recorded(last: list[Any], show: Callable[[Any], None] | None) -> Callable[[Any], None]:
+    """A function that takes the progress of work: it is stored in `last`, and shown."""
 
-    **Raises** `misfit` of an exception before the first progress: until then it is the input.
-    """
-    last: list[Any] = []
-    with bar as show:
+    def record(now: Any) -> None:
+        last[:] = [now]
+        if show is not None:
+            show(now)
 
-        def report(now: Any) -> None:
-            last[:] = [now]
-            if show is not None:
-                show(now)
-
-        try:
-            return work(report), last[0] if last else None
-        except (dvi.StoreError, OSError):
-            raise
-        except Exception as error:
-            if last:
-                raise
-            raise misfit(error) from error
+    return record

@@ -45,49 +45,39 @@ def run_file(
 
     **Raises** `InputError` for bad input; nothing is written then.
     """
-    file, output = opened("run", Path(path), out, WRITTEN, force)
-    with output.reserved():
+    file, report = opened("run", Path(path), out, WRITTEN, force)
+    with report.reserved():
         source = find_source(file, Path(path).parent)
-        run = run_arguments(file, source)
-        observe_own = read_observables(file.observables, source)
-        always = {} if source.jd is None else solar.conserved()
+        run = _arguments(file, source)
+        # Those of the file come in the report; the ephemeris is compared with the same in each run.
+        wanted = {"own": read_observables(file.observables, source)}
+        wanted["always"] = {} if source.jd is None else solar.conserved()
         began = time.perf_counter()
-        asked = {"own": observe_own, "always": always}
-        try:
-            found = dvi.integrate(**run, observe=asked, throw=False, progress=progress)
+        allowed = "functions, state and args that fit one another"
+        with source.at_work("system", "integrated", allowed):
+            found = dvi.integrate(**run, observe=wanted, throw=False, progress=progress)
             jax.block_until_ready(found)
-        except Exception as error:  # also whatever a user's function raises while it is traced
-            allowed = "functions, state and args that fit one another"
-            raise source.misfit("system", "integrated", error, allowed) from error
         seconds = time.perf_counter() - began
-    with output.writing():
-        own = observe(run, observe_own, found.observed["own"])
-        contents = output.about | _results(found, own, seconds)
+    with report.writing():
+        own, always = (observe(run, wanted[x], found.observed[x]) for x in ("own", "always"))
+        _describe(report, found, own, seconds)
         arrays = {name: np.asarray(getattr(found, name)) for name in ("ts", "qs", "ps", "hs")}
         values = {f"observed/{name}": np.asarray(found.observed["own"][name]) for name in own}
-        output.write_arrays("trajectory.npz", arrays | values)
-        report = Report(contents, [_table(own)] if own else [], folder=output.folder)
+        report.write_arrays("trajectory.npz", arrays | values)
         ts, qs, ps, _ = arrays.values()
         if source.jd is None:
             pictures = _pictures(source, ts, qs, ps, own)
         else:
-            observed = observe(run, always, found.observed["always"])
-            pictures = solar.report(report, source.jd + (ts - ts[0]), qs, ps, run, observed)
-        output.write_json("report.json", contents)
+            pictures = solar.report(report, source.jd + (ts - ts[0]), qs, ps, run, always)
+        report.write_contents("report.json")
         if file.output.plots:
-            output.draw(pictures)
-    report.files, report.message = output.files, _failure(contents["status"])
-    steps = contents["stats"]["num_steps"]
-    report.summary = f"{steps} steps in {seconds:.1f} s (compilation included)"
+            report.draw(pictures)
     return report
 
 
-def run_arguments(file: RunFile, source: Source) -> dict[str, Any]:
-    """The arguments of `dvi.integrate`, without observables.
-
-    **Raises** `InputError`.
-    """
-    (q0, p0), args = source.state, source.args
+def _arguments(file: RunFile, source: Source) -> dict[str, Any]:
+    """The arguments of `dvi.integrate`, without observables."""
+    q0, p0, args = source.array("q0"), source.array("p0"), source.args
     source.check_start(q0, p0, args)
     method, save = parse_method(file.method), dvi.Save(every=file.output.every, final=True)
     run = {"system": source.system, "q0": q0, "p0": p0, "args": args, "method": method}
@@ -103,43 +93,43 @@ def run_arguments(file: RunFile, source: Source) -> dict[str, Any]:
     return run
 
 
-def _results(found: dvi.Solution, own: dict[str, Observed], seconds: float) -> dict[str, Any]:
+def _describe(
+    report: Report, found: dvi.Solution, own: dict[str, Observed], seconds: float
+) -> None:
+    """Add status, statistics and observables to the report."""
     stats = {name: np.asarray(value) for name, value in found.stats.items()}
-    return {
+    step, steps = int(stats["failed_step"]), int(stats["num_steps"])
+    residual, message = float(stats["failed_residual"]), dvi.RESULTS[found.result]
+    report.contents |= {
         "status": {
             "result": found.status,
-            "message": dvi.RESULTS[found.result],
-            "failed_step": int(stats["failed_step"]),
-            "failed_residual": float(stats["failed_residual"]),
-            "num_steps": int(stats["num_steps"]),
+            "message": message,
+            "failed_step": step,
+            "failed_residual": residual,
+            "num_steps": steps,
         },
         "stats": stats | {"seconds": seconds, "saved": len(found.ts)},
         "results": {name: observed.summary() for name, observed in own.items()},
     }
+    if own:
+        title = "Observables (changes: relative, where the start is not zero)"
+        columns = ["name", "reduction", "start", "end or value", "change"]
+        report.tables.append(Table(title, columns, [_row(*item) for item in own.items()]))
+    report.summary = f"{steps} steps in {seconds:.1f} s (compilation included)"
+    if found.status != "successful":
+        report.message = (
+            f"the trajectory failed at step {step} of {steps} with {found.status} (relative "
+            f"residual {residual:.3g}).\n{message}\nThe results up to that step have been written."
+        )
 
 
-def _failure(status: dict[str, Any]) -> str:
-    if status["result"] == "successful":
-        return ""
-    return (
-        f"the trajectory failed at step {status['failed_step']} of {status['num_steps']} with "
-        f"{status['result']} (relative residual {status['failed_residual']:.3g}).\n"
-        f"{status['message']}\nThe results up to that step have been written."
-    )
-
-
-def _table(observed: dict[str, Observed]) -> Table:
-    rows = []
-    for name, found in observed.items():
-        s = found.summary()
-        if found.reduction:
-            relative = f"{s['relative']:.2e}" if "relative" in s and found.is_relative else ""
-            rows.append([name, found.reduction, "", _number(s["value"], 4), relative])
-        else:
-            change = f"{s['largest_saved_change']:.2e}"
-            rows.append([name, "", _number(s["start"]), _number(s["end"]), change])
-    title = "Observables (changes: relative, where the start is not zero)"
-    return Table(title, ["name", "reduction", "start", "end or value", "change"], rows)
+def _row(name: str, found: Observed) -> list[str]:
+    s = found.summary()
+    if found.reduction:
+        relative = f"{s['relative']:.2e}" if "relative" in s and found.is_relative else ""
+        return [name, found.reduction, "", _number(s["value"], 4), relative]
+    change = f"{s['largest_saved_change']:.2e}"
+    return [name, "", _number(s["start"]), _number(s["end"]), change]
 
 
 def _number(value: Any, most: int = 0) -> str:
@@ -156,10 +146,11 @@ def _pictures(
     source: Source, ts: np.ndarray, qs: np.ndarray, ps: np.ndarray, observed: dict[str, Observed]
 ) -> dict[str, Any]:
     """File name → function that draws: the trajectory, and the changes of the observables."""
-    unit, title = source.units.get("t", ""), source.name.replace("_", " ")
+    units = dict(source.problem.units) if source.problem is not None else {}
+    unit, title = units.get("t", ""), source.name.replace("_", " ")
     time = "t" if unit in ("", "1") else f"t [{unit}]"
-    units = source.units.get("q"), source.units.get("p")
-    drawn = {"trajectory.png": lambda: plot.trajectory(ts, qs, ps, time, *units, title)}
+    of_state = units.get("q"), units.get("p")
+    drawn = {"trajectory.png": lambda: plot.trajectory(ts, qs, ps, time, *of_state, title)}
     series = {}
     for name, found in observed.items():
         if not found.reduction:

@@ -10,12 +10,13 @@ from pydantic import AfterValidator, BeforeValidator, WithJsonSchema, model_vali
 from pydantic.json_schema import models_json_schema
 from typing_extensions import TypeAliasType
 
-from .._errors import known, one_of, require, shown
+from .._errors import require, shown
 from .._names import FILES as KINDS
-from .axis import AN_AXIS, Axis, AxisName, StateOrAxis, SweepParameter, number_or_axis
 from .table import (
-    MISSING,
+    AN_AXIS,
     Array,
+    Axis,
+    AxisName,
     Count,
     Fraction,
     JsonSchema,
@@ -24,15 +25,19 @@ from .table import (
     Number,
     NumberOrArray,
     Scalar,
+    StateOrAxis,
     StepSize,
+    SweepParameter,
     Table,
     Text,
     Two,
     Whole,
     check,
     key,
-    type_in_toml,
+    number_or_axis,
+    type_tag,
     union,
+    union_by_kind,
 )
 
 ARRAY = "an array of finite numbers, or of such arrays with rows of one length"
@@ -203,21 +208,7 @@ class EnergyShellStart(_Start):
     high: Array = key(..., f"a corner of the box of q, {ARRAY}")
 
 
-Start = BoxStart | NormalStart | EnergyShellStart
-_STARTS: dict[str, type[_Start]] = {
-    "halton": BoxStart,
-    "random": BoxStart,
-    "normal": NormalStart,
-    "energy_shell": EnergyShellStart,
-}
-
-
-def _read_start(given: Any) -> Any:
-    """The kind of generated initial conditions decides which other keys there are."""
-    kind = given.get("kind") if isinstance(given, dict) else given
-    require(isinstance(given, dict), "", shown(given), f"a table with kind = {one_of(_STARTS)}")
-    known("kind", str(kind), _STARTS, seen=MISSING if kind is None else repr(kind))
-    return _STARTS[str(kind)].model_validate(given)
+Start = union_by_kind(BoxStart, NormalStart, EnergyShellStart)
 
 
 class SaveEvery(Table):
@@ -241,8 +232,8 @@ class SweepFile(SystemFile, Integration):
     """Many trajectories: the keys of a run with axes in the place of numbers."""
 
     state: SweepState = SweepState()
-    start: Annotated[Start, BeforeValidator(_read_start)] | None = key(
-        None, "initial conditions that are generated"
+    start: Start | None = key(
+        None, "initial conditions: a table with kind = halton, random, normal or energy_shell"
     )
     args: dict[str, SweepParameter] | None = key(
         None, f"{ARGS}; a number may be an axis, {AN_AXIS}"
@@ -288,7 +279,7 @@ Priors = TypeAliasType("Priors", union(array=Two[NumberOrArray], table=dict[str,
 
 def _sigma_tag(value: Any) -> str:
     is_names = isinstance(value, list) and value and isinstance(value[0], str)
-    return "<names>" if is_names else type_in_toml(value)
+    return "<names>" if is_names else type_tag(value)
 
 
 Sigma = union(

@@ -1,8 +1,7 @@
 """The solar system in comparison with the ephemeris that it was started from."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,29 +30,27 @@ _AGAIN = 4 * 365.25  # stretch that is repeated to find the integrator's error [
 _MERCURY = BODIES.index("Mercury")
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """An integration and the ephemeris at the saved times.
-
-    - `years`: since the start, shape (T,). `heliocentric`: positions on ecliptic axes [au],
-      shape (T, bodies, 3).
-    - `errors`: distance between integrated and tabulated heliocentric position [km], shape
-      (T, bodies). `angles`: the same as seen from the Sun [″].
-    - `perihelion`: Mercury's longitude of perihelion, ephemeris minus integration [″], shape (T,).
-    - `slope`, `intercept`: its least-squares line [″/century], [″]; `scatter`: the root mean
-      square about the line [″].
-    - `relativity`: the slope according to general relativity [″/century].
-    """
+class Comparison(NamedTuple):
+    """An integration and the ephemeris at the saved times."""
 
     years: np.ndarray
+    """Since the start, shape (T,)."""
     heliocentric: np.ndarray
+    """Positions on ecliptic axes [au], shape (T, bodies, 3)."""
     errors: np.ndarray
+    """Distance between integrated and tabulated heliocentric position [km], shape (T, bodies)."""
     angles: np.ndarray
+    """The same as seen from the Sun [″]."""
     perihelion: np.ndarray
+    """Mercury's longitude of perihelion, ephemeris minus integration [″], shape (T,)."""
     slope: float
+    """Of its least-squares line [″/century]."""
     intercept: float
+    """Of that line [″]."""
     scatter: float
+    """Root mean square about that line [″]."""
     relativity: float
+    """The slope according to general relativity [″/century]."""
 
 
 def compare(jd: np.ndarray, qs: np.ndarray, ps: np.ndarray, masses: np.ndarray) -> Comparison:
@@ -112,14 +109,12 @@ def own_share(run: dict[str, Any], qs: np.ndarray, ps: np.ndarray) -> float:
         return np.nan
     finer = {"h": run["h"] / 2, "num_steps": 2 * every * count, "save": dvi.Save(every=2 * every)}
     again = dvi.integrate(**run | finer, throw=False)
-    masses = np.asarray(run["args"]["masses"])[:, None]
-
-    def perihelion(q, p):
+    masses, longitudes = np.asarray(run["args"]["masses"])[:, None], []
+    for q, p in ((qs[: count + 1], ps[: count + 1]), (np.asarray(again.qs), np.asarray(again.ps))):
         q, v = (to_ecliptic(x[:, _MERCURY] - x[:, 0]) for x in (q, p / masses))
-        return perihelion_longitude(q, v, float(masses[0, 0] + masses[_MERCURY, 0]))
-
-    whole = perihelion(qs[: count + 1], ps[: count + 1])
-    half = perihelion(np.asarray(again.qs), np.asarray(again.ps))
+        mu = float(masses[0, 0] + masses[_MERCURY, 0])
+        longitudes.append(perihelion_longitude(q, v, mu))
+    whole, half = longitudes
     slope, _, _ = _line(span * np.arange(count + 1) / CENTURY, (half - whole) * _ARCSEC)
     return slope / (1 - 0.5 ** run["method"].order)
 
@@ -199,11 +194,9 @@ def report(
         report.notes.append(note)
     title = f"Ten bodies with {type(run['method']).__name__}"
     title += f", h = {run['h']:g} day" if run["h"] is not None else ""
-    line = (c.perihelion, c.slope, c.intercept)
+    compared = (c.years, c.errors[:, 1:], BODIES[1:], c.perihelion, c.slope, c.intercept)
     return {
         "orbits.png": lambda: plot.planet_orbits(c.heliocentric[:, 1:], BODIES[1:]),
-        "ephemeris.png": lambda: plot.ephemeris_comparison(
-            c.years, c.errors[:, 1:], BODIES[1:], *line
-        ),
+        "ephemeris.png": lambda: plot.ephemeris_comparison(*compared),
         "invariants.png": lambda: plot.conserved(c.years, changes, "years since the start", title),
     }

@@ -5,9 +5,13 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import dvi_jax as dvi
@@ -16,16 +20,21 @@ from dvi_jax.sweep.variables import RESERVED
 
 from .._errors import InputError, require
 from .._show import Table
-from .output import Report, watched
-from .schema import SweepFile
-from .sweep_problem import sweep_problem
-from .table import read_file
+from .expressions import parse_method
+from .observables import read_observables
+from .output import Report, recorded
+from .schema import ARRAY, Pair, SweepFile
+from .system import Source, find_source
+from .table import AN_AXIS, MISSING, Axis, at, axes_in, read_file
 
 _MOST = 10_000_000
 """Numbers up to which results are read again for the table at the end."""
 
 _NOT_OURS = ("config", "config_sha256", "Conventions", "coordinates", "dvi_jax_sweep")
 """Attributes of a store that say how to read it, not where it comes from."""
+
+_KEYS = {"num_steps": "steps"}
+"""Argument of `dvi.sweep` → key of the file, where they differ."""
 
 _ALLOWED = "axes, functions, state and args that fit one another"
 
@@ -54,12 +63,11 @@ def sweep_file(
     folder = Path(store or file.output.store or f"results/{path.stem}.zarr")
     _check_folder(folder, "--store" if store is not None else "output.store", resume)
     source, arguments = sweep_problem(file, path.parent)
-    found, last = watched(
-        lambda report: dvi.sweep(**arguments, store=folder, threads=threads, progress=report),
-        shown_bar(progress),
-        lambda error: source.misfit(str(path), "swept", error, _ALLOWED),
-    )
-    return _finished(found, last)
+    last: list[dvi.SweepProgress] = []
+    with shown_bar(progress) as show, source.at_work(str(path), "swept", _ALLOWED, last):
+        arguments |= {"store": folder, "threads": threads, "progress": recorded(last, show)}
+        result = dvi.sweep(**arguments)
+    return _finished(result, last[0])
 
 
 def sweep_cost(path: str | Path) -> Report:
@@ -70,10 +78,8 @@ def sweep_cost(path: str | Path) -> Report:
     """
     file, _ = read_file(Path(path), SweepFile)
     source, arguments = sweep_problem(file, Path(path).parent)
-    try:
+    with source.at_work(str(path), "swept", _ALLOWED):
         cost = dvi.sweep_cost(**arguments)
-    except Exception as error:
-        raise source.misfit(str(path), "swept", error, _ALLOWED) from error
     contents = dataclasses.asdict(cost) | {"seconds": cost.seconds()}
     return Report(contents, summary=f"{cost}\n\n{cost.table()}")
 
@@ -96,30 +102,33 @@ def _check_folder(folder: Path, key: str, resume: bool) -> None:
 
 def _finished(result: dvi.SweepResult, last: dvi.SweepProgress) -> Report:
     counts, observed = result.status_counts(), _observed(result)
-    contents = {
-        "store": str(result.path),
-        "dims": result.dims,
-        "tasks": {"done": last.tasks_done, "all": last.num_tasks},
-        "trajectories": counts,
-        "seconds": last.seconds,
-        "steps_per_second": last.rate,
-    } | ({"observed": observed} if observed else {})
-    tables = [_status_table(counts)]
+    report = Report(
+        {
+            "store": str(result.path),
+            "dims": result.dims,
+            "tasks": {"done": last.tasks_done, "all": last.num_tasks},
+            "trajectories": counts,
+            "seconds": last.seconds,
+            "steps_per_second": last.rate,
+        },
+        [_status_table(counts)],
+    )
     if observed:
+        report.contents["observed"] = observed
         rows = [[name, *(f"{x:.6g}" for x in of.values())] for name, of in observed.items()]
         title = "Observables of the successful trajectories"
-        tables.append(Table(title, ["name", "min", "median", "max"], rows))
+        report.tables.append(Table(title, ["name", "min", "median", "max"], rows))
     speed = f"{last.seconds:.1f} s (compilation included), {last.rate:.3g} steps/s"
-    summary = (
+    report.summary = (
         f"{last.num_lanes} trajectories in {last.num_tasks} tasks; "
-        f"{speed if last.rate else 'nothing was left to do'}; in {result.path}"
+        f"{speed if last.rate else 'all tasks were done already'}; in {result.path}"
     )
-    return Report(contents, tables, summary=summary)
+    return report
 
 
 def _observed(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
-    """Name → least, median and largest over the successful trajectories. Empty where there is
-    nothing to say, or too much to read."""
+    """Name → least, median and largest over the successful trajectories. Empty without observables,
+    and where there is too much to read."""
     data = result.to_xarray()
     names = [str(n) for n in data.data_vars if str(n).split(".")[0] not in RESERVED]
     if not names or sum(data[name].size for name in names) > _MOST:
@@ -140,7 +149,128 @@ def _observed(result: dvi.SweepResult) -> dict[str, dict[str, float]]:
 def _status_table(counts: dict[str, int]) -> Table:
     total = sum(counts.values())
     rows = [[name, str(n), f"{100 * n / total:.4g} %"] for name, n in counts.items()]
-    return Table("How the trajectories ended", ["status", "trajectories", "share"], rows)
+    return Table("How the trajectories ended", ["status", "trajectories", "fraction"], rows)
+
+
+# The arguments of `dvi.sweep`
+
+
+def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]]:
+    """The source of the system, and the arguments of `dvi.sweep` except for the store.
+
+    **Raises** `InputError`.
+    """
+    source = find_source(file, folder)
+    times = source.times(file)
+    every = getattr(file.save, "every", None)  # None of "final"
+    save = dvi.Save(every=every) if every else dvi.Save(final=True)
+    arguments = {
+        "system": source.system,
+        "lattice": times.pop("lattice"),
+        "args": _parameters(source.args),
+        "method": _methods(file.method),
+        "save": None if file.save is None else save,
+        "observe": _observe(file, source),
+        "lanes_per_task": file.output.lanes_per_task,
+    }
+    arguments |= {name: _for_sweep(_KEYS.get(name, name), value) for name, value in times.items()}
+    arguments |= _initial_conditions(file, source)
+    kinds = (dvi.Axis, dvi.starts.Starts)
+    leaves = jax.tree.leaves(arguments, is_leaf=lambda x: isinstance(x, kinds))
+    seen = "nothing varies, neither this nor another number"
+    allowed = "an axis for some number, or [start]; for one trajectory there is dvi-jax run"
+    require(any(isinstance(x, kinds) for x in leaves), "epsilon", seen, allowed)
+    return source, arguments
+
+
+def _for_sweep(key: str, value: Any) -> Any:
+    """A value with its axes as those of `dvi.sweep`; one without a name has that of the key."""
+    if isinstance(value, list):
+        return [_for_sweep(f"{key}[{i}]", part) for i, part in enumerate(value)]
+    return _axis(key, value, value.all) if isinstance(value, Axis) else value
+
+
+def _axis(key: str, given: Axis, values: Any) -> dvi.Axis:
+    try:
+        return dvi.Axis(given.axis or key.rpartition(".")[2], values, given.units)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{key}.{given.kind}", str(error), AN_AXIS) from None
+
+
+def _parameters(value: Any, key: str = "args") -> Any:
+    """The parameters; an array with axes in it becomes an axis of arrays."""
+    if isinstance(value, dict):
+        return {name: _parameters(inner, f"{key}.{name}") for name, inner in value.items()}
+    axes = axes_in(value) if isinstance(value, list) else []
+    if not axes:
+        return _for_sweep(key, value)
+    seen = [f"{axis.axis} with {len(axis.all)} values" for axis in axes]
+    allowed = "axes of one name and length"
+    require(len({*seen}) == 1, key, f"axes {', '.join(seen)} in one array", allowed)
+    arrays = [np.asarray(at(value, k), float) for k in range(len(axes[0].all))]
+    return _axis(key, axes[0], np.stack(arrays))
+
+
+def _methods(given: Any) -> Any:
+    if isinstance(given, str):
+        return parse_method(given)
+    if isinstance(given, list):
+        return dvi.Axis("method", [parse_method(text) for text in given])
+    return _axis("method", given, [parse_method(text) for text in given.all])
+
+
+def _observe(file: SweepFile, source: Source) -> dict[str, Any] | None:
+    """The observables; one without a reduction is that of the last step."""
+    found = read_observables(file.observables, source)
+    fits, allowed = found or file.save is not None, 'an observable at least, or save = "final"'
+    require(fits, "observables", "nothing would be saved", allowed)
+    reduced = {n: f if isinstance(f, dvi.Reduction) else dvi.Last(f) for n, f in found.items()}
+    return reduced or None
+
+
+def _initial_conditions(file: SweepFile, source: Source) -> dict[str, Any]:
+    """`start`, or `q0` and `p0`, checked for one of the trajectories at least."""
+    if file.start is None:
+        q0, p0 = source.array("q0"), source.array("p0")
+        try:
+            _check(source, q0, p0, 0)
+        except InputError:  # a single one is a trajectory that fails, which is a result
+            _check(source, q0, p0, -1)
+        return {"q0": _for_sweep("state.q0", q0), "p0": _for_sweep("state.p0", p0)}
+    start = _start(file.start, source)
+    t0, args = at(file.t0, 0), at(source.args, 0)
+    try:
+        q0, p0 = (np.asarray(x) for x in start.at(jnp.zeros((), jnp.int32), t0, args))
+    except Exception as error:  # whatever a user's H raises
+        allowed = "an H (t, q, p, args) that fits the box and args"
+        raise InputError("start", source.reported(error), allowed) from error
+    source.check_start(q0, p0, args)
+    return {"start": start}
+
+
+def _check(source: Source, q0: Any, p0: Any, which: int) -> None:
+    """Reject a state of which the first trajectory, or the last, cannot start."""
+    q0, p0 = (np.asarray(at(x, which), float) for x in (q0, p0))
+    source.check_start(q0, p0, at(source.args, which))
+
+
+def _start(given: Any, source: Source) -> dvi.starts.Starts:
+    """Generated initial conditions; normally distributed ones are by default about the system's."""
+    options = {name: getattr(given, name) for name in given.model_fields_set - {"kind"}}
+    for name, value in options.items():
+        if isinstance(value, Pair):
+            options[name] = (value.q, value.p)
+    for name in ("q0", "p0") if given.kind == "normal" else ():
+        if name not in options:
+            require(source.problem, f"start.{name}", MISSING, ARRAY)
+            options[name] = np.asarray(getattr(source.problem, name), float)
+    if "H" in options:
+        options["H"] = source.loader.load("start.H", options["H"])
+    made = getattr(dvi.starts, given.kind.title().replace("_", ""))  # energy_shell → EnergyShell
+    try:
+        return made(**options)
+    except (TypeError, ValueError) as error:
+        raise InputError("start", str(error), f"keys that fit kind = {given.kind}") from None
 
 
 # Stores
@@ -176,7 +306,7 @@ def sweep_status(store: str | Path) -> Report:
         "trajectories_per_second": rate,
         "steps_per_second": speed,
         "seconds_left": left / rate if rate else None,
-        "bytes": sum(_sizes(Path(store))),
+        "bytes": _size(Path(store)),
         "provenance": {k: v for k, v in result.attributes.items() if k not in _NOT_OURS},
     }
     about = [[name, str(value)] for name, value in contents["provenance"].items()]
@@ -213,23 +343,24 @@ def _covered(spans: list[tuple[float, float]]) -> float:
     return total
 
 
-def _sizes(folder: Path) -> Iterator[int]:
+def _size(folder: Path) -> int:
+    """Bytes of all files in a folder."""
+    total = 0
     for root, _, names in os.walk(folder):
         for name in names:
-            try:
-                yield os.stat(Path(root, name)).st_size
-            except FileNotFoundError:  # a temporary file of a process that is working on it
-                continue
+            with suppress(FileNotFoundError):  # a temporary file of a process that is working on it
+                total += os.stat(Path(root, name)).st_size
+    return total
 
 
 def verify_store(store: str | Path, progress: Callable[[int, int], None] | None = None) -> Report:
-    """Read everything in a store again; tasks that are bad are open again after this.
+    """Read everything in a store again; bad tasks are marked as not done.
 
     **Raises** `InputError` where there is no store, `OSError` where it cannot be changed.
     """
     found = _opened(store).verify(progress)
     contents = {"store": str(store), **found._asdict()}
-    summary = f"{store}: {found.sound} tasks are sound, {len(found.bad)} bad, {found.todo} to do"
+    summary = f"{store}: {found.sound} tasks are correct, {len(found.bad)} bad, {found.todo} to do"
     report = Report(contents, summary=summary)
     if found.bad:
         rows = [[str(number), wrong] for number, wrong in found.bad.items()]

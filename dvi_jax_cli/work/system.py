@@ -1,5 +1,7 @@
 """The system of a TOML file, its parameters and state, and the times of the steps."""
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -37,14 +39,24 @@ class Source:
         """The name of the system."""
         return self.problem.name if self.problem is not None else self.file.system
 
-    @property
-    def units(self) -> dict[str, str]:
-        """The units of t, q and p, where they are known."""
-        return dict(self.problem.units) if self.problem is not None else {}
+    @contextmanager
+    def at_work(
+        self, key: str, what: str, allowed: str, begun: Sequence[Any] | None = None
+    ) -> Iterator[None]:
+        """Within this an exception means that the input does not fit: an `InputError`, such as
+        "kepler cannot be integrated: …", whatever a user's function raises while it is traced.
 
-    def misfit(self, key: str, what: str, error: BaseException, allowed: str) -> InputError:
-        """The error of input that does not fit, such as "kepler cannot be integrated: …"."""
-        return InputError(key, f"{self.name} cannot be {what}: {self.reported(error)}", allowed)
+        - `begun`: of work that writes files as it goes on: has an item once the input is known to
+          fit. Errors of files, and all errors after that, are raised as they are.
+        """
+        try:
+            yield
+        except Exception as error:
+            writes = begun is not None and isinstance(error, dvi.StoreError | OSError)
+            if begun or writes:
+                raise
+            seen = f"{self.name} cannot be {what}: {self.reported(error)}"
+            raise InputError(key, seen, allowed) from error
 
     def reported(self, error: BaseException) -> str:
         """An exception in one line, with its place in the user's files."""
@@ -52,7 +64,7 @@ class Source:
 
     @cached_property
     def args(self) -> Any:
-        """The parameters of the system with those of the file in their place."""
+        """The parameters of the system, with those of the file in their place."""
         given, problem = self.file.args, self.problem
         names = problem.args if problem is not None else None
         if given is None or problem is None:
@@ -66,11 +78,6 @@ class Source:
             allowed = "a number or an array; in a sweep also an axis"
             require(fits, f"args.{name}", shown(value), allowed)
         return {**names, **given}
-
-    @cached_property
-    def state(self) -> tuple[Any, Any]:
-        """(q0, p0) of the file, or else of the system."""
-        return self.array("q0"), self.array("p0")
 
     def array(self, name: str) -> Any:
         """q0 or p0 of the file, or else of the system."""
@@ -101,7 +108,7 @@ class Source:
         return h
 
     def times(self, file: RunFile | SweepFile) -> dict[str, Any]:
-        """The arguments of `dvi.integrate` that set the times of the steps."""
+        """The arguments of `dvi.integrate` that set the times of the steps, and ε."""
         if isinstance(file.lattice, Times):
             grid = {"lattice": dvi.Given(file.lattice.times), "h": None, "num_steps": None}
         else:
@@ -129,10 +136,10 @@ def find_source(file: SystemFile, folder: Path) -> Source:
             raise InputError("system", seen, "a function that returns a system") from error
     if isinstance(made, systems.Problem):
         return Source(file, loader, made, made.system)
-    if isinstance(made, dvi.System):
-        return Source(file, loader, None, made)
     allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
-    raise InputError("system", f"{name!r} is {type(made).__name__}", allowed)
+    seen = f"{name!r} is {type(made).__name__}"
+    require(isinstance(made, dvi.System), "system", seen, allowed)
+    return Source(file, loader, None, made)
 
 
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:

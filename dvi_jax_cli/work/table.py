@@ -1,29 +1,32 @@
-"""Tables of TOML files as pydantic models, and errors that name the key with its path."""
+"""Tables of TOML files as pydantic models, errors that name the key with its path, and axes."""
 # pyright: reportInvalidTypeForm=false
 
 import math
+import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar, Union, get_args
 
 import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
     StringConstraints,
     Tag,
     ValidationError,
+    WithJsonSchema,
     model_validator,
 )
 from pydantic.json_schema import GenerateJsonSchema
 from typing_extensions import TypeAliasType
 
-from .._errors import InputError, InputErrors, one_of, shown
+from .._errors import InputError, nearest, one_of, require, shown, toml_type
 
 MISSING = "the key is missing"
 
@@ -40,31 +43,35 @@ class Table(BaseModel):
         extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True
     )
 
+    # Each table converts its own errors, because only here the fields and their descriptions are
+    # known; the table around it then puts its key in front.
     @model_validator(mode="wrap")
     @classmethod
     def _name_the_keys(cls, given: Any, read: Callable[[Any], Any]) -> Any:
         try:
             return read(given)
         except ValidationError as error:
-            raise InputErrors([e for one in error.errors() for e in cls._errors(one)]) from None
+            first, *more = [e for one in error.errors() for e in cls._errors(one)]
+            raise InputError(first.key, first.seen, first.allowed, more) from None
 
     @classmethod
-    def _errors(cls, found: Any) -> Iterator[InputError]:
+    def _errors(cls, found: Any) -> list[InputError]:
         """An error of pydantic as errors with the key, relative to this table."""
-        place, inner = found["loc"], found.get("ctx", {}).get("error")
+        place, kind, context = found["loc"], found["type"], found.get("ctx", {})
+        inner, seen = context.get("error"), shown(found["input"])
         if isinstance(inner, InputError):  # of a table within this one, or of a validator
-            for one in getattr(inner, "found", [inner]):
-                yield InputError(path(place, one.key), one.seen, one.allowed)
-        elif not place:
-            seen, names = shown(found["input"]), one_of(cls.model_fields)
-            yield InputError("", seen, f"a table with the keys {names}")
-        elif found["type"] == "extra_forbidden":
+            return [InputError(path(place, e.key), e.seen, e.allowed) for e in inner.found]
+        if not place:
+            return [InputError("", seen, f"a table with the keys {one_of(cls.model_fields)}")]
+        if kind == "extra_forbidden":
             names = one_of(cls.model_fields, str(place[-1]))
-            yield InputError(path(place), "there is no such key", names)
-        else:
-            seen = MISSING if found["type"] == "missing" else shown(found["input"])
-            allowed = cls.model_fields[str(place[0])].description
-            yield InputError(path(place), seen, allowed or "")
+            return [InputError(path(place), "there is no such key", names)]
+        allowed = cls.model_fields[str(place[0])].description or ""
+        if context.get("discriminator") == "'kind'":  # the key that tells the tables of a union
+            tag, kinds = context.get("tag", ""), context.get("expected_tags", allowed)
+            near = nearest(tag, re.findall(r"\w+", kinds))
+            return [InputError(path(place, "kind"), repr(tag) if tag else MISSING, kinds + near)]
+        return [InputError(path(place), MISSING if kind == "missing" else seen, allowed)]
 
 
 _TAGS = {""}
@@ -101,7 +108,7 @@ def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
         raise InputError(str(file), f"is not TOML: {error}", "https://toml.io") from None
     try:
         return model.model_validate(raw), raw
-    except ValidationError as error:
+    except ValidationError as error:  # pydantic wraps the one of the outermost table
         context: Any = error.errors()[0].get("ctx")
         raise context["error"] from None
 
@@ -128,18 +135,23 @@ class JsonSchema(GenerateJsonSchema):
 # Types of values
 
 
-def type_in_toml(value: Any) -> str:
-    """The tag of a value, by which the types of a union are told apart."""
-    kinds = ((bool, "<boolean>"), (int | float, "<number>"), (str, "<text>"))
-    kinds += ((list, "<array>"), (dict, "<table>"))
-    return next((tag for kind, tag in kinds if isinstance(value, kind)), "<date>")
+def type_tag(value: Any) -> str:
+    """The tag of a value, by which the types of a union are distinguished."""
+    return f"<{toml_type(value).removeprefix('whole ')}>"
 
 
-def union(tag_of: Callable[[Any], str] = type_in_toml, **kinds: Any) -> Any:
+def union(tag_of: Callable[[Any], str] = type_tag, **kinds: Any) -> Any:
     """The union of types: type of a value in TOML, or what `tag_of` returns → type."""
     tagged = [Annotated[kind, Tag(f"<{name}>")] for name, kind in kinds.items()]
     _TAGS.update(f"<{name}>" for name in kinds)
     return Annotated[Union[tuple(tagged)], Discriminator(tag_of)]  # noqa: UP007
+
+
+def union_by_kind(*tables: type[Table]) -> Any:
+    """The union of tables that differ in the values of their key ``kind``."""
+    for table in tables:
+        _TAGS.update(get_args(table.model_fields["kind"].annotation))
+    return Annotated[Union[tables], Discriminator("kind")]  # noqa: UP007
 
 
 def check(is_allowed: Callable[[Any], Any]) -> AfterValidator:
@@ -182,3 +194,137 @@ else:
 """Nested arrays of finite numbers, all rows of one length, as an array of NumPy."""
 
 NumberOrArray = union(number=Number, array=Array)
+
+
+# Axes of a sweep, in the place of numbers
+
+AN_AXIS = "{linspace = [a, b, n]}, {geomspace = [a, b, n]} or {values = […]}"
+KINDS = ("linspace", "geomspace", "values")
+_SPACED = "[first, last, how many]"
+_EACH = "each of which is a value that this key takes without an axis"
+_MOST = 10_000_000
+"""Values of an axis, which are all in memory."""
+
+
+def _spaced(kind: str) -> Callable[[Any], list[float]]:
+    """A reader of ``[first, last, how many]``: the values that this describes."""
+
+    def spaced(given: Any) -> list[float]:
+        types = [type_tag(x) for x in given] if isinstance(given, list) else []
+        fits = types == ["<number>"] * 3 and isinstance(given[2], int) and given[2] >= 1
+        require(fits, "", shown(given), f"{_SPACED}: two numbers and a positive whole number")
+        a, b, n = given
+        most = f"at most {_MOST} values; more are generated by [start]"
+        require(n <= _MOST, "[2]", shown(n), most)
+        fits = kind == "linspace" or a * b > 0
+        require(fits, "", shown(given), f"{_SPACED}, both ends above zero or both below")
+        return getattr(np, kind)(a, b, n).tolist()
+
+    return spaced
+
+
+def _axis_name(name: str) -> str:
+    from dvi_jax.sweep.variables import RESERVED
+
+    allowed = f"a name such as x1, except {', '.join(RESERVED)}"
+    require(name.isidentifier() and name not in RESERVED, "", shown(name), allowed)
+    return name
+
+
+AxisName = Annotated[str, AfterValidator(_axis_name)]
+_THREE = WithJsonSchema(
+    {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
+)
+
+
+class Axis(Table, Generic[V]):
+    """An axis of a sweep: the values that a number takes."""
+
+    linspace: Annotated[list[V], BeforeValidator(_spaced("linspace")), _THREE] | None = key(
+        None, f"{_SPACED}, evenly spaced values, {_EACH}"
+    )
+    geomspace: Annotated[list[V], BeforeValidator(_spaced("geomspace")), _THREE] | None = key(
+        None, f"{_SPACED}, values with one ratio, {_EACH}"
+    )
+    values: Annotated[Many[V], check(lambda all: len({*map(np.shape, all)}) == 1)] | None = key(
+        None, f"an array of at least one value, values of one shape, {_EACH}"
+    )
+    axis: AxisName | None = key(None, "a name for this axis, by default the key")
+    units: str = key("", 'text such as "m/s"')
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Any:
+        given = {name: getattr(self, name) for name in self.model_fields_set}
+        require(len(given.keys() & {*KINDS}) == 1, "", shown(given), f"one of {AN_AXIS}")
+        return self
+
+    @classmethod
+    def model_parametrized_name(cls, params: Any) -> str:
+        """The name in a JSON schema, without the type of the values."""
+        return cls.__name__
+
+    @property
+    def kind(self) -> str:
+        """The key that has the values."""
+        return next(kind for kind in KINDS if getattr(self, kind) is not None)
+
+    @property
+    def all(self) -> list[Any]:
+        """The values."""
+        return getattr(self, self.kind)
+
+
+class NamedAxis(Axis[V], Generic[V]):
+    """An axis of a sweep that has no key of its own to be named after."""
+
+    axis: AxisName = key(..., 'a name for this axis, such as axis = "x"')
+
+
+def number_or_axis(number: Any, of_axis: Any = None) -> Any:
+    """A number or an axis of them."""
+    return union(number=number, table=Axis[of_axis or number])
+
+
+def at(value: Any, which: int) -> Any:
+    """An argument with every axis in it at one of its values."""
+    if isinstance(value, Axis):
+        return value.all[which]
+    if isinstance(value, dict):
+        return {name: at(v, which) for name, v in value.items()}
+    return [at(v, which) for v in value] if isinstance(value, list) else value
+
+
+def axes_in(value: Any) -> list[Axis]:
+    """The axes in an argument."""
+    if isinstance(value, Axis):
+        return [value]
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return [axis for part in parts for axis in axes_in(part)]
+
+
+# Arrays and parameters with axes
+
+
+def _array_or_axes(components: list[Any]) -> Any:
+    """An array, or nested lists with axes in them; `ValueError` for rows of unequal length."""
+    array = np.asarray(at(components, 0), float)
+    return components if axes_in(components) else array
+
+
+Component = TypeAliasType(
+    "Component", union(number=Number, table=NamedAxis[Number], array=Many["Component"])
+)
+Components = Annotated[Many[Component], AfterValidator(_array_or_axes)]
+StateOrAxis = union(array=Components, table=NamedAxis[Array])
+
+
+def _parameter_tag(value: Any) -> str:
+    is_axis = isinstance(value, dict) and any(name in value for name in (*KINDS, "axis"))
+    return "<axis>" if is_axis else type_tag(value)
+
+
+_Single = union(number=Scalar, array=Array)
+_KINDS = {"boolean": bool, "number": Scalar, "array": Components, "axis": Axis[_Single]}
+SweepParameter = TypeAliasType(
+    "SweepParameter", union(_parameter_tag, **_KINDS, table=dict[str, "SweepParameter"])
+)

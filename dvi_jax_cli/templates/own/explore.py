@@ -24,10 +24,8 @@ settings = {"h": 0.05, "args": {"mass": 1.0, "stiffness": 1.0}, "method": dvi.St
 
 # %%
 observe = {"energy": dvi.Range(energy), "angular momentum": dvi.MaxDrift(angular_momentum)}
-save = dvi.Save(every=4)
-solution = dvi.integrate(
-    system, q0, p0, num_steps=4000, epsilon=0.05, save=save, observe=observe, **settings
-)
+run = settings | {"num_steps": 4000, "epsilon": 0.05, "save": dvi.Save(every=4)}
+solution = dvi.integrate(system, q0, p0, observe=observe, **run)
 print(solution.status, solution.observed)
 plot.orbit(solution)
 
@@ -46,10 +44,8 @@ def modified_energy(t0, t1, q0, p0, q1, p1, args):
 
 
 epsilons = np.geomspace(1e-4, 1e-2, 5)
-type_ii = settings | {"method": dvi.TypeII()}
-order = dvi.drift_order(
-    system, modified_energy, q0, p0, epsilons=epsilons, num_steps=1000, **type_ii
-)
+run = settings | {"method": dvi.TypeII(), "num_steps": 1000}
+order = dvi.drift_order(system, modified_energy, q0, p0, epsilons=epsilons, **run)
 print(order)
 
 # %% [markdown]
@@ -60,10 +56,8 @@ print(order)
 
 # %%
 def last(epsilon):
-    save = dvi.Save(final=True)
-    return dvi.integrate(system, q0, p0, num_steps=400, epsilon=epsilon, save=save, **settings).qs[
-        -1, 0
-    ]
+    run = settings | {"num_steps": 400, "save": dvi.Save(final=True)}
+    return dvi.integrate(system, q0, p0, epsilon=epsilon, **run).qs[-1, 0]
 
 
 slope = jax.grad(last)(0.05)
@@ -77,9 +71,6 @@ print(slope)
 
 # %%
 x = dvi.Axis("x", np.linspace(0.2, 1.2, 24), units="m")
-epsilons = np.geomspace(1e-3, 1e-1, 12)
-observe = {"energy_drift": dvi.MaxDrift(energy)}
-many = dvi.sweep(
-    system, [x, 0.0], p0, num_steps=1000, epsilon=epsilons, observe=observe, **settings
-)
+run = settings | {"num_steps": 1000, "epsilon": np.geomspace(1e-3, 1e-1, 12)}
+many = dvi.sweep(system, [x, 0.0], p0, observe={"energy_drift": dvi.MaxDrift(energy)}, **run)
 plot.sweep_map(many.to_xarray().energy_drift, x="epsilon", y="x")
