@@ -130,7 +130,7 @@ def test_a_section_and_a_bifurcation_are_drawn():
     assert drawn == 8 * 50
     texts = [t.get_text() for of in (axis.get_legend(), *axis.figure.legends) if of
              for t in of.get_texts()]  # fmt: skip
-    assert not any("more often" in t for t in texts)
+    assert not any("more than" in t for t in texts)
     axis = plot.bifurcation(np.arange(8.0), found)
     assert sum(len(c.get_offsets()) for c in axis.collections) == 8 * 50
     plot.plt.close("all")
