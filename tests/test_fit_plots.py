@@ -50,9 +50,6 @@ def points(axis):
     return [np.asarray(line.get_xydata()) for line in axis.lines if line.get_marker() != "None"]
 
 
-# --- residuals -----------------------------------------------------------------------------------
-
-
 def test_residuals_are_drawn_at_their_times_next_to_their_distribution():
     fit = made()
     fit.whitened[0][7, 1] = -12.0  # an outlier stays in the picture
@@ -104,9 +101,6 @@ def test_the_sign_that_the_label_says_is_that_of_a_real_fit():
     last = points(plot.fit_residuals(fit)[0])[0][-1, 1]
     np.testing.assert_allclose(last, (fit.observed[0] - fit.predicted[0])[-1, 0] / 0.1)
     assert last > 3
-
-
-# --- covariance ----------------------------------------------------------------------------------
 
 
 def edge(ellipse):
@@ -189,9 +183,6 @@ def test_what_is_not_determined_is_named():
     assert plot.fit_corner(fit, ["args.mu", "q0[0]"]).shape == (2, 2)
 
 
-# --- data, history -------------------------------------------------------------------------------
-
-
 def bars(axis):
     """Half lengths of the error bars of each set of data, without those that have none."""
     return [
@@ -266,9 +257,6 @@ def test_pictures_of_ones_own_have_their_legends_within_the_axes(tmp_path):
         figure.canvas.draw()
         assert all(lies_within(axis.get_legend(), axis) for axis in axes[:3])
         assert plot.save(figure, tmp_path / "fit.png").stat().st_size > 10_000
-
-
-# --- what is rejected ---------------------------------------------------------------------------
 
 
 def test_invalid_input_is_rejected():

@@ -64,15 +64,13 @@ def arrays(lanes=None, n=1, steps=50, shape=None):
     radii = np.arange(1, (lanes or 1) + 1)[:, None, None] * np.ones(n)
     q, p = radii * np.cos(t)[:, None], -radii * np.sin(t)[:, None]
     ts = np.broadcast_to(t, (lanes or 1, steps))
-    found = (ts, q, p) if shape is None else (ts, *(x.reshape(*ts.shape, *shape) for x in (q, p)))
+    found = ts, *(x.reshape(*ts.shape, *(shape or (n,))) for x in (q, p))
     return found if lanes else tuple(x[0] for x in found)
 
 
 def drawn_lines(axis):
     return [line for line in axis.lines if line.get_linestyle() != "None"]
 
-
-# --- the style ----------------------------------------------------------------------------------
 
 # Machado, Oliveira & Fernandes 2009, IEEE Trans. Vis. Comput. Graph. 15, 1291: severity 1, in
 # linear RGB, row by row.
@@ -115,31 +113,24 @@ def test_colours_differ_and_shades_grow_lighter_for_all_eyes(sight):
 
 
 def test_lines_differ_in_a_black_and_white_print():
+    """By dash and marker; dashes of orbits that retrace themselves overlap, and markers do not."""
     assert (np.diff(lab(plot.COLOURS, "normal")[:5, 0]) > 3).all()
     assert len(set(plot.DASHES)) == len(plot.DASHES) == len(plot.COLOURS)
     assert len(set(MARKERS)) >= len(plot.COLOURS)
-    drawn = drawn_lines(plot.phase_portrait(arrays(5)))
+    axis = plot.phase_portrait(arrays(5, steps=4001), labels=list("abcde"))
+    drawn = drawn_lines(axis)
     assert len({str(line._dash_pattern) for line in drawn}) == 5
-    assert len({line.get_marker() for line in drawn}) == 5
     assert [line.get_color() for line in drawn] == list(plot.COLOURS[:5])
-
-
-def test_orbits_that_retrace_themselves_differ_by_markers():
-    """Dashes of many turns overlap; markers at different places do not."""
-    t = np.linspace(0, 80 * np.pi, 4001)
-    q, p = (np.stack([k * f(t) for k in (1, 2, 3)])[..., None] for f in (np.cos, np.sin))
-    axis = plot.phase_portrait((np.broadcast_to(t, (3, 4001)), q, -p), labels=["a", "b", "c"])
-    marks = [line.get_marker() for line in drawn_lines(axis)]
-    assert len(set(marks)) == 3
+    marks = [line.get_marker() for line in drawn]
+    assert len(set(marks)) == 5
     assert not {"None", "o", "x"} & set(marks)
-    assert [h.get_marker() for h in axis.figure.legends[0].legend_handles[:3]] == marks
-    for line in drawn_lines(axis):
-        first, step = line.get_markevery()
-        assert 8 <= len(range(first, 4001, step)) <= 10
-    eight = np.stack([np.cos(t), np.sin(2 * t)] * 3, 1).reshape(-1, 3, 2)
-    bodies = drawn_lines(plot.orbit((t, eight), names=["A", "B", "C"]))
+    assert [h.get_marker() for h in axis.figure.legends[0].legend_handles[:5]] == marks
+    bodies = drawn_lines(plot.orbit(arrays(n=6, shape=(3, 2), steps=4001)[:2]))
     assert len({line.get_marker() for line in bodies}) == 3
-    assert len({line.get_markevery() for line in bodies}) == 3
+    for some in (drawn, bodies):
+        assert len({line.get_markevery() for line in some}) == len(some)
+        for first, step in (line.get_markevery() for line in some):
+            assert 8 <= len(range(first, 4001, step)) <= 10
     for plain in (plot.phase_portrait(arrays()), plot.phase_portrait(arrays(9))):
         assert {x.get_marker() for x in drawn_lines(plain)} == {"None"}
 
@@ -190,9 +181,6 @@ def test_an_envelope_keeps_the_extremes_and_the_gaps():
     assert np.isnan(b).sum() == 1
     assert (a[0], a[-1]) == (0, x[-1])
     same(envelope(x[:50], y[:50])[1], y[:50])
-
-
-# --- the axes -----------------------------------------------------------------------------------
 
 
 def pictures(single):
@@ -288,9 +276,6 @@ def test_unknown_keywords_are_rejected_with_those_that_there_are():
     ):
         match = f"unknown keyword '{wrong}': there are {known}"
         refuses(draw, (args, {wrong: 1}, match, TypeError))
-
-
-# --- orbits -------------------------------------------------------------------------------------
 
 
 def test_a_phase_portrait_draws_the_states_as_they_are(single):
@@ -461,9 +446,6 @@ def test_a_long_line_is_drawn_whole_in_pieces():
     drawn = lines(plot.phase_portrait(arrays(steps=50_001)))
     assert [xy.shape[1] for xy in drawn] == [20_001, 20_001, 10_001]
     same(drawn[1][:, 0], drawn[0][:, -1])
-
-
-# --- along time ---------------------------------------------------------------------------------
 
 
 def test_invariants_are_changes_since_the_first_value(single):
@@ -643,9 +625,6 @@ def test_indicators_count_values_without_a_place_each_by_its_reason():
     assert plot.indicator(t, -t).get_yscale() == "linear"
 
 
-# --- sections -----------------------------------------------------------------------------------
-
-
 def crossings(counts, *statuses, room=5, n=2):
     """`Crossings` of orbits that crossed so often, or a `PoincareSection` with these statuses."""
     rows = np.arange(room) < np.minimum(np.asarray(counts), room)[:, None]
@@ -803,8 +782,6 @@ def test_a_bifurcation_has_a_column_of_points_for_each_parameter():
     )
 
 
-# --- cost, orders, frequencies ------------------------------------------------------------------
-
 COST = 10.0 ** np.arange(1, 6)
 FLAT = [1e-3, 1e-5, 1e-7, 1.1e-7, 1.3e-7]  # round-off after three runs
 
@@ -940,9 +917,6 @@ def test_a_resonance_has_its_name_where_its_line_leaves_the_picture(x, y, k, edg
     assert low <= at_y <= high
 
 
-# --- films --------------------------------------------------------------------------------------
-
-
 def frames(path):
     """Pictures and delays [ms] of a GIF."""
     image = Image.open(path)
@@ -1072,9 +1046,6 @@ def test_an_mp4_is_written_if_ffmpeg_is_installed(tmp_path):
     path = plot.animate(arrays(n=2), tmp_path / "a.mp4", seconds=0.5, fps=10, size=(3, 3), dpi=50)
     assert path.read_bytes()[4:8] == b"ftyp"
     assert path.stat().st_size > 2000
-
-
-# --- documentation ------------------------------------------------------------------------------
 
 
 def test_the_gallery_rejects_an_unknown_picture_before_it_draws(tmp_path, monkeypatch, capsys):

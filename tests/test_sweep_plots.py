@@ -56,9 +56,6 @@ def colour_at(axis, x, y):
     return picture[picture.shape[0] - 1 - round(row), round(column), :3]
 
 
-# --- what is drawn ---------------------------------------------------------------------------
-
-
 def test_the_numbers_and_their_places():
     axis = plot.sweep_map(drift())
     np.testing.assert_array_equal(array_of(axis), drift().values.T)
@@ -158,9 +155,6 @@ def test_a_picture_of_ones_own_has_its_legends_within_the_axes(tmp_path):
         assert plot.save(figure, tmp_path / "maps.png").stat().st_size > 10_000
 
 
-# --- cells without a number ---------------------------------------------------------------------
-
-
 def test_maps_have_the_colours_that_are_measured():
     data = with_status()
     maps = plot.sweep_map(data.drift), plot.slope_map(data.drift, x="epsilon", y="x")
@@ -220,9 +214,6 @@ def test_a_single_failure_is_not_hidden_in_its_pixel():
     assert texts(axis) == ["not computed: 60 of 2400 (2.5 %)"]
 
 
-# --- slopes ------------------------------------------------------------------------------------
-
-
 def test_fitted_slopes_against_polyfit():
     noisy = drift(2) * np.exp(0.3 * RNG.normal(size=drift().shape))
     noisy[1, 2], noisy[4, 2], noisy[2, 0] = np.nan, 0.0, -1.0
@@ -264,9 +255,6 @@ def test_slopes_over_two_dimensions():
     np.testing.assert_allclose(array_of(plot.slope_map(data)), np.broadcast_to(orders, (5, 3)))
     axis = plot.slope_map(data, x="k", over="x", reduce="median")
     np.testing.assert_allclose(axis.lines[0].get_ydata(), orders)
-
-
-# --- more points than pixels -------------------------------------------------------------------
 
 
 class Counted(BackendArray):
@@ -436,9 +424,6 @@ def test_a_store_is_read_in_blocks(tmp_path, monkeypatch):
     plot.failure_map(data, pixels=(20, 5))
     plot.slope_map(data.drift, pixels=(20, 5), local=True)
     assert max(r.size for r in read) == 200  # lines along ε are whole
-
-
-# --- what is rejected ---------------------------------------------------------------------------
 
 
 def test_invalid_input_is_rejected():

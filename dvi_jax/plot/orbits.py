@@ -11,17 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from .._checks import positive, whole
 from .axes import at_most, canvas, entry, labels_of, legend, path, stack
-from .states import (
-    Lane,
-    Looks,
-    chosen,
-    lanes_of,
-    looks_of,
-    one_shape,
-    place_in,
-    subscript,
-    troubles,
-)
+from .states import Lane, Looks, chosen, indexed, lanes_of, looks_of, one_shape, place_in, troubles
 from .style import COLOURS, CROSS, DASHES, MARKS, STAR, START, in_style, look_of, named
 
 _PANELS, _MARKS, _MESH, _NARROW = 6, 9, 161, 0.45
@@ -230,7 +220,7 @@ class Plane(NamedTuple):
 
     def name_axes(self, axis: Any, units: Mapping[str, str]) -> None:
         for which, name in (("x", "q"), ("y", "p")):
-            label = named(subscript(name, self.place, self.shape), units.get(name))
+            label = named(indexed(name, self.place, self.shape), units.get(name))
             axis.set(**{f"{which}label": label})
 
 
@@ -265,7 +255,7 @@ class View(NamedTuple):
     def name_axes(self, axis: Any, units: Mapping[str, str]) -> None:
         """Set the names of the axes, and one scale for all."""
         for which, c in zip("xyz", self.coordinates, strict=False):
-            name = "xyz"[c] if self.many else subscript("q", (c,), (2,))
+            name = "xyz"[c] if self.many else indexed("q", (c,), (2,))
             if self.about is not None:
                 name += f" − {name}$_{{{self.about + 1}}}$"
             axis.set(**{f"{which}label": named(name, units.get("q"))})

@@ -11,19 +11,7 @@ from matplotlib.patches import Patch
 from ..discover import DriftOrder, DriftSurface
 from . import axes as draw
 from .axes import canvas, counted, entry, legend, stack
-from .style import (
-    COLOURS,
-    DASHES,
-    GUIDE,
-    HATCH,
-    MARKERS,
-    SHADES,
-    SMALL,
-    ZERO,
-    in_style,
-    named,
-    signed,
-)
+from .style import COLOURS, DASHES, MARKERS, SMALL, ZERO, in_style, named, signed
 
 _HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++++")
 _CAUSES = ("symmetry", "work", "lattice")
@@ -142,7 +130,7 @@ def drift_orders(
     axis.set(xscale="log", yscale="log", xlabel="ε", ylabel="largest drift", title=title)
     marks: Any = {"color": "#444444", "ls": "none"}
     hollow = marks | {"marker": "o", "mfc": "white"}
-    extra = [entry("expected slope", **GUIDE)] if promised is not None else []
+    extra = [entry("expected slope", **draw.GUIDE)] if promised is not None else []
     extra += [entry("excluded from the fit", **hollow)] if excluded else []
     extra.append(entry("at ε = 0", **marks | _BAR))
     extra += draw.without_place_entries(lost, total, "drifts failed", "drifts are exactly 0")
@@ -197,7 +185,7 @@ def _draw_drifts(axis: Any, surface: DriftSurface, edges: Any) -> list[Any]:
     zero, failed = drifts == 0, ~np.isfinite(drifts)
     norm = None if (zero | failed).all() else LogNorm()
     x, y = edges
-    image = draw.cells(axis, x, y, np.where(zero, np.nan, drifts).T, norm, SHADES)
+    image = draw.cells(axis, x, y, np.where(zero, np.nan, drifts).T, norm, draw.SHADES)
     axis.figure.colorbar(image, ax=axis, label="largest drift")
     draw.flat_cells(axis, x, y, zero.T, ZERO)
     entries: list[Any] = []
@@ -207,7 +195,7 @@ def _draw_drifts(axis: Any, surface: DriftSurface, edges: Any) -> list[Any]:
         look |= {"mew": 0.8, "label": "excluded from the fit"}
         entries += axis.plot(surface.epsilons[i], surface.hs[j], "o", **look)
     black: dict[str, Any] = {"color": ZERO}
-    for where, text, look in ((zero, "exactly 0", black), (failed, "failed", HATCH)):
+    for where, text, look in ((zero, "exactly 0", black), (failed, "failed", draw.HATCH)):
         counts = counted({f"of {drifts.size} {text}": where.sum()})
         entries += [Patch(label=label, **look) for label in counts]
     return entries
@@ -228,7 +216,7 @@ def _draw_orders_in_epsilon(axis: Any, surface: DriftSurface, promised: float | 
             bars = [y - low[here], high[here] - y]
             axis.errorbar(surface.hs[here], y, yerr=bars, fmt="o", **look)
     if promised is not None:
-        axis.axhline(promised, label="expected", **GUIDE)
+        axis.axhline(promised, label="expected", **draw.GUIDE)
         axis.set_ylim(
             np.min(low[measured] - 0.05, initial=promised - 0.1),
             np.max(high[measured] + 0.05, initial=promised + 0.1),

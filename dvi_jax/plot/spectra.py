@@ -10,19 +10,7 @@ from matplotlib.patches import Patch
 from . import axes as draw
 from .axes import canvas, check_shapes, counted, labels_of, legend
 from .states import looks_of
-from .style import (
-    COLOURS,
-    DASHES,
-    GREY,
-    HATCH,
-    MARKERS,
-    PALE,
-    SHADES,
-    SMALL,
-    in_style,
-    named,
-    signed,
-)
+from .style import COLOURS, DASHES, GREY, MARKERS, SMALL, in_style, named, signed
 
 _PERCENTILES = (2, 98)
 """Range of the colours, so that a few extreme values do not determine it."""
@@ -140,9 +128,9 @@ def _draw_plane(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, list
     for name, values in (("x", x), ("y", y)):
         if not (np.diff(values) > 0).all() or not np.isfinite(values).all():
             raise ValueError(f"the coordinates {name} of a grid of initial conditions must rise.")
-    mesh = draw.cells(axis, draw.cell_edges(x), draw.cell_edges(y), D.T, norm, SHADES)
+    mesh = draw.cells(axis, draw.cell_edges(x), draw.cell_edges(y), D.T, norm, draw.SHADES)
     texts = counted({f"of {D.size} orbits have no value": np.sum(~np.isfinite(D))})
-    return mesh, [Patch(label=text, **HATCH) for text in texts]
+    return mesh, [Patch(label=text, **draw.HATCH) for text in texts]
 
 
 def _draw_points(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, list[Any]]:
@@ -152,11 +140,13 @@ def _draw_points(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, lis
     grey, count = there & ~known, int(there.sum())
     look: Any = {"s": float(np.clip(3000 / max(count, 1), 2, 16)), "linewidths": 0}
     look["rasterized"] = count > 3000
-    shown = {"color": COLOURS[0]} if D is None else {"c": D[known], "norm": norm, "cmap": SHADES}
+    shown = (
+        {"color": COLOURS[0]} if D is None else {"c": D[known], "norm": norm, "cmap": draw.SHADES}
+    )
     drawn = axis.scatter(x[known], y[known], **shown, **look)
     if grey.any():
         label = f"{grey.sum()} orbits without a diffusion"
-        axis.scatter(x[grey], y[grey], color=PALE, label=label, **look)
+        axis.scatter(x[grey], y[grey], color=draw.PALE, label=label, **look)
     return drawn, counted({f"of {there.size} orbits have no frequencies": np.sum(~there)})
 
 

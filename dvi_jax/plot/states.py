@@ -116,7 +116,7 @@ def place_in(shape: tuple[int, ...], index: Any) -> tuple[int, ...]:
     return tuple(int(i) % n for i, n in zip(place, shape, strict=True))
 
 
-def subscript(letter: str, place: tuple[int, ...], shape: tuple[int, ...]) -> str:
+def indexed(letter: str, place: tuple[int, ...], shape: tuple[int, ...]) -> str:
     """A component as the field writes it: counted from 1, without a number if there is only one."""
     if shape == (1,):
         return letter
@@ -144,7 +144,7 @@ def component(
         )
     letter, inside = found.groups()
     place = place_in(shape, tuple(map(int, inside.split(","))) if inside else (0,) * len(shape))
-    label = named(subscript(letter, place, shape), units.get(letter))
+    label = named(indexed(letter, place, shape), units.get(letter))
     return lambda qs, ps: (qs if letter == "q" else ps)[(slice(None), *place)], label
 
 
