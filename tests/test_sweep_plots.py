@@ -343,7 +343,7 @@ def test_memory_is_one_block_however_large_the_grid(monkeypatch):
 def test_a_dimension_without_values_costs_nothing_for_its_length(monkeypatch):
     """10¹² points: their axis, pixels and selections are made without a list of them."""
     source, data = lazily((3, 10**12), ("a", "b"), lambda i, j: (i + 1.0) * (j + 1.0))
-    found = grid.arrange(data, "b", "a", pixels=(400, 300))
+    found = grid.arrange(data, "b", "a", {"pixels": (400, 300)})
     assert found.x.edges[-1] == 10**12 - 0.5
     chosen = slice(10**11, 10**11 + 5)
     np.testing.assert_array_equal(found.x.bins.pixels(chosen), [40] * 5)

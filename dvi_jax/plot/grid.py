@@ -1,6 +1,6 @@
 """Axes and panels of a map: assignment of dimensions, positions of their points, tick labels."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -10,10 +10,10 @@ from matplotlib.ticker import LogFormatterMathtext, LogLocator
 from .._checks import instance
 from .axes import at_most, canvas, cell_edges, stack
 from .blocks import Bins, make_bins
-from .style import named
+from .style import check_keywords, named
 
-PIXELS = (480, 320)
-"""Largest number of pixels of a map, in x and y."""
+_WHERE: dict[str, Any] = {"facet": None, "over": (), "pixels": (480, 320)}
+"""Keywords of all maps; the largest number of pixels in x and y."""
 
 _GREEK = {"epsilon": "ε", "h": "step size h", "start": "number of the start", "t0": "t$_0$"}
 _MOST_NAMES, _MOST_PANELS = 12, 16
@@ -180,13 +180,7 @@ class Grid(NamedTuple):
 
 
 def arrange(
-    data: Any,
-    x: str | None,
-    y: str | None,
-    facet: str | None = None,
-    over: str | Sequence[str] = (),
-    pixels: Any = PIXELS,
-    made: dict[str, Any] | None = None,
+    data: Any, x: str | None, y: str | None, where: Mapping[str, Any], made: Any = None
 ) -> Grid:
     """Assign dimensions to x, y and facets; those that are not named become x and y in turn.
 
@@ -194,6 +188,8 @@ def arrange(
     dimension that does not appear. **Raises** `ValueError` for a dimension that does not exist, is
     named twice, or is in excess.
     """
+    check_keywords(where, *_WHERE)
+    facet, over, pixels = (where.get(k, v) for k, v in _WHERE.items())
     width, height = two_numbers(pixels)
     if not (width >= 1 and height >= 1):
         raise ValueError(f"pixels must be (width, height), two positive numbers, got {pixels!r}.")

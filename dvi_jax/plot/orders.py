@@ -272,10 +272,14 @@ def work_precision(
         axis.loglog(costs[good], errors[good], label=label, **look)
         lost += draw.without_place(axis, costs, errors, colour)
     axis.set(xscale="log", yscale="log", xlabel=cost, ylabel=error, title=title)
-    extra, total, line = [], points.shape[1], _front(*points)
-    if front and len(line):
+    extra, total = [], points.shape[1]
+    # In the order of cost, a run is in front if its error is below those of all before it.
+    known = points[:, np.isfinite(points[1]) & (points[1] > 0)]
+    known = known[:, np.lexsort(known[::-1])]
+    line = known[:, known[1] < np.minimum.accumulate(np.append(np.inf, known[1]))[:-1]]
+    if front and line.size:
         look = {"color": "#dcdcdc", "lw": 9, "zorder": 0.5}
-        axis.plot(*line.T, **look, solid_capstyle="round", solid_joinstyle="round")
+        axis.plot(*line, **look, solid_capstyle="round", solid_joinstyle="round")
         extra.append(entry("front", color="#dcdcdc", lw=7))
     extra += draw.without_place_entries(lost, total, "runs failed", "runs without error")
     legend(axis, new, extra)
@@ -312,12 +316,3 @@ def _slope(costs: np.ndarray, errors: np.ndarray) -> str:
     settled = len(last) > 1 and np.ptp(last) <= _SETTLED * np.abs(last).max()
     about = "" if settled else ", not settled" if len(last) > 1 else " of two runs"
     return f"slope {signed(np.polyfit(x[part], y[part], 1)[0], '.1f')}{about}"
-
-
-def _front(costs: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Runs that nothing beats in both, shape (count, 2), in the order of cost."""
-    good = np.isfinite(errors) & (errors > 0)
-    order = np.lexsort((errors[good], costs[good]))
-    points = np.stack([costs[good], errors[good]], 1)[order]
-    least = np.minimum.accumulate(np.append(np.inf, points[:, 1]))
-    return points[points[:, 1] < least[:-1]]

@@ -16,7 +16,7 @@ from .._checks import one_of
 from .axes import at_edge, cells, entry, flat_cells, legend, scale_of
 from .blocks import REDUCTIONS, Lines, Picture, count_codes, reduced
 from .grid import Grid, arrange, checked_array, dim_of, label_of, names_of, two_numbers
-from .style import COLOURS, GREY, HATCH, NO_NUMBER, SHADES, ZERO, check_keywords, in_style
+from .style import COLOURS, GREY, HATCH, NO_NUMBER, SHADES, ZERO, in_style
 
 _NOT_COMPUTED = "#ffffff"
 _MARKS = {NO_NUMBER: ("x", GREY), ZERO: ("v", ZERO)}
@@ -74,10 +74,9 @@ def sweep_map(
     are an array of numbers; `ValueError` for dimensions that do not exist or are too many, a median
     of more numbers than are read at a time, and other invalid input.
     """
-    check_keywords(where, "facet", "over", "pixels")
     data = checked_array(data)
     one_of("reduce", reduce, REDUCTIONS)
-    grid = arrange(data, x, y, **where)
+    grid = arrange(data, x, y, where)
     label = label_of(data, data.name or "value")
     fewer = any(len(place.centres) < place.bins.size for place in grid.places)
     if fewer or any(data.sizes[d] > 1 for d in grid.over):
@@ -116,7 +115,6 @@ def slope_map(
     """
     import xarray as xr
 
-    check_keywords(where, "facet", "over", "pixels")
     data = checked_array(data)
     one_of("reduce", reduce, REDUCTIONS)
     dim = dim_of(data, along)
@@ -138,7 +136,7 @@ def slope_map(
         middle = np.sqrt(values[1:] * values[:-1])
         about = data.coords[along].attrs
         made = {along: xr.DataArray(middle, dims=[dim], coords={along: (dim, middle, about)})}
-    grid = arrange(data, x, y, **where, made=made)
+    grid = arrange(data, x, y, where, made)
     lines = Lines(dim, partial(_slopes, np.log(values), order, floor, local))
     pictures = [reduced(panel, grid.bins, reduce, lines) for _, panel in grid.panels]
     name = str(data.name or "data").replace("_", " ")
@@ -169,10 +167,9 @@ def failure_map(
     **Returns** the `Axes`, an array of them with `facet`. **Raises** `TypeError` or `ValueError`
     for data without a status, and as `sweep_map`.
     """
-    check_keywords(where, "facet", "over", "pixels")
     status = _status_of(data)
     one_of("reduce", reduce, ("any", "fraction"))
-    grid = arrange(status, x, y, **where)
+    grid = arrange(status, x, y, where)
     found = _count(status, grid, (panel for _, panel in grid.panels))
     codes, names = found.codes, found.names
     if reduce == "fraction":
@@ -350,21 +347,15 @@ def _slopes(
 
 
 class _Statuses(NamedTuple):
-    """Codes, rising, with their names; for each panel their counts, shape (codes, *pixels)."""
+    """Codes, rising, with their names; which say that nothing is computed, and which are failures;
+    for each panel how often each occurs in each pixel, shape (codes, *pixels).
+    """
 
     codes: list[int]
     names: list[str]
+    open: np.ndarray
+    bad: np.ndarray
     counts: list[np.ndarray]
-
-    @property
-    def open(self) -> np.ndarray:
-        """Which statuses say that nothing is computed."""
-        return np.asarray([name == _OPEN for name in self.names])
-
-    @property
-    def bad(self) -> np.ndarray:
-        """Which statuses are failures."""
-        return np.asarray([name not in (*_GOOD, _OPEN) for name in self.names])
 
 
 def _status_of(data: Any) -> Any:
@@ -388,7 +379,9 @@ def _count(status: Any, grid: Grid, panels: Iterable[Any]) -> _Statuses:
         )
     codes, names = zip(*sorted(zip(map(int, values), meanings.split(), strict=True)), strict=True)
     counts = [count_codes(panel, grid.bins, codes) for panel in panels]
-    return _Statuses(list(codes), list(names), counts)
+    unknown = np.asarray([name == _OPEN for name in names])
+    bad = np.asarray([name not in (*_GOOD, _OPEN) for name in names])
+    return _Statuses(list(codes), list(names), unknown, bad, counts)
 
 
 def _count_beside(status: Any, grid: Grid) -> _Statuses:
