@@ -1,6 +1,6 @@
 """A gallery: pictures of states, invariants, chaos, frequencies, cost and sweeps, from real runs.
 
-Pictures of fits, and of the planets beside an ephemeris, are in examples of their own.
+Pictures of fits, and of the planets with an ephemeris, are in other examples.
 
 Run: python examples/gallery.py [DIRECTORY for the pictures] [NAME of a picture ...]
 """
@@ -70,7 +70,7 @@ def eight():
 
 
 def orbits(out):
-    """Bodies in the plane, and a disturbed Kepler orbit about its centre."""
+    """Bodies in the plane, and a perturbed Kepler orbit about its centre."""
     problem = systems.kepler()
 
     def run(epsilon):
@@ -84,7 +84,7 @@ def orbits(out):
         figure, axes = plt.subplots(1, 2, figsize=(10.4, 4.6))
         plot.orbit(
             jax.vmap(run)(epsilons), centre=[0.0, 0.0],
-            labels=[f"ε = {e:g}" for e in epsilons], title="Kepler, disturbed", ax=axes[0],
+            labels=[f"ε = {e:g}" for e in epsilons], title="Perturbed Kepler orbits", ax=axes[0],
         )  # fmt: skip
         plot.orbit(eight(), names=["A", "B", "C"], title="The figure eight", ax=axes[1])
         return plot.save(figure, out / "orbits.png")
@@ -110,7 +110,7 @@ def mirror(out):
 
 
 def conserved_along_time(out):
-    """One energy by four methods, and all that one run watched."""
+    """The relative error of the energy by four methods."""
     problem = systems.kepler()
     methods = {
         "TypeII": dvi.TypeII(), "Strang": dvi.Strang(), "Yoshida(4)": dvi.Yoshida(4),
@@ -128,20 +128,20 @@ def conserved_along_time(out):
         return p @ p / 2 - 1 / jnp.linalg.norm(q)
 
     axis = plot.invariants(
-        sols, {"energy": energy}, log=True, labels=list(methods), title="Kepler's energy"
+        sols, {"energy": energy}, log=True, labels=list(methods), title="Energy of a Kepler orbit"
     )
     return plot.save(axis, out / "invariants.png")
 
 
 def watched(out):
-    """What the run in the mirror watched: kept, and adiabatic."""
+    """Observables of the run in the mirror: conserved and adiabatic quantities."""
     problem, sol = mirror_run()
-    axes = plot.invariants(sol, units=problem.units, title="In a magnetic mirror")
+    axes = plot.invariants(sol, units=problem.units, title="Observables in a magnetic mirror")
     return plot.save(axes, out / "watched.png")
 
 
 def balance(out):
-    """Why the angular momentum of a disturbed Kepler orbit with a clock drifts."""
+    """Why the angular momentum of a perturbed Kepler orbit with a clock drifts."""
     problem = systems.kepler()
     clocked = dvi.Generator(
         lambda t, q, p, args: 1.0,
@@ -155,12 +155,12 @@ def balance(out):
     found = dvi.noether_balance(
         problem.system, [clocked], [None], sol, epsilon=0.05, args=problem.args
     )
-    axes = plot.balance(found, title="What turns an invariant into a drift")
+    axes = plot.balance(found, title="Causes of the drift of the angular momentum")
     return plot.save(axes, out / "balance.png")
 
 
 def drift_orders(out):
-    """Drift against ε with the promised slopes."""
+    """Drift against ε with the expected slopes."""
     rng = np.random.default_rng(0)
     system = dvi.System(
         lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2,
@@ -178,7 +178,7 @@ def drift_orders(out):
 
 
 def drift_surface(out):
-    """The same over ε and h: the order in ε at each h, and steps that are too long."""
+    """The drift over ε and h: the order in ε at each h, and steps that are too long."""
     oscillator = systems.oscillator()
     cubic = dvi.System(oscillator.system.H_D, force=lambda t0, t1, q, p, args: -(q**3))
     found = dvi.drift_surface(
@@ -233,7 +233,7 @@ def chaos(out):
 
 
 def duffing(out):
-    """What a damped spring does once a period of the force that drives it, over its size."""
+    """Positions of a damped oscillator, once per period, against the amplitude of its force."""
     problem = systems.duffing()
     gamma, period = np.linspace(0.2, 0.65, 450), 2 * np.pi / problem.args["omega"]
     found = dvi.bifurcation(
@@ -242,7 +242,7 @@ def duffing(out):
         skip=90, crossings=60, method=dvi.Strang(),
     )  # fmt: skip
     axis = plot.bifurcation(
-        gamma, found, name="γ, size of the driving force", title="Duffing's oscillator"
+        gamma, found, name="amplitude γ of the driving force", title="Duffing's oscillator"
     )
     return plot.save(axis, out / "bifurcation.png")
 
@@ -251,7 +251,7 @@ def duffing(out):
 
 
 def frequencies(out):
-    """Lines of a regular orbit, and the frequencies of many as they change."""
+    """Lines of a regular orbit, and the diffusion of the frequencies of many."""
     problem, energy = systems.henon_heiles(), 1 / 8
     settings = {"h": 0.1, "method": dvi.Yoshida(4)}
     sol = dvi.integrate(
@@ -283,11 +283,11 @@ def frequencies(out):
 
 
 def diffusion(out):
-    """How fast frequencies change over a plane of starts: (y, p_y) on the section x = 0."""
+    """Diffusion of frequencies over initial conditions (y, p_y) on the section x = 0."""
     problem, energy = systems.henon_heiles(), 1 / 8
     y, py = np.linspace(-0.35, 0.6, 48), np.linspace(-0.45, 0.45, 47)
     Y, P = (jnp.asarray(v) for v in np.meshgrid(y, py, indexing="ij"))
-    # NaN where there is no such momentum: starts beyond the reach of the energy.
+    # NaN where no momentum has this energy.
     px = jnp.sqrt(2 * energy - Y**2 + 2 * Y**3 / 3 - P**2)
 
     def run(y, px, py):
@@ -311,7 +311,7 @@ def diffusion(out):
 
 
 def sweeps(out):
-    """Drift of a disturbed oscillator over ε and the step, its local order, and where it failed."""
+    """Drift of a perturbed oscillator over ε and the step, its local order, and failures."""
     oscillator = systems.oscillator()
     system = dvi.System(oscillator.system.H_D, force=lambda t0, t1, q0, p1, args: -(q0**3))
     data = dvi.sweep(
@@ -332,7 +332,7 @@ def sweeps(out):
 
 
 def cost(out):
-    """Error of the place after ten turns of Kepler's ellipse, against evaluations of the force.
+    """Error of the position after ten periods of a Kepler orbit, against evaluations of the force.
 
     RungeKutta4, of order 4, falls by 5: its energy drifts as h⁵, and that outweighs the rest here.
     KahanLi(8) meets round-off before its slope has settled at −8.
@@ -358,7 +358,7 @@ def cost(out):
             errors.append(float(jnp.linalg.norm(sol.qs[-1] - jnp.asarray(problem.q0))))
         results[name] = (costs, errors)
     axis = plot.work_precision(
-        results, "evaluations of the force", "error of the place after ten turns",
+        results, "evaluations of the force", "error of the position after ten periods",
         title="Kepler's ellipse",
     )  # fmt: skip
     return plot.save(axis, out / "work_precision.png")
@@ -368,7 +368,7 @@ def cost(out):
 
 
 def films(out):
-    """The figure eight; a Kepler orbit beside what it conserves; the mirror in space."""
+    """The figure eight; a Kepler orbit with its invariants; the mirror in space."""
     yield plot.animate(
         eight(), out / "figure_eight.gif", names=["A", "B", "C"], seconds=5, fps=20, tail=0.12,
         title="The figure eight", dpi=80,

@@ -449,7 +449,7 @@ def test_pictures_show_what_was_excluded():
     with plot.style():
         axis = plot.drift_orders({"kept": usual(), "energy": sweep(ENERGY)}, [1, None])
         labels = [text.get_text() for text in axis.figure.legends[0].get_texts()]
-        assert labels[0].endswith(", promised 1")
+        assert labels[0].endswith(", expected 1")
         assert labels[1] == "energy: no order"
         hollow = [line for line in axis.lines if line.get_markerfacecolor() == "white"]
         assert sum(len(line.get_xdata()) for line in hollow) == 10

@@ -3,17 +3,15 @@
 import types
 
 import jax.numpy as jnp
-import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.patches import Ellipse
+from pictures import closed, legend, lies_within, marked, refuses  # noqa: F401
 
 import dvi_jax as dvi
 from dvi_jax import plot
-
-mpl.use("Agg")
 
 NAMES = ["args.mu", "epsilon", "q0[0]"]
 X = np.array([1.000632, -0.02, 3.2e-4])
@@ -21,12 +19,6 @@ SIGMA = np.array([2e-5, 4e-3, 5e-4])
 RHO = np.array([[1.0, 0.6, 0.0], [0.6, 1.0, -0.9996], [0.0, -0.9996, 1.0]])
 RHO = np.where(np.eye(3, dtype=bool), 1.0, np.clip(RHO, -0.8, 0.8))
 C = RHO * np.outer(SIGMA, SIGMA)
-
-
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
 
 
 def made(arcs=1, sigma=0.1, n=60, components=2, **changes):
@@ -58,36 +50,31 @@ def points(axis):
     return [np.asarray(line.get_xydata()) for line in axis.lines if line.get_marker() != "None"]
 
 
-def texts(axis):
-    found = axis.get_legend() or axis.figure.legends[0]
-    return [t.get_text() for t in found.get_texts()]
-
-
-# --- residuals -----------------------------------------------------------------------------------
-
-
-def test_residuals_stand_at_their_times_beside_their_distribution():
+def test_residuals_are_drawn_at_their_times_next_to_their_distribution():
     fit = made()
+    fit.whitened[0][7, 1] = -12.0  # an outlier stays in the picture
     axes = plot.fit_residuals(fit)
     assert axes.shape == (2,)
     for k, drawn in enumerate(points(axes[0])[:2]):
         np.testing.assert_array_equal(drawn, np.stack([fit.ts[0], fit.whitened[0][:, k]], 1))
     levels = {line.get_ydata()[0] for line in axes[0].lines if line.get_marker() == "None"}
     assert levels == {0, 1, -1, 3, -3}
-    counted = sum(patch.get_width() for patch in axes[1].patches)
-    assert counted == 119  # one is missing
+    assert sum(patch.get_width() for patch in axes[1].patches) == 119  # one is missing
+    assert axes[-1].get_xlabel() == "count\n1 of 120\nnot finite"
     curve = next(line for line in axes[1].lines if len(line.get_xdata()) == 200)
     area = np.trapezoid(curve.get_xdata(), curve.get_ydata())
     assert area == pytest.approx(119 * axes[1].patches[0].get_height(), rel=1e-3)
     assert axes[0].get_ylim() == axes[1].get_ylim()
+    assert axes[0].get_ylim()[0] < -12
     assert axes[0].get_ylabel() == "observed − predicted\n[standard errors]"
-    assert texts(axes[0]) == ["component 0", "component 1"]
+    assert legend(axes[0]) == ["component 0", "component 1"]
+    fit.whitened[0][3, 0] = 0.5
+    assert plot.fit_residuals(fit)[-1].get_xlabel() == "count"
 
 
-def test_residuals_of_unknown_errors_are_in_the_error_that_was_found():
+def test_residuals_of_unknown_errors_are_in_the_estimated_error():
     fit = made(sigma=None)
-    named = plot.fit_residuals(fit, names=["x", "y"])
-    assert texts(named[0]) == ["x", "y"]
+    assert legend(plot.fit_residuals(fit, names=["x", "y"])[0]) == ["x", "y"]
     axes = plot.fit_residuals(fit, component=1)
     (drawn,) = points(axes[0])
     s = np.sqrt(fit.reduced_chi2)
@@ -96,25 +83,14 @@ def test_residuals_of_unknown_errors_are_in_the_error_that_was_found():
     assert f"s = {s:.3g}" in axes[0].get_ylabel()
 
 
-def test_an_outlier_stays_in_the_picture():
-    fit = made()
-    fit.whitened[0][7, 1] = -12.0
-    axes = plot.fit_residuals(fit)
-    assert axes[0].get_ylim()[0] < -12
-    assert sum(patch.get_width() for patch in axes[1].patches) == 119
-
-
 def test_arcs_have_panels_until_there_are_many():
-    assert [a.get_title(loc="left") or a.get_title() for a in plot.fit_residuals(made(3))[:3]] == [
-        "arc 0", "arc 1", "arc 2"
-    ]  # fmt: skip
+    axes = plot.fit_residuals(made(3))
+    assert [a.get_title(loc="left") for a in axes[:3]] == ["arc 0", "arc 1", "arc 2"]
     axes = plot.fit_residuals(made(9))
     assert len(axes) == 2
     assert len(points(axes[0])) == 18
     axes = plot.fit_residuals(made(9), arcs=[8])
     np.testing.assert_array_equal(points(axes[0])[0][:, 0], np.linspace(0, 10, 60) + 8)
-    mine = plt.subplots(1, 2)[1]
-    assert list(plot.fit_residuals(made(), axes=mine)) == list(mine)
 
 
 @pytest.mark.slow
@@ -125,9 +101,6 @@ def test_the_sign_that_the_label_says_is_that_of_a_real_fit():
     last = points(plot.fit_residuals(fit)[0])[0][-1, 1]
     np.testing.assert_allclose(last, (fit.observed[0] - fit.predicted[0])[-1, 0] / 0.1)
     assert last > 3
-
-
-# --- covariance ----------------------------------------------------------------------------------
 
 
 def edge(ellipse):
@@ -210,9 +183,6 @@ def test_what_is_not_determined_is_named():
     assert plot.fit_corner(fit, ["args.mu", "q0[0]"]).shape == (2, 2)
 
 
-# --- data, history -------------------------------------------------------------------------------
-
-
 def bars(axis):
     """Half lengths of the error bars of each set of data, without those that have none."""
     return [
@@ -229,9 +199,9 @@ def test_data_with_their_errors_beside_the_prediction():
     lines = [line.get_xydata() for line in axis.lines]
     np.testing.assert_array_equal(lines[0], np.stack([fit.ts[0], fit.predicted[0][:, 1]], 1))
     np.testing.assert_array_equal(lines[1], np.stack([fit.ts[0], fit.observed[0][:, 1]], 1))
-    assert texts(axis) == ["component 1: fit", "component 1: observed"]
+    assert legend(axis) == ["component 1: fit", "component 1: observed"]
     axis = plot.fit_against_data(fit, component=1, names=("x", "y"))
-    assert texts(axis) == ["y: fit", "y: observed"]
+    assert legend(axis) == ["y: fit", "y: observed"]
     both = plot.fit_against_data(fit)
     shown = [to_hex(line.get_color()).upper() for line in both.lines[::2]]
     assert shown == list(plot.COLOURS[:2])
@@ -260,114 +230,73 @@ def test_losses_by_stage_with_rejected_steps():
     np.testing.assert_array_equal(first.get_xydata(), [[1, 1e3], [2, 40]])
     np.testing.assert_array_equal(second.get_xdata(), [3, 4, 5])
     assert first.get_color() != second.get_color()
-    (cross,) = [line for line in axis.lines if line.get_marker() == "x"]
-    np.testing.assert_array_equal(cross.get_xydata(), [[4, 90]])
-    assert texts(axis) == ["stage 1: up to 5 after the start", "stage 2: all data", "step rejected"]
+    np.testing.assert_array_equal(marked(axis, "x"), [[[4, 90]]])
+    stages = ["stage 1: up to 5 after the start", "stage 2: all data"]
+    assert legend(axis) == [*stages, "step rejected"]
     assert axis.get_yscale() == "log"
     fit = made()
     fit.history["loss"][4] = -3.0
     fit.history["accepted"][:] = True
     axis = plot.learning_curve(fit)
     assert axis.get_yscale() == "linear"
-    assert "step rejected" not in texts(axis)
-
-
-def test_losses_and_residuals_that_are_no_numbers_are_counted():
+    assert legend(axis) == stages
     fit = made()
     fit.history["loss"][3] = np.inf
     axis = plot.learning_curve(fit)
-    (top,) = [x for x in axis.lines if x.get_marker() == "x" and len(x.get_xdata())]
-    np.testing.assert_array_equal(top.get_xydata(), [[4, 0.985]])
-    assert top.get_transform() == axis.get_xaxis_transform()
-    assert texts(axis)[-1] == "1 of 5 losses are no numbers (at the top)"
-    assert not any("no numbers" in text for text in texts(plot.learning_curve(made())))
-    assert plot.fit_residuals(made())[-1].get_xlabel() == "count\n1 of 120\nno number"
-    whole = made()
-    whole.whitened[0][3, 0] = 0.5
-    assert plot.fit_residuals(whole)[-1].get_xlabel() == "count"
+    np.testing.assert_array_equal(marked(axis, "x"), [[[4, 0.985]]])
+    assert legend(axis)[-1] == "1 of 5 losses are not finite (at the top)"
 
 
-def test_legends_stay_within_the_axes_that_are_given():
-    for draw in (
-        lambda ax: plot.fit_against_data(made(), ax=ax),
-        lambda ax: plot.learning_curve(made(), ax=ax),
-        lambda ax: plot.fit_residuals(made(), axes=[ax, plt.figure().subplots()])[0],
-    ):
-        axis = draw(plt.subplots(layout="constrained", figsize=(6, 4))[1])
-        axis.figure.canvas.draw()
-        inside, box = axis.get_legend().get_window_extent(), axis.get_window_extent()
-        assert box.x0 <= inside.x0 < inside.x1 <= box.x1
-        assert box.y0 <= inside.y0 < inside.y1 <= box.y1
-
-
-def test_pictures_of_ones_own(tmp_path):
+def test_pictures_of_ones_own_have_their_legends_within_the_axes(tmp_path):
     with plot.style():
-        figure, axes = plt.subplots(1, 2, layout="constrained")
-        assert plot.learning_curve(made(), ax=axes[0]) is axes[0]
-        assert plot.fit_against_data(made(2), arc=1, ax=axes[1]) is axes[1]
+        figure, axes = plt.subplots(1, 4, layout="constrained", figsize=(18, 4))
+        plot.learning_curve(made(), ax=axes[0])
+        plot.fit_against_data(made(2), arc=1, ax=axes[1])
+        plot.fit_residuals(made(), axes=axes[2:])
         assert axes[1].get_title(loc="left") == "arc 1"
+        figure.canvas.draw()
+        assert all(lies_within(axis.get_legend(), axis) for axis in axes[:3])
         assert plot.save(figure, tmp_path / "fit.png").stat().st_size > 10_000
 
 
-# --- what is refused -----------------------------------------------------------------------------
-
-BARE = types.SimpleNamespace(x=X)
-NONE = np.full((3, 3), np.nan)
-MANY = made(names=[f"a{i}" for i in range(13)], x=np.ones(13), covariance=np.eye(13))
-
-
-@pytest.mark.parametrize(
-    ("draw", "error", "said"),
-    [
-        (lambda: plot.fit_residuals(BARE), TypeError, "must be a FitResult.*whitened"),
-        (lambda: plot.fit_residuals(made(), arcs=1), ValueError, "arcs must be .* 0 to 0, got 1"),
-        (lambda: plot.fit_residuals(made(), component="q"), ValueError, "component must be .*'q'"),
-        (lambda: plot.fit_residuals(made(), names=["x"]), ValueError, "1 names for 2"),
-        (lambda: plot.fit_against_data(made(), names="xy"), ValueError, "1 names for 2"),
-        (lambda: plot.fit_residuals(made(), arcs=[]), ValueError, "arcs is empty: .*at least one"),
-        (
-            lambda: plot.fit_residuals(made(), axes=plt.subplots(1, 3)[1]),
-            ValueError,
-            "axes must be 2, one for each panel.*got 3",
-        ),
-        (lambda: plot.fit_corner(BARE), TypeError, "a FitResult.* names, covariance"),
-        (lambda: plot.fit_corner(made(covariance=NONE)), ValueError, "no covariance to draw"),
-        (
-            lambda: plot.fit_corner(made(), ["mu"]),
-            ValueError,
-            r"different names of \['args.mu', 'eps.*'mu'",
-        ),
-        (lambda: plot.fit_corner(made(), ["epsilon"] * 2), ValueError, "different names"),
-        (lambda: plot.fit_corner(made(), []), ValueError, "one or more"),
-        (lambda: plot.fit_corner(MANY), ValueError, r"13 parameters are too many.*params=\['a0'"),
-        (
-            lambda: plot.fit_corner(made(), samples={"mu": X}),
-            ValueError,
-            "samples has no 'args.mu'",
-        ),
-        (lambda: plot.fit_corner(made(), samples=3), TypeError, "a dvi.Samples or a dict"),
-        (
-            lambda: plot.fit_corner(made(), axes=plt.subplots(2, 2)[1]),
-            ValueError,
-            r"shape \(3, 3\) for 3 parameters",
-        ),
-        (lambda: plot.fit_against_data(BARE), TypeError, "must be a FitResult"),
-        (lambda: plot.fit_against_data(made(), arc=2), ValueError, "arc must be .*got 2"),
-        (
-            lambda: plot.fit_against_data(made(), component=-1),
-            ValueError,
-            "component must be .*got -1",
-        ),
-        (lambda: plot.fit_against_data(made(), curve=(X, X)), ValueError, "with 2 components"),
-        (lambda: plot.fit_against_data(made(components=9)), ValueError, "9 components are too"),
-        (lambda: plot.learning_curve(BARE), TypeError, "must be a FitResult"),
-        (
-            lambda: plot.learning_curve(made(history=dict.fromkeys(made().history, X[:0]))),
-            ValueError,
-            "took no step",
-        ),
-    ],
-)
-def test_refused(draw, error, said):
-    with pytest.raises(error, match=said):
-        draw()
+def test_invalid_input_is_rejected():
+    bare, none = types.SimpleNamespace(x=X), np.full((3, 3), np.nan)
+    many = made(names=[f"a{i}" for i in range(13)], x=np.ones(13), covariance=np.eye(13))
+    still = made(history=dict.fromkeys(made().history, X[:0]))
+    fit, three, four = made(), plt.subplots(1, 3)[1], plt.subplots(2, 2)[1]
+    names = r"different names of \['args.mu', 'eps.*'mu'"
+    refuses(
+        plot.fit_residuals,
+        ((bare,), {}, "must be a FitResult.*whitened", TypeError),
+        ((fit,), {"arcs": 1}, "arcs must be .* 0 to 0, got 1"),
+        ((fit,), {"component": "q"}, "component must be .*'q'"),
+        ((fit,), {"names": ["x"]}, "1 names for 2"),
+        ((fit,), {"arcs": []}, "arcs is empty: .*at least one"),
+        ((fit,), {"axes": three}, "axes must be 2, one for each panel.*got 3"),
+    )
+    refuses(
+        plot.fit_corner,
+        ((bare,), {}, "a FitResult.* names, covariance", TypeError),
+        ((made(covariance=none),), {}, "no covariance to draw"),
+        ((fit, ["mu"]), {}, names),
+        ((fit, ["epsilon"] * 2), {}, "different names"),
+        ((fit, []), {}, "one or more"),
+        ((many,), {}, r"13 parameters are too many.*params=\['a0'"),
+        ((fit,), {"samples": {"mu": X}}, "samples has no 'args.mu'"),
+        ((fit,), {"samples": 3}, "a dvi.Samples or a dict", TypeError),
+        ((fit,), {"axes": four}, r"shape \(3, 3\) for 3 parameters"),
+    )
+    refuses(
+        plot.fit_against_data,
+        ((bare,), {}, "must be a FitResult", TypeError),
+        ((fit,), {"names": "xy"}, "1 names for 2"),
+        ((fit,), {"arc": 2}, "arc must be .*got 2"),
+        ((fit,), {"component": -1}, "component must be .*got -1"),
+        ((fit,), {"curve": (X, X)}, "with 2 components"),
+        ((made(components=9),), {}, "9 components are too"),
+    )
+    refuses(
+        plot.learning_curve,
+        ((bare,), {}, "must be a FitResult", TypeError),
+        ((still,), {}, "took no step"),
+    )

@@ -2,23 +2,21 @@
 
 import tracemalloc
 
-import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.colors import LogNorm, Normalize, to_hex
+from pictures import closed, legend as texts, lies_within, refuses  # noqa: F401
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
 import dvi_jax as dvi
 from dvi_jax import plot
 from dvi_jax._results import STATUS_NAMES
-from dvi_jax.plot import blocks
+from dvi_jax.plot import blocks, grid
 from dvi_jax.plot.style import SHADES
 from dvi_jax.sweep import lazy
-
-mpl.use("Agg")
 
 EPS = np.geomspace(1e-4, 1e-1, 7)
 X = np.asarray([0.1, 0.2, 0.4, 0.5, 0.9])
@@ -27,12 +25,6 @@ FLAGS = {
     "flag_meanings": " ".join(("not_computed", *STATUS_NAMES)),
 }
 RNG = np.random.default_rng(1)
-
-
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
 
 
 def drift(order=1.0):
@@ -56,20 +48,12 @@ def array_of(axis, which=0):
     return axis.collections[which].get_array()
 
 
-def texts(axis):
-    found = axis.get_legend() or axis.figure.legends[0]
-    return [t.get_text() for t in found.get_texts()]
-
-
 def colour_at(axis, x, y):
     """The colour that is drawn at a place, as three bytes."""
     axis.figure.canvas.draw()
     picture = np.asarray(axis.figure.canvas.buffer_rgba())
     column, row = axis.transData.transform((x, y))
     return picture[picture.shape[0] - 1 - round(row), round(column), :3]
-
-
-# --- what is drawn ---------------------------------------------------------------------------
 
 
 def test_the_numbers_and_their_places():
@@ -86,49 +70,37 @@ def test_the_numbers_and_their_places():
     assert not axis.figure.legends
 
 
-def test_axes_turned_and_numbers_of_one_decade():
+def test_scales_are_logarithmic_over_decades_and_centred_for_both_signs():
     narrow = drift(0.2)
     axis = plot.sweep_map(narrow, x="x")
     np.testing.assert_array_equal(array_of(axis), narrow.values)
     assert axis.get_ylabel() == "ε"
-    assert type(axis.collections[0].norm) is Normalize
-    assert isinstance(plot.sweep_map(narrow, log=True).collections[0].norm, LogNorm)
-    assert type(plot.sweep_map(drift(), log=False).collections[0].norm) is Normalize
+
+    def norm(data, **options):
+        return plot.sweep_map(data, **options).collections[0].norm
+
+    assert type(norm(narrow)) is type(norm(drift(), log=False)) is Normalize
+    assert type(norm(drift())) is type(norm(narrow, log=True)) is LogNorm
+    assert norm(drift() - 0.05).vmin == -norm(drift() - 0.05).vmax
+    limited = norm(drift() - 0.05, limits=(-0.01, 0.2))
+    assert (limited.vmin, limited.vmax) == (-0.01, 0.2)
 
 
-def test_numbers_of_both_signs_have_a_middle():
-    norm = plot.sweep_map(drift() - 0.05).collections[0].norm
-    assert norm.vmin == -norm.vmax
-    norm = plot.sweep_map(drift() - 0.05, limits=(-0.01, 0.2)).collections[0].norm
-    assert (norm.vmin, norm.vmax) == (-0.01, 0.2)
-
-
-def test_values_out_of_order_are_put_in_order():
+def test_places_along_the_axes():
+    """Values out of order, a coordinate along a dimension, names, and a place for 0."""
     mixed = drift().isel(epsilon=[3, 0, 5, 1, 6, 2, 4])
     np.testing.assert_array_equal(array_of(plot.sweep_map(mixed)), drift().values.T)
-
-
-def test_a_coordinate_beside_the_dimension_is_an_axis():
     case = drift().rename(epsilon="case").drop_vars("case").assign_coords(epsilon=("case", EPS))
     axis = plot.sweep_map(case, x="epsilon")
     np.testing.assert_array_equal(array_of(axis), drift().values.T)
     assert (axis.get_xscale(), axis.get_xlabel()) == ("log", "ε")
     axis = plot.sweep_map(case)
     assert (axis.get_xscale(), axis.get_xlabel()) == ("linear", "case")
-
-
-def test_names_stand_at_their_places():
     methods = ["TypeII()", "Strang()", "Yoshida()"]
-    data = drift().isel(x=slice(3)).assign_coords(x=methods).rename(x="method")
-    axis = plot.sweep_map(data)
+    axis = plot.sweep_map(drift().isel(x=slice(3)).assign_coords(x=methods).rename(x="method"))
     assert [t.get_text() for t in axis.get_yticklabels()] == methods
     np.testing.assert_array_equal(axis.get_yticks(), [0, 1, 2])
-
-
-def test_a_disturbance_of_0_has_a_place_before_the_others():
-    eps = np.asarray([0, *EPS])
-    data = drift().reindex(epsilon=eps, fill_value=1e-9)
-    axis = plot.sweep_map(data)
+    axis = plot.sweep_map(drift().reindex(epsilon=[0, *EPS], fill_value=1e-9))
     assert axis.get_xscale() == "log"
     assert axis.get_xticklabels()[0].get_text() == "0"
     edges = axis.collections[0].get_coordinates()[0, :, 0]
@@ -171,52 +143,36 @@ def test_facets_share_their_colours():
     assert [a.get_ylabel() for a in axes] == ["x [kg]", ""]
 
 
-def test_a_picture_of_ones_own(tmp_path):
+def test_a_picture_of_ones_own_has_its_legends_within_the_axes(tmp_path):
     with plot.style():
-        figure, axes = plt.subplots(1, 3, layout="constrained", figsize=(9, 3))
+        figure, axes = plt.subplots(1, 3, layout="constrained", figsize=(15, 4))
         data = with_status()
-        assert plot.sweep_map(data.drift, ax=axes[0], status=data.status) is axes[0]
-        assert plot.slope_map(data.drift, ax=axes[1]) is axes[1]
-        assert plot.failure_map(data, ax=axes[2]) is axes[2]
-        file = plot.save(figure, tmp_path / "maps.png")
-    assert file.stat().st_size > 10_000
-
-
-# --- where there is no number ------------------------------------------------------------------
-
-
-def test_legends_stay_within_the_axes_that_are_given():
-    data = with_status()
-    for draw in (plot.sweep_map, lambda x, ax: plot.failure_map(data, ax=ax)):
-        axis = draw(data.drift, ax=plt.subplots(layout="constrained")[1])
-        axis.figure.canvas.draw()
-        inside, box = axis.get_legend().get_window_extent(), axis.get_window_extent()
-        assert box.x0 <= inside.x0 < inside.x1 <= box.x1
-        assert box.y0 <= inside.y0 < inside.y1 <= box.y1
+        plot.sweep_map(data.drift, ax=axes[0], status=data.status)
+        plot.slope_map(data.drift, ax=axes[1])
+        plot.failure_map(data, ax=axes[2])
+        figure.canvas.draw()
+        assert all(lies_within(axes[i].get_legend(), axes[i]) for i in (0, 2))
+        assert plot.save(figure, tmp_path / "maps.png").stat().st_size > 10_000
 
 
 def test_maps_have_the_colours_that_are_measured():
     data = with_status()
-    for axis in (plot.sweep_map(data.drift), plot.slope_map(data.drift, x="epsilon", y="x"),
-                 plot.failure_map(data, reduce="fraction")):  # fmt: skip
+    maps = plot.sweep_map(data.drift), plot.slope_map(data.drift, x="epsilon", y="x")
+    for axis in (*maps, plot.failure_map(data, reduce="fraction")):
         top = to_hex(axis.collections[0].cmap(1.0))
         assert top == to_hex(SHADES(1.0)) != to_hex(plt.get_cmap("viridis")(1.0))
 
 
 def test_cells_without_a_number_are_grey_and_counted():
+    """With a status, those that are not computed are white."""
     data = with_status()
     axis = plot.sweep_map(data.drift)
     np.testing.assert_array_equal(array_of(axis).mask, np.isnan(data.drift.values.T))
     assert texts(axis) == ["no number: 6 of 35 (17.1 %)"]
-    grey = colour_at(axis, EPS[2], X[1])
-    assert np.ptp(grey.astype(int)) == 0
+    grey, good = (colour_at(axis, EPS[2], x).astype(int) for x in X[1:3])
+    assert np.ptp(grey) == 0
     assert grey[0] < 220
-    good = colour_at(axis, EPS[2], X[2])
-    assert np.ptp(good.astype(int)) > 20
-
-
-def test_a_status_tells_failed_from_not_computed():
-    data = with_status()
+    assert np.ptp(good) > 20
     axis = plot.sweep_map(data.drift, status=data.status)
     assert texts(axis) == ["no number: 2 of 35 (5.71 %)", "not computed: 4 of 35 (11.4 %)"]
     assert tuple(colour_at(axis, EPS[6], X[4])) == (255, 255, 255)
@@ -236,12 +192,8 @@ def test_the_failures_of_a_real_sweep():
     np.testing.assert_array_equal(bad, [0xD5, 0x5E, 0x00])
     fine = plot.failure_map(data.isel(epsilon=slice(3)))
     assert texts(fine) == ["successful: 15 of 15 (100 %)"]
-
-
-def test_statuses_of_one_dimension_are_a_strip():
     status = with_status().status.assign_coords(epsilon=EPS)[:, 1]
-    axis = plot.failure_map(status)
-    np.testing.assert_array_equal(array_of(axis), status.values[None])
+    np.testing.assert_array_equal(array_of(plot.failure_map(status)), status.values[None])
 
 
 def test_a_single_failure_is_not_hidden_in_its_pixel():
@@ -262,9 +214,6 @@ def test_a_single_failure_is_not_hidden_in_its_pixel():
     assert texts(axis) == ["not computed: 60 of 2400 (2.5 %)"]
 
 
-# --- slopes ------------------------------------------------------------------------------------
-
-
 def test_fitted_slopes_against_polyfit():
     noisy = drift(2) * np.exp(0.3 * RNG.normal(size=drift().shape))
     noisy[1, 2], noisy[4, 2], noisy[2, 0] = np.nan, 0.0, -1.0
@@ -281,7 +230,7 @@ def test_fitted_slopes_against_polyfit():
     assert texts(axis) == ["no slope: 1 of 5 (20 %)"]
 
 
-def test_local_slopes_stand_between_the_points():
+def test_local_slopes_lie_between_the_points():
     data = drift(1) + 1e3 * drift(3)
     axis = plot.slope_map(data, x="epsilon", y="x")
     want = np.diff(np.log(data.values), axis=0) / np.diff(np.log(EPS))[:, None]
@@ -293,29 +242,23 @@ def test_local_slopes_stand_between_the_points():
     np.testing.assert_array_equal(array_of(other), array_of(axis))
 
 
-def test_slopes_leave_out_0_and_what_is_below_the_floor():
-    eps = np.asarray([0, *EPS])
-    data = (drift(2) + 1e-5).reindex(epsilon=eps, fill_value=1e-5)
-    with_floor = plot.slope_map(data, floor=1e-4).lines[0].get_ydata()
-    without = plot.slope_map(data).lines[0].get_ydata()
+def test_slopes_leave_out_0_and_numbers_below_the_floor():
+    data = (drift(2) + 1e-5).reindex(epsilon=[0, *EPS], fill_value=1e-5)
+    with_floor, without = (plot.slope_map(data, floor=f).lines[0].get_ydata() for f in (1e-4, 0))
     assert np.abs(with_floor - 2).max() < 0.1
     assert np.abs(without - 2).min() > 0.5
 
 
-def test_slopes_over_two_dimensions_and_starts():
+def test_slopes_over_two_dimensions():
     orders = np.asarray([1.0, 2.0, 3.0])
     data = xr.concat([drift(k) for k in orders], xr.IndexVariable("k", [0, 1, 2]))
-    axis = plot.slope_map(data)
-    np.testing.assert_allclose(array_of(axis), np.broadcast_to(orders, (5, 3)))
+    np.testing.assert_allclose(array_of(plot.slope_map(data)), np.broadcast_to(orders, (5, 3)))
     axis = plot.slope_map(data, x="k", over="x", reduce="median")
     np.testing.assert_allclose(axis.lines[0].get_ydata(), orders)
 
 
-# --- more points than pixels -------------------------------------------------------------------
-
-
 class Counted(BackendArray):
-    """An array that is made where it is asked for, and counts what is asked for at a time."""
+    """An array that is made where it is read, and counts what is read at a time."""
 
     def __init__(self, shape, function):
         self.shape, self.dtype, self.function = shape, np.dtype(float), function
@@ -400,10 +343,10 @@ def test_memory_is_one_block_however_large_the_grid(monkeypatch):
 def test_a_dimension_without_values_costs_nothing_for_its_length(monkeypatch):
     """10¹² points: their axis, pixels and selections are made without a list of them."""
     source, data = lazily((3, 10**12), ("a", "b"), lambda i, j: (i + 1.0) * (j + 1.0))
-    grid = plot.panels.arrange(data, "b", "a", None, (), (400, 300))
-    assert grid.x.edges[-1] == 10**12 - 0.5
+    found = grid.arrange(data, "b", "a", {"pixels": (400, 300)})
+    assert found.x.edges[-1] == 10**12 - 0.5
     chosen = slice(10**11, 10**11 + 5)
-    np.testing.assert_array_equal(grid.x.bins.pixels(chosen), [40] * 5)
+    np.testing.assert_array_equal(found.x.bins.pixels(chosen), [40] * 5)
     assert source.total == 0
 
 
@@ -413,14 +356,14 @@ def test_what_lies_in_chunks_is_read_in_chunks(monkeypatch):
     plain = array_of(plot.sweep_map(data, pixels=(5, 50)))
     source.largest = source.total = 0
     data.encoding["preferred_chunks"] = {"a": 4, "b": 120}
-    read = list(blocks._selections(data, {}, None, False))
+    read = list(blocks.selections(data, {}))
     for dim, chunk, most in (("a", 4, 4), ("b", 120, 240)):
         assert {s[dim].start % chunk for s in read} == {0}
         assert max(s[dim].stop - s[dim].start for s in read) == most
     np.testing.assert_array_equal(array_of(plot.sweep_map(data, pixels=(5, 50))), plain)
     assert (source.largest, source.total) == (960, 25_000)
     data.encoding["preferred_chunks"] = {"a": 4, "b": 500}  # more than a block
-    assert max(s["b"].stop for s in blocks._selections(data, {}, None, False)) == 2500
+    assert max(s["b"].stop for s in blocks.selections(data, {})) == 2500
     plot.sweep_map(data)
     assert source.largest <= 1000
 
@@ -453,7 +396,7 @@ def energy(t0, t1, q0, p0, q1, p1, args):
 
 
 def small_sweep(**kw):
-    """4 disturbances, of which the last is too much, × 5 springs."""
+    """4 perturbations, of which the last is too large, × 5 springs."""
     kw = {"epsilon": [0.01, 0.02, 0.04, 1e80], "num_steps": 5} | kw
     system = dvi.System(hamiltonian, force=lambda t0, t1, q0, p1, args: -(q0**3))
     springs = {"k": dvi.Axis("k", [1.0, 1.5, 2.0, 2.5, 3.0])}
@@ -483,55 +426,41 @@ def test_a_store_is_read_in_blocks(tmp_path, monkeypatch):
     assert max(r.size for r in read) == 200  # lines along ε are whole
 
 
-# --- what is refused ---------------------------------------------------------------------------
-
-THREE = xr.DataArray(np.ones((2, 3, 4)), dims=("a", "b", "c"), name="v")
-
-
-@pytest.mark.parametrize(
-    ("draw", "error", "said"),
-    [
-        (lambda: plot.sweep_map(drift(), "y"), ValueError, r"no dimension 'y'.*epsilon \(7\), x"),
-        (lambda: plot.sweep_map(THREE), ValueError, r"'c' is left.*isel\(c=0\).*over='c'.*facet="),
-        (lambda: plot.sweep_map(THREE, "a", "a"), ValueError, "y and x are both along 'a'"),
-        (lambda: plot.sweep_map(THREE, "a", over="a"), ValueError, "both along 'a'"),
-        (lambda: plot.sweep_map(THREE[:, :0]), ValueError, "b has no values"),
-        (lambda: plot.sweep_map(THREE[0, 0, 0]), ValueError, "no dimension has more than one"),
-        (lambda: plot.sweep_map(THREE[0], reduce="sum"), ValueError, "one of 'max', 'min'"),
-        (lambda: plot.sweep_map(THREE[0], pixels=3), ValueError, "pixels must be"),
-        (lambda: plot.sweep_map(THREE[0], limits=(2, 1)), ValueError, "two rising numbers"),
-        (lambda: plot.sweep_map(-THREE[0], log=True), ValueError, "no place for the 12 pixels"),
-        (lambda: plot.sweep_map(np.ones(3)), TypeError, "must be an xarray.DataArray"),
-        (lambda: plot.sweep_map(with_status()), TypeError, "one variable.*drift, status"),
-        (lambda: plot.sweep_map(THREE[0] + 1j), TypeError, "real numbers, got .* complex128"),
-        (
-            lambda: plot.sweep_map(THREE, facet="a", ax=plt.subplots()[1]),
-            ValueError,
-            "leave out ax",
-        ),
-        (
-            lambda: plot.sweep_map(xr.DataArray(np.ones((40, 2, 2))), facet="dim_0"),
-            ValueError,
-            r"40 values.*16 panels.*slice\(None, None, 3\)",
-        ),
-        (
-            lambda: plot.sweep_map(drift(), status=with_status().status.expand_dims(k=2)),
-            ValueError,
-            "select the same of both",
-        ),
-        (lambda: plot.failure_map(drift().to_dataset()), ValueError, "has no status: .*drift"),
-        (lambda: plot.failure_map(drift()), ValueError, "flag_values and flag_meanings"),
-        (lambda: plot.slope_map(drift(), "h"), ValueError, "no dimension 'h'"),
-        (lambda: plot.slope_map(THREE, "a"), ValueError, "'a' has no numbers to take a slope"),
-        (lambda: plot.slope_map(drift(), facet="epsilon"), ValueError, "nothing of it for a facet"),
-        (lambda: plot.slope_map(drift()[:1]), ValueError, "two or more positive values"),
-        (
-            lambda: plot.slope_map(drift().expand_dims(k=2), x="x", y="k", local=True),
-            ValueError,
-            "name it as x or y",
-        ),
-    ],
-)
-def test_refused(draw, error, said):
-    with pytest.raises(error, match=said):
-        draw()
+def test_invalid_input_is_rejected():
+    three = xr.DataArray(np.ones((2, 3, 4)), dims=("a", "b", "c"), name="v")
+    two, many = three[0], xr.DataArray(np.ones((40, 2, 2)))
+    status, ax = with_status().status.expand_dims(k=2), plt.subplots()[1]
+    left = r"'c' is left.*isel\(c=0\).*over='c'.*facet="
+    refuses(
+        plot.sweep_map,
+        ((drift(), "y"), {}, r"no dimension 'y'.*epsilon \(7\), x"),
+        ((three,), {}, left),
+        ((three, "a", "a"), {}, "y and x are both along 'a'"),
+        ((three, "a"), {"over": "a"}, "both along 'a'"),
+        ((three[:, :0],), {}, "b has no values"),
+        ((three[0, 0, 0],), {}, "no dimension has more than one"),
+        ((two,), {"reduce": "sum"}, "one of 'max', 'min'"),
+        ((two,), {"pixels": 3}, "pixels must be"),
+        ((two,), {"limits": (2, 1)}, "two rising numbers"),
+        ((-two,), {"log": True}, "no place for the 12 pixels"),
+        ((np.ones(3),), {}, "must be an xarray.DataArray", TypeError),
+        ((with_status(),), {}, "one variable.*drift, status", TypeError),
+        ((two + 1j,), {}, "real numbers, got .* complex128", TypeError),
+        ((three,), {"facet": "a", "ax": ax}, "leave out ax"),
+        ((many,), {"facet": "dim_0"}, r"40 values.*at most 16.*slice\(None, None, 3\)"),
+        ((drift(),), {"status": status}, "select the same of both"),
+    )
+    refuses(
+        plot.failure_map,
+        ((drift().to_dataset(),), {}, "has no status: .*drift"),
+        ((drift(),), {}, "flag_values and flag_meanings"),
+    )
+    local = {"x": "x", "y": "k", "local": True}
+    refuses(
+        plot.slope_map,
+        ((drift(), "h"), {}, "no dimension 'h'"),
+        ((three, "a"), {}, "'a' has no numbers to take a slope"),
+        ((drift(),), {"facet": "epsilon"}, "nothing of it for a facet"),
+        ((drift()[:1],), {}, "two or more positive values"),
+        ((drift().expand_dims(k=2),), local, "name it as x or y"),
+    )

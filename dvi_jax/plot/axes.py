@@ -7,11 +7,12 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
+from matplotlib.cbook import normalize_kwargs
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.lines import Line2D
 
 from .._checks import instance
-from .style import GREY, HATCH, PALE, SHADES, figure_of
+from .style import GUIDE, HATCH, PALE, SHADES, figure_of
 
 _PIECE = 20_000
 """Points of one path: Agg cannot draw much longer ones in one piece."""
@@ -19,9 +20,7 @@ _PIECE = 20_000
 _EXTEND = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
 
 
-def canvas(
-    ax: Any, size: tuple[float, float] | None = None, space: bool = False
-) -> tuple[Any, bool]:
+def canvas(ax: Any, size: Any = None, space: bool = False) -> tuple[Any, bool]:
     """(`ax` or the axes of a new figure, whether they are new); three-dimensional for `space`.
 
     **Raises** `TypeError` for anything but axes, `ValueError` for axes of another dimension.
@@ -39,24 +38,24 @@ def canvas(
 
 
 def stack(
-    ax: Any, count: int, what: str, size: tuple[float, float], ncols: int = 1, **layout: Any
+    ax: Any, places: Any, what: str, size: tuple[float, float], ncols: int = 1, **layout: Any
 ) -> tuple[list[Any], bool]:
-    """(`count` axes, whether they are new): `ax`, or those of a new figure with `ncols` columns."""
-    if ax is not None:
-        return given(ax, count, what), False
-    layout |= {"squeeze": False, "figsize": size, "layout": "constrained"}
-    figure, axes = plt.subplots(-(-count // ncols), ncols, **layout)
-    for spare in axes.flat[count:]:
-        figure.delaxes(spare)
-    return list(axes.flat)[:count], True
+    """(several axes, whether they are new): `ax`, or those of a new figure.
 
-
-def given(axes: Any, count: int, what: str) -> list[Any]:
-    """The axes as a list. **Raises** `ValueError` unless there are `count`."""
-    found = [canvas(axis)[0] for axis in np.ravel(np.asarray(axes, object))]
+    `places`: number of axes, which fill rows of `ncols`; or rows of their names, as
+    `Figure.subplot_mosaic` takes them. `what`: what they are for, in the error message.
+    """
+    if isinstance(places, int):
+        cells = [*range(places), *["."] * (-places % ncols)]
+        places = [cells[i : i + ncols] for i in range(0, len(cells), ncols)]
+    if ax is None:
+        figure = plt.figure(figsize=size, layout="constrained")
+        return list(figure.subplot_mosaic(places, **layout).values()), True
+    found = [canvas(axis)[0] for axis in np.ravel(np.asarray(ax, object))]
+    count = len({name for row in places for name in row} - {"."})
     if len(found) != count:
         raise ValueError(f"axes must be {count}, {what}, got {len(found)}.")
-    return found
+    return found, False
 
 
 def check_shapes(fits: Any, wanted: str, **arrays: np.ndarray) -> None:
@@ -66,31 +65,43 @@ def check_shapes(fits: Any, wanted: str, **arrays: np.ndarray) -> None:
         raise ValueError(f"{wanted}: got {got}.")
 
 
+def at_most(most: int, count: int, what: str, choice: str) -> None:
+    """**Raises** `ValueError` for too many things in one picture, with a way to choose some."""
+    if count > most:
+        raise ValueError(f"{count} {what} are too many, at most {most}: choose some, {choice}.")
+
+
+def check_attributes(thing: Any, names: Sequence[str], wanted: str) -> None:
+    """**Raises** `TypeError` for an object without these attributes."""
+    if lacking := ", ".join(name for name in names if not hasattr(thing, name)):
+        raise TypeError(f"{wanted}, got {type(thing).__name__} without {lacking}.")
+
+
 def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[str]:
     """`count` labels, empty ones for None. **Raises** `ValueError` for another number of them."""
-    found = [""] * count if labels is None else [labels] if isinstance(labels, str) else labels
+    if labels is None:
+        return [""] * count
+    found = [labels] if isinstance(labels, str) else labels
     if len(found) != count or isinstance(labels, str):
         raise ValueError(f"{name} has {len(found)} names for {count} {what}: give a list of them.")
     return [str(label) for label in found]
 
 
-# --- legends and colours ------------------------------------------------------------------------
+def entry(label: str, **look: Any) -> Line2D:
+    """An entry of a legend."""
+    return Line2D([], [], label=label, **normalize_kwargs(look, Line2D))
 
 
 def legend(axis: Any, new: bool, extra: Iterable[Any] = (), labelled: bool = True) -> Any:
     """A legend below a new figure in as many columns as fit, or inside axes that were given.
 
-    Below given axes it would cover their labels, or the axes below.
-
-    - `extra`: entries after those of the labelled artists: artists, or texts without a mark.
+    `extra`: entries after those of the labelled artists: artists, or texts without a mark.
     """
     handles = axis.get_legend_handles_labels()[0] if labelled else []
-    for one in extra:
-        text = isinstance(one, str)
-        handles.append(Line2D([], [], linestyle="none", label=one) if text else one)
+    handles += [entry(one, ls="none") if isinstance(one, str) else one for one in extra]
     if not handles:
         return None
-    if not new:
+    if not new:  # below given axes it would cover their labels, or other axes
         paper = {"frameon": True, "framealpha": 0.6, "edgecolor": "none"}
         return axis.legend(handles=handles, fontsize=8, **paper)
     figure = figure_of(axis)
@@ -107,44 +118,38 @@ def counted(counts: dict[str, Any]) -> list[str]:
     return [f"{int(count)} {text}" for text, count in counts.items() if count]
 
 
-def interval(
-    values: np.ndarray, limits: Any = None, percentiles: tuple[float, float] = (0, 100)
-) -> tuple[float, float, str]:
-    """(low, high, `extend` of a colour bar) of a linear colour scale, never of zero length."""
-    known = values[np.isfinite(values)]
+def scale_of(
+    values: np.ndarray, limits: Any = None, log: bool = False, percentiles: Any = (0, 100)
+) -> tuple[Any, str]:
+    """(norm of a colour scale, never of zero length; `extend` of its bar, as matplotlib names it).
+
+    `limits`: (low, high); None: these percentiles of the finite values, for `log` positive ones.
+    """
+    known = values[np.isfinite(values) & ((values > 0) | (not log))]
     if limits is None:
-        limits = np.percentile(known, percentiles) if known.size else (0.0, 1.0)
+        limits = np.percentile(known, percentiles) if known.size else (0.1 if log else 0.0, 1.0)
     low, high = (float(v) for v in limits)
-    if high <= low:
-        low, high = low - 0.5, high + 0.5
-    return low, high, extend(known, low, high)
-
-
-def extend(values: np.ndarray, low: float, high: float) -> str:
-    """At which ends of a colour bar values lie outside, as matplotlib names it."""
-    return _EXTEND[int((values < low).any()), int((values > high).any())]
-
-
-# --- lines and marks ----------------------------------------------------------------------------
+    ends = _EXTEND[int((known < low).any()), int((known > high).any())]
+    if high <= low and log:
+        low, high = low / 2, high * 2
+    elif high <= low:
+        half = (abs(low) or 1) / 2
+        low, high = low - half, high + half
+    return (LogNorm if log else Normalize)(low, high), ends
 
 
 def path(axis: Any, *coordinates: np.ndarray, label: str | None = None, **look: Any) -> None:
     """A line of any length; a long one is drawn as pixels in a vector file."""
     n = len(coordinates[0])
-    if n <= _PIECE:
-        axis.plot(*coordinates, label=label, **look)
-        return
-    for first in range(0, n - 1, _PIECE):
+    long: dict[str, Any] = {"rasterized": True} if n > _PIECE else {}
+    for first in range(0, n - 1 if long else 1, _PIECE):
         part = slice(first, first + _PIECE + 1)
-        axis.plot(*(c[part] for c in coordinates), label=label, rasterized=True, **look)
+        axis.plot(*(c[part] for c in coordinates), label=label, **long, **look)
         label = None
 
 
 def envelope(x: np.ndarray, y: np.ndarray, most: int = 8000) -> tuple[np.ndarray, np.ndarray]:
-    """About `most` points of a function of x that look like all: the extremes of each piece.
-
-    Values that are not finite remain as gaps.
-    """
+    """About `most` points of a function of x that look like all: extremes, gaps of each piece."""
     if len(x) <= most:
         return x, y
     keep = {0, len(x) - 1}
@@ -162,7 +167,7 @@ def envelope(x: np.ndarray, y: np.ndarray, most: int = 8000) -> tuple[np.ndarray
 def at_edge(axis: Any, x: np.ndarray, marker: str, height: float = 0.015, **look: Any) -> None:
     """Marks at the edge of the axes, for values that have no place on the y axis."""
     if len(x):
-        look = {"linestyle": "none", "markersize": 6} | look
+        look = {"ls": "none", "ms": 6} | look
         transform = axis.get_xaxis_transform()
         axis.plot(x, np.full(len(x), height), marker=marker, transform=transform, **look)
 
@@ -178,24 +183,17 @@ def without_place(axis: Any, x: np.ndarray, y: np.ndarray, colour: Any) -> np.nd
     return np.array([failed.sum(), zero.sum()])
 
 
-def without_place_entries(counts: np.ndarray, total: int, texts: Sequence[str]) -> list[Any]:
+def without_place_entries(counts: Any, total: int, failed: str, zero: str) -> list[Any]:
     """Legend entries of the marks that `without_place` draws."""
-    look: dict[str, Any] = {"color": PALE, "linestyle": "none"}
-    return [
-        Line2D([], [], marker=marker, label=f"{count} of {total} {text}", **look)
-        for count, marker, text in zip(counts, "xv", texts, strict=True)
-        if count
-    ]
+    marks = zip(counts, "xv", (failed, zero), strict=True)
+    look: Any = {"color": PALE, "ls": "none"}
+    return [entry(f"{n} of {total} {text}", marker=m, **look) for n, m, text in marks if n]
 
 
 def guide(axis: Any, x: Sequence[float], y: float, slope: float, **look: Any) -> None:
     """A dashed grey line of a slope on logarithmic axes, from (x[0], y) to x[1]."""
     ends = np.asarray(x)
-    look = {"color": GREY, "linewidth": 1, "linestyle": "--"} | look
-    axis.plot(ends, y * (ends / ends[0]) ** slope, **look)
-
-
-# --- cells --------------------------------------------------------------------------------------
+    axis.plot(ends, y * (ends / ends[0]) ** slope, **GUIDE | look)
 
 
 def cell_edges(centres: np.ndarray, log: bool = False) -> np.ndarray:

@@ -11,14 +11,14 @@ BLOCK = 2**21
 """Numbers of a grid that are in memory at a time, 16 MiB of float64."""
 
 REDUCTIONS = {"max": "largest", "min": "smallest", "mean": "mean", "median": "median"}
-"""How the numbers of one pixel become one → what the result is called."""
+"""How the numbers of one pixel become one → the name of the result."""
 
 
 class Bins(NamedTuple):
-    """Which points of a dimension belong to which pixel.
+    """Which of n points of a dimension belong to which pixel.
 
-    - `size`: points n of the dimension. `starts`: where each pixel begins, shape (pixels,).
-    - `order`: the points in the order in which they are drawn, shape (n,); None: as they are.
+    `starts`: where each pixel begins, shape (pixels,). `order`: the points in the order in which
+    they are drawn, shape (n,); None: as they are.
     """
 
     size: int
@@ -30,13 +30,8 @@ class Bins(NamedTuple):
         """Where each pixel begins, and where the last one ends."""
         return np.append(self.starts, self.size)
 
-    @property
-    def most(self) -> int:
-        """Points of the largest pixel."""
-        return int(np.diff(self.ends).max())
-
     def points(self, first: int, last: int) -> Any:
-        """The points of the pixels from `first` to before `last`, a slice where they are one."""
+        """The points of the pixels from `first` to before `last`, as a slice if possible."""
         a, b = (int(x) for x in self.ends[[first, last]])
         return slice(a, b) if self.order is None else np.sort(self.order[a:b])
 
@@ -55,23 +50,17 @@ def make_bins(size: int, pixels: int, order: np.ndarray | None = None) -> Bins:
 
 
 class Lines(NamedTuple):
-    """Function of each line of the grid along `dim`, applied before the reduction to pixels.
+    """Function of lines along `dim`, from shape (n, ...) to (m, ...), applied before the reduction.
 
-    - `function`: lines of shape (n, ...) → shape (m, ...).
-    - `keeps`: whether `dim` is a dimension of the result, with m points; else m = 1.
+    If `dim` is a dimension of the result it has m points there; else m = 1.
     """
 
     dim: str
     function: Callable[[np.ndarray], np.ndarray]
-    keeps: bool
 
 
 class Picture(NamedTuple):
-    """One number for each pixel, and how many points of the grid had none.
-
-    - `values`: one axis for each `Bins`, NaN where no point of a pixel has a number.
-    - `missing`, `points`: points without a number, of how many.
-    """
+    """One number for each pixel, NaN without any; how many points have none, and of how many."""
 
     values: np.ndarray
     missing: int
@@ -84,14 +73,10 @@ _COMBINE: dict[str, Any] = {"max": np.fmax, "min": np.fmin, "mean": np.add}
 def reduced(
     data: Any, bins: Mapping[str, Bins], reduce: str, lines: Lines | None = None
 ) -> Picture:
-    """The values of a grid, reduced to pixels.
+    """The values of a `xarray.DataArray`, reduced to pixels; one block is read at a time.
 
-    - `data`: `xarray.DataArray`, of which one block is read at a time.
-    - `bins`: dimension → its pixels, for each axis of the result in turn; the other dimensions
-      are reduced as a whole.
-    - `reduce`: a key of `REDUCTIONS`; entries that are not finite are left out.
-
-    **Raises** `ValueError` for a median if one pixel is larger than a block.
+    `bins`: dimension → its pixels, for each axis of the result in turn; the other dimensions are
+    reduced as a whole. Entries that are not finite are left out.
     """
     shape, points = tuple(len(b.starts) for b in bins.values()), 0
     values = np.full(math.prod(shape), 0.0 if reduce == "mean" else np.nan)
@@ -128,10 +113,10 @@ def blocks(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """(number of the pixel of each point, the points), both of shape (rest, *points).
 
-    - `whole`: every pixel lies in one block, as a median needs it.
+    `whole`: every pixel lies in one block, as a median needs it.
     """
     shape = [len(b.starts) for b in bins.values()]
-    for selection in _selections(data, bins, lines, whole):
+    for selection in selections(data, bins, None if lines is None else lines.dim, whole):
         block = data.variable.isel(selection).values
         names = list(data.dims)
         if lines is not None:
@@ -145,41 +130,41 @@ def blocks(
         yield np.broadcast_to(np.ravel_multi_index(places, shape), block.shape), block
 
 
-def _selections(
-    data: Any, bins: Mapping[str, Bins], lines: Lines | None, whole: bool
+def selections(
+    data: Any, bins: Mapping[str, Bins], line: str | None = None, whole: bool = False
 ) -> Iterator[dict[str, Any]]:
-    """Selections of one block each: whole chunks if they are known, last dimension first."""
-    parts: dict[str, list[Any]] = {}
+    """Selections of at most a block, last dimension first, that hold whole lines along `line`.
+
+    A block consists of units: single points, chunks if they are known and fit, or for `whole` all
+    numbers of a pixel. **Raises** `ValueError` if a pixel is larger than a block.
+    """
     sizes = dict(zip(data.dims, data.shape, strict=True))
-    together = {d for d in sizes if whole and d not in bins}
-    together |= set() if lines is None else {lines.dim}
-    room = max(1, BLOCK // math.prod(sizes[d] for d in together))
-    pixel = math.prod(b.most for d, b in bins.items() if d not in together)
-    pixel *= math.prod(sizes[d] for d in together)
-    if whole and pixel > BLOCK:
-        raise ValueError(
-            f"a median needs all {pixel} numbers of a pixel at a time, and {BLOCK} are read at a "
-            "time: take reduce='mean' or 'max', more pixels, or a part of the data."
-        )
-    chunk = {d: 1 for d in sizes if d not in together}
-    known = data.encoding.get("preferred_chunks") or {}
-    if all(isinstance(known.get(d), int) for d in chunk):
-        fits = {d: min(known[d], sizes[d]) for d in chunk}
-        chunk = fits if math.prod(fits.values()) <= room else chunk
-    if not whole:
-        room //= math.prod(chunk.values())
+    unit = {d: n if d == line or (whole and d not in bins) else 1 for d, n in sizes.items()}
+    if whole:
+        unit |= {d: int(np.diff(b.ends).max()) for d, b in bins.items() if d != line}
+        if math.prod(unit.values()) > BLOCK:
+            raise ValueError(
+                f"a median needs all {math.prod(unit.values())} numbers of a pixel at a time, and "
+                f"{BLOCK} are read at a time: take reduce='mean' or 'max', more pixels, or a part "
+                "of the data."
+            )
+    else:
+        known = data.encoding.get("preferred_chunks") or {}
+        chunks = {d: min(known[d], n) for d, n in sizes.items() if isinstance(known.get(d), int)}
+        chunks |= {line: sizes[line]} if line is not None else {}
+        if len(chunks) == len(sizes) and math.prod(chunks.values()) <= BLOCK:
+            unit = chunks
+    room, parts = max(1, BLOCK // math.prod(unit.values())), {}
     for d in reversed(data.dims):
-        if d in together:
-            parts[d] = [slice(0, sizes[d])]
-        elif whole:
-            of, count = bins[d], len(bins[d].starts)
-            step = min(count, max(1, room // of.most))
-            parts[d] = [of.points(i, min(i + step, count)) for i in range(0, count, step)]
-            room //= of.most * step
+        size, step = sizes[d], unit[d]
+        pixels = bins[d] if whole and d in bins and d != line else None
+        total = -(-size // step) if pixels is None else len(pixels.starts)
+        count = min(total, max(room, 1))
+        room //= count
+        starts = range(0, total, count)
+        if pixels is None:
+            parts[d] = [slice(i * step, min((i + count) * step, size)) for i in starts]
         else:
-            chunks = min(-(-sizes[d] // chunk[d]), max(room, 1))
-            step = chunks * chunk[d]
-            parts[d] = [slice(i, min(i + step, sizes[d])) for i in range(0, sizes[d], step)]
-            room //= chunks
+            parts[d] = [pixels.points(i, min(i + count, total)) for i in starts]
     for chosen in itertools.product(*(parts[d] for d in data.dims)):
         yield dict(zip(data.dims, chosen, strict=True))

@@ -1,22 +1,33 @@
-"""Pictures of a fit: residuals, data with the model, the loss of every step."""
+"""Pictures of a fit: residuals, data with the model, the loss of every step, covariances."""
 
 import itertools
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.lines import Line2D
+from matplotlib import colormaps
+from matplotlib.patches import Ellipse
 
-from .axes import at_edge, canvas, check_shapes, counted, given, labels_of, legend
+from .._checks import instance
+from . import axes as draw
+from .axes import canvas, counted, entry, labels_of, legend, stack
 from .states import chosen
-from .style import COLOURS, GREY, MARKERS, in_style
+from .style import COLOURS, GREY, MARKERS, in_style, signed
 
-_PANELS = 6
-"""Arcs up to which each has a panel of its own."""
+_PANELS, _PARAMETERS, _WIDE = 6, 12, 3.2
+"""Arcs up to which each has a panel of its own; parameters that are drawn without a selection;
+standard errors to either side in a panel of a parameter."""
 
-# --- residuals ----------------------------------------------------------------------------------
+
+def _check(fit: Any, *needs: str) -> None:
+    draw.check_attributes(fit, needs, "fit must be a FitResult, as dvi.fit returns it")
+
+
+def _dot(number: int, size: float | None = None) -> dict[str, Any]:
+    """Marker and colour of a component or of an arc."""
+    look = {"marker": MARKERS[number % len(MARKERS)], "c": COLOURS[number % len(COLOURS)]}
+    return look | {"ls": "none", "ms": size}
 
 
 @in_style
@@ -30,90 +41,73 @@ def fit_residuals(
     """Residuals in standard errors against time, and their distribution with a normal density.
 
     - `fit`: a `FitResult`. Its whitened residuals, observed − predicted, are drawn as they are; for
-      data without errors they are divided by s, the error that was found.
+      data without errors they are divided by s, the estimated error.
     - `arcs`: numbers of those that are drawn; None: all. Up to six have a panel each, more share
       one. `component`: of the flattened values of one observation; None: all.
-    - `axes`: where to draw: one `Axes` for each panel and one for the distribution.
+    - `axes`: one `Axes` for each panel and one for the distribution; None: a new figure.
     - `names`: of all components of one observation, for the legend.
 
     Dashed lines are at ±1, dotted ones at ±3 standard errors. Residuals that are not finite, such
     as those of values that were not observed, are counted below the distribution.
 
     **Returns** the `Axes` of the panels and, last, of the distribution, shape (panels + 1,).
-
-    **Raises** `TypeError` for what is no fit; `ValueError` for arcs or components that are not
-    there, and another number of axes or names.
+    **Raises** `TypeError` for anything but a fit; `ValueError` for arcs or components that do not
+    exist, and another number of axes or names.
     """
-    check_fit(fit, "whitened", "ts", "chi2", "degrees_of_freedom")
+    _check(fit, "whitened", "ts", "chi2", "degrees_of_freedom")
     numbers = chosen("arcs", arcs, len(fit.whitened))
     size = 1.0 if fit.has_errors else math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
     rows = {i: np.asarray(fit.whitened[i]) / (size or 1.0) for i in numbers}
     components = max(r.shape[1] for r in rows.values())
     kept = chosen("component", component, components)
     named = labels_of(names, components, "components", "names")
-    panels, single = [[i] for i in numbers], len(numbers) <= _PANELS
-    panels, new = panels if single else [numbers], axes is None
-    axes = _residual_axes(axes, len(panels))
-    every = np.concatenate(
-        [r[:, [k for k in kept if k < r.shape[1]]].ravel() for r in rows.values()]
-    )
+    panels = [[i] for i in numbers] if len(numbers) <= _PANELS else [numbers]
+    count, new = len(panels), axes is None
+    height, what = 2.6 + 0.9 * (count - 1) + 0.6, "one for each panel and one for the distribution"
+    places = [[f"panel {i}", "distribution"] for i in range(count)]
+    found, _ = stack(axes, places, what, (7.4, height), width_ratios=(5, 1))
+    if new:  # a mosaic lists the distribution after the first panel
+        found.append(found.pop(1))
+        for axis in found[:count]:
+            axis.grid(axis="y", visible=False)
+        for axis in found[1:count]:
+            axis.sharey(found[0])
+        found[-1].tick_params(labelleft=count > 1)
+    every = [rows[i][:, k] for i in numbers for k in kept if k < rows[i].shape[1]]
+    every = np.concatenate(every)
     known = every[np.isfinite(every)]
     furthest = 1.08 * max(3.5, np.abs(known).max(initial=0.0))
-    for axis, those in zip(axes, panels, strict=False):
+    for axis, those in zip(found, panels, strict=False):
         for i, k in itertools.product(those, kept):
             if k < rows[i].shape[1]:
                 look = _dot(k if len(those) == 1 else i, 3.5 if len(fit.ts[i]) < 400 else 1.8)
-                axis.plot(fit.ts[i], rows[i][:, k], **look, markeredgewidth=0, alpha=0.85)
-        if len(panels) > 1:
+                axis.plot(fit.ts[i], rows[i][:, k], **look, mew=0, alpha=0.85)
+        if count > 1:
             axis.set_title(f"arc {those[0]}", fontsize=9.5)
         _lines(axis, furthest)
         if furthest < 5:
             axis.set_yticks([-3, -1, 1, 3])
-    _draw_distribution(axes[-1], known, furthest)
+    _draw_distribution(found[-1], known, furthest)
     if lost := every.size - known.size:
-        axes[-1].set_xlabel(f"count\n{lost} of {every.size}\nno number")
+        found[-1].set_xlabel(f"count\n{lost} of {every.size}\nnot finite")
     unit = "standard errors" if fit.has_errors else f"s = {size:.3g}"
-    axes[(len(panels) - 1) // 2].set_ylabel(f"observed − predicted\n[{unit}]")
-    axes[len(panels) - 1].set_xlabel("time t")
-    if (single or len(numbers) == 1) and 1 < len(kept) <= len(COLOURS):
-        handles = [
-            Line2D([], [], markeredgewidth=0, label=named[k] or f"component {k}", **_dot(k))
-            for k in kept
-        ]
+    found[(count - 1) // 2].set_ylabel(f"observed − predicted\n[{unit}]")
+    found[count - 1].set_xlabel("time t")
+    if len(panels[0]) == 1 and 1 < len(kept) <= len(COLOURS):
+        handles = [entry(named[k] or f"component {k}", mew=0, **_dot(k)) for k in kept]
         if new:
-            look: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "columnspacing": 1.0}
+            look = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "columnspacing": 1.0}
             look |= {"handletextpad": 0.1, "borderaxespad": 0.1, "ncols": min(len(kept), 4)}
-            axes[0].legend(handles=handles, **look)
+            found[0].legend(handles=handles, **look)
         else:
-            legend(axes[0], new, handles, labelled=False)
-    return np.asarray(axes)
-
-
-def _residual_axes(axes: Sequence[Any] | None, count: int) -> list[Any]:
-    """`axes` or those of a new figure, the panels shared in time and size."""
-    if axes is not None:
-        return given(axes, count + 1, "one for each panel and one for the distribution")
-    figure = plt.figure(figsize=(7.4, 2.6 + 0.9 * (count - 1) + 0.6), layout="constrained")
-    grid = figure.add_gridspec(count, 2, width_ratios=(5, 1))
-    panels: list[Any] = []
-    for i in range(count):
-        panels.append(figure.add_subplot(grid[i, 0], sharey=panels[0] if panels else None))
-        panels[-1].grid(axis="y", visible=False)
-    beside = figure.add_subplot(grid[:, 1])
-    beside.tick_params(labelleft=count > 1)
-    return [*panels, beside]
-
-
-def _dot(number: int, size: float | None = None) -> dict[str, Any]:
-    """Marker and colour of a component or of an arc."""
-    look = {"marker": MARKERS[number % len(MARKERS)], "color": COLOURS[number % len(COLOURS)]}
-    return look | {"linestyle": "none", "markersize": size}
+            legend(found[0], new, handles, labelled=False)
+    return np.asarray(found)
 
 
 def _lines(axis: Any, furthest: float) -> None:
     """Lines at 0, ±1 and ±3 standard errors."""
     for at, dash in ((0, "-"), (-1, "--"), (1, "--"), (-3, ":"), (3, ":")):
-        axis.axhline(at, color=GREY, linewidth=0.8, linestyle=dash)
+        axis.axhline(at, c=GREY, lw=0.8, ls=dash)
     axis.set_ylim(-furthest, furthest)
 
 
@@ -124,13 +118,10 @@ def _draw_distribution(axis: Any, r: np.ndarray, furthest: float) -> None:
     axis.hist(r, bins=bins, orientation="horizontal", color=COLOURS[5], edgecolor="none")
     y = np.linspace(-furthest, furthest, 200)
     density = np.exp(-(y**2) / 2) / np.sqrt(2 * np.pi) * r.size * (bins[1] - bins[0])
-    axis.plot(density, y, color="#000000", linewidth=1.1)
+    axis.plot(density, y, c="#000000", lw=1.1)
     _lines(axis, furthest)
     axis.grid(visible=False)
     axis.set_xlabel("count")
-
-
-# --- data and model -----------------------------------------------------------------------------
 
 
 @in_style
@@ -144,38 +135,30 @@ def fit_against_data(
 ) -> Any:
     """Observations along one arc, with their errors, and the predictions of the fit.
 
-    Data without errors have bars of the error that was found.
+    Data without errors have bars of the estimated error.
 
     - `fit`: a `FitResult`. `arc`: its number. `component`: of the flattened values of one
       observation, one or several; None: all, up to seven.
     - `curve`: (times, values) of the model on a finer grid, (T,) and (T, ...), in place of the
       straight lines between its predictions.
-    - `ax`: where to draw; None: a new figure.
     - `names`: of all components of one observation, for the legend.
 
-    **Returns** the `Axes`.
-
-    **Raises** `TypeError` for what is no fit; `ValueError` for an arc or a component that is not
-    there, a curve of another shape, or another number of names.
+    **Returns** the `Axes`. **Raises** `TypeError` for anything but a fit; `ValueError` for an arc
+    or a component that does not exist, a curve of another shape, or another number of names.
     """
-    check_fit(fit, "ts", "observed", "predicted", "errors")
+    _check(fit, "ts", "observed", "predicted", "errors")
     (arc,) = chosen("arc", arc, len(fit.ts))
     ts = np.asarray(fit.ts[arc])
     seen, model = (np.asarray(x[arc]).reshape(len(ts), -1) for x in (fit.observed, fit.predicted))
     components = seen.shape[1]
     kept = chosen("component", component, components)
     named = labels_of(names, components, "components", "names")
-    if component is None and len(kept) > len(COLOURS):
-        raise ValueError(
-            f"{len(kept)} components are too many for one picture: choose some, "
-            f"component={kept[:3]}, say."
-        )
+    if component is None:
+        draw.at_most(len(COLOURS), len(kept), "components", f"component={kept[:3]}")
     fine, curves = (np.asarray(x, float) for x in ((ts, model) if curve is None else curve))
-    wanted = (
-        f"curve must be (times, values), shapes (T,) and (T, ...), with {components} components"
-    )
+    shapes = f"shapes (T,) and (T, ...), with {components} components"
     fits = fine.ndim == 1 and curves.shape[:1] == fine.shape and curves[:1].size == components
-    check_shapes(fits, wanted, times=fine, values=curves)
+    draw.check_shapes(fits, f"curve must be (times, values), {shapes}", times=fine, values=curves)
     found = math.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1))
     errors = np.asarray(fit.errors[arc]).reshape(seen.shape) if fit.has_errors else found
     errors = np.broadcast_to(errors, seen.shape)
@@ -184,9 +167,8 @@ def fit_against_data(
     for k in kept:
         name = named[k] or (f"component {k}" if components > 1 else "")
         name += ": " if name else ""
-        look = _dot(k, 4 if len(ts) < 200 else 2) | {"markerfacecolor": "white", "capsize": 0}
-        line = {"color": look["color"], "linewidth": 1.1, "label": f"{name}fit"}
-        ax.plot(fine[order], curves[order, k], **line)
+        look = _dot(k, 4 if len(ts) < 200 else 2) | {"mfc": "white", "capsize": 0}
+        ax.plot(fine[order], curves[order, k], c=look["c"], lw=1.1, label=f"{name}fit")
         look |= {"elinewidth": 0.9, "label": f"{name}observed"}
         ax.errorbar(ts, seen[:, k], yerr=errors[:, k], **look)
     title = f"arc {arc}" if len(fit.ts) > 1 else ""
@@ -195,50 +177,42 @@ def fit_against_data(
     return ax
 
 
-# --- how it went --------------------------------------------------------------------------------
-
-
 @in_style
 def learning_curve(fit: Any, ax: Any = None) -> Any:
     """The loss after each step of a fit, its stages in colours, rejected steps crossed.
 
-    - `fit`: a `FitResult`, with its `history`. `ax`: where to draw; None: a new figure.
+    `fit`: a `FitResult`, with its `history`. A stage uses the observations up to its horizon, so
+    that losses of different stages are not of the same data. The axis is logarithmic unless a loss
+    is not positive. Losses that are not finite are crosses at the top, counted in the legend.
 
-    A stage looks at what was observed up to its horizon; losses of different stages are not of the
-    same data. The axis is logarithmic unless a loss is not positive. A loss that is no number has a
-    cross at the top, and the legend counts them.
-
-    **Returns** the `Axes`.
-
-    **Raises** `TypeError` for what is no fit; `ValueError` for one that took no step.
+    **Returns** the `Axes`. **Raises** `TypeError` for anything but a fit; `ValueError` for one that
+    took no step.
     """
-    check_fit(fit, "history")
+    _check(fit, "history")
     columns = ("stage", "loss", "accepted", "horizon")
     stage, loss, accepted, horizon = (np.asarray(fit.history[name]) for name in columns)
     if loss.size == 0:
         raise ValueError("the fit took no step: there is no history to draw.")
     ax, new = canvas(ax)
-    steps = np.arange(1, len(loss) + 1)
-    accepted = accepted.astype(bool)
+    steps, accepted, finite = np.arange(1, len(loss) + 1), accepted.astype(bool), np.isfinite(loss)
     looks = zip(np.unique(stage), itertools.cycle(COLOURS[:-1]), itertools.cycle(MARKERS))
     for number, colour, marker in looks:
         here = stage == number
         until = horizon[here][0]
         what = "all data" if np.isinf(until) else f"up to {until:.3g} after the start"
-        look = {"color": colour, "label": f"stage {int(number) + 1}: {what}"}
+        look = {"c": colour, "label": f"stage {int(number) + 1}: {what}"}
         if here.sum() <= 100:
             every = np.flatnonzero(accepted[here]).tolist()
-            look |= {"marker": marker, "markersize": 4, "markevery": every}
+            look |= {"marker": marker, "ms": 4, "markevery": every}
         ax.plot(steps[here], loss[here], **look)
         if number > stage[0]:
-            ax.axvline(steps[here][0] - 0.5, color=GREY, linewidth=0.8, linestyle=":")
-    rejected: dict[str, Any] = {"color": "#000000", "markersize": 6, "markeredgewidth": 1.3}
-    finite = np.isfinite(loss)
+            ax.axvline(steps[here][0] - 0.5, c=GREY, lw=0.8, ls=":")
+    rejected: dict[str, Any] = {"c": "#000000", "ms": 6, "mew": 1.3, "zorder": 4}
     if not accepted.all():
-        here, look = ~accepted & finite, {"linestyle": "none", "zorder": 4, **rejected}
-        ax.plot(steps[here], loss[here], "x", label="step rejected", **look)
-    for text in counted({f"of {len(loss)} losses are no numbers (at the top)": np.sum(~finite)}):
-        at_edge(ax, steps[~finite], "x", 0.985, label=text, zorder=4, **rejected)
+        here = ~accepted & finite
+        ax.plot(steps[here], loss[here], "x", label="step rejected", **rejected)
+    for text in counted({f"of {len(loss)} losses are not finite (at the top)": np.sum(~finite)}):
+        draw.at_edge(ax, steps[~finite], "x", 0.985, label=text, **rejected)
     ax.set_yscale("log" if finite.any() and loss[finite].min() > 0 else "linear")
     ax.set(xlabel="step", ylabel="loss")
     ax.xaxis.get_major_locator().set_params(integer=True)
@@ -246,13 +220,172 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
     return ax
 
 
-# --- what is taken ------------------------------------------------------------------------------
+class _Scale(NamedTuple):
+    """How a parameter is drawn: (x − `zero`) / `unit`, with the label of that axis."""
+
+    name: str
+    value: float
+    sigma: float
+    zero: float
+    unit: float
+    label: str
+
+    def __call__(self, x: Any) -> Any:
+        return (x - self.zero) / self.unit
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Limits of a panel, in its units."""
+        return self(self.value - _WIDE * self.sigma), self(self.value + _WIDE * self.sigma)
 
 
-def check_fit(fit: Any, *needs: str) -> None:
-    lacking = [name for name in needs if not hasattr(fit, name)]
-    if lacking:
-        raise TypeError(
-            f"fit must be a FitResult, as dvi.fit returns it, got {type(fit).__name__} without "
-            f"{', '.join(lacking)}."
+@in_style
+def fit_corner(
+    fit: Any, params: Sequence[str] | None = None, samples: Any = None, axes: Any = None
+) -> np.ndarray:
+    r"""Covariance of the parameters, pair by pair.
+
+    Below the diagonal the ellipses dᵀC⁻¹d = 1 and 4 about the fit, whose projections on the axes
+    are ±1 and ±2 standard errors (they contain 39 % and 86 % of a normal distribution); on the
+    diagonal the normal densities; above it the correlations, in colours.
+
+    - `fit`: a `FitResult`, or anything else with `names`, `covariance` and the values `x` (n,) or
+      draws `x` with their `mean` (`dvi.Samples`).
+    - `params`: names that are drawn, in this order; None: all, up to twelve.
+    - `samples`: draws that are shown under the ellipses: `dvi.Samples`, or name → draws of any
+      shape.
+    - `axes`: array of shape (n, n) of `Axes`; None: a new figure.
+
+    A parameter whose error is much smaller than its size is drawn relative to the fit's value.
+
+    **Returns** the `Axes`, shape (n, n). **Raises** `TypeError` for anything but a fit;
+    `ValueError` for one without a covariance, parameters that the data do not determine, and names
+    that do not exist.
+    """
+    _check(fit, "names", "x", "covariance")
+    numbers, values = _of_parameters(fit, params)
+    C, n = np.asarray(fit.covariance)[np.ix_(numbers, numbers)], len(numbers)
+    about = zip(numbers, np.sqrt(np.diag(C)).tolist(), strict=True)
+    scales = [_scale(fit.names[i], float(values[i]), sigma) for i, sigma in about]
+    draws = [None] * n if samples is None else _draws(samples, [scale.name for scale in scales])
+    side = 1.3 + max(1.7, 1.9 - 0.05 * n) * n
+    what = f"in an array of shape {(n, n)} for {n} parameters"
+    found: Any = np.asarray(stack(axes, n * n, what, (side, side), ncols=n)[0]).reshape(n, n)
+    for i, j in np.ndindex(n, n):
+        axis, x, y = found[i, j], scales[j], scales[i]
+        axis.grid(visible=False)
+        if i < j:
+            _draw_correlation(axis, C[i, j] / (x.sigma * y.sigma))
+            continue
+        if i == j:
+            _draw_marginal(axis, x, draws[j])
+        else:
+            _draw_pair(axis, x, y, C[np.ix_([j, i], [j, i])], draws[j], draws[i])
+            axis.set_ylim(*y.limits)
+            axis.locator_params(axis="y", nbins=4)
+            axis.tick_params(axis="y", labelleft=j == 0)
+            axis.set_ylabel(y.label if j == 0 else "")
+        axis.set_xlim(*x.limits)
+        axis.locator_params(axis="x", nbins=4)
+        axis.tick_params(axis="x", labelbottom=i == n - 1)
+        axis.set_xlabel(x.label if i == n - 1 else "")
+    found[0, 0].figure.align_labels()
+    return found
+
+
+def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], np.ndarray]:
+    """(numbers of the parameters that are drawn, values of all), checked."""
+    names, variances = list(fit.names), np.diag(np.asarray(fit.covariance))
+    known = [n for n, v in zip(names, variances, strict=True) if np.isfinite(v) and v > 0]
+    if not known:
+        raise ValueError(
+            "the fit has no covariance to draw: it had too many parameters for a Jacobian, ended "
+            "at a failure, or the data determine none of its parameters."
         )
+    if params is None:
+        draw.at_most(_PARAMETERS, len(names), "parameters", f"params={names[:3]}")
+    params = names if params is None else [params] if isinstance(params, str) else [*params]
+    if len(set(params)) < len(params) or not params or not {*params} <= {*names}:
+        raise ValueError(f"params must be different names of {names}, one or more, got {params}.")
+    if unknown := [name for name in params if name not in known]:
+        raise ValueError(
+            f"the data do not determine {unknown[0]}; those that have a variance: params={known}."
+        )
+    values = np.asarray(fit.x if np.ndim(fit.x) == 1 else fit.mean)
+    return [names.index(n) for n in params], values
+
+
+def _draws(samples: Any, names: list[str]) -> list[np.ndarray]:
+    """Draws of each of the names, flat."""
+    found = getattr(samples, "samples", samples)
+    instance("samples", found, Mapping, "a dvi.Samples or a dict of names with arrays of draws")
+    if missing := [name for name in names if name not in found]:
+        raise ValueError(f"samples has no {missing[0]!r}: there are {', '.join(map(str, found))}.")
+    flat = [np.ravel(np.asarray(found[n], float)) for n in names]
+    if len({len(f) for f in flat}) > 1:
+        raise ValueError("samples must hold the same number of draws for each name.")
+    return flat
+
+
+def _scale(name: str, value: float, sigma: float) -> _Scale:
+    """Ticks of few digits: counted from the value where it has many more than its error."""
+    near = abs(value) < 30 * sigma
+    exponent = math.floor(math.log10(_WIDE * sigma + (abs(value) if near else 0.0)))
+    exponent = 0 if -2 <= exponent <= 2 else exponent
+    zero, label = 0.0, name
+    if not near:
+        place = math.floor(math.log10(sigma)) - 1  # that of the last significant digit
+        zero, size = round(value, -place), math.floor(math.log10(abs(value)))
+        form = f".{max(0, -place)}f" if -4 <= size <= 6 else f".{max(0, size - place)}e"
+        label += f" {'−' if zero >= 0 else '+'} {abs(zero):{form}}"
+    label += "" if exponent == 0 else f"\n[$10^{{{exponent}}}$]"
+    return _Scale(name, value, sigma, zero, 10.0**exponent, label)
+
+
+def _draw_marginal(axis: Any, scale: _Scale, draws: np.ndarray | None) -> None:
+    """The normal density of a parameter over its draws; its value with two digits of the error."""
+    centre, sigma = scale(scale.value), scale.sigma / scale.unit
+    x = centre + sigma * np.linspace(-_WIDE, _WIDE, 200)
+    if draws is not None:
+        bins = np.linspace(x[0], x[-1], 33)
+        axis.hist(scale(draws), bins=bins, density=True, color="#c8c8c8", edgecolor="none")
+    density = np.exp(-(((x - centre) / sigma) ** 2) / 2) / (sigma * np.sqrt(2 * np.pi))
+    axis.plot(x, density, c=COLOURS[0])
+    for sign in (-1, 1):
+        axis.axvline(centre + sign * sigma, c=GREY, lw=0.8, ls="--")
+    axis.set_ylim(bottom=0)
+    axis.set_yticks([])
+    digits = 1 - math.floor(math.log10(scale.sigma))
+    size = math.floor(math.log10(abs(scale.value))) if scale.value else 0
+    fixed = 0 <= digits <= 7 and size <= 6
+    forms = (f".{digits}f",) * 2 if fixed else (f".{max(size + digits, 1)}e", ".1e")
+    text = f"{signed(scale.value, forms[0])} ± {signed(scale.sigma, forms[1])}"
+    axis.set_title(f"{scale.name}\n{text}", fontsize=9, loc="center")
+
+
+def _draw_pair(axis: Any, x: _Scale, y: _Scale, C: np.ndarray, xs: Any, ys: Any) -> None:
+    """Ellipses of one pair of parameters over its draws."""
+    centre = (x(x.value), y(y.value))
+    if xs is not None:
+        look: Any = {"c": "#8c8c8c", "alpha": min(1.0, 600 / len(xs)), "zorder": 1}
+        axis.plot(x(xs), y(ys), ".", ms=2.5, mew=0, rasterized=True, **look)
+    units = np.array([x.unit, y.unit])
+    # Half axes of dᵀC⁻¹d = 1 along the eigenvectors, in the units of the panel.
+    values, vectors = np.linalg.eigh(C / (units * units[:, None]))
+    angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    look = {"angle": angle, "fill": False, "edgecolor": COLOURS[0], "zorder": 3}
+    for size, width, dash in ((1, 1.6, "-"), (2, 1.0, "--")):
+        sides = 2 * size * np.sqrt(np.maximum(values[::-1], 0.0))
+        axis.add_patch(Ellipse(centre, *sides, lw=width, ls=dash, **look))
+    axis.plot(*centre, "+", c=COLOURS[1], ms=7, mew=1.6, zorder=4)
+
+
+def _draw_correlation(axis: Any, value: float) -> None:
+    """A number on a colour from −1 (orange) to 1 (purple)."""
+    axis.set_facecolor(colormaps["PuOr"]((1 + 0.6 * value) / 2))
+    axis.set(xticks=[], yticks=[])
+    axis.spines[:].set_visible(False)
+    digits = 2 if abs(value) < 0.995 else 4
+    text = signed(value, f"+.{digits}f") if abs(value) >= 0.005 else "0.00"
+    look: Any = {"ha": "center", "va": "center", "fontsize": 9 + 4 * abs(value)}
+    axis.text(0.5, 0.5, text, transform=axis.transAxes, **look)

@@ -7,35 +7,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from .._checks import positive, whole
-from .axes import canvas, labels_of, legend, path, stack
-from .states import (
-    Lane,
-    Looks,
-    chosen,
-    lanes_of,
-    looks_of,
-    one_shape,
-    place_in,
-    subscript,
-    troubles,
-)
-from .style import COLOURS, CROSS, DASHES, MARKS, STAR, START, in_style, named
+from .axes import at_most, canvas, entry, labels_of, legend, path, stack
+from .states import Lane, Looks, chosen, indexed, lanes_of, looks_of, one_shape, place_in, troubles
+from .style import COLOURS, CROSS, DASHES, MARKS, STAR, START, in_style, look_of, named
 
-_PANELS = 6
-"""Largest number of degrees of freedom that are drawn without a selection."""
-
-_MARKS = 9
-"""Number of markers along a line, which distinguish it from others."""
-
-_NARROW = 0.45
-"""Shortest side of a box in space, relative to the longest."""
-
-_MESH = 161
-"""Points of a side of the mesh on which a Hamiltonian is drawn."""
+_PANELS, _MARKS, _MESH, _NARROW = 6, 9, 161, 0.45
+"""Largest number of panels without a selection; markers along a line; points of a side of the mesh
+of a Hamiltonian; shortest side of a box in space, relative to the longest."""
 
 
 @in_style
@@ -46,79 +27,67 @@ def phase_portrait(
     levels: int | Sequence[float] = 12,
     period: float | None = None,
     dots: bool = False,
-    labels: Sequence[str] | None = None,
-    colour: Any = None,
-    colour_label: str = "",
-    units: Mapping[str, str] | None = None,
-    title: str = "",
-    ax: Any = None,
+    **options: Any,
 ) -> Any:
     """Momenta over positions, one panel for each degree of freedom.
 
     - `orbits`: a `Solution`, of one run or of a batch, the arrays (ts, qs, ps), of shapes (..., S)
       and (..., S, *shape), or a list of these.
     - `dof`: number of a degree of freedom from 0, of bodies (body, coordinate); or a list of them.
-      None: all, up to six. Labels count from 1, as the field does.
+      None: all, up to six. Labels count from 1, as is usual in mechanics.
     - `hamiltonian`: function ``(q, p)`` → number of one state, whose level lines are drawn behind
-      the orbits; the other degrees of freedom stay at the first start. `levels`: how many, or
-      which.
+      the orbits; the other degrees of freedom stay at the first initial condition. `levels`: how
+      many, or which.
     - `period`: of q as an angle, which is drawn from −period/2 to period/2.
-    - `dots`: the states alone, without a line between them.
-    - `labels`: one name for each orbit. `colour`: a number for each, shown by a bar with
-      `colour_label`; NaN is grey.
-    - `units`: of "q" and "p". `ax`: where to draw, one `Axes` for each panel.
+    - `dots`: draw the states alone, without a line between them.
+    - `labels`, `colour`, `colour_label`, `units` (of "q" and "p"), `title`, `ax` (one `Axes` for
+      each panel): as for all pictures.
 
     Circles are initial states; crosses mark early ends of orbits, with the reason in the legend.
-    Up to seven orbits have marks along them, as dashes run into one another where an orbit retraces
+    Up to seven orbits also differ by markers, because dashes overlap where an orbit retraces
     itself.
 
     **Returns** the `Axes`, an array of them for a list or for several degrees of freedom.
-
-    **Raises** `TypeError` for what are no orbits, `ValueError` for shapes and components that do
+    **Raises** `TypeError` for input without orbits, `ValueError` for shapes and components that do
     not fit.
     """
-    lanes = lanes_of(orbits, labels)
-    shape, units = one_shape(lanes), units or {}
-    places = _places(shape, dof)
-    looks = looks_of(len(lanes), colour)
-    columns, height = min(3, len(places)), 4.0 if len(places) <= 3 else 6.8
-    size = (5.2, 4.4) if len(places) == 1 else (1.2 + 3.4 * columns, height)
-    axes, new = stack(ax, len(places), "one for each degree of freedom", size, ncols=columns)
-    for axis, place in zip(axes, places, strict=True):
+    look = look_of(options)
+    lanes = lanes_of(orbits, look.labels)
+    planes = _planes(one_shape(lanes), dof)
+    count = len(planes)
+    looks = looks_of(len(lanes), look.colour)
+    columns, height = min(3, count), 4.0 if count <= 3 else 6.8
+    size = (5.2, 4.4) if count == 1 else (1.2 + 3.4 * columns, height)
+    axes, new = stack(look.ax, count, "one for each degree of freedom", size, columns)
+    for axis, plane in zip(axes, planes, strict=True):
         for i, lane in enumerate(lanes):
-            _draw_orbit(axis, lane, _folded(*lane.plane(place), period), looks, i, dots)
-        label_plane(axis, place, shape, units)
+            q, p = plane.of(lane)
+            _draw_orbit(axis, lane, _folded(q, p, period), looks, i, dots)
+        plane.name_axes(axis, look.units)
         if period is not None:
             axis.set_xlim(-period / 2, period / 2)
             if math.isclose(period, 2 * math.pi):
                 axis.set_xticks(np.arange(-2, 3) * math.pi / 2, ["−π", "−π/2", "0", "π/2", "π"])
         if hamiltonian is not None:
-            _level_lines(axis, hamiltonian, lanes[0], place, levels)
-    axes[0].set_title(title)
-    _finish(axes, lanes, looks, colour_label, new, hamiltonian is not None)
-    single = len(axes) == 1 and not isinstance(dof, list)
-    return axes[0] if single else np.asarray(axes)
+            _level_lines(axis, hamiltonian, lanes[0], plane.place, levels)
+    entries = _entries(lanes, looks)
+    if hamiltonian is not None:
+        level = entry("levels of H", color="#a8a8a8", lw=0.8)
+        entries.insert(int(len(lanes) <= len(COLOURS)), level)
+    looks.finish(axes, look, new, entries)
+    return axes[0] if count == 1 and not isinstance(dof, list) else np.asarray(axes)
 
 
-def label_plane(axis: Any, place: Any, shape: tuple[int, ...], units: Mapping[str, str]) -> None:
-    """Names of the axes of one degree of freedom, q and p."""
-    axis.set_xlabel(named(subscript("q", place, shape), units.get("q")))
-    axis.set_ylabel(named(subscript("p", place, shape), units.get("p")))
-
-
-def _places(shape: tuple[int, ...], dof: Any) -> list[tuple[int, ...]]:
+def _planes(shape: tuple[int, ...], dof: Any) -> list["Plane"]:
     places = list(np.ndindex(shape))
     if dof is not None:
         places = [place_in(shape, one) for one in (dof if isinstance(dof, list) else [dof])]
-    elif len(places) > _PANELS:
+    else:
         some = "0, 1" if len(shape) == 1 else "(0, 0), (0, 1)"
-        raise ValueError(
-            f"there are {len(places)} degrees of freedom and room for {_PANELS} panels: name some, "
-            f"dof=[{some}]."
-        )
+        at_most(_PANELS, len(places), "degrees of freedom", f"dof=[{some}]")
     if not places:
         raise ValueError("dof is empty, there is nothing to draw.")
-    return places
+    return [Plane(place, shape) for place in places]
 
 
 def _folded(q: np.ndarray, p: np.ndarray, period: float | None) -> tuple[np.ndarray, np.ndarray]:
@@ -135,44 +104,36 @@ def _draw_orbit(
     axis: Any, lane: Lane, xy: Sequence[np.ndarray], looks: Looks, i: int, dots: bool
 ) -> None:
     """A line with a circle at its start, and a cross at its end if that came too early."""
-    look, n = looks.line(i, 1.0) | {"label": lane.label or None}, len(xy[0])
+    look, n, many = looks.line(i, 1.0), len(xy[0]), len(looks.colours)
+    look["label"] = lane.label or None
     if dots:
-        look |= {"linestyle": "none", "marker": "o", "markeredgewidth": 0}
-        axis.plot(*xy, markersize=2.2 if n < 3000 else 0.9, rasterized=n > 5000, **look)
+        look |= {"ls": "none", "marker": "o", "mew": 0}
+        axis.plot(*xy, ms=2.2 if n < 3000 else 0.9, rasterized=n > 5000, **look)
     else:
-        path(axis, *xy, **look, **_marks(looks, i, n))
-    if len(looks.colours) <= len(COLOURS):
+        # Where an orbit retraces itself its dashes overlap to a full line, and only markers
+        # distinguish it in a print without colours.
+        if 1 < many <= len(COLOURS) and looks.scale is None:
+            step = max(1, n // _MARKS)
+            place = step * (2 * i + 1) // (2 * many), step
+            look |= {"marker": MARKS[i], "markevery": place, "ms": 4.5}
+        path(axis, *xy, **look)
+    if many <= len(COLOURS):
         axis.plot(*(x[:1] for x in xy), color=looks.colours[i], zorder=3, **START)
     if lane.trouble:
         finite = np.flatnonzero(np.logical_and.reduce([np.isfinite(x) for x in xy]))[-1:]
-        axis.plot(*(x[finite] for x in xy), linestyle="none", zorder=4, **CROSS)
+        axis.plot(*(x[finite] for x in xy), ls="none", zorder=4, **CROSS)
 
 
-def _marks(looks: Looks, i: int, count: int) -> dict[str, Any]:
-    """Marks along one line of several of the palette: where an orbit retraces itself its dashes
-    overlap to a full line, and a print without colours would not distinguish it."""
-    if not 1 < len(looks.colours) <= len(COLOURS) or looks.scale is not None:
-        return {}
-    step = max(1, count // _MARKS)
-    first = step * (2 * i + 1) // (2 * len(looks.colours))
-    return {"marker": MARKS[i], "markevery": (first, step), "markersize": 4.5}
-
-
-def _finish(
-    axes: Sequence[Any], lanes: Any, looks: Looks, label: str, new: bool, levels: bool = False
-) -> None:
-    """The bar of colours and the legend of a picture of orbits."""
-    looks.colour_bar(axes, label)
-    start = Line2D([], [], color="#444444", label="start", **START)
-    level = Line2D([], [], color="#a8a8a8", linewidth=0.8, label="levels of H")
-    handles = [start] * (len(lanes) <= len(COLOURS)) + [level] * levels
-    legend(axes[0], new, [*handles, *looks.entries(), *troubles(lanes)])
+def _entries(lanes: Sequence[Lane], looks: Looks) -> list[Any]:
+    """Legend entries of a picture of orbits after their names."""
+    start = [entry("start", color="#444444", **START)] if len(lanes) <= len(COLOURS) else []
+    return start + looks.entries + troubles(lanes)
 
 
 def _level_lines(
     axis: Any, hamiltonian: Any, lane: Lane, place: tuple[int, ...], levels: Any
 ) -> None:
-    """Level lines over the whole panel, as far as the orbits made it."""
+    """Level lines over the whole panel, after the orbits have set its limits."""
     x, y = (np.linspace(low, high, _MESH) for low, high in (axis.get_xlim(), axis.get_ylim()))
     assert lane.ps is not None
     q, p = (jnp.asarray(state[0], float) for state in (lane.qs, lane.ps))
@@ -192,9 +153,6 @@ def _level_lines(
         axis.contour(x, y, np.ma.masked_invalid(H), levels, zorder=0.9, **look)
 
 
-# --- orbits -------------------------------------------------------------------------------------
-
-
 @in_style
 def orbit(
     orbits: Any,
@@ -203,56 +161,74 @@ def orbit(
     centre: Any = None,
     names: Sequence[str] | None = None,
     dots: bool = False,
-    labels: Sequence[str] | None = None,
-    colour: Any = None,
-    colour_label: str = "",
-    units: Mapping[str, str] | None = None,
-    title: str = "",
-    ax: Any = None,
+    **options: Any,
 ) -> Any:
     """Orbits in the plane or in space, the same scale along every axis.
 
     - `orbits`: a `Solution`, of one run or of a batch, the arrays (ts, qs), of shapes (..., S) and
       (..., S, n) or (..., S, bodies, dim), or a list of these.
-    - `coordinates`: two or three numbers of coordinates from 0; None: all, if they are two or
-      three.
+    - `coordinates`: two or three numbers of coordinates from 0; None: all.
     - `bodies`: numbers of those that are drawn; None: all. `names`: one for each of these, of a
       single orbit; `labels` name the orbits of a batch.
-    - `centre`: number of the body that the others are drawn about, a star there; or a point, shape
-      (dim,), that is marked. None: nothing is.
-    - `dots`, `labels`, `colour`, `colour_label`: as for `phase_portrait`. In a batch a colour is an
-      orbit, else a body.
-    - `units`: of "q". `ax`: where to draw, with ``projection="3d"`` for three coordinates.
+    - `centre`: number of the body that is the origin, marked by a star; or a point, shape (dim,),
+      that is marked. None: no mark.
+    - `dots`: draw the states alone, without a line between them.
+    - `labels`, `colour`, `colour_label`, `units` (of "q"), `title`, `ax` (with ``projection="3d"``
+      for three coordinates): as for all pictures. Colours distinguish the orbits of a batch, or the
+      bodies of one orbit.
 
     Circles are initial states; crosses mark early ends of orbits, with the reason in the legend.
 
-    **Returns** the `Axes`.
-
-    **Raises** `TypeError` for what are no orbits, `ValueError` for one coordinate, for bodies and
-    coordinates that are not there, for names in a batch, and for axes of another dimension.
+    **Returns** the `Axes`. **Raises** `TypeError` for input without orbits, `ValueError` for one
+    coordinate, for bodies and coordinates that do not exist, for names in a batch, and for axes of
+    another dimension.
     """
-    lanes = lanes_of(orbits, labels, momenta=False)
+    look = look_of(options)
+    lanes = lanes_of(orbits, look.labels, momenta=False)
     view = view_of(lanes, coordinates, bodies, centre, names)
-    if colour is not None and len(lanes) == 1:
+    if look.colour is not None and len(lanes) == 1:
         raise ValueError("colour distinguishes orbits of a batch, and there is one orbit.")
-    looks = looks_of(len(lanes) if len(lanes) > 1 else len(view.bodies), colour)
-    axis, new = canvas(ax, (5.4, 5.0), len(view.coordinates) == 3)
-    for i, k, colour_number, name in view.lines(lanes):
+    looks = looks_of(len(lanes) if len(lanes) > 1 else len(view.bodies), look.colour)
+    axis, new = canvas(look.ax, (5.4, 5.0), len(view.coordinates) == 3)
+    for i, k, number, name in view.lines(lanes):
         lane = lanes[i]._replace(label=name)
-        _draw_orbit(axis, lane, view.of(lane.qs, k), looks, colour_number, dots)
+        _draw_orbit(axis, lane, view.of(lane, k), looks, number, dots)
     if view.mark is not None:
         axis.plot(*([x] for x in view.mark), label=view.mark_name, **STAR)
-    label_view(axis, view, units or {})
-    axis.set_title(title)
-    _finish([axis], lanes, looks, colour_label, new)
+    view.name_axes(axis, look.units)
+    looks.finish([axis], look, new, _entries(lanes, looks))
     return axis
+
+
+class Plane(NamedTuple):
+    """The position and the momentum of one degree of freedom as coordinates of a picture."""
+
+    place: tuple[int, ...]
+    shape: tuple[int, ...]
+    coordinates: tuple[int, ...] = (0, 1)
+    mark: None = None
+
+    def of(self, lane: Lane, k: int = 0) -> Any:
+        """(q, p) along an orbit, shape (S,) each."""
+        if lane.ps is None:
+            raise TypeError("this picture needs momenta: a Solution, or the arrays (ts, qs, ps).")
+        return [x[(slice(None), *self.place)] for x in (lane.qs, lane.ps)]
+
+    def lines(self, lanes: Sequence[Lane]) -> Iterator[tuple[int, int, int, str]]:
+        """As `View.lines`."""
+        return ((i, 0, i, lane.label) for i, lane in enumerate(lanes))
+
+    def name_axes(self, axis: Any, units: Mapping[str, str]) -> None:
+        for which, name in (("x", "q"), ("y", "p")):
+            label = named(indexed(name, self.place, self.shape), units.get(name))
+            axis.set(**{f"{which}label": label})
 
 
 class View(NamedTuple):
     """Which coordinates of which bodies are drawn, relative to which point.
 
-    - `many`: whether a state has bodies. `about`: number of the body at the origin, or None.
-    - `mark`: the point that has a star, or None, and `mark_name`: its name in the legend.
+    `many`: whether a state has bodies; `about`: number of the body at the origin, or None; `mark`:
+    the point that has a star, or None.
     """
 
     coordinates: tuple[int, ...]
@@ -263,24 +239,45 @@ class View(NamedTuple):
     mark: np.ndarray | None = None
     mark_name: str = "centre"
 
-    def of(self, qs: np.ndarray, k: int) -> list[np.ndarray]:
+    def of(self, lane: Lane, k: int) -> list[np.ndarray]:
         """Coordinates of drawn body number k, shape (S,) each."""
-        x = qs[:, self.bodies[k]] if self.many else qs
+        x = lane.qs[:, self.bodies[k]] if self.many else lane.qs
         if self.about is not None:
-            x = x - qs[:, self.about]
+            x = x - lane.qs[:, self.about]
         return [x[:, c] for c in self.coordinates]
 
     def lines(self, lanes: Sequence[Lane]) -> Iterator[tuple[int, int, int, str]]:
-        """(number of the orbit, of the drawn body, of the colour; name) of every line.
-
-        A colour is an orbit of a batch, else a body.
-        """
-        several = len(lanes) > 1
+        """(number of the orbit, of the drawn body, of the colour; name) of every line."""
+        several = len(lanes) > 1  # then a colour is an orbit, else a body
         for i, k in np.ndindex(len(lanes), len(self.bodies)):
             yield i, k, i if several else k, self.names[k] or (lanes[i].label if k == 0 else "")
 
+    def name_axes(self, axis: Any, units: Mapping[str, str]) -> None:
+        """Set the names of the axes, and one scale for all."""
+        for which, c in zip("xyz", self.coordinates, strict=False):
+            name = "xyz"[c] if self.many else indexed("q", (c,), (2,))
+            if self.about is not None:
+                name += f" − {name}$_{{{self.about + 1}}}$"
+            axis.set(**{f"{which}label": named(name, units.get("q"))})
+        if len(self.coordinates) == 2:
+            axis.set_aspect("equal", adjustable="datalim")
+            return
+        # In space the box is widened about an orbit that is much narrower than long.
+        limits = np.asarray([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()])
+        wide = np.ptp(limits, axis=1)
+        sides = np.maximum(wide, _NARROW * wide.max())
+        for which, middle, side in zip("xyz", limits.mean(1), sides, strict=True):
+            axis.set(**{f"{which}lim": (middle - side / 2, middle + side / 2)})
+            bins = int(np.clip(round(6 * side / wide.max()), 3, 6))
+            getattr(axis, f"{which}axis").set_major_locator(MaxNLocator(bins))
+        # A smaller box, so that the labels fit into the figure.
+        axis.set_box_aspect(sides, zoom=0.84)
+        axis.zaxis.labelpad = 9
 
-def view_of(lanes: Sequence[Lane], coordinates: Any, bodies: Any, centre: Any, names: Any) -> View:
+
+def view_of(
+    lanes: Any, coordinates: Any = None, bodies: Any = None, centre: Any = None, names: Any = None
+) -> View:
     """The checked choice of what is drawn of orbits."""
     shape = one_shape(lanes)
     if names is not None and (len(lanes) > 1 or math.prod(shape) == 1):
@@ -314,36 +311,6 @@ def view_of(lanes: Sequence[Lane], coordinates: Any, bodies: Any, centre: Any, n
     return view._replace(bodies=drawn, names=labels_of(names, len(drawn), "bodies", "names"))
 
 
-def label_view(axis: Any, view: View, units: Mapping[str, str]) -> None:
-    """Names of the axes, and one scale for all."""
-    for which, c in zip("xyz", view.coordinates, strict=False):
-        name = "xyz"[c] if view.many else subscript("q", (c,), (2,))
-        if view.about is not None:
-            name += f" − {name}$_{{{view.about + 1}}}$"
-        axis.set(**{f"{which}label": named(name, units.get("q"))})
-    if len(view.coordinates) == 3:
-        _widen(axis)
-    else:
-        axis.set_aspect("equal", adjustable="datalim")
-
-
-def _widen(axis: Any) -> None:
-    """One scale for all axes in space, with room about an orbit much narrower than long."""
-    limits = np.asarray([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()])
-    wide = np.ptp(limits, axis=1)
-    sides = np.maximum(wide, _NARROW * wide.max())
-    for which, middle, side in zip("xyz", limits.mean(1), sides, strict=True):
-        axis.set(**{f"{which}lim": (middle - side / 2, middle + side / 2)})
-        bins = int(np.clip(round(6 * side / wide.max()), 3, 6))
-        getattr(axis, f"{which}axis").set_major_locator(MaxNLocator(bins))
-    # A smaller box, so that the labels fit into the figure.
-    axis.set_box_aspect(sides, zoom=0.84)
-    axis.zaxis.labelpad = 9
-
-
-# --- what a run shows ---------------------------------------------------------------------------
-
-
 @in_style
 def trajectory(
     ts: Any,
@@ -355,14 +322,14 @@ def trajectory(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """A trajectory as its shape suggests.
+    """A trajectory in the kind of picture that fits its shape.
 
     One degree of freedom: (q, p). Two, or bodies in the plane or in space: orbits in the first
     two coordinates. More: every position against time.
 
     - `ts`: a `Solution` of one run; or times, shape (S,), with `qs`, `ps`: shape (S, n) or
       (S, bodies, dim).
-    - `time`: label of its axis; `position`, `momentum`: units or None. `ax`: where to draw.
+    - `time`: label of its axis; `position`, `momentum`: units or None.
 
     **Returns** the `Axes`.
     """
@@ -382,9 +349,9 @@ def trajectory(
     axis, new = canvas(ax, (6.4, 4.2))
     flat = q.reshape(len(t), -1)
     for i, values in enumerate(flat.T):
-        look: Any = {"color": COLOURS[i % len(COLOURS)], "linestyle": DASHES[i % len(DASHES)]}
+        look: Any = {"color": COLOURS[i % len(COLOURS)], "ls": DASHES[i % len(DASHES)]}
         label = f"q$_{{{i + 1}}}$" if flat.shape[1] <= 12 else None
-        path(axis, t, values, linewidth=1, label=label, **look)
+        path(axis, t, values, lw=1, label=label, **look)
     axis.set(xlabel=time, ylabel=named("q", position), title=title)
     legend(axis, new, troubles(lanes))
     return axis

@@ -2,17 +2,18 @@
 
 import itertools
 import textwrap
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._checks import one_of
-from .axes import canvas, check_shapes, counted, envelope, labels_of, legend, stack
-from .states import each_state, lanes_of, looks_of, troubles
-from .style import COLOURS, CROSS, DASHES, GREY, in_style, named
+from .axes import at_most, canvas, check_shapes, counted, envelope, guide, labels_of, legend, stack
+from .states import Lane, each_state, lanes_of, looks_of, troubles
+from .style import COLOURS, CROSS, DASHES, GREY, GUIDE, SMALL, in_style, look_of, named, signed
 
-_KINDS = {"relative": "relative change", "absolute": "change", "value": ""}
+_CHANGES = {"relative": "relative change", "absolute": "change", "value": ""}
 _PANELS = 12
 
 _NEAR_ROUNDING = 1e-12
@@ -26,26 +27,12 @@ def draw_series(
 
     Long series are drawn by the extremes of each piece.
     """
-    lost = {"are no numbers": ~np.isfinite(v)}
+    lost = {"are not finite": ~np.isfinite(v)}
     if log:
         lost |= {"are exactly 0": v == 0, "are below 0": v < 0}
     shown = np.where(np.logical_or.reduce(list(lost.values())), np.nan, v)
     axis.plot(*envelope(t, shown), label=label or None, **look)
     return {text: int(here.sum()) for text, here in lost.items()}
-
-
-class _Series(NamedTuple):
-    """One quantity along every orbit: times and values, shape (S,) each.
-
-    `size`: whether the values are lengths of vectors. `from_zero`: number of orbits that start at
-    0 and therefore have no relative change.
-    """
-
-    name: str
-    ts: list[np.ndarray]
-    values: list[np.ndarray]
-    size: bool
-    from_zero: int
 
 
 @in_style
@@ -54,125 +41,140 @@ def invariants(
     values: Mapping[str, Any] | None = None,
     change: str = "relative",
     log: bool = False,
-    labels: Sequence[str] | None = None,
-    colour: Any = None,
-    colour_label: str = "",
-    units: Mapping[str, str] | None = None,
-    title: str = "",
-    ax: Any = None,
+    **options: Any,
 ) -> Any:
     """Quantities along time and how well they are conserved, one panel above another.
 
     - `orbits`: a `Solution`, of one run or of a batch; or times alone, shape (..., S).
     - `values`: name → numbers, shape (..., S, *any), or (..., S − 1, *any) for those at the ends of
-      steps; or a function ``(q, p)`` of one state. None: the observables
-      in the dictionary ``solution.observed`` that have a value per step.
+      steps; or a function ``(q, p)`` of one state. None: the observables in the dictionary
+      ``solution.observed`` that have a value per step.
     - `change`: "relative", (I − I₀)/|I₀|; "absolute", I − I₀; "value", I itself. I₀ is the first
-      number there is, of an observable that of the first step. Of vectors and matrices it is the
+      finite number, of an observable that of the first step. For vectors and matrices it is the
       length of the change, relative to the length of I₀.
     - `log`: sizes on a logarithmic axis, on which several quantities of one orbit share a panel,
-      and relative changes are compared with the rounding of one operation. The legend counts
-      values that are exactly 0, which have no place there.
-    - `labels`, `colour`, `colour_label`: of the orbits, as for `phase_portrait`.
-    - `units`: of "t" and of quantities by their name, where the change is not relative.
-    - `ax`: where to draw, one `Axes` for each panel.
+      and relative changes are compared with the machine epsilon. The legend counts values that are
+      exactly 0, which have no place there.
+    - `labels`, `colour`, `colour_label`, `units` (of "t", and of quantities whose change is not
+      relative), `title`, `ax` (one `Axes` for each panel): as for all pictures.
 
-    Lines of many points are drawn by the extremes of each piece. Crosses mark early ends of orbits,
-    with the reason in the legend.
+    Crosses mark early ends of orbits, with the reason in the legend.
 
-    **Returns** the `Axes`, an array of them for several panels.
-
-    **Raises** `TypeError` for what has no times or no numbers; `ValueError` for shapes that do not
-    fit, and for relative changes of what always starts at 0 (an orbit of a batch is left out, and
-    named in the legend).
+    **Returns** the `Axes`, an array of them for several panels. **Raises** `TypeError` for input
+    without times or numbers; `ValueError` for shapes that do not fit, and for relative changes of a
+    quantity that starts at 0 on every orbit (if others do not, such an orbit is left out and
+    counted in the legend).
     """
-    one_of("change", change, _KINDS)
-    units = units or {}
-    ts, names, lanes = _times(orbits, labels)
-    watched = _watched(orbits, values, lanes)
-    series = [_changed(name, ts, v, change, log) for name, v in watched.items()]
-    count = _count_of_panels(len(series), len(ts), log)
-    together = count < len(series)
-    if count > _PANELS:
+    look = look_of(options)
+    one_of("change", change, _CHANGES)
+    ts, names, lanes, watched = _read(orbits, values, look.labels)
+    changed = {k: [_changed(k, v, change, log) for v in rows] for k, rows in watched.items()}
+    if zero := [name for name, rows in changed.items() if all(v is None for v in rows)]:
         raise ValueError(
-            f"{count} quantities are too many for {_PANELS} panels: name some, values="
+            f"every orbit starts at 0 of {zero[0]!r}, so that no change is relative to it: take "
+            "change='absolute'."
         )
+    together = log and len(ts) == 1 < len(watched)
+    count = 1 if together else len(watched)
+    at_most(_PANELS, count, "quantities", "values={...}")
     size = (6.4, 4.2) if count == 1 else (6.4, 1.4 + 1.45 * count)
-    axes, new = stack(ax, count, "one for each quantity", size, sharex=True)
-    looks = looks_of(len(series) if together else len(ts), None if together else colour)
-    zeros = 0
-    for i, one in enumerate(series):
+    axes, new = stack(look.ax, count, "one for each quantity", size, sharex=True)
+    looks = looks_of(len(watched)) if together else looks_of(len(ts), look.colour)
+    zeros, from_zero = 0, []
+    for i, (quantity, rows) in enumerate(watched.items()):
         axis = axes[0 if together else i]
-        for k, (t, v) in enumerate(zip(one.ts, one.values, strict=True)):
-            name = one.name if together else names[k] if i == 0 else ""
-            _draw_change(axis, t, v, name, log, looks.line(i if together else k, 1.1))
+        lost = {f"of {len(ts)} orbits start at 0": sum(v is None for v in changed[quantity])}
+        from_zero += [f"{quantity}: {text}" for text in counted(lost)]
+        title = quantity.replace("_", " ")
+        for k, (t, v, old) in enumerate(zip(ts, changed[quantity], rows, strict=True)):
+            v, t = np.full(len(old), np.nan) if v is None else v, t[len(t) - len(old) :]
+            name = title if together else names[k] if i == 0 else ""
+            draw_series(axis, t, v, name, log, **looks.line(i if together else k, 1.1))
+            last = np.flatnonzero(np.isfinite(v))[-1:]
+            if last.size and last[0] < len(v) - 1 and not (log and v[last[0]] == 0):
+                axis.plot(t[last], v[last], ls="none", zorder=4, **CROSS)
             # The first value is the reference and therefore 0.
             zeros += int(np.sum(v[1:] == 0)) if log else 0
-        label = _name_of_axis("" if together else one.name, change, log, one.size, units)
+        kind = _CHANGES[change]
+        if log or any(v[:1].size > 1 for v in rows):
+            kind = f"size of {kind}" if kind else "size"
+        unit = look.units.get(quantity) if change != "relative" and not together else None
+        title = "" if together else textwrap.fill(title, 20) if kind else title
+        label = f"{title}\n{named(kind, unit)}" if kind and title else named(title or kind, unit)
         axis.set_ylabel(label, fontsize=9 if count > 1 else None)
         if log:
             axis.set_yscale("log")
+    for axis in axes:
         if log and change == "relative" and axis.get_ylim()[0] < _NEAR_ROUNDING:
             _rounding(axis)
-    _finish(axes, named("time t", units.get("t")), title)
-    looks.colour_bar(axes, colour_label)
-    notes = [*looks.entries(), *counted({"values exactly 0": zeros})]
-    for one in series:
-        texts = counted({f"of {len(ts)} orbits start at 0": one.from_zero})
-        notes += [f"{one.name}: {text}" for text in texts]
-    legend(axes[0], new, notes + troubles(lanes))
+    axes[-1].set_xlabel(named("time t", look.units.get("t")))
+    axes[0].figure.align_ylabels(axes)
+    notes = [*looks.entries, *counted({"values exactly 0": zeros}), *from_zero]
+    looks.finish(axes, look, new, [*notes, *troubles(lanes)])
     return axes[0] if count == 1 else np.asarray(axes)
 
 
-def _finish(axes: Sequence[Any], time: str, title: str) -> None:
-    """Title, name of the times, and aligned names of the y axes."""
-    axes[0].set_title(title)
-    axes[-1].set_xlabel(time)
-    axes[0].figure.align_ylabels(axes)
+def _changed(name: str, v: np.ndarray, change: str, log: bool) -> np.ndarray | None:
+    """Changes since the first finite value, shape (S,); None if they are relative to 0."""
+    if v.dtype.kind not in "biuf":
+        raise TypeError(f"{name!r} is {v.dtype}, and only real numbers can be drawn.")
+    v = v.reshape(len(v), -1).astype(float)
+    first = next((row for row in v if np.isfinite(row).all()), np.full(v.shape[1], np.nan))
+    v = v if change == "value" else v - first
+    v = np.linalg.norm(v, axis=1) if v.shape[1] > 1 else v[:, 0]
+    if change == "relative":
+        size = np.linalg.norm(first)
+        if size == 0:
+            return None
+        v = v / size
+    return np.abs(v) if log else v
 
 
 def panels_of(orbits: Any, values: Mapping[str, Any] | None, log: bool) -> int:
     """How many panels `invariants` draws."""
-    ts, _, lanes = _times(orbits, None)
-    return _count_of_panels(len(_watched(orbits, values, lanes)), len(ts), log)
+    ts, *_, watched = _read(orbits, values, None)
+    return 1 if log and len(ts) == 1 else len(watched)
 
 
-def _count_of_panels(quantities: int, orbits: int, log: bool) -> int:
-    return 1 if log and orbits == 1 else quantities
-
-
-def _times(
-    orbits: Any, labels: Sequence[str] | None
-) -> tuple[list[np.ndarray], list[str], list[Any]]:
-    """Times and labels of every orbit, and the orbits themselves if there are states."""
+def _read(
+    orbits: Any, values: Mapping[str, Any] | None, labels: Sequence[str] | None
+) -> tuple[list[np.ndarray], list[str], list[Lane], dict[str, list[np.ndarray]]]:
+    """(times and labels of every orbit, the orbits if there are states; name → their values)."""
     if isinstance(orbits, list | tuple) or hasattr(orbits, "qs"):
         lanes = lanes_of(orbits, labels, momenta=False)
-        return [lane.ts for lane in lanes], [lane.label for lane in lanes], lanes
-    ts = np.asarray(getattr(orbits, "ts", orbits))
-    if ts.dtype.kind not in "iuf" or ts.ndim == 0:
-        raise TypeError(
-            f"invariants takes a Solution, or times of shape (S,) with values, got {orbits!r}."
-        )
-    ts = ts.reshape(-1, ts.shape[-1])
-    return list(ts), labels_of(labels, len(ts), "orbits"), []
-
-
-def _watched(
-    orbits: Any, values: Mapping[str, Any] | None, lanes: Sequence[Any]
-) -> dict[str, list[np.ndarray]]:
-    """Name → the values of every orbit, one array each."""
-    if values is None and isinstance(orbits, list):  # each may be a batch
-        pairs = [(one, _observed(one)) for one in orbits]
-        shared = [n for n in pairs[0][1] if all(n in observed for _, observed in pairs)]
-        values = {
-            n: [v for one, seen in pairs for v in _of_every_orbit(n, seen[n], one, ())]
-            for n in shared
-        }
-    elif values is None:
-        values = _observed(orbits)
-    if not values:
+        ts, names = [lane.ts for lane in lanes], [lane.label for lane in lanes]
+    else:
+        lanes, times = [], np.asarray(getattr(orbits, "ts", orbits))
+        if times.dtype.kind not in "iuf" or times.ndim == 0:
+            raise TypeError(
+                f"invariants takes a Solution, or times of shape (S,) with values, got {orbits!r}."
+            )
+        ts = list(times.reshape(-1, times.shape[-1]))
+        names = labels_of(labels, len(ts), "orbits")
+    watched: dict[str, list[np.ndarray]] = {}
+    if values is None:
+        parts = orbits if isinstance(orbits, list) else [orbits]
+        seen = [_observed(one) for one in parts]
+        for name in seen[0]:
+            if all(name in one for one in seen):
+                pairs = zip(parts, seen, strict=True)
+                watched[name] = [row for one, found in pairs for row in _rows(name, found, one)]
+    for name, v in (values or {}).items():
+        if callable(v):
+            if any(lane.ps is None for lane in lanes) or not lanes:
+                raise TypeError(
+                    f"{name!r} is a function (q, p): it takes a Solution, or (ts, qs, ps)."
+                )
+            watched[name] = [each_state(v, lane.qs, lane.ps) for lane in lanes]
+        elif not isinstance(orbits, list):
+            watched[name] = _rows(name, {name: v}, orbits)
+        elif isinstance(v, list) and len(v) == len(lanes):
+            watched[name] = [np.asarray(x) for x in v]
+        else:
+            raise ValueError(f"{name!r} must be a list of numbers, one array for each solution.")
+    if not watched:
         raise ValueError("there is nothing to draw: no observable has a value per step.")
-    return {name: _of_every_orbit(name, v, orbits, lanes) for name, v in values.items()}
+    return ts, names, lanes, watched
 
 
 def _observed(one: Any) -> dict[str, Any]:
@@ -188,17 +190,10 @@ def _observed(one: Any) -> dict[str, Any]:
     return {k: v for k, v in observed.items() if hasattr(v, "shape") and v.shape[:front] in shapes}
 
 
-def _of_every_orbit(name: str, v: Any, orbits: Any, lanes: Sequence[Any]) -> list[np.ndarray]:
-    if callable(v):
-        if any(lane.ps is None for lane in lanes) or not lanes:
-            raise TypeError(f"{name!r} is a function (q, p): it takes a Solution, or (ts, qs, ps).")
-        return [each_state(v, lane.qs, lane.ps) for lane in lanes]
-    if isinstance(orbits, list):
-        if not isinstance(v, list) or len(v) != len(lanes):
-            raise ValueError(f"{name!r} must be a list of numbers, one array for each solution.")
-        return [np.asarray(x) for x in v]
+def _rows(name: str, values: Mapping[str, Any], orbits: Any) -> list[np.ndarray]:
+    """The values of a name along every orbit of a batch."""
     ts = np.asarray(orbits[0] if isinstance(orbits, tuple) else getattr(orbits, "ts", orbits))
-    v, (*lead, n) = np.asarray(v), ts.shape
+    v, (*lead, n) = np.asarray(values[name]), ts.shape
     shapes = (*lead, n), (*lead, n - 1)
     wanted = f"{name!r} must have one value for each time, shape {shapes[0]}, or for each step, "
     wanted += f"{shapes[1]}, and possibly more axes after these"
@@ -206,60 +201,13 @@ def _of_every_orbit(name: str, v: Any, orbits: Any, lanes: Sequence[Any]) -> lis
     return list(v.reshape(-1, *v.shape[len(lead) :]))
 
 
-def _changed(
-    name: str, ts: list[np.ndarray], values: list[np.ndarray], change: str, log: bool
-) -> _Series:
-    """The changes of a quantity since its first finite value, along every orbit."""
-    times, found, vector, from_zero = [], [], False, 0
-    for t, v in zip(ts, values, strict=True):
-        if v.dtype.kind not in "biuf":
-            raise TypeError(f"{name!r} is {v.dtype}, and only real numbers can be drawn.")
-        v = v.reshape(len(v), -1).astype(float)
-        first = next((row for row in v if np.isfinite(row).all()), np.full(v.shape[1], np.nan))
-        v = v if change == "value" else v - first
-        vector = vector or v.shape[1] > 1
-        v = np.linalg.norm(v, axis=1) if v.shape[1] > 1 else v[:, 0]
-        if change == "relative":
-            size = np.linalg.norm(first)
-            from_zero += int(size == 0)
-            v = v / (size or np.nan)
-        times.append(t[len(t) - len(v) :])
-        found.append(np.abs(v) if log else v)
-    if from_zero and from_zero == len(ts):
-        raise ValueError(
-            f"every orbit starts at 0 of {name!r}, so that no change is relative to it: take "
-            "change='absolute'."
-        )
-    return _Series(name, times, found, vector, from_zero)
-
-
-def _draw_change(axis: Any, t: Any, v: np.ndarray, name: str, log: bool, look: Any) -> None:
-    """One orbit's line, with a cross where its values end too early."""
-    draw_series(axis, t, v, name.replace("_", " "), log, **look)
-    finite = np.flatnonzero(np.isfinite(v))
-    if finite.size and finite[-1] < len(v) - 1 and not (log and v[finite[-1]] == 0):
-        axis.plot(t[finite[-1:]], v[finite[-1:]], linestyle="none", zorder=4, **CROSS)
-
-
-def _name_of_axis(name: str, change: str, log: bool, vector: bool, units: Mapping[str, str]) -> str:
-    kind = _KINDS[change]
-    if log or vector:
-        kind = f"size of {kind}" if kind else "size"
-    unit = units.get(name) if change != "relative" else None
-    name = name.replace("_", " ")
-    if kind and name:
-        return f"{textwrap.fill(name, 20)}\n{named(kind, unit)}"
-    return named(name or kind, unit)
-
-
 def _rounding(axis: Any) -> None:
     """A line at the rounding error of one operation in double precision."""
     eps = float(np.finfo(float).eps)
-    axis.axhline(eps, color=GREY, linewidth=1, linestyle=":")
+    axis.axhline(eps, color=GREY, lw=1, ls=":")
     paper = {"facecolor": "#ffffff", "edgecolor": "none", "alpha": 0.75, "pad": 0.5}
-    look = {"ha": "right", "va": "bottom", "fontsize": 8, "color": "#555555", "zorder": 4}
-    where = ("axes fraction", "data")
-    axis.annotate("rounding of one operation", (1, eps), xycoords=where, bbox=paper, **look)
+    look = SMALL | {"ha": "right", "va": "bottom", "zorder": 4, "bbox": paper}
+    axis.annotate("machine epsilon", (1, eps), xycoords=("axes fraction", "data"), **look)
 
 
 @in_style
@@ -267,23 +215,23 @@ def changes(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any =
     """Changes of quantities along a run, one panel above another.
 
     - `ts`: times, shape (S,). `series`: label → changes, shape (S,). `time`: label of the axis.
-    - `ax`: where to draw, one `Axes` for each quantity.
 
-    A panel reports how many of its changes are not finite.
-
-    **Returns** the `Axes`, shape (quantities,).
+    A panel reports how many of its changes are not finite. **Returns** the `Axes`, shape
+    (quantities,).
     """
     size = (6.4, 1.2 + 1.35 * len(series))
     axes, _ = stack(ax, len(series), "one for each quantity", size, sharex=True)
     colours = itertools.cycle(COLOURS)
     for axis, colour, (label, values) in zip(axes, colours, series.items(), strict=False):
         t, v = _pair(ts, values, label)
-        lost = draw_series(axis, t, v, "", color=colour, linewidth=1.1)
+        lost = draw_series(axis, t, v, "", color=colour, lw=1.1)
         axis.set_ylabel(label, fontsize=9)
-        look = {"ha": "right", "va": "top", "fontsize": 8, "color": "#555555"}
         for text in counted({f"of {len(v)} {what}": n for what, n in lost.items()}):
-            axis.text(0.99, 0.95, text, transform=axis.transAxes, **look)
-    _finish(axes, time, title)
+            where = {"ha": "right", "va": "top", "transform": axis.transAxes}
+            axis.text(0.99, 0.95, text, **SMALL, **where)
+    axes[0].set_title(title)
+    axes[-1].set_xlabel(time)
+    axes[0].figure.align_ylabels(axes)
     return np.asarray(axes)
 
 
@@ -291,12 +239,10 @@ def changes(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any =
 def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any = None) -> Any:
     """Sizes of relative changes of conserved quantities, on one logarithmic axis.
 
-    - `ts`: times, shape (S,). `series`: label → sizes, shape (S,). `ax`: where to draw.
+    - `ts`: times, shape (S,). `series`: label → sizes, shape (S,). `time`: label of the axis.
 
     The legend counts values without a place on this axis: exact zeros, and values that are
-    negative or not finite.
-
-    **Returns** the `Axes`.
+    negative or not finite. **Returns** the `Axes`.
     """
     axis, new = canvas(ax)
     axis.set_yscale("log")
@@ -305,7 +251,7 @@ def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any
     for (label, values), (colour, dash) in zip(series.items(), looks, strict=False):
         # The change at the start is 0 by definition and is left out.
         t, v = (x[1:] for x in _pair(ts, values, label))
-        lost = draw_series(axis, t, v, label, True, color=colour, linestyle=dash, linewidth=0.9)
+        lost = draw_series(axis, t, v, label, True, color=colour, ls=dash, lw=0.9)
         texts = counted({f"of {len(v)} {what}": n for what, n in lost.items()})
         notes += [f"{label}: {text}" for text in texts]
     _rounding(axis)
@@ -321,3 +267,118 @@ def _pair(ts: Any, values: Any, label: str) -> tuple[np.ndarray, np.ndarray]:
     wanted = f"{label!r} must have one number for each time, shape (S,)"
     check_shapes(t.ndim == 1 and v.shape == t.shape, wanted, ts=t, values=v)
     return t, v
+
+
+class _Kind(NamedTuple):
+    """How an indicator is drawn, and what regular motion shows: a level, or a slope."""
+
+    label: str
+    log: str = ""
+    level: float | None = None
+    slope: float | None = None
+
+
+_KINDS: dict[str | None, _Kind] = {
+    None: _Kind("indicator"),
+    "megno": _Kind("MEGNO ⟨Y⟩", "x", level=2.0),
+    "lyapunov": _Kind("finite-time Lyapunov exponent", "xy", slope=-1.0),
+    "sali": _Kind("SALI", "xy"),
+    "gali": _Kind("GALI", "xy"),
+}
+
+
+@in_style
+def indicator(
+    ts: Any,
+    values: Any,
+    kind: str | None = None,
+    slope: float | None = None,
+    t0: float | None = None,
+    **options: Any,
+) -> Any:
+    """An indicator of chaos against time, with its reference for regular motion.
+
+    - `ts`: times, shape (S,) or (..., S), or an object with `ts`, such as a `Solution`.
+    - `values`: numbers, shape (..., S) or (..., S − 1) for those at the ends of steps; several
+      exponents of one orbit are several lines; or label → such numbers.
+    - `kind`: "megno", with a line at 2, its limit for regular motion (Cincotta & Simó 2000);
+      "lyapunov", with a slope of −1, as the finite-time exponent falls for it (Benettin et al.
+      1980, up to a logarithm); "sali" or "gali", which stay, or fall by a power, for regular and
+      fall exponentially for chaotic motion (Skokos 2001; Skokos et al. 2007). None: any numbers.
+    - `slope`: of a guide through the largest first value, on logarithmic axes, in place of that of
+      the kind.
+    - `t0`: time of the start; None: the first of `ts` if the values are those at ends of steps,
+      else 0. A logarithmic axis shows |t − t0|, so that runs backward have their place.
+    - `labels`, `colour`, `colour_label`, `units` (of "t" and "value"), `title`, `ax`: as for all
+      pictures.
+
+    The legend counts values that are not finite, and, on logarithmic axes, those that are not
+    positive and those at the start itself.
+
+    **Returns** the `Axes`. **Raises** `ValueError` for an unknown kind and for shapes that do not
+    fit.
+    """
+    look, about = look_of(options), _KINDS[one_of("kind", kind, _KINDS)]
+    if slope is not None:
+        about = about._replace(log="xy", slope=slope)
+    lines, names = _lines_of(ts, values)
+    names = labels_of(look.labels or names or None, len(lines), "lines")
+    looks = looks_of(len(lines), look.colour)
+    axis, new = canvas(look.ax)
+    xlog, ylog = ("x" in about.log), ("y" in about.log)
+    lost: Counter[str] = Counter()
+    drawn, shifted = [], False
+    for i, (t, v, start) in enumerate(lines):
+        start = start if t0 is None else float(t0)
+        shifted |= xlog and (start != 0 or bool((t < 0).any()))
+        t = np.abs(t - start) if xlog else t
+        at_start = (t == 0) & np.isfinite(v) & xlog
+        t, v = t[~at_start], v[~at_start]
+        v = np.where(np.isfinite(t), v, np.nan)
+        counts = draw_series(axis, t, v, names[i], ylog, **looks.line(i, 1.2))
+        lost["are not finite"] += counts["are not finite"]
+        lost["at the start, t = t$_0$"] += int(at_start.sum())
+        lost["are not positive"] += counts.get("are exactly 0", 0) + counts.get("are below 0", 0)
+        positive = (t > 0) & (v > 0) & np.isfinite(v)
+        drawn += [(t[positive], v[positive])] if positive.any() else []
+    axis.set(xscale="log" if xlog else "linear", yscale="log" if ylog else "linear")
+    if about.level is not None:
+        axis.axhline(about.level, label=f"regular: {about.level:g}", **GUIDE)
+    if about.slope is not None and drawn:
+        # Over all times, through the largest of the first values.
+        value, first = max((v[0], t[0]) for t, v in drawn)
+        ends = first, max(t[-1] for t, _ in drawn)
+        guide(axis, ends, value, about.slope, label=f"slope {signed(about.slope)}")
+    time, units = "time since the start |t − t$_0$|" if shifted else "time t", look.units
+    axis.set(xlabel=named(time, units.get("t")), ylabel=named(about.label, units.get("value")))
+    notes = counted({f"values {text}": n for text, n in lost.items()})
+    looks.finish([axis], look, new, [*looks.entries, *notes])
+    return axis
+
+
+def _lines_of(ts: Any, values: Any) -> tuple[list[tuple[np.ndarray, np.ndarray, float]], list[str]]:
+    """(times, numbers, start) of every line, and their names if they have any.
+
+    The start is the time before the values where `ts` have one more than there are values, else 0.
+    """
+    if isinstance(values, Mapping):
+        found = {name: _lines_of(ts, v)[0] for name, v in values.items()}
+        named = [(k, n, line) for k, some in found.items() for n, line in enumerate(some, 1)]
+        names = [name if len(found[name]) == 1 else f"{name} {n}" for name, n, _ in named]
+        return [line for *_, line in named], names
+    t, v = np.asarray(getattr(ts, "ts", ts)), np.asarray(values)
+    n, several = t.shape[-1] if t.ndim else 0, t.ndim > 1
+    numbers = v.dtype.kind in "iuf" and v.ndim and n and v.shape[-1] in (n, n - 1)
+    fits = numbers and not (several and t.shape[:-1] != v.shape[: t.ndim - 1])
+    wanted = (
+        f"an indicator has one number for each time or step, shape (..., {n}) or (..., {n - 1})"
+    )
+    check_shapes(fits, wanted, ts=t, values=v)
+    start = t[..., 0] if n > v.shape[-1] else np.zeros(t.shape[:-1])
+    t = t[..., n - v.shape[-1] :]
+    if several:  # the axes of a batch come first, those of the lines of one orbit behind
+        inner = (1,) * (v.ndim - t.ndim)
+        start, t = start.reshape(*start.shape, *inner), t.reshape(*t.shape[:-1], *inner, -1)
+    start = np.broadcast_to(start, v.shape[:-1]).ravel().tolist()
+    rows = (x.reshape(-1, v.shape[-1]) for x in (np.broadcast_to(t, v.shape), v))
+    return list(zip(*rows, start, strict=True)), []

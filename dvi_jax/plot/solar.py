@@ -4,10 +4,9 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 
-from .axes import check_shapes, given, legend, stack
+from .axes import check_shapes, legend, stack
 from .style import COLOURS, MARKERS, STAR, in_style
 
 
@@ -25,11 +24,11 @@ def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
     check_shapes(fits, wanted, positions=positions)
     axes, new = stack(ax, 2, "inner and outer planets", (9.6, 5.4), ncols=2)
     groups = range(len(names))[:4], range(len(names))[4:]
-    mark: Any = {"markersize": 7, "markeredgecolor": "black", "markeredgewidth": 0.7}
+    mark: Any = {"ms": 7, "mec": "black", "mew": 0.7}
     for axis, group, title in zip(axes, groups, ("Inner planets", "Outer planets"), strict=True):
         for i, colour, marker in zip(group, itertools.cycle(COLOURS), MARKERS, strict=False):
             x, y = positions[:, i, 0], positions[:, i, 1]
-            axis.plot(x, y, ".", markersize=1, color=colour, alpha=0.35, rasterized=True)
+            axis.plot(x, y, ".", ms=1, color=colour, alpha=0.35, rasterized=True)
             axis.plot(x[:1], y[:1], marker, color=colour, label=names[i], **mark)
         axis.plot(0, 0, **STAR)
         axis.set(xlabel="x [au]", ylabel="y [au]", title=title)
@@ -40,7 +39,8 @@ def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
             legend(axis, new)
     if new:
         axes[0].figure.suptitle(
-            "Heliocentric orbits on the ecliptic of J2000; marks: places at the start", fontsize=10
+            "Heliocentric orbits on the ecliptic of J2000; marks: positions at the start",
+            fontsize=10,
         )
     return np.asarray(axes)
 
@@ -60,46 +60,41 @@ def ephemeris_comparison(
     - `years`: since the start, shape (T,). `errors`: [km], shape (T, planets).
     - `perihelion`: ephemeris minus integration [″], shape (T,); `slope` [″/century] and
       `intercept` [″] of its fitted line.
-    - `ax`: three `Axes`: of the errors, of the perihelion, of what the line leaves.
+    - `ax`: three `Axes`: of the errors, of the perihelion, of its residual.
 
     **Returns** the `Axes`, shape (3,).
     """
     years, errors, perihelion = np.asarray(years), np.asarray(errors), np.asarray(perihelion)
-    if ax is None:
-        figure = plt.figure(figsize=(10.4, 5.2), layout="constrained")
-        grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
-        left, right = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
-        below = figure.add_subplot(grid[1, 1], sharex=right)
-    else:
-        left, right, below = given(ax, 3, "for the errors, the perihelion and its residual")
+    places, what = [[0, 1], [0, 2]], "for the errors, the perihelion and its residual"
+    axes, new = stack(ax, places, what, (10.4, 5.2), height_ratios=(3, 1))
+    left, right, below = axes
+    if new:
+        below.sharex(right)
     for i, name in enumerate(names):
-        x, y = _upper_envelope(years, errors[:, i])
-        look: Any = {"color": COLOURS[i % len(COLOURS)], "linewidth": 1.3, "marker": MARKERS[i]}
-        look |= {"linestyle": "-" if i < len(COLOURS) else "--"}
+        # The largest value of each of about a hundred pieces is a readable line.
+        pieces = 100 if len(years) > 200 else len(years) - 1
+        parts = np.array_split(np.arange(1, len(years)), pieces)
+        x, y = years[[part[-1] for part in parts]], [errors[part, i].max() for part in parts]
+        look: Any = {"color": COLOURS[i % len(COLOURS)], "lw": 1.3, "marker": MARKERS[i]}
+        look |= {"ls": "-" if i < len(COLOURS) else "--"}
         left.semilogy(x, y, markevery=(i * 2 % 12, 12), label=name, **look)
     left.set(xlabel="years since the start", ylabel="distance from the ephemeris [km]")
     left.set_title("Heliocentric position, integration − DE421")
-    if ax is None:
+    if new:
         left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
     else:
-        legend(left, False)
-    right.plot(years, perihelion, ".", color=COLOURS[0], markersize=2, label="osculating orbits")
+        legend(left, new)
+    right.plot(years, perihelion, ".", color=COLOURS[0], ms=2, label="osculating orbits")
     line = intercept + slope * years / 100
     if np.isfinite(slope):
-        look = {"color": COLOURS[1], "linewidth": 1.2, "linestyle": "--"}
+        look = {"color": COLOURS[1], "lw": 1.2, "ls": "--"}
         right.plot(years, line, label=f"line: {slope:.2f}″ per century", **look)
-        below.plot(years, perihelion - line, color=COLOURS[0], linewidth=0.5)
+        below.plot(years, perihelion - line, color=COLOURS[0], lw=0.5)
         below.axhline(0, **look)
     right.set_title("Mercury's perihelion, DE421 − integration")
     right.set_ylabel("ϖ(DE421) − ϖ(integration) [″]")
     right.legend(loc="best", markerscale=3)
     right.tick_params(labelbottom=False)
-    below.set(xlabel="years since the start", ylabel="minus the line [″]")
+    below.set(xlabel="years since the start", ylabel="residual [″]")
     left.figure.align_ylabels([right, below])
-    return np.asarray([left, right, below])
-
-
-def _upper_envelope(x: np.ndarray, y: np.ndarray, pieces: int = 100) -> tuple[Any, Any]:
-    """Largest value in each of about a hundred pieces: a readable line."""
-    parts = np.array_split(np.arange(1, len(x)), pieces if len(x) > 2 * pieces else len(x) - 1)
-    return x[[part[-1] for part in parts]], [y[part].max() for part in parts]
+    return np.asarray(axes)

@@ -5,21 +5,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import Normalize
 from matplotlib.patches import Patch
 
-from .axes import (
-    canvas,
-    cell_edges,
-    cells,
-    check_shapes,
-    counted,
-    interval,
-    labels_of,
-    legend,
-)
+from . import axes as draw
+from .axes import canvas, check_shapes, counted, labels_of, legend
 from .states import looks_of
-from .style import COLOURS, DASHES, GREY, HATCH, MARKERS, PALE, SHADES, in_style, named, signed
+from .style import COLOURS, DASHES, GREY, MARKERS, SMALL, in_style, named, signed
 
 _PERCENTILES = (2, 98)
 """Range of the colours, so that a few extreme values do not determine it."""
@@ -39,20 +30,19 @@ def spectrum(
     """Lines of a spectrum: sizes of amplitudes at their frequencies.
 
     - `frequencies`: shape (count,), or (signals, count) such as one for each degree of freedom;
-      with `amplitudes`, real or complex, of the same shape; or what has both as attributes.
+      with `amplitudes`, real or complex, of the same shape; or an object with both as attributes.
     - `fundamental`: name → frequency, marked over the whole height.
     - `log`: a logarithmic axis of amplitudes. `labels`: one name for each signal.
     - `units`: of "frequency" and "amplitude". `ax`: where to draw.
 
     Lines that are not finite, or have no amplitude to draw, are counted in the legend.
 
-    **Returns** the `Axes`.
-
-    **Raises** `TypeError` without amplitudes, `ValueError` for shapes that do not fit.
+    **Returns** the `Axes`. **Raises** `TypeError` without amplitudes, `ValueError` for shapes that
+    do not fit.
     """
     if amplitudes is None:
-        if not hasattr(frequencies, "frequencies") or not hasattr(frequencies, "amplitudes"):
-            raise TypeError("spectrum takes frequencies and amplitudes, or what has both.")
+        wanted = "spectrum takes frequencies and amplitudes, or an object with both"
+        draw.check_attributes(frequencies, ("frequencies", "amplitudes"), wanted)
         frequencies, amplitudes = frequencies.frequencies, frequencies.amplitudes
     w, A = np.asarray(frequencies), np.abs(np.asarray(amplitudes))
     wanted = f"real frequencies ({w.dtype}) and amplitudes have one shape, (..., count)"
@@ -66,14 +56,14 @@ def spectrum(
     floor = A[there].min() / 3 if log and there.any() else 0.0
     rows = zip(w, A, there, colours, markers, names, strict=False)
     for x, y, good, colour, marker, name in rows:
-        axis.vlines(x[good], floor, y[good], color=colour, linewidth=1.3)
+        axis.vlines(x[good], floor, y[good], color=colour, lw=1.3)
         axis.plot(x[good], y[good], marker, color=colour, label=name or None)
     if log:
         axis.set_yscale("log")
     if there.any():
         axis.set_ylim(bottom=floor)
     for (name, at), dash in zip((fundamental or {}).items(), itertools.cycle(DASHES[1:])):
-        axis.axvline(at, color=GREY, linewidth=1, linestyle=dash, label=name, zorder=0.8)
+        axis.axvline(at, color=GREY, lw=1, ls=dash, label=name, zorder=0.8)
     axis.set(xlabel=named("frequency", units.get("frequency", "rad per unit of time")))
     axis.set(ylabel=named("amplitude", units.get("amplitude")), title=title)
     lost = f"of {there.size} lines have no frequency or amplitude"
@@ -93,21 +83,18 @@ def frequency_map(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Fundamental frequencies against each other, or how fast they change over a plane of starts.
+    """Fundamental frequencies against each other, or their rate of change over initial conditions.
 
     - `x`, `y`: of each orbit, any one shape: two frequencies, drawn as points; or, with `diffusion`
-      of shape (len(x), len(y)), the coordinates of a grid of starts, drawn as cells.
+      of shape (len(x), len(y)), the coordinates of a grid of initial conditions, drawn as cells.
     - `diffusion`: log₁₀ of the relative change of a frequency from one window to the next (Laskar
       1993), as colours; low is regular. NaN is hatched or grey, and counted in the legend.
     - `resonances`: (k₁, k₂) of lines k₁x + k₂y = 0, of frequencies against each other.
     - `limits`: (low, high) of the colours; None: from the 2nd to the 98th percentile.
-    - `names`: labels of x and y; None: ω₁ and ω₂, of a plane of starts x and y. `ax`: where to
-      draw.
+    - `names`: labels of x and y; None: ω₁ and ω₂, of a grid x and y. `ax`: where to draw.
 
-    **Returns** the `Axes`.
-
-    **Raises** `ValueError` for shapes that do not fit, for a resonance (0, 0), and for resonances
-    over a plane of starts, whose coordinates are no frequencies.
+    **Returns** the `Axes`. **Raises** `ValueError` for shapes that do not fit, for a resonance (0,
+    0), and for resonances over a grid of initial conditions, whose coordinates are not frequencies.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     D = None if diffusion is None else np.asarray(diffusion, float)
@@ -117,16 +104,16 @@ def frequency_map(
     check_shapes(on_grid or len({a.shape for a in arrays.values()}) == 1, wanted, **arrays)
     if on_grid and len(resonances):
         raise ValueError(
-            "a resonance is a line among frequencies, and x and y are coordinates of starts here: "
-            "leave out resonances, or give the frequencies of each start, x and y of shape "
+            "a resonance is a line among frequencies, and x and y are initial conditions here: "
+            "leave out resonances, or give the frequencies of each orbit, x and y of shape "
             f"{(len(x), len(y))}."
         )
     axis, new = canvas(ax, (6.0, 4.8))
-    low, high, beyond = (0.0, 1.0, "neither")
-    if D is not None:
-        shown = D if on_grid else D[np.isfinite(x) & np.isfinite(y)]
-        low, high, beyond = interval(shown, limits, _PERCENTILES)
-    drawn, extra = (_draw_plane if on_grid else _draw_points)(axis, x, y, D, Normalize(low, high))
+    shown = D if on_grid or D is None else D[np.isfinite(x) & np.isfinite(y)]
+    norm, beyond = (
+        (None, "") if shown is None else draw.scale_of(shown, limits, False, _PERCENTILES)
+    )
+    drawn, extra = (_draw_plane if on_grid else _draw_points)(axis, x, y, D, norm)
     if D is not None:
         axis.figure.colorbar(drawn, ax=axis, label=diffusion_label, extend=beyond)
     _draw_resonances(axis, resonances)
@@ -137,13 +124,13 @@ def frequency_map(
 
 
 def _draw_plane(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, list[Any]]:
-    """(cells over a plane of initial conditions, legend entries)."""
+    """(cells over a grid of initial conditions, legend entries)."""
     for name, values in (("x", x), ("y", y)):
         if not (np.diff(values) > 0).all() or not np.isfinite(values).all():
-            raise ValueError(f"the coordinates {name} of a grid of starts must rise.")
-    mesh = cells(axis, cell_edges(x), cell_edges(y), D.T, norm, SHADES)
-    texts = counted({f"of {D.size} starts without a value": np.sum(~np.isfinite(D))})
-    return mesh, [Patch(label=text, **HATCH) for text in texts]
+            raise ValueError(f"the coordinates {name} of a grid of initial conditions must rise.")
+    mesh = draw.cells(axis, draw.cell_edges(x), draw.cell_edges(y), D.T, norm, draw.SHADES)
+    texts = counted({f"of {D.size} orbits have no value": np.sum(~np.isfinite(D))})
+    return mesh, [Patch(label=text, **draw.HATCH) for text in texts]
 
 
 def _draw_points(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, list[Any]]:
@@ -153,19 +140,21 @@ def _draw_points(axis: Any, x: Any, y: Any, D: Any, norm: Any) -> tuple[Any, lis
     grey, count = there & ~known, int(there.sum())
     look: Any = {"s": float(np.clip(3000 / max(count, 1), 2, 16)), "linewidths": 0}
     look["rasterized"] = count > 3000
-    shown = {"color": COLOURS[0]} if D is None else {"c": D[known], "norm": norm, "cmap": SHADES}
+    shown = (
+        {"color": COLOURS[0]} if D is None else {"c": D[known], "norm": norm, "cmap": draw.SHADES}
+    )
     drawn = axis.scatter(x[known], y[known], **shown, **look)
     if grey.any():
         label = f"{grey.sum()} orbits without a diffusion"
-        axis.scatter(x[grey], y[grey], color=PALE, label=label, **look)
+        axis.scatter(x[grey], y[grey], color=draw.PALE, label=label, **look)
     return drawn, counted({f"of {there.size} orbits have no frequencies": np.sum(~there)})
 
 
 def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, int]]) -> None:
     """Lines ax + by = 0 with their numbers where they leave the picture.
 
-    That is at the top or at the right, else inside of the left, without which are numbers of the
-    axis. A line leaves at two edges, so that is all.
+    That is at the top or at the right, else inside of the left, as the numbers of the axis are
+    outside. A line leaves at two edges, so that one of the three is among them.
     """
     (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
     axis.autoscale(False)
@@ -173,18 +162,16 @@ def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, int]]) -> None:
         if tuple(k) == (0, 0) or len(k) != 2:
             raise ValueError(f"a resonance is two integers that are not both 0, got {k!r}.")
         a, b = k
-        axis.axline((0, 0), (b, -a), color=GREY, linewidth=0.8, linestyle="--", zorder=0.9)
+        axis.axline((0, 0), (b, -a), color=GREY, lw=0.8, ls="--", zorder=0.9)
         places = [((-b * high / a, high), "center", "bottom", (0, 2))] if a else []
         if b:
             places += [((right, -a * right / b), "left", "center", (2, 0))]
             places += [((left, -a * left / b), "left", "center", (3, 0))]
-        inside = (
-            place
-            for place in places
-            if min(left, right) <= place[0][0] <= max(left, right)
-            and min(low, high) <= place[0][1] <= max(low, high)
-        )
-        for at, horizontal, vertical, off in itertools.islice(inside, 1):
-            look: Any = {"fontsize": 8, "color": "#555555", "annotation_clip": False}
-            look |= {"ha": horizontal, "va": vertical, "textcoords": "offset points"}
-            axis.annotate(f"({signed(a)}, {signed(b)})", at, xytext=off, **look)
+        for (at_x, at_y), horizontal, vertical, off in places:
+            if not (left <= at_x <= right or right <= at_x <= left):
+                continue
+            if low <= at_y <= high or high <= at_y <= low:
+                look = SMALL | {"ha": horizontal, "va": vertical, "textcoords": "offset points"}
+                text = f"({signed(a)}, {signed(b)})"
+                axis.annotate(text, (at_x, at_y), xytext=off, annotation_clip=False, **look)
+                break

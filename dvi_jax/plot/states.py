@@ -10,32 +10,22 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.lines import Line2D
 
 from .._checks import whole
-from .axes import check_shapes, counted, interval, labels_of
-from .style import COLOURS, CROSS, DASHES, PALE, SHADES, named
+from .axes import check_shapes, counted, entry, labels_of, legend, scale_of
+from .style import COLOURS, CROSS, DASHES, PALE, SHADES, Look, named
 
 _GOOD = ("", "successful", "stopped")
 
 
 class Lane(NamedTuple):
-    """One orbit.
-
-    - `ts`: shape (S,). `qs`, `ps`: shape (S, *shape); no `ps` if none were given.
-    - `status`: how it ended, "" if that is not known. `label`: its name, or "".
-    """
+    """One orbit: shapes (S,) and (S, *shape); its status and its name, "" if unknown."""
 
     ts: np.ndarray
     qs: np.ndarray
     ps: np.ndarray | None
     status: str
-    label: str
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return self.qs.shape[1:]
+    label: str = ""
 
     @property
     def there(self) -> np.ndarray:
@@ -44,32 +34,16 @@ class Lane(NamedTuple):
         return np.all(np.isfinite(np.hstack(parts)), axis=1)
 
     @property
-    def ended(self) -> int:
-        """Place of the last state there is, −1 if there is none."""
-        there = np.flatnonzero(self.there)
-        return int(there[-1]) if there.size else -1
-
-    def plane(self, place: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Position and momentum of one degree of freedom, shape (S,) each."""
-        assert self.ps is not None
-        return self.qs[(slice(None), *place)], self.ps[(slice(None), *place)]
-
-    @property
     def trouble(self) -> str:
         """Why it has no states to the end, "" if it has."""
-        if self.status not in _GOOD:
-            return self.status
-        if not self.there.all():
-            return self.status if self.status == "stopped" else "not finite"
-        return ""
+        if self.status in ("", "successful") and not self.there.all():
+            return "not finite"
+        return "" if self.status in _GOOD and self.there.all() else self.status
 
 
 def lanes_of(orbits: Any, labels: Sequence[str] | None = None, momenta: bool = True) -> list[Lane]:
-    """Every orbit of what a picture was given.
-
-    - `orbits`: a `Solution`, of one run or of a batch (any axes in front), anything else with `ts`,
-      `qs`, `ps`; the tuple (ts, qs, ps) or (ts, qs) of arrays, of which qs has the axes of ts in
-      front; or a list of these.
+    """Every orbit of a `Solution` or another object with `ts`, `qs`, `ps`, of a tuple of arrays
+    (ts, qs, ps) or (ts, qs), or of a list of these.
 
     **Raises** `TypeError` for anything else and for missing momenta; `ValueError` for shapes that
     do not fit one another and another number of `labels`.
@@ -107,24 +81,15 @@ def _lanes_of_one(one: Any) -> list[Lane]:
     )
     fits = fits and ts.ndim and ts.shape[-1] and len({x.shape for x in states}) == 1
     check_shapes(fits, wanted, ts=ts, **dict(zip(("qs", "ps"), states, strict=False)))
-    lead, last = ts.shape[:-1], (math.prod(ts.shape[:-1]), ts.shape[-1])
-    names = np.broadcast_to(np.asarray(getattr(one, "status", ""), object), lead).ravel()
-    qs, ps = [
-        *(x.reshape(*last, *x.shape[ts.ndim :]) for x in states),
-        np.full(last[0], None),
-    ][:2]
-    return [
-        Lane(t, q, p, str(name), "")
-        for t, q, p, name in zip(ts.reshape(last), qs, ps, names, strict=True)
-    ]
-
-
-# --- components ---------------------------------------------------------------------------------
+    lead = ts.shape[:-1]
+    names = np.broadcast_to(np.asarray(getattr(one, "status", ""), object), lead)
+    qs, *ps = states
+    return [Lane(ts[i], qs[i], ps[0][i] if ps else None, str(names[i])) for i in np.ndindex(lead)]
 
 
 def one_shape(lanes: Sequence[Lane]) -> tuple[int, ...]:
-    """The shape of a state, refused if the orbits have different ones."""
-    shapes = sorted({lane.shape for lane in lanes})
+    """The shape of a state. **Raises** `ValueError` if the orbits have different ones."""
+    shapes = sorted({lane.qs.shape[1:] for lane in lanes})
     if len(shapes) > 1:
         raise ValueError(f"orbits must be of one system, got states of shapes {shapes}.")
     return shapes[0]
@@ -139,10 +104,7 @@ def chosen(name: str, which: Any, count: int) -> list[int]:
 
 
 def place_in(shape: tuple[int, ...], index: Any) -> tuple[int, ...]:
-    """A component of a state as a tuple of numbers from 0.
-
-    **Raises** `ValueError` for one that is not there.
-    """
+    """A component of a state as a tuple of numbers from 0. **Raises** `ValueError` if invalid."""
     place = index if isinstance(index, tuple) else (index,)
     fits = len(place) == len(shape) and all(isinstance(i, int | np.integer) for i in place)
     if not fits or not all(-n <= i < n for i, n in zip(place, shape, strict=True)):
@@ -154,8 +116,8 @@ def place_in(shape: tuple[int, ...], index: Any) -> tuple[int, ...]:
     return tuple(int(i) % n for i, n in zip(place, shape, strict=True))
 
 
-def subscript(letter: str, place: tuple[int, ...], shape: tuple[int, ...]) -> str:
-    """A component as the field writes it: counted from 1, none where there is but one."""
+def indexed(letter: str, place: tuple[int, ...], shape: tuple[int, ...]) -> str:
+    """A component as the field writes it: counted from 1, without a number if there is only one."""
     if shape == (1,):
         return letter
     return f"{letter}$_{{{','.join(str(i + 1) for i in place)}}}$"
@@ -167,10 +129,8 @@ _NAME = re.compile(r"([qp])(?:\[\s*(-?\d+(?:\s*,\s*-?\d+)*)\s*\])?")
 def component(
     which: Any, shape: tuple[int, ...], units: Mapping[str, str]
 ) -> tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], str]:
-    """(function of (qs, ps), shape (N, *shape) → numbers, shape (N,); label with units).
-
-    - `which`: "q[0]", "p[-1]", of bodies "q[0, 2]", "q" where there is but one; or a function
-      ``(q, p)`` → number of one state, labelled by its name.
+    """(function of (qs, ps), shape (N, *shape) → numbers, shape (N,); label with units) of
+    "q[0]", "q[0, 2]", "q" if there is only one; or of a function ``(q, p)`` of one state.
     """
     if callable(which):
         name = getattr(which, "__name__", "")
@@ -184,19 +144,16 @@ def component(
         )
     letter, inside = found.groups()
     place = place_in(shape, tuple(map(int, inside.split(","))) if inside else (0,) * len(shape))
-    label = named(subscript(letter, place, shape), units.get(letter))
+    label = named(indexed(letter, place, shape), units.get(letter))
     return lambda qs, ps: (qs if letter == "q" else ps)[(slice(None), *place)], label
 
 
-def each_state(function: Callable[..., Any], qs: np.ndarray, ps: np.ndarray) -> np.ndarray:
+def each_state(function: Callable[..., Any], qs: Any, ps: Any) -> np.ndarray:
     """A function ``(q, p)`` of every state, shape (N, ...)."""
     values = np.asarray(jax.vmap(function)(qs, ps))
     if values.dtype.kind not in "biuf":
-        raise TypeError(f"a function of the state returned {values.dtype}, no real numbers.")
+        raise TypeError(f"a function of the state must return real numbers, not {values.dtype}.")
     return values
-
-
-# --- colours and dashes of orbits -----------------------------------------------------------------
 
 
 class Looks(NamedTuple):
@@ -209,24 +166,24 @@ class Looks(NamedTuple):
 
     def line(self, i: int, width: float) -> dict[str, Any]:
         """How line number i is drawn."""
-        return {"color": self.colours[i], "linestyle": self.dashes[i], "linewidth": width}
+        return {"color": self.colours[i], "ls": self.dashes[i], "lw": width}
 
-    def colour_bar(self, axes: Sequence[Any], label: str) -> None:
-        """A bar of the scale of values next to the axes, if there is a scale."""
-        if self.scale is not None:
-            axes[0].figure.colorbar(self.scale, ax=list(axes), label=label)
-
-    def entries(self) -> list[Line2D]:
+    @property
+    def entries(self) -> list[Any]:
         """Legend entry of the orbits without a value."""
         texts = counted({f"of {len(self.colours)} orbits have no value": self.unknown})
-        return [Line2D([], [], color=PALE, label=text) for text in texts]
+        return [entry(text, color=PALE) for text in texts]
+
+    def finish(self, axes: Sequence[Any], look: Look, new: bool, entries: Sequence[Any]) -> Any:
+        """Draw the title, the bar of the scale of values if there is one, and the legend."""
+        axes[0].set_title(look.title)
+        if self.scale is not None:
+            axes[0].figure.colorbar(self.scale, ax=list(axes), label=look.colour_label)
+        return legend(axes[0], new, entries)
 
 
 def looks_of(count: int, values: Any = None, limits: tuple[float, float] | None = None) -> Looks:
-    """Colours of orbits: of the palette for a few, along a scale for many or for their `values`.
-
-    - `values`: shape (count,), any axes of a batch; NaN is grey and named.
-    """
+    """Colours of orbits: of the palette for a few, along a scale for many or for their `values`."""
     if values is None and count <= len(COLOURS):
         return Looks(list(COLOURS[:count]), list(DASHES[:count]))
     if values is None:
@@ -235,15 +192,15 @@ def looks_of(count: int, values: Any = None, limits: tuple[float, float] | None 
     if len(values) != count:
         raise ValueError(f"colour has {len(values)} values for {count} orbits: give one for each.")
     known = np.isfinite(values)
-    scale = ScalarMappable(Normalize(*interval(values, limits)[:2]), SHADES)
+    scale = ScalarMappable(scale_of(values, limits)[0], SHADES)
     shades = [tuple(scale.to_rgba(v)) if k else PALE for v, k in zip(values, known, strict=True)]
     return Looks(shades, ["-"] * count, scale, int(np.sum(~known)))
 
 
-def troubles(lanes: Sequence[Lane]) -> list[Line2D]:
+def troubles(lanes: Sequence[Lane]) -> list[Any]:
     """Legend entries of orbits without states to the end, a cross for each reason."""
     texts = []
     for reason, count in Counter(lane.trouble for lane in lanes if lane.trouble).items():
         who = "" if len(lanes) == 1 else f"{count} of {len(lanes)} orbits "
         texts.append(f"{who}{'' if reason == 'stopped' else 'failed: '}{reason.replace('_', ' ')}")
-    return [Line2D([], [], linestyle="none", label=text, **CROSS) for text in texts]
+    return [entry(text, ls="none", **CROSS) for text in texts]

@@ -1,14 +1,14 @@
-"""Style of the pictures: colours, dashes, markers, and how a figure is written to a file.
+"""Style of the pictures: colours, dashes, markers, common keywords, writing to a file.
 
 The settings of matplotlib are in ``dvi.mplstyle``, next to this file.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import wraps
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -27,11 +27,9 @@ COLOURS: tuple[str, ...] = tuple(_SETTINGS["axes.prop_cycle"].by_key()["color"])
 """The palette of Okabe and Ito (2008), dark first. Lines differ by marker or dash as well."""
 
 DASHES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)))
-
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 MARKS = ("s", "^", "D", "v", "P", "<", ">")
 """Markers on lines that may overlap. The circle marks a start and the cross an early end."""
-
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 
 SHADES = ListedColormap(colormaps["viridis"](np.linspace(0, 0.88, 256)), "shades")
 """Colours of numbers: viridis without its light yellow, which is invisible on white paper."""
@@ -43,12 +41,13 @@ NO_NUMBER, ZERO = "#d0d0d0", "#000000"
 """Colours of cells without a number (hatched as well) and of exact zeros on a logarithmic scale."""
 
 HATCH: dict[str, Any] = {"facecolor": NO_NUMBER, "edgecolor": "#8c8c8c", "hatch": "/////"}
-HATCH["linewidth"] = 0
-
-CROSS: dict[str, Any] = {"marker": "x", "color": "#000000", "markersize": 7, "markeredgewidth": 1.5}
-START: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "linestyle": "none"}
-STAR: dict[str, Any] = {"marker": "*", "color": "#E69F00", "markersize": 11, "linestyle": "none"}
-STAR["markeredgecolor"] = "black"
+HATCH["lw"] = 0
+CROSS: dict[str, Any] = {"marker": "x", "color": "#000000", "ms": 7, "mew": 1.5}
+START: dict[str, Any] = {"marker": "o", "mfc": "white", "ls": "none"}
+STAR: dict[str, Any] = {"marker": "*", "color": "#E69F00", "ms": 11, "ls": "none"}
+STAR["mec"] = "black"
+GUIDE: dict[str, Any] = {"color": GREY, "lw": 1, "ls": "--"}
+SMALL: dict[str, Any] = {"fontsize": 8, "color": "#555555"}
 
 _chosen: ContextVar[bool] = ContextVar("chosen", default=False)
 
@@ -84,19 +83,41 @@ def in_style(function: Callable[P, R]) -> Callable[P, R]:
     return drawn
 
 
+class Look(NamedTuple):
+    """Keywords that several pictures share; `dvi_jax.plot` describes them."""
+
+    labels: Sequence[str] | None = None
+    colour: Any = None
+    colour_label: str = ""
+    units: Mapping[str, str] = {}
+    title: str = ""
+    ax: Any = None
+
+
+def look_of(options: Mapping[str, Any], *but: str) -> Look:
+    """The options that were given, with defaults for the others; a picture has none of `but`."""
+    check_keywords(options, *(name for name in Look._fields if name not in but))
+    return Look(**{name: x for name, x in options.items() if x is not None})
+
+
+def check_keywords(given: Mapping[str, Any], *known: str) -> None:
+    """**Raises** `TypeError` for a keyword that is not one of those known."""
+    if unknown := [name for name in given if name not in known]:
+        raise TypeError(f"unknown keyword {unknown[0]!r}: there are {', '.join(known)}.")
+
+
 @in_style
 def save(drawn: Any, path: str | Path) -> Path:
     """Write the figure (type from the suffix) and close it; returns the path.
 
-    - `drawn`: a figure, or axes of one, as every function of `dvi_jax.plot` returns them.
-
-    **Raises** `TypeError` for anything else, `ValueError` for axes of several figures.
+    `drawn`: a figure, or axes of one, as every function of `dvi_jax.plot` returns them. **Raises**
+    `TypeError` for anything else, `ValueError` for axes of several figures.
     """
     path = Path(path)
     axes = np.ravel(np.asarray(drawn, object)).tolist()
     if not axes or not all(hasattr(axis, "figure") for axis in axes):
         raise TypeError(f"save takes a figure or axes, as the plots return them, got {drawn!r}.")
-    figures = {figure_of(axis) for axis in axes}  # of a figure it is the figure
+    figures = {figure_of(axis) for axis in axes}  # a figure's own `figure` is itself
     if len(figures) > 1:
         raise ValueError(f"these axes belong to {len(figures)} figures: save one at a time.")
     figure = figures.pop()

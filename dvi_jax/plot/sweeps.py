@@ -1,7 +1,7 @@
 """Pictures of a sweep: maps of its numbers, of where it failed, and of orders.
 
 Each takes `xarray` data as `to_xarray` gives them, and returns the `Axes`, one for each panel with
-`facet`. Data that lie in a store are read one block at a time: a grid of any size can be drawn.
+`facet`. Data in a store are read one block at a time: a grid of any size can be drawn.
 """
 
 from collections.abc import Iterable, Sequence
@@ -9,23 +9,27 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.colors import BoundaryNorm, CenteredNorm, ListedColormap, LogNorm
+from matplotlib.patches import Patch
 
 from .._checks import one_of
-from . import panels
-from .axes import flat_cells, legend
+from .axes import at_edge, cells, entry, flat_cells, legend, scale_of
 from .blocks import REDUCTIONS, Lines, Picture, count_codes, reduced
-from .panels import NOT_COMPUTED, Grid, flag, share
-from .places import dim_of, label_of, names_of
-from .style import COLOURS, NO_NUMBER, ZERO, in_style
+from .grid import Grid, arrange, checked_array, dim_of, label_of, names_of, two_numbers
+from .style import COLOURS, GREY, HATCH, NO_NUMBER, SHADES, ZERO, in_style
 
-PIXELS = (480, 320)
-"""Largest number of pixels of a map, in x and y."""
+_NOT_COMPUTED = "#ffffff"
+_MARKS = {NO_NUMBER: ("x", GREY), ZERO: ("v", ZERO)}
+"""Colour of cells that are not computed; marker and colour of others along a line."""
+
+_BOTH_SIGNS, _DECADES = 0.05, 2
+"""Values of both signs have a centred scale if the smaller side exceeds this fraction; positive
+numbers over more decades have a logarithmic scale."""
 
 _GOOD = ("successful", "stopped")
 _OPEN = "not_computed"
 _STATUS_COLOURS = {
-    _OPEN: NOT_COMPUTED,
+    _OPEN: _NOT_COMPUTED,
     "successful": "#d9d9d9",
     "not_converged": COLOURS[0],
     "not_finite": COLOURS[1],
@@ -38,71 +42,48 @@ _STATUS_COLOURS = {
 """One colour for each status in all pictures, so that they can be compared."""
 
 
-class _Statuses(NamedTuple):
-    """How the trajectories of each panel ended: codes, rising, with their names.
-
-    - `counts`: for each panel how often each occurs in each pixel, shape (codes, *pixels).
-    """
-
-    codes: list[int]
-    names: list[str]
-    counts: list[np.ndarray]
-
-    @property
-    def open(self) -> np.ndarray:
-        """Which statuses say that nothing is computed."""
-        return np.asarray([name == _OPEN for name in self.names])
-
-    @property
-    def bad(self) -> np.ndarray:
-        """Which statuses are failures."""
-        return np.asarray([name not in (*_GOOD, _OPEN) for name in self.names])
-
-
 @in_style
 def sweep_map(
     data: Any,
     x: str | None = None,
     y: str | None = None,
-    facet: str | None = None,
-    over: str | Sequence[str] = (),
     reduce: str = "max",
     log: bool | None = None,
     status: Any = None,
     limits: tuple[float, float] | None = None,
     ax: Any = None,
-    pixels: tuple[int, int] = PIXELS,
+    **where: Any,
 ) -> Any:
     """A map of one variable of a sweep; of one dimension a line.
 
     - `data`: `DataArray`, e.g. ``result.to_xarray()["drift"]``. Nothing is loaded as a whole.
-    - `x`, `y`: dimensions, or one-dimensional coordinates along them; None: those left, in turn.
+    - `x`, `y`: dimensions, or one-dimensional coordinates along them; None: the first free ones.
     - `facet`: dimension of which each value has a panel. `over`: dimensions that are reduced.
     - `reduce`: "max", "min", "mean" or "median" of the numbers that meet in one pixel: those of
-      `over`, and neighbours where there are more points than `pixels`, (width, height). What is
-      not finite is left out; the legend says how much that was.
+      `over`, and neighbours where there are more points than `pixels`, (width, height): (480, 320)
+      at most. Numbers that are not finite are left out; the legend counts them.
     - `log`: scale of the numbers; None: logarithmic for positive numbers over two decades. Then
       exact zeros are black.
     - `status`: that of the same sweep; distinguishes failed from not computed cells.
     - `limits`: (low, high) of the scale. `ax`: where to draw; None: a new figure.
 
-    Axes are logarithmic where the values are spaced so. Pixels without a number are hatched grey.
+    Axes are logarithmic if that spaces their values more evenly. Pixels without a number are
+    hatched grey.
 
-    **Returns** the `Axes`, an array of them with `facet`.
-
-    **Raises** `TypeError` for what is no array of numbers; `ValueError` for dimensions that are not
-    there or too many, a median of more numbers than are read at a time, and other invalid input.
+    **Returns** the `Axes`, an array of them with `facet`. **Raises** `TypeError` unless the data
+    are an array of numbers; `ValueError` for dimensions that do not exist or are too many, a median
+    of more numbers than are read at a time, and other invalid input.
     """
-    data = panels.checked_array(data)
+    data = checked_array(data)
     one_of("reduce", reduce, REDUCTIONS)
-    grid = panels.arrange(data, x, y, facet, over, pixels)
+    grid = arrange(data, x, y, where)
     label = label_of(data, data.name or "value")
     fewer = any(len(place.centres) < place.bins.size for place in grid.places)
     if fewer or any(data.sizes[d] > 1 for d in grid.over):
         label = f"{REDUCTIONS[reduce]} {label}"
     pictures = [reduced(panel, grid.bins, reduce) for _, panel in grid.panels]
-    found = None if status is None else _count_beside(status, grid, facet)
-    return _draw(grid, pictures, label, log, limits, ax, found, "no number")
+    found = None if status is None else _count_beside(status, grid)
+    return _draw(grid, pictures, label, "no number", ax, _scale(pictures, log, limits), found)
 
 
 @in_style
@@ -111,14 +92,12 @@ def slope_map(
     along: str = "epsilon",
     x: str | None = None,
     y: str | None = None,
-    facet: str | None = None,
-    over: str | Sequence[str] = (),
     local: bool = False,
     floor: float = 0.0,
     reduce: str = "mean",
     limits: tuple[float, float] | None = None,
     ax: Any = None,
-    pixels: tuple[int, int] = PIXELS,
+    **where: Any,
 ) -> Any:
     """A map of orders: slopes d log(data) / d log(along), such as that of a drift over ε.
 
@@ -126,23 +105,23 @@ def slope_map(
     - `local`: False: the least-squares slope along the dimension, over the others. True, or if
       `along` is `x` or `y`: slopes between neighbours, at the geometric means of their values.
     - `floor`: numbers that are not above it, such as round-off, are left out.
-    - `reduce`: of the slopes that meet in one pixel. Other arguments as for `sweep_map`; each block
-      that is read holds whole lines along the dimension.
+    - `reduce`: of the slopes that meet in one pixel. Other arguments, with `facet`, `over` and
+      `pixels`, as for `sweep_map`; each block that is read holds whole lines along the dimension.
 
     Pixels without a slope (fewer than two positive numbers) are hatched grey.
 
-    **Returns** the `Axes`, an array of them with `facet`.
-
-    **Raises** as `sweep_map`; `ValueError` for a dimension with fewer than two positive values.
+    **Returns** the `Axes`, an array of them with `facet`. **Raises** as `sweep_map`; `ValueError`
+    for a dimension with fewer than two positive values.
     """
     import xarray as xr
 
-    data = panels.checked_array(data)
+    data = checked_array(data)
     one_of("reduce", reduce, REDUCTIONS)
     dim = dim_of(data, along)
     values, order = _positive(data, along)
-    others = [over] if isinstance(over, str) else list(over)
-    if any(dim_of(data, name) == dim for name in ([facet] if facet else []) + others):
+    others, facet = where.get("over", ()), where.get("facet")
+    others = [*([others] if isinstance(others, str) else others), *([facet] if facet else [])]
+    if any(dim_of(data, name) == dim for name in others):
         raise ValueError(f"slopes along {along!r} leave nothing of it for a facet or for over.")
     x, y = (along if name is not None and dim_of(data, name) == dim else name for name in (x, y))
     local = local or along in (x, y)
@@ -157,14 +136,13 @@ def slope_map(
         middle = np.sqrt(values[1:] * values[:-1])
         about = data.coords[along].attrs
         made = {along: xr.DataArray(middle, dims=[dim], coords={along: (dim, middle, about)})}
-    make = partial(_slopes, np.log(values), order, floor, local)
-    grid = panels.arrange(data, x, y, facet, over, pixels, made)
-    lines = Lines(dim, make, local)
+    grid = arrange(data, x, y, where, made)
+    lines = Lines(dim, partial(_slopes, np.log(values), order, floor, local))
     pictures = [reduced(panel, grid.bins, reduce, lines) for _, panel in grid.panels]
     name = str(data.name or "data").replace("_", " ")
     over_what = label_of(data.coords[along], along).partition(" [")[0]
     label = f"{'local slope' if local else 'slope'} of log {name} over log {over_what}"
-    return _draw(grid, pictures, label, False, limits, ax, None, "no slope")
+    return _draw(grid, pictures, label, "no slope", ax, _scale(pictures, False, limits))
 
 
 @in_style
@@ -172,29 +150,26 @@ def failure_map(
     data: Any,
     x: str | None = None,
     y: str | None = None,
-    facet: str | None = None,
-    over: str | Sequence[str] = (),
     reduce: str = "any",
     ax: Any = None,
-    pixels: tuple[int, int] = PIXELS,
+    **where: Any,
 ) -> Any:
     """A map of how the trajectories of a sweep ended.
 
     - `data`: the `Dataset`, or its ``status``, with `flag_values` and `flag_meanings`.
-    - `reduce`: "any": a pixel has the colour of its commonest failure if there is a single one, so
-      that none is hidden; "fraction": the share that failed of those that are computed. A run that
+    - `reduce`: "any": a pixel has the colour of its most frequent failure if there is one, so that
+      none is hidden; "fraction": the fraction that failed of those that are computed. A run that
       was stopped by its condition has not failed.
-    - Other arguments as for `sweep_map`.
+    - Other arguments, with `facet`, `over` and `pixels`, as for `sweep_map`.
 
     The legend counts the trajectories of each status.
 
-    **Returns** the `Axes`, an array of them with `facet`.
-
-    **Raises** `TypeError` or `ValueError` for data without a status, and as `sweep_map`.
+    **Returns** the `Axes`, an array of them with `facet`. **Raises** `TypeError` or `ValueError`
+    for data without a status, and as `sweep_map`.
     """
     status = _status_of(data)
     one_of("reduce", reduce, ("any", "fraction"))
-    grid = panels.arrange(status, x, y, facet, over, pixels)
+    grid = arrange(status, x, y, where)
     found = _count(status, grid, (panel for _, panel in grid.panels))
     codes, names = found.codes, found.names
     if reduce == "fraction":
@@ -203,74 +178,136 @@ def failure_map(
             computed = c[~found.open].sum(0)
             values = c[found.bad].sum(0) / np.where(computed, computed, np.nan)
             pictures.append(Picture(values, int(c[found.open].sum()), int(c.sum())))
-        label = "share of trajectories that failed"
-        return _draw(grid, pictures, label, False, (0, 1), ax, None, "not computed")
-    axes = panels.make_axes(grid, ax, 1.9 if grid.y is None else None)
+        label = "fraction of trajectories that failed"
+        return _draw(grid, pictures, label, "not computed", ax, _scale(pictures, False, (0, 1)))
+    axes = grid.axes(ax, 1.9 if grid.y is None else None)
     colours = [_STATUS_COLOURS.get(n, COLOURS[i % len(COLOURS)]) for i, n in enumerate(names)]
     norm = BoundaryNorm([*(c - 0.5 for c in codes), codes[-1] + 0.5], len(codes))
     for axis, c in zip(axes, found.counts, strict=True):
-        # Its commonest failure, else its commonest status.
+        # Its most frequent failure, else its most frequent status.
         failures = c * found.bad.reshape(-1, *(1,) * (c.ndim - 1))
         commonest = np.where(failures.any(0), failures.argmax(0), c.argmax(0))
         shown, edges = np.asarray(codes)[commonest], [place.edges for place in grid.places]
         if grid.y is None:  # a strip
             shown, edges = shown[None], [np.asarray([0.0, 1.0]), *edges]
             axis.set_yticks([])
-        panels.frame(axis)
+        _frame(axis)
         look: Any = {"cmap": ListedColormap(colours), "norm": norm, "rasterized": True}
         axis.pcolormesh(edges[1], edges[0], shown, **look)
-    panels.finish(axes, grid)
     total = np.sum([c.reshape(len(codes), -1).sum(1) for c in found.counts], axis=0)
     entries = [
-        flag(colour, f"{name.replace('_', ' ')}: {share(int(n), int(total.sum()))}")
+        _flag(colour, f"{name.replace('_', ' ')}: {_share(int(n), int(total.sum()))}")
         for colour, name, n in zip(colours, names, total, strict=True)
         if n
     ]
+    drawn = grid.dress(axes)
     legend(axes[0], ax is None, entries, labelled=False)
-    return axes[0] if facet is None else np.asarray(axes)
+    return drawn
 
 
-# --- numbers ------------------------------------------------------------------------------------
+def _scale(pictures: Sequence[Picture], log: bool | None, limits: Any) -> tuple[Any, str]:
+    """(norm, `extend`) for all panels: logarithmic for positive numbers over decades, with a
+    middle for numbers of both signs. **Raises** `ValueError` for a scale that is impossible.
+    """
+    found = np.concatenate([np.ravel(p.values) for p in pictures])
+    found = found[np.isfinite(found)]
+    positive = found[found > 0]
+    if log is None:
+        log = positive.size > 0 and bool((found >= 0).all())
+        log = log and bool(positive.max() > 10**_DECADES * positive.min())
+    if log and (found < 0).any():
+        raise ValueError(
+            f"a logarithmic scale has no place for the {np.sum(found < 0)} pixels below 0: leave "
+            "out log=True, or draw abs(data)."
+        )
+    if limits is not None:
+        low, high = two_numbers(limits)
+        if not low < high or (log and low <= 0):
+            wanted = "two rising positive numbers" if log else "two rising numbers"
+            raise ValueError(f"limits must be {wanted}, got {limits!r}.")
+    elif not log and found.size:
+        below, above = -found.min(), found.max()
+        if min(below, above) > _BOTH_SIGNS * max(below, above):
+            return CenteredNorm(0, max(below, above)), "neither"
+    return scale_of(found, limits, log)
 
 
 def _draw(
     grid: Grid,
     pictures: list[Picture],
     label: str,
-    log: bool | None,
-    limits: Any,
-    ax: Any,
-    found: _Statuses | None,
     what: str,
+    ax: Any,
+    scale: tuple[Any, str],
+    found: "_Statuses | None" = None,
 ) -> Any:
-    """Numbers in their colours, with a bar and a legend of what has none."""
-    scale = panels.make_scale([p.values for p in pictures], log, limits)
-    axes = panels.make_axes(grid, ax)
-    mesh = None
+    """Numbers in their colours, with a bar and a legend of cells without a number."""
+    norm, beyond = scale
+    log, signs = isinstance(norm, LogNorm), isinstance(norm, CenteredNorm)
+    axes, mesh, line = grid.axes(ax), None, grid.y is None
     for i, (axis, picture) in enumerate(zip(axes, pictures, strict=True)):
-        mesh = panels.draw_values(axis, grid, picture.values, scale)
-        if found is not None and grid.y is not None:
+        values = picture.values
+        zero, missing = (values == 0) & log, ~np.isfinite(values)
+        shown = np.where(zero | missing, np.nan, values)
+        if grid.y is None:
+            # A line, over marks at the bottom where there is no number.
+            centres, mark = grid.x.centres, "o" if values.size <= 60 else ""
+            axis.plot(centres, shown, marker=mark, color=COLOURS[0])
+            axis.set(yscale="log" if log else "linear", ylabel=label)
+            for here, kind in ((zero, ZERO), (missing, NO_NUMBER)):
+                marker, colour = _MARKS[kind]
+                at_edge(axis, centres[here], marker, 0.025, color=colour, ms=4.5)
+            continue
+        _frame(axis)
+        edges = grid.x.edges, grid.y.edges
+        mesh = cells(axis, *edges, shown, norm, "PuOr_r" if signs else SHADES)
+        flat_cells(axis, *edges, zero, ZERO)
+        if found is not None:
             nothing = found.counts[i][~found.open].sum(0) == 0
-            where = nothing & np.isnan(picture.values)
-            flat_cells(axis, grid.x.edges, grid.y.edges, where, NOT_COMPUTED)
-    panels.finish(axes, grid)
-    panels.colour_bar(axes, mesh, scale, label)
-    points = sum(p.points for p in pictures)
-    counts = {NO_NUMBER: sum(p.missing for p in pictures)}
+            flat_cells(axis, *edges, nothing & np.isnan(values), _NOT_COMPUTED)
+    drawn = grid.dress(axes)
+    if mesh is not None:
+        axes[0].figure.colorbar(mesh, ax=list(axes), label=label, extend=beyond)
+    points, missing = sum(p.points for p in pictures), sum(p.missing for p in pictures)
+    open_points = 0
     if found is not None:
         share_open = sum(c[found.open].sum() for c in found.counts) / np.sum(found.counts)
-        counts[NOT_COMPUTED] = round(share_open * points)
-        counts[NO_NUMBER] -= counts[NOT_COMPUTED]
-    names, line = {NO_NUMBER: what, NOT_COMPUTED: "not computed"}, grid.y is None
+        open_points = round(share_open * points)
+    counts = {
+        (NO_NUMBER, what): missing - open_points,
+        (_NOT_COMPUTED, "not computed"): open_points,
+    }
     entries = [
-        flag(colour, f"{names[colour]}: {share(count, points)}", line)
-        for colour, count in counts.items()
+        _flag(colour, f"{text}: {_share(count, points)}", line)
+        for (colour, text), count in counts.items()
         if count > 0
     ]
-    if scale.log and any((p.values == 0).any() for p in pictures):
-        entries.append(flag(ZERO, "exactly 0", line))
+    if log and any((p.values == 0).any() for p in pictures):
+        entries.append(_flag(ZERO, "exactly 0", line))
     legend(axes[0], ax is None, entries, labelled=False)
-    return axes[0] if len(grid.panels) == 1 and not grid.panels[0][0] else np.asarray(axes)
+    return drawn
+
+
+def _frame(axis: Any) -> None:
+    """No grid, and a line all around: white cells belong to the map."""
+    axis.grid(False)
+    axis.spines[:].set_visible(True)
+
+
+def _flag(colour: str, label: str, line: bool = False) -> Any:
+    """An entry of a legend, of a map or of a line."""
+    if line and colour in _MARKS:
+        marker, shown = _MARKS[colour]
+        return entry(label, marker=marker, color=shown, ls="none")
+    plain = {"facecolor": colour, "edgecolor": "#8c8c8c", "lw": 0.6}
+    return Patch(label=label, **(HATCH if colour == NO_NUMBER else plain))
+
+
+def _share(count: int, total: int) -> str:
+    """Text "n of N (p %)"."""
+    percent = 100 * count / total
+    text = "< 0.1" if 0 < percent < 0.1 else f"{percent:.3g}"
+    return f"{count} of {total} ({text} %)"
 
 
 def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
@@ -294,9 +331,9 @@ def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
 def _slopes(
     x: np.ndarray, order: np.ndarray, floor: float, local: bool, lines: np.ndarray
 ) -> np.ndarray:
-    """Slopes along the first axis of what lies above the floor: between neighbours, (n − 1, ...).
+    """Slopes of the numbers above the floor along the first axis: between neighbours, (n − 1, ...).
 
-    Not `local`: Σ (x − x̄) y / Σ (x − x̄)² over the numbers that are there, shape (1, ...).
+    Not `local`: Σ (x − x̄) y / Σ (x − x̄)² over these numbers, shape (1, ...).
     """
     lines = np.asarray(lines[order], float)
     there = np.isfinite(lines) & (lines > max(floor, 0.0))
@@ -309,7 +346,16 @@ def _slopes(
     return np.where(there.sum(0) > 1, slopes, np.nan)[None]
 
 
-# --- statuses -----------------------------------------------------------------------------------
+class _Statuses(NamedTuple):
+    """Codes, rising, with their names; which say that nothing is computed, and which are failures;
+    for each panel how often each occurs in each pixel, shape (codes, *pixels).
+    """
+
+    codes: list[int]
+    names: list[str]
+    open: np.ndarray
+    bad: np.ndarray
+    counts: list[np.ndarray]
 
 
 def _status_of(data: Any) -> Any:
@@ -320,7 +366,7 @@ def _status_of(data: Any) -> Any:
             held = ", ".join(map(str, data.data_vars))
             raise ValueError(f"the Dataset has no status: it contains {held}.")
         data = data["status"]
-    return panels.checked_array(data)
+    return checked_array(data)
 
 
 def _count(status: Any, grid: Grid, panels: Iterable[Any]) -> _Statuses:
@@ -333,13 +379,15 @@ def _count(status: Any, grid: Grid, panels: Iterable[Any]) -> _Statuses:
         )
     codes, names = zip(*sorted(zip(map(int, values), meanings.split(), strict=True)), strict=True)
     counts = [count_codes(panel, grid.bins, codes) for panel in panels]
-    return _Statuses(list(codes), list(names), counts)
+    unknown = np.asarray([name == _OPEN for name in names])
+    bad = np.asarray([name not in (*_GOOD, _OPEN) for name in names])
+    return _Statuses(list(codes), list(names), unknown, bad, counts)
 
 
-def _count_beside(status: Any, grid: Grid, facet: str | None) -> _Statuses:
+def _count_beside(status: Any, grid: Grid) -> _Statuses:
     """The statuses in the pixels of a map of other numbers."""
     status = _status_of(status)
-    along = [] if facet is None else [dim_of(status, facet)]
+    along = [] if grid.facet is None else [dim_of(status, grid.facet)]
     wanted = [*grid.bins, *along]
     others = [d for d in status.dims if d not in (*wanted, *grid.over) and status.sizes[d] > 1]
     if others or any(d not in status.dims for d in wanted):

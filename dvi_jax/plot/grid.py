@@ -1,0 +1,265 @@
+"""Axes and panels of a map: assignment of dimensions, positions of their points, tick labels."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.ticker import LogFormatterMathtext, LogLocator
+
+from .._checks import instance
+from .axes import at_most, canvas, cell_edges, stack
+from .blocks import Bins, make_bins
+from .style import check_keywords, named
+
+_WHERE: dict[str, Any] = {"facet": None, "over": (), "pixels": (480, 320)}
+"""Keywords of all maps; the largest number of pixels in x and y."""
+
+_GREEK = {"epsilon": "ε", "h": "step size h", "start": "number of the start", "t0": "t$_0$"}
+_MOST_NAMES, _MOST_PANELS = 12, 16
+"""Names that are written along an axis; panels of a figure."""
+
+
+class Place(NamedTuple):
+    """An axis along a dimension, with edges (pixels + 1,) and centres (pixels,) of its pixels.
+
+    `zero`: where on a logarithmic axis the value 0 is put, or None. `names`: (positions, texts) of
+    values that are not numbers, or None.
+    """
+
+    dim: str
+    label: str
+    bins: Bins
+    edges: np.ndarray
+    centres: np.ndarray
+    log: bool = False
+    zero: float | None = None
+    names: tuple[np.ndarray, list[str]] | None = None
+
+    def dress(self, axis: Any, which: str) -> None:
+        """Set the scale, the limits, the label and the ticks of the x or y axis."""
+        ticks = getattr(axis, f"set_{which}ticks")
+        if self.log:
+            axis.set(**{f"{which}scale": "log"})
+        axis.set(**{f"{which}lim": tuple(self.edges[[0, -1]]), f"{which}label": self.label})
+        if self.names is not None:
+            positions, texts = self.names
+            long = which == "x" and sum(map(len, texts)) > 60
+            turn = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if long else {}
+            ticks(positions, texts, **turn)
+        if self.zero is not None:
+            low, high = np.sqrt(self.zero * self.centres[1]), self.edges[-1]
+            major, minor = (
+                [t for t in LogLocator(subs=subs).tick_values(low, high) if low <= t <= high]
+                for subs in ((1.0,), tuple(range(2, 10)))
+            )
+            ticks([self.zero, *major], ["0", *map(LogFormatterMathtext(), major)])
+            ticks(minor, minor=True, labels=[""] * len(minor))
+
+
+def find_place(data: Any, name: str, pixels: int) -> Place:
+    """The axis along a dimension, or along a one-dimensional coordinate that has the name.
+
+    Numbers that are all different are put in their order, on a logarithmic axis if that spaces
+    them more evenly; a 0 before such numbers has a place of its own at the left. Anything else has
+    its position, with its name as a label.
+    """
+    dim = dim_of(data, name)
+    size = data.sizes[dim]
+    values, label = None, label_of(None, name)
+    if name in data.coords:  # of others xarray would make 0, 1, 2, … of any length
+        values, label = data.coords[name].values, label_of(data.coords[name], name)
+    numbers = values is not None and values.dtype.kind in "iuf" and np.isfinite(values).all()
+    if values is None or not numbers or len(np.unique(values)) < size:
+        bins, every = make_bins(size, pixels), -(-size // _MOST_NAMES)
+        edges = bins.ends - 0.5
+        texts = None if values is None else [_short(v) for v in values[::every]]
+        names = None if texts is None else (np.arange(0, size, every), texts)
+        return Place(dim, label, bins, edges, (edges[1:] + edges[:-1]) / 2, names=names)
+    rising = bool((np.diff(values) > 0).all())
+    order = None if rising else np.argsort(values, kind="stable")
+    bins = make_bins(size, pixels, order)
+    x = np.asarray(values if order is None else values[order], float)
+    log, zero = _is_log(x), None
+    if not log and size > 3 and x[0] == 0 and _is_log(x[1:]):
+        log, zero = True, float(x[1] ** 2 / x[2])
+        x = np.asarray([zero, *x[1:]])
+    edges, centres = cell_edges(x, log), x
+    if len(bins.starts) < size:
+        low, high = x[bins.starts], x[bins.ends[1:] - 1]
+        centres = np.sqrt(low) * np.sqrt(high) if log else (low + high) / 2
+    return Place(dim, label, bins, edges[bins.ends], centres, log, zero)
+
+
+def dim_of(data: Any, name: str) -> str:
+    """The dimension of a name, which may be a coordinate along it. **Raises** `ValueError`."""
+    if name in data.dims:
+        return name
+    if name in data.coords and data.coords[name].ndim == 1:
+        return str(data.coords[name].dims[0])
+    raise ValueError(f"there is no dimension {name!r}: there are {names_of(data)}.")
+
+
+def names_of(data: Any) -> str:
+    """Names that can be an axis, for an error message."""
+    sizes = ", ".join(f"{d} ({n})" for d, n in data.sizes.items())
+    others = [str(c) for c in data.coords if c not in data.dims and data.coords[c].ndim == 1]
+    return (sizes or "none") + (f", and along them {', '.join(others)}" if others else "")
+
+
+def label_of(variable: Any, name: Any) -> str:
+    """The long name of a variable, or its name as it is usually written, with its units."""
+    attributes = variable.attrs if variable is not None else {}
+    text = attributes.get("long_name") or _GREEK.get(str(name)) or str(name).replace("_", " ")
+    return named(text, attributes.get("units"))
+
+
+def _is_log(x: np.ndarray) -> bool:
+    """Whether rising numbers are spaced more evenly on a logarithmic axis, over a factor of 4."""
+    if len(x) < 3 or x[0] <= 0 or x[-1] < 4 * x[0]:
+        return False
+    logarithms, linear = (np.diff(v / np.abs(v).max()) for v in (np.log(x), x))
+    return np.std(logarithms) / np.mean(logarithms) < 0.5 * np.std(linear) / np.mean(linear)
+
+
+def _short(value: Any) -> str:
+    text = f"{value:g}" if isinstance(value, float | np.floating) else str(value)
+    return text if len(text) <= 24 else text[:23] + "…"
+
+
+class Grid(NamedTuple):
+    """(title, array) of each panel, and the axes that all panels share; no `y` for a line.
+
+    `over`: dimensions of which the numbers meet in a pixel.
+    """
+
+    panels: list[tuple[str, Any]]
+    x: Place
+    y: Place | None
+    over: tuple[str, ...]
+    facet: str | None
+
+    @property
+    def places(self) -> list[Place]:
+        """The axes in the order of an array that is drawn: y, x."""
+        return [self.x] if self.y is None else [self.y, self.x]
+
+    @property
+    def bins(self) -> dict[str, Any]:
+        return {place.dim: place.bins for place in self.places}
+
+    def axes(self, ax: Any, height: float | None = None) -> list[Any]:
+        """One `Axes` for each panel: `ax`, or those of a new figure; `height` of a single one."""
+        count = len(self.panels)
+        if ax is not None:
+            if count > 1:
+                raise ValueError("a facet has a figure of its own: leave out ax, or facet.")
+            return [canvas(ax)[0]]
+        if count == 1:
+            size = None if height is None else (plt.rcParams["figure.figsize"][0], height)
+            return [canvas(None, size)[0]]
+        columns = min(count, 3 if count > 4 else 2)
+        size = (1.4 + 2.7 * columns, 1.0 + 2.3 * -(-count // columns))
+        return stack(None, count, "one for each", size, columns, sharex=True, sharey=True)[0]
+
+    def dress(self, axes: Sequence[Any]) -> Any:
+        """Set scales, ticks, labels and titles; returns the axes, an array of them for a facet."""
+        for i, ((title, _), axis) in enumerate(zip(self.panels, axes, strict=True)):
+            self.x.dress(axis, "x")
+            if self.y is not None:
+                self.y.dress(axis, "y")
+            if title:
+                axis.set_title(title)
+            if len(axes) > 1:
+                columns = axis.get_subplotspec().get_gridspec().ncols
+                last = i + columns >= len(axes)
+                axis.tick_params(labelbottom=last)
+                axis.set_xlabel(axis.get_xlabel() if last else "")
+                axis.set_ylabel(axis.get_ylabel() if i % columns == 0 else "")
+        return axes[0] if self.facet is None else np.asarray(axes)
+
+
+def arrange(
+    data: Any, x: str | None, y: str | None, where: Mapping[str, Any], made: Any = None
+) -> Grid:
+    """Assign dimensions to x, y and facets; those that are not named become x and y in turn.
+
+    `made`: name → array that replaces that of the data for the search of its axis; None for a
+    dimension that does not appear. **Raises** `ValueError` for a dimension that does not exist, is
+    named twice, or is in excess.
+    """
+    check_keywords(where, *_WHERE)
+    facet, over, pixels = (where.get(k, v) for k, v in _WHERE.items())
+    width, height = two_numbers(pixels)
+    if not (width >= 1 and height >= 1):
+        raise ValueError(f"pixels must be (width, height), two positive numbers, got {pixels!r}.")
+    if empty := [str(d) for d, n in data.sizes.items() if n == 0]:
+        raise ValueError(f"there is nothing to draw: {', '.join(empty)} has no values.")
+    over = (over,) if isinstance(over, str) else tuple(over)
+    roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in over}}
+    taken: dict[str, str] = {}
+    for role, name in roles.items():
+        dim = None if name is None else dim_of(data, name)
+        if dim in taken:
+            raise ValueError(f"{role} and {taken[dim]} are both along {dim!r}: name another.")
+        taken |= {} if dim is None else {dim: role}
+    made = made or {}
+    gone = [dim_of(data, name) for name, array in made.items() if array is None]
+    left = [str(d) for d in data.dims if d not in taken and d not in gone]
+    free = [d for d in left if data.sizes[d] > 1]
+    if x is None:
+        x, y = (free.pop(0), y) if free else (y, None)
+    if y is None and free:
+        y = free.pop(0)
+    if x is None:
+        raise ValueError("there is nothing to draw: no dimension has more than one value.")
+    if free:
+        raise ValueError(
+            f"a map has two dimensions, {x!r} and {y!r} here; {', '.join(map(repr, free))} "
+            f"{'is' if len(free) == 1 else 'are'} left of {names_of(data)}. Select one value, "
+            f"data.isel({free[0]}=0), reduce them, over={free[0]!r}, or draw one map each, "
+            f"facet={free[0]!r}."
+        )
+    data = data.isel({d: 0 for d in left if data.sizes[d] == 1})
+    along: dict[Any, Any] = dict.fromkeys((x, y), data) | made
+    along_x = find_place(along[x], x, int(width))
+    along_y = None if y is None else find_place(along[y], y, int(height))
+    dims = tuple(dim_of(data, name) for name in over)
+    return Grid(_panels(data, facet), along_x, along_y, dims, facet)
+
+
+def two_numbers(values: Any) -> tuple[float, float]:
+    """Two numbers; NaN, which fails every comparison, for anything else."""
+    try:
+        first, second = (float(v) for v in values)
+    except (TypeError, ValueError):
+        return np.nan, np.nan
+    return first, second
+
+
+def _panels(data: Any, facet: str | None) -> list[tuple[str, Any]]:
+    if facet is None:
+        return [("", data)]
+    dim = dim_of(data, facet)
+    count = data.sizes[dim]
+    some = f"data.isel({dim}=slice(None, None, {-(-count // _MOST_PANELS)}))"
+    at_most(_MOST_PANELS, count, f"values of facet={facet!r}", some)
+    coordinate = data.coords.get(facet)
+    name, _, units = label_of(coordinate, facet).partition(" [")
+    values = np.arange(count) if coordinate is None else coordinate.values
+    texts = [f"{v:.4g}" if np.issubdtype(type(v), np.number) else str(v) for v in values]
+    tail = f" {units.rstrip(']')}" if units else ""
+    return [(f"{name} = {t}{tail}", data.isel({dim: i})) for i, t in enumerate(texts)]
+
+
+def checked_array(data: Any) -> Any:
+    """A `DataArray` of numbers, or an error that shows how to get one."""
+    import xarray as xr
+
+    hint = 'Take one variable of a Dataset, such as result.to_xarray()["drift"].'
+    if isinstance(data, xr.Dataset):
+        hint += f" There are {', '.join(map(str, data.data_vars))}."
+    instance("data", data, xr.DataArray, "an xarray.DataArray", hint)
+    if data.dtype.kind not in "biuf":
+        raise TypeError(f"data must be real numbers, got an array of {data.dtype}.")
+    return data

@@ -1,0 +1,318 @@
+"""Pictures of orders: drifts and their causes, drift against ε, error against cost."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.patches import Patch
+
+from ..discover import DriftOrder, DriftSurface
+from . import axes as draw
+from .axes import canvas, counted, entry, legend, stack
+from .style import COLOURS, DASHES, MARKERS, SMALL, ZERO, in_style, named, signed
+
+_HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++++")
+_CAUSES = ("symmetry", "work", "lattice")
+_BAR: dict[str, Any] = {"marker": "_", "ms": 12, "mew": 2, "ls": "none"}
+
+
+@in_style
+def balance(
+    ts: Any,
+    drift: Any = None,
+    causes: Mapping[str, Any] | None = None,
+    time: str = "time t",
+    title: str = "",
+    cumulative: bool = False,
+    unit: str = "",
+    ax: Any = None,
+) -> Any:
+    """The drift of an invariant as a stack of its causes, and the residual of their sum.
+
+    - `ts`: a `dvi.Balance`, as `dvi.noether_balance` returns it; or start of each step, shape (S,),
+      with `drift`: rate of change, shape (S,), and `causes`: label → its part of the rate, shape
+      (S,).
+    - `cumulative`: the sum Σ rate · step over the steps before each of `ts`, in place of rates. The
+      last rate is not used, as the end of its step is unknown.
+    - `unit`: of the rates, of the sums with `cumulative`. `ax`: two `Axes`.
+
+    Areas of causes that raise the invariant are stacked upward from 0, others downward. The line is
+    the drift; below is its difference from the sum of the causes.
+
+    **Returns** the `Axes` of the stack and of the residual, shape (2,). **Raises** `TypeError`
+    without drift or causes, `ValueError` for shapes that do not fit.
+    """
+    if all(hasattr(ts, name) for name in ("ts", "drift", *_CAUSES)):
+        causes = {name: getattr(ts, name) for name in _CAUSES} if causes is None else causes
+        ts, drift = ts.ts, ts.drift if drift is None else drift
+    if drift is None or not causes:
+        raise TypeError(
+            "balance takes what dvi.noether_balance returns, or times, the drift and its causes."
+        )
+    given = {"ts": ts, "drift": drift, **causes}
+    arrays = {name: np.asarray(x, float) for name, x in given.items()}
+    fits = np.shape(ts) == (np.size(ts),) and len({x.shape for x in arrays.values()}) == 1
+    draw.check_shapes(fits, "a balance has one number of each kind a step, shape (S,)", **arrays)
+    t = arrays.pop("ts")
+    if cumulative:
+        arrays = {k: np.append(0.0, np.cumsum(x[:-1] * np.diff(t))) for k, x in arrays.items()}
+    rate = arrays.pop("drift")
+    ratios, what = (3, 1), "the stack and the residual"
+    (top, bottom), new = stack(ax, 2, what, (6.4, 4.6), sharex=True, height_ratios=ratios)
+    up = down = np.zeros(len(t))
+    # Hatches distinguish the areas in print without colours.
+    looks = itertools.cycle(zip(COLOURS[:-1], _HATCHES, strict=True))
+    for (label, values), (colour, hatch) in zip(arrays.items(), looks, strict=False):
+        look = {"facecolor": colour, "hatch": hatch, "edgecolor": "#ffffff", "lw": 0}
+        higher, lower = up + np.maximum(values, 0), down + np.minimum(values, 0)
+        top.fill_between(t, up, higher, label=label, **look)
+        top.fill_between(t, lower, down, **look)
+        up, down = higher, lower
+    top.plot(t, rate, color="#000000", lw=0.9, label="drift")
+    residual = rate - sum(arrays.values(), np.zeros(len(t)))
+    bottom.plot(t, residual, color="#000000", lw=0.7)
+    top.axhline(0, color="#000000", lw=0.5)
+    top.set(ylabel=named("change" if cumulative else "rate of change", unit), title=title)
+    bottom.set(xlabel=time, ylabel="drift − sum")
+    legend(top, new)
+    top.figure.align_ylabels([top, bottom])
+    return np.asarray([top, bottom])
+
+
+@in_style
+def drift_orders(
+    results: Mapping[str, DriftOrder] | Sequence[DriftOrder],
+    promised: Sequence[float | None] | float | None = None,
+    title: str = "Largest drift against the perturbation",
+    ax: Any = None,
+) -> Any:
+    """Drifts over ε (`drift_order`) and the orders that are expected.
+
+    - `results`: label → measured order, or a sequence of them.
+    - `promised`: expected order z + 1 of each result in turn (None: unknown), or one for all; a
+      grey line of that slope goes through the first point of the fit.
+
+    Hollow points are excluded from the fit; bars at the left end mark the drift at ε = 0. The
+    legend counts drifts that failed, crosses at the top, and those exactly 0, triangles at the
+    bottom. **Returns** the `Axes`. **Raises** `TypeError` for anything but a `DriftOrder`.
+    """
+    if not isinstance(results, Mapping):
+        results = {f"observable {i}": order for i, order in enumerate(results, 1)}
+    for order in results.values():
+        wanted = "drift_orders draws what dvi.drift_order returned"
+        draw.check_attributes(order, ("drifts", "epsilons"), wanted)
+    slopes = [*promised] if isinstance(promised, Sequence) else [promised] * len(results)
+    if len(slopes) != len(results):
+        raise ValueError(f"promised has {len(slopes)} orders for {len(results)} results.")
+    axis, new = canvas(ax, (6.4, 4.8))
+    left = 0.7 * min(order.epsilons.min() for order in results.values())
+    looks = zip(results.items(), slopes, itertools.cycle(COLOURS), itertools.cycle(MARKERS))
+    lost, total, excluded = np.zeros(2, int), 0, False
+    for (label, order), slope, colour, marker in looks:
+        x, y, used = order.epsilons, np.asarray(order.drifts), order.used
+        out = np.isfinite(y) & (y > 0) & ~used
+        excluded |= bool(out.any())
+        look = {"ls": "none", "color": colour, "marker": marker}
+        axis.loglog(x[used], y[used], **look)
+        axis.loglog(x[out], y[out], mfc="white", **look)
+        text = f"{label}: {_slope_text(order)}" + ("" if slope is None else f", expected {slope:g}")
+        axis.plot([], [], mfc=colour if used.any() else "white", label=text, **look)
+        # The drift at ε = 0 is a bar at the left end of the axis.
+        if np.isfinite(order.floor) and order.floor > 0:
+            axis.plot(left, order.floor, color=colour, **_BAR)
+        if slope is not None and used.any():
+            first = np.argmin(np.where(used, x, np.inf))
+            draw.guide(axis, (x[first], x.max()), y[first], slope, zorder=1)
+        lost += draw.without_place(axis, np.append(x, left), np.append(y, order.floor), colour)
+        total += len(y) + 1
+    axis.set(xscale="log", yscale="log", xlabel="ε", ylabel="largest drift", title=title)
+    marks: Any = {"color": "#444444", "ls": "none"}
+    hollow = marks | {"marker": "o", "mfc": "white"}
+    extra = [entry("expected slope", **draw.GUIDE)] if promised is not None else []
+    extra += [entry("excluded from the fit", **hollow)] if excluded else []
+    extra.append(entry("at ε = 0", **marks | _BAR))
+    extra += draw.without_place_entries(lost, total, "drifts failed", "drifts are exactly 0")
+    legend(axis, new, extra)
+    return axis
+
+
+def _slope_text(order: DriftOrder) -> str:
+    if not np.isfinite(order.slope):
+        return "no order"
+    if not order.resolved:
+        return f"no order resolved, slope of the line {order.slope:.2f}"
+    half = (order.interval[1] - order.interval[0]) / 2
+    return f"slope {order.slope:.2f} ± {half:.2f}" if half >= 0.005 else f"slope {order.slope:.2f}"
+
+
+@in_style
+def drift_surface(
+    surface: DriftSurface,
+    promised: float | None = None,
+    title: str = "Largest drift over ε and h",
+    ax: Any = None,
+) -> Any:
+    """Drifts over ε and h (`drift_surface`), and their orders in ε at each h.
+
+    - `surface`: what `drift_surface` returned. `promised`: the expected order z + 1.
+    - `ax`: two `Axes`, of the drifts and of their orders.
+
+    Dots mark drifts that are excluded from the fits; bars are 95 % intervals, and orders that are
+    not resolved are hollow. Drifts that are exactly 0 have no place on a logarithmic scale: they
+    are black. Those that failed are hatched; the legend counts both. **Returns** the `Axes`, shape
+    (2,).
+    """
+    ratios, what = (5, 4), "the drifts and their orders"
+    (left, right), new = stack(ax, 2, what, (9.6, 4.2), ncols=2, width_ratios=ratios)
+    edges = draw.cell_edges(surface.epsilons, log=True), draw.cell_edges(surface.hs, log=True)
+    entries = _draw_drifts(left, surface, edges)
+    left.set(xscale="log", yscale="log", xlabel="ε", ylabel="step size h", title=title)
+    _draw_orders_in_epsilon(right, surface, promised)
+    right.set(xscale="log", xlabel="step size h", ylabel="order in ε", title="Order in ε")
+    right.set_xlim(*edges[1][[0, -1]])
+    orders = right.get_legend_handles_labels()[0]
+    legend(left, new, entries + (orders if new else []), labelled=False)
+    if not new:
+        legend(right, new)
+    return np.asarray([left, right])
+
+
+def _draw_drifts(axis: Any, surface: DriftSurface, edges: Any) -> list[Any]:
+    """A map of the drifts, with dots where they are excluded from the fits; its legend entries."""
+    drifts = np.asarray(surface.drifts)
+    zero, failed = drifts == 0, ~np.isfinite(drifts)
+    norm = None if (zero | failed).all() else LogNorm()
+    x, y = edges
+    image = draw.cells(axis, x, y, np.where(zero, np.nan, drifts).T, norm, draw.SHADES)
+    axis.figure.colorbar(image, ax=axis, label="largest drift")
+    draw.flat_cells(axis, x, y, zero.T, ZERO)
+    entries: list[Any] = []
+    i, j = np.nonzero(~surface.used & ~failed)
+    if len(i):
+        look: Any = {"color": "black", "mfc": "white", "ms": 4}
+        look |= {"mew": 0.8, "label": "excluded from the fit"}
+        entries += axis.plot(surface.epsilons[i], surface.hs[j], "o", **look)
+    black: dict[str, Any] = {"color": ZERO}
+    for where, text, look in ((zero, "exactly 0", black), (failed, "failed", draw.HATCH)):
+        counts = counted({f"of {drifts.size} {text}": where.sum()})
+        entries += [Patch(label=label, **look) for label in counts]
+    return entries
+
+
+def _draw_orders_in_epsilon(axis: Any, surface: DriftSurface, promised: float | None) -> None:
+    """The orders in ε at each h with their 95 % intervals."""
+    measured = np.isfinite(surface.slopes)
+    resolved = np.array([order.resolved for order in surface.orders])
+    low, high = surface.intervals.T
+    for here, face, label in (
+        (measured & resolved, COLOURS[0], "order for ε → 0, 95 % interval"),
+        (measured & ~resolved, "white", "not resolved: slope of the straight line"),
+    ):
+        if here.any():
+            y = surface.slopes[here]
+            look = {"color": COLOURS[0], "mfc": face, "capsize": 3, "label": label}
+            bars = [y - low[here], high[here] - y]
+            axis.errorbar(surface.hs[here], y, yerr=bars, fmt="o", **look)
+    if promised is not None:
+        axis.axhline(promised, label="expected", **draw.GUIDE)
+        axis.set_ylim(
+            np.min(low[measured] - 0.05, initial=promised - 0.1),
+            np.max(high[measured] + 0.05, initial=promised + 0.1),
+        )
+    look = SMALL | {"rotation": 90, "ha": "center", "va": "bottom"}
+    for value in surface.hs[~measured]:
+        axis.annotate("no order", (value, 0.02), xycoords=("data", "axes fraction"), **look)
+
+
+_FLATTER, _SETTLED, _LAST = 0.6, 0.1, 3
+"""A line whose slope is below this fraction of the slope before has reached round-off; largest
+relative change of a settled slope from one pair of runs to the next; number of runs that determine
+a slope, as earlier ones have too long steps."""
+
+
+@in_style
+def work_precision(
+    results: Mapping[str, tuple[Any, Any]],
+    cost: str = "cost",
+    error: str = "error",
+    slopes: bool = True,
+    front: bool = True,
+    title: str = "",
+    ax: Any = None,
+) -> Any:
+    """Error against cost, a line for each method, both axes logarithmic.
+
+    - `results`: name of the method → (costs, errors), shape (runs,) each, in any order.
+    - `cost`, `error`: labels, with units.
+    - `slopes`: report the slope of each line, d log(error)/d log(cost), in the legend: the
+      least-squares slope of its last three runs before round-off, "not settled" where it still
+      changes by more than a tenth from one pair of them to the next. Round-off begins where the
+      error no longer falls, or falls by less than 0.6 of the slope before. Of runs of equal cost
+      the geometric mean of the errors counts.
+    - `front`: a pale band under the runs that no other run beats in both cost and error.
+
+    The legend counts runs whose error is not finite, crosses at the top, and those whose error is
+    exactly 0, triangles at the bottom. **Returns** the `Axes`. **Raises** `ValueError` for no
+    methods, for shapes that do not fit and for costs that are not positive.
+    """
+    if not results:
+        raise ValueError("work_precision was given no method.")
+    axis, new = canvas(ax, (6.4, 4.8))
+    runs = {name: _checked(name, pair) for name, pair in results.items()}
+    points, lost = np.hstack(list(runs.values())), np.zeros(2, int)
+    for i, (name, (costs, errors)) in enumerate(runs.items()):
+        colour = COLOURS[i % len(COLOURS)]
+        # The same marker comes back with another colour: 9 and 7 have no common factor.
+        marker, dash = MARKERS[i % len(MARKERS)], DASHES[i // len(COLOURS) % len(DASHES)]
+        good = np.isfinite(errors) & (errors > 0)
+        label = f"{name}: {_slope(costs[good], errors[good])}" if slopes else name
+        look = {"color": colour, "marker": marker, "ls": dash, "lw": 1.2}
+        axis.loglog(costs[good], errors[good], label=label, **look)
+        lost += draw.without_place(axis, costs, errors, colour)
+    axis.set(xscale="log", yscale="log", xlabel=cost, ylabel=error, title=title)
+    extra, total = [], points.shape[1]
+    # In the order of cost, a run is in front if its error is below those of all before it.
+    known = points[:, np.isfinite(points[1]) & (points[1] > 0)]
+    known = known[:, np.lexsort(known[::-1])]
+    line = known[:, known[1] < np.minimum.accumulate(np.append(np.inf, known[1]))[:-1]]
+    if front and line.size:
+        look = {"color": "#dcdcdc", "lw": 9, "zorder": 0.5}
+        axis.plot(*line, **look, solid_capstyle="round", solid_joinstyle="round")
+        extra.append(entry("front", color="#dcdcdc", lw=7))
+    extra += draw.without_place_entries(lost, total, "runs failed", "runs without error")
+    legend(axis, new, extra)
+    return axis
+
+
+def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(costs, sizes of errors), in the order of cost."""
+    try:
+        costs, errors = (np.asarray(x, float) for x in pair)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name!r} must be (costs, errors), two arrays, got {pair!r}.") from None
+    positive = bool((np.isfinite(costs) & (costs > 0)).all())
+    if costs.ndim != 1 or costs.shape != errors.shape or not len(costs) or not positive:
+        raise ValueError(
+            f"{name!r} must have costs and errors of one shape (runs,), and the costs must be "
+            f"positive: got {costs.shape} and {errors.shape}, costs {costs}."
+        )
+    order = np.argsort(costs, kind="stable")
+    return costs[order], np.abs(errors[order])
+
+
+def _slope(costs: np.ndarray, errors: np.ndarray) -> str:
+    """The slope of the last runs before round-off, for the legend."""
+    costs, place = np.unique(costs, return_inverse=True)
+    x, y = np.log(costs), np.bincount(place, np.log(errors)) / np.bincount(place)
+    local, n = np.diff(y) / np.diff(x), len(x)
+    while n > 1 and (local[n - 2] >= 0 or (n > 2 and local[n - 2] > _FLATTER * local[n - 3])):
+        n -= 1
+    if n < 2:
+        return "no slope"
+    part = slice(max(0, n - _LAST), n)
+    last = local[part.start : n - 1]
+    settled = len(last) > 1 and np.ptp(last) <= _SETTLED * np.abs(last).max()
+    about = "" if settled else ", not settled" if len(last) > 1 else " of two runs"
+    return f"slope {signed(np.polyfit(x[part], y[part], 1)[0], '.1f')}{about}"
