@@ -206,18 +206,14 @@ def start(task: Task, q0: State, p0: State) -> Carry:
     result = RESULTS.where(usable, result, RESULTS.bad_step_size)
     interval = task.first_interval()
 
-    def zero_value(reduction):
-        step = StepTaken(interval.t0, interval.t1, q0, p0, q0, p0)
-        like = eqx.filter_eval_shape(step.number, task.bound(reduction.function), task.args)
-        return jnp.zeros(like.shape, like.dtype)
-
     def memory(reduction):
-        """Before the first step: the value of a function of the state is known."""
-        begun = reduction.start(zero_value(reduction))
+        at_start = StepTaken(interval.t0, interval.t0, q0, p0, q0, p0)
+        function = task.bound(reduction.function)
+        like = eqx.filter_eval_shape(at_start.number, function, task.args)
+        begun = reduction.start(jnp.zeros(like.shape, like.dtype))
         if not has_initial_value(reduction.function):
             return begun
-        step = StepTaken(interval.t0, interval.t0, q0, p0, q0, p0)
-        value = step.number(task.bound(reduction.function), task.args)
+        value = at_start.number(function, task.args)
         return reduction.update(begun, jnp.asarray(0, jnp.int32), interval.t0, value)
 
     _, reductions = task.observables()

@@ -4,6 +4,14 @@ import difflib
 import re
 from typing import Any
 
+from ._adjoint import Adjoint
+from ._gauss_legendre import GaussLegendre
+from ._lobatto_pair import LobattoIIIAIIIB
+from ._published import BlanesMoan, KahanLi, McLachlan, Suzuki, Yoshida
+from ._runge_kutta4 import RungeKutta4
+from ._strang import Strang
+from ._type_ii import TypeII
+
 
 def as_method(given: Any) -> Any:
     """The method with a name: "strang", "leapfrog", "rk4", "KahanLi8", "yoshida(4)".
@@ -14,28 +22,26 @@ def as_method(given: Any) -> Any:
     if not isinstance(given, str):
         return given
     text = given
-    from .. import methods as m  # the package that this file is a part of
-
     plain = {
-        "TypeII": m.TypeII,
-        "SymplecticEuler": m.TypeII,
-        "Adjoint": m.Adjoint,
-        "Strang": m.Strang,
-        "StormerVerlet": m.Strang,
-        "Verlet": m.Strang,
-        "Leapfrog": m.Strang,
-        "RungeKutta4": m.RungeKutta4,
-        "RK4": m.RungeKutta4,
-        "ImplicitMidpoint": lambda: m.GaussLegendre(1),
+        "TypeII": TypeII,
+        "SymplecticEuler": TypeII,
+        "Adjoint": Adjoint,
+        "Strang": Strang,
+        "StormerVerlet": Strang,
+        "Verlet": Strang,
+        "Leapfrog": Strang,
+        "RungeKutta4": RungeKutta4,
+        "RK4": RungeKutta4,
+        "ImplicitMidpoint": lambda: GaussLegendre(1),
     }
     with_number = {
-        "Yoshida": m.Yoshida,
-        "Suzuki": m.Suzuki,
-        "BlanesMoan": m.BlanesMoan,
-        "McLachlan": m.McLachlan,
-        "KahanLi": m.KahanLi,
-        "GaussLegendre": m.GaussLegendre,
-        "LobattoIIIAIIIB": m.LobattoIIIAIIIB,
+        "Yoshida": Yoshida,
+        "Suzuki": Suzuki,
+        "BlanesMoan": BlanesMoan,
+        "McLachlan": McLachlan,
+        "KahanLi": KahanLi,
+        "GaussLegendre": GaussLegendre,
+        "LobattoIIIAIIIB": LobattoIIIAIIIB,
     }
     key = re.sub(r"[\s_-]", "", text).lower().replace("ö", "o").removesuffix("()")
     for name, make in plain.items():

@@ -138,7 +138,8 @@ def find_source(file: SystemFile, folder: Path) -> Source:
         return Source(file, loader, made, made.system)
     allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
     seen = f"{name!r} is {type(made).__name__}"
-    require(isinstance(made, dvi.System), "system", seen, allowed)
+    if not isinstance(made, dvi.System):
+        raise InputError("system", seen, allowed)
     return Source(file, loader, None, made)
 
 
