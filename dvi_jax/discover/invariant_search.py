@@ -298,7 +298,8 @@ class Search:
         found = span.representatives(self.fitted, self.slopes)
         picked: list[tuple[np.ndarray, bool, bool]] = []
         for series, independent in found:
-            picked.append((*self._picked(span, series, representative), independent))
+            c, at_every_epsilon = self._picked(span, series, representative)
+            picked.append((c, at_every_epsilon, independent))
         size = self.order + 1, self.basis.size
 
         def those(independent):
@@ -316,7 +317,9 @@ class Search:
             coefficients, exact, dependent = coefficients[kept], exact[kept], dependent[others]
         return _Chosen(coefficients, dependent, tuple(map(bool, exact)), refused, unclear, blur)
 
-    def _picked(self, span: Span, series: np.ndarray, representative: str):
+    def _picked(
+        self, span: Span, series: np.ndarray, representative: str
+    ) -> tuple[np.ndarray, bool]:
         """Coefficients, shape (order + 1, size), and whether the series is exact."""
         if self.order == 0:
             return self._of_order_0(series[0], span.blur)[None] / self.sizes, False

@@ -118,7 +118,13 @@ class ShadowHamiltonian(eqx.Module):
         H_D at (t + kh, t + (k+1)h, q_k, p_{k+1}), Δ b_k = b_{k+1} − b_k. Since [h^i] b_k is a
         polynomial of degree i in k, its differences Δ^j with j > i vanish.
         """
-        system = self._known_system()
+        system = self.system
+        if system is None:
+            raise ValueError(
+                "a ShadowHamiltonian has to know the system: write "
+                "ShadowHamiltonian(order, system), call shadow.bind(system, epsilon), or give it "
+                "to dvi.integrate(observe=...)."
+            )
         for name, value in (("q", q), ("p", p)):
             if not is_traced(value):
                 refuse_double_without_x64(name, getattr(value, "dtype", np.float32))
@@ -147,15 +153,6 @@ class ShadowHamiltonian(eqx.Module):
 
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         return self.evaluate(t1, q1, p1, t1 - t0 if self.h is None else self.h, args)
-
-    def _known_system(self) -> System:
-        if self.system is None:
-            raise ValueError(
-                "a ShadowHamiltonian has to know the system: write "
-                "ShadowHamiltonian(order, system), call shadow.bind(system, epsilon), or give it "
-                "to dvi.integrate(observe=...)."
-            )
-        return self.system
 
 
 def _series_along_orbit(

@@ -1,7 +1,5 @@
 """The linear algebra of a search for symmetries: null series, their kinds and representatives."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -57,7 +55,8 @@ class Search:
         fit, n = ~self.held, samples.q[0].size
         q, p = spread(samples.q), spread(samples.p)
         rows = h / np.repeat([q, p], n)
-        t = _inverse(np.median(np.sqrt(np.mean((raw.clock[fit, 0] * rows) ** 2, axis=1))))
+        rate = float(np.median(np.sqrt(np.mean((raw.clock[fit, 0] * rows) ** 2, axis=1))))
+        t = 1 / rate if rate > 0 else 1.0
         used = slice(0 if time else 1, None)
         self.units = np.repeat([t, q, p], [1, n, n])[used]
         self.size = len(self.units) * basis.size  # unknowns of each order
@@ -416,7 +415,3 @@ def _component_names(shape: tuple[int, ...]) -> tuple[str, ...]:
     names = coordinate_names(shape)
     half = len(names) // 2
     return ("ξ0", *(f"ξ_{v}" for v in names[:half]), *(f"η_{v}" for v in names[half:]))
-
-
-def _inverse(value: Any) -> float:
-    return 1 / float(value) if value > 0 else 1.0
