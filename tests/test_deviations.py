@@ -203,12 +203,6 @@ def test_growth_and_megno_are_those_of_the_variational_equations(start):
     assert 1.7 < np.log2(errors[0] / errors[1]) < 2.3  # its integrals are midpoint sums
 
 
-@pytest.mark.slow
-def test_the_first_exponents_do_not_depend_on_their_number():
-    few = seen(HENON.system, *CHAOTIC, dvi.LyapunovSpectrum(2), num_steps=2000)
-    assert np.max(np.abs(few - observed("chaotic", 2000)["lyapunov"][:2])) < 1e-12
-
-
 @functools.cache
 def neighbours(energy, num_steps, orbits, apart):
     """Spectra of orbits that start side by side in the chaotic sea, x = 0, y = −0.25, p_y = 0."""

@@ -228,21 +228,16 @@ class LeastSquaresStage:
         return u, best, getattr(FIT_RESULTS, at.status or "max_steps_reached")
 
 
-class _Known(eqx.Module):
-    """Inputs of a compiled step of the scalar loss: origin and scale of z, and what is summed."""
-
-    base: Array
-    scale: Array
-    horizon: Array
-    extra: Any = None
-
-
 def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
-    """The scalar loss over `per` for optimistix. Its derivative is by reverse mode, whichever mode
-    the solver uses: memory does not grow with the number of steps."""
+    """The scalar loss over `per` for optimistix, a function of z and (base, scale, horizon, arcs).
+
+    Its derivative is by reverse mode, whichever mode the solver uses: memory does not grow with the
+    number of steps.
+    """
 
     def value(z, known):
-        return core.scalar(known.base + known.scale * z, known.horizon, known.extra) / per
+        base, scale, horizon, choice = known
+        return core.scalar(base + scale * z, horizon, choice) / per
 
     @eqx.filter_custom_jvp
     def function(z, known):
@@ -258,7 +253,7 @@ def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
 
 @eqx.filter_jit
 def _descend(
-    solver: Any, core: Any, per: float, z: Array, known: _Known, state: Any
+    solver: Any, core: Any, per: float, z: Array, known: tuple, state: Any
 ) -> tuple[Array, Any, Array]:
     function = _scalar_function(core, per)
     new, state, _ = solver.step(function, z, known, {}, state, frozenset())
@@ -292,7 +287,7 @@ class ScalarStage:
         base, size, z = (jnp.asarray(x) for x in (at.base, at.scale, at.z))
 
         def known():
-            return _Known(base, size, jnp.asarray(task.horizon), choose and choose(at.done))
+            return base, size, jnp.asarray(task.horizon), choose and choose(at.done)
 
         struct = jax.ShapeDtypeStruct((), jnp.result_type(float))
         function = _scalar_function(self.core, self.per)
