@@ -13,7 +13,7 @@ def H(t0, t1, q0, p1, args):
     return jnp.sum(p1**2) / 2 + args["k"] * jnp.sum(q0**2) / 2
 
 
-SYSTEM = dvi.System(H, force=lambda t0, t1, q0, p1, args: -p1)
+SYSTEM = dvi.System(H, force=lambda t0, t1, q0, p1, args: -p1, epsilon=0.0)
 TS = np.arange(1, 21) * 0.5
 VALUES = np.cos(TS)[:, None]
 START = {"q0": [1.0], "p0": [0.0], "args": {"k": 1.0}}

@@ -187,8 +187,8 @@ def unit():
         ({"events": marked(lambda t, y: y[0], terminal=-1)}, ValueError, "terminal"),
         ({"h": -0.1}, ValueError, "direction is that of t_span"),
         ({"h": [0.1, 0.1]}, ValueError, r"a positive and finite step, got \[0.1, 0.1\]"),
-        ({"t_eval": unit}, TypeError, "has the unit 'min', and numbers are taken here"),
-        ({"h": unit}, TypeError, "has the unit 'min', and numbers are taken here"),
+        ({"t_eval": unit}, TypeError, "has the unit 'min', which would be lost"),
+        ({"h": unit}, TypeError, "has the unit 'min', which would be lost"),
     ],
     ids=lambda x: "",
 )

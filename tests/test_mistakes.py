@@ -299,7 +299,7 @@ ERRORS = {
         lambda: sweep(epsilon=dvi.Axis("a", [0.1, 0.2]), h=dvi.Axis("a", [0.1, 0.2, 0.3])),
         "'?a'?",
     ),
-    "an axis of text": (lambda: dvi.Axis("a", ["x"]), "a"),
+    "an axis of text": (lambda: sweep(epsilon=dvi.Axis("a", ["x"]), observe=dvi.Last(energy)), "real numbers|axis 'a'"),
     "a sweep that observes nothing": (sweep, "observe|save"),
     # --- fits ---
     "a parameter that the model does not have": (lambda: fit(params={"gamma": 1.0}), "gamma"),
@@ -311,10 +311,6 @@ ERRORS = {
         "NaN|missing|observ",
     ),
     "bounds the wrong way round": (lambda: dvi.Bounds(1.0, 0.0), "Bounds|lower|upper"),
-    "observations without t0": (
-        lambda: fit(dvi.Observations(TS, np.ones((3, 1)), sigma=0.1)),
-        "t0",
-    ),
     # --- other functions ---
     "one orbit to a section": (lambda: section(q0=[1.0], p0=[0.0]), "orbits|axis|shape"),
     "no crossings": (lambda: section(crossings=0), "crossings"),
@@ -368,6 +364,10 @@ def message_of(call):
 
 WARNINGS = {
     "epsilon without a force": (lambda: run(epsilon=0.1), "epsilon.*no effect"),
+    "observations without t0": (
+        lambda: fit(dvi.Observations(TS, np.ones(3), sigma=0.1)),
+        "t0 is not given.*t=?",
+    ),
     "p and q of H_D in the other order": (
         lambda: dvi.System(lambda t0, t1, p1, q0, args: p1 @ p1 / 2 + jnp.cos(q0[0])),
         "order",
@@ -433,8 +433,8 @@ ANSWERS = {
     ),
     "progress=True": lambda: (run(progress=True).qs, run().qs),
     "values of shape (N,) in a fit": lambda: (
-        observed(values=np.ones(3)).values,
-        observed().values,
+        fit(observed(values=np.ones(3))).x,
+        fit(observed()).x,
     ),
     "Leapfrog": lambda: (final(method=dvi.Leapfrog()), final(method=dvi.Strang())),
     "the last state": lambda: (run().p_final, run().ps[-1]),

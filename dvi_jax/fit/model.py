@@ -353,11 +353,11 @@ def _between(
     return jnp.where(wide, sol.qs[0], qs), jnp.where(wide, sol.ps[0], ps)
 
 
-def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> None:
-    """Refuse a start and args that `integrate` refuses, and an observable that does not return one
-    value of the shape of the data.
+def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> bool:
+    """Whether values of shape (N,) have to become (N, 1), for an observable of one component.
 
-    **Raises** `ValueError` with both shapes; errors of the function itself with a note.
+    **Raises** as `integrate` does for the initial state and args; `ValueError` with both shapes for
+    an observable that does not return one value of the data; errors of the function with a note.
     """
     q, p = start_state(spec["q0"], spec["p0"])
     args = jax.tree.map(as_parameter, spec.get("args"))
@@ -367,10 +367,12 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> None
         error.add_note(f"(in the observe of arc {i}, called with (t, q, p, args))")
         raise
     shape, of_one = getattr(out, "shape", None), arc.values.shape[1:]
+    if of_one == () and shape == (1,) and arc.covariance is None:
+        return True
     if shape != of_one:
         name = arc.observe if isinstance(arc.observe, str) else "observe"
-        hint = " Give values[:, None]." if of_one == () and shape == (1,) else ""
         raise ValueError(
             f"arc {i}: values has shape {arc.values.shape}, so one observation has {of_one}, but "
-            f"{name} returns {shape} for a state of shape {q.shape}.{hint}"
+            f"{name} returns {shape} for a state of shape {q.shape}."
         )
+    return False

@@ -1,7 +1,7 @@
 """Observations: times, values and errors, checked."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
@@ -28,8 +28,8 @@ class Observations:
 
     - `ts`: times, shape (N,), ascending or descending, no two equal, and all on one side of t0.
       Either order may be combined with either sign of h; a `FitResult` has the order given here.
-    - `values`: observed values, shape (N, ...); NaN, or a masked number, where a component is
-      missing. Only `values` may be masked.
+    - `values`: observed values, shape (N, ...), for one component also (N,); NaN, or a masked
+      number, where a component is missing. Only `values` may be masked.
     - `observe`: the observable of a state: ``"positions"`` (q, the default), ``"momenta"`` (p),
       ``"state"`` (both in one vector), or a function ``(t, q, p, args)`` that returns an array of
       the shape of one value: a range, an angle, one body of many.
@@ -38,6 +38,7 @@ class Observations:
     - `covariance`: instead of sigma, covariances of the K components of one observation in the
       order of ``ravel``: shape (K, K) for all, or (N, K, K).
     - `t0`: time of the arc's start, to which the model's q0 and p0 belong; ``ts[0]`` if left out.
+      A fit of a model with a given q0 or p0 warns then, unless ``ts[0]`` is 0.
       The sign of the model's h must lead from t0 to the observations.
 
     Observations of several kinds along one arc are one `observe` that returns them all, at
@@ -54,6 +55,7 @@ class Observations:
     sigma: Any = None
     covariance: Any = None
     t0: float | None = None
+    t0_is_given: bool = field(init=False, default=False, repr=False)
 
     def __post_init__(self):
         values = self.values
@@ -95,8 +97,14 @@ class Observations:
             if self.sigma is not None:
                 raise ValueError("give sigma or covariance, not both.")
             checked["covariance"] = _covariance(self.covariance, values)
+        checked["t0_is_given"] = self.t0 is not None
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+
+    def in_columns(self) -> "Observations":
+        """The same observations with values of shape (N, 1) in place of (N,)."""
+        sigma = None if self.sigma is None else self.sigma[:, None]
+        return replace(self, values=self.values[:, None], sigma=sigma)
 
     @property
     def function(self) -> Callable[..., Any]:

@@ -20,12 +20,22 @@ class Bounds:
     - `lower`, `upper`: numbers, or arrays that broadcast to the parameter; None or infinite for
       no limit.
 
+    **Raises** `ValueError` where lower is not less than upper.
+
     Inside the fit a parameter between both is lower + (upper − lower) / (1 + exp(−u)), above
     one limit lower + exp(u), with u free.
     """
 
     lower: Any = None
     upper: Any = None
+
+    def __post_init__(self):
+        if None not in (self.lower, self.upper) and np.any(
+            np.asarray(self.lower) >= np.asarray(self.upper)
+        ):
+            raise ValueError(
+                f"lower of Bounds must be less than upper, got {self.lower!r} and {self.upper!r}."
+            )
 
 
 @dataclass(frozen=True)

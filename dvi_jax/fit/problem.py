@@ -1,5 +1,6 @@
 """A fit as functions of one vector: predictions, residuals, Jacobian, a scalar to minimise."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -144,6 +145,19 @@ class Core(eqx.Module):
         return jax.vmap(second)(directions)
 
 
+def _warn_of_times(model: Model, params: Any, arcs: list[Observations]) -> None:
+    """Warn of initial states that are known for a time which was not given."""
+    fixed = [n for n in ("q0", "p0") if model.fixed[n] is not None and n not in params]
+    for i, arc in enumerate(arcs):
+        if fixed and not arc.t0_is_given and arc.t0 != 0:
+            warnings.warn(
+                f"arc {i}: t0 is not given, so {' and '.join(fixed)} of the model are taken as the "
+                f"state at the first observation, t = {arc.t0:g}. If they are the state at another "
+                "time, pass dvi.Observations(..., t0=...).",
+                stacklevel=5,
+            )
+
+
 def within(group: Group, horizon: Any) -> Array:
     """Which values were observed within the horizon, shape (A, N, K)."""
     since = jnp.abs(jnp.asarray(group.ts) - jnp.asarray(group.t0)[:, None])
@@ -184,7 +198,7 @@ class Problem:
     ):
         known = "a dvi.LeastSquares(), dvi.SoftL1(), dvi.Cauchy() or dvi.Likelihood(f)"
         instance("loss", loss, Loss | Likelihood, known)
-        self.given, self.loss = arcs, loss
+        self.given, self.loss = list(arcs), loss
         self.arcs = arcs = [arc.ordered() for arc in arcs]
         self.space, self.start = make_space(params, bounds, priors)
         self.size = self.space.size
@@ -203,8 +217,11 @@ class Problem:
             specification(model, arrays, 0, many)  # which reports what is missing
             model.check_rows(arrays, len(arcs))
         self.specs = [specification(model, arrays, i, many) for i in range(len(arcs))]
+        if isinstance(model, Model):
+            _warn_of_times(model, params, self.given)
         for i, arc in enumerate(arcs):
-            check_observable(i, arc, self.specs[i])
+            if check_observable(i, arc, self.specs[i]):
+                arcs[i], self.given[i] = arc.in_columns(), self.given[i].in_columns()
         self.groups = make_groups(arcs, self.specs)
         seen = reads(model, loss, [arc.function for arc in arcs])
         self.core = Core(model, tuple(self.groups), self.space, loss, many, seen)
