@@ -161,7 +161,7 @@ REFUSED = {
         ({"params": {"q0": MASKED}}, r"q0 is a masked array with a masked number at index \[0\]"),
         ({"bounds": {"epsilon": dvi.Bounds(np.ma.masked, 1)}}, "lower of epsilon is a"),
         ({"model": starting(q0=MASKED)}, "q0 is a masked array"),
-        ({"bounds": {"epsilon": dvi.Bounds(1, 0)}}, "lower one must be less"),
+        ({"bounds": {"epsilon": dvi.Bounds(np.nan, 1)}}, "lower one must be less"),
         ({"bounds": {"epsilon": dvi.Bounds(0.5, 1)}}, "not between"),
         ({"bounds": {"eps": dvi.Bounds(0.5, 1)}}, "given for 'eps'"),
         ({"priors": {"epsilon": dvi.Prior(0.0, 0.0)}}, "positive sigma"),

@@ -299,7 +299,10 @@ ERRORS = {
         lambda: sweep(epsilon=dvi.Axis("a", [0.1, 0.2]), h=dvi.Axis("a", [0.1, 0.2, 0.3])),
         "'?a'?",
     ),
-    "an axis of text": (lambda: sweep(epsilon=dvi.Axis("a", ["x"]), observe=dvi.Last(energy)), "real numbers|axis 'a'"),
+    "an axis of text": (
+        lambda: sweep(epsilon=dvi.Axis("a", ["x"]), observe=dvi.Last(energy)),
+        "real numbers|axis 'a'",
+    ),
     "a sweep that observes nothing": (sweep, "observe|save"),
     # --- fits ---
     "a parameter that the model does not have": (lambda: fit(params={"gamma": 1.0}), "gamma"),

@@ -210,7 +210,7 @@ def diagram(q, p, **options):
         (lambda q, p: section(q, p, crossings=0), "crossings must be a whole .* from 1 on, got 0"),
         (lambda q, p: section(q, p, system=HENON), "be a dvi.System, got Problem.*problem.system"),
         (lambda q, p: section(0.0, 0.0), r"orbits along the first axis.*got shape \(\)"),
-        (lambda q, p: section(q, p, crosings=3), "has no argument 'crosings'. Did you mean 'crossings'"),
+        (lambda q, p: section(q, p, crosings=3), "argument 'crosings'. Did you mean 'crossings'"),
         (lambda q, p: dvi.poincare_section(HENON.system, q, p, plane, h=1), "'num_steps'"),
         (lambda q, p: diagram(q, p, epsilon=0.1), "needs something that varies"),
         (lambda q, p: diagram(q, p, epsilon=[0.0, np.nan]), "epsilon must be finite, got .*nan"),

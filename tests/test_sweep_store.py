@@ -466,7 +466,7 @@ def test_paths_that_are_not_a_store(tmp_path):
 def test_keys_of_args_that_cannot_be_file_names(key, tmp_path):
     axes = {name: dvi.Axis("x", [1.0, 2.0]) for name in (key, "k")}
     with pytest.raises(ValueError, match="cannot be the name of an array in a store"):
-        dvi.sweep(sweep_child.SYSTEM, [0.0], [1.0], args=axes, h=0.1, num_steps=2,
+        dvi.sweep(sweep_child.SYSTEM, [0.0], [1.0], args=axes, h=0.1, num_steps=2, epsilon=0.0,
                   save=dvi.Save(final=True), store=tmp_path / "s.zarr")  # fmt: skip
     assert not list(tmp_path.iterdir())
 

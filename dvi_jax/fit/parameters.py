@@ -20,7 +20,7 @@ class Bounds:
     - `lower`, `upper`: numbers, or arrays that broadcast to the parameter; None or infinite for
       no limit.
 
-    **Raises** `ValueError` where lower is not less than upper.
+    **Raises** `ValueError` if lower is not less than upper.
 
     Inside the fit a parameter between both is lower + (upper − lower) / (1 + exp(−u)), above
     one limit lower + exp(u), with u free.
@@ -30,9 +30,9 @@ class Bounds:
     upper: Any = None
 
     def __post_init__(self):
-        if None not in (self.lower, self.upper) and np.any(
-            np.asarray(self.lower) >= np.asarray(self.upper)
-        ):
+        # Arrays are compared later, when the shape of the parameter is known.
+        numbers = all(isinstance(x, int | float) for x in (self.lower, self.upper))
+        if numbers and self.lower >= self.upper:
             raise ValueError(
                 f"lower of Bounds must be less than upper, got {self.lower!r} and {self.upper!r}."
             )

@@ -199,8 +199,9 @@ def prepare(
 
 
 def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
+    has_start = given["start"] is not None or isinstance(system, System)
     system, q0, p0, given["h"], given["args"] = of_problem(
-        system, q0, p0, given["h"], given["args"], given["start"] is not None
+        system, q0, p0, given["h"], given["args"], has_start
     )
     check_system(system)
     given["epsilon"] = system.strength(given["epsilon"])
