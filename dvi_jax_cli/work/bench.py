@@ -232,10 +232,11 @@ def _timed(row: Row, rounds: int) -> list[dict[str, Any]]:
     for i, name in enumerate(row.references, 1):
         ratios = seconds[:, i] / seconds[:, 0]
         low, middle, high = np.quantile(ratios, [0.25, 0.5, 0.75], method="weibull").tolist()
-        differ = None
+        differ, agrees = None, True
         if row.tolerance is not None:
             both = zip(ends[0], ends[i], strict=True)
             differ = float(np.max([np.max(np.abs(x - y)) for x, y in both]))
+            agrees = differ <= row.tolerance  # NaN does not
         found.append(
             {
                 "reference": name,
@@ -245,7 +246,7 @@ def _timed(row: Row, rounds: int) -> list[dict[str, Any]]:
                 "quartiles": [low, high],
                 "compilation_seconds": max(0.0, first[0] - typical[0]),
                 "largest_difference": differ,
-                "agrees": differ is None or differ <= row.tolerance,  # NaN does not
+                "agrees": agrees,
             }
         )
     return found
