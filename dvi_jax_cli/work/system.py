@@ -136,11 +136,10 @@ def find_source(file: SystemFile, folder: Path) -> Source:
             raise InputError("system", seen, "a function that returns a system") from error
     if isinstance(made, systems.Problem):
         return Source(file, loader, made, made.system)
+    if isinstance(made, dvi.System):
+        return Source(file, loader, None, made)
     allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
-    seen = f"{name!r} is {type(made).__name__}"
-    if not isinstance(made, dvi.System):
-        raise InputError("system", seen, allowed)
-    return Source(file, loader, None, made)
+    raise InputError("system", f"{name!r} is {type(made).__name__}", allowed)
 
 
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:
