@@ -216,8 +216,17 @@ REJECTED = [
     (SPRING, "state.q0: the key is missing", "this system has none"),
     (SPRING + STATE, "h: the key is missing", "none of its own"),
     (SPRING + "h = 0.1\n" + STATE, "(own.py, line 7)", "state and args that fit"),
-    ('system = "own.py:forced"\n' + FULL, "jnp.where in place of if (own.py, line 25)", "fit"),
-    ('system = "own.py:numbered"\n' + FULL, "in place of if (own.py, line 28)", "fit"),
+    ('system = "own.py:forced"\n' + FULL, "epsilon: the key is missing", "a force"),
+    (
+        'system = "own.py:forced"\nepsilon = 0.1\n' + FULL,
+        "jnp.where in place of if (own.py, line 25)",
+        "fit",
+    ),
+    (
+        'system = "own.py:numbered"\nepsilon = 0.1\n' + FULL,
+        "in place of if (own.py, line 28)",
+        "fit",
+    ),
     (N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]", "body 0 and body 1 are on top", "start"),
     (N_BODY + "[args]\nmasses = [1, 0, 1]", "mass of body 1 is 0", "start"),
 ]

@@ -114,7 +114,16 @@ class Source:
         else:
             grid = {"lattice": dvi.Uniform(), "h": self.h, "num_steps": file.steps}
             require(file.steps is not None, "steps", MISSING, COUNT)
-        return grid | {"t0": file.t0, "epsilon": file.epsilon}
+        return grid | {"t0": file.t0, "epsilon": self.epsilon}
+
+    @property
+    def epsilon(self) -> Any:
+        """The strength of the perturbation in the file, or else of the system."""
+        try:
+            return self.system.strength(getattr(self.file, "epsilon", None))
+        except ValueError:
+            allowed = "a number: the system has a force or a perturbation (0.0: unperturbed)"
+            raise InputError("epsilon", MISSING, allowed) from None
 
 
 def find_source(file: SystemFile, folder: Path) -> Source:
