@@ -134,7 +134,7 @@ def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
     return x
 
 
-# Applied number by number; an operand without axes goes with each number of the others.
+# Applied number by number; an operand without axes is combined with each number of the others.
 ELEMENTWISE: dict[str, Callable] = {
     **{op: _combined(op) for op in ("add", "mul", "max", "min")},
     "add_any": _combined("add"),

@@ -120,7 +120,7 @@ _unit_vectors = primitive("unit_vectors", lambda *, n, dtype: jnp.eye(n, dtype=d
 
 
 def on_any(x: Array, rare: bool = True) -> Array:
-    """Whether a truth value is true on any of the trajectories that run together.
+    """Whether a condition is true for any of the trajectories that run together.
 
     It may decide what is computed, as a branch that most trajectories do not need, never what a
     trajectory's result is: that must not depend on its neighbours. Where it is `rare` that the

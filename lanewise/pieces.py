@@ -37,7 +37,7 @@ def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> 
 
     `reason` returns why no code can be generated for a function, None if it can be. A loop, a
     branch or a linear solve is never cut: it is in one piece with all that it calls. Code is
-    generated for pieces with a loop; what is between them goes with the piece before it.
+    generated for pieces with a loop; what is between them belongs to the piece before it.
     """
     jaxpr = closed.jaxpr
     known = dict(zip(jaxpr.constvars, closed.consts, strict=True))

@@ -114,7 +114,7 @@ DIFFERENT = {
     "a bound method": [{"system": dvi.System(Spring(k).__call__)} for k in (1.0, 2.0)],
     "a rule of differentiation": [{"system": with_own_derivative(c)} for c in (1.0, 2.0)],
     "args of a class": [{"system": OF_ARGS, "args": Parameters(k)} for k in (1.0, 5.0)],
-    "a reduction of one's own": [{"observe": last(c)} for c in (1.0, 2.0)],
+    "a user-defined reduction": [{"observe": last(c)} for c in (1.0, 2.0)],
     "a default of a stop": [{"args": 1.0, "stop": stop_at(k)} for k in (1.2, 1.35)],
     "a lattice's function": [
         {"lattice": dvi.TimeTransformed(lambda t, q, p, a, c=c: c + q @ q)} for c in (1.0, 2.0)

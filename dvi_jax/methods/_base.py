@@ -14,7 +14,7 @@ from .._types import Args, Interval, State
 
 
 class Method(eqx.Module):
-    """Base of all methods. A subclass declares its order and properties and implements `step`."""
+    """Base class of all methods: order and properties are declared, `step` is implemented."""
 
     order: eqx.AbstractVar[int]
     is_symmetric: eqx.AbstractVar[bool]

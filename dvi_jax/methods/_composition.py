@@ -146,7 +146,7 @@ def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
 
 
 class Composition(CompositionMethod):
-    r"""A composition of a map with its adjoint, with coefficients that the user gives.
+    r"""A composition of a map and its adjoint with user-defined coefficients.
 
         Ψ_h = … ∘ Φ*_{c₄h} ∘ Φ_{c₃h} ∘ Φ*_{c₂h} ∘ Φ_{c₁h}        (c₁ acts first)
 

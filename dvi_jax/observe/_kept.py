@@ -175,7 +175,7 @@ class Section(KeptSteps):
 
 
 class RequestedTimes(KeptSteps):
-    """The steps that contain the times of ``Save(ts=...)``, by t or by a clock of the user's.
+    """The steps that contain the times of ``Save(ts=...)``, by t or by a user-defined clock.
 
     `due` are the times minus their possible rounding error: the step in which one is due is the one
     that reaches it. `ordered` are these in ascending order, for bisection.
@@ -201,7 +201,7 @@ class RequestedTimes(KeptSteps):
 
 
 def shown(clock: Callable[..., Any] | None, t: Scalar, q: State, p: State, args: Args) -> Scalar:
-    """The value of a clock at a point; the time if there is none."""
+    """The value of a clock at a point; the time t without a clock."""
     return t if clock is None else event(clock, t, q, p, args, "the clock")
 
 

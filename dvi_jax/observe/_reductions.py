@@ -226,7 +226,7 @@ class Last(_OfFunction):
 
 
 class Running(eqx.Module):
-    """The value of a reduction at every save point: over the steps from the start up to there.
+    """The values of a reduction at the saved steps, each over all steps before it.
 
     ``dvi.Running(dvi.MEGNO())`` with ``save=dvi.Save(every=m)`` shows how an indicator converges;
     the values have shape (S − 1, …), like those of an observable without a reduction.

@@ -35,7 +35,7 @@ def has_initial_value(function: Any) -> bool:
 
 
 def of_steps(observe: PyTree) -> PyTree:
-    """The observables with those of a state as functions of a step.
+    """The observables, all as functions of a step.
 
     **Raises** `TypeError` for a function with another number of arguments.
     """

@@ -39,7 +39,7 @@ _MANY_STARTS = 100_000
 
 
 class SweepInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a sweep. `result` has the finished tasks, as has the store if there is one."""
+    """Raised by Ctrl-C during a sweep. `result` and the store, if any, have the finished tasks."""
 
     def __init__(self, message: str, result: SweepResult):
         super().__init__(message)

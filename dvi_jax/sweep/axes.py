@@ -15,7 +15,7 @@ from ..engine.quantities import refuse_unit_or_mask
 
 @dataclass(frozen=True, init=False, eq=False)
 class Axis:
-    """A named axis of a sweep: the argument that it replaces takes each of its values.
+    """A named axis of a sweep: the values that one argument takes.
 
     Axes of different names make a grid, axes of one name vary together (they are zipped).
 

@@ -34,8 +34,8 @@ _ATTEMPTS = 10
 
 
 class ClusterError(RuntimeError):
-    """The cluster is gone, or a task kills the workers that it runs on. Finished tasks are in the
-    store; the same call goes on from there."""
+    """Raised if the cluster is lost or a task kills its workers. Finished tasks are in the store,
+    and the same call continues from there."""
 
 
 def run_on(
