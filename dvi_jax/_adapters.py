@@ -351,6 +351,7 @@ def _start(slope: Callable[[Vector], Vector], p: Vector, rest: Vector) -> Vector
 
     def far(state):
         _, left, _, trials = state
+        # Relative to the defect at rest, since an absolute limit would depend on the units.
         return (left > _NEAR * size(rest)) & (trials < _MOST_TRIALS)
 
     def closer(state):

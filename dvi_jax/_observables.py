@@ -77,6 +77,7 @@ def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> Non
 
 def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
     """The pytree `observe` with every observable replaced by its values."""
+    # Both lists are in the order of the leaves, in which `Task.observables` has separated them.
     values, lone = iter(reduced), iter(alone)
 
     def value(f):

@@ -320,6 +320,7 @@ def get_threads() -> int:
 
 
 def _threads() -> ctypes.c_int64:
+    # A variable of the machine code itself, so that a new number holds for compiled programs too.
     return ctypes.c_int64.from_address(runtime().get_global_value_address("lanewise_threads"))
 
 
@@ -331,6 +332,7 @@ def module_text(kernel: str, block: int) -> str:
 
 def registered(text: str) -> str:
     """The name by which XLA calls a module's handler, compiled and registered if it was not."""
+    # By the text, not by the function: two programs with equal code are compiled once.
     key = hashlib.sha256(text.encode()).hexdigest()
     with _lock:
         if key not in _targets:

@@ -109,6 +109,7 @@ def in_pieces(
         flags = tuple(is_on(v) for v in piece.reads)
         outs = run(piece, *(read(v) for v in piece.reads), on=flags)
         values.update(zip(piece.writes, outs, strict=True))
+        # `run` returns all results with the batch in front, those that it does not change included.
         batched.update(dict.fromkeys(piece.writes, lanes is not None))
     front = () if lanes is None else (lanes,)
     return [
@@ -164,6 +165,7 @@ def _function_of(
         invars=reads,
         outvars=list(writes),
         eqns=list(eqns),
+        # The names of the original arguments do not belong to these inputs.
         debug_info=jaxpr.debug_info.with_unknown_names(),
     )
     return ClosedJaxpr(part, [known[v] for v in consts]), reads

@@ -172,6 +172,7 @@ class Trend(_OfFunction):
 
     def finish(self, memory):
         _, _, t_t, t_f = memory
+        # 0/0 for fewer than two steps, which is the NaN that the docstring promises.
         return t_f / t_t
 
     def combine(self, memory, k, t, value):

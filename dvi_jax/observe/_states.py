@@ -51,6 +51,7 @@ def _of_step(leaf: Any) -> Any:
         if converted is function or not isinstance(converted, OfState):
             return leaf
         return eqx.tree_at(lambda r: r.function, leaf, converted)
+    # The longest form first: a function with defaults or *rest accepts several of them.
     if not callable(leaf) or isinstance(leaf, type) or accepts(leaf, 7):
         return leaf
     for count in (4, 2):
