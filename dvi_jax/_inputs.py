@@ -27,7 +27,7 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
     if q.dtype != p.dtype:
         dtype = jnp.result_type(q.dtype, p.dtype)
         q, p = q.astype(dtype), p.astype(dtype)
-    # Half precision has at most three digits, in which neither a solve nor an invariant can be checked.
+    # Half precision has at most three digits: neither a solve nor an invariant can be checked.
     if q.dtype.itemsize < 4:
         raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype}: too few digits.")
     return q, p

@@ -180,7 +180,7 @@ class Variational(StepSizes):
 
         # Cell i is [hs[i], hs[i + 1]]. NaN, where (13) has no solution, is not a change of sign.
         changes = (jnp.sign(values[:-1]) * jnp.sign(values[1:]) <= 0) & (jnp.diff(fixed) != 0)
-        # If the values at both ends are equal and change sign, both are zero: the left end is a root.
+        # If equal values at both ends change sign, both are zero: the left end is a root.
         slopes = jnp.diff(values) / jnp.diff(fixed)
         crossing = fixed[:-1] - jnp.where(slopes == 0, 0, values[:-1] / slopes)
         nearest = jnp.argmin(jnp.where(changes, jnp.abs(crossing - fixed[_CELLS]), jnp.inf))
