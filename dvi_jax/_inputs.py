@@ -23,7 +23,7 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
             "needs its momentum."
         )
     if q.size == 0:
-        raise ValueError(f"q0 is empty (shape {q.shape}): there is nothing to integrate.")
+        raise ValueError(f"q0 is empty, of shape {q.shape}: give at least one position.")
     if q.dtype != p.dtype:
         dtype = jnp.result_type(q.dtype, p.dtype)
         q, p = q.astype(dtype), p.astype(dtype)

@@ -201,7 +201,7 @@ def test_unsigned_integers_and_unknown_names(tmp_path):
     assert found["count"].dtype == np.uint8
     assert (found["count"] == 3).all()
     np.testing.assert_array_equal(found["t0"], [0.0, 1.0])
-    with pytest.raises(KeyError, match="there are"):
+    with pytest.raises(KeyError, match="it has"):
         found["cuont"]
 
 

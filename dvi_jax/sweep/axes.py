@@ -73,7 +73,7 @@ _NUMBERS = (int, float, np.ndarray, np.generic, jax.Array, list, tuple)
 
 def _check(of: str, values: np.ndarray) -> None:
     if values.ndim == 0:
-        raise ValueError(f"{of} needs a sequence of values, got the number {values}.")
+        raise ValueError(f"{of} needs a sequence of values, such as [{values}], got {values}.")
     if values.dtype.kind not in "iuf":
         raise TypeError(f"{of} needs real numbers, got dtype {values.dtype}.")
     if not np.isfinite(values).all():
