@@ -65,18 +65,27 @@ class Baseline:
     def final(self, kernel: str, q0, p0, *, h: float, steps: int, epsilon: float) -> Run:
         """The explicit run to the state after the last step: outputs q, p."""
         return self._run(
-            f"{kernel}_final", q0, p0, [_whole(steps), _real(h), _real(epsilon)],
+            f"{kernel}_final",
+            q0,
+            p0,
+            [_whole(steps), _real(h), _real(epsilon)],
             lambda n, lanes: {"q": (n, lanes), "p": (n, lanes)},
-        )  # fmt: skip
+        )
 
     def streamed(self, kernel: str, q0, p0, *, h: float, steps: int, epsilon: float) -> Run:
         """As `final`, and of the energy its largest `drift` and its `slope` against time."""
         return self._run(
-            f"{kernel}_streamed", q0, p0, [_whole(steps), _real(h), _real(epsilon)],
+            f"{kernel}_streamed",
+            q0,
+            p0,
+            [_whole(steps), _real(h), _real(epsilon)],
             lambda n, lanes: {
-                "q": (n, lanes), "p": (n, lanes), "drift": (lanes,), "slope": (lanes,),
+                "q": (n, lanes),
+                "p": (n, lanes),
+                "drift": (lanes,),
+                "slope": (lanes,),
             },
-        )  # fmt: skip
+        )
 
     def saved(
         self, kernel: str, q0, p0, *, h: float, steps: int, every: int, epsilon: float
@@ -89,24 +98,41 @@ class Baseline:
             raise ValueError(f"steps must be a multiple of every, got {steps} and {every}.")
         shape = steps // every + 1
         return self._run(
-            f"{kernel}_saved", q0, p0, [_whole(steps), _whole(every), _real(h), _real(epsilon)],
-            lambda n, lanes: {"q": (shape, n, lanes), "p": (shape, n, lanes)}, anew=True,
-        )  # fmt: skip
+            f"{kernel}_saved",
+            q0,
+            p0,
+            [_whole(steps), _whole(every), _real(h), _real(epsilon)],
+            lambda n, lanes: {"q": (shape, n, lanes), "p": (shape, n, lanes)},
+            anew=True,
+        )
 
     def implicit(
-        self, kernel: str, q0, p0, *, h: float, steps: int, epsilon: float, iterations: int,
+        self,
+        kernel: str,
+        q0,
+        p0,
+        *,
+        h: float,
+        steps: int,
+        epsilon: float,
+        iterations: int,
         monitor: bool = False,
-    ) -> Run:  # fmt: skip
+    ) -> Run:
         """The implicit run to its last state; with `monitor`, the largest last `correction` too."""
         if iterations < 1:
             raise ValueError(f"iterations must be at least 1, got {iterations}.")
         numbers = [_whole(steps), ctypes.c_int(iterations), _real(h), _real(epsilon)]
         return self._run(
-            kernel, q0, p0, numbers,
+            kernel,
+            q0,
+            p0,
+            numbers,
             lambda n, lanes: {
-                "q": (n, lanes), "p": (n, lanes), "correction": (lanes,) if monitor else None,
+                "q": (n, lanes),
+                "p": (n, lanes),
+                "correction": (lanes,) if monitor else None,
             },
-        )  # fmt: skip
+        )
 
     def iterations_needed(
         self, kernel: str, q0, p0, *, h: float, steps: int, epsilon: float
@@ -118,9 +144,15 @@ class Baseline:
         scale, correction = float(np.max(np.abs(p0))), np.inf
         for iterations in range(1, 9):
             run = self.implicit(
-                kernel, q0, p0, h=h, steps=steps, epsilon=epsilon, iterations=iterations,
+                kernel,
+                q0,
+                p0,
+                h=h,
+                steps=steps,
+                epsilon=epsilon,
+                iterations=iterations,
                 monitor=True,
-            )  # fmt: skip
+            )
             correction = float(np.max(run()["correction"])) / scale
             if correction <= NEWTON_TOLERANCE:
                 return iterations, correction

@@ -104,9 +104,16 @@ def _mirror() -> Workload:
     """The magnetic mirror with W = −q0; the kernel solves the linear equation for p1 directly."""
     problem = systems.magnetic_mirror()
     return Workload(
-        "mirror", dvi.System(charged_particle, force=linear_force), 3, problem.h, problem.q0,
-        problem.p0, (0.1, 0.1), is_explicit=True, args=problem.args,
-    )  # fmt: skip
+        "mirror",
+        dvi.System(charged_particle, force=linear_force),
+        3,
+        problem.h,
+        problem.q0,
+        problem.p0,
+        (0.1, 0.1),
+        is_explicit=True,
+        args=problem.args,
+    )
 
 
 def _bodies() -> Workload:

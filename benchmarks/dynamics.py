@@ -84,10 +84,14 @@ def moment() -> Iterator[Row]:
     for length in lengths:
         made = systems.magnetic_mirror(length, length / 2)
         found = along(
-            made.q0, made.p0,
+            made.q0,
+            made.p0,
             [dvi.Range(made.observables[k]) for k in ("magnetic_moment", "corrected_moment")],
-            round(30 * length), dvi.RungeKutta4(), system=made.system, args=made.args,
-        )  # fmt: skip
+            round(30 * length),
+            dvi.RungeKutta4(),
+            system=made.system,
+            args=made.args,
+        )
         seen.append([float(x) for x in found])
     slopes = np.polyfit(np.log(lengths), np.log(seen), 1)[0]
     for name, slope, power in zip(("μ0", "μ0 + μ1"), -slopes, (1, 2), strict=True):
@@ -116,9 +120,15 @@ def section() -> Iterator[Row]:
     px = np.sqrt(2 * 0.1 - y**2 + 2 * y**3 / 3)
     began = time.perf_counter()
     found = dvi.poincare_section(
-        HENON.system, np.stack([0 * y, y], 1), np.stack([px, 0 * y], 1), lambda t, q, p, args: q[0],
-        h=0.05, num_steps=1_600_000, crossings=10_000, throw=False,
-    )  # fmt: skip
+        HENON.system,
+        np.stack([0 * y, y], 1),
+        np.stack([px, 0 * y], 1),
+        lambda t, q, p, args: q[0],
+        h=0.05,
+        num_steps=1_600_000,
+        crossings=10_000,
+        throw=False,
+    )
     off = float(np.abs(found.qs[..., 0]).max())
     taken = time.perf_counter() - began
     ended = sorted({str(s) for s in np.ravel(found.status)})

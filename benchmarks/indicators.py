@@ -52,9 +52,16 @@ def ours(observe, lanes, steps):
 
     def one(q, p):
         return dvi.integrate(
-            STAR.system, q, p, h=H, num_steps=steps, method=dvi.Strang(), observe=observe,
-            save=dvi.Save(final=True), throw=False,
-        )  # fmt: skip
+            STAR.system,
+            q,
+            p,
+            h=H,
+            num_steps=steps,
+            method=dvi.Strang(),
+            observe=observe,
+            save=dvi.Save(final=True),
+            throw=False,
+        )
 
     run = jax.jit(jax.vmap(lambda q, p: (one(q, p).observed, one(q, p).qs)))
     return lambda: jax.block_until_ready(run(q, p))

@@ -102,27 +102,52 @@ def cases():
     h = 2.0**-5
     return {
         "cubic oscillator, E, TypeII": Case(
-            dvi.System(cubic), dvi.TypeII(), h, draw(0.5, 1, one), draw(-0.5, 0.5, one), h,
-            cubic_energy, 2.0**-52,
+            dvi.System(cubic),
+            dvi.TypeII(),
+            h,
+            draw(0.5, 1, one),
+            draw(-0.5, 0.5, one),
+            h,
+            cubic_energy,
+            2.0**-52,
         ),
         "Kepler, L, Strang": Case(
-            kepler.system, dvi.Strang(), 2.0**-6, *start, {"K": 1.0},
-            kepler.observables["angular_momentum"], 2.0**-51,
+            kepler.system,
+            dvi.Strang(),
+            2.0**-6,
+            *start,
+            {"K": 1.0},
+            kepler.observables["angular_momentum"],
+            2.0**-51,
         ),
         "Kepler, H, KahanLi(8)": Case(
-            kepler.system, dvi.KahanLi(8), 2.0**-6, *start, {"K": 1.0},
-            kepler.observables["energy"], 2.0**-51, 10**6,
+            kepler.system,
+            dvi.KahanLi(8),
+            2.0**-6,
+            *start,
+            {"K": 1.0},
+            kepler.observables["energy"],
+            2.0**-51,
+            10**6,
         ),
-    }  # fmt: skip
+    }
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4, 5))
 def _values(system, method, arithmetic, observable, num_steps, every, h, q, p, args):
     def one(q, p):
         return dvi.integrate(
-            system, q, p, h=h, num_steps=num_steps, args=args, method=method,
-            arithmetic=arithmetic, save=dvi.Save(every=every), observe=observable,
-        ).observed  # fmt: skip
+            system,
+            q,
+            p,
+            h=h,
+            num_steps=num_steps,
+            args=args,
+            method=method,
+            arithmetic=arithmetic,
+            save=dvi.Save(every=every),
+            observe=observable,
+        ).observed
 
     t = jnp.zeros(())
     first = jax.vmap(lambda q, p: observable(t, t, q, p, q, p, args))(q, p)
@@ -132,9 +157,17 @@ def _values(system, method, arithmetic, observable, num_steps, every, h, q, p, a
 def errors(case, arithmetic, num_steps, every):
     """(steps, relative errors), shapes (S,) and (STARTS, S)."""
     first, values = _values(
-        case.system, case.method, arithmetic, case.observable, num_steps, every,
-        case.h, jnp.asarray(case.q), jnp.asarray(case.p), case.args,
-    )  # fmt: skip
+        case.system,
+        case.method,
+        arithmetic,
+        case.observable,
+        num_steps,
+        every,
+        case.h,
+        jnp.asarray(case.q),
+        jnp.asarray(case.p),
+        case.args,
+    )
     first, values = np.asarray(first)[:, None], np.asarray(values)
     return every * np.arange(1, values.shape[1] + 1), values / first - 1
 

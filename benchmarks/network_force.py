@@ -89,19 +89,29 @@ METHOD = dvi.Strang()
 
 def model(network):
     return {
-        "system": dvi.System(H_D, force=network), "q0": [START[0]], "p0": [START[1]], "h": H,
+        "system": dvi.System(H_D, force=network),
+        "q0": [START[0]],
+        "p0": [START[1]],
+        "h": H,
         "epsilon": 1.0,
         "method": METHOD,
-    }  # fmt: skip
+    }
 
 
 def fit_ours(seed, key, steps):
     """The network, and its loss."""
     network = dvi.NetworkForce(1, key=key, width=6, depth=1)
     found = dvi.fit(
-        model, data(seed), network, priors=dvi.Prior(0.0, PRIOR), horizons=list(HORIZONS),
-        max_steps=steps, check_curvature=False, throw=False, progress=False,
-    )  # fmt: skip
+        model,
+        data(seed),
+        network,
+        priors=dvi.Prior(0.0, PRIOR),
+        horizons=list(HORIZONS),
+        max_steps=steps,
+        check_curvature=False,
+        throw=False,
+        progress=False,
+    )
     return found.params, found.loss
 
 

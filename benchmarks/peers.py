@@ -228,9 +228,11 @@ def run_heyoka(work: Work) -> Call:
         for stretch in (x, d, y):
             H = H + stretch**2 / 2.0 + C / 4.0 * stretch**4
     field = [
-        (x, heyoka.diff(H, u)), (y, heyoka.diff(H, v)),
-        (u, -heyoka.diff(H, x)), (v, -heyoka.diff(H, y)),
-    ]  # fmt: skip
+        (x, heyoka.diff(H, u)),
+        (y, heyoka.diff(H, v)),
+        (u, -heyoka.diff(H, x)),
+        (v, -heyoka.diff(H, y)),
+    ]
     start = np.concatenate([work.q0.reshape(2, -1), work.p0.reshape(2, -1)])
     end = np.empty_like(start)
     shape = work.q0.shape
@@ -320,9 +322,14 @@ def run_scipy(work: Work) -> Call:
 
     def call():
         sol = solve_ivp(
-            rate, (0.0, work.span), start, "DOP853", t_eval=[work.span],
-            rtol=RELATIVE_TOLERANCE, atol=RELATIVE_TOLERANCE,
-        )  # fmt: skip
+            rate,
+            (0.0, work.span),
+            start,
+            "DOP853",
+            t_eval=[work.span],
+            rtol=RELATIVE_TOLERANCE,
+            atol=RELATIVE_TOLERANCE,
+        )
         q, p = np.split(sol.y[:, -1], 2)
         return q.reshape(shape), p.reshape(shape)
 
@@ -350,16 +357,22 @@ def all_peers() -> list[Peer]:
             Peer("dvi_jax", task, "TypeII", True, run_dvi_jax),
             Peer("numba", task, "the map, lane after lane", True, run_numba),
             Peer(
-                "diffrax", task, "SemiImplicitEuler" if explicit else f"ImplicitEuler, {steps}",
-                explicit, run_diffrax,
+                "diffrax",
+                task,
+                "SemiImplicitEuler" if explicit else f"ImplicitEuler, {steps}",
+                explicit,
+                run_diffrax,
             ),
             Peer("heyoka", task, "Taylor, its own steps to round-off", False, run_heyoka),
             Peer(
-                "pyhamsys", task, f"Verlet, {steps}" if explicit else f"BM4 extended, {steps}",
-                False, run_pyhamsys,
+                "pyhamsys",
+                task,
+                f"Verlet, {steps}" if explicit else f"BM4 extended, {steps}",
+                False,
+                run_pyhamsys,
             ),
             Peer("scipy", task, f"DOP853, {fit}", False, run_scipy),
-        ]  # fmt: skip
+        ]
     for integrator in ("leapfrog", "whfast"):
         prepare = functools.partial(run_rebound, integrator=integrator)
         peers.append(Peer("rebound", one, f"{integrator}, {steps}", False, prepare))
@@ -406,8 +419,11 @@ def compared(peer: Peer, baseline: Baseline, clock: Clock) -> dict[str, Any]:
     low, high = np.quantile(measured.samples, [0.25, 0.75])
     quartiles = [float(low), float(high)]
     return result | {
-        "status": "ok", "value": float(measured), "quartiles": quartiles, **measured.details,
-    }  # fmt: skip
+        "status": "ok",
+        "value": float(measured),
+        "quartiles": quartiles,
+        **measured.details,
+    }
 
 
 def version(package: str) -> str:

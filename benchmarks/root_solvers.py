@@ -184,9 +184,18 @@ def runner(row: Row, solver: dvi.RootSolver, args: Any):
 
     def one(q0, p0):
         sol = dvi.integrate(
-            row.system, q0, p0, h=row.h, num_steps=row.steps, epsilon=row.epsilon, args=args,
-            method=row.method, newton=solver, save=dvi.Save(final=True), throw=False,
-        )  # fmt: skip
+            row.system,
+            q0,
+            p0,
+            h=row.h,
+            num_steps=row.steps,
+            epsilon=row.epsilon,
+            args=args,
+            method=row.method,
+            newton=solver,
+            save=dvi.Save(final=True),
+            throw=False,
+        )
         good = sol.result == dvi.RESULTS.successful
         return sol.qs[-1], sol.ps[-1], good, sol.stats["newton_iterations"]
 

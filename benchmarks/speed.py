@@ -165,8 +165,12 @@ class Bench:
         environment |= {"JAX_PLATFORMS": "cpu", "DVI_JAX_CACHE": cache}
         done = subprocess.run(
             [sys.executable, str(file), json.dumps(given)],
-            env=environment, capture_output=True, text=True, check=False, timeout=LONGEST_PROCESS,
-        )  # fmt: skip
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=LONGEST_PROCESS,
+        )
         if done.returncode:
             raise RuntimeError(f"{measure} failed in its process: {done.stderr[-400:]}")
         return float(done.stdout.splitlines()[-1])
@@ -371,8 +375,11 @@ def table() -> list[Row]:
         add(f"one trajectory, implicit, {title}", 1.5, one_row, name=name, steps=100_000)
 
     for name, lanes, steps in (
-        ("kepler", 64, 3000), ("kepler", 1024, 300), ("kepler", 65536, 20), ("chain2", 512, 100),
-    ):  # fmt: skip
+        ("kepler", 64, 3000),
+        ("kepler", 1024, 300),
+        ("kepler", 65536, 20),
+        ("chain2", 512, 100),
+    ):
         title = f"reverse gradient, {name}, {lanes} trajectories"
         add(title, 2.5, gradient_row, name=name, lanes=lanes, steps=steps)
     for name, lanes, steps in (("kepler", 1024, 300), ("chain2", 512, 100)):
@@ -475,9 +482,14 @@ def scaling_n(bench: Bench) -> list[dict[str, Any]]:
     kernels = {2: "chain2", 4: "chain4", 10: "chain10_tridiagonal"}
     for n in (1, 2, 4, 8, 10, 16, 32, 64):
         w = Workload(
-            kernels.get(n, ""), dvi.System(chain, force=linear_force), n, 0.02, np.zeros(n),
-            np.zeros(n), (0.3, 0.3),
-        )  # fmt: skip
+            kernels.get(n, ""),
+            dvi.System(chain, force=linear_force),
+            n,
+            0.02,
+            np.zeros(n),
+            np.zeros(n),
+            (0.3, 0.3),
+        )
         q0, p0 = w.start(lanes)
         f = jax.jit(batched(last_state(w, steps), bench.axis))
         inputs = w.inputs(lanes, bench.axis)
@@ -701,9 +713,10 @@ def check(now: dict, path: Path, tolerance: float, again: Callable[[list[str]], 
 def options_of(words: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Speed of the package relative to C.")
     parser.add_argument(
-        "--rows", action="append",
+        "--rows",
+        action="append",
         help="only rows whose name contains this (* and ?); may be repeated",
-    )  # fmt: skip
+    )
     parser.add_argument("--rounds", type=int, default=15, help="of each row at most (default 15)")
     parser.add_argument("--budget", type=float, default=6.0, help="seconds of a row (default 6)")
     parser.add_argument(

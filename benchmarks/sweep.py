@@ -75,9 +75,17 @@ def bare(steps: int):
 
     def one(q0, p0):
         sol = dvi.integrate(
-            KEPLER.system, q0, p0, h=H, num_steps=steps, epsilon=EPSILON, args=KEPLER.args,
-            observe=OBSERVE, save=dvi.Save(final=True), throw=False,
-        )  # fmt: skip
+            KEPLER.system,
+            q0,
+            p0,
+            h=H,
+            num_steps=steps,
+            epsilon=EPSILON,
+            args=KEPLER.args,
+            observe=OBSERVE,
+            save=dvi.Save(final=True),
+            throw=False,
+        )
         return sol.observed, sol.result
 
     start = dvi.starts.Halton(KERNEL_LANES, LOW, HIGH)

@@ -317,8 +317,8 @@ def _velocity(
     def slope(v):
         return jax.grad(L)(v, *parameters)
 
-    # The matrix ∂²L/∂v² of a Lagrangian that is quadratic in v does not depend on v. Found from the
-    # jaxpr, because then also ∂H_D/∂p1 of a separable system is seen to be independent of q0.
+    # The matrix ∂²L/∂v² of a Lagrangian that is quadratic in v does not depend on v. This is
+    # decided from the jaxpr, so that ∂H_D/∂p1 of a separable system is independent of q0 too.
     rest = jnp.zeros_like(p)
     if not depends_on(jax.jacfwd(slope), 0, rest):
         return lanewise.solve(jax.jacfwd(slope)(rest), p - slope(rest))
@@ -351,6 +351,7 @@ def _start(slope: Callable[[Vector], Vector], p: Vector, rest: Vector) -> Vector
 
     def far(state):
         _, left, _, trials = state
+        # Relative to the defect at rest, since an absolute limit would depend on the units.
         return (left > _NEAR * size(rest)) & (trials < _MOST_TRIALS)
 
     def closer(state):

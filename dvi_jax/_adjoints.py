@@ -88,6 +88,7 @@ class Checkpointed(AbstractAdjoint):
 
         carry, ys = lax.scan(segment(size), carry, None, segments)
         ys = jax.tree.map(lambda y: y.reshape(-1, *y.shape[2:]), ys)
+        # A shorter last segment, without padding: a step beyond the end could fail.
         left = count - size * segments
         if left:
             carry, rest = segment(left)(carry, None)

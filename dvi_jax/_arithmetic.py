@@ -55,7 +55,7 @@ class FloatingPoint(Arithmetic):
 
 
 class Compensated(Arithmetic):
-    r"""Compensated summation: the rounding error of the state is stored and added again.
+    r"""Compensated summation: the rounding error of each step is stored and added in the next.
 
     The state is q + e, with q = fl(q + e) and e below round-off of q. A step of the method runs in
     coordinates x relative to q, where no digits of an increment are lost next to a large q,
@@ -88,7 +88,7 @@ class Compensated(Arithmetic):
 
 
 class FixedPoint(Arithmetic):
-    r"""Fixed point: the state moves on a grid, in steps that can be undone bit for bit.
+    r"""Fixed-point arithmetic: the state is on a grid, and steps can be inverted bit for bit.
 
     Positions and momenta are integer multiples of `quantum`, and so is each change of them,
 
@@ -178,4 +178,4 @@ def _exact_sum(a: State, b: State) -> tuple[State, State]:
 
 def _start_on_grid(x: State, quantum: float) -> State:
     x = to_grid(x, quantum)
-    return jnp.where(x == 0, jnp.zeros_like(x), x)  # −0 would come back as +0
+    return jnp.where(x == 0, jnp.zeros_like(x), x)  # the inverse step would return −0 as +0

@@ -12,6 +12,7 @@ import numpy as np
 
 def whole(name: str, value: Any, least: int = 1, most: int | None = None, hint: str = "") -> int:
     """A whole number from `least` to `most` (None: any), not a bool. **Raises** `ValueError`."""
+    # True is an integer in Python, but as a number it is nearly always a mistake.
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not fits or value < least or (most is not None and value > most):
         last = "on" if most is None else f"to {most}"
@@ -98,6 +99,7 @@ def refuse_unknown(name: str, function: Callable[..., Any], unknown: Iterable[st
             k for k, p in inspect.signature(function).parameters.items() if p.kind != p.VAR_KEYWORD
         ]
         close = difflib.get_close_matches(keyword, known, 1, 0.6)
+        # Synonyms first: by spelling alone the nearest name to dt0 would be t0.
         meant = SYNONYMS.get(keyword) if SYNONYMS.get(keyword) in known else None
         meant = meant or (close[0] if close else None)
         hint = f" Did you mean {meant!r}?" if meant else f" It has {', '.join(known)}."

@@ -113,6 +113,7 @@ def at_times(
     began = each(_shown, given, starts, layout=curve.layout)
     first = one_by_one(_shown, given, safe, layout=curve.layout)
     sense = jnp.where(starts.until[0] >= began[0], 1, -1)  # −1: time runs backwards
+    # In ascending order, as bisection requires: empty rows, which are last, are at infinity.
     ends = jnp.where(exists, sense * starts.until, jnp.inf)
 
     def one(time, due):

@@ -23,10 +23,11 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
             "needs its momentum."
         )
     if q.size == 0:
-        raise ValueError(f"q0 is empty (shape {q.shape}): there is nothing to integrate.")
+        raise ValueError(f"q0 is empty, of shape {q.shape}: give at least one position.")
     if q.dtype != p.dtype:
         dtype = jnp.result_type(q.dtype, p.dtype)
         q, p = q.astype(dtype), p.astype(dtype)
+    # Half precision has at most three digits: neither a solve nor an invariant can be checked.
     if q.dtype.itemsize < 4:
         raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype}: too few digits.")
     return q, p

@@ -322,7 +322,7 @@ def _as_solution(
     carry, saved, reduced, defect = outcome
     curve = Curve.of(task.method, task.equations, layout)
     first = task.first_interval()
-    # The first step stands in where a batch element has none to look into: its numbers are finite.
+    # A batch element without a step to interpolate in uses the first one: its numbers are finite.
     safe = Start(first.t0, first.t1, first.t1, q0, p0)
     _, reductions = task.observables()
     values: list[Any] = [

@@ -128,6 +128,7 @@ class Package(ModuleType):
             raise AttributeError(
                 f"module {self.__name__!r} has no attribute {name!r}.{_hint(name)}", name=name
             )
+        # Stored in the module: `__getattr__` is called for missing names only, so once for each.
         setattr(self, name, found)
         return found
 

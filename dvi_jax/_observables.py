@@ -52,7 +52,8 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
             raise
         if not hasattr(out, "shape") and not isinstance(out, int | float):
             raise TypeError(
-                f"an observable must return one array; {called} returned {type(out).__name__}."
+                f"an observable must return one array; {called} returned {type(out).__name__}. For "
+                "several values use jnp.stack, or a dictionary of observables."
             )
         if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
             raise TypeError(
@@ -77,6 +78,7 @@ def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> Non
 
 def observed(observe: PyTree, alone: list[Any], reduced: list[Any]) -> PyTree:
     """The pytree `observe` with every observable replaced by its values."""
+    # Both lists are in the order of the leaves, in which `Task.observables` has separated them.
     values, lone = iter(reduced), iter(alone)
 
     def value(f):
@@ -95,10 +97,11 @@ def with_initial_values(observe: PyTree, found: PyTree, run: Run, layout: Layout
     def value(f, values):
         if not isinstance(f, OfState):
             return values
-        first = lanewise.call(
-            lambda t, q, p, args: jnp.asarray(f(t, t, q, p, q, p, args)),
-            run.t0, run.q0, run.p0, run.args, layout=layout,
-        )  # fmt: skip
+
+        def at_start(t, q, p, args):
+            return jnp.asarray(f(t, t, q, p, q, p, args))
+
+        first = lanewise.call(at_start, run.t0, run.q0, run.p0, run.args, layout=layout)
         return jnp.concatenate([first[None].astype(values.dtype), values])
 
     return jax.tree.map(value, observe, found, is_leaf=is_observable)

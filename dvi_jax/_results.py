@@ -84,6 +84,7 @@ def status_code(result: RESULTS) -> Array:
 
 def first_failure(earlier: RESULTS, later: RESULTS) -> RESULTS:
     """The combined status when `later` follows `earlier`: the first failure."""
+    # A selection, not a branch: in a batch every trajectory has its own status.
     return RESULTS.where(earlier == RESULTS.successful, later, earlier)
 
 

@@ -133,6 +133,7 @@ class Solution(eqx.Module):
     @property
     def q_final(self) -> Array:
         """The last saved positions, shape (*batch, *q0.shape)."""
+        # Axes of the batch come first, those of a state last: the saved states are in between.
         return jnp.take(self.qs, -1, axis=self.ts.ndim - 1)
 
     @property
@@ -156,6 +157,7 @@ class Solution(eqx.Module):
         status = ", ".join(f"{n} {s}" for s, n in counts.items()) if batch else str(self.status)
         many = f"{' × '.join(map(str, batch))} trajectories, " if batch else ""
         shape = self.qs.shape[len(batch) + 1 :]
+        # The times of the first trajectory; those of others in the batch may differ.
         t = np.asarray(self.ts).reshape(-1, saved)[0]
         lines = [
             f"Solution: {many}{status}; {self.stats['num_steps']} steps, {saved} saved states of "

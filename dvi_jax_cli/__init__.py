@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """`app`, imported when it is asked for: `main` guards its imports against Ctrl-C."""
+    """`app`, imported at its first use: `main` guards its imports against Ctrl-C."""
     if name == "app":
         from ._app import app
 

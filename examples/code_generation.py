@@ -53,10 +53,15 @@ def box(axis, corner, title, note):
     x, y = corner
     axis.add_patch(
         FancyBboxPatch(
-            (x, y), WIDTH, HEIGHT, boxstyle="round,pad=0,rounding_size=0.15",
-            facecolor="#f7f7f7", edgecolor="#555555", linewidth=1.0,
+            (x, y),
+            WIDTH,
+            HEIGHT,
+            boxstyle="round,pad=0,rounding_size=0.15",
+            facecolor="#f7f7f7",
+            edgecolor="#555555",
+            linewidth=1.0,
         )
-    )  # fmt: skip
+    )
     axis.text(x + 0.25, y + HEIGHT - 0.2, title, va="top", weight="bold", size=11.5)
     axis.text(x + 0.25, y + 0.2, note, va="bottom", size=10.5, color="#333333")
 
@@ -67,17 +72,24 @@ def handler(axis, corner):
     note = "Each thread of XLA's pool takes the next block when\nit has finished one."
     box(axis, corner, "4  Handler: called by XLA, shares blocks", note)
     axis.text(
-        x + 0.3, y + HEIGHT - 0.85, "one batch, cut into blocks:", va="top", size=10.5,
+        x + 0.3,
+        y + HEIGHT - 0.85,
+        "one batch, cut into blocks:",
+        va="top",
+        size=10.5,
         color="#333333",
-    )  # fmt: skip
+    )
     side = (WIDTH - 0.6) / len(THREADS)
     for i, thread in enumerate(THREADS):
         axis.add_patch(
             Rectangle(
-                (x + 0.3 + i * side, y + 2.05), 0.85 * side, 0.7,
-                facecolor=plot.COLOURS[thread], edgecolor="none",
+                (x + 0.3 + i * side, y + 2.05),
+                0.85 * side,
+                0.7,
+                facecolor=plot.COLOURS[thread],
+                edgecolor="none",
             )
-        )  # fmt: skip
+        )
     for thread in (0, 1):
         left = x + 0.3 + 3.2 * thread
         axis.add_patch(Rectangle((left, y + 1.3), 0.35, 0.35, facecolor=plot.COLOURS[thread]))
@@ -93,9 +105,14 @@ def picture(file: Path) -> Path:
         for corner, title, code, note in BOXES:
             box(axis, corner, title, note)
             axis.text(
-                corner[0] + 0.3, corner[1] + HEIGHT - 0.85, code, va="top", size=9.8,
-                family="monospace", linespacing=1.35,
-            )  # fmt: skip
+                corner[0] + 0.3,
+                corner[1] + HEIGHT - 0.85,
+                code,
+                va="top",
+                size=9.8,
+                family="monospace",
+                linespacing=1.35,
+            )
         handler(axis, (8.0, 0.0))
         for start, end in [
             ((7.3, 7.0), (8.0, 7.0)),

@@ -32,7 +32,7 @@ def pendulum(out):
 
     def run(p):
         q = jnp.zeros(1)
-        return dvi.integrate(problem.system, q, p[None], h=0.05, num_steps=400, method=dvi.Strang())
+        return dvi.integrate(problem, q, p[None], h=0.05, num_steps=400, method=dvi.Strang())
 
     sol = jax.vmap(run)(jnp.asarray(p0))
     axis = plot.phase_portrait(
@@ -49,9 +49,7 @@ def pendulum(out):
 def two_degrees(out):
     """One regular orbit in the two planes (q, p) and in the plane of positions."""
     problem = systems.henon_heiles()
-    sol = dvi.integrate(
-        problem.system, problem.q0, problem.p0, h=0.05, num_steps=2400, method=dvi.Yoshida(4)
-    )
+    sol = dvi.integrate(problem, h=0.05, num_steps=2400, method=dvi.Yoshida(4))
     with plot.style():
         figure, axes = plt.subplots(1, 3, figsize=(11.5, 4.0))
         plot.phase_portrait(sol, ax=axes[:2])
@@ -64,9 +62,8 @@ def eight():
     """The figure eight, three turns."""
     problem = systems.figure_eight()
     return dvi.integrate(
-        problem.system, problem.q0, problem.p0, h=0.02, num_steps=950, args=problem.args,
-        method=dvi.Yoshida(4), observe=dict(problem.observables),
-    )  # fmt: skip
+        problem, h=0.02, num_steps=950, method=dvi.Yoshida(4), observe=dict(problem.observables)
+    )
 
 
 def orbits(out):
@@ -74,18 +71,18 @@ def orbits(out):
     problem = systems.kepler()
 
     def run(epsilon):
-        return dvi.integrate(
-            problem.system, problem.q0, problem.p0, h=0.02, num_steps=2500, args=problem.args,
-            epsilon=epsilon, method=dvi.Strang(),
-        )  # fmt: skip
+        return dvi.integrate(problem, h=0.02, num_steps=2500, epsilon=epsilon, method=dvi.Strang())
 
     epsilons = jnp.array([0.0, 0.02, 0.05])
     with plot.style():
         figure, axes = plt.subplots(1, 2, figsize=(10.4, 4.6))
         plot.orbit(
-            jax.vmap(run)(epsilons), centre=[0.0, 0.0],
-            labels=[f"ε = {e:g}" for e in epsilons], title="Perturbed Kepler orbits", ax=axes[0],
-        )  # fmt: skip
+            jax.vmap(run)(epsilons),
+            centre=[0.0, 0.0],
+            labels=[f"ε = {e:g}" for e in epsilons],
+            title="Perturbed Kepler orbits",
+            ax=axes[0],
+        )
         plot.orbit(eight(), names=["A", "B", "C"], title="The figure eight", ax=axes[1])
         return plot.save(figure, out / "orbits.png")
 
@@ -94,9 +91,12 @@ def mirror_run(num_steps=6000, h=0.1):
     """A particle that bounces in a magnetic mirror."""
     problem = systems.magnetic_mirror()
     return problem, dvi.integrate(
-        problem.system, problem.q0, problem.p0, h=h, num_steps=num_steps, args=problem.args,
-        method=dvi.GaussLegendre(2), observe=dict(problem.observables),
-    )  # fmt: skip
+        problem,
+        h=h,
+        num_steps=num_steps,
+        method=dvi.GaussLegendre(2),
+        observe=dict(problem.observables),
+    )
 
 
 def mirror(out):
@@ -113,16 +113,20 @@ def conserved_along_time(out):
     """The relative error of the energy by four methods."""
     problem = systems.kepler()
     methods = {
-        "TypeII": dvi.TypeII(), "Strang": dvi.Strang(), "Yoshida(4)": dvi.Yoshida(4),
+        "TypeII": dvi.TypeII(),
+        "Strang": dvi.Strang(),
+        "Yoshida(4)": dvi.Yoshida(4),
         "RungeKutta4": dvi.RungeKutta4(),
-    }  # fmt: skip
+    }
     sols = [
         dvi.integrate(
-            problem.system, problem.q0, problem.p0, h=0.02, num_steps=20_000, args=problem.args,
+            problem,
+            h=0.02,
+            num_steps=20_000,
             method=method,
         )
         for method in methods.values()
-    ]  # fmt: skip
+    ]
 
     def energy(q, p):
         return p @ p / 2 - 1 / jnp.linalg.norm(q)
@@ -148,10 +152,7 @@ def balance(out):
         lambda t, q, p, args: jnp.array([-q[1], q[0]]),
         lambda t, q, p, args: jnp.array([-p[1], p[0]]),
     )
-    sol = dvi.integrate(
-        problem.system, problem.q0, problem.p0, h=0.05, num_steps=400, args=problem.args,
-        epsilon=0.05,
-    )  # fmt: skip
+    sol = dvi.integrate(problem, h=0.05, num_steps=400, epsilon=0.05)
     found = dvi.noether_balance(
         problem.system, [clocked], [None], sol, epsilon=0.05, args=problem.args
     )
@@ -171,9 +172,14 @@ def drift_orders(out):
     for z in range(2):
         found = dvi.discover_invariants(system, dvi.Polynomials(6), z, h=0.1, samples=samples)
         orders[f"order {z}"] = dvi.drift_order(
-            system, found.invariants[0], [0.4], [0.3], epsilons=np.geomspace(1e-3, 0.2, 8), h=0.1,
+            system,
+            found.invariants[0],
+            [0.4],
+            [0.3],
+            epsilons=np.geomspace(1e-3, 0.2, 8),
+            h=0.1,
             num_steps=5000,
-        )  # fmt: skip
+        )
     return plot.save(plot.drift_orders(orders, promised=[1, 2]), out / "drift_orders.png")
 
 
@@ -182,10 +188,14 @@ def drift_surface(out):
     oscillator = systems.oscillator()
     cubic = dvi.System(oscillator.system.H_D, force=lambda t0, t1, q, p, args: -(q**3))
     found = dvi.drift_surface(
-        cubic, oscillator.observables["map_invariant"], [0.4], [0.3],
-        epsilons=np.geomspace(1e-3, 0.3, 9), hs=np.array([0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.5]),
+        cubic,
+        oscillator.observables["map_invariant"],
+        [0.4],
+        [0.3],
+        epsilons=np.geomspace(1e-3, 0.3, 9),
+        hs=np.array([0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.5]),
         duration=200.0,
-    )  # fmt: skip
+    )
     return plot.save(plot.drift_surface(found, promised=1), out / "drift_surface.png")
 
 
@@ -200,26 +210,33 @@ def chaos(out):
     p = np.stack([np.sqrt(2 * energy - y**2 + 2 * y**3 / 3), 0 * y], 1)
     settings = {"h": 0.1, "method": dvi.Yoshida(4)}
     crossed = dvi.poincare_section(
-        problem.system, q, p, lambda t, q, p, args: q[0], num_steps=30_000, crossings=400,
+        problem.system,
+        q,
+        p,
+        lambda t, q, p, args: q[0],
+        num_steps=30_000,
+        crossings=400,
         **settings,
-    )  # fmt: skip
+    )
     watched = {
-        "lyapunov": dvi.Running(dvi.LyapunovSpectrum(1)), "megno": dvi.Running(dvi.MEGNO()),
+        "lyapunov": dvi.Running(dvi.LyapunovSpectrum(1)),
+        "megno": dvi.Running(dvi.MEGNO()),
         "gali": dvi.Running(dvi.GALI(3)),
-    }  # fmt: skip
+    }
 
     def run(q, p):
         return dvi.integrate(
-            problem.system, q, p, num_steps=20_000, save=dvi.Save(every=20), observe=watched,
-            **settings,
-        )  # fmt: skip
+            problem, q, p, num_steps=20_000, save=dvi.Save(every=20), observe=watched, **settings
+        )
 
     sol = jax.vmap(run)(jnp.asarray(q), jnp.asarray(p))
     found = {name: np.asarray(x) for name, x in sol.observed.items()}
     axis = plot.section(
-        crossed, colour=np.log10(found["megno"][:, -1]), colour_label="log$_{10}$ MEGNO",
+        crossed,
+        colour=np.log10(found["megno"][:, -1]),
+        colour_label="log$_{10}$ MEGNO",
         title="Hénon and Heiles, energy 1/8",
-    )  # fmt: skip
+    )
     yield plot.save(axis, out / "section.png")
     few, t = [4, 20, 32, 44], np.asarray(sol.ts)[0, 1:]
     with plot.style():
@@ -237,10 +254,18 @@ def duffing(out):
     problem = systems.duffing()
     gamma, period = np.linspace(0.2, 0.65, 450), 2 * np.pi / problem.args["omega"]
     found = dvi.bifurcation(
-        problem.system, problem.q0, problem.p0, dvi.stroboscope(period), h=period / 60,
-        num_steps=60 * 152, epsilon=1.0, args={**problem.args, "gamma": dvi.Axis("gamma", gamma)},
-        skip=90, crossings=60, method=dvi.Strang(),
-    )  # fmt: skip
+        problem.system,
+        problem.q0,
+        problem.p0,
+        dvi.stroboscope(period),
+        h=period / 60,
+        num_steps=60 * 152,
+        epsilon=1.0,
+        args={**problem.args, "gamma": dvi.Axis("gamma", gamma)},
+        skip=90,
+        crossings=60,
+        method=dvi.Strang(),
+    )
     axis = plot.bifurcation(
         gamma, found, name="amplitude γ of the driving force", title="Duffing's oscillator"
     )
@@ -254,10 +279,7 @@ def frequencies(out):
     """Lines of a regular orbit, and the diffusion of the frequencies of many."""
     problem, energy = systems.henon_heiles(), 1 / 8
     settings = {"h": 0.1, "method": dvi.Yoshida(4)}
-    sol = dvi.integrate(
-        problem.system, problem.q0, problem.p0, num_steps=16_384, save=dvi.Save(every=4),
-        **settings,
-    )  # fmt: skip
+    sol = dvi.integrate(problem, num_steps=16_384, save=dvi.Save(every=4), **settings)
     found = dvi.frequencies(sol, count=7)
     with plot.style():
         figure, axes = plt.subplots(1, 2, figsize=(10.8, 4.2), width_ratios=(5, 4))
@@ -270,7 +292,7 @@ def frequencies(out):
         def run(y, px):
             q, p = jnp.stack([0 * y, y]), jnp.stack([px, 0 * y])
             return dvi.integrate(
-                problem.system, q, p, num_steps=16_384, save=dvi.Save(every=8), **settings
+                problem, q, p, num_steps=16_384, save=dvi.Save(every=8), **settings
             )
 
         many = dvi.frequency_diffusion(jax.vmap(run)(y, px), throw=False)
@@ -292,9 +314,15 @@ def diffusion(out):
 
     def run(y, px, py):
         return dvi.integrate(
-            problem.system, jnp.stack([0 * y, y]), jnp.stack([px, py]), h=0.1, num_steps=8192,
-            method=dvi.Yoshida(4), save=dvi.Save(every=8), throw=False,
-        )  # fmt: skip
+            problem,
+            jnp.stack([0 * y, y]),
+            jnp.stack([px, py]),
+            h=0.1,
+            num_steps=8192,
+            method=dvi.Yoshida(4),
+            save=dvi.Save(every=8),
+            throw=False,
+        )
 
     inside = np.isfinite(np.asarray(px))
     sol = jax.vmap(run)(Y[inside], px[inside], P[inside])
@@ -315,10 +343,14 @@ def sweeps(out):
     oscillator = systems.oscillator()
     system = dvi.System(oscillator.system.H_D, force=lambda t0, t1, q0, p1, args: -(q0**3))
     data = dvi.sweep(
-        system, [0.4], [0.3], h=np.linspace(0.05, 2.4, 48), num_steps=2000,
+        system,
+        [0.4],
+        [0.3],
+        h=np.linspace(0.05, 2.4, 48),
+        num_steps=2000,
         epsilon=np.geomspace(1e-4, 1, 40),
         observe={"drift": dvi.MaxDrift(oscillator.observables["map_invariant"])},
-    ).to_xarray()  # fmt: skip
+    ).to_xarray()
     with plot.style():
         figure, axes = plt.subplots(1, 3, figsize=(14.0, 4.0))
         plot.sweep_map(data["drift"], status=data["status"], limits=(1e-6, 0.1), ax=axes[0])
@@ -341,26 +373,34 @@ def cost(out):
     energy = 0.5 * 1.36 - 1 / 1.2
     turn = 2 * np.pi * (-2 * energy) ** -1.5
     methods = {
-        "Strang": (dvi.Strang(), 1), "Yoshida(4)": (dvi.Yoshida(4), 3),
-        "BlanesMoan(4)": (dvi.BlanesMoan(4), 6), "KahanLi(8)": (dvi.KahanLi(8), 17),
+        "Strang": (dvi.Strang(), 1),
+        "Yoshida(4)": (dvi.Yoshida(4), 3),
+        "BlanesMoan(4)": (dvi.BlanesMoan(4), 6),
+        "KahanLi(8)": (dvi.KahanLi(8), 17),
         "RungeKutta4": (dvi.RungeKutta4(), 4),
-    }  # fmt: skip
+    }
     results = {}
     for name, (method, stages) in methods.items():
         costs, errors = [], []
         for k in range(5, 13):
             steps = 10 * 2**k // (4 if stages > 10 else 1)
             sol = dvi.integrate(
-                problem.system, problem.q0, problem.p0, h=10 * turn / steps, num_steps=steps,
-                args=problem.args, method=method, save=dvi.Save(final=True), throw=False,
-            )  # fmt: skip
+                problem,
+                h=10 * turn / steps,
+                num_steps=steps,
+                method=method,
+                save=dvi.Save(final=True),
+                throw=False,
+            )
             costs.append(stages * steps)
             errors.append(float(jnp.linalg.norm(sol.qs[-1] - jnp.asarray(problem.q0))))
         results[name] = (costs, errors)
     axis = plot.work_precision(
-        results, "evaluations of the force", "error of the position after ten periods",
+        results,
+        "evaluations of the force",
+        "error of the position after ten periods",
         title="Kepler's ellipse",
-    )  # fmt: skip
+    )
     return plot.save(axis, out / "work_precision.png")
 
 
@@ -370,19 +410,35 @@ def cost(out):
 def films(out):
     """The figure eight; a Kepler orbit with its invariants; the mirror in space."""
     yield plot.animate(
-        eight(), out / "figure_eight.gif", names=["A", "B", "C"], seconds=5, fps=20, tail=0.12,
-        title="The figure eight", dpi=80,
-    )  # fmt: skip
+        eight(),
+        out / "figure_eight.gif",
+        names=["A", "B", "C"],
+        seconds=5,
+        fps=20,
+        tail=0.12,
+        title="The figure eight",
+        dpi=80,
+    )
     problem = systems.kepler()
     sol = dvi.integrate(
-        problem.system, problem.q0, problem.p0, h=0.05, num_steps=600, args=problem.args,
-        epsilon=0.02, method=dvi.Strang(), observe=dict(problem.observables),
-    )  # fmt: skip
+        problem,
+        h=0.05,
+        num_steps=600,
+        epsilon=0.02,
+        method=dvi.Strang(),
+        observe=dict(problem.observables),
+    )
     yield plot.animate(
-        sol, out / "kepler.gif", centre=[0.0, 0.0], beside="invariants",
+        sol,
+        out / "kepler.gif",
+        centre=[0.0, 0.0],
+        beside="invariants",
         values={name: sol.observed[name] for name in ("energy", "angular_momentum")},
-        seconds=5, fps=12, dpi=80, title="Kepler, ε = 0.02",
-    )  # fmt: skip
+        seconds=5,
+        fps=12,
+        dpi=80,
+        title="Kepler, ε = 0.02",
+    )
     _, sol = mirror_run(1500)
     yield plot.animate(sol, out / "mirror.gif", seconds=4, fps=10, tail=0.1, dpi=80)
 

@@ -98,9 +98,16 @@ def century(J2=0.0, conservative=False, method=dvi.GaussLegendre(8), h=10.0):
         if conservative:  # canonical momenta, linear in 1/c² and so in ε
             p0 = p0 + epsilon * (momenta_from_velocities(q0, v0, args) - p0)
         return {
-            "system": SYSTEMS[conservative], "q0": q0, "p0": p0, "h": h, "epsilon": epsilon,
-            "args": args, "method": method, "newton": dvi.Picard(), "arithmetic": dvi.Compensated(),
-        }  # fmt: skip
+            "system": SYSTEMS[conservative],
+            "q0": q0,
+            "p0": p0,
+            "h": h,
+            "epsilon": epsilon,
+            "args": args,
+            "method": method,
+            "newton": dvi.Picard(),
+            "arithmetic": dvi.Compensated(),
+        }
 
     return model
 

@@ -38,9 +38,16 @@ def end(i, epsilon):
     """The last position of trajectory number i."""
     q0, p0 = START.at(i, 0.0, None)
     sol = dvi.integrate(
-        KEPLER.system, q0, p0, h=0.02, num_steps=100, epsilon=epsilon, args=KEPLER.args,
-        save=dvi.Save(final=True), throw=False,
-    )  # fmt: skip
+        KEPLER.system,
+        q0,
+        p0,
+        h=0.02,
+        num_steps=100,
+        epsilon=epsilon,
+        args=KEPLER.args,
+        save=dvi.Save(final=True),
+        throw=False,
+    )
     return sol.qs[-1]
 
 
@@ -84,11 +91,11 @@ def launch(count: int, arguments: list[str], times: int = 20) -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             address = f"127.0.0.1:{free.getsockname()[1]}"
+        common = ["--coordinator", address, "--hosts", str(count)]
         hosts = [
-            subprocess.Popen([sys.executable, __file__, *arguments, "--coordinator", address,
-                              "--hosts", str(count), "--host", str(i)])
+            subprocess.Popen([sys.executable, __file__, *arguments, *common, "--host", str(i)])
             for i in range(count)
-        ]  # fmt: skip
+        ]
         print("hosts:", *(h.pid for h in hosts), flush=True)
         while all(h.poll() is None for h in hosts):
             time.sleep(0.1)
@@ -113,8 +120,9 @@ def main():
     parser.add_argument("--iterations", type=int, default=12)
     options = parser.parse_args()
     if options.launch:
-        launch(options.launch, ["--state", str(options.state),
-                                "--iterations", str(options.iterations)])  # fmt: skip
+        launch(
+            options.launch, ["--state", str(options.state), "--iterations", str(options.iterations)]
+        )
         return
     if options.coordinator:
         if jax.config.jax_platforms == "cpu":

@@ -41,9 +41,15 @@ def energy_errors(axis):
 
     for name, method in METHODS.items():
         sol = dvi.integrate(
-            kepler, q0, p0, h=2 * np.pi / 100, num_steps=STEPS, method=method,
-            arithmetic=dvi.Compensated(), save=dvi.Save(every=EVERY),
-        )  # fmt: skip
+            kepler,
+            q0,
+            p0,
+            h=2 * np.pi / 100,
+            num_steps=STEPS,
+            method=method,
+            arithmetic=dvi.Compensated(),
+            save=dvi.Save(every=EVERY),
+        )
         E = np.asarray(jax.vmap(energy)(sol.qs, sol.ps))
         error = np.maximum.accumulate(np.abs(E / E[0] - 1))
         rows = np.unique(np.geomspace(5, len(E) - 1, 300).astype(int))
@@ -68,9 +74,14 @@ def drifts(axis):
     print(found)
     for order in range(3):
         measured = dvi.drift_order(
-            oscillator, truncated(found, order), [0.4], [0.3], h=0.1, num_steps=5000,
+            oscillator,
+            truncated(found, order),
+            [0.4],
+            [0.3],
+            h=0.1,
+            num_steps=5000,
             epsilons=epsilons,
-        )  # fmt: skip
+        )
         label = f"order {order}: drift ∝ ε$^{{{measured.slope:.2f}}}$"
         axis.loglog(measured.epsilons, measured.drifts, "o-", label=label)
         print(order, measured.slope, measured.stderr)

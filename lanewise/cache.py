@@ -53,7 +53,7 @@ def _is_safe(path: Path) -> bool:
 
 
 def read(name: str) -> bytes | None:
-    """The code under a name, None if there is none, or if its file or folder is not safe."""
+    """The code under a name, None if it is not stored, or if its file or folder is not safe."""
     where = folder()
     if where is None:
         return None

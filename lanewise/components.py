@@ -156,7 +156,7 @@ class Evaluator:
         buffer = value.buffer
         assert buffer is not None
         if value.size > most:
-            raise Unsupported(f"an array of {value.size} elements, which is not taken apart")
+            raise Unsupported(f"an array of {value.size} elements, at most {most} fit in registers")
 
         def make() -> tuple[Value, Entries]:  # the value as well, so that no other one gets its id
             return value, objects(load_row(self.b, buffer), value.shape)
@@ -253,7 +253,7 @@ class Evaluator:
             ]
         found = [Value.in_memory(x) for x in buffers if x is not None]
         if len(found) < len(buffers):
-            raise Unsupported(f"{name} of an array in memory")
+            raise Unsupported(f"a copy of a long array in memory, for {name}")
         return found
 
     def _joined(self, eqn: Any, values: list[Value], place: Buffer | None) -> Value:

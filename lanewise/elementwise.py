@@ -134,7 +134,12 @@ def _reduced_precision(e: "Evaluator", params: dict, x: Num) -> Num:
     return x
 
 
-# Applied number by number; an operand without axes goes with each number of the others.
+_FUNCTIONS = (
+    "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh "
+    "exp exp2 expm1 log log1p log2 cbrt erf erfc logistic"
+)
+
+# Applied number by number; an operand without axes is combined with each number of the others.
 ELEMENTWISE: dict[str, Callable] = {
     **{op: _combined(op) for op in ("add", "mul", "max", "min")},
     "add_any": _combined("add"),
@@ -168,12 +173,5 @@ ELEMENTWISE: dict[str, Callable] = {
         op: (lambda e, _, a, b, op=op: e.b.shift(op, a, b))
         for op in ("shift_left", "shift_right_logical", "shift_right_arithmetic")
     },
-    **{
-        name: _elementary(name)
-        for name in (
-            "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh",
-            "asinh", "acosh", "atanh", "exp", "exp2", "expm1", "log", "log1p", "log2", "cbrt",
-            "erf", "erfc", "logistic",
-        )
-    },
-}  # fmt: skip
+    **{name: _elementary(name) for name in _FUNCTIONS.split()},
+}

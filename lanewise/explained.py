@@ -38,7 +38,7 @@ class Part:
 
     @property
     def assembly(self) -> str:
-        """The machine code in the assembler's language, empty where there is none."""
+        """The machine code in the assembler's language; empty without machine code."""
         return machine.assembly(self.ir) if self.ir else ""
 
     def __str__(self) -> str:
@@ -53,7 +53,7 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """What `explain` found: one `Part` for each piece that is compiled by itself."""
+    """Result of `explain`: one `Part` for each piece that is compiled by itself."""
 
     parts: tuple[Part, ...]
 
@@ -66,7 +66,7 @@ class Explanation:
 def explain(
     function: Callable, *args: Any, batch: int = 1024, layout: Layout = AUTO
 ) -> Explanation:
-    """How ``function(*args)``, of one trajectory, is compiled for a batch of them.
+    """Report of how ``function(*args)``, of one trajectory, is compiled for a batch.
 
     Calls of `lanewise` in it are explained one by one, as in a function that calls
     ``dvi_jax.integrate``; a function without any is taken as the argument of `batched`.

@@ -56,7 +56,8 @@ def operation_count(jaxpr: Any) -> int:
     return count
 
 
-_FREE = frozenset(
-    ["broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "slice", "concatenate",
-     "stack", "split", "unstack", "pad", "rev", "copy", "convert_element_type", "stop_gradient"]
-)  # fmt: skip
+_MOVES = (
+    "broadcast_in_dim reshape squeeze expand_dims transpose slice concatenate stack split "
+    "unstack pad rev copy convert_element_type stop_gradient"
+)
+_FREE = frozenset(_MOVES.split())

@@ -32,7 +32,7 @@ define ptr @lanewise_handler(ptr %frame) {
   %ext = load ptr, ptr %ext.at
   %is.call = icmp eq ptr %ext, null
   br i1 %is.call, label %call, label %version
-version:                                     ; XLA asks for the version of the interface
+version:                                     ; XLA queries the version of the interface
   %meta.at = getelementptr i8, ptr %ext, i64 24
   %meta = load ptr, ptr %meta.at
   %major = getelementptr i8, ptr %meta, i64 24
@@ -299,14 +299,14 @@ def _addressed(text: str) -> str:
 def runtime() -> Any:
     """The machine code that all kernels share."""
     text = _addressed(_RUNTIME).replace("SCHEDULE", str(_SCHEDULE)).replace("COUNT", str(_COUNT))
-    # Only Linux knows the request. Below 32 MiB the C library hands out memory that it has had
-    # before, where the request costs more than it brings.
+    # Only Linux has this system call. Below 32 MiB the C library reuses memory that is mapped
+    # already, so that the call would cost more time than it saves.
     text = text.replace("LARGE", str(32 * 2**20 if sys.platform == "linux" else 2**63 - 1))
     return machine.loaded(text)
 
 
 def set_threads(count: int) -> None:
-    """Threads that a batch is shared over: 0 means all of XLA's pool."""
+    """Set the number of threads of a batch; 0 means all of XLA's pool."""
     if isinstance(count, bool) or not isinstance(count, int):
         raise TypeError(f"the number of threads must be an integer, got {count!r}.")
     if count < 0:
@@ -315,11 +315,12 @@ def set_threads(count: int) -> None:
 
 
 def get_threads() -> int:
-    """The number that was set last."""
+    """The number of threads of a batch, as set by `set_threads`."""
     return _threads().value
 
 
 def _threads() -> ctypes.c_int64:
+    # A variable of the machine code itself, so that a new number holds for compiled programs too.
     return ctypes.c_int64.from_address(runtime().get_global_value_address("lanewise_threads"))
 
 
@@ -331,6 +332,7 @@ def module_text(kernel: str, block: int) -> str:
 
 def registered(text: str) -> str:
     """The name by which XLA calls a module's handler, compiled and registered if it was not."""
+    # By the text, not by the function: two programs with equal code are compiled once.
     key = hashlib.sha256(text.encode()).hexdigest()
     with _lock:
         if key not in _targets:

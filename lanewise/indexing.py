@@ -92,6 +92,7 @@ def dynamic_slice(e: "Evaluator", eqn: Any, values: list[Value], places: list) -
     b, sizes = e.b, eqn.params["slice_sizes"]
     at = _starts(e, starts, value.shape, sizes)
     if value.entries is None and not value.is_small:
+        # A long array stays in memory, and only its pointer moves.
         buffer = value.buffer
         assert buffer is not None
         for start, stride in zip(at, buffer.strides, strict=True):
@@ -117,6 +118,7 @@ def dynamic_update_slice(
     b = e.b
     at = _starts(e, starts, value.shape, update.shape)
     entries = e.entries(value).copy()
+    # Each element is compared with each start: the code grows with the product of the sizes.
     if value.size * update.size > MADE:
         raise Unsupported(f"an update at a traced index of {value.size} elements")
     news = e.entries(update)
@@ -163,6 +165,7 @@ def gather(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[
         for j, d in enumerate(dims.start_index_map):
             start = b.convert(starts[(*where, j)], "int64")
             clipped = _clipped(b, start, value.shape[d] - sizes[d])
+            # The load itself has to be inside of the array; the result is replaced afterwards.
             if "fill" in mode.lower():
                 inside = b.logic("and", inside, b.compare("eq", clipped, start))
             total = b.add(total, b.mul(clipped, b.known(strides[d], "int64")))
@@ -213,6 +216,7 @@ def scatter(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list
         for j, d in enumerate(dims.scatter_dims_to_operand_dims):
             start = b.convert(starts[(*where, j)], "int64")
             clipped = _clipped(b, start, value.shape[d] - sizes[d])
+            # In the other modes JAX drops an update outside of the array.
             if "clip" not in mode:
                 inside = b.logic("and", inside, b.compare("eq", clipped, start))
             moving[d] = clipped

@@ -194,6 +194,7 @@ class Writer:
 
         def make() -> str:
             t = self.type(x.dtype, True)
+            # LLVM has no instruction for it: it recognises this pair as a broadcast.
             first = self.new(f"insertelement {t} poison, {TYPES[x.dtype]} {x.names[0]}, i64 0")
             zeros = f"<{self.W} x i32> zeroinitializer"
             return self.new(f"shufflevector {t} {first}, {t} poison, {zeros}")

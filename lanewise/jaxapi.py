@@ -30,9 +30,11 @@ def batch_size(values: Iterable[Any]) -> tuple[int, bool]:
     sizes: dict[Any, int] = {}
     is_compiled = False
     for x in values:
+        # Transformations nest: a tracer may hold the tracer of another transformation.
         while isinstance(x, Tracer):
             inner: Any = x
             if isinstance(axis := getattr(inner, "batch_dim", None), int):
+                # By the trace, so that values of one batch count once.
                 sizes[id(getattr(inner, "_trace", None))] = inner.val.shape[axis]
                 x = inner.val
             elif hasattr(inner, "primal"):

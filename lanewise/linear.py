@@ -88,6 +88,7 @@ def _column_by_column(A: Array, b: Array) -> Array:
     n = b.shape[0]
 
     def eliminate(c, rows):
+        # Rows before c have been used: −1 is below every magnitude, so that none is chosen again.
         size = jnp.where(jnp.arange(n) >= c, jnp.abs(rows[:, c]), -1.0)
         p = jnp.argmax(size)
         pivot, there = rows[p], rows[c]
@@ -120,7 +121,7 @@ _unit_vectors = primitive("unit_vectors", lambda *, n, dtype: jnp.eye(n, dtype=d
 
 
 def on_any(x: Array, rare: bool = True) -> Array:
-    """Whether a truth value is true on any of the trajectories that run together.
+    """Whether a condition is true for any of the trajectories that run together.
 
     It may decide what is computed, as a branch that most trajectories do not need, never what a
     trajectory's result is: that must not depend on its neighbours. Where it is `rare` that the
@@ -142,6 +143,7 @@ def on_any(x: Array, rare: bool = True) -> Array:
 
 def _least_of_batch(arrays, axes, *, rare):
     (x,), (axis,) = arrays, axes
+    # Without a batch axis, so that a `cond` on it stays a branch and does not become a selection.
     return _least.bind(jnp.min(x, axis=axis), rare=rare), None
 
 

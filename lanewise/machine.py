@@ -97,6 +97,7 @@ def loaded(ir: str, symbols: dict[str, int] | None = None) -> Any:
     for name, address in (symbols or {}).items():
         llvm.add_symbol(name, address)
     cpu, features = host()
+    # All that the code depends on: an object file of another processor or release does not fit.
     key = cache.key(FORMAT, llvmlite.__version__, llvm.llvm_version_info, cpu, features, ir)
     code = cache.read(key)
     if code is None:

@@ -63,6 +63,8 @@ class Buffer:
     def seen(self, view: Any) -> "Buffer | None":
         """The buffer as `view` arranges it, a function of NumPy arrays that copies nothing."""
         item = 8
+        # NumPy computes the strides of a view without reading the array: the memory of one number
+        # is enough.
         like = np.lib.stride_tricks.as_strided(
             np.broadcast_to(np.int64(0), ()), self.shape, [s * item for s in self.strides]
         )
@@ -71,6 +73,7 @@ class Buffer:
         except (TypeError, ValueError):
             return None
         start = like.__array_interface__["data"][0]
+        # A copy has elements in an order that no strides of this buffer describe.
         if other.size and not np.may_share_memory(like, other, max_work=0):
             return None
         by = (other.__array_interface__["data"][0] - start) // item
@@ -192,6 +195,7 @@ def _lane_pointer(b: Builder, base: str, i: int, lane: int | str, item: str) -> 
 
 
 def _load(b: Builder, what: str, where: str, item: str = "") -> str:
+    # The alignment of one element, not of the vector: a row may begin anywhere.
     return b.new(f"load {what}, ptr {where}, align {_bytes(item or what)}")
 
 

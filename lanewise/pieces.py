@@ -37,7 +37,7 @@ def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> 
 
     `reason` returns why no code can be generated for a function, None if it can be. A loop, a
     branch or a linear solve is never cut: it is in one piece with all that it calls. Code is
-    generated for pieces with a loop; what is between them goes with the piece before it.
+    generated for pieces with a loop; what is between them belongs to the piece before it.
     """
     jaxpr = closed.jaxpr
     known = dict(zip(jaxpr.constvars, closed.consts, strict=True))
@@ -109,6 +109,7 @@ def in_pieces(
         flags = tuple(is_on(v) for v in piece.reads)
         outs = run(piece, *(read(v) for v in piece.reads), on=flags)
         values.update(zip(piece.writes, outs, strict=True))
+        # `run` returns all results with the batch in front, those that it does not change included.
         batched.update(dict.fromkeys(piece.writes, lanes is not None))
     front = () if lanes is None else (lanes,)
     return [
@@ -164,6 +165,7 @@ def _function_of(
         invars=reads,
         outvars=list(writes),
         eqns=list(eqns),
+        # The names of the original arguments do not belong to these inputs.
         debug_info=jaxpr.debug_info.with_unknown_names(),
     )
     return ClosedJaxpr(part, [known[v] for v in consts]), reads

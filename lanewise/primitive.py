@@ -37,7 +37,7 @@ SWITCH = "LANEWISE"  # the variable that switches the generator off: ``LANEWISE=
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """How the arithmetic of a run is compiled; the numbers are the same to round-off.
+    """Options of compilation of a run; they change results by round-off at most.
 
     **Arguments**
 
@@ -134,7 +134,7 @@ def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Call
 
 
 def generates() -> bool:
-    """Whether machine code is generated in this process; if not, all goes through XLA."""
+    """Whether machine code is generated in this process; otherwise XLA compiles everything."""
     if os.environ.get(SWITCH, "").strip().lower() in ("off", "0", "no", "false"):
         return False
     return _can_start()

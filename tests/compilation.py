@@ -11,7 +11,7 @@ if HAS_BOTH_EMITTERS:
     FLAGS = "--xla_cpu_use_fusion_emitters=false " + FLAGS
 """The emitters that XLA:CPU uses by default take twice as long to compile the same program, and
 more than half of the processor time of the tests is compilation. A second thread of compilation
-gains nothing beside a second worker. Numbers may differ in the last digit."""
+saves no time when a second worker runs. Numbers may differ in the last digit."""
 
 
 def set_flags() -> None:

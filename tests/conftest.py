@@ -17,7 +17,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 MAPS = 20_000
 
-# Rooms whose callers are the package itself. The door checks what users give it, in its own words.
+# Modules that only the package itself calls. The public functions check their arguments themselves.
 _CHECKED = ["dvi_jax._step", "dvi_jax._rollout", "lanewise.linear", "lanewise.dependence"]
 
 with install_import_hook(_CHECKED, "beartype.beartype"):

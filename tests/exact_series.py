@@ -367,10 +367,10 @@ def rank_of(columns: np.ndarray, prime: int | None) -> int:
 
 
 class Count:
-    """The leading parts of invariants of order 0 … z in a basis.
+    """The leading-order terms of invariants of order 0 … z in a basis.
 
-    - `survivors`: how many of each order; a constant is none.
-    - `reaches(function)`: the highest order of an invariant with this leading part; −1 for a
+    - `survivors`: how many of each order, without constants.
+    - `reaches(function)`: the highest order of an invariant with this leading-order term; −1 for a
       function that is not conserved at order 0, or not in the basis.
     """
 
@@ -424,8 +424,8 @@ class Symmetries:
     With ξ0, times move too: DΦ has the derivatives by t and by h, which changes by the difference
     of ξ0. With K = z + 1, ε is η and a nilpotent δ is η^K, in series cut off after η^{2K − 1}.
 
-    - `survivors`: how many leading parts, for order 0 … z. `hamiltonian`: of the last order, how
-      many can have ξ0 = 0 and Hamiltonian vector fields at all orders.
+    - `survivors`: how many leading-order terms, for order 0 … z. `hamiltonian`: of the last
+      order, how many can have ξ0 = 0 and Hamiltonian vector fields at all orders.
     - `independent`, `independent_hamiltonian`: the rank of them as vectors at both points of a
       step, at generic points: how many do not depend on one another with invariants for
       coefficients.
@@ -523,7 +523,7 @@ class Symmetries:
         return columns / np.where(lengths > 0, lengths, 1.0)
 
     def holds(self, vectors) -> bool:
-        """Whether a generator is a leading part; its components at the points, (components,
+        """Whether a generator is a leading-order term; its components at the points, (components,
         points), in double precision."""
         shares = np.linalg.lstsq(self.values.T, vectors.T, rcond=None)[0]
         left = self.values.T @ shares - vectors.T

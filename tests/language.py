@@ -4,7 +4,8 @@
     python tests/language.py --count    numbers per phrase
 
 Each phrase below was in the texts once; the right column is what to write. Searched are docstrings,
-comments and string literals with a space of Python files, and Markdown outside of code blocks.
+comments and string literals with a space of Python files, TOML files of the package, and Markdown
+outside of code blocks.
 """
 
 import argparse
@@ -21,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 
 PHRASES = {
     # "disturbed" is the paper's word: allowed in its title and, in italics, where it is explained.
-    r"(?<!\*)\bdisturb(?:ed|ing|s|ances?)?\b(?!\*| Hamiltonian\s+systems\s+under)": "perturbed",
+    r"(?<!\*)\bdisturb(?:ed|ing|s|ances?)?\b(?!\*| Hamiltonian systems(?:\s+under|$))": "perturbed",
     r"\bundisturbed\b": "unperturbed",
     r"\b(?:waver|wiggl)(?:s|es|ed|e|ing)?\b|\bswings\b": "oscillates, oscillation",
     r"\bgo(?:es)? (?:as|with)\b": "scales as",
@@ -39,7 +40,7 @@ PHRASES = {
     r"\bnoises\b": "noise realisations",
     r"\bdear\b|\banew\b": "expensive, again",
     r"\bcannot be meant\b|\b(?:is|may be) meant\b": "is invalid, means",
-    r"\bnought\b|\b(?:is|are) none\b": "zero, does not exist",
+    r"\bnought\b|\b(?:is|are) (?-i:none)\b": "zero, does not exist",
     r"\bas it should be\b": "correct",
     r"\bbeside\b": "next to, compared with, and",
     r"\ba look\b|\blooked at\b|\b(?:is|are) seen\b": "check, checked, detected",
@@ -102,7 +103,8 @@ def files() -> list[Path]:
     pages = [
         p for p in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")] if p.name != "CHANGELOG.md"
     ]
-    return [p for p in python + pages if p.name not in ("language.py", "test_language.py")]
+    data = sorted((ROOT / "dvi_jax").rglob("*.toml"))
+    return [p for p in python + data + pages if p.name not in ("language.py", "test_language.py")]
 
 
 def main() -> None:

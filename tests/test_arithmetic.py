@@ -245,7 +245,8 @@ ROUTES = [*covering(ORBITS, THERE_AND_BACK), ("henon_heiles", "TypeII by its inv
 @pytest.mark.parametrize(("orbit", "route"), ROUTES)
 @pytest.mark.slow
 def test_fixed_point_comes_back_bit_for_bit(orbit, route):
-    """A million steps forth and as many back; plain and compensated sums do not come back."""
+    """A million steps forward and a million back return the state; plain and compensated sums
+    do not."""
     methods = THERE_AND_BACK[route]
     assert comes_back(orbit, methods, dvi.FixedPoint(QUANTUM), 1_000_000)
     assert not comes_back(orbit, methods, dvi.FloatingPoint(), 20_000)
@@ -264,7 +265,7 @@ def test_a_batch_in_fixed_point_comes_back_bit_for_bit(orbit, route):
 def test_random_forces_come_back_bit_for_bit():
     """Polynomials of many products, with observables that share products with the force.
 
-    With products contracted to FMA this one did not come back: the force was compiled in more than
+    With products contracted to FMA this run did not return: the force was compiled in more than
     one way. The control changes the last bits of the coefficients.
     """
     rng = np.random.default_rng(1)

@@ -116,7 +116,7 @@ if sys.argv[1] == "touched":
 with socket.socket() as free:
     free.bind(("127.0.0.1", 0))
     address = f"127.0.0.1:{free.getsockname()[1]}"
-jax.distributed.initialize(address, 1, 0)  # refuses once a device was asked for
+jax.distributed.initialize(address, 1, 0)  # raises once JAX has a backend
 print("together")
 """
 

@@ -92,7 +92,7 @@ def test_the_least_and_the_simplest_corrections_differ_by_what_is_kept():
     difference = np.asarray(least.coefficients[0, 1] - simplest.coefficients[0, 1])
     q, p = box(1, 50, seed=7)
     series = dvi.InvariantSeries(least.basis, jnp.asarray(difference)[None])
-    q1, p1 = q + 0.1 * (p - 0.1 * q), p - 0.1 * q  # the undisturbed map
+    q1, p1 = q + 0.1 * (p - 0.1 * q), p - 0.1 * q  # the unperturbed map
     values = jax.vmap(lambda q, p: series.evaluate(q, p, 0.0))
     np.testing.assert_allclose(values(q1, p1), values(q, p), atol=1e-13)
     assert np.std(values(q, p)) > 1e-2
@@ -327,7 +327,7 @@ def in_span(columns, target):
 
 @pytest.mark.slow
 def test_magnetic_moment_survives_order_one_and_the_guiding_centre_drifts():
-    """v²/2 is among what is kept; across grad B the centre moves at v²/2, the textbook drift."""
+    """v²/2 is among the invariants; across grad B the centre moves at v²/2, the textbook drift."""
     system, h = magnetic(), 0.05
     samples = box(2, 300)
     d = discover(system, 3, 1, samples, h=h)
@@ -574,7 +574,7 @@ def test_near_resonance_shows_in_the_reach():
     d = discover(system, 3, 1, box(2, 200))
     assert d.survivors == (2, 2)
     assert np.all(d.reach < 0.05)
-    assert "as large as the leading part" in str(d)
+    assert "as large as the leading-order term" in str(d)
     assert found("cubic", 6, 1).reach[0] > 1
 
 

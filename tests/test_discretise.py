@@ -37,7 +37,7 @@ T0 = 0.2
 
 
 def stepper(H_D, method):
-    """One jitted step (z, t0, h) → z of the undisturbed map."""
+    """One jitted step (z, t0, h) → z of the unperturbed map."""
     system = dvi.System(H_D)
 
     @jax.jit

@@ -348,7 +348,7 @@ def page():
         def local_only(route):
             if not home or route.request.url.startswith((home[0], "data:", "blob:")):
                 return route.continue_()
-            seen.append(f"asked for {route.request.url}")
+            seen.append(f"requested {route.request.url}")
             return route.abort()
 
         tab.route("**/*", local_only)
@@ -419,7 +419,7 @@ def test_what_is_wrong_with_a_page_is_seen(site, serve, page, tmp_path):
         "unrendered": "0 of 1 formulas", "wrong": "formula", "dollar": "left over: costs $x$",
         "braces": "left over: q_{k+1}", "task": "left over: [ ]", "default": "left over: f(x=_HAS",
         "wide": "pixels too wide at 390",
-        "slides": "pixels too wide at 390", "picture": "none.png", "outside": "asked for http://192",
+        "slides": "pixels too wide at 390", "picture": "none.png", "outside": "requested http://192",
         "script": "script: ",
     }  # fmt: skip
     for name, words in expected.items():

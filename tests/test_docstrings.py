@@ -1,4 +1,4 @@
-"""The examples in docstrings run, and print what stands below them."""
+"""The examples in docstrings run, and print the output that is shown below them."""
 
 import ast
 import contextlib

@@ -438,7 +438,7 @@ def test_surface_has_an_order_at_each_h_and_none_where_it_failed():
     assert np.isnan(surface.drifts[:, 2]).all()
     assert set(surface.excluded[:, 2]) == {"failed"}
     assert surface.orders[0].kept.all()
-    # Undisturbed, the unstable orbit stays finite, but so large that the form cancels badly.
+    # Unperturbed, the unstable orbit stays finite, but so large that the form cancels badly.
     assert surface.mesh_used.tolist() == [False, False, True]
     assert np.isnan(surface.mesh_slope)
     assert "above round-off at 1 of 3 step sizes" in str(surface)

@@ -1,4 +1,4 @@
-"""Unknown forces out of candidates: exactly the planted terms, and none where there are none."""
+"""Identification of unknown forces: exactly the planted terms, and no term without a force."""
 
 import functools
 
@@ -115,7 +115,7 @@ def test_noise_gives_no_term_whether_or_not_its_size_is_known(seed, known):
     assert it.coefficients.shape == (0,)
     assert it.fit is None
     assert it.system.force is None
-    assert "no force is seen" in str(it)
+    assert "no force was detected" in str(it)
     assert not known or len(it.path) == 21
 
 

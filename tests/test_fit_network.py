@@ -174,7 +174,8 @@ def benchmark():
 
 @pytest.mark.slow
 def test_structure_generalises_beyond_the_arc():
-    """After the training arc and from another start; by the median over five noises and weights."""
+    """After the training arc and from other initial conditions; median over five realisations of
+    the noise and of the initial weights."""
     compare = benchmark().compare  # of one module: its programs are compiled for the first noise
     each = [compare(seed, 80, 4)[0] for seed in range(10, 15)]
     ours, general = (np.array([e[name] for e in each]) for name in ("ours", "RK4, general"))

@@ -1,4 +1,4 @@
-"""Disturbances from real data: relativity from an ephemeris, the wobble from measured poles."""
+"""Perturbations from real data: relativity from an ephemeris, the wobble from measured poles."""
 
 import importlib.util
 import sys
@@ -45,7 +45,7 @@ def test_two_years_ask_for_relativity(relativity):
     assert found.rms < 20  # m
     # The start of the ephemeris is nearly right: less than a kilometre is moved.
     assert np.abs(found.fit.x[1:4]).max() * relativity.METRES < 1000
-    # Negative control: from the same start without the disturbance.
+    # Negative control: the same initial state without the perturbation.
     still = {"epsilon": 0.0, "start": found.fit.x[1:]}
     q, _, _ = relativity.orbit(relativity.century(), still, len(data.ts))
     assert np.linalg.norm(q[-1] - data.values[-1]) * relativity.METRES > 1e5

@@ -111,7 +111,7 @@ def memory(steps, how):
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["levenberg-marquardt", "adam"])
 def test_memory_is_flat_in_the_number_of_steps(how):
-    """10⁵ steps × 64 trajectories beside 10⁴: states alone would be 205 MB more in each pass."""
+    """10⁵ steps × 64 trajectories against 10⁴: states alone would be 205 MB more in each pass."""
     few, many = memory(10_000, how), memory(100_000, how)
     print(f"{how}: {few:.0f} MiB for 10^4 steps, {many:.0f} MiB for 10^5")
     assert many - few < 60

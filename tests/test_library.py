@@ -104,7 +104,7 @@ def test_equations_are_those_of_an_independent_derivation(name):
         theirs = DERIVATIONS[name](t, q, p, args, epsilon)
         for a, b in zip(ours, theirs, strict=True):
             assert np.max(np.abs(a - b)) <= 1e-12 * np.max(np.abs(b))
-        # and a change in the seventh digit of the state is seen
+        # negative control: a change in the seventh digit of the state is detected
         other = DERIVATIONS[name](t, q * (1 + 1e-6), p * (1 + 1e-6), args, epsilon)
         assert any(
             np.max(np.abs(a - b)) > 1e-8 * np.max(np.abs(b))
@@ -285,7 +285,7 @@ def residuals(name):
 
     On the flow, with D = ∂/∂t + V: |X(V) − D(ξ, η) + D(ξ0) V|, the determining equation of a
     differential equation. On the mesh, `dvi.determining_residual` at the points of a solution.
-    They are linear in X, so that one program tells of every generator.
+    They are linear in X, so that one program evaluates every generator.
     """
     made = problem(name)
     generators = [*made.symmetries.values(), *made.flow_symmetries.values(), BEND]
@@ -343,7 +343,7 @@ def test_declared_symmetries_solve_the_determining_equations(name):
         if key in made.symmetries:
             assert mesh < 1e-13, key
             assert off_mesh > 1e-6, key
-        else:  # broken at first order: the residual goes as h, and what it is measured by as 1/h
+        else:  # broken at first order: the residual scales as h, its measure as 1/h
             finer = of(true, t, q, p, made.h / 2)[1]
             assert abs(np.log2(mesh / finer) - 2) < 0.3, key
 
@@ -358,7 +358,7 @@ def test_a_system_without_a_declared_symmetry_has_a_reason():
 
 @pytest.mark.parametrize("name", listed(NAMES, QUICK))
 def test_defaults_run_and_their_energy_is_bounded(name):
-    """The paper's map, 1000 steps of the default size: the energy wavers and does not run away."""
+    """The paper's map, 1000 steps of the default size: the energy oscillates and does not drift."""
     made = problem(name)
     made.check(made.q0, made.p0, made.args)
     sol = run_problem(made, 1000, observe=dict(made.observables), throw=False)
@@ -528,7 +528,9 @@ def test_facts_about_nothing_are_refused():
     """A `Problem` does not promise what it cannot show."""
     made = problem("kepler")
     parts = {"name": "x", "system": made.system, "q0": [0.0], "p0": [0.0], "h": 0.1}
-    with pytest.raises(ValueError, match=r"invariants names 'energy'.*observables: there are none"):
+    with pytest.raises(
+        ValueError, match=r"invariants names 'energy'.*observables: it has no such entries"
+    ):
         systems.Problem(**parts, invariants=("energy",))
     with pytest.raises(ValueError, match=r"parameters names 'k'.*not one of its args: K"):
         systems.Problem(**parts, args={"K": 1.0}, parameters={"k": "strength [1]"})
@@ -577,7 +579,7 @@ def test_elliptic_integrals_and_functions_are_those_of_scipy():
 
 @slow
 def test_integrals_of_the_third_kind_are_those_of_scipy():
-    """Of either sign of n, to 1 − n = 1e-12 and n = −1e8; beside another n."""
+    """Both signs of n, up to 1 − n = 1e-12 and n = −1e8; negative control: another n."""
     rng = np.random.default_rng(1)
     m, phi = rng.uniform(0, 1, 100), rng.uniform(-20, 20, 100)
     complement = np.r_[
@@ -742,7 +744,7 @@ def test_the_pendulum_carries_gradients_at_rest():
 
 @slow
 def test_kepler_carries_gradients_on_a_circle():
-    """Beside central differences of the fourth order; and it is symplectic."""
+    """They agree with central differences of the fourth order, and the map is symplectic."""
     made, circle = problem("kepler"), jnp.array([1.0, 0.0, 0.0, 1.0])
 
     @jax.jit

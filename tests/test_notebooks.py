@@ -147,7 +147,7 @@ def stream(name, text):
 
 
 def test_units_are_no_places(make):
-    """ "/" stands between units, too."""
+    """A "/" also separates units."""
     assert not make._MACHINE.search("43.0 ″/century, 1/h and m/(N/m), 3 km/s/Mpc or 1/2/3")
 
 
@@ -162,7 +162,7 @@ def test_an_unknown_notebook_is_refused():
     assert "no source for no_such; there are discovering_invariants" in run.stderr
 
 
-# --- executed anew ------------------------------------------------------------------------------
+# --- executed again -----------------------------------------------------------------------------
 
 
 def kernels():

@@ -115,7 +115,7 @@ def replaced(m, field, **changes):
 def test_verdicts_follow_the_measurements(m):
     before, mesh, small = verdicts(m), m.fixed_mesh, m.small_step_sweep
     steady = np.repeat(mesh.mixed[:1, :1] * (1 + 1e-9 * np.sin(mesh.ts)), len(mesh.mixed), 0)
-    holds, mended, fails = Verdict
+    holds, corrected, fails = Verdict
     changes = {
         "fixed_mesh": {"mixed": steady},
         "mesh_sweep": {"relative_49": m.mesh_sweep.relative_49 + 1e-6},
@@ -125,11 +125,16 @@ def test_verdicts_follow_the_measurements(m):
     after = {field: judge(replaced(m, field, **change)) for field, change in changes.items()}
     for field, key, was, becomes in (
         ("fixed_mesh", "energy-fig1", fails, holds),
-        ("fixed_mesh", "exact-oscillator", mended, mended),  # 1e-9 is small, and not round-off
+        (
+            "fixed_mesh",
+            "exact-oscillator",
+            corrected,
+            corrected,
+        ),  # 1e-9 is small, and not round-off
         ("mesh_sweep", "momentum", holds, fails),
         ("mesh_sweep", "invariant-49", holds, fails),
-        ("small_step_sweep", "force-kepler", mended, holds),
-        ("small_step_sweep", "invariant-50", mended, fails),
+        ("small_step_sweep", "force-kepler", corrected, holds),
+        ("small_step_sweep", "invariant-50", corrected, fails),
         ("crossover", "rk4-long", holds, fails),
     ):
         claim = next(c for c in after[field] if c.key == key)
@@ -142,7 +147,7 @@ def test_every_number_has_one_name_and_every_claim_a_bound(m, run):
     parts = (*(part(m) for part in values.PARTS), m.limits, m.symmetries, m.identities)
     parts += (m.discoveries, m.repulsion, m.variational_mesh)
     assert len(values.numbers(m)) == sum(map(len, parts))
-    assert all(check.decides for c in run[0].claims for check in (*c.printed, *c.mended))
+    assert all(check.decides for c in run[0].claims for check in (*c.printed, *c.corrected))
     assert not any(check.decides for c in run[0].claims for check in c.also)
 
 
@@ -200,7 +205,7 @@ def test_what_is_printed_without_a_terminal(run):
     printed = run[1]
     assert "\x1b" not in printed
     assert printed.count("100 %") == 12
-    assert "hold once mended" in printed
+    assert "hold once corrected" in printed
     assert "verdicts.html" in printed
 
 

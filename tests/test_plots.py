@@ -424,7 +424,7 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         ((arrays(n=4),), {}, r"coordinates=\(0, 1\)"),
         ((two,), {"coordinates": (0, 2)}, "from 0 to 1"),
         ((two,), {"coordinates": (0,)}, "two or three"),
-        ((two,), {"centre": 0}, "there are none"),
+        ((two,), {"centre": 0}, "centre must be a point of"),
         ((two,), {"centre": [1.0]}, r"shape \(2,\)"),
         ((two,), {"colour": [1.0]}, "one orbit"),
         ((bodies,), {"bodies": [3]}, "from 0 to 2"),

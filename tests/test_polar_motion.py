@@ -258,7 +258,7 @@ def test_eight_years_are_exact_enough_to_fit():
 
 @pytest.mark.slow
 def test_derivatives_by_the_parameters():
-    """Forward and reverse through a run of two years, beside those of the closed form."""
+    """Forward and reverse mode through a run of two years agree with the closed form."""
 
     def integrated(args):
         solution = run(args, 1.0, 730, dvi.Strang(), save=dvi.Save(every=365))

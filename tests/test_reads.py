@@ -265,7 +265,7 @@ def test_large_arrays_are_compared_in_part():
     assert read() != before
     table[0] = 0.0
     table[1] = 1.0
-    assert read() == before  # every ninth entry is looked at
+    assert read() == before  # only every ninth entry is compared
 
 
 def test_one_name_in_several_functions_is_stored_for_each():

@@ -117,7 +117,9 @@ def test_earth_stays_on_the_ecliptic():
     jd = START + np.linspace(0, 3652, 100)
     q, _ = ephemeris(jd)
     earth = q[:, BODIES.index("Earth–Moon")] - q[:, 0]
-    assert np.abs(to_ecliptic(earth)[:, 2]).max() < 3e-4  # the ecliptic of 1900 beside J2000's
+    assert (
+        np.abs(to_ecliptic(earth)[:, 2]).max() < 3e-4
+    )  # the ecliptic of 1900 is near that of J2000
     assert np.abs(earth[:, 2]).max() > 0.39  # negative control: on the equator's axes it does not
 
 
@@ -181,7 +183,7 @@ def test_planets_are_named_when_they_coincide(century):
     check_bodies(century.q0, century.p0, century.args)
 
 
-# Ten years beside the ephemeris
+# Ten years compared with the ephemeris
 
 
 @pytest.mark.slow

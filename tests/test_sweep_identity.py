@@ -114,7 +114,7 @@ DIFFERENT = {
     "a bound method": [{"system": dvi.System(Spring(k).__call__)} for k in (1.0, 2.0)],
     "a rule of differentiation": [{"system": with_own_derivative(c)} for c in (1.0, 2.0)],
     "args of a class": [{"system": OF_ARGS, "args": Parameters(k)} for k in (1.0, 5.0)],
-    "a reduction of one's own": [{"observe": last(c)} for c in (1.0, 2.0)],
+    "a user-defined reduction": [{"observe": last(c)} for c in (1.0, 2.0)],
     "a default of a stop": [{"args": 1.0, "stop": stop_at(k)} for k in (1.2, 1.35)],
     "a lattice's function": [
         {"lattice": dvi.TimeTransformed(lambda t, q, p, a, c=c: c + q @ q)} for c in (1.0, 2.0)
@@ -201,7 +201,7 @@ def test_unsigned_integers_and_unknown_names(tmp_path):
     assert found["count"].dtype == np.uint8
     assert (found["count"] == 3).all()
     np.testing.assert_array_equal(found["t0"], [0.0, 1.0])
-    with pytest.raises(KeyError, match="there are"):
+    with pytest.raises(KeyError, match="it has"):
         found["cuont"]
 
 

@@ -334,7 +334,7 @@ def test_invariants_of_found_symmetries_drift_as_promised():
     alone = dvi.AdiabaticInvariant([quartic.generators[0]], [quartic.gauges[0]])
     drifts = largest_drifts(QUARTIC, [quartic.invariant, alone], [0.02, 0.2])
     slopes = np.log10(drifts[:, 1] / drifts[:, 0])
-    # the leading part alone: negative control
+    # negative control: the leading-order term alone
     np.testing.assert_allclose(slopes, [2, 1], atol=0.15)
     # The spring's series ends: it is an invariant at every ε.
     invariant = found("spring").variational[0].invariant

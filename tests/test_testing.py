@@ -1,4 +1,4 @@
-"""The checks as functions for tests of one's own: what they raise, return and accept."""
+"""The checks as functions for user-defined tests: what they raise, return and accept."""
 
 import subprocess
 import sys

@@ -12,7 +12,7 @@ from truths.table import all_cases
 
 CASES = all_cases()
 UNDECIDED = 0.05
-"""Share of the cases in which the report may warn that it cannot tell."""
+"""Fraction of the cases in which the report may warn that it is undecided."""
 
 ONCE_WRONG = {
     "the invariant alone",

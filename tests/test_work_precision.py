@@ -41,7 +41,7 @@ def counting(system, made):
         shape = jax.ShapeDtypeStruct(x.shape, x.dtype)
         return jax.pure_callback(note, shape, x, t0, t1, vmap_method="sequential")
 
-    seen.defjvp(lambda x, dx: (seen(*x), dx[0]))  # a column of a Jacobian is none
+    seen.defjvp(lambda x, dx: (seen(*x), dx[0]))  # columns of a Jacobian are not counted
 
     @jax.custom_jvp
     def H_D(t0, t1, q0, p1, args):
@@ -82,7 +82,7 @@ COUNTED = [
     [pytest.param(*pair, marks=[pytest.mark.slow] * (i > 1)) for i, pair in enumerate(COUNTED)],
 )
 def test_evaluations_are_counted_as_they_are_made(bench, problem, method):
-    """Against derivatives of H_D at run time, each half an evaluation; columns are none."""
+    """Against derivatives of H_D at run time, each half an evaluation; columns are not counted."""
     problem, halves = problems(bench)[problem], []
     watched = problem._replace(system=counting(problem.system, halves))
     price, num_steps = bench.cost(bench.METHODS[method], problem), 16

@@ -144,7 +144,7 @@ class About(NamedTuple):
 
 
 class Basis(AbstractBasis):
-    """Functions given by the user.
+    """A basis of user-defined functions.
 
     - `functions`: a list of functions ``(q, p)`` or ``(q, p, t)`` → scalar, or a dict with their
       names as keys.

@@ -61,7 +61,7 @@ def determining_residual(
 
 
 class ConformalFactor(NamedTuple):
-    """What `conformal_factor` found.
+    """Result of `conformal_factor`.
 
     - `factor`: Λ, shape (2n, 2n); with ``pointwise=True`` one for each sample, (S, 2n, 2n).
     - `residual`: the largest |pr X̃(F) − Λ F| over the samples, relative to the largest term of

@@ -42,9 +42,9 @@ def echelon(
 
 
 def reduced(columns: np.ndarray, complexity: np.ndarray, above: float = RANK) -> np.ndarray:
-    """The same span with a reduced echelon in the leading part: each column alone in its pivot.
+    """The same span, its leading-order terms in reduced echelon form: one pivot for each column.
 
-    `columns` may have more rows below the leading part, which are combined in the same way.
+    `columns` may have more rows below the leading-order term, which are combined in the same way.
     """
     pivots, _ = echelon(columns[: len(complexity)], complexity, above)
     pivots = pivots[::-1]  # simplest first

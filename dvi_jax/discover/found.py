@@ -24,7 +24,7 @@ _ILL = 1e8  # Condition number of a basis from which on formulas have lost half 
 
 
 class Discovery(eqx.Module):
-    """What `discover_invariants` found.
+    """Result of `discover_invariants`.
 
     The invariants:
 
@@ -35,11 +35,12 @@ class Discovery(eqx.Module):
       round-off over many steps; not tried (False) at order 0.
     - `leading_parts`: shape (families, basis size): a basis, orthonormal on the samples, of the
       order-0 parts of *all* invariants in the span.
-    - `survivors`: for m = 0 … order, how many leading parts have an invariant of order m
+    - `survivors`: for m = 0 … order, how many leading-order terms have an invariant of order
+      m
       (a constant does not count).
-    - `reach`: shape (count,): the ε at which corrections are as large as the leading part; the
-      series is of use far below it. Infinite without corrections.
-    - `obstructions`: a `DriftLaw` for each leading part that is lost at order 1, 2, …
+    - `reach`: shape (count,): the ε at which corrections are as large as the leading-order term;
+      the series is of use far below it. Infinite without corrections.
+    - `obstructions`: a `DriftLaw` for each leading-order term that is lost at order 1, 2, …
 
     How reliable they are:
 
@@ -49,9 +50,10 @@ class Discovery(eqx.Module):
       samples that change by more than rounding by their own measure, or that a lower order
       rejects.
     - `residuals`: shape (count, order + 1), on held-out points: the largest change over one
-      step at each order in ε · `scale`, relative to what the slopes of the leading part predict,
-      |∇I|·|Δz|, or to its spread over the samples where that is less. `typical_residuals`: their
-      median and 95 % quantile, shape (count, order + 1, 2). `dependent_residuals`: as `residuals`.
+      step at each order in ε · `scale`, relative to what the slopes of the leading-order term
+      predict, |∇I|·|Δz|, or to its spread over the samples where that is less.
+      `typical_residuals`: their median and 95 % quantile, shape (count, order + 1, 2).
+      `dependent_residuals`: as `residuals`.
     - `undecided`: how many combinations of the functions change in the steps by less than 1000
       times their rounding, or are null and change by more than rounding and less than 1e-6 of what
       their slopes predict: whether they are conserved cannot be decided. `impossible`: whether as
@@ -148,7 +150,7 @@ class Discovery(eqx.Module):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the answer is not reliable, each with what would help; empty if it is."""
+        """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
         reasons = []
         if self.survivors[0] and self.gap < CLEAR:
             reasons.append("the gap is not clear: let drift_order on a long run decide")
@@ -242,8 +244,8 @@ class Discovery(eqx.Module):
             drop = 10.0 ** -(digits + 1)
         lines = [
             f"{self.count} {kind} invariant{'' if self.count == 1 else 's'} of order "
-            f"{self.order} in {self.basis.size} functions; leading parts that survive order 0 … "
-            f"{self.order}: {', '.join(map(str, self.survivors))}; gap {self.gap:.1e}"
+            f"{self.order} in {self.basis.size} functions; leading-order terms that survive "
+            f"order 0 … {self.order}: {', '.join(map(str, self.survivors))}; gap {self.gap:.1e}"
         ]
         if self.tolerance is not None:
             lines.append(f"  singular values up to {self.tolerance:g} of the largest count as zero")
@@ -262,7 +264,10 @@ class Discovery(eqx.Module):
         for i, series in enumerate(self.invariants):
             note = ", exact at every ε tried" if self.exact[i] else ""
             if np.isfinite(self.reach[i]) and not self.exact[i]:
-                note = f"; corrections are as large as the leading part at ε = {self.reach[i]:.2g}"
+                note = (
+                    "; corrections are as large as the leading-order term at ε = "
+                    f"{self.reach[i]:.2g}"
+                )
             half, most = np.max(self.typical_residuals[i], axis=0)
             lines += [
                 f"  I = {series.formula(_SHOWN, drop, digits)}",

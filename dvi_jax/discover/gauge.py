@@ -52,7 +52,7 @@ class BasisGauge(eqx.Module):
 
 
 class GaugeSolution(eqx.Module):
-    """What `solve_gauge` found; print it for a report. A sequence of its first three fields.
+    """Result of `solve_gauge`; print it for a report. A sequence of its first three fields.
 
     - `gauges`: one for each order, for `AdiabaticInvariant`.
     - `coefficients`: shape (z + 1, basis size).
@@ -71,7 +71,7 @@ class GaugeSolution(eqx.Module):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the answer is not reliable, with what would help; empty if it is."""
+        """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
         if self.rounding <= _HIDDEN:
             return ()
         return (

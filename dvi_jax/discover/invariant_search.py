@@ -54,7 +54,7 @@ def discover_invariants(
     representative: Literal["least", "simplest"] = "least",
     **how: Any,
 ) -> Discovery:
-    r"""The adiabatic invariants of order z that a basis can express, on the iterated map itself.
+    r"""Adiabatic invariants of order z in a basis of functions, found from the iterated map.
 
     With φ the basis, Φ_ε the map of one step, and A_m(q, p, t) the m-th Taylor coefficient in ε
     of φ(Φ_ε(q, p), t + h) − φ(q, p, t), the series Σ ε^m c_m·φ changes by O(ε^{z+1}) in a step
@@ -293,7 +293,7 @@ class Search:
         return chosen
 
     def chosen(self, blur: float, representative: str) -> _Chosen:
-        """One series for each leading part, in functions of the basis; `blur`: see `Span`."""
+        """One series for each leading-order term, in functions of the basis; `blur`: see `Span`."""
         span = Span(self.basis, self.rms, self.R, self.spaces[-1], blur, self.constant)
         found = span.representatives(self.fitted, self.slopes)
         picked: list[tuple[np.ndarray, bool, bool]] = []
@@ -361,7 +361,7 @@ class Search:
         return max(space.unclear for space in self.spaces) if self.tolerance is None else 0
 
     def laws(self, volume: np.ndarray, slow_time: bool, blur: float):
-        """The `DriftLaw` of each leading part that is lost."""
+        """The `DriftLaw` of each leading-order term that is lost."""
         volume = np.max(np.abs(in_units_of(self.scale, volume)), axis=0)
         return drift_laws(self, volume, slow_time, blur)
 

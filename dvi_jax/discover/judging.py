@@ -26,7 +26,7 @@ class Judge(NamedTuple):
     def quantiles(self, coefficients: np.ndarray, share: float, sizes=None) -> np.ndarray:
         """The change that the given share of the samples stays below, shape (count, z + 1).
 
-        `sizes`: of the leading parts on the samples that were fitted, if these are others.
+        `sizes`: of the leading-order terms on the samples that were fitted, if these are others.
         """
         out = np.zeros(coefficients.shape[:2])
         sizes = self.sizes(coefficients) if sizes is None else sizes
@@ -38,7 +38,7 @@ class Judge(NamedTuple):
         return out
 
     def sizes(self, coefficients: np.ndarray) -> np.ndarray:
-        """Root mean squares of the leading parts, shape (count,)."""
+        """Root mean squares of the leading-order terms, shape (count,)."""
         calm = self.calm**2 / np.sum(self.calm**2)
         return np.sqrt(calm @ (self.changes.values @ coefficients[:, 0].T) ** 2)
 
@@ -111,7 +111,7 @@ def cleaned(shares: np.ndarray, blur: float = RANK) -> np.ndarray:
 
 
 def reach(coefficients: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The smallest ε at which a correction is as large as the leading part, shape (count,)."""
+    """The smallest ε with a correction as large as the leading-order term, shape (count,)."""
     out = np.full(len(coefficients), np.inf)
     for i, c in enumerate(coefficients):
         sizes = np.sqrt(np.mean((values @ c.T) ** 2, axis=0))

@@ -166,7 +166,8 @@ def conserved(
     """The combinations of series that change in a step by no more than rounding, each measured by
     what its own slopes predict, sample by sample; and how many are unclear.
 
-    - `leading`: series as columns, shape ((m + 1) · size, count), leading parts orthonormal.
+    - `leading`: series as columns, shape ((m + 1) · size, count), leading-order terms
+      orthonormal.
     - `terms`: A_0 … A_z at all samples, shape (S, z + 1, size), for fields (S, z + 1, rows, size).
     """
     count, size = leading.shape[1], terms.shape[-1]
@@ -197,7 +198,8 @@ def relative_changes(
     digits: np.ndarray | float = 0.0,
 ) -> np.ndarray:
     """The change of one series, shape (z + 1, size), at each order, by the measure of `conserved`:
-    shape (S, z + 1). `spread`: of its leading part; `digits`: see `coefficient_errors`."""
+    shape (S, z + 1). `spread`: of its leading-order term; `digits`: see
+    `coefficient_errors`."""
     own = motion.of(series[:1].T)
     own = own._replace(rounding=own.rounding + np.reshape(digits, (-1, 1))).at_most(spread)
     changes = series_changes(terms, series.reshape(-1, 1))[..., 0]

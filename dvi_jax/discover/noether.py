@@ -80,7 +80,7 @@ def noether_identity(
 
 
 class AdiabaticInvariant(eqx.Module):
-    r"""The adiabatic invariant of order z that a series of generators and gauges leads to.
+    r"""The adiabatic invariant of order z of a series of generators and gauges.
 
         I_z = Σ_{m≤z} ε^m (ξ_m·p_k − ξ0_m E⁻_k + G_m)
 

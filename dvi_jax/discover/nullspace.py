@@ -43,8 +43,8 @@ def singular_vectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def by_leading(leading: np.ndarray, above: float = RANK) -> tuple[np.ndarray, np.ndarray]:
-    """Combinations of columns whose leading parts are orthonormal, and those without one, up to
-    the size `above`. `leading`: the leading parts of the columns, shape (size, count)."""
+    """Combinations of columns whose leading-order terms are orthonormal, and those without one, up
+    to the size `above`. `leading`: the leading-order terms of the columns, shape (size, count)."""
     singular, V = singular_vectors(leading)
     large = singular > above
     return V[large].T / singular[large], V[~large].T

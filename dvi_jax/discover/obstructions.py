@@ -13,12 +13,12 @@ from .series import shortened
 # A drift law is reported when it leaves less than this share of the drift unexplained.
 EXPLAINED = 1e-6
 _SHOWN = 12  # Terms of a formula in a law
-_DEGREE = 4  # A law is sought as a polynomial of the leading part itself up to this degree
+_DEGREE = 4  # A law is sought as a polynomial of the leading-order term up to this degree
 _POWERS = ("1", *(raised("I", k) for k in range(1, _DEGREE + 1)))
 
 
 class DriftLaw(NamedTuple):
-    """Why a leading-order invariant I has no correction at an order: its averaged drift.
+    """The averaged drift of a leading-order invariant I without a correction at some order.
 
     D(I) per step is ε^order times ``formula``, a function of what order 0 conserves.
 
@@ -59,7 +59,7 @@ class DriftLaw(NamedTuple):
 def drift_laws(
     search: Any, volume: np.ndarray, slow_time: bool, blur: float
 ) -> tuple[DriftLaw, ...]:
-    """The laws of all leading parts that are lost at order 1, 2, ….
+    """The laws of all leading-order terms that are lost at order 1, 2, ….
 
     For a series c that is invariant up to order m − 1 the condition of order m,
     Σ_k A_{m−k} c_k + A_0 c_m = 0, has no solution c_m; with a function of what order 0 conserves
@@ -115,7 +115,7 @@ def drift_laws(
 
 
 def _lost(basis, R, alive, through, blur) -> list[np.ndarray]:
-    """The simplest of the leading parts `alive` that are outside of `through`."""
+    """The simplest of the leading-order terms `alive` that are outside of `through`."""
     count = alive.shape[1] - through.shape[1]
     candidates = reduced(np.linalg.solve(R, alive), np.array(basis.complexity), blur).T
     taken, lost = through, []
@@ -130,7 +130,7 @@ def _lost(basis, R, alive, through, blur) -> list[np.ndarray]:
 
 
 def _own_powers(leading: np.ndarray, law: np.ndarray) -> np.ndarray:
-    """a with law = Σ_k a_k I^k on the samples, of the lowest degree; empty when there is none."""
+    """a with law = Σ_k a_k I^k on the samples, of the lowest degree; empty without such a law."""
     scale = np.max(np.abs(leading))
     for degree in range(1, _DEGREE + 1):
         columns = (leading[:, None] / scale) ** np.arange(degree + 1)

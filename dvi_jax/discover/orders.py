@@ -90,7 +90,7 @@ class DriftOrder(NamedTuple):
 
     @property
     def successful(self) -> np.ndarray:
-        """At which ε no trajectory failed, shape (E,)."""
+        """Whether all trajectories succeeded, for each ε, shape (E,)."""
         return (self.statuses[:-1] == "successful").all(axis=1)
 
     @property

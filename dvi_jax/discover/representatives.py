@@ -1,4 +1,4 @@
-"""The series that represents an invariant: independent leading parts and their corrections."""
+"""The series that represents an invariant: independent leading-order terms and corrections."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class Span:
     def representatives(
         self, samples: Samples, slopes: np.ndarray
     ) -> list[tuple[np.ndarray, bool]]:
-        """One series, shape (order + 1, size), for each leading part, the simplest first; and
+        """One series, shape (order + 1, size), for each leading-order term, the simplest first; and
         whether it is independent of those before it: its differential is, at generic points,
         outside the span of theirs.
 
@@ -65,7 +65,7 @@ class Span:
         return found
 
     def _up_to(self, level: int) -> np.ndarray:
-        """Series, as shares, whose leading part uses no function above this complexity."""
+        """Series, as shares, whose leading-order term uses no function above this complexity."""
         shares = self.shares(self.space.leading)
         leading = shares[: self.size]
         above = leading[np.array(self.basis.complexity) > level]

@@ -275,7 +275,7 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
 def solution_pairs(
     system: System, *, h: float, samples: Any, epsilon: Any = 0.0, **how: Any
 ) -> tuple[LatticePoint, LatticePoint]:
-    r"""Pairs of lattice points on solutions: each sample, and where one step of the map takes it.
+    r"""Pairs of lattice points on solutions: each sample and its image under one step of the map.
 
     For `determining_residual` under ``vmap``: it vanishes on them for a symmetry.
 

@@ -76,7 +76,7 @@ class InvariantSeries(eqx.Module):
         return self.formula()
 
     def formula(self, terms: int | None = None, drop: float = 1e-9, digits: int = 6) -> str:
-        """The series as text: at each order at most so many terms, all above a share `drop`.
+        """The series as text: at most so many terms at each order, all above a fraction `drop`.
 
         The number of terms left out is printed, unless they are round-off.
         """

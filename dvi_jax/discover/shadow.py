@@ -98,7 +98,7 @@ class ShadowHamiltonian(eqx.Module):
             )
 
     def bind(self, system: System, epsilon: Any) -> "ShadowHamiltonian":
-        """The same for this system and ε; a system or ε given before stays."""
+        """The same Hamiltonian for this system and ε, unless they were given before."""
         return ShadowHamiltonian(
             self.order,
             system if self.system is None else self.system,

@@ -63,12 +63,12 @@ class Symmetry(eqx.Module):
 
     @property
     def moves_time(self) -> bool:
-        """Whether ξ0 is not zero: on a fixed mesh its invariant may then move by O(h)."""
+        """Whether ξ0 is not zero; its invariant may then oscillate by O(h) on a fixed time grid."""
         return any(generator.xi0 is not None for generator in self.generators)
 
     @property
     def invariant(self) -> AdiabaticInvariant | None:
-        """The adiabatic invariant of order z that it leads to; None where not variational."""
+        """Its adiabatic invariant of order z; None if the symmetry is not variational."""
         if self.gauges is None:
             return None
         return AdiabaticInvariant(list(self.generators), list(self.gauges))
@@ -121,10 +121,10 @@ def _series(basis: BoundBasis, coefficients: np.ndarray) -> str:
 
 
 class Symmetries(eqx.Module):
-    """What `find_symmetries` found; print it for a report. A sequence of `Symmetry`.
+    """Result of `find_symmetries`; print it for a report. A sequence of `Symmetry`.
 
     - `found`: the variational ones first, the simplest first in each kind; there may be none.
-    - `survivors`: for m = 0 … order, how many leading parts X_0 go on to order m.
+    - `survivors`: for m = 0 … order, how many leading-order terms X_0 go on to order m.
     - `singular_values`: of all conditions, descending, relative to the largest; `gap`: the ratio
       at which they were cut (large is clear, below 1e3 is not).
     - `null`: below this relative size a singular value is zero, within rounding.
@@ -179,7 +179,7 @@ class Symmetries(eqx.Module):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the answer is not reliable, each with what would help; empty if it is."""
+        """Reasons why the result is not reliable, each with a remedy; empty if it is reliable."""
         reasons = []
         if self.survivors[0] and self.gap < CLEAR:
             reasons.append("the gap is not clear: take more samples, or others")
@@ -212,8 +212,8 @@ class Symmetries(eqx.Module):
         lines = [
             f"{count} symmetr{'y' if count == 1 else 'ies'} of order {self.order} in "
             f"{self.basis.size} functions for each component: {len(self.variational)} variational, "
-            f"{len(self.conformal)} conformal only; leading parts that survive order 0 … "
-            f"{self.order}: {', '.join(map(str, self.survivors))}; gap {self.gap:.1e}"
+            f"{len(self.conformal)} conformal only; leading-order terms that survive "
+            f"order 0 … {self.order}: {', '.join(map(str, self.survivors))}; gap {self.gap:.1e}"
         ]
         lines += [f"  {warning}" for warning in self.warnings]
         if not count and self.survivors[0]:

@@ -181,8 +181,8 @@ class Search:
     def _judged(self, columns, series, conditions, null) -> np.ndarray:
         """The combinations of null vectors that all samples take for null, held-out ones too.
 
-        A vector with a small leading part is null for no better reason: leading parts are made
-        orthonormal first.
+        A vector can be null only because its leading-order term is small, therefore the
+        leading-order terms are made orthonormal first.
         """
         if columns.shape[1] == 0:
             return columns
@@ -221,7 +221,7 @@ class Search:
         return (np.linalg.solve(self.R, blocks) * self.rms[:, None]).reshape(columns.shape)
 
     def _variational_representatives(self, series, gauges) -> np.ndarray:
-        """One series for each leading part, the simplest; its gauges below it."""
+        """One series for each leading-order term, the simplest; its gauges below it."""
         blocks = gauges.reshape(self.order + 1, self.gauge_basis.size, gauges.shape[1])
         gauges = np.linalg.solve(self.R_gauge, blocks).reshape(gauges.shape)
         columns = np.vstack([self._shares(series), gauges])
@@ -229,7 +229,8 @@ class Search:
         return self._simplest(columns @ led, columns @ shifts)
 
     def _representatives(self, space, known, free) -> np.ndarray:
-        """One series of a space for each leading part not known, the simplest up to free ones."""
+        """One series for each leading-order term of a space that is not known, the simplest up to
+        free ones."""
         basis = orthonormal_range(known[: self.size])
         led, _ = by_leading(space[: self.size] - basis @ (basis.T @ space[: self.size]))
         _, shifts = by_leading(space[: self.size])

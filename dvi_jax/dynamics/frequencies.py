@@ -230,7 +230,8 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     state_axes = None
     if isinstance(ts, Solution) == (signal is not None):
         raise ValueError(
-            "give times and a signal, or a Solution alone, which has its own signal, q − i p."
+            "give times and a signal, frequencies(ts, signal), or a Solution alone, whose "
+            "signal is q − i p."
         )
     if isinstance(ts, Solution):
         qs, ps = (_double("the trajectory", x) for x in (ts.qs, ts.ps))

@@ -19,7 +19,7 @@ def bracketed_root(
     function: Function, a: Number, at_a: Number, b: Number, at_b: Number, exists: Bool[Array, ""]
 ) -> Number:
     """The root of `function` between a and b, where it has the values `at_a` and `at_b`; b, without
-    a derivative, where none `exists`.
+    a derivative, where no root `exists`.
 
     To the last digit, by false position (Illinois) with bisection in every third iteration. The
     derivative with respect to values that `function` closes over is that of the implicit function

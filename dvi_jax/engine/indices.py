@@ -44,12 +44,15 @@ def out_of_bounds(traced: ClosedJaxpr) -> Iterator[tuple[int, int]]:
             sizes, shape = equation.params["slice_sizes"], equation.invars[0].aval.shape
             for start, size, length in zip(inputs[1:], sizes, shape, strict=True):
                 if start is not None and not 0 <= start <= length - size:
+                    # JAX has added the length to a negative index; the message has the one that was
+                    # written.
                     yield int(start if start >= 0 else start - length), length
         elif name == "gather" and inputs[1] is not None:
             axes = equation.params["dimension_numbers"].start_index_map
             shape = equation.invars[0].aval.shape
             for axis, column in zip(axes, np.moveaxis(inputs[1], -1, 0), strict=True):
                 outside = column[(column < 0) | (column >= shape[axis])]
+                # One wrong index of an array is enough for a message.
                 yield from ((int(i), shape[axis]) for i in outside.ravel()[:1])
         elif name == "broadcast_in_dim" and inputs[0] is not None:
             shape, axes = equation.params["shape"], equation.params["broadcast_dimensions"]

@@ -39,6 +39,7 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -
         *own, _ = signature.parameters.values()  # without **keywords
         passed = [p for p in listed if p.name not in signature.parameters]
         defaults = {p.name: p.default for p in passed}
+        # `inspect` requires positional parameters before keyword-only ones.
         shown = sorted([*passed, *own], key=lambda p: p.kind)
 
         @functools.wraps(function)

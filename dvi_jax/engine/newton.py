@@ -234,6 +234,7 @@ def find_root(
 
 def value_and_jacobian(F: Function, x: Vector) -> tuple[Vector, Array]:
     value, push = jax.linearize(F, x)
+    # Not jnp.eye: machine code uses the structural zeros, and a banded Jacobian stays banded.
     return value, jax.vmap(push, out_axes=1)(lanewise.unit_vectors(x.shape[0], x.dtype))
 
 

@@ -13,6 +13,7 @@ from .._checks import function as check_function
 def accepts(function: Callable[..., Any], count: int) -> bool:
     """Whether `function` takes `count` positional arguments; True where that is not known."""
     try:
+        # Bound, not counted: defaults and *rest are then taken into account.
         inspect.signature(function).bind(*range(count))
     except TypeError:
         return False

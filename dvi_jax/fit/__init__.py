@@ -1,4 +1,4 @@
-"""Disturbances from data: parameters of a model that observed trajectories determine."""
+"""Parameters and perturbing forces of a model, estimated from observed trajectories."""
 
 from ._fit import fit as fit
 from .bayes import Samples as Samples, sample as sample

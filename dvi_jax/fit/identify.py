@@ -76,7 +76,7 @@ class Identification:
         count, all_terms = len(self.full.names), self.path[0]
         lines = [f"{len(self.terms)} of {len(all_terms.terms)} candidates"]
         if not self.terms:
-            lines[0] = f"none of {len(all_terms.terms)} candidates: no force is seen"
+            lines[0] = f"none of {len(all_terms.terms)} candidates: no force was detected"
         width = max((len(name) for name in self.terms), default=0)
         for name, c, s in zip(self.terms, self.coefficients, self.sigma, strict=True):
             lines.append(f"  {name:{width}}  {with_error(float(c), float(s))}")
@@ -111,7 +111,7 @@ def identify(
     throw: bool = True,
     **options: Any,
 ) -> Identification:
-    r"""The terms of an unknown force, out of a library of candidates, from trajectories.
+    r"""Terms of an unknown force, selected from a library of candidates by observations.
 
         q1 = q0 + h ∂H_D/∂p1,   p1 = p0 − h ∂H_D/∂q0 + h ε (W + Σ c_i f_i)
 

@@ -69,7 +69,7 @@ class Cauchy(_Robust):
 
 
 class Likelihood(eqx.Module):
-    """Any likelihood of the observations, whose parameters may include a noise level.
+    """A user-defined likelihood of the observations; its parameters may include a noise level.
 
     - `negative_log_density`: function ``(predicted, observed, sigma, params)`` → −log of the
       density for each value, an array of their shape. `observed` and `sigma` have the shape (N, K)

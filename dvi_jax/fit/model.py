@@ -109,7 +109,7 @@ class Model(eqx.Module):
         return {**self.rest, **found}
 
     def check_rows(self, params: Mapping[str, Any], arcs: int) -> None:
-        """Refuse q0 and p0 with more rows than there are arcs."""
+        """Reject q0 and p0 with more rows than there are arcs."""
         for name in ("q0", "p0"):
             shape = np.shape(params.get(name, self.fixed[name]))
             if shape[0] != arcs:

@@ -192,7 +192,7 @@ def _real(name: str, value: Any) -> np.ndarray:
 
 
 def _first(where: np.ndarray) -> list[int]:
-    """The first index at which an array is true; empty where there is none."""
+    """The first index at which an array is true; an empty list if it is false everywhere."""
     return np.argwhere(where)[0].tolist() if where.any() else []
 
 

@@ -59,7 +59,7 @@ class Space(eqx.Module):
     x obeys the bounds, u has none.
 
     - `names`: one for each number, such as ``q0[1]``. `lower`, `upper`: bounds of x, infinite
-      where there are none; `below`, `above`: where there are some.
+      for no bound; `below`, `above`: whether there is a bound.
     - `prior_mean`, `prior_weight`: of x; the weight is 1/sigma, 0 without a prior.
     - `rest`: the leaves that are not fitted.
     """

@@ -67,7 +67,7 @@ class Posterior:
         require_double("a posterior")
         one_of("gradient", gradient, ("reverse", "forward"))
         arcs, many = as_arcs(data)
-        # Priors are added here, so that they go with errors of unknown size as well.
+        # Priors are added here, so that they also work with errors of unknown size.
         self._problem = Problem(model, arcs, many, params, bounds=bounds, loss=loss)
         self._core = self._problem.core
         self._space, x = make_space(params, bounds, priors)
@@ -96,11 +96,11 @@ class Posterior:
         return self._potential(u)
 
     def log_density(self, u: Array) -> Array:
-        """`potential` with the other sign."""
+        """The negative of `potential`."""
         return -self._potential(u)
 
     def to_x(self, u: Array) -> Array:
-        """The parameters' numbers, within their bounds, shape (n,)."""
+        """Values of the parameters, within their bounds, shape (n,)."""
         return self._space.to_x(u)
 
     def to_u(self, x: Any) -> np.ndarray:

@@ -274,7 +274,7 @@ def _shape_of(params: PyTree) -> Any:
 
 
 def _is_plain(node: Any) -> bool:
-    """Whether it consists of arrays and numbers in dicts; lists could not be told from arrays."""
+    """Whether it consists of arrays and numbers in dicts; a list would be loaded as an array."""
     if isinstance(node, dict):
         return all(isinstance(k, str) and _is_plain(v) for k, v in node.items())
     return isinstance(node, np.ndarray | np.generic | jax.Array | float | int)

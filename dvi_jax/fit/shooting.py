@@ -21,12 +21,12 @@ from .problem import Problem
 
 @dataclass(frozen=True)
 class SingleShooting:
-    """Each arc is one trajectory from its start."""
+    """Single shooting: each arc is one trajectory from its initial state."""
 
 
 @dataclass(frozen=True)
 class MultipleShooting:
-    """Each arc is cut into segments with initial states of their own, tied by continuity.
+    """Multiple shooting: arcs in segments, each with an initial state, joined by continuity.
 
     - `segments`: how many, at least 2.
     - `guess`: initial guess of the states at the cuts: a function ``t`` → (q, p); ``"data"``, by

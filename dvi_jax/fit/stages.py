@@ -155,7 +155,7 @@ def _horizon(
     """The horizon of a stage; infinite for all data.
 
     Where none are `wanted`: the longest of full, full/2, full/4, … over which the misfit is small
-    compared with the scatter of the data; where there is none, the shortest with enough data for
+    compared with the scatter of the data; without such a horizon, the shortest with enough data for
     the parameters, but not beyond the first prediction that is not finite.
 
     - `rows`: whitened residuals (A, N, K) of each group. `at_least`: a horizon to exceed.

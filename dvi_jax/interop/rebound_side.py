@@ -129,7 +129,7 @@ def from_rebound(
         simulation.synchronize()  # a snapshot may have been taken between half steps
     elif snapshot != -1:
         raise ValueError(
-            f"snapshot={snapshot} goes with the path of a file, not with a simulation."
+            f"snapshot={snapshot} can be given for the path of a file, not for a simulation."
         )
     called = "a rebound.Simulation (of an archive one snapshot, archive[i]), or the path of a file"
     expect("simulation", simulation, rebound.Simulation, called)

@@ -43,7 +43,7 @@ class Run(NamedTuple):
 
 
 class Lattice(eqx.Module):
-    """Base of all lattices.
+    """Base class of all lattices (time grids).
 
     Most know every interval in advance, by `interval`. A lattice that chooses its steps during the
     run sets ``has_memory = True``: its `next` computes the interval from the state and from a

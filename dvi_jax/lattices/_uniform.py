@@ -30,6 +30,7 @@ class Uniform(StepSizes):
                 f"{names[0]}={given[names[0]]!r} is not reached from t0={t0!r} with h={h!r}: a "
                 "negative h runs backwards."
             )
+        # (t1 − t0)/h has round-off, which is not a remaining part of a step.
         if abs(steps - count) > 1e-9 * max(1, count):
             raise ValueError(
                 f"{names[0]}={given[names[0]]!r} is not a multiple of h={h!r} away from t0 "

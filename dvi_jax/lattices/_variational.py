@@ -160,6 +160,7 @@ class Variational(StepSizes):
     def _factors(self, grown: Scalar) -> Array:
         """Candidate ratios to the last step, which is `grown` times the first; 1 in the middle."""
         smallest, largest = (jnp.asarray(b, grown.dtype) / grown for b in self.bounds)
+        # The last step stays in the range, also if rounding has moved it beyond a bound.
         low = jnp.clip(smallest, 1 / self.reach, 1)
         high = jnp.clip(largest, 1, self.reach)
         # A geometric grid: cells are narrow near the last step, where the root usually is.
@@ -179,6 +180,7 @@ class Variational(StepSizes):
 
         # Cell i is [hs[i], hs[i + 1]]. NaN, where (13) has no solution, is not a change of sign.
         changes = (jnp.sign(values[:-1]) * jnp.sign(values[1:]) <= 0) & (jnp.diff(fixed) != 0)
+        # If equal values at both ends change sign, both are zero: the left end is a root.
         slopes = jnp.diff(values) / jnp.diff(fixed)
         crossing = fixed[:-1] - jnp.where(slopes == 0, 0, values[:-1] / slopes)
         nearest = jnp.argmin(jnp.where(changes, jnp.abs(crossing - fixed[_CELLS]), jnp.inf))
@@ -250,6 +252,7 @@ def _energies(equations: Equations, t: Scalar, h: Scalar, q: State, p: State) ->
     """The energies of the step (12)–(13) of size h from (q, p) at t; NaN without a solution."""
     interval = Interval(t, t + h, h)
     q1, p1, info = step(equations, interval, q, p)
+    # The energy of a p1 that does not solve (13) could change sign where there is no root.
     p1 = jnp.where(info.result == RESULTS.successful, p1, jnp.nan)
     at, more = (equations.system, *interval[:2], q), (p1, equations.epsilon, equations.args)
     leaving, arriving = outgoing_energy(*at, *more, h), incoming_energy(*at, *more, h)

@@ -55,6 +55,7 @@ class Adjoint(Method):
         return self.method.step(equations, interval.reversed(), q1, p1)
 
     def needs_no_solve(self, equations, interval, q) -> bool:
+        # A step of the adjoint is an inverse step of the method: the two answers are exchanged.
         return self.method.inverse_needs_no_solve(equations, interval, q)
 
     def inverse_needs_no_solve(self, equations, interval, q) -> bool:

@@ -14,7 +14,7 @@ from .._types import Args, Interval, State
 
 
 class Method(eqx.Module):
-    """Base of all methods. A subclass declares its order and properties and implements `step`."""
+    """Base class of all methods: order and properties are declared, `step` is implemented."""
 
     order: eqx.AbstractVar[int]
     is_symmetric: eqx.AbstractVar[bool]
@@ -71,6 +71,7 @@ class Method(eqx.Module):
 
         try:
             jax.eval_shape(probe, scalar, scalar, q, scalar)
+        # What a function raises for a q or args of another structure than it expects.
         except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
                 f"could not trace the system for q of shape {q.shape} and args={args!r} ({error}). "

@@ -109,6 +109,7 @@ class CompositionMethod(Method):
         return pairs, parts[-1] if len(parts) % 2 else None
 
     def needs_no_solve(self, equations, interval, q) -> bool:
+        # Steps and inverse steps alternate, so that both have to be explicit.
         forwards = self.base.needs_no_solve(equations, interval, q)
         return forwards and self.base.inverse_needs_no_solve(equations, interval, q)
 
@@ -146,7 +147,7 @@ def _as_coefficients(values: Sequence[float]) -> tuple[float, ...]:
 
 
 class Composition(CompositionMethod):
-    r"""A composition of a map with its adjoint, with coefficients that the user gives.
+    r"""A composition of a map and its adjoint with user-defined coefficients.
 
         Ψ_h = … ∘ Φ*_{c₄h} ∘ Φ_{c₃h} ∘ Φ*_{c₂h} ∘ Φ_{c₁h}        (c₁ acts first)
 
@@ -209,4 +210,5 @@ class Composition(CompositionMethod):
     def is_symmetric(self) -> bool:
         """Whether the map is its own adjoint."""
         c = self.coefficients
+        # An odd number has one step of the base in the middle, which has to be symmetric itself.
         return c == c[::-1] and (len(c) % 2 == 0 or self.base.is_symmetric)

@@ -24,7 +24,7 @@ def warn_of_dissipation(
     q0: State,
     p0: State,
 ) -> None:
-    r"""A warning when a substep that goes backwards in time meets strong dissipation at the start.
+    r"""Warn of substeps backwards in time if the dissipation at the initial state is strong.
 
     Over a substep ch with c < 0 a force εW = −γp amplifies p by 1/(1 + cγh), which is infinite at
     −cγh = 1. The other substeps reverse that, but the errors grow with it. γ is the largest

@@ -70,7 +70,7 @@ class GaussLegendre(Collocation):
 
     @property
     def order(self) -> int:
-        """Twice the stages."""
+        """The order 2s."""
         return 2 * self.stages
 
     def step(self, equations, interval, q0, p0):

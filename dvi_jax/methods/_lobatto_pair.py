@@ -117,7 +117,7 @@ class LobattoIIIAIIIB(Collocation):
 
     @property
     def order(self) -> int:
-        """Twice the stages, less two."""
+        """The order 2s − 2."""
         return 2 * self.stages - 2
 
     def step(self, equations, interval, q0, p0):

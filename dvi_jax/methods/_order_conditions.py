@@ -40,6 +40,7 @@ def order_defects(
     words = _words(order, letters)
     # The product of two series is a convolution: a word is cut in two at every place.
     product = {word: float(word == ()) for word in words}
+    # Operators on functions compose in reverse: c₁, which acts first, is the left factor.
     for c, sign in zip(coefficients, itertools.cycle((1, -1))):
         factor = {word: _in_exponential(word, c, sign) for word in words}
         product = {
@@ -50,6 +51,7 @@ def order_defects(
     worst = [0.0] * (order + 1)
     for word in words:
         exact = 1 / math.factorial(len(word)) if set(word) <= {1} else 0.0
+        # Terms of this size cancel in the sum: their round-off is not a defect of the coefficients.
         unit = max(1.0, length ** sum(word) / math.factorial(sum(word)))
         worst[sum(word)] = max(worst[sum(word)], abs(product[word] - exact) / unit)
     return tuple(worst[1:])

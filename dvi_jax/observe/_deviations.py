@@ -73,6 +73,8 @@ class _Sum(NamedTuple):
     def plus(self, x: Array) -> "_Sum":
         term = x - self.excess
         value = self.value + term
+        # Zero in exact arithmetic: what rounding added to the sum, to be subtracted from the next
+        # term.
         return _Sum(value, (value - self.value) - term)
 
 
@@ -130,6 +132,7 @@ class _Framed(Deviations):
             )
         # All `size` vectors are drawn, so that the first ones do not depend on the count.
         random = np.random.default_rng(self.seed).standard_normal((size, size))
+        # In NumPy the frame is a constant of the program, and costs nothing in a run.
         frame = np.linalg.qr(random)[0][: size if count is None else count]
         return jnp.asarray(frame, value.dtype)
 
@@ -170,6 +173,7 @@ class TangentMap(Deviations):
         return value.vectors
 
     def finish(self, memory):
+        # The vectors are rows here; the columns of a Jacobian are the images of the unit vectors.
         return memory.T
 
 
@@ -260,9 +264,11 @@ class MEGNO(_Framed):
         _, weighted, before, area, time = memory
         vector = self._measured(value.vectors)
         square = jnp.sum(vector**2)
+        # The vector had length 1 before the step. ln |w|² is 2 ln |w|: the factor 2 of Y is in it.
         weighted = weighted.plus(jnp.log(square) * (time.value + value.h / 2))
         time = time.plus(value.h)
         now = weighted.value / time.value
+        # Trapezoidal rule, with Y(0) = 0 as the first `before`.
         area = area.plus(value.h * (before + now) / 2)
         return vector * lax.rsqrt(square), weighted, now, area, time
 
@@ -311,6 +317,8 @@ class GALI(_Framed):
         return frame, columns * shrink[None, :], logs.plus(jnp.log(_diagonal(R) * shrink))
 
     def finish(self, memory):
+        # The volume is the product of the diagonal, whose first entry is 1. Logarithms do not
+        # underflow.
         logs = jnp.cumsum(memory[2].value)[1:]
         return logs / math.log(10) if self.log10 else jnp.exp(logs)
 

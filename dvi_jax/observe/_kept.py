@@ -58,6 +58,7 @@ class KeptSteps(Reduction):
 
     def start(self, value):
         rows = jnp.full((self.capacity, *value.shape), jnp.nan, value.dtype)
+        # Step −1 does not exist: `combine` gives an empty row no derivative.
         return rows, jnp.full((self.capacity,), -1, jnp.int32), jnp.asarray(-self.skip, jnp.int32)
 
     def update(self, memory, k, t, value):
@@ -70,6 +71,7 @@ class KeptSteps(Reduction):
 
     def finish(self, memory) -> Any:
         rows, _, count = memory
+        # The count is negative while the first hits are skipped.
         return rows, jnp.maximum(count, 0).astype(rows.dtype)
 
     def combine(self, memory, k, t, value):
@@ -162,9 +164,11 @@ class Section(KeptSteps):
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
         before, after = event(self.g, t0, q0, p0, args), event(self.g, t1, q1, p1, args)
+        # A zero belongs to the step that ends there: a crossing at a grid point is counted once.
         up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
         ahead = t1 > t0
         hit = up | down
+        # `direction` refers to increasing time: for h < 0 a step passes the surface the other way.
         if self.direction != 0:
             hit = jnp.where(ahead, up, down) if self.direction == 1 else jnp.where(ahead, down, up)
         # A run that continues from a crossing starts on the surface only up to rounding.
@@ -175,7 +179,7 @@ class Section(KeptSteps):
 
 
 class RequestedTimes(KeptSteps):
-    """The steps that contain the times of ``Save(ts=...)``, by t or by a clock of the user's.
+    """The steps that contain the times of ``Save(ts=...)``, by t or by a user-defined clock.
 
     `due` are the times minus their possible rounding error: the step in which one is due is the one
     that reaches it. `ordered` are these in ascending order, for bisection.
@@ -193,6 +197,7 @@ class RequestedTimes(KeptSteps):
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
         start, end = shown(self.clock, t0, q0, p0, args), shown(self.clock, t1, q1, p1, args)
+        # Bisection: a comparison with every requested time would be made in each step.
         passed, inside = (jnp.searchsorted(self.ordered, x, side="right") for x in (start, end))
         ahead, behind = (jnp.searchsorted(self.ordered, x, side="left") for x in (start, end))
         hit = jnp.where(end >= start, inside > passed, ahead > behind)  # (start, end], [end, start)
@@ -201,7 +206,7 @@ class RequestedTimes(KeptSteps):
 
 
 def shown(clock: Callable[..., Any] | None, t: Scalar, q: State, p: State, args: Args) -> Scalar:
-    """The value of a clock at a point; the time if there is none."""
+    """The value of a clock at a point; the time t without a clock."""
     return t if clock is None else event(clock, t, q, p, args, "the clock")
 
 

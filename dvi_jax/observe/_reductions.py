@@ -172,6 +172,7 @@ class Trend(_OfFunction):
 
     def finish(self, memory):
         _, _, t_t, t_f = memory
+        # 0/0 for fewer than two steps, which is the NaN that the docstring promises.
         return t_f / t_t
 
     def combine(self, memory, k, t, value):
@@ -226,7 +227,7 @@ class Last(_OfFunction):
 
 
 class Running(eqx.Module):
-    """The value of a reduction at every save point: over the steps from the start up to there.
+    """The values of a reduction at the saved steps, each over all steps before it.
 
     ``dvi.Running(dvi.MEGNO())`` with ``save=dvi.Save(every=m)`` shows how an indicator converges;
     the values have shape (S − 1, …), like those of an observable without a reduction.

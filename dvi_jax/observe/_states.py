@@ -35,7 +35,7 @@ def has_initial_value(function: Any) -> bool:
 
 
 def of_steps(observe: PyTree) -> PyTree:
-    """The observables with those of a state as functions of a step.
+    """The observables, all as functions of a step.
 
     **Raises** `TypeError` for a function with another number of arguments.
     """
@@ -51,6 +51,7 @@ def _of_step(leaf: Any) -> Any:
         if converted is function or not isinstance(converted, OfState):
             return leaf
         return eqx.tree_at(lambda r: r.function, leaf, converted)
+    # The longest form first: a function with defaults or *rest accepts several of them.
     if not callable(leaf) or isinstance(leaf, type) or accepts(leaf, 7):
         return leaf
     for count in (4, 2):

@@ -18,7 +18,7 @@ from .experiments import Measurements, measure
 from .figures import FIGURES, draw
 from .report import MARKS, counts, write_html, write_json, write_markdown, write_tables
 
-_COLOUR = {Verdict.HOLDS: "green", Verdict.MENDED: "yellow", Verdict.FAILS: "red"}
+_COLOUR = {Verdict.HOLDS: "green", Verdict.CORRECTED: "yellow", Verdict.FAILS: "red"}
 
 
 @dataclass(frozen=True)

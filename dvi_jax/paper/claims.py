@@ -15,7 +15,7 @@ class Verdict(Enum):
     """The outcome of the checks of a claim."""
 
     HOLDS = "holds"
-    MENDED = "holds once mended"
+    CORRECTED = "holds once corrected"
     FAILS = "does not hold"
 
 
@@ -66,7 +66,7 @@ class Claim:
     where: str
     says: str
     printed: tuple[Check, ...]
-    mended: tuple[Check, ...]
+    corrected: tuple[Check, ...]
     on_record: Verdict
     why: str
     also: tuple[Check, ...] = ()
@@ -75,8 +75,8 @@ class Claim:
     def verdict(self) -> Verdict:
         if all(check.passes for check in self.printed):
             return Verdict.HOLDS
-        if self.mended and all(check.passes for check in self.mended):
-            return Verdict.MENDED
+        if self.corrected and all(check.passes for check in self.corrected):
+            return Verdict.CORRECTED
         return Verdict.FAILS
 
     @property
@@ -104,7 +104,7 @@ def judge(measurements: Measurements) -> list[Claim]:
                 Check(what, values[name], *map(float, bounds))
                 for what, name, *bounds in row.get(part, ())
             )
-            for part in ("printed", "mended", "also")
+            for part in ("printed", "corrected", "also")
         }
         return Claim(**{**row, **checks, "on_record": Verdict(row["on_record"])})
 

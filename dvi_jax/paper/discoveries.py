@@ -24,7 +24,7 @@ def discoveries(tick: Tick) -> dict[str, Any]:
 
 
 def _on_oscillator(rng, tick: Tick) -> dict[str, Any]:
-    """h = 0.1, disturbed by −εq.
+    """Invariants found for the oscillator with h = 0.1 and the perturbing force −εq.
 
     `oscillator`: the invariant of order 1 that is found in quadratics, as text; `oscillator_off`:
     distance of its coefficients from those of (p² + (1+ε)q² − h(1+ε)qp)/2; `oscillator_residual`:
@@ -77,9 +77,9 @@ def _on_kepler(rng, tick: Tick) -> dict[str, Any]:
 
     `kepler_count` invariants found, at h = 0.1. `gauge_50_left`: what the best gauge of degree 4
     leaves of the identity of order 1 for (50), with its exponent in h. `balance_gap_by_tool`:
-    largest gap of the balance law of (50) over 200 steps, relative to its causes. Undisturbed,
-    symmetries in polynomials of degree 1: `variational_count`; `found_rotation`, distance of (40)
-    from the span of all; `found_residual`, of the determining equations, held-out.
+    largest gap of the balance law of (50) over 200 steps, relative to its causes. Without
+    perturbation, symmetries in polynomials of degree 1: `variational_count`; `found_rotation`,
+    distance of (40) from the span of all; `found_residual`, of the determining equations, held-out.
     """
     kepler = systems.kepler()
     clocked = [CLOCKED_ROTATION] * 2

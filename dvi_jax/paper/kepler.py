@@ -227,7 +227,7 @@ def repulsion(tick: Tick) -> dict[str, float]:
         return jnp.sum(p1**2) / 2 + args["K"] ** 2 / jnp.sqrt(jnp.sum(q0**2))
 
     found = {}
-    for key, system in {"printed": dvi.System(printed), "mended": problem.system}.items():
+    for key, system in {"printed": dvi.System(printed), "corrected": problem.system}.items():
         one = dataclasses.replace(problem, system=system)
         solution = run(one, problem.h, round(DURATION / problem.h))
         found[f"distance_{key}"] = float(np.max(np.linalg.norm(np.asarray(solution.qs), axis=1)))

@@ -20,14 +20,14 @@ from .experiments import Measurements
 from .figures import FIGURES
 from .numbers import largest, relative_spread
 
-MARKS = {Verdict.HOLDS: "✓", Verdict.MENDED: "≈", Verdict.FAILS: "✗"}
+MARKS = {Verdict.HOLDS: "✓", Verdict.CORRECTED: "≈", Verdict.FAILS: "✗"}
 """A sign for each colour, so that verdicts can be read without colours."""
 
 
 def counts(claims: Sequence[Claim]) -> str:
     """The number of claims with each verdict, as one phrase."""
     number = Counter(claim.verdict for claim in claims)
-    plural = zip(Verdict, ("hold", "hold once mended", "do not hold"), strict=True)
+    plural = zip(Verdict, ("hold", "hold once corrected", "do not hold"), strict=True)
     parts = ", ".join(f"{number[verdict]} {words}" for verdict, words in plural)
     return f"{len(claims)} claims: {parts}"
 
@@ -55,7 +55,7 @@ def write_json(claims: Sequence[Claim], setting: dict[str, Any], path: Path) -> 
                 "why": claim.reason,
                 "as_on_record": claim.is_expected,
                 "checks_as_printed": rows(claim.printed),
-                "checks_as_mended": rows(claim.mended),
+                "checks_as_corrected": rows(claim.corrected),
                 "also_measured": {c.what: value(c) for c in claim.also},
             }
             for claim in claims
@@ -190,13 +190,13 @@ def write_tables(m: Measurements, folder: Path) -> None:
 
 
 def _check_texts(claim: Claim) -> list[tuple[str, str]]:
-    """The part (printed, mended, also) and the text of each number of a claim."""
+    """The part (printed, corrected, also) and the text of each number of a claim."""
 
     def text(check: Check) -> str:
         mark = f" ({'✓' if check.passes else '✗'} required: {check.band})" if check.decides else ""
         return f"{check.what}: {pretty(check.value)}{mark}"
 
-    parts = ("printed", "mended", "also")
+    parts = ("printed", "corrected", "also")
     return [(part, text(check)) for part in parts for check in getattr(claim, part)]
 
 

@@ -26,10 +26,10 @@ def limits(tick: Tick) -> dict[str, float]:
     """What happens as h → 0: exponents in h of the largest error over sampled starts.
 
     `local_error_exponent`: one step of (12)–(13) against the flow. On a driven oscillator, per unit
-    of time: `lattice_mended_exponent`, residual of (14) with the signs of (11);
-    `lattice_sign_exponent`, of (14) as printed; `lattice_slot_exponent`, with the sign mended and
-    H_{D,k−1} still differentiated in t_{k−1}. `stationarity`: largest difference between the mended
-    form and the derivative of the action with respect to t_k, by autodiff.
+    of time: `lattice_corrected_exponent`, residual of (14) with the signs of (11);
+    `lattice_sign_exponent`, of (14) as printed; `lattice_slot_exponent`, with the right sign but
+    H_{D,k−1} still differentiated in t_{k−1}. `stationarity`: largest difference between the
+    corrected form and the derivative of the action with respect to t_k, by autodiff.
     """
     problem = systems.kepler()
     orbit = run(problem, 0.01, 4000, method=dvi.Yoshida(4), save=dvi.Save(every=125))
@@ -49,11 +49,11 @@ def limits(tick: Tick) -> dict[str, float]:
 
     gap = np.abs(np.asarray(flight(dvi.TypeII(), 1) - flight(dvi.Yoshida(4), 32)))
     tick(0.6)
-    mended, sign, slot, stationarity = (np.asarray(x) for x in _lattice_forms())
+    corrected, sign, slot, stationarity = (np.asarray(x) for x in _lattice_forms())
     tick(1.0)
     return {
         "local_error_exponent": slope(STEP_SIZES, np.max(gap, axis=(1, 2))),
-        "lattice_mended_exponent": slope(STEP_SIZES, mended),
+        "lattice_corrected_exponent": slope(STEP_SIZES, corrected),
         "lattice_sign_exponent": slope(STEP_SIZES, sign),
         "lattice_slot_exponent": slope(STEP_SIZES, slot),
         "stationarity": float(stationarity),
@@ -64,7 +64,7 @@ def limits(tick: Tick) -> dict[str, float]:
 def _lattice_forms():
     """Residuals of the three forms of (14), (H,) each, and the largest gap to ∂S/∂t_k."""
 
-    # The paper's examples are autonomous and cannot tell the slots of time apart: drive one.
+    # In the autonomous examples of the paper derivatives by t0 and by t1 agree; this one is driven.
     def driven(t0, t1, q0, p1, args):
         return jnp.sum(p1**2) / 2 + (1 + 0.3 * jnp.cos(t0)) * jnp.sum(q0**2) / 2
 
@@ -104,13 +104,13 @@ def _lattice_forms():
 
         still = jnp.zeros(())
         gap = jax.grad(action)(t0) / (t1 - t0) - dvi.lattice_defect(free, points, still)
-        mended = dvi.lattice_defect(system, points, jnp.asarray(EPSILON))
-        return jnp.abs(jnp.stack([mended, sign / h, slot / h, gap]))
+        corrected = dvi.lattice_defect(system, points, jnp.asarray(EPSILON))
+        return jnp.abs(jnp.stack([corrected, sign / h, slot / h, gap]))
 
     starts = jnp.linspace(0.0, 12.0, 48)
     each = jax.vmap(jax.vmap(forms, (None, 0)), (0, None))(jnp.asarray(STEP_SIZES), starts)
-    mended, sign, slot, gap = jnp.moveaxis(jnp.max(each, axis=1), 1, 0)
-    return mended, sign, slot, jnp.max(gap)
+    corrected, sign, slot, gap = jnp.moveaxis(jnp.max(each, axis=1), 1, 0)
+    return corrected, sign, slot, jnp.max(gap)
 
 
 def symmetries(tick: Tick) -> dict[str, float]:
@@ -119,14 +119,14 @@ def symmetries(tick: Tick) -> dict[str, float]:
     Residuals are relative (round-off: Λ exists). `kepler_factor_off_…`: distance of the measured Λ
     from (48) as printed, and from (1+ε) times it. `scaling_…`: with the generator (33) as printed,
     and with its momentum part. `display_off_…`: distance of the equation of motion displayed after
-    (32) from (13) with W = q (printed) and with W = −q (mended).
+    (32) from (13) with W = q (printed) and with W = −q (corrected).
     """
     found = {k: float(v) for k, v in _conformal_factors().items()}
     factor = found.pop("scaling_factor")
     tick(1.0)
     return found | {
         "scaling_factor_off_1": abs(factor - 1),
-        "scaling_factor_off_mended": abs(factor - 1 - EPSILON),
+        "scaling_factor_off_corrected": abs(factor - 1 - EPSILON),
     }
 
 
@@ -173,12 +173,12 @@ def _conformal_factors():
         "clocked_residual": kepler_factor(CLOCKED_ROTATION, 0.0).residual,
         "kepler_factor_residual": disturbed.residual,
         "kepler_factor_off_printed": jnp.max(jnp.abs(disturbed.factor - printed)),
-        "kepler_factor_off_mended": jnp.max(jnp.abs(disturbed.factor - (1 + EPSILON) * printed)),
+        "kepler_factor_off_corrected": jnp.max(jnp.abs(disturbed.factor - (1 + EPSILON) * printed)),
         "scaling_residual_printed": without.residual,
-        "scaling_residual_mended": with_momenta.residual,
+        "scaling_residual_corrected": with_momenta.residual,
         "scaling_factor": with_momenta.factor[0, 0],
         "display_off_printed": display(1.0),
-        "display_off_mended": display(-1.0),
+        "display_off_corrected": display(-1.0),
     }
 
 

@@ -51,7 +51,9 @@ def animate(
     progress: Callable[[int, int], Any] | None = None,
     **options: Any,
 ) -> Path:
-    """A film of orbits with a fading tail, evenly in time; of one degree of freedom in (q, p).
+    """An animation of orbits with a fading tail, in equal steps of time.
+
+    Orbits of one degree of freedom are drawn in the plane (q, p).
 
     - `orbits`, and of the keywords `coordinates`, `bodies`, `centre`, `names`, `labels`, `units`,
       `title`: as for `orbit`; `units` also of "t", for the time that is shown.

@@ -179,7 +179,7 @@ def fit_against_data(
 
 @in_style
 def learning_curve(fit: Any, ax: Any = None) -> Any:
-    """The loss after each step of a fit, its stages in colours, rejected steps crossed.
+    """The loss after each step of a fit: a colour for each stage, a cross for a rejected step.
 
     `fit`: a `FitResult`, with its `history`. A stage uses the observations up to its horizon, so
     that losses of different stages are not of the same data. The axis is logarithmic unless a loss

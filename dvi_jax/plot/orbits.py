@@ -163,7 +163,7 @@ def orbit(
     dots: bool = False,
     **options: Any,
 ) -> Any:
-    """Orbits in the plane or in space, the same scale along every axis.
+    """Orbits in the plane or in space, with equal scales on all axes.
 
     - `orbits`: a `Solution`, of one run or of a batch, the arrays (ts, qs), of shapes (..., S) and
       (..., S, n) or (..., S, bodies, dim), or a list of these.
@@ -303,10 +303,8 @@ def view_of(
     elif centre is not None:
         point = np.asarray(centre, float)
         if point.shape != (dim,):
-            raise ValueError(
-                "centre must be the number of a body, of which there are "
-                f"{count if many else 'none'}, or a point of shape {(dim,)}, got {centre!r}."
-            )
+            body = f"the number of a body (0 to {count - 1}) or " if many else ""
+            raise ValueError(f"centre must be {body}a point of shape {(dim,)}, got {centre!r}.")
         view = view._replace(mark=point[list(axes)])
     return view._replace(bodies=drawn, names=labels_of(names, len(drawn), "bodies", "names"))
 
@@ -322,7 +320,7 @@ def trajectory(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """A trajectory in the kind of picture that fits its shape.
+    """A picture of a trajectory, of the kind that suits the shape of its states.
 
     One degree of freedom: (q, p). Two, or bodies in the plane or in space: orbits in the first
     two coordinates. More: every position against time.

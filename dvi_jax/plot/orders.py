@@ -29,7 +29,7 @@ def balance(
     unit: str = "",
     ax: Any = None,
 ) -> Any:
-    """The drift of an invariant as a stack of its causes, and the residual of their sum.
+    """The drift of an invariant as a stacked plot of its causes, and the residual of their sum.
 
     - `ts`: a `dvi.Balance`, as `dvi.noether_balance` returns it; or start of each step, shape (S,),
       with `drift`: rate of change, shape (S,), and `causes`: label → its part of the rate, shape
@@ -264,7 +264,7 @@ def work_precision(
     points, lost = np.hstack(list(runs.values())), np.zeros(2, int)
     for i, (name, (costs, errors)) in enumerate(runs.items()):
         colour = COLOURS[i % len(COLOURS)]
-        # The same marker comes back with another colour: 9 and 7 have no common factor.
+        # The same marker occurs again with another colour: 9 and 7 have no common factor.
         marker, dash = MARKERS[i % len(MARKERS)], DASHES[i // len(COLOURS) % len(DASHES)]
         good = np.isfinite(errors) & (errors > 0)
         label = f"{name}: {_slope(costs[good], errors[good])}" if slopes else name

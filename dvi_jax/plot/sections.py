@@ -109,7 +109,7 @@ def section(
     size: float | None = None,
     **options: Any,
 ) -> Any:
-    """Where orbits crossed a surface (Poincaré 1892), a point for each crossing.
+    """Poincaré section: one point for each crossing of a surface by an orbit (Poincaré 1892).
 
     - `crossings`: a `dvi.PoincareSection`, a `dvi.Crossings` of one orbit or of a batch, or a
       `Solution` that observed one.
@@ -193,11 +193,11 @@ def bifurcation(
     size: float | None = None,
     **options: Any,
 ) -> Any:
-    """A coordinate of orbits at a section against a parameter, such as ε.
+    """Bifurcation diagram: a coordinate of section points against a parameter, such as ε.
 
     - `parameter`: shape (runs,). `name`: its label, with a unit if it has one.
     - `crossings`: a batch of `dvi.Crossings` with one axis, (runs,), or a `Solution` that observed
-      one; or numbers, shape (runs, room), NaN where there are none.
+      one; or numbers, shape (runs, room), NaN without a crossing.
     - `y`: as for `section`, a component or a function ``(q, p)``; the label if `crossings` are
       numbers.
     - `skip`: crossings at the beginning of each run that are left out, until it has settled.

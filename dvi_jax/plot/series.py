@@ -43,7 +43,7 @@ def invariants(
     log: bool = False,
     **options: Any,
 ) -> Any:
-    """Quantities along time and how well they are conserved, one panel above another.
+    """Quantities against time and their changes, one panel above another.
 
     - `orbits`: a `Solution`, of one run or of a batch; or times alone, shape (..., S).
     - `values`: name → numbers, shape (..., S, *any), or (..., S − 1, *any) for those at the ends of

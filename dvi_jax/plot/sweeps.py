@@ -54,7 +54,7 @@ def sweep_map(
     ax: Any = None,
     **where: Any,
 ) -> Any:
-    """A map of one variable of a sweep; of one dimension a line.
+    """A map of one variable of a sweep, or a line for a sweep of one dimension.
 
     - `data`: `DataArray`, e.g. ``result.to_xarray()["drift"]``. Nothing is loaded as a whole.
     - `x`, `y`: dimensions, or one-dimensional coordinates along them; None: the first free ones.
@@ -154,7 +154,7 @@ def failure_map(
     ax: Any = None,
     **where: Any,
 ) -> Any:
-    """A map of how the trajectories of a sweep ended.
+    """A map of the status of each trajectory of a sweep.
 
     - `data`: the `Dataset`, or its ``status``, with `flag_values` and `flag_meanings`.
     - `reduce`: "any": a pixel has the colour of its most frequent failure if there is one, so that

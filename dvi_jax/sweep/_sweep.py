@@ -39,7 +39,7 @@ _MANY_STARTS = 100_000
 
 
 class SweepInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a sweep. `result` has the finished tasks, as has the store if there is one."""
+    """Raised by Ctrl-C during a sweep. `result` and the store, if any, have the finished tasks."""
 
     def __init__(self, message: str, result: SweepResult):
         super().__init__(message)
@@ -155,7 +155,7 @@ def sweep(
         done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
         where = "; they are the `result` of this exception."
         if store is not None:
-            where = f" and kept in {result.path}; the same call goes on from there."
+            where = f" and kept in {result.path}; the same call continues from there."
         raise SweepInterrupted(f"interrupted: {done}{where}", result)
     return result
 
@@ -231,7 +231,10 @@ def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
     if start is not None:
         Axis(start.name, [0])  # raises for a name that is not an identifier
         if start.name in (name for name, *_ in axes):
-            raise ValueError(f"the name {start.name!r} of the start is also that of an axis.")
+            raise ValueError(
+                f"an Axis and the initial conditions {type(start).__name__}(...) have the same "
+                f"name, {start.name!r}: give one of them another name=..."
+            )
         axes.append((start.name, start.count, "start"))
     dims = lengths(axes)
     _check_dims(dims)

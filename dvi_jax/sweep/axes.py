@@ -15,7 +15,7 @@ from ..engine.quantities import refuse_unit_or_mask
 
 @dataclass(frozen=True, init=False, eq=False)
 class Axis:
-    """A named axis of a sweep: the argument that it replaces takes each of its values.
+    """A named axis of a sweep: the values that one argument takes.
 
     Axes of different names make a grid, axes of one name vary together (they are zipped).
 
@@ -73,7 +73,7 @@ _NUMBERS = (int, float, np.ndarray, np.generic, jax.Array, list, tuple)
 
 def _check(of: str, values: np.ndarray) -> None:
     if values.ndim == 0:
-        raise ValueError(f"{of} needs a sequence of values, got the number {values}.")
+        raise ValueError(f"{of} needs a sequence of values, such as [{values}], got {values}.")
     if values.dtype.kind not in "iuf":
         raise TypeError(f"{of} needs real numbers, got dtype {values.dtype}.")
     if not np.isfinite(values).all():

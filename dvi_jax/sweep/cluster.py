@@ -34,8 +34,8 @@ _ATTEMPTS = 10
 
 
 class ClusterError(RuntimeError):
-    """The cluster is gone, or a task kills the workers that it runs on. Finished tasks are in the
-    store; the same call goes on from there."""
+    """Raised if the cluster is lost or a task kills its workers. Finished tasks are in the store,
+    and the same call continues from there."""
 
 
 def run_on(
@@ -103,7 +103,10 @@ def run_on(
     except _TaskError as error:
         raise error.args[0] from None
     except (OSError, TimeoutError) as error:
-        raise ClusterError(f"the cluster is lost ({error!r}). {ClusterError.__doc__}") from error
+        raise ClusterError(
+            f"the cluster is lost ({error!r}). Finished tasks are in the store; start a new "
+            "cluster, and the same call continues from there."
+        ) from error
     finally:
         with contextlib.suppress(OSError, TimeoutError):
             client.cancel([future for _, future in running.values()])

@@ -45,7 +45,7 @@ class SweepCost:
     cores: int
 
     def seconds(self, workers: int | None = None) -> float:
-        """Time until the last task is done on so many cores or GPUs; None: those of this machine.
+        """Estimated time on this number of cores or GPUs; None: those of this machine.
 
         The time of ⌈tasks/workers⌉ tasks, one after the other, and of one compilation.
         """

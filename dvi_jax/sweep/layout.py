@@ -30,7 +30,7 @@ CHUNK_BYTES = 2**22
 
 
 class StoreError(Exception):
-    """A store that cannot be used: the message says why, and what to do."""
+    """Raised for a store that cannot be used; the message has the reason and a remedy."""
 
 
 @contextlib.contextmanager

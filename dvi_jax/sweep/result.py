@@ -46,7 +46,7 @@ class SweepResult:
 
     @property
     def tasks_done(self) -> int:
-        """Number of tasks whose results are there; all records of a store are read for it."""
+        """Number of finished tasks; all records of a store are read for it."""
         return len(self._source.done())
 
     @property
@@ -59,7 +59,7 @@ class SweepResult:
             return self._coordinates[name][1]
         if name not in self._source.variables:
             known = ", ".join((*self._source.variables, *self._coordinates))
-            raise KeyError(f"{name!r}: there are {known}.")
+            raise KeyError(f"the sweep has no variable {name!r}; it has {known}.")
         if isinstance(self._source, Memory):
             return self._source.arrays[name]
         return self.to_xarray()[name].values
@@ -151,7 +151,7 @@ class SweepResult:
 def open_sweep(path: Any) -> SweepResult:
     """The results in a store, which may be unfinished and still be written by other processes.
 
-    **Raises** `StoreError` where there is none.
+    **Raises** `StoreError` if the path is not a store.
     """
     store = Store.open(path)
     return SweepResult(store, store.coordinates(), store.attributes)

@@ -36,7 +36,7 @@ _RESTORE = (
 
 
 class StoreMismatch(StoreError, ValueError):
-    """A store of another sweep; `differing` lists the differences."""
+    """Raised for the store of another sweep; `differing` lists the differences."""
 
     def __init__(self, message: str, differing: list[str]):
         super().__init__(message)

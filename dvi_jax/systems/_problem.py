@@ -99,7 +99,7 @@ class Problem:
             for name in set(getattr(self, what)) - set(known):
                 raise ValueError(
                     f"{self.name}: {what} names {name!r}, which is not one of its {kind}: "
-                    f"{', '.join(sorted(known)) or 'there are none'}."
+                    f"{', '.join(sorted(known)) or 'it has no such entries'}."
                 )
 
 

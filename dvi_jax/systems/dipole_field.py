@@ -60,7 +60,7 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
 
 
 def dipole_field(radius: float = 50.0) -> Problem:
-    """A trapped particle that gyrates, bounces between north and south, and drifts in longitude.
+    """A charged particle trapped in a dipole field: it gyrates, bounces and drifts in longitude.
 
     Dimensionless: e = m = B0 = 1, so that gyrofrequency and gyroradius at the start are 1; it
     starts at the equator at r ≈ R with its velocity at 45° to the field.

@@ -28,7 +28,7 @@ def angular_momentum(t0, t1, q0, p0, q1, p1, args):
 
 
 def double_pendulum() -> Problem:
-    """Two bobs of 1 kg on rods of 1 m, at rest at 90° and 60° from the vertical: chaotic.
+    """A chaotic double pendulum: 1 kg on rods of 1 m, from rest at 90° and 60°.
 
     **Source** Landau & Lifshitz 1976, *Mechanics*, §5, Problem 1; the Legendre transform and
     the initial conditions are ours.

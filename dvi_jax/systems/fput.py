@@ -40,7 +40,7 @@ def mode_energies(t0, t1, q0, p0, q1, p1, args):
 
 
 def fput(n: int = 31, alpha: float = 0.25, beta: float = 0.0) -> Problem:
-    """The chain with all its energy in the longest mode; dimensionless.
+    """The Fermi–Pasta–Ulam–Tsingou chain with its energy in the longest mode; dimensionless.
 
     n = 31 moving particles (32 springs), α = 1/4 and a sine wave of amplitude 1 are those of the
     report's first figure; all but some per cent of the energy returns to the first mode at

@@ -31,7 +31,7 @@ def jacobi_constant(t0, t1, q0, p0, q1, p1, args):
 
 
 def hill() -> Problem:
-    r"""An inclined orbit about the small body at a third of the distance of L2.
+    r"""Hill's problem: an inclined orbit about the small body at a third of the distance of L2.
 
     Unit of length: (m/M)^(1/3) times the distance of the two bodies of masses M ≫ m; of time: their
     period over 2π. The limit μ → 0 of `restricted_three_body` with lengths over μ^(1/3). Initial

@@ -63,10 +63,10 @@ def exact(t, q0, p0, args):
 
 
 def lorentz_pendulum() -> Problem:
-    """The pendulum of one metre and one kilogram, l = l0 (1 + d sin εt), from rest at 1 rad.
+    """A pendulum of 1 m and 1 kg with slowly varying length, from rest at 1 rad.
 
-    d = 0.3 (`depth` in args); ε [1/s] is the angular frequency of the change. Initial conditions
-    and step are ours.
+    The length is l0 (1 + d sin εt) with d = 0.3 (`depth` in args); ε [1/s] is the angular frequency
+    of the change. Initial conditions and step are ours.
 
     **Source** Solvay congress 1911 (Langevin & de Broglie 1912, *La théorie du rayonnement et les
     quanta*, p. 450); action: Landau & Lifshitz 1976, *Mechanics*, §49.

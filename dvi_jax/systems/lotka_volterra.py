@@ -46,7 +46,7 @@ def equilibrium(args):
 
 
 def lotka_volterra() -> Problem:
-    """Hares and lynxes of the Hudson's Bay Company, in thousands and years; one cycle: 9.9 years.
+    """Predators and prey: hares and lynxes in thousands, time in years, a cycle of 9.9 years.
 
     Rates and the initial 33.9 and 5.9 thousand are ours, close to fits to the pelts of 1900–1920
     (Carpenter 2018, *Predator–Prey Population Dynamics: the Lotka–Volterra model in Stan*).

@@ -66,7 +66,7 @@ def bounce_action(t0, t1, q0, p0, q1, p1, args):
 
 
 def magnetic_mirror(length: float = 20.0, distance: float = 2.0) -> Problem:
-    """A particle that bounces in B = B0 (1 + z²/ℓ²) on the axis; dimensionless.
+    """A charged particle in a magnetic mirror, B = B0 (1 + z²/ℓ²) on the axis; dimensionless.
 
     e = m = B0 = 1: gyroradius and gyrofrequency 1 at the start, on the middle plane with its
     guiding centre at (`distance`, 0, 0). With v_{∥} = 0.8 v_{⊥} it turns where |B| is 1.64 times

@@ -56,9 +56,9 @@ def plane_wave(t, n, mode, amplitude, args):
 
 
 def nls_lattice(n: int = 8) -> Problem:
-    """A moving localised excitation on a focusing ring of n sites; dimensionless.
+    """Discrete nonlinear Schrödinger equation on a ring: a moving localised excitation.
 
-    κ = γ = 1. Initial conditions and step are ours.
+    Dimensionless, n sites, focusing: κ = γ = 1. Initial conditions and step are ours.
 
     **Raises** `ValueError` for fewer than three sites.
 

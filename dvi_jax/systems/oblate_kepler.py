@@ -81,7 +81,7 @@ def _outside(q, p, args):
 
 
 def oblate_kepler() -> Problem:
-    """A satellite of the Earth of a = 8000 km, e = 0.1 and i = 50°, at perigee on the node.
+    """A satellite of the oblate Earth: a = 8000 km, e = 0.1, i = 50°, at perigee on the node.
 
     km, s and unit mass: p is the velocity. Node and perigee precess by `secular_rates`, −3.0° and
     +2.5° per day. Initial conditions and step are ours.

@@ -89,7 +89,7 @@ def pendulum() -> Problem:
         p0=np.array([1.0]),
         h=0.1,
         parameters={
-            "omega": Parameter(1.0, "frequency of small swings [1/time]"),
+            "omega": Parameter(1.0, "frequency of small oscillations [1/time]"),
         },
         force=friction,
         observables=[action],

@@ -195,9 +195,9 @@ def _pair(first, second, meaning):
 
 
 def polar_motion() -> Problem:
-    r"""The pole from 2000-01-01 (t = 0): of the Earth at ε = 1, free and undamped at ε = 0.
+    r"""Polar motion of the Earth from 2000-01-01 (t = 0); at ε = 0 free and undamped.
 
-        H_D + ε H1_D  and  ε W    of  hamiltonian, disturbance, damping
+        H_D + ε H1_D  and  ε W    of  hamiltonian, excitation, damping
 
     q = x and p = y [arcsec], t = MJD − 51544 [day]; `parameters` describes args. ε between 0 and 1
     scales excitation and damping; the closed forms `forced_pole` and `exact` hold at ε = 1. The

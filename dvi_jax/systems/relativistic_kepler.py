@@ -64,7 +64,7 @@ def _misses_the_centre(q, p, args):
 
 
 def relativistic_kepler() -> Problem:
-    """An ellipse of e ≈ 0.35 with K = 1, c = 10, from perihelion; dimensionless.
+    """Relativistic Kepler problem: e ≈ 0.35, K = 1, c = 10, from perihelion; dimensionless.
 
     It precesses by 2.2° per revolution. Initial conditions and step are ours. General relativity:
     `relativity`, with `n_body`.

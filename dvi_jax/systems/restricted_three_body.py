@@ -80,7 +80,7 @@ def lagrange_points(mu):
 
 
 def restricted_three_body() -> Problem:
-    """A libration about L4 of Earth and Moon, also out of their plane.
+    """A libration about L4 of the Earth–Moon system, in and out of the plane.
 
     Unit of length: the distance of the two bodies; of time: their period over 2π. Initial
     conditions and step are ours.

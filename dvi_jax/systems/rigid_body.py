@@ -132,7 +132,7 @@ def _possible(q, p, args):
 
 
 def rigid_body() -> Problem:
-    """A body of moments 1, 2 and 2.5 that rotates about its middle axis, which is unstable.
+    """A free rigid body with moments 1, 2 and 2.5, in rotation about the unstable middle axis.
 
     Dimensionless. Initial conditions and step are ours.
 

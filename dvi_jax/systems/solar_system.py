@@ -156,7 +156,7 @@ def check_start(q0: Any, p0: Any, args: Any) -> None:
 
 
 def solar_system(date: str | datetime.date | float = "1900-01-01") -> Problem:
-    """The ten bodies on a day, barycentric, on the axes of the ICRF.
+    """The Sun and nine bodies on a given day, in barycentric coordinates on the ICRF axes.
 
     - `date`: the initial day, as for `julian_date`.
 

@@ -31,7 +31,7 @@ def oscillatory_energy(t0, t1, q0, p0, q1, p1, args):
 
 
 def stiff_fput(m: int = 3, omega: float = 50.0) -> Problem:
-    """The stiff chain with its energy in the first spring: x_1 = ẋ_1 = ẏ_1 = 1, y_1 = 1/ω.
+    """The FPUT chain of stiff and soft springs: x_1 = ẋ_1 = ẏ_1 = 1, y_1 = 1/ω, all else zero.
 
     **Raises** `ValueError` for fewer than one spring, and for an ω that is not positive.
 

@@ -41,7 +41,9 @@ def angular_momentum_squared(t0, t1, q0, p0, q1, p1, args):
 
 
 def two_centres() -> Problem:
-    """An orbit about two unequal centres; dimensionless. Initial conditions and step are ours.
+    """An orbit about two fixed unequal centres of attraction; dimensionless.
+
+    Initial conditions and step are ours.
 
     **Source** Euler 1760; Whittaker 1937, *Analytical Dynamics*, §53; Erikson & Hill 1949, *Phys.
     Rev.* 75, 29.

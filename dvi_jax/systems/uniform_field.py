@@ -82,7 +82,7 @@ def exact(t, q0, p0, args):
 
 
 def uniform_field() -> Problem:
-    """A particle that gyrates about B = ẑ and drifts across B and E = 0.1 x̂; dimensionless.
+    """A charged particle in the fields B = ẑ and E = 0.1 x̂: gyration and drift; dimensionless.
 
     e = m = B = 1: gyrofrequency 1. Initial conditions and step are ours.
 

@@ -33,7 +33,10 @@ class Measured:
 
     def __post_init__(self):
         if self.passed and not math.isfinite(self.value):
-            raise ValueError(f"a value of {self.value} cannot have passed ({self.detail}).")
+            raise ValueError(
+                f"a check that measured {self.value} cannot have passed: give passed=False. "
+                f"{self.detail}".rstrip()
+            )
 
     @property
     def ok(self) -> bool:

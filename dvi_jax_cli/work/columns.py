@@ -78,6 +78,6 @@ def _number(cell: str) -> float:
 
 
 def column(columns: dict[str, np.ndarray], key: str, name: str) -> np.ndarray:
-    """One of the columns. **Raises** `InputError` when there is none of that name."""
+    """One of the columns. **Raises** `InputError` when no column has that name."""
     known(key, name, columns, "a column of the file: {}")
     return np.asarray(columns[name], float)

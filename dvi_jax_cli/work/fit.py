@@ -51,7 +51,7 @@ def fit_file(
     - `path`: the file; its keys are in `FitFile` and in the documentation.
     - `out`: directory to write to, as for `run_file`.
     - `force`: replace the results of an earlier fit there. `resume`: continue from the checkpoint
-      there; begin where there is none.
+      there; begin a new fit without one.
     - `progress`: as for `dvi.fit`.
 
     Writes fit.npz (`FitResult.save`), fit.json, trajectory.npz (ts, qs, ps of the fitted

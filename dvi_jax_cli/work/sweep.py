@@ -51,7 +51,7 @@ def sweep_file(
     - `path`: the file; its keys are in `SweepFile` and in the documentation.
     - `store`: directory to write to instead of the file's ``output.store``; either is relative to
       the working directory. It must not exist, or be empty, unless
-    - `resume`: continue with the store there; begin where there is none.
+    - `resume`: continue with the store there; begin a new one if there is no store.
     - `threads`, `progress`: as for `dvi.sweep`.
 
     **Raises** `InputError` for bad input, nothing is written then; `StoreMismatch`
@@ -71,8 +71,8 @@ def sweep_file(
 
 
 def sweep_cost(path: str | Path) -> Report:
-    """What the sweep of a TOML file would take, and larger ones: the summary has a table. One task
-    is computed and timed for it, and nothing is written.
+    """Estimated cost of the sweep of a TOML file, and a table for larger ones. One task is computed
+    and timed; nothing is written.
 
     **Raises** `InputError` for bad input.
     """
@@ -284,7 +284,7 @@ def _opened(store: str | Path) -> dvi.SweepResult:
 
 
 def sweep_status(store: str | Path) -> Report:
-    """How far a sweep is, from the records of its store; others may be working on it.
+    """Progress of a sweep, from the records of its store; other processes may still write to it.
 
     **Raises** `InputError` where there is no store.
     """

@@ -32,7 +32,7 @@ MISSING = "the key is missing"
 
 
 def key(default: Any, allowed: str) -> Any:
-    """A key with its default, ``...`` where there is none, and what it allows."""
+    """A key with its default (``...``: the key is required) and its allowed values."""
     return Field(default, description=allowed)
 
 
@@ -67,7 +67,7 @@ class Table(BaseModel):
             names = one_of(cls.model_fields, str(place[-1]))
             return [InputError(path(place), "there is no such key", names)]
         allowed = cls.model_fields[str(place[0])].description or ""
-        if context.get("discriminator") == "'kind'":  # the key that tells the tables of a union
+        if context.get("discriminator") == "'kind'":  # the key that selects a table of a union
             tag, kinds = context.get("tag", ""), context.get("expected_tags", allowed)
             near = nearest(tag, re.findall(r"\w+", kinds))
             return [InputError(path(place, "kind"), repr(tag) if tag else MISSING, kinds + near)]

@@ -200,7 +200,7 @@ def settings(draw):
     observed = draw(OBSERVED)
     if "ts=" in save and "Running" in observed:
         observed = "observable"
-    # Each of these goes with some methods only.
+    # Each of these works with some methods only.
     arithmetic = "dvi.FloatingPoint()" if "Uniform" not in lattice else draw(ARITHMETICS)
     explicit_only = "Variational" in lattice or "FixedPoint" in arithmetic
     method = "dvi.TypeII()" if explicit_only else draw(METHODS)

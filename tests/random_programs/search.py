@@ -117,7 +117,8 @@ def _finished(command: list[str], env: dict[str, str], current: Path) -> tuple[i
 
 def search(count: int, minutes: float, seed: int, out: Path) -> int:
     out.mkdir(parents=True, exist_ok=True)
-    # One seed draws the same programs everywhere: hypothesis asks for CI, and sets have an order.
+    # One seed draws the same programs everywhere: hypothesis reads CI, and a fixed hash seed
+    # orders sets.
     env = {k: v for k, v in os.environ.items() if k not in ("CI", "GITHUB_ACTIONS")}
     env["PYTHONPATH"] = os.pathsep.join([str(TESTS), str(TESTS.parent)])
     env["PYTHONHASHSEED"] = "0"

@@ -38,15 +38,15 @@ class Case(NamedTuple):
 
     - `samples`: a function of a NumPy generator that draws (qs, ps) or (qs, ps, ts).
     - `truth`: of "invariants", functions (q, p, t), each a combination of the basis: a largest set
-      of independent invariants of the basis, for order > 0 the leading parts that reach that
+      of independent invariants of the basis, for order > 0 the leading-order terms that reach that
       order. Of "symmetries", generators that span all symmetries of the basis that do not depend
       on one another with invariants for coefficients; `variational`: how many of them are. Of
       "gauges", the generators, one for each order; `closes`: whether a gauge in the basis closes
       Noether's identity, for each order up to the first at which none does.
     - `points`: like `samples`, for the comparison with the truth; None for the samples.
     - `options`: further arguments of the search.
-    - `survivors`: how many leading parts have an invariant, or symmetries go on, for order 0 …
-      `order`, those that depend on others included, a constant not; None where not compared.
+    - `survivors`: how many leading-order terms have an invariant, or symmetries go on, for order
+      0 … `order`, those that depend on others included, a constant not; None where not compared.
     - `exact`: whether the series of order > 0 are conserved at every ε; None as above. `epsilon`:
       where a series that is reported as exact is tried, for a step of the map.
     - `name`, `kind`: "integrable", "neighbours", …: a row of the table.

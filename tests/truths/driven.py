@@ -151,7 +151,7 @@ _CASES = {
     "parametric oscillator with harmonics": case(
         (PERIODIC, QUADRATICS * trig(3, "t", constant=True), timed(box(1, 100), 0.0, 20.0))
     ),
-    # at ε = 0 the slow time stands still: p² + ω² q² − h ω² q p with ω² = 1 + 0.3 τ, and its
+    # at ε = 0 the slow time is constant: p² + ω² q² − h ω² q p with ω² = 1 + 0.3 τ, and its
     # products with functions of τ, which alone have no differential in q and p
     "slow oscillator at order 0": case(
         (SLOW, QUADRATICS * TAU[4], timed(box(1, 60), 0.0, 3.0)), SLOW_FORM

@@ -272,7 +272,7 @@ _CASES = {
         (OSCILLATOR, poly(6), box(1, 120), 1.0), (energy(1.0, 1.0), hexagon)
     ),
     # as above, and the quadratic form of an oscillator that turns by another angle
-    "sixth of a turn beside another oscillator": case(
+    "sixth of a turn and another oscillator": case(
         (spring(1.0, 0.3), poly(6, ["q1", "p1"]) + poly(2, ["q2", "p2"]), box(2, 150), 1.0),
         (*energies(1.0, 1.0, 0.3), hexagon),
     ),
@@ -337,7 +337,7 @@ _CASES = {
         (of_garnier(0.9, 0.5), of_garnier_too(0.9, 0.5)),
     ),
     # separable: one invariant each
-    "McMillan's map beside an oscillator": case(
+    "McMillan's map and an oscillator": case(
         (
             separable("q1**2 - 0.7 * log(1 + q1**2) + 0.3 * q2**2 / 2"),
             poly(4, ["q1", "p1"]) + poly(4, ["q2", "p2"]),

@@ -1,4 +1,4 @@
-"""Perturbed systems whose normal forms are known: which leading parts have an invariant of order z.
+"""Perturbed systems with known normal forms: leading-order terms with an invariant of order z.
 
 All maps are of type II with the step `H` = 0.1, unless a case says otherwise. Formulas have only
 functions that `exact_series` evaluates too: its `Count` confirms `truth` and `survivors`.

@@ -101,7 +101,7 @@ _UNITS = {
         (f"1e20 * {energy(1.0, 0.3, 1)}", f"1e-20 * {energy(0.5, 0.3, 2)}"),
     ),
     # H = 1e-60 p²/2 + 1e60 q²/2: p²/m + k q² − (hk/m) q p, h = 0.1
-    "momentum of 1e30 beside a position of 1e-30": case(
+    "momentum of 1e30 and position of 1e-30": case(
         (system("p @ p / (2 * 1e60) + 1e60 * (q @ q) / 2"), poly(4), sized(1, 100, 1e-30, 1e30)),
         "(1e-30 * p1)**2 + (1e30 * q1)**2 - 0.1 * (1e30 * q1) * (1e-30 * p1)",
     ),
