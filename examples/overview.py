@@ -49,7 +49,7 @@ def energy_errors(axis):
         rows = np.unique(np.geomspace(5, len(E) - 1, 300).astype(int))
         axis.loglog(rows * EVERY / 100, error[rows], label=name)
         print(f"{name}: {error[-1]:.1e}")
-    axis.set(xlabel="time (periods)", ylabel="largest relative energy error")
+    axis.set(xlabel="time [periods]", ylabel="largest relative energy error")
     axis.set_title("A Kepler orbit over a million steps")
     axis.legend()
 
@@ -74,7 +74,7 @@ def drifts(axis):
         label = f"order {order}: drift ∝ ε$^{{{measured.slope:.2f}}}$"
         axis.loglog(measured.epsilons, measured.drifts, "o-", label=label)
         print(order, measured.slope, measured.stderr)
-    axis.set(xlabel="strength ε of the perturbing force", ylabel="drift over 5000 steps")
+    axis.set(xlabel="strength ε of the perturbing force", ylabel="largest drift over 5000 steps")
     axis.set_title("Invariants found for a perturbed oscillator")
     axis.legend()
 

@@ -29,7 +29,7 @@ from nbclient.exceptions import CellExecutionError
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 
-LARGEST = 300_000
+LARGEST = 1_000_000
 """Bytes of a notebook: a code host shows larger ones slowly or not at all."""
 
 LONGEST = 600
@@ -81,7 +81,9 @@ class _ThisPython(KernelSpecManager):
     def get_kernel_spec(self, kernel_name: str) -> KernelSpec:
         spec = get_kernel_dict()
         # What a kernel says of itself, such as how it is connected, is not for this terminal.
-        return KernelSpec(**spec | {"argv": [*spec["argv"], "--IPKernelApp.log_level=40"]})
+        # "retina": pictures have twice the pixels, which sharp screens show in the same size.
+        settings = "--IPKernelApp.log_level=40", "--InlineBackend.figure_formats=retina"
+        return KernelSpec(**spec | {"argv": [*spec["argv"], *settings]})
 
 
 def executed(name: str) -> Any:
@@ -124,10 +126,12 @@ def _joined(outputs: list[Any]) -> list[Any]:
 
 
 def _plain(output: Any) -> Any:
-    """An output without its metadata; a picture without those inside of it."""
+    """An output without its metadata; a picture without those inside of it, with its width."""
     if output.output_type in ("display_data", "execute_result"):
+        width = output.metadata.get("image/png", {}).get("width")  # its height follows
         output.metadata = {}
         if "image/png" in output.data:
+            output.metadata = {"image/png": {"width": width}} if width else {}
             output.data = {
                 "image/png": _pixels(output.data["image/png"]),
                 "text/plain": output.data.get("text/plain", "a picture"),

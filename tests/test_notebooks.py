@@ -47,9 +47,9 @@ def test_all_are_there(make):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_notebook_is_as_it_should_be(make, name):
-    """In step with its source, below 300 kB, executed in order, without errors or warnings."""
+    """In step with its source, below 1 MB, executed in order, without errors or warnings."""
     assert make.faults(name) == []
-    assert make.LARGEST <= 300_000
+    assert make.LARGEST <= 1_000_000
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -130,7 +130,7 @@ def test_a_changed_source_is_caught(make, book):
             "names a place on a machine",
         ),
         (
-            lambda cells: cells[1].update(outputs=[stream("stdout", "x" * 300_000)]),
+            lambda cells: cells[1].update(outputs=[stream("stdout", "x" * 1_000_000)]),
             "fewer or smaller pictures",
         ),
     ],
@@ -144,6 +144,16 @@ def stream(name, text):
     from nbformat.v4 import new_output
 
     return new_output("stream", name=name, text=text)
+
+
+def test_a_picture_keeps_its_width_and_no_other_metadata(make, book):
+    """Pictures have twice the pixels of the width in which they are shown."""
+    outputs = [output for cell in book.cells for output in cell.get("outputs", [])]
+    picture = next(output for output in outputs if make._is_picture(output))
+    for width, kept in ((715, {"image/png": {"width": 715}}), (None, {})):
+        size = {"width": width, "height": 450} if width else {}
+        picture.metadata = {"image/png": size, "needs_background": "light"}
+        assert make._plain(picture).metadata == kept
 
 
 def test_units_are_no_places(make):
