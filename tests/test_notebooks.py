@@ -1,12 +1,15 @@
 """The notebooks: in step with their sources, executed, small; what they print comes out again."""
 
+import base64
 import copy
 import importlib.util
+import io
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from compilation import flags_of_users
 
@@ -154,6 +157,27 @@ def test_a_picture_keeps_its_width_and_no_other_metadata(make, book):
         size = {"width": width, "height": 450} if width else {}
         picture.metadata = {"image/png": size, "needs_background": "light"}
         assert make._plain(picture).metadata == kept
+
+
+@pytest.mark.parametrize(("colours", "mode"), [(64, "P"), (4096, "RGB")])
+def test_a_palette_is_used_unless_it_changes_colours(make, colours, mode):
+    """Neither the resolution nor the colours change; texts, which name versions, are removed."""
+    image = pytest.importorskip("PIL.Image")
+    info = pytest.importorskip("PIL.PngImagePlugin").PngInfo()
+    info.add_text("Software", "a version")
+    side = round(colours**0.5)
+    pixels = np.zeros((side, side, 3), np.uint8)
+    pixels[..., 0], pixels[..., 1] = np.mgrid[:side, :side] * (255 // (side - 1))
+    pixels[..., 2] = 255 - pixels[..., 0]
+    before, after = io.BytesIO(), io.BytesIO()
+    image.fromarray(pixels).save(before, "PNG", dpi=(220, 220), pnginfo=info)
+    after.write(base64.b64decode(make._pixels(base64.b64encode(before.getvalue()).decode())))
+    found = image.open(after)
+    assert found.mode == mode
+    assert found.info["dpi"] == pytest.approx((220, 220), rel=1e-3)
+    assert "Software" not in found.info
+    change = np.asarray(found.convert("RGB")).astype(int) - pixels
+    assert np.abs(change).max() <= (make.UNSEEN if mode == "P" else 0)
 
 
 def test_units_are_no_places(make):

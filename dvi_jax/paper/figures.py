@@ -39,7 +39,7 @@ def _figure(name: str, caption: str, heading: str, size: tuple[float, float], **
 
 @_figure(
     "fig1",
-    "Energy error of the free oscillator: on the fixed mesh the energy oscillates by O(h), and "
+    "Energy error of the free oscillator: with equal steps the energy oscillates by O(h), and "
     "another quadratic form is conserved.",
     "Figure 1   Energy error of the variational method, h = 0.1, ε = 0",
     (9, 3.6),
@@ -271,7 +271,7 @@ def sweep_50(m: Measurements, figure: Any, axes: Any) -> None:
     positive = sweep.epsilons[1:]
     for i, h in enumerate(sweep.hs):
         look = _look(i) | {"marker": MARKERS[i]}
-        left.loglog(positive, sweep.spread_50[i, 1:], **look, label=f"fixed mesh, h = {h:g}")
+        left.loglog(positive, sweep.spread_50[i, 1:], **look, label=f"equal steps, h = {h:g}")
     for drifts, label, look in (
         (small.attracting, "h → 0, force −εq", {"color": "k", "marker": "o"}),
         (small.repelling, "h → 0, force +εq", {"color": GREY, "marker": "x", "ls": "--"}),
@@ -285,8 +285,10 @@ def sweep_50(m: Measurements, figure: Any, axes: Any) -> None:
     text = "error of the order-4 method: the drift of\n(1+ε)L − H − ε|q|²/2 for every ε"
     look = {"ha": "right", "va": "top", "fontsize": 8.5, "color": GREY}
     left.text(0.1, small.literal[0] / 1.4, text, **look)
-    left.set(title="(50) against ε", xlabel="strength of the perturbation ε", ylim=(1e-10, 300))
-    left.set_ylabel("range (fixed mesh), drift (h → 0)")
+    left.set(
+        title="invariant (50) against ε", xlabel="strength of the perturbation ε", ylim=(1e-10, 300)
+    )
+    left.set_ylabel("range of (50) (equal steps), drift (h → 0)")
     left.legend(fontsize=8.5, ncols=2, loc="upper center", columnspacing=1)
     for i, epsilon in enumerate(sweep.epsilons):
         if epsilon not in (0.0, 1e-2, 1e-1):
@@ -297,7 +299,7 @@ def sweep_50(m: Measurements, figure: Any, axes: Any) -> None:
     right.loglog(sweep.hs, largest_49, "kP:", label="(49), relative, largest over ε")
     reference = sweep.spread_50[0, 0] * sweep.hs / sweep.hs[0] / 2.5
     right.loglog(sweep.hs, reference, color=GREY, linewidth=0.9, label="in proportion to h")
-    right.set(title="(50) and (49) against h", xlabel="step size h", ylim=(1e-15, 100))
+    right.set(title="invariants (50) and (49) against h", xlabel="step size h", ylim=(1e-15, 100))
     right.set_xticks(sweep.hs, [f"{h:g}" for h in sweep.hs])
     right.minorticks_off()
     right.set_ylabel("range over t = 200")
