@@ -60,7 +60,7 @@ for name, x, sigma in zip(found.names, found.x, found.sigma, strict=True):
 print(f"{found.status}, reduced chi² = {found.reduced_chi2:.2f}")
 
 # %% [markdown]
-# The line joins the predictions at the times of observation.
+# The predictions at the times of observation, and the observations with their errors:
 
 # %%
 axis = plot.fit_against_data(found)
@@ -136,11 +136,13 @@ with plot.style():
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
     left.hist(pulls, bins=np.arange(-3.5, 3.6, 0.5), color=plot.COLOURS[0], alpha=0.8)
     left.set(
-        xlabel="(estimate − true value)/sigma", ylabel="fits", title="Thirty noise realisations"
+        xlabel="(estimate of ε − true value)/sigma",
+        ylabel="number of fits",
+        title="30 noise realisations",
     )
     for name, fit in {"with friction": found, "without": without}.items():
         right.plot(ts, fit.whitened[0], ".-", lw=0.7, label=f"{name}: {fit.reduced_chi2:.2f}")
-    right.set(xlabel="time t", ylabel="residual over sigma", title="Residuals, reduced χ²")
+    right.set(xlabel="time t", ylabel="residual/sigma", title="Residuals and reduced χ²")
     right.legend()
 plt.show()
 

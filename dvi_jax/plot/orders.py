@@ -15,6 +15,7 @@ from .style import COLOURS, DASHES, MARKERS, SMALL, ZERO, in_style, named, signe
 
 _HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++++")
 _CAUSES = ("symmetry", "work", "lattice")
+_EPSILON = "strength ε of the perturbation"
 _BAR: dict[str, Any] = {"marker": "_", "ms": 12, "mew": 2, "ls": "none"}
 
 
@@ -127,7 +128,7 @@ def drift_orders(
             draw.guide(axis, (x[first], x.max()), y[first], slope, zorder=1)
         lost += draw.without_place(axis, np.append(x, left), np.append(y, order.floor), colour)
         total += len(y) + 1
-    axis.set(xscale="log", yscale="log", xlabel="ε", ylabel="largest drift", title=title)
+    axis.set(xscale="log", yscale="log", xlabel=_EPSILON, ylabel="largest drift", title=title)
     marks: Any = {"color": "#444444", "ls": "none"}
     hollow = marks | {"marker": "o", "mfc": "white"}
     extra = [entry("expected slope", **draw.GUIDE)] if promised is not None else []
@@ -168,7 +169,7 @@ def drift_surface(
     (left, right), new = stack(ax, 2, what, (9.6, 4.2), ncols=2, width_ratios=ratios)
     edges = draw.cell_edges(surface.epsilons, log=True), draw.cell_edges(surface.hs, log=True)
     entries = _draw_drifts(left, surface, edges)
-    left.set(xscale="log", yscale="log", xlabel="ε", ylabel="step size h", title=title)
+    left.set(xscale="log", yscale="log", xlabel=_EPSILON, ylabel="step size h", title=title)
     _draw_orders_in_epsilon(right, surface, promised)
     right.set(xscale="log", xlabel="step size h", ylabel="order in ε", title="Order in ε")
     right.set_xlim(*edges[1][[0, -1]])
