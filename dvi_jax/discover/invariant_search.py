@@ -6,8 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import fraction, one_of, whole
+from .._integrate import integrate
 from .._step import Equations
 from .._system import System, check_system
+from ..engine.keywords import with_keywords_of
+from ..engine.names import both_names
 from .basis import AbstractBasis, bind_basis, check_step_size
 from .changes import Changes, Stepped, changes_at, checked_changes, is_exact
 from .expansions import Larger, at_larger_step, in_larger_box, powers_of_size
@@ -26,6 +29,7 @@ from .nullspace import (
 from .obstructions import drift_laws
 from .representatives import Span
 from .sampling import (
+    TYPE_2,
     Samples,
     as_samples,
     check_basis,
@@ -43,6 +47,8 @@ _AS_GOOD = 10.0  # An invariant with fewer terms may change by so many times mor
 _ROUND_OFF = 1e-12  # Changes below this need not be smaller
 
 
+@both_names
+@with_keywords_of(integrate, f"{TYPE_2} method")
 def discover_invariants(
     system: System,
     basis: AbstractBasis,
