@@ -574,7 +574,7 @@ def test_near_resonance_shows_in_the_reach():
     d = discover(system, 3, 1, box(2, 200))
     assert d.survivors == (2, 2)
     assert np.all(d.reach < 0.05)
-    assert "as large as the leading part" in str(d)
+    assert "as large as the leading-order term" in str(d)
     assert found("cubic", 6, 1).reach[0] > 1
 
 
