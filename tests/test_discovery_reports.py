@@ -117,6 +117,7 @@ def test_formulas_show_the_digits_that_errors_leave():
 def test_an_energy_that_is_not_found_has_a_reason_and_a_remedy(method, order):
     found = discover(QUARTIC, 4, method=method)
     assert found.count == 1  # the angular momentum
+    assert found.energy is not None
     assert found.energy.order == pytest.approx(order, abs=0.1)
     power = {1: "O(h)", 2: "O(h²)"}[order]
     assert f"energy is conserved to {power} only by this map" in str(found)

@@ -60,6 +60,11 @@ class _OfEnergy(eqx.Module):
         return system.hamiltonian(t, t, q, p, zero, self.equations.args)[None]
 
 
+@eqx.filter_jit
+def _values(energy, q, p, t):
+    return jax.vmap(energy)(q, p, t)
+
+
 def unconserved_energy(stepped: Stepped, samples: Samples, search: Any) -> Energy | None:
     """The energy, if it is neither among the invariants of the `search` at order 0 nor conserved
     to rounding by the map, and its change in a step is a power of h."""
@@ -69,7 +74,7 @@ def unconserved_energy(stepped: Stepped, samples: Samples, search: Any) -> Energ
     if system.slow_time or depends_on(lambda t: energy(q, p, t), 0, t):
         return None
     fit = search.fitted
-    values = np.asarray(jax.jit(jax.vmap(energy))(*map(jnp.asarray, fit)))[:, 0]
+    values = np.asarray(_values(energy, *map(jnp.asarray, fit)))[:, 0]
     if not np.isfinite(values).all():
         return None
     calm = search.calm
