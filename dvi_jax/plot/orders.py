@@ -84,22 +84,30 @@ def balance(
 
 @in_style
 def drift_orders(
-    results: Mapping[str, DriftOrder] | Sequence[DriftOrder],
+    results: DriftOrder | Mapping[str, DriftOrder] | Sequence[DriftOrder],
     promised: Sequence[float | None] | float | None = None,
     title: str = "Largest drift against the perturbation",
     ax: Any = None,
+    *,
+    expected: Sequence[float | None] | float | None = None,
 ) -> Any:
     """Drifts over ε (`drift_order`) and the orders that are expected.
 
-    - `results`: label → measured order, or a sequence of them.
-    - `promised`: expected order z + 1 of each result in turn (None: unknown), or one for all; a
-      grey line of that slope goes through the first point of the fit.
+    - `results`: one measured order, label → measured order, or a sequence of them.
+    - `promised`, or `expected`: the order z + 1 of each result in turn (None: unknown), or one for
+      all; a grey line of that slope goes through the first point of the fit.
 
     Hollow points are excluded from the fit; bars at the left end mark the drift at ε = 0. The
     legend counts drifts that failed, crosses at the top, and those exactly 0, triangles at the
     bottom. **Returns** the `Axes`. **Raises** `TypeError` for anything but a `DriftOrder`.
     """
-    if not isinstance(results, Mapping):
+    if expected is not None:
+        if promised is not None:
+            raise TypeError("expected and promised are one keyword: give one of them.")
+        promised = expected
+    if isinstance(results, DriftOrder):
+        results = {"drift": results}
+    elif not isinstance(results, Mapping):
         results = {f"observable {i}": order for i, order in enumerate(results, 1)}
     for order in results.values():
         wanted = "drift_orders draws what dvi.drift_order returned"
