@@ -56,6 +56,8 @@ class FitResult:
     - `at_bounds`: names of the parameters that ended at a bound. Their entries of `covariance` are
       those of a free parameter or NaN: the error of such a parameter is not symmetric.
     - `trajectories`: status of each arc's trajectory.
+    - `rounding`: standard errors of x from the round-off of the predictions, shape (n,), measured
+      if it bounds the accuracy of the fit, else 0. They are included in `covariance`.
     """
 
     params: PyTree
@@ -80,6 +82,7 @@ class FitResult:
     trajectories: list[str] = field(default_factory=list)
     prior_chi2: float = 0.0
     seconds: float = 0.0
+    rounding: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def status(self) -> str:
@@ -174,7 +177,7 @@ class FitResult:
             f"{errors}rms {self.rms:.4g}, {explained}{self.num_observed} values, "
             f"{self.degrees_of_freedom} degrees of freedom"
         )
-        lines += [words for words in [little_explained(self)] if words]
+        lines += [words for words in [little_explained(self), rounded(self)] if words]
         lines += [f"not determined: {words}" for words in self.undetermined]
         if self.result != FIT_RESULTS.converged and str(FIT_RESULTS[self.result]):
             lines.append(str(FIT_RESULTS[self.result]))
@@ -190,6 +193,7 @@ class FitResult:
         arrays |= {f"history.{name}": value for name, value in self.history.items()}
         for name in _BY_ARC:
             arrays |= {f"{name}.{i}": a for i, a in enumerate(getattr(self, name))}
+        arrays["rounding"] = self.rounding
         if self.curvature is not None:
             arrays["curvature"] = self.curvature
         publish_npz(path, _FORMAT, about, arrays)
@@ -229,6 +233,7 @@ class FitResult:
             result=getattr(FIT_RESULTS, one_of("status of the file", about["result"], NAMES)),
             singular_values=arrays["values"],
             curvature=arrays.get("curvature"),
+            rounding=arrays.get("rounding", np.zeros(len(arrays["x"]))),
             **{name: about[name] for name in _PLAIN},
             **by_arc,
         )
@@ -252,6 +257,19 @@ def little_explained(found: FitResult) -> str:
     return (
         f"the model describes the data {than}: this may be a local minimum, or the data are "
         "constants and noise. Start from other parameters."
+    )
+
+
+def rounded(found: FitResult) -> str:
+    """The remark on a fit whose accuracy is bounded by rounding; empty for another one."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        part = found.rounding / found.sigma
+    part = part[np.isfinite(part)].max(initial=0.0)
+    if found.result != FIT_RESULTS.converged or part == 0:
+        return ""
+    return (
+        "converged at the level of rounding: the round-off of the predictions changes parameters "
+        f"by up to {part:.1g} of their errors, which include it"
     )
 
 
