@@ -75,14 +75,14 @@ def fit(
       `Likelihood` BFGS; or a solver of optimistix, or a gradient transformation of optax.
     - `max_steps`: in all; None means 200, with optax 2000.
     - `tolerance`: a fit has converged when the next step would change the predictions by less than
-      this many standard errors in total.
+      this many standard errors in total, or if round-off of the predictions prevents that.
     - `horizons`: ``"auto"`` fits the beginning of the arcs first where the start is so far off
       that later data would mislead the fit, and extends it step by step; None fits all data at
       once; or a list of times since t0 to fit up to before all data.
     - `batch`: with optax, how many arcs of each group are drawn for each step; `seed` of the draw.
     - `check_units`: refuse data that differ from the model by orders of magnitude.
-    - `check_curvature`: compare the Gauss–Newton errors with exact second derivatives (for up to
-      50 parameters).
+    - `check_curvature`: compare the Gauss–Newton errors with second derivatives (for up to 50
+      parameters).
     - `checkpoint`: a file that is written every few seconds. The same call continues from it, with
       the same bits as without the interruption, also with more `max_steps`; it is removed when
       the fit has converged.
@@ -224,6 +224,7 @@ def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
         trajectories=trajectories,
         prior_chi2=float(np.sum(r[-n:] ** 2)),
         rounding=rounding,
+        start=problem.start_in_words(),
         seconds=time.monotonic() - run.began,
     )
 

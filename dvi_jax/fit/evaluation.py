@@ -13,8 +13,8 @@ is Marquardt's 1e-3 of the squared columns."""
 class Evaluation(NamedTuple):
     """Residual vector (R,), its derivative (R, n), and what else was computed with them."""
 
-    residual: Array
-    jacobian: Array
+    residual: Array | np.ndarray
+    jacobian: Array | np.ndarray
     aux: Any = None
 
 

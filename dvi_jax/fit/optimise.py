@@ -20,14 +20,15 @@ from .uncertainty import inverse_or
 _REJECTED = 12
 """Rejected steps in a row after which no further step is expected to help."""
 
-_NEAR = {1: (0.0, 1e-13), 4: (0.1, 0.0)}
-"""The same for small steps with hardly any damping, which are rejected because of round-off: their
-size in standard errors, and relative to the predictions that a change of u by all of it makes."""
+_NEAR = 0.1
+"""Size in standard errors below which a third of them are enough, if damping is not the reason."""
+
+_SMALL = 1e-13
+"""Relative change of u that makes as little difference as round-off of the predictions may make.
+One rejected step of this size is enough."""
 
 _REJECTED_ON_LINE = 40
 """The same for a line search that halves: it does not know the scale to begin with."""
-
-_EPS = 2 * float(np.finfo(float).eps)
 
 _FLAT = 1e-3
 """Length of an undamped step in standard errors below which a loss that no longer decreases is at
@@ -136,7 +137,7 @@ _kept = functools.lru_cache(maxsize=64)(_state)
 
 
 @eqx.filter_jit
-def _advance(solver: Any, z: Array, known: tuple[Array, Array], state: Any) -> tuple[Array, Any]:
+def _advance(solver: Any, z: Array, known: tuple[Any, Any], state: Any) -> tuple[Array, Any]:
     z, state, _ = solver.step(_function, z, known, {}, state, frozenset())
     return z, state
 
@@ -215,7 +216,7 @@ class LeastSquaresStage:
                 *map(_leaves, (state, extra)),
             )
             u = at.u
-            least = max(tolerance * spread, _EPS * at.reach)
+            least = tolerance * spread
             if accepted:  # at a bound the free variable grows for ever, and nothing changes
                 at.still = at.still + 1 if at.last - loss <= (tolerance * spread) ** 2 else 0
                 at.last = loss
@@ -228,11 +229,7 @@ class LeastSquaresStage:
             elif (
                 at.rejected >= _REJECTED
                 or (at.rejected >= 3 and moved <= least)
-                or (
-                    at.rejected
-                    and _is_near(at, moved, spread)
-                    and undamped(best, scale)[1] <= 2 * moved
-                )
+                or (_is_near(at, moved, spread) and undamped(best, scale)[1] <= 2 * moved)
             ):
                 at.status = "stalled"
             in_sigma = moved / spread if spread else 0.0
@@ -240,8 +237,10 @@ class LeastSquaresStage:
         status = at.status or "max_steps_reached"
         if status == "stalled" and horizon == np.inf:  # of a part of the data it does not matter
             spread = float(np.linalg.norm(best.residual)) / np.sqrt(max(degrees, 1))
-            flat = max(_FLAT * spread, _EPS * at.reach)
-            end = settle(lambda u: self.at(u, horizon, extra), u, best, scale, flat)
+            flat = _FLAT * spread
+            end = settle(
+                lambda u: self.at(u, horizon, extra), u, best, scale, flat, _SMALL * at.reach
+            )
             if end is not None:
                 u, best, self.shifts = end
                 status = "converged"
@@ -250,10 +249,8 @@ class LeastSquaresStage:
 
 def _is_near(at: Position, moved: float, spread: float) -> bool:
     """Whether a rejected step is small enough for round-off to be the likely cause."""
-    return any(
-        at.rejected >= count and moved <= max(part * spread, relative * at.reach)
-        for count, (part, relative) in _NEAR.items()
-    )
+    is_near = at.rejected >= _REJECTED // 3 and moved <= _NEAR * spread
+    return is_near or (at.rejected > 0 and moved <= _SMALL * at.reach)
 
 
 def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
@@ -351,7 +348,7 @@ class ScalarStage:
         return np.asarray(base + size * z), getattr(FIT_RESULTS, at.status or usual)
 
 
-def _check_same(now: Array, then: Array) -> None:
+def _check_same(now: Any, then: Any) -> None:
     """Refuse a checkpoint whose residuals are not those of this model."""
     if not np.allclose(now, then, rtol=1e-6, atol=1e-6 * float(np.abs(then).max(initial=0.0))):
         raise ValueError(

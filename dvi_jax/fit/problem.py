@@ -238,6 +238,19 @@ class Problem:
         """Observed values and priors minus parameters."""
         return self.count + self.space.count_of_priors - self.size
 
+    def start_in_words(self) -> str:
+        """``initial state at t0 = 0: q0 fitted, p0 of the model``."""
+        times = np.array([arc.t0 for arc in self.given])
+        when = f"t0 = {times.min():g}" + (f" to {times.max():g}" if np.ptp(times) else "")
+        if all(arc.t0 == arc.ts[0] for arc in self.given):
+            when += " (the first observation)"
+        own = {name.split("[")[0] for name in self.space.names}
+        by = [
+            f"{n} {'fitted' if n in own and isinstance(self.core.model, Model) else 'of the model'}"
+            for n in ("q0", "p0")
+        ]
+        return f"initial state at {when}: {', '.join(by)}"
+
     def check_count(self) -> None:
         """**Raises** `ValueError` for fewer observed values than parameters."""
         if self.degrees_of_freedom < 0:

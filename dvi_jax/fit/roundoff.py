@@ -17,14 +17,15 @@ from .evaluation import Evaluation, undamped
 _STEPS = 4
 """Undamped steps, each of which is a sample of the round-off."""
 
-_WORSE = 100.0
-"""Factor by which round-off may change Σ r² where the residuals are round-off themselves."""
+_WORSE = 2.0
+"""Factor by which a step may increase the residuals, `small` changes apart: of residuals that are
+round-off themselves, those of the first point are the smallest by chance."""
 
-_ABOVE = 10.0
+_ABOVE = 30.0
 """Size of the steps, over that of the round-off, that must change the predictions linearly."""
 
 _LINEAR = 0.3
-"""Relative error of the derivative allowed there. A sample of the round-off has 0.1 of it."""
+"""Relative error of the derivative allowed there. That of a sample of the round-off is 0.03."""
 
 
 class End(NamedTuple):
@@ -42,22 +43,23 @@ def settle(
     at: Evaluation,
     scale: np.ndarray,
     flat: float,
+    small: float,
 ) -> End | None:
     """The minimum near u, or None if the fit is stuck elsewhere.
 
     - `at`: the evaluation at u. `scale`: of u. `flat`: change of the predictions by the undamped
-      step below which the gradient is zero.
+      step below which the gradient is zero. `small`: one that round-off may cause.
 
-    The steps are samples of the round-off if the predictions are linear in u over ten times their
-    size: there an undamped step leads to the minimum if it is not for round-off. Steps that do not
-    end because of a wrong derivative, a kink or a chaotic trajectory are not linear.
+    The steps are samples of the round-off if the predictions are linear in u over thirty times
+    their size: there an undamped step leads to the minimum but for round-off. With a wrong
+    derivative, a kink or a chaotic trajectory they are not linear.
     """
-    limit, (step, size) = _WORSE * _square(at), undamped(at, scale)
+    limit, (step, size) = _WORSE * _norm(at) + small, undamped(at, scale)
     points, shifts = [(size, u, at)], []
     while size > flat and len(shifts) < _STEPS:
         u = u + step
         at = evaluate(u)
-        if not (_square(at) <= limit and np.isfinite(at.jacobian).all()):
+        if not (_norm(at) <= limit and np.isfinite(at.jacobian).all()):
             return None
         step, size = undamped(at, scale)
         points.append((size, u, at))
@@ -77,5 +79,5 @@ def settle(
     return End(u, at, np.array(shifts))
 
 
-def _square(at: Evaluation) -> float:
-    return float(np.sum(np.square(at.residual)))
+def _norm(at: Evaluation) -> float:
+    return float(np.linalg.norm(at.residual))
