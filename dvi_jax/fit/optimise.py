@@ -20,12 +20,12 @@ from .uncertainty import inverse_or
 _REJECTED = 12
 """Rejected steps in a row after which no further step is expected to help."""
 
-_NEAR = 0.1
-"""Size in standard errors below which a third of them are enough, if damping is not the reason."""
+_NEAR = 1.0
+"""Length of an undamped step in standard errors up to which a third of them are enough."""
 
 _SMALL = 1e-13
 """Relative change of u that makes as little difference as round-off of the predictions may make.
-One rejected step of this size is enough."""
+Where an undamped step is not larger, one rejected step is enough."""
 
 _REJECTED_ON_LINE = 40
 """The same for a line search that halves: it does not know the scale to begin with."""
@@ -229,7 +229,7 @@ class LeastSquaresStage:
             elif (
                 at.rejected >= _REJECTED
                 or (at.rejected >= 3 and moved <= least)
-                or (_is_near(at, moved, spread) and undamped(best, scale)[1] <= 2 * moved)
+                or (at.rejected and _is_near(at, undamped(best, scale)[1], spread))
             ):
                 at.status = "stalled"
             in_sigma = moved / spread if spread else 0.0
@@ -247,10 +247,10 @@ class LeastSquaresStage:
         return u, best, getattr(FIT_RESULTS, status)
 
 
-def _is_near(at: Position, moved: float, spread: float) -> bool:
-    """Whether a rejected step is small enough for round-off to be the likely cause."""
-    is_near = at.rejected >= _REJECTED // 3 and moved <= _NEAR * spread
-    return is_near or (at.rejected > 0 and moved <= _SMALL * at.reach)
+def _is_near(at: Position, size: float, spread: float) -> bool:
+    """Whether the undamped step is small enough for round-off to be why steps are rejected."""
+    few = at.rejected >= _REJECTED // 3
+    return size <= max(_NEAR * spread * few, _SMALL * at.reach)
 
 
 def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
