@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-import optimistix as optx
 
 import dvi_jax as dvi
 from dvi_jax import plot
@@ -114,17 +113,7 @@ def century(J2=0.0, conservative=False, method=dvi.GaussLegendre(8), h=10.0):
 
 def fitted(name, model, data, params):
     """The fit of one stage."""
-    fit = dvi.fit(
-        model,
-        data,
-        params,
-        # Nearly linear in the parameters: steps without damping, until only the last digit of the
-        # start changes, which is half a metre of Mercury in a century.
-        optimiser=optx.Dogleg(rtol=1e-14, atol=1e-300),
-        tolerance=0.9,
-        max_steps=8,
-        check_curvature=False,
-    )
+    fit = dvi.fit(model, data, params, check_curvature=False)
     known = "epsilon" in params
     off = fit.residuals[0] * METRES
     q, v, advance = orbit(model, fit.params, len(data.ts))

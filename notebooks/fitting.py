@@ -52,7 +52,7 @@ def friction(t0, t1, q0, p1, args):
 
 
 system = dvi.System(H_D, force=friction)
-model = dvi.Model(system, h=0.05, p0=[0.0], method=dvi.Yoshida(4))
+model = dvi.Model(system, h=0.05, p0=[0.0], epsilon=0.0, method=dvi.Yoshida(4))
 guess = {"epsilon": 0.0, "q0": np.array([0.9]), "args": {"k": 1.2}}
 found = dvi.fit(model, observed(0), guess, progress=False)
 for name, x, sigma in zip(found.names, found.x, found.sigma, strict=True):

@@ -104,8 +104,8 @@ class InvariantSeries(eqx.Module):
         return np.abs(c if self.sizes is None else c * np.asarray(self.sizes))
 
     def formula(self, terms: int | None = None, drop: float = _DROP, digits: int = 6) -> str:
-        """The series as text: at each order at most so many terms, all above a fraction `drop`, with
-        at most so many digits, and no more than their errors leave.
+        """The series as text: at each order at most so many terms, all above a fraction `drop`,
+        with at most so many digits, and no more than their errors leave.
 
         The number of terms left out is printed, unless they are round-off.
         """
