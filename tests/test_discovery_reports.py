@@ -92,7 +92,7 @@ def test_rounding_is_removed_and_small_terms_are_not():
 def test_closed_forms_are_recognised_to_all_digits_only(value, text):
     assert closed_form(value, 1e-13) == text
     assert closed_form(value * (1 + 1e-9), 1e-13) is None
-    assert closed_form(value, 1e-2 * value) is None  # too few digits to tell
+    assert closed_form(value, 1e-2 * value) is None  # too few digits to decide
 
 
 @pytest.mark.parametrize("error", [1e-14, 1e-11, 1e-8, 1e-5, 1e-3])
