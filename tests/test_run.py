@@ -385,7 +385,7 @@ def test_systems_are_listed_and_described():
     _, tables = library_tables("magnetic_mirror")  # a terminal folds its lines
     kinds = {row[0]: row[1] for row in tables[1].rows}
     assert kinds["corrected_moment"] == "adiabatic: oscillates by gyroradius over ℓ to power 2"
-    assert kinds["energy"] == "conserved exactly at ε = 0"
+    assert kinds["energy"] == "conserved by the unperturbed flow"
     refuses(command("systems", "magnetic_miror"), "NAME: ", "did you mean magnetic_mirror?")
 
 
