@@ -507,9 +507,11 @@ def test_a_surface_shows_zeros_failures_and_limits():
     mine = plt.subplots(1, 2, layout="constrained", figsize=(10, 4))[1]
     plot.drift_surface(surface(np.nan), promised=1, ax=mine)
     mine[0].figure.canvas.draw()
-    for axis in mine:
-        inside, box = axis.get_legend().get_window_extent(), axis.get_window_extent()
-        assert box.y0 <= inside.y0 < inside.y1 <= box.y1
+    (below, map_box), (inside, box) = (
+        (axis.get_legend().get_window_extent(), axis.get_window_extent()) for axis in mine
+    )
+    assert 0 <= below.y0 < below.y1 < map_box.y0  # a map fills its axes: its legend is below them
+    assert box.y0 <= inside.y0 < inside.y1 <= box.y1
     plt.close("all")
 
 
