@@ -25,7 +25,8 @@ extensions = [
     "pictures",
 ]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
-exclude_patterns = ["_build", "_static", "_ext"]
+# The reference has the examples, each in its entry.
+exclude_patterns = ["_build", "_static", "_ext", "examples.md"]
 templates_path = ["_templates"]
 nitpicky = True
 # Types in signatures are links where the reference has them, and plain text elsewhere.

@@ -24,8 +24,8 @@ BLOCK = re.compile(
     r"^(?:<!-- not run by the tests: (?P<reason>.+?) -->\n)?```python\n(?P<code>.*?)^```",
     re.S | re.M,
 )
-ELSEWHERE = {"sweeps", "fitting", "chaos", "certificate"}
-"""Pages that tests/test_readme.py and tests/test_certify.py run, and whose numbers they check."""
+ELSEWHERE = {"sweeps", "fitting", "chaos", "certificate", "examples"}
+"""Pages that test_readme.py, test_certify.py and test_docstrings.py run, with their numbers."""
 
 
 def examples(page):

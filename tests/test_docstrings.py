@@ -1,27 +1,41 @@
-"""The examples in docstrings run, and print the output that is shown below them."""
+"""The examples in docstrings and in docs/examples.md run, and print what they show."""
 
 import ast
 import contextlib
 import inspect
 import io
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import dvi_jax as dvi
-from dvi_jax import _namespaces, systems
+from dvi_jax import _namespaces, plot, systems
 
-BLOCK = re.compile(r"^```python\n(.*?)^```", re.S | re.M)
+sys.path.insert(0, str(Path(__file__).parents[1] / "docs/_ext"))
+import examples
 
-EXAMPLES = {
-    name: BLOCK.findall(inspect.getdoc(getattr(dvi, name)) or "")
+sys.path.pop(0)
+
+KNOWN = {"jax": jax, "jnp": jnp, "np": np, "dvi": dvi, "systems": systems, "plot": plot}
+PAGE = examples.page()
+
+DOCSTRINGS = {
+    f"dvi.{name}": examples.BLOCK.findall(inspect.getdoc(getattr(dvi, name)) or "")
     for name in _namespaces.names()
     if inspect.isclass(getattr(dvi, name)) or inspect.isfunction(getattr(dvi, name))
 }
-EXAMPLES = {name: blocks for name, blocks in EXAMPLES.items() if blocks}
+DOCSTRINGS = {name: blocks for name, blocks in DOCSTRINGS.items() if blocks}
+
+FAST = ("dvi.Given", "generators.rotation", "plot.orbit")
+OWN_PROCESS = ("dvi.configure_cpu",)
+"""Examples that have to run before JAX starts."""
 
 
 def wanted(code):
@@ -34,25 +48,128 @@ def agrees(printed, expected):
     return re.fullmatch(".*".join(map(re.escape, expected.split("…"))), printed, re.S) is not None
 
 
+def run(code, known):
+    """What an example prints; it sees `known` alone."""
+    assert any(isinstance(x, ast.Call) for x in ast.walk(ast.parse(code)))
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        exec(code, dict(known))
+    return out.getvalue().rstrip("\n")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("name", DOCSTRINGS)
 def test_it_runs_and_prints_what_it_says(name):
-    for code in EXAMPLES[name]:
-        assert any(isinstance(x, ast.Call) for x in ast.walk(ast.parse(code)))
+    for code in DOCSTRINGS[name]:
         assert wanted(code), "an example ends with what it prints, as a comment below"
-        out = io.StringIO()
-        with contextlib.redirect_stdout(out):
-            exec(code, {"jax": jax, "jnp": jnp, "np": np, "dvi": dvi, "systems": systems})
-        assert agrees(out.getvalue().rstrip("\n"), wanted(code)), out.getvalue()
+        printed = run(code, KNOWN)
+        assert agrees(printed, wanted(code)), printed
 
 
-def test_what_people_call_first_has_an_example():
+@pytest.fixture(scope="module")
+def known():
+    """code → the names that it may use: those of the imports, and of the lines that the reference
+    shows before it. Each of these lines is executed once."""
+    made = {}
+
+    def names(code):
+        seen = dict(KNOWN)
+        for statement in PAGE.lines_before(code):
+            if statement not in made:
+                after = dict(seen)
+                exec(statement, after)
+                made[statement] = {x: after[x] for x in after.keys() - seen.keys()}
+            seen |= made[statement]
+        return seen
+
+    return names
+
+
+@pytest.mark.filterwarnings("error::FutureWarning", "error::UserWarning")
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[] if n in FAST else pytest.mark.slow) for n in PAGE.code]
+)
+def test_the_example_of_the_page_prints_what_it_says(name, known, tmp_path, monkeypatch):
+    code = PAGE.code[name]
+    for package in re.findall(r"^(?:import|from) (diffrax|rebound|astropy)\b", code, re.M):
+        pytest.importorskip(package)
+    monkeypatch.chdir(tmp_path)
+    plt.switch_backend("Agg")
+    if name in OWN_PROCESS:
+        alone = [sys.executable, "-c", PAGE.imports + code]
+        printed = subprocess.run(alone, capture_output=True, text=True, check=True).stdout.rstrip()
+    else:
+        printed = run(code, known(code))
+    figures = [plt.figure(number) for number in plt.get_fignums()]
+    plt.close("all")
+    assert wanted(code) or any(axis.has_data() for f in figures for axis in f.axes)
+    assert agrees(printed, wanted(code)), printed
+
+
+def test_an_example_sees_the_names_that_the_reference_shows_and_no_others(known):
+    assert [x.split(" =")[0] for x in PAGE.lines_before("print(fitted)")] == [
+        *("elastic", "model", "ts", "noise", "data", "fitted")
+    ]
+    assert run("print(spring is not None)", known("spring")) == "True"
+    with pytest.raises(NameError, match="spring"):
+        run("print(spring)", known("x"))
+
+
+def without(things, page):
+    """Names of the reference that a user calls, and that have no example."""
+    left = []
+    for name, thing in things.items():
+        is_class = inspect.isclass(thing)
+        made_by_others = is_class and (
+            issubclass(thing, BaseException) or hasattr(thing, "_name_to_item")
+        )
+        is_there = "```python" in (inspect.getdoc(thing) or "")
+        if not (made_by_others or is_there or name in page.code or name in page.origins):
+            left.append(name)
+    return left
+
+
+@pytest.fixture(scope="module")
+def entries():
+    """Name → thing, of the whole reference except for the library of systems."""
+    pytest.importorskip("sphinx")
+    sys.path.insert(0, str(Path(examples.__file__).parent))
+    try:
+        import reference
+    finally:
+        sys.path.pop(0)
+    pages = reference.entries()
+    del pages["systems"]
+    return {shown: thing for page in pages.values() for shown, thing in page.values()}
+
+
+def test_every_name_that_a_user_calls_has_an_example(entries):
+    assert without(entries, PAGE) == []
+    code = {name: text for name, text in PAGE.code.items() if name != "plot.orbit"}
+    assert without(entries, PAGE._replace(code=code)) == ["plot.orbit"]
+    assert without({"dvi.planted": lambda x: x}, PAGE) == ["dvi.planted"]
+
+
+def test_the_page_has_each_name_once_and_no_others(entries):
+    """An entry with an example in its docstring keeps that; an object that users do not make is a
+    class, whose entry names a function or a class that is in the reference."""
+    listed = [*DOCSTRINGS, *PAGE.code, *PAGE.origins]
+    assert len(listed) == len(set(listed)) > 200
+    assert set(listed) - set(entries) == {"systems", "plot"}
+    for name, origin in PAGE.origins.items():
+        assert inspect.isclass(entries[name]), name
+        found = re.findall(r"`((?:dvi|interop|starts|lanewise)\.\w+)`", origin)
+        assert found or "all generated" in origin, name
+        assert set(found) <= set(entries), name
+
+
+def test_what_people_call_first_has_an_example_in_its_docstring():
     first = {
         "System", "discretise", "integrate", "Save", "MaxDrift", "Section", "Stop", "MEGNO",
         "find_symmetries", "discover_invariants", "drift_order", "noether_balance", "sweep", "fit",
         "poincare_section", "frequencies", "over_threads",
     }  # fmt: skip
-    assert first <= set(EXAMPLES)
+    assert {f"dvi.{name}" for name in first} <= set(DOCSTRINGS)
 
 
 def test_a_wrong_number_is_seen():

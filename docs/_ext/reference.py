@@ -1,8 +1,9 @@
 """The reference, from the docstrings: a page for each package.
 
 The docstrings are Markdown, which Sphinx's own autodoc does not read; here each public name becomes
-a `py:function` or `py:class` of MyST with its docstring inside. A name in code font anywhere in the
-documentation, such as ``dvi.Save``, leads to its entry.
+a `py:function` or `py:class` of MyST with its docstring inside, and with its example of
+docs/examples.md. A name in code font anywhere in the documentation, such as ``dvi.Save``, leads to
+its entry.
 """
 
 import dataclasses
@@ -22,6 +23,7 @@ from sphinx.transforms.post_transforms import SphinxPostTransform
 from sphinx.util.docutils import SphinxDirective
 
 import dvi_jax
+import examples
 import lanewise
 from dvi_jax._namespaces import SHORT, names
 from dvi_jax.paper.equations import EQUATIONS
@@ -220,6 +222,7 @@ def _entry(full: str, shown: str, thing: Any) -> str:
         arguments, body = "", "Statuses of a result, and what they say.\n\n" + table
     module, _, name = full.rpartition(".")
     lines = [f":::::{{py:{kind}}} {name}{arguments}", f":module: {module}", "", body, ""]
+    lines += [examples.page().markdown(shown), ""]
     if kind == "class" and not table:
         for what, member_name, member in _class_members(thing):
             extra = "" if what == "property" else signature(member)
@@ -255,6 +258,10 @@ def _table(listed: Iterable[tuple[str, Any]]) -> list[str]:
     return ["| name | summary |", "| --- | --- |", *rows, ""]
 
 
+AFTER = "The examples run after [these lines](index.md#examples)."
+"""Above the table of each page."""
+
+
 def write(folder: Path) -> None:
     """The pages of the reference, as Markdown; a page that did not change is not written again."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -263,21 +270,20 @@ def write(folder: Path) -> None:
     for page, title in TITLES.items():
         if not found[page]:
             continue
-        parts = [f"# {title}", "", *_table(found[page].values())]
+        parts = [f"# {title}", "", AFTER, "", examples.page().markdown(page), ""]
+        parts += _table(found[page].values())
         parts += [_entry(full, *rest) for full, rest in found[page].items()]
         pages[page] = "\n".join(parts)
     index = [
         "# Reference",
         "",
         "Every public class and function, from its docstring. The names that are used most are "
-        "first on each page. The examples run after these lines:",
+        "first on each page.",
         "",
-        "```python",
-        "import jax, jax.numpy as jnp, numpy as np",
-        'jax.config.update("jax_enable_x64", True)',
-        "import dvi_jax as dvi",
-        "from dvi_jax import systems",
-        "```",
+        "(examples)=",
+        "The examples run after these lines:",
+        "",
+        f"```python\n{examples.page().imports}```",
         "",
     ]
     index += ["```{toctree}", ":hidden:", "", *pages, "```", ""]
