@@ -18,16 +18,14 @@ import pytest
 import dvi_jax as dvi
 from dvi_jax import _namespaces, plot, systems
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "docs/_ext"))
-import examples
-
-sys.path.pop(0)
+sys.path.append(str(Path(__file__).parents[1] / "docs/_ext"))
+import usage
 
 KNOWN = {"jax": jax, "jnp": jnp, "np": np, "dvi": dvi, "systems": systems, "plot": plot}
-PAGE = examples.page()
+PAGE = usage.page()
 
 DOCSTRINGS = {
-    f"dvi.{name}": examples.BLOCK.findall(inspect.getdoc(getattr(dvi, name)) or "")
+    f"dvi.{name}": usage.BLOCK.findall(inspect.getdoc(getattr(dvi, name)) or "")
     for name in _namespaces.names()
     if inspect.isclass(getattr(dvi, name)) or inspect.isfunction(getattr(dvi, name))
 }
@@ -57,7 +55,11 @@ def run(code, known):
     return out.getvalue().rstrip("\n")
 
 
+WITHOUT_WARNINGS = pytest.mark.filterwarnings("error::FutureWarning", "error::UserWarning")
+
+
 @pytest.mark.slow
+@WITHOUT_WARNINGS
 @pytest.mark.parametrize("name", DOCSTRINGS)
 def test_it_runs_and_prints_what_it_says(name):
     for code in DOCSTRINGS[name]:
@@ -85,7 +87,7 @@ def known():
     return names
 
 
-@pytest.mark.filterwarnings("error::FutureWarning", "error::UserWarning")
+@WITHOUT_WARNINGS
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=[] if n in FAST else pytest.mark.slow) for n in PAGE.code]
 )
@@ -133,11 +135,8 @@ def without(things, page):
 def entries():
     """Name → thing, of the whole reference except for the library of systems."""
     pytest.importorskip("sphinx")
-    sys.path.insert(0, str(Path(examples.__file__).parent))
-    try:
-        import reference
-    finally:
-        sys.path.pop(0)
+    import reference
+
     pages = reference.entries()
     del pages["systems"]
     return {shown: thing for page in pages.values() for shown, thing in page.values()}
@@ -161,6 +160,19 @@ def test_the_page_has_each_name_once_and_no_others(entries):
         found = re.findall(r"`((?:dvi|interop|starts|lanewise)\.\w+)`", origin)
         assert found or "all generated" in origin, name
         assert set(found) <= set(entries), name
+
+
+def test_the_reference_shows_the_example_once_with_the_lines_that_it_needs(entries):
+    import reference
+
+    def shown(name):
+        return reference._entry(name.replace("dvi.", "dvi_jax."), name, entries[name])
+
+    assert "\nkepler = systems.kepler()\norbit = dvi.integrate(" in shown("plot.orbit")
+    assert PAGE.code["plot.orbit"] in shown("plot.orbit")
+    assert "Returned by `dvi.fit`." in shown("dvi.FitResult")
+    for name in ("plot.orbit", "dvi.Save"):
+        assert shown(name).count("**Example**") == 1
 
 
 def test_what_people_call_first_has_an_example_in_its_docstring():

@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import usage
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.transforms.post_transforms import SphinxPostTransform
 from sphinx.util.docutils import SphinxDirective
 
 import dvi_jax
-import examples
 import lanewise
 from dvi_jax._namespaces import SHORT, names
 from dvi_jax.paper.equations import EQUATIONS
@@ -222,7 +222,7 @@ def _entry(full: str, shown: str, thing: Any) -> str:
         arguments, body = "", "Statuses of a result, and what they say.\n\n" + table
     module, _, name = full.rpartition(".")
     lines = [f":::::{{py:{kind}}} {name}{arguments}", f":module: {module}", "", body, ""]
-    lines += [examples.page().markdown(shown), ""]
+    lines += [usage.page().markdown(shown), ""]
     if kind == "class" and not table:
         for what, member_name, member in _class_members(thing):
             extra = "" if what == "property" else signature(member)
@@ -270,7 +270,7 @@ def write(folder: Path) -> None:
     for page, title in TITLES.items():
         if not found[page]:
             continue
-        parts = [f"# {title}", "", AFTER, "", examples.page().markdown(page), ""]
+        parts = [f"# {title}", "", AFTER, "", usage.page().markdown(page), ""]
         parts += _table(found[page].values())
         parts += [_entry(full, *rest) for full, rest in found[page].items()]
         pages[page] = "\n".join(parts)
@@ -283,7 +283,7 @@ def write(folder: Path) -> None:
         "(examples)=",
         "The examples run after these lines:",
         "",
-        f"```python\n{examples.page().imports}```",
+        f"```python\n{usage.page().imports}```",
         "",
     ]
     index += ["```{toctree}", ":hidden:", "", *pages, "```", ""]

@@ -170,7 +170,7 @@ def poincare_section(
     heiles = systems.henon_heiles()
     q0, p0 = np.array([[0.0, 0.1], [0.0, 0.2]]), np.array([[0.3, 0.0], [0.25, 0.1]])
     found = dvi.poincare_section(heiles.system, q0, p0, lambda t, q, p, args: q[0], h=0.1,
-                                 num_steps=2000, crossings=25)
+                                 num_steps=2000, crossings=25, method=dvi.Strang())
     print(found.qs.shape, bool(np.all(np.abs(found.qs[..., 0]) < 1e-12)))
     # (2, 25, 2) True
     ```
