@@ -184,7 +184,7 @@ def observed(**observe):
         ({"lattice": dvi.Given([0.0, 0.1]), "h": None, "num_steps": None}, "replace h, t0 and num"),
         ({"lattice": dvi.Given([0.0, 0.1]), "t0": 0.0, "epsilon": [0.0, 0.1]}, "replace h, t0"),
         ({"start": dvi.starts.Random(4, ([0.0], [0.0]), ([1.0], [1.0]))}, "give either q0 and p0"),
-        ({"q0": None, "p0": None, "start": Constant(1.0, name="t0")}, "also that of an axis"),
+        ({"q0": None, "p0": None, "start": Constant(1.0, name="t0")}, "have the same name"),
         ({"q0": None, "p0": None, "start": Constant(1.0, name="a/b")}, "identifier"),
     ],
 )  # fmt: skip
