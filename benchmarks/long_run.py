@@ -101,7 +101,7 @@ def cases():
     start = draw(0.8, 1.2, one) * np.array([1.0, 0.0]), draw(0.9, 1.1, one) * np.array([0.0, 1.0])
     h = 2.0**-5
     return {
-        "cubic oscillator, E, TypeII": Case(
+        "Energy of a cubic oscillator, TypeII": Case(
             dvi.System(cubic),
             dvi.TypeII(),
             h,
@@ -111,7 +111,7 @@ def cases():
             cubic_energy,
             2.0**-52,
         ),
-        "Kepler, L, Strang": Case(
+        "Angular momentum, Kepler, Strang": Case(
             kepler.system,
             dvi.Strang(),
             2.0**-6,
@@ -120,7 +120,7 @@ def cases():
             kepler.observables["angular_momentum"],
             2.0**-51,
         ),
-        "Kepler, H, KahanLi(8)": Case(
+        "Energy, Kepler, KahanLi(8)": Case(
             kepler.system,
             dvi.KahanLi(8),
             2.0**-6,
@@ -223,7 +223,7 @@ def print_cost(case, num_steps=20_000):
 def print_mean_errors(num_steps):
     """The mean error over 200 starts: systematic or not, for several h."""
     draw = np.random.default_rng(1).uniform
-    base = cases()["cubic oscillator, E, TypeII"]
+    base = cases()["Energy of a cubic oscillator, TypeII"]
     print(f"mean error of E over 200 starts after {num_steps} steps, in standard errors:")
     for h in (2.0**-5, 2.0**-4, 0.05, 0.1):
         case = base._replace(h=h, args=h, q=draw(0.5, 1, (200, 1)), p=draw(-0.5, 0.5, (200, 1)))
@@ -249,9 +249,9 @@ def picture(curves, path):
             guide = rms[-1] * 10 * np.sqrt(steps / steps[-1])
             axis.loglog(steps, guide, color="0.6", linewidth=1, label="$\\sqrt{N}$")
             axis.set_title(title)
-            axis.set_xlabel("steps N")
+            axis.set_xlabel("number N of steps")
             axis.legend()
-        axes[0].set_ylabel("rms relative error")
+        axes[0].set_ylabel(f"rms relative error of {STARTS} runs")
         plot.save(figure, path)
 
 

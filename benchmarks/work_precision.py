@@ -31,7 +31,7 @@ between two interruptions by other work. In each round, and in another order eac
 the least of LEAST or of as many as fit into TAKEN seconds, divided by the least of the same for
 `Strang` with REFERENCE_STEPS steps, right before it; the median over rounds is shown.
 
-Run: python benchmarks/work_precision.py --out DIR
+Run: python benchmarks/work_precision.py --out DIR [--redraw]
 """
 
 import argparse
@@ -48,6 +48,8 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from PIL import Image
 from scipy.integrate import solve_ivp
 
@@ -462,6 +464,16 @@ def write_csv(path: Path, points: list[Point]) -> None:
         writer.writerows(points)
 
 
+def read_csv(path: Path) -> list[Point]:
+    """The points that `write_csv` wrote."""
+    kinds = Point.__annotations__
+    with path.open(newline="", encoding="utf-8") as file:
+        return [
+            Point(**{name: kinds[name](text) for name, text in row.items()})
+            for row in csv.DictReader(file)
+        ]
+
+
 # Pictures
 
 STYLES = {
@@ -479,16 +491,23 @@ STYLES = {
 }
 """Colour (Okabe & Ito, and a violet) and marker of each family."""
 
+BEST: dict[str, Any] = {"color": "0.8", "lw": 5, "solid_capstyle": "round"}
+SLOPE: dict[str, Any] = {"color": "0.3", "lw": 1, "ls": ":"}
+SHADED = "0.92"
+
 GROUPS = {"order 1 and 2": (1, 2), "order 4": (4,), "order 6": (6,), "order 8": (8,)}
 
 
-def picture(points: list[Point], truth: Reference) -> plt.Figure:
+def picture(points: list[Point], floor: float) -> plt.Figure:
     """Error against evaluations (above) and time (below), one column for each order.
 
     In grey the best of all methods at each work, in every panel the same; dotted the slope of the
-    order; the floor of the reference shaded.
+    order; errors below that of the reference, `floor`, shaded.
     """
-    axes_of = {"evaluations": "evaluations of ∇H", "time": f"time / {REFERENCE}({REFERENCE_STEPS})"}
+    axes_of = {
+        "evaluations": "evaluations of ∇H",
+        "time": f"time [{REFERENCE_STEPS} steps of {REFERENCE}]",
+    }
     has_time = any(not math.isnan(p.time) for p in points)
     rows = list(axes_of)[: 2 if has_time else 1]
     figure, axes = plt.subplots(
@@ -502,10 +521,10 @@ def picture(points: list[Point], truth: Reference) -> plt.Figure:
         layout="constrained",
     )
     for of, row in zip(rows, axes, strict=True):
-        best = envelope([p for p in points if p.error > truth.floor], of)
+        best = envelope([p for p in points if p.error > floor], of)
         for (title, orders), ax in zip(GROUPS.items(), row, strict=True):
             inside = [p for p in points if p.order in orders]
-            ax.loglog(*best, color="0.8", lw=5, solid_capstyle="round", zorder=1)
+            ax.loglog(*best, **BEST, zorder=1)
             for method in dict.fromkeys(p.method for p in inside):
                 mine = [p for p in inside if p.method == method]
                 colour, marker = STYLES[method.rstrip("0123456789")]
@@ -518,7 +537,7 @@ def picture(points: list[Point], truth: Reference) -> plt.Figure:
                     lw=1.3,
                     label=method.replace("LobattoIIIAIIIB", "Lobatto "),
                 )
-            ax.axhspan(1e-16, truth.floor, color="0.92", zorder=-1)
+            ax.axhspan(1e-16, floor, color=SHADED, zorder=-1)
             if of == "evaluations":
                 ax.set_title(title, fontsize=10, loc="left")
                 for order in orders:
@@ -530,15 +549,15 @@ def picture(points: list[Point], truth: Reference) -> plt.Figure:
                 ax.legend(fontsize=7, frameon=False, loc="lower left", handlelength=1.8)
             ax.spines[["top", "right"]].set_visible(False)
         row[0].set_ylabel("relative error at the end")
-    axes[0, 0].set_ylim(truth.floor / 8, 1)
+    axes[0, 0].set_ylim(floor / 8, 1)
     title = PROBLEMS[points[0].problem]().title
-    figure.suptitle(
-        f"{title}.  Wide grey: the best of all methods. Dotted: slope of the order. "
-        "Shaded: below what the reference is known to.",
-        fontsize=10,
-        x=0.01,
-        ha="left",
-    )
+    figure.suptitle(f"Error against work: {title}", fontsize=11, weight="bold", x=0.01, ha="left")
+    entries = [
+        Line2D([], [], label="best of all methods", **BEST),
+        Line2D([], [], label="slope of the order", **SLOPE),
+        Patch(label="below the error of the reference solution", color=SHADED),
+    ]
+    figure.legend(handles=entries, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     return figure
 
 
@@ -558,7 +577,7 @@ def guide(ax, points, order):
         return
     right = max(mine, key=lambda p: p.evaluations)
     x = right.evaluations * np.array([0.25, 1.0]) * 2
-    ax.loglog(x, right.error * (x / right.evaluations / 2) ** -order, ":", color="0.3", lw=1)
+    ax.loglog(x, right.error * (x / right.evaluations / 2) ** -order, **SLOPE)
     ax.annotate(
         f" {order}", (x[1], right.error), fontsize=8, color="0.3", va="center", annotation_clip=True
     )
@@ -589,6 +608,9 @@ def main(words=None):
     parser.add_argument("--out", type=Path, required=True, help="folder for tables and pictures")
     parser.add_argument("--problem", choices=PROBLEMS, action="append", help="only this (repeat)")
     parser.add_argument("--method", choices=METHODS, action="append", help="only this (repeat)")
+    parser.add_argument(
+        "--redraw", action="store_true", help="measure nothing, take the CSV file in the folder"
+    )
     parser.add_argument("--rounds", type=int, default=7, help="of timing; 0 for none (default 7)")
     parser.add_argument(
         "--quick", action="store_true", help="Hénon–Heiles, fewer steps, one round of timing"
@@ -602,16 +624,23 @@ def main(words=None):
     methods = [m for m in METHODS if options.method is None or m in options.method]
 
     options.out.mkdir(parents=True, exist_ok=True)
+    file = options.out / "work_precision.csv"
+    known = read_csv(file) if options.redraw else []
+    if options.redraw:
+        names = list(dict.fromkeys(point.problem for point in known))
     points: list[Point] = []
     floors = {}
     for name in names:
-        found, truth = measure(name, methods, work, rounds)
+        if options.redraw:
+            found, truth = [p for p in known if p.problem == name], reference(PROBLEMS[name]())
+        else:
+            found, truth = measure(name, methods, work, rounds)
         points += found
         floors[name] = truth.floor
-        figure = picture(found, truth)
+        figure = picture(found, truth.floor)
         save(figure, options.out / f"work_precision_{name}")
         plt.close(figure)
-    write_csv(options.out / "work_precision.csv", points)
+    write_csv(file, points)
     text = table(points, floors)
     (options.out / "work_precision.md").write_text(text, encoding="utf-8")
     print(text)

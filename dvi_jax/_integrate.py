@@ -164,7 +164,8 @@ def integrate(
     instance("save", save, Save, "a dvi.Save(...)", _save_hint(save))
     instance("stop", stop, Stop | None, "a dvi.Stop(g)")
     q0, p0 = start_state(q0, p0)
-    observe = of_steps(observe)
+    if observe is not None:
+        observe = of_steps(observe)
     # A method of the class, here and below: equinox takes 20 µs to make a bound method of a module.
     kind = type(lattice)
     if t1 is not None or duration is not None:
@@ -207,9 +208,10 @@ def integrate(
             outcome = _in_pieces(task, plan, q0, p0, report, layout)
         solution = _solution(task, plan, asked.observe, outcome, q0, p0, layout)
     solution = undo(solution)
-    watched = jax.tree.leaves(observe, is_leaf=is_observable)
-    if save.ts is None and any(isinstance(f, OfState) for f in watched):
-        solution = _with_initial_values(solution, given, layout)
+    if observe is not None and save.ts is None:
+        watched = jax.tree.leaves(observe, is_leaf=is_observable)
+        if any(isinstance(f, OfState) for f in watched):
+            solution = _with_initial_values(solution, given, layout)
     return _raise_on_failure(solution, task) if throw else solution
 
 

@@ -54,7 +54,7 @@ app = typer.Typer(
     cls=Commands,
     help="Differentiable variational integrators for perturbed Hamiltonian systems.\n\n"
     "Exit codes: 0 done, 1 failed, 2 bad input, 130 Ctrl-C. Every command has --help with "
-    "examples, --json for programs, -v for what it does.",
+    "examples, --json for programs, -v for details.",
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
@@ -72,7 +72,7 @@ app = typer.Typer(
     ),
 )
 
-RUNS, INVERSE, CHECKING, START = "Trajectories", "From data", "Checks", "Start"
+RUNS, INVERSE, CHECKING, START = "Trajectories", "From data", "Checks", "Getting started"
 
 
 def _show_version(wanted: bool) -> None:

@@ -72,7 +72,7 @@ sweeps = typer.Typer(
     no_args_is_help=True,
     subcommand_metavar="CONFIG | status STORE | verify STORE",
     rich_markup_mode="rich",
-    help="Many trajectories: run the sweep of a TOML file, show the state of its store, verify it.",
+    help="Compute many trajectories: run the sweep of a TOML file, show or verify its store.",
 )
 app.add_typer(sweeps, name="sweep", rich_help_panel=RUNS)
 

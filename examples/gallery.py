@@ -41,7 +41,7 @@ def pendulum(out):
         hamiltonian=lambda q, p: jnp.sum(p**2) / 2 - jnp.sum(jnp.cos(q)),
         labels=[f"p$_0$ = {p:g}".replace("-", "−") for p in p0],
         units={"q": "rad"},
-        title="The pendulum",
+        title="Orbits of a pendulum",
     )
     return plot.save(axis, out / "phase_portrait.png")
 
@@ -58,11 +58,15 @@ def two_degrees(out):
         return plot.save(figure, out / "phase_planes.png")
 
 
-def eight():
-    """The figure eight, three turns."""
+def eight(num_steps=950):
+    """The figure eight, three turns unless `num_steps` differs."""
     problem = systems.figure_eight()
     return dvi.integrate(
-        problem, h=0.02, num_steps=950, method=dvi.Yoshida(4), observe=dict(problem.observables)
+        problem,
+        h=0.02,
+        num_steps=num_steps,
+        method=dvi.Yoshida(4),
+        observe=dict(problem.observables),
     )
 
 
@@ -83,7 +87,9 @@ def orbits(out):
             title="Perturbed Kepler orbits",
             ax=axes[0],
         )
-        plot.orbit(eight(), names=["A", "B", "C"], title="The figure eight", ax=axes[1])
+        # All three bodies go round on one curve: after a third of a turn the next would cover it.
+        title = "The figure eight, a third of a turn"
+        plot.orbit(eight(105), names=["A", "B", "C"], title=title, ax=axes[1])
         return plot.save(figure, out / "orbits.png")
 
 
@@ -235,7 +241,7 @@ def chaos(out):
         crossed,
         colour=np.log10(found["megno"][:, -1]),
         colour_label="log$_{10}$ MEGNO",
-        title="Hénon and Heiles, energy 1/8",
+        title="Section x = 0 of Hénon and Heiles, energy 1/8",
     )
     yield plot.save(axis, out / "section.png")
     few, t = [4, 20, 32, 44], np.asarray(sol.ts)[0, 1:]

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-import optimistix as optx
 
 import dvi_jax as dvi
 from dvi_jax import plot
@@ -114,17 +113,7 @@ def century(J2=0.0, conservative=False, method=dvi.GaussLegendre(8), h=10.0):
 
 def fitted(name, model, data, params):
     """The fit of one stage."""
-    fit = dvi.fit(
-        model,
-        data,
-        params,
-        # Nearly linear in the parameters: steps without damping, until only the last digit of the
-        # start changes, which is half a metre of Mercury in a century.
-        optimiser=optx.Dogleg(rtol=1e-14, atol=1e-300),
-        tolerance=0.9,
-        max_steps=8,
-        check_curvature=False,
-    )
+    fit = dvi.fit(model, data, params, check_curvature=False)
     known = "epsilon" in params
     off = fit.residuals[0] * METRES
     q, v, advance = orbit(model, fit.params, len(data.ts))
@@ -221,19 +210,21 @@ def draw(found):
         size = np.linalg.norm(s.off, axis=1) / 1e3
         label = f"{s.name}: {float(f'{s.rms / 1e3:.3g}'):g} km"
         a.semilogy(year, size, ".", ms=1.2, color=colour, label=label)
-    a.set(title="Distance from DE421 (and its rms)", ylabel="km", ylim=(1e-3, None))
+    a.set(title="Mercury, distance of the fits from DE421 (rms)", ylabel="distance [km]")
+    a.set_ylim(1e-3, None)
     a.legend(loc="center right", bbox_to_anchor=(1, 0.58), markerscale=8)
     b.plot(year, last[:, 0], lw=0.5, color=plot.COLOURS[2])
-    b.set(title="Along track, DE421 − fit with oblate Sun", ylabel="m")
+    b.set(title="Residuals along track, fit with oblate Sun", ylabel="DE421 − fit [m]")
     for s, colour in zip(found[1:], plot.COLOURS[1:], strict=False):
         c.plot(year, s.off[:, 2], lw=0.5, color=colour, label=s.name)
-    c.set(title="Across the orbit, DE421 − fit", xlabel="year", ylabel="m")
+    c.set(title="Residuals across the orbit", xlabel="year", ylabel="DE421 − fit [m]")
     c.legend(loc="upper center", ncols=2)
     for i, (name, colour) in enumerate([("along", 2), ("radial", 3), ("across", 0)]):
         d.loglog(*spectrum(last[:, i]), lw=0.8, color=plot.COLOURS[colour], label=name)
     d.axvline(EARTH_1_4, color="0.5", lw=0.8, ls=":")
-    d.text(EARTH_1_4 * 1.15, 20, "Earth 1 : 4", color="0.3", va="center", fontsize=9)
-    d.set(title="Residuals with an oblate Sun", xlabel="period [day]", ylabel="amplitude [m]")
+    d.text(EARTH_1_4 * 1.15, 20, "Mercury–Earth 4 : 1", color="0.3", va="center", fontsize=9)
+    d.set(title="Spectrum of the residuals, fit with oblate Sun")
+    d.set(xlabel="period [day]", ylabel="amplitude [m]")
     d.set(ylim=(1e-2, 1e2), xlim=(20, 4e4))
     d.legend(loc="upper left", ncols=3, handlelength=1.2, columnspacing=1.0)
     return figure
@@ -272,7 +263,7 @@ def main():
         h=given.step,
     )
     print(table(found, given.years))
-    with plot.style(), mpl.rc_context({"savefig.dpi": 110}):
+    with plot.style():
         print(f"written: {plot.save(draw(found), given.out / 'general_relativity.png')}")
 
 

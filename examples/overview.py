@@ -55,7 +55,7 @@ def energy_errors(axis):
         rows = np.unique(np.geomspace(5, len(E) - 1, 300).astype(int))
         axis.loglog(rows * EVERY / 100, error[rows], label=name)
         print(f"{name}: {error[-1]:.1e}")
-    axis.set(xlabel="time (periods)", ylabel="largest relative energy error")
+    axis.set(xlabel="time [periods]", ylabel="largest relative energy error")
     axis.set_title("A Kepler orbit over a million steps")
     axis.legend()
 
@@ -83,10 +83,15 @@ def drifts(axis):
             epsilons=epsilons,
         )
         label = f"order {order}: drift ∝ ε$^{{{measured.slope:.2f}}}$"
-        axis.loglog(measured.epsilons, measured.drifts, "o-", label=label)
+        (line,) = axis.loglog(measured.epsilons, measured.drifts, "o-", label=label)
+        out = ~measured.used
+        look = {"mfc": "white", "color": line.get_color()}
+        axis.plot(measured.epsilons[out], np.asarray(measured.drifts)[out], "o", **look)
         print(order, measured.slope, measured.stderr)
-    axis.set(xlabel="strength ε of the perturbing force", ylabel="drift over 5000 steps")
+    axis.set(xlabel="strength ε of the perturbing force", ylabel="largest drift over 5000 steps")
+    axis.set_ylim(bottom=1e-17)  # space for the legend
     axis.set_title("Invariants found for a perturbed oscillator")
+    axis.plot([], [], "o", mfc="white", color="0.3", label="excluded: round-off")
     axis.legend()
 
 

@@ -124,7 +124,7 @@ def draw(fit, knife):
             axis.axvline(year[0], color="0.8", lw=0.8, zorder=0)
         axis.set(ylabel=f"{name} [arcsec]")
         if i == 0:
-            axis.set_title("The pole: four arcs, ten parameters in common")
+            axis.set_title("Position of the pole, four arcs fitted together")
             axis.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, markerscale=3)
     axis = rows[2]
     for t, off in zip(fit.ts, fit.residuals, strict=True):
@@ -149,7 +149,7 @@ def draw(fit, knife):
     for k, axis in enumerate(right.subplots(2, 1)):
         middle, low, high = literature[k]
         axis.axhspan(low, high, color=plot.COLOURS[2], alpha=0.25, lw=0)
-        axis.axhline(middle, color=plot.COLOURS[2], lw=1.2)
+        axis.axhline(middle, color=plot.COLOURS[2], lw=1.2, label="literature")
         axis.errorbar(0, x[k], formal[k], fmt="o", color=plot.COLOURS[0], capsize=3)
         axis.errorbar(1, x[k], knife.error[k], fmt="s", color=plot.COLOURS[1], capsize=3)
         each = [shared(one)[0][k] for one in knife.fits]
@@ -158,7 +158,8 @@ def draw(fit, knife):
         axis.set_xticks([0, 1, 2], ["formal", "jack-\nknife", "each arc\nleft out"])
         axis.grid(False, axis="x")
         if k == 0:
-            axis.set_title("Literature: green")
+            axis.set_title("Period and damping")
+            axis.legend(loc="lower right", handlelength=1.2)
         else:
             axis.axhline(0, color="0.4", lw=0.8, ls=":")
     return figure
@@ -175,7 +176,7 @@ def main():
     fit = fitted(data)
     knife = jackknife(data, fit.params["args"])
     print(report(fit, knife))
-    with plot.style(), mpl.rc_context({"savefig.dpi": 110}):
+    with plot.style():
         print(f"written: {plot.save(draw(fit, knife), given.out / 'polar_motion.png')}")
 
 

@@ -40,15 +40,15 @@ def measured():
 
 def draw(data):
     """Drift, local order in ε and statuses, side by side."""
-    figure, axes = plt.subplots(1, 3, figsize=(11.4, 4.0), sharey=True, layout="constrained")
-    data.p_x.attrs["long_name"] = "momentum p$_x$ at the start"
+    figure, axes = plt.subplots(1, 3, figsize=(12.6, 4.3), layout="constrained")
+    data.p_x.attrs["long_name"] = "initial momentum p$_x$"
     data.energy_drift.attrs["long_name"] = "largest drift of the energy"
     plot.sweep_map(data.energy_drift, limits=(1e-4, 10), ax=axes[0])
     plot.slope_map(data.energy_drift, "epsilon", x="epsilon", limits=(0, 2), ax=axes[1])
     plot.failure_map(data, ax=axes[2])
-    for axis, title in zip(axes, ("Drift", "Order of the drift in ε", "How runs end"), strict=True):
-        axis.set_title(title)
-        axis.label_outer()
+    titles = "Largest drift of the energy", "Order of the drift in ε", "Status of the runs"
+    for axis, title in zip(axes, titles, strict=True):
+        axis.set(title=title, xlabel="strength ε of the perturbing force")
     figure.get_layout_engine().set(w_pad=0.12)
     return figure
 

@@ -127,11 +127,12 @@ def damped_oscillator(out):
         left.semilogy(t1, h1, lw=0.9, label="force of the step at its end: (13), this package")
         left.semilogy(t2, h2, lw=1.4, label="half of it at each end: the published scheme")
         left.axhline(H, color="0.6", lw=0.8, ls=":", label="no damping")
-        left.set(xlabel="time", ylabel="step h", title="Steps grow as the energy is lost")
+        left.set(xlabel="time", ylabel="step size h")
+        left.set_title("Steps grow as the damped oscillator loses energy")
         right.semilogy(t1, jacobian1, lw=0.9, label="condition of ∂(13, 14)/∂(p₁, h)")
         right.semilogy(t2[1 : len(jacobian2) + 1], jacobian2, lw=1.4, label="published scheme")
-        right.semilogy(t1, kappa, lw=0.9, label="κ: of h, relative to the energies")
-        right.set(xlabel="time", title="Conditioning")
+        right.semilogy(t1, kappa, lw=0.9, label="κ, of h with respect to the energies")
+        right.set(xlabel="time", ylabel="condition number", title="Conditioning of the equations")
         for axes in (left, right):
             axes.legend(loc="upper left", fontsize="small")
         left.set_ylim(0.05, 200)
@@ -188,13 +189,16 @@ def limits(out):
             print(f"t = {float(sol.ts[n]):.3f}, at radius {radius[-1]:.3f}")
             hs = np.asarray(sol.hs)[:n]
             ends = np.append(t, sol.ts[n])
-            left.semilogy(ends, np.append(hs, hs[-1]), lw=1, color=color, label=f"h, from {first}")
+            label = f"step size h, first step {first}"
+            left.semilogy(ends, np.append(hs, hs[-1]), lw=1, color=color, label=label)
             left.semilogy(ends[-1], hs[-1], "x", color=color, ms=9, mew=2)
             if first == 0.01:
-                left.semilogy(t, radius, lw=0.8, color="0.6", label="distance from the centre")
-        left.set(xlabel="time", ylabel="h, distance")
-        left.set(title="Kepler, H$_D$ of order 1: no root beyond ×")
-        left.legend(loc="lower right", fontsize="small")
+                label = "distance r from the centre"
+                left.semilogy(t, radius, lw=0.8, color="0.6", ls="--", label=label)
+        left.plot([], [], "kx", ms=7, mew=1.5, label="no root: the run ends")
+        left.set(xlabel="time t", ylabel="step size h, distance r", ylim=(1e-3, 10))
+        left.set(title="Kepler orbits with H$_D$ of order 1")
+        left.legend(loc="lower right", fontsize="small", bbox_to_anchor=(1, 0.02))
 
         hs = np.geomspace(1e-3, 0.3, 25)
         q, p = jnp.asarray([0.7]), jnp.asarray([0.9])
@@ -208,12 +212,14 @@ def limits(out):
             values = jax.vmap(lambda h, f=kappa: f(0.0, h, q, p, q, p, None))(jnp.asarray(hs))
             slope = np.polyfit(np.log(hs[:10]), np.log(np.asarray(values)[:10]), 1)[0]
             print(f"pendulum, H_D of order {order}: κ ~ h^{slope:.2f}, {values[0]:.1e} at 1e-3")
-            right.loglog(hs, values, lw=1.2)
-            right.annotate(f"order {order}", (hs[0], values[0]), (4, 2), textcoords="offset points")
+            text = f"H$_D$ of order {order}: κ ∝ h$^{{{slope:.1f}}}$"
+            right.loglog(hs, values, lw=1.2, label=text)
         digits = 1 / np.finfo(float).eps
         right.axhline(digits, color="0.5", lw=0.8, ls=":")
-        right.annotate("no digit of h left", (0.02, digits), (0, 3), textcoords="offset points")
-        right.set(xlabel="h", ylabel="κ", title="Pendulum: condition number of h")
+        right.annotate("no correct digit of h", (0.02, digits), (0, 3), textcoords="offset points")
+        right.set(xlabel="step size h", ylabel="condition number κ of h")
+        right.set(title="Pendulum: relative error of h, δh/h = κ δE/E")
+        right.legend(loc="upper right", bbox_to_anchor=(1, 0.94), reverse=True)
         print(f"written: {plot.save(figure, out / 'variational_limits.png')}")
 
 

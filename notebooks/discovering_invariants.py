@@ -98,7 +98,7 @@ with plot.style():
         right.plot(sol.ts, I_0(sol.qs[:, 0], sol.ps[:, 0]), lw=1, label=name)
     right.axhline(at_rest, color="0.3", ls="--", lw=1, label="fixed point of the law")
     left.set(xlabel="q", ylabel="p", aspect="equal", title="van der Pol, ε = 0.05")
-    right.set(xlabel="time t", ylabel="I", title="Leading-order term")
+    right.set(xlabel="time t", ylabel="leading-order term I", title="Approach to the limit cycle")
     right.legend()
 plt.show()
 

@@ -52,7 +52,7 @@ def friction(t0, t1, q0, p1, args):
 
 
 system = dvi.System(H_D, force=friction)
-model = dvi.Model(system, h=0.05, p0=[0.0], method=dvi.Yoshida(4))
+model = dvi.Model(system, h=0.05, p0=[0.0], epsilon=0.0, method=dvi.Yoshida(4))
 guess = {"epsilon": 0.0, "q0": np.array([0.9]), "args": {"k": 1.2}}
 found = dvi.fit(model, observed(0), guess, progress=False)
 for name, x, sigma in zip(found.names, found.x, found.sigma, strict=True):
@@ -60,7 +60,7 @@ for name, x, sigma in zip(found.names, found.x, found.sigma, strict=True):
 print(f"{found.status}, reduced chi² = {found.reduced_chi2:.2f}")
 
 # %% [markdown]
-# The line joins the predictions at the times of observation.
+# The predictions at the times of observation, and the observations with their errors:
 
 # %%
 axis = plot.fit_against_data(found)
@@ -136,11 +136,13 @@ with plot.style():
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
     left.hist(pulls, bins=np.arange(-3.5, 3.6, 0.5), color=plot.COLOURS[0], alpha=0.8)
     left.set(
-        xlabel="(estimate − true value)/sigma", ylabel="fits", title="Thirty noise realisations"
+        xlabel="(estimate of ε − true value)/sigma",
+        ylabel="number of fits",
+        title="30 noise realisations",
     )
     for name, fit in {"with friction": found, "without": without}.items():
         right.plot(ts, fit.whitened[0], ".-", lw=0.7, label=f"{name}: {fit.reduced_chi2:.2f}")
-    right.set(xlabel="time t", ylabel="residual over sigma", title="Residuals, reduced χ²")
+    right.set(xlabel="time t", ylabel="residual/sigma", title="Residuals and reduced χ²")
     right.legend()
 plt.show()
 

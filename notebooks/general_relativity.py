@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-import optimistix as optx
 
 import dvi_jax as dvi
 from dvi_jax import plot
@@ -76,16 +75,7 @@ def model(params):
 
 
 def fitted(model, params):
-    return dvi.fit(
-        model,
-        data,
-        params,
-        optimiser=optx.Dogleg(rtol=1e-14, atol=1e-300),
-        tolerance=0.9,  # what follows is less than the last digit of the start
-        max_steps=8,
-        check_curvature=False,
-        progress=False,
-    )
+    return dvi.fit(model, data, params, check_curvature=False, progress=False)
 
 
 # %% [markdown]

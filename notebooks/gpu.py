@@ -24,7 +24,7 @@ print("platform:", device.platform)
 
 # %% [markdown]
 # `JAX_PLATFORMS=cpu` or `cuda` in the environment selects the device before Python starts. For an
-# NVIDIA GPU install `dvi-jax[cuda12]`. In a program, `jax.default_device` selects the device for a
+# NVIDIA GPU install the extra `cuda12`. In a program, `jax.default_device` selects the device for a
 # block, and computations with an array run on the device of the array (`jax.device_put`).
 #
 # ## A batch

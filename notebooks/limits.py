@@ -30,6 +30,11 @@ def power(epsilons, changes):
     return np.polyfit(np.log(epsilons), np.log(changes), 1)[0].round(2) + 0.0  # −0 is 0
 
 
+def power_law(epsilons, changes):
+    """The power of epsilon for a legend."""
+    return f"ε$^{{{power(epsilons, changes):.2f}}}$"
+
+
 # %% [markdown]
 # ## Passage through a resonance
 #
@@ -256,22 +261,18 @@ assert slowest > 10
 with plot.style():
     figure, axes = plt.subplots(1, 3, figsize=(9.6, 3.9))
     a, b, c = axes
-    a.loglog(epsilons, half_range, "o", label=f"resonance: ε^{power(epsilons, half_range):.2f}")
-    a.loglog(epsilons, missed, "s", label=f"no resonance: ε^{power(epsilons, missed):.2f}")
+    a.loglog(epsilons, half_range, "o", label=f"resonance: {power_law(epsilons, half_range)}")
+    a.loglog(epsilons, missed, "s", label=f"no resonance: {power_law(epsilons, missed)}")
     a.set(title="Resonance", ylabel="change of the action")
-    b.loglog(epsilons, lost, "o", label=f"J: ε^{power(epsilons, lost):.2f}")
-    b.loglog(epsilons, kept, "s", label=f"J exp(εt): ε^{power(epsilons, kept):.2f}")
+    b.loglog(epsilons, lost, "o", label=f"J: {power_law(epsilons, lost)}")
+    b.loglog(epsilons, kept, "s", label=f"J exp(εt): {power_law(epsilons, kept)}")
     b.set(title="Friction, up to t = 1/ε", ylabel="relative change")
-    c.loglog(
-        crossing_epsilons,
-        crossed,
-        "o",
-        label=f"crossing: ε^{power(crossing_epsilons, crossed):.2f}",
-    )
-    c.loglog(slow_epsilons, not_crossed, "s", label=f"none: exp(−{rate:.1f}/ε)")
-    c.set(title="Separatrix", ylabel="rms change of the action")
+    label = f"crossing: {power_law(crossing_epsilons, crossed)}"
+    c.loglog(crossing_epsilons, crossed, "o", label=label)
+    c.loglog(slow_epsilons, not_crossed, "s", label=f"no crossing: exp(−{rate:.1f}/ε)")
+    c.set(title="Passage of a separatrix", ylabel="rms change of the action")
     for axis in axes:
-        axis.set_xlabel("ε")
+        axis.set_xlabel("strength ε of the perturbation")
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2))
 plt.show()
 

@@ -142,7 +142,7 @@ with plot.style():
         axis.loglog(1 / lengths, row, "os^"[i] + "-", label=f"{name}: slope {slope:.2f}")
     axis.loglog(1 / lengths, gyration, "x--", color="0.5", label="m v⊥²/2: not an invariant")
     axis.set(xlabel="gyroradius / ℓ", ylabel="range / mean")
-    axis.set_title("Amplitude of the oscillation")
+    axis.set_title("Oscillation of each quantity along one orbit")
     figure.legend(loc="outside lower center", ncols=2)
 plt.show()
 

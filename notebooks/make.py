@@ -9,9 +9,9 @@ run to run (times, identifiers, names of machines). Exit status 1 where somethin
 
 import argparse
 import base64
+import io
 import os
 import re
-import struct
 import sys
 import tempfile
 import time
@@ -25,12 +25,16 @@ from jupyter_client.kernelspec import KernelSpec, KernelSpecManager
 from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
+from PIL import Image, ImageChops
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 
-LARGEST = 300_000
+LARGEST = 1_000_000
 """Bytes of a notebook: a code host shows larger ones slowly or not at all."""
+
+UNSEEN = 6
+"""Change of a colour, of 255, up to which a picture has a palette of 256 colours."""
 
 LONGEST = 600
 """Seconds that a cell may take."""
@@ -81,7 +85,9 @@ class _ThisPython(KernelSpecManager):
     def get_kernel_spec(self, kernel_name: str) -> KernelSpec:
         spec = get_kernel_dict()
         # Messages of the kernel about itself, such as its connection, are not shown.
-        return KernelSpec(**spec | {"argv": [*spec["argv"], "--IPKernelApp.log_level=40"]})
+        # "retina": pictures have twice the pixels, which sharp screens show in the same size.
+        settings = "--IPKernelApp.log_level=40", "--InlineBackend.figure_formats=retina"
+        return KernelSpec(**spec | {"argv": [*spec["argv"], *settings]})
 
 
 def executed(name: str) -> Any:
@@ -124,10 +130,12 @@ def _joined(outputs: list[Any]) -> list[Any]:
 
 
 def _plain(output: Any) -> Any:
-    """An output without its metadata; a picture without those inside of it."""
+    """An output without its metadata; a picture without those inside of it, with its width."""
     if output.output_type in ("display_data", "execute_result"):
+        width = output.metadata.get("image/png", {}).get("width")  # its height follows
         output.metadata = {}
         if "image/png" in output.data:
+            output.metadata = {"image/png": {"width": width}} if width else {}
             output.data = {
                 "image/png": _pixels(output.data["image/png"]),
                 "text/plain": output.data.get("text/plain", "a picture"),
@@ -136,16 +144,15 @@ def _plain(output: Any) -> Any:
 
 
 def _pixels(encoded: str) -> str:
-    """A PNG without its chunks of text, which name versions."""
-    png = base64.b64decode(encoded)
-    kept, at = [png[:8]], 8
-    while at < len(png):
-        length, kind = struct.unpack(">I4s", png[at : at + 8])
-        end = at + 12 + length
-        if kind not in (b"tEXt", b"zTXt", b"iTXt", b"tIME"):
-            kept.append(png[at:end])
-        at = end
-    return base64.b64encode(b"".join(kept)).decode("ascii")
+    """A PNG without chunks of text, which name versions; with a palette, a third of the bytes."""
+    png = Image.open(io.BytesIO(base64.b64decode(encoded)))
+    full, file = png.convert("RGB"), io.BytesIO()
+    few = full.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    # A palette that would change a colour visibly is not used.
+    changes = ImageChops.difference(full, few.convert("RGB")).getextrema()
+    image = few if max(most for _, most in changes) <= UNSEEN else full
+    image.save(file, "PNG", optimize=True, dpi=png.info.get("dpi"))
+    return base64.b64encode(file.getvalue()).decode("ascii")
 
 
 # --- what is checked ---------------------------------------------------------------------------

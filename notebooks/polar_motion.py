@@ -85,22 +85,24 @@ assert np.all(error > 8 * fit.sigma[at])  # formal errors are far too small
 assert abs(inverse_Q) < 2 * error[1]  # 1/Q is not different from 0
 
 # %% [markdown]
-# Grey: measured. Blue in the upper panels: fitted. Lower panel: x in blue, y in orange. The period
-# agrees with the literature, 433.0 ± 1.1 days. 1/Q differs from zero by less than its error: these
-# data do not determine Q.
+# The period agrees with the literature, 433.0 ± 1.1 days. 1/Q differs from zero by less than its
+# error: these data do not determine Q.
 
 # %%
 with plot.style():
     figure, axes = plt.subplots(3, 1, figsize=(7, 5), sharex=True, dpi=85)
     for t, seen, found in zip(fit.ts, fit.observed, fit.predicted, strict=True):
         for i, name in enumerate("xy"):
-            axes[i].plot(2000 + t / YEAR, seen[:, i], ".", ms=1.5, color="0.6")
-            axes[i].plot(2000 + t / YEAR, found[:, i], lw=1, color=plot.COLOURS[0])
+            axes[i].plot(2000 + t / YEAR, seen[:, i], ".", ms=1.5, color="0.6", label="measured")
+            axes[i].plot(2000 + t / YEAR, found[:, i], lw=1, color=plot.COLOURS[0], label="fit")
             axes[i].set_ylabel(f"{name} [arcsec]")
             off = 1e3 * (seen - found)[:, i]
-            axes[2].plot(2000 + t / YEAR, off, lw=0.8, color=plot.COLOURS[i])
-    axes[0].set_title("The pole, measured and fitted")
-    axes[2].set(xlabel="year", ylabel="residuals [mas]", title="Residuals of x and y")
+            axes[2].plot(2000 + t / YEAR, off, lw=0.8, color=plot.COLOURS[i], label=name)
+    axes[0].set_title("Position of the pole")
+    axes[2].set(xlabel="year", ylabel="measured − fit [mas]", title="Residuals")
+    for axis in axes[[0, 2]]:  # the first arc is enough for a legend
+        look = {"loc": "lower right", "bbox_to_anchor": (1, 0.97), "ncols": 2, "markerscale": 4}
+        axis.legend(handles=axis.lines[:2], **look)
 plt.show()
 
 # %% [markdown]

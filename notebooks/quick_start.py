@@ -63,7 +63,8 @@ assert abs(order.slope - 2) < 0.02
 # %% [markdown]
 # ## Controls
 #
-# A check is meaningful only if something fails it. The energy must fail for two reasons: the force
+# A test is meaningful only if it can fail. We therefore test two quantities that are not adiabatic
+# invariants of first order. The energy must fail for two reasons: the force
 # changes it at first order, and the map does not conserve it even at $\varepsilon = 0$. $I_0$
 # without its correction must fail for the first reason only.
 
@@ -94,8 +95,8 @@ axis = plot.drift_orders(orders, promised=[None, 1, 2], title="Largest change in
 plt.show()
 
 # %% [markdown]
-# Open symbols are at the level of the drift at $\varepsilon = 0$. They contain no information about
-# $\varepsilon$, so no slope is given for the energy.
+# Open symbols mark drifts that are not larger than the drift at $\varepsilon = 0$. There the effect
+# of $\varepsilon$ is not visible. All points of the energy are open; therefore no slope is given.
 #
 # The same quantities against time, for $\varepsilon = 0.1$:
 

@@ -69,7 +69,7 @@ with plot.style():
         right.plot(sol.ts, sol.observed["energy"], lw=1.2, label=name)
     left.plot(0, 0, "k+")
     left.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="Path of the weight")
-    right.set(xlabel="time [s]", ylabel="energy [J]", title="Energy")
+    right.set(xlabel="time [s]", ylabel="energy [J]", title="Energy along the path")
     right.legend()
 plt.show()
 

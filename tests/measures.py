@@ -204,11 +204,11 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 49_420,
-    "raise statements": 680,
-    COMMENTS: 1.3,
-    f"files of more than {LONGEST_FILE} lines": 5,
-    f"functions with more than {MOST_PARAMETERS} parameters": 28,
+    "lines": 48_600,
+    "raise statements": 633,
+    COMMENTS: 5,
+    f"files of more than {LONGEST_FILE} lines": 0,
+    f"functions with more than {MOST_PARAMETERS} parameters": 6,
     "circles of imports": 0,
 }
 """What the tests allow. When the code has become smaller lower them; never let them rise."""

@@ -73,7 +73,7 @@ def test_a_basis_without_invariants(folder):
     """The control: linear functions alone. That is a result, and no failure."""
     result = command("discover", write(folder, SMALL.replace("als(2)", "als(1)")))
     assert result.exit_code == 0, result.output
-    assert "0 independent invariants" in result.output
+    assert "0 independent conserved quantities" in result.output
     assert read("out/invariants.json")["invariants"] == []
 
 

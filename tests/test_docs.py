@@ -4,6 +4,7 @@ import functools
 import html.parser
 import http.server
 import importlib
+import importlib.util
 import os
 import re
 import shutil
@@ -259,6 +260,21 @@ def test_indices_and_numbers_of_running_text(extensions):
     )
     for plain in ("num_steps", "t_eval", "a < b", "2000 steps", "in 5 to 10"):
         assert as_html(plain) is None, plain
+
+
+@pytest.mark.parametrize("dpi", [110, 220, None])
+def test_the_size_of_a_picture_does_not_depend_on_its_pixels(tmp_path, dpi):
+    """A notebook's pictures have twice the pixels of those before; without a resolution: 110."""
+    pytest.importorskip("sphinx")
+    image = pytest.importorskip("PIL.Image")
+    about = importlib.util.spec_from_file_location("of_docs", DOCS / "_ext/pictures.py")
+    pictures = importlib.util.module_from_spec(about)
+    about.loader.exec_module(pictures)
+    name = tmp_path / "picture.png"
+    image.new("L", (550, 330)).save(name, **({"dpi": (dpi, dpi)} if dpi else {}))
+    width, height = pictures.size(name)
+    assert width == pytest.approx(550 / (dpi or 110), rel=1e-3)
+    assert height == pytest.approx(330 / (dpi or 110), rel=1e-3)
 
 
 def test_docstrings_are_taken_literally_and_defaults_told(extensions):

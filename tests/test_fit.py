@@ -101,6 +101,7 @@ def test_the_truth_is_found(regular):
     assert 0.5 < found.reduced_chi2 < 1.6
     assert abs(found.statistics()["lag_one"]) < 0.4
     assert {"args.k", "±"} <= set(str(found).split())
+    assert "initial state at t0 = 0: q0 fitted, p0 of the model" in str(found)
     np.testing.assert_allclose(found.predicted[0] + found.residuals[0], data.values, atol=1e-14)
 
 

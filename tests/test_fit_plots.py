@@ -207,6 +207,16 @@ def test_data_with_their_errors_beside_the_prediction():
     assert shown == list(plot.COLOURS[:2])
 
 
+@pytest.mark.parametrize(("count", "line"), [(400, "-"), (12, "None")])
+def test_predictions_that_do_not_show_the_curve_are_crosses(count, line):
+    """Straight lines between twelve points of one and a half periods would be a polygon."""
+    fit = made(n=count, components=1)
+    first = plot.fit_against_data(fit).lines[0]
+    assert (first.get_linestyle(), first.get_marker()) == (line, "None" if line == "-" else "x")
+    curve = plot.fit_against_data(fit, curve=(fit.ts[0], fit.predicted[0])).lines[0]
+    assert curve.get_linestyle() == "-"
+
+
 def test_error_bars_are_those_of_the_data():
     sizes = np.linspace(0.1, 0.2, 60)[:, None] * np.ones(2)
     found = bars(plot.fit_against_data(made(errors=[sizes]), component=0))[0]

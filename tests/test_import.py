@@ -41,3 +41,12 @@ def test_every_alias_is_listed_and_means_its_name():
     assert listed == ALIASES
     for alias, name in ALIASES.items():
         assert getattr(dvi, alias) is getattr(dvi, name)
+
+
+def test_the_command_line_knows_names_that_are_imported_late():
+    code = """
+from dvi_jax_cli.work.expressions import public
+from dvi_jax.discover import AbstractBasis
+assert {"Polynomials", "Radial"} <= public(AbstractBasis).keys()
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -177,9 +177,31 @@ def test_no_function_with_newton_is_missing_here():
 
 def _has_newton(f) -> bool:
     try:
-        return not {"newton", "how"}.isdisjoint(inspect.signature(f).parameters)
+        return "newton" in inspect.signature(f).parameters
     except (TypeError, ValueError):
         return False
+
+
+OF_A_RUN = {"t0", "args", "newton", "integrator"}
+SEARCHES = {
+    dvi.discover_invariants: {"method"},
+    dvi.drift_order: {"method"},
+    dvi.drift_surface: {"method"},
+    dvi.find_symmetries: set(),
+    dvi.solution_pairs: set(),
+}
+
+
+@pytest.mark.parametrize("search", SEARCHES, ids=lambda f: f.__name__)
+def test_searches_list_their_keywords_and_name_the_one_that_is_unknown(search):
+    parameters = inspect.signature(search).parameters
+    assert set(parameters) >= OF_A_RUN | SEARCHES[search]
+    assert not any(p.kind == p.VAR_KEYWORD for p in parameters.values())
+    with pytest.raises(TypeError, match=f"{search.__name__} has no argument 'integratr'. Did you "):
+        search(PENDULUM, integratr=None)
+    name, hint = ("methd", "Did you mean 'method'") if SEARCHES[search] else ("method", "It has")
+    with pytest.raises(TypeError, match=f"{search.__name__} has no argument '{name}'. {hint}"):
+        search(PENDULUM, **{name: dvi.Strang()})
 
 
 @pytest.mark.parametrize(

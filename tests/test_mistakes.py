@@ -458,3 +458,9 @@ def test_a_habit_gives_the_right_answer(habit):
 
 def test_there_are_enough_rows():
     assert len(ERRORS) + len(WARNINGS) + len(ANSWERS) >= 150
+
+
+def test_states_of_the_library_are_arrays():
+    for make in (systems.kepler, systems.henon_heiles, systems.oscillator):
+        assert isinstance(make().q0, np.ndarray)
+        assert isinstance(make().p0 @ make().p0, float)

@@ -96,8 +96,12 @@ def lab(colours, sight):
 
 
 def nearest(colours, sight):
-    x = lab(colours, sight)
-    return min(np.linalg.norm(a - b) for a, b in itertools.combinations(x, 2))
+    return nearest_two(lab(colours, sight))
+
+
+def nearest_two(points):
+    """The smallest distance between two points."""
+    return min(np.linalg.norm(a - b) for a, b in itertools.combinations(points, 2))
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
@@ -128,11 +132,24 @@ def test_lines_differ_in_a_black_and_white_print():
     bodies = drawn_lines(plot.orbit(arrays(n=6, shape=(3, 2), steps=4001)[:2]))
     assert len({line.get_marker() for line in bodies}) == 3
     for some in (drawn, bodies):
-        assert len({line.get_markevery() for line in some}) == len(some)
-        for first, step in (line.get_markevery() for line in some):
-            assert 8 <= len(range(first, 4001, step)) <= 10
+        marks = [line.get_markevery() for line in some]
+        assert len({tuple(one) for one in marks}) == len(some)
+        assert all(len(set(one)) == 9 and 0 <= min(one) < max(one) <= 4000 for one in marks)
     for plain in (plot.phase_portrait(arrays()), plot.phase_portrait(arrays(9))):
         assert {x.get_marker() for x in drawn_lines(plain)} == {"None"}
+
+
+@pytest.mark.parametrize("steps", [301, 50_000])
+def test_marks_are_far_apart_where_an_orbit_retraces_itself(steps):
+    """Three turns in equal steps of time would put three marks at each of three places."""
+    t = np.linspace(0, 6 * np.pi, steps)
+    circle = np.stack([np.cos(t), np.sin(t)], 1)
+    axis = plot.orbit([(t, circle), (t, 3 * circle)], labels=["a", "b"])
+    pieces = [line for line in drawn_lines(axis) if line.get_marker() == "s"]
+    marks = np.concatenate([line.get_xydata()[line.get_markevery()] for line in pieces])
+    assert len(marks) >= 9  # a mark at the border of two pieces is in both
+    assert nearest_two(np.unique(marks, axis=0)) > 0.8 * 2 * np.sin(np.pi / 16)
+    assert nearest_two(circle[(steps - 1) // 9 :: (steps - 1) // 9][:9]) < 0.1
 
 
 def test_pictures_have_the_style_and_leave_the_settings_of_the_user():
@@ -494,7 +511,7 @@ def test_vectors_change_by_the_length_of_their_difference():
     v = np.array([[3.0, 4], [3, 4], [3, 5], [0, 0]])
     axis = plot.invariants(np.arange(4.0), {"L": v})
     close(lines(axis)[0][1], [0, 0, 0.2, 1.0])
-    assert axis.get_ylabel() == "L\nsize of relative change"
+    assert axis.get_ylabel() == "L\n|ΔI/I$_0$|"
 
 
 def test_a_logarithmic_axis_has_all_quantities_of_one_orbit_and_counts_zeros():

@@ -105,7 +105,7 @@ def test_own_system_example(folder):
     with np.load("pendulum/trajectory.npz") as saved:
         start, end = ([saved[x][i] for x in ("qs", "ps")] for i in (0, -1))
     args = {"mass": 1.0, "length": 1.0, "gravity": 9.81}
-    run = {"h": -0.005, "num_steps": 4000, "args": args, "method": dvi.Strang()}
+    run = {"h": -0.005, "num_steps": 4000, "epsilon": 0.0, "args": args, "method": dvi.Strang()}
     back = dvi.integrate(own["system"], *end, save=dvi.Save(final=True), **run)
     np.testing.assert_allclose([back.qs[-1], back.ps[-1]], start, atol=1e-11)
 
@@ -216,8 +216,17 @@ REJECTED = [
     (SPRING, "state.q0: the key is missing", "this system has none"),
     (SPRING + STATE, "h: the key is missing", "none of its own"),
     (SPRING + "h = 0.1\n" + STATE, "(own.py, line 7)", "state and args that fit"),
-    ('system = "own.py:forced"\n' + FULL, "jnp.where in place of if (own.py, line 25)", "fit"),
-    ('system = "own.py:numbered"\n' + FULL, "in place of if (own.py, line 28)", "fit"),
+    ('system = "own.py:forced"\n' + FULL, "epsilon: the key is missing", "a force"),
+    (
+        'system = "own.py:forced"\nepsilon = 0.1\n' + FULL,
+        "jnp.where in place of if (own.py, line 25)",
+        "fit",
+    ),
+    (
+        'system = "own.py:numbered"\nepsilon = 0.1\n' + FULL,
+        "in place of if (own.py, line 28)",
+        "fit",
+    ),
     (N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]", "body 0 and body 1 are on top", "start"),
     (N_BODY + "[args]\nmasses = [1, 0, 1]", "mass of body 1 is 0", "start"),
 ]
@@ -376,7 +385,7 @@ def test_systems_are_listed_and_described():
     _, tables = library_tables("magnetic_mirror")  # a terminal folds its lines
     kinds = {row[0]: row[1] for row in tables[1].rows}
     assert kinds["corrected_moment"] == "adiabatic: oscillates by gyroradius over ℓ to power 2"
-    assert kinds["energy"] == "conserved exactly at ε = 0"
+    assert kinds["energy"] == "conserved by the unperturbed flow"
     refuses(command("systems", "magnetic_miror"), "NAME: ", "did you mean magnetic_mirror?")
 
 

@@ -165,6 +165,29 @@ def test_quick_run(bench, tmp_path, capsys):
         assert 10_000 < (tmp_path / f"work_precision_henon_heiles.{kind}").stat().st_size < most
 
 
+def test_pictures_are_drawn_again_from_the_numbers(bench, tmp_path, monkeypatch):
+    """Nothing is measured; the caption is a legend, and the title names the problem."""
+    steps = [64, 128, 256, 512]
+    points = [
+        bench.Point("henon_heiles", name, order, n, 40 / n, 0, float(n), n**-order, n / 8192)
+        for name, order in (("Strang", 2), ("KahanLi6", 6))
+        for n in steps
+    ]
+    bench.write_csv(tmp_path / "work_precision.csv", points)
+    drawn = []
+    monkeypatch.setattr(bench, "measure", None)
+    monkeypatch.setattr(bench, "reference", lambda problem: bench.Reference(0, 0, 1e-13))
+    monkeypatch.setattr(bench, "save", lambda figure, path: drawn.append((figure, path.name)))
+    again, floors = bench.main(["--out", str(tmp_path), "--redraw"])
+    assert again == points
+    assert floors == {"henon_heiles": 1e-13}
+    ((figure, name),) = drawn
+    assert name == "work_precision_henon_heiles"
+    assert figure.get_suptitle() == "Error against work: Hénon–Heiles, E = 1/12"
+    assert len(figure.legends[0].get_texts()) == 3
+    assert figure.axes[4].get_xlabel() == "time [8192 steps of Strang]"
+
+
 def test_where_an_error_is_reached(bench):
     """By hand: error N⁻² crosses 1e-3 at 31.6; never 1e-9; a temporary dip does not count."""
     points = [

@@ -9,14 +9,19 @@ from sphinx.transforms.post_transforms import SphinxPostTransform
 
 WIDE = 1.75
 """Width over height from which a picture has several panels in a row."""
-LARGE = 1000
-"""Pixels of width from which it has, whatever its height."""
+LARGE = 9.0
+"""Inches of width from which it has, whatever its height."""
 
 
-def size(path: Path) -> tuple[int, int] | None:
-    """Width and height of a PNG in pixels; None for other pictures."""
-    head = path.read_bytes()[:24]
-    return struct.unpack(">II", head[16:]) if head[:8] == b"\x89PNG\r\n\x1a\n" else None
+def size(path: Path) -> tuple[float, float] | None:
+    """Width and height of a PNG in inches, of 110 pixels if it does not say; None for others."""
+    png = path.read_bytes()
+    if png[:8] != b"\x89PNG\r\n\x1a\n":
+        return None
+    at = png.find(b"pHYs", 0, png.find(b"IDAT"))
+    per_metre = struct.unpack(">I", png[at + 4 : at + 8])[0] if at > 0 else 110 / 0.0254
+    width, height = (n / (0.0254 * per_metre) for n in struct.unpack(">II", png[16:24]))
+    return width, height
 
 
 class Pictures(SphinxPostTransform):

@@ -97,7 +97,7 @@ class BoundBasis(eqx.Module):
         function = jax.tree.map(without, self.function, is_leaf=is_basis)
         return dataclasses.replace(self, function=function, names=("",) * self.size)
 
-    def formula(self, coefficients: Any, digits: int = 6, drop: float = 1e-9) -> str:
+    def formula(self, coefficients: Any, digits: Any = 6, drop: float = 1e-9) -> str:
         """The combination with these coefficients as text; tiny ones (relative) are left out."""
         c = np.asarray(coefficients, float)
         shown = np.abs(c) > drop * np.max(np.abs(c), initial=0.0)
@@ -121,13 +121,14 @@ class BoundBasis(eqx.Module):
         return None if about is None else about(middle)
 
 
-def linear_text(coefficients: np.ndarray, names: Sequence[str], digits: int = 6) -> str:
-    """A linear combination as text, without what has the coefficient 0; the name "1" is implied."""
-    text = ""
-    for value, name in zip(coefficients, names, strict=True):
+def linear_text(coefficients: np.ndarray, names: Sequence[str], digits: Any = 6) -> str:
+    """A linear combination as text, without what has the coefficient 0; the name "1" is implied.
+    `digits`: of all coefficients, or of each."""
+    text, digits = "", np.broadcast_to(digits, len(names))
+    for value, name, known in zip(coefficients, names, digits, strict=True):
         if value == 0:
             continue
-        size = f"{abs(value):.{digits}g}"
+        size = f"{abs(value):.{known}g}"
         term = size if name == "1" else name if size == "1" else f"{size} {name}"
         sign = "−" if value < 0 else "+"
         text += f" {sign} {term}" if text else term if value > 0 else f"−{term}"

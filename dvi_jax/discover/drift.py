@@ -11,20 +11,23 @@ import numpy as np
 from .._checks import function
 from .._inputs import as_parameter, as_scalar, start_state
 from .._integrate import integrate
-from .._integrator import Integrator, chosen
+from .._integrator import chosen
 from .._results import status_name
 from .._solution import Save
 from .._system import System, check_system
-from .._types import Args
+from ..engine.keywords import taken, with_keywords_of
 from ..engine.names import both_names
-from ..engine.newton import RootSolver
 from ..engine.reads import Reads, reads
-from ..methods import Method
 from ..observe import MaxDrift
 from .exponents import line, plateau_level, small_epsilon_exponent
 from .orders import ABOVE_FLOOR, DriftOrder, DriftSurface
+from .sampling import TYPE_2
+
+_TAKEN = f"{TYPE_2} method"
 
 
+@both_names
+@with_keywords_of(integrate, _TAKEN)
 def drift_order(
     system: System,
     invariant: Callable[..., Any],
@@ -91,10 +94,12 @@ def drift_order(
     epsilons = _positive("epsilons", epsilons)
     starts = _starts(q0, p0, batched)
     h = float(as_scalar("h", h, starts[0].dtype, zero_allowed=False))
-    lanes = _sweep(system, invariant, starts, epsilons, h, num_steps, _settings(**how))
+    lanes = _sweep(system, invariant, starts, epsilons, h, num_steps, _settings(how))
     return _order(epsilons, lanes, _kept(lanes.good))
 
 
+@both_names
+@with_keywords_of(integrate, _TAKEN)
 def drift_surface(
     system: System,
     invariant: Callable[..., Any] | Sequence[Callable[..., Any]],
@@ -148,7 +153,7 @@ def drift_surface(
         )
     for each in invariants:
         _check_observable(each)
-    starts, settings = _starts(q0, p0, batched), _settings(**how)
+    starts, settings = _starts(q0, p0, batched), _settings(how)
     num_steps = np.round(duration / hs).astype(int)
     lanes = [
         _sweep(system, each, starts, epsilons, float(h), int(steps), settings)
@@ -293,14 +298,11 @@ def _starts(q0: Any, p0: Any, batched: bool):
     return q0, p0
 
 
-@both_names
-def _settings(
-    t0: Any = 0.0,
-    args: Args = None,
-    method: Method | None = None,
-    newton: RootSolver | None = None,
-    integrator: Integrator | None = None,
-) -> dict[str, Any]:
-    """The keywords of `integrate` that both functions accept; others are a `TypeError`."""
-    integrator = chosen(integrator, method=method, root_finder=newton)
-    return {"t0": t0, "args": jax.tree.map(as_parameter, args), "integrator": integrator}
+def _settings(how: dict[str, Any]) -> dict[str, Any]:
+    """What `integrate` receives of the keywords that both functions take from it."""
+    run = taken(how, "t0 args")
+    return {
+        "t0": run["t0"],
+        "args": jax.tree.map(as_parameter, run["args"]),
+        "integrator": chosen(**how),
+    }

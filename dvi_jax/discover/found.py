@@ -14,9 +14,11 @@ from .._files import publish_npz, read_npz
 from .._precision import refuse_double_without_x64
 from .._types import State
 from .basis import AbstractBasis, BoundBasis, bind_basis
-from .expansions import Larger, grown
+from .energy import Energy
+from .expansions import Larger
 from .nullspace import CLEAR
 from .obstructions import DriftLaw
+from .report import report
 from .sampling import Samples
 from .series import InvariantSeries
 
@@ -28,15 +30,17 @@ class Discovery(eqx.Module):
 
     The invariants:
 
-    - `coefficients`: shape (count, order + 1, basis size), of the independent invariants, the
-      simplest first; count may be 0. `dependent`: the same for the others in the span, which
-      are functions of them (on the samples, as far as differentials show).
+    - `coefficients`: shape (count, order + 1, basis size), of the independent invariants: those
+      that are conserved to rounding before approximate ones, and those with few terms before
+      others; count may be 0. `dependent`: the same for the others in the span, which are functions
+      of them (on the samples, as far as differentials show).
+    - `errors`: estimated errors of `inner_coefficients`, from the residual and the singular values
+      of the conditions; coefficients that are only rounding are exactly zero.
     - `exact`: for each independent invariant, whether it is conserved at ε that are not small, to
       round-off over many steps; not tried (False) at order 0.
     - `leading_parts`: shape (families, basis size): a basis, orthonormal on the samples, of the
       order-0 parts of *all* invariants in the span.
-    - `survivors`: for m = 0 … order, how many leading-order terms have an invariant of order
-      m
+    - `survivors`: for m = 0 … order, how many leading-order terms have an invariant of order m
       (a constant does not count).
     - `reach`: shape (count,): the ε at which corrections are as large as the leading-order term;
       the series is of use far below it. Infinite without corrections.
@@ -76,6 +80,8 @@ class Discovery(eqx.Module):
     - `sizes`: shape (order + 1, basis size): size of a term with coefficient 1 on the samples, of
       `inner`. `scale`: 1 over the ε at which the perturbation changes a step as much as H_D does.
     - `slow_time`: of the system. `tolerance`: None, or that of approximate invariants.
+    - `energy`: how far the map conserves the energy, where no invariant found represents it, see
+      `Energy`; else None. `seconds`: time of the search.
 
     On resonant or integrable systems the null space is large; on chaotic ones spurious near-null
     vectors appear. Held-out residuals and `drift_order` on a long run decide.
@@ -83,6 +89,7 @@ class Discovery(eqx.Module):
 
     inner_coefficients: Array
     inner_dependent: Array
+    errors: np.ndarray
     exact: tuple[bool, ...] = eqx.field(static=True)
     leading_parts: np.ndarray
     survivors: tuple[int, ...] = eqx.field(static=True)
@@ -109,6 +116,8 @@ class Discovery(eqx.Module):
     shape: tuple[int, ...] = eqx.field(static=True)
     slow_time: bool = eqx.field(static=True)
     tolerance: float | None = eqx.field(static=True)
+    energy: Energy | None = eqx.field(static=True, default=None)
+    seconds: float = eqx.field(static=True, default=float("nan"))
 
     @property
     def count(self) -> int:
@@ -136,16 +145,17 @@ class Discovery(eqx.Module):
     @property
     def invariants(self) -> list[InvariantSeries]:
         """The independent invariants as observables."""
-        return self._series(self.inner_coefficients)
+        return self._series(self.inner_coefficients, self.errors)
 
     @property
     def dependent_invariants(self) -> list[InvariantSeries]:
         """Those in the span that are functions of the independent ones."""
-        return self._series(self.inner_dependent)
+        return self._series(self.inner_dependent, [None] * len(self.inner_dependent))
 
-    def _series(self, coefficients: Array) -> list[InvariantSeries]:
+    def _series(self, coefficients: Array, errors: Any) -> list[InvariantSeries]:
         return [
-            InvariantSeries(self.inner, c, self.slow_time, sizes=self.sizes) for c in coefficients
+            InvariantSeries(self.inner, c, self.slow_time, sizes=self.sizes, errors=error)
+            for c, error in zip(coefficients, errors, strict=True)
         ]
 
     @property
@@ -205,7 +215,11 @@ class Discovery(eqx.Module):
         about, found = read_npz(path, _FORMAT, "discovery")
         plain, names = _fields()
         try:
-            arrays: dict[str, Any] = {name: found[name] for name in names}
+            # Files of earlier versions have no errors.
+            unknown = np.full_like(found["inner_coefficients"], np.nan)
+            arrays: dict[str, Any] = {"errors": unknown} | {
+                name: found[name] for name in names if name != "errors" or name in found
+            }
             probe = Samples(*(found[f"probe_{name}"] for name in Samples._fields))
             values = found["probe_values"]
         except KeyError as error:
@@ -227,6 +241,8 @@ class Discovery(eqx.Module):
         for name in ("inner_coefficients", "inner_dependent"):
             arrays[name] = jnp.asarray(arrays[name])
         given = {k: tuple(v) if isinstance(v, list) else v for k, v in about.items() if k in plain}
+        if about.get("energy"):
+            given["energy"] = Energy(*about["energy"])
         given["larger"] = tuple(Larger(*x) for x in about.get("larger", ()))
         laws: list[dict[str, Any]] = [
             {k: np.array(v) if isinstance(v, list) else v for k, v in law.items()}
@@ -236,61 +252,7 @@ class Discovery(eqx.Module):
         return cls(basis=bound, inner=inner, to_basis=to_basis, probe=probe, **given, **arrays)
 
     def __str__(self) -> str:
-        kind = "independent" if self.tolerance is None else "independent approximate"
-        drop = 1e-9 if self.tolerance is None else np.sqrt(self.tolerance)
-        # Coefficients are known to about as many digits as the gap has.
-        digits = int(np.clip(np.log10(self.gap) - 2, 2, 6)) if self.order == 0 else 6
-        if self.tolerance is None and digits < 6:
-            drop = 10.0 ** -(digits + 1)
-        lines = [
-            f"{self.count} {kind} invariant{'' if self.count == 1 else 's'} of order "
-            f"{self.order} in {self.basis.size} functions; leading-order terms that survive "
-            f"order 0 … {self.order}: {', '.join(map(str, self.survivors))}; gap {self.gap:.1e}"
-        ]
-        if self.tolerance is not None:
-            lines.append(f"  singular values up to {self.tolerance:g} of the largest count as zero")
-        lines += [f"  {warning}" for warning in self.warnings]
-        if self.count and self.count == 2 * int(np.prod(self.shape, dtype=int)):
-            lines.append(
-                "  as many independent invariants as coordinates: each orbit of the map has "
-                "finitely many points, or the functions repeat along it"
-            )
-        if self.refused:
-            lines.append(
-                f"  {self.refused} null vectors of the fitted samples refused: held-out samples, "
-                "their own slopes or a lower order decide (chaos, too few samples, or too large a "
-                "tolerance)"
-            )
-        for i, series in enumerate(self.invariants):
-            note = ", exact at every ε tried" if self.exact[i] else ""
-            if np.isfinite(self.reach[i]) and not self.exact[i]:
-                note = (
-                    "; corrections are as large as the leading-order term at ε = "
-                    f"{self.reach[i]:.2g}"
-                )
-            half, most = np.max(self.typical_residuals[i], axis=0)
-            lines += [
-                f"  I = {series.formula(_SHOWN, drop, digits)}",
-                f"      changes in a step on held-out samples: median {half:.1e}, 95 % below "
-                f"{most:.1e}, largest {np.max(self.residuals[i]):.1e} of what its slopes predict"
-                f"{note}",
-                *grown("changes grow", self.powers[i]),
-            ]
-        if len(self.dependent):
-            lines.append(f"  functions of them, as differentials say: {len(self.dependent)}")
-            for series in self.dependent_invariants[:3]:
-                lines.append(f"      {series.formula(_SHOWN, drop, digits)}")
-        laws = [law for law in self.obstructions if law.kind != "unexplained"]
-        lines += [f"  {law}" for law in laws[:_LAWS]]
-        if len(laws) > _LAWS:
-            lines.append(f"  {len(laws) - _LAWS} more lost, each by such a law")
-        lost = self.survivors[0] - self.survivors[-1]
-        if len(laws) < lost:
-            lines.append(
-                f"  {lost - len(laws)} more lost, by a drift that is not a function of what order "
-                "0 conserves in this basis: it may be too small"
-            )
-        return "\n".join(lines)
+        return report(self)
 
 
 def _fields() -> tuple[list[str], list[str]]:
@@ -307,7 +269,3 @@ _FORMAT = 2
 def _probed(basis: BoundBasis, probe: Samples) -> np.ndarray:
     """The functions at some points, shape (points, size)."""
     return np.asarray(jax.vmap(basis)(*map(jnp.asarray, probe)))
-
-
-_SHOWN = 12  # Terms of a formula in a report; ``str`` of a series shows all
-_LAWS = 4  # Drift laws in a report

@@ -1,15 +1,21 @@
 """Adiabatic invariants as the null space of a linear system on the iterated map."""
 
+import time
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from .._checks import fraction, one_of, whole
+from .._integrate import integrate
 from .._step import Equations
 from .._system import System, check_system
+from ..engine.keywords import with_keywords_of
+from ..engine.names import both_names
 from .basis import AbstractBasis, bind_basis, check_step_size
 from .changes import Changes, Stepped, changes_at, checked_changes, is_exact
+from .digits import Conditions
+from .energy import unconserved_energy
 from .expansions import Larger, at_larger_step, in_larger_box, powers_of_size
 from .found import Discovery
 from .judging import CLEARLY, Fewest, Judge, cleaned, reach
@@ -26,6 +32,7 @@ from .nullspace import (
 from .obstructions import drift_laws
 from .representatives import Span
 from .sampling import (
+    TYPE_2,
     Samples,
     as_samples,
     check_basis,
@@ -43,6 +50,8 @@ _AS_GOOD = 10.0  # An invariant with fewer terms may change by so many times mor
 _ROUND_OFF = 1e-12  # Changes below this need not be smaller
 
 
+@both_names
+@with_keywords_of(integrate, f"{TYPE_2} method")
 def discover_invariants(
     system: System,
     basis: AbstractBasis,
@@ -109,6 +118,7 @@ def discover_invariants(
     # 0.5 q² − 0.05 q p + 0.5 p² + ε (0.251256 q⁴ − 0.0502513 q³ p + 0.00251256 q² p²)
     ```
     """
+    began = time.perf_counter()
     check_system(system)
     one_step = map_of("discover_invariants", system, **how)
     samples = as_samples(samples, one_step.t0)
@@ -129,11 +139,13 @@ def discover_invariants(
     found = Search(stepped, changes, samples, order, tolerance)
     chosen = found.best(representative)
     coefficients, dependent, exact = chosen.coefficients, chosen.dependent, chosen.exact
+    errors = chosen.errors
     refused = found.spaces[-1].refused + chosen.refused
     known = found.count if order else len(coefficients) + len(dependent)
     larger: tuple[Larger, ...] = ()
     if tolerance is None and known:
         larger = _at_larger(stepped, changes, samples, order)
+    energy = None if tolerance is not None else unconserved_energy(stepped, samples, found)
     known += found.constant is not None
     judge = found.judge
     typical_residuals = np.stack([judge.quantiles(coefficients, x) for x in (0.5, 0.95)], axis=-1)
@@ -155,11 +167,12 @@ def discover_invariants(
     impossible = everything and not (powers == 0).all()
     if impossible:
         refused, exact = refused + len(coefficients) + len(dependent), ()
-        coefficients, dependent = coefficients[:0], dependent[:0]
+        coefficients, dependent, errors = coefficients[:0], dependent[:0], errors[:0]
         typical_residuals, powers = typical_residuals[:0], powers[:0]
     return Discovery(
         inner_coefficients=jnp.asarray(coefficients),
         inner_dependent=jnp.asarray(dependent),
+        errors=errors,
         exact=exact,
         leading_parts=found.leading_parts @ to_basis,
         survivors=tuple(space.leading.shape[1] for space in found.spaces),
@@ -186,6 +199,8 @@ def discover_invariants(
         shape=samples.q.shape[1:],
         slow_time=system.slow_time,
         tolerance=tolerance,
+        energy=energy,
+        seconds=time.perf_counter() - began,
     )
 
 
@@ -214,11 +229,12 @@ def _at_larger(
 
 
 class _Chosen(NamedTuple):
-    """Representatives, shape (count, order + 1, size); how many were refused, and how many of
-    those are unclear; the blur."""
+    """Representatives, shape (count, order + 1, size), and errors of the independent ones; how many
+    were refused, and how many of those are unclear; the blur."""
 
     coefficients: np.ndarray
     dependent: np.ndarray
+    errors: np.ndarray
     exact: tuple[bool, ...]
     refused: int
     unclear: int
@@ -234,7 +250,7 @@ class Search:
         basis, fit = stepped.basis, ~samples.held_out
         self.basis, self.fitted = basis, samples.at(fit)
         self.rms, calm = typical_sizes(changes.values)
-        self.fitted_values = changes.values[fit]
+        self.fitted_values, self.calm = changes.values[fit], calm[fit]
         self.values = calm[fit, None] * self.fitted_values
         self.condition = check_basis(basis, self.values)
         self.R = triangle(self.values / self.rms) / np.sqrt(len(self.values))
@@ -255,7 +271,9 @@ class Search:
             return leading, shifts, unclear
 
         trivial = None if self.constant is None else self.R @ self.constant
-        self.spaces = series_spaces(compress(self.rows), judge, tolerance, trivial)
+        compressed = compress(self.rows)
+        self.spaces = series_spaces(compressed, judge, tolerance, trivial)
+        self.conditions = Conditions.of(compressed @ self.R)
         step = triangle(calm[fit, None] * terms[fit, 0]) / np.sqrt(len(self.values))
         self.typical = np.linalg.norm(step, 2) or 1.0
         in_units = changes._replace(terms=in_units_of(self.scale, changes.terms))
@@ -315,22 +333,40 @@ class Search:
             refused = len(lost)
             unclear = int(np.sum(self.judge.largest(lost) < UNCLEAR))
             coefficients, exact, dependent = coefficients[kept], exact[kept], dependent[others]
-        return _Chosen(coefficients, dependent, tuple(map(bool, exact)), refused, unclear, blur)
+        place = np.array(self._order_of_importance(coefficients, exact), int)
+        coefficients, exact = coefficients[place], tuple(map(bool, exact[place]))
+        errors = [self.conditions.errors(c * self.sizes, self.tolerance) for c in coefficients]
+        errors = np.array(errors).reshape(coefficients.shape) / self.sizes
+        return _Chosen(coefficients, dependent, errors, exact, refused, unclear, blur)
+
+    def _order_of_importance(self, coefficients: np.ndarray, exact: np.ndarray) -> list[int]:
+        """Conserved to rounding before approximate, at every ε before to an order, few terms
+        before many."""
+        rounding, terms = self.judge.keep(coefficients), np.count_nonzero(coefficients, (1, 2))
+        return sorted(range(len(exact)), key=lambda i: (not rounding[i], not exact[i], terms[i]))
 
     def _picked(
         self, span: Span, series: np.ndarray, representative: str
     ) -> tuple[np.ndarray, bool]:
         """Coefficients, shape (order + 1, size), and whether the series is exact."""
         if self.order == 0:
-            return self._of_order_0(series[0], span.blur)[None] / self.sizes, False
-        simplest = cleaned(span.simplest(series)) / self.sizes
+            shares = self._of_order_0(series[0], span.blur)[None]
+            return self._without_rounding(shares) / self.sizes, False
+        simplest = self._without_rounding(cleaned(span.simplest(series))) / self.sizes
         given, *sizes = map(jnp.asarray, (simplest, self.typical, self.scale))
         some = slice(None, None, max(1, len(self.fitted.q) // 100))
         at = self.fitted.at(some)
         exact = bool(is_exact(self.stepped.unnamed(), given, sizes, at))
         if exact or representative == "simplest":
             return simplest, exact
-        return cleaned(span.least(series)) / self.sizes, exact
+        return self._without_rounding(cleaned(span.least(series))) / self.sizes, exact
+
+    def _without_rounding(self, shares: np.ndarray) -> np.ndarray:
+        if self.tolerance is not None:
+            return shares
+        return self.conditions.without_rounding(
+            shares, lambda tried: self.judge.largest((tried / self.sizes)[None])[0]
+        )
 
     def _of_order_0(self, series: np.ndarray, blur: float) -> np.ndarray:
         """Shares of an invariant of order 0, with as few terms and as many digits as can be."""

@@ -43,7 +43,8 @@ class DriftLaw(NamedTuple):
     rest: np.ndarray
 
     def __str__(self) -> str:
-        head = f"lost at order {self.order} ({self.kind}): I = {self.leading}"
+        cause = "resonance or secular drift" if self.kind == "resonance" else self.kind
+        head = f"lost at order {self.order} ({cause}): I = {self.leading}"
         if self.kind == "unexplained":
             drift = "its drift is not a function of what order 0 conserves in this basis"
             return f"{head}\n      {drift}"
@@ -77,7 +78,7 @@ def drift_laws(
     system = np.concatenate([-terms[:, 0], search.weights[:, None] * orthonormal @ kept], axis=1)
 
     def text(coefficients, shares):
-        return shortened(basis, coefficients, np.abs(shares), _SHOWN, max(1e-9, blur**2))
+        return shortened(basis, coefficients, np.abs(shares), _SHOWN, max(0.1 * EXPLAINED, blur**2))
 
     laws = []
     for m in range(1, len(spaces)):

@@ -101,7 +101,9 @@ class DriftOrder(NamedTuple):
 
     def __str__(self) -> str:
         points, used = len(self.epsilons), int(self.used.sum())
-        if used >= ENOUGH:
+        if (self.excluded == "round-off").all():
+            lines = ["no order: conserved to round-off at every ε"]
+        elif used >= ENOUGH:
             lines = self.fit.report(points, self.resolving_range)
         else:
             lines = [

@@ -10,11 +10,13 @@ import numpy as np
 
 from lanewise.jaxapi import x64_enabled
 
+from .._integrate import integrate
 from .._integrator import Integrator, chosen, only
 from .._results import RESULTS
 from .._step import Equations, step
 from .._system import System, check_system
 from .._types import Args, Interval
+from ..engine.keywords import with_keywords_of
 from ..engine.names import both_names
 from ..engine.newton import Newton, RootSolver
 from ..methods import Method
@@ -158,38 +160,28 @@ class Map(NamedTuple):
     root_finder: RootSolver
 
 
-@both_names
+TYPE_2 = "t0 args newton integrator"
+"""Keywords of searches that examine the paper's map, of `TypeII()`."""
+
+
 def map_of(
     function: str,
     system: System,
-    t0: Any = 0.0,
-    args: Args = None,
-    method: Method | None = None,
-    newton: RootSolver | None = None,
-    integrator: Integrator | None = None,
-    used: tuple[str, ...] = ("method", "root_finder"),
+    t0: Any,
+    args: Args,
+    newton: RootSolver | None,
+    integrator: Integrator | None,
+    **method: Method | None,
 ) -> Map:
-    """The map from the keywords of a search; other keywords are a `TypeError`.
+    """The map from the keywords of a search, with or without `method`.
 
     By default by Newton's iteration, through which Taylor coefficients in ε are exact.
     """
     if integrator is None and newton is None:
         newton = Newton()
-    found = only(chosen(integrator, method=method, root_finder=newton), function, *used)
+    integrator = chosen(integrator, root_finder=newton, **method)
+    found = only(integrator, function, *method, "root_finder")
     return Map(t0, args, found.method_for(system), found.root_finder)
-
-
-@both_names
-def type_2_map_of(
-    function: str,
-    system: System,
-    t0: Any = 0.0,
-    args: Args = None,
-    newton: RootSolver | None = None,
-    integrator: Integrator | None = None,
-) -> Map:
-    """The same where the map is the paper's, of `TypeII()`."""
-    return map_of(function, system, t0, args, None, newton, integrator, used=("root_finder",))
 
 
 def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None:
@@ -272,6 +264,8 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
     return float(singular[0] / singular[-1])
 
 
+@both_names
+@with_keywords_of(integrate, TYPE_2)
 def solution_pairs(
     system: System, *, h: float, samples: Any, epsilon: Any = 0.0, **how: Any
 ) -> tuple[LatticePoint, LatticePoint]:
@@ -287,7 +281,7 @@ def solution_pairs(
     of unequal shapes or not finite, h = 0, or a step that fails on them.
     """
     check_system(system)
-    one_step = type_2_map_of("solution_pairs", system, **how)
+    one_step = map_of("solution_pairs", system, **how)
     samples, h = as_samples(samples, one_step.t0), check_step_size(h)
     equations = Equations(system, jnp.asarray(epsilon, float), one_step.args, one_step.root_finder)
     first, second, good = _stepped(equations, jnp.asarray(h), samples)

@@ -1,6 +1,7 @@
 """A series in ε of combinations of basis functions: what discovery returns, as an observable."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -12,8 +13,11 @@ from jaxtyping import Array, Float
 from .._system import System
 from .._types import Scalar, State
 from .basis import BoundBasis
+from .digits import closed_form, digits_of
 from .families import raised
 from .generators import Generator
+
+_DROP = 1e-9  # Formulas leave out terms below this share of the largest
 
 
 class InvariantSeries(eqx.Module):
@@ -23,6 +27,8 @@ class InvariantSeries(eqx.Module):
     - `slow_time`: whether φ is a function of the slow time τ = εt in place of t.
     - `sizes`: shape of `coefficients`: size of a term with coefficient 1 on the samples of the
       search, by which terms of a formula are left out; None: all have the same size.
+    - `errors`: shape of `coefficients`: their estimated errors, by which digits of a formula are
+      left out; None: unknown.
 
     Give it to `integrate` as it is: the run binds it to its ε. As a formula: `str`.
     """
@@ -32,6 +38,7 @@ class InvariantSeries(eqx.Module):
     slow_time: bool = eqx.field(static=True, default=False)
     epsilon: Any = None
     sizes: Any = None
+    errors: Any = None
 
     @property
     def order(self) -> int:
@@ -41,7 +48,7 @@ class InvariantSeries(eqx.Module):
     def bind(self, system: System, epsilon: Any) -> "InvariantSeries":
         """The same series at this ε."""
         del system
-        return InvariantSeries(self.basis, self.coefficients, self.slow_time, epsilon, self.sizes)
+        return replace(self, epsilon=epsilon)
 
     def evaluate(self, q: State, p: State, epsilon: Any, t: Any = 0.0) -> Scalar:
         """The value at a point, a scalar; t is the slow time τ when `slow_time` is set."""
@@ -75,18 +82,40 @@ class InvariantSeries(eqx.Module):
     def __str__(self) -> str:
         return self.formula()
 
-    def formula(self, terms: int | None = None, drop: float = 1e-9, digits: int = 6) -> str:
-        """The series as text: at most so many terms at each order, all above a fraction `drop`.
+    @property
+    def recognised(self) -> dict[str, str]:
+        """Coefficients that agree to all their digits with a small fraction, or with such a
+        multiple of √2, √3, √5, π or 1/π: printed number → closed form. Empty without `errors`.
+
+        A random number is recognised with a probability below 1e-3.
+        """
+        if self.errors is None:
+            return {}
+        c, errors = np.asarray(self.coefficients), np.asarray(self.errors)
+        found = {}
+        for m, j in np.argwhere(self._shares() > _DROP * np.max(self._shares())):
+            value, error = float(abs(c[m, j])), float(errors[m, j])
+            if error > 0 and (text := closed_form(value, error)):
+                found[f"{value:.{digits_of(c[m, j], errors[m, j])}g}"] = text
+        return found
+
+    def _shares(self) -> np.ndarray:
+        c = np.asarray(self.coefficients)
+        return np.abs(c if self.sizes is None else c * np.asarray(self.sizes))
+
+    def formula(self, terms: int | None = None, drop: float = _DROP, digits: int = 6) -> str:
+        """The series as text: at each order at most so many terms, all above a fraction `drop`,
+        with at most so many digits, and no more than their errors leave.
 
         The number of terms left out is printed, unless they are round-off.
         """
-        c = np.asarray(self.coefficients)
-        shares = np.abs(c if self.sizes is None else c * np.asarray(self.sizes))
+        c, shares = np.asarray(self.coefficients), self._shares()
+        known = digits_of(c, None if self.errors is None else np.asarray(self.errors), digits)
         return in_powers_of_epsilon(
-            shortened(self.basis, block, share, terms, drop, digits)
-            if m == 0 or np.max(share) > 1e-9 * np.max(shares)
+            shortened(self.basis, block, share, terms, drop, some)
+            if m == 0 or np.max(share) > _DROP * np.max(shares)
             else ""
-            for m, (block, share) in enumerate(zip(c, shares, strict=True))
+            for m, (block, share, some) in enumerate(zip(c, shares, known, strict=True))
         )
 
 
@@ -101,8 +130,8 @@ def shortened(
     c: np.ndarray,
     shares: np.ndarray,
     terms: int | None = None,
-    drop: float = 1e-9,
-    digits: int = 6,
+    drop: float = _DROP,
+    digits: int | np.ndarray = 6,
 ) -> str:
     """The combination as text: at most so many terms, all above the share `drop` of the largest."""
     shown = np.where(shares > drop * np.max(shares), c, 0.0)

@@ -124,7 +124,7 @@ class Symmetries(eqx.Module):
     """Result of `find_symmetries`; print it for a report. A sequence of `Symmetry`.
 
     - `found`: the variational ones first, the simplest first in each kind; there may be none.
-    - `survivors`: for m = 0 … order, how many leading-order terms X_0 go on to order m.
+    - `survivors`: for m = 0 … order, how many leading-order fields X_0 have a symmetry of order m.
     - `singular_values`: of all conditions, descending, relative to the largest; `gap`: the ratio
       at which they were cut (large is clear, below 1e3 is not).
     - `null`: below this relative size a singular value is zero, within rounding.
@@ -212,8 +212,9 @@ class Symmetries(eqx.Module):
         lines = [
             f"{count} symmetr{'y' if count == 1 else 'ies'} of order {self.order} in "
             f"{self.basis.size} functions for each component: {len(self.variational)} variational, "
-            f"{len(self.conformal)} conformal only; leading-order terms that survive "
-            f"order 0 … {self.order}: {', '.join(map(str, self.survivors))}; gap {self.gap:.1e}"
+            f"{len(self.conformal)} conformal only; number at order "
+            f"{', '.join(f'{m}: {n}' for m, n in enumerate(self.survivors))}; the smallest "
+            f"singular value of all other fields is {self.gap:.1e} times as large"
         ]
         lines += [f"  {warning}" for warning in self.warnings]
         if not count and self.survivors[0]:

@@ -8,8 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import fraction, whole
+from .._integrate import integrate
 from .._step import Equations
 from .._system import System, check_system
+from ..engine.keywords import with_keywords_of
+from ..engine.names import both_names
 from .basis import AbstractBasis, Basis, BoundBasis, Product, Sum, bind_basis, check_step_size
 from .conditions import Conditions, at_samples, require_finite_conditions, require_times, values_at
 from .expansions import at_larger_step, enlarged, in_larger_box
@@ -18,18 +21,19 @@ from .motion import typical_sizes
 from .nullspace import triangle
 from .sampling import (
     SMALL,
+    TYPE_2,
     Samples,
     as_samples,
     check_basis,
     check_finite,
     later,
+    map_of,
     middle,
     relative_step,
     require_enough,
     require_steps,
     require_time,
     spreads,
-    type_2_map_of,
 )
 from .symmetries import Symmetries
 from .symmetry_series import Search, rows_of
@@ -38,6 +42,8 @@ from .symmetry_series import Search, rows_of
 _NO_STEP = 1e-13
 
 
+@both_names
+@with_keywords_of(integrate, TYPE_2)
 def find_symmetries(
     system: System,
     basis: AbstractBasis,
@@ -113,7 +119,7 @@ def find_symmetries(
     if tolerance is not None:
         tolerance = fraction("tolerance", tolerance)
     check_system(system)
-    one_step = type_2_map_of("find_symmetries", system, **how)
+    one_step = map_of("find_symmetries", system, **how)
     samples, h = as_samples(samples, one_step.t0), check_step_size(h)
     shape = samples.q.shape[1:]
     bound = bind_basis(basis, shape)

@@ -25,7 +25,13 @@ from .stages import MANY, Minimum, by_gradient, in_segments, least_squares
 from .uncertainty import Uncertainty, in_words, uncertainty
 
 _FEW = 50
-"""Parameters up to which exact second derivatives are computed."""
+"""Parameters up to which second derivatives are computed."""
+
+_SMALL = 1_000_000
+"""Steps of trajectories that take less time than the compilation of exact second derivatives."""
+
+_PART = 0.01
+"""Part of a standard error over which Jacobians are subtracted."""
 
 
 def fit(
@@ -69,14 +75,14 @@ def fit(
       `Likelihood` BFGS; or a solver of optimistix, or a gradient transformation of optax.
     - `max_steps`: in all; None means 200, with optax 2000.
     - `tolerance`: a fit has converged when the next step would change the predictions by less than
-      this many standard errors in total.
+      this many standard errors in total, or if round-off of the predictions prevents that.
     - `horizons`: ``"auto"`` fits the beginning of the arcs first where the start is so far off
       that later data would mislead the fit, and extends it step by step; None fits all data at
       once; or a list of times since t0 to fit up to before all data.
     - `batch`: with optax, how many arcs of each group are drawn for each step; `seed` of the draw.
     - `check_units`: refuse data that differ from the model by orders of magnitude.
-    - `check_curvature`: compare the Gauss–Newton errors with exact second derivatives (for up to
-      50 parameters).
+    - `check_curvature`: compare the Gauss–Newton errors with second derivatives (for up to 50
+      parameters).
     - `checkpoint`: a file that is written every few seconds. The same call continues from it, with
       the same bits as without the interruption, also with more `max_steps`; it is removed when
       the fit has converged.
@@ -171,12 +177,11 @@ def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
     rows, known = minimum.aux or problem.whitened(u)
     predicted, whitened, trajectories = problem.by_arc(rows, known)
     x = np.asarray(space.to_x(u))
-    if has_residuals:
-        loss = float(np.sum(np.asarray(problem.core.root_rows(u, rows)) ** 2) / 2)
-    else:
-        loss = float(problem.core.scalar(u))
+    r = problem.root_rows(u, rows)
+    loss = float(np.sum(r**2) / 2) if has_residuals else float(problem.core.scalar(u))
     degrees, variance = problem.degrees_of_freedom, 1.0
     covariance, curvature, lost, values = np.full((n, n), np.nan), None, [], np.zeros(0)
+    rounding = np.zeros(n)
     if minimum.jacobian is not None and np.isfinite(minimum.jacobian).all():
         J = np.asarray(minimum.jacobian)
         about = uncertainty(J, 1.0, minimum.free)
@@ -186,9 +191,13 @@ def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
         slope, values = space.slope(u), about.singular_values
         with np.errstate(invalid="ignore"):  # infinite variance of a parameter without effect
             covariance = variance * about.covariance[:n, :n] * np.outer(slope, slope)
+        if minimum.shifts is not None and len(minimum.shifts):
+            by_rounding = slope * minimum.shifts
+            covariance = covariance + by_rounding.T @ by_rounding / (2 * len(by_rounding))
+            rounding = np.sqrt(np.mean(by_rounding**2, axis=0) / 2)
         lost = about.undetermined[:n].T
         if check_curvature and minimum.free is None and has_residuals and n <= _FEW:
-            curvature = _curvature_ratio(problem, u, J, about)
+            curvature = _curvature_ratio(problem, u, r, J, about)
     at_bounds = space.at_bounds(x, np.sqrt(np.diag(covariance)))
     free = ~np.isin(space.names, at_bounds)  # a parameter at its bound is known: it is there
     words = [in_words(d, list(space.names)) for d in lost if np.abs(d[free]).max(initial=0) > 1e-6]
@@ -213,13 +222,30 @@ def _result(run: Run, minimum: Minimum, check_curvature: bool) -> FitResult:
         curvature=curvature,
         at_bounds=at_bounds,
         trajectories=trajectories,
-        prior_chi2=float(np.sum(np.asarray(problem.core.prior_rows(u)) ** 2)),
+        prior_chi2=float(np.sum(r[-n:] ** 2)),
+        rounding=rounding,
+        start=problem.start_in_words(),
         seconds=time.monotonic() - run.began,
     )
 
 
-def _curvature_ratio(problem: Problem, u: Any, J: np.ndarray, about: Uncertainty) -> np.ndarray:
-    """Exact second derivative of the loss along each principal direction over Gauss–Newton's."""
+def _curvature_ratio(
+    problem: Problem, u: Any, r: np.ndarray, J: np.ndarray, about: Uncertainty
+) -> np.ndarray:
+    """Second derivative of the loss along each principal direction over Gauss–Newton's, which
+    lacks r · r''.
+
+    In a small problem r'' is a difference of Jacobians, whose program exists already; compiling
+    one for exact second derivatives takes as long as all else.
+    """
     D = about.directions[:, : about.directions.shape[1] - about.undetermined.shape[1]]
-    exact = np.asarray(problem.curvature(u, D.T)) if D.shape[1] else np.zeros(0)
-    return exact / np.sum((J @ D) ** 2, axis=0)
+    squares = np.sum((J @ D) ** 2, axis=0)
+    if 2 * problem.size * (problem.size + 1) * problem.steps > _SMALL:
+        exact = np.asarray(problem.curvature(u, D.T)) if D.shape[1] else np.zeros(0)
+        return exact / squares
+    t = _PART * np.linalg.norm(r) / np.sqrt(squares * max(problem.degrees_of_freedom, 1))
+    found = []
+    for d, step, square in zip(D.T, t, squares, strict=True):
+        ahead, back = (np.asarray(problem.evaluate(u + s * step * d).jacobian) for s in (1, -1))
+        found.append(1 + (r @ ((ahead - back) @ d) / (2 * step * square) if step > 0 else 0.0))
+    return np.array(found)

@@ -11,16 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .evaluation import STIFFNESS, Evaluation, undamped
 from .results import FIT_RESULTS
+from .roundoff import settle
 from .solvers import is_optax
 from .uncertainty import inverse_or
 
-_STIFFNESS = 30.0
-"""Length of the columns of the scaled Jacobian. Optimistix begins with a damping of 1, which then
-is Marquardt's 1e-3 of the squared columns."""
-
 _REJECTED = 12
 """Rejected steps in a row after which no further step is expected to help."""
+
+_NEAR = 1.0
+"""Length of an undamped step in standard errors up to which a third of them are enough."""
+
+_SMALL = 1e-13
+"""Relative change of u that makes as little difference as round-off of the predictions may make.
+Where an undamped step is not larger, one rejected step is enough."""
 
 _REJECTED_ON_LINE = 40
 """The same for a line search that halves: it does not know the scale to begin with."""
@@ -69,6 +74,11 @@ class Position:
         """The free variables."""
         return self.base + self.scale * self.z
 
+    @property
+    def reach(self) -> float:
+        """Change of the predictions by one of u of its own size."""
+        return STIFFNESS * float(np.linalg.norm(self.u / self.scale))
+
 
 @dataclass(frozen=True)
 class Task:
@@ -88,14 +98,6 @@ class Task:
         """The position to continue from, or that before the first step."""
         new = Position(self.stage, self.horizon, 0, np.asarray(u), scale, np.zeros(len(u)))
         return self.resume or new
-
-
-class Evaluation(NamedTuple):
-    """Residual vector (R,), its derivative (R, n), and what else was computed with them."""
-
-    residual: Array
-    jacobian: Array
-    aux: Any = None
 
 
 # Optimistix differentiates the residual function itself. Here it gets a function whose value and
@@ -135,7 +137,7 @@ _kept = functools.lru_cache(maxsize=64)(_state)
 
 
 @eqx.filter_jit
-def _advance(solver: Any, z: Array, known: tuple[Array, Array], state: Any) -> tuple[Array, Any]:
+def _advance(solver: Any, z: Array, known: tuple[Any, Any], state: Any) -> tuple[Array, Any]:
     z, state, _ = solver.step(_function, z, known, {}, state, frozenset())
     return z, state
 
@@ -150,10 +152,12 @@ class LeastSquaresStage:
 
     - `evaluate`: compiled function ``(u, horizon, extra)`` → `Evaluation`.
     - `solver`: one of optimistix's Gauss–Newton family.
+    - `shifts`: changes of u by round-off that the last run has measured, see `roundoff.End`.
     """
 
     def __init__(self, evaluate: Callable[..., Evaluation], solver: Any):
         self.evaluate, self._solver = evaluate, solver
+        self.shifts: np.ndarray | None = None
 
     def at(self, u: np.ndarray, horizon: float = np.inf, extra: Any = None) -> Evaluation:
         """Residual, Jacobian and the rest at u."""
@@ -174,27 +178,28 @@ class LeastSquaresStage:
 
         Ends when the step to the next trial moves the predictions by less than `tolerance`
         standard errors, whose size is estimated from the residuals; or when three steps in a row
-        decrease Σ r² by less than the square of that.
+        decrease Σ r² by less than the square of that. Where steps are rejected again and again,
+        `settle` distinguishes a minimum up to round-off from a fit that is stuck.
         """
-        horizon, tolerance = task.horizon, task.tolerance
+        horizon, tolerance, self.shifts = task.horizon, task.tolerance, None
         u = u if task.resume is None else task.resume.u
         best = self.at(u, horizon, extra) if first is None else first
         trial, state = best, _begin(self._solver, *best.jacobian.shape)
         if task.resume is None:
-            square = best.residual @ best.residual
+            square = np.sum(np.square(best.residual))
             if not (np.isfinite(square) and np.isfinite(best.jacobian).all()):
                 return u, best, FIT_RESULTS.not_finite
         else:
             trial, state = None, _with_leaves(state, task.resume.leaves)
             _check_same(best.residual, state.f_info.residual)
         length = np.linalg.norm(np.asarray(best.jacobian), axis=0)
-        at = task.begin(u, inverse_or(length, 1.0, _STIFFNESS))
+        at = task.begin(u, inverse_or(length, 1.0, STIFFNESS))
         base, scale, z = at.base, at.scale, jnp.asarray(at.z)
         while not at.status and at.done < task.max_steps:
             if trial is None:
                 trial = self.at(base + scale * np.asarray(state.y_eval), horizon, extra)
             z, state = _advance(
-                self._solver, z, (trial.residual, trial.jacobian * scale[None]), state
+                self._solver, z, (trial.residual, np.asarray(trial.jacobian) * scale), state
             )
             accepted = int(state.num_steps_since_acceptance) == 0
             best, at.rejected = (trial, 0) if accepted else (best, at.rejected + 1)
@@ -202,30 +207,50 @@ class LeastSquaresStage:
             residual = np.asarray(best.residual)
             loss = float(residual @ residual) / 2
             spread = np.sqrt(2 * loss / max(degrees, 1))
-            moved = float(np.linalg.norm(np.asarray(best.jacobian) @ (scale * (state.y_eval - z))))
+            moved = float(
+                np.linalg.norm(np.asarray(best.jacobian) @ (scale * np.subtract(state.y_eval, z)))
+            )
             at.done, at.z, at.leaves, at.extra = (
                 at.done + 1,
                 np.asarray(z),
                 *map(_leaves, (state, extra)),
             )
             u = at.u
-            rounding = 1e-13 * _STIFFNESS * float(np.linalg.norm(u / scale))
-            least = max(tolerance * spread, rounding)
+            least = tolerance * spread
             if accepted:  # at a bound the free variable grows for ever, and nothing changes
                 at.still = at.still + 1 if at.last - loss <= (tolerance * spread) ** 2 else 0
                 at.last = loss
             ended = at.still >= 3 or (moved <= least and at.rejected < 3)
             if not np.isfinite(moved):
                 at.status = "stalled"
-            elif ended and _undamped(best, scale) <= least:
+            elif ended and undamped(best, scale)[1] <= least:
                 # A step may be small because of its damping: the undamped one decides.
                 at.status = "converged"
-            elif at.rejected >= _REJECTED or (at.rejected >= 3 and moved <= least):
-                flat = _undamped(best, scale) <= max(_FLAT * spread, least)
-                at.status = "converged" if flat else "stalled"
+            elif (
+                at.rejected >= _REJECTED
+                or (at.rejected >= 3 and moved <= least)
+                or (at.rejected and _is_near(at, undamped(best, scale)[1], spread))
+            ):
+                at.status = "stalled"
             in_sigma = moved / spread if spread else 0.0
             task.watch(Record(task.stage, horizon, loss, in_sigma, accepted, u), at)
-        return u, best, getattr(FIT_RESULTS, at.status or "max_steps_reached")
+        status = at.status or "max_steps_reached"
+        if status == "stalled" and horizon == np.inf:  # of a part of the data it does not matter
+            spread = float(np.linalg.norm(best.residual)) / np.sqrt(max(degrees, 1))
+            flat = _FLAT * spread
+            end = settle(
+                lambda u: self.at(u, horizon, extra), u, best, scale, flat, _SMALL * at.reach
+            )
+            if end is not None:
+                u, best, self.shifts = end
+                status = "converged"
+        return u, best, getattr(FIT_RESULTS, status)
+
+
+def _is_near(at: Position, size: float, spread: float) -> bool:
+    """Whether the undamped step is small enough for round-off to be why steps are rejected."""
+    few = at.rejected >= _REJECTED // 3
+    return size <= max(_NEAR * spread * few, _SMALL * at.reach)
 
 
 def _scalar_function(core: Any, per: float) -> Callable[..., Any]:
@@ -323,18 +348,7 @@ class ScalarStage:
         return np.asarray(base + size * z), getattr(FIT_RESULTS, at.status or usual)
 
 
-def _undamped(at: Evaluation, scale: np.ndarray) -> float:
-    """Change of the predictions by the undamped step, in standard errors; parameters that have
-    almost no effect any more (at a bound) are left out."""
-    J = np.asarray(at.jacobian) * scale
-    J = J[:, np.linalg.norm(J, axis=0) > 1e-3 * _STIFFNESS]
-    if not J.shape[1]:
-        return 0.0
-    U, s, _ = np.linalg.svd(J / np.linalg.norm(J, axis=0), full_matrices=False)
-    return float(np.linalg.norm(U[:, s > 1e-7 * s[0]].T @ np.asarray(at.residual)))
-
-
-def _check_same(now: Array, then: Array) -> None:
+def _check_same(now: Any, then: Any) -> None:
     """Refuse a checkpoint whose residuals are not those of this model."""
     if not np.allclose(now, then, rtol=1e-6, atol=1e-6 * float(np.abs(then).max(initial=0.0))):
         raise ValueError(

@@ -1,5 +1,6 @@
 """Parameters as one vector: their names, bounds and priors."""
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
+
+from lanewise.jaxapi import is_traced
 
 from ..engine.quantities import refuse_unit_or_mask
 
@@ -85,33 +88,18 @@ class Space(eqx.Module):
         """Number of numbers with a prior."""
         return int((np.asarray(self.prior_weight) > 0).sum())
 
-    @property
-    def _sides(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Which numbers have both bounds, a lower one only, and an upper one only."""
-        below, above = np.array(self.below), np.array(self.above)
-        return below & above, below & ~above, above & ~below
-
     def to_params(self, x: Array) -> PyTree:
         """The pytree that holds the numbers x."""
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])[:-1]
-        parts = zip(jnp.split(x, ends), self.shapes, strict=True)
-        leaves = [part.reshape(shape) for part, shape in parts]
+        # Numbers that are known are split without a program to compile.
+        split = jnp.split if is_traced(x) else np.split
+        parts = zip(split(x if is_traced(x) else np.asarray(x), ends), self.shapes, strict=True)
+        leaves = [jnp.asarray(part.reshape(shape)) for part, shape in parts]
         return eqx.combine(jax.tree.unflatten(self.tree, leaves), self.rest)
 
     def to_x(self, u: Array) -> Array:
         """x within its bounds from the free vector u."""
-        both, low, high = self._sides
-        # Infinite limits and large u must not reach a branch that is not taken: 0·inf is NaN.
-        lower = jnp.where(both | low, self.lower, 0.0)
-        upper = jnp.where(both | high, self.upper, 0.0)
-        one = jnp.exp(jnp.where(low | high, u, 0.0))
-        x = jnp.where(both, lower + (upper - lower) * jax.nn.sigmoid(u), u)
-        x = jnp.where(low, lower + one, x)
-        x = jnp.where(high, upper - one, x)
-        # Rounding must not put x on a bound: there u is infinite. Derivatives stay those of exp.
-        least = jnp.where(both | low, lower + _gap(lower), -jnp.inf)
-        most = jnp.where(both | high, upper - _gap(upper), jnp.inf)
-        return x + jax.lax.stop_gradient(jnp.clip(x, least, most) - x)
+        return _to_x(u, self.lower, self.upper, self.below, self.above)
 
     def to_u(self, x: Any) -> np.ndarray:
         """The free vector of x."""
@@ -119,7 +107,7 @@ class Space(eqx.Module):
         with np.errstate(divide="ignore", invalid="ignore"):  # in branches that are not taken
             part = (x - lower) / (upper - lower)
             ways = [np.log(part) - np.log1p(-part), np.log(x - lower), np.log(upper - x)]
-        return np.select(self._sides, ways, x)
+        return np.select(_sides(self.below, self.above), ways, x)
 
     def in_words(self, x: np.ndarray, most: int = 8) -> str:
         """``args.k = 1.2, epsilon = 0``, the first few numbers."""
@@ -138,6 +126,29 @@ class Space(eqx.Module):
         reach = np.where(np.isfinite(sigma), 0.1 * sigma, 1e-12 * np.abs(x) + _UNDERFLOW)
         near = np.isfinite(off) & (off <= reach)
         return [name for name, is_near in zip(self.names, near, strict=True) if is_near]
+
+
+def _sides(below: Any, above: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which numbers have both bounds, a lower one only, and an upper one only."""
+    below, above = np.array(below), np.array(above)
+    return below & above, below & ~above, above & ~below
+
+
+# One program in place of one for each operation where a fit calls it outside of its own.
+@functools.partial(jax.jit, static_argnames=("below", "above"))
+def _to_x(u: Array, lower: Array, upper: Array, below: Any, above: Any) -> Array:
+    both, low, high = _sides(below, above)
+    # Infinite limits and large u must not reach a branch that is not taken: 0·inf is NaN.
+    lower = jnp.where(both | low, lower, 0.0)
+    upper = jnp.where(both | high, upper, 0.0)
+    one = jnp.exp(jnp.where(low | high, u, 0.0))
+    x = jnp.where(both, lower + (upper - lower) * jax.nn.sigmoid(u), u)
+    x = jnp.where(low, lower + one, x)
+    x = jnp.where(high, upper - one, x)
+    # Rounding must not put x on a bound: there u is infinite. Derivatives stay those of exp.
+    least = jnp.where(both | low, lower + _gap(lower), -jnp.inf)
+    most = jnp.where(both | high, upper - _gap(upper), jnp.inf)
+    return x + jax.lax.stop_gradient(jnp.clip(x, least, most) - x)
 
 
 def _gap(bound: Array) -> Array:

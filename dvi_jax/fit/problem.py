@@ -14,10 +14,10 @@ from .._checks import instance
 from .._results import RESULTS, status_name
 from .._system import check_system
 from ..engine.reads import Reads, reads
+from .evaluation import Evaluation
 from .losses import LeastSquares, Likelihood, Loss
 from .model import Group, Model, check_observable, make_groups, predict, specification, weighed
 from .observations import Observations
-from .optimise import Evaluation
 from .parameters import Space, make_space
 
 _UNITS = 1e3
@@ -160,8 +160,8 @@ def _warn_of_times(model: Model, params: Any, arcs: list[Observations]) -> None:
 
 def within(group: Group, horizon: Any) -> Array:
     """Which values were observed within the horizon, shape (A, N, K)."""
-    since = jnp.abs(jnp.asarray(group.ts) - jnp.asarray(group.t0)[:, None])
-    return jnp.asarray(group.seen) & (since <= horizon)[..., None]
+    since = abs(group.ts - group.t0[:, None])
+    return group.seen & (since <= horizon)[..., None]
 
 
 def _whiten(group: Group, found: Array, horizon: Any) -> Array:
@@ -173,6 +173,7 @@ def _whiten(group: Group, found: Array, horizon: Any) -> Array:
 # Functions of the module: a method of an instance would be compiled again for each fit.
 _evaluate = eqx.filter_jit(Core.evaluate)
 _whitened = eqx.filter_jit(Core.whitened)
+_root_rows = eqx.filter_jit(Core.root_rows)
 _hessian = eqx.filter_jit(Core.hessian)
 _curvature = eqx.filter_jit(Core.curvature)
 
@@ -228,9 +229,27 @@ class Problem:
         self.count = int(sum(group.seen.sum() for group in self.groups))
 
     @property
+    def steps(self) -> int:
+        """Steps of all trajectories together."""
+        return sum(len(group.arcs) * group.num_steps for group in self.groups)
+
+    @property
     def degrees_of_freedom(self) -> int:
         """Observed values and priors minus parameters."""
         return self.count + self.space.count_of_priors - self.size
+
+    def start_in_words(self) -> str:
+        """``initial state at t0 = 0: q0 fitted, p0 of the model``."""
+        times = np.array([arc.t0 for arc in self.given])
+        when = f"t0 = {times.min():g}" + (f" to {times.max():g}" if np.ptp(times) else "")
+        if all(arc.t0 == arc.ts[0] for arc in self.given):
+            when += " (the first observation)"
+        own = {name.split("[")[0] for name in self.space.names}
+        by = [
+            f"{n} {'fitted' if n in own and isinstance(self.core.model, Model) else 'of the model'}"
+            for n in ("q0", "p0")
+        ]
+        return f"initial state at {when}: {', '.join(by)}"
 
     def check_count(self) -> None:
         """**Raises** `ValueError` for fewer observed values than parameters."""
@@ -251,6 +270,10 @@ class Problem:
     def whitened(self, u: Any, horizon: Any = np.inf) -> tuple[list[Array], list[Any]]:
         """`Core.whitened`."""
         return _whitened(self.core, jnp.asarray(u), jnp.asarray(horizon, float))
+
+    def root_rows(self, u: Any, rows: list[Any]) -> np.ndarray:
+        """`Core.root_rows`."""
+        return np.asarray(_root_rows(self.core, jnp.asarray(u), rows))
 
     def hessian(self, u: Any) -> Array:
         """`Core.hessian`."""

@@ -20,10 +20,13 @@ _FORMAT = 1
 
 _PLAIN = (
     *("names", "loss", "degrees_of_freedom", "num_observed", "has_errors", "undetermined"),
-    *("at_bounds", "trajectories", "seconds", "prior_chi2"),
+    *("at_bounds", "trajectories", "seconds", "prior_chi2", "start"),
 )
 _BY_ARC = ("ts", "observed", "predicted", "whitened", "errors")
 """Fields that a file has as JSON, and those that are a list of arrays."""
+
+_NOTABLE = 0.01
+"""Part of a standard error from which on round-off is reported."""
 
 _LITTLE = 0.1
 """Fraction of the variance below which a model is reported as little better than a constant."""
@@ -51,11 +54,14 @@ class FitResult:
     - `prior_chi2`: Σ ((x − mean)/sigma)² of the priors.
     - `undetermined`: parameter combinations that the data do not determine, as text.
     - `singular_values`: of the Jacobian with columns of unit length, largest first.
-    - `curvature`: the exact second derivative of the loss along each principal direction over
-      that of Gauss–Newton: near 1 where the errors are reliable. None if it was not computed.
+    - `curvature`: the second derivative of the loss along each principal direction over that of
+      Gauss–Newton: near 1 where the errors are reliable. None if it was not computed.
     - `at_bounds`: names of the parameters that ended at a bound. Their entries of `covariance` are
       those of a free parameter or NaN: the error of such a parameter is not symmetric.
     - `trajectories`: status of each arc's trajectory.
+    - `rounding`: standard errors of x from the round-off of the predictions, shape (n,), measured
+      if it bounds the accuracy of the fit, else 0. They are included in `covariance`.
+    - `start`: t0, and which parts of the initial state were fitted, as text.
     """
 
     params: PyTree
@@ -80,6 +86,8 @@ class FitResult:
     trajectories: list[str] = field(default_factory=list)
     prior_chi2: float = 0.0
     seconds: float = 0.0
+    rounding: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    start: str = ""
 
     @property
     def status(self) -> str:
@@ -174,7 +182,8 @@ class FitResult:
             f"{errors}rms {self.rms:.4g}, {explained}{self.num_observed} values, "
             f"{self.degrees_of_freedom} degrees of freedom"
         )
-        lines += [words for words in [little_explained(self)] if words]
+        lines += [self.start] if self.start else []
+        lines += [words for words in [little_explained(self), rounded(self)] if words]
         lines += [f"not determined: {words}" for words in self.undetermined]
         if self.result != FIT_RESULTS.converged and str(FIT_RESULTS[self.result]):
             lines.append(str(FIT_RESULTS[self.result]))
@@ -190,6 +199,7 @@ class FitResult:
         arrays |= {f"history.{name}": value for name, value in self.history.items()}
         for name in _BY_ARC:
             arrays |= {f"{name}.{i}": a for i, a in enumerate(getattr(self, name))}
+        arrays["rounding"] = self.rounding
         if self.curvature is not None:
             arrays["curvature"] = self.curvature
         publish_npz(path, _FORMAT, about, arrays)
@@ -229,7 +239,8 @@ class FitResult:
             result=getattr(FIT_RESULTS, one_of("status of the file", about["result"], NAMES)),
             singular_values=arrays["values"],
             curvature=arrays.get("curvature"),
-            **{name: about[name] for name in _PLAIN},
+            rounding=arrays.get("rounding", np.zeros(len(arrays["x"]))),
+            **{name: about[name] for name in _PLAIN if name in about},
             **by_arc,
         )
 
@@ -252,6 +263,19 @@ def little_explained(found: FitResult) -> str:
     return (
         f"the model describes the data {than}: this may be a local minimum, or the data are "
         "constants and noise. Start from other parameters."
+    )
+
+
+def rounded(found: FitResult) -> str:
+    """The remark on a fit whose accuracy is bounded by rounding; empty for another one."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        part = found.rounding / found.sigma
+    part = part[np.isfinite(part)].max(initial=0.0)
+    if found.result != FIT_RESULTS.converged or part < _NOTABLE:
+        return ""
+    return (
+        "converged at the level of rounding: the round-off of the predictions changes parameters "
+        f"by up to {part:.1g} of their errors, which include it"
     )
 
 

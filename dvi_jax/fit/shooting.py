@@ -13,9 +13,9 @@ from jaxtyping import Array
 from .._checks import fraction, whole
 from .._integrate import integrate
 from .._solution import Save
+from .evaluation import Evaluation
 from .model import make_group, predict, specification, weighed
 from .observations import Observations
-from .optimise import Evaluation
 from .problem import Problem
 
 

@@ -10,9 +10,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from .evaluation import Evaluation
 from .losses import Likelihood
 from .model import Group, weighed
-from .optimise import Evaluation, LeastSquaresStage, ScalarStage
+from .optimise import LeastSquaresStage, ScalarStage
 from .problem import Problem
 from .results import FIT_RESULTS
 from .run import Run
@@ -43,7 +44,7 @@ class Minimum(NamedTuple):
 
     - `u`, `status`. `jacobian` of the residuals there, or a matrix whose square is the Hessian.
     - `free`: a basis of the directions that constraints leave free. `aux`: whitened residuals, and
-      predictions with statuses, of all data if they are known.
+      predictions with statuses, of all data if they are known. `shifts`: of u by round-off.
     """
 
     u: np.ndarray
@@ -51,6 +52,7 @@ class Minimum(NamedTuple):
     jacobian: Any = None
     free: np.ndarray | None = None
     aux: Any = None
+    shifts: np.ndarray | None = None
 
 
 def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units: bool) -> Minimum:
@@ -63,7 +65,7 @@ def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units
         if whole is not None:
             keep = problem.rows_within(task.horizon)
             r, J, aux = whole
-            whole = Evaluation(jnp.where(keep, r, 0.0), jnp.where(keep[:, None], J, 0.0), aux)
+            whole = Evaluation(np.where(keep, r, 0.0), np.where(keep[:, None], J, 0.0), aux)
         return stage.run(u, task, problem.degrees_of_freedom, whole)
 
     cut = FIT_RESULTS.max_steps_reached
@@ -71,7 +73,7 @@ def least_squares(run: Run, u: np.ndarray, solver: Any, wanted: Any, check_units
     u, found, status = _stages(
         run, u, wanted, check_units, stage.at, solve, (_BEFORE_LAST, tolerance, cut)
     )
-    return Minimum(u, status, found.jacobian, None, found.aux)
+    return Minimum(u, status, found.jacobian, None, found.aux, stage.shifts)
 
 
 def by_gradient(
@@ -254,4 +256,5 @@ def in_segments(run: Run, segments: Segments, u: np.ndarray, solver: Any) -> Min
     J = np.asarray(found.jacobian)
     data, tied = J[: len(J) - gaps], J[len(J) - gaps :]
     free = null_space(tied / root) if np.isfinite(J).all() else None
-    return Minimum(w[:n], status, data, free)
+    shifts = None if stage.shifts is None else stage.shifts[:, :n]
+    return Minimum(w[:n], status, data, free, shifts=shifts)

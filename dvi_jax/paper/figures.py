@@ -14,8 +14,8 @@ from .numbers import relative_spread, slope
 BLUE, ORANGE, GREEN, PINK = plot.COLOURS[:4]
 GREY = "#555555"
 MARKERS = "osD^vP"
-TIME = "time t (dimensionless; one period is 2π)"
-KEPLER_TIME = "time t (dimensionless)"
+TIME = "time t (one period is 2π)"
+KEPLER_TIME = "time t"
 
 FIGURES: dict[str, tuple[Callable[[Measurements], Any], str]] = {}
 """File name → the function that makes the figure, and its caption."""
@@ -39,7 +39,7 @@ def _figure(name: str, caption: str, heading: str, size: tuple[float, float], **
 
 @_figure(
     "fig1",
-    "Energy error of the free oscillator: on the fixed mesh the energy oscillates by O(h), and "
+    "Energy error of the free oscillator: with equal steps the energy oscillates by O(h), and "
     "another quadratic form is conserved.",
     "Figure 1   Energy error of the variational method, h = 0.1, ε = 0",
     (9, 3.6),
@@ -50,10 +50,11 @@ def energy_error(m: Measurements, figure: Any, axes: Any) -> None:
     error = (run.mixed[0] - run.mixed[0, 0]) / 1e-6
     exact = (run.exact[0] - run.exact[0, 0]) / 1e-6
     t, low, high = _bands(run.ts, error, run.h)
-    whole.fill_between(t, low, high, color=BLUE, alpha=0.25, linewidth=0)
-    whole.plot(t, low, t, high, color=BLUE)
-    whole.text(500, np.mean(high) / 2, "swept twice a period", color=BLUE, ha="center")
-    ylabel = "error in the energy  (10⁻⁶, dimensionless)"
+    whole.plot(t, high, color=BLUE)
+    whole.plot(t, low, color=BLUE, dashes=(5, 2))
+    for values, text in ((high, "largest in each period"), (low, "smallest in each period")):
+        whole.text(500, np.mean(values) + 0.5, text, color=BLUE, ha="center")
+    ylabel = "error in the energy  (10⁻⁶)"
     whole.set(title="all 10 000 steps", xlabel=TIME, ylim=(-4.5, 14), ylabel=ylabel)
     part = run.ts < 3 * 2 * np.pi
     close.plot(run.ts[part], error[part], color=BLUE, marker="o", markersize=2.5, linewidth=0.8)
@@ -80,7 +81,7 @@ def against_rk4(m: Measurements, figure: Any, axes: Any) -> None:
     t, _, crests = _bands(run.ts, variational, run.h)
     axes.semilogy(t, crests, color=BLUE)
     axes.semilogy(run.ts, rk4, color=ORANGE, dashes=(5, 2))
-    axes.set(xlabel=TIME, ylabel="|error in the energy|  (dimensionless)", ylim=(1e-12, 1e-3))
+    axes.set(xlabel=TIME, ylabel="|error in the energy|", ylim=(1e-12, 1e-3))
     axes.text(run.ts[-1], 2e-5, "variational: largest in each period", color=BLUE, ha="right")
     axes.text(run.ts[-1], 1.5e-9, "RK4: grows in proportion to t", color=ORANGE, ha="right")
 
@@ -126,14 +127,14 @@ def phase_diagrams(m: Measurements, figure: Any, axes: Any) -> None:
         colours = axis.scatter(*run.qs.T, c=run.ts / 1000, s=0.15, **look)
         axis.plot(0, 0, "k+", markersize=8)
         axis.set(title=name, aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1] + 1.6))
-        axis.set_xlabel("q₁  (dimensionless)")
+        axis.set_xlabel("q₁")
         mantissa, exponent = f"{run.turn:.1e}".split("e")
         turn = rf"${mantissa}\times 10^{{{int(exponent)}}}$"
         text = (
             f"loop {run.width:.2g} wide at the apocentre\nellipse turns {turn} rad per revolution"
         )
         axis.text(0.03, 0.97, text, transform=axis.transAxes, va="top", fontsize=8.5)
-    axes[0].set_ylabel("q₂  (dimensionless)")
+    axes[0].set_ylabel("q₂")
     # The width of RK4's loop is not visible at full size: a window around the apocentre shows it.
     rk4 = shown[0]
     half_way = rk4.qs[len(rk4.qs) // 2 :][:500]  # more than one revolution
@@ -147,8 +148,10 @@ def phase_diagrams(m: Measurements, figure: Any, axes: Any) -> None:
     window.set(xticks=[], yticks=[], aspect="equal")
     window.set_title(f"apocentre, {2 * half:.2g} across", fontsize=8, fontweight="normal")
     window.spines[["top", "right"]].set_visible(True)
-    axes[0].indicate_inset_zoom(window, edgecolor=GREY)
-    figure.colorbar(colours, ax=axes, label="time t  (thousands, dimensionless)", shrink=0.85)
+    # The lines from the window to its place would cross the orbit; the rectangle marks the place.
+    for line in axes[0].indicate_inset_zoom(window, edgecolor="black", alpha=1).connectors:
+        line.set_visible(False)
+    figure.colorbar(colours, ax=axes, label="time t  (thousands)", shrink=0.85)
 
 
 @_figure(
@@ -167,11 +170,11 @@ def long_run_errors(m: Measurements, figure: Any, axes: Any) -> None:
         for axis, errors in ((left, run.energy_errors), (right, run.momentum_errors)):
             crests = np.abs(errors[: count * block]).reshape(count, block).max(1)
             axis.semilogy(t, crests, **look)
-    thousands = "time t  (thousands, dimensionless)"
+    thousands = "time t  (thousands)"
     left.set(title=f"energy: largest in {block} steps", ylabel="|error|, relative")
     left.set_xlabel(thousands)
     right.set(title=f"angular momentum: largest in {block} steps", xlabel=thousands)
-    right.set_ylabel("|error|  (dimensionless)")
+    right.set_ylabel("|error|")
     right.legend(loc="center")
 
 
@@ -188,7 +191,7 @@ def adiabatic_50(m: Measurements, figure: Any, axes: Any) -> None:
         look = _look(i) | {"marker": MARKERS[i], "label": f"ε = {epsilon:g}"}
         left.plot(sweep.ts[part], sweep.values_50[i, part], markevery=(40 * i, 160), **look)
     left.set(title=f"the paper's map, h = {sweep.hs[0]:g}", xlabel=KEPLER_TIME)
-    left.set_ylabel("adiabatic invariant (50)  (dimensionless)")
+    left.set_ylabel("adiabatic invariant (50)")
     low, high = left.get_ylim()
     left.set_ylim(low, high + 0.35 * (high - low))
     left.legend(ncols=2, loc="upper center")
@@ -198,7 +201,7 @@ def adiabatic_50(m: Measurements, figure: Any, axes: Any) -> None:
             change = np.abs(small.values[k] - small.values[k, 0])[part]
             right.semilogy(small.ts[part], change, **_look(int(i)), label=f"ε = {epsilon:g}")
     right.set(title=f"as h → 0 (order 4, h = {small.h:g})", xlabel=KEPLER_TIME)
-    right.set(ylabel="|change of (50)|  (dimensionless)", ylim=(1e-11, 1))
+    right.set(ylabel="|change of invariant (50)|", ylim=(1e-11, 1))
     right.legend(ncols=2, loc="upper center")
 
 
@@ -219,7 +222,7 @@ def rk4_crossover(m: Measurements, figure: Any, axes: Any) -> None:
         left.plot(*point, "ko")
         left.annotate(text, point, (0, 9), textcoords="offset points", ha="right")
     left.set(title=f"h = {cross.hs[0]:g}", xlabel="steps", ylim=(1e-9, 1e-4))
-    left.set_ylabel("energy error  (dimensionless)")
+    left.set_ylabel("|error in the energy|")
     left.legend(loc="upper left")
     fine = np.geomspace(0.9 * cross.hs[0], 1.1 * cross.hs[-1], 50)
     start = m.fixed_mesh.energy
@@ -268,7 +271,7 @@ def sweep_50(m: Measurements, figure: Any, axes: Any) -> None:
     positive = sweep.epsilons[1:]
     for i, h in enumerate(sweep.hs):
         look = _look(i) | {"marker": MARKERS[i]}
-        left.loglog(positive, sweep.spread_50[i, 1:], **look, label=f"fixed mesh, h = {h:g}")
+        left.loglog(positive, sweep.spread_50[i, 1:], **look, label=f"equal steps, h = {h:g}")
     for drifts, label, look in (
         (small.attracting, "h → 0, force −εq", {"color": "k", "marker": "o"}),
         (small.repelling, "h → 0, force +εq", {"color": GREY, "marker": "x", "ls": "--"}),
@@ -282,8 +285,10 @@ def sweep_50(m: Measurements, figure: Any, axes: Any) -> None:
     text = "error of the order-4 method: the drift of\n(1+ε)L − H − ε|q|²/2 for every ε"
     look = {"ha": "right", "va": "top", "fontsize": 8.5, "color": GREY}
     left.text(0.1, small.literal[0] / 1.4, text, **look)
-    left.set(title="(50) against ε", xlabel="strength of the perturbation ε", ylim=(1e-10, 300))
-    left.set_ylabel("range (fixed mesh), drift (h → 0)")
+    left.set(
+        title="invariant (50) against ε", xlabel="strength of the perturbation ε", ylim=(1e-10, 300)
+    )
+    left.set_ylabel("range of (50) (equal steps), drift (h → 0)")
     left.legend(fontsize=8.5, ncols=2, loc="upper center", columnspacing=1)
     for i, epsilon in enumerate(sweep.epsilons):
         if epsilon not in (0.0, 1e-2, 1e-1):
@@ -294,7 +299,7 @@ def sweep_50(m: Measurements, figure: Any, axes: Any) -> None:
     right.loglog(sweep.hs, largest_49, "kP:", label="(49), relative, largest over ε")
     reference = sweep.spread_50[0, 0] * sweep.hs / sweep.hs[0] / 2.5
     right.loglog(sweep.hs, reference, color=GREY, linewidth=0.9, label="in proportion to h")
-    right.set(title="(50) and (49) against h", xlabel="step size h", ylim=(1e-15, 100))
+    right.set(title="invariants (50) and (49) against h", xlabel="step size h", ylim=(1e-15, 100))
     right.set_xticks(sweep.hs, [f"{h:g}" for h in sweep.hs])
     right.minorticks_off()
     right.set_ylabel("range over t = 200")

@@ -8,14 +8,19 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cbook import normalize_kwargs
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.lines import Line2D
+from matplotlib.transforms import ScaledTranslation
 
 from .._checks import instance
 from .style import GUIDE, HATCH, PALE, SHADES, figure_of
 
 _PIECE = 20_000
 """Points of one path: Agg cannot draw much longer ones in one piece."""
+
+_LABELS = 36
+"""Points below axes that their ticks and their label take."""
 
 _EXTEND = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
 
@@ -93,7 +98,8 @@ def entry(label: str, **look: Any) -> Line2D:
 
 
 def legend(axis: Any, new: bool, extra: Iterable[Any] = (), labelled: bool = True) -> Any:
-    """A legend below a new figure in as many columns as fit, or inside axes that were given.
+    """A legend below a new figure in as many columns as fit, or inside axes that were given; below
+    them if they hold a map, which fills them, and the figure has a layout that makes space.
 
     `extra`: entries after those of the labelled artists: artists, or texts without a mark.
     """
@@ -101,10 +107,15 @@ def legend(axis: Any, new: bool, extra: Iterable[Any] = (), labelled: bool = Tru
     handles += [entry(one, ls="none") if isinstance(one, str) else one for one in extra]
     if not handles:
         return None
-    if not new:  # below given axes it would cover their labels, or other axes
-        paper = {"frameon": True, "framealpha": 0.6, "edgecolor": "none"}
-        return axis.legend(handles=handles, fontsize=8, **paper)
     figure = figure_of(axis)
+    if not new:  # below axes without a layout it would cover their labels, or other axes
+        look = {"frameon": True, "framealpha": 0.6, "edgecolor": "none"}
+        is_map = any(isinstance(drawn, QuadMesh) for drawn in axis.collections)
+        if is_map and figure.get_layout_engine() is not None:
+            under = ScaledTranslation(0, -_LABELS / 72, figure.dpi_scale_trans)
+            look = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "borderaxespad": 0.0}
+            look["bbox_transform"] = axis.transAxes + under
+        return axis.legend(handles=handles, fontsize=8, **look)
     if axis.name == "3d":  # the labels of its axes need the space below
         return figure.legend(handles=handles, loc="upper right")
     # A letter is about 0.066 inch wide; the handle and the space between columns take five more.
@@ -138,12 +149,19 @@ def scale_of(
     return (LogNorm if log else Normalize)(low, high), ends
 
 
-def path(axis: Any, *coordinates: np.ndarray, label: str | None = None, **look: Any) -> None:
-    """A line of any length; a long one is drawn as pixels in a vector file."""
+def path(
+    axis: Any, *coordinates: np.ndarray, label: str | None = None, marks: Any = None, **look: Any
+) -> None:
+    """A line of any length; a long one is drawn as pixels in a vector file.
+
+    `marks`: numbers of the points that have a marker; None: all.
+    """
     n = len(coordinates[0])
     long: dict[str, Any] = {"rasterized": True} if n > _PIECE else {}
     for first in range(0, n - 1 if long else 1, _PIECE):
         part = slice(first, first + _PIECE + 1)
+        if marks is not None:
+            look["markevery"] = [i - first for i in marks if part.start <= i < part.stop]
         axis.plot(*(c[part] for c in coordinates), label=label, **long, **look)
         label = None
 

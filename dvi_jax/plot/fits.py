@@ -135,12 +135,13 @@ def fit_against_data(
 ) -> Any:
     """Observations along one arc, with their errors, and the predictions of the fit.
 
-    Data without errors have bars of the estimated error.
+    Data without errors have bars of the estimated error. The predictions are joined by a line where
+    that is close to the model's curve (within a hundredth of its range); else they are crosses.
 
     - `fit`: a `FitResult`. `arc`: its number. `component`: of the flattened values of one
       observation, one or several; None: all, up to seven.
-    - `curve`: (times, values) of the model on a finer grid, (T,) and (T, ...), in place of the
-      straight lines between its predictions.
+    - `curve`: (times, values) of the model on a finer grid, (T,) and (T, ...), in place of its
+      predictions.
     - `names`: of all components of one observation, for the legend.
 
     **Returns** the `Axes`. **Raises** `TypeError` for anything but a fit; `ValueError` for an arc
@@ -168,13 +169,31 @@ def fit_against_data(
         name = named[k] or (f"component {k}" if components > 1 else "")
         name += ": " if name else ""
         look = _dot(k, 4 if len(ts) < 200 else 2) | {"mfc": "white", "capsize": 0}
-        ax.plot(fine[order], curves[order, k], c=look["c"], lw=1.1, label=f"{name}fit")
+        x, y = fine[order], curves[order, k]
+        line = {"c": look["c"], "lw": 1.1, "label": f"{name}fit"}
+        if curve is None and not _is_smooth(x, y):
+            line |= {"ls": "none", "marker": "x", "ms": 4}
+        ax.plot(x, y, **line)
         look |= {"elinewidth": 0.9, "label": f"{name}observed"}
         ax.errorbar(ts, seen[:, k], yerr=errors[:, k], **look)
     title = f"arc {arc}" if len(fit.ts) > 1 else ""
     ax.set(xlabel="time t", ylabel="observed value", title=title)
     legend(ax, new)
     return ax
+
+
+def _is_smooth(x: np.ndarray, y: np.ndarray) -> bool:
+    """Whether straight lines between the points are within a hundredth of the range of a curve.
+
+    Its distance from them is h²|y″|/8, with y″ from three neighbours.
+    """
+    x, y = x[np.isfinite(y)], y[np.isfinite(y)]
+    if len(x) < 3:
+        return False
+    h = np.diff(x)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bend = np.diff(np.diff(y) / h) * np.maximum(h[1:], h[:-1]) ** 2 / (h[1:] + h[:-1]) / 4
+    return bool((np.abs(bend) <= 0.01 * np.ptp(y)).all())
 
 
 @in_style

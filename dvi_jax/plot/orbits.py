@@ -113,15 +113,35 @@ def _draw_orbit(
         # Where an orbit retraces itself its dashes overlap to a full line, and only markers
         # distinguish it in a print without colours.
         if 1 < many <= len(COLOURS) and looks.scale is None:
-            step = max(1, n // _MARKS)
-            place = step * (2 * i + 1) // (2 * many), step
-            look |= {"marker": MARKS[i], "markevery": place, "ms": 4.5}
+            marks = _spread(xy, n // _MARKS * (2 * i + 1) // (2 * many))
+            look |= {"marker": MARKS[i], "marks": marks, "ms": 4.5}
         path(axis, *xy, **look)
     if many <= len(COLOURS):
         axis.plot(*(x[:1] for x in xy), color=looks.colours[i], zorder=3, **START)
     if lane.trouble:
         finite = np.flatnonzero(np.logical_and.reduce([np.isfinite(x) for x in xy]))[-1:]
         axis.plot(*(x[finite] for x in xy), ls="none", zorder=4, **CROSS)
+
+
+def _spread(xy: Sequence[np.ndarray], first: int) -> list[int]:
+    """Places of markers along a line, each as far in the picture as possible from those before.
+
+    Equal steps in time would put them on top of one another where an orbit retraces itself.
+    """
+    points = np.stack(xy)
+    known = np.flatnonzero(np.isfinite(points).all(axis=0))
+    known = known[:: max(1, len(known) // 2000)]
+    if not known.size:
+        return []
+    size = np.ptp(points[:, known], axis=1, keepdims=True)
+    points = points[:, known] / np.where(size > 0, size, 1.0)
+    found = [min(int(np.searchsorted(known, first)), len(known) - 1)]
+    distance = np.full(len(known), np.inf)
+    while len(found) < min(_MARKS, len(known)):
+        away = np.linalg.norm(points - points[:, found[-1:]], axis=0)
+        distance = np.minimum(distance, away)
+        found.append(int(np.argmax(distance)))
+    return known[found].tolist()
 
 
 def _entries(lanes: Sequence[Lane], looks: Looks) -> list[Any]:

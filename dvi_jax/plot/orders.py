@@ -15,6 +15,7 @@ from .style import COLOURS, DASHES, MARKERS, SMALL, ZERO, in_style, named, signe
 
 _HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++++")
 _CAUSES = ("symmetry", "work", "lattice")
+_EPSILON = "strength ε of the perturbation"
 _BAR: dict[str, Any] = {"marker": "_", "ms": 12, "mew": 2, "ls": "none"}
 
 
@@ -83,22 +84,30 @@ def balance(
 
 @in_style
 def drift_orders(
-    results: Mapping[str, DriftOrder] | Sequence[DriftOrder],
+    results: DriftOrder | Mapping[str, DriftOrder] | Sequence[DriftOrder],
     promised: Sequence[float | None] | float | None = None,
     title: str = "Largest drift against the perturbation",
     ax: Any = None,
+    *,
+    expected: Sequence[float | None] | float | None = None,
 ) -> Any:
     """Drifts over ε (`drift_order`) and the orders that are expected.
 
-    - `results`: label → measured order, or a sequence of them.
-    - `promised`: expected order z + 1 of each result in turn (None: unknown), or one for all; a
-      grey line of that slope goes through the first point of the fit.
+    - `results`: one measured order, label → measured order, or a sequence of them.
+    - `promised`, or `expected`: the order z + 1 of each result in turn (None: unknown), or one for
+      all; a grey line of that slope goes through the first point of the fit.
 
     Hollow points are excluded from the fit; bars at the left end mark the drift at ε = 0. The
     legend counts drifts that failed, crosses at the top, and those exactly 0, triangles at the
     bottom. **Returns** the `Axes`. **Raises** `TypeError` for anything but a `DriftOrder`.
     """
-    if not isinstance(results, Mapping):
+    if expected is not None:
+        if promised is not None:
+            raise TypeError("expected and promised are one keyword: give one of them.")
+        promised = expected
+    if isinstance(results, DriftOrder):
+        results = {"drift": results}
+    elif not isinstance(results, Mapping):
         results = {f"observable {i}": order for i, order in enumerate(results, 1)}
     for order in results.values():
         wanted = "drift_orders draws what dvi.drift_order returned"
@@ -127,7 +136,7 @@ def drift_orders(
             draw.guide(axis, (x[first], x.max()), y[first], slope, zorder=1)
         lost += draw.without_place(axis, np.append(x, left), np.append(y, order.floor), colour)
         total += len(y) + 1
-    axis.set(xscale="log", yscale="log", xlabel="ε", ylabel="largest drift", title=title)
+    axis.set(xscale="log", yscale="log", xlabel=_EPSILON, ylabel="largest drift", title=title)
     marks: Any = {"color": "#444444", "ls": "none"}
     hollow = marks | {"marker": "o", "mfc": "white"}
     extra = [entry("expected slope", **draw.GUIDE)] if promised is not None else []
@@ -168,7 +177,7 @@ def drift_surface(
     (left, right), new = stack(ax, 2, what, (9.6, 4.2), ncols=2, width_ratios=ratios)
     edges = draw.cell_edges(surface.epsilons, log=True), draw.cell_edges(surface.hs, log=True)
     entries = _draw_drifts(left, surface, edges)
-    left.set(xscale="log", yscale="log", xlabel="ε", ylabel="step size h", title=title)
+    left.set(xscale="log", yscale="log", xlabel=_EPSILON, ylabel="step size h", title=title)
     _draw_orders_in_epsilon(right, surface, promised)
     right.set(xscale="log", xlabel="step size h", ylabel="order in ε", title="Order in ε")
     right.set_xlim(*edges[1][[0, -1]])

@@ -13,7 +13,11 @@ from .axes import at_most, canvas, check_shapes, counted, envelope, guide, label
 from .states import Lane, each_state, lanes_of, looks_of, troubles
 from .style import COLOURS, CROSS, DASHES, GREY, GUIDE, SMALL, in_style, look_of, named, signed
 
-_CHANGES = {"relative": "relative change", "absolute": "change", "value": ""}
+_CHANGES = {
+    "relative": ("relative change", "|ΔI/I$_0$|"), "absolute": ("change", "|ΔI|"),
+    "value": ("", "|I|"),
+}  # fmt: skip
+"""Labels of each change, and of its size."""
 _PANELS = 12
 
 _NEAR_ROUNDING = 1e-12
@@ -52,9 +56,9 @@ def invariants(
     - `change`: "relative", (I − I₀)/|I₀|; "absolute", I − I₀; "value", I itself. I₀ is the first
       finite number, of an observable that of the first step. For vectors and matrices it is the
       length of the change, relative to the length of I₀.
-    - `log`: sizes on a logarithmic axis, on which several quantities of one orbit share a panel,
-      and relative changes are compared with the machine epsilon. The legend counts values that are
-      exactly 0, which have no place there.
+    - `log`: sizes, such as |ΔI/I₀|, on a logarithmic axis, on which several quantities of one orbit
+      share a panel, and relative changes are compared with the machine epsilon. The legend counts
+      values that are exactly 0, which have no place there.
     - `labels`, `colour`, `colour_label`, `units` (of "t", and of quantities whose change is not
       relative), `title`, `ax` (one `Axes` for each panel): as for all pictures.
 
@@ -95,9 +99,9 @@ def invariants(
                 axis.plot(t[last], v[last], ls="none", zorder=4, **CROSS)
             # The first value is the reference and therefore 0.
             zeros += int(np.sum(v[1:] == 0)) if log else 0
-        kind = _CHANGES[change]
+        kind, size = _CHANGES[change]
         if log or any(v[:1].size > 1 for v in rows):
-            kind = f"size of {kind}" if kind else "size"
+            kind = f"{kind} {size}".lstrip() if together else size
         unit = look.units.get(quantity) if change != "relative" and not together else None
         title = "" if together else textwrap.fill(title, 20) if kind else title
         label = f"{title}\n{named(kind, unit)}" if kind and title else named(title or kind, unit)
@@ -255,7 +259,7 @@ def conserved(ts: Any, series: Mapping[str, Any], time: str, title: str, ax: Any
         texts = counted({f"of {len(v)} {what}": n for what, n in lost.items()})
         notes += [f"{label}: {text}" for text in texts]
     _rounding(axis)
-    axis.set(xlabel=time, ylabel="relative change since the start", title=title)
+    axis.set(xlabel=time, ylabel="relative change since the start |ΔI/I$_0$|", title=title)
     found = legend(axis, new, notes)
     for line in found.get_lines() if found else ():
         line.set_linewidth(2.0)

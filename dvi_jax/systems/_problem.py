@@ -85,6 +85,11 @@ class Problem:
     def __post_init__(self):
         if self.system.epsilon is None:  # what is known is known of the unperturbed motion
             object.__setattr__(self, "system", replace(self.system, epsilon=0.0))
+        for name in ("q0", "p0"):
+            value = getattr(self, name)
+            if isinstance(value, list | tuple):
+                array = np.asarray(value, jnp.result_type(float))
+                object.__setattr__(self, name, array)
         args = self.args if isinstance(self.args, Mapping) else {}
         for what, known, kind in (
             ("invariants", self.observables, "observables"),

@@ -236,7 +236,7 @@ def _timed(row: Row, rounds: int) -> list[dict[str, Any]]:
         if row.tolerance is not None:
             both = zip(ends[0], ends[i], strict=True)
             differ = float(np.max([np.max(np.abs(x - y)) for x, y in both]))
-            agrees = differ <= row.tolerance  # NaN does not agree
+            agrees = differ <= row.tolerance  # NaN does not
         found.append(
             {
                 "reference": name,

@@ -1,6 +1,7 @@
 """Texts such as ``Yoshida(4)``: names of known classes with arguments; nothing else is called."""
 
 import ast
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,8 +15,14 @@ from .loader import Loader
 
 def public(base: type, *without: type) -> dict[str, type]:
     """The public classes of the package that are subclasses of `base`, by name."""
-    classes = {n: c for n, c in vars(dvi).items() if isinstance(c, type) and issubclass(c, base)}
-    return {n: c for n, c in classes.items() if c is not base and c not in without}
+    # In the package of `base`: `dvi_jax` itself has some of its names after their first use only.
+    package = sys.modules[base.__module__.rpartition(".")[0]]
+    classes = {n: c for n, c in vars(package).items() if isinstance(c, type)}
+    return {
+        n: c
+        for n, c in classes.items()
+        if issubclass(c, base) and c is not base and c not in without and hasattr(dvi, n)
+    }
 
 
 @dataclass(frozen=True)

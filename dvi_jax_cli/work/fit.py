@@ -105,7 +105,8 @@ def fit_problem(file: FitFile, source: Source) -> tuple[dict[str, Any], list[str
     """
     q0, p0, args = source.array("q0"), source.array("p0"), source.args
     source.check_start(q0, p0, args)
-    start = {"epsilon": file.epsilon, "q0": q0, "p0": p0}
+    fitted = file.epsilon is None and "epsilon" in file.parameters
+    start = {"epsilon": 0.0 if fitted else source.epsilon, "q0": q0, "p0": p0}
     params = _parameters(file.parameters, start, args)
     h, method, options = float(source.h), parse_method(file.method), file.options
     data, columns = _observations(file.data, source.loader, np.shape(q0), file.t0)

@@ -57,7 +57,7 @@ def _conserved(problem: systems.Problem, name: str) -> str:
         adiabatic = problem.adiabatic[name]
         power = f" to power {adiabatic.power}" if adiabatic.power != 1 else ""
         return f"adiabatic: oscillates by {adiabatic.small}{power}"
-    return "conserved exactly at ε = 0" if name in problem.invariants else ""
+    return "conserved by the unperturbed flow" if name in problem.invariants else ""
 
 
 def _short(value: Any) -> str:

@@ -154,7 +154,7 @@ class RunFile(SystemFile, Integration):
     """One trajectory."""
 
     steps: Count | None = key(None, COUNT)
-    epsilon: Number = key(0.0, FINITE)
+    epsilon: Number | None = key(None, FINITE)
     output: RunOutput = RunOutput()
 
 
@@ -243,7 +243,7 @@ class SweepFile(SystemFile, Integration):
     steps: number_or_axis(Count, Annotated[Count, BeforeValidator(_whole)]) | None = key(
         None, f"{COUNT}{OR_AXIS} of such"
     )
-    epsilon: number_or_axis(Number) = key(0.0, FINITE + OR_AXIS)
+    epsilon: number_or_axis(Number) | None = key(None, FINITE + OR_AXIS)
     method: union(text=Text, array=Many[Text], table=Axis[Text]) = key(
         "TypeII", f"{METHOD}; or an array of such texts"
     )
@@ -330,7 +330,7 @@ class FitFile(SystemFile):
     t0: Number | None = key(
         None, f"{FINITE}: the time of [state]; that of the first observation if not given"
     )
-    epsilon: Number = key(0.0, FINITE)
+    epsilon: Number | None = key(None, FINITE)
     parameters: Many[Text] = key(..., 'an array of names: "epsilon", "q0", "p0", "args.NAME"')
     bounds: Annotated[dict[str, Bounds], AfterValidator(_flat)] = key(
         {}, "[lower, upper], numbers or arrays; -inf, inf for none"

@@ -114,7 +114,16 @@ class Source:
         else:
             grid = {"lattice": dvi.Uniform(), "h": self.h, "num_steps": file.steps}
             require(file.steps is not None, "steps", MISSING, COUNT)
-        return grid | {"t0": file.t0, "epsilon": file.epsilon}
+        return grid | {"t0": file.t0, "epsilon": self.epsilon}
+
+    @property
+    def epsilon(self) -> Any:
+        """The strength of the perturbation in the file, or else of the system."""
+        try:
+            return self.system.strength(getattr(self.file, "epsilon", None))
+        except ValueError:
+            allowed = "a number: the system has a force or a perturbation (0.0: unperturbed)"
+            raise InputError("epsilon", MISSING, allowed) from None
 
 
 def find_source(file: SystemFile, folder: Path) -> Source:
@@ -136,11 +145,10 @@ def find_source(file: SystemFile, folder: Path) -> Source:
             raise InputError("system", seen, "a function that returns a system") from error
     if isinstance(made, systems.Problem):
         return Source(file, loader, made, made.system)
+    if isinstance(made, dvi.System):
+        return Source(file, loader, None, made)
     allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
-    seen = f"{name!r} is {type(made).__name__}"
-    if not isinstance(made, dvi.System):
-        raise InputError("system", seen, allowed)
-    return Source(file, loader, None, made)
+    raise InputError("system", f"{name!r} is {type(made).__name__}", allowed)
 
 
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:
