@@ -252,7 +252,7 @@ def _compile(target: Path) -> list[str]:
 
 
 def _run(command: list[str]) -> str:
-    """What went wrong, with the command; nothing if it went well."""
+    """The error message with the command; empty if it succeeded."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:

@@ -145,7 +145,7 @@ WORKLOADS = {
     "web10": _implicit("web10", web, 10, 0.3),
     "bodies": _bodies(),
 }
-"""By name. `kernel` is the name of the C kernel, empty for workloads without one."""
+"""Workloads by name. `kernel` is the name of the C kernel, empty for workloads without one."""
 
 
 def run_of(w: Workload, steps: int, *, save=None, observe=None, epsilon=EPSILON, **settings):

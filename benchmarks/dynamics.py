@@ -30,7 +30,7 @@ Row = tuple[str, str, str, bool]
 
 
 def along(q0, p0, observe, num_steps, method=dvi.Strang(), **options):
-    """What is observed along an orbit of Hénon and Heiles, or another system."""
+    """Observables along an orbit of Hénon and Heiles, or of another system."""
     system = options.pop("system", HENON.system)
     options = {"h": 0.05, "save": dvi.Save(final=True)} | options
     return dvi.integrate(

@@ -3,7 +3,7 @@
     python benchmarks/import_time.py [--rounds 7] [--check]
 
 Each is a process of its own, interleaved with the others; medians, with byte code compiled and
-files in the cache of the disk. Of an import the first column is the statement alone, of a command
+files in the cache of the disk. For an import the first column is the statement alone, for a command
 the whole process; the others are the whole process, the interpreter's start and end included.
 `--check`: exit status 1 if `import dvi_jax` takes more than 1.1 times `import jax, equinox` and
 0.15 s more, or help more than 0.5 s.

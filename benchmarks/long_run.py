@@ -1,6 +1,6 @@
 """Round-off over ten million steps: plain, compensated and fixed-point arithmetic.
 
-What is watched has no error of the method in it, only that of the arithmetic:
+The quantities have no error of the method, only that of the arithmetic:
 
 - cubic oscillator: the map p1 = p0 − h q0 (1 + q0²)/(1 + h² q0²/2), q1 = q0 + h p1 keeps
 
@@ -63,7 +63,7 @@ def _potential(q, h):
 
 @_potential.defjvp
 def _(primals, tangents):
-    # By hand, because what cancels in the derivative of the above is divided by h².
+    # Derived by hand: autodiff of the above has terms that cancel and are divided by h².
     q, h = primals
     return _potential(q, h), q * (1 + q**2) / (1 + h**2 * q**2 / 2) * tangents[0]
 

@@ -12,11 +12,12 @@ an amplitude inside that of the training:
 - `RK4, general`: nothing is known; (q̇, ṗ) is a network of (q, p), under RK4.
 
 All have about the same number of parameters, the same data, start, step h, prior, horizons and
-number of steps of optimistix's Levenberg–Marquardt in the same scaled variables. Of several initial
-weights each takes those with the least training loss; the reference models also choose between two
-activations. The general network has less prior knowledge; the second reference has the same as the
-first model, except the structure. The length of the arc, the activation of the first model and the
-number of restarts were chosen with noise of the seeds 0 to 4; the table uses other seeds.
+number of steps of optimistix's Levenberg–Marquardt in the same scaled variables. From several
+initial weights each takes those with the least training loss; the reference models also choose
+between two activations. The general network has less prior knowledge; the second reference has the
+same as the first model, except the structure. The length of the arc, the activation of the first
+model and the number of restarts were chosen with noise of the seeds 0 to 4; the table uses other
+seeds.
 """
 
 import argparse

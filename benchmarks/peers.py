@@ -36,11 +36,11 @@ from speed import Clock, batched, last_state, pin, processor, ratio, say
 SAME_MAP, FIRST_ORDER = 1e-12, 2.0
 FINE_STEP, FINE_STEPS, FINE_LANES = 1e-3, 1000, 8
 RELATIVE_TOLERANCE = 1e-9
-"""Of adaptive peers."""
+"""Relative tolerance of adaptive peers."""
 
 
 class Work(NamedTuple):
-    """What is to be integrated: a workload, its start (n, lanes) or (n,), a step, how many."""
+    """A run: a workload, its initial state (n, lanes) or (n,), the step, the number of steps."""
 
     w: Workload
     q0: np.ndarray

@@ -1,4 +1,4 @@
-"""What several threads gain: wall-clock time of a batch on one thread over that on several.
+"""Speed-up by several threads: wall-clock time of a batch on one thread over that on several.
 
     python benchmarks/threads.py [--threads N] [--rounds N]
 

@@ -25,7 +25,7 @@ is what Newton's method reports, not an assumption.
 
 Kicks that meet between two parts are counted twice, as they are computed.
 
-Times are those of a jitted run in one process, after compilation. Of a run that takes longer than
+Times are those of a jitted run in one process, after compilation. For a run that takes longer than
 SHORT its first part is timed, at the same step size, and scaled by evaluations: a part that fits
 between two interruptions by other work. In each round, and in another order each time, a run is
 the least of LEAST or of as many as fit into TAKEN seconds, divided by the least of the same for
@@ -197,13 +197,13 @@ class Cost(NamedTuple):
     columns: float
 
     def evaluations(self, num_steps, iterations):
-        """Of a whole run, Jacobians included."""
+        """Evaluations of a whole run, Jacobians included."""
         each = self.of_iteration + JACOBIAN_WEIGHT * self.columns
         return num_steps * self.of_step + iterations * each
 
 
 def cost(method: dvi.Method, problem: Problem) -> Cost:
-    """What a step of the method does, see the head of this file.
+    """Cost of a step of the method, see the head of this file.
 
     **Raises** `TypeError` for a method of a class that it does not know.
     """
@@ -228,7 +228,10 @@ def cost(method: dvi.Method, problem: Problem) -> Cost:
 
 
 def lobatto_cost(s, n, step_is_explicit, inverse_is_explicit) -> Cost:
-    """Of s stages: whether p enters no rate of p, and q no rate of q (the P_i then suffice)."""
+    """Cost for s stages.
+
+    The flags: whether p enters no rate of p, and q no rate of q (the P_i then suffice).
+    """
     if s == 2 and step_is_explicit and inverse_is_explicit:
         return Cost(3.5, 0, 0)  # halves: one sweep of 2 + 1, 2 for Q, 2 at the end
     sweep = s - 1 / 2  # s halves for Q, s − 1 for P

@@ -141,7 +141,7 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
 
     **Source** the paper, (36); Marsden & West 2001, *Acta Numerica* 10, 357, 1.4.
     """
-    # By the number of arguments alone; a function that takes four and five cannot be classified.
+    # The number of arguments decides; a function that takes four and five cannot be classified.
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
         raise TypeError(

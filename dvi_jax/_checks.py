@@ -48,7 +48,7 @@ def finite(name: str, value: Any, hint: str = "") -> float:
 def one_of(name: str, value: Any, known: Iterable[Any], hint: str = "") -> Any:
     """One of the known values. **Raises** `ValueError`."""
     known = list(known)
-    # By type as well: True == 1, and an array has no truth value.
+    # The types are compared as well: True == 1, and an array has no truth value.
     if not any(value is one or (type(value) is type(one) and value == one) for one in known):
         these = ", ".join(map(repr, known))
         raise ValueError(f"{name} must be one of {these}, got {value!r}.{_more(hint)}")

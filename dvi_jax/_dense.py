@@ -84,7 +84,7 @@ def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTi
             size = jnp.maximum(jnp.abs(task.t0), jnp.abs(known))
             near = jnp.abs(ts - known) <= 16 * eps * size
             ts = jnp.where(near, ts + lax.stop_gradient(known - ts), ts)
-        # Likewise t0 + k h, compiled in a loop, may differ in the last digit from its value here.
+        # Also t0 + k h, compiled in a loop, may differ in the last digit from its value here.
         slack = 4 * eps * (jnp.abs(task.t0) + jnp.abs(ts))
         due = lax.stop_gradient(ts - jnp.where(end >= task.t0, slack, -slack))
     return RequestedTimes(ts=ts, due=due, ordered=jnp.sort(due), clock=save.clock), kept

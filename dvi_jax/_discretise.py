@@ -24,7 +24,7 @@ class _LeftRule(eqx.Module):
 _MIDPOINT = ((0.5,), (1.0,), ((0.5,),))
 _ROOT = 3.0**0.5 / 6
 _TWO_POINTS = ((0.5 - _ROOT, 0.5 + _ROOT), (0.5, 0.5), ((0.25, 0.25 - _ROOT), (0.25 + _ROOT, 0.25)))
-# By order: Gauss nodes c, weights b and integrals a of collocation, and the number of passes. Two
+# Order: Gauss nodes c, weights b and integrals a of collocation, and the number of passes. Two
 # passes would suffice for order 4 (the error of a curve enters a stationary value squared), but
 # then terms of h⁵ exceed that of h⁴ at usual steps.
 _RULES = {2: (_MIDPOINT, 1), 3: (_TWO_POINTS, 1), 4: (_TWO_POINTS, 3)}

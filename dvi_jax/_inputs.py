@@ -121,7 +121,7 @@ def as_parameter(leaf: Any) -> Any:
             raise TypeError(f"args holds an array of dtype {leaf.dtype}: numbers are required.")
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
-        # What is not an array is static: compiled programs are looked up by its hash.
+        # Everything but arrays is static: compiled programs are looked up by its hash.
         try:
             hash(leaf)
         except TypeError:

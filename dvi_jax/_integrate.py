@@ -166,7 +166,7 @@ def integrate(
     q0, p0 = start_state(q0, p0)
     if observe is not None:
         observe = of_steps(observe)
-    # By the class, here and below: equinox takes 20 µs to make a bound method of a module.
+    # A method of the class, here and below: equinox takes 20 µs to make a bound method of a module.
     kind = type(lattice)
     if t1 is not None or duration is not None:
         num_steps = kind.steps_to(lattice, t0, h, num_steps, t1, duration)

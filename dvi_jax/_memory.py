@@ -15,7 +15,7 @@ def results_memory() -> int | None:
     if jax.default_backend() != "cpu":
         return _devices_memory()
     machine = machine_memory()
-    # Of the other hosts nothing is known here; they usually are machines of the same kind.
+    # The memory of the other hosts is not known here; they usually are machines of the same kind.
     return None if machine is None else machine * jax.process_count()
 
 

@@ -183,7 +183,7 @@ def of_problem(
 
     `has_start`: the call has its initial states in another argument.
     """
-    # By the attribute, since the class `Problem` is in a layer above this one.
+    # Recognised by its attribute, since the class `Problem` is in a layer above this one.
     if isinstance(getattr(system, "system", None), System):
         problem, system = system, system.system
         defaults = (("q0", q0), ("p0", p0), ("h", h), ("args", args))

@@ -68,7 +68,7 @@ def _extra(name: str) -> dict[str, Any]:
 
 
 def tables(found: dict[str, Any]) -> list[Table]:
-    """What was gathered, for the reader."""
+    """The collected information as tables."""
     versions = [[name, v or "not installed"] for name, v in found["versions"].items()]
     versions.append(["python", f"{found['python']} ({found['executable']})"])
     processors = f"{found['processors']['machine']}"

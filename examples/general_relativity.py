@@ -46,7 +46,7 @@ SYSTEMS = {
     False: dvi.System(hamiltonian_with_oblateness, force=post_newtonian_force),
     True: dvi.System(hamiltonian_with_oblateness, perturbation=post_newtonian_hamiltonian),
 }
-"""By the question whether relativity is to be a Hamiltonian; with J2 = 0 the Sun is a point."""
+"""Key: whether relativity is a Hamiltonian perturbation. With J2 = 0 the Sun is a point."""
 
 
 @dataclass

@@ -30,7 +30,7 @@ NAMES = ("args.period", "args.inverse_Q")
 
 @dataclass
 class Jackknife:
-    """What is found with each arc left out in turn.
+    """The results with each arc left out in turn.
 
     - `fits`: one for each arc. `error`: of period [day] and 1/Q, √((n − 1)/n Σ (x_i − mean)²).
     """
@@ -76,7 +76,7 @@ def shared(fit):
 
 
 def report(fit, knife):
-    """What was found, as text."""
+    """The results as text."""
     (period, inverse_q), formal = shared(fit)
     honest = knife.error
     r = fit.residuals

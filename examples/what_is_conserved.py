@@ -1,4 +1,4 @@
-"""What is conserved, to what order in ε, and why the rest drifts: six systems and two pictures.
+"""Conserved quantities, their order in ε, and why others drift: six systems and two pictures.
 
 Run: python examples/what_is_conserved.py [DIRECTORY for the pictures]
 """
@@ -63,7 +63,7 @@ def van_der_pol():
 
 
 def henon_heiles():
-    """Of four quadratic invariants of the isotropic oscillator two survive the second order."""
+    """Two of four quadratic invariants of the isotropic oscillator exist to the second order."""
 
     def H1(t0, t1, q0, p1, args):
         return q0[0] ** 2 * q0[1] - q0[1] ** 3 / 3

@@ -371,7 +371,7 @@ class Arithmetic(Writer):
                 stack += [(a, False) for a in parts]
                 continue
             mine = [found.get(a.serial, frozenset()) for a in parts] or [frozenset()]
-            # Of a choice one operand is taken, and it is not known which: what both show.
+            # A selection takes one operand, and it is not known which: only what both show counts.
             of_parts = mine[0].intersection if x.op == "select" else mine[0].union
             found[x.serial] = of_parts(*mine[1:]) | (frozenset([x.serial]) & targets)
         return frozenset().union(*(found.get(x.serial, frozenset()) for x in by))

@@ -109,7 +109,7 @@ class Assumed:
             fewer = [j for j in chosen if j != i]
             if is_enough(fewer):
                 chosen = fewer
-        # Else the state may look finite at the end although a number was not: test in every round.
+        # If they are not enough, the state may be finite at the end although a number was not.
         if is_enough(chosen):
             self.at_the_end = chosen
         else:

@@ -91,7 +91,7 @@ class Builder(Arithmetic):
         def phi(name: str, t: str, old: str, new: str) -> str:
             return f"  {name} = phi {t} [{old}, %{entered_from}], [{new}, %{left_from}]"
 
-        # What a number is after a round is known only now: its line is put in above.
+        # The value of a number after a round is known only now: its line is inserted above.
         lines = [
             phi(name, self.type(p.dtype, v), old, new)
             for p, olds, news, v in zip(phis, before, again, vec, strict=True)

@@ -77,7 +77,7 @@ def read(name: str) -> bytes | None:
 
 
 def _checksum(name: str, code: bytes) -> bytes:
-    """Of the code and of its name, so that code under another name is not taken for its own."""
+    """The checksum of the code and its name: code that was stored under another name differs."""
     return hashlib.sha256(name.encode() + b"\0" + code).digest()
 
 

@@ -75,8 +75,8 @@ class Evaluator:
                 known[eqn.outvars[0]] = self.sine_or_cosine(eqn, inputs[0])
                 continue
             outputs = self.equation(eqn, inputs, [places.get(v) for v in eqn.outvars])
-            # What is linear in unit vectors is a derivative: its zeros stay zeros, also times
-            # infinity.
+            # A number that is linear in unit vectors is a derivative: its zeros stay zeros, also
+            # times infinity.
             if eqn.primitive.name not in _ENDS and any(v.is_tangent for v in inputs):
                 outputs = [self.as_tangent(v) for v in outputs]
             known.update(zip(eqn.outvars, outputs, strict=True))

@@ -70,7 +70,7 @@ def reached_by(eqn: Any, inputs: list[bool], ends: frozenset[str] = frozenset())
         def scanned(carry):
             return reached_outputs(params["jaxpr"].jaxpr, [*fixed, *carry, *xs], ends)
 
-        # What reaches one part of the carry in a round may reach another part in the next.
+        # A dependence of one part of the carry may become one of another part in the next round.
         carry = fixed_point(lambda carry: scanned(carry)[:count], carry)
         return [*carry, *scanned(carry)[count:]]
     if name == "while":

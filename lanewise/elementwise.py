@@ -23,7 +23,7 @@ def _compared(op: str) -> Callable:
 def _equal(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
     """A loop's counter equals a given number in one round: taken for rare."""
     same = e.b.compare("eq", x, y)
-    # What is the same on all trajectories of a batch and changes is a counter.
+    # A number that changes and is the same on all trajectories of a batch is a counter.
     is_count = e.b.W > 1 and taken_value(same) is None and not same.vec and not x.is_float
     if e.assumed is not None and is_count and (x.known is not None or y.known is not None):
         e.assumed.never(same)

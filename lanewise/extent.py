@@ -34,7 +34,7 @@ def operation_count(jaxpr: Any) -> int:
     for eqn in jaxpr.eqns:
         inside = (*bodies(eqn), *functions_in(eqn))
         if eqn.primitive.name == "custom_linear_solve":
-            # Of its four functions only this one is run.
+            # Only this one of its four functions is run.
             inside = (eqn.params["jaxprs"].solve,)
         inner = [operation_count(b.jaxpr) for b in inside]
         if inner:

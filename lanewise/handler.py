@@ -332,7 +332,7 @@ def module_text(kernel: str, block: int) -> str:
 
 def registered(text: str) -> str:
     """The name by which XLA calls a module's handler, compiled and registered if it was not."""
-    # By the text, not by the function: two programs with equal code are compiled once.
+    # The text is the key, not the function: two programs with equal code are compiled once.
     key = hashlib.sha256(text.encode()).hexdigest()
     with _lock:
         if key not in _targets:

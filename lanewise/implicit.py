@@ -40,7 +40,7 @@ def implicit_root(
         trees.append(tree)
         return [x, *leaves]
 
-    # What the equation closes over becomes operands, so that derivatives by it are found.
+    # Values that the equation closes over become operands, so that derivatives by it are found.
     operands = [*equation.outer, guess]
     search = Traced.of(found, operands, jax.tree.structure(tuple(operands)))
     rest = _Rest(
@@ -55,8 +55,8 @@ def implicit_root(
 
 
 class _Rest(NamedTuple):
-    """What the derivative needs: ``equation(*consts, x)``, ``divide(*consts, x, b)``, and how many
-    operands of the search the equation does not have."""
+    """The parts of the derivative: ``equation(*consts, x)``, ``divide(*consts, x, b)``, and how
+    many operands of the search the equation does not have."""
 
     equation: Callable
     divide: Callable

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .components import Evaluator
 
 
-# What is done to an element and its update, by the primitive; releases of JAX differ in the names.
+# Name of a primitive → operation on an element and its update; releases of JAX differ in names.
 SCATTERS = {
     "scatter": None,
     **{f"scatter{mark}{op}": op for op in ("add", "sub", "mul", "max", "min") for mark in "-_"},
@@ -175,7 +175,7 @@ def gather(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[
 
 
 def _default_fill(dtype: str) -> Any:
-    """What JAX puts in place of elements outside of an array."""
+    """The value that JAX returns for elements outside of an array."""
     if np.issubdtype(dtype, np.floating):
         return np.nan
     if dtype == "bool":

@@ -1,7 +1,7 @@
 """The text of one function in LLVM IR, and the numbers in it.
 
 A number is either the same on all trajectories (a scalar in the IR) or has a value for each (`U`
-vectors of `W` elements). What is computed does not depend on `W` and `U`: `Arithmetic` decides on
+vectors of `W` elements). The operations do not depend on `W` and `U`: `Arithmetic` decides on
 numbers which products and sums become fused multiply-adds, and LLVM may not change an operation.
 """
 
@@ -82,7 +82,7 @@ class Writer:
         self.lines: list[str] = []
         self.block = "entry"
         self.operations = 0
-        # What was made in a loop or a branch is not known outside of it: one scope for each.
+        # A number that was made in a loop or a branch is not known outside of it: each has a scope.
         self.scopes: list[dict] = [{}]
         self.declared: set[str] = set()
         self._names, self._serials = itertools.count(), itertools.count(1)
@@ -142,7 +142,7 @@ class Writer:
         self.scopes[-1][key] = value
 
     def once(self, key: Any, make: Callable[[], Any]) -> Any:
-        """What was made under a key; made now if it is not known here."""
+        """The object that was made under a key; made now if it is not known here."""
         found = self.find(key)
         if found is None:
             found = make()

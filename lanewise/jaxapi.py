@@ -34,7 +34,7 @@ def batch_size(values: Iterable[Any]) -> tuple[int, bool]:
         while isinstance(x, Tracer):
             inner: Any = x
             if isinstance(axis := getattr(inner, "batch_dim", None), int):
-                # By the trace, so that values of one batch count once.
+                # The key is the trace, so that values of one batch count once.
                 sizes[id(getattr(inner, "_trace", None))] = inner.val.shape[axis]
                 x = inner.val
             elif hasattr(inner, "primal"):
@@ -283,7 +283,7 @@ def _linear_derivative(primals, tangents, *, functions: _Linear, count: int):
     # Linear in x: the map of the change.
     total = _linear.bind(*known, *change, functions=functions, count=count)
     moves = [i for i, t in enumerate(tangents[:count]) if not isinstance(t, ad.Zero)]
-    # By the residuals the map is not linear; its definition is differentiated there.
+    # In the residuals the map is not linear: its definition is differentiated by them.
     if moves:
 
         def of(*moving):

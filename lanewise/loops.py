@@ -157,7 +157,7 @@ def _masked(e: "Evaluator", numbers, vec, per_lane, part, goes_on, step) -> list
         kept = [
             b.select(active[i], new, old) for i, new, old in zip(part, news, numbers, strict=True)
         ]
-        # What a trajectory or a part that has stopped would do next decides nothing.
+        # A trajectory or a part that has stopped has no influence on whether the loop continues.
         of = kept if count > 1 else news
         going = [b.logic("and", x, y) for x, y in zip(active, goes_on(of), strict=True)]
         return [*going, *kept]
@@ -201,8 +201,8 @@ def _branches(e: "Evaluator", eqn: Any, which: Num, operands: list[Value]) -> li
     for i in range(len(branches)):
         op = "le" if i == 0 else "ge" if i == last else "eq"
         takes.append(b.compare(op, which, b.known(i, which.dtype)))
-    # The same branch on all trajectories: jump. Else run all branches that some trajectory takes,
-    # and let each trajectory select its own result.
+    # The same branch on all trajectories: jump. Otherwise run all branches that some trajectory
+    # takes, and let each trajectory select its own result.
     if not which.vec:
         results = _one_of(e, takes, [run(x) for x in branches], vec, dtypes)
     else:

@@ -88,7 +88,7 @@ def call(function: Callable, *args: Any, layout: Layout = AUTO) -> Any:
     # Traced here, for one trajectory: `vmap` outside only reaches the primitive.
     traced = Traced.of(function, leaves, tree)
     program = Program(traced, layout)
-    # What is traced outside and closed over is an input like the others.
+    # A value that is traced outside and closed over is an input like the others.
     operands = [*traced.outer, *leaves]
     on = (False,) * len(operands)
     outs = _lanewise.bind(*operands, program=program, lanes=None, on=on)
@@ -158,7 +158,7 @@ def _can_start() -> bool:
 # Compared by identity: JAX takes two calls of one program for the same, and hashes its parameters.
 @dataclasses.dataclass(frozen=True, eq=False)
 class Program:
-    """What a call computes, and how that is compiled."""
+    """The function of a call, and the options of its compilation."""
 
     traced: Traced
     layout: Layout = AUTO

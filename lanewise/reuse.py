@@ -36,7 +36,7 @@ def carried_over(before: Sequence[Num], after: Sequence[Num]) -> list[tuple[Num,
         if form in ends and _is_costly(x) and x.vec and x.write and ends[form].vec:
             pairs.append((x, ends[form]))
             found.add(x.serial)
-    # What is needed by others that are carried over only, need not be.
+    # A number that only other carried numbers need does not have to be carried.
     needed = {a.serial for z in seen if z.serial not in found for a in z.args}
     pairs = [(x, y) for x, y in pairs if x.serial in needed]
     # More of them would need more registers than the state leaves.

@@ -89,10 +89,10 @@ class Rounds:
     waiting: Waiting | None
 
     def all(self, jaxpr: Jaxpr, numbers: list[Num]) -> list[Num]:
-        """What is carried after all rounds of a loop with this body."""
+        """The numbers that are carried after all rounds of a loop with this body."""
         e, b = self.e, self.e.b
         with e.assuming(None):
-            # What the attempt has written is removed if an assumption turns out to be impossible.
+            # The attempt is removed from the text if an assumption turns out to be impossible.
             if self.length > 1 and may_assume(jaxpr):
                 mark = b.mark()
                 try:

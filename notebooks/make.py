@@ -84,7 +84,7 @@ class _ThisPython(KernelSpecManager):
 
     def get_kernel_spec(self, kernel_name: str) -> KernelSpec:
         spec = get_kernel_dict()
-        # What a kernel says of itself, such as how it is connected, is not for this terminal.
+        # Messages of the kernel about itself, such as its connection, are not shown.
         # "retina": pictures have twice the pixels, which sharp screens show in the same size.
         settings = "--IPKernelApp.log_level=40", "--InlineBackend.figure_formats=retina"
         return KernelSpec(**spec | {"argv": [*spec["argv"], *settings]})
@@ -159,7 +159,7 @@ def _pixels(encoded: str) -> str:
 
 
 def faults(name: str, book: Any = None) -> list[str]:
-    """What is wrong with a notebook as it is, one line each; nothing is executed.
+    """The faults of a notebook as it is, one line each; nothing is executed.
 
     - `book`: in place of the file.
     """
@@ -249,7 +249,7 @@ def _near(a: str, b: str) -> bool:
 
 
 def _unit(text: str) -> float:
-    """Of the last digit: 0.001 for 1.234, 10 for 1.2e2; nothing for whole numbers, which count."""
+    """The unit of the last digit: 0.001 for 1.234, 10 for 1.2e2; 0 for whole numbers."""
     mantissa, _, exponent = text.lower().partition("e")
     decimals = len(mantissa.partition(".")[2])
     if not decimals and not exponent:

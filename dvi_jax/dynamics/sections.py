@@ -52,7 +52,7 @@ class PoincareSection(WithStatus):
 
 
 class _Settings(eqx.Module):
-    """What all orbits of a section have in common; `options` are keywords of `integrate`."""
+    """The settings that all orbits of a section share; `options` are keywords of `integrate`."""
 
     system: System
     section: Section

@@ -18,7 +18,7 @@ _OPERATIONS: dict[str, Any] = {
     "convert_element_type": lambda x: x,
     "squeeze": np.squeeze,
 }
-"""What JAX computes of an index before it is used."""
+"""Operations that JAX applies to an index before it is used."""
 
 
 def out_of_bounds(traced: ClosedJaxpr) -> Iterator[tuple[int, int]]:

@@ -179,7 +179,7 @@ class Newton(RootSolver):
 
 
 _FIRST_APART = 4
-"""Unknowns up to which the first iteration is written out in front of Newton's loop. Of larger
+"""Unknowns up to which the first iteration is written out in front of Newton's loop. For larger
 systems the second copy of the elimination would double the code to compile."""
 
 _THIRD_UP_TO = 16
@@ -242,7 +242,7 @@ def largest(x: Vector) -> Float[Array, ""]:
     return jnp.max(jnp.abs(x), initial=0.0)
 
 
-# Of few numbers a chain of comparisons, which is faster in generated code than a reduction. A NaN
+# For few numbers a chain of comparisons, which is faster in generated code than a reduction. A NaN
 # among them may be ignored, so that no decision rests on one.
 def _largest_of(x: Vector) -> Float[Array, ""]:
     if x.size > 16:

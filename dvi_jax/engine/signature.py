@@ -69,7 +69,7 @@ def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -
 
 
 def tracing_note(name: str, error: Exception) -> str:
-    """What to do about an error in a function of the user that JAX traces."""
+    """Advice about an error in a function of the user that JAX traces."""
     if isinstance(error, jax.errors.TracerBoolConversionError):
         return (
             f"{name} is traced by JAX, so no number decides an if or a while: use "

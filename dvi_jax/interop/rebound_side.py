@@ -38,7 +38,7 @@ _TURNED_ON = {
     "exit_min_distance": "exit_min_distance: take stop=dvi.Stop(g)",
     "N_var": "variational particles: dvi.TangentMap(), dvi.MEGNO() or jax.jvp give derivatives",
 }
-"""What changes a simulation besides its bodies: name of the field → what to do."""
+"""Settings that change a simulation besides its bodies: name of the field → what to do."""
 
 _ASTROPY = {
     **dict.fromkeys(("msun", "msolar", "solarmass", "sunmass"), "Msun"),
@@ -175,8 +175,8 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
 
     **Returns** a ``rebound.Simulation`` with masses, radii, names, G, softening, units, t, and
     dt = h. Its integrator is REBOUND's default, IAS15. The start of a problem of `from_rebound`
-    has the same bits, as its `velocities` are stored. Of a state given as q and p the velocities
-    p/m are rounded: they differ by up to 2.2e-16, relative, from v in p = m v.
+    has the same bits, as its `velocities` are stored. For a state given as q and p the
+    velocities p/m are rounded: they differ by up to 2.2e-16, relative, from v in p = m v.
 
     **Raises** `TypeError` for another object than a problem, or for only one of q and p;
     `ValueError` for another system than Newton's N bodies or one with a force or a perturbation,

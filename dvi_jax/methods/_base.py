@@ -71,7 +71,7 @@ class Method(eqx.Module):
 
         try:
             jax.eval_shape(probe, scalar, scalar, q, scalar)
-        # What a function raises for a q or args of another structure than it expects.
+        # The errors that a function raises for a q or args of another structure than it expects.
         except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
                 f"could not trace the system for q of shape {q.shape} and args={args!r} ({error}). "

@@ -119,9 +119,9 @@ class CompositionMethod(Method):
 
 def _in_turn(body: Callable, pairs: list) -> Callable:
     """state → state after `body` on each pair in turn."""
-    # By a scan: written out, several pairs make a loop over steps that is too large to be compiled
-    # as one piece. One trajectory of order 4 then takes five times as long (a batch a seventh
-    # less), and twice as long to compile.
+    # A scan, because several pairs written out make a loop over steps that is too large to be
+    # compiled as one piece. One trajectory of order 4 then takes five times as long (a batch a
+    # seventh less), and twice as long to compile.
     if len(pairs) == 1:
         return functools.partial(body, parts=pairs[0])
     if not pairs:

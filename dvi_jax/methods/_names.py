@@ -16,7 +16,7 @@ from ._type_ii import TypeII
 def as_method(given: Any) -> Any:
     """The method with a name: "strang", "leapfrog", "rk4", "KahanLi8", "yoshida(4)".
 
-    Capital letters, spaces, hyphens and underscores make no difference. What is not text is
+    Capital letters, spaces, hyphens and underscores make no difference. Any other object is
     returned. **Raises** `ValueError`.
     """
     if not isinstance(given, str):

@@ -23,8 +23,8 @@ def order_defects(
     where X₁ is the vector field of the equations and nothing is known of X₂, X₃, …. A product of
     such exponentials is a series of words X_i X_j X_k …; the part of it with h^n has words of
     degree i + j + k + … = n. The composition is of order r when those of degree 1 to r are the
-    words of exp(hX₁). Of a base of order s the generators X₂, …, X_s are zero, of a symmetric one
-    all with even index.
+    words of exp(hX₁). For a base of order s the generators X₂, …, X_s are zero, for a symmetric
+    one all with even index.
 
     **Returns** for each degree n = 1, …, `order` the largest |coefficient of a word − that in
     exp(hX₁)|, in units of max(1, (Σ|c_i|)^n / n!), the size of what cancels.

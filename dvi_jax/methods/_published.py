@@ -117,8 +117,8 @@ class McLachlan(Published):
     """
 
     tables: ClassVar[Tables] = {
-        # Pairs of the map and its adjoint, a pair in each line. By formulas, since the coefficients
-        # are algebraic numbers.
+        # Pairs of the map and its adjoint, a pair in each line. The coefficients are algebraic
+        # numbers, and given by formulas.
         4: (
             *((14 - _ROOT) / 108, (146 + 5 * _ROOT) / 540),
             *((-23 - 20 * _ROOT) / 270, (-2 + 10 * _ROOT) / 135),

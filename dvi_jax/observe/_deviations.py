@@ -362,7 +362,7 @@ class SALI(_Framed):
 def _gram_schmidt(vectors: Array) -> tuple[Array, Array]:
     """(Q, R) with ``vectors[j] = Σ_i R[i, j] Q[i]``, Q orthonormal, R upper triangular, R_jj > 0.
 
-    By the modified process, row by row.
+    The modified process is used, row by row.
     """
     # Once is enough: the vectors are an orthonormal frame after one step, far from dependent.
     count = vectors.shape[0]

@@ -113,7 +113,7 @@ class MaxDrift(_OfFunction):
 
     def combine(self, memory, k, t, value):
         first, farthest, at = memory
-        # By the number of the step: a rebuilt value equals the largest one only up to rounding.
+        # The number of the step decides: a rebuilt value is the largest one only up to rounding.
         of_first = self.change(value, k == 0)
         return first + of_first, farthest + self.change(value, k == at) - of_first, at
 

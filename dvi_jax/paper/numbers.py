@@ -1,4 +1,4 @@
-"""What every measurement uses: a run of a problem, and a few statistics."""
+"""Common parts of all measurements: a run of a problem, and a few statistics."""
 
 from collections.abc import Callable
 from typing import Any

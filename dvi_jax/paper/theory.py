@@ -23,7 +23,7 @@ STEP_SIZES = np.array([0.04, 0.02, 0.01, 0.005])
 
 
 def limits(tick: Tick) -> dict[str, float]:
-    """What happens as h → 0: exponents in h of the largest error over sampled starts.
+    """Convergence as h → 0: exponents in h of the largest error over sampled starts.
 
     `local_error_exponent`: one step of (12)–(13) against the flow. On a driven oscillator, per unit
     of time: `lattice_corrected_exponent`, residual of (14) with the signs of (11);

@@ -29,7 +29,7 @@ from .program import Sweep, stacked
 from .variables import Variable
 
 FORMAT = 1
-"""Of the store: a greater number when stores of this format cannot be read any more."""
+"""The format of a store: a greater number when stores of this format cannot be read any more."""
 
 PROGRAM = "program"
 

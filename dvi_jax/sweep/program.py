@@ -27,7 +27,7 @@ from .starts import Starts
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sweep:
-    """What defines a sweep: the arguments of `integrate`, with axes in them.
+    """The definition of a sweep: the arguments of `integrate`, with axes in them.
 
     - `inputs`: h, t0, epsilon, args, and q0, p0 unless there is a `start`.
     - `options`: the other arguments. `method` and `num_steps` may be an `Axis`.
@@ -200,7 +200,7 @@ class Program:
         return {n: x.reshape((*task.size, *x.shape[len(size) :])) for n, x in boxes.items()}
 
     def steps(self, task: Task) -> int:
-        """Of each trajectory of a task."""
+        """The number of steps of each trajectory of a task."""
         steps = self.sweep.value(self.sweep.num_steps, task.start)
         return self.sweep.most_steps if steps is None else steps
 

@@ -287,7 +287,7 @@ class Store:
                 return file, f"the shard of {name} cannot be read ({error.strerror})"
             if size != known["bytes"]:
                 return file, f"the shard of {name} has {size} bytes"
-            # Of the whole file: the codecs would accept the shard of another task.
+            # The checksum of the whole file: the codecs would accept the shard of another task.
             if not size_only and _crc32(content) != known["crc32"]:
                 return file, f"the shard of {name} has another checksum"
         return None

@@ -31,7 +31,7 @@ from ._problem import Adiabatic, Parameter, Problem, gyrates
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _HALVINGS = 54
-"""Of the interval that holds the mirror point: to the last digits."""
+"""Halvings of the interval that contains the mirror point, which give all its digits."""
 
 PARTICLE = {
     "charge": Parameter(1.0, "e [charge]", gyrates),

@@ -58,7 +58,7 @@ def _turning_points(E, p_phi, p_psi, args):
 
         1 + u1,    1 − u2,    1 + u3
 
-    By the trigonometric formula for three real roots, and Newton's steps in the returned numbers:
+    Computed by the trigonometric formula for three real roots, and Newton's steps in the results:
     1 + u1 and 1 − u2 are accurate also where the axis comes close to the vertical.
     """
     A, w = args["A"], args["w"]

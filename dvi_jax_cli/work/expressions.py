@@ -51,7 +51,7 @@ class Expressions:
         return self.checked(made, text)
 
     def checked(self, made: Any, text: str) -> Any:
-        """What was made, an instance of `kind`."""
+        """The object that was made, an instance of `kind`."""
         if not isinstance(made, self.kind):
             raise self.error(repr(text))
         return made

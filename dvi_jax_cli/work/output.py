@@ -21,7 +21,7 @@ from .table import read_file
 
 @dataclass
 class Report:
-    """What the work of a TOML file found.
+    """The results of the work of a TOML file.
 
     - `contents`: for programs; the JSON file of the results has it.
     - `tables`, `notes`, `summary`: for the reader.

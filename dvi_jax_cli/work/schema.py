@@ -380,7 +380,7 @@ class Drift(Table):
 
 
 class DiscoverFile(SystemFile):
-    """What a map conserves."""
+    """A search for invariants of a map."""
 
     basis: Text = key(
         ...,

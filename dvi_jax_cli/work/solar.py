@@ -44,9 +44,9 @@ class Comparison(NamedTuple):
     perihelion: np.ndarray
     """Mercury's longitude of perihelion, ephemeris minus integration [″], shape (T,)."""
     slope: float
-    """Of its least-squares line [″/century]."""
+    """Slope of its least-squares line [″/century]."""
     intercept: float
-    """Of that line [″]."""
+    """Intercept of that line [″]."""
     scatter: float
     """Root mean square about that line [″]."""
     relativity: float

@@ -22,7 +22,7 @@ from .table import MISSING
 
 @dataclass(frozen=True)
 class Source:
-    """What a TOML file says of the system.
+    """The system that a TOML file describes.
 
     - `problem`: the library's record, or that of a user's file; None for a `dvi.System` alone.
     - `jd`: the Julian date of the start of the solar system, if an ephemeris gives it.
