@@ -60,10 +60,12 @@ for name, x, sigma in zip(found.names, found.x, found.sigma, strict=True):
 print(f"{found.status}, reduced chi² = {found.reduced_chi2:.2f}")
 
 # %% [markdown]
-# The predictions at the times of observation, and the observations with their errors:
+# The observations with their errors, and the orbit of the fitted parameters at all steps between
+# them (without `curve` the plot shows the predictions at the times of observation):
 
 # %%
-axis = plot.fit_against_data(found)
+fitted = dvi.integrate(system, p0=[0.0], h=0.05, t1=ts[-1], method=dvi.Yoshida(4), **found.params)
+axis = plot.fit_against_data(found, curve=(fitted.ts, fitted.qs))
 plt.show()
 
 # %% [markdown]

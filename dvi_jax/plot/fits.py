@@ -172,7 +172,7 @@ def fit_against_data(
         x, y = fine[order], curves[order, k]
         line = {"c": look["c"], "lw": 1.1, "label": f"{name}fit"}
         if curve is None and not _is_smooth(x, y):
-            line |= {"ls": "none", "marker": "x", "ms": 4}
+            line |= {"ls": "none", "marker": "x", "ms": 5, "zorder": 3}
         ax.plot(x, y, **line)
         look |= {"elinewidth": 0.9, "label": f"{name}observed"}
         ax.errorbar(ts, seen[:, k], yerr=errors[:, k], **look)
