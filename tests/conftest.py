@@ -48,6 +48,7 @@ SECONDS = {
     "test_fit_real_data": 100,
     "test_lanewise_programs": 90,
     "test_library": 80,
+    "test_docstrings": 60,
     "test_sweep_store": 80,
     "test_deviations": 80,
     "test_fit_statistics": 80,

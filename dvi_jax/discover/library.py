@@ -168,7 +168,10 @@ def _finite(name: str, value: Any) -> np.ndarray:
 def _direction(value: Any) -> np.ndarray:
     direction = _finite("direction", value)
     if not direction.any():
-        raise ValueError("the direction must not be zero.")
+        raise ValueError(
+            "the direction of a translation or boost must have a component that is not zero, got "
+            f"{value!r}."
+        )
     return direction
 
 

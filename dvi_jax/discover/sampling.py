@@ -146,8 +146,12 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
     t = arrays[2] if len(arrays) == 3 else np.full(len(q), float(t0))
     if t.shape != (len(q),):
         raise ValueError(f"the times of {len(q)} samples must have shape ({len(q)},): {t.shape}.")
-    if not all(np.isfinite(x).all() for x in (q, p, t)):
-        raise ValueError("samples hold a value that is not finite: take points of the domain.")
+    finite = [np.isfinite(x).reshape(len(q), -1).all(axis=1) for x in (q, p, t)]
+    if len(bad := np.flatnonzero(~np.all(finite, axis=0))):
+        raise ValueError(
+            f"{len(bad)} of {len(q)} samples are not finite, the first has index {bad[0]}: take "
+            "points where H and W are defined."
+        )
     return Samples(q, p, t)
 
 
