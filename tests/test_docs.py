@@ -321,6 +321,34 @@ TOO_WIDE = """() => {
 }"""
 """Of the page, or of its text, which must not slide as a whole either."""
 
+FAINT = r"""() => {
+  const parts = c => c.match(/[\d.]+/g).map(Number).concat(1).slice(0, 4);
+  const over = (a, b) => [0, 1, 2].map(i => a[i] * a[3] + b[i] * (1 - a[3])).concat(1);
+  const behind = e => {
+    const layers = [];
+    for (; e; e = e.parentElement) layers.push(parts(getComputedStyle(e).backgroundColor));
+    return layers.reverse().reduce((below, above) => over(above, below), [255, 255, 255, 1]); };
+  const luminance = c => [0.2126, 0.7152, 0.0722].reduce((sum, weight, i) => sum + weight *
+    (c[i] / 255 <= 0.03928 ? c[i] / 255 / 12.92 : ((c[i] / 255 + 0.055) / 1.055) ** 2.4), 0);
+  const faint = new Set(), walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  for (let n = walk.nextNode(); n; n = walk.nextNode()) {
+    const e = n.parentElement;
+    if (!n.data.trim() || !e.checkVisibility({opacityProperty: true, visibilityProperty: true})
+        || e.closest('svg, script, style, noscript, mjx-assistive-mml')) continue;
+    const paper = behind(e), ink = over(parts(getComputedStyle(e).color), paper);
+    const [dark, bright] = [luminance(ink), luminance(paper)].sort((a, b) => a - b);
+    if ((bright + 0.05) / (dark + 0.05) < 4.5) faint.add('faint: ' + n.data.trim().slice(0, 30));
+  }
+  return [...faint];
+}"""
+"""Text whose contrast with what is behind it is below 4.5, the bound of WCAG 2.2 (AA, 1.4.3)."""
+
+FOCUS = """() => {
+  const e = document.activeElement, style = getComputedStyle(e);
+  const seen = style.outlineStyle !== 'none' && parseFloat(style.outlineWidth) > 0;
+  return [e.tagName, seen || style.boxShadow !== 'none', e.href || ''];
+}"""
+
 
 def browser_or_skip():
     if BROWSER is None:
@@ -383,11 +411,27 @@ def page():
                 over = tab.evaluate(TOO_WIDE)
                 if over > 0:
                     found.append(f"{over} pixels too wide at {width}")
+            for scheme in ("light", "dark"):
+                tab.emulate_media(color_scheme=scheme)
+                found.extend(f"{scheme}: {words}" for words in tab.evaluate(FAINT))
             return found + seen, formulas
 
         tab.faults, tab.open_page = faults, open_page
         yield tab
         browser.close()
+
+
+@pytest.mark.slow
+def test_no_page_is_larger_than_500_kilobytes(site):
+    """With its pictures; scripts and styles are loaded once for all pages."""
+    large = {}
+    for path in site.rglob("*.html"):
+        text = path.read_text(encoding="utf-8")
+        pictures = {path.parent / name for name in re.findall(r'<img[^>]* src="([^":]+)"', text)}
+        size = path.stat().st_size + sum(picture.stat().st_size for picture in pictures)
+        if size > 500e3:
+            large[path.name] = size
+    assert large == {}
 
 
 @pytest.mark.slow
@@ -402,6 +446,29 @@ def test_a_browser_shows_every_page_whole(site, serve, page):
     assert found == {}
     assert formulas > 60
     assert page.faults(f"{home}/theory.html")[1] > 50
+
+
+@pytest.mark.slow
+def test_a_keyboard_leads_through_a_page(site, serve, page, tmp_path):
+    """Tab reaches every part of the page in turn, and one sees where one is."""
+    (tmp_path / "hidden.html").write_text(
+        "<style>a:focus { outline: none }</style><a href='x'>x</a>", encoding="utf-8"
+    )
+    steps = {}
+    for folder, name, presses in (
+        (site, "getting-started.html", 130),
+        (tmp_path, "hidden.html", 1),
+    ):
+        page.open_page(f"{serve(folder)}/{name}")
+        steps[name] = []
+        for _ in range(presses):
+            page.keyboard.press("Tab")
+            steps[name].append(page.evaluate(FOCUS))
+    walked = steps["getting-started.html"]
+    assert [step for step in walked if not step[1]] == []
+    assert {"A", "INPUT", "BUTTON"} <= {step[0] for step in walked}
+    assert walked[0][2].endswith("#furo-main-content")  # past the navigation by one key
+    assert not steps["hidden.html"][0][1]
 
 
 @pytest.mark.slow
@@ -424,6 +491,7 @@ def test_what_is_wrong_with_a_page_is_seen(site, serve, page, tmp_path):
         "picture": '<img src="none.png">',
         "outside": '<script src="http://192.0.2.1/x.js"></script>',
         "script": "<script>throw new Error('no')</script>",
+        "faint": '<p style="color: #888; background: #fff">faint words</p>',
     }
     seen = {}
     home = serve(tmp_path)
@@ -436,7 +504,7 @@ def test_what_is_wrong_with_a_page_is_seen(site, serve, page, tmp_path):
         "braces": "left over: q_{k+1}", "task": "left over: [ ]", "default": "left over: f(x=_HAS",
         "wide": "pixels too wide at 390",
         "slides": "pixels too wide at 390", "picture": "none.png", "outside": "requested http://192",
-        "script": "script: ",
+        "script": "script: ", "faint": "dark: faint: faint words",
     }  # fmt: skip
     for name, words in expected.items():
         assert words in seen[name], (name, seen[name])
