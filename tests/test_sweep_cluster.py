@@ -117,7 +117,7 @@ def test_the_scheduler_is_lost(tmp_path):
                 if p.tasks_done == 8:
                     scheduler.kill()
 
-            with pytest.raises(dvi.ClusterError, match="the same call goes on"):
+            with pytest.raises(dvi.ClusterError, match="the same call continues"):
                 sweep(path, 60, client=client, progress=kill)
     finally:
         for process in (scheduler, *workers):
