@@ -78,7 +78,7 @@ def test_short_arcs_of_the_wobble(wobble):
     assert formal[0] > 0
 
 
-YEARS = 30
+YEARS = 12
 """Enough for the digits below; the century of docs/general-relativity.md takes minutes."""
 
 
