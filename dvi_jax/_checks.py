@@ -34,7 +34,7 @@ def positive(name: str, value: Any, zero: bool = False, hint: str = "") -> float
 def fraction(name: str, value: Any) -> float:
     """A number between 0 and 1, both excluded. **Raises** `ValueError`."""
     if not _is_number(value) or not 0 < value < 1:
-        raise ValueError(f"{name} must lie between 0 and 1, got {value!r}.")
+        raise ValueError(f"{name} must lie between 0 and 1 (both excluded), got {value!r}.")
     return float(value)
 
 

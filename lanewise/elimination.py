@@ -32,7 +32,9 @@ def eliminate(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> li
     """Dense systems, by elimination; rows are exchanged on trajectories that need it."""
     matrices, vectors = values
     if matrices.size > MADE // 4:
-        raise Unsupported(f"a linear system with {vectors.shape[-1]} unknowns")
+        raise Unsupported(
+            f"linear systems whose matrices have {matrices.size} elements, at most {MADE // 4} fit"
+        )
     (out,) = eqn.outvars
     front = out.aval.shape[:-1]
     A = np.broadcast_to(e.entries(matrices), (*front, *matrices.shape[-2:]))

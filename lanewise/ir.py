@@ -153,7 +153,9 @@ class Writer:
 
     def known(self, value: Any, dtype: str, structural: bool = False) -> Num:
         if dtype not in TYPES:
-            raise Unsupported(f"numbers of type {dtype}")
+            raise Unsupported(
+                f"numbers of type {dtype}: only float64, float32, integers and bool are compiled"
+            )
         return Num((), dtype, False, np.asarray(value, dtype)[()], structural=structural)
 
     def made(self, names: Sequence[str], dtype: str, vec: bool, op: str = "", args=()) -> Num:

@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Fit ε to data
 #
-# A perturbed system is observed with noise. How large is $\varepsilon$, what is its error, and do
-# the data require a perturbation at all? `dvi.fit` differentiates the discrete trajectory.
+# This notebook determines the strength $\varepsilon$ of a perturbation and its error from noisy
+# observations, and tests whether the data require a perturbation at all. `dvi.fit` minimises
+# $\chi^2$ with the derivatives of the discrete trajectory.
 #
 # The example has a known solution, an oscillator with weak friction,
 #
@@ -38,8 +39,8 @@ def observed(seed, epsilon=EPSILON):
 # %% [markdown]
 # ## The fit
 #
-# `Model` contains the known quantities. The last argument of `fit` contains the unknown ones, with
-# their initial guesses: $\varepsilon = 0$ means no perturbation.
+# `Model` contains the known quantities. The third argument of `fit` contains the unknown ones,
+# with their initial guesses: $\varepsilon = 0$ means no perturbation.
 
 
 # %%
@@ -93,8 +94,9 @@ assert 0.7 < pulls.std(ddof=1) < 1.3
 # %% [markdown]
 # ## Do the data require the friction?
 #
-# The control is the same fit without friction, whose $\chi^2$ must be too large. For data without
-# friction, the fit must find none.
+# There are two controls. A fit of the same data by a model without friction must have a $\chi^2$
+# that is too large. A fit to data without friction must give an $\varepsilon$ that is compatible
+# with zero.
 
 # %%
 unperturbed = {"q0": np.array([0.9]), "args": {"k": 1.2}}
@@ -114,7 +116,7 @@ assert abs(none.x[epsilon_at]) < 3 * none.sigma[epsilon_at]
 # Suppose that the law is unknown. `identify` fits the coefficients of many candidate terms to the
 # trajectory and removes the terms that the data do not support. Candidates are the monomials
 # $q^i p^j$ up to degree 3; positions and momenta are observed. The true force is $-\varepsilon p$.
-# The criterion is $\chi^2$ plus a penalty for each term; smaller is better.
+# The printed criterion is $\chi^2$ plus a penalty for each term; smaller is better.
 
 # %%
 times = np.linspace(0.25, 30, 120)
@@ -155,4 +157,4 @@ plt.show()
 #   the [Chandler wobble](polar_motion.ipynb).
 # - `bounds`, `priors`, losses for outliers, several arcs, `MultipleShooting` for chaotic arcs.
 # - `dvi.NetworkForce`: a potential and a damping given by networks.
-# - `dvi.sample`: the posterior distribution in place of a $\pm$.
+# - `dvi.sample`: the posterior distribution of the parameters, not only their errors.

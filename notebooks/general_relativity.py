@@ -6,12 +6,13 @@
 #
 # $$\dot p = -\frac{\partial H}{\partial q} + \varepsilon\, W_{\rm PN}(q, p).$$
 #
-# Which $\varepsilon$ fits the positions of Mercury in JPL's ephemeris DE421? DE421 is itself an
-# integration with relativity, fitted to observations, so the expected result is
-# $\varepsilon = 1$. The initial guess of the fit is 0.
+# This notebook fits $\varepsilon$ to the positions of Mercury in JPL's ephemeris DE421. DE421 is
+# itself an integration with relativity, fitted to observations, so the expected result is
+# $\varepsilon = 1$. The initial guess is 0.
 #
-# The notebook needs the ephemeris: `pip install "dvi-jax[ephemeris]"`. A program that also draws
-# the residuals is `python examples/general_relativity.py`.
+# The notebook needs the ephemeris: `pip install ".[ephemeris]"` in a clone.
+# `python examples/general_relativity.py` is a program that also analyses the residuals of a
+# century.
 
 # %%
 import jax
@@ -31,8 +32,8 @@ YEARS = 5  # a century takes minutes, and is in docs/general-relativity.md
 # %% [markdown]
 # ## The data
 #
-# Heliocentric positions of Mercury every ten days from 1900 on. No errors are given: the size of
-# the differences between model and ephemeris is estimated from the residuals.
+# The data are heliocentric positions of Mercury every ten days from 1900 on. They have no errors;
+# the fit estimates the size of the differences between model and ephemeris from the residuals.
 
 # %%
 START, MERCURY = julian_date("1900-01-01"), 1
@@ -51,8 +52,8 @@ print(len(days), "positions")
 # ## The model
 #
 # `post_newtonian_force` is the perturbing force $W$, and $\varepsilon$ its strength. The initial
-# states are those of the ephemeris; corrections of Mercury's initial state, in au and au/day, are
-# fitted together with $\varepsilon$.
+# states are those of the ephemeris. Six corrections of Mercury's initial state, in au and au/day,
+# are fitted together with $\varepsilon$.
 
 # %%
 system = dvi.System(hamiltonian_with_oblateness, force=post_newtonian_force)
@@ -81,7 +82,8 @@ def fitted(model, params):
 # %% [markdown]
 # ## Two fits: Newton alone, and with relativity
 #
-# Both include the oblateness of the Sun, $J_2 = 2 \times 10^{-7}$, which also turns the perihelion.
+# Both models include the oblateness of the Sun, $J_2 = 2 \times 10^{-7}$, which also turns the
+# perihelion. The fit without relativity is the control: its residuals must be much larger.
 
 # %%
 still = np.zeros(6)
@@ -108,10 +110,10 @@ assert rms(fits["Newton alone"]) > 1000 * rms(fit)  # control: the data require 
 assert lag > 0.5  # so that the formal error is much too small
 
 # %% [markdown]
-# The error (±) is formal and assumes independent residuals. The residuals are slow waves, so the
-# true error of $\varepsilon$ is many times larger. Without the oblateness of the Sun, `"J2": 0.0`,
-# its contribution to the rotation of the perihelion is included in $\varepsilon$: 1.0006, also over
-# a century.
+# The printed error (±) is formal: it assumes independent residuals. The residuals vary slowly, so
+# the true error of $\varepsilon$ is many times larger. In a model without the oblateness,
+# `"J2": 0.0`, the fit attributes its effect on the perihelion to relativity: $\varepsilon$ is then
+# 1.0006, also over a century.
 
 # %%
 with plot.style():
@@ -126,6 +128,5 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - `YEARS = 100`, and its residuals: `docs/general-relativity.md`.
-# - Another body, or another perturbation: `dvi_jax.systems.relativity` also has the Hamiltonian
-#   form.
+# - A century (`YEARS = 100`) and its residuals: `docs/general-relativity.md`.
+# - Fit another body, or use the Hamiltonian form of relativity in `dvi_jax.systems.relativity`.

@@ -1,12 +1,12 @@
 # %% [markdown]
 # # GPU: devices, batches, precision
 #
-# How do you run a batch of trajectories on a GPU, and which accuracy is lost in single precision?
+# How do you run a batch of trajectories on a GPU, and how much accuracy does single precision lose?
 # This notebook runs on any device that JAX finds. The stored outputs are those of a CPU.
 #
-# **Not tested on a GPU.** On a GPU XLA compiles a batch as any JAX program: a scan over the steps
-# under `vmap`. The package has not been run on a GPU, and its speed there has not been measured;
-# see `docs/gpu.md`.
+# **The package has not been tested on a GPU**, and its speed there has not been measured
+# (`docs/gpu.md`). On a GPU a batch is an ordinary JAX program, a scan over the steps under `vmap`,
+# which XLA compiles.
 
 # %%
 import jax
@@ -23,9 +23,10 @@ device = jax.devices()[0]
 print("platform:", device.platform)
 
 # %% [markdown]
-# `JAX_PLATFORMS=cpu` or `cuda` in the environment selects the device before Python starts. For an
-# NVIDIA GPU install the extra `cuda12`. In a program, `jax.default_device` selects the device for a
-# block, and computations with an array run on the device of the array (`jax.device_put`).
+# To select the device, set `JAX_PLATFORMS=cpu` or `JAX_PLATFORMS=cuda` in the environment before
+# Python starts. For an NVIDIA GPU install the extra `cuda12`. In a program,
+# `jax.default_device(device)` selects the device for a `with` block, and computations with an array
+# run on the device of the array (`jax.device_put`).
 #
 # ## A batch
 #
@@ -82,8 +83,8 @@ print(len(jax.devices()), "device")
 # ## Two ways to compile
 #
 # With `Layout()`, the default, a run is compiled to machine code on a CPU, and by XLA on a GPU.
-# `Layout(form="arrays")` uses XLA everywhere. The results agree to round-off. Eight trajectories,
-# twenty steps:
+# `Layout(form="arrays")` uses XLA everywhere. The results agree to round-off, which we check with
+# eight trajectories of twenty steps:
 
 # %%
 few = q0[:8], p0[:8]
@@ -99,8 +100,8 @@ assert worst < 1e-14
 # %% [markdown]
 # ## Single precision
 #
-# Graphics GPUs compute in float32 many times faster than in float64. float64 input with x64
-# switched off raises an error; float32 is used if the initial state has this type. This map
+# Graphics GPUs compute in float32 many times faster than in float64. A run uses float32 only if the
+# initial state has this type; float64 input raises an error if x64 is switched off. This map
 # conserves the angular momentum exactly, so its drift is round-off. How does it grow?
 
 # %%
@@ -114,7 +115,6 @@ def drift_of_L(dtype, arithmetic):
         sol = dvi.integrate(
             system, q0, p0, h=jnp.asarray(0.0625, dtype), num_steps=200_000,
             epsilon=jnp.asarray(0.0, dtype), save=dvi.Save(every=10), arithmetic=arithmetic,
-            layout=dvi.Layout(form="components"),
         )  # fmt: skip
         return sol.qs, sol.ps
 
@@ -151,10 +151,10 @@ plt.show()
 
 # %% [markdown]
 # In float32 the drift is larger by the ratio of the rounding units, about $5 \times 10^8$.
-# `Compensated()` adds the rounding errors of sums back, for a few operations more. After 200 000
-# steps an exact invariant has changed by $2 \times 10^{-5}$ in plain float32. An adiabatic
-# invariant with a smaller drift cannot be measured with it; therefore the package requires float64
-# by default.
+# `Compensated()` adds the rounding errors of sums back, and needs a few more operations. After
+# 200 000 steps an exact invariant has changed by $2 \times 10^{-5}$ in plain float32. The drift of
+# an adiabatic invariant cannot be measured in float32 if it is smaller than this. Therefore the
+# package does not let JAX round float64 input to float32, but raises an error.
 #
 # ## Next steps
 #

@@ -7,12 +7,13 @@
 #
 # $$\mu_0 = \frac{m v_\perp^2}{2 B},$$
 #
-# with the small parameter gyroradius / field scale length. Three questions: how well is $\mu_0$
-# conserved, can it be corrected, and is the particle reflected where $\mu$ predicts?
+# where $v_\perp$ is the velocity perpendicular to the field. The small parameter is the gyroradius
+# divided by the length over which the field changes. This notebook measures how well $\mu_0$ and
+# its first correction are conserved, and whether the particle is reflected where $\mu$ predicts it.
 #
-# The system is `systems.magnetic_mirror`, $H = |p - eA(q)|^2/2m$ with
-# $B = B_0 (1 + z^2/\ell^2)$ on the axis. Gyroradius and gyrofrequency are 1 at the centre, so
-# $1/\ell$ is the small parameter. The kinetic energy mixes $q$ and $p$: each step is implicit.
+# The system is `systems.magnetic_mirror`, $H = |p - eA(q)|^2/2m$ with $B = B_0 (1 + z^2/\ell^2)$ on
+# the axis. Gyroradius and gyrofrequency are 1 at the centre, so $1/\ell$ is the small parameter.
+# $H$ is not separable, so each step is implicit.
 
 # %%
 import jax
@@ -28,8 +29,8 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## The motion
 #
-# The guiding centre is at a distance $\ell/2$ from the axis, the run covers about two bounces, and
-# the method is that of Gauss of order 4.
+# The guiding centre is at a distance $\ell/2$ from the axis, the run covers about two bounces
+# between the mirror points, and the method is that of Gauss of order 4. The right plot shows $\mu$.
 
 
 # %%
@@ -68,10 +69,11 @@ plt.show()
 # %% [markdown]
 # ## Conservation
 #
-# Two quantities check the integration: the method conserves the canonical angular momentum, which
-# follows from the symmetry of the field, to round-off, and the energy to the order of the method.
-# The moment oscillates at the gyrofrequency. With its first correction $\mu_1$ (for fields with
-# $b \cdot (\nabla \times b) = 0$) the amplitude is of second order. So is the *bounce action*
+# Two quantities check the integration. The method conserves the canonical angular momentum, which
+# follows from the symmetry of the field, to round-off. The energy has the error of the method.
+# $\mu_0$ oscillates at the gyrofrequency, with an amplitude proportional to $1/\ell$. With its
+# first correction $\mu_1$ (for fields with $b \cdot (\nabla \times b) = 0$, where $b = B/|B|$) the
+# amplitude is proportional to $1/\ell^2$. The same holds for the *bounce action*
 # $J = \oint p_\parallel\, ds$ along the field line, the second adiabatic invariant.
 
 # %%
@@ -94,8 +96,8 @@ assert energy < 2e-6
 # %% [markdown]
 # ## The mirror point
 #
-# At the mirror point the whole energy is in the gyration, $E = \mu B$. The largest field along the
-# orbit, multiplied by $\mu$, must be $E$.
+# At the mirror point the whole energy is in the gyration, $E = \mu B$. The field at the mirror
+# point must therefore be $E/\mu$.
 
 
 # %%
@@ -118,8 +120,9 @@ for run, length in zip(runs, lengths, strict=True):
 # %% [markdown]
 # ## Controls
 #
-# The energy of the gyration alone, $m v_\perp^2/2 = \mu B$, changes as much as the field, for any
-# $1/\ell$. And if the field changes within a gyroradius, $\mu$ is not an invariant.
+# There are two controls. The energy of the gyration, $m v_\perp^2/2 = \mu B$, changes as much as
+# the field, for any $\ell$. If the field changes within a few gyroradii ($\ell = 2$), $\mu$ is not
+# an invariant.
 
 # %%
 gyration = []
@@ -149,7 +152,7 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - `systems.dipole_field`: the same in the Earth's field, Störmer's problem.
+# - `systems.dipole_field`: a particle in the Earth's field (Störmer's problem).
 # - `dvi.discover_invariants` finds $\mu$ in a field with a weak gradient: `magnetic_moment()` in
 #   `examples/what_is_conserved.py`.
-# - For small $\ell$, $\mu$ is lost: use `dvi.sweep` with many initial conditions to map where.
+# - For small $\ell$, $\mu$ is not conserved. `dvi.sweep` with many initial conditions shows where.

@@ -2,13 +2,14 @@
 # # The Chandler wobble from measured poles
 #
 # The Earth's pole of rotation moves around a mean position in about 433 days. The motion is damped,
-# and driven with a period of one year. In $q = x,$ $p = y$ of the pole this is a damped and driven
-# oscillator, whose perturbation has the strength $\varepsilon = 1$. Four arcs of eight years share
-# period, damping and driving; each has its own initial state. What are the period and the damping,
-# and what are their errors?
+# and driven with a period of one year. The coordinates $q = x$, $p = y$ of the pole are those of a
+# damped and driven oscillator. The damping and the driving are the perturbation; its strength is
+# $\varepsilon = 1$. The data are four arcs of eight years. The period, the damping and the driving
+# are the same for all arcs; each arc has its own initial state. What are the period and the
+# damping, and what are their errors?
 #
-# The notebook needs the extra `ephemeris`, which contains the measured poles: `pip install
-# "dvi-jax[ephemeris]"`. As a command: `python examples/polar_motion.py`.
+# The notebook needs the extra `ephemeris`, which contains the measured poles:
+# `pip install ".[ephemeris]"` in a clone. As a command: `python examples/polar_motion.py`.
 
 # %%
 import jax
@@ -27,8 +28,9 @@ YEARS = 8  # length of an arc
 # %% [markdown]
 # ## The data
 #
-# Published errors are much smaller than the effects that the model neglects (atmosphere, ocean).
-# Therefore no errors are given, and all values have the same weight.
+# The published errors do not include the effects that the model neglects (atmosphere, ocean), and
+# from 1984 on they are much smaller. Therefore no errors are given, and all values have the same
+# weight.
 
 # %%
 pole = read_polar_motion()
@@ -42,8 +44,8 @@ print(len(arcs), "arcs,", sum(arc.values.size for arc in arcs), "values")
 # %% [markdown]
 # ## The fit
 #
-# With $\varepsilon = 1$ the perturbation is that of the Earth. Parameters in `args` are common to
-# all arcs; `q0` and `p0` have one row per arc.
+# With $\varepsilon = 1$ the damping and the driving are those of the Earth. Parameters in `args`
+# are common to all arcs; `q0` and `p0` have one row per arc.
 
 # %%
 problem = polar_motion()
@@ -65,8 +67,9 @@ assert fit.rms < 0.05  # arcsec
 # %% [markdown]
 # ## Errors
 #
-# The formal errors assume white noise. The noise excites the wobble itself, so residuals are
-# correlated over months. Leaving out one arc at a time (jackknife) gives realistic errors.
+# The formal errors assume white noise, but atmosphere and ocean excite the wobble itself, so the
+# residuals are correlated over months. We repeat the fit without one arc at a time (jackknife); the
+# scatter of these fits gives realistic errors.
 
 # %%
 at = [fit.names.index(name) for name in ("args.period", "args.inverse_Q")]
@@ -109,4 +112,4 @@ plt.show()
 # ## Next steps
 #
 # - Longer or shorter arcs, `YEARS = 4`: how do the residuals and the jackknife errors change?
-# - The error of the step is smaller than the noise: try `h=10.0`.
+# - The discretisation error is smaller than the noise: compare with `h=10.0`.

@@ -5,8 +5,9 @@
 # needs many trajectories. `dvi.sweep` runs a whole grid, labels the results, gives each trajectory
 # a status and stores finished results on disk.
 #
-# The system is Kepler's problem in the plane, perturbed by the central force $-\varepsilon q$. With
-# which power of $\varepsilon$ do energy $H$ and angular momentum $L$ drift, and which orbits fail?
+# The system is the Kepler problem in the plane, perturbed by the central force $-\varepsilon q$.
+# The drifts of the energy $H$ and of the angular momentum $L$ scale with which powers of
+# $\varepsilon$? For which orbits does the run fail?
 
 # %%
 import tempfile
@@ -27,9 +28,10 @@ folder = tempfile.TemporaryDirectory()  # for results that you need later, use a
 # %% [markdown]
 # ## A grid
 #
-# Any number that `integrate` accepts can be an axis of `sweep`: here 20 strengths and 32 initial
-# momenta, 640 trajectories with Gauss' method of order 6. Of the 800 steps of each trajectory only
-# two numbers are stored: the largest drifts, computed during the run.
+# Any number in `epsilon`, `h`, `t0`, `q0`, `p0` and `args` can be an axis of `sweep`. Here there
+# are 20 strengths and 32 initial momenta, which are 640 trajectories, with Gauss' method of
+# order 6. Each trajectory has 800 steps, but only two numbers of it are stored: the largest drifts,
+# which are computed during the run.
 
 # %%
 asked = {
@@ -52,9 +54,9 @@ data = result.to_xarray()
 print(dict(data.sizes), result.status_counts())
 
 # %% [markdown]
-# A failed trajectory affects only its own entry: orbits with momenta close to $-0.25$ come so close
-# to the centre that the equations of a step of this size are not solved. They are counted, hatched
-# in the plot, and excluded from statistics.
+# A failed trajectory affects only its own entry. Orbits with initial momenta close to $-0.25$ come
+# so close to the centre that the solver does not converge with this step. They are counted, hatched
+# in the plot, and excluded from the statistics.
 
 # %%
 data.p_x.attrs["long_name"] = "initial momentum p$_x$"
@@ -74,10 +76,10 @@ with plot.style():
 # ## Numbers
 #
 # The drift of the energy is proportional to $\varepsilon$ for small $\varepsilon$. For orbits that
-# come close to the centre the error of the discretisation is larger than the effect of
-# $\varepsilon$: the local slope is noise, the checkerboard in the plot, and a line through the
-# median has a slope close to 0. The angular momentum must not drift at all: the force has no
-# torque, and a symplectic Runge–Kutta method conserves quadratic invariants.
+# come close to the centre (*steep orbits* below) the error of the discretisation is larger than the
+# effect of $\varepsilon$. The local slope is then noise, which is the checkerboard in the plot, and
+# the median drift has a slope close to 0. The angular momentum must not drift at all: the force has
+# no torque, and a symplectic Runge–Kutta method conserves quadratic invariants.
 
 # %%
 good = data.where(data.status == 0)
@@ -106,8 +108,8 @@ assert 0 < share < 0.2
 # ## Repeat and resume
 #
 # The store belongs to this sweep. The same call finds all results and computes nothing; after an
-# interruption it would compute the missing ones. The results are identical bit for bit. A single
-# trajectory of the sweep agrees to round-off with that of `integrate`, which is another program.
+# interruption it would compute the missing ones. The results are identical bit for bit. `integrate`
+# computes a single trajectory with another program; it agrees with the sweep to round-off.
 
 # %%
 again = dvi.sweep(kepler.system, **asked, store=store)

@@ -1,16 +1,22 @@
 # %% [markdown]
 # # The paper: claims and measurements
 #
-# The package grew from "Preservation of adiabatic invariants for disturbed Hamiltonian systems
-# under variational discretization". Its discrete equations, with corrected signs, are
+# This notebook measures whether five claims of one paper hold, with public functions of the
+# package. The paper is "Preservation of adiabatic invariants for disturbed Hamiltonian systems
+# under variational discretization" (Acta Mechanica, doi:10.1007/s00707-019-02571-z). The package
+# implements its discrete equations, which are, with corrected signs,
 #
 # $$q_1 = q_0 + h\,\frac{\partial H_D}{\partial p_1}, \qquad
-# p_1 = p_0 - h\,\frac{\partial H_D}{\partial q_0} + h\,\varepsilon W, \tag{12, 13}$$
+# p_1 = p_0 - h\,\frac{\partial H_D}{\partial q_0} + h\,\varepsilon W . \tag{12, 13}$$
 #
-# A generator of a symmetry $(\xi_0, \xi)$ with gauge $G$ leads to the adiabatic
-# invariant $I_z = \sum_{m \le z} \varepsilon^m (\xi_m \cdot p - \xi_{0m} E^- + G_m)$ of (29). Are
-# the numbers of its examples reproduced? This notebook measures five claims with public functions;
-# `dvi-jax paper` measures all claims and writes a table of verdicts.
+# $\varepsilon W$ is the perturbing force. A symmetry shifts the time by $\xi_0$ and the positions
+# by $\xi$; both are series in $\varepsilon$ with the terms $\xi_{0m}$ and $\xi_m$. With a gauge
+# function $G$ it leads to the adiabatic invariant of order $z$,
+#
+# $$I_z = \sum_{m \le z} \varepsilon^m (\xi_m \cdot p - \xi_{0m} E^- + G_m), \tag{29}$$
+#
+# where $E^-$ is the incoming energy of a grid point, that of the step that ends there. The command
+# `dvi-jax paper` measures all claims of the paper and writes a table of verdicts.
 
 # %%
 import jax
@@ -44,7 +50,7 @@ free = dvi.System(oscillator, force=minus_q, epsilon=0.0)
 start = {"q0": [0.01], "p0": [0.01], "h": h, "num_steps": N}
 sol, rk4 = dvi.integrate(free, **start), dvi.integrate(free, **start, method=dvi.RungeKutta4())
 q, p = np.asarray(sol.qs)[:, 0], np.asarray(sol.ps)[:, 0]
-printed = (p[1:] ** 2 + q[:-1] ** 2) / 2  # the paper's, momenta and positions of two points
+printed = (p[1:] ** 2 + q[:-1] ** 2) / 2  # the paper's energy: p and q of different points
 exact = (p**2 + q**2 - h * q * p) / 2
 lost = np.asarray((rk4.ps**2 + rk4.qs**2) / 2)[:, 0]
 print(f"energy of the paper: range {np.ptp(printed):.2e}, claimed 1e-8")
@@ -146,8 +152,9 @@ assert of_34["its h = 0.1 form"].max() < 1e-12 * 1e-4  # exact, for all ε
 # ## Kepler: (49) and (50)
 #
 # $H_D = p_1^2/2 - K^2/|q_0|$ (the paper prints $+$, a repulsive potential), with the perturbing
-# force $W = -q$. (49) is the angular momentum, from the rotation. (50) comes from a rotation with a
-# shift of time, $\xi_0 = 1$, and the gauge $-\varepsilon |q|^2/2$:
+# force $W = -q$. (49) is $1 + \varepsilon$ times the angular momentum, from the rotation. (50)
+# comes from a rotation with a shift of time, and the gauge $-\varepsilon |q|^2/2$. The paper writes
+# $\xi_0 = 1$ in (47); (50) as printed corresponds to $\xi_0 = 1 + \varepsilon$:
 #
 # $$I_{(49)} = (1 + \varepsilon) L, \qquad
 # I_{(50)} = (1 + \varepsilon)(L - H) - \tfrac{\varepsilon}{2} |q|^2 .$$
@@ -181,20 +188,20 @@ print(f"(49), h = 0.1: drifts by {of_L.max():.0e}")
 print("(50), h = 0.1:", ", ".join(f"{x:.4f}" for x in on_mesh), "for ε =", *small)
 slopes = []
 for sign, values in (("−εq", attracting), ("+εq", repelling)):
-    beyond = values[1:3] - values[0]  # what the method does by itself is at ε = 0
+    beyond = values[1:3] - values[0]  # the value at ε = 0 is the error of the method
     slopes.append(np.log2(beyond[1] / beyond[0]))
     print(f"(50), h → 0, force {sign}: slope {slopes[-1]:.2f}")
 
 assert of_L.max() < 1e-12  # holds, for every ε and h
-assert abs(on_mesh[1] / on_mesh[0] - 1) < 0.01  # the mesh hides ε
+assert abs(on_mesh[1] / on_mesh[0] - 1) < 0.01  # the oscillation on the fixed grid hides ε
 assert abs(slopes[0] - 2) < 0.1  # of first order, with −εq …
 assert abs(slopes[1] - 1) < 0.1  # … and not with +εq
 
 # %% [markdown]
-# (49) holds to round-off on any time grid, because $\xi_0 = 0$. (50) has $\xi_0 = 1$ and needs the
-# variational grid; on a fixed grid it oscillates with an amplitude $O(h)$ for any $\varepsilon$.
-# For $h \to 0$ it is an invariant of first order for the force $-\varepsilon q$. The force
-# $+\varepsilon q$ is the control that must fail.
+# (49) is conserved to round-off on any time grid, because its $\xi_0$ is 0. For (50) $\xi_0$ is not
+# 0, and it requires the variational grid: on a fixed grid it oscillates with an amplitude $O(h)$
+# for any $\varepsilon$. For $h \to 0$ it is an invariant of first order for the force
+# $-\varepsilon q$. The force $+\varepsilon q$ is the control that must fail: its slope is 1.
 
 # %%
 with plot.style():
@@ -219,9 +226,9 @@ plt.show()
 # |---|---|---|
 # | Fig. 1: the oscillator's energy error is 1e-8 | 9.5e-6, another form to 1e-14 | does not hold |
 # | Fig. 2: RK4 is worse over 10 000 steps | RK4 has lost 1.4e-8 | does not hold |
-# | (34) is an adiabatic invariant of first order | slope 1 | exact after a correction |
+# | (34) is of first order in ε | slope 1; the corrected form is exact | holds after a correction |
 # | (49) is exact | to round-off | holds |
-# | (50) is an adiabatic invariant of first order | slope 2 as h → 0 | after a correction |
+# | (50) is of first order in ε | slope 2 as h → 0, for the force −εq | holds for h → 0 only |
 #
 # ## Next steps
 #

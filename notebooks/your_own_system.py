@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Your own system
 #
-# How do you define your own system, and how do you check that it is correct? The example is a
-# weight on an elastic string, in polar coordinates $q = (r, \theta)$ about the hook,
+# How do you define your own system, and how do you check that it is correct? The example is an
+# elastic pendulum: a weight on a spring, in polar coordinates $q = (r, \theta)$ about the point of
+# suspension,
 #
 # $$H = \frac{p_r^2}{2m} + \frac{p_\theta^2}{2 m r^2} + \frac{k}{2}(r - 1)^2 - m g r \cos\theta,$$
 #
@@ -130,8 +131,8 @@ assert abs(np.log2(bands[1] / bands[2]) - 2) < 0.3
 
 # %% [markdown]
 # **4. Work of the drag.** Since $\dot H = -\varepsilon\, \dot q \cdot p$, the energy decreases by
-# $\varepsilon \int \dot q \cdot p\, dt$: $\varepsilon$ times twice the kinetic energy, integrated
-# over time.
+# $\varepsilon \int \dot q \cdot p\, dt$. The integrand $\dot q \cdot p$ is twice the kinetic
+# energy.
 
 # %%
 r, p_r, p_t = damped.qs[:, 0], damped.ps[:, 0], damped.ps[:, 1]
@@ -166,8 +167,9 @@ assert sol.observed[-1] < sol.observed[0]
 # %% [markdown]
 # ## Gradients
 #
-# The derivative of the position after half a second with respect to the stiffness of the string: by
-# automatic differentiation through every implicit step, and by central differences.
+# This cell computes the derivative of the height of the weight after half a second with respect to
+# the stiffness of the spring, by automatic differentiation through every implicit step. Central
+# differences give the same number.
 
 
 # %%
@@ -189,10 +191,10 @@ assert abs(slope / differences - 1) < 1e-6
 # %% [markdown]
 # ## When a step has no solution
 #
-# A step of Gauss' method that is much too long, for a weight that is thrown at the hook, has no
-# solution close to its initial state. An error then names the step. With `throw=False` the
-# solution has a status, and its states are NaN from this step on. Strang's equations have a
-# solution even here, but it is not accurate.
+# Here the weight is thrown towards the point of suspension, and the step is much too long. The
+# solver finds no solution of the equations of Gauss' method. By default this raises an error that
+# names the step. With `throw=False` the run returns its status, and the states are NaN from this
+# step on. The equations of `Strang` are solved even here, but the result is not accurate.
 
 # %%
 too_long = {"h": 0.5, "num_steps": 20, "epsilon": 0.0, "args": args, "throw": False}

@@ -155,7 +155,7 @@ def find_symmetries(
     if relative < _NO_STEP:
         raise ValueError(
             f"a step of h = {h:g} moves the samples by {relative:.0e} of their spread, which is "
-            "hardly more than rounding: no symmetry can be decided. Take a larger h."
+            "hardly more than rounding: symmetries cannot be identified. Take a larger h."
         )
     if relative < SMALL and np.ptp(samples.t) == 0:
         shifts = later(h, relative)

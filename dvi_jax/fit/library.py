@@ -183,8 +183,9 @@ class _Monomial(eqx.Module):
         del t0, t1, args
         if q0.shape != (self.n,):
             raise ValueError(
-                f"these monomials are made for q0 of shape ({self.n},), got {q0.shape}: "
-                "dvi.ForceLibrary.monomials(degree, n)."
+                f"this ForceLibrary was made for n = {self.n} coordinates, q0 of shape "
+                f"({self.n},), got q0 of shape {q0.shape}. Make it with the number of coordinates: "
+                "dvi.ForceLibrary.monomials(degree, n); q0 must be one-dimensional."
             )
         value = jnp.ones((), q0.dtype)
         for (v, i), power in self.powers:

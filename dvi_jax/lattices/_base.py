@@ -61,8 +61,9 @@ class Lattice(eqx.Module):
     def steps_to(self, t0: Any, h: Any, num_steps: Any, t1: Any, duration: Any) -> int:
         """Number of steps to the time t1, or over a duration. **Raises** `ValueError`."""
         raise ValueError(
-            f"t1 and duration need equal steps, and the lattice is {self!r}: give num_steps, or "
-            "use save=dvi.Save(ts=[t1])."
+            f"t1 and duration require equal steps, but the lattice is {self!r}. Leave them out "
+            "and give num_steps (not with Given(ts), which determines it). For the state at a "
+            "given time within the run add save=dvi.Save(ts=[t1])."
         )
 
     @abc.abstractmethod

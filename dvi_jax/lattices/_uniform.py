@@ -33,9 +33,10 @@ class Uniform(StepSizes):
         # (t1 − t0)/h has round-off, which is not a remaining part of a step.
         if abs(steps - count) > 1e-9 * max(1, count):
             raise ValueError(
-                f"{names[0]}={given[names[0]]!r} is not a multiple of h={h!r} away from t0 "
-                f"({steps:.6g} steps, not a whole number). Use h={length / max(1, count)!r}, or "
-                "save=dvi.Save(ts=[...]) for a time between two steps."
+                f"{names[0]}={given[names[0]]!r} requires {steps:.6g} steps of h={h!r} from "
+                f"t0={t0!r}, not a whole number. Use h={length / max(1, count)!r}; or give "
+                f"num_steps in place of {names[0]}, and save=dvi.Save(ts=[...]) for times between "
+                "two steps."
             )
         return count
 

@@ -111,8 +111,9 @@ class Variational(StepSizes):
             )
         if arithmetic.undoes_steps:
             raise ValueError(
-                "the steps of Variational() are solved for, and a solve cannot be undone bit for "
-                "bit: use arithmetic=dvi.Compensated(), or another lattice."
+                f"the lattice Variational() cannot be used with arithmetic={arithmetic!r}: the "
+                "size of each step is the solution of an equation, and a solve cannot be undone "
+                "bit for bit. Use arithmetic=dvi.Compensated(), or another lattice."
             )
 
     def interval(self, t0, h, k):

@@ -139,8 +139,8 @@ def component(
     if found is None or (found[2] is None and math.prod(shape) != 1):
         example = f"q[{', '.join('0' * len(shape))}]"
         raise ValueError(
-            f'a component of a state of shape {shape} is one such as "{example}", or a function '
-            f"(q, p) → number, got {which!r}."
+            f'a coordinate must be the name of a component, such as "{example}" for a state of '
+            f"shape {shape}, or a function (q, p) → number; got {which!r}."
         )
     letter, inside = found.groups()
     place = place_in(shape, tuple(map(int, inside.split(","))) if inside else (0,) * len(shape))

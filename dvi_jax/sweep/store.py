@@ -85,7 +85,7 @@ class Store:
         self.config = json.loads(attributes["config"])
         self.sha = attributes["config_sha256"]
         if digest(self.config) != self.sha:
-            raise ValueError("the configuration does not have its checksum")
+            raise ValueError("the configuration does not match its checksum")
         dict(json.loads(attributes.get("units", "{}")))  # raises what is wrong with the units
         self.plan = Plan(dict(self.config["dims"]), tuple(self.config["chunk"]))
         self.variables = {

@@ -213,7 +213,9 @@ def vector(size: int) -> Check:
         try:
             value = np.asarray(given, float)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{name} must be {size} numbers: {error}") from None
+            raise ValueError(
+                f"{name} must be an array of {size} numbers, got {given!r} ({error})."
+            ) from None
         if value.shape != (size,):
             raise ValueError(f"{name} must have shape ({size},), got {value.shape}.")
         if not np.isfinite(value).all():

@@ -72,13 +72,16 @@ class Expressions:
             case ast.BinOp(left=left, op=ast.Add() | ast.Mult() as op, right=right):
                 left, right = self._made(left), self._made(right)
                 if not (isinstance(left, self.kind) and isinstance(right, self.kind)):
-                    raise ValueError("numbers are written out, without + and *")
+                    raise ValueError(
+                        "+ and * cannot be used with a number: for 2 + 2 write the result, 4"
+                    )
                 return left + right if isinstance(op, ast.Add) else left * right
             case ast.Name(id=name):
                 try:
                     return self._called(name, [], [])
                 except TypeError:
-                    raise self.error(f"{name!r} without its arguments in parentheses") from None
+                    seen = f"{name!r} without its arguments in parentheses: write {name}(...)"
+                    raise self.error(seen) from None
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=keywords):
                 return self._called(name, arguments, keywords)
         raise ValueError(f"{ast.unparse(node)!r} is not one of these, a number or a list of them")
