@@ -126,7 +126,7 @@ def symplectic_defect(M) -> float:
     any_problem=True,
 )
 def check_reversible(candidate: Candidate) -> Measured:
-    """max |z − z0| of the state z = (q, p) after ten steps h = 0.1 and ten steps −h; coupled
+    """max |z − z0| after ten steps h = 0.1 and ten steps −h, where z = (q, p) is the state; coupled
     problem with its force. At most 1e-12. Claimed by symmetric methods."""
     n, x = 10, inputs(candidate.problem, 0.0)
     q, p = candidate.flow(x, n)
