@@ -1,15 +1,18 @@
 # %% [markdown]
 # # Discovering invariants
 #
-# Which quantities does a given system conserve, exactly or to some order in $\varepsilon$? The
-# search needs no symmetry as input. It is a problem of linear algebra: with functions $\varphi(q,
-# p)$, the map $\Phi_\varepsilon$ of one step and the Taylor coefficients $A_m$ of $\varphi \circ
-# \Phi_\varepsilon - \varphi$ in $\varepsilon$ at random samples, the series $I = \sum_m
-# \varepsilon^m c_m \cdot \varphi$ is an invariant of order $z$ where
+# Which quantities does a given system conserve, exactly or to some order in $\varepsilon$? This
+# notebook answers the question for four systems, without symmetries as input.
 #
-# $$\sum_{m \le k} A_{k-m}\, c_m = 0, \qquad k = 0 \dots z:$$
+# The search is a problem of linear algebra. Let $\varphi(q, p)$ be the basis functions,
+# $\Phi_\varepsilon$ the map of one step, and $A_m$ the Taylor coefficients in $\varepsilon$ of the
+# change $\varphi \circ \Phi_\varepsilon - \varphi$ at random samples. The series $I = \sum_m
+# \varepsilon^m c_m \cdot \varphi$ is an invariant of order $z$ if
 #
-# a null space. A quarter of the samples is held out for validation. A long run is the final test.
+# $$\sum_{m \le k} A_{k-m}\, c_m = 0, \qquad k = 0 \dots z.$$
+#
+# The coefficients $c_m$ are therefore a null space. A quarter of the samples is held out for
+# validation. A long run is the final test.
 
 # %%
 import jax
@@ -61,7 +64,8 @@ plt.show()
 # ## No invariant
 #
 # Van der Pol's force $(1 - q^2)\,p$ amplifies small oscillations and damps large ones. There is no
-# invariant of first order, and the report must say so and give the reason.
+# invariant of first order. The result must be empty, and the report must give the reason: a law for
+# the mean change of the lost invariant $I$ in one step.
 
 # %%
 van_der_pol = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: (1 - q0**2) * p1)
@@ -72,8 +76,8 @@ print(law)
 assert len(none.invariants) == 0
 
 # %% [markdown]
-# The law of the drift has a fixed point, the limit cycle. Two runs, one from inside and one from
-# outside, must end on it.
+# The law has a fixed point $I$, which is the limit cycle. Two runs, one from inside and one from
+# outside of it, must end there.
 
 # %%
 runs = [
@@ -105,9 +109,10 @@ plt.show()
 # %% [markdown]
 # ## Number of invariants per order
 #
-# The isotropic oscillator in the plane conserves four quadratic forms, three of them independent.
-# The perturbation of Hénon and Heiles, $\varepsilon (x^2 y - y^3/3)$, removes some of them, at
-# second order.
+# The isotropic oscillator in the plane conserves four quadratic forms, of which three are
+# functionally independent. The perturbation of Hénon and Heiles, $\varepsilon (x^2 y - y^3/3)$,
+# destroys some of these conservation laws. The next cell counts the leading-order terms $c_0 \cdot
+# \varphi$ that have corrections up to orders 0, 1 and 2.
 
 # %%
 henon_heiles = dvi.System(
@@ -123,19 +128,20 @@ for series in found.invariants:
 assert found.survivors == (13, 4, 2)
 
 # %% [markdown]
-# There are thirteen at order 0, because nine products of the quadratic forms have degree four and
-# are in the basis. Their corrections would have degree five, which is not in the basis: four
-# remain. Two have corrections of second order, the angular momentum and the energy. This is no
-# statement about higher orders: the motion becomes chaotic, so the first one is not conserved at
-# all orders.
+# There are thirteen at order 0: the four quadratic forms and nine products of them, of degree four.
+# The corrections of the products would have degree five, which is not in the basis; therefore four
+# remain at order 1. Two of these, the angular momentum and the energy, have corrections of second
+# order. This does not hold at all orders: the motion becomes chaotic, and then only the energy is
+# conserved.
 
 # %% [markdown]
 # ## A basis that is too small
 #
-# If the basis cannot represent an invariant, the search does not find it, but does not report a
+# If the basis cannot represent an invariant, the search does not find it, but it must not report a
 # wrong one. For Kepler's problem and polynomials only the angular momentum is found. With $1/r$ in
-# the basis, a map of second order conserves the energy and the Laplace–Runge–Lenz vector
-# approximately, and the report says how well.
+# the basis, three more are found: a map of second order conserves the energy and the two components
+# of the Laplace–Runge–Lenz vector approximately. The smallest singular values show how well;
+# `tolerance` is the limit below which they count as zero.
 
 # %%
 kepler = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - 1 / jnp.sqrt(q0 @ q0))
@@ -161,7 +167,9 @@ assert kept["with 1/r"].survivors[0] == 4
 # %% [markdown]
 # ## Next steps
 #
-# - A system with a slow time, `dvi.System(..., slow_time=True)`, needs samples (qs, ps, taus): for
-#   the slow oscillator in `examples/what_is_conserved.py` the search finds the discrete action.
-# - `dvi.find_symmetries` finds generators; `dvi.noether_balance` measures the causes of a drift.
+# - A system with a slow time $\tau = \varepsilon t$, `dvi.System(..., slow_time=True)`, requires
+#   samples (qs, ps, taus): for the slow oscillator in `examples/what_is_conserved.py` the search
+#   finds the discrete action.
+# - `dvi.find_symmetries` finds generators of symmetries; `dvi.noether_balance` measures the causes
+#   of a drift.
 # - Systems without adiabatic invariants: [limits](limits.ipynb).

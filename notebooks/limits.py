@@ -1,16 +1,16 @@
 # %% [markdown]
 # # Limits of adiabatic invariance
 #
-# An adiabatic invariant needs conditions: the perturbation is not resonant with the frequencies of
-# the motion, phase volume is conserved, and no orbit crosses a separatrix. This notebook violates
-# each condition in turn, measures the change of the action as a power of $\varepsilon$, and
-# compares it with the same system where the condition holds.
+# An adiabatic invariant such as the action requires conditions: the perturbation is not resonant
+# with the frequencies of the motion, phase volume is conserved, and the orbit does not cross a
+# separatrix. This notebook violates each condition in turn, measures how the change of the action
+# scales with $\varepsilon$, and compares the result with a case without the violation.
 #
-# | violated by | change of the action | if the condition holds |
+# | violated by | change of the action | for comparison |
 # |---|---|---|
-# | a resonance | $\varepsilon^{1/2}$ | $\varepsilon$ |
-# | dissipation, time $1/\varepsilon$ | $\varepsilon^0$: 63 % | rescaled action: $\varepsilon$ |
-# | a separatrix | $\varepsilon$ | $e^{-c/\varepsilon}$ |
+# | a resonance | $\varepsilon^{1/2}$ | no resonance: $\varepsilon$ |
+# | dissipation, $t \le 1/\varepsilon$ | 63 %, $\varepsilon^0$ | rescaled action: $\varepsilon$ |
+# | a separatrix | $\varepsilon$ | no crossing: $e^{-c/\varepsilon}$ |
 
 # %%
 import jax
@@ -45,11 +45,12 @@ def power_law(epsilons, changes):
 # \omega = \bar\omega + 0.3 \tanh(\varepsilon t).$$
 #
 # For $\bar\omega = 1$ it passes through the resonance $\omega = 1$, where $\dot\omega =
-# 0.3\,\varepsilon$. Write $\sqrt{J}\, e^{-i\theta} = (\sqrt\omega\, q + i p/\sqrt\omega)/\sqrt2$,
-# $J$ the action. The drive adds $\tfrac{i\varepsilon}{2\sqrt2}\, e^{i\phi}$ to the amplitude in a
-# unit of time, $\phi = \theta - t$. While the phase $\phi$ is stationary, for a time
-# $\sqrt{2\pi/\dot\omega}$, these contributions accumulate. To leading order in $\varepsilon$ the
-# amplitude jumps by at most
+# 0.3\,\varepsilon$. Let $J$ be the action, and write the state as $\sqrt{J}\, e^{-i\theta} =
+# (\sqrt\omega\, q + i p/\sqrt\omega)/\sqrt2$. Relative to the phase $\theta$ of the free motion
+# and up to terms that oscillate fast, the drive adds $\tfrac{i\varepsilon}{2\sqrt2}\, e^{i\phi}$ to
+# the amplitude $\sqrt{J}$ per unit of time, with $\phi = \theta - t$. At the resonance $\phi$ is
+# stationary for a time $\sqrt{2\pi/\dot\omega}$, in which these contributions accumulate. To
+# leading order in $\varepsilon$ the amplitude changes by at most
 #
 # $$|\Delta \sqrt J| \le \frac{\varepsilon}{2\sqrt2} \sqrt{\frac{2\pi}{0.3\,\varepsilon}},
 # \qquad |\Delta J| \le 2\sqrt{J}\, |\Delta\sqrt J| + |\Delta\sqrt J|^2 \sim \varepsilon^{1/2}.$$
@@ -100,9 +101,10 @@ print("largest change over the phases, measured / predicted:", np.round(passed /
 print(f"no resonance: the change scales as ε^{power(epsilons, missed):.2f}")
 
 # %% [markdown]
-# The estimate is that of stationary phase, to leading order: the measured change agrees within a
-# few percent, and is 16 % larger at the largest $\varepsilon$, where the quadratic term changes the
-# exponent. Half the range over the phases does not contain this term.
+# The estimate is that of stationary phase, to leading order. The measured change agrees within a
+# few percent for small $\varepsilon$, and is 16 % larger at the largest $\varepsilon$, where the
+# quadratic term changes the exponent. Therefore we fit the exponent to half of the range of
+# $\Delta J$ over the phases, which does not contain this term.
 
 # %%
 half_range = np.ptp(through, axis=1) / 2
@@ -115,10 +117,10 @@ assert np.all(np.abs(passed / jump - 1)[epsilons < 2e-3] < 0.05)
 # %% [markdown]
 # ## Dissipation
 #
-# A pendulum with friction, $\dot p = -\sin q - \varepsilon p$. Averaged over an oscillation,
-# $\langle \dot J \rangle = -\varepsilon J$, since $\oint p^2 dt = \oint p\, dq = 2\pi J$. After a
-# time $1/\varepsilon$ the action has decreased by a factor $e$, for any $\varepsilon$. The
-# adiabatic invariant is $J e^{\varepsilon t}$.
+# The system is a pendulum with friction, $\dot p = -\sin q - \varepsilon p$. Averaged over an
+# oscillation, $\langle \dot J \rangle = -\varepsilon J$, since $\oint p^2 dt = \oint p\, dq =
+# 2\pi J$. After a time $1/\varepsilon$ the action has decreased by a factor $e$, for any small
+# $\varepsilon$. The adiabatic invariant is $J e^{\varepsilon t}$.
 
 # %%
 pendulum = systems.pendulum()
@@ -151,8 +153,8 @@ assert np.all(np.abs(lost - (1 - np.exp(-1))) < 0.01)
 assert abs(power(epsilons, kept) - 1) < 0.05
 
 # %% [markdown]
-# The type II map is *conformally* symplectic under this friction: each step multiplies phase volume
-# by the same number, $1/(1 + \varepsilon h)$, at any state.
+# The type II map is *conformally* symplectic with this friction: each step multiplies the phase
+# volume by the same number, $1/(1 + \varepsilon h)$, at every state.
 
 
 # %%
@@ -173,8 +175,8 @@ print(f"area after one step: {areas[0, 0]:.6f} … {areas[0, -1]:.6f}")
 assert np.abs(areas * (1 + h * epsilons) - 1).max() < 1e-14
 
 # %% [markdown]
-# Discovery gives the same result: for the linear oscillator with this friction no invariant exists
-# at first order, and the report gives the averaged law of the drift.
+# The search for invariants gives the same result for the linear oscillator with this friction: no
+# invariant of first order exists, and the report gives the averaged law of the drift.
 
 # %%
 damped = dvi.System(
@@ -189,16 +191,16 @@ assert len(found.invariants) == 0
 # %% [markdown]
 # ## Crossing of a separatrix
 #
-# A pendulum without friction whose frequency changes slowly, $H = p^2/2 - \omega^2 \cos q$, $\omega
-# = 1 \pm 0.3 \tanh(\varepsilon t)$. At first it oscillates with an amplitude of 2 rad. The area
-# inside the separatrix is $16\,\omega$. If $\omega$ decreases, this area becomes smaller than that
-# of the orbit, and the pendulum begins to rotate. At the crossing the period is infinite, so the
-# change is not slow compared with it. The action $J = \oint p\, dq/2\pi$ (twice that of one
-# rotation after the crossing, so that both measure the same area) jumps by an amount that depends
-# on the phase. In theory (Cary, Escande & Tennyson 1986; Neishtadt 1986) this amount has order
-# $\varepsilon$, in general with a logarithm, $\varepsilon \ln \varepsilon$. If $\omega$ increases
-# there is no crossing, and since $\omega$ is analytic, the change from $-\infty$ to $\infty$ is
-# smaller than any power of $\varepsilon$.
+# The system is a pendulum without friction whose frequency changes slowly, $H = p^2/2 - \omega^2
+# \cos q$, $\omega = 1 \pm 0.3 \tanh(\varepsilon t)$. At first it oscillates with an amplitude of
+# 2 rad. The area inside the separatrix is $16\,\omega$. If $\omega$ decreases, this area becomes
+# smaller than that of the orbit, and the pendulum begins to rotate. At the crossing the period is
+# infinite, so the change of $\omega$ is not slow compared with it. The action $J = \oint p\,
+# dq/2\pi$ (after the crossing twice that of one rotation, so that both measure the same area)
+# changes by an amount that depends on the phase. In theory (Cary, Escande & Tennyson 1986;
+# Neishtadt 1986) this amount has order $\varepsilon$, in general with a logarithm, $\varepsilon \ln
+# \varepsilon$. If $\omega$ increases there is no crossing. Because $\omega(t)$ is analytic, the
+# change of $J$ from $t = -\infty$ to $\infty$ is then smaller than any power of $\varepsilon$.
 
 # %%
 swinging = dvi.System(
@@ -251,9 +253,9 @@ assert abs(power(crossing_epsilons, crossed) - 1) < 0.1
 assert slowest > 10
 
 # %% [markdown]
-# The first change is proportional to $\varepsilon$; over a factor of 15 in $\varepsilon$ the ratio
-# decreases by a few percent, the only sign of a logarithm. The second is not a power of
-# $\varepsilon$.
+# With a crossing, the change is proportional to $\varepsilon$. Over a factor of 15 in $\varepsilon$
+# the ratio to $\varepsilon$ changes by a few percent only, so that a logarithm is hardly visible.
+# Without a crossing, the change is not a power of $\varepsilon$.
 #
 # ## Summary
 
@@ -281,7 +283,7 @@ plt.show()
 #
 # - Replace $\tanh$ by a ramp with a corner, `jnp.clip(x, -1, 1)`: the change without crossing
 #   becomes a power of $\varepsilon$, because exponential smallness requires a smooth $\omega$.
-# - Close to a constant resonance the range of a series shrinks with the distance from it: `reach`
-#   in the result of `discover_invariants`.
+# - Close to a resonance that is constant in time, a series in $\varepsilon$ is useful only up to a
+#   small $\varepsilon$: `reach` in the result of `discover_invariants`.
 # - Chaos destroys invariants, too: `dvi.LyapunovSpectrum()`, `dvi.GALI(2)` and
 #   `dvi.frequency_diffusion` distinguish regular from chaotic orbits.

@@ -1,7 +1,8 @@
 # %% [markdown]
 # # Quick start: find an adiabatic invariant and verify it
 #
-# A mass on a spring is perturbed by a weak nonlinear force,
+# This notebook finds an adiabatic invariant of a perturbed oscillator and verifies it by long runs
+# and by controls. A mass on a spring is perturbed by a weak nonlinear force,
 #
 # $$H = \tfrac12\,(p^2 + q^2), \qquad \dot p = -q - \varepsilon q^3 .$$
 #
@@ -9,8 +10,8 @@
 # energy that changes less? A quantity $I = I_0 + \varepsilon I_1$ whose change stays
 # $O(\varepsilon^2)$ over a long time is an *adiabatic invariant of first order*.
 #
-# `dvi_jax` iterates a map, the variational integrator, in place of the differential equation. The
-# question is therefore which quantities the *map* conserves, at the step that is used.
+# `dvi_jax` iterates a map, one step of a variational integrator, in place of the differential
+# equation. The question is therefore which quantities the *map* conserves, here at $h = 0.1$.
 
 # %%
 import jax
@@ -26,10 +27,10 @@ jax.config.update("jax_enable_x64", True)  # invariants need double precision
 # %% [markdown]
 # ## Define, discover, verify
 #
-# The discrete Hamiltonian and the force are functions of one step: `q0` is the position at its
-# beginning, `p1` the momentum at its end. `discover_invariants` searches the polynomials up to
-# degree 8 with random samples. `drift_order` measures how the largest change along 5000 steps
-# scales with $\varepsilon$.
+# The discrete Hamiltonian `H_D`, which defines the map, and the force `W` are functions of one
+# step: `q0` is the position at its beginning, `p1` the momentum at its end. `discover_invariants`
+# searches the polynomials up to degree 8, at random states. `drift_order` measures how the drift of
+# the invariant, its largest change in 5000 steps, scales with $\varepsilon$.
 
 
 # %%
@@ -64,9 +65,9 @@ assert abs(order.slope - 2) < 0.02
 # ## Controls
 #
 # A test is meaningful only if it can fail. We therefore test two quantities that are not adiabatic
-# invariants of first order. The energy must fail for two reasons: the force
-# changes it at first order, and the map does not conserve it even at $\varepsilon = 0$. $I_0$
-# without its correction must fail for the first reason only.
+# invariants of first order. The energy must fail for two reasons: the force changes it at first
+# order, and the map does not conserve it even at $\varepsilon = 0$. $I_0$ without its correction
+# must fail for the first reason only; its slope must be 1.
 
 
 # %%
@@ -95,10 +96,10 @@ axis = plot.drift_orders(orders, promised=[None, 1, 2], title="Largest change in
 plt.show()
 
 # %% [markdown]
-# Open symbols mark drifts that are not larger than the drift at $\varepsilon = 0$. There the effect
-# of $\varepsilon$ is not visible. All points of the energy are open; therefore no slope is given.
+# Open symbols mark drifts that are less than ten times the drift at $\varepsilon = 0$ and are not
+# used for the slope. All points of the energy are open; therefore it has no slope.
 #
-# The same quantities against time, for $\varepsilon = 0.1$:
+# The next cell plots the same quantities against time, for $\varepsilon = 0.1$.
 
 # %%
 sol = dvi.integrate(
@@ -117,8 +118,8 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - Use `order=2` or 3: the slope becomes 3 or 4 ([discovering
+# - Use `order=2` or 3 in `discover_invariants`: the slope becomes 3 or 4 ([discovering
 #   invariants](discovering_invariants.ipynb)).
 # - Use your own $H$ and force ([your own system](your_own_system.ipynb)).
-# - Use a force with friction, `-p1`: no adiabatic invariant exists, and the report gives the reason
-#   ([limits](limits.ipynb)).
+# - Use friction, `-p1`, as the force: no adiabatic invariant of first order exists, and the report
+#   gives the reason ([limits](limits.ipynb)).

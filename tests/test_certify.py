@@ -206,7 +206,7 @@ def test_certify_methods_of_ones_own():
     assert page.startswith(TITLE)
     for said in ("| mine | pass ", "| liar | FAIL", "| honest | not claimed (", "## Failures"):
         assert said in page
-    assert "TypeII said to be symmetric" in page
+    assert "TypeII declared to be symmetric" in page
     assert "symplecticity" not in page.split("## Your own method")[0].split("## What")[0]
 
 

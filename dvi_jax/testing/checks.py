@@ -36,15 +36,16 @@ _ORDER = (
 
 @check("order", _ORDER, ".2f")
 def check_order(candidate: Candidate) -> Measured:
-    """The r of log error = c + r log h + d h², by least squares through the six smallest of the
-    steps h = 4/8 … 4/512 whose global errors at t = 4 are above 3e-13 (below is round-off), on the
-    coupled problem without its force. Within 0.2 of the order claimed, from both sides."""
+    """The exponent r in log error = c + r log h + d h², fitted by least squares, where the error is
+    that of the state at t = 4 on the coupled problem without its force. The six smallest of the
+    steps h = 4/8 … 4/512 with an error above 3e-13 are used, because smaller errors contain
+    round-off. r must be within 0.2 of the order claimed."""
     return _measured_order(candidate, 0.0)
 
 
 @check("forced-order", _ORDER, ".2f")
 def check_forced_order(candidate: Candidate) -> Measured:
-    """The same as order, with the force on."""
+    """The same as order, with the force."""
     return _measured_order(candidate, FORCED)
 
 
@@ -95,8 +96,8 @@ _SYMPLECTIC = (
 
 @check("symplecticity", _SYMPLECTIC, any_problem=True)
 def check_symplectic(candidate: Candidate) -> Measured:
-    """max |MᵀJM − J|, M the Jacobian of one step by autodiff, h = 0.1, coupled problem without its
-    force. At most 1e-12."""
+    """max |MᵀJM − J|, where M is the Jacobian of one step h = 0.1 by automatic differentiation and
+    J the symplectic matrix; coupled problem without its force. At most 1e-12."""
 
     @jax.jit
     @jax.jacfwd
@@ -125,8 +126,8 @@ def symplectic_defect(M) -> float:
     any_problem=True,
 )
 def check_reversible(candidate: Candidate) -> Measured:
-    """max |z − z0| after ten steps of h = 0.1 and ten of −h, coupled problem with its force. At
-    most 1e-12."""
+    """max |z − z0| after ten steps h = 0.1 and ten steps −h, where z = (q, p) is the state; coupled
+    problem with its force. At most 1e-12. Claimed by symmetric methods."""
     n, x = 10, inputs(candidate.problem, 0.0)
     q, p = candidate.flow(x, n)
     back = candidate.flow(x | {"q0": q, "p0": p, "t0": n * x["h"], "h": -x["h"]}, n)
@@ -141,8 +142,8 @@ def check_reversible(candidate: Candidate) -> Measured:
     any_problem=True,
 )
 def check_inverse(candidate: Candidate) -> Measured:
-    """max |z − z0| after four steps of the method and four of its adjoint over −h, coupled problem
-    with its force. At most 1e-12."""
+    """max |z − z0| after four steps h = 0.1 of the method and four steps −h of its adjoint; coupled
+    problem with its force. At most 1e-12. Claimed by invertible methods."""
     allowed, method = f"≤ {ROUND_OFF:g}", candidate.method
     if not method.is_invertible:
         return not_measured(allowed, "the method has no inverse", claimed=False)
@@ -168,9 +169,9 @@ FRACTION, QUIET = 0.05, 1e-10
 
 @check("energy", _SYMPLECTIC)
 def check_energy(candidate: Candidate) -> Measured:
-    """Drift of the energy (slope times length of the run) divided by the range of its oscillation,
-    over 100 000 steps of h = 0.2 on the central problem. At most 0.05; a range of less than 1e-10
-    of the energy counts as that much. Claimed by symplectic methods."""
+    """Drift of the energy (slope times length of the run) divided by the range of the energy, or by
+    1e-10 of the energy if this is larger; 100 000 steps h = 0.2 of the central problem without its
+    force. At most 0.05. Claimed by symplectic methods."""
     x, run = inputs(problems.CENTRAL), candidate.long_run
     drift = abs(float(run.observed["slope"])) * LONG * LONG_H
     swing = float(run.observed["range"])
@@ -181,8 +182,8 @@ def check_energy(candidate: Candidate) -> Measured:
 
 @check("momentum", _SYMPLECTIC)
 def check_momentum(candidate: Candidate) -> Measured:
-    """Largest relative change of the angular momentum over the run of energy. At most 1e-12.
-    Claimed by symplectic methods."""
+    """Largest relative change of the angular momentum in the same run. At most 1e-12. Claimed by
+    symplectic methods."""
     (q1, q2), (p1, p2) = problems.CENTRAL.q0, problems.CENTRAL.p0
     change = float(candidate.long_run.observed["momentum"])
     return _of_long_run(candidate, change / abs(q1 * p2 - q2 * p1), ROUND_OFF)
@@ -207,9 +208,9 @@ def _of_long_run(candidate, value: float, bound: float, detail: str = "") -> Mea
     "from arrays, and for an `inverse` that does not undo the step.",
 )
 def check_gradient(candidate: Candidate) -> Measured:
-    """Worst relative difference of the reverse-mode gradient from a central difference quotient,
-    over q0, p0, t0, h, ε and args; four steps of the coupled problem with its force. At most 1e-6.
-    """
+    """Largest relative difference between the reverse-mode gradient and a central difference
+    quotient, for q0, p0, t0, h, ε and args; four steps of the coupled problem with its force. At
+    most 1e-6."""
     gradient = candidate.gradients[0]["Reversible"]  # the default of `integrate`
     quotient = {name: _quotient(candidate, name) for name in gradient}
     error = {name: abs(gradient[name] - x) / abs(x) for name, x in quotient.items()}
@@ -219,8 +220,8 @@ def check_gradient(candidate: Candidate) -> Measured:
 
 @check("modes", "Let `inverse` undo the step to round-off: `Reversible` rebuilds states with it.")
 def check_modes(candidate: Candidate) -> Measured:
-    """Worst relative difference of a derivative by `Direct`, `Checkpointed` and `Reversible` from
-    that by forward mode. At most 1e-10."""
+    """Largest relative difference between a derivative by reverse mode, with the adjoints `Direct`,
+    `Checkpointed` and `Reversible`, and by forward mode. At most 1e-10."""
     backward, forward = candidate.gradients
     error = {name: abs(sum(row.values()) / forward - 1) for name, row in backward.items()}
     worst = _worst(error)
@@ -254,8 +255,8 @@ def _quotient(candidate: Candidate, name: str) -> float:
     "Python.",
 )
 def check_jit(candidate: Candidate) -> Measured:
-    """Relative difference of a step under jit from the same step op by op, central problem with its
-    force. At most 1e-14."""
+    """Relative difference between a step that is compiled (`jax.jit`) and the same step without
+    compilation; central problem with its force. At most 1e-14."""
     compiled = candidate.one_step()
     with jax.disable_jit():
         return at_most(_relative(compiled, candidate.one_step()), 1e-14)
@@ -263,8 +264,8 @@ def check_jit(candidate: Candidate) -> Measured:
 
 @check("vmap", "Look for operations that mix the elements of a batch, such as a custom_vmap.")
 def check_batch(candidate: Candidate) -> Measured:
-    """Relative difference of four trajectories under vmap, different in every input, from the four
-    run one by one; coupled problem with its force. At most 1e-12."""
+    """Relative difference between four trajectories in a batch (`jax.vmap`), different in every
+    input, and the same four computed one by one; coupled problem with its force. At most 1e-12."""
     xs = _batch(candidate)
     together = candidate.batch(_stacked(xs))[0]
     alone = [candidate.compiled(x)[0] for x in xs]
@@ -273,8 +274,8 @@ def check_batch(candidate: Candidate) -> Measured:
 
 @check("failure", "Return the status of every solve in `info`, and never replace NaN by a number.")
 def check_failure(candidate: Candidate) -> Measured:
-    """The same as vmap, with one trajectory that overflows: it must have the status of a failure
-    and be NaN, and the others must be what they are alone, to 1e-12."""
+    """The same as vmap, with one trajectory that overflows. It must have the status of a failure
+    and be NaN, and the others must agree to 1e-12 with those computed alone."""
     xs, bad = _batch(candidate), 1
     xs[bad] |= {"q0": jnp.full_like(xs[bad]["q0"], 1e200)}
     together, good = candidate.batch(_stacked(xs))
@@ -293,8 +294,8 @@ def check_failure(candidate: Candidate) -> Measured:
     ".0f",
 )
 def check_traces(candidate: Candidate) -> Measured:
-    """Further traces of a run when q0, p0, t0, h, ε and args change and the method is an equal, new
-    instance. None."""
+    """Number of times that a run is traced again if q0, p0, t0, h, ε and args change and the method
+    is a new instance that is equal. It must be 0."""
     calls, seen = 0, []
 
     def counted(t0, t1, q0, p0, q1, p1, args):

@@ -131,45 +131,49 @@ _FIRST, _SECOND = dvi.TypeII(), dvi.Strang()
 _RK4 = altered(dvi.RungeKutta4(), is_symplectic=True)
 
 CONTROLS: tuple[Control, ...] = (
-    Control("TypeII said to be of order 2", "order", altered(_FIRST, order=2)),
-    Control("Strang said to be of order 1", "order", altered(_SECOND, order=1)),
+    Control("TypeII declared to be of order 2", "order", altered(_FIRST, order=2)),
+    Control("Strang declared to be of order 1", "order", altered(_SECOND, order=1)),
     Control(
-        "KahanLi8 with third digits changed, said to be of order 8",
+        "KahanLi8 with coefficients changed by 1e-3, declared of order 8",
         "order",
         altered(_with_other_digits(), order=8),
     ),
     Control(
-        "Strang whose force sees the time of the step's start",
+        "Strang with the force at the initial time of the step only",
         "forced-order",
         altered(_SECOND, _with_frozen_time),
     ),
-    Control("RungeKutta4 said to be symplectic", "symplecticity", _RK4),
+    Control("RungeKutta4 declared to be symplectic", "symplecticity", _RK4),
     Control("explicit Euler in place of TypeII", "symplecticity", altered(_FIRST, _explicit_euler)),
-    Control("TypeII said to be symmetric", "reversal", altered(_FIRST, is_symmetric=True)),
+    Control("TypeII declared to be symmetric", "reversal", altered(_FIRST, is_symmetric=True)),
     Control(
-        "TypeII with the step over −h for an inverse",
+        "TypeII with the step −h as its inverse",
         "adjoint",
         altered(_FIRST, inverse=_backwards),
     ),
-    Control("RungeKutta4 said to be symplectic", "energy", _RK4),
-    Control("RungeKutta4 said to be symplectic", "momentum", _RK4),
+    Control("RungeKutta4 declared to be symplectic", "energy", _RK4),
+    Control("RungeKutta4 declared to be symplectic", "momentum", _RK4),
     Control(
-        "TypeII with h taken for a constant by autodiff",
+        "TypeII without the derivative with respect to h",
         "gradient",
         altered(_FIRST, _without_gradient_of_h),
     ),
     Control(
-        "TypeII with an inverse wrong by 1e-8", "modes", altered(_FIRST, inverse=_not_quite_inverse)
+        "TypeII with an inverse that is wrong by 1e-8",
+        "modes",
+        altered(_FIRST, inverse=_not_quite_inverse),
     ),
     Control(
-        "TypeII with a Python counter, which differs at each trace",
+        "TypeII with a Python counter that changes at each trace",
         "jit",
         altered(_FIRST, _with_a_number_from_python),
     ),
     Control(
-        "TypeII with a rule for batches that mixes lanes", "vmap", altered(_FIRST, _mixing_lanes)
+        "TypeII with a batching rule that mixes trajectories",
+        "vmap",
+        altered(_FIRST, _mixing_lanes),
     ),
-    Control("TypeII that puts numbers for NaN", "failure", altered(_FIRST, _hiding_nan)),
+    Control("TypeII that replaces NaN by numbers", "failure", altered(_FIRST, _hiding_nan)),
     Control(
         "TypeII whose instances never compare equal",
         "traces",
