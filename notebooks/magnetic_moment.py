@@ -43,7 +43,7 @@ def bounces(length):
     )  # fmt: skip
 
 
-def wavers(values):
+def relative_range(values):
     """Range over mean."""
     return np.ptp(values) / abs(np.mean(values))
 
@@ -78,13 +78,13 @@ plt.show()
 
 # %%
 keys = ["magnetic_moment", "corrected_moment", "bounce_action"]
-table = np.array([[wavers(run.observed[key]) for run in runs] for key in keys])
+table = np.array([[relative_range(run.observed[key]) for run in runs] for key in keys])
 slopes = [-np.polyfit(np.log(lengths), np.log(row), 1)[0] for row in table]
 print(f"{'range / mean, ℓ =':22}", *(f"{length:9.0f}" for length in lengths), "   power of 1/ℓ")
 for key, row, slope in zip(keys, table, slopes, strict=True):
     print(f"{key:22}", *(f"{x:9.2e}" for x in row), f"{slope:12.2f}")
-exact = max(wavers(run.observed["canonical_angular_momentum"]) for run in runs)
-energy = max(wavers(run.observed["energy"]) for run in runs)
+exact = max(relative_range(run.observed["canonical_angular_momentum"]) for run in runs)
+energy = max(relative_range(run.observed["energy"]) for run in runs)
 print(f"angular momentum: {exact:.0e}, energy: {energy:.0e}")
 
 assert abs(slopes[0] - 1) < 0.1
@@ -129,13 +129,13 @@ gyration = []
 for run, length in zip(runs, lengths, strict=True):
     x, y, z = np.asarray(run.qs)[1:].T
     B = np.linalg.norm(np.stack([-x * z, -y * z, length**2 + z**2]) / length**2, axis=0)
-    gyration.append(wavers(np.asarray(run.observed["magnetic_moment"]) * B))
+    gyration.append(relative_range(np.asarray(run.observed["magnetic_moment"]) * B))
 slope = -np.polyfit(np.log(lengths), np.log(gyration), 1)[0]
 short = bounces(2.0)
 print(f"energy of the gyration: range / mean {np.round(gyration, 2)}, (1/ℓ)^{slope:.2f}")
-print(f"ℓ = 2: range / mean of the moment is {wavers(short.observed['magnetic_moment']):.2f}")
+print(f"ℓ = 2: range / mean of the moment is {relative_range(short.observed['magnetic_moment']):.2f}")
 assert abs(slope) < 0.1
-assert wavers(short.observed["magnetic_moment"]) > 0.5
+assert relative_range(short.observed["magnetic_moment"]) > 0.5
 
 # %%
 with plot.style():
