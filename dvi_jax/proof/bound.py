@@ -1,0 +1,425 @@
+"""`bound_drift`: a proved bound of how much invariants change, for all starts of a domain."""
+
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._arithmetic import FloatingPoint
+from .._checks import finite, positive, whole
+from .._files import publish
+from .._integrator import Integrator, chosen, only
+from .._step import Equations
+from .._system import System, check_system, of_problem
+from .._types import Interval
+from ..discover.found import Discovery
+from ..discover.series import InvariantSeries
+from .components import Unsupported, program_of
+
+if TYPE_CHECKING:
+    from . import checker as _checker
+
+_LEVELS = (0.99, 0.95, 0.8, 0.6, 0.4)
+"""Fractions of the range between the least value in the domain and that at its border that are
+tried as the level below which trajectories stay in the domain."""
+
+_ACCEPTED = 8.0
+"""Residual of an implicit equation that a solver accepts, in units of round-off of the momenta."""
+
+
+class DriftBound(eqx.Module):
+    """Result of `bound_drift`: what is proved about the change of invariants in each step.
+
+    For all states (q, p) of the domain and all ε of the interval, in one step of the map
+
+        |I_k(q1, p1) − I_k(q0, p0)| ≤ per_step[k]                 in exact arithmetic,
+                                    ≤ per_step[k] + rounding[k]   as computed in float64.
+
+    - `per_step`, `rounding`: [unit of the invariant]. `seen`: the largest change found at sample
+      points of the boxes, a lower estimate of the least possible `per_step`.
+    - `level`: (k, sign, c): trajectories that start in the domain with sign·I_k ≤ c stay in it for
+      `steps` steps, exact or computed; None if that is not shown, and `reason` says why.
+    - `start`: factor by which the domain is scaled about its middle so that all its states satisfy
+      that. `change`: the change of I_k that `steps` steps exclude.
+    - `boxes`: number of boxes of the proof. `formulas`: the invariants as text.
+    - `certificate`: all that `dvi-jax verify` checks, see `save`.
+    """
+
+    per_step: tuple[float, ...] = eqx.field(static=True)
+    rounding: tuple[float, ...] = eqx.field(static=True)
+    seen: tuple[float, ...] = eqx.field(static=True)
+    level: tuple[int, int, float] | None = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    start: float = eqx.field(static=True)
+    change: float = eqx.field(static=True)
+    boxes: int = eqx.field(static=True)
+    reason: str = eqx.field(static=True)
+    formulas: tuple[str, ...] = eqx.field(static=True)
+    certificate: dict[str, Any] = eqx.field(static=True)
+
+    def num_steps(self, change: float, invariant: int = 0) -> int | float:
+        """The number of computed steps within which I_k changes by less than `change`, as long as
+        the trajectory is in the domain; inf if it is conserved exactly, without rounding."""
+        each = self.per_step[invariant] + self.rounding[invariant]
+        return math.floor(change / each) if each else math.inf
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the certificate, a JSON file that ``dvi-jax verify`` checks."""
+        publish(Path(path), (json.dumps(self.certificate, indent=1) + "\n").encode())
+
+    def __repr__(self) -> str:
+        return self.report()
+
+    def report(self) -> str:
+        """What is proved, as text."""
+        c = self.certificate
+        low, high = (float.fromhex(x) for x in c["epsilon"])
+        n = len(c["domain"][0]) // 2
+        names = [f"{x}{i + 1 if n > 1 else ''}" for x in "qp" for i in range(n)]
+        sides = ", ".join(
+            f"{name} in [{float.fromhex(a):.6g}, {float.fromhex(b):.6g}]"
+            for name, a, b in zip(names, *c["domain"], strict=True)
+        )
+        lines = [
+            f"proved for each step from a state with {sides}"
+            + (" and inside(q, p) ≥ 0" if c["inside"]["outputs"] else "")
+            + f", for all ε in [{low:.6g}, {high:.6g}], h = {float.fromhex(c['h']):.6g}:",
+            f"{'':4}{'change ≤':>10} {'seen':>9} {'rounding ≤':>10} {'steps for ' + format(self.change, 'g'):>18}",
+        ]
+        for k, b in enumerate(self.per_step):
+            lines.append(
+                f"I_{k:<2}{b:10.2g} {self.seen[k]:9.2g} {self.rounding[k]:10.2g} "
+                f"{self.num_steps(self.change, k):18.3g}"
+            )
+        if self.level is None:
+            lines.append(f"it is not shown that trajectories stay in the domain: {self.reason}")
+        else:
+            k, sign, value = self.level
+            lines.append(
+                f"no trajectory that starts in the domain with {'−' if sign < 0 else ''}I_{k} ≤ "
+                f"{value:.6g} leaves it in {self.steps:.3g} steps; all states of the domain scaled "
+                f"by {self.start:.3g} are such"
+            )
+        lines.extend(f"I_{k} = {text}" for k, text in enumerate(self.formulas))
+        return "\n".join(lines)
+
+
+def bound_drift(
+    found: Discovery | InvariantSeries | Callable | Sequence[Any],
+    system: Any,
+    *,
+    epsilon: Any,
+    domain: Any,
+    h: Any = None,
+    inside: Callable | None = None,
+    args: Any = None,
+    method: Any = None,
+    integrator: Integrator | None = None,
+    change: float = 1e-3,
+    ratio: float = 2.0,
+    max_boxes: int = 2000,
+    max_seconds: float = 300.0,
+) -> DriftBound:
+    r"""Prove how little invariants of the map change in a step, for all states of a domain.
+
+    The change I(Φ(x, ε), ε) − I(x, ε) of each invariant I = Σ ε^m I_m is expanded on boxes that
+    cover the domain, in exact arithmetic and with a rigorous bound of the remainder, so that terms
+    that cancel do so exactly. The rounding of one step in float64 is bounded as well. Then N steps
+    change I by at most N (per_step + rounding) as long as the trajectory is in the domain; and
+    where an invariant is larger all around the domain than inside, this is proved, too: such
+    trajectories cannot leave it.
+
+    **Arguments**
+
+    - `found`: a `Discovery`, an `InvariantSeries`, a function ``(q, p, epsilon)`` → scalar, or a
+      list of these. `system`: a `System` or a problem of the library.
+    - `epsilon`: the largest ε of an interval from 0, or the pair (least, largest).
+    - `domain`: half-width r of |q_i|, |p_i| ≤ r; or a pair for q and p, each a half-width, an array
+      of half-widths like q, or an array (lower, upper) of shape (2, *shape of q).
+    - `inside`: function ``(q, p)`` → array; the domain has only states where no value is negative.
+    - `h`, `args`: of the map. `method`, `integrator`: explicit methods, or `TypeII()`, whose
+      implicit step is a function of (q0, p1). The map must not depend on the time.
+    - `change`: of an invariant, for which a number of steps is stated.
+    - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, or
+      the limits `max_boxes` or `max_seconds` are reached.
+
+    **Returns** a `DriftBound`; ``print`` shows what is proved.
+
+    **Raises** `ProofError` if nothing is bounded on a part of the domain: a singularity, an ε that
+    is too large. `ValueError` for a function that is not analytic, or depends on the time.
+    `ImportError` without python-flint.
+
+    **Assumes** that each operation of float64 is rounded to nearest, with or without contraction
+    of products and sums, that elementary functions have errors of at most 4 ulp; and that the
+    solver of an implicit step accepts residuals of at most 8 units of round-off of the momenta.
+
+    **Source** Taylor models: Makino & Berz 2003, *Int. J. Pure Appl. Math.* 4, 379. Balls: Johansson
+    2017, *IEEE Trans. Computers* 66, 1281.
+
+    **Example**
+
+    ```python
+    cubic = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2,
+                       force=lambda t0, t1, q0, p1, args: -q0**3)
+    samples = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 400, 1))
+    found = dvi.discover_invariants(cubic, dvi.Polynomials(8), order=2, h=0.1, samples=samples)
+    bound = dvi.bound_drift(found, cubic, h=0.1, epsilon=0.01, domain=0.5)
+    print(bound.per_step[0] < 2e-10, bound.num_steps(1e-3) > 5e6)
+    # True True
+    ```
+    """
+    exact, search = _tools()
+    positive("change", change), whole("max_boxes", max_boxes), positive("max_seconds", max_seconds)
+    if not finite("ratio", ratio) > 1:
+        raise ValueError(f"ratio must be larger than 1, got {ratio!r}.")
+    system, _, _, h, args = of_problem(system, None, None, h, args, has_start=True)
+    check_system(system)
+    how = only(chosen(integrator, method=method), "bound_drift", "method", "arithmetic")
+    if how.arithmetic != FloatingPoint():
+        raise ValueError(f"bound_drift bounds the rounding of float64, not of {how.arithmetic!r}.")
+    h = finite("h", h)
+    shape, (lower, upper) = _domain(domain, found)
+    strengths = _interval(epsilon)
+    functions = _functions(found)
+    certificate = {
+        "format": exact.FORMAT,
+        **_step_of(system, how.method_for(system), shape, args, h),
+        "h": h.hex(),
+        "epsilon": [x.hex() for x in strengths],
+        "domain": [[x.hex() for x in side] for side in (lower, upper)],
+        "inside": program_of(inside or (lambda q, p: jnp.zeros(0)), shape, shape),
+        "invariants": [program_of(f, shape, shape, ()) for f, _ in functions],
+        "unit": (2.0**-53).hex(),
+        "bits": 140,
+        "tiny": (2.0**-73).hex(),
+    }
+    size = max(abs(x) for x in (*lower, *upper))
+    certificate["accepted"] = (_ACCEPTED * 2.0**-52 * size).hex()
+    certificate["spread"] = [(0.0).hex()] * (len(lower) // 2)
+    checker = exact.Checker(certificate)
+    limits = {"max_boxes": max_boxes, "max_seconds": max_seconds}
+    result = search.subdivide(checker, ratio=ratio, **limits)
+    per_step = [exact.up(b) for b in result.bounds]
+    for k, (b, s) in enumerate(zip(per_step, result.seen, strict=True)):
+        if s == 0 and b and checker.is_identity(k):
+            per_step[k] = 0.0
+    certificate |= {
+        "per_step": [b.hex() for b in per_step],
+        "rounding": [r.hex() for r in result.rounding],
+        "reach": [m.hex() for m in result.moved],
+        "boxes": result.tree,
+        "steps": 0,
+        "levels": [[None, None] for _ in per_step],
+        "shell": None,
+    }
+    level, start, reason, count = _confine(checker, certificate, functions, shape, change, limits)
+    certificate["hash"] = exact.digest(certificate)
+    return DriftBound(
+        per_step=tuple(per_step),
+        rounding=tuple(result.rounding),
+        seen=tuple(result.seen),
+        level=level,
+        steps=certificate["steps"],
+        start=start,
+        change=float(change),
+        boxes=result.count + count,
+        reason=reason,
+        formulas=tuple(text for _, text in functions),
+        certificate=certificate,
+    )
+
+
+def _tools() -> tuple[Any, Any]:
+    try:
+        from . import checker, search
+    except ImportError as error:
+        raise ImportError(
+            "bound_drift computes with python-flint, which is not installed: "
+            'pip install "dvi-jax[proof]", or pip install python-flint.'
+        ) from error
+    return checker, search
+
+
+def _step_of(system: System, method: Any, shape: Any, args: Any, h: float) -> dict[str, Any]:
+    """The step as a list of operations: of (q0, p0), or of (q0, p1) if it is implicit in p1."""
+    explicit = method.is_explicit(system, jnp.zeros(shape), args)
+    if not (explicit or method.is_the_map):
+        raise ValueError(
+            f"{method!r} is implicit for this system. Use dvi.TypeII(), whose step is an explicit "
+            "function of (q0, p1), or a method that is explicit for this system."
+        )
+
+    def stepped(t0, q, p, epsilon, h):
+        equations, interval = Equations(system, epsilon, args), Interval(t0, t0 + h, h)
+        if explicit:
+            return method.step(equations, interval, q, p)[:2]
+        rate = h * equations.momentum_rate(interval, q, p)
+        return rate, q + h * equations.position_rate(interval, q, p)
+
+    programs = [
+        program_of(lambda *x, t=t: stepped(t, *x), shape, shape, (), ()) for t in (0.0, 1.0)
+    ]
+    if programs[0] != programs[1]:
+        raise ValueError(
+            "the map depends on the time, and bound_drift needs one map for all steps: write it "
+            "as a system with one more degree of freedom, the angle of the time."
+        )
+    return {"step": programs[0], "implicit": not explicit}
+
+
+def _functions(found: Any) -> list[tuple[Callable, str]]:
+    """(function of (q, p, ε), formula) for each invariant."""
+    if isinstance(found, Discovery):
+        if not found.count:
+            raise ValueError("the Discovery has found no invariant: there is nothing to bound.")
+        return _functions(list(found.invariants))
+    if isinstance(found, InvariantSeries):
+        if found.slow_time and found.basis.uses_time:
+            raise ValueError("an invariant that is a function of the slow time cannot be bounded.")
+        return [(found.evaluate, found.formula(terms=8))]
+    if callable(found):
+        return [(found, getattr(found, "__name__", "a function"))]
+    return [pair for one in found for pair in _functions(one)]
+
+
+def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float], list[float]]]:
+    """Shape of a state, and the lower and upper bounds of the raveled (q, p)."""
+    parts = domain if isinstance(domain, tuple) else (domain, domain)
+    if len(parts) != 2:
+        raise ValueError(f"domain must be a number or a pair for q and p, got {domain!r}.")
+    shapes = [np.shape(x)[1:] if np.ndim(x) > 1 else np.shape(x) for x in parts]
+    one = found if isinstance(found, Discovery) else None
+    shape = one.shape if one is not None else max(shapes, key=len)
+    lower, upper = [], []
+    for name, x in zip("qp", parts, strict=True):
+        x = np.asarray(x, float)
+        low, high = x if x.ndim > len(shape) else (-x, x)
+        low, high = (np.broadcast_to(side, shape).ravel() for side in (low, high))
+        if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+            raise ValueError(
+                f"the domain of {name} must have finite lower bounds below its upper bounds, got "
+                f"{low.tolist()} and {high.tolist()}."
+            )
+        lower.extend(low.tolist())
+        upper.extend(high.tolist())
+    return shape, (lower, upper)
+
+
+def _interval(epsilon: Any) -> tuple[float, float]:
+    ends = epsilon if np.ndim(epsilon) else (0.0, epsilon)
+    if len(ends) != 2:
+        raise ValueError(f"epsilon must be one number or a pair, got {epsilon!r}.")
+    low, high = (finite("epsilon", float(x)) for x in ends)
+    if not low < high:
+        raise ValueError(f"epsilon must have a least value below its largest, got {epsilon!r}.")
+    return low, high
+
+
+def _confine(
+    checker: "_checker.Checker",
+    certificate: dict[str, Any],
+    functions: list,
+    shape: Any,
+    change: float,
+    limits: dict[str, Any],
+) -> tuple[tuple[int, int, float] | None, float, str, int]:
+    """Complete the certificate by a level below which trajectories stay in the domain.
+
+    Returns (k, sign, level), the scale of the domain that satisfies it, or why there is none, and
+    the number of boxes.
+    """
+    exact, search = _tools()
+    reach = [exact.exact(x) for x in certificate["reach"]]
+    candidates = _candidates(checker, functions, shape, reach)
+    reason = "no invariant is larger all around the domain than somewhere inside"
+    for k, sign, least, border in candidates:
+        each = exact.exact(certificate["per_step"][k]) + exact.exact(certificate["rounding"][k])
+        steps = math.floor(Fraction(change) / each) if each else 2**62
+        for part in _LEVELS:
+            level = least + part * (border - least) - change
+            if level <= least:
+                reason = f"change={change:g} is larger than the range of I_{k} in the domain"
+                continue
+            ends = [(-math.inf, math.inf)] * len(functions)
+            drift = steps * each
+            value = Fraction(level)
+            ends[k] = (-math.inf, value + drift) if sign > 0 else (-value - drift, math.inf)
+            try:
+                shell, count = search.enclose(checker, ends, reach, **limits)
+            except exact.Failed as error:
+                reason = str(error)
+                continue
+            certificate["levels"][k] = [None, level.hex()] if sign > 0 else [(-level).hex(), None]
+            certificate |= {"steps": steps, "shell": shell}
+            return (k, sign, level), _scale(checker, k, sign, value), "", count
+    return None, 0.0, reason, 0
+
+
+def _candidates(checker: Any, functions: list, shape: Any, reach: list) -> list[tuple]:
+    """(k, sign, least value in the domain, least value around it) of sign·I_k where the latter is
+    larger, those first that leave most of the domain; from random points."""
+    rng = np.random.default_rng(0)
+    low, high = (np.array([float(x) for x in side]) for side in (checker.lower, checker.upper))
+    wide = np.array([float(x) for x in reach])
+    inner = rng.uniform(low, high, (4000, len(low)))
+    near = rng.uniform(low, high, (40000, len(low)))
+    axis = rng.integers(0, len(low), len(near))
+    rows = np.arange(len(near))
+    side = rng.random(len(near)) < 0.5
+    near[rows, axis] = np.where(side, low[axis], high[axis])
+    outer = near + rng.uniform(0, 1, near.shape) * wide * np.where(near >= high, 1, -1) * (
+        (near <= low) | (near >= high)
+    )
+    if checker.inside["outputs"]:
+        algebra = checker.floats()
+        keep = lambda z: np.all(np.array([np.broadcast_to(g, len(z)) for g in algebra(checker.inside, z.T)]) >= 0, axis=0)
+        near = rng.uniform(low, high, (200000, len(low)))
+        near = near[keep(near)]
+        moved = near + rng.choice([-1.0, 1.0], near.shape) * wide
+        off = ~keep(moved) | (moved < low).any(1) | (moved > high).any(1)
+        inner, outer = near[:4000], moved[off][:40000]
+    epsilons = [float(x) for x in checker.epsilon]
+    found = []
+    for k, (function, _) in enumerate(functions):
+        value = jax.jit(jax.vmap(lambda z, e, f=function: f(*_state(z, shape), e), (0, None)))
+        around = np.concatenate([np.asarray(value(outer, e)) for e in epsilons])
+        within = np.concatenate([np.asarray(value(inner, e)) for e in epsilons])
+        for sign in (1, -1):
+            border, least = float(np.min(sign * around)), float(np.min(sign * within))
+            if border > least:
+                share = float(np.mean(sign * within < border))
+                found.append((share, (k, sign, least, border)))
+    return [item for _, item in sorted(found, key=lambda pair: -pair[0])]
+
+
+def _state(z: Any, shape: Any) -> tuple[Any, Any]:
+    q, p = jnp.split(z, 2)
+    return q.reshape(shape), p.reshape(shape)
+
+
+def _scale(checker: Any, k: int, sign: int, level: Fraction) -> float:
+    """The largest factor (to 1 %) by which the domain may be scaled about its middle so that
+    sign·I_k ≤ level in it."""
+    exact, _ = _tools()
+    sides = list(zip(checker.lower, checker.upper, strict=True))
+    good = 0.0
+    for i in range(1, 101):
+        s = Fraction(i, 100)
+        box = [((a + b) / 2 - s * (b - a) / 2, (a + b) / 2 + s * (b - a) / 2) for a, b in sides]
+        algebra, x = checker.models([*box, checker.epsilon])
+        low, high = algebra.range(exact.run(checker.invariants[k], x, algebra)[0])
+        if (high if sign > 0 else -low) > level:
+            break
+        good = i / 100
+    return good
+
+
+__all__ = ["DriftBound", "Unsupported", "bound_drift"]

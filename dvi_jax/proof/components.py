@@ -1,0 +1,360 @@
+"""A function of JAX as a list of scalar operations.
+
+The list is what a certificate contains: it is read from the jaxpr of the package's own step, so
+that a user writes no second definition of the system. Operations that only move numbers (slices,
+reshapes, gathers) disappear; what remains are sums, products, quotients, integer powers and
+elementary functions.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+UNARY = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sinh", "cosh", "sqrt")
+_MOVES = (
+    "reshape", "broadcast_in_dim", "squeeze", "transpose", "slice", "rev", "concatenate", "gather",
+    "dynamic_slice", "pad", "select_n", "dynamic_update_slice", "scatter", "split",
+    "stack", "unstack", "copy", "copy_p", "reduce_precision", "optimization_barrier",
+)  # fmt: skip
+_CALLS = ("pjit", "jit", "closed_call", "core_call", "remat", "checkpoint", "custom_jvp_call",
+          "custom_vjp_call", "custom_lin")  # fmt: skip
+
+
+class Unsupported(ValueError):
+    """A function that has no list of operations; the message says what is in it."""
+
+
+class Program:
+    """Operations (name, operands), written one by one; equal ones are written once."""
+
+    def __init__(self):
+        self.operations: list[list[Any]] = []
+        self._known: dict[tuple, int] = {}
+        self.constants: dict[int, float] = {}
+
+    def write(self, name: str, *operands: Any) -> "Scalar":
+        key = (name, *operands)
+        if key not in self._known:
+            self._known[key] = len(self.operations)
+            self.operations.append([name, *operands])
+        return Scalar(self, self._known[key])
+
+    def constant(self, value: float) -> "Scalar":
+        made = self.write("constant", float(value).hex())
+        self.constants[made.index] = float(value)
+        return made
+
+    def as_json(self, outputs: Sequence["Scalar"]) -> dict[str, Any]:
+        """With the operations that the outputs need only."""
+        needed = set()
+        stack = [out.index for out in outputs]
+        while stack:
+            i = stack.pop()
+            if i not in needed:
+                needed.add(i)
+                stack.extend(_operands(self.operations[i]))
+        order = sorted(needed)
+        unknown = {self.operations[i][1] for i in order if self.operations[i][0] == "unknown"}
+        if unknown:
+            raise Unsupported(
+                f"the function uses {', '.join(sorted(unknown))}; a proof needs sums, products, "
+                f"quotients, powers and {', '.join(UNARY)}."
+            )
+        new = {old: i for i, old in enumerate(order)}
+        operations = []
+        for i in order:
+            name, *rest = self.operations[i]
+            count = len(_operands(self.operations[i]))
+            operations.append([name, *(new[j] for j in rest[:count]), *rest[count:]])
+        return {"operations": operations, "outputs": [new[out.index] for out in outputs]}
+
+
+def _operands(operation: list[Any]) -> list[int]:
+    name, *rest = operation
+    if name in ("input", "constant", "unknown"):
+        return []
+    return rest[:1] if name == "power" else rest
+
+
+class Scalar:
+    """One number of a program, with Python's operators."""
+
+    __slots__ = ("index", "program")
+
+    def __init__(self, program: Program, index: int):
+        self.program, self.index = program, index
+
+    @property
+    def known(self) -> float | None:
+        return self.program.constants.get(self.index)
+
+    def _of(self, other: Any) -> "Scalar":
+        return other if isinstance(other, Scalar) else self.program.constant(other)
+
+    def __add__(self, other: Any) -> "Scalar":
+        other = self._of(other)
+        if self.known == 0:
+            return other
+        return self if other.known == 0 else self.program.write("sum", self.index, other.index)
+
+    def __neg__(self) -> "Scalar":
+        if self.known is not None:
+            return self.program.constant(-self.known)
+        return self.program.write("negative", self.index)
+
+    def __sub__(self, other: Any) -> "Scalar":
+        return self + -self._of(other)
+
+    def __mul__(self, other: Any) -> "Scalar":
+        other = self._of(other)
+        for a, b in ((self, other), (other, self)):
+            if a.known == 0 or b.known == 1:
+                return a
+        return self.program.write("multiply", self.index, other.index)
+
+    def __truediv__(self, other: Any) -> "Scalar":
+        other = self._of(other)
+        if self.known == 0 or other.known == 1:
+            return self
+        return self.program.write("divide", self.index, other.index)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __rsub__(self, other: Any) -> "Scalar":
+        return self._of(other) - self
+
+    def __rtruediv__(self, other: Any) -> "Scalar":
+        return self._of(other) / self
+
+    def power(self, n: int) -> "Scalar":
+        return {0: self.program.constant(1.0), 1: self}.get(n) or self.program.write(
+            "power", self.index, n
+        )
+
+    def apply(self, name: str) -> "Scalar":
+        return self.program.write(name, self.index)
+
+
+def total(scalars: Sequence[Any]) -> Any:
+    """The sum of several numbers as one operation, whose order is open."""
+    parts = [s for s in scalars if not (isinstance(s, Scalar) and s.known == 0)]
+    if len(parts) < 2:
+        return parts[0] if parts else scalars[0]
+    return parts[0].program.write("sum", *(part.index for part in parts))
+
+
+def program_of(function: Callable, *shapes: tuple[int, ...]) -> dict[str, Any]:
+    """The list of operations of a function of arrays of float64 with these shapes.
+
+    Returns ``{"operations": [[name, *operands], ...], "outputs": [...]}``: an operand is the number
+    of an earlier operation; inputs and outputs are in the order of the raveled arrays.
+
+    **Raises** `Unsupported` for operations that are not analytic, or that depend on the values.
+    """
+    structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
+    closed = jax.make_jaxpr(function)(*structs)
+    program, inputs, at = Program(), [], 0
+    for shape in shapes:
+        size = int(np.prod(shape))
+        numbers = [program.write("input", at + i) for i in range(size)]
+        inputs.append(_array(numbers, shape))
+        at += size
+    outputs = _evaluate(program, closed.jaxpr, closed.consts, inputs)
+    scalars = [x for out in outputs for x in _symbolic(program, out).ravel()]
+    return program.as_json(scalars)
+
+
+def _array(scalars: Sequence[Scalar], shape: tuple[int, ...]) -> np.ndarray:
+    made = np.empty(len(scalars), object)
+    made[:] = scalars
+    return made.reshape(shape)
+
+
+def _is_symbolic(x: Any) -> bool:
+    return isinstance(x, np.ndarray) and x.dtype == object
+
+
+def _symbolic(program: Program, x: Any) -> np.ndarray:
+    if _is_symbolic(x):
+        return x
+    values = np.asarray(x)
+    return _array([program.constant(v) for v in values.ravel()], values.shape)
+
+
+def _evaluate(program: Program, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]) -> list:
+    known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
+    known.update(zip(jaxpr.invars, inputs, strict=True))
+
+    def read(atom):
+        return atom.val if isinstance(atom, core.Literal) else known[atom]
+
+    for equation in jaxpr.eqns:
+        made = _apply(program, equation, [read(v) for v in equation.invars])
+        known.update(zip(equation.outvars, made, strict=True))
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _apply(program: Program, equation: Any, values: list) -> list:
+    name, params = equation.primitive.name, equation.params
+    inner = params.get("jaxpr") or params.get("call_jaxpr") or params.get("fun_jaxpr")
+    if inner is not None and (name in _CALLS or "call" in name or "jit" in name):
+        if isinstance(inner, core.ClosedJaxpr):
+            return _evaluate(program, inner.jaxpr, inner.consts, values)
+        return _evaluate(program, inner, [], values)
+    if name == "scan":
+        return _scan(program, params, values)
+    if name == "cond" and not _is_symbolic(values[0]):
+        branch = params["branches"][int(values[0])]
+        return _evaluate(program, branch.jaxpr, branch.consts, values[1:])
+    if not any(map(_is_symbolic, values)):
+        out = equation.primitive.bind(*map(jnp.asarray, values), **params)
+        return list(out) if equation.primitive.multiple_results else [out]
+    if name in _MOVES and not (name == "select_n" and _is_symbolic(values[0])):
+        return _moved(program, equation, values)
+    if name == "convert_element_type":
+        return [values[0]]
+    made = _arithmetic(program, equation, [_symbolic(program, v) for v in values], values)
+    if made is None:  # which is an error only if an output needs it: a status does not
+        unknown = program.write("unknown", name)
+        shapes = [v.aval.shape for v in equation.outvars]
+        return [_array([unknown] * int(np.prod(shape)), shape) for shape in shapes]
+    return [made]
+
+
+def _arithmetic(program: Program, equation: Any, arrays: list, values: list) -> np.ndarray | None:
+    """The output of an operation; None for one that has no list of operations."""
+    name, params = equation.primitive.name, equation.params
+    shape = equation.outvars[0].aval.shape
+    each = _ELEMENTWISE.get(name)
+    if each is not None:
+        spread = [np.broadcast_to(a, shape) for a in arrays]
+        return _array([each(*xs) for xs in zip(*(a.ravel() for a in spread), strict=True)], shape)
+    if name in UNARY:
+        return _array([x.apply(name) for x in arrays[0].ravel()], shape)
+    if name == "integer_pow":
+        return _array([x.power(int(params["y"])) for x in arrays[0].ravel()], shape)
+    if name == "pow" and not _is_symbolic(values[1]):
+        exponent = np.broadcast_to(np.asarray(values[1]), shape).ravel()
+        pairs = zip(np.broadcast_to(arrays[0], shape).ravel(), exponent, strict=True)
+        return _array([_real_power(x, float(y)) for x, y in pairs], shape)
+    if name in ("reduce_sum", "reduce_prod"):
+        moved = np.moveaxis(arrays[0], params["axes"], range(len(params["axes"])))
+        flat = moved.reshape(-1, int(np.prod(shape)))
+        combine = total if name == "reduce_sum" else math.prod
+        return _array([combine(column) for column in flat.T], shape)
+    if name == "dot_general":
+        return _dot(params["dimension_numbers"], *arrays).reshape(shape)
+    if name in ("scatter-add", "cumsum", "reduce_window_sum"):
+        return _linear(program, equation, values)
+    return None
+
+
+def _real_power(x: Scalar, y: float) -> Scalar:
+    if y.is_integer():
+        return x.power(int(y))
+    if (2 * y).is_integer():
+        return x.apply("sqrt").power(int(2 * y))
+    return (x.apply("log") * y).apply("exp")
+
+
+def _tanh(x: Scalar) -> Scalar:
+    return 1.0 - 2.0 / ((x * 2.0).apply("exp") + 1.0)
+
+
+_ELEMENTWISE: dict[str, Callable] = {
+    "add": lambda a, b: a + b,
+    "add_any": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "neg": lambda a: -a,
+    "square": lambda a: a.power(2),
+    "rsqrt": lambda a: 1.0 / a.apply("sqrt"),
+    "expm1": lambda a: a.apply("exp") - 1.0,
+    "log1p": lambda a: (a + 1.0).apply("log"),
+    "logistic": lambda a: 1.0 / ((-a).apply("exp") + 1.0),
+    "tanh": _tanh,
+}
+
+
+def _dot(dimensions: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Σ a b over the contracted axes; batch axes first, then those of a, then those of b."""
+    (ca, cb), (ba, bb) = dimensions
+    parts = []
+    for x, contracted, batch in ((a, ca, ba), (b, cb, bb)):
+        free = [i for i in range(x.ndim) if i not in (*contracted, *batch)]
+        moved = np.transpose(x, (*batch, *free, *contracted))
+        sizes = [x.shape[i] for i in batch], [x.shape[i] for i in free]
+        parts.append(moved.reshape(*(int(np.prod(s)) for s in sizes), -1))
+    left, right = parts
+    out = np.empty((left.shape[0], left.shape[1], right.shape[1]), object)
+    for index in np.ndindex(out.shape):
+        pairs = zip(left[index[0], index[1]], right[index[0], index[2]], strict=True)
+        out[index] = total([x * y for x, y in pairs])
+    return out
+
+
+def _moved(program: Program, equation: Any, values: list) -> list:
+    """Apply an operation that only moves numbers to their places in a list."""
+    table: list[Any] = [program.constant(0.0)]
+    arguments = []
+    for atom, value in zip(equation.invars, values, strict=True):
+        if _is_symbolic(value) or atom.aval.dtype == equation.outvars[0].aval.dtype:
+            flat = _symbolic(program, value)
+            arguments.append(jnp.arange(len(table), len(table) + flat.size).reshape(flat.shape))
+            table.extend(flat.ravel())
+        else:
+            arguments.append(jnp.asarray(value))
+    # Places are integers; 0 is the place of the number 0, with which a gather or a pad fills.
+    params = {k: v for k, v in equation.params.items() if k not in ("fill_value",)}
+    if "fill_value" in equation.params:
+        params["fill_value"] = 0
+    out = equation.primitive.bind(*arguments, **params)
+    places = out if equation.primitive.multiple_results else [out]
+    return [_array([table[i] for i in np.asarray(x).ravel()], x.shape) for x in places]
+
+
+def _linear(program: Program, equation: Any, values: list) -> np.ndarray:
+    """An operation that is linear in its symbolic arguments, by its effect on each number."""
+    parts, shape = [], equation.outvars[0].aval.shape
+    symbolic = [i for i, v in enumerate(values) if _is_symbolic(v)]
+    for i in symbolic:
+        for place in np.ndindex(values[i].shape):
+            units = [
+                np.zeros(np.shape(v)) if j in symbolic else np.asarray(v)
+                for j, v in enumerate(values)
+            ]
+            units[i][place] = 1.0
+            out = equation.primitive.bind(*map(jnp.asarray, units), **equation.params)
+            parts.append((values[i][place], np.asarray(out)))
+    zero = program.constant(0.0)
+    sums = [
+        total([zero, *(x * float(m.ravel()[k]) for x, m in parts if m.ravel()[k])])
+        for k in range(int(np.prod(shape)))
+    ]
+    return _array(sums, shape)
+
+
+def _scan(program: Program, params: Any, values: list) -> list:
+    """A loop of a fixed length, written out."""
+    nc, nk, length = params["num_consts"], params["num_carry"], params["length"]
+    body, consts, carry = params["jaxpr"], values[:nc], values[nc : nc + nk]
+    rows: list[list] = []
+    order = range(length)[:: -1 if params["reverse"] else 1]
+    for i in order:
+        xs = [v[i : i + 1].reshape(v.shape[1:]) for v in map(np.asarray, values[nc + nk :])]
+        out = _evaluate(program, body.jaxpr, body.consts, [*consts, *carry, *xs])
+        carry = out[:nk]
+        rows.append(out[nk:])
+    if params["reverse"]:
+        rows.reverse()
+    stacked = [
+        np.stack([_symbolic(program, np.asarray(y) if not _is_symbolic(y) else y) for y in ys])
+        for ys in zip(*rows, strict=True)
+    ]
+    return [*carry, *stacked]
