@@ -96,8 +96,8 @@ class Polynomials(AbstractBasis):
         size = math.comb(len(chosen) + self.degree, self.degree)
         if size > _MOST:
             raise ValueError(
-                f"Polynomials({self.degree}) of {len(chosen)} variables are {size:.3g} monomials, "
-                f"and at most {_MOST} can be searched: take a lower degree, or fewer variables, "
+                f"Polynomials({self.degree}) of {len(chosen)} variables has {size:.3g} monomials, "
+                f"but at most {_MOST} can be searched: use a lower degree, or fewer variables, "
                 'as in Polynomials(degree, ("q1", "p1")).'
             )
         exponents = [
@@ -195,7 +195,7 @@ class Chebyshev(AbstractBasis):
         whole("count", self.count)
         ends = np.asarray(self.domain, float)
         if ends.shape != (2,) or not np.isfinite(ends).all() or not ends[0] < ends[1]:
-            raise ValueError(f"domain must be two numbers (a, b), a < b, got {self.domain!r}.")
+            raise ValueError(f"domain must be two numbers (a, b) with a < b, got {self.domain!r}.")
 
     def for_shape(self, shape):
         names = ("1", *(f"T{k}({self.variable})" for k in range(1, self.count)))
@@ -270,7 +270,7 @@ class Radial(AbstractBasis):
     def __check_init__(self):
         whole = all(isinstance(k, int) and not isinstance(k, bool) for k in self.powers)
         if not self.powers or not whole:
-            raise ValueError(f"powers must be a list of integers, got {self.powers!r}.")
+            raise ValueError(f"powers must be a list of one or more integers, got {self.powers!r}.")
 
     def for_shape(self, shape):
         names = coordinate_names(shape)

@@ -121,16 +121,15 @@ class ShadowHamiltonian(eqx.Module):
         system = self.system
         if system is None:
             raise ValueError(
-                "a ShadowHamiltonian has to know the system: write "
-                "ShadowHamiltonian(order, system), call shadow.bind(system, epsilon), or give it "
-                "to dvi.integrate(observe=...)."
+                "a ShadowHamiltonian requires the system: write ShadowHamiltonian(order, system), "
+                "call shadow.bind(system, epsilon), or give it to dvi.integrate(observe=...)."
             )
         for name, value in (("q", q), ("p", p)):
             if not is_traced(value):
                 refuse_double_without_x64(name, getattr(value, "dtype", np.float32))
         q, p = jnp.asarray(q), jnp.asarray(p)
         if q.shape != p.shape:
-            raise ValueError(f"q and p must have one shape, got {q.shape} and {p.shape}.")
+            raise ValueError(f"q and p must have the same shape, got {q.shape} and {p.shape}.")
         dtype = jnp.result_type(q.dtype, p.dtype, float)
         epsilon = jnp.asarray(0.0 if self.epsilon is None else self.epsilon, dtype)
         t, q, p = jnp.asarray(t, dtype), q.astype(dtype), p.astype(dtype)

@@ -50,7 +50,8 @@ def with_keywords_of(source: Callable[..., Any], names: str = "", **more: Any) -
             given = {**defaults, **given}
             if missing := [name for name, value in given.items() if value is empty]:
                 raise TypeError(
-                    f"{function.__name__}() missing the required keyword argument {missing[0]!r}"
+                    f"{function.__name__} requires the keyword argument {missing[0]}=..., which "
+                    "is missing."
                 )
             return function(*args, **given)
 

@@ -52,13 +52,17 @@ class Given(Lattice):
     def prepare(self, t0, h, num_steps):
         available = self.ts.shape[0] - 1
         if h is not None:
-            raise ValueError("h must be left out with the lattice Given(ts): ts sets the steps.")
+            raise ValueError(
+                f"leave h out with lattice=dvi.Given(ts): ts determines the steps, got h={h!r}."
+            )
         if not is_traced(t0) and not is_traced(self.ts) and t0 != 0.0 and t0 != self.ts[0]:
-            raise ValueError(f"t0={t0} contradicts Given(ts), which starts at {self.ts[0]}.")
+            raise ValueError(
+                f"t0={t0} contradicts Given(ts) with ts[0]={self.ts[0]}: leave t0 out."
+            )
         if num_steps is not None and check_num_steps(num_steps) != available:
             raise ValueError(
                 f"num_steps={num_steps} contradicts Given(ts), whose {available + 1} times make "
-                f"{available} steps. Leave num_steps out, or cut ts."
+                f"{available} steps. Leave num_steps out, or shorten ts."
             )
         return self.ts[0], 1.0, available  # any h: the steps do not depend on it
 

@@ -149,13 +149,14 @@ class Extended(eqx.Module):
             return Running(self.seen(observable.reduction))
         if isinstance(observable, Trend):
             raise ValueError(
-                "a Trend over a TimeTransformed lattice would be a slope in its fictitious time: "
-                "observe the function alone and fit a line to it over solution.ts."
+                "observe has a Trend, which on a TimeTransformed lattice would be the slope in its "
+                "fictitious time: observe the function itself and fit a line to its values over "
+                "solution.ts."
             )
         if isinstance(observable, Deviations):
             raise ValueError(
-                f"{type(observable).__name__} needs steps whose size does not depend on the state, "
-                "and those of a TimeTransformed lattice do: take lattice=dvi.Uniform() or "
+                f"{type(observable).__name__} requires steps whose size does not depend on the "
+                "state, but those of a TimeTransformed lattice do: use lattice=dvi.Uniform() or "
                 "dvi.Given(ts)."
             )
         if isinstance(observable, Section):
@@ -230,6 +231,6 @@ def _check_speed(speed, t0, q0, p0, args) -> None:
     value = jnp.asarray(speed(t0, q0, p0, args))
     if value.shape != () or (not is_traced(value) and not float(value) > 0):
         raise ValueError(
-            "the speed of TimeTransformed must be a positive scalar; at the start it is "
+            "the speed of TimeTransformed must be a positive scalar; at t0, q0, p0 it is "
             f"{value if value.shape == () else f'an array of shape {value.shape}'}."
         )

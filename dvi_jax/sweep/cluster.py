@@ -82,8 +82,7 @@ def run_on(
                 if lost[number] >= _ATTEMPTS:
                     raise ClusterError(
                         f"task {number} was lost {_ATTEMPTS} times with its worker, so that it "
-                        "seems to be the cause (memory?): use a smaller lanes_per_task. "
-                        f"({error})"
+                        f"seems to be the cause (memory?): use a smaller lanes_per_task. ({error})"
                     ) from error
                 again.append(number)
             except CancelledError as error:

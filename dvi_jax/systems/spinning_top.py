@@ -145,7 +145,8 @@ def exact(t, q0, p0, args):
 def _leans(q, p, args):
     if not 0 < q[1] < np.pi:
         raise ValueError(
-            f"θ must lie between 0 and π, got {q[1]}: Euler's angles are singular on the vertical."
+            "θ = q0[1] must lie between 0 and π (excluded, Euler's angles are singular there), got "
+            f"{q[1]}."
         )
 
 
