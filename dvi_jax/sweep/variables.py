@@ -75,7 +75,7 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
             dims.insert(0, first[name])
         dtype = np.dtype(x.dtype)
         if dtype.kind not in "iufbc":
-            raise TypeError(f"the observable {name!r} has dtype {dtype}: it must be a number.")
+            raise TypeError(f"the observable {name!r} must return numbers, got dtype {dtype}.")
         found[name] = Variable("int8" if dtype.kind == "b" else dtype.name, x.shape, tuple(dims))
     return found
 

@@ -45,7 +45,7 @@ class Expressions:
         except InputError:
             raise
         except SyntaxError:
-            raise self.error(f"{text!r}: the syntax is not that of a call") from None
+            raise self.error(f"{text!r} is not a valid expression") from None
         except (ValueError, TypeError, RecursionError, MemoryError) as error:
             raise self.error(f"{text!r}: {error}") from None
         return self.checked(made, text)
@@ -84,7 +84,7 @@ class Expressions:
                     raise self.error(seen) from None
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=keywords):
                 return self._called(name, arguments, keywords)
-        raise ValueError(f"{ast.unparse(node)!r} is not one of these, a number or a list of them")
+        raise ValueError(f"{ast.unparse(node)!r} is not one of these, a number or a list")
 
     def _called(self, name: str, arguments: list[Any], keywords: list[ast.keyword]) -> Any:
         if name not in self.known:

@@ -91,7 +91,7 @@ def _check_folder(folder: Path, key: str, resume: bool) -> None:
             return
         result = dvi.open_sweep(folder)
     except (dvi.StoreError, OSError) as error:
-        seen = f"{folder} exists, and is not the store of a sweep ({error})"
+        seen = f"{folder} exists, but is not the store of a sweep ({error})"
         raise InputError(key, seen, "a new directory") from None
     except ValueError as error:  # a name that no directory can have
         raise InputError(key, f"{folder}: {error}", "a new directory") from None
