@@ -129,9 +129,7 @@ class FixedPoint(Arithmetic):
         quantum = self.quantum
         is_number = isinstance(quantum, int | float) and not isinstance(quantum, bool)
         if not is_number or not 0 < quantum < math.inf:
-            raise ValueError(
-                f"quantum must be a positive power of two such as 2.0**-40, got {quantum!r}."
-            )
+            raise ValueError(f"quantum must be a power of two such as 2.0**-40, got {quantum!r}.")
         # A power of two: multiplication by it and by its reciprocal is exact, and so are sums.
         mantissa, exponent = math.frexp(quantum)
         if mantissa != 0.5:

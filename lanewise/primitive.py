@@ -126,9 +126,7 @@ def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Call
     if not callable(function):
         raise TypeError(f"batched requires a function of one trajectory, got {function!r}.")
     if not isinstance(layout, Layout):
-        raise TypeError(
-            f"layout must be a lanewise.Layout, got {layout!r}: write Layout(form=...)."
-        )
+        raise TypeError(f"layout must be a lanewise.Layout(form=...), got {layout!r}.")
     one = functools.partial(call, function, layout=layout)
     return jax.vmap(one, in_axes)
 

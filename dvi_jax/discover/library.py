@@ -63,9 +63,7 @@ def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
     if a.shape != ():
         raise ValueError(f"the weight of t must be a number, got an array of shape {a.shape}.")
     if not (a.any() or b.any() or c.any()):
-        raise ValueError(
-            "all weights t, q, p of the scaling are 0: give at least one other number."
-        )
+        raise ValueError("all weights t, q, p of the scaling are 0: give one that is not.")
     weights = enumerate((a, b, c))
     return Generator(*(eqx.Partial(_scaled, i, w) if w.any() else None for i, w in weights))
 

@@ -93,9 +93,7 @@ class ShadowHamiltonian(eqx.Module):
         if self.h is None or is_traced(self.h):
             return
         if np.shape(self.h) != () or not np.isfinite(self.h) or self.h == 0:
-            raise ValueError(
-                f"h must be one finite step size other than zero, or None, got {self.h!r}."
-            )
+            raise ValueError(f"h must be a finite number other than zero, or None, got {self.h!r}.")
 
     def bind(self, system: System, epsilon: Any) -> "ShadowHamiltonian":
         """The same Hamiltonian for this system and ε, unless they were given before."""

@@ -108,9 +108,7 @@ def actions(
             f"of shape (n, N), or a Solution; got a real signal of shape {signal.shape}."
         )
     if is_traced(signal) or is_traced(ts):
-        raise ValueError(
-            "call actions outside of jit, vmap and grad, with the whole batch at once."
-        )
+        raise ValueError("call actions outside of jit, vmap and grad, with the whole batch.")
     # One axis for all degrees of freedom of a trajectory.
     lead, N = signal.shape[: signal.ndim - 1 - axes], signal.shape[-1]
     signal = signal.reshape(*lead, math.prod(signal.shape[len(lead) : -1]), N)

@@ -341,9 +341,7 @@ def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
         if np.ndim(x) == 0:
             return as_parameter(x)
         if np.ndim(x) != 1:
-            raise ValueError(
-                f"{name} must be a number or a one-dimensional array, got shape {np.shape(x)}."
-            )
+            raise ValueError(f"{name} must be a number or a 1-D array, got shape {np.shape(x)}.")
         if not is_traced(x) and not np.isfinite(x).all():
             raise ValueError(f"{name} must be finite, got {x}.")
         found[name] = len(x)

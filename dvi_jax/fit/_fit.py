@@ -133,7 +133,7 @@ def fit(
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError(
             "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and an "
-            "optimiser for least squares: leave optimiser out."
+            "optimiser such as optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10)."
         )
     wanted = _horizons(horizons)
     u = problem.space.to_u(problem.start)

@@ -217,9 +217,7 @@ def _check_input(
     for name, given in (("params", params), ("bounds", bounds), ("priors", priors)):
         instance(name, {} if given is None else given, Mapping, "a dict or None")
         if given is not None and KEY in given:
-            raise ValueError(
-                f"{name} must not have {KEY!r}: they belong to the library and start at 0."
-            )
+            raise ValueError(f"{name} must not have {KEY!r}: library adds them, starting at 0.")
     if penalty is not None:
         positive("penalty", penalty)
 
@@ -272,7 +270,7 @@ def _extended(
     if alone and is_perturbed:
         raise ValueError(
             "the model has a known perturbation, but epsilon = 0 would remove it and the library: "
-            "let the model return epsilon, or fit it as a parameter."
+            "let the model return another epsilon, or fit it as a parameter."
         )
     return _Extended(model, library, many, alone)
 

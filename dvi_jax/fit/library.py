@@ -163,9 +163,7 @@ class ForceLibrary(eqx.Module):
         names = tuple(names)
         for name in names:
             if name not in self.names:
-                raise ValueError(
-                    f"there is no candidate {name!r}; the names are {', '.join(self.names)}."
-                )
+                raise ValueError(f"unknown candidate {name!r}; known are {', '.join(self.names)}.")
         return names
 
     def _candidates(self) -> dict[str, Callable[..., Any]]:

@@ -103,9 +103,7 @@ class Model(eqx.Module):
             found[name] = {**old, **value} if both else value
         for name in ("q0", "p0"):
             if found[name] is None:
-                raise TypeError(
-                    f"{name} is missing: give dvi.Model(..., {name}=...) or fit {name}."
-                )
+                raise TypeError(f"{name} is missing: give dvi.Model(..., {name}=...), or fit it.")
             if arc is not None:
                 found[name] = _row(name, found[name], arc)
         return {**self.rest, **found}
@@ -116,8 +114,7 @@ class Model(eqx.Module):
             shape = np.shape(params.get(name, self.fixed[name]))
             if shape[0] != arcs:
                 raise ValueError(
-                    f"{name} has shape {shape}, but data is a list of {arcs} arcs: give {name} one "
-                    "row for each arc."
+                    f"{name} needs one row for each of {arcs} arcs, got shape {shape}."
                 )
 
 
@@ -131,9 +128,7 @@ def _row(name: str, rows: Any, arc: Any) -> Array:
     rows = jnp.asarray(rows)
     # JAX takes the last row for a number that is too large, without an error.
     if rows.ndim == 0 or (not is_traced(arc) and arc >= len(rows)):
-        raise ValueError(
-            f"{name} has shape {rows.shape}, but data is a list of arcs: give one row for each."
-        )
+        raise ValueError(f"{name} needs one row for each arc in data, got shape {rows.shape}.")
     return rows[arc]
 
 

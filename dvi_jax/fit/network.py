@@ -79,9 +79,7 @@ class NetworkForce(eqx.Module):
         initial: float = 0.3,
     ):
         if not (conservative or dissipative):
-            raise ValueError(
-                "conservative and dissipative are both False: set at least one to True."
-            )
+            raise ValueError("conservative and dissipative are both False: set one to True.")
         self.n = whole("n", n)
         self.damping_of = one_of("damping_of", damping_of, ("q", "qp"))
         self.scale_q, self.scale_p = positive("scale_q", scale_q), positive("scale_p", scale_p)

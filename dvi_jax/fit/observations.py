@@ -77,9 +77,7 @@ class Observations:
             )
         _check_times(ts)
         if where := _first(np.isinf(values)):
-            raise ValueError(
-                f"values is infinite at index {where}. A missing component is given as NaN."
-            )
+            raise ValueError(f"values is infinite at index {where}: give NaN for a missing value.")
         if np.isnan(values).all():
             raise ValueError("all values are NaN, which means missing: give at least one number.")
         refuse_unit_or_mask("t0", self.t0)

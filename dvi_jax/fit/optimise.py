@@ -355,8 +355,8 @@ def _check_same(now: Any, then: Any) -> None:
     """Refuse a checkpoint whose residuals are not those of this model."""
     if not np.allclose(now, then, rtol=1e-6, atol=1e-6 * float(np.abs(then).max(initial=0.0))):
         raise ValueError(
-            "the checkpoint was written by a fit of another model, which predicts other values at "
-            "the same parameters. Give another file, or remove it to start again."
+            "the checkpoint is of another model, which predicts other values at the same "
+            "parameters. Give another file, or remove it to start again."
         )
 
 

@@ -177,10 +177,7 @@ def make_space(
         name, shape = _name(path), np.shape(leaf)
         refuse_unit_or_mask(f"the parameter {name}", leaf)
         if np.iscomplexobj(leaf):
-            raise TypeError(
-                f"the parameter {name} is complex: give its real and imaginary parts as two real "
-                "ones."
-            )
+            raise TypeError(f"the parameter {name} is complex: give its real and imaginary parts.")
         places[name] = len(names) + np.arange(math.prod(shape)).reshape(shape)
         each = np.ndindex(shape)
         names += [f"{name}[{', '.join(map(str, i))}]" for i in each] if shape else [name]

@@ -54,7 +54,9 @@ class Run:
         if self.checkpoint is not None:
             file = Path(self.checkpoint)
             if not file.parent.is_dir():
-                raise FileNotFoundError(f"create the directory of the checkpoint {file} first.")
+                raise FileNotFoundError(
+                    f"there is no directory for the checkpoint {file}: create it first."
+                )
             if file.is_dir():
                 raise IsADirectoryError(f"checkpoint must be a file, but {file} is a directory.")
             if file.exists():

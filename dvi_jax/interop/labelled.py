@@ -176,9 +176,7 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
 
 def _check_free(kind: str, name: str, is_taken: bool) -> None:
     if is_taken:
-        raise ValueError(
-            f"the name of the {kind} {name!r} is already in use: give it another name."
-        )
+        raise ValueError(f"the name of the {kind} {name!r} is already in use: choose another.")
 
 
 def _components(

@@ -128,9 +128,7 @@ def from_rebound(
             ) from None
         simulation.synchronize()  # a snapshot may have been taken between half steps
     elif snapshot != -1:
-        raise ValueError(
-            f"snapshot={snapshot} is for the path of a file; with a simulation leave it out."
-        )
+        raise ValueError(f"snapshot={snapshot} is for files only: leave it out with a simulation.")
     called = "a rebound.Simulation (of an archive one snapshot, archive[i]), or the path of a file"
     expect("simulation", simulation, rebound.Simulation, called)
     _check_convertible(simulation)
@@ -272,7 +270,7 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
     heavy = np.flatnonzero(masses[active:]) + active
     if heavy.size and (sim.testparticle_type == 0 or len(masses) - active > 1):
         raise ValueError(
-            f"N_active = {active} but body {heavy[0]} after it has the mass {masses[heavy[0]]:g}: "
+            f"N_active = {active}, but body {heavy[0]} after it has the mass {masses[heavy[0]]:g}: "
             "REBOUND leaves out some of the attraction between such test particles, so that there "
             "is no Hamiltonian. Give them mass 0, or set sim.N_active to all bodies."
         )

@@ -103,7 +103,7 @@ def solve_ivp(
     """
     for name in unsupported:
         reason = _REJECTED.get(name, "it is unknown, also in SciPy's solve_ivp, or it is too new")
-        raise TypeError(f"interop.solve_ivp has no argument {name!r}: {reason}. Leave it out.")
+        raise TypeError(f"interop.solve_ivp has no argument {name!r}: {reason}.")
     for name, given in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
         refuse_unit_or_mask(name, given)
     bunch = needed("scipy.optimize", "interop.solve_ivp").OptimizeResult
@@ -204,7 +204,7 @@ def _span(t_span: Any, h: Any) -> tuple[float, float, int]:
         raise ValueError(f"t_span must be two finite times (t0, t1) that differ, got {t_span!r}.")
     step = float(h) if np.ndim(h) == 0 and np.asarray(h).dtype.kind in "iuf" else math.nan
     if not (math.isfinite(step) and step > 0):
-        raise ValueError(f"h must be positive and finite (the sign follows from t_span), got {h}.")
+        raise ValueError(f"h must be positive and finite (t_span gives the direction), got {h}.")
     # 1/0.1 is 10 steps, not 11.
     return t0, t1, max(1, math.ceil(abs(t1 - t0) / step * (1 - 1e-12)))
 

@@ -297,9 +297,7 @@ def _unit(u: Any, name: str, what: Any) -> Any:
     try:
         return u.Unit(what)
     except (ValueError, TypeError) as error:
-        raise ValueError(
-            f"the unit of {name}, {what!r}, is not known to astropy: {error}"
-        ) from None
+        raise ValueError(f"the unit of {name}, {what!r}, is unknown to astropy: {error}") from None
 
 
 def _read(u: Any, text: str) -> Any:

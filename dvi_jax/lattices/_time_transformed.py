@@ -149,15 +149,13 @@ class Extended(eqx.Module):
             return Running(self.seen(observable.reduction))
         if isinstance(observable, Trend):
             raise ValueError(
-                "observe has a Trend, which on a TimeTransformed lattice would be the slope in its "
-                "fictitious time: observe the function itself and fit a line to its values over "
-                "solution.ts."
+                "observe has a Trend, which would be a slope in the fictitious time of "
+                "TimeTransformed: observe the function itself and fit a line over solution.ts."
             )
         if isinstance(observable, Deviations):
             raise ValueError(
                 f"{type(observable).__name__} requires steps whose size does not depend on the "
-                "state, but those of a TimeTransformed lattice do: use lattice=dvi.Uniform() or "
-                "dvi.Given(ts)."
+                "state, unlike those of TimeTransformed: use dvi.Uniform() or dvi.Given(ts)."
             )
         if isinstance(observable, Section):
             return eqx.tree_at(lambda s: s.g, observable, _SeenPoint(observable.g, self))

@@ -86,6 +86,5 @@ def check_invertible(name: str, method: Any) -> None:
     instance(name, method, Method, "a method such as dvi.TypeII()")
     if not method.is_invertible:
         raise ValueError(
-            f"{method!r} has no inverse step, so it has no adjoint: use a variational method such "
-            "as dvi.TypeII()."
+            f"{method!r} has no inverse step and no adjoint: use a variational one, dvi.TypeII()."
         )

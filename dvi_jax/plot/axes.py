@@ -36,8 +36,8 @@ def canvas(ax: Any, size: Any = None, space: bool = False) -> tuple[Any, bool]:
     instance("ax", ax, Axes, "the matplotlib Axes to draw on")
     if space != (ax.name == "3d"):
         raise ValueError(
-            f'ax has the projection "{ax.name}": an orbit in space needs projection="3d" in '
-            "figure.add_subplot, one in the plane (such as coordinates=(0, 1)) no projection."
+            f'ax has the projection "{ax.name}": make it with figure.add_subplot(projection="3d") '
+            "for an orbit in space, without projection for one in a plane, coordinates=(0, 1)."
         )
     return ax, False
 
@@ -88,7 +88,9 @@ def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[
         return [""] * count
     found = [labels] if isinstance(labels, str) else labels
     if len(found) != count or isinstance(labels, str):
-        raise ValueError(f"{name} must be a list of {count} names, one for each of the {what}.")
+        raise ValueError(
+            f"{name} must be a list of names, one for each of {count} {what}, got {labels!r}."
+        )
     return [str(label) for label in found]
 
 

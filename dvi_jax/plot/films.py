@@ -131,7 +131,9 @@ def _check_film(path: Path, suffix: str, seconds: Any, fps: Any, tail: Any, besi
     if not 0 <= tail <= 1:
         raise ValueError(f"tail must be a fraction from 0 to 1, got {tail!r}.")
     if suffix == ".gif" and fps > _FASTEST_GIF:
-        raise ValueError(f"fps of a GIF must be at most {_FASTEST_GIF}, got {fps:g}: use .mp4.")
+        raise ValueError(
+            f"fps of a GIF must be at most {_FASTEST_GIF}, got {fps:g} (an .mp4 can have more)."
+        )
     if suffix == ".mp4" and not writers.is_available("ffmpeg"):
         raise RuntimeError(
             "an .mp4 requires ffmpeg, which was not found: install it (apt, brew or conda install "

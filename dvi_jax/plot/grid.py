@@ -201,9 +201,7 @@ def arrange(
     for role, name in roles.items():
         dim = None if name is None else dim_of(data, name)
         if dim in taken:
-            raise ValueError(
-                f"{role} and {taken[dim]} both have the dimension {dim!r}: change one."
-            )
+            raise ValueError(f"{role} and {taken[dim]} share the dimension {dim!r}: change one.")
         taken |= {} if dim is None else {dim: role}
     made = made or {}
     gone = [dim_of(data, name) for name, array in made.items() if array is None]

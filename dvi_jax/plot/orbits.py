@@ -163,10 +163,7 @@ def _level_lines(
 
     H = np.asarray(jax.jit(jax.vmap(jax.vmap(value, (0, None)), (None, 0)))(x, y))
     if H.shape != (_MESH, _MESH):
-        raise ValueError(
-            "hamiltonian(q, p) must return one number for one state; it returned shape "
-            f"{H.shape[2:]}."
-        )
+        raise ValueError(f"hamiltonian(q, p) must return one number, got shape {H.shape[2:]}.")
     axis.autoscale(False)
     if np.isfinite(H).any():
         look: dict[str, Any] = {"colors": "#a8a8a8", "linewidths": 0.7, "linestyles": "-"}

@@ -114,7 +114,9 @@ def drift_orders(
         draw.check_attributes(order, ("drifts", "epsilons"), wanted)
     slopes = [*promised] if isinstance(promised, Sequence) else [promised] * len(results)
     if len(slopes) != len(results):
-        raise ValueError(f"promised must have one order for each of {len(results)} results.")
+        raise ValueError(
+            f"promised must have {len(results)} orders, one per result, got {len(slopes)}."
+        )
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
     looks = zip(results.items(), slopes, itertools.cycle(COLOURS), itertools.cycle(MARKERS))

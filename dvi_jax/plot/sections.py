@@ -229,7 +229,7 @@ def bifurcation(
     skip = whole("skip", skip, 0)
     if log and not (parameter > 0).all():
         raise ValueError(
-            f"log=True needs positive parameters, got {parameter.min()}: leave it out."
+            f"log=True requires positive parameters, got {parameter.min()}: leave log out."
         )
     values = values[:, skip:]
     x = np.broadcast_to(parameter[:, None], values.shape)

@@ -150,9 +150,7 @@ def _read(
     else:
         lanes, times = [], np.asarray(getattr(orbits, "ts", orbits))
         if times.dtype.kind not in "iuf" or times.ndim == 0:
-            raise TypeError(
-                f"orbits must be a Solution, or times of shape (S,) with values, got {orbits!r}."
-            )
+            raise TypeError(f"orbits must be a Solution, or times with values=..., got {orbits!r}.")
         ts = list(times.reshape(-1, times.shape[-1]))
         names = labels_of(labels, len(ts), "orbits")
     watched: dict[str, list[np.ndarray]] = {}
@@ -166,9 +164,7 @@ def _read(
     for name, v in (values or {}).items():
         if callable(v):
             if any(lane.ps is None for lane in lanes) or not lanes:
-                raise TypeError(
-                    f"{name!r} is a function (q, p): orbits must be a Solution or (ts, qs, ps)."
-                )
+                raise TypeError(f"the function {name!r} needs a Solution or (ts, qs, ps).")
             watched[name] = [each_state(v, lane.qs, lane.ps) for lane in lanes]
         elif not isinstance(orbits, list):
             watched[name] = _rows(name, {name: v}, orbits)
@@ -177,9 +173,7 @@ def _read(
         else:
             raise ValueError(f"{name!r} must be a list of {len(lanes)} arrays, one for each orbit.")
     if not watched:
-        raise ValueError(
-            "there is nothing to draw: no observable has a value for each saved state."
-        )
+        raise ValueError("nothing to draw: no observable has a value for each saved state.")
     return ts, names, lanes, watched
 
 

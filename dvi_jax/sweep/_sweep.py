@@ -126,9 +126,7 @@ def sweep(
     if threads is not None:
         whole("threads", threads)
         if client is not None:
-            raise ValueError(
-                "threads is for this process, not for workers: leave it out with client."
-            )
+            raise ValueError("threads has no effect on workers: leave it out with client.")
     config = description(made, program.plan, found, programs)
     if store is None:
         needed = program.plan.lanes * sum(v.bytes for v in found.values())
@@ -136,7 +134,7 @@ def sweep(
         if needed > _SHARE * there:
             raise ValueError(
                 f"the results need {needed / 2**30:.1f} GiB of memory, but this machine has only "
-                f"{there / 2**30:.1f} GiB: give a directory, store=..., so that only one task at a "
+                f"{there / 2**30:.1f} GiB: give store=..., a directory, so that only one task at a "
                 "time is in memory."
             )
         sink = Memory(program.plan, found)
@@ -260,9 +258,7 @@ def _states(q0: Any, p0: Any, start: Any) -> dict[str, Any]:
             return {}
     elif q0 is not None and p0 is not None:
         return {"q0": q0, "p0": p0}
-    raise ValueError(
-        "give both q0 and p0, or start=dvi.starts.Random(...) or another of dvi.starts."
-    )
+    raise ValueError("give both q0 and p0, or start=..., such as dvi.starts.Random(...).")
 
 
 def _check_dims(dims: Mapping[str, int]) -> None:
@@ -286,8 +282,7 @@ def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) ->
     if isinstance(lattice, Given):
         if num_steps is not None or any(is_axis(inputs[name]) for name in ("h", "t0")):
             raise ValueError(
-                "leave out num_steps, and do not use h or t0 as axes: dvi.Given(ts) determines "
-                "them all."
+                "leave out num_steps, and the axes h and t0: dvi.Given(ts) determines all of them."
             )
     elif num_steps is None:
         raise ValueError("num_steps is missing: give the number of steps of each trajectory.")

@@ -128,7 +128,6 @@ def lengths(axes: Sequence[tuple[str, int, str]]) -> dict[str, int]:
         if known != length:
             raise ValueError(
                 f"the axis {name!r} has {known} values in {first}, but {length} in {where}: axes "
-                "of the same name vary together and must have the same length; for a grid give "
-                "them different names."
+                "of the same name vary together and need equal lengths; for a grid rename one."
             )
     return {name: length for name, (length, _) in dims.items()}

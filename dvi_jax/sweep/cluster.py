@@ -160,7 +160,7 @@ def _task(pickled: bytes, number: int) -> tuple[Any, dict[str, int]]:
             return results, facts["statuses"]
         store = Store.open(path)
         if store.sha != sha:
-            raise StoreError(f"{path} must be the same directory on all machines, but is not.")
+            raise StoreError(f"{path} must be the directory of this sweep on every worker.")
         known = store.record(number)
         if known is None:
             results, known = compute(program, task, device)

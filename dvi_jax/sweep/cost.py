@@ -75,10 +75,11 @@ class SweepCost:
     def __str__(self) -> str:
         grid = " × ".join(f"{name} {n}" for name, n in self.dims.items())
         return (
-            f"{grid or 'trajectories'}: {self.lanes:.6g} trajectories, {self.steps:.3g} "
-            f"steps\n{self.tasks} tasks of {self.lanes_per_task} trajectories, "
-            f"{span(self.seconds_per_task)} each\n{size(self.bytes)} of results in {self.files} "
-            f"files\n{self.seconds_per_step * 1e9:.3g} ns a step; compilation "
+            f"{grid or 'trajectories'}: {self.lanes:.6g} trajectories, {self.steps:.3g} steps\n"
+            f"{self.tasks} tasks of {self.lanes_per_task} trajectories, "
+            f"{span(self.seconds_per_task)} each\n"
+            f"{size(self.bytes)} of results in {self.files} files\n"
+            f"{self.seconds_per_step * 1e9:.3g} ns a step; compilation "
             f"{span(self.compilation)}; in all {span(self.seconds())} on {self.cores} cores"
         )
 

@@ -21,9 +21,7 @@ def _whole_or_not(path: Any, force: bool, package: str) -> Iterator[Path]:
     try:
         __import__(package)
     except ImportError:
-        raise ImportError(
-            f"the export requires {package}: pip install 'dvi-jax[export]'."
-        ) from None
+        raise ImportError(f"export requires {package}: pip install 'dvi-jax[export]'.") from None
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         yield temporary

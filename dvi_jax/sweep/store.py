@@ -191,8 +191,7 @@ class Store:
         except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
                 f"{self.shard_path(name, number)} is damaged ({error}). Call "
-                "dvi.open_sweep(path).verify(); then the same call of dvi.sweep computes its task "
-                "again."
+                "dvi.open_sweep(path).verify(); then the same call of dvi.sweep repeats its task."
             ) from error
 
     def coordinates(self) -> dict[str, Any]:

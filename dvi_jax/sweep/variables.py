@@ -58,8 +58,7 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
             raise ValueError(f"the observable {name!r} cannot have this name: {ARRAY_NAMES}.")
         if name in taken or name.split(".")[0] in RESERVED:
             raise ValueError(
-                f"the observable {name!r} has a name that is reserved ({', '.join(taken)}): rename "
-                "it."
+                f"the observable {name!r} has a reserved name ({', '.join(taken)}): rename it."
             )
     # Observables that are not reduced have a row for each step that ends at a save point: one less
     # than states, except for `Save(ts=...)`.

@@ -142,7 +142,7 @@ class Start:
             point: Any = at(args) if callable(at) else at
             if (q == point).all():
                 raise ValueError(
-                    f"q0 is at {what}, {list(point)}, where the system is singular: move q0."
+                    f"q0 must not be at {what}, {list(point)}, where the system is singular."
                 )
         if self.also is not None:
             self.also(q, p, args)
@@ -201,7 +201,9 @@ def between(low: float, high: float) -> Check:
 
     def check(name: str, value: Any) -> None:
         if not low < finite(name, value) < high:
-            raise ValueError(f"{name} must be between {low} and {high} (excluded), got {value}.")
+            raise ValueError(
+                f"{name} must be between {low} and {high} (both excluded), got {value}."
+            )
 
     return check
 

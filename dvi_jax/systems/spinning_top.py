@@ -145,8 +145,8 @@ def exact(t, q0, p0, args):
 def _leans(q, p, args):
     if not 0 < q[1] < np.pi:
         raise ValueError(
-            "θ = q0[1] must lie between 0 and π (excluded, Euler's angles are singular there), got "
-            f"{q[1]}."
+            f"θ = q0[1] must lie between 0 and π (both excluded, since Euler's angles are singular "
+            f"there), got {q[1]}."
         )
 
 

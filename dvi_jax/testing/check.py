@@ -166,7 +166,5 @@ def chosen(kind: str, names: Any, known: Iterable[str], hint: str = "") -> list[
         if name not in known:
             near = difflib.get_close_matches(str(name).lower(), lowered, n=1)
             meant = f" (did you mean {lowered[near[0]]}?)" if near else ""
-            raise ValueError(
-                f"there is no {kind} {name!r}{meant}; known are {', '.join(known)}.{hint}"
-            )
+            raise ValueError(f"unknown {kind} {name!r}{meant}; known are {', '.join(known)}.{hint}")
     return names

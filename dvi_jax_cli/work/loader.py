@@ -29,7 +29,7 @@ class Loader:
         """
         file, _, name = text.rpartition(":")
         leaves = os.path.isabs(file) or ".." in Path(file).parts
-        require(not leaves, key, f"{shown(text)} leaves the folder of the TOML file", _ALLOWED)
+        require(not leaves, key, f"{shown(text)} is not in the folder of the TOML file", _ALLOWED)
         try:
             path = (self.folder / file).resolve()
             is_file = path.is_file()
