@@ -291,7 +291,7 @@ def test_unknown_keywords_are_rejected_with_those_that_there_are():
         (plot.animate, (arrays(), "a.gif"), "colour", "labels, units, title"),
         (plot.sweep_map, (xr.DataArray(t),), "facets", "facet, over, pixels"),
     ):
-        match = f"unknown keyword '{wrong}': there are {known}"
+        match = f"unknown keyword '{wrong}'; allowed are {known}"
         refuses(draw, (args, {wrong: 1}, match, TypeError))
 
 
@@ -429,7 +429,7 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         ((two,), {"dof": "q"}, "has no component 'q'"),
         ((two,), {"dof": []}, "dof is empty"),
         ((two,), {"labels": ["a", "b"]}, r"one for each of 1 orbits, got \['a', 'b'\]"),
-        ((two,), {"labels": "ab"}, "1 names for 1 orbits"),
+        ((two,), {"labels": "ab"}, "one for each of 1 orbits, got 'ab'"),
         ((bodies,), {"dof": 0}, "a tuple of 2 numbers"),
         ((two,), {"period": 0}, "period must be a positive"),
         ((arrays(3),), {"colour": [1, 2]}, "2 values for 3 orbits"),
@@ -445,7 +445,7 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         ((two,), {"centre": [1.0]}, r"shape \(2,\)"),
         ((two,), {"colour": [1.0]}, "one orbit"),
         ((bodies,), {"bodies": [3]}, "from 0 to 2"),
-        ((bodies,), {"names": ["A"]}, "1 names for 3 bodies"),
+        ((bodies,), {"names": ["A"]}, "one for each of 3 bodies"),
         ((arrays(2, n=2),), {"names": ["A", "B"]}, r"2 orbits.*labels="),
     )
 

@@ -204,7 +204,7 @@ def orbit(
     lanes = lanes_of(orbits, look.labels, momenta=False)
     view = view_of(lanes, coordinates, bodies, centre, names)
     if look.colour is not None and len(lanes) == 1:
-        raise ValueError("colour is for several orbits, but there is only one: leave it out.")
+        raise ValueError("colour requires several orbits, but there is one orbit: leave it out.")
     looks = looks_of(len(lanes) if len(lanes) > 1 else len(view.bodies), look.colour)
     axis, new = canvas(look.ax, (5.4, 5.0), len(view.coordinates) == 3)
     for i, k, number, name in view.lines(lanes):
