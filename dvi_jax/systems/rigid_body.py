@@ -122,7 +122,9 @@ def exact(t, q0, p0, args):
 def _possible(q, p, args):
     moments = [args["I1"], args["I2"], args["I3"]]
     if 2 * max(moments) > sum(moments):
-        raise ValueError(f"each of I1, I2, I3 must be ≤ the sum of the others, got {moments}.")
+        raise ValueError(
+            f"each of I1, I2, I3 must be at most the sum of the others, got {moments}."
+        )
     L, G, K = p
     if not (abs(L) < G and abs(K) <= G):
         raise ValueError(
