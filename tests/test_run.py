@@ -213,8 +213,8 @@ REJECTED = [
     ('system = "broken.py:system"', "not_there_at_all' (broken.py, line 2)", "can import"),
     ('system = "syntax.py:system"', "SyntaxError", "can import"),
     ('system = "leaves.py:system"', "SystemExit", "can import"),
-    (SPRING, "state.q0: the key is missing", "this system has none"),
-    (SPRING + STATE, "h: the key is missing", "none of its own"),
+    (SPRING, "state.q0: the key is missing", "the system has no default"),
+    (SPRING + STATE, "h: the key is missing", "the system has no default"),
     (SPRING + "h = 0.1\n" + STATE, "(own.py, line 7)", "state and args that fit"),
     ('system = "own.py:forced"\n' + FULL, "epsilon: the key is missing", "a force"),
     (

@@ -133,7 +133,8 @@ def fit(
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError(
             "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and an "
-            "optimiser such as optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10)."
+            "optimiser such as optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10), got "
+            f"{type(problem.loss).__name__} and {type(solver).__name__}."
         )
     wanted = _horizons(horizons)
     u = problem.space.to_u(problem.start)

@@ -270,7 +270,9 @@ def _start(given: Any, source: Source) -> dvi.starts.Starts:
     try:
         return made(**options)
     except (TypeError, ValueError) as error:
-        raise InputError("start", str(error), f"keys that fit kind = {given.kind}") from None
+        raise InputError(
+            "start", str(error), f"keys that are valid for kind = {given.kind}"
+        ) from None
 
 
 # Stores
