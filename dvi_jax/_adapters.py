@@ -147,7 +147,11 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
         raise TypeError(
             "L must be a discrete Lagrangian (t0, t1, q0, v, args) or a continuous one "
             f"(t, q, v, args), got {_described(L)}, which "
-            + ("takes four arguments and five: wrap it." if discrete else "takes neither.")
+            + (
+                "accepts both four and five arguments: wrap it in a function of four or of five."
+                if discrete
+                else "accepts neither."
+            )
         )
     return _DiscreteLegendreTransform(L, newton) if discrete else _LegendreTransform(L, newton)
 

@@ -129,9 +129,7 @@ class FixedPoint(Arithmetic):
         quantum = self.quantum
         is_number = isinstance(quantum, int | float) and not isinstance(quantum, bool)
         if not is_number or not 0 < quantum < math.inf:
-            raise ValueError(
-                f"quantum must be a positive power of two such as 2.0**-40, got {quantum!r}."
-            )
+            raise ValueError(f"quantum must be a power of two such as 2.0**-40, got {quantum!r}.")
         # A power of two: multiplication by it and by its reciprocal is exact, and so are sums.
         mantissa, exponent = math.frexp(quantum)
         if mantissa != 0.5:
@@ -143,25 +141,26 @@ class FixedPoint(Arithmetic):
     def prepare(self, method, equations, interval, q0, p0):
         if not method.is_made_of_the_map():
             raise ValueError(
-                f"FixedPoint needs a method that is made of the map (12)–(13) and its adjoint; "
-                f"{method!r} is not. Use dvi.Strang(), dvi.Yoshida(4) or another composition, "
-                "or arithmetic=dvi.Compensated(), which works with every method."
+                "arithmetic=dvi.FixedPoint(...) requires a method composed of dvi.TypeII() and its "
+                f"adjoint; {method!r} is not. Use dvi.Strang(), dvi.Yoshida(4) or another "
+                "composition, or arithmetic=dvi.Compensated(), which works with every method."
             )
         if not (
             method.needs_no_solve(equations, interval, q0)
             and method.inverse_needs_no_solve(equations, interval, q0)
         ):
             raise ValueError(
-                "FixedPoint needs steps without a solve, forwards and backwards: here p1 enters "
-                "∂H_D/∂q0 or the force, or q0 enters ∂H_D/∂p1. Use a separable H_D = T(p1) + "
-                "V(q0) with a force of q0 and t alone, or arithmetic=dvi.Compensated()."
+                "arithmetic=dvi.FixedPoint(...) requires steps that are explicit forwards and "
+                "backwards, but here ∂H_D/∂q0 or the force depends on p1, or ∂H_D/∂p1 on q0. Use a "
+                "separable H_D = T(p1) + V(q0) with a force that depends on q0 and t only, or "
+                "arithmetic=dvi.Compensated()."
             )
         # Both the quantum and its reciprocal, by which a state is multiplied, must be normal.
         smallest, largest = jnp.finfo(q0.dtype).tiny, 1 / jnp.finfo(q0.dtype).tiny
         if not smallest <= self.quantum <= largest:
             raise ValueError(
-                f"quantum = {self.quantum!r} is not a normal number of {q0.dtype}: choose one "
-                f"between {smallest:.1e} and {largest:.1e}."
+                f"quantum = {self.quantum!r} is too small or too large for {q0.dtype}: choose a "
+                f"power of two between {smallest:.1e} and {largest:.1e}."
             )
         equations = dataclasses.replace(equations, quantum=self.quantum)
         return equations, _start_on_grid(q0, self.quantum), _start_on_grid(p0, self.quantum)

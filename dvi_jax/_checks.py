@@ -102,9 +102,9 @@ def refuse_unknown(name: str, function: Callable[..., Any], unknown: Iterable[st
         # Synonyms first: by spelling alone the nearest name to dt0 would be t0.
         meant = SYNONYMS.get(keyword) if SYNONYMS.get(keyword) in known else None
         meant = meant or (close[0] if close else None)
-        hint = f" Did you mean {meant!r}?" if meant else f" It has {', '.join(known)}."
+        hint = f" Did you mean {meant!r}?" if meant else f" Its arguments are {', '.join(known)}."
         if keyword in ("rtol", "atol", "tolerance"):
-            hint = f" Steps are fixed: choose h; {keyword} has no meaning."
+            hint = " No tolerance controls the size of the steps: choose h."
         raise TypeError(f"{name} has no argument {keyword!r}.{hint}")
 
 

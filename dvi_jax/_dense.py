@@ -66,8 +66,8 @@ def requested_times(save: Save, task: Task, num_steps: int) -> tuple[RequestedTi
     all reductions."""
     if task.has_running_values:
         raise ValueError(
-            "Running gives a reduction at grid points, and Save(ts=...) requests other times: "
-            "use save=dvi.Save(every=m)."
+            "observe has a dvi.Running, whose values exist at grid points only, but "
+            "save=dvi.Save(ts=...) requests other times: use save=dvi.Save(every=m)."
         )
     # Functions that are not reductions are evaluated at the requested times, after the run.
     kept = jax.tree.map(

@@ -72,7 +72,9 @@ def publish_npz(
     path, content = Path(path), io.BytesIO()
     header = {"format": form, "holds": sorted(arrays), **about}
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"there is no directory {path.parent} to write {path.name} into.")
+        raise FileNotFoundError(
+            f"{path.name} cannot be written: there is no directory {path.parent}. Create it first."
+        )
     np.savez(content, about=np.array(json.dumps(header)), **arrays)
     try:
         publish(path, content.getvalue())
@@ -99,15 +101,15 @@ def read_npz(
         found = about["format"]
         # The directory of a zip file has no checksum: a flipped bit there can hide an array.
         if set(about.get("holds", arrays)) != set(arrays):
-            raise ValueError("it lacks an array")
+            raise ValueError("an array is missing in it")
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes
         raise ValueError(
-            f"{path} is no {what} of this package, or is damaged ({error}): restore it from a "
-            "backup, or remove it and compute it again."
+            f"{path} is not a {what} of this package, or it is damaged ({error}): restore it from "
+            "a backup, or remove it and compute it again."
         ) from None
     if found != form:
         raise ValueError(
-            f"{path} has the format {found!r}; this version reads {form}: use the version that "
-            "wrote it, or remove it and compute it again."
+            f"{path} has the format {found!r}, but this version of dvi_jax reads {form!r}: use the "
+            "version that wrote it, or remove it and compute it again."
         )
     return about, arrays

@@ -19,7 +19,7 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
     q, p = _real_array("q0", q0), _real_array("p0", p0)
     if q.shape != p.shape:
         raise ValueError(
-            f"q0 and p0 must have one shape, got q0 {q.shape} and p0 {p.shape}. Each position "
+            f"q0 and p0 must have the same shape, got q0 {q.shape} and p0 {p.shape}: each position "
             "needs its momentum."
         )
     if q.size == 0:
@@ -29,7 +29,7 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
         q, p = q.astype(dtype), p.astype(dtype)
     # Half precision has at most three digits: neither a solve nor an invariant can be checked.
     if q.dtype.itemsize < 4:
-        raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype}: too few digits.")
+        raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype} (too few digits).")
     return q, p
 
 
@@ -42,7 +42,7 @@ def as_times(of: str, ts: Any) -> Array:
     if jnp.issubdtype(ts.dtype, jnp.integer):
         ts = ts.astype(jnp.result_type(float))
     if not jnp.issubdtype(ts.dtype, jnp.floating):
-        raise TypeError(f"{of} needs real times, got dtype {ts.dtype}.")
+        raise TypeError(f"{of} requires real numbers as times, got dtype {ts.dtype}.")
     return jnp.asarray(ts)
 
 
@@ -62,7 +62,7 @@ def _real_array(name: str, value: Any) -> Array:
             "imaginary parts (a canonical pair, up to a factor)."
         )
     if not _is_real(kind):
-        raise TypeError(f"{name} must be a real array, got dtype {kind}.")
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}.")
     # A traced value that is not finite becomes the status of its trajectory.
     if isinstance(value, np.ndarray) and not np.isfinite(value).all():
         where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())

@@ -249,7 +249,7 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
     if not (is_disturbed or system.slow_time or is_traced(epsilon)) and float(epsilon) != 0:
         warnings.warn(
             f"epsilon = {float(epsilon):g} has no effect: the system has neither a force nor a "
-            "perturbation.",
+            "perturbation. Leave epsilon out, or add one in dvi.System(...).",
             stacklevel=3,
         )
     lattice, arithmetic = integrator.lattice, integrator.arithmetic
@@ -433,7 +433,7 @@ def _check_memory(
     disk = ", and dvi.sweep(store=...) writes results of many trajectories to disk" if batch else ""
     raise ValueError(
         f"the results need {count * saved * each / 2**30:.3g} GiB of memory ({saved} saved states"
-        f"{batch}), and there are {memory / 2**30:.3g} GiB. Save fewer states: "
+        f"{batch}), but only {memory / 2**30:.3g} GiB are available. Save fewer states: "
         "save=dvi.Save(every=m), dvi.Save(final=True) or dvi.Save(ts=times). A reduction such as "
         f"dvi.MaxDrift(function) observes every step in constant memory{disk}."
     )

@@ -108,7 +108,7 @@ def chosen(integrator: Integrator | None, **given: Any) -> Integrator:
     if given:
         names = ", ".join("newton" if name == "root_finder" else name for name in given)
         raise ValueError(
-            f"{names} and integrator are both given: put all in dvi.Integrator(...), or leave "
+            f"{names} and integrator are both given: set {names} in dvi.Integrator(...), or leave "
             "integrator out."
         )
     return integrator
@@ -122,7 +122,7 @@ def only(integrator: Integrator, function: str, *used: str) -> Integrator:
         value, default = getattr(integrator, name), getattr(_DEFAULT, name)
         if name not in used and not eqx.tree_equal(value, default):
             raise ValueError(
-                f"{function} does not use {name}, and integrator has {name}={value!r}: it uses "
-                f"{', '.join(used)}."
+                f"{function} does not use {name}, but integrator has {name}={value!r}: leave it "
+                f"out. {function} uses only {', '.join(used)}."
             )
     return integrator

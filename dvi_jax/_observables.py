@@ -31,8 +31,8 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
             )
         if not is_observable(leaf):
             raise TypeError(
-                f"observe must be a pytree of functions of {FORMS}, or of "
-                f"reductions such as dvi.MaxDrift(function); it holds {leaf!r}."
+                f"observe must be a function of {FORMS}, a reduction such as "
+                f"dvi.MaxDrift(function), or a dict, list or tuple of these; it holds {leaf!r}."
             )
         if isinstance(leaf, Running):
             leaf = leaf.reduction
@@ -57,8 +57,8 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
             )
         if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
             raise TypeError(
-                f"Range compares values, and complex numbers have no order; {called} returns "
-                "them. Take the real and imaginary parts, or the absolute value."
+                f"Range requires real values, since complex numbers have no order, but {called} "
+                "returns complex ones. Take real and imaginary parts, or the absolute value."
             )
         if not isinstance(leaf, Reduction):
             size += int(np.prod(np.shape(out), dtype=int)) * jnp.result_type(out).itemsize
@@ -70,8 +70,8 @@ def _check_deviations(leaf: Deviations, task: Task, q0: Array, p0: Array) -> Non
     # The derivative of a step is taken at a fixed h; the derivative of h would be missing.
     if task.lattice.has_memory:
         raise ValueError(
-            f"{name} needs steps whose size does not depend on the state, and those of "
-            f"{task.lattice!r} do: take lattice=dvi.Uniform() or dvi.Given(ts)."
+            f"{name} requires steps whose size does not depend on the state, but those of "
+            f"{task.lattice!r} do: use lattice=dvi.Uniform() or dvi.Given(ts)."
         )
     eqx.filter_eval_shape(leaf.start, jnp.zeros(2 * q0.size, q0.dtype))  # counts and units
 

@@ -13,8 +13,8 @@ def refuse_double_without_x64(name: str, dtype: Any) -> None:
     # JAX would round both without a warning, and invariants with them.
     if np.issubdtype(dtype, np.inexact) and np.finfo(dtype).eps < np.finfo(np.float64).eps:
         raise TypeError(
-            f"{name} is {np.dtype(dtype)}, and JAX has no numbers beyond double precision: use "
-            f"np.asarray({name}, np.float64), which rounds them."
+            f"{name} is {np.dtype(dtype)}, but JAX has at most double precision: use "
+            f"np.asarray({name}, np.float64), which rounds the numbers."
         )
     if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():
         raise TypeError(

@@ -66,7 +66,7 @@ class Save(eqx.Module):
             check_takes("the clock of Save", self.clock, "(t, q, p, args)")
         if self.ts is None:
             if self.clock is not None:
-                raise ValueError("a clock requires times: Save(ts=..., clock=...).")
+                raise ValueError("clock requires times as well: Save(ts=times, clock=...).")
             return
         if self.every is not None or self.final:
             raise ValueError(

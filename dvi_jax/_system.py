@@ -92,7 +92,8 @@ class System(eqx.Module):
             raise ValueError(
                 "dvi.discretise(H, order) of order 2 and higher, dvi.from_lagrangian and "
                 "dvi.from_type_iii take the step from t1 − t0, which is not the step in a slow "
-                "time: use order=1, and compose the map for a higher order."
+                "time. Use dvi.discretise(H, order=1); for a higher order use method=dvi.Strang() "
+                "or dvi.Yoshida(4)."
             )
 
     def strength(self, epsilon: Any) -> Any:

@@ -120,7 +120,7 @@ def dynamic_update_slice(
     entries = e.entries(value).copy()
     # Each element is compared with each start: the code grows with the product of the sizes.
     if value.size * update.size > MADE:
-        raise Unsupported(f"an update at a traced index of {value.size} elements")
+        raise Unsupported(f"an update of an array of {value.size} elements at a computed index")
     news = e.entries(update)
     for i in np.ndindex(value.shape):
         for k in np.ndindex(update.shape):

@@ -56,7 +56,7 @@ class Module:
         # Whole cache lines, so that no vector lies in two of them.
         self.scratch_bytes += (size * block * 8 + 63) // 64 * 64
         if self.scratch_bytes > LARGEST_SCRATCH:
-            raise Unsupported(f"{self.scratch_bytes} bytes of rows that are not results")
+            raise Unsupported(f"more than {LARGEST_SCRATCH} bytes of intermediate arrays")
         item = np.dtype(dtype).itemsize
         bases = tuple(
             self.b.new(f"getelementptr i8, ptr %scratch, i64 {start + u * self.W * item}")

@@ -133,8 +133,8 @@ def on_any(x: Array, rare: bool = True) -> Array:
     kind = jnp.asarray(x)
     if kind.dtype != bool or kind.shape != ():
         raise TypeError(
-            f"on_any takes one truth value of one trajectory, got {kind.dtype} of shape "
-            f"{kind.shape}: write jnp.any(...) around a comparison."
+            f"on_any requires one bool of one trajectory, got {kind.dtype} of shape {kind.shape}: "
+            "write jnp.any(...) around a comparison."
         )
     if not isinstance(rare, bool):
         raise TypeError(f"rare must be True or False, got {rare!r}.")

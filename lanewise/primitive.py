@@ -124,11 +124,9 @@ def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Call
     ```
     """
     if not callable(function):
-        raise TypeError(f"batched takes a function of one trajectory, got {function!r}.")
+        raise TypeError(f"batched requires a function of one trajectory, got {function!r}.")
     if not isinstance(layout, Layout):
-        raise TypeError(
-            f"layout must be a lanewise.Layout, got {layout!r}: write Layout(form=...)."
-        )
+        raise TypeError(f"layout must be a lanewise.Layout(form=...), got {layout!r}.")
     one = functools.partial(call, function, layout=layout)
     return jax.vmap(one, in_axes)
 
@@ -255,7 +253,7 @@ def kernel_of(
     # Counted before code is written, which would take minutes for the largest functions.
     count = operation_count(closed.jaxpr)
     if count > MOST_OPERATIONS:
-        raise Unsupported(f"a function of {count} operations")
+        raise Unsupported(f"a function of {count} operations (at most {MOST_OPERATIONS})")
     if vectors is None and program.layout.width is not None:
         vectors = max(program.layout.width // machine.width(), 1)
     if vectors is None:

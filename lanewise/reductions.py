@@ -70,7 +70,7 @@ def dot(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list[Val
     contracted = math.prod(a.shape[i] for i in of_a)
     # Each term is an instruction of its own: the code, and the time to compile it, grow with them.
     if out.aval.size * contracted > 8 * MADE:
-        raise Unsupported(f"a product of {out.aval.size * contracted} terms")
+        raise Unsupported(f"a product of {out.aval.size * contracted} terms (at most {8 * MADE})")
     x = _as_stack_of_matrices(e.entries(a), batch_a, of_a)
     y = _as_stack_of_matrices(e.entries(c), batch_c, of_c)
     results = []

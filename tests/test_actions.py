@@ -352,7 +352,7 @@ def of_one_line(**options):
         (lambda: of_one_line(guess="a"), ValueError, "finite.*'a'"),
         (lambda: actions(TS, np.exp(1j * TS), leftover="a"), ValueError, "finite number, got 'a"),
         (lambda: actions(TS, np.zeros((0, 256), complex), count=4), ValueError, "at least one deg"),
-        (lambda: jax.jit(lambda z: actions(TS, z))(TS + 0j), ValueError, "not under jit"),
+        (lambda: jax.jit(lambda z: actions(TS, z))(TS + 0j), ValueError, "outside of jit"),
     ],
 )
 def test_invalid_arguments(give, error, words):

@@ -226,11 +226,11 @@ def test_a_control_that_passes_is_missed(monkeypatch):
 @pytest.mark.parametrize(
     ("methods", "checks", "error", "said"),
     [
-        (["yoshida4"], None, ValueError, r"no method 'yoshida4' \(did you mean Yoshida4\?\)"),
-        (None, ["symmetry"], ValueError, "no check 'symmetry'.*known are order, forced-order"),
-        ([], None, ValueError, "no method was named"),
-        ({}, None, ValueError, "no method was given"),
-        (None, [], ValueError, "no check was named"),
+        (["yoshida4"], None, ValueError, r"unknown method 'yoshida4' \(did you mean Yoshida4\?\)"),
+        (None, ["symmetry"], ValueError, "unknown check 'symmetry'.*known are order, forced-order"),
+        ([], None, ValueError, "methods is empty: name"),
+        ({}, None, ValueError, "methods is empty: give"),
+        (None, [], ValueError, "checks is empty: name"),
         ("TypeII", None, TypeError, "must be a list of names"),
         (dvi.TypeII(), None, TypeError, "give the method a name"),
         ({"mine": dvi.TypeII}, None, TypeError, "'mine' must be a method such as"),

@@ -573,8 +573,8 @@ INVALID = [
     (lambda: dvi.MEGNO(scale=(1.0, np.nan)), ValueError, "scale of p in MEGNO .* nan"),
     (lambda: dvi.GALI(2, scale=("a", 1.0)), ValueError, "scale of q in GALI .* 'a'"),
     (lambda: dvi.SALI(scale=(1j, 1.0)), ValueError, "scale of q in SALI .* 1j"),
-    (lambda: dvi.Running(HENON.observables["energy"]), TypeError, "Running takes a reduction"),
-    (lambda: dvi.Running(dvi.Section(lambda t, q, p, a: q[0])), TypeError, "any time"),
+    (lambda: dvi.Running(HENON.observables["energy"]), TypeError, "Running requires a reduction"),
+    (lambda: dvi.Running(dvi.Section(lambda t, q, p, a: q[0])), TypeError, "value at every step"),
 ]
 
 
@@ -588,11 +588,11 @@ TRANSFORMED = {"lattice": dvi.TimeTransformed(lambda t, q, p, a: 1.0)}
 SOLVED_FOR = {"lattice": dvi.Variational(), "method": dvi.TypeII()}
 AT_TIMES = {"save": dvi.Save(ts=[0.1])}
 INVALID_RUNS = [
-    (dvi.GALI(5), {}, "5 deviation vectors, .* only 4 directions: take at most 4"),
-    (dvi.MEGNO(scale=(np.ones(3), 1.0)), {}, "scale of q .* 2 numbers, like q; got 3"),
-    (dvi.MEGNO(), TRANSFORMED, "MEGNO needs steps"),
+    (dvi.GALI(5), {}, "5 deviation vectors, .* only 4 directions: use at most 4"),
+    (dvi.MEGNO(scale=(np.ones(3), 1.0)), {}, r"scale of q .* 2 numbers .*of q\); got 3 numbers"),
+    (dvi.MEGNO(), TRANSFORMED, "MEGNO requires steps"),
     (dvi.SALI(), SOLVED_FOR, "whose size does not depend on the state"),
-    (dvi.Running(dvi.MEGNO()), AT_TIMES, r"Running .*=dvi.Save\(every=m\)"),
+    (dvi.Running(dvi.MEGNO()), AT_TIMES, r"Running.*=dvi.Save\(every=m\)"),
     (dvi.MEGNO, {}, r"holds the class MEGNO: .* dvi.MEGNO\(\)"),
     (dvi.Running, {}, r"holds the class Running: .* dvi.Running\(dvi.MEGNO\(\)\)"),
 ]
@@ -646,5 +646,5 @@ def test_a_users_reduction_has_a_reversible_gradient_by_combine():
     expected = total(SumOfSquares, dvi.Direct())
     for kind in (SumOfSquares, ByHand):
         np.testing.assert_allclose(total(kind, dvi.Reversible()), expected, rtol=1e-12)
-    with pytest.raises(NotImplementedError, match=r"Without has no gradient by dvi\.Reversible"):
+    with pytest.raises(NotImplementedError, match=r"Without cannot be diff.*dvi\.Reversible"):
         total(Without, dvi.Reversible())

@@ -136,9 +136,9 @@ def test_one_device_and_what_is_refused():
     x, c = jnp.arange(6.0).reshape(2, 3), jnp.asarray(2.0)
     doubled = dvi.over_devices(lambda x, c: c * x, in_axes=(-1, None), out_axes=1)
     np.testing.assert_array_equal(doubled(x, c), 2 * x)
-    with pytest.raises(TypeError, match="takes must be a function"):
+    with pytest.raises(TypeError, match="argument of over_devices must be a function"):
         dvi.over_devices(3)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="at least one device"):
+    with pytest.raises(ValueError, match="devices is empty: give at least one"):
         dvi.over_devices(jnp.sin, devices=[])
     with pytest.raises(ValueError, match="in_axes has 1 entries for 2"):
         dvi.over_devices(jnp.add, in_axes=[0])(x, x)

@@ -460,12 +460,12 @@ def test_pictures_show_what_was_excluded():
             assert excluded == np.sum(~surface.used & np.isfinite(surface.drifts))
             axes[0].figure.canvas.draw()
             plt.close(axes[0].figure)
-        with pytest.raises(ValueError, match="1 orders for 2 results"):
+        with pytest.raises(ValueError, match="one order for each of 2 results"):
             plot.drift_orders([usual(), usual()], [1])
         axis = plot.drift_orders(usual(), expected=1)
         assert axis.figure.legends[0].get_texts()[0].get_text().endswith(", expected 1")
         plt.close(axis.figure)
-        with pytest.raises(TypeError, match="expected and promised are one keyword"):
+        with pytest.raises(TypeError, match="expected and promised are two names of one argument"):
             plot.drift_orders(usual(), 1, expected=1)
 
 
@@ -526,7 +526,7 @@ def test_a_surface_shows_zeros_failures_and_limits():
         ({"epsilons": [0.1, 0.2, 0.1]}, "distinct"),
         ({"h": np.float64(0.0)}, "must not be zero"),
         ({"h": [0.1, 0.2]}, "h must be one number"),
-        ({"starts": (np.ones((3, 1)), np.ones((2, 1)))}, "one shape"),
+        ({"starts": (np.ones((3, 1)), np.ones((2, 1)))}, "the same shape"),
         ({"starts": (0.1, 0.1)}, "first axis of initial conditions"),
         ({"starts": (np.array([[0.1], [np.nan]]), np.ones((2, 1)))}, "not finite at index"),
         ({"observable": lambda t0, t1, q0, p0, q1, p1, args: q1}, "must be a scalar"),
@@ -557,7 +557,7 @@ def test_bad_surfaces_are_refused(change, match):
 
 def test_wrong_arguments_are_refused():
     for nothing in (3.0, None):
-        with pytest.raises(TypeError, match=r"invariant must be a function.*take one of its"):
+        with pytest.raises(TypeError, match=r"invariant must be a function.*give one of its"):
             sweep(nothing)
     with pytest.raises(TypeError, match="has no argument 'metod'"):
         sweep(metod=dvi.Strang())

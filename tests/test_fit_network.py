@@ -148,7 +148,7 @@ def test_a_network_is_fitted_by_gradients_too():
         ({"scale_q": -1.0}, ValueError, "scale_q must be"),
         ({"initial": 0.0}, ValueError, "initial must be"),
         ({"damping_of": "p"}, ValueError, "damping_of"),
-        ({"conservative": False, "dissipative": False}, ValueError, "no force is left"),
+        ({"conservative": False, "dissipative": False}, ValueError, "both False"),
         ({"activation": 3}, TypeError, "activation must be a function"),
         ({"velocity": 3}, TypeError, "velocity must be a function"),
     ],

@@ -107,7 +107,7 @@ def test_bodies_and_axes_have_names():
     [
         ({"dims": ("batch",)}, "0 dimensions"),
         ({"components": ["x"]}, r"q has the shape \(2,\)"),
-        ({"observe": {"E": ENERGY}}, "observe is not that of this solution"),
+        ({"observe": {"E": ENERGY}}, "observe must be the one given to integrate"),
         ({"observe": {"E": ENERGY, "kept": {"drift": ENERGY}}}, "kept.drift"),
     ],
     ids=lambda x: "",
@@ -120,7 +120,7 @@ def test_labels_that_do_not_fit(options, words):
 @pytest.mark.parametrize("name", ["q", "newton_iterations", "failed_step", "max_residual"])
 def test_names_in_use(name):
     observe = {name: dvi.MaxDrift(ENERGY)}
-    with pytest.raises(ValueError, match=f"{name}' has a name that is taken"):
+    with pytest.raises(ValueError, match=f"{name}' is already in use"):
         interop.to_xarray(run(observe=observe), observe=observe)
 
 

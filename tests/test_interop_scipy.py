@@ -175,18 +175,18 @@ def unit():
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [
-        ({"rtol": 1e-3}, TypeError, "rtol: .*lattice is fixed"),
+        ({"rtol": 1e-3}, TypeError, "'rtol': .*lattice is fixed"),
         ({"dense_output": True}, TypeError, "t_eval"),
         ({"vectorized": True}, TypeError, "vmap"),
         ({"jac": None}, TypeError, "autodiff"),
         ({"foo": 1}, TypeError, "foo"),
         ({"method": "RK45"}, ValueError, "KahanLi8"),
-        ({"t_eval": [0.0, 2.0]}, ValueError, "within t_span"),
-        ({"t_eval": [0.5, 0.2]}, ValueError, "order of the run"),
+        ({"t_eval": [0.0, 2.0]}, ValueError, r"\(t_span\)"),
+        ({"t_eval": [0.5, 0.2]}, ValueError, "strictly increasing"),
         ({"events": 3}, TypeError, "event"),
         ({"events": marked(lambda t, y: y[0], terminal=-1)}, ValueError, "terminal"),
-        ({"h": -0.1}, ValueError, "direction is that of t_span"),
-        ({"h": [0.1, 0.1]}, ValueError, r"a positive and finite step, got \[0.1, 0.1\]"),
+        ({"h": -0.1}, ValueError, "t_span gives the direction"),
+        ({"h": [0.1, 0.1]}, ValueError, r"positive and finite .*, got \[0.1, 0.1\]"),
         ({"t_eval": unit}, TypeError, "has the unit 'min', which would be lost"),
         ({"h": unit}, TypeError, "has the unit 'min', which would be lost"),
     ],
@@ -202,7 +202,7 @@ def test_wrong_times_and_states():
     for t_span in ((0.0, 0.0), (0.0, np.inf), 1.0):
         with pytest.raises(ValueError, match="t_span"):
             ours(t_span)
-    with pytest.raises(ValueError, match="q0 and then p0"):
+    with pytest.raises(ValueError, match="all of q0 and then all of p0"):
         interop.solve_ivp(KEPLER, (0, 1), [1.0, 2.0, 3.0], h=0.1)
     with pytest.raises(TypeError, match=r"dvi\.System"):
         interop.solve_ivp(rate, (0, 1), Y0, h=0.1)

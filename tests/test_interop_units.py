@@ -128,7 +128,7 @@ def test_angles_and_their_momenta():
 def test_a_unit_of_another_kind_is_no_base():
     with pytest.raises(ValueError, match=r"time must be a unit of time.*\(length\)"):
         interop.UnitSystem(u.m, u.m, u.kg)
-    with pytest.raises(ValueError, match="not known"):
+    with pytest.raises(ValueError, match="is unknown to astropy"):
         interop.UnitSystem(u.m, u.s, u.kg, q="longitude")
     made = interop.UnitSystem(u.m, u.s, u.kg, args={"mu": u.au**3 / u.yr**2})
     assert made.args["mu"] == u.m**3 / u.s**2
@@ -197,9 +197,9 @@ def test_a_unit_applies_to_all_parameters_below_its_name():
 
 
 def test_mistyped_names_of_parameters():
-    with pytest.raises(ValueError, match=r"units has kk, which args has not.*args has k without"):
+    with pytest.raises(ValueError, match=r"has kk, which is not in args, and args has k without"):
         weights([1, 2] * u.kg, k=5.0, kinds={"kk": u.N / u.m})
-    with pytest.raises(ValueError, match=r"'J22', and oblate_kepler has no such.*mu, R, J2"):
+    with pytest.raises(ValueError, match=r"'J22', but oblate_kepler has no such.*mu, R, J2"):
         interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args={"J22": 0.0})
     with pytest.raises(TypeError, match="mapping from name to value; got list"):
         interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args=[0.0])
@@ -218,7 +218,7 @@ def test_a_problem_of_the_library_in_other_units():
 
 def test_masked_values_and_units_without_a_factor():
     masked = pytest.importorskip("astropy.utils.masked").Masked
-    with pytest.raises(ValueError, match="q0 has masked values"):
+    with pytest.raises(ValueError, match="q0 must not have masked values"):
         run(SOLAR, q0=masked([1, 0] * u.au, mask=[False, True]))
     for unit in (u.deg_C, u.mag, u.ABmag, u.photon / u.s):
         with pytest.raises(ValueError, match="T cannot be in"):

@@ -121,7 +121,7 @@ def wrong_digits():
 )  # fmt: skip
 def test_an_order_that_coefficients_do_not_have_is_rejected(coefficients, claimed, found):
     assert dvi.Composition(coefficients, order=found).order == found
-    with pytest.raises(ValueError, match=f"have order {found}, not {claimed}.*Claim order={found}"):
+    with pytest.raises(ValueError, match=f"have order {found}, not {claimed}.*Set order={found}"):
         dvi.Composition(coefficients, order=claimed)
 
 
@@ -130,7 +130,7 @@ def test_printed_digits_are_enough_for_a_claim():
     good, poor = ([round(x, n) for x in (0.784513610477557, 0.235573213359358)] for n in (12, 6))
     third = -1.177679984178871
     assert dvi.Composition(of_strang(*good, third), order=6).is_symmetric
-    with pytest.raises(ValueError, match="give more digits"):
+    with pytest.raises(ValueError, match="with more digits"):
         dvi.Composition(of_strang(*poor, third), order=6)
 
 
@@ -216,9 +216,11 @@ def test_a_substep_backwards_against_strong_dissipation_warns():
         equations = Equations(s, jnp.asarray(epsilon))
         warn_of_dissipation(method, equations, lambda: Interval(t0, t0 + h, h), q, p)
 
-    with pytest.warns(UserWarning, match=r"Yoshida goes backwards by 0.85 .*substep 0\.306\. .*St"):
+    with pytest.warns(
+        UserWarning, match=r"Yoshida .*backwards .* 0.85 h.*substep is 0\.306\. .*St"
+    ):
         check(dvi.Yoshida(4), 3.6)
-    with pytest.warns(UserWarning, match="no more accurate than one of order 2"):
+    with pytest.warns(UserWarning, match="not more accurate than a map of order 2"):
         check(dvi.Adjoint(dvi.Yoshida(4)), 3.6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -226,7 +228,7 @@ def test_a_substep_backwards_against_strong_dissipation_warns():
         check(dvi.Strang(), 50.0)
         check(dvi.Yoshida(4), 50.0, undamped)
         check(dvi.Yoshida(4), -50.0)  # the force drives: backwards it damps
-    with pytest.warns(UserWarning, match="goes backwards"):
+    with pytest.warns(UserWarning, match="substep backwards"):
         dvi.integrate(system, q, p, h=0.1, num_steps=2, epsilon=3.6, method=dvi.Yoshida(4))
 
 
@@ -240,11 +242,11 @@ PAIR = (0.5, 0.5)
           for c in ((), (0.5, 0.6), (np.nan, 1.0))),
         *((lambda c=c: dvi.Composition(c), TypeError, "sequence of numbers")
           for c in (0.5, "half", [None])),
-        (lambda: dvi.Yoshida(5), ValueError, "orders 4, 6 and 8, got 5"),
-        (lambda: dvi.Suzuki(6), ValueError, "order 4, got 6"),
-        (lambda: dvi.BlanesMoan(8), ValueError, "orders 4 and 6, got 8"),
-        (lambda: dvi.McLachlan(2), ValueError, "orders 4, 6 and 8, got 2"),
-        (lambda: dvi.KahanLi(4), ValueError, "orders 6 and 8, got 4"),
+        (lambda: dvi.Yoshida(5), ValueError, "orders 4, 6 and 8, got order=5"),
+        (lambda: dvi.Suzuki(6), ValueError, "order 4, got order=6"),
+        (lambda: dvi.BlanesMoan(8), ValueError, "orders 4 and 6, got order=8"),
+        (lambda: dvi.McLachlan(2), ValueError, "orders 4, 6 and 8, got order=2"),
+        (lambda: dvi.KahanLi(4), ValueError, "orders 6 and 8, got order=4"),
         (lambda: dvi.Composition(PAIR, order=13), ValueError, "from 1 to 12"),
         (lambda: dvi.Composition(PAIR, base=dvi.RungeKutta4()), ValueError, "no inverse step"),
         (lambda: dvi.Composition(PAIR, base=dvi.TypeII), TypeError, "base must be a method"),

@@ -81,7 +81,7 @@ def section(**how):
 
 ERRORS = {
     # --- the state ---
-    "q0 and p0 of different shapes": (lambda: run(p0=[0.0, 1.0]), "one shape.*\\(1,\\).*\\(2,\\)"),
+    "q0 and p0 of different shapes": (lambda: run(p0=[0.0, 1.0]), "same shape.*\\(1,\\).*\\(2,\\)"),
     "no momenta": (lambda: dvi.integrate(FREE, Q, **STEPS), "p0"),
     "no state at all": (lambda: dvi.integrate(FREE, **STEPS), "q0"),
     "an empty state": (lambda: run(q0=[], p0=[]), "empty"),
@@ -213,7 +213,7 @@ ERRORS = {
     ),
     "newton and root_finder": (
         lambda: run(newton=dvi.Newton(), root_finder=dvi.Newton()),
-        "one keyword",
+        "two names of one argument",
     ),
     "a root finder as text": (lambda: run(root_finder="newton"), "root_finder|newton"),
     "the class of a root finder": (lambda: run(root_finder=dvi.Newton), "parentheses|dvi.Newton"),

@@ -203,7 +203,7 @@ def diagram(q, p, **options):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda q, p: section(q, p[:2]), r"one shape, got q0 \(3, 2\) and p0 \(2, 2\)"),
+        (lambda q, p: section(q, p[:2]), r"the same shape, got q0 \(3, 2\) and p0 \(2, 2\)"),
         (lambda q, p: section(q, p, num_steps=0), "num_steps must be a whole .* from 1 on, got 0"),
         (lambda q, p: section(q, p, epsilon=[0.0, 0.1]), "one for each of the 3 orbits, got 2"),
         (lambda q, p: section(q, p, skip=-1), "skip must be a whole"),
@@ -212,9 +212,9 @@ def diagram(q, p, **options):
         (lambda q, p: section(0.0, 0.0), r"orbits along the first axis.*got shape \(\)"),
         (lambda q, p: section(q, p, crosings=3), "argument 'crosings'. Did you mean 'crossings'"),
         (lambda q, p: dvi.poincare_section(HENON.system, q, p, plane, h=1), "'num_steps'"),
-        (lambda q, p: diagram(q, p, epsilon=0.1), "needs something that varies"),
+        (lambda q, p: diagram(q, p, epsilon=0.1), "requires a parameter that varies"),
         (lambda q, p: diagram(q, p, epsilon=[0.0, np.nan]), "epsilon must be finite, got .*nan"),
-        (lambda q, p: diagram(q, p, epsilon=[[0.0]]), "one-dimensional array, got shape"),
+        (lambda q, p: diagram(q, p, epsilon=[[0.0]]), "1-D array, got shape"),
         (lambda q, p: diagram(q, p, folow=True), "has no argument 'folow'. Did you mean 'follow'"),
         (lambda q, p: return_map(HENON), "problem.system"),
         (lambda q, p: return_map(returns=0), "returns must be a whole number"),
@@ -406,7 +406,7 @@ def test_the_changed_default_method_gives_a_warning_at_the_line_of_the_call():
         lambda: dvi.poincare_section(HENON.system, q, p, plane, **given, throw=False),
         lambda: dvi.ReturnMap(HENON.system, plane, **given),
     ):
-        with pytest.warns(FutureWarning, match=r"used Strang\(\) by default") as seen:
+        with pytest.warns(FutureWarning, match=r"it was Strang\(\)") as seen:
             call()
         assert seen[0].filename == __file__
     made = dvi.System(dvi.discretise(lambda t, q, p, args: hamiltonian(t, t, q, p, args), order=1))

@@ -75,9 +75,9 @@ def test_dates(date, jd):
 @pytest.mark.parametrize(
     ("date", "said"),
     [
-        ("1899-07-28", "DE421 covers 1899-07-29 to 2053-10-09"),
-        ("2053-10-10", "DE421 covers"),
-        ("01/01/1900", "must read like"),
+        ("1899-07-28", "DE421, which covers 1899-07-29 to 2053-10-09"),
+        ("2053-10-10", "DE421, which covers"),
+        ("01/01/1900", "must be like"),
         (True, r"got True\. Give a calendar day or a Julian date"),
         (float("nan"), "finite number, got nan"),
     ],

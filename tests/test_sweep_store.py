@@ -245,12 +245,12 @@ def test_damage_is_not_read_as_numbers_without_verification(copy, expected):
     """The codec finds a flipped bit; a missing file counts as not computed."""
     file = shard(copy)
     flip(file, len(file.read_bytes()) // 3)
-    with pytest.raises(dvi.StoreError, match=r"drift/c/3/0: is damaged .*verify\(\)"):
+    with pytest.raises(dvi.StoreError, match=r"drift/c/3/0 is damaged .*verify\(\)"):
         dvi.open_sweep(copy)["drift"]
     file.unlink()
     record(copy, 5).write_bytes(b"")
     found = dvi.open_sweep(copy)
-    with pytest.warns(UserWarning, match=r"1 of the finished tasks lack a file .*drift"):
+    with pytest.warns(UserWarning, match=r"a file of 1 finished tasks is missing .*drift"):
         assert found.tasks_done == 10
     with pytest.warns(UserWarning, match="the same call"):
         assert found.status_counts()["not_computed"] == 200
@@ -335,9 +335,9 @@ def test_an_edited_description_is_an_error_and_loses_nothing(copy):
     content = json.loads(sound)
     content["attributes"]["dvi_jax_sweep"] = 99
     for text, message in (
-        (json.dumps(content), "format 99, this version reads 1"),
+        (json.dumps(content), "format 99, but this version reads 1"),
         (sound.replace('\\"k\\"', '\\"K\\"', 1), "damaged or was edited"),
-        (sound[:100], "is not that of a sweep"),
+        (sound[:100], "does not describe a sweep"),
     ):
         meta.write_text(text)
         with pytest.raises(dvi.StoreError, match=message):

@@ -138,15 +138,15 @@ def test_brackets_close_the_algebra():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: library.space_translation([0.0, 0.0]), "must not be zero"),
+        (lambda: library.space_translation([0.0, 0.0]), "component that is not zero"),
         (lambda: library.space_translation([np.nan, 1.0]), "finite"),
         (lambda: library.rotation(1, 1), "two different axes"),
         (lambda: library.rotation(-1, 0), "two different axes"),
-        (lambda: library.scaling(0.0, 0.0, 0.0), "other than zero"),
+        (lambda: library.scaling(0.0, 0.0, 0.0), "give one that is not"),
         (lambda: library.scaling(t=[1.0, 2.0]), "must be a number"),
         (lambda: library.boost([1.0, 0.0], mass=-1.0), "positive"),
         (lambda: library.rotation(0, 2)(POINT), "at least 3 components"),
-        (lambda: library.space_translation([1.0, 0.0, 0.0])(POINT), r"does not fit q of shape"),
+        (lambda: library.space_translation([1.0, 0.0, 0.0])(POINT), r"does not match q of shape"),
         (lambda: library.boost([1.0, 0.0], [1.0, 2.0, 3.0])(POINT), "mass of shape"),
     ],
 )
@@ -434,7 +434,7 @@ POLE = {
     [
         ({"samples": box(1, 8)}, ValueError, "too few"),
         ({"samples": (np.full((50, 1), np.nan), np.ones((50, 1)))}, ValueError, "not finite"),
-        ({"samples": (np.ones((50, 1)), np.ones((50, 2)))}, ValueError, "one shape"),
+        ({"samples": (np.ones((50, 1)), np.ones((50, 2)))}, ValueError, "the same shape"),
         ({"h": 0.0}, ValueError, "step size"),
         ({"order": -1}, ValueError, "order must be"),
         ({"order": 0.5}, ValueError, "order must be"),
@@ -443,7 +443,7 @@ POLE = {
         ({"basis": LOG}, ValueError, "'log' is not finite"),
         ({"gauges": LOG}, ValueError, "'log' is not finite"),
         (ROOT, ValueError, "where a step leads"),
-        ({"basis": TIMED}, ValueError, "all samples are of one time"),
+        ({"basis": TIMED}, ValueError, "all samples have the same time"),
         (POLE, ValueError, "step fails at 1 of 60"),
         ({"basis": 3}, TypeError, "basis must be a basis"),
         ({"gauges": 3}, TypeError, "basis must be a basis"),

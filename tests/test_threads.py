@@ -69,7 +69,7 @@ def test_an_error_of_the_function_is_raised():
         (jnp.sin, -2, ValueError, "whole number from 1 on, got -2"),
         (jnp.sin, 1.5, TypeError, "positive integer or None, got 1.5"),
         (jnp.sin, True, ValueError, "whole number from 1 on, got True"),
-        (jnp.ones(3), None, TypeError, "takes must be a function"),
+        (jnp.ones(3), None, TypeError, "argument of over_threads must be a function"),
     ],
 )
 def test_invalid_arguments_are_rejected(function, threads, error, match):

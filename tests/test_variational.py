@@ -266,7 +266,7 @@ def test_condition_number_of_the_midpoint_rule():
     for h in (0.1, 0.05):
         # The size counts E⁺ and E⁻: twice the energy.
         np.testing.assert_allclose(damped(h, 5, 0.0).observed, 1 + 4 / h**2, rtol=1e-9)
-    with pytest.raises(ValueError, match="has to know the system"):
+    with pytest.raises(ValueError, match="requires the system"):
         dvi.LatticeCondition()(0.0, 0.1, *[jnp.ones(1)] * 4, None)
 
 
@@ -282,7 +282,7 @@ def test_progress_changes_nothing():
     ("call", "error", "message"),
     [
         (lambda: dvi.Variational("halve"), ValueError, "on_no_root must be one of 'stop', 'hold'"),
-        (lambda: dvi.Variational(reach=1.0), ValueError, "reach must be a number above 1"),
+        (lambda: dvi.Variational(reach=1.0), ValueError, "reach .*finite and greater than 1"),
         (lambda: dvi.Variational(bounds=(2.0, 3.0)), ValueError, "two positive numbers around 1"),
         (lambda: kepler(0.1, 3, method=dvi.Strang()), ValueError, r"method=dvi\.TypeII\(\) only"),
         (
@@ -290,7 +290,7 @@ def test_progress_changes_nothing():
             ValueError,
             "a solve cannot be undone bit for bit",
         ),
-        (lambda: kepler(None, 3), TypeError, "needs h and num_steps; h is missing"),
+        (lambda: kepler(None, 3), TypeError, r"requires h and num_steps .*Not given: h\."),
         (
             lambda: kepler(0.1, 80, throw=True),
             dvi.IntegrationError,

@@ -120,7 +120,7 @@ def _named(methods: Any) -> dict[str, dvi.Method]:
     if isinstance(methods, dvi.Method):
         raise TypeError(f'give the method a name: certify({{"mine": {methods!r}}}).')
     if not isinstance(methods, Mapping):
-        own = " A method of your own: certify({name: method})."
+        own = " For your own method call certify({name: method})."
         return {name: METHODS[name] for name in chosen("method", methods, METHODS, own)}
     for name, method in methods.items():
         if not isinstance(method, dvi.Method):
@@ -129,7 +129,7 @@ def _named(methods: Any) -> dict[str, dvi.Method]:
         if isinstance(order, bool) or not isinstance(order, int | float):
             raise TypeError(f"the order of {name!r} must be a number, got {order!r}.")
         if not (math.isfinite(order) and order > 0):
-            raise ValueError(f"the order of {name!r} must be positive, got {order!r}.")
+            raise ValueError(f"the order of {name!r} must be positive and finite, got {order!r}.")
     if not methods:
-        raise ValueError("no method was given: certify({}) would certify nothing.")
+        raise ValueError("methods is empty: give at least one, certify({name: method}).")
     return {str(name): method for name, method in methods.items()}

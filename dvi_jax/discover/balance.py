@@ -90,7 +90,7 @@ def noether_balance(
         raise ValueError(
             "a balance needs every lattice point: the solution has "
             f"{steps + 1} states of {solution.stats['num_steps']} steps"
-            + (", saved at times of their own" if steps != jnp.size(solution.hs) else "")
+            + (", saved at requested times" if steps != jnp.size(solution.hs) else "")
             + ". Integrate with save=dvi.Save()."
         )
     return _balance(

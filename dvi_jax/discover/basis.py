@@ -79,7 +79,7 @@ class BoundBasis(eqx.Module):
         q, p = jnp.asarray(q), jnp.asarray(p)
         if self.shape is not None and not q.shape == p.shape == self.shape:
             raise ValueError(
-                f"these basis functions are of states of shape {self.shape}; got q of shape "
+                f"these basis functions are for q and p of shape {self.shape}; got q of shape "
                 f"{q.shape} and p of shape {p.shape}."
             )
         return self.function(q, p, jnp.asarray(t, float))

@@ -123,7 +123,7 @@ def conformal_factor(
     if not pointwise and samples < size:
         raise ValueError(
             f"a {size}×{size} factor needs at least {size} sampled pairs of points, got {samples}: "
-            "take more points, or pointwise=True."
+            "give more points, or pointwise=True."
         )
     find = _pointwise if pointwise else _constant
     return find(system, generators, first, second, jnp.asarray(epsilon), args)

@@ -142,7 +142,8 @@ def drift_surface(
     is_number = isinstance(duration, int | float | np.number)
     if not is_number or not np.isfinite(duration) or duration < 2 * hs[-1]:
         raise ValueError(
-            f"duration must hold at least two of the longest steps, {hs[-1]:g}; got {duration!r}."
+            f"duration must be finite and at least {2 * hs[-1]:g} (two of the longest steps), got "
+            f"{duration!r}."
         )
     given = isinstance(invariant, Sequence)
     invariants = list(invariant) if given else [invariant] * len(hs)
@@ -268,7 +269,7 @@ def _order(epsilons: np.ndarray, lanes: _Lanes, kept: np.ndarray) -> DriftOrder:
 
 
 def _check_observable(invariant: Any) -> None:
-    function("invariant", invariant, hint="Of a Discovery take one of its `invariants`.")
+    function("invariant", invariant, hint="From a Discovery give one of its `invariants`.")
 
 
 def _positive(name: str, values: Any, increasing: bool = False) -> np.ndarray:

@@ -29,9 +29,7 @@ def _places(variables: Sequence[str], shape: tuple[int, ...]) -> tuple[int, ...]
     every = coordinate_names(shape)
     unknown = [v for v in variables if v not in every + TIME]
     if unknown:
-        raise ValueError(
-            f"the state has no component {unknown[0]!r}; it has {list(every)} and the time 't'."
-        )
+        raise ValueError(f"there is no component {unknown[0]!r}, only {[*every]} and the time 't'.")
     return tuple(len(every) if v in TIME else every.index(v) for v in variables)
 
 
@@ -96,8 +94,8 @@ class Polynomials(AbstractBasis):
         size = math.comb(len(chosen) + self.degree, self.degree)
         if size > _MOST:
             raise ValueError(
-                f"Polynomials({self.degree}) of {len(chosen)} variables are {size:.3g} monomials, "
-                f"and at most {_MOST} can be searched: take a lower degree, or fewer variables, "
+                f"Polynomials({self.degree}) of {len(chosen)} variables has {size:.3g} monomials, "
+                f"but at most {_MOST} can be searched: use a lower degree, or fewer variables, "
                 'as in Polynomials(degree, ("q1", "p1")).'
             )
         exponents = [
@@ -195,7 +193,7 @@ class Chebyshev(AbstractBasis):
         whole("count", self.count)
         ends = np.asarray(self.domain, float)
         if ends.shape != (2,) or not np.isfinite(ends).all() or not ends[0] < ends[1]:
-            raise ValueError(f"domain must be two numbers (a, b), a < b, got {self.domain!r}.")
+            raise ValueError(f"domain must be two numbers (a, b) with a < b, got {self.domain!r}.")
 
     def for_shape(self, shape):
         names = ("1", *(f"T{k}({self.variable})" for k in range(1, self.count)))
@@ -270,7 +268,7 @@ class Radial(AbstractBasis):
     def __check_init__(self):
         whole = all(isinstance(k, int) and not isinstance(k, bool) for k in self.powers)
         if not self.powers or not whole:
-            raise ValueError(f"powers must be a list of integers, got {self.powers!r}.")
+            raise ValueError(f"powers must be a list of one or more integers, got {self.powers!r}.")
 
     def for_shape(self, shape):
         names = coordinate_names(shape)

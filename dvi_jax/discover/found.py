@@ -223,20 +223,20 @@ class Discovery(eqx.Module):
             probe = Samples(*(found[f"probe_{name}"] for name in Samples._fields))
             values = found["probe_values"]
         except KeyError as error:
-            raise ValueError(f"Discovery.save did not write {os.fspath(path)}.") from error
+            raise ValueError(f"{os.fspath(path)} is not a file of Discovery.save.") from error
         bound = bind_basis(basis, tuple(about["shape"]))
         inner, to_basis = bound.about(arrays["middle"])
         if list(bound.names) != about["names"]:
             raise ValueError(
-                f"{os.fspath(path)} was found in a basis of {len(about['names'])} functions "
-                f"({', '.join(about['names'][:4])} …); the one given has {bound.size} "
-                f"({', '.join(bound.names[:4])} …)."
+                f"basis must be the basis of the search saved in {os.fspath(path)}, which has "
+                f"{len(about['names'])} functions ({', '.join(about['names'][:4])} …); the one "
+                f"given has {bound.size} ({', '.join(bound.names[:4])} …)."
             )
         differs = ~np.isclose(_probed(bound, probe), values, rtol=1e-9)
         if differs.any():
             raise ValueError(
-                f"the basis given has the names of that of {os.fspath(path)} and other values: "
-                f"{bound.names[int(np.argmax(differs.any(axis=0)))]!r} differs."
+                f"basis must be the basis of the search saved in {os.fspath(path)}: its function "
+                f"{bound.names[int(np.argmax(differs.any(axis=0)))]!r} has other values."
             )
         for name in ("inner_coefficients", "inner_dependent"):
             arrays[name] = jnp.asarray(arrays[name])

@@ -51,8 +51,8 @@ class Generator(eqx.Module):
                 value = jnp.asarray(component(t, q, p, args), like.dtype)
                 if value.shape != like.shape:
                     raise ValueError(
-                        f"{name} must have shape {like.shape} at q of shape {q.shape}; it has "
-                        f"shape {value.shape}."
+                        f"{name} of the Generator must return shape {like.shape} for q of shape "
+                        f"{q.shape}; it returned shape {value.shape}."
                     )
             values.append(value)
         return LatticePoint(*values)

@@ -63,7 +63,7 @@ def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
     if a.shape != ():
         raise ValueError(f"the weight of t must be a number, got an array of shape {a.shape}.")
     if not (a.any() or b.any() or c.any()):
-        raise ValueError("a scaling needs a weight other than zero.")
+        raise ValueError("all weights t, q, p of the scaling are 0: give one that is not.")
     weights = enumerate((a, b, c))
     return Generator(*(eqx.Partial(_scaled, i, w) if w.any() else None for i, w in weights))
 
@@ -181,6 +181,6 @@ def _fitted(name: str, value: np.ndarray, q: State) -> Array:
         return jnp.broadcast_to(value, q.shape).astype(q.dtype)
     except ValueError:
         raise ValueError(
-            f"{name} of shape {value.shape} does not fit q of shape {q.shape}: give that shape or "
-            "the one of its last axes."
+            f"{name} of shape {value.shape} does not match q of shape {q.shape}: give an array of "
+            "that shape, or of the shape of its last axes."
         ) from None

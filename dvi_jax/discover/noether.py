@@ -136,7 +136,7 @@ class AdiabaticInvariant(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.system is None:
             raise ValueError(
-                "an AdiabaticInvariant has to know the system and ε: call "
+                "an AdiabaticInvariant requires the system and ε: call "
                 "invariant.bind(system, epsilon)(...), or give it to dvi.integrate(observe=...)."
             )
         energy = incoming_energy(self.system, t0, t1, q0, p1, self.epsilon, args)

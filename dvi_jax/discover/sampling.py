@@ -135,22 +135,23 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
         arrays = []
     if len(arrays) not in (2, 3):
         raise ValueError(
-            "samples must be a pair (qs, ps) of arrays with one row for each point, or (qs, ps, "
-            "ts) with their times."
+            "samples must be a pair (qs, ps) of arrays of numbers with one row for each point, or "
+            f"(qs, ps, ts) with their times; got {samples!r:.100}."
         )
     q, p = arrays[:2]
     if q.shape != p.shape or q.ndim < 1 or len(q) == 0:
         raise ValueError(
-            f"samples (qs, ps) must have one shape (points, *q.shape), got {q.shape} and {p.shape}."
+            "qs and ps of samples must have the same shape, with the points along the first axis; "
+            f"got {q.shape} and {p.shape}."
         )
     t = arrays[2] if len(arrays) == 3 else np.full(len(q), float(t0))
     if t.shape != (len(q),):
-        raise ValueError(f"the times of {len(q)} samples must have shape ({len(q)},): {t.shape}.")
+        raise ValueError(f"ts of {len(q)} samples must have shape ({len(q)},), got {t.shape}.")
     finite = [np.isfinite(x).reshape(len(q), -1).all(axis=1) for x in (q, p, t)]
     if len(bad := np.flatnonzero(~np.all(finite, axis=0))):
         raise ValueError(
-            f"{len(bad)} of {len(q)} samples are not finite, the first has index {bad[0]}: take "
-            "points where H and W are defined."
+            f"{len(bad)} of {len(q)} samples are not finite, the first has index {bad[0]}: use "
+            "only points where H and W are defined."
         )
     return Samples(q, p, t)
 
@@ -194,7 +195,7 @@ def require_enough(samples: Samples, unknowns: int, conditions: int = 1) -> None
     if len(samples.q) < needed:
         raise ValueError(
             f"{len(samples.q)} samples are too few for {unknowns} unknown coefficients (a quarter "
-            f"is held out): give at least {needed}."
+            f"of them is held out for validation): give at least {needed}."
         )
 
 
@@ -202,8 +203,8 @@ def require_time(basis: BoundBasis, samples: Samples) -> None:
     """Reject a basis with functions of time when all samples are of one time."""
     if basis.uses_time and np.ptp(samples.t) == 0:
         raise ValueError(
-            "the basis has functions of time, and all samples are of one time: give samples=(qs, "
-            "ps, ts)."
+            "the basis has functions of time, but all samples have the same time: give "
+            "samples=(qs, ps, ts) with different times."
         )
 
 
@@ -318,7 +319,7 @@ def random_pairs(
     samples, h = as_samples(samples, t0), check_step_size(h)
     count = len(samples.q)
     if count < 2:
-        raise ValueError("pairs off the solutions need at least two samples, got one.")
+        raise ValueError("random_pairs requires at least two samples, got one.")
     order = np.random.default_rng(seed).permutation(count)
     other = np.empty(count, int)
     other[order] = np.roll(order, 1)  # one cycle: no sample is paired with itself

@@ -58,8 +58,8 @@ class InvariantSeries(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.epsilon is None:
             raise ValueError(
-                "an InvariantSeries has to know ε: call invariant.bind(system, epsilon)(...), or "
-                "give it to dvi.integrate(observe=...)."
+                "an InvariantSeries requires the value of ε: call invariant.bind(system, "
+                "epsilon)(...), or give it to dvi.integrate(observe=...)."
             )
         time = self.epsilon * t1 if self.slow_time else t1
         return self.evaluate(q1, p1, self.epsilon, time)
@@ -75,7 +75,8 @@ class InvariantSeries(eqx.Module):
         """
         if self.slow_time and self.basis.uses_time:
             raise ValueError(
-                "a generator is a function of the time t, and this invariant of the slow time εt."
+                "this invariant is a function of the slow time εt, but a generator must be one of "
+                "the time t: generators() cannot be used for it."
             )
         return [_symplectic_gradient(self.basis, c) for c in self.coefficients]
 

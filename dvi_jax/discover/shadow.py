@@ -93,9 +93,7 @@ class ShadowHamiltonian(eqx.Module):
         if self.h is None or is_traced(self.h):
             return
         if np.shape(self.h) != () or not np.isfinite(self.h) or self.h == 0:
-            raise ValueError(
-                f"h must be one finite step size other than zero, or None, got {self.h!r}."
-            )
+            raise ValueError(f"h must be a finite number other than zero, or None, got {self.h!r}.")
 
     def bind(self, system: System, epsilon: Any) -> "ShadowHamiltonian":
         """The same Hamiltonian for this system and ε, unless they were given before."""
@@ -121,16 +119,15 @@ class ShadowHamiltonian(eqx.Module):
         system = self.system
         if system is None:
             raise ValueError(
-                "a ShadowHamiltonian has to know the system: write "
-                "ShadowHamiltonian(order, system), call shadow.bind(system, epsilon), or give it "
-                "to dvi.integrate(observe=...)."
+                "a ShadowHamiltonian requires the system: write ShadowHamiltonian(order, system), "
+                "call shadow.bind(system, epsilon), or give it to dvi.integrate(observe=...)."
             )
         for name, value in (("q", q), ("p", p)):
             if not is_traced(value):
                 refuse_double_without_x64(name, getattr(value, "dtype", np.float32))
         q, p = jnp.asarray(q), jnp.asarray(p)
         if q.shape != p.shape:
-            raise ValueError(f"q and p must have one shape, got {q.shape} and {p.shape}.")
+            raise ValueError(f"q and p must have the same shape, got {q.shape} and {p.shape}.")
         dtype = jnp.result_type(q.dtype, p.dtype, float)
         epsilon = jnp.asarray(0.0 if self.epsilon is None else self.epsilon, dtype)
         t, q, p = jnp.asarray(t, dtype), q.astype(dtype), p.astype(dtype)

@@ -104,11 +104,11 @@ def actions(
     ts, signal, eps, axes = signals_of(ts, signal)
     if not jnp.iscomplexobj(signal):
         raise TypeError(
-            "actions need q and p of every degree of freedom: the complex signal q − i p, shape "
-            "(n, N), or a Solution; got a real one."
+            "actions require q and p of every degree of freedom: give the complex signal q − i p "
+            f"of shape (n, N), or a Solution; got a real signal of shape {signal.shape}."
         )
     if is_traced(signal) or is_traced(ts):
-        raise ValueError("actions run on the CPU, not under jit or vmap: give the whole batch.")
+        raise ValueError("call actions outside of jit, vmap and grad, with the whole batch.")
     # One axis for all degrees of freedom of a trajectory.
     lead, N = signal.shape[: signal.ndim - 1 - axes], signal.shape[-1]
     signal = signal.reshape(*lead, math.prod(signal.shape[len(lead) : -1]), N)

@@ -185,7 +185,10 @@ def frequency_diffusion(
     half = signal.shape[-1] // 2
     halves = jnp.stack([signal[..., :half], signal[..., half : 2 * half]])
     if half < _FEWEST:
-        raise ValueError(f"two halves need at least {2 * _FEWEST} samples, got {signal.shape[-1]}.")
+        raise ValueError(
+            f"frequency_diffusion compares two halves, which need at least {2 * _FEWEST} samples "
+            f"together, got {signal.shape[-1]}: save more often, or run longer."
+        )
     times = jnp.stack([ts[..., :half], ts[..., half : 2 * half]])
     times = times.reshape(2, *(1,) * (halves.ndim - times.ndim), *times.shape[1:])
     check_count(settings, halves)
@@ -218,8 +221,8 @@ def check_count(settings: Settings, signal: Array) -> None:
     unknowns = 3 * settings.lines * (1 if jnp.iscomplexobj(signal) else 2)
     if unknowns >= signal.shape[-1]:
         raise ValueError(
-            f"count = {settings.lines} lines have {unknowns} unknowns, too many for "
-            f"{signal.shape[-1]} samples: take a smaller count or more samples."
+            f"count = {settings.lines} lines have {unknowns} unknowns, which require more than "
+            f"{unknowns} samples, got {signal.shape[-1]}: use a smaller count or more samples."
         )
 
 
@@ -230,8 +233,8 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     state_axes = None
     if isinstance(ts, Solution) == (signal is not None):
         raise ValueError(
-            "give times and a signal, frequencies(ts, signal), or a Solution alone, whose "
-            "signal is q − i p."
+            "give either times and a signal, frequencies(ts, signal), or only a Solution, "
+            "frequencies(solution), whose signal is q − i p."
         )
     if isinstance(ts, Solution):
         qs, ps = (_double("the trajectory", x) for x in (ts.qs, ts.ps))
@@ -243,8 +246,8 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     ts, signal = _real_times("ts", ts), _double("signal", signal)
     if signal.ndim == 0 or ts.ndim == 0 or ts.shape[-1] != signal.shape[-1]:
         raise ValueError(
-            f"ts and signal must have one length along their last axis, got shapes {ts.shape} and "
-            f"{signal.shape}. For trajectories saved as (N, n) give signal.T."
+            f"ts and signal must have the same length along their last axis, got shapes {ts.shape} "
+            f"and {signal.shape}. For trajectories saved as (N, n) give signal.T."
         )
     sizes = zip(ts.shape[::-1], signal.shape[::-1], strict=False)
     if ts.ndim > signal.ndim or any(n not in (1, size) for n, size in sizes):
@@ -275,7 +278,10 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
 def _real_times(name: str, value: Any) -> Array:
     value = _double(name, value)
     if jnp.iscomplexobj(value):
-        raise TypeError("the times must be real: frequencies(ts, signal) takes the times first.")
+        raise TypeError(
+            f"{name} must be real, got dtype {value.dtype}: in frequencies(ts, signal) the times "
+            "are the first argument."
+        )
     return value
 
 

@@ -79,7 +79,7 @@ class SECTION_RESULTS(eqx.Enumeration):
         "The orbit never crossed the section. Likely causes: (a) g(t, q, p, args) has one sign all "
         "along it: take a surface that the orbit meets; (b) the direction is the other one: try "
         "direction=0; (c) too few steps; (d) steps so long that g changes sign twice within one; "
-        "(e) all crossings were skipped: a smaller skip."
+        "(e) all crossings were skipped: use a smaller skip."
     )
     too_few_crossings = (
         "The orbit crossed the section less often than requested; missing crossings are NaN. Take "

@@ -84,9 +84,9 @@ def _settings(
     has_default = integrator.method is None and not isinstance(default_method(system), Strang)
     if has_default and level is not None:
         warnings.warn(
-            "sections used Strang() by default, and now use the default of integrate, which is "
-            "TypeII() for this system. Give method=: dvi.Strang() for the results of earlier "
-            "versions, dvi.TypeII() for the map of H_D itself.",
+            "the default method of sections has changed: it was Strang(), and is now the default "
+            "of integrate, which is TypeII() for this system. Give method=dvi.Strang() for the "
+            "results of earlier versions, method=dvi.TypeII() for the map of H_D itself.",
             FutureWarning,
             stacklevel=level,
         )
@@ -189,7 +189,7 @@ def poincare_section(
         if length != q.shape[0]:
             raise ValueError(
                 f"{name} must be one number or one for each of the {q.shape[0]} orbits, got "
-                f"{length}."
+                f"{length} numbers."
             )
     start = (as_scalar("t0", keywords["t0"], q.dtype), _Varied(q), _Varied(p))
     h = as_scalar("h", h, q.dtype, zero_allowed=False)
@@ -243,9 +243,9 @@ def bifurcation(
     lengths = set(varied.values())
     if len(lengths) != 1 or 0 in lengths:
         raise ValueError(
-            "a bifurcation diagram needs something that varies: epsilon as a one-dimensional array "
-            "of values, or a dvi.Axis in args; several vary together and must have one length. Got "
-            f"{varied if varied else 'one number for each'}."
+            "a bifurcation diagram requires a parameter that varies: epsilon as a one-dimensional "
+            "array of values, or a dvi.Axis in args. Several vary together and must have the same "
+            f"length; the lengths are {varied or 'not given: each parameter is one number'}."
         )
     start = (as_scalar("t0", keywords["t0"], q.dtype), q, p)
     h = as_scalar("h", keywords["h"], q.dtype, zero_allowed=False)
@@ -341,9 +341,7 @@ def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
         if np.ndim(x) == 0:
             return as_parameter(x)
         if np.ndim(x) != 1:
-            raise ValueError(
-                f"{name} must be a number or a one-dimensional array, got shape {np.shape(x)}."
-            )
+            raise ValueError(f"{name} must be a number or a 1-D array, got shape {np.shape(x)}.")
         if not is_traced(x) and not np.isfinite(x).all():
             raise ValueError(f"{name} must be finite, got {x}.")
         found[name] = len(x)

@@ -104,7 +104,7 @@ def fundamental_frequencies(
     hint = "dvi.fundamental_frequencies(dvi.frequencies(solution))."
     instance("lines", lines, Frequencies, "a result of dvi.frequencies", hint)
     if is_traced(lines.frequencies):
-        raise ValueError("integer combinations are found on the CPU, not under jit or vmap.")
+        raise ValueError("call fundamental_frequencies outside of jit, vmap and grad.")
     omega, A = np.asarray(lines.frequencies), np.asarray(lines.amplitudes)
     code, resolution = np.asarray(code_of(lines.result)), np.asarray(lines.resolution)
     axes = min(lines.state_axes, omega.ndim - 1)  # fewer if one degree of freedom was selected
@@ -130,14 +130,14 @@ class Search(NamedTuple):
 
 def search_of(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshold: Any) -> Search:
     if n == 0:
-        raise ValueError("a torus needs at least one degree of freedom, got lines of none.")
+        raise ValueError("a torus needs at least one degree of freedom, but the signal has none.")
     if guess is not None:
         guess = np.array([finite("each frequency of guess", x) for x in np.atleast_1d(guess)])
     if num is None:
         num = n if guess is None else len(guess)
     num = whole("num", num, hint="It is the number of frequencies.")
     if guess is not None and len(guess) != num:
-        raise ValueError(f"guess must hold num = {num} frequencies, got {guess}.")
+        raise ValueError(f"guess must have num = {num} frequencies, got {len(guess)}: {guess}.")
     order = _ORDERS.get(num, 5) if order is None else whole("order", order, hint="It is Σ|k|.")
     tolerance = None if tolerance is None else positive("tolerance", tolerance)
     fraction = "It is a fraction of the leading amplitude."

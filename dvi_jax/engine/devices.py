@@ -38,10 +38,10 @@ def over_devices(
     **Raises** `ValueError` for a batch that the number of devices does not divide; `TypeError` for
     an object that is not a function.
     """
-    check_function("what over_devices takes", function, hint="jax.vmap(one), for example.")
+    check_function("the argument of over_devices", function, hint="Give, say, jax.vmap(one).")
     chosen = np.asarray(jax.devices() if devices is None else list(devices))
     if chosen.size == 0:
-        raise ValueError("over_devices needs at least one device.")
+        raise ValueError("devices is empty: give at least one, or leave devices out to use all.")
     whole("out_axes", out_axes, least=0)
     # Auto: shardings of arguments outside are left to JAX, and need not be declared.
     mesh = jax.sharding.Mesh(chosen, (LANES,), axis_types=(AxisType.Auto,))

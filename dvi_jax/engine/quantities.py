@@ -14,7 +14,7 @@ def refuse_unit_or_mask(name: str, value: Any) -> None:
         raise ValueError(
             f"{name} is a masked array with a masked number"
             + (f" at index {where}" if where else "")
-            + ", which would be used like any other: give an array without masked numbers."
+            + ", which would be used as if it were valid: give an array without masked numbers."
         )
     unit = None
     if hasattr(value, "to_value"):

@@ -72,8 +72,8 @@ def tracing_note(name: str, error: Exception) -> str:
     """Advice about an error in a function of the user that JAX traces."""
     if isinstance(error, jax.errors.TracerBoolConversionError):
         return (
-            f"{name} is traced by JAX, so no number decides an if or a while: use "
-            "jnp.where(condition, a, b), jax.lax.cond or jax.lax.while_loop."
+            f"{name} is traced by JAX: its values are not known yet, so if and while cannot depend "
+            "on them. Use jnp.where(condition, a, b), jax.lax.cond or jax.lax.while_loop."
         )
     if isinstance(
         error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError
@@ -83,5 +83,5 @@ def tracing_note(name: str, error: Exception) -> str:
             "float() or int()."
         )
     if isinstance(error, TypeError) and "NoneType" in str(error):
-        return f"If {name} uses args: no args were given (args=None); pass args=..."
+        return f"If {name} uses args: args is None here. Pass args=... to the call."
     return f"{name} is traced by JAX: it must consist of functions of jax.numpy."

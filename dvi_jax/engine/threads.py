@@ -35,7 +35,9 @@ def over_threads(
     # (64, 2)
     ```
     """
-    check_function("what over_threads takes", function, hint="jax.jit(jax.vmap(one)), for example.")
+    check_function(
+        "the argument of over_threads", function, hint="Give, say, jax.jit(jax.vmap(one))."
+    )
     if threads is not None:
         instance("threads", threads, int, "a positive integer or None")
         whole("threads", threads)

@@ -129,9 +129,13 @@ def fit(
     if batch is not None:
         whole("batch", batch)
         if not by_optax:
-            raise ValueError("batch is for a stochastic optimiser, such as optax.adam(1e-3).")
+            raise ValueError("batch requires optimiser=optax.adam(1e-3) or another one of optax.")
     if isinstance(shooting, MultipleShooting) and not is_vector:
-        raise ValueError("multiple shooting works only with least squares and their solvers.")
+        raise ValueError(
+            "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and an "
+            "optimiser such as optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10), got "
+            f"{type(problem.loss).__name__} and {type(solver).__name__}."
+        )
     wanted = _horizons(horizons)
     u = problem.space.to_u(problem.start)
     name = identity(problem, u, solver, shooting, wanted, batch, seed, tolerance)
@@ -166,7 +170,7 @@ def _horizons(horizons: Any) -> list[float] | None:
         return [np.inf]
     found = np.asarray(horizons, float)
     if found.ndim != 1 or not (np.diff(found) > 0).all() or not (found > 0).all():
-        raise ValueError(f"horizons must be increasing positive times, got {horizons!r}.")
+        raise ValueError(f"horizons must be a list of increasing positive times, got {horizons!r}.")
     return [*found.tolist(), np.inf]
 
 

@@ -136,8 +136,8 @@ class Samples:
             import arviz  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise ImportError(
-                "to_arviz needs arviz: pip install arviz. Without it, print(samples) is a summary "
-                "and to_xarray() has the draws in the same layout."
+                "to_arviz requires arviz: pip install arviz. Without it, print(samples) shows a "
+                "summary, and to_xarray() returns the draws in the same layout."
             ) from None
         tree = self.to_xarray()
         if int(arviz.__version__.split(".")[0]) >= 1:
@@ -243,8 +243,8 @@ def _numpyro() -> Any:
         import numpyro.infer
     except ImportError:
         raise ImportError(
-            'dvi.sample needs numpyro, which an extra installs: pip install "dvi-jax[bayes]". '
-            "(dvi.Posterior does not need it, for a sampler of your own.)"
+            'dvi.sample requires numpyro: pip install "dvi-jax[bayes]". (dvi.Posterior does not '
+            "require it: use it with your own sampler.)"
         ) from None
     return numpyro
 
@@ -261,8 +261,8 @@ def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) 
     space, x = make_space(*given)
     if list(space.names) != posterior.names:
         raise ValueError(
-            f"start has the parameters {', '.join(space.names[:8])}, those to be sampled are "
-            f"{', '.join(posterior.names[:8])}."
+            f"start must have the parameters that are sampled, {', '.join(posterior.names[:8])}; "
+            f"it has {', '.join(space.names[:8])}."
         )
     if is_fit:
         at_bounds = np.isin(posterior.names, posterior._space.at_bounds(x, start.sigma))

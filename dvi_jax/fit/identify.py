@@ -208,18 +208,16 @@ def _check_input(
     known = (*_OPTIONS, *_OF_FIRST, "check_curvature")
     for name in options:
         if name not in known:
-            raise TypeError(f"dvi.identify takes no {name!r}: options are {', '.join(known)}.")
+            raise TypeError(f"dvi.identify has no option {name!r}; it has {', '.join(known)}.")
     instance("library", library, ForceLibrary, "a dvi.ForceLibrary")
     if library.coefficients is not None:
-        raise ValueError("the library has coefficients already: give one without them.")
+        raise ValueError("library already has coefficients: make a dvi.ForceLibrary without them.")
     losses = "dvi.LeastSquares(), dvi.SoftL1() or dvi.Cauchy()"
     instance("loss", loss, Loss, losses, "Terms are distinguished from noise by residuals.")
     for name, given in (("params", params), ("bounds", bounds), ("priors", priors)):
         instance(name, {} if given is None else given, Mapping, "a dict or None")
         if given is not None and KEY in given:
-            raise ValueError(
-                f"{name} must have no {KEY!r}: they follow from the library and start at 0."
-            )
+            raise ValueError(f"{name} must not have {KEY!r}: library adds them, starting at 0.")
     if penalty is not None:
         positive("penalty", penalty)
 
@@ -271,8 +269,8 @@ def _extended(
     alone = not np.any(np.asarray(epsilon)) and "epsilon" not in params
     if alone and is_perturbed:
         raise ValueError(
-            "the model has a known perturbation, but epsilon = 0, which would remove it and the "
-            "library: give epsilon."
+            "the model has a known perturbation, but epsilon = 0 would remove it and the library: "
+            "let the model return another epsilon, or fit it as a parameter."
         )
     return _Extended(model, library, many, alone)
 

@@ -49,7 +49,7 @@ class ForceLibrary(eqx.Module):
         a_dict = "a dict {name: function (t0, t1, q0, p1, args)}"
         instance("the candidates of a dvi.ForceLibrary", candidates, Mapping, a_dict)
         if not candidates:
-            raise ValueError("dvi.ForceLibrary needs at least one candidate.")
+            raise ValueError("candidates is empty: dvi.ForceLibrary requires at least one.")
         for name, function in candidates.items():
             instance("the name of a candidate", name, str, "a string")
             if not (callable(function) and accepts(function, 5)):
@@ -98,8 +98,8 @@ class ForceLibrary(eqx.Module):
             value = function(t0, t1, q0, p1, args)
             if jnp.shape(value) != q0.shape:
                 raise ValueError(
-                    f"the candidate {name!r} must return an array shaped like q0, {q0.shape}; it "
-                    f"returned shape {jnp.shape(value)}."
+                    f"the candidate {name!r} must return an array of the shape of q0, {q0.shape}; "
+                    f"it returned shape {jnp.shape(value)}."
                 )
             total = total + c[i] * value
         return total
@@ -110,7 +110,7 @@ class ForceLibrary(eqx.Module):
         if not (isinstance(args, Mapping) and KEY in args):
             raise ValueError(
                 f'a dvi.ForceLibrary without coefficients reads them from args["{KEY}"]: give '
-                f'args={{"{KEY}": array of shape ({len(self.names)},)}}, or take '
+                f'args={{"{KEY}": array of shape ({len(self.names)},)}}, or use '
                 f"library.with_coefficients(...). Got args={args!r}."
             )
         c = jnp.asarray(args[KEY])
@@ -135,7 +135,7 @@ class ForceLibrary(eqx.Module):
         if both:
             raise ValueError(f"both libraries have a candidate {both[0]!r}: rename one of them.")
         if (self.coefficients is None) != (other.coefficients is None):
-            raise ValueError("one library has coefficients, the other has none.")
+            raise ValueError("both libraries must have coefficients, or neither of them.")
         c = None
         if self.coefficients is not None and other.coefficients is not None:
             c = jnp.concatenate([self.coefficients, other.coefficients])
@@ -163,9 +163,7 @@ class ForceLibrary(eqx.Module):
         names = tuple(names)
         for name in names:
             if name not in self.names:
-                raise ValueError(
-                    f"there is no candidate {name!r}; there are {', '.join(self.names)}."
-                )
+                raise ValueError(f"unknown candidate {name!r}; known are {', '.join(self.names)}.")
         return names
 
     def _candidates(self) -> dict[str, Callable[..., Any]]:

@@ -74,7 +74,7 @@ class Model(eqx.Module):
         for name in options:
             if name not in _OPTIONS:
                 raise TypeError(
-                    f"dvi.Model takes no {name!r}: options are {', '.join(_OPTIONS)}; what is "
+                    f"dvi.Model has no option {name!r}; it has {', '.join(_OPTIONS)}. What is "
                     "saved and observed follows from the data."
                 )
         # Arrays, so that another value needs no other compilation.
@@ -87,23 +87,23 @@ class Model(eqx.Module):
         allowed = ", ".join(_MAY_BE_FITTED)
         if not isinstance(params, Mapping):
             raise TypeError(
-                f"the parameters of a dvi.Model are a dict with keys among {allowed}, got "
-                f"{type(params).__name__}. For any other pytree write the model as a function "
-                "(params) that returns the arguments of integrate."
+                f"params of a dvi.Model must be a dict with keys among {allowed}, got "
+                f"{type(params).__name__}. For other structures write the model as a function "
+                "(params) that returns the arguments of dvi.integrate."
             )
         found = dict(self.fixed)
         for name, value in params.items():
             if name not in _MAY_BE_FITTED:
                 raise TypeError(
-                    f"{name!r} is not a parameter of a dvi.Model: they are {allowed}. A parameter "
-                    f'of the system goes under args: {{"args": {{{name!r}: ...}}}}.'
+                    f"{name!r} is not a parameter of a dvi.Model; these are {allowed}. Put a "
+                    f'parameter of the system into args: {{"args": {{{name!r}: ...}}}}.'
                 )
             old = found[name]
             both = isinstance(old, Mapping) and isinstance(value, Mapping)
             found[name] = {**old, **value} if both else value
         for name in ("q0", "p0"):
             if found[name] is None:
-                raise TypeError(f"{name} is neither in dvi.Model(..., {name}=...) nor a parameter.")
+                raise TypeError(f"{name} is missing: give dvi.Model(..., {name}=...), or fit it.")
             if arc is not None:
                 found[name] = _row(name, found[name], arc)
         return {**self.rest, **found}
@@ -114,8 +114,7 @@ class Model(eqx.Module):
             shape = np.shape(params.get(name, self.fixed[name]))
             if shape[0] != arcs:
                 raise ValueError(
-                    f"{name} has shape {shape}, but data is a list of {arcs} arcs: it needs a row "
-                    "for each."
+                    f"{name} needs one row for each of {arcs} arcs, got shape {shape}."
                 )
 
 
@@ -129,9 +128,7 @@ def _row(name: str, rows: Any, arc: Any) -> Array:
     rows = jnp.asarray(rows)
     # JAX takes the last row for a number that is too large, without an error.
     if rows.ndim == 0 or (not is_traced(arc) and arc >= len(rows)):
-        raise ValueError(
-            f"{name} has shape {rows.shape}: data is a list of arcs, so it needs a row for each."
-        )
+        raise ValueError(f"{name} needs one row for each arc in data, got shape {rows.shape}.")
     return rows[arc]
 
 
@@ -151,15 +148,15 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: boo
     found = dict(instance("what the model returns", found, Mapping, called))
     for name in ("system", "q0", "p0", "h"):
         if found.get(name) is None:
-            raise ValueError(f"the model's arguments of dvi.integrate lack {name!r}.")
+            raise ValueError(f"the model must return {name!r} for dvi.integrate, which is missing.")
     for name in _OWN:
         if name in found and not (name == "num_steps" and not _is_uniform(found)):
             hint = " (Observations(..., t0=...))" if name == "t0" else ""
-            raise ValueError(f"the model must not set {name!r}: it follows from the data{hint}.")
+            raise ValueError(f"leave {name!r} out of the model: it follows from the data{hint}.")
     if isinstance(found["h"], jax.Array):
         raise ValueError(
-            "the step size h of the model must be a number such as 0.1, not a parameter nor a JAX "
-            "array: the number of steps to the data follows from it."
+            "the step size h of the model must be a Python number such as 0.1, not a parameter or "
+            "JAX array: it determines the number of steps."
         )
     return found
 

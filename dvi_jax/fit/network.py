@@ -79,7 +79,7 @@ class NetworkForce(eqx.Module):
         initial: float = 0.3,
     ):
         if not (conservative or dissipative):
-            raise ValueError("conservative and dissipative are both False: no force is left.")
+            raise ValueError("conservative and dissipative are both False: set one to True.")
         self.n = whole("n", n)
         self.damping_of = one_of("damping_of", damping_of, ("q", "qp"))
         self.scale_q, self.scale_p = positive("scale_q", scale_q), positive("scale_p", scale_p)
@@ -157,8 +157,8 @@ class NetworkForce(eqx.Module):
         x = jnp.asarray(x)
         if x.shape != (self.n,):
             raise ValueError(
-                f"this NetworkForce is made for q and p of shape ({self.n},), got {x.shape}: "
-                "dvi.NetworkForce(n, ...)."
+                f"this NetworkForce was made for n = {self.n} coordinates, q and p of shape "
+                f"({self.n},), got {x.shape}: make it with the n of the system."
             )
         return x
 

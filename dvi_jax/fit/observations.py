@@ -77,11 +77,9 @@ class Observations:
             )
         _check_times(ts)
         if where := _first(np.isinf(values)):
-            raise ValueError(
-                f"values is infinite at index {where}. A missing component is given as NaN."
-            )
+            raise ValueError(f"values is infinite at index {where}: give NaN for a missing value.")
         if np.isnan(values).all():
-            raise ValueError("all values are NaN, which means missing: nothing was observed.")
+            raise ValueError("all values are NaN, which means missing: give at least one number.")
         refuse_unit_or_mask("t0", self.t0)
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():
@@ -95,7 +93,7 @@ class Observations:
             checked["sigma"] = _sigma(self.sigma, values)
         if self.covariance is not None:
             if self.sigma is not None:
-                raise ValueError("give sigma or covariance, not both.")
+                raise ValueError("sigma and covariance are both given: give only one of them.")
             checked["covariance"] = _covariance(self.covariance, values)
         checked["t0_is_given"] = self.t0 is not None
         for name, value in checked.items():
@@ -168,14 +166,14 @@ def as_arcs(data: Any) -> tuple[list[Observations], bool]:
         return [data], False
     instance("data", data, list | tuple, "a dvi.Observations or a list of them, one for each arc")
     if not data:
-        raise ValueError("data is an empty list: there is nothing to fit.")
+        raise ValueError("data is an empty list: give at least one dvi.Observations.")
     for i, arc in enumerate(data):
         instance(f"data[{i}]", arc, Observations, "a dvi.Observations")
     known = [arc.has_errors for arc in data]
     if any(known) and not all(known):
         raise ValueError(
-            f"data[{known.index(False)}] has neither sigma nor covariance while other arcs have: "
-            "their weights would be arbitrary. Give errors for all arcs, or for none."
+            f"data[{known.index(False)}] has neither sigma nor covariance, but other arcs have one "
+            "of them. Give errors for all arcs, or for none; otherwise their weights are arbitrary."
         )
     return list(data), True
 
@@ -239,9 +237,9 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
     size = np.nanmax(np.abs(values)) or 1.0
     if at := _first(~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & seen):
         raise ValueError(
-            f"sigma is {full[tuple(at)]:g} for the value at index {at}, and the values are up to "
-            f"{size:.3g}: squares of their ratio are beyond the range of double precision. Give "
-            "the standard errors in the units of the values."
+            f"sigma is {full[tuple(at)]:g} for the value at index {at}, but the values are up to "
+            f"{size:.3g}: the square of the ratio is outside of double precision. Give the "
+            "standard errors in the units of the values."
         )
     return full
 
@@ -262,7 +260,8 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
     if at := _first(~(skew <= 1e-10 * (scale.max(axis=1) ** 2 + np.finfo(float).tiny))):
         [i] = at
         raise ValueError(
-            f"the covariance of observation {i} is not symmetric and finite: {full[i]}"
+            f"the covariance of observation {i} must be symmetric and finite, got "
+            f"{full[i].tolist()}."
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         unit = full / (scale[:, :, None] * scale[:, None, :])

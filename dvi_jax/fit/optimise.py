@@ -319,7 +319,10 @@ class ScalarStage:
         zero = jnp.zeros(len(u))
         state = self.solver.init(function, zero, known(), {}, struct, None, frozenset())
         if not (hasattr(state, "f") or hasattr(state, "f_info")):
-            raise TypeError(f"{type(self.solver).__name__} does not report the loss of its steps.")
+            raise TypeError(
+                f"optimiser={type(self.solver).__name__} cannot be used, because it does not "
+                "report the loss of its steps: leave optimiser out, or use another one."
+            )
         if task.resume is not None:
             state = _with_leaves(state, at.leaves)
         fixed_steps = is_optax(self.solver)
@@ -352,8 +355,8 @@ def _check_same(now: Any, then: Any) -> None:
     """Refuse a checkpoint whose residuals are not those of this model."""
     if not np.allclose(now, then, rtol=1e-6, atol=1e-6 * float(np.abs(then).max(initial=0.0))):
         raise ValueError(
-            "the checkpoint is of another model: at its parameters this one predicts other values. "
-            "Give another file, or remove it to start again."
+            "the checkpoint is of another model, which predicts other values at the same "
+            "parameters. Give another file, or remove it to start again."
         )
 
 
@@ -366,6 +369,6 @@ def _with_leaves(state: Any, leaves: list[np.ndarray]) -> Any:
     arrays, rest = eqx.partition(state, eqx.is_array)
     old, tree = jax.tree.flatten(arrays)
     if [np.shape(x) for x in old] != [np.shape(x) for x in leaves]:
-        raise ValueError("the checkpoint is of another fit: its optimiser has another state.")
+        raise ValueError("the checkpoint is of a fit with another optimiser: give another file.")
     new = [jnp.asarray(x, o.dtype) for x, o in zip(leaves, old, strict=True)]
     return eqx.combine(jax.tree.unflatten(tree, new), rest)

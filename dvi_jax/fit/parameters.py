@@ -169,8 +169,8 @@ def make_space(
     paths, tree = jax.tree_util.tree_flatten_with_path(numbers)
     if not paths:
         raise ValueError(
-            f"params holds no number that could be fitted: {params!r}. Give starting values as "
-            "floats or floating-point arrays."
+            f"params has no number that can be fitted: {params!r}. Give initial values as floats "
+            "or floating-point arrays."
         )
     names, places = [], {}
     for path, leaf in paths:
@@ -183,7 +183,7 @@ def make_space(
         names += [f"{name}[{', '.join(map(str, i))}]" for i in each] if shape else [name]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"two parameters are called {twice}: give their keys other names.")
+        raise ValueError(f"two parameters have the name {twice}: rename one of their keys.")
     x = np.concatenate([np.ravel(np.asarray(leaf, float)) for _, leaf in paths])
     limits, _ = _given(bounds, Bounds, {"lower": -np.inf, "upper": np.inf}, places, len(x))
     (mean, sigma), has = _given(priors, Prior, {"mean": np.nan, "sigma": np.nan}, places, len(x))
@@ -238,8 +238,8 @@ def _given(
         name = _name(path)
         if not isinstance(given, kind):
             raise TypeError(
-                f"{called} must be made like the parameters, with dvi.{kind.__name__}(...) or None "
-                f"in place of numbers; at {name} it holds {given!r}."
+                f"{called} must have the structure of params, with dvi.{kind.__name__}(...) or "
+                f"None in place of numbers; at {name} it has {given!r}."
             )
         under = tuple(name + end for end in ("[", "."))
         below = [k for k in places if not path or k == name or k.startswith(under)]
@@ -264,7 +264,7 @@ def _spread(value: Any, size: int, shape: tuple[int, ...], called: str) -> np.nd
     except (TypeError, ValueError):
         raise TypeError(f"{called} must be a number or an array, got {value!r}.") from None
     if value.ndim and value.shape != shape:
-        raise ValueError(f"{called} has shape {value.shape}, the parameter has {shape}.")
+        raise ValueError(f"{called} must be a number or have shape {shape}, got {value.shape}.")
     return value.ravel() if value.ndim else np.full(size, float(value))
 
 

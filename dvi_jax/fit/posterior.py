@@ -82,8 +82,8 @@ class Posterior:
             raise ValueError(
                 f"{free} parameters without a prior or two bounds"
                 + (", and the size of the errors," if lost else "")
-                + f" cannot follow from {count} observed values: the posterior has no integral. "
-                "Give priors, bounds on both sides, or more observations."
+                + f" cannot be determined from {count} observed values: the posterior cannot be "
+                "normalised. Give priors, bounds on both sides, or more observations."
             )
         self._slopes = self._forward if gradient == "forward" else self._reverse
         self._potential = jax.jit(_guarded(self._value, self._slopes))
@@ -180,8 +180,8 @@ class Posterior:
         if about.undetermined.size:
             words = "; ".join(in_words(d, self.names) for d in about.undetermined.T)
             raise ValueError(
-                f"neither the data nor priors determine {words}: the posterior has no integral "
-                "along it. Give a prior or bounds on both sides, or sample fewer parameters."
+                f"neither the data nor priors determine {words}: the posterior cannot be "
+                "normalised. Give a prior or bounds on both sides, or sample fewer parameters."
             )
         return u, about.directions / about.singular_values
 
@@ -191,7 +191,7 @@ class Posterior:
             raise ValueError(
                 f"the posterior density is 0 at the start ({self._space.in_words(x)}): the "
                 "model's trajectory fails, or its misfit is NaN. Start from other "
-                "parameters, or take a smaller h."
+                "parameters, or use a smaller h."
             )
 
     def _descend(self, u: np.ndarray, max_steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -113,7 +113,7 @@ class Core(eqx.Module):
 
     def _likelihood(self, group: Group, found: Array, horizon: Any, params: PyTree) -> Array:
         if group.whiten.ndim == 4:
-            raise ValueError("dvi.Likelihood takes sigma, not covariance, with the observations.")
+            raise ValueError("dvi.Likelihood requires Observations with sigma, not covariance.")
         keep, values = within(group, horizon), jnp.asarray(group.values)
         sigma = 1 / jnp.where(keep, jnp.asarray(group.whiten), 1.0)
         # Missing values get the observed ones as predictions, so that no NaN reaches the density.
@@ -210,8 +210,8 @@ class Problem:
             robust = not isinstance(loss, LeastSquares)
             if self.space.count_of_priors or robust:
                 raise ValueError(
-                    f"{'a robust loss' if robust else 'priors'} can only be weighed against data "
-                    "with errors: give sigma or covariance with the observations."
+                    f"{'a robust loss' if robust else 'priors'} can only be used with data that "
+                    "have errors: give sigma or covariance in dvi.Observations."
                 )
         if isinstance(model, Model):
             check_system(model.rest["system"])
@@ -258,9 +258,9 @@ class Problem:
         if self.degrees_of_freedom < 0:
             priors = self.space.count_of_priors
             raise ValueError(
-                f"{self.size} parameters cannot follow from {self.count} observed values"
+                f"{self.size} parameters cannot be determined from {self.count} observed values"
                 + (f" and {priors} priors" if priors else "")
-                + ". Fit fewer parameters, give priors, or more observations."
+                + ". Fit fewer parameters, or give priors or more observations."
             )
 
     # ---- the functions of `core`, compiled

@@ -218,14 +218,14 @@ class FitResult:
         if params is None:
             if about["shape"] is None:
                 raise ValueError(
-                    "these parameters hold more than numbers: use FitResult.load(path, params) "
-                    "with a pytree like the fitted one."
+                    f"the parameters in {path} are not only dicts, lists and numbers: call "
+                    "FitResult.load(path, params) with params of the same structure."
                 )
             params = jax.tree.map(np.array, about["shape"], is_leaf=lambda x: isinstance(x, list))
         space, _ = make_space(params)
         if list(space.names) != about["names"]:
             raise ValueError(
-                f"the fit in {path} has the parameters {about['names'][:5]}…, not "
+                f"params must have the parameters of the fit in {path}, {about['names'][:5]}…, got "
                 f"{space.names[:5]}…."
             )
         by_arc: dict[str, Any] = {

@@ -54,9 +54,11 @@ class Run:
         if self.checkpoint is not None:
             file = Path(self.checkpoint)
             if not file.parent.is_dir():
-                raise FileNotFoundError(f"there is no directory for the checkpoint {file}.")
+                raise FileNotFoundError(
+                    f"there is no directory for the checkpoint {file}: create it first."
+                )
             if file.is_dir():
-                raise IsADirectoryError(f"checkpoint must be a file, {file} is a directory.")
+                raise IsADirectoryError(f"checkpoint must be a file, but {file} is a directory.")
             if file.exists():
                 self.resume, self.records = _read_checkpoint(file, self.identity)
 
@@ -83,8 +85,8 @@ class Run:
                 _write_checkpoint(self.checkpoint, self.identity, position, self.records)
             except OSError as error:  # no reason to lose the fit as well
                 warnings.warn(
-                    f"the checkpoint cannot be written ({error}). The fit goes on and tries again; "
-                    "a checkpoint that was written before is unchanged.",
+                    f"the checkpoint cannot be written ({error}). The fit continues and tries "
+                    "again; a checkpoint that was written before is unchanged.",
                     stacklevel=2,
                 )
             self.saved = time.monotonic()

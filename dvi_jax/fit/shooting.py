@@ -85,14 +85,17 @@ class Segments:
         self.problem, self.shooting = problem, shooting
         spec, arcs, S = problem.specs[0], problem.arcs, shooting.segments
         if any(s["h"] != spec["h"] for s in problem.specs) or problem.groups[0].block == 0:
-            raise ValueError("multiple shooting needs a uniform lattice, and one h for all arcs.")
+            raise ValueError("MultipleShooting requires dvi.Uniform() and the same h for all arcs.")
         if len({(a.function, a.values.shape[1:], a.covariance is None) for a in arcs}) > 1:
-            raise ValueError("multiple shooting needs arcs that observe the same.")
+            raise ValueError(
+                "MultipleShooting requires arcs with the same observe and the same number of "
+                "values at a time, all of them with covariance or all without."
+            )
         h = float(spec["h"])
         steps = max(math.ceil(abs(a.ts[-1] - a.t0) / abs(h) - 1e-9) for a in arcs)
         self.steps = math.ceil(steps / S)
         if self.steps < 1 or steps < S:
-            raise ValueError(f"{S} segments of {steps} steps: take fewer segments.")
+            raise ValueError(f"segments={S} must be at most the number of steps, {steps}.")
         self.cuts = np.array([[arc.t0 + s * self.steps * h for s in range(S)] for arc in arcs])
         parts = []
         for arc, cuts in zip(arcs, self.cuts, strict=True):
@@ -136,7 +139,8 @@ class Segments:
             found = np.array([np.concatenate([np.ravel(q), np.ravel(p)]) for q, p in pairs], float)
             if found.shape != (len(times), 2 * self.half):
                 raise ValueError(
-                    f"the guess of MultipleShooting must return (q, p) of shape {self.shape}."
+                    "the guess of MultipleShooting must return (q, p), each of shape "
+                    f"{self.shape}, got {found.shape[1]} numbers in all."
                 )
         elif guess == "data":
             found = from_data(arc, spec, times)
@@ -147,7 +151,7 @@ class Segments:
             found = np.concatenate(flat, axis=1)
         if not np.isfinite(found).all():
             raise ValueError(
-                f"arc {i}: the guess of the segments' starts is not finite at t = "
+                f"arc {i}: the guess of the segments' initial states is not finite at t = "
                 f"{times[np.argmin(np.isfinite(found).all(axis=1))]:g}. Give "
                 "dvi.MultipleShooting(guess=...) as a function t → (q, p)."
             )

@@ -16,7 +16,7 @@ def needed(package: str, by: str) -> Any:
         if error.name not in (None, package, package.partition(".")[0]):
             raise  # the package is installed, and something that it needs is not
         raise ImportError(
-            f"{by} needs {package.partition('.')[0]}, which is in the extra: "
+            f"{by} requires {package.partition('.')[0]}, which is not installed: "
             'pip install "dvi-jax[interop]".',
             name=package,
         ) from None

@@ -52,7 +52,7 @@ def as_pair(y: Any) -> tuple[Any, Any]:
         raise TypeError(f"the state must be a pair y0 = (q0, p0), got {type(y).__name__}.")
     q, p = (jnp.asarray(x) for x in y)
     if q.shape != p.shape:
-        raise ValueError(f"q and p must have one shape, got {q.shape} and {p.shape}.")
+        raise ValueError(f"q0 and p0 in y0 must have the same shape, got {q.shape} and {p.shape}.")
     return q, p
 
 

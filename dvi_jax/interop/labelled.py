@@ -64,13 +64,13 @@ def to_xarray(
     expect("solution", solution, dvi.Solution, f"a dvi.Solution {hint}")
     dims = (dims,) if isinstance(dims, str) else tuple(dims)
     if solution.result.is_traced():
-        raise TypeError("to_xarray takes values: call it outside of jit, vmap and grad.")
+        raise TypeError("to_xarray needs known values: call it outside of jit, vmap and grad.")
     ts, hs = np.asarray(solution.ts), np.asarray(solution.hs)
     *batch, count = ts.shape
     if len(dims) != len(batch):
         raise ValueError(
-            f"the batch has {len(batch)} dimensions, of sizes {batch}, and dims names {len(dims)}: "
-            f"{dims}. Name each, in the order of the vmaps from the outermost."
+            f"the batch has {len(batch)} dimensions, of sizes {batch}, but dims has {len(dims)} "
+            f"names: {dims}. Name each dimension, that of the outermost vmap first."
         )
     for name in dims:
         _check_free("dimension", name, name in _TAKEN or dims.count(name) > 1)
@@ -92,8 +92,8 @@ def to_xarray(
         own = value.shape[len(dims) :]
         if per_step and own[:1] != hs.shape[-1:]:
             raise ValueError(
-                f"observe says that {name!r} has a value for each of {hs.shape[-1]} steps, and its "
-                f"shape is {own}: give the observe that integrate was given."
+                f"by observe, {name!r} has a value for each of {hs.shape[-1]} steps, but its shape "
+                f"is {own}: give the same observe as to integrate."
             )
         front = [step] * per_step
         add(name, [*front, *_own(name, own[len(front) :])], value)
@@ -176,7 +176,7 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
 
 def _check_free(kind: str, name: str, is_taken: bool) -> None:
     if is_taken:
-        raise ValueError(f"the {kind} {name!r} has a name that is taken: give it another.")
+        raise ValueError(f"the name of the {kind} {name!r} is already in use: choose another.")
 
 
 def _components(
@@ -190,8 +190,8 @@ def _components(
     sizes = tuple(len(labels) for labels in components.values())
     if sizes != tuple(shape):
         raise ValueError(
-            f"components labels axes of sizes {sizes}, and q has the shape {tuple(shape)}: give "
-            "one list of labels for each axis."
+            f"components has labels for axes of sizes {sizes}, but q has the shape {tuple(shape)}: "
+            "give one list of labels for each axis."
         )
     return tuple(components), {name: list(labels) for name, labels in components.items()}
 
@@ -215,7 +215,7 @@ def _observed(observed: Any, observe: Any) -> list[tuple[str, np.ndarray, bool]]
         # Without `observe` one None applies to all.
         flags = jax.tree.map(flags_of, observe, observed, is_leaf=is_observable)
     except ValueError as error:
-        raise ValueError(f"observe is not that of this solution: {error}.") from None
+        raise ValueError(f"observe must be the one given to integrate: {error}.") from None
     arrays = jax.tree.leaves_with_path(observed, is_leaf=eqx.is_array)
     names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in arrays]
     names = [f"observed.{n}".rstrip(".") if not n or n[0].isdigit() else n for n in names]

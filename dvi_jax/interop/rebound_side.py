@@ -128,9 +128,7 @@ def from_rebound(
             ) from None
         simulation.synchronize()  # a snapshot may have been taken between half steps
     elif snapshot != -1:
-        raise ValueError(
-            f"snapshot={snapshot} can be given for the path of a file, not for a simulation."
-        )
+        raise ValueError(f"snapshot={snapshot} is for files only: leave it out with a simulation.")
     called = "a rebound.Simulation (of an archive one snapshot, archive[i]), or the path of a file"
     expect("simulation", simulation, rebound.Simulation, called)
     _check_convertible(simulation)
@@ -192,7 +190,7 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
             "Hamiltonian, a force or a perturbation, which REBOUND would leave out."
         )
     if (q is None) != (p is None):
-        raise TypeError("a state is q and p together, or neither of them.")
+        raise TypeError("q and p must be given together, or neither of them.")
     masses = np.asarray(args["masses"], float)
     theirs = problem if isinstance(problem, ReboundProblem) else None
     velocities = theirs.velocities if theirs is not None and q is None else None
@@ -250,7 +248,7 @@ def _check_convertible(sim: Any) -> None:
     if not sim.is_synchronized:
         raise ValueError("the simulation is in the middle of a step: call sim.synchronize() first.")
     if sim.N == 0:
-        raise ValueError("the simulation has no bodies.")
+        raise ValueError("the simulation has no bodies: add some with sim.add(...).")
 
 
 def _finite(whose: str, what: Any, fields: Sequence[str]) -> dict[str, float]:
@@ -272,7 +270,7 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
     heavy = np.flatnonzero(masses[active:]) + active
     if heavy.size and (sim.testparticle_type == 0 or len(masses) - active > 1):
         raise ValueError(
-            f"N_active = {active} and body {heavy[0]} behind it has the mass {masses[heavy[0]]:g}: "
+            f"N_active = {active}, but body {heavy[0]} after it has the mass {masses[heavy[0]]:g}: "
             "REBOUND leaves out some of the attraction between such test particles, so that there "
             "is no Hamiltonian. Give them mass 0, or set sim.N_active to all bodies."
         )
@@ -286,7 +284,7 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
             f"them a tiny mass: from_rebound(sim, massless={1e-20 * masses.max() or 1e-20:.0e})."
         )
     if not 0 < massless < np.inf:
-        raise ValueError(f"massless must be a positive mass, got {massless!r}.")
+        raise ValueError(f"massless must be a positive and finite mass, got {massless!r}.")
     return np.where(empty, massless, masses)
 
 

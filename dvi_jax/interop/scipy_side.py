@@ -102,8 +102,8 @@ def solve_ivp(
     through it; take ``dvi.integrate`` for that.
     """
     for name in unsupported:
-        reason = _REJECTED.get(name, "SciPy's solve_ivp does not know it either, or it is new")
-        raise TypeError(f"interop.solve_ivp takes no {name}: {reason}.")
+        reason = _REJECTED.get(name, "it is unknown, also in SciPy's solve_ivp, or it is too new")
+        raise TypeError(f"interop.solve_ivp has no argument {name!r}: {reason}.")
     for name, given in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
         refuse_unit_or_mask(name, given)
     bunch = needed("scipy.optimize", "interop.solve_ivp").OptimizeResult
@@ -204,9 +204,7 @@ def _span(t_span: Any, h: Any) -> tuple[float, float, int]:
         raise ValueError(f"t_span must be two finite times (t0, t1) that differ, got {t_span!r}.")
     step = float(h) if np.ndim(h) == 0 and np.asarray(h).dtype.kind in "iuf" else math.nan
     if not (math.isfinite(step) and step > 0):
-        raise ValueError(
-            f"h must be a positive and finite step, got {h}; the direction is that of t_span."
-        )
+        raise ValueError(f"h must be positive and finite (t_span gives the direction), got {h}.")
     # 1/0.1 is 10 steps, not 11.
     return t0, t1, max(1, math.ceil(abs(t1 - t0) / step * (1 - 1e-12)))
 
@@ -216,8 +214,8 @@ def _halves(y0: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
     shape = (y0.size // 2,) if shape is None else tuple(np.ravel(shape).tolist())
     if y0.ndim != 1 or y0.size == 0 or y0.size != 2 * math.prod(shape):
         raise ValueError(
-            "y0 must be one vector, q0 and then p0, of an even length; got the shape "
-            f"{y0.shape}, and q has the shape {shape}."
+            "y0 must be one vector, all of q0 and then all of p0, of even length; got the shape "
+            f"{y0.shape} for a q0 of shape {shape}."
         )
     q0, p0 = np.split(y0, 2)
     return q0.reshape(shape), p0.reshape(shape)
@@ -229,11 +227,12 @@ def _times(t_eval: Any, t0: float, t1: float) -> np.ndarray | None:
     times, low, high = np.asarray(t_eval, float), min(t0, t1), max(t0, t1)
     if times.ndim != 1 or not ((times >= low) & (times <= high)).all():
         raise ValueError(
-            f"t_eval must be one-dimensional, shape {times.shape}, and within t_span, "
-            f"[{low}, {high}]."
+            f"t_eval must be a one-dimensional array of times from {low} to {high} (t_span), got "
+            f"{t_eval!r:.200}."
         )
     if not (np.diff(times) * np.sign(t1 - t0) > 0).all():
-        raise ValueError("values in t_eval must be in the order of the run, no two alike.")
+        order = "increasing" if t1 > t0 else "decreasing"
+        raise ValueError(f"t_eval must be strictly {order}, like t_span; got {t_eval!r:.200}.")
     return times
 
 

@@ -69,8 +69,8 @@ class UnitSystem:
                 return u.CompositeUnit(1.0, parts.bases, parts.powers)
             except (AttributeError, u.UnitConversionError):  # °C, magnitudes, photons
                 raise ValueError(
-                    f"{name} cannot be in {unit}, which no factor takes to length, time, mass, "
-                    "angle, current, temperature (K), amount and luminous intensity: convert it."
+                    f"{name} cannot be in {unit}, which is not proportional to a product of powers "
+                    "of m, s, kg, rad, A, K, mol and cd: convert it to a unit that is."
                 ) from None
 
         named = {name: coherent(name, unit) for name, unit in (args or {}).items()}
@@ -92,8 +92,8 @@ class UnitSystem:
         read = {name: _read(u, text) for name, text in texts.items()}
         if bad := [name for name, unit in read.items() if unit is None]:
             raise ValueError(
-                f"{problem.name} measures {bad[0]} in {texts[bad[0]]!r}, which is no unit of "
-                "astropy: give its numbers to dvi.integrate, or say units=UnitSystem(...)."
+                f"{problem.name} measures {bad[0]} in {texts[bad[0]]!r}, which is not a unit of "
+                "astropy: call dvi.integrate with numbers, or give units=UnitSystem(...)."
             )
         brackets = {n: re.search(r"\[([^\]]*)\]\s*$", m) for n, m in problem.parameters.items()}
         args = {name: _read(u, found[1]) for name, found in brackets.items() if found}
@@ -190,11 +190,11 @@ def integrate(
     save, lattice = options.get("save"), options.get("lattice")
     if getattr(save, "ts", None) is not None or isinstance(lattice, dvi.Given):
         raise TypeError(
-            "dvi.Save(ts=...) and dvi.Given(ts) have times without a unit. Give ts= a quantity in "
-            "place of the first; for the second call dvi.integrate on numbers."
+            "dvi.Save(ts=...) and dvi.Given(ts) have times without a unit. In place of Save give "
+            "ts=..., a quantity; for Given call dvi.integrate with numbers."
         )
     if ts is not None and save is not None:
-        raise TypeError("ts= sets which states are saved: leave save out.")
+        raise TypeError("ts=... already determines which states are saved: leave save out.")
     if ts is not None:
         options["save"] = dvi.Save(ts=_number(u, "ts", ts, taken.t))
     q0, p0, args = _filled(u, problem, own, q0, p0, args)
@@ -220,7 +220,7 @@ def _filled(
         expect(f"args of {problem.name}", args, Mapping, "a mapping from name to value")
         if unknown := [name for name in args if name not in known]:
             raise ValueError(
-                f"args has {unknown[0]!r}, and {problem.name} has no such parameter; it has "
+                f"args has {unknown[0]!r}, but {problem.name} has no such parameter; it has "
                 f"{', '.join(known)}."
             )
     if own is None:  # the units of its numbers are not known
@@ -247,8 +247,8 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
             return _number(u, f"args {name}", leaf, units.args[declared])
         if isinstance(leaf, u.Quantity) and leaf.unit != u.dimensionless_unscaled:
             raise TypeError(
-                f"args has {name} in {leaf.unit}, and the units do not say what it should be in: "
-                f'declare it, UnitSystem(..., args={{"{name}": u.Unit("{leaf.unit}")}}).'
+                f"args has {name} in {leaf.unit}, but units does not have a unit for it: declare "
+                f'it, UnitSystem(..., args={{"{name}": u.Unit("{leaf.unit}")}}).'
             )
         bare.append(name)
         return _number(u, f"args {name}", leaf, u.dimensionless_unscaled)
@@ -257,8 +257,8 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     unmet = [name for name in units.args if name not in seen]
     if unmet and bare:  # a mistyped name would let a bare number through
         raise ValueError(
-            f"units has {', '.join(unmet)}, which args has not, and args has {', '.join(bare)} "
-            "without a unit: name in UnitSystem(args=...) what args has, and nothing else."
+            f"UnitSystem(args=...) has {', '.join(unmet)}, which is not in args, and args has "
+            f"{', '.join(bare)} without a unit: use the same names in both."
         )
     return numbers
 
@@ -271,24 +271,24 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
             value = u.Quantity(given)
         except (TypeError, u.UnitsError) as error:
             raise TypeError(
-                f"{name} mixes quantities and numbers, or units that do not go together: {error}."
+                f"{name} mixes quantities with plain numbers, or incompatible units: {error}."
             ) from None
     if np.any(getattr(value, "mask", False)):
-        raise ValueError(f"{name} has masked values, and a run needs them all: {value!r}.")
+        raise ValueError(f"{name} must not have masked values, got {value!r}.")
     if not isinstance(value, u.Quantity):
         if unit == u.dimensionless_unscaled:
             return value
         seen = "is missing" if value is None else f"= {value!r} has no unit"
         raise TypeError(
-            f"{name} {seen}: everything that has a unit must say so here, such as "
-            f"{name.split()[-1]} * u.Unit({str(unit)!r}) or another unit of that kind."
+            f"{name} {seen}: give a quantity, such as {name.split()[-1]} * u.Unit({str(unit)!r}) "
+            "or in another unit of that kind."
         )
     try:
         return value.to_value(unit, equivalencies=u.dimensionless_angles())
     except u.UnitConversionError:
         offset = ": in kelvin, x.to(u.K, u.temperature())" if value.unit == u.deg_C else ""
         raise ValueError(
-            f"{name} is in {str(value.unit) or 1} ({value.unit.physical_type}); it has to be "
+            f"{name} is in {str(value.unit) or 1} ({value.unit.physical_type}), but must be "
             f"convertible to {str(unit) or 1} ({unit.physical_type}){offset}."
         ) from None
 
@@ -297,9 +297,7 @@ def _unit(u: Any, name: str, what: Any) -> Any:
     try:
         return u.Unit(what)
     except (ValueError, TypeError) as error:
-        raise ValueError(
-            f"the unit of {name}, {what!r}, is not known to astropy: {error}"
-        ) from None
+        raise ValueError(f"the unit of {name}, {what!r}, is unknown to astropy: {error}") from None
 
 
 def _read(u: Any, text: str) -> Any:

@@ -104,8 +104,8 @@ class StepSizes(Lattice):
         missing = [name for name, x in (("h", h), ("num_steps", num_steps)) if x is None]
         if missing:
             raise TypeError(
-                f"a {type(self).__name__} lattice needs h and num_steps; {' and '.join(missing)} "
-                "is missing."
+                f"lattice={self!r} requires h and num_steps (with dvi.Uniform() also t1 or "
+                f"duration in place of num_steps). Not given: {', '.join(missing)}."
             )
         return t0, h, check_num_steps(num_steps)
 
@@ -123,8 +123,8 @@ def check_num_steps(num_steps: object) -> int:
         count = None
     if count is None:
         raise TypeError(
-            f"num_steps must be a Python integer (it sets array shapes), got {num_steps!r}. Under "
-            "jit mark it static."
+            f"num_steps must be a Python integer (it determines array shapes), got {num_steps!r}. "
+            'Under jax.jit mark it static: static_argnames="num_steps".'
         )
     hint = "To go backwards in time give a negative h; run more steps in pieces, each from the "
     hint += "end of the one before."

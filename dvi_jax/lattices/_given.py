@@ -36,7 +36,7 @@ class Given(Lattice):
     def __check_init__(self):
         if self.ts.ndim != 1 or self.ts.shape[0] < 1:
             raise ValueError(
-                f"Given(ts) needs a one-dimensional array of times, got shape {self.ts.shape}."
+                f"ts of Given must be one-dimensional, and not empty, got shape {self.ts.shape}."
             )
         if not is_traced(self.ts):
             steps = np.diff(np.asarray(self.ts))
@@ -52,13 +52,13 @@ class Given(Lattice):
     def prepare(self, t0, h, num_steps):
         available = self.ts.shape[0] - 1
         if h is not None:
-            raise ValueError("h must be left out with the lattice Given(ts): ts sets the steps.")
+            raise ValueError(f"h={h!r} must be left out with Given(ts): ts determines the steps.")
         if not is_traced(t0) and not is_traced(self.ts) and t0 != 0.0 and t0 != self.ts[0]:
-            raise ValueError(f"t0={t0} contradicts Given(ts), which starts at {self.ts[0]}.")
+            raise ValueError(f"t0={t0} contradicts ts[0]={self.ts[0]} of Given(ts): leave t0 out.")
         if num_steps is not None and check_num_steps(num_steps) != available:
             raise ValueError(
                 f"num_steps={num_steps} contradicts Given(ts), whose {available + 1} times make "
-                f"{available} steps. Leave num_steps out, or cut ts."
+                f"{available} steps. Leave num_steps out, or shorten ts."
             )
         return self.ts[0], 1.0, available  # any h: the steps do not depend on it
 

@@ -149,14 +149,13 @@ class Extended(eqx.Module):
             return Running(self.seen(observable.reduction))
         if isinstance(observable, Trend):
             raise ValueError(
-                "a Trend over a TimeTransformed lattice would be a slope in its fictitious time: "
-                "observe the function alone and fit a line to it over solution.ts."
+                "observe has a Trend, which would be a slope in the fictitious time of "
+                "TimeTransformed: observe the function itself and fit a line over solution.ts."
             )
         if isinstance(observable, Deviations):
             raise ValueError(
-                f"{type(observable).__name__} needs steps whose size does not depend on the state, "
-                "and those of a TimeTransformed lattice do: take lattice=dvi.Uniform() or "
-                "dvi.Given(ts)."
+                f"{type(observable).__name__} requires steps whose size does not depend on the "
+                "state, unlike those of TimeTransformed: use dvi.Uniform() or dvi.Given(ts)."
             )
         if isinstance(observable, Section):
             return eqx.tree_at(lambda s: s.g, observable, _SeenPoint(observable.g, self))
@@ -230,6 +229,6 @@ def _check_speed(speed, t0, q0, p0, args) -> None:
     value = jnp.asarray(speed(t0, q0, p0, args))
     if value.shape != () or (not is_traced(value) and not float(value) > 0):
         raise ValueError(
-            "the speed of TimeTransformed must be a positive scalar; at the start it is "
+            "the speed of TimeTransformed must be a positive scalar; at t0, q0, p0 it is "
             f"{value if value.shape == () else f'an array of shape {value.shape}'}."
         )

@@ -15,20 +15,21 @@ class Uniform(StepSizes):
         given = {"num_steps": num_steps, "t1": t1, "duration": duration}
         names = [name for name, value in given.items() if value is not None]
         if len(names) > 1:
-            raise ValueError(f"{' and '.join(names)} are given: give one of them.")
+            raise ValueError(f"{' and '.join(names)} are given: give only one of them.")
         try:
             length = float(duration) if t1 is None else float(t1) - float(t0)
             steps = length / float(h)
         except TypeError:
             raise TypeError(
-                f"{names[0]} needs numbers for t0, h and {names[0]} (they set array shapes), got "
-                f"t0={t0!r}, h={h!r}, {names[0]}={given[names[0]]!r}. Under jit give num_steps."
+                f"{names[0]} requires that t0, h and {names[0]} are known numbers (they determine "
+                f"array shapes), got t0={t0!r}, h={h!r}, {names[0]}={given[names[0]]!r}. Under jit "
+                f"give num_steps in place of {names[0]}."
             ) from None
         count = round(steps) if math.isfinite(steps) else -1
         if count < 0:
             raise ValueError(
-                f"{names[0]}={given[names[0]]!r} is not reached from t0={t0!r} with h={h!r}: a "
-                "negative h runs backwards."
+                f"{names[0]}={given[names[0]]!r} is not reached from t0={t0!r} with h={h!r}: h > 0 "
+                "runs forwards in time, h < 0 backwards."
             )
         # (t1 − t0)/h has round-off, which is not a remaining part of a step.
         if abs(steps - count) > 1e-9 * max(1, count):

@@ -89,8 +89,8 @@ class Variational(StepSizes):
         one_of("on_no_root", self.on_no_root, get_args(Policy))
         if not (isinstance(self.reach, int | float) and 1 < self.reach < float("inf")):
             raise ValueError(
-                "reach must be a number above 1 (the largest ratio between a step and the one "
-                f"before it), got {self.reach!r}."
+                "reach (the largest ratio of a step size to the one before it) must be finite and "
+                f"greater than 1, got {self.reach!r}."
             )
         try:
             smallest, largest = map(float, self.bounds)
@@ -105,9 +105,9 @@ class Variational(StepSizes):
     def check(self, method, arithmetic):
         if not method.is_the_map:
             raise ValueError(
-                f"the lattice Variational() requires method=dvi.TypeII() only, got {method!r}: "
-                "(14) is the variation of that map's action. For a higher order use an H_D of "
-                "higher order, dvi.discretise(H, order=2)."
+                f"the lattice Variational() can be used with method=dvi.TypeII() only, got "
+                f"{method!r}: its equation (14) is derived for that map. For a higher order use an "
+                "H_D of higher order, dvi.discretise(H, order=2)."
             )
         if arithmetic.undoes_steps:
             raise ValueError(
@@ -222,7 +222,7 @@ class LatticeCondition(eqx.Module):
     ) -> Scalar:
         if self.system is None:
             raise ValueError(
-                "LatticeCondition has to know the system and ε: call "
+                "LatticeCondition requires the system and ε: call "
                 "condition.bind(system, epsilon)(...), or give it to dvi.integrate(observe=...)."
             )
         equations = Equations(self.system, self.epsilon, args)

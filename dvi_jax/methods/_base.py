@@ -74,8 +74,8 @@ class Method(eqx.Module):
         # The errors that a function raises for a q or args of another structure than it expects.
         except (TypeError, IndexError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(
-                f"could not trace the system for q of shape {q.shape} and args={args!r} ({error}). "
-                "Give an example: is_explicit(system, q=jnp.zeros(shape), args=...)."
+                f"the functions of the system fail for q of shape {q.shape} and args={args!r} "
+                f"({error}). Give an example: is_explicit(system, q=jnp.zeros(shape), args=...)."
             ) from error
         return found[0]
 
@@ -86,5 +86,5 @@ def check_invertible(name: str, method: Any) -> None:
     instance(name, method, Method, "a method such as dvi.TypeII()")
     if not method.is_invertible:
         raise ValueError(
-            f"{method!r} has no inverse step, so it has no adjoint: use a variational method."
+            f"{method!r} has no inverse step and no adjoint: use a variational one, dvi.TypeII()."
         )

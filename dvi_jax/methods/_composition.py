@@ -200,7 +200,7 @@ class Composition(CompositionMethod):
             raise ValueError(
                 f"these coefficients have order {found}, not {order}: their defect in the "
                 f"conditions of order {found + 1} is {defects[found]:.1e}, of the terms that "
-                f"cancel there. Claim order={found}, or give more digits."
+                f"cancel there. Set order={found}, or give the coefficients with more digits."
             )
 
     def fractions(self):

@@ -40,11 +40,11 @@ def warn_of_dissipation(
     growth = backwards * float(interval.h) * damping
     if growth > _STRONG and np.isfinite(growth):
         warnings.warn(
-            f"{type(method).__name__} goes backwards by {backwards:.2g} of a step, where a damping "
-            f"force drives. At the start the damping rate is {damping:.3g} per unit of time, times "
-            f"that substep {growth:.3g}. The map is singular at 1, and above {_STRONG} no more "
-            "accurate than one of order 2: use a smaller h, or dvi.Strang(), which never goes "
-            "backwards.",
+            f"{type(method).__name__} has a substep backwards in time of {backwards:.2g} h, in "
+            "which a damping force amplifies. At the initial conditions the damping rate is "
+            f"{damping:.3g} per unit of time, and its product with that substep is {growth:.3g}. "
+            f"At 1 the map is singular, above {_STRONG} it is not more accurate than a map of "
+            "order 2: use a smaller h, or dvi.Strang(), which has no substep backwards.",
             stacklevel=3,
         )
 

@@ -66,7 +66,7 @@ class GaussLegendre(Collocation):
     stages: int = eqx.field(static=True, default=2)
 
     def __check_init__(self):
-        whole("stages", self.stages, 1, _MOST_STAGES, hint="The order is twice that.")
+        whole("stages", self.stages, 1, _MOST_STAGES, hint="The order is 2·stages.")
 
     @property
     def order(self) -> int:

@@ -113,7 +113,7 @@ class LobattoIIIAIIIB(Collocation):
     stages: int = eqx.field(static=True, default=2)
 
     def __check_init__(self):
-        whole("stages", self.stages, 2, _MOST_STAGES, hint="The order is twice that less two.")
+        whole("stages", self.stages, 2, _MOST_STAGES, hint="The order is 2·stages − 2.")
 
     @property
     def order(self) -> int:

@@ -29,8 +29,8 @@ class Published(CompositionMethod):
             *most, last = self.tables
             which = f"orders {', '.join(map(str, most))} and {last}" if most else f"order {last}"
             raise ValueError(
-                f"{type(self).__name__} has coefficients for {which}, got {self.order!r}. For "
-                "order 2 use dvi.Strang(); for other coefficients, "
+                f"{type(self).__name__} has coefficients for {which}, got order={self.order!r}. "
+                "For order 2 use dvi.Strang(); for other coefficients, "
                 "dvi.Composition(coefficients, order=...)."
             )
 

@@ -109,8 +109,8 @@ class _Framed(Deviations):
                 good = False
             if not good:
                 raise ValueError(
-                    f"the scale of {which} in {type(self).__name__} must be a positive number, or "
-                    f"an array of them like {which}; got {unit!r}."
+                    f"the scale of {which} in {type(self).__name__} must be a positive and finite "
+                    f"number, or an array of such numbers with the shape of {which}; got {unit!r}."
                 )
 
     def vectors(self, memory):
@@ -128,7 +128,7 @@ class _Framed(Deviations):
         if count is not None and count > size:
             raise ValueError(
                 f"{type(self).__name__} has {count} deviation vectors, but a state of {size} "
-                f"components has only {size} directions: take at most {size}."
+                f"components has only {size} directions: use at most {size}."
             )
         # All `size` vectors are drawn, so that the first ones do not depend on the count.
         random = np.random.default_rng(self.seed).standard_normal((size, size))
@@ -146,8 +146,8 @@ class _Framed(Deviations):
             unit = jnp.asarray(unit, like.dtype).ravel()
             if unit.size not in (1, size):
                 raise ValueError(
-                    f"the scale of {which} in {type(self).__name__} must be a number or an array "
-                    f"of {size} numbers, like {which}; got {unit.size}."
+                    f"the scale of {which} in {type(self).__name__} must be one number, or {size} "
+                    f"numbers (one for each component of {which}); got {unit.size} numbers."
                 )
             parts.append(jnp.broadcast_to(unit, (size,)))
         return jnp.concatenate(parts)[None, :]

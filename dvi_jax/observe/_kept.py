@@ -227,4 +227,4 @@ def event(
 def check_event(g: Any, of: str) -> None:
     """Refuse a g that cannot be called as ``g(t, q, p, args)``."""
     if not callable(g) or not accepts(g, 4):
-        raise TypeError(f"{of} takes a function g(t, q, p, args) → scalar, got {g!r}.")
+        raise TypeError(f"{of} requires a function g(t, q, p, args) → scalar, got {g!r}.")

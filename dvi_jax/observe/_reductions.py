@@ -45,8 +45,8 @@ class Reduction(eqx.Module):
         ``memory + self.change(value, k == at)``.
         """
         raise NotImplementedError(
-            f"{type(self).__name__} has no gradient by dvi.Reversible(): define combine(memory, k, "
-            "t, value), or take adjoint=dvi.Direct()."
+            f"{type(self).__name__} cannot be differentiated with dvi.Reversible(): define its "
+            "method combine(memory, k, t, value), or use adjoint=dvi.Direct()."
         )
 
     @staticmethod
@@ -242,8 +242,8 @@ class Running(eqx.Module):
     def __check_init__(self):
         if not (isinstance(self.reduction, Reduction) and self.reduction.has_running_value):
             raise TypeError(
-                "Running takes a reduction with a value at any time, such as dvi.MEGNO() or "
-                f"dvi.Mean(f), got {self.reduction!r}."
+                "Running requires a reduction that has a value at every step, such as dvi.MEGNO() "
+                f"or dvi.Mean(f), got {self.reduction!r}."
             )
 
 

@@ -49,7 +49,7 @@ def reproduce(out: Path | str, force: bool = False, console: Console | None = No
     """
     out = Path(out)
     if out.exists() and not out.is_dir():
-        raise NotADirectoryError(f"{out} is a file; the reproduction needs a folder to write to.")
+        raise NotADirectoryError(f"{out} is a file: choose the name of a folder for the results.")
     if out.exists() and any(out.iterdir()) and not force:
         raise FileExistsError(
             f"{out} is not empty. Choose another folder, or set force (--force) to overwrite the "

@@ -36,8 +36,8 @@ def canvas(ax: Any, size: Any = None, space: bool = False) -> tuple[Any, bool]:
     instance("ax", ax, Axes, "the matplotlib Axes to draw on")
     if space != (ax.name == "3d"):
         raise ValueError(
-            'an orbit in space needs axes in space, figure.add_subplot(projection="3d"), one in '
-            f'the plane (coordinates=(0, 1), say) axes without a projection: got "{ax.name}".'
+            f'ax has the projection "{ax.name}": make it with figure.add_subplot(projection="3d") '
+            "for an orbit in space, without projection for one in a plane, coordinates=(0, 1)."
         )
     return ax, False
 
@@ -59,7 +59,7 @@ def stack(
     found = [canvas(axis)[0] for axis in np.ravel(np.asarray(ax, object))]
     count = len({name for row in places for name in row} - {"."})
     if len(found) != count:
-        raise ValueError(f"axes must be {count}, {what}, got {len(found)}.")
+        raise ValueError(f"give {count} axes, {what}, got {len(found)}.")
     return found, False
 
 
@@ -73,13 +73,13 @@ def check_shapes(fits: Any, wanted: str, **arrays: np.ndarray) -> None:
 def at_most(most: int, count: int, what: str, choice: str) -> None:
     """**Raises** `ValueError` for too many things in one picture, with a way to choose some."""
     if count > most:
-        raise ValueError(f"{count} {what} are too many, at most {most}: choose some, {choice}.")
+        raise ValueError(f"{count} {what} are too many: choose at most {most}, {choice}.")
 
 
 def check_attributes(thing: Any, names: Sequence[str], wanted: str) -> None:
     """**Raises** `TypeError` for an object without these attributes."""
     if lacking := ", ".join(name for name in names if not hasattr(thing, name)):
-        raise TypeError(f"{wanted}, got {type(thing).__name__} without {lacking}.")
+        raise TypeError(f"{wanted}, got {type(thing).__name__}, which has no {lacking}.")
 
 
 def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[str]:
@@ -88,7 +88,9 @@ def labels_of(labels: Any, count: int, what: str, name: str = "labels") -> list[
         return [""] * count
     found = [labels] if isinstance(labels, str) else labels
     if len(found) != count or isinstance(labels, str):
-        raise ValueError(f"{name} has {len(found)} names for {count} {what}: give a list of them.")
+        raise ValueError(
+            f"{name} must be a list of names, one for each of {count} {what}, got {labels!r}."
+        )
     return [str(label) for label in found]
 
 

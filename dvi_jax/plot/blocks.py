@@ -144,9 +144,8 @@ def selections(
         unit |= {d: int(np.diff(b.ends).max()) for d, b in bins.items() if d != line}
         if math.prod(unit.values()) > BLOCK:
             raise ValueError(
-                f"a median needs all {math.prod(unit.values())} numbers of a pixel at a time, and "
-                f"{BLOCK} are read at a time: take reduce='mean' or 'max', more pixels, or a part "
-                "of the data."
+                f"reduce='median' needs all {math.prod(unit.values())} numbers of a pixel at "
+                f"once, at most {BLOCK}: use reduce='mean' or 'max', more pixels, or less data."
             )
     else:
         known = data.encoding.get("preferred_chunks") or {}

@@ -89,8 +89,8 @@ def animate(
     pixels = round(width * dpi) * round(height * dpi)
     if suffix == ".gif" and pixels * len(times) > _MOST_BYTES:
         raise ValueError(
-            f"a GIF of {len(times)} frames of {pixels} pixels is too large to be held, and to be "
-            "shown anywhere: take fewer seconds, a lower fps, a smaller size or dpi, or .mp4."
+            f"a GIF of {len(times)} frames of {pixels} pixels needs too much memory: use fewer "
+            "seconds, a lower fps, a smaller size or dpi, or .mp4."
         )
     figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
     canvas = FigureCanvasAgg(figure)
@@ -122,20 +122,22 @@ def animate(
 
 def _check_film(path: Path, suffix: str, seconds: Any, fps: Any, tail: Any, beside: Any) -> None:
     if suffix not in (".gif", ".mp4"):
-        raise ValueError(f"a film is a .gif or an .mp4, got {path.name!r}.")
+        raise ValueError(f"the name of the film must end with .gif or .mp4, got {path.name!r}.")
     if not path.parent.is_dir():
-        raise ValueError(f"the folder of the film does not exist: {path.parent}.")
+        raise ValueError(f"the folder of the film does not exist: create {path.parent} first.")
     positive("seconds", seconds)
     positive("fps", fps)
     one_of("beside", beside, _BESIDE)
     if not 0 <= tail <= 1:
         raise ValueError(f"tail must be a fraction from 0 to 1, got {tail!r}.")
     if suffix == ".gif" and fps > _FASTEST_GIF:
-        raise ValueError(f"a GIF shows at most {_FASTEST_GIF} frames a second, got fps={fps:g}.")
+        raise ValueError(
+            f"fps of a GIF must be at most {_FASTEST_GIF}, got {fps:g} (an .mp4 can have more)."
+        )
     if suffix == ".mp4" and not writers.is_available("ffmpeg"):
         raise RuntimeError(
-            "an .mp4 is written by ffmpeg, which is not found: install it (apt, brew or conda "
-            'install ffmpeg), set matplotlib.rcParams["animation.ffmpeg_path"], or write a .gif.'
+            "an .mp4 requires ffmpeg, which was not found: install it (apt, brew or conda install "
+            'ffmpeg), set matplotlib.rcParams["animation.ffmpeg_path"], or write a .gif.'
         )
 
 
@@ -143,7 +145,7 @@ def _moments(lanes: Sequence[Lane], frames: float) -> np.ndarray:
     """Times of the frames, evenly from the first to the last finite state."""
     known = [lane.ts[lane.there] for lane in lanes if lane.there.any()]
     if not known:
-        raise ValueError("no orbit has a state that is finite.")
+        raise ValueError("there is nothing to draw: all states of all orbits are NaN or infinite.")
     count = max(2, min(round(frames), max(len(t) for t in known)))
     ends = np.array([[t[0], t[-1]] for t in known])
     times = np.linspace(ends.min(), ends.max(), count)

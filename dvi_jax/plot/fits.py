@@ -327,9 +327,7 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
     if len(set(params)) < len(params) or not params or not {*params} <= {*names}:
         raise ValueError(f"params must be different names of {names}, one or more, got {params}.")
     if unknown := [name for name in params if name not in known]:
-        raise ValueError(
-            f"the data do not determine {unknown[0]}; those that have a variance: params={known}."
-        )
+        raise ValueError(f"the data do not determine {unknown[0]}: choose from params={known}.")
     values = np.asarray(fit.x if np.ndim(fit.x) == 1 else fit.mean)
     return [names.index(n) for n in params], values
 
@@ -339,10 +337,10 @@ def _draws(samples: Any, names: list[str]) -> list[np.ndarray]:
     found = getattr(samples, "samples", samples)
     instance("samples", found, Mapping, "a dvi.Samples or a dict of names with arrays of draws")
     if missing := [name for name in names if name not in found]:
-        raise ValueError(f"samples has no {missing[0]!r}: there are {', '.join(map(str, found))}.")
+        raise ValueError(f"samples has no {missing[0]!r}; it has {', '.join(map(str, found))}.")
     flat = [np.ravel(np.asarray(found[n], float)) for n in names]
     if len({len(f) for f in flat}) > 1:
-        raise ValueError("samples must hold the same number of draws for each name.")
+        raise ValueError(f"samples must have equally many draws of each, got {[*map(len, flat)]}.")
     return flat
 
 

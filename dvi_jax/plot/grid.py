@@ -97,7 +97,7 @@ def dim_of(data: Any, name: str) -> str:
         return name
     if name in data.coords and data.coords[name].ndim == 1:
         return str(data.coords[name].dims[0])
-    raise ValueError(f"there is no dimension {name!r}: there are {names_of(data)}.")
+    raise ValueError(f"there is no dimension {name!r}; the data has {names_of(data)}.")
 
 
 def names_of(data: Any) -> str:
@@ -153,7 +153,7 @@ class Grid(NamedTuple):
         count = len(self.panels)
         if ax is not None:
             if count > 1:
-                raise ValueError("a facet has a figure of its own: leave out ax, or facet.")
+                raise ValueError("facet makes a new figure: leave out ax, or facet.")
             return [canvas(ax)[0]]
         if count == 1:
             size = None if height is None else (plt.rcParams["figure.figsize"][0], height)
@@ -192,7 +192,7 @@ def arrange(
     facet, over, pixels = (where.get(k, v) for k, v in _WHERE.items())
     width, height = two_numbers(pixels)
     if not (width >= 1 and height >= 1):
-        raise ValueError(f"pixels must be (width, height), two positive numbers, got {pixels!r}.")
+        raise ValueError(f"pixels must be (width, height), both at least 1, got {pixels!r}.")
     if empty := [str(d) for d, n in data.sizes.items() if n == 0]:
         raise ValueError(f"there is nothing to draw: {', '.join(empty)} has no values.")
     over = (over,) if isinstance(over, str) else tuple(over)
@@ -201,7 +201,7 @@ def arrange(
     for role, name in roles.items():
         dim = None if name is None else dim_of(data, name)
         if dim in taken:
-            raise ValueError(f"{role} and {taken[dim]} are both along {dim!r}: name another.")
+            raise ValueError(f"{role} and {taken[dim]} share the dimension {dim!r}: change one.")
         taken |= {} if dim is None else {dim: role}
     made = made or {}
     gone = [dim_of(data, name) for name, array in made.items() if array is None]
@@ -215,10 +215,9 @@ def arrange(
         raise ValueError("there is nothing to draw: no dimension has more than one value.")
     if free:
         raise ValueError(
-            f"a map has two dimensions, {x!r} and {y!r} here; {', '.join(map(repr, free))} "
-            f"{'is' if len(free) == 1 else 'are'} left of {names_of(data)}. Select one value, "
-            f"data.isel({free[0]}=0), reduce them, over={free[0]!r}, or draw one map each, "
-            f"facet={free[0]!r}."
+            f"a map has two dimensions, here {x!r} and {y!r}, but the data has also "
+            f"{', '.join(map(repr, free))}. Select one value, data.isel({free[0]}=0), reduce all, "
+            f"over={free[0]!r}, or draw a map for each, facet={free[0]!r}."
         )
     data = data.isel({d: 0 for d in left if data.sizes[d] == 1})
     along: dict[Any, Any] = dict.fromkeys((x, y), data) | made

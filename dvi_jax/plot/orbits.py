@@ -86,7 +86,7 @@ def _planes(shape: tuple[int, ...], dof: Any) -> list["Plane"]:
         some = "0, 1" if len(shape) == 1 else "(0, 0), (0, 1)"
         at_most(_PANELS, len(places), "degrees of freedom", f"dof=[{some}]")
     if not places:
-        raise ValueError("dof is empty, there is nothing to draw.")
+        raise ValueError("dof is empty: choose at least one degree of freedom.")
     return [Plane(place, shape) for place in places]
 
 
@@ -163,10 +163,7 @@ def _level_lines(
 
     H = np.asarray(jax.jit(jax.vmap(jax.vmap(value, (0, None)), (None, 0)))(x, y))
     if H.shape != (_MESH, _MESH):
-        raise ValueError(
-            "hamiltonian must be a function (q, p) → number of one state, it returned shape "
-            f"{H.shape[2:]}."
-        )
+        raise ValueError(f"hamiltonian(q, p) must return one number, got shape {H.shape[2:]}.")
     axis.autoscale(False)
     if np.isfinite(H).any():
         look: dict[str, Any] = {"colors": "#a8a8a8", "linewidths": 0.7, "linestyles": "-"}
@@ -207,7 +204,7 @@ def orbit(
     lanes = lanes_of(orbits, look.labels, momenta=False)
     view = view_of(lanes, coordinates, bodies, centre, names)
     if look.colour is not None and len(lanes) == 1:
-        raise ValueError("colour distinguishes orbits of a batch, and there is one orbit.")
+        raise ValueError("colour requires several orbits, but there is one orbit: leave it out.")
     looks = looks_of(len(lanes) if len(lanes) > 1 else len(view.bodies), look.colour)
     axis, new = canvas(look.ax, (5.4, 5.0), len(view.coordinates) == 3)
     for i, k, number, name in view.lines(lanes):
@@ -231,7 +228,7 @@ class Plane(NamedTuple):
     def of(self, lane: Lane, k: int = 0) -> Any:
         """(q, p) along an orbit, shape (S,) each."""
         if lane.ps is None:
-            raise TypeError("this picture needs momenta: a Solution, or the arrays (ts, qs, ps).")
+            raise TypeError("this picture needs momenta: give a Solution or (ts, qs, ps).")
         return [x[(slice(None), *self.place)] for x in (lane.qs, lane.ps)]
 
     def lines(self, lanes: Sequence[Lane]) -> Iterator[tuple[int, int, int, str]]:
@@ -302,8 +299,8 @@ def view_of(
     shape = one_shape(lanes)
     if names is not None and (len(lanes) > 1 or math.prod(shape) == 1):
         raise ValueError(
-            f"names are of bodies of one orbit, and there are {len(lanes)} orbits of states of "
-            f"shape {shape}: name the orbits, labels=[...], or draw one of them."
+            f"names is for the bodies of one orbit, but there are {len(lanes)} orbits with states "
+            f"of shape {shape}: use labels=[...] for the orbits, or draw only one."
         )
     if len(shape) not in (1, 2):
         raise ValueError(f"orbit draws states of shape (n,) or (bodies, dim), got {shape}.")
@@ -311,8 +308,8 @@ def view_of(
     axes = tuple(chosen("coordinates", coordinates, dim))
     if len(axes) not in (2, 3):
         raise ValueError(
-            f"an orbit has two or three coordinates, there are {len(axes)} of {dim}: name some, "
-            "coordinates=(0, 1); phase_portrait draws a single one."
+            f"orbit draws two or three coordinates, got {len(axes)} of {dim}: choose some, such as "
+            "coordinates=(0, 1). For a single one use phase_portrait."
         )
     drawn = chosen("bodies", bodies, count)
     view = View(axes, drawn, [], many)
@@ -353,9 +350,7 @@ def trajectory(
     """
     lanes = lanes_of(ts if qs is None else (ts, qs, ps))
     if len(lanes) > 1:
-        raise ValueError(
-            f"trajectory draws one orbit, got {len(lanes)}: see phase_portrait and orbit."
-        )
+        raise ValueError(f"trajectory draws one orbit, got {len(lanes)}: use orbit for several.")
     t, q, p = lanes[0][:3]
     assert p is not None
     units, shape = {"q": position or "", "p": momentum or ""}, q.shape[1:]

@@ -50,7 +50,7 @@ def balance(
         ts, drift = ts.ts, ts.drift if drift is None else drift
     if drift is None or not causes:
         raise TypeError(
-            "balance takes what dvi.noether_balance returns, or times, the drift and its causes."
+            "balance requires a result of dvi.noether_balance, or times, drift=... and causes=..."
         )
     given = {"ts": ts, "drift": drift, **causes}
     arrays = {name: np.asarray(x, float) for name, x in given.items()}
@@ -103,7 +103,7 @@ def drift_orders(
     """
     if expected is not None:
         if promised is not None:
-            raise TypeError("expected and promised are one keyword: give one of them.")
+            raise TypeError("expected and promised are two names of one argument: give one.")
         promised = expected
     if isinstance(results, DriftOrder):
         results = {"drift": results}
@@ -114,7 +114,9 @@ def drift_orders(
         draw.check_attributes(order, ("drifts", "epsilons"), wanted)
     slopes = [*promised] if isinstance(promised, Sequence) else [promised] * len(results)
     if len(slopes) != len(results):
-        raise ValueError(f"promised has {len(slopes)} orders for {len(results)} results.")
+        raise ValueError(
+            f"promised must have {len(results)} orders, one per result, got {len(slopes)}."
+        )
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
     looks = zip(results.items(), slopes, itertools.cycle(COLOURS), itertools.cycle(MARKERS))
@@ -267,7 +269,7 @@ def work_precision(
     methods, for shapes that do not fit and for costs that are not positive.
     """
     if not results:
-        raise ValueError("work_precision was given no method.")
+        raise ValueError("results is empty: give at least one method, {name: (costs, errors)}.")
     axis, new = canvas(ax, (6.4, 4.8))
     runs = {name: _checked(name, pair) for name, pair in results.items()}
     points, lost = np.hstack(list(runs.values())), np.zeros(2, int)
@@ -304,8 +306,8 @@ def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
     positive = bool((np.isfinite(costs) & (costs > 0)).all())
     if costs.ndim != 1 or costs.shape != errors.shape or not len(costs) or not positive:
         raise ValueError(
-            f"{name!r} must have costs and errors of one shape (runs,), and the costs must be "
-            f"positive: got {costs.shape} and {errors.shape}, costs {costs}."
+            f"{name!r} must have costs and errors of the same shape (runs,), with positive costs; "
+            f"got {costs.shape} and {errors.shape}, costs {costs}."
         )
     order = np.argsort(costs, kind="stable")
     return costs[order], np.abs(errors[order])

@@ -152,8 +152,8 @@ def _points_of(crossings: Any) -> _Points:
     found = _crossings_in(crossings)
     if len(found) != 1:
         raise TypeError(
-            "crossings must be the Crossings of a dvi.Section, solution.observed, "
-            + (f"and there are {len(found)}: name one." if found else f"got {crossings!r:.60}.")
+            "crossings must be the result of one dvi.Section in solution.observed, got "
+            + (f"{len(found)} results: choose one." if found else f"{crossings!r:.60}.")
         )
     ((one, status),) = found
     qs, ps, ts = (np.asarray(v) for v in (one.qs, one.ps, one.ts))
@@ -228,7 +228,9 @@ def bifurcation(
     check_shapes(fits, wanted, parameter=parameter, crossings=values)
     skip = whole("skip", skip, 0)
     if log and not (parameter > 0).all():
-        raise ValueError("a logarithmic axis takes positive parameters: leave out log=True.")
+        raise ValueError(
+            f"log=True requires positive parameters, got {parameter.min()}: leave log out."
+        )
     values = values[:, skip:]
     x = np.broadcast_to(parameter[:, None], values.shape)
     axis, new = canvas(look.ax, (6.8, 4.4))

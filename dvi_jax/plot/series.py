@@ -75,8 +75,8 @@ def invariants(
     changed = {k: [_changed(k, v, change, log) for v in rows] for k, rows in watched.items()}
     if zero := [name for name, rows in changed.items() if all(v is None for v in rows)]:
         raise ValueError(
-            f"every orbit starts at 0 of {zero[0]!r}, so that no change is relative to it: take "
-            "change='absolute'."
+            f"{zero[0]!r} is 0 at the start of every orbit, so that relative changes are not "
+            "defined: use change='absolute'."
         )
     together = log and len(ts) == 1 < len(watched)
     count = 1 if together else len(watched)
@@ -121,7 +121,7 @@ def invariants(
 def _changed(name: str, v: np.ndarray, change: str, log: bool) -> np.ndarray | None:
     """Changes since the first finite value, shape (S,); None if they are relative to 0."""
     if v.dtype.kind not in "biuf":
-        raise TypeError(f"{name!r} is {v.dtype}, and only real numbers can be drawn.")
+        raise TypeError(f"{name!r} must be real numbers, got dtype {v.dtype}.")
     v = v.reshape(len(v), -1).astype(float)
     first = next((row for row in v if np.isfinite(row).all()), np.full(v.shape[1], np.nan))
     v = v if change == "value" else v - first
@@ -150,9 +150,7 @@ def _read(
     else:
         lanes, times = [], np.asarray(getattr(orbits, "ts", orbits))
         if times.dtype.kind not in "iuf" or times.ndim == 0:
-            raise TypeError(
-                f"invariants takes a Solution, or times of shape (S,) with values, got {orbits!r}."
-            )
+            raise TypeError(f"orbits must be a Solution, or times with values=..., got {orbits!r}.")
         ts = list(times.reshape(-1, times.shape[-1]))
         names = labels_of(labels, len(ts), "orbits")
     watched: dict[str, list[np.ndarray]] = {}
@@ -166,18 +164,16 @@ def _read(
     for name, v in (values or {}).items():
         if callable(v):
             if any(lane.ps is None for lane in lanes) or not lanes:
-                raise TypeError(
-                    f"{name!r} is a function (q, p): it takes a Solution, or (ts, qs, ps)."
-                )
+                raise TypeError(f"the function {name!r} needs a Solution or (ts, qs, ps).")
             watched[name] = [each_state(v, lane.qs, lane.ps) for lane in lanes]
         elif not isinstance(orbits, list):
             watched[name] = _rows(name, {name: v}, orbits)
         elif isinstance(v, list) and len(v) == len(lanes):
             watched[name] = [np.asarray(x) for x in v]
         else:
-            raise ValueError(f"{name!r} must be a list of numbers, one array for each solution.")
+            raise ValueError(f"{name!r} must be a list of {len(lanes)} arrays, one for each orbit.")
     if not watched:
-        raise ValueError("there is nothing to draw: no observable has a value per step.")
+        raise ValueError("nothing to draw: no observable has a value for each saved state.")
     return ts, names, lanes, watched
 
 

@@ -53,7 +53,7 @@ def lanes_of(orbits: Any, labels: Sequence[str] | None = None, momenta: bool = T
     if not lanes:
         raise ValueError("there is no orbit to draw: the list or the batch is empty.")
     if momenta and any(lane.ps is None for lane in lanes):
-        raise TypeError("this picture needs momenta: a Solution, or the arrays (ts, qs, ps).")
+        raise TypeError("this picture needs momenta: give a Solution or (ts, qs, ps).")
     names = labels_of(labels, len(lanes), "orbits")
     return [lane._replace(label=name) for lane, name in zip(lanes, names, strict=True)]
 
@@ -111,7 +111,7 @@ def place_in(shape: tuple[int, ...], index: Any) -> tuple[int, ...]:
         wanted = "one number" if len(shape) == 1 else f"a tuple of {len(shape)} numbers"
         most = ", ".join(str(n - 1) for n in shape)
         raise ValueError(
-            f"a state of shape {shape} has no component {index!r}; take {wanted} from 0 to {most}."
+            f"a state of shape {shape} has no component {index!r}; give {wanted} from 0 to {most}."
         )
     return tuple(int(i) % n for i, n in zip(place, shape, strict=True))
 
@@ -152,7 +152,7 @@ def each_state(function: Callable[..., Any], qs: Any, ps: Any) -> np.ndarray:
     """A function ``(q, p)`` of every state, shape (N, ...)."""
     values = np.asarray(jax.vmap(function)(qs, ps))
     if values.dtype.kind not in "biuf":
-        raise TypeError(f"a function of the state must return real numbers, not {values.dtype}.")
+        raise TypeError(f"a function (q, p) must return real numbers, got dtype {values.dtype}.")
     return values
 
 

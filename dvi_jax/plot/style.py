@@ -103,7 +103,7 @@ def look_of(options: Mapping[str, Any], *but: str) -> Look:
 def check_keywords(given: Mapping[str, Any], *known: str) -> None:
     """**Raises** `TypeError` for a keyword that is not one of those known."""
     if unknown := [name for name in given if name not in known]:
-        raise TypeError(f"unknown keyword {unknown[0]!r}: there are {', '.join(known)}.")
+        raise TypeError(f"unknown keyword {unknown[0]!r}; allowed are {', '.join(known)}.")
 
 
 @in_style
@@ -116,7 +116,7 @@ def save(drawn: Any, path: str | Path) -> Path:
     path = Path(path)
     axes = np.ravel(np.asarray(drawn, object)).tolist()
     if not axes or not all(hasattr(axis, "figure") for axis in axes):
-        raise TypeError(f"save takes a figure or axes, as the plots return them, got {drawn!r}.")
+        raise TypeError(f"save requires a figure, or the axes that a plot returns, got {drawn!r}.")
     figures = {figure_of(axis) for axis in axes}  # a figure's own `figure` is itself
     if len(figures) > 1:
         raise ValueError(f"these axes belong to {len(figures)} figures: save one at a time.")

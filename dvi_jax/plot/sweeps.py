@@ -122,15 +122,13 @@ def slope_map(
     others, facet = where.get("over", ()), where.get("facet")
     others = [*([others] if isinstance(others, str) else others), *([facet] if facet else [])]
     if any(dim_of(data, name) == dim for name in others):
-        raise ValueError(f"slopes along {along!r} leave nothing of it for a facet or for over.")
+        raise ValueError(f"facet and over must not be {along!r}, along which slopes are computed.")
     x, y = (along if name is not None and dim_of(data, name) == dim else name for name in (x, y))
     local = local or along in (x, y)
     made: dict[str, Any] = {along: None}
     if local:
         if along not in (x, y) and None not in (x, y):
-            raise ValueError(
-                f"local slopes are along {along!r}: name it as x or y, or leave one out."
-            )
+            raise ValueError(f"local slopes need {along!r} as x or y: name it, or leave one out.")
         if along not in (x, y):
             x, y = (along, y) if x is None else (x, along)
         middle = np.sqrt(values[1:] * values[:-1])
@@ -217,13 +215,13 @@ def _scale(pictures: Sequence[Picture], log: bool | None, limits: Any) -> tuple[
         log = log and bool(positive.max() > 10**_DECADES * positive.min())
     if log and (found < 0).any():
         raise ValueError(
-            f"a logarithmic scale has no place for the {np.sum(found < 0)} pixels below 0: leave "
-            "out log=True, or draw abs(data)."
+            f"a logarithmic scale cannot show the {np.sum(found < 0)} pixels below 0: leave out "
+            "log=True, or draw abs(data)."
         )
     if limits is not None:
         low, high = two_numbers(limits)
         if not low < high or (log and low <= 0):
-            wanted = "two rising positive numbers" if log else "two rising numbers"
+            wanted = "two increasing positive numbers" if log else "two increasing numbers"
             raise ValueError(f"limits must be {wanted}, got {limits!r}.")
     elif not log and found.size:
         below, above = -found.min(), found.max()
@@ -314,7 +312,7 @@ def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
     """(positive values of a coordinate, rising; their places along the dimension)."""
     if along not in data.coords or data.coords[along].dtype.kind not in "iuf":
         raise ValueError(
-            f"{along!r} has no numbers to take a slope along; choose one of {names_of(data)}."
+            f"{along!r} has no numbers along which a slope exists; choose one of {names_of(data)}."
         )
     values = data.coords[along].values
     order = np.argsort(values, kind="stable")
@@ -322,7 +320,7 @@ def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
     different = len(np.unique(values[order]))
     if different < max(2, len(order)):
         raise ValueError(
-            f"a slope along {along!r} needs two or more positive values, all different: it has "
+            f"{along!r} must have at least two positive values, all different, for a slope; it has "
             f"{len(order)} positive ones, {different} of them different."
         )
     return np.asarray(values[order], float), order
@@ -393,7 +391,7 @@ def _count_beside(status: Any, grid: Grid) -> _Statuses:
     if others or any(d not in status.dims for d in wanted):
         raise ValueError(
             f"the status has the dimensions {names_of(status)}; those of the map are "
-            f"{', '.join(wanted)}: select the same of both."
+            f"{', '.join(wanted)}: select the same values in both."
         )
     selections = (dict.fromkeys(along, i) for i in range(len(grid.panels)))
     return _count(status, grid, (status.isel(one) for one in selections))

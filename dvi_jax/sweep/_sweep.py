@@ -126,15 +126,15 @@ def sweep(
     if threads is not None:
         whole("threads", threads)
         if client is not None:
-            raise ValueError("threads are those of this process: leave them out with a client.")
+            raise ValueError("threads has no effect on workers: leave it out with client.")
     config = description(made, program.plan, found, programs)
     if store is None:
         needed = program.plan.lanes * sum(v.bytes for v in found.values())
         there = machine_memory() or 8 * 2**30
         if needed > _SHARE * there:
             raise ValueError(
-                f"the results need {needed / 2**30:.1f} GiB of memory, and this machine has "
-                f"{there / 2**30:.1f} GiB: give store=..., a directory; then only one task at a "
+                f"the results need {needed / 2**30:.1f} GiB of memory, but this machine has only "
+                f"{there / 2**30:.1f} GiB: give store=..., a directory, so that only one task at a "
                 "time is in memory."
             )
         sink = Memory(program.plan, found)
@@ -177,7 +177,7 @@ def sweep_cost(system: System, q0: Any = None, p0: Any = None, **settings: Any) 
 
 def _check_units(units: Any, found: Mapping[str, Any]) -> None:
     if not isinstance(units, Mapping) or not all(isinstance(u, str) for u in units.values()):
-        raise TypeError(f'units must be a table such as {{"drift": "J"}}, got {units!r}.')
+        raise TypeError(f'units must be a dict such as {{"drift": "J"}}, got {units!r}.')
     if unknown := [name for name in units if name not in found]:
         raise ValueError(
             f"units are given for {unknown[0]!r}, which is not a result. Results are "
@@ -258,7 +258,7 @@ def _states(q0: Any, p0: Any, start: Any) -> dict[str, Any]:
             return {}
     elif q0 is not None and p0 is not None:
         return {"q0": q0, "p0": p0}
-    raise ValueError("give either q0 and p0, or start=dvi.starts.Random(...) or another of those.")
+    raise ValueError("give both q0 and p0, or start=..., such as dvi.starts.Random(...).")
 
 
 def _check_dims(dims: Mapping[str, int]) -> None:
@@ -269,7 +269,7 @@ def _check_dims(dims: Mapping[str, int]) -> None:
     if not dims:
         raise ValueError(
             'nothing varies: give an array for epsilon or h, a dvi.Axis("name", values) anywhere, '
-            "or a start. For one trajectory there is dvi.integrate."
+            "or start=dvi.starts.Random(...). For one trajectory use dvi.integrate."
         )
     if not x64_enabled() and max(dims.values()) >= 2**31:
         raise ValueError(
@@ -282,11 +282,10 @@ def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) ->
     if isinstance(lattice, Given):
         if num_steps is not None or any(is_axis(inputs[name]) for name in ("h", "t0")):
             raise ValueError(
-                "the times of dvi.Given replace h, t0 and num_steps: leave them out. They cannot "
-                "be axes."
+                "leave out num_steps, and the axes h and t0: dvi.Given(ts) determines all of them."
             )
     elif num_steps is None:
-        raise ValueError("num_steps is missing: the number of steps of each trajectory.")
+        raise ValueError("num_steps is missing: give the number of steps of each trajectory.")
     else:
         for n in num_steps.values if is_axis(num_steps) else [num_steps]:
             whole("num_steps", n)

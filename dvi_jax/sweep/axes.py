@@ -36,7 +36,7 @@ class Axis:
 
     def __init__(self, name: str, values: Any, units: str = ""):
         if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
-            raise ValueError(f"the name of an axis must be an identifier, got {name!r}.")
+            raise ValueError(f"name of an Axis must be a Python identifier, got {name!r}.")
         of = f"the axis {name!r}"
         instance(f"units of {of}", units, str, "text")
         refuse_unit_or_mask(of, values)
@@ -46,7 +46,7 @@ class Axis:
             try:
                 values = list(values)
             except TypeError:
-                raise TypeError(f"{of} needs a sequence of values, got {values!r}.") from None
+                raise TypeError(f"{of} requires a list or array, got {values!r}.") from None
             if values and all(isinstance(v, _NUMBERS) for v in values):
                 array = np.asarray(values)
                 # Numbers of Python have the precision of the process, as in JAX.
@@ -57,7 +57,7 @@ class Axis:
         if isinstance(values, np.ndarray):
             _check(of, values)
         if len(values) == 0:
-            raise ValueError(f"{of} has no values.")
+            raise ValueError(f"{of} has no values: give at least one.")
         for field, value in (("name", name), ("values", values), ("units", units)):
             object.__setattr__(self, field, value)
 
@@ -78,7 +78,7 @@ def _check(of: str, values: np.ndarray) -> None:
         raise TypeError(f"{of} needs real numbers, got dtype {values.dtype}.")
     if not np.isfinite(values).all():
         where = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
-        raise ValueError(f"{of} contains {values[where]} at index {list(where)}.")
+        raise ValueError(f"{of} must be finite, but is {values[where]} at index {list(where)}.")
 
 
 def is_axis(x: Any) -> bool:
@@ -92,8 +92,8 @@ def as_axis(name: str, value: Any) -> Any:
     if np.ndim(value) > 1:
         raise ValueError(
             f"{name} must be a number or a one-dimensional array, got shape {np.shape(value)}: "
-            "for a grid give the axes one by one, for pairs that vary together "
-            'dvi.Axis("name", values) of one name.'
+            "for a grid give one-dimensional axes; for arguments that vary together give each of "
+            'them dvi.Axis("name", values) with the same name.'
         )
     return Axis(name, value)
 
@@ -108,7 +108,7 @@ def axes_in(arguments: Mapping[str, Any]) -> list[tuple[str, Axis]]:
             where = ".".join(filter(None, (name, place(path))))
             if not isinstance(axis.values, np.ndarray):
                 seen = type(axis.values[0]).__name__
-                raise TypeError(f"{where} takes numbers, but its axis {axis.name!r} holds {seen}.")
+                raise TypeError(f"{where} must be numbers, but its axis {axis.name!r} has {seen}.")
             refuse_double_without_x64(f"the axis {axis.name!r}", axis.values.dtype)
             found.append((where, axis))
     return found
@@ -127,7 +127,7 @@ def lengths(axes: Sequence[tuple[str, int, str]]) -> dict[str, int]:
         known, first = dims.setdefault(name, (length, where))
         if known != length:
             raise ValueError(
-                f"the axis {name!r} has {known} values in {first} and {length} in {where}: axes of "
-                "one name vary together and need one length; for a grid give them two names."
+                f"the axis {name!r} has {known} values in {first}, but {length} in {where}: axes "
+                "of the same name vary together and need equal lengths; for a grid rename one."
             )
     return {name: length for name, (length, _) in dims.items()}

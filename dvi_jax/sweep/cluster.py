@@ -81,9 +81,8 @@ def run_on(
                 lost[number] += 1
                 if lost[number] >= _ATTEMPTS:
                     raise ClusterError(
-                        f"task {number} was lost {_ATTEMPTS} times with its worker, so that it "
-                        "seems to be the cause (memory?): use a smaller lanes_per_task. "
-                        f"({error})"
+                        f"{_ATTEMPTS} workers were lost during task {number}, probably because it "
+                        f"needs too much memory: use a smaller lanes_per_task. ({error})"
                     ) from error
                 again.append(number)
             except CancelledError as error:
@@ -104,8 +103,8 @@ def run_on(
         raise error.args[0] from None
     except (OSError, TimeoutError) as error:
         raise ClusterError(
-            f"the cluster is lost ({error!r}). Finished tasks are in the store; start a new "
-            "cluster, and the same call continues from there."
+            f"the connection to the cluster was lost ({error!r}). If store is given, finished "
+            "tasks are there: start a new cluster, and the same call continues."
         ) from error
     finally:
         with contextlib.suppress(OSError, TimeoutError):
@@ -161,7 +160,7 @@ def _task(pickled: bytes, number: int) -> tuple[Any, dict[str, int]]:
             return results, facts["statuses"]
         store = Store.open(path)
         if store.sha != sha:
-            raise StoreError(f"{path}: a worker sees another sweep there than the client does.")
+            raise StoreError(f"{path} must be the directory of this sweep on every worker.")
         known = store.record(number)
         if known is None:
             results, known = compute(program, task, device)

@@ -21,7 +21,7 @@ def _whole_or_not(path: Any, force: bool, package: str) -> Iterator[Path]:
     try:
         __import__(package)
     except ImportError:
-        raise ImportError(f"this needs {package}: pip install 'dvi-jax[export]'.") from None
+        raise ImportError(f"export requires {package}: pip install 'dvi-jax[export]'.") from None
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         yield temporary
@@ -93,7 +93,7 @@ def _columns(part: Any, grid: list[str]) -> dict[str, np.ndarray]:
             if np.iscomplexobj(entries):
                 parts = {f"{column}_re": np.real(entries), f"{column}_im": np.imag(entries)}
             if taken := [c for c in parts if c in columns]:
-                raise ValueError(f"two results give the column {taken[0]!r}: rename one of them.")
+                raise ValueError(f"two results have the column {taken[0]!r}: rename one of them.")
             columns.update(parts)
     names = np.asarray(("not_computed", *STATUS_NAMES))
     columns["status"] = names[columns["status"].astype(int) + 1]

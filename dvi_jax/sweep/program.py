@@ -220,9 +220,9 @@ def traced(sweep: Sweep) -> tuple[dict[str, Any], list[ClosedJaxpr]]:
         kinds.add(tuple((name, x.shape, x.dtype) for name, x in out.items()))
         if len(kinds) > 1:
             raise ValueError(
-                "the results of all values of method and num_steps must have one shape: with "
-                "several num_steps save the final state only, save=dvi.Save(final=True), or "
-                "given times, save=dvi.Save(ts=...)."
+                "the results of all values of method and num_steps must have the same shape: with "
+                "several num_steps save only the final state, save=dvi.Save(final=True), or given "
+                "times, save=dvi.Save(ts=...)."
             )
         found = out
     return found, programs

@@ -105,12 +105,12 @@ class Store:
             if not (path / TASKS).is_dir():
                 raise StoreError(
                     f"{path}: the directory {TASKS}, with the records of tasks, is missing: was "
-                    "the store copied without the names that begin with a point?"
+                    "the store copied without hidden files (names that begin with a point)?"
                 )
             if (found := attributes["dvi_jax_sweep"]) != FORMAT:
                 raise StoreError(
-                    f"{path}: the store has format {found}, this version reads {FORMAT}: use the "
-                    f"version that made it ({attributes.get('dvi-jax', 'unknown')})."
+                    f"{path}: the store has format {found}, but this version reads {FORMAT}: use "
+                    f"the version that made it ({attributes.get('dvi-jax', 'unknown')})."
                 )
             store = cls(path, attributes)
         except FileNotFoundError:
@@ -123,7 +123,7 @@ class Store:
             ) from None
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(
-                f"{path}: zarr.json is not that of a sweep ({error!r}): it is damaged or was "
+                f"{path}: zarr.json does not describe a sweep ({error!r}): it is damaged or was "
                 f"edited. {_RESTORE}"
             ) from None
         for name in store.variables:
@@ -156,8 +156,8 @@ class Store:
             )
         if not os.access(path / TASKS, os.W_OK):
             raise StoreError(
-                f"{path}: cannot be written by this user: results would be lost. Give another "
-                "store, or change its permissions; dvi.open_sweep(path) reads it."
+                f"{path} cannot be written by this user. Give another store, or change its "
+                "permissions; dvi.open_sweep(path) reads it without writing."
             )
         store._restore(coordinates)
         return store
@@ -190,8 +190,8 @@ class Store:
             return array.get_orthogonal_selection(where)
         except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
-                f"{self.shard_path(name, number)}: is damaged ({error}). Open its task again with "
-                "dvi.open_sweep(path).verify(); then the same call of dvi.sweep computes it."
+                f"{self.shard_path(name, number)} is damaged ({error}). Call "
+                "dvi.open_sweep(path).verify(); then the same call of dvi.sweep repeats its task."
             ) from error
 
     def coordinates(self) -> dict[str, Any]:
@@ -305,8 +305,8 @@ class Store:
         found = {i: self._damage(i, x, size_only=True) for i, x in written.items() if x is not None}
         if lost := [damage[0] for damage in found.values() if damage]:
             warnings.warn(
-                f"{self.path}: {len(lost)} of the finished tasks lack a file (missing or of "
-                f"another size: {lost[0]}). They count as not computed; the same call of "
+                f"{self.path}: a file of {len(lost)} finished tasks is missing or has another size "
+                f"(the first: {lost[0]}). These tasks count as not computed; the same call of "
                 "dvi.sweep computes them again.",
                 stacklevel=2,
             )
@@ -362,7 +362,7 @@ def _resolved(path: str | os.PathLike) -> Path:
         found.exists()
     except (OSError, ValueError, RuntimeError) as error:
         raise StoreError(
-            f"{os.fspath(path)!r:.80}: cannot be the path of a store "
+            f"{os.fspath(path)!r:.80} cannot be the path of a store "
             f"({getattr(error, 'strerror', None) or error}): give the path of a directory."
         ) from None
     return found

@@ -58,8 +58,7 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
             raise ValueError(f"the observable {name!r} cannot have this name: {ARRAY_NAMES}.")
         if name in taken or name.split(".")[0] in RESERVED:
             raise ValueError(
-                f"the observable {name!r} has a name that is reserved ({', '.join(taken)}): rename "
-                "it."
+                f"the observable {name!r} has a reserved name ({', '.join(taken)}): rename it."
             )
     # Observables that are not reduced have a row for each step that ends at a save point: one less
     # than states, except for `Save(ts=...)`.
@@ -75,7 +74,7 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
             dims.insert(0, first[name])
         dtype = np.dtype(x.dtype)
         if dtype.kind not in "iufbc":
-            raise TypeError(f"the observable {name!r} has dtype {dtype}: it must be a number.")
+            raise TypeError(f"the observable {name!r} must return numbers, got dtype {dtype}.")
         found[name] = Variable("int8" if dtype.kind == "b" else dtype.name, x.shape, tuple(dims))
     return found
 

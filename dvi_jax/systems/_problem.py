@@ -142,7 +142,7 @@ class Start:
             point: Any = at(args) if callable(at) else at
             if (q == point).all():
                 raise ValueError(
-                    f"q0 is on top of {what} at {list(point)}: the system is singular there."
+                    f"q0 must not be at {what}, {list(point)}, where the system is singular."
                 )
         if self.also is not None:
             self.also(q, p, args)
@@ -193,7 +193,7 @@ def check_parameter(args: Any, name: str, check: Check) -> None:
 def gyrates(name: str, value: Any) -> None:
     """A check for the charge of a particle or the strength of a magnetic field."""
     if finite(name, value) == 0:
-        raise ValueError(f"{name} is 0: the particle does not gyrate. Take another system.")
+        raise ValueError(f"{name} must not be zero: the particle would not gyrate. Got {value}.")
 
 
 def between(low: float, high: float) -> Check:
@@ -201,7 +201,9 @@ def between(low: float, high: float) -> Check:
 
     def check(name: str, value: Any) -> None:
         if not low < finite(name, value) < high:
-            raise ValueError(f"{name} must be between {low} and {high}, got {value}.")
+            raise ValueError(
+                f"{name} must be between {low} and {high} (both excluded), got {value}."
+            )
 
     return check
 

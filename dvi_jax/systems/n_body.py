@@ -123,7 +123,7 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
         a, b = int(i[0]), int(j[0])
         raise ValueError(
             f"{called(a)} and {called(b)} are on top of one another, at {q[a].tolist()}: their "
-            "attraction is infinite. No two bodies may start at one point."
+            "attraction is infinite. Give them different positions."
         )
 
 
@@ -171,7 +171,7 @@ def n_body(
     if masses is None and q0 is None and p0 is None:
         masses, q0, p0 = np.ones(3), EIGHT_POSITIONS, EIGHT_MOMENTA
     if masses is None or q0 is None or p0 is None:
-        raise TypeError("n_body takes masses, q0 and p0 together, or none of them.")
+        raise TypeError("n_body requires all of masses, q0 and p0, or none of them.")
     args = {"masses": np.asarray(masses, float), "G": finite("G", G)}
     check_bodies(q0, p0, args)
     return Problem(

@@ -77,7 +77,7 @@ def secular_rates(a, e, i, args):
 
 def _outside(q, p, args):
     if (r := float(np.linalg.norm(q))) < args["R"]:
-        raise ValueError(f"the satellite starts at r = {r}, inside the planet of R = {args['R']}.")
+        raise ValueError(f"|q0| = {r} lies inside the planet: it must be at least R = {args['R']}.")
 
 
 def oblate_kepler() -> Problem:

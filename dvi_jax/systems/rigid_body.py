@@ -122,12 +122,14 @@ def exact(t, q0, p0, args):
 def _possible(q, p, args):
     moments = [args["I1"], args["I2"], args["I3"]]
     if 2 * max(moments) > sum(moments):
-        raise ValueError(f"each moment of inertia is at most the sum of the others, got {moments}.")
+        raise ValueError(
+            f"each of I1, I2, I3 must be at most the sum of the others, got {moments}."
+        )
     L, G, K = p
     if not (abs(L) < G and abs(K) <= G):
         raise ValueError(
-            f"the components L and K of the angular momentum must be smaller than its size G, got "
-            f"L = {L}, G = {G}, K = {K}; at L = ±G the angles are singular."
+            f"the momenta (L, G, K) must have |L| < G and |K| ≤ G, since L and K are components of "
+            f"an angular momentum of size G; got L = {L}, G = {G}, K = {K}."
         )
 
 

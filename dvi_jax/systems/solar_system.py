@@ -65,7 +65,8 @@ def installed_file(name: str, what: str) -> Path:
     path = Path(package.origin).parent / "data" / name
     if not path.is_file():
         raise EphemerisMissing(
-            f"the installed skyfield-data has no {name}; a version that has it: {_EXTRA}"
+            f"the installed skyfield-data has no file {name}. Install a newer version: "
+            "pip install --upgrade skyfield-data"
         )
     return path
 
@@ -82,7 +83,7 @@ def julian_date(date: str | datetime.date | float) -> float:
             date = datetime.date.fromisoformat(date)
         except ValueError:
             raise ValueError(
-                f'date must read like "1900-01-01" (year, month, day), got {date!r}.'
+                f'date must be like "1900-01-31" (year-month-day), got {date!r}.'
             ) from None
     if isinstance(date, datetime.datetime):
         raise ValueError(f"date must be a day without a time of day, got {date}.")
@@ -101,8 +102,8 @@ def check_covered(jd: Any) -> None:
     outside = jd[~((jd >= first) & (jd <= last))]  # NaN is outside
     if outside.size:
         raise ValueError(
-            f"the ephemeris DE421 covers 1899-07-29 to 2053-10-09 (Julian dates {first} to "
-            f"{last}); {outside[0]} is outside."
+            f"the Julian date {outside[0]} is outside of the ephemeris DE421, which covers "
+            f"1899-07-29 to 2053-10-09 (Julian dates {first} to {last})."
         )
 
 

@@ -145,7 +145,8 @@ def exact(t, q0, p0, args):
 def _leans(q, p, args):
     if not 0 < q[1] < np.pi:
         raise ValueError(
-            f"θ must lie between 0 and π, got {q[1]}: Euler's angles are singular on the vertical."
+            f"θ = q0[1] must lie between 0 and π (both excluded, since Euler's angles are singular "
+            f"there), got {q[1]}."
         )
 
 

@@ -160,13 +160,11 @@ def chosen(kind: str, names: Any, known: Iterable[str], hint: str = "") -> list[
         raise TypeError(f"{kind}s must be a list of names, got {names!r}.")
     names = list(dict.fromkeys(names))
     if not names:
-        raise ValueError(f"no {kind} was named; known are {', '.join(known)}.")
+        raise ValueError(f"{kind}s is empty: name at least one of {', '.join(known)}.")
     lowered = {name.lower(): name for name in known}
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(str(name).lower(), lowered, n=1)
             meant = f" (did you mean {lowered[near[0]]}?)" if near else ""
-            raise ValueError(
-                f"there is no {kind} {name!r}{meant}; known are {', '.join(known)}.{hint}"
-            )
+            raise ValueError(f"unknown {kind} {name!r}{meant}; known are {', '.join(known)}.{hint}")
     return names

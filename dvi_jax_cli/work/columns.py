@@ -52,12 +52,12 @@ def _csv(path: Path, key: str) -> dict[str, np.ndarray]:
     ]
     allowed = "different names, one for each column, such as t, x, y"
     for i, name in enumerate(names):
-        require(not np.isfinite(_number(name)), key, f"{first}: the number {name}", allowed)
+        require(not np.isfinite(_number(name)), key, f"{first}: {name} is a number", allowed)
         fits = name and name not in names[:i]
-        require(fits, key, f"{first}: the name {name!r} again", allowed)
-    require(rows, key, f"{path} has names and no numbers", "at least one line of numbers")
+        require(fits, key, f"{first}: {name!r} is empty or repeated", allowed)
+    require(rows, key, f"{path} has names but no numbers", "at least one line of numbers")
     for place, cells in rows:
-        allowed = f"{len(names)}, one for each of the names {', '.join(names)}"
+        allowed = f"{len(names)} cells, one for each of the names {', '.join(names)}"
         require(len(cells) == len(names), key, f"{place}: {len(cells)} cells", allowed)
     table = np.array([[_number(cell) for cell in cells] for _, cells in rows])
     for i, j in np.argwhere(np.isinf(table))[:1]:

@@ -86,10 +86,10 @@ def _arguments(file: DiscoverFile, source: Source) -> tuple[dict[str, Any], Any]
     try:
         size = basis.for_shape(shape).size
     except (TypeError, ValueError) as error:
-        allowed = f"a basis for a q of shape {shape}"
+        allowed = f"a basis that can be used for q of shape {shape}"
         raise InputError("basis", source.reported(error), allowed) from None
     count = file.samples.count or max(_LEAST, _FOR_EACH * size)
-    allowed = f"{2 * size} at least: twice the {size} functions"
+    allowed = f"at least {2 * size}, twice the number of functions"
     require(count >= 2 * size, "samples.count", shown(count), allowed)
     random = np.random.default_rng(file.samples.seed)
 
@@ -112,8 +112,8 @@ def _box(file: DiscoverFile, source: Source) -> list[tuple[np.ndarray, ...]]:
         shape = np.shape(source.array("q0"))
     else:
         shapes = {np.shape(x) for corner in given.values() for x in (corner.q, corner.p)} - {()}
-        seen = f"shapes {', '.join(map(str, sorted(shapes))) or 'of numbers alone'}"
-        allowed = "arrays of the one shape of q in low and high"
+        seen = f"shapes {', '.join(map(str, sorted(shapes))) or 'of numbers only'}"
+        allowed = "arrays of the same shape, that of q, in low and high (not only numbers)"
         require(len(shapes) == 1, "samples.low", seen, allowed)
         shape = shapes.pop()
     corners = []
@@ -127,7 +127,7 @@ def _box(file: DiscoverFile, source: Source) -> list[tuple[np.ndarray, ...]]:
             allowed = f"numbers, or arrays of the shape of q, {shape}"
             raise InputError(f"samples.{name}", seen, allowed) from None
     is_below = all((a < b).all() for a, b in zip(*corners, strict=True))
-    require(is_below, "samples.low", "it is not below samples.high", "low < high everywhere")
+    require(is_below, "samples.low", "it is not below samples.high", "low < high in each component")
     return corners
 
 

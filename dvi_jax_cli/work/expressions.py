@@ -45,7 +45,7 @@ class Expressions:
         except InputError:
             raise
         except SyntaxError:
-            raise self.error(f"{text!r}: the syntax is not that of a call") from None
+            raise self.error(f"{text!r} is not a valid expression") from None
         except (ValueError, TypeError, RecursionError, MemoryError) as error:
             raise self.error(f"{text!r}: {error}") from None
         return self.checked(made, text)
@@ -72,9 +72,7 @@ class Expressions:
             case ast.BinOp(left=left, op=ast.Add() | ast.Mult() as op, right=right):
                 left, right = self._made(left), self._made(right)
                 if not (isinstance(left, self.kind) and isinstance(right, self.kind)):
-                    raise ValueError(
-                        "+ and * cannot be used with a number: for 2 + 2 write the result, 4"
-                    )
+                    raise ValueError("+ and * cannot be used with numbers: for 2 + 2 write 4")
                 return left + right if isinstance(op, ast.Add) else left * right
             case ast.Name(id=name):
                 try:
@@ -84,7 +82,7 @@ class Expressions:
                     raise self.error(seen) from None
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=keywords):
                 return self._called(name, arguments, keywords)
-        raise ValueError(f"{ast.unparse(node)!r} is not one of these, a number or a list of them")
+        raise ValueError(f"{ast.unparse(node)!r} is not one of these, a number or a list")
 
     def _called(self, name: str, arguments: list[Any], keywords: list[ast.keyword]) -> Any:
         if name not in self.known:

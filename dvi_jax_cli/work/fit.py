@@ -169,7 +169,7 @@ def _observations(
         used = sigma
         sigma = np.stack([column(columns, "data.sigma", name) for name in used], axis=-1)
     names = given.columns or [n for n in columns if n not in (given.time, *used)]
-    require(names, "data.columns", "no column remains", f"out of {one_of(columns)}")
+    require(names, "data.columns", "no column is left", f"one or more of {one_of(columns)}")
     observed = _joined(columns, names, len(ts))
     observe = _observe(given.observe, loader)
     if observe in _NAMED:
@@ -182,10 +182,10 @@ def _observations(
     if sigma is not None and np.ndim(sigma):  # one for all columns, or one for each
         flat = observed.reshape(len(observed), -1)
         fits = sigma.shape[-1] in (1, flat.shape[1])
-        allowed = f"one for all, or {len(names)}, one for each column"
-        require(fits, "data.sigma", f"{sigma.shape[-1]} of them", allowed)
+        allowed = f"one column for all, or {len(names)}, one for each column of values"
+        require(fits, "data.sigma", f"{sigma.shape[-1]} columns", allowed)
         sigma = np.broadcast_to(sigma, flat.shape).reshape(observed.shape)
-    fits, allowed = len(ts) > 1 or t0 is not None, "two times at least, or t0 before it"
+    fits, allowed = len(ts) > 1 or t0 is not None, "at least two, or an earlier time t0"
     require(fits, "data.file", "one observation", allowed)
     try:
         return dvi.Observations(ts, observed, observe, sigma=sigma, t0=t0), names

@@ -29,7 +29,7 @@ class Loader:
         """
         file, _, name = text.rpartition(":")
         leaves = os.path.isabs(file) or ".." in Path(file).parts
-        require(not leaves, key, f"{shown(text)} leaves the folder of the TOML file", _ALLOWED)
+        require(not leaves, key, f"{shown(text)} is not in the folder of the TOML file", _ALLOWED)
         try:
             path = (self.folder / file).resolve()
             is_file = path.is_file()
@@ -54,8 +54,8 @@ class Loader:
         try:
             spec.loader.exec_module(module)
         except (Exception, SystemExit) as error:
-            seen = f"{text!r} does not import: {in_one_line(error, path)}"
-            raise InputError(key, seen, "a file that imports") from error
+            seen = f"{text!r} cannot be imported: {in_one_line(error, path)}"
+            raise InputError(key, seen, "a file that Python can import") from error
         finally:
             sys.path.remove(str(path.parent))
         return module

@@ -87,8 +87,8 @@ class Output(Report):
         """
         if not self.force and any(p.name != keep for p in self.folder.iterdir()):
             raise FileExistsError(
-                f"{self.folder} was empty when this began, and another process has written there "
-                "since; take another directory, or --force"
+                f"another process has written to {self.folder} since this command began; give "
+                "another directory, or --force"
             )
         for name in self.names:
             if name != keep:
@@ -98,8 +98,8 @@ class Output(Report):
         except KeyboardInterrupt:
             there = ", ".join(sorted(file.name for file in self.folder.iterdir())) or "nothing"
             raise KeyboardInterrupt(
-                f"by Ctrl-C while results were written to {self.folder}, where there is: {there}. "
-                "The last file may be incomplete; the same with --force writes all of them again"
+                f"by Ctrl-C while results were written to {self.folder}, which contains: {there}. "
+                "The last file may be incomplete; the same command with --force writes all again"
             ) from None
 
     def path(self, name: str) -> Path:

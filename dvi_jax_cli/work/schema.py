@@ -79,7 +79,7 @@ class State(Table):
     @model_validator(mode="after")
     def _date_or_arrays(self) -> Any:
         fits = self.date is None or (self.q0 is None and self.p0 is None)
-        require(fits, "date", "given together with q0 or p0", "date, or q0 and p0")
+        require(fits, "date", "given together with q0 or p0", "either date, or q0 and p0")
         return self
 
 
@@ -137,10 +137,10 @@ class Integration(Table):
         given: Any = self  # of a run or of a sweep, with h, steps and t0
         if isinstance(self.lattice, Times):
             for name in ("h", "steps"):
-                value, allowed = getattr(given, name), "nothing: lattice.times sets the steps"
+                value, allowed = getattr(given, name), "nothing: lattice.times gives the steps"
                 require(value is None, name, shown(value), allowed)
             fits = given.t0 in (0.0, self.lattice.times[0])
-            require(fits, "t0", shown(given.t0), "nothing: lattice.times has the start")
+            require(fits, "t0", shown(given.t0), "nothing: the run begins at lattice.times[0]")
         return self
 
 

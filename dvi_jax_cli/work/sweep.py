@@ -91,7 +91,7 @@ def _check_folder(folder: Path, key: str, resume: bool) -> None:
             return
         result = dvi.open_sweep(folder)
     except (dvi.StoreError, OSError) as error:
-        seen = f"{folder} exists, and is not the store of a sweep ({error})"
+        seen = f"{folder} exists, but is not the store of a sweep ({error})"
         raise InputError(key, seen, "a new directory") from None
     except ValueError as error:  # a name that no directory can have
         raise InputError(key, f"{folder}: {error}", "a new directory") from None
@@ -177,8 +177,8 @@ def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]
     arguments |= _initial_conditions(file, source)
     kinds = (dvi.Axis, dvi.starts.Starts)
     leaves = jax.tree.leaves(arguments, is_leaf=lambda x: isinstance(x, kinds))
-    seen = "nothing varies, neither this nor another number"
-    allowed = "an axis for some number, or [start]; for one trajectory there is dvi-jax run"
+    seen = "neither this nor another number varies"
+    allowed = "an axis for some number, or [start]; for one trajectory use dvi-jax run"
     require(any(isinstance(x, kinds) for x in leaves), "epsilon", seen, allowed)
     return source, arguments
 
@@ -205,7 +205,7 @@ def _parameters(value: Any, key: str = "args") -> Any:
     if not axes:
         return _for_sweep(key, value)
     seen = [f"{axis.axis} with {len(axis.all)} values" for axis in axes]
-    allowed = "axes of one name and length"
+    allowed = "axes of the same name and length"
     require(len({*seen}) == 1, key, f"axes {', '.join(seen)} in one array", allowed)
     arrays = [np.asarray(at(value, k), float) for k in range(len(axes[0].all))]
     return _axis(key, axes[0], np.stack(arrays))
@@ -222,7 +222,7 @@ def _methods(given: Any) -> Any:
 def _observe(file: SweepFile, source: Source) -> dict[str, Any] | None:
     """The observables; one without a reduction is that of the last step."""
     found = read_observables(file.observables, source)
-    fits, allowed = found or file.save is not None, 'an observable at least, or save = "final"'
+    fits, allowed = found or file.save is not None, 'at least one observable, or save = "final"'
     require(fits, "observables", "nothing would be saved", allowed)
     reduced = {n: f if isinstance(f, dvi.Reduction) else dvi.Last(f) for n, f in found.items()}
     return reduced or None
@@ -270,7 +270,9 @@ def _start(given: Any, source: Source) -> dvi.starts.Starts:
     try:
         return made(**options)
     except (TypeError, ValueError) as error:
-        raise InputError("start", str(error), f"keys that fit kind = {given.kind}") from None
+        raise InputError(
+            "start", str(error), f"keys that are valid for kind = {given.kind}"
+        ) from None
 
 
 # Stores

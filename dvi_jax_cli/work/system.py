@@ -83,7 +83,7 @@ class Source:
         """q0 or p0 of the file, or else of the system."""
         given, own = getattr(self.file.state, name), getattr(self.problem, name, None)
         fits = given is not None or own is not None
-        require(fits, f"state.{name}", MISSING, "an array of numbers; this system has none")
+        require(fits, f"state.{name}", MISSING, "an array of numbers (the system has no default)")
         return given if given is not None else np.asarray(own, float)
 
     def check_start(self, q0: Any, p0: Any, args: Any) -> None:
@@ -97,14 +97,14 @@ class Source:
         except systems.ParameterError as error:
             raise InputError("args", str(error), "args that fit the system") from None
         except ValueError as error:
-            allowed = "a start from which the system can continue"
+            allowed = "initial conditions from which the system can start"
             raise InputError("state", str(error), allowed) from None
 
     @property
     def h(self) -> Any:
         """The step size of the file, or else of the system."""
         h = self.file.h if self.file.h is not None else getattr(self.problem, "h", None)
-        require(h is not None, "h", MISSING, "a number; this system has none of its own")
+        require(h is not None, "h", MISSING, "a number (the system has no default)")
         return h
 
     def times(self, file: RunFile | SweepFile) -> dict[str, Any]:
