@@ -2,6 +2,7 @@
 
 import json
 import math
+import operator
 import os
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -379,8 +380,7 @@ def _candidates(checker: Any, functions: list, shape: Any, reach: list) -> list[
         (near <= low) | (near >= high)
     )
     if checker.inside["outputs"]:
-        algebra = checker.floats()
-        keep = lambda z: np.all(np.array([np.broadcast_to(g, len(z)) for g in algebra(checker.inside, z.T)]) >= 0, axis=0)
+        keep = _is_inside(checker.inside)
         near = rng.uniform(low, high, (200000, len(low)))
         near = near[keep(near)]
         moved = near + rng.choice([-1.0, 1.0], near.shape) * wide
@@ -398,6 +398,25 @@ def _candidates(checker: Any, functions: list, shape: Any, reach: list) -> list[
                 share = float(np.mean(sign * within < border))
                 found.append((share, (k, sign, least, border)))
     return [item for _, item in sorted(found, key=lambda pair: -pair[0])]
+
+
+class _Floats:
+    """The arithmetic of float64 for `checker.run`."""
+
+    constant, sum = staticmethod(float), staticmethod(lambda *terms: sum(terms))
+    negative, multiply, divide = operator.neg, operator.mul, operator.truediv
+    apply = staticmethod(lambda name, a: getattr(np, name)(a))
+
+
+def _is_inside(inside: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
+    """States (many, 2n) → whether no value of `inside` is negative."""
+    exact, _ = _tools()
+
+    def keep(states):
+        values = exact.run(inside, list(states.T), _Floats)
+        return np.all([np.broadcast_to(value >= 0, len(states)) for value in values], axis=0)
+
+    return keep
 
 
 def _state(z: Any, shape: Any) -> tuple[Any, Any]:

@@ -41,6 +41,10 @@ ULPS = {"sqrt": 1}
 """Errors of computed elementary functions in units of round-off; 8 (4 ulp) for the others."""
 
 
+LEAST = 2.0**-1000
+"""Added to each error, for results below the normal numbers."""
+
+
 class Failed(Exception):
     """What could not be shown, and where."""
 
@@ -75,11 +79,14 @@ def series(name, at, length):
     """The Taylor coefficients of a function at a point, or balls of them on a ball."""
     ctx.cap = length
     x = arb_series([at, 1], length)
-    if name == "inverse":
-        return 1 / x
-    if name in ("sinh", "cosh"):
-        return (x.exp() + (-1 if name == "sinh" else 1) / x.exp()) / 2
-    return getattr(x, name)()
+    try:
+        if name == "inverse":
+            return 1 / x
+        if name in ("sinh", "cosh"):
+            return (x.exp() + (-1 if name == "sinh" else 1) / x.exp()) / 2
+        return getattr(x, name)()
+    except (ValueError, ZeroDivisionError) as error:
+        raise Failed(f"{name} is singular ({error})") from None
 
 
 def power(a, n, algebra):
@@ -125,7 +132,6 @@ class Models:
     def __init__(self, size, bits, tiny):
         self.bits, self.one, self.tiny = bits, 1 << bits, max(1, int(Fraction(tiny) * 2**bits))
         self.ring = fmpz_mpoly_ctx.get([f"s{i}" for i in range(size)], "lex")
-        self.at_middle = (0,) * size
 
     def constant(self, value):
         scaled = value * self.one
@@ -178,10 +184,10 @@ class Models:
 
     def apply(self, name, a):
         """f(c + r) = Σ f⁽ᵏ⁾(c)/k! rᵏ, with Lagrange's remainder on the range of c + r."""
-        middle = int(a[0].to_dict().get(self.at_middle, 0))
-        around = self.norm(a) - abs(middle) + a[1]
-        ahead = series(name, arb(middle, around) / self.one, ORDERS + 2)
-        radius = arb(around) / self.one
+        low, high = (value * self.one for value in self.range(a))
+        middle = int(low + high) // 2
+        ahead = series(name, arb(int(low)).union(arb(int(high))) / self.one, ORDERS + 2)
+        radius = arb(int(max(high - middle, middle - low))) / self.one
         left = [abs(ahead[k + 1]) * radius ** (k + 1) * self.one for k in range(ORDERS + 1)]
         if not all(remainder.is_finite() for remainder in left):
             raise Failed(f"{name} is singular, or varies too much")
@@ -211,11 +217,14 @@ class Rounding:
         return ball(value), arb(0)
 
     def rounded(self, value, error, operations=1):
-        return value, arb((error + operations * self.unit * (abs(value) + error)).upper())
+        made = operations * self.unit * (abs(value) + error) + LEAST
+        return value, arb((error + made).upper())
 
     def sum(self, *terms):
         error, size = sum(t[1] for t in terms), sum(abs(t[0]) + t[1] for t in terms)
-        return sum(t[0] for t in terms), arb((error + len(terms) * self.unit * size).upper())
+        return sum(t[0] for t in terms), arb(
+            (error + len(terms) * self.unit * size + LEAST).upper()
+        )
 
     def negative(self, a):
         return -a[0], a[1]
@@ -228,7 +237,8 @@ class Rounding:
         value, least = a[0] / b[0], b[0].abs_lower() - b[1]
         if not least > 0:
             raise Failed("a divisor can be zero")
-        return self.rounded(value, (a[1] + abs(value) * b[1]) / least)
+        # A compiler may multiply by the inverse of a constant: two roundings.
+        return self.rounded(value, (a[1] + abs(value) * b[1]) / least, 2)
 
     def apply(self, name, a):
         near = series(name, a[0] + arb(0, up(a[1])), 2)
