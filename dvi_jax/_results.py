@@ -27,7 +27,7 @@ class RESULTS(eqx.Enumeration):
         "needs h times the derivative of the rate to be less than one; dvi.Newton() does not."
     )
     not_finite = (
-        "The state became NaN or infinite. Likely causes: (a) the start or args already hold a "
+        "The state became NaN or infinite. Likely causes: (a) the initial state or args contain a "
         "value that is not finite; (b) a singularity of H_D was met (two bodies at one place, "
         "say); (c) h is beyond the stability limit and the orbit escaped."
     )
