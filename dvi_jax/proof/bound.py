@@ -199,14 +199,16 @@ def bound_drift(
         "inside": program_of(inside or (lambda q, p: jnp.zeros(0)), shape, shape),
         "invariants": [program_of(f, shape, shape, ()) for f, _ in functions],
         "unit": (2.0**-53).hex(),
-        "bits": 140,
-        "tiny": (2.0**-73).hex(),
+        "bits": 100,
+        "tiny": (2.0**-60).hex(),
     }
     size = max(abs(x) for x in (*lower, *upper))
     certificate["accepted"] = (_ACCEPTED * 2.0**-52 * size).hex()
     certificate["spread"] = [(0.0).hex()] * (len(lower) // 2)
     checker = exact.Checker(certificate)
     limits = {"max_boxes": max_boxes, "max_seconds": max_seconds}
+    search.resolve(checker)
+    certificate |= {"bits": checker.bits, "tiny": float(checker.tiny).hex()}
     result = search.subdivide(checker, ratio=ratio, **limits)
     per_step = [exact.up(b) for b in result.bounds]
     for k, (b, s) in enumerate(zip(per_step, result.seen, strict=True)):

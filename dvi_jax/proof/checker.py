@@ -104,21 +104,22 @@ def run(program, inputs, algebra):
     earlier operation. `algebra` has the arithmetic of the values."""
     values = []
     for name, *operands in program["operations"]:
-        if name == "input":
-            value = inputs[operands[0]]
-        elif name == "constant":
-            value = algebra.constant(exact(operands[0]))
-        elif name == "power":
-            value = power(values[operands[0]], operands[1], algebra)
-        else:
-            given = [values[i] for i in operands]
-            if name in ("sum", "negative", "multiply", "divide"):
-                value = getattr(algebra, name)(*given)
+        try:
+            if name == "input":
+                values.append(inputs[operands[0]])
+            elif name == "constant":
+                values.append(algebra.constant(exact(operands[0])))
+            elif name == "power":
+                values.append(power(values[operands[0]], operands[1], algebra))
+            elif name in ("sum", "negative", "multiply", "divide"):
+                values.append(getattr(algebra, name)(*(values[i] for i in operands)))
             elif name in FUNCTIONS:
-                value = algebra.apply(name, *given)
+                values.append(algebra.apply(name, values[operands[0]]))
             else:
                 raise Failed(f"unknown operation {name}")
-        values.append(value)
+        except Failed as error:
+            error.place = program, len(values)
+            raise
     return [values[i] for i in program["outputs"]]
 
 

@@ -12,6 +12,9 @@ import numpy as np
 
 from . import checker as exact
 
+_DIGITS = (30, 45, 60, 80, 100, 130)
+"""Binary digits after the point that are tried for the smallest terms."""
+
 _POINTS = 64
 """Random points of a box at which a change is evaluated, for a lower estimate of its supremum."""
 
@@ -23,6 +26,7 @@ class Leaf:
     - `failed`: why nothing is bounded there.
     - `bounds`, `seen`: for each invariant an upper bound of the change, and the largest one seen.
     - `rounding`, `moved`: changes by rounding, and how far a step moves each coordinate.
+    - `remainders`: of the models of the changes. `blame`: the coordinates that a failure is due to.
     - `axis`, `parts`: of the cut, if there is one.
     """
 
@@ -33,6 +37,8 @@ class Leaf:
     seen: list = field(default_factory=list)
     rounding: list = field(default_factory=list)
     moved: list = field(default_factory=list)
+    remainders: list = field(default_factory=list)
+    blame: set = field(default_factory=set)
     axis: int = 0
     parts: list = field(default_factory=list)
 
@@ -55,14 +61,49 @@ def examine(checker: exact.Checker, box: list, rng: Any) -> Leaf:
             return leaf
         changes = checker.changes(x, algebra)
         leaf.bounds = [algebra.bound(change) for change in changes]
+        leaf.remainders = [change[1] / algebra.one for change in changes]
         leaf.seen = [seen(algebra, change, box, rng) for change in changes]
         leaf.rounding, errors = checker.rounding(box)
         leaf.moved = [exact.up(m + Fraction(e)) for m, e in zip(moved, errors, strict=True)]
         if not all(map(math.isfinite, (*leaf.rounding, *leaf.moved))):
             raise exact.Failed("a value is not bounded")
-    except (exact.Failed, OverflowError, ZeroDivisionError) as error:
+    except (exact.Failed, OverflowError) as error:
         leaf.failed = str(error)
+        leaf.blame = _inputs(*error.place) if hasattr(error, "place") else set()
     return leaf
+
+
+def _inputs(program: dict, index: int) -> set[int]:
+    """The inputs of a program on which one of its operations depends."""
+    needed = {index}
+    for i in range(index, -1, -1):
+        name, *operands = program["operations"][i]
+        if i in needed and name not in ("input", "constant"):
+            needed.update(operands[:1] if name == "power" else operands)
+    used = [program["operations"][i] for i in needed]
+    return {operands[0] for name, *operands in used if name == "input"}
+
+
+def resolve(checker: exact.Checker) -> None:
+    """Choose below which size terms are dropped: remainders shall be small next to the changes.
+
+    Large terms are faster; a change that nearly cancels needs small ones.
+    """
+    rng, box = np.random.default_rng(0), checker.root()
+    for digits in _DIGITS:
+        checker.tiny, checker.bits = Fraction(1, 2**digits), digits + 40
+        leaf = examine(checker, box, rng)
+        while leaf.failed and box[0][1] - box[0][0] > Fraction(1, 10**4):
+            # A part of the domain is enough here.
+            parts = [rng.integers(0, 2) for _ in box]
+            box = [
+                ((a + b) / 2, b) if up else (a, (a + b) / 2)
+                for (a, b), up in zip(box, parts, strict=True)
+            ]
+            leaf = examine(checker, box, rng)
+        pairs = zip(leaf.remainders, leaf.seen, strict=True)
+        if leaf.remainders and all(r <= s / 10 for r, s in pairs):
+            return
 
 
 def seen(algebra: exact.Models, model: Any, box: list, rng: Any) -> float:
@@ -151,9 +192,9 @@ def _rank(leaf: Leaf, best: list) -> float:
 
 def _cut(checker: exact.Checker, leaf: Leaf, rng: Any) -> tuple[int, list[Leaf]]:
     """The parts of a leaf along the axis that leaves the smallest bounds."""
-    axes = [_widest(checker, leaf.box)]
-    if not leaf.failed:
-        axes = [i for i, (a, b) in enumerate(leaf.box) if a < b]
+    axes = [i for i, (a, b) in enumerate(leaf.box) if a < b]
+    if leaf.failed:
+        axes = [_widest(checker, leaf.box, leaf.blame)]
     tried = [(i, [examine(checker, half, rng) for half in halves(leaf.box, i)]) for i in axes]
     return min(tried, key=lambda item: sum(_rest(leaf, part) for part in item[1]))
 
@@ -230,11 +271,11 @@ def _claim(checker: exact.Checker, box: list, limits: list, reach: list) -> Any:
     return None
 
 
-def _widest(checker: exact.Checker, box: list) -> int:
-    """The widest coordinate, relative to the domain; ε counts less."""
+def _widest(checker: exact.Checker, box: list, of: Any = ()) -> int:
+    """The widest coordinate, or the widest one `of` some, relative to the domain; ε counts less."""
     ends = zip(
         box, [*checker.lower, checker.epsilon[0]], [*checker.upper, checker.epsilon[1]], strict=True
     )
     widths = [float((b - a) / (high - low)) if high > low else 0.0 for (a, b), low, high in ends]
     widths[-1] /= 8
-    return max(range(len(box)), key=widths.__getitem__)
+    return max([i for i in of if i < len(box)] or range(len(box)), key=widths.__getitem__)
