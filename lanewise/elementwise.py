@@ -97,7 +97,9 @@ def _pow(e: "Evaluator", _: Any, x: Num, y: Num) -> Num:
 def _elementary(name: str) -> Callable:
     def rule(e: "Evaluator", _: Any, *xs: Num) -> Num:
         if not xs[0].is_float:
-            raise Unsupported(f"{name} of {xs[0].dtype}")
+            raise Unsupported(
+                f"the function {name} of numbers of type {xs[0].dtype}, not floating point"
+            )
         if xs[0].dtype == "float32":
             # Own functions for float32 would be faster, and one more set to test.
             wide = e.kernel.elementary(name, [e.b.convert(x, "float64") for x in xs])

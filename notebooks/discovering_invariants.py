@@ -11,8 +11,8 @@
 #
 # $$\sum_{m \le k} A_{k-m}\, c_m = 0, \qquad k = 0 \dots z.$$
 #
-# The coefficients $c_m$ are therefore a null space. A quarter of the samples is held out for
-# validation. A long run is the final test.
+# The coefficients $c_0, \dots, c_z$ together are therefore a vector of a null space. A quarter of
+# the samples is held out for validation. A long run is the final test.
 
 # %%
 import jax
@@ -64,8 +64,8 @@ plt.show()
 # ## No invariant
 #
 # Van der Pol's force $(1 - q^2)\,p$ amplifies small oscillations and damps large ones. There is no
-# invariant of first order. The result must be empty, and the report must give the reason: a law for
-# the mean change of the lost invariant $I$ in one step.
+# invariant of first order: the result must be empty. The report must give a law for the quantity
+# $I$ that is conserved only for $\varepsilon = 0$: its mean change in one step.
 
 # %%
 van_der_pol = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: (1 - q0**2) * p1)
@@ -140,8 +140,9 @@ assert found.survivors == (13, 4, 2)
 # If the basis cannot represent an invariant, the search does not find it, but it must not report a
 # wrong one. For Kepler's problem and polynomials only the angular momentum is found. With $1/r$ in
 # the basis, three more are found: a map of second order conserves the energy and the two components
-# of the Laplace–Runge–Lenz vector approximately. The smallest singular values show how well;
-# `tolerance` is the limit below which they count as zero.
+# of the Laplace–Runge–Lenz vector approximately. The smaller a singular value, the better the
+# conservation. `tolerance` is the limit, relative to the largest singular value, below which a
+# singular value counts as zero.
 
 # %%
 kepler = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - 1 / jnp.sqrt(q0 @ q0))

@@ -61,8 +61,8 @@ for name, x, sigma in zip(found.names, found.x, found.sigma, strict=True):
 print(f"{found.status}, reduced chi² = {found.reduced_chi2:.2f}")
 
 # %% [markdown]
-# The observations with their errors, and the orbit of the fitted parameters at all steps between
-# them (without `curve` the plot shows the predictions at the times of observation):
+# The plot shows the observations with their errors, and the trajectory of the fitted parameters at
+# all steps. Without `curve` it shows the predictions at the times of observation.
 
 # %%
 fitted = dvi.integrate(system, p0=[0.0], h=0.05, t1=ts[-1], method=dvi.Yoshida(4), **found.params)
@@ -155,6 +155,7 @@ plt.show()
 #
 # - Real data, with systematic errors: [general relativity](general_relativity.ipynb) and
 #   the [Chandler wobble](polar_motion.ipynb).
-# - `bounds`, `priors`, losses for outliers, several arcs, `MultipleShooting` for chaotic arcs.
+# - `dvi.fit` has the arguments `bounds`, `priors`, `loss` (for data with outliers) and `shooting`
+#   (`MultipleShooting` for chaotic arcs), and fits several arcs together.
 # - `dvi.NetworkForce`: a potential and a damping given by networks.
 # - `dvi.sample`: the posterior distribution of the parameters, not only their errors.

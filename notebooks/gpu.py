@@ -102,7 +102,8 @@ assert worst < 1e-14
 #
 # Graphics GPUs compute in float32 many times faster than in float64. A run uses float32 only if the
 # initial state has this type; float64 input raises an error if x64 is switched off. This map
-# conserves the angular momentum exactly, so its drift is round-off. How does it grow?
+# conserves the angular momentum exactly, so its drift is round-off. The plot shows how the drift
+# grows with the number of steps.
 
 # %%
 marks = np.unique(np.geomspace(10, 200_000, 40).astype(int))
@@ -151,7 +152,7 @@ plt.show()
 
 # %% [markdown]
 # In float32 the drift is larger by the ratio of the rounding units, about $5 \times 10^8$.
-# `Compensated()` adds the rounding errors of sums back, and needs a few more operations. After
+# `Compensated()` stores the rounding error of each step and adds it in the next step. After
 # 200 000 steps an exact invariant has changed by $2 \times 10^{-5}$ in plain float32. The drift of
 # an adiabatic invariant cannot be measured in float32 if it is smaller than this. Therefore the
 # package does not let JAX round float64 input to float32, but raises an error.

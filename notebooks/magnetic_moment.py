@@ -29,8 +29,9 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## The motion
 #
-# The guiding centre is at a distance $\ell/2$ from the axis, the run covers about two bounces
-# between the mirror points, and the method is that of Gauss of order 4. The right plot shows $\mu$.
+# The initial guiding centre is at a distance $\ell/2$ from the axis. The run covers about two
+# bounces, from one mirror point to the other and back. The method is that of Gauss of order 4. The
+# left plot shows the orbit, the right plot $\mu$.
 
 
 # %%
@@ -73,8 +74,9 @@ plt.show()
 # follows from the symmetry of the field, to round-off. The energy has the error of the method.
 # $\mu_0$ oscillates at the gyrofrequency, with an amplitude proportional to $1/\ell$. With its
 # first correction $\mu_1$ (for fields with $b \cdot (\nabla \times b) = 0$, where $b = B/|B|$) the
-# amplitude is proportional to $1/\ell^2$. The same holds for the *bounce action*
-# $J = \oint p_\parallel\, ds$ along the field line, the second adiabatic invariant.
+# amplitude is proportional to $1/\ell^2$. The second adiabatic invariant, the *bounce action*
+# $J = \oint p_\parallel\, ds$ along the field line, also oscillates with an amplitude proportional
+# to $1/\ell^2$.
 
 # %%
 keys = ["magnetic_moment", "corrected_moment", "bounce_action"]

@@ -6,8 +6,8 @@
 # a status and stores finished results on disk.
 #
 # The system is the Kepler problem in the plane, perturbed by the central force $-\varepsilon q$.
-# The drifts of the energy $H$ and of the angular momentum $L$ scale with which powers of
-# $\varepsilon$? For which orbits does the run fail?
+# With which power of $\varepsilon$ does the drift of the energy $H$ scale? Does the angular
+# momentum $L$ drift? For which orbits does the run fail?
 
 # %%
 import tempfile
@@ -108,8 +108,9 @@ assert 0 < share < 0.2
 # ## Repeat and resume
 #
 # The store belongs to this sweep. The same call finds all results and computes nothing; after an
-# interruption it would compute the missing ones. The results are identical bit for bit. `integrate`
-# computes a single trajectory with another program; it agrees with the sweep to round-off.
+# interruption it would compute the missing ones. The results are identical bit for bit to those of
+# a sweep without interruption. `integrate` computes a single trajectory with another program; its
+# result agrees with the sweep to round-off.
 
 # %%
 again = dvi.sweep(kepler.system, **asked, store=store)

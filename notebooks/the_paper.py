@@ -9,11 +9,12 @@
 # $$q_1 = q_0 + h\,\frac{\partial H_D}{\partial p_1}, \qquad
 # p_1 = p_0 - h\,\frac{\partial H_D}{\partial q_0} + h\,\varepsilon W . \tag{12, 13}$$
 #
-# $\varepsilon W$ is the perturbing force. A symmetry shifts the time by $\xi_0$ and the positions
-# by $\xi$; both are series in $\varepsilon$ with the terms $\xi_{0m}$ and $\xi_m$. With a gauge
-# function $G$ it leads to the adiabatic invariant of order $z$,
+# $\varepsilon W$ is the perturbing force. A symmetry shifts the time by $\xi^0$ and the positions
+# by $\xi$. Both are series in $\varepsilon$, with the coefficients $\xi^0_m$ and $\xi_m$ of order
+# $m$. With a gauge function $G$, also a series, the symmetry gives the adiabatic invariant of order
+# $z$,
 #
-# $$I_z = \sum_{m \le z} \varepsilon^m (\xi_m \cdot p - \xi_{0m} E^- + G_m), \tag{29}$$
+# $$I_z = \sum_{m \le z} \varepsilon^m (\xi_m \cdot p - \xi^0_m E^- + G_m), \tag{29}$$
 #
 # where $E^-$ is the incoming energy of a grid point, that of the step that ends there. The command
 # `dvi-jax paper` measures all claims of the paper and writes a table of verdicts.
@@ -87,9 +88,11 @@ plt.show()
 # %% [markdown]
 # ## (34): an invariant of first order?
 #
-# Under $W = -q$ the paper gives $(1 + \varepsilon)(p^2 + q^2)/2$. The slope of the drift is 2
-# for an invariant of first order, and 1 otherwise. To remove the effect of the discretisation, a
-# composition of order 4 with $h = 0.01$ represents $h \to 0$.
+# For $W = -q$ the paper gives $(1 + \varepsilon)(p^2 + q^2)/2$ as an invariant of first order. The
+# drift of such an invariant scales as $\varepsilon^2$: the slope of log(drift) against
+# log($\varepsilon$) is 2. A slope of 1 means that the quantity is conserved only for
+# $\varepsilon = 0$. To remove the effect of the discretisation, a composition of order 4 with
+# $h = 0.01$ represents $h \to 0$.
 
 
 # %%
@@ -154,7 +157,7 @@ assert of_34["its h = 0.1 form"].max() < 1e-12 * 1e-4  # exact, for all ε
 # $H_D = p_1^2/2 - K^2/|q_0|$ (the paper prints $+$, a repulsive potential), with the perturbing
 # force $W = -q$. (49) is $1 + \varepsilon$ times the angular momentum, from the rotation. (50)
 # comes from a rotation with a shift of time, and the gauge $-\varepsilon |q|^2/2$. The paper writes
-# $\xi_0 = 1$ in (47); (50) as printed corresponds to $\xi_0 = 1 + \varepsilon$:
+# $\xi^0 = 1$ in (47); (50) as printed corresponds to $\xi^0 = 1 + \varepsilon$:
 #
 # $$I_{(49)} = (1 + \varepsilon) L, \qquad
 # I_{(50)} = (1 + \varepsilon)(L - H) - \tfrac{\varepsilon}{2} |q|^2 .$$
@@ -198,9 +201,10 @@ assert abs(slopes[0] - 2) < 0.1  # of first order, with −εq …
 assert abs(slopes[1] - 1) < 0.1  # … and not with +εq
 
 # %% [markdown]
-# (49) is conserved to round-off on any time grid, because its $\xi_0$ is 0. For (50) $\xi_0$ is not
-# 0, and it requires the variational grid: on a fixed grid it oscillates with an amplitude $O(h)$
-# for any $\varepsilon$. For $h \to 0$ it is an invariant of first order for the force
+# (49) is conserved to round-off on any time grid, because its $\xi^0$ is 0 and the force is
+# central. For (50) $\xi^0$ is not 0, so (50) requires the variational grid. On a fixed grid it
+# oscillates with an amplitude $O(h)$ for any $\varepsilon$. For $h \to 0$ it is an invariant of
+# first order for the force
 # $-\varepsilon q$. The force $+\varepsilon q$ is the control that must fail: its slope is 1.
 
 # %%

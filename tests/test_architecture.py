@@ -29,7 +29,7 @@ FLOORS = [
     ["_integrator"],
     ["_integrate"],
     ["discover"],
-    ["sweep", "fit"],
+    ["sweep", "fit", "proof"],
     ["dynamics"],
     ["_namespaces"],
     ["__init__", "systems", "plot", "symmetry", "invariants"],

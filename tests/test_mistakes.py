@@ -178,6 +178,7 @@ ERRORS = {
     "no h": (lambda: dvi.integrate(FREE, Q, P, num_steps=3), "h"),
     "no num_steps": (lambda: dvi.integrate(FREE, Q, P, h=0.1), "num_steps"),
     "h = 0": (lambda: run(h=0.0), "h must not be zero"),
+    "h = 0 and t1": (lambda: dvi.integrate(FREE, Q, P, h=0.0, t1=1.0), "h must not be zero"),
     "h NaN": (lambda: run(h=np.nan), "h must be finite"),
     "h as text": (lambda: run(h="0.1"), "h "),
     "an array of h": (lambda: run(h=[0.1, 0.2]), "dvi.Given"),

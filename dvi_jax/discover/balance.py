@@ -22,7 +22,7 @@ class Balance(NamedTuple):
     - `drift`: (I_{k+1} − I_k)/h, the sum of the other three to round-off.
     - `symmetry`: Σ ε^m N_m, the residuals of Noether's identities.
     - `work`: ε^{z+1} W·(ξ_z − Dq ξ0_z), the work of the perturbing force.
-    - `lattice`: −Σ ε^m ξ0_m r, from a mesh that violates the energy equation.
+    - `lattice`: −Σ ε^m ξ0_m r, from a time grid that violates the energy equation.
     """
 
     ts: Float[Array, " steps"]
@@ -50,7 +50,7 @@ def noether_balance(
 
         D(I_z) = Σ_m ε^m N_m + ε^{z+1} W·(ξ_z − Dq ξ0_z) − Σ_m ε^m ξ0_m r
 
-    It holds on every mesh, for any generators and gauges: every drift is the sum of the violation
+    It holds on every time grid, for any generators and gauges: every drift is the sum of the violation
     of the symmetry, the work of the perturbing force and the lattice defect.
 
     **Arguments**

@@ -108,7 +108,10 @@ def actions(
             f"of shape (n, N), or a Solution; got a real signal of shape {signal.shape}."
         )
     if is_traced(signal) or is_traced(ts):
-        raise ValueError("call actions outside of jit, vmap and grad, with the whole batch.")
+        raise ValueError(
+            "the times or the signal are traced: call actions outside of jit, vmap and grad, once "
+            "for the whole batch (a part of the computation uses NumPy)."
+        )
     # One axis for all degrees of freedom of a trajectory.
     lead, N = signal.shape[: signal.ndim - 1 - axes], signal.shape[-1]
     signal = signal.reshape(*lead, math.prod(signal.shape[len(lead) : -1]), N)

@@ -252,8 +252,8 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     sizes = zip(ts.shape[::-1], signal.shape[::-1], strict=False)
     if ts.ndim > signal.ndim or any(n not in (1, size) for n, size in sizes):
         raise ValueError(
-            f"times of shape {ts.shape} do not match signals of shape {signal.shape}: give one "
-            "row of times, or one for each signal."
+            f"ts of shape {ts.shape} does not match a signal of shape {signal.shape}: give times "
+            f"for all signals, shape {ts.shape[-1:]}, or for each one, shape {signal.shape}."
         )
     if signal.shape[-1] < _FEWEST:
         raise ValueError(

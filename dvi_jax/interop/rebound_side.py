@@ -28,15 +28,15 @@ _NEWTONIAN = ("basic", "compensated", "jacobi", "mercurius", "trace")
 """Modules for gravity that evaluate Newton's law in full, whichever way they order the sums."""
 
 _TURNED_ON = {
-    "_additional_forces": "additional_forces: write it as force= of a dvi.System",
+    "_additional_forces": "additional_forces (write it as force= of a dvi.System)",
     "_pre_timestep_modifications": "pre_timestep_modifications",
     "_post_timestep_modifications": "post_timestep_modifications",
-    "_heartbeat": "a heartbeat: dvi.integrate(observe=..., stop=...) watches a run",
-    "extras": "extras (REBOUNDx): write its effect as force= of a dvi.System",
-    "_N_odes": "ODEs of the user's",
-    "exit_max_distance": "exit_max_distance: take stop=dvi.Stop(g)",
-    "exit_min_distance": "exit_min_distance: take stop=dvi.Stop(g)",
-    "N_var": "variational particles: dvi.TangentMap(), dvi.MEGNO() or jax.jvp give derivatives",
+    "_heartbeat": "heartbeat (use observe= and stop= of dvi.integrate)",
+    "extras": "extras of REBOUNDx (write their effect as force= of a dvi.System)",
+    "_N_odes": "additional ODEs",
+    "exit_max_distance": "exit_max_distance (use stop=dvi.Stop(g))",
+    "exit_min_distance": "exit_min_distance (use stop=dvi.Stop(g))",
+    "N_var": "variational particles (use dvi.TangentMap(), dvi.MEGNO() or jax.jvp)",
 }
 """Settings that change a simulation besides its bodies: name of the field → what to do."""
 
@@ -237,13 +237,14 @@ def _check_convertible(sim: Any) -> None:
     settings = (("boundary", ("none",)), ("collision", ("none",)), ("gravity", _NEWTONIAN))
     for field, allowed in settings:
         if (value := getattr(sim, field)) not in allowed:
-            found.append(f"{field} = {value!r}, which must be one of {', '.join(allowed)}")
+            found.append(f"{field} = {value!r} (allowed: {', '.join(map(repr, allowed))})")
     if str(sim.integrator) == "sei":
-        found.append("the shearing sheet (integrator sei): see the system hill")
+        found.append("the shearing sheet, integrator sei (see the system hill)")
     if found:
         raise ValueError(
             "this simulation has features that cannot be converted: "
-            f"{'; '.join(found)}. Turn them off in REBOUND (sim.copy() leaves callbacks out)."
+            f"{'; '.join(found)}. Remove them in REBOUND, and convert again; sim.copy() is a copy "
+            "without callbacks."
         )
     if not sim.is_synchronized:
         raise ValueError("the simulation is in the middle of a step: call sim.synchronize() first.")

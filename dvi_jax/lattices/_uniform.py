@@ -18,18 +18,20 @@ class Uniform(StepSizes):
             raise ValueError(f"{' and '.join(names)} are given: give only one of them.")
         try:
             length = float(duration) if t1 is None else float(t1) - float(t0)
-            steps = length / float(h)
+            # h = 0 has its own message later.
+            steps = length / (float(h) or 1.0)
         except TypeError:
             raise TypeError(
-                f"{names[0]} requires that t0, h and {names[0]} are known numbers (they determine "
-                f"array shapes), got t0={t0!r}, h={h!r}, {names[0]}={given[names[0]]!r}. Under jit "
-                f"give num_steps in place of {names[0]}."
+                f"t0, h and {names[0]} must be numbers that are known before compilation, because "
+                f"they determine array shapes; got t0={t0!r}, h={h!r}, "
+                f"{names[0]}={given[names[0]]!r}. Under jit give num_steps in place of {names[0]}."
             ) from None
         count = round(steps) if math.isfinite(steps) else -1
         if count < 0:
             raise ValueError(
-                f"{names[0]}={given[names[0]]!r} is not reached from t0={t0!r} with h={h!r}: h > 0 "
-                "runs forwards in time, h < 0 backwards."
+                f"no number of steps of h={h!r} from t0={t0!r} gives "
+                f"{names[0]}={given[names[0]]!r}: give a finite {names[0]}, and h > 0 for a run "
+                "forwards in time or h < 0 for a run backwards (a duration has the sign of h)."
             )
         # (t1 − t0)/h has round-off, which is not a remaining part of a step.
         if abs(steps - count) > 1e-9 * max(1, count):

@@ -93,7 +93,8 @@ class DriftBound(eqx.Module):
             f"proved for each step from a state with {sides}"
             + (" and inside(q, p) ≥ 0" if c["inside"]["outputs"] else "")
             + f", for all ε in [{low:.6g}, {high:.6g}], h = {float.fromhex(c['h']):.6g}:",
-            f"{'':4}{'change ≤':>10} {'seen':>9} {'rounding ≤':>10} {'steps for ' + format(self.change, 'g'):>18}",
+            f"{'':4}{'change ≤':>10} {'seen':>9} {'rounding ≤':>10} "
+            f"{'steps for ' + format(self.change, 'g'):>18}",
         ]
         for k, b in enumerate(self.per_step):
             lines.append(
@@ -162,8 +163,8 @@ def bound_drift(
     of products and sums, that elementary functions have errors of at most 4 ulp; and that the
     solver of an implicit step accepts residuals of at most 8 units of round-off of the momenta.
 
-    **Source** Taylor models: Makino & Berz 2003, *Int. J. Pure Appl. Math.* 4, 379. Balls: Johansson
-    2017, *IEEE Trans. Computers* 66, 1281.
+    **Source** Taylor models: Makino & Berz 2003, *Int. J. Pure Appl. Math.* 4, 379. Balls:
+    Johansson 2017, *IEEE Trans. Computers* 66, 1281.
 
     **Example**
 
@@ -209,6 +210,7 @@ def bound_drift(
     limits = {"max_boxes": max_boxes, "max_seconds": max_seconds}
     search.resolve(checker)
     certificate |= {"bits": checker.bits, "tiny": float(checker.tiny).hex()}
+    checker = exact.Checker(certificate)
     result = search.subdivide(checker, ratio=ratio, **limits)
     per_step = [exact.up(b) for b in result.bounds]
     for k, (b, s) in enumerate(zip(per_step, result.seen, strict=True)):

@@ -123,7 +123,14 @@ def run(program, inputs, algebra):
     return [values[i] for i in program["outputs"]]
 
 
-class Models:
+class Pairs:
+    """Values (a, b) whose negative is (−a, b)."""
+
+    def negative(self, a):
+        return -a[0], a[1]
+
+
+class Models(Pairs):
     """Taylor models in variables s with |s| ≤ 1.
 
     A model (P, E) stands for functions that differ from P(s)/2^bits by at most E/2^bits. P has
@@ -138,16 +145,8 @@ class Models:
         scaled = value * self.one
         return self.ring.constant(math.floor(scaled)), int(scaled.denominator != 1)
 
-    def variable(self, index, middle, radius):
-        """The coordinate middle + radius s."""
-        moved = self.multiply((self.ring.gen(index) * self.one, 0), self.constant(radius))
-        return self.sum(self.constant(middle), moved)
-
     def sum(self, *terms):
         return sum((t[0] for t in terms[1:]), terms[0][0]), sum(t[1] for t in terms)
-
-    def negative(self, a):
-        return -a[0], a[1]
 
     def multiply(self, a, b):
         error = self.norm(a) * b[1] + self.norm(b) * a[1] + a[1] * b[1]
@@ -204,7 +203,7 @@ class Models:
         return result[0], result[1] + math.ceil(up(left[order]))
 
 
-class Rounding:
+class Rounding(Pairs):
     """Values (ball, error): a computed number differs by at most `error` from one in the ball.
 
     Each operation has a relative error of at most `unit`. If a product is contracted with a sum,
@@ -227,9 +226,6 @@ class Rounding:
             (error + len(terms) * self.unit * size + LEAST).upper()
         )
 
-    def negative(self, a):
-        return -a[0], a[1]
-
     def multiply(self, a, b):
         error = abs(a[0]) * b[1] + abs(b[0]) * a[1] + a[1] * b[1]
         return self.rounded(a[0] * b[0], error)
@@ -246,7 +242,7 @@ class Rounding:
         return self.rounded(near[0], abs(near[1]) * a[1], ULPS.get(name, 8))
 
 
-class Identities:
+class Identities(Pairs):
     """Quotients (numerator, denominator) of polynomials with rational coefficients."""
 
     def __init__(self, size):
@@ -261,9 +257,6 @@ class Identities:
         for c, d in others:
             a, b = (a + c, b) if b == d else (a * d + c * b, b * d)
         return a, b
-
-    def negative(self, a):
-        return -a[0], a[1]
 
     def multiply(self, a, b):
         return a[0] * b[0], a[1] * b[1]
@@ -305,8 +298,12 @@ class Checker:
         radii = [(b - a) / 2 for a, b in box]
         if box[-1][0] == 0:
             middles[-1], radii[-1] = Fraction(0), box[-1][1]
-        points = zip(range(len(box)), middles, radii, strict=True)
-        return algebra, [algebra.variable(*point) for point in points]
+        s = [(generator * algebra.one, 0) for generator in algebra.ring.gens()]
+        moved = (
+            algebra.multiply(*pair) for pair in zip(s, map(algebra.constant, radii), strict=True)
+        )
+        middle = map(algebra.constant, middles)
+        return algebra, [algebra.sum(*pair) for pair in zip(middle, moved, strict=True)]
 
     def balls(self, box):
         """The same as balls."""
@@ -314,16 +311,18 @@ class Checker:
 
     def is_outside(self, algebra, state):
         """Whether no state of these models is in the domain."""
-        values = [algebra.range(x) for x in state]
-        off = any(
-            b < low or a > high
-            for (a, b), low, high in zip(values, self.lower, self.upper, strict=True)
-        )
-        inside = off or run(self.inside, state, algebra)
-        return off or any(algebra.range(g)[1] < 0 for g in inside)
+        for x, lower, upper in zip(state, self.lower, self.upper, strict=True):
+            low, high = algebra.range(x)
+            if high < lower or low > upper:
+                return True
+        return any(algebra.range(g)[1] < 0 for g in run(self.inside, state, algebra))
+
+    def start(self, x, algebra):
+        """The state before a step, from the coordinates of a box and ε."""
+        return self.stepped(x, algebra)[0] if self.implicit else x[:-1]
 
     def stepped(self, x, algebra):
-        """The states before and after a step, from the coordinates of a box and ε."""
+        """The states before and after a step."""
         out, n = run(self.step, [*x, algebra.constant(self.h)], algebra), self.n
         if not self.implicit:
             return x[:-1], out
@@ -397,22 +396,27 @@ def require(condition, what, box):
 def check_step(checker, box, claim, per_step, rounding, reach):
     """Statements 1 and 2 on one box."""
     algebra, x = checker.models(box)
-    moved = checker.moved(x, algebra)
     if checker.implicit:
-        near = all(m <= s for m, s in zip(moved[checker.n :], checker.spread, strict=True))
-        require(near and checker.contraction(box) < 1 / 3, "p1 is not shown to be near p0", box)
+        near = zip(checker.moved(x, algebra)[checker.n :], checker.spread, strict=True)
+        solved = all(m <= s for m, s in near) and checker.contraction(box) < 1 / 3
+        require(solved, "p1 is not shown to be near p0", box)
     if claim == "outside":
-        outside = checker.is_outside(algebra, checker.stepped(x, algebra)[0])
+        outside = checker.is_outside(algebra, checker.start(x, algebra))
         require(outside, "not shown to be outside of the domain", box)
         return
-    changes, (rounded, errors) = checker.changes(x, algebra), checker.rounding(box)
-    for k, (change, limit) in enumerate(zip(changes, per_step, strict=True)):
-        zero = limit == 0 and checker.is_identity(k)
-        require(zero or algebra.bound(change) <= limit, f"I_{k} changes by more than stated", box)
-    for error, limit in zip(rounded, rounding, strict=True):
-        require(error <= limit, "rounding is larger than stated", box)
-    for m, error, limit in zip(moved, errors, reach, strict=True):
-        require(m + Fraction(error) <= limit, "a step reaches further than stated", box)
+    rounded, errors = checker.rounding(box)
+    bounds = [
+        Fraction(0) if limit == 0 and checker.is_identity(k) else algebra.bound(change)
+        for k, (change, limit) in enumerate(zip(checker.changes(x, algebra), per_step, strict=True))
+    ]
+    moved = [m + Fraction(e) for m, e in zip(checker.moved(x, algebra), errors, strict=True)]
+    for what, found, stated in (
+        ("an invariant changes by", bounds, per_step),
+        ("rounding is", rounded, rounding),
+        ("a step moves by", moved, reach),
+    ):
+        fits = all(value <= limit for value, limit in zip(found, stated, strict=True))
+        require(fits, f"{what} more than stated", box)
 
 
 def check_confined(checker, box, claim, limits, reach):
@@ -448,21 +452,16 @@ def check(certificate):
     for box, claim in boxes:
         check_step(checker, box, claim, per_step, rounding, reach)
     text = (
-        f"{len(boxes)} boxes; change per step at most {[*map(float, per_step)]} in exact arithmetic"
+        f"{len(boxes)} boxes; change per step at most {certificate['per_step']} in exact arithmetic"
     )
-    text += f", and at most {[*map(float, rounding)]} more by rounding"
+    text += f", and at most {certificate['rounding']} more by rounding"
     if certificate["shell"] is None:
         return text + "; for steps that begin in the domain."
     steps, limits = certificate["steps"], []
     for (low, high), b, r in zip(certificate["levels"], per_step, rounding, strict=True):
-        low, high = (None if x is None else exact(x) for x in (low, high))
         change = steps * (b + r)
-        limits.append(
-            (
-                -math.inf if low is None else low - change,
-                math.inf if high is None else high + change,
-            )
-        )
+        above = math.inf if high is None else exact(high) + change
+        limits.append((-math.inf if low is None else exact(low) - change, above))
     sides = zip(checker.lower, checker.upper, reach, strict=True)
     around = [(a - w, b + w) for a, b, w in sides]
     for box, claim in leaves([*around, checker.epsilon], certificate["shell"]):

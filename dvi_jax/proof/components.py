@@ -13,7 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
+
+from lanewise.jaxapi import ClosedJaxpr, Literal
 
 UNARY = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sinh", "cosh", "sqrt")
 _MOVES = (
@@ -191,7 +192,7 @@ def _evaluate(program: Program, jaxpr: Any, consts: Sequence[Any], inputs: Seque
     known.update(zip(jaxpr.invars, inputs, strict=True))
 
     def read(atom):
-        return atom.val if isinstance(atom, core.Literal) else known[atom]
+        return atom.val if isinstance(atom, Literal) else known[atom]
 
     for equation in jaxpr.eqns:
         made = _apply(program, equation, [read(v) for v in equation.invars])
@@ -203,7 +204,7 @@ def _apply(program: Program, equation: Any, values: list) -> list:
     name, params = equation.primitive.name, equation.params
     inner = params.get("jaxpr") or params.get("call_jaxpr") or params.get("fun_jaxpr")
     if inner is not None and (name in _CALLS or "call" in name or "jit" in name):
-        if isinstance(inner, core.ClosedJaxpr):
+        if isinstance(inner, ClosedJaxpr):
             return _evaluate(program, inner.jaxpr, inner.consts, values)
         return _evaluate(program, inner, [], values)
     if name == "scan":

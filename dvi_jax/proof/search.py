@@ -48,17 +48,16 @@ def examine(checker: exact.Checker, box: list, rng: Any) -> Leaf:
     leaf = Leaf(box)
     try:
         algebra, x = checker.models(box)
-        start, _ = checker.stepped(x, algebra)
-        moved = checker.moved(x, algebra)
-        n = checker.n
         if checker.implicit:
-            if any(m > s for m, s in zip(moved[n:], checker.spread, strict=True)):
+            near = zip(checker.moved(x, algebra)[checker.n :], checker.spread, strict=True)
+            if any(m > s for m, s in near):
                 raise exact.Failed("p1 is further from p0 than `spread`")
             if not checker.contraction(box) < 1 / 3:
                 raise exact.Failed("the equation of the implicit step is not a contraction")
-        if checker.is_outside(algebra, start):
+        if checker.is_outside(algebra, checker.start(x, algebra)):
             leaf.outside = True
             return leaf
+        moved = checker.moved(x, algebra)
         changes = checker.changes(x, algebra)
         leaf.bounds = [algebra.bound(change) for change in changes]
         leaf.remainders = [change[1] / algebra.one for change in changes]

@@ -282,7 +282,8 @@ def _check_steps(num_steps: Any, lattice: Lattice, inputs: Mapping[str, Any]) ->
     if isinstance(lattice, Given):
         if num_steps is not None or any(is_axis(inputs[name]) for name in ("h", "t0")):
             raise ValueError(
-                "leave out num_steps, and the axes h and t0: dvi.Given(ts) determines all of them."
+                "num_steps, or an axis h or t0, is given with the lattice dvi.Given(ts), which "
+                "determines all of them: leave them out."
             )
     elif num_steps is None:
         raise ValueError("num_steps is missing: give the number of steps of each trajectory.")

@@ -36,7 +36,10 @@ class Axis:
 
     def __init__(self, name: str, values: Any, units: str = ""):
         if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
-            raise ValueError(f"name of an Axis must be a Python identifier, got {name!r}.")
+            raise ValueError(
+                "name of an Axis must be an identifier of ASCII letters, digits and _, such as "
+                f'"epsilon", got {name!r}.'
+            )
         of = f"the axis {name!r}"
         instance(f"units of {of}", units, str, "text")
         refuse_unit_or_mask(of, values)

@@ -93,7 +93,10 @@ def _columns(part: Any, grid: list[str]) -> dict[str, np.ndarray]:
             if np.iscomplexobj(entries):
                 parts = {f"{column}_re": np.real(entries), f"{column}_im": np.imag(entries)}
             if taken := [c for c in parts if c in columns]:
-                raise ValueError(f"two results have the column {taken[0]!r}: rename one of them.")
+                raise ValueError(
+                    f"two variables would have the column {taken[0]!r} (a variable with components "
+                    "has the columns NAME_0, NAME_1, …): rename an observable or an axis."
+                )
             columns.update(parts)
     names = np.asarray(("not_computed", *STATUS_NAMES))
     columns["status"] = names[columns["status"].astype(int) + 1]

@@ -70,8 +70,8 @@ class Source:
         if given is None or problem is None:
             return names if given is None else given
         if not isinstance(names, dict):
-            why = f"{problem.name} has no parameters" if names is None else "args is not a table"
-            raise InputError("args", shown(given), f"nothing: {why}")
+            why = "no parameters" if names is None else "parameters without names (not a dict)"
+            raise InputError("args", shown(given), f"no key args: {problem.name} has {why}")
         for name, value in given.items():
             known(f"args.{name}", name, names, seen="there is no such parameter")
             fits = isinstance(names[name], dict) or not isinstance(value, dict)
@@ -163,5 +163,6 @@ def _of_the_library(file: SystemFile, loader: Loader) -> Source:
     except EphemerisMissing as error:
         raise InputError("system", f"{name!r}: {error}", "an installed ephemeris") from None
     except ValueError as error:
-        raise InputError("state.date", str(error), "a day that the ephemeris covers") from None
+        allowed = 'a day that the ephemeris covers, such as "1900-01-01"'
+        raise InputError("state.date", str(error), allowed) from None
     return Source(file, loader, problem, problem.system, jd)
