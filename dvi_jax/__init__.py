@@ -87,6 +87,7 @@ if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
         interop as interop,
         paper as paper,
         plot as plot,
+        proof as proof,
         run as run,
         sweep as _sweep,
         systems as systems,
@@ -170,6 +171,11 @@ if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
         fit as fit,
         identify as identify,
         sample as sample,
+    )
+    from .proof import (
+        DriftBound as DriftBound,
+        ProofError as ProofError,
+        bound_drift as bound_drift,
     )
     from .sweep import (
         Axis as Axis,

@@ -10,7 +10,7 @@ NAMESPACES = {
     **{
         name: name
         for name in (
-            *("methods", "lattices", "observe", "discover", "dynamics"),
+            *("methods", "lattices", "observe", "discover", "dynamics", "proof"),
             *("systems", "plot", "interop", "testing", "paper", "certify", "run"),
         )
     },
@@ -44,6 +44,7 @@ HOMES = {
         *("MultipleShooting", "NetworkForce", "Observations", "Posterior", "Prior", "Samples"),
         *("SingleShooting", "SoftL1", "fit", "identify", "sample"),
     ),
+    "proof": ("DriftBound", "ProofError", "bound_drift"),
     "sweep": (
         *("Axis", "ClusterError", "StoreError", "StoreMismatch", "SweepCost"),
         *("SweepInterrupted", "SweepProgress", "SweepResult", "open_sweep", "sweep"),
@@ -77,7 +78,8 @@ SHORT = (
     *("Uniform", "TimeTransformed", "Variational", "Compensated", "FixedPoint"),
     *("Newton", "SimplifiedNewton", "Picard", "Reversible", "Checkpointed"),
     *("MaxDrift", "Range", "Trend", "Mean", "Section", "Stop"),
-    *("discover_invariants", "find_symmetries", "drift_order", "Polynomials", "ShadowHamiltonian"),
+    *("discover_invariants", "find_symmetries", "drift_order", "bound_drift"),
+    *("Polynomials", "ShadowHamiltonian"),
     *("sweep", "Axis", "open_sweep", "fit", "Observations"),
     *("poincare_section", "frequencies", "tangent_map"),
     *("over_threads", "over_devices"),

@@ -68,6 +68,31 @@ def schema(
     print_json(json_schema(kind))
 
 
+@command(app, "verify", CHECKING, jax=False)
+def verify(
+    session: Session,
+    certificate: Annotated[
+        Path, typer.Argument(metavar="CERTIFICATE", help="A file of DriftBound.save.")
+    ],
+) -> None:
+    """Check a certificate of `bound_drift` with a small program of its own.
+
+    It evaluates every box of the proof again, with python-flint and without JAX. Exit code 0: the
+    bounds are proved. 1: they are not; the message says where. 2: there is no such file.
+
+    Examples
+        dvi-jax verify bound.json
+    """
+    found = f"no file at {certificate}"
+    require(certificate.is_file(), "CERTIFICATE", found, "a file that DriftBound.save wrote")
+    from .work.verify import verify_certificate
+
+    contents, message = verify_certificate(certificate)
+    if not message:
+        session.line(f"proved: {contents['proved']}")
+    session.finish(contents, message)
+
+
 @command(app, "paper", CHECKING)
 def paper(
     session: Session,

@@ -409,7 +409,7 @@ def test_a_discovery_is_saved_and_loaded(tmp_path, monkeypatch):
         np.testing.assert_array_equal(back.coefficients, d.coefficients)
         at = np.array([0.3]), np.array([0.2]), 0.1
         np.testing.assert_array_equal(back.evaluate(*at), d.evaluate(*at))
-    with pytest.raises(ValueError, match="basis of 44 functions"):
+    with pytest.raises(ValueError, match=r"which has 44 functions .* has 14 "):
         dvi.Discovery.load(path, dvi.Polynomials(4))
     named = dvi.Basis({"f": lambda q, p: q @ q + p @ p - 0.1 * (q @ p)})
     discover(OSCILLATOR, named, samples=box(1, 20)).save(path)
@@ -425,7 +425,7 @@ def test_a_discovery_is_saved_and_loaded(tmp_path, monkeypatch):
     np.save(path.with_suffix(".npy"), np.zeros(3))
     path.write_bytes(b"something else")
     for damaged in (path.with_suffix(".npy"), path):
-        with pytest.raises(ValueError, match="is no discovery of this package, or is damaged"):
+        with pytest.raises(ValueError, match="is not a discovery of this package, or it is damaged"):
             dvi.Discovery.load(damaged, named)
     with pytest.raises(FileNotFoundError, match="there is no discovery at"):
         dvi.Discovery.load(path.with_suffix(".none"), named)
@@ -593,14 +593,14 @@ def test_arguments_of_the_wrong_kind_are_refused():
             search(H_D, two, **given)
         with pytest.raises(TypeError, match="root_finder must be"):
             search(SPRING, two, newton=5, **given)
-    with pytest.raises(ValueError, match=r"states of shape \(1,\); got q of shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"of shape \(1,\); got q of shape \(2,\)"):
         found("spring", 4, 2).evaluate([0.1, 0.2], [0.3, 0.4], 0.1)
     with pytest.raises(TypeError, match="method must be a Method"):
         discover(SPRING, 2, method=5)
     broadcast = dvi.System(H_D, force=lambda t0, t1, q, p, args: jnp.sum(q))
     with pytest.raises(ValueError, match="shaped like q0"):
         discover(broadcast, 2, samples=box(2, 60))
-    with pytest.raises(TypeError, match="take one of its"):
+    with pytest.raises(TypeError, match="give one of its"):
         dvi.drift_order(
             SPRING, found("cubic", 8, 0), [0.1], [0.1], epsilons=[0.1], h=0.1, num_steps=2
         )

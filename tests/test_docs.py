@@ -465,7 +465,8 @@ def test_a_keyboard_leads_through_a_page(site, serve, page, tmp_path):
             page.keyboard.press("Tab")
             steps[name].append(page.evaluate(FOCUS))
     walked = steps["getting-started.html"]
-    assert [step for step in walked if not step[1]] == []
+    # After the last element the whole page has the focus once.
+    assert [step for step in walked if not step[1] and step[0] != "BODY"] == []
     assert {"A", "INPUT", "BUTTON"} <= {step[0] for step in walked}
     assert walked[0][2].endswith("#furo-main-content")  # past the navigation by one key
     assert not steps["hidden.html"][0][1]

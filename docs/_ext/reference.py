@@ -35,6 +35,7 @@ PAGES = {
     "solvers": ("Root solvers, layout, devices", "dvi_jax.engine"),
     "observables": ("Observables and reductions", "dvi_jax.observe"),
     "discovery": ("Symmetries and invariants", "dvi_jax.discover"),
+    "proof": ("Proved bounds", "dvi_jax.proof"),
     "sweeps": ("Sweeps", "dvi_jax.sweep"),
     "fitting": ("Fits", "dvi_jax.fit"),
     "dynamics": ("Sections, frequencies, actions", "dvi_jax.dynamics"),

@@ -50,8 +50,8 @@ def noether_balance(
 
         D(I_z) = Σ_m ε^m N_m + ε^{z+1} W·(ξ_z − Dq ξ0_z) − Σ_m ε^m ξ0_m r
 
-    It holds on every time grid, for any generators and gauges: every drift is the sum of the violation
-    of the symmetry, the work of the perturbing force and the lattice defect.
+    It holds on every time grid, for any generators and gauges: every drift is the sum of the
+    violation of the symmetry, the work of the perturbing force and the lattice defect.
 
     **Arguments**
 

@@ -1,16 +1,15 @@
 """`bound_drift`: a proved bound of how much invariants change, for all starts of a domain."""
 
+import functools
 import json
 import math
 import operator
 import os
 from collections.abc import Callable, Sequence
-from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,17 +22,16 @@ from .._system import System, check_system, of_problem
 from .._types import Interval
 from ..discover.found import Discovery
 from ..discover.series import InvariantSeries
-from .components import Unsupported, program_of
-
-if TYPE_CHECKING:
-    from . import checker as _checker
-
-_LEVELS = (0.99, 0.95, 0.8, 0.6, 0.4)
-"""Fractions of the range between the least value in the domain and that at its border that are
-tried as the level below which trajectories stay in the domain."""
+from .components import program_of
+from .confinement import confine
+from .tools import tools
 
 _ACCEPTED = 8.0
 """Residual of an implicit equation that a solver accepts, in units of round-off of the momenta."""
+
+
+class ProofError(Exception):
+    """Nothing is proved: the message says what failed, and for which states."""
 
 
 class DriftBound(eqx.Module):
@@ -178,8 +176,10 @@ def bound_drift(
     # True True
     ```
     """
-    exact, search = _tools()
-    positive("change", change), whole("max_boxes", max_boxes), positive("max_seconds", max_seconds)
+    exact, search = tools()
+    positive("change", change)
+    whole("max_boxes", max_boxes)
+    positive("max_seconds", max_seconds)
     if not finite("ratio", ratio) > 1:
         raise ValueError(f"ratio must be larger than 1, got {ratio!r}.")
     system, _, _, h, args = of_problem(system, None, None, h, args, has_start=True)
@@ -203,15 +203,16 @@ def bound_drift(
         "bits": 100,
         "tiny": (2.0**-60).hex(),
     }
-    size = max(abs(x) for x in (*lower, *upper))
-    certificate["accepted"] = (_ACCEPTED * 2.0**-52 * size).hex()
-    certificate["spread"] = [(0.0).hex()] * (len(lower) // 2)
+    certificate |= _solving(certificate, lower, upper, strengths)
     checker = exact.Checker(certificate)
     limits = {"max_boxes": max_boxes, "max_seconds": max_seconds}
     search.resolve(checker)
     certificate |= {"bits": checker.bits, "tiny": float(checker.tiny).hex()}
     checker = exact.Checker(certificate)
-    result = search.subdivide(checker, ratio=ratio, **limits)
+    try:
+        result = search.subdivide(checker, ratio=ratio, **limits)
+    except exact.Failed as error:
+        raise ProofError(f"{error}. Take a smaller domain, ε or h.") from None
     per_step = [exact.up(b) for b in result.bounds]
     for k, (b, s) in enumerate(zip(per_step, result.seen, strict=True)):
         if s == 0 and b and checker.is_identity(k):
@@ -225,7 +226,9 @@ def bound_drift(
         "levels": [[None, None] for _ in per_step],
         "shell": None,
     }
-    level, start, reason, count = _confine(checker, certificate, functions, shape, change, limits)
+    level, start, reason, count = confine(
+        checker, certificate, functions, inside, shape, change, limits
+    )
     certificate["hash"] = exact.digest(certificate)
     return DriftBound(
         per_step=tuple(per_step),
@@ -242,19 +245,9 @@ def bound_drift(
     )
 
 
-def _tools() -> tuple[Any, Any]:
-    try:
-        from . import checker, search
-    except ImportError as error:
-        raise ImportError(
-            "bound_drift computes with python-flint, which is not installed: "
-            'pip install "dvi-jax[proof]", or pip install python-flint.'
-        ) from error
-    return checker, search
-
-
 def _step_of(system: System, method: Any, shape: Any, args: Any, h: float) -> dict[str, Any]:
-    """The step as a list of operations: of (q0, p0), or of (q0, p1) if it is implicit in p1."""
+    """The step at t0 = 0 as a list of operations: of (q0, p0), or of (q0, p1) if it is implicit."""
+    run = tools()[0].run
     explicit = method.is_explicit(system, jnp.zeros(shape), args)
     if not (explicit or method.is_the_map):
         raise ValueError(
@@ -272,12 +265,48 @@ def _step_of(system: System, method: Any, shape: Any, args: Any, h: float) -> di
     programs = [
         program_of(lambda *x, t=t: stepped(t, *x), shape, shape, (), ()) for t in (0.0, 1.0)
     ]
-    if programs[0] != programs[1]:
-        raise ValueError(
-            "the map depends on the time, and bound_drift needs one map for all steps: write it "
-            "as a system with one more degree of freedom, the angle of the time."
-        )
+    if programs[0] != programs[1]:  # or the step is a difference of two times
+        rng, size = np.random.default_rng(0), int(np.prod(shape))
+        inputs = [rng.uniform(0.1, 0.2, 8) for _ in range(2 * size + 1)] + [np.full(8, h)]
+        first, later = (np.asarray(run(p, inputs, _Floats)) for p in programs)
+        if not np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True):
+            raise ValueError(
+                "the map depends on the time, and bound_drift needs one map for all steps: write "
+                "it as a system with one more degree of freedom, the angle of the time."
+            )
     return {"step": programs[0], "implicit": not explicit}
+
+
+def _solving(
+    certificate: dict[str, Any], lower: list[float], upper: list[float], strengths: tuple
+) -> dict[str, Any]:
+    """How far p1 may be from p0 in an implicit step, and the residual that its solver accepts."""
+    n, exact = len(lower) // 2, tools()[0]
+    largest = max(abs(x) for x in (*lower[n:], *upper[n:]))
+    accepted = {"accepted": (_ACCEPTED * 2.0**-52 * largest).hex()}
+    if not certificate["implicit"]:
+        return {"spread": [(0.0).hex()] * n, **accepted}
+    rng, h = np.random.default_rng(0), float.fromhex(certificate["h"])
+    points = [rng.uniform(a, b, 4000) for a, b in zip(lower, upper, strict=True)]
+    inputs = [*points, rng.choice(strengths, 4000), np.full(4000, h)]
+    with np.errstate(all="ignore"):
+        moves = exact.run(certificate["step"], inputs, _Floats)[:n]
+    # A guess; the checker decides.
+    return {"spread": [float(1.3 * np.nanmax(np.abs(m)) + 1e-12).hex() for m in moves], **accepted}
+
+
+class _Floats:
+    """The arithmetic of float64 for the `run` of the checker."""
+
+    constant, multiply, divide = staticmethod(float), operator.mul, operator.truediv
+
+    @staticmethod
+    def sum(*terms: Any) -> Any:
+        return functools.reduce(operator.add, terms)
+
+    @staticmethod
+    def apply(name: str, a: Any) -> Any:
+        return getattr(jnp, name)(a)
 
 
 def _functions(found: Any) -> list[tuple[Callable, str]]:
@@ -326,123 +355,3 @@ def _interval(epsilon: Any) -> tuple[float, float]:
     if not low < high:
         raise ValueError(f"epsilon must have a least value below its largest, got {epsilon!r}.")
     return low, high
-
-
-def _confine(
-    checker: "_checker.Checker",
-    certificate: dict[str, Any],
-    functions: list,
-    shape: Any,
-    change: float,
-    limits: dict[str, Any],
-) -> tuple[tuple[int, int, float] | None, float, str, int]:
-    """Complete the certificate by a level below which trajectories stay in the domain.
-
-    Returns (k, sign, level), the scale of the domain that satisfies it, or why there is none, and
-    the number of boxes.
-    """
-    exact, search = _tools()
-    reach = [exact.exact(x) for x in certificate["reach"]]
-    candidates = _candidates(checker, functions, shape, reach)
-    reason = "no invariant is larger all around the domain than somewhere inside"
-    for k, sign, least, border in candidates:
-        each = exact.exact(certificate["per_step"][k]) + exact.exact(certificate["rounding"][k])
-        steps = math.floor(Fraction(change) / each) if each else 2**62
-        for part in _LEVELS:
-            level = least + part * (border - least) - change
-            if level <= least:
-                reason = f"change={change:g} is larger than the range of I_{k} in the domain"
-                continue
-            ends = [(-math.inf, math.inf)] * len(functions)
-            drift = steps * each
-            value = Fraction(level)
-            ends[k] = (-math.inf, value + drift) if sign > 0 else (-value - drift, math.inf)
-            try:
-                shell, count = search.enclose(checker, ends, reach, **limits)
-            except exact.Failed as error:
-                reason = str(error)
-                continue
-            certificate["levels"][k] = [None, level.hex()] if sign > 0 else [(-level).hex(), None]
-            certificate |= {"steps": steps, "shell": shell}
-            return (k, sign, level), _scale(checker, k, sign, value), "", count
-    return None, 0.0, reason, 0
-
-
-def _candidates(checker: Any, functions: list, shape: Any, reach: list) -> list[tuple]:
-    """(k, sign, least value in the domain, least value around it) of sign·I_k where the latter is
-    larger, those first that leave most of the domain; from random points."""
-    rng = np.random.default_rng(0)
-    low, high = (np.array([float(x) for x in side]) for side in (checker.lower, checker.upper))
-    wide = np.array([float(x) for x in reach])
-    inner = rng.uniform(low, high, (4000, len(low)))
-    near = rng.uniform(low, high, (40000, len(low)))
-    axis = rng.integers(0, len(low), len(near))
-    rows = np.arange(len(near))
-    side = rng.random(len(near)) < 0.5
-    near[rows, axis] = np.where(side, low[axis], high[axis])
-    outer = near + rng.uniform(0, 1, near.shape) * wide * np.where(near >= high, 1, -1) * (
-        (near <= low) | (near >= high)
-    )
-    if checker.inside["outputs"]:
-        keep = _is_inside(checker.inside)
-        near = rng.uniform(low, high, (200000, len(low)))
-        near = near[keep(near)]
-        moved = near + rng.choice([-1.0, 1.0], near.shape) * wide
-        off = ~keep(moved) | (moved < low).any(1) | (moved > high).any(1)
-        inner, outer = near[:4000], moved[off][:40000]
-    epsilons = [float(x) for x in checker.epsilon]
-    found = []
-    for k, (function, _) in enumerate(functions):
-        value = jax.jit(jax.vmap(lambda z, e, f=function: f(*_state(z, shape), e), (0, None)))
-        around = np.concatenate([np.asarray(value(outer, e)) for e in epsilons])
-        within = np.concatenate([np.asarray(value(inner, e)) for e in epsilons])
-        for sign in (1, -1):
-            border, least = float(np.min(sign * around)), float(np.min(sign * within))
-            if border > least:
-                share = float(np.mean(sign * within < border))
-                found.append((share, (k, sign, least, border)))
-    return [item for _, item in sorted(found, key=lambda pair: -pair[0])]
-
-
-class _Floats:
-    """The arithmetic of float64 for `checker.run`."""
-
-    constant, sum = staticmethod(float), staticmethod(lambda *terms: sum(terms))
-    negative, multiply, divide = operator.neg, operator.mul, operator.truediv
-    apply = staticmethod(lambda name, a: getattr(np, name)(a))
-
-
-def _is_inside(inside: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
-    """States (many, 2n) → whether no value of `inside` is negative."""
-    exact, _ = _tools()
-
-    def keep(states):
-        values = exact.run(inside, list(states.T), _Floats)
-        return np.all([np.broadcast_to(value >= 0, len(states)) for value in values], axis=0)
-
-    return keep
-
-
-def _state(z: Any, shape: Any) -> tuple[Any, Any]:
-    q, p = jnp.split(z, 2)
-    return q.reshape(shape), p.reshape(shape)
-
-
-def _scale(checker: Any, k: int, sign: int, level: Fraction) -> float:
-    """The largest factor (to 1 %) by which the domain may be scaled about its middle so that
-    sign·I_k ≤ level in it."""
-    exact, _ = _tools()
-    sides = list(zip(checker.lower, checker.upper, strict=True))
-    good = 0.0
-    for i in range(1, 101):
-        s = Fraction(i, 100)
-        box = [((a + b) / 2 - s * (b - a) / 2, (a + b) / 2 + s * (b - a) / 2) for a, b in sides]
-        algebra, x = checker.models([*box, checker.epsilon])
-        low, high = algebra.range(exact.run(checker.invariants[k], x, algebra)[0])
-        if (high if sign > 0 else -low) > level:
-            break
-        good = i / 100
-    return good
-
-
-__all__ = ["DriftBound", "Unsupported", "bound_drift"]

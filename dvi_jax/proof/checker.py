@@ -1,27 +1,23 @@
-"""The checker of drift certificates: short enough to be read completely.
+"""The checker of drift certificates, short enough to be read completely: python checker.py FILE.
 
-    python checker.py CERTIFICATE.json
+It needs Python and python-flint, no other part of the package. A certificate states, for a map
+Φ(x, ε) and functions I_k(x, ε) given as lists of scalar operations, with x = (q, p):
 
-It needs Python and python-flint, neither JAX nor the rest of the package. A certificate states, for
-a map Φ(x, ε) and functions I_k(x, ε), which are lists of scalar operations, and x = (q, p):
-
-1. |I_k(Φ(x, ε), ε) − I_k(x, ε)| ≤ `per_step`[k] in exact arithmetic, for all x in the domain and
-   all ε;
+1. |I_k(Φ(x, ε), ε) − I_k(x, ε)| ≤ `per_step`[k] in exact arithmetic, in the domain and for all ε;
 2. a step that is computed with the unit round-off `unit` changes I_k by at most `rounding`[k] more,
    and moves no coordinate by more than `reach`;
 3. trajectories that start in the domain with `levels`[k][0] ≤ I_k ≤ `levels`[k][1] for all k
    stay in the domain for `steps` steps, exact or computed.
 
-For 1 and 2 the domain is covered by boxes, made by bisection. On a box a function is a polynomial
-in the coordinates of the box with integer coefficients, and a bound of the remainder (a Taylor
-model; Makino & Berz 2003). Nothing is estimated: integers are exact, and elementary functions are
-enclosed by balls (Arb; Johansson 2017). For 3, boxes cover all places outside of the domain that
-one step can reach, and on each box some I_k differs from its levels by more than `steps` steps can
-change it. By induction no trajectory gets there.
+For 1 and 2 boxes cover the domain. On a box a function is a polynomial in the coordinates of the
+box with integer coefficients, and a bound of the remainder (a Taylor model; Makino & Berz 2003);
+elementary functions are enclosed by balls (Arb; Johansson 2017). For 3, boxes cover all places
+outside of the domain that one step can reach, and on each some I_k differs from its levels by more
+than `steps` steps can change it. By induction no trajectory gets there.
 
-A step that is implicit in p1 is given as a function of (q0, p1), and the boxes are boxes of those.
-Each (q0, p0) of the domain has a p1 within `spread` of p0, because p1 → p0 + h·rate maps this box
-into itself (Brouwer), and only one, because it is a contraction there.
+A step that is implicit in p1 is a function of (q0, p1), on boxes of those. Each (q0, p0) of the
+domain has a p1 within `spread` of p0, because p1 → p0 + h·rate maps this box into itself (Brouwer),
+and only one, because it is a contraction there.
 """
 
 import hashlib
@@ -33,16 +29,11 @@ from fractions import Fraction
 from flint import arb, arb_series, ctx, fmpq, fmpq_mpoly_ctx, fmpz_mpoly_ctx
 
 FORMAT = "dvi_jax drift bound 1"
-FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sinh", "cosh", "sqrt")
-ORDERS = 40
-"""Largest order of the expansion of an elementary function."""
-
-ULPS = {"sqrt": 1}
-"""Errors of computed elementary functions in units of round-off; 8 (4 ulp) for the others."""
-
-
-LEAST = 2.0**-1000
-"""Added to each error, for results below the normal numbers."""
+FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
+ORDERS = 40  # the largest order of the expansion of an elementary function
+ULPS = {"sqrt": 1}  # errors of computed functions in units of round-off; 8 (4 ulp) for others
+MALFORMED = (KeyError, ValueError, TypeError, IndexError, AttributeError, RecursionError)
+LEAST = 2.0**-1000  # added to each error, for results below the normal numbers
 
 
 class Failed(Exception):
@@ -51,8 +42,7 @@ class Failed(Exception):
 
 def digest(certificate):
     """SHA-256 of everything in a certificate but the hash itself."""
-    content = {key: value for key, value in certificate.items() if key != "hash"}
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    text = json.dumps({k: v for k, v in certificate.items() if k != "hash"}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -75,18 +65,22 @@ def ball(value, radius=0):
     return arb(value.numerator) / value.denominator + arb(0, up(Fraction(radius)))
 
 
+def balls(box):
+    return [ball((a + b) / 2, (b - a) / 2) for a, b in box]
+
+
 def series(name, at, length):
     """The Taylor coefficients of a function at a point, or balls of them on a ball."""
     ctx.cap = length
     x = arb_series([at, 1], length)
     try:
-        if name == "inverse":
-            return 1 / x
-        if name in ("sinh", "cosh"):
-            return (x.exp() + (-1 if name == "sinh" else 1) / x.exp()) / 2
-        return getattr(x, name)()
+        return 1 / x if name == "inverse" else getattr(x, name)()
     except (ValueError, ZeroDivisionError) as error:
         raise Failed(f"{name} is singular ({error})") from None
+
+
+def negative(a):
+    return -a[0], a[1]
 
 
 def power(a, n, algebra):
@@ -94,9 +88,10 @@ def power(a, n, algebra):
     if n < 1:
         one = algebra.constant(Fraction(1))
         return algebra.divide(one, power(a, -n, algebra)) if n else one
-    half = power(a, n // 2, algebra) if n > 1 else a
-    square = algebra.multiply(half, half) if n > 1 else a
-    return algebra.multiply(square, a) if n % 2 and n > 1 else square
+    if n == 1:
+        return a
+    square = power(algebra.multiply(a, a), n // 2, algebra)
+    return algebra.multiply(square, a) if n % 2 else square
 
 
 def run(program, inputs, algebra):
@@ -104,33 +99,22 @@ def run(program, inputs, algebra):
     earlier operation. `algebra` has the arithmetic of the values."""
     values = []
     for name, *operands in program["operations"]:
-        try:
-            if name == "input":
-                values.append(inputs[operands[0]])
-            elif name == "constant":
-                values.append(algebra.constant(exact(operands[0])))
-            elif name == "power":
-                values.append(power(values[operands[0]], operands[1], algebra))
-            elif name in ("sum", "negative", "multiply", "divide"):
-                values.append(getattr(algebra, name)(*(values[i] for i in operands)))
-            elif name in FUNCTIONS:
-                values.append(algebra.apply(name, values[operands[0]]))
-            else:
-                raise Failed(f"unknown operation {name}")
-        except Failed as error:
-            error.place = program, len(values)
-            raise
+        if name == "input":
+            values.append(inputs[operands[0]])
+        elif name == "constant":
+            values.append(algebra.constant(exact(operands[0])))
+        elif name == "power":
+            values.append(power(values[operands[0]], operands[1], algebra))
+        elif name in ("sum", "multiply", "divide"):
+            values.append(getattr(algebra, name)(*(values[i] for i in operands)))
+        elif name in FUNCTIONS:
+            values.append(algebra.apply(name, values[operands[0]]))
+        else:
+            raise Failed(f"unknown operation {name}")
     return [values[i] for i in program["outputs"]]
 
 
-class Pairs:
-    """Values (a, b) whose negative is (−a, b)."""
-
-    def negative(self, a):
-        return -a[0], a[1]
-
-
-class Models(Pairs):
+class Models:
     """Taylor models in variables s with |s| ≤ 1.
 
     A model (P, E) stands for functions that differ from P(s)/2^bits by at most E/2^bits. P has
@@ -149,7 +133,8 @@ class Models(Pairs):
         return sum((t[0] for t in terms[1:]), terms[0][0]), sum(t[1] for t in terms)
 
     def multiply(self, a, b):
-        error = self.norm(a) * b[1] + self.norm(b) * a[1] + a[1] * b[1]
+        norm = [int(sum(map(abs, x[0].coeffs()))) for x in (a, b)]  # |P| is not larger
+        error = norm[0] * b[1] + norm[1] * a[1] + a[1] * b[1]
         kept = {}
         for powers, c in (a[0] * b[0]).to_dict().items():
             rounded = c >> self.bits
@@ -162,10 +147,6 @@ class Models(Pairs):
 
     def divide(self, a, b):
         return self.multiply(a, self.apply("inverse", b))
-
-    def norm(self, a):
-        """A bound of |P| · 2^bits, the sum of the absolute values of its coefficients."""
-        return int(sum(map(abs, a[0].coeffs())))
 
     def range(self, a):
         """A lower and an upper bound of the value; an even power of s is not negative."""
@@ -197,13 +178,13 @@ class Models(Pairs):
         rest, result = (a[0] - middle, a[1]), self.constant(Fraction(0))
         for k in range(order, -1, -1):
             scaled = terms[k] * self.one
-            whole = int(scaled.mid().floor().unique_fmpz())
+            whole = int(scaled.mid().floor().unique_fmpz() or 0)
             coefficient = self.ring.constant(whole), math.ceil(up(abs(scaled - whole)))
             result = self.sum(self.multiply(result, rest), coefficient)
         return result[0], result[1] + math.ceil(up(left[order]))
 
 
-class Rounding(Pairs):
+class Rounding:
     """Values (ball, error): a computed number differs by at most `error` from one in the ball.
 
     Each operation has a relative error of at most `unit`. If a product is contracted with a sum,
@@ -242,7 +223,7 @@ class Rounding(Pairs):
         return self.rounded(near[0], abs(near[1]) * a[1], ULPS.get(name, 8))
 
 
-class Identities(Pairs):
+class Identities:
     """Quotients (numerator, denominator) of polynomials with rational coefficients."""
 
     def __init__(self, size):
@@ -273,8 +254,8 @@ class Checker:
 
     def __init__(self, certificate):
         self.step, self.invariants = certificate["step"], certificate["invariants"]
-        self.domain, self.inside = certificate["domain"], certificate["inside"]
-        self.lower, self.upper = ([exact(x) for x in self.domain[i]] for i in (0, 1))
+        self.inside, sides = certificate["inside"], certificate["domain"]
+        self.lower, self.upper = ([exact(x) for x in side] for side in sides)
         self.n, self.implicit = len(self.lower) // 2, certificate["implicit"]
         self.spread = [exact(x) for x in certificate["spread"]]
         self.epsilon = tuple(exact(x) for x in certificate["epsilon"])
@@ -282,8 +263,6 @@ class Checker:
         self.bits, self.tiny = certificate["bits"], exact(certificate["tiny"])
         self.h = exact(certificate["h"])
         ctx.prec = self.bits + 60
-        if not (len(self.lower) == len(self.upper) == 2 * self.n and len(self.spread) == self.n):
-            raise Failed("the domain has another number of coordinates than the map")
 
     def root(self):
         """The box of all boxes: the domain, where p1 may differ from p0 by `spread`; and ε."""
@@ -294,20 +273,14 @@ class Checker:
     def models(self, box):
         """The coordinates of a box and ε as Taylor models; ε from 0 keeps its orders apart."""
         algebra = Models(len(box), self.bits, self.tiny)
-        middles = [(a + b) / 2 for a, b in box]
-        radii = [(b - a) / 2 for a, b in box]
+        parts = [((a + b) / 2, (b - a) / 2) for a, b in box]
         if box[-1][0] == 0:
-            middles[-1], radii[-1] = Fraction(0), box[-1][1]
-        s = [(generator * algebra.one, 0) for generator in algebra.ring.gens()]
-        moved = (
-            algebra.multiply(*pair) for pair in zip(s, map(algebra.constant, radii), strict=True)
-        )
-        middle = map(algebra.constant, middles)
-        return algebra, [algebra.sum(*pair) for pair in zip(middle, moved, strict=True)]
-
-    def balls(self, box):
-        """The same as balls."""
-        return [ball((a + b) / 2, (b - a) / 2) for a, b in box]
+            parts[-1] = Fraction(0), box[-1][1]
+        x = []
+        for s, (middle, radius) in zip(algebra.ring.gens(), parts, strict=True):
+            moved = algebra.multiply((s * algebra.one, 0), algebra.constant(radius))
+            x.append(algebra.sum(algebra.constant(middle), moved))
+        return algebra, x
 
     def is_outside(self, algebra, state):
         """Whether no state of these models is in the domain."""
@@ -327,17 +300,17 @@ class Checker:
         if not self.implicit:
             return x[:-1], out
         # (q0, p1) → (h·rate, q1), and p0 = p1 − h·rate.
-        p0 = [algebra.sum(p1, algebra.negative(r)) for p1, r in zip(x[n:-1], out[:n], strict=True)]
+        p0 = [algebra.sum(p1, negative(r)) for p1, r in zip(x[n:-1], out[:n], strict=True)]
         return [*x[:n], *p0], [*out[n:], *x[n:-1]]
 
     def changes(self, x, algebra):
         """I_k(Φ(x)) − I_k(x) for each k."""
         start, end = self.stepped(x, algebra)
-        pairs = [
-            [run(function, [*z, x[-1]], algebra)[0] for z in (start, end)]
-            for function in self.invariants
-        ]
-        return [algebra.sum(after, algebra.negative(before)) for before, after in pairs]
+        changes = []
+        for function in self.invariants:
+            before, after = (run(function, [*z, x[-1]], algebra)[0] for z in (start, end))
+            changes.append(algebra.sum(after, negative(before)))
+        return changes
 
     def is_identity(self, k):
         """Whether I_k is conserved exactly, for all x and ε: as a rational function."""
@@ -349,19 +322,19 @@ class Checker:
     def moved(self, x, algebra):
         """How far a step moves each coordinate, in exact arithmetic."""
         pairs = zip(*self.stepped(x, algebra), strict=True)
-        return [algebra.bound(algebra.sum(b, algebra.negative(a))) for a, b in pairs]
+        return [algebra.bound(algebra.sum(b, negative(a))) for a, b in pairs]
 
     def contraction(self, box):
         """A Lipschitz constant of p1 → h·rate(q0, p1) in the maximum norm."""
-        x, small = self.balls(box), arb(2) ** -60
-        z = [(ball, small * (self.n <= i < 2 * self.n)) for i, ball in enumerate(x)]
+        x, small = balls(box), arb(2) ** -60
+        z = [(value, small * (self.n <= i < 2 * self.n)) for i, value in enumerate(x)]
         out = run(self.step, [*z, Rounding(0).constant(self.h)], Rounding(0))
         return max(up(change / small) for _, change in out[: self.n])
 
     def rounding(self, box):
         """The changes of the I_k by the rounding of a step, and the errors of the coordinates."""
         algebra, n = Rounding(self.unit), self.n
-        x = [(value, arb(0)) for value in self.balls(box)]
+        x = [(value, arb(0)) for value in balls(box)]
         start, end = self.stepped(x, algebra)
         if self.implicit:
             # The solver accepts a p1 whose residual is `accepted` and as computed.
@@ -410,13 +383,9 @@ def check_step(checker, box, claim, per_step, rounding, reach):
         for k, (change, limit) in enumerate(zip(checker.changes(x, algebra), per_step, strict=True))
     ]
     moved = [m + Fraction(e) for m, e in zip(checker.moved(x, algebra), errors, strict=True)]
-    for what, found, stated in (
-        ("an invariant changes by", bounds, per_step),
-        ("rounding is", rounded, rounding),
-        ("a step moves by", moved, reach),
-    ):
+    for found, stated in (bounds, per_step), (rounded, rounding), (moved, reach):
         fits = all(value <= limit for value, limit in zip(found, stated, strict=True))
-        require(fits, f"{what} more than stated", box)
+        require(fits, "a change, a rounding or a move is larger than stated", box)
 
 
 def check_confined(checker, box, claim, limits, reach):
@@ -427,10 +396,9 @@ def check_confined(checker, box, claim, limits, reach):
         require(checker.is_outside(algebra, x[:-1]), "one step can reach", box)
     elif claim == "inside":
         sides = zip(box[:-1], checker.lower, checker.upper, strict=True)
-        inside = all(low <= a and b <= high for (a, b), low, high in sides) and all(
-            algebra.range(g)[0] >= 0 for g in run(checker.inside, x[:-1], algebra)
-        )
-        require(inside, "not shown to be in the domain", box)
+        inside = [low <= a and b <= high for (a, b), low, high in sides]
+        inside += [algebra.range(g)[0] >= 0 for g in run(checker.inside, x[:-1], algebra)]
+        require(all(inside), "not shown to be in the domain", box)
     else:
         side, k = claim
         low, high = algebra.range(run(checker.invariants[k], x, algebra)[0])
@@ -451,22 +419,19 @@ def check(certificate):
     boxes = list(leaves(checker.root(), certificate["boxes"]))
     for box, claim in boxes:
         check_step(checker, box, claim, per_step, rounding, reach)
-    text = (
-        f"{len(boxes)} boxes; change per step at most {certificate['per_step']} in exact arithmetic"
-    )
-    text += f", and at most {certificate['rounding']} more by rounding"
+    text = f"on {len(boxes)} boxes a step changes I by ≤ {[*map(float, per_step)]}"
+    text += f", its rounding by ≤ {[*map(float, rounding)]}"
     if certificate["shell"] is None:
-        return text + "; for steps that begin in the domain."
+        return text
     steps, limits = certificate["steps"], []
     for (low, high), b, r in zip(certificate["levels"], per_step, rounding, strict=True):
         change = steps * (b + r)
         above = math.inf if high is None else exact(high) + change
         limits.append((-math.inf if low is None else exact(low) - change, above))
-    sides = zip(checker.lower, checker.upper, reach, strict=True)
-    around = [(a - w, b + w) for a, b, w in sides]
+    around = [(a - w, b + w) for (a, b), w in zip(checker.root()[:-1], reach, strict=True)]
     for box, claim in leaves([*around, checker.epsilon], certificate["shell"]):
         check_confined(checker, box, claim, limits, reach)
-    return text + f"; from the given levels, the domain is not left in {steps} steps."
+    return text + f"; from the given levels the domain is not left in {steps} steps"
 
 
 def main(path):
@@ -474,7 +439,7 @@ def main(path):
     try:
         with open(path, encoding="utf-8") as file:
             print("proved:", check(json.load(file)))
-    except (Failed, KeyError, ValueError, TypeError, IndexError, RecursionError, OSError) as error:
+    except (Failed, OSError, *MALFORMED) as error:
         print(f"not proved: {type(error).__name__}: {error}")
         return 1
     return 0

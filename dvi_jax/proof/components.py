@@ -16,7 +16,7 @@ import numpy as np
 
 from lanewise.jaxapi import ClosedJaxpr, Literal
 
-UNARY = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sinh", "cosh", "sqrt")
+UNARY = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
 _MOVES = (
     "reshape", "broadcast_in_dim", "squeeze", "transpose", "slice", "rev", "concatenate", "gather",
     "dynamic_slice", "pad", "select_n", "dynamic_update_slice", "scatter", "split",
@@ -106,7 +106,7 @@ class Scalar:
     def __neg__(self) -> "Scalar":
         if self.known is not None:
             return self.program.constant(-self.known)
-        return self.program.write("negative", self.index)
+        return self * -1.0
 
     def __sub__(self, other: Any) -> "Scalar":
         return self + -self._of(other)
@@ -246,7 +246,7 @@ def _arithmetic(program: Program, equation: Any, arrays: list, values: list) -> 
     if name in ("reduce_sum", "reduce_prod"):
         moved = np.moveaxis(arrays[0], params["axes"], range(len(params["axes"])))
         flat = moved.reshape(-1, int(np.prod(shape)))
-        combine = total if name == "reduce_sum" else math.prod
+        combine: Any = total if name == "reduce_sum" else math.prod
         return _array([combine(column) for column in flat.T], shape)
     if name == "dot_general":
         return _dot(params["dimension_numbers"], *arrays).reshape(shape)
@@ -263,10 +263,6 @@ def _real_power(x: Scalar, y: float) -> Scalar:
     return (x.apply("log") * y).apply("exp")
 
 
-def _tanh(x: Scalar) -> Scalar:
-    return 1.0 - 2.0 / ((x * 2.0).apply("exp") + 1.0)
-
-
 _ELEMENTWISE: dict[str, Callable] = {
     "add": lambda a, b: a + b,
     "add_any": lambda a, b: a + b,
@@ -279,7 +275,9 @@ _ELEMENTWISE: dict[str, Callable] = {
     "expm1": lambda a: a.apply("exp") - 1.0,
     "log1p": lambda a: (a + 1.0).apply("log"),
     "logistic": lambda a: 1.0 / ((-a).apply("exp") + 1.0),
-    "tanh": _tanh,
+    "tanh": lambda a: 1.0 - 2.0 / ((a * 2.0).apply("exp") + 1.0),
+    "sinh": lambda a: (a.apply("exp") - (-a).apply("exp")) * 0.5,
+    "cosh": lambda a: (a.apply("exp") + (-a).apply("exp")) * 0.5,
 }
 
 

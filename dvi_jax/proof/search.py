@@ -1,5 +1,6 @@
 """The search for a certificate: boxes, bounds, levels. What it finds, the checker decides."""
 
+import bisect
 import heapq
 import itertools
 import math
@@ -68,19 +69,31 @@ def examine(checker: exact.Checker, box: list, rng: Any) -> Leaf:
             raise exact.Failed("a value is not bounded")
     except (exact.Failed, OverflowError) as error:
         leaf.failed = str(error)
-        leaf.blame = _inputs(*error.place) if hasattr(error, "place") else set()
+        leaf.blame = blamed(checker, box)
     return leaf
 
 
-def _inputs(program: dict, index: int) -> set[int]:
-    """The inputs of a program on which one of its operations depends."""
-    needed = {index}
-    for i in range(index, -1, -1):
-        name, *operands = program["operations"][i]
-        if i in needed and name not in ("input", "constant"):
+def blamed(checker: exact.Checker, box: list) -> set[int]:
+    """The coordinates on which the operation depends at which the step fails on a box."""
+    algebra, x = checker.models(box)
+    inputs, operations = [*x, algebra.constant(checker.h)], checker.step["operations"]
+
+    def fails(count):
+        try:
+            exact.run({"operations": operations[:count], "outputs": []}, inputs, algebra)
+        except (exact.Failed, OverflowError):
+            return True
+        return False
+
+    index = bisect.bisect_left(range(len(operations)), True, key=lambda i: fails(i + 1))
+    needed, used = {index}, set()
+    for i in range(min(index, len(operations) - 1), -1, -1):
+        name, *operands = operations[i]
+        if i in needed and name == "input":
+            used.add(operands[0])
+        elif i in needed and name != "constant":
             needed.update(operands[:1] if name == "power" else operands)
-    used = [program["operations"][i] for i in needed]
-    return {operands[0] for name, *operands in used if name == "input"}
+    return used
 
 
 def resolve(checker: exact.Checker) -> None:
@@ -245,9 +258,10 @@ def enclose(
             parts = (first, borders[1:]), (second, ())
         return ["cut", axis, cut, *(node(*part) for part in parts)]
 
-    sides = list(zip(checker.lower, checker.upper, reach, strict=True))
-    root = [*((a - w, b + w) for a, b, w in sides), checker.epsilon]
-    borders = [(i, side) for i, (a, b, _) in enumerate(sides) for side in (a, b)]
+    around = zip(checker.root()[:-1], reach, strict=True)
+    root = [*((a - w, b + w) for (a, b), w in around), checker.epsilon]
+    sides = enumerate(zip(checker.lower, checker.upper, strict=True))
+    borders = [(i, side) for i, pair in sides for side in pair]
     return node(root, tuple(borders)), count
 
 
