@@ -425,7 +425,9 @@ def test_a_discovery_is_saved_and_loaded(tmp_path, monkeypatch):
     np.save(path.with_suffix(".npy"), np.zeros(3))
     path.write_bytes(b"something else")
     for damaged in (path.with_suffix(".npy"), path):
-        with pytest.raises(ValueError, match="is not a discovery of this package, or it is damaged"):
+        with pytest.raises(
+            ValueError, match="is not a discovery of this package, or it is damaged"
+        ):
             dvi.Discovery.load(damaged, named)
     with pytest.raises(FileNotFoundError, match="there is no discovery at"):
         dvi.Discovery.load(path.with_suffix(".none"), named)

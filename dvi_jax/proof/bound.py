@@ -210,13 +210,11 @@ def bound_drift(
     certificate |= {"bits": checker.bits, "tiny": float(checker.tiny).hex()}
     checker = exact.Checker(certificate)
     try:
-        result = search.subdivide(checker, ratio=ratio, **limits)
+        identities = search.identities(checker)
+        result = search.subdivide(checker, identities, ratio=ratio, **limits)
     except exact.Failed as error:
         raise ProofError(f"{error}. Take a smaller domain, ε or h.") from None
     per_step = [exact.up(b) for b in result.bounds]
-    for k, (b, s) in enumerate(zip(per_step, result.seen, strict=True)):
-        if s == 0 and b and checker.is_identity(k):
-            per_step[k] = 0.0
     certificate |= {
         "per_step": [b.hex() for b in per_step],
         "rounding": [r.hex() for r in result.rounding],

@@ -30,7 +30,7 @@ from flint import arb, arb_series, ctx, fmpq, fmpq_mpoly_ctx, fmpz_mpoly_ctx
 
 FORMAT = "dvi_jax drift bound 1"
 FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
-ORDERS = 40  # the largest order of the expansion of an elementary function
+ORDERS = 24  # the largest order of the expansion of an elementary function
 ULPS = {"sqrt": 1}  # errors of computed functions in units of round-off; 8 (4 ulp) for others
 MALFORMED = (KeyError, ValueError, TypeError, IndexError, AttributeError, RecursionError)
 LEAST = 2.0**-1000  # added to each error, for results below the normal numbers

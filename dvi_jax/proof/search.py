@@ -4,6 +4,7 @@ import bisect
 import heapq
 import itertools
 import math
+import operator
 import time
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -44,8 +45,10 @@ class Leaf:
     parts: list = field(default_factory=list)
 
 
-def examine(checker: exact.Checker, box: list, rng: Any) -> Leaf:
-    """Everything that is bounded on one box."""
+def examine(
+    checker: exact.Checker, box: list, rng: Any, identities: frozenset = frozenset()
+) -> Leaf:
+    """Everything that is bounded on one box; `identities`: numbers of what is conserved exactly."""
     leaf = Leaf(box)
     try:
         algebra, x = checker.models(box)
@@ -60,7 +63,10 @@ def examine(checker: exact.Checker, box: list, rng: Any) -> Leaf:
             return leaf
         moved = checker.moved(x, algebra)
         changes = checker.changes(x, algebra)
-        leaf.bounds = [algebra.bound(change) for change in changes]
+        leaf.bounds = [
+            Fraction(0) if k in identities else algebra.bound(change)
+            for k, change in enumerate(changes)
+        ]
         leaf.remainders = [change[1] / algebra.one for change in changes]
         leaf.seen = [seen(algebra, change, box, rng) for change in changes]
         leaf.rounding, errors = checker.rounding(box)
@@ -105,17 +111,22 @@ def resolve(checker: exact.Checker) -> None:
     for digits in _DIGITS:
         checker.tiny, checker.bits = Fraction(1, 2**digits), digits + 40
         leaf = examine(checker, box, rng)
-        while leaf.failed and box[0][1] - box[0][0] > Fraction(1, 10**4):
+        while leaf.failed:
+            widths = [float(b - a) for a, b in box]
+            if digits > _DIGITS[0] or max(widths) < 1e-3 * max(map(abs, (*box[0], 1))):
+                return  # nothing is bounded there: `subdivide` says where
             # A part of the domain is enough here.
-            parts = [rng.integers(0, 2) for _ in box]
-            box = [
-                ((a + b) / 2, b) if up else (a, (a + b) / 2)
-                for (a, b), up in zip(box, parts, strict=True)
-            ]
+            box = [half(side, rng.random() < 0.5) for side in box]
             leaf = examine(checker, box, rng)
         pairs = zip(leaf.remainders, leaf.seen, strict=True)
         if leaf.remainders and all(r <= s / 10 for r, s in pairs):
             return
+
+
+def half(side: tuple, upper: bool) -> tuple:
+    """A half of an interval."""
+    middle = (side[0] + side[1]) / 2
+    return (middle, side[1]) if upper else (side[0], middle)
 
 
 def seen(algebra: exact.Models, model: Any, box: list, rng: Any) -> float:
@@ -130,6 +141,47 @@ def seen(algebra: exact.Models, model: Any, box: list, rng: Any) -> float:
     monomials = np.prod(s[:, None, :] ** powers[None], axis=2)
     error = float(Fraction(model[1], algebra.one))
     return max(0.0, float(np.max(np.abs(monomials @ values))) - error)
+
+
+class _Rational:
+    """Rational numbers for the `run` of the checker."""
+
+    constant, multiply, divide = staticmethod(Fraction), operator.mul, operator.truediv
+
+    @staticmethod
+    def sum(*terms: Any) -> Any:
+        return sum(terms)
+
+    @staticmethod
+    def apply(name: str, a: Any) -> Any:
+        raise exact.Failed(f"{name} is no rational function")
+
+
+def identities(checker: exact.Checker) -> frozenset:
+    """The numbers of the functions that are conserved exactly: zero at points, then proved."""
+    if checker.implicit:
+        return frozenset()
+    rng = np.random.default_rng(1)
+    sides = [(checker.lower[i], checker.upper[i]) for i in range(2 * checker.n)]
+    points = [
+        [
+            a + (b - a) * Fraction(int(rng.integers(1, 99)), 100)
+            for a, b in [*sides, checker.epsilon]
+        ]
+        for _ in range(2)
+    ]
+    found = set(range(len(checker.invariants)))
+    for x in points:
+        for k in tuple(found):
+            function = checker.invariants[k]
+            try:
+                end = exact.run(checker.step, [*x, checker.h], _Rational)
+                after, before = (exact.run(function, [*z, x[-1]], _Rational) for z in (end, x[:-1]))
+            except (exact.Failed, ZeroDivisionError):
+                after, before = 1, 0
+            if after != before:
+                found.remove(k)
+    return frozenset(k for k in found if checker.is_identity(k))
 
 
 class TooMany(exact.Failed):
@@ -148,20 +200,27 @@ class Found:
     moved: list
 
 
-def subdivide(checker: exact.Checker, *, ratio: float, max_boxes: int, max_seconds: float) -> Found:
+def subdivide(
+    checker: exact.Checker,
+    identities: frozenset,
+    *,
+    ratio: float,
+    max_boxes: int,
+    max_seconds: float,
+) -> Found:
     """Cut the domain until no bound exceeds `ratio` times the largest change seen.
 
     The box with the worst bound is cut first, along the axis that leaves the smallest bounds.
     **Raises** `TooMany` where boxes on which nothing is bounded remain.
     """
     rng, began, order = np.random.default_rng(0), time.monotonic(), itertools.count()
-    root = examine(checker, checker.root(), rng)
+    root = examine(checker, checker.root(), rng, identities)
     best = root.seen or [0.0] * len(checker.invariants)
     heap = [(_rank(root, best), next(order), root)]
     count = 1
     while -heap[0][0] > ratio and count < max_boxes and time.monotonic() - began < max_seconds:
         leaf = heapq.heappop(heap)[2]
-        leaf.axis, leaf.parts = _cut(checker, leaf, rng)
+        leaf.axis, leaf.parts = _cut(checker, leaf, rng, identities)
         count += 1
         old = best
         for part in leaf.parts:
@@ -202,12 +261,16 @@ def _rank(leaf: Leaf, best: list) -> float:
     return -max((float(b) / s if s else math.inf) if b else 0.0 for b, s in pairs)
 
 
-def _cut(checker: exact.Checker, leaf: Leaf, rng: Any) -> tuple[int, list[Leaf]]:
+def _cut(
+    checker: exact.Checker, leaf: Leaf, rng: Any, identities: frozenset
+) -> tuple[int, list[Leaf]]:
     """The parts of a leaf along the axis that leaves the smallest bounds."""
     axes = [i for i, (a, b) in enumerate(leaf.box) if a < b]
     if leaf.failed:
         axes = [_widest(checker, leaf.box, leaf.blame)]
-    tried = [(i, [examine(checker, half, rng) for half in halves(leaf.box, i)]) for i in axes]
+    tried = [
+        (i, [examine(checker, part, rng, identities) for part in halves(leaf.box, i)]) for i in axes
+    ]
     return min(tried, key=lambda item: sum(_rest(leaf, part) for part in item[1]))
 
 

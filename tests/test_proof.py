@@ -1,0 +1,412 @@
+"""Proved bounds of the drift: never below the truth, and a checker that refuses what is false."""
+
+import copy
+import json
+import subprocess
+import sys
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+import dvi_jax as dvi
+
+pytest.importorskip("flint")
+from dvi_jax.proof import checker as exact
+from dvi_jax.proof.components import Unsupported, program_of
+
+CUBIC = dvi.System(
+    lambda t0, t1, q, p, args: (p @ p + q @ q) / 2, force=lambda t0, t1, q, p, args: -(q**3)
+)
+HENON_HEILES = dvi.System(
+    lambda t0, t1, q, p, args: (p @ p + q @ q) / 2,
+    force=lambda t0, t1, q, p, args: -jnp.array([2 * q[0] * q[1], q[0] ** 2 - q[1] ** 2]),
+)
+
+
+def found(system, degree, order, r, n=1, count=800):
+    samples = np.random.default_rng(0).uniform(-r, r, (2, count, n))
+    return dvi.discover_invariants(
+        system, dvi.Polynomials(degree), order=order, h=0.1, samples=samples
+    )
+
+
+@pytest.fixture(scope="module")
+def cubic():
+    """The bound of order 2 on the box of half-width 0.5."""
+    return dvi.bound_drift(found(CUBIC, 8, 2, 0.5), CUBIC, h=0.1, epsilon=0.01, domain=0.5)
+
+
+def energy_of_the_map(q, p, epsilon):
+    return (p @ p + q @ q - 0.1 * (q @ p)) / 2
+
+
+# --- the bounds ----------------------------------------------------------------------------------
+
+
+def test_the_cubic_oscillator(cubic):
+    assert cubic.per_step[0] <= 3e-10
+    assert cubic.seen[0] <= cubic.per_step[0] <= 2 * cubic.seen[0]
+    assert 1e-17 < cubic.rounding[0] < 3e-16
+    assert cubic.num_steps(1e-3) == int(1e-3 / (cubic.per_step[0] + cubic.rounding[0]))
+    assert cubic.level is not None
+    assert cubic.steps > 3e6
+    assert 0.5 < cubic.start < 0.8
+    assert "leaves it in" in str(cubic)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("order", "degree", "limit"), [(1, 6, 1.7e-7), (2, 8, 1.3e-9), (3, 10, 8e-12)]
+)
+def test_orders_of_the_cubic_oscillator(order, degree, limit):
+    bound = dvi.bound_drift(
+        found(CUBIC, degree, order, 0.5, count=3000), CUBIC, h=0.1, epsilon=0.01, domain=0.5
+    )
+    assert bound.per_step[0] <= limit
+
+
+@pytest.mark.slow
+def test_henon_and_heiles():
+    bound = dvi.bound_drift(
+        found(HENON_HEILES, 5, 3, 0.3, n=2), HENON_HEILES, h=0.1, epsilon=0.01, domain=0.3,
+        ratio=6.0,
+    )  # fmt: skip
+    k = bound.level[0]
+    assert bound.per_step[k] <= 1e-13
+    assert bound.num_steps(1e-3, k) >= 9e9
+    assert bound.steps >= 9e9
+    assert "the domain is not left" in exact.check(bound.certificate)
+
+
+class Digits:
+    """The arithmetic of mpmath for the `run` of the checker."""
+
+    @staticmethod
+    def constant(value):
+        return mpmath.mpf(value.numerator) / value.denominator
+
+    @staticmethod
+    def sum(*terms):
+        return sum(terms[1:], terms[0])
+
+    @staticmethod
+    def multiply(a, b):
+        return a * b
+
+    @staticmethod
+    def divide(a, b):
+        return a / b
+
+    @staticmethod
+    def apply(name, a):
+        return getattr(mpmath, name)(a)
+
+
+def changes_in_digits(certificate, k, points):
+    """|I_k(Φ(x)) − I_k(x)| at states with ε, in 50 digits."""
+    with mpmath.workdps(50):
+        h = mpmath.mpf(float.fromhex(certificate["h"]))
+        values = []
+        for point in points:
+            x = [mpmath.mpf(float(v)) for v in point]
+            end = exact.run(certificate["step"], [*x, h], Digits)
+            invariant = certificate["invariants"][k]
+            after, before = (exact.run(invariant, [*z, x[-1]], Digits)[0] for z in (end, x[:-1]))
+            values.append(abs(after - before))
+        return values
+
+
+def random_system(seed, analytic):
+    """A system with a random potential and force of one degree of freedom, and a function."""
+    rng = np.random.default_rng(seed)
+    a, b, c, d = rng.uniform(-1, 1, 4)
+    if analytic:
+
+        def V(x):
+            return a * jnp.cos(x) + b * jnp.exp(x / 2) + jnp.sqrt(1.5 + c * x / 2)
+
+        def W(x):
+            return d * jnp.sin(2 * x) / (2 + x)
+    else:
+
+        def V(x):
+            return a * x**2 + b * x**3 + c * x**4
+
+        def W(x):
+            return d * x**2 - a * x**5
+
+    system = dvi.System(
+        lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(V(q)),
+        force=lambda t0, t1, q, p, args: W(q),
+    )
+    return system, lambda q, p, epsilon: p @ p / 2 + jnp.sum(V(q)) + epsilon * c * jnp.sum(q * p)
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(s, marks=pytest.mark.slow) for s in range(2, 30))]
+)
+@pytest.mark.parametrize("analytic", [False, True])
+def test_a_bound_is_never_below_the_truth(seed, analytic):
+    system, function = random_system(seed, analytic)
+    bound = dvi.bound_drift(
+        function, system, h=0.1, epsilon=0.05, domain=np.array([0.4]), ratio=1.2, max_boxes=60
+    )
+    certificate = bound.certificate
+    grid = np.linspace(-0.4, 0.4, 9)
+    points = [(q, p, e) for q in grid for p in grid for e in (0.0, 0.05)]
+    values = changes_in_digits(certificate, 0, points)
+    best = points[int(np.argmax([float(v) for v in values]))]
+    rng = np.random.default_rng(seed)
+    for scale in (0.05, 0.01, 0.002):
+        near = np.clip(best + rng.normal(0, scale, (60, 3)), [-0.4, -0.4, 0], [0.4, 0.4, 0.05])
+        more = changes_in_digits(certificate, 0, near)
+        values.extend(more)
+        best = near[int(np.argmax([float(v) for v in more]))]
+    largest = float(max(values))
+    assert largest <= bound.per_step[0] <= 1.5 * largest
+    # A bound that is 1 % below the largest change is false, and is refused.
+    false = copy.deepcopy(certificate)
+    false["per_step"] = [(0.99 * largest).hex()]
+    false["hash"] = exact.digest(false)
+    with pytest.raises(exact.Failed, match="larger than stated"):
+        exact.check(false)
+
+
+def test_rounding_is_bounded(cubic):
+    """Computed steps against exact ones, in rational numbers."""
+    rng = np.random.default_rng(1)
+    q, p = rng.uniform(-0.5, 0.5, (2, 500, 1))
+    certificate = cubic.certificate
+    h = Fraction(float.fromhex(certificate["h"]))
+    sol = jax.vmap(lambda q, p: dvi.integrate(CUBIC, q, p, h=0.1, num_steps=1, epsilon=0.01))(q, p)
+    worst = 0.0
+    for i in range(500):
+        x = [Fraction(float(v)) for v in (q[i, 0], p[i, 0], 0.01)]
+        step = exact.run(certificate["step"], [*x, h], Rational)
+        computed = [Fraction(float(v[i, 1, 0])) for v in (sol.qs, sol.ps)]
+        invariant = certificate["invariants"][0]
+        values = [exact.run(invariant, [*z, x[-1]], Rational)[0] for z in (step, computed)]
+        worst = max(worst, abs(float(values[0] - values[1])))
+    assert cubic.rounding[0] / 30 < worst <= cubic.rounding[0]
+
+
+class Rational:
+    """The arithmetic of rational numbers for the `run` of the checker."""
+
+    constant = Fraction
+    sum = staticmethod(lambda *terms: sum(terms))
+    multiply = staticmethod(lambda a, b: a * b)
+
+
+def test_trajectories_stay_below_the_line(cubic):
+    k = cubic.level[0]
+    s = cubic.start * 0.5
+    q, p = np.random.default_rng(2).uniform(-s, s, (2, 64, 1))
+    invariant = found(CUBIC, 8, 2, 0.5).invariants[k]
+    run = jax.vmap(
+        lambda q, p: dvi.integrate(
+            CUBIC, q, p, h=0.1, num_steps=20_000, epsilon=0.01,
+            observe={"I": dvi.MaxDrift(invariant), "q": dvi.Range(lambda q, p: q[0])},
+        ).observed
+    )(q, p)  # fmt: skip
+    each = cubic.per_step[k] + cubic.rounding[k]
+    assert float(np.max(run["I"])) < 20_000 * each + 1e-15
+    assert float(np.max(np.abs(run["q"]))) < 1.0  # max − min of a coordinate of the domain
+
+
+def test_an_implicit_step_is_a_function_of_q0_and_p1():
+    """H_D = p²(1 + q²)/2 + q²/2: p0 follows from (q0, p1)."""
+    system = dvi.System(lambda t0, t1, q, p, args: (p @ p) * (1 + q @ q) / 2 + q @ q / 2)
+
+    def function(q, p, epsilon):
+        return (p @ p) * (1 + q @ q) / 2 + q @ q / 2
+
+    bound = dvi.bound_drift(function, system, h=0.05, epsilon=0.01, domain=np.array([0.3]))
+    assert bound.certificate["implicit"]
+    sol = dvi.integrate(system, [0.2], [0.25], h=0.05, num_steps=500, epsilon=0.0)
+    values = [float(function(q, p, 0)) for q, p in zip(sol.qs, sol.ps, strict=True)]
+    measured = np.max(np.abs(np.diff(values)))
+    assert measured <= bound.per_step[0] <= 10 * measured
+    assert "a step changes I" in exact.check(bound.certificate)
+
+
+def test_what_is_conserved_exactly_is_an_identity():
+    """The angular momentum of a central force, and McMillan's map, a rational one."""
+    central = dvi.System(
+        lambda t0, t1, q, p, args: p @ p / 2 + q @ q, force=lambda t0, t1, q, p, args: -q * (q @ q)
+    )
+    momentum = dvi.bound_drift(
+        lambda q, p, e: q[0] * p[1] - q[1] * p[0], central, h=0.1, epsilon=0.1,
+        domain=np.full(2, 0.5),
+    )  # fmt: skip
+    assert momentum.per_step == (0.0,)
+    # q1 = q0 + p1, p1 = p0 + f(q0): in x = q1 and y = q0, x' = −y + 2x + f(x).
+    mcmillan = dvi.System(
+        lambda t0, t1, q, p, args: p @ p / 2 + q @ q - jnp.sum(jnp.log(1 + q * q))
+    )
+
+    def invariant(q, p, epsilon):
+        x, y = q[0], q[0] - p[0]
+        return x**2 * y**2 + x**2 + y**2 - 2 * x * y
+
+    bound = dvi.bound_drift(invariant, mcmillan, h=1.0, epsilon=0.1, domain=np.array([0.3]))
+    assert bound.per_step == (0.0,)
+    assert "by ≤ [0.0]" in exact.check(bound.certificate)
+    false = dvi.bound_drift(
+        lambda q, p, e: invariant(q, p, e) + 1e-6 * q[0] ** 2, mcmillan, h=1.0, epsilon=0.1,
+        domain=np.array([0.3]),
+    )  # fmt: skip
+    assert false.per_step[0] > 1e-8
+
+
+# --- nothing is claimed --------------------------------------------------------------------------
+
+
+def test_a_singularity_in_the_domain():
+    kepler = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - 1 / jnp.sqrt(q @ q))
+    with pytest.raises(dvi.ProofError, match=r"nothing is bounded. The first is .* is singular"):
+        dvi.bound_drift(
+            lambda q, p, e: q[0] * p[1] - q[1] * p[0], kepler, h=0.1, epsilon=0.1,
+            domain=np.full(2, 0.5), max_boxes=4,
+        )  # fmt: skip
+
+
+def test_a_wrong_invariant_confines_nothing():
+    bound = dvi.bound_drift(
+        lambda q, p, e: q[0] * p[0], CUBIC, h=0.1, epsilon=0.01, domain=np.array([0.5])
+    )
+    assert bound.level is None
+    assert "it is not shown that trajectories stay" in str(bound)
+
+
+@pytest.mark.parametrize(
+    ("how", "kind", "message"),
+    [
+        ({"epsilon": (0.1, 0.1)}, ValueError, "a least value below its largest"),
+        ({"ratio": 1.0}, ValueError, "larger than 1"),
+        ({"domain": -1.0}, ValueError, "lower bounds below"),
+        ({"method": dvi.GaussLegendre(2)}, ValueError, "is implicit for this system"),
+        ({"integrator": dvi.Integrator(arithmetic=dvi.Compensated())}, ValueError, "float64"),
+    ],
+)
+def test_bad_input(how, kind, message):
+    given = {"h": 0.1, "epsilon": 0.01, "domain": np.array([0.5]), **how}
+    with pytest.raises(kind, match=message):
+        dvi.bound_drift(energy_of_the_map, CUBIC, **given)
+
+
+def test_what_has_no_bound():
+    kicked = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.cos(q - t0)))
+    given = {"h": 0.1, "epsilon": 0.01, "domain": np.array([0.5])}
+    with pytest.raises(ValueError, match="depends on the time"):
+        dvi.bound_drift(energy_of_the_map, kicked, **given)
+    folded = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 + jnp.sum(jnp.abs(q)))
+    with pytest.raises(Unsupported, match="select_n"):
+        dvi.bound_drift(energy_of_the_map, folded, **given)
+
+
+def test_functions_become_the_same_numbers():
+    def function(q, p):
+        A = jnp.outer(q, p) + jnp.eye(2)
+        series = jnp.cumsum(q) ** 3 + jnp.where(jnp.arange(2) > 0, p, q)
+        return jnp.sin(A @ q), jnp.tanh(series) / (2 + p[::-1] ** 2), jnp.prod(A[:, 1]) ** 1.5
+
+    q, p = jnp.array([0.3, 0.7]), jnp.array([0.2, 0.9])
+    program = program_of(function, (2,), (2,))
+    values = exact.run(program, [mpmath.mpf(float(x)) for x in (*q, *p)], Digits)
+    expected = np.concatenate([np.ravel(x) for x in function(q, p)])
+    np.testing.assert_allclose([float(v) for v in values], expected, rtol=1e-14)
+
+
+# --- the certificate -----------------------------------------------------------------------------
+
+
+def mutations(c):
+    """Name → a certificate with one thing changed."""
+
+    def changed(name, index, value):
+        new = copy.deepcopy(c)
+        place = new
+        for key in index[:-1]:
+            place = place[key]
+        place[index[-1]] = value(place[index[-1]]) if callable(value) else value
+        return name, new
+
+    constant = next(
+        i for i, op in enumerate(c["invariants"][0]["operations"]) if op[0] == "constant"
+    )
+    product = next(i for i, op in enumerate(c["step"]["operations"]) if op[0] == "multiply")
+    total = next(i for i, op in enumerate(c["step"]["operations"]) if op[0] == "sum")
+
+    def times(factor):
+        return lambda text: (float.fromhex(text) * factor).hex()
+
+    where = ("invariants", 0, "operations", constant, 1)
+    return dict(
+        [
+            changed("a coefficient", where, times(1.001)),
+            changed("a coefficient by one digit", where, times(1 + 1e-9)),
+            changed("h", ("h",), times(1.01)),
+            changed("the largest ε", ("epsilon", 1), times(1.5)),
+            changed("the least ε", ("epsilon", 0), (-0.02).hex()),
+            changed("the upper side of q", ("domain", 1, 0), times(1.2)),
+            changed("the lower side of p", ("domain", 0, 1), times(1.2)),
+            changed("the bound", ("per_step", 0), times(0.3)),
+            changed("the bound is zero", ("per_step", 0), (0.0).hex()),
+            changed("the bound is negative", ("per_step", 0), times(-1)),
+            changed("the rounding", ("rounding", 0), times(0.5)),
+            changed("the unit round-off", ("unit",), times(8)),
+            changed("the reach", ("reach", 0), times(0.9)),
+            changed("the number of steps", ("steps",), lambda n: 10 * n),
+            changed("the level", ("levels", 0, 1), times(1.2)),
+            changed("the number of bits", ("bits",), 8),
+            changed("the smallest terms", ("tiny",), (0.5).hex()),
+            changed("an operation", ("step", "operations", product, 0), "sum"),
+            changed("another operation", ("step", "operations", total, 0), "divide"),
+            changed("the order of outputs", ("step", "outputs"), lambda x: x[::-1]),
+            changed("an unknown operation", ("step", "operations", total, 0), "abs"),
+            changed("a box left out", ("shell", -1), lambda node: "inside"),
+            changed("a box that is no box", ("shell",), lambda node: node[:-1]),
+            changed("all boxes outside", ("boxes",), "outside"),
+            changed("a cut elsewhere", ("shell", 2), times(1.5)),
+            changed("the format", ("format",), "drift bound 0"),
+        ]
+    )
+
+
+def test_a_changed_certificate_fails(cubic):
+    c = cubic.certificate
+    assert "the domain is not left" in exact.check(c)
+    changed = mutations(c)
+    assert len(changed) >= 25
+    for name, certificate in changed.items():
+        with pytest.raises(exact.Failed, match=r"was changed|the format"):
+            exact.check(certificate)
+        # Also by somebody who computes the hash anew.
+        certificate["hash"] = exact.digest(certificate)
+        with pytest.raises((exact.Failed, *exact.MALFORMED)):
+            print(name, exact.check(certificate))
+
+
+def test_the_checker_is_a_small_program_of_its_own(cubic, tmp_path):
+    path = tmp_path / "bound.json"
+    cubic.save(path)
+    code = f"""
+import runpy, sys
+sys.argv = ["checker.py", {str(path)!r}]
+try:
+    runpy.run_path({exact.__file__!r}, run_name="__main__")
+finally:
+    assert not {{"jax", "numpy", "dvi_jax"}} & set(sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("proved: on ")
+    content = json.loads(path.read_text())
+    content["h"] = (0.2).hex()
+    path.write_text(json.dumps(content))
+    assert exact.main(str(path)) == 1
