@@ -37,6 +37,7 @@ EXTRAS = {
     "distributed": ("distributed",),
     "bayes": ("numpyro",),
     "export": ("h5netcdf", "h5py", "pyarrow"),
+    "proof": ("flint",),
     "ephemeris": ("jplephem", "skyfield_data"),
     "interop": ("astropy", "diffrax", "rebound", "scipy"),
 }

@@ -24,7 +24,7 @@ from dvi_jax_cli._new import notebook
 from dvi_jax_cli._session import CODES, Session
 
 COMMANDS = ["new", "systems", "schema", "run", "sweep", "fit", "discover", "paper", "certify"]
-COMMANDS += ["bench", "info"]
+COMMANDS += ["verify", "bench", "info"]
 
 WITHOUT_JAX = """
 import sys

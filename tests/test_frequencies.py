@@ -322,7 +322,7 @@ ROUNDED = (1e6 + 0.05 * np.arange(N)).astype(np.float32)
         (lambda: frequencies(TS[:20], torus()[:20]), ValueError, "at least 32 samples, got 20"),
         (lambda: frequencies(TS[:-1], torus()), ValueError, "same length along their last axis"),
         (lambda: frequencies(TS, torus()[:, None]), ValueError, "signal.T"),
-        (lambda: frequencies(np.stack([TS] * 3), torus()), ValueError, "do not match"),
+        (lambda: frequencies(np.stack([TS] * 3), torus()), ValueError, "does not match a signal"),
         (lambda: frequencies(TS), ValueError, "give either times and a signal"),
         (lambda: frequencies(torus(), TS), TypeError, "the times are the first argument"),
         (lambda: frequencies(TS, ["a"] * N), TypeError, "array of numbers"),

@@ -386,7 +386,7 @@ def test_a_changed_certificate_fails(cubic):
     for name, certificate in changed.items():
         with pytest.raises(exact.Failed, match=r"was changed|the format"):
             exact.check(certificate)
-        # Also by somebody who computes the hash anew.
+        # Also if the hash is computed again.
         certificate["hash"] = exact.digest(certificate)
         with pytest.raises((exact.Failed, *exact.MALFORMED)):
             print(name, exact.check(certificate))

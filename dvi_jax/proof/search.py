@@ -278,7 +278,7 @@ def _rest(leaf: Leaf, part: Leaf) -> float:
     """The bound of a part over that of the whole, at most 10."""
     if part.outside or part.failed:
         return 0.0 if part.outside else 10.0
-    pairs = zip(part.bounds, leaf.bounds, strict=False)  # of a failed one there are none
+    pairs = zip(part.bounds, leaf.bounds, strict=False)  # a failed one has no bounds
     return max((float(a / b) for a, b in pairs if b), default=0.0)
 
 
