@@ -271,7 +271,16 @@ def _cut(
     tried = [
         (i, [examine(checker, part, rng, identities) for part in halves(leaf.box, i)]) for i in axes
     ]
-    return min(tried, key=lambda item: sum(_rest(leaf, part) for part in item[1]))
+
+    widest = _widest(checker, leaf.box)
+
+    def cost(item):
+        # The larger bound decides. Where no cut makes it much smaller, more than one is needed, and
+        # the widest coordinate is cut: cutting one part again and again would go on for ever.
+        rests = [_rest(leaf, part) for part in item[1]]
+        return max(*rests, 0.9), item[0] != widest, sum(rests)
+
+    return min(tried, key=cost)
 
 
 def _rest(leaf: Leaf, part: Leaf) -> float:
