@@ -17,6 +17,7 @@ from .._arithmetic import FloatingPoint
 from .._checks import finite, positive, whole
 from .._files import publish
 from .._integrator import Integrator, chosen, only
+from .._precision import refuse_double_without_x64
 from .._step import Equations
 from .._system import System, check_system, of_problem
 from .._types import Interval
@@ -177,6 +178,8 @@ def bound_drift(
     ```
     """
     exact, search = tools()
+    # In float32 the bound of the rounding would be that of another program.
+    refuse_double_without_x64("domain", np.dtype(float))
     positive("change", change)
     whole("max_boxes", max_boxes)
     positive("max_seconds", max_seconds)
@@ -319,7 +322,10 @@ def _functions(found: Any) -> list[tuple[Callable, str]]:
         return [(found.evaluate, found.formula(terms=8))]
     if callable(found):
         return [(found, getattr(found, "__name__", "a function"))]
-    return [pair for one in found for pair in _functions(one)]
+    pairs = [pair for one in found for pair in _functions(one)]
+    if not pairs:
+        raise ValueError("found is empty: give an invariant, or a list of at least one.")
+    return pairs
 
 
 def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float], list[float]]]:
@@ -330,6 +336,11 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
     shapes = [np.shape(x)[1:] if np.ndim(x) > 1 else np.shape(x) for x in parts]
     one = found if isinstance(found, Discovery) else None
     shape = one.shape if one is not None else max(shapes, key=len)
+    if not shape:
+        raise ValueError(
+            f"domain={domain!r} does not contain the number of coordinates of q: give half-widths "
+            "as an array like q, for example domain=np.full(2, 0.5)."
+        )
     lower, upper = [], []
     for name, x in zip("qp", parts, strict=True):
         x = np.asarray(x, float)
@@ -347,9 +358,11 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
 
 def _interval(epsilon: Any) -> tuple[float, float]:
     ends = epsilon if np.ndim(epsilon) else (0.0, epsilon)
-    if len(ends) != 2:
-        raise ValueError(f"epsilon must be one number or a pair, got {epsilon!r}.")
-    low, high = (finite("epsilon", float(x)) for x in ends)
-    if not low < high:
-        raise ValueError(f"epsilon must have a least value below its largest, got {epsilon!r}.")
+    ends = [finite("epsilon", float(x)) for x in ends]
+    if len(ends) != 2 or not ends[0] < ends[1]:
+        raise ValueError(
+            "epsilon must be the largest value, above 0, or a pair with a least value below its "
+            f"largest, got {epsilon!r}."
+        )
+    low, high = ends
     return low, high

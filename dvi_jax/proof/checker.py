@@ -11,9 +11,9 @@ It needs Python and python-flint, no other part of the package. A certificate st
 
 For 1 and 2 boxes cover the domain. On a box a function is a polynomial in the coordinates of the
 box with integer coefficients, and a bound of the remainder (a Taylor model; Makino & Berz 2003);
-elementary functions are enclosed by balls (Arb; Johansson 2017). For 3, boxes cover all places
-outside of the domain that one step can reach, and on each some I_k differs from its levels by more
-than `steps` steps can change it. By induction no trajectory gets there.
+elementary functions are enclosed by balls (Arb). For 3, boxes cover all places outside of the
+domain that one step can reach, and on each some I_k differs from its levels by more than `steps`
+steps can change it. By induction no trajectory gets there.
 
 A step that is implicit in p1 is a function of (q0, p1), on boxes of those. Each (q0, p0) of the
 domain has a p1 within `spread` of p0, because p1 → p0 + h·rate maps this box into itself (Brouwer),
@@ -23,6 +23,8 @@ and only one, because it is a contraction there.
 import hashlib
 import json
 import math
+import operator
+import pathlib
 import sys
 from fractions import Fraction
 
@@ -32,7 +34,7 @@ FORMAT = "dvi_jax drift bound 1"
 FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
 ORDERS = 24  # the largest order of the expansion of an elementary function
 ULPS = {"sqrt": 1}  # errors of computed functions in units of round-off; 8 (4 ulp) for others
-MALFORMED = (KeyError, ValueError, TypeError, IndexError, AttributeError, RecursionError)
+MALFORMED = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)
 LEAST = 2.0**-1000  # added to each error, for results below the normal numbers
 
 
@@ -104,7 +106,7 @@ def run(program, inputs, algebra):
         elif name == "constant":
             values.append(algebra.constant(exact(operands[0])))
         elif name == "power":
-            values.append(power(values[operands[0]], operands[1], algebra))
+            values.append(power(values[operands[0]], operator.index(operands[1]), algebra))
         elif name in ("sum", "multiply", "divide"):
             values.append(getattr(algebra, name)(*(values[i] for i in operands)))
         elif name in FUNCTIONS:
@@ -198,14 +200,12 @@ class Rounding:
         return ball(value), arb(0)
 
     def rounded(self, value, error, operations=1):
-        made = operations * self.unit * (abs(value) + error) + LEAST
-        return value, arb((error + made).upper())
+        return value, arb((error + operations * self.unit * (abs(value) + error) + LEAST).upper())
 
     def sum(self, *terms):
         error, size = sum(t[1] for t in terms), sum(abs(t[0]) + t[1] for t in terms)
-        return sum(t[0] for t in terms), arb(
-            (error + len(terms) * self.unit * size + LEAST).upper()
-        )
+        made = len(terms) * self.unit * size + LEAST
+        return sum(t[0] for t in terms), arb((error + made).upper())
 
     def multiply(self, a, b):
         error = abs(a[0]) * b[1] + abs(b[0]) * a[1] + a[1] * b[1]
@@ -262,6 +262,7 @@ class Checker:
         self.unit, self.accepted = exact(certificate["unit"]), exact(certificate["accepted"])
         self.bits, self.tiny = certificate["bits"], exact(certificate["tiny"])
         self.h = exact(certificate["h"])
+        require(self.unit >= Fraction(1, 2**53), "the unit is not that of float64", self.root())
         ctx.prec = self.bits + 60
 
     def root(self):
@@ -353,9 +354,9 @@ def leaves(box, node):
         yield box, node
         return
     _, axis, where, *parts = node
+    require(axis in range(len(box)) and len(parts) == 2, "a cut has no axis or part", box)
     (a, b), c = box[axis], exact(where)
-    if not a <= c <= b or len(parts) != 2:
-        raise Failed("a cut is outside of its box")
+    require(a <= c <= b, "a cut is outside of its box,", box)
     for side, part in zip(((a, c), (c, b)), parts, strict=True):
         yield from leaves([*box[:axis], side, *box[axis + 1 :]], part)
 
@@ -403,7 +404,7 @@ def check_confined(checker, box, claim, limits, reach):
         side, k = claim
         low, high = algebra.range(run(checker.invariants[k], x, algebra)[0])
         off = low > limits[k][1] if side == "above" else high < limits[k][0]
-        require(off, f"I_{k} is not shown to exclude a trajectory", box)
+        require(off, f"I_{k} does not exclude a trajectory", box)
 
 
 def check(certificate):
@@ -421,6 +422,7 @@ def check(certificate):
         check_step(checker, box, claim, per_step, rounding, reach)
     text = f"on {len(boxes)} boxes a step changes I by ≤ {[*map(float, per_step)]}"
     text += f", its rounding by ≤ {[*map(float, rounding)]}"
+    text += f" if a solver accepts residuals ≤ {float(checker.accepted):.3g}" * checker.implicit
     if certificate["shell"] is None:
         return text
     steps, limits = certificate["steps"], []
@@ -437,8 +439,7 @@ def check(certificate):
 def main(path):
     """Check one file. Returns the exit code: 0 for a proof, 1 otherwise."""
     try:
-        with open(path, encoding="utf-8") as file:
-            print("proved:", check(json.load(file)))
+        print("proved:", check(json.loads(pathlib.Path(path).read_text(encoding="utf-8"))))
     except (Failed, OSError, *MALFORMED) as error:
         print(f"not proved: {type(error).__name__}: {error}")
         return 1
