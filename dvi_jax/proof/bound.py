@@ -1,15 +1,15 @@
 """`bound_drift`: a proved bound of how much invariants change, for all starts of a domain."""
 
-import functools
+import inspect
 import json
 import math
-import operator
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -45,7 +45,7 @@ class DriftBound(eqx.Module):
 
     - `per_step`, `rounding`: [unit of the invariant]. `seen`: the largest change found at sample
       points of the boxes, a lower estimate of the least possible `per_step`.
-    - `level`: (k, sign, c): trajectories that start in the domain with sign·I_k ≤ c stay in it for
+    - `level`: (w, c): trajectories that start in the domain with Σ w_k I_k ≤ c stay in it for
       `steps` steps, exact or computed; None if that is not shown, and `reason` says why.
     - `start`: factor by which the domain is scaled about its middle so that all its states satisfy
       that. `change`: the change of I_k that `steps` steps exclude.
@@ -56,7 +56,7 @@ class DriftBound(eqx.Module):
     per_step: tuple[float, ...] = eqx.field(static=True)
     rounding: tuple[float, ...] = eqx.field(static=True)
     seen: tuple[float, ...] = eqx.field(static=True)
-    level: tuple[int, int, float] | None = eqx.field(static=True)
+    level: tuple[tuple[float, ...], float] | None = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     start: float = eqx.field(static=True)
     change: float = eqx.field(static=True)
@@ -84,9 +84,12 @@ class DriftBound(eqx.Module):
         low, high = (float.fromhex(x) for x in c["epsilon"])
         n = len(c["domain"][0]) // 2
         names = [f"{x}{i + 1 if n > 1 else ''}" for x in "qp" for i in range(n)]
+        if c["timed"]:
+            names.append("τ" if c["slow"] else "t")
+        ends = [*zip(*c["domain"], strict=True), c["time"]]
         sides = ", ".join(
             f"{name} in [{float.fromhex(a):.6g}, {float.fromhex(b):.6g}]"
-            for name, a, b in zip(names, *c["domain"], strict=True)
+            for name, (a, b) in zip(names, ends, strict=False)
         )
         lines = [
             f"proved for each step from a state with {sides}"
@@ -103,14 +106,19 @@ class DriftBound(eqx.Module):
         if self.level is None:
             lines.append(f"it is not shown that trajectories stay in the domain: {self.reason}")
         else:
-            k, sign, value = self.level
             lines.append(
-                f"no trajectory that starts in the domain with {'−' if sign < 0 else ''}I_{k} ≤ "
-                f"{value:.6g} leaves it in {self.steps:.3g} steps; all states of the domain scaled "
-                f"by {self.start:.3g} are such"
+                f"no trajectory that starts in the domain with {self._combination()} ≤ "
+                f"{self.level[1]:.6g} leaves it in {self.steps:.3g} steps; all states of the "
+                f"domain scaled by {self.start:.3g} are such"
             )
         lines.extend(f"I_{k} = {text}" for k, text in enumerate(self.formulas))
         return "\n".join(lines)
+
+    def _combination(self) -> str:
+        """Σ w_k I_k as text."""
+        weights = enumerate(self.level[0] if self.level else ())
+        text = " + ".join(f"{w:.4g} I_{k}" if w != 1 else f"I_{k}" for k, w in weights if w)
+        return text.replace("+ -", "− ").replace("-1 I", "−I").replace("-", "−")
 
 
 def bound_drift(
@@ -119,6 +127,7 @@ def bound_drift(
     *,
     epsilon: Any,
     domain: Any,
+    time: Any = None,
     h: Any = None,
     inside: Callable | None = None,
     args: Any = None,
@@ -140,14 +149,16 @@ def bound_drift(
 
     **Arguments**
 
-    - `found`: a `Discovery`, an `InvariantSeries`, a function ``(q, p, epsilon)`` → scalar, or a
-      list of these. `system`: a `System` or a problem of the library.
+    - `found`: a `Discovery`, an `InvariantSeries`, a function ``(q, p, epsilon)`` or ``(q, p,
+      epsilon, t)`` → scalar, or a list of these. `system`: a `System` or a problem of the library.
     - `epsilon`: the largest ε of an interval from 0, or the pair (least, largest).
     - `domain`: half-width r of |q_i|, |p_i| ≤ r; or a pair for q and p, each a half-width, an array
       of half-widths like q, or an array (lower, upper) of shape (2, *shape of q).
     - `inside`: function ``(q, p)`` → array; the domain has only states where no value is negative.
+    - `time`: if the map or an invariant depends on the time, the interval (t_begin, t_end) in which
+      steps begin, of the slow time τ = εt where the system has one (`slow_time`).
     - `h`, `args`: of the map. `method`, `integrator`: explicit methods, or `TypeII()`, whose
-      implicit step is a function of (q0, p1). The map must not depend on the time.
+      implicit step is a function of (q0, p1).
     - `change`: of an invariant, for which a number of steps is stated.
     - `ratio`: the boxes are cut until no bound exceeds the largest change seen by this factor, or
       the limits `max_boxes` or `max_seconds` are reached.
@@ -192,29 +203,43 @@ def bound_drift(
         raise ValueError(f"bound_drift bounds the rounding of float64, not of {how.arithmetic!r}.")
     h = finite("h", h)
     shape, (lower, upper) = _domain(domain, found)
-    strengths = _interval(epsilon)
-    functions = _functions(found)
+    strengths, times = (
+        _interval("epsilon", epsilon),
+        None if time is None else _interval("time", time),
+    )
+    functions = _functions(found, system, time is not None)
+    stepped, programs = _step_of(system, how.method_for(system), shape, args, h, times)
+    invariants = [program_of(f, shape, shape, (), ()) for f, _ in functions]
+    n, t = len(lower) // 2, ["input", len(lower)]
     certificate = {
         "format": exact.FORMAT,
-        **_step_of(system, how.method_for(system), shape, args, h),
+        **programs,
         "h": h.hex(),
         "epsilon": [x.hex() for x in strengths],
+        "time": [x.hex() for x in times or (0.0, 0.0)],
+        "slow": system.slow_time,
+        "timed": any(t in p["operations"] for p in (programs["step"], *invariants)),
         "domain": [[x.hex() for x in side] for side in (lower, upper)],
         "inside": program_of(inside or (lambda q, p: jnp.zeros(0)), shape, shape),
-        "invariants": [program_of(f, shape, shape, ()) for f, _ in functions],
+        "invariants": invariants,
         "unit": (2.0**-53).hex(),
         "bits": 100,
-        "tiny": (2.0**-60).hex(),
+        "orders": 24 if n < 2 else 12 if n < 3 else 8,  # of the expansion of a function
+        "accepted": (_ACCEPTED * 2.0**-52 * max(map(abs, (*lower[n:], *upper[n:])))).hex(),
+        "spread": [(0.0).hex()] * n,
     }
-    certificate |= _solving(certificate, lower, upper, strengths)
+    if certificate["implicit"]:
+        guess = _spread(stepped, shape, (lower, upper), strengths, times, h)
+        certificate["spread"] = guess
     checker = exact.Checker(certificate)
     limits = {"max_boxes": max_boxes, "max_seconds": max_seconds}
-    search.resolve(checker)
-    certificate |= {"bits": checker.bits, "tiny": float(checker.tiny).hex()}
+    seen = search.estimate(checker)
+    identities = frozenset(k for k, s in enumerate(seen) if s == 0 and checker.is_identity(k))
+    search.resolve(checker, seen, ratio)
+    certificate["bits"] = checker.bits
     checker = exact.Checker(certificate)
     try:
-        identities = search.identities(checker)
-        result = search.subdivide(checker, identities, ratio=ratio, **limits)
+        result = search.subdivide(checker, identities, seen, ratio=ratio, **limits)
     except exact.Failed as error:
         raise ProofError(f"{error}. Take a smaller domain, ε or h.") from None
     per_step = [exact.up(b) for b in result.bounds]
@@ -224,7 +249,7 @@ def bound_drift(
         "reach": [m.hex() for m in result.moved],
         "boxes": result.tree,
         "steps": 0,
-        "levels": [[None, None] for _ in per_step],
+        "level": None,
         "shell": None,
     }
     level, start, reason, count = confine(
@@ -246,83 +271,79 @@ def bound_drift(
     )
 
 
-def _step_of(system: System, method: Any, shape: Any, args: Any, h: float) -> dict[str, Any]:
-    """The step at t0 = 0 as a list of operations: of (q0, p0), or of (q0, p1) if it is implicit."""
-    run = tools()[0].run
+def _step_of(
+    system: System, method: Any, shape: Any, args: Any, h: float, times: tuple | None
+) -> tuple[Callable, dict[str, Any]]:
+    """The step, a function of (q, p, t, ε, h), and its list of operations: of (q0, p0), or of
+    (q0, p1) if it is implicit. Without `times` it is that at t = 0."""
     explicit = method.is_explicit(system, jnp.zeros(shape), args)
     if not (explicit or method.is_the_map):
         raise ValueError(
             f"{method!r} is implicit for this system. Use dvi.TypeII(), whose step is an explicit "
             "function of (q0, p1), or a method that is explicit for this system."
         )
+    plain = System(system.H_D, system.force, system.perturbation)
 
-    def stepped(t0, q, p, epsilon, h):
-        equations, interval = Equations(system, epsilon, args), Interval(t0, t0 + h, h)
+    def stepped(q, p, t, epsilon, h):
+        equations = Equations(plain, epsilon, args)
+        interval = Interval(t, t + (epsilon * h if system.slow_time else h), h)
         if explicit:
             return method.step(equations, interval, q, p)[:2]
         rate = h * equations.momentum_rate(interval, q, p)
         return rate, q + h * equations.position_rate(interval, q, p)
 
-    programs = [
-        program_of(lambda *x, t=t: stepped(t, *x), shape, shape, (), ()) for t in (0.0, 1.0)
-    ]
-    if programs[0] != programs[1]:  # or the step is a difference of two times
-        rng, size = np.random.default_rng(0), int(np.prod(shape))
-        inputs = [rng.uniform(0.1, 0.2, 8) for _ in range(2 * size + 1)] + [np.full(8, h)]
-        first, later = (np.asarray(run(p, inputs, _Floats)) for p in programs)
+    batched = jax.vmap(stepped, (0, 0, 0, 0, None))
+    if times is None:
+        q, p = np.random.default_rng(0).uniform(0.1, 0.2, (2, 8, *shape))
+        first, later = (
+            batched(q, p, np.full(8, t), np.full(8, 0.1), jnp.asarray(h)) for t in (0.0, 1.0)
+        )
         if not np.allclose(first, later, rtol=1e-12, atol=1e-12, equal_nan=True):
             raise ValueError(
-                "the map depends on the time, and bound_drift needs one map for all steps: write "
-                "it as a system with one more degree of freedom, the angle of the time."
+                "the map depends on the time: give the interval in which steps begin as "
+                "time=(t_begin, t_end)."
             )
-    return {"step": programs[0], "implicit": not explicit}
+    zero = jnp.zeros(())
+    at = stepped if times else lambda q, p, t, epsilon, h: stepped(q, p, zero, epsilon, h)
+    program = program_of(at, shape, shape, (), (), ())
+    return batched, {"step": program, "implicit": not explicit}
 
 
-def _solving(
-    certificate: dict[str, Any], lower: list[float], upper: list[float], strengths: tuple
-) -> dict[str, Any]:
-    """How far p1 may be from p0 in an implicit step, and the residual that its solver accepts."""
-    n, exact = len(lower) // 2, tools()[0]
-    largest = max(abs(x) for x in (*lower[n:], *upper[n:]))
-    accepted = {"accepted": (_ACCEPTED * 2.0**-52 * largest).hex()}
-    if not certificate["implicit"]:
-        return {"spread": [(0.0).hex()] * n, **accepted}
-    rng, h = np.random.default_rng(0), float.fromhex(certificate["h"])
-    points = [rng.uniform(a, b, 4000) for a, b in zip(lower, upper, strict=True)]
-    inputs = [*points, rng.choice(strengths, 4000), np.full(4000, h)]
-    with np.errstate(all="ignore"):
-        moves = exact.run(certificate["step"], inputs, _Floats)[:n]
-    # A guess; the checker decides.
-    return {"spread": [float(1.3 * np.nanmax(np.abs(m)) + 1e-12).hex() for m in moves], **accepted}
+def _spread(
+    stepped: Callable, shape: Any, sides: tuple, strengths: tuple, times: tuple | None, h: float
+) -> list[str]:
+    """A guess of how far p1 is from p0 in an implicit step; the checker decides."""
+    rng, size = np.random.default_rng(0), int(np.prod(shape))
+    z = rng.uniform(*sides, (4000, 2 * size)).reshape(4000, 2, *shape)
+    t, epsilon = rng.choice(times or (0.0, 0.0), 4000), rng.choice(strengths, 4000)
+    moves = np.abs(stepped(z[:, 0], z[:, 1], t, epsilon, jnp.asarray(h))[0])
+    return [float(m).hex() for m in 1.3 * np.nanmax(moves, axis=0).ravel() + 1e-12]
 
 
-class _Floats:
-    """The arithmetic of float64 for the `run` of the checker."""
-
-    constant, multiply, divide = staticmethod(float), operator.mul, operator.truediv
-
-    @staticmethod
-    def sum(*terms: Any) -> Any:
-        return functools.reduce(operator.add, terms)
-
-    @staticmethod
-    def apply(name: str, a: Any) -> Any:
-        return getattr(jnp, name)(a)
-
-
-def _functions(found: Any) -> list[tuple[Callable, str]]:
-    """(function of (q, p, ε), formula) for each invariant."""
+def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, str]]:
+    """(function of (q, p, t, ε), formula) for each invariant."""
     if isinstance(found, Discovery):
         if not found.count:
             raise ValueError("the Discovery has found no invariant: there is nothing to bound.")
-        return _functions(list(found.invariants))
+        return _functions(list(found.invariants), system, timed)
     if isinstance(found, InvariantSeries):
-        if found.slow_time and found.basis.uses_time:
-            raise ValueError("an invariant that is a function of the slow time cannot be bounded.")
-        return [(found.evaluate, found.formula(terms=8))]
+        if found.basis.uses_time and not timed:
+            raise ValueError(
+                "the invariant depends on the time: give the interval in which steps begin as "
+                "time=(t_begin, t_end)."
+            )
+        if found.basis.uses_time and found.slow_time != system.slow_time:
+            raise ValueError(
+                f"the invariant was found with slow_time={found.slow_time}, and the system has "
+                f"slow_time={system.slow_time}: give the system with which it was found."
+            )
+        return [(lambda q, p, t, e: found.evaluate(q, p, e, t), found.formula(terms=8))]
     if callable(found):
-        return [(found, getattr(found, "__name__", "a function"))]
-    pairs = [pair for one in found for pair in _functions(one)]
+        name = getattr(found, "__name__", "a function")
+        if len(inspect.signature(found).parameters) > 3:
+            return [(lambda q, p, t, e: found(q, p, e, t), name)]
+        return [(lambda q, p, t, e: found(q, p, e), name)]
+    pairs = [pair for one in found for pair in _functions(one, system, timed)]
     if not pairs:
         raise ValueError("found is empty: give an invariant, or a list of at least one.")
     return pairs
@@ -356,13 +377,12 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
     return shape, (lower, upper)
 
 
-def _interval(epsilon: Any) -> tuple[float, float]:
-    ends = epsilon if np.ndim(epsilon) else (0.0, epsilon)
-    ends = [finite("epsilon", float(x)) for x in ends]
+def _interval(name: str, ends: Any) -> tuple[float, float]:
+    given, ends = ends, [finite(name, float(x)) for x in (ends if np.ndim(ends) else (0.0, ends))]
     if len(ends) != 2 or not ends[0] < ends[1]:
         raise ValueError(
-            "epsilon must be the largest value, above 0, or a pair with a least value below its "
-            f"largest, got {epsilon!r}."
+            f"{name} must be the largest value, above 0, or a pair with a least value below its "
+            f"largest, got {given!r}."
         )
     low, high = ends
     return low, high

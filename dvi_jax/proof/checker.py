@@ -1,29 +1,26 @@
 """The checker of drift certificates, short enough to be read completely: python checker.py FILE.
 
-It needs Python and python-flint, no other part of the package. A certificate states, for a map
-Φ(x, ε) and functions I_k(x, ε) given as lists of scalar operations, with x = (q, p):
+It needs Python and python-flint only. A certificate states, for a map Φ(x, t, ε) and functions
+I_k(x, t, ε) of x = (q, p), given as lists of scalar operations:
 
-1. |I_k(Φ(x, ε), ε) − I_k(x, ε)| ≤ `per_step`[k] in exact arithmetic, in the domain and for all ε;
+1. |I_k(Φ(x, t, ε), t1, ε) − I_k(x, t, ε)| ≤ `per_step`[k] in exact arithmetic, in the domain, for
+   all t and ε of their intervals, with t1 = t + h, or t + εh if t is a slow time;
 2. a step that is computed with the unit round-off `unit` changes I_k by at most `rounding`[k] more,
    and moves no coordinate by more than `reach`;
-3. trajectories that start in the domain with `levels`[k][0] ≤ I_k ≤ `levels`[k][1] for all k
-   stay in the domain for `steps` steps, exact or computed.
+3. trajectories that start in the domain with Σ w_k I_k ≤ c, where (w, c) is the `level`, stay in
+   the domain for `steps` steps, exact or computed.
 
-For 1 and 2 boxes cover the domain. On a box a function is a polynomial in the coordinates of the
-box with integer coefficients, and a bound of the remainder (a Taylor model; Makino & Berz 2003);
-elementary functions are enclosed by balls (Arb). For 3, boxes cover all places outside of the
-domain that one step can reach, and on each some I_k differs from its levels by more than `steps`
-steps can change it. By induction no trajectory gets there.
-
-A step that is implicit in p1 is a function of (q0, p1), on boxes of those. Each (q0, p0) of the
-domain has a p1 within `spread` of p0, because p1 → p0 + h·rate maps this box into itself (Brouwer),
-and only one, because it is a contraction there.
+For 1 and 2 boxes cover the domain. On a box a function is a polynomial with integer coefficients
+and a bound of the remainder (a Taylor model; Makino & Berz 2003); elementary functions are enclosed
+by balls (Arb). For 3, boxes cover all places outside of the domain that one step can reach, and on
+each Σ w_k I_k exceeds c by more than `steps` steps can change it: no trajectory gets there. A step
+that is implicit in p1 is a function of (q0, p1): each (q0, p0) of the domain has one p1 within
+`spread`, because p1 → p0 + h·rate maps this box into itself and is a contraction.
 """
 
 import hashlib
 import json
 import math
-import operator
 import pathlib
 import sys
 from fractions import Fraction
@@ -31,15 +28,21 @@ from fractions import Fraction
 from flint import arb, arb_series, ctx, fmpq, fmpq_mpoly_ctx, fmpz_mpoly_ctx
 
 FORMAT = "dvi_jax drift bound 1"
-FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt")
-ORDERS = 24  # the largest order of the expansion of an elementary function
-ULPS = {"sqrt": 1}  # errors of computed functions in units of round-off; 8 (4 ulp) for others
+FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sqrt", "inverse")
+ULPS = {"sqrt": 1, "inverse": 1}  # errors of functions in units of round-off; 8 (4 ulp) for others
 MALFORMED = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)
+LEVEL = 30  # bits for levels, where nothing cancels
 LEAST = 2.0**-1000  # added to each error, for results below the normal numbers
 
 
 class Failed(Exception):
     """What could not be shown, and where."""
+
+
+def require(condition, what, box=()):
+    if not condition:
+        where = " × ".join(f"[{float(a):.6g}, {float(b):.6g}]" for a, b in box)
+        raise Failed(f"{what} on the box {where}" if box else what)
 
 
 def digest(certificate):
@@ -48,9 +51,9 @@ def digest(certificate):
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def exact(text):
-    """The number that a hexadecimal float stands for."""
-    return Fraction(float.fromhex(text))
+def exact(texts):
+    """The numbers that hexadecimal floats stand for."""
+    return Fraction(float.fromhex(texts)) if isinstance(texts, str) else [exact(x) for x in texts]
 
 
 def up(value):
@@ -67,64 +70,41 @@ def ball(value, radius=0):
     return arb(value.numerator) / value.denominator + arb(0, up(Fraction(radius)))
 
 
-def balls(box):
-    return [ball((a + b) / 2, (b - a) / 2) for a, b in box]
-
-
 def series(name, at, length):
     """The Taylor coefficients of a function at a point, or balls of them on a ball."""
     ctx.cap = length
     x = arb_series([at, 1], length)
-    try:
-        return 1 / x if name == "inverse" else getattr(x, name)()
-    except (ValueError, ZeroDivisionError) as error:
-        raise Failed(f"{name} is singular ({error})") from None
+    return 1 / x if name == "inverse" else getattr(x, name)()
 
 
-def negative(a):
-    return -a[0], a[1]
-
-
-def power(a, n, algebra):
-    """aⁿ by n − 1 products, in any order."""
-    if n < 1:
-        one = algebra.constant(Fraction(1))
-        return algebra.divide(one, power(a, -n, algebra)) if n else one
-    if n == 1:
-        return a
-    square = power(algebra.multiply(a, a), n // 2, algebra)
-    return algebra.multiply(square, a) if n % 2 else square
+def difference(a, b, algebra):
+    return algebra.sum(a, (-b[0], b[1]))
 
 
 def run(program, inputs, algebra):
-    """The outputs of a program: each operation is (name, operands), an operand is the number of an
-    earlier operation. `algebra` has the arithmetic of the values."""
+    """The outputs of a list of operations (name, operands): numbers of earlier operations."""
     values = []
     for name, *operands in program["operations"]:
         if name == "input":
-            values.append(inputs[operands[0]])
+            value = inputs[operands[0]]
         elif name == "constant":
-            values.append(algebra.constant(exact(operands[0])))
-        elif name == "power":
-            values.append(power(values[operands[0]], operator.index(operands[1]), algebra))
-        elif name in ("sum", "multiply", "divide"):
-            values.append(getattr(algebra, name)(*(values[i] for i in operands)))
+            value = algebra.constant(exact(operands[0]))
         elif name in FUNCTIONS:
-            values.append(algebra.apply(name, values[operands[0]]))
+            value = algebra.apply(name, values[operands[0]])
         else:
-            raise Failed(f"unknown operation {name}")
+            require(name in ("sum", "multiply"), f"unknown operation {name}")
+            value = getattr(algebra, name)(*(values[i] for i in operands))
+        values.append(value)
     return [values[i] for i in program["outputs"]]
 
 
 class Models:
     """Taylor models in variables s with |s| ≤ 1.
+    Functions that differ from P(s)/2^bits by at most E/2^bits are a model (P, E), with integers E
+    and coefficients of P. Products are rounded towards zero, so that small terms vanish."""
 
-    A model (P, E) stands for functions that differ from P(s)/2^bits by at most E/2^bits. P has
-    integer coefficients; those below `tiny` are moved to E, an integer.
-    """
-
-    def __init__(self, size, bits, tiny):
-        self.bits, self.one, self.tiny = bits, 1 << bits, max(1, int(Fraction(tiny) * 2**bits))
+    def __init__(self, size, bits, orders):
+        self.bits, self.one, self.orders = bits, 1 << bits, range(orders + 1)
         self.ring = fmpz_mpoly_ctx.get([f"s{i}" for i in range(size)], "lex")
 
     def constant(self, value):
@@ -137,29 +117,19 @@ class Models:
     def multiply(self, a, b):
         norm = [int(sum(map(abs, x[0].coeffs()))) for x in (a, b)]  # |P| is not larger
         error = norm[0] * b[1] + norm[1] * a[1] + a[1] * b[1]
-        kept = {}
-        for powers, c in (a[0] * b[0]).to_dict().items():
-            rounded = c >> self.bits
-            if abs(rounded) < self.tiny:
-                error += abs(c)
-            else:
-                kept[powers] = rounded
-                error += c - (rounded << self.bits)
-        return self.ring.from_dict(kept), (int(error) >> self.bits) + 1
-
-    def divide(self, a, b):
-        return self.multiply(a, self.apply("inverse", b))
+        product = a[0] * b[0]
+        signs = product // (norm[0] * norm[1] + 1)  # rounded down: −1 where a coefficient is < 0
+        whole = (product - (self.one - 1) * signs) // self.one
+        error += int(sum(map(abs, (product - self.one * whole).coeffs())))
+        return whole, (error >> self.bits) + 1
 
     def range(self, a):
         """A lower and an upper bound of the value; an even power of s is not negative."""
         low, high = -a[1], a[1]
         for powers, c in a[0].to_dict().items():
-            if any(powers):
-                even = not any(k % 2 for k in powers)
-                low -= -min(c, 0) if even else abs(c)
-                high += max(c, 0) if even else abs(c)
-            else:
-                low, high = low + c, high + c
+            span = (0, c) if any(powers) else (c, c)
+            span = (-c, c) if any(k % 2 for k in powers) else span
+            low, high = low + min(span), high + max(span)
         return Fraction(int(low), self.one), Fraction(int(high), self.one)
 
     def bound(self, a):
@@ -169,13 +139,12 @@ class Models:
         """f(c + r) = Σ f⁽ᵏ⁾(c)/k! rᵏ, with Lagrange's remainder on the range of c + r."""
         low, high = (value * self.one for value in self.range(a))
         middle = int(low + high) // 2
-        ahead = series(name, arb(int(low)).union(arb(int(high))) / self.one, ORDERS + 2)
+        ahead = series(name, arb(int(low)).union(arb(int(high))) / self.one, len(self.orders) + 1)
         radius = arb(int(max(high - middle, middle - low))) / self.one
-        left = [abs(ahead[k + 1]) * radius ** (k + 1) * self.one for k in range(ORDERS + 1)]
-        if not all(remainder.is_finite() for remainder in left):
-            raise Failed(f"{name} is singular, or varies too much")
-        small = (k for k in range(ORDERS + 1) if left[k] < self.tiny)
-        order = next(small, min(range(ORDERS + 1), key=lambda k: up(left[k])))
+        left = [abs(ahead[k + 1]) * radius ** (k + 1) * self.one for k in self.orders]
+        require(all(x.is_finite() for x in left), f"{name} is singular, or varies too much")
+        small = (k for k in self.orders if left[k] < 1)
+        order = next(small, min(self.orders, key=lambda k: up(left[k])))
         terms = series(name, arb(middle) / self.one, order + 1)
         rest, result = (a[0] - middle, a[1]), self.constant(Fraction(0))
         for k in range(order, -1, -1):
@@ -189,8 +158,8 @@ class Models:
 class Rounding:
     """Values (ball, error): a computed number differs by at most `error` from one in the ball.
 
-    Each operation has a relative error of at most `unit`. If a product is contracted with a sum,
-    there is one rounding less; a sum may be taken in any order.
+    Each operation has a relative error of at most `unit`, a quotient of two. If a product is
+    contracted with a sum, there is one rounding less; a sum may be taken in any order.
     """
 
     def __init__(self, unit):
@@ -199,8 +168,8 @@ class Rounding:
     def constant(self, value):
         return ball(value), arb(0)
 
-    def rounded(self, value, error, operations=1):
-        return value, arb((error + operations * self.unit * (abs(value) + error) + LEAST).upper())
+    def rounded(self, value, error, units=1):
+        return value, arb((error + units * self.unit * (abs(value) + error) + LEAST).upper())
 
     def sum(self, *terms):
         error, size = sum(t[1] for t in terms), sum(abs(t[0]) + t[1] for t in terms)
@@ -211,24 +180,20 @@ class Rounding:
         error = abs(a[0]) * b[1] + abs(b[0]) * a[1] + a[1] * b[1]
         return self.rounded(a[0] * b[0], error)
 
-    def divide(self, a, b):
-        value, least = a[0] / b[0], b[0].abs_lower() - b[1]
-        if not least > 0:
-            raise Failed("a divisor can be zero")
-        # A compiler may multiply by the inverse of a constant: two roundings.
-        return self.rounded(value, (a[1] + abs(value) * b[1]) / least, 2)
-
     def apply(self, name, a):
         near = series(name, a[0] + arb(0, up(a[1])), 2)
+        require(near[1].is_finite(), f"{name} is singular")
         return self.rounded(near[0], abs(near[1]) * a[1], ULPS.get(name, 8))
 
 
 class Identities:
-    """Quotients (numerator, denominator) of polynomials with rational coefficients."""
+    """Quotients (numerator, denominator) of polynomials with rational coefficients, in x and in
+    each value f(a) of an elementary function, of which nothing else is used."""
 
     def __init__(self, size):
-        self.ring = fmpq_mpoly_ctx.get([f"x{i}" for i in range(size)], "lex")
-        self.one = self.ring.constant(1)
+        self.ring = fmpq_mpoly_ctx.get([f"x{i}" for i in range(size + 40)], "lex")
+        self.one, self.values = self.ring.constant(1), {}
+        self.x, self.free = self.ring.gens()[:size], list(self.ring.gens()[size:])
 
     def constant(self, value):
         return self.ring.constant(fmpq(value.numerator, value.denominator)), self.one
@@ -242,110 +207,97 @@ class Identities:
     def multiply(self, a, b):
         return a[0] * b[0], a[1] * b[1]
 
-    def divide(self, a, b):
-        return a[0] * b[1], a[1] * b[0]
-
     def apply(self, name, a):
-        raise Failed(f"an identity with {name} is not proved")
+        if name == "inverse":
+            return a[1], a[0]
+        key = name, str(a[0]), str(a[1])
+        self.values[key] = self.values.get(key) or (self.free.pop(), self.one)
+        return self.values[key]
 
 
 class Checker:
-    """A certificate with its numbers read, and what is evaluated on a box of it."""
+    """A certificate, and what is evaluated on a box of (q, p, t, ε)."""
 
     def __init__(self, certificate):
         self.step, self.invariants = certificate["step"], certificate["invariants"]
-        self.inside, sides = certificate["inside"], certificate["domain"]
-        self.lower, self.upper = ([exact(x) for x in side] for side in sides)
-        self.n, self.implicit = len(self.lower) // 2, certificate["implicit"]
-        self.spread = [exact(x) for x in certificate["spread"]]
-        self.epsilon = tuple(exact(x) for x in certificate["epsilon"])
-        self.unit, self.accepted = exact(certificate["unit"]), exact(certificate["accepted"])
-        self.bits, self.tiny = certificate["bits"], exact(certificate["tiny"])
-        self.h = exact(certificate["h"])
+        self.inside, self.implicit = certificate["inside"], certificate["implicit"]
+        self.lower, self.upper = exact(certificate["domain"])
+        self.time, self.epsilon = exact(certificate["time"]), exact(certificate["epsilon"])
+        self.n, self.slow = len(self.lower) // 2, certificate["slow"]
+        numbers = (exact(certificate[name]) for name in ("h", "unit", "accepted", "spread"))
+        self.h, self.unit, self.accepted, self.spread = numbers
+        self.bits, self.orders = certificate["bits"], certificate["orders"]
         require(self.unit >= Fraction(1, 2**53), "the unit is not that of float64", self.root())
         ctx.prec = self.bits + 60
 
     def root(self):
-        """The box of all boxes: the domain, where p1 may differ from p0 by `spread`; and ε."""
+        """The box of all boxes: the domain, where p1 may differ from p0 by `spread`."""
         wide = [Fraction(0)] * self.n + self.spread
-        box = zip(self.lower, self.upper, wide, strict=True)
-        return [(a - w, b + w) for a, b, w in box] + [self.epsilon]
+        box = [(a - w, b + w) for a, b, w in zip(self.lower, self.upper, wide, strict=True)]
+        return [*box, tuple(self.time), tuple(self.epsilon)]
 
     def models(self, box):
-        """The coordinates of a box and ε as Taylor models; ε from 0 keeps its orders apart."""
-        algebra = Models(len(box), self.bits, self.tiny)
+        """The coordinates of a box as Taylor models; ε from 0 keeps its orders apart."""
+        algebra = Models(len(box), self.bits, self.orders)
         parts = [((a + b) / 2, (b - a) / 2) for a, b in box]
         if box[-1][0] == 0:
             parts[-1] = Fraction(0), box[-1][1]
-        x = []
-        for s, (middle, radius) in zip(algebra.ring.gens(), parts, strict=True):
-            moved = algebra.multiply((s * algebra.one, 0), algebra.constant(radius))
-            x.append(algebra.sum(algebra.constant(middle), moved))
-        return algebra, x
+        gens = [(s * algebra.one, 0) for s in algebra.ring.gens()]
+        c = [[algebra.constant(value) for value in part] for part in parts]
+        pairs = zip(gens, c, strict=True)
+        return algebra, [algebra.sum(a, algebra.multiply(s, b)) for s, (a, b) in pairs]
 
-    def is_outside(self, algebra, state):
+    def is_outside(self, algebra, x):
         """Whether no state of these models is in the domain."""
-        for x, lower, upper in zip(state, self.lower, self.upper, strict=True):
-            low, high = algebra.range(x)
-            if high < lower or low > upper:
-                return True
-        return any(algebra.range(g)[1] < 0 for g in run(self.inside, state, algebra))
-
-    def start(self, x, algebra):
-        """The state before a step, from the coordinates of a box and ε."""
-        return self.stepped(x, algebra)[0] if self.implicit else x[:-1]
+        sides = zip(map(algebra.range, x), self.lower, self.upper, strict=False)
+        beside = any(high < lower or low > upper for (low, high), lower, upper in sides)
+        return beside or any(algebra.range(g)[1] < 0 for g in run(self.inside, x, algebra))
 
     def stepped(self, x, algebra):
-        """The states before and after a step."""
-        out, n = run(self.step, [*x, algebra.constant(self.h)], algebra), self.n
-        if not self.implicit:
-            return x[:-1], out
-        # (q0, p1) → (h·rate, q1), and p0 = p1 − h·rate.
-        p0 = [algebra.sum(p1, negative(r)) for p1, r in zip(x[n:-1], out[:n], strict=True)]
-        return [*x[:n], *p0], [*out[n:], *x[n:-1]]
+        """(q, p, t, ε) before and after a step, from the coordinates of a box."""
+        q0, p0, (t0, epsilon) = x[: self.n], x[self.n : -2], x[-2:]
+        h, end = algebra.constant(self.h), run(self.step, [*x, algebra.constant(self.h)], algebra)
+        if self.implicit:  # (q0, p1) → (h·rate, q1)
+            end, moves, p1 = [*end[self.n :], *p0], end[: self.n], p0
+            p0 = [difference(p, m, algebra) for p, m in zip(p1, moves, strict=True)]
+        t1 = algebra.sum(t0, algebra.multiply(epsilon, h) if self.slow else h)
+        return [*q0, *p0, t0, epsilon], [*end, t1, epsilon]
 
-    def changes(self, x, algebra):
-        """I_k(Φ(x)) − I_k(x) for each k."""
-        start, end = self.stepped(x, algebra)
-        changes = []
-        for function in self.invariants:
-            before, after = (run(function, [*z, x[-1]], algebra)[0] for z in (start, end))
-            changes.append(algebra.sum(after, negative(before)))
-        return changes
+    def change(self, k, step, algebra):
+        """I_k(Φ(x)) − I_k(x), from x before and after a step."""
+        before, after = (run(self.invariants[k], x, algebra)[0] for x in step)
+        return difference(after, before, algebra)
+
+    def moved(self, step, algebra):
+        """How far a step moves each coordinate, in exact arithmetic."""
+        pairs = list(zip(*step, strict=True))[: 2 * self.n]
+        return [algebra.bound(difference(b, a, algebra)) for a, b in pairs]
 
     def is_identity(self, k):
-        """Whether I_k is conserved exactly, for all x and ε: as a rational function."""
-        algebra = Identities(2 * self.n + 1)
-        x = [(gen, algebra.one) for gen in algebra.ring.gens()]
-        numerator, denominator = self.changes(x, algebra)[k]
+        """Whether I_k is conserved exactly, for all x, t and ε."""
+        algebra = Identities(2 * self.n + 2)
+        step = self.stepped([(x, algebra.one) for x in algebra.x], algebra)
+        numerator, denominator = self.change(k, step, algebra)
         return numerator == 0 and denominator != 0
-
-    def moved(self, x, algebra):
-        """How far a step moves each coordinate, in exact arithmetic."""
-        pairs = zip(*self.stepped(x, algebra), strict=True)
-        return [algebra.bound(algebra.sum(b, negative(a))) for a, b in pairs]
-
-    def contraction(self, box):
-        """A Lipschitz constant of p1 → h·rate(q0, p1) in the maximum norm."""
-        x, small = balls(box), arb(2) ** -60
-        z = [(value, small * (self.n <= i < 2 * self.n)) for i, value in enumerate(x)]
-        out = run(self.step, [*z, Rounding(0).constant(self.h)], Rounding(0))
-        return max(up(change / small) for _, change in out[: self.n])
 
     def rounding(self, box):
         """The changes of the I_k by the rounding of a step, and the errors of the coordinates."""
-        algebra, n = Rounding(self.unit), self.n
-        x = [(value, arb(0)) for value in balls(box)]
+        algebra, exactly, n = Rounding(self.unit), Rounding(0), self.n
+        x = [(ball((a + b) / 2, (b - a) / 2), arb(0)) for a, b in box]
+        x[-2] = x[-2][0], 2 * algebra.unit * abs(x[-2][0])  # t of step k is computed as t0 + kh
         start, end = self.stepped(x, algebra)
         if self.implicit:
+            # A Lipschitz constant of p1 → h·rate(q0, p1) in the maximum norm: the effect of errors.
+            near = [(p1, arb(2) ** -60) for p1, _ in x[n:-2]]
+            inputs = [*x[:n], *near, *x[-2:], exactly.constant(self.h)]
+            lipschitz = max(up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
+            require(lipschitz < 1 / 3, "the implicit step is not shown to be a contraction", box)
             # The solver accepts a p1 whose residual is `accepted` and as computed.
-            factor = 1 / (1 - arb(self.contraction(box)))
-            error = max((e + arb(up(self.accepted)) for _, e in start[n:]), key=up) * factor
-            p1 = [(value, error) for value, _ in x[n:-1]]
-            end = self.stepped([*x[:n], *p1, x[-1]], algebra)[1]
-        exactly = Rounding(0)
-        changes = [run(function, [*end, x[-1]], exactly)[0][1] for function in self.invariants]
-        return list(map(up, changes)), [up(error) for _, error in end]
+            error = max((e + arb(up(self.accepted)) for _, e in start[n:-2]), key=up)
+            x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in near]
+            end = self.stepped(x, algebra)[1]
+        changes = [run(function, end, exactly)[0][1] for function in self.invariants]
+        return list(map(up, changes)), [up(error) for _, error in end[:-2]]
 
 
 def leaves(box, node):
@@ -361,79 +313,76 @@ def leaves(box, node):
         yield from leaves([*box[:axis], side, *box[axis + 1 :]], part)
 
 
-def require(condition, what, box):
-    if not condition:
-        where = ", ".join(f"[{float(a):.6g}, {float(b):.6g}]" for a, b in box)
-        raise Failed(f"{what} on the box {where}")
-
-
-def check_step(checker, box, claim, per_step, rounding, reach):
-    """Statements 1 and 2 on one box."""
+def check_step(checker, box, claim, stated):
+    """Statements 1 and 2 on one box; `stated`: the numbers per_step, rounding and reach."""
     algebra, x = checker.models(box)
-    if checker.implicit:
-        near = zip(checker.moved(x, algebra)[checker.n :], checker.spread, strict=True)
-        solved = all(m <= s for m, s in near) and checker.contraction(box) < 1 / 3
-        require(solved, "p1 is not shown to be near p0", box)
+    step = [x]
+    if checker.implicit or claim != "outside":  # where an explicit step may be singular
+        step, (rounded, errors) = checker.stepped(x, algebra), checker.rounding(box)
+        moved = checker.moved(step, algebra)
+        near = zip(moved[checker.n :], checker.spread, strict=True)
+        require(not checker.implicit or all(m <= s for m, s in near), "p1 is far from p0", box)
     if claim == "outside":
-        outside = checker.is_outside(algebra, checker.start(x, algebra))
-        require(outside, "not shown to be outside of the domain", box)
+        require(checker.is_outside(algebra, step[0]), "not shown to be outside", box)
         return
-    rounded, errors = checker.rounding(box)
-    bounds = [
-        Fraction(0) if limit == 0 and checker.is_identity(k) else algebra.bound(change)
-        for k, (change, limit) in enumerate(zip(checker.changes(x, algebra), per_step, strict=True))
+    found = [
+        algebra.bound(checker.change(k, step, algebra)) for k in range(len(checker.invariants))
     ]
-    moved = [m + Fraction(e) for m, e in zip(checker.moved(x, algebra), errors, strict=True)]
-    for found, stated in (bounds, per_step), (rounded, rounding), (moved, reach):
-        fits = all(value <= limit for value, limit in zip(found, stated, strict=True))
-        require(fits, "a change, a rounding or a move is larger than stated", box)
+    found = [0 if stated[k] == 0 and checker.is_identity(k) else b for k, b in enumerate(found)]
+    moved = [m + Fraction(e) for m, e in zip(moved, errors, strict=True)]
+    fits = [a <= b for a, b in zip([*found, *rounded, *moved], stated, strict=True)]
+    require(all(fits), "a change, a rounding or a move is larger than stated", box)
 
 
-def check_confined(checker, box, claim, limits, reach):
+def combined(checker, weights, box):
+    """Σ w_k I_k as a model on a box."""
+    algebra, x = checker.models(box)
+    used = [(w, f) for w, f in zip(weights, checker.invariants, strict=True) if w]
+    terms = [algebra.multiply(algebra.constant(w), run(f, x, algebra)[0]) for w, f in used]
+    return algebra, algebra.sum(*terms)
+
+
+def check_confined(checker, box, claim, weights, limit, reach):
     """Statement 3 on one box: no trajectory gets there, or it is in the domain there."""
-    wide = [(a - w, b + w) for (a, b), w in zip(box, reach, strict=False)]
-    algebra, x = checker.models([*wide, box[-1]] if claim == "unreachable" else box)
     if claim == "unreachable":
-        require(checker.is_outside(algebra, x[:-1]), "one step can reach", box)
+        wide = [(a - w, b + w) for (a, b), w in zip(box[:-2], reach, strict=True)]
+        shown = checker.is_outside(*checker.models([*wide, *box[-2:]]))
     elif claim == "inside":
-        sides = zip(box[:-1], checker.lower, checker.upper, strict=True)
-        inside = [low <= a and b <= high for (a, b), low, high in sides]
-        inside += [algebra.range(g)[0] >= 0 for g in run(checker.inside, x[:-1], algebra)]
-        require(all(inside), "not shown to be in the domain", box)
+        sides = zip(box, checker.lower, checker.upper, strict=False)
+        shown = all(low <= a and b <= high for (a, b), low, high in sides)
+        algebra, x = checker.models(box)
+        shown &= all(algebra.range(g)[0] >= 0 for g in run(checker.inside, x, algebra))
     else:
-        side, k = claim
-        low, high = algebra.range(run(checker.invariants[k], x, algebra)[0])
-        off = low > limits[k][1] if side == "above" else high < limits[k][0]
-        require(off, f"I_{k} does not exclude a trajectory", box)
+        algebra, value = combined(checker, weights, box)
+        shown = algebra.range(value)[0] > limit
+    require(shown, f"{claim} is not shown", box)
 
 
 def check(certificate):
     """What a certificate proves, as a sentence. **Raises** `Failed` if it does not."""
-    if certificate.get("format") != FORMAT:
-        raise Failed(f"the format is {certificate.get('format')!r}, not {FORMAT!r}")
-    if digest(certificate) != certificate["hash"]:
-        raise Failed("the hash is not that of the content: the file was changed")
+    require(certificate["format"] == FORMAT, f"the format is not {FORMAT!r}")
+    require(digest(certificate) == certificate["hash"], "the file was changed: its hash differs")
     checker = Checker(certificate)
-    per_step, rounding, reach = (
-        [exact(x) for x in certificate[name]] for name in ("per_step", "rounding", "reach")
-    )
+    per_step, rounding, reach = (exact(certificate[x]) for x in ("per_step", "rounding", "reach"))
     boxes = list(leaves(checker.root(), certificate["boxes"]))
     for box, claim in boxes:
-        check_step(checker, box, claim, per_step, rounding, reach)
+        check_step(checker, box, claim, [*per_step, *rounding, *reach])
     text = f"on {len(boxes)} boxes a step changes I by ≤ {[*map(float, per_step)]}"
     text += f", its rounding by ≤ {[*map(float, rounding)]}"
     text += f" if a solver accepts residuals ≤ {float(checker.accepted):.3g}" * checker.implicit
-    if certificate["shell"] is None:
+    if certificate["level"] is None:
         return text
-    steps, limits = certificate["steps"], []
-    for (low, high), b, r in zip(certificate["levels"], per_step, rounding, strict=True):
-        change = steps * (b + r)
-        above = math.inf if high is None else exact(high) + change
-        limits.append((-math.inf if low is None else exact(low) - change, above))
-    around = [(a - w, b + w) for (a, b), w in zip(checker.root()[:-1], reach, strict=True)]
-    for box, claim in leaves([*around, checker.epsilon], certificate["shell"]):
-        check_confined(checker, box, claim, limits, reach)
-    return text + f"; from the given levels the domain is not left in {steps} steps"
+    (weights, value), steps = exact(certificate["level"]), certificate["steps"]
+    each = [abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True)]
+    *around, time, epsilon = checker.root()
+    around = [(a - w, b + w) for (a, b), w in zip(around, reach, strict=True)]
+    t, lasts = ["input", 2 * checker.n], steps * checker.h * (epsilon[1] if checker.slow else 1)
+    timed = any(t in program["operations"] for program in [checker.step, *checker.invariants])
+    require(not timed or lasts <= time[1] - time[0], "the steps last longer than the time", [time])
+    checker.bits = LEVEL
+    for box, claim in leaves([*around, time, epsilon], certificate["shell"]):
+        check_confined(checker, box, claim, weights, value + steps * sum(each), reach)
+    return text + f"; from Σ w_k I_k ≤ {float(value):.6g} the domain is not left in {steps} steps"
 
 
 def main(path):

@@ -77,9 +77,7 @@ class Program:
 
 def _operands(operation: list[Any]) -> list[int]:
     name, *rest = operation
-    if name in ("input", "constant", "unknown"):
-        return []
-    return rest[:1] if name == "power" else rest
+    return [] if name in ("input", "constant", "unknown") else rest
 
 
 class Scalar:
@@ -122,7 +120,9 @@ class Scalar:
         other = self._of(other)
         if self.known == 0 or other.known == 1:
             return self
-        return self.program.write("divide", self.index, other.index)
+        if other.known and math.frexp(other.known)[0] in (0.5, -0.5):
+            return self * (1 / other.known)  # exact
+        return self * other.apply("inverse")
 
     __radd__, __rmul__ = __add__, __mul__
 
@@ -133,9 +133,14 @@ class Scalar:
         return self._of(other) / self
 
     def power(self, n: int) -> "Scalar":
-        return {0: self.program.constant(1.0), 1: self}.get(n) or self.program.write(
-            "power", self.index, n
-        )
+        """selfⁿ: n − 1 products."""
+        if n < 1:
+            one = self.program.constant(1.0)
+            return one / self.power(-n) if n else one
+        if n == 1:
+            return self
+        square = (self * self).power(n // 2)
+        return square * self if n % 2 else square
 
     def apply(self, name: str) -> "Scalar":
         return self.program.write(name, self.index)

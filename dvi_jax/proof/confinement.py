@@ -1,4 +1,4 @@
-"""Levels of an invariant that a trajectory cannot leave."""
+"""Levels of a combination of invariants that a trajectory cannot leave."""
 
 import math
 from fractions import Fraction
@@ -7,10 +7,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import linprog
 
 from .tools import tools
 
-_LEVELS = (0.99, 0.95, 0.8, 0.6, 0.4)
+_LEVELS = (0.97, 0.9, 0.75, 0.5)
 """Fractions of the range between the least value in the domain and that at its border that are
 tried as the level below which trajectories stay in the domain."""
 
@@ -23,48 +24,118 @@ def confine(
     shape: Any,
     change: float,
     limits: dict[str, Any],
-) -> tuple[tuple[int, int, float] | None, float, str, int]:
+) -> tuple[tuple[tuple[float, ...], float] | None, float, str, int]:
     """Complete the certificate by a level below which trajectories stay in the domain.
 
-    Returns (k, sign, level), the scale of the domain that satisfies it, the reason if no level is
+    Returns (weights, level), the scale of the domain that satisfies it, the reason if no level is
     found, and the number of boxes.
     """
     exact, search = tools()
-    reach = [exact.exact(x) for x in certificate["reach"]]
-    candidates = _candidates(checker, functions, inside, shape, reach)
-    reason = "no invariant is larger all around the domain than somewhere inside"
-    for k, sign, least, border in candidates:
-        each = exact.exact(certificate["per_step"][k]) + exact.exact(certificate["rounding"][k])
+    checker.bits = exact.LEVEL
+    per_step, rounding, reach = (
+        exact.exact(certificate[name]) for name in ("per_step", "rounding", "reach")
+    )
+    reason = "no combination of the invariants is larger all around the domain than inside"
+    for weights, least, border in _candidates(checker, functions, inside, shape, reach):
+        w = [Fraction(x) for x in weights]
+        each = sum(abs(x) * (b + r) for x, b, r in zip(w, per_step, rounding, strict=True))
         steps = math.floor(Fraction(change) / each) if each else 2**62
+        if certificate["timed"]:
+            last = checker.h * (checker.epsilon[1] if checker.slow else 1)
+            steps = min(steps, math.floor((checker.time[1] - checker.time[0]) / last))
         if not steps:
-            reason = f"I_{k} may change by more than change={change:g} in one step"
+            reason = f"{_named(weights)} may change by more than change={change:g} in one step"
             continue
         for part in _LEVELS:
             level = least + part * (border - least) - change
             if level <= least:
-                reason = f"change={change:g} is larger than the range of I_{k} in the domain"
+                reason = f"change={change:g} is larger than the range of {_named(weights)}"
                 continue
-            ends = [(-math.inf, math.inf)] * len(functions)
-            drift = steps * each
             value = Fraction(level)
-            ends[k] = (-math.inf, value + drift) if sign > 0 else (-value - drift, math.inf)
             try:
-                shell, count = search.enclose(checker, ends, reach, **limits)
+                shell, count = search.enclose(
+                    checker, w, value + steps * each, reach, _value(functions, weights, shape),
+                    **limits,
+                )  # fmt: skip
             except exact.Failed as error:
                 reason = str(error)
                 continue
-            certificate["levels"][k] = [None, level.hex()] if sign > 0 else [(-level).hex(), None]
+            certificate |= {"level": [[x.hex() for x in weights], level.hex()]}
             certificate |= {"steps": steps, "shell": shell}
-            return (k, sign, level), _scale(checker, k, sign, value), "", count
+            return (tuple(weights), level), _scale(checker, w, value), "", count
     return None, 0.0, reason, 0
 
 
+def _value(functions: list, weights: list[float], shape: Any) -> Any:
+    """Σ w_k I_k of an array of points (q, p, t, ε)."""
+    used = [(w, f) for w, (f, _) in zip(weights, functions, strict=True) if w]
+    return jax.jit(
+        jax.vmap(lambda x: sum(w * f(*_state(x[:-2], shape), x[-2], x[-1]) for w, f in used))
+    )
+
+
+def _named(weights: list[float]) -> str:
+    return " + ".join(f"{w:.4g} I_{k}" for k, w in enumerate(weights) if w)
+
+
 def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: list) -> list[tuple]:
-    """(k, sign, least value in the domain, least value around it) of sign·I_k where the latter is
+    """(weights, least value in the domain, least value around it) of Σ w_k I_k where the latter is
     larger, those first that leave most of the domain; from random points."""
-    rng = np.random.default_rng(0)
+    inner, outer = _points(checker, inside, shape, [float(x) for x in reach])
+    middle = (np.array(checker.lower, float) + np.array(checker.upper, float))[None] / 2
+    spans = [np.linspace(*map(float, ends), 2) for ends in (checker.time, checker.epsilon)]
+
+    def values(z):
+        one = jax.jit(
+            jax.vmap(
+                lambda z, t, e: jnp.stack([f(*_state(z, shape), t, e) for f, _ in functions]),
+                (0, None, None),
+            )
+        )
+        rows = np.concatenate([np.asarray(one(z, t, e)) for t in spans[0] for e in spans[1]])
+        return np.where(np.isfinite(rows), rows, 0.0)  # candidates only: the checker decides
+
+    within, around, center = values(inner), values(outer), values(middle)[0]
+    weights = [sign * unit for unit in np.eye(len(functions)) for sign in (1, -1)]
+    if len(functions) > 1:
+        weights[:0] = _best_combination(within - center, around - center)
+    found = []
+    for w in weights:
+        border, least = float(np.min(around @ w)), float(np.min(within @ w))
+        if border > least:
+            share = float(np.mean(within @ w < border))
+            found.append((share, (w.tolist(), least, border)))
+    return [item for _, item in sorted(found, key=lambda pair: -pair[0])]
+
+
+def _best_combination(within: np.ndarray, around: np.ndarray) -> list[np.ndarray]:
+    """The w whose least w·I around the domain is largest next to its mean inside: a linear program.
+    None if no w·I is larger around the domain than at its middle, where I is 0 here."""
+    mean = np.mean(within, axis=0)
+    n = len(mean)
+    size = np.std(within, axis=0) + 1e-300
+    # max m  with  w·I(border) ≥ m  and  w·mean = 1.
+    rows = np.column_stack([-around[:: max(1, len(around) // 20000)] / size, np.ones(1).repeat(
+        len(around[:: max(1, len(around) // 20000)]))])  # fmt: skip
+    solution = linprog(
+        [*np.zeros(n), -1.0],
+        A_ub=rows,
+        b_ub=np.zeros(len(rows)),
+        A_eq=[[*(mean / size), 0.0]],
+        b_eq=[1.0],
+        bounds=[(None, None)] * (n + 1),
+    )
+    if solution.status or solution.x[-1] <= 0:
+        return []
+    w = solution.x[:n] / size
+    w = w / np.max(np.abs(w))
+    return [np.where(np.abs(w) < 1e-6, 0.0, w)]
+
+
+def _points(checker: Any, inside: Any, shape: Any, reach: list) -> tuple[np.ndarray, np.ndarray]:
+    """Random states of the domain, and around it within `reach`."""
+    rng, wide = np.random.default_rng(0), np.array(reach)
     low, high = (np.array([float(x) for x in side]) for side in (checker.lower, checker.upper))
-    wide = np.array([float(x) for x in reach])
     inner = rng.uniform(low, high, (4000, len(low)))
     near = rng.uniform(low, high, (40000, len(low)))
     axis = rng.integers(0, len(low), len(near))
@@ -74,25 +145,14 @@ def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: l
     outer = near + rng.uniform(0, 1, near.shape) * wide * np.where(near >= high, 1, -1) * (
         (near <= low) | (near >= high)
     )
-    if inside is not None:
-        keep = jax.jit(jax.vmap(lambda z: jnp.all(inside(*_state(z, shape)) >= 0)))
-        near = rng.uniform(low, high, (200000, len(low)))
-        near = near[np.asarray(keep(near))]
-        moved = near + rng.choice([-1.0, 1.0], near.shape) * wide
-        off = ~np.asarray(keep(moved)) | (moved < low).any(1) | (moved > high).any(1)
-        inner, outer = near[:4000], moved[off][:40000]
-    epsilons = [float(x) for x in checker.epsilon]
-    found = []
-    for k, (function, _) in enumerate(functions):
-        value = jax.jit(jax.vmap(lambda z, e, f=function: f(*_state(z, shape), e), (0, None)))
-        around = np.concatenate([np.asarray(value(outer, e)) for e in epsilons])
-        within = np.concatenate([np.asarray(value(inner, e)) for e in epsilons])
-        for sign in (1, -1):
-            border, least = float(np.min(sign * around)), float(np.min(sign * within))
-            if border > least:
-                share = float(np.mean(sign * within < border))
-                found.append((share, (k, sign, least, border)))
-    return [item for _, item in sorted(found, key=lambda pair: -pair[0])]
+    if inside is None:
+        return inner, outer
+    keep = jax.jit(jax.vmap(lambda z: jnp.all(inside(*_state(z, shape)) >= 0)))
+    near = rng.uniform(low, high, (200000, len(low)))
+    near = near[np.asarray(keep(near))]
+    moved = near + rng.choice([-1.0, 1.0], near.shape) * wide
+    off = ~np.asarray(keep(moved)) | (moved < low).any(1) | (moved > high).any(1)
+    return near[:4000], moved[off][:40000]
 
 
 def _state(z: Any, shape: Any) -> tuple[Any, Any]:
@@ -100,18 +160,19 @@ def _state(z: Any, shape: Any) -> tuple[Any, Any]:
     return q.reshape(shape), p.reshape(shape)
 
 
-def _scale(checker: Any, k: int, sign: int, level: Fraction) -> float:
+def _scale(checker: Any, weights: list, level: Fraction) -> float:
     """The largest factor (to 1 %) by which the domain may be scaled about its middle so that
-    sign·I_k ≤ level in it."""
-    exact, _ = tools()
+    Σ w_k I_k ≤ level in it."""
+    exact, search = tools()
     sides = list(zip(checker.lower, checker.upper, strict=True))
-    good = 0.0
-    for i in range(1, 101):
-        s = Fraction(i, 100)
-        box = [((a + b) / 2 - s * (b - a) / 2, (a + b) / 2 + s * (b - a) / 2) for a, b in sides]
-        algebra, x = checker.models([*box, checker.epsilon])
-        low, high = algebra.range(exact.run(checker.invariants[k], x, algebra)[0])
-        if (high if sign > 0 else -low) > level:
-            break
-        good = i / 100
-    return good
+    good, bad = 0, 101
+    while bad - good > 1:
+        i = (good + bad) // 2
+        box = [((a + b) / 2 - i * (b - a) / 200, (a + b) / 2 + i * (b - a) / 200) for a, b in sides]
+        try:
+            algebra, value = exact.combined(checker, weights, [*box, *checker.root()[-2:]])
+            fits = algebra.range(value)[1] <= level
+        except search.SINGULAR:
+            fits = False
+        good, bad = (i, bad) if fits else (good, i)
+    return good / 100

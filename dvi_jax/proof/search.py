@@ -1,21 +1,24 @@
 """The search for a certificate: boxes, bounds, levels. What it finds, the checker decides."""
 
-import bisect
 import heapq
 import itertools
 import math
-import operator
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from flint import arb
 
 from . import checker as exact
 
-_DIGITS = (30, 45, 60, 80, 100, 130)
-"""Binary digits after the point that are tried for the smallest terms."""
+_BITS = (20, 26, 32, 40, 50, 60, 75, 90, 110, 140)
+"""Binary digits of the models that are tried."""
+
+SINGULAR = exact.Failed, ValueError, ArithmeticError
+"""Errors of an evaluation on a box with a singularity."""
 
 _POINTS = 64
 """Random points of a box at which a change is evaluated, for a lower estimate of its supremum."""
@@ -28,7 +31,8 @@ class Leaf:
     - `failed`: why nothing is bounded there.
     - `bounds`, `seen`: for each invariant an upper bound of the change, and the largest one seen.
     - `rounding`, `moved`: changes by rounding, and how far a step moves each coordinate.
-    - `remainders`: of the models of the changes. `blame`: the coordinates that a failure is due to.
+    - `remainders`: of the models of the changes. `shares`: for each invariant and coordinate, by
+      how much the bound would decrease if the coordinate were cut.
     - `axis`, `parts`: of the cut, if there is one.
     """
 
@@ -40,7 +44,7 @@ class Leaf:
     rounding: list = field(default_factory=list)
     moved: list = field(default_factory=list)
     remainders: list = field(default_factory=list)
-    blame: set = field(default_factory=set)
+    shares: list = field(default_factory=list)
     axis: int = 0
     parts: list = field(default_factory=list)
 
@@ -52,75 +56,98 @@ def examine(
     leaf = Leaf(box)
     try:
         algebra, x = checker.models(box)
-        if checker.implicit:
-            near = zip(checker.moved(x, algebra)[checker.n :], checker.spread, strict=True)
-            if any(m > s for m, s in near):
-                raise exact.Failed("p1 is further from p0 than `spread`")
-            if not checker.contraction(box) < 1 / 3:
-                raise exact.Failed("the equation of the implicit step is not a contraction")
-        if checker.is_outside(algebra, checker.start(x, algebra)):
+        if not checker.implicit and checker.is_outside(algebra, x):
             leaf.outside = True
             return leaf
-        moved = checker.moved(x, algebra)
-        changes = checker.changes(x, algebra)
+        leaf.rounding, errors = checker.rounding(box)  # first: it takes little time, and may fail
+        step = checker.stepped(x, algebra)
+        moved = checker.moved(step, algebra)
+        if checker.implicit:
+            near = zip(moved[checker.n :], checker.spread, strict=True)
+            exact.require(all(m <= s for m, s in near), "p1 is further from p0 than `spread`")
+            if checker.is_outside(algebra, step[0]):
+                leaf.outside = True
+                return leaf
+        changes = [checker.change(k, step, algebra) for k in range(len(checker.invariants))]
         leaf.bounds = [
             Fraction(0) if k in identities else algebra.bound(change)
             for k, change in enumerate(changes)
         ]
         leaf.remainders = [change[1] / algebra.one for change in changes]
-        leaf.seen = [seen(algebra, change, box, rng) for change in changes]
-        leaf.rounding, errors = checker.rounding(box)
+        sampled = [_sampled(algebra, change, box, rng) for change in changes]
+        leaf.seen, leaf.shares = ([pair[i] for pair in sampled] for i in (0, 1))
         leaf.moved = [exact.up(m + Fraction(e)) for m, e in zip(moved, errors, strict=True)]
-        if not all(map(math.isfinite, (*leaf.rounding, *leaf.moved))):
-            raise exact.Failed("a value is not bounded")
-    except (exact.Failed, OverflowError) as error:
-        leaf.failed = str(error)
-        leaf.blame = blamed(checker, box)
+        finite = all(map(math.isfinite, (*leaf.rounding, *leaf.moved)))
+        exact.require(finite, "a value is not bounded")
+    except SINGULAR as error:
+        leaf.failed = str(error) if isinstance(error, exact.Failed) else "a function is singular"
     return leaf
 
 
-def blamed(checker: exact.Checker, box: list) -> set[int]:
-    """The coordinates on which the operation depends at which the step fails on a box."""
-    algebra, x = checker.models(box)
-    inputs, operations = [*x, algebra.constant(checker.h)], checker.step["operations"]
-
-    def fails(count):
-        try:
-            exact.run({"operations": operations[:count], "outputs": []}, inputs, algebra)
-        except (exact.Failed, OverflowError):
-            return True
-        return False
-
-    index = bisect.bisect_left(range(len(operations)), True, key=lambda i: fails(i + 1))
-    needed, used = {index}, set()
-    for i in range(min(index, len(operations) - 1), -1, -1):
+def curved(checker: exact.Checker) -> set[int]:
+    """The coordinates on which the arguments of elementary functions in the step depend."""
+    operations = checker.step["operations"]
+    needed, used = set(), set()
+    for i in reversed(range(len(operations))):
         name, *operands = operations[i]
-        if i in needed and name == "input":
+        if name == "input" and i in needed:
             used.add(operands[0])
-        elif i in needed and name != "constant":
-            needed.update(operands[:1] if name == "power" else operands)
-    return used
+        elif name in exact.FUNCTIONS or (i in needed and name != "constant"):
+            needed.update(operands)
+    return used & {*range(2 * checker.n + 2)}
 
 
-def resolve(checker: exact.Checker) -> None:
-    """Choose below which size terms are dropped: remainders shall be small next to the changes.
+def estimate(checker: exact.Checker) -> list[float]:
+    """The largest change of each I_k at random points of the domain; 0 where all contain 0."""
+    rng, algebra = np.random.default_rng(1), exact.Rounding(0)
+    seen = [0.0] * len(checker.invariants)
+    for _ in range(_POINTS):
+        x = [(exact.ball(a + (b - a) * Fraction(rng.random())), arb(0)) for a, b in checker.root()]
+        x[-1] = (exact.ball(checker.epsilon[1]), arb(0))
+        try:
+            step = checker.stepped(x, algebra)
+            if any(g[0] < 0 for g in exact.run(checker.inside, step[0], algebra)):
+                continue
+            changes = [checker.change(k, step, algebra)[0] for k in range(len(seen))]
+        except SINGULAR:
+            continue
+        seen = [max(s, float(abs(c).lower())) for s, c in zip(seen, changes, strict=True)]
+    return seen
 
-    Large terms are faster; a change that nearly cancels needs small ones.
+
+def resolve(checker: exact.Checker, seen: list[float], ratio: float) -> None:
+    """Choose the number of bits: remainders shall be small next to the changes.
+
+    Few bits are faster; a change that nearly cancels needs many.
     """
-    rng, box = np.random.default_rng(0), checker.root()
-    for digits in _DIGITS:
-        checker.tiny, checker.bits = Fraction(1, 2**digits), digits + 40
-        leaf = examine(checker, box, rng)
-        while leaf.failed:
-            widths = [float(b - a) for a, b in box]
-            if digits > _DIGITS[0] or max(widths) < 1e-3 * max(map(abs, (*box[0], 1))):
+    small = min(ratio - 1, 4) / 10
+    rng, leaf, last = np.random.default_rng(0), None, []
+    for checker.bits in _BITS:
+        leaf = examine(checker, leaf.box, rng) if leaf else _bounded_part(checker, rng)
+        for _ in range(20):
+            if leaf is None or leaf.failed or leaf.outside:
                 return  # nothing is bounded there: `subdivide` says where
-            # A part of the domain is enough here.
-            box = [half(side, rng.random() < 0.5) for side in box]
-            leaf = examine(checker, box, rng)
-        pairs = zip(leaf.remainders, leaf.seen, strict=True)
-        if leaf.remainders and all(r <= s / 10 for r, s in pairs):
-            return
+            rows = enumerate(zip(leaf.remainders, seen, strict=True))
+            left = [k for k, (r, s) in rows if s and r > s * small]
+            if not left:
+                return
+            if last and all(leaf.remainders[k] < last[k] / 4 for k in left):
+                break
+            # More bits do not help much: the box is too large.
+            last = leaf.remainders
+            leaf = examine(checker, [half(side, rng.random() < 0.5) for side in leaf.box], rng)
+
+
+def _bounded_part(checker: exact.Checker, rng: Any) -> Leaf | None:
+    """The domain, or a part of it on which something is bounded; None if 60 parts have failed."""
+    box = checker.root()
+    for _ in range(60):
+        leaf = examine(checker, box, rng)
+        if not (leaf.failed or leaf.outside):
+            return leaf
+        box = checker.root() if leaf.outside else box
+        box = [half(side, rng.random() < 0.5) for side in box]
+    return None
 
 
 def half(side: tuple, upper: bool) -> tuple:
@@ -129,59 +156,20 @@ def half(side: tuple, upper: bool) -> tuple:
     return (middle, side[1]) if upper else (side[0], middle)
 
 
-def seen(algebra: exact.Models, model: Any, box: list, rng: Any) -> float:
-    """The largest |P| at random points of the box, less the remainder."""
+def _sampled(algebra: exact.Models, model: Any, box: list, rng: Any) -> tuple[float, list[float]]:
+    """The largest |P| at random points of the box, less the remainder; and for each coordinate by
+    how much the sum of |coefficients| would decrease if the box were half as wide."""
     terms = model[0].to_dict()
     if not terms:
-        return 0.0
+        return 0.0, [0.0] * len(box)
     s = rng.choice([-1.0, -0.7, -0.3, 0.0, 0.3, 0.7, 1.0], (_POINTS, len(box)))
     s[:, -1] = 1.0 if box[-1][0] == 0 else s[:, -1]
     powers = np.array([[int(k) for k in powers] for powers in terms])
     values = np.array([float(Fraction(int(c), algebra.one)) for c in terms.values()])
     monomials = np.prod(s[:, None, :] ** powers[None], axis=2)
     error = float(Fraction(model[1], algebra.one))
-    return max(0.0, float(np.max(np.abs(monomials @ values))) - error)
-
-
-class _Rational:
-    """Rational numbers for the `run` of the checker."""
-
-    constant, multiply, divide = staticmethod(Fraction), operator.mul, operator.truediv
-
-    @staticmethod
-    def sum(*terms: Any) -> Any:
-        return sum(terms)
-
-    @staticmethod
-    def apply(name: str, a: Any) -> Any:
-        raise exact.Failed(f"{name} is no rational function")
-
-
-def identities(checker: exact.Checker) -> frozenset:
-    """The numbers of the functions that are conserved exactly: zero at points, then proved."""
-    if checker.implicit:
-        return frozenset()
-    rng = np.random.default_rng(1)
-    sides = [(checker.lower[i], checker.upper[i]) for i in range(2 * checker.n)]
-    points = [
-        [
-            a + (b - a) * Fraction(int(rng.integers(1, 99)), 100)
-            for a, b in [*sides, checker.epsilon]
-        ]
-        for _ in range(2)
-    ]
-    found = set(range(len(checker.invariants)))
-    for x in points:
-        for k in tuple(found):
-            function = checker.invariants[k]
-            try:
-                end = exact.run(checker.step, [*x, checker.h], _Rational)
-                after, before = (exact.run(function, [*z, x[-1]], _Rational) for z in (end, x[:-1]))
-            except (exact.Failed, ZeroDivisionError):
-                after, before = 1, 0
-            if after != before:
-                found.remove(k)
-    return frozenset(k for k in found if checker.is_identity(k))
+    shares = np.abs(values) @ (1 - 0.5**powers)
+    return max(0.0, float(np.max(np.abs(monomials @ values))) - error), shares.tolist()
 
 
 class TooMany(exact.Failed):
@@ -203,24 +191,26 @@ class Found:
 def subdivide(
     checker: exact.Checker,
     identities: frozenset,
+    best: list[float],
     *,
     ratio: float,
     max_boxes: int,
     max_seconds: float,
 ) -> Found:
-    """Cut the domain until no bound exceeds `ratio` times the largest change seen.
+    """Cut the domain until no bound exceeds `ratio` times the largest change seen, at least `best`.
 
-    The box with the worst bound is cut first, along the axis that leaves the smallest bounds.
-    **Raises** `TooMany` where boxes on which nothing is bounded remain.
+    The box with the worst bound is cut first. **Raises** `TooMany` where boxes on which nothing is
+    bounded remain.
     """
     rng, began, order = np.random.default_rng(0), time.monotonic(), itertools.count()
     root = examine(checker, checker.root(), rng, identities)
-    best = root.seen or [0.0] * len(checker.invariants)
+    best = [max(b, s) for b, s in itertools.zip_longest(best, root.seen, fillvalue=0.0)]
     heap = [(_rank(root, best), next(order), root)]
     count = 1
     while -heap[0][0] > ratio and count < max_boxes and time.monotonic() - began < max_seconds:
         leaf = heapq.heappop(heap)[2]
-        leaf.axis, leaf.parts = _cut(checker, leaf, rng, identities)
+        leaf.axis = _axis(checker, leaf, best)
+        leaf.parts = [examine(checker, p, rng, identities) for p in halves(leaf.box, leaf.axis)]
         count += 1
         old = best
         for part in leaf.parts:
@@ -257,38 +247,24 @@ def _rank(leaf: Leaf, best: list) -> float:
     """Minus the largest bound over the change seen: the smallest is cut first."""
     if leaf.failed or leaf.outside:
         return 0.0 if leaf.outside else -math.inf
+    return -max(_excesses(leaf, best))
+
+
+def _excesses(leaf: Leaf, best: list) -> list[float]:
     pairs = zip(leaf.bounds, best, strict=True)
-    return -max((float(b) / s if s else math.inf) if b else 0.0 for b, s in pairs)
+    return [(float(b) / s if s else math.inf) if b else 0.0 for b, s in pairs]
 
 
-def _cut(
-    checker: exact.Checker, leaf: Leaf, rng: Any, identities: frozenset
-) -> tuple[int, list[Leaf]]:
-    """The parts of a leaf along the axis that leaves the smallest bounds."""
-    axes = [i for i, (a, b) in enumerate(leaf.box) if a < b]
+def _axis(checker: exact.Checker, leaf: Leaf, best: list) -> int:
+    """The coordinate along which a box is cut: where the bound decreases most, but not far narrower
+    than the others."""
     if leaf.failed:
-        axes = [_widest(checker, leaf.box, leaf.blame)]
-    tried = [
-        (i, [examine(checker, part, rng, identities) for part in halves(leaf.box, i)]) for i in axes
-    ]
-
-    widest = _widest(checker, leaf.box)
-
-    def cost(item):
-        # The larger bound decides. Where no cut makes it much smaller, more than one is needed, and
-        # the widest coordinate is cut: cutting one part again and again would go on for ever.
-        rests = [_rest(leaf, part) for part in item[1]]
-        return max(*rests, 0.9), item[0] != widest, sum(rests)
-
-    return min(tried, key=cost)
-
-
-def _rest(leaf: Leaf, part: Leaf) -> float:
-    """The bound of a part over that of the whole, at most 10."""
-    if part.outside or part.failed:
-        return 0.0 if part.outside else 10.0
-    pairs = zip(part.bounds, leaf.bounds, strict=False)  # a failed one has no bounds
-    return max((float(a / b) for a, b in pairs if b), default=0.0)
+        return _widest(leaf.box, checker.root(), curved(checker))
+    excesses = _excesses(leaf, best)
+    k = max(range(len(excesses)), key=excesses.__getitem__)
+    if leaf.remainders[k] > 0.5 * float(leaf.bounds[k]):
+        return _widest(leaf.box, checker.root(), curved(checker))
+    return max(range(len(leaf.box)), key=leaf.shares[k].__getitem__)
 
 
 def halves(box: list, axis: int, where: Fraction | None = None) -> list[list]:
@@ -299,68 +275,86 @@ def halves(box: list, axis: int, where: Fraction | None = None) -> list[list]:
 
 
 def enclose(
-    checker: exact.Checker, limits: list, reach: list, *, max_boxes: int, max_seconds: float
+    checker: exact.Checker,
+    weights: list,
+    limit: Fraction,
+    reach: list,
+    value: Callable,
+    *,
+    max_boxes: int,
+    max_seconds: float,
 ) -> tuple[Any, int]:
     """The tree of boxes around the domain on which no trajectory can be, and their number.
 
-    **Raises** `TooMany` with a box on which no invariant excludes a trajectory.
+    `value`: Σ w_k I_k of an array of points (q, p, t, ε), a quick estimate. **Raises** `TooMany`
+    with a box on which Σ w_k I_k does not exclude a trajectory.
     """
-    began, count = time.monotonic(), 0
+    began, count, rng = time.monotonic(), 0, np.random.default_rng(0)
+    *around, span, epsilon = checker.root()
+    around = [(a - w, b + w) for (a, b), w in zip(around, reach, strict=True)]
+    whole, sides = [*around, span, epsilon], [*zip(checker.lower, checker.upper, strict=True)]
+    domain = np.array(sides, float).T
 
     def node(box, borders):
         nonlocal count
-        claim = _claim(checker, box, limits, reach)
-        if claim is not None:
-            count += 1
-            return claim
-        if count > max_boxes or time.monotonic() - began > max_seconds:
+        claim, axis = None, _widest(box, whole)
+        for claim in ("inside", "unreachable"):
+            if _is_shown(checker, box, claim, weights, limit, reach):
+                count += 1
+                return claim
+        points = _corners(box, rng)
+        beside = ((points[:, :-2] < domain[0]) | (points[:, :-2] > domain[1])).any(1)
+        low = ~(value(points) > float(limit))
+        hopeless = low & beside if not checker.inside["outputs"] else low & False
+        if not low.any():
+            model = exact.combined(checker, weights, box)
+            if model[0].range(model[1])[0] > limit:
+                count += 1
+                return "above"
+            axis = int(np.argmax(_sampled(*model, box, rng)[1]))
+        late = count > max_boxes or time.monotonic() - began > max_seconds
+        narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, whole, strict=True))
+        if late or narrow or hopeless.any():
             raise TooMany(f"no invariant excludes that a trajectory gets to {place(box)}")
-        if borders:  # first the domain itself is cut out
-            axis, where = borders[0]
-        else:
-            axis, where = _widest(checker, box), None
+        if not borders:
+            first, second = halves(box, axis)
+            return ["cut", axis, float(first[axis][1]).hex(), node(first, ()), node(second, ())]
+        (axis, where), *others = borders  # first the domain itself is cut out
         first, second = halves(box, axis, where)
-        cut = float(first[axis][1]).hex()
-        if where is None:
-            return ["cut", axis, cut, node(first, ()), node(second, ())]
-        # A part outside of a border has no further ones.
-        below = where == checker.lower[axis]
-        parts = (first, ()), (second, borders[1:])
-        if not below:
-            parts = (first, borders[1:]), (second, ())
-        return ["cut", axis, cut, *(node(*part) for part in parts)]
+        # The part outside of a border has no further ones.
+        left, right = ((), others) if where == checker.lower[axis] else (others, ())
+        return ["cut", axis, float(where).hex(), node(first, left), node(second, right)]
 
-    around = zip(checker.root()[:-1], reach, strict=True)
-    root = [*((a - w, b + w) for (a, b), w in around), checker.epsilon]
-    sides = enumerate(zip(checker.lower, checker.upper, strict=True))
-    borders = [(i, side) for i, pair in sides for side in pair]
-    return node(root, tuple(borders)), count
+    return node(whole, [(i, side) for i, pair in enumerate(sides) for side in pair]), count
+
+
+def _is_shown(checker: exact.Checker, box: list, claim: str, *level: Any) -> bool:
+    try:
+        exact.check_confined(checker, box, claim, *level)
+    except SINGULAR:
+        return False
+    return True
+
+
+def _corners(box: list, rng: Any) -> np.ndarray:
+    """The middle and 15 random corners of a box."""
+    low, high = np.array(box, float).T
+    signs = rng.choice([-1.0, 1.0], (16, len(box)))
+    signs[0] = 0.0
+    return (low + high) / 2 + signs * (high - low) / 2
 
 
 def place(box: list) -> str:
     """A box as text."""
-    return " × ".join(f"[{float(a):.4g}, {float(b):.4g}]" for a, b in box)
+    return " × ".join(f"[{float(a):.4g}, {float(b):.4g}]" for a, b in box if a < b)
 
 
-def _claim(checker: exact.Checker, box: list, limits: list, reach: list) -> Any:
-    claims: list[Any] = ["inside", "unreachable"]
-    claims += [[side, k] for k in range(len(limits)) for side in ("above", "below")]
-    for claim in claims:
-        if isinstance(claim, list) and math.isinf(limits[claim[1]][claim[0] == "above"]):
-            continue
-        try:
-            exact.check_confined(checker, box, claim, limits, reach)
-        except (exact.Failed, OverflowError):
-            continue
-        return claim
-    return None
-
-
-def _widest(checker: exact.Checker, box: list, of: Any = ()) -> int:
-    """The widest coordinate, or the widest one `of` some, relative to the domain; ε counts less."""
-    ends = zip(
-        box, [*checker.lower, checker.epsilon[0]], [*checker.upper, checker.epsilon[1]], strict=True
-    )
-    widths = [float((b - a) / (high - low)) if high > low else 0.0 for (a, b), low, high in ends]
-    widths[-1] /= 8
-    return max([i for i in of if i < len(box)] or range(len(box)), key=widths.__getitem__)
+def _widest(box: list, whole: list, of: Any = ()) -> int:
+    """The widest coordinate, or the widest one `of` some, relative to the box `whole`; t and ε
+    count less."""
+    widths = [
+        float((b - a) / (high - low)) if high > low else 0.0
+        for (a, b), (low, high) in zip(box, whole, strict=True)
+    ]
+    widths[-2:] = [w / 8 for w in widths[-2:]]
+    return max(of or range(len(box)), key=widths.__getitem__)
