@@ -91,9 +91,9 @@ class System(eqx.Module):
         if self.slow_time and any(getattr(f, "step_is_from_times", False) for f in functions):
             raise ValueError(
                 "dvi.discretise(H, order) of order 2 and higher, dvi.from_lagrangian and "
-                "dvi.from_type_iii take the step from t1 − t0, which is not the step in a slow "
-                "time. Use dvi.discretise(H, order=1); for a higher order use method=dvi.Strang() "
-                "or dvi.Yoshida(4)."
+                "dvi.from_type_iii take the step from t1 − t0. With slow_time=True, t0 and t1 are "
+                "multiplied by ε, and t1 − t0 is not the step. Use dvi.discretise(H, order=1); for "
+                "a higher order use method=dvi.Strang() or dvi.Yoshida(4)."
             )
 
     def strength(self, epsilon: Any) -> Any:

@@ -64,8 +64,9 @@ plt.show()
 # ## No invariant
 #
 # Van der Pol's force $(1 - q^2)\,p$ amplifies small oscillations and damps large ones. There is no
-# invariant of first order: the result must be empty. The report must give a law for the quantity
-# $I$ that is conserved only for $\varepsilon = 0$: its mean change in one step.
+# invariant of first order, and the result must be empty. There is a quantity $I$ that is conserved
+# for $\varepsilon = 0$ only. The report must give the mean change of $I$ in one step, as a function
+# of $I$.
 
 # %%
 van_der_pol = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: (1 - q0**2) * p1)
@@ -76,8 +77,9 @@ print(law)
 assert len(none.invariants) == 0
 
 # %% [markdown]
-# The law has a fixed point $I$, which is the limit cycle. Two runs, one from inside and one from
-# outside of it, must end there.
+# The mean change is zero at one positive value of $I$, the fixed point. This is the value on the
+# limit cycle. Two runs, one with an initial state inside the limit cycle and one with an initial
+# state outside of it, must end at this value.
 
 # %%
 runs = [
@@ -131,8 +133,8 @@ assert found.survivors == (13, 4, 2)
 # There are thirteen at order 0: the four quadratic forms and nine products of them, of degree four.
 # The corrections of the products would have degree five, which is not in the basis; therefore four
 # remain at order 1. Two of these, the angular momentum and the energy, have corrections of second
-# order. This does not hold at all orders: the motion becomes chaotic, and then only the energy is
-# conserved.
+# order. The corrections of the angular momentum do not exist to every order. For large
+# $\varepsilon$ the motion is chaotic, and only the energy is conserved.
 
 # %% [markdown]
 # ## A basis that is too small

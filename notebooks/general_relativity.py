@@ -1,18 +1,18 @@
 # %% [markdown]
 # # General relativity from the ephemeris
 #
-# The Sun and the planets move according to Newton's law, with a perturbing force: $\varepsilon$
-# times the relativity of the Sun,
+# In this notebook you fit the strength of general relativity to positions of Mercury. The Sun and
+# the planets move according to Newton's law and a perturbing force, which is $\varepsilon$ times
+# the post-Newtonian correction of the Sun's attraction,
 #
 # $$\dot p = -\frac{\partial H}{\partial q} + \varepsilon\, W_{\rm PN}(q, p).$$
 #
-# This notebook fits $\varepsilon$ to the positions of Mercury in JPL's ephemeris DE421. DE421 is
-# itself an integration with relativity, fitted to observations, so the expected result is
-# $\varepsilon = 1$. The initial guess is 0.
+# The positions are those of JPL's ephemeris DE421. DE421 is itself an integration with relativity,
+# fitted to observations, so the expected result is $\varepsilon = 1$. The initial guess is 0.
 #
 # The notebook needs the ephemeris: `pip install ".[ephemeris]"` in a clone.
-# `python examples/general_relativity.py` is a program that also analyses the residuals of a
-# century.
+# `python examples/general_relativity.py` fits a century of positions and also analyses the
+# residuals.
 
 # %%
 import jax
@@ -32,8 +32,8 @@ YEARS = 5  # a century takes minutes, and is in docs/general-relativity.md
 # %% [markdown]
 # ## The data
 #
-# The data are heliocentric positions of Mercury every ten days from 1900 on. They have no errors;
-# the fit estimates the size of the differences between model and ephemeris from the residuals.
+# The data are heliocentric positions of Mercury every ten days from 1900 on. No standard deviation
+# is given for them; the fit estimates it from the residuals.
 
 # %%
 START, MERCURY = julian_date("1900-01-01"), 1
@@ -82,7 +82,7 @@ def fitted(model, params):
 # %% [markdown]
 # ## Two fits: Newton alone, and with relativity
 #
-# Both models include the oblateness of the Sun, $J_2 = 2 \times 10^{-7}$, which also turns the
+# Both models include the oblateness of the Sun, $J_2 = 2 \times 10^{-7}$, which also rotates the
 # perihelion. The fit without relativity is the control: its residuals must be much larger.
 
 # %%

@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Limits of adiabatic invariance
 #
-# An adiabatic invariant such as the action requires conditions: the perturbation is not resonant
-# with the frequencies of the motion, phase volume is conserved, and the orbit does not cross a
-# separatrix. This notebook violates each condition in turn, measures how the change of the action
-# scales with $\varepsilon$, and compares the result with a case without the violation.
+# The action is an adiabatic invariant under three conditions: the perturbation is not resonant with
+# the frequencies of the motion, phase volume is conserved, and the orbit does not cross a
+# separatrix. In this notebook you violate one condition after the other, measure how the change of
+# the action scales with $\varepsilon$, and compare it with a case in which the condition holds.
 #
 # | violated by | change of the action | for comparison |
 # |---|---|---|
@@ -101,10 +101,12 @@ print("largest change over the phases, measured / predicted:", np.round(passed /
 print(f"no resonance: the change scales as ε^{power(epsilons, missed):.2f}")
 
 # %% [markdown]
-# The estimate is that of stationary phase, to leading order. The measured change agrees within a
-# few percent for small $\varepsilon$, and is 16 % larger at the largest $\varepsilon$, where the
-# quadratic term changes the exponent. Therefore we fit the exponent to half of the range of
-# $\Delta J$ over the phases, which does not contain this term.
+# The estimate uses the method of stationary phase to leading order. The measured change agrees with
+# it within 3 % for the three smallest $\varepsilon$, and is 16 % larger at the largest
+# $\varepsilon$. The exponent $1/2$ belongs to the term $2\sqrt{J}\, |\Delta\sqrt J|$ only; the
+# quadratic term $|\Delta\sqrt J|^2$ is proportional to $\varepsilon$. This term is the same at the
+# maximum and at the minimum of $\Delta J$ over the phases. Therefore we fit the exponent to half of
+# the difference of maximum and minimum, in which it cancels.
 
 # %%
 half_range = np.ptp(through, axis=1) / 2
@@ -195,12 +197,13 @@ assert len(found.invariants) == 0
 # \cos q$, $\omega = 1 \pm 0.3 \tanh(\varepsilon t)$. At first it oscillates with an amplitude of
 # 2 rad. The area inside the separatrix is $16\,\omega$. If $\omega$ decreases, this area becomes
 # smaller than that of the orbit, and the pendulum begins to rotate. At the crossing the period is
-# infinite, so the change of $\omega$ is not slow compared with it. The action $J = \oint p\,
-# dq/2\pi$ (after the crossing twice that of one rotation, so that both measure the same area)
-# changes by an amount that depends on the phase. In theory (Cary, Escande & Tennyson 1986;
-# Neishtadt 1986) this amount has order $\varepsilon$, in general with a logarithm, $\varepsilon \ln
-# \varepsilon$. If $\omega$ increases there is no crossing. Because $\omega(t)$ is analytic, the
-# change of $J$ from $t = -\infty$ to $\infty$ is then smaller than any power of $\varepsilon$.
+# infinite, so the change of $\omega$ is not slow compared with it. The action is $J = \oint p\,
+# dq/2\pi$; for a rotation we use twice this integral, so that the value at the separatrix is the
+# same on both sides. At the crossing $J$ changes by an amount that depends on the phase. In theory
+# (Cary, Escande & Tennyson 1986; Neishtadt 1986) this amount has order $\varepsilon$, in general
+# with a logarithm, $\varepsilon \ln \varepsilon$. If $\omega$ increases there is no crossing.
+# Because $\omega(t)$ is analytic, the change of $J$ from $t = -\infty$ to $\infty$ is then smaller
+# than any power of $\varepsilon$.
 
 # %%
 swinging = dvi.System(
@@ -272,7 +275,7 @@ with plot.style():
     label = f"crossing: {power_law(crossing_epsilons, crossed)}"
     c.loglog(crossing_epsilons, crossed, "o", label=label)
     c.loglog(slow_epsilons, not_crossed, "s", label=f"no crossing: exp(−{rate:.1f}/ε)")
-    c.set(title="Passage of a separatrix", ylabel="rms change of the action")
+    c.set(title="Crossing of a separatrix", ylabel="rms change of the action")
     for axis in axes:
         axis.set_xlabel("strength ε of the perturbation")
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2))

@@ -1,9 +1,10 @@
 # %% [markdown]
 # # Sweeps: many trajectories at once
 #
-# How does the drift of an invariant depend on the perturbation and on the initial condition? This
-# needs many trajectories. `dvi.sweep` runs a whole grid, labels the results, gives each trajectory
-# a status and stores finished results on disk.
+# This notebook shows how to compute many trajectories with `dvi.sweep`, for example to find how the
+# drift of an invariant depends on the perturbation and on the initial condition. `dvi.sweep`
+# computes a whole grid of parameters, labels the results, gives each trajectory a status and stores
+# finished results on disk.
 #
 # The system is the Kepler problem in the plane, perturbed by the central force $-\varepsilon q$.
 # With which power of $\varepsilon$ does the drift of the energy $H$ scale? Does the angular
@@ -75,11 +76,12 @@ with plot.style():
 # %% [markdown]
 # ## Numbers
 #
-# The drift of the energy is proportional to $\varepsilon$ for small $\varepsilon$. For orbits that
-# come close to the centre (*steep orbits* below) the error of the discretisation is larger than the
-# effect of $\varepsilon$. The local slope is then noise, which is the checkerboard in the plot, and
-# the median drift has a slope close to 0. The angular momentum must not drift at all: the force has
-# no torque, and a symplectic Runge–Kutta method conserves quadratic invariants.
+# The drift of the energy is proportional to $\varepsilon$ for small $\varepsilon$. For very
+# eccentric orbits, which come close to the centre, the error of the discretisation is larger than
+# the effect of $\varepsilon$. The local slope of the drift is then irregular (the region in the
+# plot where it changes from pixel to pixel), and the median drift has a slope close to 0. The
+# angular momentum must not drift at all: the force has no torque, and a symplectic Runge–Kutta
+# method conserves quadratic invariants.
 
 # %%
 good = data.where(data.status == 0)
@@ -94,7 +96,7 @@ weak = good.sel(epsilon=slice(1e-4, 3e-3))
 round_orbits = order(weak.energy_drift.sel(p_x=slice(-0.85, -0.52)), weak.epsilon)
 steep_orbits = order(weak.energy_drift.sel(p_x=slice(-0.37, -0.33)), weak.epsilon)
 largest = float(good.momentum_drift.max())
-print(f"drift of H: ε^{round_orbits:.2f}; on steep orbits ε^{steep_orbits:.2f}")
+print(f"drift of H: ε^{round_orbits:.2f}; on very eccentric orbits ε^{steep_orbits:.2f}")
 print(f"drift of L: at most {largest:.0e}")
 share = float((data.status != 0).mean())
 print(f"{100 * share:.1f} % of the trajectories failed")
@@ -107,10 +109,11 @@ assert 0 < share < 0.2
 # %% [markdown]
 # ## Repeat and resume
 #
-# The store belongs to this sweep. The same call finds all results and computes nothing; after an
-# interruption it would compute the missing ones. The results are identical bit for bit to those of
-# a sweep without interruption. `integrate` computes a single trajectory with another program; its
-# result agrees with the sweep to round-off.
+# The store contains a description of this sweep and its results. If the same call is made again, it
+# reads all results and computes nothing. After an interruption it computes only the missing
+# results; all results are then identical bit for bit to those of a sweep without interruption.
+# `integrate` computes a single trajectory with another program; its result agrees with the sweep to
+# round-off.
 
 # %%
 again = dvi.sweep(kepler.system, **asked, store=store)
@@ -127,7 +130,8 @@ print(f"in the sweep {in_sweep:.12f}, alone {float(alone.observed['energy_drift'
 assert abs(in_sweep / float(alone.observed["energy_drift"]) - 1) < 1e-10
 
 # %% [markdown]
-# Control: the store of another sweep must be rejected. One number is changed:
+# As a control, the step is changed. `sweep` must then reject the store, which belongs to another
+# sweep:
 
 # %%
 try:

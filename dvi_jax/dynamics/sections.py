@@ -243,9 +243,10 @@ def bifurcation(
     lengths = set(varied.values())
     if len(lengths) != 1 or 0 in lengths:
         raise ValueError(
-            "a bifurcation diagram requires a parameter that varies: epsilon as a one-dimensional "
-            "array of values, or a dvi.Axis in args. Several vary together and must have the same "
-            f"length; the lengths are {varied or 'not given: each parameter is one number'}."
+            "a bifurcation diagram requires a parameter that varies: give epsilon as a "
+            "one-dimensional array of at least one value, or a dvi.Axis in args. If several "
+            "parameters vary, they vary together and must have the same length. Lengths in this "
+            f"call: {varied or 'not given: each parameter is one number'}."
         )
     start = (as_scalar("t0", keywords["t0"], q.dtype), q, p)
     h = as_scalar("h", keywords["h"], q.dtype, zero_allowed=False)
@@ -370,7 +371,7 @@ def _raise_on_failure(found: PoincareSection, settings: _Settings) -> PoincareSe
     wanted, num_steps = settings.section.capacity, settings.options["num_steps"]
     raise SectionError(
         f"{bad.size} of {len(names)} orbits did not cross the section {wanted} times in "
-        f"{num_steps} steps; the first is orbit {i}, with {int(found.count[i])} crossings: "
-        f"{names[i]} (run: {own}). {text} {AS_ATTRIBUTE}",
+        f"{num_steps} steps. The first of them is orbit {i}, with {int(found.count[i])} crossings. "
+        f"Its status is {names[i]} (run: {own}). {text} {AS_ATTRIBUTE}",
         found,
     )

@@ -217,7 +217,10 @@ def _check_input(
     for name, given in (("params", params), ("bounds", bounds), ("priors", priors)):
         instance(name, {} if given is None else given, Mapping, "a dict or None")
         if given is not None and KEY in given:
-            raise ValueError(f"{name} must not have {KEY!r}: library adds them, starting at 0.")
+            raise ValueError(
+                f"{name} must not contain the key {KEY!r}: library adds them, with the initial "
+                "guess 0. Remove this key."
+            )
     if penalty is not None:
         positive("penalty", penalty)
 

@@ -74,8 +74,8 @@ class Model(eqx.Module):
         for name in options:
             if name not in _OPTIONS:
                 raise TypeError(
-                    f"dvi.Model has no option {name!r}; it has {', '.join(_OPTIONS)}. What is "
-                    "saved and observed follows from the data."
+                    f"dvi.Model has no option {name!r}; it has {', '.join(_OPTIONS)}. The data "
+                    "determine which states and observables are saved: give no save or observe."
                 )
         # Arrays, so that another value needs no other compilation.
         fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
@@ -114,7 +114,8 @@ class Model(eqx.Module):
             shape = np.shape(params.get(name, self.fixed[name]))
             if shape[0] != arcs:
                 raise ValueError(
-                    f"{name} needs one row for each of {arcs} arcs, got shape {shape}."
+                    f"{name} must have one row for each of {arcs} arcs along its first axis, got "
+                    f"shape {shape}."
                 )
 
 

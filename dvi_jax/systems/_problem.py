@@ -132,7 +132,7 @@ class Start:
     least: int = 1
 
     def __call__(self, q0: Any, p0: Any, args: Any) -> None:
-        check_shape(q0, p0, self._fits, f"{self.system}: q0 and p0 of {self._wanted}")
+        check_shape(q0, p0, self._fits, f"{self.system}: q0 and p0 must have {self._wanted}")
         for name, check in self.parameters.items():
             check_parameter(args, name, check)
         if not (self.singular or self.also):
@@ -158,7 +158,7 @@ class Start:
     @property
     def _wanted(self) -> str:
         if self.shape is None:
-            return "one shape, any"
+            return "the same shape"
         range_of_n = f", n ≥ {self.least}" if None in self.shape else ""
         return f"shape {self.shape}{range_of_n}".replace("None", "n")
 
