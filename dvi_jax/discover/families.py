@@ -30,8 +30,8 @@ def _places(variables: Sequence[str], shape: tuple[int, ...]) -> tuple[int, ...]
     unknown = [v for v in variables if v not in every + TIME]
     if unknown:
         raise ValueError(
-            f"variables of a basis: there is no component {unknown[0]!r}, only {[*every]} and the "
-            "time 't'. Use these names."
+            f"the basis has the variable {unknown[0]!r}, but states of shape {shape} have only the "
+            f"components {', '.join(every)} and the time t: use these names."
         )
     return tuple(len(every) if v in TIME else every.index(v) for v in variables)
 

@@ -86,7 +86,7 @@ def _settings(
         warnings.warn(
             "the default method of sections has changed: it was Strang(), and is now the default "
             "of integrate, which is TypeII() for this system. Give method=dvi.Strang() for the "
-            "results of earlier versions, method=dvi.TypeII() for the map of H_D itself.",
+            "results of earlier versions, or method=dvi.TypeII() for the map of H_D itself.",
             FutureWarning,
             stacklevel=level,
         )
@@ -199,8 +199,8 @@ def poincare_section(
         if any("called with q0 of shape" in note for note in getattr(error, "__notes__", ())):
             error.add_note(
                 f"(q0 and p0 have the orbits along the first axis: shape {q.shape} means "
-                f"{q.shape[0]} orbits with q0 of shape {q.shape[1:]}. Give a single start as "
-                "q0[None], p0[None].)"
+                f"{q.shape[0]} orbits with q0 of shape {q.shape[1:]}. Give a single initial "
+                "condition as q0[None], p0[None].)"
             )
         raise
     return _raise_on_failure(found, settings) if keywords["throw"] else found
@@ -360,7 +360,7 @@ def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
 def _raise_on_failure(found: PoincareSection, settings: _Settings) -> PoincareSection:
     fine = found.result == SECTION_RESULTS.successful
     if is_traced(fine):
-        message = "an orbit has too few crossings: with throw=False read the status of each orbit."
+        message = "an orbit has too few crossings: give throw=False and read each orbit's status."
         return eqx.error_if(found, ~jnp.all(fine), message)
     bad = np.flatnonzero(~np.asarray(fine))
     if not bad.size:
@@ -372,6 +372,6 @@ def _raise_on_failure(found: PoincareSection, settings: _Settings) -> PoincareSe
     raise SectionError(
         f"{bad.size} of {len(names)} orbits did not cross the section {wanted} times in "
         f"{num_steps} steps. The first of them is orbit {i}, with {int(found.count[i])} crossings. "
-        f"Its status is {names[i]} (run: {own}). {text} {AS_ATTRIBUTE}",
+        f"Its status is {names[i]}; the status of its run is {own}. {text} {AS_ATTRIBUTE}",
         found,
     )
