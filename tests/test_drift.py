@@ -527,9 +527,9 @@ def test_a_surface_shows_zeros_failures_and_limits():
         ({"h": np.float64(0.0)}, "must not be zero"),
         ({"h": [0.1, 0.2]}, "h must be one number"),
         ({"starts": (np.ones((3, 1)), np.ones((2, 1)))}, "the same shape"),
-        ({"starts": (0.1, 0.1)}, "first axis of initial conditions"),
+        ({"starts": (0.1, 0.1)}, "initial conditions along the first axis"),
         ({"starts": (np.array([[0.1], [np.nan]]), np.ones((2, 1)))}, "not finite at index"),
-        ({"observable": lambda t0, t1, q0, p0, q1, p1, args: q1}, "must be a scalar"),
+        ({"observable": lambda t0, t1, q0, p0, q1, p1, args: q1}, "must return a scalar"),
     ],
 )
 def test_bad_sweeps_are_refused(change, match):
@@ -540,13 +540,13 @@ def test_bad_sweeps_are_refused(change, match):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"hs": [0.2, 0.1]}, "hs must increase"),
-        ({"hs": [0.1, 0.1]}, "hs must increase"),
+        ({"hs": [0.2, 0.1]}, "hs must be in increasing order"),
+        ({"hs": [0.1, 0.1]}, "hs must be in increasing order"),
         ({"hs": [-0.1, 0.1]}, "hs must be a list of positive"),
-        ({"epsilons": [0.2, 0.1]}, "epsilons must increase"),
+        ({"epsilons": [0.2, 0.1]}, "epsilons must be in increasing order"),
         ({"duration": 0.3}, "two of the longest steps"),
         ({"duration": np.nan}, "two of the longest steps"),
-        ({"invariant": [KEPT]}, "got 1 for 2 step sizes"),
+        ({"invariant": [KEPT]}, "got 1 observables for 2"),
     ],
 )
 def test_bad_surfaces_are_refused(change, match):

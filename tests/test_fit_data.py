@@ -200,7 +200,7 @@ REFUSED = {
 }
 if LONG.itemsize > 8:
     long = starting(p0=np.array([0.0], LONG))
-    REFUSED[TypeError].append(({"model": long}, f"p0 is {LONG}"))
+    REFUSED[TypeError].append(({"model": long}, f"p0 has the type {LONG}"))
 
 
 @pytest.mark.parametrize(

@@ -446,7 +446,11 @@ E = {"epsilon": [0.1]}
         (E | {"client": 3}, TypeError, r"distributed\.Client"),
         (E | {"epsilom": 1}, TypeError, r"sweep has no argument 'epsilom'. Did you mean 'epsilon'"),
         (E | {"newton": None, "root_finder": None}, TypeError, "are two names of one argument"),
-        (E | {"method": dvi.Strang(), "integrator": dvi.Integrator()}, ValueError, "both given"),
+        (
+            E | {"method": dvi.Strang(), "integrator": dvi.Integrator()},
+            ValueError,
+            "cannot be given together",
+        ),
         (
             {"epsilon": dvi.Axis("a", [0.1]), "h": dvi.Axis("a", [0.1, 0.2])},
             ValueError,
