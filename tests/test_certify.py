@@ -283,7 +283,7 @@ def test_command_refuses_bad_input(tmp_path):
     for words, said in [
         (("--method", "strang"), "did you mean Strang"),
         (("--check", "energies"), "did you mean energy"),
-        (("--quick", "--method", "Strang"), "--quick: given together with --method"),
+        (("--quick", "--method", "Strang"), "--quick: it is given together with --method"),
         (("--out", other), "exists and is not a certificate"),
         (("--out", tmp_path / "file"), "neither a directory nor a .md file"),
     ]:

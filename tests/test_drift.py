@@ -460,7 +460,7 @@ def test_pictures_show_what_was_excluded():
             assert excluded == np.sum(~surface.used & np.isfinite(surface.drifts))
             axes[0].figure.canvas.draw()
             plt.close(axes[0].figure)
-        with pytest.raises(ValueError, match="must have 2 orders, one per result, got 1"):
+        with pytest.raises(ValueError, match="must have 2 orders, one for each result, got 1"):
             plot.drift_orders([usual(), usual()], [1])
         axis = plot.drift_orders(usual(), expected=1)
         assert axis.figure.legends[0].get_texts()[0].get_text().endswith(", expected 1")
@@ -565,5 +565,5 @@ def test_wrong_arguments_are_refused():
 
 @pytest.mark.parametrize("wrong", ["abc", [1.0], {"energy": None}])
 def test_a_picture_of_what_are_no_orders_is_refused(wrong):
-    with pytest.raises(TypeError, match=r"drift_orders draws what dvi\.drift_order returned, got"):
+    with pytest.raises(TypeError, match=r"results must be one dvi\.DriftOrder, .*, got"):
         plot.drift_orders(wrong)

@@ -245,8 +245,8 @@ def _given(
         below = [k for k in places if not path or k == name or k.startswith(under)]
         if not below:
             raise ValueError(
-                f"{called} are given for {name!r}, which is not a fitted parameter; these are "
-                f"{', '.join(map(repr, places))}."
+                f"{called} are given for {name!r}, which is not a fitted parameter. The fitted "
+                f"parameters are {', '.join(map(repr, places))}."
             )
         where = np.concatenate([places[k].ravel() for k in below])
         has[where] = True
