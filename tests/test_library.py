@@ -534,7 +534,7 @@ def test_facts_about_nothing_are_refused():
         systems.Problem(**parts, invariants=("energy",))
     with pytest.raises(ValueError, match=r"parameters of .* contains 'k'.*not among its args .K"):
         systems.Problem(**parts, args={"K": 1.0}, parameters={"k": "strength [1]"})
-    with pytest.raises(ValueError, match="adiabatic of .* contains 'action'"):
+    with pytest.raises(ValueError, match=r"adiabatic of .* contains 'action'"):
         systems.Problem(**parts, adiabatic={"action": systems.Adiabatic("ε", 1)})
 
 

@@ -73,7 +73,7 @@ class Observations:
         if values.shape[:1] != ts.shape:
             raise ValueError(
                 f"values must have one row for each time: ts has shape {ts.shape}, values has "
-                f"{values.shape}."
+                f"shape {values.shape}."
             )
         _check_times(ts)
         if where := _first(np.isinf(values)):

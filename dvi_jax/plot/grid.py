@@ -104,7 +104,7 @@ def names_of(data: Any) -> str:
     """Names that can be an axis, for an error message."""
     sizes = ", ".join(f"{d} ({n})" for d, n in data.sizes.items())
     others = [str(c) for c in data.coords if c not in data.dims and data.coords[c].ndim == 1]
-    return (sizes or "none") + (f", and along them {', '.join(others)}" if others else "")
+    return (sizes or "none") + (f", with the coordinates {', '.join(others)}" if others else "")
 
 
 def label_of(variable: Any, name: Any) -> str:

@@ -115,7 +115,9 @@ class Store:
             store = cls(path, attributes)
         except FileNotFoundError:
             lost = f" The file was lost. {_RESTORE}" if (path / TASKS).is_dir() else ""
-            raise StoreError(f"{path}: there is no sweep here (no zarr.json).{lost}") from None
+            raise StoreError(
+                f"{path}: there is no sweep here (no zarr.json). Check the path.{lost}"
+            ) from None
         except OSError as error:
             raise StoreError(
                 f"{path}: zarr.json cannot be read ({error.strerror or error}): check its "

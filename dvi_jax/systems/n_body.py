@@ -171,7 +171,7 @@ def n_body(
     if masses is None and q0 is None and p0 is None:
         masses, q0, p0 = np.ones(3), EIGHT_POSITIONS, EIGHT_MOMENTA
     if masses is None or q0 is None or p0 is None:
-        raise TypeError("n_body requires all of masses, q0 and p0, or none of them.")
+        raise TypeError("masses, q0 and p0 must all be given, or none of them.")
     args = {"masses": np.asarray(masses, float), "G": finite("G", G)}
     check_bodies(q0, p0, args)
     return Problem(

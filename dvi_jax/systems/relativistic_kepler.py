@@ -59,7 +59,7 @@ def _misses_the_centre(q, p, args):
     if abs(L) * args["c"] <= args["K"] ** 2:
         raise ValueError(
             f"the angular momentum {L} must be larger than K²/c = {args['K'] ** 2 / args['c']} in "
-            "size: the orbit falls into the centre. Give other q0 and p0, or a larger c."
+            "size: otherwise the orbit falls into the centre. Give other q0 and p0, or a larger c."
         )
 
 

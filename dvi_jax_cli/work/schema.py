@@ -241,7 +241,7 @@ class SweepFile(SystemFile, Integration):
     t0: number_or_axis(Number) = key(0.0, FINITE + OR_AXIS)
     h: number_or_axis(StepSize) | None = key(None, STEP_SIZE + OR_AXIS)
     steps: number_or_axis(Count, Annotated[Count, BeforeValidator(_whole)]) | None = key(
-        None, f"{COUNT}{OR_AXIS} of such"
+        None, f"{COUNT}{OR_AXIS} of such numbers"
     )
     epsilon: number_or_axis(Number) | None = key(None, FINITE + OR_AXIS)
     method: union(text=Text, array=Many[Text], table=Axis[Text]) = key(
