@@ -145,12 +145,12 @@ def legendre(L: Callable[..., Any], newton: Newton = Newton()) -> Callable[..., 
     discrete, continuous = (callable(L) and accepts(L, count) for count in (5, 4))
     if discrete == continuous:
         raise TypeError(
-            "L must be a discrete Lagrangian (t0, t1, q0, v, args) or a continuous one "
-            f"(t, q, v, args), got {_described(L)}, which "
+            "L must be a function of (t0, t1, q0, v, args), a discrete Lagrangian, or of "
+            f"(t, q, v, args), a continuous one; got {_described(L)}, which "
             + (
                 "accepts both four and five arguments: wrap it in a function of four or of five."
                 if discrete
-                else "accepts neither."
+                else "accepts neither four nor five arguments."
             )
         )
     return _DiscreteLegendreTransform(L, newton) if discrete else _LegendreTransform(L, newton)
@@ -375,8 +375,9 @@ def _require_scalar(value: Any, name: str, shape: tuple[int, ...], what: str) ->
     value = jnp.asarray(value)
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(
-            f"{name} must return a real scalar ({what}); for q0 of shape {shape} it returned "
-            f"shape {value.shape}, dtype {value.dtype}. Reduce it, e.g. with jnp.sum."
+            f"{name} must return a real scalar ({what}); for q0 of shape {shape} it returned an "
+            f"array of shape {value.shape}, dtype {value.dtype}. Sum its entries with jnp.sum, or "
+            "take one component."
         )
     return value
 

@@ -142,7 +142,7 @@ class FixedPoint(Arithmetic):
         if not method.is_made_of_the_map():
             raise ValueError(
                 "arithmetic=dvi.FixedPoint(...) requires a method composed of dvi.TypeII() and its "
-                f"adjoint; {method!r} is not. Use dvi.Strang(), dvi.Yoshida(4) or another "
+                f"adjoint, got {method!r}. Use dvi.Strang(), dvi.Yoshida(4) or another "
                 "composition, or arithmetic=dvi.Compensated(), which works with every method."
             )
         if not (
@@ -151,16 +151,16 @@ class FixedPoint(Arithmetic):
         ):
             raise ValueError(
                 "arithmetic=dvi.FixedPoint(...) requires steps that are explicit forwards and "
-                "backwards, but here ∂H_D/∂q0 or the force depends on p1, or ∂H_D/∂p1 on q0. Use a "
-                "separable H_D = T(p1) + V(q0) with a force that depends on q0 and t only, or "
-                "arithmetic=dvi.Compensated()."
+                "backwards. In this system ∂H_D/∂q0 or the force depends on p1, or ∂H_D/∂p1 "
+                "depends on q0. Use a separable H_D = T(p1) + V(q0) with a force that depends on "
+                "q0 and t only, or arithmetic=dvi.Compensated()."
             )
         # Both the quantum and its reciprocal, by which a state is multiplied, must be normal.
         smallest, largest = jnp.finfo(q0.dtype).tiny, 1 / jnp.finfo(q0.dtype).tiny
         if not smallest <= self.quantum <= largest:
             raise ValueError(
-                f"quantum = {self.quantum!r} is too small or too large for {q0.dtype}: choose a "
-                f"power of two between {smallest:.1e} and {largest:.1e}."
+                f"quantum = {self.quantum!r} is too small or too large for a state in {q0.dtype}: "
+                f"choose a power of two between {smallest:.1e} and {largest:.1e}."
             )
         equations = dataclasses.replace(equations, quantum=self.quantum)
         return equations, _start_on_grid(q0, self.quantum), _start_on_grid(p0, self.quantum)

@@ -26,8 +26,8 @@ def positive(name: str, value: Any, zero: bool = False, hint: str = "") -> float
     """A positive and finite number; `zero`: or 0. **Raises** `ValueError`."""
     fits = _is_number(value) and math.isfinite(value)
     if not fits or value < 0 or (value == 0 and not zero):
-        kind = "finite number, not negative" if zero else "positive and finite number"
-        raise ValueError(f"{name} must be a {kind}, got {value!r}.{_more(hint)}")
+        kind = "zero or a positive finite number" if zero else "a positive and finite number"
+        raise ValueError(f"{name} must be {kind}, got {value!r}.{_more(hint)}")
     return float(value)
 
 
@@ -71,7 +71,7 @@ def instance(name: str, value: Any, kind: Any, called: str, hint: str = "") -> A
 def function(name: str, value: Any, arguments: str = "", hint: str = "") -> Callable[..., Any]:
     """A function; `arguments`: of what, such as "(t, q, p, args)". **Raises** `TypeError`."""
     if not callable(value):
-        of = f" {arguments}" if arguments else ""
+        of = f" of {arguments}" if arguments else ""
         raise TypeError(f"{name} must be a function{of}, got {value!r:.200}.{_more(hint)}")
     return value
 

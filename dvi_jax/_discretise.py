@@ -57,8 +57,8 @@ class _ActionRule(eqx.Module):
 
 
 _DISCRETE = (
-    "A discrete Hamiltonian H_D(t0, t1, q0, p1, args) needs no discretise: pass it to dvi.System "
-    "directly."
+    "A discrete Hamiltonian H_D(t0, t1, q0, p1, args) does not need dvi.discretise: pass it to "
+    "dvi.System directly."
 )
 
 

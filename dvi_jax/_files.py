@@ -79,7 +79,7 @@ def publish_npz(
     try:
         publish(path, content.getvalue())
     except OSError as error:
-        why = f"{error.strerror or error}; give another path, or make it possible to write there"
+        why = f"{error.strerror or error}: give another path, or permit writing to this one"
         raise OSError(error.errno, why, str(path)) from error
 
 
@@ -92,7 +92,7 @@ def read_npz(
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"there is no {what} at {path}.")
+        raise FileNotFoundError(f"the file {path} of a {what} does not exist: check the path.")
     try:
         # Without pickles: loading one would execute code from the file.
         with np.load(path, allow_pickle=False) as file:
@@ -104,12 +104,12 @@ def read_npz(
             raise ValueError("an array is missing in it")
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes
         raise ValueError(
-            f"{path} is not a {what} of this package, or it is damaged ({error}): restore it from "
-            "a backup, or remove it and compute it again."
+            f"{path} is not the file of a {what} of this package, or it is damaged ({error}): "
+            "restore it from a backup, or remove it and compute it again."
         ) from None
     if found != form:
         raise ValueError(
-            f"{path} has the format {found!r}, but this version of dvi_jax reads {form!r}: use the "
-            "version that wrote it, or remove it and compute it again."
+            f"the file {path} has the format {found!r}, but this version of dvi_jax reads only "
+            f"{form!r}: use the version that wrote it, or remove it and compute it again."
         )
     return about, arrays

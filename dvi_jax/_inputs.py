@@ -19,8 +19,8 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
     q, p = _real_array("q0", q0), _real_array("p0", p0)
     if q.shape != p.shape:
         raise ValueError(
-            f"q0 and p0 must have the same shape, got q0 {q.shape} and p0 {p.shape}: each position "
-            "needs its momentum."
+            f"q0 and p0 must have the same shape, got {q.shape} for q0 and {p.shape} for p0: give "
+            "one momentum for each position."
         )
     if q.size == 0:
         raise ValueError(f"q0 is empty, of shape {q.shape}: give at least one position.")
@@ -29,7 +29,7 @@ def start_state(q0: Any, p0: Any) -> tuple[Array, Array]:
         q, p = q.astype(dtype), p.astype(dtype)
     # Half precision has at most three digits: neither a solve nor an invariant can be checked.
     if q.dtype.itemsize < 4:
-        raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype} (too few digits).")
+        raise TypeError(f"q0 and p0 must be float32 or float64, got {q.dtype}: convert them.")
     return q, p
 
 
@@ -42,7 +42,7 @@ def as_times(of: str, ts: Any) -> Array:
     if jnp.issubdtype(ts.dtype, jnp.integer):
         ts = ts.astype(jnp.result_type(float))
     if not jnp.issubdtype(ts.dtype, jnp.floating):
-        raise TypeError(f"{of} requires real numbers as times, got dtype {ts.dtype}.")
+        raise TypeError(f"the times ts of {of} must be real numbers, got dtype {ts.dtype}.")
     return jnp.asarray(ts)
 
 
@@ -67,8 +67,8 @@ def _real_array(name: str, value: Any) -> Array:
     if isinstance(value, np.ndarray) and not np.isfinite(value).all():
         where = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
         raise ValueError(
-            f"{name} holds a value that is not finite at index {list(where)}: {value[where]}. "
-            "Every component of the initial conditions must be a number."
+            f"{name} has a value that is not finite at index {list(where)}: {value[where]}. "
+            "Every component of the initial conditions must be a finite number."
         )
     array = jnp.asarray(value)
     return array.astype(jnp.result_type(float)) if kind.kind in "iu" else array
@@ -89,7 +89,7 @@ def as_scalar(name: str, value: Any, dtype: Any, zero_allowed: bool = True) -> A
         raise TypeError(f"{name} must be a real number, got {value!r}.")
     if shape != ():
         raise ValueError(
-            f"{name} must be one number, got shape {shape}. For several values use "
+            f"{name} must be one number, got an array of shape {shape}. For several values use "
             f"jax.vmap over {name}" + (", or lattice=dvi.Given(ts)." if name == "h" else ".")
         )
     if known is not None and not np.isfinite(known):
@@ -108,7 +108,7 @@ def _as_numpy(name: str, value: Any) -> np.ndarray:
     try:
         return np.asarray(value)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be made of real numbers, got {value!r} ({error}).") from None
+        raise TypeError(f"{name} must consist of real numbers, got {value!r} ({error}).") from None
 
 
 def as_parameter(leaf: Any) -> Any:
@@ -118,7 +118,7 @@ def as_parameter(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
         refuse_double_without_x64("args", leaf.dtype)
         if leaf.dtype.kind in "OMm":
-            raise TypeError(f"args holds an array of dtype {leaf.dtype}: numbers are required.")
+            raise TypeError(f"args contains an array of dtype {leaf.dtype}: give numbers instead.")
         return jnp.asarray(leaf)
     if not isinstance(leaf, jax.Array):
         # Everything but arrays is static: compiled programs are looked up by its hash.
@@ -126,7 +126,7 @@ def as_parameter(leaf: Any) -> Any:
             hash(leaf)
         except TypeError:
             raise TypeError(
-                f"args holds a {type(leaf).__name__}, which is neither an array nor hashable: "
+                f"args contains a {type(leaf).__name__}, which is neither an array nor hashable: "
                 f"{leaf!r:.80}. Give arrays and numbers, in dicts, lists and tuples."
             ) from None
     # A float becomes an array: a new value needs no new compilation, and has a derivative.

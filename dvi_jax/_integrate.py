@@ -202,7 +202,7 @@ def integrate(
     elif traced:
         raise ValueError("progress cannot be reported under jit, vmap or grad: leave progress out.")
     elif getattr(integrator.adjoint, "report_defect", False):
-        raise ValueError("report_defect=True and progress exclude each other: leave one out.")
+        raise ValueError("report_defect=True cannot be combined with progress: leave one out.")
     else:
         with _reported(progress) as report:
             outcome = _in_pieces(task, plan, q0, p0, report, layout)
@@ -249,7 +249,7 @@ def _task(run: Run, integrator: Integrator, method: Method, h: Array) -> tuple[T
     if not (is_disturbed or system.slow_time or is_traced(epsilon)) and float(epsilon) != 0:
         warnings.warn(
             f"epsilon = {float(epsilon):g} has no effect: the system has neither a force nor a "
-            "perturbation. Leave epsilon out, or add one in dvi.System(...).",
+            "perturbation. Leave epsilon out, or add force= or perturbation= in dvi.System(...).",
             stacklevel=3,
         )
     lattice, arithmetic = integrator.lattice, integrator.arithmetic
@@ -389,8 +389,8 @@ def _raise_on_failure(solution: Solution, task: Task) -> Solution:
         return eqx.combine(checked, rest)
     if status_name(result) in ("successful", "stopped"):
         return solution
-    kept = "With throw=False the solution up to there is returned with its status; the attribute "
-    kept += "`solution` of this error has it as well."
+    kept = "With throw=False the solution up to this point is returned, with its status; it is "
+    kept += "also the attribute `solution` of this error."
     if bool(result == RESULTS.not_reached):
         missed = np.isnan(np.asarray(solution.qs)).reshape(len(solution.ts), -1).any(1)
         first = float(solution.ts[missed.argmax()])

@@ -108,8 +108,8 @@ def chosen(integrator: Integrator | None, **given: Any) -> Integrator:
     if given:
         names = ", ".join("newton" if name == "root_finder" else name for name in given)
         raise ValueError(
-            f"{names} and integrator are both given: set {names} in dvi.Integrator(...), or leave "
-            "integrator out."
+            f"{names} and integrator cannot be given together: set {names} in "
+            "dvi.Integrator(...), or leave integrator out."
         )
     return integrator
 
@@ -122,7 +122,7 @@ def only(integrator: Integrator, function: str, *used: str) -> Integrator:
         value, default = getattr(integrator, name), getattr(_DEFAULT, name)
         if name not in used and not eqx.tree_equal(value, default):
             raise ValueError(
-                f"{function} does not use {name}, but integrator has {name}={value!r}: leave it "
-                f"out. {function} uses only {', '.join(used)}."
+                f"{function} does not use {name}, but integrator has {name}={value!r}: leave "
+                f"{name} out of it. {function} uses only {', '.join(used)}."
             )
     return integrator

@@ -25,14 +25,14 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
     for leaf in jax.tree.leaves(task.observe, is_leaf=is_observable):
         if isinstance(leaf, type) and issubclass(leaf, Reduction | Running):
             raise TypeError(
-                f"observe holds the class {leaf.__name__}: make an object of it, as in "
-                f"dvi.MaxDrift(function) with a function of {FORMS}, dvi.MEGNO() or "
-                "dvi.Running(dvi.MEGNO())."
+                f"observe contains the class {leaf.__name__}: give an object, such as dvi.MEGNO(), "
+                "dvi.Running(dvi.MEGNO()) or dvi.MaxDrift(function), where the function has the "
+                f"arguments {FORMS}."
             )
         if not is_observable(leaf):
             raise TypeError(
                 f"observe must be a function of {FORMS}, a reduction such as "
-                f"dvi.MaxDrift(function), or a dict, list or tuple of these; it holds {leaf!r}."
+                f"dvi.MaxDrift(function), or a dict, list or tuple of these, got {leaf!r}."
             )
         if isinstance(leaf, Running):
             leaf = leaf.reduction
@@ -52,13 +52,14 @@ def check_observe(task: Task, q0: Array, p0: Array) -> int:
             raise
         if not hasattr(out, "shape") and not isinstance(out, int | float):
             raise TypeError(
-                f"an observable must return one array; {called} returned {type(out).__name__}. For "
-                "several values use jnp.stack, or a dictionary of observables."
+                f"the observable {called} must return one array, but it returned an object of type "
+                f"{type(out).__name__}. For several values use jnp.stack, or a dict of observables."
             )
         if isinstance(leaf, Range) and jnp.issubdtype(jnp.result_type(out), jnp.complexfloating):
             raise TypeError(
-                f"Range requires real values, since complex numbers have no order, but {called} "
-                "returns complex ones. Take real and imaginary parts, or the absolute value."
+                "dvi.Range requires real values, since complex numbers have no order, but the "
+                f"observable {called} returns complex ones. Take its real part, imaginary part or "
+                "absolute value."
             )
         if not isinstance(leaf, Reduction):
             size += int(np.prod(np.shape(out), dtype=int)) * jnp.result_type(out).itemsize

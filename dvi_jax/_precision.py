@@ -13,14 +13,15 @@ def refuse_double_without_x64(name: str, dtype: Any) -> None:
     # JAX would round both without a warning, and invariants with them.
     if np.issubdtype(dtype, np.inexact) and np.finfo(dtype).eps < np.finfo(np.float64).eps:
         raise TypeError(
-            f"{name} is {np.dtype(dtype)}, but JAX has at most double precision: use "
+            f"{name} has the type {np.dtype(dtype)}, but JAX has at most double precision: use "
             f"np.asarray({name}, np.float64), which rounds the numbers."
         )
     if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.complex128)) and not x64_enabled():
         raise TypeError(
-            f"{name} is float64, but this process computes in float32. Invariants need double "
-            'precision: put\n    jax.config.update("jax_enable_x64", True)\nbefore the first '
-            f"array is made. To compute in float32, pass {name} as jnp.float32."
+            f"{name} has the type {np.dtype(dtype)}, but this process computes in float32. "
+            "Invariants need double precision: put the line\n    "
+            'jax.config.update("jax_enable_x64", True)\nbefore the first array is made. If single '
+            "precision is sufficient, give arrays of type float32."
         )
 
 
@@ -28,6 +29,6 @@ def require_double(what: str) -> None:
     """**Raises** `ValueError` in a process that computes in float32: `what` needs more."""
     if not x64_enabled():
         raise ValueError(
-            f'{what} needs double precision: put\n    jax.config.update("jax_enable_x64", True)\n'
-            "before the first array is made."
+            f"{what} needs double precision: put the line\n    "
+            'jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
         )

@@ -36,8 +36,9 @@ class RESULTS(eqx.Enumeration):
         "are equal or the times change direction."
     )
     no_root = (
-        "The lattice equation (14) has no root near the last step: no h keeps the energy balance "
-        "there. It happens near turning points and apsides, for an H_D of first order above all. "
+        "The lattice equation (14) has no root near the last step: no h satisfies the energy "
+        "balance there. It happens near turning points and apsides, most often for an H_D of first "
+        "order. "
         "Try a smaller first h, dvi.discretise(H, order=2), a policy, "
         "lattice=dvi.Variational(on_no_root='hold') or 'minimise', or "
         "lattice=dvi.TimeTransformed(g), whose steps always exist."

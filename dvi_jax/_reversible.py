@@ -98,8 +98,9 @@ class Reversible(AbstractAdjoint):
         if why:
             if self.report_defect:
                 raise ValueError(
-                    f"report_defect=True requires states that are reconstructed, but none are: "
-                    f"{why}. Leave it out: gradients are those of dvi.Checkpointed() here."
+                    "report_defect=True requires states that can be reconstructed backwards, "
+                    f"but {why}. Leave report_defect out: gradients are then those of "
+                    "dvi.Checkpointed()."
                 )
             return Checkpointed().rollout(task, plan, q0, p0, layout)
 

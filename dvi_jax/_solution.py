@@ -61,21 +61,22 @@ class Save(eqx.Module):
 
     def __check_init__(self):
         if self.every is not None:
-            whole("every of Save", self.every)
+            whole("every in Save(every=...)", self.every)
         if self.clock is not None:
             check_takes("the clock of Save", self.clock, "(t, q, p, args)")
         if self.ts is None:
             if self.clock is not None:
-                raise ValueError("clock requires times as well: Save(ts=times, clock=...).")
+                raise ValueError("clock requires ts, its values: write Save(ts=values, clock=...).")
             return
         if self.every is not None or self.final:
             raise ValueError(
-                "Save(ts=...) saves at those times only: leave out every and final, or add their "
+                "Save(ts=...) saves only at the times ts: leave out every and final, or add their "
                 "times to ts."
             )
         if self.ts.ndim != 1 or self.ts.shape[0] == 0:
             raise ValueError(
-                f"Save(ts=...) needs a one-dimensional array of times, got shape {self.ts.shape}."
+                "ts in Save(ts=...) must be a one-dimensional array of at least one time, got "
+                f"shape {self.ts.shape}."
             )
         if not is_traced(self.ts):
             steps = np.diff(np.asarray(self.ts))
@@ -83,8 +84,8 @@ class Save(eqx.Module):
             ordered = bool((steps >= 0).all() or (steps <= 0).all())
             if not (ordered and np.isfinite(np.asarray(self.ts)).all()):
                 raise ValueError(
-                    "Save(ts=...) needs finite times in ascending order (descending for h < 0), "
-                    f"got {np.asarray(self.ts)}."
+                    "ts in Save(ts=...) must have finite times in ascending order (descending for "
+                    f"h < 0), got {np.asarray(self.ts)}."
                 )
 
 

@@ -90,10 +90,10 @@ class System(eqx.Module):
         functions = (self.H_D, self.perturbation)
         if self.slow_time and any(getattr(f, "step_is_from_times", False) for f in functions):
             raise ValueError(
-                "dvi.discretise(H, order) of order 2 and higher, dvi.from_lagrangian and "
-                "dvi.from_type_iii take the step from t1 − t0, which is not the step in a slow "
-                "time. Use dvi.discretise(H, order=1); for a higher order use method=dvi.Strang() "
-                "or dvi.Yoshida(4)."
+                "with slow_time=True, t0 and t1 are multiplied by ε, and t1 − t0 is not the step. "
+                "But functions of dvi.discretise(H, order) with order ≥ 2, dvi.from_lagrangian and "
+                "dvi.from_type_iii compute the step as t1 − t0. Use dvi.discretise(H, order=1); "
+                "for a higher order use method=dvi.Strang() or dvi.Yoshida(4)."
             )
 
     def strength(self, epsilon: Any) -> Any:
@@ -111,8 +111,8 @@ class System(eqx.Module):
         if any(parts.values()):
             has = " and ".join(name for name, is_there in parts.items() if is_there)
             raise ValueError(
-                f"the system has {has}, and epsilon, its strength, is not given: pass epsilon=... "
-                "(epsilon=0.0 for the unperturbed motion, 1.0 if the strength is in the functions)."
+                f"the system has {has}, but epsilon, its strength, is not given: pass epsilon=... "
+                "(0.0 for the unperturbed motion, 1.0 if the functions contain the strength)."
             )
         return 0.0
 
@@ -162,10 +162,10 @@ class System(eqx.Module):
                 continue
             hint = "" if shape else "Take the real part, if it is the energy."
             if out.shape and not shape:
-                hint = "Reduce it, e.g. with jnp.sum."
+                hint = "Sum its entries with jnp.sum, or take one component."
             raise ValueError(
-                f"{name}{_NAMES} must return {expected}; for q0 of shape {q.shape} it returned "
-                f"shape {out.shape}, dtype {out.dtype}. {hint}".rstrip()
+                f"{name}{_NAMES} must return {expected}; for q0 of shape {q.shape} it returned an "
+                f"array of shape {out.shape}, dtype {out.dtype}. {hint}".rstrip()
             )
 
 
@@ -192,7 +192,7 @@ def of_problem(
         q0, p0, h, args = (None, None, *tuple(given)[2:]) if has_start else given
     elif isinstance(system, System) and not has_start and (q0 is None or p0 is None):
         raise TypeError(
-            f"the initial state is missing: {'q0' if q0 is None else 'p0'} is not given. Call "
+            f"{'q0' if q0 is None else 'p0'} is missing: give the initial positions and momenta, "
             "integrate(system, q0, p0, ...)."
         )
     return system, q0, p0, h, args
@@ -257,7 +257,7 @@ def _traced_output(
     for index, size in out_of_bounds(traced):
         raise IndexError(
             f"{name}{_NAMES} uses the index {index}, which is out of bounds for an axis with "
-            f"{size} entries (q0 and p1 have shape {q.shape})."
+            f"{size} entries (q0 and p1 have shape {q.shape}). Correct the index, or the shape."
         )
     out = eqx.combine(*out)
     after = reads(function)

@@ -83,7 +83,7 @@ def verify(
     Examples
         dvi-jax verify bound.json
     """
-    found = f"no file at {certificate}"
+    found = f"there is no file {certificate}"
     require(certificate.is_file(), "CERTIFICATE", found, "a file that DriftBound.save wrote")
     from .work.verify import verify_certificate
 
@@ -152,7 +152,7 @@ def certify(
     from dvi_jax.certify import QUICK, certify, page_for
 
     is_single = not (quick and method)
-    require(is_single, "--quick", "given together with --method", "one of the two")
+    require(is_single, "--quick", "it is given together with --method", "only one of the two")
     try:
         page = None if out is None else page_for(out)
         with progress_bar("certifying") as bar:
@@ -221,7 +221,7 @@ def bench(
     session.tables([speeds])
     session.line(f"{found['machine']}; {found['setting']}")
     wrong = [r["row"] for r in found["rows"] if not r["agrees"]]
-    session.finish(found, f"the two sides differ: {', '.join(wrong)}" if wrong else "")
+    session.finish(found, f"the two results differ: {', '.join(wrong)}" if wrong else "")
 
 
 @command(app, "info", CHECKING, jax=False)

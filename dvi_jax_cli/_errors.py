@@ -54,11 +54,11 @@ def toml_type(value: Any) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value, shortened, and its type."""
+    """As "the value is 3 (a whole number)": a value, shortened, and its type."""
     text = str(value).lower() if isinstance(value, bool) else _SHORT.repr(value)
     kind = toml_type(value)
     article = {"array": "an ", "text": ""}.get(kind, "a ")
-    return f"{text} ({article}{kind})"
+    return f"the value is {text} ({article}{kind})"
 
 
 def nearest(seen: str, names: Iterable[str]) -> str:

@@ -45,7 +45,7 @@ def _refuse(error: Any, as_json: bool) -> None:
         names = [o for p in command.params for o in p.opts] + list(getattr(command, "commands", ()))
         if seen := re.search(r"No such (?:command|option):? '?([^'\s]+)'?", message):
             message += nearest(seen[1], names)
-        message += f"\n  {error.ctx.command_path} --help lists what there is"
+        message += f"\n  {error.ctx.command_path} --help lists the commands and options"
     print_error("bad input", message, as_json)
 
 

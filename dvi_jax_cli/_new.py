@@ -65,7 +65,7 @@ def _check(name: Path, system: str | None) -> None:
     last = name.name
     fits = _NAME.fullmatch(last) and last.split(".")[0].lower() not in _RESERVED
     allowed = "letters and digits first, then also . _ - and spaces"
-    require(fits and last[-1] not in " .", "NAME", repr(str(name)), allowed)
+    require(fits and last[-1] not in " .", "NAME", f"{str(name)!r} is not a valid name", allowed)
     is_new = not (name.exists() or name.is_symlink())
     require(is_new, "NAME", f"{name} exists already", "a new directory")
     if system is not None:

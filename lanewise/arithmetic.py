@@ -164,7 +164,7 @@ class Arithmetic(Writer):
     def _integer_division(self, op: str, a: Num, b: Num) -> Num:
         """Quotient or remainder; by zero −1 or the dividend, as XLA has it."""
         if a.dtype == "bool":
-            raise Unsupported(f"{op} of truth values")
+            raise Unsupported(f"{op} is not compiled for truth values")
         signed = not a.dtype.startswith("u")
         zero, one = self.known(0, a.dtype), self.known(1, a.dtype)
         by_zero = self.compare("eq", b, zero)
@@ -382,7 +382,7 @@ class Arithmetic(Writer):
         if a.dtype == dtype:
             return a
         if dtype not in TYPES:
-            raise Unsupported(f"numbers of type {dtype}")
+            raise Unsupported(f"numbers of type {dtype} are not compiled")
         to_float = dtype in FLOATS
         if a.known is not None and (to_float or not a.is_float):
             structural = a.structural and to_float

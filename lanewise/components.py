@@ -42,7 +42,7 @@ class Evaluator:
         array = np.asarray(array)
         dtype = str(array.dtype)
         if dtype not in TYPES:
-            raise Unsupported(f"numbers of type {dtype}")
+            raise Unsupported(f"numbers of type {dtype} are not compiled")
         if array.size > SMALL:
             return Value(array.shape, dtype, buffer=self.kernel.constant(array))
         entries = [self.b.known(x, dtype) for x in array.reshape(-1)]
@@ -81,7 +81,7 @@ class Evaluator:
                 outputs = [self.as_tangent(v) for v in outputs]
             known.update(zip(eqn.outvars, outputs, strict=True))
         if self.b.operations > MOST_OPERATIONS:
-            raise Unsupported(f"more than {MOST_OPERATIONS} operations a step")
+            raise Unsupported(f"a step has more than {MOST_OPERATIONS} operations")
         return [read(v) for v in jaxpr.outvars]
 
     def sine_or_cosine(self, eqn: Any, value: Value) -> Value:
@@ -105,7 +105,7 @@ class Evaluator:
             return self.by_itself(eqn, values)
         for v in eqn.outvars:
             if str(v.aval.dtype) not in TYPES:
-                raise Unsupported(f"{name} of type {v.aval.dtype}")
+                raise Unsupported(f"{name} is not compiled for type {v.aval.dtype}")
         if name == "reshape" or name in VIEWS:
             seen = self._viewed(eqn, values)
             if seen is not None:
@@ -126,14 +126,14 @@ class Evaluator:
         if written is not None:
             body = jax.make_jaxpr(functools.partial(written, **eqn.params))
             return self.closed(body(*(v.aval for v in eqn.invars)), values)
-        raise Unsupported(f"the primitive {name}")
+        raise Unsupported(f"no rule compiles the primitive {name}")
 
     def by_itself(self, eqn: Any, values: list[Value]) -> list[Value]:
         """A call within a call: no product in it is contracted with a sum outside, nor the other
         way round, so that its numbers have the same bits wherever it is called."""
         program = eqn.params["program"]
         if eqn.params["lanes"] is not None:
-            raise Unsupported("a batch within the function of one trajectory")
+            raise Unsupported("the function of one trajectory contains a batch")
         outs = self.closed(program.traced.all_inputs, [self.closed_off(v) for v in values])
         return [self.closed_off(v) for v in outs]
 
@@ -156,7 +156,7 @@ class Evaluator:
         buffer = value.buffer
         assert buffer is not None
         if value.size > most:
-            raise Unsupported(f"an array of {value.size} elements, at most {most} fit in registers")
+            raise Unsupported(f"an array has {value.size} elements, but registers hold {most}")
 
         def make() -> tuple[Value, Entries]:  # the value as well, so that no other one gets its id
             return value, objects(load_row(self.b, buffer), value.shape)
@@ -253,7 +253,7 @@ class Evaluator:
             ]
         found = [Value.in_memory(x) for x in buffers if x is not None]
         if len(found) < len(buffers):
-            raise Unsupported(f"a copy of a long array in memory, for {name}")
+            raise Unsupported(f"{name} requires a copy of a long array in memory")
         return found
 
     def _joined(self, eqn: Any, values: list[Value], place: Buffer | None) -> Value:

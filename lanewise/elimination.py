@@ -33,7 +33,7 @@ def eliminate(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> li
     matrices, vectors = values
     if matrices.size > MADE // 4:
         raise Unsupported(
-            f"linear systems whose matrices have {matrices.size} elements, at most {MADE // 4} fit"
+            f"the matrices of linear systems have {matrices.size} elements, more than {MADE // 4}"
         )
     (out,) = eqn.outvars
     front = out.aval.shape[:-1]

@@ -308,9 +308,9 @@ def runtime() -> Any:
 def set_threads(count: int) -> None:
     """Set the number of threads of a batch; 0 means all of XLA's pool."""
     if isinstance(count, bool) or not isinstance(count, int):
-        raise TypeError(f"the number of threads must be an integer, got {count!r}.")
+        raise TypeError(f"count, the number of threads, must be an integer, got {count!r}.")
     if count < 0:
-        raise ValueError(f"the number of threads must be at least 1, or 0 for all; got {count}.")
+        raise ValueError(f"count must be a positive number of threads, or 0 for all, got {count}.")
     _threads().value = count
 
 

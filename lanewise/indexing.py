@@ -120,7 +120,7 @@ def dynamic_update_slice(
     entries = e.entries(value).copy()
     # Each element is compared with each start: the code grows with the product of the sizes.
     if value.size * update.size > MADE:
-        raise Unsupported(f"an update of an array of {value.size} elements at a computed index")
+        raise Unsupported(f"{value.size} elements are too many for an update at a computed index")
     news = e.entries(update)
     for i in np.ndindex(value.shape):
         for k in np.ndindex(update.shape):
@@ -197,7 +197,7 @@ def scatter(e: "Evaluator", eqn: Any, values: list[Value], places: list) -> list
     for d, k in zip(window, dims.update_window_dims, strict=True):
         sizes[d] = updates.shape[k]
     if value.size * updates.size > 4 * MADE:
-        raise Unsupported(f"a scatter into {value.size} elements")
+        raise Unsupported(f"{value.size} elements are too many for a scatter")
 
     def updated(old: Num, new: Num) -> Num:
         if op is None:

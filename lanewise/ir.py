@@ -154,7 +154,7 @@ class Writer:
     def known(self, value: Any, dtype: str, structural: bool = False) -> Num:
         if dtype not in TYPES:
             raise Unsupported(
-                f"numbers of type {dtype}: only float64, float32, integers and bool are compiled"
+                f"numbers of type {dtype} are not compiled: use float64, float32, integers or bool"
             )
         return Num((), dtype, False, np.asarray(value, dtype)[()], structural=structural)
 

@@ -25,8 +25,8 @@ def solve(A: Array, b: Array) -> Array:
     """
     if A.ndim != 2 or A.shape[0] != A.shape[1] or b.shape != A.shape[:1]:
         raise ValueError(
-            f"A must have shape (n, n) and b shape (n,), got {A.shape} and {b.shape}. For several "
-            "systems use jax.vmap or lanewise.batched."
+            f"A must have shape (n, n) and b shape (n,), got {A.shape} for A, {b.shape} for b. For "
+            "several systems use jax.vmap or lanewise.batched."
         )
     # It makes the solution differentiable any number of times by solving with the same matrix.
     return lax.custom_linear_solve(
@@ -133,8 +133,8 @@ def on_any(x: Array, rare: bool = True) -> Array:
     kind = jnp.asarray(x)
     if kind.dtype != bool or kind.shape != ():
         raise TypeError(
-            f"on_any requires one bool of one trajectory, got {kind.dtype} of shape {kind.shape}: "
-            "write jnp.any(...) around a comparison."
+            f"x must be one bool of one trajectory, got {kind.dtype} of shape {kind.shape}: write "
+            "a comparison, and reduce an array with jnp.any(...)."
         )
     if not isinstance(rare, bool):
         raise TypeError(f"rare must be True or False, got {rare!r}.")

@@ -20,7 +20,7 @@ def started() -> Any:
     try:
         import llvmlite.binding as llvm
     except ImportError as error:
-        raise ImportError(f"{error} (required for machine code: pip install llvmlite)") from error
+        raise ImportError(f"{error}: for machine code run pip install llvmlite.") from error
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm

@@ -75,7 +75,7 @@ def pieces(closed: ClosedJaxpr, reason: Callable[[ClosedJaxpr], str | None]) -> 
             reads, writes = eqns[0].invars, eqns[0].outvars
             needed |= {v for v in reads if not isinstance(v, Literal)}
         # Without a loop XLA is as fast, and a call less is made.
-        why = group.reason or (None if group.loops else "no loop in it")
+        why = group.reason or (None if group.loops else "it has no loop")
         found.append(Piece(part, tuple(reads), tuple(writes), why, group.is_call))
     return found[::-1]
 

@@ -61,8 +61,8 @@ class Layout:
             raise ValueError(f'form must be "auto", "components" or "arrays", got {self.form!r}.')
         if self.form == "kernel":
             warnings.warn(
-                'Layout(form="kernel") is now form="auto": the Pallas kernel was removed. On a GPU '
-                "a batch runs as lax.scan under vmap.",
+                'Layout(form="kernel") now means form="auto", since the Pallas kernel was removed: '
+                'write form="auto". On a GPU a batch runs as lax.scan under vmap.',
                 DeprecationWarning,
                 stacklevel=3,
             )
@@ -124,7 +124,7 @@ def batched(function: Callable, in_axes: Any = 0, layout: Layout = AUTO) -> Call
     ```
     """
     if not callable(function):
-        raise TypeError(f"batched requires a function of one trajectory, got {function!r}.")
+        raise TypeError(f"function must be a function of one trajectory, got {function!r}.")
     if not isinstance(layout, Layout):
         raise TypeError(f"layout must be a lanewise.Layout(form=...), got {layout!r}.")
     one = functools.partial(call, function, layout=layout)
@@ -145,8 +145,8 @@ def _can_start() -> bool:
         handler.runtime()
     except Exception as error:
         warnings.warn(
-            f"No machine code can be generated here ({type(error).__name__}: {error}); batches run "
-            "through XLA, several times slower. Results agree to round-off.",
+            f"No machine code can be generated ({type(error).__name__}: {error}). XLA compiles the "
+            "batches, which run several times slower. Results agree to round-off.",
             stacklevel=2,
         )
         return False
@@ -232,7 +232,7 @@ def compiled(
     if not generates():
         raise Unsupported("no machine code is generated in this process")
     if lanes == 0:
-        raise Unsupported("a batch of no trajectories")
+        raise Unsupported("the batch has no trajectories")
     module, text = kernel_of(program, on, 1 if lanes is None else lanes, vectors)
     name = handler.registered(handler.module_text(text, module.W * module.U))
     # The operations of a block, times the rounds of its longest loop: with few of them the threads
@@ -253,7 +253,7 @@ def kernel_of(
     # Counted before code is written, which would take minutes for the largest functions.
     count = operation_count(closed.jaxpr)
     if count > MOST_OPERATIONS:
-        raise Unsupported(f"a function of {count} operations (at most {MOST_OPERATIONS})")
+        raise Unsupported(f"the function has {count} operations, more than {MOST_OPERATIONS}")
     if vectors is None and program.layout.width is not None:
         vectors = max(program.layout.width // machine.width(), 1)
     if vectors is None:

@@ -1,18 +1,20 @@
 # %% [markdown]
 # # Discovering invariants
 #
-# Which quantities does a given system conserve, exactly or to some order in $\varepsilon$? This
-# notebook answers the question for four systems, without symmetries as input.
+# In this notebook you search for the quantities that a system conserves, exactly or up to an order
+# in $\varepsilon$. You do this for four systems, without symmetries as input.
 #
-# The search is a problem of linear algebra. Let $\varphi(q, p)$ be the basis functions,
-# $\Phi_\varepsilon$ the map of one step, and $A_m$ the Taylor coefficients in $\varepsilon$ of the
-# change $\varphi \circ \Phi_\varepsilon - \varphi$ at random samples. The series $I = \sum_m
-# \varepsilon^m c_m \cdot \varphi$ is an invariant of order $z$ if
+# The search is a problem of linear algebra. Let $\varphi(q, p)$ be a vector of basis functions and
+# $\Phi_\varepsilon$ the map of one step. The matrix $A_m$ contains the Taylor coefficients of order
+# $\varepsilon^m$ of the change $\varphi \circ \Phi_\varepsilon - \varphi$, with one row for each
+# random sample. The series $I = \sum_m \varepsilon^m c_m \cdot \varphi$ with constant vectors $c_m$
+# is an invariant of order $z$ if
 #
 # $$\sum_{m \le k} A_{k-m}\, c_m = 0, \qquad k = 0 \dots z.$$
 #
-# The coefficients $c_0, \dots, c_z$ together are therefore a vector of a null space. A quarter of
-# the samples is held out for validation. A long run is the final test.
+# The coefficients $c_0, \dots, c_z$ together are therefore a vector in the null space of a matrix
+# that consists of the $A_m$. A quarter of the samples is held out for validation. A long run is the
+# final test.
 
 # %%
 import jax
@@ -40,7 +42,7 @@ def oscillator(t0, t1, q0, p1, args):
 # ## An invariant for every order
 #
 # The system is the cubic spring of the [quick start](quick_start.ipynb). The drift of an invariant
-# of order $z$ over 10 000 steps must scale as $\varepsilon^{z+1}$.
+# of order $z$, its largest change in 10 000 steps, must scale as $\varepsilon^{z+1}$.
 
 # %%
 cubic = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: -(q0**3))
@@ -63,21 +65,23 @@ plt.show()
 #
 # ## No invariant
 #
-# Van der Pol's force $(1 - q^2)\,p$ amplifies small oscillations and damps large ones. There is no
-# invariant of first order: the result must be empty. The report must give a law for the quantity
-# $I$ that is conserved only for $\varepsilon = 0$: its mean change in one step.
+# Van der Pol's force $(1 - q^2)\,p$ amplifies small oscillations and damps large ones. Therefore no
+# invariant of first order exists, and the search must return none. A quantity $I$ is conserved for
+# $\varepsilon = 0$ only. The report must give the mean change of $I$ in one step, as a function of
+# $I$.
 
 # %%
 van_der_pol = dvi.System(oscillator, force=lambda t0, t1, q0, p1, args: (1 - q0**2) * p1)
 none = dvi.discover_invariants(van_der_pol, dvi.Polynomials(6), 1, h=0.1, samples=box(1, 400))
 law = none.obstructions[0]
-print("independent functions conserved to order 0, to order 1:", none.survivors)
+print("linearly independent functions conserved to order 0, to order 1:", none.survivors)
 print(law)
 assert len(none.invariants) == 0
 
 # %% [markdown]
-# The law has a fixed point $I$, which is the limit cycle. Two runs, one from inside and one from
-# outside of it, must end there.
+# The mean change is zero at one positive value of $I$, the fixed point. This is the value of $I$ on
+# the limit cycle. A run from a state inside the limit cycle and a run from a state outside must
+# both end at this value.
 
 # %%
 runs = [
@@ -110,9 +114,9 @@ plt.show()
 # ## Number of invariants per order
 #
 # The isotropic oscillator in the plane conserves four quadratic forms, of which three are
-# functionally independent. The perturbation of Hénon and Heiles, $\varepsilon (x^2 y - y^3/3)$,
-# destroys some of these conservation laws. The next cell counts the leading-order terms $c_0 \cdot
-# \varphi$ that have corrections up to orders 0, 1 and 2.
+# functionally independent. The perturbation of Hénon and Heiles, $\varepsilon (q_1^2 q_2 -
+# q_2^3/3)$, destroys some of these conservation laws. The next cell counts the linearly independent
+# leading-order terms $c_0 \cdot \varphi$ of the invariants of order 0, 1 and 2.
 
 # %%
 henon_heiles = dvi.System(
@@ -128,21 +132,21 @@ for series in found.invariants:
 assert found.survivors == (13, 4, 2)
 
 # %% [markdown]
-# There are thirteen at order 0: the four quadratic forms and nine products of them, of degree four.
-# The corrections of the products would have degree five, which is not in the basis; therefore four
-# remain at order 1. Two of these, the angular momentum and the energy, have corrections of second
-# order. This does not hold at all orders: the motion becomes chaotic, and then only the energy is
-# conserved.
+# Thirteen terms exist at order 0: the four quadratic forms and nine products of them, of degree
+# four. The corrections of the products would have degree five, but the basis ends at degree four.
+# Therefore only the four quadratic forms remain at order 1. Two of them, the angular momentum and
+# the energy, also have corrections of second order. For large $\varepsilon$ the motion is chaotic,
+# and of these quantities only the energy is conserved.
 
 # %% [markdown]
 # ## A basis that is too small
 #
-# If the basis cannot represent an invariant, the search does not find it, but it must not report a
-# wrong one. For Kepler's problem and polynomials only the angular momentum is found. With $1/r$ in
-# the basis, three more are found: a map of second order conserves the energy and the two components
-# of the Laplace–Runge–Lenz vector approximately. The smaller a singular value, the better the
-# conservation. `tolerance` is the limit, relative to the largest singular value, below which a
-# singular value counts as zero.
+# If the basis cannot represent an invariant, the search does not find the invariant, but it must
+# not report a wrong one. For Kepler's problem and a basis of polynomials, only the angular momentum
+# is found. With $1/r$ in the basis, three approximate invariants are found, too: the energy and the
+# two components of the Laplace–Runge–Lenz vector. The better the map conserves a quantity, the
+# smaller is its singular value. A singular value counts as zero if it is below `tolerance` times
+# the largest one.
 
 # %%
 kepler = dvi.System(lambda t0, t1, q0, p1, args: p1 @ p1 / 2 - 1 / jnp.sqrt(q0 @ q0))
@@ -168,9 +172,9 @@ assert kept["with 1/r"].survivors[0] == 4
 # %% [markdown]
 # ## Next steps
 #
-# - A system with a slow time $\tau = \varepsilon t$, `dvi.System(..., slow_time=True)`, requires
-#   samples (qs, ps, taus): for the slow oscillator in `examples/what_is_conserved.py` the search
-#   finds the discrete action.
-# - `dvi.find_symmetries` finds generators of symmetries; `dvi.noether_balance` measures the causes
-#   of a drift.
-# - Systems without adiabatic invariants: [limits](limits.ipynb).
+# - Search for invariants that depend on a slow time $\tau = \varepsilon t$:
+#   `dvi.System(..., slow_time=True)`, with samples (qs, ps, taus). For the oscillator with a slowly
+#   varying frequency in `examples/what_is_conserved.py` the search finds the discrete action.
+# - Find generators of symmetries with `dvi.find_symmetries`, and measure the causes of a drift with
+#   `dvi.noether_balance`.
+# - Study systems in which adiabatic invariance fails: [limits](limits.ipynb).

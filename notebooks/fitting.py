@@ -1,17 +1,17 @@
 # %% [markdown]
 # # Fit ε to data
 #
-# This notebook determines the strength $\varepsilon$ of a perturbation and its error from noisy
-# observations, and tests whether the data require a perturbation at all. `dvi.fit` minimises
+# In this notebook you determine the strength $\varepsilon$ of a perturbation and its error from
+# noisy observations, and test whether the data require a perturbation at all. `dvi.fit` minimises
 # $\chi^2$ with the derivatives of the discrete trajectory.
 #
-# The example has a known solution, an oscillator with weak friction,
+# The example is an oscillator with weak friction, whose exact solution is known,
 #
 # $$H = \tfrac12 p^2 + \tfrac12 k q^2, \qquad \dot p = -kq - \varepsilon p, \qquad
-# k = 1.3,\ \varepsilon = 0.02 ,$$
+# k = 1.3,\ \varepsilon = 0.02 .$$
 #
-# observed 60 times within 30 units of time, with errors of 0.01. The data are generated from the
-# exact solution, not from the model.
+# Its position is observed 60 times within 30 units of time, with a standard deviation of 0.01. The
+# data are generated from the exact solution, not from the model.
 
 # %%
 import jax
@@ -39,8 +39,9 @@ def observed(seed, epsilon=EPSILON):
 # %% [markdown]
 # ## The fit
 #
-# `Model` contains the known quantities. The third argument of `fit` contains the unknown ones,
-# with their initial guesses: $\varepsilon = 0$ means no perturbation.
+# `Model` contains the known quantities. The third argument of `fit` contains the initial guesses of
+# the unknown ones. The guess $\varepsilon = 0$ means no perturbation; it replaces the `epsilon` of
+# the model.
 
 
 # %%
@@ -61,8 +62,8 @@ for name, x, sigma in zip(found.names, found.x, found.sigma, strict=True):
 print(f"{found.status}, reduced chi² = {found.reduced_chi2:.2f}")
 
 # %% [markdown]
-# The plot shows the observations with their errors, and the trajectory of the fitted parameters at
-# all steps. Without `curve` it shows the predictions at the times of observation.
+# The plot shows the observations with their errors, and the trajectory with the fitted parameters
+# at all steps (`curve`).
 
 # %%
 fitted = dvi.integrate(system, p0=[0.0], h=0.05, t1=ts[-1], method=dvi.Yoshida(4), **found.params)
@@ -72,8 +73,8 @@ plt.show()
 # %% [markdown]
 # ## Are the errors correct?
 #
-# For thirty noise realisations the standard deviation of the estimates must agree with the error
-# that the fit reports. Only the first fit needs compilation.
+# The fit is repeated for thirty noise realisations. The standard deviation of the estimates of
+# $\varepsilon$ must agree with the error that the fit reports.
 
 # %%
 epsilon_at = found.names.index("epsilon")
@@ -94,8 +95,8 @@ assert 0.7 < pulls.std(ddof=1) < 1.3
 # %% [markdown]
 # ## Do the data require the friction?
 #
-# There are two controls. A fit of the same data by a model without friction must have a $\chi^2$
-# that is too large. A fit to data without friction must give an $\varepsilon$ that is compatible
+# There are two controls. A fit to the same data with a model without friction must have a reduced
+# $\chi^2$ far above 1. A fit to data without friction must give an $\varepsilon$ that is compatible
 # with zero.
 
 # %%
@@ -113,10 +114,11 @@ assert abs(none.x[epsilon_at]) < 3 * none.sigma[epsilon_at]
 # %% [markdown]
 # ## Which force is it?
 #
-# Suppose that the law is unknown. `identify` fits the coefficients of many candidate terms to the
-# trajectory and removes the terms that the data do not support. Candidates are the monomials
-# $q^i p^j$ up to degree 3; positions and momenta are observed. The true force is $-\varepsilon p$.
-# The printed criterion is $\chi^2$ plus a penalty for each term; smaller is better.
+# Suppose that the force law is unknown, and that positions and momenta are observed. `identify`
+# fits the coefficients of many candidate terms to the trajectory and removes the terms that the
+# data do not support. The candidates are the nine monomials $q^i p^j$ of degree 1 to 3. The true
+# force is $-\varepsilon p$. The printed criterion is $\chi^2$ plus a penalty for each term; smaller
+# is better.
 
 # %%
 times = np.linspace(0.25, 30, 120)
@@ -153,9 +155,10 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - Real data, with systematic errors: [general relativity](general_relativity.ipynb) and
+# - Fit real data, with systematic errors: [general relativity](general_relativity.ipynb) and
 #   the [Chandler wobble](polar_motion.ipynb).
-# - `dvi.fit` has the arguments `bounds`, `priors`, `loss` (for data with outliers) and `shooting`
-#   (`MultipleShooting` for chaotic arcs), and fits several arcs together.
-# - `dvi.NetworkForce`: a potential and a damping given by networks.
-# - `dvi.sample`: the posterior distribution of the parameters, not only their errors.
+# - Use the arguments `bounds`, `priors`, `loss` (for data with outliers) and `shooting`
+#   (`MultipleShooting`, for chaotic trajectories) of `dvi.fit`, or fit several data sets together.
+# - Fit an unknown force: in `dvi.NetworkForce` neural networks represent its potential and its
+#   damping.
+# - Sample the posterior distribution of the parameters: `dvi.sample`.

@@ -1,18 +1,17 @@
 # %% [markdown]
 # # General relativity from the ephemeris
 #
-# The Sun and the planets move according to Newton's law, with a perturbing force: $\varepsilon$
-# times the relativity of the Sun,
+# In this notebook you fit the strength $\varepsilon$ of general relativity to positions of Mercury.
+# The Sun and the planets move according to Newton's law and a perturbing force, which is
+# $\varepsilon$ times the post-Newtonian correction $W_{\rm PN}$ of the Sun's attraction,
 #
-# $$\dot p = -\frac{\partial H}{\partial q} + \varepsilon\, W_{\rm PN}(q, p).$$
+# $$\dot p = -\frac{\partial H}{\partial q} + \varepsilon\, W_{\rm PN}(q, p),$$
 #
-# This notebook fits $\varepsilon$ to the positions of Mercury in JPL's ephemeris DE421. DE421 is
-# itself an integration with relativity, fitted to observations, so the expected result is
+# where $H$ is the Hamiltonian of Newton's law. The positions are those of JPL's ephemeris DE421.
+# DE421 is itself an integration with relativity, fitted to observations, so the expected result is
 # $\varepsilon = 1$. The initial guess is 0.
 #
-# The notebook needs the ephemeris: `pip install ".[ephemeris]"` in a clone.
-# `python examples/general_relativity.py` is a program that also analyses the residuals of a
-# century.
+# The notebook needs the ephemeris: `pip install ".[ephemeris]"` in a clone of the repository.
 
 # %%
 import jax
@@ -27,13 +26,13 @@ from dvi_jax.systems.solar_system import AU_IN_KM, GM, ephemeris, julian_date
 
 jax.config.update("jax_enable_x64", True)
 
-YEARS = 5  # a century takes minutes, and is in docs/general-relativity.md
+YEARS = 5  # 100 years take minutes; the results are in docs/general-relativity.md
 
 # %% [markdown]
 # ## The data
 #
-# The data are heliocentric positions of Mercury every ten days from 1900 on. They have no errors;
-# the fit estimates the size of the differences between model and ephemeris from the residuals.
+# The data are heliocentric positions of Mercury every ten days from 1900 on. No standard deviation
+# is given for them; the fit estimates it from the residuals.
 
 # %%
 START, MERCURY = julian_date("1900-01-01"), 1
@@ -51,9 +50,9 @@ print(len(days), "positions")
 # %% [markdown]
 # ## The model
 #
-# `post_newtonian_force` is the perturbing force $W$, and $\varepsilon$ its strength. The initial
-# states are those of the ephemeris. Six corrections of Mercury's initial state, in au and au/day,
-# are fitted together with $\varepsilon$.
+# `post_newtonian_force` is the perturbing force $W_{\rm PN}$. The initial states are those of the
+# ephemeris. Six corrections `start` of Mercury's initial position [au] and velocity [au/day] are
+# fitted together with $\varepsilon$.
 
 # %%
 system = dvi.System(hamiltonian_with_oblateness, force=post_newtonian_force)
@@ -82,7 +81,7 @@ def fitted(model, params):
 # %% [markdown]
 # ## Two fits: Newton alone, and with relativity
 #
-# Both models include the oblateness of the Sun, $J_2 = 2 \times 10^{-7}$, which also turns the
+# Both fits include the oblateness of the Sun, $J_2 = 2 \times 10^{-7}$, because it also rotates the
 # perihelion. The fit without relativity is the control: its residuals must be much larger.
 
 # %%
@@ -110,10 +109,10 @@ assert rms(fits["Newton alone"]) > 1000 * rms(fit)  # control: the data require 
 assert lag > 0.5  # so that the formal error is much too small
 
 # %% [markdown]
-# The printed error (±) is formal: it assumes independent residuals. The residuals vary slowly, so
-# the true error of $\varepsilon$ is many times larger. In a model without the oblateness,
-# `"J2": 0.0`, the fit attributes its effect on the perihelion to relativity: $\varepsilon$ is then
-# 1.0006, also over a century.
+# The printed error (±) is formal: it assumes independent residuals. But neighbouring residuals are
+# correlated, so the true error of $\varepsilon$ is many times larger. In a model without the
+# oblateness, `"J2": 0.0`, the fit attributes the effect of the oblateness to relativity:
+# $\varepsilon$ is then 1.0006.
 
 # %%
 with plot.style():
@@ -128,5 +127,6 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - A century (`YEARS = 100`) and its residuals: `docs/general-relativity.md`.
+# - Fit 100 years and analyse the residuals: `python examples/general_relativity.py`;
+#   `docs/general-relativity.md` shows the results.
 # - Fit another body, or use the Hamiltonian form of relativity in `dvi_jax.systems.relativity`.

@@ -1,12 +1,12 @@
 # %% [markdown]
 # # GPU: devices, batches, precision
 #
-# How do you run a batch of trajectories on a GPU, and how much accuracy does single precision lose?
-# This notebook runs on any device that JAX finds. The stored outputs are those of a CPU.
+# In this notebook you run a batch of trajectories on a GPU or another device that JAX finds, and
+# measure how much accuracy is lost in single precision. The stored outputs are those of a CPU.
 #
 # **The package has not been tested on a GPU**, and its speed there has not been measured
-# (`docs/gpu.md`). On a GPU a batch is an ordinary JAX program, a scan over the steps under `vmap`,
-# which XLA compiles.
+# (`docs/gpu.md`). On a GPU a batch is an ordinary JAX program, `jax.lax.scan` over the steps under
+# `jax.vmap`, which XLA compiles.
 
 # %%
 import jax
@@ -23,16 +23,17 @@ device = jax.devices()[0]
 print("platform:", device.platform)
 
 # %% [markdown]
-# To select the device, set `JAX_PLATFORMS=cpu` or `JAX_PLATFORMS=cuda` in the environment before
-# Python starts. For an NVIDIA GPU install the extra `cuda12`. In a program,
-# `jax.default_device(device)` selects the device for a `with` block, and computations with an array
-# run on the device of the array (`jax.device_put`).
+# For an NVIDIA GPU install the extra `cuda12`. To select the device, set `JAX_PLATFORMS=cpu` or
+# `JAX_PLATFORMS=cuda` in the environment before Python starts. In a program,
+# `jax.default_device(device)` selects the device for a `with` block. Arrays that `jax.device_put`
+# has moved to a device are used on this device.
 #
 # ## A batch
 #
-# One trajectory is a sequence of small dependent operations; a GPU needs many trajectories.
-# Therefore the function of one trajectory is mapped over initial conditions: `vmap`, then `jit`.
-# With `Save(final=True)` and reductions, memory does not grow with the number of steps.
+# One trajectory is a sequence of small operations, which cannot run in parallel. To use a whole
+# GPU, compute many trajectories at once: `jax.vmap` maps the function of one trajectory over the
+# initial conditions, and `jax.jit` compiles the result. With `Save(final=True)` and reductions such
+# as `MaxDrift`, memory does not grow with the number of steps.
 
 
 # %%
@@ -71,8 +72,9 @@ print(
 assert float(drift.max()) < 1e-12
 
 # %% [markdown]
-# Several devices: `dvi.over_devices(jax.vmap(one))` divides the trajectories between them;
-# `dvi.sweep` distributes tasks to all of them. With one device the result is identical bit for bit.
+# With several devices, `dvi.over_devices(jax.vmap(one))` divides the trajectories between them, and
+# `dvi.sweep` distributes its tasks to all of them. With one device, the result must be identical
+# bit for bit to that without `over_devices`.
 
 # %%
 divided = jax.jit(dvi.over_devices(jax.vmap(one)))
@@ -82,9 +84,9 @@ print(len(jax.devices()), "device")
 # %% [markdown]
 # ## Two ways to compile
 #
-# With `Layout()`, the default, a run is compiled to machine code on a CPU, and by XLA on a GPU.
-# `Layout(form="arrays")` uses XLA everywhere. The results agree to round-off, which we check with
-# eight trajectories of twenty steps:
+# With `Layout()`, the default, this package compiles a run to machine code on a CPU, and XLA
+# compiles it on a GPU. With `Layout(form="arrays")`, XLA compiles it on every device. The results
+# must agree to round-off, which the next cell checks with eight trajectories of twenty steps.
 
 # %%
 few = q0[:8], p0[:8]
@@ -100,17 +102,17 @@ assert worst < 1e-14
 # %% [markdown]
 # ## Single precision
 #
-# Graphics GPUs compute in float32 many times faster than in float64. A run uses float32 only if the
-# initial state has this type; float64 input raises an error if x64 is switched off. This map
-# conserves the angular momentum exactly, so its drift is round-off. The plot shows how the drift
-# grows with the number of steps.
+# Many GPUs compute much faster in float32 than in float64. A run uses float32 only if the initial
+# state has this type. If x64 is switched off, float64 input raises an error. The next cell computes
+# the same orbits in both precisions. The map conserves the angular momentum exactly, so its drift
+# is round-off. The plot shows how this drift grows with the number of steps.
 
 # %%
 marks = np.unique(np.geomspace(10, 200_000, 40).astype(int))
 
 
 def drift_of_L(dtype, arithmetic):
-    """Root mean square over 64 orbits of the change of L, at steps that are marked."""
+    """Root mean square over 64 orbits of the relative change of L, at the steps in `marks`."""
 
     def run(q0, p0):
         sol = dvi.integrate(
@@ -136,7 +138,7 @@ for name, values in growth.items():
     print(f"{name:21} after {marks[-1]} steps: {values[-1]:.0e}")
 
 ratio = growth["float32"][-1] / growth["float64"][-1]
-assert 1e7 < ratio < 1e10  # of the units in the last place: 5e8
+assert 1e7 < ratio < 1e10  # the ratio of the rounding units is 5e8
 assert growth["float32, compensated"][-1] < 0.1 * growth["float32"][-1]
 
 # %%
@@ -151,11 +153,12 @@ with plot.style():
 plt.show()
 
 # %% [markdown]
-# In float32 the drift is larger by the ratio of the rounding units, about $5 \times 10^8$.
-# `Compensated()` stores the rounding error of each step and adds it in the next step. After
-# 200 000 steps an exact invariant has changed by $2 \times 10^{-5}$ in plain float32. The drift of
-# an adiabatic invariant cannot be measured in float32 if it is smaller than this. Therefore the
-# package does not let JAX round float64 input to float32, but raises an error.
+# In float32 the drift is larger approximately by the ratio of the rounding units of float32 and
+# float64, $5 \times 10^8$. After 200 000 steps in float32 an exact invariant has changed by $2
+# \times 10^{-5}$; smaller drifts of adiabatic invariants cannot be measured in this arithmetic.
+# Therefore the package raises an error where JAX would round float64 input to float32.
+# `Compensated()` stores the rounding error of each step and adds it in the next step, which reduces
+# the drift to $2 \times 10^{-7}$.
 #
 # ## Next steps
 #

@@ -1,16 +1,17 @@
 # %% [markdown]
 # # Limits of adiabatic invariance
 #
-# An adiabatic invariant such as the action requires conditions: the perturbation is not resonant
-# with the frequencies of the motion, phase volume is conserved, and the orbit does not cross a
-# separatrix. This notebook violates each condition in turn, measures how the change of the action
-# scales with $\varepsilon$, and compares the result with a case without the violation.
+# In this notebook you measure how adiabatic invariance fails. The action is an adiabatic invariant
+# under three conditions: the perturbation is not resonant with the frequencies of the motion, phase
+# volume is conserved, and the orbit does not cross a separatrix. You violate one condition after
+# the other, measure how the change of the action $J$ scales with $\varepsilon$, and compare it with
+# a case in which an invariant exists. The table gives the expected results; $c$ is a constant.
 #
-# | violated by | change of the action | for comparison |
+# | violation | change of $J$ | change in the comparison case |
 # |---|---|---|
-# | a resonance | $\varepsilon^{1/2}$ | no resonance: $\varepsilon$ |
-# | dissipation, $t \le 1/\varepsilon$ | 63 %, $\varepsilon^0$ | rescaled action: $\varepsilon$ |
-# | a separatrix | $\varepsilon$ | no crossing: $e^{-c/\varepsilon}$ |
+# | resonance | $\propto \varepsilon^{1/2}$ | without resonance $\propto \varepsilon$ |
+# | dissipation, $t \le 1/\varepsilon$ | 63 % | of $J e^{\varepsilon t}$: $\propto \varepsilon$ |
+# | separatrix crossing | $\propto \varepsilon$ | without crossing $\propto e^{-c/\varepsilon}$ |
 
 # %%
 import jax
@@ -38,18 +39,18 @@ def power_law(epsilons, changes):
 # %% [markdown]
 # ## Passage through a resonance
 #
-# An oscillator whose frequency rises slowly from $\bar\omega - 0.3$ to $\bar\omega + 0.3$ is driven
-# weakly with frequency 1,
+# The system is an oscillator whose frequency $\omega$ rises slowly from $\bar\omega - 0.3$ to
+# $\bar\omega + 0.3$. A weak force drives it with frequency 1,
 #
 # $$\ddot q + \omega^2 q = \varepsilon \cos t, \qquad
 # \omega = \bar\omega + 0.3 \tanh(\varepsilon t).$$
 #
-# For $\bar\omega = 1$ it passes through the resonance $\omega = 1$, where $\dot\omega =
+# For $\bar\omega = 1$ the oscillator passes through the resonance $\omega = 1$, where $\dot\omega =
 # 0.3\,\varepsilon$. Let $J$ be the action, and write the state as $\sqrt{J}\, e^{-i\theta} =
-# (\sqrt\omega\, q + i p/\sqrt\omega)/\sqrt2$. Relative to the phase $\theta$ of the free motion
-# and up to terms that oscillate fast, the drive adds $\tfrac{i\varepsilon}{2\sqrt2}\, e^{i\phi}$ to
-# the amplitude $\sqrt{J}$ per unit of time, with $\phi = \theta - t$. At the resonance $\phi$ is
-# stationary for a time $\sqrt{2\pi/\dot\omega}$, in which these contributions accumulate. To
+# (\sqrt\omega\, q + i p/\sqrt\omega)/\sqrt2$ with the amplitude $\sqrt J$ and the phase $\theta$.
+# Close to the resonance and up to terms that oscillate fast, the force changes the amplitude at the
+# rate $-\tfrac{\varepsilon}{2\sqrt2} \sin\phi$, with $\phi = \theta - t$. At the resonance $\phi$
+# is stationary for a time of about $\sqrt{2\pi/\dot\omega}$, in which these changes add up. To
 # leading order in $\varepsilon$ the amplitude changes by at most
 #
 # $$|\Delta \sqrt J| \le \frac{\varepsilon}{2\sqrt2} \sqrt{\frac{2\pi}{0.3\,\varepsilon}},
@@ -101,10 +102,12 @@ print("largest change over the phases, measured / predicted:", np.round(passed /
 print(f"no resonance: the change scales as ε^{power(epsilons, missed):.2f}")
 
 # %% [markdown]
-# The estimate is that of stationary phase, to leading order. The measured change agrees within a
-# few percent for small $\varepsilon$, and is 16 % larger at the largest $\varepsilon$, where the
-# quadratic term changes the exponent. Therefore we fit the exponent to half of the range of
-# $\Delta J$ over the phases, which does not contain this term.
+# The measured change agrees with the estimate within 3 % for the three smallest $\varepsilon$, and
+# is 16 % larger than the estimate at the largest $\varepsilon$. Only the term $2\sqrt{J}\,
+# |\Delta\sqrt J|$ scales as $\varepsilon^{1/2}$; the quadratic term $|\Delta\sqrt J|^2$ is
+# proportional to $\varepsilon$. The quadratic term has the same value at the maximum and at the
+# minimum of $\Delta J$ over the phases, and cancels in their difference. Therefore we fit the
+# exponent to half of this difference.
 
 # %%
 half_range = np.ptp(through, axis=1) / 2
@@ -117,10 +120,10 @@ assert np.all(np.abs(passed / jump - 1)[epsilons < 2e-3] < 0.05)
 # %% [markdown]
 # ## Dissipation
 #
-# The system is a pendulum with friction, $\dot p = -\sin q - \varepsilon p$. Averaged over an
-# oscillation, $\langle \dot J \rangle = -\varepsilon J$, since $\oint p^2 dt = \oint p\, dq =
-# 2\pi J$. After a time $1/\varepsilon$ the action has decreased by a factor $e$, for any small
-# $\varepsilon$. The adiabatic invariant is $J e^{\varepsilon t}$.
+# The system is a pendulum with friction, $\dot p = -\sin q - \varepsilon p$. The average over an
+# oscillation is $\langle \dot J \rangle = -\varepsilon J$, because $\oint p^2 dt = \oint p\, dq =
+# 2\pi J$. Therefore the action decreases by a factor $e$, that is by 63 %, within a time
+# $1/\varepsilon$, for any small $\varepsilon$. The adiabatic invariant is $J e^{\varepsilon t}$.
 
 # %%
 pendulum = systems.pendulum()
@@ -153,8 +156,9 @@ assert np.all(np.abs(lost - (1 - np.exp(-1))) < 0.01)
 assert abs(power(epsilons, kept) - 1) < 0.05
 
 # %% [markdown]
-# The type II map is *conformally* symplectic with this friction: each step multiplies the phase
-# volume by the same number, $1/(1 + \varepsilon h)$, at every state.
+# With this friction, `dvi.TypeII`, the default method, is a *conformally* symplectic map: each step
+# multiplies the phase volume by the same number, $1/(1 + \varepsilon h)$, at every state. The next
+# cell verifies this at three states.
 
 
 # %%
@@ -175,8 +179,9 @@ print(f"area after one step: {areas[0, 0]:.6f} … {areas[0, -1]:.6f}")
 assert np.abs(areas * (1 + h * epsilons) - 1).max() < 1e-14
 
 # %% [markdown]
-# The search for invariants gives the same result for the linear oscillator with this friction: no
-# invariant of first order exists, and the report gives the averaged law of the drift.
+# For the linear oscillator with the same friction, the search for invariants must find no invariant
+# of first order. The report must confirm the law $\langle \dot J \rangle = -\varepsilon J$. It
+# gives the mean change of the leading-order term $I$ in a step of $h = 0.1$.
 
 # %%
 damped = dvi.System(
@@ -192,15 +197,19 @@ assert len(found.invariants) == 0
 # ## Crossing of a separatrix
 #
 # The system is a pendulum without friction whose frequency changes slowly, $H = p^2/2 - \omega^2
-# \cos q$, $\omega = 1 \pm 0.3 \tanh(\varepsilon t)$. At first it oscillates with an amplitude of
-# 2 rad. The area inside the separatrix is $16\,\omega$. If $\omega$ decreases, this area becomes
-# smaller than that of the orbit, and the pendulum begins to rotate. At the crossing the period is
-# infinite, so the change of $\omega$ is not slow compared with it. The action $J = \oint p\,
-# dq/2\pi$ (after the crossing twice that of one rotation, so that both measure the same area)
-# changes by an amount that depends on the phase. In theory (Cary, Escande & Tennyson 1986;
-# Neishtadt 1986) this amount has order $\varepsilon$, in general with a logarithm, $\varepsilon \ln
-# \varepsilon$. If $\omega$ increases there is no crossing. Because $\omega(t)$ is analytic, the
-# change of $J$ from $t = -\infty$ to $\infty$ is then smaller than any power of $\varepsilon$.
+# \cos q$ with $\omega = 1 \pm 0.3 \tanh(\varepsilon t)$. The initial amplitude is 2 rad. The action
+# is $J = \oint p\, dq/2\pi$; for a rotation we use twice this integral, so that $J$ has the same
+# value on both sides of the separatrix.
+#
+# The area inside the separatrix is $16\,\omega$. If $\omega$ decreases, this area becomes smaller
+# than the area inside the orbit: the orbit crosses the separatrix, and the pendulum begins to
+# rotate. At the crossing the period is infinite, so $\omega$ does not change slowly in comparison.
+# $J$ then changes by an amount that depends on the phase. In theory (Cary, Escande & Tennyson 1986;
+# Neishtadt 1986) this amount has order $\varepsilon$, in general with a logarithm,
+# $\varepsilon \ln \varepsilon$.
+#
+# If $\omega$ increases, the orbit does not cross the separatrix. Because $\omega(t)$ is analytic,
+# the change of $J$ from $t = -\infty$ to $\infty$ is then smaller than any power of $\varepsilon$.
 
 # %%
 swinging = dvi.System(
@@ -253,9 +262,9 @@ assert abs(power(crossing_epsilons, crossed) - 1) < 0.1
 assert slowest > 10
 
 # %% [markdown]
-# With a crossing, the change is proportional to $\varepsilon$. Over a factor of 15 in $\varepsilon$
-# the ratio to $\varepsilon$ changes by a few percent only, so that a logarithm is hardly visible.
-# Without a crossing, the change is not a power of $\varepsilon$.
+# With a crossing, the change is proportional to $\varepsilon$. While $\varepsilon$ increases by a
+# factor of 15, the change divided by $\varepsilon$ decreases from 0.49 to 0.46 only, so that a
+# logarithm is hardly visible. Without a crossing, the change is exponentially small.
 #
 # ## Summary
 
@@ -272,7 +281,7 @@ with plot.style():
     label = f"crossing: {power_law(crossing_epsilons, crossed)}"
     c.loglog(crossing_epsilons, crossed, "o", label=label)
     c.loglog(slow_epsilons, not_crossed, "s", label=f"no crossing: exp(−{rate:.1f}/ε)")
-    c.set(title="Passage of a separatrix", ylabel="rms change of the action")
+    c.set(title="Crossing of a separatrix", ylabel="rms change of the action")
     for axis in axes:
         axis.set_xlabel("strength ε of the perturbation")
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2))
@@ -281,9 +290,11 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - Replace $\tanh$ by a ramp with a corner, `jnp.clip(x, -1, 1)`: the change without crossing
-#   becomes a power of $\varepsilon$, because exponential smallness requires a smooth $\omega$.
-# - Close to a resonance that is constant in time, a series in $\varepsilon$ is useful only up to a
-#   small $\varepsilon$: `reach` in the result of `discover_invariants`.
+# - Replace $\tanh$ by a ramp with a corner, `jnp.clip(x, -1, 1)`: the change without a crossing
+#   becomes a power of $\varepsilon$, because an exponentially small change requires a smooth
+#   $\omega$.
+# - Search for invariants close to a resonance that is constant in time. Their series in
+#   $\varepsilon$ are useful only below a small $\varepsilon$, which `reach` in the result of
+#   `discover_invariants` gives.
 # - Chaos destroys invariants, too: `dvi.LyapunovSpectrum()`, `dvi.GALI(2)` and
 #   `dvi.frequency_diffusion` distinguish regular from chaotic orbits.

@@ -1,19 +1,22 @@
 # %% [markdown]
 # # The magnetic moment in a magnetic mirror
 #
-# A charged particle gyrates around a field line. If the field increases along the line, the
-# particle is reflected, for example in the Earth's field and in mirror machines. The reason is an
-# adiabatic invariant, the magnetic moment
+# In this notebook you measure how well a magnetic mirror conserves the magnetic moment of a charged
+# particle, and whether the particle is reflected where the magnetic moment predicts it.
+#
+# The particle gyrates around a field line. If the field increases along the line, the particle is
+# reflected. The reason is an adiabatic invariant, the magnetic moment. Its leading-order term is
 #
 # $$\mu_0 = \frac{m v_\perp^2}{2 B},$$
 #
-# where $v_\perp$ is the velocity perpendicular to the field. The small parameter is the gyroradius
-# divided by the length over which the field changes. This notebook measures how well $\mu_0$ and
-# its first correction are conserved, and whether the particle is reflected where $\mu$ predicts it.
+# where $m$ is the mass, $v_\perp$ the velocity perpendicular to the field and $B$ the field
+# strength. The small parameter is the gyroradius divided by the length over which the field
+# changes.
 #
-# The system is `systems.magnetic_mirror`, $H = |p - eA(q)|^2/2m$ with $B = B_0 (1 + z^2/\ell^2)$ on
-# the axis. Gyroradius and gyrofrequency are 1 at the centre, so $1/\ell$ is the small parameter.
-# $H$ is not separable, so each step is implicit.
+# The system is `systems.magnetic_mirror`, $H = |p - eA(q)|^2/2m$ with the charge $e$ and the vector
+# potential $A$. On the axis $B = B_0 (1 + z^2/\ell^2)$. The gyroradius and the gyrofrequency are 1
+# at the initial state, so the small parameter is $1/\ell$. $H$ is not separable, so each step is
+# implicit.
 
 # %%
 import jax
@@ -29,9 +32,10 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## The motion
 #
-# The initial guiding centre is at a distance $\ell/2$ from the axis. The run covers about two
-# bounces, from one mirror point to the other and back. The method is that of Gauss of order 4. The
-# left plot shows the orbit, the right plot $\mu$.
+# The guiding centre (the centre of the gyration) is initially at a distance $\ell/2$ from the axis.
+# The run covers about two bounces; a bounce leads from one mirror point to the other and back. The
+# method is Gauss' method of order 4. The left plot shows one bounce, the right plot the magnetic
+# moment without and with its first correction $\mu_1$.
 
 
 # %%
@@ -70,13 +74,14 @@ plt.show()
 # %% [markdown]
 # ## Conservation
 #
-# Two quantities check the integration. The method conserves the canonical angular momentum, which
-# follows from the symmetry of the field, to round-off. The energy has the error of the method.
-# $\mu_0$ oscillates at the gyrofrequency, with an amplitude proportional to $1/\ell$. With its
-# first correction $\mu_1$ (for fields with $b \cdot (\nabla \times b) = 0$, where $b = B/|B|$) the
-# amplitude is proportional to $1/\ell^2$. The second adiabatic invariant, the *bounce action*
-# $J = \oint p_\parallel\, ds$ along the field line, also oscillates with an amplitude proportional
-# to $1/\ell^2$.
+# Two quantities check the integration. The method conserves the canonical angular momentum to
+# round-off, because the field is symmetric about the axis. The energy has the error of the method.
+#
+# $\mu_0$ oscillates at the gyrofrequency, with an amplitude proportional to $1/\ell$. The amplitude
+# of $\mu_0 + \mu_1$ is proportional to $1/\ell^2$. (The formula for $\mu_1$ requires a field with
+# $b \cdot (\nabla \times b) = 0$, where $b$ is the unit vector along the field.) The second
+# adiabatic invariant is the *bounce action* $J = \oint p_\parallel\, ds$ along the field line. Its
+# amplitude is also proportional to $1/\ell^2$.
 
 # %%
 keys = ["magnetic_moment", "corrected_moment", "bounce_action"]
@@ -98,16 +103,16 @@ assert energy < 2e-6
 # %% [markdown]
 # ## The mirror point
 #
-# At the mirror point the whole energy is in the gyration, $E = \mu B$. The field at the mirror
-# point must therefore be $E/\mu$.
+# At the mirror point the whole energy $E$ is in the gyration: $E = \mu B$ with $\mu = \mu_0 +
+# \mu_1$. The field strength at the mirror point must therefore be $E/\mu$.
 
 
 # %%
 def field_at_turn(run, length):
-    """|B| at the guiding centre, to first order the particle's mean over a turn, where |z| ends."""
+    """|B| at the guiding centre where |z| is largest: the mean of |B| over one gyration."""
     z = np.asarray(run.qs)[:, 2]
     peak = np.argmax(np.abs(z))
-    about = np.asarray(run.qs)[max(peak - 12, 0) : peak + 13]  # one gyration or so
+    about = np.asarray(run.qs)[max(peak - 12, 0) : peak + 13]  # about one gyration
     x, y, z = about.T
     B = np.stack([-x * z, -y * z, length**2 + z**2]) / length**2
     return np.linalg.norm(B, axis=0).mean()
@@ -122,9 +127,9 @@ for run, length in zip(runs, lengths, strict=True):
 # %% [markdown]
 # ## Controls
 #
-# There are two controls. The energy of the gyration, $m v_\perp^2/2 = \mu B$, changes as much as
-# the field, for any $\ell$. If the field changes within a few gyroradii ($\ell = 2$), $\mu$ is not
-# an invariant.
+# There are two controls, in which the range must not be small. The energy of the gyration,
+# $m v_\perp^2/2 = \mu_0 B$, changes as much as the field, for any $\ell$. If the field changes
+# within a few gyroradii ($\ell = 2$), $\mu_0$ is not an adiabatic invariant.
 
 # %%
 gyration = []
@@ -155,7 +160,7 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - `systems.dipole_field`: a particle in the Earth's field (Störmer's problem).
-# - `dvi.discover_invariants` finds $\mu$ in a field with a weak gradient: `magnetic_moment()` in
-#   `examples/what_is_conserved.py`.
-# - For small $\ell$, $\mu$ is not conserved. `dvi.sweep` with many initial conditions shows where.
+# - Use the Earth's field (Störmer's problem): `systems.dipole_field`.
+# - Find $\mu$ in a field with a weak gradient, with `dvi.discover_invariants`: `magnetic_moment()`
+#   in `examples/what_is_conserved.py`.
+# - Find the initial conditions for which $\mu$ is not conserved at small $\ell$, with `dvi.sweep`.

@@ -1,15 +1,17 @@
 # %% [markdown]
 # # The Chandler wobble from measured poles
 #
-# The Earth's pole of rotation moves around a mean position in about 433 days. The motion is damped,
-# and driven with a period of one year. The coordinates $q = x$, $p = y$ of the pole are those of a
-# damped and driven oscillator. The damping and the driving are the perturbation; its strength is
-# $\varepsilon = 1$. The data are four arcs of eight years. The period, the damping and the driving
-# are the same for all arcs; each arc has its own initial state. What are the period and the
-# damping, and what are their errors?
+# In this notebook you fit the period and the damping of the Chandler wobble to measured positions
+# of the Earth's pole, and determine realistic errors.
+#
+# The Earth's pole of rotation moves around a mean position in about 433 days (Chandler wobble). The
+# motion is damped, and driven with a period of one year. The model is a damped and driven
+# oscillator with the coordinates of the pole as $q = x$, $p = y$. The damping and the driving are
+# the perturbation; its strength is $\varepsilon = 1$. The data are four arcs of eight years. The
+# period, the damping and the driving are the same for all arcs; each arc has its own initial state.
 #
 # The notebook needs the extra `ephemeris`, which contains the measured poles:
-# `pip install ".[ephemeris]"` in a clone. As a command: `python examples/polar_motion.py`.
+# `pip install ".[ephemeris]"` in a clone. `python examples/polar_motion.py` computes the same fit.
 
 # %%
 import jax
@@ -28,9 +30,9 @@ YEARS = 8  # length of an arc
 # %% [markdown]
 # ## The data
 #
-# The published errors do not include the effects that the model neglects (atmosphere, ocean), and
-# from 1984 on they are much smaller. Therefore no errors are given, and all values have the same
-# weight.
+# The published errors of the poles are not used. They do not include the effects that the model
+# neglects (atmosphere, ocean), and from 1984 on they are much smaller than these effects. All
+# values have the same weight, and the fit estimates their standard deviation from the residuals.
 
 # %%
 pole = read_polar_motion()
@@ -44,8 +46,8 @@ print(len(arcs), "arcs,", sum(arc.values.size for arc in arcs), "values")
 # %% [markdown]
 # ## The fit
 #
-# With $\varepsilon = 1$ the damping and the driving are those of the Earth. Parameters in `args`
-# are common to all arcs; `q0` and `p0` have one row per arc.
+# With $\varepsilon = 1$ the damping and the driving have their full strength. The parameters in
+# `args` are common to all arcs; `q0` and `p0` have one row per arc.
 
 # %%
 problem = polar_motion()
@@ -67,9 +69,10 @@ assert fit.rms < 0.05  # arcsec
 # %% [markdown]
 # ## Errors
 #
-# The formal errors assume white noise, but atmosphere and ocean excite the wobble itself, so the
-# residuals are correlated over months. We repeat the fit without one arc at a time (jackknife); the
-# scatter of these fits gives realistic errors.
+# The formal errors assume white noise. But atmosphere and ocean excite the wobble itself, so the
+# residuals are correlated over months. Therefore we repeat the fit four times, each time without
+# one arc (jackknife). The scatter of these fits gives realistic errors. The damping is described by
+# $1/Q$, where $Q$ is the quality factor.
 
 # %%
 at = [fit.names.index(name) for name in ("args.period", "args.inverse_Q")]
@@ -85,11 +88,11 @@ for name, k in (("period [day]", 0), ("1/Q", 1)):
 period, inverse_Q = fit.x[at]
 assert abs(period - 433.0) < 2 * error[0]  # Wilson & Vicente 1990: 433.0 ± 1.1
 assert np.all(error > 8 * fit.sigma[at])  # formal errors are far too small
-assert abs(inverse_Q) < 2 * error[1]  # 1/Q is not different from 0
+assert abs(inverse_Q) < 2 * error[1]  # 1/Q is compatible with 0
 
 # %% [markdown]
-# The period agrees with the literature, 433.0 ± 1.1 days. 1/Q differs from zero by less than its
-# error: these data do not determine Q.
+# The period agrees with the literature, 433.0 ± 1.1 days. $1/Q$ differs from zero by less than its
+# jackknife error: these data do not determine $Q$.
 
 # %%
 with plot.style():
@@ -111,5 +114,5 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - Longer or shorter arcs, `YEARS = 4`: how do the residuals and the jackknife errors change?
-# - The discretisation error is smaller than the noise: compare with `h=10.0`.
+# - Use shorter arcs, `YEARS = 4`, and compare the residuals and the jackknife errors.
+# - Repeat the fit with `h=10.0`: the discretisation error must be smaller than the noise.

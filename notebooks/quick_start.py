@@ -1,17 +1,18 @@
 # %% [markdown]
 # # Quick start: find an adiabatic invariant and verify it
 #
-# This notebook finds an adiabatic invariant of a perturbed oscillator and verifies it by long runs
-# and by controls. A mass on a spring is perturbed by a weak nonlinear force,
+# In this notebook you find an adiabatic invariant of a perturbed oscillator and verify it by long
+# runs and by controls. A weak nonlinear force perturbs a mass on a spring,
 #
 # $$H = \tfrac12\,(p^2 + q^2), \qquad \dot p = -q - \varepsilon q^3 .$$
 #
-# Its energy $H$ is not conserved: it changes by $O(\varepsilon)$. Is there a quantity close to the
-# energy that changes less? A quantity $I = I_0 + \varepsilon I_1$ whose change stays
-# $O(\varepsilon^2)$ over a long time is an *adiabatic invariant of first order*.
+# The energy $H$ is not conserved: it changes by $O(\varepsilon)$. A quantity $I = I_0 + \varepsilon
+# I_1$ whose change stays $O(\varepsilon^2)$ over a long time is an *adiabatic invariant of first
+# order*.
 #
-# `dvi_jax` iterates a map, one step of a variational integrator, in place of the differential
-# equation. The question is therefore which quantities the *map* conserves, here at $h = 0.1$.
+# In place of the differential equation, `dvi_jax` iterates a map, which is one step of a
+# variational integrator with the step size $h$. You therefore search for an invariant of the *map*,
+# here at $h = 0.1$.
 
 # %%
 import jax
@@ -27,10 +28,13 @@ jax.config.update("jax_enable_x64", True)  # invariants need double precision
 # %% [markdown]
 # ## Define, discover, verify
 #
-# The discrete Hamiltonian `H_D`, which defines the map, and the force `W` are functions of one
-# step: `q0` is the position at its beginning, `p1` the momentum at its end. `discover_invariants`
-# searches the polynomials up to degree 8, at random states. `drift_order` measures how the drift of
-# the invariant, its largest change in 5000 steps, scales with $\varepsilon$.
+# The discrete Hamiltonian `H_D`, which defines the map, and the force `W` are functions of one step
+# from the time `t0` to the time `t1`: `q0` is the position at the beginning of the step, `p1` the
+# momentum at its end. `args` contains parameters, which are not used here.
+#
+# `discover_invariants` searches the polynomials up to degree 8, at random states. `drift_order`
+# measures how the drift of the invariant, its largest change in 5000 steps, scales with
+# $\varepsilon$.
 
 
 # %%
@@ -54,8 +58,9 @@ print("I =", invariant.formula(4))
 print(order)
 
 # %% [markdown]
-# The result is $I_0 = (q^2 - h\,qp + p^2)/2$, the energy *of the map* at $h = 0.1$, with a
-# correction of degree four. The drift scales as $\varepsilon^2$.
+# The leading-order term $I_0 = (q^2 - h\,qp + p^2)/2$ is the quantity that the map conserves for
+# $\varepsilon = 0$ in place of the energy. The correction $I_1$ is a polynomial of degree four. The
+# drift scales as $\varepsilon^2$.
 
 # %%
 assert abs(order.slope - 2) < 0.02
@@ -66,8 +71,9 @@ assert abs(order.slope - 2) < 0.02
 #
 # A test is meaningful only if it can fail. We therefore test two quantities that are not adiabatic
 # invariants of first order. The energy must fail for two reasons: the force changes it at first
-# order, and the map does not conserve it even at $\varepsilon = 0$. $I_0$ without its correction
-# must fail for the first reason only; its slope must be 1.
+# order in $\varepsilon$, and the map does not conserve it even at $\varepsilon = 0$. $I_0$ without
+# its correction must fail for the first reason only. Its drift must scale as $\varepsilon$: the
+# slope in the output must be 1.
 
 
 # %%
@@ -96,8 +102,8 @@ axis = plot.drift_orders(orders, promised=[None, 1, 2], title="Largest change in
 plt.show()
 
 # %% [markdown]
-# Open symbols mark drifts that are less than ten times the drift at $\varepsilon = 0$ and are not
-# used for the slope. All points of the energy are open; therefore it has no slope.
+# Open symbols mark drifts that are less than ten times the drift at $\varepsilon = 0$. They are not
+# used for the slope. All points of the energy are open, so it has no slope (`nan`).
 #
 # The next cell plots the same quantities against time, for $\varepsilon = 0.1$.
 
@@ -118,8 +124,8 @@ plt.show()
 # %% [markdown]
 # ## Next steps
 #
-# - Use `order=2` or 3 in `discover_invariants`: the slope becomes 3 or 4 ([discovering
-#   invariants](discovering_invariants.ipynb)).
+# - Use `order=2` or `order=3` in `discover_invariants`: the slope becomes 3 or 4
+#   ([discovering invariants](discovering_invariants.ipynb)).
 # - Use your own $H$ and force ([your own system](your_own_system.ipynb)).
 # - Use friction, `-p1`, as the force: no adiabatic invariant of first order exists, and the report
 #   gives the reason ([limits](limits.ipynb)).

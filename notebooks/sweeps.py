@@ -1,13 +1,14 @@
 # %% [markdown]
 # # Sweeps: many trajectories at once
 #
-# How does the drift of an invariant depend on the perturbation and on the initial condition? This
-# needs many trajectories. `dvi.sweep` runs a whole grid, labels the results, gives each trajectory
-# a status and stores finished results on disk.
+# In this notebook you compute many trajectories with one call of `dvi.sweep`, for example to find
+# how the drift of an invariant depends on the perturbation and on the initial condition.
+# `dvi.sweep` runs a grid of parameters, labels the results, gives each trajectory a status and
+# stores finished results on disk.
 #
 # The system is the Kepler problem in the plane, perturbed by the central force $-\varepsilon q$.
-# With which power of $\varepsilon$ does the drift of the energy $H$ scale? Does the angular
-# momentum $L$ drift? For which orbits does the run fail?
+# You measure with which power of $\varepsilon$ the drift of the energy $H$ scales, whether the
+# angular momentum $L$ drifts, and for which orbits the run fails.
 
 # %%
 import tempfile
@@ -28,10 +29,10 @@ folder = tempfile.TemporaryDirectory()  # for results that you need later, use a
 # %% [markdown]
 # ## A grid
 #
-# Any number in `epsilon`, `h`, `t0`, `q0`, `p0` and `args` can be an axis of `sweep`. Here there
-# are 20 strengths and 32 initial momenta, which are 640 trajectories, with Gauss' method of
-# order 6. Each trajectory has 800 steps, but only two numbers of it are stored: the largest drifts,
-# which are computed during the run.
+# Any number in `epsilon`, `h`, `t0`, `q0`, `p0` and `args` can be an axis of the grid. Here the
+# axes are 20 strengths `epsilon` and 32 initial momenta `p_x`, which gives 640 trajectories. The
+# method is Gauss' method of order 6. Each trajectory has 800 steps, but only two numbers per
+# trajectory are stored: the largest drifts of $H$ and $L$, which are computed during the run.
 
 # %%
 asked = {
@@ -55,8 +56,8 @@ print(dict(data.sizes), result.status_counts())
 
 # %% [markdown]
 # A failed trajectory affects only its own entry. Orbits with initial momenta close to $-0.25$ come
-# so close to the centre that the solver does not converge with this step. They are counted, hatched
-# in the plot, and excluded from the statistics.
+# so close to the centre that the solver does not converge with this step. The failed trajectories
+# are counted, hatched in the first two plots, and excluded from the statistics.
 
 # %%
 data.p_x.attrs["long_name"] = "initial momentum p$_x$"
@@ -75,11 +76,13 @@ with plot.style():
 # %% [markdown]
 # ## Numbers
 #
-# The drift of the energy is proportional to $\varepsilon$ for small $\varepsilon$. For orbits that
-# come close to the centre (*steep orbits* below) the error of the discretisation is larger than the
-# effect of $\varepsilon$. The local slope is then noise, which is the checkerboard in the plot, and
-# the median drift has a slope close to 0. The angular momentum must not drift at all: the force has
-# no torque, and a symplectic Runge–Kutta method conserves quadratic invariants.
+# The drift of the energy is proportional to $\varepsilon$ for small $\varepsilon$. For very
+# eccentric orbits, which come close to the centre, the error of the discretisation is larger than
+# the effect of $\varepsilon$. The local exponent of $\varepsilon$ (second plot) then changes
+# irregularly from pixel to pixel, and the exponent of the median drift is close to 0.
+#
+# The angular momentum must not drift at all: the force has no torque, and Gauss' methods conserve
+# quadratic invariants.
 
 # %%
 good = data.where(data.status == 0)
@@ -92,25 +95,28 @@ def order(drift, epsilons):
 
 weak = good.sel(epsilon=slice(1e-4, 3e-3))
 round_orbits = order(weak.energy_drift.sel(p_x=slice(-0.85, -0.52)), weak.epsilon)
-steep_orbits = order(weak.energy_drift.sel(p_x=slice(-0.37, -0.33)), weak.epsilon)
+eccentric_orbits = order(weak.energy_drift.sel(p_x=slice(-0.37, -0.33)), weak.epsilon)
 largest = float(good.momentum_drift.max())
-print(f"drift of H: ε^{round_orbits:.2f}; on steep orbits ε^{steep_orbits:.2f}")
+print(f"drift of H: ε^{round_orbits:.2f}; on very eccentric orbits ε^{eccentric_orbits:.2f}")
 print(f"drift of L: at most {largest:.0e}")
 share = float((data.status != 0).mean())
 print(f"{100 * share:.1f} % of the trajectories failed")
 
 assert abs(round_orbits - 1) < 0.1
-assert abs(steep_orbits) < 0.3
+assert abs(eccentric_orbits) < 0.3
 assert largest < 1e-11
 assert 0 < share < 0.2
 
 # %% [markdown]
 # ## Repeat and resume
 #
-# The store belongs to this sweep. The same call finds all results and computes nothing; after an
-# interruption it would compute the missing ones. The results are identical bit for bit to those of
-# a sweep without interruption. `integrate` computes a single trajectory with another program; its
-# result agrees with the sweep to round-off.
+# The store contains a description of this sweep and its results. If you repeat the call, it reads
+# all results and computes nothing. If you repeat it after an interruption, it computes only the
+# missing results. The results are then identical bit for bit to those of a sweep without
+# interruption.
+#
+# `integrate` computes a single trajectory with another compiled program. Its result agrees with
+# that of the sweep to round-off.
 
 # %%
 again = dvi.sweep(kepler.system, **asked, store=store)
@@ -127,7 +133,8 @@ print(f"in the sweep {in_sweep:.12f}, alone {float(alone.observed['energy_drift'
 assert abs(in_sweep / float(alone.observed["energy_drift"]) - 1) < 1e-10
 
 # %% [markdown]
-# Control: the store of another sweep must be rejected. One number is changed:
+# As a control, the step is changed. `sweep` must then reject the store, because it contains the
+# results of another sweep.
 
 # %%
 try:
@@ -143,8 +150,8 @@ folder.cleanup()
 # %% [markdown]
 # ## Next steps
 #
-# - `start=dvi.starts.Halton(count, low, high)`: initial conditions that are generated on the
-#   device; $10^{12}$ of them need no memory.
-# - `dvi-jax sweep examples/sweep.toml`: a sweep from a file.
-# - `dvi.sweep_cost(...)`: time and memory of a large sweep, measured on one task.
-# - Many machines: pass a Dask client as `client=`.
+# - Generate initial conditions on the device: `start=dvi.starts.Halton(count, low, high)`. Even
+#   $10^{12}$ of them need no memory.
+# - Run a sweep from a file: `dvi-jax sweep examples/sweep.toml`.
+# - Estimate the time and the size of a large sweep: `dvi.sweep_cost(...)` runs one task of it.
+# - Use many machines: pass a Dask client as `client=`.

@@ -1,23 +1,24 @@
 # %% [markdown]
 # # The paper: claims and measurements
 #
-# This notebook measures whether five claims of one paper hold, with public functions of the
+# In this notebook you measure whether five claims of a paper hold, with public functions of the
 # package. The paper is "Preservation of adiabatic invariants for disturbed Hamiltonian systems
-# under variational discretization" (Acta Mechanica, doi:10.1007/s00707-019-02571-z). The package
-# implements its discrete equations, which are, with corrected signs,
+# under variational discretization" (Acta Mechanica, doi:10.1007/s00707-019-02571-z). Numbers in
+# parentheses, such as (34), are those of its equations. The package implements its discrete
+# equations, which are, with corrected signs,
 #
 # $$q_1 = q_0 + h\,\frac{\partial H_D}{\partial p_1}, \qquad
 # p_1 = p_0 - h\,\frac{\partial H_D}{\partial q_0} + h\,\varepsilon W . \tag{12, 13}$$
 #
-# $\varepsilon W$ is the perturbing force. A symmetry shifts the time by $\xi^0$ and the positions
-# by $\xi$. Both are series in $\varepsilon$, with the coefficients $\xi^0_m$ and $\xi_m$ of order
-# $m$. With a gauge function $G$, also a series, the symmetry gives the adiabatic invariant of order
-# $z$,
+# $H_D$ is the discrete Hamiltonian, $h$ the step and $\varepsilon W$ the perturbing force. A
+# symmetry shifts the time by $\xi^0$ and the positions by $\xi$. Both are series in $\varepsilon$,
+# with the coefficients $\xi^0_m$ and $\xi_m$ of order $m$. With a gauge function $G$, also a
+# series, the symmetry gives the adiabatic invariant of order $z$,
 #
 # $$I_z = \sum_{m \le z} \varepsilon^m (\xi_m \cdot p - \xi^0_m E^- + G_m), \tag{29}$$
 #
-# where $E^-$ is the incoming energy of a grid point, that of the step that ends there. The command
-# `dvi-jax paper` measures all claims of the paper and writes a table of verdicts.
+# where $E^-$, the incoming energy at a grid point, is the energy of the step that ends there. The
+# command `dvi-jax paper` measures all claims of the paper and writes a table of verdicts.
 
 # %%
 import jax
@@ -33,8 +34,9 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## The oscillator: conserved quantities
 #
-# $H_D = (p_1^2 + q_0^2)/2$, $q = p = 0.01$, $h = 0.1$, 10 000 steps. Figure 1 claims an error of
-# the energy of $10^{-8}$; Figure 2 claims that the error of RK4 is larger.
+# The system is $H_D = (p_1^2 + q_0^2)/2$ with the initial state $q = p = 0.01$, $h = 0.1$ and
+# 10 000 steps. Figure 1 of the paper claims that the error of the energy is $10^{-8}$; Figure 2
+# claims that the error of RK4, the classical Runge–Kutta method of order 4, is larger.
 
 
 # %%
@@ -59,14 +61,15 @@ print(f"(p² + q² − hqp)/2: relative range {np.ptp(exact) / exact.mean():.0e}
 predicted = -N * h**6 / 72 * lost[0]
 print(f"RK4 after {N} steps: {lost[-1] - lost[0]:.3e}, h⁶/72 a step predicts {predicted:.3e}")
 
-assert 9e-6 < np.ptp(printed) < 1e-5  # does not hold
+assert 9e-6 < np.ptp(printed) < 1e-5  # the claim of Figure 1 does not hold
 assert np.ptp(exact) / exact.mean() < 1e-13
-assert abs(lost[-1] - lost[0]) < 1e-2 * np.ptp(printed)  # does not hold
+assert abs(lost[-1] - lost[0]) < 1e-2 * np.ptp(printed)  # nor does that of Figure 2
 
 # %% [markdown]
-# Neither claim holds. The energy of the paper oscillates by 10 % of its value, without growth;
-# another quadratic form is conserved to round-off. RK4 loses a fraction $h^6/72$ of the energy in
-# each step, so its error becomes the larger one after about 7 million steps.
+# Neither claim holds. The energy of the paper oscillates by 10 % of its value, without growth. The
+# quadratic form $(p^2 + q^2 - hqp)/2$ is conserved to round-off. RK4 loses a fraction $h^6/72$ of
+# the energy in each step. The error of RK4 is therefore smaller than that of the variational
+# integrator up to about 7 million steps.
 
 # %%
 with plot.style():
@@ -91,8 +94,8 @@ plt.show()
 # For $W = -q$ the paper gives $(1 + \varepsilon)(p^2 + q^2)/2$ as an invariant of first order. The
 # drift of such an invariant scales as $\varepsilon^2$: the slope of log(drift) against
 # log($\varepsilon$) is 2. A slope of 1 means that the quantity is conserved only for
-# $\varepsilon = 0$. To remove the effect of the discretisation, a composition of order 4 with
-# $h = 0.01$ represents $h \to 0$.
+# $\varepsilon = 0$. For the limit $h \to 0$ we use a composition of order 4 with $h = 0.01$, whose
+# discretisation error is negligible here.
 
 
 # %%
@@ -149,18 +152,21 @@ assert of_34["its h = 0.1 form"].max() < 1e-12 * 1e-4  # exact, for all ε
 # %% [markdown]
 # (34) as printed is not an invariant of first order: its drift scales as $\varepsilon$. The drift
 # of $\tfrac12(p^2 + (1+\varepsilon) q^2)$ does not depend on $\varepsilon$; it is the error of the
-# method. At $h = 0.1$ the form with the correction for the step, $\tfrac12(p^2 + (1+\varepsilon)
-# q^2 - h (1+\varepsilon)\, qp)$, is exact.
+# method. With a term for the step, $\tfrac12(p^2 + (1+\varepsilon) q^2 - h (1+\varepsilon)\, qp)$,
+# this form is conserved to round-off at $h = 0.1$.
 #
 # ## Kepler: (49) and (50)
 #
-# $H_D = p_1^2/2 - K^2/|q_0|$ (the paper prints $+$, a repulsive potential), with the perturbing
-# force $W = -q$. (49) is $1 + \varepsilon$ times the angular momentum, from the rotation. (50)
-# comes from a rotation with a shift of time, and the gauge $-\varepsilon |q|^2/2$. The paper writes
-# $\xi^0 = 1$ in (47); (50) as printed corresponds to $\xi^0 = 1 + \varepsilon$:
+# The system is $H_D = p_1^2/2 - K^2/|q_0|$ with $K = 1$ and $W = -q$. (The paper prints
+# $+K^2/|q_0|$, a repulsive potential.) With the angular momentum $L$ and the energy $H$ the two
+# invariants are
 #
 # $$I_{(49)} = (1 + \varepsilon) L, \qquad
 # I_{(50)} = (1 + \varepsilon)(L - H) - \tfrac{\varepsilon}{2} |q|^2 .$$
+#
+# (49) follows from a rotation. (50) follows from a rotation with a shift of time, and the gauge
+# function $-\varepsilon |q|^2/2$. The paper writes $\xi^0 = 1$ in (47), but (50) as printed
+# corresponds to $\xi^0 = 1 + \varepsilon$.
 
 
 # %%
@@ -197,15 +203,15 @@ for sign, values in (("−εq", attracting), ("+εq", repelling)):
 
 assert of_L.max() < 1e-12  # holds, for every ε and h
 assert abs(on_mesh[1] / on_mesh[0] - 1) < 0.01  # the oscillation on the fixed grid hides ε
-assert abs(slopes[0] - 2) < 0.1  # of first order, with −εq …
-assert abs(slopes[1] - 1) < 0.1  # … and not with +εq
+assert abs(slopes[0] - 2) < 0.1  # an invariant of first order for the force −εq
+assert abs(slopes[1] - 1) < 0.1  # not for the force +εq
 
 # %% [markdown]
-# (49) is conserved to round-off on any time grid, because its $\xi^0$ is 0 and the force is
-# central. For (50) $\xi^0$ is not 0, so (50) requires the variational grid. On a fixed grid it
-# oscillates with an amplitude $O(h)$ for any $\varepsilon$. For $h \to 0$ it is an invariant of
-# first order for the force
-# $-\varepsilon q$. The force $+\varepsilon q$ is the control that must fail: its slope is 1.
+# (49) is conserved to round-off on any time grid, because $\xi^0 = 0$ for (49) and the force is
+# central. For (50) $\xi^0$ is not 0. Therefore (50) requires a time grid that satisfies the energy
+# equation (`dvi.Variational`). On a fixed time grid (50) oscillates with an amplitude $O(h)$ for
+# any $\varepsilon$. For $h \to 0$ and the force $-\varepsilon q$, (50) is an invariant of first
+# order. The force $+\varepsilon q$ is the control that must fail: the slope is 1.
 
 # %%
 with plot.style():
@@ -228,14 +234,14 @@ plt.show()
 #
 # | claim | measured here | verdict |
 # |---|---|---|
-# | Fig. 1: the oscillator's energy error is 1e-8 | 9.5e-6, another form to 1e-14 | does not hold |
-# | Fig. 2: RK4 is worse over 10 000 steps | RK4 has lost 1.4e-8 | does not hold |
+# | Figure 1: the error of the energy is 1e-8 | range of the energy 9.5e-6 | does not hold |
+# | Figure 2: the error of RK4 is larger | error of RK4 1.4e-8, smaller | does not hold |
 # | (34) is of first order in ε | slope 1; the corrected form is exact | holds after a correction |
-# | (49) is exact | to round-off | holds |
-# | (50) is of first order in ε | slope 2 as h → 0, for the force −εq | holds for h → 0 only |
+# | (49) is exact | conserved to round-off | holds |
+# | (50) is of first order in ε | slope 2 for h → 0 and the force −εq | holds for h → 0 only |
 #
 # ## Next steps
 #
-# - `dvi-jax paper --out DIR`: all claims, figures and tables.
-# - The causes of the oscillation of (50), to round-off: `dvi.noether_balance`, and
+# - Measure all claims, and make all figures and tables: `dvi-jax paper --out DIR`.
+# - Find the causes of the oscillation of (50) with `dvi.noether_balance`, see
 #   `docs/what-is-conserved.md`.

@@ -1,13 +1,14 @@
 # %% [markdown]
 # # Your own system
 #
-# How do you define your own system, and how do you check that it is correct? The example is an
-# elastic pendulum: a weight on a spring, in polar coordinates $q = (r, \theta)$ about the point of
+# In this notebook you define your own system and check that it is correct. The example is an
+# elastic pendulum, a weight on a spring, in polar coordinates $q = (r, \theta)$ about the point of
 # suspension,
 #
 # $$H = \frac{p_r^2}{2m} + \frac{p_\theta^2}{2 m r^2} + \frac{k}{2}(r - 1)^2 - m g r \cos\theta,$$
 #
-# with air drag on both momenta, $W = -(p_r, p_\theta)$, of strength $\varepsilon$. The kinetic
+# with the mass $m$, the stiffness $k$, the natural length 1 m and the gravitational acceleration
+# $g$. The perturbation is air drag, $\varepsilon W = -\varepsilon\, (p_r, p_\theta)$. The kinetic
 # energy depends on $r$, so each step is implicit. The package detects this and solves the
 # equations.
 
@@ -26,9 +27,11 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## Hamiltonian, force, observables
 #
-# `H(t, q, p, args)` is the usual Hamiltonian; `dvi.discretise` converts it to a discrete
-# Hamiltonian $H_D(t_0, t_1, q_0, p_1)$. A force has the same arguments. An observable is a function
-# of $(q, p)$ or of $(t, q, p, args)$. `args` contains the parameters.
+# `H(t, q, p, args)` is the usual Hamiltonian; `args` contains its parameters. `dvi.discretise`
+# converts it to a discrete Hamiltonian, a function of one step with the arguments
+# `(t0, t1, q0, p1, args)`: `q0` is the position at the beginning of the step, `p1` the momentum at
+# its end. A force has the same arguments. An observable is a function of `(q, p)` or of
+# `(t, q, p, args)`.
 
 
 # %%
@@ -77,8 +80,8 @@ plt.show()
 # %% [markdown]
 # ## Four checks
 #
-# **1. Order.** Strang's composition of the map with its adjoint has order 2: half the step gives a
-# quarter of the error. The reference is the same method with a much smaller step.
+# **1. Order.** `dvi.Strang`, the composition of the map with its adjoint, has order 2: half the
+# step gives a quarter of the error. The reference is the same method with a much smaller step.
 
 # %%
 reference = run(h=2.0 / 6400, num_steps=6400)
@@ -90,7 +93,8 @@ assert abs(order - 2) < 0.1
 
 # %% [markdown]
 # **2. Symplecticity.** Without the force, the Jacobian $M$ of the map satisfies
-# $M^T \Omega M = \Omega$. With the force, phase volume shrinks, and the check must fail.
+# $M^T \Omega M = \Omega$, where $\Omega$ is the symplectic matrix (`omega` below). With the force,
+# phase volume shrinks, and the check must fail.
 
 
 # %%
@@ -112,9 +116,9 @@ assert defects[0] < 1e-11
 assert defects[1] > 0.1
 
 # %% [markdown]
-# **3. Conservation.** Without gravity the angular momentum is conserved to round-off, because the
-# map has the rotational symmetry; with gravity it must change. The energy oscillates with an
-# amplitude of order $h^2$ and does not drift.
+# **3. Conservation.** Without gravity the map has a rotational symmetry and conserves the angular
+# momentum to round-off. With gravity the angular momentum must change. The energy must oscillate
+# with an amplitude $O(h^2)$ and must not drift.
 
 # %%
 for g in (0.0, 9.81):
@@ -145,9 +149,10 @@ assert abs(lost / work - 1) < 2e-3
 # %% [markdown]
 # ## Forces that depend on the velocity
 #
-# A force law is often given for the velocity, for example quadratic drag $F = -|v|\, v$.
-# `dvi.velocity_force` converts it to a function of $(q, p)$ by $v = \partial H_D / \partial p$. In
-# these coordinates $v = (\dot r, \dot\theta)$, and the force on $\theta$ is a torque.
+# A force law often contains the velocity, for example quadratic drag $F = -|v|\, v$.
+# `dvi.velocity_force` converts it to a function of position and momentum by
+# $v = \partial H_D / \partial p$. In these coordinates $v = (\dot r, \dot\theta)$, and the force
+# on $\theta$ is a torque.
 
 
 # %%
@@ -167,9 +172,9 @@ assert sol.observed[-1] < sol.observed[0]
 # %% [markdown]
 # ## Gradients
 #
-# This cell computes the derivative of the height of the weight after half a second with respect to
-# the stiffness of the spring, by automatic differentiation through every implicit step. Central
-# differences give the same number.
+# The next cell differentiates the height $y$ of the weight after half a second with respect to the
+# stiffness $k$ of the spring, by automatic differentiation through every implicit step. Central
+# differences must give the same number.
 
 
 # %%
@@ -191,10 +196,11 @@ assert abs(slope / differences - 1) < 1e-6
 # %% [markdown]
 # ## When a step has no solution
 #
-# Here the weight is thrown towards the point of suspension, and the step is much too long. The
-# solver finds no solution of the equations of Gauss' method. By default this raises an error that
-# names the step. With `throw=False` the run returns its status, and the states are NaN from this
-# step on. The equations of `Strang` are solved even here, but the result is not accurate.
+# In the next cell the weight moves fast towards the point of suspension, and the step is much too
+# long. The solver finds no solution of the equations of Gauss' method. By default this raises an
+# error that names the step. With `throw=False` the run returns its status, and the states are NaN
+# from this step on. With `Strang` the solver finds a solution even here, but the result is not
+# accurate.
 
 # %%
 too_long = {"h": 0.5, "num_steps": 20, "epsilon": 0.0, "args": args, "throw": False}
@@ -208,7 +214,7 @@ assert dvi.integrate(system, *thrown, method=dvi.Strang(), **too_long).status ==
 # %% [markdown]
 # ## Next steps
 #
-# - A system given by a Lagrangian: `dvi.from_lagrangian`. A system in a file:
-#   `dvi-jax run examples/own_system.toml`.
-# - Which quantities does a perturbed system conserve?
-#   [Discovering invariants](discovering_invariants.ipynb).
+# - Define a system by a Lagrangian: `dvi.from_lagrangian`.
+# - Run a system from a file: `dvi-jax run examples/own_system.toml`.
+# - Search for the quantities that a perturbed system conserves:
+#   [discovering invariants](discovering_invariants.ipynb).

@@ -232,7 +232,7 @@ def test_a_control_that_passes_is_missed(monkeypatch):
         ({}, None, ValueError, "methods is empty: give"),
         (None, [], ValueError, "checks is empty: name"),
         ("TypeII", None, TypeError, "must be a list of names"),
-        (dvi.TypeII(), None, TypeError, "give the method a name"),
+        (dvi.TypeII(), None, TypeError, "methods must have names"),
         ({"mine": dvi.TypeII}, None, TypeError, "'mine' must be a method such as"),
         ({"m": altered(dvi.TypeII(), order="2")}, None, TypeError, "order of 'm' must be a num"),
         ({"m": altered(dvi.TypeII(), order=0)}, None, ValueError, "order of 'm' must be positive"),
@@ -283,7 +283,7 @@ def test_command_refuses_bad_input(tmp_path):
     for words, said in [
         (("--method", "strang"), "did you mean Strang"),
         (("--check", "energies"), "did you mean energy"),
-        (("--quick", "--method", "Strang"), "--quick: given together with --method"),
+        (("--quick", "--method", "Strang"), "--quick: it is given together with --method"),
         (("--out", other), "exists and is not a certificate"),
         (("--out", tmp_path / "file"), "neither a directory nor a .md file"),
     ]:

@@ -573,7 +573,7 @@ INVALID = [
     (lambda: dvi.MEGNO(scale=(1.0, np.nan)), ValueError, "scale of p in MEGNO .* nan"),
     (lambda: dvi.GALI(2, scale=("a", 1.0)), ValueError, "scale of q in GALI .* 'a'"),
     (lambda: dvi.SALI(scale=(1j, 1.0)), ValueError, "scale of q in SALI .* 1j"),
-    (lambda: dvi.Running(HENON.observables["energy"]), TypeError, "Running requires a reduction"),
+    (lambda: dvi.Running(HENON.observables["energy"]), TypeError, "reduction of Running must"),
     (lambda: dvi.Running(dvi.Section(lambda t, q, p, a: q[0])), TypeError, "value at every step"),
 ]
 
@@ -593,8 +593,8 @@ INVALID_RUNS = [
     (dvi.MEGNO(), TRANSFORMED, "MEGNO requires steps"),
     (dvi.SALI(), SOLVED_FOR, "whose size does not depend on the state"),
     (dvi.Running(dvi.MEGNO()), AT_TIMES, r"Running.*=dvi.Save\(every=m\)"),
-    (dvi.MEGNO, {}, r"holds the class MEGNO: .* dvi.MEGNO\(\)"),
-    (dvi.Running, {}, r"holds the class Running: .* dvi.Running\(dvi.MEGNO\(\)\)"),
+    (dvi.MEGNO, {}, r"contains the class MEGNO: .* dvi.MEGNO\(\)"),
+    (dvi.Running, {}, r"contains the class Running: .* dvi.Running\(dvi.MEGNO\(\)\)"),
 ]
 
 

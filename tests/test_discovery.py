@@ -413,7 +413,7 @@ def test_a_discovery_is_saved_and_loaded(tmp_path, monkeypatch):
         dvi.Discovery.load(path, dvi.Polynomials(4))
     named = dvi.Basis({"f": lambda q, p: q @ q + p @ p - 0.1 * (q @ p)})
     discover(OSCILLATOR, named, samples=box(1, 20)).save(path)
-    with pytest.raises(ValueError, match="function 'f' has other values"):
+    with pytest.raises(ValueError, match="values of 'f' differ from those saved"):
         dvi.Discovery.load(path, dvi.Basis({"f": lambda q, p: q @ q}))
     before = path.read_bytes()
     again = dvi.Discovery.load(path, named)
@@ -426,10 +426,10 @@ def test_a_discovery_is_saved_and_loaded(tmp_path, monkeypatch):
     path.write_bytes(b"something else")
     for damaged in (path.with_suffix(".npy"), path):
         with pytest.raises(
-            ValueError, match="is not a discovery of this package, or it is damaged"
+            ValueError, match="is not the file of a discovery of this package, or it is damaged"
         ):
             dvi.Discovery.load(damaged, named)
-    with pytest.raises(FileNotFoundError, match="there is no discovery at"):
+    with pytest.raises(FileNotFoundError, match="of a discovery does not exist"):
         dvi.Discovery.load(path.with_suffix(".none"), named)
 
 
@@ -459,7 +459,7 @@ def test_series_differentiates_batches_and_refuses_to_guess():
     q, p = jnp.array([0.4]), jnp.array([0.3])
     slope = jax.grad(series.evaluate, argnums=2)(q, p, 0.1)
     np.testing.assert_allclose(slope, series.coefficients[1] @ series.basis(q, p), rtol=1e-12)
-    with pytest.raises(ValueError, match="requires the value of ε"):
+    with pytest.raises(ValueError, match="has no value of ε"):
         series(0.0, 0.1, q, p, q, p, None)
 
 
@@ -473,7 +473,7 @@ def test_series_differentiates_batches_and_refuses_to_guess():
         ({"order": -1}, "from 0 on"),
         ({"tolerance": 2.0}, "between 0 and 1"),
         ({"basis": dvi.Chebyshev(3, "t")}, "all samples have the same time"),
-        ({"samples": (*box(1, 60), np.zeros(50))}, "ts of 60 samples"),
+        ({"samples": (*box(1, 60), np.zeros(50))}, "for 60 samples"),
         ({"basis": dvi.Polynomials(2) + dvi.Polynomials(1)}, "rank-deficient"),
         ({"basis": dvi.Basis([lambda q, p: 1 / (0 * q[0])])}, "'f1' is not finite"),
         ({"basis": dvi.Basis([lambda q, p: q**2])}, r"'f1' must return a real scalar.*\(1,\)"),
@@ -553,7 +553,7 @@ def test_derivatives_that_are_not_finite_are_named():
     q, p = box(1, 80)
     q[7] = p[7] = 0
     radius = dvi.Basis({"r": lambda q, p: jnp.sqrt(q[0] ** 2 + p[0] ** 2)})
-    with pytest.raises(ValueError, match="'r' has in order 1 of ε in a step is not finite at 1"):
+    with pytest.raises(ValueError, match=r"order 1 in ε .* 'r' in a step is not finite at 1"):
         discover(SPRING, radius, 1, (q, p))
     root = dvi.Basis({"root": lambda q, p: jnp.sqrt(jnp.abs(q[0])), "E": lambda q, p: q @ q})
     with pytest.raises(ValueError, match=r"derivative of the basis function 'root' .* at 1 of 80"):
@@ -562,7 +562,7 @@ def test_derivatives_that_are_not_finite_are_named():
 
 def test_powers_that_underflow_are_named():
     q, p = box(1, 400, low=-1e-23, high=1e-23)
-    with pytest.raises(ValueError, match=r"functions are 0 on all samples .'q¹⁴'.*larger units"):
+    with pytest.raises(ValueError, match=r"functions are 0 on all samples .'q¹⁴'.*smaller units"):
         discover(SPRING, 16, samples=(q, p))
 
 
@@ -595,7 +595,7 @@ def test_arguments_of_the_wrong_kind_are_refused():
             search(H_D, two, **given)
         with pytest.raises(TypeError, match="root_finder must be"):
             search(SPRING, two, newton=5, **given)
-    with pytest.raises(ValueError, match=r"of shape \(1,\); got q of shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"the shape \(1,\) for .* got q of shape \(2,\)"):
         found("spring", 4, 2).evaluate([0.1, 0.2], [0.3, 0.4], 0.1)
     with pytest.raises(TypeError, match="method must be a Method"):
         discover(SPRING, 2, method=5)

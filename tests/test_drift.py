@@ -460,7 +460,7 @@ def test_pictures_show_what_was_excluded():
             assert excluded == np.sum(~surface.used & np.isfinite(surface.drifts))
             axes[0].figure.canvas.draw()
             plt.close(axes[0].figure)
-        with pytest.raises(ValueError, match="must have 2 orders, one per result, got 1"):
+        with pytest.raises(ValueError, match="must have 2 orders, one for each result, got 1"):
             plot.drift_orders([usual(), usual()], [1])
         axis = plot.drift_orders(usual(), expected=1)
         assert axis.figure.legends[0].get_texts()[0].get_text().endswith(", expected 1")
@@ -527,9 +527,9 @@ def test_a_surface_shows_zeros_failures_and_limits():
         ({"h": np.float64(0.0)}, "must not be zero"),
         ({"h": [0.1, 0.2]}, "h must be one number"),
         ({"starts": (np.ones((3, 1)), np.ones((2, 1)))}, "the same shape"),
-        ({"starts": (0.1, 0.1)}, "first axis of initial conditions"),
+        ({"starts": (0.1, 0.1)}, "initial conditions along the first axis"),
         ({"starts": (np.array([[0.1], [np.nan]]), np.ones((2, 1)))}, "not finite at index"),
-        ({"observable": lambda t0, t1, q0, p0, q1, p1, args: q1}, "must be a scalar"),
+        ({"observable": lambda t0, t1, q0, p0, q1, p1, args: q1}, "must return a scalar"),
     ],
 )
 def test_bad_sweeps_are_refused(change, match):
@@ -540,13 +540,13 @@ def test_bad_sweeps_are_refused(change, match):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"hs": [0.2, 0.1]}, "hs must increase"),
-        ({"hs": [0.1, 0.1]}, "hs must increase"),
+        ({"hs": [0.2, 0.1]}, "hs must be in increasing order"),
+        ({"hs": [0.1, 0.1]}, "hs must be in increasing order"),
         ({"hs": [-0.1, 0.1]}, "hs must be a list of positive"),
-        ({"epsilons": [0.2, 0.1]}, "epsilons must increase"),
+        ({"epsilons": [0.2, 0.1]}, "epsilons must be in increasing order"),
         ({"duration": 0.3}, "two of the longest steps"),
         ({"duration": np.nan}, "two of the longest steps"),
-        ({"invariant": [KEPT]}, "got 1 for 2 step sizes"),
+        ({"invariant": [KEPT]}, "got 1 observables for 2"),
     ],
 )
 def test_bad_surfaces_are_refused(change, match):
@@ -565,5 +565,5 @@ def test_wrong_arguments_are_refused():
 
 @pytest.mark.parametrize("wrong", ["abc", [1.0], {"energy": None}])
 def test_a_picture_of_what_are_no_orders_is_refused(wrong):
-    with pytest.raises(TypeError, match=r"drift_orders draws what dvi\.drift_order returned, got"):
+    with pytest.raises(TypeError, match=r"results must be one dvi\.DriftOrder, .*, got"):
         plot.drift_orders(wrong)

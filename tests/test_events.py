@@ -313,9 +313,9 @@ INVALID = [
     (
         lambda: dvi.Section(lambda q: q),
         TypeError,
-        r"Section requires a function g\(t, q, p, args\)",
+        r"g of Section must be a function of \(t, q, p, args\)",
     ),
-    (lambda: dvi.Stop(3.0), TypeError, r"Stop requires a function g\(t, q, p, args\)"),
+    (lambda: dvi.Stop(3.0), TypeError, r"g of Stop must be a function of \(t, q, p, args\)"),
     (lambda: dvi.Section(on_axis, 2), ValueError, "direction must be one of 1, -1, 0"),
     (
         lambda: dvi.Section(on_axis, max_crossings=0),
@@ -328,7 +328,7 @@ INVALID = [
     (lambda: dvi.Save(ts=[0.1], final=True), ValueError, "leave out every and final"),
     (lambda: dvi.Save(ts=[0.1, 0.3, 0.2]), ValueError, "ascending order"),
     (lambda: dvi.Save(ts=0.1), ValueError, "one-dimensional"),
-    (lambda: dvi.Save(clock=on_axis), ValueError, "clock requires times"),
+    (lambda: dvi.Save(clock=on_axis), ValueError, "clock requires ts"),
     (lambda: dvi.Save(ts=[0.1], clock=3), TypeError, "the clock of Save"),
     (
         lambda: kepler(save=dvi.Save(ts=[0.1], clock=vector)),

@@ -584,12 +584,12 @@ def test_saved_and_loaded(regular, tmp_path):
     np.testing.assert_array_equal(loaded.history["x"], found.history["x"])
     assert loaded.status == "converged"
     assert str(loaded) == str(found)
-    with pytest.raises(ValueError, match="must have the parameters of the fit"):
+    with pytest.raises(ValueError, match="must have the same parameters as the fit"):
         dvi.FitResult.load(tmp_path / "fit.npz", {"other": 1.0})
     with pytest.raises(FileNotFoundError, match="no directory"):
         found.save(tmp_path / "nowhere" / "fit.npz")
     (tmp_path / "bad.npz").write_bytes(b"nonsense")
-    with pytest.raises(ValueError, match="is not a fit"):
+    with pytest.raises(ValueError, match="is not the file of a fit"):
         dvi.FitResult.load(tmp_path / "bad.npz")
 
 

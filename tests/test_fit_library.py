@@ -221,7 +221,7 @@ INVALID_LIBRARIES = [
     (lambda: ONE + ONE, ValueError, "both libraries"),
     (lambda: ONE(*AT, None), ValueError, r"args\[.coefficients.\]"),
     (lambda: ONE(*AT, {"coefficients": Q}), ValueError, r"shape \(20,\)"),
-    (lambda: TWO(*AT, {"coefficients": jnp.ones(20)}), ValueError, r"shape \(2,\)"),
+    (lambda: TWO(*AT, {"coefficients": jnp.ones(20)}), ValueError, r"shape \(n,\) with n = 2, got"),
     (lambda: SCALAR(*AT, None), ValueError, "'f' must return an array of the shape of q0"),
     (lambda: dvi.ForceLibrary.monomials(0, 1), ValueError, "degree must be"),
     (lambda: dvi.ForceLibrary.monomials(1, 1.0), ValueError, "n must be"),
@@ -240,7 +240,7 @@ FORCED = dvi.System(H_D, force=lambda t0, t1, q, p, args: -q)
 INVALID = [
     ({"library": {"q": H_D}}, TypeError, "must be a dvi.ForceLibrary"),
     ({"library": SMALL.with_coefficients({})}, ValueError, "already has coefficients"),
-    ({"params": {"coefficients": 0.0}}, ValueError, "library adds them"),
+    ({"params": {"coefficients": 0.0}}, ValueError, "adds the coefficients"),
     ({"params": [1.0]}, TypeError, "must be a dict"),
     ({"params": {"epsilon": 0.1}}, ValueError, "only their product"),
     ({"penalty": 0.0}, ValueError, "penalty must be a positive"),
@@ -248,7 +248,7 @@ INVALID = [
     ({"model": 3}, TypeError, "model must be"),
     ({"model": dvi.Model(FORCED, h=H, q0=[1.0], p0=[0.0])}, ValueError, "epsilon = 0"),
     ({"model": dvi.Model(FREE, h=H, q0=[1.0], p0=[0.0], args=2.0)}, TypeError, "args of the model"),
-    ({"optimiser": None}, TypeError, "has no option 'optimiser'; it has max_steps"),
+    ({"optimiser": None}, TypeError, "has no option 'optimiser': use one of max_steps"),
     ({"max_steps": 0}, ValueError, "max_steps must be"),
 ]
 

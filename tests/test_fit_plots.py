@@ -274,7 +274,7 @@ def test_invalid_input_is_rejected():
     many = made(names=[f"a{i}" for i in range(13)], x=np.ones(13), covariance=np.eye(13))
     still = made(history=dict.fromkeys(made().history, X[:0]))
     fit, three, four = made(), plt.subplots(1, 3)[1], plt.subplots(2, 2)[1]
-    names = r"different names of \['args.mu', 'eps.*'mu'"
+    names = r"different names from \['args.mu', 'eps.*'mu'"
     refuses(
         plot.fit_residuals,
         ((bare,), {}, "must be a FitResult.*whitened", TypeError),
@@ -282,7 +282,7 @@ def test_invalid_input_is_rejected():
         ((fit,), {"component": "q"}, "component must be .*'q'"),
         ((fit,), {"names": ["x"]}, r"one for each of 2 .*got \['x'\]"),
         ((fit,), {"arcs": []}, "arcs is empty: .*at least one"),
-        ((fit,), {"axes": three}, "give 2 axes, one for each panel.*got 3"),
+        ((fit,), {"axes": three}, r"needs 2 Axes \(one for each panel.*got 3"),
     )
     refuses(
         plot.fit_corner,
@@ -292,7 +292,7 @@ def test_invalid_input_is_rejected():
         ((fit, ["epsilon"] * 2), {}, "different names"),
         ((fit, []), {}, "one or more"),
         ((many,), {}, r"13 parameters are too many.*params=\['a0'"),
-        ((fit,), {"samples": {"mu": X}}, "samples has no 'args.mu'"),
+        ((fit,), {"samples": {"mu": X}}, "samples has no draws of 'args.mu'"),
         ((fit,), {"samples": 3}, "a dvi.Samples or a dict", TypeError),
         ((fit,), {"axes": four}, r"shape \(3, 3\) for 3 parameters"),
     )

@@ -104,7 +104,7 @@ def test_signals_without_reliable_frequencies_have_a_status_and_nan(name, status
 
 
 def test_failed_signals_do_not_change_others_and_the_error_has_all():
-    with pytest.raises(FrequencyError, match=r"12 of 18 .*number \(1,\): not_finite") as info:
+    with pytest.raises(FrequencyError, match=r"12 of 18 .*index \(1,\), is not_finite") as info:
         frequencies(TS, np.stack(list(SIGNALS.values())), count=COUNT)
     assert list(info.value.found.status) == list(analysed().status)
     np.testing.assert_allclose(info.value.found.frequencies[0, :4], OMEGA, atol=1e-13)
@@ -294,7 +294,7 @@ def stars():
 
 @pytest.mark.slow
 def test_frequency_diffusion_distinguishes_chaos_from_order():
-    with pytest.raises(FrequencyError, match=r"2 of 10 signals.*\(4, 0\): not_finite") as info:
+    with pytest.raises(FrequencyError, match=r"2 of 10 signals.*\(4, 0\), is not_finite") as info:
         frequency_diffusion(stars())
     moved = info.value.found
     assert moved.rate.shape == (5, 2)
@@ -323,8 +323,8 @@ ROUNDED = (1e6 + 0.05 * np.arange(N)).astype(np.float32)
         (lambda: frequencies(TS[:-1], torus()), ValueError, "same length along their last axis"),
         (lambda: frequencies(TS, torus()[:, None]), ValueError, "signal.T"),
         (lambda: frequencies(np.stack([TS] * 3), torus()), ValueError, "does not match a signal"),
-        (lambda: frequencies(TS), ValueError, "give either times and a signal"),
-        (lambda: frequencies(torus(), TS), TypeError, "the times are the first argument"),
+        (lambda: frequencies(TS), ValueError, "must be times and a signal"),
+        (lambda: frequencies(torus(), TS), TypeError, "the times as the first argument"),
         (lambda: frequencies(TS, ["a"] * N), TypeError, "array of numbers"),
         (lambda: frequencies(TS, torus(), count=0), ValueError, "from 1 on, got 0"),
         (lambda: frequencies(TS, torus(), count=2.0), ValueError, "from 1 on, got 2.0"),

@@ -134,7 +134,7 @@ def test_nothing_is_silently_ignored():
         run(term, stepsize_controller=ACCURATE)
     with pytest.raises(ValueError, match="DiscreteTerm"):
         jax.grad(end_of, argnums=2)(solver, diffrax.BacksolveAdjoint(), 0.1, 1.0)
-    with pytest.raises(TypeError, match="must be a pair y0"):
+    with pytest.raises(TypeError, match="y0 must be a pair"):
         run(term, y0=jnp.concatenate([Q0, P0]))
     as_list = run(term, y0=[Q0, P0])  # the control: a list is a pair, too
     assert isinstance(as_list.ys, list)

@@ -107,7 +107,7 @@ def test_bodies_and_axes_have_names():
     [
         ({"dims": ("batch",)}, "0 dimensions"),
         ({"components": ["x"]}, r"q has the shape \(2,\)"),
-        ({"observe": {"E": ENERGY}}, "observe must be the one given to integrate"),
+        ({"observe": {"E": ENERGY}}, "observe must be the same as for integrate"),
         ({"observe": {"E": ENERGY, "kept": {"drift": ENERGY}}}, "kept.drift"),
     ],
     ids=lambda x: "",

@@ -142,9 +142,9 @@ def test_problems_of_the_library():
     np.testing.assert_allclose(sim.energy(), at_start(problem, "energy"), rtol=1e-14)
     with pytest.raises(ValueError, match="another Hamiltonian"):
         interop.to_rebound(systems.kepler())
-    with pytest.raises(TypeError, match="together"):
+    with pytest.raises(TypeError, match="give both"):
         interop.to_rebound(problem, q=problem.q0)
-    with pytest.raises(ValueError, match=r"q holds values that are not finite.*failing step"):
+    with pytest.raises(ValueError, match=r"q has values that are not finite.*earlier state"):
         interop.to_rebound(problem, np.nan * problem.q0, problem.p0)
     u = pytest.importorskip("astropy.units")
     with pytest.raises(TypeError, match="p has the unit 'km'"):
@@ -162,7 +162,7 @@ def test_a_file(tmp_path):
     assert not np.array_equal(first.q0, last.q0)
     with pytest.raises(TypeError, match=r"archive\[i\]"):
         interop.from_rebound(rebound.Simulationarchive(str(path)))
-    with pytest.raises(FileNotFoundError, match="there is no Simulationarchive"):
+    with pytest.raises(FileNotFoundError, match=r"none\.bin' does not exist"):
         interop.from_rebound(tmp_path / "none.bin")
     with pytest.raises(ValueError, match="cannot read snapshot 7 of"):
         interop.from_rebound(path, snapshot=7)
@@ -224,7 +224,7 @@ def test_bodies_without_mass_need_one():
     sim = three_bodies()
     sim.N_active = 3
     sim.add(a=3.0, e=0.2)
-    with pytest.raises(ValueError, match="number 3"):
+    with pytest.raises(ValueError, match="index 3"):
         interop.from_rebound(sim)
     problem = interop.from_rebound(sim, massless=1e-20)
     assert problem.args["masses"][3] == 1e-20
@@ -245,5 +245,5 @@ def test_other_objects():
         interop.from_rebound(three_bodies(), snapshot=2)
     sim = three_bodies()
     sim.add(m=1e-5, x=sim.particles[1].x, y=sim.particles[1].y, z=sim.particles[1].z)
-    with pytest.raises(ValueError, match="giant and body 3 are on top"):
+    with pytest.raises(ValueError, match="giant and body 3 are at the same position"):
         interop.from_rebound(sim)

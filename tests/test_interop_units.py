@@ -77,11 +77,11 @@ def test_observables_see_numbers_in_the_units():
         ({"t0": 1 * u.kg}, ValueError, "mass.*time"),
         ({"args": {**ARGS, "m": 1.0}}, TypeError, "m .*no unit"),
         ({"args": {**ARGS, "mu": 1 * u.m}}, ValueError, "args mu is in m"),
-        ({"args": {**ARGS, "J": 1 * u.m}}, TypeError, "declare it"),
+        ({"args": {**ARGS, "J": 1 * u.m}}, TypeError, "units has no unit for J"),
         ({"epsilon": 1 * u.m}, ValueError, "epsilon"),
         ({"ts": [1, 2] * u.m}, ValueError, "ts is in m"),
-        ({"save": dvi.Save(ts=[1.0])}, TypeError, "without a unit"),
-        ({"lattice": dvi.Given([0.0, 1.0])}, TypeError, "without a unit"),
+        ({"save": dvi.Save(ts=[1.0])}, TypeError, "have no unit"),
+        ({"lattice": dvi.Given([0.0, 1.0])}, TypeError, "have no unit"),
         ({"ts": [1] * u.day, "save": dvi.Save()}, TypeError, "leave save out"),
         ({"units": {"length": "m"}}, TypeError, "UnitSystem"),
     ],
@@ -197,11 +197,11 @@ def test_a_unit_applies_to_all_parameters_below_its_name():
 
 
 def test_mistyped_names_of_parameters():
-    with pytest.raises(ValueError, match=r"has kk, which is not in args, and args has k without"):
+    with pytest.raises(ValueError, match=r"units for kk, .* and no units for k in args"):
         weights([1, 2] * u.kg, k=5.0, kinds={"kk": u.N / u.m})
     with pytest.raises(ValueError, match=r"'J22', but oblate_kepler has no such.*mu, R, J2"):
         interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args={"J22": 0.0})
-    with pytest.raises(TypeError, match="mapping from name to value; got list"):
+    with pytest.raises(TypeError, match=r"mapping from name to value, got .* of type list"):
         interop.integrate(systems.oblate_kepler(), h=10 * u.s, num_steps=1, args=[0.0])
 
 
@@ -223,5 +223,5 @@ def test_masked_values_and_units_without_a_factor():
     for unit in (u.deg_C, u.mag, u.ABmag, u.photon / u.s):
         with pytest.raises(ValueError, match="T cannot be in"):
             interop.UnitSystem(u.m, u.s, u.kg, args={"T": unit})
-    with pytest.raises(ValueError, match=r"in kelvin, x\.to\(u\.K, u\.temperature"):
+    with pytest.raises(ValueError, match=r"in kelvin it is x\.to\(u\.K, u\.temperature"):
         weights([1, 2] * u.kg, k=5 * u.deg_C, kinds={"k": u.K})

@@ -397,10 +397,10 @@ SHAPES = {  # another shape, and what the message says of the system
     "toda": ((2,), r"at least three particles.*shape \(n,\), n ≥ 3"),
     "fput": ((2, 4), r"row of particles"),
     "stiff_fput": ((3,), r"shape \(2, n\), n ≥ 1"),
-    "perturbed_pendulum": ((2,), r"one pendulum"),
+    "perturbed_pendulum": ((2,), r"one angle"),
     "magnetic_mirror": ((2,), r"one particle in space"),
     "figure_eight": ((3,), r"shape \(bodies, 2\) or \(bodies, 3\)"),
-    "polar_motion": ((2,), "the pole is one point"),
+    "polar_motion": ((2,), "the pole has one x"),
 }
 
 
@@ -419,7 +419,7 @@ def test_initial_conditions_of_another_shape_are_refused(name):
             made.check(np.ones(shape), np.ones(shape), made.args)
 
 
-POSITIVE, NO_GYRATION = "must be a positive.*got ", "must not be zero: .* not gyrate"
+POSITIVE, NO_GYRATION = "must be a positive.*got ", "must not be zero, got .* not gyrate"
 
 
 @pytest.mark.parametrize(
@@ -437,7 +437,7 @@ POSITIVE, NO_GYRATION = "must be a positive.*got ", "must not be zero: .* not gy
         ("restricted_three_body", {"mu": 0.7}, "must be the smaller.*0 < mu ≤ 1/2; got 0.7"),
         ("lotka_volterra", {"alpha": -0.1}, POSITIVE),
         ("uniform_field", {"B": 0.0}, NO_GYRATION),
-        ("uniform_field", {"E": [0.1]}, r"must have shape \(3,\), got \(1,\)"),
+        ("uniform_field", {"E": [0.1]}, r"must have shape \(3,\), got shape \(1,\)"),
         ("dipole_field", {"radius": -1.0}, POSITIVE),
         ("dipole_field", {"B0": 0.0}, NO_GYRATION),
         ("rigid_body", {"I3": 4.0}, ""),
@@ -447,9 +447,9 @@ POSITIVE, NO_GYRATION = "must be a positive.*got ", "must not be zero: .* not gy
         ("magnetic_mirror", {"B0": 0.0}, NO_GYRATION),
         ("magnetic_mirror", {"mass": -1.0}, POSITIVE + "-1.0"),
         ("magnetic_mirror", {"length": math.inf}, POSITIVE + "inf"),
-        ("polar_motion", {"mean": [0.1]}, r"must have shape \(2,\), got \(1,\)"),
-        ("polar_motion", {"drift": [0.1]}, r"must have shape \(2,\), got \(1,\)"),
-        ("polar_motion", {"prograde": 0.1}, r"must have shape \(2,\), got \(\)"),
+        ("polar_motion", {"mean": [0.1]}, r"must have shape \(2,\), got shape \(1,\)"),
+        ("polar_motion", {"drift": [0.1]}, r"must have shape \(2,\), got shape \(1,\)"),
+        ("polar_motion", {"prograde": 0.1}, r"must have shape \(2,\), got shape \(\)"),
         ("polar_motion", {"retrograde": [0.1, math.nan]}, "must be finite"),
         ("polar_motion", {"period": -433.0}, POSITIVE + "-433"),
         ("stiff_fput", {"omega": 0.0}, POSITIVE + "0.0"),
@@ -529,12 +529,12 @@ def test_facts_about_nothing_are_refused():
     made = problem("kepler")
     parts = {"name": "x", "system": made.system, "q0": [0.0], "p0": [0.0], "h": 0.1}
     with pytest.raises(
-        ValueError, match=r"invariants names 'energy'.*observables: it has no such entries"
+        ValueError, match=r"invariants of .* contains 'energy'.*observables .it has none"
     ):
         systems.Problem(**parts, invariants=("energy",))
-    with pytest.raises(ValueError, match=r"parameters names 'k'.*not one of its args: K"):
+    with pytest.raises(ValueError, match=r"parameters of .* contains 'k'.*not among its args .K"):
         systems.Problem(**parts, args={"K": 1.0}, parameters={"k": "strength [1]"})
-    with pytest.raises(ValueError, match="adiabatic names 'action'"):
+    with pytest.raises(ValueError, match=r"adiabatic of .* contains 'action'"):
         systems.Problem(**parts, adiabatic={"action": systems.Adiabatic("ε", 1)})
 
 
@@ -773,7 +773,9 @@ def test_exact_solutions_keep_the_dtype_and_refuse_other_shapes(name):
             assert x.shape == (1, 2, *q0.shape)
     many = jnp.stack([q0] * 3)
     if name not in ("oscillator", "van_der_pol", "slow_oscillator"):  # of any number of dimensions
-        with pytest.raises(ValueError, match=r"one start.*jax\.vmap.*got q0 of shape \(3, "):
+        with pytest.raises(
+            ValueError, match=r"one initial condition.*jax\.vmap.*got q0 of shape \(3, "
+        ):
             made.exact(1.0, many, many, made.args)
     with pytest.raises(ValueError, match="shape"):
         made.exact(1.0, many, q0, made.args)

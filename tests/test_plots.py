@@ -183,7 +183,7 @@ def test_save_takes_what_the_pictures_return(tmp_path):
     refuses(
         plot.save,
         (([one, several[0]], tmp_path / "b.png"), {}, "2 figures"),
-        (("picture", tmp_path / "b.png"), {}, "a figure, or the axes", TypeError),
+        (("picture", tmp_path / "b.png"), {}, "a figure or the axes", TypeError),
     )
     assert not (tmp_path / "b.png").exists()
 
@@ -267,7 +267,7 @@ def test_every_picture_draws_on_the_axes_it_is_given_and_on_nothing_else(single)
         assert not other.has_data(), name
         assert figure.legends == [], name
         if count > 1:
-            with pytest.raises(ValueError, match=f"give {count}"):
+            with pytest.raises(ValueError, match=f"needs {count} Axes"):
                 draw(mine[:-1])
         if name in ("planet_orbits", "ephemeris_comparison"):
             figure.canvas.draw()
@@ -422,11 +422,11 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
         ((states(3, (3, 1), (3, 1), dtype=complex),), {}, "complex", TypeError),
         ((states(3, (3, 1)),), {}, "needs momenta", TypeError),
         (states((3, 1)), {}, "must be a Solution", TypeError),
-        (([],), {}, "no orbit"),
+        (([],), {}, "orbits is empty"),
         (([arrays(n=1), two],), {}, r"shapes \[\(1,\), \(2,\)\]"),
         ((arrays(n=7),), {}, r"7 degrees of freedom are too many.*dof=\[0, 1\]"),
-        ((two,), {"dof": 2}, "has no component 2; give one number from 0 to 1"),
-        ((two,), {"dof": "q"}, "has no component 'q'"),
+        ((two,), {"dof": 2}, "dof must be a number from 0 to 1 .*, got 2"),
+        ((two,), {"dof": "q"}, "dof must be a number .*, got 'q'"),
         ((two,), {"dof": []}, "dof is empty"),
         ((two,), {"labels": ["a", "b"]}, r"one for each of 1 orbits, got \['a', 'b'\]"),
         ((two,), {"labels": "ab"}, "one for each of 1 orbits, got 'ab'"),
@@ -437,13 +437,13 @@ def test_orbits_and_choices_that_do_not_fit_are_named():
     )
     refuses(
         plot.orbit,
-        ((arrays(n=1),), {}, "For a single one use phase_portrait"),
+        ((arrays(n=1),), {}, "For a single coordinate use phase_portrait"),
         ((arrays(n=4),), {}, r"coordinates=\(0, 1\)"),
         ((two,), {"coordinates": (0, 2)}, "from 0 to 1"),
         ((two,), {"coordinates": (0,)}, "two or three"),
         ((two,), {"centre": 0}, "centre must be a point of"),
         ((two,), {"centre": [1.0]}, r"shape \(2,\)"),
-        ((two,), {"colour": [1.0]}, "one orbit"),
+        ((two,), {"colour": [1.0]}, "several orbits"),
         ((bodies,), {"bodies": [3]}, "from 0 to 2"),
         ((bodies,), {"names": ["A"]}, "one for each of 3 bodies"),
         ((arrays(2, n=2),), {"names": ["A", "B"]}, r"2 orbits.*labels="),
@@ -539,9 +539,9 @@ def test_invariants_that_cannot_be_drawn_are_named(single):
         ((t, {"E": np.ones(6)}), {}, r"shape \(4,\).*of shape \(6,\)"),
         ((t, {"E": 1j * t}), {}, "complex", TypeError),
         ((t, {"E": lambda q, p: q}), {}, "function", TypeError),
-        ((t,), {}, "there is neither", TypeError),
+        ((t,), {}, "orbits has no observables", TypeError),
         (("orbit", {"E": t}), {}, "must be a Solution, or times", TypeError),
-        ((t, {}), {}, "nothing to draw"),
+        ((t, {}), {}, "no observable of orbits"),
         ((t, dict.fromkeys("abcdefghijklm", 1 + t)), {}, "13 quantities are too"),
         ((single,), {"change": "log"}, known),
     )
@@ -769,7 +769,7 @@ def test_sections_take_functions_of_the_state():
     wrong = r"result of one dvi\.Section"
     refuses(
         plot.section,
-        ((made,), {"x": "q[2]"}, "has no component"),
+        ((made,), {"x": "q[2]"}, "the index in 'q.2.' must be a number from 0 to 1"),
         ((made,), {"x": "r[0]"}, r'such as "q\[0\]"'),
         ((made,), {"x": "q"}, r'such as "q\[0\]"'),
         ((made,), {"colour": [1.0]}, "1 values for 2 orbits"),
@@ -795,7 +795,7 @@ def test_a_bifurcation_has_a_column_of_points_for_each_parameter():
         plot.bifurcation,
         (([1, 2], np.ones((3, 4))), {}, shapes),
         (([1, 2], np.ones((2, 4))), {"skip": -1}, "from 0 on, got -1"),
-        (([0, 2], np.ones((2, 4))), {"log": True}, "positive parameters"),
+        (([0, 2], np.ones((2, 4))), {"log": True}, "positive values of parameter"),
     )
 
 
@@ -839,8 +839,8 @@ def test_work_precision_finds_the_front_and_marks_runs_without_a_place():
     refuses(
         plot.work_precision,
         (({},), {}, "results is empty"),
-        (({"a": ([1, 2], [1])},), {}, r"got \(2,\) and \(1,\)"),
-        (({"a": ([0, 2], [1, 1])},), {}, "with positive costs"),
+        (({"a": ([1, 2], [1])},), {}, r"got shapes \(2,\) and \(1,\)"),
+        (({"a": ([0, 2], [1, 1])},), {}, "and positive costs"),
         (({"a": 3},), {}, r"must be \(costs, errors\)"),
     )
 
@@ -880,7 +880,9 @@ def test_a_spectrum_draws_sizes_at_their_frequencies():
     assert len(linear.lines[0].get_xdata()) == 3
     shapes = r"float64.*of shape \(2, 3\), amplitudes of shape \(3,\)"
     refuses(
-        plot.spectrum, ((w, A[0]), {}, shapes), ((w,), {}, "frequencies and amplitudes", TypeError)
+        plot.spectrum,
+        ((w, A[0]), {}, shapes),
+        ((w,), {}, "has no frequencies, amplitudes", TypeError),
     )
 
 
@@ -904,7 +906,7 @@ def test_frequencies_are_drawn_against_each_other_or_their_diffusion_over_a_grid
     assert plot.frequency_map(a, b, D).get_xlabel() == "x"
     A, B = np.meshgrid(a, b, indexing="ij")
     assert plot.frequency_map(A, B, D, resonances=[(1, -1)]).get_xlabel() == "ω$_1$"
-    line = r"line among frequencies.*x and y of shape \(4, 3\)"
+    line = r"lines between frequencies.*x and y .* of shape \(4, 3\)"
     refuses(
         plot.frequency_map,
         ((x, y), {"resonances": [(0, 0)]}, "not both 0"),
@@ -1033,7 +1035,7 @@ def test_films_that_cannot_be_made_leave_nothing_behind(tmp_path, monkeypatch):
         (orbit, "a.gif", {"fps": float("nan")}, "fps must be"),
         (orbit, "a.gif", {"tail": 2}, "a fraction from 0 to 1, got 2"),
         (orbit, "a.gif", {"beside": "energy"}, known),
-        (orbit, "none/a.gif", {}, "folder of the film does not exist"),
+        (orbit, "none/a.gif", {}, "folder of path does not exist"),
         (orbit, "a.gif", {"size": (40, 40), "dpi": 600}, "needs too much memory"),
         (arrays(2, n=2), "a.gif", names, "2 orbits"),
         (arrays(), "a.gif", names, r"states of shape \(1,\)"),

@@ -164,42 +164,54 @@ def test_the_text_of_a_method_cannot_call_other_functions(tmp_path):
 LONG = "a" * 5000
 REJECTED = [
     ("steps = 5", "system: the key is missing", "file.py:name"),
-    ('system = "keplr"', "system: 'keplr'", "did you mean kepler?"),
-    ("system = 3", "system: 3 (a whole number)", "library"),
+    ('system = "keplr"', "system: the value is 'keplr'", "did you mean kepler?"),
+    ("system = 3", "system: the value is 3 (a whole number)", "library"),
     (KEPLER + "stepps = 5", "stepps: there is no such key", "did you mean steps?"),
     (KEPLER, "steps: the key is missing", "positive whole number"),
-    (KEPLER + "steps = 1.5", "steps: 1.5 (a number)", "positive whole number"),
-    (KEPLER + "steps = true", "steps: true (a boolean)", "positive whole number"),
-    (KEPLER + "steps = -1", "steps: -1 (a whole number)", "positive whole number"),
-    (FIVE + "h = 0.0", "h: 0.0 (a number)", "not zero"),
-    (FIVE + "h = inf", "h: inf (a number)", "finite"),
-    (FIVE + 'epsilon = "big"', "epsilon: 'big' (text)", "finite number"),
-    (FIVE + "epsilon = 1" + 400 * "0", "epsilon: 1000", "finite number"),
+    (KEPLER + "steps = 1.5", "steps: the value is 1.5 (a number)", "positive whole number"),
+    (KEPLER + "steps = true", "steps: the value is true (a boolean)", "positive whole number"),
+    (KEPLER + "steps = -1", "steps: the value is -1 (a whole number)", "positive whole number"),
+    (FIVE + "h = 0.0", "h: the value is 0.0 (a number)", "not zero"),
+    (FIVE + "h = inf", "h: the value is inf (a number)", "finite"),
+    (FIVE + 'epsilon = "big"', "epsilon: the value is 'big' (text)", "finite number"),
+    (FIVE + "epsilon = 1" + 400 * "0", "epsilon: the value is 1000", "finite number"),
     (FIVE + 'method = "Yosida(4)"', "method: 'Yosida'", "did you mean Yoshida?"),
     (FIVE + 'method = "Yoshida(5)"', "orders 4, 6 and 8, got order=5", "Strang"),
     (FIVE + 'method = "3"', "method: '3'", "Strang"),
     (FIVE + f'method = "{3000 * "-"}5"', "method: ", "Strang"),
-    (FIVE + 'lattice = "given"', "lattice: 'given' (text)", "uniform"),
-    (KEPLER + "lattice = {times = [0, 1, 0.5]}", "lattice.times: [0, 1, 0.5]", "all increasing"),
-    (FIVE + "lattice = {times = [0.0, 1.0]}", "steps: 5", "lattice.times gives"),
-    (FIVE + "state = 1", "state: 1", "q0, p0, date"),
-    (FIVE + "[state]\nq0 = [1, 2, 3]", "state.p0: shape (2,)", "(3,)"),
+    (FIVE + 'lattice = "given"', "lattice: the value is 'given' (text)", "uniform"),
+    (
+        KEPLER + "lattice = {times = [0, 1, 0.5]}",
+        "lattice.times: the value is [0, 1, 0.5]",
+        "all increasing",
+    ),
+    (FIVE + "lattice = {times = [0.0, 1.0]}", "steps: the value is 5", "lattice.times gives"),
+    (FIVE + "state = 1", "state: the value is 1", "q0, p0, date"),
+    (FIVE + "[state]\nq0 = [1, 2, 3]", "state.p0: p0 has shape (2,)", "(3,)"),
     (FIVE + "[state]\nq0 = [1.0]\np0 = [1.0]", "state: ", ""),
     (FIVE + "[state]\nq0 = [0, 0]\np0 = [1, 0]", "state: ", ""),
-    (FIVE + "[state]\nq0 = [[1, 2], [3]]", "state.q0: [[1, 2], [3]]", "one length"),
-    (FIVE + "[state]\nq0 = [1, nan]", "state.q0[1]: nan (a number)", "finite"),
+    (FIVE + "[state]\nq0 = [[1, 2], [3]]", "state.q0: the value is [[1, 2], [3]]", "one length"),
+    (FIVE + "[state]\nq0 = [1, nan]", "state.q0[1]: the value is nan (a number)", "finite"),
     (FIVE + '[state]\ndate = "1950-01-01"', "state.date:", "solar_system"),
     (FIVE + "[args]\nk = 1.0", "args.k: there is no such", "did you mean K?"),
-    (FIVE + '[args]\nK = "one"', "args.K: 'one' (text)", "numbers"),
-    (FIVE + "[args]\nK = 1" + "0" * 400, "args.K: 1000", "numbers"),
+    (FIVE + '[args]\nK = "one"', "args.K: the value is 'one' (text)", "numbers"),
+    (FIVE + "[args]\nK = 1" + "0" * 400, "args.K: the value is 1000", "numbers"),
     (FIVE + "[args]\nK = [1.0, 2.0]", "args: K must be a positive and finite", "args that fit"),
-    (FIVE + "[observables]\n'../x' = 'energy'", "the name '../x'", "without /"),
+    (FIVE + "[observables]\n'../x' = 'energy'", "the name is '../x'", "without /"),
     (FIVE + '[observables]\na = "enrgy"', "observables.a: 'enrgy'", "mean energy?"),
-    (FIVE + "[observables]\na = 3", "observables.a: 3 (a whole number)", ""),
-    (FIVE + '[observables]\na = "Max(energy)"', "observables.a: 'Max(", "MaxDrift"),
-    (FIVE + '[observables]\na = "own.py:number"', "own.py:number' is int", "function"),
-    (FIVE + '[observables]\na = "own.py:too_few"', "takes (t0, t1)", "a function (t0, t1, q0"),
-    (FIVE + "[output]\nevery = 0", "output.every: 0", "positive whole number"),
+    (FIVE + "[observables]\na = 3", "observables.a: the value is 3 (a whole number)", ""),
+    (
+        FIVE + '[observables]\na = "Max(energy)"',
+        "observables.a: 'Max' is not a reduction",
+        "MaxDrift",
+    ),
+    (FIVE + '[observables]\na = "own.py:number"', "own.py:number' has the type int", "function"),
+    (
+        FIVE + '[observables]\na = "own.py:too_few"',
+        "takes (t0, t1)",
+        "a function (t0, t1, q0",
+    ),
+    (FIVE + "[output]\nevery = 0", "output.every: the value is 0", "positive whole number"),
     (FIVE + "[output]\nevrey = 1", "output.evrey: there is no", "mean every?"),
     ('system = "kepler', "is not TOML", "toml.io"),
     ("h = 1" + "0" * 5000, "is not TOML", "toml.io"),
@@ -208,7 +220,7 @@ REJECTED = [
     ('system = "a\\u0000.py:system"', "null ", ""),
     ('system = "nowhere.py:system"', "there is no file", "file.py:name"),
     ('system = "own.py:sistem"', "own.py has no 'sistem'", "did you mean system?"),
-    ('system = "own.py:number"', "own.py:number' is int", "dvi.System"),
+    ('system = "own.py:number"', "own.py:number' has the type int", "dvi.System"),
     ('system = "own.py:failing"', "RuntimeError: no luck (own.py, line 16)", "returns a system"),
     ('system = "broken.py:system"', "not_there_at_all' (broken.py, line 2)", "can import"),
     ('system = "syntax.py:system"', "SyntaxError", "can import"),
@@ -227,7 +239,11 @@ REJECTED = [
         "in place of if (own.py, line 28)",
         "fit",
     ),
-    (N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]", "body 0 and body 1 are on top", "start"),
+    (
+        N_BODY + "[state]\nq0 = [[0, 0], [0, 0], [1, 1]]",
+        "body 0 and body 1 are at the same position",
+        "start",
+    ),
     (N_BODY + "[args]\nmasses = [1, 0, 1]", "mass of body 1 is 0", "start"),
 ]
 
@@ -245,13 +261,20 @@ def test_bad_paths(folder):
     path = write(folder, FIVE + '[output]\ndir = "a\\u0000"')
     refuses(command("run", path), "output.dir: ")
     (folder / "bom.toml").write_bytes(b"\xef\xbb\xbf" + b'system = "none"\r\n')
-    refuses(command("run", "bom.toml"), "system: 'none'")  # a byte order mark is allowed
+    refuses(
+        command("run", "bom.toml"), "system: the value is 'none'"
+    )  # a byte order mark is allowed
 
 
 def test_all_wrong_keys_of_a_file_are_named(folder):
     text = KEPLER + 'stepps = 5\nh = 0.0\n[state]\nq0 = [1, nan]\nq1 = 1\n[args]\nK = "k"\n'
     result = command("run", write(folder, text))
-    for seen in ("stepps: there is", "h: 0.0", "state.q0[1]: nan", "args.K: 'k' (text)"):
+    for seen in (
+        "stepps: there is",
+        "h: the value is 0.0",
+        "state.q0[1]: the value is nan",
+        "args.K: the value is 'k' (text)",
+    ):
         refuses(result, seen)
     assert "state.q1: there is no such key\n  allowed: q0, p0, date" in result.stderr
     assert result.stderr.count("allowed: ") == 5
@@ -262,7 +285,7 @@ def test_all_wrong_keys_of_a_file_are_named(folder):
 @pytest.mark.parametrize(
     ("date", "steps", "seen"),
     [
-        ("1850-01-01", 5, "covers 1899-07-29"),
+        ("1850-01-01", 5, "choose a date from 1899-07-29"),
         ("2053-10-01", 10_000, "the run ends 312.5 days after"),
     ],
 )
@@ -407,6 +430,8 @@ def test_ctrl_c_while_results_are_written_lists_the_files(tmp_path):
 
 
 def test_the_error_in_python(folder):
-    with pytest.raises(InputError, match=re.escape("h: 0.0 (a number)\n  allowed: ")) as error:
+    with pytest.raises(
+        InputError, match=re.escape("h: the value is 0.0 (a number)\n  allowed: ")
+    ) as error:
         run_file(write(folder, FIVE + "h = 0.0"))
-    assert (error.value.key, error.value.seen) == ("h", "0.0 (a number)")
+    assert (error.value.key, error.value.seen) == ("h", "the value is 0.0 (a number)")

@@ -187,7 +187,9 @@ def test_an_orbit_that_escapes_does_not_change_others():
     escape = dvi.Stop(lambda t, q, p, args: jnp.sum(q**2) - 4)
     stopped = section(q, p, throw=False, stop=escape)
     assert list(stopped.status) == ["successful", "stopped", "successful"]
-    with pytest.raises(dvi.SectionError, match=r"1 of 3 orbits .* orbit 1, .* failed .run: not_fi"):
+    with pytest.raises(
+        dvi.SectionError, match=r"1 of 3 orbits .* orbit 1, .* failed; .* its run is not_fi"
+    ):
         section(q, p)
 
 
@@ -203,7 +205,7 @@ def diagram(q, p, **options):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda q, p: section(q, p[:2]), r"the same shape, got q0 \(3, 2\) and p0 \(2, 2\)"),
+        (lambda q, p: section(q, p[:2]), r"the same shape, got \(3, 2\) for q0 and \(2, 2\)"),
         (lambda q, p: section(q, p, num_steps=0), "num_steps must be a whole .* from 1 on, got 0"),
         (lambda q, p: section(q, p, epsilon=[0.0, 0.1]), "one for each of the 3 orbits, got 2"),
         (lambda q, p: section(q, p, skip=-1), "skip must be a whole"),
@@ -230,7 +232,7 @@ def test_invalid_arguments(make, message):
 def test_the_error_for_a_single_initial_condition_says_how_to_give_it():
     with pytest.raises(TypeError) as error:
         section(HENON.q0, HENON.p0)
-    assert "Give a single start as q0[None], p0[None]" in "".join(error.value.__notes__)
+    assert "Give a single initial condition as q0[None], p0[None]" in "".join(error.value.__notes__)
 
 
 def test_signatures_list_the_keywords_that_are_passed_on():

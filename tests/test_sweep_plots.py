@@ -438,15 +438,15 @@ def test_invalid_input_is_rejected():
     three = xr.DataArray(np.ones((2, 3, 4)), dims=("a", "b", "c"), name="v")
     two, many = three[0], xr.DataArray(np.ones((40, 2, 2)))
     status, ax = with_status().status.expand_dims(k=2), plt.subplots()[1]
-    left = r"has also 'c'.*isel\(c=0\).*over='c'.*facet="
+    left = r"also has 'c'.*isel\(c=0\).*over='c'.*facet="
     refuses(
         plot.sweep_map,
         ((drift(), "y"), {}, r"no dimension 'y'.*epsilon \(7\), x"),
         ((three,), {}, left),
-        ((three, "a", "a"), {}, "y and x share the dimension 'a'"),
-        ((three, "a"), {"over": "a"}, "share the dimension 'a'"),
-        ((three[:, :0],), {}, "b has no values"),
-        ((three[0, 0, 0],), {}, "no dimension has more than one"),
+        ((three, "a", "a"), {}, "y and x both use 'a'"),
+        ((three, "a"), {"over": "a"}, "both use 'a'"),
+        ((three[:, :0],), {}, "no values to draw along b"),
+        ((three[0, 0, 0],), {}, "no dimension of the data has more than one"),
         ((two,), {"reduce": "sum"}, "one of 'max', 'min'"),
         ((two,), {"pixels": 3}, "pixels must be"),
         ((two,), {"limits": (2, 1)}, "two increasing numbers"),
@@ -454,21 +454,21 @@ def test_invalid_input_is_rejected():
         ((np.ones(3),), {}, "must be an xarray.DataArray", TypeError),
         ((with_status(),), {}, "one variable.*drift, status", TypeError),
         ((two + 1j,), {}, "real numbers, got .* complex128", TypeError),
-        ((three,), {"facet": "a", "ax": ax}, "leave out ax"),
+        ((three,), {"facet": "a", "ax": ax}, "leave out ax or facet"),
         ((many,), {"facet": "dim_0"}, r"40 values.*at most 16.*slice\(None, None, 3\)"),
         ((drift(),), {"status": status}, "select the same values in both"),
     )
     refuses(
         plot.failure_map,
-        ((drift().to_dataset(),), {}, "has no status: .*drift"),
+        ((drift().to_dataset(),), {}, "data has no status, only drift"),
         ((drift(),), {}, "flag_values and flag_meanings"),
     )
     local = {"x": "x", "y": "k", "local": True}
     refuses(
         plot.slope_map,
         ((drift(), "h"), {}, "no dimension 'h'"),
-        ((three, "a"), {}, "'a' has no numbers along which a slope"),
+        ((three, "a"), {}, "along='a' has no numbers for a slope"),
         ((drift(),), {"facet": "epsilon"}, "facet and over must not be 'epsilon'"),
         ((drift()[:1],), {}, "at least two positive values"),
-        ((drift().expand_dims(k=2),), local, "as x or y: name it"),
+        ((drift().expand_dims(k=2),), local, "needs 'epsilon' as x or y"),
     )

@@ -250,7 +250,7 @@ def test_damage_is_not_read_as_numbers_without_verification(copy, expected):
     file.unlink()
     record(copy, 5).write_bytes(b"")
     found = dvi.open_sweep(copy)
-    with pytest.warns(UserWarning, match=r"a file of 1 finished tasks is missing .*drift"):
+    with pytest.warns(UserWarning, match=r"files of 1 finished tasks are missing .*drift"):
         assert found.tasks_done == 10
     with pytest.warns(UserWarning, match="the same call"):
         assert found.status_counts()["not_computed"] == 200
@@ -454,7 +454,7 @@ def test_paths_that_are_not_a_store(tmp_path):
     with pytest.raises(dvi.StoreError, match="there is no sweep here"):
         dvi.open_sweep(tmp_path)
     (tmp_path / "thesis.txt").write_text("all of it")
-    with pytest.raises(dvi.StoreError, match="is not a sweep store"):
+    with pytest.raises(dvi.StoreError, match="is not the store of a sweep"):
         sweep(tmp_path)
     assert (tmp_path / "thesis.txt").read_text() == "all of it"
     for path, use in itertools.product(("a\0b", "x" * 300, "y/" * 3000), (dvi.open_sweep, sweep)):

@@ -58,7 +58,9 @@ def test_prolongation_is_the_sum_over_points():
 
 def test_generator_of_the_wrong_shape_is_named():
     bad = dvi.Generator(xi=lambda t, q, p, args: q[:1])
-    with pytest.raises(ValueError, match=r"xi .*must return shape \(2,\).*shape \(1,\)"):
+    with pytest.raises(
+        ValueError, match=r"xi .*must return an array of shape \(2,\).*shape \(1,\)"
+    ):
         bad(dvi.LatticePoint(0.0, np.ones(2), np.ones(2)))
     with pytest.raises(TypeError, match="eta must be a function"):
         dvi.Generator(eta=1.0)
@@ -115,7 +117,7 @@ def test_an_unbound_invariant_names_what_it_needs():
     invariant = dvi.AdiabaticInvariant([ROTATION], [None])
     with pytest.raises(ValueError, match="bind"):
         invariant(0.0, 0.1, *(np.ones(2) for _ in range(4)), None)
-    with pytest.raises(ValueError, match="got 2 and 1"):
+    with pytest.raises(ValueError, match="got 2 generators and 1 gauges"):
         dvi.AdiabaticInvariant([ROTATION, TIME], [None])
 
 

@@ -114,5 +114,5 @@ def test_checks_of_types():
         _checks.instance("method", "Strang", dvi.Method, "a dvi.Method", "Take one.")
     with pytest.raises(TypeError, match=r"got the class TypeII .is a pair of parentheses missing"):
         _checks.instance("method", dvi.TypeII, dvi.Method, "a dvi.Method")
-    with pytest.raises(TypeError, match=r"f must be a function \(t, q\), got 3\."):
+    with pytest.raises(TypeError, match=r"f must be a function of \(t, q\), got 3\."):
         _checks.function("f", 3, "(t, q)")

@@ -118,7 +118,7 @@ def certify(
 def _named(methods: Any) -> dict[str, dvi.Method]:
     """Name → method, checked."""
     if isinstance(methods, dvi.Method):
-        raise TypeError(f'give the method a name: certify({{"mine": {methods!r}}}).')
+        raise TypeError(f'methods must have names: write certify({{"mine": {methods!r}}}).')
     if not isinstance(methods, Mapping):
         own = " For your own method call certify({name: method})."
         return {name: METHODS[name] for name in chosen("method", methods, METHODS, own)}

@@ -40,7 +40,7 @@ def page_for(out: Path) -> Path:
         except (OSError, UnicodeDecodeError) as error:
             fault = f"{page} cannot be read: {error}"
     if fault:
-        allowed = "a .md file that is new or a certificate, or a directory for one."
+        allowed = "a new .md file, an earlier certificate, or a directory for the certificate."
         raise ValueError(f"--out: {fault}\n  allowed: {allowed}")
     return page
 

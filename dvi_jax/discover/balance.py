@@ -83,13 +83,13 @@ def noether_balance(
     steps = int(jnp.size(solution.ts)) - 1
     if jnp.ndim(solution.ts) != 1 or steps < 2:
         raise ValueError(
-            f"a balance needs one solution with at least two steps, got ts of shape "
+            "solution must be one trajectory with at least two steps, got times of shape "
             f"{jnp.shape(solution.ts)}. For a batch use jax.vmap over solutions."
         )
     if steps != solution.stats["num_steps"] or steps != jnp.size(solution.hs):
         raise ValueError(
-            "a balance needs every lattice point: the solution has "
-            f"{steps + 1} states of {solution.stats['num_steps']} steps"
+            "a balance needs every lattice point, but solution has "
+            f"{steps + 1} states for {solution.stats['num_steps']} steps"
             + (", saved at requested times" if steps != jnp.size(solution.hs) else "")
             + ". Integrate with save=dvi.Save()."
         )

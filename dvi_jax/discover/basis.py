@@ -79,8 +79,8 @@ class BoundBasis(eqx.Module):
         q, p = jnp.asarray(q), jnp.asarray(p)
         if self.shape is not None and not q.shape == p.shape == self.shape:
             raise ValueError(
-                f"these basis functions are for q and p of shape {self.shape}; got q of shape "
-                f"{q.shape} and p of shape {p.shape}."
+                f"q and p must have the shape {self.shape} for which this basis was made, got q of "
+                f"shape {q.shape} and p of shape {p.shape}."
             )
         return self.function(q, p, jnp.asarray(t, float))
 
@@ -169,11 +169,12 @@ class Basis(AbstractBasis):
         else:
             named = {_name(each, i): each for i, each in enumerate(tuple(functions))}
         if not named:
-            raise ValueError("a basis needs at least one function (q, p) → scalar, got none.")
+            raise ValueError("functions is empty: give at least one function (q, p) → scalar.")
         for name, each in named.items():
             function(f"basis function {name!r}", each, "(q, p) or (q, p, t)")
             if not (_takes(each, 2) or _takes(each, 3)):
-                raise TypeError(f"basis function {name!r} must take (q, p) or (q, p, t).")
+                seen = inspect.signature(each)
+                raise TypeError(f"basis function {name!r} takes {seen}, not (q, p) or (q, p, t).")
         self.functions, self.names = tuple(named.values()), tuple(named)
         self.complexity = complexity
 
@@ -209,7 +210,7 @@ def _require_real_scalar(name, function, timed: bool, shape) -> None:
         seen = "None" if out is None else f"shape {kind}, type {np.dtype(dtype).name}"
         raise ValueError(
             f"the basis function {name!r} must return a real scalar; for q of shape {shape} it "
-            f"returned {seen}. Take one component, e.g. q[0]."
+            f"returned {seen}. Return one number, such as the component q[0]."
         )
 
 

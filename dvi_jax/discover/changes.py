@@ -95,13 +95,13 @@ def checked_changes(stepped: Stepped, order: int, samples: Samples) -> Changes:
     check_finite(stepped.basis, found.values)
 
     def change(m, j):
-        what = "changes by" if m == 0 else f"has in order {m} of ε"
-        return f"what the basis function {names[j]!r} {what} in a step"
+        what = "the change" if m == 0 else f"the term of order {m} in ε of the change"
+        return f"{what} of the basis function {names[j]!r} in a step"
 
-    singular = "H_D, the force or the function is singular there or where the step leads"
-    require_finite(found.terms, change, f"{singular}; keep the samples off the singularity")
+    singular = "H_D, the force or the function is singular there or at the end of the step"
+    require_finite(found.terms, change, f"{singular}; keep the samples away from singularities")
     require_finite(found.slopes, lambda j, i: f"the derivative of the basis function {names[j]!r}")
-    hint = "keep them off singularities of H_D and the force"
+    hint = "keep the samples away from singularities of H_D and the force"
     require_finite(np.where(found.good, 0, np.nan), lambda: "the derivative of the map", hint)
     if np.ptp(samples.t) == 0 and _may_depend_on_time(stepped.equations, samples):
         _require_no_time(stepped, order, samples, found)

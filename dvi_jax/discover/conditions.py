@@ -118,12 +118,12 @@ def at_samples(equations, h, basis, gauge_basis, order, samples, later) -> Condi
 def require_finite_conditions(raw: Conditions) -> None:
     """Reject conditions that are not finite: at the samples, or where the step leads."""
     hint = (
-        "H_D or the functions are singular there, or where a step leads from there; keep the "
-        "samples off the singularity"
+        "H_D or the functions are singular there or at the end of the step; keep the samples away "
+        "from singularities"
     )
     require_finite(raw.determining, lambda *_: "the left side of a determining equation", hint)
-    require_finite(raw.identity, lambda *_: "Noether's identity", hint)
-    require_finite(raw.gauge, lambda *_: "the gauge basis", hint)
+    require_finite(raw.identity, lambda *_: "a term of Noether's identity", hint)
+    require_finite(raw.gauge, lambda *_: "a function of the gauge basis", hint)
 
 
 def require_times(raw: Conditions, samples: Samples, h: float, shift: float) -> None:

@@ -122,8 +122,8 @@ def conformal_factor(
     samples, size = len(first.q), 2 * first.q[0].size
     if not pointwise and samples < size:
         raise ValueError(
-            f"a {size}×{size} factor needs at least {size} sampled pairs of points, got {samples}: "
-            "give more points, or pointwise=True."
+            f"first and second must have at least {size} points for a {size}×{size} conformal "
+            f"factor, got {samples}: give more points, or pointwise=True."
         )
     find = _pointwise if pointwise else _constant
     return find(system, generators, first, second, jnp.asarray(epsilon), args)

@@ -149,8 +149,8 @@ def drift_surface(
     invariants = list(invariant) if given else [invariant] * len(hs)
     if len(invariants) != len(hs):
         raise ValueError(
-            f"give one observable for all step sizes or one for each: got {len(invariants)} for "
-            f"{len(hs)} step sizes."
+            "invariant must be one observable for all step sizes, or a list with one for each: got "
+            f"{len(invariants)} observables for {len(hs)} step sizes."
         )
     for each in invariants:
         _check_observable(each)
@@ -196,8 +196,8 @@ def _sweep(system, invariant, starts, epsilons, h, num_steps, settings) -> _Lane
     )
     if drifts.ndim != 1:
         raise ValueError(
-            f"the invariant must be a scalar, got values of shape {drifts.shape[1:]}: take one "
-            "component."
+            f"invariant must return a scalar, but returns values of shape {drifts.shape[1:]}: take "
+            "one component."
         )
     drifts = np.asarray(drifts, float)
     # An odd observable may end near zero: its drift shows how large it was.
@@ -269,7 +269,7 @@ def _order(epsilons: np.ndarray, lanes: _Lanes, kept: np.ndarray) -> DriftOrder:
 
 
 def _check_observable(invariant: Any) -> None:
-    function("invariant", invariant, hint="From a Discovery give one of its `invariants`.")
+    function("invariant", invariant, hint="Of a Discovery give one of its `invariants`.")
 
 
 def _positive(name: str, values: Any, increasing: bool = False) -> np.ndarray:
@@ -278,10 +278,10 @@ def _positive(name: str, values: Any, increasing: bool = False) -> np.ndarray:
     except (TypeError, ValueError):
         array = np.zeros(())
     if array.ndim != 1 or len(array) == 0 or not (np.isfinite(array) & (array > 0)).all():
-        raise ValueError(f"{name} must be a list of positive numbers, got {values!r:.200}.")
+        raise ValueError(f"{name} must be a list of positive, finite numbers, got {values!r:.200}.")
     fits = (np.diff(array) > 0).all() if increasing else len(np.unique(array)) == len(array)
     if not fits:
-        rule = "increase" if increasing else "be distinct"
+        rule = "be in increasing order" if increasing else "have distinct values"
         raise ValueError(f"{name} must {rule}, got {array.tolist()}.")
     return array
 
@@ -293,8 +293,8 @@ def _starts(q0: Any, p0: Any, batched: bool):
         return q0[None], p0[None]
     if q0.ndim == 0:
         raise ValueError(
-            "with batched=True, q0 and p0 must have a first axis of initial conditions, (S, "
-            "*state); got single numbers."
+            "with batched=True, q0 and p0 must be arrays with the initial conditions along the "
+            "first axis, (S, *state), got single numbers: leave batched out."
         )
     return q0, p0
 

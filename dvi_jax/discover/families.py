@@ -29,7 +29,10 @@ def _places(variables: Sequence[str], shape: tuple[int, ...]) -> tuple[int, ...]
     every = coordinate_names(shape)
     unknown = [v for v in variables if v not in every + TIME]
     if unknown:
-        raise ValueError(f"there is no component {unknown[0]!r}, only {[*every]} and the time 't'.")
+        raise ValueError(
+            f"the basis has the variable {unknown[0]!r}, but states of shape {shape} have only the "
+            f"components {', '.join(every)} and the time t: use these names."
+        )
     return tuple(len(every) if v in TIME else every.index(v) for v in variables)
 
 

@@ -211,7 +211,7 @@ class Discovery(eqx.Module):
         **Raises** `FileNotFoundError` where there is no such file, `ValueError` for a file of
         something else, or another basis.
         """
-        refuse_double_without_x64("a Discovery", np.float64)
+        refuse_double_without_x64("a saved Discovery", np.float64)
         about, found = read_npz(path, _FORMAT, "discovery")
         plain, names = _fields()
         try:
@@ -223,20 +223,20 @@ class Discovery(eqx.Module):
             probe = Samples(*(found[f"probe_{name}"] for name in Samples._fields))
             values = found["probe_values"]
         except KeyError as error:
-            raise ValueError(f"{os.fspath(path)} is not a file of Discovery.save.") from error
+            raise ValueError(f"{os.fspath(path)} was not written by Discovery.save.") from error
         bound = bind_basis(basis, tuple(about["shape"]))
         inner, to_basis = bound.about(arrays["middle"])
         if list(bound.names) != about["names"]:
             raise ValueError(
                 f"basis must be the basis of the search saved in {os.fspath(path)}, which has "
-                f"{len(about['names'])} functions ({', '.join(about['names'][:4])} …); the one "
-                f"given has {bound.size} ({', '.join(bound.names[:4])} …)."
+                f"{len(about['names'])} functions ({', '.join(about['names'][:4])} …), but the "
+                f"given basis has {bound.size} ({', '.join(bound.names[:4])} …)."
             )
         differs = ~np.isclose(_probed(bound, probe), values, rtol=1e-9)
         if differs.any():
             raise ValueError(
-                f"basis must be the basis of the search saved in {os.fspath(path)}: its function "
-                f"{bound.names[int(np.argmax(differs.any(axis=0)))]!r} has other values."
+                f"basis must be the basis of the search saved in {os.fspath(path)}, but the values "
+                f"of {bound.names[int(np.argmax(differs.any(axis=0)))]!r} differ from those saved."
             )
         for name in ("inner_coefficients", "inner_dependent"):
             arrays[name] = jnp.asarray(arrays[name])

@@ -38,7 +38,7 @@ class Generator(eqx.Module):
     def __check_init__(self):
         for name in _COMPONENTS:
             if getattr(self, name) is not None:
-                function(name, getattr(self, name), "(t, q, p, args)", "None stands for zero.")
+                function(name, getattr(self, name), "(t, q, p, args)", "None means zero.")
 
     def __call__(self, point: LatticePoint, args: Args = None) -> LatticePoint:
         """(ξ0, ξ, η) at the point, shaped like (t, q, p)."""
@@ -51,8 +51,8 @@ class Generator(eqx.Module):
                 value = jnp.asarray(component(t, q, p, args), like.dtype)
                 if value.shape != like.shape:
                     raise ValueError(
-                        f"{name} of the Generator must return shape {like.shape} for q of shape "
-                        f"{q.shape}; it returned shape {value.shape}."
+                        f"{name} of the Generator must return an array of shape {like.shape} for q "
+                        f"of shape {q.shape}, but it returned shape {value.shape}."
                     )
             values.append(value)
         return LatticePoint(*values)

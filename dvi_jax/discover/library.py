@@ -46,7 +46,7 @@ def rotation(i: int = 0, j: int = 1) -> Generator:
     """
     axes = (i, j)
     if any(isinstance(a, bool) or not isinstance(a, int) or a < 0 for a in axes) or i == j:
-        raise ValueError(f"a rotation needs two different axes i, j ≥ 0, got {i!r} and {j!r}.")
+        raise ValueError(f"i and j must be two different axes ≥ 0, got i = {i!r} and j = {j!r}.")
     return Generator(xi=eqx.Partial(_turned, 1, i, j), eta=eqx.Partial(_turned, 2, i, j))
 
 
@@ -61,9 +61,9 @@ def scaling(q: Any = 1.0, p: Any = 1.0, t: float = 0.0) -> Generator:
     """
     a, b, c = (_finite(name, x) for name, x in (("t", t), ("q", q), ("p", p)))
     if a.shape != ():
-        raise ValueError(f"the weight of t must be a number, got an array of shape {a.shape}.")
+        raise ValueError(f"the weight t must be one number, got an array of shape {a.shape}.")
     if not (a.any() or b.any() or c.any()):
-        raise ValueError("all weights t, q, p of the scaling are 0: give one that is not.")
+        raise ValueError("the weights t, q and p of the scaling are all 0: change one of them.")
     weights = enumerate((a, b, c))
     return Generator(*(eqx.Partial(_scaled, i, w) if w.any() else None for i, w in weights))
 
@@ -80,7 +80,7 @@ def boost(direction: Any, mass: Any = 1.0) -> Generator:
     """
     masses = _finite("mass", mass)
     if not (masses > 0).all():
-        raise ValueError(f"masses must be positive, got {mass!r}.")
+        raise ValueError(f"mass must be positive for every body, got {mass!r}.")
     v = _direction(direction)
     return Generator(xi=eqx.Partial(_boosted, v, None), eta=eqx.Partial(_boosted, v, masses))
 
@@ -93,7 +93,7 @@ def hamiltonian_flow(function: Callable[..., Any]) -> Generator:
 
     **Raises** `TypeError` for what is not callable. **Source** Olver 1993, Chapter 6.
     """
-    _checks.function("K", function, "(t, q, p, args) → scalar")
+    _checks.function("the argument of hamiltonian_flow", function, "(t, q, p, args) → scalar")
     return Generator(
         xi=eqx.Partial(_slope, function, 2, 1.0), eta=eqx.Partial(_slope, function, 1, -1.0)
     )
@@ -124,8 +124,8 @@ def _turned(place, i, j, t, q, p, args):
     v = (t, q, p)[place]
     if v.ndim == 0 or v.shape[-1] <= max(i, j):
         raise ValueError(
-            f"rotation({i}, {j}) needs q whose last axis has at least {max(i, j) + 1} components; "
-            f"q has shape {q.shape}."
+            f"rotation({i}, {j}) requires that the last axis of q has at least {max(i, j) + 1} "
+            f"components, but q has shape {q.shape}: use smaller axes i, j."
         )
     return jnp.zeros_like(v).at[..., i].set(-v[..., j]).at[..., j].set(v[..., i])
 
@@ -168,10 +168,7 @@ def _finite(name: str, value: Any) -> np.ndarray:
 def _direction(value: Any) -> np.ndarray:
     direction = _finite("direction", value)
     if not direction.any():
-        raise ValueError(
-            "the direction of a translation or boost must have a component that is not zero, got "
-            f"{value!r}."
-        )
+        raise ValueError(f"direction must have a component that is not zero, got {value!r}.")
     return direction
 
 
@@ -181,6 +178,6 @@ def _fitted(name: str, value: np.ndarray, q: State) -> Array:
         return jnp.broadcast_to(value, q.shape).astype(q.dtype)
     except ValueError:
         raise ValueError(
-            f"{name} of shape {value.shape} does not match q of shape {q.shape}: give an array of "
-            "that shape, or of the shape of its last axes."
+            f"{name} of shape {value.shape} does not match q of shape {q.shape}: give an array "
+            "with the shape of q, or with the shape of the last axes of q."
         ) from None

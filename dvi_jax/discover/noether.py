@@ -120,8 +120,8 @@ class AdiabaticInvariant(eqx.Module):
     def __check_init__(self):
         if len(self.generators) != len(self.gauges) or not self.gauges:
             raise ValueError(
-                "an invariant of order z needs z + 1 generators and z + 1 gauges (None for zero); "
-                f"got {len(self.generators)} and {len(self.gauges)}."
+                "generators and gauges must have one entry for each order (None: the gauge is "
+                f"zero), got {len(self.generators)} generators and {len(self.gauges)} gauges."
             )
 
     @property
@@ -136,7 +136,7 @@ class AdiabaticInvariant(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.system is None:
             raise ValueError(
-                "an AdiabaticInvariant requires the system and ε: call "
+                "this AdiabaticInvariant has no system and no ε yet: call "
                 "invariant.bind(system, epsilon)(...), or give it to dvi.integrate(observe=...)."
             )
         energy = incoming_energy(self.system, t0, t1, q0, p1, self.epsilon, args)

@@ -123,8 +123,8 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
     """(qs, ps) at the time t0, or (qs, ps, ts), after rejecting what cannot be sampled points."""
     if not x64_enabled():
         raise TypeError(
-            "this process computes in float32, and a search needs double precision, whatever the "
-            'type of the samples: put\n    jax.config.update("jax_enable_x64", True)\nbefore the '
+            "this process computes in float32, but a search needs double precision for samples of "
+            'any type: put the line\n    jax.config.update("jax_enable_x64", True)\nbefore the '
             "first array is made."
         )
     if isinstance(samples, Samples):
@@ -142,16 +142,16 @@ def as_samples(samples: Any, t0: float = 0.0) -> Samples:
     if q.shape != p.shape or q.ndim < 1 or len(q) == 0:
         raise ValueError(
             "qs and ps of samples must have the same shape, with the points along the first axis; "
-            f"got {q.shape} and {p.shape}."
+            f"got {q.shape} for qs and {p.shape} for ps."
         )
     t = arrays[2] if len(arrays) == 3 else np.full(len(q), float(t0))
     if t.shape != (len(q),):
-        raise ValueError(f"ts of {len(q)} samples must have shape ({len(q)},), got {t.shape}.")
+        raise ValueError(f"ts must have the shape ({len(q)},) for {len(q)} samples, got {t.shape}.")
     finite = [np.isfinite(x).reshape(len(q), -1).all(axis=1) for x in (q, p, t)]
     if len(bad := np.flatnonzero(~np.all(finite, axis=0))):
         raise ValueError(
-            f"{len(bad)} of {len(q)} samples are not finite, the first has index {bad[0]}: use "
-            "only points where H and W are defined."
+            f"{len(bad)} of {len(q)} samples are not finite (the first has index {bad[0]}): give "
+            "only points with finite q, p and t."
         )
     return Samples(q, p, t)
 
@@ -214,16 +214,16 @@ def require_steps(good: Any, samples: Samples) -> None:
     if not good.all():
         i = int(np.argmin(good))
         raise ValueError(
-            f"the step fails at {int(np.sum(~good))} of {len(good)} samples, first at q = "
-            f"{samples.q[i].tolist()}, p = {samples.p[i].tolist()}: take samples where the map is "
-            "defined, or a smaller h."
+            f"the step fails at {int(np.sum(~good))} of {len(good)} samples, the first of which is "
+            f"q = {samples.q[i].tolist()}, p = {samples.p[i].tolist()}: take samples where the map "
+            "is defined, or a smaller h."
         )
 
 
 def require_finite(
     values: np.ndarray,
     what: Callable[..., str],
-    hint: str = "keep the samples off its singularity",
+    hint: str = "keep the samples away from its singularities",
 ) -> None:
     """Reject values, shape (S, …), that are not finite; `what`: their name from the indices that
     follow the sample."""
@@ -232,8 +232,8 @@ def require_finite(
         i, *index = np.argwhere(bad)[0]
         count = int(bad.reshape(len(bad), -1).any(axis=1).sum())
         raise ValueError(
-            f"{what(*index)} is not finite at {count} of {len(bad)} samples (first: number {i}): "
-            f"{hint}."
+            f"{what(*index)} is not finite at {count} of {len(bad)} samples (the first has index "
+            f"{i}): {hint}."
         )
 
 
@@ -258,13 +258,13 @@ def check_basis(basis: BoundBasis, values: np.ndarray) -> float:
         raise ValueError(
             f"the basis is rank-deficient: {zero.size} of {len(scale)} functions are 0 on all "
             f"samples ({members}{' …' if zero.size > 4 else ''}). Leave them out; if the "
-            "coordinates are so small that their powers underflow, use larger units."
+            "coordinates are so small that their powers underflow, use smaller units."
         )
     if singular[-1] < 1e-13 * singular[0]:
         members = ", ".join(repr(basis.names[j]) for j in np.argsort(-abs(V[-1]))[:4])
         raise ValueError(
-            f"the basis is rank-deficient on the samples: a combination of {members} … vanishes "
-            "on all of them. Leave one out, or take samples that fill the domain."
+            f"the basis is rank-deficient: a combination of the functions {members} … vanishes on "
+            "all samples. Leave one of them out, or take samples that fill the domain."
         )
     return float(singular[0] / singular[-1])
 
@@ -319,7 +319,7 @@ def random_pairs(
     samples, h = as_samples(samples, t0), check_step_size(h)
     count = len(samples.q)
     if count < 2:
-        raise ValueError("random_pairs requires at least two samples, got one.")
+        raise ValueError("samples must have at least two points for random_pairs, got one.")
     order = np.random.default_rng(seed).permutation(count)
     other = np.empty(count, int)
     other[order] = np.roll(order, 1)  # one cycle: no sample is paired with itself

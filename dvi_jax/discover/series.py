@@ -58,7 +58,7 @@ class InvariantSeries(eqx.Module):
     def __call__(self, t0, t1, q0, p0, q1, p1, args):
         if self.epsilon is None:
             raise ValueError(
-                "an InvariantSeries requires the value of ε: call invariant.bind(system, "
+                "this InvariantSeries has no value of ε yet: call invariant.bind(system, "
                 "epsilon)(...), or give it to dvi.integrate(observe=...)."
             )
         time = self.epsilon * t1 if self.slow_time else t1
@@ -75,8 +75,8 @@ class InvariantSeries(eqx.Module):
         """
         if self.slow_time and self.basis.uses_time:
             raise ValueError(
-                "this invariant is a function of the slow time εt, but a generator must be one of "
-                "the time t: generators() cannot be used for it."
+                "this invariant depends on the slow time εt, but a generator must be a function of "
+                "t: for `generators` search with a basis that has no functions of the time."
             )
         return [_symplectic_gradient(self.basis, c) for c in self.coefficients]
 

@@ -119,7 +119,7 @@ class ShadowHamiltonian(eqx.Module):
         system = self.system
         if system is None:
             raise ValueError(
-                "a ShadowHamiltonian requires the system: write ShadowHamiltonian(order, system), "
+                "this ShadowHamiltonian has no system yet: write ShadowHamiltonian(order, system), "
                 "call shadow.bind(system, epsilon), or give it to dvi.integrate(observe=...)."
             )
         for name, value in (("q", q), ("p", p)):

@@ -104,13 +104,13 @@ def actions(
     ts, signal, eps, axes = signals_of(ts, signal)
     if not jnp.iscomplexobj(signal):
         raise TypeError(
-            "actions require q and p of every degree of freedom: give the complex signal q − i p "
-            f"of shape (n, N), or a Solution; got a real signal of shape {signal.shape}."
+            f"signal of shape {signal.shape} is real, but actions require q and p of every degree "
+            "of freedom: give the complex signal q − i p of shape (n, N), or a Solution."
         )
     if is_traced(signal) or is_traced(ts):
         raise ValueError(
-            "the times or the signal are traced: call actions outside of jit, vmap and grad, once "
-            "for the whole batch (a part of the computation uses NumPy)."
+            "ts or signal is traced, but a part of the computation uses NumPy: call actions "
+            "outside of jit, vmap and grad, once for the whole batch."
         )
     # One axis for all degrees of freedom of a trajectory.
     lead, N = signal.shape[: signal.ndim - 1 - axes], signal.shape[-1]

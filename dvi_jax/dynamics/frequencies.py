@@ -186,8 +186,8 @@ def frequency_diffusion(
     halves = jnp.stack([signal[..., :half], signal[..., half : 2 * half]])
     if half < _FEWEST:
         raise ValueError(
-            f"frequency_diffusion compares two halves, which need at least {2 * _FEWEST} samples "
-            f"together, got {signal.shape[-1]}: save more often, or run longer."
+            f"signal must have at least {2 * _FEWEST} samples, since its two halves are compared; "
+            f"got {signal.shape[-1]} samples: save more often, or run longer."
         )
     times = jnp.stack([ts[..., :half], ts[..., half : 2 * half]])
     times = times.reshape(2, *(1,) * (halves.ndim - times.ndim), *times.shape[1:])
@@ -222,7 +222,7 @@ def check_count(settings: Settings, signal: Array) -> None:
     if unknowns >= signal.shape[-1]:
         raise ValueError(
             f"count = {settings.lines} lines have {unknowns} unknowns, which require more than "
-            f"{unknowns} samples, got {signal.shape[-1]}: use a smaller count or more samples."
+            f"{unknowns} samples; signal has {signal.shape[-1]}. Use fewer lines or more samples."
         )
 
 
@@ -233,11 +233,11 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
     state_axes = None
     if isinstance(ts, Solution) == (signal is not None):
         raise ValueError(
-            "give either times and a signal, frequencies(ts, signal), or only a Solution, "
-            "frequencies(solution), whose signal is q − i p."
+            "the arguments must be times and a signal, frequencies(ts, signal), or a Solution "
+            "alone, frequencies(solution), whose signal is q − i p."
         )
     if isinstance(ts, Solution):
-        qs, ps = (_double("the trajectory", x) for x in (ts.qs, ts.ps))
+        qs, ps = (_double("the solution", x) for x in (ts.qs, ts.ps))
         state_axes = qs.ndim - ts.ts.ndim
         signal, ts = jnp.moveaxis(qs - 1j * ps, ts.ts.ndim - 1, -1), ts.ts
         ts = ts.reshape(*ts.shape[:-1], *(1,) * state_axes, ts.shape[-1])
@@ -257,7 +257,7 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
         )
     if signal.shape[-1] < _FEWEST:
         raise ValueError(
-            f"a frequency needs at least {_FEWEST} samples, got {signal.shape[-1]}: save more "
+            f"signal must have at least {_FEWEST} samples, got {signal.shape[-1]}: save more "
             "often, or run longer."
         )
     if not is_traced(ts):
@@ -266,10 +266,10 @@ def signals_of(ts: Any, signal: Any) -> tuple[Array, Array, float, int]:
         uneven = np.asarray(_unevenness(jnp.asarray(rows), eps)) if len(rows) else np.zeros(1)
         if not (uneven <= 1).all():
             steps = np.diff(rows[uneven.argmax()])
-            coarse = f" These are {dtype}: give the times in float64." if eps > EPS else ""
+            coarse = f" Their type is {dtype}: give the times in float64." if eps > EPS else ""
             raise ValueError(
-                f"the times are not uniform: of their steps the shortest is {steps.min():.17g} and "
-                f"the longest {steps.max():.17g}. Save with dvi.Save(every=m) on the lattice "
+                f"the times ts are not uniform: the shortest step is {steps.min():.17g} and the "
+                f"longest is {steps.max():.17g}. Save with dvi.Save(every=m) on the lattice "
                 f"dvi.Uniform(), without final=True.{coarse}"
             )
     return ts, signal, eps, min(signal.ndim - 1, 1) if state_axes is None else state_axes
@@ -279,8 +279,8 @@ def _real_times(name: str, value: Any) -> Array:
     value = _double(name, value)
     if jnp.iscomplexobj(value):
         raise TypeError(
-            f"{name} must be real, got dtype {value.dtype}: in frequencies(ts, signal) the times "
-            "are the first argument."
+            f"{name} must be real, got dtype {value.dtype}: give the times as the first argument, "
+            "frequencies(ts, signal)."
         )
     return value
 
@@ -294,8 +294,8 @@ def _double(name: str, value: Any) -> Array:
         raise TypeError(f"{name} must be an array of numbers, got dtype {value.dtype}.")
     if not x64_enabled():
         raise TypeError(
-            "frequency analysis needs double precision, and this process computes in float32: put"
-            '\n    jax.config.update("jax_enable_x64", True)\nbefore the first array is made.'
+            "frequency analysis needs double precision, but this process computes in float32: put "
+            'this line\n    jax.config.update("jax_enable_x64", True)\nbefore any array is made.'
         )
     return jnp.asarray(value, jnp.complex128 if value.dtype.kind == "c" else jnp.float64)
 

@@ -171,7 +171,9 @@ def raise_on_failure(found: Any) -> Any:
     if not bad.any():
         return found
     where = tuple(int(i) for i in np.argwhere(bad)[0])
-    which = f"{bad.sum()} of {bad.size} signals; the first is number {where}: " if where else ""
+    which = "The status of the signal"
+    if where:
+        which = f"{bad.sum()} of {bad.size} signals failed. The status of the first, index {where},"
     name = str(np.asarray(found.status)[where])
     text = FREQUENCY_RESULTS[getattr(FREQUENCY_RESULTS, name)]
-    raise FrequencyError(f"{which}{name}. {text} {AS_ATTRIBUTE}", found)
+    raise FrequencyError(f"{which} is {name}. {text} {AS_ATTRIBUTE}", found)

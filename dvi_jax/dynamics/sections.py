@@ -86,7 +86,7 @@ def _settings(
         warnings.warn(
             "the default method of sections has changed: it was Strang(), and is now the default "
             "of integrate, which is TypeII() for this system. Give method=dvi.Strang() for the "
-            "results of earlier versions, method=dvi.TypeII() for the map of H_D itself.",
+            "results of earlier versions, or method=dvi.TypeII() for the map of H_D itself.",
             FutureWarning,
             stacklevel=level,
         )
@@ -199,8 +199,8 @@ def poincare_section(
         if any("called with q0 of shape" in note for note in getattr(error, "__notes__", ())):
             error.add_note(
                 f"(q0 and p0 have the orbits along the first axis: shape {q.shape} means "
-                f"{q.shape[0]} orbits with q0 of shape {q.shape[1:]}. Give a single start as "
-                "q0[None], p0[None].)"
+                f"{q.shape[0]} orbits with q0 of shape {q.shape[1:]}. Give a single initial "
+                "condition as q0[None], p0[None].)"
             )
         raise
     return _raise_on_failure(found, settings) if keywords["throw"] else found
@@ -243,9 +243,10 @@ def bifurcation(
     lengths = set(varied.values())
     if len(lengths) != 1 or 0 in lengths:
         raise ValueError(
-            "a bifurcation diagram requires a parameter that varies: epsilon as a one-dimensional "
-            "array of values, or a dvi.Axis in args. Several vary together and must have the same "
-            f"length; the lengths are {varied or 'not given: each parameter is one number'}."
+            "a bifurcation diagram requires a parameter that varies: give epsilon as a "
+            "one-dimensional array of at least one value, or a dvi.Axis in args. If several "
+            "parameters vary, they vary together and must have the same length. Lengths in this "
+            f"call: {varied or 'not given: each parameter is one number'}."
         )
     start = (as_scalar("t0", keywords["t0"], q.dtype), q, p)
     h = as_scalar("h", keywords["h"], q.dtype, zero_allowed=False)
@@ -359,7 +360,7 @@ def _varied(epsilon: Any, args: Any) -> tuple[Any, Any, dict[str, int]]:
 def _raise_on_failure(found: PoincareSection, settings: _Settings) -> PoincareSection:
     fine = found.result == SECTION_RESULTS.successful
     if is_traced(fine):
-        message = "an orbit has too few crossings: with throw=False read the status of each orbit."
+        message = "an orbit has too few crossings: give throw=False and read each orbit's status."
         return eqx.error_if(found, ~jnp.all(fine), message)
     bad = np.flatnonzero(~np.asarray(fine))
     if not bad.size:
@@ -370,7 +371,7 @@ def _raise_on_failure(found: PoincareSection, settings: _Settings) -> PoincareSe
     wanted, num_steps = settings.section.capacity, settings.options["num_steps"]
     raise SectionError(
         f"{bad.size} of {len(names)} orbits did not cross the section {wanted} times in "
-        f"{num_steps} steps; the first is orbit {i}, with {int(found.count[i])} crossings: "
-        f"{names[i]} (run: {own}). {text} {AS_ATTRIBUTE}",
+        f"{num_steps} steps. The first of them is orbit {i}, with {int(found.count[i])} crossings. "
+        f"Its status is {names[i]}; the status of its run is {own}. {text} {AS_ATTRIBUTE}",
         found,
     )

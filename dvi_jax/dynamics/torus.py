@@ -101,10 +101,10 @@ def fundamental_frequencies(
 
     **Source** the procedure of Laskar 1990, *Icarus* 88, 266, with our own choice of a basis.
     """
-    hint = "dvi.fundamental_frequencies(dvi.frequencies(solution))."
+    hint = "Write dvi.fundamental_frequencies(dvi.frequencies(solution))."
     instance("lines", lines, Frequencies, "a result of dvi.frequencies", hint)
     if is_traced(lines.frequencies):
-        raise ValueError("call fundamental_frequencies outside of jit, vmap and grad.")
+        raise ValueError("lines is traced: call this function outside of jit, vmap and grad.")
     omega, A = np.asarray(lines.frequencies), np.asarray(lines.amplitudes)
     code, resolution = np.asarray(code_of(lines.result)), np.asarray(lines.resolution)
     axes = min(lines.state_axes, omega.ndim - 1)  # fewer if one degree of freedom was selected
@@ -130,7 +130,7 @@ class Search(NamedTuple):
 
 def search_of(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshold: Any) -> Search:
     if n == 0:
-        raise ValueError("a torus needs at least one degree of freedom, but the signal has none.")
+        raise ValueError("signal has no degrees of freedom: give at least one degree of freedom.")
     if guess is not None:
         guess = np.array([finite("each frequency of guess", x) for x in np.atleast_1d(guess)])
     if num is None:
@@ -138,7 +138,7 @@ def search_of(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshol
     num = whole("num", num, hint="It is the number of frequencies.")
     if guess is not None and len(guess) != num:
         raise ValueError(f"guess must have num = {num} frequencies, got {len(guess)}: {guess}.")
-    order = _ORDERS.get(num, 5) if order is None else whole("order", order, hint="It is Σ|k|.")
+    order = _ORDERS.get(num, 5) if order is None else whole("order", order, hint="It limits Σ|k|.")
     tolerance = None if tolerance is None else positive("tolerance", tolerance)
     fraction = "It is a fraction of the leading amplitude."
     if positive("threshold", threshold, hint=fraction) > 1:

@@ -27,9 +27,9 @@ def configure_cpu() -> None:
     """
     if backends_are_initialized():
         raise RuntimeError(
-            "configure_cpu() comes too late: JAX has started, and reads XLA_FLAGS only then. Call "
-            "it before the first array is made (right after the imports), or set the variable "
-            f'before Python starts: XLA_FLAGS="{_with_flags("")}".'
+            "configure_cpu() was called too late: JAX reads XLA_FLAGS only when it starts, and it "
+            "has started already. Call it right after the imports, before the first array is made, "
+            f'or set the variable before Python starts: XLA_FLAGS="{_with_flags("")}".'
         )
     os.environ["XLA_FLAGS"] = _with_flags(os.environ.get("XLA_FLAGS", ""))
 

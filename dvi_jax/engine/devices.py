@@ -38,7 +38,7 @@ def over_devices(
     **Raises** `ValueError` for a batch that the number of devices does not divide; `TypeError` for
     an object that is not a function.
     """
-    check_function("the argument of over_devices", function, hint="Give, say, jax.vmap(one).")
+    check_function("the argument of over_devices", function, hint="Give jax.vmap(f), for example.")
     chosen = np.asarray(jax.devices() if devices is None else list(devices))
     if chosen.size == 0:
         raise ValueError("devices is empty: give at least one, or leave devices out to use all.")
@@ -50,11 +50,11 @@ def over_devices(
         each = [in_axes] * len(args) if isinstance(in_axes, int | None) else list(in_axes)
         if len(each) != len(args):
             raise ValueError(
-                f"in_axes has {len(each)} entries for {len(args)} arguments: give one for each, or "
-                "one number for all."
+                f"in_axes has {len(each)} entries, but there are {len(args)} arguments: give one "
+                "entry for each argument, or one number for all."
             )
         for axis in each:
-            instance("a batch axis", axis, int | None, "a whole number or None")
+            instance("each entry of in_axes", axis, int | None, "a whole number or None")
         specs = tuple(
             jax.tree.map(lambda x, axis=axis: _spec(x, axis, chosen.size), argument)
             for argument, axis in zip(args, each, strict=True)
@@ -73,12 +73,12 @@ def _spec(x: Any, axis: int | None, count: int) -> PartitionSpec:
     shape = np.shape(x)
     if not -len(shape) <= axis < len(shape):
         raise ValueError(
-            f"in_axes says that the batch is along axis {axis}, but an argument has shape {shape}: "
-            "give None for arguments without a batch axis."
+            f"in_axes has the batch axis {axis}, but an argument has only the shape {shape}: give "
+            "None for arguments without a batch axis."
         )
     if shape[axis] % count:
         raise ValueError(
-            f"{shape[axis]} trajectories (shape {shape}, axis {axis}) cannot be divided between "
-            f"{count} devices: use a multiple of {count}, or fewer devices."
+            f"{shape[axis]} trajectories (shape {shape}, axis {axis}) cannot be divided equally "
+            f"between {count} devices: use a multiple of {count}, or another number of devices."
         )
     return PartitionSpec(*(None,) * (axis % len(shape)), LANES)

@@ -25,7 +25,7 @@ def both_names(function: F) -> F:
     def call(*args: Any, **given: Any) -> Any:
         if other in given:
             if own in given:
-                raise TypeError(f"{own} and {other} are two names of one argument: give one.")
+                raise TypeError(f"{own} and {other} are two names of one argument: leave one out.")
             given[own] = given.pop(other)
         return function(*args, **given)
 

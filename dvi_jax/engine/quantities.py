@@ -23,7 +23,7 @@ def refuse_unit_or_mask(name: str, value: Any) -> None:
         unit = getattr(value, "units", None)
     if unit is not None:
         raise TypeError(
-            f"{name} has the unit {str(unit) or '1'!r}, which would be lost: numbers without units "
-            "are required here. dvi_jax.interop.integrate(..., units=...) accepts quantities of "
-            "astropy and converts them; or divide by the unit of the run."
+            f"{name} has the unit {str(unit) or '1'!r}, but numbers without units are required "
+            f"here. Divide {name} by the unit of the run, or call dvi_jax.interop.integrate(..., "
+            "units=...), which accepts quantities of astropy and converts them."
         )

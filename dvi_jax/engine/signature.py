@@ -35,8 +35,8 @@ def check_takes(
     called = getattr(function, "__name__", type(function).__name__)
     hint = (hints or {}).get(len(signature.parameters), "")
     raise TypeError(
-        f"{name} must take {_WORDS[count]} positional arguments {arguments}; "
-        f"{called}{signature} does not. {hint}".rstrip()
+        f"{name} must take {_WORDS[count]} positional arguments {arguments}, got "
+        f"{called}{signature}. {hint}".rstrip()
     )
 
 
@@ -62,8 +62,8 @@ def warn_of_exchanged(name: str, function: Callable[..., Any], arguments: str) -
     q, p = (next(i for i, x in enumerate(expected) if x[0] == letter) for letter in "qp")
     if p < len(taken) and taken[q][:1].lower() == "p" and taken[p][:1].lower() == "q":
         warnings.warn(
-            f"{name} has the arguments ({', '.join(taken)}), and is called with {arguments}: the "
-            "positions come before the momenta. Is the order of p and q wrong?",
+            f"{name} has the arguments ({', '.join(taken)}), but is called with {arguments}, the "
+            "positions before the momenta. Check the order of q and p in its definition.",
             stacklevel=5,
         )
 
@@ -83,5 +83,5 @@ def tracing_note(name: str, error: Exception) -> str:
             "float() or int()."
         )
     if isinstance(error, TypeError) and "NoneType" in str(error):
-        return f"If {name} uses args: args is None here. Pass args=... to the call."
+        return f"In this call args is None: if {name} uses args, pass args=... to the call."
     return f"{name} is traced by JAX: it must consist of functions of jax.numpy."

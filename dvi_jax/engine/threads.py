@@ -36,7 +36,7 @@ def over_threads(
     ```
     """
     check_function(
-        "the argument of over_threads", function, hint="Give, say, jax.jit(jax.vmap(one))."
+        "the argument of over_threads", function, hint="Give jax.jit(jax.vmap(f)), for example."
     )
     if threads is not None:
         instance("threads", threads, int, "a positive integer or None")

@@ -129,12 +129,12 @@ def fit(
     if batch is not None:
         whole("batch", batch)
         if not by_optax:
-            raise ValueError("batch requires optimiser=optax.adam(1e-3) or another one of optax.")
+            raise ValueError("batch requires an optimiser of optax, such as optax.adam(1e-3).")
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError(
             "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and an "
-            "optimiser such as optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10), got "
-            f"{type(problem.loss).__name__} and {type(solver).__name__}."
+            "optimiser such as optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10), got the "
+            f"loss {type(problem.loss).__name__} and the optimiser {type(solver).__name__}."
         )
     wanted = _horizons(horizons)
     u = problem.space.to_u(problem.start)
@@ -154,7 +154,7 @@ def fit(
     if fine or not throw:
         return found
     raise FitError(
-        f"the fit did not converge ({found.status} after {len(run.records)} steps, loss "
+        f"the fit did not converge (status {found.status} after {len(run.records)} steps, loss "
         f"{found.loss:.6g}). {FIT_RESULTS[status]} With throw=False the result is returned with "
         "its status; here it is the `fit` attribute of this error.",
         found,

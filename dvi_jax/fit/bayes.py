@@ -209,7 +209,7 @@ def sample(
         quiet: dict[str, Any] = {"check_curvature": False, "progress": False, "throw": False}
         start = fit(model, data, params, **of_fit, **quiet)
     if isinstance(start, FitResult) and start.status != "converged":
-        notes.append(f"the fit that the chains start from did not converge: {start.status}.")
+        notes.append(f"the chains start from a fit that did not converge: {start.status}.")
     mode, root = posterior.laplace(_start_of(posterior, start, bounds, priors))
     centre, L = jnp.asarray(mode), jnp.asarray(root)
 
@@ -261,8 +261,8 @@ def _start_of(posterior: Posterior, start: Any, bounds: PyTree, priors: PyTree) 
     space, x = make_space(*given)
     if list(space.names) != posterior.names:
         raise ValueError(
-            f"start must have the parameters that are sampled, {', '.join(posterior.names[:8])}; "
-            f"it has {', '.join(space.names[:8])}."
+            f"start must have the parameters that are sampled, {', '.join(posterior.names[:8])}, "
+            f"but it has {', '.join(space.names[:8])}."
         )
     if is_fit:
         at_bounds = np.isin(posterior.names, posterior._space.at_bounds(x, start.sigma))
@@ -313,21 +313,21 @@ def _doubts(found: Samples, longest: int) -> list[str]:
     if worst := sorted(off, key=lambda n: -off[n]):
         shown = ", ".join(f"{n} {found.r_hat[n]:.3f}" for n in worst[:4])
         notes.append(
-            f"the chains do not agree: R̂ is above {_R_HAT} for {len(worst)} of {len(found.names)} "
-            f"parameters ({shown}). Draw more samples after more warm-up; if it stays, the density "
-            "has several maxima or is not determined: look at single chains, or give priors."
+            f"the chains do not agree: R̂ is above {_R_HAT} for {len(worst)} of "
+            f"{len(found.names)} parameters ({shown}). Draw more samples after more warm-up; if "
+            "R̂ stays large, give priors: the density has several maxima or is not determined."
         )
     if found.divergences:
         notes.append(
             f"{found.divergences} of {found.diverging.size} draws diverged: a narrow part of the "
-            "density, or one next to failing trajectories, may be missing. Take target_accept "
+            "density, or one next to failing trajectories, may be missing. Use a target_accept "
             "nearer to 1, a smaller h, or bounds that exclude failing trajectories."
         )
     cut = float((found.steps >= longest).mean())
     if cut > _SATURATED:
         notes.append(
             f"{100 * cut:.0f} % of the paths were truncated at {longest} steps: the draws are "
-            "right, but correlated. Take more warm-up, or a larger max_tree_depth."
+            "valid, but correlated. Use more warm-up, or a larger max_tree_depth."
         )
     return notes
 

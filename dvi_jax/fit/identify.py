@@ -208,7 +208,7 @@ def _check_input(
     known = (*_OPTIONS, *_OF_FIRST, "check_curvature")
     for name in options:
         if name not in known:
-            raise TypeError(f"dvi.identify has no option {name!r}; it has {', '.join(known)}.")
+            raise TypeError(f"dvi.identify has no option {name!r}: use one of {', '.join(known)}.")
     instance("library", library, ForceLibrary, "a dvi.ForceLibrary")
     if library.coefficients is not None:
         raise ValueError("library already has coefficients: make a dvi.ForceLibrary without them.")
@@ -217,7 +217,10 @@ def _check_input(
     for name, given in (("params", params), ("bounds", bounds), ("priors", priors)):
         instance(name, {} if given is None else given, Mapping, "a dict or None")
         if given is not None and KEY in given:
-            raise ValueError(f"{name} must not have {KEY!r}: library adds them, starting at 0.")
+            raise ValueError(
+                f"{name} must not contain the key {KEY!r}, under which dvi.identify adds the "
+                "coefficients of library with the initial value 0: remove this key."
+            )
     if penalty is not None:
         positive("penalty", penalty)
 
@@ -270,7 +273,7 @@ def _extended(
     if alone and is_perturbed:
         raise ValueError(
             "the model has a known perturbation, but epsilon = 0 would remove it and the library: "
-            "let the model return another epsilon, or fit it as a parameter."
+            "let the model return another epsilon, or fit epsilon as a parameter."
         )
     return _Extended(model, library, many, alone)
 

@@ -49,7 +49,7 @@ class ForceLibrary(eqx.Module):
         a_dict = "a dict {name: function (t0, t1, q0, p1, args)}"
         instance("the candidates of a dvi.ForceLibrary", candidates, Mapping, a_dict)
         if not candidates:
-            raise ValueError("candidates is empty: dvi.ForceLibrary requires at least one.")
+            raise ValueError("candidates is empty: give dvi.ForceLibrary at least one candidate.")
         for name, function in candidates.items():
             instance("the name of a candidate", name, str, "a string")
             if not (callable(function) and accepts(function, 5)):
@@ -121,7 +121,7 @@ class ForceLibrary(eqx.Module):
         if c.shape != (len(self.names),):
             raise ValueError(
                 f"{called} must have shape ({len(self.names)},), one number for each candidate "
-                f"({', '.join(self.names[:4])}{', …' if len(self.names) > 4 else ''}), got "
+                f"({', '.join(self.names[:4])}{', …' if len(self.names) > 4 else ''}), got shape "
                 f"{c.shape}."
             )
 
@@ -135,7 +135,7 @@ class ForceLibrary(eqx.Module):
         if both:
             raise ValueError(f"both libraries have a candidate {both[0]!r}: rename one of them.")
         if (self.coefficients is None) != (other.coefficients is None):
-            raise ValueError("both libraries must have coefficients, or neither of them.")
+            raise ValueError("only one library has coefficients: give them to both or to none.")
         c = None
         if self.coefficients is not None and other.coefficients is not None:
             c = jnp.concatenate([self.coefficients, other.coefficients])
@@ -181,9 +181,9 @@ class _Monomial(eqx.Module):
         del t0, t1, args
         if q0.shape != (self.n,):
             raise ValueError(
-                f"this ForceLibrary was made for n = {self.n} coordinates, q0 of shape "
-                f"({self.n},), got q0 of shape {q0.shape}. Make it with the number of coordinates: "
-                "dvi.ForceLibrary.monomials(degree, n); q0 must be one-dimensional."
+                f"this dvi.ForceLibrary is for q0 of shape (n,) with n = {self.n}, got q0 of "
+                f"shape {q0.shape}. q0 must be one-dimensional: make the library for its length "
+                "with dvi.ForceLibrary.monomials(degree, n)."
             )
         value = jnp.ones((), q0.dtype)
         for (v, i), power in self.powers:

@@ -35,7 +35,7 @@ class _Robust(Loss):
     scale: eqx.AbstractVar[float]
 
     def __check_init__(self):
-        positive("scale", self.scale, hint="It is in standard errors.")
+        positive("scale", self.scale, hint="Its unit is the standard error.")
 
 
 class SoftL1(_Robust):

@@ -74,8 +74,8 @@ class Model(eqx.Module):
         for name in options:
             if name not in _OPTIONS:
                 raise TypeError(
-                    f"dvi.Model has no option {name!r}; it has {', '.join(_OPTIONS)}. What is "
-                    "saved and observed follows from the data."
+                    f"dvi.Model has no option {name!r}; it has {', '.join(_OPTIONS)}. The data "
+                    "determine which states and observables are saved: give no save or observe."
                 )
         # Arrays, so that another value needs no other compilation.
         fixed = {"q0": q0, "p0": p0, "epsilon": epsilon, "args": args}
@@ -95,7 +95,7 @@ class Model(eqx.Module):
         for name, value in params.items():
             if name not in _MAY_BE_FITTED:
                 raise TypeError(
-                    f"{name!r} is not a parameter of a dvi.Model; these are {allowed}. Put a "
+                    f"{name!r} is not a parameter of a dvi.Model, which has {allowed}. Put a "
                     f'parameter of the system into args: {{"args": {{{name!r}: ...}}}}.'
                 )
             old = found[name]
@@ -114,7 +114,8 @@ class Model(eqx.Module):
             shape = np.shape(params.get(name, self.fixed[name]))
             if shape[0] != arcs:
                 raise ValueError(
-                    f"{name} needs one row for each of {arcs} arcs, got shape {shape}."
+                    f"{name} must have one row for each of {arcs} arcs along its first axis, got "
+                    f"shape {shape}."
                 )
 
 
@@ -145,10 +146,10 @@ def specification(model: Callable[..., Any], params: PyTree, arc: Any, many: boo
         found = model(params, arc) if accepts(model, 2) else model(params)
     example = 'dict(system=..., q0=..., p0=..., h=..., epsilon=params["epsilon"])'
     called = f"a dict of the arguments of dvi.integrate, such as {example}"
-    found = dict(instance("what the model returns", found, Mapping, called))
+    found = dict(instance("the return value of the model", found, Mapping, called))
     for name in ("system", "q0", "p0", "h"):
         if found.get(name) is None:
-            raise ValueError(f"the model must return {name!r} for dvi.integrate, which is missing.")
+            raise ValueError(f"the model does not return {name!r}, which dvi.integrate requires.")
     for name in _OWN:
         if name in found and not (name == "num_steps" and not _is_uniform(found)):
             hint = " (Observations(..., t0=...))" if name == "t0" else ""
@@ -207,8 +208,8 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
     longest = max(abs((arc.ts[-1] - arc.t0) / spec["h"]) for arc, spec in pairs)
     if _is_uniform(specs[0]) and 0 < longest < 0.5:
         raise ValueError(
-            f"all observations lie within {longest:.3g} steps of h = {specs[0]['h']:g}, less "
-            "than half of one. Are the times of the data in the units of h?"
+            f"all observations lie within {longest:.3g} steps of h = {specs[0]['h']:g}, less than "
+            "half of one: give a smaller h, or h and the times of the data in the same unit."
         )
     # Compiling takes seconds for each program; some millions of steps too many do not.
     apart = len(arcs) * max(steps) - sum(steps) > _WASTE
@@ -235,23 +236,23 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
     if span * h < 0:
         side, direction = ("before", "later") if span < 0 else ("after", "earlier")
         raise ValueError(
-            f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} "
-            f"t0 = {arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}, or the "
-            "t0 to which the model's q0 and p0 belong (Observations(..., t0=...); the first time "
-            "if it was left out)."
+            f"arc {i}: the observations (t = {arc.ts.min():g} to {arc.ts.max():g}) lie {side} t0 "
+            f"= {arc.t0:g}, but h = {h:g} leads to {direction} times. Give h = {-h:g}, or the t0 "
+            "to which the model's q0 and p0 belong, as Observations(..., t0=...); without it t0 "
+            "is the first time."
         )
     if not _is_uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
-                f"on the lattice {_lattice(spec)!r} the model must give num_steps, the number of "
-                "steps to the last observation."
+                f"on the lattice {_lattice(spec)!r} the model must return num_steps, an int: the "
+                "number of steps to the last observation."
             )
         return spec["num_steps"]
     steps = span / h
     if steps > 2e9:
         raise ValueError(
-            f"arc {i}: {steps:.3g} steps of h = {h:g} would be needed for a span of {span:g}. Are "
-            "the times of the data in the units of h?"
+            f"arc {i}: {steps:.3g} steps of h = {h:g} would be needed for a span of {span:g}: "
+            "give a larger h, or h and the times of the data in the same unit."
         )
     return max(1, math.ceil(steps - 1e-9))
 
@@ -369,7 +370,7 @@ def check_observable(i: int, arc: Observations, spec: Mapping[str, Any]) -> bool
     if shape != of_one:
         name = arc.observe if isinstance(arc.observe, str) else "observe"
         raise ValueError(
-            f"arc {i}: values has shape {arc.values.shape}, so one observation has {of_one}, but "
-            f"{name} returns {shape} for a state of shape {q.shape}."
+            f"arc {i}: values has shape {arc.values.shape}, so one observation has shape "
+            f"{of_one}, but {name} returns shape {shape} for a state of shape {q.shape}."
         )
     return False

@@ -157,8 +157,8 @@ class NetworkForce(eqx.Module):
         x = jnp.asarray(x)
         if x.shape != (self.n,):
             raise ValueError(
-                f"this NetworkForce was made for n = {self.n} coordinates, q and p of shape "
-                f"({self.n},), got {x.shape}: make it with the n of the system."
+                f"this dvi.NetworkForce is for q and p of shape (n,) with n = {self.n}, got shape "
+                f"{x.shape}: make it with the number of coordinates of the system as n."
             )
         return x
 

@@ -73,7 +73,7 @@ class Observations:
         if values.shape[:1] != ts.shape:
             raise ValueError(
                 f"values must have one row for each time: ts has shape {ts.shape}, values has "
-                f"{values.shape}."
+                f"shape {values.shape}."
             )
         _check_times(ts)
         if where := _first(np.isinf(values)):
@@ -84,9 +84,9 @@ class Observations:
         t0 = finite("t0", ts[0] if self.t0 is None else self.t0)
         if ts.min() < t0 < ts.max():
             raise ValueError(
-                f"t0 = {t0:.17g}, the start of the arc, lies between the times of the observations "
-                f"({ts.min():.17g} to {ts.max():.17g}). All must be on one side of it: move t0, or "
-                "give the observations before t0 as a second arc, with h < 0."
+                f"t0 = {t0:.17g}, the start of the arc, lies between the times of the "
+                f"observations ({ts.min():.17g} to {ts.max():.17g}). All must be on one side of "
+                "it: move t0, or give the observations before t0 as a second arc, with h < 0."
             )
         checked: dict[str, Any] = {"ts": ts, "values": values, "t0": t0}
         if self.sigma is not None:
@@ -198,15 +198,15 @@ def _check_times(ts: np.ndarray) -> None:
     if at := _first(~np.isfinite(ts)):
         [i] = at
         raise ValueError(
-            f"ts[{i}] is {ts[i]}: every observation needs its time. Leave out those without one."
+            f"ts[{i}] is {ts[i]}: every observation needs a time. Leave out those without one."
         )
     steps = np.diff(ts)
     if at := _first(steps == 0):
         [i] = at
         raise ValueError(
-            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]:.17g}. Several observations at "
-            "one time are one observation with more components (an observe that returns them "
-            "all), or their mean with its smaller sigma."
+            f"ts[{i}] and ts[{i + 1}] are the same time, {ts[i]:.17g}. Combine observations at "
+            "one time into one row: use an observe that returns all of their components, or their "
+            "mean with its smaller sigma."
         )
     is_up = (steps > 0).sum() >= (steps < 0).sum()
     if at := _first(steps < 0 if is_up else steps > 0):
@@ -231,15 +231,15 @@ def _sigma(sigma: Any, values: np.ndarray) -> np.ndarray:
     if at := _first(~(np.isfinite(full) & (full > 0)) & seen):
         raise ValueError(
             f"sigma is {full[tuple(at)]} for the value at index {at}: standard errors must be "
-            "positive and finite. A value that is to be ignored is given as NaN; put one that is "
-            "known exactly into the model."
+            "positive and finite. To ignore a value, set it to NaN; put a value that is known "
+            "exactly into the model."
         )
     size = np.nanmax(np.abs(values)) or 1.0
     if at := _first(~((full > _RANGE[0] * size) & (full < _RANGE[1] * size)) & seen):
         raise ValueError(
             f"sigma is {full[tuple(at)]:g} for the value at index {at}, but the values are up to "
-            f"{size:.3g}: the square of the ratio is outside of double precision. Give the "
-            "standard errors in the units of the values."
+            f"{size:.3g}: the square of their ratio is outside the range of double precision. "
+            "Give the standard errors in the units of the values."
         )
     return full
 
@@ -250,7 +250,7 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
     if C.shape not in ((k, k), (n, k, k)):
         raise ValueError(
             f"covariance must have shape {(k, k)} or {(n, k, k)} for values of shape "
-            f"{values.shape}, got {C.shape}."
+            f"{values.shape}, got shape {C.shape}."
         )
     full = np.array(np.broadcast_to(C, (n, k, k)))
     variance = np.einsum("nii->ni", full)

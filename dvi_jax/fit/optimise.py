@@ -356,7 +356,7 @@ def _check_same(now: Any, then: Any) -> None:
     if not np.allclose(now, then, rtol=1e-6, atol=1e-6 * float(np.abs(then).max(initial=0.0))):
         raise ValueError(
             "the checkpoint is of another model, which predicts other values at the same "
-            "parameters. Give another file, or remove it to start again."
+            "parameters. Give another path in checkpoint, or remove the file to start again."
         )
 
 

@@ -183,7 +183,7 @@ def make_space(
         names += [f"{name}[{', '.join(map(str, i))}]" for i in each] if shape else [name]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"two parameters have the name {twice}: rename one of their keys.")
+        raise ValueError(f"params has two parameters named {twice}: rename one of their keys.")
     x = np.concatenate([np.ravel(np.asarray(leaf, float)) for _, leaf in paths])
     limits, _ = _given(bounds, Bounds, {"lower": -np.inf, "upper": np.inf}, places, len(x))
     (mean, sigma), has = _given(priors, Prior, {"mean": np.nan, "sigma": np.nan}, places, len(x))
@@ -245,8 +245,8 @@ def _given(
         below = [k for k in places if not path or k == name or k.startswith(under)]
         if not below:
             raise ValueError(
-                f"{called} are given for {name!r}, which is not a fitted parameter; these are "
-                f"{', '.join(map(repr, places))}."
+                f"{called} are given for {name!r}, which is not a fitted parameter. The fitted "
+                f"parameters are {', '.join(map(repr, places))}."
             )
         where = np.concatenate([places[k].ravel() for k in below])
         has[where] = True
@@ -264,7 +264,7 @@ def _spread(value: Any, size: int, shape: tuple[int, ...], called: str) -> np.nd
     except (TypeError, ValueError):
         raise TypeError(f"{called} must be a number or an array, got {value!r}.") from None
     if value.ndim and value.shape != shape:
-        raise ValueError(f"{called} must be a number or have shape {shape}, got {value.shape}.")
+        raise ValueError(f"{called} must be a number or of shape {shape}, got shape {value.shape}.")
     return value.ravel() if value.ndim else np.full(size, float(value))
 
 

@@ -80,7 +80,7 @@ class Posterior:
         lost = not (self._problem.has_errors or self._has_density)
         if count < free + lost:
             raise ValueError(
-                f"{free} parameters without a prior or two bounds"
+                f"{free} parameters without a prior or bounds on both sides"
                 + (", and the size of the errors," if lost else "")
                 + f" cannot be determined from {count} observed values: the posterior cannot be "
                 "normalised. Give priors, bounds on both sides, or more observations."

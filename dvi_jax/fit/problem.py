@@ -123,7 +123,7 @@ class Core(eqx.Module):
         if jnp.shape(each) != jnp.shape(found):
             raise ValueError(
                 "the function of dvi.Likelihood must return one number for each value, shape "
-                f"{found.shape[1:]} for an arc, got {jnp.shape(each)[1:]}."
+                f"{found.shape[1:]} for an arc, got shape {jnp.shape(each)[1:]}."
             )
         return jnp.sum(jnp.where(keep, each, 0.0))
 
@@ -320,9 +320,9 @@ class Problem:
                 first = group.seen[a].any(axis=1).argmax()
                 if not np.isfinite(np.asarray(found)[a, first][group.seen[a, first]]).all():
                     raise ValueError(
-                        f"{where}no number for the first observation of arc {arc} (t = "
+                        f"{where}no finite number for the first observation of arc {arc} (t = "
                         f"{group.ts[a, first]:g}; status {str(names[a])!r}). Start from other "
-                        "parameters or take a smaller h."
+                        "parameters or use a smaller h."
                     )
         if check_units:
             self._check_sizes([np.asarray(found) for found, _ in known], where)
@@ -334,11 +334,11 @@ class Problem:
         largest = max(float(size.max()) for size in own)
         if data == 0 or largest == 0 or 1 / _UNITS < data / largest < _UNITS:
             return
-        intended = "If this is intended, use check_units=False."
+        intended = "If the difference is intended, use check_units=False."
         if largest < data:
             raise ValueError(
-                f"{where}values up to {largest:.3g}, the observed ones are up to {data:.3g}: a "
-                f"factor of {data / largest:.3g}. Are they in the same units? {intended}"
+                f"{where}values up to {largest:.3g}, but the observed values are up to "
+                f"{data:.3g}, {data / largest:.3g} times as large. Use the same units. {intended}"
             )
         large, each = _UNITS * data, zip(self.groups, own, strict=True)
         group, size = next((g, s) for g, s in each if (s >= large).any())
@@ -348,9 +348,9 @@ class Problem:
         q0, p0 = (jnp.asarray(spec[name], float) for name in ("q0", "p0"))
         first = float(jnp.max(jnp.abs(seen.function(seen.t0, q0, p0, spec.get("args")))))
         raise ValueError(
-            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g} (at its start, "
-            f"t = {group.t0[a]:g}, {first:.3g}; largest value {size[a].max():.3g}), "
-            f"the observed ones are up to {data:.3g}. Likely causes: (a) the trajectory diverges "
-            "at these parameters: start from others, give bounds, or take a smaller h; (b) model "
-            f"and data are not in the same units. {intended}"
+            f"{where}{size[a, row]:.3g} for arc {arc} at t = {group.ts[a, row]:g} (it gives "
+            f"{first:.3g} at the start, t = {group.t0[a]:g}, and at most {size[a].max():.3g}), "
+            f"but the observed values are only up to {data:.3g}. Likely causes: (a) the "
+            "trajectory diverges at these parameters: start from others, give bounds, or use a "
+            f"smaller h; (b) the model and the data are not in the same units. {intended}"
         )

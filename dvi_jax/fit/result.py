@@ -225,8 +225,8 @@ class FitResult:
         space, _ = make_space(params)
         if list(space.names) != about["names"]:
             raise ValueError(
-                f"params must have the parameters of the fit in {path}, {about['names'][:5]}…, got "
-                f"{space.names[:5]}…."
+                f"params must have the same parameters as the fit in {path}, which begin with "
+                f"{about['names'][:5]}, but they begin with {space.names[:5]}."
             )
         by_arc: dict[str, Any] = {
             n: [arrays[f"{n}.{i}"] for i in range(about["arcs"])] for n in _BY_ARC
@@ -236,7 +236,7 @@ class FitResult:
             x=arrays["x"],
             covariance=arrays["covariance"],
             history={k[8:]: v for k, v in arrays.items() if k.startswith("history.")},
-            result=getattr(FIT_RESULTS, one_of("status of the file", about["result"], NAMES)),
+            result=getattr(FIT_RESULTS, one_of(f"the status in {path}", about["result"], NAMES)),
             singular_values=arrays["values"],
             curvature=arrays.get("curvature"),
             rounding=arrays.get("rounding", np.zeros(len(arrays["x"]))),

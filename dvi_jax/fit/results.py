@@ -9,9 +9,9 @@ class FIT_RESULTS(eqx.Enumeration):
     converged = ""
     steps_done = "The given number of steps was taken; a stochastic optimiser has no other end."
     max_steps_reached = (
-        "The optimiser did not converge within max_steps. Likely causes: (a) it needs more; (b) a "
-        "direction of the parameters is not determined by the data: see the singular values of the "
-        "result; (c) the start is far away: give better starting values, or shorter horizons."
+        "The optimiser did not converge within max_steps. Likely causes: (a) it needs more steps; "
+        "(b) the data do not determine a direction of the parameters: see the singular values of "
+        "the result; (c) the start is far away: give a better one, or shorter horizons."
     )
     stalled = (
         "No step along the descent makes the loss smaller, though its gradient is not zero. Likely "

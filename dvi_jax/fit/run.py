@@ -131,8 +131,8 @@ def _read_checkpoint(path: Any, identity: str) -> tuple[Position, list[Record]]:
     about, arrays = read_npz(path, _FORMAT, "checkpoint of a fit")
     if about.get("identity") != identity:
         raise ValueError(
-            f"the checkpoint {path} is of another fit (data, parameters, their start or settings "
-            "differ). Give another file, or remove this one to start again."
+            f"the checkpoint {path} is of another fit: the data, parameters, initial values or "
+            "settings differ. Give another path in checkpoint, or remove this file to start again."
         )
     known = {name: about[name] for name in Position.__dataclass_fields__ if name in about}
     known |= {name: arrays[name] for name in _VECTORS}

@@ -139,7 +139,7 @@ class Segments:
             found = np.array([np.concatenate([np.ravel(q), np.ravel(p)]) for q, p in pairs], float)
             if found.shape != (len(times), 2 * self.half):
                 raise ValueError(
-                    "the guess of MultipleShooting must return (q, p), each of shape "
+                    "guess of dvi.MultipleShooting must return (q, p), each of shape "
                     f"{self.shape}, got {found.shape[1]} numbers in all."
                 )
         elif guess == "data":
@@ -151,9 +151,9 @@ class Segments:
             found = np.concatenate(flat, axis=1)
         if not np.isfinite(found).all():
             raise ValueError(
-                f"arc {i}: the guess of the segments' initial states is not finite at t = "
-                f"{times[np.argmin(np.isfinite(found).all(axis=1))]:g}. Give "
-                "dvi.MultipleShooting(guess=...) as a function t → (q, p)."
+                f"arc {i}: the guess of the initial states of the segments is not finite at t = "
+                f"{times[np.argmin(np.isfinite(found).all(axis=1))]:g}. Give another guess in "
+                "dvi.MultipleShooting(..., guess=...), a function t → (q, p)."
             )
         return found
 
@@ -237,8 +237,8 @@ def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.
     """
     if arc.observe not in ("positions", "state"):
         raise ValueError(
-            'guess="data" needs observations of "positions" or of the "state"; this arc observes '
-            f"{arc.observe!r}. Give guess as a function t → (q, p)."
+            'guess="data" of dvi.MultipleShooting needs observations of "positions" or of the '
+            f'"state", but this arc observes {arc.observe!r}. Give guess as a function t → (q, p).'
         )
     flat = arc.values.reshape(len(arc.ts), -1)
     good = np.isfinite(flat).all(axis=1)

@@ -49,7 +49,7 @@ def vector_field(system: Any, epsilon: Any = None) -> Callable[[Any, Any, Any], 
 def as_pair(y: Any) -> tuple[Any, Any]:
     """A state (q, p) as two arrays of one shape."""
     if not (isinstance(y, tuple | list) and len(y) == 2):
-        raise TypeError(f"the state must be a pair y0 = (q0, p0), got {type(y).__name__}.")
+        raise TypeError(f"the state y0 must be a pair (q0, p0), got type {type(y).__name__}.")
     q, p = (jnp.asarray(x) for x in y)
     if q.shape != p.shape:
         raise ValueError(f"q0 and p0 in y0 must have the same shape, got {q.shape} and {p.shape}.")
@@ -67,6 +67,6 @@ def checked(system: Any, epsilon: Any) -> tuple[dvi.System, Any]:
         value = 0.0
     used = system.force is not None or system.perturbation is not None or system.slow_time
     if value != 0 and not used:
-        text = f"epsilon = {value:g} has no effect: the system has no force and no perturbation."
+        text = f"epsilon = {value:g} has no effect without a force or a perturbation: leave it out."
         warnings.warn(text, stacklevel=3)
     return system, epsilon

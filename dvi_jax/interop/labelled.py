@@ -60,17 +60,17 @@ def to_xarray(
     """
     import xarray as xr
 
-    hint = "(a sweep has its own to_xarray(); of a UnitSolution take .solution, and units=)"
+    hint = "(a sweep has its own to_xarray(); for a UnitSolution give its solution, and units=)"
     expect("solution", solution, dvi.Solution, f"a dvi.Solution {hint}")
     dims = (dims,) if isinstance(dims, str) else tuple(dims)
     if solution.result.is_traced():
-        raise TypeError("to_xarray needs known values: call it outside of jit, vmap and grad.")
+        raise TypeError("solution is traced: call to_xarray outside of jit, vmap and grad.")
     ts, hs = np.asarray(solution.ts), np.asarray(solution.hs)
     *batch, count = ts.shape
     if len(dims) != len(batch):
         raise ValueError(
-            f"the batch has {len(batch)} dimensions, of sizes {batch}, but dims has {len(dims)} "
-            f"names: {dims}. Name each dimension, that of the outermost vmap first."
+            f"dims must have a name for each of the {len(batch)} dimensions of the batch, of sizes "
+            f"{batch}, got {len(dims)} names: {dims}. The outermost vmap comes first."
         )
     for name in dims:
         _check_free("dimension", name, name in _TAKEN or dims.count(name) > 1)
@@ -92,8 +92,8 @@ def to_xarray(
         own = value.shape[len(dims) :]
         if per_step and own[:1] != hs.shape[-1:]:
             raise ValueError(
-                f"by observe, {name!r} has a value for each of {hs.shape[-1]} steps, but its shape "
-                f"is {own}: give the same observe as to integrate."
+                f"according to observe, {name!r} has a value for each of {hs.shape[-1]} steps, but "
+                f"its values have the shape {own}: give the same observe as to integrate."
             )
         front = [step] * per_step
         add(name, [*front, *_own(name, own[len(front) :])], value)
@@ -142,7 +142,7 @@ def to_inference_data(samples: dvi.Samples, observed: Any = None) -> Any:
     """
     import xarray as xr
 
-    hint = "(of trajectories take interop.to_xarray)"
+    hint = "(for trajectories use interop.to_xarray)"
     expect("samples", samples, dvi.Samples, f"a result of dvi.sample {hint}")
     try:
         arviz = needed("arviz", "interop.to_inference_data")
@@ -191,7 +191,7 @@ def _components(
     if sizes != tuple(shape):
         raise ValueError(
             f"components has labels for axes of sizes {sizes}, but q has the shape {tuple(shape)}: "
-            "give one list of labels for each axis."
+            "give a list of labels for each axis, one label for each index."
         )
     return tuple(components), {name: list(labels) for name, labels in components.items()}
 
@@ -215,7 +215,7 @@ def _observed(observed: Any, observe: Any) -> list[tuple[str, np.ndarray, bool]]
         # Without `observe` one None applies to all.
         flags = jax.tree.map(flags_of, observe, observed, is_leaf=is_observable)
     except ValueError as error:
-        raise ValueError(f"observe must be the one given to integrate: {error}.") from None
+        raise ValueError(f"observe must be the same as for integrate ({error}).") from None
     arrays = jax.tree.leaves_with_path(observed, is_leaf=eqx.is_array)
     names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in arrays]
     names = [f"observed.{n}".rstrip(".") if not n or n[0].isdigit() else n for n in names]

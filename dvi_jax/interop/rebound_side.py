@@ -119,17 +119,18 @@ def from_rebound(
     rebound = needed("rebound", "interop.from_rebound")
     if isinstance(simulation, str | PathLike):
         if not Path(simulation).is_file():
-            raise FileNotFoundError(f"there is no Simulationarchive {str(simulation)!r}.")
+            raise FileNotFoundError(f"the Simulationarchive {str(simulation)!r} does not exist.")
         try:
             simulation = rebound.Simulation(str(simulation), snapshot=snapshot)
         except (RuntimeError, ValueError) as error:
             raise ValueError(
-                f"REBOUND cannot read snapshot {snapshot} of {str(simulation)!r}: {error}"
+                f"REBOUND cannot read snapshot {snapshot} of {str(simulation)!r} ({error}): give "
+                "the number of a snapshot in this archive."
             ) from None
         simulation.synchronize()  # a snapshot may have been taken between half steps
     elif snapshot != -1:
-        raise ValueError(f"snapshot={snapshot} is for files only: leave it out with a simulation.")
-    called = "a rebound.Simulation (of an archive one snapshot, archive[i]), or the path of a file"
+        raise ValueError(f"snapshot={snapshot} has no effect on a Simulation: leave it out.")
+    called = "a rebound.Simulation (archive[i] for one in an archive), or the path of a file"
     expect("simulation", simulation, rebound.Simulation, called)
     _check_convertible(simulation)
     numbers = _finite("the simulation", simulation, ("t", "dt", "G", "softening"))
@@ -186,11 +187,11 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     known = system.H_D in (hamiltonian, softened_hamiltonian) and isinstance(args, Mapping)
     if not known or system.force is not None or system.perturbation is not None:
         raise ValueError(
-            f"to_rebound converts only Newton's law between N bodies; {problem.name} has another "
-            "Hamiltonian, a force or a perturbation, which REBOUND would leave out."
+            "to_rebound converts only N bodies under Newton's law, such as systems.n_body(), but "
+            f"{problem.name} has another Hamiltonian, a force or a perturbation."
         )
     if (q is None) != (p is None):
-        raise TypeError("q and p must be given together, or neither of them.")
+        raise TypeError("only one of q and p is given: give both, or leave both out.")
     masses = np.asarray(args["masses"], float)
     theirs = problem if isinstance(problem, ReboundProblem) else None
     velocities = theirs.velocities if theirs is not None and q is None else None
@@ -202,8 +203,8 @@ def to_rebound(problem: Problem, q: Any = None, p: Any = None, t: Any = None) ->
     for name, values in (("q", q), ("p", p), ("t", t)):
         if not np.isfinite(values).all():
             raise ValueError(
-                f"{name} holds values that are not finite. A run that failed has NaN from its "
-                "failing step on; take a state before it."
+                f"{name} has values that are not finite. The states of a run that failed are NaN "
+                "after the failure: give an earlier state."
             )
     v = p / masses[:, None]
     if velocities is not None and np.array_equal(p, masses[:, None] * np.asarray(velocities)):
@@ -258,8 +259,8 @@ def _finite(whose: str, what: Any, fields: Sequence[str]) -> dict[str, float]:
     for name, value in numbers.items():
         if not np.isfinite(value):
             raise ValueError(
-                f"{name} of {whose} is {value}: it must be a finite number. A simulation that "
-                "failed has NaN: take a snapshot before it."
+                f"{name} of {whose} is {value}, but must be a finite number. A simulation that "
+                "failed contains NaN: take a snapshot before the failure."
             )
     return numbers
 
@@ -271,16 +272,16 @@ def _with_mass(sim: Any, masses: np.ndarray, massless: float | None) -> np.ndarr
     heavy = np.flatnonzero(masses[active:]) + active
     if heavy.size and (sim.testparticle_type == 0 or len(masses) - active > 1):
         raise ValueError(
-            f"N_active = {active}, but body {heavy[0]} after it has the mass {masses[heavy[0]]:g}: "
-            "REBOUND leaves out some of the attraction between such test particles, so that there "
-            "is no Hamiltonian. Give them mass 0, or set sim.N_active to all bodies."
+            f"body {heavy[0]} is a test particle, since N_active = {active}, but has the mass "
+            f"{masses[heavy[0]]:g}. REBOUND leaves out some attractions of such bodies: there is "
+            "no Hamiltonian. Set their masses to 0, or sim.N_active to the number of all bodies."
         )
     empty = masses == 0
     if not empty.any():
         return masses
     if massless is None:
         raise ValueError(
-            f"{empty.sum()} of {len(masses)} bodies have no mass (the first is number "
+            f"{empty.sum()} of {len(masses)} bodies have mass 0 (the first has index "
             f"{int(np.argmax(empty))}), so that p = m v does not determine their velocity. Give "
             f"them a tiny mass: from_rebound(sim, massless={1e-20 * masses.max() or 1e-20:.0e})."
         )

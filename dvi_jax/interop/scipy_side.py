@@ -16,18 +16,18 @@ from ..engine.quantities import refuse_unit_or_mask
 from ..systems import Problem
 from .extras import needed, system_of
 
-_JACOBIAN = "Jacobians of implicit steps come from autodiff"
+_JACOBIAN = "Jacobians of implicit steps are computed by autodiff; leave it out"
 _ESTIMATE = (
     "steps are not chosen by an estimate of the error: the lattice is fixed, which conserves the "
     "invariants. Choose h, and compare with h/2"
 )
 _REJECTED = {
     **dict.fromkeys(("rtol", "atol"), _ESTIMATE),
-    **dict.fromkeys(("max_step", "min_step", "first_step"), "every step is h"),
+    **dict.fromkeys(("max_step", "min_step", "first_step"), "all steps have the size h"),
     **dict.fromkeys(("jac", "jac_sparsity", "lband", "uband"), _JACOBIAN),
-    "vectorized": "functions are written for one state, and jax.vmap makes a batch",
-    "dense_output": "there is no interpolant: request the times, t_eval=, and each is a step of "
-    "the method",
+    "vectorized": "functions are written for one state; use jax.vmap for a batch",
+    "dense_output": "no interpolant is made; give the output times as t_eval, and the method "
+    "computes a step to each of them",
 }
 """Argument of SciPy's → why it has no meaning here."""
 
@@ -102,7 +102,7 @@ def solve_ivp(
     through it; take ``dvi.integrate`` for that.
     """
     for name in unsupported:
-        reason = _REJECTED.get(name, "it is unknown, also in SciPy's solve_ivp, or it is too new")
+        reason = _REJECTED.get(name, "SciPy's solve_ivp does not have it either; check its name")
         raise TypeError(f"interop.solve_ivp has no argument {name!r}: {reason}.")
     for name, given in (("t_span", t_span), ("y0", y0), ("t_eval", t_eval), ("h", h)):
         refuse_unit_or_mask(name, given)
@@ -214,8 +214,8 @@ def _halves(y0: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
     shape = (y0.size // 2,) if shape is None else tuple(np.ravel(shape).tolist())
     if y0.ndim != 1 or y0.size == 0 or y0.size != 2 * math.prod(shape):
         raise ValueError(
-            "y0 must be one vector, all of q0 and then all of p0, of even length; got the shape "
-            f"{y0.shape} for a q0 of shape {shape}."
+            "y0 must be one vector with all of q0 and then all of p0, twice as many numbers as q0 "
+            f"has; got the shape {y0.shape} for a q0 of shape {shape}."
         )
     q0, p0 = np.split(y0, 2)
     return q0.reshape(shape), p0.reshape(shape)
@@ -227,12 +227,12 @@ def _times(t_eval: Any, t0: float, t1: float) -> np.ndarray | None:
     times, low, high = np.asarray(t_eval, float), min(t0, t1), max(t0, t1)
     if times.ndim != 1 or not ((times >= low) & (times <= high)).all():
         raise ValueError(
-            f"t_eval must be a one-dimensional array of times from {low} to {high} (t_span), got "
-            f"{t_eval!r:.200}."
+            f"t_eval must be a one-dimensional array of times within t_span, from {low} to {high}, "
+            f"got {t_eval!r:.200}."
         )
     if not (np.diff(times) * np.sign(t1 - t0) > 0).all():
         order = "increasing" if t1 > t0 else "decreasing"
-        raise ValueError(f"t_eval must be strictly {order}, like t_span; got {t_eval!r:.200}.")
+        raise ValueError(f"t_eval must be strictly {order}, as t_span is, got {t_eval!r:.200}.")
     return times
 
 
@@ -244,20 +244,21 @@ def _method(method: Any) -> dvi.Method:
     if isinstance(method, str) and method in METHODS:
         return METHODS[method]
     raise ValueError(
-        f"method must be a dvi.Method or one of {', '.join(METHODS)}; got {method!r}. For SciPy's "
+        f"method must be a dvi.Method or one of {', '.join(METHODS)}, got {method!r}. For SciPy's "
         "own methods, which choose their steps and conserve no structure, call "
-        "scipy.integrate.solve_ivp on interop.vector_field."
+        "scipy.integrate.solve_ivp with interop.vector_field."
     )
 
 
 def _event(event: Any) -> _Event:
     if not callable(event):
-        raise TypeError(f"an event must be a function event(t, y), got {event!r}.")
+        raise TypeError(f"each event must be a function event(t, y), got {event!r}.")
     terminal = getattr(event, "terminal", False)
     terminal = int(terminal or 0) if isinstance(terminal, bool | None | np.bool_) else terminal
     if not isinstance(terminal, int | np.integer) or terminal < 0:
         raise ValueError(
-            f"terminal of an event must be True, False or a number of crossings, got {terminal!r}."
+            "the attribute terminal of an event must be True, False or a number of crossings, got "
+            f"{terminal!r}."
         )
     direction = int(np.sign(getattr(event, "direction", 0)))
     return _Event(event, _takes_args(event), int(terminal), direction)

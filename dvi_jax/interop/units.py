@@ -70,7 +70,7 @@ class UnitSystem:
             except (AttributeError, u.UnitConversionError):  # °C, magnitudes, photons
                 raise ValueError(
                     f"{name} cannot be in {unit}, which is not proportional to a product of powers "
-                    "of m, s, kg, rad, A, K, mol and cd: convert it to a unit that is."
+                    "of m, s, kg, rad, A, K, mol and cd: convert it to such a product."
                 ) from None
 
         named = {name: coherent(name, unit) for name, unit in (args or {}).items()}
@@ -190,8 +190,8 @@ def integrate(
     save, lattice = options.get("save"), options.get("lattice")
     if getattr(save, "ts", None) is not None or isinstance(lattice, dvi.Given):
         raise TypeError(
-            "dvi.Save(ts=...) and dvi.Given(ts) have times without a unit. In place of Save give "
-            "ts=..., a quantity; for Given call dvi.integrate with numbers."
+            "the times in dvi.Save(ts=...) and dvi.Given(ts) have no unit. In place of Save give a "
+            "quantity as ts=...; for dvi.Given(ts) call dvi.integrate with numbers."
         )
     if ts is not None and save is not None:
         raise TypeError("ts=... already determines which states are saved: leave save out.")
@@ -220,8 +220,8 @@ def _filled(
         expect(f"args of {problem.name}", args, Mapping, "a mapping from name to value")
         if unknown := [name for name in args if name not in known]:
             raise ValueError(
-                f"args has {unknown[0]!r}, but {problem.name} has no such parameter; it has "
-                f"{', '.join(known)}."
+                f"args has {unknown[0]!r}, but {problem.name} has no such parameter: use only the "
+                f"names {', '.join(known)}."
             )
     if own is None:  # the units of its numbers are not known
         return q0, p0, args
@@ -247,8 +247,8 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
             return _number(u, f"args {name}", leaf, units.args[declared])
         if isinstance(leaf, u.Quantity) and leaf.unit != u.dimensionless_unscaled:
             raise TypeError(
-                f"args has {name} in {leaf.unit}, but units does not have a unit for it: declare "
-                f'it, UnitSystem(..., args={{"{name}": u.Unit("{leaf.unit}")}}).'
+                f"{name} in args has the unit {leaf.unit}, but units has no unit for {name}: add "
+                f'one, UnitSystem(..., args={{"{name}": u.Unit("{leaf.unit}")}}).'
             )
         bare.append(name)
         return _number(u, f"args {name}", leaf, u.dimensionless_unscaled)
@@ -257,8 +257,8 @@ def _arguments(u: Any, args: Any, units: UnitSystem) -> Any:
     unmet = [name for name in units.args if name not in seen]
     if unmet and bare:  # a mistyped name would let a bare number through
         raise ValueError(
-            f"UnitSystem(args=...) has {', '.join(unmet)}, which is not in args, and args has "
-            f"{', '.join(bare)} without a unit: use the same names in both."
+            f"UnitSystem(args=...) has units for {', '.join(unmet)}, which args does not have, and "
+            f"no units for {', '.join(bare)} in args: use the same names in both."
         )
     return numbers
 
@@ -280,13 +280,13 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
             return value
         seen = "is missing" if value is None else f"= {value!r} has no unit"
         raise TypeError(
-            f"{name} {seen}: give a quantity, such as {name.split()[-1]} * u.Unit({str(unit)!r}) "
-            "or in another unit of that kind."
+            f"{name} {seen}: give a quantity, such as {name.split()[-1]} * u.Unit({str(unit)!r}), "
+            "in this unit or another one of this kind."
         )
     try:
         return value.to_value(unit, equivalencies=u.dimensionless_angles())
     except u.UnitConversionError:
-        offset = ": in kelvin, x.to(u.K, u.temperature())" if value.unit == u.deg_C else ""
+        offset = "; in kelvin it is x.to(u.K, u.temperature())" if value.unit == u.deg_C else ""
         raise ValueError(
             f"{name} is in {str(value.unit) or 1} ({value.unit.physical_type}), but must be "
             f"convertible to {str(unit) or 1} ({unit.physical_type}){offset}."

@@ -62,8 +62,8 @@ class Lattice(eqx.Module):
         """Number of steps to the time t1, or over a duration. **Raises** `ValueError`."""
         raise ValueError(
             f"t1 and duration require equal steps, but the lattice is {self!r}. Leave them out "
-            "and give num_steps (not with Given(ts), which determines it). For the state at a "
-            "given time within the run add save=dvi.Save(ts=[t1])."
+            "and give num_steps (but not with Given(ts), which determines it). For the state at a "
+            "time t1 within the run add save=dvi.Save(ts=[t1])."
         )
 
     @abc.abstractmethod
@@ -104,8 +104,8 @@ class StepSizes(Lattice):
         missing = [name for name, x in (("h", h), ("num_steps", num_steps)) if x is None]
         if missing:
             raise TypeError(
-                f"lattice={self!r} requires h and num_steps (with dvi.Uniform() also t1 or "
-                f"duration in place of num_steps). Not given: {', '.join(missing)}."
+                f"{' and '.join(missing)} must be given, since lattice={self!r} requires h and "
+                "num_steps (with dvi.Uniform() you can give t1 or duration in place of num_steps)."
             )
         return t0, h, check_num_steps(num_steps)
 
@@ -126,6 +126,6 @@ def check_num_steps(num_steps: object) -> int:
             f"num_steps must be a Python integer (it determines array shapes), got {num_steps!r}. "
             'Under jax.jit mark it static: static_argnames="num_steps".'
         )
-    hint = "To go backwards in time give a negative h; run more steps in pieces, each from the "
-    hint += "end of the one before."
+    hint = "To go backwards in time give a negative h; divide a longer run into several runs, each "
+    hint += "from the end of the one before."
     return whole("num_steps", count, 0, 2**31 - 2, hint)  # steps are counted in 32 bits

@@ -36,7 +36,8 @@ class Given(Lattice):
     def __check_init__(self):
         if self.ts.ndim != 1 or self.ts.shape[0] < 1:
             raise ValueError(
-                f"ts of Given must be one-dimensional, and not empty, got shape {self.ts.shape}."
+                "ts in Given(ts) must be a one-dimensional array of at least one time, got shape "
+                f"{self.ts.shape}."
             )
         if not is_traced(self.ts):
             steps = np.diff(np.asarray(self.ts))
@@ -44,8 +45,8 @@ class Given(Lattice):
             if not np.isfinite(np.asarray(self.ts)).all() or bad.any():
                 k = int(np.argmax(bad)) if bad.any() else 0
                 raise ValueError(
-                    "Given(ts) needs finite times in strictly increasing or strictly decreasing "
-                    f"order; the first fault is at ts[{k}:{k + 2}] = "
+                    "ts in Given(ts) must have finite times in strictly increasing or strictly "
+                    f"decreasing order, but ts[{k}:{k + 2}] is "
                     f"{np.asarray(self.ts)[k : k + 2].tolist()}."
                 )
 

@@ -149,13 +149,13 @@ class Extended(eqx.Module):
             return Running(self.seen(observable.reduction))
         if isinstance(observable, Trend):
             raise ValueError(
-                "observe has a Trend, which would be a slope in the fictitious time of "
+                "observe has a dvi.Trend, which would be a slope in the fictitious time of "
                 "TimeTransformed: observe the function itself and fit a line over solution.ts."
             )
         if isinstance(observable, Deviations):
             raise ValueError(
                 f"{type(observable).__name__} requires steps whose size does not depend on the "
-                "state, unlike those of TimeTransformed: use dvi.Uniform() or dvi.Given(ts)."
+                "state, but those of TimeTransformed do: use dvi.Uniform() or dvi.Given(ts)."
             )
         if isinstance(observable, Section):
             return eqx.tree_at(lambda s: s.g, observable, _SeenPoint(observable.g, self))
@@ -229,6 +229,6 @@ def _check_speed(speed, t0, q0, p0, args) -> None:
     value = jnp.asarray(speed(t0, q0, p0, args))
     if value.shape != () or (not is_traced(value) and not float(value) > 0):
         raise ValueError(
-            "the speed of TimeTransformed must be a positive scalar; at t0, q0, p0 it is "
+            "the speed of TimeTransformed must return a positive scalar; at t0, q0, p0 it returns "
             f"{value if value.shape == () else f'an array of shape {value.shape}'}."
         )

@@ -15,7 +15,7 @@ class Uniform(StepSizes):
         given = {"num_steps": num_steps, "t1": t1, "duration": duration}
         names = [name for name, value in given.items() if value is not None]
         if len(names) > 1:
-            raise ValueError(f"{' and '.join(names)} are given: give only one of them.")
+            raise ValueError(f"{' and '.join(names)} cannot be given together: give one of them.")
         try:
             length = float(duration) if t1 is None else float(t1) - float(t0)
             # h = 0 has its own message later.
@@ -29,9 +29,9 @@ class Uniform(StepSizes):
         count = round(steps) if math.isfinite(steps) else -1
         if count < 0:
             raise ValueError(
-                f"no number of steps of h={h!r} from t0={t0!r} gives "
-                f"{names[0]}={given[names[0]]!r}: give a finite {names[0]}, and h > 0 for a run "
-                "forwards in time or h < 0 for a run backwards (a duration has the sign of h)."
+                f"{names[0]}={given[names[0]]!r} cannot be reached from t0={t0!r} with steps of "
+                f"h={h!r}: give a finite {names[0]}, and h > 0 for a run forwards in time or h < 0 "
+                "for a run backwards (a duration has the sign of h)."
             )
         # (t1 − t0)/h has round-off, which is not a remaining part of a step.
         if abs(steps - count) > 1e-9 * max(1, count):

@@ -98,16 +98,16 @@ class Variational(StepSizes):
             smallest, largest = 1.0, 0.0
         if not 0 < smallest <= 1 <= largest < float("inf"):
             raise ValueError(
-                "bounds must be two positive numbers around 1, the smallest and the largest step "
-                f"as multiples of the first, such as (1e-3, 1e3); got {self.bounds!r}."
+                "bounds, the smallest and the largest step as multiples of the first one, must be "
+                f"two numbers with 0 < smallest ≤ 1 ≤ largest, got {self.bounds!r}."
             )
 
     def check(self, method, arithmetic):
         if not method.is_the_map:
             raise ValueError(
-                f"the lattice Variational() can be used with method=dvi.TypeII() only, got "
-                f"{method!r}: its equation (14) is derived for that map. For a higher order use an "
-                "H_D of higher order, dvi.discretise(H, order=2)."
+                "the lattice Variational() requires method=dvi.TypeII(), got "
+                f"{method!r}: the lattice equation (14) is derived for that map. For a higher "
+                "order use an H_D of higher order, dvi.discretise(H, order=2)."
             )
         if arithmetic.undoes_steps:
             raise ValueError(

@@ -86,5 +86,6 @@ def check_invertible(name: str, method: Any) -> None:
     instance(name, method, Method, "a method such as dvi.TypeII()")
     if not method.is_invertible:
         raise ValueError(
-            f"{method!r} has no inverse step and no adjoint: use a variational one, dvi.TypeII()."
+            f"{name} must have an inverse step, but {method!r} has none: use a variational method, "
+            "such as dvi.TypeII()."
         )

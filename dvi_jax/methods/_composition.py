@@ -192,15 +192,15 @@ class Composition(CompositionMethod):
                 "the coefficients of a composition must be finite and sum to 1 (consistency); "
                 f"got {c}" + (f", which sum to {math.fsum(c)!r}." if c else ".")
             )
-        hint = "The conditions of higher orders are not checked."
+        hint = "Conditions of higher orders cannot be checked."
         whole("order", order, most=_MOST_CHECKED, hint=hint)
         defects = order_defects(c, order, base.order, base.is_symmetric)
         found = next((n for n, defect in enumerate(defects) if defect > _DEFECT), order)
         if found < order:
             raise ValueError(
-                f"these coefficients have order {found}, not {order}: their defect in the "
-                f"conditions of order {found + 1} is {defects[found]:.1e}, of the terms that "
-                f"cancel there. Set order={found}, or give the coefficients with more digits."
+                f"the coefficients have order {found}, not {order}: in the conditions of order "
+                f"{found + 1} their relative defect is {defects[found]:.1e}. Set order={found}, or "
+                "give the coefficients with more digits."
             )
 
     def fractions(self):

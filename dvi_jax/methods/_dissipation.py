@@ -41,10 +41,11 @@ def warn_of_dissipation(
     if growth > _STRONG and np.isfinite(growth):
         warnings.warn(
             f"{type(method).__name__} has a substep backwards in time of {backwards:.2g} h, in "
-            "which a damping force amplifies. At the initial conditions the damping rate is "
-            f"{damping:.3g} per unit of time, and its product with that substep is {growth:.3g}. "
-            f"At 1 the map is singular, above {_STRONG} it is not more accurate than a map of "
-            "order 2: use a smaller h, or dvi.Strang(), which has no substep backwards.",
+            "which the damping force amplifies the momenta. At the initial conditions the damping "
+            f"rate is {damping:.3g} per unit of time, and its product with that substep is "
+            f"{growth:.3g}. If this product is 1 the map is singular; if it exceeds {_STRONG} the "
+            "map is not more accurate than one of order 2. Use a smaller h, or dvi.Strang(), which "
+            "has no substep backwards.",
             stacklevel=3,
         )
 

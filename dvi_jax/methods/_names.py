@@ -55,7 +55,7 @@ def as_method(given: Any) -> Any:
     close = difflib.get_close_matches(key, known, 1, 0.5)
     meant = f" Did you mean {known[close[0]]!r}?" if close else ""
     raise ValueError(
-        f"method {text!r} is not known.{meant} Allowed are {', '.join(plain)}; with an order or a "
-        f"number of stages, as in 'Yoshida4', {', '.join(with_number)}; and objects such as "
-        "dvi.Strang()."
+        f"method {text!r} is not known.{meant} Allowed are {', '.join(plain)}; "
+        f"{', '.join(with_number)} followed by an order or a number of stages, as in 'Yoshida4'; "
+        "and objects such as dvi.Strang()."
     )

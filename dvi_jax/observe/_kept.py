@@ -159,7 +159,7 @@ class Section(KeptSteps):
 
     def __check_init__(self):
         check_event(self.g, "Section")
-        hint = "1: g increases, -1: it decreases, 0: both."
+        hint = "1 selects the crossings where g increases, -1 where it decreases, 0 both."
         one_of("direction", self.direction, (1, -1, 0), hint)
 
     def _row(self, t0, t1, q0, p0, q1, p1, args):
@@ -227,4 +227,4 @@ def event(
 def check_event(g: Any, of: str) -> None:
     """Refuse a g that cannot be called as ``g(t, q, p, args)``."""
     if not callable(g) or not accepts(g, 4):
-        raise TypeError(f"{of} requires a function g(t, q, p, args) → scalar, got {g!r}.")
+        raise TypeError(f"g of {of} must be a function of (t, q, p, args) → scalar, got {g!r}.")

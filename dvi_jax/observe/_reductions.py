@@ -242,8 +242,8 @@ class Running(eqx.Module):
     def __check_init__(self):
         if not (isinstance(self.reduction, Reduction) and self.reduction.has_running_value):
             raise TypeError(
-                "Running requires a reduction that has a value at every step, such as dvi.MEGNO() "
-                f"or dvi.Mean(f), got {self.reduction!r}."
+                "the reduction of Running must have a value at every step, as dvi.MEGNO() or "
+                f"dvi.Mean(f) has, got {self.reduction!r}."
             )
 
 

@@ -36,8 +36,8 @@ def canvas(ax: Any, size: Any = None, space: bool = False) -> tuple[Any, bool]:
     instance("ax", ax, Axes, "the matplotlib Axes to draw on")
     if space != (ax.name == "3d"):
         raise ValueError(
-            f'ax has the projection "{ax.name}": make it with figure.add_subplot(projection="3d") '
-            "for an orbit in space, without projection for one in a plane, coordinates=(0, 1)."
+            f'ax has the projection "{ax.name}", but this picture needs axes that were made '
+            + ('with projection="3d".' if space else "without a projection.")
         )
     return ax, False
 
@@ -59,7 +59,7 @@ def stack(
     found = [canvas(axis)[0] for axis in np.ravel(np.asarray(ax, object))]
     count = len({name for row in places for name in row} - {"."})
     if len(found) != count:
-        raise ValueError(f"give {count} axes, {what}, got {len(found)}.")
+        raise ValueError(f"this picture needs {count} Axes ({what}), got {len(found)}.")
     return found, False
 
 
@@ -67,13 +67,13 @@ def check_shapes(fits: Any, wanted: str, **arrays: np.ndarray) -> None:
     """**Raises** `ValueError` with what is wanted and with the shapes, unless they fit."""
     if not fits:
         got = ", ".join(f"{name} of shape {x.shape}" for name, x in arrays.items())
-        raise ValueError(f"{wanted}: got {got}.")
+        raise ValueError(f"{wanted}; got {got}.")
 
 
 def at_most(most: int, count: int, what: str, choice: str) -> None:
     """**Raises** `ValueError` for too many things in one picture, with a way to choose some."""
     if count > most:
-        raise ValueError(f"{count} {what} are too many: choose at most {most}, {choice}.")
+        raise ValueError(f"{count} {what} are too many: choose at most {most}, such as {choice}.")
 
 
 def check_attributes(thing: Any, names: Sequence[str], wanted: str) -> None:

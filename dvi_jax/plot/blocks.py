@@ -145,7 +145,7 @@ def selections(
         if math.prod(unit.values()) > BLOCK:
             raise ValueError(
                 f"reduce='median' needs all {math.prod(unit.values())} numbers of a pixel at "
-                f"once, at most {BLOCK}: use reduce='mean' or 'max', more pixels, or less data."
+                f"once, but the limit is {BLOCK}: use reduce='mean', more pixels, or less data."
             )
     else:
         known = data.encoding.get("preferred_chunks") or {}

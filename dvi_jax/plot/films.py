@@ -122,9 +122,9 @@ def animate(
 
 def _check_film(path: Path, suffix: str, seconds: Any, fps: Any, tail: Any, beside: Any) -> None:
     if suffix not in (".gif", ".mp4"):
-        raise ValueError(f"the name of the film must end with .gif or .mp4, got {path.name!r}.")
+        raise ValueError(f"path must end with .gif or .mp4, got {path.name!r}.")
     if not path.parent.is_dir():
-        raise ValueError(f"the folder of the film does not exist: create {path.parent} first.")
+        raise ValueError(f"the folder of path does not exist: create {path.parent} first.")
     positive("seconds", seconds)
     positive("fps", fps)
     one_of("beside", beside, _BESIDE)
@@ -225,7 +225,7 @@ class _Scene:
     def mark_phase(self, axis: Any, orbits: Any, dof: Any, units: Any) -> None:
         """A phase portrait with a dot at the current time."""
         shape = one_shape(self.lanes)
-        plane = Plane((0,) * len(shape) if dof is None else place_in(shape, dof), shape)
+        plane = Plane((0,) * len(shape) if dof is None else place_in("dof", shape, dof), shape)
         phase_portrait(orbits, dof=plane.place, units=units, ax=axis)
         for i, colour in enumerate(looks_of(len(self.lanes)).colours):
             (dot,) = axis.plot([], [], color=colour, zorder=5, **_DOT)

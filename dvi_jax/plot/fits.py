@@ -211,7 +211,7 @@ def learning_curve(fit: Any, ax: Any = None) -> Any:
     columns = ("stage", "loss", "accepted", "horizon")
     stage, loss, accepted, horizon = (np.asarray(fit.history[name]) for name in columns)
     if loss.size == 0:
-        raise ValueError("the fit took no step: there is no history to draw.")
+        raise ValueError("fit has no history to draw, because it took no step.")
     ax, new = canvas(ax)
     steps, accepted, finite = np.arange(1, len(loss) + 1), accepted.astype(bool), np.isfinite(loss)
     looks = zip(np.unique(stage), itertools.cycle(COLOURS[:-1]), itertools.cycle(MARKERS))
@@ -318,16 +318,16 @@ def _of_parameters(fit: Any, params: Sequence[str] | None) -> tuple[list[int], n
     known = [n for n, v in zip(names, variances, strict=True) if np.isfinite(v) and v > 0]
     if not known:
         raise ValueError(
-            "the fit has no covariance to draw: it had too many parameters for a Jacobian, ended "
-            "at a failure, or the data determine none of its parameters."
+            "fit has no covariance to draw: it had too many parameters for a Jacobian, it failed, "
+            "or the data determine none of its parameters."
         )
     if params is None:
         draw.at_most(_PARAMETERS, len(names), "parameters", f"params={names[:3]}")
     params = names if params is None else [params] if isinstance(params, str) else [*params]
     if len(set(params)) < len(params) or not params or not {*params} <= {*names}:
-        raise ValueError(f"params must be different names of {names}, one or more, got {params}.")
+        raise ValueError(f"params must be one or more different names from {names}, got {params}.")
     if unknown := [name for name in params if name not in known]:
-        raise ValueError(f"the data do not determine {unknown[0]}: choose from params={known}.")
+        raise ValueError(f"the data do not determine {unknown[0]}: choose params from {known}.")
     values = np.asarray(fit.x if np.ndim(fit.x) == 1 else fit.mean)
     return [names.index(n) for n in params], values
 
@@ -337,10 +337,12 @@ def _draws(samples: Any, names: list[str]) -> list[np.ndarray]:
     found = getattr(samples, "samples", samples)
     instance("samples", found, Mapping, "a dvi.Samples or a dict of names with arrays of draws")
     if missing := [name for name in names if name not in found]:
-        raise ValueError(f"samples has no {missing[0]!r}; it has {', '.join(map(str, found))}.")
+        raise ValueError(
+            f"samples has no draws of {missing[0]!r}, only of {', '.join(map(str, found))}."
+        )
     flat = [np.ravel(np.asarray(found[n], float)) for n in names]
     if len({len(f) for f in flat}) > 1:
-        raise ValueError(f"samples must have equally many draws of each, got {[*map(len, flat)]}.")
+        raise ValueError(f"samples must have equal numbers of draws, got {[*map(len, flat)]}.")
     return flat
 
 

@@ -97,14 +97,14 @@ def dim_of(data: Any, name: str) -> str:
         return name
     if name in data.coords and data.coords[name].ndim == 1:
         return str(data.coords[name].dims[0])
-    raise ValueError(f"there is no dimension {name!r}; the data has {names_of(data)}.")
+    raise ValueError(f"the data has no dimension {name!r}: choose from {names_of(data)}.")
 
 
 def names_of(data: Any) -> str:
     """Names that can be an axis, for an error message."""
     sizes = ", ".join(f"{d} ({n})" for d, n in data.sizes.items())
     others = [str(c) for c in data.coords if c not in data.dims and data.coords[c].ndim == 1]
-    return (sizes or "none") + (f", and along them {', '.join(others)}" if others else "")
+    return (sizes or "none") + (f", with the coordinates {', '.join(others)}" if others else "")
 
 
 def label_of(variable: Any, name: Any) -> str:
@@ -153,7 +153,7 @@ class Grid(NamedTuple):
         count = len(self.panels)
         if ax is not None:
             if count > 1:
-                raise ValueError("facet makes a new figure: leave out ax, or facet.")
+                raise ValueError("facet makes a new figure: leave out ax or facet.")
             return [canvas(ax)[0]]
         if count == 1:
             size = None if height is None else (plt.rcParams["figure.figsize"][0], height)
@@ -194,14 +194,14 @@ def arrange(
     if not (width >= 1 and height >= 1):
         raise ValueError(f"pixels must be (width, height), both at least 1, got {pixels!r}.")
     if empty := [str(d) for d, n in data.sizes.items() if n == 0]:
-        raise ValueError(f"there is nothing to draw: {', '.join(empty)} has no values.")
+        raise ValueError(f"the data has no values to draw along {', '.join(empty)}.")
     over = (over,) if isinstance(over, str) else tuple(over)
     roles = {"x": x, "y": y, "facet": facet, **{f"over={name!r}": name for name in over}}
     taken: dict[str, str] = {}
     for role, name in roles.items():
         dim = None if name is None else dim_of(data, name)
         if dim in taken:
-            raise ValueError(f"{role} and {taken[dim]} share the dimension {dim!r}: change one.")
+            raise ValueError(f"{role} and {taken[dim]} both use {dim!r}: change one of them.")
         taken |= {} if dim is None else {dim: role}
     made = made or {}
     gone = [dim_of(data, name) for name, array in made.items() if array is None]
@@ -212,12 +212,12 @@ def arrange(
     if y is None and free:
         y = free.pop(0)
     if x is None:
-        raise ValueError("there is nothing to draw: no dimension has more than one value.")
+        raise ValueError("no dimension of the data has more than one value to draw.")
     if free:
         raise ValueError(
-            f"a map has two dimensions, here {x!r} and {y!r}, but the data has also "
-            f"{', '.join(map(repr, free))}. Select one value, data.isel({free[0]}=0), reduce all, "
-            f"over={free[0]!r}, or draw a map for each, facet={free[0]!r}."
+            f"a map has two dimensions, here {x!r} and {y!r}, but the data also has "
+            f"{', '.join(map(repr, free))}. Select one value with data.isel({free[0]}=0), reduce "
+            f"all with over={free[0]!r}, or draw a map for each with facet={free[0]!r}."
         )
     data = data.isel({d: 0 for d in left if data.sizes[d] == 1})
     along: dict[Any, Any] = dict.fromkeys((x, y), data) | made
@@ -260,5 +260,5 @@ def checked_array(data: Any) -> Any:
         hint += f" There are {', '.join(map(str, data.data_vars))}."
     instance("data", data, xr.DataArray, "an xarray.DataArray", hint)
     if data.dtype.kind not in "biuf":
-        raise TypeError(f"data must be real numbers, got an array of {data.dtype}.")
+        raise TypeError(f"data must be an array of real numbers, got dtype {data.dtype}.")
     return data

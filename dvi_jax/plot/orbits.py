@@ -81,12 +81,12 @@ def phase_portrait(
 def _planes(shape: tuple[int, ...], dof: Any) -> list["Plane"]:
     places = list(np.ndindex(shape))
     if dof is not None:
-        places = [place_in(shape, one) for one in (dof if isinstance(dof, list) else [dof])]
+        places = [place_in("dof", shape, one) for one in (dof if isinstance(dof, list) else [dof])]
     else:
         some = "0, 1" if len(shape) == 1 else "(0, 0), (0, 1)"
         at_most(_PANELS, len(places), "degrees of freedom", f"dof=[{some}]")
     if not places:
-        raise ValueError("dof is empty: choose at least one degree of freedom.")
+        raise ValueError("dof is empty: choose at least one degree of freedom, such as dof=[0].")
     return [Plane(place, shape) for place in places]
 
 
@@ -204,7 +204,7 @@ def orbit(
     lanes = lanes_of(orbits, look.labels, momenta=False)
     view = view_of(lanes, coordinates, bodies, centre, names)
     if look.colour is not None and len(lanes) == 1:
-        raise ValueError("colour requires several orbits, but there is one orbit: leave it out.")
+        raise ValueError("colour requires several orbits, but there is only one: leave colour out.")
     looks = looks_of(len(lanes) if len(lanes) > 1 else len(view.bodies), look.colour)
     axis, new = canvas(look.ax, (5.4, 5.0), len(view.coordinates) == 3)
     for i, k, number, name in view.lines(lanes):
@@ -299,17 +299,17 @@ def view_of(
     shape = one_shape(lanes)
     if names is not None and (len(lanes) > 1 or math.prod(shape) == 1):
         raise ValueError(
-            f"names is for the bodies of one orbit, but there are {len(lanes)} orbits with states "
-            f"of shape {shape}: use labels=[...] for the orbits, or draw only one."
+            f"names must be those of the bodies of one orbit, but there are {len(lanes)} orbits "
+            f"with states of shape {shape}: use labels=[...] for the orbits, or draw only one."
         )
     if len(shape) not in (1, 2):
-        raise ValueError(f"orbit draws states of shape (n,) or (bodies, dim), got {shape}.")
+        raise ValueError(f"orbits must have states of shape (n,) or (bodies, dim), got {shape}.")
     many, dim, count = len(shape) == 2, shape[-1], shape[0] if len(shape) == 2 else 1
     axes = tuple(chosen("coordinates", coordinates, dim))
     if len(axes) not in (2, 3):
         raise ValueError(
-            f"orbit draws two or three coordinates, got {len(axes)} of {dim}: choose some, such as "
-            "coordinates=(0, 1). For a single one use phase_portrait."
+            f"coordinates must be two or three of the {dim} coordinates, got {len(axes)}: choose "
+            "for example coordinates=(0, 1). For a single coordinate use phase_portrait."
         )
     drawn = chosen("bodies", bodies, count)
     view = View(axes, drawn, [], many)

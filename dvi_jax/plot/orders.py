@@ -50,12 +50,12 @@ def balance(
         ts, drift = ts.ts, ts.drift if drift is None else drift
     if drift is None or not causes:
         raise TypeError(
-            "balance requires a result of dvi.noether_balance, or times, drift=... and causes=..."
+            "ts must be a result of dvi.noether_balance, or drift and causes must be given too."
         )
     given = {"ts": ts, "drift": drift, **causes}
     arrays = {name: np.asarray(x, float) for name, x in given.items()}
     fits = np.shape(ts) == (np.size(ts),) and len({x.shape for x in arrays.values()}) == 1
-    draw.check_shapes(fits, "a balance has one number of each kind a step, shape (S,)", **arrays)
+    draw.check_shapes(fits, "ts, drift and causes must have the same shape (S,)", **arrays)
     t = arrays.pop("ts")
     if cumulative:
         arrays = {k: np.append(0.0, np.cumsum(x[:-1] * np.diff(t))) for k, x in arrays.items()}
@@ -110,12 +110,12 @@ def drift_orders(
     elif not isinstance(results, Mapping):
         results = {f"observable {i}": order for i, order in enumerate(results, 1)}
     for order in results.values():
-        wanted = "drift_orders draws what dvi.drift_order returned"
+        wanted = "results must be one dvi.DriftOrder, or a dict or a sequence of them"
         draw.check_attributes(order, ("drifts", "epsilons"), wanted)
     slopes = [*promised] if isinstance(promised, Sequence) else [promised] * len(results)
     if len(slopes) != len(results):
         raise ValueError(
-            f"promised must have {len(results)} orders, one per result, got {len(slopes)}."
+            f"promised must have {len(results)} orders, one for each result, got {len(slopes)}."
         )
     axis, new = canvas(ax, (6.4, 4.8))
     left = 0.7 * min(order.epsilons.min() for order in results.values())
@@ -302,12 +302,12 @@ def _checked(name: str, pair: Any) -> tuple[np.ndarray, np.ndarray]:
     try:
         costs, errors = (np.asarray(x, float) for x in pair)
     except (TypeError, ValueError):
-        raise ValueError(f"{name!r} must be (costs, errors), two arrays, got {pair!r}.") from None
+        raise ValueError(f"results[{name!r}] must be (costs, errors), got {pair!r}.") from None
     positive = bool((np.isfinite(costs) & (costs > 0)).all())
     if costs.ndim != 1 or costs.shape != errors.shape or not len(costs) or not positive:
         raise ValueError(
-            f"{name!r} must have costs and errors of the same shape (runs,), with positive costs; "
-            f"got {costs.shape} and {errors.shape}, costs {costs}."
+            f"results[{name!r}] must have costs and errors of the same shape (runs,), and "
+            f"positive costs; got shapes {costs.shape} and {errors.shape}, and the costs {costs}."
         )
     order = np.argsort(costs, kind="stable")
     return costs[order], np.abs(errors[order])

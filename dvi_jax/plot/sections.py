@@ -158,7 +158,7 @@ def _points_of(crossings: Any) -> _Points:
     ((one, status),) = found
     qs, ps, ts = (np.asarray(v) for v in (one.qs, one.ps, one.ts))
     fits = ts.ndim and qs.shape[: ts.ndim] == ts.shape and qs.shape == ps.shape
-    wanted = "crossings have ts of shape (..., room) and qs, ps of shape (..., room, *state)"
+    wanted = "crossings must have ts of shape (..., n), and qs and ps of shape (..., n, *state)"
     check_shapes(fits, wanted, ts=ts, qs=qs, ps=ps)
     *lead, room = ts.shape
     shape = (math.prod(lead), room, *(qs.shape[ts.ndim :] or (1,)))
@@ -223,13 +223,13 @@ def bifurcation(
         counts = np.isfinite(values).reshape(len(values), -1).sum(1)
         points = _Points(values[..., None], values[..., None], counts, unknown, unknown)
         label = y if isinstance(y, str) and y != "q[-1]" else ""
-    wanted = "a bifurcation has a parameter of shape (runs,) and crossings of as many runs"
+    wanted = "parameter must have shape (runs,), and crossings shape (runs, n)"
     fits = parameter.ndim == 1 and values.ndim == 2 and len(values) == len(parameter)
     check_shapes(fits, wanted, parameter=parameter, crossings=values)
     skip = whole("skip", skip, 0)
     if log and not (parameter > 0).all():
         raise ValueError(
-            f"log=True requires positive parameters, got {parameter.min()}: leave log out."
+            f"log=True requires positive values of parameter, got {parameter.min()}: leave log out."
         )
     values = values[:, skip:]
     x = np.broadcast_to(parameter[:, None], values.shape)

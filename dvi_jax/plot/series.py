@@ -121,7 +121,7 @@ def invariants(
 def _changed(name: str, v: np.ndarray, change: str, log: bool) -> np.ndarray | None:
     """Changes since the first finite value, shape (S,); None if they are relative to 0."""
     if v.dtype.kind not in "biuf":
-        raise TypeError(f"{name!r} must be real numbers, got dtype {v.dtype}.")
+        raise TypeError(f"the values of {name!r} must be real numbers, got dtype {v.dtype}.")
     v = v.reshape(len(v), -1).astype(float)
     first = next((row for row in v if np.isfinite(row).all()), np.full(v.shape[1], np.nan))
     v = v if change == "value" else v - first
@@ -164,16 +164,18 @@ def _read(
     for name, v in (values or {}).items():
         if callable(v):
             if any(lane.ps is None for lane in lanes) or not lanes:
-                raise TypeError(f"the function {name!r} needs a Solution or (ts, qs, ps).")
+                raise TypeError(f"the function {name!r} in values needs states: give (ts, qs, ps).")
             watched[name] = [each_state(v, lane.qs, lane.ps) for lane in lanes]
         elif not isinstance(orbits, list):
             watched[name] = _rows(name, {name: v}, orbits)
         elif isinstance(v, list) and len(v) == len(lanes):
             watched[name] = [np.asarray(x) for x in v]
         else:
-            raise ValueError(f"{name!r} must be a list of {len(lanes)} arrays, one for each orbit.")
+            raise ValueError(
+                f"values[{name!r}] must be a list of {len(lanes)} arrays, one for each orbit."
+            )
     if not watched:
-        raise ValueError("nothing to draw: no observable has a value for each saved state.")
+        raise ValueError("no observable of orbits has a value for each saved state: give values.")
     return ts, names, lanes, watched
 
 
@@ -182,8 +184,8 @@ def _observed(one: Any) -> dict[str, Any]:
     observed = getattr(one, "observed", None)
     if not isinstance(observed, Mapping):
         raise TypeError(
-            "invariants draws the observables of integrate(..., observe={'energy': f}), or "
-            "values={'energy': numbers or a function (q, p)}: there is neither."
+            "orbits has no observables: give a solution of integrate(..., observe={'energy': f}), "
+            "or values={'energy': numbers or a function (q, p)}."
         )
     *lead, n = np.shape(one.ts)
     shapes, front = ((*lead, n), (*lead, n - 1)), len(lead) + 1
@@ -196,7 +198,7 @@ def _rows(name: str, values: Mapping[str, Any], orbits: Any) -> list[np.ndarray]
     v, (*lead, n) = np.asarray(values[name]), ts.shape
     shapes = (*lead, n), (*lead, n - 1)
     wanted = f"{name!r} must have one value for each time, shape {shapes[0]}, or for each step, "
-    wanted += f"{shapes[1]}, and possibly more axes after these"
+    wanted += f"shape {shapes[1]} (more axes may follow)"
     check_shapes(v.shape[: ts.ndim] in shapes, wanted, values=v)
     return list(v.reshape(-1, *v.shape[len(lead) :]))
 
@@ -371,7 +373,7 @@ def _lines_of(ts: Any, values: Any) -> tuple[list[tuple[np.ndarray, np.ndarray, 
     numbers = v.dtype.kind in "iuf" and v.ndim and n and v.shape[-1] in (n, n - 1)
     fits = numbers and not (several and t.shape[:-1] != v.shape[: t.ndim - 1])
     wanted = (
-        f"an indicator has one number for each time or step, shape (..., {n}) or (..., {n - 1})"
+        f"values must have one number for each time or step, shape (..., {n}) or (..., {n - 1})"
     )
     check_shapes(fits, wanted, ts=t, values=v)
     start = t[..., 0] if n > v.shape[-1] else np.zeros(t.shape[:-1])

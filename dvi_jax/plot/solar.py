@@ -19,7 +19,7 @@ def planet_orbits(positions: Any, names: Sequence[str], ax: Any = None) -> Any:
     **Returns** the `Axes`, shape (2,).
     """
     positions = np.asarray(positions)
-    wanted = f"planets have positions of shape (times, {len(names)}, 3), one for each name"
+    wanted = f"positions must have shape (times, {len(names)}, 3), a planet for each of names"
     fits = positions.ndim == 3 and positions.shape[1:] == (len(names), 3)
     check_shapes(fits, wanted, positions=positions)
     axes, new = stack(ax, 2, "inner and outer planets", (9.6, 5.4), ncols=2)

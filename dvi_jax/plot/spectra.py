@@ -41,11 +41,11 @@ def spectrum(
     do not fit.
     """
     if amplitudes is None:
-        wanted = "spectrum takes frequencies and amplitudes, or an object with both"
+        wanted = "without amplitudes, frequencies must be an object that has both"
         draw.check_attributes(frequencies, ("frequencies", "amplitudes"), wanted)
         frequencies, amplitudes = frequencies.frequencies, frequencies.amplitudes
     w, A = np.asarray(frequencies), np.abs(np.asarray(amplitudes))
-    wanted = f"real frequencies ({w.dtype}) and amplitudes have one shape, (..., count)"
+    wanted = f"frequencies ({w.dtype}) must be real, of the same shape (..., count) as amplitudes"
     fits = w.shape == A.shape and w.ndim and w.size and w.dtype.kind in "iuf"
     check_shapes(fits, wanted, frequencies=w, amplitudes=A)
     w, A = w.reshape(-1, w.shape[-1]), A.reshape(-1, A.shape[-1])
@@ -100,12 +100,12 @@ def frequency_map(
     D = None if diffusion is None else np.asarray(diffusion, float)
     arrays = {"x": x, "y": y} | ({} if D is None else {"diffusion": D})
     on_grid = D is not None and x.ndim == y.ndim == 1 and D.shape == (len(x), len(y))
-    wanted = "x, y and diffusion have one shape, or diffusion has the shape (len(x), len(y))"
+    wanted = "x, y and diffusion must have one shape, or diffusion the shape (len(x), len(y))"
     check_shapes(on_grid or len({a.shape for a in arrays.values()}) == 1, wanted, **arrays)
     if on_grid and len(resonances):
         raise ValueError(
-            "a resonance is a line among frequencies, and x and y are initial conditions here: "
-            "leave out resonances, or give the frequencies of each orbit, x and y of shape "
+            "resonances are lines between frequencies, but here x and y are initial conditions: "
+            "leave out resonances, or give as x and y the frequencies of each orbit, of shape "
             f"{(len(x), len(y))}."
         )
     axis, new = canvas(ax, (6.0, 4.8))
@@ -160,7 +160,7 @@ def _draw_resonances(axis: Any, resonances: Sequence[tuple[int, int]]) -> None:
     axis.autoscale(False)
     for k in resonances:
         if tuple(k) == (0, 0) or len(k) != 2:
-            raise ValueError(f"a resonance is two integers that are not both 0, got {k!r}.")
+            raise ValueError(f"a resonance must be two integers that are not both 0, got {k!r}.")
         a, b = k
         axis.axline((0, 0), (b, -a), color=GREY, lw=0.8, ls="--", zorder=0.9)
         places = [((-b * high / a, high), "center", "bottom", (0, 2))] if a else []

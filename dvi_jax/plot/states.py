@@ -51,7 +51,7 @@ def lanes_of(orbits: Any, labels: Sequence[str] | None = None, momenta: bool = T
     several = orbits if isinstance(orbits, list) else [orbits]
     lanes = [lane for one in several for lane in _lanes_of_one(one)]
     if not lanes:
-        raise ValueError("there is no orbit to draw: the list or the batch is empty.")
+        raise ValueError("orbits is empty: give at least one orbit.")
     if momenta and any(lane.ps is None for lane in lanes):
         raise TypeError("this picture needs momenta: give a Solution or (ts, qs, ps).")
     names = labels_of(labels, len(lanes), "orbits")
@@ -70,14 +70,14 @@ def _lanes_of_one(one: Any) -> list[Lane]:
         )
     ts, *states = (np.asarray(x) for x in given if x is not None)
     if bad := [x.dtype for x in (ts, *states) if x.dtype.kind not in "iuf"]:
-        raise TypeError(f"orbits must be real numbers, got an array of {bad[0]}.")
+        raise TypeError(f"orbits must consist of real numbers, got an array of dtype {bad[0]}.")
     if ts.ndim and states[0].shape == ts.shape:  # a state that is one number
         states = [x[..., None] for x in states]
     fits = all(x.shape[: ts.ndim] == ts.shape and x.ndim > ts.ndim for x in states)
     wanted = (
-        "orbits must be ts of shape (..., S), qs and ps of shape (..., S, n) or (..., S, bodies, "
-        "dim), with the same axes in front (times that a batch shares: np.broadcast_to(ts, "
-        "(batch, S)))"
+        "orbits must have ts of shape (..., S), and qs and ps of shape (..., S, n) or (..., S, "
+        "bodies, dim), with the same leading axes (for times that a batch shares: "
+        "np.broadcast_to(ts, (batch, S)))"
     )
     fits = fits and ts.ndim and ts.shape[-1] and len({x.shape for x in states}) == 1
     check_shapes(fits, wanted, ts=ts, **dict(zip(("qs", "ps"), states, strict=False)))
@@ -91,7 +91,7 @@ def one_shape(lanes: Sequence[Lane]) -> tuple[int, ...]:
     """The shape of a state. **Raises** `ValueError` if the orbits have different ones."""
     shapes = sorted({lane.qs.shape[1:] for lane in lanes})
     if len(shapes) > 1:
-        raise ValueError(f"orbits must be of one system, got states of shapes {shapes}.")
+        raise ValueError(f"orbits must have states of one shape, got the shapes {shapes}.")
     return shapes[0]
 
 
@@ -103,16 +103,16 @@ def chosen(name: str, which: Any, count: int) -> list[int]:
     return [whole(name, i, 0, count - 1) for i in numbers]
 
 
-def place_in(shape: tuple[int, ...], index: Any) -> tuple[int, ...]:
-    """A component of a state as a tuple of numbers from 0. **Raises** `ValueError` if invalid."""
+def place_in(name: str, shape: tuple[int, ...], index: Any) -> tuple[int, ...]:
+    """A component of a state, called `name`, from 0. **Raises** `ValueError` if invalid."""
     place = index if isinstance(index, tuple) else (index,)
     fits = len(place) == len(shape) and all(isinstance(i, int | np.integer) for i in place)
     if not fits or not all(-n <= i < n for i, n in zip(place, shape, strict=True)):
-        wanted = "one number" if len(shape) == 1 else f"a tuple of {len(shape)} numbers"
-        most = ", ".join(str(n - 1) for n in shape)
-        raise ValueError(
-            f"a state of shape {shape} has no component {index!r}; give {wanted} from 0 to {most}."
-        )
+        most = tuple(n - 1 for n in shape)
+        wanted = f"a number from 0 to {most[0]}"
+        if len(shape) != 1:
+            wanted = f"a tuple of {len(shape)} numbers from {(0,) * len(shape)} to {most}"
+        raise ValueError(f"{name} must be {wanted} for states of shape {shape}, got {index!r}.")
     return tuple(int(i) % n for i, n in zip(place, shape, strict=True))
 
 
@@ -143,7 +143,8 @@ def component(
             f"shape {shape}, or a function (q, p) → number; got {which!r}."
         )
     letter, inside = found.groups()
-    place = place_in(shape, tuple(map(int, inside.split(","))) if inside else (0,) * len(shape))
+    index = tuple(map(int, inside.split(","))) if inside else (0,) * len(shape)
+    place = place_in(f"the index in {which!r}", shape, index[0] if len(index) == 1 else index)
     label = named(indexed(letter, place, shape), units.get(letter))
     return lambda qs, ps: (qs if letter == "q" else ps)[(slice(None), *place)], label
 

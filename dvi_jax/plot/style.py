@@ -116,10 +116,10 @@ def save(drawn: Any, path: str | Path) -> Path:
     path = Path(path)
     axes = np.ravel(np.asarray(drawn, object)).tolist()
     if not axes or not all(hasattr(axis, "figure") for axis in axes):
-        raise TypeError(f"save requires a figure, or the axes that a plot returns, got {drawn!r}.")
+        raise TypeError(f"drawn must be a figure or the axes that a plot returns, got {drawn!r}.")
     figures = {figure_of(axis) for axis in axes}  # a figure's own `figure` is itself
     if len(figures) > 1:
-        raise ValueError(f"these axes belong to {len(figures)} figures: save one at a time.")
+        raise ValueError(f"drawn has axes of {len(figures)} figures: save one figure at a time.")
     figure = figures.pop()
     figure.savefig(path)
     plt.close(figure)

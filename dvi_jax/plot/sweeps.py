@@ -128,7 +128,7 @@ def slope_map(
     made: dict[str, Any] = {along: None}
     if local:
         if along not in (x, y) and None not in (x, y):
-            raise ValueError(f"local slopes need {along!r} as x or y: name it, or leave one out.")
+            raise ValueError(f"local=True needs {along!r} as x or y: give it, or leave x or y out.")
         if along not in (x, y):
             x, y = (along, y) if x is None else (x, along)
         middle = np.sqrt(values[1:] * values[:-1])
@@ -312,7 +312,7 @@ def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
     """(positive values of a coordinate, rising; their places along the dimension)."""
     if along not in data.coords or data.coords[along].dtype.kind not in "iuf":
         raise ValueError(
-            f"{along!r} has no numbers along which a slope exists; choose one of {names_of(data)}."
+            f"along={along!r} has no numbers for a slope: choose one of {names_of(data)}."
         )
     values = data.coords[along].values
     order = np.argsort(values, kind="stable")
@@ -320,8 +320,8 @@ def _positive(data: Any, along: str) -> tuple[np.ndarray, np.ndarray]:
     different = len(np.unique(values[order]))
     if different < max(2, len(order)):
         raise ValueError(
-            f"{along!r} must have at least two positive values, all different, for a slope; it has "
-            f"{len(order)} positive ones, {different} of them different."
+            f"along={along!r} must have at least two positive values, all different, for a slope; "
+            f"it has {len(order)} positive values, {different} of them different."
         )
     return np.asarray(values[order], float), order
 
@@ -362,7 +362,7 @@ def _status_of(data: Any) -> Any:
     if isinstance(data, xr.Dataset):
         if "status" not in data:
             held = ", ".join(map(str, data.data_vars))
-            raise ValueError(f"the Dataset has no status: it contains {held}.")
+            raise ValueError(f"data has no status, only {held}: give to_xarray() of a sweep.")
         data = data["status"]
     return checked_array(data)
 
@@ -372,8 +372,8 @@ def _count(status: Any, grid: Grid, panels: Iterable[Any]) -> _Statuses:
     values, meanings = (status.attrs.get(name) for name in ("flag_values", "flag_meanings"))
     if values is None or meanings is None or len(values) != len(meanings.split()):
         raise ValueError(
-            "the status needs the attributes flag_values and flag_meanings, one name for each "
-            "value, as to_xarray() of a sweep gives them."
+            "the status must have the attributes flag_values and flag_meanings, with one name for "
+            "each value: take it from to_xarray() of a sweep."
         )
     codes, names = zip(*sorted(zip(map(int, values), meanings.split(), strict=True)), strict=True)
     counts = [count_codes(panel, grid.bins, codes) for panel in panels]
@@ -390,7 +390,7 @@ def _count_beside(status: Any, grid: Grid) -> _Statuses:
     others = [d for d in status.dims if d not in (*wanted, *grid.over) and status.sizes[d] > 1]
     if others or any(d not in status.dims for d in wanted):
         raise ValueError(
-            f"the status has the dimensions {names_of(status)}; those of the map are "
+            f"the status has the dimensions {names_of(status)}, but the map has the dimensions "
             f"{', '.join(wanted)}: select the same values in both."
         )
     selections = (dict.fromkeys(along, i) for i in range(len(grid.panels)))

@@ -126,7 +126,7 @@ def sweep(
     if threads is not None:
         whole("threads", threads)
         if client is not None:
-            raise ValueError("threads has no effect on workers: leave it out with client.")
+            raise ValueError("threads has no effect with client: leave threads out.")
     config = description(made, program.plan, found, programs)
     if store is None:
         needed = program.plan.lanes * sum(v.bytes for v in found.values())
@@ -153,9 +153,9 @@ def sweep(
             is_whole = run_here(program, sink, threads, report)
     if not is_whole:
         done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
-        where = "; they are the `result` of this exception."
+        where = "; their results are the attribute `result` of this exception."
         if store is not None:
-            where = f" and kept in {result.path}; the same call continues from there."
+            where = f" and stored in {result.path}; the same call continues from there."
         raise SweepInterrupted(f"interrupted: {done}{where}", result)
     return result
 
@@ -180,7 +180,7 @@ def _check_units(units: Any, found: Mapping[str, Any]) -> None:
         raise TypeError(f'units must be a dict such as {{"drift": "J"}}, got {units!r}.')
     if unknown := [name for name in units if name not in found]:
         raise ValueError(
-            f"units are given for {unknown[0]!r}, which is not a result. Results are "
+            f"units are given for {unknown[0]!r}, which is not a result. The results are "
             f"{', '.join(found)}."
         )
 
@@ -211,8 +211,8 @@ def _make_sweep(system: Any, q0: Any, p0: Any, given: dict[str, Any]) -> Sweep:
     inputs |= {"args": given["args"], **_states(q0, p0, given["start"])}
     if given["observe"] is None and given["save"] is None:
         raise ValueError(
-            "nothing to store: pass observe={...}, or save=dvi.Save(final=True) to store the final "
-            "states."
+            "there is nothing to store, because observe and save are both missing: give "
+            "observe={...}, or save=dvi.Save(final=True) to store the final states."
         )
     start, of_integrator = given["start"], taken(dict(given), INTEGRATOR)
     # The name of the axis is not "method", which has another meaning in xarray's sel.
@@ -258,13 +258,13 @@ def _states(q0: Any, p0: Any, start: Any) -> dict[str, Any]:
             return {}
     elif q0 is not None and p0 is not None:
         return {"q0": q0, "p0": p0}
-    raise ValueError("give both q0 and p0, or start=..., such as dvi.starts.Random(...).")
+    raise ValueError("give both q0 and p0, or only start=..., such as dvi.starts.Random(...).")
 
 
 def _check_dims(dims: Mapping[str, int]) -> None:
     if bad := [name for name in dims if name in RESERVED]:
         raise ValueError(
-            f"the axis {bad[0]!r} has a name that is reserved ({', '.join(RESERVED)}): rename it."
+            f"the axis {bad[0]!r} has a reserved name ({', '.join(RESERVED)}): rename it."
         )
     if not dims:
         raise ValueError(

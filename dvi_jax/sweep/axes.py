@@ -37,11 +37,11 @@ class Axis:
     def __init__(self, name: str, values: Any, units: str = ""):
         if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
             raise ValueError(
-                "name of an Axis must be an identifier of ASCII letters, digits and _, such as "
-                f'"epsilon", got {name!r}.'
+                "the name of a dvi.Axis must be an identifier of ASCII letters, digits and _, "
+                f'such as "epsilon", got {name!r}.'
             )
         of = f"the axis {name!r}"
-        instance(f"units of {of}", units, str, "text")
+        instance(f"the units of {of}", units, str, "text")
         refuse_unit_or_mask(of, values)
         if isinstance(values, jax.Array):
             values = np.asarray(values)
@@ -76,9 +76,9 @@ _NUMBERS = (int, float, np.ndarray, np.generic, jax.Array, list, tuple)
 
 def _check(of: str, values: np.ndarray) -> None:
     if values.ndim == 0:
-        raise ValueError(f"{of} needs a sequence of values, such as [{values}], got {values}.")
+        raise ValueError(f"{of} must have a sequence of values, such as [{values}], got {values}.")
     if values.dtype.kind not in "iuf":
-        raise TypeError(f"{of} needs real numbers, got dtype {values.dtype}.")
+        raise TypeError(f"{of} must have real numbers as values, got dtype {values.dtype}.")
     if not np.isfinite(values).all():
         where = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
         raise ValueError(f"{of} must be finite, but is {values[where]} at index {list(where)}.")
@@ -111,7 +111,10 @@ def axes_in(arguments: Mapping[str, Any]) -> list[tuple[str, Axis]]:
             where = ".".join(filter(None, (name, place(path))))
             if not isinstance(axis.values, np.ndarray):
                 seen = type(axis.values[0]).__name__
-                raise TypeError(f"{where} must be numbers, but its axis {axis.name!r} has {seen}.")
+                raise TypeError(
+                    f"{where} must be numbers, but the values of its axis {axis.name!r} are of "
+                    f"the type {seen}."
+                )
             refuse_double_without_x64(f"the axis {axis.name!r}", axis.values.dtype)
             found.append((where, axis))
     return found

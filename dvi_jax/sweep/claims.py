@@ -49,7 +49,7 @@ def _lock_byte(file: Path, number: int) -> bool:
     if fcntl is None:
         return True
     if file not in _handles:
-        with as_store_error(file, "cannot be opened"):
+        with as_store_error(file, "the lock file cannot be opened"):
             _handles[file] = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         fcntl.lockf(_handles[file], fcntl.LOCK_EX | fcntl.LOCK_NB, 1, number)
@@ -57,8 +57,8 @@ def _lock_byte(file: Path, number: int) -> bool:
         if error.errno in (errno.EACCES, errno.EAGAIN):  # another process holds it
             return False
         warnings.warn(
-            f"{file.parent}: tasks cannot be claimed here ({error.strerror or error}): several "
-            "processes on this store may compute the same tasks.",
+            f"{file.parent}: files cannot be locked here ({error.strerror or error}): several "
+            "processes may compute the same tasks, with the same results.",
             stacklevel=2,
         )
     return True

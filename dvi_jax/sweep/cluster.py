@@ -160,7 +160,10 @@ def _task(pickled: bytes, number: int) -> tuple[Any, dict[str, int]]:
             return results, facts["statuses"]
         store = Store.open(path)
         if store.sha != sha:
-            raise StoreError(f"{path} must be the directory of this sweep on every worker.")
+            raise StoreError(
+                f"a worker found another sweep in {path}, which must be the same directory on "
+                "every worker."
+            )
         known = store.record(number)
         if known is None:
             results, known = compute(program, task, device)

@@ -34,12 +34,12 @@ class StoreError(Exception):
 
 
 @contextlib.contextmanager
-def as_store_error(path: Path, what: str, then: str = "") -> Iterator[None]:
+def as_store_error(path: Path, what: str, then: str = " Check the permissions.") -> Iterator[None]:
     """Turn an error of the operating system into a `StoreError`: `what` failed, `then` do this."""
     try:
         yield
     except OSError as error:
-        raise StoreError(f"{path}: {what}: {error.strerror or error}.{then}") from error
+        raise StoreError(f"{path}: {what} ({error.strerror or error}).{then}") from error
 
 
 def layout(chunk: tuple[int, ...], variable: Variable) -> dict[str, Any]:
@@ -92,15 +92,15 @@ def make(
     """Make a store under another name and rename it: it appears as a whole or not at all."""
     if bad := [name for name in (*coordinates, *variables) if not is_array_name(name)]:
         raise ValueError(
-            f"{bad[0]!r} cannot be the name of an array in a store: {ARRAY_NAMES}. The name comes "
-            "from a key of args or from an observable: rename it."
+            f"{bad[0]!r} cannot be the name of an array in a store: {ARRAY_NAMES}. It is a key of "
+            "args or the name of an observable: rename it."
         )
     plan = Plan(dict(config["dims"]), tuple(config["chunk"]))
     about = {"Conventions": "CF-1.11", "dvi_jax_sweep": FORMAT, "config": json.dumps(config)}
     about |= {"config_sha256": digest(config), **attributes}
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
     try:
-        with as_store_error(path, "cannot be made"):
+        with as_store_error(path, "the store cannot be made"):
             path.parent.mkdir(parents=True, exist_ok=True)
             _write_arrays(temporary, plan, variables, coordinates, about)
             (temporary / TASKS).mkdir()

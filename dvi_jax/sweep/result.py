@@ -59,7 +59,7 @@ class SweepResult:
             return self._coordinates[name][1]
         if name not in self._source.variables:
             known = ", ".join((*self._source.variables, *self._coordinates))
-            raise KeyError(f"the sweep has no variable {name!r}; it has {known}.")
+            raise KeyError(f"the sweep has no variable {name!r}: use one of {known}.")
         if isinstance(self._source, Memory):
             return self._source.arrays[name]
         return self.to_xarray()[name].values

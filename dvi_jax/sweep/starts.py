@@ -54,7 +54,7 @@ def _box(of: str, **ends: Any) -> tuple[list[tuple[float, ...]], tuple[int, ...]
         raise ValueError(f"all arrays in {names} of {of} must have the same shape, got {shapes}.")
     flat = [np.ravel(arrays[i : i + 2]) for i in range(0, len(arrays), 2)]
     if (flat[0] > flat[-1]).any():
-        raise ValueError(f"low of {of} must not be greater than high, got {ends}.")
+        raise ValueError(f"low of {of} must not be greater than high in any component, got {ends}.")
     return [tuple(x.tolist()) for x in flat], shapes[0]
 
 

@@ -104,8 +104,8 @@ class Store:
             attributes = json.loads((path / "zarr.json").read_text())["attributes"]
             if not (path / TASKS).is_dir():
                 raise StoreError(
-                    f"{path}: the directory {TASKS}, with the records of tasks, is missing: was "
-                    "the store copied without hidden files (names that begin with a point)?"
+                    f"{path}: the directory {TASKS}, with the records of tasks, is missing. Copy "
+                    "the store with its hidden files (names that begin with a point)."
                 )
             if (found := attributes["dvi_jax_sweep"]) != FORMAT:
                 raise StoreError(
@@ -115,7 +115,9 @@ class Store:
             store = cls(path, attributes)
         except FileNotFoundError:
             lost = f" The file was lost. {_RESTORE}" if (path / TASKS).is_dir() else ""
-            raise StoreError(f"{path}: there is no sweep here (no zarr.json).{lost}") from None
+            raise StoreError(
+                f"{path}: there is no sweep here (no zarr.json). Check the path.{lost}"
+            ) from None
         except OSError as error:
             raise StoreError(
                 f"{path}: zarr.json cannot be read ({error.strerror or error}): check its "
@@ -144,20 +146,20 @@ class Store:
         if not path.exists() or (path.is_dir() and not any(path.iterdir())):
             make(path, config, variables, coordinates, attributes)
         elif not any((path / name).exists() for name in ("zarr.json", TASKS)):
-            raise StoreError(f"{path} exists but is not a sweep store: choose a new path.")
+            raise StoreError(f"{path} exists but is not the store of a sweep: choose a new path.")
         store = cls.open(path)
         if store.sha != digest(config):
             made, differing = store.attributes, differences(store.config, config)
             raise StoreMismatch(
                 f"{path} holds another sweep. Differences:\n  " + "\n  ".join(differing) + "\n"
                 f"(made {made.get('created')} with dvi-jax {made.get('dvi-jax')}, jax "
-                f"{made.get('jax')}). Give another store, or the arguments of that one.",
+                f"{made.get('jax')}). Give another path in store, or the arguments of that sweep.",
                 differing,
             )
         if not os.access(path / TASKS, os.W_OK):
             raise StoreError(
-                f"{path} cannot be written by this user. Give another store, or change its "
-                "permissions; dvi.open_sweep(path) reads it without writing."
+                f"{path} cannot be written by this user. Give another path in store, or change "
+                "the permissions of this one; dvi.open_sweep(path) reads it without writing."
             )
         store._restore(coordinates)
         return store
@@ -178,7 +180,7 @@ class Store:
         if seen != expected:
             raise StoreError(
                 f"{self.path}: zarr.json does not describe the array {name!r} of this sweep "
-                f"({seen}, not {expected}). It is damaged or was edited. {_RESTORE}"
+                f"(found {seen}, expected {expected}). It is damaged or was edited. {_RESTORE}"
             )
         self._arrays[name] = found
         return found
@@ -305,9 +307,9 @@ class Store:
         found = {i: self._damage(i, x, size_only=True) for i, x in written.items() if x is not None}
         if lost := [damage[0] for damage in found.values() if damage]:
             warnings.warn(
-                f"{self.path}: a file of {len(lost)} finished tasks is missing or has another size "
-                f"(the first: {lost[0]}). These tasks count as not computed; the same call of "
-                "dvi.sweep computes them again.",
+                f"{self.path}: files of {len(lost)} finished tasks are missing or have another "
+                f"size (the first is {lost[0]}). These tasks count as not computed; the same call "
+                "of dvi.sweep computes them again.",
                 stacklevel=2,
             )
         return [i for i, damage in found.items() if not damage]

@@ -15,8 +15,8 @@ from .program import Sweep
 _NAME = re.compile(r"[\w +-]+(\.[\w +-]+)*")
 
 ARRAY_NAMES = (
-    "names are letters, digits, spaces and _ - + with points between them, but not zarr.json, for "
-    "they become names in files"
+    "a name may contain letters, digits, spaces, _, - and +, with points between them, but must "
+    "not be zarr.json, because it becomes the name of a file"
 )
 
 RESERVED = ("status", "failed_step", "residual", "t", "q", "p", "save", "q0", "p0")

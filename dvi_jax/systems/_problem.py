@@ -98,8 +98,8 @@ class Problem:
         ):
             for name in set(getattr(self, what)) - set(known):
                 raise ValueError(
-                    f"{self.name}: {what} names {name!r}, which is not one of its {kind}: "
-                    f"{', '.join(sorted(known)) or 'it has no such entries'}."
+                    f"{what} of the problem {self.name} contains {name!r}, which is not among its "
+                    f"{kind} ({', '.join(sorted(known)) or 'it has none'})."
                 )
 
 
@@ -132,7 +132,7 @@ class Start:
     least: int = 1
 
     def __call__(self, q0: Any, p0: Any, args: Any) -> None:
-        check_shape(q0, p0, self._fits, f"{self.system}: q0 and p0 of {self._wanted}")
+        check_shape(q0, p0, self._fits, f"{self.system}: q0 and p0 must have {self._wanted}")
         for name, check in self.parameters.items():
             check_parameter(args, name, check)
         if not (self.singular or self.also):
@@ -158,7 +158,7 @@ class Start:
     @property
     def _wanted(self) -> str:
         if self.shape is None:
-            return "one shape, any"
+            return "the same shape"
         range_of_n = f", n ≥ {self.least}" if None in self.shape else ""
         return f"shape {self.shape}{range_of_n}".replace("None", "n")
 
@@ -175,8 +175,8 @@ def parameter(args: Any, name: str) -> Any:
     if not isinstance(args, Mapping) or name not in args:
         there = ", ".join(map(str, args)) if isinstance(args, Mapping) else ""
         raise ParameterError(
-            f"the parameter {name} is missing: args must be a dict that has {name!r}; "
-            f"got {f'one with {there}' if there else repr(args)}."
+            f"the parameter {name} is missing: args must be a dict with the key {name!r}, got "
+            + (f"the keys {there}." if there else f"{args!r}.")
         )
     return args[name]
 
@@ -193,7 +193,7 @@ def check_parameter(args: Any, name: str, check: Check) -> None:
 def gyrates(name: str, value: Any) -> None:
     """A check for the charge of a particle or the strength of a magnetic field."""
     if finite(name, value) == 0:
-        raise ValueError(f"{name} must not be zero: the particle would not gyrate. Got {value}.")
+        raise ValueError(f"{name} must not be zero, got {value}: the particle would not gyrate.")
 
 
 def between(low: float, high: float) -> Check:
@@ -219,7 +219,7 @@ def vector(size: int) -> Check:
                 f"{name} must be an array of {size} numbers, got {given!r} ({error})."
             ) from None
         if value.shape != (size,):
-            raise ValueError(f"{name} must have shape ({size},), got {value.shape}.")
+            raise ValueError(f"{name} must have shape ({size},), got shape {value.shape}.")
         if not np.isfinite(value).all():
             raise ValueError(f"{name} must be finite, got {value}.")
 
@@ -307,7 +307,7 @@ def over_times(
     shape t.shape + q0.shape and the dtype of the initial conditions. It **raises** `ValueError` for
     initial conditions of another shape.
     """
-    wanted = "q0 and p0 of one shape" if shape is None else f"q0 and p0 of shape {shape}"
+    wanted = "q0 and p0 of the same shape" if shape is None else f"q0 and p0 of shape {shape}"
 
     def decorate(at_time):
         @functools.wraps(at_time)
@@ -317,7 +317,7 @@ def over_times(
                 q0,
                 p0,
                 lambda seen: shape is None or seen == shape,
-                f"an exact solution is that of one start, with {wanted} (for many starts: "
+                f"the exact solution is for one initial condition, with {wanted} (for several use "
                 "jax.vmap(exact, (None, 0, 0, None)))",
             )
             dtype = jnp.result_type(q0, p0, float)

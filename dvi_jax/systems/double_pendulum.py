@@ -35,7 +35,7 @@ def double_pendulum() -> Problem:
     """
     return library_problem(
         hamiltonian,
-        Start("the double pendulum is two angles", (2,)),
+        Start("the double pendulum has two angles", (2,)),
         name="double_pendulum",
         q0=np.array([np.pi / 2, np.pi / 3]),
         p0=np.zeros(2),

@@ -73,7 +73,7 @@ def lorentz_pendulum() -> Problem:
     """
     return library_problem(
         hamiltonian,
-        Start("Lorentz's pendulum is one angle", (1,)),
+        Start("Lorentz's pendulum has one angle", (1,)),
         name="lorentz_pendulum",
         q0=np.array([1.0]),
         p0=np.array([0.0]),

@@ -57,7 +57,7 @@ def lotka_volterra() -> Problem:
     q0, p0 = from_populations([33.9], [5.9])
     return library_problem(
         hamiltonian,
-        Start("prey and predators are one logarithm each", (1,)),
+        Start("q0 and p0 are the logarithms of one prey and one predator population", (1,)),
         name="lotka_volterra",
         q0=q0,
         p0=p0,

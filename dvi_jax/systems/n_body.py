@@ -55,8 +55,8 @@ def masses_of(q, args):
     masses = jnp.asarray(args["masses"], q.dtype)
     if q.ndim != 2 or masses.shape != q.shape[:1]:
         raise ValueError(
-            "the N-body system needs q0 of shape (bodies, dim) and masses of shape (bodies,); "
-            f"got q0 {q.shape} and masses {masses.shape}."
+            "the N-body system needs q0 of shape (bodies, dim) and masses of shape (bodies,), got "
+            f"q0 of shape {q.shape} and masses of shape {masses.shape}."
         )
     return masses
 
@@ -101,7 +101,7 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     check_shape(q, p, lambda shape: len(shape) == 2 and shape[1] in (2, 3), wanted)
     if masses.shape != q.shape[:1]:
         raise ValueError(
-            f"masses must hold one number for each of the {q.shape[0]} bodies; got shape "
+            f"masses must have one number for each of the {q.shape[0]} bodies, got shape "
             f"{masses.shape}."
         )
 
@@ -112,8 +112,8 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     if bad.any():
         i = int(np.argmax(bad))
         raise ValueError(
-            f"the mass of {called(i)} is {masses[i]}: every mass must be positive and finite. "
-            "For a test particle give a tiny mass, such as 1e-20 of the largest."
+            f"the mass of {called(i)} is {masses[i]}: every mass must be positive and finite. For "
+            "a test particle give a very small mass, such as 1e-20 of the largest."
         )
     separation = np.linalg.norm(q[:, None, :] - q[None, :, :], axis=-1)
     size = np.linalg.norm(q, axis=-1)
@@ -122,7 +122,7 @@ def check_bodies(q0: Any, p0: Any, args: Any, names: Sequence[str] | None = None
     if i.size:
         a, b = int(i[0]), int(j[0])
         raise ValueError(
-            f"{called(a)} and {called(b)} are on top of one another, at {q[a].tolist()}: their "
+            f"{called(a)} and {called(b)} are at the same position, {q[a].tolist()}, where their "
             "attraction is infinite. Give them different positions."
         )
 
@@ -171,7 +171,7 @@ def n_body(
     if masses is None and q0 is None and p0 is None:
         masses, q0, p0 = np.ones(3), EIGHT_POSITIONS, EIGHT_MOMENTA
     if masses is None or q0 is None or p0 is None:
-        raise TypeError("n_body requires all of masses, q0 and p0, or none of them.")
+        raise TypeError("masses, q0 and p0 must all be given, or none of them.")
     args = {"masses": np.asarray(masses, float), "G": finite("G", G)}
     check_bodies(q0, p0, args)
     return Problem(

@@ -93,7 +93,7 @@ def oblate_kepler() -> Problem:
     speed = np.sqrt(mu / a * (1 + e) / (1 - e))
     return library_problem(
         hamiltonian,
-        Start("the satellite is one point in space", (3,), also=_outside),
+        Start("the satellite is one body in space", (3,), also=_outside),
         name="oblate_kepler",
         q0=np.array([a * (1 - e), 0.0, 0.0]),
         p0=speed * np.array([0.0, np.cos(i), np.sin(i)]),

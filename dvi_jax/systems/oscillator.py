@@ -47,7 +47,7 @@ def oscillator() -> Problem:
     """The paper's oscillator from q = p = 0.01 with h = 0.1; dimensionless."""
     return library_problem(
         hamiltonian,
-        Start("the oscillator is of any dimension", None),
+        Start("the oscillator can have any dimension", None),
         name="oscillator",
         q0=[0.01],
         p0=[0.01],

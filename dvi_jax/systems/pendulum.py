@@ -83,7 +83,7 @@ def pendulum() -> Problem:
     """
     return library_problem(
         hamiltonian,
-        Start("the pendulum is one angle", (1,)),
+        Start("the pendulum has one angle", (1,)),
         name="pendulum",
         q0=np.array([1.5]),
         p0=np.array([1.0]),

@@ -31,7 +31,7 @@ def perturbed_pendulum() -> Problem:
     """
     return library_problem(
         hamiltonian,
-        Start("the perturbed pendulum is one pendulum", (1,)),
+        Start("the perturbed pendulum has one angle", (1,)),
         name="perturbed_pendulum",
         q0=[0.5],
         p0=[0.3],

@@ -77,7 +77,7 @@ def read_polar_motion(path: str | Path | None = None) -> PolarMotion:
         lines = [(i, line) for i, line in enumerate(file, 1) if line[_FLAG : _FLAG + 1] == "I"]
     if not lines:
         raise ValueError(
-            f"{path.name} has no measured pole (no line with I in column 17): it must be in the "
+            f"{path.name} has no measured pole (no line with I in column 17): give a file in the "
             "format of finals2000A."
         )
     table = np.empty((len(lines), 5))
@@ -87,7 +87,7 @@ def read_polar_motion(path: str | Path | None = None) -> PolarMotion:
         except ValueError:
             raise ValueError(
                 f"line {number} of {path.name} is not in the format of finals2000A: "
-                f"{line[:55].rstrip()!r}."
+                f"{line[:55].rstrip()!r}. Correct or remove this line."
             ) from None
     return PolarMotion(*table.T)
 
@@ -218,7 +218,7 @@ def polar_motion() -> Problem:
     """
     return library_problem(
         hamiltonian,
-        Start("the pole is one point, its x and its y", (1,)),
+        Start("the pole has one x, in q0, and one y, in p0", (1,)),
         name="polar_motion",
         q0=[0.043301],
         p0=[0.377867],

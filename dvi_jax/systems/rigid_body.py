@@ -123,13 +123,13 @@ def _possible(q, p, args):
     moments = [args["I1"], args["I2"], args["I3"]]
     if 2 * max(moments) > sum(moments):
         raise ValueError(
-            f"each of I1, I2, I3 must be at most the sum of the others, got {moments}."
+            f"each of I1, I2, I3 must be at most the sum of the other two, got {moments}."
         )
     L, G, K = p
     if not (abs(L) < G and abs(K) <= G):
         raise ValueError(
-            f"the momenta (L, G, K) must have |L| < G and |K| ≤ G, since L and K are components of "
-            f"an angular momentum of size G; got L = {L}, G = {G}, K = {K}."
+            "the momenta p0 = (L, G, K) must satisfy |L| < G and |K| ≤ G, since L and K are "
+            f"components of an angular momentum of magnitude G; got L = {L}, G = {G}, K = {K}."
         )
 
 

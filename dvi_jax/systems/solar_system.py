@@ -61,7 +61,7 @@ def installed_file(name: str, what: str) -> Path:
     # The package is located, not imported: its import warns about the age of its files.
     package = find_spec("skyfield_data")
     if package is None or package.origin is None:
-        raise EphemerisMissing(f"{what} is not installed: {_EXTRA}")
+        raise EphemerisMissing(f"{what} is not installed: install it with {_EXTRA}")
     path = Path(package.origin).parent / "data" / name
     if not path.is_file():
         raise EphemerisMissing(
@@ -83,7 +83,7 @@ def julian_date(date: str | datetime.date | float) -> float:
             date = datetime.date.fromisoformat(date)
         except ValueError:
             raise ValueError(
-                f'date must be like "1900-01-31" (year-month-day), got {date!r}.'
+                f'date must be a day such as "1900-01-31" (year-month-day), got {date!r}.'
             ) from None
     if isinstance(date, datetime.datetime):
         raise ValueError(f"date must be a day without a time of day, got {date}.")
@@ -102,8 +102,8 @@ def check_covered(jd: Any) -> None:
     outside = jd[~((jd >= first) & (jd <= last))]  # NaN is outside
     if outside.size:
         raise ValueError(
-            f"the Julian date {outside[0]} is outside of the ephemeris DE421, which covers "
-            f"1899-07-29 to 2053-10-09 (Julian dates {first} to {last})."
+            f"the Julian date {outside[0]} is outside of the range of the ephemeris DE421: choose "
+            f"a date from 1899-07-29 to 2053-10-09 (Julian dates {first} to {last})."
         )
 
 
@@ -183,5 +183,5 @@ def _kernel() -> Any:
     try:
         from jplephem.spk import SPK
     except ImportError:
-        raise EphemerisMissing(f"reading an ephemeris needs jplephem: {_EXTRA}") from None
+        raise EphemerisMissing(f"an ephemeris requires jplephem: {_EXTRA}") from None
     return SPK.open(installed_file("de421.bsp", "the ephemeris DE421"))

@@ -134,7 +134,7 @@ def _require(candidate: Candidate, checks: Iterable[str] | None) -> dict[str, Me
         if not measured.ok
     ]
     if failed:
-        claims = f"{type(candidate.method).__name__} does not have properties that it claims"
+        claims = f"{type(candidate.method).__name__} does not have all properties that it claims:"
         raise AssertionError("\n".join([claims, *failed]))
     return found
 
@@ -143,7 +143,7 @@ def require_double_precision() -> None:
     """**Raises** `ValueError` where x64 is off: the bounds are those of double precision."""
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(
-            "methods are measured in double precision, and x64 is off. Turn it on first: "
+            "methods are measured in double precision, but x64 is off. First turn it on with "
             'jax.config.update("jax_enable_x64", True).'
         )
 

@@ -44,7 +44,7 @@ def _csv(path: Path, key: str) -> dict[str, np.ndarray]:
     text = path.read_text(encoding="utf-8-sig")
     lines = [(i, line) for i, line in enumerate(text.split("\n"), 1) if line.strip()]
     lines = [(f"{path.name}, line {i}", line) for i, line in lines if line.lstrip()[0] != "#"]
-    require(lines, key, f"{path} is empty", "a line of names, then lines of numbers")
+    require(lines, key, f"the file {path} is empty", "a line of names, then lines of numbers")
     separator = max(",;\t", key=lines[0][1].count)
     (first, names), *rows = [
         (place, [cell.strip() for cell in next(csv.reader([line], delimiter=separator))])
@@ -54,16 +54,16 @@ def _csv(path: Path, key: str) -> dict[str, np.ndarray]:
     for i, name in enumerate(names):
         require(not np.isfinite(_number(name)), key, f"{first}: {name} is a number", allowed)
         fits = name and name not in names[:i]
-        require(fits, key, f"{first}: {name!r} is empty or repeated", allowed)
-    require(rows, key, f"{path} has names but no numbers", "at least one line of numbers")
+        require(fits, key, f"{first}: the name {name!r} is empty or repeated", allowed)
+    require(rows, key, f"the file {path} has names but no numbers", "at least one line of numbers")
     for place, cells in rows:
         allowed = f"{len(names)} cells, one for each of the names {', '.join(names)}"
-        require(len(cells) == len(names), key, f"{place}: {len(cells)} cells", allowed)
+        require(len(cells) == len(names), key, f"{place}: it has {len(cells)} cells", allowed)
     table = np.array([[_number(cell) for cell in cells] for _, cells in rows])
     for i, j in np.argwhere(np.isinf(table))[:1]:
         place, cells = rows[i]
         allowed = "a finite number; empty, or nan, where nothing was observed"
-        raise InputError(key, f"{place}, column {names[j]}: {cells[j]!r}", allowed)
+        raise InputError(key, f"{place}, column {names[j]}: the cell is {cells[j]!r}", allowed)
     return dict(zip(names, table.T, strict=True))
 
 
@@ -79,5 +79,5 @@ def _number(cell: str) -> float:
 
 def column(columns: dict[str, np.ndarray], key: str, name: str) -> np.ndarray:
     """One of the columns. **Raises** `InputError` when no column has that name."""
-    known(key, name, columns, "a column of the file: {}")
+    known(key, name, columns, "a column of the file: {}", f"the file has no column {name!r}")
     return np.asarray(columns[name], float)

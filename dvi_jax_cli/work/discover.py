@@ -112,7 +112,7 @@ def _box(file: DiscoverFile, source: Source) -> list[tuple[np.ndarray, ...]]:
         shape = np.shape(source.array("q0"))
     else:
         shapes = {np.shape(x) for corner in given.values() for x in (corner.q, corner.p)} - {()}
-        seen = f"shapes {', '.join(map(str, sorted(shapes))) or 'of numbers only'}"
+        seen = f"low and high have shapes {', '.join(map(str, sorted(shapes))) or '()'}"
         allowed = "arrays of the same shape, that of q, in low and high (not only numbers)"
         require(len(shapes) == 1, "samples.low", seen, allowed)
         shape = shapes.pop()
@@ -123,7 +123,7 @@ def _box(file: DiscoverFile, source: Source) -> list[tuple[np.ndarray, ...]]:
                 tuple(np.broadcast_to(np.asarray(x, float), shape) for x in (corner.q, corner.p))
             )
         except ValueError:
-            seen = f"shapes {np.shape(corner.q)} and {np.shape(corner.p)}"
+            seen = f"q has shape {np.shape(corner.q)} and p has shape {np.shape(corner.p)}"
             allowed = f"numbers, or arrays of the shape of q, {shape}"
             raise InputError(f"samples.{name}", seen, allowed) from None
     is_below = all((a < b).all() for a, b in zip(*corners, strict=True))

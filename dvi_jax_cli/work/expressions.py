@@ -47,13 +47,13 @@ class Expressions:
         except SyntaxError:
             raise self.error(f"{text!r} is not a valid expression") from None
         except (ValueError, TypeError, RecursionError, MemoryError) as error:
-            raise self.error(f"{text!r}: {error}") from None
+            raise self.error(f"{text!r} is invalid: {error}") from None
         return self.checked(made, text)
 
     def checked(self, made: Any, text: str) -> Any:
         """The object that was made, an instance of `kind`."""
         if not isinstance(made, self.kind):
-            raise self.error(repr(text))
+            raise self.error(f"{text!r} is not one of the allowed objects")
         return made
 
     def error(self, seen: str, name: str = "") -> InputError:
@@ -78,15 +78,15 @@ class Expressions:
                 try:
                     return self._called(name, [], [])
                 except TypeError:
-                    seen = f"{name!r} without its arguments in parentheses: write {name}(...)"
+                    seen = f"{name!r} requires arguments in parentheses: write {name}(...)"
                     raise self.error(seen) from None
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=keywords):
                 return self._called(name, arguments, keywords)
-        raise ValueError(f"{ast.unparse(node)!r} is not one of these, a number or a list")
+        raise ValueError(f"{ast.unparse(node)!r} is not one of these names, a number or a list")
 
     def _called(self, name: str, arguments: list[Any], keywords: list[ast.keyword]) -> Any:
         if name not in self.known:
-            raise self.error(repr(name), name)
+            raise self.error(f"{name!r} is not a known name", name)
         options = {k.arg: self._made(k.value) for k in keywords if k.arg is not None}
         return self.known[name](*(self._made(a) for a in arguments), **options)
 

@@ -13,7 +13,7 @@ from dvi_jax import plot
 from dvi_jax.fit.progress import shown as shown_bar
 from dvi_jax.fit.result import little_explained, numbers_in_words
 
-from .._errors import InputError, known, one_of, require, shown
+from .._errors import InputError, known, one_of, require
 from .._show import Table
 from .columns import column, read_columns
 from .expressions import parse_method
@@ -136,7 +136,7 @@ def _parameters(names: list[str], start: dict[str, Any], args: Any) -> dict[str,
         if np.issubdtype(np.asarray(value).dtype, np.number)
     }
     for name in names:
-        known("parameters", name, values)
+        known("parameters", name, values, seen=f"it contains {name!r}")
         require(names.count(name) == 1, "parameters", f"{name!r} is listed twice", "each name once")
     return _tree({name: np.asarray(values[name], float) for name in names})
 
@@ -175,18 +175,18 @@ def _observations(
     if observe in _NAMED:
         wanted = (2 * int(np.prod(shape)),) if observe == "state" else shape
         size, needed = observed[0].size, int(np.prod(wanted))
-        seen = f"{size} numbers for each time ({', '.join(names)})"
-        allowed = f"{needed}: the {observe} of a state whose q has shape {shape}"
+        seen = f"the columns {', '.join(names)} have {size} numbers for each time"
+        allowed = f"{needed} for each time: the {observe} of a state whose q has shape {shape}"
         require(size == needed, "data.columns", seen, allowed)
         observed = observed.reshape(len(observed), *wanted)
     if sigma is not None and np.ndim(sigma):  # one for all columns, or one for each
         flat = observed.reshape(len(observed), -1)
         fits = sigma.shape[-1] in (1, flat.shape[1])
         allowed = f"one column for all, or {len(names)}, one for each column of values"
-        require(fits, "data.sigma", f"{sigma.shape[-1]} columns", allowed)
+        require(fits, "data.sigma", f"it has {sigma.shape[-1]} columns", allowed)
         sigma = np.broadcast_to(sigma, flat.shape).reshape(observed.shape)
     fits, allowed = len(ts) > 1 or t0 is not None, "at least two, or an earlier time t0"
-    require(fits, "data.file", "one observation", allowed)
+    require(fits, "data.file", "there is only one observation", allowed)
     try:
         return dvi.Observations(ts, observed, observe, sigma=sigma, t0=t0), names
     except (TypeError, ValueError) as error:
@@ -202,7 +202,8 @@ def _observe(text: str, loader: Loader) -> Any:
         known("data.observe", text, _NAMED, '{}; or "file.py:name"')
         return text
     function = loader.load("data.observe", text)
-    require(callable(function), "data.observe", shown(text), "a function (t, q, p, args)")
+    seen = f"{text!r} is not a function"
+    require(callable(function), "data.observe", seen, "a function (t, q, p, args)")
     return function
 
 
@@ -210,7 +211,7 @@ def _joined(columns: dict[str, np.ndarray], names: list[str], rows: int) -> np.n
     """The columns next to one another; one of an npz alone has the shape of q."""
     parts = [column(columns, "data.columns", name) for name in names]
     for part, name in zip(parts, names, strict=True):
-        allowed = f"as many as there are times, {rows}"
+        allowed = f"as many rows as there are times, {rows}"
         require(len(part) == rows, "data.columns", f"{name} has {len(part)} rows", allowed)
     if len(parts) == 1 and parts[0].ndim > 1:
         return parts[0]

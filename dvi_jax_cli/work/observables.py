@@ -39,11 +39,12 @@ def _observable(key: str, text: str, names: dict[str, Callable], source: Source)
         if found[1] in indicators:  # as it is written in Python, such as GALI(4, log10=True)
             example = "; with numbers alone, as in LyapunovSpectrum(2) or MEGNO()"
             return Expressions(key, dvi.Deviations, indicators, example).read(inner)
-        known(key, found[1], [*reductions, *indicators], "a reduction: {}", repr(text))
+        kinds = [*reductions, *indicators]
+        known(key, found[1], kinds, "a reduction: {}", f"{found[1]!r} is not a reduction")
         wrap, inner = reductions[found[1]], found[2].strip()
     if ":" in inner:
         function = source.loader.load(key, inner)
-        seen = f"{inner!r} is {type(function).__name__}"
+        seen = f"{inner!r} has the type {type(function).__name__}"
         require(callable(function), key, seen, _A_FUNCTION)
         # An energy has `bind` and is called with the system.
         if not hasattr(function, "bind") and not accepts(function, 7):
@@ -51,7 +52,7 @@ def _observable(key: str, text: str, names: dict[str, Callable], source: Source)
         return wrap(function)
     calls = ", ".join(f"{name}()" for name in indicators)
     allowed = f'{{}}; or "file.py:name"; alone or in {", ".join(reductions)}; or {calls}'
-    known(key, inner, names, allowed, repr(inner))
+    known(key, inner, names, allowed, f"{inner!r} is unknown")
     return wrap(names[inner])
 
 

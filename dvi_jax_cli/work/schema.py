@@ -79,7 +79,7 @@ class State(Table):
     @model_validator(mode="after")
     def _date_or_arrays(self) -> Any:
         fits = self.date is None or (self.q0 is None and self.p0 is None)
-        require(fits, "date", "given together with q0 or p0", "either date, or q0 and p0")
+        require(fits, "date", "it is given together with q0 or p0", "either date, or q0 and p0")
         return self
 
 
@@ -118,7 +118,7 @@ class Times(Table):
 def _check_names(observables: dict[str, str]) -> dict[str, str]:
     allowed = "a name without / and \\, because it becomes the name of a file in an archive"
     for name in observables:
-        require(not re.search(r"[/\\\x00-\x1f]", name), "", f"the name {name!r}", allowed)
+        require(not re.search(r"[/\\\x00-\x1f]", name), "", f"the name is {name!r}", allowed)
     return observables
 
 
@@ -137,10 +137,10 @@ class Integration(Table):
         given: Any = self  # of a run or of a sweep, with h, steps and t0
         if isinstance(self.lattice, Times):
             for name in ("h", "steps"):
-                value, allowed = getattr(given, name), "nothing: lattice.times gives the steps"
+                value, allowed = getattr(given, name), "no value: lattice.times gives the steps"
                 require(value is None, name, shown(value), allowed)
             fits = given.t0 in (0.0, self.lattice.times[0])
-            require(fits, "t0", shown(given.t0), "nothing: the run begins at lattice.times[0]")
+            require(fits, "t0", shown(given.t0), "no value: the run begins at lattice.times[0]")
         return self
 
 
@@ -241,7 +241,7 @@ class SweepFile(SystemFile, Integration):
     t0: number_or_axis(Number) = key(0.0, FINITE + OR_AXIS)
     h: number_or_axis(StepSize) | None = key(None, STEP_SIZE + OR_AXIS)
     steps: number_or_axis(Count, Annotated[Count, BeforeValidator(_whole)]) | None = key(
-        None, f"{COUNT}{OR_AXIS} of such"
+        None, f"{COUNT}{OR_AXIS} of such numbers"
     )
     epsilon: number_or_axis(Number) | None = key(None, FINITE + OR_AXIS)
     method: union(text=Text, array=Many[Text], table=Axis[Text]) = key(
@@ -256,7 +256,7 @@ class SweepFile(SystemFile, Integration):
     def _start_or_state(self) -> Any:
         for name in ("q0", "p0", "date"):
             fits = self.start is None or getattr(self.state, name) is None
-            require(fits, f"state.{name}", "given together with [start]", "[state] or [start]")
+            require(fits, f"state.{name}", "it is given with [start]", "[state] or [start]")
         return self
 
 

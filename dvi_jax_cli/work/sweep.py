@@ -94,7 +94,7 @@ def _check_folder(folder: Path, key: str, resume: bool) -> None:
         seen = f"{folder} exists, but is not the store of a sweep ({error})"
         raise InputError(key, seen, "a new directory") from None
     except ValueError as error:  # a name that no directory can have
-        raise InputError(key, f"{folder}: {error}", "a new directory") from None
+        raise InputError(key, f"{folder} cannot be used: {error}", "a new directory") from None
     done = f"{result.tasks_done} of {result.num_tasks} tasks are done"
     allowed = "--resume to continue it, or another directory, with --store PATH"
     require(resume, key, f"{folder} exists already: {done}", allowed)
@@ -177,7 +177,7 @@ def sweep_problem(file: SweepFile, folder: Path) -> tuple[Source, dict[str, Any]
     arguments |= _initial_conditions(file, source)
     kinds = (dvi.Axis, dvi.starts.Starts)
     leaves = jax.tree.leaves(arguments, is_leaf=lambda x: isinstance(x, kinds))
-    seen = "neither this nor another number varies"
+    seen = "neither epsilon nor another number varies"
     allowed = "an axis for some number, or [start]; for one trajectory use dvi-jax run"
     require(any(isinstance(x, kinds) for x in leaves), "epsilon", seen, allowed)
     return source, arguments
@@ -206,7 +206,7 @@ def _parameters(value: Any, key: str = "args") -> Any:
         return _for_sweep(key, value)
     seen = [f"{axis.axis} with {len(axis.all)} values" for axis in axes]
     allowed = "axes of the same name and length"
-    require(len({*seen}) == 1, key, f"axes {', '.join(seen)} in one array", allowed)
+    require(len({*seen}) == 1, key, f"one array contains the axes {', '.join(seen)}", allowed)
     arrays = [np.asarray(at(value, k), float) for k in range(len(axes[0].all))]
     return _axis(key, axes[0], np.stack(arrays))
 

@@ -71,7 +71,7 @@ class Source:
             return names if given is None else given
         if not isinstance(names, dict):
             why = "no parameters" if names is None else "parameters without names (not a dict)"
-            raise InputError("args", shown(given), f"no key args: {problem.name} has {why}")
+            raise InputError("args", shown(given), f"no key args, because {problem.name} has {why}")
         for name, value in given.items():
             known(f"args.{name}", name, names, seen="there is no such parameter")
             fits = isinstance(names[name], dict) or not isinstance(value, dict)
@@ -89,7 +89,7 @@ class Source:
     def check_start(self, q0: Any, p0: Any, args: Any) -> None:
         """Reject an initial condition that the system cannot start from."""
         allowed = f"the shape of q0, {np.shape(q0)}: a momentum for each q"
-        require(np.shape(q0) == np.shape(p0), "state.p0", f"shape {np.shape(p0)}", allowed)
+        require(np.shape(q0) == np.shape(p0), "state.p0", f"p0 has shape {np.shape(p0)}", allowed)
         if self.problem is None or self.problem.check is None:
             return
         try:
@@ -148,7 +148,7 @@ def find_source(file: SystemFile, folder: Path) -> Source:
     if isinstance(made, dvi.System):
         return Source(file, loader, None, made)
     allowed = "a dvi.System, a systems.Problem, or a function without arguments that returns one"
-    raise InputError("system", f"{name!r} is {type(made).__name__}", allowed)
+    raise InputError("system", f"{name!r} has the type {type(made).__name__}", allowed)
 
 
 def _of_the_library(file: SystemFile, loader: Loader) -> Source:

@@ -70,7 +70,7 @@ class Table(BaseModel):
         if context.get("discriminator") == "'kind'":  # the key that selects a table of a union
             tag, kinds = context.get("tag", ""), context.get("expected_tags", allowed)
             near = nearest(tag, re.findall(r"\w+", kinds))
-            return [InputError(path(place, "kind"), repr(tag) if tag else MISSING, kinds + near)]
+            return [InputError(path(place, "kind"), shown(tag) if tag else MISSING, kinds + near)]
         return [InputError(path(place), MISSING if kind == "missing" else seen, allowed)]
 
 
@@ -103,9 +103,9 @@ def read_file(file: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
     except FileNotFoundError:
         raise InputError(str(file), "there is no such file", "the path of a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(file), f"cannot be read: {error}", "a TOML file in UTF-8") from None
+        raise InputError(str(file), f"it cannot be read: {error}", "a TOML file in UTF-8") from None
     except (ValueError, RecursionError) as error:  # also thousands of digits, of brackets
-        raise InputError(str(file), f"is not TOML: {error}", "https://toml.io") from None
+        raise InputError(str(file), f"it is not TOML: {error}", "https://toml.io") from None
     try:
         return model.model_validate(raw), raw
     except ValidationError as error:  # pydantic wraps the one of the outermost table
@@ -255,7 +255,7 @@ class Axis(Table, Generic[V]):
     @model_validator(mode="after")
     def _one_kind(self) -> Any:
         given = {name: getattr(self, name) for name in self.model_fields_set}
-        require(len(given.keys() & {*KINDS}) == 1, "", shown(given), f"one of {AN_AXIS}")
+        require(len(given.keys() & {*KINDS}) == 1, "", shown(given), f"exactly one of {AN_AXIS}")
         return self
 
     @classmethod
