@@ -340,13 +340,22 @@ def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, 
         return [(lambda q, p, t, e: found.evaluate(q, p, e, t), found.formula(terms=8))]
     if callable(found):
         name = getattr(found, "__name__", "a function")
-        if len(inspect.signature(found).parameters) > 3:
+        if _takes(found, 4) and (timed or not _takes(found, 3)):
             return [(lambda q, p, t, e: found(q, p, e, t), name)]
         return [(lambda q, p, t, e: found(q, p, e), name)]
     pairs = [pair for one in found for pair in _functions(one, system, timed)]
     if not pairs:
         raise ValueError("found is empty: give an invariant, or a list of at least one.")
     return pairs
+
+
+def _takes(function: Callable, count: int) -> bool:
+    """Whether a function can be called with so many arguments."""
+    try:
+        inspect.signature(function).bind(*range(count))
+    except TypeError:
+        return False
+    return True
 
 
 def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float], list[float]]]:

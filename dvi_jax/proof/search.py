@@ -74,8 +74,10 @@ def examine(
             for k, change in enumerate(changes)
         ]
         leaf.remainders = [change[1] / algebra.one for change in changes]
-        sampled = [_sampled(algebra, change, box, rng) for change in changes]
-        leaf.seen, leaf.shares = ([pair[i] for pair in sampled] for i in (0, 1))
+        at = _points(box, rng)
+        counts = _is_inside(checker, algebra, step[0], at)
+        leaf.seen = [_largest(algebra, change, at[counts]) for change in changes]
+        leaf.shares = [_shares(change, len(box)) for change in changes]
         leaf.moved = [exact.up(m + Fraction(e)) for m, e in zip(moved, errors, strict=True)]
         finite = all(map(math.isfinite, (*leaf.rounding, *leaf.moved)))
         exact.require(finite, "a value is not bounded")
@@ -106,7 +108,9 @@ def estimate(checker: exact.Checker) -> list[float]:
         x[-1] = (exact.ball(checker.epsilon[1]), arb(0))
         try:
             step = checker.stepped(x, algebra)
-            if any(g[0] < 0 for g in exact.run(checker.inside, step[0], algebra)):
+            sides = zip(step[0][:-2], checker.lower, checker.upper, strict=True)
+            beside = any(not float(a) <= float(x[0]) <= float(b) for x, a, b in sides)
+            if beside or any(g[0] < 0 for g in exact.run(checker.inside, step[0], algebra)):
                 continue
             changes = [checker.change(k, step, algebra)[0] for k in range(len(seen))]
         except SINGULAR:
@@ -120,32 +124,33 @@ def resolve(checker: exact.Checker, seen: list[float], ratio: float) -> None:
 
     Few bits are faster; a change that nearly cancels needs many.
     """
-    small = min(ratio - 1, 4) / 10
-    rng, leaf, last = np.random.default_rng(0), None, []
-    for checker.bits in _BITS:
-        leaf = examine(checker, leaf.box, rng) if leaf else _bounded_part(checker, rng)
-        for _ in range(20):
-            if leaf is None or leaf.failed or leaf.outside:
-                return  # nothing is bounded there: `subdivide` says where
-            rows = enumerate(zip(leaf.remainders, seen, strict=True))
-            left = [k for k, (r, s) in rows if s and r > s * small]
-            if not left:
-                return
-            if last and all(leaf.remainders[k] < last[k] / 4 for k in left):
-                break
+    rng, bits = np.random.default_rng(0), [*_BITS]
+    checker.bits = bits.pop(0)
+    leaf = _bounded_part(checker, rng, checker.root())
+    while leaf is not None and bits:  # or nothing is bounded there: `subdivide` says where
+        rows = enumerate(zip(leaf.remainders, seen, strict=True))
+        left = [k for k, (r, s) in rows if s and r > s * min(ratio - 1, 4) / 10]
+        if not left:
+            return
+        before, checker.bits = checker.bits, bits[0]
+        finer = examine(checker, leaf.box, rng)
+        if any(finer.remainders[k] > leaf.remainders[k] / 4 for k in left):
             # More bits do not help much: the box is too large.
-            last = leaf.remainders
-            leaf = examine(checker, [half(side, rng.random() < 0.5) for side in leaf.box], rng)
+            checker.bits = before
+            leaf = _bounded_part(checker, rng, [half(s, rng.random() < 0.5) for s in leaf.box])
+        else:
+            leaf = finer
+            bits.pop(0)
 
 
-def _bounded_part(checker: exact.Checker, rng: Any) -> Leaf | None:
-    """The domain, or a part of it on which something is bounded; None if 60 parts have failed."""
-    box = checker.root()
+def _bounded_part(checker: exact.Checker, rng: Any, whole: list) -> Leaf | None:
+    """A box or a part of it on which something is bounded; None if 60 parts have failed."""
+    box = whole
     for _ in range(60):
         leaf = examine(checker, box, rng)
         if not (leaf.failed or leaf.outside):
             return leaf
-        box = checker.root() if leaf.outside else box
+        box = whole if leaf.outside else box
         box = [half(side, rng.random() < 0.5) for side in box]
     return None
 
@@ -156,20 +161,45 @@ def half(side: tuple, upper: bool) -> tuple:
     return (middle, side[1]) if upper else (side[0], middle)
 
 
-def _sampled(algebra: exact.Models, model: Any, box: list, rng: Any) -> tuple[float, list[float]]:
-    """The largest |P| at random points of the box, less the remainder; and for each coordinate by
-    how much the sum of |coefficients| would decrease if the box were half as wide."""
-    terms = model[0].to_dict()
-    if not terms:
-        return 0.0, [0.0] * len(box)
+def _points(box: list, rng: Any) -> np.ndarray:
+    """Points s of a box, |s| ≤ 1, with the largest ε."""
     s = rng.choice([-1.0, -0.7, -0.3, 0.0, 0.3, 0.7, 1.0], (_POINTS, len(box)))
     s[:, -1] = 1.0 if box[-1][0] == 0 else s[:, -1]
-    powers = np.array([[int(k) for k in powers] for powers in terms])
+    return s
+
+
+def _values(algebra: exact.Models, model: Any, s: np.ndarray) -> np.ndarray:
+    """The polynomial of a model at points s."""
+    terms = model[0].to_dict()
+    powers = np.array([[int(k) for k in powers] for powers in terms]).reshape(-1, s.shape[1])
     values = np.array([float(Fraction(int(c), algebra.one)) for c in terms.values()])
-    monomials = np.prod(s[:, None, :] ** powers[None], axis=2)
-    error = float(Fraction(model[1], algebra.one))
-    shares = np.abs(values) @ (1 - 0.5**powers)
-    return max(0.0, float(np.max(np.abs(monomials @ values))) - error), shares.tolist()
+    return np.prod(s[:, None, :] ** powers[None], axis=2) @ values
+
+
+def _largest(algebra: exact.Models, model: Any, s: np.ndarray) -> float:
+    """A lower bound of the largest |value| at points s."""
+    values = np.abs(_values(algebra, model, s))
+    return max(0.0, float(np.max(values, initial=0.0)) - float(Fraction(model[1], algebra.one)))
+
+
+def _is_inside(checker: exact.Checker, algebra: exact.Models, x: list, s: np.ndarray) -> Any:
+    """Which of the points s are states of the domain; `x`: the state as models."""
+    good = np.ones(len(s), bool)
+    sides = zip(x[:-2], checker.lower, checker.upper, strict=True)
+    for model, low, high in sides if checker.implicit else ():
+        value = _values(algebra, model, s)
+        good &= (value >= float(low)) & (value <= float(high))
+    for model in exact.run(checker.inside, x, algebra):
+        good &= _values(algebra, model, s) >= 0
+    return good
+
+
+def _shares(model: Any, size: int) -> list[float]:
+    """By how much Σ |coefficients| would decrease if a coordinate of the box were half as wide."""
+    terms = model[0].to_dict()
+    powers = np.array([[int(k) for k in powers] for powers in terms]).reshape(-1, size)
+    sizes = np.array([abs(float(c)) for c in terms.values()])
+    return (sizes @ (1 - 0.5**powers)).tolist()
 
 
 class TooMany(exact.Failed):
@@ -311,7 +341,7 @@ def enclose(
             if model[0].range(model[1])[0] > limit:
                 count += 1
                 return "above"
-            axis = int(np.argmax(_sampled(*model, box, rng)[1]))
+            axis = int(np.argmax(_shares(model[1], len(box))))
         late = count > max_boxes or time.monotonic() - began > max_seconds
         narrow = all(b - a <= (d - c) / 4096 for (a, b), (c, d) in zip(box, whole, strict=True))
         if late or narrow or hopeless.any():
