@@ -48,7 +48,7 @@ def schema(
         str | None,
         typer.Argument(
             metavar="KIND",
-            help="run, sweep, fit or discover; a file of any kind if not given.",
+            help="run, sweep, fit, discover or bound; a file of any kind if not given.",
             **completer(FILES),
         ),
     ] = None,

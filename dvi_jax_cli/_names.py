@@ -25,7 +25,7 @@ METHODS = _found("testing/registry.py", r'^    "(\w+)": ')
 CHECKS = _found("testing/checks.py", r'^@check\(\s*"([\w-]+)"')
 """Checks of a certificate, as `dvi-jax certify --check` takes them."""
 
-FILES = ("run", "sweep", "fit", "discover")
+FILES = ("run", "sweep", "fit", "discover", "bound")
 """Kinds of TOML files."""
 
 WORKLOADS = ("single", "batch", "implicit", "gradient")

@@ -1,4 +1,4 @@
-"""Commands that work on a TOML file: run, sweep, fit, discover; sweep status, sweep verify."""
+"""Commands that work on a TOML file: run, sweep, fit, discover, bound; sweep status and verify."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -190,3 +190,21 @@ def discover(session: Session, config: Config, out: Out = None, force: Force = F
     with progress_bar("discovering") as bar:
         report = discover_file(config, out=out, force=force, progress=bar)
     session.finish_report(report)
+
+
+@command(app, "bound", INVERSE)
+def bound(session: Session, config: Config, out: Out = None, force: Force = False) -> None:
+    """Prove how much invariants change in a step of the map, and in how many steps at most.
+
+    Writes bound.json and certificate.json, which `dvi-jax verify` checks.
+
+    Exit code 0: proved. 1: nothing is proved, or failed. 2: bad input.
+
+    Examples
+        dvi-jax bound bound.toml
+        dvi-jax bound bound.toml --json | jq .per_step
+    """
+    from .work.bound import bound_file
+
+    session.note(f"reading {config}")
+    session.finish_report(bound_file(config, out=out, force=force))

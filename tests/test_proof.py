@@ -2,9 +2,11 @@
 
 import copy
 import json
+import runpy
 import subprocess
 import sys
 from fractions import Fraction
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,14 +23,10 @@ from dvi_jax.proof.components import Unsupported, program_of
 CUBIC = dvi.System(
     lambda t0, t1, q, p, args: (p @ p + q @ q) / 2, force=lambda t0, t1, q, p, args: -(q**3)
 )
-HENON_HEILES = dvi.System(
-    lambda t0, t1, q, p, args: (p @ p + q @ q) / 2,
-    force=lambda t0, t1, q, p, args: -jnp.array([2 * q[0] * q[1], q[0] ** 2 - q[1] ** 2]),
-)
 
 
-def found(system, degree, order, r, n=1, count=800):
-    samples = np.random.default_rng(0).uniform(-r, r, (2, count, n))
+def found(system, degree, order, r):
+    samples = np.random.default_rng(0).uniform(-r, r, (2, 800, 1))
     return dvi.discover_invariants(
         system, dvi.Polynomials(degree), order=order, h=0.1, samples=samples
     )
@@ -58,27 +56,26 @@ def test_the_cubic_oscillator(cubic):
     assert "leaves it in" in str(cubic)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("order", "degree", "limit"), [(1, 6, 1.7e-7), (2, 8, 1.3e-9), (3, 10, 8e-12)]
-)
-def test_orders_of_the_cubic_oscillator(order, degree, limit):
-    bound = dvi.bound_drift(
-        found(CUBIC, degree, order, 0.5, count=3000), CUBIC, h=0.1, epsilon=0.01, domain=0.5
-    )
-    assert bound.per_step[0] <= limit
+SYSTEMS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "proof.py"))
 
 
 @pytest.mark.slow
-def test_henon_and_heiles():
-    bound = dvi.bound_drift(
-        found(HENON_HEILES, 5, 3, 0.3, n=2), HENON_HEILES, h=0.1, epsilon=0.01, domain=0.3,
-        ratio=6.0,
-    )  # fmt: skip
-    k = bound.level[0].index(1.0)
-    assert bound.per_step[k] <= 1e-13
-    assert bound.num_steps(1e-3, k) >= 9e9
+@pytest.mark.parametrize("name", SYSTEMS["CASES"])
+def test_the_table_of_systems(name):
+    """Bounds at most 30 times the largest change of 100 000 points, below their limits, in time."""
+    assert SYSTEMS["row"](name) == []
+
+
+@pytest.mark.slow
+def test_computed_trajectories_stay_below_the_line():
+    assert SYSTEMS["long_run"](100_000) == []
+
+
+@pytest.mark.slow
+def test_henon_and_heiles_is_confined():
+    bound = dvi.bound_drift(**SYSTEMS["henon_heiles"]())
     assert bound.steps >= 9e9
+    assert 0.4 < bound.start < 0.6
     assert "the domain is not left" in exact.check(bound.certificate)
 
 
@@ -258,6 +255,87 @@ def test_what_is_conserved_exactly_is_an_identity():
     assert false.per_step[0] > 1e-8
 
 
+def test_a_combination_of_invariants_confines():
+    """Two uncoupled oscillators: neither energy is large all around the domain, their sum is."""
+    system = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2)
+
+    def energy(i):
+        return lambda q, p, e: (p[i] ** 2 + q[i] ** 2 - 0.1 * q[i] * p[i]) / 2
+
+    bound = dvi.bound_drift(
+        [energy(0), energy(1)], system, h=0.1, epsilon=0.1, domain=np.full(2, 0.5)
+    )
+    assert bound.per_step == (0.0, 0.0)
+    weights, level = bound.level
+    np.testing.assert_allclose(weights, [1.0, 1.0], rtol=0.1)
+    assert 0.05 < level < 0.125
+    assert bound.steps > 1e11
+    assert bound.steps_inside([0.2, 0.1], [0.1, 0.2], 0.05) >= bound.steps
+    assert bound.steps_inside([0.5, 0.4], [0.4, 0.5], 0.05) == 0
+
+
+def test_a_map_that_depends_on_a_slow_time():
+    """H = p²/2 + (1 + ε sin τ) q²/2, τ = εt: the energy changes by O(ε²) in a step, if h is 0."""
+    system = dvi.System(
+        lambda t0, t1, q, p, args: (p @ p + q @ q) / 2,
+        force=lambda t0, t1, q, p, args: -jnp.sin(t0) * q,
+        slow_time=True,
+    )
+
+    def energy(q, p, epsilon, t):
+        w = 1 + epsilon * jnp.sin(t)
+        return (p @ p + w * (q @ q) - 0.1 * w * (q @ p)) / 2
+
+    given = {"h": 0.1, "epsilon": 0.01, "domain": np.array([0.5])}
+    with pytest.raises(ValueError, match="give the interval in which steps begin"):
+        dvi.bound_drift(energy, system, **given)
+    bound = dvi.bound_drift(energy, system, time=(0.0, 3.0), **given)
+    sol = dvi.integrate(system, [0.4], [0.1], h=0.1, num_steps=2000, epsilon=0.01)
+    values = jax.vmap(lambda q, p, t: energy(q, p, 0.01, 0.01 * t))(sol.qs, sol.ps, sol.ts)
+    measured = float(jnp.max(jnp.abs(jnp.diff(values))))
+    assert measured <= bound.per_step[0] <= 10 * measured
+    assert "τ in [0, 3]" in str(bound)
+    # The interval of τ ends after 3/(0.01·0.1) steps.
+    assert bound.steps == min(3000, int(1e-3 / (bound.per_step[0] + bound.rounding[0])))
+    assert "the domain is not left" in exact.check(bound.certificate)
+    longer = copy.deepcopy(bound.certificate)
+    longer["steps"] = 3001
+    longer["hash"] = exact.digest(longer)
+    with pytest.raises(exact.Failed):
+        exact.check(longer)
+
+
+def test_an_identity_with_elementary_functions():
+    """The angular momentum of a central force that is no rational function."""
+    kepler = dvi.System(lambda t0, t1, q, p, args: p @ p / 2 - 1 / jnp.sqrt(q @ q))
+    box = np.array([[1.0, 1.0], [1.1, 1.1]]), np.full(2, 0.2)
+    bound = dvi.bound_drift(
+        lambda q, p, e: q[0] * p[1] - q[1] * p[0], kepler, h=0.1, epsilon=0.1, domain=box
+    )
+    assert bound.per_step == (0.0,)
+    assert "by ≤ [0.0]" in exact.check(bound.certificate)
+
+
+def test_what_a_bound_says_of_a_start(cubic):
+    far, near = cubic.steps_inside([0.3], [0.1], 0.01), cubic.steps_inside([0.1], [0.0], 0.0)
+    assert cubic.steps < far < near
+    assert cubic.steps_inside([0.6], [0.0], 0.01) == 0  # outside of the domain
+    with pytest.raises(ValueError, match="is not in the interval .* of the proof"):
+        cubic.steps_inside([0.1], [0.1], 0.02)
+    with pytest.raises(ValueError, match="1 numbers each"):
+        cubic.steps_inside([0.1, 0.2], [0.1, 0.2], 0.01)
+
+
+def test_the_picture_of_a_bound(cubic):
+    steps, values = np.arange(5), np.array([0.1, 0.1, 0.1 + 1e-12, 0.1 - 3e-12, 0.1])
+    axis = dvi.plot.drift_bound(cubic, steps, values)
+    computed, proved = axis.get_lines()[:2]
+    each = cubic.per_step[0] + cubic.rounding[0]
+    np.testing.assert_allclose(proved.get_ydata(), each * steps[1:])
+    np.testing.assert_allclose(computed.get_ydata()[1:], [1e-12, 3e-12, 3e-12], rtol=1e-3)
+    dvi.plot.plt.close(axis.figure)
+
+
 # --- nothing is claimed --------------------------------------------------------------------------
 
 
@@ -276,6 +354,22 @@ def test_a_wrong_invariant_confines_nothing():
     )
     assert bound.level is None
     assert "it is not shown that trajectories stay" in str(bound)
+
+
+@pytest.mark.parametrize(
+    ("epsilon", "function"),
+    [
+        (5.0, energy_of_the_map),  # ε is too large
+        (0.01, lambda q, p, e: p @ p),  # not an invariant
+    ],
+)
+def test_no_number_of_steps_is_claimed(epsilon, function):
+    bound = dvi.bound_drift(
+        function, CUBIC, h=0.1, epsilon=epsilon, domain=np.array([0.9]), max_boxes=50
+    )
+    assert bound.num_steps(1e-3) == 0
+    assert bound.level is None
+    assert "no number of steps is proved: one step may already" in str(bound)
 
 
 @pytest.mark.parametrize(

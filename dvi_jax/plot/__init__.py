@@ -22,6 +22,7 @@ from .fits import (
 from .orbits import orbit as orbit, phase_portrait as phase_portrait, trajectory as trajectory
 from .orders import (
     balance as balance,
+    drift_bound as drift_bound,
     drift_orders as drift_orders,
     drift_surface as drift_surface,
     work_precision as work_precision,

@@ -244,6 +244,48 @@ a slope, as earlier ones have too long steps."""
 
 
 @in_style
+def drift_bound(
+    bound: Any,
+    steps: Any,
+    values: Any,
+    invariant: int = 0,
+    title: str = "Proved bound and computed drift",
+    ax: Any = None,
+) -> Any:
+    """The proved line N (per_step + rounding) above computed changes |I(x_N) − I(x_0)|.
+
+    - `bound`: a `DriftBound`. `invariant`: the number k of its I_k.
+    - `steps`: numbers of steps N, shape (S,), the first is 0. `values`: I_k after these steps,
+      shape (S,) or (..., S) for several trajectories; the largest change so far is drawn.
+
+    A grey line marks the number of steps within which trajectories are proved to stay in the
+    domain. The legend counts changes that are not finite, and those exactly 0. **Returns** the
+    `Axes`. **Raises** `ValueError` for shapes that do not fit.
+    """
+    draw.check_attributes(bound, ("per_step", "rounding"), "bound must be a dvi.DriftBound")
+    n, v = np.asarray(steps, float), np.asarray(values, float)
+    fits = n.ndim == 1 and v.shape[-1:] == n.shape and len(n) > 1
+    draw.check_shapes(fits, "values must have one number for each of steps", steps=n, values=v)
+    axis, new = canvas(ax, (6.4, 4.4))
+    changes = np.abs(v - v[..., :1]).reshape(-1, len(n))[:, 1:]
+    for row in np.fmax.accumulate(changes, axis=1):
+        axis.plot(n[1:], np.where(row > 0, row, np.nan), color=COLOURS[0], lw=0.7)
+    line = n[1:] * (bound.per_step[invariant] + bound.rounding[invariant])
+    axis.plot(n[1:], line, color=COLOURS[1], ls="--", label="proved for all starts of the domain")
+    if bound.level is not None and bound.steps <= n[-1]:
+        axis.axvline(bound.steps, **draw.GUIDE)
+    axis.set(xscale="log", yscale="log", xlabel="number of steps N", title=title)
+    axis.set_ylabel(f"largest |I$_{{{invariant}}}$(N) − I$_{{{invariant}}}$(0)|")
+    lost = {
+        "changes are not finite": (~np.isfinite(changes)).sum(),
+        "changes are exactly 0": (changes == 0).sum(),
+    }
+    look = entry(f"computed, {len(changes)} trajectories", color=COLOURS[0], lw=1)
+    legend(axis, new, [look, *counted(lost)])
+    return axis
+
+
+@in_style
 def work_precision(
     results: Mapping[str, tuple[Any, Any]],
     cost: str = "cost",

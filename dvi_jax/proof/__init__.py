@@ -1,3 +1,4 @@
 """Proved bounds of how much invariants change, and the checker of their certificates."""
 
-from .bound import DriftBound as DriftBound, ProofError as ProofError, bound_drift as bound_drift
+from .bound import ProofError as ProofError, bound_drift as bound_drift
+from .result import DriftBound as DriftBound

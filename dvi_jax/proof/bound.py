@@ -1,21 +1,15 @@
 """`bound_drift`: a proved bound of how much invariants change, for all starts of a domain."""
 
 import inspect
-import json
-import math
-import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._arithmetic import FloatingPoint
 from .._checks import finite, positive, whole
-from .._files import publish
 from .._integrator import Integrator, chosen, only
 from .._precision import refuse_double_without_x64
 from .._step import Equations
@@ -25,6 +19,7 @@ from ..discover.found import Discovery
 from ..discover.series import InvariantSeries
 from .components import program_of
 from .confinement import confine
+from .result import DriftBound
 from .tools import tools
 
 _ACCEPTED = 8.0
@@ -33,92 +28,6 @@ _ACCEPTED = 8.0
 
 class ProofError(Exception):
     """Nothing is proved: the message says what failed, and for which states."""
-
-
-class DriftBound(eqx.Module):
-    """Result of `bound_drift`: what is proved about the change of invariants in each step.
-
-    For all states (q, p) of the domain and all ε of the interval, in one step of the map
-
-        |I_k(q1, p1) − I_k(q0, p0)| ≤ per_step[k]                 in exact arithmetic,
-                                    ≤ per_step[k] + rounding[k]   as computed in float64.
-
-    - `per_step`, `rounding`: [unit of the invariant]. `seen`: the largest change found at sample
-      points of the boxes, a lower estimate of the least possible `per_step`.
-    - `level`: (w, c): trajectories that start in the domain with Σ w_k I_k ≤ c stay in it for
-      `steps` steps, exact or computed; None if that is not shown, and `reason` says why.
-    - `start`: factor by which the domain is scaled about its middle so that all its states satisfy
-      that. `change`: the change of I_k that `steps` steps exclude.
-    - `boxes`: number of boxes of the proof. `formulas`: the invariants as text.
-    - `certificate`: all that `dvi-jax verify` checks, see `save`.
-    """
-
-    per_step: tuple[float, ...] = eqx.field(static=True)
-    rounding: tuple[float, ...] = eqx.field(static=True)
-    seen: tuple[float, ...] = eqx.field(static=True)
-    level: tuple[tuple[float, ...], float] | None = eqx.field(static=True)
-    steps: int = eqx.field(static=True)
-    start: float = eqx.field(static=True)
-    change: float = eqx.field(static=True)
-    boxes: int = eqx.field(static=True)
-    reason: str = eqx.field(static=True)
-    formulas: tuple[str, ...] = eqx.field(static=True)
-    certificate: dict[str, Any] = eqx.field(static=True)
-
-    def num_steps(self, change: float, invariant: int = 0) -> int | float:
-        """The number of computed steps within which I_k changes by less than `change`, as long as
-        the trajectory is in the domain; inf if it is conserved exactly, without rounding."""
-        each = self.per_step[invariant] + self.rounding[invariant]
-        return math.floor(change / each) if each else math.inf
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the certificate, a JSON file that ``dvi-jax verify`` checks."""
-        publish(Path(path), (json.dumps(self.certificate, indent=1) + "\n").encode())
-
-    def __repr__(self) -> str:
-        return self.report()
-
-    def report(self) -> str:
-        """What is proved, as text."""
-        c = self.certificate
-        low, high = (float.fromhex(x) for x in c["epsilon"])
-        n = len(c["domain"][0]) // 2
-        names = [f"{x}{i + 1 if n > 1 else ''}" for x in "qp" for i in range(n)]
-        if c["timed"]:
-            names.append("τ" if c["slow"] else "t")
-        ends = [*zip(*c["domain"], strict=True), c["time"]]
-        sides = ", ".join(
-            f"{name} in [{float.fromhex(a):.6g}, {float.fromhex(b):.6g}]"
-            for name, (a, b) in zip(names, ends, strict=False)
-        )
-        lines = [
-            f"proved for each step from a state with {sides}"
-            + (" and inside(q, p) ≥ 0" if c["inside"]["outputs"] else "")
-            + f", for all ε in [{low:.6g}, {high:.6g}], h = {float.fromhex(c['h']):.6g}:",
-            f"{'':4}{'change ≤':>10} {'seen':>9} {'rounding ≤':>10} "
-            f"{'steps for ' + format(self.change, 'g'):>18}",
-        ]
-        for k, b in enumerate(self.per_step):
-            lines.append(
-                f"I_{k:<2}{b:10.2g} {self.seen[k]:9.2g} {self.rounding[k]:10.2g} "
-                f"{self.num_steps(self.change, k):18.3g}"
-            )
-        if self.level is None:
-            lines.append(f"it is not shown that trajectories stay in the domain: {self.reason}")
-        else:
-            lines.append(
-                f"no trajectory that starts in the domain with {self._combination()} ≤ "
-                f"{self.level[1]:.6g} leaves it in {self.steps:.3g} steps; all states of the "
-                f"domain scaled by {self.start:.3g} are such"
-            )
-        lines.extend(f"I_{k} = {text}" for k, text in enumerate(self.formulas))
-        return "\n".join(lines)
-
-    def _combination(self) -> str:
-        """Σ w_k I_k as text."""
-        weights = enumerate(self.level[0] if self.level else ())
-        text = " + ".join(f"{w:.4g} I_{k}" if w != 1 else f"I_{k}" for k, w in weights if w)
-        return text.replace("+ -", "− ").replace("-1 I", "−I").replace("-", "−")
 
 
 def bound_drift(

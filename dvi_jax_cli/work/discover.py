@@ -80,7 +80,7 @@ def discover_file(
 def _arguments(file: DiscoverFile, source: Source) -> tuple[dict[str, Any], Any]:
     """The arguments of `dvi.discover_invariants`, and (q0, p0) of the trajectories on which drifts
     are measured."""
-    low, high = _box(file, source)
+    low, high = box_of(file.samples, "samples", source)
     shape = low[0].shape
     basis = parse_basis(file.basis, source.loader)
     try:
@@ -104,17 +104,17 @@ def _arguments(file: DiscoverFile, source: Source) -> tuple[dict[str, Any], Any]
     return search, uniform(file.drift.starts)
 
 
-def _box(file: DiscoverFile, source: Source) -> list[tuple[np.ndarray, ...]]:
+def box_of(table: Any, key: str, source: Source) -> list[tuple[np.ndarray, ...]]:
     """(q, p) of the lower corner and of the upper one, in the shape of q: that of the system's
-    start, or else of the corners."""
-    given = {name: getattr(file.samples, name) for name in ("low", "high")}
-    if source.problem is not None or file.state.q0 is not None:
+    start, or else of the corners `low` and `high` of the table with this key."""
+    given = {name: getattr(table, name) for name in ("low", "high")}
+    if source.problem is not None or source.file.state.q0 is not None:
         shape = np.shape(source.array("q0"))
     else:
         shapes = {np.shape(x) for corner in given.values() for x in (corner.q, corner.p)} - {()}
         seen = f"low and high have shapes {', '.join(map(str, sorted(shapes))) or '()'}"
         allowed = "arrays of the same shape, that of q, in low and high (not only numbers)"
-        require(len(shapes) == 1, "samples.low", seen, allowed)
+        require(len(shapes) == 1, f"{key}.low", seen, allowed)
         shape = shapes.pop()
     corners = []
     for name, corner in given.items():
@@ -125,9 +125,10 @@ def _box(file: DiscoverFile, source: Source) -> list[tuple[np.ndarray, ...]]:
         except ValueError:
             seen = f"q has shape {np.shape(corner.q)} and p has shape {np.shape(corner.p)}"
             allowed = f"numbers, or arrays of the shape of q, {shape}"
-            raise InputError(f"samples.{name}", seen, allowed) from None
+            raise InputError(f"{key}.{name}", seen, allowed) from None
     is_below = all((a < b).all() for a, b in zip(*corners, strict=True))
-    require(is_below, "samples.low", "it is not below samples.high", "low < high in each component")
+    seen = f"it is not below {key}.high"
+    require(is_below, f"{key}.low", seen, "low < high in each component")
     return corners
 
 

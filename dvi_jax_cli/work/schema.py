@@ -1,4 +1,4 @@
-"""The TOML files of run, sweep, fit and discover: their keys, types, ranges and defaults."""
+"""The TOML files of run, sweep, fit, discover and bound: their keys, types, ranges, defaults."""
 # pyright: reportInvalidTypeForm=false
 
 import datetime
@@ -84,7 +84,7 @@ class State(Table):
 
 
 class SystemFile(Table):
-    """The common keys of the files of run, fit and discover."""
+    """The common keys of the files of run, fit, discover and bound."""
 
     system: Text = key(..., f"the name of a system in the library, or {FILE}")
     state: State = State()
@@ -394,7 +394,47 @@ class DiscoverFile(SystemFile):
     output: Output = Output()
 
 
-_MODELS = (RunFile, SweepFile, FitFile, DiscoverFile)
+# A proof
+
+
+Above0 = Annotated[Number, check(lambda value: value > 0)]
+
+
+class Domain(Table):
+    """The states for which a bound is proved."""
+
+    low: Pair = key(..., f"a corner of the box, {BOX}")
+    high: Pair = key(..., f"a corner of the box, {BOX}")
+    inside: Text | None = key(None, f"{FILE} of a function (q, p) that is ≥ 0 in the domain")
+    times: Annotated[Two[Number], check(lambda span: span[0] < span[1])] | None = key(
+        None, "[first, last]: times at which steps begin, where the map depends on the time"
+    )
+
+
+class Bound(Table):
+    """How far the domain is divided, and the change for which steps are counted."""
+
+    change: Above0 = key(1e-3, "a number above zero")
+    ratio: Annotated[Number, check(lambda ratio: ratio > 1)] = key(2.0, "a number above 1")
+    max_boxes: Count = key(2000, COUNT)
+    max_seconds: Above0 = key(300.0, "a number above zero")
+
+
+class BoundFile(SystemFile):
+    """A proof of how much invariants change."""
+
+    invariants: Text = key(
+        ..., f"discovery.npz of `dvi-jax discover`, or {FILE} of what was found or of a function"
+    )
+    epsilon: Annotated[Two[Number], check(lambda ends: ends[0] < ends[1])] = key(
+        ..., "[least, largest] strength of the perturbation"
+    )
+    domain: Domain = key(..., "[domain], a table with the box of the states")
+    bound: Bound = Bound()
+    output: Output = Output()
+
+
+_MODELS = (RunFile, SweepFile, FitFile, DiscoverFile, BoundFile)
 FILES: dict[str, type[Table]] = dict(zip(KINDS, _MODELS, strict=True))
 """Kind of file → its model."""
 

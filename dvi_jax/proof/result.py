@@ -1,0 +1,152 @@
+"""`DriftBound`: what is proved about the change of invariants in each step."""
+
+import json
+import math
+import os
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from .._files import publish
+from .tools import tools
+
+
+class DriftBound(eqx.Module):
+    """Result of `bound_drift`: what is proved about the change of invariants in each step.
+
+    For all states (q, p) of the domain and all ε of the interval, in one step of the map
+
+        |I_k(q1, p1) − I_k(q0, p0)| ≤ per_step[k]                 in exact arithmetic,
+                                    ≤ per_step[k] + rounding[k]   as computed in float64.
+
+    - `per_step`, `rounding`: [unit of the invariant]. `seen`: the largest change found at sample
+      points of the boxes, a lower estimate of the least possible `per_step`.
+    - `level`: (w, c): trajectories that start in the domain with Σ w_k I_k ≤ c stay in it for
+      `steps` steps, exact or computed; None if that is not shown, and `reason` says why.
+    - `start`: factor by which the domain is scaled about its middle so that all its states satisfy
+      that. `change`: the change of I_k that `steps` steps exclude.
+    - `boxes`: number of boxes of the proof. `formulas`: the invariants as text.
+    - `certificate`: all that `dvi-jax verify` checks, see `save`.
+    """
+
+    per_step: tuple[float, ...] = eqx.field(static=True)
+    rounding: tuple[float, ...] = eqx.field(static=True)
+    seen: tuple[float, ...] = eqx.field(static=True)
+    level: tuple[tuple[float, ...], float] | None = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    start: float = eqx.field(static=True)
+    change: float = eqx.field(static=True)
+    boxes: int = eqx.field(static=True)
+    reason: str = eqx.field(static=True)
+    formulas: tuple[str, ...] = eqx.field(static=True)
+    certificate: dict[str, Any] = eqx.field(static=True)
+
+    def num_steps(self, change: float, invariant: int = 0) -> int | float:
+        """The number of computed steps within which I_k changes by less than `change`, as long as
+        the trajectory is in the domain; inf if it is conserved exactly, without rounding."""
+        each = self.per_step[invariant] + self.rounding[invariant]
+        return math.floor(change / each) if each else math.inf
+
+    def steps_inside(self, q0: Any, p0: Any, epsilon: float) -> int:
+        """The number of steps, exact or computed, within which the trajectory from this start is
+        proved to stay in the domain; 0 if nothing is proved for it.
+
+        - `q0`, `p0`: the start, with the shape that the domain has; at the time of the begin of the
+          interval, if the map depends on the time. `epsilon`: its ε.
+
+        With C = Σ w_k I_k and the `level` (w, c), the trajectory is in the domain as long as
+        C(q0, p0) + N Σ |w_k| (per_step[k] + rounding[k]) ≤ c + `steps` Σ |w_k| (…).
+
+        **Raises** `ValueError` for an ε that is not in the interval of the proof.
+        """
+        exact, _ = tools()
+        checker, x = exact.Checker(self.certificate), [*np.ravel(q0), *np.ravel(p0)]
+        if len(x) != 2 * checker.n:
+            raise ValueError(
+                f"q0 and p0 must have {checker.n} numbers each, as in the domain of the proof; "
+                f"they have {np.size(q0)} and {np.size(p0)}."
+            )
+        low, high = map(float, checker.epsilon)
+        if not low <= epsilon <= high:
+            raise ValueError(
+                f"epsilon={epsilon!r} is not in the interval [{low:g}, {high:g}] of the proof: "
+                "call bound_drift with an interval that contains it."
+            )
+        if self.level is None:
+            return 0
+        point = [Fraction(float(v)) for v in (*x, checker.time[0], epsilon)]
+        state, algebra = (
+            [(exact.ball(v), exact.ball(Fraction(0))) for v in point],
+            exact.Rounding(0),
+        )
+        sides = zip(point, checker.lower, checker.upper, strict=False)
+        margins = [g for g, _ in exact.run(checker.inside, state, algebra)]
+        if not (all(a <= v <= b for v, a, b in sides) and all(g >= 0 for g in margins)):
+            return 0
+        weights, level = exact.exact(self.certificate["level"])
+        per_step, rounding = (exact.exact(self.certificate[n]) for n in ("per_step", "rounding"))
+        each = sum(abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True))
+        values = [exact.run(f, state, algebra)[0][0] for f in checker.invariants]
+        here = sum(exact.ball(w) * v for w, v in zip(weights, values, strict=True))
+        left = level + self.steps * each - Fraction(exact.up(here))
+        steps = max(0, math.floor(left / each)) if each else (2**62 if left >= 0 else 0)
+        last = checker.h * (Fraction(float(epsilon)) if checker.slow else 1)
+        times = checker.time[1] - checker.time[0]
+        return min(steps, math.floor(times / last)) if self.certificate["timed"] and last else steps
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the certificate, a JSON file that ``dvi-jax verify`` checks."""
+        publish(Path(path), (json.dumps(self.certificate, indent=1) + "\n").encode())
+
+    def __repr__(self) -> str:
+        return self.report()
+
+    def report(self) -> str:
+        """What is proved, as text."""
+        c = self.certificate
+        low, high = (float.fromhex(x) for x in c["epsilon"])
+        n = len(c["domain"][0]) // 2
+        names = [f"{x}{i + 1 if n > 1 else ''}" for x in "qp" for i in range(n)]
+        if c["timed"]:
+            names.append("τ" if c["slow"] else "t")
+        ends = [*zip(*c["domain"], strict=True), c["time"]]
+        sides = ", ".join(
+            f"{name} in [{float.fromhex(a):.6g}, {float.fromhex(b):.6g}]"
+            for name, (a, b) in zip(names, ends, strict=False)
+        )
+        lines = [
+            f"proved for each step from a state with {sides}"
+            + (" and inside(q, p) ≥ 0" if c["inside"]["outputs"] else "")
+            + f", for all ε in [{low:.6g}, {high:.6g}], h = {float.fromhex(c['h']):.6g}:",
+            f"{'':4}{'change ≤':>10} {'seen':>9} {'rounding ≤':>10} "
+            f"{'steps for ' + format(self.change, 'g'):>18}",
+        ]
+        for k, b in enumerate(self.per_step):
+            lines.append(
+                f"I_{k:<2}{b:10.2g} {self.seen[k]:9.2g} {self.rounding[k]:10.2g} "
+                f"{self.num_steps(self.change, k):18.3g}"
+            )
+        if not any(self.num_steps(self.change, k) for k in range(len(self.per_step))):
+            lines.append(
+                f"no number of steps is proved: one step may already change each of them by more "
+                f"than {self.change:g}"
+            )
+        if self.level is None:
+            lines.append(f"it is not shown that trajectories stay in the domain: {self.reason}")
+        else:
+            lines.append(
+                f"no trajectory that starts in the domain with {self._combination()} ≤ "
+                f"{self.level[1]:.6g} leaves it in {self.steps:.3g} steps; all states of the "
+                f"domain scaled by {self.start:.3g} are such"
+            )
+        lines.extend(f"I_{k} = {text}" for k, text in enumerate(self.formulas))
+        return "\n".join(lines)
+
+    def _combination(self) -> str:
+        """Σ w_k I_k as text."""
+        weights = enumerate(self.level[0] if self.level else ())
+        text = " + ".join(f"{w:.4g} I_{k}" if w != 1 else f"I_{k}" for k, w in weights if w)
+        return text.replace("+ -", "− ").replace("-1 I", "−I").replace("-", "−")

@@ -1,0 +1,84 @@
+"""One proof: read, bound the changes of invariants in a step, write the certificate."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import dvi_jax as dvi
+
+from .._errors import InputError
+from .._show import Table
+from .discover import box_of
+from .expressions import parse_method
+from .output import Report, opened
+from .system import find_source
+
+WRITTEN = ("bound.json", "certificate.json")
+"""Every file that a proof may write; with `force` these are replaced and nothing else."""
+
+
+def bound_file(path: str | Path, out: str | Path | None = None, force: bool = False) -> Report:
+    """The proof that a TOML file describes; its keys are in `BoundFile`.
+
+    - `out`: directory to write to, as for `run_file`. `force`: replace the results there.
+
+    **Raises** `InputError` for bad input; nothing is written then.
+    """
+    file, report = opened("bound", Path(path), out, WRITTEN, force)
+    source = find_source(file, Path(path).parent)
+    low, high = box_of(file.domain, "domain", source)
+    found = _invariants(file.invariants, source, Path(path).parent)
+    inside = file.domain.inside and source.loader.load("domain.inside", file.domain.inside)
+    given = {"h": float(source.h), "args": source.args, "method": parse_method(file.method)}
+    given |= {"epsilon": tuple(file.epsilon), "time": file.domain.times, "inside": inside}
+    given["domain"] = tuple(np.stack(pair) for pair in zip(low, high, strict=True))
+    allowed = "invariants, a domain and a method that fit the system"
+    began, bound = time.perf_counter(), None
+    with report.reserved():
+        try:
+            with source.at_work("invariants", "bounded", allowed):
+                try:
+                    bound = dvi.bound_drift(found, source.system, **given, **dict(file.bound))
+                except dvi.ProofError as error:
+                    report.message = f"nothing is proved: {error}"
+        except ImportError as error:
+            raise InputError("system", str(error), "an installation with python-flint") from None
+    with report.writing():
+        if bound is not None:
+            bound.save(report.path("certificate.json"))
+            report.contents |= _contents(bound)
+            report.notes, report.tables = str(bound).splitlines(), _tables(bound)
+        report.write_contents("bound.json")
+    report.summary = f"{time.perf_counter() - began:.1f} s"
+    return report
+
+
+def _invariants(text: str, source: Any, folder: Path) -> Any:
+    if not text.endswith(".npz"):
+        return source.loader.load("invariants", text)
+    try:
+        return dvi.Discovery.load(folder / text)
+    except (OSError, ValueError) as error:
+        allowed = "discovery.npz, as `dvi-jax discover` writes it"
+        raise InputError("invariants", f"{text}: {error}", allowed) from None
+
+
+def _contents(bound: dvi.DriftBound) -> dict[str, Any]:
+    names = ("per_step", "rounding", "seen", "level", "steps", "start", "change", "boxes", "reason")
+    return {"formulas": bound.formulas} | {name: getattr(bound, name) for name in names}
+
+
+def _tables(bound: dvi.DriftBound) -> list[Table]:
+    rows = [
+        [
+            f"I_{k}",
+            f"{b:.2e}",
+            f"{bound.rounding[k]:.2e}",
+            f"{bound.num_steps(bound.change, k):.3g}",
+        ]
+        for k, b in enumerate(bound.per_step)
+    ]
+    columns = ["invariant", "change in a step ≤", "by rounding ≤", f"steps for {bound.change:g}"]
+    return [Table("Proved bounds", columns, rows)]
