@@ -23,8 +23,8 @@ from dvi_jax_cli import app
 from dvi_jax_cli._new import notebook
 from dvi_jax_cli._session import CODES, Session
 
-COMMANDS = ["new", "systems", "schema", "run", "sweep", "fit", "discover", "paper", "certify"]
-COMMANDS += ["verify", "bench", "info"]
+COMMANDS = ["new", "systems", "schema", "run", "sweep", "fit", "discover", "bound", "paper"]
+COMMANDS += ["certify", "verify", "bench", "info"]
 
 WITHOUT_JAX = """
 import sys
@@ -311,16 +311,19 @@ def inside(project, monkeypatch):
     return project
 
 
+PROJECT = [kind for kind in known.FILES if kind != "bound"]  # which needs the extra `proof`
+
+
 def test_new_writes_a_project(project):
     assert {p.name for p in project.iterdir()} == {
         *("README.md", "system.py", "observations.csv", "explore.py", "explore.ipynb"),
-        *(f"{kind}.toml" for kind in known.FILES),
+        *(f"{kind}.toml" for kind in PROJECT),
     }
     readme = (project / "README.md").read_text(encoding="utf-8")
     assert readme.startswith("# spring\n")
     for path in project.iterdir():
         assert "{{" not in path.read_text(encoding="utf-8"), path
-    for name in known.FILES:
+    for name in PROJECT:
         assert f"dvi-jax {name} {name}.toml" in readme
 
 

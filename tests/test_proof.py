@@ -320,7 +320,7 @@ def test_what_a_bound_says_of_a_start(cubic):
     far, near = cubic.steps_inside([0.3], [0.1], 0.01), cubic.steps_inside([0.1], [0.0], 0.0)
     assert cubic.steps < far < near
     assert cubic.steps_inside([0.6], [0.0], 0.01) == 0  # outside of the domain
-    with pytest.raises(ValueError, match="is not in the interval .* of the proof"):
+    with pytest.raises(ValueError, match=r"is not in the interval .* of the proof"):
         cubic.steps_inside([0.1], [0.1], 0.02)
     with pytest.raises(ValueError, match="1 numbers each"):
         cubic.steps_inside([0.1, 0.2], [0.1, 0.2], 0.01)

@@ -133,7 +133,7 @@ def bound_drift(
         "invariants": invariants,
         "unit": (2.0**-53).hex(),
         "bits": 100,
-        "orders": 24 if n < 2 else 12 if n < 3 else 8,  # of the expansion of a function
+        "orders": 24 if n < 2 else 10 if n < 3 else 8,  # of the expansion of a function
         "accepted": (_ACCEPTED * 2.0**-52 * max(map(abs, (*lower[n:], *upper[n:])))).hex(),
         "spread": [(0.0).hex()] * n,
     }

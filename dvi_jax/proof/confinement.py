@@ -164,14 +164,16 @@ def _scale(checker: Any, weights: list, level: Fraction) -> float:
     """The largest factor (to 1 %) by which the domain may be scaled about its middle so that
     Σ w_k I_k ≤ level in it."""
     exact, search = tools()
-    sides = list(zip(checker.lower, checker.upper, strict=True))
+    *sides, (begin, end), epsilon = checker.root()
+    width = (end - begin) / 16
+    spans = [(begin + i * width, begin + (i + 1) * width) for i in range(16 if width else 1)]
     good, bad = 0, 101
     while bad - good > 1:
         i = (good + bad) // 2
         box = [((a + b) / 2 - i * (b - a) / 200, (a + b) / 2 + i * (b - a) / 200) for a, b in sides]
         try:
-            algebra, value = exact.combined(checker, weights, [*box, *checker.root()[-2:]])
-            fits = algebra.range(value)[1] <= level
+            parts = [exact.combined(checker, weights, [*box, span, epsilon]) for span in spans]
+            fits = all(algebra.range(value)[1] <= level for algebra, value in parts)
         except search.SINGULAR:
             fits = False
         good, bad = (i, bad) if fits else (good, i)

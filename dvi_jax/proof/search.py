@@ -129,7 +129,7 @@ def resolve(checker: exact.Checker, seen: list[float], ratio: float) -> None:
     leaf = _bounded_part(checker, rng, checker.root())
     while leaf is not None and bits:  # or nothing is bounded there: `subdivide` says where
         rows = enumerate(zip(leaf.remainders, seen, strict=True))
-        left = [k for k, (r, s) in rows if s and r > s * min(ratio - 1, 4) / 10]
+        left = [k for k, (r, s) in rows if s and r > s * min(ratio - 1, 4) / 5]
         if not left:
             return
         before, checker.bits = checker.bits, bits[0]

@@ -29,7 +29,7 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
     file, report = opened("bound", Path(path), out, WRITTEN, force)
     source = find_source(file, Path(path).parent)
     low, high = box_of(file.domain, "domain", source)
-    found = _invariants(file.invariants, source, Path(path).parent)
+    found = source.loader.load("invariants", file.invariants)
     inside = file.domain.inside and source.loader.load("domain.inside", file.domain.inside)
     given = {"h": float(source.h), "args": source.args, "method": parse_method(file.method)}
     given |= {"epsilon": tuple(file.epsilon), "time": file.domain.times, "inside": inside}
@@ -53,16 +53,6 @@ def bound_file(path: str | Path, out: str | Path | None = None, force: bool = Fa
         report.write_contents("bound.json")
     report.summary = f"{time.perf_counter() - began:.1f} s"
     return report
-
-
-def _invariants(text: str, source: Any, folder: Path) -> Any:
-    if not text.endswith(".npz"):
-        return source.loader.load("invariants", text)
-    try:
-        return dvi.Discovery.load(folder / text)
-    except (OSError, ValueError) as error:
-        allowed = "discovery.npz, as `dvi-jax discover` writes it"
-        raise InputError("invariants", f"{text}: {error}", allowed) from None
 
 
 def _contents(bound: dvi.DriftBound) -> dict[str, Any]:

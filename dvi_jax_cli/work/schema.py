@@ -423,9 +423,7 @@ class Bound(Table):
 class BoundFile(SystemFile):
     """A proof of how much invariants change."""
 
-    invariants: Text = key(
-        ..., f"discovery.npz of `dvi-jax discover`, or {FILE} of what was found or of a function"
-    )
+    invariants: Text = key(..., f"{FILE} of a Discovery, or of a function (q, p, epsilon)")
     epsilon: Annotated[Two[Number], check(lambda ends: ends[0] < ends[1])] = key(
         ..., "[least, largest] strength of the perturbation"
     )

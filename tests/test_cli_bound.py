@@ -1,0 +1,81 @@
+"""Proofs from TOML files: what they prove and write, which input they reject."""
+
+import json
+
+import pytest
+from cli import command, found, names, refuses, write
+
+pytest.importorskip("flint")
+
+OWN = """
+import jax.numpy as jnp
+import dvi_jax as dvi
+
+system = dvi.System(lambda t0, t1, q0, p1, args: (p1 @ p1 + q0 @ q0) / 2)
+
+def energy(q, p, epsilon):
+    return (p @ p + q @ q - 0.1 * (q @ p)) / 2
+
+def singular(q, p, epsilon):
+    return 1 / q[0]
+
+def inside(q, p):
+    return 0.1 - q @ q
+"""
+
+SMALL = """
+system = "own.py:system"
+h = 0.1
+invariants = "own.py:energy"
+epsilon = [0.0, 0.1]
+[domain]
+low = {q = [-0.5], p = -0.5}
+high = {q = [0.5], p = 0.5}
+[bound]
+change = 1e-4
+max_boxes = 200
+[output]
+dir = "out"
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    write(tmp_path, OWN, "own.py")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_small_proof(folder):
+    """The energy of the map is conserved exactly: only the rounding changes it."""
+    contents = found("bound", write(folder, SMALL))
+    assert contents["per_step"] == [0.0]
+    assert 1e-17 < contents["rounding"][0] < 1e-15
+    assert contents["steps"] > 1e11
+    assert names(folder / "out") == {"bound.json", "certificate.json"}
+    assert command("verify", "out/certificate.json").exit_code == 0
+    path = folder / "out" / "certificate.json"
+    content = json.loads(path.read_text())
+    content["h"] = (0.2).hex()
+    path.write_text(json.dumps(content))
+    assert command("verify", "out/certificate.json").exit_code == 1
+
+
+def test_nothing_is_proved_at_a_singularity(folder):
+    result = command("bound", write(folder, SMALL.replace("energy", "singular")))
+    assert result.exit_code == 1
+    assert "nothing is proved: on " in result.output
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "seen"),
+    [
+        ("low = {q = [-0.5]", "low = {q = [0.7]", "it is not below domain.high"),
+        ("[0.0, 0.1]", "[0.1, 0.1]", "epsilon"),
+        ("own.py:energy", "own.py:nothing", "own.py has no 'nothing'"),
+        ("change = 1e-4", "ratio = 0.5", "bound.ratio"),
+        ("[bound]", 'inside = "own.py:none"\n[bound]', "own.py has no 'none'"),
+    ],
+)
+def test_bad_input(folder, old, new, seen):
+    refuses(command("bound", write(folder, SMALL.replace(old, new))), seen)
