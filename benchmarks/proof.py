@@ -212,8 +212,8 @@ def changes(checker: Any, k: int, points: np.ndarray) -> np.ndarray:
             end = [*end[n:], *p1]
             start = [*x[:n], *(a - b for a, b in zip(p1, moves, strict=True))]
         t1 = x[-2] + (h * x[-1] if checker.slow else h)
-        before = exact.run(checker.invariants[k], [*start, *x[-2:]], Extended)[0]
-        after = exact.run(checker.invariants[k], [*end, t1, x[-1]], Extended)[0]
+        before = exact.run(checker.invariants[k], [*start, *x[-2:], h], Extended)[0]
+        after = exact.run(checker.invariants[k], [*end, t1, x[-1], h], Extended)[0]
         sides = zip(start, checker.lower, checker.upper, strict=True)
         inside = np.all([(a >= float(b)) & (a <= float(c)) for a, b, c in sides], axis=0)
         for g in exact.run(checker.inside, [*start, *x[-2:]], Extended):

@@ -174,8 +174,10 @@ if TYPE_CHECKING:  # names that are imported at their first use (`_namespaces`)
     )
     from .proof import (
         DriftBound as DriftBound,
+        ExactInvariant as ExactInvariant,
         ProofError as ProofError,
         bound_drift as bound_drift,
+        exact_coefficients as exact_coefficients,
     )
     from .sweep import (
         Axis as Axis,

@@ -44,7 +44,7 @@ HOMES = {
         *("MultipleShooting", "NetworkForce", "Observations", "Posterior", "Prior", "Samples"),
         *("SingleShooting", "SoftL1", "fit", "identify", "sample"),
     ),
-    "proof": ("DriftBound", "ProofError", "bound_drift"),
+    "proof": ("DriftBound", "ExactInvariant", "ProofError", "bound_drift", "exact_coefficients"),
     "sweep": (
         *("Axis", "ClusterError", "StoreError", "StoreMismatch", "SweepCost"),
         *("SweepInterrupted", "SweepProgress", "SweepResult", "open_sweep", "sweep"),

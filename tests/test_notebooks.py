@@ -109,7 +109,9 @@ def test_a_number_may_differ_in_its_last_digit(make):
 def test_a_missing_picture_is_caught(make, book):
     cell = next(c for c in book.cells if any(map(make._is_picture, c.get("outputs", []))))
     cell.outputs = []
-    assert any("kinds of outputs" in x for x in make.differences(make.committed("quick_start"), book))
+    assert any(
+        "kinds of outputs" in x for x in make.differences(make.committed("quick_start"), book)
+    )
 
 
 def test_a_changed_source_is_caught(make, book):

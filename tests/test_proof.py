@@ -108,7 +108,8 @@ def changes_in_digits(certificate, k, points):
             *x, epsilon = (mpmath.mpf(float(v)) for v in point)
             end = exact.run(certificate["step"], [*x, 0, epsilon, h], Digits)
             invariant = certificate["invariants"][k]
-            after, before = (exact.run(invariant, [*z, 0, epsilon], Digits)[0] for z in (end, x))
+            inputs = [0, epsilon, h]
+            after, before = (exact.run(invariant, [*z, *inputs], Digits)[0] for z in (end, x))
             values.append(abs(after - before))
         return values
 
@@ -182,7 +183,7 @@ def test_rounding_is_bounded(cubic):
         step = exact.run(certificate["step"], [*x, h], Rational)
         computed = [Fraction(float(v[i, 1, 0])) for v in (sol.qs, sol.ps)]
         invariant = certificate["invariants"][0]
-        values = [exact.run(invariant, [*z, *x[2:]], Rational)[0] for z in (step, computed)]
+        values = [exact.run(invariant, [*z, *x[2:], h], Rational)[0] for z in (step, computed)]
         worst = max(worst, abs(float(values[0] - values[1])))
     assert cubic.rounding[0] / 30 < worst <= cubic.rounding[0]
 
@@ -334,6 +335,38 @@ def test_the_picture_of_a_bound(cubic):
     np.testing.assert_allclose(proved.get_ydata(), each * steps[1:])
     np.testing.assert_allclose(computed.get_ydata()[1:], [1e-12, 3e-12, 3e-12], rtol=1e-3)
     dvi.plot.plt.close(axis.figure)
+
+
+@pytest.mark.parametrize("h", [0.1, 0.3])
+def test_exact_coefficients(h):
+    """q² + p² − h q p and q1 p2 − q2 p1 of two oscillators, found, made exact, and proved."""
+    system = dvi.System(lambda t0, t1, q, p, args: (p @ p + q @ q) / 2)
+    samples = np.random.default_rng(0).uniform(-1, 1, (2, 60, 1))
+    found = dvi.discover_invariants(system, dvi.Polynomials(2), order=0, h=h, samples=samples)
+    series = found.invariants[0]
+    energy = dvi.exact_coefficients(series, h)
+    assert str(energy) == "1 q² − 1 h q p + 1 p²"
+    bound = dvi.bound_drift(energy, system, h=h, epsilon=0.1, domain=np.array([0.5]))
+    assert bound.per_step == (0.0,)
+    assert "by ≤ [0.0]" in exact.check(bound.certificate)
+    # As found, in float64, it is no identity.
+    rounded = dvi.bound_drift(series, system, h=h, epsilon=0.1, domain=np.array([0.5]))
+    assert 0 < rounded.per_step[0] < 1e-14 or rounded.per_step == (0.0,)
+
+
+def test_coefficients_that_are_not_exact():
+    series = found(CUBIC, 6, 1, 0.5).invariants[0]
+    with pytest.raises(ValueError, match="has no form"):
+        dvi.exact_coefficients(series, 0.1)
+
+
+def test_small_relations():
+    from dvi_jax.proof.rational import _relation
+
+    assert _relation(1 / 3, 0.1, 1e-12) == (3, 1, 0, 0)
+    assert _relation((2 - 0.1**2) / 7, 0.1, 1e-12) == (7, 2, 0, -1)
+    assert _relation(-0.05, 0.1, 1e-12) == (2, 0, -1, 0)
+    assert _relation(np.sqrt(2) / 3, 0.1, 1e-12) == (0, 0, 0, 0)
 
 
 # --- nothing is claimed --------------------------------------------------------------------------

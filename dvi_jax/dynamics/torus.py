@@ -130,7 +130,10 @@ class Search(NamedTuple):
 
 def search_of(n: int, num: Any, guess: Any, order: Any, tolerance: Any, threshold: Any) -> Search:
     if n == 0:
-        raise ValueError("signal has no degrees of freedom: give at least one degree of freedom.")
+        raise ValueError(
+            "the number of degrees of freedom must be at least 1, got 0: give a signal, or lines, "
+            "with at least one degree of freedom."
+        )
     if guess is not None:
         guess = np.array([finite("each frequency of guess", x) for x in np.atleast_1d(guess)])
     if num is None:

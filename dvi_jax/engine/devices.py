@@ -73,8 +73,8 @@ def _spec(x: Any, axis: int | None, count: int) -> PartitionSpec:
     shape = np.shape(x)
     if not -len(shape) <= axis < len(shape):
         raise ValueError(
-            f"in_axes has the batch axis {axis}, but an argument has only the shape {shape}: give "
-            "None for arguments without a batch axis."
+            f"in_axes has the batch axis {axis}, but an argument has the shape {shape}: give an "
+            "axis of this argument, or None if the argument has no batch axis."
         )
     if shape[axis] % count:
         raise ValueError(

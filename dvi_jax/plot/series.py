@@ -164,7 +164,10 @@ def _read(
     for name, v in (values or {}).items():
         if callable(v):
             if any(lane.ps is None for lane in lanes) or not lanes:
-                raise TypeError(f"the function {name!r} in values needs states: give (ts, qs, ps).")
+                raise TypeError(
+                    f"the function {name!r} in values requires positions and momenta, but orbits "
+                    "does not contain both: give a Solution or (ts, qs, ps) as orbits."
+                )
             watched[name] = [each_state(v, lane.qs, lane.ps) for lane in lanes]
         elif not isinstance(orbits, list):
             watched[name] = _rows(name, {name: v}, orbits)

@@ -1,4 +1,5 @@
 """Proved bounds of how much invariants change, and the checker of their certificates."""
 
 from .bound import ProofError as ProofError, bound_drift as bound_drift
+from .rational import ExactInvariant as ExactInvariant, exact_coefficients as exact_coefficients
 from .result import DriftBound as DriftBound

@@ -19,6 +19,7 @@ from ..discover.found import Discovery
 from ..discover.series import InvariantSeries
 from .components import program_of
 from .confinement import confine
+from .rational import ExactInvariant
 from .result import DriftBound
 from .tools import tools
 
@@ -58,8 +59,9 @@ def bound_drift(
 
     **Arguments**
 
-    - `found`: a `Discovery`, an `InvariantSeries`, a function ``(q, p, epsilon)`` or ``(q, p,
-      epsilon, t)`` → scalar, or a list of these. `system`: a `System` or a problem of the library.
+    - `found`: a `Discovery`, an `InvariantSeries`, an `ExactInvariant`, a function ``(q, p,
+      epsilon)`` or ``(q, p, epsilon, t)`` → scalar, or a list of these. `system`: a `System` or a
+      problem of the library.
     - `epsilon`: the largest ε of an interval from 0, or the pair (least, largest).
     - `domain`: half-width r of |q_i|, |p_i| ≤ r; or a pair for q and p, each a half-width, an array
       of half-widths like q, or an array (lower, upper) of shape (2, *shape of q).
@@ -118,7 +120,7 @@ def bound_drift(
     )
     functions = _functions(found, system, time is not None)
     stepped, programs = _step_of(system, how.method_for(system), shape, args, h, times)
-    invariants = [program_of(f, shape, shape, (), ()) for f, _ in functions]
+    invariants = [program_of(f, shape, shape, (), (), ()) for f, _ in functions]
     n, t = len(lower) // 2, ["input", len(lower)]
     certificate = {
         "format": exact.FORMAT,
@@ -230,7 +232,7 @@ def _spread(
 
 
 def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, str]]:
-    """(function of (q, p, t, ε), formula) for each invariant."""
+    """(function of (q, p, t, ε, h), formula) for each invariant."""
     if isinstance(found, Discovery):
         if not found.count:
             raise ValueError("the Discovery has found no invariant: there is nothing to bound.")
@@ -239,19 +241,21 @@ def _functions(found: Any, system: System, timed: bool) -> list[tuple[Callable, 
         if found.basis.uses_time and not timed:
             raise ValueError(
                 "the invariant depends on the time: give the interval in which steps begin as "
-                "time=(t_begin, t_end)."
+                "time=(t_begin, t_end), an interval of τ = εt for a system with slow_time=True."
             )
         if found.basis.uses_time and found.slow_time != system.slow_time:
             raise ValueError(
                 f"the invariant was found with slow_time={found.slow_time}, and the system has "
                 f"slow_time={system.slow_time}: give the system with which it was found."
             )
-        return [(lambda q, p, t, e: found.evaluate(q, p, e, t), found.formula(terms=8))]
+        return [(lambda q, p, t, e, h: found.evaluate(q, p, e, t), found.formula(terms=8))]
+    if isinstance(found, ExactInvariant):
+        return [(lambda q, p, t, e, h: found.evaluate(q, p, e, h, t), str(found))]
     if callable(found):
         name = getattr(found, "__name__", "a function")
         if _takes(found, 4) and (timed or not _takes(found, 3)):
-            return [(lambda q, p, t, e: found(q, p, e, t), name)]
-        return [(lambda q, p, t, e: found(q, p, e), name)]
+            return [(lambda q, p, t, e, h: found(q, p, e, t), name)]
+        return [(lambda q, p, t, e, h: found(q, p, e), name)]
     pairs = [pair for one in found for pair in _functions(one, system, timed)]
     if not pairs:
         raise ValueError("found is empty: give an invariant, or a list of at least one.")
@@ -287,8 +291,8 @@ def _domain(domain: Any, found: Any) -> tuple[tuple[int, ...], tuple[list[float]
         low, high = (np.broadcast_to(side, shape).ravel() for side in (low, high))
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise ValueError(
-                f"the domain of {name} must have finite lower bounds below its upper bounds, got "
-                f"{low.tolist()} and {high.tolist()}."
+                f"the domain of {name} must have finite bounds, with lower bounds below upper "
+                f"bounds, got {low.tolist()} and {high.tolist()}. A half-width must be positive."
             )
         lower.extend(low.tolist())
         upper.extend(high.tolist())

@@ -1,7 +1,7 @@
 """The checker of drift certificates, short enough to be read completely: python checker.py FILE.
 
 It needs Python and python-flint only. A certificate states, for a map Φ(x, t, ε) and functions
-I_k(x, t, ε) of x = (q, p), given as lists of scalar operations:
+I_k(x, t, ε) of x = (q, p), given as lists of scalar operations, which also contain h:
 
 1. |I_k(Φ(x, t, ε), t1, ε) − I_k(x, t, ε)| ≤ `per_step`[k] in exact arithmetic, in the domain, for
    all t and ε of their intervals, with t1 = t + h, or t + εh if t is a slow time;
@@ -254,14 +254,15 @@ class Checker:
         return beside or any(algebra.range(g)[1] < 0 for g in run(self.inside, x, algebra))
 
     def stepped(self, x, algebra):
-        """(q, p, t, ε) before and after a step, from the coordinates of a box."""
+        """(q, p, t, ε, h) before and after a step, from the coordinates of a box."""
         q0, p0, (t0, epsilon) = x[: self.n], x[self.n : -2], x[-2:]
-        h, end = algebra.constant(self.h), run(self.step, [*x, algebra.constant(self.h)], algebra)
+        h = algebra.constant(self.h)
+        end = run(self.step, [*x, h], algebra)
         if self.implicit:  # (q0, p1) → (h·rate, q1)
             end, moves, p1 = [*end[self.n :], *p0], end[: self.n], p0
             p0 = [difference(p, m, algebra) for p, m in zip(p1, moves, strict=True)]
         t1 = algebra.sum(t0, algebra.multiply(epsilon, h) if self.slow else h)
-        return [*q0, *p0, t0, epsilon], [*end, t1, epsilon]
+        return [*q0, *p0, t0, epsilon, h], [*end, t1, epsilon, h]
 
     def change(self, k, step, algebra):
         """I_k(Φ(x)) − I_k(x), from x before and after a step."""
@@ -293,11 +294,11 @@ class Checker:
             lipschitz = max(up(e) * 2.0**60 for _, e in run(self.step, inputs, exactly)[:n])
             require(lipschitz < 1 / 3, "the implicit step is not shown to be a contraction", box)
             # The solver accepts a p1 whose residual is `accepted` and as computed.
-            error = max((e + arb(up(self.accepted)) for _, e in start[n:-2]), key=up)
+            error = max((e + arb(up(self.accepted)) for _, e in start[n : 2 * n]), key=up)
             x[n:-2] = [(p1, error / (1 - arb(lipschitz))) for p1, _ in near]
             end = self.stepped(x, algebra)[1]
         changes = [run(function, end, exactly)[0][1] for function in self.invariants]
-        return list(map(up, changes)), [up(error) for _, error in end[:-2]]
+        return list(map(up, changes)), [up(error) for _, error in end[: 2 * n]]
 
 
 def leaves(box, node):
@@ -337,6 +338,7 @@ def check_step(checker, box, claim, stated):
 def combined(checker, weights, box):
     """Σ w_k I_k as a model on a box."""
     algebra, x = checker.models(box)
+    x = [*x, algebra.constant(checker.h)]
     used = [(w, f) for w, f in zip(weights, checker.invariants, strict=True) if w]
     terms = [algebra.multiply(algebra.constant(w), run(f, x, algebra)[0]) for w, f in used]
     return algebra, algebra.sum(*terms)

@@ -52,11 +52,11 @@ def confine(
                 reason = f"change={change:g} is larger than the range of {_named(weights)}"
                 continue
             value = Fraction(level)
+            quick = _value(functions, weights, shape, float(checker.h))
             try:
                 shell, count = search.enclose(
-                    checker, w, value + steps * each, reach, _value(functions, weights, shape),
-                    **limits,
-                )  # fmt: skip
+                    checker, w, value + steps * each, reach, quick, **limits
+                )
             except exact.Failed as error:
                 reason = str(error)
                 continue
@@ -66,11 +66,11 @@ def confine(
     return None, 0.0, reason, 0
 
 
-def _value(functions: list, weights: list[float], shape: Any) -> Any:
+def _value(functions: list, weights: list[float], shape: Any, h: float) -> Any:
     """Σ w_k I_k of an array of points (q, p, t, ε)."""
     used = [(w, f) for w, (f, _) in zip(weights, functions, strict=True) if w]
     return jax.jit(
-        jax.vmap(lambda x: sum(w * f(*_state(x[:-2], shape), x[-2], x[-1]) for w, f in used))
+        jax.vmap(lambda x: sum(w * f(*_state(x[:-2], shape), x[-2], x[-1], h) for w, f in used))
     )
 
 
@@ -85,10 +85,12 @@ def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: l
     middle = (np.array(checker.lower, float) + np.array(checker.upper, float))[None] / 2
     spans = [np.linspace(*map(float, ends), 2) for ends in (checker.time, checker.epsilon)]
 
+    h = float(checker.h)
+
     def values(z):
         one = jax.jit(
             jax.vmap(
-                lambda z, t, e: jnp.stack([f(*_state(z, shape), t, e) for f, _ in functions]),
+                lambda z, t, e: jnp.stack([f(*_state(z, shape), t, e, h) for f, _ in functions]),
                 (0, None, None),
             )
         )

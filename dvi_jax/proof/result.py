@@ -89,6 +89,7 @@ class DriftBound(eqx.Module):
         weights, level = exact.exact(self.certificate["level"])
         per_step, rounding = (exact.exact(self.certificate[n]) for n in ("per_step", "rounding"))
         each = sum(abs(w) * (b + r) for w, b, r in zip(weights, per_step, rounding, strict=True))
+        state.append(algebra.constant(checker.h))
         values = [exact.run(f, state, algebra)[0][0] for f in checker.invariants]
         here = sum(exact.ball(w) * v for w, v in zip(weights, values, strict=True))
         left = level + self.steps * each - Fraction(exact.up(here))

@@ -108,7 +108,7 @@ def estimate(checker: exact.Checker) -> list[float]:
         x[-1] = (exact.ball(checker.epsilon[1]), arb(0))
         try:
             step = checker.stepped(x, algebra)
-            sides = zip(step[0][:-2], checker.lower, checker.upper, strict=True)
+            sides = zip(step[0], checker.lower, checker.upper, strict=False)
             beside = any(not float(a) <= float(x[0]) <= float(b) for x, a, b in sides)
             if beside or any(g[0] < 0 for g in exact.run(checker.inside, step[0], algebra)):
                 continue
@@ -185,7 +185,7 @@ def _largest(algebra: exact.Models, model: Any, s: np.ndarray) -> float:
 def _is_inside(checker: exact.Checker, algebra: exact.Models, x: list, s: np.ndarray) -> Any:
     """Which of the points s are states of the domain; `x`: the state as models."""
     good = np.ones(len(s), bool)
-    sides = zip(x[:-2], checker.lower, checker.upper, strict=True)
+    sides = zip(x, checker.lower, checker.upper, strict=False)
     for model, low, high in sides if checker.implicit else ():
         value = _values(algebra, model, s)
         good &= (value >= float(low)) & (value <= float(high))
