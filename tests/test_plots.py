@@ -206,6 +206,7 @@ def pictures(single):
     order = SimpleNamespace(
         epsilons=t, drifts=t, used=t > 0, slope=1.0, interval=(0.9, 1.1), floor=0.5, resolved=True
     )
+    proved = SimpleNamespace(per_step=(0.2,), rounding=(0.0,), level=None, steps=0)
     about = {"flag_values": [0, 1, 2, 3, 4, 5], "flag_meanings": "successful a b c d e"}
     data = xr.DataArray(t, dims="x", coords={"x": t}, name="drift", attrs=about)
     history = {"stage": 0 * t, "loss": t, "accepted": t > 0, "horizon": t}
@@ -234,6 +235,7 @@ def pictures(single):
         "work_precision": (1, lambda ax: plot.work_precision({"a": (t, 1 / t)}, ax=ax)),
         "spectrum": (1, lambda ax: plot.spectrum(t, t, ax=ax)),
         "frequency_map": (1, lambda ax: plot.frequency_map(t, t, ax=ax)),
+        "drift_bound": (1, lambda ax: plot.drift_bound(proved, [0, 1, 2], [1, 1.1, 1.2], ax=ax)),
         "drift_orders": (1, lambda ax: plot.drift_orders([order], ax=ax)),
         "drift_surface": (2, lambda ax: plot.drift_surface(surface, ax=ax)),
         "sweep_map": (1, lambda ax: plot.sweep_map(data, ax=ax)),
@@ -253,7 +255,7 @@ def test_every_picture_draws_on_the_axes_it_is_given_and_on_nothing_else(single)
     drawing = pictures(single)
     functions = {name for name, f in vars(plot).items() if inspect.isfunction(f)}
     assert set(drawing) == functions - {"save", "style", "animate"}
-    assert len(drawing) == 24
+    assert len(drawing) == 25
     for name, (count, draw) in drawing.items():
         for nothing in (3, "axes", [3]):
             with pytest.raises(TypeError, match="must be the matplotlib Axes"):

@@ -338,9 +338,8 @@ def check_step(checker, box, claim, stated):
 def combined(checker, weights, box):
     """Σ w_k I_k as a model on a box."""
     algebra, x = checker.models(box)
-    x = [*x, algebra.constant(checker.h)]
-    used = [(w, f) for w, f in zip(weights, checker.invariants, strict=True) if w]
-    terms = [algebra.multiply(algebra.constant(w), run(f, x, algebra)[0]) for w, f in used]
+    x, pairs = [*x, algebra.constant(checker.h)], zip(weights, checker.invariants, strict=True)
+    terms = [algebra.multiply(algebra.constant(w), run(f, x, algebra)[0]) for w, f in pairs if w]
     return algebra, algebra.sum(*terms)
 
 
