@@ -225,7 +225,8 @@ def _spread(
 ) -> list[str]:
     """A guess of how far p1 is from p0 in an implicit step; the checker decides."""
     rng, size = np.random.default_rng(0), int(np.prod(shape))
-    z = rng.uniform(*sides, (4000, 2 * size)).reshape(4000, 2, *shape)
+    low, high = sides
+    z = rng.uniform(low, high, (4000, 2 * size)).reshape(4000, 2, *shape)
     t, epsilon = rng.choice(times or (0.0, 0.0), 4000), rng.choice(strengths, 4000)
     moves = np.abs(stepped(z[:, 0], z[:, 1], t, epsilon, jnp.asarray(h))[0])
     return [float(m).hex() for m in 1.3 * np.nanmax(moves, axis=0).ravel() + 1e-12]

@@ -24,6 +24,7 @@ import math
 import pathlib
 import sys
 from fractions import Fraction
+from typing import Any
 
 from flint import arb, arb_series, ctx, fmpq, fmpq_mpoly_ctx, fmpz_mpoly_ctx
 
@@ -51,7 +52,7 @@ def digest(certificate):
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def exact(texts):
+def exact(texts) -> Any:
     """The numbers that hexadecimal floats stand for."""
     return Fraction(float.fromhex(texts)) if isinstance(texts, str) else [exact(x) for x in texts]
 
@@ -317,22 +318,21 @@ def leaves(box, node):
 def check_step(checker, box, claim, stated):
     """Statements 1 and 2 on one box; `stated`: the numbers per_step, rounding and reach."""
     algebra, x = checker.models(box)
-    step = [x]
-    if checker.implicit or claim != "outside":  # where an explicit step may be singular
-        step, (rounded, errors) = checker.stepped(x, algebra), checker.rounding(box)
-        moved = checker.moved(step, algebra)
-        near = zip(moved[checker.n :], checker.spread, strict=True)
-        require(not checker.implicit or all(m <= s for m, s in near), "p1 is far from p0", box)
+    if claim == "outside" and not checker.implicit:  # the step may be singular there
+        return require(checker.is_outside(algebra, x), "not shown to be outside", box)
+    step, (rounded, errors) = checker.stepped(x, algebra), checker.rounding(box)
+    moved = checker.moved(step, algebra)
+    near = zip(moved[checker.n :], checker.spread, strict=True)
+    require(not checker.implicit or all(m <= s for m, s in near), "p1 is far from p0", box)
     if claim == "outside":
-        require(checker.is_outside(algebra, step[0]), "not shown to be outside", box)
-        return
+        return require(checker.is_outside(algebra, step[0]), "not shown to be outside", box)
     found = [
         algebra.bound(checker.change(k, step, algebra)) for k in range(len(checker.invariants))
     ]
     found = [0 if stated[k] == 0 and checker.is_identity(k) else b for k, b in enumerate(found)]
     moved = [m + Fraction(e) for m, e in zip(moved, errors, strict=True)]
     fits = [a <= b for a, b in zip([*found, *rounded, *moved], stated, strict=True)]
-    require(all(fits), "a change, a rounding or a move is larger than stated", box)
+    return require(all(fits), "a change, a rounding or a move is larger than stated", box)
 
 
 def combined(checker, weights, box):

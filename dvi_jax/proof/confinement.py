@@ -83,7 +83,7 @@ def _candidates(checker: Any, functions: list, inside: Any, shape: Any, reach: l
     larger, those first that leave most of the domain; from random points."""
     inner, outer = _points(checker, inside, shape, [float(x) for x in reach])
     middle = (np.array(checker.lower, float) + np.array(checker.upper, float))[None] / 2
-    spans = [np.linspace(*map(float, ends), 2) for ends in (checker.time, checker.epsilon)]
+    spans = [[float(end) for end in ends] for ends in (checker.time, checker.epsilon)]
 
     h = float(checker.h)
 

@@ -85,7 +85,7 @@ def exact_coefficients(invariant: InvariantSeries, h: float) -> ExactInvariant:
     errors = np.zeros_like(c) if invariant.errors is None else np.asarray(invariant.errors, float)
     numbers = np.zeros((*c.shape, 4), int)
     for place, ratio in np.ndenumerate(ratios):
-        error = max(3 * float(errors[place]) / abs(pivot), _ERROR * abs(ratio))
+        error = float(max(3 * errors[place] / abs(pivot), _ERROR * abs(ratio)))
         numbers[place] = _relation(ratio, h, error) if ratio else (1, 0, 0, 0)
         if not numbers[place][0]:
             raise ValueError(

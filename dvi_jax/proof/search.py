@@ -49,9 +49,7 @@ class Leaf:
     parts: list = field(default_factory=list)
 
 
-def examine(
-    checker: exact.Checker, box: list, rng: Any, identities: frozenset = frozenset()
-) -> Leaf:
+def examine(checker: Any, box: list, rng: Any, identities: frozenset = frozenset()) -> Leaf:
     """Everything that is bounded on one box; `identities`: numbers of what is conserved exactly."""
     leaf = Leaf(box)
     try:
@@ -86,7 +84,7 @@ def examine(
     return leaf
 
 
-def curved(checker: exact.Checker) -> set[int]:
+def curved(checker: Any) -> set[int]:
     """The coordinates on which the arguments of elementary functions in the step depend."""
     operations = checker.step["operations"]
     needed, used = set(), set()
@@ -99,7 +97,7 @@ def curved(checker: exact.Checker) -> set[int]:
     return used & {*range(2 * checker.n + 2)}
 
 
-def estimate(checker: exact.Checker) -> list[float]:
+def estimate(checker: Any) -> list[float]:
     """The largest change of each I_k at random points of the domain; 0 where all contain 0."""
     rng, algebra = np.random.default_rng(1), exact.Rounding(0)
     seen = [0.0] * len(checker.invariants)
@@ -119,7 +117,7 @@ def estimate(checker: exact.Checker) -> list[float]:
     return seen
 
 
-def resolve(checker: exact.Checker, seen: list[float], ratio: float) -> None:
+def resolve(checker: Any, seen: list[float], ratio: float) -> None:
     """Choose the number of bits: remainders shall be small next to the changes.
 
     Few bits are faster; a change that nearly cancels needs many.
@@ -143,7 +141,7 @@ def resolve(checker: exact.Checker, seen: list[float], ratio: float) -> None:
             bits.pop(0)
 
 
-def _bounded_part(checker: exact.Checker, rng: Any, whole: list) -> Leaf | None:
+def _bounded_part(checker: Any, rng: Any, whole: list) -> Leaf | None:
     """A box or a part of it on which something is bounded; None if 60 parts have failed."""
     box = whole
     for _ in range(60):
@@ -182,7 +180,7 @@ def _largest(algebra: exact.Models, model: Any, s: np.ndarray) -> float:
     return max(0.0, float(np.max(values, initial=0.0)) - float(Fraction(model[1], algebra.one)))
 
 
-def _is_inside(checker: exact.Checker, algebra: exact.Models, x: list, s: np.ndarray) -> Any:
+def _is_inside(checker: Any, algebra: exact.Models, x: list, s: np.ndarray) -> Any:
     """Which of the points s are states of the domain; `x`: the state as models."""
     good = np.ones(len(s), bool)
     sides = zip(x, checker.lower, checker.upper, strict=False)
@@ -219,7 +217,7 @@ class Found:
 
 
 def subdivide(
-    checker: exact.Checker,
+    checker: Any,
     identities: frozenset,
     best: list[float],
     *,
@@ -285,7 +283,7 @@ def _excesses(leaf: Leaf, best: list) -> list[float]:
     return [(float(b) / s if s else math.inf) if b else 0.0 for b, s in pairs]
 
 
-def _axis(checker: exact.Checker, leaf: Leaf, best: list) -> int:
+def _axis(checker: Any, leaf: Leaf, best: list) -> int:
     """The coordinate along which a box is cut: where the bound decreases most, but not far narrower
     than the others."""
     if leaf.failed:
@@ -305,7 +303,7 @@ def halves(box: list, axis: int, where: Fraction | None = None) -> list[list]:
 
 
 def enclose(
-    checker: exact.Checker,
+    checker: Any,
     weights: list,
     limit: Fraction,
     reach: list,
@@ -358,7 +356,7 @@ def enclose(
     return node(whole, [(i, side) for i, pair in enumerate(sides) for side in pair]), count
 
 
-def _is_shown(checker: exact.Checker, box: list, claim: str, *level: Any) -> bool:
+def _is_shown(checker: Any, box: list, claim: str, *level: Any) -> bool:
     try:
         exact.check_confined(checker, box, claim, *level)
     except SINGULAR:
