@@ -49,8 +49,8 @@ print(bound)
 # was found at sample points, and the bound of the change by rounding in float64. The name `I_0` in
 # the report means the whole series of invariant number 0. The report also states a level and a
 # number of steps: a trajectory that starts in the domain with an invariant below this level does
-# not leave the domain in these steps. The bounds are valid for all of these steps, without any
-# assumption on the motion.
+# not leave the domain in these steps. The bounds are therefore valid in all of these steps; no
+# assumption on the motion is necessary.
 #
 # The next cell computes twenty trajectories with $10^4$ steps. The measured changes must be below
 # the proved bound.
@@ -78,9 +78,9 @@ assert largest < proved
 #
 # ## Smaller perturbations
 #
-# The bound of order $z$ is proportional to $\varepsilon_0^{z+1}$, until the rounding of float64 is
-# larger. Let $N$ be the number of steps within which the invariant is proved to change by less than
-# $10^{-3}$. It therefore scales as $\varepsilon_0^{-(z+1)}$.
+# The bound of order $z$ is proportional to $\varepsilon_0^{z+1}$ as long as it is larger than the
+# rounding of float64. Let $N$ be the number of steps within which the invariant is proved to change
+# by less than $10^{-3}$. Then $N$ scales as $\varepsilon_0^{-(z+1)}$.
 
 # %%
 strengths = np.array([2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01])
@@ -107,7 +107,7 @@ with plot.style():
 # adiabatic invariant is conserved for a time that grows faster than any power of $1/\varepsilon$.
 # With the best order $z^*(\varepsilon)$ for each $\varepsilon$, this time is exponentially long. In
 # the picture, the highest line at each $\varepsilon_0$ gives the longest proved time. Here this is
-# the line of order 4 everywhere, so invariants of higher order can give longer times. For
+# the line of order 4 everywhere. Invariants of an order above 4 may give longer times. For
 # $\varepsilon_0 = 2$ the orders 1 to 3 have no point, because their bound of the change in one step
 # is larger than $10^{-3}$.
 # Rounding limits all orders: it changes the invariant by up to $2 \times 10^{-16}$ in a step, so
@@ -118,8 +118,8 @@ with plot.style():
 #
 # Hénon and Heiles' system has the force $-\varepsilon\,(2 q_1 q_2,\; q_1^2 - q_2^2)$. The search at
 # order 3 finds two invariants; the second one is the energy with corrections. Its level surfaces
-# enclose the middle of the domain. Therefore a trajectory that starts near the middle is proved to
-# stay in the domain for the printed number of steps.
+# around the middle of the domain are closed. Therefore a trajectory that starts near the middle is
+# proved to stay in the domain for the printed number of steps.
 
 # %%
 henon_heiles = dvi.System(
@@ -132,8 +132,9 @@ energy = dvi.bound_drift(
     two.invariants[-1], henon_heiles, h=0.1, epsilon=0.01, domain=np.full(2, 0.3), ratio=6.0
 )
 print(f"change in a step at most {energy.per_step[0]:.1e}, by rounding {energy.rounding[0]:.1e}")
-print(f"no change of 0.001 before {energy.num_steps(1e-3):.1e} steps")
-print(f"the domain, scaled by {energy.start}, is not left in {energy.steps:.1e} steps")
+print(f"the change is below 0.001 for {energy.num_steps(1e-3):.1e} steps")
+scaled = f"the domain scaled by {energy.start}"
+print(f"no trajectory that starts in {scaled} leaves the domain in {energy.steps:.1e} steps")
 assert energy.num_steps(1e-3) > 9e9
 
 # %% [markdown]
@@ -166,14 +167,14 @@ slow = dvi.bound_drift(
     time=(0.0, 2 * np.pi), ratio=4.0,
 )  # fmt: skip
 print(slow)
-print("steps proved for the start (0.3, 0):", slow.steps_inside([0.3], [0.0], 0.01))
+print("steps proved for the initial state (0.3, 0):", slow.steps_inside([0.3], [0.0], 0.01))
 
 # %% [markdown]
 # In one step this quantity changes by $O(h^3)$, because it contains only the first correction of
 # the energy, and by $O(\varepsilon^2 h)$, because the strength of the field varies. Both parts have
 # about the same size here. Therefore the number of steps for a change of 0.001 is small. The last
-# line of the output is another number: from the state (0.3, 0) the trajectory is proved to stay in
-# the domain for all 12 566 steps of one period.
+# line of the output does not refer to this change: from the initial state (0.3, 0) the trajectory
+# is proved to stay in the domain for all 12 566 steps of one period.
 #
 # ## Proved and measured statements
 #

@@ -10,10 +10,11 @@
 # $$q_1 = q_0 + h\,\frac{\partial H_D}{\partial p_1}, \qquad
 # p_1 = p_0 - h\,\frac{\partial H_D}{\partial q_0} + h\,\varepsilon W . \tag{12, 13}$$
 #
-# $H_D$ is the discrete Hamiltonian, $h$ the step and $\varepsilon W$ the perturbing force. A
-# symmetry shifts the time by $\xi^0$ and the positions by $\xi$. Both are series in $\varepsilon$,
-# with the coefficients $\xi^0_m$ and $\xi_m$ of order $m$. With a gauge function $G$, also a
-# series, the symmetry gives the adiabatic invariant of order $z$,
+# $H_D$ is the discrete Hamiltonian, $h$ the step and $\varepsilon W$ the perturbing force. The
+# generator of a symmetry has the component $\xi^0$ for the time and the components $\xi$ for the
+# positions. Both are series in $\varepsilon$, with the coefficients $\xi^0_m$ and $\xi_m$ of order
+# $m$. With a gauge function $G$, also a series, the symmetry gives the adiabatic invariant of order
+# $z$,
 #
 # $$I_z = \sum_{m \le z} \varepsilon^m (\xi_m \cdot p - \xi^0_m E^- + G_m), \tag{29}$$
 #
@@ -63,7 +64,7 @@ print(f"RK4 after {N} steps: {lost[-1] - lost[0]:.3e}, h⁶/72 a step predicts {
 
 assert 9e-6 < np.ptp(printed) < 1e-5  # the claim of Figure 1 does not hold
 assert np.ptp(exact) / exact.mean() < 1e-13
-assert abs(lost[-1] - lost[0]) < 1e-2 * np.ptp(printed)  # nor does that of Figure 2
+assert abs(lost[-1] - lost[0]) < 1e-2 * np.ptp(printed)  # the claim of Figure 2 does not hold
 
 # %% [markdown]
 # Neither claim holds. The energy of the paper oscillates by 10 % of its value, without growth. The
@@ -80,7 +81,7 @@ with plot.style():
         "RK4's energy": np.abs(lost / lost[0] - 1)[1:],
         "(p² + q² − hqp)/2": np.abs(exact / exact[0] - 1)[1:],
     }
-    blocks = N // 100  # the largest of a hundred steps, because the error oscillates
+    blocks = N // 100  # of 100 steps; the largest error of each block is drawn
     for name, values in shown.items():
         crests = values[: 100 * blocks].reshape(blocks, 100).max(axis=1)
         axis.semilogy(t[50:-1:100], crests, label=name)
@@ -100,7 +101,7 @@ plt.show()
 
 # %%
 def of_end(function):
-    """An observable of the end of a step, with its epsilon in args."""
+    """An observable at the end of a step; the value of ε is args["epsilon"]."""
 
     def observed(t0, t1, q0, p0, q1, p1, args):
         return function(q1, p1, args["epsilon"])
@@ -132,7 +133,7 @@ fine = {"q0": [0.01], "p0": [0.01], "h": 0.01, "num_steps": 20_000, "method": dv
 of_34 = {name: drifts(form, free, epsilons, **fine) for name, form in FORMS.items()}
 
 
-def on_the_mesh(q, p, e):
+def corrected(q, p, e):
     return (p @ p + (1 + e) * (q @ q) - h * (1 + e) * (q @ p)) / 2
 
 
@@ -140,20 +141,21 @@ def power(epsilons, values):
     return np.polyfit(np.log(epsilons), np.log(values), 1)[0]
 
 
-of_34["its h = 0.1 form"] = drifts(on_the_mesh, free, epsilons, **start)
+of_34["with −h(1+ε)qp/2"] = drifts(corrected, free, epsilons, **start)
 slopes = [power(epsilons, values) for values in of_34.values()]
 for name, values in of_34.items():
     print(f"{name:18} drifts by {values[0] / 1e-4:.0e} … {values[-1] / 1e-4:.0e} of the energy")
 print(f"slope of (34) as printed: {slopes[0]:.2f}")
 
 assert abs(slopes[0] - 1) < 0.05  # not of first order
-assert of_34["its h = 0.1 form"].max() < 1e-12 * 1e-4  # exact, for all ε
+assert of_34["with −h(1+ε)qp/2"].max() < 1e-12 * 1e-4  # exact, for all ε
 
 # %% [markdown]
 # (34) as printed is not an invariant of first order: its drift scales as $\varepsilon$. The drift
-# of $\tfrac12(p^2 + (1+\varepsilon) q^2)$ does not depend on $\varepsilon$; it is the error of the
-# method. With a term for the step, $\tfrac12(p^2 + (1+\varepsilon) q^2 - h (1+\varepsilon)\, qp)$,
-# this form is conserved to round-off at $h = 0.1$.
+# of $\tfrac12(p^2 + (1+\varepsilon) q^2)$ does not depend on $\varepsilon$; it is the
+# discretisation error. With a term for the step,
+# $\tfrac12(p^2 + (1+\varepsilon) q^2 - h (1+\varepsilon)\, qp)$, this form is conserved to
+# round-off at $h = 0.1$.
 #
 # ## Kepler: (49) and (50)
 #
@@ -191,10 +193,10 @@ fine = ellipse | {"h": 0.01, "num_steps": 20_000, "method": dvi.Yoshida(4)}
 
 small = np.array([0.0, 1e-4, 2e-4, 5e-4, 1e-3])
 of_L = drifts(momentum, kepler, small, **coarse)
-on_mesh = drifts(of_50, kepler, small, **coarse)
+fixed = drifts(of_50, kepler, small, **coarse)
 attracting, repelling = (drifts(of_50, system, small, **fine) for system in (kepler, repelled))
 print(f"(49), h = 0.1: drifts by {of_L.max():.0e}")
-print("(50), h = 0.1:", ", ".join(f"{x:.4f}" for x in on_mesh), "for ε =", *small)
+print("(50), h = 0.1:", ", ".join(f"{x:.4f}" for x in fixed), "for ε =", *small)
 slopes = []
 for sign, values in (("−εq", attracting), ("+εq", repelling)):
     beyond = values[1:3] - values[0]  # the value at ε = 0 is the error of the method
@@ -202,7 +204,7 @@ for sign, values in (("−εq", attracting), ("+εq", repelling)):
     print(f"(50), h → 0, force {sign}: slope {slopes[-1]:.2f}")
 
 assert of_L.max() < 1e-12  # holds, for every ε and h
-assert abs(on_mesh[1] / on_mesh[0] - 1) < 0.01  # the oscillation on the fixed grid hides ε
+assert abs(fixed[1] / fixed[0] - 1) < 0.01  # the oscillation on the fixed grid hides ε
 assert abs(slopes[0] - 2) < 0.1  # an invariant of first order for the force −εq
 assert abs(slopes[1] - 1) < 0.1  # not for the force +εq
 
@@ -238,7 +240,7 @@ plt.show()
 # | Figure 2: the error of RK4 is larger | error of RK4 1.4e-8, smaller | does not hold |
 # | (34) is of first order in ε | slope 1; the corrected form is exact | holds after a correction |
 # | (49) is exact | conserved to round-off | holds |
-# | (50) is of first order in ε | slope 2 for h → 0 and the force −εq | holds for h → 0 only |
+# | (50) is of first order in ε | slope 2 for h → 0, force −εq | holds for h → 0, force −εq |
 #
 # ## Next steps
 #

@@ -244,8 +244,9 @@ def _steps(i: int, arc: Observations, spec: Mapping[str, Any]) -> int:
     if not _is_uniform(spec):
         if not isinstance(spec.get("num_steps"), int):
             raise ValueError(
-                f"on the lattice {_lattice(spec)!r} the model must return num_steps, an int: the "
-                "number of steps to the last observation."
+                f"on the lattice {_lattice(spec)!r} the model requires num_steps, an int: the "
+                f"number of steps to the last observation; got {spec.get('num_steps')!r}. Give it "
+                "in dvi.Model, or in the dict that the model returns."
             )
         return spec["num_steps"]
     steps = span / h

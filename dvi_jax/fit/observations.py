@@ -269,9 +269,11 @@ def _covariance(covariance: Any, values: np.ndarray) -> np.ndarray:
     smallest = np.linalg.eigvalsh(np.where(good[:, None, None], unit, np.eye(k)))[:, 0]
     if at := _first(~good | (smallest <= 1e-14)):
         [i] = at
+        smallest = np.where(good, smallest, np.nan)  # not defined if a variance is not positive
         raise ValueError(
             f"the covariance of observation {i} is not positive definite (smallest eigenvalue of "
-            f"its correlations {smallest[i]:.3g}): {full[i].tolist()}. Put a combination that is "
-            "known exactly into the model; an error of zero cannot be weighted."
+            f"its correlation matrix: {smallest[i]:.3g}): {full[i].tolist()}. An error of zero has "
+            "no finite weight: if a combination of the values is known exactly, leave it out of "
+            "the observations, and make the model satisfy it."
         )
     return full
