@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .nullspace import NULL, series_changes, toeplitz, triangle
+from .nullspace import DENSE, NULL, series_changes, toeplitz, triangle
 from .staircase import Staircase, above
 
 # Coefficients below such shares of the largest may be rounding; the first level that the held-out
@@ -14,7 +14,6 @@ _LEVELS = 10.0 ** -np.arange(7.0, 13.0)
 _GROWS = 2.0  # A series with fewer terms may change by so many times more, or by rounding
 _ROUND_OFF = 1e-13
 _DETERMINED = 1e-6  # Coefficients are solved for again along directions that are determined so well
-_DENSE = 1000  # Coefficients up to which all orders are solved together
 _PROBES = 64  # Random residuals by which errors are estimated beyond
 _MOST = 6  # Digits that a formula shows
 _SAFETY = 3.0  # Errors of a coefficient within which a closed form has to agree
@@ -27,7 +26,7 @@ class Conditions(NamedTuple):
     """The linear conditions on a series, with rows weighted by the typical change in a step, for
     functions that are scaled to one size on the samples.
 
-    `terms`: A_0 … A_z, shape (rows, z + 1, size); up to `_DENSE` coefficients their Toeplitz matrix
+    `terms`: A_0 … A_z, shape (rows, z + 1, size); up to `DENSE` coefficients their Toeplitz matrix
     as one order.
     """
 
@@ -37,7 +36,7 @@ class Conditions(NamedTuple):
     def of(cls, terms: np.ndarray) -> "Conditions":
         """From A_0 … A_z, shape (rows, z + 1, size)."""
         _, orders, size = terms.shape
-        if orders * size > _DENSE:
+        if orders * size > DENSE:
             return cls(terms)
         return cls(triangle(toeplitz(terms, orders - 1))[:, None])
 

@@ -48,7 +48,7 @@ class Discovery(eqx.Module):
 
     How reliable they are:
 
-    - `singular_values`: of the system (from order 1 on without a tolerance those of A_0 and of the
+    - `singular_values`: of the system (for more than 1000 coefficients those of A_0 and of the
       secular terms), descending, relative to the changes that the slopes of the functions predict
       (with a tolerance, to the largest value); `gap`: the ratio at which they were cut (large is
       clear, below 1e3 is not). `refused`: null vectors of the training

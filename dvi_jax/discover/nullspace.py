@@ -15,6 +15,7 @@ NULL = 1e-11  # Without a tolerance, a singular value above this share of the la
 CLEAR = 1e3  # A gap in the singular values below this is not clear
 HELD_OUT = 10  # Held-out samples may leave this many times what fitted ones are allowed to
 RANK = 1e-7  # Relative size below which a direction counts as dependent on others
+DENSE = 1000  # Coefficients up to which all orders are solved together
 _FREE = 1e-9  # Directions of a least-squares problem below this relative size are free
 # A perturbation that changes a step by less than this share of the step counts as zero.
 _NOTHING = 1e-250
@@ -88,9 +89,9 @@ def _cut(relative: np.ndarray, tolerance: float | None, below: float = NULL) -> 
 
 
 def _spaces_of_orders(terms: np.ndarray, tolerance: float | None) -> list[NullSpace]:
-    """The null space of the Toeplitz matrix of each order. With a tolerance by its own singular
-    values; without, from order 1 on, by those of A_0 and of the secular terms."""
-    if tolerance is not None or terms.shape[1] == 1:
+    """The null space of the Toeplitz matrix of each order: by its own singular values up to `DENSE`
+    columns and with a tolerance, else by those of A_0 and of the secular terms."""
+    if tolerance is not None or terms.shape[1] * terms.shape[2] <= DENSE:
         orders = range(terms.shape[1])
         return [null_space(toeplitz(terms, k), tolerance, 1.0) for k in orders]
     stairs, spaces = Staircase(terms, lambda relative: _cut(relative, None)[0], unit=1.0), []
@@ -99,7 +100,7 @@ def _spaces_of_orders(terms: np.ndarray, tolerance: float | None) -> list[NullSp
         shifts = np.linalg.qr(shifts)[0]
         kept, null = [step.singular], [step.every[len(step.singular) :]]
         for columns, split in ((leading, order.rest), (shifts, order.later)):
-            # Singular values of what is left over, which may be less than rounding on the way.
+            # Singular values of the residuals, which may be less than the rounding on the way.
             left = stairs.left_sides(columns.reshape(k + 1, terms.shape[2], -1))
             null.append(singular_vectors(np.concatenate(left))[0])
             kept.append(split.singular)
