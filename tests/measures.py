@@ -204,7 +204,7 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 50_850,
+    "lines": 51_250,
     "raise statements": 662,
     COMMENTS: 5,
     f"files of more than {LONGEST_FILE} lines": 0,
@@ -212,7 +212,8 @@ LIMITS = {
     "circles of imports": 0,
 }
 """What the tests allow. When the code has become smaller lower them; only a new capability raises
-them, by its own size (`proof`, its command and its picture: 2 150 lines)."""
+them, by its own size (`proof`, its command and its picture: 2 150 lines; series of high order in
+`discover`: 400 lines)."""
 
 
 GOALS = dict(zip(LIMITS, (33_000, 450, 5, 0, 15, 0), strict=True))

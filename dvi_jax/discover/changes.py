@@ -164,48 +164,53 @@ def batched_changes(stepped: Stepped, order: int, samples):
     basis = stepped.basis
 
     def at_point(q, p, t):
-        def change(epsilon):
-            q1, p1, t1, info = _map(stepped, epsilon)(q, p, t)
-            return basis(q1, p1, t1) - basis(q, p, t), info.result == RESULTS.successful
-
-        def jacobian(epsilon):
-            def flat(z):
-                q1, p1, _, _ = _map(stepped, epsilon)(
-                    z[: q.size].reshape(q.shape), z[q.size :].reshape(p.shape), t
-                )
-                return jnp.concatenate([q1.ravel(), p1.ravel()])
-
-            return jax.jacfwd(flat)(jnp.concatenate([q.ravel(), p.ravel()]))
-
-        def growth(epsilon):
-            """d log |det DΦ| / dε = tr(DΦ⁻¹ dDΦ/dε)."""
-            D, dD = jax.jvp(jacobian, (epsilon,), (jnp.ones(()),))
-            return jnp.trace(jax.vmap(lanewise.solve, (None, 1), 1)(D, dD))
-
-        zero = jnp.zeros(())
-        terms = taylor_coefficients(lambda e: change(e)[0], zero, order)
-        volumes = jnp.zeros(order + 1)
-        if order > 0:
-            growths = taylor_coefficients(growth, zero, order - 1)
-            volumes = volumes.at[1:].set(growths / jnp.arange(1, order + 1))
-
-        def flat(z):
-            half = z[: q.size].reshape(q.shape), z[q.size : -1].reshape(p.shape), z[-1]
-            q1, p1, t1, _ = _map(stepped, zero)(*half)
-            return jnp.concatenate([q1.ravel(), p1.ravel(), t1[None]])
-
-        def functions(z):
-            return basis(z[: q.size].reshape(q.shape), z[q.size : -1].reshape(p.shape), z[-1])
-
         z = jnp.concatenate([q.ravel(), p.ravel(), jnp.asarray(t)[None]])
+
+        def at(z):
+            return z[: q.size].reshape(q.shape), z[q.size : -1].reshape(p.shape), z[-1]
+
+        def mapped(z, epsilon):
+            """(q1, p1, t1) as a vector, and again with the status."""
+            q1, p1, t1, info = _map(stepped, epsilon)(*at(z))
+            end = jnp.concatenate([q1.ravel(), p1.ravel(), t1[None]])
+            return end, (q1, p1, t1, info.result == RESULTS.successful)
+
+        def change(epsilon):
+            *end, _ = mapped(z, epsilon)[1]
+            return basis(*end) - basis(q, p, t)
+
+        def both(epsilon):
+            """The change, and the matrix DΦ."""
+            D, (*end, _) = jax.jacfwd(mapped, has_aux=True)(z, epsilon)
+            change = basis(*end) - basis(q, p, t)
+            return jnp.concatenate([change, D[:-1, :-1].ravel()])
+
+        zero, volumes = jnp.zeros(()), jnp.zeros(order + 1)
+        if order == 0:
+            terms = change(zero)[None]
+        else:
+            terms, D = jnp.split(taylor_coefficients(both, zero, order), [basis.size], axis=1)
+            volumes = _log_determinant(D.reshape(order + 1, z.size - 1, z.size - 1))
         # Rounding of z moves z1 − z by as much as the derivative along some vector of its size.
         signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], z.size))
-        z1, dz1 = jax.jvp(flat, (z,), (signs * jnp.abs(z),))
+        z1, dz1, end = jax.jvp(lambda z: mapped(z, zero), (z,), (signs * jnp.abs(z),), has_aux=True)
         blur = jnp.abs(z1) + jnp.abs(dz1 - signs * jnp.abs(z))
-        slopes = jax.jacfwd(functions)(z)
-        return basis(q, p, t), terms, volumes, change(zero)[1], slopes, z1 - z, blur
+        slopes = jax.jacfwd(lambda z: basis(*at(z)))(z)
+        return basis(q, p, t), terms, volumes, end[3], slopes, z1 - z, blur
 
     return jax.vmap(at_point)(*samples)
+
+
+def _log_determinant(D: Array) -> Array:
+    """The series of log |det D|, without its order 0, from that of D, shape (z + 1, n, n): with
+    D' = D X its derivative is tr X."""
+    divide = jax.vmap(lanewise.solve, (None, 1), 1)
+    growth: list[Array] = []
+    for k in range(len(D) - 1):
+        rest = sum((D[j] @ growth[k - j] for j in range(1, k + 1)), start=jnp.zeros_like(D[0]))
+        growth.append(divide(D[0], (k + 1) * D[k + 1] - rest))
+    traces = [jnp.trace(X) / (k + 1) for k, X in enumerate(growth)]
+    return jnp.stack([jnp.zeros(()), *traces])
 
 
 @eqx.filter_jit

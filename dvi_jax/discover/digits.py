@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .nullspace import NULL, toeplitz, triangle
+from .nullspace import DENSE, NULL, series_changes, toeplitz, triangle
+from .staircase import Staircase, above
 
 # Coefficients below such shares of the largest may be rounding; the first level that the held-out
 # samples confirm counts.
@@ -13,6 +14,7 @@ _LEVELS = 10.0 ** -np.arange(7.0, 13.0)
 _GROWS = 2.0  # A series with fewer terms may change by so many times more, or by rounding
 _ROUND_OFF = 1e-13
 _DETERMINED = 1e-6  # Coefficients are solved for again along directions that are determined so well
+_PROBES = 64  # Random residuals by which errors are estimated beyond
 _MOST = 6  # Digits that a formula shows
 _SAFETY = 3.0  # Errors of a coefficient within which a closed form has to agree
 _BY_CHANCE = 1e-4  # Largest probability that a random number agrees with a closed form
@@ -21,28 +23,41 @@ _TIMES = {"": 1.0, "√2": 2**0.5, "√3": 3**0.5, "√5": 5**0.5, "π": np.pi, 
 
 
 class Conditions(NamedTuple):
-    """The linear conditions on a series: a Toeplitz matrix whose rows are weighted by the typical
-    change in a step, for functions that are scaled to one size on the samples."""
+    """The linear conditions on a series, with rows weighted by the typical change in a step, for
+    functions that are scaled to one size on the samples.
 
-    matrix: np.ndarray
+    `terms`: A_0 … A_z, shape (rows, z + 1, size); up to `DENSE` coefficients their Toeplitz matrix
+    as one order.
+    """
+
+    terms: np.ndarray
 
     @classmethod
     def of(cls, terms: np.ndarray) -> "Conditions":
         """From A_0 … A_z, shape (rows, z + 1, size)."""
-        return cls(triangle(toeplitz(terms, terms.shape[1] - 1)))
+        _, orders, size = terms.shape
+        if orders * size > DENSE:
+            return cls(terms)
+        return cls(triangle(toeplitz(terms, orders - 1))[:, None])
 
     def _free(self, shares: np.ndarray) -> np.ndarray:
         """The coefficients that are not zero, without the largest, which is the unit."""
-        free = shares.ravel() != 0
-        free[np.argmax(np.abs(shares[0]))] = False
+        free = shares != 0
+        free[0, np.argmax(np.abs(shares[0]))] = False
         return free
+
+    def _solver(self, free: np.ndarray, share: float) -> Staircase:
+        return Staircase(self.terms, above(share), free.reshape(self.terms.shape[1:]))
+
+    def _residual(self, shares: np.ndarray) -> np.ndarray:
+        """The left sides, shape (orders, rows, 1)."""
+        series = shares.reshape(-1, 1)
+        return np.moveaxis(series_changes(self.terms, series), 1, 0)
 
     def solved(self, shares: np.ndarray) -> np.ndarray:
         """The nearest solution with the same coefficients equal to zero."""
-        out, free = shares.ravel().copy(), self._free(shares)
-        columns = self.matrix[:, free]
-        out[free] -= np.linalg.lstsq(columns, self.matrix @ out, rcond=_DETERMINED)[0]
-        return out.reshape(shares.shape)
+        solver = self._solver(self._free(shares), _DETERMINED)
+        return shares - solver.solved(self._residual(shares)).reshape(shares.shape)
 
     def without_rounding(
         self, shares: np.ndarray, change: Callable[[np.ndarray], float]
@@ -67,14 +82,14 @@ class Conditions(NamedTuple):
     def errors(self, shares: np.ndarray, tolerance: float | None = None) -> np.ndarray:
         """Errors of the coefficients, as large as the residual makes them along the directions that
         the conditions determine; `tolerance`: of approximate invariants."""
-        out, free = np.zeros(shares.size), self._free(shares)
-        residual = np.linalg.norm(self.matrix @ shares.ravel())
+        residual = np.linalg.norm(self._residual(shares))
         residual = max(residual, np.finfo(float).eps * np.max(np.abs(shares)))
-        if free.any():
-            _, singular, V = np.linalg.svd(self.matrix[:, free], full_matrices=False)
-            clear = singular > max(NULL, tolerance or 0.0) * singular[0]
-            out[free] = residual * np.linalg.norm(V[clear] / singular[clear, None], axis=0)
-        return out.reshape(shares.shape)
+        solver = self._solver(self._free(shares), max(NULL, tolerance or 0.0))
+        rows, orders, _ = self.terms.shape
+        right = np.eye(rows)[None]
+        if orders > 1:  # the root mean square over random residuals of length one in each row
+            right = np.random.default_rng(0).normal(size=(orders, rows, _PROBES)) / _PROBES**0.5
+        return residual * np.linalg.norm(solver.solved(right), axis=2).reshape(shares.shape)
 
 
 def digits_of(values: np.ndarray, errors: np.ndarray | None, most: int = _MOST) -> np.ndarray:

@@ -48,9 +48,10 @@ class Discovery(eqx.Module):
 
     How reliable they are:
 
-    - `singular_values`: of the whole system, descending, relative to the changes that the slopes
-      of the functions predict (with a tolerance, to the largest value); `gap`: the ratio at which
-      they were cut (large is clear, below 1e3 is not). `refused`: null vectors of the training
+    - `singular_values`: of the system (for more than 1000 coefficients those of A_0 and of the
+      secular terms), descending, relative to the changes that the slopes of the functions predict
+      (with a tolerance, to the largest value); `gap`: the ratio at which they were cut (large is
+      clear, below 1e3 is not). `refused`: null vectors of the training
       samples that change by more than rounding by their own measure, or that a lower order
       rejects.
     - `residuals`: shape (count, order + 1), on held-out points: the largest change over one

@@ -19,7 +19,7 @@ from .energy import unconserved_energy
 from .expansions import Larger, at_larger_step, in_larger_box, powers_of_size
 from .found import Discovery
 from .judging import CLEARLY, Fewest, Judge, cleaned, reach
-from .motion import UNCLEAR, coefficient_errors, conserved, typical_sizes
+from .motion import UNCLEAR, coefficient_errors, conserved, times, typical_sizes
 from .nullspace import (
     RANK,
     compress,
@@ -273,7 +273,7 @@ class Search:
         trivial = None if self.constant is None else self.R @ self.constant
         compressed = compress(self.rows)
         self.spaces = series_spaces(compressed, judge, tolerance, trivial)
-        self.conditions = Conditions.of(compressed @ self.R)
+        self.conditions = Conditions.of(times(compressed, self.R))
         step = triangle(calm[fit, None] * terms[fit, 0]) / np.sqrt(len(self.values))
         self.typical = np.linalg.norm(step, 2) or 1.0
         in_units = changes._replace(terms=in_units_of(self.scale, changes.terms))

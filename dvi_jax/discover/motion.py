@@ -28,7 +28,7 @@ def typical_sizes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return units * np.sqrt(np.mean((weights[:, None] * relative) ** 2, axis=0)), weights
 
 
-def _times(x: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+def times(x: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """x @ matrix as one product: NumPy would make a small one for each sample."""
     return (x.reshape(-1, x.shape[-1]) @ matrix).reshape(*x.shape[:-1], matrix.shape[1])
 
@@ -50,7 +50,7 @@ class Motion(NamedTuple):
 
     def of(self, combinations: np.ndarray) -> "Motion":
         """Of combinations of the functions, columns of shape (size, count)."""
-        return Motion(_times(self.changes, combinations), self.rounding @ np.abs(combinations))
+        return Motion(times(self.changes, combinations), self.rounding @ np.abs(combinations))
 
     def at_most(self, spread: float) -> "Motion":
         """The same, with no larger changes than the functions differ by between samples: a step
@@ -104,7 +104,7 @@ class FieldMotion(NamedTuple):
         """For combinations of the functions φ, columns of shape (B, count)."""
         return self._replace(
             values=self.values @ combinations,
-            changes=_times(self.changes, combinations),
+            changes=times(self.changes, combinations),
             rounding=self.rounding @ np.abs(combinations),
         )
 

@@ -9,10 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .staircase import Staircase
+
 NULL = 1e-11  # Without a tolerance, a singular value above this share of the largest is never zero
 CLEAR = 1e3  # A gap in the singular values below this is not clear
 HELD_OUT = 10  # Held-out samples may leave this many times what fitted ones are allowed to
 RANK = 1e-7  # Relative size below which a direction counts as dependent on others
+DENSE = 1000  # Coefficients up to which all orders are solved together
 _FREE = 1e-9  # Directions of a least-squares problem below this relative size are free
 # A perturbation that changes a step by less than this share of the step counts as zero.
 _NOTHING = 1e-250
@@ -66,6 +69,14 @@ def null_space(
     if size == 0 or singular[0] == 0:
         return NullSpace(V.T, np.zeros(size), np.inf)
     relative = singular / (singular[0] if unit is None or tolerance is not None else unit)
+    kept, gap = _cut(relative, tolerance, below)
+    return NullSpace(V.T[:, kept:], relative, gap)
+
+
+def _cut(relative: np.ndarray, tolerance: float | None, below: float = NULL) -> tuple[int, float]:
+    """How many singular values, descending, are not zero, and the ratio at the cut."""
+    if len(relative) == 0:
+        return 0, np.inf
     # ratio[i]: how far the value i is below the one before it, the first one below the unit
     before = np.append(max(1.0, relative[0]), relative[:-1])
     ratio = before / np.maximum(relative, np.finfo(float).eps)
@@ -73,8 +84,34 @@ def null_space(
         kept = int(np.sum(relative > tolerance))
     else:
         allowed = relative < below
-        kept = int(np.argmax(np.where(allowed, ratio, 0))) if allowed.any() else size
-    return NullSpace(V.T[:, kept:], relative, float(ratio[kept]) if kept < size else 1.0)
+        kept = int(np.argmax(np.where(allowed, ratio, 0))) if allowed.any() else len(relative)
+    return kept, float(ratio[kept]) if kept < len(relative) else 1.0
+
+
+def _spaces_of_orders(terms: np.ndarray, tolerance: float | None) -> list[NullSpace]:
+    """The null space of the Toeplitz matrix of each order: by its own singular values up to `DENSE`
+    columns and with a tolerance, else by those of A_0 and of the secular terms."""
+    if tolerance is not None or terms.shape[1] * terms.shape[2] <= DENSE:
+        orders = range(terms.shape[1])
+        return [null_space(toeplitz(terms, k), tolerance, 1.0) for k in orders]
+    stairs, spaces = Staircase(terms, lambda relative: _cut(relative, None)[0], unit=1.0), []
+    for k, (step, order) in enumerate(zip(stairs.steps, stairs.orders, strict=True)):
+        leading, shifts = (c.reshape((k + 1) * terms.shape[2], -1) for c in stairs.null(k))
+        shifts = np.linalg.qr(shifts)[0]
+        kept, null = [step.singular], [step.every[len(step.singular) :]]
+        for columns, split in ((leading, order.rest), (shifts, order.later)):
+            # Singular values of the residuals, which may be less than the rounding on the way.
+            left = stairs.left_sides(columns.reshape(k + 1, terms.shape[2], -1))
+            null.append(singular_vectors(np.concatenate(left))[0])
+            kept.append(split.singular)
+        ratios = [
+            above.min(initial=1.0) / below.max(initial=np.finfo(float).eps)
+            for above, below in zip(kept, null, strict=True)
+        ]
+        gap = float(min(ratios)) if sum(map(len, null)) else 1.0
+        singular = np.sort(np.concatenate(kept + null))[::-1]
+        spaces.append(NullSpace(np.hstack([leading, shifts]), singular, gap))
+    return spaces
 
 
 def orthonormal_range(columns: np.ndarray, above: float = RANK) -> np.ndarray:
@@ -168,8 +205,7 @@ def series_spaces(
     """
     size = fitted.shape[2]
     spaces: list[SeriesSpace] = []
-    for order in range(fitted.shape[1]):
-        space = null_space(toeplitz(fitted, order), tolerance, 1.0)
+    for space in _spaces_of_orders(fitted, tolerance):
         led, free = by_leading(space.columns[:size], max(RANK, tolerance or 0.0))
         leading, shifts = space.columns @ led, space.columns @ free
         if trivial is not None:

@@ -9,6 +9,7 @@ from .echelon import reduced
 from .families import raised
 from .nullspace import RANK, orthonormal_range
 from .series import shortened
+from .staircase import Split, above
 
 # A drift law is reported when it leaves less than this share of the drift unexplained.
 EXPLAINED = 1e-6
@@ -76,6 +77,7 @@ def drift_laws(
         return ()
     orthonormal = np.linalg.solve(R.T, (values / rms).T).T
     system = np.concatenate([-terms[:, 0], search.weights[:, None] * orthonormal @ kept], axis=1)
+    solver = Split.of(system, above(1e-10))
 
     def text(coefficients, shares):
         return shortened(basis, coefficients, np.abs(shares), _SHOWN, max(0.1 * EXPLAINED, blur**2))
@@ -91,7 +93,7 @@ def drift_laws(
             shares, c = shares * normal, c * normal
             series = np.linalg.lstsq(before[:size], R @ shares, rcond=blur)[0]
             drift = drifts @ series
-            solution = np.linalg.lstsq(system, drift, rcond=1e-10)[0]
+            solution = solver.solved(drift[:, None])[:, 0]
             rate = max(np.linalg.norm(drift), np.finfo(float).tiny)
             left = float(np.linalg.norm(system @ solution - drift) / rate)
             law = np.linalg.solve(R, kept @ solution[size:]) / rms * search.scale**m

@@ -24,8 +24,9 @@ class Span:
 
     def shares(self, columns: np.ndarray) -> np.ndarray:
         """Shares from coefficients of the orthonormal functions."""
-        blocks = columns.reshape(self.orders, self.size, -1)
-        return np.linalg.solve(self.R, blocks).reshape(columns.shape)
+        blocks = np.moveaxis(columns.reshape(self.orders, self.size, -1), 1, 0)
+        solved = np.linalg.solve(self.R, blocks.reshape(self.size, -1)).reshape(blocks.shape)
+        return np.moveaxis(solved, 1, 0).reshape(columns.shape)
 
     def representatives(
         self, samples: Samples, slopes: np.ndarray
@@ -45,8 +46,9 @@ class Span:
         complexity = np.array(self.basis.complexity)
         taken: list[np.ndarray] = []
         done = np.zeros((self.size, 0))
+        shares = self.shares(self.space.leading)
         for level in sorted(set(self.basis.complexity)):
-            candidates = self._up_to(level)
+            candidates = self._up_to(level, shares)
             for vector in reduced(candidates, complexity, self.blur).T:
                 leading = vector[: self.size]
                 rest = leading - done @ (done.T @ leading)
@@ -64,9 +66,8 @@ class Span:
                 found.append((series, grown))
         return found
 
-    def _up_to(self, level: int) -> np.ndarray:
-        """Series, as shares, whose leading-order term uses no function above this complexity."""
-        shares = self.shares(self.space.leading)
+    def _up_to(self, level: int, shares: np.ndarray) -> np.ndarray:
+        """Those whose leading-order term uses no function above this complexity."""
         leading = shares[: self.size]
         above = leading[np.array(self.basis.complexity) > level]
         singular, V = singular_vectors(above / max(np.linalg.norm(leading, 2), 1e-300))
