@@ -204,15 +204,15 @@ def draw_layers(path: Path) -> None:
 
 
 LIMITS = {
-    "lines": 50_400,
-    "raise statements": 662,
+    "lines": 51_600,
+    "raise statements": 665,
     COMMENTS: 5,
     f"files of more than {LONGEST_FILE} lines": 0,
     f"functions with more than {MOST_PARAMETERS} parameters": 7,
     "circles of imports": 0,
 }
 """What the tests allow. When the code has become smaller lower them; only a new capability raises
-them, by its own size (`proof`: 1 700 lines)."""
+them, by its own size (`proof`: 1 700 lines; pairs of numbers: 1 200)."""
 
 
 GOALS = dict(zip(LIMITS, (33_000, 450, 5, 0, 15, 0), strict=True))
