@@ -125,7 +125,7 @@ class DoubleDouble(Arithmetic):
     Saved states are q without e; observables without a reduction, `Stop`, `Section` and deviation
     vectors are evaluated at them in float64. Derivatives are those of the map in float64.
 
-    In a batch a step takes 6 to 17 times as long as with `FloatingPoint`, where machine code is
+    In a batch a step takes 6 to 18 times as long as with `FloatingPoint`, where machine code is
     generated.
 
     **Raises** `ValueError` for a state that is not float64, `NotImplementedError` for a function

@@ -298,20 +298,35 @@ def test_a_batch_has_the_bits_of_single_runs(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [dvi.Strang(), dvi.GaussLegendre(2)], ids=repr)
-def test_cost_of_a_step(method):
-    """In a batch of Kepler orbits, relative to float64: the least of some runs of each."""
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        ("pendulum", dvi.Strang()),
+        ("kepler", dvi.Strang()),
+        ("henon_heiles", dvi.Strang()),
+        ("kepler", dvi.GaussLegendre(2)),
+    ],
+)
+def test_cost_of_a_step(name, method):
+    """In a batch, relative to float64: the least of some runs of each."""
+    problem = systems.LIBRARY[name]()
 
     def seconds(arithmetic):
         def one(q):
-            how = {"args": KEPLER.args, "h": 0.01, "num_steps": 500, "epsilon": 0.0, "save": FINAL}
+            how = {"args": problem.args, "h": 0.01, "num_steps": 500, "epsilon": 0.0}
             sol = dvi.integrate(
-                KEPLER.system, q, KEPLER.p0, method=method, arithmetic=arithmetic, **how
+                problem.system,
+                q,
+                problem.p0,
+                method=method,
+                arithmetic=arithmetic,
+                save=FINAL,
+                **how,
             )
             return sol.qs[-1]
 
         run = jax.jit(jax.vmap(one))
-        q = jnp.linspace(0.9, 1.1, 256)[:, None] * jnp.asarray(KEPLER.q0)[None]
+        q = jnp.linspace(0.9, 1.1, 256)[:, None] * jnp.asarray(problem.q0)[None]
         run(q).block_until_ready()
         times = []
         for _ in range(5):
@@ -321,7 +336,7 @@ def test_cost_of_a_step(method):
         return min(times)
 
     ratio = seconds(dvi.DoubleDouble()) / seconds(dvi.FloatingPoint())
-    print(f"{method!r}: a step in pairs takes {ratio:.1f} times as long")
+    print(f"{name}, {method!r}: a step in pairs takes {ratio:.1f} times as long")
     assert 2 < ratio < 25
 
 
