@@ -18,6 +18,7 @@ from ._adjoints import (
 from ._arithmetic import (
     Arithmetic as Arithmetic,
     Compensated as Compensated,
+    DoubleDouble as DoubleDouble,
     FixedPoint as FixedPoint,
     FloatingPoint as FloatingPoint,
 )

@@ -2,14 +2,19 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 
-from ._step import Equations, to_grid
+from lanewise.exact import two_sum
+
+from ._step import Equations, StepInfo, to_grid
 from ._types import Interval, State
+from .engine.in_pairs import in_pairs
+from .engine.pairs import Pair, rounded
 from .methods import Method
 
 
@@ -42,6 +47,22 @@ class Arithmetic(eqx.Module):
     def leave(self, q0: State, p0: State, x1: State, y1: State) -> tuple[State, State, Any]:
         """The state after a step from (q0, p0), whose result is (x1, y1), and the memory."""
         return x1, y1, None
+
+    def step(
+        self, method: Method, equations: Equations, interval: Interval, q0, p0, memory: Any
+    ) -> tuple[State, State, Any, StepInfo]:
+        """The state after a step, the memory, and the status of the step."""
+        here, *relative = self.enter(equations, q0, p0, memory)
+        x1, y1, info = method.step(here, interval, *relative)
+        return *self.leave(q0, p0, x1, y1), info
+
+    def whole(self, q: State, p: State, memory: Any) -> tuple[Any, Any]:
+        """The state as arguments of a function for `evaluate`."""
+        return q, p
+
+    def evaluate(self, function: Callable, *args: Any) -> Any:
+        """``function(*args)``, a part of an observable, in this representation."""
+        return function(*args)
 
 
 class FloatingPoint(Arithmetic):
@@ -81,10 +102,65 @@ class Compensated(Arithmetic):
         return dataclasses.replace(equations, origin=(q0, p0)), *memory
 
     def leave(self, q0, p0, x1, y1):
-        q1, lost_q = _exact_sum(q0, x1)
-        p1, lost_p = _exact_sum(p0, y1)
+        # Of values that need not be ordered: an increment may be larger than a coordinate.
+        q1, lost_q = two_sum(q0, x1)
+        p1, lost_p = two_sum(p0, y1)
         # In exact arithmetic the errors are zero, and so are their derivatives.
         return q1, p1, lax.stop_gradient((lost_q, lost_p))
+
+
+class DoubleDouble(Arithmetic):
+    r"""Pairs of float64 numbers: steps and observables with about 31 digits.
+
+    The state is q + e, with q = fl(q + e), as in `Compensated`; but each operation of a step is on
+    pairs, with relative errors of about 1e-32. So are those of elementary functions (3e-31 at
+    most), of implicit solves, and of the observables in reductions: with
+    ``observe=dvi.MaxDrift(f)`` a drift of 1e-25 is measured, and not the rounding of f. It works
+    with every method.
+
+    The map is that of the numbers in float64 that define it: initial conditions, h, times of the
+    grid, args, ε, and constants in your functions. Coefficients of the collocation methods are
+    pairs, so that quadratic invariants hold to 31 digits too.
+
+    Saved states are q without e; observables without a reduction, `Stop`, `Section` and deviation
+    vectors are evaluated at them in float64. Derivatives are those of the map in float64.
+
+    In a batch a step takes 6 to 18 times as long as with `FloatingPoint`, where machine code is
+    generated.
+
+    **Raises** `ValueError` for a state that is not float64, `NotImplementedError` for a function
+    with an operation that has no rule (`jax.scipy.special.erf`, factorisations of matrices, sorts).
+
+    **Source** Dekker 1971, *Numer. Math.* 18, 224; Joldes, Muller & Popescu 2017, *ACM TOMS* 44,
+    15.
+    """
+
+    def prepare(self, method, equations, interval, q0, p0):
+        if q0.dtype != jnp.float64:
+            raise ValueError(
+                f"arithmetic=dvi.DoubleDouble() requires q0 and p0 in float64, got {q0.dtype}: "
+                "convert them, or use arithmetic=dvi.Compensated()."
+            )
+        return equations, q0, p0
+
+    def start(self, q0, p0):
+        return jnp.zeros_like(q0), jnp.zeros_like(p0)
+
+    def step(self, method, equations, interval, q0, p0, memory):
+        # The whole step is interpreted, so that no method needs code of its own for pairs.
+        (q1, p1), info = in_pairs(_step, method, equations, interval, *self.whole(q0, p0, memory))
+        return q1.hi, p1.hi, lax.stop_gradient((q1.lo, p1.lo)), rounded(info)
+
+    def whole(self, q, p, memory):
+        return Pair(q, memory[0]), Pair(p, memory[1])
+
+    def evaluate(self, function, *args):
+        return in_pairs(function, *args)
+
+
+def _step(method: Method, equations: Equations, interval: Interval, q0: State, p0: State) -> Any:
+    q1, p1, info = method.step(equations, interval, q0, p0)
+    return (q1, p1), info
 
 
 class FixedPoint(Arithmetic):
@@ -164,15 +240,6 @@ class FixedPoint(Arithmetic):
             )
         equations = dataclasses.replace(equations, quantum=self.quantum)
         return equations, _start_on_grid(q0, self.quantum), _start_on_grid(p0, self.quantum)
-
-
-def _exact_sum(a: State, b: State) -> tuple[State, State]:
-    """(s, e) with s = fl(a + b) and s + e = a + b exactly."""
-    # Knuth's six operations, not Dekker's three, which require |a| ≥ |b|: an increment may be
-    # larger than a coordinate near zero. No compiler here reassociates floating-point sums.
-    s = a + b
-    b_seen = s - a
-    return s, (a - (s - b_seen)) + (b - b_seen)
 
 
 def _start_on_grid(x: State, quantum: float) -> State:

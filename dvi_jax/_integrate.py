@@ -118,7 +118,7 @@ def integrate(
     - `root_finder`, or `newton`: the solver of implicit steps: `PicardThenNewton`, `Newton`,
       `SimplifiedNewton`, `Picard`.
     - `arithmetic`: the representation of the state: `FloatingPoint`; for long runs `Compensated`,
-      or `FixedPoint`, whose explicit steps can be undone bit for bit.
+      or `FixedPoint`, whose explicit steps can be undone bit for bit; `DoubleDouble`, 31 digits.
     - `integrator`: an `Integrator` in place of method, lattice, adjoint, newton, arithmetic and
       layout.
     - `throw`: raise an error if the trajectory fails; otherwise read ``solution.result``.

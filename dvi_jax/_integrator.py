@@ -81,7 +81,10 @@ _FIELDS = {
     ),
     "adjoint": (AbstractAdjoint, "dvi.Reversible(), dvi.Checkpointed() or dvi.Direct()"),
     "root_finder": (RootSolver, "dvi.Newton(), dvi.SimplifiedNewton() or dvi.Picard()"),
-    "arithmetic": (Arithmetic, "dvi.FloatingPoint(), dvi.Compensated() or dvi.FixedPoint(quantum)"),
+    "arithmetic": (
+        Arithmetic,
+        "dvi.FloatingPoint(), dvi.Compensated(), dvi.DoubleDouble() or dvi.FixedPoint(quantum)",
+    ),
     "layout": (Layout, 'dvi.Layout() or dvi.Layout(form="arrays")'),
 }
 

@@ -75,7 +75,7 @@ SHORT = (
     *("System", "discretise", "from_lagrangian", "velocity_force"),
     *("integrate", "Integrator", "Save", "Solution", "RESULTS", "IntegrationError"),
     *("TypeII", "SymplecticEuler", "Strang", "StormerVerlet", "Yoshida", "GaussLegendre"),
-    *("Uniform", "TimeTransformed", "Variational", "Compensated", "FixedPoint"),
+    *("Uniform", "TimeTransformed", "Variational", "Compensated", "DoubleDouble", "FixedPoint"),
     *("Newton", "SimplifiedNewton", "Picard", "Reversible", "Checkpointed"),
     *("MaxDrift", "Range", "Trend", "Mean", "Section", "Stop"),
     *("discover_invariants", "find_symmetries", "drift_order", "bound_drift"),

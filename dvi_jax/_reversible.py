@@ -26,6 +26,7 @@ from ._rollout import (
     start,
     with_start,
 )
+from .engine.pairs import rounded
 
 
 class Reversible(AbstractAdjoint):
@@ -121,7 +122,11 @@ class Reversible(AbstractAdjoint):
             change = eqx.filter(change, moves)
             # Only the values that the reverse pass reads: the others need not be computed.
             carry, saved, tail, _ = trace
-            known = carry.reductions, states_of(saved), None if tail is None else states_of(tail)
+            known = (
+                rounded(carry.reductions),
+                states_of(saved),
+                None if tail is None else states_of(tail),
+            )
 
             def along(moving, still, whole, u):
                 def of(moving):

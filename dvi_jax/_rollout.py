@@ -12,11 +12,12 @@ from jaxtyping import Array, Float, Int, PyTree
 import lanewise
 
 from ._arithmetic import Arithmetic, FloatingPoint
+from ._plan import Plan as Plan, make_plan as make_plan, piece_length as piece_length
 from ._results import RESULTS, first_failure
-from ._solution import Save
 from ._step import Equations
 from ._types import Args, Bindable, Interval, Scalar, State
 from .engine.newton import no_residual, worse
+from .engine.pairs import rounded
 from .engine.reads import Reads
 from .lattices import Lattice, Place
 from .methods import Method
@@ -77,7 +78,7 @@ class Task(eqx.Module):
         memories, values = iter(carry.reductions), []
         for f in self._leaves():
             if isinstance(f, Running):
-                value = f.reduction.finish(next(memories))
+                value = self.finished(f.reduction, next(memories))
                 values.append(_or_nan(carry.result == RESULTS.successful, value))
             elif isinstance(f, Reduction):
                 next(memories)
@@ -85,6 +86,17 @@ class Task(eqx.Module):
                 assert taken is not None
                 values.append(taken.value(self.bound(f), self.args))
         return values
+
+    def evaluate(self, reduction: Reduction, function: Callable, *args: Any) -> Any:
+        """``function(*args)``, a part of the reduction, in the arithmetic of the run."""
+        # Deviation vectors and recorded steps are values in floating point.
+        if isinstance(reduction, Deviations) or not reduction.has_running_value:
+            return function(*rounded(args))
+        return self.arithmetic.evaluate(function, *args)
+
+    def finished(self, reduction: Reduction, memory: Any) -> Any:
+        """The reduced value of a memory."""
+        return rounded(self.evaluate(reduction, reduction.finish, memory))
 
     def _leaves(self) -> list[Any]:
         return jax.tree.leaves(self.observe, is_leaf=is_observable)
@@ -167,36 +179,6 @@ class Outcome(NamedTuple):
     round_trip_defect: Array | None = None
 
 
-class Plan(NamedTuple):
-    """Steps as blocks of `block` steps with a save after each, then a tail. Static."""
-
-    num_blocks: int
-    block: int
-    tail: int
-    save_tail: bool
-
-    @property
-    def num_steps(self) -> int:
-        return self.num_blocks * self.block + self.tail
-
-
-def make_plan(save: Save, num_steps: int) -> Plan:
-    every = save.every
-    if every is None:
-        # Without `every` a run that saves its end only is one block. A block has at least one step.
-        keeps_end_alone = save.final or save.ts is not None
-        every = max(num_steps, 1) if keeps_end_alone else 1
-    num_blocks, tail = divmod(num_steps, every)
-    return Plan(num_blocks, every, tail, save.final and tail > 0)
-
-
-def piece_length(count: int, every: int) -> int:
-    """The length, about `every`, of the pieces of `count` steps."""
-    # A divisor of `count`, if there is one near: with pieces of one length one loop is compiled.
-    lengths = range(min(3 * every // 2, count), every // 2, -1)
-    return next((n for n in lengths if count % n == 0), every)
-
-
 def start(task: Task, q0: State, p0: State) -> Carry:
     """The carry before the first step."""
     real = jnp.finfo(q0.dtype).dtype
@@ -210,11 +192,15 @@ def start(task: Task, q0: State, p0: State) -> Carry:
         at_start = StepTaken(interval.t0, interval.t0, q0, p0, q0, p0)
         function = task.bound(reduction.function)
         like = eqx.filter_eval_shape(at_start.number, function, task.args)
-        begun = reduction.start(jnp.zeros(like.shape, like.dtype))
-        if not has_initial_value(reduction.function):
-            return begun
-        value = at_start.number(function, task.args)
-        return reduction.update(begun, jnp.asarray(0, jnp.int32), interval.t0, value)
+
+        def begun(taken):
+            begun = reduction.start(jnp.zeros(like.shape, like.dtype))
+            if not has_initial_value(reduction.function):
+                return begun
+            value = taken.number(function, task.args)
+            return reduction.update(begun, jnp.asarray(0, jnp.int32), interval.t0, value)
+
+        return task.evaluate(reduction, begun, at_start)
 
     _, reductions = task.observables()
     failed = result != RESULTS.successful
@@ -250,9 +236,8 @@ def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
     interval = task.in_precision(interval)
 
     def advance(q, p):
-        here, *relative = task.arithmetic.enter(task.equations, q, p, carry.beside)
-        q1, p1, info = task.method.step(here, interval, *relative)
-        q1, p1, beside = task.arithmetic.leave(q, p, q1, p1)
+        at = (task.method, task.equations, interval, q, p, carry.beside)
+        q1, p1, beside, info = task.arithmetic.step(*at)
         return (q1, p1), (beside, info)
 
     if task.has_deviations:
@@ -268,7 +253,7 @@ def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
     residual = lax.stop_gradient(info.residual)
     q1, p1, result, failed_step, failed_residual = _noted(carry, q1, p1, result, good, residual)
     taken = StepTaken(interval.t0, interval.t1, carry.q, carry.p, q1, p1)
-    reduced = _reduced(task, carry, taken, push, interval.h)
+    reduced = _reduced(task, carry, taken, beside, push, interval.h)
     if stop is not None:
         # Reductions cover the steps before the one in which the run stopped.
         over = result == RESULTS.stopped
@@ -317,21 +302,26 @@ def _noted(
 
 
 def _reduced(
-    task: Task, carry: Carry, taken: StepTaken, push: Callable | None, h: Scalar
+    task: Task, carry: Carry, taken: StepTaken, beside: Any, push: Callable | None, h: Scalar
 ) -> list[Any]:
     """The memories of the reductions after a step with the derivative `push`."""
     _, reductions = task.observables()
+    before = task.arithmetic.whole(taken.q0, taken.p0, carry.beside)
+    after = task.arithmetic.whole(taken.q1, taken.p1, beside)
 
-    def value(r: Reduction, memory: Any) -> Any:
+    def updated(r: Reduction, memory: Any) -> Any:
+        k = number_of(r, carry.k)
         if isinstance(r, Deviations):
             assert push is not None
-            return _pushed(push, r.vectors(memory), taken, h)
-        return taken.number(task.bound(r.function), task.args)
+            return r.update(memory, k, taken.t1, _pushed(push, r.vectors(memory), taken, h))
+        function = task.bound(r.function)
 
-    return [
-        r.update(so_far, number_of(r, carry.k), taken.t1, value(r, so_far))
-        for r, so_far in zip(reductions, carry.reductions, strict=True)
-    ]
+        def of(taken, memory):
+            return r.update(memory, k, taken.t1, taken.number(function, task.args))
+
+        return task.evaluate(r, of, StepTaken(*taken[:2], *before, *after), memory)
+
+    return [updated(r, memory) for r, memory in zip(reductions, carry.reductions, strict=True)]
 
 
 def number_of(reduction: Reduction, k: Int[Array, ""]) -> Int[Array, ""]:
@@ -419,7 +409,8 @@ def outcome(
 def reduce(task: Task, carry: Carry) -> list[Any]:
     """The reduced values, in tree order."""
     _, reductions = task.observables()
-    return [r.finish(memory) for r, memory in zip(reductions, carry.reductions, strict=True)]
+    pairs = zip(reductions, carry.reductions, strict=True)
+    return [task.finished(r, memory) for r, memory in pairs]
 
 
 def with_tail(plan: Plan, saved: Saved, tail: Saved | None) -> Saved:

@@ -103,7 +103,7 @@ class Arithmetic(Writer):
             d, y = x.args if x.args[0].known is not None else x.args[::-1]
         else:
             return None
-        two = _is_power_of_two(c.known) or _is_power_of_two(d.known)
+        two = is_power_of_two(c.known) or is_power_of_two(d.known)
         with np.errstate(all="ignore"):
             both = np.asarray(c.known * d.known, x.dtype)
         # A subnormal d·y would have lost digits, which (c·d)·y has.
@@ -135,7 +135,7 @@ class Arithmetic(Writer):
             return self.mul(a, self.known(1 / b.known, b.dtype))
         # c/x = c·(1/x) to the bit where 1/x cannot leave the range: −1, or x a square root. So that
         # 1/x is computed once for several c.
-        by_reciprocal = b.op == "sqrt" and a.known is not None and _is_power_of_two(a.known)
+        by_reciprocal = b.op == "sqrt" and a.known is not None and is_power_of_two(a.known)
         if a.is_known_as(-1) or (by_reciprocal and not a.is_known_as(1)):
             return self.mul(a, self.div(self.known(1, a.dtype), b))
         return self.instruction("fdiv", (a, b), "div")
@@ -435,10 +435,11 @@ class Arithmetic(Writer):
         return value if word == "ashr" else self.select(inside, value, self.known(0, a.dtype))
 
 
-def _is_power_of_two(x: Any) -> bool:
+def is_power_of_two(x: Any) -> bool:
+    """Whether a product with x is exact, but for subnormal numbers."""
     return abs(np.frexp(np.float64(x))[0]) == 0.5
 
 
 def _has_exact_reciprocal(x: Any) -> bool:
     """Whether a product with 1/x is the quotient, subnormal results included."""
-    return _is_power_of_two(x) and 2.0**-100 <= abs(float(x)) <= 2.0**100
+    return is_power_of_two(x) and 2.0**-100 <= abs(float(x)) <= 2.0**100

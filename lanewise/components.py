@@ -23,8 +23,6 @@ from .written import WRITTEN
 if TYPE_CHECKING:
     from .kernel import Module
 
-MOST_OPERATIONS = 60_000  # more operations than this are left to XLA, loops counted once
-
 
 class Evaluator:
     """One evaluation: numbers go through `b`, memory comes from `kernel`."""
@@ -80,8 +78,8 @@ class Evaluator:
             if eqn.primitive.name not in _ENDS and any(v.is_tangent for v in inputs):
                 outputs = [self.as_tangent(v) for v in outputs]
             known.update(zip(eqn.outvars, outputs, strict=True))
-        if self.b.operations > MOST_OPERATIONS:
-            raise Unsupported(f"a step has more than {MOST_OPERATIONS} operations")
+        if self.b.operations > self.b.most:
+            raise Unsupported(f"a step has more than {self.b.most} operations")
         return [read(v) for v in jaxpr.outvars]
 
     def sine_or_cosine(self, eqn: Any, value: Value) -> Value:

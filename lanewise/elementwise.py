@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from . import exact
 from .assumed import taken_for, taken_value
 from .ir import Num, Unsupported
 
@@ -169,6 +170,8 @@ ELEMENTWISE: dict[str, Callable] = {
     **dict.fromkeys(["copy", "copy_p", "stop_gradient", "real", "conj"], _same),
     **{op: (lambda e, _, a, b, op=op: e.b.logic(op, a, b)) for op in ("and", "or", "xor")},
     "not": lambda e, _, x: e.b.invert(x),
+    "rounded_product": exact.rounded,
+    "lost_by_product": exact.lost,
     "eq": _equal,
     **{op: _compared(op) for op in ("ne", "lt", "le", "gt", "ge")},
     **{

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from .ir import MOST_OPERATIONS
 from .jaxapi import ClosedJaxpr, bodies, scan_counts
 
 
@@ -26,6 +27,24 @@ def carried(jaxpr: Any) -> int:
             # Large arrays stay in memory and take no register; integers are few.
             most = max(most, sum(a.size for a in state if a.size <= 64 and a.dtype.kind == "f"))
     return most
+
+
+MOST_IN_PAIRS = 150_000
+"""The same for functions with exact products, whose long chains of sums XLA compiles to code that
+takes minutes to run."""
+
+
+def most_operations(jaxpr: Any) -> int:
+    """The largest number of operations of a function for which code is generated."""
+    return MOST_IN_PAIRS if _has_exact_products(jaxpr) else MOST_OPERATIONS
+
+
+def _has_exact_products(jaxpr: Any) -> bool:
+    return any(
+        eqn.primitive.name == "lost_by_product"
+        or any(_has_exact_products(body.jaxpr) for body in (*bodies(eqn), *functions_in(eqn)))
+        for eqn in jaxpr.eqns
+    )
 
 
 def operation_count(jaxpr: Any) -> int:

@@ -13,6 +13,9 @@ from typing import Any
 
 import numpy as np
 
+MOST_OPERATIONS = 60_000
+"""Functions with more operations are left to XLA, loops counted once."""
+
 # NumPy's name of a type → LLVM's.
 TYPES = {
     "float64": "double",
@@ -81,7 +84,7 @@ class Writer:
         self.W, self.U = width, vectors
         self.lines: list[str] = []
         self.block = "entry"
-        self.operations = 0
+        self.operations, self.most = 0, MOST_OPERATIONS
         # A number that was made in a loop or a branch is not known outside of it: each has a scope.
         self.scopes: list[dict] = [{}]
         self.declared: set[str] = set()

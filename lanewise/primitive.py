@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import handler, machine
-from .components import MOST_OPERATIONS
-from .extent import carried, operation_count
+from .extent import carried, most_operations, operation_count
 from .ir import Unsupported
 from .jaxapi import (
     ClosedJaxpr,
@@ -252,8 +251,9 @@ def kernel_of(
     closed = program.traced.all_inputs
     # Counted before code is written, which would take minutes for the largest functions.
     count = operation_count(closed.jaxpr)
-    if count > MOST_OPERATIONS:
-        raise Unsupported(f"the function has {count} operations, more than {MOST_OPERATIONS}")
+    most = most_operations(closed.jaxpr)
+    if count > most:
+        raise Unsupported(f"the function has {count} operations, more than {most}")
     if vectors is None and program.layout.width is not None:
         vectors = max(program.layout.width // machine.width(), 1)
     if vectors is None:
@@ -264,6 +264,7 @@ def kernel_of(
         moved = sum(n for n in ends if n <= 128)
         vectors = vectors_for(state, count) if state or moved <= 24 else 1
     module = Module(*variant(lanes, vectors))
+    module.b.most = most
     return module, module.kernel(closed, on)
 
 

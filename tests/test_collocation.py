@@ -29,7 +29,12 @@ from dvi_jax.systems.n_body import angular_momentum, energy
 
 SLOW = pytest.mark.slow
 GAUSS, LOBATTO = dvi.GaussLegendre, dvi.LobattoIIIAIIIB
-TABLES = {GAUSS: _gauss_legendre._table, LOBATTO: _lobatto_pair._table}
+EXACT = {GAUSS: _gauss_legendre._table, LOBATTO: _lobatto_pair._table}
+
+
+def rounded_table(kind, stages):
+    return [part.astype(float) for part in EXACT[kind](stages)]
+
 
 R3, R15 = 3**0.5, 15**0.5
 BY_HAND = {
@@ -74,7 +79,7 @@ def by_hand(kind, stages):
 
 @pytest.mark.parametrize(("kind", "stages"), BY_HAND)
 def test_coefficients_are_those_in_print(kind, stages):
-    for ours, printed in zip(TABLES[kind](stages), BY_HAND[kind, stages], strict=False):
+    for ours, printed in zip(rounded_table(kind, stages), BY_HAND[kind, stages], strict=False):
         np.testing.assert_allclose(ours, printed, rtol=0, atol=3e-16)
 
 
@@ -83,7 +88,7 @@ def test_coefficients_are_those_in_print(kind, stages):
 )
 def test_order_conditions_hold_and_the_next_does_not(kind, stages):
     """B(order), C(s) (of IIIB C(s − 2)), and symplecticity, in the notation of the source."""
-    c, b, a, *more = TABLES[kind](stages)
+    c, b, a, *more = rounded_table(kind, stages)
     order = kind(stages).order
 
     def defect(k):

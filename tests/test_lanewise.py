@@ -23,7 +23,7 @@ from jax import export, lax
 
 import dvi_jax as dvi
 import lanewise
-from lanewise import assumed, cache, components, handler, machine, primitive, rules
+from lanewise import assumed, cache, components, extent, handler, machine, primitive, rules
 from lanewise.kernel import Module
 from lanewise.traced import Traced
 
@@ -1177,7 +1177,7 @@ def test_loops_around_a_callback_are_compiled(left):
 
 def test_loops_that_are_too_large_together_end_in_xla(left, monkeypatch):
     """Each loop could be compiled, the function of both cannot: no search without an end."""
-    monkeypatch.setattr(primitive, "MOST_OPERATIONS", 12)
+    monkeypatch.setattr(extent, "MOST_OPERATIONS", 12)
 
     def loop(x):
         return lax.fori_loop(0, 3, lambda _, y: jnp.sin(jnp.sin(jnp.sin(y) + x) + x), x)

@@ -1,12 +1,13 @@
 """Common parts of the collocation methods: a base, their integrals, the continuous rates."""
 
-from collections.abc import Callable
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Sequence
+from fractions import Fraction
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from numpy.polynomial import legendre
+from jaxtyping import Array
 
 from .._step import Equations
 from .._types import Interval, Scalar, State
@@ -30,8 +31,35 @@ class Collocation(Method):
         return self.needs_no_solve(equations, interval, q)
 
 
-def integrals(x: np.ndarray, b: np.ndarray, degree: int) -> np.ndarray:
-    r"""a_ij = ∫₀^{c_i} ℓ_j of the Lagrange polynomials ℓ_j at c = (x + 1)/2, in double precision.
+def exact_nodes(guesses: Iterable[float], slope: Callable) -> list[Fraction]:
+    """Zeros x near floating-point numbers, to 48 digits; ``slope(x)`` → (f(x), f'(x))."""
+    found = []
+    for guess in guesses:
+        x = Fraction(float(guess))
+        for _ in range(3):  # Newton's steps double the digits
+            value, derivative = slope(x)
+            x = Fraction(round((x - value / derivative) * 2**160), 2**160)
+        found.append(x)
+    # Symmetric, because the reversal of a step depends on it.
+    return [(x - y) / 2 for x, y in zip(found, reversed(found), strict=True)]
+
+
+def legendre(x: Fraction, degree: int) -> list[Fraction]:
+    """P_0(x), …, P_degree(x)."""
+    P = [Fraction(1), x]
+    for k in range(1, degree):
+        P.append(((2 * k + 1) * x * P[k] - k * P[k - 1]) / (k + 1))
+    return P[: degree + 1]
+
+
+def legendre_slope(x: Fraction, degree: int) -> Fraction:
+    """P'_degree(x) at an inner x."""
+    *_, before, last = legendre(x, degree)
+    return degree * (x * last - before) / (x * x - 1)
+
+
+def integrals(x: Sequence[Fraction], b: Sequence[Any], degree: int) -> np.ndarray:
+    r"""a_ij = ∫₀^{c_i} ℓ_j of the Lagrange polynomials ℓ_j at c = (x + 1)/2, as fractions.
 
     With P_k the Legendre polynomials and P_{−1} = −1,
 
@@ -39,13 +67,20 @@ def integrals(x: np.ndarray, b: np.ndarray, degree: int) -> np.ndarray:
 
     **Source** Hairer & Wanner 1996, *Solving ODEs II*, IV.5 (the W-transformation).
     """
-    # This is the expansion of ℓ_j in Legendre polynomials, integrated term by term. No digits
-    # cancel in it, unlike in a solve with a Vandermonde matrix. `degree` is s for s Gauss nodes,
-    # and s − 1 for s Lobatto nodes, where the integral of the last term, a multiple of
-    # (1 − x²) P'_{s−1}, vanishes at every node.
-    P = legendre.legvander(x, degree)  # (s, degree + 1)
-    before = np.concatenate([-np.ones((len(x), 1)), P[:, : degree - 1]], axis=1)
-    return b * ((P[:, 1:] - before) / 2 @ P[:, :degree].T)
+    # This is the expansion of ℓ_j in Legendre polynomials, integrated term by term. `degree` is s
+    # for s Gauss nodes, and s − 1 for s Lobatto nodes, where the integral of the last term, a
+    # multiple of (1 − x²) P'_{s−1}, vanishes at every node.
+    P = np.array([legendre(y, degree) for y in x], object)  # (s, degree + 1)
+    before = np.concatenate([np.full((len(x), 1), -1), P[:, : degree - 1]], axis=1)
+    return np.array(b, object) * ((P[:, 1:] - before) / 2 @ P[:, :degree].T)
+
+
+def coefficients(exact: np.ndarray, dtype: Any) -> Array:
+    """An array of fractions: rounded in floating point, and a pair in `DoubleDouble`."""
+    upper = exact.astype(float)
+    lower = (exact - np.vectorize(Fraction, otypes=[object])(upper)).astype(float)
+    # A sum that floating point rounds to its first term, and pairs of numbers do not.
+    return jnp.asarray(upper, dtype) + jnp.asarray(lower, dtype)
 
 
 def continuous_rates(equations: Equations, like: Scalar) -> tuple[Callable, Callable]:

@@ -6,12 +6,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.polynomial import legendre
 
 from .._checks import whole
 from .._step import judge
 from ..engine.newton import find_root
-from ._collocation import Collocation, continuous_rates, integrals
+from ._collocation import (
+    Collocation,
+    coefficients,
+    continuous_rates,
+    exact_nodes,
+    integrals,
+    legendre,
+    legendre_slope,
+)
 
 # Order 16: the order conditions are tested up to there.
 _MOST_STAGES = 8
@@ -19,12 +26,15 @@ _MOST_STAGES = 8
 
 @functools.cache
 def _table(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    r"""Nodes c (s,), weights b (s,) and a (s, s), a_ij = ∫₀^{c_i} ℓ_j, in double precision."""
+    r"""Nodes c (s,), weights b (s,) and a (s, s), a_ij = ∫₀^{c_i} ℓ_j, as fractions."""
     # x = 2c − 1 are the zeros of P_s. Therefore the sum in `integrals` telescopes in
-    # b_i a_ij + b_j a_ji = b_i b_j, the condition of symplecticity, which holds to round-off.
-    x, weights = legendre.leggauss(stages)
-    b = weights / 2
-    return (x + 1) / 2, b, integrals(x, b, stages)
+    # b_i a_ij + b_j a_ji = b_i b_j, the condition of symplecticity.
+    x = exact_nodes(
+        np.polynomial.legendre.leggauss(stages)[0],
+        lambda x: (legendre(x, stages)[-1], legendre_slope(x, stages)),
+    )
+    b = [1 / ((1 - y * y) * legendre_slope(y, stages) ** 2) for y in x]
+    return (np.array(x, object) + 1) / 2, np.array(b, object), integrals(x, b, stages)
 
 
 class GaussLegendre(Collocation):
@@ -75,9 +85,8 @@ class GaussLegendre(Collocation):
 
     def step(self, equations, interval, q0, p0):
         t0, t1, h = interval
-        c, b, a = _table(self.stages)
-        b, a = jnp.asarray(b, q0.dtype), jnp.asarray(a, q0.dtype)
-        times = t0 + jnp.asarray(c, t0.dtype) * (t1 - t0)
+        c, b, a = (coefficients(part, q0.dtype) for part in _table(self.stages))
+        times = t0 + c * (t1 - t0)
         z0 = jnp.stack([q0, p0])
         all_at_start = jnp.broadcast_to(z0, (self.stages, *z0.shape))
 

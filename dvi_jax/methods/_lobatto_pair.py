@@ -1,6 +1,8 @@
 """The partitioned pair of Lobatto IIIA and IIIB methods."""
 
 import functools
+import math
+from fractions import Fraction
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,12 +10,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from numpy.polynomial import legendre
 
 from .._checks import whole
 from .._step import judge, no_solve
 from ..engine.newton import find_root
-from ._collocation import Collocation, continuous_rates, integrals
+from ._collocation import (
+    Collocation,
+    coefficients,
+    continuous_rates,
+    exact_nodes,
+    integrals,
+    legendre,
+    legendre_slope,
+)
 
 # Order 10: the order conditions are tested up to there.
 _MOST_STAGES = 6
@@ -32,7 +41,7 @@ class _Table(NamedTuple):
 
 @functools.cache
 def _table(stages: int) -> _Table:
-    r"""Nodes c, weights b, IIIA's a, IIIB's â and the weights of the last P, to round-off.
+    r"""Nodes c, weights b, IIIA's a, IIIB's â and the weights of the last P, as fractions.
 
     x = 2c − 1 are the ends ∓1 and the zeros of P'_{s−1}; b_i = 1/(s(s − 1) P_{s−1}(x_i)²). Then
     a_ij = ∫₀^{c_i} ℓ_j, whose first row is zero and last row b, and from it, by the condition of
@@ -44,25 +53,23 @@ def _table(stages: int) -> _Table:
 
     **Source** Hairer & Wanner 1996, *Solving ODEs II*, IV.5; Hairer, Lubich & Wanner 2006, II.1.4.
     """
-    top = np.zeros(stages)
-    top[-1] = 1  # P_{s−1}
-    slope = legendre.legder(top)
-    inner = legendre.legroots(slope)
-    # `legroots` has errors of some units of round-off; one Newton step removes them.
-    inner = inner - legendre.legval(inner, slope) / legendre.legval(inner, legendre.legder(slope))
-    x = np.array([-1.0, *inner, 1.0])
-    # Symmetric to the last digit, because the reversal of a step depends on it.
-    x = (x - x[::-1]) / 2
-    b = 1 / (stages * (stages - 1) * legendre.legval(x, top) ** 2)
-    a = integrals(x, b, stages - 1)
-    # a_ij / b_j, not a divided by b: the division would round a second time.
-    ratio = integrals(x, np.ones(stages), stages - 1)
+    n = stages - 1
+
+    def slope(x: Fraction) -> tuple[Fraction, Fraction]:
+        # P'_n, and P''_n from Legendre's differential equation.
+        first = legendre_slope(x, n)
+        return first, (2 * x * first - n * stages * legendre(x, n)[-1]) / (1 - x * x)
+
+    guesses = np.polynomial.legendre.Legendre.basis(n).deriv().roots()
+    x = [Fraction(-1), *exact_nodes(guesses, slope), Fraction(1)]
+    b = [1 / (stages * n * legendre(y, n)[-1] ** 2) for y in x]
+    a, ratio = integrals(x, b, n), integrals(x, [1] * stages, n)
     # The P_i lie on a polynomial of degree s − 2, so that P_s = Σ_{i<s} last_i P_i: one unknown
     # less to solve for.
     known = x[:-1]
-    apart = known[:, None] - known + np.eye(stages - 1)
-    last = np.prod(1 - known + np.diag(known), axis=1) / np.prod(apart, axis=1)
-    return _Table((x + 1) / 2, b, a, b * (1 - ratio.T), last)
+    last = [math.prod((1 - z) / (y - z) for z in known if z != y) for y in known]
+    c, b, last = (np.array(part, object) for part in (x, b, last))
+    return _Table((c + 1) / 2, b, a, b * (1 - ratio.T), last)
 
 
 class LobattoIIIAIIIB(Collocation):
@@ -123,8 +130,8 @@ class LobattoIIIAIIIB(Collocation):
     def step(self, equations, interval, q0, p0):
         t0, t1, h = interval
         s, table = self.stages, _table(self.stages)
-        b, a, a_hat, last = (jnp.asarray(part, q0.dtype) for part in table[1:])
-        times = t0 + jnp.asarray(table.c, t0.dtype) * (t1 - t0)
+        c, b, a, a_hat, last = (coefficients(part, q0.dtype) for part in table)
+        times = t0 + c * (t1 - t0)
         velocities, forces = map(jax.vmap, continuous_rates(equations, h))
         # Where q does not enter ∂H/∂p the Q follow from the P, which halves the unknowns.
         momenta_suffice = equations.inverse_is_explicit(interval, q0)
