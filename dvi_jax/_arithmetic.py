@@ -1,6 +1,7 @@
 """Representations of a state: rounded, with the rounding error, or on a grid."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -11,10 +12,10 @@ from jax import lax
 
 from lanewise.exact import two_sum
 
-from ._step import Equations, StepInfo, to_grid
+from ._step import Equations, to_grid
 from ._types import Interval, State
 from .engine.in_pairs import in_pairs
-from .engine.pairs import Pair, rounded
+from .engine.pairs import Pair
 from .methods import Method
 
 
@@ -48,21 +49,13 @@ class Arithmetic(eqx.Module):
         """The state after a step from (q0, p0), whose result is (x1, y1), and the memory."""
         return x1, y1, None
 
-    def step(
-        self, method: Method, equations: Equations, interval: Interval, q0, p0, memory: Any
-    ) -> tuple[State, State, Any, StepInfo]:
-        """The state after a step, the memory, and the status of the step."""
-        here, *relative = self.enter(equations, q0, p0, memory)
-        x1, y1, info = method.step(here, interval, *relative)
-        return *self.leave(q0, p0, x1, y1), info
-
     def whole(self, q: State, p: State, memory: Any) -> tuple[Any, Any]:
-        """The state as arguments of a function for `evaluate`."""
+        """The state as arguments of a function for `evaluated`."""
         return q, p
 
-    def evaluate(self, function: Callable, *args: Any) -> Any:
-        """``function(*args)``, a part of an observable, in this representation."""
-        return function(*args)
+    def evaluated(self, function: Callable) -> Callable:
+        """A function, the step of a method or a part of an observable, in this representation."""
+        return function
 
 
 class FloatingPoint(Arithmetic):
@@ -146,21 +139,18 @@ class DoubleDouble(Arithmetic):
     def start(self, q0, p0):
         return jnp.zeros_like(q0), jnp.zeros_like(p0)
 
-    def step(self, method, equations, interval, q0, p0, memory):
-        # The whole step is interpreted, so that no method needs code of its own for pairs.
-        (q1, p1), info = in_pairs(_step, method, equations, interval, *self.whole(q0, p0, memory))
-        return q1.hi, p1.hi, lax.stop_gradient((q1.lo, p1.lo)), rounded(info)
+    def enter(self, equations, q0, p0, memory):
+        return equations, *self.whole(q0, p0, memory)
+
+    def leave(self, q0, p0, x1, y1):
+        return x1.hi, y1.hi, lax.stop_gradient((x1.lo, y1.lo))
 
     def whole(self, q, p, memory):
         return Pair(q, memory[0]), Pair(p, memory[1])
 
-    def evaluate(self, function, *args):
-        return in_pairs(function, *args)
-
-
-def _step(method: Method, equations: Equations, interval: Interval, q0: State, p0: State) -> Any:
-    q1, p1, info = method.step(equations, interval, q0, p0)
-    return (q1, p1), info
+    # The whole step is interpreted, so that no method needs code of its own for pairs.
+    def evaluated(self, function):
+        return functools.partial(in_pairs, function)
 
 
 class FixedPoint(Arithmetic):

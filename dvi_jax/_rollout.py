@@ -92,7 +92,7 @@ class Task(eqx.Module):
         # Deviation vectors and recorded steps are values in floating point.
         if isinstance(reduction, Deviations) or not reduction.has_running_value:
             return function(*rounded(args))
-        return self.arithmetic.evaluate(function, *args)
+        return self.arithmetic.evaluated(function)(*args)
 
     def finished(self, reduction: Reduction, memory: Any) -> Any:
         """The reduced value of a memory."""
@@ -235,10 +235,13 @@ def take_step(task: Task, carry: Carry) -> tuple[Carry, Interval, StepTaken]:
     interval, memory, exists = task.lattice.next(carry.lattice, task.equations, place)
     interval = task.in_precision(interval)
 
+    step = task.arithmetic.evaluated(task.method.step)
+
     def advance(q, p):
-        at = (task.method, task.equations, interval, q, p, carry.beside)
-        q1, p1, beside, info = task.arithmetic.step(*at)
-        return (q1, p1), (beside, info)
+        here, *relative = task.arithmetic.enter(task.equations, q, p, carry.beside)
+        q1, p1, info = step(here, interval, *relative)
+        q1, p1, beside = task.arithmetic.leave(q, p, q1, p1)
+        return (q1, p1), (beside, rounded(info))
 
     if task.has_deviations:
         # One linearisation serves all deviation vectors of all reductions.
