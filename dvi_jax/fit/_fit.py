@@ -129,7 +129,10 @@ def fit(
     if batch is not None:
         whole("batch", batch)
         if not by_optax:
-            raise ValueError("batch requires an optimiser of optax, such as optax.adam(1e-3).")
+            raise ValueError(
+                "batch requires an optimiser of optax: give, for example, "
+                "optimiser=optax.adam(1e-3), or leave batch out."
+            )
     if isinstance(shooting, MultipleShooting) and not is_vector:
         raise ValueError(
             "MultipleShooting requires a loss of residuals, such as dvi.LeastSquares(), and an "

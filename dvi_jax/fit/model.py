@@ -208,8 +208,9 @@ def make_groups(arcs: list[Observations], specs: list[dict[str, Any]]) -> list[G
     longest = max(abs((arc.ts[-1] - arc.t0) / spec["h"]) for arc, spec in pairs)
     if _is_uniform(specs[0]) and 0 < longest < 0.5:
         raise ValueError(
-            f"all observations lie within {longest:.3g} steps of h = {specs[0]['h']:g}, less than "
-            "half of one: give a smaller h, or h and the times of the data in the same unit."
+            f"all observations lie within {longest:.3g} steps of t0 (h = {specs[0]['h']:g}), less "
+            "than half a step. Give a smaller h, or give h and the times of the data in the same "
+            "unit."
         )
     # Compiling takes seconds for each program; some millions of steps too many do not.
     apart = len(arcs) * max(steps) - sum(steps) > _WASTE

@@ -237,8 +237,9 @@ def from_data(arc: Observations, spec: dict[str, Any], times: np.ndarray) -> np.
     """
     if arc.observe not in ("positions", "state"):
         raise ValueError(
-            'guess="data" of dvi.MultipleShooting needs observations of "positions" or of the '
-            f'"state", but this arc observes {arc.observe!r}. Give guess as a function t → (q, p).'
+            'guess="data" of dvi.MultipleShooting requires observations of "positions" or of the '
+            f'"state", but this arc observes {arc.observe!r}. Use guess="model", or give guess as '
+            "a function t → (q, p)."
         )
     flat = arc.values.reshape(len(arc.ts), -1)
     good = np.isfinite(flat).all(axis=1)

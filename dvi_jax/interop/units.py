@@ -271,7 +271,8 @@ def _number(u: Any, name: str, given: Any, unit: Any) -> Any:
             value = u.Quantity(given)
         except (TypeError, u.UnitsError) as error:
             raise TypeError(
-                f"{name} mixes quantities with plain numbers, or incompatible units: {error}."
+                f"{name} mixes quantities with plain numbers, or incompatible units: {error}. Give "
+                "all of its entries as quantities with convertible units."
             ) from None
     if np.any(getattr(value, "mask", False)):
         raise ValueError(f"{name} must not have masked values, got {value!r}.")

@@ -304,8 +304,8 @@ def _interval(name: str, ends: Any) -> tuple[float, float]:
     given, ends = ends, [finite(name, float(x)) for x in (ends if np.ndim(ends) else (0.0, ends))]
     if len(ends) != 2 or not ends[0] < ends[1]:
         raise ValueError(
-            f"{name} must be the largest value, above 0, or a pair with a least value below its "
-            f"largest, got {given!r}."
+            f"{name} must be a positive number (the end of an interval that begins at 0) or a pair "
+            f"(least, largest) with least < largest, got {given!r}."
         )
     low, high = ends
     return low, high

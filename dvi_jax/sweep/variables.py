@@ -53,7 +53,10 @@ def variables(sweep: Sweep, shapes: Mapping[str, Any]) -> dict[str, Variable]:
     taken = (*RESERVED, *(d for d in sweep.dims if d not in RESERVED))
     for name in given:
         if given.count(name) > 1:
-            raise ValueError(f"two observables have the name {name!r}: rename one of them.")
+            raise ValueError(
+                f"two observables have the name {name!r} (the keys of nested containers are joined "
+                "by dots): rename one of them."
+            )
         if not is_array_name(name):
             raise ValueError(f"the observable {name!r} cannot have this name: {ARRAY_NAMES}.")
         if name in taken or name.split(".")[0] in RESERVED:
