@@ -161,8 +161,8 @@ def _task(pickled: bytes, number: int) -> tuple[Any, dict[str, int]]:
         store = Store.open(path)
         if store.sha != sha:
             raise StoreError(
-                f"a worker found another sweep in {path}, which must be the same directory on "
-                "every worker."
+                f"{path} must be the same directory on every worker, but a worker found another "
+                "sweep there. Give a path in store that all workers share."
             )
         known = store.record(number)
         if known is None:
