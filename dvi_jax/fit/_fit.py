@@ -158,8 +158,8 @@ def fit(
         return found
     raise FitError(
         f"the fit did not converge (status {found.status} after {len(run.records)} steps, loss "
-        f"{found.loss:.6g}). {FIT_RESULTS[status]} With throw=False the result is returned with "
-        "its status; here it is the `fit` attribute of this error.",
+        f"{found.loss:.6g}). {FIT_RESULTS[status]} The result is in the attribute `fit` "
+        "of this error. With throw=False it is returned without an error.",
         found,
     )
 
