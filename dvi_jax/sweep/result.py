@@ -95,7 +95,7 @@ class SweepResult:
         """
         if not isinstance(self._source, Store):
             raise StoreError(
-                "results in memory cannot be verified: only a store has checksums. To make a store, "
+                "results in memory cannot be verified: only a store has checksums. To make one, "
                 "give a path in dvi.sweep(store=...)."
             )
         return self._source.verify(progress)

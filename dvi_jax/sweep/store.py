@@ -179,7 +179,8 @@ class Store:
         if seen != expected:
             raise StoreError(
                 f"{self.path}: zarr.json does not describe the array {name!r} of this sweep "
-                f"(found {seen}, expected {expected}). The file is damaged or was edited. {_RESTORE}"
+                f"(found {seen}, expected {expected}). The file is damaged or was edited. "
+                f"{_RESTORE}"
             )
         self._arrays[name] = found
         return found
@@ -216,8 +217,8 @@ class Store:
             values = array[:]
         except Exception as error:  # codecs have many errors for bytes that they cannot decode
             raise StoreError(
-                f"{self.path}: the coordinate {name!r} cannot be read ({error}). Repeat the call of "
-                "dvi.sweep: it writes it again."
+                f"{self.path}: the coordinate {name!r} cannot be read ({error}). Call dvi.sweep "
+                "again with the same arguments: this call writes it again."
             ) from error
         if values.dtype.kind == "T":
             values = np.asarray(values.tolist())

@@ -98,8 +98,8 @@ class Problem:
         ):
             for name in set(getattr(self, what)) - set(known):
                 raise ValueError(
-                    f"{what} of the problem {self.name} contains {name!r}, but this is not among its "
-                    f"{kind} ({', '.join(sorted(known)) or 'it has none'})."
+                    f"{what} of the problem {self.name} contains {name!r}, but this is not among "
+                    f"its {kind} ({', '.join(sorted(known)) or 'it has none'})."
                 )
 
 

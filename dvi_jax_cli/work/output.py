@@ -99,7 +99,7 @@ class Output(Report):
             there = ", ".join(sorted(file.name for file in self.folder.iterdir())) or "nothing"
             raise KeyboardInterrupt(
                 f"by Ctrl-C while results were written to {self.folder}, which contains: {there}. "
-                "The last file may be incomplete. Repeat the command with --force to write all files"
+                "The last file may be incomplete. To write all again, repeat the command with --force"
             ) from None
 
     def path(self, name: str) -> Path:
