@@ -99,7 +99,7 @@ class Output(Report):
             there = ", ".join(sorted(file.name for file in self.folder.iterdir())) or "nothing"
             raise KeyboardInterrupt(
                 f"by Ctrl-C while results were written to {self.folder}, which contains: {there}. "
-                "The last file may be incomplete. To write all again, repeat the command with --force"
+                "The last file may be incomplete. To write all again, add --force to the command"
             ) from None
 
     def path(self, name: str) -> Path:
