@@ -103,8 +103,8 @@ def run_on(
         raise error.args[0] from None
     except (OSError, TimeoutError) as error:
         raise ClusterError(
-            f"the connection to the cluster was lost ({error!r}). If store is given, finished "
-            "tasks are there: start a new cluster, and the same call continues."
+            f"the connection to the cluster was lost ({error!r}). Start a new cluster and repeat "
+            "the call. With store=..., the same call continues after the finished tasks."
         ) from error
     finally:
         with contextlib.suppress(OSError, TimeoutError):
