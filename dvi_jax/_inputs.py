@@ -59,7 +59,7 @@ def _real_array(name: str, value: Any) -> Array:
     if kind.kind == "c":
         raise TypeError(
             f"{name} must be real, got dtype {kind}. If the imaginary part is zero, take jnp.real. "
-            "Otherwise use the two parts as a coordinate and its momentum, up to a factor."
+            "Otherwise use its real and imaginary parts as a canonical pair, up to a factor."
         )
     if not _is_real(kind):
         raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}.")
